@@ -1,0 +1,1 @@
+"""The nouns of GaussLite: frozen values over NumPy arrays, without input or output."""

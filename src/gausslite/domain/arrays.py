@@ -1,0 +1,31 @@
+"""Check arrays at the border: shape, type and finiteness, with messages that name the field."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+from gausslite.errors import InvalidInputError, ShapeError
+
+
+def require_array(name: str, value: NDArray[Any], shape: tuple[int | None, ...], dtype: DTypeLike) -> None:
+    """Raise ShapeError unless `value` has this dtype and shape (None matches any length)."""
+    expected = np.dtype(dtype)
+    if not isinstance(value, np.ndarray) or value.dtype != expected:
+        came = getattr(value, "dtype", type(value).__name__)
+        raise ShapeError(f"{name}: expected an array of {expected}, got {came}")
+    fits = len(value.shape) == len(shape) and all(
+        want is None or want == have for want, have in zip(shape, value.shape, strict=True)
+    )
+    if not fits:
+        wanted = "(" + ", ".join("*" if want is None else str(want) for want in shape) + ")"
+        raise ShapeError(f"{name}: expected shape {wanted}, got {value.shape}")
+
+
+def require_finite(name: str, value: NDArray[Any]) -> None:
+    """Raise InvalidInputError when any element is NaN or infinite."""
+    if not np.isfinite(value).all():
+        bad = int(np.count_nonzero(~np.isfinite(value)))
+        raise InvalidInputError(f"{name}: expected finite values, got {bad} NaN or infinite")

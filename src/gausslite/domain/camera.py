@@ -1,0 +1,72 @@
+"""The pinhole camera, and pixels lifted to points.
+
+Pixel (column u, row v) has its centre at (u + 0.5, v + 0.5). Readers of data sets whose principal point counts
+from pixel centres at integers add 0.5 to cx and cy when they build a Camera.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float32
+from numpy import ndarray
+
+from gausslite.errors import InvalidInputError
+
+_MAX_SIDE_PX = 16384
+
+
+@dataclass(frozen=True, slots=True)
+class Camera:
+    """Intrinsics in pixels; the image plane's origin is the top-left corner of the top-left pixel."""
+
+    fx_px: float
+    fy_px: float
+    cx_px: float
+    cy_px: float
+    width_px: int
+    height_px: int
+
+    def __post_init__(self) -> None:
+        for name in ("fx_px", "fy_px"):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value > 0):
+                raise InvalidInputError(f"camera {name}: expected a positive number, got {value}")
+        for name in ("cx_px", "cy_px"):
+            value = getattr(self, name)
+            if not np.isfinite(value):
+                raise InvalidInputError(f"camera {name}: expected a finite number, got {value}")
+        for name in ("width_px", "height_px"):
+            value = getattr(self, name)
+            if not 1 <= value <= _MAX_SIDE_PX:
+                raise InvalidInputError(f"camera {name}: expected 1 to {_MAX_SIDE_PX}, got {value}")
+
+    def resized(self, width_px: int, height_px: int) -> Camera:
+        """The same camera for an image scaled to this size."""
+        sx, sy = width_px / self.width_px, height_px / self.height_px
+        return Camera(self.fx_px * sx, self.fy_px * sy, self.cx_px * sx, self.cy_px * sy, width_px, height_px)
+
+
+def back_project(depth_m: Float32[ndarray, "h w"], camera: Camera) -> Float32[ndarray, "h w 3"]:
+    """Lift every pixel to a point in the camera frame (OpenCV axes); depth 0 gives the origin."""
+    height, width = depth_m.shape
+    x = ((np.arange(width, dtype=np.float32) + 0.5) - np.float32(camera.cx_px)) / np.float32(camera.fx_px)
+    y = ((np.arange(height, dtype=np.float32) + 0.5) - np.float32(camera.cy_px)) / np.float32(camera.fy_px)
+    points = np.empty((height, width, 3), np.float32)
+    points[..., 0] = x[None, :] * depth_m
+    points[..., 1] = y[:, None] * depth_m
+    points[..., 2] = depth_m
+    return points
+
+
+def project(points_camera: Float32[ndarray, "n 3"], camera: Camera) -> Float32[ndarray, "n 2"]:
+    """Project camera-frame points with z > 0 to image coordinates (column, row) in pixels."""
+    inverse_z = 1.0 / points_camera[:, 2]
+    return np.stack(
+        [
+            points_camera[:, 0] * inverse_z * camera.fx_px + camera.cx_px,
+            points_camera[:, 1] * inverse_z * camera.fy_px + camera.cy_px,
+        ],
+        axis=1,
+    ).astype(np.float32)

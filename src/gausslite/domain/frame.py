@@ -1,0 +1,44 @@
+"""One posed RGB-D image, checked when it is born."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float32, Float64, UInt8
+from numpy import ndarray
+
+from gausslite.domain.arrays import require_array
+from gausslite.domain.camera import Camera
+from gausslite.domain.pose import require_rigid
+from gausslite.errors import InvalidInputError
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Frame:
+    """A colour and depth image with its camera and pose.
+
+    depth_m is the distance along the optical axis in metres, 0 where the sensor had no return.
+    T_world_camera uses OpenCV axes (x right, y down, z forward). Raises ShapeError, PoseError, InvalidInputError.
+    """
+
+    index: int
+    capture_time_ns: int
+    rgb: UInt8[ndarray, "h w 3"]
+    depth_m: Float32[ndarray, "h w"]
+    camera: Camera
+    T_world_camera: Float64[ndarray, "4 4"]
+
+    def __post_init__(self) -> None:
+        size = (self.camera.height_px, self.camera.width_px)
+        require_array("frame rgb", self.rgb, (*size, 3), np.uint8)
+        require_array("frame depth_m", self.depth_m, size, np.float32)
+        require_array("frame T_world_camera", self.T_world_camera, (4, 4), np.float64)
+        require_rigid("frame T_world_camera", self.T_world_camera)
+        if not np.isfinite(self.depth_m).all() or (self.depth_m < 0).any():
+            raise InvalidInputError("frame depth_m: expected finite values of at least 0 (0 = no return)")
+
+    @property
+    def has_depth(self) -> bool:
+        """False when no pixel has a return; such a frame cannot be mapped."""
+        return bool((self.depth_m > 0).any())

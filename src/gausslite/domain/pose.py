@@ -1,0 +1,54 @@
+"""Rigid transforms as 4x4 matrices; `T_a_b` takes points of frame b to frame a."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float, Float64
+from numpy import ndarray
+
+from gausslite.errors import PoseError
+
+_RIGIDITY_TOLERANCE = 1e-2
+
+
+def require_rigid(name: str, T: Float[ndarray, "4 4"]) -> None:
+    """Raise PoseError unless T is finite, has an orthonormal right-handed rotation and a last row 0 0 0 1."""
+    if T.shape != (4, 4):
+        raise PoseError(f"{name}: expected a 4x4 matrix, got shape {T.shape}")
+    if not np.isfinite(T).all():
+        raise PoseError(f"{name}: expected finite numbers, got NaN or infinity")
+    if not np.allclose(T[3], (0.0, 0.0, 0.0, 1.0), atol=1e-6):
+        raise PoseError(f"{name}: expected a last row 0 0 0 1, got {T[3].tolist()}")
+    R = T[:3, :3]
+    deviation = float(np.abs(R @ R.T - np.eye(3)).max())
+    if deviation > _RIGIDITY_TOLERANCE or np.linalg.det(R) < 0:
+        raise PoseError(
+            f"{name}: expected a rotation (orthonormal, determinant +1), "
+            f"got deviation {deviation:.3g} and determinant {np.linalg.det(R):.3g}"
+        )
+
+
+def inverse(T: Float64[ndarray, "4 4"]) -> Float64[ndarray, "4 4"]:
+    """Invert a rigid transform."""
+    out = np.eye(4)
+    out[:3, :3] = T[:3, :3].T
+    out[:3, 3] = -T[:3, :3].T @ T[:3, 3]
+    return out
+
+
+def transform_points(T: Float64[ndarray, "4 4"], points: Float[ndarray, "*n 3"]) -> Float[ndarray, "*n 3"]:
+    """Apply `T_a_b` to points of frame b; keeps the points' dtype."""
+    R, t = T[:3, :3].astype(points.dtype), T[:3, 3].astype(points.dtype)
+    moved: Float[ndarray, "*n 3"] = points @ R.T + t
+    return moved
+
+
+def rotation_angle_deg(T_world_a: Float64[ndarray, "4 4"], T_world_b: Float64[ndarray, "4 4"]) -> float:
+    """Angle of the rotation between two poses, in degrees."""
+    cosine = (np.trace(T_world_a[:3, :3].T @ T_world_b[:3, :3]) - 1.0) / 2.0
+    return float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
+
+
+def translation_m(T_world_a: Float64[ndarray, "4 4"], T_world_b: Float64[ndarray, "4 4"]) -> float:
+    """Distance between the origins of two poses, in metres."""
+    return float(np.linalg.norm(T_world_a[:3, 3] - T_world_b[:3, 3]))

@@ -1,0 +1,72 @@
+"""A ground-truth region of space and the pixels of a frame that show it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from jaxtyping import Bool, Float, Int64
+from numpy import ndarray
+
+from gausslite.domain.camera import back_project
+from gausslite.domain.frame import Frame
+from gausslite.domain.pose import transform_points
+
+
+class Region(Protocol):
+    """Something whose pixels are known for any frame."""
+
+    def mask(self, frame: Frame) -> Bool[ndarray, "h w"]:
+        """True where the frame shows the region."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class BallRegion:
+    """All surface points within radius_m of a world point."""
+
+    centre_m: tuple[float, float, float]
+    radius_m: float
+
+    def mask(self, frame: Frame) -> Bool[ndarray, "h w"]:
+        """True where the pixel's back-projected point lies in the ball."""
+        points = _world_points(frame)
+        near: Bool[ndarray, "h w"] = (
+            np.square(points - np.asarray(self.centre_m, np.float32)).sum(axis=-1) <= self.radius_m**2
+        )
+        return near & (frame.depth_m > 0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class VoxelRegion:
+    """Surface points whose voxel floor(p / size) is listed, or touches a listed one."""
+
+    voxels: Int64[ndarray, "n 3"]
+    size_m: float
+
+    def mask(self, frame: Frame) -> Bool[ndarray, "h w"]:
+        """True where the pixel's back-projected point falls in a listed voxel, dilated by one."""
+        low = self.voxels.min(axis=0) - 2
+        shape = self.voxels.max(axis=0) + 3 - low
+        occupied = np.zeros(shape, np.bool_)
+        i, j, k = (self.voxels - low).T
+        for di in (-1, 0, 1):
+            for dj in (-1, 0, 1):
+                for dk in (-1, 0, 1):
+                    occupied[i + di, j + dj, k + dk] = True
+        index = np.floor(_world_points(frame) / np.float32(self.size_m)).astype(np.int64) - low
+        inside = ((index >= 0) & (index < shape)).all(axis=-1) & (frame.depth_m > 0)
+        result = np.zeros(frame.depth_m.shape, np.bool_)
+        result[inside] = occupied[tuple(index[inside].T)]
+        return result
+
+    @property
+    def centroid_m(self) -> Float[ndarray, "3"]:
+        """Mean of the listed voxels' centres."""
+        centroid: Float[ndarray, "3"] = (self.voxels.mean(axis=0) + 0.5) * self.size_m
+        return centroid
+
+
+def _world_points(frame: Frame) -> Float[ndarray, "h w 3"]:
+    return transform_points(frame.T_world_camera, back_project(frame.depth_m, frame.camera))

@@ -1,0 +1,53 @@
+"""Where in the image the task is: detections and the per-pixel relevance w(u, v)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float32, Int16
+from numpy import ndarray
+
+from gausslite.domain.arrays import require_array
+
+NO_TARGET = -1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Detection:
+    """One object found in one image. box_px is (left, top, right, bottom)."""
+
+    phrase: str
+    score: float
+    box_px: tuple[float, float, float, float]
+    mask: Bool[ndarray, "h w"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RelevanceMap:
+    """weight is the paper's w(u, v) in [0, 1]; target is the index into TaskGraph.targets, -1 where none."""
+
+    weight: Float32[ndarray, "h w"]
+    target: Int16[ndarray, "h w"]
+
+    def __post_init__(self) -> None:
+        require_array("relevance weight", self.weight, (None, None), np.float32)
+        require_array("relevance target", self.target, self.weight.shape, np.int16)
+
+    @classmethod
+    def nothing(cls, height_px: int, width_px: int) -> RelevanceMap:
+        """No pixel is relevant."""
+        return cls(
+            np.zeros((height_px, width_px), np.float32),
+            np.full((height_px, width_px), NO_TARGET, np.int16),
+        )
+
+    @property
+    def roi(self) -> Bool[ndarray, "h w"]:
+        """Pixels that belong to the task's region."""
+        return self.weight > 0
+
+    @property
+    def roi_share(self) -> float:
+        """Fraction of the pixels inside the region."""
+        return float(np.count_nonzero(self.weight) / self.weight.size)

@@ -1,0 +1,40 @@
+"""What the operator asked for, as objects and the relations between them (Sec. III-B.1)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+
+class Predicate(StrEnum):
+    """Spatial predicates the relation filter can evaluate."""
+
+    NEAR = "near"
+    ON = "on"
+    CLOSEST_TO = "closest_to"
+
+
+@dataclass(frozen=True, slots=True)
+class Relation:
+    """`predicate(target, anchor)`; both are noun phrases of the graph."""
+
+    predicate: Predicate
+    target: str
+    anchor: str
+
+
+@dataclass(frozen=True, slots=True)
+class TaskGraph:
+    """Targets to map in detail, anchors that locate them, and the relations r(target, anchor)."""
+
+    task_id: str
+    text: str
+    targets: tuple[str, ...]
+    anchors: tuple[str, ...]
+    relations: tuple[Relation, ...]
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def queries(self) -> tuple[str, ...]:
+        """Q = targets ∪ anchors, in order, without repeats."""
+        return tuple(dict.fromkeys((*self.targets, *self.anchors)))

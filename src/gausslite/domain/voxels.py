@@ -1,0 +1,74 @@
+"""World space in cubes: the unit of the fusion vote and of the uplink (Sec. III-E)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float32, Int64
+from numpy import ndarray
+
+from gausslite.errors import InvalidInputError
+
+_BITS_PER_AXIS = 21
+_OFFSET = 1 << (_BITS_PER_AXIS - 1)
+_MASK = (1 << _BITS_PER_AXIS) - 1
+
+
+@dataclass(frozen=True, slots=True)
+class VoxelGrid:
+    """Cubes of size_m metres aligned to the world's origin; keys pack (i, j, k) = floor(p / size) into 63 bits."""
+
+    size_m: float = 0.10
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.size_m) and 1e-3 <= self.size_m <= 1e3):
+            raise InvalidInputError(f"voxel size_m: expected 0.001 to 1000, got {self.size_m}")
+
+    @property
+    def reach_m(self) -> float:
+        """Coordinates must stay below this distance from the origin along each axis."""
+        return _OFFSET * self.size_m
+
+    def keys(self, points_m: Float32[ndarray, "n 3"]) -> Int64[ndarray, " n"]:
+        """The key of the voxel that holds each point. Raises InvalidInputError for points out of reach."""
+        # float64: the key must not depend on how a float32 quotient happens to round
+        index = np.floor(points_m.astype(np.float64) / self.size_m)
+        if not (np.abs(index) < _OFFSET).all():
+            raise InvalidInputError(f"points: expected coordinates within ±{self.reach_m:g} m, got one outside")
+        ijk = index.astype(np.int64) + _OFFSET
+        packed: Int64[ndarray, " n"] = (ijk[:, 0] << (2 * _BITS_PER_AXIS)) | (ijk[:, 1] << _BITS_PER_AXIS) | ijk[:, 2]
+        return packed
+
+    def centres_m(self, keys: Int64[ndarray, " n"]) -> Float32[ndarray, "n 3"]:
+        """The centres of the voxels with these keys."""
+        ijk = np.stack([(keys >> (2 * _BITS_PER_AXIS)) & _MASK, (keys >> _BITS_PER_AXIS) & _MASK, keys & _MASK], axis=1)
+        return ((ijk - _OFFSET + 0.5) * self.size_m).astype(np.float32)
+
+
+@dataclass(frozen=True, slots=True)
+class AgentStake:
+    """One agent's total on one voxel."""
+
+    agent_id: str
+    kappa_sum: int
+    count: int
+
+
+@dataclass(frozen=True, slots=True)
+class VoxelVotes:
+    """The outcome on one voxel: stakes sorted best first; margin is the lead in kappa_sum over the second."""
+
+    key: int
+    stakes: tuple[AgentStake, ...]
+
+    @property
+    def winner(self) -> str:
+        """The agent whose Gaussians the fused map keeps here."""
+        return self.stakes[0].agent_id
+
+    @property
+    def margin(self) -> int:
+        """How much more trained the winner is than the runner-up; its whole sum when uncontested."""
+        second = self.stakes[1].kappa_sum if len(self.stakes) > 1 else 0
+        return self.stakes[0].kappa_sum - second

@@ -1,0 +1,1 @@
+"""Gaussians to pixels and gradients: one protocol, its backends, and the choice between them."""

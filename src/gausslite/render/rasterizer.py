@@ -1,0 +1,193 @@
+"""The seam between the mapper and the machines that draw: what every rasterizer backend does.
+
+Rows. A splat is one row of 16 float32 (64 bytes, one cache line):
+    0-2 mean x y z in metres | 3-5 log of the scales in metres | 6-9 quaternion w x y z (any non-zero length)
+    10 opacity logit | 11-13 red green blue | 14 number of Adam updates so far | 15 spare, zero
+Adam's two moments are tables of the same shape; columns 14 and 15 of the FIRST moment hold the density statistics
+since they were last cleared: the sum of the norms of the gradient of the mean in the image, in half image widths
+and heights (as in 3DGS), and the number of steps in which the splat was visible.
+
+Image model (EWA splatting, Kerbl et al. 2023). The 2D covariance gets 0.3 px² on its diagonal; a contribution below
+1/255 is dropped and alpha is clamped to 0.99 (no gradient through the clamp); a pixel stops once its transmittance is
+below 1e-4; splats nearer than 0.05 m are culled; the tangent that enters the Jacobian is clamped to
+1.3 times the half field of view; splats are drawn in order of their z. Pixel centres are at +0.5.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+from jaxtyping import Bool, Float32, Float64, UInt8, UInt32
+from numpy import ndarray
+
+from gausslite.domain.camera import Camera
+
+ROW_WIDTH = 16
+MEAN, LOG_SCALE, QUAT, LOGIT, RGB = slice(0, 3), slice(3, 6), slice(6, 10), 10, slice(11, 14)
+UPDATES = 14
+GRAD_2D_SUM, GRAD_2D_COUNT = 14, 15
+"""Columns of the first-moment table, not of the rows."""
+
+TILE_PX = 16
+NEAR_M = 0.05
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Subset:
+    """What takes part in a rendering; None means everything.
+
+    tiles: True for each 16x16 tile to draw, row-major from the top left; other pixels come out as zeros, alpha 0.
+    ids: the rows that exist for this rendering, ascending (active-only rendering).
+    """
+
+    tiles: Bool[ndarray, "th tw"] | None = None
+    ids: UInt32[ndarray, " m"] | None = None
+
+
+EVERYTHING = Subset()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rendering:
+    """rgb and depth_m are accumulated with the weights T·alpha: divide depth_m by alpha for the expected depth.
+
+    context belongs to the backend and is needed by `backward`; it is valid until the backend's next forward or step.
+    """
+
+    rgb: Float32[ndarray, "h w 3"]
+    depth_m: Float32[ndarray, "h w"]
+    alpha: Float32[ndarray, "h w"]
+    context: Any = field(repr=False)
+
+    def expected_depth_m(self, min_alpha: float = 0.5) -> Float32[ndarray, "h w"]:
+        """Depth of the surface drawn; 0 where alpha is below min_alpha."""
+        shown = self.alpha > min_alpha
+        out: Float32[ndarray, "h w"] = np.where(shown, self.depth_m / np.where(shown, self.alpha, 1.0), 0.0).astype(
+            np.float32
+        )
+        return out
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SplatGradients:
+    """d_rows: gradient per column (columns 14, 15 zero). d_twist: for T_camera_world ← exp(twist) T_camera_world,
+    twist = (translation 3, rotation 3) in the camera frame. visible: ascending rows that touched a pixel's bounding
+    box. mean_2d_norm: per visible row, norm of the image-mean gradient scaled by half width and half height."""
+
+    d_rows: Float32[ndarray, "n 16"]
+    d_twist: Float64[ndarray, "6"]
+    visible: UInt32[ndarray, " m"]
+    mean_2d_norm: Float32[ndarray, " m"]
+
+
+@dataclass(frozen=True, slots=True)
+class LossWeights:
+    """Weights of Eq. (1), with w the view's weight (1 everywhere when not masked) and W the sum of w over all pixels:
+
+      colour / (3W) · Σ w |rgb − image|   summed over the three channels
+    + depth / W · Σ w |depth / alpha − measured|   where alpha > 0.5 and measured > 0
+    + ssim · (1 − Σ w SSIM / (3W))   11x11 Gaussian window, sigma 1.5, zero padding, C1 = 1e-4, C2 = 9e-4
+    """
+
+    colour: float = 0.8
+    depth: float = 1.0
+    ssim: float = 0.2
+
+
+@dataclass(frozen=True, slots=True)
+class AdamSettings:
+    """Learning rates per group (FIELD defaults) and Adam's constants; bias correction counts updates per splat."""
+
+    means: float = 1e-4
+    log_scales: float = 5e-3
+    quats: float = 1e-3
+    opacity_logits: float = 5e-2
+    rgb: float = 2.5e-3
+    beta1: float = 0.9
+    beta2: float = 0.999
+    epsilon: float = 1e-15
+
+    def row_rates(self) -> Float32[ndarray, "16"]:
+        """The learning rate of each column of a row; zero for the spare ones."""
+        rates = np.zeros(ROW_WIDTH, np.float32)
+        rates[MEAN], rates[LOG_SCALE], rates[QUAT] = self.means, self.log_scales, self.quats
+        rates[LOGIT], rates[RGB] = self.opacity_logits, self.rgb
+        return rates
+
+
+class TrainingView(Protocol):
+    """An image prepared once for many steps (padded, planar, SSIM moments cached); opaque outside its backend."""
+
+    @property
+    def camera(self) -> Camera:
+        """Intrinsics of the image."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StepReport:
+    """What one fused step did. visible: ascending rows whose parameters this view could move (frozen rows too)."""
+
+    loss: float
+    visible: UInt32[ndarray, " m"]
+
+
+class Rasterizer(Protocol):
+    """A backend. It owns scratch memory and threads, never the splats. Calls are not re-entrant."""
+
+    @property
+    def name(self) -> str:
+        """`reference`, `cpu` or `cuda`."""
+        ...
+
+    def forward(
+        self,
+        rows: Float32[ndarray, "n 16"],
+        camera: Camera,
+        T_camera_world: Float64[ndarray, "4 4"],
+        subset: Subset = EVERYTHING,
+    ) -> Rendering:
+        """Draw the splats. Raises ShapeError."""
+        ...
+
+    def backward(
+        self,
+        rendering: Rendering,
+        d_rgb: Float32[ndarray, "h w 3"],
+        d_depth_m: Float32[ndarray, "h w"],
+        d_alpha: Float32[ndarray, "h w"],
+    ) -> SplatGradients:
+        """Gradients of a scalar whose derivatives by the rendering's images are given."""
+        ...
+
+    def prepare_view(
+        self,
+        rgb: UInt8[ndarray, "h w 3"],
+        depth_m: Float32[ndarray, "h w"],
+        camera: Camera,
+        weight: Float32[ndarray, "h w"] | None = None,
+    ) -> TrainingView:
+        """Make an image ready to train on. weight in [0, 1] masks the loss of steps with `masked=True`."""
+        ...
+
+    def step(
+        self,
+        rows: Float32[ndarray, "n 16"],
+        first_moment: Float32[ndarray, "n 16"],
+        second_moment: Float32[ndarray, "n 16"],
+        view: TrainingView,
+        T_camera_world: Float64[ndarray, "4 4"],
+        loss: LossWeights,
+        adam: AdamSettings,
+        masked: bool = False,
+        subset: Subset = EVERYTHING,
+        trainable: Bool[ndarray, " n"] | None = None,
+    ) -> StepReport:
+        """One whole iteration in place: forward, loss, backward, sparse Adam on the visible (and trainable) rows.
+
+        masked=True weighs every loss term by the view's weight and divides by the weights' sum. Only visible rows
+        change, their UPDATES count rises by one, and the density statistics of the first moment are added up.
+        """
+        ...
