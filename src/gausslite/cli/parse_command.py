@@ -1,0 +1,44 @@
+"""`gausslite parse`: show how a task sentence is understood."""
+
+from __future__ import annotations
+
+import argparse
+import json
+
+from gausslite.domain.task import TaskGraph
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `gausslite parse`."""
+    parser.add_argument("text", metavar="TEXT", help='for example "Pick up the mug on the table"')
+    parser.add_argument("--json", action="store_true", help="print JSON for scripts")
+    parser.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Parse and print."""
+    from gausslite.task.rules import RuleParser
+
+    graph = RuleParser().parse(options.text)
+    print(json.dumps(as_json(graph)) if options.json else _as_text(graph))
+    return 0
+
+
+def as_json(graph: TaskGraph) -> dict[str, object]:
+    """The stable JSON form of a task graph."""
+    return {
+        "targets": list(graph.targets),
+        "anchors": list(graph.anchors),
+        "relations": [
+            {"predicate": str(relation.predicate), "target": relation.target, "anchor": relation.anchor}
+            for relation in graph.relations
+        ],
+        "warnings": list(graph.warnings),
+    }
+
+
+def _as_text(graph: TaskGraph) -> str:
+    lines = [f"targets   {', '.join(graph.targets) or '-'}", f"anchors   {', '.join(graph.anchors) or '-'}"]
+    lines += [f"relation  {r.predicate}({r.target}, {r.anchor})" for r in graph.relations]
+    lines += [f"warning   {warning}" for warning in graph.warnings]
+    return "\n".join(lines)

@@ -1,0 +1,52 @@
+"""Promises of the repository itself: README's commands, short files, no machine's secrets."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def _tracked(*patterns: str) -> list[Path]:
+    done = subprocess.run(["git", "ls-files", *patterns], cwd=ROOT, capture_output=True, text=True)
+    if done.returncode != 0:
+        pytest.skip("not a git checkout")
+    return [ROOT / line for line in done.stdout.splitlines() if (ROOT / line).is_file()]
+
+
+def test_readme_has_exactly_the_two_commands() -> None:
+    readme = (ROOT / "README.md").read_text()
+    assert re.findall(r"<!-- command: (\w+) -->", readme) == ["demo", "tests"]
+
+
+def test_no_source_file_grows_past_reading() -> None:
+    sources = [path for path in _tracked("*.py", "*.cpp", "*.h") if "v1" not in path.parts]
+    too_long = {str(p.relative_to(ROOT)): n for p in sources if (n := len(p.read_text().splitlines())) > 400}
+    assert not too_long
+
+
+def test_every_package_module_says_why_it_exists() -> None:
+    silent = [
+        str(path.relative_to(ROOT))
+        for path in _tracked("src/*.py", "services/*.py")
+        if "v1" not in path.parts and not path.read_text().startswith('"""')
+    ]
+    assert not silent
+
+
+def test_services_is_a_folder_not_a_package() -> None:
+    assert not list((ROOT / "services").glob("__init__.py"))
+    assert not list((ROOT / "services").glob("*/__init__.py"))
+
+
+def test_nothing_is_ever_unpickled() -> None:
+    guilty = [
+        str(path.relative_to(ROOT))
+        for path in _tracked("src/*.py", "services/*.py")
+        if re.search(r"\b(pickle|marshal|shelve)\b|allow_pickle=True|torch\.load", path.read_text())
+    ]
+    assert not guilty
