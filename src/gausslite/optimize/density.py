@@ -1,0 +1,115 @@
+"""Adapt the number of Gaussians to what training asks for: clone, split and prune under a hard cap (Sec. III-D.3)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float32, Int64
+from numpy import ndarray
+
+from gausslite.errors import InvalidInputError
+from gausslite.optimize.parameters import SplatTable
+from gausslite.render.rasterizer import GRAD_2D_COUNT, GRAD_2D_SUM, LOG_SCALE, MEAN, QUAT, UPDATES
+
+_SPLIT_SHRINK = 1.6
+"""Each half of a split Gaussian is this much smaller (Kerbl et al. 2023)."""
+
+
+@dataclass(frozen=True, slots=True)
+class DensitySettings:
+    """When and what to clone, split and prune; counts are mapping iterations.
+
+    min_mean_gradient is in half image widths (as the rasterizer's statistics); percent_dense, a fraction of the
+    scene's extent, parts the Gaussians to clone (smaller) from those to split.
+    """
+
+    densify_every: int = 150
+    min_mean_gradient: float = 2e-4
+    percent_dense: float = 0.01
+    prune_every: int = 100
+    min_opacity: float = 0.005
+
+    def __post_init__(self) -> None:
+        for name in ("densify_every", "prune_every"):
+            if getattr(self, name) < 1:
+                raise InvalidInputError(f"density {name}: expected at least 1 iteration, got {getattr(self, name)}")
+        for name in ("min_mean_gradient", "percent_dense", "min_opacity"):
+            if not getattr(self, name) >= 0:
+                raise InvalidInputError(f"density {name}: expected at least 0, got {getattr(self, name)}")
+
+
+@dataclass(frozen=True, slots=True)
+class Densified:
+    """How many Gaussians were cloned and how many were split; each adds one."""
+
+    cloned: int
+    split: int
+
+
+def densify(table: SplatTable, settings: DensitySettings, extent_m: float, rng: np.random.Generator) -> Densified:
+    """Clone small and split large Gaussians whose image gradient stays high, as far as the table has room.
+
+    Where room is short the largest gradients go first. Children inherit active, kappa and target and start with
+    fresh optimiser state; a split puts its first half in the parent's row. The statistics start anew.
+    """
+    chosen = _most_wanted(_mean_gradient(table), settings.min_mean_gradient, table.room)
+    largest_scale_m = np.exp(table.rows[chosen][:, LOG_SCALE].max(axis=1, initial=-np.inf))
+    small = largest_scale_m <= settings.percent_dense * extent_m
+    to_clone, to_split = chosen[small], chosen[~small]
+    _split(table, to_split, rng)
+    _clone(table, to_clone)
+    table.first_moment[:, [GRAD_2D_SUM, GRAD_2D_COUNT]] = 0.0
+    return Densified(cloned=len(to_clone), split=len(to_split))
+
+
+def prune(table: SplatTable, settings: DensitySettings) -> int:
+    """Drop the Gaussians that became all but transparent; returns how many."""
+    before = table.count
+    table.keep(table.opacities >= settings.min_opacity)
+    return before - table.count
+
+
+def _mean_gradient(table: SplatTable) -> Float32[ndarray, " n"]:
+    seen = table.first_moment[:, GRAD_2D_COUNT]
+    mean: Float32[ndarray, " n"] = table.first_moment[:, GRAD_2D_SUM] / np.maximum(seen, 1.0)
+    return mean
+
+
+def _most_wanted(gradient: Float32[ndarray, " n"], threshold: float, room: int) -> Int64[ndarray, " m"]:
+    above = np.flatnonzero(gradient > threshold)
+    if len(above) <= room:
+        return above
+    # a stable order makes the choice among equals repeatable
+    order = np.argsort(-gradient[above], kind="stable")
+    return np.sort(above[order[:room]])
+
+
+def _clone(table: SplatTable, parents: Int64[ndarray, " m"]) -> None:
+    rows = table.rows[parents]
+    rows[:, UPDATES] = 0.0
+    table.append_rows(rows, table.active[parents], table.kappa[parents], table.target[parents])
+
+
+def _split(table: SplatTable, parents: Int64[ndarray, " m"], rng: np.random.Generator) -> None:
+    halves = []
+    for _ in range(2):
+        rows = table.rows[parents]
+        local = rng.standard_normal((len(parents), 3), np.float32) * np.exp(rows[:, LOG_SCALE])
+        rows[:, MEAN] += _rotate(rows[:, QUAT], local)
+        rows[:, LOG_SCALE] -= np.float32(np.log(_SPLIT_SHRINK))
+        rows[:, UPDATES] = 0.0
+        halves.append(rows)
+    first, second = halves
+    table.rows[parents] = first
+    table.first_moment[parents] = 0.0
+    table.second_moment[parents] = 0.0
+    table.append_rows(second, table.active[parents], table.kappa[parents], table.target[parents])
+
+
+def _rotate(quats_wxyz: Float32[ndarray, "m 4"], vectors: Float32[ndarray, "m 3"]) -> Float32[ndarray, "m 3"]:
+    unit = quats_wxyz / np.maximum(np.linalg.norm(quats_wxyz, axis=1, keepdims=True), np.float32(1e-12))
+    w, xyz = unit[:, :1], unit[:, 1:]
+    twice = 2.0 * np.cross(xyz, vectors)
+    rotated: Float32[ndarray, "m 3"] = (vectors + w * twice + np.cross(xyz, twice)).astype(np.float32)
+    return rotated

@@ -1,0 +1,179 @@
+"""Hold the trainable Gaussians and their optimiser state in memory that is allocated once and never outgrown."""
+
+from __future__ import annotations
+
+import mmap
+
+import numpy as np
+from jaxtyping import Bool, Float32, Int, Int16, UInt32
+from numpy import ndarray
+
+from gausslite.domain.arrays import require_array
+from gausslite.domain.gaussians import Gaussians
+from gausslite.errors import InvalidInputError, QuotaError
+from gausslite.render.rasterizer import LOG_SCALE, LOGIT, MEAN, QUAT, RGB, ROW_WIDTH
+
+_MIN_SCALE_M = 1e-7
+_MIN_OPACITY = 1e-6
+
+
+class SplatTable:
+    """Rows of raw parameters, Adam's two moments and what each Gaussian carries beside them (Sec. III-A).
+
+    `capacity` is the hard cap: `count` never exceeds it, not even for an instant. All arrays are views of the first
+    `count` rows; a view taken before `append`, `append_rows` or `keep` is stale after it.
+    """
+
+    def __init__(self, capacity: int) -> None:
+        """Reserve room for `capacity` Gaussians. Raises InvalidInputError when capacity is not positive."""
+        if capacity < 1:
+            raise InvalidInputError(f"table capacity: expected at least 1 Gaussian, got {capacity}")
+        self._capacity = capacity
+        self._count = 0
+        self._rows = _row_memory(capacity)
+        self._first_moment = _row_memory(capacity)
+        self._second_moment = _row_memory(capacity)
+        self._active = np.zeros(capacity, np.bool_)
+        self._kappa = np.zeros(capacity, np.uint32)
+        self._target = np.zeros(capacity, np.int16)
+
+    def __len__(self) -> int:
+        return self._count
+
+    @property
+    def capacity(self) -> int:
+        """The most Gaussians this table can ever hold."""
+        return self._capacity
+
+    @property
+    def count(self) -> int:
+        """Gaussians held now."""
+        return self._count
+
+    @property
+    def room(self) -> int:
+        """How many Gaussians still fit."""
+        return self._capacity - self._count
+
+    @property
+    def rows(self) -> Float32[ndarray, "n 16"]:
+        """Raw parameters, laid out as in `render.rasterizer`."""
+        return self._rows[: self._count]
+
+    @property
+    def first_moment(self) -> Float32[ndarray, "n 16"]:
+        """Adam's first moment; its columns 14 and 15 hold the density statistics."""
+        return self._first_moment[: self._count]
+
+    @property
+    def second_moment(self) -> Float32[ndarray, "n 16"]:
+        """Adam's second moment."""
+        return self._second_moment[: self._count]
+
+    @property
+    def active(self) -> Bool[ndarray, " n"]:
+        """The paper's a: seeded inside the task's region."""
+        return self._active[: self._count]
+
+    @property
+    def kappa(self) -> UInt32[ndarray, " n"]:
+        """Active-phase iterations that trained each Gaussian."""
+        return self._kappa[: self._count]
+
+    @property
+    def target(self) -> Int16[ndarray, " n"]:
+        """Index into TaskGraph.targets, -1 for none."""
+        return self._target[: self._count]
+
+    @property
+    def opacities(self) -> Float32[ndarray, " n"]:
+        """Opacities in (0, 1)."""
+        return _sigmoid(self.rows[:, LOGIT])
+
+    def append(self, gaussians: Gaussians) -> None:
+        """Add Gaussians with fresh optimiser state. Raises QuotaError when they do not fit."""
+        self.append_rows(gaussians_to_rows(gaussians), gaussians.active, gaussians.kappa, gaussians.target)
+
+    def append_rows(
+        self,
+        rows: Float32[ndarray, "m 16"],
+        active: Bool[ndarray, " m"],
+        kappa: UInt32[ndarray, " m"],
+        target: Int16[ndarray, " m"],
+    ) -> None:
+        """Add raw rows with fresh optimiser state. Raises QuotaError when they do not fit."""
+        if len(rows) > self.room:
+            raise QuotaError(f"table: expected at most {self.room} more Gaussians, got {len(rows)}")
+        new = slice(self._count, self._count + len(rows))
+        self._rows[new] = rows
+        self._first_moment[new] = 0.0
+        self._second_moment[new] = 0.0
+        self._active[new], self._kappa[new], self._target[new] = active, kappa, target
+        self._count += len(rows)
+
+    def keep(self, mask: Bool[ndarray, " n"]) -> None:
+        """Drop the Gaussians where mask is false; the others keep their order and their optimiser state."""
+        require_array("keep mask", mask, (self._count,), np.bool_)
+        kept = np.flatnonzero(mask)
+        if len(kept) == self._count:
+            return
+        # rows before the first gap stay where they are
+        first_gap = int(np.argmin(mask))
+        moved = kept[first_gap:]
+        for column in (self._rows, self._first_moment, self._second_moment, self._active, self._kappa, self._target):
+            column[first_gap : len(kept)] = column[moved]
+        self._count = len(kept)
+
+    def to_gaussians(self, ids: Int[ndarray, " m"] | None = None) -> Gaussians:
+        """Copies of all Gaussians, or of these rows, as physical values."""
+        chosen = np.arange(self._count) if ids is None else ids
+        return rows_to_gaussians(self.rows[chosen], self.active[chosen], self.kappa[chosen], self.target[chosen])
+
+
+def gaussians_to_rows(gaussians: Gaussians) -> Float32[ndarray, "n 16"]:
+    """Physical values to raw rows: scales to logarithms, opacities to logits."""
+    opacities = np.clip(gaussians.opacities, _MIN_OPACITY, 1.0 - _MIN_OPACITY).astype(np.float32)
+    rows = np.zeros((len(gaussians), ROW_WIDTH), np.float32)
+    rows[:, MEAN] = gaussians.means_m
+    rows[:, LOG_SCALE] = np.log(np.maximum(gaussians.scales_m, _MIN_SCALE_M))
+    rows[:, QUAT] = gaussians.quats_wxyz
+    rows[:, LOGIT] = np.log(opacities) - np.log1p(-opacities)
+    rows[:, RGB] = gaussians.rgb
+    return rows
+
+
+def rows_to_gaussians(
+    rows: Float32[ndarray, "n 16"],
+    active: Bool[ndarray, " n"],
+    kappa: UInt32[ndarray, " n"],
+    target: Int16[ndarray, " n"],
+) -> Gaussians:
+    """Raw rows to physical values, with quaternions of unit length."""
+    quats = rows[:, QUAT]
+    length = np.linalg.norm(quats, axis=1, keepdims=True)
+    return Gaussians(
+        means_m=rows[:, MEAN].copy(),
+        quats_wxyz=(quats / np.maximum(length, np.float32(1e-12))).astype(np.float32),
+        scales_m=np.exp(rows[:, LOG_SCALE]),
+        opacities=_sigmoid(rows[:, LOGIT]),
+        rgb=rows[:, RGB].copy(),
+        active=active.copy(),
+        kappa=kappa.copy(),
+        target=target.copy(),
+    )
+
+
+def _sigmoid(logits: Float32[ndarray, " n"]) -> Float32[ndarray, " n"]:
+    # the symmetric form cannot overflow
+    opacities: Float32[ndarray, " n"] = 0.5 * (np.tanh(0.5 * logits) + 1.0)
+    return opacities
+
+
+def _row_memory(capacity: int) -> Float32[ndarray, "capacity 16"]:
+    """Zeroed rows on whole pages (so 64-byte aligned), in huge pages where the system has them."""
+    size = capacity * ROW_WIDTH * np.dtype(np.float32).itemsize
+    memory = mmap.mmap(-1, size)
+    huge_pages = getattr(mmap, "MADV_HUGEPAGE", None)
+    if huge_pages is not None:
+        memory.madvise(huge_pages)
+    return np.frombuffer(memory, np.float32).reshape(capacity, ROW_WIDTH)
