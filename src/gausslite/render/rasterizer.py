@@ -8,9 +8,14 @@ since they were last cleared: the sum of the norms of the gradient of the mean i
 and heights (as in 3DGS), and the number of steps in which the splat was visible.
 
 Image model (EWA splatting, Kerbl et al. 2023). The 2D covariance gets 0.3 px² on its diagonal; a contribution below
-1/255 is dropped and alpha is clamped to 0.99 (no gradient through the clamp); a pixel stops once its transmittance is
-below 1e-4; splats nearer than 0.05 m are culled; the tangent that enters the Jacobian is clamped to
-1.3 times the half field of view; splats are drawn in order of their z. Pixel centres are at +0.5.
+1/255 is dropped and alpha is clamped to 0.99 (no gradient through the clamp); splats nearer than 0.05 m are culled;
+the tangent that enters the Jacobian is clamped to 1.3 times the half field of view; splats are drawn in order of
+their z. Pixel centres are at +0.5. A backend may stop a pixel once its transmittance is below 1e-4, after the splat
+that took it there: what it leaves out weighs less than that (the reference leaves out nothing).
+
+A row with a value that is not finite in columns 0-13, with a quaternion of length zero, or whose ellipse is not finite
+in the backend's precision is not drawn. A row is visible when the bounding box of its ellipse alpha >= 1/255 holds
+the centre of at least one drawn pixel.
 """
 
 from __future__ import annotations
@@ -73,8 +78,9 @@ class Rendering:
 @dataclass(frozen=True, slots=True, eq=False)
 class SplatGradients:
     """d_rows: gradient per column (columns 14, 15 zero). d_twist: for T_camera_world ← exp(twist) T_camera_world,
-    twist = (translation 3, rotation 3) in the camera frame. visible: ascending rows that touched a pixel's bounding
-    box. mean_2d_norm: per visible row, norm of the image-mean gradient scaled by half width and half height."""
+    twist = (translation 3, rotation 3) in the camera frame. visible: the visible rows, ascending. mean_2d_norm: per
+    visible row, norm of the image-mean gradient scaled by half width and half height.
+    """
 
     d_rows: Float32[ndarray, "n 16"]
     d_twist: Float64[ndarray, "6"]
@@ -84,7 +90,8 @@ class SplatGradients:
 
 @dataclass(frozen=True, slots=True)
 class LossWeights:
-    """Weights of Eq. (1), with w the view's weight (1 everywhere when not masked) and W the sum of w over all pixels:
+    """Weights of Eq. (1), with w the view's weight (1 everywhere when not masked) and W the sum of w over all pixels
+    (every term is 0 where W is 0):
 
       colour / (3W) · Σ w |rgb − image|   summed over the three channels
     + depth / W · Σ w |depth / alpha − measured|   where alpha > 0.5 and measured > 0
@@ -128,7 +135,7 @@ class TrainingView(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StepReport:
-    """What one fused step did. visible: ascending rows whose parameters this view could move (frozen rows too)."""
+    """What one fused step did. loss: before the update. visible: the visible rows, ascending (frozen ones too)."""
 
     loss: float
     visible: UInt32[ndarray, " m"]
@@ -187,7 +194,8 @@ class Rasterizer(Protocol):
     ) -> StepReport:
         """One whole iteration in place: forward, loss, backward, sparse Adam on the visible (and trainable) rows.
 
-        masked=True weighs every loss term by the view's weight and divides by the weights' sum. Only visible rows
-        change, their UPDATES count rises by one, and the density statistics of the first moment are added up.
+        masked=True weighs every loss term by the view's weight and divides by the weights' sum. Only rows that are
+        visible and trainable change, with their moments: their UPDATES count rises by one, and the density
+        statistics of the first moment are added up. Raises ShapeError.
         """
         ...

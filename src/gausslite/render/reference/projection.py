@@ -1,0 +1,167 @@
+"""From rows to ellipses in the image (EWA splatting), differentiable in the rows and in the camera's pose."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float64, Int64
+from numpy import ndarray
+from torch import Tensor
+
+from gausslite.domain.camera import Camera
+from gausslite.render.rasterizer import LOG_SCALE, LOGIT, MEAN, NEAR_M, QUAT, RGB, TILE_PX
+
+LOW_PASS_PX2 = 0.3
+MIN_ALPHA = 1.0 / 255.0
+TANGENT_MARGIN = 1.3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Ellipses:
+    """The visible splats in drawing order. conics hold (a, b, c) of the inverse 2D covariance [[a, b], [b, c]].
+
+    half_box_px is half the bounding box of the ellipse alpha >= 1/255; it and row_ids carry no gradient.
+    """
+
+    row_ids: Int64[Tensor, " m"]
+    means_px: Float64[Tensor, "m 2"]
+    conics: Float64[Tensor, "m 3"]
+    opacities: Float64[Tensor, " m"]
+    rgb: Float64[Tensor, "m 3"]
+    z_m: Float64[Tensor, " m"]
+    half_box_px: Float64[Tensor, "m 2"]
+
+    @property
+    def differentiable(self) -> tuple[Tensor, ...]:
+        """The columns that gradients flow through."""
+        return self.means_px, self.conics, self.opacities, self.rgb, self.z_m
+
+    def detached(self) -> Ellipses:
+        """The same ellipses as leaves of a new graph."""
+        means_px, conics, opacities, rgb, z_m = (column.detach().requires_grad_() for column in self.differentiable)
+        return Ellipses(self.row_ids, means_px, conics, opacities, rgb, z_m, self.half_box_px)
+
+    def take(self, chosen: Tensor) -> Ellipses:
+        """The ellipses at these positions or where this mask is true, in the same order."""
+        return Ellipses(
+            self.row_ids[chosen],
+            self.means_px[chosen],
+            self.conics[chosen],
+            self.opacities[chosen],
+            self.rgb[chosen],
+            self.z_m[chosen],
+            self.half_box_px[chosen],
+        )
+
+
+def project(
+    rows: Float64[Tensor, "n 16"],
+    camera: Camera,
+    T_camera_world: Float64[Tensor, "4 4"],
+    ids: Int64[Tensor, " k"] | None = None,
+    tiles: Bool[ndarray, "th tw"] | None = None,
+) -> Ellipses:
+    """Project the rows (only `ids`, if given) and keep those that can touch a pixel of `tiles`, nearest first."""
+    with torch.no_grad():
+        drawable = torch.isfinite(rows[:, :14]).all(dim=1) & (rows[:, QUAT].abs().sum(dim=1) > 0)
+        row_ids = torch.nonzero(drawable)[:, 0] if ids is None else ids[drawable[ids]]
+        z_m = rows[row_ids, MEAN] @ T_camera_world[2, :3] + T_camera_world[2, 3]
+        ellipses = _ellipses(rows, row_ids[z_m >= NEAR_M], camera, T_camera_world)
+        finite = torch.isfinite(ellipses.half_box_px).all(dim=1) & torch.isfinite(ellipses.means_px).all(dim=1)
+        ellipses = ellipses.take(finite & (ellipses.opacities > MIN_ALPHA))
+        ellipses = ellipses.take(_touches_tiles(ellipses, camera, tiles))
+        row_ids = ellipses.row_ids[torch.argsort(ellipses.z_m, stable=True)]
+    # projected again with gradients, so that none flows through what was culled
+    return _ellipses(rows, row_ids, camera, T_camera_world)
+
+
+def _ellipses(
+    rows: Float64[Tensor, "n 16"], row_ids: Int64[Tensor, " m"], camera: Camera, T_camera_world: Float64[Tensor, "4 4"]
+) -> Ellipses:
+    kept = rows[row_ids]
+    R, t = T_camera_world[:3, :3], T_camera_world[:3, 3]
+    points = kept[:, MEAN] @ R.T + t
+    z = points[:, 2]
+    means_px = torch.stack(
+        [camera.fx_px * points[:, 0] / z + camera.cx_px, camera.fy_px * points[:, 1] / z + camera.cy_px], dim=1
+    )
+    variance_x, covariance, variance_y = _covariance_px2(kept, points, R, camera)
+    determinant = variance_x * variance_y - covariance * covariance
+    conics = torch.stack([variance_y, -covariance, variance_x], dim=1) / determinant[:, None]
+    opacities = torch.sigmoid(kept[:, LOGIT])
+    # the boundary alpha = 1/255 is an ellipse at this squared Mahalanobis distance
+    reach = 2.0 * torch.log(opacities.detach() / MIN_ALPHA).clamp(min=0.0)
+    half_box_px = torch.sqrt(reach[:, None] * torch.stack([variance_x, variance_y], dim=1).detach())
+    return Ellipses(row_ids, means_px, conics, opacities, kept[:, RGB], z, half_box_px)
+
+
+def _covariance_px2(
+    kept: Float64[Tensor, "m 16"], points: Float64[Tensor, "m 3"], R: Float64[Tensor, "3 3"], camera: Camera
+) -> tuple[Tensor, Tensor, Tensor]:
+    """J R Σ Rᵀ Jᵀ plus the low-pass filter as var x, cov xy, var y; the Jacobian is taken at the clamped tangent."""
+    x, y, z = points.unbind(dim=1)
+    limit_x = TANGENT_MARGIN * 0.5 * camera.width_px / camera.fx_px
+    limit_y = TANGENT_MARGIN * 0.5 * camera.height_px / camera.fy_px
+    u, v = (x / z).clamp(-limit_x, limit_x), (y / z).clamp(-limit_y, limit_y)
+    zero = torch.zeros_like(z)
+    jacobian_x = torch.stack([camera.fx_px / z, zero, -camera.fx_px * u / z], dim=1)
+    jacobian_y = torch.stack([zero, camera.fy_px / z, -camera.fy_px * v / z], dim=1)
+    spread = R @ _rotations(kept[:, QUAT]) * torch.exp(kept[:, LOG_SCALE])[:, None, :]
+    spread_x = torch.einsum("mi,mij->mj", jacobian_x, spread)
+    spread_y = torch.einsum("mi,mij->mj", jacobian_y, spread)
+    variance_x = (spread_x * spread_x).sum(dim=1) + LOW_PASS_PX2
+    variance_y = (spread_y * spread_y).sum(dim=1) + LOW_PASS_PX2
+    return variance_x, (spread_x * spread_y).sum(dim=1), variance_y
+
+
+def _rotations(quats_wxyz: Float64[Tensor, "m 4"]) -> Float64[Tensor, "m 3 3"]:
+    w, x, y, z = (quats_wxyz / quats_wxyz.norm(dim=1, keepdim=True)).unbind(dim=1)
+    entries = [
+        1 - 2 * (y * y + z * z),
+        2 * (x * y - w * z),
+        2 * (x * z + w * y),
+        2 * (x * y + w * z),
+        1 - 2 * (x * x + z * z),
+        2 * (y * z - w * x),
+        2 * (x * z - w * y),
+        2 * (y * z + w * x),
+        1 - 2 * (x * x + y * y),
+    ]
+    return torch.stack(entries, dim=1).reshape(-1, 3, 3)
+
+
+def _touches_tiles(ellipses: Ellipses, camera: Camera, tiles: Bool[ndarray, "th tw"] | None) -> Bool[Tensor, " m"]:
+    """True where the bounding box holds a pixel centre of a drawn tile (of any tile, when `tiles` is None)."""
+    last = torch.tensor([camera.width_px - 1, camera.height_px - 1], dtype=torch.float64)
+    low = torch.ceil(ellipses.means_px - ellipses.half_box_px - 0.5).clamp(min=0.0)
+    high = torch.minimum(torch.floor(ellipses.means_px + ellipses.half_box_px - 0.5), last)
+    hit = (low <= high).all(dim=1)
+    if tiles is None:
+        return hit
+    # how many drawn tiles lie in the box, by four corners of a summed-area table
+    table = torch.from_numpy(np.pad(tiles.cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0))))
+    x0, y0 = (torch.minimum(low, last).long() // TILE_PX).unbind(dim=1)
+    x1, y1 = (high.clamp(min=0.0).long() // TILE_PX + 1).unbind(dim=1)
+    return hit & (table[y1, x1] - table[y0, x1] - table[y1, x0] + table[y0, x0] > 0)
+
+
+def skew(v: Float64[Tensor, "3"]) -> Float64[Tensor, "3 3"]:
+    """The matrix of the cross product with v."""
+    zero = torch.zeros((), dtype=v.dtype)
+    x, y, z = v.unbind()
+    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3)
+
+
+def moved(T_camera_world: Float64[Tensor, "4 4"], twist: Float64[Tensor, "6"]) -> Float64[Tensor, "4 4"]:
+    """exp(twist) T_camera_world to first order, which has the exact derivative at twist 0."""
+    top = torch.cat([skew(twist[3:]), twist[:3, None]], dim=1)
+    generator = torch.cat([top, torch.zeros(1, 4, dtype=torch.float64)])
+    return T_camera_world + generator @ T_camera_world
+
+
+def tile_grid(camera: Camera) -> tuple[int, int]:
+    """Rows and columns of tiles that cover the image."""
+    return math.ceil(camera.height_px / TILE_PX), math.ceil(camera.width_px / TILE_PX)
