@@ -1,0 +1,46 @@
+"""Keep the map under its cap: what gives way when new seeds come and the table is full."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Int64
+from numpy import ndarray
+
+from gausslite.mapping.seeding import Seeds
+from gausslite.optimize.parameters import SplatTable
+
+
+def insert(table: SplatTable, seeds: Seeds, newborn_opacity: float, rng: np.random.Generator) -> int:
+    """Add the seeds, the task's first, and return how many were added; the table never exceeds its capacity.
+
+    For the task's seeds others give way: inactive before active, the most transparent first. For the rest only
+    inactive Gaussians more transparent than a newborn give way; seeds that still do not fit are left out at random.
+    """
+    roi = _at_random(len(seeds.roi), table.capacity, rng)
+    _evict(table, len(roi) - table.room, _by_worth(table))
+    table.append(seeds.roi.take(roi))
+    faint = ~table.active & (table.opacities < newborn_opacity)
+    order = _by_worth(table)
+    _evict(table, len(seeds.rest) - table.room, order[faint[order]])
+    rest = _at_random(len(seeds.rest), table.room, rng)
+    table.append(seeds.rest.take(rest))
+    return len(roi) + len(rest)
+
+
+def _by_worth(table: SplatTable) -> Int64[ndarray, " n"]:
+    """All rows, the first to give way first."""
+    return np.lexsort((table.opacities, table.active))
+
+
+def _evict(table: SplatTable, count: int, order: Int64[ndarray, " m"]) -> None:
+    if count <= 0:
+        return
+    kept = np.ones(table.count, np.bool_)
+    kept[order[:count]] = False
+    table.keep(kept)
+
+
+def _at_random(wanted: int, fits: int, rng: np.random.Generator) -> Int64[ndarray, " n"]:
+    if wanted <= fits:
+        return np.arange(wanted)
+    return np.sort(rng.choice(wanted, fits, replace=False))

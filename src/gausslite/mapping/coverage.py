@@ -1,0 +1,67 @@
+"""Find the pixels that the map does not explain yet, and the parts of the task's region it explains too coarsely."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Bool, Float32
+from numpy import ndarray
+
+from gausslite.domain.camera import project
+from gausslite.domain.frame import Frame
+from gausslite.domain.pose import inverse, transform_points
+from gausslite.render.rasterizer import NEAR_M, Rendering
+
+_CELL_PX = 8
+_SAME_SURFACE = 0.05
+"""A Gaussian within this fraction of the measured depth lies on the surface that is seen."""
+
+
+def unexplained(
+    frame: Frame, rendering: Rendering, min_alpha: float, depth_error_factor: float
+) -> Bool[ndarray, "h w"]:
+    """Pixels the map leaves open (alpha below min_alpha) or draws far behind what is measured.
+
+    Far means more than depth_error_factor times the median depth error over the image. Only pixels with a depth
+    reading can be unexplained: no other pixel can be seeded.
+    """
+    measured = frame.depth_m > 0
+    drawn_m = rendering.expected_depth_m()
+    comparable = measured & (drawn_m > 0)
+    behind_m = np.where(comparable, drawn_m - frame.depth_m, np.float32(0.0))
+    typical_m = float(np.median(np.abs(behind_m[comparable]))) if comparable.any() else 0.0
+    return measured & ((rendering.alpha < min_alpha) | (comparable & (behind_m > depth_error_factor * typical_m)))
+
+
+def too_coarse(
+    frame: Frame, region: Bool[ndarray, "h w"], active_means_m: Float32[ndarray, "n 3"], pixels_per_active: float
+) -> Bool[ndarray, "h w"]:
+    """Pixels of the region in 8x8 cells that hold less than one active Gaussian for `pixels_per_active` pixels.
+
+    This is what makes a region that was first mapped as background (the detector saw it late) the task's own.
+    """
+    height, width = region.shape
+    shape = (-(-height // _CELL_PX), -(-width // _CELL_PX))
+    rows, columns = np.nonzero(region & (frame.depth_m > 0))
+    wanted = _count(rows, columns, shape) / pixels_per_active
+    held = _count(*_seen_at(frame, active_means_m), shape)
+    lacking = np.repeat(np.repeat(held < wanted, _CELL_PX, axis=0), _CELL_PX, axis=1)[:height, :width]
+    result: Bool[ndarray, "h w"] = lacking & region & (frame.depth_m > 0)
+    return result
+
+
+def _seen_at(frame: Frame, means_m: Float32[ndarray, "n 3"]) -> tuple[ndarray, ndarray]:
+    """Pixel rows and columns of the means that lie on the surface the frame sees."""
+    points = transform_points(inverse(frame.T_world_camera), means_m)
+    points = points[points[:, 2] > NEAR_M]
+    columns, rows = np.floor(project(points, frame.camera)).astype(np.int64).T
+    height, width = frame.depth_m.shape
+    inside = (rows >= 0) & (rows < height) & (columns >= 0) & (columns < width)
+    rows, columns, z_m = rows[inside], columns[inside], points[inside, 2]
+    depth_m = frame.depth_m[rows, columns]
+    on_surface = np.abs(z_m - depth_m) < _SAME_SURFACE * depth_m
+    return rows[on_surface], columns[on_surface]
+
+
+def _count(rows: ndarray, columns: ndarray, shape: tuple[int, int]) -> ndarray:
+    cells = (rows // _CELL_PX) * shape[1] + columns // _CELL_PX
+    return np.bincount(cells, minlength=shape[0] * shape[1]).reshape(shape)

@@ -1,0 +1,97 @@
+"""Remember the frames to train on: a window of recent ones ready for the rasterizer, and a buffer of the mission."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float64
+from numpy import ndarray
+
+from gausslite.domain.frame import Frame
+from gausslite.domain.pose import inverse
+from gausslite.domain.relevance import RelevanceMap
+from gausslite.mapping.settings import KeyframeSettings
+from gausslite.render.rasterizer import TILE_PX, Rasterizer, TrainingView
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Keyframe:
+    """A frame and what in it was relevant when it was mapped."""
+
+    frame: Frame
+    relevance: RelevanceMap
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WindowView:
+    """A keyframe made ready to train on. active_tiles: the 16x16 tiles that touch the region and its margin."""
+
+    keyframe: Keyframe
+    training_view: TrainingView
+    T_camera_world: Float64[ndarray, "4 4"]
+    active_tiles: Bool[ndarray, "th tw"]
+
+    @property
+    def shows_region(self) -> bool:
+        """True when any pixel belongs to the task's region."""
+        return bool(self.active_tiles.any())
+
+
+def window_view(keyframe: Keyframe, rasterizer: Rasterizer, roi_margin_px: int) -> WindowView:
+    """Make a frame ready to train on; the margin gives SSIM's window its neighbours at the region's border."""
+    frame, relevance = keyframe.frame, keyframe.relevance
+    return WindowView(
+        keyframe=keyframe,
+        training_view=rasterizer.prepare_view(frame.rgb, frame.depth_m, frame.camera, relevance.weight),
+        T_camera_world=inverse(frame.T_world_camera),
+        active_tiles=tiles_of(relevance.roi, roi_margin_px),
+    )
+
+
+def tiles_of(region: Bool[ndarray, "h w"], margin_px: int) -> Bool[ndarray, "th tw"]:
+    """The tiles that touch the region grown by margin_px."""
+    kernel = np.ones((2 * margin_px + 1, 2 * margin_px + 1), np.uint8)
+    grown = cv2.dilate(region.astype(np.uint8), kernel)
+    by_rows = np.maximum.reduceat(grown, np.arange(0, grown.shape[0], TILE_PX), axis=0)
+    tiles: Bool[ndarray, "th tw"] = np.maximum.reduceat(by_rows, np.arange(0, grown.shape[1], TILE_PX), axis=1) > 0
+    return tiles
+
+
+class KeyframeStore:
+    """Every `every`th mapped frame; the latest `window` are ready to train on, at most `buffer` are remembered."""
+
+    def __init__(self, settings: KeyframeSettings) -> None:
+        self._settings = settings
+        self._window: list[WindowView] = []
+        self._buffer: list[Keyframe] = []
+        self._offered = 0
+
+    @property
+    def window(self) -> tuple[WindowView, ...]:
+        """The most recent keyframes, oldest first."""
+        return tuple(self._window)
+
+    @property
+    def buffer(self) -> tuple[Keyframe, ...]:
+        """Keyframes of the whole mission, oldest first, thinned evenly once the buffer is full."""
+        return tuple(self._buffer)
+
+    def offer(self, view: WindowView) -> None:
+        """Keep this mapped frame if it is the turn of a keyframe."""
+        due = self._offered % self._settings.every == 0
+        self._offered += 1
+        if not due:
+            return
+        self._window = [*self._window, view][-self._settings.window :]
+        self._buffer.append(view.keyframe)
+        if len(self._buffer) > self._settings.buffer:
+            self._thin()
+
+    def _thin(self) -> None:
+        """Drop the keyframe that is closest in time to its neighbours; the first and the last stay."""
+        times = np.array([keyframe.frame.capture_time_ns for keyframe in self._buffer])
+        gaps = times[2:] - times[:-2]
+        drop = 1 + int(np.argmin(gaps)) if len(gaps) else 0
+        del self._buffer[drop]

@@ -1,0 +1,132 @@
+"""Grow one robot's map frame by frame: seed where it is missing, train where the task needs it (Sec. III-C, III-D)."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float32, Float64
+from numpy import ndarray
+
+from gausslite.domain.arrays import require_array
+from gausslite.domain.camera import Camera
+from gausslite.domain.frame import Frame
+from gausslite.domain.gaussians import Gaussians
+from gausslite.domain.pose import inverse
+from gausslite.domain.relevance import RelevanceMap
+from gausslite.mapping.budget import insert
+from gausslite.mapping.keyframes import Keyframe, KeyframeStore, WindowView, window_view
+from gausslite.mapping.seeding import MapState, Seeder
+from gausslite.mapping.settings import MapperSettings
+from gausslite.mapping.training import Trainer
+from gausslite.optimize.parameters import SplatTable
+from gausslite.render.rasterizer import MEAN, Rasterizer, Rendering
+
+_EXTENT_PER_DEPTH = 1.0 / 3.0
+"""The scene's extent as a fraction of the farthest depth seen, as SplaTAM's released configuration takes it."""
+
+
+@dataclass(frozen=True, slots=True)
+class MappedFrame:
+    """What mapping one frame did; skipped says why nothing was done, and is None otherwise."""
+
+    index: int
+    seeded: int
+    iterations: int
+    gaussians: int
+    seconds: float
+    skipped: str | None = None
+
+
+class GaussianMapper:
+    """The owner of a growing map. Not thread-safe: one worker calls it.
+
+    The same settings, seed and frames give the same map, as far as the rasterizer is deterministic.
+    """
+
+    def __init__(self, settings: MapperSettings, rasterizer: Rasterizer, seed: int = 0) -> None:
+        """Reserve the memory of `settings.max_gaussians` Gaussians; seed starts all random choices."""
+        self._settings = settings
+        self._rasterizer = rasterizer
+        self._rng = np.random.default_rng(seed)
+        self._table = SplatTable(settings.max_gaussians)
+        self._seeder = Seeder(settings.seeding, settings.components, self._rng)
+        self._keyframes = KeyframeStore(settings.keyframes)
+        self._trainer = Trainer(settings, self._table, rasterizer, self._rng)
+        self._extent_m = 0.0
+        self._revision = 0
+        self._skipped = 0
+
+    @property
+    def count(self) -> int:
+        """Gaussians in the map."""
+        return self._table.count
+
+    @property
+    def revision(self) -> int:
+        """Rises by one with every frame that changed the map."""
+        return self._revision
+
+    @property
+    def skipped(self) -> int:
+        """Frames that could not be mapped."""
+        return self._skipped
+
+    @property
+    def settings(self) -> MapperSettings:
+        """The policy in force."""
+        return self._settings
+
+    def map_frame(self, frame: Frame, relevance: RelevanceMap, deadline_s: float | None = None) -> MappedFrame:
+        """Take one frame into the map.
+
+        With deadline_s (seconds from this call) iterations go on until then instead of for a fixed number. A frame
+        without a depth reading is skipped and counted. Raises ShapeError when relevance and frame differ in size.
+        """
+        require_array("relevance weight", relevance.weight, frame.depth_m.shape, np.float32)
+        started_s = time.perf_counter()
+        if not frame.has_depth:
+            self._skipped += 1
+            return MappedFrame(frame.index, 0, 0, self.count, 0.0, "no pixel has a depth reading")
+        view = self._observe(frame, relevance)
+        seeded = self._seed(view.keyframe)
+        iterations = self._train(view, None if deadline_s is None else started_s + deadline_s)
+        self._keyframes.offer(view)
+        self._revision += 1
+        return MappedFrame(frame.index, seeded, iterations, self.count, time.perf_counter() - started_s)
+
+    def render(self, camera: Camera, T_world_camera: Float64[ndarray, "4 4"]) -> Rendering:
+        """Draw the map from a pose."""
+        return self._rasterizer.forward(self._table.rows, camera, inverse(T_world_camera))
+
+    def expected_depth_m(self, frame: Frame) -> Float32[ndarray, "h w"]:
+        """Depth of the map as the frame's camera would see it; 0 where the map is open."""
+        return self.render(frame.camera, frame.T_world_camera).expected_depth_m()
+
+    def gaussians(self) -> Gaussians:
+        """A copy of the map as physical values."""
+        return self._table.to_gaussians()
+
+    def keyframes(self) -> list[Keyframe]:
+        """The keyframes remembered of the whole mission, oldest first (for joint refinement)."""
+        return list(self._keyframes.buffer)
+
+    def _observe(self, frame: Frame, relevance: RelevanceMap) -> WindowView:
+        """Make the frame ready to train on, and note how deep the scene is."""
+        self._extent_m = max(self._extent_m, float(frame.depth_m.max()) * _EXTENT_PER_DEPTH)
+        return window_view(Keyframe(frame, relevance), self._rasterizer, self._settings.keyframes.roi_margin_px)
+
+    def _seed(self, keyframe: Keyframe) -> int:
+        """Add Gaussians where the map does not explain the frame, within the cap."""
+        frame, state = keyframe.frame, None
+        if self.count > 0:
+            active_means_m = self._table.rows[self._table.active][:, MEAN]
+            state = MapState(self.render(frame.camera, frame.T_world_camera), active_means_m)
+        seeds = self._seeder.seed(frame, keyframe.relevance, state)
+        return insert(self._table, seeds, self._settings.seeding.opacity, self._rng)
+
+    def _train(self, current: WindowView, ends_at_s: float | None) -> int:
+        """MVO: train on views drawn from the window and the current one; without it on the current one alone."""
+        views = (*self._keyframes.window, current) if self._settings.components.mvo else (current,)
+        return self._trainer.train(views, self._extent_m, ends_at_s)

@@ -1,0 +1,104 @@
+"""Choose which Gaussians leave the robot: in the task's region, changed since the last time, voxel by voxel."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Bool, Int64, UInt64
+from numpy import ndarray
+
+from gausslite.domain.gaussians import Gaussians
+from gausslite.domain.subset import VoxelWords
+from gausslite.domain.voxels import VoxelGrid
+
+
+def voxel_words(gaussians: Gaussians, grid: VoxelGrid) -> VoxelWords:
+    """A complete word on every voxel that holds any of these Gaussians (Sec. III-E). Raises InvalidInputError."""
+    keys = grid.keys(gaussians.means_m)
+    order = np.argsort(keys, kind="stable")
+    present, starts, counts = np.unique(keys[order], return_index=True, return_counts=True)
+    ordered = gaussians.take(order)
+    return VoxelWords(
+        keys=present,
+        kappa_sums=_sums(ordered.kappa.astype(np.uint64), starts),
+        counts=counts.astype(np.uint32),
+        gaussians=ordered,
+    )
+
+
+class RoiLedger:
+    """Knows the last word given on each voxel, as three numbers: Σκ, count and a fingerprint of the contents."""
+
+    def __init__(self, grid: VoxelGrid) -> None:
+        self._grid = grid
+        self._keys = np.zeros(0, np.int64)
+        self._states = np.zeros((0, 3), np.uint64)
+
+    def changed(self, gaussians: Gaussians) -> VoxelWords:
+        """Words on the voxels whose active Gaussians are new or changed since the last call.
+
+        A voxel that held active Gaussians then and holds none now gets a tombstone (count 0).
+        """
+        words = voxel_words(gaussians.take(gaussians.active), self._grid)
+        states = np.stack([words.kappa_sums, words.counts.astype(np.uint64), _fingerprints(words)], axis=1)
+        same = self._unchanged(words.keys, states)
+        vanished = np.setdiff1d(self._keys, words.keys, assume_unique=True)
+        self._keys, self._states = words.keys, states
+        return _with_tombstones(_select(words, ~same), vanished)
+
+    def forget(self) -> None:
+        """Treat every voxel as new at the next call (the receiver lost what it had)."""
+        self._keys, self._states = np.zeros(0, np.int64), np.zeros((0, 3), np.uint64)
+
+    def _unchanged(self, keys: Int64[ndarray, " v"], states: UInt64[ndarray, "v 3"]) -> Bool[ndarray, " v"]:
+        if len(self._keys) == 0:
+            return np.zeros(len(keys), np.bool_)
+        place = np.minimum(np.searchsorted(self._keys, keys), len(self._keys) - 1)
+        same: Bool[ndarray, " v"] = (self._keys[place] == keys) & (self._states[place] == states).all(axis=1)
+        return same
+
+
+def _select(words: VoxelWords, chosen: Bool[ndarray, " v"]) -> VoxelWords:
+    return VoxelWords(
+        keys=words.keys[chosen],
+        kappa_sums=words.kappa_sums[chosen],
+        counts=words.counts[chosen],
+        gaussians=words.gaussians.take(np.repeat(chosen, words.counts)),
+    )
+
+
+def _with_tombstones(words: VoxelWords, vanished: Int64[ndarray, " t"]) -> VoxelWords:
+    keys = np.concatenate([words.keys, vanished])
+    order = np.argsort(keys)
+    empty = np.zeros(len(vanished), np.uint64)
+    return VoxelWords(
+        keys=keys[order],
+        kappa_sums=np.concatenate([words.kappa_sums, empty])[order],
+        counts=np.concatenate([words.counts, empty.astype(np.uint32)])[order],
+        # tombstones hold no Gaussians, so those of the others keep their order
+        gaussians=words.gaussians,
+    )
+
+
+def _fingerprints(words: VoxelWords) -> UInt64[ndarray, " v"]:
+    """A number per voxel that changes with any value of its Gaussians, whatever their order."""
+    g = words.gaussians
+    columns = np.concatenate([g.means_m, g.quats_wxyz, g.scales_m, g.opacities[:, None], g.rgb], axis=1)
+    bits = np.ascontiguousarray(columns).view(np.uint32).astype(np.uint64)
+    # odd multipliers from a fixed seed: equal Gaussians give equal numbers in every run
+    multipliers = np.random.default_rng(0).integers(0, 2**64, bits.shape[1], np.uint64) | np.uint64(1)
+    mixed = _mix((bits * multipliers).sum(axis=1, dtype=np.uint64) + g.target.astype(np.uint64))
+    return _sums(mixed, words.offsets[:-1])
+
+
+def _mix(values: UInt64[ndarray, " n"]) -> UInt64[ndarray, " n"]:
+    # without this step the sums of two voxels' contents could trade parts unnoticed
+    mixed = (values ^ (values >> np.uint64(31))) * np.uint64(0x9E3779B97F4A7C15)
+    result: UInt64[ndarray, " n"] = mixed ^ (mixed >> np.uint64(29))
+    return result
+
+
+def _sums(values: UInt64[ndarray, " n"], starts: Int64[ndarray, " v"]) -> UInt64[ndarray, " v"]:
+    if len(starts) == 0:
+        return np.zeros(0, np.uint64)
+    sums: UInt64[ndarray, " v"] = np.add.reduceat(values, starts)
+    return sums

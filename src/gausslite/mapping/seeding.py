@@ -1,0 +1,131 @@
+"""Turn pixels of a frame into new Gaussians, more and finer ones where the task is (Sec. III-C: SB, SIS, GFD)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float32, Int64
+from numpy import ndarray
+
+from gausslite.domain.camera import back_project
+from gausslite.domain.frame import Frame
+from gausslite.domain.gaussians import Gaussians
+from gausslite.domain.pose import transform_points
+from gausslite.domain.relevance import RelevanceMap
+from gausslite.mapping.coverage import too_coarse, unexplained
+from gausslite.mapping.sampling import edge_magnitude, sample_pixels, sample_stratified
+from gausslite.mapping.settings import Components, SeedingSettings
+from gausslite.mapping.spacing import initial_spacing_m, neighbour_distance_px
+from gausslite.render.rasterizer import Rendering
+
+_REFERENCE_PIXELS = 640 * 480
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MapState:
+    """What seeding needs to know of the map: how it looks from the frame, and where its active Gaussians are."""
+
+    rendering: Rendering
+    active_means_m: Float32[ndarray, "n 3"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Seeds:
+    """New Gaussians: those of the ROI budget, served first when room is short, and the rest."""
+
+    roi: Gaussians
+    rest: Gaussians
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Pool:
+    """Pixels to draw from, how many, and how."""
+
+    pixels: Bool[ndarray, "h w"]
+    count: int
+    stratified: bool
+
+
+class Seeder:
+    """Draws each frame's seeds; its random generator is the mapper's."""
+
+    def __init__(self, settings: SeedingSettings, components: Components, rng: np.random.Generator) -> None:
+        self._settings = settings
+        self._components = components
+        self._rng = rng
+
+    def seed(self, frame: Frame, relevance: RelevanceMap, state: MapState | None) -> Seeds:
+        """New Gaussians for this frame; state is None while the map is empty."""
+        weight = self._pixel_weight(frame)
+        roi_pool, rest_pool = self._pools(frame, relevance, state)
+        return Seeds(
+            roi=self._gaussians(frame, relevance, roi_pool, weight),
+            rest=self._gaussians(frame, relevance, rest_pool, weight),
+        )
+
+    def _pools(self, frame: Frame, relevance: RelevanceMap, state: MapState | None) -> tuple[_Pool, _Pool]:
+        """SB: the ROI share of the seeds is drawn from the region, the rest elsewhere; without SB from one pool."""
+        settings = self._settings
+        budget = self._budget(frame, first=state is None)
+        seedable = (frame.depth_m > 0) & (frame.depth_m <= settings.max_depth_m)
+        open_pixels = seedable if state is None else seedable & self._open(frame, state, settings.min_alpha)
+        if not self._components.sb:
+            return _Pool(np.zeros_like(seedable), 0, False), self._rest_pool(open_pixels, budget)
+        roi_budget = int(settings.roi_share * budget)
+        roi_pixels = seedable & relevance.roi
+        if state is not None and roi_pixels.any():
+            coarse = too_coarse(frame, relevance.roi, state.active_means_m, settings.roi_pixels_per_active)
+            roi_pixels &= coarse | self._open(frame, state, settings.roi_min_alpha)
+        roi_pool = _Pool(roi_pixels, roi_budget, False)
+        return roi_pool, self._rest_pool(open_pixels & ~relevance.roi, budget - roi_budget)
+
+    def _rest_pool(self, pixels: Bool[ndarray, "h w"], budget: int) -> _Pool:
+        return _Pool(pixels, budget, self._components.sis)
+
+    def _open(self, frame: Frame, state: MapState, min_alpha: float) -> Bool[ndarray, "h w"]:
+        return unexplained(frame, state.rendering, min_alpha, self._settings.depth_error_factor)
+
+    def _budget(self, frame: Frame, first: bool) -> int:
+        """N, for this image size."""
+        seeds = self._settings.first_frame_seeds if first else self._settings.later_seeds
+        return max(1, round(seeds * frame.depth_m.size / _REFERENCE_PIXELS))
+
+    def _pixel_weight(self, frame: Frame) -> Float32[ndarray, "h w"]:
+        """GFD: P ∝ E + ε, with ε a fraction of the image's mean edge magnitude; without GFD uniform."""
+        if not self._components.gfd:
+            return np.ones(frame.depth_m.shape, np.float32)
+        edges = edge_magnitude(frame.rgb)
+        return edges + np.float32(self._settings.edge_floor)
+
+    def _gaussians(
+        self, frame: Frame, relevance: RelevanceMap, pool: _Pool, weight: Float32[ndarray, "h w"]
+    ) -> Gaussians:
+        sample = sample_stratified if pool.stratified else sample_pixels
+        pixels = sample(pool.pixels, pool.count, weight, self._rng)
+        if len(pixels) == 0:
+            return Gaussians.empty()
+        distance_px = neighbour_distance_px(pixels, pool.pixels, pool.stratified)
+        spacing_m = initial_spacing_m(distance_px, frame.depth_m.ravel()[pixels], frame.camera.fx_px)
+        return self._born(frame, relevance, pixels, spacing_m)
+
+    def _born(
+        self, frame: Frame, relevance: RelevanceMap, pixels: Int64[ndarray, " n"], spacing_m: Float32[ndarray, " n"]
+    ) -> Gaussians:
+        """SIS: scale s0·m, identity rotation, observed colour, and the active flag of the seed's pixel."""
+        settings, count = self._settings, len(pixels)
+        active = relevance.roi.ravel()[pixels]
+        scale_m = spacing_m
+        if self._components.sis:
+            scale_m = spacing_m * np.where(active, settings.roi_scale, settings.background_scale).astype(np.float32)
+        points = back_project(frame.depth_m, frame.camera).reshape(-1, 3)[pixels]
+        return Gaussians(
+            means_m=transform_points(frame.T_world_camera, points),
+            quats_wxyz=np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1)),
+            scales_m=np.repeat(scale_m[:, None], 3, axis=1),
+            opacities=np.full(count, settings.opacity, np.float32),
+            rgb=frame.rgb.reshape(-1, 3)[pixels].astype(np.float32) / np.float32(255.0),
+            active=active,
+            kappa=np.zeros(count, np.uint32),
+            target=relevance.target.ravel()[pixels],
+        )

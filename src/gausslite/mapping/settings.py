@@ -1,0 +1,132 @@
+"""Everything about mapping that can be chosen, in small sections, each checked once when it is made."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from enum import StrEnum
+
+from gausslite.errors import InvalidInputError
+from gausslite.optimize.density import DensitySettings
+from gausslite.render.rasterizer import AdamSettings, LossWeights
+
+
+@dataclass(frozen=True, slots=True)
+class Components:
+    """The paper's five components (Sec. III-C, III-D), each with its own switch."""
+
+    sb: bool = True
+    """ROI seed budgeting: a share of the seeds is reserved for the task's region."""
+    mvo: bool = True
+    """Multi-view optimisation: train on views drawn from a window of keyframes, not on the current one alone."""
+    roi: bool = True
+    """ROI optimisation: after a short warm-up, train on the task's region only."""
+    sis: bool = True
+    """Stratified initial scaling: one background seed a cell, and seeds that start small."""
+    gfd: bool = True
+    """Gradient-focused densification: seeds prefer image edges."""
+
+
+class ActivePhase(StrEnum):
+    """What an active-phase iteration draws and moves; its loss is masked to the region in every case."""
+
+    EXACT = "exact"
+    """Draw every Gaussian in the region's tiles; all of them may move."""
+    FROZEN_BACKGROUND = "frozen-background"
+    """Draw every Gaussian in the region's tiles; only active ones move."""
+    ACTIVE_ONLY = "active-only"
+    """Draw active Gaussians only: cheaper, but nothing hides the missing background at the region's borders."""
+
+
+@dataclass(frozen=True, slots=True)
+class SeedingSettings:
+    """Where new Gaussians go and how they start (Sec. III-C). Seed counts are for 640x480 and scale with the pixels."""
+
+    first_frame_seeds: int = 60_000
+    later_seeds: int = 10_000
+    roi_share: float = 0.40
+    min_alpha: float = 0.6
+    roi_min_alpha: float = 0.9
+    roi_pixels_per_active: float = 4.0
+    depth_error_factor: float = 40.0
+    max_depth_m: float = 10.0
+    opacity: float = 0.5
+    roi_scale: float = 0.5
+    background_scale: float = 0.7
+    edge_floor: float = 0.05
+
+    def __post_init__(self) -> None:
+        for name in ("first_frame_seeds", "later_seeds"):
+            _require(getattr(self, name) >= 1, f"seeding {name}", "at least 1", getattr(self, name))
+        for name in ("roi_share", "min_alpha", "roi_min_alpha"):
+            _require(0 <= getattr(self, name) <= 1, f"seeding {name}", "0 to 1", getattr(self, name))
+        _require(0 < self.opacity < 1, "seeding opacity", "more than 0 and less than 1", self.opacity)
+        for name in (
+            "roi_pixels_per_active",
+            "depth_error_factor",
+            "max_depth_m",
+            "roi_scale",
+            "background_scale",
+            "edge_floor",
+        ):
+            _require(getattr(self, name) > 0, f"seeding {name}", "more than 0", getattr(self, name))
+
+
+@dataclass(frozen=True, slots=True)
+class KeyframeSettings:
+    """Which frames are kept to train on: every `every`th, the `window` latest of them, and `buffer` of the mission."""
+
+    every: int = 5
+    window: int = 24
+    buffer: int = 96
+    roi_margin_px: int = 5
+
+    def __post_init__(self) -> None:
+        for name in ("every", "window", "buffer"):
+            _require(getattr(self, name) >= 1, f"keyframes {name}", "at least 1", getattr(self, name))
+        _require(self.roi_margin_px >= 0, "keyframes roi_margin_px", "at least 0", self.roi_margin_px)
+
+
+@dataclass(frozen=True, slots=True)
+class OptimizationSettings:
+    """How a frame trains the map (Sec. III-D): first warm-up iterations on the full image, then active ones."""
+
+    warmup_iterations: int = 2
+    active_iterations: int = 6
+    active_phase: ActivePhase = ActivePhase.EXACT
+    loss: LossWeights = field(default_factory=LossWeights)
+    adam: AdamSettings = field(default_factory=AdamSettings)
+
+    def __post_init__(self) -> None:
+        for name in ("warmup_iterations", "active_iterations"):
+            _require(getattr(self, name) >= 0, f"optimization {name}", "at least 0", getattr(self, name))
+
+    @property
+    def iterations(self) -> int:
+        """Iterations a frame."""
+        return self.warmup_iterations + self.active_iterations
+
+    def with_iterations(self, iterations: int) -> OptimizationSettings:
+        """The same proportion of the two phases in this many iterations a frame."""
+        _require(iterations >= 0, "optimization iterations", "at least 0", iterations)
+        warmup = round(iterations * self.warmup_iterations / max(self.iterations, 1))
+        return replace(self, warmup_iterations=warmup, active_iterations=iterations - warmup)
+
+
+@dataclass(frozen=True, slots=True)
+class MapperSettings:
+    """A whole mapping policy. max_gaussians is a hard cap: memory for exactly that many is reserved at the start."""
+
+    max_gaussians: int = 1_000_000
+    components: Components = field(default_factory=Components)
+    seeding: SeedingSettings = field(default_factory=SeedingSettings)
+    keyframes: KeyframeSettings = field(default_factory=KeyframeSettings)
+    optimization: OptimizationSettings = field(default_factory=OptimizationSettings)
+    density: DensitySettings = field(default_factory=DensitySettings)
+
+    def __post_init__(self) -> None:
+        _require(self.max_gaussians >= 1, "max_gaussians", "at least 1", self.max_gaussians)
+
+
+def _require(holds: bool, name: str, wanted: str, came: float) -> None:
+    if not holds:
+        raise InvalidInputError(f"{name}: expected {wanted}, got {came}")

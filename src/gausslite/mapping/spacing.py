@@ -1,0 +1,55 @@
+"""Tell how far apart seeds lie, without a search tree a frame: s0 of Eq. (scale) from how densely pixels were drawn.
+
+Seeds drawn at a local density of λ a pixel have their median nearest neighbour at sqrt(ln 2 / (π λ)) pixels when they
+are scattered at random (a Poisson process), and at 0.63 / sqrt(λ), measured, when there is one in each cell of a grid.
+λ is counted over 48x48 pixels round a seed, but only over those a seed could have been drawn from, so that the seeds
+that fill a narrow gap do not pass for sparse ones. A pixel is depth / focal metres wide on a surface that faces the
+camera; on slanted surfaces the true distance is larger, so seeds start a little smaller there.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float32, Int64
+from numpy import ndarray
+
+_BLOCK_PX = 16
+_MEDIAN_POISSON = float(np.sqrt(np.log(2.0) / np.pi))
+_MEDIAN_STRATIFIED = 0.63
+_MIN_SQUARED_M = 1e-7
+
+
+def neighbour_distance_px(
+    pixels: Int64[ndarray, " n"], pool: Bool[ndarray, "h w"], stratified: bool
+) -> Float32[ndarray, " n"]:
+    """Median distance to the nearest other seed round each seed, in pixels; at least one pixel.
+
+    pixels: flat indices of seeds drawn from `pool`. stratified: they were drawn one a cell.
+    """
+    width = pool.shape[1]
+    seeds = np.zeros(pool.shape, np.float32)
+    seeds.ravel()[pixels] = 1.0
+    density = _round_about(seeds) / np.maximum(_round_about(pool.astype(np.float32)), 1.0)
+    rows, columns = np.divmod(pixels, width)
+    local = density[rows // _BLOCK_PX, columns // _BLOCK_PX]
+    factor = _MEDIAN_STRATIFIED if stratified else _MEDIAN_POISSON
+    distance: Float32[ndarray, " n"] = np.maximum(factor / np.sqrt(local), 1.0).astype(np.float32)
+    return distance
+
+
+def initial_spacing_m(
+    distance_px: Float32[ndarray, " n"], depth_m: Float32[ndarray, " n"], focal_px: float
+) -> Float32[ndarray, " n"]:
+    """s0 in metres at each seed's depth, its square clamped to 1e-7."""
+    squared = np.square(distance_px * depth_m / np.float32(focal_px))
+    spacing: Float32[ndarray, " n"] = np.sqrt(np.maximum(squared, np.float32(_MIN_SQUARED_M)))
+    return spacing
+
+
+def _round_about(image: Float32[ndarray, "h w"]) -> Float32[ndarray, "bh bw"]:
+    """Sums over each block of 16x16 pixels and its neighbours."""
+    height, width = image.shape
+    by_rows = np.add.reduceat(image, np.arange(0, height, _BLOCK_PX), axis=0)
+    blocks = np.add.reduceat(by_rows, np.arange(0, width, _BLOCK_PX), axis=1)
+    return np.asarray(cv2.boxFilter(blocks, -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT))
