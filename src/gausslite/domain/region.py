@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float, Int64
@@ -14,6 +14,7 @@ from gausslite.domain.frame import Frame
 from gausslite.domain.pose import transform_points
 
 
+@runtime_checkable
 class Region(Protocol):
     """Something whose pixels are known for any frame."""
 

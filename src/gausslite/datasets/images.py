@@ -1,0 +1,99 @@
+"""Read colour and depth images, refuse damaged ones by name, and bring them to the size asked for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import Float32, UInt8
+from numpy import ndarray
+from numpy.typing import NDArray
+
+from gausslite.domain.camera import Camera
+from gausslite.errors import DatasetError
+
+_ENDINGS = {".png": b"IEND\xaeB`\x82", ".jpg": b"\xff\xd9", ".jpeg": b"\xff\xd9"}
+_ENDING_WINDOW_BYTES = 64
+
+
+@dataclass(frozen=True, slots=True)
+class DepthUnits:
+    """How a 16-bit depth image counts: units per metre, and the values that mean no return."""
+
+    per_metre: float
+    invalid: tuple[int, ...] = (0,)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RgbdImage:
+    """A colour and a depth image of one size, with the camera of that size."""
+
+    rgb: UInt8[ndarray, "h w 3"]
+    depth_m: Float32[ndarray, "h w"]
+    camera: Camera
+
+
+def read_colour(path: Path) -> UInt8[ndarray, "h w 3"]:
+    """An 8-bit RGB image. Raises DatasetError naming the file."""
+    bgr = _decode(path, cv2.IMREAD_COLOR)
+    rgb: UInt8[ndarray, "h w 3"] = np.ascontiguousarray(bgr[..., ::-1])
+    return rgb
+
+
+def read_depth(path: Path, units: DepthUnits) -> Float32[ndarray, "h w"]:
+    """Depth in metres, 0 where invalid. Raises DatasetError naming the file."""
+    raw = _decode(path, cv2.IMREAD_UNCHANGED)
+    if raw.dtype != np.uint16 or raw.ndim != 2:
+        raise DatasetError(f"{path}: expected a 16-bit image of one channel, got {raw.dtype} of shape {raw.shape}")
+    depth_m = raw.astype(np.float32) / np.float32(units.per_metre)
+    depth_m[np.isin(raw, units.invalid)] = 0.0
+    return depth_m
+
+
+def load_rgbd(
+    colour_path: Path, depth_path: Path, camera: Camera, units: DepthUnits, size: tuple[int, int] | None
+) -> RgbdImage:
+    """Both images of a frame at (width, height); at the camera's own size when None. Raises DatasetError."""
+    rgb, depth_m = read_colour(colour_path), read_depth(depth_path, units)
+    if rgb.shape[:2] != depth_m.shape:
+        raise DatasetError(f"{depth_path}: expected the size of {colour_path.name}, {_size(rgb)}, got {_size(depth_m)}")
+    if rgb.shape[:2] != (camera.height_px, camera.width_px):
+        wanted = f"{camera.width_px}x{camera.height_px}"
+        raise DatasetError(f"{colour_path}: expected the camera's size {wanted}, got {_size(rgb)}")
+    return resize_rgbd(RgbdImage(rgb, depth_m, camera), size)
+
+
+def resize_rgbd(image: RgbdImage, size: tuple[int, int] | None) -> RgbdImage:
+    """Bring an image to (width, height): colour by area, depth by nearest pixel centre (depth must not be mixed)."""
+    if size is None or size == (image.camera.width_px, image.camera.height_px):
+        return image
+    width, height = size
+    camera = image.camera.resized(width, height)
+    rgb = cv2.resize(image.rgb, size, interpolation=cv2.INTER_AREA)
+    rows = ((np.arange(height) + 0.5) * (image.camera.height_px / height)).astype(np.int64)
+    columns = ((np.arange(width) + 0.5) * (image.camera.width_px / width)).astype(np.int64)
+    return RgbdImage(rgb, np.ascontiguousarray(image.depth_m[np.ix_(rows, columns)]), camera)
+
+
+def _decode(path: Path, flags: int) -> NDArray[Any]:
+    try:
+        data = path.read_bytes()
+    except FileNotFoundError:
+        raise DatasetError(f"{path}: expected an image, there is none") from None
+    except OSError as error:
+        raise DatasetError(f"{path}: expected a readable image, got {type(error).__name__}") from None
+    # decoders fill what a truncated file lacks with grey and go on: look for the format's end mark first
+    ending = _ENDINGS.get(path.suffix.lower(), b"")
+    if ending not in data[-_ENDING_WINDOW_BYTES:]:
+        raise DatasetError(f"{path}: expected a whole image file, got one cut short or of another format")
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    if image is None:
+        raise DatasetError(f"{path}: expected an image, got bytes that cannot be decoded")
+    return np.asarray(image)
+
+
+def _size(image: NDArray[Any]) -> str:
+    return f"{image.shape[1]}x{image.shape[0]}"

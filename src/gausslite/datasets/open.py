@@ -1,0 +1,56 @@
+"""Open a sequence by looking at what is there: a folder of a known layout, or the simulated home."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from gausslite.datasets.replica import ReplicaSource
+from gausslite.datasets.sevenscenes import SevenScenesSource
+from gausslite.datasets.source import Source, UpAxis
+from gausslite.datasets.tum import TumSource
+from gausslite.errors import DatasetError
+
+_READERS = (TumSource, SevenScenesSource, ReplicaSource)
+_LAYOUTS = (
+    "TUM RGB-D (rgb.txt, depth.txt, groundtruth.txt), 7-Scenes (frame-000000.color.png ...) "
+    "or Replica (results/frame000000.jpg, traj.txt)"
+)
+_SIMULATED = "sim:"
+
+
+def open_source(spec: str, up_axis: UpAxis | None = None) -> Source:
+    """The sequence in a folder, or a simulated one ("sim:home?seed=0&trajectory=0").
+
+    A folder that only holds one folder with a sequence stands for it. Raises DatasetError, PoseError.
+    """
+    if spec.startswith(_SIMULATED):
+        # the simulated home needs the optional ray caster; files do not
+        from gausslite.datasets.simulated.source import open_simulated
+
+        return open_simulated(spec.removeprefix(_SIMULATED), up_axis)
+    folder = Path(spec).expanduser()
+    if not folder.is_dir():
+        came = "a file" if folder.is_file() else "nothing there"
+        raise DatasetError(f"{spec}: expected a folder with a sequence, or sim:home; got {came}")
+    source = _open_folder(folder, up_axis)
+    if source is not None:
+        return source
+    inside = [path for path in sorted(folder.iterdir()) if path.is_dir() and _recognised(path)]
+    if len(inside) == 1:
+        found = _open_folder(inside[0], up_axis)
+        if found is not None:
+            return found
+    if inside:
+        names = ", ".join(path.name for path in inside)
+        raise DatasetError(f"{folder}: holds {len(inside)} sequences; expected one of them: {names}")
+    if not any(folder.iterdir()):
+        raise DatasetError(f"{folder}: expected a sequence, got an empty folder")
+    raise DatasetError(f"{folder}: unknown layout; expected {_LAYOUTS}")
+
+
+def _recognised(folder: Path) -> bool:
+    return any(reader.recognises(folder) for reader in _READERS)
+
+
+def _open_folder(folder: Path, up_axis: UpAxis | None) -> Source | None:
+    return next((reader(folder, up_axis) for reader in _READERS if reader.recognises(folder)), None)

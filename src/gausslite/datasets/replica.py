@@ -1,0 +1,94 @@
+"""Read Replica sequences in the layout of NICE-SLAM."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from gausslite.datasets.images import DepthUnits, load_rgbd
+from gausslite.datasets.intrinsics import find_beside_or_above, read_json_camera
+from gausslite.datasets.poses import nearest_rigid
+from gausslite.datasets.source import UpAxis, require_frames, require_position, unit_up_axis
+from gausslite.datasets.text_files import parse_numbers, read_rows
+from gausslite.domain.camera import Camera
+from gausslite.domain.frame import Frame
+from gausslite.domain.region import Region
+from gausslite.errors import DatasetError
+
+_RATE_HZ = 30
+_CAMERA_FILE = "cam_params.json"
+_COLOUR_NAME = re.compile(r"frame(\d{6})\.(?:jpg|png)")
+
+
+class ReplicaSource:
+    """A folder with results/frame%06d.jpg, results/depth%06d.png and traj.txt, one 4x4 row-major pose a row.
+
+    cam_params.json lies in or above the folder. Times are the frame numbers at 30 Hz. Raises DatasetError, PoseError.
+    """
+
+    def __init__(self, folder: Path, up_axis: UpAxis | None = None) -> None:
+        self._folder = folder
+        results = folder / "results"
+        found = (_COLOUR_NAME.fullmatch(path.name) for path in (results.iterdir() if results.is_dir() else ()))
+        colours = {int(match.group(1)): results / match.group(0) for match in found if match}
+        require_frames(results, len(colours), "images named frame000000.jpg")
+        self._colours = dict(sorted(colours.items()))
+        self._numbers = list(self._colours)
+        camera_path = find_beside_or_above(folder, _CAMERA_FILE)
+        if camera_path is None:
+            raise DatasetError(f"{folder}: the camera is unknown: expected {_CAMERA_FILE} here or one folder above")
+        self._camera, per_metre = read_json_camera(camera_path)
+        self._units = DepthUnits(per_metre)
+        self._trajectory = folder / "traj.txt"
+        self._pose_rows = read_rows(self._trajectory)
+        if len(self._pose_rows) <= self._numbers[-1]:
+            raise DatasetError(
+                f"{self._trajectory}: expected a pose for each of frames 0 to {self._numbers[-1]}, "
+                f"got {len(self._pose_rows)} rows"
+            )
+        self._up_axis = unit_up_axis(up_axis or (0.0, 0.0, 1.0))
+
+    @staticmethod
+    def recognises(folder: Path) -> bool:
+        """Whether the folder looks like this layout."""
+        return (folder / "traj.txt").is_file() or any((folder / "results").glob("frame??????.*"))
+
+    @property
+    def name(self) -> str:
+        """The folder's name."""
+        return self._folder.name
+
+    @property
+    def camera(self) -> Camera:
+        """From cam_params.json."""
+        return self._camera
+
+    @property
+    def up_axis(self) -> UpAxis:
+        """Z unless told otherwise."""
+        return self._up_axis
+
+    def __len__(self) -> int:
+        return len(self._numbers)
+
+    def frame(self, i: int, size: tuple[int, int] | None = None) -> Frame:
+        """The frame at position i. Raises DatasetError, PoseError."""
+        require_position(self.name, i, len(self))
+        number = self._numbers[i]
+        place, fields = self._pose_rows[number]
+        numbers = parse_numbers(place, fields, 16, "a 4x4 pose, row by row")
+        T_world_camera = nearest_rigid(place, np.array(numbers).reshape(4, 4))
+        depth = self._folder / "results" / f"depth{number:06d}.png"
+        image = load_rgbd(self._colours[number], depth, self._camera, self._units, size)
+        return Frame(number, number * 10**9 // _RATE_HZ, image.rgb, image.depth_m, image.camera, T_world_camera)
+
+    def indices(self) -> Sequence[int]:
+        """The numbers in the file names."""
+        return list(self._numbers)
+
+    def regions(self) -> Mapping[str, Region]:
+        """None are known."""
+        return {}

@@ -1,0 +1,36 @@
+"""Choose frames of a sequence by the sequence's own frame numbers."""
+
+from __future__ import annotations
+
+from gausslite.datasets.source import Source
+from gausslite.errors import DatasetError, InvalidInputError
+
+
+def select_frames(source: Source, selection: str) -> list[int]:
+    """Positions of the frames whose number n is in range(START, STOP, STEP) for the text "START:STOP:STEP".
+
+    Each part may be left out, as in a slice: "0:497", "500:1000:4", "::2". The numbers are those of
+    `source.indices()`, so a sequence that keeps every fourth frame has no frame 1. Raises InvalidInputError for a
+    text of another form and DatasetError when nothing is selected.
+    """
+    start, stop, step = _parse(selection)
+    numbers = source.indices()
+    chosen = [i for i, n in enumerate(numbers) if n >= start and (stop is None or n < stop) and (n - start) % step == 0]
+    if not chosen:
+        raise DatasetError(
+            f"{source.name}: no frame is in {selection!r}; its {len(numbers)} frames are "
+            f"numbered {numbers[0]} to {numbers[-1]}"
+        )
+    return chosen
+
+
+def _parse(selection: str) -> tuple[int, int | None, int]:
+    wanted = "expected START:STOP or START:STOP:STEP with 0 <= START < STOP and STEP >= 1"
+    parts = [part.strip() for part in selection.split(":")]
+    if len(parts) not in (2, 3) or not all(part == "" or (part.isascii() and part.isdigit()) for part in parts):
+        raise InvalidInputError(f"frames {selection!r}: {wanted}")
+    numbers = [int(part) if part else None for part in (*parts, "")[:3]]
+    start, stop, step = numbers[0] or 0, numbers[1], 1 if numbers[2] is None else numbers[2]
+    if step < 1 or (stop is not None and stop <= start):
+        raise InvalidInputError(f"frames {selection!r}: {wanted}")
+    return start, stop, step

@@ -1,0 +1,126 @@
+"""Read 7-Scenes and everything else laid out as frame-000000.color / .depth / .pose files."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64
+from numpy import ndarray
+
+from gausslite.datasets.images import DepthUnits, load_rgbd, read_colour
+from gausslite.datasets.intrinsics import INTRINSICS_FILE, FileIntrinsics, find_beside_or_above, read_matrix
+from gausslite.datasets.poses import estimate_up, nearest_rigid
+from gausslite.datasets.regions import balls_for_small_objects, load_voxel_regions
+from gausslite.datasets.source import UpAxis, require_frames, require_position, unit_up_axis
+from gausslite.datasets.text_files import parse_numbers, read_rows
+from gausslite.domain.camera import Camera
+from gausslite.domain.frame import Frame
+from gausslite.domain.region import Region
+from gausslite.errors import DatasetError, PoseError
+
+_UNITS = DepthUnits(per_metre=1000.0, invalid=(0, 65535))
+_RATE_HZ = 30
+_COLOUR_NAME = re.compile(r"frame-(\d{6})\.color\.(?:png|jpg)")
+_KINECT = FileIntrinsics(585.0, 585.0, 320.0, 240.0)
+_KINECT_SIZE = (640, 480)
+_REGIONS_FILE = "roi_voxels.npz"
+_UP_POSES = 64
+_LEVEL_FIRST_VIEW_UP = (0.0, -1.0, 0.0)
+
+
+class SevenScenesSource:
+    """A folder of frame-%06d.color.{png,jpg}, .depth.png (mm; 0 and 65535 invalid) and .pose.txt (camera to world).
+
+    The camera comes from camera-intrinsics.txt in or above the folder; without one, 640x480 images get the values
+    the 7-Scenes authors state. Times are the frame numbers at 30 Hz. Raises DatasetError.
+    """
+
+    def __init__(self, folder: Path, up_axis: UpAxis | None = None) -> None:
+        self._folder = folder
+        found = (_COLOUR_NAME.fullmatch(path.name) for path in folder.iterdir())
+        colours = {int(match.group(1)): folder / match.group(0) for match in found if match}
+        require_frames(folder, len(colours), "images named frame-000000.color.png or .jpg")
+        self._colours = dict(sorted(colours.items()))
+        self._numbers = list(self._colours)
+        first = read_colour(self._colours[self._numbers[0]])
+        self._camera = _camera(folder, first.shape[1], first.shape[0])
+        self._up_axis = unit_up_axis(up_axis) if up_axis else self._estimate_up_axis()
+
+    @staticmethod
+    def recognises(folder: Path) -> bool:
+        """Whether the folder looks like this layout."""
+        return any(folder.glob("frame-??????.*"))
+
+    @property
+    def name(self) -> str:
+        """The folder's name."""
+        return self._folder.name
+
+    @property
+    def camera(self) -> Camera:
+        """At the size of the first colour image."""
+        return self._camera
+
+    @property
+    def up_axis(self) -> UpAxis:
+        """Estimated from the poses, unless told otherwise: the world is the first camera's, however it was tilted.
+
+        In RedKitchen it lands 2.5 degrees from the normal of the table, which itself is 27 degrees off -y.
+        """
+        return self._up_axis
+
+    def __len__(self) -> int:
+        return len(self._numbers)
+
+    def frame(self, i: int, size: tuple[int, int] | None = None) -> Frame:
+        """The frame at position i. Raises DatasetError, PoseError."""
+        require_position(self.name, i, len(self))
+        number = self._numbers[i]
+        T_world_camera = _read_pose(self._pose_path(number))
+        depth = self._folder / f"frame-{number:06d}.depth.png"
+        image = load_rgbd(self._colours[number], depth, self._camera, _UNITS, size)
+        return Frame(number, number * 10**9 // _RATE_HZ, image.rgb, image.depth_m, image.camera, T_world_camera)
+
+    def indices(self) -> Sequence[int]:
+        """The numbers in the file names."""
+        return list(self._numbers)
+
+    def regions(self) -> Mapping[str, Region]:
+        """From roi_voxels.npz when it is there; small objects as a ball of 0.10 m round their centroid."""
+        path = self._folder / _REGIONS_FILE
+        return balls_for_small_objects(load_voxel_regions(path)) if path.is_file() else {}
+
+    def _pose_path(self, number: int) -> Path:
+        return self._folder / f"frame-{number:06d}.pose.txt"
+
+    def _estimate_up_axis(self) -> UpAxis:
+        rotations = []
+        for number in self._numbers[:: max(1, len(self._numbers) // _UP_POSES)]:
+            try:
+                rotations.append(_read_pose(self._pose_path(number))[:3, :3])
+            except (DatasetError, PoseError):
+                # a damaged pose is the matter of its own frame, which may not even be wanted
+                continue
+        return estimate_up(np.array(rotations).reshape(-1, 3, 3), _LEVEL_FIRST_VIEW_UP)
+
+
+def _read_pose(path: Path) -> Float64[ndarray, "4 4"]:
+    rows = read_rows(path)
+    if len(rows) != 4:
+        raise DatasetError(f"{path}: expected the 4 rows of a 4x4 pose, got {len(rows)}")
+    numbers = [parse_numbers(place, fields, 4, "a row of a 4x4 pose") for place, fields in rows]
+    return nearest_rigid(str(path), np.array(numbers))
+
+
+def _camera(folder: Path, width_px: int, height_px: int) -> Camera:
+    path = find_beside_or_above(folder, INTRINSICS_FILE)
+    if path is not None:
+        return read_matrix(path).camera(str(path), width_px, height_px)
+    if (width_px, height_px) != _KINECT_SIZE:
+        raise DatasetError(
+            f"{folder}: the camera of {width_px}x{height_px} images is unknown: expected the file {INTRINSICS_FILE}"
+        )
+    return _KINECT.camera(str(folder), width_px, height_px)

@@ -1,0 +1,170 @@
+"""Read TUM RGB-D sequences: colour, depth and pose come with their own stamps and are brought together by time."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64
+from numpy import ndarray
+
+from gausslite.datasets.images import DepthUnits, load_rgbd, read_colour
+from gausslite.datasets.intrinsics import INTRINSICS_FILE, FileIntrinsics, find_beside_or_above, read_matrix
+from gausslite.datasets.poses import pose_from_quaternion, slerp
+from gausslite.datasets.source import UpAxis, require_frames, require_position, unit_up_axis
+from gausslite.datasets.text_files import parse_numbers, read_rows
+from gausslite.domain.camera import Camera
+from gausslite.domain.frame import Frame
+from gausslite.domain.region import Region
+from gausslite.errors import DatasetError
+
+_UNITS = DepthUnits(per_metre=5000.0)
+_MAX_DEPTH_LAG_S = 0.020
+_MAX_POSE_GAP_S = 0.100
+_INTRINSICS = {
+    "1": FileIntrinsics(517.3, 516.5, 318.6, 255.3),
+    "2": FileIntrinsics(520.9, 521.0, 325.1, 249.7),
+    "3": FileIntrinsics(535.4, 539.2, 320.1, 247.6),
+}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Match:
+    number: int
+    time_s: float
+    colour: Path
+    depth: Path
+    T_world_camera: Float64[ndarray, "4 4"]
+
+
+class TumSource:
+    """A folder with rgb.txt, depth.txt and groundtruth.txt.
+
+    A colour image goes with the depth image nearest in time, at most 20 ms away, and with the pose interpolated
+    (lerp and slerp) at the colour's stamp between two poses at most 0.1 s apart; colour images without either are no
+    part of the sequence. Frame numbers count the rows of rgb.txt from 0. The lens distortion of fr1 and fr2 (up to
+    a few pixels in the corners) is left in. Raises DatasetError, PoseError.
+    """
+
+    def __init__(self, folder: Path, up_axis: UpAxis | None = None) -> None:
+        self._folder = folder
+        self._matches = _associate(folder)
+        first = read_colour(self._matches[0].colour)
+        self._camera = _camera(folder, first.shape[1], first.shape[0])
+        self._up_axis = unit_up_axis(up_axis or (0.0, 0.0, 1.0))
+
+    @staticmethod
+    def recognises(folder: Path) -> bool:
+        """Whether the folder looks like this layout."""
+        return (folder / "rgb.txt").is_file() or (folder / "groundtruth.txt").is_file()
+
+    @property
+    def name(self) -> str:
+        """The folder's name."""
+        return self._folder.name
+
+    @property
+    def camera(self) -> Camera:
+        """By the folder's name (fr1, fr2, fr3), or from camera-intrinsics.txt in or above the folder."""
+        return self._camera
+
+    @property
+    def up_axis(self) -> UpAxis:
+        """z, as the motion capture system was set up, unless told otherwise."""
+        return self._up_axis
+
+    def __len__(self) -> int:
+        return len(self._matches)
+
+    def frame(self, i: int, size: tuple[int, int] | None = None) -> Frame:
+        """The frame at position i. Raises DatasetError."""
+        require_position(self.name, i, len(self))
+        match = self._matches[i]
+        image = load_rgbd(match.colour, match.depth, self._camera, _UNITS, size)
+        time_ns = round(match.time_s * 1e9)
+        return Frame(match.number, time_ns, image.rgb, image.depth_m, image.camera, match.T_world_camera)
+
+    def indices(self) -> Sequence[int]:
+        """Rows of rgb.txt, counted from 0."""
+        return [match.number for match in self._matches]
+
+    def regions(self) -> Mapping[str, Region]:
+        """None are known."""
+        return {}
+
+
+def _associate(folder: Path) -> list[_Match]:
+    colour_times, colour_names = _read_stamps(folder / "rgb.txt")
+    depth_times, depth_names = _read_stamps(folder / "depth.txt")
+    trajectory = _Trajectory(folder / "groundtruth.txt")
+    matches = []
+    for number, (time_s, name) in enumerate(zip(colour_times, colour_names, strict=True)):
+        nearest = int(np.abs(depth_times - time_s).argmin())
+        T_world_camera = trajectory.at(float(time_s))
+        if abs(depth_times[nearest] - time_s) <= _MAX_DEPTH_LAG_S and T_world_camera is not None:
+            depth = folder / depth_names[nearest]
+            matches.append(_Match(number, float(time_s), folder / name, depth, T_world_camera))
+    wanted = "a colour image with depth within 20 ms (rgb.txt, depth.txt) and poses around it (groundtruth.txt)"
+    require_frames(folder, len(matches), wanted)
+    return matches
+
+
+def _read_stamps(path: Path) -> tuple[Float64[ndarray, " n"], list[str]]:
+    """Ascending times in seconds and the image's path after each."""
+    times, names = [], []
+    for place, fields in read_rows(path):
+        if len(fields) != 2:
+            raise DatasetError(f"{place}: expected a time and a file name, got {len(fields)} fields")
+        times += parse_numbers(place, fields[:1], 1, "a time in seconds")
+        names.append(fields[1])
+        if not np.isfinite(times[-1]) or (len(times) > 1 and times[-1] < times[-2]):
+            raise DatasetError(f"{place}: expected finite times in ascending order, got {fields[0]}")
+    if not times:
+        raise DatasetError(f"{path}: expected rows of a time and a file name, got none")
+    return np.array(times), names
+
+
+class _Trajectory:
+    """Poses over time from rows of: time tx ty tz qx qy qz qw."""
+
+    def __init__(self, path: Path) -> None:
+        rows = read_rows(path)
+        meaning = "time tx ty tz qx qy qz qw"
+        table = np.array([parse_numbers(place, fields, 8, meaning) for place, fields in rows])
+        if len(table) < 2:
+            raise DatasetError(f"{path}: expected at least 2 poses, got {len(table)}")
+        for (place, _), row in zip(rows, table, strict=True):
+            pose_from_quaternion(place, row[1:4], row[4:8])
+        if not (np.isfinite(table[:, 0]).all() and (np.diff(table[:, 0]) >= 0).all()):
+            raise DatasetError(f"{path}: expected finite times in ascending order")
+        self._path, self._table = path, table
+
+    def at(self, time_s: float) -> Float64[ndarray, "4 4"] | None:
+        """The interpolated pose; None outside the recording and in its gaps."""
+        times = self._table[:, 0]
+        after = int(np.searchsorted(times, time_s))
+        if after == len(times) or (after == 0 and times[0] != time_s):
+            return None
+        before = max(after - 1, 0)
+        gap_s = float(times[after] - times[before])
+        if gap_s > _MAX_POSE_GAP_S:
+            return None
+        share = (time_s - float(times[before])) / gap_s if gap_s > 0 else 0.0
+        a, b = self._table[before], self._table[after]
+        return pose_from_quaternion(str(self._path), a[1:4] + share * (b[1:4] - a[1:4]), slerp(a[4:8], b[4:8], share))
+
+
+def _camera(folder: Path, width_px: int, height_px: int) -> Camera:
+    path = find_beside_or_above(folder, INTRINSICS_FILE)
+    if path is not None:
+        return read_matrix(path).camera(str(path), width_px, height_px)
+    group = re.search(r"(?:freiburg|fr)([123])", folder.resolve().name)
+    if group is None:
+        raise DatasetError(
+            f"{folder}: the camera is unknown: expected a folder named after fr1, fr2 or fr3 (or freiburg1 ...), "
+            f"or the file {INTRINSICS_FILE}"
+        )
+    return _INTRINSICS[group.group(1)].camera(str(folder), width_px, height_px)

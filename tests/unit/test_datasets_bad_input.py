@@ -1,0 +1,215 @@
+"""Damaged sequences get one line that names the file and what would be right."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tiny_sequences import IDENTITY_ROWS, write_colour, write_depth, write_replica, write_seven_scenes, write_tum
+
+from gausslite.datasets.open import open_source
+from gausslite.datasets.regions import load_voxel_regions
+from gausslite.errors import DatasetError, GaussLiteError, PoseError
+
+WRITERS = {"tum": write_tum, "seven": write_seven_scenes, "replica": write_replica}
+FOLDERS = {"tum": "fr1", "seven": "seq", "replica": "office0"}
+
+
+def cut(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:-40])
+
+
+def read_all(folder: Path) -> None:
+    source = open_source(str(folder))
+    for i in range(len(source)):
+        source.frame(i)
+
+
+def replace(path: Path, old: str, new: str) -> None:
+    path.write_text(path.read_text().replace(old, new))
+
+
+Damage = Callable[[Path], object]
+SEVEN_POSE = "frame-000004.pose.txt"
+
+CASES: list[tuple[str, Damage, type[GaussLiteError], str]] = [
+    ("tum", lambda f: (f / "rgb/1.png").unlink(), DatasetError, "1.png: expected an image, there is none"),
+    ("tum", lambda f: cut(f / "depth/1.png"), DatasetError, "depth/1.png: expected a whole image"),
+    ("tum", lambda f: write_depth(f / "depth/1.png", width=8), DatasetError, "depth/1.png: expected the size of 1.png"),
+    ("tum", lambda f: (f / "depth.txt").unlink(), DatasetError, "depth.txt: expected a text file"),
+    ("tum", lambda f: (f / "groundtruth.txt").unlink(), DatasetError, "groundtruth.txt: expected a text file"),
+    ("tum", lambda f: (f / "rgb.txt").write_text("# nothing\n"), DatasetError, "rgb.txt: expected rows"),
+    ("tum", lambda f: (f / "rgb.txt").write_text("10.0\n"), DatasetError, "rgb.txt line 1: expected a time and a file"),
+    ("tum", lambda f: (f / "rgb.txt").write_bytes(b"\xff\xfe\x00"), DatasetError, "rgb.txt: expected a readable text"),
+    ("tum", lambda f: (f / "rgb.txt").write_text("2 a\n1 b\n"), DatasetError, "rgb.txt line 2: expected finite times"),
+    ("tum", lambda f: replace(f / "groundtruth.txt", "9.9000 9.9000", "nan 1"), DatasetError, "groundtruth.txt: exp"),
+    ("tum", lambda f: (f / "groundtruth.txt").write_text("1 0 0 0 0 0 0 1\n"), DatasetError, "at least 2 poses"),
+    ("tum", lambda f: (f / "groundtruth.txt").write_text("1 0 0\n2 0 0\n"), DatasetError, "line 1: expected 8 numbers"),
+    (
+        "tum",
+        lambda f: (f / "groundtruth.txt").write_text("1 0 nan 0 0 0 0 1\n2 0 0 0 0 0 0 1\n"),
+        PoseError,
+        "groundtruth.txt line 1: expected a pose of finite",
+    ),
+    (
+        "tum",
+        lambda f: (f / "groundtruth.txt").write_text("1 0 0 0 0 0 0 3\n2 0 0 0 0 0 0 1\n"),
+        PoseError,
+        "groundtruth.txt line 1: expected a quaternion of length 1",
+    ),
+    (
+        "tum",
+        lambda f: (f / "groundtruth.txt").write_text("1 0 0 0 0 0 0 1\n2 0 0 0 0 0 0 1\n"),
+        DatasetError,
+        "fr1: expected a colour image with depth within 20 ms",
+    ),
+    ("tum", lambda f: f.rename(f.with_name("odd")), DatasetError, "odd: the camera is unknown"),
+    ("seven", lambda f: cut(f / "frame-000004.color.png"), DatasetError, "frame-000004.color.png: expected a whole"),
+    ("seven", lambda f: (f / "frame-000004.depth.png").unlink(), DatasetError, "000004.depth.png: expected an image"),
+    ("seven", lambda f: write_colour(f / "frame-000004.depth.png"), DatasetError, "expected a 16-bit image"),
+    (
+        "seven",
+        lambda f: write_depth(f / "frame-000008.depth.png", height=6),
+        DatasetError,
+        "000008.depth.png: exp",
+    ),
+    ("seven", lambda f: (f / SEVEN_POSE).unlink(), DatasetError, f"{SEVEN_POSE}: expected a text file"),
+    ("seven", lambda f: (f / SEVEN_POSE).write_text("1 0 0 0\n"), DatasetError, f"{SEVEN_POSE}: expected the 4 rows"),
+    ("seven", lambda f: replace(f / SEVEN_POSE, "0 1 0 0", "0 1 0"), DatasetError, f"{SEVEN_POSE} line 2: exp"),
+    (
+        "seven",
+        lambda f: replace(f / SEVEN_POSE, "0 1 0 0", "0 b 0 0"),
+        DatasetError,
+        f"{SEVEN_POSE} line 2: exp",
+    ),
+    ("seven", lambda f: replace(f / SEVEN_POSE, "0 1 0 0", "0 1 0 nan"), PoseError, f"{SEVEN_POSE}: .* got nan"),
+    ("seven", lambda f: replace(f / SEVEN_POSE, "1", "-inf"), PoseError, f"{SEVEN_POSE}: .* got -inf"),
+    ("seven", lambda f: replace(f / SEVEN_POSE, "0 1 0 0", "0 2 0 0"), PoseError, f"{SEVEN_POSE}: expected a rigid"),
+    ("seven", lambda f: replace(f / SEVEN_POSE, "0 1 0 0", "0 -1 0 0"), PoseError, f"{SEVEN_POSE}: expected a rigid"),
+    ("seven", lambda f: replace(f / SEVEN_POSE, "0 0 0 1", "0 0 1 1"), PoseError, f"{SEVEN_POSE}: expected a last row"),
+    ("seven", lambda f: (f / "camera-intrinsics.txt").unlink(), DatasetError, "expected the file camera-intrinsics"),
+    (
+        "seven",
+        lambda f: (f / "camera-intrinsics.txt").write_text("5 5"),
+        DatasetError,
+        "camera-intrinsics.txt: expe",
+    ),
+    ("seven", lambda f: (f / "camera-intrinsics.txt").write_text(IDENTITY_ROWS), DatasetError, "camera-intrinsics.txt"),
+    (
+        "seven",
+        lambda f: (f / "camera-intrinsics.txt").write_text("-5 0 1\n0 5 1\n0 0 1"),
+        DatasetError,
+        "intrinsics.txt: camera fx_px: expected a positive",
+    ),
+    (
+        "seven",
+        lambda f: (f / "camera-intrinsics.txt").write_text("5 1 1\n0 5 1\n0 0 1"),
+        DatasetError,
+        "intrinsics.txt: expected rows fx 0 cx",
+    ),
+    ("seven", lambda f: [p.unlink() for p in f.glob("*.color.png")], DatasetError, "seq: expected images named"),
+    ("replica", lambda f: cut(f / "results/frame000001.jpg"), DatasetError, "frame000001.jpg: expected a whole image"),
+    ("replica", lambda f: (f / "traj.txt").write_text(""), DatasetError, "traj.txt: expected a pose for each"),
+    ("replica", lambda f: (f / "traj.txt").write_text("1 2\n" * 3), DatasetError, "traj.txt line 1: expected 16"),
+    (
+        "replica",
+        lambda f: (f / "traj.txt").write_text(("nan " * 16 + "\n") * 3),
+        PoseError,
+        "line 1: .* nan",
+    ),
+    ("replica", lambda f: (f.parent / "cam_params.json").unlink(), DatasetError, "office0: the camera is unknown"),
+    ("replica", lambda f: (f.parent / "cam_params.json").write_text("{"), DatasetError, "cam_params.json: expected"),
+    ("replica", lambda f: replace(f.parent / "cam_params.json", '"fx"', '"x"'), DatasetError, "cam_params.json: .*fx"),
+    ("replica", lambda f: replace(f.parent / "cam_params.json", "6553.5", "0"), DatasetError, "positive depth scale"),
+    (
+        "replica",
+        lambda f: replace(f.parent / "cam_params.json", '"w": 16', '"w": 20'),
+        DatasetError,
+        "size 20x12",
+    ),
+    ("replica", lambda f: [p.unlink() for p in f.glob("results/*")], DatasetError, "results: expected images named"),
+]
+
+
+@pytest.mark.parametrize(("layout", "damage", "error", "message"), CASES)
+def test_damage_is_named(
+    tmp_path: Path, layout: str, damage: Damage, error: type[GaussLiteError], message: str
+) -> None:
+    folder = WRITERS[layout](tmp_path / FOLDERS[layout])
+    damage(folder)
+    folder = folder if folder.exists() else folder.with_name("odd")
+    with pytest.raises(error, match=message) as raised:
+        read_all(folder)
+    assert str(tmp_path) in str(raised.value)
+    assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda path: None, "got nothing there"),
+        (lambda path: path.write_text(""), "got a file"),
+        (lambda path: path.mkdir(), "got an empty folder"),
+        (lambda path: (path / "other").mkdir(parents=True), "unknown layout; expected TUM"),
+    ],
+)
+def test_a_place_without_a_sequence_is_named(tmp_path: Path, make: Damage, message: str) -> None:
+    make(tmp_path / "place")
+    with pytest.raises(DatasetError, match=f"place: .*{message}"):
+        open_source(str(tmp_path / "place"))
+
+
+def test_a_depth_image_without_returns_is_no_error(tmp_path: Path) -> None:
+    folder = write_seven_scenes(tmp_path / "seq")
+    write_depth(folder / "frame-000004.depth.png", 0)
+    assert not open_source(str(folder)).frame(1).has_depth
+
+
+def test_a_position_outside_the_sequence_is_refused(tmp_path: Path) -> None:
+    source = open_source(str(write_seven_scenes(tmp_path / "seq")))
+    with pytest.raises(DatasetError, match="position from 0 to 2, got 3"):
+        source.frame(3)
+
+
+def test_regions_come_back_by_name(tmp_path: Path) -> None:
+    path = tmp_path / "regions.npz"
+    voxels = np.array([[0, 0, 50], [1, 0, 50]], np.int16)
+    np.savez(path, mug_1=voxels, voxel_size_m=0.02)
+    region = load_voxel_regions(path)["mug_1"]
+    assert region.size_m == 0.02
+    np.testing.assert_array_equal(region.voxels, voxels)
+
+
+@pytest.mark.parametrize(
+    ("arrays", "message"),
+    [
+        ({"mug": np.zeros((1, 3), np.int16)}, "expected voxel_size_m"),
+        ({"mug": np.zeros((1, 3), np.int16), "voxel_size_m": np.array(np.nan)}, "expected voxel_size_m"),
+        ({"mug": np.zeros((1, 2), np.int16), "voxel_size_m": np.array(0.02)}, "mug: expected integers"),
+        ({"mug": np.zeros((0, 3), np.int16), "voxel_size_m": np.array(0.02)}, "mug: expected integers"),
+        ({"mug": np.zeros((1, 3)), "voxel_size_m": np.array(0.02)}, "mug: expected integers"),
+        ({"mug": np.array([[0, 0, 0], [30000, 0, 0]]), "voxel_size_m": np.array(0.02)}, "mug: expected at most 512"),
+        ({"mug": np.array([[None]], object), "voxel_size_m": np.array(0.02)}, "plain arrays"),
+        ({"voxel_size_m": np.array(0.02)}, "at least one object"),
+    ],
+)
+def test_wrong_regions_are_named(tmp_path: Path, arrays: dict[str, np.ndarray], message: str) -> None:
+    path = tmp_path / "regions.npz"
+    np.savez(path, **arrays)
+    with pytest.raises(DatasetError, match=f"regions.npz: .*{message}"):
+        load_voxel_regions(path)
+
+
+@pytest.mark.parametrize("content", [b"", b"PK\x03\x04 not really", b"\x80\x04N.", b"\x93NUMPY\x01\x00"])
+def test_a_damaged_regions_file_is_named(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "regions.npz"
+    path.write_bytes(content)
+    with pytest.raises(DatasetError, match=r"regions.npz: expected a readable"):
+        load_voxel_regions(path)
+
+
+def test_a_missing_regions_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(DatasetError, match=r"regions.npz: expected a file of regions"):
+        load_voxel_regions(tmp_path / "regions.npz")

@@ -1,0 +1,137 @@
+"""The readers turn each layout into frames with the times, units, poses and pixel centres its authors mean."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from tiny_sequences import HEIGHT, WIDTH, write_depth, write_replica, write_seven_scenes, write_tum
+
+from gausslite.datasets.open import open_source
+from gausslite.datasets.selection import select_frames
+from gausslite.domain.region import BallRegion, VoxelRegion
+from gausslite.errors import DatasetError, InvalidInputError
+
+
+def test_tum_interpolates_the_pose_at_the_colours_time(tmp_path: Path) -> None:
+    source = open_source(str(write_tum(tmp_path / "rgbd_dataset_freiburg2_x")))
+    frame = source.frame(1)
+    assert frame.T_world_camera[0, 3] == pytest.approx(10.0 + 1 / 30, abs=1e-5)
+    assert frame.capture_time_ns == pytest.approx(10_033_333_000, abs=1_000_000)
+    assert frame.depth_m[1, 1] == 1.0
+    assert frame.depth_m[0, 0] == 0.0
+    assert (source.camera.fx_px, source.camera.cx_px) == (520.9, 325.6)
+    assert source.up_axis == (0.0, 0.0, 1.0)
+
+
+def test_tum_leaves_out_colour_without_depth_or_pose(tmp_path: Path) -> None:
+    folder = write_tum(tmp_path / "fr1", frames=4)
+    rows = (folder / "depth.txt").read_text().splitlines()
+    (folder / "depth.txt").write_text("\n".join([rows[0], *rows[2:]]))
+    poses = (folder / "groundtruth.txt").read_text().splitlines()
+    (folder / "groundtruth.txt").write_text("\n".join(row for row in poses if float(row.split()[0]) < 10.09))
+    assert list(open_source(str(folder)).indices()) == [0, 2]
+
+
+def test_tum_interpolates_rotations_on_the_sphere(tmp_path: Path) -> None:
+    folder = write_tum(tmp_path / "fr3", frames=1)
+    half = np.sqrt(0.5)
+    (folder / "groundtruth.txt").write_text(f"9.96 0 0 0 0 0 0 1\n10.04 1 0 0 0 0 {half} {half}\n")
+    T = open_source(str(folder)).frame(0).T_world_camera
+    np.testing.assert_allclose(T[:2, :2], [[half, -half], [half, half]], atol=1e-9)
+    assert T[0, 3] == pytest.approx(0.5)
+
+
+def test_seven_scenes_reads_numbers_depth_and_principal_point(tmp_path: Path) -> None:
+    source = open_source(str(write_seven_scenes(tmp_path / "seq")))
+    assert list(source.indices()) == [0, 4, 8]
+    assert (source.camera.cx_px, source.camera.cy_px) == (8.0, 6.0)
+    write_depth(tmp_path / "seq" / "frame-000004.depth.png", 65535)
+    assert not source.frame(1).has_depth
+    assert source.frame(2).depth_m[3, 3] == 2.0
+    assert source.frame(2).index == 8
+
+
+def test_seven_scenes_repairs_rounded_rotations(tmp_path: Path) -> None:
+    folder = write_seven_scenes(tmp_path / "seq")
+    (folder / "frame-000000.pose.txt").write_text("1.004 0 0 1\n0 1 0.003 2\n0 0 0.998 3\n0 0 0 1\n")
+    R = open_source(str(folder)).frame(0).T_world_camera[:3, :3]
+    np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
+
+
+def test_replica_reads_the_camera_from_above_and_its_depth_scale(tmp_path: Path) -> None:
+    source = open_source(str(write_replica(tmp_path / "office0")))
+    assert (source.camera.width_px, source.camera.cx_px) == (WIDTH, 8.0)
+    assert source.frame(2).depth_m[2, 2] == pytest.approx(6553 / 6553.5)
+    assert len(source) == 3
+
+
+def test_resizing_averages_colour_and_never_mixes_depth(tmp_path: Path) -> None:
+    folder = write_seven_scenes(tmp_path / "seq", numbers=(0,))
+    depth = np.full((HEIGHT, WIDTH), 1000, np.uint16)
+    depth[:, WIDTH // 2 :] = 3000
+    cv2.imwrite(str(folder / "frame-000000.depth.png"), depth)
+    source = open_source(str(folder))
+    whole, half = source.frame(0), source.frame(0, (WIDTH // 2, HEIGHT // 2))
+    assert set(np.unique(half.depth_m)) == {1.0, 3.0}
+    blocks = whole.rgb.reshape(HEIGHT // 2, 2, WIDTH // 2, 2, 3).mean(axis=(1, 3))
+    assert np.abs(half.rgb - blocks).max() <= 0.76
+    assert (half.camera.fx_px, half.camera.cx_px) == (10.0, 4.0)
+
+
+def test_a_folder_that_holds_one_sequence_stands_for_it(tmp_path: Path) -> None:
+    write_seven_scenes(tmp_path / "scene" / "seq-01")
+    assert open_source(str(tmp_path / "scene")).name == "seq-01"
+    write_seven_scenes(tmp_path / "scene" / "seq-02")
+    with pytest.raises(DatasetError, match="seq-01, seq-02"):
+        open_source(str(tmp_path / "scene"))
+
+
+def test_the_up_axis_can_be_told(tmp_path: Path) -> None:
+    folder = write_seven_scenes(tmp_path / "seq")
+    assert open_source(str(folder)).up_axis == (0.0, -1.0, 0.0)
+    assert open_source(str(folder), up_axis=(0.0, 0.0, 2.0)).up_axis == (0.0, 0.0, 1.0)
+    with pytest.raises(InvalidInputError, match="up axis"):
+        open_source(str(folder), up_axis=(0.0, 0.0, 0.0))
+
+
+@pytest.mark.parametrize(
+    ("selection", "positions"),
+    [(":", [0, 1, 2, 3]), ("0:9", [0, 1, 2]), ("4:", [1, 2, 3]), ("0:100:8", [0, 2]), ("::12", [0, 3])],
+)
+def test_frames_are_selected_by_their_own_numbers(tmp_path: Path, selection: str, positions: list[int]) -> None:
+    source = open_source(str(write_seven_scenes(tmp_path / "seq", numbers=(0, 4, 8, 12))))
+    assert select_frames(source, selection) == positions
+
+
+@pytest.mark.parametrize("selection", ["", "5", "a:b", "0:10:0", "10:5", "-1:5", "0:1:2:3", "0:1.5", "0:٣"])
+def test_a_nonsense_selection_is_refused(tmp_path: Path, selection: str) -> None:
+    source = open_source(str(write_seven_scenes(tmp_path / "seq")))
+    with pytest.raises(InvalidInputError, match="START:STOP"):
+        select_frames(source, selection)
+
+
+def test_an_empty_selection_says_what_numbers_there_are(tmp_path: Path) -> None:
+    source = open_source(str(write_seven_scenes(tmp_path / "seq")))
+    with pytest.raises(DatasetError, match="3 frames are numbered 0 to 8"):
+        select_frames(source, "1:4")
+
+
+def test_the_real_kitchen_opens_with_its_regions(shared_dir: Path) -> None:
+    source = open_source(str(shared_dir / "data" / "redkitchen"))
+    assert len(select_frames(source, "0:497")) == len(select_frames(source, "500:1000:4")) == 125
+    regions = source.regions()
+    assert isinstance(regions["mug_1"], BallRegion)
+    assert isinstance(regions["chair_2"], VoxelRegion)
+    frame = source.frame(3, (320, 240))
+    assert 200 < regions["mug_1"].mask(frame).sum() < 1500
+    table_normal = np.array([0.008, -0.891, -0.454])
+    assert np.array(source.up_axis) @ table_normal > np.cos(np.radians(3.5))
+
+
+def test_the_real_desk_opens(shared_dir: Path) -> None:
+    source = open_source(str(shared_dir / "data" / "tum_fr1"))
+    assert len(source) == 9
+    assert 0.5 < np.median(source.frame(0).depth_m) < 2.0
