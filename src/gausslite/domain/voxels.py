@@ -40,10 +40,14 @@ class VoxelGrid:
         packed: Int64[ndarray, " n"] = (ijk[:, 0] << (2 * _BITS_PER_AXIS)) | (ijk[:, 1] << _BITS_PER_AXIS) | ijk[:, 2]
         return packed
 
+    def indices(self, keys: Int64[ndarray, " n"]) -> Int64[ndarray, "n 3"]:
+        """The (i, j, k) of the voxels with these keys."""
+        ijk = np.stack([(keys >> (2 * _BITS_PER_AXIS)) & _MASK, (keys >> _BITS_PER_AXIS) & _MASK, keys & _MASK], axis=1)
+        return ijk - _OFFSET
+
     def centres_m(self, keys: Int64[ndarray, " n"]) -> Float32[ndarray, "n 3"]:
         """The centres of the voxels with these keys."""
-        ijk = np.stack([(keys >> (2 * _BITS_PER_AXIS)) & _MASK, (keys >> _BITS_PER_AXIS) & _MASK, keys & _MASK], axis=1)
-        return ((ijk - _OFFSET + 0.5) * self.size_m).astype(np.float32)
+        return ((self.indices(keys) + 0.5) * self.size_m).astype(np.float32)
 
 
 @dataclass(frozen=True, slots=True)
