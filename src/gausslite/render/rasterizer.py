@@ -21,7 +21,7 @@ the centre of at least one drawn pixel.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, UInt8, UInt32
@@ -124,6 +124,7 @@ class AdamSettings:
         return rates
 
 
+@runtime_checkable
 class TrainingView(Protocol):
     """An image prepared once for many steps (padded, planar, SSIM moments cached); opaque outside its backend."""
 
@@ -141,6 +142,7 @@ class StepReport:
     visible: UInt32[ndarray, " m"]
 
 
+@runtime_checkable
 class Rasterizer(Protocol):
     """A backend. It owns scratch memory and threads, never the splats. Calls are not re-entrant."""
 

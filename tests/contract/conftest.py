@@ -1,0 +1,41 @@
+"""Run the contract on every backend that this machine has."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+
+from gausslite.errors import KernelError
+from gausslite.render.rasterizer import Rasterizer
+
+pytest.importorskip("torch", reason="the oracle needs torch, which is not installed")
+
+
+def _reference() -> Rasterizer:
+    from gausslite.render.reference import ReferenceRasterizer
+
+    return ReferenceRasterizer()
+
+
+def _cpu() -> Rasterizer:
+    from gausslite.render.cpu import CpuRasterizer
+
+    return CpuRasterizer(threads=2)
+
+
+BACKENDS: dict[str, Callable[[], Rasterizer]] = {"reference": _reference, "cpu": _cpu}
+
+
+@pytest.fixture(scope="session", params=BACKENDS)
+def rasterizer(request: pytest.FixtureRequest) -> Rasterizer:
+    """Each backend in turn; one that cannot run here is skipped with its own reason."""
+    try:
+        return BACKENDS[request.param]()
+    except (ImportError, KernelError) as reason:
+        pytest.skip(f"backend {request.param}: {reason}")
+
+
+@pytest.fixture(scope="session")
+def oracle() -> Rasterizer:
+    return _reference()

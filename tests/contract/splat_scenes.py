@@ -1,0 +1,183 @@
+"""Scenes that every backend must draw alike, from the ordinary to the hostile, and what a fair comparison leaves out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from gausslite.domain.camera import Camera
+from gausslite.render.rasterizer import LOG_SCALE, LOGIT, MEAN, QUAT, RGB, Rasterizer, Rendering, TrainingView
+from gausslite.render.reference.compositing import MAX_ALPHA
+from gausslite.render.reference.projection import MIN_ALPHA, project
+
+GROUPS = {"means": MEAN, "log_scales": LOG_SCALE, "quats": QUAT, "logits": slice(LOGIT, LOGIT + 1), "rgb": RGB}
+CAMERA = Camera(52.0, 50.0, 32.3, 23.6, 64, 48)
+
+
+@dataclass(frozen=True)
+class Scene:
+    rows: np.ndarray
+    camera: Camera
+    T_camera_world: np.ndarray
+
+    @property
+    def size(self) -> tuple[int, int]:
+        return self.camera.height_px, self.camera.width_px
+
+
+def turned(angle: float = 0.2) -> np.ndarray:
+    """A camera turned about its y axis and moved a little."""
+    T_camera_world = np.eye(4)
+    c, s = np.cos(angle), np.sin(angle)
+    T_camera_world[:3, :3] = [[c, 0, s], [0, 1, 0], [-s, 0, c]]
+    T_camera_world[:3, 3] = (0.1, -0.05, 0.3)
+    return T_camera_world
+
+
+def random_rows(seed: int, n: int, size_m: float = 0.1, logit: float = 0.0) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    rows = np.zeros((n, 16), np.float32)
+    rows[:, :3] = np.stack([rng.uniform(-1.3, 1.3, n), rng.uniform(-1, 1, n), rng.uniform(0.6, 4, n)], axis=1)
+    rows[:, LOG_SCALE] = np.log(size_m * rng.uniform(0.3, 2.5, (n, 3)))
+    rows[:, QUAT] = rng.normal(size=(n, 4)) * rng.uniform(0.1, 10.0, (n, 1))
+    rows[:, LOGIT] = rng.normal(logit, 1.5, n)
+    rows[:, RGB] = rng.random((n, 3))
+    return rows
+
+
+def _ordinary(seed: int, n: int, size_m: float, logit: float = 0.0) -> Callable[[], Scene]:
+    return lambda: Scene(random_rows(seed, n, size_m, logit), CAMERA, turned())
+
+
+def _behind_the_camera() -> Scene:
+    rows = random_rows(5, 300)
+    rows[:, 2] = np.random.default_rng(5).uniform(-4.0, 4.0, 300)
+    rows[:20, :3] = [0.0, 0.0, 0.0]
+    return Scene(rows, CAMERA, turned())
+
+
+def _huge() -> Scene:
+    rows = random_rows(6, 60)
+    rows[:20, LOG_SCALE] = np.log(np.random.default_rng(6).uniform(2.0, 30.0, (20, 3)))
+    return Scene(rows, CAMERA, turned())
+
+
+def _needles_and_sheets() -> Scene:
+    rows = random_rows(7, 150)
+    rows[:50, 3] = np.log(1.0)
+    rows[:50, 4:6] = np.log(1e-4)
+    rows[50:100, 3:5] = np.log(0.3)
+    rows[50:100, 5] = np.log(1e-6)
+    rows[100:, LOG_SCALE] = np.log(1e-7)
+    return Scene(rows, CAMERA, turned())
+
+
+def _transparent() -> Scene:
+    rows = random_rows(8, 200)
+    rows[:150, LOGIT] = np.random.default_rng(8).uniform(-100.0, -6.0, 150)
+    return Scene(rows, CAMERA, turned())
+
+
+def _opaque() -> Scene:
+    rows = random_rows(9, 200, 0.15)
+    rows[:, LOGIT] = np.random.default_rng(9).uniform(8.0, 60.0, 200)
+    return Scene(rows, CAMERA, turned())
+
+
+def _outside_the_view() -> Scene:
+    rng = np.random.default_rng(10)
+    rows = random_rows(10, 200, 0.5)
+    rows[:, 0] = rng.uniform(-6, 6, 200)
+    rows[:, 1] = rng.uniform(-5, 5, 200)
+    return Scene(rows, CAMERA, turned())
+
+
+def _broken() -> Scene:
+    rows = random_rows(11, 200)
+    for column in range(14):
+        rows[column, column] = np.nan
+        rows[14 + column, column] = np.inf
+        rows[28 + column, column] = -np.inf
+    rows[60:80, QUAT] = 0.0
+    return Scene(rows, CAMERA, turned())
+
+
+def _odd_size() -> Scene:
+    return Scene(random_rows(12, 200), Camera(40.0, 55.0, 13.7, 30.2, 37, 51), turned())
+
+
+def _tiny_image() -> Scene:
+    return Scene(random_rows(13, 50), Camera(4.0, 4.0, 1.5, 1.0, 3, 2), turned())
+
+
+SCENES: dict[str, Callable[[], Scene]] = {
+    "small splats": _ordinary(0, 200, 0.03),
+    "medium splats": _ordinary(1, 200, 0.1),
+    "large splats": _ordinary(2, 60, 0.4, 1.0),
+    "nearly opaque": _ordinary(3, 400, 0.02, 3.0),
+    "dense": _ordinary(4, 500, 0.05),
+    "behind the camera": _behind_the_camera,
+    "huge": _huge,
+    "needles and sheets": _needles_and_sheets,
+    "transparent": _transparent,
+    "opaque": _opaque,
+    "outside the view": _outside_the_view,
+    "broken rows": _broken,
+    "odd size": _odd_size,
+    "tiny image": _tiny_image,
+}
+
+
+def steady_pixels(scene: Scene, margin: float = 2e-4) -> np.ndarray:
+    """True where no alpha lies within this relative margin of a threshold that float32 might cross."""
+    rows = torch.from_numpy(scene.rows.astype(np.float64))
+    e = project(rows, scene.camera, torch.from_numpy(scene.T_camera_world))
+    height, width = scene.size
+    dx = (torch.arange(width) + 0.5)[None, None, :] - e.means_px[:, 0, None, None]
+    dy = (torch.arange(height) + 0.5)[None, :, None] - e.means_px[:, 1, None, None]
+    a, b, c = e.conics[:, :, None, None].unbind(dim=1)
+    alpha = e.opacities[:, None, None] * torch.exp(-0.5 * (a * dx * dx + 2 * b * dx * dy + c * dy * dy))
+    near = ((alpha / MIN_ALPHA - 1.0).abs() < margin) | ((alpha / MAX_ALPHA - 1.0).abs() < margin)
+    return ~near.any(dim=0).numpy()
+
+
+def random_image_gradients(scene: Scene, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Derivatives by rgb, depth and alpha, zero on the pixels that a fair comparison leaves out."""
+    rng = np.random.default_rng(seed)
+    steady = steady_pixels(scene)
+    d = rng.normal(size=(*scene.size, 5)).astype(np.float32) * steady[..., None]
+    return np.ascontiguousarray(d[..., :3]), np.ascontiguousarray(d[..., 3]), np.ascontiguousarray(d[..., 4])
+
+
+def relative_error(came: np.ndarray, wanted: np.ndarray) -> float:
+    """‖came − wanted‖ / ‖wanted‖; zero wanted leaves the absolute error."""
+    norm = float(np.linalg.norm(wanted.astype(np.float64)))
+    return float(np.linalg.norm(came.astype(np.float64) - wanted)) / (norm or 1.0)
+
+
+@dataclass(frozen=True)
+class Picture:
+    """An image to train towards that keeps every pixel away from the kinks of the loss."""
+
+    rgb: np.ndarray
+    depth_m: np.ndarray
+    weight: np.ndarray
+
+    def view(self, rasterizer: Rasterizer, scene: Scene) -> TrainingView:
+        return rasterizer.prepare_view(self.rgb, self.depth_m, scene.camera, self.weight)
+
+
+def picture_near(drawn: Rendering, seed: int = 0) -> Picture:
+    """A random picture, moved off `drawn` wherever an absolute difference or alpha's half might change sign."""
+    rng = np.random.default_rng(seed)
+    rgb = rng.integers(0, 256, drawn.rgb.shape)
+    rgb = np.where(np.abs(rgb - 255.0 * drawn.rgb) < 4, (rgb + 60) % 256, rgb).astype(np.uint8)
+    offset_m = rng.choice([-1.0, 1.0], drawn.alpha.shape) * rng.uniform(0.05, 0.3, drawn.alpha.shape)
+    depth_m = np.maximum(drawn.expected_depth_m(0.4) + offset_m, 0.0)
+    unsure = np.abs(drawn.alpha - 0.5) < 1e-2
+    depth_m = np.where(unsure | (rng.random(drawn.alpha.shape) < 0.2), 0.0, depth_m).astype(np.float32)
+    weight = np.where(rng.random(drawn.alpha.shape) < 0.4, rng.random(drawn.alpha.shape), 0.0).astype(np.float32)
+    return Picture(rgb, depth_m, weight)
