@@ -1,0 +1,71 @@
+"""Everyday nouns in the singular: enough to tell a task from noise; any other word may still be an object."""
+
+from __future__ import annotations
+
+from typing import Final
+
+
+def _words(text: str) -> frozenset[str]:
+    return frozenset(text.split())
+
+
+ROOMS: Final = _words(
+    "kitchen bedroom bathroom office hallway corridor lobby garage basement attic hall lounge closet pantry laundry "
+    "garden yard backyard lawn patio balcony warehouse workshop lab laboratory classroom store shop hospital street "
+    "sidewalk driveway field park campus courtyard terrace porch entryway foyer study library cafeteria restroom "
+    "toilet-room elevator staircase stairwell aisle"
+)
+LANDMARKS: Final = _words(
+    "table desk counter countertop shelf bookshelf cabinet cupboard dresser nightstand bench sofa couch bed chair stool "
+    "armchair sink stove oven fridge refrigerator dishwasher microwave wall floor ceiling door doorway window entrance "
+    "exit gate fence stair stairs ladder fireplace bathtub shower toilet workbench rack sideboard wardrobe tree "
+    "building car truck tv television piano pillar column whiteboard blackboard printer island"
+)
+CONTAINERS: Final = _words(
+    "drawer box bin basket cabinet cupboard closet fridge refrigerator freezer dishwasher oven microwave bag backpack "
+    "crate bucket bowl jar suitcase locker wardrobe container carton trunk dumpster sink bathtub pot washer dryer case "
+    "pocket purse toolbox chest sack hamper safe mailbox vase envelope package pantry kitchen bathroom bedroom office "
+    "garage room"
+)
+_OBJECTS: Final = _words(
+    "mug cup glass bottle plate bowl fork knife spoon pan pot kettle teapot jug pitcher can jar lid tray napkin towel "
+    "sponge cloth soap dish toaster blender grill apple banana orange lemon tomato potato carrot bread food fruit "
+    "vegetable sandwich pizza cake cookie egg milk coffee tea juice water snack cereal "
+    "book notebook magazine newspaper paper pen pencil marker stapler folder binder envelope letter document laptop "
+    "computer monitor keyboard mouse phone cellphone telephone tablet charger cable cord remote printer camera speaker "
+    "headphones headset microphone router lamp light bulb clock watch calculator eraser ruler scissors tape "
+    "pillow cushion blanket sheet rug carpet mat curtain blind mirror picture painting poster frame vase candle plant "
+    "flower flowerpot planter pot tree bush grass leaf branch rock stone dirt mud puddle sand gravel trash garbage "
+    "rubbish litter waste debris dust crumb stain spill can recycling cart trolley wheelchair walker stroller bicycle "
+    "bike scooter motorcycle car truck van bus vehicle forklift pallet cone barrier bollard sign hydrant extinguisher "
+    "pole post pipe valve gauge meter switch socket outlet plug button lever handle knob panel fuse thermostat sensor "
+    "detector alarm vent fan heater radiator conditioner boiler tank pump motor engine machine conveyor robot "
+    "hammer screwdriver wrench drill saw pliers nail screw bolt nut toolbox tool glove helmet vest goggles rope chain "
+    "hose ladder broom mop bucket dustpan vacuum brush shovel rake wheelbarrow mower "
+    "ball toy doll puzzle block brick dice card game controller guitar piano drum violin bat racket frisbee kite "
+    "shoe boot sandal slipper sock shirt t-shirt tshirt jacket coat hat cap scarf pants jeans dress skirt clothes "
+    "clothing laundry hanger bag backpack purse wallet suitcase luggage umbrella key keys keychain glasses sunglasses "
+    "belt ring necklace tie "
+    "person people man woman child baby kid human pedestrian worker patient visitor guest user operator nurse doctor "
+    "dog cat bird pet animal horse cow sheep "
+    "medicine pill medication syringe bandage thermometer mask kit toothbrush toothpaste comb razor shampoo tissue "
+    "package parcel box crate carton basket bin barrel container pallet shelf rack locker drawer hook stand tripod "
+    "chair table stool bench sofa couch bed crib mattress desk cabinet furniture appliance utensil cutlery "
+    "silverware tableware electronics equipment supply device gadget instrument article belonging valuables "
+    "stairs step ramp railing rail curb hole crack leak window door wall floor ceiling roof beam column pillar "
+    "entrance exit doorway gate fence bridge elevator charger dock station landmark marker tag poster whiteboard "
+    "coaster saucer straw ladle spatula whisk corkscrew opener grater strainer colander mitt apron thermos flask canteen "
+    "dumbbell treadmill yoga barbell skateboard surfboard snowboard ski tent sleeping cooler lantern flashlight torch "
+    "battery adapter usb drive disk disc cd dvd television tv screen projector console antenna modem server rack "
+    "hydrant mailbox bench streetlight lamppost statue fountain swing slide sandbox manhole crosswalk tire wheel "
+    "weed hedge log stump root seed fertilizer sprinkler nozzle faucet tap drain pipe gutter chimney brick tile "
+    "plank board lumber wood scrap metal wire spring gear bearing shaft coil circuit breaker transformer inverter "
+    "seat armrest cushion leg arm edge pad notepad sticker label stamp coin money bill cash ticket passport badge"
+)
+NOUNS: Final = (
+    _OBJECTS
+    | ROOMS
+    | LANDMARKS
+    | CONTAINERS
+    | frozenset({"object", "thing", "item", "stuff", "obstacle", "obstruction", "clutter", "hazard", "target"})
+)

@@ -1,0 +1,57 @@
+"""A noun phrase: its words without determiners, the head in the singular."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from gausslite.task import lexicon
+from gausslite.task.singular import singular
+
+_SELVES = {(word,) for word in lexicon.SELVES}
+# in a compound the drinking kind, alone the reading kind
+_COMPOUND_HEADS = {"glasses": "glass"}
+
+
+@dataclass(frozen=True, slots=True)
+class NounPhrase:
+    """words without determiners, head singular; determined: an article stood before it; superlative: "the closest"."""
+
+    words: tuple[str, ...]
+    determined: bool
+    superlative: bool
+
+    @property
+    def head(self) -> str:
+        """The noun itself, without its adjectives."""
+        return self.words[-1]
+
+    @property
+    def text(self) -> str:
+        """The phrase as a detector gets it."""
+        return " ".join(self.words)
+
+    @property
+    def known(self) -> bool:
+        """True when the head is a noun of the lexicon."""
+        return self.head in lexicon.NOUNS or self.head in lexicon.GENERIC
+
+    @property
+    def names_object(self) -> bool:
+        """False for places, routes, measures, the robot itself and adjectives without a noun."""
+        if adjectives_only(self.words) or self.words in _SELVES:
+            return False
+        return self.head not in lexicon.DROPPED_HEADS
+
+
+def noun_phrase(words: Sequence[str], determined: bool, superlative: bool) -> NounPhrase:
+    """Build the phrase from the words as they were written."""
+    kept = list(words)
+    last = kept[-1]
+    kept[-1] = _COMPOUND_HEADS.get(last, singular(last)) if len(kept) > 1 else singular(last)
+    return NounPhrase(tuple(kept), determined, superlative)
+
+
+def adjectives_only(words: Sequence[str]) -> bool:
+    """True for "red" or "big old": something is described and nothing named."""
+    return all(word in lexicon.ADJECTIVES and word not in lexicon.NOUNS for word in words)

@@ -1,0 +1,38 @@
+"""Which words between two nouns mean which relation."""
+
+from __future__ import annotations
+
+from typing import Final
+
+# a relation that is no Predicate yet is kept as `near`, with a warning; the names below say what the words mean
+_BY_RELATION: Final = {
+    "near": "near|next to|beside|by|close to|closer to|adjacent to|alongside|at|around|against|nearby to|touching|"
+    "attached to|connected to|in the vicinity of|next|surrounding|along|close by|by the side of|at the side of|"
+    "right next to|in reach of|within reach of|leaning on|leaning against",
+    "on": "on|on top of|upon|atop|resting on|on the top of|at the top of|on the surface of|mounted on|on to",
+    "closest_to": "closest to|nearest to|nearest|closest|most close to|nearest from|closest from",
+    "farthest_from": "farthest from|furthest from|farthest to",
+    "far_from": "far from|away from|far away from|clear of|far off",
+    "inside": "in|inside|inside of|within|in the middle of|in the center of|in the centre of|in the corner of",
+    "under": "under|underneath|beneath|below|underneath of",
+    "above": "above|over",
+    "behind": "behind|in back of|at the back of|in the back of",
+    "in_front_of": "in front of|at the front of|before the front of|ahead of",
+    "left_of": "left of|to the left of|on the left of|on the left side of|to the left side of|left to",
+    "right_of": "right of|to the right of|on the right of|on the right side of|to the right side of|right to",
+    "between": "between|in between|among|amongst|amid",
+    "opposite": "opposite|opposite to|across from|facing|opposite of",
+    "outside": "outside|outside of|out in front of",
+    "beyond": "beyond|past|through|across|via",
+    "from": "from|out of|off|off of|from the top of|from on top of|from atop",
+    "from_under": "from under|from underneath|from below|from beneath",
+    "from_inside": "from inside|from within|from inside of",
+    "from_behind": "from behind",
+    "from_near": "from near|from beside|from next to",
+    "to": "to|into|onto|toward|towards|up to|over to|back to|all the way to|down to|inside to|out to",
+    "for": "for",
+    "of": "of",
+    "with": "with|using|by means of|by using",
+}
+PREPOSITIONS: Final = {words: relation for relation, line in _BY_RELATION.items() for words in line.split("|")}
+LONGEST_PREPOSITION: Final = max(len(words.split()) for words in PREPOSITIONS)

@@ -1,0 +1,256 @@
+"""Read a sentence as a row of verbs, noun phrases, prepositions and joints, without yet asking what they mean."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import Enum
+from typing import Final
+
+from gausslite.task import lexicon
+from gausslite.task.phrases import NounPhrase, adjectives_only, noun_phrase
+from gausslite.task.prepositions import LONGEST_PREPOSITION, PREPOSITIONS
+
+_TOKEN: Final = re.compile(r"[^\W\d_][\w'’-]*|\d[\w.]*|[,/&+;.!?:()]")
+_ALSO: Final = re.compile(r"\b(?:as well as|along with|together with|in addition to)\b")
+_BREAKS: Final = frozenset(
+    ". ; : ! ? then while before after until when once if whether where because afterwards".split()
+)
+_RELATIVES: Final = frozenset({"that", "which", "who"})
+_BACK_REFERENCES: Final = frozenset({"it", "them"})
+_PARTICLES_ONLY: Final = frozenset("up down out away back forward backward apart upstairs downstairs".split())
+_LONGEST_NEGATION: Final = max(len(words) for words in lexicon.NEGATIONS)
+_SUPERLATIVES: Final = frozenset({"closest", "nearest"})
+
+
+class Kind(Enum):
+    """What a piece of a sentence is."""
+
+    VERB = "verb"
+    NOUN = "noun"
+    PREPOSITION = "preposition"
+    JOIN = "join"
+    BREAK = "break"
+    NEGATION = "negation"
+    BACK_REFERENCE = "back reference"
+
+
+@dataclass(frozen=True, slots=True)
+class Piece:
+    """One piece: the verb's base form, the preposition's relation, the joint's word, or a noun phrase."""
+
+    kind: Kind
+    word: str
+    noun: NounPhrase | None = None
+    gerund: bool = False
+
+
+def tokens_of(text: str) -> list[str]:
+    """Lower-case words, numbers and the punctuation that matters."""
+    return _TOKEN.findall(_ALSO.sub(" and ", text))
+
+
+def read(text: str) -> list[Piece]:
+    """The pieces of one normalised sentence, in order."""
+    return _Reader(tokens_of(text)).read()
+
+
+def verb_base(word: str) -> str | None:
+    """The base form of a known verb in any of its forms, or None."""
+    if word in lexicon.VERBS:
+        return word
+    if word in lexicon.IRREGULAR_VERBS:
+        return lexicon.IRREGULAR_VERBS[word]
+    for ending, replacements in (
+        ("ies", ("y",)),
+        ("ing", ("", "e")),
+        ("es", ("", "e")),
+        ("s", ("",)),
+        ("ed", ("", "e")),
+    ):
+        if word.endswith(ending) and len(word) > len(ending) + 1:
+            stem = word[: -len(ending)]
+            for replacement in replacements:
+                if stem + replacement in lexicon.VERBS:
+                    return stem + replacement
+    return None
+
+
+class _Reader:
+    """Walks the tokens once, collecting the words of the noun phrase that is open."""
+
+    def __init__(self, tokens: Sequence[str]) -> None:
+        self.tokens = tokens
+        self.at = 0
+        self.pieces: list[Piece] = []
+        self.words: list[str] = []
+        self.determined = False
+        self.superlative = False
+
+    def read(self) -> list[Piece]:
+        while self.at < len(self.tokens):
+            if not (self._negation() or self._preposition()):
+                self._word(self.tokens[self.at])
+                self.at += 1
+        self._close()
+        return self.pieces
+
+    def _peek(self, ahead: int = 1) -> str:
+        position = self.at + ahead
+        return self.tokens[position] if 0 <= position < len(self.tokens) else ""
+
+    def _last(self) -> Kind | None:
+        return self.pieces[-1].kind if self.pieces else None
+
+    def _emit(self, kind: Kind, word: str, gerund: bool = False) -> None:
+        self._close()
+        self.pieces.append(Piece(kind, word, gerund=gerund))
+
+    def _close(self) -> None:
+        """End the open noun phrase."""
+        if self.words:
+            self.pieces.append(
+                Piece(Kind.NOUN, self.words[-1], noun_phrase(self.words, self.determined, self.superlative))
+            )
+        self.words, self.determined, self.superlative = [], False, False
+
+    def _negation(self) -> bool:
+        if self.words and self.tokens[self.at] == "no":
+            return False
+        if self.tokens[self.at] in ("avoid", "avoiding") and self._peek().endswith("ing"):
+            if verb_base(self._peek()) and self._peek() not in lexicon.ADJECTIVES:
+                self._emit(Kind.NEGATION, "avoid")
+                self.at += 1
+                return True
+        for length in range(_LONGEST_NEGATION, 0, -1):
+            words = tuple(self.tokens[self.at : self.at + length])
+            if len(words) == length and words in lexicon.NEGATIONS:
+                self._emit(Kind.NEGATION, " ".join(words))
+                self.at += length
+                return True
+        return False
+
+    def _preposition(self) -> bool:
+        for length in range(LONGEST_PREPOSITION, 0, -1):
+            words = " ".join(self.tokens[self.at : self.at + length])
+            relation = PREPOSITIONS.get(words)
+            if relation is None or len(self.tokens) < self.at + length:
+                continue
+            after = self._peek(length)
+            if words in _SUPERLATIVES and not (self.words and after in lexicon.DETERMINERS):
+                return False
+            if length == 1 and self._is_particle(words, after):
+                self.at += 1
+                return True
+            if self._is_purpose(words, after):
+                self._close()
+                self.at += length
+                return True
+            self._emit(Kind.PREPOSITION, relation)
+            self.at += length
+            return True
+        return False
+
+    def _is_particle(self, word: str, after: str) -> bool:
+        """`on` in "turn on the lamp" and `off` in "turn the lamp off" belong to the verb."""
+        if not self.words and self._last() is Kind.VERB:
+            if word in ("on", "in"):
+                return self.pieces[-1].word in lexicon.ON_IN_PARTICLE_VERBS and word == "on"
+            return word in lexicon.PARTICLES
+        ends = not after or after in lexicon.CONJUNCTIONS or after in _BREAKS
+        return ends and word not in ("to", "of")
+
+    def _is_purpose(self, words: str, after: str) -> bool:
+        """ "to" before a verb, or any preposition before a gerund, opens a clause and not a place."""
+        base = verb_base(after)
+        if base is None:
+            return False
+        if after.endswith("ing") and after not in lexicon.NOUNS:
+            return words in ("to", "for", "by", "before", "after")
+        beyond = self._peek(2)
+        plain_noun = after in lexicon.NOUNS and not self._starts_noun(beyond) and beyond not in lexicon.PARTICLES
+        return words == "to" and not plain_noun
+
+    def _starts_noun(self, word: str) -> bool:
+        known = word in lexicon.CONJUNCTIONS or word in _BREAKS or word in lexicon.FILLERS or word in PREPOSITIONS
+        return bool(word) and not known
+
+    def _word(self, word: str) -> None:
+        if word in _BREAKS:
+            self._emit(Kind.BREAK, word)
+        elif word in lexicon.CONJUNCTIONS or word in "()":
+            self._emit(Kind.JOIN, word)
+        elif word in _BACK_REFERENCES:
+            self._emit(Kind.BACK_REFERENCE, word)
+        elif word in _RELATIVES and (self.words or self._last() is Kind.NOUN):
+            self._close()
+        elif word in lexicon.DETERMINERS or word[0].isdigit() or word.endswith(("'s", "s'")) and len(word) > 3:
+            self._determiner()
+        elif word in _SUPERLATIVES:
+            self.superlative = True
+        elif word in _PARTICLES_ONLY and not (self.determined and not self.words):
+            self._close()
+        elif word in lexicon.PRONOUNS:
+            self._close()
+        elif word in lexicon.STAND_INS:
+            self._close()
+            self.words.append(lexicon.STAND_INS[word])
+            self._close()
+        elif word in lexicon.FILLERS and not self._filler_is_adjective(word):
+            self._close()
+        elif not self._verb(word):
+            self._content(word)
+
+    def _determiner(self) -> None:
+        if self.words:
+            self._close()
+        self.determined = True
+
+    def _filler_is_adjective(self, word: str) -> bool:
+        """ "the standing lamp": a participle between a determiner and a noun describes it."""
+        return self.determined and not self.words and word.endswith("ing") and self._starts_noun(self._peek())
+
+    def _verb(self, word: str) -> bool:
+        """Take the word as a verb if it stands where a verb can stand."""
+        base = verb_base(word)
+        if base is None:
+            return False
+        after, gerund = self._peek(), word.endswith("ing")
+        if self._peek(-1) in _RELATIVES:
+            return True
+        if self.words:
+            return gerund and word not in lexicon.NOUNS and self._participle(after)
+        if self.determined or (self._last() is Kind.PREPOSITION and not gerund):
+            return False
+        if self._last() is Kind.NOUN and gerund and self._participle(after):
+            return True
+        could_be_noun = word in lexicon.NOUNS or noun_phrase([word], False, False).known
+        if could_be_noun and not (self._starts_noun(after) or after in lexicon.PARTICLES):
+            return False
+        self._emit(Kind.VERB, base, gerund)
+        return True
+
+    def _participle(self, after: str) -> bool:
+        """ "the person holding a cup": the cup is beside the person."""
+        if after in lexicon.DETERMINERS:
+            self._emit(Kind.PREPOSITION, "near")
+            return True
+        if after in PREPOSITIONS or not after:
+            self._close()
+            return True
+        return False
+
+    def _content(self, word: str) -> None:
+        if (
+            word.endswith("ly")
+            and word not in lexicon.NOUNS
+            and not (self.determined and not self._starts_noun(self._peek()))
+        ):
+            return
+        # "the red and blue mugs": an adjective on its own waits for the noun of the next phrase
+        if not self.words and self._last() is Kind.JOIN and len(self.pieces) >= 2:
+            before = self.pieces[-2].noun
+            if before is not None and adjectives_only(before.words):
+                self.determined = before.determined
+        self.words.append(word)

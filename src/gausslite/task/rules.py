@@ -1,0 +1,54 @@
+"""Parse tasks by rules: no model, no network, a fraction of a millisecond, the same answer everywhere."""
+
+from __future__ import annotations
+
+from gausslite.domain.task import TaskGraph
+from gausslite.errors import TaskError
+from gausslite.task.graph_builder import GraphBuilder
+from gausslite.task.parser import normalise_text, task_id_of
+from gausslite.task.reading import Kind, Piece, read
+from gausslite.task.validate import EXAMPLE, require_graph, require_task_text
+
+
+class RuleParser:
+    """A TaskParser for English sentences about objects and where they are (Sec. III-B.1)."""
+
+    def parse(self, text: str) -> TaskGraph:
+        """The graph of one task. Raises TaskError."""
+        require_task_text(text)
+        pieces = read(normalise_text(text))
+        _require_sense(text, pieces)
+        builder = GraphBuilder()
+        for before, piece, after in zip([None, *pieces], pieces, [*pieces[1:], None], strict=False):
+            builder.add(before, piece, after)
+        builder.finish()
+        if not builder.targets:
+            raise TaskError(_nothing_named(text, tuple(builder.excluded)))
+        graph = TaskGraph(
+            task_id=task_id_of(text),
+            text=text.strip(),
+            targets=tuple(builder.targets),
+            anchors=tuple(builder.anchors),
+            relations=tuple(builder.relations),
+            warnings=tuple(builder.warnings),
+        )
+        require_graph(graph)
+        return graph
+
+
+def _require_sense(text: str, pieces: list[Piece]) -> None:
+    """Unknown words alone are noise; next to a verb, an article or a preposition they may be rare objects."""
+    nouns = [piece.noun for piece in pieces if piece.noun is not None]
+    structured = any(piece.kind in (Kind.VERB, Kind.PREPOSITION) for piece in pieces)
+    if not structured and not any(noun.known or noun.determined for noun in nouns):
+        raise TaskError(_nothing_named(text, ()))
+
+
+def _nothing_named(text: str, excluded: tuple[str, ...]) -> str:
+    shown = text.strip() if len(text.strip()) <= 60 else text.strip()[:57] + "..."
+    came = (
+        f"only objects to leave alone ({', '.join(excluded)}) in {shown!r}"
+        if excluded
+        else repr(" ".join(shown.split()))
+    )
+    return f"task text: expected an English sentence that names an object, such as {EXAMPLE}, got {came}"

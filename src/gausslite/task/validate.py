@@ -1,0 +1,61 @@
+"""The bounds every parser's answer keeps, whoever gave it: rules, a language model or another machine."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from gausslite.domain.task import TaskGraph
+from gausslite.errors import TaskError
+
+EXAMPLE = "'Pick up the mug on the table'"
+
+
+@dataclass(frozen=True, slots=True)
+class TaskLimits:
+    """How large a task may be."""
+
+    max_text_chars: int = 1000
+    max_targets: int = 16
+    max_anchors: int = 16
+    max_phrase_chars: int = 64
+
+
+LIMITS = TaskLimits()
+
+
+def require_task_text(text: str, limits: TaskLimits = LIMITS) -> None:
+    """Raise TaskError unless the text has a letter in it and is short enough to be one task."""
+    if len(text) > limits.max_text_chars:
+        raise TaskError(f"task text: expected at most {limits.max_text_chars} characters, got {len(text)}")
+    if not any(character.isalpha() for character in text):
+        raise TaskError(f"task text: expected a sentence that names an object, such as {EXAMPLE}, got {text.strip()!r}")
+
+
+def require_graph(graph: TaskGraph, limits: TaskLimits = LIMITS) -> None:
+    """Raise TaskError unless the graph is within bounds and its relations join nouns that it lists."""
+    require_task_text(graph.text, limits)
+    if not graph.targets:
+        raise TaskError(f"task targets: expected at least one object, such as in {EXAMPLE}, got none")
+    _require_phrases("targets", graph.targets, limits.max_targets, limits.max_phrase_chars)
+    _require_phrases("anchors", graph.anchors, limits.max_anchors, limits.max_phrase_chars)
+    for relation in graph.relations:
+        if relation.target not in graph.targets:
+            raise TaskError(
+                f"task relation {relation.predicate}: expected a target as subject, got {relation.target!r}"
+            )
+        if relation.anchor not in graph.anchors:
+            raise TaskError(
+                f"task relation {relation.predicate}: expected an anchor as object, got {relation.anchor!r}"
+            )
+
+
+def _require_phrases(role: str, phrases: tuple[str, ...], max_count: int, max_chars: int) -> None:
+    if len(phrases) > max_count:
+        raise TaskError(f"task {role}: expected at most {max_count} objects, got {len(phrases)}")
+    if len(set(phrases)) != len(phrases):
+        raise TaskError(f"task {role}: expected each object once, got {', '.join(phrases)}")
+    for phrase in phrases:
+        if not phrase.strip() or phrase != phrase.strip() or not phrase.isprintable():
+            raise TaskError(f"task {role}: expected printable phrases without outer spaces, got {phrase!r}")
+        if len(phrase) > max_chars:
+            raise TaskError(f"task {role}: expected phrases of at most {max_chars} characters, got {len(phrase)}")
