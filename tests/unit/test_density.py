@@ -1,0 +1,116 @@
+"""Clone, split and prune: who is chosen, what children inherit, and that the cap holds."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from gausslite.errors import InvalidInputError
+from gausslite.optimize.density import DensitySettings, densify, prune
+from gausslite.optimize.parameters import SplatTable
+from gausslite.render.rasterizer import GRAD_2D_COUNT, GRAD_2D_SUM, LOG_SCALE, LOGIT, MEAN, QUAT, UPDATES
+
+SETTINGS = DensitySettings()
+EXTENT_M = 1.0
+
+
+def table_of(scales_m: list[float], gradients: list[float], capacity: int) -> SplatTable:
+    table, count = SplatTable(capacity), len(scales_m)
+    rows = np.zeros((count, 16), np.float32)
+    rows[:, MEAN] = np.arange(count)[:, None]
+    rows[:, LOG_SCALE] = np.log(np.array(scales_m, np.float32))[:, None]
+    rows[:, QUAT] = (1.0, 0.0, 0.0, 0.0)
+    rows[:, UPDATES] = 9.0
+    target = np.arange(count).astype(np.int16)
+    table.append_rows(rows, target % 2 == 1, (10 * target).astype(np.uint32), target)
+    table.first_moment[:] = 3.0
+    table.second_moment[:] = 4.0
+    table.first_moment[:, GRAD_2D_COUNT] = 5.0
+    table.first_moment[:, GRAD_2D_SUM] = 5.0 * np.array(gradients, np.float32)
+    return table
+
+
+def test_small_ones_are_cloned_large_ones_are_split_and_calm_ones_are_left() -> None:
+    table = table_of([0.001, 0.1, 0.1], [1e-3, 1e-3, 1e-5], capacity=10)
+    before = table.rows.copy()
+    outcome = densify(table, SETTINGS, EXTENT_M, np.random.default_rng(0))
+    assert (outcome.cloned, outcome.split, table.count) == (1, 1, 5)
+    np.testing.assert_array_equal(table.rows[[0, 2]], before[[0, 2]])
+    clone = table.rows[np.flatnonzero(table.target == 0)[1]]
+    np.testing.assert_array_equal(clone[:UPDATES], before[0, :UPDATES])
+    halves = table.rows[table.target == 1]
+    np.testing.assert_allclose(halves[:, LOG_SCALE], np.log(0.1 / 1.6), rtol=1e-5)
+    assert (np.abs(halves[:, MEAN] - 1.0) < 0.6).all()
+    assert not np.array_equal(halves[0], halves[1])
+
+
+def test_children_inherit_and_start_with_fresh_optimiser_state_while_the_others_keep_theirs() -> None:
+    table = table_of([0.001, 0.1, 0.1], [1e-3, 1e-3, 1e-5], capacity=10)
+    densify(table, SETTINGS, EXTENT_M, np.random.default_rng(0))
+    np.testing.assert_array_equal(table.kappa, 10 * table.target)
+    np.testing.assert_array_equal(table.active, table.target % 2 == 1)
+    kept, fresh = [0, 2], [1, 3, 4]
+    assert (table.first_moment[kept, :LOGIT] == 3.0).all()
+    assert (table.second_moment[kept] == 4.0).all()
+    assert (table.rows[kept, UPDATES] == 9.0).all()
+    assert not table.first_moment[fresh].any()
+    assert not table.second_moment[fresh].any()
+    assert not table.rows[fresh, UPDATES].any()
+
+
+def test_statistics_start_anew() -> None:
+    table = table_of([0.001] * 3, [1e-3] * 3, capacity=10)
+    densify(table, SETTINGS, EXTENT_M, np.random.default_rng(0))
+    assert not table.first_moment[:, [GRAD_2D_SUM, GRAD_2D_COUNT]].any()
+
+
+def test_where_room_is_short_the_largest_gradients_go_first() -> None:
+    table = table_of([0.001] * 5, [3e-3, 5e-3, 1e-3, 4e-3, 2e-3], capacity=7)
+    densify(table, SETTINGS, EXTENT_M, np.random.default_rng(0))
+    assert table.count == 7
+    assert sorted(table.target[5:]) == [1, 3]
+
+
+def test_a_full_table_is_left_alone() -> None:
+    table = table_of([0.1] * 4, [1.0] * 4, capacity=4)
+    before = table.rows.copy()
+    outcome = densify(table, SETTINGS, EXTENT_M, np.random.default_rng(0))
+    assert (outcome.cloned, outcome.split) == (0, 0)
+    np.testing.assert_array_equal(table.rows, before)
+
+
+def test_a_gaussian_never_seen_is_not_densified() -> None:
+    table = table_of([0.1], [1.0], capacity=4)
+    table.first_moment[:, [GRAD_2D_SUM, GRAD_2D_COUNT]] = 0.0
+    densify(table, SETTINGS, EXTENT_M, np.random.default_rng(0))
+    assert table.count == 1
+
+
+def test_split_follows_the_rotation_of_an_elongated_gaussian() -> None:
+    table = SplatTable(4000)
+    rows = np.zeros((2000, 16), np.float32)
+    rows[:, LOG_SCALE] = np.log(np.array([1.0, 1e-3, 1e-3], np.float32))
+    rows[:, QUAT] = (np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5))  # a quarter turn about z: x becomes y
+    table.append_rows(rows, np.zeros(2000, np.bool_), np.zeros(2000, np.uint32), np.zeros(2000, np.int16))
+    table.first_moment[:, [GRAD_2D_SUM, GRAD_2D_COUNT]] = 1.0
+    densify(table, SETTINGS, EXTENT_M, np.random.default_rng(0))
+    np.testing.assert_allclose(table.rows[:, MEAN].std(axis=0), [1e-3, 1.0, 1e-3], rtol=0.05)
+
+
+def test_prune_drops_the_transparent() -> None:
+    table = table_of([0.1] * 3, [0.0] * 3, capacity=4)
+    table.rows[:, LOGIT] = (-6.0, 0.0, -5.0)
+    assert prune(table, SETTINGS) == 1
+    assert table.target.tolist() == [1, 2]
+
+
+def test_an_empty_table_survives_both() -> None:
+    table = SplatTable(4)
+    densify(table, SETTINGS, EXTENT_M, np.random.default_rng(0))
+    assert prune(table, SETTINGS) == 0
+
+
+@pytest.mark.parametrize("wrong", [{"densify_every": 0}, {"prune_every": -1}, {"min_opacity": float("nan")}])
+def test_settings_name_what_is_wrong(wrong: dict[str, float]) -> None:
+    with pytest.raises(InvalidInputError, match=next(iter(wrong))):
+        DensitySettings(**wrong)
