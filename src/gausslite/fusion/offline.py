@@ -1,0 +1,15 @@
+"""Fuse whole maps from files, as the server would have fused what their robots sent."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from gausslite.domain.gaussians import Gaussians
+from gausslite.domain.voxels import VoxelGrid
+from gausslite.fusion.vote import FusedMap, fuse
+from gausslite.fusion.words import words_of
+
+
+def fuse_maps(maps: Mapping[str, Gaussians], grid: VoxelGrid) -> FusedMap:
+    """The voxel vote over complete maps by agent id (Sec. III-E). Raises InvalidInputError for means out of reach."""
+    return fuse({agent_id: words_of(gaussians, grid) for agent_id, gaussians in maps.items()})

@@ -1,0 +1,69 @@
+"""Make, cut and unite words on voxels."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Int64
+from numpy import ndarray
+from numpy.typing import NDArray
+
+from gausslite.domain.gaussians import Gaussians
+from gausslite.domain.subset import VoxelWords
+from gausslite.domain.voxels import VoxelGrid
+
+
+def no_words() -> VoxelWords:
+    """Nothing said about any voxel."""
+    return VoxelWords(np.zeros(0, np.int64), np.zeros(0, np.uint64), np.zeros(0, np.uint32), Gaussians.empty())
+
+
+def words_of(gaussians: Gaussians, grid: VoxelGrid) -> VoxelWords:
+    """A whole map as words: its Gaussians sorted by voxel (stable within one) and the totals of each."""
+    keys = grid.keys(gaussians.means_m)
+    order = np.argsort(keys, kind="stable")
+    present, counts = np.unique(keys, return_counts=True)
+    owner = np.searchsorted(present, keys)
+    sums = np.zeros(len(present), np.uint64)
+    np.add.at(sums, owner, gaussians.kappa.astype(np.uint64))
+    return VoxelWords(present, sums, counts.astype(np.uint32), gaussians.take(order))
+
+
+def tombstones(keys: Int64[ndarray, " k"]) -> VoxelWords:
+    """The word "nothing is here any more" on each of these ascending voxels."""
+    return VoxelWords(keys, np.zeros(len(keys), np.uint64), np.zeros(len(keys), np.uint32), Gaussians.empty())
+
+
+def unite(a: VoxelWords, b: VoxelWords) -> VoxelWords:
+    """The words of both, which must have no voxel in common."""
+    keys = np.concatenate([a.keys, b.keys])
+    order = np.argsort(keys, kind="stable")
+    counts = np.concatenate([a.counts, b.counts])
+    starts = np.cumsum(counts, dtype=np.int64) - counts
+    rows = gather_rows(starts[order], counts[order])
+    sums = np.concatenate([a.kappa_sums, b.kappa_sums])
+    return VoxelWords(
+        keys[order], sums[order], counts[order], Gaussians.concatenate([a.gaussians, b.gaussians]).take(rows)
+    )
+
+
+def gather_rows(starts: NDArray[Any], counts: NDArray[Any]) -> NDArray[np.int64]:
+    """The indices start, start + 1, … of every run (start, count), run after run."""
+    ends = np.cumsum(counts, dtype=np.int64)
+    total = int(ends[-1]) if len(ends) else 0
+    shift = np.repeat(starts.astype(np.int64) - (ends - counts), counts)
+    rows: NDArray[np.int64] = np.arange(total, dtype=np.int64) + shift
+    return rows
+
+
+def take_voxels(words: VoxelWords, keep: Bool[ndarray, " v"]) -> VoxelWords:
+    """The words on the voxels where `keep` is true."""
+    counts = words.counts[keep]
+    rows = gather_rows(words.offsets[:-1][keep], counts)
+    return VoxelWords(words.keys[keep], words.kappa_sums[keep], counts, words.gaussians.take(rows))
+
+
+def at_keys(words: VoxelWords, keys: Int64[ndarray, " k"]) -> VoxelWords:
+    """The words on those of these voxels that have one; keys in any order."""
+    return take_voxels(words, np.isin(words.keys, keys))
