@@ -9,7 +9,9 @@ import pytest
 from gausslite.errors import KernelError
 from gausslite.render.rasterizer import Rasterizer
 
-pytest.importorskip("torch", reason="the oracle needs torch, which is not installed")
+torch = pytest.importorskip("torch", reason="the oracle needs torch, which is not installed")
+# the oracle's tensors are small: more threads only wait for each other
+torch.set_num_threads(1)
 
 
 def _reference() -> Rasterizer:

@@ -1,4 +1,4 @@
-"""Scenes that every backend must draw alike, from the ordinary to the hostile, and what a fair comparison leaves out."""
+"""Scenes that every backend must draw alike, the ordinary and the hostile, and what a fair comparison leaves out."""
 
 from __future__ import annotations
 

@@ -33,9 +33,7 @@ def test_gradients_match_the_oracle(rasterizer: Rasterizer, oracle: Rasterizer, 
 
 
 @pytest.mark.parametrize("channel", range(3))
-def test_each_image_alone_gives_the_oracles_gradients(
-    rasterizer: Rasterizer, oracle: Rasterizer, channel: int
-) -> None:
+def test_each_image_alone_gives_the_oracles_gradients(rasterizer: Rasterizer, oracle: Rasterizer, channel: int) -> None:
     scene = SCENES["medium splats"]()
     d_images = [d if i == channel else np.zeros_like(d) for i, d in enumerate(random_image_gradients(scene))]
     came, wanted = (

@@ -141,7 +141,7 @@ class ReferenceRasterizer:
         _adam(rows, first_moment, second_moment, d_rows, moving, adam)
         first_moment[moving, GRAD_2D_SUM] += norms[updated].astype(np.float32)
         first_moment[moving, GRAD_2D_COUNT] += 1.0
-        return StepReport(float(value), visible.astype(np.uint32))
+        return StepReport(value.item(), visible.astype(np.uint32))
 
 
 def _draw(

@@ -1,0 +1,149 @@
+"""The oracle itself, against finite differences and against sums done by hand."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from splat_scenes import CAMERA, GROUPS, SCENES, Scene, random_image_gradients, relative_error, turned
+
+from gausslite.render.rasterizer import LossWeights, Rasterizer
+from gausslite.render.reference.compositing import draw
+from gausslite.render.reference.loss import ReferenceView, ssim_map, training_loss
+from gausslite.render.reference.projection import project
+
+STEP = 1e-6
+
+
+def scalar(scene: Scene, rows: np.ndarray, T_camera_world: np.ndarray, d_images: np.ndarray) -> float:
+    ellipses = project(torch.from_numpy(rows), scene.camera, torch.from_numpy(T_camera_world))
+    return float((draw(ellipses, scene.camera, None).numpy() * d_images).sum())
+
+
+def exp_twist(twist: np.ndarray) -> np.ndarray:
+    generator = np.zeros((4, 4))
+    x, y, z = twist[3:]
+    generator[:3, :3] = [[0, -z, y], [z, 0, -x], [-y, x, 0]]
+    generator[:3, 3] = twist[:3]
+    return torch.linalg.matrix_exp(torch.from_numpy(generator)).numpy()
+
+
+@pytest.mark.parametrize("name", ["medium splats", "large splats", "outside the view", "needles and sheets"])
+def test_row_gradients_match_finite_differences(oracle: Rasterizer, name: str) -> None:
+    scene = SCENES[name]()
+    d_rgb, d_depth_m, d_alpha = random_image_gradients(scene)
+    d_images = np.concatenate([d_rgb, d_depth_m[..., None], d_alpha[..., None]], axis=2).astype(np.float64)
+    drawn = oracle.forward(scene.rows, scene.camera, scene.T_camera_world)
+    came = oracle.backward(drawn, d_rgb, d_depth_m, d_alpha)
+    chosen = np.random.default_rng(0).choice(came.visible, 6, replace=False)
+    rows = scene.rows.astype(np.float64)
+    wanted = np.zeros((len(chosen), 14))
+    for i, row in enumerate(chosen):
+        for column in range(14):
+            low, high = rows.copy(), rows.copy()
+            low[row, column] -= STEP
+            high[row, column] += STEP
+            wanted[i, column] = (
+                scalar(scene, high, scene.T_camera_world, d_images) - scalar(scene, low, scene.T_camera_world, d_images)
+            ) / (2 * STEP)
+    for group, columns in GROUPS.items():
+        assert relative_error(came.d_rows[chosen][:, columns], wanted[:, columns]) < 1e-5, group
+
+
+def test_the_pose_gradient_matches_finite_differences(oracle: Rasterizer) -> None:
+    scene = SCENES["medium splats"]()
+    d_rgb, d_depth_m, d_alpha = random_image_gradients(scene)
+    d_images = np.concatenate([d_rgb, d_depth_m[..., None], d_alpha[..., None]], axis=2).astype(np.float64)
+    drawn = oracle.forward(scene.rows, scene.camera, scene.T_camera_world)
+    came = oracle.backward(drawn, d_rgb, d_depth_m, d_alpha).d_twist
+    rows = scene.rows.astype(np.float64)
+    wanted = [
+        scalar(scene, rows, exp_twist(STEP * axis) @ scene.T_camera_world, d_images)
+        - scalar(scene, rows, exp_twist(-STEP * axis) @ scene.T_camera_world, d_images)
+        for axis in np.eye(6)
+    ]
+    assert relative_error(came, np.array(wanted) / (2 * STEP)) < 1e-5
+
+
+def test_the_2d_norm_is_the_gradient_of_a_shift_of_the_image(oracle: Rasterizer) -> None:
+    """Moving the principal point moves every mean in the image alike, so one splat alone shows its own norm."""
+    rows = SCENES["large splats"]().rows[:1]
+    rows[0, :3] = [0.1, 0.05, 1.5]
+    scene = Scene(rows, CAMERA, np.eye(4))
+    d_rgb, d_depth_m, d_alpha = random_image_gradients(scene)
+    came = oracle.backward(oracle.forward(rows, CAMERA, np.eye(4)), d_rgb, d_depth_m, d_alpha).mean_2d_norm
+
+    def shifted(dx: float, dy: float) -> float:
+        camera = type(CAMERA)(52.0, 50.0, CAMERA.cx_px + dx, CAMERA.cy_px + dy, 64, 48)
+        drawn = draw(project(torch.from_numpy(rows.astype(np.float64)), camera, torch.eye(4).double()), camera, None)
+        return float((drawn.numpy() * np.dstack([d_rgb, d_depth_m, d_alpha])).sum())
+
+    by_x = (shifted(STEP, 0) - shifted(-STEP, 0)) / (2 * STEP)
+    by_y = (shifted(0, STEP) - shifted(0, -STEP)) / (2 * STEP)
+    assert came[0] == pytest.approx(np.hypot(by_x * 32, by_y * 24), rel=1e-4)
+
+
+def test_two_splats_blend_front_over_back(oracle: Rasterizer) -> None:
+    rows = np.zeros((2, 16), np.float32)
+    rows[:, 6] = 1.0
+    rows[:, 3:6] = np.log(3.0)
+    rows[:, 2] = [4.0, 2.0]
+    rows[0, 11:14], rows[1, 11:14] = [0, 0, 1], [1, 0, 0]
+    rows[:, 10] = np.log(0.5 / 0.5)
+    drawn = oracle.forward(rows, CAMERA, np.eye(4))
+    np.testing.assert_allclose(drawn.rgb[23, 32], [0.5, 0.0, 0.25], atol=1e-3)
+    np.testing.assert_allclose(drawn.depth_m[23, 32], 0.5 * 2.0 + 0.25 * 4.0, atol=1e-2)
+    np.testing.assert_allclose(drawn.alpha[23, 32], 0.75, atol=1e-3)
+
+
+def test_a_wall_of_opaque_splats_lets_a_hundredth_through_each(oracle: Rasterizer) -> None:
+    rows = np.zeros((3, 16), np.float32)
+    rows[:, 6] = 1.0
+    rows[:, 3:6] = np.log(5.0)
+    rows[:, 2] = [1.0, 2.0, 3.0]
+    rows[:, 10] = 50.0
+    drawn = oracle.forward(rows, CAMERA, turned(0.0))
+    assert drawn.alpha[24, 32] == pytest.approx(1.0 - 0.01**3, abs=1e-7)
+
+
+def test_the_loss_terms_are_the_sums_of_their_definition() -> None:
+    rng = np.random.default_rng(0)
+    images, rgb = rng.random((7, 9, 5)), rng.random((7, 9, 3))
+    depth_m = np.where(rng.random((7, 9)) < 0.7, rng.uniform(0.5, 3.0, (7, 9)), 0.0)
+    weight = np.where(rng.random((7, 9)) < 0.5, rng.random((7, 9)), 0.0)
+    view = ReferenceView(CAMERA, *(torch.from_numpy(a) for a in (rgb, depth_m, weight)))
+    for masked, w in ((False, np.ones((7, 9))), (True, weight)):
+        colour = depth = structure = 0.0
+        similarity = _ssim_by_hand(images[..., :3], rgb)
+        for y in range(7):
+            for x in range(9):
+                colour += w[y, x] * np.abs(images[y, x, :3] - rgb[y, x]).sum()
+                structure += w[y, x] * similarity[y, x].sum()
+                if images[y, x, 4] > 0.5 and depth_m[y, x] > 0:
+                    depth += w[y, x] * abs(images[y, x, 3] / images[y, x, 4] - depth_m[y, x])
+        total = w.sum()
+        wanted = 0.7 * colour / (3 * total) + 0.9 * depth / total + 0.3 * (1 - structure / (3 * total))
+        came = training_loss(torch.from_numpy(images), view, LossWeights(0.7, 0.9, 0.3), masked)
+        assert came.item() == pytest.approx(wanted, rel=1e-10)
+
+
+def _ssim_by_hand(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """SSIM by its window sums, pixel by pixel, with zeros outside the image."""
+    offsets = np.arange(-5, 6)
+    window = np.exp(-(offsets[:, None] ** 2 + offsets[None, :] ** 2) / (2 * 1.5**2))
+    window = (window / window.sum())[..., None]
+    a, b = (np.pad(image, ((5, 5), (5, 5), (0, 0))) for image in (a, b))
+    out = np.zeros((a.shape[0] - 10, a.shape[1] - 10, 3))
+    for y in range(out.shape[0]):
+        for x in range(out.shape[1]):
+            p, q = a[y : y + 11, x : x + 11], b[y : y + 11, x : x + 11]
+            mp, mq = (window * p).sum((0, 1)), (window * q).sum((0, 1))
+            vp, vq = (window * p * p).sum((0, 1)) - mp**2, (window * q * q).sum((0, 1)) - mq**2
+            cov = (window * p * q).sum((0, 1)) - mp * mq
+            out[y, x] = (2 * mp * mq + 1e-4) * (2 * cov + 9e-4) / ((mp**2 + mq**2 + 1e-4) * (vp + vq + 9e-4))
+    return out
+
+
+def test_identical_images_are_perfectly_similar() -> None:
+    image = torch.rand(20, 20, 3, dtype=torch.float64)
+    np.testing.assert_allclose(ssim_map(image, image).numpy(), 1.0)
