@@ -26,7 +26,12 @@ def add_regions(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--roi", metavar="FILE.npz", type=Path, help="voxel file of ground-truth regions")
     parser.add_argument("--objects", metavar="A,B", type=names, default=(), help="objects of --roi (default: all)")
     parser.add_argument(
-        "--roi-ball", metavar="X,Y,Z,R", type=ball, action="append", default=[], help="a ball in metres; may be repeated"
+        "--roi-ball",
+        metavar="X,Y,Z,R",
+        type=ball,
+        action="append",
+        default=[],
+        help="a ball in metres; may be repeated",
     )
 
 

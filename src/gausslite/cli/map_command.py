@@ -1,0 +1,149 @@
+"""`gausslite map`: one sequence, one task, one map."""
+
+from __future__ import annotations
+
+import argparse
+import resource
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from gausslite.cli.arguments import add_mapping, add_regions, add_source, named_regions, names
+from gausslite.cli.output import prepare_folder, write_json
+from gausslite.cli.parse_command import as_json
+from gausslite.cli.progress import MappingBar
+from gausslite.codec.ply import write_ply
+from gausslite.datasets.open import open_source
+from gausslite.datasets.selection import select_frames
+from gausslite.datasets.source import Source
+from gausslite.domain.task import TaskGraph
+from gausslite.errors import InvalidInputError
+from gausslite.mapping.policies import POLICIES
+from gausslite.mission import (
+    DEFAULT_MAX_GAUSSIANS,
+    MissionSettings,
+    build_attention,
+    build_detector,
+    build_mapper,
+    choose_regions,
+    frame_size,
+)
+from gausslite.perception.attention import Attention
+from gausslite.perception.fixed import RegionAttention
+from gausslite.pipeline import FrameOutcome, TaskMapper
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `gausslite map`."""
+    add_source(parser)
+    parser.add_argument(
+        "--task", metavar="TEXT", help='what the robot is to do, such as "Pick up the mug on the table"'
+    )
+    parser.add_argument("--detector", metavar="FILE.onnx", type=Path, help="a YOLO-seg model (default: ground truth)")
+    add_regions(parser)
+    parser.add_argument("--policy", choices=sorted(POLICIES), default="task", help="how to spend the budget")
+    parser.add_argument("--without", metavar="A,B", type=names, default=(), help="components off: sb mvo roi sis gfd")
+    add_mapping(parser, DEFAULT_MAX_GAUSSIANS)
+    parser.add_argument("--out", metavar="DIR", type=Path, required=True, help="gets map.ply and report.json")
+    parser.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Map the sequence and write the results."""
+    settings = _settings(options)
+    source = open_source(options.source, options.up)
+    positions = select_frames(source, options.frames)
+    size = frame_size(options.size, source)
+    attention, graph = _attention(options, source, settings)
+    mapper = TaskMapper(attention, build_mapper(settings), seconds_per_frame=settings.seconds_per_frame)
+    prepare_folder(options.out)
+    mission = _play(source, positions, size, mapper)
+    gaussians = mapper.gaussians()
+    write_ply(options.out / "map.ply", gaussians)
+    active = int(gaussians.active.sum())
+    report = {
+        "source": options.source,
+        "task": None if graph is None else {"text": graph.text, **as_json(graph)},
+        "policy": options.policy,
+        "without": sorted(settings.without),
+        "size": list(size),
+        "seed": settings.seed,
+        **mission.summary(),
+        "gaussians": len(gaussians),
+        "active_gaussians": active,
+        "max_gaussians": settings.max_gaussians,
+        "peak_rss_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+        "notes": list(attention.notes),
+    }
+    write_json(options.out / "report.json", report)
+    print(
+        f"{report['frames']} frames at {report['hz']:.1f} Hz, {len(gaussians)} Gaussians "
+        f"({active} of the task) → {options.out / 'map.ply'}"
+    )
+    return 0
+
+
+@dataclass(frozen=True, slots=True)
+class _Mission:
+    """The outcomes of all frames, and the time they took."""
+
+    outcomes: tuple[FrameOutcome, ...]
+    seconds: float
+
+    def summary(self) -> dict[str, object]:
+        """Totals for the report; hz is mapped frames per second of perception and mapping, without reading files."""
+        mapped = [outcome for outcome in self.outcomes if outcome.skipped is None]
+        busy_s = sum(outcome.seconds for outcome in mapped)
+        return {
+            "frames": len(mapped),
+            "frames_skipped": len(self.outcomes) - len(mapped),
+            "iterations": sum(outcome.iterations for outcome in mapped),
+            "roi_share": sum(outcome.roi_share for outcome in mapped) / max(len(mapped), 1),
+            "hz": len(mapped) / busy_s if busy_s > 0 else 0.0,
+            "seconds": self.seconds,
+        }
+
+
+def _play(source: Source, positions: Sequence[int], size: tuple[int, int], mapper: TaskMapper) -> _Mission:
+    started_s = time.perf_counter()
+    outcomes: list[FrameOutcome] = []
+    with MappingBar(len(positions)) as bar:
+        for position in positions:
+            outcomes.append(mapper.process(source.frame(position, size)))
+            bar.show(len(outcomes), outcomes[-1].gaussians, outcomes[-1].roi_share)
+    return _Mission(tuple(outcomes), time.perf_counter() - started_s)
+
+
+def _attention(
+    options: argparse.Namespace, source: Source, settings: MissionSettings
+) -> tuple[Attention, TaskGraph | None]:
+    """A task in words, or regions of space, or (for a uniform map) nothing to attend to."""
+    regions = named_regions(options)
+    if options.task is not None and regions:
+        raise InvalidInputError("--task: give either a task in words, or regions with --roi or --roi-ball, not both")
+    if options.detector is not None and options.task is None:
+        raise InvalidInputError("--detector: finds the nouns of a task; give the task with --task TEXT")
+    if options.task is not None:
+        from gausslite.task.rules import RuleParser
+
+        graph = RuleParser().parse(options.task)
+        detector = build_detector(options.detector, source.regions(), settings.threads)
+        return build_attention(graph, detector, source.up_axis), graph
+    if not regions and options.policy != "uniform":
+        raise InvalidInputError(
+            "--task: expected a task in words, or regions with --roi FILE.npz or --roi-ball X,Y,Z,R"
+        )
+    return RegionAttention(choose_regions(regions, options.objects) if regions else ()), None
+
+
+def _settings(options: argparse.Namespace) -> MissionSettings:
+    return MissionSettings(
+        policy=options.policy,
+        without=frozenset(options.without),
+        max_gaussians=options.max_gaussians,
+        iterations=options.iterations,
+        rate_hz=options.rate,
+        seed=options.seed,
+        threads=options.threads,
+    )
