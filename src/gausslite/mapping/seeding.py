@@ -92,7 +92,7 @@ class Seeder:
         return max(1, round(seeds * frame.depth_m.size / _REFERENCE_PIXELS))
 
     def _pixel_weight(self, frame: Frame) -> Float32[ndarray, "h w"]:
-        """GFD: P ∝ E + ε, with ε a fraction of the image's mean edge magnitude; without GFD uniform."""
+        """GFD: P ∝ E + ε; without it uniform."""
         if not self._components.gfd:
             return np.ones(frame.depth_m.shape, np.float32)
         edges = edge_magnitude(frame.rgb)

@@ -52,7 +52,7 @@ class SeedingSettings:
     opacity: float = 0.5
     roi_scale: float = 0.5
     background_scale: float = 0.7
-    edge_floor: float = 0.05
+    edge_floor: float = 0.01
 
     def __post_init__(self) -> None:
         for name in ("first_frame_seeds", "later_seeds"):

@@ -1,0 +1,72 @@
+"""Who gives way when seeds come to a full table, and that the cap holds at every instant."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gausslite.domain.gaussians import Gaussians
+from gausslite.mapping.budget import insert
+from gausslite.mapping.seeding import Seeds
+from gausslite.optimize.parameters import SplatTable
+
+NEWBORN = 0.5
+
+
+def gaussians(opacities: list[float], active: bool, target: int = -1) -> Gaussians:
+    count = len(opacities)
+    return Gaussians(
+        means_m=np.zeros((count, 3), np.float32),
+        quats_wxyz=np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1)),
+        scales_m=np.full((count, 3), 0.01, np.float32),
+        opacities=np.array(opacities, np.float32),
+        rgb=np.zeros((count, 3), np.float32),
+        active=np.full(count, active),
+        kappa=np.zeros(count, np.uint32),
+        target=np.full(count, target, np.int16),
+    )
+
+
+def full_table() -> SplatTable:
+    table = SplatTable(6)
+    table.append(gaussians([0.9, 0.2, 0.7], active=False))
+    table.append(gaussians([0.1, 0.8, 0.3], active=True))
+    return table
+
+
+def insert_into(table: SplatTable, roi: int, rest: int) -> int:
+    seeds = Seeds(gaussians([NEWBORN] * roi, True, 7), gaussians([NEWBORN] * rest, False, 8))
+    return insert(table, seeds, NEWBORN, np.random.default_rng(0))
+
+
+def test_with_room_nobody_gives_way() -> None:
+    table = SplatTable(10)
+    table.append(gaussians([0.1, 0.2], active=False))
+    assert insert_into(table, 3, 4) == 7
+    assert table.count == 9
+
+
+def test_for_the_task_the_faintest_inactive_gives_way_first_then_the_faintest_active() -> None:
+    table = full_table()
+    assert insert_into(table, 2, 0) == 2
+    np.testing.assert_allclose(np.sort(table.opacities), [0.1, 0.3, 0.5, 0.5, 0.8, 0.9], rtol=1e-4)
+    table = full_table()
+    insert_into(table, 4, 0)
+    np.testing.assert_allclose(np.sort(table.opacities), [0.3, 0.5, 0.5, 0.5, 0.5, 0.8], rtol=1e-4)
+
+
+def test_for_the_rest_only_inactive_ones_fainter_than_a_newborn_give_way() -> None:
+    table = full_table()
+    assert insert_into(table, 0, 5) == 1
+    np.testing.assert_allclose(np.sort(table.opacities), [0.1, 0.3, 0.5, 0.7, 0.8, 0.9], rtol=1e-4)
+
+
+def test_the_tasks_seeds_are_served_before_the_rest() -> None:
+    table = SplatTable(5)
+    assert insert_into(table, 4, 4) == 5
+    assert (table.target == 7).sum() == 4
+
+
+def test_more_seeds_of_the_task_than_the_whole_cap() -> None:
+    table = full_table()
+    assert insert_into(table, 50, 50) == 6
+    assert (table.target == 7).all()

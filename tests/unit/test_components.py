@@ -1,0 +1,39 @@
+"""Laws of the mapper that hold for every combination of its components."""
+
+from __future__ import annotations
+
+from itertools import product
+
+import numpy as np
+import pytest
+from mapping_scenes import middle_relevance, wall_frame
+
+from gausslite.mapping.mapper import GaussianMapper
+from gausslite.mapping.settings import Components, KeyframeSettings, MapperSettings, SeedingSettings
+from gausslite.optimize.density import DensitySettings
+from gausslite.render.reference import ReferenceRasterizer
+
+SIZE = (32, 24)
+
+
+@pytest.mark.parametrize(
+    "switches", list(product((False, True), repeat=5)), ids=lambda on: "".join("01"[x] for x in on)
+)
+def test_every_combination_maps_within_the_cap(switches: tuple[bool, ...]) -> None:
+    components = Components(*switches)
+    settings = MapperSettings(
+        max_gaussians=150,
+        components=components,
+        seeding=SeedingSettings(later_seeds=60_000),
+        keyframes=KeyframeSettings(every=1, window=2),
+        density=DensitySettings(densify_every=3, prune_every=4),
+    )
+    mapper = GaussianMapper(settings, ReferenceRasterizer(), seed=0)
+    for index in range(2):
+        frame = wall_frame(index, SIZE, shift_m=0.2 * index)
+        mapper.map_frame(frame, middle_relevance(frame))
+        assert 0 < mapper.count <= 150
+    gaussians = mapper.gaussians()
+    assert np.isfinite(gaussians.means_m).all()
+    assert gaussians.active.any()
+    assert bool(gaussians.kappa.any()) == components.roi

@@ -1,0 +1,48 @@
+"""Which frames are kept, and which tiles of them belong to the task."""
+
+from __future__ import annotations
+
+import numpy as np
+from mapping_scenes import middle_relevance, wall_frame
+
+from gausslite.domain.relevance import RelevanceMap
+from gausslite.mapping.keyframes import Keyframe, KeyframeStore, tiles_of, window_view
+from gausslite.mapping.settings import KeyframeSettings
+from gausslite.render.reference import ReferenceRasterizer
+
+
+def stored(settings: KeyframeSettings, frames: int) -> KeyframeStore:
+    store, rasterizer = KeyframeStore(settings), ReferenceRasterizer()
+    for index in range(frames):
+        frame = wall_frame(index)
+        store.offer(window_view(Keyframe(frame, middle_relevance(frame)), rasterizer, settings.roi_margin_px))
+    return store
+
+
+def test_every_fifth_frame_is_kept_and_the_window_holds_the_latest() -> None:
+    store = stored(KeyframeSettings(every=5, window=3), 23)
+    assert [view.keyframe.frame.index for view in store.window] == [10, 15, 20]
+    assert [keyframe.frame.index for keyframe in store.buffer] == [0, 5, 10, 15, 20]
+
+
+def test_the_buffer_is_bounded_and_stays_spread_over_the_mission() -> None:
+    store = stored(KeyframeSettings(every=1, window=2, buffer=8), 64)
+    kept = [keyframe.frame.index for keyframe in store.buffer]
+    assert len(kept) == 8
+    assert (kept[0], kept[-1]) == (0, 63)
+    assert max(np.diff(kept)) <= 20
+
+
+def test_tiles_touch_the_region_and_its_margin() -> None:
+    region = np.zeros((40, 64), np.bool_)
+    region[0:12, 20:28] = True
+    expected = np.zeros((3, 4), np.bool_)
+    expected[0:2, 0:3] = True
+    np.testing.assert_array_equal(tiles_of(region, 5), expected)
+    assert not tiles_of(np.zeros((40, 64), np.bool_), 5).any()
+
+
+def test_a_view_knows_whether_it_shows_the_region() -> None:
+    frame, rasterizer = wall_frame(), ReferenceRasterizer()
+    assert window_view(Keyframe(frame, middle_relevance(frame)), rasterizer, 5).shows_region
+    assert not window_view(Keyframe(frame, RelevanceMap.nothing(48, 64)), rasterizer, 5).shows_region
