@@ -82,7 +82,7 @@ class _FusionStrategyEnumTypeWrapper(_enum_type_wrapper._EnumTypeWrapper[_Fusion
     FUSION_STRATEGY_CONCATENATION: _FusionStrategy.ValueType  # 2
     """Everything of everyone."""
     FUSION_STRATEGY_REFINED: _FusionStrategy.ValueType  # 3
-    """The result of the latest RefineFusedMap; NOT_FOUND before there is one."""
+    """The result of the latest RefineFusedMap; FAILED_PRECONDITION before there is one."""
 
 class FusionStrategy(_FusionStrategy, metaclass=_FusionStrategyEnumTypeWrapper): ...
 
@@ -92,7 +92,7 @@ FUSION_STRATEGY_VOTE: FusionStrategy.ValueType  # 1
 FUSION_STRATEGY_CONCATENATION: FusionStrategy.ValueType  # 2
 """Everything of everyone."""
 FUSION_STRATEGY_REFINED: FusionStrategy.ValueType  # 3
-"""The result of the latest RefineFusedMap; NOT_FOUND before there is one."""
+"""The result of the latest RefineFusedMap; FAILED_PRECONDITION before there is one."""
 Global___FusionStrategy: _TypeAlias = FusionStrategy  # noqa: Y015
 
 @_typing.final

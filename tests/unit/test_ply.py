@@ -1,0 +1,155 @@
+"""PLY maps: what was written is read, other tools understand it, and damage is one line."""
+
+from __future__ import annotations
+
+import resource
+from pathlib import Path
+
+import gsply
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gausslite.codec.ply import gaussians_from_ply, ply_bytes, read_ply, write_ply
+from gausslite.domain.gaussians import Gaussians
+from gausslite.errors import MapFileError, StorageError
+
+
+def some_gaussians(n: int = 50) -> Gaussians:
+    rng = np.random.default_rng(1)
+    quats = rng.normal(size=(n, 4)).astype(np.float32)
+    return Gaussians(
+        rng.normal(size=(n, 3)).astype(np.float32),
+        quats / np.linalg.norm(quats, axis=1, keepdims=True),
+        rng.uniform(0.001, 0.3, (n, 3)).astype(np.float32),
+        rng.uniform(0.01, 0.99, n).astype(np.float32),
+        rng.uniform(-0.1, 1.1, (n, 3)).astype(np.float32),
+        rng.random(n) < 0.5,
+        rng.integers(0, 2**24, n, dtype=np.uint32),
+        rng.integers(-1, 5, n, dtype=np.int16),
+    )
+
+
+def assert_same(got: Gaussians, sent: Gaussians) -> None:
+    for name in ("active", "kappa", "target", "means_m", "quats_wxyz"):
+        np.testing.assert_array_equal(getattr(got, name), getattr(sent, name))
+    for name in ("scales_m", "opacities", "rgb"):
+        np.testing.assert_allclose(getattr(got, name), getattr(sent, name), rtol=2e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("n", [0, 1, 50])
+def test_what_was_written_is_read(tmp_path: Path, n: int) -> None:
+    path = tmp_path / "map.ply"
+    write_ply(path, some_gaussians(n))
+    assert_same(read_ply(path), some_gaussians(n))
+    assert [file.name for file in tmp_path.iterdir()] == ["map.ply"]
+
+
+def test_opacities_of_zero_and_one_survive() -> None:
+    gaussians = some_gaussians(2)
+    gaussians.opacities[:] = [0.0, 1.0]
+    np.testing.assert_allclose(gaussians_from_ply(ply_bytes(gaussians)).opacities, [0, 1], atol=2e-6)
+
+
+def test_a_kappa_beyond_what_a_float_can_say_does_not_wrap() -> None:
+    gaussians = some_gaussians(1)
+    gaussians.kappa[:] = 2**32 - 1
+    assert gaussians_from_ply(ply_bytes(gaussians)).kappa.tolist() == [2**32 - 1]
+
+
+def test_another_tool_reads_ours_and_we_read_its(tmp_path: Path) -> None:
+    sent = some_gaussians()
+    write_ply(tmp_path / "ours.ply", sent)
+    theirs = gsply.plyread(str(tmp_path / "ours.ply"))
+    np.testing.assert_allclose(theirs.means, sent.means_m)
+    np.testing.assert_allclose(np.exp(theirs.scales), sent.scales_m, rtol=1e-5)
+    np.testing.assert_allclose(1 / (1 + np.exp(-theirs.opacities)), sent.opacities, rtol=1e-5)
+    np.testing.assert_allclose(theirs.quats, sent.quats_wxyz)
+    np.testing.assert_allclose(theirs.sh0 * 0.28209479177387814 + 0.5, sent.rgb, atol=1e-6)
+    gsply.plywrite(str(tmp_path / "theirs.ply"), theirs)
+    read = read_ply(tmp_path / "theirs.ply")
+    np.testing.assert_allclose(read.rgb, sent.rgb, atol=1e-6)
+    assert not read.active.any()
+    assert not read.kappa.any()
+    assert (read.target == -1).all()
+
+
+def test_columns_go_by_name() -> None:
+    """Normals, f_rest, doubles, comments, another order and a second element: all of it exists in the wild."""
+    sent = some_gaussians(4)
+    names = ["nx", "rot_3", "rot_2", "rot_1", "rot_0", "opacity", "f_rest_0", "scale_2", "scale_1", "scale_0"]
+    names += ["f_dc_0", "f_dc_1", "f_dc_2", "x", "y", "z"]
+    values = np.zeros((4, len(names)))
+    for i in range(3):
+        values[:, names.index(f"scale_{i}")] = np.log(sent.scales_m[:, i])
+        values[:, names.index("xyz"[i])] = sent.means_m[:, i]
+    for i in range(4):
+        values[:, names.index(f"rot_{i}")] = sent.quats_wxyz[:, i]
+    header = "ply\r\nformat binary_little_endian 1.0\r\ncomment by hand\r\nelement vertex 4\r\n"
+    header += "".join(f"property double {name}\r\n" for name in names)
+    header += "element face 0\r\nproperty list uchar int vertex_indices\r\nend_header\r\n"
+    read = gaussians_from_ply(header.encode() + values.astype("<f8").tobytes())
+    np.testing.assert_array_equal(read.means_m, sent.means_m)
+    np.testing.assert_allclose(read.scales_m, sent.scales_m, rtol=1e-6)
+    np.testing.assert_allclose(read.opacities, 0.5)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (lambda data: data[:-1], "expected 3 Gaussians"),
+        (lambda data: b"", "expected a PLY file"),
+        (lambda data: b"glTF" + data[4:], "expected a PLY file"),
+        (lambda data: data.replace(b"binary_little_endian", b"ascii"), "binary_little_endian 1.0, got format ascii"),
+        (lambda data: data.replace(b"vertex 3", b"vertex 99999999999"), "expected 0 to 100000000 Gaussians"),
+        (lambda data: data.replace(b"vertex 3", b"vertex -3"), "Gaussians, got '-3'"),
+        (lambda data: data.replace(b"float opacity", b"float opaqueness"), "missing opacity"),
+        (lambda data: data.replace(b"float y", b"float x"), "once per column"),
+        (lambda data: data.replace(b"float y", b"list uchar int y"), "once per column"),
+        (lambda data: data[:-68] + b"\x00\x00\xc0\x7f" + data[-64:], "expected finite values"),
+    ],
+)
+def test_a_damaged_map_is_one_line_that_names_the_file(tmp_path: Path, spoil: object, message: str) -> None:
+    path = tmp_path / "map.ply"
+    path.write_bytes(spoil(ply_bytes(some_gaussians(3))))  # type: ignore[operator]
+    with pytest.raises(MapFileError, match=message) as caught:
+        read_ply(path)
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_missing_map_is_a_map_file_error(tmp_path: Path) -> None:
+    with pytest.raises(MapFileError, match="No such file"):
+        read_ply(tmp_path / "none.ply")
+
+
+@given(st.data())
+@settings(max_examples=200, deadline=None)
+def test_a_flipped_byte_never_raises_anything_else(data: st.DataObject) -> None:
+    file = bytearray(ply_bytes(some_gaussians(2)))
+    for _ in range(data.draw(st.integers(1, 3))):
+        file[data.draw(st.integers(0, len(file) - 1))] = data.draw(st.integers(0, 255))
+    try:
+        gaussians_from_ply(bytes(file))
+    except MapFileError as error:
+        message = str(error)
+    else:
+        message = ""
+    assert "\n" not in message
+
+
+def test_a_full_disk_keeps_the_old_map_and_says_so(tmp_path: Path) -> None:
+    path = tmp_path / "map.ply"
+    write_ply(path, some_gaussians(3))
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, limits[1]))
+    try:
+        with pytest.raises(StorageError, match="cannot write the map"):
+            write_ply(path, some_gaussians(500))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert_same(read_ply(path), some_gaussians(3))
+    assert [file.name for file in tmp_path.iterdir()] == ["map.ply"]
+    with pytest.raises(StorageError, match="cannot write the map"):
+        write_ply(tmp_path / "no" / "map.ply", some_gaussians(3))
