@@ -1,0 +1,26 @@
+"""The refined map, laid over the vote it was made from: what agents say later shows through voxel by voxel."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Int64
+from numpy import ndarray
+
+from gausslite.domain.subset import VoxelWords
+from gausslite.fusion.vote import FusedMap
+from gausslite.fusion.words import take_voxels, unite
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RefinedMap:
+    """The result of a refinement and the fused revision it started from."""
+
+    words: VoxelWords
+    revision: int
+
+    def overlaid(self, newer: FusedMap, changed: Int64[ndarray, " c"]) -> VoxelWords:
+        """The refined words, except on the voxels that changed since: these show the newer vote."""
+        kept = take_voxels(self.words, ~np.isin(self.words.keys, changed))
+        return unite(kept, newer.words)

@@ -1,0 +1,82 @@
+"""Count each agent's part in the team's map, so that nobody's contribution is invisible."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from gausslite.fusion.store import Charter, StakeTable
+from gausslite.fusion.vote import Election
+
+
+@dataclass(frozen=True, slots=True)
+class Tally:
+    """What one agent sent in this life of the server. last_seen_ns is 0 when it has not been heard of."""
+
+    last_seen_ns: int = 0
+    roi_bytes: int = 0
+    handover_bytes: int = 0
+    subsets_accepted: int = 0
+    subsets_stale: int = 0
+    subsets_rejected: int = 0
+
+    def plus(self, sent: Tally) -> Tally:
+        """Both together, last seen when `sent` was."""
+        return Tally(
+            sent.last_seen_ns,
+            self.roi_bytes + sent.roi_bytes,
+            self.handover_bytes + sent.handover_bytes,
+            self.subsets_accepted + sent.subsets_accepted,
+            self.subsets_stale + sent.subsets_stale,
+            self.subsets_rejected + sent.subsets_rejected,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class AgentContribution:
+    """One agent's part: what is held of it, how much of that the fused map shows, and what it sent."""
+
+    agent_id: str
+    joined: bool
+    voxels: int
+    gaussians: int
+    kappa_sum: int
+    won_voxels: int
+    lost_voxels: int
+    last_map_revision: int
+    keyframes: int
+    tally: Tally
+
+
+@dataclass(frozen=True, slots=True)
+class TeamStatus:
+    """The state of the mission in figures."""
+
+    charter: Charter
+    revision: int
+    fused_gaussians: int
+    fused_voxels: int
+    keyframes: int
+    refined: bool
+    agents: tuple[AgentContribution, ...]
+
+
+def contribution(agent_id: str, stakes: StakeTable, election: Election) -> AgentContribution:
+    """The part of this agent in the words and in the vote; voxels without Gaussians count as neither won nor lost."""
+    none = AgentContribution(agent_id, False, 0, 0, 0, 0, 0, 0, 0, Tally())
+    if agent_id not in stakes.agents:
+        return none
+    index = stakes.agents.index(agent_id)
+    mine = stakes.agent == index
+    voxels = int(np.count_nonzero(stakes.counts[mine]))
+    won = int(np.count_nonzero(election.winner == index))
+    return replace(
+        none,
+        voxels=voxels,
+        gaussians=int(stakes.counts[mine].sum(dtype=np.int64)),
+        kappa_sum=int(stakes.kappa_sums[mine].sum(dtype=np.uint64)),
+        won_voxels=won,
+        lost_voxels=voxels - won,
+        last_map_revision=int(stakes.map_revisions[mine].max(initial=0)),
+    )

@@ -1,0 +1,89 @@
+"""On what terms agents share a map: the grid, the mission and its world frame, and how much each may bring."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+
+import numpy as np
+
+from gausslite.domain.voxels import VoxelGrid
+from gausslite.errors import InvalidInputError, MismatchError, QuotaError
+from gausslite.fusion.store import Charter, StakeTable
+
+
+@dataclass(frozen=True, slots=True)
+class Quotas:
+    """The most the team's map takes in. Voxels count tombstones too, since those are kept."""
+
+    agents: int = 64
+    voxels_per_agent: int = 500_000
+    gaussians_per_agent: int = 3_000_000
+    keyframes_per_agent: int = 64
+    keyframe_pixels: int = 1920 * 1080
+
+    def __post_init__(self) -> None:
+        for quota in fields(self):
+            if getattr(self, quota.name) < 1:
+                raise InvalidInputError(f"quota {quota.name}: expected at least 1, got {getattr(self, quota.name)}")
+
+
+@dataclass(frozen=True, slots=True)
+class TeamSettings:
+    """The server's own terms. Empty mission_id and world_frame: the first agent that names them decides."""
+
+    grid: VoxelGrid = field(default_factory=VoxelGrid)
+    mission_id: str = ""
+    world_frame: str = ""
+    quotas: Quotas = field(default_factory=Quotas)
+
+    @property
+    def offer(self) -> Charter:
+        """These terms as a charter that may still have empty names."""
+        return Charter(self.mission_id, self.world_frame, self.grid.size_m)
+
+
+def agree(own: Charter, asked: Charter) -> Charter:
+    """The charter both sides can live with; an empty name leaves it to the other. Raises MismatchError."""
+    if asked.voxel_size_m != own.voxel_size_m:
+        raise MismatchError(f"voxel size: this mission votes on {own.voxel_size_m:g} m, got {asked.voxel_size_m:g} m")
+    for name, ours, theirs in (
+        ("world frame", own.world_frame, asked.world_frame),
+        ("mission", own.mission_id, asked.mission_id),
+    ):
+        if ours and theirs and ours != theirs:
+            raise MismatchError(f"{name}: expected {ours!r} as agreed here, got {theirs!r}")
+    return Charter(own.mission_id or asked.mission_id, own.world_frame or asked.world_frame, own.voxel_size_m)
+
+
+def named(charter: Charter) -> Charter:
+    """The charter with plain names where nobody gave one."""
+    return Charter(charter.mission_id or "mission", charter.world_frame or "world", charter.voxel_size_m)
+
+
+@dataclass(frozen=True, slots=True)
+class Holding:
+    """How much the store keeps of one agent."""
+
+    voxels: int = 0
+    gaussians: int = 0
+
+    @classmethod
+    def in_stakes(cls, stakes: StakeTable, agent_id: str) -> Holding:
+        """What these stakes hold of the agent."""
+        if agent_id not in stakes.agents:
+            return cls()
+        mine = stakes.agent == stakes.agents.index(agent_id)
+        return cls(int(np.count_nonzero(mine)), int(stakes.counts[mine].sum(dtype=np.int64)))
+
+    def exchanged(self, gone: Holding, come: Holding) -> Holding:
+        """The holding after one part made room for another."""
+        return Holding(self.voxels - gone.voxels + come.voxels, self.gaussians - gone.gaussians + come.gaussians)
+
+    def require_within(self, quotas: Quotas, agent_id: str) -> None:
+        """Raise QuotaError when this is more than one agent may bring."""
+        for name, value, most in (
+            ("voxels", self.voxels, quotas.voxels_per_agent),
+            ("Gaussians", self.gaussians, quotas.gaussians_per_agent),
+        ):
+            if value > most:
+                raise QuotaError(f"agent {agent_id!r}: expected at most {most} {name} in all, got {value}")
