@@ -1,0 +1,108 @@
+"""Score maps on held-out views, inside the task's region and over the whole image (Sec. IV-A, metrics).
+
+Averages are those of the field: each view has its own PSNR, SSIM and depth error (inside the region, over the
+region's pixels of that view), and a map's score is the mean over the views. Views that show fewer than
+MIN_ROI_PIXELS of the region count for the whole image only. SSIM is the plain one, not the multi-scale variant.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from statistics import fmean
+
+import numpy as np
+
+from gausslite.domain.gaussians import Gaussians
+from gausslite.errors import InvalidInputError
+from gausslite.evaluation.metrics import depth_l1_m, psnr, ssim_map
+from gausslite.evaluation.views import HeldOutView, MapViewer
+from gausslite.render.rasterizer import Rasterizer, Rendering
+
+MIN_ROI_PIXELS = 64
+_COVERED_ALPHA = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class RoiScore:
+    """One view's figures inside the region. covered: share of its pixels drawn with alpha above 0.5."""
+
+    psnr: float
+    ssim: float
+    depth_l1_m: float | None
+    covered: float
+
+
+@dataclass(frozen=True, slots=True)
+class ViewScore:
+    """One view's figures; roi is None where the view shows too little of the region."""
+
+    index: int
+    psnr: float
+    ssim: float
+    roi_pixels: int
+    roi: RoiScore | None
+
+
+@dataclass(frozen=True, slots=True)
+class MapScores:
+    """Means over the views: PSNR in dB, depth in metres. None where no view has such a figure.
+
+    n_views and n_roi_views count the views behind the full and the ROI figures; roi_pixels sums the region's pixels
+    over the latter.
+    """
+
+    roi_psnr: float | None
+    roi_ssim: float | None
+    full_psnr: float
+    full_ssim: float
+    roi_depth_l1_m: float | None
+    roi_covered: float | None
+    n_views: int
+    n_roi_views: int
+    roi_pixels: int
+
+
+def evaluate(gaussians: Gaussians, views: Sequence[HeldOutView], rasterizer: Rasterizer) -> MapScores:
+    """Draw the map from every held-out view and average. Raises InvalidInputError without views."""
+    viewer = MapViewer(gaussians, rasterizer)
+    return average([score_view(viewer.draw_frame(view.frame), view) for view in views])
+
+
+def score_view(drawn: Rendering, view: HeldOutView) -> ViewScore:
+    """Compare one rendering with its frame."""
+    rgb = view.frame.rgb
+    similarity = ssim_map(drawn.rgb, rgb)
+    roi_pixels = int(np.count_nonzero(view.roi))
+    roi = None
+    if roi_pixels >= MIN_ROI_PIXELS:
+        roi = RoiScore(
+            psnr(drawn.rgb, rgb, view.roi),
+            float(similarity[view.roi].mean()),
+            depth_l1_m(drawn.expected_depth_m(_COVERED_ALPHA), view.frame.depth_m, view.roi),
+            float((drawn.alpha[view.roi] > _COVERED_ALPHA).mean()),
+        )
+    return ViewScore(view.frame.index, psnr(drawn.rgb, rgb), float(similarity.mean()), roi_pixels, roi)
+
+
+def average(scores: Sequence[ViewScore]) -> MapScores:
+    """The map's scores from its views' scores. Raises InvalidInputError without views."""
+    if not scores:
+        raise InvalidInputError("held-out views: expected at least one, got none")
+    rois = [score.roi for score in scores if score.roi is not None]
+    return MapScores(
+        roi_psnr=_mean_or_none(roi.psnr for roi in rois),
+        roi_ssim=_mean_or_none(roi.ssim for roi in rois),
+        full_psnr=fmean(score.psnr for score in scores),
+        full_ssim=fmean(score.ssim for score in scores),
+        roi_depth_l1_m=_mean_or_none(roi.depth_l1_m for roi in rois if roi.depth_l1_m is not None),
+        roi_covered=_mean_or_none(roi.covered for roi in rois),
+        n_views=len(scores),
+        n_roi_views=len(rois),
+        roi_pixels=sum(score.roi_pixels for score in scores if score.roi is not None),
+    )
+
+
+def _mean_or_none(values: Iterable[float]) -> float | None:
+    listed = list(values)
+    return fmean(listed) if listed else None

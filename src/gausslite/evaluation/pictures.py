@@ -1,0 +1,132 @@
+"""Sheets to look at: the ground truth beside each map's rendering, the region enlarged, and where they differ."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float32, UInt8
+from numpy import ndarray
+
+from gausslite.domain.arrays import require_array
+from gausslite.errors import StorageError
+from gausslite.evaluation.views import HeldOutView
+
+_HEADER_PX = 26
+_GAP_PX = 6
+_MIN_CELL_WIDTH_PX = 320
+_BACKGROUND = 24
+_TEXT_RGB = (235, 235, 235)
+_OUTLINE_RGB = (255, 208, 0)
+_CROP_MARGIN = 0.15
+_DIFFERENCE_GAIN = 3.0
+
+
+def comparison_sheet(view: HeldOutView, drawings: Mapping[str, Float32[ndarray, "h w 3"]]) -> UInt8[ndarray, "H W 3"]:
+    """One column for the ground truth and one for each named drawing (colours in [0, 1]), labelled.
+
+    Rows: the image with the region outlined; the region enlarged; the absolute difference (three times amplified,
+    the region outlined). The last two rows are left out where there is no region or no drawing. Raises ShapeError.
+    """
+    truth_rgb = view.frame.rgb
+    for name, drawing in drawings.items():
+        require_array(f"drawing {name}", drawing, truth_rgb.shape, np.float32)
+    columns = {"ground truth": truth_rgb} | {name: _to_uint8(drawing) for name, drawing in drawings.items()}
+    rows = [[_cell(_outlined(image, view.roi), label) for label, image in columns.items()]]
+    if view.roi.any():
+        rows.append([_cell(_crop(image, view.roi), f"{label}: region") for label, image in columns.items()])
+    if drawings:
+        truth = truth_rgb / np.float32(255.0)
+        differences = [_to_uint8(_DIFFERENCE_GAIN * np.abs(drawing - truth)) for drawing in drawings.values()]
+        region = _cell(_lit(truth_rgb, view.roi), "the task's region")
+        cells = [
+            _cell(_outlined(difference, view.roi), f"{name}: difference x{_DIFFERENCE_GAIN:g}")
+            for name, difference in zip(drawings, differences, strict=True)
+        ]
+        rows.append([region, *cells])
+    return _grid(rows)
+
+
+def write_png(path: Path, image: UInt8[ndarray, "h w 3"]) -> None:
+    """Write an RGB image as PNG. Raises StorageError naming the file."""
+    import cv2
+
+    encoded = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1]
+    try:
+        path.write_bytes(encoded.tobytes())
+    except OSError as error:
+        raise StorageError(f"{path}: expected a file that can be written, got {error.strerror}") from error
+
+
+def _to_uint8(image: Float32[ndarray, "h w 3"]) -> UInt8[ndarray, "h w 3"]:
+    rounded: UInt8[ndarray, "h w 3"] = np.rint(np.clip(image, 0.0, 1.0) * 255.0).astype(np.uint8)
+    return rounded
+
+
+def _outlined(image: UInt8[ndarray, "h w 3"], roi: Bool[ndarray, "h w"]) -> UInt8[ndarray, "h w 3"]:
+    import cv2
+
+    contours = cv2.findContours(roi.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0]
+    out = image.copy()
+    cv2.drawContours(out, contours, -1, _OUTLINE_RGB, 1)
+    return out
+
+
+def _lit(image: UInt8[ndarray, "h w 3"], roi: Bool[ndarray, "h w"]) -> UInt8[ndarray, "h w 3"]:
+    """The image with everything outside the region dimmed."""
+    dimmed: UInt8[ndarray, "h w 3"] = np.where(roi[..., None], image, image // 4)
+    return dimmed
+
+
+def _crop(image: UInt8[ndarray, "h w 3"], roi: Bool[ndarray, "h w"]) -> UInt8[ndarray, "h w 3"]:
+    """The region's box with a margin, grown to the image's proportions and enlarged to its size."""
+    import cv2
+
+    height, width = roi.shape
+    ys, xs = np.nonzero(roi)
+    top, bottom, left, right = ys.min(), ys.max() + 1, xs.min(), xs.max() + 1
+    share = min(1.0, (1.0 + 2.0 * _CROP_MARGIN) * max((bottom - top) / height, (right - left) / width))
+    crop_height, crop_width = max(1, round(share * height)), max(1, round(share * width))
+    y = int(np.clip((top + bottom - crop_height) // 2, 0, height - crop_height))
+    x = int(np.clip((left + right - crop_width) // 2, 0, width - crop_width))
+    enlarged: UInt8[ndarray, "h w 3"] = cv2.resize(
+        image[y : y + crop_height, x : x + crop_width], (width, height), interpolation=cv2.INTER_CUBIC
+    )
+    return enlarged
+
+
+def _cell(image: UInt8[ndarray, "h w 3"], label: str) -> UInt8[ndarray, "H W 3"]:
+    """The image, wide enough to be read, under a line of text that is shrunk to fit."""
+    import cv2
+
+    height, width = image.shape[:2]
+    if width < _MIN_CELL_WIDTH_PX:
+        size = (_MIN_CELL_WIDTH_PX, round(height * _MIN_CELL_WIDTH_PX / width))
+        image = cv2.resize(image, size, interpolation=cv2.INTER_NEAREST)
+        width = _MIN_CELL_WIDTH_PX
+    header = np.full((_HEADER_PX, width, 3), _BACKGROUND, np.uint8)
+    font, scale = cv2.FONT_HERSHEY_SIMPLEX, 0.55
+    text_width = cv2.getTextSize(label, font, scale, 1)[0][0]
+    scale *= min(1.0, (width - 12) / max(1, text_width))
+    cv2.putText(header, label, (6, _HEADER_PX - 8), font, scale, _TEXT_RGB, 1, cv2.LINE_AA)
+    return np.concatenate([header, image])
+
+
+def _grid(rows: list[list[UInt8[ndarray, "_ _ 3"]]]) -> UInt8[ndarray, "H W 3"]:
+    """Cells of one size in rows, with gaps between them and round them."""
+    cell_height, cell_width = rows[0][0].shape[:2]
+    sheet = np.full(
+        (
+            _GAP_PX + len(rows) * (cell_height + _GAP_PX),
+            _GAP_PX + max(len(row) for row in rows) * (cell_width + _GAP_PX),
+            3,
+        ),
+        _BACKGROUND,
+        np.uint8,
+    )
+    for i, row in enumerate(rows):
+        for j, cell in enumerate(row):
+            top, left = _GAP_PX + i * (cell_height + _GAP_PX), _GAP_PX + j * (cell_width + _GAP_PX)
+            sheet[top : top + cell_height, left : left + cell_width] = cell
+    return sheet

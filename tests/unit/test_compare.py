@@ -1,0 +1,114 @@
+"""A map is scored on what its held-out views show."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from gausslite.domain.camera import Camera
+from gausslite.domain.frame import Frame
+from gausslite.domain.gaussians import Gaussians
+from gausslite.domain.region import BallRegion
+from gausslite.errors import InvalidInputError
+from gausslite.evaluation.compare import average, evaluate, score_view
+from gausslite.evaluation.metrics import psnr
+from gausslite.evaluation.views import HeldOutView, MapViewer
+
+pytest.importorskip("torch", reason="the reference rasterizer needs torch, which is not installed")
+
+from gausslite.render.reference import ReferenceRasterizer
+
+CAMERA = Camera(40.0, 40.0, 20.0, 16.0, 40, 32)
+
+
+def wall(n: int = 300, seed: int = 0) -> Gaussians:
+    """Opaque splats that cover the view at about two metres."""
+    rng = np.random.default_rng(seed)
+    means_m = np.stack([rng.uniform(-1.2, 1.2, n), rng.uniform(-1, 1, n), rng.uniform(1.9, 2.1, n)], axis=1)
+    return Gaussians(
+        means_m.astype(np.float32),
+        np.tile(np.float32([1, 0, 0, 0]), (n, 1)),
+        np.full((n, 3), 0.15, np.float32),
+        np.full(n, 0.9, np.float32),
+        rng.random((n, 3), np.float32),
+        np.ones(n, np.bool_),
+        np.zeros(n, np.uint32),
+        np.zeros(n, np.int16),
+    )
+
+
+def frame_of(gaussians: Gaussians, x_m: float = 0.0) -> Frame:
+    """What a perfect camera at (x, 0, 0) would record of the map."""
+    T_world_camera = np.eye(4)
+    T_world_camera[0, 3] = x_m
+    drawn = MapViewer(gaussians, ReferenceRasterizer()).draw(CAMERA, T_world_camera)
+    rgb = np.rint(drawn.rgb * 255).astype(np.uint8)
+    return Frame(int(100 * x_m), 0, rgb, drawn.expected_depth_m(), CAMERA, T_world_camera)
+
+
+def view_with(frame: Frame, roi_pixels: int) -> HeldOutView:
+    roi = np.zeros(CAMERA.height_px * CAMERA.width_px, np.bool_)
+    roi[:roi_pixels] = True
+    return HeldOutView(frame, roi.reshape(frame.depth_m.shape))
+
+
+def test_the_map_itself_scores_as_well_as_bytes_allow() -> None:
+    gaussians = wall()
+    views = [view_with(frame_of(gaussians, x), 200) for x in (0.0, 0.1)]
+    scores = evaluate(gaussians, views, ReferenceRasterizer())
+    assert scores.full_psnr > 55
+    assert scores.roi_psnr is not None
+    assert scores.roi_psnr > 55
+    assert scores.full_ssim == pytest.approx(1.0, abs=1e-3)
+    assert scores.roi_depth_l1_m == pytest.approx(0.0, abs=1e-5)
+    assert scores.roi_covered == pytest.approx(1.0)
+    assert (scores.n_views, scores.n_roi_views, scores.roi_pixels) == (2, 2, 400)
+
+
+def test_another_map_scores_worse() -> None:
+    views = [view_with(frame_of(wall()), 200)]
+    scores = evaluate(wall(seed=1), views, ReferenceRasterizer())
+    assert scores.full_psnr < 20
+    assert scores.full_ssim < 0.6
+
+
+def test_an_empty_map_is_black_and_covers_nothing() -> None:
+    frame = frame_of(wall())
+    scores = evaluate(Gaussians.empty(), [view_with(frame, 100)], ReferenceRasterizer())
+    assert scores.full_psnr == pytest.approx(psnr(np.zeros_like(frame.rgb), frame.rgb))
+    assert scores.roi_covered == 0.0
+    assert scores.roi_depth_l1_m is None
+
+
+def test_a_view_with_few_roi_pixels_counts_for_the_whole_image_only() -> None:
+    gaussians = wall()
+    frame = frame_of(gaussians)
+    viewer = MapViewer(gaussians, ReferenceRasterizer())
+    drawn = viewer.draw_frame(frame)
+    seen, unseen = (score_view(drawn, view_with(frame, n)) for n in (64, 63))
+    assert unseen.roi is None
+    scores = average([seen, unseen])
+    assert (scores.n_views, scores.n_roi_views, scores.roi_pixels) == (2, 1, 64)
+    alone = average([unseen])
+    assert alone.roi_psnr is alone.roi_ssim is alone.roi_depth_l1_m is None
+
+
+def test_scores_are_means_over_views() -> None:
+    gaussians = wall()
+    frames = [frame_of(wall(seed=seed)) for seed in (1, 2)]
+    viewer = MapViewer(gaussians, ReferenceRasterizer())
+    each = [score_view(viewer.draw_frame(frame), view_with(frame, 300)) for frame in frames]
+    assert average(each).full_psnr == pytest.approx((each[0].psnr + each[1].psnr) / 2)
+
+
+def test_regions_join_into_one_mask() -> None:
+    frame = frame_of(wall())
+    left, right = BallRegion((-0.5, 0.0, 2.0), 0.3), BallRegion((0.5, 0.0, 2.0), 0.3)
+    view = HeldOutView.of(frame, [left, right])
+    np.testing.assert_array_equal(view.roi, left.mask(frame) | right.mask(frame))
+    assert view.roi.any()
+
+
+def test_no_views_are_refused() -> None:
+    with pytest.raises(InvalidInputError, match="held-out views"):
+        evaluate(wall(), [], ReferenceRasterizer())

@@ -1,0 +1,79 @@
+"""Sheets show every map beside the truth, and end up on disk."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from gausslite.domain.camera import Camera
+from gausslite.domain.frame import Frame
+from gausslite.errors import ShapeError, StorageError
+from gausslite.evaluation.pictures import comparison_sheet, write_png
+from gausslite.evaluation.views import HeldOutView
+
+
+def view(roi: bool = True, width: int = 320, height: int = 240) -> HeldOutView:
+    rgb = np.random.default_rng(0).integers(0, 256, (height, width, 3), np.uint8)
+    camera = Camera(300.0, 300.0, width / 2, height / 2, width, height)
+    frame = Frame(0, 0, rgb, np.ones((height, width), np.float32), camera, np.eye(4))
+    mask = np.zeros((height, width), np.bool_)
+    if roi:
+        mask[height // 2 : height // 2 + 20, width // 2 : width // 2 + 30] = True
+    return HeldOutView(frame, mask)
+
+
+def drawing(of: HeldOutView, error: float = 0.0) -> np.ndarray:
+    return np.clip(of.frame.rgb / np.float32(255) + np.float32(error), 0, 1).astype(np.float32)
+
+
+def test_a_sheet_has_a_column_for_the_truth_and_each_map_and_three_rows() -> None:
+    shown = view()
+    sheet = comparison_sheet(shown, {"vote": drawing(shown), "refine": drawing(shown, 0.1)})
+    cell_width, cell_height = 320 + 6, 240 + 26 + 6
+    assert sheet.shape == (6 + 3 * cell_height, 6 + 3 * cell_width, 3)
+    # a perfect map has a black difference, apart from the outline
+    difference = sheet[6 + 2 * cell_height + 26 :, 6 + cell_width : 6 + cell_width + 320][:100]
+    assert not difference.any()
+    worse = sheet[6 + 2 * cell_height + 26 :, 6 + 2 * cell_width : 6 + 2 * cell_width + 320][:100]
+    assert worse.mean() > 50
+
+
+def test_without_a_region_there_is_no_crop_row() -> None:
+    shown = view(roi=False)
+    assert comparison_sheet(shown, {"map": drawing(shown)}).shape[0] == 6 + 2 * (240 + 26 + 6)
+
+
+def test_the_truth_alone_makes_a_sheet() -> None:
+    assert comparison_sheet(view(), {}).shape == (6 + 2 * (240 + 26 + 6), 6 + 326, 3)
+
+
+def test_small_images_are_enlarged_to_be_readable() -> None:
+    shown = view(width=64, height=48)
+    assert comparison_sheet(shown, {"map": drawing(shown)}).shape[1] == 6 + 2 * 326
+
+
+def test_a_region_as_large_as_the_image_is_its_own_crop() -> None:
+    shown = view()
+    shown.roi[:] = True
+    sheet = comparison_sheet(shown, {})
+    crop = sheet[6 + 272 + 26 : 6 + 272 + 266, 6:326]
+    np.testing.assert_array_equal(crop, shown.frame.rgb)
+
+
+def test_a_drawing_of_another_size_is_refused() -> None:
+    with pytest.raises(ShapeError, match="drawing vote"):
+        comparison_sheet(view(), {"vote": np.zeros((4, 4, 3), np.float32)})
+
+
+def test_a_png_holds_the_same_colours(tmp_path: Path) -> None:
+    rgb = view().frame.rgb
+    write_png(tmp_path / "sheet.png", rgb)
+    np.testing.assert_array_equal(cv2.imread(str(tmp_path / "sheet.png"))[..., ::-1], rgb)
+
+
+def test_a_folder_that_is_missing_is_named(tmp_path: Path) -> None:
+    with pytest.raises(StorageError, match=r"sheet\.png"):
+        write_png(tmp_path / "missing" / "sheet.png", view().frame.rgb)
