@@ -41,6 +41,13 @@ def test_a_sheet_has_a_column_for_the_truth_and_each_map_and_three_rows() -> Non
     assert worse.mean() > 50
 
 
+def test_the_two_largest_pieces_of_a_region_are_shown_in_detail() -> None:
+    shown = view()
+    for column in (10, 60, 250):
+        shown.roi[20:30, column : column + 12] = True
+    assert comparison_sheet(shown, {}).shape[0] == 6 + 3 * (240 + 26 + 6)
+
+
 def test_without_a_region_there_is_no_crop_row() -> None:
     shown = view(roi=False)
     assert comparison_sheet(shown, {"map": drawing(shown)}).shape[0] == 6 + 2 * (240 + 26 + 6)

@@ -20,26 +20,30 @@ _BACKGROUND = 24
 _TEXT_RGB = (235, 235, 235)
 _OUTLINE_RGB = (255, 208, 0)
 _CROP_MARGIN = 0.15
+_MAX_PIECES = 2
+_BRIDGED_SHARE = 0.02
 _DIFFERENCE_GAIN = 3.0
 
 
 def comparison_sheet(view: HeldOutView, drawings: Mapping[str, Float32[ndarray, "h w 3"]]) -> UInt8[ndarray, "H W 3"]:
     """One column for the ground truth and one for each named drawing (colours in [0, 1]), labelled.
 
-    Rows: the image with the region outlined; the region enlarged; the absolute difference (three times amplified,
-    the region outlined). The last two rows are left out where there is no region or no drawing. Raises ShapeError.
+    Rows: the image with the region outlined; the region's largest pieces enlarged, one row each; the absolute
+    difference (three times amplified). Rows that would show nothing are left out. Raises ShapeError.
     """
     truth_rgb = view.frame.rgb
     for name, drawing in drawings.items():
         require_array(f"drawing {name}", drawing, truth_rgb.shape, np.float32)
     columns = {"ground truth": truth_rgb} | {name: _to_uint8(drawing) for name, drawing in drawings.items()}
     rows = [[_cell(_outlined(image, view.roi), label) for label, image in columns.items()]]
-    if view.roi.any():
-        rows.append([_cell(_crop(image, view.roi), f"{label}: region") for label, image in columns.items()])
+    rows += [
+        [_cell(_crop(image, piece), f"{label}: detail") for label, image in columns.items()]
+        for piece in _largest_pieces(view.roi)
+    ]
     if drawings:
         truth = truth_rgb / np.float32(255.0)
         differences = [_to_uint8(_DIFFERENCE_GAIN * np.abs(drawing - truth)) for drawing in drawings.values()]
-        region = _cell(_lit(truth_rgb, view.roi), "the task's region")
+        region = _cell(_lit(truth_rgb, view.roi), "region of the task")
         cells = [
             _cell(_outlined(difference, view.roi), f"{name}: difference x{_DIFFERENCE_GAIN:g}")
             for name, difference in zip(drawings, differences, strict=True)
@@ -79,12 +83,23 @@ def _lit(image: UInt8[ndarray, "h w 3"], roi: Bool[ndarray, "h w"]) -> UInt8[nda
     return dimmed
 
 
-def _crop(image: UInt8[ndarray, "h w 3"], roi: Bool[ndarray, "h w"]) -> UInt8[ndarray, "h w 3"]:
-    """The region's box with a margin, grown to the image's proportions and enlarged to its size."""
+def _largest_pieces(roi: Bool[ndarray, "h w"]) -> list[Bool[ndarray, "h w"]]:
+    """The region's largest connected pieces; gaps that are small in the image do not divide it."""
     import cv2
 
-    height, width = roi.shape
-    ys, xs = np.nonzero(roi)
+    reach = max(3, round(_BRIDGED_SHARE * roi.shape[1]))
+    bridged = cv2.dilate(roi.astype(np.uint8), np.ones((reach, reach), np.uint8))
+    count, labels = cv2.connectedComponents(bridged)
+    pieces = [roi & (labels == label) for label in range(1, count)]
+    return sorted(pieces, key=np.count_nonzero, reverse=True)[:_MAX_PIECES]
+
+
+def _crop(image: UInt8[ndarray, "h w 3"], piece: Bool[ndarray, "h w"]) -> UInt8[ndarray, "h w 3"]:
+    """The piece's box with a margin, grown to the image's proportions and enlarged to its size."""
+    import cv2
+
+    height, width = piece.shape
+    ys, xs = np.nonzero(piece)
     top, bottom, left, right = ys.min(), ys.max() + 1, xs.min(), xs.max() + 1
     share = min(1.0, (1.0 + 2.0 * _CROP_MARGIN) * max((bottom - top) / height, (right - left) / width))
     crop_height, crop_width = max(1, round(share * height)), max(1, round(share * width))
