@@ -1,0 +1,199 @@
+"""Messages to nouns and back; whatever comes from outside is checked here and nowhere else."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float32, Float64
+from numpy import ndarray
+
+from gausslite.codec.subset_codec import CodecLimits, decode_subset
+from gausslite.domain.camera import Camera
+from gausslite.domain.frame import Frame
+from gausslite.domain.pose import require_rigid
+from gausslite.domain.subset import VoxelWords
+from gausslite.domain.task import Predicate, Relation, TaskGraph
+from gausslite.domain.voxels import VoxelGrid
+from gausslite.errors import InvalidInputError, TaskError
+from gausslite.v1 import gaussians_pb2, geometry_pb2, task_pb2
+from gausslite.wire.images import decode_colour, decode_depth, encode_colour, encode_depth
+
+MAX_IMAGE_PX = 1 << 23
+_MAX_PHRASES = 64
+_MAX_PHRASE_CHARS = 200
+_MAX_TEXT_CHARS = 4096
+
+_PREDICATES = {
+    Predicate.NEAR: task_pb2.PREDICATE_NEAR,
+    Predicate.ON: task_pb2.PREDICATE_ON,
+    Predicate.CLOSEST_TO: task_pb2.PREDICATE_CLOSEST_TO,
+}
+_PREDICATES_BACK = {number: predicate for predicate, number in _PREDICATES.items()}
+
+
+@dataclass(frozen=True, slots=True)
+class Box:
+    """A part of the world; voxels whose centre lies in it belong to it. Raises InvalidInputError when upside down."""
+
+    min_m: tuple[float, float, float]
+    max_m: tuple[float, float, float]
+
+    def __post_init__(self) -> None:
+        corners = np.array([self.min_m, self.max_m])
+        if not np.isfinite(corners).all() or not (corners[0] <= corners[1]).all():
+            raise InvalidInputError(f"region: expected finite min <= max, got {self.min_m} and {self.max_m}")
+
+    def holds(self, centres_m: Float32[ndarray, "n 3"]) -> Bool[ndarray, " n"]:
+        """True for each point in the box."""
+        low, high = np.array(self.min_m), np.array(self.max_m)
+        inside: Bool[ndarray, " n"] = np.logical_and(centres_m >= low, centres_m <= high).min(axis=1)
+        return inside
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MapUpdate:
+    """Part of a map at a revision: words to put over what is held; winners name the agent of each voxel, or nothing."""
+
+    revision: int
+    snapshot: bool
+    last: bool
+    words: VoxelWords | None
+    grid: VoxelGrid | None
+    winners: tuple[str, ...]
+
+
+def graph_to_message(graph: TaskGraph) -> task_pb2.TaskGraph:
+    """A task graph as a message."""
+    return task_pb2.TaskGraph(
+        task_id=graph.task_id,
+        text=graph.text,
+        targets=graph.targets,
+        anchors=graph.anchors,
+        relations=[
+            task_pb2.Relation(predicate=_PREDICATES[r.predicate], target=r.target, anchor=r.anchor)
+            for r in graph.relations
+        ],
+        warnings=graph.warnings,
+    )
+
+
+def graph_from_message(message: task_pb2.TaskGraph) -> TaskGraph:
+    """A checked task graph. Raises TaskError."""
+    phrases = [*message.targets, *message.anchors]
+    if not message.targets or len(phrases) > _MAX_PHRASES or len(message.relations) > _MAX_PHRASES:
+        raise TaskError(f"task graph: expected 1 to {_MAX_PHRASES} targets and anchors, got {len(phrases)}")
+    if any(not phrase.strip() or len(phrase) > _MAX_PHRASE_CHARS for phrase in phrases):
+        raise TaskError(f"task graph: expected phrases of 1 to {_MAX_PHRASE_CHARS} characters, got one outside")
+    if len(message.text) > _MAX_TEXT_CHARS or len(message.warnings) > _MAX_PHRASES:
+        raise TaskError(f"task graph: expected a text of at most {_MAX_TEXT_CHARS} characters and few warnings")
+    for relation in message.relations:
+        if relation.predicate not in _PREDICATES_BACK:
+            raise TaskError(f"task graph: unknown predicate {relation.predicate}")
+        if relation.target not in message.targets or relation.anchor not in message.anchors:
+            raise TaskError(
+                f"task graph: expected relations of a target to an anchor, got {relation.target!r}, {relation.anchor!r}"
+            )
+    relations = (Relation(_PREDICATES_BACK[r.predicate], r.target, r.anchor) for r in message.relations)
+    return TaskGraph(
+        message.task_id,
+        message.text,
+        tuple(message.targets),
+        tuple(message.anchors),
+        tuple(relations),
+        tuple(message.warnings),
+    )
+
+
+def camera_to_message(camera: Camera) -> geometry_pb2.Camera:
+    """A camera as a message."""
+    return geometry_pb2.Camera(
+        fx_px=camera.fx_px,
+        fy_px=camera.fy_px,
+        cx_px=camera.cx_px,
+        cy_px=camera.cy_px,
+        width_px=camera.width_px,
+        height_px=camera.height_px,
+    )
+
+
+def camera_from_message(message: geometry_pb2.Camera) -> Camera:
+    """A checked camera of at most 8 megapixels. Raises InvalidInputError."""
+    if message.width_px * message.height_px > MAX_IMAGE_PX:
+        raise InvalidInputError(
+            f"camera: expected at most {MAX_IMAGE_PX} pixels, got {message.width_px}x{message.height_px}"
+        )
+    return Camera(message.fx_px, message.fy_px, message.cx_px, message.cy_px, message.width_px, message.height_px)
+
+
+def transform_to_message(T: Float64[ndarray, "4 4"]) -> geometry_pb2.RigidTransform:
+    """A rigid transform as a message."""
+    return geometry_pb2.RigidTransform(row_major=T.reshape(-1).tolist())
+
+
+def transform_from_message(name: str, message: geometry_pb2.RigidTransform) -> Float64[ndarray, "4 4"]:
+    """A checked rigid transform. Raises PoseError, InvalidInputError."""
+    if len(message.row_major) != 16:
+        raise InvalidInputError(f"{name}: expected 16 numbers, got {len(message.row_major)}")
+    T = np.array(message.row_major, np.float64).reshape(4, 4)
+    require_rigid(name, T)
+    return T
+
+
+def frame_to_message(frame: Frame, lossless: bool = False) -> geometry_pb2.EncodedFrame:
+    """A frame with JPEG colour (PNG when lossless) and millimetre depth."""
+    return geometry_pb2.EncodedFrame(
+        index=frame.index,
+        capture_time_ns=frame.capture_time_ns,
+        colour=encode_colour(frame.rgb, lossless),
+        depth_png=encode_depth(frame.depth_m),
+        camera=camera_to_message(frame.camera),
+        t_world_camera=transform_to_message(frame.T_world_camera),
+    )
+
+
+def frame_from_message(message: geometry_pb2.EncodedFrame) -> Frame:
+    """A checked frame; its images must have the camera's size. Raises InvalidInputError and its kinds."""
+    camera = camera_from_message(message.camera)
+    return Frame(
+        message.index,
+        message.capture_time_ns,
+        decode_colour(message.colour, camera.width_px, camera.height_px),
+        decode_depth(message.depth_png, camera.width_px, camera.height_px),
+        camera,
+        transform_from_message("frame t_world_camera", message.t_world_camera),
+    )
+
+
+def grid_to_message(grid: VoxelGrid) -> geometry_pb2.VoxelGrid:
+    """A voxel grid as a message."""
+    return geometry_pb2.VoxelGrid(size_m=grid.size_m)
+
+
+def grid_from_message(message: geometry_pb2.VoxelGrid) -> VoxelGrid:
+    """A checked grid. Raises InvalidInputError."""
+    return VoxelGrid(message.size_m)
+
+
+def box_to_message(box: Box) -> geometry_pb2.Box:
+    """A box as a message."""
+    low, high = (geometry_pb2.Point(x=p[0], y=p[1], z=p[2]) for p in (box.min_m, box.max_m))
+    return geometry_pb2.Box(min_m=low, max_m=high)
+
+
+def box_from_message(message: geometry_pb2.Box) -> Box:
+    """A checked box. Raises InvalidInputError."""
+    low, high = message.min_m, message.max_m
+    return Box((low.x, low.y, low.z), (high.x, high.y, high.z))
+
+
+def map_update_from_message(message: gaussians_pb2.MapBlock, limits: CodecLimits) -> MapUpdate:
+    """A checked block of a map. Raises CodecError, ChecksumError, InvalidInputError."""
+    words, grid = None, None
+    if message.subset:
+        subset, grid = decode_subset(message.subset, limits)
+        words = subset.words
+    names, winner = message.provenance.agent_ids, message.provenance.winner
+    if len(winner) not in (0, 0 if words is None else len(words)) or any(i >= len(names) for i in winner):
+        raise InvalidInputError("map block provenance: expected one known agent for each voxel")
+    return MapUpdate(message.revision, message.snapshot, message.last, words, grid, tuple(names[i] for i in winner))

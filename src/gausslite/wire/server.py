@@ -1,0 +1,184 @@
+"""Start, watch and end a gRPC server: one way for all three services.
+
+Servicers raise our errors and write their streams as async generators; the interceptor here turns errors into status,
+so that a method is decode, call, encode, and no message ends the server.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import signal
+import socket
+from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NoReturn
+
+import grpc
+from grpc_health.v1 import health, health_pb2, health_pb2_grpc
+from grpc_reflection.v1alpha import reflection
+
+from gausslite.errors import GaussLiteError, InvalidInputError, UnavailableError
+from gausslite.wire.status import to_status
+
+MAX_MESSAGE_BYTES = 16 << 20
+"""Both ends refuse more; a frame of two megapixels with PNG depth fits several times."""
+
+_log = logging.getLogger(__name__)
+_OPTIONS = (
+    ("grpc.max_receive_message_length", MAX_MESSAGE_BYTES),
+    ("grpc.max_send_message_length", MAX_MESSAGE_BYTES),
+    # a second server on the port must fail, not share it
+    ("grpc.so_reuseport", 0),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Service:
+    """A servicer ready to be added: its full name and the generated function that adds it, already bound."""
+
+    name: str
+    register: Callable[[grpc.aio.Server], None]
+
+
+class RunningServer:
+    """A server that answers. `address` has the real port; `stop` lets calls in flight end."""
+
+    def __init__(self, server: grpc.aio.Server, address: str, health_servicer: Any) -> None:
+        self._server = server
+        self._health = health_servicer
+        self.address = address
+
+    async def stop(self, grace_s: float = 5.0) -> None:
+        """Say NOT_SERVING, refuse new calls, give those in flight `grace_s`, then cancel them."""
+        await self._health.enter_graceful_shutdown()
+        await self._server.stop(grace_s)
+
+
+async def start_server(listen: str, services: Sequence[Service]) -> RunningServer:
+    """Serve on HOST:PORT (port 0 = any free one) or unix:PATH, with health and reflection.
+
+    Raises UnavailableError when the address is taken, InvalidInputError when it is none.
+    """
+    _require_free(listen)
+    server = grpc.aio.server(interceptors=[ErrorInterceptor()], options=_OPTIONS)
+    health_servicer = health.aio.HealthServicer()
+    health_pb2_grpc.add_HealthServicer_to_server(health_servicer, server)
+    for service in services:
+        service.register(server)
+        await health_servicer.set(service.name, health_pb2.HealthCheckResponse.SERVING)
+    await health_servicer.set("", health_pb2.HealthCheckResponse.SERVING)
+    names = [service.name for service in services]
+    reflection.enable_server_reflection([*names, health.SERVICE_NAME, reflection.SERVICE_NAME], server)
+    try:
+        port = server.add_insecure_port(listen)
+    except RuntimeError:
+        port = 0
+    if port == 0:
+        raise UnavailableError(f"listen {listen}: the address is in use or cannot be bound; choose another")
+    await server.start()
+    address = listen if listen.startswith("unix:") else f"{listen.rpartition(':')[0]}:{port}"
+    return RunningServer(server, address, health_servicer)
+
+
+async def serve_until_stopped(
+    listen: str, services: Sequence[Service], until: Callable[[], Awaitable[None]] | None = None, grace_s: float = 5.0
+) -> None:
+    """Serve until SIGTERM or SIGINT, or until `until` returns; then drain. Prints nothing; logs where it listens."""
+    stopping = asyncio.Event()
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        loop.add_signal_handler(number, stopping.set)
+    running = await start_server(listen, services)
+    _log.info("%s listens on %s", ", ".join(service.name for service in services), running.address)
+    waits: list[asyncio.Future[Any]] = [asyncio.ensure_future(stopping.wait())]
+    if until is not None:
+        waits.append(asyncio.ensure_future(until()))
+    try:
+        done, _ = await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)
+        for task in done:
+            task.result()
+    finally:
+        for task in waits:
+            task.cancel()
+        await asyncio.gather(*waits, return_exceptions=True)
+        await running.stop(grace_s)
+        _log.info("ended")
+
+
+class ErrorInterceptor(grpc.aio.ServerInterceptor[Any, Any]):
+    """Ends a call with the status of the error its method raised; anything unforeseen is INTERNAL and logged."""
+
+    async def intercept_service(
+        self,
+        continuation: Callable[[grpc.HandlerCallDetails], Awaitable[grpc.RpcMethodHandler[Any, Any]]],
+        handler_call_details: grpc.HandlerCallDetails,
+    ) -> grpc.RpcMethodHandler[Any, Any]:
+        """Wrap the method that is about to be called."""
+        handler = await continuation(handler_call_details)
+        method = handler_call_details.method
+        if handler is None or not method.startswith("/gausslite."):
+            return handler
+        serializers = {
+            "request_deserializer": handler.request_deserializer,
+            "response_serializer": handler.response_serializer,
+        }
+        if handler.response_streaming:
+            inner = handler.stream_stream if handler.request_streaming else handler.unary_stream
+            make = (
+                grpc.stream_stream_rpc_method_handler
+                if handler.request_streaming
+                else grpc.unary_stream_rpc_method_handler
+            )
+            return make(_guard_stream(inner, method), **serializers)
+        inner = handler.stream_unary if handler.request_streaming else handler.unary_unary
+        make = (
+            grpc.stream_unary_rpc_method_handler if handler.request_streaming else grpc.unary_unary_rpc_method_handler
+        )
+        return make(_guard_unary(inner, method), **serializers)
+
+
+def _guard_unary(inner: Any, method: str) -> Any:
+    async def guarded(request: Any, context: Any) -> Any:
+        try:
+            return await inner(request, context)
+        except Exception as error:
+            await _abort(error, method, context)
+
+    return guarded
+
+
+def _guard_stream(inner: Any, method: str) -> Any:
+    async def guarded(request: Any, context: Any) -> AsyncIterator[Any]:
+        try:
+            async for response in inner(request, context):
+                yield response
+        except Exception as error:
+            await _abort(error, method, context)
+
+    return guarded
+
+
+async def _abort(error: Exception, method: str, context: Any) -> NoReturn:
+    if isinstance(error, grpc.aio.AbortError):
+        raise error
+    if not isinstance(error, GaussLiteError):
+        _log.error("%s failed: %s: %s", method, type(error).__name__, error, exc_info=error)
+        error = GaussLiteError(f"{method}: the server met an unforeseen error; its log has the details")
+    await context.abort_with_status(to_status(error))
+    raise error
+
+
+def _require_free(listen: str) -> None:
+    """GRPC silently takes over a unix socket that another server still answers on."""
+    if listen.startswith("unix:"):
+        path = Path(listen.removeprefix("unix:"))
+        with socket.socket(socket.AF_UNIX) as probe:
+            probe.settimeout(1.0)
+            if probe.connect_ex(str(path)) == 0:
+                raise UnavailableError(f"listen {listen}: another server answers on this socket; choose another")
+        return
+    host, _, port = listen.rpartition(":")
+    if not host or not port.isdigit() or int(port) > 65535:
+        raise InvalidInputError(f"listen: expected HOST:PORT or unix:PATH, got {listen!r}")

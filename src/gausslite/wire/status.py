@@ -1,0 +1,99 @@
+"""The one table between our errors and gRPC status codes, used in both directions.
+
+The ErrorInfo's reason names the error class, so a client raises what the server raised; the code tells strangers.
+"""
+
+from __future__ import annotations
+
+import grpc
+from google.protobuf import any_pb2
+from google.rpc import code_pb2, error_details_pb2, status_pb2  # type: ignore[import-untyped]
+from grpc_status import rpc_status
+
+from gausslite import errors
+from gausslite.errors import GaussLiteError
+
+DOMAIN = "gausslite"
+
+_TABLE: tuple[tuple[type[GaussLiteError], grpc.StatusCode, str], ...] = (
+    (errors.ShapeError, grpc.StatusCode.INVALID_ARGUMENT, "SHAPE"),
+    (errors.PoseError, grpc.StatusCode.INVALID_ARGUMENT, "POSE"),
+    (errors.TaskError, grpc.StatusCode.INVALID_ARGUMENT, "TASK"),
+    (errors.DatasetError, grpc.StatusCode.INVALID_ARGUMENT, "DATASET"),
+    (errors.ModelFileError, grpc.StatusCode.INVALID_ARGUMENT, "MODEL_FILE"),
+    (errors.MapFileError, grpc.StatusCode.INVALID_ARGUMENT, "MAP_FILE"),
+    (errors.CodecError, grpc.StatusCode.INVALID_ARGUMENT, "CODEC"),
+    (errors.InvalidInputError, grpc.StatusCode.INVALID_ARGUMENT, "INVALID_INPUT"),
+    (errors.ChecksumError, grpc.StatusCode.DATA_LOSS, "CHECKSUM"),
+    (errors.SessionUnknownError, grpc.StatusCode.NOT_FOUND, "SESSION_UNKNOWN"),
+    (errors.MismatchError, grpc.StatusCode.FAILED_PRECONDITION, "MISMATCH"),
+    (errors.RevisionGoneError, grpc.StatusCode.OUT_OF_RANGE, "REVISION_GONE"),
+    (errors.QuotaError, grpc.StatusCode.RESOURCE_EXHAUSTED, "QUOTA"),
+    (errors.StorageError, grpc.StatusCode.RESOURCE_EXHAUSTED, "STORAGE"),
+    (errors.NotPermittedError, grpc.StatusCode.PERMISSION_DENIED, "NOT_PERMITTED"),
+    (errors.UnavailableError, grpc.StatusCode.UNAVAILABLE, "UNAVAILABLE"),
+    (errors.KernelError, grpc.StatusCode.FAILED_PRECONDITION, "KERNEL"),
+    (GaussLiteError, grpc.StatusCode.INTERNAL, "INTERNAL"),
+)
+
+_BY_REASON = {reason: kind for kind, _, reason in _TABLE}
+# what a code alone means, when no ErrorInfo of ours came with it (the transport, a proxy, another server)
+_BY_CODE: dict[grpc.StatusCode, type[GaussLiteError]] = {
+    grpc.StatusCode.INVALID_ARGUMENT: errors.InvalidInputError,
+    grpc.StatusCode.DATA_LOSS: errors.ChecksumError,
+    grpc.StatusCode.FAILED_PRECONDITION: errors.MismatchError,
+    grpc.StatusCode.OUT_OF_RANGE: errors.RevisionGoneError,
+    grpc.StatusCode.RESOURCE_EXHAUSTED: errors.QuotaError,
+    grpc.StatusCode.PERMISSION_DENIED: errors.NotPermittedError,
+    grpc.StatusCode.UNAUTHENTICATED: errors.NotPermittedError,
+    grpc.StatusCode.UNAVAILABLE: errors.UnavailableError,
+    grpc.StatusCode.DEADLINE_EXCEEDED: errors.UnavailableError,
+    grpc.StatusCode.CANCELLED: errors.UnavailableError,
+}
+
+
+def code_and_reason(error: GaussLiteError) -> tuple[grpc.StatusCode, str]:
+    """The code and ErrorInfo reason of an error; a subclass not in the table gets its nearest listed base."""
+    return next((code, reason) for kind, code, reason in _TABLE if isinstance(error, kind))
+
+
+def to_status(error: GaussLiteError) -> grpc.Status:
+    """The status to abort a call with: code, the error's one line, and an ErrorInfo."""
+    code, reason = code_and_reason(error)
+    detail = any_pb2.Any()
+    detail.Pack(error_details_pb2.ErrorInfo(reason=reason, domain=DOMAIN))
+    number = code_pb2.Code.Value(code.name)
+    status: grpc.Status = rpc_status.to_status(status_pb2.Status(code=number, message=str(error), details=[detail]))
+    return status
+
+
+def error_from_reason(reason: str, message: str) -> GaussLiteError:
+    """The error that a reason names; a reason of another version becomes the base error."""
+    return _BY_REASON.get(reason, GaussLiteError)(message)
+
+
+def from_rpc_error(error: grpc.RpcError, address: str) -> GaussLiteError:
+    """The error the server raised, as its class; what the transport says becomes the class of its code."""
+    if not isinstance(error, grpc.Call):
+        return errors.UnavailableError(f"{address}: {error}")
+    code, text = error.code(), error.details() or "no details"
+    reason = _reason(error)
+    if reason is not None:
+        return error_from_reason(reason, text)
+    if code is grpc.StatusCode.DEADLINE_EXCEEDED:
+        return errors.UnavailableError(f"{address}: no answer in time")
+    first_line = text.splitlines()[0]
+    return _BY_CODE.get(code, GaussLiteError)(f"{address}: {code.name}: {first_line}")
+
+
+def _reason(error: grpc.Call) -> str | None:
+    try:
+        status = rpc_status.from_call(error)
+    except ValueError:
+        # a status whose details contradict its code: not one of ours
+        return None
+    for detail in status.details if status is not None else ():
+        info = error_details_pb2.ErrorInfo()
+        if detail.Unpack(info) and info.domain == DOMAIN:
+            return str(info.reason)
+    return None
