@@ -10,7 +10,7 @@ from gausslite.optimize.density import DensitySettings, densify, prune
 from gausslite.optimize.parameters import SplatTable
 from gausslite.render.rasterizer import GRAD_2D_COUNT, GRAD_2D_SUM, LOG_SCALE, LOGIT, MEAN, QUAT, UPDATES
 
-SETTINGS = DensitySettings()
+SETTINGS = DensitySettings(max_growth=1.0)
 EXTENT_M = 1.0
 
 
@@ -114,3 +114,9 @@ def test_an_empty_table_survives_both() -> None:
 def test_settings_name_what_is_wrong(wrong: dict[str, float]) -> None:
     with pytest.raises(InvalidInputError, match=next(iter(wrong))):
         DensitySettings(**wrong)
+
+
+def test_one_densification_adds_no_more_than_its_growth() -> None:
+    table = table_of([0.001] * 40, [1e-3] * 40, capacity=100)
+    densify(table, DensitySettings(max_growth=0.1), EXTENT_M, np.random.default_rng(0))
+    assert table.count == 44

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,12 +22,15 @@ class DensitySettings:
     """When and what to clone, split and prune; counts are mapping iterations.
 
     min_mean_gradient is in half image widths (as the rasterizer's statistics); percent_dense, a fraction of the
-    scene's extent, parts the Gaussians to clone (smaller) from those to split.
+    scene's extent, parts the Gaussians to clone (smaller) from those to split. max_growth bounds how much a single
+    densification may add, as a fraction of the Gaussians there are: at low resolution, where every gradient is large,
+    the threshold alone would fill the table at once and leave no room for seeds.
     """
 
     densify_every: int = 150
     min_mean_gradient: float = 2e-4
     percent_dense: float = 0.01
+    max_growth: float = 0.05
     prune_every: int = 100
     min_opacity: float = 0.005
 
@@ -34,7 +38,7 @@ class DensitySettings:
         for name in ("densify_every", "prune_every"):
             if getattr(self, name) < 1:
                 raise InvalidInputError(f"density {name}: expected at least 1 iteration, got {getattr(self, name)}")
-        for name in ("min_mean_gradient", "percent_dense", "min_opacity"):
+        for name in ("min_mean_gradient", "percent_dense", "max_growth", "min_opacity"):
             if not getattr(self, name) >= 0:
                 raise InvalidInputError(f"density {name}: expected at least 0, got {getattr(self, name)}")
 
@@ -48,12 +52,13 @@ class Densified:
 
 
 def densify(table: SplatTable, settings: DensitySettings, extent_m: float, rng: np.random.Generator) -> Densified:
-    """Clone small and split large Gaussians whose image gradient stays high, as far as the table has room.
+    """Clone small and split large Gaussians whose image gradient stays high, as far as the cap and max_growth allow.
 
-    Where room is short the largest gradients go first. Children inherit active, kappa and target and start with
+    Where that is short the largest gradients go first. Children inherit active, kappa and target and start with
     fresh optimiser state; a split puts its first half in the parent's row. The statistics start anew.
     """
-    chosen = _most_wanted(_mean_gradient(table), settings.min_mean_gradient, table.room)
+    most = min(table.room, math.ceil(settings.max_growth * table.count))
+    chosen = _most_wanted(_mean_gradient(table), settings.min_mean_gradient, most)
     largest_scale_m = np.exp(table.rows[chosen][:, LOG_SCALE].max(axis=1, initial=-np.inf))
     small = largest_scale_m <= settings.percent_dense * extent_m
     to_clone, to_split = chosen[small], chosen[~small]
@@ -76,13 +81,13 @@ def _mean_gradient(table: SplatTable) -> Float32[ndarray, " n"]:
     return mean
 
 
-def _most_wanted(gradient: Float32[ndarray, " n"], threshold: float, room: int) -> Int64[ndarray, " m"]:
+def _most_wanted(gradient: Float32[ndarray, " n"], threshold: float, most: int) -> Int64[ndarray, " m"]:
     above = np.flatnonzero(gradient > threshold)
-    if len(above) <= room:
+    if len(above) <= most:
         return above
     # a stable order makes the choice among equals repeatable
     order = np.argsort(-gradient[above], kind="stable")
-    return np.sort(above[order[:room]])
+    return np.sort(above[order[:most]])
 
 
 def _clone(table: SplatTable, parents: Int64[ndarray, " m"]) -> None:
