@@ -1,0 +1,169 @@
+"""The task's attention (Sec. III-B): detect on keyframes, carry over between them, filter in space, merge to w(u, v)."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+from jaxtyping import Float32
+from numpy import ndarray
+
+from gausslite.domain.frame import Frame
+from gausslite.domain.pose import rotation_angle_deg, translation_m
+from gausslite.domain.relevance import NO_TARGET, Detection, RelevanceMap
+from gausslite.domain.task import TaskGraph
+from gausslite.errors import InvalidInputError
+from gausslite.perception.detect import Detector, Segmenter
+from gausslite.perception.reproject import Frustum, cut_by_depth, frustum_of, reprojected_box_px
+from gausslite.perception.spatial import SpatialFilter, SpatialSettings, best_depth_m, sight, unit_axis
+from gausslite.perception.vocabulary import is_generic
+
+
+class Attention(Protocol):
+    """Says for each frame which pixels the task is about."""
+
+    def attend(self, frame: Frame, rendered_depth_m: Float32[ndarray, "h w"] | None = None) -> RelevanceMap:
+        """The relevance of one frame; rendered_depth_m is drawn from the current map, 0 where it shows nothing."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class AttentionSettings:
+    """up_axis points up in the world; max_* say when to detect anew (comment in Sec. III-B.2)."""
+
+    up_axis: tuple[float, float, float] = (0.0, -1.0, 0.0)
+    max_translation_m: float = 1.0
+    max_rotation_deg: float = 15.0
+    max_frames: int = 5
+    spatial: SpatialSettings = field(default_factory=SpatialSettings)
+
+    def __post_init__(self) -> None:
+        for name in ("max_translation_m", "max_rotation_deg"):
+            if not getattr(self, name) > 0:
+                raise InvalidInputError(f"attention {name}: expected a positive number, got {getattr(self, name)}")
+        unit_axis(self.up_axis)
+        if self.max_frames < 1:
+            raise InvalidInputError(f"attention max_frames: expected at least 1, got {self.max_frames}")
+
+
+@dataclass(slots=True)
+class AttentionCounters:
+    """What the attention did so far, for reports; the milliseconds are of the last call and of all calls."""
+
+    frames: int = 0
+    keyframes: int = 0
+    detections: int = 0
+    kept: int = 0
+    carried_over: int = 0
+    last_ms: float = 0.0
+    total_ms: float = 0.0
+
+
+class TaskAttention:
+    """An Attention that follows a task graph; it owns the keyframe and the memory of objects. One thread at a time."""
+
+    def __init__(
+        self,
+        graph: TaskGraph,
+        detector: Detector,
+        settings: AttentionSettings | None = None,
+        segmenter: Segmenter | None = None,
+    ) -> None:
+        """Without a segmenter, carried boxes are cut out by depth alone."""
+        self._graph = graph
+        self._detector = detector
+        self._settings = settings or AttentionSettings()
+        self._segmenter = segmenter
+        self._filter = SpatialFilter(graph, self._settings.up_axis, self._settings.spatial)
+        self._keyframe: Frame | None = None
+        self._frames_since = 0
+        self._kept: list[Frustum] = []
+        self.counters = AttentionCounters()
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What a reader of the report should know: nouns without a class, anchors that never came into view."""
+        unseen = (f"anchor {name!r} not seen yet: its targets are kept" for name in self._filter.unseen_anchors)
+        return (*self._detector.warnings, *unseen)
+
+    @property
+    def spatial(self) -> SpatialFilter:
+        """The filter with its memory of objects."""
+        return self._filter
+
+    def attend(self, frame: Frame, rendered_depth_m: Float32[ndarray, "h w"] | None = None) -> RelevanceMap:
+        """Weight 1 on the pixels of the targets that fit the task's relations."""
+        started = time.perf_counter()
+        if self._needs_detection(frame):
+            shown = self._detect(frame, best_depth_m(frame.depth_m, rendered_depth_m))
+        else:
+            shown = self._carry_over(frame)
+        relevance = merge(shown, self._graph.targets, frame)
+        self._count((time.perf_counter() - started) * 1e3)
+        return relevance
+
+    def _needs_detection(self, frame: Frame) -> bool:
+        key = self._keyframe
+        self._frames_since += 1
+        return (
+            key is None
+            or self._frames_since >= self._settings.max_frames
+            or translation_m(key.T_world_camera, frame.T_world_camera) > self._settings.max_translation_m
+            or rotation_angle_deg(key.T_world_camera, frame.T_world_camera) > self._settings.max_rotation_deg
+        )
+
+    def _detect(self, frame: Frame, depth_m: Float32[ndarray, "h w"]) -> list[Detection]:
+        self._keyframe, self._frames_since = frame, 0
+        detections = self._without_anchors_as_objects(self._detector.detect(frame, self._graph.queries))
+        placed = [sight(each.phrase, each.mask, depth_m, frame.camera, frame.T_world_camera) for each in detections]
+        self._filter.observe([sighting for sighting in placed if sighting is not None])
+        targets = [
+            detection
+            for detection, sighting in zip(detections, placed, strict=True)
+            if detection.phrase in self._graph.targets and sighting is not None and self._filter.keep(sighting)
+        ]
+        lifted = [frustum_of(detection, depth_m, frame) for detection in targets]
+        self._kept = [frustum for frustum in lifted if frustum is not None]
+        self.counters.keyframes += 1
+        self.counters.detections += len(detections)
+        self.counters.kept += len(targets)
+        return targets
+
+    def _without_anchors_as_objects(self, detections: Sequence[Detection]) -> list[Detection]:
+        """The object on the desk is not the desk itself, although a desk is an object."""
+        anchors = [each.mask for each in detections if each.phrase in self._graph.anchors]
+        return [
+            each
+            for each in detections
+            if not (is_generic(each.phrase) and any(each.mask is anchor for anchor in anchors))
+        ]
+
+    def _carry_over(self, frame: Frame) -> list[Detection]:
+        boxes = [(frustum, reprojected_box_px(frustum, frame)) for frustum in self._kept]
+        in_view = [(frustum, box) for frustum, box in boxes if box is not None]
+        masks = [cut_by_depth(frustum, box, frame) for frustum, box in in_view]
+        if self._segmenter is not None and in_view:
+            table = np.asarray([box for _, box in in_view], np.float32)
+            cut_again = self._segmenter.segment(frame, table)
+            masks = [new if new is not None else old for new, old in zip(cut_again, masks, strict=True)]
+        self.counters.carried_over += len(in_view)
+        return [
+            Detection(frustum.detection.phrase, frustum.detection.score, box, mask)
+            for (frustum, box), mask in zip(in_view, masks, strict=True)
+        ]
+
+    def _count(self, elapsed_ms: float) -> None:
+        self.counters.frames += 1
+        self.counters.last_ms = elapsed_ms
+        self.counters.total_ms += elapsed_ms
+
+
+def merge(detections: Sequence[Detection], targets: Sequence[str], frame: Frame) -> RelevanceMap:
+    """The binary w(u, v): 1 on every target's mask; where masks overlap the smaller object owns the pixel."""
+    target = np.full(frame.depth_m.shape, NO_TARGET, np.int16)
+    for detection in sorted(detections, key=lambda each: int(np.count_nonzero(each.mask)), reverse=True):
+        target[detection.mask] = targets.index(detection.phrase)
+    return RelevanceMap((target != NO_TARGET).astype(np.float32), target)

@@ -1,0 +1,83 @@
+"""The seam between words and pixels: every detector, learned or exact, fits here, and so does every segmenter."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from jaxtyping import Bool, Float32
+from numpy import ndarray
+
+from gausslite.domain.frame import Frame
+from gausslite.domain.relevance import Detection
+from gausslite.errors import InvalidInputError
+from gausslite.perception.vocabulary import is_furniture, is_generic
+
+
+class Detector(Protocol):
+    """Finds the objects that noun phrases name."""
+
+    def detect(self, frame: Frame, queries: Sequence[str]) -> list[Detection]:
+        """All instances of each query, best first; one object may answer several queries."""
+        ...
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What this detector could not do with the queries so far, one line each."""
+        ...
+
+
+class Segmenter(Protocol):
+    """Cuts known boxes out of a new image, without asking again what they hold."""
+
+    def segment(self, frame: Frame, boxes_px: Float32[ndarray, "n 4"]) -> list[Bool[ndarray, "h w"] | None]:
+        """One mask a box (left, top, right, bottom); None where the box holds no clear object."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class BoxFractions:
+    """The largest share of the image that a box may span before it is taken for a mistake (comment in Sec. III-B.2)."""
+
+    small: float = 0.20
+    furniture: float = 0.40
+    many: float = 0.70
+
+    def __post_init__(self) -> None:
+        for name in ("small", "furniture", "many"):
+            if not 0.0 < getattr(self, name) <= 1.0:
+                raise InvalidInputError(f"box fraction {name}: expected 0 to 1, got {getattr(self, name)}")
+
+    def limit(self, phrase: str, many_objects: bool) -> float:
+        """The share allowed for one phrase; tasks about many objects are the most lenient."""
+        if many_objects:
+            return self.many
+        return self.furniture if is_furniture(phrase) else self.small
+
+
+def concerns_many_objects(queries: Sequence[str]) -> bool:
+    """True for tasks about anything at all, or about more than a target and its anchor."""
+    return len(queries) > 2 or any(is_generic(query) for query in queries)
+
+
+def box_iou(boxes_a: Float32[ndarray, "n 4"], boxes_b: Float32[ndarray, "m 4"]) -> Float32[ndarray, "n m"]:
+    """Intersection over union of every pair of boxes (left, top, right, bottom)."""
+    top_left = np.maximum(boxes_a[:, None, :2], boxes_b[None, :, :2])
+    bottom_right = np.minimum(boxes_a[:, None, 2:], boxes_b[None, :, 2:])
+    shared = np.clip(bottom_right - top_left, 0.0, None).prod(axis=2)
+    area_a = (boxes_a[:, 2:] - boxes_a[:, :2]).prod(axis=1)
+    area_b = (boxes_b[:, 2:] - boxes_b[:, :2]).prod(axis=1)
+    union = area_a[:, None] + area_b[None, :] - shared
+    iou: Float32[ndarray, "n m"] = (shared / np.maximum(union, 1e-9)).astype(np.float32)
+    return iou
+
+
+def box_around(mask: Bool[ndarray, "h w"]) -> tuple[float, float, float, float] | None:
+    """The tight box (left, top, right, bottom) round a mask in pixels, None when it is empty."""
+    columns = np.flatnonzero(mask.any(axis=0))
+    rows = np.flatnonzero(mask.any(axis=1))
+    if len(columns) == 0:
+        return None
+    return float(columns[0]), float(rows[0]), float(columns[-1] + 1), float(rows[-1] + 1)

@@ -1,0 +1,145 @@
+"""Keep the detections whose place in space fits the task's relations (Sec. III-B.3)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float32, Float64
+from numpy import ndarray
+
+from gausslite.domain.camera import Camera
+from gausslite.domain.pose import transform_points
+from gausslite.domain.task import Predicate, Relation, TaskGraph
+from gausslite.errors import InvalidInputError
+from gausslite.perception.memory import ObjectMemory, Remembered, Sighting
+
+_MIN_PIXELS = 8
+_MAX_PIXELS = 4000
+
+
+@dataclass(frozen=True, slots=True)
+class SpatialSettings:
+    """near: distance under near_m. on: higher than the anchor and less than on_m aside."""
+
+    near_m: float = 1.0
+    on_m: float = 0.5
+
+    def __post_init__(self) -> None:
+        for name in ("near_m", "on_m"):
+            if not (np.isfinite(getattr(self, name)) and getattr(self, name) > 0):
+                raise InvalidInputError(f"spatial {name}: expected a positive length, got {getattr(self, name)}")
+
+
+def unit_axis(up_axis: tuple[float, float, float]) -> Float64[ndarray, "3"]:
+    """The direction of an up axis. Raises InvalidInputError when it has none."""
+    length = float(np.linalg.norm(up_axis))
+    if not (np.isfinite(length) and length > 1e-6):
+        raise InvalidInputError(f"up axis: expected a finite vector that is not zero, got {up_axis}")
+    return np.asarray(up_axis, np.float64) / length
+
+
+def best_depth_m(
+    sensor_m: Float32[ndarray, "h w"], rendered_m: Float32[ndarray, "h w"] | None
+) -> Float32[ndarray, "h w"]:
+    """The map's depth where it has drawn something, the sensor's elsewhere."""
+    if rendered_m is None or rendered_m.shape != sensor_m.shape:
+        return sensor_m
+    return np.where(rendered_m > 0, rendered_m, sensor_m)
+
+
+def sight(
+    phrase: str,
+    mask: Bool[ndarray, "h w"],
+    depth_m: Float32[ndarray, "h w"],
+    camera: Camera,
+    T_world_camera: Float64[ndarray, "4 4"],
+) -> Sighting | None:
+    """Lift a mask to its centroid in the world; None where too few of its pixels have depth.
+
+    The centroid is the median of the lifted points, so that background at the mask's rim does not pull it away.
+    """
+    rows, columns = np.nonzero(mask & (depth_m > 0))
+    if len(rows) < _MIN_PIXELS:
+        return None
+    step = max(1, len(rows) // _MAX_PIXELS)
+    rows, columns = rows[::step], columns[::step]
+    z = depth_m[rows, columns].astype(np.float64)
+    x = (columns + 0.5 - camera.cx_px) / camera.fx_px * z
+    y = (rows + 0.5 - camera.cy_px) / camera.fy_px * z
+    points = transform_points(T_world_camera, np.stack([x, y, z], axis=1))
+    centroid = np.median(points, axis=0)
+    radius_m = float(np.percentile(np.linalg.norm(points - centroid, axis=1), 90))
+    return Sighting(phrase, centroid, radius_m)
+
+
+class SpatialFilter:
+    """Evaluates the graph's relations against everything seen so far; anchors stay where they were last seen."""
+
+    def __init__(self, graph: TaskGraph, up_axis: tuple[float, float, float], settings: SpatialSettings) -> None:
+        self._relations = {
+            target: tuple(relation for relation in graph.relations if relation.target == target)
+            for target in graph.targets
+        }
+        self._settings = settings
+        self._up = unit_axis(up_axis)
+        self._memory = ObjectMemory()
+
+    @property
+    def remembered(self) -> tuple[Remembered, ...]:
+        """Every object seen so far, where it was seen on average."""
+        return self._memory.objects
+
+    @property
+    def unseen_anchors(self) -> tuple[str, ...]:
+        """Anchors that some relation needs and no frame has shown yet."""
+        needed = dict.fromkeys(each.anchor for relations in self._relations.values() for each in relations)
+        return tuple(anchor for anchor in needed if not self._memory.named(anchor))
+
+    def observe(self, sightings: Sequence[Sighting]) -> None:
+        """Take one frame's sightings into the memory."""
+        self._memory.observe(sightings)
+
+    def keep(self, sighting: Sighting) -> bool:
+        """Any relation of the target holds (Sec. III-B.3); True without relations or without their anchors.
+
+        A target is judged by the anchors that were seen; while none of them was, it is kept, for want of evidence.
+        """
+        judged = [each for each in self._relations.get(sighting.phrase, ()) if self._memory.named(each.anchor)]
+        return not judged or any(self._holds(relation, sighting) for relation in judged)
+
+    def _holds(self, relation: Relation, sighting: Sighting) -> bool:
+        anchors = [each for each in self._memory.named(relation.anchor) if not each.is_same_object(sighting)]
+        if relation.predicate is Predicate.CLOSEST_TO:
+            return self._is_closest(relation, sighting)
+        if relation.predicate is Predicate.ON:
+            return any(self._is_on(sighting.centroid_m, anchor) for anchor in anchors)
+        return any(
+            float(np.linalg.norm(sighting.centroid_m - anchor.centroid_m)) < self._settings.near_m for anchor in anchors
+        )
+
+    def _is_on(self, centroid_m: Float64[ndarray, "3"], anchor: Remembered) -> bool:
+        offset = centroid_m - anchor.centroid_m
+        height_m = float(offset @ self._up)
+        aside_m = float(np.linalg.norm(offset - height_m * self._up))
+        return height_m > 0.0 and aside_m < self._settings.on_m
+
+    def _is_closest(self, relation: Relation, sighting: Sighting) -> bool:
+        """Only the candidate with the least distance to an anchor, of all that were ever seen, is the closest."""
+        anchors = self._memory.named(relation.anchor)
+        candidates = self._memory.confirmed(relation.target)
+        distances = [
+            min(
+                (
+                    float(np.linalg.norm(candidate.centroid_m - anchor.centroid_m))
+                    for anchor in anchors
+                    if not anchor.is_same_object(candidate.sighting)
+                ),
+                default=np.inf,
+            )
+            for candidate in candidates
+        ]
+        if not distances:
+            return False
+        return candidates[int(np.argmin(distances))].is_same_object(sighting)

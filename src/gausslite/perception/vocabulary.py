@@ -1,0 +1,97 @@
+"""What nouns have in common: heads, synonyms, and the kinds that size limits and generic tasks depend on."""
+
+from __future__ import annotations
+
+from typing import Final
+
+GENERIC: Final = frozenset(
+    {"object", "thing", "item", "stuff", "obstacle", "obstruction", "clutter", "hazard", "debris", "target"}
+)
+# the shell of a building or a stretch of ground: never one object among others
+STRUCTURE: Final = frozenset(
+    {"wall", "floor", "ceiling", "ground", "roof", "room", "kitchen", "bathroom", "bedroom", "office", "hallway",
+     "corridor", "road", "street", "sidewalk", "lawn", "grass", "sky", "stairs", "door", "window", "carpet", "rug"}
+)  # fmt: skip
+FURNITURE: Final = frozenset(
+    {"chair", "armchair", "stool", "couch", "sofa", "loveseat", "bench", "table", "desk", "counter", "countertop",
+     "bed", "shelf", "bookshelf", "bookcase", "cabinet", "cupboard", "dresser", "wardrobe", "closet", "sideboard",
+     "refrigerator", "fridge", "freezer", "oven", "stove", "dishwasher", "sink", "toilet", "bathtub", "door", "window",
+     "wall", "floor", "rug", "carpet", "car", "truck", "bus", "van", "boat", "train", "airplane", "tree", "person",
+     "piano", "workbench", "nightstand", "ottoman", "television", "whiteboard", "curtain", "fence", "gate"}
+)  # fmt: skip
+# phrases that name one kind of thing; the first of each row is the word the others are read as
+_SAME: Final = (
+    ("cup", "mug", "teacup", "coffee mug", "coffee cup", "tumbler", "paper cup"),
+    ("couch", "sofa", "settee", "loveseat", "futon"),
+    ("tv", "television", "monitor", "screen", "display", "computer monitor", "tv screen"),
+    ("dining table", "table", "desk", "coffee table", "counter", "countertop", "workbench", "kitchen table",
+     "dinner table"),
+    ("refrigerator", "fridge", "freezer"),
+    ("cell phone", "phone", "smartphone", "mobile phone", "telephone", "cellphone", "mobile"),
+    ("potted plant", "plant", "houseplant", "flowerpot", "planter", "pot plant"),
+    ("chair", "armchair", "seat", "office chair", "lawn chair", "stool", "lounge chair", "folding chair"),
+    ("person", "human", "man", "woman", "child", "pedestrian", "worker", "visitor", "boy", "girl", "kid", "baby"),
+    ("bicycle", "bike"),
+    ("motorcycle", "motorbike"),
+    ("backpack", "rucksack"),
+    ("handbag", "purse", "bag"),
+    ("suitcase", "luggage", "briefcase"),
+    ("remote", "remote control"),
+    ("oven", "stove", "cooker"),
+    ("microwave", "microwave oven"),
+    ("mouse", "computer mouse"),
+    ("keyboard", "computer keyboard"),
+    ("laptop", "notebook computer", "laptop computer"),
+    ("book", "notebook", "magazine"),
+    ("airplane", "plane", "aeroplane", "aircraft"),
+    ("donut", "doughnut"),
+    ("hair drier", "hair dryer", "hairdryer", "blow dryer"),
+    ("sports ball", "ball", "football", "basketball", "soccer ball"),
+    ("wine glass", "glass", "goblet"),
+    ("fire hydrant", "hydrant"),
+    ("stop sign", "sign"),
+    ("teddy bear", "teddy", "stuffed animal"),
+)  # fmt: skip
+SYNONYMS: Final = {name: row[0] for row in _SAME for name in row}
+
+
+def head_of(phrase: str) -> str:
+    """The noun itself: "lawn chair" → "chair", "mug_2" → "mug"."""
+    words = phrase.casefold().replace("_", " ").replace("-", " ").split()
+    while len(words) > 1 and words[-1].isdigit():
+        words.pop()
+    return words[-1] if words else ""
+
+
+def bare_name(phrase: str) -> str:
+    """The phrase without a trailing number and with plain spaces: "dining_table_1" → "dining table"."""
+    words = phrase.casefold().replace("_", " ").replace("-", " ").split()
+    while len(words) > 1 and words[-1].isdigit():
+        words.pop()
+    return " ".join(words)
+
+
+def is_generic(phrase: str) -> bool:
+    """True when the phrase stands for any object."""
+    return head_of(phrase) in GENERIC
+
+
+def is_structure(phrase: str) -> bool:
+    """True for walls, floors, rooms and the like."""
+    return head_of(phrase) in STRUCTURE
+
+
+def is_furniture(phrase: str) -> bool:
+    """True for things that rightly fill much of an image."""
+    return head_of(phrase) in FURNITURE
+
+
+def same_kind(phrase: str, name: str) -> bool:
+    """True when a task's phrase means objects of this name: equal heads, or two words for one thing."""
+    if is_generic(phrase):
+        return not is_structure(name)
+    wanted, offered = bare_name(phrase), bare_name(name)
+    if wanted == offered or head_of(wanted) == head_of(offered):
+        return True
+    canonical = SYNONYMS.get(wanted, SYNONYMS.get(head_of(wanted)))
+    return canonical is not None and canonical == SYNONYMS.get(offered, SYNONYMS.get(head_of(offered)))

@@ -1,0 +1,128 @@
+"""Arithmetic around a YOLO-seg network: the image into its square, its numbers back into boxes and masks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float32, Int64, UInt8
+from numpy import ndarray
+
+MASK_COEFFICIENTS = 32
+_PAD_VALUE = 114
+
+
+@dataclass(frozen=True, slots=True)
+class Letterbox:
+    """How an image was scaled and padded: x_network = x_image · scale_x + left_px, and the same for y."""
+
+    scale_x: float
+    scale_y: float
+    left_px: int
+    top_px: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Candidates:
+    """Boxes (left, top, right, bottom) in image pixels with their best class and mask coefficients."""
+
+    boxes_px: Float32[ndarray, "n 4"]
+    scores: Float32[ndarray, " n"]
+    classes: Int64[ndarray, " n"]
+    coefficients: Float32[ndarray, "n 32"]
+
+    def take(self, rows: Int64[ndarray, " m"]) -> Candidates:
+        """The candidates in these rows."""
+        return Candidates(self.boxes_px[rows], self.scores[rows], self.classes[rows], self.coefficients[rows])
+
+
+def letterbox(
+    rgb: UInt8[ndarray, "h w 3"], height_px: int, width_px: int
+) -> tuple[Float32[ndarray, "1 3 H W"], Letterbox]:
+    """Scale to fit, centre on grey, and bring to [0, 1] with channels first."""
+    h, w = rgb.shape[:2]
+    scale = min(height_px / h, width_px / w)
+    inner_h, inner_w = max(1, round(h * scale)), max(1, round(w * scale))
+    top, left = (height_px - inner_h) // 2, (width_px - inner_w) // 2
+    canvas = np.full((height_px, width_px, 3), _PAD_VALUE, np.uint8)
+    canvas[top : top + inner_h, left : left + inner_w] = (
+        rgb if (inner_h, inner_w) == (h, w) else cv2.resize(rgb, (inner_w, inner_h), interpolation=cv2.INTER_LINEAR)
+    )
+    tensor = np.ascontiguousarray(canvas.transpose(2, 0, 1)[None]).astype(np.float32) / np.float32(255.0)
+    return tensor, Letterbox(inner_w / w, inner_h / h, left, top)
+
+
+def decode(
+    output: Float32[ndarray, "rows a"], placed: Letterbox, size_px: tuple[int, int], min_score: float
+) -> Candidates:
+    """Anchors whose best class reaches min_score, as boxes clipped to an image of size_px (height, width)."""
+    class_scores = output[4:-MASK_COEFFICIENTS]
+    classes = class_scores.argmax(axis=0)
+    scores = class_scores[classes, np.arange(output.shape[1])]
+    kept = np.flatnonzero(scores >= min_score)
+    centre_x, centre_y, width, height = output[:4, kept]
+    height_px, width_px = size_px
+    boxes = np.stack(
+        [
+            np.clip((centre_x - width / 2 - placed.left_px) / placed.scale_x, 0, width_px),
+            np.clip((centre_y - height / 2 - placed.top_px) / placed.scale_y, 0, height_px),
+            np.clip((centre_x + width / 2 - placed.left_px) / placed.scale_x, 0, width_px),
+            np.clip((centre_y + height / 2 - placed.top_px) / placed.scale_y, 0, height_px),
+        ],
+        axis=1,
+    ).astype(np.float32)
+    return Candidates(
+        boxes,
+        scores[kept].astype(np.float32),
+        classes[kept].astype(np.int64),
+        np.ascontiguousarray(output[-MASK_COEFFICIENTS:, kept].T).astype(np.float32),
+    )
+
+
+def suppress(candidates: Candidates, max_iou: float, max_boxes: int, across_classes: bool) -> Candidates:
+    """Greedy non-maximum suppression, within each class or across all; the best max_boxes survive, best first."""
+    if len(candidates.scores) == 0:
+        return candidates
+    boxes = candidates.boxes_px.astype(np.float64)
+    boxes[:, 2:] -= boxes[:, :2]
+    if not across_classes:
+        # boxes of different classes, moved apart, never overlap
+        boxes[:, :2] += (candidates.classes * (boxes.max() * 2 + 1.0))[:, None]
+    order = cv2.dnn.NMSBoxes(boxes.tolist(), candidates.scores.tolist(), 0.0, max_iou)
+    return candidates.take(np.asarray(order, np.int64).reshape(-1)[:max_boxes])
+
+
+def mask_of(
+    coefficients: Float32[ndarray, "32"],
+    prototypes: Float32[ndarray, "32 ph pw"],
+    box_px: Float32[ndarray, "4"],
+    placed: Letterbox,
+    sizes_px: tuple[tuple[int, int], tuple[int, int]],
+) -> Bool[ndarray, "h w"]:
+    """One object's mask in the image, zero outside its box; sizes_px are (height, width) of image and network."""
+    (height_px, width_px), (network_h, network_w) = sizes_px
+    logits = np.tensordot(coefficients, prototypes, axes=1).astype(np.float32)
+    rows_per_px, columns_per_px = logits.shape[0] / network_h, logits.shape[1] / network_w
+    left, top = np.floor(box_px[:2]).astype(int)
+    right, bottom = np.minimum(np.ceil(box_px[2:]).astype(int), (width_px, height_px))
+    mask = np.zeros((height_px, width_px), np.bool_)
+    if right <= left or bottom <= top:
+        return mask
+    # maps pixel centres of the box onto centres of the prototype grid
+    scale_x, scale_y = placed.scale_x * columns_per_px, placed.scale_y * rows_per_px
+    to_grid = np.array(
+        [
+            [scale_x, 0.0, (left + 0.5) * scale_x + placed.left_px * columns_per_px - 0.5],
+            [0.0, scale_y, (top + 0.5) * scale_y + placed.top_px * rows_per_px - 0.5],
+        ]
+    )
+    inside = cv2.warpAffine(
+        logits,
+        to_grid,
+        (int(right - left), int(bottom - top)),
+        flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+        borderMode=cv2.BORDER_REPLICATE,
+    )
+    mask[top:bottom, left:right] = inside > 0.0
+    return mask
