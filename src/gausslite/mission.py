@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from gausslite.datasets.source import Source, UpAxis
@@ -14,11 +14,23 @@ from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.policies import policy
 from gausslite.mapping.settings import Components, MapperSettings
 from gausslite.perception.attention import AttentionSettings, TaskAttention
-from gausslite.perception.detect import Detector
 from gausslite.render.choose import choose_rasterizer
 
 DEFAULT_MAX_GAUSSIANS = 150_000
 """What two cores keep busy at 640x480; the paper's cap of a million is for a GPU."""
+
+
+@dataclass(frozen=True, slots=True)
+class SceneKnowledge:
+    """What is known of a place before the robot looks: which way is up and, in tests, where the objects are."""
+
+    up_axis: UpAxis = (0.0, 0.0, 1.0)
+    regions: Mapping[str, Region] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, source: Source) -> SceneKnowledge:
+        """What a sequence says about its place."""
+        return cls(source.up_axis, source.regions())
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,27 +81,26 @@ def build_mapper(settings: MissionSettings) -> GaussianMapper:
     return GaussianMapper(settings.mapper_settings(), rasterizer, seed=settings.seed)
 
 
-def build_detector(model: Path | None, regions: Mapping[str, Region], threads: int | None = None) -> Detector:
-    """The user's YOLO-seg file, or, without one, the sequence's own ground truth.
+def build_attention(
+    graph: TaskGraph, scene: SceneKnowledge, model: Path | None = None, threads: int | None = None
+) -> TaskAttention:
+    """Attention to a task: by the user's YOLO-seg file or, without one, by the scene's own ground truth.
 
-    Raises ModelFileError for a bad file and InvalidInputError when there is neither.
+    Raises ModelFileError for a bad file and InvalidInputError when there is neither file nor ground truth.
     """
+    settings = AttentionSettings(up_axis=scene.up_axis)
     if model is not None:
         from gausslite.perception.yolo import load_yolo
 
-        return load_yolo(model, threads=threads)
-    if not regions:
+        yolo = load_yolo(model, threads=threads)
+        return TaskAttention(graph, yolo, settings, segmenter=yolo)
+    if not scene.regions:
         raise InvalidInputError(
             "detector: the sequence has no ground-truth regions; name a YOLO-seg ONNX file with --detector"
         )
     from gausslite.perception.ground_truth import RegionDetector
 
-    return RegionDetector(regions)
-
-
-def build_attention(graph: TaskGraph, detector: Detector, up_axis: UpAxis) -> TaskAttention:
-    """Attention to the task of `graph` in a world with this upward direction."""
-    return TaskAttention(graph, detector, AttentionSettings(up_axis=up_axis))
+    return TaskAttention(graph, RegionDetector(scene.regions), settings)
 
 
 def choose_regions(regions: Mapping[str, Region], names: Sequence[str]) -> list[Region]:

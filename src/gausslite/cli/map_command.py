@@ -23,14 +23,14 @@ from gausslite.mapping.policies import POLICIES
 from gausslite.mission import (
     DEFAULT_MAX_GAUSSIANS,
     MissionSettings,
+    SceneKnowledge,
     build_attention,
-    build_detector,
     build_mapper,
     choose_regions,
     frame_size,
 )
-from gausslite.perception.attention import Attention
-from gausslite.perception.fixed import RegionAttention
+from gausslite.perception.attention import Attention, TaskAttention
+from gausslite.perception.fixed import NoAttention, RegionAttention
 from gausslite.pipeline import FrameOutcome, TaskMapper
 
 
@@ -74,7 +74,7 @@ def run(options: argparse.Namespace) -> int:
         "active_gaussians": active,
         "max_gaussians": settings.max_gaussians,
         "peak_rss_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
-        "notes": list(attention.notes),
+        "notes": list(attention.notes) if isinstance(attention, TaskAttention) else [],
     }
     write_json(options.out / "report.json", report)
     print(
@@ -128,13 +128,12 @@ def _attention(
         from gausslite.task.rules import RuleParser
 
         graph = RuleParser().parse(options.task)
-        detector = build_detector(options.detector, source.regions(), settings.threads)
-        return build_attention(graph, detector, source.up_axis), graph
+        return build_attention(graph, SceneKnowledge.of(source), options.detector, settings.threads), graph
     if not regions and options.policy != "uniform":
         raise InvalidInputError(
             "--task: expected a task in words, or regions with --roi FILE.npz or --roi-ball X,Y,Z,R"
         )
-    return RegionAttention(choose_regions(regions, options.objects) if regions else ()), None
+    return RegionAttention(choose_regions(regions, options.objects)) if regions else NoAttention(), None
 
 
 def _settings(options: argparse.Namespace) -> MissionSettings:

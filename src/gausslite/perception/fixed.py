@@ -29,3 +29,12 @@ class RegionAttention:
         for index, region in reversed(list(enumerate(self._regions))):
             target[region.mask(frame)] = index
         return RelevanceMap((target != NO_TARGET).astype(np.float32), target)
+
+
+class NoAttention:
+    """An Attention for uniform maps: nothing is relevant."""
+
+    def attend(self, frame: Frame, rendered_depth_m: Float32[ndarray, "h w"] | None = None) -> RelevanceMap:
+        """Weight 0 everywhere."""
+        del rendered_depth_m
+        return RelevanceMap.nothing(*frame.depth_m.shape)
