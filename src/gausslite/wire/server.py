@@ -12,7 +12,6 @@ import signal
 import socket
 from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, NoReturn
 
 import grpc
@@ -63,7 +62,7 @@ async def start_server(listen: str, services: Sequence[Service]) -> RunningServe
     """
     _require_free(listen)
     server = grpc.aio.server(interceptors=[ErrorInterceptor()], options=_OPTIONS)
-    health_servicer = health.aio.HealthServicer()
+    health_servicer = health.aio.HealthServicer()  # type: ignore[attr-defined]
     health_pb2_grpc.add_HealthServicer_to_server(health_servicer, server)
     for service in services:
         service.register(server)
@@ -107,14 +106,14 @@ async def serve_until_stopped(
         _log.info("ended")
 
 
-class ErrorInterceptor(grpc.aio.ServerInterceptor[Any, Any]):
+class ErrorInterceptor(grpc.aio.ServerInterceptor):  # type: ignore[type-arg]
     """Ends a call with the status of the error its method raised; anything unforeseen is INTERNAL and logged."""
 
     async def intercept_service(
         self,
-        continuation: Callable[[grpc.HandlerCallDetails], Awaitable[grpc.RpcMethodHandler[Any, Any]]],
-        handler_call_details: grpc.HandlerCallDetails,
-    ) -> grpc.RpcMethodHandler[Any, Any]:
+        continuation: Callable[[Any], Awaitable[Any]],
+        handler_call_details: Any,
+    ) -> Any:
         """Wrap the method that is about to be called."""
         handler = await continuation(handler_call_details)
         method = handler_call_details.method
@@ -171,14 +170,23 @@ async def _abort(error: Exception, method: str, context: Any) -> NoReturn:
 
 
 def _require_free(listen: str) -> None:
-    """GRPC silently takes over a unix socket that another server still answers on."""
+    """Try the address first: gRPC takes over a unix socket that another server still answers on, and writes lines of
+    its own to stderr about a port in use.
+    """
     if listen.startswith("unix:"):
-        path = Path(listen.removeprefix("unix:"))
         with socket.socket(socket.AF_UNIX) as probe:
             probe.settimeout(1.0)
-            if probe.connect_ex(str(path)) == 0:
+            if probe.connect_ex(listen.removeprefix("unix:")) == 0:
                 raise UnavailableError(f"listen {listen}: another server answers on this socket; choose another")
         return
     host, _, port = listen.rpartition(":")
     if not host or not port.isdigit() or int(port) > 65535:
         raise InvalidInputError(f"listen: expected HOST:PORT or unix:PATH, got {listen!r}")
+    try:
+        resolved = socket.getaddrinfo(host.strip("[]"), int(port), type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
+        for family, kind, protocol, _, address in resolved:
+            with socket.socket(family, kind, protocol) as probe:
+                probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+                probe.bind(address)
+    except OSError as error:
+        raise UnavailableError(f"listen {listen}: {error.strerror or error}; choose another address") from error

@@ -1,0 +1,277 @@
+"""The three services as plain Python objects: nouns in, nouns out, our errors raised, every unary call with a deadline.
+
+A client is safe to use from many threads. Streams are iterators; closing one cancels the call.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import google_crc32c
+import grpc
+from jaxtyping import Float32, Float64, UInt8
+from numpy import ndarray
+
+from gausslite.codec.subset_codec import CodecLimits
+from gausslite.domain.camera import Camera
+from gausslite.domain.frame import Frame
+from gausslite.domain.task import TaskGraph
+from gausslite.domain.voxels import VoxelGrid
+from gausslite.errors import ChecksumError, CodecError
+from gausslite.v1 import (
+    agent_service_pb2,
+    agent_service_pb2_grpc,
+    fusion_service_pb2,
+    fusion_service_pb2_grpc,
+    parser_service_pb2,
+    parser_service_pb2_grpc,
+)
+from gausslite.wire import convert
+from gausslite.wire.images import decode_colour, decode_depth
+from gausslite.wire.server import MAX_MESSAGE_BYTES
+from gausslite.wire.status import from_rpc_error
+
+DEADLINE_S = 30.0
+# a snapshot's block may come from a server with a larger limit of its own
+_WATCH_LIMITS = CodecLimits(max_bytes=MAX_MESSAGE_BYTES, max_voxels=2_000_000, max_gaussians=2_000_000)
+_RETRIED = {
+    "gausslite.v1.ParserService": ("ParseTask",),
+    "gausslite.v1.AgentService": ("AssignTask", "GetAgentStatus", "RenderView"),
+    "gausslite.v1.FusionService": ("JoinSession", "GetSessionStatus", "LeaveSession"),
+}
+_RETRY_POLICY = {
+    "maxAttempts": 4,
+    "initialBackoff": "0.2s",
+    "maxBackoff": "2s",
+    "backoffMultiplier": 2,
+    "retryableStatusCodes": ["UNAVAILABLE"],
+}
+
+
+ClientKind = TypeVar("ClientKind", bound="_Client")
+
+
+@dataclass(frozen=True, slots=True)
+class Session:
+    """A place in a mission, as the fusion server granted it."""
+
+    session_id: str
+    highest_map_revision: int
+    fused_revision: int
+    max_subset_bytes: int
+    max_gaussians: int
+
+
+@dataclass(frozen=True, slots=True)
+class Export:
+    """Which map to fetch: `vote`, `concatenation` or `refined`; with an agent's name only its contribution."""
+
+    strategy: str = "vote"
+    agent_id: str = ""
+
+
+class _Client:
+    """Owns one channel. Raises our errors for what the server or the transport says."""
+
+    def __init__(self, address: str, deadline_s: float = DEADLINE_S) -> None:
+        self.address = address
+        self._deadline_s = deadline_s
+        methods = [{"service": service, "method": name} for service, names in _RETRIED.items() for name in names]
+        config = {"methodConfig": [{"name": methods, "retryPolicy": _RETRY_POLICY}]}
+        options = (
+            ("grpc.service_config", json.dumps(config)),
+            ("grpc.max_receive_message_length", MAX_MESSAGE_BYTES),
+            ("grpc.max_send_message_length", MAX_MESSAGE_BYTES),
+            ("grpc.max_reconnect_backoff_ms", 2000),
+        )
+        self._channel = grpc.insecure_channel(address, options=options)
+
+    def close(self) -> None:
+        """End the channel and every call on it."""
+        self._channel.close()
+
+    def __enter__(self: ClientKind) -> ClientKind:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+    @contextmanager
+    def _our_errors(self) -> Iterator[None]:
+        try:
+            yield
+        except grpc.RpcError as error:
+            raise from_rpc_error(error, self.address) from error
+
+    def _call(self, method: Any, request: Any, deadline_s: float | None = None) -> Any:
+        with self._our_errors():
+            return method(request, timeout=self._deadline_s if deadline_s is None else deadline_s)
+
+    def _stream(self, call: Any) -> Iterator[Any]:
+        try:
+            with self._our_errors():
+                yield from call
+        finally:
+            call.cancel()
+
+
+class ParserClient(_Client):
+    """The parser service as a task.TaskParser."""
+
+    def __init__(self, address: str, deadline_s: float = DEADLINE_S) -> None:
+        super().__init__(address, deadline_s)
+        self._stub = parser_service_pb2_grpc.ParserServiceStub(self._channel)
+
+    def parse(self, text: str) -> TaskGraph:
+        """The graph of a task. Raises TaskError, UnavailableError."""
+        response = self._call(self._stub.ParseTask, parser_service_pb2.ParseTaskRequest(text=text))
+        return convert.graph_from_message(response.graph)
+
+
+class AgentClient(_Client):
+    """One robot's mapper."""
+
+    def __init__(self, address: str, deadline_s: float = DEADLINE_S) -> None:
+        super().__init__(address, deadline_s)
+        self._stub = agent_service_pb2_grpc.AgentServiceStub(self._channel)
+
+    def assign_task(self, task: str | TaskGraph) -> TaskGraph:
+        """Give the agent words or a graph; returns the graph it works on. Raises TaskError, UnavailableError."""
+        if isinstance(task, str):
+            request = agent_service_pb2.AssignTaskRequest(text=task)
+        else:
+            request = agent_service_pb2.AssignTaskRequest(graph=convert.graph_to_message(task))
+        return convert.graph_from_message(self._call(self._stub.AssignTask, request).graph)
+
+    def ingest(
+        self, frames: Iterable[Frame], lossless: bool = False
+    ) -> Iterator[agent_service_pb2.IngestFramesResponse]:
+        """Send frames as they come; yields one outcome for each, in order."""
+        requests = (
+            agent_service_pb2.IngestFramesRequest(frame=convert.frame_to_message(frame, lossless)) for frame in frames
+        )
+        return self._stream(self._stub.IngestFrames(requests))
+
+    def status(self) -> agent_service_pb2.GetAgentStatusResponse:
+        """What the agent has done so far."""
+        request = agent_service_pb2.GetAgentStatusRequest()
+        response: agent_service_pb2.GetAgentStatusResponse = self._call(self._stub.GetAgentStatus, request)
+        return response
+
+    def render(
+        self, camera: Camera, T_world_camera: Float64[ndarray, "4 4"]
+    ) -> tuple[UInt8[ndarray, "h w 3"], Float32[ndarray, "h w"]]:
+        """Colour and depth of the agent's map from this pose."""
+        request = agent_service_pb2.RenderViewRequest(
+            camera=convert.camera_to_message(camera), t_world_camera=convert.transform_to_message(T_world_camera)
+        )
+        response = self._call(self._stub.RenderView, request)
+        size = camera.width_px, camera.height_px
+        return decode_colour(response.colour_png, *size), decode_depth(response.depth_png, *size)
+
+    def watch_map(
+        self, since_revision: int = 0, region: convert.Box | None = None, roi_only: bool = False
+    ) -> Iterator[convert.MapUpdate]:
+        """The map as it grows, without end. Raises RevisionGoneError when since_revision is no longer kept."""
+        request = agent_service_pb2.WatchMapRequest(
+            since_revision=since_revision,
+            region=None if region is None else convert.box_to_message(region),
+            roi_only=roi_only,
+        )
+        for response in self._stream(self._stub.WatchMap(request)):
+            yield convert.map_update_from_message(response.block, _WATCH_LIMITS)
+
+
+class FusionClient(_Client):
+    """The team's map."""
+
+    def __init__(self, address: str, deadline_s: float = DEADLINE_S, mission_id: str = "") -> None:
+        super().__init__(address, deadline_s)
+        self.mission_id = mission_id
+        self._stub = fusion_service_pb2_grpc.FusionServiceStub(self._channel)
+
+    def join(self, agent_id: str, grid: VoxelGrid, world_frame: str = "", fresh_map: bool = False) -> Session:
+        """Enter the mission. Raises MismatchError when the grid, the world frame or the mission differ."""
+        request = fusion_service_pb2.JoinSessionRequest(
+            agent_id=agent_id,
+            mission_id=self.mission_id,
+            grid=convert.grid_to_message(grid),
+            world_frame=world_frame,
+            fresh_map=fresh_map,
+        )
+        response = self._call(self._stub.JoinSession, request)
+        return Session(
+            response.session_id,
+            response.highest_map_revision,
+            response.fused_revision,
+            response.max_subset_bytes,
+            response.max_gaussians,
+        )
+
+    def contribute(
+        self, requests: Sequence[fusion_service_pb2.ContributeSubsetsRequest], deadline_s: float
+    ) -> Iterator[fusion_service_pb2.ContributeSubsetsResponse]:
+        """Send these subsets and yield the acks until all are answered or `deadline_s` is over."""
+        return self._stream(self._stub.ContributeSubsets(iter(requests), timeout=deadline_s))
+
+    def contribute_keyframes(self, session_id: str, keyframes: Iterable[Frame]) -> int:
+        """Hand over views for the refinement; how many were kept. Raises QuotaError, SessionUnknownError."""
+        requests = (
+            fusion_service_pb2.ContributeKeyframesRequest(
+                session_id=session_id, keyframe=convert.frame_to_message(keyframe)
+            )
+            for keyframe in keyframes
+        )
+        return int(self._call(self._stub.ContributeKeyframes, requests, 10 * self._deadline_s).accepted)
+
+    def watch(self, since_revision: int = 0, region: convert.Box | None = None) -> Iterator[convert.MapUpdate]:
+        """The fused map as it changes, without end. Raises RevisionGoneError when since_revision is no longer kept."""
+        request = fusion_service_pb2.WatchFusedMapRequest(
+            mission_id=self.mission_id,
+            since_revision=since_revision,
+            region=None if region is None else convert.box_to_message(region),
+        )
+        for response in self._stream(self._stub.WatchFusedMap(request)):
+            yield convert.map_update_from_message(response.block, _WATCH_LIMITS)
+
+    def refine(
+        self, iterations: int = 0, max_gaussians: int = 0, seed: int = 0
+    ) -> Iterator[fusion_service_pb2.RefineFusedMapResponse]:
+        """Optimise the fused map on the union of the keyframes; yields progress; closing it cancels."""
+        request = fusion_service_pb2.RefineFusedMapRequest(
+            mission_id=self.mission_id, iterations=iterations, max_gaussians=max_gaussians, seed=seed
+        )
+        return self._stream(self._stub.RefineFusedMap(request))
+
+    def export(self, export: Export) -> bytes:
+        """A map as the bytes of a PLY file. Raises MismatchError before there is a refined one, ChecksumError."""
+        request = fusion_service_pb2.ExportFusedMapRequest(
+            mission_id=self.mission_id,
+            strategy=fusion_service_pb2.FusionStrategy.Value(f"FUSION_STRATEGY_{export.strategy.upper()}"),
+            agent_id=export.agent_id,
+        )
+        data, last = bytearray(), None
+        for last in self._stream(self._stub.ExportFusedMap(request)):
+            if last.offset != len(data):
+                raise CodecError(f"export: expected the chunk at byte {len(data)}, got the one at {last.offset}")
+            data += last.data
+        if last is None or last.total_bytes != len(data):
+            raise CodecError(f"export: the stream ended after {len(data)} bytes, before the map was whole")
+        if google_crc32c.value(bytes(data)) != last.crc32c:
+            raise ChecksumError("export: CRC32C does not match; the map was damaged on the way")
+        return bytes(data)
+
+    def status(self) -> fusion_service_pb2.GetSessionStatusResponse:
+        """What the server holds of whom."""
+        request = fusion_service_pb2.GetSessionStatusRequest(mission_id=self.mission_id)
+        response: fusion_service_pb2.GetSessionStatusResponse = self._call(self._stub.GetSessionStatus, request)
+        return response
+
+    def leave(self, session_id: str, forget: bool = False) -> int:
+        """Leave; with `forget` the map becomes as if the agent had never been there. Returns the fused revision."""
+        request = fusion_service_pb2.LeaveSessionRequest(session_id=session_id, forget=forget)
+        return int(self._call(self._stub.LeaveSession, request).fused_revision)

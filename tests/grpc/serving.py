@@ -1,0 +1,28 @@
+"""Serve in process on an event loop in a thread, as another process would."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from gausslite.wire.server import RunningServer, Service, start_server
+
+
+@contextmanager
+def serving(services: list[Service], listen: str = "127.0.0.1:0") -> Iterator[RunningServer]:
+    """A running server; it is drained at the end."""
+    loop = asyncio.new_event_loop()
+    thread = threading.Thread(target=loop.run_forever)
+    thread.start()
+    try:
+        running = asyncio.run_coroutine_threadsafe(start_server(listen, services), loop).result(10)
+        try:
+            yield running
+        finally:
+            asyncio.run_coroutine_threadsafe(running.stop(1.0), loop).result(10)
+    finally:
+        loop.call_soon_threadsafe(loop.stop)
+        thread.join()
+        loop.close()

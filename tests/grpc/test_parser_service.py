@@ -1,0 +1,97 @@
+"""The parser service in process: the right graph, the right status, health, reflection, and an address in use."""
+
+from __future__ import annotations
+
+import asyncio
+import subprocess
+import sys
+from pathlib import Path
+
+import grpc
+import pytest
+from grpc_health.v1 import health_pb2, health_pb2_grpc
+from grpc_reflection.v1alpha import reflection_pb2, reflection_pb2_grpc
+from serving import serving
+
+from gausslite.domain.task import TaskGraph
+from gausslite.errors import GaussLiteError, InvalidInputError, TaskError, UnavailableError
+from gausslite.task.rules import RuleParser
+from gausslite.wire.clients import ParserClient
+from gausslite.wire.server import start_server
+from gausslite_parser.servicer import parser_service
+
+
+class FailingParser:
+    """A parser with a bug."""
+
+    def parse(self, text: str) -> TaskGraph:
+        raise ZeroDivisionError("secret detail")
+
+
+def test_the_graph_comes_back_as_the_parser_made_it() -> None:
+    text = "Identify the chair closest to the table"
+    with serving([parser_service(RuleParser())]) as server, ParserClient(server.address) as client:
+        assert client.parse(text) == RuleParser().parse(text)
+
+
+def test_unix_socket(tmp_path: Path) -> None:
+    listen = f"unix:{tmp_path}/parser.sock"
+    with serving([parser_service(RuleParser())], listen) as server, ParserClient(server.address) as client:
+        assert client.parse("Pick up the mug on the table").targets == ("mug",)
+        with pytest.raises(UnavailableError, match="another server answers"):
+            asyncio.run(start_server(listen, []))
+
+
+@pytest.mark.parametrize("text", ["", "   ", "x" * 100_000])
+def test_a_task_without_sense_is_a_task_error(text: str) -> None:
+    with serving([parser_service(RuleParser())]) as server, ParserClient(server.address) as client:
+        with pytest.raises(TaskError):
+            client.parse(text)
+        assert client.parse("Pick up the mug").targets == ("mug",)
+
+
+def test_a_bug_is_internal_without_its_details_and_the_server_lives() -> None:
+    with serving([parser_service(FailingParser())]) as server, ParserClient(server.address) as client:
+        for _ in range(2):
+            with pytest.raises(GaussLiteError, match="unforeseen error") as caught:
+                client.parse("Pick up the mug")
+            assert "secret" not in str(caught.value)
+
+
+def test_health_and_reflection() -> None:
+    with serving([parser_service(RuleParser())]) as server, grpc.insecure_channel(server.address) as channel:
+        check = health_pb2_grpc.HealthStub(channel).Check
+        for name in ("", "gausslite.v1.ParserService"):
+            assert check(health_pb2.HealthCheckRequest(service=name)).status == health_pb2.HealthCheckResponse.SERVING
+        request = reflection_pb2.ServerReflectionRequest(list_services="")
+        [answer] = reflection_pb2_grpc.ServerReflectionStub(channel).ServerReflectionInfo(iter([request]))
+        names = {service.name for service in answer.list_services_response.service}
+        assert names >= {"gausslite.v1.ParserService", "grpc.health.v1.Health"}
+
+
+def test_an_address_in_use_is_one_line_and_code_2() -> None:
+    with serving([parser_service(RuleParser())]) as server:
+        with pytest.raises(UnavailableError, match="in use"):
+            asyncio.run(start_server(server.address, []))
+        ended = subprocess.run(
+            [sys.executable, "-m", "gausslite_parser", "--listen", server.address],
+            capture_output=True, text=True, timeout=60, check=False,
+        )  # fmt: skip
+    assert ended.returncode == 2
+    assert ended.stdout == ""
+    assert len(ended.stderr.splitlines()) == 1
+    assert "in use" in ended.stderr
+
+
+@pytest.mark.parametrize("listen", ["nowhere", "localhost:port", "localhost:70000", ":50051", ""])
+def test_what_is_no_address_is_refused(listen: str) -> None:
+    with pytest.raises(InvalidInputError, match="HOST:PORT"):
+        asyncio.run(start_server(listen, []))
+
+
+def test_nobody_there_is_unavailable() -> None:
+    with (
+        ParserClient("127.0.0.1:1", deadline_s=5.0) as client,
+        pytest.raises(UnavailableError, match=r"127\.0\.0\.1:1"),
+    ):
+        client.parse("Pick up the mug")
