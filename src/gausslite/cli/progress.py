@@ -10,7 +10,7 @@ from types import TracebackType
 class MappingBar:
     """A progress bar over frames. Draws on a terminal; elsewhere it prints a line every few seconds."""
 
-    def __init__(self, total: int, label: str = "map") -> None:
+    def __init__(self, total: int, label: str = "map", row: int = 0) -> None:
         from tqdm import tqdm
 
         on_terminal = sys.stderr.isatty()
@@ -18,6 +18,7 @@ class MappingBar:
             total=total,
             desc=label,
             unit="frame",
+            position=row if on_terminal else 0,
             mininterval=0.2 if on_terminal else 10.0,
             dynamic_ncols=on_terminal,
             file=sys.stderr,
@@ -30,6 +31,10 @@ class MappingBar:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Leave the last figures on the screen."""
         self._bar.close()
 
     def show(self, done: int, gaussians: int, roi_share: float, uplink_bytes: int | None = None) -> None:

@@ -1,0 +1,201 @@
+"""`gausslite demo`: a team of two maps one place by task, and the fused map is scored against each robot alone."""
+
+from __future__ import annotations
+
+import argparse
+import signal
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from types import FrameType
+
+from gausslite.cli.arguments import add_mapping, names
+from gausslite.cli.output import prepare_folder, write_json
+from gausslite.cli.team import AgentPlan, Team, TeamPlan, agent_report, collect_maps, running_team, watch_missions
+from gausslite.codec.ply import read_ply
+from gausslite.datasets.open import open_source
+from gausslite.datasets.selection import select_frames
+from gausslite.domain.region import Region
+from gausslite.domain.voxels import VoxelGrid
+from gausslite.errors import InvalidInputError
+from gausslite.evaluation.compare import MapScores
+from gausslite.evaluation.held_out import HoldOut
+from gausslite.evaluation.pictures import write_png
+from gausslite.evaluation.team import TeamScores, Viewpoints, score_team
+from gausslite.mission import DEFAULT_MAX_GAUSSIANS, choose_regions, frame_size
+from gausslite.perception.vocabulary import same_kind
+from gausslite.render.choose import choose_rasterizer
+
+_HOME = "sim:home?seed={seed}&trajectory={trajectory}&frames={frames}"
+_HOME_FRAMES, _HOME_VIEWS = 120, 24
+_HOME_SIZE = "320x240"
+_HOLD_OUT = 8
+_AGENT_KEYS = ("frames", "hz", "gaussians", "roi_share", "bytes_sent", "map_shared_percent")
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `gausslite demo`."""
+    parser.add_argument("--source", metavar="SOURCE", help="a sequence to share out (default: a simulated home)")
+    parser.add_argument("--task-a", metavar="TEXT", default="Pick up the mug on the table", help="mission of agent-a")
+    parser.add_argument(
+        "--task-b", metavar="TEXT", default="Identify the chair closest to the table", help="mission of agent-b"
+    )
+    parser.add_argument("--frames-a", metavar="START:STOP:STEP", help="frames of agent-a (default: the first half)")
+    parser.add_argument("--frames-b", metavar="START:STOP:STEP", help="frames of agent-b (default: the second half)")
+    parser.add_argument(
+        "--objects", metavar="A,B", type=names, default=(), help="score these (default: the tasks' nouns)"
+    )
+    parser.add_argument("--detector", metavar="FILE.onnx", type=Path, help="a YOLO-seg model (default: ground truth)")
+    parser.add_argument("--size", metavar="WxH", help=f"image size (default: as it is; {_HOME_SIZE} in the home)")
+    parser.add_argument(
+        "--voxel-size", metavar="M", type=float, default=VoxelGrid().size_m, help="metres (default: 0.1)"
+    )
+    parser.add_argument("--refine-iterations", metavar="N", type=int, default=500, help="0 leaves refinement out")
+    add_mapping(parser, DEFAULT_MAX_GAUSSIANS)
+    parser.add_argument("--out", metavar="DIR", type=Path, required=True, help="gets report.json, maps and pictures")
+    parser.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Run the team, score the maps, write and print the report."""
+    signal.signal(signal.SIGTERM, _interrupt)
+    stage = _simulated_stage(options) if options.source is None else _recorded_stage(options)
+    regions = _scored_regions(options, stage.regions)
+    prepare_folder(options.out)
+    with running_team(_plan(options, stage), options.out.absolute()) as team:
+        watch_missions(team)
+        maps = collect_maps(team, options.out)
+        agents = _agents(team, options.out)
+    scores = _score(options, stage, list(regions.values()), maps)
+    report = {
+        "source": options.source or stage.agents[0].source,
+        "size": list(stage.size),
+        "seed": options.seed,
+        "agents": agents,
+        "maps": {name: _figures(score) for name, score in scores.scores.items()},
+        "scored": {"objects": sorted(regions), "views": next(iter(scores.scores.values())).n_views},
+    }
+    write_json(options.out / "report.json", report)
+    _write_pictures(options.out / "pictures", scores)
+    print(_table(agents, scores.scores))
+    print(f"report, maps and pictures are in {options.out}")
+    return 0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Stage:
+    """Where the team works: the agents' cameras and the views kept from them."""
+
+    agents: tuple[AgentPlan, ...]
+    size: tuple[int, int]
+    hold_out: int | None
+    held_out: tuple[Viewpoints, ...]
+    regions: Mapping[str, Region]
+
+
+def _simulated_stage(options: argparse.Namespace) -> _Stage:
+    """Two walks through one home; the held-out views lie off both."""
+    specs = [
+        _HOME.format(seed=options.seed, trajectory=walk, frames=_HOME_VIEWS if walk == 2 else _HOME_FRAMES)
+        for walk in range(3)
+    ]
+    walks = [(specs[0], options.task_a, options.frames_a), (specs[1], options.task_b, options.frames_b)]
+    agents = tuple(
+        AgentPlan(f"agent-{letter}", task, spec, frames or ":", len(select_frames(open_source(spec), frames or ":")))
+        for letter, (spec, task, frames) in zip("ab", walks, strict=True)
+    )
+    held_out = open_source(specs[2])
+    size = frame_size(options.size or _HOME_SIZE, held_out)
+    return _Stage(agents, size, None, (Viewpoints(held_out, range(len(held_out)), size),), held_out.regions())
+
+
+def _recorded_stage(options: argparse.Namespace) -> _Stage:
+    """One sequence in two parts; every eighth frame of each is kept from mapping."""
+    source = open_source(options.source)
+    middle = source.indices()[len(source) // 2]
+    first, second = options.frames_a or f":{middle}", options.frames_b or f"{middle}:"
+    size = frame_size(options.size, source)
+    agents, held_out = [], []
+    for letter, task, frames in (("a", options.task_a, first), ("b", options.task_b, second)):
+        train, held = HoldOut(_HOLD_OUT, _HOLD_OUT - 1).split(select_frames(source, frames))
+        agents.append(AgentPlan(f"agent-{letter}", task, str(options.source), frames, len(train)))
+        held_out.append(Viewpoints(source, held, size))
+    return _Stage(tuple(agents), size, _HOLD_OUT, tuple(held_out), source.regions())
+
+
+def _scored_regions(options: argparse.Namespace, regions: Mapping[str, Region]) -> dict[str, Region]:
+    """The objects the tasks name, or the ones the user names. Raises InvalidInputError."""
+    if options.objects:
+        return dict(zip(options.objects, choose_regions(regions, options.objects), strict=True))
+    from gausslite.task.rules import RuleParser
+
+    targets = {t for task in (options.task_a, options.task_b) for t in RuleParser().parse(task).targets}
+    chosen = {name: region for name, region in regions.items() if any(same_kind(target, name) for target in targets)}
+    if not chosen:
+        raise InvalidInputError(
+            f"demo: expected ground truth for {', '.join(sorted(targets))} to score against, "
+            f"got regions {', '.join(regions) or 'of nothing'}"
+        )
+    return chosen
+
+
+def _plan(options: argparse.Namespace, stage: _Stage) -> TeamPlan:
+    width, height = stage.size
+    shared = ["--size", f"{width}x{height}", "--max-gaussians", str(options.max_gaussians), "--seed", str(options.seed)]
+    shared += ["--threads", str(options.threads or 1), "--voxel-size", str(options.voxel_size)]
+    if stage.hold_out is not None:
+        shared += ["--hold-out", str(stage.hold_out)]
+    if options.detector is not None:
+        shared += ["--detector", str(options.detector.absolute())]
+    if options.rate is not None:
+        shared += ["--rate", str(options.rate)]
+    if options.iterations is not None:
+        shared += ["--iterations", str(options.iterations)]
+    return TeamPlan(stage.agents, tuple(shared), options.voxel_size, options.refine_iterations, options.seed)
+
+
+def _agents(team: Team, out: Path) -> dict[str, dict[str, object]]:
+    agents = {}
+    for plan in team.plan.agents:
+        report = agent_report(out, plan.agent_id)
+        agents[plan.agent_id] = {"task": plan.task, **{key: report[key] for key in _AGENT_KEYS}, **report}
+    return agents
+
+
+def _score(
+    options: argparse.Namespace, stage: _Stage, regions: Sequence[Region], maps: Mapping[str, Path]
+) -> TeamScores:
+    rasterizer = choose_rasterizer(threads=options.threads)
+    return score_team({name: read_ply(path) for name, path in maps.items()}, stage.held_out, regions, rasterizer)
+
+
+def _figures(score: MapScores) -> dict[str, object]:
+    return asdict(score)
+
+
+def _write_pictures(folder: Path, scores: TeamScores) -> None:
+    prepare_folder(folder)
+    for name, sheet in scores.sheets.items():
+        write_png(folder / f"{name}.png", sheet)
+
+
+def _table(agents: Mapping[str, Mapping[str, object]], scores: Mapping[str, MapScores]) -> str:
+    lines = ["", f"{'agent':<10}{'frames':>8}{'Hz':>8}{'Gaussians':>11}{'ROI':>8}{'sent':>11}{'shared':>9}"]
+    for name, row in agents.items():
+        lines.append(
+            f"{name:<10}{row['frames']:>8}{row['hz']:>8.1f}{row['gaussians']:>11}{row['roi_share']:>8.1%}"
+            f"{_number(row['bytes_sent']) / 1e6:>8.2f} MB{_number(row['map_shared_percent']):>8.1f}%"
+        )
+    lines += ["", f"{'map':<15}{'ROI PSNR':>10}{'ROI SSIM':>10}{'full PSNR':>11}"]
+    for name, score in scores.items():
+        roi_psnr, roi_ssim = (float("nan") if v is None else v for v in (score.roi_psnr, score.roi_ssim))
+        lines.append(f"{name:<15}{roi_psnr:>7.2f} dB{roi_ssim:>10.3f}{score.full_psnr:>8.2f} dB")
+    return "\n".join(lines) + "\n"
+
+
+def _number(value: object) -> float:
+    return float(value) if isinstance(value, int | float) else float("nan")
+
+
+def _interrupt(_signal: int, _frame: FrameType | None) -> None:
+    raise KeyboardInterrupt

@@ -1,0 +1,72 @@
+"""`gausslite eval`: how well a map shows what was really there."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import asdict
+from pathlib import Path
+
+from gausslite.cli.arguments import add_regions, add_source, named_regions
+from gausslite.cli.output import as_text, prepare_folder
+from gausslite.codec.ply import read_ply
+from gausslite.datasets.open import open_source
+from gausslite.datasets.selection import select_frames
+from gausslite.errors import DatasetError
+from gausslite.evaluation.compare import MapScores, average, score_view
+from gausslite.evaluation.held_out import HoldOut
+from gausslite.evaluation.pictures import comparison_sheet, write_png
+from gausslite.evaluation.views import HeldOutView, MapViewer
+from gausslite.mission import choose_regions, frame_size
+from gausslite.render.choose import choose_rasterizer
+
+_PICTURES = 8
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `gausslite eval`."""
+    parser.add_argument("map", metavar="MAP", type=Path, help="a PLY file")
+    add_source(parser)
+    add_regions(parser)
+    parser.add_argument("--hold-out", metavar="N", type=int, help="score every Nth selected frame only")
+    parser.add_argument("--pictures", metavar="DIR", type=Path, help="write side-by-side pictures of a few views")
+    parser.add_argument("--threads", metavar="N", type=int, help="threads (default: all the processor allows)")
+    parser.add_argument("--json", action="store_true", help="print JSON for scripts")
+    parser.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Draw the map from every selected frame with depth, compare, print the means."""
+    from tqdm import tqdm
+
+    gaussians = read_ply(options.map)
+    source = open_source(options.source, options.up)
+    positions = select_frames(source, options.frames)
+    if options.hold_out is not None:
+        positions = HoldOut(options.hold_out, options.hold_out - 1).split(positions)[1]
+        if not positions:
+            raise DatasetError(f"--hold-out {options.hold_out}: expected at least that many frames, got fewer")
+    regions = named_regions(options)
+    chosen = choose_regions(regions, options.objects) if regions else []
+    size = frame_size(options.size, source)
+    viewer = MapViewer(gaussians, choose_rasterizer(threads=options.threads))
+    if options.pictures is not None:
+        prepare_folder(options.pictures)
+    pictured = set(positions[:: max(1, len(positions) // _PICTURES)])
+    scores = []
+    for position in tqdm(positions, desc="eval", unit="view", disable=options.json):
+        view = HeldOutView.of(source.frame(position, size), chosen)
+        drawn = viewer.draw_frame(view.frame)
+        scores.append(score_view(drawn, view))
+        if options.pictures is not None and position in pictured:
+            sheet = comparison_sheet(view, {options.map.stem: drawn.rgb})
+            write_png(options.pictures / f"view-{view.frame.index:06d}.png", sheet)
+    result = average(scores)
+    print(as_text(asdict(result)) if options.json else _as_line(result))
+    return 0
+
+
+def _as_line(scores: MapScores) -> str:
+    roi = "no view shows the region"
+    if scores.roi_psnr is not None and scores.roi_ssim is not None:
+        roi = f"ROI PSNR {scores.roi_psnr:.2f} dB, SSIM {scores.roi_ssim:.3f} on {scores.n_roi_views} views"
+    return f"{roi}; full PSNR {scores.full_psnr:.2f} dB, SSIM {scores.full_ssim:.3f} on {scores.n_views} views"

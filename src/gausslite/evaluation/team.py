@@ -1,0 +1,82 @@
+"""Score a team's maps side by side on the same held-out views: each agent alone, and every way of fusing them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float32, UInt8
+from numpy import ndarray
+
+from gausslite.datasets.source import Source
+from gausslite.domain.gaussians import Gaussians
+from gausslite.domain.region import Region
+from gausslite.errors import InvalidInputError
+from gausslite.evaluation.compare import MIN_ROI_PIXELS, MapScores, ViewScore, average, score_view
+from gausslite.evaluation.pictures import comparison_sheet
+from gausslite.evaluation.views import HeldOutView, MapViewer
+from gausslite.render.rasterizer import Rasterizer
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Viewpoints:
+    """Held-out frames: positions of a source at one size (width, height)."""
+
+    source: Source
+    positions: Sequence[int]
+    size: tuple[int, int]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TeamScores:
+    """Scores by map name, and a few side-by-side sheets by frame number."""
+
+    scores: dict[str, MapScores]
+    sheets: dict[str, UInt8[ndarray, "_ _ 3"]]
+
+
+def score_team(
+    maps: Mapping[str, Gaussians],
+    viewpoints: Iterable[Viewpoints],
+    regions: Sequence[Region],
+    rasterizer: Rasterizer,
+    sheets: int = 4,
+) -> TeamScores:
+    """Draw every map from every view; the sheets show the views with the most of the region, spread over the sequence.
+
+    Raises InvalidInputError without a single view with depth.
+    """
+    views = [view for point in viewpoints for view in _views(point, regions)]
+    if not views:
+        raise InvalidInputError("held-out views: expected at least one frame with depth, got none")
+    viewers = {name: MapViewer(gaussians, rasterizer) for name, gaussians in maps.items()}
+    scores: dict[str, list[ViewScore]] = {name: [] for name in maps}
+    shown = _most_telling(views, sheets)
+    pictures = {}
+    for i, view in enumerate(views):
+        drawings: dict[str, Float32[ndarray, "h w 3"]] = {}
+        for name, viewer in viewers.items():
+            drawn = viewer.draw_frame(view.frame)
+            scores[name].append(score_view(drawn, view))
+            drawings[name] = drawn.rgb
+        if i in shown:
+            pictures[f"{i:03d}-frame-{view.frame.index:06d}"] = comparison_sheet(view, drawings)
+    return TeamScores({name: average(listed) for name, listed in scores.items()}, pictures)
+
+
+def _views(point: Viewpoints, regions: Sequence[Region]) -> Iterable[HeldOutView]:
+    for position in point.positions:
+        frame = point.source.frame(position, point.size)
+        if frame.has_depth:
+            yield HeldOutView.of(frame, regions)
+
+
+def _most_telling(views: Sequence[HeldOutView], count: int) -> set[int]:
+    """From each of `count` stretches of the sequence, the view with the largest region."""
+    if count < 1:
+        return set()
+    pixels = np.array([np.count_nonzero(view.roi) for view in views])
+    stretches = [part for part in np.array_split(np.arange(len(views)), count) if len(part)]
+    best = {int(part[np.argmax(pixels[part])]) for part in stretches}
+    return {i for i in best if pixels[i] >= MIN_ROI_PIXELS} or best
