@@ -1,0 +1,169 @@
+"""Triangle meshes with texture coordinates, from the few shapes furniture is made of."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from jaxtyping import Float64, Int64
+from numpy import ndarray
+from numpy.typing import ArrayLike
+
+_CELL_M = 0.12
+_BAND_M = 0.03
+"""Faces and turned bodies are cut into pieces of about this size, since light is stored at the vertices."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Mesh:
+    """uv is in metres along the surface (u right, v down, seen from outside), or 0 to 1 where a picture is fitted."""
+
+    positions_m: Float64[ndarray, "n 3"]
+    uv: Float64[ndarray, "n 2"]
+    normals: Float64[ndarray, "n 3"]
+    faces: Int64[ndarray, "m 3"]
+
+    def moved(self, offset_m: ArrayLike) -> Mesh:
+        """Shifted by (x, y, z)."""
+        return Mesh(self.positions_m + np.asarray(offset_m, np.float64), self.uv, self.normals, self.faces)
+
+    def turned(self, yaw_rad: float) -> Mesh:
+        """Turned about z."""
+        c, s = np.cos(yaw_rad), np.sin(yaw_rad)
+        R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        return Mesh(self.positions_m @ R.T, self.uv, self.normals @ R.T, self.faces)
+
+
+def merged(meshes: list[Mesh]) -> Mesh:
+    """All meshes in one."""
+    offsets = np.cumsum([0, *(len(mesh.positions_m) for mesh in meshes[:-1])])
+    return Mesh(
+        np.concatenate([mesh.positions_m for mesh in meshes]),
+        np.concatenate([mesh.uv for mesh in meshes]),
+        np.concatenate([mesh.normals for mesh in meshes]),
+        np.concatenate([mesh.faces + offset for mesh, offset in zip(meshes, offsets, strict=True)]),
+    )
+
+
+def panel(
+    top_left_m: ArrayLike, right_m: ArrayLike, down_m: ArrayLike, fit: bool = False, cell_m: float = _CELL_M
+) -> Mesh:
+    """A rectangle seen from the side where `right_m` points right and `down_m` down; fit: one whole picture."""
+    origin, right, down = (np.asarray(value, np.float64) for value in (top_left_m, right_m, down_m))
+    width, height = float(np.linalg.norm(right)), float(np.linalg.norm(down))
+    columns, rows = max(1, round(width / cell_m)), max(1, round(height / cell_m))
+    b, a = (axis[:, None] for axis in _grid(np.linspace(0, 1, rows + 1), np.linspace(0, 1, columns + 1)))
+    normal = np.cross(down, right)
+    normals = np.broadcast_to(normal / np.linalg.norm(normal), (len(a), 3)).copy()
+    uv = np.hstack([a, b]) * ((1.0, 1.0) if fit else (width, height))
+    return Mesh(origin + a * right + b * down, uv, normals, _grid_faces(rows, columns))
+
+
+def box(low_m: ArrayLike, high_m: ArrayLike, fit: bool = False, cell_m: float = _CELL_M) -> Mesh:
+    """An axis-aligned box; with fit, each of its six sides shows the whole picture."""
+    x0, y0, z0 = np.asarray(low_m, np.float64)
+    x1, y1, z1 = np.asarray(high_m, np.float64)
+    dx, dy, dz = x1 - x0, y1 - y0, z1 - z0
+    return merged(
+        [
+            panel((x0, y0, z1), (dx, 0, 0), (0, 0, -dz), fit, cell_m),
+            panel((x1, y1, z1), (-dx, 0, 0), (0, 0, -dz), fit, cell_m),
+            panel((x1, y0, z1), (0, dy, 0), (0, 0, -dz), fit, cell_m),
+            panel((x0, y1, z1), (0, -dy, 0), (0, 0, -dz), fit, cell_m),
+            panel((x0, y1, z1), (dx, 0, 0), (0, -dy, 0), fit, cell_m),
+            panel((x0, y0, z0), (dx, 0, 0), (0, dy, 0), fit, cell_m),
+        ]
+    )
+
+
+def lathe(profile_m: list[tuple[float, float]], smooth: bool = False, fit: bool = False, sectors: int = 28) -> Mesh:
+    """A profile of (radius, z) turned about z; the outside lies to the right of its direction (upwards: outwards).
+
+    smooth averages the normals of neighbouring segments; fit winds one whole picture round the body.
+    """
+    points = np.asarray(profile_m, np.float64)
+    if not smooth:
+        points = _cut(points)
+    steps = np.diff(points, axis=0)
+    lengths = np.linalg.norm(steps, axis=1)
+    segment_normals = np.stack([steps[:, 1], -steps[:, 0]], axis=1) / lengths[:, None]
+    start, stop = segment_normals.copy(), segment_normals.copy()
+    if smooth:
+        between = segment_normals[:-1] + segment_normals[1:]
+        start[1:] = stop[:-1] = between / np.linalg.norm(between, axis=1, keepdims=True)
+    along = np.concatenate([[0.0], np.cumsum(lengths)])
+    around_m = 2 * np.pi * float(points[:, 0].max())
+    scale = np.array([1.0, 1.0 / along[-1]]) if fit else np.array([around_m, 1.0])
+    strips = []
+    for i in range(len(steps)):
+        ends = (points[i + 1], points[i]), (stop[i], start[i]), (along[-1] - along[i + 1], along[-1] - along[i])
+        strips.append(_strip(*ends, scale, sectors))
+    return merged(strips)
+
+
+def ring(major_m: float, minor_m: float, start_rad: float, stop_rad: float) -> Mesh:
+    """A bent tube in the x-z plane: the handle of a mug. Angles from +x towards +z."""
+    rows, columns = 14, 10
+    t, p = _grid(np.linspace(start_rad, stop_rad, rows + 1), np.linspace(0, 2 * np.pi, columns + 1))
+    normals = np.stack([np.cos(p) * np.cos(t), np.sin(p), np.cos(p) * np.sin(t)], axis=1)
+    centres = major_m * np.stack([np.cos(t), np.zeros_like(t), np.sin(t)], axis=1)
+    uv = np.stack([p * minor_m, t * major_m], axis=1)
+    return Mesh(centres + minor_m * normals, uv, normals, _grid_faces(rows, columns))
+
+
+def leaf(length_m: float, width_m: float, rise_m: float) -> Mesh:
+    """A leaf that grows along +x from the origin, rises and bends over; one whole picture, stem at v = 1."""
+    rows, columns = 8, 2
+    t, s = _grid(np.linspace(0, 1, rows + 1), np.linspace(-1, 1, columns + 1))
+    half = 0.5 * width_m * np.sin(np.pi * np.clip(0.06 + 0.94 * t, 0, 0.995)) ** 0.8
+    z = rise_m * (2.2 * t - 1.6 * t**2) + 0.25 * half * np.abs(s)
+    positions = np.stack([length_m * t, s * half, z], axis=1)
+    slope = rise_m * (2.2 - 3.2 * t)
+    normals = np.stack([-slope, np.zeros_like(t), np.full_like(t, length_m)], axis=1)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    return Mesh(positions, np.stack([(s + 1) / 2, 1 - t], axis=1), normals, _grid_faces(rows, columns))
+
+
+def _cut(points: Float64[ndarray, "k 2"]) -> Float64[ndarray, "n 2"]:
+    """The same line with no step longer than a band."""
+    pieces = [points[:1]]
+    for a, b in pairwise(points):
+        count = max(1, round(float(np.linalg.norm(b - a)) / _BAND_M))
+        pieces.append(a + (b - a) * (np.arange(1, count + 1) / count)[:, None])
+    return np.concatenate(pieces)
+
+
+def _strip(
+    points: tuple[ndarray, ndarray],
+    normals: tuple[ndarray, ndarray],
+    v: tuple[float, float],
+    scale: Float64[ndarray, "2"],
+    sectors: int,
+) -> Mesh:
+    """The band between two rings, upper one first."""
+    share = np.linspace(0.0, 1.0, sectors + 1)
+    cosine, sine = np.cos(2 * np.pi * share), np.sin(2 * np.pi * share)
+    rings, ring_normals, uv = [], [], []
+    for (radius, z), (normal_r, normal_z), down in zip(points, normals, v, strict=True):
+        rings.append(np.stack([radius * cosine, radius * sine, np.full_like(share, z)], axis=1))
+        ring_normals.append(np.stack([normal_r * cosine, normal_r * sine, np.full_like(share, normal_z)], axis=1))
+        uv.append(np.stack([share, np.full_like(share, down)], axis=1) * scale)
+    return Mesh(np.concatenate(rings), np.concatenate(uv), np.concatenate(ring_normals), _grid_faces(1, sectors))
+
+
+def _grid(
+    down: Float64[ndarray, " r"], along: Float64[ndarray, " c"]
+) -> tuple[Float64[ndarray, " n"], Float64[ndarray, " n"]]:
+    """Both coordinates of each vertex of a grid, row by row."""
+    return np.repeat(down, len(along)), np.tile(along, len(down))
+
+
+def _grid_faces(rows: int, columns: int) -> Int64[ndarray, "m 3"]:
+    """Two triangles for each cell of a grid of (rows + 1) x (columns + 1) vertices, row by row."""
+    corner = (np.arange(rows)[:, None] * (columns + 1) + np.arange(columns)[None, :]).ravel()
+    right, below, across = corner + 1, corner + columns + 1, corner + columns + 2
+    faces: Int64[ndarray, "m 3"] = np.concatenate(
+        [np.stack([corner, below, right], axis=1), np.stack([right, below, across], axis=1)]
+    ).astype(np.int64)
+    return faces

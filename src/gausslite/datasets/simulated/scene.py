@@ -1,0 +1,118 @@
+"""The home as one triangle soup in a ray caster, with what each triangle looks like and belongs to."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float32, Float64, Int64
+from numpy import ndarray
+from numpy.typing import NDArray
+
+from gausslite.datasets.simulated.atlas import TextureAtlas
+from gausslite.datasets.simulated.layout import furnish, paint_textures
+from gausslite.datasets.simulated.lighting import vertex_light
+from gausslite.datasets.simulated.mesh import merged
+from gausslite.datasets.simulated.textures import SIDE_PX
+from gausslite.errors import DatasetError
+
+NOTHING = -1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Triangles:
+    """Per triangle: texture coordinates and brightness of its corners, unit normal, texture, item, texels per metre."""
+
+    uv: Float32[ndarray, "m 3 2"]
+    light: Float32[ndarray, "m 3"]
+    normal: Float32[ndarray, "m 3"]
+    texture: Int64[ndarray, " m"]
+    item: Int64[ndarray, " m"]
+    texels_per_m: Float32[ndarray, " m"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Hits:
+    """Where rays end: triangle (NOTHING if none), its barycentric coordinates, and the lengths along the directions."""
+
+    triangle: Int64[ndarray, " r"]
+    barycentric: Float32[ndarray, "r 2"]
+    distance: Float32[ndarray, " r"]
+
+
+class HomeScene:
+    """Owns the ray caster and the tables; built once for each seed. Raises DatasetError without the extra `sim`."""
+
+    def __init__(self, seed: int) -> None:
+        items = furnish(seed)
+        textures = paint_textures(seed)
+        texture_ids = {name: i for i, name in enumerate(textures)}
+        self.names = tuple(item.name for item in items)
+        self.object_names = tuple(item.name for item in items if not item.is_room)
+        self.atlas = TextureAtlas(list(textures.values()))
+        parts = [(i, part) for i, item in enumerate(items) for part in item.parts]
+        whole = merged([part.mesh for _, part in parts])
+        counts = [len(part.mesh.faces) for _, part in parts]
+        repeats_m = np.repeat([textures[part.texture].repeat_m or 1.0 for _, part in parts], counts)
+        corners_m = whole.positions_m[whole.faces]
+        uv = whole.uv[whole.faces] / repeats_m[:, None, None]
+        self._embree = _embree_scene(corners_m.astype(np.float32))
+        light = vertex_light(whole.positions_m, whole.normals, self.occluded, seed)
+        self.triangles = Triangles(
+            uv.astype(np.float32),
+            light[whole.faces],
+            _unit_normals(corners_m),
+            np.repeat([texture_ids[part.texture] for _, part in parts], counts),
+            np.repeat([i for i, _ in parts], counts),
+            _texels_per_m(corners_m, uv),
+        )
+
+    def cast(self, origins_m: Float32[ndarray, "r 3"], directions: Float32[ndarray, "r 3"]) -> Hits:
+        """The first surface along each ray."""
+        result = self._embree.run(origins_m, directions, output=True)
+        barycentric = np.stack([result["u"], result["v"]], axis=1)
+        return Hits(result["primID"].astype(np.int64), barycentric, result["tfar"])
+
+    def occluded(
+        self, origins_m: Float32[ndarray, "r 3"], directions: Float32[ndarray, "r 3"], reach: float
+    ) -> Bool[ndarray, " r"]:
+        """Whether something lies within `reach` lengths of the direction."""
+        reaches = np.full(len(origins_m), reach, np.float32)
+        free = self._embree.run(origins_m, directions, dists=reaches, query="OCCLUDED")
+        return np.asarray(free >= 0)
+
+
+@lru_cache(maxsize=2)
+def home_scene(seed: int) -> HomeScene:
+    """The home of this seed, shared by every source of the process."""
+    return HomeScene(seed)
+
+
+def _embree_scene(corners_m: Float32[ndarray, "m 3 3"]) -> Any:
+    try:
+        from embreex.mesh_construction import TriangleMesh
+        from embreex.rtcore_scene import EmbreeScene
+    except ImportError:
+        raise DatasetError(
+            "sim:home: the simulated home needs the extra `sim`; install it with: pip install 'gausslite[sim]'"
+        ) from None
+    scene = EmbreeScene()
+    TriangleMesh(scene, corners_m)
+    return scene
+
+
+def _unit_normals(corners_m: Float64[ndarray, "m 3 3"]) -> Float32[ndarray, "m 3"]:
+    normals = np.cross(corners_m[:, 1] - corners_m[:, 0], corners_m[:, 2] - corners_m[:, 0])
+    length = np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    return np.asarray(normals / length, np.float32)
+
+
+def _texels_per_m(corners_m: Float64[ndarray, "m 3 3"], uv: Float64[ndarray, "m 3 2"]) -> Float32[ndarray, " m"]:
+    """How finely a triangle is textured, from its areas on the picture and in the world."""
+    a, b = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
+    on_picture = np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
+    in_world = np.linalg.norm(np.cross(corners_m[:, 1] - corners_m[:, 0], corners_m[:, 2] - corners_m[:, 0]), axis=1)
+    ratio: NDArray[np.float64] = SIDE_PX * np.sqrt(on_picture / np.maximum(in_world, 1e-12))
+    return ratio.astype(np.float32)

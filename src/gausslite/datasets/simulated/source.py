@@ -1,0 +1,133 @@
+"""The simulated home as a Source: sim:home?seed=0&trajectory=0&frames=120&size=320x240&noise=1."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+from urllib.parse import parse_qsl
+
+import numpy as np
+
+from gausslite.datasets.images import RgbdImage, resize_rgbd
+from gausslite.datasets.simulated.regions import InstanceRegion, ItemImages
+from gausslite.datasets.simulated.scene import home_scene
+from gausslite.datasets.simulated.sensor import SensorNoise, colour_image, noisy_colour, noisy_depth
+from gausslite.datasets.simulated.trajectories import TRAJECTORY_COUNT, poses
+from gausslite.datasets.simulated.view import draw
+from gausslite.datasets.source import Source, UpAxis, require_position, unit_up_axis
+from gausslite.domain.camera import Camera
+from gausslite.domain.frame import Frame
+from gausslite.domain.region import Region
+from gausslite.errors import DatasetError
+
+_RATE_HZ = 30
+_FOCAL_PER_WIDTH = 0.85
+_SIDES_PX = (16, 4096)
+
+
+@dataclass(frozen=True, slots=True)
+class HomeSettings:
+    """One walk through one home. noise scales the whole sensor model; 0 turns it off: depth is then exact."""
+
+    seed: int = 0
+    trajectory: int = 0
+    frames: int = 120
+    size_px: tuple[int, int] = (320, 240)
+    noise: float = 1.0
+
+    def __post_init__(self) -> None:
+        low, high = _SIDES_PX
+        for name, value, wanted, right in (
+            ("seed", self.seed, "0 to 4294967295", 0 <= self.seed < 2**32),
+            ("trajectory", self.trajectory, f"0 to {TRAJECTORY_COUNT - 1}", 0 <= self.trajectory < TRAJECTORY_COUNT),
+            ("frames", self.frames, "1 to 100000", 1 <= self.frames <= 100_000),
+            ("size", self.size_px, f"sides of {low} to {high} px", all(low <= side <= high for side in self.size_px)),
+            ("noise", self.noise, "0 to 10", 0.0 <= self.noise <= 10.0),
+        ):
+            if not right:
+                raise DatasetError(f"sim:home: {name}: expected {wanted}, got {value}")
+
+    @classmethod
+    def parse(cls, query: str) -> HomeSettings:
+        """From "seed=0&trajectory=1&frames=120&size=320x240&noise=1"; what is left out keeps its default."""
+        chosen: dict[str, Any] = {}
+        for key, value in parse_qsl(query, keep_blank_values=True):
+            if key in ("seed", "trajectory", "frames") and re.fullmatch(r"[0-9]{1,10}", value):
+                chosen[key] = int(value)
+            elif key == "noise" and re.fullmatch(r"[0-9]{1,3}(\.[0-9]{1,9})?", value):
+                chosen[key] = float(value)
+            elif key == "size" and (match := re.fullmatch(r"([0-9]{1,5})x([0-9]{1,5})", value)):
+                chosen["size_px"] = (int(match.group(1)), int(match.group(2)))
+            else:
+                wanted = "seed=N&trajectory=N&frames=N&size=WxH&noise=X"
+                raise DatasetError(f"sim:home: {key}={value}: expected {wanted}, each of them optional")
+        return cls(**chosen)
+
+
+class SimulatedHome:
+    """A walk through the home with z up. Every frame is the same whenever and wherever it is asked for.
+
+    Frame numbers run from 0 to frames - 1, times are those numbers at 30 Hz. Raises DatasetError, also where the
+    extra `sim` is not installed.
+    """
+
+    def __init__(self, settings: HomeSettings, up_axis: UpAxis | None = None) -> None:
+        width, height = settings.size_px
+        focal = _FOCAL_PER_WIDTH * width
+        self._settings = settings
+        self._camera = Camera(focal, focal, width / 2, height / 2, width, height)
+        self._scene = home_scene(settings.seed)
+        self._poses = poses(settings.trajectory, settings.frames)
+        self._up_axis = unit_up_axis(up_axis or (0.0, 0.0, 1.0))
+        names, images = self._scene.names, ItemImages(self._scene)
+        self._regions = {name: InstanceRegion(name, names.index(name), images) for name in self._scene.object_names}
+
+    @property
+    def name(self) -> str:
+        """The home and the walk."""
+        return f"sim-home-{self._settings.seed}-{self._settings.trajectory}"
+
+    @property
+    def camera(self) -> Camera:
+        """A horizontal field of view of 61 degrees."""
+        return self._camera
+
+    @property
+    def up_axis(self) -> UpAxis:
+        """Z."""
+        return self._up_axis
+
+    def __len__(self) -> int:
+        return self._settings.frames
+
+    def frame(self, i: int, size: tuple[int, int] | None = None) -> Frame:
+        """The frame at position i. Raises DatasetError."""
+        require_position(self.name, i, len(self))
+        settings, T_world_camera = self._settings, self._poses[i]
+        view = draw(self._scene, self._camera, T_world_camera)
+        if settings.noise > 0:
+            rng = np.random.default_rng([settings.seed, settings.trajectory, i])
+            rgb = noisy_colour(view, SensorNoise(), settings.noise, rng)
+            depth_m = noisy_depth(view, SensorNoise(), settings.noise, rng)
+        else:
+            rgb, depth_m = colour_image(view.rgb), view.depth_m
+        image = resize_rgbd(RgbdImage(rgb, depth_m, self._camera), size)
+        return Frame(i, i * 10**9 // _RATE_HZ, image.rgb, image.depth_m, image.camera, T_world_camera.copy())
+
+    def indices(self) -> Sequence[int]:
+        """0 to frames - 1."""
+        return range(len(self))
+
+    def regions(self) -> Mapping[str, Region]:
+        """Every object by name: table, chair_1 ..., mug, sofa ...; walls, floors and ceilings are none."""
+        return dict(self._regions)
+
+
+def open_simulated(spec: str, up_axis: UpAxis | None = None) -> Source:
+    """The walk of a spec without its "sim:": "home" or "home?seed=0&...". Raises DatasetError."""
+    world, _, query = spec.partition("?")
+    if world != "home":
+        raise DatasetError(f"sim:{world}: expected sim:home, the only simulated world")
+    return SimulatedHome(HomeSettings.parse(query), up_axis)
