@@ -1,0 +1,282 @@
+"""Bring a robot's words to the fusion server: in the background, within a bandwidth, until each is acknowledged.
+
+It sends in rounds. A round takes the waiting words whose kappa grew most, sends them as subsets on one stream and
+settles what is acknowledged; everything else stays in the spool and goes in a later round. So a lost connection,
+a restart of either side or a duplicate needs no special case.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+from gausslite.codec.subset_codec import MAX_SUBSET_BYTES, encode_subset, split_words
+from gausslite.domain.subset import RoiSubset, VoxelWords
+from gausslite.domain.voxels import VoxelGrid
+from gausslite.errors import (
+    GaussLiteError,
+    InvalidInputError,
+    MismatchError,
+    NotPermittedError,
+    QuotaError,
+    SessionUnknownError,
+    StorageError,
+    UnavailableError,
+)
+from gausslite.v1 import fusion_service_pb2 as pb
+from gausslite.wire.bandwidth import Allowance
+from gausslite.wire.clients import FusionClient, Session
+from gausslite.wire.spool import Picked, Purpose, Spool
+
+_log = logging.getLogger(__name__)
+_MIN_SUBSET_BYTES = 1 << 16
+_MIN_INTERVAL_S = 0.02
+_FIRST_BACKOFF_S, _LAST_BACKOFF_S = 0.2, 5.0
+_PURPOSES = {Purpose.ROI: pb.PURPOSE_ROI, Purpose.HANDOVER: pb.PURPOSE_HANDOVER}
+
+
+@dataclass(frozen=True, slots=True)
+class UplinkSettings:
+    """kbps bounds the bandwidth (kilobits a second; None = no bound). Between rounds at least interval_s pass, so that
+    words coalesce; a voxel is sent again once its kappa grew by growth_share, or when draining.
+    """
+
+    kbps: float | None = None
+    interval_s: float = 1.0
+    growth_share: float = 0.25
+    round_bytes: int = 4 << 20
+    deadline_s: float = 30.0
+    world_frame: str = ""
+
+    def __post_init__(self) -> None:
+        if self.kbps is not None and not self.kbps > 0:
+            raise InvalidInputError(f"uplink kbps: expected a positive number, got {self.kbps}")
+        if not (self.interval_s >= 0 and self.growth_share >= 0 and self.deadline_s > 0 and self.round_bytes > 0):
+            raise InvalidInputError(
+                "uplink: expected interval and growth of at least 0, and a positive deadline and size"
+            )
+
+
+@dataclass(frozen=True, slots=True)
+class UplinkCounters:
+    """What was sent and acknowledged so far; voxels_sent counts each voxel of the task's region once."""
+
+    roi_bytes: int = 0
+    handover_bytes: int = 0
+    gaussians_sent: int = 0
+    voxels_sent: int = 0
+    voxels_waiting: int = 0
+    subsets_sent: int = 0
+    subsets_rejected: int = 0
+    joins: int = 0
+    connected: bool = False
+    stopped_because: str = ""
+
+    @property
+    def bytes_sent(self) -> int:
+        """All subset bytes, resends included."""
+        return self.roi_bytes + self.handover_bytes
+
+
+class Uplink:
+    """Owns the spool, the client and one thread. `offer` never waits for the network."""
+
+    def __init__(
+        self, client: FusionClient, agent_id: str, spool: Spool, grid: VoxelGrid, settings: UplinkSettings | None = None
+    ) -> None:
+        self._client, self._agent_id, self._spool, self._grid = client, agent_id, spool, grid
+        self._settings = settings or UplinkSettings()
+        self._counters = UplinkCounters()
+        self._roi_voxels: set[int] = set()
+        self._damaged: set[int] = set()
+        self._session: Session | None = None
+        self._sequence = 0
+        self._subset_bytes = MAX_SUBSET_BYTES
+        self._allowance = Allowance(self._settings.kbps)
+        self._backoff_s = 0.0
+        self._next_round_s = 0.0
+        self._draining = self._closing = False
+        # guards the counters and flags; waited on by the thread and by drain
+        self._changed = threading.Condition()
+        self._thread = threading.Thread(target=self._run, name="uplink", daemon=True)
+        self._thread.start()
+
+    def offer(self, words: VoxelWords, purpose: Purpose = Purpose.ROI) -> None:
+        """Take these words to be sent; on each voxel they replace what was not sent yet. Raises StorageError."""
+        if len(words):
+            self._spool.offer(words, purpose)
+            with self._changed:
+                self._changed.notify_all()
+
+    def drain(self, timeout_s: float) -> bool:
+        """Send what waits, small changes too; True when the server has everything, False when the time is over."""
+        with self._changed:
+            self._draining = True
+            self._next_round_s = 0.0
+            self._changed.notify_all()
+            try:
+                return self._changed.wait_for(self._is_finished, timeout_s) and not self._counters.stopped_because
+            finally:
+                self._draining = False
+
+    def counters(self) -> UplinkCounters:
+        """A snapshot."""
+        with self._changed:
+            return replace(self._counters, voxels_sent=len(self._roi_voxels), voxels_waiting=self._spool.waiting)
+
+    @property
+    def session_id(self) -> str:
+        """The session in force; empty while there is none."""
+        session = self._session
+        return "" if session is None else session.session_id
+
+    def close(self) -> None:
+        """End the thread and the connection; what waits stays in the spool."""
+        with self._changed:
+            self._closing = True
+            self._changed.notify_all()
+        # ends a call in flight, so that the thread cannot hang on the network
+        self._client.close()
+        self._thread.join()
+        self._spool.close()
+
+    def _is_finished(self) -> bool:
+        return bool(self._counters.stopped_because) or self._closing or self._spool.waiting == 0
+
+    def _run(self) -> None:
+        try:
+            while self._wait_until_due():
+                try:
+                    self._after_round(self._round())
+                except (MismatchError, NotPermittedError) as error:
+                    self._stop(str(error))
+                except GaussLiteError as error:
+                    if not self._closing:
+                        self._recover(error)
+        except Exception as error:
+            # whatever it is, the operator must see that nothing is sent any more
+            _log.exception("uplink failed")
+            self._stop(f"{type(error).__name__}: {error}")
+
+    def _wait_until_due(self) -> bool:
+        """Wait for words, bandwidth and the next round's time; False when it is time to end."""
+        with self._changed:
+            while not self._closing and not self._counters.stopped_because:
+                now_s = time.monotonic()
+                wait_s = max(self._next_round_s - now_s, self._allowance.seconds_until_positive(now_s))
+                if wait_s <= 0 and self._spool.waiting:
+                    return True
+                self._changed.wait(wait_s if wait_s > 0 else None)
+        return False
+
+    def _round(self) -> bool:
+        """Join if needed, send one batch, settle what is acknowledged. False when no word was due."""
+        growth_share = 0.0 if self._draining else self._settings.growth_share
+        room = self._allowance.room(self._settings.round_bytes)
+        picked = self._spool.pick(room, growth_share)
+        if picked is None:
+            return False
+        session = self._joined()
+        sent: dict[int, tuple[Picked, int]] = {}
+        requests = list(self._requests(picked, session, sent))
+        self._allowance.spend(sum(size for _, size in sent.values()))
+        problem: GaussLiteError | None = None
+        for response in self._client.contribute(requests, self._settings.deadline_s):
+            for outcome in response.outcomes:
+                if outcome.sequence in sent:
+                    problem = self._take_outcome(outcome, *sent.pop(outcome.sequence)) or problem
+        if problem is not None:
+            raise problem
+        if sent:
+            raise UnavailableError(f"{self._client.address}: the stream ended before {len(sent)} subsets were answered")
+        return True
+
+    def _joined(self) -> Session:
+        if self._session is None:
+            # a robot that begins with nothing cannot take back what it said in an earlier life
+            fresh = self._spool.is_new and self._counters.joins == 0
+            self._session = self._client.join(self._agent_id, self._grid, self._settings.world_frame, fresh)
+            self._sequence = 0
+            self._subset_bytes = min(self._subset_bytes, self._session.max_subset_bytes or MAX_SUBSET_BYTES)
+            with self._changed:
+                self._counters = replace(self._counters, connected=True, joins=self._counters.joins + 1)
+        return self._session
+
+    def _requests(
+        self, picked: Picked, session: Session, sent: dict[int, tuple[Picked, int]]
+    ) -> Iterator[pb.ContributeSubsetsRequest]:
+        start = 0
+        for part in split_words(picked.words, self._subset_bytes):
+            stop = start + len(part)
+            self._sequence += 1
+            stamp = self._spool.next_stamp(session.highest_map_revision)
+            data = encode_subset(RoiSubset(self._agent_id, session.session_id, self._sequence, stamp, part), self._grid)
+            sent[self._sequence] = Picked(picked.purpose, part, picked.versions[start:stop]), len(data)
+            start = stop
+            yield pb.ContributeSubsetsRequest(
+                session_id=session.session_id,
+                sequence=self._sequence,
+                purpose=_PURPOSES[picked.purpose],
+                subset=data,
+            )
+
+    def _take_outcome(self, outcome: pb.SubsetOutcome, part: Picked, size: int) -> GaussLiteError | None:
+        """Settle one subset; the error to recover from when it has to be sent again."""
+        keys = set(part.words.keys.tolist())
+        rejected = outcome.status == pb.SUBSET_STATUS_REJECTED
+        self._count(part, size, keys, rejected)
+        if rejected and outcome.reason in ("QUOTA", "STORAGE"):
+            return QuotaError(outcome.message)
+        if rejected and outcome.reason == "CHECKSUM" and not keys & self._damaged:
+            self._damaged |= keys
+            return UnavailableError(outcome.message)
+        if rejected:
+            _log.warning("subset of %d voxels rejected: %s %s", len(keys), outcome.reason, outcome.message)
+        self._damaged -= keys
+        self._spool.settle(part)
+        return None
+
+    def _count(self, part: Picked, size: int, keys: set[int], rejected: bool) -> None:
+        is_roi = part.purpose is Purpose.ROI
+        with self._changed:
+            c = self._counters
+            self._counters = replace(
+                c,
+                roi_bytes=c.roi_bytes + size * is_roi,
+                handover_bytes=c.handover_bytes + size * (not is_roi),
+                gaussians_sent=c.gaussians_sent + len(part.words.gaussians) * (not rejected),
+                subsets_sent=c.subsets_sent + 1,
+                subsets_rejected=c.subsets_rejected + rejected,
+            )
+            if is_roi and not rejected:
+                self._roi_voxels |= keys
+
+    def _recover(self, error: GaussLiteError) -> None:
+        """Make ready for another try: join anew, send less at once, or just wait."""
+        _log.warning("uplink: %s", error)
+        if isinstance(error, SessionUnknownError):
+            self._session = None
+            self._spool.forget_what_was_sent()
+        if isinstance(error, (QuotaError, StorageError)):
+            self._subset_bytes = max(_MIN_SUBSET_BYTES, self._subset_bytes // 2)
+        with self._changed:
+            self._counters = replace(self._counters, connected=False)
+            self._backoff_s = min(max(2 * self._backoff_s, _FIRST_BACKOFF_S), _LAST_BACKOFF_S)
+            self._next_round_s = time.monotonic() + self._backoff_s
+
+    def _after_round(self, sent: bool) -> None:
+        with self._changed:
+            self._backoff_s = 0.0
+            self._counters = replace(self._counters, connected=self._session is not None)
+            if not (sent and self._draining):
+                self._next_round_s = time.monotonic() + max(self._settings.interval_s, _MIN_INTERVAL_S)
+            self._changed.notify_all()
+
+    def _stop(self, reason: str) -> None:
+        _log.error("uplink stops: %s", reason)
+        with self._changed:
+            self._counters = replace(self._counters, connected=False, stopped_because=reason)
+            self._changed.notify_all()
