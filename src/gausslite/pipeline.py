@@ -86,4 +86,4 @@ class TaskMapper:
         return max(0.0, started_s + self._seconds_per_frame - time.perf_counter())
 
     def _changed_roi(self) -> VoxelWords | None:
-        return None if self._ledger is None else self._ledger.changed(self._mapper.gaussians())
+        return None if self._ledger is None else self._ledger.changed(self._mapper.roi_gaussians())

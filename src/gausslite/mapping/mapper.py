@@ -108,6 +108,10 @@ class GaussianMapper:
         """A copy of the map as physical values."""
         return self._table.to_gaussians()
 
+    def roi_gaussians(self) -> Gaussians:
+        """A copy of the active Gaussians: the task's part of the map."""
+        return self._table.to_gaussians(np.flatnonzero(self._table.active))
+
     def keyframes(self) -> list[Keyframe]:
         """The keyframes remembered of the whole mission, oldest first (for joint refinement)."""
         return list(self._keyframes.buffer)
@@ -119,12 +123,14 @@ class GaussianMapper:
 
     def _seed(self, keyframe: Keyframe) -> int:
         """Add Gaussians where the map does not explain the frame, within the cap."""
-        frame, state = keyframe.frame, None
-        if self.count > 0:
-            active_means_m = self._table.rows[self._table.active][:, MEAN]
-            state = MapState(self.render(frame.camera, frame.T_world_camera), active_means_m)
+        frame, table = keyframe.frame, self._table
+        state = MapState(
+            room=table.room,
+            rendering=self.render(frame.camera, frame.T_world_camera) if table.count > 0 else None,
+            active_means_m=table.rows[table.active][:, MEAN],
+        )
         seeds = self._seeder.seed(frame, keyframe.relevance, state)
-        return insert(self._table, seeds, self._settings.seeding.opacity, self._rng)
+        return insert(table, seeds, self._settings.seeding.opacity, self._rng)
 
     def _train(self, current: WindowView, ends_at_s: float | None) -> int:
         """MVO: train on views drawn from the window and the current one; without it on the current one alone."""

@@ -24,9 +24,12 @@ _REFERENCE_PIXELS = 640 * 480
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MapState:
-    """What seeding needs to know of the map: how it looks from the frame, and where its active Gaussians are."""
+    """What seeding needs to know of the map: how many Gaussians still fit, how it looks from the frame (None while it
+    is empty), and where its active Gaussians are.
+    """
 
-    rendering: Rendering
+    room: int
+    rendering: Rendering | None
     active_means_m: Float32[ndarray, "n 3"]
 
 
@@ -55,8 +58,8 @@ class Seeder:
         self._components = components
         self._rng = rng
 
-    def seed(self, frame: Frame, relevance: RelevanceMap, state: MapState | None) -> Seeds:
-        """New Gaussians for this frame; state is None while the map is empty."""
+    def seed(self, frame: Frame, relevance: RelevanceMap, state: MapState) -> Seeds:
+        """New Gaussians for this frame."""
         weight = self._pixel_weight(frame)
         roi_pool, rest_pool = self._pools(frame, relevance, state)
         return Seeds(
@@ -64,31 +67,39 @@ class Seeder:
             rest=self._gaussians(frame, relevance, rest_pool, weight),
         )
 
-    def _pools(self, frame: Frame, relevance: RelevanceMap, state: MapState | None) -> tuple[_Pool, _Pool]:
+    def _pools(self, frame: Frame, relevance: RelevanceMap, state: MapState) -> tuple[_Pool, _Pool]:
         """SB: the ROI share of the seeds is drawn from the region, the rest elsewhere; without SB from one pool."""
         settings = self._settings
-        budget = self._budget(frame, first=state is None)
+        budget = self._budget(frame, state)
         seedable = (frame.depth_m > 0) & (frame.depth_m <= settings.max_depth_m)
-        open_pixels = seedable if state is None else seedable & self._open(frame, state, settings.min_alpha)
+        open_pixels = seedable & self._open(frame, state, settings.min_alpha)
         if not self._components.sb:
-            return _Pool(np.zeros_like(seedable), 0, False), self._rest_pool(open_pixels, budget)
+            return _Pool(np.zeros_like(seedable), 0, False), self._rest_pool(open_pixels, budget, state.room)
         roi_budget = int(settings.roi_share * budget)
-        roi_pixels = seedable & relevance.roi
-        if state is not None and roi_pixels.any():
-            coarse = too_coarse(frame, relevance.roi, state.active_means_m, settings.roi_pixels_per_active)
-            roi_pixels &= coarse | self._open(frame, state, settings.roi_min_alpha)
-        roi_pool = _Pool(roi_pixels, roi_budget, False)
-        return roi_pool, self._rest_pool(open_pixels & ~relevance.roi, budget - roi_budget)
+        coarse = too_coarse(frame, relevance.roi, state.active_means_m, settings.roi_pixels_per_active)
+        roi_pixels = seedable & relevance.roi & (coarse | self._open(frame, state, settings.roi_min_alpha))
+        rest_pixels = open_pixels & ~relevance.roi
+        return _Pool(roi_pixels, roi_budget, False), self._rest_pool(rest_pixels, budget - roi_budget, state.room)
 
-    def _rest_pool(self, pixels: Bool[ndarray, "h w"], budget: int) -> _Pool:
-        return _Pool(pixels, budget, self._components.sis)
+    def _rest_pool(self, pixels: Bool[ndarray, "h w"], budget: int, room: int) -> _Pool:
+        """No denser than leaves room for `reserved_views` more views as open as this whole image would be.
+
+        So the first views do not use up the cap: as room gets short, seeds get sparser and start larger.
+        """
+        settings = self._settings
+        densest = settings.first_frame_seeds / _REFERENCE_PIXELS
+        affordable = room / (settings.reserved_views * pixels.size)
+        density = min(densest, max(affordable, settings.sparsest * densest))
+        return _Pool(pixels, min(budget, int(np.ceil(density * np.count_nonzero(pixels)))), self._components.sis)
 
     def _open(self, frame: Frame, state: MapState, min_alpha: float) -> Bool[ndarray, "h w"]:
+        if state.rendering is None:
+            return np.ones(frame.depth_m.shape, np.bool_)
         return unexplained(frame, state.rendering, min_alpha, self._settings.depth_error_factor)
 
-    def _budget(self, frame: Frame, first: bool) -> int:
+    def _budget(self, frame: Frame, state: MapState) -> int:
         """N, for this image size."""
-        seeds = self._settings.first_frame_seeds if first else self._settings.later_seeds
+        seeds = self._settings.first_frame_seeds if state.rendering is None else self._settings.later_seeds
         return max(1, round(seeds * frame.depth_m.size / _REFERENCE_PIXELS))
 
     def _pixel_weight(self, frame: Frame) -> Float32[ndarray, "h w"]:

@@ -47,6 +47,8 @@ class SeedingSettings:
     min_alpha: float = 0.6
     roi_min_alpha: float = 0.9
     roi_pixels_per_active: float = 4.0
+    reserved_views: float = 4.0
+    sparsest: float = 0.1
     depth_error_factor: float = 40.0
     max_depth_m: float = 10.0
     opacity: float = 0.5
@@ -57,11 +59,12 @@ class SeedingSettings:
     def __post_init__(self) -> None:
         for name in ("first_frame_seeds", "later_seeds"):
             _require(getattr(self, name) >= 1, f"seeding {name}", "at least 1", getattr(self, name))
-        for name in ("roi_share", "min_alpha", "roi_min_alpha"):
+        for name in ("roi_share", "min_alpha", "roi_min_alpha", "sparsest"):
             _require(0 <= getattr(self, name) <= 1, f"seeding {name}", "0 to 1", getattr(self, name))
         _require(0 < self.opacity < 1, "seeding opacity", "more than 0 and less than 1", self.opacity)
         for name in (
             "roi_pixels_per_active",
+            "reserved_views",
             "depth_error_factor",
             "max_depth_m",
             "roi_scale",
