@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache, cached_property
 
 import numpy as np
 import torch
@@ -11,9 +12,11 @@ import torch
 from gausslite.domain.camera import Camera
 from gausslite.render.rasterizer import LOG_SCALE, LOGIT, MEAN, QUAT, RGB, Rasterizer, Rendering, TrainingView
 from gausslite.render.reference.compositing import MAX_ALPHA
-from gausslite.render.reference.projection import MIN_ALPHA, project
+from gausslite.render.reference.projection import MIN_ALPHA, Ellipses, project
 
 GROUPS = {"means": MEAN, "log_scales": LOG_SCALE, "quats": QUAT, "logits": slice(LOGIT, LOGIT + 1), "rgb": RGB}
+MARGIN = 2e-4
+"""How near to a threshold, relatively, an alpha may come before its pixel is left out of the comparison."""
 CAMERA = Camera(52.0, 50.0, 32.3, 23.6, 64, 48)
 
 
@@ -26,6 +29,25 @@ class Scene:
     @property
     def size(self) -> tuple[int, int]:
         return self.camera.height_px, self.camera.width_px
+
+    @cached_property
+    def steady(self) -> np.ndarray:
+        """True on the pixels where no alpha lies so close to a threshold that float32 might cross it."""
+        rows = torch.from_numpy(self.rows.astype(np.float64))
+        ellipses = project(rows, self.camera, torch.from_numpy(self.T_camera_world))
+        steady = np.ones(self.size, np.bool_)
+        for chunk in torch.arange(len(ellipses.row_ids)).split(64):
+            steady &= ~_near_a_threshold(ellipses.take(chunk), self.camera)
+        return steady
+
+
+def _near_a_threshold(e: Ellipses, camera: Camera) -> np.ndarray:
+    dx = (torch.arange(camera.width_px) + 0.5)[None, None, :] - e.means_px[:, 0, None, None]
+    dy = (torch.arange(camera.height_px) + 0.5)[None, :, None] - e.means_px[:, 1, None, None]
+    a, b, c = e.conics[:, :, None, None].unbind(dim=1)
+    alpha = e.opacities[:, None, None] * torch.exp(-0.5 * (a * dx * dx + 2 * b * dx * dy + c * dy * dy))
+    near = ((alpha / MIN_ALPHA - 1.0).abs() < MARGIN) | ((alpha / MAX_ALPHA - 1.0).abs() < MARGIN)
+    return near.any(dim=0).numpy()
 
 
 def turned(angle: float = 0.2) -> np.ndarray:
@@ -105,6 +127,11 @@ def _broken() -> Scene:
     return Scene(rows, CAMERA, turned())
 
 
+def _many() -> Scene:
+    """More rows than one batch of any backend, more splats to a tile than one chunk."""
+    return Scene(random_rows(14, 9000, 0.02), Camera(120.0, 120.0, 75.0, 50.0, 150, 100), turned())
+
+
 def _odd_size() -> Scene:
     return Scene(random_rows(12, 200), Camera(40.0, 55.0, 13.7, 30.2, 37, 51), turned())
 
@@ -113,7 +140,7 @@ def _tiny_image() -> Scene:
     return Scene(random_rows(13, 50), Camera(4.0, 4.0, 1.5, 1.0, 3, 2), turned())
 
 
-SCENES: dict[str, Callable[[], Scene]] = {
+_BUILDERS: dict[str, Callable[[], Scene]] = {
     "small splats": _ordinary(0, 200, 0.03),
     "medium splats": _ordinary(1, 200, 0.1),
     "large splats": _ordinary(2, 60, 0.4, 1.0),
@@ -128,27 +155,20 @@ SCENES: dict[str, Callable[[], Scene]] = {
     "broken rows": _broken,
     "odd size": _odd_size,
     "tiny image": _tiny_image,
+    "many": _many,
 }
+SCENES = tuple(_BUILDERS)
 
 
-def steady_pixels(scene: Scene, margin: float = 2e-4) -> np.ndarray:
-    """True where no alpha lies within this relative margin of a threshold that float32 might cross."""
-    rows = torch.from_numpy(scene.rows.astype(np.float64))
-    e = project(rows, scene.camera, torch.from_numpy(scene.T_camera_world))
-    height, width = scene.size
-    dx = (torch.arange(width) + 0.5)[None, None, :] - e.means_px[:, 0, None, None]
-    dy = (torch.arange(height) + 0.5)[None, :, None] - e.means_px[:, 1, None, None]
-    a, b, c = e.conics[:, :, None, None].unbind(dim=1)
-    alpha = e.opacities[:, None, None] * torch.exp(-0.5 * (a * dx * dx + 2 * b * dx * dy + c * dy * dy))
-    near = ((alpha / MIN_ALPHA - 1.0).abs() < margin) | ((alpha / MAX_ALPHA - 1.0).abs() < margin)
-    return ~near.any(dim=0).numpy()
+@cache
+def scene_named(name: str) -> Scene:
+    return _BUILDERS[name]()
 
 
 def random_image_gradients(scene: Scene, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Derivatives by rgb, depth and alpha, zero on the pixels that a fair comparison leaves out."""
     rng = np.random.default_rng(seed)
-    steady = steady_pixels(scene)
-    d = rng.normal(size=(*scene.size, 5)).astype(np.float32) * steady[..., None]
+    d = rng.normal(size=(*scene.size, 5)).astype(np.float32) * scene.steady[..., None]
     return np.ascontiguousarray(d[..., :3]), np.ascontiguousarray(d[..., 3]), np.ascontiguousarray(d[..., 4])
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from splat_scenes import CAMERA, GROUPS, SCENES, Scene, random_image_gradients, random_rows, relative_error
+from splat_scenes import CAMERA, GROUPS, SCENES, Scene, random_image_gradients, random_rows, relative_error, scene_named
 
 from gausslite.render.rasterizer import EVERYTHING, Rasterizer, SplatGradients, Subset
 
@@ -28,13 +28,13 @@ def assert_same_gradients(came: SplatGradients, wanted: SplatGradients) -> None:
 
 @pytest.mark.parametrize("name", SCENES)
 def test_gradients_match_the_oracle(rasterizer: Rasterizer, oracle: Rasterizer, name: str) -> None:
-    scene = SCENES[name]()
+    scene = scene_named(name)
     assert_same_gradients(gradients(rasterizer, scene), gradients(oracle, scene))
 
 
 @pytest.mark.parametrize("channel", range(3))
 def test_each_image_alone_gives_the_oracles_gradients(rasterizer: Rasterizer, oracle: Rasterizer, channel: int) -> None:
-    scene = SCENES["medium splats"]()
+    scene = scene_named("medium splats")
     d_images = [d if i == channel else np.zeros_like(d) for i, d in enumerate(random_image_gradients(scene))]
     came, wanted = (
         r.backward(r.forward(scene.rows, scene.camera, scene.T_camera_world), *d_images) for r in (rasterizer, oracle)
@@ -44,7 +44,7 @@ def test_each_image_alone_gives_the_oracles_gradients(rasterizer: Rasterizer, or
 
 @pytest.mark.parametrize("name", ["medium splats", "odd size"])
 def test_gradients_of_a_tile_subset_match(rasterizer: Rasterizer, oracle: Rasterizer, name: str) -> None:
-    scene = SCENES[name]()
+    scene = scene_named(name)
     grid = (-(-scene.size[0] // 16), -(-scene.size[1] // 16))
     subset = Subset(tiles=np.random.default_rng(1).random(grid) < 0.4)
     came, wanted = gradients(rasterizer, scene, subset), gradients(oracle, scene, subset)
@@ -54,7 +54,7 @@ def test_gradients_of_a_tile_subset_match(rasterizer: Rasterizer, oracle: Raster
 
 
 def test_gradients_of_an_id_subset_match(rasterizer: Rasterizer, oracle: Rasterizer) -> None:
-    scene = SCENES["medium splats"]()
+    scene = scene_named("medium splats")
     ids = np.flatnonzero(np.random.default_rng(4).random(len(scene.rows)) < 0.3).astype(np.uint32)
     came, wanted = gradients(rasterizer, scene, Subset(ids=ids)), gradients(oracle, scene, Subset(ids=ids))
     assert_same_gradients(came, wanted)
@@ -62,7 +62,7 @@ def test_gradients_of_an_id_subset_match(rasterizer: Rasterizer, oracle: Rasteri
 
 
 def test_ids_and_tiles_together_match(rasterizer: Rasterizer, oracle: Rasterizer) -> None:
-    scene = SCENES["dense"]()
+    scene = scene_named("dense")
     tiles = np.zeros((3, 4), np.bool_)
     tiles[1, 1:3] = True
     subset = Subset(tiles=tiles, ids=np.arange(0, len(scene.rows), 2, dtype=np.uint32))
@@ -85,7 +85,7 @@ def test_no_splats_have_no_gradient(rasterizer: Rasterizer) -> None:
 
 
 def test_rows_that_cannot_be_drawn_get_no_gradient(rasterizer: Rasterizer) -> None:
-    scene = SCENES["broken rows"]()
+    scene = scene_named("broken rows")
     came = gradients(rasterizer, scene)
     assert came.visible.min() >= 42
     assert not np.isin(np.arange(60, 80), came.visible).any()
@@ -94,7 +94,7 @@ def test_rows_that_cannot_be_drawn_get_no_gradient(rasterizer: Rasterizer) -> No
 
 
 def test_a_second_rendering_forgets_the_first(rasterizer: Rasterizer) -> None:
-    scene, other = SCENES["medium splats"](), SCENES["odd size"]()
+    scene, other = scene_named("medium splats"), scene_named("odd size")
     first = gradients(rasterizer, scene)
     gradients(rasterizer, other)
     again = gradients(rasterizer, scene)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from splat_scenes import CAMERA, SCENES, Scene, random_rows, relative_error, steady_pixels, turned
+from splat_scenes import CAMERA, SCENES, Scene, random_rows, relative_error, scene_named, turned
 
 from gausslite.errors import InvalidInputError, ShapeError
 from gausslite.render.rasterizer import TILE_PX, Rasterizer, Rendering, Subset
@@ -23,8 +23,8 @@ def assert_same_images(came: Rendering, wanted: Rendering, where: np.ndarray) ->
 
 @pytest.mark.parametrize("name", SCENES)
 def test_images_match_the_oracle(rasterizer: Rasterizer, oracle: Rasterizer, name: str) -> None:
-    scene = SCENES[name]()
-    where = steady_pixels(scene)
+    scene = scene_named(name)
+    where = scene.steady
     assert where.mean() > 0.8
     came = rasterizer.forward(scene.rows, scene.camera, scene.T_camera_world)
     wanted = oracle.forward(scene.rows, scene.camera, scene.T_camera_world)
@@ -88,7 +88,7 @@ def _some_tiles(scene: Scene, seed: int = 0) -> np.ndarray:
 
 @pytest.mark.parametrize("name", ["medium splats", "odd size", "huge"])
 def test_tiles_outside_the_subset_stay_empty(rasterizer: Rasterizer, name: str) -> None:
-    scene = SCENES[name]()
+    scene = scene_named(name)
     tiles = _some_tiles(scene)
     shown = np.kron(tiles, np.ones((TILE_PX, TILE_PX), np.bool_))[: scene.size[0], : scene.size[1]]
     whole = rasterizer.forward(scene.rows, scene.camera, scene.T_camera_world)
@@ -102,7 +102,7 @@ def test_tiles_outside_the_subset_stay_empty(rasterizer: Rasterizer, name: str) 
 
 @pytest.mark.parametrize("name", ["medium splats", "broken rows"])
 def test_an_id_subset_draws_like_a_map_of_those_rows(rasterizer: Rasterizer, name: str) -> None:
-    scene = SCENES[name]()
+    scene = scene_named(name)
     ids = np.flatnonzero(np.random.default_rng(3).random(len(scene.rows)) < 0.3).astype(np.uint32)
     part = rasterizer.forward(scene.rows, scene.camera, scene.T_camera_world, Subset(ids=ids))
     part_rgb = part.rgb.copy()

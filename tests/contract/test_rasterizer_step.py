@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 import torch
-from splat_scenes import GROUPS, SCENES, Picture, Scene, picture_near, relative_error
+from splat_scenes import GROUPS, Picture, Scene, picture_near, relative_error, scene_named
 
 from gausslite.errors import ShapeError
 from gausslite.render.rasterizer import (
@@ -105,7 +105,7 @@ CASES = {
 @pytest.mark.parametrize("case", CASES)
 def test_step_feeds_adam_the_oracles_gradient(rasterizer: Rasterizer, oracle: Rasterizer, case: str) -> None:
     options = CASES[case]
-    scene = SCENES["medium splats"]()
+    scene = scene_named("medium splats")
     picture = picture_for(scene, oracle, options.get("subset", EVERYTHING))
     came, wanted = train(rasterizer, scene, picture, **options), train(oracle, scene, picture, **options)
     assert came.report.loss == pytest.approx(wanted.report.loss, rel=1e-4)
@@ -117,7 +117,7 @@ def test_step_feeds_adam_the_oracles_gradient(rasterizer: Rasterizer, oracle: Ra
 
 @pytest.mark.parametrize("name", ["odd size", "opaque", "broken rows", "needles and sheets", "behind the camera"])
 def test_step_matches_the_oracle_on_other_scenes(rasterizer: Rasterizer, oracle: Rasterizer, name: str) -> None:
-    scene = SCENES[name]()
+    scene = scene_named(name)
     picture = picture_for(scene, oracle)
     came, wanted = train(rasterizer, scene, picture), train(oracle, scene, picture)
     assert came.report.loss == pytest.approx(wanted.report.loss, rel=1e-4)
@@ -128,7 +128,7 @@ def test_step_matches_the_oracle_on_other_scenes(rasterizer: Rasterizer, oracle:
 
 @pytest.mark.parametrize("masked", [False, True])
 def test_step_equals_the_separate_path(rasterizer: Rasterizer, oracle: Rasterizer, masked: bool) -> None:
-    scene = SCENES["odd size"]()
+    scene = scene_named("odd size")
     picture = picture_for(scene, oracle)
     drawn = rasterizer.forward(scene.rows, scene.camera, scene.T_camera_world)
     images = np.concatenate([drawn.rgb, drawn.depth_m[..., None], drawn.alpha[..., None]], axis=2)
@@ -146,7 +146,7 @@ def test_step_equals_the_separate_path(rasterizer: Rasterizer, oracle: Rasterize
 
 
 def test_rows_move_by_adams_rule(rasterizer: Rasterizer, oracle: Rasterizer) -> None:
-    scene = SCENES["medium splats"]()
+    scene = scene_named("medium splats")
     done = train(rasterizer, scene, picture_for(scene, oracle))
     moved = done.report.visible
     before, after = done.before[0][moved, :14].astype(np.float64), done.rows[moved, :14]
@@ -163,7 +163,7 @@ def test_rows_move_by_adams_rule(rasterizer: Rasterizer, oracle: Rasterizer) -> 
 
 
 def test_density_statistics_count_the_steps_seen(rasterizer: Rasterizer, oracle: Rasterizer) -> None:
-    scene = SCENES["medium splats"]()
+    scene = scene_named("medium splats")
     picture = picture_for(scene, oracle)
     came, wanted = train(rasterizer, scene, picture), train(oracle, scene, picture)
     visible = came.report.visible
@@ -175,7 +175,7 @@ def test_density_statistics_count_the_steps_seen(rasterizer: Rasterizer, oracle:
 
 
 def test_rows_out_of_sight_are_untouched(rasterizer: Rasterizer, oracle: Rasterizer) -> None:
-    scene = SCENES["outside the view"]()
+    scene = scene_named("outside the view")
     done = train(rasterizer, scene, picture_for(scene, oracle))
     hidden = np.setdiff1d(np.arange(len(scene.rows)), done.report.visible)
     assert len(hidden) > 10
@@ -184,7 +184,7 @@ def test_rows_out_of_sight_are_untouched(rasterizer: Rasterizer, oracle: Rasteri
 
 
 def test_frozen_rows_are_untouched_and_the_others_move_as_ever(rasterizer: Rasterizer, oracle: Rasterizer) -> None:
-    scene = SCENES["medium splats"]()
+    scene = scene_named("medium splats")
     picture = picture_for(scene, oracle)
     trainable = np.random.default_rng(5).random(len(scene.rows)) < 0.5
     free, held = train(rasterizer, scene, picture), train(rasterizer, scene, picture, trainable=trainable)
@@ -200,7 +200,7 @@ def test_frozen_rows_are_untouched_and_the_others_move_as_ever(rasterizer: Raste
 
 
 def test_pixels_of_weight_zero_do_not_matter_to_a_masked_step(rasterizer: Rasterizer, oracle: Rasterizer) -> None:
-    scene = SCENES["medium splats"]()
+    scene = scene_named("medium splats")
     picture = picture_for(scene, oracle)
     other_rgb, other_depth_m = 255 - picture.rgb, picture.depth_m + np.float32(0.5)
     unseen = picture.weight == 0
@@ -217,7 +217,7 @@ def test_pixels_of_weight_zero_do_not_matter_to_a_masked_step(rasterizer: Raster
 
 
 def test_an_empty_mask_has_no_loss_and_no_gradient(rasterizer: Rasterizer, oracle: Rasterizer) -> None:
-    scene = SCENES["medium splats"]()
+    scene = scene_named("medium splats")
     picture = replace(picture_for(scene, oracle), weight=np.zeros(scene.size, np.float32))
     done = train(rasterizer, scene, picture, masked=True)
     assert done.report.loss == 0.0
@@ -226,7 +226,7 @@ def test_an_empty_mask_has_no_loss_and_no_gradient(rasterizer: Rasterizer, oracl
 
 
 def test_a_step_on_an_empty_map_costs_the_whole_image(rasterizer: Rasterizer, oracle: Rasterizer) -> None:
-    scene = Scene(np.zeros((0, 16), np.float32), SCENES["odd size"]().camera, np.eye(4))
+    scene = Scene(np.zeros((0, 16), np.float32), scene_named("odd size").camera, np.eye(4))
     picture = picture_for(scene, oracle)
     came, wanted = train(rasterizer, scene, picture), train(oracle, scene, picture)
     assert came.report.loss == pytest.approx(wanted.report.loss, rel=1e-5)
@@ -234,8 +234,8 @@ def test_a_step_on_an_empty_map_costs_the_whole_image(rasterizer: Rasterizer, or
 
 
 def test_thirty_steps_reduce_the_loss(rasterizer: Rasterizer, oracle: Rasterizer) -> None:
-    scene = SCENES["medium splats"]()
-    goal = oracle.forward(SCENES["large splats"]().rows, scene.camera, scene.T_camera_world)
+    scene = scene_named("medium splats")
+    goal = oracle.forward(scene_named("large splats").rows, scene.camera, scene.T_camera_world)
     picture = Picture((goal.rgb.clip(0, 1) * 255).astype(np.uint8), goal.expected_depth_m(), np.ones_like(goal.alpha))
     view = picture.view(rasterizer, scene)
     rows, first, second = scene.rows.copy(), np.zeros_like(scene.rows), np.zeros_like(scene.rows)
@@ -245,7 +245,7 @@ def test_thirty_steps_reduce_the_loss(rasterizer: Rasterizer, oracle: Rasterizer
 
 
 def test_moments_of_another_length_are_refused(rasterizer: Rasterizer, oracle: Rasterizer) -> None:
-    scene = SCENES["medium splats"]()
+    scene = scene_named("medium splats")
     view = picture_for(scene, oracle).view(rasterizer, scene)
     rows, first, second = tables(scene)
     with pytest.raises((ShapeError, TypeError)):
@@ -253,6 +253,6 @@ def test_moments_of_another_length_are_refused(rasterizer: Rasterizer, oracle: R
 
 
 def test_a_view_of_another_size_than_its_camera_is_refused(rasterizer: Rasterizer) -> None:
-    camera = SCENES["odd size"]().camera
+    camera = scene_named("odd size").camera
     with pytest.raises(ShapeError, match="rgb"):
         rasterizer.prepare_view(np.zeros((4, 4, 3), np.uint8), np.zeros((4, 4), np.float32), camera)

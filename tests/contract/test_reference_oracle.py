@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from splat_scenes import CAMERA, GROUPS, SCENES, Scene, random_image_gradients, relative_error, turned
+from splat_scenes import CAMERA, GROUPS, Scene, random_image_gradients, relative_error, scene_named, turned
 
 from gausslite.render.rasterizer import LossWeights, Rasterizer
 from gausslite.render.reference.compositing import draw
@@ -30,7 +30,7 @@ def exp_twist(twist: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("name", ["medium splats", "large splats", "outside the view", "needles and sheets"])
 def test_row_gradients_match_finite_differences(oracle: Rasterizer, name: str) -> None:
-    scene = SCENES[name]()
+    scene = scene_named(name)
     d_rgb, d_depth_m, d_alpha = random_image_gradients(scene)
     d_images = np.concatenate([d_rgb, d_depth_m[..., None], d_alpha[..., None]], axis=2).astype(np.float64)
     drawn = oracle.forward(scene.rows, scene.camera, scene.T_camera_world)
@@ -51,7 +51,7 @@ def test_row_gradients_match_finite_differences(oracle: Rasterizer, name: str) -
 
 
 def test_the_pose_gradient_matches_finite_differences(oracle: Rasterizer) -> None:
-    scene = SCENES["medium splats"]()
+    scene = scene_named("medium splats")
     d_rgb, d_depth_m, d_alpha = random_image_gradients(scene)
     d_images = np.concatenate([d_rgb, d_depth_m[..., None], d_alpha[..., None]], axis=2).astype(np.float64)
     drawn = oracle.forward(scene.rows, scene.camera, scene.T_camera_world)
@@ -67,7 +67,7 @@ def test_the_pose_gradient_matches_finite_differences(oracle: Rasterizer) -> Non
 
 def test_the_2d_norm_is_the_gradient_of_a_shift_of_the_image(oracle: Rasterizer) -> None:
     """Moving the principal point moves every mean in the image alike, so one splat alone shows its own norm."""
-    rows = SCENES["large splats"]().rows[:1]
+    rows = scene_named("large splats").rows[:1].copy()
     rows[0, :3] = [0.1, 0.05, 1.5]
     scene = Scene(rows, CAMERA, np.eye(4))
     d_rgb, d_depth_m, d_alpha = random_image_gradients(scene)
