@@ -14,7 +14,7 @@ from pathlib import Path
 from gausslite.cli.processes import ProcessGroup, ServiceProcess
 from gausslite.cli.progress import MappingBar
 from gausslite.errors import UnavailableError
-from gausslite.wire.clients import AgentClient, Export, FusionClient
+from gausslite.wire.clients import AgentClient, Export, FusionClient, is_done
 
 _START_TIMEOUT_S = 60.0
 _POLL_S = 0.25
@@ -73,8 +73,6 @@ def running_team(plan: TeamPlan, out: Path) -> Iterator[Team]:
 
 def watch_missions(team: Team) -> None:
     """Show every agent's progress until all are done. Raises UnavailableError when one ends before that."""
-    from gausslite.wire.convert import is_done
-
     waiting = dict(team.agents)
     counts = {agent.agent_id: agent.count for agent in team.plan.agents}
     bars = {agent_id: MappingBar(counts[agent_id], agent_id, row) for row, agent_id in enumerate(waiting)}

@@ -186,6 +186,11 @@ class AgentClient(_Client):
             yield convert.map_update_from_message(response.block, _WATCH_LIMITS)
 
 
+def is_done(status: agent_service_pb2.GetAgentStatusResponse) -> bool:
+    """True once the agent's source has ended and its uplink is empty."""
+    return status.state == agent_service_pb2.AGENT_STATE_DONE
+
+
 class FusionClient(_Client):
     """The team's map."""
 
