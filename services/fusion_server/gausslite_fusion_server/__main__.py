@@ -4,33 +4,32 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import logging
 import sys
 from collections.abc import Sequence
 
-from gausslite.errors import GaussLiteError
 from gausslite.fusion.memory import MemoryStore
 from gausslite.fusion.sqlite import SqliteStore
 from gausslite.fusion.store import FusionStore
 from gausslite.fusion.team import TeamMap
+from gausslite.render.rasterizer import Rasterizer
+from gausslite.wire.process import run_service
 from gausslite.wire.server import serve_until_stopped
 from gausslite_fusion_server.refinement import Refinery
 from gausslite_fusion_server.servicer import FusionServicer
 from gausslite_fusion_server.settings import ServerSettings, parse_arguments
 
+_PROGRAM = "gausslite-fusion-server"
+
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Serve until stopped. Returns 0, or 2 with one line on stderr when the server cannot start or go on."""
-    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s %(message)s")
-    try:
+
+    async def serve() -> None:
         settings = parse_arguments(arguments)
-        store = _open_store(settings)
-        with contextlib.closing(store):
-            asyncio.run(_serve(settings, store))
-    except GaussLiteError as error:
-        print(f"gausslite-fusion-server: {error}", file=sys.stderr)
-        return 2
-    return 0
+        with contextlib.closing(_open_store(settings)) as store:
+            await _serve(settings, store)
+
+    return run_service(_PROGRAM, serve)
 
 
 def _open_store(settings: ServerSettings) -> FusionStore:
@@ -40,8 +39,13 @@ def _open_store(settings: ServerSettings) -> FusionStore:
 
 
 async def _serve(settings: ServerSettings, store: FusionStore) -> None:
-    refinery = Refinery(settings.refine, settings.rasterizer)
-    servicer = FusionServicer(TeamMap(store, settings.team), refinery)
+    def chosen_rasterizer() -> Rasterizer:
+        # imported here: a server that never refines needs no kernels
+        from gausslite.render.choose import choose_rasterizer
+
+        return choose_rasterizer(settings.rasterizer)
+
+    servicer = FusionServicer(TeamMap(store, settings.team), Refinery(settings.refine, chosen_rasterizer))
 
     async def drain_when_stopping() -> None:
         try:

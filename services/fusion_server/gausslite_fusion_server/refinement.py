@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from threading import Event
@@ -11,6 +11,7 @@ from threading import Event
 from gausslite.errors import QuotaError
 from gausslite.fusion.refine import RefineProgress, RefineSettings, refine
 from gausslite.fusion.team import TeamMap
+from gausslite.render.rasterizer import Rasterizer
 from gausslite_fusion_server.bell import Bell
 
 MAX_ITERATIONS = 30_000
@@ -26,11 +27,11 @@ class RefineOrder:
 
 
 class Refinery:
-    """Refines one map at a time. The rasterizer is chosen when the first refinement starts, not before."""
+    """Refines one map at a time. A rasterizer is chosen when a refinement starts, so that others need none."""
 
-    def __init__(self, settings: RefineSettings, rasterizer: str = "auto") -> None:
+    def __init__(self, settings: RefineSettings, choose_rasterizer: Callable[[], Rasterizer]) -> None:
         self._settings = settings
-        self._rasterizer = rasterizer
+        self._choose_rasterizer = choose_rasterizer
         self._worker = ThreadPoolExecutor(1, "refine")
         self._busy = False
 
@@ -55,10 +56,8 @@ class Refinery:
             return not cancelled.is_set()
 
         def work() -> None:
-            from gausslite.render.choose import choose_rasterizer
-
             gaussians, keyframes, revision = team.to_refine()
-            refined = refine(gaussians, keyframes, choose_rasterizer(self._rasterizer), settings, go_on)
+            refined = refine(gaussians, keyframes, self._choose_rasterizer(), settings, go_on)
             if not cancelled.is_set():
                 team.keep_refined(refined, revision)
 

@@ -32,11 +32,6 @@ class RevisionLedger:
         """The fused map's present revision."""
         return self._revision
 
-    @property
-    def live_keys(self) -> Int64[ndarray, " v"]:
-        """The voxels that hold something, ascending."""
-        return np.array(sorted(self._holder), np.int64)
-
     def record(self, agent_id: str, keys: Int64[ndarray, " k"], election: Election) -> Int64[ndarray, " c"]:
         """Note that this agent's words on `keys` changed and that the vote on them now stands so.
 

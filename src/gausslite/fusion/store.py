@@ -8,7 +8,7 @@ had never been there. An empty word is a tombstone and is kept, since an older w
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Int32, Int64, UInt32, UInt64
@@ -58,6 +58,7 @@ class StakeTable:
     counts: UInt32[ndarray, " w"]
 
 
+@runtime_checkable
 class FusionStore(Protocol):
     """Owns the register, the charter and the sessions. Every method may be called from any thread.
 

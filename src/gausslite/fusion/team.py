@@ -191,10 +191,19 @@ class TeamMap:
         return concatenate({only_agent: self._store.words(only_agent)})
 
     def to_refine(self) -> tuple[Gaussians, list[TeamKeyframe], int]:
-        """The fused map, the union of the keyframe buffers, and the revision they are of."""
+        """The fused map, the union of the keyframe buffers, and the revision they are of.
+
+        Raises MismatchError when the team has not brought both yet.
+        """
         with self._lock:
             revision, keyframes, table = self._ledger.revision, self._pool.keyframes(), self._store.table()
-        return fuse(table).gaussians, keyframes, revision
+        gaussians = fuse(table).gaussians
+        if not keyframes or len(gaussians) == 0:
+            raise MismatchError(
+                f"refinement: expected a fused map and keyframes, got {len(gaussians)} Gaussians and "
+                f"{len(keyframes)} keyframes"
+            )
+        return gaussians, keyframes, revision
 
     def keep_refined(self, gaussians: Gaussians, revision: int) -> None:
         """Lay a refined map over the vote of this revision."""
@@ -205,12 +214,12 @@ class TeamMap:
     def refined(self) -> VoxelWords:
         """The refined map; voxels that changed since it was made show the newer vote.
 
-        Raises InvalidInputError when there is none, RevisionGoneError when it is too old to tell: refine again.
+        Raises MismatchError when there is none, RevisionGoneError when it is too old to tell: refine again.
         """
         with self._lock:
             refined = self._refined
             if refined is None:
-                raise InvalidInputError("refined map: expected a refinement first, got none; call RefineFusedMap")
+                raise MismatchError("refined map: expected a refinement first, got none yet; call RefineFusedMap")
             newer = self._ledger.changed_since(refined.revision)
             table = self._store.table(newer)
         return refined.overlaid(fuse(table), newer)

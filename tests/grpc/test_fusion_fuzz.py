@@ -1,0 +1,146 @@
+"""Whatever bytes arrive, the fusion server answers with a known code and goes on serving."""
+
+from __future__ import annotations
+
+import subprocess
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import grpc
+import pytest
+from fusion_team import GRID, frame, request, said, server_process
+from google.protobuf.message import DecodeError, Message
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gausslite.v1 import fusion_service_pb2 as pb
+from gausslite.wire.clients import FusionClient
+from gausslite.wire.convert import frame_to_message, grid_to_message
+
+KNOWN = {
+    grpc.StatusCode.OK,
+    grpc.StatusCode.INVALID_ARGUMENT,
+    grpc.StatusCode.NOT_FOUND,
+    grpc.StatusCode.FAILED_PRECONDITION,
+    grpc.StatusCode.OUT_OF_RANGE,
+    grpc.StatusCode.RESOURCE_EXHAUSTED,
+    grpc.StatusCode.DATA_LOSS,
+}
+fuzz = settings(max_examples=50, deadline=None)
+
+
+@dataclass(frozen=True)
+class Target:
+    """A server in a process of its own: its threads would otherwise draw random numbers beside hypothesis."""
+
+    process: subprocess.Popen[str]
+    client: FusionClient
+    channel: grpc.Channel
+    session_id: str
+
+    def send(self, *requests: pb.ContributeSubsetsRequest) -> list[pb.SubsetOutcome]:
+        return [outcome for answer in self.client.contribute(requests, 20.0) for outcome in answer.outcomes]
+
+    def code(self, method: str, message: bytes) -> grpc.StatusCode:
+        """How the call begins to go: OK when an answer comes."""
+        call = self.channel.stream_stream(f"/gausslite.v1.FusionService/{method}")(iter([message]), timeout=10)
+        try:
+            next(call, None)
+            return grpc.StatusCode.OK
+        except grpc.RpcError as error:
+            return error.code()
+        finally:
+            call.cancel()
+
+    def assert_alive(self) -> None:
+        assert self.process.poll() is None
+        assert self.client.status().mission_id == "mission"
+
+
+@pytest.fixture(scope="module")
+def target() -> Iterator[Target]:
+    with server_process() as (process, client), grpc.insecure_channel(client.address) as channel:
+        yield Target(process, client, channel, client.join("ant", GRID).session_id)
+
+
+def mutated(data: bytes, edits: list[tuple[int, int]], cut: int) -> bytes:
+    """Some bytes replaced, then the end cut off."""
+    out = bytearray(data)
+    for place, value in edits:
+        out[place % len(out)] = value
+    return bytes(out[: len(out) - cut % len(out)])
+
+
+EDITS = st.lists(st.tuples(st.integers(0, 10_000), st.integers(0, 255)), max_size=6)
+CUT = st.one_of(st.just(0), st.integers(0, 10_000))
+
+
+@fuzz
+@given(blob=st.binary(max_size=300))
+def test_any_bytes_as_a_subset_are_rejected(target: Target, blob: bytes) -> None:
+    [outcome] = target.send(pb.ContributeSubsetsRequest(session_id=target.session_id, sequence=1, subset=blob))
+    assert outcome.status == pb.SUBSET_STATUS_REJECTED
+    assert outcome.reason in {"CODEC", "CHECKSUM"}
+
+
+@fuzz
+@given(edits=EDITS, cut=CUT)
+def test_a_mutated_subset_is_an_outcome_and_never_the_end(
+    target: Target, edits: list[tuple[int, int]], cut: int
+) -> None:
+    good = request(target.session_id, said("ant", 1, {0: [1, 2], 3: []}))
+    bad = pb.ContributeSubsetsRequest(session_id=target.session_id, sequence=1, subset=mutated(good.subset, edits, cut))
+    outcomes = target.send(bad, good)
+    assert outcomes[-1].status != pb.SUBSET_STATUS_REJECTED
+
+
+@fuzz
+@given(edits=EDITS, cut=CUT)
+def test_a_mutated_keyframe_is_reported_and_never_the_end(
+    target: Target, edits: list[tuple[int, int]], cut: int
+) -> None:
+    whole = frame_to_message(frame(1)).SerializeToString()
+    message = pb.ContributeKeyframesRequest(session_id=target.session_id)
+    try:
+        message.keyframe.ParseFromString(mutated(whole, edits, cut))
+    except DecodeError:
+        return
+    assert target.code("ContributeKeyframes", message.SerializeToString()) is grpc.StatusCode.OK
+    target.assert_alive()
+
+
+@fuzz
+@given(
+    blob=st.binary(max_size=200),
+    method=st.sampled_from([method.name for method in pb.DESCRIPTOR.services_by_name["FusionService"].methods]),
+)
+def test_any_bytes_to_any_rpc_leave_the_server_alive(target: Target, blob: bytes, method: str) -> None:
+    # INTERNAL and UNKNOWN are the transport's own words for bytes that are no message
+    assert target.code(method, blob) in KNOWN | {grpc.StatusCode.INTERNAL, grpc.StatusCode.UNKNOWN}
+    target.assert_alive()
+
+
+NUMBERS = st.one_of(st.sampled_from([0, 1, 2**32 - 1]), st.integers(0, 2**32 - 1))
+NAMES = st.one_of(st.sampled_from(["", "ant", "mission"]), st.text(max_size=20))
+
+
+@fuzz
+@given(
+    message=st.one_of(
+        st.builds(
+            pb.JoinSessionRequest,
+            agent_id=NAMES,
+            mission_id=NAMES,
+            world_frame=NAMES,
+            grid=st.one_of(st.just(grid_to_message(GRID)), st.none()),
+        ),
+        st.builds(pb.ExportFusedMapRequest, mission_id=NAMES, strategy=st.integers(0, 9), agent_id=NAMES),
+        st.builds(pb.RefineFusedMapRequest, iterations=NUMBERS, max_gaussians=NUMBERS, seed=st.integers(0, 2**64 - 1)),
+        st.builds(pb.WatchFusedMapRequest, mission_id=NAMES, since_revision=st.integers(0, 2**64 - 1)),
+        st.builds(pb.LeaveSessionRequest, session_id=NAMES, forget=st.booleans()),
+    )
+)
+def test_wild_but_well_formed_messages_get_a_known_code(target: Target, message: Message) -> None:
+    method = type(message).__name__.removesuffix("Request")
+    assert target.code(method, message.SerializeToString()) in KNOWN
+    target.assert_alive()

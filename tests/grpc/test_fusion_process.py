@@ -1,0 +1,66 @@
+"""The fusion server as its own process: its command line, its end on SIGTERM, and its next life after a kill."""
+
+from __future__ import annotations
+
+import signal
+import socket
+import subprocess
+from pathlib import Path
+
+import pytest
+from fusion_team import COMMAND, GRID, request, said, server_process
+
+from gausslite.codec.ply import gaussians_from_ply
+from gausslite.errors import UnavailableError
+from gausslite.v1 import fusion_service_pb2 as pb
+from gausslite.wire.clients import Export
+
+
+def test_after_a_kill_the_acknowledged_is_there_and_a_resend_is_stale(tmp_path: Path) -> None:
+    store = tmp_path / "team.sqlite"
+    with server_process("--store", str(store)) as (_, client):
+        session = client.join("ant", GRID).session_id
+        message = request(session, said("ant", 1, {0: [4], 1: [2, 2]}))
+        [answer] = client.contribute([message], 20.0)
+        assert answer.acknowledged == 1
+    with server_process("--store", str(store)) as (_, client):
+        [answer] = client.contribute([message], 20.0)
+        assert answer.outcomes[0].status == pb.SUBSET_STATUS_STALE
+        assert sorted(gaussians_from_ply(client.export(Export())).kappa.tolist()) == [2, 2, 4]
+
+
+def test_sigterm_ends_open_streams_and_the_process_with_code_0(tmp_path: Path) -> None:
+    with server_process("--store", str(tmp_path / "team.sqlite")) as (process, client):
+        watch = client.watch()
+        next(watch)
+        process.send_signal(signal.SIGTERM)
+        with pytest.raises(UnavailableError):
+            next(watch)
+        assert process.wait(20) == 0
+
+
+def ends_with_one_line(*arguments: str) -> str:
+    done = subprocess.run([*COMMAND, *arguments], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 2
+    assert done.stdout == ""
+    [line] = done.stderr.splitlines()
+    return line
+
+
+def test_what_the_operator_can_mend_is_one_line_and_code_2(tmp_path: Path) -> None:
+    nonsense = tmp_path / "notes.sqlite"
+    nonsense.write_text("remember the milk, " * 300)
+    assert "cannot be opened" in ends_with_one_line("--store", str(tmp_path / "no" / "folder" / "x.sqlite"))
+    assert "undamaged GaussLite store" in ends_with_one_line("--store", str(nonsense))
+    assert "voxel size_m" in ends_with_one_line("--voxel-size", "0")
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        assert "in use" in ends_with_one_line("--listen", f"127.0.0.1:{taken.getsockname()[1]}")
+
+
+def test_help_lists_the_options() -> None:
+    done = subprocess.run([*COMMAND, "--help"], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0
+    for option in ("--listen", "--store", "--voxel-size", "--quota-gaussians", "--rasterizer"):
+        assert option in done.stdout

@@ -1,0 +1,395 @@
+"""Every rpc of the fusion service on a real server in process, and every error code that applies to it."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+
+import grpc
+import numpy as np
+import pytest
+from fusion_team import CAMERA, GRID, Team, frame, keys, request, said, team, words
+from grpc_health.v1 import health_pb2, health_pb2_grpc
+
+from gausslite.codec.ply import gaussians_from_ply
+from gausslite.domain.camera import Camera
+from gausslite.domain.subset import RoiSubset
+from gausslite.domain.voxels import VoxelGrid
+from gausslite.errors import (
+    InvalidInputError,
+    MismatchError,
+    QuotaError,
+    RevisionGoneError,
+    SessionUnknownError,
+    UnavailableError,
+)
+from gausslite.fusion.memory import MemoryStore
+from gausslite.fusion.refine import RefineSettings
+from gausslite.fusion.sqlite import SqliteStore
+from gausslite.fusion.terms import Quotas, TeamSettings
+from gausslite.v1 import fusion_service_pb2 as pb
+from gausslite.wire.clients import Export
+from gausslite.wire.convert import Box
+
+ACCEPTED, STALE, REJECTED = pb.SUBSET_STATUS_ACCEPTED, pb.SUBSET_STATUS_STALE, pb.SUBSET_STATUS_REJECTED
+
+
+def test_two_agents_join_contribute_and_the_better_trained_wins() -> None:
+    with team() as t:
+        ant, bee = t.client.join("ant", GRID), t.client.join("bee", GRID)
+        assert ant.highest_map_revision == 0
+        assert [o.status for o in t.say(ant.session_id, said("ant", 1, {0: [5], 1: [1]}))] == [ACCEPTED]
+        assert [o.status for o in t.say(bee.session_id, said("bee", 1, {1: [2, 2], 2: [0]}))] == [ACCEPTED]
+        fused = gaussians_from_ply(t.client.export(Export("vote")))
+        assert sorted(fused.kappa.tolist()) == [0, 2, 2, 5]
+        assert len(gaussians_from_ply(t.client.export(Export("concatenation")))) == 5
+        assert gaussians_from_ply(t.client.export(Export("vote", "ant"))).kappa.tolist() == [5]
+        assert sorted(gaussians_from_ply(t.client.export(Export("concatenation", "ant"))).kappa.tolist()) == [1, 5]
+        assert t.client.join("ant", GRID).highest_map_revision == 1
+
+
+def test_the_same_again_is_stale_and_acks_are_cumulative() -> None:
+    with team() as t:
+        session = t.client.join("ant", GRID).session_id
+        subsets = [said("ant", revision, {0: [revision]}) for revision in (1, 2, 3)]
+        sent = [request(session, subset) for subset in (*subsets, subsets[0])]
+        answers = list(t.client.contribute(sent, 20.0))
+        assert [answer.acknowledged for answer in answers] == [1, 2, 3, 3]
+        assert [answer.outcomes[0].status for answer in answers] == [ACCEPTED] * 3 + [STALE]
+        assert answers[0].outcomes[0].accepted_voxels == answers[3].outcomes[0].stale_voxels == 1
+        assert gaussians_from_ply(t.client.export(Export())).kappa.tolist() == [3]
+
+
+def test_one_bad_block_does_not_end_a_good_stream() -> None:
+    with team(settings=TeamSettings(grid=GRID, quotas=Quotas(gaussians_per_agent=3))) as t:
+        session = t.client.join("ant", GRID).session_id
+        good = request(session, said("ant", 1, {0: [1]}))
+        flipped = bytearray(good.subset)
+        flipped[-20] ^= 1
+        bad = [
+            pb.ContributeSubsetsRequest(session_id=session, sequence=2, subset=bytes(flipped)),
+            pb.ContributeSubsetsRequest(session_id=session, sequence=3, subset=b"no subset at all" * 9),
+            pb.ContributeSubsetsRequest(session_id=session, sequence=4, subset=bytes(3 << 20)),
+            request(session, said("bee", 5, {0: [1]})),
+            request(session, said("ant", 6, {1: [1, 1, 1]})),
+        ]
+        last = request(session, said("ant", 7, {1: [1, 1]}))
+        outcomes = t.send(good, *bad, last)
+        assert [o.status for o in outcomes] == [ACCEPTED] + [REJECTED] * 5 + [ACCEPTED]
+        assert [o.reason for o in outcomes[1:-1]] == ["CHECKSUM", "CODEC", "CODEC", "INVALID_INPUT", "QUOTA"]
+        assert all(o.message and "\n" not in o.message for o in outcomes[1:-1])
+        [ant] = t.client.status().agents
+        assert (ant.subsets_accepted, ant.subsets_rejected, ant.gaussians, ant.voxels) == (2, 5, 3, 2)
+
+
+def test_a_quota_counts_what_is_held_and_not_what_was_sent() -> None:
+    with team(settings=TeamSettings(grid=GRID, quotas=Quotas(agents=1, voxels_per_agent=2))) as t:
+        session = t.client.join("ant", GRID).session_id
+        statuses = [
+            t.say(session, said("ant", revision, cells))[0].status
+            for revision, cells in [(1, {0: [1], 1: [1]}), (2, {0: [2], 1: []}), (3, {2: [1]}), (2, {0: [9], 2: [9]})]
+        ]
+        assert statuses == [ACCEPTED, ACCEPTED, REJECTED, REJECTED]
+        assert t.say(session, said("ant", 1, {0: [1], 1: [1]}))[0].status == STALE
+        with pytest.raises(QuotaError, match="at most 1 in this mission"):
+            t.client.join("bee", GRID)
+        assert t.client.join("ant", GRID).session_id != session
+
+
+def test_an_unknown_session_is_told_to_join_again() -> None:
+    with team() as t:
+        with pytest.raises(SessionUnknownError):
+            t.say("never given", said("ant", 1, {0: [1]}))
+        with pytest.raises(SessionUnknownError):
+            t.client.contribute_keyframes("never given", [frame(0)])
+        with pytest.raises(SessionUnknownError):
+            t.client.leave("never given")
+        first = t.client.join("ant", GRID).session_id
+        t.client.join("ant", GRID)
+        with pytest.raises(SessionUnknownError):
+            t.say(first, said("ant", 1, {0: [1]}))
+        with pytest.raises(grpc.RpcError) as caught:
+            t.stub.LeaveSession(pb.LeaveSessionRequest(session_id="x"))
+        assert caught.value.code() is grpc.StatusCode.NOT_FOUND
+
+
+def test_other_terms_are_a_mismatch_that_names_both_values() -> None:
+    with team() as t:
+        with pytest.raises(MismatchError, match=r"0\.1 m, got 0\.2 m"):
+            t.client.join("ant", VoxelGrid(0.2))
+        session = t.client.join("ant", GRID, world_frame="map").session_id
+        t.client.join("bee", GRID)
+        with pytest.raises(MismatchError, match="world frame: expected 'map' as agreed here, got 'odom'"):
+            t.client.join("cat", GRID, world_frame="odom")
+        t.client.mission_id = "other"
+        for call in (lambda: t.client.join("cat", GRID), t.client.status, lambda: t.client.export(Export()),
+                     lambda: next(t.client.watch()), lambda: next(t.client.refine())):  # fmt: skip
+            with pytest.raises(MismatchError, match="mission: expected 'mission' as agreed here, got 'other'"):
+                call()
+        coarse = VoxelGrid(1.0)
+        subset = RoiSubset("ant", "", 1, 1, words({}))
+        with pytest.raises(MismatchError, match="voxel size"):
+            t.say(session, subset, grid=coarse)
+
+
+@pytest.mark.parametrize("agent_id", ["", "x" * 256])
+def test_an_agent_needs_a_name_of_bearable_length(agent_id: str) -> None:
+    with team() as t, pytest.raises(InvalidInputError, match="agent_id"):
+        t.client.join(agent_id, GRID)
+
+
+def test_a_grid_must_be_named() -> None:
+    with team() as t, pytest.raises(grpc.RpcError) as caught:
+        t.stub.JoinSession(pb.JoinSessionRequest(agent_id="ant"))
+    assert caught.value.code() is grpc.StatusCode.INVALID_ARGUMENT
+
+
+def test_a_fresh_map_and_a_forgotten_agent_leave_nothing() -> None:
+    with team() as t:
+        t.say(t.client.join("ant", GRID).session_id, said("ant", 7, {0: [1]}))
+        session = t.client.join("ant", GRID, fresh_map=True)
+        assert session.highest_map_revision == 0
+        assert t.client.status().fused_voxels == 0
+        assert t.say(session.session_id, said("ant", 1, {1: [1]}))[0].status == ACCEPTED
+        t.client.leave(session.session_id)
+        assert t.client.status().fused_voxels == 1
+        assert not t.client.status().agents[0].joined
+        t.client.leave(t.client.join("ant", GRID).session_id, forget=True)
+        assert t.client.status().fused_voxels == 0
+        assert len(t.client.status().agents) == 0
+        assert len(gaussians_from_ply(t.client.export(Export()))) == 0
+
+
+def test_a_watcher_gets_the_snapshot_and_then_what_changes() -> None:
+    with team() as t:
+        ant, bee = (t.client.join(name, GRID).session_id for name in ("ant", "bee"))
+        t.say(ant, said("ant", 1, {0: [5], 1: [1]}))
+        watch = t.client.watch()
+        first = next(watch)
+        assert first.snapshot
+        assert first.last
+        assert first.words.keys.tolist() == keys(0, 1).tolist()
+        assert first.winners == ("ant", "ant")
+        t.say(bee, said("bee", 1, {0: [1], 1: [2]}))
+        second = next(watch)
+        assert not second.snapshot
+        assert second.words.keys.tolist() == keys(1).tolist()
+        assert second.winners == ("bee",)
+        t.say(ant, said("ant", 2, {0: []}))
+        assert next(watch).winners == ("bee",)
+        t.client.leave(bee, forget=True)
+        third = next(watch)
+        assert dict(zip(third.words.keys.tolist(), third.words.counts.tolist(), strict=True)) == {
+            keys(0)[0]: 0,
+            keys(1)[0]: 1,
+        }
+        watch.close()
+        late = t.client.watch(first.revision)
+        summed_up = next(late)
+        assert not summed_up.snapshot
+        assert summed_up.revision == third.revision
+        assert summed_up.words.counts.tolist() == [0, 1]
+        late.close()
+        current = t.client.watch(third.revision)
+        nothing = next(current)
+        assert nothing.last
+        assert nothing.words is None
+        current.close()
+
+
+def test_a_watcher_of_a_region_sees_that_region_alone() -> None:
+    with team() as t:
+        session = t.client.join("ant", GRID).session_id
+        t.say(session, said("ant", 1, {0: [1], 5: [1]}))
+        watch = t.client.watch(region=Box((0.4, 0.0, 0.0), (0.6, 0.1, 2.0)))
+        assert next(watch).words.keys.tolist() == keys(5).tolist()
+        t.say(session, said("ant", 2, {0: []}))
+        assert next(watch).words is None
+        t.say(session, said("ant", 3, {5: []}))
+        assert next(watch).words.counts.tolist() == [0]
+        watch.close()
+        upside_down = pb.WatchFusedMapRequest()
+        upside_down.region.min_m.x = 1.0
+        with pytest.raises(grpc.RpcError) as caught:
+            next(t.stub.WatchFusedMap(upside_down))
+        assert caught.value.code() is grpc.StatusCode.INVALID_ARGUMENT
+
+
+def test_a_revision_of_another_life_is_out_of_range() -> None:
+    with team() as t:
+        for revision in (1, t.client.join("ant", GRID).fused_revision + 1000):
+            with pytest.raises(RevisionGoneError):
+                next(t.client.watch(revision))
+
+
+def test_a_large_map_comes_in_several_blocks_of_one_revision() -> None:
+    with team() as t:
+        session = t.client.join("ant", GRID).session_id
+        for part in range(3):
+            t.say(session, said("ant", part + 1, {cell: [1] * 8 for cell in range(part * 1000, part * 1000 + 1000)}))
+        blocks = []
+        for block in t.client.watch():
+            blocks.append(block)
+            if block.last:
+                break
+        assert len(blocks) > 1
+        assert len({block.revision for block in blocks}) == 1
+        assert [block.last for block in blocks] == [False] * (len(blocks) - 1) + [True]
+        assert np.concatenate([block.words.keys for block in blocks]).tolist() == keys(*range(3000)).tolist()
+
+
+def test_keyframes_are_kept_within_bounds_and_bad_ones_reported() -> None:
+    with team(settings=TeamSettings(grid=GRID, quotas=Quotas(keyframes_per_agent=2, keyframe_pixels=32 * 24))) as t:
+        session = t.client.join("ant", GRID).session_id
+        large = Camera(40.0, 40.0, 32.0, 12.0, 64, 24)
+        assert t.client.contribute_keyframes(session, [frame(1), frame(2), frame(3), frame(3), frame(4, large)]) == 4
+        status = t.client.status()
+        assert status.keyframes == status.agents[0].keyframes == 2
+        broken = pb.ContributeKeyframesRequest(session_id=session)
+        broken.keyframe.index = 77
+        answer = t.stub.ContributeKeyframes(iter([broken]))
+        assert answer.accepted == 0
+        assert answer.rejected[0].index == 77
+        assert answer.rejected[0].reason
+
+
+def contributed(t: Team) -> str:
+    session = t.client.join("ant", GRID).session_id
+    t.say(session, said("ant", 1, {cell: [3] * 4 for cell in (-1, 0, 1)}))
+    t.client.contribute_keyframes(session, [frame(1), frame(2)])
+    return session
+
+
+def test_refinement_reports_ends_and_lies_over_the_vote() -> None:
+    with team() as t:
+        with pytest.raises(MismatchError, match="refined map"):
+            t.client.export(Export("refined"))
+        session = contributed(t)
+        progress = list(t.client.refine(iterations=4))
+        assert [p.done for p in progress] == [False] * (len(progress) - 1) + [True]
+        assert progress[-1].iteration == progress[-1].iterations == 4
+        assert t.client.status().refined
+        refined, voted = (gaussians_from_ply(t.client.export(Export(name))) for name in ("refined", "vote"))
+        assert refined.rgb.tobytes() != voted.rgb.tobytes()
+        t.say(session, said("ant", 2, {0: [90]}))
+        assert sorted(gaussians_from_ply(t.client.export(Export("refined"))).kappa.tolist())[-1] == 90
+        with pytest.raises(InvalidInputError, match="expected none with REFINED"):
+            t.client.export(Export("refined", "ant"))
+
+
+def test_closing_the_refinement_cancels_it_and_another_can_start() -> None:
+    with team(refine=RefineSettings(iterations=20_000, report_every=1)) as t:
+        contributed(t)
+        running = t.client.refine()
+        assert next(running).iteration >= 1
+        with pytest.raises(QuotaError, match="one at a time"):
+            list(t.client.refine(iterations=1))
+        running.close()
+        while True:
+            try:
+                assert list(t.client.refine(iterations=1))[-1].done
+                break
+            except QuotaError:
+                continue
+        with pytest.raises(QuotaError, match="iterations"):
+            list(t.client.refine(iterations=2_000_000_000))
+
+
+def test_a_refinement_without_anything_to_learn_from_is_refused() -> None:
+    with team() as t:
+        with pytest.raises(MismatchError, match="0 Gaussians and 0 keyframes"):
+            list(t.client.refine())
+        session = t.client.join("ant", GRID).session_id
+        t.say(session, said("ant", 1, {0: [1]}))
+        with pytest.raises(MismatchError, match="1 Gaussians and 0 keyframes"):
+            list(t.client.refine())
+        behind = np.diag([1.0, -1.0, -1.0, 1.0])
+        t.client.contribute_keyframes(session, [frame(1, CAMERA, behind)])
+        with pytest.raises(InvalidInputError, match="of which none does"):
+            list(t.client.refine())
+
+
+def test_an_export_of_nobody_or_of_no_strategy_is_invalid() -> None:
+    with team() as t:
+        with pytest.raises(InvalidInputError, match="no agents yet"):
+            t.client.export(Export("vote", "ant"))
+        with pytest.raises(InvalidInputError, match="strategy"):
+            t.client.export(Export("unspecified"))
+
+
+def test_a_full_store_ends_the_stream_and_the_server_goes_on(tmp_path: Path) -> None:
+    store = SqliteStore(tmp_path / "store.sqlite", max_bytes=200_000)
+    with team(store) as t:
+        session = t.client.join("ant", GRID).session_id
+        with pytest.raises(grpc.RpcError) as caught:
+            list(t.stub.ContributeSubsets(iter([request(session, said("ant", 1, {c: [1] * 50 for c in range(100)}))])))
+        assert caught.value.code() is grpc.StatusCode.RESOURCE_EXHAUSTED
+        assert "no room left" in caught.value.details()
+        assert t.say(session, said("ant", 2, {0: [1]}))[0].status == ACCEPTED
+    store.close()
+
+
+def test_a_restarted_server_with_a_file_goes_on_and_one_in_memory_says_so(tmp_path: Path) -> None:
+    first_life, second_life = MemoryStore(), MemoryStore()
+    with team(first_life) as t:
+        session = t.client.join("ant", GRID).session_id
+        t.say(session, said("ant", 1, {0: [1]}))
+    with team(second_life) as t, pytest.raises(SessionUnknownError):
+        t.say(session, said("ant", 1, {0: [1]}))
+
+    store = SqliteStore(tmp_path / "store.sqlite")
+    with team(store) as t:
+        session = t.client.join("ant", GRID, world_frame="map").session_id
+        t.say(session, said("ant", 1, {0: [1], 1: [1]}))
+        before, seen = t.client.export(Export()), t.client.status().fused_revision
+    store.close()
+    store = SqliteStore(tmp_path / "store.sqlite")
+    with team(store) as t:
+        assert t.say(session, said("ant", 1, {0: [1], 1: [1]}))[0].status == STALE
+        assert t.client.export(Export()) == before
+        with pytest.raises(RevisionGoneError):
+            next(t.client.watch(seen))
+        assert t.say(session, said("ant", 2, {2: [1]}))[0].status == ACCEPTED
+        with pytest.raises(MismatchError, match="'map'"):
+            t.client.join("bee", GRID, world_frame="odom")
+    with pytest.raises(MismatchError, match="voxel size"), team(store, TeamSettings(grid=VoxelGrid(0.2))):
+        pass
+    store.close()
+
+
+def test_a_draining_server_ends_open_streams_and_takes_no_more() -> None:
+    with team() as t:
+        session = t.client.join("ant", GRID).session_id
+        watch = t.client.watch()
+        next(watch)
+        silent = threading.Event()
+
+        def one_and_then_silence():
+            yield request(session, said("ant", 1, {0: [1]}))
+            silent.wait(20)
+
+        stream = t.stub.ContributeSubsets(one_and_then_silence())
+        assert next(stream).acknowledged == 1
+        next(watch)
+        t.drain()
+        with pytest.raises(UnavailableError, match="draining"):
+            next(watch)
+        with pytest.raises(grpc.RpcError) as caught:
+            next(stream)
+        assert caught.value.code() is grpc.StatusCode.UNAVAILABLE
+        silent.set()
+        with pytest.raises(grpc.RpcError) as caught:
+            t.stub.GetSessionStatus(pb.GetSessionStatusRequest())
+        assert caught.value.code() is grpc.StatusCode.UNAVAILABLE
+
+
+def test_health_answers_while_a_refinement_runs() -> None:
+    with team(refine=RefineSettings(iterations=20_000, report_every=1)) as t:
+        contributed(t)
+        running = t.client.refine()
+        next(running)
+        check = health_pb2_grpc.HealthStub(t.channel).Check
+        for _ in range(3):
+            answer = check(health_pb2.HealthCheckRequest(service="gausslite.v1.FusionService"), timeout=5)
+            assert answer.status == health_pb2.HealthCheckResponse.SERVING
+        running.close()
