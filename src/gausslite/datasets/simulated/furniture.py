@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from gausslite.datasets.simulated.mesh import Mesh, box, lathe, leaf, merged, panel, ring
+from gausslite.datasets.simulated.mesh import Mesh, Vector, box, lathe, leaf, merged, panel, ring
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -17,7 +16,7 @@ class Part:
     mesh: Mesh
     texture: str
 
-    def placed(self, position_m: ArrayLike, yaw_deg: float) -> Part:
+    def placed(self, position_m: Vector, yaw_deg: float) -> Part:
         """Turned about z, then moved."""
         return Part(self.mesh.turned(float(np.radians(yaw_deg))).moved(position_m), self.texture)
 

@@ -5,11 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from gausslite.datasets.simulated import furniture, prints, textures
 from gausslite.datasets.simulated.furniture import Part
-from gausslite.datasets.simulated.mesh import box, merged
+from gausslite.datasets.simulated.mesh import Vector, box, merged
 from gausslite.datasets.simulated.textures import Texture
 
 KITCHEN_END_M, LIVING_START_M, LENGTH_M = 4.2, 4.3, 8.1
@@ -180,5 +179,5 @@ def _living(rng: np.random.Generator) -> list[Item]:
     ]
 
 
-def _placed(name: str, parts: list[Part], position_m: ArrayLike, yaw_deg: float) -> Item:
+def _placed(name: str, parts: list[Part], position_m: Vector, yaw_deg: float) -> Item:
     return Item(name, [part.placed(position_m, yaw_deg) for part in parts])

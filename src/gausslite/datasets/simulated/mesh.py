@@ -8,7 +8,8 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Float64, Int64
 from numpy import ndarray
-from numpy.typing import ArrayLike
+
+Vector = tuple[float, float, float]
 
 _CELL_M = 0.12
 _BAND_M = 0.03
@@ -24,7 +25,7 @@ class Mesh:
     normals: Float64[ndarray, "n 3"]
     faces: Int64[ndarray, "m 3"]
 
-    def moved(self, offset_m: ArrayLike) -> Mesh:
+    def moved(self, offset_m: Vector) -> Mesh:
         """Shifted by (x, y, z)."""
         return Mesh(self.positions_m + np.asarray(offset_m, np.float64), self.uv, self.normals, self.faces)
 
@@ -46,9 +47,7 @@ def merged(meshes: list[Mesh]) -> Mesh:
     )
 
 
-def panel(
-    top_left_m: ArrayLike, right_m: ArrayLike, down_m: ArrayLike, fit: bool = False, cell_m: float = _CELL_M
-) -> Mesh:
+def panel(top_left_m: Vector, right_m: Vector, down_m: Vector, fit: bool = False, cell_m: float = _CELL_M) -> Mesh:
     """A rectangle seen from the side where `right_m` points right and `down_m` down; fit: one whole picture."""
     origin, right, down = (np.asarray(value, np.float64) for value in (top_left_m, right_m, down_m))
     width, height = float(np.linalg.norm(right)), float(np.linalg.norm(down))
@@ -60,7 +59,7 @@ def panel(
     return Mesh(origin + a * right + b * down, uv, normals, _grid_faces(rows, columns))
 
 
-def box(low_m: ArrayLike, high_m: ArrayLike, fit: bool = False, cell_m: float = _CELL_M) -> Mesh:
+def box(low_m: Vector, high_m: Vector, fit: bool = False, cell_m: float = _CELL_M) -> Mesh:
     """An axis-aligned box; with fit, each of its six sides shows the whole picture."""
     x0, y0, z0 = np.asarray(low_m, np.float64)
     x1, y1, z1 = np.asarray(high_m, np.float64)

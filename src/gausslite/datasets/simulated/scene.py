@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -46,6 +47,7 @@ class HomeScene:
     """Owns the ray caster and the tables; built once for each seed. Raises DatasetError without the extra `sim`."""
 
     def __init__(self, seed: int) -> None:
+        new_caster = _ray_caster()
         items = furnish(seed)
         textures = paint_textures(seed)
         texture_ids = {name: i for i, name in enumerate(textures)}
@@ -58,7 +60,7 @@ class HomeScene:
         repeats_m = np.repeat([textures[part.texture].repeat_m or 1.0 for _, part in parts], counts)
         corners_m = whole.positions_m[whole.faces]
         uv = whole.uv[whole.faces] / repeats_m[:, None, None]
-        self._embree = _embree_scene(corners_m.astype(np.float32))
+        self._embree = new_caster(corners_m.astype(np.float32))
         light = vertex_light(whole.positions_m, whole.normals, self.occluded, seed)
         self.triangles = Triangles(
             uv.astype(np.float32),
@@ -90,7 +92,8 @@ def home_scene(seed: int) -> HomeScene:
     return HomeScene(seed)
 
 
-def _embree_scene(corners_m: Float32[ndarray, "m 3 3"]) -> Any:
+def _ray_caster() -> Callable[[Float32[ndarray, "m 3 3"]], Any]:
+    """What makes a ray caster of triangles; asked for first, so that a missing extra is told at once."""
     try:
         from embreex.mesh_construction import TriangleMesh
         from embreex.rtcore_scene import EmbreeScene
@@ -98,9 +101,13 @@ def _embree_scene(corners_m: Float32[ndarray, "m 3 3"]) -> Any:
         raise DatasetError(
             "sim:home: the simulated home needs the extra `sim`; install it with: pip install 'gausslite[sim]'"
         ) from None
-    scene = EmbreeScene()
-    TriangleMesh(scene, corners_m)
-    return scene
+
+    def new_caster(corners_m: Float32[ndarray, "m 3 3"]) -> Any:
+        caster = EmbreeScene()
+        TriangleMesh(caster, corners_m)
+        return caster
+
+    return new_caster
 
 
 def _unit_normals(corners_m: Float64[ndarray, "m 3 3"]) -> Float32[ndarray, "m 3"]:
