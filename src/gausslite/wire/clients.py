@@ -120,15 +120,18 @@ class _Client:
 
 
 class ParserClient(_Client):
-    """The parser service as a task.TaskParser."""
+    """The parser service as a task.TaskParser. With `patient` a call waits, within its deadline, for it to start."""
 
-    def __init__(self, address: str, deadline_s: float = DEADLINE_S) -> None:
+    def __init__(self, address: str, deadline_s: float = DEADLINE_S, patient: bool = False) -> None:
         super().__init__(address, deadline_s)
+        self._patient = patient
         self._stub = parser_service_pb2_grpc.ParserServiceStub(self._channel)
 
     def parse(self, text: str) -> TaskGraph:
         """The graph of a task. Raises TaskError, UnavailableError."""
-        response = self._call(self._stub.ParseTask, parser_service_pb2.ParseTaskRequest(text=text))
+        request = parser_service_pb2.ParseTaskRequest(text=text)
+        with self._our_errors():
+            response = self._stub.ParseTask(request, timeout=self._deadline_s, wait_for_ready=self._patient)
         return convert.graph_from_message(response.graph)
 
 

@@ -16,7 +16,7 @@ from gausslite.domain.subset import VoxelWords
 from gausslite.domain.task import Predicate, Relation, TaskGraph
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.errors import InvalidInputError, TaskError
-from gausslite.v1 import gaussians_pb2, geometry_pb2, task_pb2
+from gausslite.v1 import agent_service_pb2, gaussians_pb2, geometry_pb2, task_pb2
 from gausslite.wire.images import decode_colour, decode_depth, encode_colour, encode_depth
 
 MAX_IMAGE_PX = 1 << 23
@@ -197,3 +197,8 @@ def map_update_from_message(message: gaussians_pb2.MapBlock, limits: CodecLimits
     if len(winner) not in (0, 0 if words is None else len(words)) or any(i >= len(names) for i in winner):
         raise InvalidInputError("map block provenance: expected one known agent for each voxel")
     return MapUpdate(message.revision, message.snapshot, message.last, words, grid, tuple(names[i] for i in winner))
+
+
+def is_done(status: agent_service_pb2.GetAgentStatusResponse) -> bool:
+    """True when the agent has ended its mission and written its results."""
+    return status.state == agent_service_pb2.AGENT_STATE_DONE

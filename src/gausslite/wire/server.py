@@ -90,7 +90,7 @@ async def serve_until_stopped(
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, stopping.set)
     running = await start_server(listen, services)
-    _log.info("%s listens on %s", ", ".join(service.name for service in services), running.address)
+    _log.info("%s listening on %s", ", ".join(service.name for service in services), running.address)
     waits: list[asyncio.Future[Any]] = [asyncio.ensure_future(stopping.wait())]
     if until is not None:
         waits.append(asyncio.ensure_future(until()))

@@ -98,7 +98,7 @@ class Uplink:
         self._allowance = Allowance(self._settings.kbps)
         self._backoff_s = 0.0
         self._next_round_s = 0.0
-        self._draining = self._closing = False
+        self._draining = self._closing = self._hurrying = False
         # guards the counters and flags; waited on by the thread and by drain
         self._changed = threading.Condition()
         self._thread = threading.Thread(target=self._run, name="uplink", daemon=True)
@@ -118,7 +118,8 @@ class Uplink:
             self._next_round_s = 0.0
             self._changed.notify_all()
             try:
-                return self._changed.wait_for(self._is_finished, timeout_s) and not self._counters.stopped_because
+                self._changed.wait_for(self._is_finished, timeout_s)
+                return self._spool.waiting == 0
             finally:
                 self._draining = False
 
@@ -133,6 +134,12 @@ class Uplink:
         session = self._session
         return "" if session is None else session.session_id
 
+    def stop_waiting(self) -> None:
+        """Make `drain` return at once, now and from now on; sending goes on until `close`."""
+        with self._changed:
+            self._hurrying = True
+            self._changed.notify_all()
+
     def close(self) -> None:
         """End the thread and the connection; what waits stays in the spool."""
         with self._changed:
@@ -144,7 +151,7 @@ class Uplink:
         self._spool.close()
 
     def _is_finished(self) -> bool:
-        return bool(self._counters.stopped_because) or self._closing or self._spool.waiting == 0
+        return self._hurrying or self._closing or bool(self._counters.stopped_because) or self._spool.waiting == 0
 
     def _run(self) -> None:
         try:
