@@ -1,0 +1,206 @@
+// SPDX-License-Identifier: Apache-2.0
+// The extension module gausslite.render._kernels. Shapes were checked by render/cpu.py, whose messages name the argument; the array
+// types here are the second line. Work runs without the interpreter lock.
+#include <nanobind/nanobind.h>
+#include <nanobind/ndarray.h>
+#include <nanobind/stl/optional.h>
+#include <nanobind/stl/string.h>
+#include <nanobind/stl/tuple.h>
+#include <nanobind/stl/unique_ptr.h>
+#include <nanobind/stl/vector.h>
+
+#include <algorithm>
+#include <memory>
+#include <optional>
+#include <string>
+
+#include "dispatch.h"
+#include "rasterizer.h"
+
+namespace nb = nanobind;
+
+namespace {
+
+using namespace gausslite;
+
+using RowTable = nb::ndarray<float, nb::numpy, nb::shape<-1, 16>, nb::c_contig, nb::device::cpu>;
+using ConstRowTable = nb::ndarray<const float, nb::numpy, nb::shape<-1, 16>, nb::c_contig, nb::device::cpu>;
+using Matrix4 = nb::ndarray<const double, nb::numpy, nb::shape<4, 4>, nb::c_contig, nb::device::cpu>;
+using Plane = nb::ndarray<const float, nb::numpy, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
+using Colours = nb::ndarray<const float, nb::numpy, nb::shape<-1, -1, 3>, nb::c_contig, nb::device::cpu>;
+using ByteColours = nb::ndarray<const uint8_t, nb::numpy, nb::shape<-1, -1, 3>, nb::c_contig, nb::device::cpu>;
+using TileMask = nb::ndarray<const bool, nb::numpy, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
+using Flags = nb::ndarray<const bool, nb::numpy, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
+using Ids = nb::ndarray<const uint32_t, nb::numpy, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
+using Intrinsics = std::tuple<double, double, double, double, int, int>;  // fx fy cx cy, width, height
+
+void require(bool holds, const char* message) {
+  if (!holds) throw nb::value_error(message);
+}
+
+template <class T, class... Sizes>
+auto new_array(Sizes... sizes) {
+  size_t total = 1;
+  ((total *= size_t(sizes)), ...);
+  T* data = new T[std::max<size_t>(total, 1)]();
+  nb::capsule owner(data, [](void* p) noexcept { delete[] static_cast<T*>(p); });
+  return nb::ndarray<nb::numpy, T>(data, {size_t(sizes)...}, owner);
+}
+
+Camera make_camera(const Intrinsics& intrinsics, const Matrix4& T_camera_world) {
+  Camera camera;
+  for (size_t i = 0; i < 3; ++i) {
+    for (size_t j = 0; j < 3; ++j) camera.R_camera_world[3 * i + j] = float(T_camera_world(i, j));
+    camera.t_camera_world[i] = float(T_camera_world(i, 3));
+  }
+  camera.fx = float(std::get<0>(intrinsics));
+  camera.fy = float(std::get<1>(intrinsics));
+  camera.cx = float(std::get<2>(intrinsics));
+  camera.cy = float(std::get<3>(intrinsics));
+  camera.width = std::get<4>(intrinsics);
+  camera.height = std::get<5>(intrinsics);
+  require(camera.width > 0 && camera.height > 0 && camera.width <= 16384 && camera.height <= 16384, "image size");
+  return camera;
+}
+
+// What of the scene is drawn.
+struct Scene {
+  FrameInput input;
+
+  Scene(const float* rows, size_t count, const Intrinsics& intrinsics, const Matrix4& T_camera_world,
+        const std::optional<TileMask>& tiles, const std::optional<Ids>& ids) {
+    require(count < (size_t{1} << 31), "rows: too many");
+    input = {rows, uint32_t(count), nullptr, 0, nullptr, make_camera(intrinsics, T_camera_world)};
+    if (tiles) {
+      const size_t tiles_x = size_t(input.camera.width + kTile - 1) / kTile, tiles_y = size_t(input.camera.height + kTile - 1) / kTile;
+      require(tiles->shape(0) == tiles_y && tiles->shape(1) == tiles_x, "tiles: wrong grid");
+      input.active_tiles = reinterpret_cast<const uint8_t*>(tiles->data());
+    }
+    if (ids) {
+      static constexpr uint32_t kNothing = 0;
+      const uint32_t* first = ids->data();
+      require(std::adjacent_find(first, first + ids->size(), std::greater_equal<>()) == first + ids->size() &&
+                  (ids->size() == 0 || first[ids->size() - 1] < count),
+              "ids");
+      input.ids = ids->size() > 0 ? first : &kNothing;
+      input.id_count = uint32_t(ids->size());
+    }
+  }
+};
+
+// Work that holds the rasterizer and not the interpreter.
+template <class F>
+auto work(Rasterizer& rasterizer, F f) {
+  nb::gil_scoped_release unlocked;
+  const std::lock_guard<std::mutex> mine(rasterizer.mutex());
+  return f();
+}
+
+std::unique_ptr<Rasterizer> make_rasterizer(const std::string& simd, int threads) {
+  const Stages* stages = find_stages(simd);
+  require(stages != nullptr, "simd: not usable here");
+  require(threads >= 1 && threads <= 256, "threads: expected 1 to 256");
+  return std::make_unique<Rasterizer>(*stages, threads);
+}
+
+auto visible_ids(const Rasterizer& rasterizer) {
+  auto ids = new_array<uint32_t>(rasterizer.visible_count());
+  rasterizer.copy_visible(ids.data());
+  return ids;
+}
+
+nb::tuple forward(Rasterizer& self, ConstRowTable rows, const Intrinsics& intrinsics, Matrix4 T_camera_world,
+                  std::optional<TileMask> tiles, std::optional<Ids> ids) {
+  const Scene scene(rows.data(), rows.shape(0), intrinsics, T_camera_world, tiles, ids);
+  const size_t height = size_t(scene.input.camera.height), width = size_t(scene.input.camera.width);
+  auto rgb = new_array<float>(height, width, 3);
+  auto depth_m = new_array<float>(height, width);
+  auto alpha = new_array<float>(height, width);
+  const ImageOutput output{rgb.data(), depth_m.data(), alpha.data()};
+  const uint64_t frame = work(self, [&] {
+    self.forward(scene.input, output);
+    return self.frame();
+  });
+  return nb::make_tuple(rgb, depth_m, alpha, frame);
+}
+
+nb::tuple backward(Rasterizer& self, uint64_t frame, size_t row_count, Colours d_rgb, Plane d_depth_m, Plane d_alpha) {
+  require(frame == self.frame(), "rendering: superseded");
+  require(self.matches(row_count, d_rgb.shape(1), d_rgb.shape(0)) && d_depth_m.shape(0) == d_rgb.shape(0) &&
+              d_depth_m.shape(1) == d_rgb.shape(1) && d_alpha.shape(0) == d_rgb.shape(0) && d_alpha.shape(1) == d_rgb.shape(1),
+          "image gradients: wrong shape");
+  auto d_rows = new_array<float>(row_count, 16);
+  auto d_twist = new_array<double>(6);
+  auto visible = visible_ids(self);
+  auto norms = new_array<float>(visible.size());
+  const ImageGradients input{d_rgb.data(), d_depth_m.data(), d_alpha.data()};
+  work(self, [&] { self.backward(input, d_rows.data(), d_twist.data(), norms.data()); });
+  return nb::make_tuple(d_rows, d_twist, visible, norms);
+}
+
+std::unique_ptr<TrainingView> prepare_view(const Rasterizer& self, ByteColours rgb, Plane depth_m, std::optional<Plane> weight) {
+  const size_t height = rgb.shape(0), width = rgb.shape(1);
+  const auto fits = [&](const Plane& plane) { return plane.shape(0) == height && plane.shape(1) == width; };
+  require(fits(depth_m) && (!weight || fits(*weight)), "view: sizes disagree");
+  nb::gil_scoped_release unlocked;
+  return std::make_unique<TrainingView>(self.stages(), int(width), int(height), rgb.data(), depth_m.data(),
+                                        weight ? weight->data() : nullptr);
+}
+
+nb::tuple step(Rasterizer& self, RowTable rows, RowTable first_moment, RowTable second_moment, const TrainingView& view,
+               const Intrinsics& intrinsics, Matrix4 T_camera_world, std::tuple<float, float, float> loss,
+               const std::vector<float>& rates, std::tuple<double, double, double> adam, bool masked,
+               std::optional<TileMask> tiles, std::optional<Ids> ids, std::optional<Flags> trainable) {
+  const size_t n = rows.shape(0);
+  const Scene scene(rows.data(), n, intrinsics, T_camera_world, tiles, ids);
+  require(first_moment.shape(0) == n && second_moment.shape(0) == n && (!trainable || trainable->shape(0) == n),
+          "tables: lengths disagree");
+  require(view.width() == scene.input.camera.width && view.height() == scene.input.camera.height, "view: wrong size");
+  require(rates.size() == 16, "rates: expected 16");
+  const OptimizerState state{rows.data(), first_moment.data(), second_moment.data(),
+                             trainable ? reinterpret_cast<const uint8_t*>(trainable->data()) : nullptr};
+  AdamOptions options;
+  std::copy_n(rates.begin(), 16, options.rates);
+  std::tie(options.beta1, options.beta2, options.epsilon) = adam;
+  const LossWeights weights{std::get<0>(loss), std::get<1>(loss), std::get<2>(loss)};
+  const double value = work(self, [&] { return self.step(scene.input, state, view, masked, weights, options); });
+  return nb::make_tuple(value, visible_ids(self));
+}
+
+nb::dict stage_times(const Rasterizer& self) {
+  const StageTimes& t = self.times();
+  nb::dict out;
+  out["project"] = t.project;
+  out["raster"] = t.raster;
+  out["loss"] = t.loss;
+  out["backward"] = t.backward;
+  out["update"] = t.update;
+  return out;
+}
+
+}  // namespace
+
+NB_MODULE(_kernels, m) {
+  m.doc() = "Native rasterizer kernels; use gausslite.render.cpu.CpuRasterizer.";
+  m.def("usable_simd", &usable_forms, "Instruction sets this build has and this machine runs, fastest first.");
+
+  nb::class_<TrainingView>(m, "View", "A training image made ready: padded, planar, SSIM moments cached.")
+      .def_prop_ro("width", &TrainingView::width)
+      .def_prop_ro("height", &TrainingView::height);
+
+  nb::class_<Rasterizer>(m, "Engine", "Scratch memory and a team of threads; it never keeps the splats.")
+      .def(nb::new_(&make_rasterizer), nb::arg("simd"), nb::arg("threads"))
+      .def_prop_ro("threads", &Rasterizer::threads)
+      .def_prop_ro("frame", &Rasterizer::frame, "The number of the latest forward or step.")
+      .def("forward", &forward, nb::arg("rows").noconvert(), nb::arg("intrinsics"), nb::arg("T_camera_world").noconvert(),
+           nb::arg("tiles").noconvert().none(), nb::arg("ids").noconvert().none(), "rgb, depth_m, alpha and the frame's number.")
+      .def("backward", &backward, nb::arg("frame"), nb::arg("row_count"), nb::arg("d_rgb").noconvert(),
+           nb::arg("d_depth_m").noconvert(), nb::arg("d_alpha").noconvert(), "d_rows, d_twist, visible rows, mean_2d_norm.")
+      .def("prepare_view", &prepare_view, nb::arg("rgb").noconvert(), nb::arg("depth_m").noconvert(),
+           nb::arg("weight").noconvert().none())
+      .def("step", &step, nb::arg("rows").noconvert(), nb::arg("first_moment").noconvert(), nb::arg("second_moment").noconvert(),
+           nb::arg("view"), nb::arg("intrinsics"), nb::arg("T_camera_world").noconvert(), nb::arg("loss"), nb::arg("rates"),
+           nb::arg("adam"), nb::arg("masked"), nb::arg("tiles").noconvert().none(), nb::arg("ids").noconvert().none(),
+           nb::arg("trainable").noconvert().none(), "The loss and the visible rows.")
+      .def("stage_times_ms", &stage_times, "Milliseconds of the last call's stages.");
+}

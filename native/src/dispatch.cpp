@@ -1,0 +1,49 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "dispatch.h"
+
+namespace gausslite {
+
+namespace {
+
+struct Form {
+  const char* name;
+  bool (*runs_here)();
+  const Stages& (*stages)();
+};
+
+#if defined(GAUSSLITE_X86_FORMS)
+bool has_avx2() { return __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma"); }
+
+// VBMI2 (Ice Lake and Zen 4 onwards) brings the byte compression that builds the block lists.
+bool has_avx512() {
+  return has_avx2() && __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") &&
+         __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("avx512vl") && __builtin_cpu_supports("avx512vbmi2");
+}
+#endif
+
+constexpr Form kForms[] = {
+#if defined(GAUSSLITE_X86_FORMS)
+    {"avx512", has_avx512, avx512::stages},
+    {"avx2", has_avx2, avx2::stages},
+#endif
+    {"portable", [] { return true; }, portable::stages},
+};
+
+}  // namespace
+
+std::vector<std::string> usable_forms() {
+  std::vector<std::string> names;
+  for (const Form& form : kForms) {
+    if (form.runs_here()) names.emplace_back(form.name);
+  }
+  return names;
+}
+
+const Stages* find_stages(const std::string& name) {
+  for (const Form& form : kForms) {
+    if (name == form.name && form.runs_here()) return &form.stages();
+  }
+  return nullptr;
+}
+
+}  // namespace gausslite

@@ -1,0 +1,42 @@
+// SPDX-License-Identifier: Apache-2.0
+// Growable scratch memory that is aligned, zeroed and backed by huge pages where it is large.
+#pragma once
+
+#include <cstddef>
+#include <utility>
+
+namespace gausslite {
+
+// A replacement for `old` with room for `bytes`, its first `kept` bytes copied and the rest zero; frees `old`. Throws std::bad_alloc.
+void* grow_memory(void* old, size_t kept, size_t bytes);
+void free_memory(void* p) noexcept;
+
+// An array that grows and never shrinks. Its members are always inlined: the stages are compiled for several instruction sets,
+// and a shared out-of-line copy could be one that this machine cannot run.
+template <class T>
+class Buffer {
+ public:
+  Buffer() = default;
+  Buffer(Buffer&& other) noexcept : data_(std::exchange(other.data_, nullptr)), capacity_(std::exchange(other.capacity_, 0)) {}
+  Buffer& operator=(Buffer&&) = delete;
+  ~Buffer() { free_memory(data_); }
+
+  // Makes room for `count` elements; on growth the first `kept` stay and the others are zero.
+  __attribute__((always_inline)) void reserve(size_t count, size_t kept = 0) {
+    if (count <= capacity_) return;
+    const size_t wanted = count + count / 4 + 64;
+    data_ = static_cast<T*>(grow_memory(data_, kept * sizeof(T), wanted * sizeof(T)));
+    capacity_ = wanted;
+  }
+  __attribute__((always_inline)) T* data() { return data_; }
+  __attribute__((always_inline)) const T* data() const { return data_; }
+  __attribute__((always_inline)) T& operator[](size_t i) { return data_[i]; }
+  __attribute__((always_inline)) const T& operator[](size_t i) const { return data_[i]; }
+  __attribute__((always_inline)) size_t capacity() const { return capacity_; }
+
+ private:
+  T* data_ = nullptr;
+  size_t capacity_ = 0;
+};
+
+}  // namespace gausslite

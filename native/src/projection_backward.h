@@ -1,0 +1,111 @@
+// SPDX-License-Identifier: Apache-2.0
+// The projection's way back for sixteen splats: image gradients to gradients of the parameters, and of the camera's pose.
+#pragma once
+
+#include "projection.h"
+
+namespace gausslite::GAUSSLITE_ISA {
+
+// Gradients of sixteen parameter rows, transposed; the norm of the gradient by the image mean in half image widths and heights;
+// and, when asked for, what each splat adds to the gradient of the camera twist (translation, rotation).
+struct ParameterGradients {
+  Pack16 column[16];
+  Pack16 mean_2d_norm;
+  Pack16 twist[6];
+};
+
+// The gradient by the covariance entries xx, xy, yy, from the moments of v = dL/d ln(alpha). As ln(alpha) = ... - d^T K d / 2, the
+// gradient by the conic K is -1/2 sum of v d d^T, and that by the covariance is -K (dL/dK) K.
+GAUSSLITE_INLINE void covariance_gradient(const Projection& p, const Pack16* moments, Pack16& by_xx, Pack16& by_xy, Pack16& by_yy) {
+  const Pack16 A = p.conic_xx, B = p.conic_xy, C = p.conic_yy;
+  const Pack16 g_xx = moments[3] * -0.5f, g_xy = moments[4] * -0.5f, g_yy = moments[5] * -0.5f;
+  const Pack16 k00 = A * g_xx + B * g_xy, k01 = A * g_xy + B * g_yy, k10 = B * g_xx + C * g_xy, k11 = B * g_xy + C * g_yy;
+  by_xx = -(k00 * A + k01 * B);
+  by_xy = -(k00 * B + k01 * C) * 2.0f;
+  by_yy = -(k10 * B + k11 * C);
+}
+
+// `by_R` is the gradient by the rotation matrix of the unit quaternion; the result is by the raw one.
+GAUSSLITE_INLINE void quaternion_gradient(const Projection& p, const Pack16 (&by_R)[3][3], Pack16* out) {
+  const Pack16 w = p.qw, x = p.qx, y = p.qy, z = p.qz;
+  const Pack16 minus_x = by_R[2][1] - by_R[1][2], minus_y = by_R[0][2] - by_R[2][0], minus_z = by_R[1][0] - by_R[0][1];
+  const Pack16 plus_x = by_R[2][1] + by_R[1][2], plus_y = by_R[0][2] + by_R[2][0], plus_z = by_R[1][0] + by_R[0][1];
+  const Pack16 two(2.0f);
+  const Pack16 g[4] = {x * minus_x + y * minus_y + z * minus_z,
+                       y * plus_z + z * plus_y + w * minus_x - two * x * (by_R[1][1] + by_R[2][2]),
+                       x * plus_z + z * plus_x + w * minus_y - two * y * (by_R[0][0] + by_R[2][2]),
+                       x * plus_y + y * plus_x + w * minus_z - two * z * (by_R[0][0] + by_R[1][1])};
+  const Pack16 along = w * g[0] + x * g[1] + y * g[2] + z * g[3], scale = p.inverse_norm * 2.0f;
+  out[0] = (g[0] - w * along) * scale;
+  out[1] = (g[1] - x * along) * scale;
+  out[2] = (g[2] - y * along) * scale;
+  out[3] = (g[3] - z * along) * scale;
+}
+
+// `row`: parameters, `image`: image gradient rows (row_layout.h), both transposed.
+template <bool kTwist>
+GAUSSLITE_INLINE void backward16(const Pack16* row, const Pack16* image, const Camera& camera, ParameterGradients& out) {
+  Projection p;
+  project16(row, camera, p);
+  const float* R = camera.R_camera_world;
+
+  const Pack16 by_mean_x = p.conic_xx * image[1] + p.conic_xy * image[2];
+  const Pack16 by_mean_y = p.conic_xy * image[1] + p.conic_yy * image[2];
+  const Pack16 half_x = by_mean_x * (0.5f * float(camera.width)), half_y = by_mean_y * (0.5f * float(camera.height));
+  out.mean_2d_norm = sqrt(half_x * half_x + half_y * half_y);
+
+  // Covariance = M M^T + 0.3 I with M = P R S.
+  Pack16 by_xx, by_xy, by_yy;
+  covariance_gradient(p, image + kMoments, by_xx, by_xy, by_yy);
+  const Pack16 twice_xx = by_xx + by_xx, twice_yy = by_yy + by_yy;
+  Pack16 by_P0[3] = {0.0f, 0.0f, 0.0f}, by_P1[3] = {0.0f, 0.0f, 0.0f}, by_R[3][3];
+  for (int j = 0; j < 3; ++j) {
+    const Pack16 by_M0 = twice_xx * p.M0[j] + by_xy * p.M1[j], by_M1 = twice_yy * p.M1[j] + by_xy * p.M0[j];
+    out.column[kLogScale + j] = by_M0 * p.M0[j] + by_M1 * p.M1[j];
+    const Pack16 scaled0 = by_M0 * p.scale[j], scaled1 = by_M1 * p.scale[j];
+    for (int i = 0; i < 3; ++i) {
+      by_R[i][j] = p.P0[i] * scaled0 + p.P1[i] * scaled1;
+      by_P0[i] = fma(scaled0, p.R[i][j], by_P0[i]);
+      by_P1[i] = fma(scaled1, p.R[i][j], by_P1[i]);
+    }
+  }
+  quaternion_gradient(p, by_R, out.column + kQuat);
+
+  // P = J R_camera_world; where the tangent is clamped, the Jacobian does not move with it.
+  const Pack16 by_J00 = dot3(by_P0, R), by_J02 = dot3(by_P0, R + 6), by_J11 = dot3(by_P1, R + 3), by_J12 = dot3(by_P1, R + 6);
+  const Pack16 by_u = fma(by_mean_x, Pack16(camera.fx), keep(p.u == p.u_clamped, -(p.J00 * by_J02)));
+  const Pack16 by_v = fma(by_mean_y, Pack16(camera.fy), keep(p.v == p.v_clamped, -(p.J11 * by_J12)));
+  const Pack16 by_inverse_z = (by_J00 - p.u_clamped * by_J02) * camera.fx + (by_J11 - p.v_clamped * by_J12) * camera.fy +
+                              by_u * p.x + by_v * p.y;
+  const Pack16 by_camera[3] = {by_u * p.inverse_z, by_v * p.inverse_z,
+                               image[kColourSums + 3] - p.inverse_z * p.inverse_z * by_inverse_z};
+  for (int j = 0; j < 3; ++j) {
+    out.column[kMean + j] = by_camera[0] * R[j] + by_camera[1] * R[3 + j] + by_camera[2] * R[6 + j];
+  }
+  out.column[kLogit] = image[0] * (Pack16(1.0f) - p.opacity);
+  for (int k = 0; k < 3; ++k) out.column[kRgb + k] = image[kColourSums + k];
+  out.column[14] = out.column[15] = Pack16(0.0f);
+
+  if constexpr (kTwist) {
+    // T <- exp(twist) T moves a camera-frame point by t + r x point and turns R_camera_world by r. With N = (dL/dR) R^T, the
+    // latter's gradient is the axis of N - N^T; dL/dR = J^T (dL/dP).
+    const Pack16 a01 = dot3(by_P0, R + 3), a10 = dot3(by_P1, R);
+    const Pack16 n01 = p.J00 * a01, n02 = p.J00 * by_J02, n10 = p.J11 * a10, n12 = p.J11 * by_J12;
+    const Pack16 n20 = p.J02 * by_J00 + p.J12 * a10, n21 = p.J02 * a01 + p.J12 * by_J11;
+    for (int k = 0; k < 3; ++k) out.twist[k] = by_camera[k];
+    out.twist[3] = p.y * by_camera[2] - p.z * by_camera[1] + n21 - n12;
+    out.twist[4] = p.z * by_camera[0] - p.x * by_camera[2] + n02 - n20;
+    out.twist[5] = p.x * by_camera[1] - p.y * by_camera[0] + n10 - n01;
+  }
+}
+
+// A gradient with a NaN or infinite entry, which only absurd splats can have, counts as zero rather than spoiling its row.
+GAUSSLITE_INLINE void drop_unsound(ParameterGradients& g) {
+  Pack16 total = g.mean_2d_norm * 0.0f;
+  for (int k = 0; k < kTrained; ++k) total = fma(g.column[k], Pack16(0.0f), total);
+  const Mask16 sound = total == Pack16(0.0f);
+  for (int k = 0; k < kTrained; ++k) g.column[k] = keep(sound, g.column[k]);
+  g.mean_2d_norm = keep(sound, g.mean_2d_norm);
+}
+
+}  // namespace gausslite::GAUSSLITE_ISA

@@ -1,0 +1,245 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "rasterizer.h"
+
+#include <algorithm>
+#include <chrono>
+#include <cmath>
+
+namespace gausslite {
+
+namespace {
+
+// 0.999^t is below single precision's resolution of 1 after some 17 000 updates.
+constexpr int kCorrections = 20'000;
+
+double now_ms() {
+  return std::chrono::duration<double, std::milli>(std::chrono::steady_clock::now().time_since_epoch()).count();
+}
+
+// The k-th tile row to work on, from the middle outwards: the heaviest rows tend to be there, and starting with them leaves the
+// threads little to wait for at the end.
+int strip_of_ticket(int ticket, int strips) {
+  const int middle = strips / 2;
+  const int away = (ticket + 1) / 2;
+  const int strip = ticket % 2 == 0 ? middle + away : middle - away;
+  return strip >= 0 && strip < strips ? strip : -1;
+}
+
+// Rows of the image that member `thread` works on.
+struct Band {
+  int begin, end;
+  Band(int height, int thread, int threads) : begin(height * thread / threads), end(height * (thread + 1) / threads) {}
+};
+
+}  // namespace
+
+Rasterizer::Rasterizer(const Stages& stages, int threads) : stages_(stages), team_(threads) {
+  ws_.threads = threads;
+  ws_.scratch.resize(size_t(threads));
+}
+
+void Rasterizer::begin_frame(const FrameInput& input) {
+  ws_.camera = input.camera;
+  ws_.tiles_x = (input.camera.width + kTile - 1) / kTile;
+  ws_.tiles_y = (input.camera.height + kTile - 1) / kTile;
+  ws_.padded_width = ws_.tiles_x * kTile;
+  ws_.plane = int64_t(ws_.padded_width) * ws_.tiles_y * kTile;
+  row_count_ = input.row_count;
+  ws_.rows = input.rows;
+  ws_.ids = input.ids;
+  ws_.count = input.ids != nullptr ? input.id_count : input.row_count;
+  ws_.active_tiles = input.active_tiles;
+  ++frame_;
+  next_tag();
+  ws_.segments = (ws_.count + kSegment - 1) / kSegment;
+  ws_.splats.reserve(size_t(ws_.count) + 1);
+  ws_.visible.reserve(size_t(ws_.count) + 1);
+  ws_.segment_visible.reserve(ws_.segments + 1);
+  ws_.segment_keys.reserve(size_t(ws_.segments + 1) * size_t(ws_.tiles_y));
+  const size_t tiles = size_t(ws_.tiles_x) * size_t(ws_.tiles_y);
+  if (ws_.tiles.size() < tiles) ws_.tiles.resize(tiles);
+  ws_.image.reserve(5 * size_t(ws_.plane));
+  ws_.image_gradient.reserve(5 * size_t(ws_.plane));
+  ws_.gradient_rows_used = 0;
+  ws_.ticket = 0;
+  for (ThreadScratch& scratch : ws_.scratch) {
+    if (scratch.strips.size() < size_t(ws_.tiles_y)) scratch.strips.resize(size_t(ws_.tiles_y));
+  }
+  loss_sums_.reserve(std::max(tiles, size_t(ws_.tiles_y) * kTile));
+  if (input.active_tiles != nullptr) count_active_tiles();
+  times_ = {};
+  last_mark_ms_ = now_ms();
+}
+
+// Memory is zeroed when it grows, so 0 would read as written.
+void Rasterizer::next_tag() {
+  if (++ws_.tag == 0) ++ws_.tag;
+}
+
+void Rasterizer::count_active_tiles() {
+  const size_t stride = size_t(ws_.tiles_x) + 1;
+  ws_.active_before.reserve(stride * size_t(ws_.tiles_y));
+  for (int y = 0; y < ws_.tiles_y; ++y) {
+    uint16_t* before = &ws_.active_before[stride * size_t(y)];
+    before[0] = 0;
+    for (int x = 0; x < ws_.tiles_x; ++x) {
+      before[x + 1] = uint16_t(before[x] + (ws_.active_tiles[size_t(y) * size_t(ws_.tiles_x) + size_t(x)] != 0));
+    }
+  }
+}
+
+void Rasterizer::prepare_gradient_rows() { ws_.gradient_rows.reserve(size_t(ws_.gradient_rows_used.load()) * 16); }
+
+void Rasterizer::mark(double StageTimes::* stage) {
+  const double now = now_ms();
+  times_.*stage = now - std::exchange(last_mark_ms_, now);
+}
+
+template <class F>
+void Rasterizer::for_each_strip(F f) {
+  const int tickets = 2 * (ws_.tiles_y / 2 + 1);
+  for (int ticket; (ticket = ws_.ticket.fetch_add(1, std::memory_order_relaxed)) < tickets;) {
+    const int strip = strip_of_ticket(ticket, ws_.tiles_y);
+    if (strip >= 0) f(strip);
+  }
+}
+
+void Rasterizer::forward(const FrameInput& input, const ImageOutput& output) {
+  begin_frame(input);
+  team_.run([&](int thread) {
+    stages_.project(ws_, thread);
+    team_.barrier([&] { mark(&StageTimes::project); });
+    for_each_strip([&](int strip) { stages_.draw_strip(ws_, strip, thread); });
+    team_.barrier([&] { mark(&StageTimes::raster); });
+    const Band band(ws_.camera.height, thread, team_.size());
+    export_rows(output, band.begin, band.end);
+  });
+}
+
+void Rasterizer::export_rows(const ImageOutput& output, int begin, int end) const {
+  const float* image = ws_.image.data();
+  for (int y = begin; y < end; ++y) {
+    for (int x = 0; x < ws_.camera.width; ++x) {
+      const int64_t from = int64_t(y) * ws_.padded_width + x, to = int64_t(y) * ws_.camera.width + x;
+      for (int k = 0; k < 3; ++k) output.rgb[3 * to + k] = image[k * ws_.plane + from];
+      output.depth_m[to] = image[3 * ws_.plane + from];
+      output.alpha[to] = 1.0f - image[4 * ws_.plane + from];
+    }
+  }
+}
+
+void Rasterizer::import_gradients(const ImageGradients& input, int begin, int end) {
+  float* gradient = ws_.image_gradient.data();
+  for (int y = begin; y < end; ++y) {
+    for (int x = 0; x < ws_.padded_width; ++x) {
+      const int64_t from = int64_t(y) * ws_.camera.width + x, to = int64_t(y) * ws_.padded_width + x;
+      const bool inside = y < ws_.camera.height && x < ws_.camera.width;
+      for (int k = 0; k < 3; ++k) gradient[k * ws_.plane + to] = inside ? input.d_rgb[3 * from + k] : 0.0f;
+      gradient[3 * ws_.plane + to] = inside ? input.d_depth_m[from] : 0.0f;
+      gradient[4 * ws_.plane + to] = inside ? input.d_alpha[from] : 0.0f;
+    }
+  }
+}
+
+void Rasterizer::backward(const ImageGradients& input, float* d_rows, double* d_twist, float* mean_2d_norm) {
+  last_mark_ms_ = now_ms();
+  ws_.ticket = 0;
+  next_tag();  // a second backward of the same forward must not add to the first one's rows
+  prepare_gradient_rows();
+  twist_sums_.reserve(6 * size_t(ws_.segments) + 6);
+  norms_by_slot_.reserve(size_t(ws_.count) + 1);
+  const GradientOutput output{d_rows, norms_by_slot_.data(), twist_sums_.data()};
+  team_.run([&](int thread) {
+    const Band band(ws_.tiles_y * kTile, thread, team_.size());
+    import_gradients(input, band.begin, band.end);
+    team_.barrier();
+    for_each_strip([&](int strip) { stages_.backward_strip(ws_, strip, thread); });
+    team_.barrier([&] { mark(&StageTimes::backward); });
+    stages_.gradients(ws_, output, thread);
+    team_.barrier([&] { mark(&StageTimes::update); });
+  });
+  std::fill_n(d_twist, 6, 0.0);
+  for (uint32_t s = 0; s < ws_.segments; ++s) {
+    for (size_t k = 0; k < 6; ++k) d_twist[k] += twist_sums_[6 * size_t(s) + k];
+    const float* norms = norms_by_slot_.data() + size_t(s) * kSegment;
+    mean_2d_norm = std::copy_n(norms, ws_.segment_visible[s], mean_2d_norm);
+  }
+}
+
+const float* Rasterizer::corrections(const AdamOptions& adam) {
+  if (adam.beta1 != correction_beta1_ || adam.beta2 != correction_beta2_) {
+    corrections_.reserve(2 * size_t(kCorrections));
+    for (int t = 1; t <= kCorrections; ++t) {
+      corrections_[2 * size_t(t - 1)] = float(1.0 / (1.0 - std::pow(adam.beta1, t)));
+      corrections_[2 * size_t(t - 1) + 1] = float(1.0 / (1.0 - std::pow(adam.beta2, t)));
+    }
+    correction_beta1_ = adam.beta1;
+    correction_beta2_ = adam.beta2;
+  }
+  return corrections_.data();
+}
+
+double Rasterizer::step(const FrameInput& input, const OptimizerState& state, const TrainingView& view, bool masked,
+                        const LossWeights& loss, const AdamOptions& adam) {
+  begin_frame(input);
+  const double weight_sum = view.weight_sum(masked);
+  const double per_pixel = weight_sum > 0.0 ? 1.0 / weight_sum : 0.0;
+  const Training training{view.targets(masked),
+                          {float(loss.colour * per_pixel / 3.0), float(loss.depth * per_pixel), float(loss.ssim * per_pixel / 3.0)},
+                          loss_sums_.data()};
+  Update update{state.rows, state.first_moment, state.second_moment, state.trainable, {}};
+  std::copy_n(adam.rates, 16, update.adam.rates);
+  update.adam.beta1 = float(adam.beta1);
+  update.adam.beta2 = float(adam.beta2);
+  update.adam.epsilon = float(adam.epsilon);
+  update.adam.corrections = corrections(adam);
+  update.adam.correction_count = kCorrections;
+  const bool fused = loss.ssim == 0.0f;
+
+  team_.run([&](int thread) {
+    stages_.project(ws_, thread);
+    team_.barrier([&] {
+      prepare_gradient_rows();
+      mark(&StageTimes::project);
+    });
+    if (fused) {
+      for_each_strip([&](int strip) { stages_.train_strip(ws_, training, strip, thread); });
+    } else {
+      for_each_strip([&](int strip) { stages_.draw_strip(ws_, strip, thread); });
+    }
+    team_.barrier([&] {
+      ws_.ticket = 0;
+      mark(&StageTimes::raster);
+    });
+    if (!fused) {
+      const Band band(ws_.tiles_y * kTile, thread, team_.size());
+      stages_.loss_l1(ws_, training, band.begin, band.end);
+      stages_.loss_ssim(ws_, training, band.begin, std::min(band.end, ws_.camera.height), thread);
+      team_.barrier([&] { mark(&StageTimes::loss); });
+      for_each_strip([&](int strip) { stages_.backward_strip(ws_, strip, thread); });
+      team_.barrier([&] { mark(&StageTimes::backward); });
+    }
+    stages_.update(ws_, update, thread);
+    team_.barrier([&] { mark(&StageTimes::update); });
+  });
+
+  const size_t sums = fused ? size_t(ws_.tiles_x) * size_t(ws_.tiles_y) : size_t(ws_.camera.height);
+  double total = weight_sum > 0.0 ? double(loss.ssim) : 0.0;
+  for (size_t i = 0; i < sums; ++i) total += loss_sums_[i];
+  return total;
+}
+
+uint32_t Rasterizer::visible_count() const {
+  uint32_t total = 0;
+  for (uint32_t s = 0; s < ws_.segments; ++s) total += ws_.segment_visible[s];
+  return total;
+}
+
+void Rasterizer::copy_visible(uint32_t* ids) const {
+  for (uint32_t s = 0; s < ws_.segments; ++s) {
+    const Visible* visible = ws_.visible.data() + size_t(s) * kSegment;
+    for (uint32_t i = 0; i < ws_.segment_visible[s]; ++i) *ids++ = visible[i].id;
+  }
+}
+
+}  // namespace gausslite

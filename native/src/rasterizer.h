@@ -1,0 +1,109 @@
+// SPDX-License-Identifier: Apache-2.0
+// The order of the stages: forward, backward, and the whole training step in one call.
+#pragma once
+
+#include <mutex>
+
+#include "stages.h"
+#include "team.h"
+#include "training_view.h"
+
+namespace gausslite {
+
+// A frame to draw. Nothing is owned.
+struct FrameInput {
+  const float* rows;
+  uint32_t row_count;
+  const uint32_t* ids;  // null: all rows
+  uint32_t id_count;
+  const uint8_t* active_tiles;  // null: all tiles
+  Camera camera;
+};
+
+struct ImageOutput {
+  float* rgb;      // height x width x 3
+  float* depth_m;  // height x width
+  float* alpha;    // height x width
+};
+
+struct ImageGradients {
+  const float* d_rgb;
+  const float* d_depth_m;
+  const float* d_alpha;
+};
+
+struct LossWeights {
+  float colour, depth, ssim;
+};
+
+struct OptimizerState {
+  float* rows;
+  float* first_moment;
+  float* second_moment;
+  const uint8_t* trainable;  // null: all
+};
+
+struct AdamOptions {
+  float rates[16];
+  double beta1, beta2, epsilon;
+};
+
+// Milliseconds of the last call's stages, as its first thread saw them.
+struct StageTimes {
+  double project = 0.0, raster = 0.0, loss = 0.0, backward = 0.0, update = 0.0;
+};
+
+// Calls from several threads are served one after the other.
+class Rasterizer {
+ public:
+  Rasterizer(const Stages& stages, int threads);
+
+  const Stages& stages() const { return stages_; }
+  int threads() const { return team_.size(); }
+  const StageTimes& times() const { return times_; }
+  // True when the last frame had this many rows and pixels.
+  bool matches(size_t rows, size_t width, size_t height) const {
+    return rows == row_count_ && width == size_t(ws_.camera.width) && height == size_t(ws_.camera.height);
+  }
+  // Rises with every forward and step: a rendering of an earlier frame cannot be walked back.
+  uint64_t frame() const { return frame_; }
+
+  void forward(const FrameInput& input, const ImageOutput& output);
+  // Of the last forward. d_rows must be zero; mean_2d_norm has room for visible_count().
+  void backward(const ImageGradients& input, float* d_rows, double* d_twist, float* mean_2d_norm);
+  double step(const FrameInput& input, const OptimizerState& state, const TrainingView& view, bool masked, const LossWeights& loss,
+              const AdamOptions& adam);
+
+  // The rows that the last call found visible, ascending.
+  uint32_t visible_count() const;
+  void copy_visible(uint32_t* ids) const;
+
+  std::mutex& mutex() { return mutex_; }
+
+ private:
+  void begin_frame(const FrameInput& input);
+  void next_tag();
+  void count_active_tiles();
+  void prepare_gradient_rows();
+  void export_rows(const ImageOutput& output, int begin, int end) const;
+  void import_gradients(const ImageGradients& input, int begin, int end);
+  const float* corrections(const AdamOptions& adam);
+  void mark(double StageTimes::* stage);
+  template <class F>
+  void for_each_strip(F f);
+
+  const Stages& stages_;
+  Team team_;
+  Workspace ws_;
+  uint64_t frame_ = 0;
+  uint32_t row_count_ = 0;
+  std::mutex mutex_;
+  Buffer<double> loss_sums_, twist_sums_;
+  Buffer<float> norms_by_slot_;
+  Buffer<float> corrections_;
+  double correction_beta1_ = -1.0, correction_beta2_ = -1.0;
+  StageTimes times_;
+  double last_mark_ms_ = 0.0;
+};
+
+}  // namespace gausslite

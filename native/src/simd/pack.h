@@ -1,0 +1,70 @@
+// SPDX-License-Identifier: Apache-2.0
+// Sixteen floats at once: picks the form this translation unit is compiled for and adds the functions all forms share.
+//
+// The build compiles every stage once per form and defines GAUSSLITE_ISA as the form's name, which is also the namespace its
+// code lives in, so that the forms can sit in one extension module side by side.
+#pragma once
+
+#ifndef GAUSSLITE_ISA
+#error "GAUSSLITE_ISA is not defined: stages are compiled by native/CMakeLists.txt, once per instruction set"
+#endif
+
+#define GAUSSLITE_INLINE inline __attribute__((always_inline))
+
+#if defined(GAUSSLITE_USE_AVX512)
+#include "simd/pack_avx512.h"
+#elif defined(GAUSSLITE_USE_AVX2)
+#include "simd/pack_avx2.h"
+#else
+#include "simd/pack_portable.h"
+#endif
+
+namespace gausslite::GAUSSLITE_ISA {
+
+constexpr float kLog2E = 1.44269504088896f;
+constexpr float kLn2 = 0.69314718055994531f;
+
+// 2^e to a relative error of 2.6e-6: a polynomial of degree 4 on the fraction of e.
+GAUSSLITE_INLINE Pack16 exp2_fast(Pack16 e) {
+  const Pack16 f = fraction(e);
+  Pack16 p = fma(Pack16(0.013534167781472206f), f, Pack16(0.052011460065841675f));
+  p = fma(p, f, Pack16(0.2414427548646927f));
+  p = fma(p, f, Pack16(0.6930038332939148f));
+  p = fma(p, f, Pack16(1.0000026226043701f));
+  return scale_by_power(p, e);
+}
+
+// 2^e to a relative error of 7.5e-8: degree 5.
+GAUSSLITE_INLINE Pack16 exp2_fine(Pack16 e) {
+  const Pack16 f = fraction(e);
+  Pack16 p = fma(Pack16(0.0018775766948238015f), f, Pack16(0.008989340625703335f));
+  p = fma(p, f, Pack16(0.05582631751894951f));
+  p = fma(p, f, Pack16(0.24015361070632935f));
+  p = fma(p, f, Pack16(0.6931530833244324f));
+  p = fma(p, f, Pack16(0.9999999403953552f));
+  return scale_by_power(p, e);
+}
+
+GAUSSLITE_INLINE Pack16 exp(Pack16 x) { return exp2_fine(x * kLog2E); }
+
+// log2(x) of positive normal x to an absolute error of 2e-7.
+GAUSSLITE_INLINE Pack16 log2(Pack16 x) {
+  const Pack16 m = mantissa(x) - 1.0f;
+  Pack16 p = fma(Pack16(-0.012370623648166656f), m, Pack16(0.06378752738237381f));
+  p = fma(p, m, Pack16(-0.15559986233711243f));
+  p = fma(p, m, Pack16(0.2561796307563782f));
+  p = fma(p, m, Pack16(-0.3534546494483948f));
+  p = fma(p, m, Pack16(0.4800737500190735f));
+  p = fma(p, m, Pack16(-0.7213107347488403f));
+  p = fma(p, m, Pack16(1.4426947832107544f));
+  return fma(p, m, exponent(x));
+}
+
+// True where a number is neither NaN nor infinite: x times 0 is 0 only then.
+GAUSSLITE_INLINE Mask16 is_finite(Pack16 x) { return x * 0.0f == Pack16(0.0f); }
+
+GAUSSLITE_INLINE bool any(Mask16 m) { return bits(m) != 0; }
+
+GAUSSLITE_INLINE void prefetch(const void* p) { __builtin_prefetch(p, 0, 3); }
+
+}  // namespace gausslite::GAUSSLITE_ISA

@@ -1,0 +1,35 @@
+// SPDX-License-Identifier: Apache-2.0
+// Eight floats in one AVX register, shared by the AVX2 and the AVX-512 form.
+#pragma once
+
+#include <immintrin.h>
+
+#include <cstdint>
+
+namespace gausslite::GAUSSLITE_ISA {
+
+struct Pack8 {
+  __m256 v;
+  Pack8() = default;
+  GAUSSLITE_INLINE Pack8(__m256 x) : v(x) {}
+  GAUSSLITE_INLINE Pack8(float x) : v(_mm256_set1_ps(x)) {}
+};
+
+GAUSSLITE_INLINE Pack8 load8(const float* p) { return _mm256_loadu_ps(p); }
+GAUSSLITE_INLINE void store8(float* p, Pack8 a) { _mm256_storeu_ps(p, a.v); }
+GAUSSLITE_INLINE Pack8 broadcast8(const float* p) { return _mm256_broadcast_ss(p); }
+GAUSSLITE_INLINE Pack8 operator+(Pack8 a, Pack8 b) { return _mm256_add_ps(a.v, b.v); }
+GAUSSLITE_INLINE Pack8 operator-(Pack8 a, Pack8 b) { return _mm256_sub_ps(a.v, b.v); }
+GAUSSLITE_INLINE Pack8 operator*(Pack8 a, Pack8 b) { return _mm256_mul_ps(a.v, b.v); }
+GAUSSLITE_INLINE Pack8 fma(Pack8 a, Pack8 b, Pack8 c) { return _mm256_fmadd_ps(a.v, b.v, c.v); }
+GAUSSLITE_INLINE Pack8 fnma(Pack8 a, Pack8 b, Pack8 c) { return _mm256_fnmadd_ps(a.v, b.v, c.v); }
+GAUSSLITE_INLINE Pack8 keep_if(bool yes, Pack8 a) {
+  return _mm256_and_ps(a.v, _mm256_castsi256_ps(_mm256_set1_epi32(-int32_t(yes))));
+}
+
+template <int a, int b, int c, int d, int e, int f, int g, int h>
+GAUSSLITE_INLINE Pack8 permute(Pack8 x) {
+  return _mm256_permutevar8x32_ps(x.v, _mm256_setr_epi32(a, b, c, d, e, f, g, h));
+}
+
+}  // namespace gausslite::GAUSSLITE_ISA

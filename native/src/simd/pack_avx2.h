@@ -1,0 +1,168 @@
+// SPDX-License-Identifier: Apache-2.0
+// Sixteen floats in two AVX registers (AVX2 and FMA). pack_portable.h documents the functions.
+#pragma once
+
+#include <immintrin.h>
+
+#include <cstdint>
+
+#include "simd/pack8_avx.h"
+
+namespace gausslite::GAUSSLITE_ISA {
+
+struct Mask16 {
+  __m256 lo, hi;
+};
+
+GAUSSLITE_INLINE Mask16 operator&(Mask16 a, Mask16 b) { return {_mm256_and_ps(a.lo, b.lo), _mm256_and_ps(a.hi, b.hi)}; }
+GAUSSLITE_INLINE Mask16 operator|(Mask16 a, Mask16 b) { return {_mm256_or_ps(a.lo, b.lo), _mm256_or_ps(a.hi, b.hi)}; }
+GAUSSLITE_INLINE uint32_t bits(Mask16 m) {
+  return uint32_t(_mm256_movemask_ps(m.lo)) | uint32_t(_mm256_movemask_ps(m.hi)) << 8;
+}
+GAUSSLITE_INLINE Mask16 first_lanes(int n) {
+  const __m256i count = _mm256_set1_epi32(n);
+  return {_mm256_castsi256_ps(_mm256_cmpgt_epi32(count, _mm256_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7))),
+          _mm256_castsi256_ps(_mm256_cmpgt_epi32(count, _mm256_setr_epi32(8, 9, 10, 11, 12, 13, 14, 15)))};
+}
+
+struct Pack16 {
+  __m256 lo, hi;
+  Pack16() = default;
+  GAUSSLITE_INLINE Pack16(__m256 a, __m256 b) : lo(a), hi(b) {}
+  GAUSSLITE_INLINE Pack16(float x) : lo(_mm256_set1_ps(x)), hi(lo) {}
+};
+
+GAUSSLITE_INLINE Pack16 load(const float* p) { return {_mm256_loadu_ps(p), _mm256_loadu_ps(p + 8)}; }
+GAUSSLITE_INLINE void store(float* p, Pack16 a) {
+  _mm256_storeu_ps(p, a.lo);
+  _mm256_storeu_ps(p + 8, a.hi);
+}
+GAUSSLITE_INLINE void store_int(int32_t* p, Pack16 a) {
+  _mm256_storeu_si256(reinterpret_cast<__m256i*>(p), _mm256_cvttps_epi32(a.lo));
+  _mm256_storeu_si256(reinterpret_cast<__m256i*>(p + 8), _mm256_cvttps_epi32(a.hi));
+}
+
+#define GAUSSLITE_LANEWISE(name, op) \
+  GAUSSLITE_INLINE Pack16 name(Pack16 a, Pack16 b) { return {op(a.lo, b.lo), op(a.hi, b.hi)}; }
+GAUSSLITE_LANEWISE(operator+, _mm256_add_ps)
+GAUSSLITE_LANEWISE(operator-, _mm256_sub_ps)
+GAUSSLITE_LANEWISE(operator*, _mm256_mul_ps)
+GAUSSLITE_LANEWISE(operator/, _mm256_div_ps)
+GAUSSLITE_LANEWISE(min, _mm256_min_ps)
+GAUSSLITE_LANEWISE(max, _mm256_max_ps)
+#undef GAUSSLITE_LANEWISE
+
+GAUSSLITE_INLINE Pack16 operator-(Pack16 a) {
+  const __m256 sign = _mm256_set1_ps(-0.0f);
+  return {_mm256_xor_ps(a.lo, sign), _mm256_xor_ps(a.hi, sign)};
+}
+GAUSSLITE_INLINE Pack16 fma(Pack16 a, Pack16 b, Pack16 c) {
+  return {_mm256_fmadd_ps(a.lo, b.lo, c.lo), _mm256_fmadd_ps(a.hi, b.hi, c.hi)};
+}
+GAUSSLITE_INLINE Pack16 fnma(Pack16 a, Pack16 b, Pack16 c) {
+  return {_mm256_fnmadd_ps(a.lo, b.lo, c.lo), _mm256_fnmadd_ps(a.hi, b.hi, c.hi)};
+}
+GAUSSLITE_INLINE Pack16 abs(Pack16 a) {
+  const __m256 sign = _mm256_set1_ps(-0.0f);
+  return {_mm256_andnot_ps(sign, a.lo), _mm256_andnot_ps(sign, a.hi)};
+}
+GAUSSLITE_INLINE Pack16 sqrt(Pack16 a) { return {_mm256_sqrt_ps(a.lo), _mm256_sqrt_ps(a.hi)}; }
+GAUSSLITE_INLINE Pack16 floor(Pack16 a) { return {_mm256_floor_ps(a.lo), _mm256_floor_ps(a.hi)}; }
+GAUSSLITE_INLINE Pack16 ceil(Pack16 a) { return {_mm256_ceil_ps(a.lo), _mm256_ceil_ps(a.hi)}; }
+
+// rcpps has 12 bits; one Newton step makes it as good as the other forms.
+GAUSSLITE_INLINE Pack16 rough_reciprocal(Pack16 a) {
+  const Pack16 r{_mm256_rcp_ps(a.lo), _mm256_rcp_ps(a.hi)};
+  return r * fnma(a, r, Pack16(2.0f));
+}
+
+#define GAUSSLITE_COMPARISON(name, predicate) \
+  GAUSSLITE_INLINE Mask16 name(Pack16 a, Pack16 b) { \
+    return {_mm256_cmp_ps(a.lo, b.lo, predicate), _mm256_cmp_ps(a.hi, b.hi, predicate)}; \
+  }
+GAUSSLITE_COMPARISON(operator<, _CMP_LT_OQ)
+GAUSSLITE_COMPARISON(operator<=, _CMP_LE_OQ)
+GAUSSLITE_COMPARISON(operator>, _CMP_GT_OQ)
+GAUSSLITE_COMPARISON(operator>=, _CMP_GE_OQ)
+GAUSSLITE_COMPARISON(operator==, _CMP_EQ_OQ)
+#undef GAUSSLITE_COMPARISON
+
+GAUSSLITE_INLINE Pack16 keep(Mask16 m, Pack16 a) { return {_mm256_and_ps(m.lo, a.lo), _mm256_and_ps(m.hi, a.hi)}; }
+GAUSSLITE_INLINE Pack16 select(Mask16 m, Pack16 yes, Pack16 no) {
+  return {_mm256_blendv_ps(no.lo, yes.lo, m.lo), _mm256_blendv_ps(no.hi, yes.hi, m.hi)};
+}
+
+GAUSSLITE_INLINE Pack16 fraction(Pack16 e) { return e - floor(e); }
+
+// Adds floor(e) to the float's exponent field; e below -126 gives about 2^-126, above 127 about 2^127.
+GAUSSLITE_INLINE Pack16 scale_by_power(Pack16 a, Pack16 e) {
+  const Pack16 whole = floor(min(max(e, Pack16(-126.0f)), Pack16(127.0f)));
+  const __m256i lo = _mm256_slli_epi32(_mm256_cvtps_epi32(whole.lo), 23);
+  const __m256i hi = _mm256_slli_epi32(_mm256_cvtps_epi32(whole.hi), 23);
+  return {_mm256_castsi256_ps(_mm256_add_epi32(_mm256_castps_si256(a.lo), lo)),
+          _mm256_castsi256_ps(_mm256_add_epi32(_mm256_castps_si256(a.hi), hi))};
+}
+
+GAUSSLITE_INLINE __m256 exponent_of(__m256 a) {
+  const __m256i biased = _mm256_srli_epi32(_mm256_castps_si256(a), 23);
+  return _mm256_cvtepi32_ps(_mm256_sub_epi32(biased, _mm256_set1_epi32(127)));
+}
+GAUSSLITE_INLINE __m256 mantissa_of(__m256 a) {
+  const __m256i digits = _mm256_and_si256(_mm256_castps_si256(a), _mm256_set1_epi32(0x007FFFFF));
+  return _mm256_castsi256_ps(_mm256_or_si256(digits, _mm256_set1_epi32(0x3F800000)));
+}
+GAUSSLITE_INLINE Pack16 exponent(Pack16 a) { return {exponent_of(a.lo), exponent_of(a.hi)}; }
+GAUSSLITE_INLINE Pack16 mantissa(Pack16 a) { return {mantissa_of(a.lo), mantissa_of(a.hi)}; }
+
+GAUSSLITE_INLINE Pack8 sum_of_quads(Pack16 a) {
+  const __m256 half = _mm256_add_ps(a.lo, a.hi);
+  return _mm256_zextps128_ps256(_mm_add_ps(_mm256_castps256_ps128(half), _mm256_extractf128_ps(half, 1)));
+}
+GAUSSLITE_INLINE float sum(Pack16 a) {
+  const __m128 quad = _mm256_castps256_ps128(sum_of_quads(a).v);
+  const __m128 pair = _mm_add_ps(quad, _mm_movehl_ps(quad, quad));
+  return _mm_cvtss_f32(_mm_add_ss(pair, _mm_movehdup_ps(pair)));
+}
+
+template <int kLane>
+GAUSSLITE_INLINE Pack16 spread_in_quads(Pack16 a) {
+  return {_mm256_permute_ps(a.lo, kLane * 0x55), _mm256_permute_ps(a.hi, kLane * 0x55)};
+}
+
+GAUSSLITE_INLINE void transpose_quads(__m256& a, __m256& b, __m256& c, __m256& d) {
+  const __m256 ac_lo = _mm256_unpacklo_ps(a, c), ac_hi = _mm256_unpackhi_ps(a, c);
+  const __m256 bd_lo = _mm256_unpacklo_ps(b, d), bd_hi = _mm256_unpackhi_ps(b, d);
+  a = _mm256_unpacklo_ps(ac_lo, bd_lo);
+  b = _mm256_unpackhi_ps(ac_lo, bd_lo);
+  c = _mm256_unpacklo_ps(ac_hi, bd_hi);
+  d = _mm256_unpackhi_ps(ac_hi, bd_hi);
+}
+GAUSSLITE_INLINE void transpose_quads(Pack16& a, Pack16& b, Pack16& c, Pack16& d) {
+  transpose_quads(a.lo, b.lo, c.lo, d.lo);
+  transpose_quads(a.hi, b.hi, c.hi, d.hi);
+}
+
+GAUSSLITE_INLINE void transpose(Pack16 (&r)[16]) {
+  for (int i = 0; i < 16; i += 4) transpose_quads(r[i], r[i + 1], r[i + 2], r[i + 3]);
+  Pack16 t[16];
+  for (int i = 0; i < 4; ++i) {
+    t[i] = {_mm256_permute2f128_ps(r[i].lo, r[i + 4].lo, 0x20), _mm256_permute2f128_ps(r[i + 8].lo, r[i + 12].lo, 0x20)};
+    t[i + 4] = {_mm256_permute2f128_ps(r[i].lo, r[i + 4].lo, 0x31), _mm256_permute2f128_ps(r[i + 8].lo, r[i + 12].lo, 0x31)};
+    t[i + 8] = {_mm256_permute2f128_ps(r[i].hi, r[i + 4].hi, 0x20), _mm256_permute2f128_ps(r[i + 8].hi, r[i + 12].hi, 0x20)};
+    t[i + 12] = {_mm256_permute2f128_ps(r[i].hi, r[i + 4].hi, 0x31), _mm256_permute2f128_ps(r[i + 8].hi, r[i + 12].hi, 0x31)};
+  }
+  for (int i = 0; i < 16; ++i) r[i] = t[i];
+}
+
+GAUSSLITE_INLINE Pack16 load_block(const float* p, int64_t stride) {
+  return {_mm256_insertf128_ps(_mm256_castps128_ps256(_mm_loadu_ps(p)), _mm_loadu_ps(p + stride), 1),
+          _mm256_insertf128_ps(_mm256_castps128_ps256(_mm_loadu_ps(p + 2 * stride)), _mm_loadu_ps(p + 3 * stride), 1)};
+}
+GAUSSLITE_INLINE void store_block(float* p, int64_t stride, Pack16 a) {
+  _mm_storeu_ps(p, _mm256_castps256_ps128(a.lo));
+  _mm_storeu_ps(p + stride, _mm256_extractf128_ps(a.lo, 1));
+  _mm_storeu_ps(p + 2 * stride, _mm256_castps256_ps128(a.hi));
+  _mm_storeu_ps(p + 3 * stride, _mm256_extractf128_ps(a.hi, 1));
+}
+
+}  // namespace gausslite::GAUSSLITE_ISA

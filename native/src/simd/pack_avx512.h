@@ -1,0 +1,110 @@
+// SPDX-License-Identifier: Apache-2.0
+// Sixteen floats in one AVX-512 register. Every form of Pack16 offers the same functions; pack_portable.h documents them.
+#pragma once
+
+#include <immintrin.h>
+
+#include <cstdint>
+
+#include "simd/pack8_avx.h"
+
+namespace gausslite::GAUSSLITE_ISA {
+
+struct Mask16 {
+  __mmask16 v;
+};
+
+GAUSSLITE_INLINE Mask16 operator&(Mask16 a, Mask16 b) { return {__mmask16(a.v & b.v)}; }
+GAUSSLITE_INLINE Mask16 operator|(Mask16 a, Mask16 b) { return {__mmask16(a.v | b.v)}; }
+GAUSSLITE_INLINE uint32_t bits(Mask16 m) { return m.v; }
+GAUSSLITE_INLINE Mask16 first_lanes(int n) { return {__mmask16((1u << n) - 1u)}; }
+
+struct Pack16 {
+  __m512 v;
+  Pack16() = default;
+  GAUSSLITE_INLINE Pack16(__m512 x) : v(x) {}
+  GAUSSLITE_INLINE Pack16(float x) : v(_mm512_set1_ps(x)) {}
+};
+
+GAUSSLITE_INLINE Pack16 load(const float* p) { return _mm512_loadu_ps(p); }
+GAUSSLITE_INLINE void store(float* p, Pack16 a) { _mm512_storeu_ps(p, a.v); }
+GAUSSLITE_INLINE void store_int(int32_t* p, Pack16 a) { _mm512_storeu_si512(p, _mm512_cvttps_epi32(a.v)); }
+
+GAUSSLITE_INLINE Pack16 operator+(Pack16 a, Pack16 b) { return _mm512_add_ps(a.v, b.v); }
+GAUSSLITE_INLINE Pack16 operator-(Pack16 a, Pack16 b) { return _mm512_sub_ps(a.v, b.v); }
+GAUSSLITE_INLINE Pack16 operator*(Pack16 a, Pack16 b) { return _mm512_mul_ps(a.v, b.v); }
+GAUSSLITE_INLINE Pack16 operator/(Pack16 a, Pack16 b) { return _mm512_div_ps(a.v, b.v); }
+GAUSSLITE_INLINE Pack16 operator-(Pack16 a) { return _mm512_xor_ps(a.v, _mm512_set1_ps(-0.0f)); }
+GAUSSLITE_INLINE Pack16 fma(Pack16 a, Pack16 b, Pack16 c) { return _mm512_fmadd_ps(a.v, b.v, c.v); }
+GAUSSLITE_INLINE Pack16 fnma(Pack16 a, Pack16 b, Pack16 c) { return _mm512_fnmadd_ps(a.v, b.v, c.v); }
+GAUSSLITE_INLINE Pack16 min(Pack16 a, Pack16 b) { return _mm512_min_ps(a.v, b.v); }
+GAUSSLITE_INLINE Pack16 max(Pack16 a, Pack16 b) { return _mm512_max_ps(a.v, b.v); }
+GAUSSLITE_INLINE Pack16 abs(Pack16 a) { return _mm512_abs_ps(a.v); }
+GAUSSLITE_INLINE Pack16 sqrt(Pack16 a) { return _mm512_sqrt_ps(a.v); }
+GAUSSLITE_INLINE Pack16 floor(Pack16 a) { return _mm512_roundscale_ps(a.v, _MM_FROUND_TO_NEG_INF | _MM_FROUND_NO_EXC); }
+GAUSSLITE_INLINE Pack16 ceil(Pack16 a) { return _mm512_roundscale_ps(a.v, _MM_FROUND_TO_POS_INF | _MM_FROUND_NO_EXC); }
+GAUSSLITE_INLINE Pack16 rough_reciprocal(Pack16 a) { return _mm512_rcp14_ps(a.v); }
+
+GAUSSLITE_INLINE Mask16 operator<(Pack16 a, Pack16 b) { return {_mm512_cmp_ps_mask(a.v, b.v, _CMP_LT_OQ)}; }
+GAUSSLITE_INLINE Mask16 operator<=(Pack16 a, Pack16 b) { return {_mm512_cmp_ps_mask(a.v, b.v, _CMP_LE_OQ)}; }
+GAUSSLITE_INLINE Mask16 operator>(Pack16 a, Pack16 b) { return {_mm512_cmp_ps_mask(a.v, b.v, _CMP_GT_OQ)}; }
+GAUSSLITE_INLINE Mask16 operator>=(Pack16 a, Pack16 b) { return {_mm512_cmp_ps_mask(a.v, b.v, _CMP_GE_OQ)}; }
+GAUSSLITE_INLINE Mask16 operator==(Pack16 a, Pack16 b) { return {_mm512_cmp_ps_mask(a.v, b.v, _CMP_EQ_OQ)}; }
+
+GAUSSLITE_INLINE Pack16 keep(Mask16 m, Pack16 a) { return _mm512_maskz_mov_ps(m.v, a.v); }
+GAUSSLITE_INLINE Pack16 select(Mask16 m, Pack16 yes, Pack16 no) { return _mm512_mask_mov_ps(no.v, m.v, yes.v); }
+GAUSSLITE_INLINE float sum(Pack16 a) { return _mm512_reduce_add_ps(a.v); }
+
+// vreduceps gives e - floor(e) and vscalefps multiplies by 2^floor(e): no integer detour, and no clamping is needed.
+GAUSSLITE_INLINE Pack16 fraction(Pack16 e) { return _mm512_reduce_ps(e.v, 0x01); }
+GAUSSLITE_INLINE Pack16 scale_by_power(Pack16 a, Pack16 e) { return _mm512_scalef_ps(a.v, e.v); }
+GAUSSLITE_INLINE Pack16 exponent(Pack16 a) { return _mm512_getexp_ps(a.v); }
+GAUSSLITE_INLINE Pack16 mantissa(Pack16 a) { return _mm512_getmant_ps(a.v, _MM_MANT_NORM_1_2, _MM_MANT_SIGN_zero); }
+
+template <int kLane>
+GAUSSLITE_INLINE Pack16 spread_in_quads(Pack16 a) {
+  return _mm512_permute_ps(a.v, kLane * 0x55);
+}
+
+GAUSSLITE_INLINE void transpose_quads(Pack16& a, Pack16& b, Pack16& c, Pack16& d) {
+  const __m512 ac_lo = _mm512_unpacklo_ps(a.v, c.v), ac_hi = _mm512_unpackhi_ps(a.v, c.v);
+  const __m512 bd_lo = _mm512_unpacklo_ps(b.v, d.v), bd_hi = _mm512_unpackhi_ps(b.v, d.v);
+  a = _mm512_unpacklo_ps(ac_lo, bd_lo);
+  b = _mm512_unpackhi_ps(ac_lo, bd_lo);
+  c = _mm512_unpacklo_ps(ac_hi, bd_hi);
+  d = _mm512_unpackhi_ps(ac_hi, bd_hi);
+}
+
+GAUSSLITE_INLINE void transpose(Pack16 (&r)[16]) {
+  for (int i = 0; i < 16; i += 4) transpose_quads(r[i], r[i + 1], r[i + 2], r[i + 3]);
+  for (int i = 0; i < 4; ++i) {
+    const __m512 a = _mm512_shuffle_f32x4(r[i].v, r[i + 4].v, 0x88), b = _mm512_shuffle_f32x4(r[i].v, r[i + 4].v, 0xDD);
+    const __m512 c = _mm512_shuffle_f32x4(r[i + 8].v, r[i + 12].v, 0x88);
+    const __m512 d = _mm512_shuffle_f32x4(r[i + 8].v, r[i + 12].v, 0xDD);
+    r[i] = _mm512_shuffle_f32x4(a, c, 0x88);
+    r[i + 8] = _mm512_shuffle_f32x4(a, c, 0xDD);
+    r[i + 4] = _mm512_shuffle_f32x4(b, d, 0x88);
+    r[i + 12] = _mm512_shuffle_f32x4(b, d, 0xDD);
+  }
+}
+
+GAUSSLITE_INLINE Pack16 load_block(const float* p, int64_t stride) {
+  __m512 v = _mm512_castps128_ps512(_mm_loadu_ps(p));
+  v = _mm512_insertf32x4(v, _mm_loadu_ps(p + stride), 1);
+  v = _mm512_insertf32x4(v, _mm_loadu_ps(p + 2 * stride), 2);
+  return _mm512_insertf32x4(v, _mm_loadu_ps(p + 3 * stride), 3);
+}
+
+GAUSSLITE_INLINE void store_block(float* p, int64_t stride, Pack16 a) {
+  _mm_storeu_ps(p, _mm512_castps512_ps128(a.v));
+  _mm_storeu_ps(p + stride, _mm512_extractf32x4_ps(a.v, 1));
+  _mm_storeu_ps(p + 2 * stride, _mm512_extractf32x4_ps(a.v, 2));
+  _mm_storeu_ps(p + 3 * stride, _mm512_extractf32x4_ps(a.v, 3));
+}
+
+GAUSSLITE_INLINE Pack8 sum_of_quads(Pack16 a) {
+  const __m256 half = _mm256_add_ps(_mm512_castps512_ps256(a.v), _mm512_extractf32x8_ps(a.v, 1));
+  return _mm256_zextps128_ps256(_mm_add_ps(_mm256_castps256_ps128(half), _mm256_extractf128_ps(half, 1)));
+}
+
+}  // namespace gausslite::GAUSSLITE_ISA

@@ -1,0 +1,231 @@
+// SPDX-License-Identifier: Apache-2.0
+// Sixteen floats without any instruction set in mind: four groups of four, written with the compiler's vector types, which
+// become SSE, NEON or scalar code. It is the fallback, the oracle of the other forms, and the place where each function is explained.
+#pragma once
+
+#include <cmath>
+#include <cstdint>
+#include <cstring>
+
+namespace gausslite::GAUSSLITE_ISA {
+
+typedef float Quad __attribute__((vector_size(16)));
+typedef int32_t QuadInt __attribute__((vector_size(16)));
+
+GAUSSLITE_INLINE Quad quad(float x) { return Quad{x, x, x, x}; }
+GAUSSLITE_INLINE Quad load_quad(const float* p) {
+  Quad q;
+  std::memcpy(&q, p, sizeof q);
+  return q;
+}
+GAUSSLITE_INLINE void store_quad(float* p, Quad q) { std::memcpy(p, &q, sizeof q); }
+GAUSSLITE_INLINE Quad choose(QuadInt mask, Quad yes, Quad no) { return (Quad)((mask & (QuadInt)yes) | (~mask & (QuadInt)no)); }
+GAUSSLITE_INLINE Quad floor_quad(Quad a) {
+  // Beyond 2^23 a float is whole already, and the conversion to an integer would overflow.
+  const QuadInt small = (a < 8388608.0f) & (a > -8388608.0f);
+  const QuadInt truncated = __builtin_convertvector(choose(small, a, quad(0.0f)), QuadInt);
+  const Quad whole = __builtin_convertvector(truncated, Quad);
+  return choose(small, whole - choose(whole > a, quad(1.0f), quad(0.0f)), a);
+}
+
+// Sixteen truth values, one per lane.
+struct Mask16 {
+  QuadInt q[4];
+};
+
+#define GAUSSLITE_EACH for (int i = 0; i < 4; ++i)
+
+GAUSSLITE_INLINE Mask16 operator&(Mask16 a, Mask16 b) {
+  GAUSSLITE_EACH a.q[i] &= b.q[i];
+  return a;
+}
+GAUSSLITE_INLINE Mask16 operator|(Mask16 a, Mask16 b) {
+  GAUSSLITE_EACH a.q[i] |= b.q[i];
+  return a;
+}
+// The mask as an integer, lane 0 in bit 0.
+GAUSSLITE_INLINE uint32_t bits(Mask16 m) {
+  uint32_t out = 0;
+  for (int i = 0; i < 16; ++i) out |= uint32_t(m.q[i / 4][i % 4] & 1) << i;
+  return out;
+}
+GAUSSLITE_INLINE Mask16 first_lanes(int n) {
+  Mask16 m;
+  for (int i = 0; i < 16; ++i) m.q[i / 4][i % 4] = i < n ? -1 : 0;
+  return m;
+}
+
+struct Pack16 {
+  Quad q[4];
+  Pack16() = default;
+  GAUSSLITE_INLINE Pack16(float x) : q{quad(x), quad(x), quad(x), quad(x)} {}
+};
+
+GAUSSLITE_INLINE Pack16 load(const float* p) {
+  Pack16 a;
+  GAUSSLITE_EACH a.q[i] = load_quad(p + 4 * i);
+  return a;
+}
+GAUSSLITE_INLINE void store(float* p, Pack16 a) { GAUSSLITE_EACH store_quad(p + 4 * i, a.q[i]); }
+// Truncates towards zero; the values must fit.
+GAUSSLITE_INLINE void store_int(int32_t* p, Pack16 a) {
+  GAUSSLITE_EACH {
+    const QuadInt whole = __builtin_convertvector(a.q[i], QuadInt);
+    std::memcpy(p + 4 * i, &whole, sizeof whole);
+  }
+}
+
+#define GAUSSLITE_LANEWISE(name, expression) \
+  GAUSSLITE_INLINE Pack16 name(Pack16 a, Pack16 b) { \
+    Pack16 r; \
+    GAUSSLITE_EACH r.q[i] = expression; \
+    return r; \
+  }
+GAUSSLITE_LANEWISE(operator+, a.q[i] + b.q[i])
+GAUSSLITE_LANEWISE(operator-, a.q[i] - b.q[i])
+GAUSSLITE_LANEWISE(operator*, a.q[i] * b.q[i])
+GAUSSLITE_LANEWISE(operator/, a.q[i] / b.q[i])
+GAUSSLITE_LANEWISE(min, choose(a.q[i] < b.q[i], a.q[i], b.q[i]))
+GAUSSLITE_LANEWISE(max, choose(a.q[i] > b.q[i], a.q[i], b.q[i]))
+#undef GAUSSLITE_LANEWISE
+
+GAUSSLITE_INLINE Pack16 operator-(Pack16 a) {
+  GAUSSLITE_EACH a.q[i] = -a.q[i];
+  return a;
+}
+// a b + c and c - a b, rounded once where the machine can.
+GAUSSLITE_INLINE Pack16 fma(Pack16 a, Pack16 b, Pack16 c) { return a * b + c; }
+GAUSSLITE_INLINE Pack16 fnma(Pack16 a, Pack16 b, Pack16 c) { return c - a * b; }
+GAUSSLITE_INLINE Pack16 abs(Pack16 a) {
+  GAUSSLITE_EACH a.q[i] = (Quad)((QuadInt)a.q[i] & 0x7FFFFFFF);
+  return a;
+}
+GAUSSLITE_INLINE Pack16 sqrt(Pack16 a) {
+  for (int i = 0; i < 16; ++i) a.q[i / 4][i % 4] = __builtin_sqrtf(a.q[i / 4][i % 4]);
+  return a;
+}
+GAUSSLITE_INLINE Pack16 floor(Pack16 a) {
+  GAUSSLITE_EACH a.q[i] = floor_quad(a.q[i]);
+  return a;
+}
+GAUSSLITE_INLINE Pack16 ceil(Pack16 a) { return -floor(-a); }
+// 1 / a to a relative error below 6.2e-5 (14 bits): enough where errors average out over many terms.
+GAUSSLITE_INLINE Pack16 rough_reciprocal(Pack16 a) { return Pack16(1.0f) / a; }
+
+// Comparisons are false for NaN.
+#define GAUSSLITE_COMPARISON(name, op) \
+  GAUSSLITE_INLINE Mask16 name(Pack16 a, Pack16 b) { \
+    Mask16 m; \
+    GAUSSLITE_EACH m.q[i] = a.q[i] op b.q[i]; \
+    return m; \
+  }
+GAUSSLITE_COMPARISON(operator<, <)
+GAUSSLITE_COMPARISON(operator<=, <=)
+GAUSSLITE_COMPARISON(operator>, >)
+GAUSSLITE_COMPARISON(operator>=, >=)
+GAUSSLITE_COMPARISON(operator==, ==)
+#undef GAUSSLITE_COMPARISON
+
+// a where the mask is set, 0 elsewhere.
+GAUSSLITE_INLINE Pack16 keep(Mask16 m, Pack16 a) {
+  GAUSSLITE_EACH a.q[i] = (Quad)(m.q[i] & (QuadInt)a.q[i]);
+  return a;
+}
+GAUSSLITE_INLINE Pack16 select(Mask16 m, Pack16 yes, Pack16 no) {
+  GAUSSLITE_EACH yes.q[i] = choose(m.q[i], yes.q[i], no.q[i]);
+  return yes;
+}
+
+// The pieces of exp2 and log2: e - floor(e), a 2^floor(e), and a = mantissa(a) 2^exponent(a) with mantissa in [1, 2).
+GAUSSLITE_INLINE Pack16 fraction(Pack16 e) { return e - floor(e); }
+GAUSSLITE_INLINE Pack16 scale_by_power(Pack16 a, Pack16 e) {
+  const Pack16 whole = floor(min(max(e, Pack16(-126.0f)), Pack16(127.0f)));
+  GAUSSLITE_EACH a.q[i] = (Quad)((QuadInt)a.q[i] + (__builtin_convertvector(whole.q[i], QuadInt) << 23));
+  return a;
+}
+GAUSSLITE_INLINE Pack16 exponent(Pack16 a) {
+  GAUSSLITE_EACH a.q[i] = __builtin_convertvector(((QuadInt)a.q[i] >> 23) - 127, Quad);
+  return a;
+}
+GAUSSLITE_INLINE Pack16 mantissa(Pack16 a) {
+  GAUSSLITE_EACH a.q[i] = (Quad)(((QuadInt)a.q[i] & 0x007FFFFF) | 0x3F800000);
+  return a;
+}
+
+GAUSSLITE_INLINE float sum(Pack16 a) {
+  const Quad s = (a.q[0] + a.q[2]) + (a.q[1] + a.q[3]);
+  return (s[0] + s[2]) + (s[1] + s[3]);
+}
+
+// In each group of four lanes, copy lane kLane to all four.
+template <int kLane>
+GAUSSLITE_INLINE Pack16 spread_in_quads(Pack16 a) {
+  GAUSSLITE_EACH a.q[i] = quad(a.q[i][kLane]);
+  return a;
+}
+
+// In each group of four lanes, the 4x4 transpose of a, b, c, d.
+GAUSSLITE_INLINE void transpose_quads(Pack16& a, Pack16& b, Pack16& c, Pack16& d) {
+  GAUSSLITE_EACH {
+    const Quad p = a.q[i], q = b.q[i], r = c.q[i], s = d.q[i];
+    a.q[i] = Quad{p[0], q[0], r[0], s[0]};
+    b.q[i] = Quad{p[1], q[1], r[1], s[1]};
+    c.q[i] = Quad{p[2], q[2], r[2], s[2]};
+    d.q[i] = Quad{p[3], q[3], r[3], s[3]};
+  }
+}
+
+// The 16x16 transpose: sixteen rows become sixteen columns.
+GAUSSLITE_INLINE void transpose(Pack16 (&r)[16]) {
+  for (int i = 0; i < 16; i += 4) transpose_quads(r[i], r[i + 1], r[i + 2], r[i + 3]);
+  for (int i = 0; i < 4; ++i) {
+    Pack16 t[4];
+    for (int j = 0; j < 4; ++j) {
+      for (int k = 0; k < 4; ++k) t[j].q[k] = r[4 * k + i].q[j];
+    }
+    for (int j = 0; j < 4; ++j) r[4 * j + i] = t[j];
+  }
+}
+
+// A 4x4 block of pixels: four rows of four, `stride` floats apart.
+GAUSSLITE_INLINE Pack16 load_block(const float* p, int64_t stride) {
+  Pack16 a;
+  GAUSSLITE_EACH a.q[i] = load_quad(p + i * stride);
+  return a;
+}
+GAUSSLITE_INLINE void store_block(float* p, int64_t stride, Pack16 a) { GAUSSLITE_EACH store_quad(p + i * stride, a.q[i]); }
+
+#undef GAUSSLITE_EACH
+
+// Eight floats.
+struct Pack8 {
+  Quad lo, hi;
+  Pack8() = default;
+  GAUSSLITE_INLINE Pack8(Quad a, Quad b) : lo(a), hi(b) {}
+  GAUSSLITE_INLINE Pack8(float x) : lo(quad(x)), hi(quad(x)) {}
+};
+
+GAUSSLITE_INLINE Pack8 load8(const float* p) { return {load_quad(p), load_quad(p + 4)}; }
+GAUSSLITE_INLINE void store8(float* p, Pack8 a) {
+  store_quad(p, a.lo);
+  store_quad(p + 4, a.hi);
+}
+GAUSSLITE_INLINE Pack8 broadcast8(const float* p) { return Pack8(*p); }
+GAUSSLITE_INLINE Pack8 operator+(Pack8 a, Pack8 b) { return {a.lo + b.lo, a.hi + b.hi}; }
+GAUSSLITE_INLINE Pack8 operator-(Pack8 a, Pack8 b) { return {a.lo - b.lo, a.hi - b.hi}; }
+GAUSSLITE_INLINE Pack8 operator*(Pack8 a, Pack8 b) { return {a.lo * b.lo, a.hi * b.hi}; }
+GAUSSLITE_INLINE Pack8 fma(Pack8 a, Pack8 b, Pack8 c) { return a * b + c; }
+GAUSSLITE_INLINE Pack8 fnma(Pack8 a, Pack8 b, Pack8 c) { return c - a * b; }
+GAUSSLITE_INLINE Pack8 keep_if(bool yes, Pack8 a) { return yes ? a : Pack8(0.0f); }
+
+// Lane k of the result is the lane of x that the k-th argument names.
+template <int a, int b, int c, int d, int e, int f, int g, int h>
+GAUSSLITE_INLINE Pack8 permute(Pack8 x) {
+  const auto lane = [&x](int i) { return i < 4 ? x.lo[i & 3] : x.hi[i & 3]; };
+  return {Quad{lane(a), lane(b), lane(c), lane(d)}, Quad{lane(e), lane(f), lane(g), lane(h)}};
+}
+
+// The sum of the four groups of four in lanes 0-3; lanes 4-7 are 0.
+GAUSSLITE_INLINE Pack8 sum_of_quads(Pack16 a) { return {(a.q[0] + a.q[2]) + (a.q[1] + a.q[3]), quad(0.0f)}; }
+
+}  // namespace gausslite::GAUSSLITE_ISA

@@ -1,0 +1,24 @@
+// SPDX-License-Identifier: Apache-2.0
+// Declarations of the stage functions of the instruction set being compiled; stages.h explains them.
+#pragma once
+
+#include "simd/pack.h"
+#include "stages.h"
+
+namespace gausslite::GAUSSLITE_ISA {
+
+void project(Workspace&, int thread);
+// The depth keys of a tile row, nearest first, with kPrefetchAhead copies of the last behind them.
+const DepthKey* sort_strip(Workspace&, int strip, int thread, int& count);
+void bin_strip(Workspace&, int strip, const DepthKey* keys, int count);
+void draw_strip(Workspace&, int strip, int thread);
+void train_strip(Workspace&, const Training&, int strip, int thread);
+void loss_l1(Workspace&, const Training&, int begin, int end);
+void loss_ssim(Workspace&, const Training&, int begin, int end, int thread);
+void backward_strip(Workspace&, int strip, int thread);
+void update(Workspace&, const Update&, int thread);
+void gradients(Workspace&, const GradientOutput&, int thread);
+void prepare_ssim(const float* rgb, int width, int height, int padded_width, int64_t plane, float* moments, float* scratch);
+size_t ssim_scratch_floats(int padded_width);
+
+}  // namespace gausslite::GAUSSLITE_ISA

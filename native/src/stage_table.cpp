@@ -1,0 +1,13 @@
+// SPDX-License-Identifier: Apache-2.0
+// The stages of the instruction set being compiled, for the dispatcher.
+#include "stage_functions.h"
+
+namespace gausslite::GAUSSLITE_ISA {
+
+const Stages& stages() {
+  static constexpr Stages kStages{project,   draw_strip, train_strip, loss_l1,
+                                  loss_ssim, backward_strip, update, gradients, prepare_ssim, ssim_scratch_floats};
+  return kStages;
+}
+
+}  // namespace gausslite::GAUSSLITE_ISA

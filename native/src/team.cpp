@@ -1,0 +1,76 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "team.h"
+
+namespace gausslite {
+
+namespace {
+
+// Plain loads while the wait is likely short: a PAUSE instruction lets a hypervisor take the processor away, which costs far more
+// than the wait (0.2 ms a stage were seen). Then the scheduler may run others: with fewer free cores than members, spinning
+// longer would only delay the member that is waited for. After some 0.2 ms of that the thread sleeps.
+constexpr int kSpins = 20'000;
+constexpr int kYields = 400;
+
+uint32_t wait_while(const std::atomic<uint32_t>& value, uint32_t old) {
+  for (int i = 0; i < kSpins; ++i) {
+    const uint32_t now = value.load(std::memory_order_acquire);
+    if (now != old) return now;
+  }
+  for (int i = 0; i < kYields; ++i) {
+    std::this_thread::yield();
+    const uint32_t now = value.load(std::memory_order_acquire);
+    if (now != old) return now;
+  }
+  value.wait(old, std::memory_order_acquire);
+  return value.load(std::memory_order_acquire);
+}
+
+}  // namespace
+
+Team::Team(int threads) : size_(threads) {
+  for (int member = 1; member < threads; ++member) threads_.emplace_back([this, member] { serve(member); });
+}
+
+Team::~Team() {
+  quit_ = true;
+  call_.fetch_add(1, std::memory_order_release);
+  call_.notify_all();
+  for (std::thread& thread : threads_) thread.join();
+}
+
+void Team::serve(int member) {
+  for (uint32_t seen = 0;;) {
+    // The calls are counted one by one: `run` returns only after every member has finished, so none can be missed.
+    seen = wait_while(call_, seen);
+    if (quit_) return;
+    (*job_)(member);
+    if (running_.fetch_sub(1, std::memory_order_acq_rel) == 1) running_.notify_one();
+  }
+}
+
+void Team::run(const std::function<void(int)>& job) {
+  if (size_ == 1) {
+    job(0);
+    return;
+  }
+  job_ = &job;
+  running_.store(uint32_t(size_ - 1), std::memory_order_relaxed);
+  call_.fetch_add(1, std::memory_order_release);
+  call_.notify_all();
+  job(0);
+  for (uint32_t left = running_.load(std::memory_order_acquire); left != 0;) left = wait_while(running_, left);
+}
+
+void Team::barrier(const std::function<void()>& last) {
+  const uint32_t generation = generation_.load(std::memory_order_acquire);
+  if (arrived_.fetch_add(1, std::memory_order_acq_rel) + 1 == uint32_t(size_)) {
+    if (last) last();
+    arrived_.store(0, std::memory_order_relaxed);
+    generation_.fetch_add(1, std::memory_order_release);
+    generation_.notify_all();
+  } else {
+    wait_while(generation_, generation);
+  }
+}
+
+}  // namespace gausslite

@@ -1,0 +1,59 @@
+// SPDX-License-Identifier: Apache-2.0
+// Stage 6: pixel gradients to image gradients of the splats, tile by tile along the lists of the forward pass.
+#include <algorithm>
+
+#include "block_forward.h"
+#include "block_backward.h"
+#include "stage_functions.h"
+#include "tile_chunk.h"
+
+namespace gausslite::GAUSSLITE_ISA {
+
+namespace {
+
+void load_pixels(const Workspace& ws, const float* planes, const TilePosition& tile, int b, Pack16 (&out)[5]) {
+  for (int k = 0; k < 5; ++k) out[k] = load_block(planes + k * ws.plane + tile.block(ws, b), ws.padded_width);
+}
+
+void backward_tile(Workspace& ws, const TileList& list, const TilePosition& tile) {
+  Splat records[kChunk];
+  BlockLists lists;
+  ChunkSums sums;
+  BlockGradient gradients[kBlocks];
+  uint32_t left[kBlocks], total_left = 0;
+  for (int b = 0; b < kBlocks; ++b) {
+    left[b] = list.used[b];
+    total_left += left[b];
+    Pack16 image[5], gradient[5];
+    load_pixels(ws, ws.image.data(), tile, b, image);
+    load_pixels(ws, ws.image_gradient.data(), tile, b, gradient);
+    gradients[b].start(gradient, image);
+  }
+  for (uint32_t first = 0; first < list.count && total_left > 0; first += kChunk) {
+    const int n = int(std::min<uint32_t>(kChunk, list.count - first));
+    load_chunk(ws, list, first, n, records, lists);
+    for (int i = 0; i < n; ++i) {
+      prefetch(ws.gradient_rows.data() + size_t(kRowWidth) * uint32_t(records[i].gradient_row + uint32_t(tile.y)));
+    }
+    sums.clear(n);
+    for (int b = 0; b < kBlocks; ++b) {
+      const uint32_t entries = std::min<uint32_t>(lists.count[b], left[b]);
+      const float* none = nullptr;
+      if (entries > 0) walk_back<false>(records, lists.entry[b], int(entries), tile, b, gradients[b], sums, none);
+      left[b] -= entries;
+      total_left -= entries;
+    }
+    add_to_rows(ws, records, n, tile, sums);
+  }
+}
+
+}  // namespace
+
+void backward_strip(Workspace& ws, int strip, int) {
+  for (int x = 0; x < ws.tiles_x; ++x) {
+    const size_t t = size_t(strip) * size_t(ws.tiles_x) + size_t(x);
+    if (ws.active_tiles == nullptr || ws.active_tiles[t]) backward_tile(ws, ws.tiles[t], TilePosition(ws, x, strip));
+  }
+}
+
+}  // namespace gausslite::GAUSSLITE_ISA

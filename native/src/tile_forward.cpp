@@ -1,0 +1,58 @@
+// SPDX-License-Identifier: Apache-2.0
+// Stage 4: draw the tiles of a strip, keeping what the backward pass needs to walk the same lists.
+#include <algorithm>
+
+#include "block_forward.h"
+#include "stage_functions.h"
+#include "tile_chunk.h"
+
+namespace gausslite::GAUSSLITE_ISA {
+
+namespace {
+
+void store_pixels(Workspace& ws, const TilePosition& tile, int b, const BlockState& state) {
+  float* out = ws.image.data() + tile.block(ws, b);
+  store_block(out, ws.padded_width, state.r);
+  store_block(out + ws.plane, ws.padded_width, state.g);
+  store_block(out + 2 * ws.plane, ws.padded_width, state.b);
+  store_block(out + 3 * ws.plane, ws.padded_width, state.depth);
+  store_block(out + 4 * ws.plane, ws.padded_width, state.transmittance);
+}
+
+void draw_tile(Workspace& ws, TileList& list, const TilePosition& tile) {
+  Splat records[kChunk];
+  BlockLists lists;
+  BlockState state[kBlocks];
+  std::fill_n(list.used, kBlocks, 0);
+  uint32_t finished = 0;
+  for (uint32_t first = 0; first < list.count && finished != 0xFFFF; first += kChunk) {
+    load_chunk(ws, list, first, int(std::min<uint32_t>(kChunk, list.count - first)), records, lists);
+    for (int b = 0; b < kBlocks; ++b) {
+      if (finished >> b & 1u) continue;
+      float* none = nullptr;
+      const int taken = composite<false>(records, lists.entry[b], lists.count[b], tile.pixel_x(b), tile.pixel_y(b), state[b], none);
+      list.used[b] += uint32_t(taken);
+      if (state[b].finished()) finished |= 1u << b;
+    }
+  }
+  for (int b = 0; b < kBlocks; ++b) store_pixels(ws, tile, b, state[b]);
+}
+
+}  // namespace
+
+void draw_strip(Workspace& ws, int strip, int thread) {
+  int count = 0;
+  const DepthKey* keys = sort_strip(ws, strip, thread, count);
+  bin_strip(ws, strip, keys, count);
+  for (int x = 0; x < ws.tiles_x; ++x) {
+    const size_t t = size_t(strip) * size_t(ws.tiles_x) + size_t(x);
+    const TilePosition tile(ws, x, strip);
+    if (ws.active_tiles != nullptr && !ws.active_tiles[t]) {
+      for (int b = 0; b < kBlocks; ++b) store_pixels(ws, tile, b, BlockState{});
+    } else {
+      draw_tile(ws, ws.tiles[t], tile);
+    }
+  }
+}
+
+}  // namespace gausslite::GAUSSLITE_ISA

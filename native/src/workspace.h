@@ -1,0 +1,107 @@
+// SPDX-License-Identifier: Apache-2.0
+// The scratch memory that one frame's stages hand to each other. It knows nothing of instruction sets.
+#pragma once
+
+#include <atomic>
+#include <cstdint>
+#include <vector>
+
+#include "camera.h"
+#include "memory.h"
+
+namespace gausslite {
+
+// A projected splat in one cache line. log2(alpha) at a pixel d = pixel - mean is
+// log2_opacity - (quad_xx dx dx + quad_xy dx dy + quad_yy dy dy).
+struct alignas(64) Splat {
+  float mean_x, mean_y;
+  float quad_xx, quad_xy, quad_yy;
+  float log2_opacity;
+  float r, g, b, depth;
+  float slope_y;          // the dy that minimises the quadric for dx = 1 ...
+  float slope_x;          // ... and the dx for dy = 1: the exact ellipse-block test needs them
+  uint16_t block_x0, block_x1, block_y0, block_y1;  // 4x4 blocks that its bounding box touches, both ends included
+  uint32_t gradient_row;  // its image gradients of tile row y are in row gradient_row + y (modulo 2^32)
+  uint32_t elongated;     // 1 when the bounding box is a poor stand-in for the ellipse
+};
+static_assert(sizeof(Splat) == 64);
+
+// What the projection's backward pass needs to know of a visible splat.
+struct Visible {
+  uint32_t id;            // its parameter row
+  uint32_t gradient_row;  // the first of its image gradient rows, one per tile row that it touches
+  uint32_t gradient_rows;
+};
+
+struct DepthKey {
+  uint32_t depth, slot;  // bits of the positive float depth; index into Workspace::splats
+};
+
+struct KeyList {
+  Buffer<DepthKey> keys;
+  uint32_t count = 0;
+};
+
+// The splats of a tile, nearest first, and the 4x4 blocks that each one touches (bit 4 row + column).
+struct TileList {
+  Buffer<uint32_t> slots;
+  Buffer<uint16_t> blocks;
+  uint32_t count = 0;
+  uint32_t used[kBlocks];  // entries of each block's list that were composited before all of its pixels were finished
+};
+
+constexpr int kChunk = 64;          // splats of a tile that are handled at a time: their records stay in the first-level cache
+constexpr int kPrefetchAhead = 24;  // keys
+constexpr int kSegment = 4096;      // parameter rows that are projected as a unit, always by the same thread
+
+// The entries of a chunk that touch each block, in order. Rows have slack for whole-register writes.
+struct BlockLists {
+  alignas(64) uint8_t entry[kBlocks][kChunk + 32];
+  uint16_t count[kBlocks];
+};
+
+struct ThreadScratch {
+  std::vector<KeyList> strips;  // by tile row: the splats of this thread's segments that touch it
+  Buffer<DepthKey> sorted[2];
+  Buffer<Splat> records;        // the fused pass: a tile's splats, block lists and alphas between its two directions
+  Buffer<BlockLists> lists;
+  Buffer<float> alphas;
+  Buffer<float> ssim;           // row buffers of the SSIM loss
+  uint32_t next_row = 0, last_row = 0;  // the block of gradient rows this thread is handing out
+};
+
+struct Workspace {
+  Camera camera;
+  int tiles_x = 0, tiles_y = 0, padded_width = 0;
+  int64_t plane = 0;  // floats in one padded image plane
+  int threads = 1;
+
+  // Input of the frame. `count` entries: rows `ids[0..count)`, or rows 0..count when ids is null.
+  const float* rows = nullptr;
+  const uint32_t* ids = nullptr;
+  uint32_t count = 0;
+  const uint8_t* active_tiles = nullptr;  // null: all
+  Buffer<uint16_t> active_before;         // [tile row][tile column + 1]: active tiles to the left
+
+  // Projection. A segment's visible splats are packed to its front: slots segment * kSegment + 0 .. segment_visible.
+  Buffer<Splat> splats;
+  Buffer<Visible> visible;
+  Buffer<uint32_t> segment_visible;
+  Buffer<uint32_t> segment_keys;  // [segment][tile row]: end of the segment's keys in its thread's list
+  uint32_t segments = 0;
+
+  // Raster. image: red, green, blue, depth, transmittance; image_gradient: by red, green, blue, depth, alpha.
+  std::vector<TileList> tiles;
+  Buffer<float> image, image_gradient;
+  // Gradient rows are owned by one (splat, tile row) pair each, so that no two threads add to the same one and the sum over a
+  // splat's rows has a fixed order: results do not depend on the number of threads. `tag` marks the rows written in this
+  // pass; stale ones count as zero and are never cleared.
+  Buffer<float> gradient_rows;
+  std::atomic<uint32_t> gradient_rows_used{0};
+  uint32_t tag = 0;
+
+  std::vector<ThreadScratch> scratch;
+  std::atomic<int> ticket{0};  // dynamic scheduling of tile rows; reset between stages
+};
+
+}  // namespace gausslite

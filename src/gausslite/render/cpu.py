@@ -1,0 +1,245 @@
+"""The native CPU backend: checks its input, then hands whole iterations to the C++ kernels."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Bool, Float32, Float64, UInt8, UInt32
+from numpy import ndarray
+
+from gausslite.domain.arrays import require_array
+from gausslite.domain.camera import Camera
+from gausslite.errors import InvalidInputError, KernelError, ShapeError
+from gausslite.render.rasterizer import (
+    EVERYTHING,
+    ROW_WIDTH,
+    TILE_PX,
+    AdamSettings,
+    LossWeights,
+    Rendering,
+    SplatGradients,
+    StepReport,
+    Subset,
+    TrainingView,
+)
+
+if TYPE_CHECKING:
+    from gausslite.render import _kernels
+
+SIMD_VARIABLE = "GAUSSLITE_SIMD"
+MAX_THREADS = 256
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CpuView:
+    """A training image inside the native backend."""
+
+    camera: Camera
+    native: _kernels.View
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Drawn:
+    """Which frame of which rasterizer a rendering is, and the rows it was drawn from: the way back reads them again."""
+
+    owner: CpuRasterizer
+    frame: int
+    rows: Float32[ndarray, "n 16"]
+    T_camera_world: Float64[ndarray, "4 4"]
+
+
+class CpuRasterizer:
+    """C++ kernels with a persistent team of threads; results do not depend on the number of threads.
+
+    threads: by default one per core this process may use. simd: `avx512`, `avx2` or `portable`; by default the
+    environment variable GAUSSLITE_SIMD, and without it the fastest this machine runs. Raises KernelError when the
+    kernels are not built or the choice is impossible. Threads do not survive a fork: build it in the child.
+    """
+
+    def __init__(self, threads: int | None = None, simd: str | None = None) -> None:
+        kernels = _load_kernels()
+        self._simd = _choose_simd(simd, kernels.usable_simd())
+        self._engine = kernels.Engine(self._simd, _choose_threads(threads))
+
+    @property
+    def name(self) -> str:
+        """`cpu`."""
+        return "cpu"
+
+    @property
+    def simd(self) -> str:
+        """The instruction set in use."""
+        return self._simd
+
+    @property
+    def threads(self) -> int:
+        """Members of the team, the caller included."""
+        return int(self._engine.threads)
+
+    def forward(
+        self,
+        rows: Float32[ndarray, "n 16"],
+        camera: Camera,
+        T_camera_world: Float64[ndarray, "4 4"],
+        subset: Subset = EVERYTHING,
+    ) -> Rendering:
+        """Draw the splats. Raises ShapeError, InvalidInputError for ids that are not ascending rows."""
+        _require_table("rows", rows, None)
+        _require_scene(len(rows), camera, T_camera_world, subset)
+        T_camera_world = np.ascontiguousarray(T_camera_world)
+        rgb, depth_m, alpha, frame = self._engine.forward(
+            rows, _intrinsics(camera), T_camera_world, _contiguous(subset.tiles), _contiguous(subset.ids)
+        )
+        return Rendering(rgb, depth_m, alpha, _Drawn(self, frame, rows, T_camera_world))
+
+    def backward(
+        self,
+        rendering: Rendering,
+        d_rgb: Float32[ndarray, "h w 3"],
+        d_depth_m: Float32[ndarray, "h w"],
+        d_alpha: Float32[ndarray, "h w"],
+    ) -> SplatGradients:
+        """Gradients of a scalar whose derivatives by the rendering's images are given.
+
+        The rows must not have changed since. Raises ShapeError, InvalidInputError for a rendering that is not this
+        backend's latest.
+        """
+        drawn = rendering.context
+        if not isinstance(drawn, _Drawn) or drawn.owner is not self or drawn.frame != self._engine.frame:
+            raise InvalidInputError("rendering: expected the latest forward of this rasterizer, got another one")
+        size = rendering.alpha.shape
+        require_array("d_rgb", d_rgb, (*size, 3), np.float32)
+        require_array("d_depth_m", d_depth_m, size, np.float32)
+        require_array("d_alpha", d_alpha, size, np.float32)
+        d_rows, d_twist, visible, norms = self._engine.backward(
+            drawn.frame,
+            len(drawn.rows),
+            np.ascontiguousarray(d_rgb),
+            np.ascontiguousarray(d_depth_m),
+            np.ascontiguousarray(d_alpha),
+        )
+        return SplatGradients(d_rows, d_twist, visible, norms)
+
+    def prepare_view(
+        self,
+        rgb: UInt8[ndarray, "h w 3"],
+        depth_m: Float32[ndarray, "h w"],
+        camera: Camera,
+        weight: Float32[ndarray, "h w"] | None = None,
+    ) -> TrainingView:
+        """Make an image ready to train on. Raises ShapeError, InvalidInputError for weights outside [0, 1]."""
+        size = (camera.height_px, camera.width_px)
+        require_array("view rgb", rgb, (*size, 3), np.uint8)
+        require_array("view depth_m", depth_m, size, np.float32)
+        if weight is not None:
+            require_array("view weight", weight, size, np.float32)
+            if not ((weight >= 0.0) & (weight <= 1.0)).all():
+                raise InvalidInputError(f"view weight: expected values in [0, 1], got {weight.min()} to {weight.max()}")
+        native = self._engine.prepare_view(
+            np.ascontiguousarray(rgb), np.ascontiguousarray(depth_m), _contiguous(weight)
+        )
+        return CpuView(camera, native)
+
+    def step(
+        self,
+        rows: Float32[ndarray, "n 16"],
+        first_moment: Float32[ndarray, "n 16"],
+        second_moment: Float32[ndarray, "n 16"],
+        view: TrainingView,
+        T_camera_world: Float64[ndarray, "4 4"],
+        loss: LossWeights,
+        adam: AdamSettings,
+        masked: bool = False,
+        subset: Subset = EVERYTHING,
+        trainable: Bool[ndarray, " n"] | None = None,
+    ) -> StepReport:
+        """One whole iteration in place. Raises ShapeError, also for a view of another backend."""
+        if not isinstance(view, CpuView):
+            raise ShapeError(f"view: expected one that this backend prepared, got {type(view).__name__}")
+        n = len(rows)
+        for name, table in (("rows", rows), ("first_moment", first_moment), ("second_moment", second_moment)):
+            _require_table(name, table, n)
+            if not table.flags.writeable:
+                raise ShapeError(f"{name}: expected a writeable array, got a read-only one")
+        _require_scene(n, view.camera, T_camera_world, subset)
+        if trainable is not None:
+            require_array("trainable", trainable, (n,), np.bool_)
+        value, visible = self._engine.step(
+            rows,
+            first_moment,
+            second_moment,
+            view.native,
+            _intrinsics(view.camera),
+            np.ascontiguousarray(T_camera_world),
+            (loss.colour, loss.depth, loss.ssim),
+            adam.row_rates().tolist(),
+            (adam.beta1, adam.beta2, adam.epsilon),
+            masked,
+            _contiguous(subset.tiles),
+            _contiguous(subset.ids),
+            _contiguous(trainable),
+        )
+        return StepReport(value, visible)
+
+    def stage_times_ms(self) -> dict[str, float]:
+        """Milliseconds that the stages of the latest call took: project, raster, loss, backward, update."""
+        return self._engine.stage_times_ms()
+
+
+def _load_kernels() -> Any:
+    try:
+        from gausslite.render import _kernels
+    except ImportError as reason:
+        raise KernelError(
+            f"native kernels: not built for this Python; install the package again ({reason})"
+        ) from reason
+    return _kernels
+
+
+def _choose_simd(asked: str | None, usable: list[str]) -> str:
+    chosen = asked or os.environ.get(SIMD_VARIABLE) or usable[0]
+    if chosen not in usable:
+        source = "simd" if asked else SIMD_VARIABLE
+        raise KernelError(f"{source}: expected one of {', '.join(usable)} on this machine, got {chosen}")
+    return chosen
+
+
+def _choose_threads(asked: int | None) -> int:
+    if asked is None:
+        available = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        return min(available, MAX_THREADS)
+    if not 1 <= asked <= MAX_THREADS:
+        raise KernelError(f"threads: expected 1 to {MAX_THREADS}, got {asked}")
+    return asked
+
+
+def _intrinsics(camera: Camera) -> tuple[float, float, float, float, int, int]:
+    return camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px, camera.width_px, camera.height_px
+
+
+def _contiguous(array: ndarray | None) -> ndarray | None:
+    return None if array is None else np.ascontiguousarray(array)
+
+
+def _require_table(name: str, table: Float32[ndarray, "n 16"], n: int | None) -> None:
+    require_array(name, table, (n, ROW_WIDTH), np.float32)
+    if not table.flags.c_contiguous:
+        raise ShapeError(f"{name}: expected contiguous rows, got strides {table.strides}")
+
+
+def _require_scene(n: int, camera: Camera, T_camera_world: Float64[ndarray, "4 4"], subset: Subset) -> None:
+    require_array("T_camera_world", T_camera_world, (4, 4), np.float64)
+    if subset.tiles is not None:
+        grid = (-(-camera.height_px // TILE_PX), -(-camera.width_px // TILE_PX))
+        require_array("subset tiles", subset.tiles, grid, np.bool_)
+    if subset.ids is not None:
+        require_array("subset ids", subset.ids, (None,), np.uint32)
+        _require_ascending(subset.ids, n)
+
+
+def _require_ascending(ids: UInt32[ndarray, " m"], n: int) -> None:
+    if len(ids) and (ids[-1] >= n or (ids[1:] <= ids[:-1]).any()):
+        raise InvalidInputError(f"subset ids: expected ascending row numbers below {n}, got others")

@@ -1,0 +1,10 @@
+#!/bin/sh
+# Builds the native kernels into the source tree, for work on them: tools/build_native.sh [PYTHON]. Installing the package does not need it.
+set -eu
+root=$(cd "$(dirname "$0")/.." && pwd)
+python=${1:-python3}
+cmake -S "$root/native" -B "$root/build/dev" -DPython_EXECUTABLE="$("$python" -c 'import sys; print(sys.executable)')" \
+  -Dnanobind_DIR="$("$python" -m nanobind --cmake_dir)" >/dev/null
+cmake --build "$root/build/dev" --parallel
+rm -f "$root"/src/gausslite/render/_kernels*.so
+cp "$root"/build/dev/_kernels*.so "$root/src/gausslite/render/"
