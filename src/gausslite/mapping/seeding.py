@@ -79,7 +79,12 @@ class Seeder:
         coarse = too_coarse(frame, relevance.roi, state.active_means_m, settings.roi_pixels_per_active)
         roi_pixels = seedable & relevance.roi & (coarse | self._open(frame, state, settings.roi_min_alpha))
         rest_pixels = open_pixels & ~relevance.roi
-        return _Pool(roi_pixels, roi_budget, False), self._rest_pool(rest_pixels, budget - roi_budget, state.room)
+        return self._roi_pool(roi_pixels, roi_budget), self._rest_pool(rest_pixels, budget - roi_budget, state.room)
+
+    def _roi_pool(self, pixels: Bool[ndarray, "h w"], budget: int) -> _Pool:
+        """No denser than the active Gaussians that the region is to have; its room is made by others."""
+        wanted = int(np.ceil(np.count_nonzero(pixels) / self._settings.roi_pixels_per_active))
+        return _Pool(pixels, min(budget, wanted), False)
 
     def _rest_pool(self, pixels: Bool[ndarray, "h w"], budget: int, room: int) -> _Pool:
         """No denser than leaves room for `reserved_views` more views as open as this whole image would be.

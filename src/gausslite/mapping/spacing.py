@@ -1,10 +1,11 @@
-"""Tell how far apart seeds lie, without a search tree a frame: s0 of Eq. (scale) from how densely pixels were drawn.
+"""Tell how far apart seeds lie, without a search tree a frame: s0 of Sec. III-C.2 from how densely pixels were drawn.
 
-Seeds drawn at a local density of λ a pixel have their median nearest neighbour at sqrt(ln 2 / (π λ)) pixels when they
-are scattered at random (a Poisson process), and at 0.63 / sqrt(λ), measured, when there is one in each cell of a grid.
-λ is counted over 48x48 pixels round a seed, but only over those a seed could have been drawn from, so that the seeds
-that fill a narrow gap do not pass for sparse ones. A pixel is depth / focal metres wide on a surface that faces the
-camera; on slanted surfaces the true distance is larger, so seeds start a little smaller there.
+s0 is the median of a seed's distances to its three nearest neighbours, that is, the distance to the second nearest.
+Seeds drawn at a density of λ a pixel have it at 0.73 / sqrt(λ) pixels when they are scattered at random (a Poisson
+process: π λ r² = 1.678), and at 0.89 / sqrt(λ), measured, when there is one in each cell of a grid. λ is counted over
+48x48 pixels round a seed, but only over those a seed could have been drawn from, so that the seeds that fill a narrow
+gap do not pass for sparse ones. A pixel is depth / focal metres wide on a surface that faces the camera; on slanted
+surfaces the true distance is larger, so seeds start a little smaller there.
 """
 
 from __future__ import annotations
@@ -15,15 +16,15 @@ from jaxtyping import Bool, Float32, Int64
 from numpy import ndarray
 
 _BLOCK_PX = 16
-_MEDIAN_POISSON = float(np.sqrt(np.log(2.0) / np.pi))
-_MEDIAN_STRATIFIED = 0.63
+_MEDIAN_SCATTERED = float(np.sqrt(1.6783 / np.pi))
+_MEDIAN_STRATIFIED = 0.89
 _MIN_SQUARED_M = 1e-7
 
 
 def neighbour_distance_px(
     pixels: Int64[ndarray, " n"], pool: Bool[ndarray, "h w"], stratified: bool
 ) -> Float32[ndarray, " n"]:
-    """Median distance to the nearest other seed round each seed, in pixels; at least one pixel.
+    """Median distance from each seed to its three nearest others, in pixels; at least one pixel.
 
     pixels: flat indices of seeds drawn from `pool`. stratified: they were drawn one a cell.
     """
@@ -33,7 +34,7 @@ def neighbour_distance_px(
     density = _round_about(seeds) / np.maximum(_round_about(pool.astype(np.float32)), 1.0)
     rows, columns = np.divmod(pixels, width)
     local = density[rows // _BLOCK_PX, columns // _BLOCK_PX]
-    factor = _MEDIAN_STRATIFIED if stratified else _MEDIAN_POISSON
+    factor = _MEDIAN_STRATIFIED if stratified else _MEDIAN_SCATTERED
     distance: Float32[ndarray, " n"] = np.maximum(factor / np.sqrt(local), 1.0).astype(np.float32)
     return distance
 
