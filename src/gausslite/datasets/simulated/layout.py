@@ -32,7 +32,12 @@ class Item:
 def paint_textures(seed: int) -> dict[str, Texture]:
     """Every texture of the home by name."""
     rng = np.random.default_rng([seed, 1])
-    plain = {
+    return _materials(rng) | _pictures(rng)
+
+
+def _materials(rng: np.random.Generator) -> dict[str, Texture]:
+    """What repeats."""
+    return {
         "oak": textures.wood(rng, (0.80, 0.58, 0.34)),
         "walnut": textures.wood(rng, (0.46, 0.30, 0.20), 0.6),
         "cherry": textures.wood(rng, (0.66, 0.34, 0.20), 0.5),
@@ -55,7 +60,11 @@ def paint_textures(seed: int) -> dict[str, Texture]:
         "orange": textures.mottled(rng, (0.96, 0.58, 0.14), 0.4),
         "bark": textures.wood(rng, (0.44, 0.36, 0.22), 0.2),
     }
-    fitted = {
+
+
+def _pictures(rng: np.random.Generator) -> dict[str, Texture]:
+    """What is fitted to a face."""
+    return {
         "mug_print": prints.mug_print(rng),
         "vase_print": prints.vase_print(rng),
         "cover_red": prints.book_cover(rng, (0.62, 0.16, 0.16)),
@@ -78,7 +87,6 @@ def paint_textures(seed: int) -> dict[str, Texture]:
         "rug": prints.rug(rng, (0.62, 0.16, 0.14)),
         "leaf": prints.leaf_veins(rng),
     }
-    return plain | fitted
 
 
 def furnish(seed: int) -> list[Item]:
