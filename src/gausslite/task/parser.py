@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import hashlib
 import unicodedata
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from gausslite.domain.task import TaskGraph
 
 _TASK_ID_HEX_DIGITS = 12
 
 
+@runtime_checkable
 class TaskParser(Protocol):
     """Reads a task in plain words."""
 
