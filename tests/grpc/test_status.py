@@ -1,0 +1,106 @@
+"""The one table between errors and codes: every error there, and the same class on the other side."""
+
+from __future__ import annotations
+
+import asyncio
+import inspect
+from typing import Any
+
+import grpc
+import pytest
+from serving import serving
+
+from gausslite import errors
+from gausslite.domain.task import TaskGraph
+from gausslite.errors import GaussLiteError, QuotaError, UnavailableError
+from gausslite.v1 import parser_service_pb2, parser_service_pb2_grpc
+from gausslite.wire.clients import ParserClient
+from gausslite.wire.server import MAX_MESSAGE_BYTES, Service
+from gausslite.wire.status import code_and_reason, error_from_reason
+
+ERRORS = [kind for _, kind in inspect.getmembers(errors, inspect.isclass) if issubclass(kind, GaussLiteError)]
+CODES = {
+    errors.InvalidInputError: grpc.StatusCode.INVALID_ARGUMENT,
+    errors.CodecError: grpc.StatusCode.INVALID_ARGUMENT,
+    errors.TaskError: grpc.StatusCode.INVALID_ARGUMENT,
+    errors.SessionUnknownError: grpc.StatusCode.NOT_FOUND,
+    errors.MismatchError: grpc.StatusCode.FAILED_PRECONDITION,
+    errors.RevisionGoneError: grpc.StatusCode.OUT_OF_RANGE,
+    errors.QuotaError: grpc.StatusCode.RESOURCE_EXHAUSTED,
+    errors.ChecksumError: grpc.StatusCode.DATA_LOSS,
+    errors.NotPermittedError: grpc.StatusCode.PERMISSION_DENIED,
+    errors.UnavailableError: grpc.StatusCode.UNAVAILABLE,
+}
+
+
+class Raising(parser_service_pb2_grpc.ParserServiceServicer):
+    """Raises the error whose name it is asked to parse."""
+
+    def __init__(self) -> None:
+        self.calls = 0
+
+    async def ParseTask(self, request: parser_service_pb2.ParseTaskRequest, context: Any) -> Any:
+        self.calls += 1
+        if request.text == "UNAUTHENTICATED":
+            await context.abort(grpc.StatusCode.UNAUTHENTICATED, "no certificate")
+        raise getattr(errors, request.text)("one line: what, what came")
+
+
+def service(servicer: Raising) -> Service:
+    return Service(
+        "gausslite.v1.ParserService",
+        lambda server: parser_service_pb2_grpc.add_ParserServiceServicer_to_server(servicer, server),
+    )
+
+
+@pytest.mark.parametrize("kind", ERRORS, ids=lambda kind: kind.__name__)
+def test_the_client_raises_what_the_server_raised(kind: type[GaussLiteError]) -> None:
+    servicer = Raising()
+    with (
+        serving([service(servicer)]) as server,
+        ParserClient(server.address) as client,
+        pytest.raises(GaussLiteError) as caught,
+    ):
+        client.parse(kind.__name__)
+    assert type(caught.value) is kind
+    assert str(caught.value) == "one line: what, what came"
+    # only what says "try again" is tried again
+    assert servicer.calls == (4 if kind is UnavailableError else 1)
+
+
+@pytest.mark.parametrize(("kind", "code"), CODES.items(), ids=lambda value: getattr(value, "__name__", ""))
+def test_codes_are_those_of_the_design(kind: type[GaussLiteError], code: grpc.StatusCode) -> None:
+    assert code_and_reason(kind("x"))[0] is code
+
+
+def test_every_error_has_a_reason_of_its_own() -> None:
+    reasons = [code_and_reason(kind("x"))[1] for kind in ERRORS]
+    assert len(set(reasons)) == len(ERRORS)
+    assert [type(error_from_reason(reason, "x")) for reason in reasons] == ERRORS
+    assert type(error_from_reason("OF_ANOTHER_VERSION", "x")) is GaussLiteError
+
+
+def test_what_strangers_say_becomes_the_class_of_its_code() -> None:
+    with serving([service(Raising())]) as server, ParserClient(server.address) as client:
+        with pytest.raises(errors.NotPermittedError, match="no certificate"):
+            client.parse("UNAUTHENTICATED")
+        with pytest.raises(QuotaError):
+            client.parse("x" * (MAX_MESSAGE_BYTES + 1))
+
+
+def test_a_server_that_takes_too_long_is_unavailable() -> None:
+    class Slow(parser_service_pb2_grpc.ParserServiceServicer):
+        async def ParseTask(self, request: Any, context: Any) -> TaskGraph:
+            await asyncio.Event().wait()
+            raise AssertionError
+
+    slow = Service(
+        "gausslite.v1.ParserService",
+        lambda server: parser_service_pb2_grpc.add_ParserServiceServicer_to_server(Slow(), server),
+    )
+    with (
+        serving([slow]) as server,
+        ParserClient(server.address, deadline_s=0.2) as client,
+        pytest.raises(UnavailableError, match="no answer in time"),
+    ):
+        client.parse("anything")
