@@ -1,11 +1,11 @@
-"""The task's attention (Sec. III-B): detect on keyframes, carry over between them, filter in space, merge to w(u, v)."""
+"""The task's attention (Sec. III-B): detect on keyframes, carry over between them, filter in 3D, merge to w(u, v)."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float32
@@ -22,6 +22,7 @@ from gausslite.perception.spatial import SpatialFilter, SpatialSettings, best_de
 from gausslite.perception.vocabulary import is_generic
 
 
+@runtime_checkable
 class Attention(Protocol):
     """Says for each frame which pixels the task is about."""
 

@@ -1,4 +1,4 @@
-"""The objects seen so far, in world coordinates: several sightings of one thing become one entry."""
+"""The objects seen so far, in world coordinates: partial sightings of one thing grow into one entry."""
 
 from __future__ import annotations
 
@@ -7,49 +7,85 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float32, Float64, Int64
 from numpy import ndarray
 
+from gausslite.domain.voxels import VoxelGrid
+
+_CELLS: Final = VoxelGrid(0.05)
 _MIN_REACH_M: Final = 0.15
-_MAX_OBJECTS: Final = 1000
+_MIN_SHARED: Final = 0.3
+_MAX_CELLS: Final = 4000
+_MAX_OBJECTS: Final = 500
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sighting:
-    """One object in one frame: its centroid in the world and the radius that holds most of its visible points."""
+    """One object in one frame: its centroid in the world, the cells of its surface, and its radius.
+
+    The radius is twice the median distance of its points to the centroid: masks of chairs let background through, and
+    the outermost points would measure that.
+    """
 
     phrase: str
     centroid_m: Float64[ndarray, "3"]
     radius_m: float
+    cells: Int64[ndarray, " k"]
+
+    @classmethod
+    def of_points(cls, phrase: str, points_m: Float64[ndarray, "n 3"]) -> Sighting:
+        """From the points of an object's mask; the centroid is their median, points far outside are left out."""
+        centroid = np.median(points_m, axis=0)
+        distances = np.linalg.norm(points_m - centroid, axis=1)
+        radius_m = 2.0 * float(np.median(distances))
+        own = points_m[distances <= 2.0 * max(radius_m, _MIN_REACH_M)]
+        return cls(phrase, centroid, radius_m, np.unique(_CELLS.keys(own.astype(np.float32))))
 
 
 @dataclass(slots=True, eq=False)
 class Remembered:
-    """One object over all its sightings: the mean centroid, the largest radius, how often it was seen."""
+    """One object over all its sightings. Its centroid is the mean over cells, wherever the camera dwelt."""
 
-    sighting: Sighting
+    phrase: str
+    centroid_m: Float64[ndarray, "3"]
+    radius_m: float
+    cells: Int64[ndarray, " k"]
+    counts: Int64[ndarray, " k"]
     seen: int = 1
 
-    @property
-    def phrase(self) -> str:
-        """The noun phrase it answers."""
-        return self.sighting.phrase
+    @classmethod
+    def from_sighting(cls, sighting: Sighting) -> Remembered:
+        """The first sighting of an object."""
+        counts = np.ones(len(sighting.cells), np.int64)
+        return cls(sighting.phrase, sighting.centroid_m, sighting.radius_m, sighting.cells, counts)
 
-    @property
-    def centroid_m(self) -> Float64[ndarray, "3"]:
-        """Where it is on average."""
-        return self.sighting.centroid_m
-
-    def is_same_object(self, other: Sighting) -> bool:
-        """True when a sighting is so near that it must be this object, whatever it was called."""
-        reach_m = max(_MIN_REACH_M, 0.75 * min(self.sighting.radius_m, other.radius_m))
+    def is_at(self, other: Sighting) -> bool:
+        """True when the centroids are so near that both must be one object, whatever they were called."""
+        reach_m = max(_MIN_REACH_M, 0.75 * min(self.radius_m, other.radius_m))
         return float(np.linalg.norm(self.centroid_m - other.centroid_m)) < reach_m
 
-    def add(self, other: Sighting) -> None:
-        """Take one more sighting into the mean."""
-        self.seen += 1
-        centroid = self.centroid_m + (other.centroid_m - self.centroid_m) / self.seen
-        self.sighting = Sighting(self.phrase, centroid, max(self.sighting.radius_m, other.radius_m))
+    def matches(self, other: Sighting) -> bool:
+        """True when a sighting of the same phrase shows this object, in whole or in part."""
+        shared = len(np.intersect1d(self.cells, other.cells, assume_unique=True))
+        return self.is_at(other) or shared >= _MIN_SHARED * max(1, min(len(self.cells), len(other.cells)))
+
+    def add(self, cells: Int64[ndarray, " k"], counts: Int64[ndarray, " k"], seen: int) -> None:
+        """Take more cells into the object and find its centre anew."""
+        self.seen += seen
+        merged, where = np.unique(np.concatenate([self.cells, cells]), return_inverse=True)
+        total = np.bincount(where, weights=np.concatenate([self.counts, counts])).astype(np.int64)
+        if len(merged) > _MAX_CELLS:
+            often = np.sort(np.argsort(-total, kind="stable")[:_MAX_CELLS])
+            merged, total = merged[often], total[often]
+        self.cells, self.counts = merged, total
+        centres = self.footprint_m().astype(np.float64)
+        self.centroid_m = centres.mean(axis=0)
+        self.radius_m = 2.0 * float(np.median(np.linalg.norm(centres - self.centroid_m, axis=1)))
+
+    def footprint_m(self) -> Float32[ndarray, "k 3"]:
+        """Centres of the cells seen more than once, or of all while that would be few."""
+        firm = self.cells[self.counts > 1]
+        return _CELLS.centres_m(firm if 2 * len(firm) >= len(self.cells) else self.cells)
 
 
 class ObjectMemory:
@@ -73,13 +109,15 @@ class ObjectMemory:
         return [each for each in candidates if each.seen > 1] or candidates
 
     def observe(self, sightings: Sequence[Sighting]) -> None:
-        """Add one frame's sightings to the nearest entries of the same phrase, or as new entries."""
+        """Add one frame's sightings to the objects they show; one that joins several makes them one."""
         for sighting in sightings:
-            same = [each for each in self.named(sighting.phrase) if each.is_same_object(sighting)]
-            if same:
-                min(same, key=lambda each: float(np.linalg.norm(each.centroid_m - sighting.centroid_m))).add(sighting)
-            else:
-                self._objects.append(Remembered(sighting))
-        if len(self._objects) > _MAX_OBJECTS:
-            rarest = min(range(len(self._objects)), key=lambda index: self._objects[index].seen)
-            del self._objects[rarest]
+            same = [each for each in self.named(sighting.phrase) if each.matches(sighting)]
+            if not same:
+                self._objects.append(Remembered.from_sighting(sighting))
+                continue
+            same[0].add(sighting.cells, np.ones(len(sighting.cells), np.int64), 1)
+            for other in same[1:]:
+                same[0].add(other.cells, other.counts, other.seen)
+                self._objects.remove(other)
+        while len(self._objects) > _MAX_OBJECTS:
+            self._objects.remove(min(self._objects, key=lambda each: each.seen))

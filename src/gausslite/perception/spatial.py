@@ -17,11 +17,12 @@ from gausslite.perception.memory import ObjectMemory, Remembered, Sighting
 
 _MIN_PIXELS = 8
 _MAX_PIXELS = 4000
+_FOOTPRINT_SLACK_M = 0.10
 
 
 @dataclass(frozen=True, slots=True)
 class SpatialSettings:
-    """near: distance under near_m. on: higher than the anchor and less than on_m aside."""
+    """near: distance under near_m. on: higher than the anchor, and less than on_m aside or over it."""
 
     near_m: float = 1.0
     on_m: float = 0.5
@@ -58,7 +59,7 @@ def sight(
 ) -> Sighting | None:
     """Lift a mask to its centroid in the world; None where too few of its pixels have depth.
 
-    The centroid is the median of the lifted points, so that background at the mask's rim does not pull it away.
+    Instead of the one pixel at the 2D centroid, which may lie beside the object, all its pixels are lifted.
     """
     rows, columns = np.nonzero(mask & (depth_m > 0))
     if len(rows) < _MIN_PIXELS:
@@ -69,9 +70,7 @@ def sight(
     x = (columns + 0.5 - camera.cx_px) / camera.fx_px * z
     y = (rows + 0.5 - camera.cy_px) / camera.fy_px * z
     points = transform_points(T_world_camera, np.stack([x, y, z], axis=1))
-    centroid = np.median(points, axis=0)
-    radius_m = float(np.percentile(np.linalg.norm(points - centroid, axis=1), 90))
-    return Sighting(phrase, centroid, radius_m)
+    return Sighting.of_points(phrase, points)
 
 
 class SpatialFilter:
@@ -110,36 +109,42 @@ class SpatialFilter:
         return not judged or any(self._holds(relation, sighting) for relation in judged)
 
     def _holds(self, relation: Relation, sighting: Sighting) -> bool:
-        anchors = [each for each in self._memory.named(relation.anchor) if not each.is_same_object(sighting)]
         if relation.predicate is Predicate.CLOSEST_TO:
             return self._is_closest(relation, sighting)
+        anchors = [each for each in self._memory.named(relation.anchor) if not each.is_at(sighting)]
         if relation.predicate is Predicate.ON:
             return any(self._is_on(sighting.centroid_m, anchor) for anchor in anchors)
-        return any(
-            float(np.linalg.norm(sighting.centroid_m - anchor.centroid_m)) < self._settings.near_m for anchor in anchors
-        )
+        return any(_distance_m(sighting.centroid_m, anchor.centroid_m) < self._settings.near_m for anchor in anchors)
 
     def _is_on(self, centroid_m: Float64[ndarray, "3"], anchor: Remembered) -> bool:
-        offset = centroid_m - anchor.centroid_m
-        height_m = float(offset @ self._up)
-        aside_m = float(np.linalg.norm(offset - height_m * self._up))
-        return height_m > 0.0 and aside_m < self._settings.on_m
+        """Higher than the anchor's centroid, and less than on_m aside of it or over its footprint."""
+        height_m, aside_m = self._offset_m(centroid_m, anchor.centroid_m[None])
+        if height_m[0] <= 0.0:
+            return False
+        if aside_m[0] < self._settings.on_m:
+            return True
+        _, beside_m = self._offset_m(centroid_m, anchor.footprint_m().astype(np.float64))
+        return bool(beside_m.min() < _FOOTPRINT_SLACK_M)
+
+    def _offset_m(
+        self, point_m: Float64[ndarray, "3"], from_m: Float64[ndarray, "n 3"]
+    ) -> tuple[Float64[ndarray, " n"], Float64[ndarray, " n"]]:
+        """How much higher, and how far aside horizontally, a point is from others."""
+        offset = point_m - from_m
+        height = offset @ self._up
+        return height, np.linalg.norm(offset - height[:, None] * self._up, axis=1)
 
     def _is_closest(self, relation: Relation, sighting: Sighting) -> bool:
         """Only the candidate with the least distance to an anchor, of all that were ever seen, is the closest."""
         anchors = self._memory.named(relation.anchor)
-        candidates = self._memory.confirmed(relation.target)
-        distances = [
-            min(
-                (
-                    float(np.linalg.norm(candidate.centroid_m - anchor.centroid_m))
-                    for anchor in anchors
-                    if not anchor.is_same_object(candidate.sighting)
-                ),
-                default=np.inf,
-            )
-            for candidate in candidates
-        ]
-        if not distances:
-            return False
-        return candidates[int(np.argmin(distances))].is_same_object(sighting)
+        best, least_m = None, np.inf
+        for candidate in self._memory.confirmed(relation.target):
+            for anchor in anchors:
+                distance_m = _distance_m(candidate.centroid_m, anchor.centroid_m)
+                if candidate is not anchor and distance_m < least_m:
+                    best, least_m = candidate, distance_m
+        return best is not None and best.matches(sighting)
+
+
+def _distance_m(a_m: Float64[ndarray, "3"], b_m: Float64[ndarray, "3"]) -> float:
+    return float(np.linalg.norm(a_m - b_m))

@@ -19,6 +19,11 @@ FURNITURE: Final = frozenset(
      "wall", "floor", "rug", "carpet", "car", "truck", "bus", "van", "boat", "train", "airplane", "tree", "person",
      "piano", "workbench", "nightstand", "ottoman", "television", "whiteboard", "curtain", "fence", "gate"}
 )  # fmt: skip
+# what a robot stands in front of: rightly fills most of an image
+SURFACE: Final = frozenset(
+    {"table", "desk", "counter", "countertop", "bed", "workbench", "wall", "floor", "ceiling", "door", "rug", "carpet",
+     "lawn", "grass", "road", "whiteboard"}
+)  # fmt: skip
 # phrases that name one kind of thing; the first of each row is the word the others are read as
 _SAME: Final = (
     ("cup", "mug", "teacup", "coffee mug", "coffee cup", "tumbler", "paper cup"),
@@ -79,6 +84,11 @@ def is_generic(phrase: str) -> bool:
 def is_structure(phrase: str) -> bool:
     """True for walls, floors, rooms and the like."""
     return head_of(phrase) in STRUCTURE
+
+
+def is_surface(phrase: str) -> bool:
+    """True for tables, beds, walls and the like."""
+    return head_of(phrase) in SURFACE
 
 
 def is_furniture(phrase: str) -> bool:
