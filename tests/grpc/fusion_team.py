@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import asyncio
-import re
 import subprocess
 import sys
-import threading
+import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -97,25 +96,20 @@ def team(
 
 
 @contextmanager
-def server_process(*arguments: str) -> Iterator[tuple[subprocess.Popen[str], FusionClient]]:
-    """A server in a process of its own on a free port, which its log tells; killed at the end."""
-    process = subprocess.Popen([*COMMAND, "--listen", "127.0.0.1:0", *arguments], stderr=subprocess.PIPE, text=True)
-    assert process.stderr is not None
-    try:
-        found = next(filter(None, (re.search(r"listens on (\S+)", line) for line in process.stderr)))
-        # a log that nobody reads would in the end block the server
-        reader = threading.Thread(target=process.stderr.read)
-        reader.start()
+def server_process(*arguments: str) -> Iterator[tuple[subprocess.Popen[bytes], FusionClient]]:
+    """A server in a process of its own that is ready to answer; killed at the end."""
+    with tempfile.TemporaryDirectory() as folder:
+        address = f"unix:{folder}/fusion.sock"
+        process = subprocess.Popen([*COMMAND, "--listen", address, *arguments], stderr=subprocess.DEVNULL)
         try:
-            with FusionClient(found[1], deadline_s=20.0) as client:
+            options = [("grpc.initial_reconnect_backoff_ms", 100), ("grpc.max_reconnect_backoff_ms", 200)]
+            with grpc.insecure_channel(address, options) as channel:
+                grpc.channel_ready_future(channel).result(30)
+            with FusionClient(address, deadline_s=20.0) as client:
                 yield process, client
         finally:
             process.kill()
-            reader.join(20)
-    finally:
-        process.kill()
-        process.wait(20)
-        process.stderr.close()
+            process.wait(20)
 
 
 def words(cells: dict[int, Sequence[int]]) -> VoxelWords:

@@ -33,7 +33,7 @@ fuzz = settings(max_examples=50, deadline=None)
 class Target:
     """A server in a process of its own: its threads would otherwise draw random numbers beside hypothesis."""
 
-    process: subprocess.Popen[str]
+    process: subprocess.Popen[bytes]
     client: FusionClient
     channel: grpc.Channel
     session_id: str

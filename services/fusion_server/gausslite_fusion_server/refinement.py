@@ -12,7 +12,7 @@ from gausslite.errors import QuotaError
 from gausslite.fusion.refine import RefineProgress, RefineSettings, refine
 from gausslite.fusion.team import TeamMap
 from gausslite.render.rasterizer import Rasterizer
-from gausslite_fusion_server.bell import Bell
+from gausslite.wire.bell import Bell
 
 MAX_ITERATIONS = 30_000
 

@@ -31,10 +31,10 @@ from gausslite.fusion.team import Changes, TeamMap
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.v1 import fusion_service_pb2_grpc as pb_grpc
 from gausslite.v1.gaussians_pb2 import MapBlock
+from gausslite.wire.bell import Bell
 from gausslite.wire.convert import box_from_message, frame_from_message, grid_from_message, grid_to_message
 from gausslite.wire.server import Service
 from gausslite.wire.status import code_and_reason
-from gausslite_fusion_server.bell import Bell
 from gausslite_fusion_server.door import Door
 from gausslite_fusion_server.map_blocks import map_blocks
 from gausslite_fusion_server.refinement import RefineOrder, Refinery

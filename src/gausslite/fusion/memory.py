@@ -33,11 +33,6 @@ class MemoryStore:
         self._sessions: dict[str, Session] = {}
         self._charter: Charter | None = None
 
-    @property
-    def durable(self) -> bool:
-        """False: the contents end with the process."""
-        return False
-
     def put(self, subset: RoiSubset) -> PutOutcome:
         """Take in one message; a word that is not newer than the one held is stale. Raises InvalidInputError."""
         require_storable(subset)

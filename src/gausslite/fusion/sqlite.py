@@ -54,11 +54,6 @@ class SqliteStore:
             self._db.close()
             raise
 
-    @property
-    def durable(self) -> bool:
-        """True: the contents outlive the process."""
-        return True
-
     def put(self, subset: RoiSubset) -> PutOutcome:
         """Take in one message in one transaction. Raises InvalidInputError, StorageError."""
         require_storable(subset)

@@ -66,11 +66,6 @@ class FusionStore(Protocol):
     has it. All raise StorageError when the storage refuses; the store stays usable for what it still can do.
     """
 
-    @property
-    def durable(self) -> bool:
-        """Whether the contents outlive the process."""
-        ...
-
     def put(self, subset: RoiSubset) -> PutOutcome:
         """Take in one message, all of it or (on an error) nothing. Raises InvalidInputError."""
         ...
