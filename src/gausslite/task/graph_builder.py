@@ -104,7 +104,7 @@ class GraphBuilder:
                 self._place(each, pending, joined, after)
 
     def _dropped(self, noun: NounPhrase, pending: str | None, after: Piece | None) -> None:
-        """ "the edge of the table" hands its preposition on to the table; "a path to the door" makes the door a goal."""
+        """The edge of the table hands its preposition on to the table; a path to the door makes the door a goal."""
         if noun.head in lexicon.ROUTES:
             self._clause.route = True
         elif noun.head in lexicon.PLACES and pending is None:
@@ -158,7 +158,7 @@ class GraphBuilder:
         return bool(self._clause.subjects) and pending in _DESTINATIONS and not more
 
     def _belongs_to_anchor(self, noun: NounPhrase, after: Piece | None) -> bool:
-        """ "near the sink and the stove": both locate; "on the table and the keys": the keys are a target of their own."""
+        """Near the sink and the stove: both locate. On the table and the keys: the keys are a target of their own."""
         if after is not None and after.kind is Kind.PREPOSITION and after.word not in ("of", "to", "for", "with"):
             return False
         if self._clause.last_relation == "between":
@@ -215,7 +215,7 @@ class GraphBuilder:
             clause.last_relation = "to"
 
     def _sought(self, noun: NounPhrase) -> None:
-        """ "search the desk for keys" seeks the keys and only looks at the desk."""
+        """Searching the desk for keys seeks the keys and only looks at the desk."""
         clause = self._clause
         if clause.subjects and clause.verb in lexicon.SEARCH_VERBS:
             places, clause.subjects = clause.subjects, []
@@ -260,7 +260,7 @@ class _Clause:
 
 
 def _described(adjective: NounPhrase, noun: NounPhrase) -> NounPhrase:
-    """ "red and blue mugs": red takes the head that it shares."""
+    """In "red and blue mugs", red takes the head that it shares."""
     return NounPhrase((*adjective.words, noun.head), adjective.determined, noun.superlative)
 
 

@@ -5,33 +5,30 @@ from __future__ import annotations
 from typing import Final
 
 from gausslite.task.nouns import CONTAINERS, LANDMARKS, NOUNS, ROOMS
+from gausslite.task.words import words
 
 __all__ = ["CONTAINERS", "LANDMARKS", "NOUNS", "ROOMS"]
 
 
-def _words(text: str) -> frozenset[str]:
-    return frozenset(text.split())
-
-
 # verbs by what becomes of the nouns around them
-GO_VERBS: Final = _words(
+GO_VERBS: Final = words(
     "go navigate drive move walk head proceed travel come approach reach follow cross enter exit return run roll fly "
     "advance get steer park dock explore patrol roam tour wander visit escort"
 )
-CARRY_VERBS: Final = _words(
+CARRY_VERBS: Final = words(
     "bring take carry deliver fetch hand pass give transport haul transfer relocate send shift drag push pull slide "
     "connect attach plug mount fasten screw glue tape"
 )
-PLACE_VERBS: Final = _words(
+PLACE_VERBS: Final = words(
     "put place set drop leave stack hang throw load insert pour store stow deposit unload position arrange rest dump "
     "toss lay pile plant"
 )
-TOOL_VERBS: Final = _words(
+TOOL_VERBS: Final = words(
     "clean wipe vacuum sweep mop wash scrub dust polish rinse disinfect sanitize sanitise tidy brush dry sterilize "
     "declutter organize organise sort clear hoover rake shovel mow paint cut cover spray water repair fix"
 )
-SEARCH_VERBS: Final = _words("look search hunt check scan inspect explore watch scout browse survey examine patrol")
-OTHER_VERBS: Final = _words(
+SEARCH_VERBS: Final = words("look search hunt check scan inspect explore watch scout browse survey examine patrol")
+OTHER_VERBS: Final = words(
     "pick grab grasp lift hold collect gather retrieve remove catch seize lower raise open close shut press push turn "
     "switch rotate touch hit bump knock break disturb move tilt flip fill empty refill squeeze assemble disassemble "
     "find locate identify detect recognize recognise spot seek discover determine point show tell see view observe "
@@ -43,7 +40,7 @@ OTHER_VERBS: Final = _words(
     "document catalog catalogue digitize film image audit compare deliver plow trim weed work gaze steer supply "
     "obstruct harm damage scratch spill scare wake block enter interact collide contact"
 )
-AVOID_VERBS: Final = _words("avoid dodge evade circumvent bypass")
+AVOID_VERBS: Final = words("avoid dodge evade circumvent bypass")
 DELIVERY_VERBS: Final = CARRY_VERBS | PLACE_VERBS
 VERBS: Final = GO_VERBS | DELIVERY_VERBS | TOOL_VERBS | SEARCH_VERBS | OTHER_VERBS
 
@@ -58,15 +55,15 @@ IRREGULAR_VERBS: Final = {
 }  # fmt: skip
 
 # particles that belong to the verb before them: "pick up", "turn on the lamp", "look at", "search for"
-PARTICLES: Final = _words("up down off out over away around about back through along past at into across onto for")
-ON_IN_PARTICLE_VERBS: Final = _words("turn switch power put bring check focus concentrate spot home work plug report")
+PARTICLES: Final = words("up down off out over away around about back through along past at into across onto for")
+ON_IN_PARTICLE_VERBS: Final = words("turn switch power put bring check focus concentrate spot home work plug report")
 
-DETERMINERS: Final = _words(
+DETERMINERS: Final = words(
     "a an the this that these those my your his her its our their any some all every each both several many few "
     "another other others more enough whole entire one two three four five six seven eight nine ten dozen most various "
     "different multiple single either first second third last next following same such only"
 )
-PRONOUNS: Final = _words(
+PRONOUNS: Final = words(
     "i me you he him she it we us they them myself yourself itself themselves here there mine yours who whom whose "
     "where when how why which itself themselves"
 )
@@ -76,7 +73,7 @@ STAND_INS: Final = {
     "everyone": "person", "somebody": "person", "anybody": "person", "everybody": "person", "what": "object",
     "whatever": "object", "what's": "object",
 }  # fmt: skip
-FILLERS: Final = _words(
+FILLERS: Final = words(
     "please could would should can may might must will shall do does did is are was were be been being am has have had "
     "having let lets let's so very really just now then carefully quickly slowly gently safely also too again robot's "
     "kindly hey ok okay hello sure able going gonna ready order task mission job goal as if whether that because while "
@@ -88,35 +85,35 @@ FILLERS: Final = _words(
     "i'd i'll i'm we're you're there's where's it's that's here's i've we've want wants wanted need needs needed like "
     "likes"
 )
-CONJUNCTIONS: Final = _words("and or , / & plus ; then but +")
-SELVES: Final = _words("robot drone agent arm gripper rover bot")
+CONJUNCTIONS: Final = words("and or , / & plus ; then but +")
+SELVES: Final = words("robot drone agent arm gripper rover bot")
 
 # nouns that say where or how, not what: the object is the one after "of", or none at all
-PLACES: Final = _words(
+PLACES: Final = words(
     "scene environment surroundings room area world space place vicinity workspace view field region zone spot "
     "location site map surface house home building apartment floorplan indoors outdoors way side corner middle center "
     "centre top bottom edge end front back rear left right half part rest remainder interior inside outside distance "
     "position pose state status condition direction everywhere background foreground sight ground-truth height level "
     "perimeter neighbourhood neighborhood premises presence existence absence geometry details detail"
 )
-ROUTES: Final = _words("path way route road course trajectory passage line shortcut track trail")
-MEASURES: Final = _words(
+ROUTES: Final = words("path way route road course trajectory passage line shortcut track trail")
+MEASURES: Final = words(
     "picture photo photograph image video model reconstruction kind type sort piece pair set group pile stack lot lots "
     "number row bunch couple list total cluster collection copy amount view scan map sample none instance instances "
     "section look tour record inventory close-up closeup overview"
 )
 DROPPED_HEADS: Final = PLACES | ROUTES | MEASURES
-PARTS: Final = _words(
+PARTS: Final = words(
     "handle leg lid knob button screen cable door wheel seat armrest drawer shelf cap label display spout hinge arm "
     "edge rim cover panel switch lock base"
 )
-GENERIC: Final = _words("object thing item stuff obstacle obstruction clutter hazard debris target")
+GENERIC: Final = words("object thing item stuff obstacle obstruction clutter hazard debris target")
 
-ADJECTIVES: Final = _words(
+ADJECTIVES: Final = words(
     "red green blue yellow orange black white grey gray brown pink purple beige silver golden dark light bright big "
-    "small large little tiny huge tall short long wide narrow thick thin round square flat heavy old new broken damaged "
+    "small large little tiny huge tall short long wide narrow thick thin round square flat heavy old new broken "
     "clean dirty dusty wet dry empty full open closed wooden metal metallic plastic glass ceramic leather soft hard "
-    "fragile hot cold warm clear transparent striped loose left right upper lower top bottom front back rear "
+    "damaged fragile hot cold warm clear transparent striped loose left right upper lower top bottom front back rear "
     "suspicious unknown dangerous moving static movable fallen spilled unused used nearest closest relevant important "
     "leftmost rightmost highest lowest biggest largest smallest tallest free main"
 )

@@ -4,30 +4,27 @@ from __future__ import annotations
 
 from typing import Final
 
+from gausslite.task.words import words
 
-def _words(text: str) -> frozenset[str]:
-    return frozenset(text.split())
-
-
-ROOMS: Final = _words(
+ROOMS: Final = words(
     "kitchen bedroom bathroom office hallway corridor lobby garage basement attic hall lounge closet pantry laundry "
     "garden yard backyard lawn patio balcony warehouse workshop lab laboratory classroom store shop hospital street "
     "sidewalk driveway field park campus courtyard terrace porch entryway foyer study library cafeteria restroom "
     "toilet-room elevator staircase stairwell aisle"
 )
-LANDMARKS: Final = _words(
-    "table desk counter countertop shelf bookshelf cabinet cupboard dresser nightstand bench sofa couch bed chair stool "
-    "armchair sink stove oven fridge refrigerator dishwasher microwave wall floor ceiling door doorway window entrance "
-    "exit gate fence stair stairs ladder fireplace bathtub shower toilet workbench rack sideboard wardrobe tree "
+LANDMARKS: Final = words(
+    "table desk counter countertop shelf bookshelf cabinet cupboard dresser nightstand bench sofa couch bed chair "
+    "stool armchair sink stove oven fridge refrigerator dishwasher microwave wall floor ceiling door doorway "
+    "window entrance exit gate fence stair stairs ladder fireplace bathtub shower toilet workbench rack sideboard wardrobe tree "
     "building car truck tv television piano pillar column whiteboard blackboard printer island"
 )
-CONTAINERS: Final = _words(
+CONTAINERS: Final = words(
     "drawer box bin basket cabinet cupboard closet fridge refrigerator freezer dishwasher oven microwave bag backpack "
     "crate bucket bowl jar suitcase locker wardrobe container carton trunk dumpster sink bathtub pot washer dryer case "
     "pocket purse toolbox chest sack hamper safe mailbox vase envelope package pantry kitchen bathroom bedroom office "
     "garage room"
 )
-_OBJECTS: Final = _words(
+_OBJECTS: Final = words(
     "mug cup glass bottle plate bowl fork knife spoon pan pot kettle teapot jug pitcher can jar lid tray napkin towel "
     "sponge cloth soap dish toaster blender grill apple banana orange lemon tomato potato carrot bread food fruit "
     "vegetable sandwich pizza cake cookie egg milk coffee tea juice water snack cereal "
@@ -54,9 +51,9 @@ _OBJECTS: Final = _words(
     "silverware tableware electronics equipment supply device gadget instrument article belonging valuables "
     "stairs step ramp railing rail curb hole crack leak window door wall floor ceiling roof beam column pillar "
     "entrance exit doorway gate fence bridge elevator charger dock station landmark marker tag poster whiteboard "
-    "coaster saucer straw ladle spatula whisk corkscrew opener grater strainer colander mitt apron thermos flask canteen "
-    "dumbbell treadmill yoga barbell skateboard surfboard snowboard ski tent sleeping cooler lantern flashlight torch "
-    "battery adapter usb drive disk disc cd dvd television tv screen projector console antenna modem server rack "
+    "coaster saucer straw ladle spatula whisk corkscrew opener grater strainer colander mitt apron thermos flask "
+    "canteen dumbbell treadmill yoga barbell skateboard surfboard snowboard ski tent sleeping cooler lantern flashlight "
+    "torch battery adapter usb drive disk disc cd dvd television tv screen projector console antenna modem server rack "
     "hydrant mailbox bench streetlight lamppost statue fountain swing slide sandbox manhole crosswalk tire wheel "
     "weed hedge log stump root seed fertilizer sprinkler nozzle faucet tap drain pipe gutter chimney brick tile "
     "plank board lumber wood scrap metal wire spring gear bearing shaft coil circuit breaker transformer inverter "

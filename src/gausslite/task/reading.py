@@ -11,16 +11,22 @@ from typing import Final
 from gausslite.task import lexicon
 from gausslite.task.phrases import NounPhrase, adjectives_only, noun_phrase
 from gausslite.task.prepositions import LONGEST_PREPOSITION, PREPOSITIONS
+from gausslite.task.words import words
 
 _TOKEN: Final = re.compile(r"[^\W\d_][\w'’-]*|\d[\w.]*|[,/&+;.!?:()]")
 _ALSO: Final = re.compile(r"\b(?:as well as|along with|together with|in addition to)\b")
-_BREAKS: Final = frozenset(
-    ". ; : ! ? then while before after until when once if whether where because afterwards".split()
-)
+_BREAKS: Final = words(". ; : ! ? then while before after until when once if whether where because afterwards")
 _RELATIVES: Final = frozenset({"that", "which", "who"})
 _BACK_REFERENCES: Final = frozenset({"it", "them"})
-_PARTICLES_ONLY: Final = frozenset("up down out away back forward backward apart upstairs downstairs".split())
+_PARTICLES_ONLY: Final = words("up down out away back forward backward apart upstairs downstairs")
 _LONGEST_NEGATION: Final = max(len(words) for words in lexicon.NEGATIONS)
+_VERB_ENDINGS: Final = (
+    ("ies", ("y",)),
+    ("ing", ("", "e")),
+    ("es", ("", "e")),
+    ("s", ("",)),
+    ("ed", ("", "e")),
+)
 _SUPERLATIVES: Final = frozenset({"closest", "nearest"})
 
 
@@ -118,36 +124,35 @@ class _Reader:
     def _negation(self) -> bool:
         if self.words and self.tokens[self.at] == "no":
             return False
-        if self.tokens[self.at] in ("avoid", "avoiding") and self._peek().endswith("ing"):
-            if verb_base(self._peek()) and self._peek() not in lexicon.ADJECTIVES:
-                self._emit(Kind.NEGATION, "avoid")
-                self.at += 1
-                return True
+        gerund = self._peek().endswith("ing") and verb_base(self._peek()) and self._peek() not in lexicon.ADJECTIVES
+        if self.tokens[self.at] in ("avoid", "avoiding") and gerund:
+            self._emit(Kind.NEGATION, "avoid")
+            self.at += 1
+            return True
         for length in range(_LONGEST_NEGATION, 0, -1):
-            words = tuple(self.tokens[self.at : self.at + length])
-            if len(words) == length and words in lexicon.NEGATIONS:
-                self._emit(Kind.NEGATION, " ".join(words))
+            said = tuple(self.tokens[self.at : self.at + length])
+            if len(said) == length and said in lexicon.NEGATIONS:
+                self._emit(Kind.NEGATION, " ".join(said))
                 self.at += length
                 return True
         return False
 
     def _preposition(self) -> bool:
         for length in range(LONGEST_PREPOSITION, 0, -1):
-            words = " ".join(self.tokens[self.at : self.at + length])
-            relation = PREPOSITIONS.get(words)
+            said = " ".join(self.tokens[self.at : self.at + length])
+            relation = PREPOSITIONS.get(said)
             if relation is None or len(self.tokens) < self.at + length:
                 continue
             after = self._peek(length)
-            if words in _SUPERLATIVES and not (self.words and after in lexicon.DETERMINERS):
+            if said in _SUPERLATIVES and not (self.words and after in lexicon.DETERMINERS):
                 return False
-            if length == 1 and self._is_particle(words, after):
+            if length == 1 and self._is_particle(said, after):
                 self.at += 1
                 return True
-            if self._is_purpose(words, after):
+            if self._is_purpose(said, after):
                 self._close()
-                self.at += length
-                return True
-            self._emit(Kind.PREPOSITION, relation)
+            else:
+                self._emit(Kind.PREPOSITION, relation)
             self.at += length
             return True
         return False
@@ -161,16 +166,16 @@ class _Reader:
         ends = not after or after in lexicon.CONJUNCTIONS or after in _BREAKS
         return ends and word not in ("to", "of")
 
-    def _is_purpose(self, words: str, after: str) -> bool:
-        """ "to" before a verb, or any preposition before a gerund, opens a clause and not a place."""
+    def _is_purpose(self, said: str, after: str) -> bool:
+        """The word "to" before a verb, or any preposition before a gerund, opens a clause and not a place."""
         base = verb_base(after)
         if base is None:
             return False
         if after.endswith("ing") and after not in lexicon.NOUNS:
-            return words in ("to", "for", "by", "before", "after")
+            return said in ("to", "for", "by", "before", "after")
         beyond = self._peek(2)
         plain_noun = after in lexicon.NOUNS and not self._starts_noun(beyond) and beyond not in lexicon.PARTICLES
-        return words == "to" and not plain_noun
+        return said == "to" and not plain_noun
 
     def _starts_noun(self, word: str) -> bool:
         known = word in lexicon.CONJUNCTIONS or word in _BREAKS or word in lexicon.FILLERS or word in PREPOSITIONS
@@ -185,13 +190,11 @@ class _Reader:
             self._emit(Kind.BACK_REFERENCE, word)
         elif word in _RELATIVES and (self.words or self._last() is Kind.NOUN):
             self._close()
-        elif word in lexicon.DETERMINERS or word[0].isdigit() or word.endswith(("'s", "s'")) and len(word) > 3:
+        elif word in lexicon.DETERMINERS or word[0].isdigit() or (word.endswith(("'s", "s'")) and len(word) > 3):
             self._determiner()
         elif word in _SUPERLATIVES:
             self.superlative = True
-        elif word in _PARTICLES_ONLY and not (self.determined and not self.words):
-            self._close()
-        elif word in lexicon.PRONOUNS:
+        elif word in lexicon.PRONOUNS or (word in _PARTICLES_ONLY and (self.words or not self.determined)):
             self._close()
         elif word in lexicon.STAND_INS:
             self._close()
@@ -208,7 +211,7 @@ class _Reader:
         self.determined = True
 
     def _filler_is_adjective(self, word: str) -> bool:
-        """ "the standing lamp": a participle between a determiner and a noun describes it."""
+        """In "the standing lamp" a participle between a determiner and a noun describes it."""
         return self.determined and not self.words and word.endswith("ing") and self._starts_noun(self._peek())
 
     def _verb(self, word: str) -> bool:
@@ -232,7 +235,7 @@ class _Reader:
         return True
 
     def _participle(self, after: str) -> bool:
-        """ "the person holding a cup": the cup is beside the person."""
+        """In "the person holding a cup" the cup is beside the person."""
         if after in lexicon.DETERMINERS:
             self._emit(Kind.PREPOSITION, "near")
             return True

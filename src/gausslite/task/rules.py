@@ -46,9 +46,7 @@ def _require_sense(text: str, pieces: list[Piece]) -> None:
 
 def _nothing_named(text: str, excluded: tuple[str, ...]) -> str:
     shown = text.strip() if len(text.strip()) <= 60 else text.strip()[:57] + "..."
-    came = (
-        f"only objects to leave alone ({', '.join(excluded)}) in {shown!r}"
-        if excluded
-        else repr(" ".join(shown.split()))
-    )
+    came = repr(" ".join(shown.split()))
+    if excluded:
+        came = f"only objects to leave alone ({', '.join(excluded)}) in {came}"
     return f"task text: expected an English sentence that names an object, such as {EXAMPLE}, got {came}"

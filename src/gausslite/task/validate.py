@@ -40,13 +40,9 @@ def require_graph(graph: TaskGraph, limits: TaskLimits = LIMITS) -> None:
     _require_phrases("anchors", graph.anchors, limits.max_anchors, limits.max_phrase_chars)
     for relation in graph.relations:
         if relation.target not in graph.targets:
-            raise TaskError(
-                f"task relation {relation.predicate}: expected a target as subject, got {relation.target!r}"
-            )
+            raise TaskError(f"task {relation.predicate}: expected one of the targets first, got {relation.target!r}")
         if relation.anchor not in graph.anchors:
-            raise TaskError(
-                f"task relation {relation.predicate}: expected an anchor as object, got {relation.anchor!r}"
-            )
+            raise TaskError(f"task {relation.predicate}: expected one of the anchors last, got {relation.anchor!r}")
 
 
 def _require_phrases(role: str, phrases: tuple[str, ...], max_count: int, max_chars: int) -> None:
