@@ -20,13 +20,18 @@ def _reference() -> Rasterizer:
     return ReferenceRasterizer()
 
 
-def _cpu() -> Rasterizer:
+def _cpu(simd: str) -> Rasterizer:
     from gausslite.render.cpu import CpuRasterizer
 
-    return CpuRasterizer(threads=2)
+    return CpuRasterizer(threads=2, simd=simd)
 
 
-BACKENDS: dict[str, Callable[[], Rasterizer]] = {"reference": _reference, "cpu": _cpu}
+BACKENDS: dict[str, Callable[[], Rasterizer]] = {
+    "reference": _reference,
+    "cpu avx512": lambda: _cpu("avx512"),
+    "cpu avx2": lambda: _cpu("avx2"),
+    "cpu portable": lambda: _cpu("portable"),
+}
 
 
 @pytest.fixture(scope="session", params=BACKENDS)

@@ -11,12 +11,12 @@ import torch
 
 from gausslite.domain.camera import Camera
 from gausslite.render.rasterizer import LOG_SCALE, LOGIT, MEAN, QUAT, RGB, Rasterizer, Rendering, TrainingView
-from gausslite.render.reference.compositing import MAX_ALPHA
+from gausslite.render.reference.compositing import MAX_ALPHA, MIN_TRANSMITTANCE
 from gausslite.render.reference.projection import MIN_ALPHA, Ellipses, project
 
 GROUPS = {"means": MEAN, "log_scales": LOG_SCALE, "quats": QUAT, "logits": slice(LOGIT, LOGIT + 1), "rgb": RGB}
-MARGIN = 2e-4
-"""How near to a threshold, relatively, an alpha may come before its pixel is left out of the comparison."""
+MARGIN, STOP_MARGIN = 2e-4, 1e-2
+"""How near to its thresholds, relatively, an alpha and a transmittance may come before a pixel is left out."""
 CAMERA = Camera(52.0, 50.0, 32.3, 23.6, 64, 48)
 
 
@@ -36,18 +36,26 @@ class Scene:
         rows = torch.from_numpy(self.rows.astype(np.float64))
         ellipses = project(rows, self.camera, torch.from_numpy(self.T_camera_world))
         steady = np.ones(self.size, np.bool_)
-        for chunk in torch.arange(len(ellipses.row_ids)).split(64):
-            steady &= ~_near_a_threshold(ellipses.take(chunk), self.camera)
+        transmittance = torch.ones(self.size, dtype=torch.float64)
+        for start in range(0, len(ellipses.row_ids), 64):
+            chunk = torch.arange(start, min(start + 64, len(ellipses.row_ids)))
+            alpha = _unclipped_alphas(ellipses.take(chunk), self.camera)
+            near = ((alpha / MIN_ALPHA - 1.0).abs() < MARGIN) | ((alpha / MAX_ALPHA - 1.0).abs() < MARGIN)
+            drawn = torch.where(alpha < MIN_ALPHA, 0.0, alpha.clamp(max=MAX_ALPHA))
+            after = transmittance * torch.cumprod(1.0 - drawn, dim=0)
+            near |= (after / MIN_TRANSMITTANCE - 1.0).abs() < STOP_MARGIN
+            # what hides behind the stop matters no more
+            near &= torch.cat([transmittance[None], after[:-1]]) > 0.5 * MIN_TRANSMITTANCE
+            transmittance = after[-1]
+            steady &= ~near.any(dim=0).numpy()
         return steady
 
 
-def _near_a_threshold(e: Ellipses, camera: Camera) -> np.ndarray:
+def _unclipped_alphas(e: Ellipses, camera: Camera) -> torch.Tensor:
     dx = (torch.arange(camera.width_px) + 0.5)[None, None, :] - e.means_px[:, 0, None, None]
     dy = (torch.arange(camera.height_px) + 0.5)[None, :, None] - e.means_px[:, 1, None, None]
     a, b, c = e.conics[:, :, None, None].unbind(dim=1)
-    alpha = e.opacities[:, None, None] * torch.exp(-0.5 * (a * dx * dx + 2 * b * dx * dy + c * dy * dy))
-    near = ((alpha / MIN_ALPHA - 1.0).abs() < MARGIN) | ((alpha / MAX_ALPHA - 1.0).abs() < MARGIN)
-    return near.any(dim=0).numpy()
+    return e.opacities[:, None, None] * torch.exp(-0.5 * (a * dx * dx + 2 * b * dx * dy + c * dy * dy))
 
 
 def turned(angle: float = 0.2) -> np.ndarray:
@@ -129,7 +137,7 @@ def _broken() -> Scene:
 
 def _many() -> Scene:
     """More rows than one batch of any backend, more splats to a tile than one chunk."""
-    return Scene(random_rows(14, 9000, 0.02), Camera(120.0, 120.0, 75.0, 50.0, 150, 100), turned())
+    return Scene(random_rows(14, 5000, 0.02), Camera(80.0, 80.0, 50.0, 40.0, 100, 70), turned())
 
 
 def _odd_size() -> Scene:

@@ -9,8 +9,7 @@ from splat_scenes import CAMERA, SCENES, Scene, random_rows, relative_error, sce
 from gausslite.errors import InvalidInputError, ShapeError
 from gausslite.render.rasterizer import TILE_PX, Rasterizer, Rendering, Subset
 
-# what a stopped pixel may leave out, plus float32
-ATOL = 1.5e-4
+ATOL = 5e-5
 
 
 def assert_same_images(came: Rendering, wanted: Rendering, where: np.ndarray) -> None:

@@ -96,14 +96,14 @@ def test_two_splats_blend_front_over_back(oracle: Rasterizer) -> None:
     np.testing.assert_allclose(drawn.alpha[23, 32], 0.75, atol=1e-3)
 
 
-def test_a_wall_of_opaque_splats_lets_a_hundredth_through_each(oracle: Rasterizer) -> None:
-    rows = np.zeros((3, 16), np.float32)
+def test_a_pixel_stops_after_the_splat_that_leaves_less_than_a_ten_thousandth(oracle: Rasterizer) -> None:
+    rows = np.zeros((4, 16), np.float32)
     rows[:, 6] = 1.0
     rows[:, 3:6] = np.log(5.0)
-    rows[:, 2] = [1.0, 2.0, 3.0]
-    rows[:, 10] = 50.0
+    rows[:, 2] = [1.0, 2.0, 3.0, 4.0]
+    rows[:, 10] = [np.log(0.5 / 0.5), 50.0, 50.0, 50.0]
     drawn = oracle.forward(rows, CAMERA, turned(0.0))
-    assert drawn.alpha[24, 32] == pytest.approx(1.0 - 0.01**3, abs=1e-7)
+    assert drawn.alpha[24, 32] == pytest.approx(1.0 - 0.5 * 0.01**2, abs=1e-6)
 
 
 def test_the_loss_terms_are_the_sums_of_their_definition() -> None:

@@ -10,8 +10,8 @@ and heights (as in 3DGS), and the number of steps in which the splat was visible
 Image model (EWA splatting, Kerbl et al. 2023). The 2D covariance gets 0.3 px² on its diagonal; a contribution below
 1/255 is dropped and alpha is clamped to 0.99 (no gradient through the clamp); splats nearer than 0.05 m are culled;
 the tangent that enters the Jacobian is clamped to 1.3 times the half field of view; splats are drawn in order of
-their z. Pixel centres are at +0.5. A backend may stop a pixel once its transmittance is below 1e-4, after the splat
-that took it there: what it leaves out weighs less than that (the reference leaves out nothing).
+their z. Pixel centres are at +0.5. A pixel stops once its transmittance is below 1e-4, after the splat that took it
+there.
 
 A row with a value that is not finite in columns 0-13, with a quaternion of length zero, or whose ellipse is not finite
 in the backend's precision is not drawn. A row is visible when the bounding box of its ellipse alpha >= 1/255 holds

@@ -14,17 +14,18 @@ from gausslite.render.rasterizer import TILE_PX
 from gausslite.render.reference.projection import MIN_ALPHA, Ellipses, tile_grid
 
 MAX_ALPHA = 0.99
+MIN_TRANSMITTANCE = 1e-4
 
 
 def composite(ellipses: Ellipses, pixels: Float64[Tensor, "p 2"]) -> Float64[Tensor, "p 5"]:
-    """Red, green, blue, depth and alpha of these pixel centres; every ellipse is followed to the end of the list."""
+    """Red, green, blue, depth and alpha of these pixel centres."""
     dx, dy = (pixels[None] - ellipses.means_px[:, None]).unbind(dim=2)
     a, b, c = ellipses.conics[:, :, None].unbind(dim=1)
     alpha = ellipses.opacities[:, None] * torch.exp(-0.5 * (a * dx * dx + 2.0 * b * dx * dy + c * dy * dy))
     alpha = torch.where(alpha < MIN_ALPHA, 0.0, alpha.clamp(max=MAX_ALPHA))
     transmittance = torch.cumprod(1.0 - alpha, dim=0)
     before = torch.cat([torch.ones_like(transmittance[:1]), transmittance[:-1]])
-    weights = alpha * before
+    weights = torch.where(before < MIN_TRANSMITTANCE, 0.0, alpha * before)
     channels = torch.cat([ellipses.rgb, ellipses.z_m[:, None], torch.ones_like(ellipses.z_m)[:, None]], dim=1)
     return weights.T @ channels
 

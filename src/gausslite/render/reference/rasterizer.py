@@ -45,10 +45,7 @@ class _Drawn:
 
 
 class ReferenceRasterizer:
-    """Float64 torch with autograd inside, on one CPU: the oracle every other backend is measured against.
-
-    It draws every splat to the end of its pixel's list, without the transmittance stop that Rasterizer allows.
-    """
+    """Float64 torch with autograd inside, on one CPU: the oracle every other backend is measured against."""
 
     @property
     def name(self) -> str:
