@@ -1,0 +1,192 @@
+"""A whole mission: a played sequence ends in a map, a report and everything on the server."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import pytest
+from fusion_team import CAMERA, GRID, frame, team
+
+from gausslite.codec.ply import read_ply
+from gausslite.domain.camera import Camera
+from gausslite.domain.frame import Frame
+from gausslite.domain.region import BallRegion, Region
+from gausslite.errors import DatasetError, InvalidInputError, StorageError, TaskError
+from gausslite.fusion.memory import MemoryStore
+from gausslite.perception.fixed import RegionAttention
+from gausslite.task.rules import RuleParser
+from gausslite.v1 import agent_service_pb2 as pb
+from gausslite.wire.clients import FusionClient
+from gausslite.wire.spool import Spool
+from gausslite.wire.uplink import Uplink, UplinkSettings
+from gausslite_agent.player import Player
+from gausslite_agent.robot import Robot
+from gausslite_agent.settings import AgentSettings, PlaySettings, parse_arguments
+
+MUG = BallRegion((0.0, 0.0, 1.2), 0.2)
+
+
+@dataclass
+class Wall:
+    """A sequence of views of one wall."""
+
+    count: int = 8
+    name: str = "wall"
+    up_axis: tuple[float, float, float] = (0.0, -1.0, 0.0)
+    camera: Camera = CAMERA
+    broken_at: int | None = None
+    asked: list[int] = field(default_factory=list)
+    reached: threading.Event = field(default_factory=threading.Event)
+
+    def __len__(self) -> int:
+        return self.count
+
+    def frame(self, i: int, size: tuple[int, int] | None = None) -> Frame:
+        if i == self.broken_at:
+            raise DatasetError(f"wall/frame-{i}.png: expected an image, got noise")
+        self.asked.append(i)
+        if len(self.asked) == 2:
+            self.reached.set()
+        return frame(i, CAMERA)
+
+    def indices(self) -> Sequence[int]:
+        return range(self.count)
+
+    def regions(self) -> Mapping[str, Region]:
+        return {"mug": MUG}
+
+
+def settings(out: Path | None, *more: str) -> AgentSettings:
+    asked = ["--agent-id", "robot", "--task", "Pick up the mug", "--max-gaussians", "2000", "--iterations", "2"]
+    asked += ["--source", "wall", "--threads", "1", *more]
+    return parse_arguments([*asked, "--out", str(out)] if out is not None else asked)
+
+
+@contextmanager
+def player(options: AgentSettings, address: str | None = None) -> Iterator[tuple[Player, Robot]]:
+    client = None if address is None else FusionClient(address)
+    uplink = None
+    if client is not None:
+        uplink = Uplink(client, "robot", Spool(None, "robot", GRID), GRID, UplinkSettings(interval_s=0.0))
+    robot = Robot(options.mission, GRID, lambda _graph: RegionAttention([MUG]), uplink)
+    try:
+        yield Player(options, robot, RuleParser(), client), robot
+    finally:
+        robot.close()
+        if uplink is not None:
+            uplink.close()
+
+
+def test_a_mission_leaves_a_map_a_report_and_its_region_on_the_server(tmp_path: Path) -> None:
+    store, options = MemoryStore(), settings(tmp_path)
+    assert options.play is not None
+    with team(store) as fusion, player(options, fusion.client.address) as (mission, robot):
+        mission.play(Wall(), options.play)
+        assert mission.state == pb.AGENT_STATE_DONE
+        count = robot.status().gaussians
+        [agent] = fusion.client.status().agents
+    written, report = read_ply(tmp_path / "map.ply"), json.loads((tmp_path / "report.json").read_text())
+    assert len(written) == count == report["gaussians"]
+    assert report["frames"] == 8
+    assert report["hz"] > 0
+    assert 0 < report["roi_share"] < 1
+    assert report["bytes_sent"] == agent.roi_bytes > 0
+    assert report["handover_bytes"] == agent.handover_bytes == agent.keyframes == 0
+    assert report["map_shared_percent"] == pytest.approx(100 * written.active.mean())
+    assert agent.gaussians == written.active.sum()
+
+
+def test_handover_brings_the_whole_map_and_the_keyframes(tmp_path: Path) -> None:
+    options = settings(tmp_path, "--handover")
+    assert options.play is not None
+    with team() as fusion, player(options, fusion.client.address) as (mission, robot):
+        mission.play(Wall(), options.play)
+        [agent] = fusion.client.status().agents
+        keyframes = robot.do(lambda mapper: mapper.keyframes()).result(20)
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert agent.gaussians == report["gaussians"]
+    assert agent.handover_bytes == report["handover_bytes"] > 0
+    assert agent.roi_bytes == report["bytes_sent"] > 0
+    assert agent.keyframes == len(keyframes) > 0
+
+
+def test_alone_it_maps_and_sends_nothing(tmp_path: Path) -> None:
+    options = settings(tmp_path, "--hold-out", "4", "--frames", "0:6")
+    assert options.play is not None
+    wall = Wall()
+    with player(options) as (mission, _):
+        mission.play(wall, options.play)
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert wall.asked == [0, 1, 2, 4, 5]
+    assert (report["frames"], report["bytes_sent"], report["map_shared_percent"]) == (5, 0, 0)
+
+
+def test_a_mission_that_is_stopped_writes_what_it_has(tmp_path: Path) -> None:
+    options, wall = settings(tmp_path), Wall(10_000)
+    assert options.play is not None
+    with player(options) as (mission, _):
+        thread = threading.Thread(target=mission.play, args=(wall, options.play))
+        thread.start()
+        assert wall.reached.wait(20)
+        mission.stop()
+        thread.join(20)
+        assert not thread.is_alive()
+        assert mission.state == pb.AGENT_STATE_DRAINING
+    assert json.loads((tmp_path / "report.json").read_text())["frames"] < 10_000
+    assert len(read_ply(tmp_path / "map.ply")) > 0
+
+
+def test_what_is_wrong_is_raised_before_or_when_it_is_met(tmp_path: Path) -> None:
+    options = settings(tmp_path)
+    assert options.play is not None
+    with player(options) as (mission, _), pytest.raises(DatasetError, match="frame-3"):
+        mission.play(Wall(broken_at=3), options.play)
+    with player(replace(options, task="!")) as (mission, _), pytest.raises(TaskError):
+        mission.play(Wall(), options.play)
+    with player(options) as (mission, _), pytest.raises(InvalidInputError, match="size"):
+        mission.play(Wall(), PlaySettings("wall", size="big"))
+    with player(replace(options, out=tmp_path / "gone")) as (mission, _), pytest.raises(StorageError, match="gone"):
+        mission.play(Wall(), options.play)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--source", "/nowhere"], "--task"),
+        (["--source", "/nowhere", "--task", "Pick up the mug"], "/nowhere"),
+        (["--agent-id", ""], "--agent-id"),
+        (["--voxel-size", "nan"], "voxel"),
+        (["--rate", "-1"], "rate"),
+        (["--listen", "nowhere"], "HOST:PORT"),
+        (["--out", "/dev/null/x"], "/dev/null/x"),
+        (["--uplink-kbps", "0"], "kbps"),
+    ],
+)
+def test_a_wrong_command_line_is_one_line_and_code_2(
+    arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from gausslite_agent.__main__ import main
+
+    assert main(["--listen", "127.0.0.1:0", *arguments]) == 2
+    [line] = capsys.readouterr().err.splitlines()
+    assert message in line
+
+
+def test_a_real_process_ends_cleanly_on_sigterm(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "gausslite_agent", "--listen", f"unix:{tmp_path}/agent.sock"]
+    with subprocess.Popen(
+        command, stderr=subprocess.PIPE, text=True, env={**os.environ, "PYTHONWARNINGS": "error"}
+    ) as p:
+        assert p.stderr is not None
+        assert "listening on" in p.stderr.readline()
+        p.send_signal(signal.SIGTERM)
+        assert p.wait(30) == 0
+        assert "ended" in p.stderr.read()
