@@ -21,7 +21,7 @@ from gausslite.fusion.refined import RefinedMap
 from gausslite.fusion.revisions import RevisionLedger
 from gausslite.fusion.store import Charter, FusionStore, PutOutcome, Session
 from gausslite.fusion.tally import Tally, TeamStatus, contribution
-from gausslite.fusion.terms import Holding, TeamSettings, agree, named
+from gausslite.fusion.terms import Holding, TeamSettings, agree, named, require_name, shown
 from gausslite.fusion.vote import FusedMap, concatenate, elect, fuse
 from gausslite.fusion.words import take_voxels, words_of
 
@@ -57,7 +57,8 @@ class TeamMap:
         self._store = store
         self._settings = settings
         self._charter = agree(store.charter() or settings.offer, settings.offer)
-        self._ledger = RevisionLedger(time.time_ns() // 1000 if first_revision is None else first_revision)
+        begin = time.time_ns() // 1000 if first_revision is None else first_revision
+        self._ledger = RevisionLedger(begin, settings.remembered_vanished)
         self._pool = KeyframePool(settings.quotas.keyframes_per_agent, settings.quotas.keyframe_pixels)
         self._sessions = {session.session_id: session for session in store.sessions()}
         self._tallies: dict[str, Tally] = {}
@@ -93,21 +94,23 @@ class TeamMap:
     def require_mission(self, mission_id: str) -> None:
         """Raise MismatchError unless this is the mission's id, or empty."""
         if mission_id and mission_id != self.charter.mission_id:
-            raise MismatchError(f"mission: expected {self.charter.mission_id!r} as agreed here, got {mission_id!r}")
+            ours = shown(self.charter.mission_id)
+            raise MismatchError(f"mission: expected {ours} as agreed here, got {shown(mission_id)}")
 
     def join(self, agent_id: str, asked: Charter, fresh_map: bool = False) -> Joined:
         """Open a session, ending the agent's earlier one; fresh_map also forgets what the agent said before.
 
         Empty names in `asked` mean the server's. Raises InvalidInputError, MismatchError, QuotaError, StorageError.
         """
-        if not 1 <= len(agent_id.encode()) <= 255:
-            raise InvalidInputError(f"agent_id: expected 1 to 255 bytes, got {len(agent_id.encode())}")
+        require_name("agent_id", agent_id)
+        if not agent_id:
+            raise InvalidInputError("agent_id: expected a name, got an empty string")
         with self._lock:
             charter = agree(self._charter, asked)
             known = {session.agent_id for session in self._sessions.values()} | set(self._holdings)
             most = self._settings.quotas.agents
             if agent_id not in known and len(known) >= most:
-                raise QuotaError(f"agents: expected at most {most} in this mission, {agent_id!r} is one more")
+                raise QuotaError(f"agents: expected at most {most} in this mission, {shown(agent_id)} is one more")
             self._store.set_charter(named(charter))
             self._charter = named(charter)
             if fresh_map:
@@ -123,7 +126,7 @@ class TeamMap:
         with self._lock:
             session = self._sessions.get(session_id)
         if session is None:
-            raise SessionUnknownError(f"session {session_id[:64]!r}: not known here; join, then send every voxel again")
+            raise SessionUnknownError(f"session {shown(session_id)}: not known here; join, then send every voxel again")
         return session
 
     def contribute(self, session_id: str, subset: RoiSubset, grid: VoxelGrid) -> PutOutcome:
@@ -135,7 +138,7 @@ class TeamMap:
         with self._lock:
             agent_id = self.session(session_id).agent_id
             if subset.agent_id != agent_id:
-                raise InvalidInputError(f"subset agent_id: expected {agent_id!r}, got {subset.agent_id!r}")
+                raise InvalidInputError(f"subset agent_id: expected {shown(agent_id)}, got {shown(subset.agent_id)}")
             if grid != self.grid:
                 raise MismatchError(f"voxel size: this mission votes on {self.grid.size_m:g} m, got {grid.size_m:g} m")
             held = self._require_room(subset)
@@ -272,9 +275,8 @@ class TeamMap:
     def _require_contributor(self, agent_id: str) -> None:
         agents = self._store.agents()
         if agent_id not in agents:
-            raise InvalidInputError(
-                f"agent_id: expected one of {', '.join(agents) or 'no agents yet'}, got {agent_id!r}"
-            )
+            some = ", ".join(map(shown, agents[:8])) or "no agents yet"
+            raise InvalidInputError(f"agent_id: expected a contributor ({some}), got {shown(agent_id)}")
 
     def _forget(self, agent_id: str) -> None:
         keys = self._store.remove_agent(agent_id)

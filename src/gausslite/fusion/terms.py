@@ -29,12 +29,16 @@ class Quotas:
 
 @dataclass(frozen=True, slots=True)
 class TeamSettings:
-    """The server's own terms. Empty mission_id and world_frame: the first agent that names them decides."""
+    """The server's own terms. Empty mission_id and world_frame: the first agent that names them decides.
+
+    remembered_vanished: of how many voxels that became empty a watcher can still be told; see RevisionLedger.
+    """
 
     grid: VoxelGrid = field(default_factory=VoxelGrid)
     mission_id: str = ""
     world_frame: str = ""
     quotas: Quotas = field(default_factory=Quotas)
+    remembered_vanished: int = 100_000
 
     @property
     def offer(self) -> Charter:
@@ -42,8 +46,28 @@ class TeamSettings:
         return Charter(self.mission_id, self.world_frame, self.grid.size_m)
 
 
+MAX_NAME_BYTES = 255
+
+
+def shown(name: str) -> str:
+    """A name from outside as it may stand in a message: quoted and short."""
+    return repr(name if len(name) <= 64 else f"{name[:64]}…")
+
+
+def require_name(what: str, name: str) -> None:
+    """Raise InvalidInputError unless the name has at most MAX_NAME_BYTES bytes."""
+    size = len(name.encode())
+    if size > MAX_NAME_BYTES:
+        raise InvalidInputError(f"{what}: expected at most {MAX_NAME_BYTES} bytes, got {size}")
+
+
 def agree(own: Charter, asked: Charter) -> Charter:
-    """The charter both sides can live with; an empty name leaves it to the other. Raises MismatchError."""
+    """The charter both sides can live with; an empty name leaves it to the other.
+
+    Raises InvalidInputError for names without end, MismatchError.
+    """
+    require_name("mission_id", asked.mission_id)
+    require_name("world_frame", asked.world_frame)
     if asked.voxel_size_m != own.voxel_size_m:
         raise MismatchError(f"voxel size: this mission votes on {own.voxel_size_m:g} m, got {asked.voxel_size_m:g} m")
     for name, ours, theirs in (
@@ -51,7 +75,7 @@ def agree(own: Charter, asked: Charter) -> Charter:
         ("mission", own.mission_id, asked.mission_id),
     ):
         if ours and theirs and ours != theirs:
-            raise MismatchError(f"{name}: expected {ours!r} as agreed here, got {theirs!r}")
+            raise MismatchError(f"{name}: expected {shown(ours)} as agreed here, got {shown(theirs)}")
     return Charter(own.mission_id or asked.mission_id, own.world_frame or asked.world_frame, own.voxel_size_m)
 
 
@@ -86,4 +110,4 @@ class Holding:
             ("Gaussians", self.gaussians, quotas.gaussians_per_agent),
         ):
             if value > most:
-                raise QuotaError(f"agent {agent_id!r}: expected at most {most} {name} in all, got {value}")
+                raise QuotaError(f"agent {shown(agent_id)}: expected at most {most} {name} in all, got {value}")
