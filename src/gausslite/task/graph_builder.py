@@ -42,6 +42,7 @@ class GraphBuilder:
         elif piece.kind is Kind.NEGATION:
             self._pending, self._negated = None, True
             self._clause.nouns_since_negation = 0
+            self._clause.verb_since_negation = False
         elif piece.kind is Kind.BREAK:
             self._new_clause(None)
             self._negated = False
@@ -67,7 +68,8 @@ class GraphBuilder:
         if not same_negation:
             self._negated = False
         self._pending = None
-        if self._clause.subjects or self._clause.orphans:
+        self._clause.verb_since_negation = True
+        if not same_negation and (self._clause.subjects or self._clause.orphans):
             self._new_clause(piece.word)
         else:
             self._clause.verb = piece.word
@@ -92,7 +94,7 @@ class GraphBuilder:
             if after is not None and after.kind is Kind.JOIN:
                 self._adjectives.append(noun)
             return
-        if not noun.names_object:
+        if not _names_object(noun, pending, after):
             self._dropped(noun, pending, after)
             return
         nouns = [*(_described(adjective, noun) for adjective in self._adjectives), noun]
@@ -114,8 +116,11 @@ class GraphBuilder:
         self._clause.skip_of = leads_on
 
     def _exclude(self, noun: NounPhrase, pending: str | None) -> None:
-        direct = self._clause.nouns_since_negation == 0 or pending is None
-        self._clause.nouns_since_negation += 1
+        clause = self._clause
+        direct = pending is None or (clause.nouns_since_negation == 0 and clause.verb_since_negation)
+        if not direct and clause.nouns_since_negation == 0:
+            self.warnings.append(f"an exception by place ({noun.text!r}) is not supported: it is dropped")
+        clause.nouns_since_negation += 1
         if direct and noun.text not in self.excluded:
             self.excluded.append(noun.text)
 
@@ -146,7 +151,9 @@ class GraphBuilder:
                 clause.last_relation = "with"
         elif pending == "from" or pending in _SOURCES:
             self._taken_from(pending, noun)
-        elif clause.verb in lexicon.PLACE_VERBS and self._is_last_place(pending, after):
+        elif clause.last_relation == "to" or (
+            clause.verb in lexicon.PLACE_VERBS and self._is_last_place(pending, after)
+        ):
             self._anchor(noun.text)
             clause.last_relation = "to"
         else:
@@ -207,7 +214,7 @@ class GraphBuilder:
         clause = self._clause
         if clause.superlative and clause.subjects:
             self._relate(Predicate.CLOSEST_TO, noun)
-        elif clause.route or clause.verb in lexicon.GO_VERBS or not clause.subjects:
+        elif clause.route or not clause.subjects or clause.verb in lexicon.GO_VERBS - lexicon.MOVING_VERBS:
             self._target(noun, joined=bool(clause.subjects))
             clause.route = False
         else:
@@ -257,6 +264,19 @@ class _Clause:
         self.skip_of = False
         self.handed_on: str | None = None
         self.nouns_since_negation = 0
+        self.verb_since_negation = False
+
+
+def _names_object(noun: NounPhrase, pending: str | None, after: Piece | None) -> bool:
+    """False for the robot itself, and for places, routes and measures that stand for something else."""
+    if len(noun.words) == 1 and noun.head in lexicon.SELVES:
+        return False
+    if noun.head in lexicon.PLACES:
+        return noun.head in lexicon.SOLID_PLACES and pending not in (None, "inside", "to")
+    if noun.head in lexicon.ROUTES:
+        return pending not in (None, "of", "for", "to")
+    leads_on = after is not None and after.kind is Kind.PREPOSITION and after.word == "of"
+    return noun.head not in lexicon.MEASURES or (noun.known and not leads_on)
 
 
 def _described(adjective: NounPhrase, noun: NounPhrase) -> NounPhrase:

@@ -38,9 +38,11 @@ OTHER_VERBS: Final = words(
     "test build manipulate handle serve cook feed harvest prune recycle sample sit stand step swap change replace "
     "unplug unlock lock light aim dispose select choose plan compute plot route scoop pour stir tighten loosen mind "
     "document catalog catalogue digitize film image audit compare deliver plow trim weed work gaze steer supply "
-    "obstruct harm damage scratch spill scare wake block enter interact collide contact"
+    "charge guide lead obstruct harm damage scratch spill scare wake block enter interact collide contact"
 )
 AVOID_VERBS: Final = words("avoid dodge evade circumvent bypass")
+# "move to the chair" goes there, "move the chair to the door" takes it there
+MOVING_VERBS: Final = words("move roll run advance")
 DELIVERY_VERBS: Final = CARRY_VERBS | PLACE_VERBS
 VERBS: Final = GO_VERBS | DELIVERY_VERBS | TOOL_VERBS | SEARCH_VERBS | OTHER_VERBS
 
@@ -102,7 +104,8 @@ MEASURES: Final = words(
     "number row bunch couple list total cluster collection copy amount view scan map sample none instance instances "
     "section look tour record inventory close-up closeup overview"
 )
-DROPPED_HEADS: Final = PLACES | ROUTES | MEASURES
+# places that are solid things too, unless something is in them
+SOLID_PLACES: Final = words("building house home corner site front back")
 PARTS: Final = words(
     "handle leg lid knob button screen cable door wheel seat armrest drawer shelf cap label display spout hinge arm "
     "edge rim cover panel switch lock base"

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from gausslite.task import lexicon
 from gausslite.task.singular import singular
 
-_SELVES = {(word,) for word in lexicon.SELVES}
 # in a compound the drinking kind, alone the reading kind
 _COMPOUND_HEADS = {"glasses": "glass"}
 
@@ -35,13 +34,6 @@ class NounPhrase:
     def known(self) -> bool:
         """True when the head is a noun of the lexicon."""
         return self.head in lexicon.NOUNS or self.head in lexicon.GENERIC
-
-    @property
-    def names_object(self) -> bool:
-        """False for places, routes, measures, the robot itself and adjectives without a noun."""
-        if adjectives_only(self.words) or self.words in _SELVES:
-            return False
-        return self.head not in lexicon.DROPPED_HEADS
 
 
 def noun_phrase(words: Sequence[str], determined: bool, superlative: bool) -> NounPhrase:

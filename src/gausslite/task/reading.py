@@ -109,6 +109,9 @@ class _Reader:
     def _last(self) -> Kind | None:
         return self.pieces[-1].kind if self.pieces else None
 
+    def _follows_noun(self) -> bool:
+        return bool(self.words) or self._last() is Kind.NOUN
+
     def _emit(self, kind: Kind, word: str, gerund: bool = False) -> None:
         self._close()
         self.pieces.append(Piece(kind, word, gerund=gerund))
@@ -144,7 +147,7 @@ class _Reader:
             if relation is None or len(self.tokens) < self.at + length:
                 continue
             after = self._peek(length)
-            if said in _SUPERLATIVES and not (self.words and after in lexicon.DETERMINERS):
+            if said in _SUPERLATIVES and not (self._follows_noun() and after in lexicon.DETERMINERS):
                 return False
             if length == 1 and self._is_particle(said, after):
                 self.at += 1
@@ -188,7 +191,7 @@ class _Reader:
             self._emit(Kind.JOIN, word)
         elif word in _BACK_REFERENCES:
             self._emit(Kind.BACK_REFERENCE, word)
-        elif word in _RELATIVES and (self.words or self._last() is Kind.NOUN):
+        elif word in _RELATIVES and self._follows_noun():
             self._close()
         elif word in lexicon.DETERMINERS or word[0].isdigit() or (word.endswith(("'s", "s'")) and len(word) > 3):
             self._determiner()
@@ -200,7 +203,7 @@ class _Reader:
             self._close()
             self.words.append(lexicon.STAND_INS[word])
             self._close()
-        elif word in lexicon.FILLERS and not self._filler_is_adjective(word):
+        elif word in lexicon.FILLERS and not self._belongs_to_noun(word):
             self._close()
         elif not self._verb(word):
             self._content(word)
@@ -210,16 +213,18 @@ class _Reader:
             self._close()
         self.determined = True
 
-    def _filler_is_adjective(self, word: str) -> bool:
-        """In "the standing lamp" a participle between a determiner and a noun describes it."""
+    def _belongs_to_noun(self, word: str) -> bool:
+        """In "the standing lamp" a participle describes a noun; "the trash can" is no modal verb."""
+        if word == "can":
+            return (bool(self.words) or self.determined) and verb_base(self._peek()) is None
         return self.determined and not self.words and word.endswith("ing") and self._starts_noun(self._peek())
 
     def _verb(self, word: str) -> bool:
         """Take the word as a verb if it stands where a verb can stand."""
         base = verb_base(word)
-        if base is None:
-            return False
         after, gerund = self._peek(), word.endswith("ing")
+        if base is None:
+            return self._unknown_verb(word, after)
         if self._peek(-1) in _RELATIVES:
             return True
         if self.words:
@@ -228,11 +233,19 @@ class _Reader:
             return False
         if self._last() is Kind.NOUN and gerund and self._participle(after):
             return True
-        could_be_noun = word in lexicon.NOUNS or noun_phrase([word], False, False).known
+        could_be_noun = noun_phrase([word], False, False).known and base not in lexicon.GO_VERBS
         if could_be_noun and not (self._starts_noun(after) or after in lexicon.PARTICLES):
             return False
         self._emit(Kind.VERB, base, gerund)
         return True
+
+    def _unknown_verb(self, word: str, after: str) -> bool:
+        """In "rearrange the cushions" only a verb can stand before the article."""
+        opens = not (self.words or self.determined or self._follows_noun() or self._last() is Kind.PREPOSITION)
+        if opens and word not in lexicon.NOUNS and after in lexicon.DETERMINERS:
+            self._emit(Kind.VERB, word)
+            return True
+        return False
 
     def _participle(self, after: str) -> bool:
         """In "the person holding a cup" the cup is beside the person."""

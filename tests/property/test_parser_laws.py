@@ -1,0 +1,45 @@
+"""Whatever is typed, the parser answers with a graph within bounds or one line."""
+
+from __future__ import annotations
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gausslite.errors import TaskError
+from gausslite.task.lexicon import NOUNS
+from gausslite.task.parser import task_id_of
+from gausslite.task.rules import RuleParser
+from gausslite.task.validate import require_graph
+from gausslite.task.words import words
+
+WORDS = st.sampled_from(
+    sorted(
+        words(
+            "pick up put find avoid without not ignore the a red closest nearest to from on in of for with and or , / ; "
+            "it that mug table chairs map go door picture path is don't touching"
+        )
+    )
+)
+
+
+@given(st.text(max_size=200) | st.lists(WORDS, max_size=25).map(" ".join))
+def test_any_text_gives_a_valid_graph_or_one_line(text):
+    try:
+        graph = RuleParser().parse(text)
+    except TaskError as error:
+        message = str(error)
+    else:
+        require_graph(graph)
+        message = ""
+        assert graph.task_id == task_id_of(text)
+    assert "\n" not in message
+
+
+@given(st.sampled_from(sorted(NOUNS)), st.booleans())
+def test_case_spaces_and_full_stops_do_not_matter(noun, loud):
+    plain = f"find the {noun} on the shelf"
+    typed = f"  {plain.upper() if loud else plain.capitalize()} .  "
+    one, other = RuleParser().parse(plain), RuleParser().parse(typed)
+    assert (one.task_id, one.targets, one.anchors, one.relations) == (
+        other.task_id, other.targets, other.anchors, other.relations,
+    )  # fmt: skip
