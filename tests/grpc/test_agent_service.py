@@ -40,7 +40,8 @@ from gausslite.wire.bell import Bell
 from gausslite.wire.clients import AgentClient, FusionClient
 from gausslite.wire.server import Service
 from gausslite.wire.spool import Spool
-from gausslite.wire.uplink import Uplink, UplinkSettings
+from gausslite.wire.uplink import Uplink
+from gausslite.wire.uplink_values import UplinkSettings
 from gausslite_agent.robot import Outcome, Robot
 from gausslite_agent.servicer import AgentServicer
 

@@ -95,3 +95,15 @@ def test_nobody_there_is_unavailable() -> None:
         pytest.raises(UnavailableError, match=r"127\.0\.0\.1:1"),
     ):
         client.parse("Pick up the mug")
+
+
+def test_the_health_check_of_a_container(capsys: pytest.CaptureFixture[str]) -> None:
+    from gausslite.wire.health import main
+
+    with serving([parser_service(RuleParser())]) as server:
+        assert main([server.address]) == 0
+    assert main([server.address]) == 1
+    assert main([]) == 2
+    refused, usage = capsys.readouterr().err.splitlines()
+    assert server.address in refused
+    assert usage.startswith("usage")

@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 from fusion_team import GRID, team, words
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from serving import serving
 
 from gausslite.codec.subset_codec import decode_subset
@@ -32,17 +34,18 @@ from gausslite.v1 import fusion_service_pb2_grpc as pb_grpc
 from gausslite.wire.clients import FusionClient
 from gausslite.wire.server import Service
 from gausslite.wire.spool import Purpose, Spool
-from gausslite.wire.uplink import Uplink, UplinkSettings
+from gausslite.wire.uplink import Uplink
+from gausslite.wire.uplink_values import UplinkSettings
 
-EAGER = UplinkSettings(interval_s=0.0, growth_share=0.0)
+EAGER = UplinkSettings(interval_s=0.0, growth_share=0.0, first_backoff_s=0.01)
 WAIT_S = 20.0
 
 
 @contextmanager
 def uplink(
-    address: str, settings: UplinkSettings = EAGER, spool: Path | None = None, grid: VoxelGrid = GRID
+    address: str, options: UplinkSettings = EAGER, spool: Path | None = None, grid: VoxelGrid = GRID
 ) -> Iterator[Uplink]:
-    link = Uplink(FusionClient(address), "robot", Spool(spool, "robot", grid), grid, settings)
+    link = Uplink(FusionClient(address), "robot", Spool(spool, "robot", grid), grid, options)
     try:
         yield link
     finally:
@@ -190,8 +193,23 @@ def test_damage_is_sent_once_more_and_then_given_up() -> None:
     with scripted(lambda *_: next(answers)) as (server, address), uplink(address) as link:
         link.offer(words({1: [5]}))
         assert link.drain(WAIT_S)
-        assert link.counters().subsets_rejected == 2
+        assert link.counters().subsets_rejected == 1
     np.testing.assert_array_equal(server.subsets[0].gaussians.means_m, server.subsets[1].gaussians.means_m)
+
+
+@pytest.mark.parametrize("answer", [InvalidInputError("no such codec"), None])
+def test_words_that_nobody_will_ever_take_are_dropped(answer: GaussLiteError | None) -> None:
+    answers = iter([] if answer is None else [answer])
+    bad = words({1: [5]})
+    if answer is None:
+        bad.gaussians.rgb[0] = np.nan
+    with scripted(lambda *_: next(answers, accepted())) as (server, address), uplink(address) as link:
+        link.offer(bad)
+        assert link.drain(WAIT_S)
+        assert link.counters().subsets_rejected == 1
+        link.offer(words({2: [5]}))
+        assert link.drain(WAIT_S)
+    assert server.subsets[-1].keys.tolist() == words({2: [5]}).keys.tolist()
 
 
 def test_a_rejected_subset_is_dropped_and_the_next_goes_on() -> None:
@@ -292,3 +310,55 @@ def test_a_spool_of_someone_else_is_refused(tmp_path: Path) -> None:
 def test_settings_without_sense_are_refused(wrong: dict[str, float]) -> None:
     with pytest.raises(InvalidInputError, match="uplink"):
         UplinkSettings(**wrong)  # type: ignore[arg-type]
+
+
+class FlakyServer(ScriptedServer):
+    """Stores what comes, but now and then loses the message, the ack, or everything."""
+
+    def __init__(self, faults: list[str]) -> None:
+        super().__init__(self._store_or_fail)
+        self.store = MemoryStore()
+        self._faults = iter(faults)
+
+    async def ContributeSubsets(self, request_iterator: Any, context: Any) -> Any:
+        async for request in request_iterator:
+            fault = next(self._faults, "none")
+            if fault == "message lost":
+                raise UnavailableError("cut")
+            subset, _ = decode_subset(request.subset)
+            if fault == "memory lost":
+                self.store = MemoryStore()
+                raise SessionUnknownError("restarted")
+            put = self.store.put(subset)
+            if fault == "ack lost":
+                raise UnavailableError("cut")
+            status = pb.SUBSET_STATUS_ACCEPTED if len(put.accepted) else pb.SUBSET_STATUS_STALE
+            outcome = pb.SubsetOutcome(sequence=request.sequence, status=status)
+            yield pb.ContributeSubsetsResponse(acknowledged=request.sequence, outcomes=[outcome])
+
+    def _store_or_fail(self, *_: object) -> pb.SubsetOutcome:
+        raise AssertionError
+
+
+FAULTS = st.lists(st.sampled_from(["none", "message lost", "ack lost", "memory lost"]), max_size=4)
+OFFERS = st.lists(
+    st.dictionaries(st.integers(0, 5), st.lists(st.integers(0, 9), max_size=3), max_size=4), min_size=1, max_size=4
+)
+
+
+@given(offers=OFFERS, faults=FAULTS, together=st.booleans())
+@settings(max_examples=25, deadline=None)
+def test_whatever_is_lost_on_the_way_the_server_ends_with_the_newest_words(
+    offers: list[dict[int, list[int]]], faults: list[str], together: bool
+) -> None:
+    server = FlakyServer(faults)
+    service = Service(
+        "gausslite.v1.FusionService",
+        lambda running: pb_grpc.add_FusionServiceServicer_to_server(server, running),
+    )
+    with serving([service]) as running, uplink(running.address) as link:
+        for offer in offers:
+            link.offer(words(offer))
+            assert together or link.drain(WAIT_S)
+        assert link.drain(WAIT_S)
+    assert held(server.store) == said(*offers)

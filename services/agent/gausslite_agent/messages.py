@@ -15,7 +15,7 @@ from gausslite.v1 import agent_service_pb2 as pb
 from gausslite.v1.gaussians_pb2 import MapBlock
 from gausslite.wire.convert import graph_to_message
 from gausslite.wire.images import encode_colour, encode_depth
-from gausslite.wire.uplink import UplinkCounters
+from gausslite.wire.uplink_values import UplinkCounters
 from gausslite_agent.robot import FrameReport, Outcome, RobotStatus
 
 _BLOCK_BYTES = 1 << 19

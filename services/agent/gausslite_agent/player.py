@@ -19,7 +19,8 @@ from gausslite.task.parser import TaskParser
 from gausslite.v1 import agent_service_pb2 as pb
 from gausslite.wire.clients import FusionClient
 from gausslite.wire.spool import Purpose
-from gausslite.wire.uplink import Uplink, UplinkCounters
+from gausslite.wire.uplink import Uplink
+from gausslite.wire.uplink_values import UplinkCounters
 from gausslite_agent.results import mission_report, write_results
 from gausslite_agent.robot import FrameReport, Robot
 from gausslite_agent.settings import AgentSettings, PlaySettings

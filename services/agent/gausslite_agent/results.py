@@ -11,7 +11,7 @@ from pathlib import Path
 from gausslite.codec.ply import write_ply
 from gausslite.domain.gaussians import Gaussians
 from gausslite.errors import StorageError
-from gausslite.wire.uplink import UplinkCounters
+from gausslite.wire.uplink_values import UplinkCounters
 from gausslite_agent.robot import RobotStatus
 
 

@@ -23,7 +23,7 @@ from gausslite.wire.convert import (
     transform_from_message,
 )
 from gausslite.wire.server import Service
-from gausslite.wire.uplink import UplinkCounters
+from gausslite.wire.uplink_values import UplinkCounters
 from gausslite_agent.history import MapHistory
 from gausslite_agent.messages import blank_view, map_blocks, report_to_message, status_to_message, view_to_message
 from gausslite_agent.robot import FrameReport, Robot

@@ -12,7 +12,7 @@ from gausslite.domain.voxels import VoxelGrid
 from gausslite.errors import InvalidInputError
 from gausslite.mapping.policies import POLICIES
 from gausslite.mission import DEFAULT_MAX_GAUSSIANS, MissionSettings
-from gausslite.wire.uplink import UplinkSettings
+from gausslite.wire.uplink_values import UplinkSettings
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,7 +11,7 @@ import logging
 import threading
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 from gausslite.codec.subset_codec import MAX_SUBSET_BYTES, encode_subset, split_words
 from gausslite.domain.subset import RoiSubset, VoxelWords
@@ -30,55 +30,13 @@ from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.wire.bandwidth import Allowance
 from gausslite.wire.clients import FusionClient, Session
 from gausslite.wire.spool import Picked, Purpose, Spool
+from gausslite.wire.uplink_values import UplinkCounters, UplinkSettings
 
 _log = logging.getLogger(__name__)
 _MIN_SUBSET_BYTES = 1 << 16
 _MIN_INTERVAL_S = 0.02
-_FIRST_BACKOFF_S, _LAST_BACKOFF_S = 0.2, 5.0
+_LAST_BACKOFF_S = 5.0
 _PURPOSES = {Purpose.ROI: pb.PURPOSE_ROI, Purpose.HANDOVER: pb.PURPOSE_HANDOVER}
-
-
-@dataclass(frozen=True, slots=True)
-class UplinkSettings:
-    """kbps bounds the bandwidth (kilobits a second; None = no bound). Between rounds at least interval_s pass, so that
-    words coalesce; a voxel is sent again once its kappa grew by growth_share, or when draining.
-    """
-
-    kbps: float | None = None
-    interval_s: float = 1.0
-    growth_share: float = 0.25
-    round_bytes: int = 4 << 20
-    deadline_s: float = 30.0
-    world_frame: str = ""
-
-    def __post_init__(self) -> None:
-        if self.kbps is not None and not self.kbps > 0:
-            raise InvalidInputError(f"uplink kbps: expected a positive number, got {self.kbps}")
-        if not (self.interval_s >= 0 and self.growth_share >= 0 and self.deadline_s > 0 and self.round_bytes > 0):
-            raise InvalidInputError(
-                "uplink: expected interval and growth of at least 0, and a positive deadline and size"
-            )
-
-
-@dataclass(frozen=True, slots=True)
-class UplinkCounters:
-    """What was sent and acknowledged so far; voxels_sent counts each voxel of the task's region once."""
-
-    roi_bytes: int = 0
-    handover_bytes: int = 0
-    gaussians_sent: int = 0
-    voxels_sent: int = 0
-    voxels_waiting: int = 0
-    subsets_sent: int = 0
-    subsets_rejected: int = 0
-    joins: int = 0
-    connected: bool = False
-    stopped_because: str = ""
-
-    @property
-    def bytes_sent(self) -> int:
-        """All subset bytes, resends included."""
-        return self.roi_bytes + self.handover_bytes
 
 
 class Uplink:
@@ -158,15 +116,17 @@ class Uplink:
             while self._wait_until_due():
                 try:
                     self._after_round(self._round())
-                except (MismatchError, NotPermittedError) as error:
+                except (MismatchError, NotPermittedError, InvalidInputError) as error:
                     self._stop(str(error))
                 except GaussLiteError as error:
                     if not self._closing:
                         self._recover(error)
         except Exception as error:
-            # whatever it is, the operator must see that nothing is sent any more
-            _log.exception("uplink failed")
-            self._stop(f"{type(error).__name__}: {error}")
+            # a channel closed under a call is how `close` ends it
+            if not self._closing:
+                # whatever else it is, the operator must see that nothing is sent any more
+                _log.exception("uplink failed")
+                self._stop(f"{type(error).__name__}: {error}")
 
     def _wait_until_due(self) -> bool:
         """Wait for words, bandwidth and the next round's time; False when it is time to end."""
@@ -190,16 +150,29 @@ class Uplink:
         sent: dict[int, tuple[Picked, int]] = {}
         requests = list(self._requests(picked, session, sent))
         self._allowance.spend(sum(size for _, size in sent.values()))
-        problem: GaussLiteError | None = None
-        for response in self._client.contribute(requests, self._settings.deadline_s):
-            for outcome in response.outcomes:
-                if outcome.sequence in sent:
-                    problem = self._take_outcome(outcome, *sent.pop(outcome.sequence)) or problem
+        problem = self._exchange(requests, sent)
         if problem is not None:
             raise problem
         if sent:
             raise UnavailableError(f"{self._client.address}: the stream ended before {len(sent)} subsets were answered")
         return True
+
+    def _exchange(
+        self, requests: list[pb.ContributeSubsetsRequest], sent: dict[int, tuple[Picked, int]]
+    ) -> GaussLiteError | None:
+        """Send on one stream and settle what is answered; the last problem that needs another try."""
+        problem: GaussLiteError | None = None
+        try:
+            for response in self._client.contribute(requests, self._settings.deadline_s):
+                for outcome in response.outcomes:
+                    if outcome.sequence in sent:
+                        problem = self._take_outcome(outcome, *sent.pop(outcome.sequence)) or problem
+        except InvalidInputError as error:
+            # the server will not have any of it, now or later
+            for part, _ in sent.values():
+                self._drop(part, str(error))
+            sent.clear()
+        return problem
 
     def _joined(self) -> Session:
         if self._session is None:
@@ -220,9 +193,16 @@ class Uplink:
             stop = start + len(part)
             self._sequence += 1
             stamp = self._spool.next_stamp(session.highest_map_revision)
-            data = encode_subset(RoiSubset(self._agent_id, session.session_id, self._sequence, stamp, part), self._grid)
-            sent[self._sequence] = Picked(picked.purpose, part, picked.versions[start:stop]), len(data)
+            words = Picked(picked.purpose, part, picked.versions[start:stop])
             start = stop
+            try:
+                data = encode_subset(
+                    RoiSubset(self._agent_id, session.session_id, self._sequence, stamp, part), self._grid
+                )
+            except InvalidInputError as error:
+                self._drop(words, str(error))
+                continue
+            sent[self._sequence] = words, len(data)
             yield pb.ContributeSubsetsRequest(
                 session_id=session.session_id,
                 sequence=self._sequence,
@@ -240,11 +220,18 @@ class Uplink:
         if rejected and outcome.reason == "CHECKSUM" and not keys & self._damaged:
             self._damaged |= keys
             return UnavailableError(outcome.message)
-        if rejected:
-            _log.warning("subset of %d voxels rejected: %s %s", len(keys), outcome.reason, outcome.message)
         self._damaged -= keys
-        self._spool.settle(part)
+        if rejected:
+            self._drop(part, f"{outcome.reason} {outcome.message}")
+        else:
+            self._spool.settle(part)
         return None
+
+    def _drop(self, part: Picked, reason: str) -> None:
+        _log.warning("uplink: words on %d voxels are dropped: %s", len(part.words), reason)
+        self._spool.settle(part)
+        with self._changed:
+            self._counters = replace(self._counters, subsets_rejected=self._counters.subsets_rejected + 1)
 
     def _count(self, part: Picked, size: int, keys: set[int], rejected: bool) -> None:
         is_roi = part.purpose is Purpose.ROI
@@ -256,7 +243,6 @@ class Uplink:
                 handover_bytes=c.handover_bytes + size * (not is_roi),
                 gaussians_sent=c.gaussians_sent + len(part.words.gaussians) * (not rejected),
                 subsets_sent=c.subsets_sent + 1,
-                subsets_rejected=c.subsets_rejected + rejected,
             )
             if is_roi and not rejected:
                 self._roi_voxels |= keys
@@ -271,7 +257,7 @@ class Uplink:
             self._subset_bytes = max(_MIN_SUBSET_BYTES, self._subset_bytes // 2)
         with self._changed:
             self._counters = replace(self._counters, connected=False)
-            self._backoff_s = min(max(2 * self._backoff_s, _FIRST_BACKOFF_S), _LAST_BACKOFF_S)
+            self._backoff_s = min(max(2 * self._backoff_s, self._settings.first_backoff_s), _LAST_BACKOFF_S)
             self._next_round_s = time.monotonic() + self._backoff_s
 
     def _after_round(self, sent: bool) -> None:
