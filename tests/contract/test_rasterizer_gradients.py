@@ -8,7 +8,7 @@ from splat_scenes import CAMERA, GROUPS, SCENES, Scene, random_image_gradients, 
 
 from gausslite.render.rasterizer import EVERYTHING, Rasterizer, SplatGradients, Subset
 
-TOLERANCE = 1e-3
+TOLERANCE = 7e-4
 
 
 def gradients(rasterizer: Rasterizer, scene: Scene, subset: Subset = EVERYTHING) -> SplatGradients:

@@ -9,7 +9,7 @@ from splat_scenes import CAMERA, SCENES, Scene, random_rows, relative_error, sce
 from gausslite.errors import InvalidInputError, ShapeError
 from gausslite.render.rasterizer import TILE_PX, Rasterizer, Rendering, Subset
 
-ATOL = 5e-5
+ATOL = 2e-5
 
 
 def assert_same_images(came: Rendering, wanted: Rendering, where: np.ndarray) -> None:
@@ -17,7 +17,7 @@ def assert_same_images(came: Rendering, wanted: Rendering, where: np.ndarray) ->
     assert np.abs(came.rgb - wanted.rgb)[where].max(initial=0.0) < ATOL
     assert np.abs(came.alpha - wanted.alpha)[where].max(initial=0.0) < ATOL
     assert np.abs(came.depth_m - wanted.depth_m)[where].max(initial=0.0) < ATOL * far_m
-    assert relative_error(came.rgb[where], wanted.rgb[where]) < 2e-4
+    assert relative_error(came.rgb[where], wanted.rgb[where]) < ATOL
 
 
 @pytest.mark.parametrize("name", SCENES)

@@ -12,7 +12,8 @@ from gausslite.render.reference.compositing import draw
 from gausslite.render.reference.loss import ReferenceView, ssim_map, training_loss
 from gausslite.render.reference.projection import project
 
-STEP = 1e-6
+STEP = 5e-8
+"""So small that no alpha of a compared pixel crosses a threshold, and still far above the noise of float64."""
 
 
 def scalar(scene: Scene, rows: np.ndarray, T_camera_world: np.ndarray, d_images: np.ndarray) -> float:
@@ -29,25 +30,24 @@ def exp_twist(twist: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("name", ["medium splats", "large splats", "outside the view", "needles and sheets"])
-def test_row_gradients_match_finite_differences(oracle: Rasterizer, name: str) -> None:
+def test_row_gradients_match_finite_differences_along_random_directions(oracle: Rasterizer, name: str) -> None:
     scene = scene_named(name)
     d_rgb, d_depth_m, d_alpha = random_image_gradients(scene)
     d_images = np.concatenate([d_rgb, d_depth_m[..., None], d_alpha[..., None]], axis=2).astype(np.float64)
     drawn = oracle.forward(scene.rows, scene.camera, scene.T_camera_world)
     came = oracle.backward(drawn, d_rgb, d_depth_m, d_alpha)
-    chosen = np.random.default_rng(0).choice(came.visible, 6, replace=False)
     rows = scene.rows.astype(np.float64)
-    wanted = np.zeros((len(chosen), 14))
-    for i, row in enumerate(chosen):
-        for column in range(14):
-            low, high = rows.copy(), rows.copy()
-            low[row, column] -= STEP
-            high[row, column] += STEP
-            wanted[i, column] = (
-                scalar(scene, high, scene.T_camera_world, d_images) - scalar(scene, low, scene.T_camera_world, d_images)
-            ) / (2 * STEP)
+    rng = np.random.default_rng(0)
     for group, columns in GROUPS.items():
-        assert relative_error(came.d_rows[chosen][:, columns], wanted[:, columns]) < 1e-5, group
+        slopes, products = [], []
+        for _ in range(3):
+            direction = np.zeros_like(rows)
+            direction[came.visible, columns] = rng.normal(size=(len(came.visible), columns.stop - columns.start))
+            ahead = scalar(scene, rows + STEP * direction, scene.T_camera_world, d_images)
+            behind = scalar(scene, rows - STEP * direction, scene.T_camera_world, d_images)
+            slopes.append((ahead - behind) / (2 * STEP))
+            products.append((came.d_rows * direction).sum())
+        assert relative_error(np.array(products), np.array(slopes)) < 2e-5, group
 
 
 def test_the_pose_gradient_matches_finite_differences(oracle: Rasterizer) -> None:
