@@ -15,8 +15,8 @@ from gausslite.task.words import words
 WORDS = st.sampled_from(
     sorted(
         words(
-            "pick up put find avoid without not ignore the a red closest nearest to from on in of for with and or , / ; "
-            "it that mug table chairs map go door picture path is don't touching"
+            "pick up put find avoid without not ignore the a red closest nearest to from on in of for with and or , / "
+            "; it that mug table chairs map go door picture path is don't touching"
         )
     )
 )

@@ -1,0 +1,139 @@
+"""The whole way of an image through a YOLO-seg file, with numbers known by hand, and every wrong file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tiny_yolo import write_boxes_only, write_tiny_yolo
+
+from gausslite.domain.camera import Camera
+from gausslite.domain.frame import Frame
+from gausslite.errors import InvalidInputError, ModelFileError
+from gausslite.perception.detect import BoxFractions
+from gausslite.perception.yolo import YoloSegDetector, YoloSettings, load_yolo
+
+NAMES = ("cup", "chair", "dining table")
+
+
+def frame_with_red_square() -> Frame:
+    """128x64: scaled by one half into 64x64, padded by 16 rows above and below."""
+    rgb = np.zeros((64, 128, 3), np.uint8)
+    rgb[16:48, 32:64, 0] = 255
+    return Frame(0, 0, rgb, np.ones((64, 128), np.float32), Camera(100, 100, 64, 32, 128, 64), np.eye(4))
+
+
+# the square in the network's pixels: columns 16 to 32, rows 24 to 40
+CUP = (24.0, 32.0, 16.0, 16.0, 0, 0.9)
+
+
+def test_letterbox_box_and_mask_come_back_to_the_image(tmp_path):
+    detector = load_yolo(write_tiny_yolo(tmp_path / "tiny.onnx", NAMES, [CUP]))
+    (found,) = detector.detect(frame_with_red_square(), ["mug"])
+    assert found.phrase == "mug"
+    assert found.score == pytest.approx(0.9)
+    assert found.box_px == pytest.approx((32, 16, 64, 48))
+    expected = np.zeros((64, 128), np.bool_)
+    expected[16:48, 32:64] = True
+    overlap = (found.mask & expected).sum() / (found.mask | expected).sum()
+    # interpolation rounds the four corners and nothing else; any shift by half a pixel would break the symmetry
+    assert overlap > 0.97
+    assert not (found.mask & ~expected).any()
+    inside = found.mask[16:48, 32:64]
+    assert np.array_equal(inside, inside[::-1])
+    assert np.array_equal(inside, inside[:, ::-1])
+
+
+def test_a_mask_does_not_leave_its_box(tmp_path):
+    narrow = (24.0, 32.0, 8.0, 16.0, 0, 0.9)
+    detector = load_yolo(write_tiny_yolo(tmp_path / "tiny.onnx", NAMES, [narrow]))
+    (found,) = detector.detect(frame_with_red_square(), ["cup"])
+    assert not found.mask[:, :40].any()
+    assert not found.mask[:, 56:].any()
+    assert found.mask[16:48, 40:56].all()
+
+
+def test_overlapping_boxes_of_one_class_become_one_and_other_classes_stay(tmp_path):
+    shifted, chair = (25.0, 32.0, 16.0, 16.0, 0, 0.8), (24.0, 32.0, 16.0, 16.0, 1, 0.7)
+    detector = load_yolo(write_tiny_yolo(tmp_path / "tiny.onnx", NAMES, [shifted, CUP, chair]))
+    found = detector.detect(frame_with_red_square(), ["cup", "chair"])
+    assert [(each.phrase, round(each.score, 2)) for each in found] == [("cup", 0.9), ("chair", 0.7)]
+
+
+def test_boxes_below_the_score_or_without_a_mask_are_left_out(tmp_path):
+    doubtful, black = (24.0, 32.0, 16.0, 16.0, 0, 0.2), (52.0, 32.0, 16.0, 16.0, 0, 0.9)
+    detector = load_yolo(write_tiny_yolo(tmp_path / "tiny.onnx", NAMES, [doubtful, black]))
+    assert detector.detect(frame_with_red_square(), ["cup"]) == []
+
+
+def test_boxes_that_span_too_much_are_left_out(tmp_path):
+    huge = (32.0, 32.0, 64.0, 24.0, 0, 0.9)
+    path = write_tiny_yolo(tmp_path / "tiny.onnx", NAMES, [huge])
+    assert load_yolo(path).detect(frame_with_red_square(), ["cup"]) == []
+    lenient = YoloSegDetector(path, None, YoloSettings(box_fractions=BoxFractions(small=1.0)))
+    assert len(lenient.detect(frame_with_red_square(), ["cup"])) == 1
+
+
+def test_a_generic_noun_finds_every_class(tmp_path):
+    chair = (20.0, 30.0, 10.0, 10.0, 1, 0.7)
+    detector = load_yolo(write_tiny_yolo(tmp_path / "tiny.onnx", NAMES, [CUP, chair]))
+    assert len(detector.detect(frame_with_red_square(), ["obstacle"])) == 2
+
+
+def test_a_noun_without_a_class_is_said_and_not_found(tmp_path):
+    detector = load_yolo(write_tiny_yolo(tmp_path / "tiny.onnx", NAMES, [CUP]))
+    assert detector.detect(frame_with_red_square(), ["umbrella"]) == []
+    assert detector.warnings == ("no class of the detector fits 'umbrella': it will not be found",)
+
+
+def test_segment_matches_instances_of_any_class_to_boxes(tmp_path):
+    detector = load_yolo(write_tiny_yolo(tmp_path / "tiny.onnx", NAMES, [CUP]), threads=1)
+    boxes = np.array([[30, 16, 64, 50], [80, 0, 120, 30]], np.float32)
+    first, second = detector.segment(frame_with_red_square(), boxes)
+    assert first is not None
+    assert first.sum() > 0.97 * 32 * 32
+    assert second is None
+
+
+@pytest.mark.parametrize(
+    ("content", "expected"),
+    [
+        (None, "found nothing"),
+        (b"", "expected a readable ONNX model"),
+        (b"not a model", "expected a readable ONNX model"),
+    ],
+)
+def test_a_missing_or_damaged_file_is_refused_in_one_line(tmp_path, content, expected):
+    path = tmp_path / "model.onnx"
+    if content is not None:
+        path.write_bytes(content)
+    _refused(path, expected)
+
+
+def test_a_truncated_file_is_refused(tmp_path):
+    path = write_tiny_yolo(tmp_path / "tiny.onnx", NAMES, [CUP])
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    _refused(path, "expected a readable ONNX model")
+
+
+def test_a_model_of_boxes_only_is_refused(tmp_path):
+    _refused(write_boxes_only(tmp_path / "boxes.onnx"), r"boxes only, no masks")
+
+
+def test_a_model_without_class_names_is_refused(tmp_path):
+    _refused(write_tiny_yolo(tmp_path / "tiny.onnx", (), []), "class names in the metadata field 'names'")
+
+
+def test_settings_are_checked():
+    with pytest.raises(InvalidInputError, match="detector min_score: expected between 0 and 1"):
+        YoloSettings(min_score=1.5)
+    with pytest.raises(InvalidInputError, match="box fraction small"):
+        BoxFractions(small=0.0)
+
+
+def _refused(path: Path, expected: str) -> None:
+    with pytest.raises(ModelFileError, match=expected) as caught:
+        load_yolo(path)
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
