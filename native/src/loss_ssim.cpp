@@ -179,7 +179,8 @@ class ChannelPass {
       const Pack16 by_x = blur_across(window[0], i), by_xx = blur_across(window[1], i), by_xy = blur_across(window[2], i);
       const Pack16 image = load(image_ + at);
       const Pack16 change = by_x + fma(image + image, by_xx, load(target_ + at) * by_xy);
-      store(gradient_ + at, load(gradient_ + at) + change);
+      const int inside = ws_.camera.width - x;
+      store(gradient_ + at, load(gradient_ + at) + (inside >= 16 ? change : keep(first_lanes(std::max(0, inside)), change)));
     }
   }
 

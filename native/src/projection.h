@@ -20,7 +20,7 @@ struct Projection {
   Pack16 cov_xx, cov_xy, cov_yy;          // image covariance, px^2
   Pack16 conic_xx, conic_xy, conic_yy;    // its inverse
   Pack16 mean_x, mean_y;                  // px
-  Pack16 opacity, log2_opacity;
+  Pack16 transparency, log2_opacity;      // 1 - opacity, and log2(opacity)
 };
 
 GAUSSLITE_INLINE Pack16 dot3(const Pack16* a, const Pack16* b) { return fma(a[0], b[0], fma(a[1], b[1], a[2] * b[2])); }
@@ -103,8 +103,9 @@ GAUSSLITE_INLINE void project16(const Pack16* row, const Camera& camera, Project
   }
   invert_covariance(o);
 
-  const Pack16 denominator = Pack16(1.0f) + exp(-row[kLogit]);
-  o.opacity = Pack16(1.0f) / denominator;
+  // exp(-logit) / denominator keeps its digits where the opacity is close to 1 and 1 - opacity would lose them.
+  const Pack16 e = exp(-row[kLogit]), denominator = Pack16(1.0f) + e;
+  o.transparency = e / denominator;
   o.log2_opacity = -log2(denominator);
 }
 

@@ -82,7 +82,7 @@ GAUSSLITE_INLINE void backward16(const Pack16* row, const Pack16* image, const C
   for (int j = 0; j < 3; ++j) {
     out.column[kMean + j] = by_camera[0] * R[j] + by_camera[1] * R[3 + j] + by_camera[2] * R[6 + j];
   }
-  out.column[kLogit] = image[0] * (Pack16(1.0f) - p.opacity);
+  out.column[kLogit] = image[0] * p.transparency;
   for (int k = 0; k < 3; ++k) out.column[kRgb + k] = image[kColourSums + k];
   out.column[14] = out.column[15] = Pack16(0.0f);
 

@@ -23,6 +23,7 @@ struct Targets {
   const float* depth_m;  // 0 where there is no measurement
   const float* weight;   // 0 outside the image
   const float* moments;  // SSIM: three planes of the mean, three of the mean square; null when SSIM was not prepared
+  const uint8_t* weighted_tiles;  // 1 where a tile has a pixel with a weight
   const uint16_t* spans; // per image row: first column with a weight, end column; equal where there is none
 };
 

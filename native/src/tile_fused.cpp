@@ -100,9 +100,10 @@ void train_strip(Workspace& ws, const Training& training, int strip, int thread)
   for (int x = 0; x < ws.tiles_x; ++x) {
     const size_t t = size_t(strip) * size_t(ws.tiles_x) + size_t(x);
     training.loss_sums[t] = 0.0;
-    if (ws.active_tiles != nullptr && !ws.active_tiles[t]) continue;
+    if (!training.targets.weighted_tiles[t]) continue;
+    // An inactive tile stays empty, and its pixels count as they are.
     FusedTile tile(ws, ws.scratch[size_t(thread)], ws.tiles[t], TilePosition(ws, x, strip));
-    tile.draw();
+    if (ws.active_tiles == nullptr || ws.active_tiles[t]) tile.draw();
     training.loss_sums[t] = tile.compare(training);
     tile.walk_back_all();
   }

@@ -17,17 +17,25 @@ class TrainingView {
   int width() const { return width_; }
   int height() const { return height_; }
   Targets targets(bool masked) const;
-  double weight_sum(bool masked) const { return masked && masked_ ? mask_sum_ : double(width_) * height_; }
+  double weight_sum(bool masked) const { return weights(masked).sum; }
 
  private:
-  void set_spans(Buffer<uint16_t>& spans, const float* weight) const;
+
+  // One way of weighing the pixels, and where its weights are.
+  struct Weights {
+    int plane;
+    double sum = 0.0;
+    Buffer<uint16_t> spans;
+    Buffer<uint8_t> tiles;
+  };
+  void locate(Weights& weights) const;
+  const Weights& weights(bool masked) const { return masked && masked_ ? mask_ : inside_; }
 
   int width_, height_, padded_width_;
   int64_t plane_;
   bool masked_;
-  double mask_sum_ = 0.0;
   Buffer<float> planes_;  // r g b, depth, inside (1 in the image, 0 in the padding), mask, three means, three mean squares
-  Buffer<uint16_t> inside_spans_, mask_spans_;
+  Weights inside_, mask_;
 };
 
 }  // namespace gausslite
