@@ -1,0 +1,129 @@
+"""The command line as a user meets it: real runs on a small simulated home, and one line for every mistake."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gausslite.codec.ply import read_ply
+
+HOME = "sim:home?seed=0&trajectory=0&frames=12"
+SMALL = ("--size", "160x120", "--max-gaussians", "6000", "--iterations", "4")
+
+pytest.importorskip("embreex", reason="the simulated home needs the extra `sim`")
+
+
+def gausslite(*arguments: str | Path, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "gausslite", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=240, cwd=cwd)
+
+
+@pytest.fixture(scope="module")
+def mug_map(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("map")
+    done = gausslite("map", HOME, "--task", "Pick up the mug on the table", *SMALL, "--out", out)
+    assert done.returncode == 0, done.stderr
+    return out
+
+
+def test_map_writes_a_map_of_the_task_and_a_report(mug_map: Path) -> None:
+    report = json.loads((mug_map / "report.json").read_text())
+    gaussians = read_ply(mug_map / "map.ply")
+    assert report["frames"] == 12
+    assert report["frames_skipped"] == 0
+    assert report["task"]["targets"] == ["mug"]
+    assert report["gaussians"] == len(gaussians) <= 6000
+    assert 0 < gaussians.active.sum() < len(gaussians)
+    assert gaussians.kappa[gaussians.active].max() > 0
+    assert not gaussians.kappa[~gaussians.active].any()
+
+
+def test_the_cap_holds_and_the_same_seed_gives_the_same_map(tmp_path: Path) -> None:
+    maps = []
+    for name in ("a", "b"):
+        options = ("--size", "96x72", "--max-gaussians", "1500", "--iterations", "2", "--threads", "1", "--seed", "3")
+        done = gausslite("map", HOME, "--task", "Find the mug", *options, "--out", tmp_path / name)
+        assert done.returncode == 0, done.stderr
+        maps.append(read_ply(tmp_path / name / "map.ply"))
+    assert len(maps[0]) <= 1500
+    np.testing.assert_array_equal(maps[0].means_m, maps[1].means_m)
+    np.testing.assert_array_equal(maps[0].kappa, maps[1].kappa)
+
+
+def test_a_uniform_map_needs_no_task(tmp_path: Path) -> None:
+    done = gausslite("map", HOME, "--policy", "uniform", *SMALL, "--frames", "0:4", "--out", tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert not read_ply(tmp_path / "map.ply").active.any()
+
+
+def test_eval_scores_a_map_on_frames(mug_map: Path) -> None:
+    done = gausslite(
+        "eval", mug_map / "map.ply", HOME, "--size", "160x120", "--hold-out", "4", "--roi-ball", "2,2,0.8,0.5", "--json"
+    )
+    assert done.returncode == 0, done.stderr
+    scores = json.loads(done.stdout)
+    assert scores["n_views"] == 3
+    assert scores["full_psnr"] > 12
+
+
+def test_fuse_joins_map_files(mug_map: Path, tmp_path: Path) -> None:
+    source = mug_map / "map.ply"
+    done = gausslite("fuse", source, source, "--out", tmp_path / "fused.ply", "--json")
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["gaussians"] == len(read_ply(source)) == len(read_ply(tmp_path / "fused.ply"))
+
+
+def test_parse_prints_the_stable_json() -> None:
+    done = gausslite("parse", "Pick up the mug on the table", "--json")
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout) == {
+        "targets": ["mug"],
+        "anchors": ["table"],
+        "relations": [{"predicate": "on", "target": "mug", "anchor": "table"}],
+        "warnings": [],
+    }
+
+
+def test_every_mistake_gets_one_line_and_exit_code_two(tmp_path: Path, mug_map: Path) -> None:
+    (tmp_path / "notes.onnx").write_bytes(b"not a model")
+    (tmp_path / "broken.ply").write_bytes((mug_map / "map.ply").read_bytes()[:-7])
+    (tmp_path / "a-file").write_text("")
+    task = ("--task", "Pick up the mug")
+    out = ("--out", str(tmp_path / "out"))
+    mistakes: dict[str, tuple[str | Path, ...]] = {
+        "nowhere": ("map", tmp_path / "nowhere", *task, *out),
+        "layout": ("map", tmp_path, *task, *out),
+        "task": ("map", HOME, "--task", "", *out),
+        "nonsense": ("map", HOME, "--task", "?!", *out),
+        "--task": ("map", HOME, *out),
+        "notes.onnx": ("map", HOME, *task, "--detector", tmp_path / "notes.onnx", *out),
+        "frames": ("map", HOME, *task, "--frames", "9:3", *out),
+        "size": ("map", HOME, *task, "--size", "huge", *out),
+        "max_gaussians": ("map", HOME, *task, "--max-gaussians", "0", *out),
+        "a-file": ("map", HOME, *task, "--out", tmp_path / "a-file"),
+        "regions.npz": ("map", HOME, "--roi", tmp_path / "regions.npz", *out),
+        "sim:": ("map", "sim:castle", *task, *out),
+        "broken.ply": ("eval", tmp_path / "broken.ply", HOME),
+        "missing.ply": ("fuse", tmp_path / "missing.ply", mug_map / "map.ply", "--out", tmp_path / "f.ply"),
+        "two": ("fuse", mug_map / "map.ply", "--out", tmp_path / "f.ply"),
+    }
+    for named, arguments in mistakes.items():
+        done = gausslite(*arguments)
+        complaint = done.stderr.strip()
+        assert done.returncode == 2, (named, complaint)
+        assert "Traceback" not in complaint
+        assert len(complaint.splitlines()) == 1, (named, complaint)
+        if named not in ("layout", "nonsense"):
+            assert named in complaint, (named, complaint)
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full here")
+def test_a_full_disk_is_one_line(mug_map: Path) -> None:
+    done = gausslite("fuse", mug_map / "map.ply", mug_map / "map.ply", "--out", "/dev/full")
+    assert done.returncode == 2
+    assert len(done.stderr.strip().splitlines()) == 1
