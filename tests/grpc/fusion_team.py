@@ -20,12 +20,12 @@ from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.subset import RoiSubset, VoxelWords
 from gausslite.domain.voxels import VoxelGrid
+from gausslite.domain.words import tombstones, unite, words_of
 from gausslite.fusion.memory import MemoryStore
 from gausslite.fusion.refine import RefineSettings
 from gausslite.fusion.store import FusionStore
 from gausslite.fusion.team import TeamMap
 from gausslite.fusion.terms import TeamSettings
-from gausslite.fusion.words import tombstones, unite, words_of
 from gausslite.render.reference import ReferenceRasterizer
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.v1 import fusion_service_pb2_grpc as pb_grpc

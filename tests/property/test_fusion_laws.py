@@ -14,12 +14,12 @@ from hypothesis import strategies as st
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.subset import RoiSubset, VoxelWords
 from gausslite.domain.voxels import VoxelGrid
+from gausslite.domain.words import at_keys, take_voxels, tombstones, unite, words_of
 from gausslite.fusion.memory import MemoryStore
 from gausslite.fusion.offline import fuse_maps
 from gausslite.fusion.sqlite import SqliteStore
 from gausslite.fusion.store import FusionStore
 from gausslite.fusion.vote import FusedMap, concatenate, elect, fuse
-from gausslite.fusion.words import at_keys, take_voxels, tombstones, unite, words_of
 
 GRID = VoxelGrid(0.10)
 AGENTS = ("ant", "bee", "cat", "dog")

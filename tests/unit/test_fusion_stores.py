@@ -15,11 +15,11 @@ import pytest
 
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.subset import RoiSubset, VoxelWords
+from gausslite.domain.words import at_keys, gather_rows
 from gausslite.errors import InvalidInputError, StorageError
 from gausslite.fusion.memory import MemoryStore
 from gausslite.fusion.sqlite import SqliteStore
 from gausslite.fusion.store import Charter, FusionStore, Session
-from gausslite.fusion.words import at_keys, gather_rows
 
 KEYS = (11, 22, 33)
 

@@ -8,13 +8,13 @@ import pytest
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.subset import RoiSubset
 from gausslite.domain.voxels import VoxelGrid
+from gausslite.domain.words import tombstones, unite, words_of
 from gausslite.errors import GaussLiteError, InvalidInputError, MismatchError, QuotaError, SessionUnknownError
 from gausslite.fusion.memory import MemoryStore
 from gausslite.fusion.store import Charter
 from gausslite.fusion.tally import Tally
 from gausslite.fusion.team import TeamMap
 from gausslite.fusion.terms import Quotas, TeamSettings, agree
-from gausslite.fusion.words import tombstones, unite, words_of
 
 GRID = VoxelGrid(0.10)
 ANYTHING = Charter("", "", 0.10)

@@ -7,7 +7,8 @@ from test_parameters import some_gaussians
 
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.voxels import VoxelGrid
-from gausslite.mapping.roi import RoiLedger, voxel_words
+from gausslite.domain.words import words_of
+from gausslite.mapping.roi import RoiLedger
 
 GRID = VoxelGrid(0.5)
 
@@ -20,7 +21,7 @@ def active_gaussians(count: int = 60) -> Gaussians:
 
 def test_words_hold_each_gaussian_once_in_its_voxel_with_totals() -> None:
     gaussians = some_gaussians(200)
-    words = voxel_words(gaussians, GRID)
+    words = words_of(gaussians, GRID)
     assert int(words.counts.sum()) == 200
     np.testing.assert_array_equal(np.repeat(words.keys, words.counts), GRID.keys(words.gaussians.means_m))
     assert int(words.kappa_sums.sum()) == int(gaussians.kappa.sum())
@@ -29,7 +30,7 @@ def test_words_hold_each_gaussian_once_in_its_voxel_with_totals() -> None:
 
 
 def test_no_gaussians_make_no_words() -> None:
-    assert len(voxel_words(Gaussians.empty(), GRID)) == 0
+    assert len(words_of(Gaussians.empty(), GRID)) == 0
     assert len(RoiLedger(GRID).changed(Gaussians.empty())) == 0
 
 
@@ -97,7 +98,7 @@ def test_applying_all_changes_in_order_rebuilds_the_whole() -> None:
         words = ledger.changed(gaussians)
         for key, kappa, count in zip(words.keys, words.kappa_sums, words.counts, strict=True):
             known[int(key)] = (int(kappa), int(count))
-    whole = voxel_words(gaussians, GRID)
+    whole = words_of(gaussians, GRID)
     alive = {key: told for key, told in known.items() if told[1] > 0}
     assert alive == {
         int(key): (int(kappa), int(count))

@@ -9,9 +9,9 @@ import numpy as np
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.subset import VoxelWords
 from gausslite.domain.voxels import VoxelGrid
+from gausslite.domain.words import at_keys, no_words, tombstones, unite, words_of
 from gausslite.errors import RevisionGoneError
-from gausslite.fusion.words import at_keys, no_words, tombstones, unite
-from gausslite.mapping.roi import RoiLedger, voxel_words
+from gausslite.mapping.roi import RoiLedger
 
 
 class MapHistory:
@@ -31,7 +31,7 @@ class MapHistory:
         if self._first_revision is not None and revision <= self.revision:
             return
         shown = gaussians.take(gaussians.active) if self._roi_only else gaussians
-        self._words = voxel_words(shown, self._grid)
+        self._words = words_of(shown, self._grid)
         # the ledger compares active Gaussians only
         changed = self._ledger.changed(replace(shown, active=np.ones(len(shown), np.bool_)))
         self._changed_at.update(dict.fromkeys(changed.keys.tolist(), revision))

@@ -11,9 +11,9 @@ from concurrent.futures import Future
 from gausslite.datasets.selection import select_frames
 from gausslite.datasets.source import Source
 from gausslite.domain.frame import Frame
+from gausslite.domain.words import words_of
 from gausslite.errors import GaussLiteError
 from gausslite.evaluation.held_out import HoldOut
-from gausslite.mapping.roi import voxel_words
 from gausslite.mission import frame_size
 from gausslite.task.parser import TaskParser
 from gausslite.v1 import agent_service_pb2 as pb
@@ -88,7 +88,7 @@ class Player:
         drained = uplink.drain(link.drain_s)
         if link.handover and drained:
             gaussians = self._robot.do(lambda mapper: mapper.gaussians()).result()
-            uplink.offer(voxel_words(gaussians, link.grid), Purpose.HANDOVER)
+            uplink.offer(words_of(gaussians, link.grid), Purpose.HANDOVER)
             drained = uplink.drain(link.drain_s)
             self._contribute_keyframes(uplink)
         if not drained:

@@ -7,8 +7,8 @@ from collections.abc import AsyncIterator, Callable
 from typing import Any
 
 from gausslite.domain.task import TaskGraph
+from gausslite.domain.words import take_voxels
 from gausslite.errors import InvalidInputError
-from gausslite.fusion.words import take_voxels
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.task.parser import TaskParser
 from gausslite.v1 import agent_service_pb2 as pb

@@ -9,8 +9,8 @@ import numpy as np
 from gausslite.codec.subset_codec import encode_subset, split_words
 from gausslite.domain.subset import RoiSubset, VoxelWords
 from gausslite.domain.voxels import VoxelGrid
+from gausslite.domain.words import take_voxels, tombstones, unite
 from gausslite.fusion.team import Changes
-from gausslite.fusion.words import take_voxels, tombstones, unite
 from gausslite.v1.gaussians_pb2 import MapBlock, Provenance
 from gausslite.wire.convert import Box
 

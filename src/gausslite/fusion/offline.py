@@ -6,8 +6,8 @@ from collections.abc import Mapping
 
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.voxels import VoxelGrid
+from gausslite.domain.words import words_of
 from gausslite.fusion.vote import FusedMap, fuse
-from gausslite.fusion.words import words_of
 
 
 def fuse_maps(maps: Mapping[str, Gaussians], grid: VoxelGrid) -> FusedMap:

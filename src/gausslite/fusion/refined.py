@@ -9,8 +9,8 @@ from jaxtyping import Int64
 from numpy import ndarray
 
 from gausslite.domain.subset import VoxelWords
+from gausslite.domain.words import take_voxels, unite
 from gausslite.fusion.vote import FusedMap
-from gausslite.fusion.words import take_voxels, unite
 
 
 @dataclass(frozen=True, slots=True, eq=False)

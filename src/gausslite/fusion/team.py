@@ -15,6 +15,7 @@ from numpy import ndarray
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.subset import RoiSubset, VoxelWords
 from gausslite.domain.voxels import VoxelGrid
+from gausslite.domain.words import take_voxels, words_of
 from gausslite.errors import InvalidInputError, MismatchError, QuotaError, SessionUnknownError
 from gausslite.fusion.keyframes import KeyframePool, TeamKeyframe
 from gausslite.fusion.refined import RefinedMap
@@ -23,7 +24,6 @@ from gausslite.fusion.store import Charter, FusionStore, PutOutcome, Session
 from gausslite.fusion.tally import Tally, TeamStatus, contribution
 from gausslite.fusion.terms import Holding, TeamSettings, agree, named, require_name, shown
 from gausslite.fusion.vote import FusedMap, concatenate, elect, fuse
-from gausslite.fusion.words import take_voxels, words_of
 
 
 class Joined(NamedTuple):

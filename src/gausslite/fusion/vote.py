@@ -16,8 +16,8 @@ from numpy import ndarray
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.subset import VoxelWords
 from gausslite.domain.voxels import AgentStake, VoxelVotes
+from gausslite.domain.words import gather_rows
 from gausslite.fusion.store import StakeTable
-from gausslite.fusion.words import gather_rows
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -9,20 +9,7 @@ from numpy import ndarray
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.subset import VoxelWords
 from gausslite.domain.voxels import VoxelGrid
-
-
-def voxel_words(gaussians: Gaussians, grid: VoxelGrid) -> VoxelWords:
-    """A complete word on every voxel that holds any of these Gaussians (Sec. III-E). Raises InvalidInputError."""
-    keys = grid.keys(gaussians.means_m)
-    order = np.argsort(keys, kind="stable")
-    present, starts, counts = np.unique(keys[order], return_index=True, return_counts=True)
-    ordered = gaussians.take(order)
-    return VoxelWords(
-        keys=present,
-        kappa_sums=_sums(ordered.kappa.astype(np.uint64), starts),
-        counts=counts.astype(np.uint32),
-        gaussians=ordered,
-    )
+from gausslite.domain.words import take_voxels, tombstones, unite, words_of
 
 
 class RoiLedger:
@@ -38,12 +25,12 @@ class RoiLedger:
 
         A voxel that held active Gaussians then and holds none now gets a tombstone (count 0).
         """
-        words = voxel_words(gaussians.take(gaussians.active), self._grid)
+        words = words_of(gaussians.take(gaussians.active), self._grid)
         states = np.stack([words.kappa_sums, words.counts.astype(np.uint64), _fingerprints(words)], axis=1)
         same = self._unchanged(words.keys, states)
         vanished = np.setdiff1d(self._keys, words.keys, assume_unique=True)
         self._keys, self._states = words.keys, states
-        return _with_tombstones(_select(words, ~same), vanished)
+        return unite(take_voxels(words, ~same), tombstones(vanished))
 
     def forget(self) -> None:
         """Treat every voxel as new at the next call (the receiver lost what it had)."""
@@ -55,28 +42,6 @@ class RoiLedger:
         place = np.minimum(np.searchsorted(self._keys, keys), len(self._keys) - 1)
         same: Bool[ndarray, " v"] = (self._keys[place] == keys) & (self._states[place] == states).all(axis=1)
         return same
-
-
-def _select(words: VoxelWords, chosen: Bool[ndarray, " v"]) -> VoxelWords:
-    return VoxelWords(
-        keys=words.keys[chosen],
-        kappa_sums=words.kappa_sums[chosen],
-        counts=words.counts[chosen],
-        gaussians=words.gaussians.take(np.repeat(chosen, words.counts)),
-    )
-
-
-def _with_tombstones(words: VoxelWords, vanished: Int64[ndarray, " t"]) -> VoxelWords:
-    keys = np.concatenate([words.keys, vanished])
-    order = np.argsort(keys)
-    empty = np.zeros(len(vanished), np.uint64)
-    return VoxelWords(
-        keys=keys[order],
-        kappa_sums=np.concatenate([words.kappa_sums, empty])[order],
-        counts=np.concatenate([words.counts, empty.astype(np.uint32)])[order],
-        # tombstones hold no Gaussians, so those of the others keep their order
-        gaussians=words.gaussians,
-    )
 
 
 def _fingerprints(words: VoxelWords) -> UInt64[ndarray, " v"]:

@@ -20,14 +20,17 @@ def no_words() -> VoxelWords:
 
 
 def words_of(gaussians: Gaussians, grid: VoxelGrid) -> VoxelWords:
-    """A whole map as words: its Gaussians sorted by voxel (stable within one) and the totals of each."""
+    """A complete word on every voxel that holds any of these Gaussians (Sec. III-E), stable within a voxel.
+
+    Raises InvalidInputError for means out of the grid's reach.
+    """
     keys = grid.keys(gaussians.means_m)
     order = np.argsort(keys, kind="stable")
-    present, counts = np.unique(keys, return_counts=True)
-    owner = np.searchsorted(present, keys)
-    sums = np.zeros(len(present), np.uint64)
-    np.add.at(sums, owner, gaussians.kappa.astype(np.uint64))
-    return VoxelWords(present, sums, counts.astype(np.uint32), gaussians.take(order))
+    present, starts, counts = np.unique(keys[order], return_index=True, return_counts=True)
+    ordered = gaussians.take(order)
+    kappa = ordered.kappa.astype(np.uint64)
+    sums = np.add.reduceat(kappa, starts) if len(starts) else np.zeros(0, np.uint64)
+    return VoxelWords(present, sums, counts.astype(np.uint32), ordered)
 
 
 def tombstones(keys: Int64[ndarray, " k"]) -> VoxelWords:

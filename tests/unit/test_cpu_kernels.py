@@ -1,0 +1,219 @@
+"""What is the native backend's own: its instruction sets agree, threads change no bit, and misuse is refused."""
+
+from __future__ import annotations
+
+import threading
+
+import numpy as np
+import pytest
+
+from gausslite.domain.camera import Camera
+from gausslite.errors import InvalidInputError, KernelError, ShapeError
+from gausslite.render.choose import choose_rasterizer
+from gausslite.render.cpu import SIMD_VARIABLE, CpuRasterizer
+from gausslite.render.rasterizer import AdamSettings, LossWeights, SplatGradients, Subset, TrainingView
+
+kernels = pytest.importorskip("gausslite.render._kernels", reason="the native kernels are not built")
+
+CAMERA = Camera(75.0, 74.0, 50.3, 39.7, 101, 83)
+L1_ONLY, WITH_SSIM = LossWeights(ssim=0.0), LossWeights()
+
+
+def random_rows(n: int = 9000, seed: int = 0) -> np.ndarray:
+    """More rows than one projection segment holds, so that threads share the work."""
+    rng = np.random.default_rng(seed)
+    rows = np.zeros((n, 16), np.float32)
+    rows[:, :3] = rng.uniform((-2, -2, -0.5), (2, 2, 4), (n, 3))
+    rows[:, 3:6] = np.log(rng.uniform(0.005, 0.1, (n, 3)))
+    rows[:, 6:10] = rng.normal(size=(n, 4))
+    rows[:, 10] = rng.normal(0.0, 2.0, n)
+    rows[:, 11:14] = rng.random((n, 3))
+    return rows
+
+
+def view_of(rasterizer: CpuRasterizer, camera: Camera = CAMERA, masked: bool = False) -> TrainingView:
+    rng = np.random.default_rng(7)
+    size = (camera.height_px, camera.width_px)
+    weight = np.zeros(size, np.float32)
+    weight[size[0] // 3 :, : size[1] // 2] = 1.0
+    rgb = rng.integers(0, 256, (*size, 3), np.uint8)
+    return rasterizer.prepare_view(rgb, rng.uniform(0, 4, size).astype(np.float32), camera, weight if masked else None)
+
+
+def gradients(rasterizer: CpuRasterizer, rows: np.ndarray) -> SplatGradients:
+    drawn = rasterizer.forward(rows, CAMERA, np.eye(4))
+    rng = np.random.default_rng(1)
+    d_rgb, d_depth_m, d_alpha = (
+        rng.normal(size=a.shape).astype(np.float32) for a in (drawn.rgb, drawn.depth_m, drawn.alpha)
+    )
+    return rasterizer.backward(drawn, d_rgb, d_depth_m, d_alpha)
+
+
+def train(rasterizer: CpuRasterizer, loss: LossWeights, steps: int = 3, masked: bool = False) -> tuple[np.ndarray, ...]:
+    rows = random_rows()
+    first, second = np.zeros_like(rows), np.zeros_like(rows)
+    view = view_of(rasterizer, masked=masked)
+    losses = [
+        rasterizer.step(rows, first, second, view, np.eye(4), loss, AdamSettings(), masked).loss for _ in range(steps)
+    ]
+    return rows, first, second, np.array(losses)
+
+
+@pytest.mark.parametrize("simd", kernels.usable_simd())
+def test_every_instruction_set_draws_what_the_portable_form_draws(simd: str) -> None:
+    rows = random_rows()
+    came, wanted = CpuRasterizer(2, simd), CpuRasterizer(2, "portable")
+    a, b = came.forward(rows, CAMERA, np.eye(4)), wanted.forward(rows, CAMERA, np.eye(4))
+    # a contribution at the 1/255 threshold may fall on either side
+    assert np.mean(np.abs(a.rgb - b.rgb) > 1e-4) < 1e-3
+    assert np.abs(a.rgb - b.rgb).max() < 1e-2
+    assert gradients(came, rows).visible.tolist() == gradients(wanted, rows).visible.tolist()
+
+
+@pytest.mark.parametrize("threads", [2, 3])
+def test_gradients_have_the_same_bits_for_any_number_of_threads(threads: int) -> None:
+    alone, team = gradients(CpuRasterizer(1), random_rows()), gradients(CpuRasterizer(threads), random_rows())
+    np.testing.assert_array_equal(team.d_rows, alone.d_rows)
+    np.testing.assert_array_equal(team.d_twist, alone.d_twist)
+    np.testing.assert_array_equal(team.mean_2d_norm, alone.mean_2d_norm)
+    np.testing.assert_array_equal(team.visible, alone.visible)
+
+
+@pytest.mark.parametrize("masked", [False, True])
+@pytest.mark.parametrize("loss", [L1_ONLY, WITH_SSIM])
+def test_training_has_the_same_bits_for_any_number_of_threads(loss: LossWeights, masked: bool) -> None:
+    alone, team = train(CpuRasterizer(1), loss, masked=masked), train(CpuRasterizer(3), loss, masked=masked)
+    for a, b in zip(team, alone, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_a_backward_can_be_repeated() -> None:
+    rasterizer = CpuRasterizer(2)
+    drawn = rasterizer.forward(random_rows(), CAMERA, np.eye(4))
+    images = [np.ones_like(a) for a in (drawn.rgb, drawn.depth_m, drawn.alpha)]
+    np.testing.assert_array_equal(
+        rasterizer.backward(drawn, *images).d_rows, rasterizer.backward(drawn, *images).d_rows
+    )
+
+
+@pytest.mark.parametrize("size", [(1, 1), (3, 200), (16, 16), (17, 15), (640, 3)])
+def test_any_image_size_after_any_other(size: tuple[int, int]) -> None:
+    rasterizer = CpuRasterizer(2)
+    rasterizer.forward(random_rows(), CAMERA, np.eye(4))
+    camera = Camera(60.0, 60.0, size[0] / 2, size[1] / 2, *size)
+    rows = random_rows(500)
+    first, second = np.zeros_like(rows), np.zeros_like(rows)
+    for loss in (L1_ONLY, WITH_SSIM):
+        report = rasterizer.step(rows, first, second, view_of(rasterizer, camera), np.eye(4), loss, AdamSettings())
+        assert np.isfinite(report.loss)
+    assert np.isfinite(rows).all()
+
+
+def test_an_exact_subset_of_tiles_trains_like_the_whole_image_under_its_mask() -> None:
+    rasterizer = CpuRasterizer(2)
+    weight = np.zeros((CAMERA.height_px, CAMERA.width_px), np.float32)
+    weight[40:60, 30:70] = 1.0
+    rgb = np.random.default_rng(3).integers(0, 256, (*weight.shape, 3), np.uint8)
+    view = rasterizer.prepare_view(rgb, np.full_like(weight, 2.0), CAMERA, weight)
+    tiles = np.zeros((6, 7), np.bool_)
+    tiles[2:5, 1:5] = True  # covers the mask and 5 px around it
+    results = []
+    for subset in (Subset(), Subset(tiles=tiles)):
+        rows = random_rows()
+        first, second = np.zeros_like(rows), np.zeros_like(rows)
+        report = rasterizer.step(
+            rows, first, second, view, np.eye(4), WITH_SSIM, AdamSettings(), masked=True, subset=subset
+        )
+        results.append((report, rows, first))
+    (whole, whole_rows, whole_first), (part, part_rows, part_first) = results
+    assert part.loss == pytest.approx(whole.loss, rel=1e-6)
+    assert len(part.visible) < len(whole.visible)
+    np.testing.assert_allclose(part_first[part.visible, :14], whole_first[part.visible, :14], rtol=1e-4, atol=1e-9)
+    np.testing.assert_allclose(part_rows[part.visible], whole_rows[part.visible], rtol=1e-3, atol=1e-4)
+
+
+def test_measurements_that_are_not_positive_numbers_are_not_compared() -> None:
+    rasterizer = CpuRasterizer(1)
+    size = (CAMERA.height_px, CAMERA.width_px)
+    rgb = np.zeros((*size, 3), np.uint8)
+    losses = []
+    for nothing in (0.0, -1.0, np.nan, np.inf):
+        rows = random_rows()
+        view = rasterizer.prepare_view(rgb, np.full(size, nothing, np.float32), CAMERA)
+        step = rasterizer.step(rows, rows * 0, rows * 0, view, np.eye(4), WITH_SSIM, AdamSettings())
+        losses.append(step.loss)
+    assert losses == [losses[0]] * 4
+
+
+def test_calls_from_several_threads_are_served_one_after_the_other() -> None:
+    rasterizer = CpuRasterizer(2)
+    rows = random_rows()
+    wanted = rasterizer.forward(rows, CAMERA, np.eye(4)).rgb
+    came: list[np.ndarray] = []
+    callers = [
+        threading.Thread(target=lambda: came.append(rasterizer.forward(rows, CAMERA, np.eye(4)).rgb)) for _ in range(4)
+    ]
+    for caller in callers:
+        caller.start()
+    for caller in callers:
+        caller.join()
+    assert len(came) == 4
+    for image in came:
+        np.testing.assert_array_equal(image, wanted)
+
+
+def test_a_superseded_rendering_is_refused() -> None:
+    rasterizer = CpuRasterizer(1)
+    drawn = rasterizer.forward(random_rows(50), CAMERA, np.eye(4))
+    rasterizer.forward(random_rows(50), CAMERA, np.eye(4))
+    with pytest.raises(InvalidInputError, match="latest"):
+        rasterizer.backward(drawn, drawn.rgb, drawn.depth_m, drawn.alpha)
+
+
+def test_an_impossible_instruction_set_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(KernelError, match="simd: expected one of .*portable.* got sse9"):
+        CpuRasterizer(simd="sse9")
+    monkeypatch.setenv(SIMD_VARIABLE, "mmx")
+    with pytest.raises(KernelError, match=SIMD_VARIABLE):
+        CpuRasterizer()
+
+
+def test_the_environment_chooses_the_instruction_set_and_the_argument_wins(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(SIMD_VARIABLE, "portable")
+    assert CpuRasterizer(threads=1).simd == "portable"
+    fastest = kernels.usable_simd()[0]
+    assert CpuRasterizer(threads=1, simd=fastest).simd == fastest
+
+
+@pytest.mark.parametrize("threads", [0, -1, 257])
+def test_an_impossible_number_of_threads_is_refused(threads: int) -> None:
+    with pytest.raises(KernelError, match="threads"):
+        CpuRasterizer(threads=threads)
+
+
+def test_tables_that_cannot_be_changed_in_place_are_refused() -> None:
+    rasterizer = CpuRasterizer(1)
+    view = view_of(rasterizer)
+    rows = random_rows(64)
+    frozen = rows.copy()
+    frozen.flags.writeable = False
+    for bad in (rows[::2], frozen):
+        good = np.zeros_like(bad, order="C")
+        with pytest.raises(ShapeError, match="rows"):
+            rasterizer.step(bad, good, good.copy(), view, np.eye(4), L1_ONLY, AdamSettings())
+
+
+def test_weights_outside_0_to_1_are_refused() -> None:
+    size = (CAMERA.height_px, CAMERA.width_px)
+    for bad in (-0.1, 1.5, np.nan):
+        with pytest.raises(InvalidInputError, match="weight"):
+            CpuRasterizer(1).prepare_view(
+                np.zeros((*size, 3), np.uint8), np.zeros(size, np.float32), CAMERA, np.full(size, bad, np.float32)
+            )
+
+
+def test_the_backend_is_chosen_by_name() -> None:
+    assert choose_rasterizer("auto", threads=1).name == "cpu"
+    assert choose_rasterizer("cpu", threads=1).name == "cpu"
+    with pytest.raises(KernelError, match="expected one of auto, cpu, reference, got gpu"):
+        choose_rasterizer("gpu")
