@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// The extension module gausslite.render._kernels. Shapes were checked by render/cpu.py, whose messages name the argument; the array
-// types here are the second line. Work runs without the interpreter lock.
+// The extension module gausslite.render._kernels. Shapes were checked by render/cpu.py, whose messages name the
+// argument; the array types here are the second line. Work runs without the interpreter lock.
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/optional.h>
@@ -72,7 +72,8 @@ struct Scene {
     require(count < (size_t{1} << 31), "rows: too many");
     input = {rows, uint32_t(count), nullptr, 0, nullptr, make_camera(intrinsics, T_camera_world)};
     if (tiles) {
-      const size_t tiles_x = size_t(input.camera.width + kTile - 1) / kTile, tiles_y = size_t(input.camera.height + kTile - 1) / kTile;
+      const size_t tiles_x = size_t(input.camera.width + kTile - 1) / kTile,
+                   tiles_y = size_t(input.camera.height + kTile - 1) / kTile;
       require(tiles->shape(0) == tiles_y && tiles->shape(1) == tiles_x, "tiles: wrong grid");
       input.active_tiles = reinterpret_cast<const uint8_t*>(tiles->data());
     }
@@ -127,7 +128,8 @@ nb::tuple forward(Rasterizer& self, ConstRowTable rows, const Intrinsics& intrin
 nb::tuple backward(Rasterizer& self, uint64_t frame, size_t row_count, Colours d_rgb, Plane d_depth_m, Plane d_alpha) {
   require(frame == self.frame(), "rendering: superseded");
   require(self.matches(row_count, d_rgb.shape(1), d_rgb.shape(0)) && d_depth_m.shape(0) == d_rgb.shape(0) &&
-              d_depth_m.shape(1) == d_rgb.shape(1) && d_alpha.shape(0) == d_rgb.shape(0) && d_alpha.shape(1) == d_rgb.shape(1),
+              d_depth_m.shape(1) == d_rgb.shape(1) && d_alpha.shape(0) == d_rgb.shape(0) &&
+              d_alpha.shape(1) == d_rgb.shape(1),
           "image gradients: wrong shape");
   auto d_rows = new_array<float>(row_count, 16);
   auto d_twist = new_array<double>(6);
@@ -138,7 +140,8 @@ nb::tuple backward(Rasterizer& self, uint64_t frame, size_t row_count, Colours d
   return nb::make_tuple(d_rows, d_twist, visible, norms);
 }
 
-std::unique_ptr<TrainingView> prepare_view(const Rasterizer& self, ByteColours rgb, Plane depth_m, std::optional<Plane> weight) {
+std::unique_ptr<TrainingView> prepare_view(const Rasterizer& self, ByteColours rgb, Plane depth_m,
+                                           std::optional<Plane> weight) {
   const size_t height = rgb.shape(0), width = rgb.shape(1);
   const auto fits = [&](const Plane& plane) { return plane.shape(0) == height && plane.shape(1) == width; };
   require(fits(depth_m) && (!weight || fits(*weight)), "view: sizes disagree");
@@ -192,15 +195,18 @@ NB_MODULE(_kernels, m) {
       .def(nb::new_(&make_rasterizer), nb::arg("simd"), nb::arg("threads"))
       .def_prop_ro("threads", &Rasterizer::threads)
       .def_prop_ro("frame", &Rasterizer::frame, "The number of the latest forward or step.")
-      .def("forward", &forward, nb::arg("rows").noconvert(), nb::arg("intrinsics"), nb::arg("T_camera_world").noconvert(),
-           nb::arg("tiles").noconvert().none(), nb::arg("ids").noconvert().none(), "rgb, depth_m, alpha and the frame's number.")
+      .def("forward", &forward, nb::arg("rows").noconvert(), nb::arg("intrinsics"),
+           nb::arg("T_camera_world").noconvert(), nb::arg("tiles").noconvert().none(),
+           nb::arg("ids").noconvert().none(), "rgb, depth_m, alpha and the frame's number.")
       .def("backward", &backward, nb::arg("frame"), nb::arg("row_count"), nb::arg("d_rgb").noconvert(),
-           nb::arg("d_depth_m").noconvert(), nb::arg("d_alpha").noconvert(), "d_rows, d_twist, visible rows, mean_2d_norm.")
+           nb::arg("d_depth_m").noconvert(), nb::arg("d_alpha").noconvert(),
+           "d_rows, d_twist, visible rows, mean_2d_norm.")
       .def("prepare_view", &prepare_view, nb::arg("rgb").noconvert(), nb::arg("depth_m").noconvert(),
            nb::arg("weight").noconvert().none())
-      .def("step", &step, nb::arg("rows").noconvert(), nb::arg("first_moment").noconvert(), nb::arg("second_moment").noconvert(),
-           nb::arg("view"), nb::arg("intrinsics"), nb::arg("T_camera_world").noconvert(), nb::arg("loss"), nb::arg("rates"),
-           nb::arg("adam"), nb::arg("masked"), nb::arg("tiles").noconvert().none(), nb::arg("ids").noconvert().none(),
+      .def("step", &step, nb::arg("rows").noconvert(), nb::arg("first_moment").noconvert(),
+           nb::arg("second_moment").noconvert(), nb::arg("view"), nb::arg("intrinsics"),
+           nb::arg("T_camera_world").noconvert(), nb::arg("loss"), nb::arg("rates"), nb::arg("adam"), nb::arg("masked"),
+           nb::arg("tiles").noconvert().none(), nb::arg("ids").noconvert().none(),
            nb::arg("trainable").noconvert().none(), "The loss and the visible rows.")
       .def("stage_times_ms", &stage_times, "Milliseconds of the last call's stages.");
 }

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// Stage 3: sorted splats to the tiles of a strip, each with a mask of the 4x4 blocks that it really touches. Culling to blocks
-// rather than to tiles is the largest gain of all: an average splat touches 4 of a tile's 16 blocks.
+// Stage 3: sorted splats to the tiles of a strip, each with a mask of the 4x4 blocks that it really touches. Culling to
+// blocks rather than to tiles is the largest gain of all: an average splat touches 4 of a tile's 16 blocks.
 #include <algorithm>
 #include <cstring>
 
@@ -17,10 +17,10 @@ alignas(64) constexpr float kBlockX[16] = {.5f, 4.5f, 8.5f, 12.5f, .5f, 4.5f, 8.
 alignas(64) constexpr float kBlockY[16] = {.5f,  .5f,  .5f,  .5f,  4.5f,  4.5f,  4.5f,  4.5f,
                                            8.5f, 8.5f, 8.5f, 8.5f, 12.5f, 12.5f, 12.5f, 12.5f};
 
-// Which of a tile's sixteen blocks the ellipse alpha >= 1/255 meets, all at once. The quadric is convex, so its minimum over the
-// rectangle of a block's pixel centres is at the mean when that is inside, and else on one of the two sides that face the mean.
-// (dx, dy) is the rectangle's point nearest to the mean, axis by axis; on the facing vertical side the minimum is at slope_y dx,
-// clamped to the side, and likewise on the horizontal one.
+// Which of a tile's sixteen blocks the ellipse alpha >= 1/255 meets, all at once. The quadric is convex, so its minimum
+// over the rectangle of a block's pixel centres is at the mean when that is inside, and else on one of the two sides
+// that face the mean. (dx, dy) is the rectangle's point nearest to the mean, axis by axis; on the facing vertical side
+// the minimum is at slope_y dx, clamped to the side, and likewise on the horizontal one.
 GAUSSLITE_INLINE uint32_t touched_blocks(const Splat& s, float tile_x, float tile_y) {
   const Pack16 zero(0.0f);
   const Pack16 left = load(kBlockX) + (tile_x - s.mean_x), top = load(kBlockY) + (tile_y - s.mean_y);
@@ -34,8 +34,12 @@ GAUSSLITE_INLINE uint32_t touched_blocks(const Splat& s, float tile_x, float til
 }
 
 // The blocks of one tile row or column range as mask bits: rows [first, last] of four.
-GAUSSLITE_INLINE uint32_t row_bits(int first, int last) { return (0xFFFFu << (4 * first)) & (0xFFFFu >> (12 - 4 * last)); }
-GAUSSLITE_INLINE uint32_t column_bits(int first, int last) { return ((0xFu << first) & (0xFu >> (3 - last))) * 0x1111u; }
+GAUSSLITE_INLINE uint32_t row_bits(int first, int last) {
+  return (0xFFFFu << (4 * first)) & (0xFFFFu >> (12 - 4 * last));
+}
+GAUSSLITE_INLINE uint32_t column_bits(int first, int last) {
+  return ((0xFu << first) & (0xFu >> (3 - last))) * 0x1111u;
+}
 
 }  // namespace
 

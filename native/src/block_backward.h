@@ -1,10 +1,10 @@
 // SPDX-License-Identifier: Apache-2.0
 // The way back through one 4x4 block, again front to back, and the sums that its pixels leave at each splat.
 //
-// With weights w_i = alpha_i T_i and q_i = <dL/d(rgb, depth, alpha), (rgb_i, depth_i, 1)>, the derivative by ln(alpha_i) is
-// w_i q_i - alpha_i / (1 - alpha_i) S_i, where S_i = sum over k > i of w_k q_k is what lies behind. S_i is the total minus the
-// prefix, and the total is known from the finished pixel: one running scalar a pixel, no division chain for the transmittance,
-// and no second walk from the back.
+// With weights w_i = alpha_i T_i and q_i = <dL/d(rgb, depth, alpha), (rgb_i, depth_i, 1)>, the derivative by
+// ln(alpha_i) is w_i q_i - alpha_i / (1 - alpha_i) S_i, where S_i = sum over k > i of w_k q_k is what lies behind. S_i
+// is the total minus the prefix, and the total is known from the finished pixel: one running scalar a pixel, no
+// division chain for the transmittance, and no second walk from the back.
 #pragma once
 
 #include "block_forward.h"
@@ -32,8 +32,8 @@ struct BlockGradient {
   }
 };
 
-// Per entry of a chunk: v = dL/d ln(alpha) summed with 1, x, y, xx, xy, yy around the tile's centre; and the weights times the
-// channel gradients, still one sum per pixel row.
+// Per entry of a chunk: v = dL/d ln(alpha) summed with 1, x, y, xx, xy, yy around the tile's centre; and the weights
+// times the channel gradients, still one sum per pixel row.
 struct ChunkSums {
   alignas(64) float moments[kChunk][8];
   Pack16 colours[kChunk];
@@ -63,8 +63,8 @@ struct MomentTable {
 inline constexpr MomentTable kMomentTable;
 
 // Adds one entry's sixteen values of v and w to the chunk's sums.
-GAUSSLITE_INLINE void reduce_entry(const float* v, const float* w, const Pack8 (&table)[16], const BlockGradient& gradient,
-                                   float* moments, Pack16& colours) {
+GAUSSLITE_INLINE void reduce_entry(const float* v, const float* w, const Pack8 (&table)[16],
+                                   const BlockGradient& gradient, float* moments, Pack16& colours) {
   Pack8 sum0 = load8(moments), sum1(0.0f), sum2(0.0f), sum3(0.0f);
   for (int p = 0; p < 16; p += 4) {
     sum0 = fma(table[p], broadcast8(v + p), sum0);
@@ -84,8 +84,9 @@ GAUSSLITE_INLINE void reduce_entry(const float* v, const float* w, const Pack8 (
 constexpr float kBelowMaxAlpha = 0.989995f;
 constexpr int kBatch = 16;
 
-// Walks n entries of a block's list. With kFromAlphas the alphas of the forward pass are read back, otherwise computed again. Entries
-// go in batches through two loops: per-pixel values first, then the sums, whose tables want the registers for themselves.
+// Walks n entries of a block's list. With kFromAlphas the alphas of the forward pass are read back, otherwise computed
+// again. Entries go in batches through two loops: per-pixel values first, then the sums, whose tables want the
+// registers for themselves.
 template <bool kFromAlphas>
 GAUSSLITE_INLINE void walk_back(const Splat* records, const uint8_t* list, int n, const TilePosition& tile, int b,
                                 BlockGradient& gradient, ChunkSums& sums, const float*& alphas) {
@@ -131,9 +132,11 @@ GAUSSLITE_INLINE void walk_back(const Splat* records, const uint8_t* list, int n
   gradient.behind = behind;
 }
 
-// Shifts a chunk's moments from the tile's centre to the splats' means and adds them to the gradient rows of this tile row. The
-// shift by (x, y) is two fused steps: first sums of v x' - x v and the like from their neighbours, then the second ones from those.
-GAUSSLITE_INLINE void add_to_rows(Workspace& ws, const Splat* records, int n, const TilePosition& tile, const ChunkSums& sums) {
+// Shifts a chunk's moments from the tile's centre to the splats' means and adds them to the gradient rows of this tile
+// row. The shift by (x, y) is two fused steps: first sums of v x' - x v and the like from their neighbours, then the
+// second ones from those.
+GAUSSLITE_INLINE void add_to_rows(Workspace& ws, const Splat* records, int n, const TilePosition& tile,
+                                  const ChunkSums& sums) {
   const float centre_x = float(tile.x * kTile + kTile / 2), centre_y = float(tile.y * kTile + kTile / 2);
   for (int i = 0; i < n; ++i) {
     const float x = records[i].mean_x - centre_x, y = records[i].mean_y - centre_y;

@@ -20,11 +20,11 @@ GAUSSLITE_INLINE Pack16 log2_alpha(const Splat& s, Pack16 pixel_x, Pack16 pixel_
   return fnma(y_part, dy, fnma(x_part, dx, Pack16(s.log2_opacity)));
 }
 
-// Composites a list until it ends or all sixteen pixels are finished; returns how many entries it took. With kKeepAlphas they
-// are appended at `alphas`, for the way back.
+// Composites a list until it ends or all sixteen pixels are finished; returns how many entries it took. With
+// kKeepAlphas they are appended at `alphas`, for the way back.
 template <bool kKeepAlphas>
-GAUSSLITE_INLINE int composite(const Splat* records, const uint8_t* list, int n, Pack16 pixel_x, Pack16 pixel_y, BlockState& state,
-                               float*& alphas) {
+GAUSSLITE_INLINE int composite(const Splat* records, const uint8_t* list, int n, Pack16 pixel_x, Pack16 pixel_y,
+                               BlockState& state, float*& alphas) {
   BlockState s = state;
   Mask16 open = s.transmittance >= Pack16(kMinTransmittance);
   int i = 0;

@@ -1,5 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// The L1 terms of Eq. (1) on sixteen pixels: colour, and the expected depth D / A where there is a surface and a measurement.
+// The L1 terms of Eq. (1) on sixteen pixels: colour, and the expected depth D / A where there is a surface and a
+// measurement.
 #pragma once
 
 #include "simd/pack.h"
@@ -14,8 +15,8 @@ GAUSSLITE_INLINE Pack16 signed_as(Pack16 x, Pack16 size) {
 }
 
 // image: r g b depth transmittance; gradient: by r g b depth alpha. Returns the loss of each pixel.
-GAUSSLITE_INLINE Pack16 l1_of_pixels(const Pack16 (&image)[5], const Pack16 (&target_rgb)[3], Pack16 measured_m, Pack16 weight,
-                                     const LossSettings& settings, Pack16 (&gradient)[5]) {
+GAUSSLITE_INLINE Pack16 l1_of_pixels(const Pack16 (&image)[5], const Pack16 (&target_rgb)[3], Pack16 measured_m,
+                                     Pack16 weight, const LossSettings& settings, Pack16 (&gradient)[5]) {
   const Pack16 colour = weight * settings.colour;
   Pack16 loss(0.0f);
   for (int k = 0; k < 3; ++k) {

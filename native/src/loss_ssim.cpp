@@ -1,11 +1,11 @@
 // SPDX-License-Identifier: Apache-2.0
-// Stage 5b: the SSIM term and its gradient, row by row in cache. Blurring twice (image moments, then partial derivatives) over whole
-// planes would pass some thirty images through memory; here a row goes through both blurs while the rows above and below
-// it are still in rolling buffers of a few hundred kilobytes.
+// Stage 5b: the SSIM term and its gradient, row by row in cache. Blurring twice (image moments, then partial
+// derivatives) over whole planes would pass some thirty images through memory; here a row goes through both blurs while
+// the rows above and below it are still in rolling buffers of a few hundred kilobytes.
 //
-// With the window mean E of the image x and the target y: S = A1 A2 / (B1 B2), A1 = 2 Ex Ey + C1, A2 = 2 (Exy - Ex Ey) + C2,
-// B1 = Ex^2 + Ey^2 + C1, B2 = Exx - Ex^2 + Eyy - Ey^2 + C2. The gradient at a pixel is the blur of dS/dEx, plus 2x times that of
-// dS/dExx, plus y times that of dS/dExy. Pixels outside the image count as zero.
+// With the window mean E of the image x and the target y: S = A1 A2 / (B1 B2), A1 = 2 Ex Ey + C1, A2 = 2 (Exy - Ex Ey)
+// + C2, B1 = Ex^2 + Ey^2 + C1, B2 = Exx - Ex^2 + Eyy - Ey^2 + C2. The gradient at a pixel is the blur of dS/dEx, plus
+// 2x times that of dS/dExx, plus y times that of dS/dExy. Pixels outside the image count as zero.
 #include <algorithm>
 
 #include "stage_functions.h"
@@ -19,9 +19,10 @@ constexpr int kRadius = 5, kTaps = 2 * kRadius + 1;
 // Gaussian of sigma 1.5 px, normalised over its 11 taps; element k is the weight at distance k.
 constexpr float kWindow[kRadius + 1] = {0.26601171f, 0.21300553f, 0.10936070f, 0.03600077f, 0.00759876f, 0.00102838f};
 
-constexpr int kRing = 16;    // rows kept of a rolling buffer; a power of two of at least kTaps
-constexpr int kMoments = 3;  // what is blurred at a time: x, xx, xy on the way forward, their derivatives on the way back
-constexpr int kMargin = 2;   // packs of zeros left and right of a row
+constexpr int kRing = 16;  // rows kept of a rolling buffer; a power of two of at least kTaps
+constexpr int kMoments =
+    3;  // what is blurred at a time: x, xx, xy on the way forward, their derivatives on the way back
+constexpr int kMargin = 2;  // packs of zeros left and right of a row
 
 GAUSSLITE_INLINE Pack16 blur_along(const float* p) {
   Pack16 total = load(p) * kWindow[0];
@@ -31,7 +32,8 @@ GAUSSLITE_INLINE Pack16 blur_along(const float* p) {
 
 GAUSSLITE_INLINE Pack16 blur_across(const float* const (&rows)[kTaps], int at) {
   Pack16 total = load(rows[kRadius] + at) * kWindow[0];
-  for (int k = 1; k <= kRadius; ++k) total = fma(load(rows[kRadius - k] + at) + load(rows[kRadius + k] + at), Pack16(kWindow[k]), total);
+  for (int k = 1; k <= kRadius; ++k)
+    total = fma(load(rows[kRadius - k] + at) + load(rows[kRadius + k] + at), Pack16(kWindow[k]), total);
   return total;
 }
 
@@ -80,7 +82,12 @@ struct Columns {
 class ChannelPass {
  public:
   ChannelPass(Workspace& ws, const Training& training, int channel, Columns columns, RowBuffers& rows)
-      : ws_(ws), t_(training.targets), scale_(training.loss.ssim), sums_(training.loss_sums), columns_(columns), rows_(rows) {
+      : ws_(ws),
+        t_(training.targets),
+        scale_(training.loss.ssim),
+        sums_(training.loss_sums),
+        columns_(columns),
+        rows_(rows) {
     image_ = ws.image.data() + channel * ws.plane;
     target_ = t_.rgb + channel * ws.plane;
     gradient_ = ws.image_gradient.data() + channel * ws.plane;
@@ -176,11 +183,13 @@ class ChannelPass {
       const int x = columns_.begin + i;
       if (x < 0 || x >= ws_.padded_width) continue;
       const int64_t at = offset(y) + x;
-      const Pack16 by_x = blur_across(window[0], i), by_xx = blur_across(window[1], i), by_xy = blur_across(window[2], i);
+      const Pack16 by_x = blur_across(window[0], i), by_xx = blur_across(window[1], i),
+                   by_xy = blur_across(window[2], i);
       const Pack16 image = load(image_ + at);
       const Pack16 change = by_x + fma(image + image, by_xx, load(target_ + at) * by_xy);
       const int inside = ws_.camera.width - x;
-      store(gradient_ + at, load(gradient_ + at) + (inside >= 16 ? change : keep(first_lanes(std::max(0, inside)), change)));
+      store(gradient_ + at,
+            load(gradient_ + at) + (inside >= 16 ? change : keep(first_lanes(std::max(0, inside)), change)));
     }
   }
 
@@ -208,7 +217,8 @@ void loss_ssim(Workspace& ws, const Training& training, int begin, int end, int 
 
 size_t ssim_scratch_floats(int padded_width) { return RowBuffers::floats(padded_width); }
 
-void prepare_ssim(const float* rgb, int width, int height, int padded_width, int64_t plane, float* moments, float* scratch) {
+void prepare_ssim(const float* rgb, int width, int height, int padded_width, int64_t plane, float* moments,
+                  float* scratch) {
   RowBuffers rows(scratch, 0, padded_width);
   for (int channel = 0; channel < 3; ++channel) {
     int next_input = 0;
@@ -223,7 +233,8 @@ void prepare_ssim(const float* rgb, int width, int height, int padded_width, int
           store(rows.input(1) + x, t * t);
         }
         for (int k = 0; k < 2; ++k) {
-          for (int x = 0; x < padded_width; x += 16) store(rows.blurred_input(k, next_input) + x, blur_along(rows.input(k) + x));
+          for (int x = 0; x < padded_width; x += 16)
+            store(rows.blurred_input(k, next_input) + x, blur_along(rows.input(k) + x));
         }
       }
       for (int k = 0; k < 2; ++k) {

@@ -7,17 +7,19 @@
 
 namespace gausslite {
 
-// A replacement for `old` with room for `bytes`, its first `kept` bytes copied and the rest zero; frees `old`. Throws std::bad_alloc.
+// A replacement for `old` with room for `bytes`, its first `kept` bytes copied and the rest zero; frees `old`. Throws
+// std::bad_alloc.
 void* grow_memory(void* old, size_t kept, size_t bytes);
 void free_memory(void* p) noexcept;
 
-// An array that grows and never shrinks. Its members are always inlined: the stages are compiled for several instruction sets,
-// and a shared out-of-line copy could be one that this machine cannot run.
+// An array that grows and never shrinks. Its members are always inlined: the stages are compiled for several
+// instruction sets, and a shared out-of-line copy could be one that this machine cannot run.
 template <class T>
 class Buffer {
  public:
   Buffer() = default;
-  Buffer(Buffer&& other) noexcept : data_(std::exchange(other.data_, nullptr)), capacity_(std::exchange(other.capacity_, 0)) {}
+  Buffer(Buffer&& other) noexcept
+      : data_(std::exchange(other.data_, nullptr)), capacity_(std::exchange(other.capacity_, 0)) {}
   Buffer& operator=(Buffer&&) = delete;
   ~Buffer() { free_memory(data_); }
 

@@ -10,8 +10,8 @@ namespace gausslite::GAUSSLITE_ISA {
 
 namespace {
 
-// The half-spaces of the view frustum, widened for a splat's extent. At most 3.33 standard deviations of a splat are above 1/255;
-// the clamped tangent makes its projected scale at most 1.3 times sqrt(1 + tan^2) / z.
+// The half-spaces of the view frustum, widened for a splat's extent. At most 3.33 standard deviations of a splat are
+// above 1/255; the clamped tangent makes its projected scale at most 1.3 times sqrt(1 + tan^2) / z.
 struct Frustum {
   float tan_x, tan_y, reach_x, reach_y, pixel;
 
@@ -52,7 +52,8 @@ struct Box {
     block_x1 = floor(x1 * 0.25f);
     block_y0 = floor(y0 * 0.25f);
     block_y1 = floor(y1 * 0.25f);
-    // In a box of one row or column, or of four blocks with a roundish splat, the exact test would save less than it costs.
+    // In a box of one row or column, or of four blocks with a roundish splat, the exact test would save less than it
+    // costs.
     const Pack16 across = block_x1 - block_x0, down = block_y1 - block_y0, one(1.0f);
     const Mask16 slanted = p.cov_xy * p.cov_xy > p.cov_xx * p.cov_yy * 0.3f;
     const Mask16 many = (across + one) * (down + one) > Pack16(4.0f);
@@ -101,7 +102,8 @@ GAUSSLITE_INLINE uint32_t take_gradient_rows(Workspace& ws, ThreadScratch& mine,
 
 class Segment {
  public:
-  GAUSSLITE_INLINE Segment(Workspace& ws, ThreadScratch& mine, uint32_t first_slot) : ws_(ws), mine_(mine), slot_(first_slot) {}
+  GAUSSLITE_INLINE Segment(Workspace& ws, ThreadScratch& mine, uint32_t first_slot)
+      : ws_(ws), mine_(mine), slot_(first_slot) {}
 
   GAUSSLITE_INLINE uint32_t slot() const { return slot_; }
 
@@ -141,7 +143,8 @@ class Segment {
   uint32_t slot_;
 };
 
-GAUSSLITE_INLINE void project_group(const Workspace& ws, const Frustum& frustum, uint32_t begin, int lanes, Segment& segment) {
+GAUSSLITE_INLINE void project_group(const Workspace& ws, const Frustum& frustum, uint32_t begin, int lanes,
+                                    Segment& segment) {
   Pack16 row[16];
   uint32_t ids[16];
   for (int j = 0; j < 16; ++j) {

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// Sixteen splats through the camera: the EWA projection of a 3D Gaussian to an image Gaussian (Kerbl et al. 2023, Sec. 4). Both
-// directions start here, the backward one with all intermediate values.
+// Sixteen splats through the camera: the EWA projection of a 3D Gaussian to an image Gaussian (Kerbl et al. 2023, Sec.
+// 4). Both directions start here, the backward one with all intermediate values.
 #pragma once
 
 #include "camera.h"
@@ -10,17 +10,17 @@
 namespace gausslite::GAUSSLITE_ISA {
 
 struct Projection {
-  Pack16 x, y, z, inverse_z;              // the mean in the camera frame
-  Pack16 u, v, u_clamped, v_clamped;      // tangents x/z, y/z; the clamped ones enter the Jacobian
-  Pack16 J00, J02, J11, J12;              // Jacobian of the projection: [[J00 0 J02] [0 J11 J12]]
-  Pack16 P0[3], P1[3];                    // rows of P = J R_camera_world
-  Pack16 R[3][3], scale[3];               // the splat's rotation and scales
-  Pack16 M0[3], M1[3];                    // rows of M = P R S; the image covariance is M M^T + 0.3 I
-  Pack16 qw, qx, qy, qz, inverse_norm;    // the unit quaternion, and 1 / the length of the raw one
-  Pack16 cov_xx, cov_xy, cov_yy;          // image covariance, px^2
-  Pack16 conic_xx, conic_xy, conic_yy;    // its inverse
-  Pack16 mean_x, mean_y;                  // px
-  Pack16 transparency, log2_opacity;      // 1 - opacity, and log2(opacity)
+  Pack16 x, y, z, inverse_z;            // the mean in the camera frame
+  Pack16 u, v, u_clamped, v_clamped;    // tangents x/z, y/z; the clamped ones enter the Jacobian
+  Pack16 J00, J02, J11, J12;            // Jacobian of the projection: [[J00 0 J02] [0 J11 J12]]
+  Pack16 P0[3], P1[3];                  // rows of P = J R_camera_world
+  Pack16 R[3][3], scale[3];             // the splat's rotation and scales
+  Pack16 M0[3], M1[3];                  // rows of M = P R S; the image covariance is M M^T + 0.3 I
+  Pack16 qw, qx, qy, qz, inverse_norm;  // the unit quaternion, and 1 / the length of the raw one
+  Pack16 cov_xx, cov_xy, cov_yy;        // image covariance, px^2
+  Pack16 conic_xx, conic_xy, conic_yy;  // its inverse
+  Pack16 mean_x, mean_y;                // px
+  Pack16 transparency, log2_opacity;    // 1 - opacity, and log2(opacity)
 };
 
 GAUSSLITE_INLINE Pack16 dot3(const Pack16* a, const Pack16* b) { return fma(a[0], b[0], fma(a[1], b[1], a[2] * b[2])); }
@@ -57,8 +57,8 @@ GAUSSLITE_INLINE void rotate_and_scale(const Pack16* row, Projection& o) {
   for (int j = 0; j < 3; ++j) o.scale[j] = exp(row[kLogScale + j]);
 }
 
-// The determinant of M M^T is |M0 x M1|^2, so that of M M^T + d I is |M0 x M1|^2 + d (|M0|^2 + |M1|^2) + d^2: a sum of squares
-// without the cancellation of cov_xx cov_yy - cov_xy^2, which ruins needle-shaped splats in single precision.
+// The determinant of M M^T is |M0 x M1|^2, so that of M M^T + d I is |M0 x M1|^2 + d (|M0|^2 + |M1|^2) + d^2: a sum of
+// squares without the cancellation of cov_xx cov_yy - cov_xy^2, which ruins needle-shaped splats in single precision.
 GAUSSLITE_INLINE void invert_covariance(Projection& o) {
   const Pack16 square0 = dot3(o.M0, o.M0), square1 = dot3(o.M1, o.M1);
   o.cov_xx = square0 + kDilationPx2;
@@ -66,7 +66,8 @@ GAUSSLITE_INLINE void invert_covariance(Projection& o) {
   o.cov_xy = dot3(o.M0, o.M1);
   const Pack16 cross[3] = {o.M0[1] * o.M1[2] - o.M0[2] * o.M1[1], o.M0[2] * o.M1[0] - o.M0[0] * o.M1[2],
                            o.M0[0] * o.M1[1] - o.M0[1] * o.M1[0]};
-  const Pack16 determinant = dot3(cross, cross) + fma(Pack16(kDilationPx2), square0 + square1, Pack16(kDilationPx2 * kDilationPx2));
+  const Pack16 determinant =
+      dot3(cross, cross) + fma(Pack16(kDilationPx2), square0 + square1, Pack16(kDilationPx2 * kDilationPx2));
   const Pack16 inverse = Pack16(1.0f) / determinant;
   o.conic_xx = o.cov_yy * inverse;
   o.conic_xy = -(o.cov_xy * inverse);

@@ -1,25 +1,28 @@
 // SPDX-License-Identifier: Apache-2.0
-// The projection's way back for sixteen splats: image gradients to gradients of the parameters, and of the camera's pose.
+// The projection's way back for sixteen splats: image gradients to gradients of the parameters, and of the camera's
+// pose.
 #pragma once
 
 #include "projection.h"
 
 namespace gausslite::GAUSSLITE_ISA {
 
-// Gradients of sixteen parameter rows, transposed; the norm of the gradient by the image mean in half image widths and heights;
-// and, when asked for, what each splat adds to the gradient of the camera twist (translation, rotation).
+// Gradients of sixteen parameter rows, transposed; the norm of the gradient by the image mean in half image widths and
+// heights; and, when asked for, what each splat adds to the gradient of the camera twist (translation, rotation).
 struct ParameterGradients {
   Pack16 column[16];
   Pack16 mean_2d_norm;
   Pack16 twist[6];
 };
 
-// The gradient by the covariance entries xx, xy, yy, from the moments of v = dL/d ln(alpha). As ln(alpha) = ... - d^T K d / 2, the
-// gradient by the conic K is -1/2 sum of v d d^T, and that by the covariance is -K (dL/dK) K.
-GAUSSLITE_INLINE void covariance_gradient(const Projection& p, const Pack16* moments, Pack16& by_xx, Pack16& by_xy, Pack16& by_yy) {
+// The gradient by the covariance entries xx, xy, yy, from the moments of v = dL/d ln(alpha). As ln(alpha) = ... - d^T K
+// d / 2, the gradient by the conic K is -1/2 sum of v d d^T, and that by the covariance is -K (dL/dK) K.
+GAUSSLITE_INLINE void covariance_gradient(const Projection& p, const Pack16* moments, Pack16& by_xx, Pack16& by_xy,
+                                          Pack16& by_yy) {
   const Pack16 A = p.conic_xx, B = p.conic_xy, C = p.conic_yy;
   const Pack16 g_xx = moments[3] * -0.5f, g_xy = moments[4] * -0.5f, g_yy = moments[5] * -0.5f;
-  const Pack16 k00 = A * g_xx + B * g_xy, k01 = A * g_xy + B * g_yy, k10 = B * g_xx + C * g_xy, k11 = B * g_xy + C * g_yy;
+  const Pack16 k00 = A * g_xx + B * g_xy, k01 = A * g_xy + B * g_yy, k10 = B * g_xx + C * g_xy,
+               k11 = B * g_xy + C * g_yy;
   by_xx = -(k00 * A + k01 * B);
   by_xy = -(k00 * B + k01 * C) * 2.0f;
   by_yy = -(k10 * B + k11 * C);
@@ -44,7 +47,8 @@ GAUSSLITE_INLINE void quaternion_gradient(const Projection& p, const Pack16 (&by
 
 // `row`: parameters, `image`: image gradient rows (row_layout.h), both transposed.
 template <bool kTwist>
-GAUSSLITE_INLINE void backward16(const Pack16* row, const Pack16* image, const Camera& camera, ParameterGradients& out) {
+GAUSSLITE_INLINE void backward16(const Pack16* row, const Pack16* image, const Camera& camera,
+                                 ParameterGradients& out) {
   Projection p;
   project16(row, camera, p);
   const float* R = camera.R_camera_world;
@@ -72,11 +76,12 @@ GAUSSLITE_INLINE void backward16(const Pack16* row, const Pack16* image, const C
   quaternion_gradient(p, by_R, out.column + kQuat);
 
   // P = J R_camera_world; where the tangent is clamped, the Jacobian does not move with it.
-  const Pack16 by_J00 = dot3(by_P0, R), by_J02 = dot3(by_P0, R + 6), by_J11 = dot3(by_P1, R + 3), by_J12 = dot3(by_P1, R + 6);
+  const Pack16 by_J00 = dot3(by_P0, R), by_J02 = dot3(by_P0, R + 6), by_J11 = dot3(by_P1, R + 3),
+               by_J12 = dot3(by_P1, R + 6);
   const Pack16 by_u = fma(by_mean_x, Pack16(camera.fx), keep(p.u == p.u_clamped, -(p.J00 * by_J02)));
   const Pack16 by_v = fma(by_mean_y, Pack16(camera.fy), keep(p.v == p.v_clamped, -(p.J11 * by_J12)));
-  const Pack16 by_inverse_z = (by_J00 - p.u_clamped * by_J02) * camera.fx + (by_J11 - p.v_clamped * by_J12) * camera.fy +
-                              by_u * p.x + by_v * p.y;
+  const Pack16 by_inverse_z = (by_J00 - p.u_clamped * by_J02) * camera.fx +
+                              (by_J11 - p.v_clamped * by_J12) * camera.fy + by_u * p.x + by_v * p.y;
   const Pack16 by_camera[3] = {by_u * p.inverse_z, by_v * p.inverse_z,
                                image[kColourSums + 3] - p.inverse_z * p.inverse_z * by_inverse_z};
   for (int j = 0; j < 3; ++j) {
@@ -87,8 +92,8 @@ GAUSSLITE_INLINE void backward16(const Pack16* row, const Pack16* image, const C
   out.column[14] = out.column[15] = Pack16(0.0f);
 
   if constexpr (kTwist) {
-    // T <- exp(twist) T moves a camera-frame point by t + r x point and turns R_camera_world by r. With N = (dL/dR) R^T, the
-    // latter's gradient is the axis of N - N^T; dL/dR = J^T (dL/dP).
+    // T <- exp(twist) T moves a camera-frame point by t + r x point and turns R_camera_world by r. With N = (dL/dR)
+    // R^T, the latter's gradient is the axis of N - N^T; dL/dR = J^T (dL/dP).
     const Pack16 a01 = dot3(by_P0, R + 3), a10 = dot3(by_P1, R);
     const Pack16 n01 = p.J00 * a01, n02 = p.J00 * by_J02, n10 = p.J11 * a10, n12 = p.J11 * by_J12;
     const Pack16 n20 = p.J02 * by_J00 + p.J12 * a10, n21 = p.J02 * a01 + p.J12 * by_J11;
@@ -99,7 +104,8 @@ GAUSSLITE_INLINE void backward16(const Pack16* row, const Pack16* image, const C
   }
 }
 
-// A gradient with a NaN or infinite entry, which only absurd splats can have, counts as zero rather than spoiling its row.
+// A gradient with a NaN or infinite entry, which only absurd splats can have, counts as zero rather than spoiling its
+// row.
 GAUSSLITE_INLINE void drop_unsound(ParameterGradients& g) {
   Pack16 total = g.mean_2d_norm * 0.0f;
   for (int k = 0; k < kTrained; ++k) total = fma(g.column[k], Pack16(0.0f), total);

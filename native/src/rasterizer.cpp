@@ -16,8 +16,8 @@ double now_ms() {
   return std::chrono::duration<double, std::milli>(std::chrono::steady_clock::now().time_since_epoch()).count();
 }
 
-// The k-th tile row to work on, from the middle outwards: the heaviest rows tend to be there, and starting with them leaves the
-// threads little to wait for at the end.
+// The k-th tile row to work on, from the middle outwards: the heaviest rows tend to be there, and starting with them
+// leaves the threads little to wait for at the end.
 int strip_of_ticket(int ticket, int strips) {
   const int middle = strips / 2;
   const int away = (ticket + 1) / 2;
@@ -90,7 +90,7 @@ void Rasterizer::count_active_tiles() {
 
 void Rasterizer::prepare_gradient_rows() { ws_.gradient_rows.reserve(size_t(ws_.gradient_rows_used.load()) * 16); }
 
-void Rasterizer::mark(double StageTimes::* stage) {
+void Rasterizer::mark(double StageTimes::*stage) {
   const double now = now_ms();
   times_.*stage = now - std::exchange(last_mark_ms_, now);
 }
@@ -184,9 +184,10 @@ double Rasterizer::step(const FrameInput& input, const OptimizerState& state, co
   begin_frame(input);
   const double weight_sum = view.weight_sum(masked);
   const double per_pixel = weight_sum > 0.0 ? 1.0 / weight_sum : 0.0;
-  const Training training{view.targets(masked),
-                          {float(loss.colour * per_pixel / 3.0), float(loss.depth * per_pixel), float(loss.ssim * per_pixel / 3.0)},
-                          loss_sums_.data()};
+  const Training training{
+      view.targets(masked),
+      {float(loss.colour * per_pixel / 3.0), float(loss.depth * per_pixel), float(loss.ssim * per_pixel / 3.0)},
+      loss_sums_.data()};
   Update update{state.rows, state.first_moment, state.second_moment, state.trainable, {}};
   std::copy_n(adam.rates, 16, update.adam.rates);
   update.adam.beta1 = float(adam.beta1);

@@ -71,8 +71,8 @@ class Rasterizer {
   void forward(const FrameInput& input, const ImageOutput& output);
   // Of the last forward. d_rows must be zero; mean_2d_norm has room for visible_count().
   void backward(const ImageGradients& input, float* d_rows, double* d_twist, float* mean_2d_norm);
-  double step(const FrameInput& input, const OptimizerState& state, const TrainingView& view, bool masked, const LossWeights& loss,
-              const AdamOptions& adam);
+  double step(const FrameInput& input, const OptimizerState& state, const TrainingView& view, bool masked,
+              const LossWeights& loss, const AdamOptions& adam);
 
   // The rows that the last call found visible, ascending.
   uint32_t visible_count() const;
@@ -88,7 +88,7 @@ class Rasterizer {
   void export_rows(const ImageOutput& output, int begin, int end) const;
   void import_gradients(const ImageGradients& input, int begin, int end);
   const float* corrections(const AdamOptions& adam);
-  void mark(double StageTimes::* stage);
+  void mark(double StageTimes::*stage);
   template <class F>
   void for_each_strip(F f);
 

@@ -18,7 +18,8 @@ void loss_ssim(Workspace&, const Training&, int begin, int end, int thread);
 void backward_strip(Workspace&, int strip, int thread);
 void update(Workspace&, const Update&, int thread);
 void gradients(Workspace&, const GradientOutput&, int thread);
-void prepare_ssim(const float* rgb, int width, int height, int padded_width, int64_t plane, float* moments, float* scratch);
+void prepare_ssim(const float* rgb, int width, int height, int padded_width, int64_t plane, float* moments,
+                  float* scratch);
 size_t ssim_scratch_floats(int padded_width);
 
 }  // namespace gausslite::GAUSSLITE_ISA

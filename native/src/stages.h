@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// The stages of an iteration, as one table of functions per instruction set. Each stage is called by every thread of the team with
-// its own number; the barriers between stages are the caller's.
+// The stages of an iteration, as one table of functions per instruction set. Each stage is called by every thread of
+// the team with its own number; the barriers between stages are the caller's.
 #pragma once
 
 #include <cstddef>
@@ -24,7 +24,7 @@ struct Targets {
   const float* weight;   // 0 outside the image
   const float* moments;  // SSIM: three planes of the mean, three of the mean square; null when SSIM was not prepared
   const uint8_t* weighted_tiles;  // 1 where a tile has a pixel with a weight
-  const uint16_t* spans; // per image row: first column with a weight, end column; equal where there is none
+  const uint16_t* spans;          // per image row: first column with a weight, end column; equal where there is none
 };
 
 struct LossSettings {
@@ -46,13 +46,14 @@ struct Update {
 };
 
 struct GradientOutput {
-  float* d_rows;         // zeroed by the caller
-  float* mean_2d_norm;   // by visible splat
-  double* d_twist;       // [segments][6]
+  float* d_rows;        // zeroed by the caller
+  float* mean_2d_norm;  // by visible splat
+  double* d_twist;      // [segments][6]
 };
 
 struct Stages {
-  // Projects this thread's segments, packs the visible splats and hands their depth keys to the tile rows that they touch.
+  // Projects this thread's segments, packs the visible splats and hands their depth keys to the tile rows that they
+  // touch.
   void (*project)(Workspace&, int thread);
   // Sorts, bins and draws a tile row into Workspace::image.
   void (*draw_strip)(Workspace&, int strip, int thread);
@@ -68,7 +69,8 @@ struct Stages {
   void (*update)(Workspace&, const Update&, int thread);
   void (*gradients)(Workspace&, const GradientOutput&, int thread);
   // The blurred target and its blurred square, once per training image.
-  void (*prepare_ssim)(const float* rgb, int width, int height, int padded_width, int64_t plane, float* moments, float* scratch);
+  void (*prepare_ssim)(const float* rgb, int width, int height, int padded_width, int64_t plane, float* moments,
+                       float* scratch);
   size_t (*ssim_scratch_floats)(int padded_width);
 };
 

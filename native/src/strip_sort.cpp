@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// Stage 2: the splats of one row of tiles, nearest first. A strip's keys fit the second-level cache, and its thread goes on to bin
-// and draw it while they are there; one sort of the whole image would go through memory instead.
+// Stage 2: the splats of one row of tiles, nearest first. A strip's keys fit the second-level cache, and its thread
+// goes on to bin and draw it while they are there; one sort of the whole image would go through memory instead.
 #include <algorithm>
 #include <utility>
 
@@ -43,8 +43,9 @@ DepthRange depth_range(const Workspace& ws, int strip) {
 
 }  // namespace
 
-// A least-significant-digit radix sort over 24 bits: the bits of a positive float grow with the float, and rebased to the strip's
-// nearest splat 24 of them resolve depth to about 3e-7. It is stable, so equal depths keep the order of the rows.
+// A least-significant-digit radix sort over 24 bits: the bits of a positive float grow with the float, and rebased to
+// the strip's nearest splat 24 of them resolve depth to about 3e-7. It is stable, so equal depths keep the order of the
+// rows.
 const DepthKey* sort_strip(Workspace& ws, int strip, int thread, int& count) {
   const DepthRange range = depth_range(ws, strip);
   count = range.count;

@@ -5,9 +5,10 @@ namespace gausslite {
 
 namespace {
 
-// Plain loads while the wait is likely short: a PAUSE instruction lets a hypervisor take the processor away, which costs far more
-// than the wait (0.2 ms a stage were seen). Then the scheduler may run others: with fewer free cores than members, spinning
-// longer would only delay the member that is waited for. After some 0.2 ms of that the thread sleeps.
+// Plain loads while the wait is likely short: a PAUSE instruction lets a hypervisor take the processor away, which
+// costs far more than the wait (0.2 ms a stage were seen). Then the scheduler may run others: with fewer free cores
+// than members, spinning longer would only delay the member that is waited for. After some 0.2 ms of that the thread
+// sleeps.
 constexpr int kSpins = 20'000;
 constexpr int kYields = 400;
 

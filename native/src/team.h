@@ -10,8 +10,8 @@
 
 namespace gausslite {
 
-// One owner calls `run`; the calling thread is member 0. Members that wait first spin, then yield, then sleep, so that a busy
-// loop of calls pays nothing for waking up and an idle team costs nothing.
+// One owner calls `run`; the calling thread is member 0. Members that wait first spin, then yield, then sleep, so that
+// a busy loop of calls pays nothing for waking up and an idle team costs nothing.
 class Team {
  public:
   explicit Team(int threads);

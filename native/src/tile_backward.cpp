@@ -2,8 +2,8 @@
 // Stage 6: pixel gradients to image gradients of the splats, tile by tile along the lists of the forward pass.
 #include <algorithm>
 
-#include "block_forward.h"
 #include "block_backward.h"
+#include "block_forward.h"
 #include "stage_functions.h"
 #include "tile_chunk.h"
 

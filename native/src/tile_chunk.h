@@ -23,7 +23,8 @@ GAUSSLITE_INLINE void list_blocks(const uint16_t* blocks, int n, BlockLists& lis
         _mm256_add_epi8(_mm256_load_si256(reinterpret_cast<const __m256i*>(kNumbers)), _mm256_set1_epi8(char(i)));
     for (int b = 0; b < kBlocks; ++b) {
       const __mmask32 touching = _mm512_test_epi16_mask(masks, _mm512_set1_epi16(short(1u << b)));
-      _mm256_storeu_si256(reinterpret_cast<__m256i*>(lists.entry[b] + count[b]), _mm256_maskz_compress_epi8(touching, numbers));
+      _mm256_storeu_si256(reinterpret_cast<__m256i*>(lists.entry[b] + count[b]),
+                          _mm256_maskz_compress_epi8(touching, numbers));
       count[b] += uint32_t(__builtin_popcount(touching));
     }
   }
@@ -43,7 +44,8 @@ GAUSSLITE_INLINE void list_blocks(const uint16_t* blocks, int n, BlockLists& lis
 #endif
 
 // Loads entries [first, first + n) of a tile, n at most kChunk, and asks for the next chunk's splats.
-GAUSSLITE_INLINE void load_chunk(const Workspace& ws, const TileList& tile, uint32_t first, int n, Splat* records, BlockLists& lists) {
+GAUSSLITE_INLINE void load_chunk(const Workspace& ws, const TileList& tile, uint32_t first, int n, Splat* records,
+                                 BlockLists& lists) {
   const uint32_t* slots = &tile.slots[first];
   for (int i = 0; i < n; ++i) {
     store(reinterpret_cast<float*>(&records[i]), load(reinterpret_cast<const float*>(&ws.splats[slots[i]])));

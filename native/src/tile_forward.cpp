@@ -30,7 +30,8 @@ void draw_tile(Workspace& ws, TileList& list, const TilePosition& tile) {
     for (int b = 0; b < kBlocks; ++b) {
       if (finished >> b & 1u) continue;
       float* none = nullptr;
-      const int taken = composite<false>(records, lists.entry[b], lists.count[b], tile.pixel_x(b), tile.pixel_y(b), state[b], none);
+      const int taken =
+          composite<false>(records, lists.entry[b], lists.count[b], tile.pixel_x(b), tile.pixel_y(b), state[b], none);
       list.used[b] += uint32_t(taken);
       if (state[b].finished()) finished |= 1u << b;
     }

@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
-// Stages 4 to 6 in one pass, for losses that look at each pixel alone: a tile is drawn, compared and walked back while its
-// records, lists and alphas are in the second-level cache. Nothing is gathered or computed twice, and no image is written.
+// Stages 4 to 6 in one pass, for losses that look at each pixel alone: a tile is drawn, compared and walked back while
+// its records, lists and alphas are in the second-level cache. Nothing is gathered or computed twice, and no image is
+// written.
 #include <algorithm>
 
 #include "block_backward.h"
@@ -38,7 +39,8 @@ class FusedTile {
           lists.count[b] = 0;
           continue;
         }
-        lists.count[b] = uint16_t(composite<true>(records, lists.entry[b], lists.count[b], tile_.pixel_x(b), tile_.pixel_y(b), state_[b], alphas));
+        lists.count[b] = uint16_t(composite<true>(records, lists.entry[b], lists.count[b], tile_.pixel_x(b),
+                                                  tile_.pixel_y(b), state_[b], alphas));
         if (state_[b].finished()) finished |= 1u << b;
       }
       kept = size_t(alphas - mine_.alphas.data()) / 16;
@@ -54,7 +56,8 @@ class FusedTile {
       const Pack16 image[5] = {s.r, s.g, s.b, s.depth, s.transmittance};
       Pack16 rgb[3], gradient[5];
       for (int k = 0; k < 3; ++k) rgb[k] = load_block(t.rgb + k * ws_.plane + at, ws_.padded_width);
-      const Pack16 measured_m = load_block(t.depth_m + at, ws_.padded_width), weight = load_block(t.weight + at, ws_.padded_width);
+      const Pack16 measured_m = load_block(t.depth_m + at, ws_.padded_width),
+                   weight = load_block(t.weight + at, ws_.padded_width);
       loss = loss + l1_of_pixels(image, rgb, measured_m, weight, training.loss, gradient);
       gradients_[b].start(gradient, image);
     }
@@ -72,7 +75,8 @@ class FusedTile {
       }
       sums_.clear(n);
       for (int b = 0; b < kBlocks; ++b) {
-        if (lists.count[b] > 0) walk_back<true>(records, lists.entry[b], lists.count[b], tile_, b, gradients_[b], sums_, alphas);
+        if (lists.count[b] > 0)
+          walk_back<true>(records, lists.entry[b], lists.count[b], tile_, b, gradients_[b], sums_, alphas);
       }
       add_to_rows(ws_, records, n, tile_, sums_);
     }

@@ -14,7 +14,8 @@ int padded(int pixels) { return (pixels + kTile - 1) / kTile * kTile; }
 
 }  // namespace
 
-TrainingView::TrainingView(const Stages& stages, int width, int height, const uint8_t* rgb, const float* depth_m, const float* weight)
+TrainingView::TrainingView(const Stages& stages, int width, int height, const uint8_t* rgb, const float* depth_m,
+                           const float* weight)
     : width_(width),
       height_(height),
       padded_width_(padded(width)),
@@ -63,7 +64,8 @@ void TrainingView::locate(Weights& weights) const {
 Targets TrainingView::targets(bool masked) const {
   const Weights& w = weights(masked);
   const float* p = planes_.data();
-  return {p, p + kDepthPlane * plane_, p + w.plane * plane_, p + kMomentPlanes * plane_, w.tiles.data(), w.spans.data()};
+  return {
+      p, p + kDepthPlane * plane_, p + w.plane * plane_, p + kMomentPlanes * plane_, w.tiles.data(), w.spans.data()};
 }
 
 }  // namespace gausslite

@@ -12,7 +12,8 @@ namespace gausslite {
 class TrainingView {
  public:
   // rgb: height x width x 3 bytes; depth_m, weight: height x width; weight may be null (1 everywhere).
-  TrainingView(const Stages& stages, int width, int height, const uint8_t* rgb, const float* depth_m, const float* weight);
+  TrainingView(const Stages& stages, int width, int height, const uint8_t* rgb, const float* depth_m,
+               const float* weight);
 
   int width() const { return width_; }
   int height() const { return height_; }
@@ -20,7 +21,6 @@ class TrainingView {
   double weight_sum(bool masked) const { return weights(masked).sum; }
 
  private:
-
   // One way of weighing the pixels, and where its weights are.
   struct Weights {
     int plane;
@@ -34,7 +34,8 @@ class TrainingView {
   int width_, height_, padded_width_;
   int64_t plane_;
   bool masked_;
-  Buffer<float> planes_;  // r g b, depth, inside (1 in the image, 0 in the padding), mask, three means, three mean squares
+  Buffer<float>
+      planes_;  // r g b, depth, inside (1 in the image, 0 in the padding), mask, three means, three mean squares
   Weights inside_, mask_;
 };
 

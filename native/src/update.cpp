@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// Stage 7: image gradients to parameters, for the visible splats of this thread's segments: either written out as gradients, or fed
-// to Adam on the spot, while the three rows of a splat (parameters and two moments) are in cache.
+// Stage 7: image gradients to parameters, for the visible splats of this thread's segments: either written out as
+// gradients, or fed to Adam on the spot, while the three rows of a splat (parameters and two moments) are in cache.
 #include <algorithm>
 #include <cstring>
 
@@ -48,11 +48,12 @@ GAUSSLITE_INLINE void for_each_group(const Workspace& ws, int thread, F f) {
   }
 }
 
-// Adam on whole rows. The statistics in columns 14 and 15 of the first moment are plain sums, which is Adam's recurrence with
-// other factors in those lanes; the update count in column 14 of the row moves by one.
+// Adam on whole rows. The statistics in columns 14 and 15 of the first moment are plain sums, which is Adam's
+// recurrence with other factors in those lanes; the update count in column 14 of the row moves by one.
 class Adam {
  public:
-  GAUSSLITE_INLINE explicit Adam(const Update& job) : job_(job), rate_(load(job.adam.rates)), epsilon_(job.adam.epsilon) {
+  GAUSSLITE_INLINE explicit Adam(const Update& job)
+      : job_(job), rate_(load(job.adam.rates)), epsilon_(job.adam.epsilon) {
     const AdamSettings& adam = job.adam;
     alignas(64) float factors[5][16];
     for (int k = 0; k < 16; ++k) {
@@ -111,7 +112,8 @@ void update(Workspace& ws, const Update& job, int thread) {
 }
 
 void gradients(Workspace& ws, const GradientOutput& job, int thread) {
-  for (uint32_t s = uint32_t(thread); s < ws.segments; s += uint32_t(ws.threads)) std::fill_n(job.d_twist + 6 * size_t(s), 6, 0.0);
+  for (uint32_t s = uint32_t(thread); s < ws.segments; s += uint32_t(ws.threads))
+    std::fill_n(job.d_twist + 6 * size_t(s), 6, 0.0);
   for_each_group(ws, thread, [&](uint32_t segment, const Group& group, uint32_t slot) {
     ParameterGradients g;
     backward16<true>(group.row, group.image, ws.camera, g);

@@ -18,8 +18,8 @@ struct alignas(64) Splat {
   float quad_xx, quad_xy, quad_yy;
   float log2_opacity;
   float r, g, b, depth;
-  float slope_y;          // the dy that minimises the quadric for dx = 1 ...
-  float slope_x;          // ... and the dx for dy = 1: the exact ellipse-block test needs them
+  float slope_y;  // the dy that minimises the quadric for dx = 1 ...
+  float slope_x;  // ... and the dx for dy = 1: the exact ellipse-block test needs them
   uint16_t block_x0, block_x1, block_y0, block_y1;  // 4x4 blocks that its bounding box touches, both ends included
   uint32_t gradient_row;  // its image gradients of tile row y are in row gradient_row + y (modulo 2^32)
   uint32_t elongated;     // 1 when the bounding box is a poor stand-in for the ellipse
@@ -50,7 +50,7 @@ struct TileList {
   uint32_t used[kBlocks];  // entries of each block's list that were composited before all of its pixels were finished
 };
 
-constexpr int kChunk = 64;          // splats of a tile that are handled at a time: their records stay in the first-level cache
+constexpr int kChunk = 64;  // splats of a tile that are handled at a time: their records stay in the first-level cache
 constexpr int kPrefetchAhead = 24;  // keys
 constexpr int kSegment = 4096;      // parameter rows that are projected as a unit, always by the same thread
 
@@ -63,10 +63,10 @@ struct BlockLists {
 struct ThreadScratch {
   std::vector<KeyList> strips;  // by tile row: the splats of this thread's segments that touch it
   Buffer<DepthKey> sorted[2];
-  Buffer<Splat> records;        // the fused pass: a tile's splats, block lists and alphas between its two directions
+  Buffer<Splat> records;  // the fused pass: a tile's splats, block lists and alphas between its two directions
   Buffer<BlockLists> lists;
   Buffer<float> alphas;
-  Buffer<float> ssim;           // row buffers of the SSIM loss
+  Buffer<float> ssim;                   // row buffers of the SSIM loss
   uint32_t next_row = 0, last_row = 0;  // the block of gradient rows this thread is handing out
 };
 
@@ -93,9 +93,9 @@ struct Workspace {
   // Raster. image: red, green, blue, depth, transmittance; image_gradient: by red, green, blue, depth, alpha.
   std::vector<TileList> tiles;
   Buffer<float> image, image_gradient;
-  // Gradient rows are owned by one (splat, tile row) pair each, so that no two threads add to the same one and the sum over a
-  // splat's rows has a fixed order: results do not depend on the number of threads. `tag` marks the rows written in this
-  // pass; stale ones count as zero and are never cleared.
+  // Gradient rows are owned by one (splat, tile row) pair each, so that no two threads add to the same one and the sum
+  // over a splat's rows has a fixed order: results do not depend on the number of threads. `tag` marks the rows written
+  // in this pass; stale ones count as zero and are never cleared.
   Buffer<float> gradient_rows;
   std::atomic<uint32_t> gradient_rows_used{0};
   uint32_t tag = 0;

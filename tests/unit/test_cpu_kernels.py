@@ -171,7 +171,7 @@ def test_a_superseded_rendering_is_refused() -> None:
 
 
 def test_an_impossible_instruction_set_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(KernelError, match="simd: expected one of .*portable.* got sse9"):
+    with pytest.raises(KernelError, match=r"simd: expected one of .*portable.* got sse9"):
         CpuRasterizer(simd="sse9")
     monkeypatch.setenv(SIMD_VARIABLE, "mmx")
     with pytest.raises(KernelError, match=SIMD_VARIABLE):

@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 // Sixteen floats at once: picks the form this translation unit is compiled for and adds the functions all forms share.
 //
-// The build compiles every stage once per form and defines GAUSSLITE_ISA as the form's name, which is also the namespace its
-// code lives in, so that the forms can sit in one extension module side by side.
+// The build compiles every stage once per form and defines GAUSSLITE_ISA as the form's name, which is also the
+// namespace its code lives in, so that the forms can sit in one extension module side by side.
 #pragma once
 
 #ifndef GAUSSLITE_ISA

@@ -76,8 +76,8 @@ GAUSSLITE_INLINE Pack16 rough_reciprocal(Pack16 a) {
   return r * fnma(a, r, Pack16(2.0f));
 }
 
-#define GAUSSLITE_COMPARISON(name, predicate) \
-  GAUSSLITE_INLINE Mask16 name(Pack16 a, Pack16 b) { \
+#define GAUSSLITE_COMPARISON(name, predicate)                                            \
+  GAUSSLITE_INLINE Mask16 name(Pack16 a, Pack16 b) {                                     \
     return {_mm256_cmp_ps(a.lo, b.lo, predicate), _mm256_cmp_ps(a.hi, b.hi, predicate)}; \
   }
 GAUSSLITE_COMPARISON(operator<, _CMP_LT_OQ)
@@ -146,10 +146,14 @@ GAUSSLITE_INLINE void transpose(Pack16 (&r)[16]) {
   for (int i = 0; i < 16; i += 4) transpose_quads(r[i], r[i + 1], r[i + 2], r[i + 3]);
   Pack16 t[16];
   for (int i = 0; i < 4; ++i) {
-    t[i] = {_mm256_permute2f128_ps(r[i].lo, r[i + 4].lo, 0x20), _mm256_permute2f128_ps(r[i + 8].lo, r[i + 12].lo, 0x20)};
-    t[i + 4] = {_mm256_permute2f128_ps(r[i].lo, r[i + 4].lo, 0x31), _mm256_permute2f128_ps(r[i + 8].lo, r[i + 12].lo, 0x31)};
-    t[i + 8] = {_mm256_permute2f128_ps(r[i].hi, r[i + 4].hi, 0x20), _mm256_permute2f128_ps(r[i + 8].hi, r[i + 12].hi, 0x20)};
-    t[i + 12] = {_mm256_permute2f128_ps(r[i].hi, r[i + 4].hi, 0x31), _mm256_permute2f128_ps(r[i + 8].hi, r[i + 12].hi, 0x31)};
+    t[i] = {_mm256_permute2f128_ps(r[i].lo, r[i + 4].lo, 0x20),
+            _mm256_permute2f128_ps(r[i + 8].lo, r[i + 12].lo, 0x20)};
+    t[i + 4] = {_mm256_permute2f128_ps(r[i].lo, r[i + 4].lo, 0x31),
+                _mm256_permute2f128_ps(r[i + 8].lo, r[i + 12].lo, 0x31)};
+    t[i + 8] = {_mm256_permute2f128_ps(r[i].hi, r[i + 4].hi, 0x20),
+                _mm256_permute2f128_ps(r[i + 8].hi, r[i + 12].hi, 0x20)};
+    t[i + 12] = {_mm256_permute2f128_ps(r[i].hi, r[i + 4].hi, 0x31),
+                 _mm256_permute2f128_ps(r[i + 8].hi, r[i + 12].hi, 0x31)};
   }
   for (int i = 0; i < 16; ++i) r[i] = t[i];
 }

@@ -1,5 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// Sixteen floats in one AVX-512 register. Every form of Pack16 offers the same functions; pack_portable.h documents them.
+// Sixteen floats in one AVX-512 register. Every form of Pack16 offers the same functions; pack_portable.h documents
+// them.
 #pragma once
 
 #include <immintrin.h>

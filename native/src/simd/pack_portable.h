@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
-// Sixteen floats without any instruction set in mind: four groups of four, written with the compiler's vector types, which
-// become SSE, NEON or scalar code. It is the fallback, the oracle of the other forms, and the place where each function is explained.
+// Sixteen floats without any instruction set in mind: four groups of four, written with the compiler's vector types,
+// which become SSE, NEON or scalar code. It is the fallback, the oracle of the other forms, and the place where each
+// function is explained.
 #pragma once
 
 #include <cmath>
@@ -19,7 +20,9 @@ GAUSSLITE_INLINE Quad load_quad(const float* p) {
   return q;
 }
 GAUSSLITE_INLINE void store_quad(float* p, Quad q) { std::memcpy(p, &q, sizeof q); }
-GAUSSLITE_INLINE Quad choose(QuadInt mask, Quad yes, Quad no) { return (Quad)((mask & (QuadInt)yes) | (~mask & (QuadInt)no)); }
+GAUSSLITE_INLINE Quad choose(QuadInt mask, Quad yes, Quad no) {
+  return (Quad)((mask & (QuadInt)yes) | (~mask & (QuadInt)no));
+}
 GAUSSLITE_INLINE Quad floor_quad(Quad a) {
   // Beyond 2^23 a float is whole already, and the conversion to an integer would overflow.
   const QuadInt small = (a < 8388608.0f) & (a > -8388608.0f);
@@ -75,11 +78,11 @@ GAUSSLITE_INLINE void store_int(int32_t* p, Pack16 a) {
   }
 }
 
-#define GAUSSLITE_LANEWISE(name, expression) \
+#define GAUSSLITE_LANEWISE(name, expression)         \
   GAUSSLITE_INLINE Pack16 name(Pack16 a, Pack16 b) { \
-    Pack16 r; \
-    GAUSSLITE_EACH r.q[i] = expression; \
-    return r; \
+    Pack16 r;                                        \
+    GAUSSLITE_EACH r.q[i] = expression;              \
+    return r;                                        \
   }
 GAUSSLITE_LANEWISE(operator+, a.q[i] + b.q[i])
 GAUSSLITE_LANEWISE(operator-, a.q[i] - b.q[i])
@@ -113,11 +116,11 @@ GAUSSLITE_INLINE Pack16 ceil(Pack16 a) { return -floor(-a); }
 GAUSSLITE_INLINE Pack16 rough_reciprocal(Pack16 a) { return Pack16(1.0f) / a; }
 
 // Comparisons are false for NaN.
-#define GAUSSLITE_COMPARISON(name, op) \
+#define GAUSSLITE_COMPARISON(name, op)               \
   GAUSSLITE_INLINE Mask16 name(Pack16 a, Pack16 b) { \
-    Mask16 m; \
-    GAUSSLITE_EACH m.q[i] = a.q[i] op b.q[i]; \
-    return m; \
+    Mask16 m;                                        \
+    GAUSSLITE_EACH m.q[i] = a.q[i] op b.q[i];        \
+    return m;                                        \
   }
 GAUSSLITE_COMPARISON(operator<, <)
 GAUSSLITE_COMPARISON(operator<=, <=)
@@ -193,7 +196,9 @@ GAUSSLITE_INLINE Pack16 load_block(const float* p, int64_t stride) {
   GAUSSLITE_EACH a.q[i] = load_quad(p + i * stride);
   return a;
 }
-GAUSSLITE_INLINE void store_block(float* p, int64_t stride, Pack16 a) { GAUSSLITE_EACH store_quad(p + i * stride, a.q[i]); }
+GAUSSLITE_INLINE void store_block(float* p, int64_t stride, Pack16 a) {
+  GAUSSLITE_EACH store_quad(p + i * stride, a.q[i]);
+}
 
 #undef GAUSSLITE_EACH
 

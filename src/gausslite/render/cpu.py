@@ -62,7 +62,7 @@ class CpuRasterizer:
     def __init__(self, threads: int | None = None, simd: str | None = None) -> None:
         kernels = _load_kernels()
         self._simd = _choose_simd(simd, kernels.usable_simd())
-        self._engine = kernels.Engine(self._simd, _choose_threads(threads))
+        self._engine: _kernels.Engine = kernels.Engine(self._simd, _choose_threads(threads))
 
     @property
     def name(self) -> str:
@@ -77,7 +77,7 @@ class CpuRasterizer:
     @property
     def threads(self) -> int:
         """Members of the team, the caller included."""
-        return int(self._engine.threads)
+        return self._engine.threads
 
     def forward(
         self,

@@ -1,0 +1,74 @@
+"""The native extension as Python sees it (native/src/bindings.cpp); use gausslite.render.cpu.CpuRasterizer."""
+
+from collections.abc import Sequence
+
+from jaxtyping import Bool, Float32, Float64, UInt8, UInt32
+from numpy import ndarray
+
+def usable_simd() -> list[str]:
+    """Instruction sets this build has and this machine runs, fastest first."""
+
+class View:
+    """A training image made ready: padded, planar, SSIM moments cached."""
+
+    @property
+    def width(self) -> int: ...
+    @property
+    def height(self) -> int: ...
+
+class Engine:
+    """Scratch memory and a team of threads; it never keeps the splats."""
+
+    def __init__(self, simd: str, threads: int) -> None: ...
+    @property
+    def threads(self) -> int: ...
+    @property
+    def frame(self) -> int:
+        """The number of the latest forward or step."""
+
+    def forward(
+        self,
+        rows: Float32[ndarray, "n 16"],
+        intrinsics: tuple[float, float, float, float, int, int],
+        T_camera_world: Float64[ndarray, "4 4"],
+        tiles: Bool[ndarray, "th tw"] | None,
+        ids: UInt32[ndarray, " m"] | None,
+    ) -> tuple[Float32[ndarray, "h w 3"], Float32[ndarray, "h w"], Float32[ndarray, "h w"], int]:
+        """rgb, depth_m, alpha and the frame's number; intrinsics are fx, fy, cx, cy, width, height."""
+
+    def backward(
+        self,
+        frame: int,
+        row_count: int,
+        d_rgb: Float32[ndarray, "h w 3"],
+        d_depth_m: Float32[ndarray, "h w"],
+        d_alpha: Float32[ndarray, "h w"],
+    ) -> tuple[Float32[ndarray, "n 16"], Float64[ndarray, "6"], UInt32[ndarray, " m"], Float32[ndarray, " m"]]:
+        """d_rows, d_twist, visible rows and mean_2d_norm."""
+
+    def prepare_view(
+        self,
+        rgb: UInt8[ndarray, "h w 3"],
+        depth_m: Float32[ndarray, "h w"],
+        weight: Float32[ndarray, "h w"] | None,
+    ) -> View: ...
+    def step(
+        self,
+        rows: Float32[ndarray, "n 16"],
+        first_moment: Float32[ndarray, "n 16"],
+        second_moment: Float32[ndarray, "n 16"],
+        view: View,
+        intrinsics: tuple[float, float, float, float, int, int],
+        T_camera_world: Float64[ndarray, "4 4"],
+        loss: tuple[float, float, float],
+        rates: Sequence[float],
+        adam: tuple[float, float, float],
+        masked: bool,
+        tiles: Bool[ndarray, "th tw"] | None,
+        ids: UInt32[ndarray, " m"] | None,
+        trainable: Bool[ndarray, " n"] | None,
+    ) -> tuple[float, UInt32[ndarray, " m"]]:
+        """The loss and the visible rows; adam is beta1, beta2, epsilon."""
+
+    def stage_times_ms(self) -> dict[str, float]:
+        """Milliseconds of the last call's stages."""
