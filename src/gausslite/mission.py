@@ -34,6 +34,19 @@ class SceneKnowledge:
 
 
 @dataclass(frozen=True, slots=True)
+class PerceptionSettings:
+    """What finds the task's nouns: a YOLO-seg file, or ground truth without one.
+
+    resegment runs the network on frames between detections too; without it masks are cut by depth inside the
+    re-projected boxes, which on a real kitchen is as exact at a third of the time.
+    """
+
+    model: Path | None = None
+    resegment: bool = False
+    threads: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
 class MissionSettings:
     """How one robot maps.
 
@@ -81,19 +94,17 @@ def build_mapper(settings: MissionSettings) -> GaussianMapper:
     return GaussianMapper(settings.mapper_settings(), rasterizer, seed=settings.seed)
 
 
-def build_attention(
-    graph: TaskGraph, scene: SceneKnowledge, model: Path | None = None, threads: int | None = None
-) -> TaskAttention:
+def build_attention(graph: TaskGraph, scene: SceneKnowledge, perception: PerceptionSettings) -> TaskAttention:
     """Attention to a task: by the user's YOLO-seg file or, without one, by the scene's own ground truth.
 
     Raises ModelFileError for a bad file and InvalidInputError when there is neither file nor ground truth.
     """
     settings = AttentionSettings(up_axis=scene.up_axis)
-    if model is not None:
+    if perception.model is not None:
         from gausslite.perception.yolo import load_yolo
 
-        yolo = load_yolo(model, threads=threads)
-        return TaskAttention(graph, yolo, settings, segmenter=yolo)
+        yolo = load_yolo(perception.model, threads=perception.threads)
+        return TaskAttention(graph, yolo, settings, segmenter=yolo if perception.resegment else None)
     if not scene.regions:
         raise InvalidInputError(
             "detector: the sequence has no ground-truth regions; name a YOLO-seg ONNX file with --detector"

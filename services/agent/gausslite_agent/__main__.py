@@ -48,7 +48,7 @@ async def _serve(settings: AgentSettings) -> None:
         robot = Robot(
             settings.mission,
             settings.link.grid,
-            lambda graph: build_attention(graph, scene, settings.detector, settings.mission.threads),
+            lambda graph: build_attention(graph, scene, settings.perception),
             uplink,
             on_change=lambda: _ring(loop, news),
         )

@@ -11,7 +11,7 @@ from gausslite.datasets.source import UpAxis
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.errors import InvalidInputError
 from gausslite.mapping.policies import POLICIES
-from gausslite.mission import DEFAULT_MAX_GAUSSIANS, MissionSettings
+from gausslite.mission import DEFAULT_MAX_GAUSSIANS, MissionSettings, PerceptionSettings
 from gausslite.wire.uplink_values import UplinkSettings
 
 
@@ -46,7 +46,7 @@ class AgentSettings:
     listen: str
     agent_id: str
     task: str | None
-    detector: Path | None
+    perception: PerceptionSettings
     up_axis: UpAxis | None
     out: Path | None
     exit_when_done: bool
@@ -88,7 +88,7 @@ def parse_arguments(arguments: Sequence[str] | None = None) -> AgentSettings:
         options.listen,
         options.agent_id,
         options.task,
-        options.detector,
+        PerceptionSettings(options.detector, options.resegment, options.threads),
         options.up,
         options.out,
         options.exit_when_done,
@@ -109,6 +109,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--agent-id", default="agent", metavar="NAME", help="this robot's name in the team; default %(default)s")
     add("--task", metavar="TEXT", help="what the robot is to do; otherwise it waits for AssignTask")
     add("--detector", metavar="FILE.onnx", type=Path, help="a YOLO-seg model (default: the source's ground truth)")
+    add("--resegment", action="store_true", help="run the detector's masks on every frame (slower)")
     add("--up", metavar="X,Y,Z", type=_up_axis, help="the world's upward direction, if not the source's")
     add("--out", metavar="DIR", type=Path, help="gets map.ply and report.json at the end of the mission")
     add("--exit-when-done", action="store_true", help="end after the mission instead of serving on")

@@ -23,6 +23,7 @@ from gausslite.mapping.policies import POLICIES
 from gausslite.mission import (
     DEFAULT_MAX_GAUSSIANS,
     MissionSettings,
+    PerceptionSettings,
     SceneKnowledge,
     build_attention,
     build_mapper,
@@ -41,6 +42,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--task", metavar="TEXT", help='what the robot is to do, such as "Pick up the mug on the table"'
     )
     parser.add_argument("--detector", metavar="FILE.onnx", type=Path, help="a YOLO-seg model (default: ground truth)")
+    parser.add_argument("--resegment", action="store_true", help="run the detector's masks on every frame (slower)")
     add_regions(parser)
     parser.add_argument("--policy", choices=sorted(POLICIES), default="task", help="how to spend the budget")
     parser.add_argument("--without", metavar="A,B", type=names, default=(), help="components off: sb mvo roi sis gfd")
@@ -128,7 +130,8 @@ def _attention(
         from gausslite.task.rules import RuleParser
 
         graph = RuleParser().parse(options.task)
-        return build_attention(graph, SceneKnowledge.of(source), options.detector, settings.threads), graph
+        perception = PerceptionSettings(options.detector, options.resegment, settings.threads)
+        return build_attention(graph, SceneKnowledge.of(source), perception), graph
     if not regions and options.policy != "uniform":
         raise InvalidInputError(
             "--task: expected a task in words, or regions with --roi FILE.npz or --roi-ball X,Y,Z,R"
