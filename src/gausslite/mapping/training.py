@@ -11,7 +11,10 @@ from gausslite.mapping.keyframes import WindowView
 from gausslite.mapping.settings import ActivePhase, MapperSettings
 from gausslite.optimize.density import densify, prune
 from gausslite.optimize.parameters import SplatTable
-from gausslite.render.rasterizer import EVERYTHING, Rasterizer, Subset
+from gausslite.render.rasterizer import EVERYTHING, RGB, Rasterizer, Subset
+
+_COLOUR_RANGE = (-0.25, 1.25)
+"""Somewhat beyond what can be shown, so that overlapping Gaussians still add up to black and white."""
 
 
 class Trainer:
@@ -47,6 +50,7 @@ class Trainer:
             done += 1
             self._iterations += 1
             self._control_density(extent_m)
+        self._bound_colours()
         return done
 
     def _warm_up(self, views: Sequence[WindowView]) -> None:
@@ -88,6 +92,11 @@ class Trainer:
 
     def _draw(self, views: Sequence[WindowView]) -> WindowView:
         return views[int(self._rng.integers(len(views)))]
+
+    def _bound_colours(self) -> None:
+        """Colours that no view checks for a while must not run away."""
+        colours = self._table.rows[:, RGB]
+        np.clip(colours, *_COLOUR_RANGE, out=colours)
 
     def _control_density(self, extent_m: float) -> None:
         """Clone, split and prune when their turn has come."""
