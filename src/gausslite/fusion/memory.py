@@ -9,14 +9,14 @@ import numpy as np
 from jaxtyping import Int64
 from numpy import ndarray
 
+from gausslite.codec.records import from_bytes, to_records
 from gausslite.domain.subset import RoiSubset, VoxelWords
-from gausslite.fusion.records import from_bytes, to_records
 from gausslite.fusion.store import Charter, PutOutcome, Session, StakeTable, require_storable
 
 
 @dataclass(frozen=True, slots=True)
 class _Word:
-    """What one agent last said about one voxel; the records are those of records.py."""
+    """What one agent last said about one voxel; the records are those of codec.records."""
 
     map_revision: int
     kappa_sum: int

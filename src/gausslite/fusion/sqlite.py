@@ -14,9 +14,9 @@ import numpy as np
 from jaxtyping import Int64
 from numpy import ndarray
 
+from gausslite.codec.records import from_bytes, to_records
 from gausslite.domain.subset import RoiSubset, VoxelWords
 from gausslite.errors import StorageError
-from gausslite.fusion.records import from_bytes, to_records
 from gausslite.fusion.store import Charter, PutOutcome, Session, StakeTable, require_storable
 
 SCHEMA_VERSION = 1

@@ -18,17 +18,11 @@ import numpy as np
 from jaxtyping import Int64
 from numpy import ndarray
 
-from gausslite.domain.gaussians import Gaussians
+from gausslite.codec.records import from_bytes, to_records
 from gausslite.domain.subset import VoxelWords
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.errors import MismatchError, StorageError
 
-_ROW = np.dtype(
-    [
-        *(("means_m", "<f4", 3), ("quats_wxyz", "<f4", 4), ("scales_m", "<f4", 3), ("opacities", "<f4")),
-        *(("rgb", "<f4", 3), ("active", "?"), ("kappa", "<u4"), ("target", "<i2")),
-    ]
-)
 _WIRE_BYTES_PER_GAUSSIAN, _WIRE_BYTES_PER_VOXEL = 20, 20
 _MAX_INTEGER = (1 << 63) - 1
 _NEVER_SENT = -1
@@ -98,9 +92,7 @@ class Spool:
 
     def offer(self, words: VoxelWords, purpose: Purpose) -> None:
         """Keep these words in place of older ones on their voxels; what is unchanged stays as it was."""
-        rows = np.empty(len(words.gaussians), _ROW)
-        for name in _ROW.names or ():
-            rows[name] = getattr(words.gaussians, name)
+        records = to_records(words.gaussians)
         offsets = words.offsets.tolist()
         sums = np.minimum(words.kappa_sums, np.uint64(_MAX_INTEGER)).tolist()
         with self._transaction():
@@ -112,7 +104,7 @@ class Spool:
                         int(purpose),
                         sums[i],
                         offsets[i + 1] - offsets[i],
-                        rows[offsets[i] : offsets[i + 1]].tobytes(),
+                        records[offsets[i] : offsets[i + 1]].tobytes(),
                     )
                     for i, key in enumerate(words.keys.tolist())
                 ),
@@ -188,7 +180,10 @@ class Spool:
 
 def _picked(purpose: Purpose, rows: list[_Row]) -> Picked:
     keys, versions, sums, counts, blobs = zip(*rows, strict=True)
-    table = np.frombuffer(b"".join(blobs), _ROW)
-    gaussians = Gaussians(*(np.ascontiguousarray(table[name]) for name in _ROW.names or ()))
-    words = VoxelWords(np.array(keys, np.int64), np.array(sums, np.uint64), np.array(counts, np.uint32), gaussians)
+    words = VoxelWords(
+        np.array(keys, np.int64),
+        np.array(sums, np.uint64),
+        np.array(counts, np.uint32),
+        from_bytes(b"".join(blobs)),
+    )
     return Picked(purpose, words, np.array(versions, np.int64))

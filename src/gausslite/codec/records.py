@@ -1,4 +1,4 @@
-"""Gaussians as packed rows of bytes: how the stores keep the words of one voxel."""
+"""Gaussians as packed rows of bytes: how the words of a voxel lie in a store or a spool, bit for bit."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ RECORD = np.dtype(
         ("target", "<i2"),
     ]
 )
-"""63 bytes a Gaussian, little-endian, unpadded, exact: the store changes no bit of what an agent said."""
+"""63 bytes a Gaussian, little-endian, unpadded, exact: keeping changes no bit of what an agent said."""
 
 
 def to_records(gaussians: Gaussians) -> NDArray[Any]:
@@ -38,7 +38,7 @@ def from_bytes(data: bytes) -> Gaussians:
     """The Gaussians whose packed rows these are. Raises StorageError when the length is not whole rows."""
     if len(data) % RECORD.itemsize:
         raise StorageError(
-            f"stored word: expected a multiple of {RECORD.itemsize} bytes, got {len(data)}; the store is damaged"
+            f"stored word: expected a multiple of {RECORD.itemsize} bytes, got {len(data)}; what was stored is damaged"
         )
     records = np.frombuffer(data, RECORD)
     return Gaussians(*(np.ascontiguousarray(records[field.name]) for field in fields(Gaussians)))
