@@ -58,7 +58,7 @@ class QuotaError(GaussLiteError):
 
 
 class NotPermittedError(GaussLiteError):
-    """The caller may not act for this agent."""
+    """The caller may not act for this agent, here or at whatever stands before the server."""
 
 
 class UnavailableError(GaussLiteError):

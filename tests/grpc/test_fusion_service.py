@@ -76,10 +76,12 @@ def test_one_bad_block_does_not_end_a_good_stream() -> None:
         last = request(session, said("ant", 7, {1: [1, 1]}))
         outcomes = t.send(good, *bad, last)
         assert [o.status for o in outcomes] == [ACCEPTED] + [REJECTED] * 5 + [ACCEPTED]
-        assert [o.reason for o in outcomes[1:-1]] == ["CHECKSUM", "CODEC", "CODEC", "INVALID_INPUT", "QUOTA"]
+        assert [o.reason for o in outcomes[1:-1]] == ["CHECKSUM", "CODEC", "CODEC", "NOT_PERMITTED", "QUOTA"]
         assert all(o.message and "\n" not in o.message for o in outcomes[1:-1])
         [ant] = t.client.status().agents
         assert (ant.subsets_accepted, ant.subsets_rejected, ant.gaussians, ant.voxels) == (2, 5, 3, 2)
+        assert (ant.kappa_sum, ant.last_map_revision) == (3, 7)
+        assert ant.last_seen_ns > 0
 
 
 def test_a_quota_counts_what_is_held_and_not_what_was_sent() -> None:

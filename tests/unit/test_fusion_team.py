@@ -48,7 +48,7 @@ def test_status_says_who_holds_what() -> None:
     assert (status.keyframes, status.refined) == (0, False)
     first, second = status.agents
     assert (first.agent_id, first.joined, first.voxels, first.gaussians) == ("ant", True, 2, 3)
-    assert (first.kappa_sum, first.won_voxels, first.lost_voxels, first.last_map_revision) == (7, 1, 1, 3)
+    assert (first.kappa_sum, first.won_voxels, first.last_map_revision) == (7, 1, 3)
     assert (first.tally.roi_bytes, first.tally.handover_bytes, first.tally.subsets_stale) == (100, 7, 1)
     assert first.tally.last_seen_ns > 0
     assert (second.agent_id, second.joined, second.won_voxels, second.kappa_sum) == ("bee", False, 2, 9)

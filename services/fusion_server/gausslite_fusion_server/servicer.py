@@ -263,4 +263,7 @@ def _contribution_to_message(agent: AgentContribution) -> pb.AgentContribution:
         subsets_stale=agent.tally.subsets_stale,
         subsets_rejected=agent.tally.subsets_rejected,
         keyframes=agent.keyframes,
+        kappa_sum=agent.kappa_sum,
+        last_map_revision=agent.last_map_revision,
+        last_seen_ns=agent.tally.last_seen_ns,
     )

@@ -12,7 +12,7 @@ from gausslite.fusion.vote import Election
 
 @dataclass(frozen=True, slots=True)
 class Tally:
-    """What one agent sent in this life of the server. last_seen_ns is 0 when it has not been heard of."""
+    """What one agent sent in this life of the server. last_seen_ns: when its latest subset came, 0 when none did."""
 
     last_seen_ns: int = 0
     roi_bytes: int = 0
@@ -43,7 +43,6 @@ class AgentContribution:
     gaussians: int
     kappa_sum: int
     won_voxels: int
-    lost_voxels: int
     last_map_revision: int
     keyframes: int
     tally: Tally
@@ -63,20 +62,17 @@ class TeamStatus:
 
 
 def contribution(agent_id: str, stakes: StakeTable, election: Election) -> AgentContribution:
-    """The part of this agent in the words and in the vote; voxels without Gaussians count as neither won nor lost."""
-    none = AgentContribution(agent_id, False, 0, 0, 0, 0, 0, 0, 0, Tally())
+    """The part of this agent in the words and in the vote; voxels without Gaussians do not count."""
+    none = AgentContribution(agent_id, False, 0, 0, 0, 0, 0, 0, Tally())
     if agent_id not in stakes.agents:
         return none
     index = stakes.agents.index(agent_id)
     mine = stakes.agent == index
-    voxels = int(np.count_nonzero(stakes.counts[mine]))
-    won = int(np.count_nonzero(election.winner == index))
     return replace(
         none,
-        voxels=voxels,
+        voxels=int(np.count_nonzero(stakes.counts[mine])),
         gaussians=int(stakes.counts[mine].sum(dtype=np.int64)),
         kappa_sum=int(stakes.kappa_sums[mine].sum(dtype=np.uint64)),
-        won_voxels=won,
-        lost_voxels=voxels - won,
+        won_voxels=int(np.count_nonzero(election.winner == index)),
         last_map_revision=int(stakes.map_revisions[mine].max(initial=0)),
     )

@@ -16,7 +16,7 @@ from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.subset import RoiSubset, VoxelWords
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.domain.words import take_voxels, words_of
-from gausslite.errors import InvalidInputError, MismatchError, QuotaError, SessionUnknownError
+from gausslite.errors import InvalidInputError, MismatchError, NotPermittedError, QuotaError, SessionUnknownError
 from gausslite.fusion.keyframes import KeyframePool, TeamKeyframe
 from gausslite.fusion.refined import RefinedMap
 from gausslite.fusion.revisions import RevisionLedger
@@ -132,13 +132,13 @@ class TeamMap:
     def contribute(self, session_id: str, subset: RoiSubset, grid: VoxelGrid) -> PutOutcome:
         """Take in an agent's words; durable when this returns, if the store is.
 
-        Raises SessionUnknownError, MismatchError (another grid), InvalidInputError (another agent's name), QuotaError,
-        StorageError; nothing of the message is kept then.
+        Raises SessionUnknownError, MismatchError (another grid), NotPermittedError (another agent's name),
+        InvalidInputError, QuotaError, StorageError; nothing of the message is kept then.
         """
         with self._lock:
             agent_id = self.session(session_id).agent_id
             if subset.agent_id != agent_id:
-                raise InvalidInputError(f"subset agent_id: expected {shown(agent_id)}, got {shown(subset.agent_id)}")
+                raise NotPermittedError(f"subset agent_id: expected {shown(agent_id)}, got {shown(subset.agent_id)}")
             if grid != self.grid:
                 raise MismatchError(f"voxel size: this mission votes on {self.grid.size_m:g} m, got {grid.size_m:g} m")
             held = self._require_room(subset)

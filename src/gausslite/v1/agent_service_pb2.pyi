@@ -219,7 +219,9 @@ class GetAgentStatusResponse(_message.Message):
     frames_dropped: _builtins.int
     frames_rejected: _builtins.int
     hz: _builtins.float
+    """Mapped frames per second of perception and mapping."""
     roi_share: _builtins.float
+    """Mean fraction of the pixels in the task's region."""
     @_builtins.property
     def graph(self) -> _task_pb2.TaskGraph: ...
     @_builtins.property
@@ -263,9 +265,12 @@ class UplinkStatus(_message.Message):
     stopped_because: _builtins.str
     """Why the uplink stopped for good; empty while it runs."""
     bytes_sent: _builtins.int
+    """All subset messages: the task's region and the handover, resends included."""
     gaussians_sent: _builtins.int
     voxels_sent: _builtins.int
+    """Voxels of the task's region that the server has; each counts once."""
     voxels_waiting: _builtins.int
+    """Voxels with a word that the server does not have yet."""
     subsets_rejected: _builtins.int
     def __init__(
         self,

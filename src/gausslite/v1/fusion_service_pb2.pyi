@@ -235,7 +235,7 @@ class SubsetOutcome(_message.Message):
     sequence: _builtins.int
     status: Global___SubsetStatus.ValueType
     reason: _builtins.str
-    """For REJECTED: the ErrorInfo reason (for instance CODEC, CHECKSUM, INVALID_INPUT, QUOTA) and one line of text."""
+    """For REJECTED: the ErrorInfo reason (for instance CODEC, CHECKSUM, NOT_PERMITTED, QUOTA) and one line of text."""
     message: _builtins.str
     accepted_voxels: _builtins.int
     stale_voxels: _builtins.int
@@ -557,6 +557,8 @@ Global___GetSessionStatusResponse: _TypeAlias = GetSessionStatusResponse  # noqa
 
 @_typing.final
 class AgentContribution(_message.Message):
+    """What the server holds of one agent, and what it took in from it since the server started."""
+
     DESCRIPTOR: _descriptor.Descriptor
 
     AGENT_ID_FIELD_NUMBER: _builtins.int
@@ -570,17 +572,29 @@ class AgentContribution(_message.Message):
     SUBSETS_STALE_FIELD_NUMBER: _builtins.int
     SUBSETS_REJECTED_FIELD_NUMBER: _builtins.int
     KEYFRAMES_FIELD_NUMBER: _builtins.int
+    KAPPA_SUM_FIELD_NUMBER: _builtins.int
+    LAST_MAP_REVISION_FIELD_NUMBER: _builtins.int
+    LAST_SEEN_NS_FIELD_NUMBER: _builtins.int
     agent_id: _builtins.str
     joined: _builtins.bool
+    """True while the agent has a session."""
     gaussians: _builtins.int
     voxels: _builtins.int
+    """Voxels on which it has Gaussians, and those of them that show in the fused map."""
     won_voxels: _builtins.int
     roi_bytes: _builtins.int
+    """Bytes of subset messages, resends included."""
     handover_bytes: _builtins.int
     subsets_accepted: _builtins.int
     subsets_stale: _builtins.int
     subsets_rejected: _builtins.int
     keyframes: _builtins.int
+    kappa_sum: _builtins.int
+    """Training on all its voxels: the sum that the vote compares voxel by voxel."""
+    last_map_revision: _builtins.int
+    """The newest map_revision among its words; 0 when it has none."""
+    last_seen_ns: _builtins.int
+    """When its latest subset came, by the server's clock; 0 when none came since the server started."""
     def __init__(
         self,
         *,
@@ -595,10 +609,13 @@ class AgentContribution(_message.Message):
         subsets_stale: _builtins.int = ...,
         subsets_rejected: _builtins.int = ...,
         keyframes: _builtins.int = ...,
+        kappa_sum: _builtins.int = ...,
+        last_map_revision: _builtins.int = ...,
+        last_seen_ns: _builtins.int = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["agent_id", b"agent_id", "gaussians", b"gaussians", "handover_bytes", b"handover_bytes", "joined", b"joined", "keyframes", b"keyframes", "roi_bytes", b"roi_bytes", "subsets_accepted", b"subsets_accepted", "subsets_rejected", b"subsets_rejected", "subsets_stale", b"subsets_stale", "voxels", b"voxels", "won_voxels", b"won_voxels"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["agent_id", b"agent_id", "gaussians", b"gaussians", "handover_bytes", b"handover_bytes", "joined", b"joined", "kappa_sum", b"kappa_sum", "keyframes", b"keyframes", "last_map_revision", b"last_map_revision", "last_seen_ns", b"last_seen_ns", "roi_bytes", b"roi_bytes", "subsets_accepted", b"subsets_accepted", "subsets_rejected", b"subsets_rejected", "subsets_stale", b"subsets_stale", "voxels", b"voxels", "won_voxels", b"won_voxels"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

@@ -88,15 +88,16 @@ class FusionServiceServicer(object):
         raise NotImplementedError('Method not implemented!')
 
     def ContributeSubsets(self, request_iterator, context):
-        """Words in, cumulative acknowledgements out. An acknowledged word is durable. One bad subset is REJECTED and the
-        stream goes on. NOT_FOUND SESSION_UNKNOWN when the session is not known: join and send everything again.
+        """Words in, cumulative acknowledgements out. An acknowledged word is as durable as the server's store. One bad subset
+        is REJECTED and the stream goes on. It ends with NOT_FOUND SESSION_UNKNOWN when the session is not known (join and
+        send everything again), FAILED_PRECONDITION for another grid, RESOURCE_EXHAUSTED when the disk is full.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def ContributeKeyframes(self, request_iterator, context):
-        """Views for the joint refinement.
+        """Views for the joint refinement; of each agent the newest are kept. An unusable one is reported, the rest is kept.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
@@ -110,14 +111,15 @@ class FusionServiceServicer(object):
         raise NotImplementedError('Method not implemented!')
 
     def RefineFusedMap(self, request, context):
-        """Optimise the fused map on the union of the agents' keyframes; closing the stream cancels it.
+        """Optimise the fused map on the union of the agents' keyframes; closing the stream cancels it and keeps nothing.
+        FAILED_PRECONDITION before there are a map and keyframes; RESOURCE_EXHAUSTED while another refinement runs.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def ExportFusedMap(self, request, context):
-        """A map as the bytes of a standard 3DGS PLY file.
+        """A map as the bytes of a standard 3DGS PLY file. FAILED_PRECONDITION for a refined map before there is one.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')

@@ -39,17 +39,20 @@ class FusionServiceStub:
     FAILED_PRECONDITION when the grid, the world frame or the mission differ from the server's.
     """
     ContributeSubsets: _grpc.StreamStreamMultiCallable[_fusion_service_pb2.ContributeSubsetsRequest, _fusion_service_pb2.ContributeSubsetsResponse]
-    """Words in, cumulative acknowledgements out. An acknowledged word is durable. One bad subset is REJECTED and the
-    stream goes on. NOT_FOUND SESSION_UNKNOWN when the session is not known: join and send everything again.
+    """Words in, cumulative acknowledgements out. An acknowledged word is as durable as the server's store. One bad subset
+    is REJECTED and the stream goes on. It ends with NOT_FOUND SESSION_UNKNOWN when the session is not known (join and
+    send everything again), FAILED_PRECONDITION for another grid, RESOURCE_EXHAUSTED when the disk is full.
     """
     ContributeKeyframes: _grpc.StreamUnaryMultiCallable[_fusion_service_pb2.ContributeKeyframesRequest, _fusion_service_pb2.ContributeKeyframesResponse]
-    """Views for the joint refinement."""
+    """Views for the joint refinement; of each agent the newest are kept. An unusable one is reported, the rest is kept."""
     WatchFusedMap: _grpc.UnaryStreamMultiCallable[_fusion_service_pb2.WatchFusedMapRequest, _fusion_service_pb2.WatchFusedMapResponse]
     """The fused map as it changes. OUT_OF_RANGE when since_revision is no longer kept: watch from 0."""
     RefineFusedMap: _grpc.UnaryStreamMultiCallable[_fusion_service_pb2.RefineFusedMapRequest, _fusion_service_pb2.RefineFusedMapResponse]
-    """Optimise the fused map on the union of the agents' keyframes; closing the stream cancels it."""
+    """Optimise the fused map on the union of the agents' keyframes; closing the stream cancels it and keeps nothing.
+    FAILED_PRECONDITION before there are a map and keyframes; RESOURCE_EXHAUSTED while another refinement runs.
+    """
     ExportFusedMap: _grpc.UnaryStreamMultiCallable[_fusion_service_pb2.ExportFusedMapRequest, _fusion_service_pb2.ExportFusedMapResponse]
-    """A map as the bytes of a standard 3DGS PLY file."""
+    """A map as the bytes of a standard 3DGS PLY file. FAILED_PRECONDITION for a refined map before there is one."""
     GetSessionStatus: _grpc.UnaryUnaryMultiCallable[_fusion_service_pb2.GetSessionStatusRequest, _fusion_service_pb2.GetSessionStatusResponse]
     LeaveSession: _grpc.UnaryUnaryMultiCallable[_fusion_service_pb2.LeaveSessionRequest, _fusion_service_pb2.LeaveSessionResponse]
 
@@ -61,17 +64,20 @@ class FusionServiceAsyncStub(FusionServiceStub):
     FAILED_PRECONDITION when the grid, the world frame or the mission differ from the server's.
     """
     ContributeSubsets: _aio.StreamStreamMultiCallable[_fusion_service_pb2.ContributeSubsetsRequest, _fusion_service_pb2.ContributeSubsetsResponse]  # type: ignore[assignment]
-    """Words in, cumulative acknowledgements out. An acknowledged word is durable. One bad subset is REJECTED and the
-    stream goes on. NOT_FOUND SESSION_UNKNOWN when the session is not known: join and send everything again.
+    """Words in, cumulative acknowledgements out. An acknowledged word is as durable as the server's store. One bad subset
+    is REJECTED and the stream goes on. It ends with NOT_FOUND SESSION_UNKNOWN when the session is not known (join and
+    send everything again), FAILED_PRECONDITION for another grid, RESOURCE_EXHAUSTED when the disk is full.
     """
     ContributeKeyframes: _aio.StreamUnaryMultiCallable[_fusion_service_pb2.ContributeKeyframesRequest, _fusion_service_pb2.ContributeKeyframesResponse]  # type: ignore[assignment]
-    """Views for the joint refinement."""
+    """Views for the joint refinement; of each agent the newest are kept. An unusable one is reported, the rest is kept."""
     WatchFusedMap: _aio.UnaryStreamMultiCallable[_fusion_service_pb2.WatchFusedMapRequest, _fusion_service_pb2.WatchFusedMapResponse]  # type: ignore[assignment]
     """The fused map as it changes. OUT_OF_RANGE when since_revision is no longer kept: watch from 0."""
     RefineFusedMap: _aio.UnaryStreamMultiCallable[_fusion_service_pb2.RefineFusedMapRequest, _fusion_service_pb2.RefineFusedMapResponse]  # type: ignore[assignment]
-    """Optimise the fused map on the union of the agents' keyframes; closing the stream cancels it."""
+    """Optimise the fused map on the union of the agents' keyframes; closing the stream cancels it and keeps nothing.
+    FAILED_PRECONDITION before there are a map and keyframes; RESOURCE_EXHAUSTED while another refinement runs.
+    """
     ExportFusedMap: _aio.UnaryStreamMultiCallable[_fusion_service_pb2.ExportFusedMapRequest, _fusion_service_pb2.ExportFusedMapResponse]  # type: ignore[assignment]
-    """A map as the bytes of a standard 3DGS PLY file."""
+    """A map as the bytes of a standard 3DGS PLY file. FAILED_PRECONDITION for a refined map before there is one."""
     GetSessionStatus: _aio.UnaryUnaryMultiCallable[_fusion_service_pb2.GetSessionStatusRequest, _fusion_service_pb2.GetSessionStatusResponse]  # type: ignore[assignment]
     LeaveSession: _aio.UnaryUnaryMultiCallable[_fusion_service_pb2.LeaveSessionRequest, _fusion_service_pb2.LeaveSessionResponse]  # type: ignore[assignment]
 
@@ -92,8 +98,9 @@ class FusionServiceServicer(metaclass=_abc_1.ABCMeta):
         request_iterator: _MaybeAsyncIterator[_fusion_service_pb2.ContributeSubsetsRequest],
         context: _ServicerContext,
     ) -> _typing.Union[_abc.Iterator[_fusion_service_pb2.ContributeSubsetsResponse], _abc.AsyncIterator[_fusion_service_pb2.ContributeSubsetsResponse]]:
-        """Words in, cumulative acknowledgements out. An acknowledged word is durable. One bad subset is REJECTED and the
-        stream goes on. NOT_FOUND SESSION_UNKNOWN when the session is not known: join and send everything again.
+        """Words in, cumulative acknowledgements out. An acknowledged word is as durable as the server's store. One bad subset
+        is REJECTED and the stream goes on. It ends with NOT_FOUND SESSION_UNKNOWN when the session is not known (join and
+        send everything again), FAILED_PRECONDITION for another grid, RESOURCE_EXHAUSTED when the disk is full.
         """
 
     @_abc_1.abstractmethod
@@ -102,7 +109,7 @@ class FusionServiceServicer(metaclass=_abc_1.ABCMeta):
         request_iterator: _MaybeAsyncIterator[_fusion_service_pb2.ContributeKeyframesRequest],
         context: _ServicerContext,
     ) -> _typing.Union[_fusion_service_pb2.ContributeKeyframesResponse, _abc.Awaitable[_fusion_service_pb2.ContributeKeyframesResponse]]:
-        """Views for the joint refinement."""
+        """Views for the joint refinement; of each agent the newest are kept. An unusable one is reported, the rest is kept."""
 
     @_abc_1.abstractmethod
     def WatchFusedMap(
@@ -118,7 +125,9 @@ class FusionServiceServicer(metaclass=_abc_1.ABCMeta):
         request: _fusion_service_pb2.RefineFusedMapRequest,
         context: _ServicerContext,
     ) -> _typing.Union[_abc.Iterator[_fusion_service_pb2.RefineFusedMapResponse], _abc.AsyncIterator[_fusion_service_pb2.RefineFusedMapResponse]]:
-        """Optimise the fused map on the union of the agents' keyframes; closing the stream cancels it."""
+        """Optimise the fused map on the union of the agents' keyframes; closing the stream cancels it and keeps nothing.
+        FAILED_PRECONDITION before there are a map and keyframes; RESOURCE_EXHAUSTED while another refinement runs.
+        """
 
     @_abc_1.abstractmethod
     def ExportFusedMap(
@@ -126,7 +135,7 @@ class FusionServiceServicer(metaclass=_abc_1.ABCMeta):
         request: _fusion_service_pb2.ExportFusedMapRequest,
         context: _ServicerContext,
     ) -> _typing.Union[_abc.Iterator[_fusion_service_pb2.ExportFusedMapResponse], _abc.AsyncIterator[_fusion_service_pb2.ExportFusedMapResponse]]:
-        """A map as the bytes of a standard 3DGS PLY file."""
+        """A map as the bytes of a standard 3DGS PLY file. FAILED_PRECONDITION for a refined map before there is one."""
 
     @_abc_1.abstractmethod
     def GetSessionStatus(
