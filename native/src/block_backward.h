@@ -132,24 +132,36 @@ GAUSSLITE_INLINE void walk_back(const Splat* records, const uint8_t* list, int n
   gradient.behind = behind;
 }
 
-// Shifts a chunk's moments from the tile's centre to the splats' means and adds them to the gradient rows of this tile
-// row. The shift by (x, y) is two fused steps: first sums of v x' - x v and the like from their neighbours, then the
-// second ones from those.
+// Shifts moments by (x, y): about a point at that offset from the one they are about. Two fused steps: first every sum
+// less its lower neighbour times x or y, then the second-order ones once more from the results. `xy` repeats x, y;
+// lanes 6 and 7 of the moments are zero and serve the lanes that a step leaves alone.
+GAUSSLITE_INLINE Pack8 shift_moments(Pack8 m, Pack8 xy) {
+  m = fnma(permute<0, 0, 1, 0, 1, 1, 0, 0>(xy), permute<6, 0, 0, 1, 1, 2, 6, 6>(m), m);
+  return fnma(permute<0, 0, 0, 0, 0, 1, 0, 0>(xy), permute<6, 6, 6, 1, 2, 2, 6, 6>(m), m);
+}
+
+GAUSSLITE_INLINE float* gradient_row(Workspace& ws, const Splat& splat, const TilePosition& tile) {
+  return ws.gradient_rows.data() + size_t(kRowWidth) * uint32_t(splat.gradient_row + uint32_t(tile.y));
+}
+
+GAUSSLITE_INLINE void prefetch_rows(Workspace& ws, const Splat* records, int n, const TilePosition& tile) {
+  for (int i = 0; i < n; ++i) __builtin_prefetch(gradient_row(ws, records[i], tile), 0, 2);
+}
+
+// Moves a chunk's moments from the tile's centre to the splats' means and adds them to the gradient rows of this tile
+// row.
 GAUSSLITE_INLINE void add_to_rows(Workspace& ws, const Splat* records, int n, const TilePosition& tile,
                                   const ChunkSums& sums) {
   const float centre_x = float(tile.x * kTile + kTile / 2), centre_y = float(tile.y * kTile + kTile / 2);
+  alignas(32) const float centres[8] = {centre_x, centre_y, centre_x, centre_y, centre_x, centre_y, centre_x, centre_y};
+  const Pack8 centre = load8(centres);
   for (int i = 0; i < n; ++i) {
-    const float x = records[i].mean_x - centre_x, y = records[i].mean_y - centre_y;
-    alignas(32) const float first[8] = {0.0f, x, y, x, y, y, 0.0f, 0.0f};
-    alignas(32) const float second[8] = {0.0f, 0.0f, 0.0f, x, x, y, 0.0f, 0.0f};
-    Pack8 m = load8(sums.moments[i]);
-    m = fnma(load8(first), permute<0, 0, 0, 1, 1, 2, 0, 0>(m), m);
-    m = fnma(load8(second), permute<0, 0, 0, 1, 2, 2, 0, 0>(m), m);
-    float* row = ws.gradient_rows.data() + size_t(kRowWidth) * uint32_t(records[i].gradient_row + uint32_t(tile.y));
+    const Pack8 moments = shift_moments(load8(sums.moments[i]), broadcast_pair(&records[i].mean_x) - centre);
+    float* row = gradient_row(ws, records[i], tile);
     uint32_t tag;
     std::memcpy(&tag, row + kRowTag, sizeof tag);
     const bool fresh = tag == ws.tag;
-    store8(row, m + keep_if(fresh, load8(row)));
+    store8(row, moments + keep_if(fresh, load8(row)));
     store8(row + 8, sum_of_quads(sums.colours[i]) + keep_if(fresh, load8(row + 8)));
     std::memcpy(row + kRowTag, &ws.tag, sizeof ws.tag);
   }

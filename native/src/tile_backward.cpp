@@ -32,9 +32,7 @@ void backward_tile(Workspace& ws, const TileList& list, const TilePosition& tile
   for (uint32_t first = 0; first < list.count && total_left > 0; first += kChunk) {
     const int n = int(std::min<uint32_t>(kChunk, list.count - first));
     load_chunk(ws, list, first, n, records, lists);
-    for (int i = 0; i < n; ++i) {
-      prefetch(ws.gradient_rows.data() + size_t(kRowWidth) * uint32_t(records[i].gradient_row + uint32_t(tile.y)));
-    }
+    prefetch_rows(ws, records, n, tile);
     sums.clear(n);
     for (int b = 0; b < kBlocks; ++b) {
       const uint32_t entries = std::min<uint32_t>(lists.count[b], left[b]);

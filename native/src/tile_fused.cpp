@@ -30,6 +30,8 @@ class FusedTile {
       Splat* records = &mine_.records[first];
       BlockLists& lists = mine_.lists[size_t(chunks_)];
       load_chunk(ws_, list_, first, chunk_size(chunks_), records, lists);
+      // Early: by the time the way back adds to them, the rows have come from memory to the second-level cache.
+      prefetch_rows(ws_, records, chunk_size(chunks_), tile_);
       size_t entries = 0;
       for (int b = 0; b < kBlocks; ++b) entries += lists.count[b];
       mine_.alphas.reserve((kept + entries) * 16, kept * 16);
@@ -70,9 +72,6 @@ class FusedTile {
       const Splat* records = &mine_.records[size_t(c) * kChunk];
       const BlockLists& lists = mine_.lists[size_t(c)];
       const int n = chunk_size(c);
-      for (int i = 0; i < n; ++i) {
-        prefetch(ws_.gradient_rows.data() + size_t(kRowWidth) * uint32_t(records[i].gradient_row + uint32_t(tile_.y)));
-      }
       sums_.clear(n);
       for (int b = 0; b < kBlocks; ++b) {
         if (lists.count[b] > 0)

@@ -3,6 +3,7 @@
 // gradients, or fed to Adam on the spot, while the three rows of a splat (parameters and two moments) are in cache.
 #include <algorithm>
 #include <cstring>
+#include <limits>
 
 #include "projection_backward.h"
 #include "stage_functions.h"
@@ -79,8 +80,10 @@ class Adam {
     const Pack16 v_new = fma(load(v), keep2_, gradient * gradient * add2_);
     store(m, m_new);
     store(v, v_new);
-    const Pack16 size = sqrt(v_new * correction[1]) + epsilon_;
-    store(row, fnma(rate_ * correction[0], m_new / size, load(row)) + count_);
+    // Fourteen bits are ample for the size of a step. The smallest float keeps 0 / 0 out of untouched columns.
+    const Pack16 square = max(v_new * correction[1], Pack16(std::numeric_limits<float>::min()));
+    const Pack16 size = fma(square, rough_inverse_sqrt(square), epsilon_);
+    store(row, fnma(rate_ * correction[0], m_new * rough_reciprocal(size), load(row)) + count_);
   }
 
  private:

@@ -18,6 +18,9 @@ struct Pack8 {
 GAUSSLITE_INLINE Pack8 load8(const float* p) { return _mm256_loadu_ps(p); }
 GAUSSLITE_INLINE void store8(float* p, Pack8 a) { _mm256_storeu_ps(p, a.v); }
 GAUSSLITE_INLINE Pack8 broadcast8(const float* p) { return _mm256_broadcast_ss(p); }
+GAUSSLITE_INLINE Pack8 broadcast_pair(const float* p) {
+  return _mm256_castpd_ps(_mm256_broadcast_sd(reinterpret_cast<const double*>(p)));
+}
 GAUSSLITE_INLINE Pack8 operator+(Pack8 a, Pack8 b) { return _mm256_add_ps(a.v, b.v); }
 GAUSSLITE_INLINE Pack8 operator-(Pack8 a, Pack8 b) { return _mm256_sub_ps(a.v, b.v); }
 GAUSSLITE_INLINE Pack8 operator*(Pack8 a, Pack8 b) { return _mm256_mul_ps(a.v, b.v); }

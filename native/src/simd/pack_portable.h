@@ -114,6 +114,8 @@ GAUSSLITE_INLINE Pack16 floor(Pack16 a) {
 GAUSSLITE_INLINE Pack16 ceil(Pack16 a) { return -floor(-a); }
 // 1 / a to a relative error below 6.2e-5 (14 bits): enough where errors average out over many terms.
 GAUSSLITE_INLINE Pack16 rough_reciprocal(Pack16 a) { return Pack16(1.0f) / a; }
+// 1 / sqrt(a) of positive a, as rough.
+GAUSSLITE_INLINE Pack16 rough_inverse_sqrt(Pack16 a) { return Pack16(1.0f) / sqrt(a); }
 
 // Comparisons are false for NaN.
 #define GAUSSLITE_COMPARISON(name, op)               \
@@ -216,6 +218,11 @@ GAUSSLITE_INLINE void store8(float* p, Pack8 a) {
   store_quad(p + 4, a.hi);
 }
 GAUSSLITE_INLINE Pack8 broadcast8(const float* p) { return Pack8(*p); }
+// p[0], p[1], p[0], p[1], ...
+GAUSSLITE_INLINE Pack8 broadcast_pair(const float* p) {
+  const Quad pairs{p[0], p[1], p[0], p[1]};
+  return {pairs, pairs};
+}
 GAUSSLITE_INLINE Pack8 operator+(Pack8 a, Pack8 b) { return {a.lo + b.lo, a.hi + b.hi}; }
 GAUSSLITE_INLINE Pack8 operator-(Pack8 a, Pack8 b) { return {a.lo - b.lo, a.hi - b.hi}; }
 GAUSSLITE_INLINE Pack8 operator*(Pack8 a, Pack8 b) { return {a.lo * b.lo, a.hi * b.hi}; }
