@@ -29,7 +29,7 @@ from gausslite.errors import (
     UnavailableError,
 )
 from gausslite.fusion.memory import MemoryStore
-from gausslite.mission import MissionSettings
+from gausslite.mission.settings import MissionSettings
 from gausslite.perception.attention import Attention
 from gausslite.perception.fixed import RegionAttention
 from gausslite.task.rules import RuleParser

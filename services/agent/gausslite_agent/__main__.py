@@ -9,7 +9,9 @@ from contextlib import ExitStack
 
 from gausslite.datasets.open import open_source
 from gausslite.datasets.source import Source
-from gausslite.mission import SceneKnowledge, build_attention
+from gausslite.mission.build import build_attention
+from gausslite.mission.results import prepare_folder
+from gausslite.mission.settings import SceneKnowledge
 from gausslite.task.parser import TaskParser
 from gausslite.task.rules import RuleParser
 from gausslite.v1 import agent_service_pb2 as pb
@@ -20,7 +22,6 @@ from gausslite.wire.server import serve_until_stopped
 from gausslite.wire.spool import Spool
 from gausslite.wire.uplink import Uplink
 from gausslite_agent.player import Player
-from gausslite_agent.results import prepare_folder
 from gausslite_agent.robot import Robot
 from gausslite_agent.servicer import AgentServicer
 from gausslite_agent.settings import AgentSettings, LinkSettings, parse_arguments

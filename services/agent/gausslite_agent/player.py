@@ -8,20 +8,20 @@ import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future
 
-from gausslite.datasets.selection import select_frames
+from gausslite.datasets.selection import frame_size, select_frames
 from gausslite.datasets.source import Source
 from gausslite.domain.frame import Frame
 from gausslite.domain.words import words_of
 from gausslite.errors import GaussLiteError
 from gausslite.evaluation.held_out import HoldOut
-from gausslite.mission import frame_size
+from gausslite.mission.results import write_results
 from gausslite.task.parser import TaskParser
 from gausslite.v1 import agent_service_pb2 as pb
 from gausslite.wire.clients import FusionClient
 from gausslite.wire.spool import Purpose
 from gausslite.wire.uplink import Uplink
 from gausslite.wire.uplink_values import UplinkCounters
-from gausslite_agent.results import mission_report, write_results
+from gausslite_agent.report import mission_report
 from gausslite_agent.robot import FrameReport, Robot
 from gausslite_agent.settings import AgentSettings, PlaySettings
 

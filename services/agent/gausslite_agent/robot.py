@@ -21,7 +21,8 @@ from gausslite.domain.voxels import VoxelGrid
 from gausslite.errors import MismatchError, UnavailableError
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.roi import RoiLedger
-from gausslite.mission import MissionSettings, build_mapper
+from gausslite.mission.build import build_mapper
+from gausslite.mission.settings import MissionSettings
 from gausslite.perception.attention import Attention
 from gausslite.pipeline import TaskMapper
 from gausslite.wire.uplink import Uplink

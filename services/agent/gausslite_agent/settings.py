@@ -10,8 +10,16 @@ from pathlib import Path
 from gausslite.datasets.source import UpAxis
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.errors import InvalidInputError
-from gausslite.mapping.policies import POLICIES
-from gausslite.mission import DEFAULT_MAX_GAUSSIANS, MissionSettings, PerceptionSettings
+from gausslite.mission.options import (
+    add_budget,
+    add_detector,
+    add_frames,
+    add_policy,
+    add_voxel_size,
+    mission_settings,
+    perception_settings,
+)
+from gausslite.mission.settings import MissionSettings, PerceptionSettings
 from gausslite.wire.uplink_values import UplinkSettings
 
 
@@ -75,26 +83,17 @@ def parse_arguments(arguments: Sequence[str] | None = None) -> AgentSettings:
         options.handover,
         options.drain_timeout,
     )
-    mission = MissionSettings(
-        policy=options.policy,
-        max_gaussians=options.max_gaussians,
-        iterations=options.iterations,
-        rate_hz=options.rate,
-        seed=options.seed,
-        threads=options.threads,
-        backend=options.rasterizer,
-    )
     return AgentSettings(
         options.listen,
         options.agent_id,
         options.task,
-        PerceptionSettings(options.detector, options.resegment, options.threads),
+        perception_settings(options),
         options.up,
         options.out,
         options.exit_when_done,
         play,
         link,
-        mission,
+        mission_settings(options),
     )
 
 
@@ -108,22 +107,21 @@ def _parser() -> argparse.ArgumentParser:
     add("--listen", default="127.0.0.1:50053", metavar="ADDRESS", help="HOST:PORT or unix:PATH; default %(default)s")
     add("--agent-id", default="agent", metavar="NAME", help="this robot's name in the team; default %(default)s")
     add("--task", metavar="TEXT", help="what the robot is to do; otherwise it waits for AssignTask")
-    add("--detector", metavar="FILE.onnx", type=Path, help="a YOLO-seg model (default: the source's ground truth)")
-    add("--resegment", action="store_true", help="run the detector's masks on every frame (slower)")
-    add("--up", metavar="X,Y,Z", type=_up_axis, help="the world's upward direction, if not the source's")
     add("--out", metavar="DIR", type=Path, help="gets map.ply and report.json at the end of the mission")
     add("--exit-when-done", action="store_true", help="end after the mission instead of serving on")
-    _add_source(parser)
+    _add_camera(parser)
+    add_frames(parser)
+    add_detector(parser)
     _add_team(parser)
-    _add_mapping(parser)
+    add_voxel_size(parser)
+    add_policy(parser)
+    add_budget(parser)
     return parser
 
 
-def _add_source(parser: argparse.ArgumentParser) -> None:
+def _add_camera(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument_group("camera").add_argument
     add("--source", metavar="SPEC", help='a folder or "sim:home?seed=0&trajectory=0"')
-    add("--frames", metavar="START:STOP:STEP", default=":", help="frame numbers to use (default: all)")
-    add("--size", metavar="WxH", help="resize images to this size (default: as they are)")
     add("--hold-out", metavar="N", type=int, help="keep every N-th frame from mapping, for scoring")
 
 
@@ -133,30 +131,8 @@ def _add_team(parser: argparse.ArgumentParser) -> None:
     add("--fusion", metavar="ADDRESS", help="fusion server (default: none, nothing is sent)")
     add("--mission", metavar="ID", default="", help="the team's mission (default: the server's only one)")
     add("--world-frame", metavar="NAME", default="", help="name of the frame all poses are in (default: the server's)")
-    add("--voxel-size", metavar="M", type=float, default=VoxelGrid().size_m, help="metres; default %(default)s")
     add("--uplink-kbps", metavar="N", type=float, help="bandwidth to use, kilobits a second (default: no bound)")
     add("--uplink-interval", metavar="S", type=float, default=1.0, help="seconds between rounds; default %(default)s")
     add("--spool", metavar="FILE", type=Path, help="keep what is to be sent here, over restarts (default: in memory)")
     add("--handover", action="store_true", help="at the end also send the rest of the map and the keyframes")
     add("--drain-timeout", metavar="S", type=float, default=120.0, help="longest wait at the end; default %(default)s")
-
-
-def _add_mapping(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group("mapping")
-    add = group.add_argument
-    add("--policy", choices=sorted(POLICIES), default="task", help="how to spend the budget; default %(default)s")
-    add("--max-gaussians", metavar="N", type=int, default=DEFAULT_MAX_GAUSSIANS, help="hard cap; default %(default)s")
-    add("--seed", metavar="S", type=int, default=0, help="seed of every random choice; default %(default)s")
-    add("--threads", metavar="N", type=int, help="threads (default: all the processor allows)")
-    add("--rasterizer", metavar="NAME", default="auto", help="backend: auto, cpu, reference; default %(default)s")
-    budget = group.add_mutually_exclusive_group()
-    budget.add_argument("--iterations", metavar="N", type=int, help="iterations a frame (default: 8)")
-    budget.add_argument("--rate", metavar="HZ", type=float, help="frames a second: as many iterations as fit")
-
-
-def _up_axis(text: str) -> UpAxis:
-    try:
-        x, y, z = (float(part) for part in text.split(","))
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"expected X,Y,Z such as 0,-1,0, got {text!r}") from None
-    return x, y, z

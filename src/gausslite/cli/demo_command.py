@@ -9,20 +9,19 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import FrameType
 
-from gausslite.cli.arguments import add_mapping, names
-from gausslite.cli.output import prepare_folder, write_json
 from gausslite.cli.team import AgentPlan, Team, TeamPlan, agent_report, collect_maps, running_team, watch_missions
 from gausslite.codec.ply import read_ply
 from gausslite.datasets.open import open_source
-from gausslite.datasets.selection import select_frames
+from gausslite.datasets.regions import choose_regions
+from gausslite.datasets.selection import frame_size, select_frames
 from gausslite.domain.region import Region
-from gausslite.domain.voxels import VoxelGrid
 from gausslite.errors import InvalidInputError
 from gausslite.evaluation.compare import MapScores
 from gausslite.evaluation.held_out import HoldOut
 from gausslite.evaluation.pictures import write_png
 from gausslite.evaluation.team import TeamScores, Viewpoints, score_team
-from gausslite.mission import DEFAULT_MAX_GAUSSIANS, choose_regions, frame_size
+from gausslite.mission.options import add_budget, add_detector, add_voxel_size, names
+from gausslite.mission.results import prepare_folder, write_json
 from gausslite.perception.vocabulary import same_kind
 from gausslite.render.choose import choose_rasterizer
 
@@ -45,13 +44,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--objects", metavar="A,B", type=names, default=(), help="score these (default: the tasks' nouns)"
     )
-    parser.add_argument("--detector", metavar="FILE.onnx", type=Path, help="a YOLO-seg model (default: ground truth)")
     parser.add_argument("--size", metavar="WxH", help=f"image size (default: as it is; {_HOME_SIZE} in the home)")
-    parser.add_argument(
-        "--voxel-size", metavar="M", type=float, default=VoxelGrid().size_m, help="metres (default: 0.1)"
-    )
+    add_voxel_size(parser)
     parser.add_argument("--refine-iterations", metavar="N", type=int, default=500, help="0 leaves refinement out")
-    add_mapping(parser, DEFAULT_MAX_GAUSSIANS)
+    add_detector(parser)
+    add_budget(parser)
     parser.add_argument("--out", metavar="DIR", type=Path, required=True, help="gets report.json, maps and pictures")
     parser.set_defaults(run=run)
 
@@ -72,7 +69,7 @@ def run(options: argparse.Namespace) -> int:
         "size": list(stage.size),
         "seed": options.seed,
         "agents": agents,
-        "maps": {name: _figures(score) for name, score in scores.scores.items()},
+        "maps": {name: asdict(score) for name, score in scores.scores.items()},
         "scored": {"objects": sorted(regions), "views": next(iter(scores.scores.values())).n_views},
     }
     write_json(options.out / "report.json", report)
@@ -147,6 +144,8 @@ def _plan(options: argparse.Namespace, stage: _Stage) -> TeamPlan:
         shared += ["--hold-out", str(stage.hold_out)]
     if options.detector is not None:
         shared += ["--detector", str(options.detector.absolute())]
+    if options.resegment:
+        shared += ["--resegment"]
     if options.rate is not None:
         shared += ["--rate", str(options.rate)]
     if options.iterations is not None:
@@ -167,10 +166,6 @@ def _score(
 ) -> TeamScores:
     rasterizer = choose_rasterizer(threads=options.threads)
     return score_team({name: read_ply(path) for name, path in maps.items()}, stage.held_out, regions, rasterizer)
-
-
-def _figures(score: MapScores) -> dict[str, object]:
-    return asdict(score)
 
 
 def _write_pictures(folder: Path, scores: TeamScores) -> None:

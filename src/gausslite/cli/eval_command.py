@@ -7,16 +7,16 @@ from dataclasses import asdict
 from pathlib import Path
 
 from gausslite.cli.arguments import add_regions, add_source, named_regions
-from gausslite.cli.output import as_text, prepare_folder
 from gausslite.codec.ply import read_ply
 from gausslite.datasets.open import open_source
-from gausslite.datasets.selection import select_frames
+from gausslite.datasets.regions import choose_regions
+from gausslite.datasets.selection import frame_size, select_frames
 from gausslite.errors import DatasetError
 from gausslite.evaluation.compare import MapScores, average, score_view
 from gausslite.evaluation.held_out import HoldOut
 from gausslite.evaluation.pictures import comparison_sheet, write_png
 from gausslite.evaluation.views import HeldOutView, MapViewer
-from gausslite.mission import choose_regions, frame_size
+from gausslite.mission.results import as_text, prepare_folder
 from gausslite.render.choose import choose_rasterizer
 
 _PICTURES = 8

@@ -5,20 +5,19 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from gausslite.cli.output import as_text, prepare_folder
 from gausslite.codec.ply import read_ply, write_ply
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.errors import InvalidInputError
 from gausslite.fusion.offline import fuse_maps
+from gausslite.mission.options import add_voxel_size
+from gausslite.mission.results import as_text, prepare_folder
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the options of `gausslite fuse`."""
     parser.add_argument("maps", metavar="MAP", type=Path, nargs="+", help="two or more PLY files in one world frame")
     parser.add_argument("--out", metavar="FILE.ply", type=Path, required=True, help="the fused map")
-    parser.add_argument(
-        "--voxel-size", metavar="M", type=float, default=VoxelGrid().size_m, help="metres (default: 0.1)"
-    )
+    add_voxel_size(parser)
     parser.add_argument("--json", action="store_true", help="print JSON for scripts")
     parser.set_defaults(run=run)
 

@@ -3,33 +3,24 @@
 from __future__ import annotations
 
 import argparse
-import resource
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from gausslite.cli.arguments import add_mapping, add_regions, add_source, named_regions, names
-from gausslite.cli.output import prepare_folder, write_json
+from gausslite.cli.arguments import add_regions, add_source, named_regions
 from gausslite.cli.parse_command import as_json
 from gausslite.cli.progress import MappingBar
-from gausslite.codec.ply import write_ply
 from gausslite.datasets.open import open_source
-from gausslite.datasets.selection import select_frames
+from gausslite.datasets.regions import choose_regions
+from gausslite.datasets.selection import frame_size, select_frames
 from gausslite.datasets.source import Source
 from gausslite.domain.task import TaskGraph
 from gausslite.errors import InvalidInputError
-from gausslite.mapping.policies import POLICIES
-from gausslite.mission import (
-    DEFAULT_MAX_GAUSSIANS,
-    MissionSettings,
-    PerceptionSettings,
-    SceneKnowledge,
-    build_attention,
-    build_mapper,
-    choose_regions,
-    frame_size,
-)
+from gausslite.mission.build import build_attention, build_mapper
+from gausslite.mission.options import add_budget, add_detector, add_policy, mission_settings, perception_settings
+from gausslite.mission.results import peak_rss_mib, prepare_folder, write_results
+from gausslite.mission.settings import SceneKnowledge
 from gausslite.perception.attention import Attention, TaskAttention
 from gausslite.perception.fixed import NoAttention, RegionAttention
 from gausslite.pipeline import FrameOutcome, TaskMapper
@@ -41,28 +32,25 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--task", metavar="TEXT", help='what the robot is to do, such as "Pick up the mug on the table"'
     )
-    parser.add_argument("--detector", metavar="FILE.onnx", type=Path, help="a YOLO-seg model (default: ground truth)")
-    parser.add_argument("--resegment", action="store_true", help="run the detector's masks on every frame (slower)")
+    add_detector(parser)
     add_regions(parser)
-    parser.add_argument("--policy", choices=sorted(POLICIES), default="task", help="how to spend the budget")
-    parser.add_argument("--without", metavar="A,B", type=names, default=(), help="components off: sb mvo roi sis gfd")
-    add_mapping(parser, DEFAULT_MAX_GAUSSIANS)
+    add_policy(parser)
+    add_budget(parser)
     parser.add_argument("--out", metavar="DIR", type=Path, required=True, help="gets map.ply and report.json")
     parser.set_defaults(run=run)
 
 
 def run(options: argparse.Namespace) -> int:
     """Map the sequence and write the results."""
-    settings = _settings(options)
+    settings = mission_settings(options)
     source = open_source(options.source, options.up)
     positions = select_frames(source, options.frames)
     size = frame_size(options.size, source)
-    attention, graph = _attention(options, source, settings)
+    attention, graph = _attention(options, source)
     mapper = TaskMapper(attention, build_mapper(settings), seconds_per_frame=settings.seconds_per_frame)
     prepare_folder(options.out)
     mission = _play(source, positions, size, mapper)
     gaussians = mapper.gaussians()
-    write_ply(options.out / "map.ply", gaussians)
     active = int(gaussians.active.sum())
     report = {
         "source": options.source,
@@ -75,10 +63,10 @@ def run(options: argparse.Namespace) -> int:
         "gaussians": len(gaussians),
         "active_gaussians": active,
         "max_gaussians": settings.max_gaussians,
-        "peak_rss_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+        "peak_rss_mib": peak_rss_mib(),
         "notes": list(attention.notes) if isinstance(attention, TaskAttention) else [],
     }
-    write_json(options.out / "report.json", report)
+    write_results(options.out, gaussians, report)
     print(
         f"{report['frames']} frames at {report['hz']:.1f} Hz, {len(gaussians)} Gaussians "
         f"({active} of the task) → {options.out / 'map.ply'}"
@@ -117,9 +105,7 @@ def _play(source: Source, positions: Sequence[int], size: tuple[int, int], mappe
     return _Mission(tuple(outcomes), time.perf_counter() - started_s)
 
 
-def _attention(
-    options: argparse.Namespace, source: Source, settings: MissionSettings
-) -> tuple[Attention, TaskGraph | None]:
+def _attention(options: argparse.Namespace, source: Source) -> tuple[Attention, TaskGraph | None]:
     """A task in words, or regions of space, or (for a uniform map) nothing to attend to."""
     regions = named_regions(options)
     if options.task is not None and regions:
@@ -130,22 +116,9 @@ def _attention(
         from gausslite.task.rules import RuleParser
 
         graph = RuleParser().parse(options.task)
-        perception = PerceptionSettings(options.detector, options.resegment, settings.threads)
-        return build_attention(graph, SceneKnowledge.of(source), perception), graph
+        return build_attention(graph, SceneKnowledge.of(source), perception_settings(options)), graph
     if not regions and options.policy != "uniform":
         raise InvalidInputError(
             "--task: expected a task in words, or regions with --roi FILE.npz or --roi-ball X,Y,Z,R"
         )
     return RegionAttention(choose_regions(regions, options.objects)) if regions else NoAttention(), None
-
-
-def _settings(options: argparse.Namespace) -> MissionSettings:
-    return MissionSettings(
-        policy=options.policy,
-        without=frozenset(options.without),
-        max_gaussians=options.max_gaussians,
-        iterations=options.iterations,
-        rate_hz=options.rate,
-        seed=options.seed,
-        threads=options.threads,
-    )

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from gausslite.domain.region import BallRegion, Region, VoxelRegion
-from gausslite.errors import DatasetError
+from gausslite.errors import DatasetError, InvalidInputError
 
 _SIZE_KEY = "voxel_size_m"
 _MAX_SIDE_VOXELS = 512
@@ -61,3 +61,12 @@ def balls_for_small_objects(regions: Mapping[str, VoxelRegion]) -> dict[str, Reg
         else:
             chosen[name] = region
     return chosen
+
+
+def choose_regions(regions: Mapping[str, Region], names: Sequence[str]) -> list[Region]:
+    """The regions with these names; all of them when no name is given. Raises InvalidInputError."""
+    unknown = [name for name in names if name not in regions]
+    if unknown or not regions:
+        known = ", ".join(sorted(regions)) or "none"
+        raise InvalidInputError(f"objects: expected names among {known}; got {', '.join(unknown) or 'none'}")
+    return [regions[name] for name in names] if names else list(regions.values())

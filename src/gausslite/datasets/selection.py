@@ -1,4 +1,4 @@
-"""Choose frames of a sequence by the sequence's own frame numbers."""
+"""Choose what of a sequence is used: frames by the sequence's own numbers, and the size of their images."""
 
 from __future__ import annotations
 
@@ -22,6 +22,19 @@ def select_frames(source: Source, selection: str) -> list[int]:
             f"numbered {numbers[0]} to {numbers[-1]}"
         )
     return chosen
+
+
+def frame_size(text: str | None, source: Source) -> tuple[int, int]:
+    """Parse "WxH"; the sequence's own size when there is no text. Raises InvalidInputError."""
+    if text is None:
+        return source.camera.width_px, source.camera.height_px
+    parts = text.lower().split("x")
+    if len(parts) != 2 or not all(part.isascii() and part.isdigit() for part in parts):
+        raise InvalidInputError(f"size: expected WIDTHxHEIGHT such as 320x240, got {text!r}")
+    width, height = int(parts[0]), int(parts[1])
+    if not (16 <= width <= 4096 and 16 <= height <= 4096):
+        raise InvalidInputError(f"size: expected sides of 16 to 4096 pixels, got {text!r}")
+    return width, height
 
 
 def _parse(selection: str) -> tuple[int, int | None, int]:

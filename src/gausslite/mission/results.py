@@ -1,12 +1,15 @@
-"""Write results so that nothing half-written is left behind."""
+"""What a mission leaves behind: a folder with map.ply and report.json, each written whole or not at all."""
 
 from __future__ import annotations
 
 import json
 import math
+import resource
 from collections.abc import Mapping
 from pathlib import Path
 
+from gausslite.codec.ply import write_ply
+from gausslite.domain.gaussians import Gaussians
 from gausslite.errors import StorageError
 
 
@@ -18,23 +21,34 @@ def prepare_folder(folder: Path) -> None:
         probe.write_bytes(b"")
         probe.unlink()
     except OSError as error:
-        raise StorageError(f"--out {folder}: expected a folder that can be written, got {error.strerror}") from None
+        raise StorageError(f"{folder}: expected a folder that can be written, got {error.strerror}") from error
+
+
+def write_results(folder: Path, gaussians: Gaussians, report: Mapping[str, object]) -> None:
+    """Write map.ply and report.json. Raises StorageError."""
+    write_ply(folder / "map.ply", gaussians)
+    write_json(folder / "report.json", report)
 
 
 def write_json(path: Path, report: Mapping[str, object]) -> None:
-    """Write a report; not-a-number becomes null. Raises StorageError."""
-    partial = path.with_name(path.name + ".partial")
+    """Write a report. Raises StorageError."""
+    partial = path.with_name(f".{path.name}.partial")
     try:
         partial.write_text(as_text(report) + "\n")
         partial.replace(path)
     except OSError as error:
         partial.unlink(missing_ok=True)
-        raise StorageError(f"{path}: could not be written: {error.strerror}") from None
+        raise StorageError(f"{path}: could not be written: {error.strerror}") from error
 
 
 def as_text(report: Mapping[str, object]) -> str:
-    """Indented JSON of a report."""
+    """Indented JSON of a report: floats to six places, null for what is not finite."""
     return json.dumps(_finite(report), indent=2, ensure_ascii=False)
+
+
+def peak_rss_mib() -> float:
+    """The most memory this process ever held, in MiB."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
 def _finite(value: object) -> object:

@@ -1,20 +1,16 @@
-"""Build one robot's loop from settings: which frames, what attends to them, and how the map is made."""
+"""How one robot maps: what it knows of the place, what finds its nouns, and what its map may cost."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from gausslite.datasets.source import Source, UpAxis
 from gausslite.domain.region import Region
-from gausslite.domain.task import TaskGraph
 from gausslite.errors import InvalidInputError
-from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.policies import policy
 from gausslite.mapping.settings import Components, MapperSettings
-from gausslite.perception.attention import AttentionSettings, TaskAttention
-from gausslite.render.choose import choose_rasterizer
 
 DEFAULT_MAX_GAUSSIANS = 150_000
 """What two cores keep busy at 640x480; the paper's cap of a million is for a GPU."""
@@ -86,54 +82,6 @@ class MissionSettings:
             components=_without(base.components, self.without),
             optimization=optimization,
         )
-
-
-def build_mapper(settings: MissionSettings) -> GaussianMapper:
-    """A mapper with an empty map. Raises KernelError, InvalidInputError."""
-    rasterizer = choose_rasterizer(settings.backend, settings.threads)
-    return GaussianMapper(settings.mapper_settings(), rasterizer, seed=settings.seed)
-
-
-def build_attention(graph: TaskGraph, scene: SceneKnowledge, perception: PerceptionSettings) -> TaskAttention:
-    """Attention to a task: by the user's YOLO-seg file or, without one, by the scene's own ground truth.
-
-    Raises ModelFileError for a bad file and InvalidInputError when there is neither file nor ground truth.
-    """
-    settings = AttentionSettings(up_axis=scene.up_axis)
-    if perception.model is not None:
-        from gausslite.perception.yolo import load_yolo
-
-        yolo = load_yolo(perception.model, threads=perception.threads)
-        return TaskAttention(graph, yolo, settings, segmenter=yolo if perception.resegment else None)
-    if not scene.regions:
-        raise InvalidInputError(
-            "detector: the sequence has no ground-truth regions; name a YOLO-seg ONNX file with --detector"
-        )
-    from gausslite.perception.ground_truth import RegionDetector
-
-    return TaskAttention(graph, RegionDetector(scene.regions), settings)
-
-
-def choose_regions(regions: Mapping[str, Region], names: Sequence[str]) -> list[Region]:
-    """The regions with these names; all of them when no name is given. Raises InvalidInputError."""
-    unknown = [name for name in names if name not in regions]
-    if unknown or not regions:
-        known = ", ".join(sorted(regions)) or "none"
-        raise InvalidInputError(f"objects: expected names among {known}; got {', '.join(unknown) or 'none'}")
-    return [regions[name] for name in names] if names else list(regions.values())
-
-
-def frame_size(text: str | None, source: Source) -> tuple[int, int]:
-    """Parse "WxH"; the sequence's own size when there is no text. Raises InvalidInputError."""
-    if text is None:
-        return source.camera.width_px, source.camera.height_px
-    parts = text.lower().split("x")
-    if len(parts) != 2 or not all(part.isascii() and part.isdigit() for part in parts):
-        raise InvalidInputError(f"size: expected WIDTHxHEIGHT such as 320x240, got {text!r}")
-    width, height = int(parts[0]), int(parts[1])
-    if not (16 <= width <= 4096 and 16 <= height <= 4096):
-        raise InvalidInputError(f"size: expected sides of 16 to 4096 pixels, got {text!r}")
-    return width, height
 
 
 def _without(components: Components, names: frozenset[str]) -> Components:

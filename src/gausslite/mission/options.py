@@ -1,0 +1,96 @@
+"""The options that `gausslite` and `gausslite-agent` share: one spelling, one default, one way into settings."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from gausslite.datasets.source import UpAxis
+from gausslite.domain.voxels import VoxelGrid
+from gausslite.mapping.policies import POLICIES
+from gausslite.mission.settings import DEFAULT_MAX_GAUSSIANS, MissionSettings, PerceptionSettings
+from gausslite.render.choose import BACKENDS
+
+
+def add_frames(parser: argparse.ArgumentParser) -> None:
+    """Add --frames, --size and --up: what of a sequence is used, and how it stands."""
+    add = parser.add_argument_group("frames").add_argument
+    add("--frames", metavar="START:STOP:STEP", default=":", help="frame numbers to use (default: all)")
+    add("--size", metavar="WxH", help="resize images to this size (default: as they are)")
+    add("--up", metavar="X,Y,Z", type=up_axis, help="the world's upward direction, if not the source's")
+
+
+def add_detector(parser: argparse.ArgumentParser) -> None:
+    """Add --detector and --resegment: what finds the task's nouns."""
+    add = parser.add_argument_group("perception").add_argument
+    add("--detector", metavar="FILE.onnx", type=Path, help="a YOLO-seg model (default: the source's ground truth)")
+    add("--resegment", action="store_true", help="run the detector's masks on every frame (slower)")
+
+
+def add_policy(parser: argparse.ArgumentParser) -> None:
+    """Add --policy, --without and --rasterizer: how the map is made."""
+    add = parser.add_argument_group("mapping").add_argument
+    add("--policy", choices=sorted(POLICIES), default="task", help="how to spend the budget (default: task)")
+    add("--without", metavar="A,B", type=names, default=(), help="components off: sb mvo roi sis gfd")
+    add("--rasterizer", choices=BACKENDS, default="auto", help="what draws and trains the map (default: auto)")
+
+
+def add_budget(parser: argparse.ArgumentParser) -> None:
+    """Add --max-gaussians, --iterations or --rate, --seed and --threads: what the map may cost."""
+    group = parser.add_argument_group("budget")
+    add = group.add_argument
+    add("--max-gaussians", metavar="N", type=int, default=DEFAULT_MAX_GAUSSIANS, help="hard cap (default: %(default)s)")
+    per_frame = group.add_mutually_exclusive_group()
+    per_frame.add_argument("--iterations", metavar="N", type=int, help="iterations a frame (default: 8)")
+    per_frame.add_argument("--rate", metavar="HZ", type=float, help="frames a second: as many iterations as fit")
+    add("--seed", metavar="S", type=int, default=0, help="seed of every random choice (default: 0)")
+    add("--threads", metavar="N", type=int, help="threads (default: all the processor allows)")
+
+
+def add_voxel_size(parser: argparse.ArgumentParser) -> None:
+    """Add --voxel-size, in metres."""
+    size_m = VoxelGrid().size_m
+    parser.add_argument(
+        "--voxel-size", metavar="M", type=float, default=size_m, help="metres of the vote's voxels (default: 0.1)"
+    )
+
+
+def perception_settings(options: argparse.Namespace) -> PerceptionSettings:
+    """What add_detector and add_budget asked for."""
+    return PerceptionSettings(options.detector, options.resegment, options.threads)
+
+
+def mission_settings(options: argparse.Namespace) -> MissionSettings:
+    """What add_policy and add_budget asked for. Raises InvalidInputError."""
+    return MissionSettings(
+        policy=options.policy,
+        without=frozenset(options.without),
+        max_gaussians=options.max_gaussians,
+        iterations=options.iterations,
+        rate_hz=options.rate,
+        seed=options.seed,
+        threads=options.threads,
+        backend=options.rasterizer,
+    )
+
+
+def names(text: str) -> tuple[str, ...]:
+    """Split "a,b"."""
+    return tuple(part.strip() for part in text.split(",") if part.strip())
+
+
+def up_axis(text: str) -> UpAxis:
+    """Read "x,y,z"; argparse reports what is wrong."""
+    x, y, z = numbers(text, 3)
+    return (x, y, z)
+
+
+def numbers(text: str, count: int) -> list[float]:
+    """Read exactly `count` finite numbers between commas; argparse reports what is wrong."""
+    try:
+        values = [float(part) for part in text.split(",")]
+    except ValueError:
+        values = []
+    if len(values) != count or not all(abs(value) < float("inf") for value in values):
+        raise argparse.ArgumentTypeError(f"expected {count} finite numbers separated by commas, got {text!r}")
+    return values
