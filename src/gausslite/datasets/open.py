@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from gausslite.datasets.registration import ColourCamera, RegisteredSource
 from gausslite.datasets.replica import ReplicaSource
 from gausslite.datasets.sevenscenes import SevenScenesSource
 from gausslite.datasets.source import Source, UpAxis
@@ -18,11 +19,17 @@ _LAYOUTS = (
 _SIMULATED = "sim:"
 
 
-def open_source(spec: str, up_axis: UpAxis | None = None) -> Source:
+def open_source(spec: str, up_axis: UpAxis | None = None, colour_camera: ColourCamera | None = None) -> Source:
     """The sequence in a folder, or a simulated one ("sim:home?seed=0&trajectory=0").
 
-    A folder that only holds one folder with a sequence stands for it. Raises DatasetError, PoseError.
+    A folder that only holds one folder with a sequence stands for it. A colour camera given here says that colour
+    and depth are not registered: depth is then moved into it. Raises DatasetError, PoseError, InvalidInputError.
     """
+    source = _open(spec, up_axis)
+    return source if colour_camera is None else RegisteredSource(source, colour_camera)
+
+
+def _open(spec: str, up_axis: UpAxis | None) -> Source:
     if spec.startswith(_SIMULATED):
         # the simulated home needs the optional ray caster; files do not
         from gausslite.datasets.simulated.source import open_simulated
