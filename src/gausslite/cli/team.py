@@ -13,6 +13,7 @@ from pathlib import Path
 
 from gausslite.cli.processes import ProcessGroup, ServiceProcess
 from gausslite.cli.progress import MappingBar
+from gausslite.codec.files import write_whole
 from gausslite.errors import UnavailableError
 from gausslite.wire.clients import AgentClient, Export, FusionClient, is_done
 
@@ -152,5 +153,5 @@ def _refine(client: FusionClient, plan: TeamPlan) -> None:
 
 
 def _save(path: Path, data: bytes) -> Path:
-    path.write_bytes(data)
+    write_whole(path, data)
     return path

@@ -8,9 +8,6 @@ be missing (inactive, kappa 0, no target).
 
 from __future__ import annotations
 
-import contextlib
-import os
-import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -19,9 +16,10 @@ from jaxtyping import Float32
 from numpy import ndarray
 from numpy.typing import DTypeLike, NDArray
 
+from gausslite.codec.files import write_whole
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.relevance import NO_TARGET
-from gausslite.errors import InvalidInputError, MapFileError, StorageError
+from gausslite.errors import InvalidInputError, MapFileError
 
 SH_C0 = 0.28209479177387814
 _MAX_GAUSSIANS = 100_000_000
@@ -41,25 +39,8 @@ _PLY_TYPES = {
 
 
 def write_ply(path: Path, gaussians: Gaussians) -> None:
-    """Write the map beside `path` first and then put it in its place, so that no reader sees half a file.
-
-    Raises StorageError when the folder is not writable or the disk is full.
-    """
-    path = Path(path)
-    temporary: Path | None = None
-    try:
-        with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}.", delete=False) as file:
-            temporary = Path(file.name)
-            file.write(ply_bytes(gaussians))
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.chmod(0o644)
-        temporary.replace(path)
-    except OSError as error:
-        if temporary is not None:
-            with contextlib.suppress(OSError):
-                temporary.unlink()
-        raise StorageError(f"{path}: cannot write the map: {error.strerror or error}") from error
+    """Write the map, whole or not at all. Raises StorageError when the folder is not writable or the disk is full."""
+    write_whole(path, ply_bytes(gaussians))
 
 
 def read_ply(path: Path) -> Gaussians:

@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 from numpy import ndarray
 
+from gausslite.codec.files import write_whole
 from gausslite.domain.arrays import require_array
-from gausslite.errors import StorageError
 from gausslite.evaluation.views import HeldOutView
 
 _HEADER_PX = 26
@@ -57,10 +57,7 @@ def write_png(path: Path, image: UInt8[ndarray, "h w 3"]) -> None:
     import cv2
 
     encoded = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1]
-    try:
-        path.write_bytes(encoded.tobytes())
-    except OSError as error:
-        raise StorageError(f"{path}: expected a file that can be written, got {error.strerror}") from error
+    write_whole(path, encoded.tobytes())
 
 
 def _to_uint8(image: Float32[ndarray, "h w 3"]) -> UInt8[ndarray, "h w 3"]:

@@ -8,6 +8,7 @@ import resource
 from collections.abc import Mapping
 from pathlib import Path
 
+from gausslite.codec.files import write_whole
 from gausslite.codec.ply import write_ply
 from gausslite.domain.gaussians import Gaussians
 from gausslite.errors import StorageError
@@ -32,13 +33,7 @@ def write_results(folder: Path, gaussians: Gaussians, report: Mapping[str, objec
 
 def write_json(path: Path, report: Mapping[str, object]) -> None:
     """Write a report. Raises StorageError."""
-    partial = path.with_name(f".{path.name}.partial")
-    try:
-        partial.write_text(as_text(report) + "\n")
-        partial.replace(path)
-    except OSError as error:
-        partial.unlink(missing_ok=True)
-        raise StorageError(f"{path}: could not be written: {error.strerror}") from error
+    write_whole(path, (as_text(report) + "\n").encode())
 
 
 def as_text(report: Mapping[str, object]) -> str:
