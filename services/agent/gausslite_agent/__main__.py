@@ -40,7 +40,8 @@ async def _serve(settings: AgentSettings) -> None:
     """Build the robot, serve it, play its source; close in the reverse order."""
     if settings.out is not None:
         prepare_folder(settings.out)
-    source = None if settings.play is None else open_source(settings.play.source, settings.up_axis)
+    play = settings.play
+    source = None if play is None else open_source(play.source, settings.up_axis, play.colour_camera)
     loop, news = asyncio.get_running_loop(), Bell()
     with ExitStack() as stack:
         parser = _parser(settings.link, stack)

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from gausslite.datasets.registration import ColourCamera
 from gausslite.datasets.source import UpAxis
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.errors import InvalidInputError
@@ -25,12 +26,16 @@ from gausslite.wire.uplink_values import UplinkSettings
 
 @dataclass(frozen=True, slots=True)
 class PlaySettings:
-    """A sequence that stands in for the robot's camera; hold_out keeps every n-th frame from mapping."""
+    """A sequence that stands in for the robot's camera; hold_out keeps every n-th frame from mapping.
+
+    colour_camera is given when the sequence's depth is not registered to its colour.
+    """
 
     source: str
     frames: str = ":"
     size: str | None = None
     hold_out: int | None = None
+    colour_camera: ColourCamera | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +77,7 @@ def parse_arguments(arguments: Sequence[str] | None = None) -> AgentSettings:
         raise InvalidInputError(f"--agent-id: expected 1 to 255 bytes, got {len(options.agent_id.encode())}")
     play = None
     if options.source is not None:
-        play = PlaySettings(options.source, options.frames, options.size, options.hold_out)
+        play = PlaySettings(options.source, options.frames, options.size, options.hold_out, options.colour_camera)
     link = LinkSettings(
         options.parser,
         options.fusion,

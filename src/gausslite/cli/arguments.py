@@ -12,7 +12,7 @@ from gausslite.mission.options import add_frames, names, numbers
 
 
 def add_source(parser: argparse.ArgumentParser) -> None:
-    """Add SOURCE, --frames, --size and --up."""
+    """Add SOURCE and what of it is used."""
     parser.add_argument(
         "source", metavar="SOURCE", help='a folder (TUM, 7-Scenes or Replica layout) or "sim:home?seed=0&trajectory=0"'
     )

@@ -20,7 +20,7 @@ from gausslite.evaluation.compare import MapScores
 from gausslite.evaluation.held_out import HoldOut
 from gausslite.evaluation.pictures import write_png
 from gausslite.evaluation.team import TeamScores, Viewpoints, score_team
-from gausslite.mission.options import add_budget, add_detector, add_voxel_size, names
+from gausslite.mission.options import add_budget, add_colour_camera, add_detector, add_voxel_size, names
 from gausslite.mission.results import prepare_folder, write_json
 from gausslite.perception.vocabulary import same_kind
 from gausslite.render.choose import choose_rasterizer
@@ -45,6 +45,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--objects", metavar="A,B", type=names, default=(), help="score these (default: the tasks' nouns)"
     )
     parser.add_argument("--size", metavar="WxH", help=f"image size (default: as it is; {_HOME_SIZE} in the home)")
+    add_colour_camera(parser)
     add_voxel_size(parser)
     parser.add_argument("--refine-iterations", metavar="N", type=int, default=500, help="0 leaves refinement out")
     add_detector(parser)
@@ -66,6 +67,7 @@ def run(options: argparse.Namespace) -> int:
     scores = _score(options, stage, list(regions.values()), maps)
     report = {
         "source": options.source or stage.agents[0].source,
+        "colour_camera": None if options.colour_camera is None else str(options.colour_camera),
         "size": list(stage.size),
         "seed": options.seed,
         "agents": agents,
@@ -92,6 +94,8 @@ class _Stage:
 
 def _simulated_stage(options: argparse.Namespace) -> _Stage:
     """Two walks through one home; the held-out views lie off both."""
+    if options.colour_camera is not None:
+        raise InvalidInputError("--colour-camera: belongs to a recorded sequence; name it with --source")
     specs = [
         _HOME.format(seed=options.seed, trajectory=walk, frames=_HOME_VIEWS if walk == 2 else _HOME_FRAMES)
         for walk in range(3)
@@ -108,7 +112,7 @@ def _simulated_stage(options: argparse.Namespace) -> _Stage:
 
 def _recorded_stage(options: argparse.Namespace) -> _Stage:
     """One sequence in two parts; every eighth frame of each is kept from mapping."""
-    source = open_source(options.source)
+    source = open_source(options.source, colour_camera=options.colour_camera)
     middle = source.indices()[len(source) // 2]
     first, second = options.frames_a or f":{middle}", options.frames_b or f"{middle}:"
     size = frame_size(options.size, source)
@@ -142,6 +146,8 @@ def _plan(options: argparse.Namespace, stage: _Stage) -> TeamPlan:
     shared += ["--threads", str(options.threads or 1), "--voxel-size", str(options.voxel_size)]
     if stage.hold_out is not None:
         shared += ["--hold-out", str(stage.hold_out)]
+    if options.colour_camera is not None:
+        shared += ["--colour-camera", str(options.colour_camera)]
     if options.detector is not None:
         shared += ["--detector", str(options.detector.absolute())]
     if options.resegment:

@@ -39,7 +39,7 @@ def run(options: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     gaussians = read_ply(options.map)
-    source = open_source(options.source, options.up)
+    source = open_source(options.source, options.up, options.colour_camera)
     positions = select_frames(source, options.frames)
     if options.hold_out is not None:
         positions = HoldOut(options.hold_out, options.hold_out - 1).split(positions)[1]

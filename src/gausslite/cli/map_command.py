@@ -43,7 +43,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Map the sequence and write the results."""
     settings = mission_settings(options)
-    source = open_source(options.source, options.up)
+    source = open_source(options.source, options.up, options.colour_camera)
     positions = select_frames(source, options.frames)
     size = frame_size(options.size, source)
     attention, graph = _attention(options, source)
@@ -54,6 +54,7 @@ def run(options: argparse.Namespace) -> int:
     active = int(gaussians.active.sum())
     report = {
         "source": options.source,
+        "colour_camera": None if options.colour_camera is None else str(options.colour_camera),
         "task": None if graph is None else {"text": graph.text, **as_json(graph)},
         "policy": options.policy,
         "without": sorted(settings.without),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from gausslite.datasets.registration import ColourCamera
 from gausslite.datasets.source import UpAxis
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.mapping.policies import POLICIES
@@ -13,11 +14,22 @@ from gausslite.render.choose import BACKENDS
 
 
 def add_frames(parser: argparse.ArgumentParser) -> None:
-    """Add --frames, --size and --up: what of a sequence is used, and how it stands."""
+    """Add --frames, --size, --up and --colour-camera: what of a sequence is used, and how its cameras stand."""
     add = parser.add_argument_group("frames").add_argument
     add("--frames", metavar="START:STOP:STEP", default=":", help="frame numbers to use (default: all)")
     add("--size", metavar="WxH", help="resize images to this size (default: as they are)")
     add("--up", metavar="X,Y,Z", type=up_axis, help="the world's upward direction, if not the source's")
+    add_colour_camera(parser)
+
+
+def add_colour_camera(parser: argparse.ArgumentParser) -> None:
+    """Add --colour-camera, for sequences whose depth is not registered to colour."""
+    parser.add_argument(
+        "--colour-camera",
+        metavar="FX,FY,CX,CY[,TX,TY,TZ]",
+        type=ColourCamera.parse,
+        help="register depth to this camera: pixels as data sets count, metres from colour to depth camera",
+    )
 
 
 def add_detector(parser: argparse.ArgumentParser) -> None:
