@@ -19,6 +19,7 @@ from gausslite.domain.frame import Frame
 from gausslite.domain.region import BallRegion
 from gausslite.domain.relevance import RelevanceMap
 from gausslite.domain.task import TaskGraph
+from gausslite.domain.voxels import Box
 from gausslite.errors import (
     GaussLiteError,
     InvalidInputError,
@@ -267,7 +268,7 @@ def test_a_watcher_may_ask_for_a_region_and_for_the_task_alone() -> None:
         a.client.assign_task(TASK)
         list(a.client.ingest([frame(0)]))
         shown: list[dict[int, int]] = []
-        box = convert.Box((-0.1, -0.1, 0.0), (0.1, 0.1, 5.0))
+        box = Box((-0.1, -0.1, 0.0), (0.1, 0.1, 5.0))
         for region, roi_only in ((None, False), (box, False), (None, True)):
             updates = a.client.watch_map(region=region, roi_only=roi_only)
             shown.append({})
@@ -291,8 +292,8 @@ def test_an_upside_down_region_is_refused() -> None:
     with agent() as a, pytest.raises(grpc.RpcError) as caught:
         next(a.stub.WatchMap(request))
     assert caught.value.code() is grpc.StatusCode.INVALID_ARGUMENT  # type: ignore[attr-defined]
-    with pytest.raises(InvalidInputError, match="region"):
-        convert.Box((1.0, 0.0, 0.0), (-1.0, 0.0, 0.0))
+    with pytest.raises(InvalidInputError, match="box"):
+        Box((1.0, 0.0, 0.0), (-1.0, 0.0, 0.0))
 
 
 def test_only_the_tasks_region_leaves_the_robot() -> None:

@@ -14,7 +14,7 @@ from grpc_health.v1 import health_pb2, health_pb2_grpc
 from gausslite.codec.ply import gaussians_from_ply
 from gausslite.domain.camera import Camera
 from gausslite.domain.subset import RoiSubset
-from gausslite.domain.voxels import VoxelGrid
+from gausslite.domain.voxels import Box, VoxelGrid
 from gausslite.errors import (
     InvalidInputError,
     MismatchError,
@@ -29,7 +29,6 @@ from gausslite.fusion.sqlite import SqliteStore
 from gausslite.fusion.terms import Quotas, TeamSettings
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.wire.clients import Export
-from gausslite.wire.convert import Box
 
 ACCEPTED, STALE, REJECTED = pb.SUBSET_STATUS_ACCEPTED, pb.SUBSET_STATUS_STALE, pb.SUBSET_STATUS_REJECTED
 

@@ -19,10 +19,11 @@ from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.subset import RoiSubset, VoxelWords
 from gausslite.domain.task import Predicate, Relation, TaskGraph
-from gausslite.domain.voxels import VoxelGrid
+from gausslite.domain.voxels import Box, VoxelGrid
 from gausslite.errors import GaussLiteError, InvalidInputError, PoseError, TaskError
 from gausslite.v1 import agent_service_pb2, gaussians_pb2, geometry_pb2, task_pb2
 from gausslite.wire import convert
+from gausslite.wire.clients import is_done
 from gausslite.wire.images import decode_colour, encode_colour, encode_depth, image_size
 
 CAMERA = Camera(500.0, 501.0, 32.5, 24.5, 64, 48)
@@ -164,7 +165,7 @@ def test_a_map_block_is_checked() -> None:
 
 
 def test_a_box_survives_and_knows_what_it_holds() -> None:
-    box = convert.Box((-1.0, -1.0, -1.0), (1.0, 2.0, 3.0))
+    box = Box((-1.0, -1.0, -1.0), (1.0, 2.0, 3.0))
     assert convert.box_from_message(convert.box_to_message(box)) == box
     points = np.array([[0, 0, 0], [1, 2, 3], [1.1, 0, 0]], np.float32)
     assert box.holds(points).tolist() == [True, True, False]
@@ -172,5 +173,5 @@ def test_a_box_survives_and_knows_what_it_holds() -> None:
 
 def test_is_done() -> None:
     status = agent_service_pb2.GetAgentStatusResponse
-    assert convert.is_done(status(state=agent_service_pb2.AGENT_STATE_DONE))
-    assert not convert.is_done(status(state=agent_service_pb2.AGENT_STATE_DRAINING))
+    assert is_done(status(state=agent_service_pb2.AGENT_STATE_DONE))
+    assert not is_done(status(state=agent_service_pb2.AGENT_STATE_DRAINING))

@@ -2,23 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import numpy as np
 
-from gausslite.codec.subset_codec import encode_subset, split_words
 from gausslite.domain.camera import Camera
-from gausslite.domain.subset import RoiSubset, VoxelWords
-from gausslite.domain.voxels import VoxelGrid
 from gausslite.render.rasterizer import Rendering
 from gausslite.v1 import agent_service_pb2 as pb
-from gausslite.v1.gaussians_pb2 import MapBlock
 from gausslite.wire.convert import graph_to_message
 from gausslite.wire.images import encode_colour, encode_depth
 from gausslite.wire.uplink_values import UplinkCounters
 from gausslite_agent.robot import FrameReport, Outcome, RobotStatus
 
-_BLOCK_BYTES = 1 << 19
 _OUTCOMES = {
     Outcome.MAPPED: pb.FRAME_OUTCOME_MAPPED,
     Outcome.SKIPPED: pb.FRAME_OUTCOME_SKIPPED,
@@ -86,15 +79,3 @@ def blank_view(camera: Camera, map_revision: int) -> pb.RenderViewResponse:
         depth_png=encode_depth(np.zeros(size, np.float32)),
         map_revision=map_revision,
     )
-
-
-def map_blocks(words: VoxelWords, grid: VoxelGrid, agent_id: str, revision: int, snapshot: bool) -> Iterator[MapBlock]:
-    """Words cut into messages, each complete in itself; at least one."""
-    parts = split_words(words, _BLOCK_BYTES)
-    for number, part in enumerate(parts or [words], start=1):
-        yield MapBlock(
-            revision=revision,
-            snapshot=snapshot,
-            last=number >= len(parts),
-            subset=encode_subset(RoiSubset(agent_id, "", number, revision, part), grid) if parts else b"",
-        )

@@ -7,7 +7,7 @@ from collections.abc import AsyncIterator, Callable
 from typing import Any
 
 from gausslite.domain.task import TaskGraph
-from gausslite.domain.words import take_voxels
+from gausslite.domain.words import inside
 from gausslite.errors import InvalidInputError
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.task.parser import TaskParser
@@ -22,10 +22,11 @@ from gausslite.wire.convert import (
     graph_to_message,
     transform_from_message,
 )
+from gausslite.wire.map_blocks import map_blocks
 from gausslite.wire.server import Service
 from gausslite.wire.uplink_values import UplinkCounters
 from gausslite_agent.history import MapHistory
-from gausslite_agent.messages import blank_view, map_blocks, report_to_message, status_to_message, view_to_message
+from gausslite_agent.messages import blank_view, report_to_message, status_to_message, view_to_message
 from gausslite_agent.robot import FrameReport, Robot
 
 _OUTCOMES_AHEAD = 16
@@ -103,8 +104,8 @@ class AgentServicer(pb_grpc.AgentServiceServicer):
             history.update(mapper.gaussians(), self._robot.revision())
             words = history.since(since)
             if region is not None:
-                words = take_voxels(words, region.holds(self._robot.grid.centres_m(words.keys)))
-            blocks = map_blocks(words, self._robot.grid, self._agent_id, history.revision, since == 0)
+                words = inside(words, region, self._robot.grid)
+            blocks = map_blocks(words, self._robot.grid, self._agent_id, history.revision, snapshot=since == 0)
             return [pb.WatchMapResponse(block=block) for block in blocks]
 
         while True:

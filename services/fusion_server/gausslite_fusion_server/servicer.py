@@ -35,8 +35,8 @@ from gausslite.wire.bell import Bell
 from gausslite.wire.convert import box_from_message, frame_from_message, grid_from_message, grid_to_message
 from gausslite.wire.server import Service
 from gausslite.wire.status import code_and_reason
+from gausslite_fusion_server.changes import change_blocks
 from gausslite_fusion_server.door import Door
-from gausslite_fusion_server.map_blocks import map_blocks
 from gausslite_fusion_server.refinement import RefineOrder, Refinery
 
 _CHUNK_BYTES = 1 << 20
@@ -129,7 +129,7 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         region = box_from_message(request.region) if request.HasField("region") else None
         changes = await self._work(self._team.changes, request.since_revision)
         while True:
-            blocks = map_blocks(changes, self._team.grid, region)
+            blocks = change_blocks(changes, self._team.grid, region)
             while (block := await self._work(_next_block, blocks)) is not None:
                 yield pb.WatchFusedMapResponse(block=block)
             ticket = self._news.ticket()

@@ -1,11 +1,11 @@
-"""World space in cubes: the unit of the fusion vote and of the uplink (Sec. III-E)."""
+"""World space in cubes, the unit of the fusion vote and of the uplink (Sec. III-E), and in boxes of them."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float32, Int64
+from jaxtyping import Bool, Float32, Int64
 from numpy import ndarray
 
 from gausslite.errors import InvalidInputError
@@ -48,6 +48,25 @@ class VoxelGrid:
     def centres_m(self, keys: Int64[ndarray, " n"]) -> Float32[ndarray, "n 3"]:
         """The centres of the voxels with these keys."""
         return ((self.indices(keys) + 0.5) * self.size_m).astype(np.float32)
+
+
+@dataclass(frozen=True, slots=True)
+class Box:
+    """A part of the world, in metres; a voxel belongs to it when its centre does. Raises InvalidInputError."""
+
+    min_m: tuple[float, float, float]
+    max_m: tuple[float, float, float]
+
+    def __post_init__(self) -> None:
+        corners = np.array([self.min_m, self.max_m])
+        if not np.isfinite(corners).all() or not (corners[0] <= corners[1]).all():
+            raise InvalidInputError(f"box: expected finite min <= max, got {self.min_m} and {self.max_m}")
+
+    def holds(self, points_m: Float32[ndarray, "n 3"]) -> Bool[ndarray, " n"]:
+        """True for each point in the box; its faces belong to it."""
+        low, high = np.array(self.min_m), np.array(self.max_m)
+        inside: Bool[ndarray, " n"] = np.logical_and(points_m >= low, points_m <= high).min(axis=1)
+        return inside
 
 
 @dataclass(frozen=True, slots=True)

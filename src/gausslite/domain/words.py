@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.subset import VoxelWords
-from gausslite.domain.voxels import VoxelGrid
+from gausslite.domain.voxels import Box, VoxelGrid
 
 
 def no_words() -> VoxelWords:
@@ -65,6 +65,11 @@ def take_voxels(words: VoxelWords, keep: Bool[ndarray, " v"]) -> VoxelWords:
     counts = words.counts[keep]
     rows = gather_rows(words.offsets[:-1][keep], counts)
     return VoxelWords(words.keys[keep], words.kappa_sums[keep], counts, words.gaussians.take(rows))
+
+
+def inside(words: VoxelWords, box: Box, grid: VoxelGrid) -> VoxelWords:
+    """The words on the voxels whose centre lies in the box."""
+    return take_voxels(words, box.holds(grid.centres_m(words.keys)))
 
 
 def at_keys(words: VoxelWords, keys: Int64[ndarray, " k"]) -> VoxelWords:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64
+from jaxtyping import Float64
 from numpy import ndarray
 
 from gausslite.codec.subset_codec import CodecLimits, decode_subset
@@ -14,9 +14,9 @@ from gausslite.domain.frame import Frame
 from gausslite.domain.pose import require_rigid
 from gausslite.domain.subset import VoxelWords
 from gausslite.domain.task import Predicate, Relation, TaskGraph
-from gausslite.domain.voxels import VoxelGrid
+from gausslite.domain.voxels import Box, VoxelGrid
 from gausslite.errors import InvalidInputError, TaskError
-from gausslite.v1 import agent_service_pb2, gaussians_pb2, geometry_pb2, task_pb2
+from gausslite.v1 import gaussians_pb2, geometry_pb2, task_pb2
 from gausslite.wire.images import decode_colour, decode_depth, encode_colour, encode_depth
 
 MAX_IMAGE_PX = 1 << 23
@@ -30,25 +30,6 @@ _PREDICATES = {
     Predicate.CLOSEST_TO: task_pb2.PREDICATE_CLOSEST_TO,
 }
 _PREDICATES_BACK = {number: predicate for predicate, number in _PREDICATES.items()}
-
-
-@dataclass(frozen=True, slots=True)
-class Box:
-    """A part of the world; voxels whose centre lies in it belong to it. Raises InvalidInputError when upside down."""
-
-    min_m: tuple[float, float, float]
-    max_m: tuple[float, float, float]
-
-    def __post_init__(self) -> None:
-        corners = np.array([self.min_m, self.max_m])
-        if not np.isfinite(corners).all() or not (corners[0] <= corners[1]).all():
-            raise InvalidInputError(f"region: expected finite min <= max, got {self.min_m} and {self.max_m}")
-
-    def holds(self, centres_m: Float32[ndarray, "n 3"]) -> Bool[ndarray, " n"]:
-        """True for each point in the box."""
-        low, high = np.array(self.min_m), np.array(self.max_m)
-        inside: Bool[ndarray, " n"] = np.logical_and(centres_m >= low, centres_m <= high).min(axis=1)
-        return inside
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -197,8 +178,3 @@ def map_update_from_message(message: gaussians_pb2.MapBlock, limits: CodecLimits
     if len(winner) not in (0, 0 if words is None else len(words)) or any(i >= len(names) for i in winner):
         raise InvalidInputError("map block provenance: expected one known agent for each voxel")
     return MapUpdate(message.revision, message.snapshot, message.last, words, grid, tuple(names[i] for i in winner))
-
-
-def is_done(status: agent_service_pb2.GetAgentStatusResponse) -> bool:
-    """True when the agent has ended its mission and written its results."""
-    return status.state == agent_service_pb2.AGENT_STATE_DONE
