@@ -11,7 +11,7 @@ from mapping_scenes import middle_relevance, wall_frame
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.settings import Components, KeyframeSettings, MapperSettings, SeedingSettings
 from gausslite.optimize.density import DensitySettings
-from gausslite.render.reference import ReferenceRasterizer
+from gausslite.render.cpu import CpuRasterizer
 
 SIZE = (32, 24)
 
@@ -28,7 +28,7 @@ def test_every_combination_maps_within_the_cap(switches: tuple[bool, ...]) -> No
         keyframes=KeyframeSettings(every=1, window=2),
         density=DensitySettings(densify_every=3, prune_every=4),
     )
-    mapper = GaussianMapper(settings, ReferenceRasterizer(), seed=0)
+    mapper = GaussianMapper(settings, CpuRasterizer(threads=1), seed=0)
     for index in range(2):
         frame = wall_frame(index, SIZE, shift_m=0.2 * index)
         mapper.map_frame(frame, middle_relevance(frame))

@@ -8,11 +8,11 @@ from mapping_scenes import middle_relevance, wall_frame
 from gausslite.domain.relevance import RelevanceMap
 from gausslite.mapping.keyframes import Keyframe, KeyframeStore, tiles_of, window_view
 from gausslite.mapping.settings import KeyframeSettings
-from gausslite.render.reference import ReferenceRasterizer
+from gausslite.render.cpu import CpuRasterizer
 
 
 def stored(settings: KeyframeSettings, frames: int) -> KeyframeStore:
-    store, rasterizer = KeyframeStore(settings), ReferenceRasterizer()
+    store, rasterizer = KeyframeStore(settings), CpuRasterizer(threads=1)
     for index in range(frames):
         frame = wall_frame(index)
         store.offer(window_view(Keyframe(frame, middle_relevance(frame)), rasterizer, settings.roi_margin_px))
@@ -43,6 +43,6 @@ def test_tiles_touch_the_region_and_its_margin() -> None:
 
 
 def test_a_view_knows_whether_it_shows_the_region() -> None:
-    frame, rasterizer = wall_frame(), ReferenceRasterizer()
+    frame, rasterizer = wall_frame(), CpuRasterizer(threads=1)
     assert window_view(Keyframe(frame, middle_relevance(frame)), rasterizer, 5).shows_region
     assert not window_view(Keyframe(frame, RelevanceMap.nothing(48, 64)), rasterizer, 5).shows_region

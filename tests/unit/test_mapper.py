@@ -1,4 +1,4 @@
-"""The mapper as a whole, on a tiny wall, with the reference rasterizer."""
+"""The mapper as a whole, on a tiny wall, on the native rasterizer."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from gausslite.mapping.settings import (
     SeedingSettings,
 )
 from gausslite.optimize.density import DensitySettings
-from gausslite.render.reference import ReferenceRasterizer
+from gausslite.render.cpu import CpuRasterizer
 
 SIZE = (48, 32)
 SMALL = MapperSettings(
@@ -33,7 +33,7 @@ SMALL = MapperSettings(
 
 
 def mapper_of(settings: MapperSettings = SMALL, seed: int = 0) -> GaussianMapper:
-    return GaussianMapper(settings, ReferenceRasterizer(), seed)
+    return GaussianMapper(settings, CpuRasterizer(threads=1), seed)
 
 
 def map_wall(mapper: GaussianMapper, frames: int, deadline_s: float | None = None) -> None:

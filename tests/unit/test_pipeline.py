@@ -14,7 +14,7 @@ from gausslite.mapping.roi import RoiLedger
 from gausslite.mapping.settings import MapperSettings, SeedingSettings
 from gausslite.perception.fixed import NoAttention, RegionAttention
 from gausslite.pipeline import TaskMapper
-from gausslite.render.reference import ReferenceRasterizer
+from gausslite.render.cpu import CpuRasterizer
 
 SIZE = (32, 24)
 BALL = RegionAttention([BallRegion((0.0, 0.0, 2.0), 0.5)])
@@ -22,7 +22,7 @@ BALL = RegionAttention([BallRegion((0.0, 0.0, 2.0), 0.5)])
 
 def small_mapper() -> GaussianMapper:
     settings = MapperSettings(max_gaussians=200, seeding=SeedingSettings(later_seeds=20_000))
-    return GaussianMapper(settings, ReferenceRasterizer())
+    return GaussianMapper(settings, CpuRasterizer(threads=1))
 
 
 def test_words_of_all_frames_add_up_to_the_active_part_of_the_map() -> None:
