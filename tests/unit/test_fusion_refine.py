@@ -128,6 +128,6 @@ def test_the_pool_keeps_the_newest_of_each_agent_and_replaces_a_resent_one() -> 
     pool.remove_agent("ant")
     assert len(pool) == 1
     with pytest.raises(QuotaError, match="at most 1 pixels"):
-        KeyframePool(max_pixels=1).add(view(1, 1))
+        KeyframePool(2, max_pixels=1).add(view(1, 1))
     with pytest.raises(InvalidInputError, match="limits of at least 1"):
-        KeyframePool(max_per_agent=0)
+        KeyframePool(max_per_agent=0, max_pixels=1)

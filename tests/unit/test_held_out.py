@@ -16,9 +16,9 @@ def test_every_eighth_position_is_kept_by_default() -> None:
     assert train[:8] == [0, 4, 8, 12, 16, 20, 24, 32]
 
 
-@given(n=st.integers(0, 200), every=st.integers(2, 20), data=st.data())
-def test_a_split_is_a_partition_in_order(n: int, every: int, data: st.DataObject) -> None:
-    hold_out = HoldOut(every, data.draw(st.integers(0, every - 1)))
+@given(n=st.integers(0, 200), every=st.integers(2, 20))
+def test_a_split_is_a_partition_in_order(n: int, every: int) -> None:
+    hold_out = HoldOut(every)
     train, held = hold_out.split(range(n))
     assert sorted(train + held) == list(range(n))
     assert train == sorted(train)
@@ -26,7 +26,7 @@ def test_a_split_is_a_partition_in_order(n: int, every: int, data: st.DataObject
     assert abs(len(held) - n / every) < 1
 
 
-@pytest.mark.parametrize(("every", "offset"), [(1, 0), (0, 0), (8, 8), (8, -1)])
-def test_settings_that_hold_nothing_or_everything_are_refused(every: int, offset: int) -> None:
+@pytest.mark.parametrize("every", [1, 0, -8])
+def test_settings_that_hold_nothing_or_everything_are_refused(every: int) -> None:
     with pytest.raises(InvalidInputError, match="hold-out"):
-        HoldOut(every, offset)
+        HoldOut(every)

@@ -63,7 +63,7 @@ def test_the_chair_closest_to_the_table(kitchen, detector, shared_dir):
             shared += np.count_nonzero(roi & regions["chair_3"].mask(frame))
             marked += np.count_nonzero(roi)
     assert shared / marked > 0.7
-    (table,) = [each for each in attention.spatial.remembered if each.phrase == "table" and each.seen > 1]
+    (table,) = [each for each in attention.remembered if each.phrase == "table" and each.seen > 1]
     assert np.abs(table.centroid_m - regions["table_1"].centroid_m).max() < 0.2
 
 

@@ -115,5 +115,5 @@ def _frames(source: Source, play: PlaySettings) -> Iterator[Frame]:
     size = frame_size(play.size, source)
     positions: Sequence[int] = select_frames(source, play.frames)
     if play.hold_out is not None:
-        positions, _ = HoldOut(play.hold_out, play.hold_out - 1).split(positions)
+        positions, _ = HoldOut(play.hold_out).split(positions)
     return (source.frame(position, size) for position in positions)

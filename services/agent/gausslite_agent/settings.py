@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from gausslite.datasets.registration import ColourCamera
-from gausslite.datasets.source import UpAxis
+from gausslite.domain.pose import UpAxis
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.errors import InvalidInputError
 from gausslite.mission.options import (

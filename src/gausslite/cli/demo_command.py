@@ -118,7 +118,7 @@ def _recorded_stage(options: argparse.Namespace) -> _Stage:
     size = frame_size(options.size, source)
     agents, held_out = [], []
     for letter, task, frames in (("a", options.task_a, first), ("b", options.task_b, second)):
-        train, held = HoldOut(_HOLD_OUT, _HOLD_OUT - 1).split(select_frames(source, frames))
+        train, held = HoldOut(_HOLD_OUT).split(select_frames(source, frames))
         agents.append(AgentPlan(f"agent-{letter}", task, str(options.source), frames, len(train)))
         held_out.append(Viewpoints(source, held, size))
     return _Stage(tuple(agents), size, _HOLD_OUT, tuple(held_out), source.regions())

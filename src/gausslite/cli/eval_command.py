@@ -42,7 +42,7 @@ def run(options: argparse.Namespace) -> int:
     source = open_source(options.source, options.up, options.colour_camera)
     positions = select_frames(source, options.frames)
     if options.hold_out is not None:
-        positions = HoldOut(options.hold_out, options.hold_out - 1).split(positions)[1]
+        positions = HoldOut(options.hold_out).split(positions)[1]
         if not positions:
             raise DatasetError(f"--hold-out {options.hold_out}: expected at least that many frames, got fewer")
     regions = named_regions(options)

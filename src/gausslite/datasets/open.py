@@ -7,8 +7,9 @@ from pathlib import Path
 from gausslite.datasets.registration import ColourCamera, RegisteredSource
 from gausslite.datasets.replica import ReplicaSource
 from gausslite.datasets.sevenscenes import SevenScenesSource
-from gausslite.datasets.source import Source, UpAxis
+from gausslite.datasets.source import Source
 from gausslite.datasets.tum import TumSource
+from gausslite.domain.pose import UpAxis
 from gausslite.errors import DatasetError
 
 _READERS = (TumSource, SevenScenesSource, ReplicaSource)

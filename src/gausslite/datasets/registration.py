@@ -12,10 +12,10 @@ from numpy import ndarray
 
 from gausslite.datasets.images import RgbdImage, resize_rgbd
 from gausslite.datasets.intrinsics import FileIntrinsics
-from gausslite.datasets.source import Source, UpAxis
+from gausslite.datasets.source import Source
 from gausslite.domain.camera import Camera
 from gausslite.domain.frame import Frame
-from gausslite.domain.pose import inverse
+from gausslite.domain.pose import UpAxis, inverse
 from gausslite.domain.region import Region
 from gausslite.errors import InvalidInputError
 

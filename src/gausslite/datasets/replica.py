@@ -11,10 +11,11 @@ import numpy as np
 from gausslite.datasets.images import DepthUnits, load_rgbd
 from gausslite.datasets.intrinsics import find_beside_or_above, read_json_camera
 from gausslite.datasets.poses import nearest_rigid
-from gausslite.datasets.source import UpAxis, require_frames, require_position, unit_up_axis
+from gausslite.datasets.source import require_frames, require_position
 from gausslite.datasets.text_files import parse_numbers, read_rows
 from gausslite.domain.camera import Camera
 from gausslite.domain.frame import Frame
+from gausslite.domain.pose import UpAxis, unit_up_axis
 from gausslite.domain.region import Region
 from gausslite.errors import DatasetError
 

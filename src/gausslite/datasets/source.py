@@ -6,14 +6,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
-import numpy as np
-
 from gausslite.domain.camera import Camera
 from gausslite.domain.frame import Frame
+from gausslite.domain.pose import UpAxis
 from gausslite.domain.region import Region
-from gausslite.errors import DatasetError, InvalidInputError
-
-UpAxis = tuple[float, float, float]
+from gausslite.errors import DatasetError
 
 
 @runtime_checkable
@@ -51,15 +48,6 @@ class Source(Protocol):
     def regions(self) -> Mapping[str, Region]:
         """Ground-truth regions by object name; empty where the sequence has none."""
         ...
-
-
-def unit_up_axis(up_axis: UpAxis) -> UpAxis:
-    """Normalise an up axis. Raises InvalidInputError when it has no direction."""
-    length = float(np.linalg.norm(up_axis))
-    if not (np.isfinite(length) and length > 1e-6):
-        raise InvalidInputError(f"up axis: expected a finite vector that is not zero, got {up_axis}")
-    x, y, z = (float(value) / length for value in up_axis)
-    return (x, y, z)
 
 
 def require_position(source_name: str, i: int, count: int) -> None:

@@ -1,4 +1,4 @@
-"""Rigid transforms as 4x4 matrices; `T_a_b` takes points of frame b to frame a."""
+"""Rigid transforms as 4x4 matrices, where `T_a_b` takes points of frame b to frame a; and which way is up."""
 
 from __future__ import annotations
 
@@ -6,7 +6,10 @@ import numpy as np
 from jaxtyping import Float, Float64
 from numpy import ndarray
 
-from gausslite.errors import PoseError
+from gausslite.errors import InvalidInputError, PoseError
+
+UpAxis = tuple[float, float, float]
+"""The direction of a world frame that points up."""
 
 _RIGIDITY_TOLERANCE = 1e-2
 
@@ -52,3 +55,12 @@ def rotation_angle_deg(T_world_a: Float64[ndarray, "4 4"], T_world_b: Float64[nd
 def translation_m(T_world_a: Float64[ndarray, "4 4"], T_world_b: Float64[ndarray, "4 4"]) -> float:
     """Distance between the origins of two poses, in metres."""
     return float(np.linalg.norm(T_world_a[:3, 3] - T_world_b[:3, 3]))
+
+
+def unit_up_axis(up_axis: UpAxis) -> UpAxis:
+    """Normalise an up axis. Raises InvalidInputError when it has no direction."""
+    length = float(np.linalg.norm(up_axis))
+    if not (np.isfinite(length) and length > 1e-6):
+        raise InvalidInputError(f"up axis: expected a finite vector that is not zero, got {up_axis}")
+    x, y, z = (float(value) / length for value in up_axis)
+    return (x, y, z)

@@ -13,20 +13,17 @@ Item = TypeVar("Item")
 
 @dataclass(frozen=True, slots=True)
 class HoldOut:
-    """Every `every`-th position of a sequence, starting at `offset`, is kept from mapping."""
+    """The last of every `every` positions of a sequence is kept from mapping."""
 
     every: int = 8
-    offset: int = 7
 
     def __post_init__(self) -> None:
         if self.every < 2:
             raise InvalidInputError(f"hold-out every: expected at least 2 (1 would leave no frame), got {self.every}")
-        if not 0 <= self.offset < self.every:
-            raise InvalidInputError(f"hold-out offset: expected 0 to {self.every - 1}, got {self.offset}")
 
     def holds(self, position: int) -> bool:
         """True for a position (from 0, in the order of the sequence) that mapping must not see."""
-        return position % self.every == self.offset
+        return position % self.every == self.every - 1
 
     def split(self, indices: Sequence[Item]) -> tuple[list[Item], list[Item]]:
         """The items to map and the items held out, by their position in the sequence, both in order."""

@@ -26,7 +26,7 @@ class KeyframePool:
     Memory is bounded by agents × max_per_agent × max_pixels × 7 bytes. Not safe for threads: the mission's lock is.
     """
 
-    def __init__(self, max_per_agent: int = 64, max_pixels: int = 1280 * 1024) -> None:
+    def __init__(self, max_per_agent: int, max_pixels: int) -> None:
         if max_per_agent < 1 or max_pixels < 1:
             raise InvalidInputError(
                 f"keyframe pool: expected limits of at least 1, got {max_per_agent} frames of {max_pixels} pixels"

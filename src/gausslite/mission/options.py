@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from gausslite.datasets.registration import ColourCamera
-from gausslite.datasets.source import UpAxis
+from gausslite.domain.pose import UpAxis
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.mapping.policies import POLICIES
 from gausslite.mission.settings import DEFAULT_MAX_GAUSSIANS, MissionSettings, PerceptionSettings

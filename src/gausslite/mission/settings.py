@@ -6,7 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from gausslite.datasets.source import Source, UpAxis
+from gausslite.datasets.source import Source
+from gausslite.domain.pose import UpAxis
 from gausslite.domain.region import Region
 from gausslite.errors import InvalidInputError
 from gausslite.mapping.policies import policy

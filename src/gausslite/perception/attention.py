@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
@@ -12,13 +11,14 @@ from jaxtyping import Float32
 from numpy import ndarray
 
 from gausslite.domain.frame import Frame
-from gausslite.domain.pose import rotation_angle_deg, translation_m
+from gausslite.domain.pose import UpAxis, rotation_angle_deg, translation_m, unit_up_axis
 from gausslite.domain.relevance import NO_TARGET, Detection, RelevanceMap
 from gausslite.domain.task import TaskGraph
 from gausslite.errors import InvalidInputError
 from gausslite.perception.detect import Detector, Segmenter
+from gausslite.perception.memory import Remembered
 from gausslite.perception.reproject import Frustum, cut_by_depth, frustum_of, reprojected_box_px
-from gausslite.perception.spatial import SpatialFilter, SpatialSettings, best_depth_m, sight, unit_axis
+from gausslite.perception.spatial import SpatialFilter, SpatialSettings, best_depth_m, sight
 from gausslite.perception.vocabulary import is_generic
 
 
@@ -33,9 +33,12 @@ class Attention(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class AttentionSettings:
-    """up_axis points up in the world; max_* say when to detect anew (comment in Sec. III-B.2)."""
+    """up_axis points up in the world, by default that of a level first camera; max_* say when to detect anew.
 
-    up_axis: tuple[float, float, float] = (0.0, -1.0, 0.0)
+    How far the camera may go between two detections is a comment in Sec. III-B.2.
+    """
+
+    up_axis: UpAxis = (0.0, -1.0, 0.0)
     max_translation_m: float = 1.0
     max_rotation_deg: float = 15.0
     max_frames: int = 5
@@ -45,22 +48,9 @@ class AttentionSettings:
         for name in ("max_translation_m", "max_rotation_deg"):
             if not getattr(self, name) > 0:
                 raise InvalidInputError(f"attention {name}: expected a positive number, got {getattr(self, name)}")
-        unit_axis(self.up_axis)
+        unit_up_axis(self.up_axis)
         if self.max_frames < 1:
             raise InvalidInputError(f"attention max_frames: expected at least 1, got {self.max_frames}")
-
-
-@dataclass(slots=True)
-class AttentionCounters:
-    """What the attention did so far, for reports; the milliseconds are of the last call and of all calls."""
-
-    frames: int = 0
-    keyframes: int = 0
-    detections: int = 0
-    kept: int = 0
-    carried_over: int = 0
-    last_ms: float = 0.0
-    total_ms: float = 0.0
 
 
 class TaskAttention:
@@ -82,7 +72,6 @@ class TaskAttention:
         self._keyframe: Frame | None = None
         self._frames_since = 0
         self._kept: list[Frustum] = []
-        self.counters = AttentionCounters()
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -91,20 +80,17 @@ class TaskAttention:
         return (*self._detector.warnings, *unseen)
 
     @property
-    def spatial(self) -> SpatialFilter:
-        """The filter with its memory of objects."""
-        return self._filter
+    def remembered(self) -> tuple[Remembered, ...]:
+        """The objects that the task's nouns have named so far, where they were seen."""
+        return self._filter.remembered
 
     def attend(self, frame: Frame, rendered_depth_m: Float32[ndarray, "h w"] | None = None) -> RelevanceMap:
         """Weight 1 on the pixels of the targets that fit the task's relations."""
-        started = time.perf_counter()
         if self._needs_detection(frame):
             shown = self._detect(frame, best_depth_m(frame.depth_m, rendered_depth_m))
         else:
             shown = self._carry_over(frame)
-        relevance = merge(shown, self._graph.targets, frame)
-        self._count((time.perf_counter() - started) * 1e3)
-        return relevance
+        return merge(shown, self._graph.targets, frame)
 
     def _needs_detection(self, frame: Frame) -> bool:
         key = self._keyframe
@@ -128,9 +114,6 @@ class TaskAttention:
         ]
         lifted = [frustum_of(detection, depth_m, frame) for detection in targets]
         self._kept = [frustum for frustum in lifted if frustum is not None]
-        self.counters.keyframes += 1
-        self.counters.detections += len(detections)
-        self.counters.kept += len(targets)
         return targets
 
     def _without_anchors_as_objects(self, detections: Sequence[Detection]) -> list[Detection]:
@@ -150,16 +133,10 @@ class TaskAttention:
             table = np.asarray([box for _, box in in_view], np.float32)
             cut_again = self._segmenter.segment(frame, table)
             masks = [new if new is not None else old for new, old in zip(cut_again, masks, strict=True)]
-        self.counters.carried_over += len(in_view)
         return [
             Detection(frustum.detection.phrase, frustum.detection.score, box, mask)
             for (frustum, box), mask in zip(in_view, masks, strict=True)
         ]
-
-    def _count(self, elapsed_ms: float) -> None:
-        self.counters.frames += 1
-        self.counters.last_ms = elapsed_ms
-        self.counters.total_ms += elapsed_ms
 
 
 def merge(detections: Sequence[Detection], targets: Sequence[str], frame: Frame) -> RelevanceMap:

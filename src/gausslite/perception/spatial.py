@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float32, Float64
 from numpy import ndarray
 
 from gausslite.domain.camera import Camera
-from gausslite.domain.pose import transform_points
+from gausslite.domain.pose import UpAxis, transform_points, unit_up_axis
 from gausslite.domain.task import Predicate, Relation, TaskGraph
 from gausslite.errors import InvalidInputError
 from gausslite.perception.memory import ObjectMemory, Remembered, Sighting
@@ -31,14 +31,6 @@ class SpatialSettings:
         for name in ("near_m", "on_m"):
             if not (np.isfinite(getattr(self, name)) and getattr(self, name) > 0):
                 raise InvalidInputError(f"spatial {name}: expected a positive length, got {getattr(self, name)}")
-
-
-def unit_axis(up_axis: tuple[float, float, float]) -> Float64[ndarray, "3"]:
-    """The direction of an up axis. Raises InvalidInputError when it has none."""
-    length = float(np.linalg.norm(up_axis))
-    if not (np.isfinite(length) and length > 1e-6):
-        raise InvalidInputError(f"up axis: expected a finite vector that is not zero, got {up_axis}")
-    return np.asarray(up_axis, np.float64) / length
 
 
 def best_depth_m(
@@ -76,13 +68,13 @@ def sight(
 class SpatialFilter:
     """Evaluates the graph's relations against everything seen so far; anchors stay where they were last seen."""
 
-    def __init__(self, graph: TaskGraph, up_axis: tuple[float, float, float], settings: SpatialSettings) -> None:
+    def __init__(self, graph: TaskGraph, up_axis: UpAxis, settings: SpatialSettings) -> None:
         self._relations = {
             target: tuple(relation for relation in graph.relations if relation.target == target)
             for target in graph.targets
         }
         self._settings = settings
-        self._up = unit_axis(up_axis)
+        self._up = np.array(unit_up_axis(up_axis))
         self._memory = ObjectMemory()
 
     @property

@@ -16,9 +16,10 @@ from gausslite.datasets.simulated.scene import home_scene
 from gausslite.datasets.simulated.sensor import SensorNoise, colour_image, noisy_colour, noisy_depth
 from gausslite.datasets.simulated.trajectories import TRAJECTORY_COUNT, poses
 from gausslite.datasets.simulated.view import draw
-from gausslite.datasets.source import Source, UpAxis, require_position, unit_up_axis
+from gausslite.datasets.source import Source, require_position
 from gausslite.domain.camera import Camera
 from gausslite.domain.frame import Frame
+from gausslite.domain.pose import UpAxis, unit_up_axis
 from gausslite.domain.region import Region
 from gausslite.errors import DatasetError
 
