@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Int64
+from jaxtyping import Bool, Int64
 from numpy import ndarray
 
 from gausslite.mapping.seeding import Seeds
@@ -17,26 +17,22 @@ def insert(table: SplatTable, seeds: Seeds, newborn_opacity: float, rng: np.rand
     inactive Gaussians more transparent than a newborn give way; seeds that still do not fit are left out at random.
     """
     roi = _at_random(len(seeds.roi), table.capacity, rng)
-    _evict(table, len(roi) - table.room, _by_worth(table))
+    _evict(table, len(roi) - table.room, np.ones(table.count, np.bool_))
     table.append(seeds.roi.take(roi))
-    faint = ~table.active & (table.opacities < newborn_opacity)
-    order = _by_worth(table)
-    _evict(table, len(seeds.rest) - table.room, order[faint[order]])
+    _evict(table, len(seeds.rest) - table.room, ~table.active & (table.opacities < newborn_opacity))
     rest = _at_random(len(seeds.rest), table.room, rng)
     table.append(seeds.rest.take(rest))
     return len(roi) + len(rest)
 
 
-def _by_worth(table: SplatTable) -> Int64[ndarray, " n"]:
-    """All rows, the first to give way first."""
-    return np.lexsort((table.opacities, table.active))
-
-
-def _evict(table: SplatTable, count: int, order: Int64[ndarray, " m"]) -> None:
+def _evict(table: SplatTable, count: int, candidates: Bool[ndarray, " n"]) -> None:
+    """Drop up to `count` of the candidates, inactive before active, the most transparent first."""
     if count <= 0:
         return
+    rows = np.flatnonzero(candidates)
+    order = np.lexsort((table.opacities[rows], table.active[rows]))
     kept = np.ones(table.count, np.bool_)
-    kept[order[:count]] = False
+    kept[rows[order[:count]]] = False
     table.keep(kept)
 
 
