@@ -117,14 +117,26 @@ def test_a_registered_source_moves_depth_and_pose_and_nothing_else(tmp_path: Pat
 
 
 def test_the_text_of_a_colour_camera_reads_back() -> None:
-    camera = ColourCamera.parse("525,524.5,319.5,239.5,-0.025,0,0.001")
+    camera = ColourCamera.parse("525,524.5,319.5,239.5,-0.025,0,0.001,0,0.25,-0.5")
     assert ColourCamera.parse(str(camera)) == camera
-    assert ColourCamera.parse("525,525,320,240").offset_m == (0.0, 0.0, 0.0)
+    assert (camera.offset_m, camera.turn_deg) == ((-0.025, 0.0, 0.001), (0.0, 0.25, -0.5))
+    assert ColourCamera.parse("525,525,320,240,-0.025,0,0").turn_deg == (0.0, 0.0, 0.0)
+    np.testing.assert_array_equal(ColourCamera.parse("525,525,320,240").depth_to_colour(), np.eye(4))
+
+
+def test_a_turn_about_the_view_moves_the_image_right_over_to_down() -> None:
+    T_colour_depth = ColourCamera.parse("100,100,63.5,47.5,0,0,0,0,0,30").depth_to_colour()
+    depth_m = np.zeros((96, 128), np.float32)
+    depth_m[47:49, 103:105] = 1.0  # 40 px to the right of the centre
+    rows, columns = np.nonzero(register_depth(depth_m, DEPTH, DEPTH, T_colour_depth))
+    assert abs(columns.mean() + 0.5 - (64 + 40 * np.cos(np.pi / 6))) < 0.5
+    assert abs(rows.mean() + 0.5 - (48 + 40 * np.sin(np.pi / 6))) < 0.5
 
 
 @pytest.mark.parametrize(
     "text", ["", "525", "a,b,c,d", "525,525,320", "525,525,320,240,1", "0,525,320,240", "nan,525,320,240",
-             "525,525,inf,240", "525,525,320,240,-25,0,0", "525,525,320,240,nan,0,0"],
+             "525,525,inf,240", "525,525,320,240,-25,0,0", "525,525,320,240,nan,0,0",
+             "525,525,320,240,0,0,0,0,0,90", "525,525,320,240,0,0,0,0,0,nan"],
 )  # fmt: skip
 def test_a_bad_text_is_refused_in_one_line(text: str) -> None:
     with pytest.raises(InvalidInputError, match=r"^colour camera: expected [^\n]*$"):

@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Float64
 from numpy import ndarray
@@ -20,6 +21,7 @@ from gausslite.domain.region import Region
 from gausslite.errors import InvalidInputError
 
 _MAX_BASELINE_M = 1.0
+_MAX_TURN_DEG = 45.0
 _MAX_ZOOM = 4.0
 # a slanted surface stretches between two views: neighbours reach over the gap
 _OVERLAP = np.float32(1.1)
@@ -29,14 +31,16 @@ _MAX_SPREAD = np.float32(2.0)
 
 @dataclass(frozen=True, slots=True)
 class ColourCamera:
-    """The colour camera beside a depth camera, both looking the same way.
+    """The colour camera beside a depth camera, both looking about the same way.
 
-    intrinsics as data sets write them (pixel centres at integers), for images of the sequence's own size.
-    offset_m is the translation of T_colour_depth: where the depth camera sits, seen from the colour camera.
+    intrinsics as data sets write them (pixel centres at integers), for images of the sequence's own size. offset_m
+    is the translation of T_colour_depth, where the depth camera sits seen from the colour camera; turn_deg its
+    rotation vector, the axis times the angle.
     """
 
     intrinsics: FileIntrinsics
     offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    turn_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
         fx, fy, cx, cy = self.intrinsics.fx, self.intrinsics.fy, self.intrinsics.cx, self.intrinsics.cy
@@ -50,27 +54,33 @@ class ColourCamera:
             raise InvalidInputError(
                 f"colour camera: expected TX,TY,TZ in metres, at most {_MAX_BASELINE_M:g} each, got {came}"
             )
+        if not math.hypot(*self.turn_deg) <= _MAX_TURN_DEG:
+            came = ",".join(f"{value:g}" for value in self.turn_deg)
+            raise InvalidInputError(
+                f"colour camera: expected RX,RY,RZ, a turn of at most {_MAX_TURN_DEG:g} degrees, got {came}"
+            )
 
     @classmethod
     def parse(cls, text: str) -> ColourCamera:
-        """Read "FX,FY,CX,CY" or "FX,FY,CX,CY,TX,TY,TZ". Raises InvalidInputError."""
+        """Read FX,FY,CX,CY and perhaps TX,TY,TZ (metres) and RX,RY,RZ (degrees). Raises InvalidInputError."""
         try:
             values = [float(part) for part in text.split(",")]
         except ValueError:
             values = []
-        if len(values) not in (4, 7):
-            raise InvalidInputError(f"colour camera: expected FX,FY,CX,CY or FX,FY,CX,CY,TX,TY,TZ, got {text!r}")
-        x, y, z = values[4:] or (0.0, 0.0, 0.0)
-        return cls(FileIntrinsics(*values[:4]), (x, y, z))
+        if len(values) not in (4, 7, 10):
+            raise InvalidInputError(f"colour camera: expected FX,FY,CX,CY[,TX,TY,TZ[,RX,RY,RZ]], got {text!r}")
+        x, y, z, *turn = (*values[4:], *(0.0,) * (10 - len(values)))
+        return cls(FileIntrinsics(*values[:4]), (x, y, z), (turn[0], turn[1], turn[2]))
 
     def __str__(self) -> str:
         """The text that `parse` reads."""
         k = self.intrinsics
-        return ",".join(f"{value:.10g}" for value in (k.fx, k.fy, k.cx, k.cy, *self.offset_m))
+        return ",".join(f"{value:.10g}" for value in (k.fx, k.fy, k.cx, k.cy, *self.offset_m, *self.turn_deg))
 
     def depth_to_colour(self) -> Float64[ndarray, "4 4"]:
         """T_colour_depth: takes points of the depth camera to the colour camera."""
         T = np.eye(4)
+        T[:3, :3] = cv2.Rodrigues(np.radians(self.turn_deg))[0]
         T[:3, 3] = self.offset_m
         return T
 

@@ -26,9 +26,10 @@ def add_colour_camera(parser: argparse.ArgumentParser) -> None:
     """Add --colour-camera, for sequences whose depth is not registered to colour."""
     parser.add_argument(
         "--colour-camera",
-        metavar="FX,FY,CX,CY[,TX,TY,TZ]",
+        metavar="FX,FY,CX,CY[,TX,TY,TZ[,RX,RY,RZ]]",
         type=ColourCamera.parse,
-        help="register depth to this camera: pixels as data sets count, metres from colour to depth camera",
+        help="register depth to this camera (pixels as data sets count); then where the depth camera sits seen from it "
+        "(metres) and how it is turned (rotation vector, degrees)",
     )
 
 
