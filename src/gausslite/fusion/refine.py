@@ -19,6 +19,7 @@ from gausslite.errors import InvalidInputError, QuotaError
 from gausslite.fusion.keyframes import TeamKeyframe
 from gausslite.optimize.density import DensitySettings, densify, prune
 from gausslite.optimize.parameters import SplatTable, gaussians_to_rows
+from gausslite.optimize.rates import ONLINE_RATES
 from gausslite.render.rasterizer import AdamSettings, LossWeights, Rasterizer, TrainingView
 
 _FOOTPRINT_ALPHA = 0.5
@@ -37,7 +38,7 @@ class RefineSettings:
     report_every: int = 10
     max_prepared_views: int = 48
     loss: LossWeights = field(default_factory=LossWeights)
-    adam: AdamSettings = field(default_factory=AdamSettings)
+    adam: AdamSettings = ONLINE_RATES
     density: DensitySettings = field(default_factory=DensitySettings)
 
     def __post_init__(self) -> None:

@@ -7,6 +7,7 @@ from enum import StrEnum
 
 from gausslite.errors import InvalidInputError
 from gausslite.optimize.density import DensitySettings
+from gausslite.optimize.rates import ONLINE_RATES
 from gausslite.render.rasterizer import AdamSettings, LossWeights
 
 
@@ -87,13 +88,6 @@ class KeyframeSettings:
         for name in ("every", "window", "buffer"):
             _require(getattr(self, name) >= 1, f"keyframes {name}", "at least 1", getattr(self, name))
         _require(self.roi_margin_px >= 0, "keyframes roi_margin_px", "at least 0", self.roi_margin_px)
-
-
-ONLINE_RATES = AdamSettings(means=2e-4, log_scales=4e-2, quats=8e-3, opacity_logits=5e-2, rgb=2e-2)
-"""Adam's rates when a Gaussian is to be trained in some dozens of iterations: 8 times the customary ones for shape and
-colour, twice for the means. With the customary ones seeds that start small never grow and blend: on a real kitchen
-(320x240, 8 iterations a frame) these gave +1.7 dB in the task's region, and as much to uniform mapping.
-"""
 
 
 @dataclass(frozen=True, slots=True)
