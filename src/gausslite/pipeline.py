@@ -53,9 +53,9 @@ class TaskMapper:
         self._seconds_per_frame = seconds_per_frame
 
     @property
-    def mapper(self) -> GaussianMapper:
-        """The owner of the map."""
-        return self._mapper
+    def notes(self) -> tuple[str, ...]:
+        """What the attention wants the operator to know."""
+        return self._attention.notes
 
     def gaussians(self) -> Gaussians:
         """A copy of the map."""

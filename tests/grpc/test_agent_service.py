@@ -31,8 +31,9 @@ from gausslite.errors import (
 )
 from gausslite.fusion.memory import MemoryStore
 from gausslite.mission.settings import MissionSettings
-from gausslite.perception.attention import Attention
+from gausslite.perception.attention import Attention, TaskAttention
 from gausslite.perception.fixed import RegionAttention
+from gausslite.perception.ground_truth import RegionDetector
 from gausslite.task.rules import RuleParser
 from gausslite.v1 import agent_service_pb2 as pb
 from gausslite.v1 import agent_service_pb2_grpc as pb_grpc
@@ -58,6 +59,10 @@ class Gate:
     opened: threading.Event
     fail_at: int | None = None
     reached: threading.Event = field(default_factory=threading.Event)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        return self.inner.notes
 
     def attend(self, frame: Frame, rendered_depth_m: np.ndarray | None = None) -> RelevanceMap:
         self.reached.set()
@@ -108,6 +113,15 @@ def test_a_task_comes_in_words_or_as_a_graph() -> None:
         assert graph == RuleParser().parse(TASK)
         assert a.client.assign_task(graph) == graph
         assert convert.graph_from_message(a.client.status().graph) == graph
+
+
+def test_what_the_attention_cannot_find_is_told_to_the_operator() -> None:
+    mug = RegionDetector({"mug_1": BallRegion((0.0, 0.0, 1.2), 0.2)})
+    with agent(lambda graph: TaskAttention(graph, mug)) as a:
+        a.client.assign_task("Pick up the mug on the table")
+        assert list(a.client.status().notes) == ["anchor 'table' not seen yet: its targets are kept"]
+        list(a.client.ingest([frame(0)]))
+        assert any("no region answers 'table'" in note for note in a.client.status().notes)
 
 
 def test_a_task_without_sense_is_refused() -> None:

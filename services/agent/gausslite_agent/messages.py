@@ -58,6 +58,7 @@ def status_to_message(
             voxels_waiting=uplink.voxels_waiting,
             subsets_rejected=uplink.subsets_rejected,
         ),
+        notes=robot.notes,
     )
 
 

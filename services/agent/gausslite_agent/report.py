@@ -38,4 +38,5 @@ def mission_report(
         "uplink_stopped_because": uplink.stopped_because,
         "map_shared_percent": 100.0 * active / max(len(gaussians), 1) if sends else 0.0,
         "peak_rss_mib": peak_rss_mib(),
+        "notes": list(robot.notes),
     }

@@ -54,7 +54,7 @@ class FrameReport:
 
 @dataclass(frozen=True, slots=True)
 class RobotStatus:
-    """Totals so far; busy_s is the time spent on perception and mapping."""
+    """Totals so far; busy_s is the time spent on perception and mapping, notes what the attention has to say."""
 
     graph: TaskGraph | None = None
     map_revision: int = 0
@@ -66,6 +66,7 @@ class RobotStatus:
     iterations: int = 0
     busy_s: float = 0.0
     roi_share_sum: float = 0.0
+    notes: tuple[str, ...] = ()
 
     @property
     def hz(self) -> float:
@@ -177,7 +178,7 @@ class Robot:
         ledger = self._ledger if self.uplink is not None else None
         self._task_mapper = TaskMapper(attention, self._mapper, ledger, self._settings.seconds_per_frame)
         with self._lock:
-            self._status = replace(self._status, graph=graph)
+            self._status = replace(self._status, graph=graph, notes=attention.notes)
 
     def _map_next(self) -> None:
         with self._lock:
@@ -193,6 +194,8 @@ class Robot:
     def _map(self, frame: Frame) -> FrameReport:
         assert self._task_mapper is not None
         done = self._task_mapper.process(frame)
+        with self._lock:
+            self._status = replace(self._status, notes=self._task_mapper.notes)
         if done.skipped is not None:
             return self._count(FrameReport(frame.index, Outcome.SKIPPED, done.skipped, gaussians=done.gaussians))
         if self.uplink is not None and done.words is not None:

@@ -21,7 +21,7 @@ from gausslite.mission.build import build_attention, build_mapper
 from gausslite.mission.options import add_budget, add_detector, add_policy, mission_settings, perception_settings
 from gausslite.mission.results import peak_rss_mib, prepare_folder, write_results
 from gausslite.mission.settings import SceneKnowledge
-from gausslite.perception.attention import Attention, TaskAttention
+from gausslite.perception.attention import Attention
 from gausslite.perception.fixed import NoAttention, RegionAttention
 from gausslite.pipeline import FrameOutcome, TaskMapper
 
@@ -65,7 +65,7 @@ def run(options: argparse.Namespace) -> int:
         "active_gaussians": active,
         "max_gaussians": settings.max_gaussians,
         "peak_rss_mib": peak_rss_mib(),
-        "notes": list(attention.notes) if isinstance(attention, TaskAttention) else [],
+        "notes": list(attention.notes),
     }
     write_results(options.out, gaussians, report)
     print(

@@ -30,6 +30,11 @@ class Attention(Protocol):
         """The relevance of one frame; rendered_depth_m is drawn from the current map, 0 where it shows nothing."""
         ...
 
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What the operator should know of the frames so far, one line each."""
+        ...
+
 
 @dataclass(frozen=True, slots=True)
 class AttentionSettings:
@@ -75,7 +80,7 @@ class TaskAttention:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What a reader of the report should know: nouns without a class, anchors that never came into view."""
+        """Nouns without a class, and anchors that have not come into view."""
         unseen = (f"anchor {name!r} not seen yet: its targets are kept" for name in self._filter.unseen_anchors)
         return (*self._detector.warnings, *unseen)
 

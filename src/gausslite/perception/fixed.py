@@ -22,6 +22,11 @@ class RegionAttention:
             raise InvalidInputError("attention regions: expected at least one region, got none")
         self._regions = tuple(regions)
 
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """None: nothing has to be found."""
+        return ()
+
     def attend(self, frame: Frame, rendered_depth_m: Float32[ndarray, "h w"] | None = None) -> RelevanceMap:
         """Weight 1 on every pixel that shows a region; masks are exact without the rendered depth."""
         del rendered_depth_m
@@ -33,6 +38,11 @@ class RegionAttention:
 
 class NoAttention:
     """An Attention for uniform maps: nothing is relevant."""
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """None: nothing has to be found."""
+        return ()
 
     def attend(self, frame: Frame, rendered_depth_m: Float32[ndarray, "h w"] | None = None) -> RelevanceMap:
         """Weight 0 everywhere."""

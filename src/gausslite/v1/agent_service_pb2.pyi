@@ -6,11 +6,13 @@ One robot's mapper: takes a task and frames, shows its map and how it is doing.
 SPDX-License-Identifier: Apache-2.0
 """
 
+from collections import abc as _abc
 from gausslite.v1 import gaussians_pb2 as _gaussians_pb2
 from gausslite.v1 import geometry_pb2 as _geometry_pb2
 from gausslite.v1 import task_pb2 as _task_pb2
 from google.protobuf import descriptor as _descriptor
 from google.protobuf import message as _message
+from google.protobuf.internal import containers as _containers
 from google.protobuf.internal import enum_type_wrapper as _enum_type_wrapper
 import builtins as _builtins
 import sys
@@ -210,6 +212,7 @@ class GetAgentStatusResponse(_message.Message):
     HZ_FIELD_NUMBER: _builtins.int
     ROI_SHARE_FIELD_NUMBER: _builtins.int
     UPLINK_FIELD_NUMBER: _builtins.int
+    NOTES_FIELD_NUMBER: _builtins.int
     agent_id: _builtins.str
     state: Global___AgentState.ValueType
     map_revision: _builtins.int
@@ -226,6 +229,10 @@ class GetAgentStatusResponse(_message.Message):
     def graph(self) -> _task_pb2.TaskGraph: ...
     @_builtins.property
     def uplink(self) -> Global___UplinkStatus: ...
+    @_builtins.property
+    def notes(self) -> _containers.RepeatedScalarFieldContainer[_builtins.str]:
+        """What the operator should know: nouns that the detector has no class for, anchors not seen yet."""
+
     def __init__(
         self,
         *,
@@ -241,10 +248,11 @@ class GetAgentStatusResponse(_message.Message):
         hz: _builtins.float = ...,
         roi_share: _builtins.float = ...,
         uplink: Global___UplinkStatus | None = ...,
+        notes: _abc.Iterable[_builtins.str] | None = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["graph", b"graph", "uplink", b"uplink"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["agent_id", b"agent_id", "frames_dropped", b"frames_dropped", "frames_mapped", b"frames_mapped", "frames_rejected", b"frames_rejected", "frames_skipped", b"frames_skipped", "gaussians", b"gaussians", "graph", b"graph", "hz", b"hz", "map_revision", b"map_revision", "roi_share", b"roi_share", "state", b"state", "uplink", b"uplink"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["agent_id", b"agent_id", "frames_dropped", b"frames_dropped", "frames_mapped", b"frames_mapped", "frames_rejected", b"frames_rejected", "frames_skipped", b"frames_skipped", "gaussians", b"gaussians", "graph", b"graph", "hz", b"hz", "map_revision", b"map_revision", "notes", b"notes", "roi_share", b"roi_share", "state", b"state", "uplink", b"uplink"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
