@@ -12,12 +12,12 @@ from dataclasses import dataclass
 
 import grpc
 import numpy as np
+from sample_gaussians import plain_gaussians
 from serving import serving
 
 from gausslite.codec.subset_codec import encode_subset
 from gausslite.domain.camera import Camera
 from gausslite.domain.frame import Frame
-from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.subset import RoiSubset, VoxelWords
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.domain.words import tombstones, unite, words_of
@@ -117,19 +117,9 @@ def words(cells: dict[int, Sequence[int]]) -> VoxelWords:
     kappas = [(cell, kappa) for cell in sorted(cells) for kappa in cells[cell]]
     n = len(kappas)
     numbers = np.random.default_rng(n).random((n, 3), np.float32)
-    means = (numbers * 0.08 + 0.01 + np.array([[0.1 * cell, 0, 1.0] for cell, _ in kappas] or np.zeros((0, 3)))).astype(
-        np.float32
-    )
-    gaussians = Gaussians(
-        means,
-        np.tile(np.array([1, 0, 0, 0], np.float32), (n, 1)),
-        np.full((n, 3), 0.04, np.float32),
-        np.full(n, 0.9, np.float32),
-        numbers.copy(),
-        np.ones(n, np.bool_),
-        np.array([kappa for _, kappa in kappas], np.uint32),
-        np.zeros(n, np.int16),
-    )
+    corners = np.array([[0.1 * cell, 0, 1.0] for cell, _ in kappas] or np.zeros((0, 3)))
+    means = numbers * 0.08 + 0.01 + corners
+    gaussians = plain_gaussians(means, rgb=numbers, kappa=[kappa for _, kappa in kappas])
     return unite(words_of(gaussians, GRID), tombstones(keys(*(cell for cell in cells if not cells[cell]))))
 
 

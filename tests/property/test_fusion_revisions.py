@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from sample_gaussians import plain_gaussians
 
-from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.subset import RoiSubset, VoxelWords
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.errors import RevisionGoneError
@@ -31,12 +31,7 @@ STEPS = st.lists(
 
 
 def words(counts: dict[int, int]) -> VoxelWords:
-    n = sum(counts.values())
-    gaussians = Gaussians(
-        np.zeros((n, 3), np.float32), np.ones((n, 4), np.float32), np.ones((n, 3), np.float32),
-        np.ones(n, np.float32), np.zeros((n, 3), np.float32), np.ones(n, np.bool_), np.ones(n, np.uint32),
-        np.zeros(n, np.int16),
-    )  # fmt: skip
+    gaussians = plain_gaussians(np.zeros((sum(counts.values()), 3)), kappa=1)
     per_voxel = np.array([counts[key] for key in sorted(counts)], np.uint32)
     return VoxelWords(np.array(sorted(counts), np.int64), per_voxel.astype(np.uint64), per_voxel, gaussians)
 

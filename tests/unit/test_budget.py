@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from sample_gaussians import plain_gaussians
 
 from gausslite.domain.gaussians import Gaussians
 from gausslite.mapping.budget import insert
@@ -13,17 +14,7 @@ NEWBORN = 0.5
 
 
 def gaussians(opacities: list[float], active: bool, target: int = -1) -> Gaussians:
-    count = len(opacities)
-    return Gaussians(
-        means_m=np.zeros((count, 3), np.float32),
-        quats_wxyz=np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1)),
-        scales_m=np.full((count, 3), 0.01, np.float32),
-        opacities=np.array(opacities, np.float32),
-        rgb=np.zeros((count, 3), np.float32),
-        active=np.full(count, active),
-        kappa=np.zeros(count, np.uint32),
-        target=np.full(count, target, np.int16),
-    )
+    return plain_gaussians(np.zeros((len(opacities), 3)), opacities=opacities, active=active, target=target)
 
 
 def full_table() -> SplatTable:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from sample_gaussians import plain_gaussians
 
 from gausslite.domain.camera import Camera
 from gausslite.domain.frame import Frame
@@ -25,16 +26,7 @@ def wall(n: int = 300, seed: int = 0) -> Gaussians:
     """Opaque splats that cover the view at about two metres."""
     rng = np.random.default_rng(seed)
     means_m = np.stack([rng.uniform(-1.2, 1.2, n), rng.uniform(-1, 1, n), rng.uniform(1.9, 2.1, n)], axis=1)
-    return Gaussians(
-        means_m.astype(np.float32),
-        np.tile(np.float32([1, 0, 0, 0]), (n, 1)),
-        np.full((n, 3), 0.15, np.float32),
-        np.full(n, 0.9, np.float32),
-        rng.random((n, 3), np.float32),
-        np.ones(n, np.bool_),
-        np.zeros(n, np.uint32),
-        np.zeros(n, np.int16),
-    )
+    return plain_gaussians(means_m, scales_m=0.15, rgb=rng.random((n, 3), np.float32))
 
 
 def frame_of(gaussians: Gaussians, x_m: float = 0.0) -> Frame:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from sample_gaussians import plain_gaussians
 
 from gausslite.domain.camera import Camera
 from gausslite.domain.frame import Frame
@@ -22,17 +23,8 @@ def patch(rgb: float) -> Gaussians:
     """A grey wall patch, four by four Gaussians at 1 m."""
     grid = np.linspace(-0.15, 0.15, 4, dtype=np.float32)
     x, y = np.meshgrid(grid, grid)
-    n = x.size
-    return Gaussians(
-        np.stack([x.ravel(), y.ravel(), np.ones(n, np.float32)], axis=1).astype(np.float32),
-        np.tile(np.array([1, 0, 0, 0], np.float32), (n, 1)),
-        np.full((n, 3), 0.05, np.float32),
-        np.full(n, 0.9, np.float32),
-        np.full((n, 3), rgb, np.float32),
-        np.zeros(n, np.bool_),
-        np.zeros(n, np.uint32),
-        np.arange(n, dtype=np.int16),
-    )
+    means = np.stack([x.ravel(), y.ravel(), np.ones(x.size)], axis=1)
+    return plain_gaussians(means, scales_m=0.05, rgb=rgb, active=False, target=np.arange(x.size))
 
 
 def view(index: int, grey: int, depth_m: float = 1.0) -> TeamKeyframe:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from sample_gaussians import plain_gaussians
 
-from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.subset import RoiSubset
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.domain.words import tombstones, unite, words_of
@@ -23,13 +23,8 @@ LONG = "x" * 1_000_000
 
 def said(agent_id: str, revision: int, cells: list[tuple[int, int]], buried: tuple[int, ...] = ()) -> RoiSubset:
     """Words with one Gaussian for each (cell along x, kappa), and tombstones."""
-    n = len(cells)
-    means = np.array([(0.1 * cell + 0.05, 0.05, 0.05) for cell, _ in cells], np.float32).reshape(n, 3)
-    ones = np.ones((n, 4), np.float32)
-    gaussians = Gaussians(
-        means, ones, ones[:, :3].copy(), ones[:, 0].copy(), ones[:, :3].copy(), np.ones(n, np.bool_),
-        np.array([kappa for _, kappa in cells], np.uint32), np.zeros(n, np.int16),
-    )  # fmt: skip
+    means = [(0.1 * cell + 0.05, 0.05, 0.05) for cell, _ in cells]
+    gaussians = plain_gaussians(means, kappa=[kappa for _, kappa in cells])
     graves = np.array([(0.1 * cell + 0.05, 0.05, 0.05) for cell in sorted(buried)], np.float32).reshape(-1, 3)
     return RoiSubset(agent_id, "", revision, revision, unite(words_of(gaussians, GRID), tombstones(GRID.keys(graves))))
 

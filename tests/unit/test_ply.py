@@ -10,25 +10,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from sample_gaussians import random_gaussians
 
 from gausslite.codec.ply import gaussians_from_ply, ply_bytes, read_ply, write_ply
 from gausslite.domain.gaussians import Gaussians
 from gausslite.errors import MapFileError, StorageError
-
-
-def some_gaussians(n: int = 50) -> Gaussians:
-    rng = np.random.default_rng(1)
-    quats = rng.normal(size=(n, 4)).astype(np.float32)
-    return Gaussians(
-        rng.normal(size=(n, 3)).astype(np.float32),
-        quats / np.linalg.norm(quats, axis=1, keepdims=True),
-        rng.uniform(0.001, 0.3, (n, 3)).astype(np.float32),
-        rng.uniform(0.01, 0.99, n).astype(np.float32),
-        rng.uniform(-0.1, 1.1, (n, 3)).astype(np.float32),
-        rng.random(n) < 0.5,
-        rng.integers(0, 2**24, n, dtype=np.uint32),
-        rng.integers(-1, 5, n, dtype=np.int16),
-    )
 
 
 def assert_same(got: Gaussians, sent: Gaussians) -> None:
@@ -41,25 +27,25 @@ def assert_same(got: Gaussians, sent: Gaussians) -> None:
 @pytest.mark.parametrize("n", [0, 1, 50])
 def test_what_was_written_is_read(tmp_path: Path, n: int) -> None:
     path = tmp_path / "map.ply"
-    write_ply(path, some_gaussians(n))
-    assert_same(read_ply(path), some_gaussians(n))
+    write_ply(path, random_gaussians(n))
+    assert_same(read_ply(path), random_gaussians(n))
     assert [file.name for file in tmp_path.iterdir()] == ["map.ply"]
 
 
 def test_opacities_of_zero_and_one_survive() -> None:
-    gaussians = some_gaussians(2)
+    gaussians = random_gaussians(2)
     gaussians.opacities[:] = [0.0, 1.0]
     np.testing.assert_allclose(gaussians_from_ply(ply_bytes(gaussians)).opacities, [0, 1], atol=2e-6)
 
 
 def test_a_kappa_beyond_what_a_float_can_say_does_not_wrap() -> None:
-    gaussians = some_gaussians(1)
+    gaussians = random_gaussians(1)
     gaussians.kappa[:] = 2**32 - 1
     assert gaussians_from_ply(ply_bytes(gaussians)).kappa.tolist() == [2**32 - 1]
 
 
 def test_another_tool_reads_ours_and_we_read_its(tmp_path: Path) -> None:
-    sent = some_gaussians()
+    sent = random_gaussians(50, max_kappa=2**24)
     write_ply(tmp_path / "ours.ply", sent)
     theirs = gsply.plyread(str(tmp_path / "ours.ply"))
     np.testing.assert_allclose(theirs.means, sent.means_m)
@@ -77,7 +63,7 @@ def test_another_tool_reads_ours_and_we_read_its(tmp_path: Path) -> None:
 
 def test_columns_go_by_name() -> None:
     """Normals, f_rest, doubles, comments, another order and a second element: all of it exists in the wild."""
-    sent = some_gaussians(4)
+    sent = random_gaussians(4)
     names = ["nx", "rot_3", "rot_2", "rot_1", "rot_0", "opacity", "f_rest_0", "scale_2", "scale_1", "scale_0"]
     names += ["f_dc_0", "f_dc_1", "f_dc_2", "x", "y", "z"]
     values = np.zeros((4, len(names)))
@@ -112,7 +98,7 @@ def test_columns_go_by_name() -> None:
 )
 def test_a_damaged_map_is_one_line_that_names_the_file(tmp_path: Path, spoil: object, message: str) -> None:
     path = tmp_path / "map.ply"
-    path.write_bytes(spoil(ply_bytes(some_gaussians(3))))  # type: ignore[operator]
+    path.write_bytes(spoil(ply_bytes(random_gaussians(3))))  # type: ignore[operator]
     with pytest.raises(MapFileError, match=message) as caught:
         read_ply(path)
     assert str(path) in str(caught.value)
@@ -127,7 +113,7 @@ def test_a_missing_map_is_a_map_file_error(tmp_path: Path) -> None:
 @given(st.data())
 @settings(max_examples=200, deadline=None)
 def test_a_flipped_byte_never_raises_anything_else(data: st.DataObject) -> None:
-    file = bytearray(ply_bytes(some_gaussians(2)))
+    file = bytearray(ply_bytes(random_gaussians(2)))
     for _ in range(data.draw(st.integers(1, 3))):
         file[data.draw(st.integers(0, len(file) - 1))] = data.draw(st.integers(0, 255))
     try:
@@ -141,15 +127,15 @@ def test_a_flipped_byte_never_raises_anything_else(data: st.DataObject) -> None:
 
 def test_a_full_disk_keeps_the_old_map_and_says_so(tmp_path: Path) -> None:
     path = tmp_path / "map.ply"
-    write_ply(path, some_gaussians(3))
+    write_ply(path, random_gaussians(3))
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (1000, limits[1]))
     try:
         with pytest.raises(StorageError, match="cannot be written"):
-            write_ply(path, some_gaussians(500))
+            write_ply(path, random_gaussians(500))
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-    assert_same(read_ply(path), some_gaussians(3))
+    assert_same(read_ply(path), random_gaussians(3))
     assert [file.name for file in tmp_path.iterdir()] == ["map.ply"]
     with pytest.raises(StorageError, match="cannot be written"):
-        write_ply(tmp_path / "no" / "map.ply", some_gaussians(3))
+        write_ply(tmp_path / "no" / "map.ply", random_gaussians(3))
