@@ -1,0 +1,192 @@
+"""Find the colour camera of an unregistered sensor from its images: edges of depth should fall on edges of colour.
+
+Where depth jumps, colour usually changes too. The depth edges of all frames are projected by a candidate camera into
+their colour images, and the candidate is scored by how strong colour's gradient is there against its surroundings.
+A pattern search climbs that score from the depth camera itself, on blurred images first.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float32, Float64, UInt8
+from numpy import ndarray
+
+from gausslite.datasets.intrinsics import FileIntrinsics
+from gausslite.datasets.registration import ColourCamera
+from gausslite.domain.camera import Camera
+from gausslite.domain.frame import Frame
+from gausslite.domain.pose import transform_points
+from gausslite.errors import DatasetError
+
+_MIN_EDGE_POINTS = 1000
+_JUMP_M, _JUMP_SHARE = 0.06, 0.05
+_MAX_GAP_PX = 16
+_SURROUNDINGS_PX = 12.0
+_FAINT, _STRONGEST = 2.0, 4.0
+_BLURS_PX = (4.0, 2.0, 1.0)
+_HALVINGS = 5
+_FINER = 0.25
+_LEAST_GAIN = 1e-6
+# zoom against the depth camera; shift in pixels (x, y); offset in metres (x, y); roll in degrees
+_FIRST_STEPS = np.array([0.03, 8.0, 8.0, 0.016, 0.016, 0.5])
+
+
+@dataclass(frozen=True, slots=True)
+class Alignment:
+    """The camera found and how well depth edges meet colour edges: 1 is chance, more is better.
+
+    score_before takes the depth camera for the colour camera, as if the images were registered.
+    """
+
+    camera: ColourCamera
+    score: float
+    score_before: float
+    edge_points: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Edges:
+    """One frame's points of the depth camera on the near side of jumps along rows and along columns."""
+
+    along_rows: Float64[ndarray, "n 3"]
+    along_columns: Float64[ndarray, "m 3"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Gradients:
+    """One colour image's gradient along rows and along columns, relative to its surroundings."""
+
+    along_rows: Float32[ndarray, "h w"]
+    along_columns: Float32[ndarray, "h w"]
+
+
+def align(frames: Sequence[Frame]) -> Alignment:
+    """Estimate focal length, principal point, offset in x and y, and roll; 40 frames of a furnished room are plenty.
+
+    The other three numbers of a pose are left at zero: a tilt of a degree looks like a moved principal point, and an
+    offset along the view like a zoom. Raises DatasetError when the depth images hold too few edges.
+    """
+    edges = [_depth_edges(frame) for frame in frames]
+    depths_m = np.concatenate(
+        [np.zeros(0), *(e.along_rows[:, 2] for e in edges), *(e.along_columns[:, 2] for e in edges)]
+    )
+    if len(depths_m) < _MIN_EDGE_POINTS:
+        raise DatasetError(f"alignment: expected at least {_MIN_EDGE_POINTS} depth edge points, got {len(depths_m)}")
+    depth_camera, reference_m = frames[0].camera, float(np.median(depths_m))
+    guess, steps, gradients = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0]), _FIRST_STEPS, list[_Gradients]()
+
+    def score(candidate: Float64[ndarray, "6"]) -> float:
+        return _score(_camera_of(candidate, depth_camera, reference_m), edges, gradients)
+
+    start = guess
+    for blur_px in _BLURS_PX:
+        gradients[:] = [_relative_gradients(frame.rgb, blur_px) for frame in frames]
+        guess, steps = _climb(score, guess, steps), steps * _FINER
+    return Alignment(_camera_of(guess, depth_camera, reference_m), score(guess), score(start), len(depths_m))
+
+
+def _camera_of(candidate: Float64[ndarray, "6"], depth_camera: Camera, reference_m: float) -> ColourCamera:
+    """The candidate as a camera, rounded to what the method can tell.
+
+    The shift is that of a point at the reference depth: beside it the offset can be climbed alone, while the
+    principal point and the offset make up for each other.
+    """
+    zoom, shift_x_px, shift_y_px, offset_x_m, offset_y_m, roll_deg = candidate.tolist()
+    fx, fy = depth_camera.fx_px * zoom, depth_camera.fy_px * zoom
+    cx = depth_camera.cx_px - 0.5 + shift_x_px - fx * offset_x_m / reference_m
+    cy = depth_camera.cy_px - 0.5 + shift_y_px - fy * offset_y_m / reference_m
+    intrinsics = FileIntrinsics(round(fx, 2), round(fy, 2), round(cx, 2), round(cy, 2))
+    return ColourCamera(intrinsics, (round(offset_x_m, 4), round(offset_y_m, 4), 0.0), (0.0, 0.0, round(roll_deg, 3)))
+
+
+def _climb(
+    score: Callable[[Float64[ndarray, "k"]], float], start: Float64[ndarray, "k"], steps: Float64[ndarray, "k"]
+) -> Float64[ndarray, "k"]:
+    """Pattern search: step along one number at a time while that helps, then halve the steps."""
+    best, best_score = start, score(start)
+    for halving in range(_HALVINGS):
+        improved = True
+        while improved:
+            improved = False
+            for step in (*np.diag(steps), *np.diag(-steps)):
+                tried = best + step / 2**halving
+                while (tried_score := score(tried)) > best_score + _LEAST_GAIN:
+                    best, best_score, improved = tried, tried_score, True
+                    tried = best + step / 2**halving
+    return best
+
+
+def _score(camera: ColourCamera, edges: Sequence[_Edges], gradients: Sequence[_Gradients]) -> float:
+    """The mean relative gradient of colour at the projected depth edges that fall into the image."""
+    sampled = []
+    for edge, gradient in zip(edges, gradients, strict=True):
+        sampled.append(_sample(gradient.along_rows, camera, edge.along_rows))
+        sampled.append(_sample(gradient.along_columns, camera, edge.along_columns))
+    values = np.concatenate(sampled)
+    return float(values.mean()) if len(values) else 0.0
+
+
+def _sample(
+    image: Float32[ndarray, "h w"], camera: ColourCamera, points: Float64[ndarray, "n 3"]
+) -> Float32[ndarray, " k"]:
+    """The image where the camera sees these points, between pixels linearly; points outside are left out."""
+    seen = transform_points(camera.depth_to_colour(), points)
+    k, z_m = camera.intrinsics, seen[:, 2]
+    columns = (seen[:, 0] / z_m * k.fx + k.cx).astype(np.float32)
+    rows = (seen[:, 1] / z_m * k.fy + k.cy).astype(np.float32)
+    inside = (columns >= 0) & (columns <= image.shape[1] - 1) & (rows >= 0) & (rows <= image.shape[0] - 1)
+    # the sampler takes at most 32767 points in a row of its map
+    sampled: Float32[ndarray, "k 1"] = cv2.remap(image, columns[inside, None], rows[inside, None], cv2.INTER_LINEAR)
+    return sampled[:, 0]
+
+
+def _relative_gradients(rgb: UInt8[ndarray, "h w 3"], blur_px: float) -> _Gradients:
+    grey = cv2.GaussianBlur(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32), (0, 0), blur_px)
+    return _Gradients(_against_surroundings(grey, 1, 0), _against_surroundings(grey, 0, 1))
+
+
+def _against_surroundings(grey: Float32[ndarray, "h w"], dx: int, dy: int) -> Float32[ndarray, "h w"]:
+    """So that one bright poster does not outweigh the rest of the room."""
+    gradient = np.abs(cv2.Sobel(grey, cv2.CV_32F, dx, dy, ksize=3))
+    around = cv2.GaussianBlur(gradient, (0, 0), _SURROUNDINGS_PX)
+    relative: Float32[ndarray, "h w"] = np.minimum(gradient / (around + np.float32(_FAINT)), np.float32(_STRONGEST))
+    return relative
+
+
+def _depth_edges(frame: Frame) -> _Edges:
+    """Points on the borders between pixels where depth jumps, at the nearer pixel's depth."""
+    rows, columns, z_m = _jumps(frame.depth_m)
+    along_rows = _lift(columns + 1.0, rows + 0.5, z_m, frame.camera)
+    columns, rows, z_m = _jumps(np.ascontiguousarray(frame.depth_m.T))
+    return _Edges(along_rows, _lift(columns + 0.5, rows + 1.0, z_m, frame.camera))
+
+
+def _jumps(depth_m: Float32[ndarray, "h w"]) -> tuple[ndarray, ndarray, Float64[ndarray, " n"]]:
+    """Row and column of every pixel before a jump along its row, and the nearer depth."""
+    filled = _fill_shadows(depth_m)
+    nearer = np.minimum(filled[:, :-1], filled[:, 1:])
+    jump_m = np.abs(filled[:, 1:] - filled[:, :-1])
+    rows, columns = np.nonzero((nearer > 0) & (jump_m > np.maximum(_JUMP_M, _JUMP_SHARE * nearer)))
+    return rows, columns, nearer[rows, columns].astype(np.float64)
+
+
+def _fill_shadows(depth_m: Float32[ndarray, "h w"]) -> Float32[ndarray, "h w"]:
+    """Give short gaps in a row the farther of their ends: sensors see nothing in the shadow beside an object."""
+    width = depth_m.shape[1]
+    seen: Bool[ndarray, "h w"] = depth_m > 0
+    columns = np.arange(width)
+    before = np.maximum.accumulate(np.where(seen, columns, -width), axis=1)
+    after = np.minimum.accumulate(np.where(seen, columns, 2 * width)[:, ::-1], axis=1)[:, ::-1]
+    ends = [np.take_along_axis(depth_m, np.clip(end, 0, width - 1), axis=1) for end in (before, after)]
+    return np.where(~seen & (after - before <= _MAX_GAP_PX), np.maximum(*ends), depth_m)
+
+
+def _lift(
+    u_px: Float64[ndarray, " n"], v_px: Float64[ndarray, " n"], z_m: Float64[ndarray, " n"], camera: Camera
+) -> Float64[ndarray, "n 3"]:
+    x_m, y_m = (u_px - camera.cx_px) / camera.fx_px * z_m, (v_px - camera.cy_px) / camera.fy_px * z_m
+    return np.stack([x_m, y_m, z_m], axis=1)
