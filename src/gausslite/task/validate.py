@@ -18,6 +18,8 @@ class TaskLimits:
     max_targets: int = 16
     max_anchors: int = 16
     max_phrase_chars: int = 64
+    max_relations: int = 64
+    max_warnings: int = 64
 
 
 LIMITS = TaskLimits()
@@ -27,17 +29,27 @@ def require_task_text(text: str, limits: TaskLimits = LIMITS) -> None:
     """Raise TaskError unless the text has a letter in it and is short enough to be one task."""
     if len(text) > limits.max_text_chars:
         raise TaskError(f"task text: expected at most {limits.max_text_chars} characters, got {len(text)}")
+    # how Python carries bytes that are no UTF-8; no message and no file could hold them
+    if any("\ud800" <= character <= "\udfff" for character in text):
+        raise TaskError(f"task text: expected UTF-8, got bytes of another encoding in {text.strip()!r}")
     if not any(character.isalpha() for character in text):
         raise TaskError(f"task text: expected a sentence that names an object, such as {EXAMPLE}, got {text.strip()!r}")
 
 
 def require_graph(graph: TaskGraph, limits: TaskLimits = LIMITS) -> None:
-    """Raise TaskError unless the graph is within bounds and its relations join nouns that it lists."""
-    require_task_text(graph.text, limits)
+    """Raise TaskError unless the graph is within bounds and its relations join nouns that it lists.
+
+    A graph that was made without words has an empty text.
+    """
+    if graph.text:
+        require_task_text(graph.text, limits)
     if not graph.targets:
         raise TaskError(f"task targets: expected at least one object, such as in {EXAMPLE}, got none")
     _require_phrases("targets", graph.targets, limits.max_targets, limits.max_phrase_chars)
     _require_phrases("anchors", graph.anchors, limits.max_anchors, limits.max_phrase_chars)
+    if len(graph.relations) > limits.max_relations or len(graph.warnings) > limits.max_warnings:
+        most = f"{limits.max_relations} relations and {limits.max_warnings} warnings"
+        raise TaskError(f"task: expected at most {most}, got {len(graph.relations)} and {len(graph.warnings)}")
     for relation in graph.relations:
         if relation.target not in graph.targets:
             raise TaskError(f"task {relation.predicate}: expected one of the targets first, got {relation.target!r}")

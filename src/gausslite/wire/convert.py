@@ -16,13 +16,11 @@ from gausslite.domain.subset import VoxelWords
 from gausslite.domain.task import Predicate, Relation, TaskGraph
 from gausslite.domain.voxels import Box, VoxelGrid
 from gausslite.errors import InvalidInputError, TaskError
+from gausslite.task.validate import require_graph
 from gausslite.v1 import gaussians_pb2, geometry_pb2, task_pb2
 from gausslite.wire.images import decode_colour, decode_depth, encode_colour, encode_depth
 
 MAX_IMAGE_PX = 1 << 23
-_MAX_PHRASES = 64
-_MAX_PHRASE_CHARS = 200
-_MAX_TEXT_CHARS = 4096
 
 _PREDICATES = {
     Predicate.NEAR: task_pb2.PREDICATE_NEAR,
@@ -60,30 +58,20 @@ def graph_to_message(graph: TaskGraph) -> task_pb2.TaskGraph:
 
 
 def graph_from_message(message: task_pb2.TaskGraph) -> TaskGraph:
-    """A checked task graph. Raises TaskError."""
-    phrases = [*message.targets, *message.anchors]
-    if not message.targets or len(phrases) > _MAX_PHRASES or len(message.relations) > _MAX_PHRASES:
-        raise TaskError(f"task graph: expected 1 to {_MAX_PHRASES} targets and anchors, got {len(phrases)}")
-    if any(not phrase.strip() or len(phrase) > _MAX_PHRASE_CHARS for phrase in phrases):
-        raise TaskError(f"task graph: expected phrases of 1 to {_MAX_PHRASE_CHARS} characters, got one outside")
-    if len(message.text) > _MAX_TEXT_CHARS or len(message.warnings) > _MAX_PHRASES:
-        raise TaskError(f"task graph: expected a text of at most {_MAX_TEXT_CHARS} characters and few warnings")
+    """A task graph within the bounds of `task.validate`. Raises TaskError."""
     for relation in message.relations:
         if relation.predicate not in _PREDICATES_BACK:
-            raise TaskError(f"task graph: unknown predicate {relation.predicate}")
-        if relation.target not in message.targets or relation.anchor not in message.anchors:
-            raise TaskError(
-                f"task graph: expected relations of a target to an anchor, got {relation.target!r}, {relation.anchor!r}"
-            )
-    relations = (Relation(_PREDICATES_BACK[r.predicate], r.target, r.anchor) for r in message.relations)
-    return TaskGraph(
+            raise TaskError(f"task relation: expected near, on or closest_to, got predicate {relation.predicate}")
+    graph = TaskGraph(
         message.task_id,
         message.text,
         tuple(message.targets),
         tuple(message.anchors),
-        tuple(relations),
+        tuple(Relation(_PREDICATES_BACK[each.predicate], each.target, each.anchor) for each in message.relations),
         tuple(message.warnings),
     )
+    require_graph(graph)
+    return graph
 
 
 def camera_to_message(camera: Camera) -> geometry_pb2.Camera:
