@@ -83,10 +83,27 @@ def test_an_address_in_use_is_one_line_and_code_2() -> None:
     assert "in use" in ended.stderr
 
 
-@pytest.mark.parametrize("listen", ["nowhere", "localhost:port", "localhost:70000", ":50051", ""])
+@pytest.mark.parametrize("listen", ["nowhere", "localhost:port", "localhost:70000", ":50051", "", "h:" + "9" * 5000])
 def test_what_is_no_address_is_refused(listen: str) -> None:
     with pytest.raises(InvalidInputError, match="HOST:PORT"):
         asyncio.run(start_server(listen, []))
+
+
+def test_a_socket_that_cannot_be_is_one_line_and_code_2(tmp_path: Path) -> None:
+    (tmp_path / "notes").write_text("mine")
+    sockets = {
+        "1 to 107 bytes": ("", "/tmp/" + "x" * 200),
+        "folder": (str(tmp_path / "nowhere" / "x.sock"),),
+        "in the way": (str(tmp_path / "notes"),),
+    }
+    for reason, paths in sockets.items():
+        for path in paths:
+            command = [sys.executable, "-m", "gausslite_parser", "--listen", f"unix:{path}"]
+            ended = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+            assert ended.returncode == 2
+            [line] = ended.stderr.splitlines()
+            assert reason in line
+    assert (tmp_path / "notes").read_text() == "mine"
 
 
 def test_nobody_there_is_unavailable() -> None:

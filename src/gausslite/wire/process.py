@@ -37,4 +37,7 @@ def run_service(program: str, serve: Callable[[], Awaitable[None]]) -> int:
     except GaussLiteError as error:
         print(f"{program}: {error}", file=sys.stderr)
         return 2
+    except KeyboardInterrupt:
+        # Ctrl-C before the server took over the signal
+        return 130
     return 0

@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import os
 import signal
 import socket
 from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, NoReturn
 
 import grpc
@@ -25,6 +27,8 @@ MAX_MESSAGE_BYTES = 16 << 20
 """Both ends refuse more; a frame of two megapixels with PNG depth fits several times."""
 
 _log = logging.getLogger(__name__)
+# what the system keeps of a unix socket's path
+_MAX_SOCKET_PATH_BYTES = 107
 _OPTIONS = (
     ("grpc.max_receive_message_length", MAX_MESSAGE_BYTES),
     ("grpc.max_send_message_length", MAX_MESSAGE_BYTES),
@@ -174,13 +178,10 @@ def _require_free(listen: str) -> None:
     its own to stderr about a port in use.
     """
     if listen.startswith("unix:"):
-        with socket.socket(socket.AF_UNIX) as probe:
-            probe.settimeout(1.0)
-            if probe.connect_ex(listen.removeprefix("unix:")) == 0:
-                raise UnavailableError(f"listen {listen}: another server answers on this socket; choose another")
+        _require_free_socket(listen, Path(listen.removeprefix("unix:")))
         return
     host, _, port = listen.rpartition(":")
-    if not host or not port.isdigit() or int(port) > 65535:
+    if not host or not (port.isascii() and port.isdigit() and len(port) <= 5) or int(port) > 65535:
         raise InvalidInputError(f"listen: expected HOST:PORT or unix:PATH, got {listen!r}")
     try:
         resolved = socket.getaddrinfo(host.strip("[]"), int(port), type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
@@ -190,3 +191,18 @@ def _require_free(listen: str) -> None:
                 probe.bind(address)
     except OSError as error:
         raise UnavailableError(f"listen {listen}: {error.strerror or error}; choose another address") from error
+
+
+def _require_free_socket(listen: str, path: Path) -> None:
+    if not path.name or len(str(path).encode(errors="surrogateescape")) > _MAX_SOCKET_PATH_BYTES:
+        raise InvalidInputError(
+            f"listen {listen[:80]}: expected unix:PATH with a path of 1 to {_MAX_SOCKET_PATH_BYTES} bytes"
+        )
+    if path.exists() and not path.is_socket():
+        raise UnavailableError(f"listen {listen}: a file is in the way; choose another path")
+    if not os.access(path.parent, os.W_OK):
+        raise UnavailableError(f"listen {listen}: expected a path in a folder that can be written; choose another")
+    with socket.socket(socket.AF_UNIX) as probe:
+        probe.settimeout(1.0)
+        if probe.connect_ex(str(path)) == 0:
+            raise UnavailableError(f"listen {listen}: another server answers on this socket; choose another")
