@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,10 +14,13 @@ from numpy import ndarray
 from numpy.typing import NDArray
 
 from gausslite.domain.camera import Camera
+from gausslite.domain.image_bytes import image_size
 from gausslite.errors import DatasetError
 
 _ENDINGS = {".png": b"IEND\xaeB`\x82", ".jpg": b"\xff\xd9", ".jpeg": b"\xff\xd9"}
 _ENDING_WINDOW_BYTES = 64
+_MAX_IMAGE_PX = 1 << 26
+_PNG_START = 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,10 +93,24 @@ def _decode(path: Path, flags: int) -> NDArray[Any]:
     ending = _ENDINGS.get(path.suffix.lower(), b"")
     if ending not in data[-_ENDING_WINDOW_BYTES:]:
         raise DatasetError(f"{path}: expected a whole image file, got one cut short or of another format")
+    _require_sound(path, data)
     image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     if image is None:
         raise DatasetError(f"{path}: expected an image, got bytes that cannot be decoded")
     return np.asarray(image)
+
+
+def _require_sound(path: Path, data: bytes) -> None:
+    """Refuse what would take all memory, and PNGs whose damage the decoder would announce in lines of its own."""
+    width_px, height_px = image_size(data) or (0, 0)
+    if not 1 <= width_px * height_px <= _MAX_IMAGE_PX:
+        raise DatasetError(f"{path}: expected an image of 1 to {_MAX_IMAGE_PX} pixels, got {width_px}x{height_px}")
+    place = _PNG_START if path.suffix.lower() == ".png" else len(data)
+    while place + 12 <= len(data):
+        end = place + 8 + int.from_bytes(data[place : place + 4], "big")
+        if zlib.crc32(data[place + 4 : end]) != int.from_bytes(data[end : end + 4], "big"):
+            raise DatasetError(f"{path}: expected an undamaged image, got one whose checksum is wrong")
+        place = end + 4
 
 
 def _size(image: NDArray[Any]) -> str:

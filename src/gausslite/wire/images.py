@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-import struct
-
 import numpy as np
 from jaxtyping import Float32, UInt8
 from numpy import ndarray
 
+from gausslite.domain.image_bytes import image_size
 from gausslite.errors import InvalidInputError
 
 JPEG_QUALITY = 95
 _MM_PER_M = 1000.0
 _MAX_DEPTH_MM = 65535
-_PNG, _JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
-# start-of-frame markers carry the size; C4, C8 and CC are tables
-_JPEG_SIZE_MARKERS = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 
 
 def encode_colour(rgb: UInt8[ndarray, "h w 3"], lossless: bool = False) -> bytes:
@@ -56,24 +52,6 @@ def decode_depth(data: bytes, width_px: int, height_px: int) -> Float32[ndarray,
     if image is None or image.shape != (height_px, width_px) or image.dtype != np.uint16:
         raise InvalidInputError("frame depth_png: expected a one-channel 16-bit PNG, got something else")
     return (image.astype(np.float64) / _MM_PER_M).astype(np.float32)
-
-
-def image_size(data: bytes) -> tuple[int, int] | None:
-    """(width, height) in pixels as a PNG or JPEG declares them; None when the bytes are neither."""
-    if data.startswith(_PNG) and len(data) >= 24:
-        width, height = struct.unpack_from(">II", data, 16)
-        return int(width), int(height)
-    if not data.startswith(_JPEG):
-        return None
-    place = 2
-    while place + 9 <= len(data) and data[place] == 0xFF:
-        marker = data[place + 1]
-        if marker in _JPEG_SIZE_MARKERS:
-            height, width = struct.unpack_from(">HH", data, place + 5)
-            return int(width), int(height)
-        # a run of FF bytes is padding before a marker
-        place += 1 if marker == 0xFF else 2 + struct.unpack_from(">H", data, place + 2)[0]
-    return None
 
 
 def _require_size(name: str, data: bytes, width_px: int, height_px: int) -> None:
