@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import io
+import zipfile
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -21,6 +24,19 @@ def cut(path: Path) -> None:
     path.write_bytes(path.read_bytes()[:-40])
 
 
+def flip(path: Path) -> None:
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 0x55
+    path.write_bytes(data)
+
+
+def declare_huge(path: Path) -> None:
+    header = b"IHDR" + (30_000).to_bytes(4, "big") * 2 + b"\x08\x02\0\0\0"
+    data = bytearray(path.read_bytes())
+    data[12:33] = header + zlib.crc32(header).to_bytes(4, "big")
+    path.write_bytes(data)
+
+
 def read_all(folder: Path) -> None:
     source = open_source(str(folder))
     for i in range(len(source)):
@@ -37,6 +53,8 @@ SEVEN_POSE = "frame-000004.pose.txt"
 CASES: list[tuple[str, Damage, type[GaussLiteError], str]] = [
     ("tum", lambda f: (f / "rgb/1.png").unlink(), DatasetError, "1.png: expected an image, there is none"),
     ("tum", lambda f: cut(f / "depth/1.png"), DatasetError, "depth/1.png: expected a whole image"),
+    ("tum", lambda f: flip(f / "depth/1.png"), DatasetError, "depth/1.png: expected an undamaged image"),
+    ("tum", lambda f: declare_huge(f / "rgb/1.png"), DatasetError, "rgb/1.png: .* got 30000x30000"),
     ("tum", lambda f: write_depth(f / "depth/1.png", width=8), DatasetError, "depth/1.png: expected the size of 1.png"),
     ("tum", lambda f: (f / "depth.txt").unlink(), DatasetError, "depth.txt: expected a text file"),
     ("tum", lambda f: (f / "groundtruth.txt").unlink(), DatasetError, "groundtruth.txt: expected a text file"),
@@ -191,6 +209,7 @@ def test_regions_come_back_by_name(tmp_path: Path) -> None:
         ({"mug": np.zeros((0, 3), np.int16), "voxel_size_m": np.array(0.02)}, "mug: expected integers"),
         ({"mug": np.zeros((1, 3)), "voxel_size_m": np.array(0.02)}, "mug: expected integers"),
         ({"mug": np.array([[0, 0, 0], [30000, 0, 0]]), "voxel_size_m": np.array(0.02)}, "mug: expected at most 512"),
+        ({"mug": np.array([[1 << 62, 0, 0]]), "voxel_size_m": np.array(0.02)}, "mug: expected voxels within"),
         ({"mug": np.array([[None]], object), "voxel_size_m": np.array(0.02)}, "plain arrays"),
         ({"voxel_size_m": np.array(0.02)}, "at least one object"),
     ],
@@ -207,6 +226,21 @@ def test_a_damaged_regions_file_is_named(tmp_path: Path, content: bytes) -> None
     path = tmp_path / "regions.npz"
     path.write_bytes(content)
     with pytest.raises(DatasetError, match=r"regions.npz: expected a readable"):
+        load_voxel_regions(path)
+
+
+def test_regions_that_would_take_all_memory_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "regions.npz"
+    declared = io.BytesIO()
+    np.lib.format.write_array_header_1_0(declared, {"descr": "<i8", "fortran_order": False, "shape": (10**13, 3)})
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("mug.npy", declared.getvalue())
+    with pytest.raises(DatasetError, match=r"regions.npz: expected a readable"):
+        load_voxel_regions(path)
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive, archive.open("mug.npy", "w") as member:
+        for _ in range(260):
+            member.write(bytes(1 << 20))
+    with pytest.raises(DatasetError, match=r"regions.npz: expected at most"):
         load_voxel_regions(path)
 
 

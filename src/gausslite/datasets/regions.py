@@ -13,6 +13,8 @@ from gausslite.errors import DatasetError, InvalidInputError
 
 _SIZE_KEY = "voxel_size_m"
 _MAX_SIDE_VOXELS = 512
+_MAX_INDEX = 100_000
+_MAX_UNPACKED_BYTES = 1 << 28
 _SMALL_OBJECT_M = 0.25
 _SMALL_OBJECT_RADIUS_M = 0.10
 
@@ -23,12 +25,13 @@ def load_voxel_regions(path: Path) -> dict[str, VoxelRegion]:
     Raises DatasetError naming the file, and the array where one is wrong.
     """
     try:
+        _require_small(path)
         # never unpickle: the file may come from anywhere
         with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
             arrays = {name: np.asarray(stored[name]) for name in stored.files}
     except FileNotFoundError:
         raise DatasetError(f"{path}: expected a file of regions (.npz), there is none") from None
-    except (OSError, ValueError, EOFError, AttributeError, TypeError, zipfile.BadZipFile) as error:
+    except (OSError, ValueError, EOFError, AttributeError, TypeError, MemoryError, zipfile.BadZipFile) as error:
         raise DatasetError(f"{path}: expected a readable .npz of plain arrays, got {type(error).__name__}") from None
     size = arrays.pop(_SIZE_KEY, None)
     if size is None or size.size != 1 or size.dtype.kind not in "fiu" or not 1e-3 <= float(size.reshape(())) <= 10:
@@ -37,6 +40,8 @@ def load_voxel_regions(path: Path) -> dict[str, VoxelRegion]:
     for name, voxels in arrays.items():
         if voxels.ndim != 2 or voxels.shape[1] != 3 or len(voxels) == 0 or voxels.dtype.kind not in "iu":
             raise DatasetError(f"{path}: {name}: expected integers [n, 3], got {voxels.dtype} {voxels.shape}")
+        if float(voxels.max()) > _MAX_INDEX or float(voxels.min()) < -_MAX_INDEX:
+            raise DatasetError(f"{path}: {name}: expected voxels within ±{_MAX_INDEX}, got one beyond")
         side = int((voxels.max(axis=0).astype(np.int64) - voxels.min(axis=0).astype(np.int64)).max()) + 1
         if side > _MAX_SIDE_VOXELS:
             raise DatasetError(f"{path}: {name}: expected at most {_MAX_SIDE_VOXELS} voxels along an axis, got {side}")
@@ -70,3 +75,11 @@ def choose_regions(regions: Mapping[str, Region], names: Sequence[str]) -> list[
         known = ", ".join(sorted(regions)) or "none"
         raise InvalidInputError(f"objects: expected names among {known}; got {', '.join(unknown) or 'none'}")
     return [regions[name] for name in names] if names else list(regions.values())
+
+
+def _require_small(path: Path) -> None:
+    """A few bytes of zip can unpack to more than there is memory for."""
+    with zipfile.ZipFile(path) as archive:
+        unpacked = sum(member.file_size for member in archive.infolist())
+    if unpacked > _MAX_UNPACKED_BYTES:
+        raise DatasetError(f"{path}: expected at most {_MAX_UNPACKED_BYTES} bytes of regions, got {unpacked}")
