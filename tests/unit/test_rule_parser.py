@@ -60,6 +60,11 @@ def test_text_that_names_nothing_is_refused_in_one_line(text):
     assert "\n" not in str(caught.value)
 
 
+def test_bytes_of_another_encoding_are_refused():
+    with pytest.raises(TaskError, match="expected UTF-8"):
+        RuleParser().parse("find the m\udcffg")
+
+
 def test_text_that_is_too_long_is_refused():
     with pytest.raises(TaskError, match="at most 1000 characters, got 1001"):
         RuleParser().parse("a" * 1001)

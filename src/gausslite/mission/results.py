@@ -32,8 +32,8 @@ def write_results(folder: Path, gaussians: Gaussians, report: Mapping[str, objec
 
 
 def write_json(path: Path, report: Mapping[str, object]) -> None:
-    """Write a report. Raises StorageError."""
-    write_whole(path, (as_text(report) + "\n").encode())
+    """Write a report; bytes of a path that are no text become JSON's own escapes. Raises StorageError."""
+    write_whole(path, (as_text(report) + "\n").encode(errors="backslashreplace"))
 
 
 def as_text(report: Mapping[str, object]) -> str:
