@@ -98,6 +98,12 @@ def test_to_gaussians_copies() -> None:
     np.testing.assert_array_equal(copied.kappa, expected.kappa)
 
 
+@pytest.mark.parametrize("capacity", [10**12, 10**18, 10**30])
+def test_more_than_memory_is_refused_by_name(capacity: int) -> None:
+    with pytest.raises(InvalidInputError, match="max_gaussians: expected as many as there is memory for"):
+        SplatTable(capacity)
+
+
 def test_bad_arguments_are_named() -> None:
     with pytest.raises(InvalidInputError, match="capacity"):
         SplatTable(0)

@@ -25,17 +25,20 @@ class SplatTable:
     """
 
     def __init__(self, capacity: int) -> None:
-        """Reserve room for `capacity` Gaussians. Raises InvalidInputError when capacity is not positive."""
+        """Reserve room for `capacity` Gaussians. Raises InvalidInputError below 1 and beyond memory."""
         if capacity < 1:
             raise InvalidInputError(f"table capacity: expected at least 1 Gaussian, got {capacity}")
         self._capacity = capacity
         self._count = 0
-        self._rows = _row_memory(capacity)
-        self._first_moment = _row_memory(capacity)
-        self._second_moment = _row_memory(capacity)
-        self._active = np.zeros(capacity, np.bool_)
-        self._kappa = np.zeros(capacity, np.uint32)
-        self._target = np.zeros(capacity, np.int16)
+        try:
+            self._rows, self._first_moment, self._second_moment = (_row_memory(capacity) for _ in range(3))
+            self._active = np.zeros(capacity, np.bool_)
+            self._kappa = np.zeros(capacity, np.uint32)
+            self._target = np.zeros(capacity, np.int16)
+        except (OSError, MemoryError, OverflowError, ValueError):
+            raise InvalidInputError(
+                f"max_gaussians: expected as many as there is memory for, 200 bytes each, got {capacity}"
+            ) from None
 
     def __len__(self) -> int:
         return self._count
