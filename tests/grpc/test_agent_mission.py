@@ -169,6 +169,14 @@ def test_what_is_wrong_is_raised_before_or_when_it_is_met(tmp_path: Path) -> Non
         (["--listen", "nowhere"], "HOST:PORT"),
         (["--out", "/dev/null/x"], "/dev/null/x"),
         (["--uplink-kbps", "0"], "kbps"),
+        (["--drain-timeout", "nan"], "--drain-timeout"),
+        (["--fusion", ""], "--fusion"),
+        (["--up", "0,0,0"], "up axis"),
+        (["--task", "!"], "task text"),
+        (["--seed", "-1"], "seed"),
+        (["--max-gaussians", "3000000000000"], "max_gaussians"),
+        (["--detector", __file__], "expected a readable ONNX model"),
+        (["--detector", "/nowhere.onnx"], "/nowhere.onnx"),
     ],
 )
 def test_a_wrong_command_line_is_one_line_and_code_2(

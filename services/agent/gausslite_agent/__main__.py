@@ -9,6 +9,7 @@ from contextlib import ExitStack
 
 from gausslite.datasets.open import open_source
 from gausslite.datasets.source import Source
+from gausslite.domain.pose import unit_up_axis
 from gausslite.mission.build import build_attention
 from gausslite.mission.results import prepare_folder
 from gausslite.mission.settings import SceneKnowledge
@@ -40,6 +41,11 @@ async def _serve(settings: AgentSettings) -> None:
     """Build the robot, serve it, play its source; close in the reverse order."""
     if settings.out is not None:
         prepare_folder(settings.out)
+    if settings.perception.model is not None:
+        from gausslite.perception.yolo import load_yolo
+
+        # a wrong file is told now, not with the first task
+        load_yolo(settings.perception.model, settings.perception.threads)
     play = settings.play
     source = None if play is None else open_source(play.source, settings.up_axis, play.colour_camera)
     loop, news = asyncio.get_running_loop(), Bell()
@@ -102,7 +108,7 @@ def _uplink(settings: AgentSettings, stack: ExitStack) -> tuple[Uplink | None, F
 def _scene(settings: AgentSettings, source: Source | None) -> SceneKnowledge:
     if source is not None:
         return SceneKnowledge.of(source)
-    return SceneKnowledge() if settings.up_axis is None else SceneKnowledge(settings.up_axis)
+    return SceneKnowledge() if settings.up_axis is None else SceneKnowledge(unit_up_axis(settings.up_axis))
 
 
 def _ring(loop: asyncio.AbstractEventLoop, news: Bell) -> None:

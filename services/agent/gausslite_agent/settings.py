@@ -21,7 +21,10 @@ from gausslite.mission.options import (
     perception_settings,
 )
 from gausslite.mission.settings import MissionSettings, PerceptionSettings
+from gausslite.task.validate import require_task_text
 from gausslite.wire.uplink_values import UplinkSettings
+
+_MAX_DRAIN_S = 86400.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,8 +76,7 @@ def parse_arguments(arguments: Sequence[str] | None = None) -> AgentSettings:
     options = _parser().parse_args(arguments)
     if options.source is not None and options.task is None:
         raise InvalidInputError("--task: expected a task for the source to be mapped for, got none")
-    if not 1 <= len(options.agent_id.encode()) <= 255:
-        raise InvalidInputError(f"--agent-id: expected 1 to 255 bytes, got {len(options.agent_id.encode())}")
+    _require_sense(options)
     play = None
     if options.source is not None:
         play = PlaySettings(options.source, options.frames, options.size, options.hold_out, options.colour_camera)
@@ -100,6 +102,20 @@ def parse_arguments(arguments: Sequence[str] | None = None) -> AgentSettings:
         link,
         mission_settings(options),
     )
+
+
+def _require_sense(options: argparse.Namespace) -> None:
+    """What would show only in the middle of a mission is refused here."""
+    agent_id = options.agent_id.encode(errors="replace")
+    if not 1 <= len(agent_id) <= 255:
+        raise InvalidInputError(f"--agent-id: expected 1 to 255 bytes, got {len(agent_id)}")
+    if not 0 <= options.drain_timeout <= _MAX_DRAIN_S:
+        raise InvalidInputError(f"--drain-timeout: expected 0 to {_MAX_DRAIN_S:g} s, got {options.drain_timeout}")
+    for name in ("parser", "fusion"):
+        if getattr(options, name) == "":
+            raise InvalidInputError(f"--{name}: expected HOST:PORT or unix:PATH, got an empty text")
+    if options.task is not None:
+        require_task_text(options.task)
 
 
 def _parser() -> argparse.ArgumentParser:
