@@ -53,6 +53,8 @@ def test_what_the_operator_can_mend_is_one_line_and_code_2(tmp_path: Path) -> No
     assert "cannot be opened" in ends_with_one_line("--store", str(tmp_path / "no" / "folder" / "x.sqlite"))
     assert "undamaged GaussLite store" in ends_with_one_line("--store", str(nonsense))
     assert "voxel size_m" in ends_with_one_line("--voxel-size", "0")
+    assert "--store-max-mb" in ends_with_one_line("--store-max-mb", "0")
+    assert "--refine-iterations" in ends_with_one_line("--refine-iterations", "1000000")
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()

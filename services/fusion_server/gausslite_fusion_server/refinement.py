@@ -11,10 +11,9 @@ from threading import Event
 from gausslite.errors import QuotaError
 from gausslite.fusion.refine import RefineProgress, RefineSettings, refine
 from gausslite.fusion.team import TeamMap
+from gausslite.fusion.terms import MAX_REFINE_ITERATIONS
 from gausslite.render.rasterizer import Rasterizer
 from gausslite.wire.bell import Bell
-
-MAX_ITERATIONS = 30_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,8 +80,8 @@ class Refinery:
         self._worker.shutdown(wait=True, cancel_futures=True)
 
     def _settings_for(self, order: RefineOrder) -> RefineSettings:
-        if order.iterations > MAX_ITERATIONS:
-            raise QuotaError(f"refine iterations: expected at most {MAX_ITERATIONS}, got {order.iterations}")
+        if order.iterations > MAX_REFINE_ITERATIONS:
+            raise QuotaError(f"refine iterations: expected at most {MAX_REFINE_ITERATIONS}, got {order.iterations}")
         own = self._settings
         return replace(
             own,

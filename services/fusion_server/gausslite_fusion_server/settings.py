@@ -8,10 +8,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from gausslite.domain.voxels import VoxelGrid
+from gausslite.errors import InvalidInputError
 from gausslite.fusion.refine import RefineSettings
-from gausslite.fusion.terms import Quotas, TeamSettings
+from gausslite.fusion.terms import MAX_REFINE_ITERATIONS, Quotas, TeamSettings
+from gausslite.render.choose import BACKENDS
 
 MEMORY = "memory"
+_MAX_STORE_MB = 1 << 24
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,6 +32,12 @@ class ServerSettings:
 def parse_arguments(arguments: Sequence[str] | None = None) -> ServerSettings:
     """Settings from the command line. Raises InvalidInputError for values that make no sense."""
     options = _parser().parse_args(arguments)
+    if options.store_max_mb is not None and not 1 <= options.store_max_mb <= _MAX_STORE_MB:
+        raise InvalidInputError(f"--store-max-mb: expected 1 to {_MAX_STORE_MB}, got {options.store_max_mb}")
+    if options.refine_iterations > MAX_REFINE_ITERATIONS:
+        raise InvalidInputError(
+            f"--refine-iterations: expected 1 to {MAX_REFINE_ITERATIONS}, got {options.refine_iterations}"
+        )
     quotas = Quotas(
         options.quota_agents,
         options.quota_voxels,
@@ -78,5 +87,5 @@ def _parser() -> argparse.ArgumentParser:
     )
     add("--quota-keyframe-pixels", type=int, default=quotas.keyframe_pixels, metavar="N", help="largest keyframe image")
     add("--refine-iterations", type=int, default=ours.refine.iterations, metavar="N", help="when a request names none")
-    add("--rasterizer", default=ours.rasterizer, metavar="NAME", help="backend of the refinement: auto, cpu, reference")
+    add("--rasterizer", choices=BACKENDS, default=ours.rasterizer, help="backend of the refinement")
     return parser

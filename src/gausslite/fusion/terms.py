@@ -10,6 +10,9 @@ from gausslite.domain.voxels import VoxelGrid
 from gausslite.errors import InvalidInputError, MismatchError, QuotaError
 from gausslite.fusion.store import Charter, StakeTable
 
+MAX_REFINE_ITERATIONS = 30_000
+"""More would keep a server busy for hours on one request."""
+
 
 @dataclass(frozen=True, slots=True)
 class Quotas:
