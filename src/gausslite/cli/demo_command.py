@@ -20,6 +20,7 @@ from gausslite.evaluation.compare import MapScores
 from gausslite.evaluation.held_out import HoldOut
 from gausslite.evaluation.pictures import write_png
 from gausslite.evaluation.team import TeamScores, Viewpoints, score_team
+from gausslite.fusion.terms import MAX_REFINE_ITERATIONS
 from gausslite.mission.options import add_budget, add_colour_camera, add_detector, add_voxel_size, names
 from gausslite.mission.results import prepare_folder, write_json
 from gausslite.perception.vocabulary import same_kind
@@ -56,7 +57,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Run the team, score the maps, write and print the report."""
-    signal.signal(signal.SIGTERM, _interrupt)
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, _interrupt)
+    if not 0 <= options.refine_iterations <= MAX_REFINE_ITERATIONS:
+        raise InvalidInputError(
+            f"--refine-iterations: expected 0 to {MAX_REFINE_ITERATIONS}, got {options.refine_iterations}"
+        )
     stage = _simulated_stage(options) if options.source is None else _recorded_stage(options)
     regions = _scored_regions(options, stage.regions)
     prepare_folder(options.out)

@@ -71,10 +71,13 @@ class ProcessGroup:
         for process in running:
             process.send_signal(signal.SIGTERM)
         deadline = time.monotonic() + _GRACE_S
-        for process in running:
-            with contextlib.suppress(subprocess.TimeoutExpired):
-                process.wait(timeout=max(0.1, deadline - time.monotonic()))
-        for process in running:
-            if process.poll() is None:
-                process.kill()
-                process.wait()
+        try:
+            for process in running:
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    process.wait(timeout=max(0.1, deadline - time.monotonic()))
+        finally:
+            # reached at once when the user presses Ctrl-C a second time
+            for process in running:
+                if process.poll() is None:
+                    process.kill()
+                    process.wait()
