@@ -29,8 +29,8 @@ def frame_size(text: str | None, source: Source) -> tuple[int, int]:
     if text is None:
         return source.camera.width_px, source.camera.height_px
     parts = text.lower().split("x")
-    if len(parts) != 2 or not all(part.isascii() and part.isdigit() for part in parts):
-        raise InvalidInputError(f"size: expected WIDTHxHEIGHT such as 320x240, got {text!r}")
+    if len(parts) != 2 or not all(_is_whole(part) for part in parts):
+        raise InvalidInputError(f"size: expected WIDTHxHEIGHT such as 320x240, got {text[:40]!r}")
     width, height = int(parts[0]), int(parts[1])
     if not (16 <= width <= 4096 and 16 <= height <= 4096):
         raise InvalidInputError(f"size: expected sides of 16 to 4096 pixels, got {text!r}")
@@ -40,10 +40,15 @@ def frame_size(text: str | None, source: Source) -> tuple[int, int]:
 def _parse(selection: str) -> tuple[int, int | None, int]:
     wanted = "expected START:STOP or START:STOP:STEP with 0 <= START < STOP and STEP >= 1"
     parts = [part.strip() for part in selection.split(":")]
-    if len(parts) not in (2, 3) or not all(part == "" or (part.isascii() and part.isdigit()) for part in parts):
-        raise InvalidInputError(f"frames {selection!r}: {wanted}")
+    if len(parts) not in (2, 3) or not all(part == "" or _is_whole(part) for part in parts):
+        raise InvalidInputError(f"frames {selection[:40]!r}: {wanted}")
     numbers = [int(part) if part else None for part in (*parts, "")[:3]]
     start, stop, step = numbers[0] or 0, numbers[1], 1 if numbers[2] is None else numbers[2]
     if step < 1 or (stop is not None and stop <= start):
         raise InvalidInputError(f"frames {selection!r}: {wanted}")
     return start, stop, step
+
+
+def _is_whole(text: str) -> bool:
+    """True for decimal digits, not so many that Python would refuse to count them."""
+    return text.isascii() and text.isdigit() and len(text) <= 20

@@ -12,6 +12,9 @@ from numpy import ndarray
 from gausslite.domain.camera import back_project
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import transform_points
+from gausslite.errors import InvalidInputError
+
+_REACH_M = 1e6
 
 
 @runtime_checkable
@@ -29,6 +32,14 @@ class BallRegion:
 
     centre_m: tuple[float, float, float]
     radius_m: float
+
+    def __post_init__(self) -> None:
+        # beyond, float32 points have no digits left for metres
+        if not (max(map(abs, self.centre_m)) <= _REACH_M and 0 < self.radius_m <= _REACH_M):
+            raise InvalidInputError(
+                f"ball: expected a centre within ±{_REACH_M:g} m and a radius of 0 to {_REACH_M:g} m, "
+                f"got {self.centre_m} and {self.radius_m}"
+            )
 
     def mask(self, frame: Frame) -> Bool[ndarray, "h w"]:
         """True where the pixel's back-projected point lies in the ball."""

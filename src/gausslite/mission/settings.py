@@ -65,6 +65,8 @@ class MissionSettings:
             raise InvalidInputError(f"rate: expected 0.01 to 1000 Hz, got {self.rate_hz}")
         if self.iterations is not None and not 0 <= self.iterations <= 10_000:
             raise InvalidInputError(f"iterations: expected 0 to 10000, got {self.iterations}")
+        if not 0 <= self.seed < 1 << 32:
+            raise InvalidInputError(f"seed: expected 0 to {(1 << 32) - 1}, got {self.seed}")
 
     @property
     def seconds_per_frame(self) -> float | None:
