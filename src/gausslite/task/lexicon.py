@@ -40,7 +40,6 @@ OTHER_VERBS: Final = words(
     "document catalog catalogue digitize film image audit compare deliver plow trim weed work gaze steer supply "
     "charge guide lead obstruct harm damage scratch spill scare wake block enter interact collide contact"
 )
-AVOID_VERBS: Final = words("avoid dodge evade circumvent bypass")
 # "move to the chair" goes there, "move the chair to the door" takes it there
 MOVING_VERBS: Final = words("move roll run advance")
 DELIVERY_VERBS: Final = CARRY_VERBS | PLACE_VERBS

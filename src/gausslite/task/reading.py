@@ -20,13 +20,6 @@ _RELATIVES: Final = frozenset({"that", "which", "who"})
 _BACK_REFERENCES: Final = frozenset({"it", "them"})
 _PARTICLES_ONLY: Final = words("up down out away back forward backward apart upstairs downstairs")
 _LONGEST_NEGATION: Final = max(len(words) for words in lexicon.NEGATIONS)
-_VERB_ENDINGS: Final = (
-    ("ies", ("y",)),
-    ("ing", ("", "e")),
-    ("es", ("", "e")),
-    ("s", ("",)),
-    ("ed", ("", "e")),
-)
 _SUPERLATIVES: Final = frozenset({"closest", "nearest"})
 
 
