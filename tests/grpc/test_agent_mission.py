@@ -23,12 +23,11 @@ from gausslite.errors import DatasetError, InvalidInputError, StorageError, Task
 from gausslite.fusion.memory import MemoryStore
 from gausslite.perception.fixed import RegionAttention
 from gausslite.task.rules import RuleParser
-from gausslite.v1 import agent_service_pb2 as pb
 from gausslite.wire.clients import FusionClient
 from gausslite.wire.spool import Spool
 from gausslite.wire.uplink import Uplink
 from gausslite.wire.uplink_values import UplinkSettings
-from gausslite_agent.player import Player
+from gausslite_agent.player import MissionState, Player
 from gausslite_agent.robot import Robot
 from gausslite_agent.settings import AgentSettings, PlaySettings, parse_arguments
 
@@ -91,7 +90,7 @@ def test_a_mission_leaves_a_map_a_report_and_its_region_on_the_server(tmp_path: 
     assert options.play is not None
     with team(store) as fusion, player(options, fusion.client.address) as (mission, robot):
         mission.play(Wall(), options.play)
-        assert mission.state == pb.AGENT_STATE_DONE
+        assert mission.state == MissionState.DONE
         count = robot.status().gaussians
         [agent] = fusion.client.status().agents
     written, report = read_ply(tmp_path / "map.ply"), json.loads((tmp_path / "report.json").read_text())
@@ -140,7 +139,7 @@ def test_a_mission_that_is_stopped_writes_what_it_has(tmp_path: Path) -> None:
         mission.stop()
         thread.join(20)
         assert not thread.is_alive()
-        assert mission.state == pb.AGENT_STATE_DRAINING
+        assert mission.state == MissionState.DRAINING
     assert json.loads((tmp_path / "report.json").read_text())["frames"] < 10_000
     assert len(read_ply(tmp_path / "map.ply")) > 0
 

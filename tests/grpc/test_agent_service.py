@@ -44,6 +44,7 @@ from gausslite.wire.server import Service
 from gausslite.wire.spool import Spool
 from gausslite.wire.uplink import Uplink
 from gausslite.wire.uplink_values import UplinkSettings
+from gausslite_agent.player import MissionState
 from gausslite_agent.robot import Outcome, Robot
 from gausslite_agent.servicer import AgentServicer
 
@@ -93,7 +94,7 @@ def agent(attention: object = ball_attention, uplink: Uplink | None = None, queu
     def register(server: grpc.aio.Server) -> None:
         loops.append(asyncio.get_running_loop())
         bells.append(Bell())
-        servicer = AgentServicer("robot", robot, RuleParser(), bells[0], lambda: pb.AGENT_STATE_MAPPING)
+        servicer = AgentServicer("robot", robot, RuleParser(), bells[0], lambda: MissionState.MAPPING)
         servicer.service().register(server)
 
     try:

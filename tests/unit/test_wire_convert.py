@@ -78,7 +78,7 @@ def test_a_graph_without_sense_is_refused(change: dict[str, object]) -> None:
     for name in change:
         message.ClearField(name)  # type: ignore[arg-type]
     message.MergeFrom(task_pb2.TaskGraph(**change))  # type: ignore[arg-type]
-    with pytest.raises(TaskError, match="^task "):
+    with pytest.raises(TaskError, match=r"^task "):
         convert.graph_from_message(message)
 
 

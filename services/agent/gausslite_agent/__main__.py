@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import functools
 import sys
 from collections.abc import Sequence
 from contextlib import ExitStack
@@ -15,7 +16,6 @@ from gausslite.mission.results import prepare_folder
 from gausslite.mission.settings import SceneKnowledge
 from gausslite.task.parser import TaskParser
 from gausslite.task.rules import RuleParser
-from gausslite.v1 import agent_service_pb2 as pb
 from gausslite.wire.bell import Bell
 from gausslite.wire.clients import FusionClient, ParserClient
 from gausslite.wire.process import run_service
@@ -39,13 +39,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 async def _serve(settings: AgentSettings) -> None:
     """Build the robot, serve it, play its source; close in the reverse order."""
-    if settings.out is not None:
-        prepare_folder(settings.out)
-    if settings.perception.model is not None:
-        from gausslite.perception.yolo import load_yolo
-
-        # a wrong file is told now, not with the first task
-        load_yolo(settings.perception.model, settings.perception.threads)
+    _require_usable(settings)
     play = settings.play
     source = None if play is None else open_source(play.source, settings.up_axis, play.colour_camera)
     loop, news = asyncio.get_running_loop(), Bell()
@@ -62,22 +56,35 @@ async def _serve(settings: AgentSettings) -> None:
         )
         stack.callback(robot.close)
         player = Player(settings, robot, parser, client)
-        servicer = AgentServicer(settings.agent_id, robot, parser, news, lambda: _state(player, robot))
+        servicer = AgentServicer(settings.agent_id, robot, parser, news, lambda: player.state)
 
-        async def mission() -> None:
-            work = asyncio.ensure_future(asyncio.to_thread(_begin, settings, source, player))
-            try:
-                await asyncio.shield(work)
-                if not settings.exit_when_done or source is None:
-                    await asyncio.Event().wait()
-            finally:
-                # the player still writes what it has; nothing it uses may close before that
-                player.stop()
-                if uplink is not None:
-                    uplink.stop_waiting()
-                await asyncio.gather(work, return_exceptions=True)
-
+        mission = functools.partial(_live, settings, source, player, uplink)
         await serve_until_stopped(settings.listen, [servicer.service()], mission)
+
+
+def _require_usable(settings: AgentSettings) -> None:
+    """Raise for a folder or a model that would end the mission later, hours into it or with its first task."""
+    if settings.out is not None:
+        prepare_folder(settings.out)
+    if settings.perception.model is not None:
+        from gausslite.perception.yolo import load_yolo
+
+        load_yolo(settings.perception.model, settings.perception.threads)
+
+
+async def _live(settings: AgentSettings, source: Source | None, player: Player, uplink: Uplink | None) -> None:
+    """Work through the mission, then serve on unless told otherwise."""
+    work = asyncio.ensure_future(asyncio.to_thread(_begin, settings, source, player))
+    try:
+        await asyncio.shield(work)
+        if not settings.exit_when_done or source is None:
+            await asyncio.Event().wait()
+    finally:
+        # the player still writes what it has; nothing it uses may close before that
+        player.stop()
+        if uplink is not None:
+            uplink.stop_waiting()
+        await asyncio.gather(work, return_exceptions=True)
 
 
 def _begin(settings: AgentSettings, source: Source | None, player: Player) -> None:
@@ -114,13 +121,6 @@ def _scene(settings: AgentSettings, source: Source | None) -> SceneKnowledge:
 def _ring(loop: asyncio.AbstractEventLoop, news: Bell) -> None:
     if not loop.is_closed():
         loop.call_soon_threadsafe(news.ring)
-
-
-def _state(player: Player, robot: Robot) -> pb.AgentState.ValueType:
-    """Where a played mission is; a robot that is sent frames maps as soon as it has a task."""
-    if player.state != pb.AGENT_STATE_IDLE or robot.status().graph is None:
-        return player.state
-    return pb.AGENT_STATE_MAPPING
 
 
 if __name__ == "__main__":

@@ -10,8 +10,15 @@ from gausslite.v1 import agent_service_pb2 as pb
 from gausslite.wire.convert import graph_to_message
 from gausslite.wire.images import encode_colour, encode_depth
 from gausslite.wire.uplink_values import UplinkCounters
+from gausslite_agent.player import MissionState
 from gausslite_agent.robot import FrameReport, Outcome, RobotStatus
 
+_STATES = {
+    MissionState.IDLE: pb.AGENT_STATE_IDLE,
+    MissionState.MAPPING: pb.AGENT_STATE_MAPPING,
+    MissionState.DRAINING: pb.AGENT_STATE_DRAINING,
+    MissionState.DONE: pb.AGENT_STATE_DONE,
+}
 _OUTCOMES = {
     Outcome.MAPPED: pb.FRAME_OUTCOME_MAPPED,
     Outcome.SKIPPED: pb.FRAME_OUTCOME_SKIPPED,
@@ -34,12 +41,12 @@ def report_to_message(report: FrameReport) -> pb.IngestFramesResponse:
 
 
 def status_to_message(
-    agent_id: str, state: pb.AgentState.ValueType, robot: RobotStatus, uplink: UplinkCounters
+    agent_id: str, state: MissionState, robot: RobotStatus, uplink: UplinkCounters
 ) -> pb.GetAgentStatusResponse:
     """How the agent is doing."""
     return pb.GetAgentStatusResponse(
         agent_id=agent_id,
-        state=state,
+        state=_STATES[state],
         graph=None if robot.graph is None else graph_to_message(robot.graph),
         map_revision=robot.map_revision,
         gaussians=robot.gaussians,

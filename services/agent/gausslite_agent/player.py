@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future
+from enum import Enum
 
 from gausslite.datasets.selection import frame_size, select_frames
 from gausslite.datasets.source import Source
@@ -16,7 +17,6 @@ from gausslite.errors import GaussLiteError
 from gausslite.evaluation.held_out import HoldOut
 from gausslite.mission.results import write_results
 from gausslite.task.parser import TaskParser
-from gausslite.v1 import agent_service_pb2 as pb
 from gausslite.wire.clients import FusionClient
 from gausslite.wire.spool import Purpose
 from gausslite.wire.uplink import Uplink
@@ -28,13 +28,29 @@ from gausslite_agent.settings import AgentSettings, PlaySettings
 _log = logging.getLogger(__name__)
 
 
+class MissionState(Enum):
+    """Where a mission is."""
+
+    IDLE = "idle"
+    MAPPING = "mapping"
+    DRAINING = "draining"
+    DONE = "done"
+
+
 class Player:
     """Runs one mission from a source. `play` blocks: call it on a thread; `stop` makes it end after its frame."""
 
     def __init__(self, settings: AgentSettings, robot: Robot, parser: TaskParser, client: FusionClient | None) -> None:
         self._settings, self._robot, self._parser, self._client = settings, robot, parser, client
         self._stopping = threading.Event()
-        self.state: pb.AgentState.ValueType = pb.AGENT_STATE_IDLE
+        self._state = MissionState.IDLE
+
+    @property
+    def state(self) -> MissionState:
+        """Where the mission is; a robot that is sent frames maps as soon as it has a task."""
+        if self._state is MissionState.IDLE and self._robot.status().graph is not None:
+            return MissionState.MAPPING
+        return self._state
 
     def stop(self) -> None:
         """End the mission early: what is mapped is written, nothing more is sent."""
@@ -49,7 +65,7 @@ class Player:
         started_s = time.monotonic()
         frames = _frames(source, play)
         self.assign()
-        self.state = pb.AGENT_STATE_MAPPING
+        self._state = MissionState.MAPPING
         waiting: Future[FrameReport] | None = None
         for frame in frames:
             # one frame is read while the one before is mapped
@@ -63,7 +79,7 @@ class Player:
         self._finish(time.monotonic() - started_s)
 
     def _finish(self, seconds: float) -> None:
-        self.state = pb.AGENT_STATE_DRAINING
+        self._state = MissionState.DRAINING
         gaussians = self._robot.do(lambda mapper: mapper.gaussians()).result()
         uplink, counters = self._robot.uplink, UplinkCounters()
         if uplink is not None:
@@ -80,7 +96,7 @@ class Player:
             *(status.mapped, status.hz, len(gaussians), counters.roi_bytes),
         )
         if not self._stopping.is_set():
-            self.state = pb.AGENT_STATE_DONE
+            self._state = MissionState.DONE
 
     def _empty(self, uplink: Uplink) -> None:
         """Bring the rest to the server: the region, then (when asked) everything else and the keyframes."""

@@ -27,6 +27,7 @@ from gausslite.wire.server import Service
 from gausslite.wire.uplink_values import UplinkCounters
 from gausslite_agent.history import MapHistory
 from gausslite_agent.messages import blank_view, report_to_message, status_to_message, view_to_message
+from gausslite_agent.player import MissionState
 from gausslite_agent.robot import FrameReport, Robot
 
 _OUTCOMES_AHEAD = 16
@@ -41,7 +42,7 @@ class AgentServicer(pb_grpc.AgentServiceServicer):
         robot: Robot,
         parser: TaskParser,
         news: Bell,
-        state: Callable[[], pb.AgentState.ValueType],
+        state: Callable[[], MissionState],
     ) -> None:
         self._agent_id, self._robot, self._parser, self._news, self._state = agent_id, robot, parser, news, state
         # touched on the robot's worker only
