@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float32, Float64
 from numpy import ndarray
 
 from gausslite.errors import InvalidInputError
@@ -58,6 +58,15 @@ def back_project(depth_m: Float32[ndarray, "h w"], camera: Camera) -> Float32[nd
     points[..., 1] = y[:, None] * depth_m
     points[..., 2] = depth_m
     return points
+
+
+def lift(
+    pixels_px: Float64[ndarray, "n 2"], depths_m: Float64[ndarray, " n"], camera: Camera
+) -> Float64[ndarray, "n 3"]:
+    """The camera-frame points at image coordinates (column, row), centres at +0.5, at these depths along the axis."""
+    principal_px, focal_px = np.array([camera.cx_px, camera.cy_px]), np.array([camera.fx_px, camera.fy_px])
+    rays = (pixels_px - principal_px) / focal_px
+    return np.concatenate([rays * depths_m[:, None], depths_m[:, None]], axis=1)
 
 
 def project(points_camera: Float32[ndarray, "n 3"], camera: Camera) -> Float32[ndarray, "n 2"]:

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64
 from numpy import ndarray
 
-from gausslite.domain.camera import Camera, back_project, project
+from gausslite.domain.camera import Camera, back_project, lift, project
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import inverse, transform_points
 from gausslite.domain.relevance import Detection
@@ -35,12 +35,9 @@ class Frustum:
     def corners_m(self) -> Float64[ndarray, "8 3"]:
         """The frustum's corners in the world: the near face first, then the far one."""
         left, top, right, bottom = self.detection.box_px
-        corners = [
-            ((u - self.camera.cx_px) / self.camera.fx_px * z, (v - self.camera.cy_px) / self.camera.fy_px * z, z)
-            for z in (self.near_m, self.far_m)
-            for u, v in ((left, top), (right, top), (right, bottom), (left, bottom))
-        ]
-        return transform_points(self.T_world_camera, np.asarray(corners, np.float64))
+        corners_px = np.array([(left, top), (right, top), (right, bottom), (left, bottom)] * 2, np.float64)
+        depths_m = np.repeat(np.array([self.near_m, self.far_m]), 4)
+        return transform_points(self.T_world_camera, lift(corners_px, depths_m, self.camera))
 
 
 def frustum_of(detection: Detection, depth_m: Float32[ndarray, "h w"], frame: Frame) -> Frustum | None:

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64
 from numpy import ndarray
 
-from gausslite.domain.camera import Camera
+from gausslite.domain.camera import Camera, lift
 from gausslite.domain.pose import UpAxis, transform_points, unit_up_axis
 from gausslite.domain.task import Predicate, Relation, TaskGraph
 from gausslite.errors import InvalidInputError
@@ -58,11 +58,9 @@ def sight(
         return None
     step = max(1, len(rows) // _MAX_PIXELS)
     rows, columns = rows[::step], columns[::step]
-    z = depth_m[rows, columns].astype(np.float64)
-    x = (columns + 0.5 - camera.cx_px) / camera.fx_px * z
-    y = (rows + 0.5 - camera.cy_px) / camera.fy_px * z
-    points = transform_points(T_world_camera, np.stack([x, y, z], axis=1))
-    return Sighting.of_points(phrase, points)
+    centres_px = np.stack([columns, rows], axis=1) + 0.5
+    points = lift(centres_px, depth_m[rows, columns].astype(np.float64), camera)
+    return Sighting.of_points(phrase, transform_points(T_world_camera, points))
 
 
 class SpatialFilter:
