@@ -58,6 +58,15 @@ def test_a_bug_is_internal_without_its_details_and_the_server_lives() -> None:
             assert "secret" not in str(caught.value)
 
 
+def test_what_is_no_message_is_an_invalid_argument() -> None:
+    with serving([parser_service(RuleParser())]) as server, grpc.insecure_channel(server.address) as channel:
+        call = channel.unary_unary("/gausslite.v1.ParserService/ParseTask")
+        with pytest.raises(grpc.RpcError) as raised:
+            call(b"\xff\xff\xff", timeout=20)
+        assert raised.value.code() is grpc.StatusCode.INVALID_ARGUMENT
+        assert "3 other bytes" in raised.value.details()
+
+
 def test_health_and_reflection() -> None:
     with serving([parser_service(RuleParser())]) as server, grpc.insecure_channel(server.address) as channel:
         check = health_pb2_grpc.HealthStub(channel).Check

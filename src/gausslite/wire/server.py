@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 import grpc
+from google.protobuf.message import DecodeError
 from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection
 
@@ -123,10 +124,9 @@ class ErrorInterceptor(grpc.aio.ServerInterceptor):  # type: ignore[type-arg]
         method = handler_call_details.method
         if handler is None or not method.startswith("/gausslite."):
             return handler
-        serializers = {
-            "request_deserializer": handler.request_deserializer,
-            "response_serializer": handler.response_serializer,
-        }
+        # bytes come as they are and are read behind the guard: gRPC itself would answer UNKNOWN to what is no message
+        serializers = {"request_deserializer": None, "response_serializer": handler.response_serializer}
+        read = _reader(handler.request_deserializer, method, handler.request_streaming)
         if handler.response_streaming:
             inner = handler.stream_stream if handler.request_streaming else handler.unary_stream
             make = (
@@ -134,28 +134,42 @@ class ErrorInterceptor(grpc.aio.ServerInterceptor):  # type: ignore[type-arg]
                 if handler.request_streaming
                 else grpc.unary_stream_rpc_method_handler
             )
-            return make(_guard_stream(inner, method), **serializers)
+            return make(_guard_stream(inner, read, method), **serializers)
         inner = handler.stream_unary if handler.request_streaming else handler.unary_unary
         make = (
             grpc.stream_unary_rpc_method_handler if handler.request_streaming else grpc.unary_unary_rpc_method_handler
         )
-        return make(_guard_unary(inner, method), **serializers)
+        return make(_guard_unary(inner, read, method), **serializers)
 
 
-def _guard_unary(inner: Any, method: str) -> Any:
+def _reader(deserialize: Callable[[bytes], Any], method: str, streaming: bool) -> Callable[[Any], Any]:
+    def one(data: bytes) -> Any:
+        try:
+            return deserialize(data)
+        except DecodeError as error:
+            raise InvalidInputError(f"{method}: expected its request message, got {len(data)} other bytes") from error
+
+    async def each(stream: AsyncIterator[bytes]) -> AsyncIterator[Any]:
+        async for data in stream:
+            yield one(data)
+
+    return each if streaming else one
+
+
+def _guard_unary(inner: Any, read: Callable[[Any], Any], method: str) -> Any:
     async def guarded(request: Any, context: Any) -> Any:
         try:
-            return await inner(request, context)
+            return await inner(read(request), context)
         except Exception as error:
             await _abort(error, method, context)
 
     return guarded
 
 
-def _guard_stream(inner: Any, method: str) -> Any:
+def _guard_stream(inner: Any, read: Callable[[Any], Any], method: str) -> Any:
     async def guarded(request: Any, context: Any) -> AsyncIterator[Any]:
         try:
-            async for response in inner(request, context):
+            async for response in inner(read(request), context):
                 yield response
         except Exception as error:
             await _abort(error, method, context)
