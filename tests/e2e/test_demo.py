@@ -61,7 +61,8 @@ def test_the_demo_maps_fuses_scores_and_ends_everything(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(not Path("/proc/self/cmdline").exists(), reason="needs /proc to see processes")
-def test_interrupting_the_demo_ends_every_process(tmp_path: Path) -> None:
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
+def test_interrupting_the_demo_ends_every_process(tmp_path: Path, number: signal.Signals) -> None:
     out = tmp_path / "demo"
     demo = subprocess.Popen(_command(out), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
     try:
@@ -70,7 +71,7 @@ def test_interrupting_the_demo_ends_every_process(tmp_path: Path) -> None:
             assert demo.poll() is None, demo.stderr.read() if demo.stderr else ""
             assert time.monotonic() < deadline
             time.sleep(0.05)
-        demo.send_signal(signal.SIGINT)
+        demo.send_signal(number)
         _, errors = demo.communicate(timeout=60)
     finally:
         demo.kill()
