@@ -31,6 +31,11 @@ class ServiceProcess:
         if code not in (None, 0):
             raise UnavailableError(f"{self.name} ended with code {code}: {self.last_line()} (see {self.log})")
 
+    def wait(self, timeout_s: float) -> None:
+        """Give the process this long to end by itself."""
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self.process.wait(timeout_s)
+
     def last_line(self) -> str:
         """The last line the service wrote."""
         lines = self.log.read_text(errors="replace").strip().splitlines()

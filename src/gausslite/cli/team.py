@@ -19,6 +19,7 @@ from gausslite.wire.clients import AgentClient, Export, FusionClient, is_done
 
 _START_TIMEOUT_S = 60.0
 _POLL_S = 0.25
+_END_TIMEOUT_S = 5.0
 _READY = "listening on "
 
 
@@ -82,7 +83,7 @@ def watch_missions(team: Team) -> None:
             time.sleep(_POLL_S)
             for agent_id, (address, service) in list(waiting.items()):
                 service.require_alive()
-                with AgentClient(address) as client:
+                with _its_own_words(service), AgentClient(address) as client:
                     status = client.status()
                 done = status.frames_mapped + status.frames_skipped + status.frames_dropped + status.frames_rejected
                 bars[agent_id].show(done, status.gaussians, status.roi_share, status.uplink.bytes_sent)
@@ -113,6 +114,17 @@ def agent_report(out: Path, agent_id: str) -> dict[str, object]:
     except (OSError, ValueError) as error:
         raise UnavailableError(f"{path}: expected the agent's report, got {error}") from None
     return report
+
+
+@contextmanager
+def _its_own_words(service: ServiceProcess) -> Iterator[None]:
+    """A service that has just ended answers no more; its log says why, and the broken call does not."""
+    try:
+        yield
+    except UnavailableError:
+        service.wait(_END_TIMEOUT_S)
+        service.require_alive()
+        raise
 
 
 def _agent_arguments(plan: TeamPlan, agent: AgentPlan, parser: str, fusion: str, out: Path) -> tuple[str, ...]:
