@@ -41,7 +41,7 @@ def test_a_sheet_has_a_column_for_the_truth_and_each_map_and_three_rows() -> Non
     assert worse.mean() > 50
 
 
-def test_the_two_largest_pieces_of_a_region_are_shown_in_detail() -> None:
+def test_the_largest_and_the_smallest_piece_of_a_region_are_shown_in_detail() -> None:
     shown = view()
     for column in (10, 60, 250):
         shown.roi[20:30, column : column + 12] = True

@@ -20,7 +20,7 @@ _BACKGROUND = 24
 _TEXT_RGB = (235, 235, 235)
 _OUTLINE_RGB = (255, 208, 0)
 _CROP_MARGIN = 0.15
-_MAX_PIECES = 2
+_SPECK_PX = 64
 _BRIDGED_SHARE = 0.02
 _DIFFERENCE_GAIN = 3.0
 
@@ -28,7 +28,7 @@ _DIFFERENCE_GAIN = 3.0
 def comparison_sheet(view: HeldOutView, drawings: Mapping[str, Float32[ndarray, "h w 3"]]) -> UInt8[ndarray, "H W 3"]:
     """One column for the ground truth and one for each named drawing (colours in [0, 1]), labelled.
 
-    Rows: the image with the region outlined; the region's largest pieces enlarged, one row each; the absolute
+    Rows: the image with the region outlined; the region's largest and smallest pieces enlarged; the absolute
     difference (three times amplified). Rows that would show nothing are left out. Raises ShapeError.
     """
     truth_rgb = view.frame.rgb
@@ -38,7 +38,7 @@ def comparison_sheet(view: HeldOutView, drawings: Mapping[str, Float32[ndarray, 
     rows = [[_cell(_outlined(image, view.roi), label) for label, image in columns.items()]]
     rows += [
         [_cell(_crop(image, piece), f"{label}: detail") for label, image in columns.items()]
-        for piece in _largest_pieces(view.roi)
+        for piece in _telling_pieces(view.roi)
     ]
     if drawings:
         truth = truth_rgb / np.float32(255.0)
@@ -80,15 +80,19 @@ def _lit(image: UInt8[ndarray, "h w 3"], roi: Bool[ndarray, "h w"]) -> UInt8[nda
     return dimmed
 
 
-def _largest_pieces(roi: Bool[ndarray, "h w"]) -> list[Bool[ndarray, "h w"]]:
-    """The region's largest connected pieces; gaps that are small in the image do not divide it."""
+def _telling_pieces(roi: Bool[ndarray, "h w"]) -> list[Bool[ndarray, "h w"]]:
+    """The region's largest connected piece and its smallest: a chair hides how a mug came out.
+
+    Gaps that are small in the image do not divide a piece; specks are passed over unless there is nothing else.
+    """
     import cv2
 
     reach = max(3, round(_BRIDGED_SHARE * roi.shape[1]))
     bridged = cv2.dilate(roi.astype(np.uint8), np.ones((reach, reach), np.uint8))
     count, labels = cv2.connectedComponents(bridged)
-    pieces = [roi & (labels == label) for label in range(1, count)]
-    return sorted(pieces, key=np.count_nonzero, reverse=True)[:_MAX_PIECES]
+    pieces = sorted((roi & (labels == label) for label in range(1, count)), key=np.count_nonzero, reverse=True)
+    worth_showing = [piece for piece in pieces if np.count_nonzero(piece) >= _SPECK_PX] or pieces[:1]
+    return worth_showing[:1] + worth_showing[1:][-1:]
 
 
 def _crop(image: UInt8[ndarray, "h w 3"], piece: Bool[ndarray, "h w"]) -> UInt8[ndarray, "h w 3"]:
