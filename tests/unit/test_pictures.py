@@ -44,7 +44,7 @@ def test_a_sheet_has_a_column_for_the_truth_and_each_map_and_three_rows() -> Non
 def test_the_largest_and_the_smallest_piece_of_a_region_are_shown_in_detail() -> None:
     shown = view()
     for column in (10, 60, 250):
-        shown.roi[20:30, column : column + 12] = True
+        shown.roi[20:34, column : column + 12] = True
     assert comparison_sheet(shown, {}).shape[0] == 6 + 3 * (240 + 26 + 6)
 
 

@@ -20,7 +20,7 @@ _BACKGROUND = 24
 _TEXT_RGB = (235, 235, 235)
 _OUTLINE_RGB = (255, 208, 0)
 _CROP_MARGIN = 0.15
-_SPECK_PX = 64
+_SPECK_SHARE = 0.002
 _BRIDGED_SHARE = 0.02
 _DIFFERENCE_GAIN = 3.0
 
@@ -91,7 +91,7 @@ def _telling_pieces(roi: Bool[ndarray, "h w"]) -> list[Bool[ndarray, "h w"]]:
     bridged = cv2.dilate(roi.astype(np.uint8), np.ones((reach, reach), np.uint8))
     count, labels = cv2.connectedComponents(bridged)
     pieces = sorted((roi & (labels == label) for label in range(1, count)), key=np.count_nonzero, reverse=True)
-    worth_showing = [piece for piece in pieces if np.count_nonzero(piece) >= _SPECK_PX] or pieces[:1]
+    worth_showing = [piece for piece in pieces if np.count_nonzero(piece) >= _SPECK_SHARE * roi.size] or pieces[:1]
     return worth_showing[:1] + worth_showing[1:][-1:]
 
 
