@@ -189,6 +189,11 @@ class CpuRasterizer:
         return self._engine.stage_times_ms()
 
 
+def usable_simd() -> tuple[str, ...]:
+    """Instruction sets this build has and this machine runs, fastest first. Raises KernelError."""
+    return tuple(_load_kernels().usable_simd())
+
+
 def _load_kernels() -> Any:
     try:
         from gausslite.render import _kernels

@@ -1,0 +1,103 @@
+"""The rasterizer's benchmark on tiny cases: what it measures and prints, never how long it took."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gausslite.cli.bench_command import counts, sizes
+from gausslite.cli.main import main
+from gausslite.errors import InvalidInputError
+from gausslite.evaluation.bench_raster import RasterBench
+from gausslite.evaluation.bench_scene import held_view, seed_rows
+from gausslite.render.rasterizer import LOG_SCALE, MEAN, RGB
+
+pytest.importorskip("gausslite.render._kernels", reason="the native kernels are not built")
+
+from gausslite.render.cpu import CpuRasterizer, usable_simd
+
+KEYS = [
+    "gaussians",
+    "width",
+    "height",
+    "threads",
+    "simd",
+    "fused_l1_ms_min",
+    "fused_l1_ssim_ms_min",
+    "forward_ms_min",
+    "backward_ms_min",
+]
+
+
+def test_seeds_draw_the_room_that_the_held_view_shows() -> None:
+    view = held_view(96, 72)
+    drawn = CpuRasterizer(threads=1).forward(seed_rows(30_000), view.camera, view.T_camera_world)
+    seen = drawn.alpha > 0.9
+    assert seen.mean() > 0.7
+    assert np.median(np.abs(drawn.expected_depth_m() - view.depth_m)[seen]) < 0.03
+    assert np.median(np.abs(drawn.rgb - view.rgb / 255.0)[seen]) < 0.08
+
+
+def test_seeds_lie_in_the_room_and_are_the_same_every_time() -> None:
+    rows = seed_rows(600)
+    assert (np.abs(rows[:, MEAN]) < 2.61).all()
+    assert ((rows[:, RGB] >= 0) & (rows[:, RGB] <= 1)).all()
+    assert (np.exp(rows[:, LOG_SCALE]) <= 0.2001).all()
+    np.testing.assert_array_equal(rows, seed_rows(600))
+
+
+def test_fewer_seeds_than_views_are_refused() -> None:
+    with pytest.raises(InvalidInputError, match="at least 12, one a view, got 5"):
+        seed_rows(5)
+
+
+def test_every_case_is_measured_on_every_instruction_set() -> None:
+    bench = RasterBench([(48, 32), (32, 32)], [50], simd=usable_simd(), threads=1, repetitions=1)
+    timings = list(bench.run())
+    assert [(t.width, t.simd) for t in timings] == [(width, simd) for width in (48, 32) for simd in usable_simd()]
+    for timing in timings:
+        assert timing.yardstick == {}
+        assert set(timing.stages_ms) == {"fused_l1", "fused_l1_ssim"}
+        assert all(0 < duration.min_ms <= duration.median_ms for duration in timing.durations.values())
+
+
+def test_json_is_a_list_of_flat_records(capsys: pytest.CaptureFixture[str]) -> None:
+    small = ["--sizes", "32x32", "--gaussians", "20,40", "--threads", "1", "--simd", "portable", "--reps", "2"]
+    assert main(["bench", "raster", *small, "--json"]) == 0
+    records = json.loads(capsys.readouterr().out)
+    assert [record["gaussians"] for record in records] == [20, 40]
+    assert [list(record)[: len(KEYS)] for record in records] == [KEYS, KEYS]
+    assert {(record["simd"], record["threads"], record["width"]) for record in records} == {("portable", 1, 32)}
+
+
+def test_lines_name_the_case_and_every_operation(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["bench", "raster", "--sizes", "32x32", "--gaussians", "20", "--threads", "1", "--reps", "1"]) == 0
+    printed = capsys.readouterr().out
+    for word in ("20 Gaussians, 32x32", "fused_l1 ", "fused_l1_ssim", "forward", "backward", "raster"):
+        assert word in printed
+
+
+def test_a_file_that_is_no_library_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    library = tmp_path / "other.so"
+    library.write_text("not a library")
+    small = ["--sizes", "32x32", "--gaussians", "20", "--threads", "1", "--reps", "1"]
+    assert main(["bench", "raster", *small, "--yardstick", str(library)]) == 2
+    said = capsys.readouterr().err
+    assert "other.so: expected a shared library with gl_new" in said
+    assert said.count("\n") == 1
+
+
+@pytest.mark.parametrize("text", ["", "32", "32x", "32x32x3", "0x5", "axb"])
+def test_sizes_that_are_none_are_told(text: str) -> None:
+    with pytest.raises(argparse.ArgumentTypeError, match="expected"):
+        sizes(text)
+
+
+@pytest.mark.parametrize("text", ["", "0", "-3", "1.5"])
+def test_counts_that_are_none_are_told(text: str) -> None:
+    with pytest.raises(argparse.ArgumentTypeError, match="expected whole numbers"):
+        counts(text)
