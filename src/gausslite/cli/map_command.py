@@ -46,7 +46,7 @@ def run(options: argparse.Namespace) -> int:
     source = open_source(options.source, options.up, options.colour_camera)
     positions = select_frames(source, options.frames)
     size = frame_size(options.size, source)
-    attention, graph = _attention(options, source)
+    attention, graph = choose_attention(options, source)
     mapper = TaskMapper(attention, build_mapper(settings), seconds_per_frame=settings.seconds_per_frame)
     prepare_folder(options.out)
     mission = _play(source, positions, size, mapper)
@@ -106,7 +106,7 @@ def _play(source: Source, positions: Sequence[int], size: tuple[int, int], mappe
     return _Mission(tuple(outcomes), time.perf_counter() - started_s)
 
 
-def _attention(options: argparse.Namespace, source: Source) -> tuple[Attention, TaskGraph | None]:
+def choose_attention(options: argparse.Namespace, source: Source) -> tuple[Attention, TaskGraph | None]:
     """A task in words, or regions of space, or (for a uniform map) nothing to attend to."""
     regions = named_regions(options)
     if options.task is not None and regions:
