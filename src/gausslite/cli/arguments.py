@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping
 from pathlib import Path
 
+from gausslite.datasets.source import Source
 from gausslite.domain.region import BallRegion, Region
-from gausslite.errors import InvalidInputError
 from gausslite.mission.options import add_frames, names, numbers
 
 
@@ -22,7 +21,9 @@ def add_source(parser: argparse.ArgumentParser) -> None:
 def add_regions(parser: argparse.ArgumentParser) -> None:
     """Add --roi, --objects and --roi-ball: ground-truth regions of space."""
     parser.add_argument("--roi", metavar="FILE.npz", type=Path, help="voxel file of ground-truth regions")
-    parser.add_argument("--objects", metavar="A,B", type=names, default=(), help="objects of --roi (default: all)")
+    parser.add_argument(
+        "--objects", metavar="A,B", type=names, default=(), help="objects of --roi (default: all) or of SOURCE"
+    )
     parser.add_argument(
         "--roi-ball",
         metavar="X,Y,Z,R",
@@ -41,14 +42,17 @@ def ball(text: str) -> BallRegion:
     return BallRegion((x, y, z), radius_m)
 
 
-def named_regions(options: argparse.Namespace) -> Mapping[str, Region]:
-    """Regions given by --roi and --roi-ball, by name. Raises InvalidInputError, DatasetError."""
-    from gausslite.datasets.regions import balls_for_small_objects, load_voxel_regions
+def asked_regions(options: argparse.Namespace, source: Source) -> list[Region]:
+    """The objects of --roi (those of --objects, or all) and every --roi-ball; --objects alone names the source's own.
 
-    regions: dict[str, Region] = {}
+    Empty when none is asked for. Raises InvalidInputError, DatasetError.
+    """
+    from gausslite.datasets.regions import balls_for_small_objects, choose_regions, load_voxel_regions
+
+    asked: list[Region] = []
     if options.roi is not None:
-        regions.update(balls_for_small_objects(load_voxel_regions(options.roi)))
+        asked += choose_regions(balls_for_small_objects(load_voxel_regions(options.roi)), options.objects)
     elif options.objects:
-        raise InvalidInputError("--objects: names objects of a voxel file; give the file with --roi FILE.npz")
-    regions.update({f"ball_{i + 1}": region for i, region in enumerate(options.roi_ball)})
-    return regions
+        asked += choose_regions(source.regions(), options.objects)
+    balls: list[BallRegion] = options.roi_ball
+    return [*asked, *balls]

@@ -7,7 +7,7 @@ import json
 from dataclasses import asdict
 from pathlib import Path
 
-from gausslite.cli.arguments import add_regions, named_regions
+from gausslite.cli.arguments import add_regions
 from gausslite.cli.map_command import choose_attention
 from gausslite.cli.progress import MappingBar
 from gausslite.datasets.open import open_source
@@ -78,7 +78,12 @@ def run_raster(options: argparse.Namespace) -> int:
 
 def run_loop(options: argparse.Namespace) -> int:
     """Map the sequence with a clock between the steps and print the figures. Reading frames is not counted."""
-    if options.source == _HOME and options.task is None and options.policy != "uniform" and not named_regions(options):
+    if (
+        options.source == _HOME
+        and options.task is None
+        and options.policy != "uniform"
+        and not _asks_for_regions(options)
+    ):
         options.task = _HOME_TASK
     settings = mission_settings(options)
     source = open_source(options.source, options.up, options.colour_camera)
@@ -101,6 +106,10 @@ def run_loop(options: argparse.Namespace) -> int:
     else:
         print(f"{options.source} at {size[0]}x{size[1]}\n{loop_lines(timing)}\n  peak memory {peak_rss_mib():.0f} MiB")
     return 0
+
+
+def _says_what_matters(options: argparse.Namespace) -> bool:
+    return bool(options.task or options.roi or options.objects or options.roi_ball)
 
 
 def loop_lines(timing: LoopTiming) -> str:

@@ -6,10 +6,9 @@ import argparse
 from dataclasses import asdict
 from pathlib import Path
 
-from gausslite.cli.arguments import add_regions, add_source, named_regions
+from gausslite.cli.arguments import add_regions, add_source, asked_regions
 from gausslite.codec.ply import read_ply
 from gausslite.datasets.open import open_source
-from gausslite.datasets.regions import choose_regions
 from gausslite.datasets.selection import frame_size, select_frames
 from gausslite.errors import DatasetError
 from gausslite.evaluation.compare import MapScores, average, score_view
@@ -45,8 +44,7 @@ def run(options: argparse.Namespace) -> int:
         positions = HoldOut(options.hold_out).split(positions)[1]
         if not positions:
             raise DatasetError(f"--hold-out {options.hold_out}: expected at least that many frames, got fewer")
-    regions = named_regions(options)
-    chosen = choose_regions(regions, options.objects) if regions else []
+    chosen = asked_regions(options, source)
     size = frame_size(options.size, source)
     viewer = MapViewer(gaussians, choose_rasterizer(threads=options.threads))
     if options.pictures is not None:

@@ -8,11 +8,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from gausslite.cli.arguments import add_regions, add_source, named_regions
+from gausslite.cli.arguments import add_regions, add_source, asked_regions
 from gausslite.cli.parse_command import as_json
 from gausslite.cli.progress import MappingBar
 from gausslite.datasets.open import open_source
-from gausslite.datasets.regions import choose_regions
 from gausslite.datasets.selection import frame_size, select_frames
 from gausslite.datasets.source import Source
 from gausslite.domain.task import TaskGraph
@@ -108,7 +107,7 @@ def _play(source: Source, positions: Sequence[int], size: tuple[int, int], mappe
 
 def choose_attention(options: argparse.Namespace, source: Source) -> tuple[Attention, TaskGraph | None]:
     """A task in words, or regions of space, or (for a uniform map) nothing to attend to."""
-    regions = named_regions(options)
+    regions = asked_regions(options, source)
     if options.task is not None and regions:
         raise InvalidInputError("--task: give either a task in words, or regions with --roi or --roi-ball, not both")
     if options.detector is not None and options.task is None:
@@ -122,4 +121,4 @@ def choose_attention(options: argparse.Namespace, source: Source) -> tuple[Atten
         raise InvalidInputError(
             "--task: expected a task in words, or regions with --roi FILE.npz or --roi-ball X,Y,Z,R"
         )
-    return RegionAttention(choose_regions(regions, options.objects)) if regions else NoAttention(), None
+    return RegionAttention(regions) if regions else NoAttention(), None
