@@ -78,12 +78,7 @@ def run_raster(options: argparse.Namespace) -> int:
 
 def run_loop(options: argparse.Namespace) -> int:
     """Map the sequence with a clock between the steps and print the figures. Reading frames is not counted."""
-    if (
-        options.source == _HOME
-        and options.task is None
-        and options.policy != "uniform"
-        and not _asks_for_regions(options)
-    ):
+    if options.source == _HOME and options.policy != "uniform" and not _says_what_matters(options):
         options.task = _HOME_TASK
     settings = mission_settings(options)
     source = open_source(options.source, options.up, options.colour_camera)
