@@ -5,11 +5,12 @@ namespace gausslite {
 
 namespace {
 
-// Plain loads while the wait is likely short: a PAUSE instruction lets a hypervisor take the processor away, which
-// costs far more than the wait (0.2 ms a stage were seen). Then the scheduler may run others: with fewer free cores
-// than members, spinning longer would only delay the member that is waited for. After some 0.2 ms of that the thread
-// sleeps.
-constexpr int kSpins = 20'000;
+// First plain loads, for some 0.1 ms: longer than the barriers of a balanced stage and than the pause between two calls
+// of a loop. A PAUSE instruction would let a hypervisor take the processor away, which costs far more than the wait
+// (0.2 ms a stage were seen), and yielding at once would hand it to another process for a whole time slice. Then the
+// scheduler may run others: with fewer free cores than members, spinning on would only delay the member that is waited
+// for. After another 0.2 ms or so the thread sleeps.
+constexpr int kSpins = 200'000;
 constexpr int kYields = 400;
 
 uint32_t wait_while(const std::atomic<uint32_t>& value, uint32_t old) {
