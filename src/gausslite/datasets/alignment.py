@@ -32,7 +32,12 @@ _HALVINGS = 5
 _FINER = 0.25
 _LEAST_GAIN = 1e-6
 # zoom against the depth camera; shift in pixels (x, y); offset in metres (x, y); roll in degrees
+_START = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0])
 _FIRST_STEPS = np.array([0.03, 8.0, 8.0, 0.016, 0.016, 0.5])
+_SHIFTS_AND_OFFSETS = ((1, 3), (2, 4))
+_LEAPS_M, _LEAPS_PX = np.linspace(-0.12, 0.12, 25), np.linspace(-6.0, 6.0, 7)
+_LEAP_LEVEL = 1  # more blur hides which hill is higher, less makes them too narrow to hit
+_FOLD = 256
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,22 +76,24 @@ def align(frames: Sequence[Frame]) -> Alignment:
     offset along the view like a zoom. Raises DatasetError when the depth images hold too few edges.
     """
     edges = [_depth_edges(frame) for frame in frames]
-    depths_m = np.concatenate(
-        [np.zeros(0), *(e.along_rows[:, 2] for e in edges), *(e.along_columns[:, 2] for e in edges)]
-    )
+    points = [points for edge in edges for points in (edge.along_rows, edge.along_columns)]
+    depths_m = np.concatenate([np.empty((0, 3)), *points])[:, 2]
     if len(depths_m) < _MIN_EDGE_POINTS:
         raise DatasetError(f"alignment: expected at least {_MIN_EDGE_POINTS} depth edge points, got {len(depths_m)}")
     depth_camera, reference_m = frames[0].camera, float(np.median(depths_m))
-    guess, steps, gradients = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0]), _FIRST_STEPS, list[_Gradients]()
+    gradients: list[_Gradients] = []
 
     def score(candidate: Float64[ndarray, "6"]) -> float:
         return _score(_camera_of(candidate, depth_camera, reference_m), edges, gradients)
 
-    start = guess
-    for blur_px in _BLURS_PX:
+    best = _START
+    for level, blur_px in enumerate(_BLURS_PX):
         gradients[:] = [_relative_gradients(frame.rgb, blur_px) for frame in frames]
-        guess, steps = _climb(score, guess, steps), steps * _FINER
-    return Alignment(_camera_of(guess, depth_camera, reference_m), score(guess), score(start), len(depths_m))
+        steps = _FIRST_STEPS * _FINER**level
+        best = _climb(score, best, steps)
+        if level == _LEAP_LEVEL:
+            best = _climb(score, _leap(score, best), steps)
+    return Alignment(_camera_of(best, depth_camera, reference_m), score(best), score(_START), len(depths_m))
 
 
 def _camera_of(candidate: Float64[ndarray, "6"], depth_camera: Camera, reference_m: float) -> ColourCamera:
@@ -120,6 +127,16 @@ def _climb(
     return best
 
 
+def _leap(score: Callable[[Float64[ndarray, "6"]], float], start: Float64[ndarray, "6"]) -> Float64[ndarray, "6"]:
+    """Look along each offset and its shift for a higher hill: edges at two depths can be confused with each other."""
+    best = start
+    for shift, offset in _SHIFTS_AND_OFFSETS:
+        to_shift, to_offset = np.eye(len(start))[[shift, offset]]
+        leaps = [best + leap_m * to_offset + leap_px * to_shift for leap_m in _LEAPS_M for leap_px in _LEAPS_PX]
+        best = max([best, *leaps], key=score)
+    return best
+
+
 def _score(camera: ColourCamera, edges: Sequence[_Edges], gradients: Sequence[_Gradients]) -> float:
     """The mean relative gradient of colour at the projected depth edges that fall into the image."""
     sampled = []
@@ -139,9 +156,20 @@ def _sample(
     columns = (seen[:, 0] / z_m * k.fx + k.cx).astype(np.float32)
     rows = (seen[:, 1] / z_m * k.fy + k.cy).astype(np.float32)
     inside = (columns >= 0) & (columns <= image.shape[1] - 1) & (rows >= 0) & (rows <= image.shape[0] - 1)
-    # the sampler takes at most 32767 points in a row of its map
-    sampled: Float32[ndarray, "k 1"] = cv2.remap(image, columns[inside, None], rows[inside, None], cv2.INTER_LINEAR)
-    return sampled[:, 0]
+    return _between_pixels(image, columns[inside], rows[inside])
+
+
+def _between_pixels(
+    image: Float32[ndarray, "h w"], columns: Float32[ndarray, " k"], rows: Float32[ndarray, " k"]
+) -> Float32[ndarray, " k"]:
+    # OpenCV refuses maps with a side of 32767 or more: fold the points into rows
+    count = len(columns)
+    fold = ((0, -count % _FOLD),)
+    maps = [np.pad(values, fold).reshape(-1, _FOLD) for values in (columns, rows)]
+    if count == 0:
+        return columns
+    sampled: Float32[ndarray, " k"] = cv2.remap(image, maps[0], maps[1], cv2.INTER_LINEAR).reshape(-1)[:count]
+    return sampled
 
 
 def _relative_gradients(rgb: UInt8[ndarray, "h w 3"], blur_px: float) -> _Gradients:
