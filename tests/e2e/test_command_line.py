@@ -7,10 +7,12 @@ import subprocess
 import sys
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
 from gausslite.codec.ply import read_ply
+from gausslite.datasets.open import open_source
 
 HOME = "sim:home?seed=0&trajectory=0&frames=12"
 SMALL = ("--size", "160x120", "--max-gaussians", "6000", "--iterations", "4")
@@ -134,3 +136,27 @@ def test_a_full_disk_is_one_line(mug_map: Path) -> None:
     done = gausslite("fuse", mug_map / "map.ply", mug_map / "map.ply", "--out", "/dev/full")
     assert done.returncode == 2
     assert len(done.stderr.strip().splitlines()) == 1
+
+
+def test_a_damaged_frame_keeps_the_map_so_far(tmp_path: Path) -> None:
+    folder = tmp_path / "walk"
+    folder.mkdir()
+    home = open_source("sim:home?seed=0&trajectory=0&frames=3&size=64x48")
+    k = home.camera
+    np.savetxt(folder / "camera-intrinsics.txt", [[k.fx_px, 0, k.cx_px - 0.5], [0, k.fy_px, k.cy_px - 0.5], [0, 0, 1]])
+    for i in range(3):
+        frame = home.frame(i)
+        cv2.imwrite(str(folder / f"frame-{i:06d}.color.png"), frame.rgb[..., ::-1])
+        cv2.imwrite(str(folder / f"frame-{i:06d}.depth.png"), (frame.depth_m * 1000).astype(np.uint16))
+        np.savetxt(folder / f"frame-{i:06d}.pose.txt", frame.T_world_camera)
+    damaged = folder / "frame-000002.color.png"
+    damaged.write_bytes(damaged.read_bytes()[:99])
+    ball = ("--roi-ball", "2,2,0.8,0.5", "--max-gaussians", "800", "--iterations", "1")
+    done = gausslite("map", folder, *ball, "--out", tmp_path / "out")
+    assert done.returncode == 2
+    assert "frame-000002.color.png" in done.stderr
+    assert "Traceback" not in done.stderr
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert report["frames"] == 2
+    assert "frame-000002.color.png" in report["stopped_by"]
+    assert len(read_ply(tmp_path / "out" / "map.ply")) == report["gaussians"] > 0

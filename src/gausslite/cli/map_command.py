@@ -15,7 +15,7 @@ from gausslite.datasets.open import open_source
 from gausslite.datasets.selection import frame_size, select_frames
 from gausslite.datasets.source import Source
 from gausslite.domain.task import TaskGraph
-from gausslite.errors import InvalidInputError
+from gausslite.errors import GaussLiteError, InvalidInputError
 from gausslite.mission.build import build_attention, build_mapper
 from gausslite.mission.options import add_budget, add_detector, add_policy, mission_settings, perception_settings
 from gausslite.mission.results import peak_rss_mib, prepare_folder, write_results
@@ -49,6 +49,8 @@ def run(options: argparse.Namespace) -> int:
     mapper = TaskMapper(attention, build_mapper(settings), seconds_per_frame=settings.seconds_per_frame)
     prepare_folder(options.out)
     mission = _play(source, positions, size, mapper)
+    if mission.stopped is not None and not mission.outcomes:
+        raise mission.stopped
     gaussians = mapper.gaussians()
     active = int(gaussians.active.sum())
     report = {
@@ -65,8 +67,12 @@ def run(options: argparse.Namespace) -> int:
         "max_gaussians": settings.max_gaussians,
         "peak_rss_mib": peak_rss_mib(),
         "notes": list(attention.notes),
+        "stopped_by": None if mission.stopped is None else str(mission.stopped),
     }
     write_results(options.out, gaussians, report)
+    if mission.stopped is not None:
+        # what was mapped until then is kept, and the exit code says that it is not all
+        raise mission.stopped
     print(
         f"{report['frames']} frames at {report['hz']:.1f} Hz, {len(gaussians)} Gaussians "
         f"({active} of the task) → {options.out / 'map.ply'}"
@@ -76,10 +82,11 @@ def run(options: argparse.Namespace) -> int:
 
 @dataclass(frozen=True, slots=True)
 class _Mission:
-    """The outcomes of all frames, and the time they took."""
+    """The outcomes of all frames, and the time they took; stopped is the bad frame that ended it early."""
 
     outcomes: tuple[FrameOutcome, ...]
     seconds: float
+    stopped: GaussLiteError | None
 
     def summary(self) -> dict[str, object]:
         """Totals for the report; hz is mapped frames per second of perception and mapping, without reading files."""
@@ -98,11 +105,17 @@ class _Mission:
 def _play(source: Source, positions: Sequence[int], size: tuple[int, int], mapper: TaskMapper) -> _Mission:
     started_s = time.perf_counter()
     outcomes: list[FrameOutcome] = []
+    stopped: GaussLiteError | None = None
     with MappingBar(len(positions)) as bar:
         for position in positions:
-            outcomes.append(mapper.process(source.frame(position, size)))
+            try:
+                frame = source.frame(position, size)
+            except GaussLiteError as error:
+                stopped = error
+                break
+            outcomes.append(mapper.process(frame))
             bar.show(len(outcomes), outcomes[-1].gaussians, outcomes[-1].roi_share)
-    return _Mission(tuple(outcomes), time.perf_counter() - started_s)
+    return _Mission(tuple(outcomes), time.perf_counter() - started_s, stopped)
 
 
 def choose_attention(options: argparse.Namespace, source: Source) -> tuple[Attention, TaskGraph | None]:
