@@ -6,8 +6,9 @@ import contextlib
 import signal
 import subprocess
 import sys
+import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
@@ -15,6 +16,7 @@ from types import TracebackType
 from gausslite.errors import UnavailableError
 
 _GRACE_S = 10.0
+_INTERRUPTS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 @dataclass(slots=True)
@@ -56,27 +58,28 @@ class ProcessGroup:
     def start(self, name: str, module: str, arguments: Sequence[str]) -> ServiceProcess:
         """Start `python -m module arguments…` with its output in `<log_dir>/<name>.log`."""
         log = self.log_dir / f"{name}.log"
-        with log.open("wb") as stream:
+        command = [sys.executable, "-m", module, *arguments]
+        with log.open("wb") as stream, _interrupts_deferred():
             # A session of its own: Ctrl-C reaches only us, and we end the children in order.
             process = subprocess.Popen(  # noqa: S603 - our own interpreter and modules
-                [sys.executable, "-m", module, *arguments],
+                command,
                 stdin=subprocess.DEVNULL,
                 stdout=stream,
                 stderr=subprocess.STDOUT,
                 start_new_session=True,
             )
-        service = ServiceProcess(name, process, log)
-        self.services.append(service)
+            service = ServiceProcess(name, process, log)
+            self.services.append(service)
         return service
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
         running = [service.process for service in reversed(self.services) if service.process.poll() is None]
-        for process in running:
-            process.send_signal(signal.SIGTERM)
         deadline = time.monotonic() + _GRACE_S
         try:
+            for process in running:
+                process.send_signal(signal.SIGTERM)
             for process in running:
                 with contextlib.suppress(subprocess.TimeoutExpired):
                     process.wait(timeout=max(0.1, deadline - time.monotonic()))
@@ -86,3 +89,22 @@ class ProcessGroup:
                 if process.poll() is None:
                     process.kill()
                     process.wait()
+
+
+@contextlib.contextmanager
+def _interrupts_deferred() -> Iterator[None]:
+    """Let an interrupt wait until the block is left: between its birth and our note of it a child would be orphaned."""
+    if threading.current_thread() is not threading.main_thread():
+        yield  # handlers run in the main thread only
+        return
+    caught: list[int] = []
+    handlers = {number: signal.getsignal(number) for number in _INTERRUPTS}
+    for number in _INTERRUPTS:
+        signal.signal(number, lambda arrived, _frame: caught.append(arrived))
+    try:
+        yield
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+        for arrived in caught[:1]:
+            signal.raise_signal(arrived)
