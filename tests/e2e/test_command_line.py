@@ -106,6 +106,7 @@ def test_every_mistake_gets_one_line_and_exit_code_two(tmp_path: Path, mug_map: 
         "notes.onnx": ("map", HOME, *task, "--detector", tmp_path / "notes.onnx", *out),
         "frames": ("map", HOME, *task, "--frames", "9:3", *out),
         "size": ("map", HOME, *task, "--size", "huge", *out),
+        "colour camera": ("map", HOME, *task, "--colour-camera", "525,525", *out),
         "max_gaussians": ("map", HOME, *task, "--max-gaussians", "0", *out),
         "max_gaussians: expected": ("map", HOME, *task, "--max-gaussians", "3000000000000", *out),
         "seed": ("map", HOME, *task, "--seed=-1", *out),

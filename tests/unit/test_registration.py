@@ -14,6 +14,7 @@ from gausslite.datasets.open import open_source
 from gausslite.datasets.registration import ColourCamera, RegisteredSource, register_depth
 from gausslite.domain.camera import Camera
 from gausslite.errors import InvalidInputError
+from gausslite_agent.settings import parse_arguments
 
 DEPTH = Camera(100.0, 100.0, 64.0, 48.0, 128, 96)
 OFFSET_M = (-0.04, 0.0, 0.0)
@@ -141,6 +142,15 @@ def test_a_turn_about_the_view_moves_the_image_right_over_to_down() -> None:
 def test_a_bad_text_is_refused_in_one_line(text: str) -> None:
     with pytest.raises(InvalidInputError, match=r"^colour camera: expected [^\n]*$"):
         ColourCamera.parse(text)
+
+
+def test_the_agent_takes_the_text_for_its_source() -> None:
+    text = "525,525,320,240,-0.025,0,0"
+    settings = parse_arguments(["--source", "somewhere", "--task", "Find the mug", "--colour-camera", text])
+    assert settings.play is not None
+    assert settings.play.colour_camera == ColourCamera.parse(text)
+    with pytest.raises(InvalidInputError, match="colour camera"):
+        parse_arguments(["--source", "somewhere", "--task", "Find the mug", "--colour-camera", "525"])
 
 
 def test_a_focal_length_far_from_the_depth_cameras_is_refused(tmp_path: Path) -> None:

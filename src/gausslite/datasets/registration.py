@@ -23,6 +23,7 @@ from gausslite.errors import InvalidInputError
 _MAX_BASELINE_M = 1.0
 _MAX_TURN_DEG = 45.0
 _MAX_ZOOM = 4.0
+_BAND_ROWS = 40
 # a slanted surface stretches between two views: neighbours reach over the gap
 _OVERLAP = np.float32(1.1)
 # what is this much nearer to the colour camera would cost more passes than it is worth
@@ -156,22 +157,37 @@ def register_depth(
     Every depth pixel covers the pixels of the colour image whose centres lie in its footprint there, so that
     enlarging leaves no holes; the nearest surface wins. What only the colour camera sees stays empty.
     """
-    height, width = colour_camera.height_px, colour_camera.width_px
+    nearest = np.full((colour_camera.height_px, colour_camera.width_px), np.inf, np.float32)
+    # band by band: what a band needs on the way stays in the processor's cache
+    for first in range(0, len(depth_m), _BAND_ROWS):
+        band_m = depth_m[first : first + _BAND_ROWS]
+        band_camera = replace(depth_camera, cy_px=depth_camera.cy_px - first, height_px=len(band_m))
+        _splat(nearest, band_m, band_camera, colour_camera, T_colour_depth)
+    nearest[np.isinf(nearest)] = 0.0
+    return nearest
+
+
+def _splat(
+    nearest: Float32[ndarray, "hc wc"],
+    depth_m: Float32[ndarray, "h w"],
+    depth_camera: Camera,
+    colour_camera: Camera,
+    T_colour_depth: Float64[ndarray, "4 4"],
+) -> None:
+    """Lower `nearest` to the depth of every footprint that covers a pixel's centre."""
+    height, width = nearest.shape
     column_px, row_px, z_m = _project_image(depth_m, depth_camera, colour_camera, T_colour_depth)
     spread = np.minimum(_OVERLAP * depth_m / z_m, _MAX_SPREAD)
     wide = spread * np.float32(colour_camera.fx_px / depth_camera.fx_px)
     high = spread * np.float32(colour_camera.fy_px / depth_camera.fy_px)
     left, top = column_px - 0.5 * wide, row_px - 0.5 * high
-    nearest = np.full(height * width, np.inf, np.float32)
     for row_step in range(_steps(high)):
         row, in_row = _pixels_covered(top, high, row_step, height)
         for column_step in range(_steps(wide)):
             column, in_column = _pixels_covered(left, wide, column_step, width)
             covered = np.flatnonzero(in_row & in_column & (z_m < np.inf))
-            flat = (row.take(covered) * width + column.take(covered)).astype(np.int64)
-            np.minimum.at(nearest, flat, z_m.take(covered))
-    nearest[np.isinf(nearest)] = 0.0
-    return nearest.reshape(height, width)
+            flat = row.take(covered).astype(np.int64) * width + column.take(covered).astype(np.int64)
+            np.minimum.at(nearest.reshape(-1), flat, z_m.take(covered))
 
 
 def _project_image(
