@@ -14,6 +14,7 @@
 #include <optional>
 #include <string>
 
+#include "core_clock.h"
 #include "dispatch.h"
 #include "rasterizer.h"
 
@@ -186,6 +187,7 @@ nb::dict stage_times(const Rasterizer& self) {
 NB_MODULE(_kernels, m) {
   m.doc() = "Native rasterizer kernels; use gausslite.render.cpu.CpuRasterizer.";
   m.def("usable_simd", &usable_forms, "Instruction sets this build has and this machine runs, fastest first.");
+  m.def("core_clock_ghz", &core_clock_ghz, "The clock of this core, by a chain of additions.");
 
   nb::class_<TrainingView>(m, "View", "A training image made ready: padded, planar, SSIM moments cached.")
       .def_prop_ro("width", &TrainingView::width)
@@ -208,5 +210,7 @@ NB_MODULE(_kernels, m) {
            nb::arg("T_camera_world").noconvert(), nb::arg("loss"), nb::arg("rates"), nb::arg("adam"), nb::arg("masked"),
            nb::arg("tiles").noconvert().none(), nb::arg("ids").noconvert().none(),
            nb::arg("trainable").noconvert().none(), "The loss and the visible rows.")
-      .def("stage_times_ms", &stage_times, "Milliseconds of the last call's stages.");
+      .def("stage_times_ms", &stage_times, "Milliseconds of the last call's stages.")
+      .def_prop_ro("block_evaluations", &Rasterizer::block_evaluations,
+                   "How often the last forward or step composited a splat on a 4x4 block of pixels.");
 }

@@ -64,6 +64,7 @@ void Rasterizer::begin_frame(const FrameInput& input) {
   ws_.ticket = 0;
   for (ThreadScratch& scratch : ws_.scratch) {
     if (scratch.strips.size() < size_t(ws_.tiles_y)) scratch.strips.resize(size_t(ws_.tiles_y));
+    scratch.block_evaluations = 0;
   }
   loss_sums_.reserve(std::max(tiles, size_t(ws_.tiles_y) * kTile));
   if (input.active_tiles != nullptr) count_active_tiles();
@@ -227,6 +228,12 @@ double Rasterizer::step(const FrameInput& input, const OptimizerState& state, co
   const size_t sums = fused ? size_t(ws_.tiles_x) * size_t(ws_.tiles_y) : size_t(ws_.camera.height);
   double total = weight_sum > 0.0 ? double(loss.ssim) : 0.0;
   for (size_t i = 0; i < sums; ++i) total += loss_sums_[i];
+  return total;
+}
+
+uint64_t Rasterizer::block_evaluations() const {
+  uint64_t total = 0;
+  for (const ThreadScratch& scratch : ws_.scratch) total += scratch.block_evaluations;
   return total;
 }
 

@@ -61,6 +61,8 @@ class Rasterizer {
   const Stages& stages() const { return stages_; }
   int threads() const { return team_.size(); }
   const StageTimes& times() const { return times_; }
+  // How often the last frame composited a splat on a 4x4 block of pixels.
+  uint64_t block_evaluations() const;
   // True when the last frame had this many rows and pixels.
   bool matches(size_t rows, size_t width, size_t height) const {
     return rows == row_count_ && width == size_t(ws_.camera.width) && height == size_t(ws_.camera.height);

@@ -52,6 +52,7 @@ void draw_strip(Workspace& ws, int strip, int thread) {
       for (int b = 0; b < kBlocks; ++b) store_pixels(ws, tile, b, BlockState{});
     } else {
       draw_tile(ws, ws.tiles[t], tile);
+      for (const uint32_t used : ws.tiles[t].used) ws.scratch[size_t(thread)].block_evaluations += used;
     }
   }
 }

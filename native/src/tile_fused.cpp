@@ -47,6 +47,7 @@ class FusedTile {
       }
       kept = size_t(alphas - mine_.alphas.data()) / 16;
     }
+    mine_.block_evaluations += kept;
   }
 
   double compare(const Training& training) {

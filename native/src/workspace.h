@@ -68,6 +68,7 @@ struct ThreadScratch {
   Buffer<float> alphas;
   Buffer<float> ssim;                   // row buffers of the SSIM loss
   uint32_t next_row = 0, last_row = 0;  // the block of gradient rows this thread is handing out
+  uint64_t block_evaluations = 0;       // block list entries that it composited in this frame
 };
 
 struct Workspace {

@@ -10,7 +10,7 @@ import pytest
 from gausslite.domain.camera import Camera
 from gausslite.errors import InvalidInputError, KernelError, ShapeError
 from gausslite.render.choose import choose_rasterizer
-from gausslite.render.cpu import SIMD_VARIABLE, CpuRasterizer
+from gausslite.render.cpu import SIMD_VARIABLE, CpuRasterizer, core_clock_ghz
 from gausslite.render.rasterizer import AdamSettings, LossWeights, SplatGradients, Subset, TrainingView
 
 kernels = pytest.importorskip("gausslite.render._kernels", reason="the native kernels are not built")
@@ -217,3 +217,35 @@ def test_the_backend_is_chosen_by_name() -> None:
     assert choose_rasterizer("cpu", threads=1).name == "cpu"
     with pytest.raises(KernelError, match="expected one of auto, cpu, reference, got gpu"):
         choose_rasterizer("gpu")
+
+
+@pytest.mark.parametrize("simd", kernels.usable_simd())
+def test_drawing_and_training_composite_the_same_blocks_whatever_the_loss_and_the_threads(simd: str) -> None:
+    counts = set()
+    for threads in (1, 3):
+        rasterizer = CpuRasterizer(threads, simd)
+        rows = random_rows()
+        rasterizer.forward(rows, CAMERA, np.eye(4))
+        counts.add(rasterizer.block_evaluations())
+        for loss in (L1_ONLY, WITH_SSIM):
+            moments = np.zeros_like(rows), np.zeros_like(rows)
+            rasterizer.step(rows.copy(), *moments, view_of(rasterizer), np.eye(4), loss, AdamSettings())
+            counts.add(rasterizer.block_evaluations())
+    assert len(counts) == 1
+    assert counts.pop() > 0
+    rasterizer.forward(random_rows(0), CAMERA, np.eye(4))
+    assert rasterizer.block_evaluations() == 0
+
+
+def test_a_speck_is_composited_on_the_blocks_that_it_touches() -> None:
+    rows = random_rows(1)
+    # at the corner that four blocks of one tile share, a third of a pixel wide
+    rows[0, :3] = ((20 - CAMERA.cx_px) / CAMERA.fx_px, (20 - CAMERA.cy_px) / CAMERA.fy_px, 1.0)
+    rows[0, 3:6], rows[0, 10] = np.log(0.004), 3.0
+    rasterizer = CpuRasterizer(1)
+    rasterizer.forward(rows, CAMERA, np.eye(4))
+    assert rasterizer.block_evaluations() == 4
+
+
+def test_the_clock_of_the_core_is_a_clock() -> None:
+    assert 0.0 < core_clock_ghz() < np.inf

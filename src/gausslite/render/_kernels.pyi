@@ -8,6 +8,9 @@ from numpy import ndarray
 def usable_simd() -> list[str]:
     """Instruction sets this build has and this machine runs, fastest first."""
 
+def core_clock_ghz() -> float:
+    """The clock of this core, by a chain of additions."""
+
 class View:
     """A training image made ready: padded, planar, SSIM moments cached."""
 
@@ -72,3 +75,7 @@ class Engine:
 
     def stage_times_ms(self) -> dict[str, float]:
         """Milliseconds of the last call's stages."""
+
+    @property
+    def block_evaluations(self) -> int:
+        """How often the last forward or step composited a splat on a 4x4 block of pixels."""

@@ -188,10 +188,20 @@ class CpuRasterizer:
         """Milliseconds that the stages of the latest call took: project, raster, loss, backward, update."""
         return self._engine.stage_times_ms()
 
+    def block_evaluations(self) -> int:
+        """How often the latest forward or step composited a splat on a 4x4 block of pixels."""
+        return self._engine.block_evaluations
+
 
 def usable_simd() -> tuple[str, ...]:
     """Instruction sets this build has and this machine runs, fastest first. Raises KernelError."""
     return tuple(_load_kernels().usable_simd())
+
+
+def core_clock_ghz() -> float:
+    """The clock of the core that this runs on, measured in a millisecond or two. Raises KernelError."""
+    clock_ghz: float = _load_kernels().core_clock_ghz()
+    return clock_ghz
 
 
 def _load_kernels() -> Any:
