@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from gausslite.cli.bench_command import counts, sizes
+from gausslite.cli.bench_command import counts, percentages, sizes
 from gausslite.cli.main import main
 from gausslite.errors import InvalidInputError
+from gausslite.evaluation.bench_cycles import BlockCost
 from gausslite.evaluation.bench_raster import RasterBench
+from gausslite.evaluation.bench_region import Layout, tiles_of_share
 from gausslite.evaluation.bench_scene import held_view, seed_rows
 from gausslite.render.rasterizer import LOG_SCALE, MEAN, RGB
 
@@ -61,7 +64,8 @@ def test_every_case_is_measured_on_every_instruction_set() -> None:
     assert [(t.width, t.simd) for t in timings] == [(width, simd) for width in (48, 32) for simd in usable_simd()]
     for timing in timings:
         assert timing.yardstick == {}
-        assert set(timing.stages_ms) == {"fused_l1", "fused_l1_ssim"}
+        assert timing.regions == ()
+        assert set(timing.stages_ms) == set(timing.blocks) == {"fused_l1", "fused_l1_ssim"}
         assert all(0 < duration.min_ms <= duration.median_ms for duration in timing.durations.values())
 
 
@@ -70,7 +74,7 @@ def test_json_is_a_list_of_flat_records(capsys: pytest.CaptureFixture[str]) -> N
     assert main(["bench", "raster", *small, "--json"]) == 0
     records = json.loads(capsys.readouterr().out)
     assert [record["gaussians"] for record in records] == [20, 40]
-    assert [list(record)[: len(KEYS)] for record in records] == [KEYS, KEYS]
+    assert [list(record) for record in records] == [KEYS, KEYS]
     assert {(record["simd"], record["threads"], record["width"]) for record in records} == {("portable", 1, 32)}
 
 
@@ -79,6 +83,58 @@ def test_lines_name_the_case_and_every_operation(capsys: pytest.CaptureFixture[s
     printed = capsys.readouterr().out
     for word in ("20 Gaussians, 32x32", "fused_l1 ", "fused_l1_ssim", "forward", "backward", "raster"):
         assert word in printed
+
+
+def test_details_hold_every_figure_of_every_case(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "details.json"
+    small = ["--sizes", "48x32", "--gaussians", "20,40", "--threads", "1", "--reps", "1", "--shares", "10,100"]
+    assert main(["bench", "raster", *small, "--details", str(file)]) == 0
+    assert "10 % compact   fused_l1 " in capsys.readouterr().out
+    cases = json.loads(file.read_text())["cases"]
+    assert [case["gaussians"] for case in cases] == [20, 40]
+    for case in cases:
+        assert set(case["operations"]) == {"fused_l1", "fused_l1_ssim", "forward", "backward"}
+        assert case["blocks"]["fused_l1"]["evaluations"] == case["blocks"]["fused_l1_ssim"]["evaluations"] > 0
+        regions = [(each["share_percent"], each["layout"], each["loss"]) for each in case["regions"]]
+        assert len(set(regions)) == 2 * 2 * 2
+        assert all(each["ratio"] > 0 for each in case["regions"])
+
+
+def test_cycles_are_those_of_all_threads_in_the_stages_that_evaluate_blocks() -> None:
+    stages = {"project": 5.0, "raster": 2.0, "loss": 7.0, "backward": 1.0, "update": 9.0}
+    cost = BlockCost.of(evaluations=300_000, clock_ghz=3.4, threads=2, stages_ms=stages)
+    assert cost.cycles == pytest.approx(2 * 3.0e-3 * 3.4e9 / 300_000)
+    assert cost.floor_share == pytest.approx(34 / 68)
+
+
+@pytest.mark.parametrize("layout", Layout)
+def test_a_smaller_share_of_tiles_lies_inside_a_larger_one(layout: Layout) -> None:
+    shares = [tiles_of_share((240, 320), percent, layout) for percent in (0.1, 5, 20, 50, 100)]
+    assert [int(tiles.sum()) for tiles in shares] == [1, 15, 60, 150, 300]
+    for smaller, larger in itertools.pairwise(shares):
+        assert not (smaller & ~larger).any()
+
+
+def test_a_compact_region_lies_round_the_middle() -> None:
+    rows, columns = np.nonzero(tiles_of_share((160, 160), 36, Layout.COMPACT))
+    assert {*rows, *columns} == set(range(2, 8))
+
+
+@pytest.mark.parametrize("percent", [0.0, -1.0, 100.5, float("nan")])
+def test_a_share_that_is_none_is_told(percent: float) -> None:
+    with pytest.raises(InvalidInputError, match="region share: expected more than 0 and at most 100"):
+        tiles_of_share((32, 32), percent, Layout.COMPACT)
+
+
+@pytest.mark.parametrize("text", ["", "0,5", "5,,7", "101", "-1", "nan", "x"])
+def test_percents_that_are_none_are_told(text: str) -> None:
+    with pytest.raises(argparse.ArgumentTypeError, match="expected"):
+        percentages(text)
+
+
+def test_no_shares_can_be_asked_for() -> None:
+    assert percentages("0") == ()
+    assert percentages("5,20.5") == (5.0, 20.5)
 
 
 def test_a_file_that_is_no_library_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 import json
+import shlex
+import sys
 from dataclasses import asdict
 from pathlib import Path
 
@@ -13,11 +15,13 @@ from gausslite.cli.progress import MappingBar
 from gausslite.datasets.open import open_source
 from gausslite.datasets.selection import frame_size, select_frames
 from gausslite.domain.voxels import VoxelGrid
+from gausslite.evaluation.bench_cycles import FLOOR_CYCLES, BlockCost
 from gausslite.evaluation.bench_loop import Latency, LoopBench, LoopTiming
 from gausslite.evaluation.bench_raster import GAUSSIANS, OPERATIONS, SIZES, RasterBench, RasterTiming
+from gausslite.evaluation.bench_region import SHARES_PERCENT, RegionCost
 from gausslite.mission.build import build_mapper
-from gausslite.mission.options import add_budget, add_detector, add_frames, add_policy, mission_settings, names
-from gausslite.mission.results import as_text, peak_rss_mib
+from gausslite.mission.options import add_budget, add_detector, add_frames, add_policy, mission_settings, names, numbers
+from gausslite.mission.results import as_text, peak_rss_mib, write_json
 
 _HOME = "sim:home?seed=0&trajectory=0"
 _HOME_TASK = "Pick up the mug on the table"
@@ -40,7 +44,16 @@ def _configure_raster(parser: argparse.ArgumentParser) -> None:
     add("--simd", metavar="NAME", help="instruction set, or all (default: the fastest here)")
     add("--reps", metavar="N", type=int, default=60, help="timed runs of each operation (default: %(default)s)")
     add("--yardstick", metavar="LIB.so", type=Path, help="measure this library beside ours, in turns")
-    add("--json", action="store_true", help="print JSON for scripts")
+    shares = ",".join(f"{share:g}" for share in SHARES_PERCENT)
+    add(
+        "--shares",
+        metavar="P,...",
+        type=percentages,
+        default=SHARES_PERCENT,
+        help=f"percents of the image for the masked step, or 0 for none (default: {shares})",
+    )
+    add("--json", action="store_true", help="print JSON for scripts: each case's least times, without shares")
+    add("--details", metavar="FILE", type=Path, help="write everything that was measured here, as JSON")
     parser.set_defaults(run=run_raster)
 
 
@@ -67,12 +80,19 @@ def run_raster(options: argparse.Namespace) -> int:
         threads=options.threads,
         repetitions=options.reps,
         yardstick=options.yardstick,
+        shares_percent=() if options.json and options.details is None else options.shares,
     )
-    if options.json:
-        print(json.dumps([timing.as_json() for timing in bench.run()], indent=2))
-        return 0
+    timings = []
     for timing in bench.run():
-        print(raster_lines(timing), flush=True)
+        timings.append(timing)
+        if not options.json:
+            print(raster_lines(timing), flush=True)
+    if options.json:
+        print(json.dumps([timing.summary() for timing in timings], indent=2))
+    if options.details is not None:
+        write_json(
+            options.details, {"command": shlex.join(sys.argv), "cases": [timing.details() for timing in timings]}
+        )
     return 0
 
 
@@ -144,7 +164,24 @@ def raster_lines(timing: RasterTiming) -> str:
         lines.append(line)
         if stages:
             lines.append("    " + "  ".join(f"{stage} {ms:.2f}" for stage, ms in stages.items()))
+            lines.append(f"    {_block_line(timing.blocks[name])}")
+    lines += [_region_line(cost) for cost in timing.regions]
     return "\n".join(lines)
+
+
+def _block_line(cost: BlockCost) -> str:
+    return (
+        f"{cost.evaluations} block evaluations at {cost.clock_ghz:.2f} GHz: {cost.cycles:.1f} cycles each, "
+        f"the arithmetic floor of {FLOOR_CYCLES:.0f} is {cost.floor_share:.0%} of that"
+    )
+
+
+def _region_line(cost: RegionCost) -> str:
+    return (
+        f"  {cost.share_percent:5g} % {cost.layout:<9} {cost.loss:<13} {cost.region.min_ms:8.2f} / "
+        f"{cost.region.median_ms:8.2f}   full {cost.full.min_ms:8.2f} / {cost.full.median_ms:8.2f}   "
+        f"ratio {cost.ratio:.3f}"
+    )
 
 
 def sizes(text: str) -> tuple[tuple[int, int], ...]:
@@ -162,6 +199,16 @@ def counts(text: str) -> tuple[int, ...]:
     if not read:
         raise argparse.ArgumentTypeError(f"expected whole numbers such as 20000,100000, got {text!r}")
     return read
+
+
+def percentages(text: str) -> tuple[float, ...]:
+    """Read "5,20"; "0" is none; argparse reports what is wrong."""
+    if text.strip() == "0":
+        return ()
+    read = numbers(text, text.count(",") + 1)
+    if not all(0 < share <= 100 for share in read):
+        raise argparse.ArgumentTypeError(f"expected percents above 0 and up to 100, or 0 alone, got {text!r}")
+    return tuple(read)
 
 
 def _positive(text: str) -> int:

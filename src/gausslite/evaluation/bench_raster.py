@@ -3,49 +3,35 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import numpy as np
 
 from gausslite.errors import InvalidInputError
+from gausslite.evaluation.bench_cycles import BlockCost
+from gausslite.evaluation.bench_region import RegionCost, region_costs
 from gausslite.evaluation.bench_scene import BenchView, held_view, seed_rows
+from gausslite.evaluation.bench_step import LOSSES, TURN, Duration, RestingStep, timed
 from gausslite.evaluation.bench_yardstick import Yardstick
 from gausslite.optimize.parameters import SplatTable
-from gausslite.render.cpu import CpuRasterizer
-from gausslite.render.rasterizer import AdamSettings, LossWeights, Rendering
+from gausslite.render.cpu import CpuRasterizer, core_clock_ghz
+from gausslite.render.rasterizer import Rendering
 
 SIZES = ((320, 240), (640, 480))
 GAUSSIANS = (20_000, 100_000, 300_000)
-OPERATIONS = ("fused_l1", "fused_l1_ssim", "forward", "backward")
-_RESTING = AdamSettings(means=0.0, log_scales=0.0, quats=0.0, opacity_logits=0.0, rgb=0.0)
-_L1 = LossWeights(colour=0.8, depth=1.0, ssim=0.0)
-_L1_SSIM = LossWeights(colour=0.8, depth=1.0, ssim=0.2)
-_WARM_UP = 3
-_TURN = 10
+OPERATIONS = (*LOSSES, "forward", "backward")
 _SETTLE_S = 0.02
 
 
 @dataclass(frozen=True, slots=True)
-class Duration:
-    """Milliseconds of many runs of one thing."""
-
-    min_ms: float
-    median_ms: float
-
-    @classmethod
-    def of(cls, seconds: Sequence[float]) -> Duration:
-        """Minimum and median of these times."""
-        return cls(float(np.min(seconds)) * 1e3, float(np.median(seconds)) * 1e3)
-
-
-@dataclass(frozen=True, slots=True)
 class RasterTiming:
-    """What each operation took, whole calls as the mapper pays for them; stages_ms of each fused step: minima.
+    """What each operation took, whole calls as the mapper pays for them.
 
-    yardstick is the other library's, empty when none was measured.
+    stages_ms and blocks: of each fused step, least times. yardstick is the other library's and regions are what shares
+    of the image cost; both are empty when they were not asked for.
     """
 
     gaussians: int
@@ -55,22 +41,36 @@ class RasterTiming:
     simd: str
     durations: Mapping[str, Duration]
     stages_ms: Mapping[str, Mapping[str, float]]
+    blocks: Mapping[str, BlockCost]
     yardstick: Mapping[str, Duration] = field(default_factory=dict)
+    regions: Sequence[RegionCost] = ()
 
-    def as_json(self) -> dict[str, object]:
-        """One flat record for scripts."""
-        case = {name: getattr(self, name) for name in ("gaussians", "width", "height", "threads", "simd")}
+    def summary(self) -> dict[str, object]:
+        """One flat record for scripts: the case, and the least time of each operation."""
         minima = {f"{name}_ms_min": self.durations[name].min_ms for name in OPERATIONS}
-        medians = {f"{name}_ms_median": self.durations[name].median_ms for name in OPERATIONS}
-        others = {f"yardstick_{name}_ms_min": duration.min_ms for name, duration in self.yardstick.items()}
-        return {**case, **minima, **medians, **others, "stages_ms_min": self.stages_ms}
+        return {**self._case(), **minima}
+
+    def details(self) -> dict[str, object]:
+        """Everything that was measured, in sections of plain values."""
+        return {
+            **self._case(),
+            "operations": {name: asdict(duration) for name, duration in self.durations.items()},
+            "stages_ms_min": {name: dict(stages) for name, stages in self.stages_ms.items()},
+            "blocks": {name: {**asdict(cost), "floor_share": cost.floor_share} for name, cost in self.blocks.items()},
+            "yardstick": {name: asdict(duration) for name, duration in self.yardstick.items()},
+            "regions": [{**asdict(cost), "ratio": cost.ratio} for cost in self.regions],
+        }
+
+    def _case(self) -> dict[str, object]:
+        return {name: getattr(self, name) for name in ("gaussians", "width", "height", "threads", "simd")}
 
 
 @dataclass(frozen=True, slots=True)
 class RasterBench:
     """What to measure: every size with every number of Gaussians and every instruction set (None: the fastest).
 
-    repetitions counts the timed runs of each operation; threads None means one per core allowed.
+    repetitions counts the timed runs of each operation; threads None means one per core allowed. shares_percent: the
+    parts of the image on which the masked, exact step is measured as well.
     """
 
     sizes: Sequence[tuple[int, int]] = SIZES
@@ -79,6 +79,7 @@ class RasterBench:
     threads: int | None = None
     repetitions: int = 60
     yardstick: Path | None = None
+    shares_percent: Sequence[float] = ()
 
     def __post_init__(self) -> None:
         if not 1 <= self.repetitions <= 100_000:
@@ -101,8 +102,12 @@ class RasterBench:
                 other = Yardstick(self.yardstick, rasterizer.threads, _table(table.count), view)
                 at_end.callback(other.close)
                 contenders.append(other)
-            seconds = _take_turns(contenders, self.repetitions)
+            seconds, clock_ghz = _take_turns(contenders, self.repetitions)
         durations = [{name: Duration.of(times) for name, times in each.items()} for each in seconds]
+        blocks = {
+            name: BlockCost.of(ours.evaluations[name], clock_ghz, rasterizer.threads, stages)
+            for name, stages in ours.stages_ms.items()
+        }
         return RasterTiming(
             gaussians=table.count,
             width=view.camera.width_px,
@@ -111,7 +116,9 @@ class RasterBench:
             simd=rasterizer.simd,
             durations=durations[0],
             stages_ms=ours.stages_ms,
+            blocks=blocks,
             yardstick=durations[1] if self.yardstick is not None else {},
+            regions=region_costs(rasterizer, table, view, self.shares_percent, self.repetitions),
         )
 
 
@@ -120,10 +127,11 @@ class _Ours:
 
     def __init__(self, rasterizer: CpuRasterizer, table: SplatTable, view: BenchView) -> None:
         self.stages_ms: dict[str, dict[str, float]] = {}
+        self.evaluations: dict[str, int] = {}
         self._rasterizer = rasterizer
         self._table = table
         self._view = view
-        self._training_view = rasterizer.prepare_view(view.rgb, view.depth_m, view.camera)
+        self._train = RestingStep(rasterizer, table, view)
         self._drawn: Rendering = self._draw()
         self._d_rgb = np.full(view.rgb.shape, 1e-5, np.float32)
         self._d_depth_m = np.full(view.depth_m.shape, 1e-5, np.float32)
@@ -131,11 +139,11 @@ class _Ours:
 
     def fused_l1(self) -> None:
         """One whole iteration with L1 on colour and depth."""
-        self._step("fused_l1", _L1)
+        self._step("fused_l1")
 
     def fused_l1_ssim(self) -> None:
         """One whole iteration with SSIM too."""
-        self._step("fused_l1_ssim", _L1_SSIM)
+        self._step("fused_l1_ssim")
 
     def forward(self) -> None:
         """Draw."""
@@ -148,11 +156,9 @@ class _Ours:
     def _draw(self) -> Rendering:
         return self._rasterizer.forward(self._table.rows, self._view.camera, self._view.T_camera_world)
 
-    def _step(self, name: str, loss: LossWeights) -> None:
-        table = self._table
-        moments = (table.first_moment, table.second_moment)
-        pose = self._view.T_camera_world
-        self._rasterizer.step(table.rows, *moments, self._training_view, pose, loss, _RESTING)
+    def _step(self, name: str) -> None:
+        self._train(LOSSES[name])
+        self.evaluations[name] = self._rasterizer.block_evaluations()
         least = self.stages_ms.setdefault(name, {})
         for stage, ms in self._rasterizer.stage_times_ms().items():
             least[stage] = min(ms, least.get(stage, ms))
@@ -166,29 +172,21 @@ def _table(count: int) -> SplatTable:
     return table
 
 
-def _take_turns(contenders: Sequence[_Ours | Yardstick], repetitions: int) -> list[dict[str, list[float]]]:
-    """Seconds of `repetitions` runs of each operation of each contender, in turns of ten."""
+def _take_turns(
+    contenders: Sequence[_Ours | Yardstick], repetitions: int
+) -> tuple[list[dict[str, list[float]]], float]:
+    """Seconds of `repetitions` runs of each operation of each contender, in turns; and the fastest clock in between."""
     seconds: list[dict[str, list[float]]] = [{name: [] for name in OPERATIONS} for _ in contenders]
-    for done in range(0, repetitions, _TURN):
-        turn = min(_TURN, repetitions - done)
+    clock_ghz = 0.0
+    for done in range(0, repetitions, TURN):
+        turn = min(TURN, repetitions - done)
         for contender, times in zip(contenders, seconds, strict=True):
             # idle threads of the one before may still be spinning on our cores
             time.sleep(_SETTLE_S)
-            for fused in ("fused_l1", "fused_l1_ssim"):
-                times[fused] += _timed([getattr(contender, fused)], turn)[0]
-            forward, backward = _timed([contender.forward, contender.backward], turn)
+            for fused in LOSSES:
+                times[fused] += timed([getattr(contender, fused)], turn)[0]
+            clock_ghz = max(clock_ghz, core_clock_ghz())
+            forward, backward = timed([contender.forward, contender.backward], turn)
             times["forward"] += forward
             times["backward"] += backward
-    return seconds
-
-
-def _timed(operations: Sequence[Callable[[], None]], repetitions: int) -> list[list[float]]:
-    """Seconds of each run of each of these operations, one after the other, once all are warm."""
-    seconds: list[list[float]] = [[] for _ in operations]
-    for i in range(_WARM_UP + repetitions):
-        for operation, times in zip(operations, seconds, strict=True):
-            started_s = time.perf_counter()
-            operation()
-            if i >= _WARM_UP:
-                times.append(time.perf_counter() - started_s)
-    return seconds
+    return seconds, clock_ghz
