@@ -260,3 +260,32 @@ def test_a_view_of_another_size_than_its_camera_is_refused(rasterizer: Rasterize
     camera = scene_named("odd size").camera
     with pytest.raises(ShapeError, match="rgb"):
         rasterizer.prepare_view(np.zeros((4, 4, 3), np.uint8), np.zeros((4, 4), np.float32), camera)
+
+
+def test_tables_on_loan_end_up_as_step_by_step(rasterizer: Rasterizer, oracle: Rasterizer) -> None:
+    scene = scene_named("medium splats")
+    view = picture_for(scene, oracle).view(rasterizer, scene)
+    alone, lent = tables(scene, seasoned=True), tables(scene, seasoned=True)
+    reports = [rasterizer.step(*alone, view, scene.T_camera_world, LOSS, ADAM) for _ in range(3)]
+    with rasterizer.holding(*lent):
+        lent_reports = [rasterizer.step(*lent, view, scene.T_camera_world, LOSS, ADAM) for _ in range(3)]
+    for came, wanted in zip(lent, alone, strict=True):
+        np.testing.assert_array_equal(came, wanted)
+    for came, wanted in zip(lent_reports, reports, strict=True):
+        assert came.loss == wanted.loss
+        np.testing.assert_array_equal(came.visible, wanted.visible)
+
+
+def test_an_error_ends_the_loan_with_what_was_trained(rasterizer: Rasterizer, oracle: Rasterizer) -> None:
+    scene = scene_named("medium splats")
+    view = picture_for(scene, oracle).view(rasterizer, scene)
+    lent = tables(scene, seasoned=False)
+
+    def one_step_and_a_mishap() -> None:
+        with rasterizer.holding(*lent):
+            rasterizer.step(*lent, view, scene.T_camera_world, LOSS, ADAM)
+            raise KeyError("a mishap")
+
+    with pytest.raises(KeyError):
+        one_step_and_a_mishap()
+    assert lent[0][:, UPDATES].max() == 1

@@ -7,6 +7,7 @@ that map is what it shows: inside the footprint of the map as it was voted, and 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -20,7 +21,7 @@ from gausslite.fusion.keyframes import TeamKeyframe
 from gausslite.optimize.density import DensitySettings, densify, prune
 from gausslite.optimize.parameters import SplatTable, gaussians_to_rows
 from gausslite.optimize.rates import ONLINE_RATES
-from gausslite.render.rasterizer import AdamSettings, LossWeights, Rasterizer, TrainingView
+from gausslite.render.rasterizer import AdamSettings, LossWeights, Rasterizer, StepReport, TrainingView
 
 _FOOTPRINT_ALPHA = 0.5
 _IN_FRONT_M, _IN_FRONT_SHARE = 0.05, 0.05
@@ -78,14 +79,23 @@ def refine(
     views = _Views(_teaching_views(table, keyframes, rasterizer), rasterizer, settings)
     extent_m = _extent_m(gaussians)
     rng = np.random.default_rng(settings.seed)
-    for iteration in range(1, settings.iterations + 1):
-        view, T_camera_world = views.draw(rng)
-        loss = _train(table, view, T_camera_world, rasterizer, settings)
-        _control_density(table, iteration, settings, extent_m, rng)
-        due = iteration % settings.report_every == 0 or iteration == settings.iterations
-        if due and not go_on(RefineProgress(iteration, settings.iterations, loss, table.count)):
-            break
+    with ExitStack() as loan:
+        loan.enter_context(_holding(table, rasterizer))
+        for iteration in range(1, settings.iterations + 1):
+            view, T_camera_world = views.draw(rng)
+            report = _train(table, view, T_camera_world, rasterizer, settings)
+            if _density_control_is_due(iteration, settings.density):
+                loan.close()
+                _control_density(table, iteration, settings, extent_m, rng)
+                loan.enter_context(_holding(table, rasterizer))
+            due = iteration % settings.report_every == 0 or iteration == settings.iterations
+            if due and not go_on(RefineProgress(iteration, settings.iterations, report.loss, table.count)):
+                break
     return table.to_gaussians()
+
+
+def _holding(table: SplatTable, rasterizer: Rasterizer) -> AbstractContextManager[None]:
+    return rasterizer.holding(table.rows, table.first_moment, table.second_moment)
 
 
 def _fill_table(gaussians: Gaussians, settings: RefineSettings) -> SplatTable:
@@ -158,7 +168,7 @@ def _train(
     T_camera_world: Float64[ndarray, "4 4"],
     rasterizer: Rasterizer,
     settings: RefineSettings,
-) -> float:
+) -> StepReport:
     report = rasterizer.step(
         table.rows,
         table.first_moment,
@@ -170,7 +180,11 @@ def _train(
         masked=True,
     )
     table.kappa[report.visible] += 1
-    return report.loss
+    return report
+
+
+def _density_control_is_due(iteration: int, density: DensitySettings) -> bool:
+    return iteration % density.densify_every == 0 or iteration % density.prune_every == 0
 
 
 def _control_density(

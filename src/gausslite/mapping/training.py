@@ -11,10 +11,12 @@ from gausslite.mapping.keyframes import WindowView
 from gausslite.mapping.settings import ActivePhase, MapperSettings
 from gausslite.optimize.density import densify, prune
 from gausslite.optimize.parameters import SplatTable
-from gausslite.render.rasterizer import EVERYTHING, RGB, Rasterizer, Subset
+from gausslite.render.rasterizer import EVERYTHING, RGB, Rasterizer, StepReport, Subset
 
 _COLOUR_RANGE = (-0.25, 1.25)
 """Somewhat beyond what can be shown, so that overlapping Gaussians still add up to black and white."""
+_READ_EVERY = 8
+"""So many reports of the active phase wait to be read together, so that a device runs on meanwhile."""
 
 
 class Trainer:
@@ -28,6 +30,7 @@ class Trainer:
         self._rasterizer = rasterizer
         self._rng = rng
         self._iterations = 0
+        self._unread: list[StepReport] = []
 
     @property
     def iterations(self) -> int:
@@ -40,18 +43,34 @@ class Trainer:
         Without a deadline that is the number in the settings; with one, iterations go on until time.perf_counter()
         passes ends_at_s, repeating the two phases in the settings' proportion.
         """
-        optimization = self._settings.optimization
         done = 0
-        while _goes_on(done, optimization.iterations, ends_at_s):
-            if done % optimization.iterations < optimization.warmup_iterations:
-                self._warm_up(views)
-            else:
-                self._active_phase(views)
-            done += 1
-            self._iterations += 1
+        while self._goes_on(done, ends_at_s):
+            done = self._until_density_control(views, done, ends_at_s)
             self._control_density(extent_m)
         self._bound_colours()
         return done
+
+    def _until_density_control(self, views: Sequence[WindowView], done: int, ends_at_s: float | None) -> int:
+        """Iterate until density control is due or time is up, the tables on loan to the rasterizer; `done` then."""
+        table, optimization = self._table, self._settings.optimization
+        with self._rasterizer.holding(table.rows, table.first_moment, table.second_moment):
+            while True:
+                if done % optimization.iterations < optimization.warmup_iterations:
+                    self._warm_up(views)
+                else:
+                    self._active_phase(views)
+                done += 1
+                self._iterations += 1
+                if self._density_control_is_due() or not self._goes_on(done, ends_at_s):
+                    break
+        self._count_trained()
+        return done
+
+    def _goes_on(self, done: int, ends_at_s: float | None) -> bool:
+        iterations = self._settings.optimization.iterations
+        if ends_at_s is None or iterations == 0:
+            return done < iterations
+        return time.perf_counter() < ends_at_s
 
     def _warm_up(self, views: Sequence[WindowView]) -> None:
         """One iteration over the full image of a view drawn at random."""
@@ -69,14 +88,23 @@ class Trainer:
             view = self._draw(showing)
         table, phase = self._table, self._settings.optimization.active_phase
         ids = np.flatnonzero(table.active).astype(np.uint32) if phase is ActivePhase.ACTIVE_ONLY else None
-        visible = self._step(view, masked=True, subset=Subset(tiles=view.active_tiles, ids=ids))
-        table.kappa[visible[table.active[visible]]] += 1
+        self._unread.append(self._step(view, masked=True, subset=Subset(tiles=view.active_tiles, ids=ids)))
+        if len(self._unread) == _READ_EVERY:
+            self._count_trained()
         return None
 
-    def _step(self, view: WindowView, masked: bool, subset: Subset) -> np.ndarray:
+    def _count_trained(self) -> None:
+        """Kappa: active Gaussians that an iteration of the active phase trained."""
+        table = self._table
+        for report in self._unread:
+            visible = report.visible
+            table.kappa[visible[table.active[visible]]] += 1
+        self._unread.clear()
+
+    def _step(self, view: WindowView, masked: bool, subset: Subset) -> StepReport:
         table, optimization = self._table, self._settings.optimization
         frozen = masked and optimization.active_phase is ActivePhase.FROZEN_BACKGROUND
-        report = self._rasterizer.step(
+        return self._rasterizer.step(
             table.rows,
             table.first_moment,
             table.second_moment,
@@ -88,7 +116,6 @@ class Trainer:
             subset=subset,
             trainable=table.active if frozen else None,
         )
-        return report.visible
 
     def _draw(self, views: Sequence[WindowView]) -> WindowView:
         return views[int(self._rng.integers(len(views)))]
@@ -98,6 +125,10 @@ class Trainer:
         colours = self._table.rows[:, RGB]
         np.clip(colours, *_COLOUR_RANGE, out=colours)
 
+    def _density_control_is_due(self) -> bool:
+        density = self._settings.density
+        return self._iterations % density.prune_every == 0 or self._iterations % density.densify_every == 0
+
     def _control_density(self, extent_m: float) -> None:
         """Clone, split and prune when their turn has come."""
         density = self._settings.density
@@ -105,9 +136,3 @@ class Trainer:
             prune(self._table, density)
         if self._iterations % density.densify_every == 0:
             densify(self._table, density, extent_m, self._rng)
-
-
-def _goes_on(done: int, iterations: int, ends_at_s: float | None) -> bool:
-    if ends_at_s is None or iterations == 0:
-        return done < iterations
-    return time.perf_counter() < ends_at_s

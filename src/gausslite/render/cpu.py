@@ -3,21 +3,28 @@
 from __future__ import annotations
 
 import os
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, UInt8, UInt32
+from jaxtyping import Bool, Float32, Float64, UInt8
 from numpy import ndarray
 
 from gausslite.domain.arrays import require_array
 from gausslite.domain.camera import Camera
 from gausslite.errors import InvalidInputError, KernelError, ShapeError
+from gausslite.render.checks import (
+    require_image_gradients,
+    require_scene,
+    require_table,
+    require_tables,
+    require_view,
+)
 from gausslite.render.rasterizer import (
     EVERYTHING,
-    ROW_WIDTH,
-    TILE_PX,
     AdamSettings,
+    HostReport,
     LossWeights,
     Rendering,
     SplatGradients,
@@ -87,8 +94,8 @@ class CpuRasterizer:
         subset: Subset = EVERYTHING,
     ) -> Rendering:
         """Draw the splats. Raises ShapeError, InvalidInputError for ids that are not ascending rows."""
-        _require_table("rows", rows, None)
-        _require_scene(len(rows), camera, T_camera_world, subset)
+        require_table("rows", rows)
+        require_scene(len(rows), camera, T_camera_world, subset)
         T_camera_world = np.ascontiguousarray(T_camera_world)
         rgb, depth_m, alpha, frame = self._engine.forward(
             rows, _intrinsics(camera), T_camera_world, _contiguous(subset.tiles), _contiguous(subset.ids)
@@ -110,10 +117,7 @@ class CpuRasterizer:
         drawn = rendering.context
         if not isinstance(drawn, _Drawn) or drawn.owner is not self or drawn.frame != self._engine.frame:
             raise InvalidInputError("rendering: expected the latest forward of this rasterizer, got another one")
-        size = rendering.alpha.shape
-        require_array("d_rgb", d_rgb, (*size, 3), np.float32)
-        require_array("d_depth_m", d_depth_m, size, np.float32)
-        require_array("d_alpha", d_alpha, size, np.float32)
+        require_image_gradients(rendering, d_rgb, d_depth_m, d_alpha)
         d_rows, d_twist, visible, norms = self._engine.backward(
             drawn.frame,
             len(drawn.rows),
@@ -131,13 +135,7 @@ class CpuRasterizer:
         weight: Float32[ndarray, "h w"] | None = None,
     ) -> TrainingView:
         """Make an image ready to train on. Raises ShapeError, InvalidInputError for weights outside [0, 1]."""
-        size = (camera.height_px, camera.width_px)
-        require_array("view rgb", rgb, (*size, 3), np.uint8)
-        require_array("view depth_m", depth_m, size, np.float32)
-        if weight is not None:
-            require_array("view weight", weight, size, np.float32)
-            if not ((weight >= 0.0) & (weight <= 1.0)).all():
-                raise InvalidInputError(f"view weight: expected values in [0, 1], got {weight.min()} to {weight.max()}")
+        require_view(rgb, depth_m, camera, weight)
         native = self._engine.prepare_view(
             np.ascontiguousarray(rgb), np.ascontiguousarray(depth_m), _contiguous(weight)
         )
@@ -159,14 +157,10 @@ class CpuRasterizer:
         """One whole iteration in place. Raises ShapeError, also for a view of another backend."""
         if not isinstance(view, CpuView):
             raise ShapeError(f"view: expected one that this backend prepared, got {type(view).__name__}")
-        n = len(rows)
-        for name, table in (("rows", rows), ("first_moment", first_moment), ("second_moment", second_moment)):
-            _require_table(name, table, n)
-            if not table.flags.writeable:
-                raise ShapeError(f"{name}: expected a writeable array, got a read-only one")
-        _require_scene(n, view.camera, T_camera_world, subset)
+        require_tables(rows, first_moment, second_moment)
+        require_scene(len(rows), view.camera, T_camera_world, subset)
         if trainable is not None:
-            require_array("trainable", trainable, (n,), np.bool_)
+            require_array("trainable", trainable, (len(rows),), np.bool_)
         value, visible = self._engine.step(
             rows,
             first_moment,
@@ -182,7 +176,17 @@ class CpuRasterizer:
             _contiguous(subset.ids),
             _contiguous(trainable),
         )
-        return StepReport(value, visible)
+        return HostReport(value, visible)
+
+    def holding(
+        self,
+        rows: Float32[ndarray, "n 16"],
+        first_moment: Float32[ndarray, "n 16"],
+        second_moment: Float32[ndarray, "n 16"],
+    ) -> AbstractContextManager[None]:
+        """Nothing to carry: steps work on the arrays themselves. Raises ShapeError."""
+        require_tables(rows, first_moment, second_moment)
+        return nullcontext()
 
     def stage_times_ms(self) -> dict[str, float]:
         """Milliseconds that the stages of the latest call took: project, raster, loss, backward, update."""
@@ -237,24 +241,3 @@ def _intrinsics(camera: Camera) -> tuple[float, float, float, float, int, int]:
 
 def _contiguous(array: ndarray | None) -> ndarray | None:
     return None if array is None else np.ascontiguousarray(array)
-
-
-def _require_table(name: str, table: Float32[ndarray, "n 16"], n: int | None) -> None:
-    require_array(name, table, (n, ROW_WIDTH), np.float32)
-    if not table.flags.c_contiguous:
-        raise ShapeError(f"{name}: expected contiguous rows, got strides {table.strides}")
-
-
-def _require_scene(n: int, camera: Camera, T_camera_world: Float64[ndarray, "4 4"], subset: Subset) -> None:
-    require_array("T_camera_world", T_camera_world, (4, 4), np.float64)
-    if subset.tiles is not None:
-        grid = (-(-camera.height_px // TILE_PX), -(-camera.width_px // TILE_PX))
-        require_array("subset tiles", subset.tiles, grid, np.bool_)
-    if subset.ids is not None:
-        require_array("subset ids", subset.ids, (None,), np.uint32)
-        _require_ascending(subset.ids, n)
-
-
-def _require_ascending(ids: UInt32[ndarray, " m"], n: int) -> None:
-    if len(ids) and (ids[-1] >= n or (ids[1:] <= ids[:-1]).any()):
-        raise InvalidInputError(f"subset ids: expected ascending row numbers below {n}, got others")

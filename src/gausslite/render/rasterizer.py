@@ -20,6 +20,7 @@ the centre of at least one drawn pixel.
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from typing import Any, Protocol, runtime_checkable
 
@@ -134,9 +135,24 @@ class TrainingView(Protocol):
         ...
 
 
+@runtime_checkable
+class StepReport(Protocol):
+    """What one fused step did; a backend on a device fetches a figure when it is first read, so read it late."""
+
+    @property
+    def loss(self) -> float:
+        """The loss before the update."""
+        ...
+
+    @property
+    def visible(self) -> UInt32[ndarray, " m"]:
+        """The visible rows, ascending (frozen ones too)."""
+        ...
+
+
 @dataclass(frozen=True, slots=True, eq=False)
-class StepReport:
-    """What one fused step did. loss: before the update. visible: the visible rows, ascending (frozen ones too)."""
+class HostReport:
+    """The report of a backend whose figures are at hand."""
 
     loss: float
     visible: UInt32[ndarray, " m"]
@@ -199,5 +215,19 @@ class Rasterizer(Protocol):
         masked=True weighs every loss term by the view's weight and divides by the weights' sum. Only rows that are
         visible and trainable change, with their moments: their UPDATES count rises by one, and the density
         statistics of the first moment are added up. Raises ShapeError.
+        """
+        ...
+
+    def holding(
+        self,
+        rows: Float32[ndarray, "n 16"],
+        first_moment: Float32[ndarray, "n 16"],
+        second_moment: Float32[ndarray, "n 16"],
+    ) -> AbstractContextManager[None]:
+        """Lend the tables to the backend for many steps: until the context ends they are its own.
+
+        A device keeps them and brings them up to date on leaving, also when leaving by an error; inside, nobody else
+        reads or changes the arrays, and steps name the same arrays. Without it every step carries them there and
+        back. One loan at a time. Raises ShapeError.
         """
         ...

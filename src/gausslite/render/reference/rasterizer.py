@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,14 +13,21 @@ from torch import Tensor
 
 from gausslite.domain.arrays import require_array
 from gausslite.domain.camera import Camera
-from gausslite.errors import InvalidInputError, ShapeError
+from gausslite.errors import ShapeError
+from gausslite.render.checks import (
+    require_image_gradients,
+    require_scene,
+    require_table,
+    require_tables,
+    require_view,
+)
 from gausslite.render.rasterizer import (
     EVERYTHING,
     GRAD_2D_COUNT,
     GRAD_2D_SUM,
-    ROW_WIDTH,
     UPDATES,
     AdamSettings,
+    HostReport,
     LossWeights,
     Rendering,
     SplatGradients,
@@ -29,7 +37,7 @@ from gausslite.render.rasterizer import (
 )
 from gausslite.render.reference.compositing import draw, draw_backward
 from gausslite.render.reference.loss import ReferenceView, training_loss
-from gausslite.render.reference.projection import Ellipses, moved, project, tile_grid
+from gausslite.render.reference.projection import Ellipses, moved, project
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,10 +86,7 @@ class ReferenceRasterizer:
     ) -> SplatGradients:
         """Gradients of a scalar whose derivatives by the rendering's images are given. Raises ShapeError."""
         drawn: _Drawn = rendering.context
-        size = rendering.alpha.shape
-        require_array("d_rgb", d_rgb, (*size, 3), np.float32)
-        require_array("d_depth_m", d_depth_m, size, np.float32)
-        require_array("d_alpha", d_alpha, size, np.float32)
+        require_image_gradients(rendering, d_rgb, d_depth_m, d_alpha)
         stacked = np.concatenate([d_rgb, d_depth_m[..., None], d_alpha[..., None]], axis=2)
         d_rows, d_twist, visible, norms = _pull_back(drawn, torch.from_numpy(stacked.astype(np.float64)))
         return SplatGradients(d_rows.astype(np.float32), d_twist, visible.astype(np.uint32), norms.astype(np.float32))
@@ -93,13 +98,10 @@ class ReferenceRasterizer:
         camera: Camera,
         weight: Float32[ndarray, "h w"] | None = None,
     ) -> TrainingView:
-        """Make an image ready to train on. Raises ShapeError."""
-        size = (camera.height_px, camera.width_px)
-        require_array("view rgb", rgb, (*size, 3), np.uint8)
-        require_array("view depth_m", depth_m, size, np.float32)
+        """Make an image ready to train on. Raises ShapeError, InvalidInputError for weights outside [0, 1]."""
+        require_view(rgb, depth_m, camera, weight)
         if weight is None:
-            weight = np.ones(size, np.float32)
-        require_array("view weight", weight, size, np.float32)
+            weight = np.ones(depth_m.shape, np.float32)
         return ReferenceView(
             camera,
             torch.from_numpy(rgb / 255.0),
@@ -123,8 +125,7 @@ class ReferenceRasterizer:
         """One whole iteration in place. Raises ShapeError, also for a view of another backend."""
         if not isinstance(view, ReferenceView):
             raise ShapeError(f"view: expected one that this backend prepared, got {type(view).__name__}")
-        require_array("first_moment", first_moment, rows.shape, np.float32)
-        require_array("second_moment", second_moment, rows.shape, np.float32)
+        require_tables(rows, first_moment, second_moment)
         drawn = _draw(rows, view.camera, T_camera_world, subset)
         images = drawn.images.requires_grad_()
         value = training_loss(images, view, loss, masked)
@@ -138,31 +139,31 @@ class ReferenceRasterizer:
         _adam(rows, first_moment, second_moment, d_rows, moving, adam)
         first_moment[moving, GRAD_2D_SUM] += norms[updated].astype(np.float32)
         first_moment[moving, GRAD_2D_COUNT] += 1.0
-        return StepReport(value.item(), visible.astype(np.uint32))
+        return HostReport(value.item(), visible.astype(np.uint32))
+
+    def holding(
+        self,
+        rows: Float32[ndarray, "n 16"],
+        first_moment: Float32[ndarray, "n 16"],
+        second_moment: Float32[ndarray, "n 16"],
+    ) -> AbstractContextManager[None]:
+        """Nothing to carry: steps work on the arrays themselves. Raises ShapeError."""
+        require_tables(rows, first_moment, second_moment)
+        return nullcontext()
 
 
 def _draw(
     rows: Float32[ndarray, "n 16"], camera: Camera, T_camera_world: Float64[ndarray, "4 4"], subset: Subset
 ) -> _Drawn:
-    require_array("rows", rows, (None, ROW_WIDTH), np.float32)
-    require_array("T_camera_world", T_camera_world, (4, 4), np.float64)
-    if subset.tiles is not None:
-        require_array("subset tiles", subset.tiles, tile_grid(camera), np.bool_)
-    ids = None if subset.ids is None else torch.from_numpy(_checked_ids(subset.ids, len(rows)))
+    require_table("rows", rows)
+    require_scene(len(rows), camera, T_camera_world, subset)
+    ids = None if subset.ids is None else torch.from_numpy(subset.ids.astype(np.int64))
     leaves = torch.from_numpy(rows.astype(np.float64)).requires_grad_()
     twist = torch.zeros(6, dtype=torch.float64, requires_grad=True)
     ellipses = project(leaves, camera, moved(torch.from_numpy(T_camera_world), twist), ids, subset.tiles)
     with torch.no_grad():
         images = draw(ellipses, camera, subset.tiles)
     return _Drawn(leaves, twist, camera, subset.tiles, ellipses, images)
-
-
-def _checked_ids(ids: ndarray, n: int) -> ndarray:
-    require_array("subset ids", ids, (None,), np.uint32)
-    wide = ids.astype(np.int64)
-    if len(wide) and (wide[-1] >= n or (np.diff(wide) <= 0).any()):
-        raise InvalidInputError(f"subset ids: expected ascending row numbers below {n}, got others")
-    return wide
 
 
 def _pull_back(drawn: _Drawn, d_images: Tensor) -> tuple[ndarray, ndarray, ndarray, ndarray]:
