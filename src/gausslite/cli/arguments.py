@@ -13,7 +13,9 @@ from gausslite.mission.options import add_frames, names, numbers
 def add_source(parser: argparse.ArgumentParser) -> None:
     """Add SOURCE and what of it is used."""
     parser.add_argument(
-        "source", metavar="SOURCE", help='a folder (TUM, 7-Scenes or Replica layout) or "sim:home?seed=0&trajectory=0"'
+        "source",
+        metavar="SOURCE",
+        help='a folder (TUM, 7-Scenes or Replica layout) or "sim:home?seed=0&trajectory=0", sim:home-1 to sim:home-8',
     )
     add_frames(parser)
 

@@ -2,23 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
-from gausslite.datasets.simulated.mesh import Mesh, Vector, box, lathe, leaf, merged, panel, ring
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Part:
-    """A mesh that shows one texture, by name."""
-
-    mesh: Mesh
-    texture: str
-
-    def placed(self, position_m: Vector, yaw_deg: float) -> Part:
-        """Turned about z, then moved."""
-        return Part(self.mesh.turned(float(np.radians(yaw_deg))).moved(position_m), self.texture)
+from gausslite.datasets.simulated.items import Part
+from gausslite.datasets.simulated.mesh import box, lathe, leaf, merged, panel, ring
 
 
 def table() -> list[Part]:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from gausslite.datasets.simulated import furniture, prints, textures
-from gausslite.datasets.simulated.furniture import Part
+from gausslite.datasets.simulated.items import Item, Part, placed
+from gausslite.datasets.simulated.lighting import Lamp, Lighting
 from gausslite.datasets.simulated.mesh import Vector, box, merged
 from gausslite.datasets.simulated.textures import Texture
 
@@ -17,16 +16,9 @@ DOORWAY_M = (1.45, 3.05)
 DOORWAY_HEIGHT_M = 2.15
 TABLE_CENTRE_M = (2.0, 2.2)
 TABLE_TOP_M = 0.74
+LIGHTING = Lighting((Lamp((2.0, 2.0, 2.45), 1.0), Lamp((6.2, 2.3, 2.45), 1.0), Lamp((0.3, 2.2, 1.6), 0.35)))
+"""A ceiling lamp in each room, and the window."""
 _WORKTOP_M = 0.885
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Item:
-    """A thing with a name; is_room marks walls, floors and ceilings, which are no objects."""
-
-    name: str
-    parts: list[Part]
-    is_room: bool = False
 
 
 def paint_textures(seed: int) -> dict[str, Texture]:
@@ -188,4 +180,4 @@ def _living(rng: np.random.Generator) -> list[Item]:
 
 
 def _placed(name: str, parts: list[Part], position_m: Vector, yaw_deg: float) -> Item:
-    return Item(name, [part.placed(position_m, yaw_deg) for part in parts])
+    return Item(name, placed(parts, position_m, yaw_deg))

@@ -35,6 +35,18 @@ class Mesh:
         R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
         return Mesh(self.positions_m @ R.T, self.uv, self.normals @ R.T, self.faces)
 
+    def tipped(self, pitch_rad: float) -> Mesh:
+        """Turned about x: a positive angle brings the front (-y) down."""
+        c, s = np.cos(pitch_rad), np.sin(pitch_rad)
+        R = np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
+        return Mesh(self.positions_m @ R.T, self.uv, self.normals @ R.T, self.faces)
+
+    def rolled(self, roll_rad: float) -> Mesh:
+        """Turned about y: a positive angle brings the right side (+x) down."""
+        c, s = np.cos(roll_rad), np.sin(roll_rad)
+        R = np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
+        return Mesh(self.positions_m @ R.T, self.uv, self.normals @ R.T, self.faces)
+
 
 def merged(meshes: list[Mesh]) -> Mesh:
     """All meshes in one."""

@@ -1,10 +1,9 @@
-"""The home as one triangle soup in a ray caster, with what each triangle looks like and belongs to."""
+"""A home as one triangle soup in a ray caster, with what each triangle looks like and belongs to."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -13,9 +12,9 @@ from numpy import ndarray
 from numpy.typing import NDArray
 
 from gausslite.datasets.simulated.atlas import TextureAtlas
-from gausslite.datasets.simulated.layout import furnish, paint_textures
 from gausslite.datasets.simulated.lighting import vertex_light
 from gausslite.datasets.simulated.mesh import merged
+from gausslite.datasets.simulated.plan import HomePlan
 from gausslite.datasets.simulated.textures import SIDE_PX
 from gausslite.errors import DatasetError
 
@@ -24,13 +23,17 @@ NOTHING = -1
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Triangles:
-    """Per triangle: texture coordinates and brightness of its corners, unit normal, texture, item, texels per metre."""
+    """Per triangle: texture coordinates, light and normals of its corners, its own unit normal, texture, item, gloss
+    and texels per metre.
+    """
 
     uv: Float32[ndarray, "m 3 2"]
-    light: Float32[ndarray, "m 3"]
+    light: Float32[ndarray, "m 3 3"]
+    corner_normals: Float32[ndarray, "m 3 3"]
     normal: Float32[ndarray, "m 3"]
     texture: Int64[ndarray, " m"]
     item: Int64[ndarray, " m"]
+    gloss: Float32[ndarray, " m"]
     texels_per_m: Float32[ndarray, " m"]
 
 
@@ -44,13 +47,13 @@ class Hits:
 
 
 class HomeScene:
-    """Owns the ray caster and the tables; built once for each seed. Raises DatasetError without the extra `sim`."""
+    """Owns the ray caster and the tables of one home. Raises DatasetError without the extra `sim`."""
 
-    def __init__(self, seed: int) -> None:
+    def __init__(self, plan: HomePlan) -> None:
         new_caster = _ray_caster()
-        items = furnish(seed)
-        textures = paint_textures(seed)
+        items, textures = plan.items, plan.textures
         texture_ids = {name: i for i, name in enumerate(textures)}
+        self.lamps = plan.lighting.lamps
         self.names = tuple(item.name for item in items)
         self.object_names = tuple(item.name for item in items if not item.is_room)
         self.atlas = TextureAtlas(list(textures.values()))
@@ -60,15 +63,19 @@ class HomeScene:
         repeats_m = np.repeat([textures[part.texture].repeat_m or 1.0 for _, part in parts], counts)
         corners_m = whole.positions_m[whole.faces]
         uv = whole.uv[whole.faces] / repeats_m[:, None, None]
+        texture = np.repeat([texture_ids[part.texture] for _, part in parts], counts)
+        albedo = np.array([each.rgb.mean(axis=(0, 1)) / 255.0 for each in textures.values()])
         self._embree = new_caster(corners_m.astype(np.float32))
-        light = vertex_light(whole.positions_m, whole.normals, self.occluded, seed)
+        light = vertex_light(whole, albedo[texture], self, plan.lighting, plan.seed)
         self.triangles = Triangles(
-            uv.astype(np.float32),
-            light[whole.faces],
-            _unit_normals(corners_m),
-            np.repeat([texture_ids[part.texture] for _, part in parts], counts),
-            np.repeat([i for i, _ in parts], counts),
-            _texels_per_m(corners_m, uv),
+            uv=uv.astype(np.float32),
+            light=light[whole.faces],
+            corner_normals=whole.normals[whole.faces].astype(np.float32),
+            normal=_unit_normals(corners_m),
+            texture=texture,
+            item=np.repeat([i for i, _ in parts], counts),
+            gloss=np.array([each.gloss for each in textures.values()], np.float32)[texture],
+            texels_per_m=_texels_per_m(corners_m, uv),
         )
 
     def cast(self, origins_m: Float32[ndarray, "r 3"], directions: Float32[ndarray, "r 3"]) -> Hits:
@@ -77,6 +84,12 @@ class HomeScene:
         barycentric = np.stack([result["u"], result["v"]], axis=1)
         return Hits(result["primID"].astype(np.int64), barycentric, result["tfar"])
 
+    def first_triangle(
+        self, origins_m: Float32[ndarray, "r 3"], directions: Float32[ndarray, "r 3"]
+    ) -> Int64[ndarray, " r"]:
+        """The first triangle along each ray, NOTHING where there is none."""
+        return np.asarray(self._embree.run(origins_m, directions), np.int64)
+
     def occluded(
         self, origins_m: Float32[ndarray, "r 3"], directions: Float32[ndarray, "r 3"], reach: float
     ) -> Bool[ndarray, " r"]:
@@ -84,12 +97,6 @@ class HomeScene:
         reaches = np.full(len(origins_m), reach, np.float32)
         free = self._embree.run(origins_m, directions, dists=reaches, query="OCCLUDED")
         return np.asarray(free >= 0)
-
-
-@lru_cache(maxsize=2)
-def home_scene(seed: int) -> HomeScene:
-    """The home of this seed, shared by every source of the process."""
-    return HomeScene(seed)
 
 
 def _ray_caster() -> Callable[[Float32[ndarray, "m 3 3"]], Any]:

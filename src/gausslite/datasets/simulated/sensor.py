@@ -2,38 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 from numpy import ndarray
 
+from gausslite.datasets.simulated.sensor_noise import SensorNoise
 from gausslite.datasets.simulated.view import View
 
-
-@dataclass(frozen=True, slots=True)
-class SensorNoise:
-    """Standard deviations at strength 1.
-
-    Depth: axial noise of base_m + growth_per_m (z - 0.4 m)^2, the form Nguyen, Izadi and Lovell (2012) fitted to the
-    Kinect; disparity in steps of 1/disparity_steps_per_px with baseline_px_m = baseline times focal length, so that
-    the steps grow with z^2; no return outside [near_m, far_m] and at grazing incidence. At the edges of things a
-    pixel loses its depth, or flies: gets a depth between the two sides. Colour: read-out noise and shot noise.
-    """
-
-    base_m: float = 0.0012
-    growth_per_m: float = 0.0016
-    baseline_px_m: float = 43.5
-    disparity_steps_per_px: float = 8.0
-    near_m: float = 0.35
-    far_m: float = 6.0
-    edge_loss: float = 0.45
-    edge_flight: float = 0.10
-    edge_step_m: float = 0.06
-    grazing_cosine: float = 0.12
-    speckle_loss: float = 0.002
-    colour_read: float = 1.6
-    colour_shot: float = 0.16
+_DARK = 45.0
+"""Mean colour, 0 to 255, below which a surface returns too little light here and there."""
+_MIRROR = 0.4
 
 
 def colour_image(rgb: Float32[ndarray, "h w 3"]) -> UInt8[ndarray, "h w 3"]:
@@ -62,6 +40,8 @@ def noisy_depth(view: View, noise: SensorNoise, strength: float, rng: np.random.
     lost = edge & ~fly & (chance < strength * (noise.edge_flight + noise.edge_loss))
     lost |= ~edge & (chance < strength * noise.speckle_loss)
     lost |= view.facing < noise.grazing_cosine
+    if noise.dark_loss > 0 or noise.gloss_loss > 0:
+        lost |= rng.random(z.shape, np.float32) < strength * _absorbed(view, noise)
     lost |= (z < noise.near_m) | (z > noise.far_m)
     z[lost] = 0.0
     return z
@@ -72,6 +52,14 @@ def _quantised(z: Float32[ndarray, "h w"], noise: SensorNoise, strength: float) 
     steps = np.float32(noise.baseline_px_m * noise.disparity_steps_per_px / strength)
     rounded: Float32[ndarray, "h w"] = steps / np.maximum(np.rint(steps / np.maximum(z, np.float32(0.05))), 1)
     return rounded.astype(np.float32)
+
+
+def _absorbed(view: View, noise: SensorNoise) -> Float32[ndarray, "h w"]:
+    """The chance that the projector's light does not come back: black swallows it, a mirror sends it elsewhere."""
+    darkness = np.clip(1.0 - view.rgb.mean(axis=2) / _DARK, 0.0, 1.0)
+    mirrored = np.minimum(view.gloss / np.float32(_MIRROR), 1.0)
+    chance: Float32[ndarray, "h w"] = np.maximum(noise.dark_loss * darkness, noise.gloss_loss * mirrored)
+    return chance.astype(np.float32)
 
 
 def _edges(z: Float32[ndarray, "h w"], step_m: float) -> tuple[Bool[ndarray, "h w"], Float32[ndarray, "h w"]]:

@@ -1,21 +1,24 @@
-"""The simulated home as a Source: sim:home?seed=0&trajectory=0&frames=120&size=320x240&noise=1."""
+"""Simulated homes as Sources: sim:home-3?seed=0&trajectory=0&frames=120&size=320x240&noise=1."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any
 from urllib.parse import parse_qsl
 
 import numpy as np
 
 from gausslite.datasets.images import RgbdImage, resize_rgbd
+from gausslite.datasets.simulated.exposure import camera_gain
+from gausslite.datasets.simulated.family import HOME_COUNT, home_plan
+from gausslite.datasets.simulated.plan import HomePlan
 from gausslite.datasets.simulated.regions import InstanceRegion, ItemImages
-from gausslite.datasets.simulated.scene import home_scene
-from gausslite.datasets.simulated.sensor import SensorNoise, colour_image, noisy_colour, noisy_depth
-from gausslite.datasets.simulated.trajectories import TRAJECTORY_COUNT, poses
-from gausslite.datasets.simulated.view import draw
+from gausslite.datasets.simulated.scene import HomeScene
+from gausslite.datasets.simulated.sensor import colour_image, noisy_colour, noisy_depth
+from gausslite.datasets.simulated.view import View, draw
 from gausslite.datasets.source import Source, require_position
 from gausslite.domain.camera import Camera
 from gausslite.domain.frame import Frame
@@ -23,20 +26,32 @@ from gausslite.domain.pose import UpAxis, unit_up_axis
 from gausslite.domain.region import Region
 from gausslite.errors import DatasetError
 
+TRAJECTORY_COUNT = 3
 _RATE_HZ = 30
 _FOCAL_PER_WIDTH = 0.85
 _SIDES_PX = (16, 4096)
+_NUMBERS = ("seed", "trajectory", "frames")
+_STRENGTHS = ("noise", "holes", "flying", "exposure", "gloss")
 
 
 @dataclass(frozen=True, slots=True)
 class HomeSettings:
-    """One walk through one home. noise scales the whole sensor model; 0 turns it off: depth is then exact."""
+    """One walk through one home.
 
+    noise scales the whole sensor model, 0 turns it off: depth is then exact. holes and flying scale those of its
+    parts, exposure the drift of the camera's gain, gloss what polished surfaces mirror.
+    """
+
+    home: int = 0
     seed: int = 0
     trajectory: int = 0
     frames: int = 120
     size_px: tuple[int, int] = (320, 240)
     noise: float = 1.0
+    holes: float = 1.0
+    flying: float = 1.0
+    exposure: float = 1.0
+    gloss: float = 1.0
 
     def __post_init__(self) -> None:
         low, high = _SIDES_PX
@@ -45,30 +60,42 @@ class HomeSettings:
             ("trajectory", self.trajectory, f"0 to {TRAJECTORY_COUNT - 1}", 0 <= self.trajectory < TRAJECTORY_COUNT),
             ("frames", self.frames, "1 to 100000", 1 <= self.frames <= 100_000),
             ("size", self.size_px, f"sides of {low} to {high} px", all(low <= side <= high for side in self.size_px)),
-            ("noise", self.noise, "0 to 10", 0.0 <= self.noise <= 10.0),
+            *((name, getattr(self, name), "0 to 10", 0.0 <= getattr(self, name) <= 10.0) for name in _STRENGTHS),
         ):
             if not right:
-                raise DatasetError(f"sim:home: {name}: expected {wanted}, got {value}")
+                raise DatasetError(f"{self.world}: {name}: expected {wanted}, got {value}")
+
+    @property
+    def world(self) -> str:
+        """The home's name in a spec."""
+        return f"sim:home-{self.home}" if self.home else "sim:home"
 
     @classmethod
-    def parse(cls, query: str) -> HomeSettings:
+    def parse(cls, query: str, home: int = 0) -> HomeSettings:
         """From "seed=0&trajectory=1&frames=120&size=320x240&noise=1"; what is left out keeps its default."""
         chosen: dict[str, Any] = {}
         for key, value in parse_qsl(query, keep_blank_values=True):
-            if key in ("seed", "trajectory", "frames") and re.fullmatch(r"[0-9]{1,10}", value):
+            if key in _NUMBERS and re.fullmatch(r"[0-9]{1,10}", value):
                 chosen[key] = int(value)
-            elif key == "noise" and re.fullmatch(r"[0-9]{1,3}(\.[0-9]{1,9})?", value):
+            elif key in _STRENGTHS and re.fullmatch(r"[0-9]{1,3}(\.[0-9]{1,9})?", value):
                 chosen[key] = float(value)
             elif key == "size" and (match := re.fullmatch(r"([0-9]{1,5})x([0-9]{1,5})", value)):
                 chosen["size_px"] = (int(match.group(1)), int(match.group(2)))
             else:
-                wanted = "seed=N&trajectory=N&frames=N&size=WxH&noise=X"
+                wanted = "&".join([*(f"{name}=N" for name in _NUMBERS), "size=WxH", *(f"{n}=X" for n in _STRENGTHS)])
                 raise DatasetError(f"sim:home: {key}={value}: expected {wanted}, each of them optional")
-        return cls(**chosen)
+        return cls(home, **chosen)
+
+
+@lru_cache(maxsize=2)
+def _built(home: int, seed: int) -> tuple[HomePlan, HomeScene]:
+    """The home of this number and seed, shared by every source of the process."""
+    plan = home_plan(home, seed)
+    return plan, HomeScene(plan)
 
 
 class SimulatedHome:
-    """A walk through the home with z up. Every frame is the same whenever and wherever it is asked for.
+    """A walk through a home with z up. Every frame is the same whenever and wherever it is asked for.
 
     Frame numbers run from 0 to frames - 1, times are those numbers at 30 Hz. Raises DatasetError, also where the
     extra `sim` is not installed.
@@ -79,8 +106,8 @@ class SimulatedHome:
         focal = _FOCAL_PER_WIDTH * width
         self._settings = settings
         self._camera = Camera(focal, focal, width / 2, height / 2, width, height)
-        self._scene = home_scene(settings.seed)
-        self._poses = poses(settings.trajectory, settings.frames)
+        self._plan, self._scene = _built(settings.home, settings.seed)
+        self._poses = self._plan.walks[settings.trajectory](settings.frames)
         self._up_axis = unit_up_axis(up_axis or (0.0, 0.0, 1.0))
         names, images = self._scene.names, ItemImages(self._scene)
         self._regions = {name: InstanceRegion(name, names.index(name), images) for name in self._scene.object_names}
@@ -88,7 +115,8 @@ class SimulatedHome:
     @property
     def name(self) -> str:
         """The home and the walk."""
-        return f"sim-home-{self._settings.seed}-{self._settings.trajectory}"
+        settings = self._settings
+        return f"{settings.world.replace(':', '-')}-{settings.seed}-{settings.trajectory}"
 
     @property
     def camera(self) -> Camera:
@@ -107,11 +135,12 @@ class SimulatedHome:
         """The frame at position i. Raises DatasetError."""
         require_position(self.name, i, len(self))
         settings, T_world_camera = self._settings, self._poses[i]
-        view = draw(self._scene, self._camera, T_world_camera)
+        view = self._exposed(draw(self._scene, self._camera, T_world_camera, settings.gloss), i)
         if settings.noise > 0:
             rng = np.random.default_rng([settings.seed, settings.trajectory, i])
-            rgb = noisy_colour(view, SensorNoise(), settings.noise, rng)
-            depth_m = noisy_depth(view, SensorNoise(), settings.noise, rng)
+            noise = self._plan.sensor.switched(settings.holes, settings.flying)
+            rgb = noisy_colour(view, noise, settings.noise, rng)
+            depth_m = noisy_depth(view, noise, settings.noise, rng)
         else:
             rgb, depth_m = colour_image(view.rgb), view.depth_m
         image = resize_rgbd(RgbdImage(rgb, depth_m, self._camera), size)
@@ -125,10 +154,19 @@ class SimulatedHome:
         """Every object by name: table, chair_1 ..., mug, sofa ...; walls, floors and ceilings are none."""
         return dict(self._regions)
 
+    def _exposed(self, view: View, i: int) -> View:
+        """The view as a camera takes it whose exposure follows the light."""
+        drift = self._settings.exposure * self._plan.exposure_drift
+        if drift == 0:
+            return view
+        return replace(view, rgb=view.rgb * camera_gain(i / len(self), drift, self._settings.trajectory))
+
 
 def open_simulated(spec: str, up_axis: UpAxis | None = None) -> Source:
-    """The walk of a spec without its "sim:": "home" or "home?seed=0&...". Raises DatasetError."""
+    """The walk of a spec without its "sim:": "home", "home-3" or "home-3?seed=0&...". Raises DatasetError."""
     world, _, query = spec.partition("?")
-    if world != "home":
-        raise DatasetError(f"sim:{world}: expected sim:home, the only simulated world")
-    return SimulatedHome(HomeSettings.parse(query), up_axis)
+    name = re.fullmatch(r"home(?:-([1-9]))?", world)
+    home = int(name.group(1) or 0) if name else HOME_COUNT + 1
+    if home > HOME_COUNT:
+        raise DatasetError(f"sim:{world}: expected sim:home, or one of sim:home-1 to sim:home-{HOME_COUNT}")
+    return SimulatedHome(HomeSettings.parse(query, home), up_axis)

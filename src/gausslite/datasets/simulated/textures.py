@@ -17,10 +17,18 @@ Shade = Float64[ndarray, "s s"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Texture:
-    """A square picture. repeat_m: the length it covers before it repeats; None when it is fitted to a face once."""
+    """A square picture. repeat_m: the length it covers before it repeats; None when it is fitted to a face once.
+
+    gloss: share of the light that the surface mirrors, 0 for matt.
+    """
 
     rgb: UInt8[ndarray, "s s 3"]
     repeat_m: float | None = None
+    gloss: float = 0.0
+
+    def polished(self, gloss: float) -> Texture:
+        """The same picture on a surface that mirrors this share."""
+        return Texture(self.rgb, self.repeat_m, gloss)
 
 
 def noise(rng: np.random.Generator, rows: int, columns: int) -> Shade:

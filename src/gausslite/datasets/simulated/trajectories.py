@@ -1,4 +1,4 @@
-"""The three walks through the home: smooth curves through places and what is looked at from there."""
+"""The three walks through the two-room home."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from gausslite.datasets.simulated.layout import TABLE_CENTRE_M
+from gausslite.datasets.simulated.walks import Walk, looking, walk_through
 
 _CX, _CY = TABLE_CENTRE_M
 
@@ -43,44 +44,12 @@ _HELD_OUT = (
 """Above and below both walks, at the same things."""
 
 
-TRAJECTORY_COUNT = 3
-"""0: agent A round the table. 1: agent B past the chairs to the living room. 2: held-out views off both paths."""
-
-
-def poses(trajectory: int, frames: int) -> Float64[ndarray, "n 4 4"]:
-    """T_world_camera of each frame, evenly spread over the walk (z up; OpenCV camera axes, no roll)."""
-    if trajectory == 0:
-        eyes, targets = _round_the_table(np.arange(frames) / frames)
-    else:
-        keys = np.array(_KITCHEN_TO_LIVING if trajectory == 1 else _HELD_OUT)
-        share = np.linspace(0.0, 1.0, frames) if frames > 1 else np.array([0.5])
-        eyes, targets = _curve(keys[:, 0], share), _curve(keys[:, 1], share)
-    return np.stack([_look_at(eye, target) for eye, target in zip(eyes, targets, strict=True)])
-
-
-def _round_the_table(share: Float64[ndarray, " n"]) -> tuple[Float64[ndarray, "n 3"], Float64[ndarray, "n 3"]]:
-    a = 2 * np.pi * share - 0.5 * np.pi
+def _round_the_table(frames: int) -> Float64[ndarray, "n 4 4"]:
+    a = 2 * np.pi * np.arange(frames) / frames - 0.5 * np.pi
     eyes = np.stack([_CX + 1.5 * np.cos(a), _CY + 1.3 * np.sin(a), 1.42 + 0.12 * np.sin(3 * a)], axis=1)
     targets = np.stack([_CX + 0.25 * np.sin(2 * a), _CY + 0.12 * np.cos(3 * a), 0.72 + 0.08 * np.cos(2 * a)], axis=1)
-    return eyes, targets
+    return looking(eyes, targets)
 
 
-def _curve(keys: Float64[ndarray, "k 3"], share: Float64[ndarray, " n"]) -> Float64[ndarray, "n 3"]:
-    """The Catmull-Rom spline through the keys at these shares of its way."""
-    padded = np.concatenate([2 * keys[:1] - keys[1:2], keys, 2 * keys[-1:] - keys[-2:-1]])
-    place = share * (len(keys) - 1)
-    i = np.minimum(place.astype(np.int64), len(keys) - 2)
-    t = (place - i)[:, None]
-    p0, p1, p2, p3 = (padded[i + k] for k in range(4))
-    bent = 2 * p1 + (p2 - p0) * t + (2 * p0 - 5 * p1 + 4 * p2 - p3) * t**2 + (3 * p1 - p0 - 3 * p2 + p3) * t**3
-    return np.asarray(0.5 * bent)
-
-
-def _look_at(eye_m: Float64[ndarray, "3"], target_m: Float64[ndarray, "3"]) -> Float64[ndarray, "4 4"]:
-    forward = (target_m - eye_m) / np.linalg.norm(target_m - eye_m)
-    right = np.cross(forward, (0.0, 0.0, 1.0))
-    right /= np.linalg.norm(right)
-    T = np.eye(4)
-    T[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
-    T[:3, 3] = eye_m
-    return T
+WALKS: tuple[Walk, ...] = (_round_the_table, walk_through(_KITCHEN_TO_LIVING), walk_through(_HELD_OUT))
+"""0: agent A round the table. 1: agent B past the chairs to the living room. 2: held-out views off both paths."""

@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float32, Float64, Int64
 from numpy import ndarray
 
 from gausslite.datasets.simulated.scene import NOTHING, Hits, HomeScene
+from gausslite.datasets.simulated.shading import add_reflections, facing_of, matt_colour
 from gausslite.domain.camera import Camera
 
 _SUBSAMPLES = np.array([(-0.125, -0.375), (0.375, -0.125), (0.125, 0.375), (-0.375, 0.125)], np.float32)
@@ -21,22 +22,28 @@ _CREASE = 0.1
 
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
-    """What a perfect camera sees. item indexes HomeScene.names (NOTHING outside); facing is |cos| of the incidence."""
+    """What a perfect camera sees. item indexes HomeScene.names (NOTHING outside); facing is |cos| of the incidence;
+    gloss is the share that the surface mirrors.
+    """
 
     rgb: Float32[ndarray, "h w 3"]
     depth_m: Float32[ndarray, "h w"]
     item: Int64[ndarray, "h w"]
     facing: Float32[ndarray, "h w"]
+    gloss: Float32[ndarray, "h w"]
 
 
-def draw(scene: HomeScene, camera: Camera, T_world_camera: Float64[ndarray, "4 4"]) -> View:
-    """Render one view; colours 0 to 255. Depth is that of the ray through the pixel's centre."""
+def draw(scene: HomeScene, camera: Camera, T_world_camera: Float64[ndarray, "4 4"], mirror: float = 1.0) -> View:
+    """Render one view; colours 0 to 255. Depth is that of the ray through the pixel's centre.
+
+    mirror scales what glossy surfaces mirror; 0 makes all of them matt.
+    """
     shape = (camera.height_px, camera.width_px)
     columns, rows = _pixel_centres(camera)
     directions = _directions(columns, rows, camera, T_world_camera)
     hits = _cast_from(scene, directions, T_world_camera)
     depth_m = _depth(hits)
-    rgb, facing = _shade(scene, hits, directions, camera)
+    rgb, facing = _shade(scene, hits, directions, camera, T_world_camera, mirror)
     item = np.where(hits.triangle == NOTHING, NOTHING, scene.triangles.item[hits.triangle])
     texture = scene.triangles.texture[hits.triangle]
     edge = np.flatnonzero(_edges(*(image.reshape(shape) for image in (item, texture, depth_m, facing))))
@@ -44,9 +51,10 @@ def draw(scene: HomeScene, camera: Camera, T_world_camera: Float64[ndarray, "4 4
         fine_columns = (columns[edge, None] + _SUBSAMPLES[:, 0]).ravel()
         fine_rows = (rows[edge, None] + _SUBSAMPLES[:, 1]).ravel()
         fine = _directions(fine_columns, fine_rows, camera, T_world_camera)
-        fine_rgb, _ = _shade(scene, _cast_from(scene, fine, T_world_camera), fine, camera)
+        fine_rgb, _ = _shade(scene, _cast_from(scene, fine, T_world_camera), fine, camera, T_world_camera, mirror)
         rgb[edge] = fine_rgb.reshape(-1, len(_SUBSAMPLES), 3).mean(axis=1)
-    return View(rgb.reshape(*shape, 3), depth_m.reshape(shape), item.reshape(shape), facing.reshape(shape))
+    gloss = mirror * np.where(hits.triangle == NOTHING, np.float32(0), scene.triangles.gloss[hits.triangle])
+    return View(rgb.reshape(*shape, 3), *(image.reshape(shape) for image in (depth_m, item, facing, gloss)))
 
 
 def items_seen(scene: HomeScene, camera: Camera, T_world_camera: Float64[ndarray, "4 4"]) -> Int64[ndarray, "h w"]:
@@ -88,21 +96,20 @@ def _depth(hits: Hits) -> Float32[ndarray, " n"]:
 
 
 def _shade(
-    scene: HomeScene, hits: Hits, directions: Float32[ndarray, "n 3"], camera: Camera
+    scene: HomeScene,
+    hits: Hits,
+    directions: Float32[ndarray, "n 3"],
+    camera: Camera,
+    T_world_camera: Float64[ndarray, "4 4"],
+    mirror: float,
 ) -> tuple[Float32[ndarray, "n 3"], Float32[ndarray, " n"]]:
     """Colour times light at each hit, and how squarely the ray meets the surface; black where nothing is hit."""
-    table, triangle = scene.triangles, hits.triangle
-    weights = np.empty((len(triangle), 3), np.float32)
-    weights[:, 1:] = hits.barycentric
-    weights[:, 0] = 1.0 - weights[:, 1] - weights[:, 2]
-    uv = np.einsum("nk,nkc->nc", weights, table.uv[triangle])
-    light = np.einsum("nk,nk->n", weights, table.light[triangle])
-    along = np.einsum("nc,nc->n", directions, table.normal[triangle])
-    facing = np.abs(along) / np.sqrt(np.einsum("nc,nc->n", directions, directions))
+    facing = facing_of(scene, hits, directions)
     # between the footprint across the slope and the one along it
     pixel_m = hits.distance / np.float32(camera.fx_px) / np.sqrt(np.maximum(facing, 0.05))
-    rgb = scene.atlas.sample(table.texture[triangle], uv, pixel_m * table.texels_per_m[triangle])
-    rgb *= (light * (triangle != NOTHING))[:, None]
+    rgb = matt_colour(scene, hits, pixel_m)
+    if mirror > 0:
+        add_reflections(scene, rgb, hits, directions, T_world_camera[:3, 3].astype(np.float32), mirror)
     return rgb, facing
 
 

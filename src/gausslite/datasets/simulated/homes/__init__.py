@@ -1,0 +1,1 @@
+"""Eight homes as hard as real ones, each a room that somebody lives or works in."""

@@ -1,0 +1,45 @@
+"""How strongly a structured-light camera errs, each kind of error by itself."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+
+@dataclass(frozen=True, slots=True)
+class SensorNoise:
+    """Standard deviations at strength 1.
+
+    Depth: axial noise of base_m + growth_per_m (z - 0.4 m)^2, the form Nguyen, Izadi and Lovell (2012) fitted to the
+    Kinect; disparity in steps of 1/disparity_steps_per_px with baseline_px_m = baseline times focal length, so that
+    the steps grow with z^2; no return outside [near_m, far_m] and at grazing incidence. At the edges of things a
+    pixel loses its depth, or flies: gets a depth between the two sides. dark_loss and gloss_loss are the chances of no
+    return from a black and from a mirroring surface. Colour: read-out noise and shot noise.
+    """
+
+    base_m: float = 0.0012
+    growth_per_m: float = 0.0016
+    baseline_px_m: float = 43.5
+    disparity_steps_per_px: float = 8.0
+    near_m: float = 0.35
+    far_m: float = 6.0
+    edge_loss: float = 0.45
+    edge_flight: float = 0.10
+    edge_step_m: float = 0.06
+    grazing_cosine: float = 0.12
+    speckle_loss: float = 0.002
+    dark_loss: float = 0.0
+    gloss_loss: float = 0.0
+    colour_read: float = 1.6
+    colour_shot: float = 0.16
+
+    def switched(self, holes: float, flying: float) -> SensorNoise:
+        """With its holes and its flying pixels made this many times as frequent; 0 turns them off."""
+        return replace(
+            self,
+            edge_loss=holes * self.edge_loss,
+            speckle_loss=holes * self.speckle_loss,
+            dark_loss=holes * self.dark_loss,
+            gloss_loss=holes * self.gloss_loss,
+            grazing_cosine=self.grazing_cosine if holes > 0 else 0.0,
+            edge_flight=flying * self.edge_flight,
+        )
