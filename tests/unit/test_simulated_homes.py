@@ -1,4 +1,4 @@
-"""The family of simulated homes: full of named things, with held-out views off the walks, each hardship with its switch."""
+"""The family of simulated homes: full of named things, held-out views off the walks, a switch for each hardship."""
 
 from __future__ import annotations
 
