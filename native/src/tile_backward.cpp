@@ -19,6 +19,7 @@ void backward_tile(Workspace& ws, const TileList& list, const TilePosition& tile
   Splat records[kChunk];
   BlockLists lists;
   ChunkSums sums;
+  MomentBatch batch;
   BlockGradient gradients[kBlocks];
   uint32_t left[kBlocks], total_left = 0;
   for (int b = 0; b < kBlocks; ++b) {
@@ -37,10 +38,12 @@ void backward_tile(Workspace& ws, const TileList& list, const TilePosition& tile
     for (int b = 0; b < kBlocks; ++b) {
       const uint32_t entries = std::min<uint32_t>(lists.count[b], left[b]);
       const float* none = nullptr;
-      if (entries > 0) walk_back<false>(records, lists.entry[b], int(entries), tile, b, gradients[b], sums, none);
+      if (entries > 0)
+        walk_back<false>(records, lists.entry[b], int(entries), tile, b, gradients[b], sums, batch, none);
       left[b] -= entries;
       total_left -= entries;
     }
+    batch.flush(sums.moments);
     add_to_rows(ws, records, n, tile, sums);
   }
 }

@@ -76,8 +76,9 @@ class FusedTile {
       sums_.clear(n);
       for (int b = 0; b < kBlocks; ++b) {
         if (lists.count[b] > 0)
-          walk_back<true>(records, lists.entry[b], lists.count[b], tile_, b, gradients_[b], sums_, alphas);
+          walk_back<true>(records, lists.entry[b], lists.count[b], tile_, b, gradients_[b], sums_, batch_, alphas);
       }
+      batch_.flush(sums_.moments);
       add_to_rows(ws_, records, n, tile_, sums_);
     }
   }
@@ -93,6 +94,7 @@ class FusedTile {
   BlockState state_[kBlocks];
   BlockGradient gradients_[kBlocks];
   ChunkSums sums_;
+  MomentBatch batch_;
 };
 
 }  // namespace

@@ -63,6 +63,12 @@ GAUSSLITE_INLINE Pack16 log2(Pack16 x) {
 // True where a number is neither NaN nor infinite: x times 0 is 0 only then.
 GAUSSLITE_INLINE Mask16 is_finite(Pack16 x) { return x * 0.0f == Pack16(0.0f); }
 
+// The 16x16 transpose: sixteen rows become sixteen columns.
+GAUSSLITE_INLINE void transpose(Pack16 (&r)[16]) {
+  for (int i = 0; i < 16; i += 4) transpose_quads(r[i], r[i + 1], r[i + 2], r[i + 3]);
+  for (int i = 0; i < 4; ++i) transpose_groups(r[i], r[i + 4], r[i + 8], r[i + 12]);
+}
+
 GAUSSLITE_INLINE bool any(Mask16 m) { return bits(m) != 0; }
 
 GAUSSLITE_INLINE void prefetch(const void* p) { __builtin_prefetch(p, 0, 3); }

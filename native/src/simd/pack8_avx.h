@@ -17,14 +17,12 @@ struct Pack8 {
 
 GAUSSLITE_INLINE Pack8 load8(const float* p) { return _mm256_loadu_ps(p); }
 GAUSSLITE_INLINE void store8(float* p, Pack8 a) { _mm256_storeu_ps(p, a.v); }
-GAUSSLITE_INLINE Pack8 broadcast8(const float* p) { return _mm256_broadcast_ss(p); }
 GAUSSLITE_INLINE Pack8 broadcast_pair(const float* p) {
   return _mm256_castpd_ps(_mm256_broadcast_sd(reinterpret_cast<const double*>(p)));
 }
 GAUSSLITE_INLINE Pack8 operator+(Pack8 a, Pack8 b) { return _mm256_add_ps(a.v, b.v); }
 GAUSSLITE_INLINE Pack8 operator-(Pack8 a, Pack8 b) { return _mm256_sub_ps(a.v, b.v); }
 GAUSSLITE_INLINE Pack8 operator*(Pack8 a, Pack8 b) { return _mm256_mul_ps(a.v, b.v); }
-GAUSSLITE_INLINE Pack8 fma(Pack8 a, Pack8 b, Pack8 c) { return _mm256_fmadd_ps(a.v, b.v, c.v); }
 GAUSSLITE_INLINE Pack8 fnma(Pack8 a, Pack8 b, Pack8 c) { return _mm256_fnmadd_ps(a.v, b.v, c.v); }
 GAUSSLITE_INLINE Pack8 keep_if(bool yes, Pack8 a) {
   return _mm256_and_ps(a.v, _mm256_castsi256_ps(_mm256_set1_epi32(-int32_t(yes))));

@@ -146,20 +146,19 @@ GAUSSLITE_INLINE void transpose_quads(Pack16& a, Pack16& b, Pack16& c, Pack16& d
   transpose_quads(a.hi, b.hi, c.hi, d.hi);
 }
 
-GAUSSLITE_INLINE void transpose(Pack16 (&r)[16]) {
-  for (int i = 0; i < 16; i += 4) transpose_quads(r[i], r[i + 1], r[i + 2], r[i + 3]);
-  Pack16 t[16];
-  for (int i = 0; i < 4; ++i) {
-    t[i] = {_mm256_permute2f128_ps(r[i].lo, r[i + 4].lo, 0x20),
-            _mm256_permute2f128_ps(r[i + 8].lo, r[i + 12].lo, 0x20)};
-    t[i + 4] = {_mm256_permute2f128_ps(r[i].lo, r[i + 4].lo, 0x31),
-                _mm256_permute2f128_ps(r[i + 8].lo, r[i + 12].lo, 0x31)};
-    t[i + 8] = {_mm256_permute2f128_ps(r[i].hi, r[i + 4].hi, 0x20),
-                _mm256_permute2f128_ps(r[i + 8].hi, r[i + 12].hi, 0x20)};
-    t[i + 12] = {_mm256_permute2f128_ps(r[i].hi, r[i + 4].hi, 0x31),
-                 _mm256_permute2f128_ps(r[i + 8].hi, r[i + 12].hi, 0x31)};
-  }
-  for (int i = 0; i < 16; ++i) r[i] = t[i];
+GAUSSLITE_INLINE void transpose_groups(Pack16& a, Pack16& b, Pack16& c, Pack16& d) {
+  const Pack16 p = a, q = b, r = c, s = d;
+  a = {_mm256_permute2f128_ps(p.lo, q.lo, 0x20), _mm256_permute2f128_ps(r.lo, s.lo, 0x20)};
+  b = {_mm256_permute2f128_ps(p.lo, q.lo, 0x31), _mm256_permute2f128_ps(r.lo, s.lo, 0x31)};
+  c = {_mm256_permute2f128_ps(p.hi, q.hi, 0x20), _mm256_permute2f128_ps(r.hi, s.hi, 0x20)};
+  d = {_mm256_permute2f128_ps(p.hi, q.hi, 0x31), _mm256_permute2f128_ps(r.hi, s.hi, 0x31)};
+}
+
+GAUSSLITE_INLINE void pair_groups(Pack16 a, Pack16 b, Pack8 (&out)[4]) {
+  out[0] = _mm256_permute2f128_ps(a.lo, b.lo, 0x20);
+  out[1] = _mm256_permute2f128_ps(a.lo, b.lo, 0x31);
+  out[2] = _mm256_permute2f128_ps(a.hi, b.hi, 0x20);
+  out[3] = _mm256_permute2f128_ps(a.hi, b.hi, 0x31);
 }
 
 GAUSSLITE_INLINE Pack16 load_block(const float* p, int64_t stride) {

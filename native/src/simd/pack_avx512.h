@@ -77,17 +77,23 @@ GAUSSLITE_INLINE void transpose_quads(Pack16& a, Pack16& b, Pack16& c, Pack16& d
   d = _mm512_unpackhi_ps(ac_hi, bd_hi);
 }
 
-GAUSSLITE_INLINE void transpose(Pack16 (&r)[16]) {
-  for (int i = 0; i < 16; i += 4) transpose_quads(r[i], r[i + 1], r[i + 2], r[i + 3]);
-  for (int i = 0; i < 4; ++i) {
-    const __m512 a = _mm512_shuffle_f32x4(r[i].v, r[i + 4].v, 0x88), b = _mm512_shuffle_f32x4(r[i].v, r[i + 4].v, 0xDD);
-    const __m512 c = _mm512_shuffle_f32x4(r[i + 8].v, r[i + 12].v, 0x88);
-    const __m512 d = _mm512_shuffle_f32x4(r[i + 8].v, r[i + 12].v, 0xDD);
-    r[i] = _mm512_shuffle_f32x4(a, c, 0x88);
-    r[i + 8] = _mm512_shuffle_f32x4(a, c, 0xDD);
-    r[i + 4] = _mm512_shuffle_f32x4(b, d, 0x88);
-    r[i + 12] = _mm512_shuffle_f32x4(b, d, 0xDD);
-  }
+GAUSSLITE_INLINE void transpose_groups(Pack16& a, Pack16& b, Pack16& c, Pack16& d) {
+  const __m512 ab_even = _mm512_shuffle_f32x4(a.v, b.v, 0x88), ab_odd = _mm512_shuffle_f32x4(a.v, b.v, 0xDD);
+  const __m512 cd_even = _mm512_shuffle_f32x4(c.v, d.v, 0x88), cd_odd = _mm512_shuffle_f32x4(c.v, d.v, 0xDD);
+  a = _mm512_shuffle_f32x4(ab_even, cd_even, 0x88);
+  b = _mm512_shuffle_f32x4(ab_odd, cd_odd, 0x88);
+  c = _mm512_shuffle_f32x4(ab_even, cd_even, 0xDD);
+  d = _mm512_shuffle_f32x4(ab_odd, cd_odd, 0xDD);
+}
+
+GAUSSLITE_INLINE void pair_groups(Pack16 a, Pack16 b, Pack8 (&out)[4]) {
+  const __m512d x = _mm512_castps_pd(a.v), y = _mm512_castps_pd(b.v);
+  const __m512 low = _mm512_castpd_ps(_mm512_permutex2var_pd(x, _mm512_setr_epi64(0, 1, 8, 9, 2, 3, 10, 11), y));
+  const __m512 high = _mm512_castpd_ps(_mm512_permutex2var_pd(x, _mm512_setr_epi64(4, 5, 12, 13, 6, 7, 14, 15), y));
+  out[0] = _mm512_castps512_ps256(low);
+  out[1] = _mm512_extractf32x8_ps(low, 1);
+  out[2] = _mm512_castps512_ps256(high);
+  out[3] = _mm512_extractf32x8_ps(high, 1);
 }
 
 GAUSSLITE_INLINE Pack16 load_block(const float* p, int64_t stride) {

@@ -180,15 +180,15 @@ GAUSSLITE_INLINE void transpose_quads(Pack16& a, Pack16& b, Pack16& c, Pack16& d
   }
 }
 
-// The 16x16 transpose: sixteen rows become sixteen columns.
-GAUSSLITE_INLINE void transpose(Pack16 (&r)[16]) {
-  for (int i = 0; i < 16; i += 4) transpose_quads(r[i], r[i + 1], r[i + 2], r[i + 3]);
+// The same among whole groups: group i of a, b, c, d in turn make up the i-th result.
+GAUSSLITE_INLINE void transpose_groups(Pack16& a, Pack16& b, Pack16& c, Pack16& d) {
+  Pack16* rows[4] = {&a, &b, &c, &d};
   for (int i = 0; i < 4; ++i) {
-    Pack16 t[4];
-    for (int j = 0; j < 4; ++j) {
-      for (int k = 0; k < 4; ++k) t[j].q[k] = r[4 * k + i].q[j];
+    for (int j = 0; j < i; ++j) {
+      const Quad q = rows[i]->q[j];
+      rows[i]->q[j] = rows[j]->q[i];
+      rows[j]->q[i] = q;
     }
-    for (int j = 0; j < 4; ++j) r[4 * j + i] = t[j];
   }
 }
 
@@ -217,7 +217,6 @@ GAUSSLITE_INLINE void store8(float* p, Pack8 a) {
   store_quad(p, a.lo);
   store_quad(p + 4, a.hi);
 }
-GAUSSLITE_INLINE Pack8 broadcast8(const float* p) { return Pack8(*p); }
 // p[0], p[1], p[0], p[1], ...
 GAUSSLITE_INLINE Pack8 broadcast_pair(const float* p) {
   const Quad pairs{p[0], p[1], p[0], p[1]};
@@ -226,7 +225,6 @@ GAUSSLITE_INLINE Pack8 broadcast_pair(const float* p) {
 GAUSSLITE_INLINE Pack8 operator+(Pack8 a, Pack8 b) { return {a.lo + b.lo, a.hi + b.hi}; }
 GAUSSLITE_INLINE Pack8 operator-(Pack8 a, Pack8 b) { return {a.lo - b.lo, a.hi - b.hi}; }
 GAUSSLITE_INLINE Pack8 operator*(Pack8 a, Pack8 b) { return {a.lo * b.lo, a.hi * b.hi}; }
-GAUSSLITE_INLINE Pack8 fma(Pack8 a, Pack8 b, Pack8 c) { return a * b + c; }
 GAUSSLITE_INLINE Pack8 fnma(Pack8 a, Pack8 b, Pack8 c) { return c - a * b; }
 GAUSSLITE_INLINE Pack8 keep_if(bool yes, Pack8 a) { return yes ? a : Pack8(0.0f); }
 
@@ -239,5 +237,10 @@ GAUSSLITE_INLINE Pack8 permute(Pack8 x) {
 
 // The sum of the four groups of four in lanes 0-3; lanes 4-7 are 0.
 GAUSSLITE_INLINE Pack8 sum_of_quads(Pack16 a) { return {(a.q[0] + a.q[2]) + (a.q[1] + a.q[3]), quad(0.0f)}; }
+
+// Group k of a followed by group k of b, for k = 0 ... 3.
+GAUSSLITE_INLINE void pair_groups(Pack16 a, Pack16 b, Pack8 (&out)[4]) {
+  for (int k = 0; k < 4; ++k) out[k] = {a.q[k], b.q[k]};
+}
 
 }  // namespace gausslite::GAUSSLITE_ISA
