@@ -7,10 +7,11 @@
 
 namespace gausslite {
 
-// A replacement for `old` with room for `bytes`, its first `kept` bytes copied and the rest zero; frees `old`. Throws
-// std::bad_alloc.
-void* grow_memory(void* old, size_t kept, size_t bytes);
-void free_memory(void* p) noexcept;
+// A replacement for `old` with room for `bytes`, its first `kept` bytes copied and the rest zero; frees `old`, which was
+// asked for with `old_bytes`. Throws std::bad_alloc.
+void* grow_memory(void* old, size_t kept, size_t old_bytes, size_t bytes);
+// Frees what was asked for with `bytes`; the latest large blocks are kept for the next who asks for as much.
+void free_memory(void* memory, size_t bytes) noexcept;
 
 // An array that grows and never shrinks. Its members are always inlined: the stages are compiled for several
 // instruction sets, and a shared out-of-line copy could be one that this machine cannot run.
@@ -21,13 +22,13 @@ class Buffer {
   Buffer(Buffer&& other) noexcept
       : data_(std::exchange(other.data_, nullptr)), capacity_(std::exchange(other.capacity_, 0)) {}
   Buffer& operator=(Buffer&&) = delete;
-  ~Buffer() { free_memory(data_); }
+  ~Buffer() { free_memory(data_, capacity_ * sizeof(T)); }
 
   // Makes room for `count` elements; on growth the first `kept` stay and the others are zero.
   __attribute__((always_inline)) void reserve(size_t count, size_t kept = 0) {
     if (count <= capacity_) return;
     const size_t wanted = count + count / 4 + 64;
-    data_ = static_cast<T*>(grow_memory(data_, kept * sizeof(T), wanted * sizeof(T)));
+    data_ = static_cast<T*>(grow_memory(data_, kept * sizeof(T), capacity_ * sizeof(T), wanted * sizeof(T)));
     capacity_ = wanted;
   }
   __attribute__((always_inline)) T* data() { return data_; }

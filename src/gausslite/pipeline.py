@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass
-
-from jaxtyping import Float32
-from numpy import ndarray
 
 from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
+from gausslite.domain.relevance import RelevanceMap
 from gausslite.domain.subset import VoxelWords
-from gausslite.errors import InvalidInputError
+from gausslite.mapping.coverage import MapSight
 from gausslite.mapping.mapper import GaussianMapper
+from gausslite.mapping.pace import FrameBudget, Pace, Relief, Step
 from gausslite.mapping.roi import RoiLedger
 from gausslite.perception.attention import Attention
 
@@ -21,15 +19,16 @@ from gausslite.perception.attention import Attention
 class FrameOutcome:
     """What became of one frame.
 
-    seconds cover perception and mapping; skipped says why the frame was not mapped, None when it was; words are what
-    changed in the task's region, None without a ledger or when the frame was skipped.
+    budget says how its time was spent, from the image to the words; skipped says why the frame was not mapped, None
+    when it was; words are what changed in the task's region, None without a ledger, when the frame was skipped, and
+    when they wait for the next one.
     """
 
     index: int
     iterations: int
     gaussians: int
     roi_share: float
-    seconds: float
+    budget: FrameBudget
     skipped: str | None
     words: VoxelWords | None
 
@@ -42,15 +41,13 @@ class TaskMapper:
         attention: Attention,
         mapper: GaussianMapper,
         ledger: RoiLedger | None = None,
-        seconds_per_frame: float | None = None,
+        pace: Pace | None = None,
     ) -> None:
-        """With seconds_per_frame each frame trains until its time is up instead of a fixed number of iterations."""
-        if seconds_per_frame is not None and not seconds_per_frame > 0:
-            raise InvalidInputError(f"seconds_per_frame: expected a positive number, got {seconds_per_frame}")
+        """Without a pace each frame gets the fixed number of iterations of the mapper's settings."""
         self._attention = attention
         self._mapper = mapper
         self._ledger = ledger
-        self._seconds_per_frame = seconds_per_frame
+        self._pace = pace or Pace()
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -63,27 +60,34 @@ class TaskMapper:
 
     def process(self, frame: Frame) -> FrameOutcome:
         """Take one frame from its pixels to the words on its region."""
-        started_s = time.perf_counter()
-        relevance = self._attention.attend(frame, self._drawn_depth_m(frame))
-        mapped = self._mapper.map_frame(frame, relevance, self._seconds_left(started_s))
+        self._pace.begin()
+        sight = self._look(frame)
+        relevance = self._attend(frame, sight)
+        mapped = self._mapper.map_frame(frame, relevance, self._pace, sight)
         words = self._changed_roi() if mapped.skipped is None else None
         return FrameOutcome(
             index=frame.index,
             iterations=mapped.iterations,
             gaussians=mapped.gaussians,
             roi_share=relevance.roi_share,
-            seconds=time.perf_counter() - started_s,
+            budget=self._pace.end(),
             skipped=mapped.skipped,
             words=words,
         )
 
-    def _drawn_depth_m(self, frame: Frame) -> Float32[ndarray, "h w"] | None:
-        return self._mapper.expected_depth_m(frame) if self._mapper.count > 0 else None
-
-    def _seconds_left(self, started_s: float) -> float | None:
-        if self._seconds_per_frame is None:
+    def _look(self, frame: Frame) -> MapSight | None:
+        """The one drawing of a frame: attention takes its depth, seeding what it leaves open."""
+        if self._pace.spares(Relief.SEEDING):
             return None
-        return max(0.0, started_s + self._seconds_per_frame - time.perf_counter())
+        with self._pace.timing(Step.DRAWING):
+            return self._mapper.look(frame)
+
+    def _attend(self, frame: Frame, sight: MapSight | None) -> RelevanceMap:
+        with self._pace.timing(Step.ATTENTION):
+            return self._attention.attend(frame, None if sight is None else sight.depth_m)
 
     def _changed_roi(self) -> VoxelWords | None:
-        return None if self._ledger is None else self._ledger.changed(self._mapper.roi_gaussians())
+        if self._ledger is None or self._pace.spares(Relief.WORDS):
+            return None
+        with self._pace.timing(Step.WORDS):
+            return self._ledger.changed(self._mapper.roi_gaussians())

@@ -9,12 +9,15 @@ import pytest
 from gausslite.cli.main import main
 from gausslite.errors import DatasetError
 from gausslite.evaluation.bench_loop import FrameCost, Latency, LoopTiming
+from gausslite.mapping.pace import FrameBudget, Relief, Step
 
 SMALL = ("--size", "96x72", "--max-gaussians", "1500", "--threads", "1")
 
 
 def cost(perception_s: float, iterations: int) -> FrameCost:
-    return FrameCost(perception_s, 0.03, 0.01, iterations, gaussians=100 * iterations, roi_share=0.5)
+    steps_s = {Step.ATTENTION: perception_s, Step.SEEDING: 0.03, Step.WORDS: 0.01}
+    budget = FrameBudget(sum(steps_s.values()), steps_s, frozenset({Relief.SEEDING}), short=iterations < 5)
+    return FrameCost(budget, iterations, gaussians=100 * iterations, roi_share=0.5)
 
 
 def test_percentiles_of_equal_times_are_that_time() -> None:
@@ -27,6 +30,15 @@ def test_hz_is_frames_by_the_sum_of_their_latencies() -> None:
     assert timing.hz == pytest.approx(2 / 0.4)
     assert (timing.iterations_mean, timing.iterations_min, timing.gaussians) == (6.0, 4, 800)
     assert timing.latency.max_ms == pytest.approx(300.0)
+    assert timing.mapping.max_ms == pytest.approx(30.0)
+
+
+def test_steps_reliefs_and_short_frames_are_counted() -> None:
+    timing = LoopTiming.of([cost(0.06, 4), cost(0.26, 8)])
+    assert timing.steps["seeding"].p50_ms == pytest.approx(30.0)
+    assert timing.steps["drawing"].max_ms == 0.0
+    assert timing.reliefs == {"words": 0, "seeding": 2}
+    assert timing.frames_short == 1
 
 
 def test_no_mapped_frame_is_an_error() -> None:

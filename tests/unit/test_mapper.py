@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +12,7 @@ from mapping_scenes import middle_relevance, wall_frame
 from gausslite.domain.relevance import RelevanceMap
 from gausslite.errors import InvalidInputError, ShapeError
 from gausslite.mapping.mapper import GaussianMapper
+from gausslite.mapping.pace import Pace, PaceSettings, Step
 from gausslite.mapping.policies import policy
 from gausslite.mapping.settings import (
     ActivePhase,
@@ -36,10 +38,10 @@ def mapper_of(settings: MapperSettings = SMALL, seed: int = 0) -> GaussianMapper
     return GaussianMapper(settings, CpuRasterizer(threads=1), seed)
 
 
-def map_wall(mapper: GaussianMapper, frames: int, deadline_s: float | None = None) -> None:
+def map_wall(mapper: GaussianMapper, frames: int) -> None:
     for index in range(frames):
         frame = wall_frame(index, SIZE, shift_m=0.1 * index)
-        mapper.map_frame(frame, middle_relevance(frame), deadline_s)
+        mapper.map_frame(frame, middle_relevance(frame))
         assert mapper.count <= mapper.settings.max_gaussians
 
 
@@ -125,18 +127,46 @@ def test_the_same_seed_gives_the_same_map_and_another_seed_another() -> None:
     assert len(maps[2]) != len(maps[0]) or not np.array_equal(maps[0].means_m, maps[2].means_m)
 
 
-def test_a_deadline_replaces_the_number_of_iterations() -> None:
+def test_a_pace_replaces_the_number_of_iterations_and_counts_steps_by_their_names() -> None:
     mapper = mapper_of()
+    # every look at this clock takes a second, and so does every step
+    clock = itertools.count()
+    pace = Pace(PaceSettings(seconds_per_frame=60.0), clock=lambda: float(next(clock)))
     frame = wall_frame(0, SIZE)
-    assert mapper.map_frame(frame, middle_relevance(frame), deadline_s=0.0).iterations == 0
-    assert mapper.map_frame(frame, middle_relevance(frame), deadline_s=0.2).iterations > 0
+    pace.begin()
+    outcome = mapper.map_frame(frame, middle_relevance(frame), pace)
+    budget = pace.end()
+    assert 8 < outcome.iterations < 30
+    # an iteration is one second of work and some looks at the clock
+    assert budget.seconds <= 60.0 + 8.0
+    assert budget.steps_s[Step.WARM_UP] + budget.steps_s[Step.ACTIVE] == outcome.iterations
+    assert budget.steps_s[Step.SEEDING] == budget.steps_s[Step.VIEW] == 1.0
+
+
+def test_density_control_waits_for_time_but_not_for_ever() -> None:
+    settings = replace(SMALL, density=DensitySettings(densify_every=10, prune_every=1000))
+    frame, clock = wall_frame(0, SIZE), itertools.count()
+    mapper = mapper_of(settings)
+    pace = Pace(PaceSettings(seconds_per_frame=100.0, least_iterations=0), clock=lambda: float(next(clock)))
+    with pace.timing(Step.DENSITY):
+        # it once took very long
+        next(itertools.islice(clock, 200, None))
+    densified = []
+    for _ in range(3):
+        pace.begin()
+        iterations = mapper.map_frame(frame, middle_relevance(frame), pace).iterations
+        densified.append((iterations, pace.end().steps_s.get(Step.DENSITY, 0.0)))
+    assert densified[0][0] >= 20
+    assert densified[0][1] > 0
 
 
 def test_expected_depth_is_that_of_the_wall() -> None:
     mapper = mapper_of(replace(SMALL, max_gaussians=1500, components=Components(sis=False)))
     map_wall(mapper, 3)
     frame = wall_frame(0, SIZE)
-    depth_m = mapper.expected_depth_m(frame)
+    sight = mapper.look(frame)
+    assert sight is not None
+    depth_m = sight.depth_m
     assert (depth_m > 0).mean() > 0.5
     assert np.median(depth_m[depth_m > 0]) == pytest.approx(2.0, abs=0.05)
 

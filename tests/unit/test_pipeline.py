@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
-import pytest
 from mapping_scenes import wall_frame
 
+from gausslite.domain.frame import Frame
 from gausslite.domain.region import BallRegion
+from gausslite.domain.relevance import RelevanceMap
 from gausslite.domain.voxels import VoxelGrid
-from gausslite.errors import InvalidInputError
 from gausslite.mapping.mapper import GaussianMapper
+from gausslite.mapping.pace import Pace, PaceSettings, Relief, Step
 from gausslite.mapping.roi import RoiLedger
 from gausslite.mapping.settings import MapperSettings, SeedingSettings
 from gausslite.perception.fixed import NoAttention, RegionAttention
@@ -36,7 +39,7 @@ def test_words_of_all_frames_add_up_to_the_active_part_of_the_map() -> None:
     assert sum(counts.values()) == int(gaussians.active.sum()) > 0
     assert (outcome.index, outcome.gaussians, outcome.iterations) == (2, len(gaussians), 8)
     assert 0 < outcome.roi_share < 1
-    assert outcome.seconds > 0
+    assert outcome.budget.seconds >= sum(outcome.budget.steps_s.values()) > 0
 
 
 def test_without_a_ledger_there_are_no_words() -> None:
@@ -52,8 +55,62 @@ def test_a_frame_without_depth_is_passed_over() -> None:
     assert outcome.iterations == 0
 
 
-def test_time_is_a_budget_for_the_whole_frame() -> None:
-    loop = TaskMapper(NoAttention(), small_mapper(), seconds_per_frame=1e-6)
-    assert loop.process(wall_frame(0, SIZE)).iterations == 0
-    with pytest.raises(InvalidInputError, match="seconds_per_frame"):
-        TaskMapper(NoAttention(), small_mapper(), seconds_per_frame=np.nan)
+def ticking_loop(seconds_per_frame: float) -> TaskMapper:
+    """A loop with a clock on which every look takes a second."""
+    clock = itertools.count()
+    pace = Pace(PaceSettings(seconds_per_frame), clock=lambda: float(next(clock)))
+    return TaskMapper(BALL, small_mapper(), RoiLedger(VoxelGrid(0.25)), pace)
+
+
+def test_time_is_a_budget_for_the_whole_frame_words_included() -> None:
+    loop = ticking_loop(60.0)
+    for index in range(4):
+        budget = loop.process(wall_frame(index, SIZE, shift_m=0.1 * index)).budget
+        assert set(Step) - {Step.DENSITY, Step.DRAWING} <= set(budget.steps_s)
+        # an iteration is one second of work and some looks at the clock
+        assert budget.seconds <= 60.0 + 8.0
+        assert not budget.short
+    assert ticking_loop(1e-6).process(wall_frame(0, SIZE)).iterations == 0
+
+
+def test_the_same_clock_gives_the_same_map() -> None:
+    maps = []
+    for _ in range(2):
+        loop = ticking_loop(60.0)
+        for index in range(3):
+            loop.process(wall_frame(index, SIZE, shift_m=0.1 * index))
+        maps.append(loop.gaussians())
+    np.testing.assert_array_equal(maps[0].means_m, maps[1].means_m)
+    np.testing.assert_array_equal(maps[0].kappa, maps[1].kappa)
+
+
+class SlowAttention:
+    """Takes ten seconds for every frame, on a clock that nothing else moves."""
+
+    notes = ()
+
+    def __init__(self) -> None:
+        self.now_s = 0.0
+
+    def clock(self) -> float:
+        return self.now_s
+
+    def attend(self, frame: Frame, rendered_depth_m: np.ndarray | None = None) -> RelevanceMap:
+        self.now_s += 10.0
+        return BALL.attend(frame, rendered_depth_m)
+
+
+def test_words_that_had_to_wait_come_with_the_next_frame() -> None:
+    slow = SlowAttention()
+    pace = Pace(PaceSettings(5.0, reliefs=(Relief.WORDS,)), slow.clock)
+    loop = TaskMapper(slow, small_mapper(), RoiLedger(VoxelGrid(0.25)), pace)
+    counts: dict[int, int] = {}
+    waited = []
+    for index in range(5):
+        outcome = loop.process(wall_frame(index, SIZE, shift_m=0.1 * index))
+        waited.append(outcome.words is None)
+        assert outcome.budget.short
+        if outcome.words is not None:
+            counts.update(zip(outcome.words.keys.tolist(), outcome.words.counts.tolist(), strict=True))
+    assert waited == [False, True, False, True, False]
+    assert sum(counts.values()) == int(loop.gaussians().active.sum()) > 0

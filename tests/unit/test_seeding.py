@@ -8,12 +8,12 @@ from mapping_scenes import middle_relevance, rendering_of, wall_frame
 
 from gausslite.domain.relevance import RelevanceMap
 from gausslite.errors import InvalidInputError
-from gausslite.mapping.coverage import too_coarse, unexplained
+from gausslite.mapping.coverage import MapSight, drawn_behind, too_coarse
 from gausslite.mapping.seeding import MapState, Seeder
 from gausslite.mapping.settings import Components, SeedingSettings
 
 NO_MEANS = np.zeros((0, 3), np.float32)
-EMPTY = MapState(room=1_000_000, rendering=None, active_means_m=NO_MEANS)
+EMPTY = MapState(room=1_000_000, sight=None, active_means_m=NO_MEANS)
 OFF = {"sb": False, "mvo": False, "roi": False, "sis": False, "gfd": False}
 
 
@@ -80,7 +80,7 @@ def test_later_frames_seed_only_what_the_map_does_not_explain() -> None:
     frame = wall_frame()
     alpha = np.ones((48, 64))
     alpha[:, :10] = 0.3
-    state = MapState(1_000_000, rendering_of(alpha, frame.depth_m), NO_MEANS)
+    state = MapState(1_000_000, MapSight.of(rendering_of(alpha, frame.depth_m)), NO_MEANS)
     rest = seeder().seed(frame, RelevanceMap.nothing(48, 64), state).rest
     assert 0 < len(rest) <= 10_000 * 64 * 48 / (640 * 480)
     assert (rest.means_m[:, 0] / 2.0 * 64 + 32 < 10).all()
@@ -103,12 +103,12 @@ def test_pixels_without_depth_or_beyond_reach_are_not_seeded() -> None:
     np.testing.assert_allclose(rest.means_m[:, 2], 2.0, rtol=1e-6)
 
 
-def test_a_surface_drawn_far_behind_the_measured_one_is_unexplained() -> None:
+def test_a_surface_drawn_far_behind_the_measured_one_is_found_and_one_in_front_is_not() -> None:
     frame = wall_frame()
     drawn_m = np.full((48, 64), 2.01, np.float32)
     drawn_m[10:14, 20:24] = 4.0
     drawn_m[30:34, 20:24] = 1.0
-    found = unexplained(frame, rendering_of(np.ones((48, 64)), drawn_m), 0.6, 40.0)
+    found = drawn_behind(frame, MapSight.of(rendering_of(np.ones((48, 64)), drawn_m)), 40.0)
     expected = np.zeros((48, 64), np.bool_)
     expected[10:14, 20:24] = True
     np.testing.assert_array_equal(found, expected)
@@ -126,7 +126,7 @@ def test_a_region_with_enough_active_gaussians_is_fine_and_one_without_is_too_co
 
 def test_a_region_that_was_mapped_as_background_is_seeded_when_it_becomes_the_tasks() -> None:
     frame = wall_frame()
-    state = MapState(1_000_000, rendering_of(np.ones((48, 64)), frame.depth_m), NO_MEANS)
+    state = MapState(1_000_000, MapSight.of(rendering_of(np.ones((48, 64)), frame.depth_m)), NO_MEANS)
     seeds = seeder(sb=True, sis=True).seed(frame, middle_relevance(frame), state)
     assert len(seeds.roi) > 0
     assert len(seeds.rest) == 0

@@ -20,6 +20,7 @@ from gausslite.domain.task import TaskGraph
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.errors import MismatchError, UnavailableError
 from gausslite.mapping.mapper import GaussianMapper
+from gausslite.mapping.pace import Pace
 from gausslite.mapping.roi import RoiLedger
 from gausslite.mission.build import build_mapper
 from gausslite.mission.settings import MissionSettings
@@ -176,7 +177,7 @@ class Robot:
     def _begin(self, graph: TaskGraph) -> None:
         attention = self._make_attention(graph)
         ledger = self._ledger if self.uplink is not None else None
-        self._task_mapper = TaskMapper(attention, self._mapper, ledger, self._settings.seconds_per_frame)
+        self._task_mapper = TaskMapper(attention, self._mapper, ledger, Pace(self._settings.pace))
         with self._lock:
             self._status = replace(self._status, graph=graph, notes=attention.notes)
 
@@ -201,7 +202,7 @@ class Robot:
         if self.uplink is not None and done.words is not None:
             self.uplink.offer(done.words)
         report = FrameReport(
-            frame.index, Outcome.MAPPED, "", done.iterations, done.gaussians, done.roi_share, done.seconds
+            frame.index, Outcome.MAPPED, "", done.iterations, done.gaussians, done.roi_share, done.budget.seconds
         )
         self._count(report)
         self._on_change()

@@ -105,7 +105,7 @@ def run_loop(options: argparse.Namespace) -> int:
     positions = select_frames(source, options.frames)
     size = frame_size(options.size, source)
     attention, _ = choose_attention(options, source)
-    bench = LoopBench(attention, build_mapper(settings), VoxelGrid(), settings.seconds_per_frame)
+    bench = LoopBench(attention, build_mapper(settings), VoxelGrid(), settings.pace)
     costs = []
     with MappingBar(len(positions), "bench") as bar:
         for done, position in enumerate(positions, start=1):
@@ -143,6 +143,9 @@ def loop_lines(timing: LoopTiming) -> str:
             percentiles("perception", timing.perception),
             percentiles("mapping", timing.mapping),
             percentiles("ROI words", timing.words),
+            *(percentiles(f" {name}", latency) for name, latency in timing.steps.items()),
+            f"  {timing.frames_short} frames trained too little; for want of time went without "
+            + ", ".join(f"{name}: {count}" for name, count in timing.reliefs.items()),
         ]
     )
 

@@ -16,6 +16,7 @@ from gausslite.datasets.selection import frame_size, select_frames
 from gausslite.datasets.source import Source
 from gausslite.domain.task import TaskGraph
 from gausslite.errors import GaussLiteError, InvalidInputError
+from gausslite.mapping.pace import Pace
 from gausslite.mission.build import build_attention, build_mapper
 from gausslite.mission.options import add_budget, add_detector, add_policy, mission_settings, perception_settings
 from gausslite.mission.results import peak_rss_mib, prepare_folder, write_results
@@ -46,7 +47,7 @@ def run(options: argparse.Namespace) -> int:
     positions = select_frames(source, options.frames)
     size = frame_size(options.size, source)
     attention, graph = choose_attention(options, source)
-    mapper = TaskMapper(attention, build_mapper(settings), seconds_per_frame=settings.seconds_per_frame)
+    mapper = TaskMapper(attention, build_mapper(settings), pace=Pace(settings.pace))
     prepare_folder(options.out)
     mission = _play(source, positions, size, mapper)
     if mission.stopped is not None and not mission.outcomes:
@@ -91,7 +92,7 @@ class _Mission:
     def summary(self) -> dict[str, object]:
         """Totals for the report; hz is mapped frames per second of perception and mapping, without reading files."""
         mapped = [outcome for outcome in self.outcomes if outcome.skipped is None]
-        busy_s = sum(outcome.seconds for outcome in mapped)
+        busy_s = sum(outcome.budget.seconds for outcome in mapped)
         return {
             "frames": len(mapped),
             "frames_skipped": len(self.outcomes) - len(mapped),

@@ -48,11 +48,17 @@ class Camera:
         return Camera(self.fx_px * sx, self.fy_px * sy, self.cx_px * sx, self.cy_px * sy, width_px, height_px)
 
 
-def back_project(depth_m: Float32[ndarray, "h w"], camera: Camera) -> Float32[ndarray, "h w 3"]:
-    """Lift every pixel to a point in the camera frame (OpenCV axes); depth 0 gives the origin."""
+def back_project(
+    depth_m: Float32[ndarray, "h w"], camera: Camera, left_px: int = 0, top_px: int = 0
+) -> Float32[ndarray, "h w 3"]:
+    """Lift every pixel to a point in the camera frame (OpenCV axes); depth 0 gives the origin.
+
+    left_px and top_px say where in the camera's image `depth_m` begins, when it is a part of it.
+    """
     height, width = depth_m.shape
-    x = ((np.arange(width, dtype=np.float32) + 0.5) - np.float32(camera.cx_px)) / np.float32(camera.fx_px)
-    y = ((np.arange(height, dtype=np.float32) + 0.5) - np.float32(camera.cy_px)) / np.float32(camera.fy_px)
+    columns, rows = np.arange(left_px, left_px + width), np.arange(top_px, top_px + height)
+    x = ((columns.astype(np.float32) + 0.5) - np.float32(camera.cx_px)) / np.float32(camera.fx_px)
+    y = ((rows.astype(np.float32) + 0.5) - np.float32(camera.cy_px)) / np.float32(camera.fy_px)
     points = np.empty((height, width, 3), np.float32)
     points[..., 0] = x[None, :] * depth_m
     points[..., 1] = y[:, None] * depth_m

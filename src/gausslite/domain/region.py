@@ -9,12 +9,13 @@ import numpy as np
 from jaxtyping import Bool, Float, Int64
 from numpy import ndarray
 
-from gausslite.domain.camera import back_project
+from gausslite.domain.camera import back_project, project
 from gausslite.domain.frame import Frame
-from gausslite.domain.pose import transform_points
+from gausslite.domain.pose import inverse, transform_points
 from gausslite.errors import InvalidInputError
 
 _REACH_M = 1e6
+_NEAR_M = 1e-3
 
 
 @runtime_checkable
@@ -43,11 +44,12 @@ class BallRegion:
 
     def mask(self, frame: Frame) -> Bool[ndarray, "h w"]:
         """True where the pixel's back-projected point lies in the ball."""
-        points = _world_points(frame)
-        near: Bool[ndarray, "h w"] = (
-            np.square(points - np.asarray(self.centre_m, np.float32)).sum(axis=-1) <= self.radius_m**2
-        )
-        return near & (frame.depth_m > 0)
+        centre = np.asarray(self.centre_m)
+        part = _part_that_may_show(frame, centre - self.radius_m, centre + self.radius_m)
+        offsets = _world_points(frame, part) - centre.astype(np.float32)
+        result = np.zeros(frame.depth_m.shape, np.bool_)
+        result[part] = (np.square(offsets).sum(axis=-1) <= self.radius_m**2) & (frame.depth_m[part] > 0)
+        return result
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -67,10 +69,11 @@ class VoxelRegion:
             for dj in (-1, 0, 1):
                 for dk in (-1, 0, 1):
                     occupied[i + di, j + dj, k + dk] = True
-        index = np.floor(_world_points(frame) / np.float32(self.size_m)).astype(np.int64) - low
-        inside = ((index >= 0) & (index < shape)).all(axis=-1) & (frame.depth_m > 0)
+        part = _part_that_may_show(frame, low * self.size_m, (low + shape) * self.size_m)
+        index = np.floor(_world_points(frame, part) / np.float32(self.size_m)).astype(np.int64) - low
+        inside = ((index >= 0) & (index < shape)).all(axis=-1) & (frame.depth_m[part] > 0)
         result = np.zeros(frame.depth_m.shape, np.bool_)
-        result[inside] = occupied[tuple(index[inside].T)]
+        result[part][inside] = occupied[tuple(index[inside].T)]
         return result
 
     @property
@@ -80,5 +83,22 @@ class VoxelRegion:
         return centroid
 
 
-def _world_points(frame: Frame) -> Float[ndarray, "h w 3"]:
-    return transform_points(frame.T_world_camera, back_project(frame.depth_m, frame.camera))
+def _part_that_may_show(frame: Frame, low_m: Float[ndarray, "3"], high_m: Float[ndarray, "3"]) -> tuple[slice, slice]:
+    """The rows and columns of the image outside of which no surface point lies in this box of the world."""
+    height, width = frame.depth_m.shape
+    ends = np.stack([low_m, high_m]).astype(np.float64)
+    corners = np.stack(np.meshgrid(*ends.T, indexing="ij"), axis=-1).reshape(-1, 3)
+    seen = transform_points(inverse(frame.T_world_camera), corners)
+    if (seen[:, 2] < _NEAR_M).any():
+        return slice(0, height), slice(0, width)
+    pixels = project(seen.astype(np.float32), frame.camera)
+    # a pixel more on every side, for what rounding may do
+    left, top = np.clip(np.floor(pixels.min(axis=0)) - 1, 0, (width, height)).astype(int).tolist()
+    right, bottom = np.clip(np.ceil(pixels.max(axis=0)) + 1, 0, (width, height)).astype(int).tolist()
+    return slice(top, bottom), slice(left, right)
+
+
+def _world_points(frame: Frame, part: tuple[slice, slice]) -> Float[ndarray, "h w 3"]:
+    rows, columns = part
+    points = back_project(frame.depth_m[part], frame.camera, columns.start, rows.start)
+    return transform_points(frame.T_world_camera, points)

@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float32
-from numpy import ndarray
 
 from gausslite.domain.frame import Frame
-from gausslite.domain.relevance import RelevanceMap
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.errors import DatasetError
 from gausslite.mapping.mapper import GaussianMapper
+from gausslite.mapping.pace import FrameBudget, Pace, PaceSettings, Relief, Step
 from gausslite.mapping.roi import RoiLedger
 from gausslite.perception.attention import Attention
 from gausslite.pipeline import TaskMapper
@@ -38,24 +35,40 @@ class Latency:
 
 @dataclass(frozen=True, slots=True)
 class FrameCost:
-    """One mapped frame: seconds of attention, of drawing, seeding and training, and of making the region's words."""
+    """One mapped frame: its latency from the image in memory to the words that would leave the robot, and its steps."""
 
-    perception_s: float
-    mapping_s: float
-    words_s: float
+    budget: FrameBudget
     iterations: int
     gaussians: int
     roi_share: float
 
     @property
-    def latency_s(self) -> float:
-        """From the frame in memory to the words that would leave the robot."""
-        return self.perception_s + self.mapping_s + self.words_s
+    def perception_s(self) -> float:
+        """Seconds of attention."""
+        return self.of(Step.ATTENTION)
+
+    @property
+    def words_s(self) -> float:
+        """Seconds that making the region's words took."""
+        return self.of(Step.WORDS)
+
+    @property
+    def mapping_s(self) -> float:
+        """Seconds of all else: drawing, seeding and training."""
+        return self.budget.seconds - self.perception_s - self.words_s
+
+    def of(self, step: Step) -> float:
+        """Seconds of one step; 0 where the frame went without it."""
+        return self.budget.steps_s.get(step, 0.0)
 
 
 @dataclass(frozen=True, slots=True)
 class LoopTiming:
-    """The figures of a run. hz is what the loop sustains when frames are always at hand; the last frame's Gaussians."""
+    """The figures of a run. hz is what the loop sustains when frames are always at hand; the last frame's Gaussians.
+
+    steps: each step's time in a frame. frames_short trained less than they should; reliefs counts the frames that
+    went without something for want of time.
+    """
 
     frames: int
     hz: float
@@ -65,6 +78,9 @@ class LoopTiming:
     perception: Latency
     mapping: Latency
     words: Latency
+    steps: dict[str, Latency]
+    frames_short: int
+    reliefs: dict[str, int]
     roi_share: float
     gaussians: int
 
@@ -76,58 +92,33 @@ class LoopTiming:
         iterations = [cost.iterations for cost in costs]
         return cls(
             frames=len(costs),
-            hz=len(costs) / sum(cost.latency_s for cost in costs),
+            hz=len(costs) / sum(cost.budget.seconds for cost in costs),
             iterations_mean=float(np.mean(iterations)),
             iterations_min=min(iterations),
-            latency=Latency.of([cost.latency_s for cost in costs]),
+            latency=Latency.of([cost.budget.seconds for cost in costs]),
             perception=Latency.of([cost.perception_s for cost in costs]),
             mapping=Latency.of([cost.mapping_s for cost in costs]),
             words=Latency.of([cost.words_s for cost in costs]),
+            steps={step.value: Latency.of([cost.of(step) for cost in costs]) for step in Step},
+            frames_short=sum(cost.budget.short for cost in costs),
+            reliefs={relief.value: sum(relief in cost.budget.reliefs for cost in costs) for relief in Relief},
             roi_share=float(np.mean([cost.roi_share for cost in costs])),
             gaussians=costs[-1].gaussians,
         )
 
 
 class LoopBench:
-    """Runs the loop that a robot runs, with a clock between its steps."""
+    """Runs the loop that a robot runs, region words included, and keeps what each frame cost."""
 
     def __init__(
-        self, attention: Attention, mapper: GaussianMapper, grid: VoxelGrid, seconds_per_frame: float | None = None
+        self, attention: Attention, mapper: GaussianMapper, grid: VoxelGrid, pace: PaceSettings | None = None
     ) -> None:
-        """With seconds_per_frame each frame trains until its time is up; words are made after that, as in a mission."""
-        self._attention = _Clocked(attention)
-        self._mapper = mapper
-        self._loop = TaskMapper(self._attention, mapper, seconds_per_frame=seconds_per_frame)
-        self._ledger = RoiLedger(grid)
+        """With a pace each frame trains until its time is up, without one for a fixed number of iterations."""
+        self._loop = TaskMapper(attention, mapper, RoiLedger(grid), Pace(pace))
 
     def process(self, frame: Frame) -> FrameCost | None:
         """What one frame cost; None when it was skipped for want of depth."""
         outcome = self._loop.process(frame)
         if outcome.skipped is not None:
             return None
-        started_s = time.perf_counter()
-        self._ledger.changed(self._mapper.roi_gaussians())
-        words_s = time.perf_counter() - started_s
-        perception_s = self._attention.latest_s
-        mapping_s = outcome.seconds - perception_s
-        return FrameCost(perception_s, mapping_s, words_s, outcome.iterations, outcome.gaussians, outcome.roi_share)
-
-
-class _Clocked:
-    """An Attention that remembers how long it took."""
-
-    def __init__(self, inner: Attention) -> None:
-        self._inner = inner
-        self.latest_s = 0.0
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """The inner one's."""
-        return self._inner.notes
-
-    def attend(self, frame: Frame, rendered_depth_m: Float32[ndarray, "h w"] | None = None) -> RelevanceMap:
-        """The inner one's relevance."""
-        started_s = time.perf_counter()
-        relevance = self._inner.attend(frame, rendered_depth_m)
-        self.latest_s = time.perf_counter() - started_s
-        return relevance
+        return FrameCost(outcome.budget, outcome.iterations, outcome.gaussians, outcome.roi_share)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from jaxtyping import Bool, Float32
 from numpy import ndarray
@@ -14,22 +16,34 @@ from gausslite.render.rasterizer import NEAR_M, Rendering
 _CELL_PX = 8
 _SAME_SURFACE = 0.05
 """A Gaussian within this fraction of the measured depth lies on the surface that is seen."""
+_MEDIAN_STEP_PX = 4
 
 
-def unexplained(
-    frame: Frame, rendering: Rendering, min_alpha: float, depth_error_factor: float
-) -> Bool[ndarray, "h w"]:
-    """Pixels the map leaves open (alpha below min_alpha) or draws far behind what is measured.
+@dataclass(frozen=True, slots=True, eq=False)
+class MapSight:
+    """How the map looks from a frame: how opaque it is, and how far away (0 where it shows nothing)."""
 
-    Far means more than depth_error_factor times the median depth error over the image. Only pixels with a depth
-    reading can be unexplained: no other pixel can be seeded.
+    alpha: Float32[ndarray, "h w"]
+    depth_m: Float32[ndarray, "h w"]
+
+    @classmethod
+    def of(cls, rendering: Rendering) -> MapSight:
+        """What a rendering from the frame's pose shows."""
+        return cls(rendering.alpha, rendering.expected_depth_m())
+
+
+def drawn_behind(frame: Frame, sight: MapSight, depth_error_factor: float) -> Bool[ndarray, "h w"]:
+    """Pixels that the map draws far behind what is measured there.
+
+    Far means more than depth_error_factor times the median depth error, taken over every fourth row and column.
     """
-    measured = frame.depth_m > 0
-    drawn_m = rendering.expected_depth_m()
-    comparable = measured & (drawn_m > 0)
-    behind_m = np.where(comparable, drawn_m - frame.depth_m, np.float32(0.0))
-    typical_m = float(np.median(np.abs(behind_m[comparable]))) if comparable.any() else 0.0
-    return measured & ((rendering.alpha < min_alpha) | (comparable & (behind_m > depth_error_factor * typical_m)))
+    comparable = (frame.depth_m > 0) & (sight.depth_m > 0)
+    behind_m = sight.depth_m - frame.depth_m
+    sample = (slice(None, None, _MEDIAN_STEP_PX), slice(None, None, _MEDIAN_STEP_PX))
+    errors_m = np.abs(behind_m[sample][comparable[sample]])
+    typical_m = float(np.median(errors_m)) if len(errors_m) else 0.0
+    far: Bool[ndarray, "h w"] = comparable & (behind_m > depth_error_factor * typical_m)
+    return far
 
 
 def too_coarse(

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float32, Float64
+from jaxtyping import Float64
 from numpy import ndarray
 
 from gausslite.domain.arrays import require_array
@@ -16,7 +15,9 @@ from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.pose import inverse
 from gausslite.domain.relevance import RelevanceMap
 from gausslite.mapping.budget import insert
+from gausslite.mapping.coverage import MapSight
 from gausslite.mapping.keyframes import Keyframe, KeyframeStore, WindowView, window_view
+from gausslite.mapping.pace import Pace, Relief, Step
 from gausslite.mapping.seeding import MapState, Seeder
 from gausslite.mapping.settings import MapperSettings
 from gausslite.mapping.training import Trainer
@@ -35,7 +36,6 @@ class MappedFrame:
     seeded: int
     iterations: int
     gaussians: int
-    seconds: float
     skipped: str | None = None
 
 
@@ -78,31 +78,34 @@ class GaussianMapper:
         """The policy in force."""
         return self._settings
 
-    def map_frame(self, frame: Frame, relevance: RelevanceMap, deadline_s: float | None = None) -> MappedFrame:
-        """Take one frame into the map.
+    def map_frame(
+        self, frame: Frame, relevance: RelevanceMap, pace: Pace | None = None, sight: MapSight | None = None
+    ) -> MappedFrame:
+        """Take one frame into the map, in the time that the pace gives; by default iterations are counted.
 
-        With deadline_s (seconds from this call) iterations go on until then instead of for a fixed number. A frame
-        without a depth reading is skipped and counted. Raises ShapeError when relevance and frame differ in size.
+        sight is how the map looks from the frame, drawn here unless it is given. A frame without a depth reading is
+        skipped and counted. Raises ShapeError when relevance and frame differ in size.
         """
         require_array("relevance weight", relevance.weight, frame.depth_m.shape, np.float32)
-        started_s = time.perf_counter()
+        pace = Pace() if pace is None else pace
         if not frame.has_depth:
             self._skipped += 1
-            return MappedFrame(frame.index, 0, 0, self.count, 0.0, "no pixel has a depth reading")
-        view = self._observe(frame, relevance)
-        seeded = self._seed(view.keyframe)
-        iterations = self._train(view, None if deadline_s is None else started_s + deadline_s)
+            return MappedFrame(frame.index, 0, 0, self.count, "no pixel has a depth reading")
+        with pace.timing(Step.VIEW):
+            view = self._observe(frame, relevance)
+        seeded = 0 if pace.spares(Relief.SEEDING) else self._seed(view.keyframe, sight, pace)
+        iterations = self._train(view, pace)
         self._keyframes.offer(view)
         self._revision += 1
-        return MappedFrame(frame.index, seeded, iterations, self.count, time.perf_counter() - started_s)
+        return MappedFrame(frame.index, seeded, iterations, self.count)
+
+    def look(self, frame: Frame) -> MapSight | None:
+        """How the map looks from a frame; None while it is empty."""
+        return MapSight.of(self.render(frame.camera, frame.T_world_camera)) if self.count > 0 else None
 
     def render(self, camera: Camera, T_world_camera: Float64[ndarray, "4 4"]) -> Rendering:
         """Draw the map from a pose."""
         return self._rasterizer.forward(self._table.rows, camera, inverse(T_world_camera))
-
-    def expected_depth_m(self, frame: Frame) -> Float32[ndarray, "h w"]:
-        """Depth of the map as the frame's camera would see it; 0 where the map is open."""
-        return self.render(frame.camera, frame.T_world_camera).expected_depth_m()
 
     def gaussians(self) -> Gaussians:
         """A copy of the map as physical values."""
@@ -121,18 +124,16 @@ class GaussianMapper:
         self._extent_m = max(self._extent_m, float(frame.depth_m.max()) * _EXTENT_PER_DEPTH)
         return window_view(Keyframe(frame, relevance), self._rasterizer, self._settings.keyframes.roi_margin_px)
 
-    def _seed(self, keyframe: Keyframe) -> int:
+    def _seed(self, keyframe: Keyframe, sight: MapSight | None, pace: Pace) -> int:
         """Add Gaussians where the map does not explain the frame, within the cap."""
         frame, table = keyframe.frame, self._table
-        state = MapState(
-            room=table.room,
-            rendering=self.render(frame.camera, frame.T_world_camera) if table.count > 0 else None,
-            active_means_m=table.rows[table.active][:, MEAN],
-        )
-        seeds = self._seeder.seed(frame, keyframe.relevance, state)
-        return insert(table, seeds, self._settings.seeding.opacity, self._rng)
+        sight = self.look(frame) if sight is None else sight
+        with pace.timing(Step.SEEDING):
+            state = MapState(table.room, sight, table.rows[:, MEAN][table.active])
+            seeds = self._seeder.seed(frame, keyframe.relevance, state)
+            return insert(table, seeds, self._settings.seeding.opacity, self._rng)
 
-    def _train(self, current: WindowView, ends_at_s: float | None) -> int:
+    def _train(self, current: WindowView, pace: Pace) -> int:
         """MVO: train on views drawn from the window and the current one; without it on the current one alone."""
         views = (*self._keyframes.window, current) if self._settings.components.mvo else (current,)
-        return self._trainer.train(views, self._extent_m, ends_at_s)
+        return self._trainer.train(views, self._extent_m, pace)

@@ -8,16 +8,15 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int64
 from numpy import ndarray
 
-from gausslite.domain.camera import back_project
+from gausslite.domain.camera import lift
 from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.pose import transform_points
 from gausslite.domain.relevance import RelevanceMap
-from gausslite.mapping.coverage import too_coarse, unexplained
+from gausslite.mapping.coverage import MapSight, drawn_behind, too_coarse
 from gausslite.mapping.sampling import edge_magnitude, sample_pixels, sample_stratified
 from gausslite.mapping.settings import Components, SeedingSettings
 from gausslite.mapping.spacing import initial_spacing_m, neighbour_distance_px
-from gausslite.render.rasterizer import Rendering
 
 _REFERENCE_PIXELS = 640 * 480
 
@@ -29,7 +28,7 @@ class MapState:
     """
 
     room: int
-    rendering: Rendering | None
+    sight: MapSight | None
     active_means_m: Float32[ndarray, "n 3"]
 
 
@@ -72,12 +71,16 @@ class Seeder:
         settings = self._settings
         budget = self._budget(frame, state)
         seedable = (frame.depth_m > 0) & (frame.depth_m <= settings.max_depth_m)
-        open_pixels = seedable & self._open(frame, state, settings.min_alpha)
+        roi_open = open_pixels = seedable
+        if state.sight is not None:
+            behind = drawn_behind(frame, state.sight, settings.depth_error_factor)
+            open_pixels = seedable & (behind | (state.sight.alpha < settings.min_alpha))
+            roi_open = seedable & (behind | (state.sight.alpha < settings.roi_min_alpha))
         if not self._components.sb:
             return _Pool(np.zeros_like(seedable), 0, False), self._rest_pool(open_pixels, budget, state.room)
         roi_budget = int(settings.roi_share * budget)
         coarse = too_coarse(frame, relevance.roi, state.active_means_m, settings.roi_pixels_per_active)
-        roi_pixels = seedable & relevance.roi & (coarse | self._open(frame, state, settings.roi_min_alpha))
+        roi_pixels = relevance.roi & (roi_open | (coarse & seedable))
         rest_pixels = open_pixels & ~relevance.roi
         return self._roi_pool(roi_pixels, roi_budget), self._rest_pool(rest_pixels, budget - roi_budget, state.room)
 
@@ -97,14 +100,9 @@ class Seeder:
         density = min(densest, max(affordable, settings.sparsest * densest))
         return _Pool(pixels, min(budget, int(np.ceil(density * np.count_nonzero(pixels)))), self._components.sis)
 
-    def _open(self, frame: Frame, state: MapState, min_alpha: float) -> Bool[ndarray, "h w"]:
-        if state.rendering is None:
-            return np.ones(frame.depth_m.shape, np.bool_)
-        return unexplained(frame, state.rendering, min_alpha, self._settings.depth_error_factor)
-
     def _budget(self, frame: Frame, state: MapState) -> int:
         """N, for this image size."""
-        seeds = self._settings.first_frame_seeds if state.rendering is None else self._settings.later_seeds
+        seeds = self._settings.first_frame_seeds if state.sight is None else self._settings.later_seeds
         return max(1, round(seeds * frame.depth_m.size / _REFERENCE_PIXELS))
 
     def _pixel_weight(self, frame: Frame) -> Float32[ndarray, "h w"]:
@@ -134,9 +132,11 @@ class Seeder:
         scale_m = spacing_m
         if self._components.sis:
             scale_m = spacing_m * np.where(active, settings.roi_scale, settings.background_scale).astype(np.float32)
-        points = back_project(frame.depth_m, frame.camera).reshape(-1, 3)[pixels]
+        rows, columns = np.divmod(pixels, frame.camera.width_px)
+        depths_m = frame.depth_m[rows, columns].astype(np.float64)
+        points = lift(np.stack([columns, rows], axis=1) + 0.5, depths_m, frame.camera)
         return Gaussians(
-            means_m=transform_points(frame.T_world_camera, points),
+            means_m=transform_points(frame.T_world_camera, points).astype(np.float32),
             quats_wxyz=np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1)),
             scales_m=np.repeat(scale_m[:, None], 3, axis=1),
             opacities=np.full(count, settings.opacity, np.float32),

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 
 import numpy as np
 
 from gausslite.mapping.keyframes import WindowView
+from gausslite.mapping.pace import Pace, Step
 from gausslite.mapping.settings import ActivePhase, MapperSettings
 from gausslite.optimize.density import densify, prune
 from gausslite.optimize.parameters import SplatTable
@@ -30,6 +30,8 @@ class Trainer:
         self._rasterizer = rasterizer
         self._rng = rng
         self._iterations = 0
+        self._since_pruned = 0
+        self._since_densified = 0
         self._unread: list[StepReport] = []
 
     @property
@@ -37,61 +39,67 @@ class Trainer:
         """Iterations run since the start."""
         return self._iterations
 
-    def train(self, views: Sequence[WindowView], extent_m: float, ends_at_s: float | None) -> int:
-        """Train on these views and return the number of iterations.
+    def train(self, views: Sequence[WindowView], extent_m: float, pace: Pace) -> int:
+        """Train on these views for as long as the pace allows and return the number of iterations.
 
-        Without a deadline that is the number in the settings; with one, iterations go on until time.perf_counter()
-        passes ends_at_s, repeating the two phases in the settings' proportion.
+        The two phases take turns in the settings' proportion. Where the time left is too short for a warm-up, an
+        active iteration may still fit.
         """
+        showing = self._showing_region(views)
         done = 0
-        while self._goes_on(done, ends_at_s):
-            done = self._until_density_control(views, done, ends_at_s)
-            self._control_density(extent_m)
+        while self._next_step(done, bool(showing), pace) is not None:
+            done = self._until_density_control(views, showing, done, pace)
+            self._control_density(extent_m, pace)
         self._bound_colours()
         return done
 
-    def _until_density_control(self, views: Sequence[WindowView], done: int, ends_at_s: float | None) -> int:
+    def _showing_region(self, views: Sequence[WindowView]) -> list[WindowView]:
+        """The views of the active phase; none where the component is off, so that all iterations are warm-ups."""
+        optimization = self._settings.optimization
+        if not self._settings.components.roi or optimization.active_iterations == 0:
+            return []
+        return [view for view in views if view.shows_region]
+
+    def _next_step(self, done: int, region_in_view: bool, pace: Pace) -> Step | None:
+        optimization = self._settings.optimization
+        counted = optimization.iterations
+        warming_up = not region_in_view or done % counted < optimization.warmup_iterations
+        if warming_up and pace.trains_on(Step.WARM_UP, counted):
+            return Step.WARM_UP
+        return Step.ACTIVE if region_in_view and pace.trains_on(Step.ACTIVE, counted) else None
+
+    def _until_density_control(
+        self, views: Sequence[WindowView], showing: Sequence[WindowView], done: int, pace: Pace
+    ) -> int:
         """Iterate until density control is due or time is up, the tables on loan to the rasterizer; `done` then."""
-        table, optimization = self._table, self._settings.optimization
+        table = self._table
         with self._rasterizer.holding(table.rows, table.first_moment, table.second_moment):
-            while True:
-                if done % optimization.iterations < optimization.warmup_iterations:
-                    self._warm_up(views)
-                else:
-                    self._active_phase(views)
+            while (step := self._next_step(done, bool(showing), pace)) is not None:
+                with pace.timing(step):
+                    self._iterate(step, views if step is Step.WARM_UP else showing)
                 done += 1
-                self._iterations += 1
-                if self._density_control_is_due() or not self._goes_on(done, ends_at_s):
+                if self._prune_is_due(pace) or self._densify_is_due(pace):
                     break
         self._count_trained()
         return done
 
-    def _goes_on(self, done: int, ends_at_s: float | None) -> bool:
-        iterations = self._settings.optimization.iterations
-        if ends_at_s is None or iterations == 0:
-            return done < iterations
-        return time.perf_counter() < ends_at_s
+    def _iterate(self, step: Step, views: Sequence[WindowView]) -> None:
+        """One iteration on a view drawn at random: over its full image, or over the task's region alone."""
+        view = views[int(self._rng.integers(len(views)))]
+        if step is Step.WARM_UP:
+            self._step(view, masked=False, subset=EVERYTHING)
+        else:
+            self._active_phase(view)
+        self._iterations += 1
+        self._since_pruned += 1
+        self._since_densified += 1
 
-    def _warm_up(self, views: Sequence[WindowView]) -> None:
-        """One iteration over the full image of a view drawn at random."""
-        self._step(self._draw(views), masked=False, subset=EVERYTHING)
-
-    def _active_phase(self, views: Sequence[WindowView]) -> None:
-        """One iteration over the task's region; a warm-up where the component is off or no view shows the region."""
-        if not self._settings.components.roi:
-            return self._warm_up(views)
-        view = self._draw(views)
-        if not view.shows_region:
-            showing = [other for other in views if other.shows_region]
-            if not showing:
-                return self._warm_up(views)
-            view = self._draw(showing)
+    def _active_phase(self, view: WindowView) -> None:
         table, phase = self._table, self._settings.optimization.active_phase
         ids = np.flatnonzero(table.active).astype(np.uint32) if phase is ActivePhase.ACTIVE_ONLY else None
         self._unread.append(self._step(view, masked=True, subset=Subset(tiles=view.active_tiles, ids=ids)))
         if len(self._unread) == _READ_EVERY:
             self._count_trained()
-        return None
 
     def _count_trained(self) -> None:
         """Kappa: active Gaussians that an iteration of the active phase trained."""
@@ -117,22 +125,30 @@ class Trainer:
             trainable=table.active if frozen else None,
         )
 
-    def _draw(self, views: Sequence[WindowView]) -> WindowView:
-        return views[int(self._rng.integers(len(views)))]
-
     def _bound_colours(self) -> None:
         """Colours that no view checks for a while must not run away."""
         colours = self._table.rows[:, RGB]
         np.clip(colours, *_COLOUR_RANGE, out=colours)
 
-    def _density_control_is_due(self) -> bool:
-        density = self._settings.density
-        return self._iterations % density.prune_every == 0 or self._iterations % density.densify_every == 0
+    def _prune_is_due(self, pace: Pace) -> bool:
+        return _due(self._since_pruned, self._settings.density.prune_every, pace)
 
-    def _control_density(self, extent_m: float) -> None:
-        """Clone, split and prune when their turn has come."""
+    def _densify_is_due(self, pace: Pace) -> bool:
+        return _due(self._since_densified, self._settings.density.densify_every, pace)
+
+    def _control_density(self, extent_m: float, pace: Pace) -> None:
+        """Clone, split and prune when their turn has come, and later where a frame has no time for it."""
         density = self._settings.density
-        if self._iterations % density.prune_every == 0:
-            prune(self._table, density)
-        if self._iterations % density.densify_every == 0:
-            densify(self._table, density, extent_m, self._rng)
+        if self._prune_is_due(pace):
+            with pace.timing(Step.DENSITY):
+                prune(self._table, density)
+            self._since_pruned = 0
+        if self._densify_is_due(pace):
+            with pace.timing(Step.DENSITY):
+                densify(self._table, density, extent_m, self._rng)
+            self._since_densified = 0
+
+
+def _due(since: int, every: int, pace: Pace) -> bool:
+    """Density control may be late by as many iterations again as lie between two of its turns."""
+    return since >= 2 * every or (since >= every and pace.has_time_for(Step.DENSITY))

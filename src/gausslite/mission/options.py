@@ -8,9 +8,12 @@ from pathlib import Path
 from gausslite.datasets.registration import ColourCamera
 from gausslite.domain.pose import UpAxis
 from gausslite.domain.voxels import VoxelGrid
+from gausslite.mapping.pace import PaceSettings, Relief
 from gausslite.mapping.policies import POLICIES
 from gausslite.mission.settings import DEFAULT_MAX_GAUSSIANS, MissionSettings, PerceptionSettings
 from gausslite.render.choose import BACKENDS
+
+_RELIEF_HELP = "what gives way, in order, where that time is short (default: words,seeding)"
 
 
 def add_frames(parser: argparse.ArgumentParser) -> None:
@@ -49,13 +52,16 @@ def add_policy(parser: argparse.ArgumentParser) -> None:
 
 
 def add_budget(parser: argparse.ArgumentParser) -> None:
-    """Add --max-gaussians, --iterations or --rate, --seed and --threads: what the map may cost."""
+    """Add --max-gaussians, --iterations or --rate with --least and --relief, --seed and --threads: the map's cost."""
     group = parser.add_argument_group("budget")
     add = group.add_argument
     add("--max-gaussians", metavar="N", type=int, default=DEFAULT_MAX_GAUSSIANS, help="hard cap (default: %(default)s)")
     per_frame = group.add_mutually_exclusive_group()
     per_frame.add_argument("--iterations", metavar="N", type=int, help="iterations a frame (default: 8)")
     per_frame.add_argument("--rate", metavar="HZ", type=float, help="frames a second: as many iterations as fit")
+    least = PaceSettings().least_iterations
+    add("--least", metavar="N", type=int, default=least, help="at --rate, iterations to find time for (default: 4)")
+    add("--relief", metavar="A,B", type=reliefs, default=PaceSettings().reliefs, help=_RELIEF_HELP)
     add("--seed", metavar="S", type=int, default=0, help="seed of every random choice (default: 0)")
     add("--threads", metavar="N", type=int, help="threads (default: all the processor allows)")
 
@@ -81,6 +87,8 @@ def mission_settings(options: argparse.Namespace) -> MissionSettings:
         max_gaussians=options.max_gaussians,
         iterations=options.iterations,
         rate_hz=options.rate,
+        least_iterations=options.least,
+        reliefs=options.relief,
         seed=options.seed,
         threads=options.threads,
         backend=options.rasterizer,
@@ -90,6 +98,15 @@ def mission_settings(options: argparse.Namespace) -> MissionSettings:
 def names(text: str) -> tuple[str, ...]:
     """Split "a,b"."""
     return tuple(part.strip() for part in text.split(",") if part.strip())
+
+
+def reliefs(text: str) -> tuple[Relief, ...]:
+    """Read "words,seeding"; argparse reports what is wrong."""
+    try:
+        return tuple(dict.fromkeys(Relief(name) for name in names(text)))
+    except ValueError:
+        known = ", ".join(Relief)
+        raise argparse.ArgumentTypeError(f"expected names among {known}, got {text!r}") from None
 
 
 def up_axis(text: str) -> UpAxis:

@@ -10,11 +10,13 @@ from gausslite.datasets.source import Source
 from gausslite.domain.pose import UpAxis
 from gausslite.domain.region import Region
 from gausslite.errors import InvalidInputError
+from gausslite.mapping.pace import PaceSettings, Relief
 from gausslite.mapping.policies import policy
 from gausslite.mapping.settings import Components, MapperSettings
 
 DEFAULT_MAX_GAUSSIANS = 150_000
 """What two cores keep busy at 640x480; the paper's cap of a million is for a GPU."""
+_PACE = PaceSettings()
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +50,8 @@ class MissionSettings:
     """How one robot maps.
 
     without switches components off by name (sb, mvo, roi, sis, gfd). rate_hz, when given, replaces the fixed number
-    of iterations by what fits into 1 / rate_hz seconds a frame.
+    of iterations by what fits into 1 / rate_hz seconds a frame; where that is less than least_iterations, the reliefs
+    give way.
     """
 
     policy: str = "task"
@@ -56,6 +59,8 @@ class MissionSettings:
     max_gaussians: int = DEFAULT_MAX_GAUSSIANS
     iterations: int | None = None
     rate_hz: float | None = None
+    least_iterations: int = _PACE.least_iterations
+    reliefs: tuple[Relief, ...] = _PACE.reliefs
     seed: int = 0
     threads: int | None = None
     backend: str = "auto"
@@ -63,15 +68,19 @@ class MissionSettings:
     def __post_init__(self) -> None:
         if self.rate_hz is not None and not 0.01 <= self.rate_hz <= 1000:
             raise InvalidInputError(f"rate: expected 0.01 to 1000 Hz, got {self.rate_hz}")
+        if not 0 <= self.least_iterations <= 10_000:
+            raise InvalidInputError(f"least iterations: expected 0 to 10000, got {self.least_iterations}")
         if self.iterations is not None and not 0 <= self.iterations <= 10_000:
             raise InvalidInputError(f"iterations: expected 0 to 10000, got {self.iterations}")
         if not 0 <= self.seed < 1 << 32:
             raise InvalidInputError(f"seed: expected 0 to {(1 << 32) - 1}, got {self.seed}")
 
     @property
-    def seconds_per_frame(self) -> float | None:
-        """The time a frame may take; None where iterations are counted instead."""
-        return None if self.rate_hz is None else 1.0 / self.rate_hz
+    def pace(self) -> PaceSettings | None:
+        """The time a frame may take and what it goes without when short; None where iterations are counted instead."""
+        if self.rate_hz is None:
+            return None
+        return PaceSettings(1.0 / self.rate_hz, self.least_iterations, self.reliefs)
 
     def mapper_settings(self) -> MapperSettings:
         """The named policy with this mission's cap, iterations and switches."""

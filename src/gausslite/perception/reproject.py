@@ -71,12 +71,8 @@ def cut_by_depth(frustum: Frustum, box_px: tuple[float, float, float, float], fr
     right, bottom = (int(np.ceil(value)) for value in box_px[2:])
     mask = np.zeros(frame.depth_m.shape, np.bool_)
     depth_m = frame.depth_m[top:bottom, left:right]
-    camera = frame.camera
-    shifted = Camera(
-        camera.fx_px, camera.fy_px, camera.cx_px - left, camera.cy_px - top, depth_m.shape[1], depth_m.shape[0]
-    )
     T_key_camera = inverse(frustum.T_world_camera) @ frame.T_world_camera
-    points = transform_points(T_key_camera, back_project(depth_m, shifted)).reshape(-1, 3)
+    points = transform_points(T_key_camera, back_project(depth_m, frame.camera, left, top)).reshape(-1, 3)
     between = (points[:, 2] >= frustum.near_m) & (points[:, 2] <= frustum.far_m) & (depth_m.reshape(-1) > 0)
     chosen = np.flatnonzero(between)
     pixels = np.floor(project(points[chosen], frustum.camera)).astype(np.int64)

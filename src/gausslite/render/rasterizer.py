@@ -69,10 +69,8 @@ class Rendering:
 
     def expected_depth_m(self, min_alpha: float = 0.5) -> Float32[ndarray, "h w"]:
         """Depth of the surface drawn; 0 where alpha is below min_alpha."""
-        shown = self.alpha > min_alpha
-        out: Float32[ndarray, "h w"] = np.where(shown, self.depth_m / np.where(shown, self.alpha, 1.0), 0.0).astype(
-            np.float32
-        )
+        out: Float32[ndarray, "h w"] = np.zeros_like(self.depth_m)
+        np.divide(self.depth_m, self.alpha, out=out, where=self.alpha > min_alpha)
         return out
 
 
