@@ -1,7 +1,17 @@
-"""`python -m gausslite` is the `gausslite` command."""
+"""`gausslite`, and `python -m gausslite`: may be interrupted from its first moment, so the imports come after that."""
 
 import sys
 
-from gausslite.cli.main import main
+from gausslite.interrupts import end_quietly_while_starting
 
-sys.exit(main())
+
+def main() -> int:
+    """Run the command line; returns the exit code."""
+    end_quietly_while_starting("gausslite")
+    from gausslite.cli.main import main as run
+
+    return run()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import signal
 import subprocess
@@ -14,6 +15,7 @@ from pathlib import Path
 
 import pytest
 from fusion_team import CAMERA, GRID, frame, team
+from tiny_yolo import write_tiny_yolo
 
 from gausslite.codec.ply import read_ply
 from gausslite.domain.camera import Camera
@@ -23,13 +25,17 @@ from gausslite.errors import DatasetError, InvalidInputError, StorageError, Task
 from gausslite.fusion.memory import MemoryStore
 from gausslite.perception.fixed import RegionAttention
 from gausslite.task.rules import RuleParser
-from gausslite.wire.clients import FusionClient
+from gausslite.v1.agent_service_pb2 import FRAME_OUTCOME_MAPPED
+from gausslite.wire.clients import AgentClient, FusionClient
+from gausslite.wire.process import run_service
+from gausslite.wire.server import serve_until_stopped
 from gausslite.wire.spool import Spool
 from gausslite.wire.uplink import Uplink
 from gausslite.wire.uplink_values import UplinkSettings
 from gausslite_agent.player import MissionState, Player
 from gausslite_agent.robot import Robot
 from gausslite_agent.settings import AgentSettings, PlaySettings, parse_arguments
+from gausslite_agent.stand_in import StandIn
 
 MUG = BallRegion((0.0, 0.0, 1.2), 0.2)
 
@@ -181,9 +187,9 @@ def test_what_is_wrong_is_raised_before_or_when_it_is_met(tmp_path: Path) -> Non
 def test_a_wrong_command_line_is_one_line_and_code_2(
     arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from gausslite_agent.__main__ import main
+    from gausslite_agent.program import run
 
-    assert main(["--listen", "127.0.0.1:0", *arguments]) == 2
+    assert run(["--listen", "127.0.0.1:0", *arguments]) == 2
     [line] = capsys.readouterr().err.splitlines()
     assert message in line
 
@@ -196,3 +202,56 @@ def test_a_real_process_ends_cleanly_on_sigterm(tmp_path: Path) -> None:
         p.send_signal(signal.SIGTERM)
         assert p.wait(30) == 0
         assert "ended" in p.stderr.read()
+
+
+def test_frames_that_were_sent_leave_a_map_and_a_report_on_sigterm(tmp_path: Path) -> None:
+    model = write_tiny_yolo(tmp_path / "tiny.onnx", ["cup"], [(32, 32, 30, 30, 0, 0.9)])
+    address, out = f"unix:{tmp_path}/agent.sock", tmp_path / "out"
+    command = [sys.executable, "-m", "gausslite_agent", "--listen", address, "--out", str(out), "--threads", "1"]
+    command += ["--detector", str(model), "--task", "Pick up the cup", "--max-gaussians", "2000", "--iterations", "1"]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as p:
+        assert p.stderr is not None
+        assert "listening on" in p.stderr.readline()
+        with AgentClient(address) as client:
+            client.assign_task("Pick up the cup")
+            outcomes = list(client.ingest([frame(i, CAMERA) for i in range(2)]))
+        p.send_signal(signal.SIGTERM)
+        said = p.stderr.read()
+        assert p.wait(30) == 0, said
+    report = json.loads((out / "report.json").read_text())
+    assert [outcome.outcome for outcome in outcomes] == [FRAME_OUTCOME_MAPPED] * 2
+    assert report["frames"] == 2
+    assert len(read_ply(out / "map.ply")) == report["gaussians"] > 0
+
+
+def test_without_a_mapped_frame_nothing_is_written_over(tmp_path: Path) -> None:
+    options = replace(settings(tmp_path), play=None)
+    (tmp_path / "map.ply").write_text("of an earlier life")
+    with player(options) as (mission, _):
+        mission.assign()
+        mission.stop()
+        mission.conclude()
+    assert (tmp_path / "map.ply").read_text() == "of an earlier life"
+
+
+def test_a_simulated_home_is_built_when_it_is_needed_and_a_folder_is_looked_at_now() -> None:
+    with pytest.raises(DatasetError, match="/nowhere"):
+        StandIn(PlaySettings("/nowhere"), None)
+    late = StandIn(PlaySettings("sim:attic"), None)
+    with pytest.raises(DatasetError, match="sim:attic"):
+        late.source()
+
+
+def test_what_fails_at_the_very_end_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    async def serve() -> None:
+        async def until() -> None:
+            try:
+                signal.raise_signal(signal.SIGTERM)
+                await asyncio.Event().wait()
+            finally:
+                raise StorageError("map.ply: the disk is full")
+
+        await serve_until_stopped(f"unix:{tmp_path}/x.sock", [], until)
+
+    assert run_service("program", serve) == 2
+    assert "program: map.ply: the disk is full" in capsys.readouterr().err

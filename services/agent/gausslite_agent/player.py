@@ -44,6 +44,7 @@ class Player:
         self._settings, self._robot, self._parser, self._client = settings, robot, parser, client
         self._stopping = threading.Event()
         self._state = MissionState.IDLE
+        self._started_s = time.monotonic()
 
     @property
     def state(self) -> MissionState:
@@ -62,7 +63,7 @@ class Player:
 
     def play(self, source: Source, play: PlaySettings) -> None:
         """Map every frame, then end the mission. Raises what the source, the disk or the task raise."""
-        started_s = time.monotonic()
+        self._started_s = time.monotonic()
         frames = _frames(source, play)
         self.assign()
         self._state = MissionState.MAPPING
@@ -76,9 +77,14 @@ class Player:
             waiting = self._robot.submit(frame)
         if waiting is not None:
             waiting.result()
-        self._finish(time.monotonic() - started_s)
+        self._finish()
 
-    def _finish(self, seconds: float) -> None:
+    def conclude(self) -> None:
+        """End a mission whose frames were sent: write what is mapped, if anything is. Raises StorageError."""
+        if self._robot.status().mapped > 0:
+            self._finish()
+
+    def _finish(self) -> None:
         self._state = MissionState.DRAINING
         gaussians = self._robot.do(lambda mapper: mapper.gaussians()).result()
         uplink, counters = self._robot.uplink, UplinkCounters()
@@ -88,6 +94,7 @@ class Player:
             counters = uplink.counters()
         status = self._robot.status()
         if self._settings.out is not None:
+            seconds = time.monotonic() - self._started_s
             report = mission_report(self._settings.agent_id, status, gaussians, counters, seconds)
             write_results(self._settings.out, gaussians, report)
         _log.info(

@@ -1,63 +1,16 @@
-"""Start the fusion server from the command line and end it cleanly on SIGTERM."""
+"""`gausslite-fusion-server`: may be interrupted from its first moment, so the imports come after that."""
 
-from __future__ import annotations
-
-import asyncio
-import contextlib
 import sys
-from collections.abc import Sequence
 
-from gausslite.fusion.memory import MemoryStore
-from gausslite.fusion.sqlite import SqliteStore
-from gausslite.fusion.store import FusionStore
-from gausslite.fusion.team import TeamMap
-from gausslite.render.rasterizer import Rasterizer
-from gausslite.wire.process import run_service
-from gausslite.wire.server import serve_until_stopped
-from gausslite_fusion_server.refinement import Refinery
-from gausslite_fusion_server.servicer import FusionServicer
-from gausslite_fusion_server.settings import ServerSettings, parse_arguments
-
-_PROGRAM = "gausslite-fusion-server"
+from gausslite.interrupts import end_quietly_while_starting
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Serve until stopped. Returns 0, or 2 with one line on stderr when the server cannot start or go on."""
+def main() -> int:
+    """Run the program with the arguments of the command line; returns the exit code."""
+    end_quietly_while_starting("gausslite-fusion-server")
+    from gausslite_fusion_server.program import run
 
-    async def serve() -> None:
-        settings = parse_arguments(arguments)
-        with contextlib.closing(_open_store(settings)) as store:
-            await _serve(settings, store)
-
-    return run_service(_PROGRAM, serve)
-
-
-def _open_store(settings: ServerSettings) -> FusionStore:
-    if settings.store is None:
-        return MemoryStore()
-    return SqliteStore(settings.store, settings.store_max_bytes)
-
-
-async def _serve(settings: ServerSettings, store: FusionStore) -> None:
-    def chosen_rasterizer() -> Rasterizer:
-        # imported here: a server that never refines needs no kernels
-        from gausslite.render.choose import choose_rasterizer
-
-        return choose_rasterizer(settings.rasterizer)
-
-    servicer = FusionServicer(TeamMap(store, settings.team), Refinery(settings.refine, chosen_rasterizer))
-
-    async def drain_when_stopping() -> None:
-        try:
-            await asyncio.Event().wait()
-        finally:
-            # reached when the server begins to stop: open streams end with UNAVAILABLE instead of being cut
-            servicer.drain()
-
-    try:
-        await serve_until_stopped(settings.listen, [servicer.service()], drain_when_stopping)
-    finally:
-        servicer.close()
+    return run()
 
 
 if __name__ == "__main__":

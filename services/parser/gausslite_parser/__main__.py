@@ -1,21 +1,16 @@
-"""`gausslite-parser`: serve the rule-based parser until told to stop."""
-
-from __future__ import annotations
+"""`gausslite-parser`: may be interrupted from its first moment, so the imports come after that."""
 
 import sys
-from collections.abc import Sequence
 
-from gausslite.task.rules import RuleParser
-from gausslite.wire.process import run_service
-from gausslite.wire.server import serve_until_stopped
-from gausslite_parser.servicer import parser_service
-from gausslite_parser.settings import parse_arguments
+from gausslite.interrupts import end_quietly_while_starting
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """0 after a clean end, 2 with one line on stderr when it cannot serve."""
-    settings = parse_arguments(arguments)
-    return run_service("gausslite-parser", lambda: serve_until_stopped(settings.listen, [parser_service(RuleParser())]))
+def main() -> int:
+    """Run the program with the arguments of the command line; returns the exit code."""
+    end_quietly_while_starting("gausslite-parser")
+    from gausslite_parser.program import run
+
+    return run()
 
 
 if __name__ == "__main__":

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 
 from gausslite import __version__
 from gausslite.errors import GaussLiteError
+from gausslite.interrupts import started
 
 _COMMANDS = {
     "map": "map one sequence for one task, write map.ply and report.json",
@@ -52,6 +53,8 @@ def _dispatch(arguments: list[str]) -> int:
             importlib.import_module(_MODULES[name]).configure(command)
     options = parser.parse_args(arguments)
     run = options.run
+    # from here on there is work to clean up after
+    started()
     return int(run(options))
 
 
@@ -67,7 +70,3 @@ def _describe(error: OSError) -> str:
     if error.errno == errno.EPIPE:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     return f"{where}{error.strerror or error}"
-
-
-if __name__ == "__main__":
-    sys.exit(main())

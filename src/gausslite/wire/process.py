@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import signal
 import sys
 from collections.abc import Awaitable, Callable
 
@@ -33,13 +32,9 @@ def run_service(program: str, serve: Callable[[], Awaitable[None]]) -> int:
     async def body() -> None:
         await serve()
 
-    # until the server takes its signals, Ctrl-C ends the process as SIGTERM does: at once and without a traceback
-    before = signal.signal(signal.SIGINT, signal.SIG_DFL)
     try:
         asyncio.run(body())
     except GaussLiteError as error:
         print(f"{program}: {error}", file=sys.stderr)
         return 2
-    finally:
-        signal.signal(signal.SIGINT, before)
     return 0

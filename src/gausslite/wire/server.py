@@ -89,7 +89,10 @@ async def start_server(listen: str, services: Sequence[Service]) -> RunningServe
 async def serve_until_stopped(
     listen: str, services: Sequence[Service], until: Callable[[], Awaitable[None]] | None = None, grace_s: float = 5.0
 ) -> None:
-    """Serve until SIGTERM or SIGINT, or until `until` returns; then drain. Prints nothing; logs where it listens."""
+    """Serve until SIGTERM or SIGINT, or until `until` returns; then drain. Prints nothing; logs where it listens.
+
+    Raises what `until` raises, also while it is being cancelled.
+    """
     stopping = asyncio.Event()
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):
@@ -106,9 +109,13 @@ async def serve_until_stopped(
     finally:
         for task in waits:
             task.cancel()
-        await asyncio.gather(*waits, return_exceptions=True)
+        ends = await asyncio.gather(*waits, return_exceptions=True)
         await running.stop(grace_s)
         _log.info("ended")
+    for end in ends:
+        # what went wrong while `until` was ending must not pass for a clean end
+        if isinstance(end, GaussLiteError):
+            raise end
 
 
 class ErrorInterceptor(grpc.aio.ServerInterceptor):  # type: ignore[type-arg]

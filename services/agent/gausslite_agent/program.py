@@ -1,0 +1,123 @@
+"""One robot as a process, until its mission or the operator ends it."""
+
+from __future__ import annotations
+
+import asyncio
+import functools
+from collections.abc import Sequence
+from contextlib import ExitStack
+
+from gausslite.domain.pose import unit_up_axis
+from gausslite.mission.build import build_attention
+from gausslite.mission.results import prepare_folder
+from gausslite.mission.settings import SceneKnowledge
+from gausslite.task.parser import TaskParser
+from gausslite.task.rules import RuleParser
+from gausslite.wire.bell import Bell
+from gausslite.wire.clients import FusionClient, ParserClient
+from gausslite.wire.process import run_service
+from gausslite.wire.server import serve_until_stopped
+from gausslite.wire.spool import Spool
+from gausslite.wire.uplink import Uplink
+from gausslite_agent.player import Player
+from gausslite_agent.robot import Robot
+from gausslite_agent.servicer import AgentServicer
+from gausslite_agent.settings import AgentSettings, LinkSettings, parse_arguments
+from gausslite_agent.stand_in import StandIn
+
+
+def run(arguments: Sequence[str] | None = None) -> int:
+    """0 after a clean end, 2 with one line on stderr when something the operator can mend is wrong."""
+
+    async def serve() -> None:
+        await _serve(parse_arguments(arguments))
+
+    return run_service("gausslite-agent", serve)
+
+
+async def _serve(settings: AgentSettings) -> None:
+    """Build the robot, serve it, play its source; close in the reverse order."""
+    _require_usable(settings)
+    stand_in = None if settings.play is None else StandIn(settings.play, settings.up_axis)
+    loop, news = asyncio.get_running_loop(), Bell()
+    with ExitStack() as stack:
+        parser = _parser(settings.link, stack)
+        uplink, client = _uplink(settings, stack)
+        robot = Robot(
+            settings.mission,
+            settings.link.grid,
+            lambda graph: build_attention(graph, _scene(settings, stand_in), settings.perception),
+            uplink,
+            on_change=lambda: _ring(loop, news),
+        )
+        stack.callback(robot.close)
+        player = Player(settings, robot, parser, client)
+        servicer = AgentServicer(settings.agent_id, robot, parser, news, lambda: player.state)
+
+        mission = functools.partial(_live, settings, stand_in, player, uplink)
+        await serve_until_stopped(settings.listen, [servicer.service()], mission)
+
+
+def _require_usable(settings: AgentSettings) -> None:
+    """Raise for what would end the mission later, hours into it or with its first task."""
+    if settings.up_axis is not None:
+        unit_up_axis(settings.up_axis)
+    if settings.out is not None:
+        prepare_folder(settings.out)
+    if settings.perception.model is not None:
+        from gausslite.perception.yolo import load_yolo
+
+        load_yolo(settings.perception.model, settings.perception.threads)
+
+
+async def _live(settings: AgentSettings, stand_in: StandIn | None, player: Player, uplink: Uplink | None) -> None:
+    """Work through the mission, then serve on unless told otherwise; what is mapped then is written at the end."""
+    work = asyncio.ensure_future(asyncio.to_thread(_begin, settings, stand_in, player))
+    try:
+        await asyncio.shield(work)
+        if not settings.exit_when_done or stand_in is None:
+            await asyncio.Event().wait()
+    finally:
+        # the player still writes what it has; nothing it uses may close before that
+        player.stop()
+        if uplink is not None:
+            uplink.stop_waiting()
+        await work
+        if stand_in is None:
+            await asyncio.to_thread(player.conclude)
+
+
+def _begin(settings: AgentSettings, stand_in: StandIn | None, player: Player) -> None:
+    """Play the source, or take the task and wait for frames; without either do nothing."""
+    if stand_in is not None:
+        player.play(stand_in.source(), stand_in.play)
+    elif settings.task is not None:
+        player.assign()
+
+
+def _parser(link: LinkSettings, stack: ExitStack) -> TaskParser:
+    if link.parser is None:
+        return RuleParser()
+    return stack.enter_context(ParserClient(link.parser, patient=True))
+
+
+def _uplink(settings: AgentSettings, stack: ExitStack) -> tuple[Uplink | None, FusionClient | None]:
+    link = settings.link
+    if link.fusion is None:
+        return None, None
+    spool = Spool(link.spool, settings.agent_id, link.grid)
+    client = FusionClient(link.fusion, mission_id=link.mission_id)
+    uplink = Uplink(client, settings.agent_id, spool, link.grid, link.uplink)
+    stack.callback(uplink.close)
+    return uplink, client
+
+
+def _scene(settings: AgentSettings, stand_in: StandIn | None) -> SceneKnowledge:
+    if stand_in is not None:
+        return SceneKnowledge.of(stand_in.source())
+    return SceneKnowledge() if settings.up_axis is None else SceneKnowledge(unit_up_axis(settings.up_axis))
+
+
+def _ring(loop: asyncio.AbstractEventLoop, news: Bell) -> None:
+    if not loop.is_closed():
+        loop.call_soon_threadsafe(news.ring)
