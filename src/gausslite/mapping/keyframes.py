@@ -89,9 +89,22 @@ class KeyframeStore:
         if len(self._buffer) > self._settings.buffer:
             self._thin()
 
+    def revise(self, view: WindowView) -> None:
+        """Put what came to be known later in the place of a frame that is still in the window."""
+        self._window = [view if _same_frame(old.keyframe, view.keyframe) else old for old in self._window]
+        self._buffer = [view.keyframe if _same_frame(old, view.keyframe) else old for old in self._buffer]
+
+    def in_window(self, frame: Frame) -> bool:
+        """True while the frame is a keyframe of the window."""
+        return any(view.keyframe.frame is frame for view in self._window)
+
     def _thin(self) -> None:
         """Drop the keyframe that is closest in time to its neighbours; the first and the last stay."""
         times = np.array([keyframe.frame.capture_time_ns for keyframe in self._buffer])
         gaps = times[2:] - times[:-2]
         drop = 1 + int(np.argmin(gaps)) if len(gaps) else 0
         del self._buffer[drop]
+
+
+def _same_frame(a: Keyframe, b: Keyframe) -> bool:
+    return a.frame is b.frame

@@ -99,6 +99,14 @@ class GaussianMapper:
         self._revision += 1
         return MappedFrame(frame.index, seeded, iterations, self.count)
 
+    def revise(self, frame: Frame, relevance: RelevanceMap) -> bool:
+        """Take what came to be known of an earlier frame; False when it is no keyframe of the window (any more)."""
+        if not self._keyframes.in_window(frame):
+            return False
+        keyframe, margin_px = Keyframe(frame, relevance), self._settings.keyframes.roi_margin_px
+        self._keyframes.revise(window_view(keyframe, self._rasterizer, margin_px))
+        return True
+
     def look(self, frame: Frame) -> MapSight | None:
         """How the map looks from a frame; None while it is empty."""
         return MapSight.of(self.render(frame.camera, frame.T_world_camera)) if self.count > 0 else None
