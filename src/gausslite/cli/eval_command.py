@@ -12,6 +12,7 @@ from gausslite.datasets.open import open_source
 from gausslite.datasets.selection import frame_size, select_frames
 from gausslite.errors import DatasetError
 from gausslite.evaluation.compare import MapScores, average, score_view
+from gausslite.evaluation.fitted import draw_fitted
 from gausslite.evaluation.held_out import HoldOut
 from gausslite.evaluation.pictures import comparison_sheet, write_png
 from gausslite.evaluation.views import HeldOutView, MapViewer
@@ -27,6 +28,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_source(parser)
     add_regions(parser)
     parser.add_argument("--hold-out", metavar="N", type=int, help="score every Nth selected frame only")
+    parser.add_argument(
+        "--fit-views", action="store_true", help="fit each view's pose and colours first (for real cameras)"
+    )
     parser.add_argument("--pictures", metavar="DIR", type=Path, help="write side-by-side pictures of a few views")
     parser.add_argument("--threads", metavar="N", type=int, help="threads (default: all the processor allows)")
     parser.add_argument("--json", action="store_true", help="print JSON for scripts")
@@ -53,7 +57,7 @@ def run(options: argparse.Namespace) -> int:
     scores = []
     for position in tqdm(positions, desc="eval", unit="view", disable=options.json):
         view = HeldOutView.of(source.frame(position, size), chosen)
-        drawn = viewer.draw_frame(view.frame)
+        drawn = draw_fitted(viewer, view.frame) if options.fit_views else viewer.draw_frame(view.frame)
         scores.append(score_view(drawn, view))
         if options.pictures is not None and position in pictured:
             sheet = comparison_sheet(view, {options.map.stem: drawn.rgb})

@@ -18,10 +18,14 @@ from gausslite.render.rasterizer import TILE_PX, Rasterizer, TrainingView
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Keyframe:
-    """A frame and what in it was relevant when it was mapped."""
+    """A frame and what in it was relevant when it was mapped.
+
+    recorded: the frame as it came, where it is mapped with another pose or other colours; None where it is not.
+    """
 
     frame: Frame
     relevance: RelevanceMap
+    recorded: Frame | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -89,14 +93,10 @@ class KeyframeStore:
         if len(self._buffer) > self._settings.buffer:
             self._thin()
 
-    def revise(self, view: WindowView) -> None:
-        """Put what came to be known later in the place of a frame that is still in the window."""
-        self._window = [view if _same_frame(old.keyframe, view.keyframe) else old for old in self._window]
-        self._buffer = [view.keyframe if _same_frame(old, view.keyframe) else old for old in self._buffer]
-
-    def in_window(self, frame: Frame) -> bool:
-        """True while the frame is a keyframe of the window."""
-        return any(view.keyframe.frame is frame for view in self._window)
+    def replace(self, old: WindowView, new: WindowView) -> None:
+        """Put another view, of the same frame, in the place of one in the window."""
+        self._window = [new if view is old else view for view in self._window]
+        self._buffer = [new.keyframe if keyframe is old.keyframe else keyframe for keyframe in self._buffer]
 
     def _thin(self) -> None:
         """Drop the keyframe that is closest in time to its neighbours; the first and the last stay."""
@@ -104,7 +104,3 @@ class KeyframeStore:
         gaps = times[2:] - times[:-2]
         drop = 1 + int(np.argmin(gaps)) if len(gaps) else 0
         del self._buffer[drop]
-
-
-def _same_frame(a: Keyframe, b: Keyframe) -> bool:
-    return a.frame is b.frame

@@ -18,6 +18,7 @@ from gausslite.mapping.budget import insert
 from gausslite.mapping.coverage import MapSight
 from gausslite.mapping.keyframes import Keyframe, KeyframeStore, WindowView, window_view
 from gausslite.mapping.pace import Pace, Relief, Step
+from gausslite.mapping.refinement import ViewRefiner
 from gausslite.mapping.seeding import MapState, Seeder
 from gausslite.mapping.settings import MapperSettings
 from gausslite.mapping.training import Trainer
@@ -53,6 +54,7 @@ class GaussianMapper:
         self._table = SplatTable(settings.max_gaussians)
         self._seeder = Seeder(settings.seeding, settings.components, self._rng)
         self._keyframes = KeyframeStore(settings.keyframes)
+        self._refiner = ViewRefiner(settings.view_prior, self.render)
         self._trainer = Trainer(settings, self._table, rasterizer, self._rng)
         self._extent_m = 0.0
         self._revision = 0
@@ -83,8 +85,8 @@ class GaussianMapper:
     ) -> MappedFrame:
         """Take one frame into the map, in the time that the pace gives; by default iterations are counted.
 
-        sight is how the map looks from the frame, drawn here unless it is given. A frame without a depth reading is
-        skipped and counted. Raises ShapeError when relevance and frame differ in size.
+        sight is how the map looks from the frame, drawn here unless it is given and the frame's pose is trusted. A
+        frame without a depth reading is skipped and counted. Raises ShapeError when relevance and frame differ in size.
         """
         require_array("relevance weight", relevance.weight, frame.depth_m.shape, np.float32)
         pace = Pace() if pace is None else pace
@@ -98,14 +100,6 @@ class GaussianMapper:
         self._keyframes.offer(view)
         self._revision += 1
         return MappedFrame(frame.index, seeded, iterations, self.count)
-
-    def revise(self, frame: Frame, relevance: RelevanceMap) -> bool:
-        """Take what came to be known of an earlier frame; False when it is no keyframe of the window (any more)."""
-        if not self._keyframes.in_window(frame):
-            return False
-        keyframe, margin_px = Keyframe(frame, relevance), self._settings.keyframes.roi_margin_px
-        self._keyframes.revise(window_view(keyframe, self._rasterizer, margin_px))
-        return True
 
     def look(self, frame: Frame) -> MapSight | None:
         """How the map looks from a frame; None while it is empty."""
@@ -128,14 +122,27 @@ class GaussianMapper:
         return list(self._keyframes.buffer)
 
     def _observe(self, frame: Frame, relevance: RelevanceMap) -> WindowView:
-        """Make the frame ready to train on, and note how deep the scene is."""
+        """Make the frame ready to train on, with its pose and colours refined where they may be wrong."""
         self._extent_m = max(self._extent_m, float(frame.depth_m.max()) * _EXTENT_PER_DEPTH)
-        return window_view(Keyframe(frame, relevance), self._rasterizer, self._settings.keyframes.roi_margin_px)
+        if not self._refiner.needed or self._table.count == 0:
+            return self._view(Keyframe(frame, relevance))
+        self._refine_keyframe()
+        return self._view(Keyframe(self._refiner.settle(frame), relevance, recorded=frame))
+
+    def _refine_keyframe(self) -> None:
+        """One keyframe of the window, fitted again to the map as it has become."""
+        view = self._refiner.next_turn(self._keyframes.window)
+        if view is not None:
+            self._keyframes.replace(view, self._view(self._refiner.fit_again(view.keyframe)))
+
+    def _view(self, keyframe: Keyframe) -> WindowView:
+        return window_view(keyframe, self._rasterizer, self._settings.keyframes.roi_margin_px)
 
     def _seed(self, keyframe: Keyframe, sight: MapSight | None, pace: Pace) -> int:
         """Add Gaussians where the map does not explain the frame, within the cap."""
         frame, table = keyframe.frame, self._table
-        sight = self.look(frame) if sight is None else sight
+        if sight is None or keyframe.recorded is not None:
+            sight = self.look(frame)
         with pace.timing(Step.SEEDING):
             state = MapState(table.room, sight, table.rows[:, MEAN][table.active])
             seeds = self._seeder.seed(frame, keyframe.relevance, state)

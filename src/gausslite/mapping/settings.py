@@ -8,6 +8,7 @@ from enum import StrEnum
 from gausslite.errors import InvalidInputError
 from gausslite.optimize.density import DensitySettings
 from gausslite.optimize.rates import ONLINE_RATES
+from gausslite.optimize.view_fit import ViewPrior
 from gausslite.render.rasterizer import AdamSettings, LossWeights
 
 
@@ -118,7 +119,10 @@ class OptimizationSettings:
 
 @dataclass(frozen=True, slots=True)
 class MapperSettings:
-    """A whole mapping policy. max_gaussians is a hard cap: memory for exactly that many is reserved at the start."""
+    """A whole mapping policy. max_gaussians is a hard cap: memory for exactly that many is reserved at the start.
+
+    view_prior: how wrong poses and colours of frames may be; keyframes are refined where it is not 0.
+    """
 
     max_gaussians: int = 1_000_000
     components: Components = field(default_factory=Components)
@@ -126,6 +130,7 @@ class MapperSettings:
     keyframes: KeyframeSettings = field(default_factory=KeyframeSettings)
     optimization: OptimizationSettings = field(default_factory=OptimizationSettings)
     density: DensitySettings = field(default_factory=DensitySettings)
+    view_prior: ViewPrior = field(default_factory=ViewPrior)
 
     def __post_init__(self) -> None:
         _require(self.max_gaussians >= 1, "max_gaussians", "at least 1", self.max_gaussians)

@@ -11,6 +11,7 @@ from gausslite.domain.voxels import VoxelGrid
 from gausslite.mapping.pace import PaceSettings, Relief
 from gausslite.mapping.policies import POLICIES
 from gausslite.mission.settings import DEFAULT_MAX_GAUSSIANS, MissionSettings, PerceptionSettings
+from gausslite.optimize.view_fit import ViewPrior
 from gausslite.render.choose import BACKENDS
 
 _RELIEF_HELP = "what gives way, in order, where that time is short (default: words,seeding)"
@@ -44,10 +45,17 @@ def add_detector(parser: argparse.ArgumentParser) -> None:
 
 
 def add_policy(parser: argparse.ArgumentParser) -> None:
-    """Add --policy, --without and --rasterizer: how the map is made."""
+    """Add --policy, --without, --view-error and --rasterizer: how the map is made."""
     add = parser.add_argument_group("mapping").add_argument
     add("--policy", choices=sorted(POLICIES), default="task", help="how to spend the budget (default: task)")
     add("--without", metavar="A,B", type=names, default=(), help="components off: sb mvo roi sis gfd")
+    add(
+        "--view-error",
+        metavar="M,DEG[,GAIN,OFFSET]",
+        type=ViewPrior.parse,
+        default=ViewPrior(),
+        help="how wrong poses (and colours, from 0 to 1) may be; keyframes are refined within that (default: trusted)",
+    )
     add("--rasterizer", choices=BACKENDS, default="auto", help="what draws and trains the map (default: auto)")
 
 
@@ -75,10 +83,8 @@ def add_voxel_size(parser: argparse.ArgumentParser) -> None:
 
 
 def perception_settings(options: argparse.Namespace) -> PerceptionSettings:
-    """What add_detector and add_budget asked for: at a rate detections run beside, on one thread."""
-    if options.rate is None:
-        return PerceptionSettings(options.detector, options.resegment, options.threads)
-    return PerceptionSettings(options.detector, options.resegment, threads=1, beside=True)
+    """What add_detector and add_budget asked for."""
+    return PerceptionSettings(options.detector, options.resegment, options.threads)
 
 
 def mission_settings(options: argparse.Namespace) -> MissionSettings:
@@ -94,6 +100,7 @@ def mission_settings(options: argparse.Namespace) -> MissionSettings:
         seed=options.seed,
         threads=options.threads,
         backend=options.rasterizer,
+        view_prior=options.view_error,
     )
 
 

@@ -13,6 +13,7 @@ from gausslite.errors import InvalidInputError
 from gausslite.mapping.pace import PaceSettings, Relief
 from gausslite.mapping.policies import policy
 from gausslite.mapping.settings import Components, MapperSettings
+from gausslite.optimize.view_fit import ViewPrior
 
 DEFAULT_MAX_GAUSSIANS = 150_000
 """What two cores keep busy at 640x480; the paper's cap of a million is for a GPU."""
@@ -37,14 +38,12 @@ class PerceptionSettings:
     """What finds the task's nouns: a YOLO-seg file, or ground truth without one.
 
     resegment runs the network on frames between detections too; without it masks are cut by depth inside the
-    re-projected boxes, which on a real kitchen is as exact at a third of the time. With beside, mapping does not wait
-    for detections: they run on a thread of their own and count from when they are there.
+    re-projected boxes, which on a real kitchen is as exact at a third of the time.
     """
 
     model: Path | None = None
     resegment: bool = False
     threads: int | None = None
-    beside: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +52,7 @@ class MissionSettings:
 
     without switches components off by name (sb, mvo, roi, sis, gfd). rate_hz, when given, replaces the fixed number
     of iterations by what fits into 1 / rate_hz seconds a frame; where that is less than least_iterations, the reliefs
-    give way.
+    give way. view_prior: how wrong poses and colours of frames may be.
     """
 
     policy: str = "task"
@@ -66,6 +65,7 @@ class MissionSettings:
     seed: int = 0
     threads: int | None = None
     backend: str = "auto"
+    view_prior: ViewPrior = field(default_factory=ViewPrior)
 
     def __post_init__(self) -> None:
         if self.rate_hz is not None and not 0.01 <= self.rate_hz <= 1000:
@@ -95,6 +95,7 @@ class MissionSettings:
             max_gaussians=self.max_gaussians,
             components=_without(base.components, self.without),
             optimization=optimization,
+            view_prior=self.view_prior,
         )
 
 

@@ -1,0 +1,62 @@
+"""Refine the pose and colour of each frame against the map, and of the keyframes again as the map improves."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float64
+from numpy import ndarray
+
+from gausslite.domain.camera import Camera
+from gausslite.domain.frame import Frame
+from gausslite.domain.pose import inverse
+from gausslite.mapping.keyframes import Keyframe, WindowView
+from gausslite.optimize.view_fit import ViewPrior, fit_colour, fit_pose
+from gausslite.render.rasterizer import Rendering
+
+Draw = Callable[[Camera, Float64[ndarray, "4 4"]], Rendering]
+"""The map as a camera sees it from T_world_camera."""
+
+
+class ViewRefiner:
+    """Knows how far the last frame's pose was corrected, and whose turn it is among the keyframes."""
+
+    def __init__(self, prior: ViewPrior, draw: Draw) -> None:
+        self._prior = prior
+        self._draw = draw
+        self._T_said_refined = np.eye(4)
+        self._turn = 0
+
+    @property
+    def needed(self) -> bool:
+        """False where poses and colours are trusted."""
+        return self._prior.moves or self._prior.colours
+
+    def settle(self, recorded: Frame) -> Frame:
+        """A new frame with the pose and colours to map it with; an odometry's error is much like a frame ago."""
+        start = recorded.T_world_camera @ self._T_said_refined if self._prior.moves else recorded.T_world_camera
+        frame = self._fit(recorded, start)
+        self._T_said_refined = inverse(recorded.T_world_camera) @ frame.T_world_camera
+        return frame
+
+    def next_turn(self, window: Sequence[WindowView]) -> WindowView | None:
+        """The keyframe to fit again now: one a frame, each in turn; None while there is none that may change."""
+        refinable = [view for view in window if view.keyframe.recorded is not None]
+        if not refinable:
+            return None
+        self._turn = (self._turn + 1) % len(refinable)
+        return refinable[self._turn]
+
+    def fit_again(self, keyframe: Keyframe) -> Keyframe:
+        """The keyframe as it fits the map of now."""
+        if keyframe.recorded is None:
+            return keyframe
+        return replace(keyframe, frame=self._fit(keyframe.recorded, keyframe.frame.T_world_camera))
+
+    def _fit(self, recorded: Frame, T_world_drawn: Float64[ndarray, "4 4"]) -> Frame:
+        drawn = self._draw(recorded.camera, T_world_drawn)
+        T_world_camera = fit_pose(drawn, inverse(T_world_drawn), recorded, self._prior)
+        colour = fit_colour(drawn, recorded, self._prior)
+        return replace(recorded, rgb=colour.of_map(recorded.rgb), T_world_camera=T_world_camera)
