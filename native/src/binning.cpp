@@ -45,7 +45,7 @@ GAUSSLITE_INLINE uint32_t column_bits(int first, int last) {
 
 void bin_strip(Workspace& ws, int strip, const DepthKey* keys, int count) {
   TileList* tiles = &ws.tiles[size_t(strip) * size_t(ws.tiles_x)];
-  const uint8_t* active = ws.active_tiles != nullptr ? ws.active_tiles + size_t(strip) * size_t(ws.tiles_x) : nullptr;
+  const uint16_t* wanted = &ws.wanted_blocks[size_t(strip) * size_t(ws.tiles_x)];
   for (int x = 0; x < ws.tiles_x; ++x) tiles[x].count = 0;
   for (int i = 0; i < count; ++i) {
     if (i % kRoomEvery == 0) {
@@ -59,8 +59,9 @@ void bin_strip(Workspace& ws, int strip, const DepthKey* keys, int count) {
     const Splat& s = ws.splats[slot];
     const uint32_t rows = row_bits(std::max(s.block_y0 - 4 * strip, 0), std::min(s.block_y1 - 4 * strip, 3));
     for (int x = s.block_x0 / 4; x <= s.block_x1 / 4; ++x) {
-      if (active != nullptr && !active[x]) continue;
-      uint32_t blocks = rows & column_bits(std::max(s.block_x0 - 4 * x, 0), std::min(s.block_x1 - 4 * x, 3));
+      if (wanted[x] == 0) continue;
+      uint32_t blocks =
+          rows & wanted[x] & column_bits(std::max(s.block_x0 - 4 * x, 0), std::min(s.block_x1 - 4 * x, 3));
       if (s.elongated) blocks &= touched_blocks(s, float(x * kTile), float(strip * kTile));
       // Written always, kept only when a block is touched: no branch to mispredict.
       TileList& tile = tiles[x];

@@ -7,8 +7,8 @@
 
 namespace gausslite {
 
-// A replacement for `old` with room for `bytes`, its first `kept` bytes copied and the rest zero; frees `old`, which was
-// asked for with `old_bytes`. Throws std::bad_alloc.
+// A replacement for `old` with room for `bytes`, its first `kept` bytes copied and the rest zero; frees `old`, which
+// was asked for with `old_bytes`. Throws std::bad_alloc.
 void* grow_memory(void* old, size_t kept, size_t old_bytes, size_t bytes);
 // Frees what was asked for with `bytes`; the latest large blocks are kept for the next who asks for as much.
 void free_memory(void* memory, size_t bytes) noexcept;

@@ -3,14 +3,10 @@
 
 #include <algorithm>
 #include <chrono>
-#include <cmath>
 
 namespace gausslite {
 
 namespace {
-
-// 0.999^t is below single precision's resolution of 1 after some 17 000 updates.
-constexpr int kCorrections = 20'000;
 
 double now_ms() {
   return std::chrono::duration<double, std::milli>(std::chrono::steady_clock::now().time_since_epoch()).count();
@@ -66,10 +62,20 @@ void Rasterizer::begin_frame(const FrameInput& input) {
     if (scratch.strips.size() < size_t(ws_.tiles_y)) scratch.strips.resize(size_t(ws_.tiles_y));
     scratch.block_evaluations = 0;
   }
-  loss_sums_.reserve(std::max(tiles, size_t(ws_.tiles_y) * kTile));
+  ws_.wanted_blocks.reserve(tiles);
+  want_blocks(nullptr);
   if (input.active_tiles != nullptr) count_active_tiles();
   times_ = {};
   last_mark_ms_ = now_ms();
+}
+
+// Of the active tiles, the blocks that the loss depends on; null: all.
+void Rasterizer::want_blocks(const uint16_t* blocks) {
+  const size_t tiles = size_t(ws_.tiles_x) * size_t(ws_.tiles_y);
+  for (size_t t = 0; t < tiles; ++t) {
+    const bool active = ws_.active_tiles == nullptr || ws_.active_tiles[t];
+    ws_.wanted_blocks[t] = !active ? uint16_t(0) : blocks != nullptr ? blocks[t] : uint16_t(0xFFFF);
+  }
 }
 
 // Memory is zeroed when it grows, so 0 would read as written.
@@ -167,36 +173,68 @@ void Rasterizer::backward(const ImageGradients& input, float* d_rows, double* d_
   }
 }
 
-const float* Rasterizer::corrections(const AdamOptions& adam) {
-  if (adam.beta1 != correction_beta1_ || adam.beta2 != correction_beta2_) {
-    corrections_.reserve(2 * size_t(kCorrections));
-    for (int t = 1; t <= kCorrections; ++t) {
-      corrections_[2 * size_t(t - 1)] = float(1.0 / (1.0 - std::pow(adam.beta1, t)));
-      corrections_[2 * size_t(t - 1) + 1] = float(1.0 / (1.0 - std::pow(adam.beta2, t)));
-    }
-    correction_beta1_ = adam.beta1;
-    correction_beta2_ = adam.beta2;
+Training Rasterizer::begin_training(const TrainingView& view, bool masked, const LossWeights& loss) {
+  const double weight_sum = view.weight_sum(masked);
+  const double per_pixel = weight_sum > 0.0 ? 1.0 / weight_sum : 0.0;
+  const size_t tiles = size_t(ws_.tiles_x) * size_t(ws_.tiles_y), squares = tiles + size_t(ws_.tiles_x);
+  l1_sums_.reserve(tiles);
+  ssim_sums_.reserve(size_t(ws_.tiles_y) + 1);
+  const Training training{
+      view.targets(masked),
+      {float(loss.colour * per_pixel / 3.0), float(loss.depth * per_pixel), float(loss.ssim * per_pixel / 3.0)},
+      l1_sums_.data(),
+      ssim_sums_.data()};
+  if (loss.ssim == 0.0f) {
+    want_blocks(training.targets.weighted_blocks);
+  } else {
+    want_blocks(training.targets.reached_blocks);
+    ws_.ssim_squares.reserve(squares * 3 * kSsimMaps * kSquare);
+    // One more than there are strips in work, and one that waits for the strip below it.
+    const int tapes = std::max(2, std::min(team_.size() + 2, ws_.tiles_y));
+    if (ws_.tapes.size() < size_t(tapes)) ws_.tapes.resize(size_t(tapes));
+    schedule_.start(ws_.tiles_y, tapes);
   }
-  return corrections_.data();
+  return training;
+}
+
+void Rasterizer::train_with_ssim(const Training& training, int thread) {
+  StageTimes spent;
+  double started_ms = now_ms();
+  for (StripTask task; (task = schedule_.next()).kind != StripTask::kNone;) {
+    StripTape& tape = ws_.tapes[size_t(task.tape)];
+    double StageTimes::*stage = &StageTimes::raster;
+    if (task.kind == StripTask::kDraw) {
+      stages_.draw_on_tape(ws_, training, tape, task.index, thread);
+    } else if (task.kind == StripTask::kDerive) {
+      stages_.derive_ssim(ws_, training, task.index, thread);
+      stage = &StageTimes::loss;
+    } else {
+      stages_.walk_back_on_tape(ws_, training, tape, task.index);
+      stage = &StageTimes::backward;
+    }
+    schedule_.finish(task);
+    const double now = now_ms();
+    spent.*stage += now - std::exchange(started_ms, now);
+  }
+  if (thread == 0) {
+    times_.raster = spent.raster;
+    times_.loss = spent.loss;
+    times_.backward = spent.backward;
+  }
 }
 
 double Rasterizer::step(const FrameInput& input, const OptimizerState& state, const TrainingView& view, bool masked,
                         const LossWeights& loss, const AdamOptions& adam) {
   begin_frame(input);
-  const double weight_sum = view.weight_sum(masked);
-  const double per_pixel = weight_sum > 0.0 ? 1.0 / weight_sum : 0.0;
-  const Training training{
-      view.targets(masked),
-      {float(loss.colour * per_pixel / 3.0), float(loss.depth * per_pixel), float(loss.ssim * per_pixel / 3.0)},
-      loss_sums_.data()};
+  const Training training = begin_training(view, masked, loss);
+  const bool with_ssim = loss.ssim != 0.0f;
   Update update{state.rows, state.first_moment, state.second_moment, state.trainable, {}};
   std::copy_n(adam.rates, 16, update.adam.rates);
   update.adam.beta1 = float(adam.beta1);
   update.adam.beta2 = float(adam.beta2);
   update.adam.epsilon = float(adam.epsilon);
-  update.adam.corrections = corrections(adam);
-  update.adam.correction_count = kCorrections;
-  const bool fused = loss.ssim == 0.0f;
+  update.adam.corrections = corrections_.table(adam.beta1, adam.beta2);
+  update.adam.correction_count = AdamCorrections::kCount;
 
   team_.run([&](int thread) {
     stages_.project(ws_, thread);
@@ -204,30 +242,25 @@ double Rasterizer::step(const FrameInput& input, const OptimizerState& state, co
       prepare_gradient_rows();
       mark(&StageTimes::project);
     });
-    if (fused) {
-      for_each_strip([&](int strip) { stages_.train_strip(ws_, training, strip, thread); });
+    if (with_ssim) {
+      train_with_ssim(training, thread);
     } else {
-      for_each_strip([&](int strip) { stages_.draw_strip(ws_, strip, thread); });
+      for_each_strip([&](int strip) { stages_.train_strip(ws_, training, strip, thread); });
     }
     team_.barrier([&] {
-      ws_.ticket = 0;
-      mark(&StageTimes::raster);
+      if (with_ssim) {
+        last_mark_ms_ = now_ms();
+      } else {
+        mark(&StageTimes::raster);
+      }
     });
-    if (!fused) {
-      const Band band(ws_.tiles_y * kTile, thread, team_.size());
-      stages_.loss_l1(ws_, training, band.begin, band.end);
-      stages_.loss_ssim(ws_, training, band.begin, std::min(band.end, ws_.camera.height), thread);
-      team_.barrier([&] { mark(&StageTimes::loss); });
-      for_each_strip([&](int strip) { stages_.backward_strip(ws_, strip, thread); });
-      team_.barrier([&] { mark(&StageTimes::backward); });
-    }
     stages_.update(ws_, update, thread);
     team_.barrier([&] { mark(&StageTimes::update); });
   });
 
-  const size_t sums = fused ? size_t(ws_.tiles_x) * size_t(ws_.tiles_y) : size_t(ws_.camera.height);
-  double total = weight_sum > 0.0 ? double(loss.ssim) : 0.0;
-  for (size_t i = 0; i < sums; ++i) total += loss_sums_[i];
+  double total = with_ssim && view.weight_sum(masked) > 0.0 ? double(loss.ssim) : 0.0;
+  for (int t = 0; t < ws_.tiles_x * ws_.tiles_y; ++t) total += l1_sums_[size_t(t)];
+  for (int k = 0; with_ssim && k <= ws_.tiles_y; ++k) total += ssim_sums_[size_t(k)];
   return total;
 }
 

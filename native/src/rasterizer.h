@@ -4,7 +4,9 @@
 
 #include <mutex>
 
+#include "adam_corrections.h"
 #include "stages.h"
+#include "strip_schedule.h"
 #include "team.h"
 #include "training_view.h"
 
@@ -48,7 +50,8 @@ struct AdamOptions {
   double beta1, beta2, epsilon;
 };
 
-// Milliseconds of the last call's stages, as its first thread saw them.
+// Milliseconds of the last call's stages, as its first thread saw them. With SSIM strips are drawn, compared and walked
+// back side by side: then raster, loss and backward are the times that it spent on each.
 struct StageTimes {
   double project = 0.0, raster = 0.0, loss = 0.0, backward = 0.0, update = 0.0;
 };
@@ -84,12 +87,14 @@ class Rasterizer {
 
  private:
   void begin_frame(const FrameInput& input);
+  void want_blocks(const uint16_t* blocks);
+  Training begin_training(const TrainingView& view, bool masked, const LossWeights& loss);
+  void train_with_ssim(const Training& training, int thread);
   void next_tag();
   void count_active_tiles();
   void prepare_gradient_rows();
   void export_rows(const ImageOutput& output, int begin, int end) const;
   void import_gradients(const ImageGradients& input, int begin, int end);
-  const float* corrections(const AdamOptions& adam);
   void mark(double StageTimes::*stage);
   template <class F>
   void for_each_strip(F f);
@@ -100,10 +105,10 @@ class Rasterizer {
   uint64_t frame_ = 0;
   uint32_t row_count_ = 0;
   std::mutex mutex_;
-  Buffer<double> loss_sums_, twist_sums_;
+  StripSchedule schedule_;
+  Buffer<double> l1_sums_, ssim_sums_, twist_sums_;
   Buffer<float> norms_by_slot_;
-  Buffer<float> corrections_;
-  double correction_beta1_ = -1.0, correction_beta2_ = -1.0;
+  AdamCorrections corrections_;
   StageTimes times_;
   double last_mark_ms_ = 0.0;
 };

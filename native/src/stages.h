@@ -17,14 +17,24 @@ struct AdamSettings {
   int correction_count;
 };
 
+// What the weights make of a square of the SSIM loss: without a weight in it or beside it, nothing is blurred there.
+enum Reach : uint8_t { kUnreached, kReached, kWeighted };
+
+// By rows k = 0 ... tile rows of the squares that loss_ssim.cpp describes; within a square by columns.
+struct SsimTargets {
+  const float* moments;  // [square][channel][mean, mean square][16][16]
+  const float* weights;  // [square][16][16]
+  const uint8_t* reach;  // [square]
+};
+
 // The targets of one training image, planar and padded like Workspace::image.
 struct Targets {
-  const float* rgb;      // three planes
-  const float* depth_m;  // 0 where there is no measurement
-  const float* weight;   // 0 outside the image
-  const float* moments;  // SSIM: three planes of the mean, three of the mean square; null when SSIM was not prepared
-  const uint8_t* weighted_tiles;  // 1 where a tile has a pixel with a weight
-  const uint16_t* spans;          // per image row: first column with a weight, end column; equal where there is none
+  const float* rgb;                 // three planes
+  const float* depth_m;             // 0 where there is no measurement
+  const float* weight;              // 0 outside the image
+  const uint16_t* weighted_blocks;  // by tile: the blocks that have a pixel with a weight
+  const uint16_t* reached_blocks;   // ... and those that have one in an SSIM window around it
+  SsimTargets ssim;
 };
 
 struct LossSettings {
@@ -34,7 +44,8 @@ struct LossSettings {
 struct Training {
   Targets targets;
   LossSettings loss;
-  double* loss_sums;  // fused: one per tile; otherwise one per image row
+  double* l1_sums;    // one per tile
+  double* ssim_sums;  // one per row of squares
 };
 
 struct Update {
@@ -59,19 +70,20 @@ struct Stages {
   void (*draw_strip)(Workspace&, int strip, int thread);
   // Sorts, bins, draws, compares with L1 and walks back, tile by tile while everything is in cache.
   void (*train_strip)(Workspace&, const Training&, int strip, int thread);
-  // The colour and depth terms on image rows [begin, end): writes Workspace::image_gradient.
-  void (*loss_l1)(Workspace&, const Training&, int begin, int end);
-  // Adds the SSIM term on image rows [begin, end) after loss_l1 has written them.
-  void (*loss_ssim)(Workspace&, const Training&, int begin, int end, int thread);
+  // The same with SSIM, which looks beyond the tile, in three parts. Draws a strip and keeps its tape.
+  void (*draw_on_tape)(Workspace&, const Training&, StripTape&, int strip, int thread);
+  // SSIM in row k of the squares, once tile rows k - 1 and k are drawn.
+  void (*derive_ssim)(Workspace&, const Training&, int k, int thread);
+  // Compares a strip and walks it back, once rows `strip` and `strip` + 1 of the squares are derived.
+  void (*walk_back_on_tape)(Workspace&, const Training&, const StripTape&, int strip);
   // From image_gradient to gradient rows, for the tile row that draw_strip has drawn.
   void (*backward_strip)(Workspace&, int strip, int thread);
   // From gradient rows to parameters, over this thread's segments.
   void (*update)(Workspace&, const Update&, int thread);
   void (*gradients)(Workspace&, const GradientOutput&, int thread);
-  // The blurred target and its blurred square, once per training image.
-  void (*prepare_ssim)(const float* rgb, int width, int height, int padded_width, int64_t plane, float* moments,
-                       float* scratch);
-  size_t (*ssim_scratch_floats)(int padded_width);
+  // The blurred target and its blurred square (SsimTargets::moments), once per training image.
+  void (*prepare_ssim)(const float* rgb, int tiles_x, int tiles_y, float* moments, float* scratch);
+  size_t (*ssim_scratch_floats)(int tiles_x);
 };
 
 namespace portable {

@@ -13,6 +13,8 @@ namespace {
 constexpr int kSpins = 200'000;
 constexpr int kYields = 400;
 
+}  // namespace
+
 uint32_t wait_while(const std::atomic<uint32_t>& value, uint32_t old) {
   for (int i = 0; i < kSpins; ++i) {
     const uint32_t now = value.load(std::memory_order_acquire);
@@ -26,8 +28,6 @@ uint32_t wait_while(const std::atomic<uint32_t>& value, uint32_t old) {
   value.wait(old, std::memory_order_acquire);
   return value.load(std::memory_order_acquire);
 }
-
-}  // namespace
 
 Team::Team(int threads) : size_(threads) {
   for (int member = 1; member < threads; ++member) threads_.emplace_back([this, member] { serve(member); });

@@ -10,8 +10,12 @@
 
 namespace gausslite {
 
-// One owner calls `run`; the calling thread is member 0. Members that wait first spin, then yield, then sleep, so that
-// a busy loop of calls pays nothing for waking up and an idle team costs nothing.
+// Waits until `value` is no longer `old` and returns it: first spinning, then yielding, then asleep, so that whoever
+// changes the value must also notify.
+uint32_t wait_while(const std::atomic<uint32_t>& value, uint32_t old);
+
+// One owner calls `run`; the calling thread is member 0. A busy loop of calls pays nothing for waking up, and an idle
+// team costs nothing.
 class Team {
  public:
   explicit Team(int threads);

@@ -1,117 +1,201 @@
 // SPDX-License-Identifier: Apache-2.0
-// Stages 4 to 6 in one pass, for losses that look at each pixel alone: a tile is drawn, compared and walked back while
-// its records, lists and alphas are in the second-level cache. Nothing is gathered or computed twice, and no image is
-// written.
+// Stages 4 to 6 with a tape: a tile is drawn, compared and walked back without anything being gathered or computed
+// twice. Where the loss looks at each pixel alone, a tile goes through all three at once, while its records, lists and
+// alphas are in the second-level cache, and no image is written. SSIM needs the image around a tile first: then the
+// tape of a whole strip waits until its neighbours are drawn.
 #include <algorithm>
 
 #include "block_backward.h"
-#include "block_forward.h"
 #include "loss_l1.h"
+#include "ssim_gradient.h"
 #include "stage_functions.h"
-#include "tile_chunk.h"
+#include "tile_pixels.h"
 
 namespace gausslite::GAUSSLITE_ISA {
 
 namespace {
 
-class FusedTile {
- public:
-  FusedTile(Workspace& ws, ThreadScratch& mine, const TileList& list, const TilePosition& tile)
-      : ws_(ws), mine_(mine), list_(list), tile_(tile) {
-    const size_t chunks = (list.count + kChunk - 1) / kChunk;
-    mine.records.reserve(chunks * kChunk);
-    mine.lists.reserve(chunks);
+struct TileGradient {
+  BlockGradient block[kBlocks];
+  uint32_t live = 0;  // blocks with a gradient that is not zero
+
+  GAUSSLITE_INLINE void start(int b, const Pack16 (&gradient)[5], const Pack16 (&image)[5]) {
+    // The gradient by alpha is zero where that by depth is.
+    const Pack16 size = (abs(gradient[0]) + abs(gradient[1])) + (abs(gradient[2]) + abs(gradient[3]));
+    if (!any(size > Pack16(0.0f))) return;
+    live |= 1u << b;
+    block[b].start(gradient, image);
   }
-
-  void draw() {
-    size_t kept = 0;
-    uint32_t finished = 0;
-    for (uint32_t first = 0; first < list_.count && finished != 0xFFFF; first += kChunk, ++chunks_) {
-      Splat* records = &mine_.records[first];
-      BlockLists& lists = mine_.lists[size_t(chunks_)];
-      load_chunk(ws_, list_, first, chunk_size(chunks_), records, lists);
-      // Early: by the time the way back adds to them, the rows have come from memory to the second-level cache.
-      prefetch_rows(ws_, records, chunk_size(chunks_), tile_);
-      size_t entries = 0;
-      for (int b = 0; b < kBlocks; ++b) entries += lists.count[b];
-      mine_.alphas.reserve((kept + entries) * 16, kept * 16);
-      float* alphas = mine_.alphas.data() + kept * 16;
-      for (int b = 0; b < kBlocks; ++b) {
-        if (finished >> b & 1u) {
-          lists.count[b] = 0;
-          continue;
-        }
-        lists.count[b] = uint16_t(composite<true>(records, lists.entry[b], lists.count[b], tile_.pixel_x(b),
-                                                  tile_.pixel_y(b), state_[b], alphas));
-        if (state_[b].finished()) finished |= 1u << b;
-      }
-      kept = size_t(alphas - mine_.alphas.data()) / 16;
-    }
-    mine_.block_evaluations += kept;
-  }
-
-  double compare(const Training& training) {
-    Pack16 loss(0.0f);
-    const Targets& t = training.targets;
-    for (int b = 0; b < kBlocks; ++b) {
-      const int64_t at = tile_.block(ws_, b);
-      const BlockState& s = state_[b];
-      const Pack16 image[5] = {s.r, s.g, s.b, s.depth, s.transmittance};
-      Pack16 rgb[3], gradient[5];
-      for (int k = 0; k < 3; ++k) rgb[k] = load_block(t.rgb + k * ws_.plane + at, ws_.padded_width);
-      const Pack16 measured_m = load_block(t.depth_m + at, ws_.padded_width),
-                   weight = load_block(t.weight + at, ws_.padded_width);
-      loss = loss + l1_of_pixels(image, rgb, measured_m, weight, training.loss, gradient);
-      gradients_[b].start(gradient, image);
-    }
-    return double(sum(loss));
-  }
-
-  void walk_back_all() {
-    const float* alphas = mine_.alphas.data();
-    for (int c = 0; c < chunks_; ++c) {
-      const Splat* records = &mine_.records[size_t(c) * kChunk];
-      const BlockLists& lists = mine_.lists[size_t(c)];
-      const int n = chunk_size(c);
-      sums_.clear(n);
-      for (int b = 0; b < kBlocks; ++b) {
-        if (lists.count[b] > 0)
-          walk_back<true>(records, lists.entry[b], lists.count[b], tile_, b, gradients_[b], sums_, batch_, alphas);
-      }
-      batch_.flush(sums_.moments);
-      add_to_rows(ws_, records, n, tile_, sums_);
-    }
-  }
-
- private:
-  int chunk_size(int chunk) const { return int(std::min<uint32_t>(kChunk, list_.count - uint32_t(chunk) * kChunk)); }
-
-  Workspace& ws_;
-  ThreadScratch& mine_;
-  const TileList& list_;
-  const TilePosition tile_;
-  int chunks_ = 0;  // chunks that were drawn before all pixels were finished
-  BlockState state_[kBlocks];
-  BlockGradient gradients_[kBlocks];
-  ChunkSums sums_;
-  MomentBatch batch_;
 };
+
+int chunk_size(uint32_t count, uint32_t first) { return int(std::min<uint32_t>(kChunk, count - first)); }
+
+// Draws a tile and appends it to the tape.
+TileTape draw(Workspace& ws, StripTape& tape, const TileList& list, const TilePosition& tile,
+              BlockState (&state)[kBlocks]) {
+  TileTape out{tape.record_count, tape.list_count, tape.alpha_count, 0};
+  tape.records.reserve(out.first_record + list.count, out.first_record);
+  tape.lists.reserve(out.first_list + (list.count + kChunk - 1) / kChunk, out.first_list);
+  size_t alpha_count = out.first_alpha;
+  uint32_t finished = 0;
+  for (uint32_t first = 0; first < list.count && finished != 0xFFFF; first += kChunk) {
+    const int n = chunk_size(list.count, first);
+    Splat* records = &tape.records[out.first_record + first];
+    BlockLists& lists = tape.lists[tape.list_count++];
+    load_chunk(ws, list, first, n, records, lists);
+    // Early: by the time the way back adds to them, the rows have come from memory to a nearer cache.
+    prefetch_rows(ws, records, n, tile);
+    size_t entries = 0;
+    for (int b = 0; b < kBlocks; ++b) entries += lists.count[b];
+    tape.alphas.reserve((alpha_count + entries) * 16, alpha_count * 16);
+    float* alphas = tape.alphas.data() + alpha_count * 16;
+    for (int b = 0; b < kBlocks; ++b) {
+      if (finished >> b & 1u) {
+        lists.count[b] = 0;
+        continue;
+      }
+      lists.count[b] = uint16_t(
+          composite<true>(records, lists.entry[b], lists.count[b], tile.pixel_x(b), tile.pixel_y(b), state[b], alphas));
+      if (state[b].finished()) finished |= 1u << b;
+    }
+    alpha_count = size_t(alphas - tape.alphas.data()) / 16;
+    out.entries = first + uint32_t(n);
+  }
+  tape.record_count += out.entries;
+  tape.alpha_count = alpha_count;
+  return out;
+}
+
+void walk_back_tile(Workspace& ws, const StripTape& tape, const TileTape& taped, const TilePosition& tile,
+                    TileGradient& gradient) {
+  if (gradient.live == 0) return;
+  ChunkSums sums;
+  MomentBatch batch;
+  const float* alphas = tape.alphas.data() + taped.first_alpha * 16;
+  const BlockLists* lists = tape.lists.data() + taped.first_list;
+  for (uint32_t first = 0; first < taped.entries; first += kChunk, ++lists) {
+    const Splat* records = &tape.records[taped.first_record + first];
+    const int n = chunk_size(taped.entries, first);
+    if (first + kChunk < taped.entries)
+      prefetch_rows(ws, records + kChunk, chunk_size(taped.entries, first + kChunk), tile);
+    sums.clear(n);
+    for (int b = 0; b < kBlocks; ++b) {
+      if (gradient.live >> b & 1u) {
+        if (lists->count[b] > 0)
+          walk_back<true>(records, lists->entry[b], lists->count[b], tile, b, gradient.block[b], sums, batch, alphas);
+      } else {
+        alphas += 16 * size_t(lists->count[b]);
+      }
+    }
+    batch.flush(sums.moments);
+    add_to_rows(ws, records, n, tile, sums);
+  }
+}
+
+// The L1 terms of one block, and their gradient.
+GAUSSLITE_INLINE Pack16 compare(const Workspace& ws, const Training& training, int64_t at, const Pack16 (&image)[5],
+                                Pack16 (&gradient)[5]) {
+  const Targets& t = training.targets;
+  Pack16 rgb[3];
+  for (int k = 0; k < 3; ++k) rgb[k] = load_block(t.rgb + k * ws.plane + at, ws.padded_width);
+  const Pack16 measured_m = load_block(t.depth_m + at, ws.padded_width),
+               weight = load_block(t.weight + at, ws.padded_width);
+  return l1_of_pixels(image, rgb, measured_m, weight, training.loss, gradient);
+}
+
+void train_tile(Workspace& ws, const Training& training, size_t t, const TilePosition& tile, ThreadScratch& mine) {
+  BlockState state[kBlocks];
+  mine.tape.rewind();
+  const TileTape taped = draw(ws, mine.tape, ws.tiles[t], tile, state);
+  mine.block_evaluations += mine.tape.alpha_count;
+  TileGradient gradient;
+  Pack16 loss(0.0f);
+  for (int b = 0; b < kBlocks; ++b) {
+    const BlockState& s = state[b];
+    const Pack16 image[5] = {s.r, s.g, s.b, s.depth, s.transmittance};
+    Pack16 by[5];
+    loss = loss + compare(ws, training, tile.block(ws, b), image, by);
+    gradient.start(b, by, image);
+  }
+  training.l1_sums[t] = double(sum(loss));
+  walk_back_tile(ws, mine.tape, taped, tile, gradient);
+}
+
+// Colours of the pixels beyond the image's edge are zero: that is how SSIM sees them.
+void clear_padding(Workspace& ws, int strip) {
+  const int width = ws.camera.width, stride = ws.padded_width;
+  for (int y = strip * kTile; y < (strip + 1) * kTile; ++y) {
+    const int from = y < ws.camera.height ? width : 0;
+    for (int k = 0; k < 3; ++k) {
+      float* row = ws.image.data() + k * ws.plane + int64_t(y) * stride;
+      std::fill(row + from, row + stride, 0.0f);
+    }
+  }
+}
+
+bool any_tile(const uint16_t* blocks, int tiles_x) {
+  return std::any_of(blocks, blocks + tiles_x, [](uint16_t b) { return b != 0; });
+}
 
 }  // namespace
 
+// An inactive tile stays empty, and its pixels count as they are.
 void train_strip(Workspace& ws, const Training& training, int strip, int thread) {
+  const size_t first = size_t(strip) * size_t(ws.tiles_x);
+  std::fill_n(training.l1_sums + first, ws.tiles_x, 0.0);
+  if (!any_tile(training.targets.weighted_blocks + first, ws.tiles_x)) return;
   int count = 0;
   const DepthKey* keys = sort_strip(ws, strip, thread, count);
   bin_strip(ws, strip, keys, count);
   for (int x = 0; x < ws.tiles_x; ++x) {
+    const size_t t = first + size_t(x);
+    if (training.targets.weighted_blocks[t] != 0)
+      train_tile(ws, training, t, TilePosition(ws, x, strip), ws.scratch[size_t(thread)]);
+  }
+}
+
+void draw_on_tape(Workspace& ws, const Training& training, StripTape& tape, int strip, int thread) {
+  const size_t first = size_t(strip) * size_t(ws.tiles_x);
+  tape.rewind();
+  if (!any_tile(training.targets.reached_blocks + first, ws.tiles_x)) return;
+  int count = 0;
+  const DepthKey* keys = sort_strip(ws, strip, thread, count);
+  bin_strip(ws, strip, keys, count);
+  tape.tiles.reserve(size_t(ws.tiles_x));
+  for (int x = 0; x < ws.tiles_x; ++x) {
+    const size_t t = first + size_t(x);
+    if (training.targets.reached_blocks[t] == 0) continue;
+    const TilePosition tile(ws, x, strip);
+    BlockState state[kBlocks];
+    tape.tiles[size_t(x)] = draw(ws, tape, ws.tiles[t], tile, state);
+    for (int b = 0; b < kBlocks; ++b) store_pixels(ws, tile, b, state[b]);
+  }
+  ws.scratch[size_t(thread)].block_evaluations += tape.alpha_count;
+  clear_padding(ws, strip);
+}
+
+void walk_back_on_tape(Workspace& ws, const Training& training, const StripTape& tape, int strip) {
+  for (int x = 0; x < ws.tiles_x; ++x) {
     const size_t t = size_t(strip) * size_t(ws.tiles_x) + size_t(x);
-    training.loss_sums[t] = 0.0;
-    if (!training.targets.weighted_tiles[t]) continue;
-    // An inactive tile stays empty, and its pixels count as they are.
-    FusedTile tile(ws, ws.scratch[size_t(thread)], ws.tiles[t], TilePosition(ws, x, strip));
-    if (ws.active_tiles == nullptr || ws.active_tiles[t]) tile.draw();
-    training.loss_sums[t] = tile.compare(training);
-    tile.walk_back_all();
+    training.l1_sums[t] = 0.0;
+    if (training.targets.reached_blocks[t] == 0) continue;
+    const TilePosition tile(ws, x, strip);
+    TileColours by_ssim;
+    prefetch_rows(ws, &tape.records[tape.tiles[size_t(x)].first_record], chunk_size(tape.tiles[size_t(x)].entries, 0),
+                  tile);
+    const bool reached = ssim_gradient(ws, training.targets, tile, by_ssim);
+    TileGradient gradient;
+    Pack16 loss(0.0f);
+    for (int b = 0; b < kBlocks; ++b) {
+      Pack16 image[5], by[5];
+      load_pixels(ws, ws.image.data(), tile, b, image);
+      loss = loss + compare(ws, training, tile.block(ws, b), image, by);
+      const int corner = (b >> 2) * kBlock * kTile + (b & 3) * kBlock;
+      for (int k = 0; reached && k < 3; ++k) by[k] = by[k] + load_block(by_ssim.value[k] + corner, kTile);
+      gradient.start(b, by, image);
+    }
+    training.l1_sums[t] = double(sum(loss));
+    walk_back_tile(ws, tape, tape.tiles[size_t(x)], tile, gradient);
   }
 }
 

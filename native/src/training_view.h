@@ -1,5 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// A training image, prepared once: planar, padded to whole tiles, with the blurred target that SSIM needs.
+// A training image, prepared once: planar, padded to whole tiles, with the blurred target that SSIM needs,
+// and where its weights are.
 #pragma once
 
 #include <cstdint>
@@ -25,17 +26,20 @@ class TrainingView {
   struct Weights {
     int plane;
     double sum = 0.0;
-    Buffer<uint16_t> spans;
-    Buffer<uint8_t> tiles;
+    Buffer<uint16_t> weighted_blocks, reached_blocks;  // Targets
+    Buffer<float> squares;                             // SsimTargets
+    Buffer<uint8_t> reach;
   };
   void locate(Weights& weights) const;
+  void cut_squares(Weights& weights) const;
+  size_t squares() const { return size_t(tiles_y_ + 1) * size_t(tiles_x_); }
   const Weights& weights(bool masked) const { return masked && masked_ ? mask_ : inside_; }
 
-  int width_, height_, padded_width_;
+  int width_, height_, tiles_x_, tiles_y_, padded_width_;
   int64_t plane_;
   bool masked_;
-  Buffer<float>
-      planes_;  // r g b, depth, inside (1 in the image, 0 in the padding), mask, three means, three mean squares
+  Buffer<float> planes_;  // r g b, depth, inside (1 in the image, 0 in the padding), mask
+  Buffer<float> moments_;
   Weights inside_, mask_;
 };
 

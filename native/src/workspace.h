@@ -50,6 +50,8 @@ struct TileList {
   uint32_t used[kBlocks];  // entries of each block's list that were composited before all of its pixels were finished
 };
 
+constexpr int kSquare = kTile * kTile;
+constexpr int kSsimMaps = 3;  // what SSIM blurs: x, xx, xy on the way forward, their derivatives on the way back
 constexpr int kChunk = 64;  // splats of a tile that are handled at a time: their records stay in the first-level cache
 constexpr int kPrefetchAhead = 24;  // keys
 constexpr int kSegment = 4096;      // parameter rows that are projected as a unit, always by the same thread
@@ -60,13 +62,30 @@ struct BlockLists {
   uint16_t count[kBlocks];
 };
 
+// What a drawn tile leaves for its way back.
+struct TileTape {
+  size_t first_record, first_list, first_alpha;
+  uint32_t entries;  // of its list, drawn before all pixels were finished
+};
+
+// A strip between its two directions: its tiles' splats, block lists and alphas, in the order in which they are walked.
+// An alpha pack is 64 bytes for each block that a splat touches, some megabytes a strip: it lives in the third-level
+// cache, and is read back faster than it would be computed again.
+struct StripTape {
+  Buffer<TileTape> tiles;
+  Buffer<Splat> records;
+  Buffer<BlockLists> lists;
+  Buffer<float> alphas;
+  size_t record_count = 0, list_count = 0, alpha_count = 0;
+
+  void rewind() { record_count = list_count = alpha_count = 0; }
+};
+
 struct ThreadScratch {
   std::vector<KeyList> strips;  // by tile row: the splats of this thread's segments that touch it
   Buffer<DepthKey> sorted[2];
-  Buffer<Splat> records;  // the fused pass: a tile's splats, block lists and alphas between its two directions
-  Buffer<BlockLists> lists;
-  Buffer<float> alphas;
-  Buffer<float> ssim;                   // row buffers of the SSIM loss
+  StripTape tape;                       // of one tile, where a loss looks at each pixel alone
+  Buffer<float> ssim;                   // columns of the SSIM loss
   uint32_t next_row = 0, last_row = 0;  // the block of gradient rows this thread is handing out
   uint64_t block_evaluations = 0;       // block list entries that it composited in this frame
 };
@@ -91,9 +110,13 @@ struct Workspace {
   Buffer<uint32_t> segment_keys;  // [segment][tile row]: end of the segment's keys in its thread's list
   uint32_t segments = 0;
 
-  // Raster. image: red, green, blue, depth, transmittance; image_gradient: by red, green, blue, depth, alpha.
+  // Raster. Lists hold the wanted blocks of a tile only: those of the active tiles that the loss depends on.
+  Buffer<uint16_t> wanted_blocks;
+  // image: red, green, blue, depth, transmittance; image_gradient: by red, green, blue, depth, alpha.
   std::vector<TileList> tiles;
   Buffer<float> image, image_gradient;
+  Buffer<float> ssim_squares;    // derivatives of SSIM, blurred along the rows; see ssim_square
+  std::vector<StripTape> tapes;  // strips that are drawn and not yet walked back
   // Gradient rows are owned by one (splat, tile row) pair each, so that no two threads add to the same one and the sum
   // over a splat's rows has a fixed order: results do not depend on the number of threads. `tag` marks the rows written
   // in this pass; stale ones count as zero and are never cleared.
@@ -103,6 +126,12 @@ struct Workspace {
 
   std::vector<ThreadScratch> scratch;
   std::atomic<int> ticket{0};  // dynamic scheduling of tile rows; reset between stages
+
+  // Row k, column x of the squares that the SSIM loss is formed in (loss_ssim.cpp): 16 rows of 16 floats.
+  float* ssim_square(int k, int x, int channel, int map) {
+    return ssim_squares.data() +
+           (((size_t(k) * size_t(tiles_x) + size_t(x)) * 3 + size_t(channel)) * kSsimMaps + size_t(map)) * kSquare;
+  }
 };
 
 }  // namespace gausslite

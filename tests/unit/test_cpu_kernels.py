@@ -79,12 +79,46 @@ def test_gradients_have_the_same_bits_for_any_number_of_threads(threads: int) ->
     np.testing.assert_array_equal(team.visible, alone.visible)
 
 
+@pytest.mark.parametrize("simd", kernels.usable_simd())
 @pytest.mark.parametrize("masked", [False, True])
 @pytest.mark.parametrize("loss", [L1_ONLY, WITH_SSIM])
-def test_training_has_the_same_bits_for_any_number_of_threads(loss: LossWeights, masked: bool) -> None:
-    alone, team = train(CpuRasterizer(1), loss, masked=masked), train(CpuRasterizer(3), loss, masked=masked)
-    for a, b in zip(team, alone, strict=True):
-        np.testing.assert_array_equal(a, b)
+def test_training_has_the_same_bits_for_any_number_of_threads(loss: LossWeights, masked: bool, simd: str) -> None:
+    alone = train(CpuRasterizer(1, simd), loss, masked=masked)
+    for threads in (2, 3):
+        for a, b in zip(train(CpuRasterizer(threads, simd), loss, masked=masked), alone, strict=True):
+            np.testing.assert_array_equal(a, b)
+
+
+def test_weights_that_are_one_everywhere_train_like_no_mask() -> None:
+    """And a hair less in one corner takes the other way through the kernels, for a hair's difference."""
+    results = []
+    for corner in (None, 1.0):
+        rasterizer = CpuRasterizer(2)
+        weight = None if corner is None else np.full((CAMERA.height_px, CAMERA.width_px), corner, np.float32)
+        rgb = np.random.default_rng(3).integers(0, 256, (CAMERA.height_px, CAMERA.width_px, 3), np.uint8)
+        view = rasterizer.prepare_view(rgb, np.full(rgb.shape[:2], 2.0, np.float32), CAMERA, weight)
+        rows = random_rows()
+        moments = np.zeros_like(rows), np.zeros_like(rows)
+        report = rasterizer.step(rows, *moments, view, np.eye(4), WITH_SSIM, AdamSettings(), masked=corner is not None)
+        results.append((report.loss, rows))
+    assert results[0][0] == results[1][0]
+    np.testing.assert_array_equal(results[0][1], results[1][1])
+
+
+def test_a_view_without_any_weight_changes_no_gaussian_and_costs_nothing() -> None:
+    rasterizer = CpuRasterizer(2)
+    size = (CAMERA.height_px, CAMERA.width_px)
+    view = rasterizer.prepare_view(
+        np.zeros((*size, 3), np.uint8), np.ones(size, np.float32), CAMERA, np.zeros(size, np.float32)
+    )
+    rows = random_rows()
+    before = rows.copy()
+    moments = np.zeros_like(rows), np.zeros_like(rows)
+    for loss in (L1_ONLY, WITH_SSIM):
+        report = rasterizer.step(rows, *moments, view, np.eye(4), loss, AdamSettings(), masked=True)
+        assert report.loss == 0.0
+        assert rasterizer.block_evaluations() == 0
+    np.testing.assert_array_equal(rows[:, :14], before[:, :14])
 
 
 def test_a_backward_can_be_repeated() -> None:

@@ -1,0 +1,41 @@
+// SPDX-License-Identifier: Apache-2.0
+// Which part of a training step with SSIM can be done next. A strip is drawn; rows k of the SSIM squares can be derived
+// once the strips k - 1 and k are drawn; a strip is walked back once rows k and k + 1 of the squares are derived. No
+// part's result depends on who does it or when.
+#pragma once
+
+#include <atomic>
+#include <cstdint>
+#include <mutex>
+#include <vector>
+
+namespace gausslite {
+
+struct StripTask {
+  enum Kind { kDraw, kDerive, kWalkBack, kNone };
+  Kind kind = kNone;
+  int index = 0;  // of the strip, or of the row of squares
+  int tape = 0;   // where the strip's tape is: one of the tapes that `start` was told of
+};
+
+// Strips are drawn from the top down, and walked back as soon as it can be: so that few tapes wait, and those shortly.
+// With at least two tapes there is always something that can be done.
+class StripSchedule {
+ public:
+  void start(int strips, int tapes);
+  // Waits for a task; kNone when all are taken.
+  StripTask next();
+  void finish(const StripTask& task);
+
+ private:
+  bool take(StripTask& task);
+
+  std::mutex mutex_;
+  int strips_ = 0, next_draw_ = 0, walks_taken_ = 0;
+  std::vector<int> free_tapes_, tape_of_strip_;
+  std::vector<int> derive_waits_, walk_waits_;  // parts that are still missing
+  std::vector<int> derivable_, walkable_;
+  std::atomic<uint32_t> changes_{0};
+};
+
+}  // namespace gausslite
