@@ -11,21 +11,28 @@ struct Form {
   const Stages& (*stages)();
 };
 
-#if defined(GAUSSLITE_X86_FORMS)
+#if defined(GAUSSLITE_HAS_AVX2)
 bool has_avx2() { return __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma"); }
+#endif
 
+#if defined(GAUSSLITE_HAS_AVX512)
 // VBMI2 (Ice Lake and Zen 4 onwards) brings the byte compression that builds the block lists.
 bool has_avx512() {
-  return has_avx2() && __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") &&
-         __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("avx512vl") &&
-         __builtin_cpu_supports("avx512vbmi2");
+  return __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma") && __builtin_cpu_supports("avx512f") &&
+         __builtin_cpu_supports("avx512bw") && __builtin_cpu_supports("avx512dq") &&
+         __builtin_cpu_supports("avx512vl") && __builtin_cpu_supports("avx512vbmi2");
 }
 #endif
 
 constexpr Form kForms[] = {
-#if defined(GAUSSLITE_X86_FORMS)
+#if defined(GAUSSLITE_HAS_AVX512)
     {"avx512", has_avx512, avx512::stages},
+#endif
+#if defined(GAUSSLITE_HAS_AVX2)
     {"avx2", has_avx2, avx2::stages},
+#endif
+#if defined(GAUSSLITE_HAS_NEON)
+    {"neon", [] { return true; }, neon::stages},
 #endif
     {"portable", [] { return true; }, portable::stages},
 };

@@ -86,16 +86,18 @@ struct Stages {
   size_t (*ssim_scratch_floats)(int tiles_x);
 };
 
+// The forms; dispatch.cpp refers to those that this build has.
 namespace portable {
 const Stages& stages();
 }
-#if defined(GAUSSLITE_X86_FORMS)
 namespace avx2 {
 const Stages& stages();
 }
 namespace avx512 {
 const Stages& stages();
 }
-#endif
+namespace neon {
+const Stages& stages();
+}
 
 }  // namespace gausslite

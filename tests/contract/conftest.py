@@ -30,6 +30,7 @@ BACKENDS: dict[str, Callable[[], Rasterizer]] = {
     "reference": _reference,
     "cpu avx512": lambda: _cpu("avx512"),
     "cpu avx2": lambda: _cpu("avx2"),
+    "cpu neon": lambda: _cpu("neon"),
     "cpu portable": lambda: _cpu("portable"),
 }
 

@@ -15,6 +15,8 @@
 #include "simd/pack_avx512.h"
 #elif defined(GAUSSLITE_USE_AVX2)
 #include "simd/pack_avx2.h"
+#elif defined(GAUSSLITE_USE_NEON)
+#include "simd/pack_neon.h"
 #else
 #include "simd/pack_portable.h"
 #endif
@@ -68,8 +70,6 @@ GAUSSLITE_INLINE void transpose(Pack16 (&r)[16]) {
   for (int i = 0; i < 16; i += 4) transpose_quads(r[i], r[i + 1], r[i + 2], r[i + 3]);
   for (int i = 0; i < 4; ++i) transpose_groups(r[i], r[i + 4], r[i + 8], r[i + 12]);
 }
-
-GAUSSLITE_INLINE bool any(Mask16 m) { return bits(m) != 0; }
 
 GAUSSLITE_INLINE void prefetch(const void* p) { __builtin_prefetch(p, 0, 3); }
 

@@ -19,6 +19,7 @@ GAUSSLITE_INLINE Mask16 operator|(Mask16 a, Mask16 b) { return {_mm256_or_ps(a.l
 GAUSSLITE_INLINE uint32_t bits(Mask16 m) {
   return uint32_t(_mm256_movemask_ps(m.lo)) | uint32_t(_mm256_movemask_ps(m.hi)) << 8;
 }
+GAUSSLITE_INLINE bool any(Mask16 m) { return _mm256_movemask_ps(_mm256_or_ps(m.lo, m.hi)) != 0; }
 GAUSSLITE_INLINE Mask16 first_lanes(int n) {
   const __m256i count = _mm256_set1_epi32(n);
   return {_mm256_castsi256_ps(_mm256_cmpgt_epi32(count, _mm256_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7))),

@@ -18,6 +18,7 @@ struct Mask16 {
 GAUSSLITE_INLINE Mask16 operator&(Mask16 a, Mask16 b) { return {__mmask16(a.v & b.v)}; }
 GAUSSLITE_INLINE Mask16 operator|(Mask16 a, Mask16 b) { return {__mmask16(a.v | b.v)}; }
 GAUSSLITE_INLINE uint32_t bits(Mask16 m) { return m.v; }
+GAUSSLITE_INLINE bool any(Mask16 m) { return m.v != 0; }
 GAUSSLITE_INLINE Mask16 first_lanes(int n) { return {__mmask16((1u << n) - 1u)}; }
 
 struct Pack16 {

@@ -52,6 +52,10 @@ GAUSSLITE_INLINE uint32_t bits(Mask16 m) {
   for (int i = 0; i < 16; ++i) out |= uint32_t(m.q[i / 4][i % 4] & 1) << i;
   return out;
 }
+GAUSSLITE_INLINE bool any(Mask16 m) {
+  const QuadInt quads = (m.q[0] | m.q[1]) | (m.q[2] | m.q[3]);
+  return (quads[0] | quads[1] | quads[2] | quads[3]) != 0;
+}
 GAUSSLITE_INLINE Mask16 first_lanes(int n) {
   Mask16 m;
   for (int i = 0; i < 16; ++i) m.q[i / 4][i % 4] = i < n ? -1 : 0;
@@ -165,18 +169,21 @@ GAUSSLITE_INLINE float sum(Pack16 a) {
 // In each group of four lanes, copy lane kLane to all four.
 template <int kLane>
 GAUSSLITE_INLINE Pack16 spread_in_quads(Pack16 a) {
-  GAUSSLITE_EACH a.q[i] = quad(a.q[i][kLane]);
+  GAUSSLITE_EACH a.q[i] = __builtin_shufflevector(a.q[i], a.q[i], kLane, kLane, kLane, kLane);
   return a;
 }
 
 // In each group of four lanes, the 4x4 transpose of a, b, c, d.
 GAUSSLITE_INLINE void transpose_quads(Pack16& a, Pack16& b, Pack16& c, Pack16& d) {
   GAUSSLITE_EACH {
-    const Quad p = a.q[i], q = b.q[i], r = c.q[i], s = d.q[i];
-    a.q[i] = Quad{p[0], q[0], r[0], s[0]};
-    b.q[i] = Quad{p[1], q[1], r[1], s[1]};
-    c.q[i] = Quad{p[2], q[2], r[2], s[2]};
-    d.q[i] = Quad{p[3], q[3], r[3], s[3]};
+    const Quad ac_lo = __builtin_shufflevector(a.q[i], c.q[i], 0, 4, 1, 5);
+    const Quad ac_hi = __builtin_shufflevector(a.q[i], c.q[i], 2, 6, 3, 7);
+    const Quad bd_lo = __builtin_shufflevector(b.q[i], d.q[i], 0, 4, 1, 5);
+    const Quad bd_hi = __builtin_shufflevector(b.q[i], d.q[i], 2, 6, 3, 7);
+    a.q[i] = __builtin_shufflevector(ac_lo, bd_lo, 0, 4, 1, 5);
+    b.q[i] = __builtin_shufflevector(ac_lo, bd_lo, 2, 6, 3, 7);
+    c.q[i] = __builtin_shufflevector(ac_hi, bd_hi, 0, 4, 1, 5);
+    d.q[i] = __builtin_shufflevector(ac_hi, bd_hi, 2, 6, 3, 7);
   }
 }
 
@@ -231,8 +238,7 @@ GAUSSLITE_INLINE Pack8 keep_if(bool yes, Pack8 a) { return yes ? a : Pack8(0.0f)
 // Lane k of the result is the lane of x that the k-th argument names.
 template <int a, int b, int c, int d, int e, int f, int g, int h>
 GAUSSLITE_INLINE Pack8 permute(Pack8 x) {
-  const auto lane = [&x](int i) { return i < 4 ? x.lo[i & 3] : x.hi[i & 3]; };
-  return {Quad{lane(a), lane(b), lane(c), lane(d)}, Quad{lane(e), lane(f), lane(g), lane(h)}};
+  return {__builtin_shufflevector(x.lo, x.hi, a, b, c, d), __builtin_shufflevector(x.lo, x.hi, e, f, g, h)};
 }
 
 // The sum of the four groups of four in lanes 0-3; lanes 4-7 are 0.

@@ -61,8 +61,8 @@ class _Drawn:
 class CpuRasterizer:
     """C++ kernels with a persistent team of threads; results do not depend on the number of threads.
 
-    threads: by default one per core this process may use. simd: `avx512`, `avx2` or `portable`; by default the
-    environment variable GAUSSLITE_SIMD, and without it the fastest this machine runs. Raises KernelError when the
+    threads: by default one per core this process may use. simd: `avx512`, `avx2`, `neon` or `portable`; by default
+    the environment variable GAUSSLITE_SIMD, and without it the fastest this machine runs. Raises KernelError when the
     kernels are not built or the choice is impossible. Threads do not survive a fork: build it in the child.
     """
 

@@ -1,0 +1,219 @@
+// SPDX-License-Identifier: Apache-2.0
+// Sixteen floats in four NEON registers (AArch64, where every processor has them). pack_portable.h documents the
+// functions.
+#pragma once
+
+#include <arm_neon.h>
+
+#include <cstdint>
+
+namespace gausslite::GAUSSLITE_ISA {
+
+struct Mask16 {
+  uint32x4_t q[4];
+};
+
+struct Pack16 {
+  float32x4_t q[4];
+  Pack16() = default;
+  GAUSSLITE_INLINE Pack16(float32x4_t a, float32x4_t b, float32x4_t c, float32x4_t d) : q{a, b, c, d} {}
+  GAUSSLITE_INLINE Pack16(float x) : Pack16(vdupq_n_f32(x), vdupq_n_f32(x), vdupq_n_f32(x), vdupq_n_f32(x)) {}
+};
+
+#define GAUSSLITE_UNARY(name, op) \
+  GAUSSLITE_INLINE Pack16 name(Pack16 a) { return {op(a.q[0]), op(a.q[1]), op(a.q[2]), op(a.q[3])}; }
+#define GAUSSLITE_LANEWISE(name, op)                                                         \
+  GAUSSLITE_INLINE Pack16 name(Pack16 a, Pack16 b) {                                         \
+    return {op(a.q[0], b.q[0]), op(a.q[1], b.q[1]), op(a.q[2], b.q[2]), op(a.q[3], b.q[3])}; \
+  }
+#define GAUSSLITE_MASKWISE(name, op)                                                           \
+  GAUSSLITE_INLINE Mask16 name(Mask16 a, Mask16 b) {                                           \
+    return {{op(a.q[0], b.q[0]), op(a.q[1], b.q[1]), op(a.q[2], b.q[2]), op(a.q[3], b.q[3])}}; \
+  }
+#define GAUSSLITE_COMPARISON(name, op)                                                         \
+  GAUSSLITE_INLINE Mask16 name(Pack16 a, Pack16 b) {                                           \
+    return {{op(a.q[0], b.q[0]), op(a.q[1], b.q[1]), op(a.q[2], b.q[2]), op(a.q[3], b.q[3])}}; \
+  }
+
+GAUSSLITE_MASKWISE(operator&, vandq_u32)
+GAUSSLITE_MASKWISE(operator|, vorrq_u32)
+
+// There is no movemask: the lanes are narrowed to bytes, each keeps its own bit, and the bytes of each half are added.
+GAUSSLITE_INLINE uint32_t bits(Mask16 m) {
+  const uint16x8_t lo = vuzp1q_u16(vreinterpretq_u16_u32(m.q[0]), vreinterpretq_u16_u32(m.q[1]));
+  const uint16x8_t hi = vuzp1q_u16(vreinterpretq_u16_u32(m.q[2]), vreinterpretq_u16_u32(m.q[3]));
+  const uint8x16_t lanes = vuzp1q_u8(vreinterpretq_u8_u16(lo), vreinterpretq_u8_u16(hi));
+  const uint8x16_t own = vandq_u8(lanes, vreinterpretq_u8_u64(vdupq_n_u64(0x8040201008040201u)));
+  return uint32_t(vaddv_u8(vget_low_u8(own))) | uint32_t(vaddv_u8(vget_high_u8(own))) << 8;
+}
+GAUSSLITE_INLINE bool any(Mask16 m) {
+  return vmaxvq_u32(vorrq_u32(vorrq_u32(m.q[0], m.q[1]), vorrq_u32(m.q[2], m.q[3]))) != 0;
+}
+GAUSSLITE_INLINE uint32x4_t lanes_below(int n, int first) {
+  const int32x4_t lanes{first, first + 1, first + 2, first + 3};
+  return vcltq_s32(lanes, vdupq_n_s32(n));
+}
+GAUSSLITE_INLINE Mask16 first_lanes(int n) {
+  return {{lanes_below(n, 0), lanes_below(n, 4), lanes_below(n, 8), lanes_below(n, 12)}};
+}
+
+GAUSSLITE_INLINE Pack16 load(const float* p) {
+  return {vld1q_f32(p), vld1q_f32(p + 4), vld1q_f32(p + 8), vld1q_f32(p + 12)};
+}
+GAUSSLITE_INLINE void store(float* p, Pack16 a) {
+  for (int i = 0; i < 4; ++i) vst1q_f32(p + 4 * i, a.q[i]);
+}
+GAUSSLITE_INLINE void store_int(int32_t* p, Pack16 a) {
+  for (int i = 0; i < 4; ++i) vst1q_s32(p + 4 * i, vcvtq_s32_f32(a.q[i]));
+}
+
+// Not vmin and vmax, which let a NaN through: here b comes out, as in the other forms, so that a clamp gives its bound.
+GAUSSLITE_INLINE float32x4_t lesser(float32x4_t a, float32x4_t b) { return vbslq_f32(vcltq_f32(a, b), a, b); }
+GAUSSLITE_INLINE float32x4_t greater(float32x4_t a, float32x4_t b) { return vbslq_f32(vcgtq_f32(a, b), a, b); }
+
+GAUSSLITE_LANEWISE(operator+, vaddq_f32)
+GAUSSLITE_LANEWISE(operator-, vsubq_f32)
+GAUSSLITE_LANEWISE(operator*, vmulq_f32)
+GAUSSLITE_LANEWISE(operator/, vdivq_f32)
+GAUSSLITE_LANEWISE(min, lesser)
+GAUSSLITE_LANEWISE(max, greater)
+GAUSSLITE_UNARY(operator-, vnegq_f32)
+GAUSSLITE_UNARY(abs, vabsq_f32)
+GAUSSLITE_UNARY(sqrt, vsqrtq_f32)
+GAUSSLITE_UNARY(floor, vrndmq_f32)
+GAUSSLITE_UNARY(ceil, vrndpq_f32)
+
+GAUSSLITE_INLINE Pack16 fma(Pack16 a, Pack16 b, Pack16 c) {
+  return {vfmaq_f32(c.q[0], a.q[0], b.q[0]), vfmaq_f32(c.q[1], a.q[1], b.q[1]), vfmaq_f32(c.q[2], a.q[2], b.q[2]),
+          vfmaq_f32(c.q[3], a.q[3], b.q[3])};
+}
+GAUSSLITE_INLINE Pack16 fnma(Pack16 a, Pack16 b, Pack16 c) {
+  return {vfmsq_f32(c.q[0], a.q[0], b.q[0]), vfmsq_f32(c.q[1], a.q[1], b.q[1]), vfmsq_f32(c.q[2], a.q[2], b.q[2]),
+          vfmsq_f32(c.q[3], a.q[3], b.q[3])};
+}
+
+// The estimates have 8 bits; one Newton step brings them to 15 and more.
+GAUSSLITE_INLINE float32x4_t reciprocal_of(float32x4_t a) {
+  const float32x4_t r = vrecpeq_f32(a);
+  return vmulq_f32(r, vrecpsq_f32(a, r));
+}
+GAUSSLITE_INLINE float32x4_t inverse_sqrt_of(float32x4_t a) {
+  const float32x4_t r = vrsqrteq_f32(a);
+  return vmulq_f32(r, vrsqrtsq_f32(vmulq_f32(a, r), r));
+}
+GAUSSLITE_UNARY(rough_reciprocal, reciprocal_of)
+GAUSSLITE_UNARY(rough_inverse_sqrt, inverse_sqrt_of)
+
+GAUSSLITE_COMPARISON(operator<, vcltq_f32)
+GAUSSLITE_COMPARISON(operator<=, vcleq_f32)
+GAUSSLITE_COMPARISON(operator>, vcgtq_f32)
+GAUSSLITE_COMPARISON(operator>=, vcgeq_f32)
+GAUSSLITE_COMPARISON(operator==, vceqq_f32)
+
+GAUSSLITE_INLINE Pack16 select(Mask16 m, Pack16 yes, Pack16 no) {
+  return {vbslq_f32(m.q[0], yes.q[0], no.q[0]), vbslq_f32(m.q[1], yes.q[1], no.q[1]),
+          vbslq_f32(m.q[2], yes.q[2], no.q[2]), vbslq_f32(m.q[3], yes.q[3], no.q[3])};
+}
+GAUSSLITE_INLINE Pack16 keep(Mask16 m, Pack16 a) { return select(m, a, Pack16(0.0f)); }
+
+// Adds floor(e) to the float's exponent field; e below -126 gives about 2^-126, above 127 about 2^127.
+GAUSSLITE_INLINE float32x4_t scaled_by_power(float32x4_t a, float32x4_t e) {
+  const float32x4_t bounded = lesser(greater(e, vdupq_n_f32(-126.0f)), vdupq_n_f32(127.0f));
+  const int32x4_t whole = vshlq_n_s32(vcvtmq_s32_f32(bounded), 23);
+  return vreinterpretq_f32_s32(vaddq_s32(vreinterpretq_s32_f32(a), whole));
+}
+GAUSSLITE_INLINE float32x4_t exponent_of(float32x4_t a) {
+  return vcvtq_f32_s32(vsubq_s32(vshrq_n_s32(vreinterpretq_s32_f32(a), 23), vdupq_n_s32(127)));
+}
+GAUSSLITE_INLINE float32x4_t mantissa_of(float32x4_t a) {
+  const uint32x4_t digits = vandq_u32(vreinterpretq_u32_f32(a), vdupq_n_u32(0x007FFFFF));
+  return vreinterpretq_f32_u32(vorrq_u32(digits, vdupq_n_u32(0x3F800000)));
+}
+GAUSSLITE_INLINE Pack16 fraction(Pack16 e) { return e - floor(e); }
+GAUSSLITE_LANEWISE(scale_by_power, scaled_by_power)
+GAUSSLITE_UNARY(exponent, exponent_of)
+GAUSSLITE_UNARY(mantissa, mantissa_of)
+
+#undef GAUSSLITE_UNARY
+#undef GAUSSLITE_LANEWISE
+#undef GAUSSLITE_MASKWISE
+#undef GAUSSLITE_COMPARISON
+
+GAUSSLITE_INLINE float32x4_t added_quads(Pack16 a) {
+  return vaddq_f32(vaddq_f32(a.q[0], a.q[2]), vaddq_f32(a.q[1], a.q[3]));
+}
+GAUSSLITE_INLINE float sum(Pack16 a) { return vaddvq_f32(added_quads(a)); }
+
+template <int kLane>
+GAUSSLITE_INLINE Pack16 spread_in_quads(Pack16 a) {
+  return {vdupq_laneq_f32(a.q[0], kLane), vdupq_laneq_f32(a.q[1], kLane), vdupq_laneq_f32(a.q[2], kLane),
+          vdupq_laneq_f32(a.q[3], kLane)};
+}
+
+GAUSSLITE_INLINE void transpose_quad(float32x4_t& a, float32x4_t& b, float32x4_t& c, float32x4_t& d) {
+  const float32x4_t ac_lo = vzip1q_f32(a, c), ac_hi = vzip2q_f32(a, c);
+  const float32x4_t bd_lo = vzip1q_f32(b, d), bd_hi = vzip2q_f32(b, d);
+  a = vzip1q_f32(ac_lo, bd_lo);
+  b = vzip2q_f32(ac_lo, bd_lo);
+  c = vzip1q_f32(ac_hi, bd_hi);
+  d = vzip2q_f32(ac_hi, bd_hi);
+}
+GAUSSLITE_INLINE void transpose_quads(Pack16& a, Pack16& b, Pack16& c, Pack16& d) {
+  for (int i = 0; i < 4; ++i) transpose_quad(a.q[i], b.q[i], c.q[i], d.q[i]);
+}
+
+GAUSSLITE_INLINE void transpose_groups(Pack16& a, Pack16& b, Pack16& c, Pack16& d) {
+  const Pack16 p = a, q = b, r = c, s = d;
+  a = {p.q[0], q.q[0], r.q[0], s.q[0]};
+  b = {p.q[1], q.q[1], r.q[1], s.q[1]};
+  c = {p.q[2], q.q[2], r.q[2], s.q[2]};
+  d = {p.q[3], q.q[3], r.q[3], s.q[3]};
+}
+
+GAUSSLITE_INLINE Pack16 load_block(const float* p, int64_t stride) {
+  return {vld1q_f32(p), vld1q_f32(p + stride), vld1q_f32(p + 2 * stride), vld1q_f32(p + 3 * stride)};
+}
+GAUSSLITE_INLINE void store_block(float* p, int64_t stride, Pack16 a) {
+  for (int i = 0; i < 4; ++i) vst1q_f32(p + i * stride, a.q[i]);
+}
+
+struct Pack8 {
+  float32x4_t lo, hi;
+  Pack8() = default;
+  GAUSSLITE_INLINE Pack8(float32x4_t a, float32x4_t b) : lo(a), hi(b) {}
+  GAUSSLITE_INLINE Pack8(float x) : lo(vdupq_n_f32(x)), hi(lo) {}
+};
+
+GAUSSLITE_INLINE Pack8 load8(const float* p) { return {vld1q_f32(p), vld1q_f32(p + 4)}; }
+GAUSSLITE_INLINE void store8(float* p, Pack8 a) {
+  vst1q_f32(p, a.lo);
+  vst1q_f32(p + 4, a.hi);
+}
+GAUSSLITE_INLINE Pack8 broadcast_pair(const float* p) {
+  const float32x2_t pair = vld1_f32(p);
+  return {vcombine_f32(pair, pair), vcombine_f32(pair, pair)};
+}
+GAUSSLITE_INLINE Pack8 operator+(Pack8 a, Pack8 b) { return {vaddq_f32(a.lo, b.lo), vaddq_f32(a.hi, b.hi)}; }
+GAUSSLITE_INLINE Pack8 operator-(Pack8 a, Pack8 b) { return {vsubq_f32(a.lo, b.lo), vsubq_f32(a.hi, b.hi)}; }
+GAUSSLITE_INLINE Pack8 operator*(Pack8 a, Pack8 b) { return {vmulq_f32(a.lo, b.lo), vmulq_f32(a.hi, b.hi)}; }
+GAUSSLITE_INLINE Pack8 fnma(Pack8 a, Pack8 b, Pack8 c) {
+  return {vfmsq_f32(c.lo, a.lo, b.lo), vfmsq_f32(c.hi, a.hi, b.hi)};
+}
+GAUSSLITE_INLINE Pack8 keep_if(bool yes, Pack8 a) {
+  const uint32x4_t mask = vdupq_n_u32(yes ? ~0u : 0u);
+  return {vbslq_f32(mask, a.lo, vdupq_n_f32(0.0f)), vbslq_f32(mask, a.hi, vdupq_n_f32(0.0f))};
+}
+
+// Two table look-ups in the 32 bytes of x.
+template <int a, int b, int c, int d, int e, int f, int g, int h>
+GAUSSLITE_INLINE Pack8 permute(Pack8 x) {
+  return {__builtin_shufflevector(x.lo, x.hi, a, b, c, d), __builtin_shufflevector(x.lo, x.hi, e, f, g, h)};
+}
+
+GAUSSLITE_INLINE Pack8 sum_of_quads(Pack16 a) { return {added_quads(a), vdupq_n_f32(0.0f)}; }
+
+GAUSSLITE_INLINE void pair_groups(Pack16 a, Pack16 b, Pack8 (&out)[4]) {
+  for (int k = 0; k < 4; ++k) out[k] = {a.q[k], b.q[k]};
+}
+
+}  // namespace gausslite::GAUSSLITE_ISA
