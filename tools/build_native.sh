@@ -5,6 +5,6 @@ root=$(cd "$(dirname "$0")/.." && pwd)
 python=${1:-python3}
 cmake -S "$root/native" -B "$root/build/dev" -DPython_EXECUTABLE="$("$python" -c 'import sys; print(sys.executable)')" \
   -Dnanobind_DIR="$("$python" -m nanobind --cmake_dir)" >/dev/null
-cmake --build "$root/build/dev" --parallel
+cmake --build "$root/build/dev" --parallel "$(nproc)"
 rm -f "$root"/src/gausslite/render/_kernels*.so
 cp "$root"/build/dev/_kernels*.so "$root/src/gausslite/render/"

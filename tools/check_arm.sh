@@ -35,7 +35,7 @@ cmake -S "$root/native" -B "$folder/build" -DCMAKE_SYSTEM_NAME=Linux -DCMAKE_SYS
   -DCMAKE_CXX_COMPILER=aarch64-linux-gnu-g++ -DCMAKE_CXX_FLAGS="-idirafter $sysroot/usr/include" \
   -DPython_EXECUTABLE="$(command -v "$python")" -DPython_INCLUDE_DIR="$sysroot/usr/include/python3.11" -DNB_SUFFIX=.so -DNB_SUFFIX_S=.so \
   -Dnanobind_DIR="$("$python" -m nanobind --cmake_dir)" >/dev/null
-cmake --build "$folder/build" --parallel >/dev/null
+cmake --build "$folder/build" --parallel "$(nproc)" >/dev/null
 rm -rf "$folder/sources"
 mkdir "$folder/sources"
 cp -r "$root/src/gausslite" "$folder/sources/"

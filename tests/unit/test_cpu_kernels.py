@@ -166,6 +166,31 @@ def test_an_exact_subset_of_tiles_trains_like_the_whole_image_under_its_mask() -
     np.testing.assert_allclose(part_rows[part.visible], whole_rows[part.visible], rtol=1e-3, atol=1e-4)
 
 
+@pytest.mark.parametrize("loss", [L1_ONLY, WITH_SSIM])
+@pytest.mark.parametrize("simd", kernels.usable_simd())
+def test_hostile_rows_spoil_no_other_row_and_no_pixel(simd: str, loss: LossWeights) -> None:
+    """Numbers that are none and numbers far too large, in each column, under a mask, some tiles and some ids."""
+    rows = random_rows(1200)
+    rng = np.random.default_rng(5)
+    hostile = np.arange(0, 700, 5)
+    extremes = np.array([np.nan, np.inf, -np.inf, 3e38, -3e38, 1e-45, 90.0], np.float32)
+    rows[hostile, rng.integers(0, 14, len(hostile))] = rng.choice(extremes, len(hostile))
+    camera = Camera(41.0, 43.0, 20.2, 30.1, 45, 67)
+    rasterizer = CpuRasterizer(3, simd)
+    view = view_of(rasterizer, camera, masked=True)
+    tiles = np.ones((5, 3), np.bool_)
+    tiles[1, 1:] = False
+    healthy = np.setdiff1d(np.arange(len(rows)), hostile)
+    for subset in (Subset(), Subset(tiles=tiles), Subset(ids=np.arange(3, 1200, 2, dtype=np.uint32))):
+        drawn = rasterizer.forward(rows, camera, np.eye(4), subset)
+        images = (drawn.rgb, drawn.depth_m, drawn.alpha)
+        assert all(np.isfinite(image).all() for image in images)
+        assert np.isfinite(rasterizer.backward(drawn, *images).d_rows[healthy]).all()
+        table, first, second = rows.copy(), np.zeros_like(rows), np.zeros_like(rows)
+        rasterizer.step(table, first, second, view, np.eye(4), loss, AdamSettings(), True, subset)
+        assert all(np.isfinite(changed[healthy]).all() for changed in (table, first, second))
+
+
 def test_measurements_that_are_not_positive_numbers_are_not_compared() -> None:
     rasterizer = CpuRasterizer(1)
     size = (CAMERA.height_px, CAMERA.width_px)
