@@ -21,7 +21,7 @@ class FrameOutcome:
 
     budget says how its time was spent, from the image to the words; skipped says why the frame was not mapped, None
     when it was; words are what changed in the task's region, None without a ledger, when the frame was skipped, and
-    when they wait for the next one.
+    when they wait for the next one. detection_lag_frames is the age of a detection that came with this frame.
     """
 
     index: int
@@ -31,6 +31,7 @@ class FrameOutcome:
     budget: FrameBudget
     skipped: str | None
     words: VoxelWords | None
+    detection_lag_frames: int | None
 
 
 class TaskMapper:
@@ -63,6 +64,7 @@ class TaskMapper:
         self._pace.begin()
         sight = self._look(frame)
         relevance = self._attend(frame, sight)
+        lag_frames = self._catch_up()
         mapped = self._mapper.map_frame(frame, relevance, self._pace, sight)
         words = self._changed_roi() if mapped.skipped is None else None
         return FrameOutcome(
@@ -73,6 +75,7 @@ class TaskMapper:
             budget=self._pace.end(),
             skipped=mapped.skipped,
             words=words,
+            detection_lag_frames=lag_frames,
         )
 
     def _look(self, frame: Frame) -> MapSight | None:
@@ -85,6 +88,15 @@ class TaskMapper:
     def _attend(self, frame: Frame, sight: MapSight | None) -> RelevanceMap:
         with self._pace.timing(Step.ATTENTION):
             return self._attention.attend(frame, None if sight is None else sight.depth_m)
+
+    def _catch_up(self) -> int | None:
+        """Give an earlier keyframe the relevance that was not known when it was mapped; its age in frames."""
+        late = self._attention.late()
+        if late is None:
+            return None
+        with self._pace.timing(Step.VIEW):
+            self._mapper.revise(late.frame, late.relevance)
+        return late.lag_frames
 
     def _changed_roi(self) -> VoxelWords | None:
         if self._ledger is None or self._pace.spares(Relief.WORDS):

@@ -26,12 +26,20 @@ def _cpu(simd: str) -> Rasterizer:
     return CpuRasterizer(threads=2, simd=simd)
 
 
+def _cuda(device: str) -> Rasterizer:
+    from gausslite.render.cuda import CudaRasterizer
+
+    return CudaRasterizer(device)
+
+
 BACKENDS: dict[str, Callable[[], Rasterizer]] = {
     "reference": _reference,
     "cpu avx512": lambda: _cpu("avx512"),
     "cpu avx2": lambda: _cpu("avx2"),
     "cpu neon": lambda: _cpu("neon"),
     "cpu portable": lambda: _cpu("portable"),
+    "cuda": lambda: _cuda("cuda"),
+    "cuda stand-in": lambda: _cuda("cpu"),
 }
 
 

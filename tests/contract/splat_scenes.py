@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, cached_property
 
 import numpy as np
@@ -22,9 +22,12 @@ CAMERA = Camera(52.0, 50.0, 32.3, 23.6, 64, 48)
 
 @dataclass(frozen=True)
 class Scene:
+    """saturated: whether pixels are compared, too, in which alpha is clamped or that stop before the last splat."""
+
     rows: np.ndarray
     camera: Camera
     T_camera_world: np.ndarray
+    saturated: bool = True
 
     @property
     def size(self) -> tuple[int, int]:
@@ -32,7 +35,7 @@ class Scene:
 
     @cached_property
     def steady(self) -> np.ndarray:
-        """True on the pixels where no alpha lies so close to a threshold that float32 might cross it."""
+        """True on the pixels to compare: no alpha lies so close to a threshold there that float32 might cross it."""
         rows = torch.from_numpy(self.rows.astype(np.float64))
         ellipses = project(rows, self.camera, torch.from_numpy(self.T_camera_world))
         steady = np.ones(self.size, np.bool_)
@@ -44,6 +47,8 @@ class Scene:
             drawn = torch.where(alpha < MIN_ALPHA, 0.0, alpha.clamp(max=MAX_ALPHA))
             after = transmittance * torch.cumprod(1.0 - drawn, dim=0)
             near |= (after / MIN_TRANSMITTANCE - 1.0).abs() < STOP_MARGIN
+            if not self.saturated:
+                near |= (alpha > MAX_ALPHA) | (after < MIN_TRANSMITTANCE)
             # what hides behind the stop matters no more
             near &= torch.cat([transmittance[None], after[:-1]]) > 0.5 * MIN_TRANSMITTANCE
             transmittance = after[-1]
@@ -169,8 +174,16 @@ SCENES = tuple(_BUILDERS)
 
 
 @cache
-def scene_named(name: str) -> Scene:
-    return _BUILDERS[name]()
+def scene_named(name: str, saturated: bool = True) -> Scene:
+    return replace(_BUILDERS[name](), saturated=saturated)
+
+
+def scene_for(rasterizer: Rasterizer, name: str) -> Scene:
+    """The scene, with the pixels on which this backend follows the seam's image model.
+
+    gsplat's kernels clamp alpha higher and stop one splat earlier (CudaRasterizer says how far that goes).
+    """
+    return scene_named(name, saturated=rasterizer.name != "cuda")
 
 
 def random_image_gradients(scene: Scene, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

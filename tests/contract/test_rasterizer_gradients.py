@@ -4,7 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from splat_scenes import CAMERA, GROUPS, SCENES, Scene, random_image_gradients, random_rows, relative_error, scene_named
+from splat_scenes import (
+    CAMERA,
+    GROUPS,
+    SCENES,
+    Scene,
+    random_image_gradients,
+    random_rows,
+    relative_error,
+    scene_for,
+    scene_named,
+)
 
 from gausslite.render.rasterizer import EVERYTHING, Rasterizer, SplatGradients, Subset
 
@@ -28,7 +38,7 @@ def assert_same_gradients(came: SplatGradients, wanted: SplatGradients) -> None:
 
 @pytest.mark.parametrize("name", SCENES)
 def test_gradients_match_the_oracle(rasterizer: Rasterizer, oracle: Rasterizer, name: str) -> None:
-    scene = scene_named(name)
+    scene = scene_for(rasterizer, name)
     assert_same_gradients(gradients(rasterizer, scene), gradients(oracle, scene))
 
 

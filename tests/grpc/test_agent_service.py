@@ -72,6 +72,9 @@ class Gate:
             raise ZeroDivisionError("a bug")
         return self.inner.attend(frame, rendered_depth_m)
 
+    def late(self) -> None:
+        return None
+
 
 def ball_attention(_graph: TaskGraph) -> Attention:
     return RegionAttention([BallRegion((0.0, 0.0, 1.2), 0.2)])

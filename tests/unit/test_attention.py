@@ -13,11 +13,12 @@ from gausslite.domain.region import BallRegion
 from gausslite.domain.relevance import NO_TARGET
 from gausslite.domain.task import Predicate, Relation, TaskGraph
 from gausslite.errors import InvalidInputError
-from gausslite.perception.attention import AttentionSettings, TaskAttention
+from gausslite.perception.attention import TaskAttention
 from gausslite.perception.fixed import RegionAttention
 from gausslite.perception.ground_truth import RegionDetector
 from gausslite.perception.memory import Sighting
 from gausslite.perception.spatial import SpatialFilter, SpatialSettings, best_depth_m
+from gausslite.perception.tracker import AttentionSettings
 from gausslite.perception.vectors import classes_for
 
 CAMERA = Camera(100.0, 100.0, 80.0, 60.0, 160, 120)

@@ -9,7 +9,6 @@ import pytest
 
 from gausslite.domain.camera import Camera
 from gausslite.errors import InvalidInputError, KernelError, ShapeError
-from gausslite.render.choose import choose_rasterizer
 from gausslite.render.cpu import SIMD_VARIABLE, CpuRasterizer, core_clock_ghz
 from gausslite.render.rasterizer import AdamSettings, LossWeights, SplatGradients, Subset, TrainingView
 
@@ -269,13 +268,6 @@ def test_weights_outside_0_to_1_are_refused() -> None:
             CpuRasterizer(1).prepare_view(
                 np.zeros((*size, 3), np.uint8), np.zeros(size, np.float32), CAMERA, np.full(size, bad, np.float32)
             )
-
-
-def test_the_backend_is_chosen_by_name() -> None:
-    assert choose_rasterizer("auto", threads=1).name == "cpu"
-    assert choose_rasterizer("cpu", threads=1).name == "cpu"
-    with pytest.raises(KernelError, match="expected one of auto, cpu, reference, got gpu"):
-        choose_rasterizer("gpu")
 
 
 @pytest.mark.parametrize("simd", kernels.usable_simd())

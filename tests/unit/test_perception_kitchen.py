@@ -10,7 +10,8 @@ import pytest
 from gausslite.datasets.open import open_source
 from gausslite.datasets.regions import load_voxel_regions
 from gausslite.datasets.source import Source
-from gausslite.perception.attention import AttentionSettings, TaskAttention
+from gausslite.perception.attention import TaskAttention
+from gausslite.perception.tracker import AttentionSettings
 from gausslite.perception.vectors import TextVectors, classes_for
 from gausslite.perception.yolo import YoloSegDetector, load_yolo
 from gausslite.task.rules import RuleParser

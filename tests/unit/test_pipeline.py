@@ -99,6 +99,9 @@ class SlowAttention:
         self.now_s += 10.0
         return BALL.attend(frame, rendered_depth_m)
 
+    def late(self) -> None:
+        return None
+
 
 def test_words_that_had_to_wait_come_with_the_next_frame() -> None:
     slow = SlowAttention()

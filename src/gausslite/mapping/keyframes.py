@@ -27,6 +27,11 @@ class Keyframe:
     relevance: RelevanceMap
     recorded: Frame | None = None
 
+    @property
+    def as_recorded(self) -> Frame:
+        """The frame as it came."""
+        return self.frame if self.recorded is None else self.recorded
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WindowView:
@@ -93,10 +98,14 @@ class KeyframeStore:
         if len(self._buffer) > self._settings.buffer:
             self._thin()
 
-    def replace(self, old: WindowView, new: WindowView) -> None:
-        """Put another view, of the same frame, in the place of one in the window."""
-        self._window = [new if view is old else view for view in self._window]
-        self._buffer = [new.keyframe if keyframe is old.keyframe else keyframe for keyframe in self._buffer]
+    def revise(self, view: WindowView) -> None:
+        """Put what came to be known later in the place of a frame that is still in the window."""
+        self._window = [view if _same_frame(old.keyframe, view.keyframe) else old for old in self._window]
+        self._buffer = [view.keyframe if _same_frame(old, view.keyframe) else old for old in self._buffer]
+
+    def of(self, frame: Frame) -> WindowView | None:
+        """The window's view of a frame as it came; None where it is no keyframe of the window (any more)."""
+        return next((view for view in self._window if view.keyframe.as_recorded is frame), None)
 
     def _thin(self) -> None:
         """Drop the keyframe that is closest in time to its neighbours; the first and the last stay."""
@@ -104,3 +113,7 @@ class KeyframeStore:
         gaps = times[2:] - times[:-2]
         drop = 1 + int(np.argmin(gaps)) if len(gaps) else 0
         del self._buffer[drop]
+
+
+def _same_frame(a: Keyframe, b: Keyframe) -> bool:
+    return a.as_recorded is b.as_recorded

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float64
@@ -101,6 +101,14 @@ class GaussianMapper:
         self._revision += 1
         return MappedFrame(frame.index, seeded, iterations, self.count)
 
+    def revise(self, frame: Frame, relevance: RelevanceMap) -> bool:
+        """Take what came to be known of an earlier frame; False when it is no keyframe of the window (any more)."""
+        view = self._keyframes.of(frame)
+        if view is None:
+            return False
+        self._keyframes.revise(self._view(replace(view.keyframe, relevance=relevance)))
+        return True
+
     def look(self, frame: Frame) -> MapSight | None:
         """How the map looks from a frame; None while it is empty."""
         return MapSight.of(self.render(frame.camera, frame.T_world_camera)) if self.count > 0 else None
@@ -133,7 +141,7 @@ class GaussianMapper:
         """One keyframe of the window, fitted again to the map as it has become."""
         view = self._refiner.next_turn(self._keyframes.window)
         if view is not None:
-            self._keyframes.replace(view, self._view(self._refiner.fit_again(view.keyframe)))
+            self._keyframes.revise(self._view(self._refiner.fit_again(view.keyframe)))
 
     def _view(self, keyframe: Keyframe) -> WindowView:
         return window_view(keyframe, self._rasterizer, self._settings.keyframes.roi_margin_px)

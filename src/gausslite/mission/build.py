@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
+
 from gausslite.domain.task import TaskGraph
 from gausslite.errors import InvalidInputError
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mission.settings import MissionSettings, PerceptionSettings, SceneKnowledge
-from gausslite.perception.attention import AttentionSettings, TaskAttention
+from gausslite.perception.attention import Attention, AttentionBeside, TaskAttention
+from gausslite.perception.tracker import AttentionSettings
 from gausslite.render.choose import choose_rasterizer
 
 
@@ -16,17 +19,21 @@ def build_mapper(settings: MissionSettings) -> GaussianMapper:
     return GaussianMapper(settings.mapper_settings(), rasterizer, seed=settings.seed)
 
 
-def build_attention(graph: TaskGraph, scene: SceneKnowledge, perception: PerceptionSettings) -> TaskAttention:
+def build_attention(graph: TaskGraph, scene: SceneKnowledge, perception: PerceptionSettings) -> Attention:
     """Attention to a task: by the user's YOLO-seg file or, without one, by the scene's own ground truth.
 
-    Raises ModelFileError for a bad file and InvalidInputError when there is neither file nor ground truth.
+    With `beside` the network runs on a thread of its own. Raises ModelFileError for a bad file and InvalidInputError
+    when there is neither file nor ground truth.
     """
     settings = AttentionSettings(up_axis=scene.up_axis)
     if perception.model is not None:
         from gausslite.perception.yolo import load_yolo
 
         yolo = load_yolo(perception.model, threads=perception.threads)
-        return TaskAttention(graph, yolo, settings, segmenter=yolo if perception.resegment else None)
+        segmenter = yolo if perception.resegment else None
+        if perception.beside:
+            return AttentionBeside(graph, yolo, ThreadPoolExecutor(1, "detector"), settings, segmenter)
+        return TaskAttention(graph, yolo, settings, segmenter)
     if not scene.regions:
         raise InvalidInputError(
             "detector: the sequence has no ground-truth regions; name a YOLO-seg ONNX file with --detector"

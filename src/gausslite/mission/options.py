@@ -83,8 +83,10 @@ def add_voxel_size(parser: argparse.ArgumentParser) -> None:
 
 
 def perception_settings(options: argparse.Namespace) -> PerceptionSettings:
-    """What add_detector and add_budget asked for."""
-    return PerceptionSettings(options.detector, options.resegment, options.threads)
+    """What add_detector and add_budget asked for: at a rate detections run beside, on one thread."""
+    if options.rate is None:
+        return PerceptionSettings(options.detector, options.resegment, options.threads)
+    return PerceptionSettings(options.detector, options.resegment, threads=1, beside=True)
 
 
 def mission_settings(options: argparse.Namespace) -> MissionSettings:

@@ -2,24 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from concurrent.futures import Executor, Future
+from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
-import numpy as np
 from jaxtyping import Float32
 from numpy import ndarray
 
 from gausslite.domain.frame import Frame
-from gausslite.domain.pose import UpAxis, rotation_angle_deg, translation_m, unit_up_axis
-from gausslite.domain.relevance import NO_TARGET, Detection, RelevanceMap
+from gausslite.domain.relevance import Detection, RelevanceMap
 from gausslite.domain.task import TaskGraph
-from gausslite.errors import InvalidInputError
 from gausslite.perception.detect import Detector, Segmenter
 from gausslite.perception.memory import Remembered
-from gausslite.perception.reproject import Frustum, cut_by_depth, frustum_of, reprojected_box_px
-from gausslite.perception.spatial import SpatialFilter, SpatialSettings, best_depth_m, sight
-from gausslite.perception.vocabulary import is_generic
+from gausslite.perception.spatial import best_depth_m
+from gausslite.perception.tracker import AttentionSettings, TargetTracker
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LateRelevance:
+    """The relevance of a frame that was attended to lag_frames frames ago, when it was not known yet."""
+
+    frame: Frame
+    relevance: RelevanceMap
+    lag_frames: int
 
 
 @runtime_checkable
@@ -30,36 +35,18 @@ class Attention(Protocol):
         """The relevance of one frame; rendered_depth_m is drawn from the current map, 0 where it shows nothing."""
         ...
 
+    def late(self) -> LateRelevance | None:
+        """What the latest call of `attend` has come to know of an earlier frame."""
+        ...
+
     @property
     def notes(self) -> tuple[str, ...]:
         """What the operator should know of the frames so far, one line each."""
         ...
 
 
-@dataclass(frozen=True, slots=True)
-class AttentionSettings:
-    """up_axis points up in the world, by default that of a level first camera; max_* say when to detect anew.
-
-    How far the camera may go between two detections is a comment in Sec. III-B.2.
-    """
-
-    up_axis: UpAxis = (0.0, -1.0, 0.0)
-    max_translation_m: float = 1.0
-    max_rotation_deg: float = 15.0
-    max_frames: int = 5
-    spatial: SpatialSettings = field(default_factory=SpatialSettings)
-
-    def __post_init__(self) -> None:
-        for name in ("max_translation_m", "max_rotation_deg"):
-            if not getattr(self, name) > 0:
-                raise InvalidInputError(f"attention {name}: expected a positive number, got {getattr(self, name)}")
-        unit_up_axis(self.up_axis)
-        if self.max_frames < 1:
-            raise InvalidInputError(f"attention max_frames: expected at least 1, got {self.max_frames}")
-
-
 class TaskAttention:
-    """An Attention that follows a task graph; it owns the keyframe and the memory of objects. One thread at a time."""
+    """An Attention that follows a task graph and waits for its detector. One thread at a time."""
 
     def __init__(
         self,
@@ -71,82 +58,95 @@ class TaskAttention:
         """Without a segmenter, carried boxes are cut out by depth alone."""
         self._graph = graph
         self._detector = detector
-        self._settings = settings or AttentionSettings()
-        self._segmenter = segmenter
-        self._filter = SpatialFilter(graph, self._settings.up_axis, self._settings.spatial)
-        self._keyframe: Frame | None = None
-        self._frames_since = 0
-        self._kept: list[Frustum] = []
+        self._tracker = TargetTracker(graph, settings or AttentionSettings(), segmenter)
 
     @property
     def notes(self) -> tuple[str, ...]:
         """Nouns without a class, and anchors that have not come into view."""
-        unseen = (f"anchor {name!r} not seen yet: its targets are kept" for name in self._filter.unseen_anchors)
-        return (*self._detector.warnings, *unseen)
+        return (*self._detector.warnings, *self._tracker.notes)
 
     @property
     def remembered(self) -> tuple[Remembered, ...]:
         """The objects that the task's nouns have named so far, where they were seen."""
-        return self._filter.remembered
+        return self._tracker.remembered
 
     def attend(self, frame: Frame, rendered_depth_m: Float32[ndarray, "h w"] | None = None) -> RelevanceMap:
         """Weight 1 on the pixels of the targets that fit the task's relations."""
-        if self._needs_detection(frame):
-            shown = self._detect(frame, best_depth_m(frame.depth_m, rendered_depth_m))
-        else:
-            shown = self._carry_over(frame)
-        return merge(shown, self._graph.targets, frame)
+        if not self._tracker.wants_detection(frame):
+            return self._tracker.carry_over(frame)
+        found = self._detector.detect(frame, self._graph.queries)
+        return self._tracker.take(frame, best_depth_m(frame.depth_m, rendered_depth_m), found)
 
-    def _needs_detection(self, frame: Frame) -> bool:
-        key = self._keyframe
-        self._frames_since += 1
-        return (
-            key is None
-            or self._frames_since >= self._settings.max_frames
-            or translation_m(key.T_world_camera, frame.T_world_camera) > self._settings.max_translation_m
-            or rotation_angle_deg(key.T_world_camera, frame.T_world_camera) > self._settings.max_rotation_deg
-        )
-
-    def _detect(self, frame: Frame, depth_m: Float32[ndarray, "h w"]) -> list[Detection]:
-        self._keyframe, self._frames_since = frame, 0
-        detections = self._without_anchors_as_objects(self._detector.detect(frame, self._graph.queries))
-        placed = [sight(each.phrase, each.mask, depth_m, frame.camera, frame.T_world_camera) for each in detections]
-        self._filter.observe([sighting for sighting in placed if sighting is not None])
-        targets = [
-            detection
-            for detection, sighting in zip(detections, placed, strict=True)
-            if detection.phrase in self._graph.targets and sighting is not None and self._filter.keep(sighting)
-        ]
-        lifted = [frustum_of(detection, depth_m, frame) for detection in targets]
-        self._kept = [frustum for frustum in lifted if frustum is not None]
-        return targets
-
-    def _without_anchors_as_objects(self, detections: Sequence[Detection]) -> list[Detection]:
-        """The object on the desk is not the desk itself, although a desk is an object."""
-        anchors = [each.mask for each in detections if each.phrase in self._graph.anchors]
-        return [
-            each
-            for each in detections
-            if not (is_generic(each.phrase) and any(each.mask is anchor for anchor in anchors))
-        ]
-
-    def _carry_over(self, frame: Frame) -> list[Detection]:
-        boxes = [(frustum, reprojected_box_px(frustum, frame)) for frustum in self._kept]
-        in_view = [(frustum, box) for frustum, box in boxes if box is not None]
-        masks = [cut_by_depth(frustum, box, frame) for frustum, box in in_view]
-        if self._segmenter is not None and in_view:
-            table = np.asarray([box for _, box in in_view], np.float32)
-            cut_again = self._segmenter.segment(frame, table)
-            masks = [new if new is not None else old for new, old in zip(cut_again, masks, strict=True)]
-        return [
-            Detection(frustum.detection.phrase, frustum.detection.score, box, mask)
-            for (frustum, box), mask in zip(in_view, masks, strict=True)
-        ]
+    def late(self) -> None:
+        """Nothing: every frame's relevance is known at once."""
+        return
 
 
-def merge(detections: Sequence[Detection], targets: Sequence[str], frame: Frame) -> RelevanceMap:
-    """The binary w(u, v): 1 on every target's mask; where masks overlap the smaller object owns the pixel."""
-    target = np.full(frame.depth_m.shape, NO_TARGET, np.int16)
-    for detection in sorted(detections, key=lambda each: int(np.count_nonzero(each.mask)), reverse=True):
-        target[detection.mask] = targets.index(detection.phrase)
-    return RelevanceMap((target != NO_TARGET).astype(np.float32), target)
+class AttentionBeside:
+    """An Attention that follows a task graph and never waits: its detector runs beside, on an executor of one thread.
+
+    One detection runs at a time; of the keyframes that come meanwhile the newest waits and replaces an older one. What
+    was found on a keyframe is taken when it is there and carried over to the frame at hand; the keyframe's own
+    relevance comes late. One thread at a time calls it.
+    """
+
+    def __init__(
+        self,
+        graph: TaskGraph,
+        detector: Detector,
+        executor: Executor,
+        settings: AttentionSettings | None = None,
+        segmenter: Segmenter | None = None,
+    ) -> None:
+        """Without a segmenter, carried boxes are cut out by depth alone."""
+        self._graph = graph
+        self._detector = detector
+        self._executor = executor
+        self._tracker = TargetTracker(graph, settings or AttentionSettings(), segmenter)
+        self._frames = 0
+        self._replaced = 0
+        self._warnings: tuple[str, ...] = ()
+        self._running: tuple[_Keyframe, Future[list[Detection]]] | None = None
+        self._waiting: _Keyframe | None = None
+        self._late: LateRelevance | None = None
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Nouns without a class, anchors that have not come into view, keyframes that were never looked at."""
+        overtaken = (f"detector too slow: {self._replaced} keyframes were overtaken",) if self._replaced else ()
+        return (*self._warnings, *self._tracker.notes, *overtaken)
+
+    def attend(self, frame: Frame, rendered_depth_m: Float32[ndarray, "h w"] | None = None) -> RelevanceMap:
+        """Weight 1 on the pixels of the targets known so far. Raises what the detector raised."""
+        self._late = self._collect()
+        if self._tracker.wants_detection(frame):
+            self._replaced += self._waiting is not None
+            self._waiting = _Keyframe(frame, best_depth_m(frame.depth_m, rendered_depth_m), self._frames)
+        if self._running is None and self._waiting is not None:
+            found = self._executor.submit(self._detector.detect, self._waiting.frame, self._graph.queries)
+            self._running, self._waiting = (self._waiting, found), None
+        self._frames += 1
+        return self._tracker.carry_over(frame)
+
+    def late(self) -> LateRelevance | None:
+        """The relevance of the keyframe whose detection the latest frame found done."""
+        return self._late
+
+    def _collect(self) -> LateRelevance | None:
+        """Take what was found, if the detector is done."""
+        if self._running is None or not self._running[1].done():
+            return None
+        (key, found), self._running = self._running, None
+        relevance = self._tracker.take(key.frame, key.depth_m, found.result())
+        # the detector adds to its warnings while it runs; now it rests
+        self._warnings = self._detector.warnings
+        return LateRelevance(key.frame, relevance, self._frames - key.number)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Keyframe:
+    """A frame to detect on, the depth its detections are lifted by, and its number among all frames."""
+
+    frame: Frame
+    depth_m: Float32[ndarray, "h w"]
+    number: int

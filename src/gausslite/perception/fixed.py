@@ -35,6 +35,10 @@ class RegionAttention:
             target[region.mask(frame)] = index
         return RelevanceMap((target != NO_TARGET).astype(np.float32), target)
 
+    def late(self) -> None:
+        """Nothing: every frame's relevance is known at once."""
+        return
+
 
 class NoAttention:
     """An Attention for uniform maps: nothing is relevant."""
@@ -48,3 +52,7 @@ class NoAttention:
         """Weight 0 everywhere."""
         del rendered_depth_m
         return RelevanceMap.nothing(*frame.depth_m.shape)
+
+    def late(self) -> None:
+        """Nothing: every frame's relevance is known at once."""
+        return

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float64
@@ -17,15 +18,29 @@ MAX_ALPHA = 0.99
 MIN_TRANSMITTANCE = 1e-4
 
 
-def composite(ellipses: Ellipses, pixels: Float64[Tensor, "p 2"]) -> Float64[Tensor, "p 5"]:
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """Where alpha is clamped, and whether the splat that takes the transmittance to its minimum is still drawn."""
+
+    max_alpha: float = MAX_ALPHA
+    draws_the_last: bool = True
+
+
+OUR_LIMITS = Limits()
+
+
+def composite(
+    ellipses: Ellipses, pixels: Float64[Tensor, "p 2"], limits: Limits = OUR_LIMITS
+) -> Float64[Tensor, "p 5"]:
     """Red, green, blue, depth and alpha of these pixel centres."""
     dx, dy = (pixels[None] - ellipses.means_px[:, None]).unbind(dim=2)
     a, b, c = ellipses.conics[:, :, None].unbind(dim=1)
     alpha = ellipses.opacities[:, None] * torch.exp(-0.5 * (a * dx * dx + 2.0 * b * dx * dy + c * dy * dy))
-    alpha = torch.where(alpha < MIN_ALPHA, 0.0, alpha.clamp(max=MAX_ALPHA))
+    alpha = torch.where(alpha < MIN_ALPHA, 0.0, alpha.clamp(max=limits.max_alpha))
     transmittance = torch.cumprod(1.0 - alpha, dim=0)
     before = torch.cat([torch.ones_like(transmittance[:1]), transmittance[:-1]])
-    weights = torch.where(before < MIN_TRANSMITTANCE, 0.0, alpha * before)
+    hidden = before < MIN_TRANSMITTANCE if limits.draws_the_last else transmittance <= MIN_TRANSMITTANCE
+    weights = torch.where(hidden, 0.0, alpha * before)
     channels = torch.cat([ellipses.rgb, ellipses.z_m[:, None], torch.ones_like(ellipses.z_m)[:, None]], dim=1)
     return weights.T @ channels
 
@@ -43,12 +58,14 @@ def tiles_of(camera: Camera, tiles: Bool[ndarray, "th tw"] | None) -> Iterator[t
                 )
 
 
-def draw(ellipses: Ellipses, camera: Camera, tiles: Bool[ndarray, "th tw"] | None) -> Float64[Tensor, "h w 5"]:
+def draw(
+    ellipses: Ellipses, camera: Camera, tiles: Bool[ndarray, "th tw"] | None, limits: Limits = OUR_LIMITS
+) -> Float64[Tensor, "h w 5"]:
     """The images, differentiable if the ellipses are; pixels outside the drawn tiles are zero."""
     images = torch.zeros(camera.height_px, camera.width_px, 5, dtype=torch.float64)
     for rows, columns in tiles_of(camera, tiles):
         inside = _overlapping(ellipses, rows, columns)
-        tile = composite(ellipses.take(inside), _centres(rows, columns))
+        tile = composite(ellipses.take(inside), _centres(rows, columns), limits)
         images[rows, columns] = tile.reshape(rows.stop - rows.start, columns.stop - columns.start, 5)
     return images
 
@@ -58,6 +75,7 @@ def draw_backward(
     camera: Camera,
     tiles: Bool[ndarray, "th tw"] | None,
     d_images: Float64[Tensor, "h w 5"],
+    limits: Limits = OUR_LIMITS,
 ) -> tuple[Tensor, ...]:
     """Gradients by each of `ellipses.differentiable`, drawing every tile once more with autograd."""
     sums = tuple(torch.zeros_like(column) for column in ellipses.differentiable)
@@ -67,7 +85,7 @@ def draw_backward(
             continue
         part = ellipses.take(inside)
         part = part.detached()
-        tile = composite(part, _centres(rows, columns))
+        tile = composite(part, _centres(rows, columns), limits)
         gradients = torch.autograd.grad(tile, part.differentiable, d_images[rows, columns].reshape(-1, 5))
         for total, gradient in zip(sums, gradients, strict=True):
             total.index_add_(0, inside, gradient)

@@ -1,0 +1,127 @@
+"""Follow a task's targets from frame to frame: place detections in space, keep those that fit, carry them over."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float32
+from numpy import ndarray
+
+from gausslite.domain.frame import Frame
+from gausslite.domain.pose import UpAxis, rotation_angle_deg, translation_m, unit_up_axis
+from gausslite.domain.relevance import NO_TARGET, Detection, RelevanceMap
+from gausslite.domain.task import TaskGraph
+from gausslite.errors import InvalidInputError
+from gausslite.perception.detect import Segmenter
+from gausslite.perception.memory import Remembered
+from gausslite.perception.reproject import Frustum, cut_by_depth, frustum_of, reprojected_box_px
+from gausslite.perception.spatial import SpatialFilter, SpatialSettings, sight
+from gausslite.perception.vocabulary import is_generic
+
+
+@dataclass(frozen=True, slots=True)
+class AttentionSettings:
+    """up_axis points up in the world, by default that of a level first camera; max_* say when to detect anew.
+
+    How far the camera may go between two detections is a comment in Sec. III-B.2.
+    """
+
+    up_axis: UpAxis = (0.0, -1.0, 0.0)
+    max_translation_m: float = 1.0
+    max_rotation_deg: float = 15.0
+    max_frames: int = 5
+    spatial: SpatialSettings = field(default_factory=SpatialSettings)
+
+    def __post_init__(self) -> None:
+        for name in ("max_translation_m", "max_rotation_deg"):
+            if not getattr(self, name) > 0:
+                raise InvalidInputError(f"attention {name}: expected a positive number, got {getattr(self, name)}")
+        unit_up_axis(self.up_axis)
+        if self.max_frames < 1:
+            raise InvalidInputError(f"attention max_frames: expected at least 1, got {self.max_frames}")
+
+
+class TargetTracker:
+    """Owns the latest keyframe and the memory of objects, and asks no detector itself. One thread at a time."""
+
+    def __init__(self, graph: TaskGraph, settings: AttentionSettings, segmenter: Segmenter | None) -> None:
+        """Without a segmenter, carried boxes are cut out by depth alone."""
+        self._graph = graph
+        self._settings = settings
+        self._segmenter = segmenter
+        self._filter = SpatialFilter(graph, settings.up_axis, settings.spatial)
+        self._keyframe: Frame | None = None
+        self._frames_since = 0
+        self._kept: list[Frustum] = []
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Anchors that have not come into view."""
+        return tuple(f"anchor {name!r} not seen yet: its targets are kept" for name in self._filter.unseen_anchors)
+
+    @property
+    def remembered(self) -> tuple[Remembered, ...]:
+        """The objects that the task's nouns have named so far, where they were seen."""
+        return self._filter.remembered
+
+    def wants_detection(self, frame: Frame) -> bool:
+        """True for the first frame, after some frames, and once the camera went far; such a frame is a keyframe."""
+        key = self._keyframe
+        self._frames_since += 1
+        due = (
+            key is None
+            or self._frames_since >= self._settings.max_frames
+            or translation_m(key.T_world_camera, frame.T_world_camera) > self._settings.max_translation_m
+            or rotation_angle_deg(key.T_world_camera, frame.T_world_camera) > self._settings.max_rotation_deg
+        )
+        if due:
+            self._keyframe, self._frames_since = frame, 0
+        return due
+
+    def take(self, frame: Frame, depth_m: Float32[ndarray, "h w"], found: Sequence[Detection]) -> RelevanceMap:
+        """What was detected on a frame: the targets that fit the task's relations, from now on carried over."""
+        detections = self._without_anchors_as_objects(found)
+        placed = [sight(each.phrase, each.mask, depth_m, frame.camera, frame.T_world_camera) for each in detections]
+        self._filter.observe([sighting for sighting in placed if sighting is not None])
+        targets = [
+            detection
+            for detection, sighting in zip(detections, placed, strict=True)
+            if detection.phrase in self._graph.targets and sighting is not None and self._filter.keep(sighting)
+        ]
+        lifted = [frustum_of(detection, depth_m, frame) for detection in targets]
+        self._kept = [frustum for frustum in lifted if frustum is not None]
+        return merge(targets, self._graph.targets, frame)
+
+    def carry_over(self, frame: Frame) -> RelevanceMap:
+        """The latest targets as they are seen from another frame."""
+        boxes = [(frustum, reprojected_box_px(frustum, frame)) for frustum in self._kept]
+        in_view = [(frustum, box) for frustum, box in boxes if box is not None]
+        masks = [cut_by_depth(frustum, box, frame) for frustum, box in in_view]
+        if self._segmenter is not None and in_view:
+            table = np.asarray([box for _, box in in_view], np.float32)
+            cut_again = self._segmenter.segment(frame, table)
+            masks = [new if new is not None else old for new, old in zip(cut_again, masks, strict=True)]
+        shown = [
+            Detection(frustum.detection.phrase, frustum.detection.score, box, mask)
+            for (frustum, box), mask in zip(in_view, masks, strict=True)
+        ]
+        return merge(shown, self._graph.targets, frame)
+
+    def _without_anchors_as_objects(self, detections: Sequence[Detection]) -> list[Detection]:
+        """The object on the desk is not the desk itself, although a desk is an object."""
+        anchors = [each.mask for each in detections if each.phrase in self._graph.anchors]
+        return [
+            each
+            for each in detections
+            if not (is_generic(each.phrase) and any(each.mask is anchor for anchor in anchors))
+        ]
+
+
+def merge(detections: Sequence[Detection], targets: Sequence[str], frame: Frame) -> RelevanceMap:
+    """The binary w(u, v): 1 on every target's mask; where masks overlap the smaller object owns the pixel."""
+    target = np.full(frame.depth_m.shape, NO_TARGET, np.int16)
+    for detection in sorted(detections, key=lambda each: int(np.count_nonzero(each.mask)), reverse=True):
+        target[detection.mask] = targets.index(detection.phrase)
+    return RelevanceMap((target != NO_TARGET).astype(np.float32), target)

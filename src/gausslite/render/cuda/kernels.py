@@ -1,0 +1,216 @@
+"""The few of gsplat's operations that this backend calls, and a stand-in in plain torch for machines without a GPU.
+
+gsplat (Ye et al. 2025, Apache-2.0) compiles its kernels for CUDA alone. Its own torch versions of the two projection
+steps run anywhere; sorting and compositing do not, so here the oracle's compositing stands in for them, with the two
+rules in which gsplat's differs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from types import ModuleType
+from typing import Any, Protocol, cast, runtime_checkable
+
+import torch
+from jaxtyping import Bool, Float32
+from torch import Tensor
+
+from gausslite.domain.camera import Camera
+from gausslite.errors import KernelError
+from gausslite.render.rasterizer import TILE_PX
+from gausslite.render.reference.compositing import Limits, draw, draw_backward
+from gausslite.render.reference.projection import Ellipses
+
+GSPLAT_LIMITS = Limits(max_alpha=0.999, draws_the_last=False)
+"""gsplat clamps alpha at 0.999 and leaves out the splat that would take the transmittance to 1e-4."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Footprints:
+    """Splats as the compositing kernels want them, in any order, in pixels of the window to draw.
+
+    channels: red, green, blue and z. radius_px: half the bounding box beyond which alpha is below 1/255.
+    """
+
+    means_px: Float32[Tensor, "m 2"]
+    conics: Float32[Tensor, "m 3"]
+    opacities: Float32[Tensor, " m"]
+    channels: Float32[Tensor, "m 4"]
+    radius_px: Float32[Tensor, "m 2"]
+
+
+@runtime_checkable
+class Kernels(Protocol):
+    """The operations of gsplat, on one device, differentiable."""
+
+    @property
+    def device(self) -> torch.device:
+        """Where the tensors live."""
+        ...
+
+    def covariances(self, quats_wxyz: Float32[Tensor, "m 4"], scales_m: Float32[Tensor, "m 3"]) -> Tensor:
+        """Covariances [m 3 3] in the frame of the means."""
+        ...
+
+    def project(
+        self,
+        points_m: Float32[Tensor, "m 3"],
+        covariances_m2: Float32[Tensor, "m 3 3"],
+        intrinsics: Float32[Tensor, "3 3"],
+        size: tuple[int, int],
+    ) -> tuple[Tensor, Tensor]:
+        """Means [m 2] and covariances [m 2 2] in the image of this width and height, from the camera's frame."""
+        ...
+
+    def composite(
+        self, footprints: Footprints, size: tuple[int, int], tiles: Bool[Tensor, "th tw"] | None
+    ) -> tuple[Tensor, Tensor]:
+        """Channels [h w 4] and alpha [h w] of a window of this width and height; zero outside the tiles."""
+        ...
+
+
+def load_gsplat() -> ModuleType:
+    """The library with its kernels; unless its wheel brought them, the first use compiles them, which takes minutes.
+
+    Raises KernelError where there is nothing to compile them with, ImportError without gsplat.
+    """
+    import gsplat
+    from gsplat.cuda import _backend
+
+    if _backend._C is None:
+        raise KernelError("cuda backend: expected nvcc to compile gsplat's kernels with, got no CUDA toolkit")
+    return cast(ModuleType, gsplat)
+
+
+class GsplatKernels:
+    """gsplat's functions on a CUDA device."""
+
+    def __init__(self, gsplat: Any, device: torch.device) -> None:
+        self._gsplat = gsplat
+        self._device = device
+
+    @property
+    def device(self) -> torch.device:
+        """The CUDA device."""
+        return self._device
+
+    def covariances(self, quats_wxyz: Float32[Tensor, "m 4"], scales_m: Float32[Tensor, "m 3"]) -> Tensor:
+        """Covariances [m 3 3]."""
+        covariances, _ = self._gsplat.quat_scale_to_covar_preci(quats_wxyz, scales_m, compute_preci=False)
+        return cast(Tensor, covariances)
+
+    def project(
+        self,
+        points_m: Float32[Tensor, "m 3"],
+        covariances_m2: Float32[Tensor, "m 3 3"],
+        intrinsics: Float32[Tensor, "3 3"],
+        size: tuple[int, int],
+    ) -> tuple[Tensor, Tensor]:
+        """Means and covariances in the image."""
+        means_px, covariances_px2 = self._gsplat.proj(points_m[None], covariances_m2[None], intrinsics[None], *size)
+        return means_px[0], covariances_px2[0]
+
+    def composite(
+        self, footprints: Footprints, size: tuple[int, int], tiles: Bool[Tensor, "th tw"] | None
+    ) -> tuple[Tensor, Tensor]:
+        """Sort by tile and depth, and blend front to back."""
+        width_px, height_px = size
+        tile_rows, tile_columns = -(-height_px // TILE_PX), -(-width_px // TILE_PX)
+        _, crossings, owners = self._gsplat.isect_tiles(
+            footprints.means_px.detach()[None],
+            footprints.radius_px.ceil().to(torch.int32)[None],
+            footprints.channels[:, 3].detach()[None],
+            TILE_PX,
+            tile_columns,
+            tile_rows,
+        )
+        channels, alpha = self._gsplat.rasterize_to_pixels(
+            footprints.means_px[None],
+            footprints.conics[None],
+            footprints.channels[None],
+            footprints.opacities[None],
+            width_px,
+            height_px,
+            TILE_PX,
+            self._gsplat.isect_offset_encode(crossings, 1, tile_columns, tile_rows),
+            owners,
+            masks=None if tiles is None else tiles[None],
+        )
+        if tiles is None:
+            return channels[0], alpha[0, ..., 0]
+        # in tiles that it leaves out, gsplat's kernel does not write alpha at all
+        shown = tiles.repeat_interleave(TILE_PX, 0).repeat_interleave(TILE_PX, 1)[:height_px, :width_px]
+        return torch.where(shown[..., None], channels[0], 0.0), torch.where(shown, alpha[0, ..., 0], 0.0)
+
+
+class TorchKernels:
+    """The same operations on the processor, slow, for the tests of all that surrounds the kernels."""
+
+    def __init__(self) -> None:
+        from gsplat.cuda import _torch_impl
+
+        self._gsplat: Any = _torch_impl
+
+    @property
+    def device(self) -> torch.device:
+        """The processor."""
+        return torch.device("cpu")
+
+    def covariances(self, quats_wxyz: Float32[Tensor, "m 4"], scales_m: Float32[Tensor, "m 3"]) -> Tensor:
+        """Covariances [m 3 3]."""
+        covariances, _ = self._gsplat._quat_scale_to_covar_preci(quats_wxyz, scales_m, compute_preci=False)
+        return cast(Tensor, covariances)
+
+    def project(
+        self,
+        points_m: Float32[Tensor, "m 3"],
+        covariances_m2: Float32[Tensor, "m 3 3"],
+        intrinsics: Float32[Tensor, "3 3"],
+        size: tuple[int, int],
+    ) -> tuple[Tensor, Tensor]:
+        """Means and covariances in the image."""
+        means_px, covariances_px2 = self._gsplat._persp_proj(
+            points_m[None], covariances_m2[None], intrinsics[None], *size
+        )
+        return means_px[0], covariances_px2[0]
+
+    def composite(
+        self, footprints: Footprints, size: tuple[int, int], tiles: Bool[Tensor, "th tw"] | None
+    ) -> tuple[Tensor, Tensor]:
+        """Blend front to back by gsplat's rules, in double precision."""
+        columns = (footprints.means_px, footprints.conics, footprints.opacities, footprints.channels)
+        blend: Callable[..., Tensor] = _Composite.apply
+        images = blend(*columns, footprints.radius_px, size, tiles)
+        return images[..., :4].float(), images[..., 4].float()
+
+
+class _Composite(torch.autograd.Function):
+    """The oracle's two passes as one differentiable operation."""
+
+    @staticmethod
+    def forward(ctx: Any, *inputs: Any) -> Tensor:
+        """Images of five channels, in double precision."""
+        means_px, conics, opacities, channels, radius_px, (width_px, height_px), tiles = inputs
+        order = torch.argsort(channels[:, 3], stable=True)
+        columns = (column[order].double() for column in (means_px, conics, opacities, channels, radius_px))
+        means_px, conics, opacities, channels, radius_px = columns
+        ctx.ellipses = Ellipses(
+            order, means_px, conics, opacities, channels[:, :3], channels[:, 3], torch.ceil(radius_px)
+        )
+        # where the pixels are is all that compositing asks of a camera
+        ctx.camera = Camera(1.0, 1.0, 0.0, 0.0, width_px, height_px)
+        ctx.tiles = None if tiles is None else tiles.numpy()
+        return draw(ctx.ellipses, ctx.camera, ctx.tiles, GSPLAT_LIMITS)
+
+    @staticmethod
+    def backward(ctx: Any, *d_images: Tensor) -> tuple[Tensor | None, ...]:
+        """Gradients in single precision, in the order that the splats came in."""
+        ellipses: Ellipses = ctx.ellipses
+        with torch.enable_grad():
+            sums = draw_backward(ellipses, ctx.camera, ctx.tiles, d_images[0], GSPLAT_LIMITS)
+        d_means_px, d_conics, d_opacities, d_rgb, d_z_m = sums
+        d_channels = torch.cat([d_rgb, d_z_m[:, None]], dim=1)
+        back = torch.argsort(ellipses.row_ids)
+        columns = (d_means_px, d_conics, d_opacities, d_channels)
+        return (*(column[back].float() for column in columns), None, None, None)

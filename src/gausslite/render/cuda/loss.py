@@ -1,0 +1,164 @@
+"""The training loss on the device: views prepared once, and only the window that a view's weight reaches."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float32, UInt8
+from numpy import ndarray
+from torch import Tensor
+from torch.nn.functional import conv2d
+
+from gausslite.domain.camera import Camera
+from gausslite.render.cuda.projection import Lens
+from gausslite.render.rasterizer import TILE_PX, LossWeights
+
+MIN_DEPTH_ALPHA = 0.5
+_REACH_PX, _SIGMA_PX = 5, 1.5
+_C1, _C2 = 1e-4, 9e-4
+
+
+@dataclass(frozen=True, slots=True)
+class Window:
+    """A part of the image that begins and ends on the borders of tiles (or of the image), in tiles and in pixels."""
+
+    tile_rows: slice
+    tile_columns: slice
+    rows: slice
+    columns: slice
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height in pixels."""
+        return self.columns.stop - self.columns.start, self.rows.stop - self.rows.start
+
+    @property
+    def origin_px(self) -> tuple[int, int]:
+        """Left and top."""
+        return self.columns.start, self.rows.start
+
+    @classmethod
+    def whole(cls, camera: Camera) -> Window:
+        """All of the image."""
+        return cls._between((0, camera.height_px), (0, camera.width_px), camera)
+
+    @classmethod
+    def around(cls, weight: Float32[ndarray, "h w"], camera: Camera) -> Window:
+        """The pixels of some weight and what their similarity looks at; one tile where there are none."""
+        spans = []
+        for axis, length in ((1, camera.height_px), (0, camera.width_px)):
+            weighed = np.flatnonzero(weight.any(axis=axis))
+            first, last = (int(weighed[0]), int(weighed[-1])) if len(weighed) else (0, 0)
+            spans.append((max(first - _REACH_PX, 0), min(last + 1 + _REACH_PX, length)))
+        return cls._between(spans[0], spans[1], camera)
+
+    @classmethod
+    def _between(cls, rows: tuple[int, int], columns: tuple[int, int], camera: Camera) -> Window:
+        tile_rows, tile_columns = (
+            slice(start // TILE_PX, math.ceil(stop / TILE_PX)) for start, stop in (rows, columns)
+        )
+        return cls(
+            tile_rows,
+            tile_columns,
+            slice(tile_rows.start * TILE_PX, min(tile_rows.stop * TILE_PX, camera.height_px)),
+            slice(tile_columns.start * TILE_PX, min(tile_columns.stop * TILE_PX, camera.width_px)),
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Target:
+    """What a window of a view is compared with. similar: the view's own share of the similarity, mean and variance.
+
+    A weight of None is 1 everywhere.
+    """
+
+    window: Window
+    rgb: Float32[Tensor, "h w 3"]
+    depth_m: Float32[Tensor, "h w"]
+    similar: Float32[Tensor, "6 h w"]
+    weight: Float32[Tensor, "h w"] | None
+    weight_sum: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CudaView:
+    """A training image on the device, as a whole and as its weight shows it."""
+
+    camera: Camera
+    lens: Lens
+    plain: Target
+    masked: Target
+
+    @classmethod
+    def of(
+        cls,
+        rgb: UInt8[ndarray, "h w 3"],
+        depth_m: Float32[ndarray, "h w"],
+        camera: Camera,
+        weight: Float32[ndarray, "h w"] | None,
+        device: torch.device,
+    ) -> CudaView:
+        """Carry the images to the device, colours in [0, 1], with the sums that no drawing changes."""
+        colours = torch.from_numpy(np.ascontiguousarray(rgb)).to(device).float() / 255.0
+        measured_m = torch.from_numpy(np.ascontiguousarray(depth_m)).to(device)
+        planes = colours.permute(2, 0, 1)
+        blurred = _blur(torch.cat([planes, planes * planes]))
+        means = blurred[:3]
+        similar = torch.cat([means, blurred[3:] - means * means])
+        plain = Target(Window.whole(camera), colours, measured_m, similar, None, float(depth_m.size))
+        lens = Lens.of(camera, device)
+        if weight is None:
+            return cls(camera, lens, plain, plain)
+        window = Window.around(weight, camera)
+        part = (window.rows, window.columns)
+        masked = Target(
+            window,
+            colours[part],
+            measured_m[part],
+            similar[:, window.rows, window.columns],
+            torch.from_numpy(np.ascontiguousarray(weight[part])).to(device),
+            float(weight.sum(dtype=np.float64)),
+        )
+        return cls(camera, lens, plain, masked)
+
+
+def training_loss(
+    channels: Float32[Tensor, "h w 4"], alpha: Float32[Tensor, "h w"], target: Target, loss: LossWeights
+) -> Float32[Tensor, ""]:
+    """Eq. (1) as LossWeights spells it out, on a drawn window. What is left out of the window has no weight."""
+    if target.weight_sum == 0.0:
+        return channels.sum() * 0.0
+    rgb, depth_m = channels[..., :3], channels[..., 3]
+    weight = torch.ones_like(alpha) if target.weight is None else target.weight
+    colour = (weight[..., None] * (rgb - target.rgb).abs()).sum() / 3.0
+    # without selecting pixels: the host would have to wait for their number
+    measured = (alpha > MIN_DEPTH_ALPHA) & (target.depth_m > 0)
+    error_m = (depth_m / torch.where(measured, alpha, 1.0) - target.depth_m).abs()
+    depth = torch.where(measured, weight * error_m, 0.0).sum()
+    total = loss.colour * colour + loss.depth * depth
+    if loss.ssim != 0.0:
+        total = total - loss.ssim * (weight * _ssim_sum(rgb, target)).sum() / 3.0
+    return loss.ssim + total / target.weight_sum
+
+
+def _ssim_sum(rgb: Float32[Tensor, "h w 3"], target: Target) -> Float32[Tensor, "h w"]:
+    """Structural similarity of every pixel, summed over the channels, images padded with zeros (Wang et al. 2004)."""
+    planes, wanted = rgb.permute(2, 0, 1), target.rgb.permute(2, 0, 1)
+    blurred = _blur(torch.cat([planes, planes * planes, planes * wanted]))
+    mean, wanted_mean, wanted_variance = blurred[:3], target.similar[:3], target.similar[3:]
+    variance = blurred[3:6] - mean * mean
+    covariance = blurred[6:] - mean * wanted_mean
+    luminance = (2.0 * mean * wanted_mean + _C1) / (mean * mean + wanted_mean * wanted_mean + _C1)
+    return (luminance * (2.0 * covariance + _C2) / (variance + wanted_variance + _C2)).sum(dim=0)
+
+
+def _blur(planes: Float32[Tensor, "k h w"]) -> Float32[Tensor, "k h w"]:
+    """Every plane under an 11x11 Gaussian, as two passes of eleven."""
+    offsets = torch.arange(-_REACH_PX, _REACH_PX + 1, dtype=torch.float64, device=planes.device)
+    kernel = torch.exp(-offsets.square() / (2.0 * _SIGMA_PX**2))
+    kernel = (kernel / kernel.sum()).to(planes.dtype)
+    lines = conv2d(planes[:, None], kernel.reshape(1, 1, 1, -1), padding=(0, _REACH_PX))
+    return conv2d(lines, kernel.reshape(1, 1, -1, 1), padding=(_REACH_PX, 0))[:, 0]
