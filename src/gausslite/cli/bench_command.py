@@ -10,12 +10,14 @@ from dataclasses import asdict
 from pathlib import Path
 
 from gausslite.cli.arguments import add_regions
+from gausslite.cli.bench_gpu import run_gpu
 from gausslite.cli.map_command import choose_attention
 from gausslite.cli.progress import MappingBar
 from gausslite.datasets.open import open_source
 from gausslite.datasets.selection import frame_size, select_frames
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.evaluation.bench_cycles import FLOOR_CYCLES, BlockCost
+from gausslite.evaluation.bench_gpu import GPU_GAUSSIANS
 from gausslite.evaluation.bench_loop import Latency, LoopBench, LoopTiming
 from gausslite.evaluation.bench_raster import GAUSSIANS, OPERATIONS, SIZES, RasterBench, RasterTiming
 from gausslite.evaluation.bench_region import SHARES_PERCENT, RegionCost
@@ -34,6 +36,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     _configure_raster(benches.add_parser("raster", help=summary, description=f"Measure {summary}."))
     summary = "the whole loop of one robot on a sequence"
     _configure_loop(benches.add_parser("loop", help=summary, description=f"Measure {summary}."))
+    summary = "training on a GPU, beside gsplat called plainly"
+    _configure_gpu(benches.add_parser("gpu", help=summary, description=f"Measure {summary}."))
 
 
 def _configure_raster(parser: argparse.ArgumentParser) -> None:
@@ -67,6 +71,15 @@ def _configure_loop(parser: argparse.ArgumentParser) -> None:
     add_budget(parser)
     parser.add_argument("--json", action="store_true", help="print JSON for scripts")
     parser.set_defaults(run=run_loop)
+
+
+def _configure_gpu(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    default = ",".join(str(count) for count in GPU_GAUSSIANS)
+    add("--gaussians", metavar="N,...", type=counts, default=GPU_GAUSSIANS, help=f"default: {default}")
+    add("--reps", metavar="N", type=int, default=100, help="timed iterations of each kind (default: %(default)s)")
+    add("--json", action="store_true", help="print JSON for scripts")
+    parser.set_defaults(run=run_gpu)
 
 
 def run_raster(options: argparse.Namespace) -> int:

@@ -24,7 +24,8 @@ LOSSES = {
 TURN = 10
 """Runs of one thing before the next has its turn, so that a busy minute of the machine strikes all of them."""
 
-_RESTING = AdamSettings(means=0.0, log_scales=0.0, quats=0.0, opacity_logits=0.0, rgb=0.0)
+RESTING = AdamSettings(means=0.0, log_scales=0.0, quats=0.0, opacity_logits=0.0, rgb=0.0)
+"""Adam does all its work and moves nothing."""
 _WARM_UP = 3
 
 
@@ -72,7 +73,7 @@ class RestingStep:
             self._view,
             self._pose,
             loss,
-            _RESTING,
+            RESTING,
             self._masked,
             self._subset,
         )

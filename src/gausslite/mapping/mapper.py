@@ -46,12 +46,19 @@ class GaussianMapper:
     The same settings, seed and frames give the same map, as far as the rasterizer is deterministic.
     """
 
-    def __init__(self, settings: MapperSettings, rasterizer: Rasterizer, seed: int = 0) -> None:
-        """Reserve the memory of `settings.max_gaussians` Gaussians; seed starts all random choices."""
+    def __init__(
+        self, settings: MapperSettings, rasterizer: Rasterizer, seed: int = 0, known: Gaussians | None = None
+    ) -> None:
+        """Reserve the memory of `settings.max_gaussians` Gaussians; seed starts all random choices.
+
+        known is a map to start from. Raises QuotaError when it exceeds the settings' cap.
+        """
         self._settings = settings
         self._rasterizer = rasterizer
         self._rng = np.random.default_rng(seed)
         self._table = SplatTable(settings.max_gaussians)
+        if known is not None:
+            self._table.append(known)
         self._seeder = Seeder(settings.seeding, settings.components, self._rng)
         self._keyframes = KeyframeStore(settings.keyframes)
         self._refiner = ViewRefiner(settings.view_prior, self.render)

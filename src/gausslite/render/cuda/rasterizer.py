@@ -103,6 +103,12 @@ class CudaRasterizer:
         """`cuda`."""
         return "cuda"
 
+    @property
+    def device_name(self) -> str:
+        """What the driver calls the device."""
+        device = self._kernels.device
+        return str(torch.cuda.get_device_name(device)) if device.type == "cuda" else "processor (stand-in)"
+
     def forward(
         self,
         rows: Float32[ndarray, "n 16"],
@@ -159,7 +165,7 @@ class CudaRasterizer:
         depth_m: Float32[ndarray, "h w"],
         camera: Camera,
         weight: Float32[ndarray, "h w"] | None = None,
-    ) -> TrainingView:
+    ) -> CudaView:
         """Carry an image to the device. Raises ShapeError, InvalidInputError for weights outside [0, 1]."""
         require_view(rgb, depth_m, camera, weight)
         return CudaView.of(rgb, depth_m, camera, weight, self._kernels.device)

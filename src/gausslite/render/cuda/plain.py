@@ -1,0 +1,86 @@
+"""The library called as its manual calls it, with torch's Adam: what the cuda backend is measured against."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float32, Float64
+from numpy import ndarray
+from torch import Tensor
+
+from gausslite.domain.camera import Camera
+from gausslite.render.cuda.kernels import load_gsplat
+from gausslite.render.cuda.loss import CudaView, training_loss
+from gausslite.render.rasterizer import LOG_SCALE, LOGIT, MEAN, NEAR_M, QUAT, RGB, LossWeights
+
+Rasterization = Callable[..., tuple[Tensor, Tensor, dict[str, Any]]]
+"""gsplat.rasterization: means, quats, scales, opacities, colors, viewmats, Ks, width, height to images."""
+
+
+def gsplats_rasterization() -> Rasterization:
+    """The real one. Raises KernelError where its kernels cannot run."""
+    found: Rasterization = load_gsplat().rasterization
+    return found
+
+
+class PlainTraining:
+    """Five parameter tensors, `rasterization`, this backend's loss over the whole image, one dense Adam.
+
+    Learning rates are zero, as in the other benchmarks: every iteration does the same work. The loss is ours because
+    it is no slower than what is usual; so the difference measured lies in drawing and updating.
+    """
+
+    def __init__(
+        self,
+        rows: Float32[ndarray, "n 16"],
+        view: CudaView,
+        T_camera_world: Float64[ndarray, "4 4"],
+        loss: LossWeights,
+        rasterization: Rasterization,
+    ) -> None:
+        device = view.plain.rgb.device
+        on_device = torch.from_numpy(rows).to(device, copy=True)
+        self._parameters = [
+            torch.nn.Parameter(on_device[:, columns].clone()) for columns in (MEAN, QUAT, LOG_SCALE, LOGIT, RGB)
+        ]
+        self._adam = torch.optim.Adam(self._parameters, lr=0.0, eps=1e-15)
+        self._pose = torch.from_numpy(T_camera_world.astype(np.float32)).to(device)[None]
+        self._intrinsics = _intrinsics(view.camera).to(device)[None]
+        self._view, self._loss, self._rasterization = view, loss, rasterization
+
+    def train(self, iterations: int) -> float:
+        """So many iterations, waited for; the last one's loss."""
+        for _ in range(iterations):
+            value = self._iterate()
+        return float(value)
+
+    def _iterate(self) -> Tensor:
+        means_m, quats_wxyz, log_scales, logits, rgb = self._parameters
+        camera = self._view.camera
+        images, alphas, _ = self._rasterization(
+            means_m,
+            quats_wxyz,
+            log_scales.exp(),
+            logits.sigmoid(),
+            rgb,
+            self._pose,
+            self._intrinsics,
+            camera.width_px,
+            camera.height_px,
+            near_plane=NEAR_M,
+            render_mode="RGB+D",
+        )
+        value = training_loss(images[0], alphas[0, ..., 0], self._view.plain, self._loss)
+        self._adam.zero_grad(set_to_none=True)
+        torch.autograd.backward(value)
+        self._adam.step()
+        return value.detach()
+
+
+def _intrinsics(camera: Camera) -> Tensor:
+    return torch.tensor(
+        [[camera.fx_px, 0.0, camera.cx_px], [0.0, camera.fy_px, camera.cy_px], [0.0, 0.0, 1.0]], dtype=torch.float32
+    )
