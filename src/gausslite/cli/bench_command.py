@@ -1,4 +1,4 @@
-"""`gausslite bench`: how fast this machine draws, trains and maps."""
+"""`gausslite bench`: how fast this machine draws, trains and maps, and how good the maps are."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from pathlib import Path
 
 from gausslite.cli.arguments import add_regions
 from gausslite.cli.bench_gpu import run_gpu
+from gausslite.cli.bench_quality import configure_ablation, configure_quality
 from gausslite.cli.map_command import choose_attention
 from gausslite.cli.progress import MappingBar
 from gausslite.datasets.open import open_source
@@ -38,6 +39,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
     _configure_loop(benches.add_parser("loop", help=summary, description=f"Measure {summary}."))
     summary = "training on a GPU, beside gsplat called plainly"
     _configure_gpu(benches.add_parser("gpu", help=summary, description=f"Measure {summary}."))
+    summary = "every policy's maps on held-out views, at the same budget"
+    configure_quality(benches.add_parser("quality", help=summary, description=f"Score {summary}."))
+    summary = "the paper's components, switched on one by one"
+    configure_ablation(benches.add_parser("ablation", help=summary, description=f"Score {summary}."))
 
 
 def _configure_raster(parser: argparse.ArgumentParser) -> None:

@@ -10,17 +10,28 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from statistics import fmean
+from typing import Protocol, runtime_checkable
 
 import numpy as np
+from jaxtyping import Float32, Shaped
+from numpy import ndarray
 
 from gausslite.domain.gaussians import Gaussians
 from gausslite.errors import InvalidInputError
 from gausslite.evaluation.metrics import depth_l1_m, psnr, ssim_map
-from gausslite.evaluation.views import HeldOutView, MapViewer
+from gausslite.evaluation.views import MIN_ROI_PIXELS, HeldOutView, MapViewer
 from gausslite.render.rasterizer import Rasterizer, Rendering
 
-MIN_ROI_PIXELS = 64
 _COVERED_ALPHA = 0.5
+
+
+@runtime_checkable
+class PerceptualDistance(Protocol):
+    """How different two images look, pixel by pixel."""
+
+    def distance_map(self, a: Shaped[ndarray, "h w 3"], b: Shaped[ndarray, "h w 3"]) -> Float32[ndarray, "h w"]:
+        """0 where they look the same. Images are uint8, or floating in [0, 1]."""
+        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,6 +42,7 @@ class RoiScore:
     ssim: float
     depth_l1_m: float | None
     covered: float
+    lpips: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,11 +54,13 @@ class ViewScore:
     ssim: float
     roi_pixels: int
     roi: RoiScore | None
+    depth_l1_m: float | None = None
+    lpips: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class MapScores:
-    """Means over the views: PSNR in dB, depth in metres. None where no view has such a figure.
+    """Means over the views: PSNR in dB, depth in metres. None where no view has such a figure, or LPIPS had no weights.
 
     n_views and n_roi_views count the views behind the full and the ROI figures; roi_pixels sums the region's pixels
     over the latter.
@@ -61,6 +75,9 @@ class MapScores:
     n_views: int
     n_roi_views: int
     roi_pixels: int
+    full_depth_l1_m: float | None = None
+    roi_lpips: float | None = None
+    full_lpips: float | None = None
 
 
 def evaluate(gaussians: Gaussians, views: Sequence[HeldOutView], rasterizer: Rasterizer) -> MapScores:
@@ -69,20 +86,31 @@ def evaluate(gaussians: Gaussians, views: Sequence[HeldOutView], rasterizer: Ras
     return average([score_view(viewer.draw_frame(view.frame), view) for view in views])
 
 
-def score_view(drawn: Rendering, view: HeldOutView) -> ViewScore:
-    """Compare one rendering with its frame."""
+def score_view(drawn: Rendering, view: HeldOutView, perceptual: PerceptualDistance | None = None) -> ViewScore:
+    """Compare one rendering with its frame; LPIPS is left out without a network for it."""
     rgb = view.frame.rgb
     similarity = ssim_map(drawn.rgb, rgb)
+    depth_m = drawn.expected_depth_m(_COVERED_ALPHA)
+    distance = None if perceptual is None else perceptual.distance_map(drawn.rgb, rgb)
     roi_pixels = int(np.count_nonzero(view.roi))
     roi = None
     if roi_pixels >= MIN_ROI_PIXELS:
         roi = RoiScore(
             psnr(drawn.rgb, rgb, view.roi),
             float(similarity[view.roi].mean()),
-            depth_l1_m(drawn.expected_depth_m(_COVERED_ALPHA), view.frame.depth_m, view.roi),
+            depth_l1_m(depth_m, view.frame.depth_m, view.roi),
             float((drawn.alpha[view.roi] > _COVERED_ALPHA).mean()),
+            None if distance is None else float(distance[view.roi].mean()),
         )
-    return ViewScore(view.frame.index, psnr(drawn.rgb, rgb), float(similarity.mean()), roi_pixels, roi)
+    return ViewScore(
+        index=view.frame.index,
+        psnr=psnr(drawn.rgb, rgb),
+        ssim=float(similarity.mean()),
+        roi_pixels=roi_pixels,
+        roi=roi,
+        depth_l1_m=depth_l1_m(depth_m, view.frame.depth_m),
+        lpips=None if distance is None else float(distance.mean()),
+    )
 
 
 def average(scores: Sequence[ViewScore]) -> MapScores:
@@ -100,6 +128,9 @@ def average(scores: Sequence[ViewScore]) -> MapScores:
         n_views=len(scores),
         n_roi_views=len(rois),
         roi_pixels=sum(score.roi_pixels for score in scores if score.roi is not None),
+        full_depth_l1_m=_mean_or_none(score.depth_l1_m for score in scores if score.depth_l1_m is not None),
+        roi_lpips=_mean_or_none(roi.lpips for roi in rois if roi.lpips is not None),
+        full_lpips=_mean_or_none(score.lpips for score in scores if score.lpips is not None),
     )
 
 

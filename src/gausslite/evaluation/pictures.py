@@ -34,7 +34,7 @@ def comparison_sheet(view: HeldOutView, drawings: Mapping[str, Float32[ndarray, 
     truth_rgb = view.frame.rgb
     for name, drawing in drawings.items():
         require_array(f"drawing {name}", drawing, truth_rgb.shape, np.float32)
-    columns = {"ground truth": truth_rgb} | {name: _to_uint8(drawing) for name, drawing in drawings.items()}
+    columns = {"ground truth": truth_rgb} | {name: as_bytes(drawing) for name, drawing in drawings.items()}
     rows = [[_cell(_outlined(image, view.roi), label) for label, image in columns.items()]]
     rows += [
         [_cell(_crop(image, piece), f"{label}: detail") for label, image in columns.items()]
@@ -42,7 +42,7 @@ def comparison_sheet(view: HeldOutView, drawings: Mapping[str, Float32[ndarray, 
     ]
     if drawings:
         truth = truth_rgb / np.float32(255.0)
-        differences = [_to_uint8(_DIFFERENCE_GAIN * np.abs(drawing - truth)) for drawing in drawings.values()]
+        differences = [as_bytes(_DIFFERENCE_GAIN * np.abs(drawing - truth)) for drawing in drawings.values()]
         region = _cell(_lit(truth_rgb, view.roi), "region of the task")
         cells = [
             _cell(_outlined(difference, view.roi), f"{name}: difference x{_DIFFERENCE_GAIN:g}")
@@ -60,7 +60,8 @@ def write_png(path: Path, image: UInt8[ndarray, "h w 3"]) -> None:
     write_whole(path, encoded.tobytes())
 
 
-def _to_uint8(image: Float32[ndarray, "h w 3"]) -> UInt8[ndarray, "h w 3"]:
+def as_bytes(image: Float32[ndarray, "h w 3"]) -> UInt8[ndarray, "h w 3"]:
+    """Colours in [0, 1] as 0 to 255; what lies beyond is cut off."""
     rounded: UInt8[ndarray, "h w 3"] = np.rint(np.clip(image, 0.0, 1.0) * 255.0).astype(np.uint8)
     return rounded
 

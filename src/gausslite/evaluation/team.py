@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
-import numpy as np
 from jaxtyping import Float32, UInt8
 from numpy import ndarray
 
@@ -13,9 +12,9 @@ from gausslite.datasets.source import Source
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.region import Region
 from gausslite.errors import InvalidInputError
-from gausslite.evaluation.compare import MIN_ROI_PIXELS, MapScores, ViewScore, average, score_view
+from gausslite.evaluation.compare import MapScores, ViewScore, average, score_view
 from gausslite.evaluation.pictures import comparison_sheet
-from gausslite.evaluation.views import HeldOutView, MapViewer
+from gausslite.evaluation.views import HeldOutView, MapViewer, most_telling
 from gausslite.render.rasterizer import Rasterizer
 
 
@@ -52,7 +51,7 @@ def score_team(
         raise InvalidInputError("held-out views: expected at least one frame with depth, got none")
     viewers = {name: MapViewer(gaussians, rasterizer) for name, gaussians in maps.items()}
     scores: dict[str, list[ViewScore]] = {name: [] for name in maps}
-    shown = _most_telling(views, sheets)
+    shown = most_telling(views, sheets)
     pictures = {}
     for i, view in enumerate(views):
         drawings: dict[str, Float32[ndarray, "h w 3"]] = {}
@@ -70,13 +69,3 @@ def _views(point: Viewpoints, regions: Sequence[Region]) -> Iterable[HeldOutView
         frame = point.source.frame(position, point.size)
         if frame.has_depth:
             yield HeldOutView.of(frame, regions)
-
-
-def _most_telling(views: Sequence[HeldOutView], count: int) -> set[int]:
-    """From each of `count` stretches of the sequence, the view with the largest region."""
-    if count < 1:
-        return set()
-    pixels = np.array([np.count_nonzero(view.roi) for view in views])
-    stretches = [part for part in np.array_split(np.arange(len(views)), count) if len(part)]
-    best = {int(part[np.argmax(pixels[part])]) for part in stretches}
-    return {i for i in best if pixels[i] >= MIN_ROI_PIXELS} or best

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +17,9 @@ from gausslite.domain.pose import inverse
 from gausslite.domain.region import Region
 from gausslite.optimize.parameters import gaussians_to_rows
 from gausslite.render.rasterizer import Rasterizer, Rendering
+
+MIN_ROI_PIXELS = 64
+"""A view that shows fewer of the region's pixels says nothing of it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,6 +39,16 @@ class HeldOutView:
         for region in regions:
             roi |= region.mask(frame)
         return cls(frame, roi)
+
+
+def most_telling(views: Sequence[HeldOutView], count: int) -> set[int]:
+    """From each of `count` stretches of the sequence, the view with the largest region."""
+    if count < 1:
+        return set()
+    pixels = np.array([np.count_nonzero(view.roi) for view in views])
+    stretches = [part for part in np.array_split(np.arange(len(views)), count) if len(part)]
+    best = {int(part[np.argmax(pixels[part])]) for part in stretches}
+    return {i for i in best if pixels[i] >= MIN_ROI_PIXELS} or best
 
 
 class MapViewer:

@@ -49,14 +49,19 @@ def add_policy(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument_group("mapping").add_argument
     add("--policy", choices=sorted(POLICIES), default="task", help="how to spend the budget (default: task)")
     add("--without", metavar="A,B", type=names, default=(), help="components off: sb mvo roi sis gfd")
-    add(
+    add("--rasterizer", choices=BACKENDS, default="auto", help="what draws and trains the map (default: auto)")
+    add_view_error(parser)
+
+
+def add_view_error(parser: argparse.ArgumentParser) -> None:
+    """Add --view-error, for cameras whose poses and colours cannot be trusted to the pixel."""
+    parser.add_argument(
         "--view-error",
         metavar="M,DEG[,GAIN,OFFSET]",
         type=ViewPrior.parse,
         default=ViewPrior(),
         help="how wrong poses (and colours, from 0 to 1) may be; keyframes are refined within that (default: trusted)",
     )
-    add("--rasterizer", choices=BACKENDS, default="auto", help="what draws and trains the map (default: auto)")
 
 
 def add_budget(parser: argparse.ArgumentParser) -> None:

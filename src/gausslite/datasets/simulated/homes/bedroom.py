@@ -32,7 +32,7 @@ WALKS = (
         ((2.9, 3.5, 1.45), (2.2, 3.9, 0.5)),
         ((3.1, 3.4, 1.50), (0.9, 3.4, 0.6)),
         ((3.4, 2.6, 1.50), (2.4, 0.3, 0.8)),
-        ((3.0, 1.6, 1.50), (1.8, 0.3, 0.9)),
+        ((2.6, 1.9, 1.50), (4.4, 1.6, 0.6)),
         ((2.3, 0.95, 1.45), (2.0, 2.0, 0.4)),
         ((1.4, 0.9, 1.50), (0.8, 2.9, 0.6)),
         ((0.6, 0.85, 1.50), (0.4, 3.3, 0.6)),
@@ -52,8 +52,8 @@ WALKS = (
         ((3.1, 1.3, 1.0), (2.4, 2.5, 0.1)),
         ((3.0, 2.2, 1.95), (2.35, 2.5, 0.05)),
         ((2.9, 3.0, 1.05), (2.4, 2.5, 0.1)),
-        ((1.9, 1.7, 1.95), (2.4, 0.3, 0.9)),
-        ((3.1, 1.9, 1.05), (2.2, 0.3, 1.0)),
+        ((2.7, 2.3, 1.95), (4.4, 1.6, 0.6)),
+        ((2.5, 1.5, 1.10), (4.4, 1.5, 0.7)),
     ),
 )
 
@@ -77,8 +77,8 @@ def furnish(rng: np.random.Generator) -> list[Item]:
     room.drop("mug", small.cup("mug_dots"), 2.42, 3.88, 0.495, 140)
     room.drop("phone", devices.phone("phone_screen"), 2.28, 3.82, 0.495, 70)
     room.put("rug", furniture.lying_sheet("other_rug", 1.5, 2.0, 0.012), 2.9, 2.4)
-    room.drop("shoes_1", small.shoes("sneaker"), 2.3, 2.55, 0.012, 65)
-    room.drop("shoes_2", small.shoes("boot", "rubber"), 4.2, 0.5, 0, 30)
+    room.drop("shoe_1", small.shoes("sneaker"), 2.3, 2.55, 0.012, 65)
+    room.drop("shoe_2", small.shoes("boot", "rubber"), 4.2, 0.5, 0, 30)
     room.lean("wardrobe", furniture.cupboard((1.5, 0.6, 2.05), "doors", "light_wood", 2), "south", 2.3)
     room.put("box_1", furniture.carton("carton", 0.5, 0.4, 0.28), 2.0, 0.32, 2.05, 5)
     room.put("suitcase", furniture.carton("leather", 0.7, 0.45, 0.24), 2.65, 0.33, 2.05, -4)

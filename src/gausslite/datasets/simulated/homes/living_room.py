@@ -93,7 +93,7 @@ def furnish(rng: np.random.Generator) -> list[Item]:
     room.lean("picture_3", furniture.flat_picture("photo", 0.3, 0.36), "east", 2.7, 1.4)
     room.lean("clock", small.wall_clock("clock_face"), "east", 3.3, 1.7)
     room.lean("door", furniture.flat_picture("door", 0.86, 2.05), "north", 0.85)
-    room.drop("shoes", small.shoes("sneaker"), 0.95, 3.55, 0, 160)
+    room.drop("shoe", small.shoes("sneaker"), 0.95, 3.55, 0, 160)
     room.drop("books", furniture.books(), 1.05, 2.15, 0.4, 15)
     return room.items
 

@@ -98,7 +98,7 @@ def furnish(rng: np.random.Generator) -> list[Item]:
     room.put("crate", small.crate("worn_wood"), 4.5, 0.45, 0, -8)
     room.put("vase", small.round_vase("vase_print"), 4.5, 0.45, 0.015)
     room.drop("ottoman", seating.ottoman("accent_knit"), 2.75, 1.75)
-    room.drop("shoes", small.shoes("sneaker"), 1.15, 1.05, 0, 200)
+    room.drop("shoe", small.shoes("sneaker"), 1.15, 1.05, 0, 200)
     room.put("guitar_case", furniture.carton("leather", 0.4, 0.14, 1.1), 0.25, 1.25, 0, 80)
     room.put("blanket", [Part(draped(0.34, 0.6, 0.2), "plaid")], 2.75, 1.75, 0.41, 30)
     room.put("phone", devices.phone("phone_screen"), 4.95, 1.6, 0.51, 40)

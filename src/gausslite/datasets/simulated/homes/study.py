@@ -100,7 +100,7 @@ def furnish(rng: np.random.Generator) -> list[Item]:
     room.lean("poster", furniture.flat_picture("poster", 0.6, 0.85, 0.01), "south", 2.3, 1.1)
     room.lean("door", furniture.flat_picture("door", 0.84, 2.03), "west", 0.6)
     room.put("bin", small.basket("dark_weave", "paper", 0.16, 0.3), 0.45, 3.2)
-    room.drop("shoes", small.shoes("boot", "rubber"), 0.4, 2.6, 0, 100)
+    room.drop("shoe", small.shoes("boot", "rubber"), 0.4, 2.6, 0, 100)
     room.put("plant_2", small.little_tree("stone_pot", "leaf"), 0.35, 1.25)
     return room.items
 

@@ -1,0 +1,225 @@
+"""`gausslite bench quality` and `bench ablation`: how well maps show what the task is about, at the same budget."""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from gausslite.codec.files import write_whole
+from gausslite.errors import InvalidInputError
+from gausslite.evaluation.quality.ablation import cumulative_variants
+from gausslite.evaluation.quality.pairs import HomePair, choose_pairs
+from gausslite.evaluation.quality.scenes import HomeScenePlan, ScenePlan, real_plans
+from gausslite.evaluation.quality.study import Archive, Study, run_study
+from gausslite.evaluation.quality.tables import Scoreboard, ablation_table, quality_table
+from gausslite.evaluation.quality.trials import Budget, Conditions, Equal, Eyes, Trial, TrialResult, Variant
+from gausslite.mapping.policies import POLICIES
+from gausslite.mission.options import add_colour_camera, add_view_error, names, up_axis
+from gausslite.mission.results import write_json
+from gausslite.mission.settings import PerceptionSettings
+
+_ABLATION_PAIR = "home-4-manipulation"
+
+
+def configure_quality(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `bench quality`."""
+    add = parser.add_argument
+    add("--pairs", metavar="A,B", type=names, default=(), help="such as home-3,home-4-search (default: all 24)")
+    add("--policies", metavar="A,B", type=names, default=tuple(POLICIES), help="ours first (default: all there are)")
+    add(
+        "--equal",
+        choices=[str(each) for each in Equal],
+        default=str(Equal.ITERATIONS),
+        help="a frame: same count or time",
+    )
+    _add_common(parser, seeds=(0,))
+    add("--perception", metavar="gt|words|FILE.onnx", default="gt", help="masks given (default), or found by the task")
+    parser.set_defaults(run=run_quality)
+
+
+def configure_ablation(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `bench ablation`."""
+    add = parser.add_argument
+    add("--pair", metavar="NAME", default=_ABLATION_PAIR, help="the home and task (default: %(default)s)")
+    _add_common(parser, seeds=(0, 1, 2))
+    parser.set_defaults(run=run_ablation)
+
+
+def run_quality(options: argparse.Namespace) -> int:
+    """Compare policies and write quality.md, quality.json and sheets of pictures."""
+    variants = [Variant(name, name) for name in options.policies]
+    if not variants:
+        raise InvalidInputError(f"policies: expected names among {', '.join(POLICIES)}, got none")
+    plans = _real(options)
+    if options.pairs or not plans:
+        plans = [*_homes(options, choose_pairs(options.pairs)), *plans]
+    budgets = [_budget(options, Equal(options.equal))]
+    study = Study(plans, variants, budgets, options.seeds, _conditions(options, _eyes(options)))
+    board = _run(study, options)
+    _write(options.out, "quality", quality_table(board), board)
+    return 0
+
+
+def run_ablation(options: argparse.Namespace) -> int:
+    """Switch the components on one by one, at equal iterations and at equal time; write ablation.md and .json."""
+    plans: list[ScenePlan] = [*_homes(options, choose_pairs([options.pair])), *_real(options)]
+    budgets = [_budget(options, equal) for equal in Equal]
+    study = Study(plans, cumulative_variants(), budgets, options.seeds, _conditions(options, Eyes()))
+    board = _run(study, options)
+    _write(options.out, "ablation", ablation_table(board), board)
+    return 0
+
+
+def _add_common(parser: argparse.ArgumentParser, seeds: tuple[int, ...]) -> None:
+    add = parser.add_argument
+    shown = ",".join(str(seed) for seed in seeds)
+    add("--out", metavar="DIR", type=Path, required=True, help="gets tables and sheets; finished trials there are kept")
+    add("--seeds", metavar="N,...", type=whole_numbers, default=seeds, help=f"seeds of the mapper (default: {shown})")
+    add("--size", metavar="WxH", type=size, default=(320, 240), help="image size (default: 320x240)")
+    add("--frames", metavar="N", type=int, help="training frames (default: 60 in a home, all of a real sequence)")
+    add("--views", metavar="N", type=int, default=24, help="held-out views in a home (default: %(default)s)")
+    budget = Budget()
+    add("--max-gaussians", metavar="N", type=int, default=budget.max_gaussians, help="hard cap (default: %(default)s)")
+    add(
+        "--iterations",
+        metavar="N",
+        type=int,
+        default=budget.iterations,
+        help="a frame, when equal (default: %(default)s)",
+    )
+    add(
+        "--rate",
+        metavar="HZ",
+        type=float,
+        default=budget.rate_hz,
+        help="frames a second at equal time (default: %(default)s)",
+    )
+    add("--threads", metavar="N", type=int, help="threads (default: all the processor allows)")
+    add("--lpips-weights", metavar="PATH", type=Path, action="append", default=[], help="AlexNet's and LPIPS' weights")
+    add_view_error(parser)
+    add("--fit-views", action="store_true", help="score a second time with each view's pose and colours fitted")
+    real = parser.add_argument_group("a real sequence")
+    real.add_argument(
+        "--real", metavar="FOLDER", type=Path, help="measure on this sequence (too, when homes are named)"
+    )
+    real.add_argument(
+        "--roi", metavar="FILE.npz", type=Path, help="its ground-truth regions; one pair a kind of object"
+    )
+    real.add_argument("--up", metavar="X,Y,Z", type=up_axis, help="its upward direction, if not the source's")
+    add_colour_camera(parser)
+
+
+def _homes(options: argparse.Namespace, pairs: Sequence[HomePair]) -> list[HomeScenePlan]:
+    return [HomeScenePlan(pair, options.frames or 60, options.views) for pair in pairs]
+
+
+def _real(options: argparse.Namespace) -> list[ScenePlan]:
+    if (options.real is None) != (options.roi is None):
+        raise InvalidInputError(
+            "--real: expected a folder and its regions, --real FOLDER --roi FILE.npz; got one of them"
+        )
+    if options.real is None:
+        return []
+    return [*real_plans(options.real, options.roi, options.frames, options.up, options.colour_camera)]
+
+
+def _budget(options: argparse.Namespace, equal: Equal) -> Budget:
+    return Budget(options.max_gaussians, equal, options.iterations, options.rate)
+
+
+def _conditions(options: argparse.Namespace, eyes: Eyes) -> Conditions:
+    return Conditions(options.size, eyes, options.view_error, options.fit_views, options.threads)
+
+
+def _eyes(options: argparse.Namespace) -> Eyes:
+    if options.perception == "gt":
+        return Eyes()
+    if options.perception == "words":
+        return Eyes(words=True)
+    return Eyes(words=True, detector=PerceptionSettings(Path(options.perception), threads=options.threads))
+
+
+def _run(study: Study, options: argparse.Namespace) -> Scoreboard:
+    for plan in study.plans:
+        for trial in study.trials(plan):
+            trial.mission.mapper_settings()  # a wrong name or number is told before hours of work
+    perceptual = None
+    if options.lpips_weights:
+        from gausslite.evaluation.lpips import load_lpips
+
+        perceptual = load_lpips(options.lpips_weights)
+    archive = Archive(options.out)
+    with _StudyBar(study.count) as bar:
+        return Scoreboard(run_study(study, archive, perceptual, bar))
+
+
+class _StudyBar:
+    """A bar over trials, and a line for each."""
+
+    def __init__(self, count: int) -> None:
+        from tqdm import tqdm
+
+        on_terminal = sys.stderr.isatty()
+        self._bar = tqdm(
+            total=count,
+            desc="trials",
+            unit="trial",
+            mininterval=0.2 if on_terminal else 10.0,
+            dynamic_ncols=on_terminal,
+            file=sys.stderr,
+        )
+        self._on_terminal = on_terminal
+        self._frames = 0
+
+    def __enter__(self) -> _StudyBar:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.close()
+
+    def frame(self, gaussians: int) -> None:
+        """Show that a trial goes on."""
+        self._frames += 1
+        text = f"frame {self._frames}, {gaussians / 1e3:.1f}k Gaussians"
+        self._bar.set_postfix_str(text, refresh=self._on_terminal)
+
+    def finished(self, trial: Trial, result: TrialResult, kept: bool) -> None:
+        """Leave the trial's figures on the screen."""
+        self._frames = 0
+        scores = result.scores
+        roi = "no view shows the region" if scores.roi_psnr is None else f"ROI {scores.roi_psnr:.2f} dB"
+        how = " (kept)" if kept else ""
+        self._bar.write(
+            f"{trial.plan.name} {trial.variant.label} equal {trial.budget.equal} seed {trial.seed}: "
+            f"{roi}, full {scores.full_psnr:.2f} dB{how}",
+            file=sys.stderr,
+        )
+        self._bar.update()
+
+
+def _write(folder: Path, name: str, table: str, board: Scoreboard) -> None:
+    command = shlex.join(["gausslite", *sys.argv[1:]])
+    text = f"# bench {name}\n\n`{command}`\n\n{table}"
+    write_whole(folder / f"{name}.md", text.encode())
+    write_json(folder / f"{name}.json", {"command": command, **board.as_json()})
+    print(table)
+    print(f"→ {folder / f'{name}.md'}")
+
+
+def whole_numbers(text: str) -> tuple[int, ...]:
+    """Read "N,N"; argparse reports what is wrong."""
+    parts = names(text)
+    if not parts or not all(part.isascii() and part.isdigit() and len(part) < 10 for part in parts):
+        raise argparse.ArgumentTypeError(f"expected whole numbers such as 0,1,2, got {text!r}")
+    return tuple(int(part) for part in parts)
+
+
+def size(text: str) -> tuple[int, int]:
+    """Read "WxH"; argparse reports what is wrong."""
+    sides = text.lower().split("x")
+    if len(sides) != 2 or not all(side.isascii() and side.isdigit() and 16 <= int(side[:6]) <= 4096 for side in sides):
+        raise argparse.ArgumentTypeError(f"expected WIDTHxHEIGHT with sides of 16 to 4096, got {text!r}")
+    return int(sides[0]), int(sides[1])

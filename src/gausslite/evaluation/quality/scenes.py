@@ -1,0 +1,225 @@
+"""What a trial maps and is judged on: training frames with their masks, and held-out views off the training walk."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Float32
+from numpy import ndarray
+
+from gausslite.datasets.open import open_source
+from gausslite.datasets.regions import balls_for_small_objects, choose_regions, load_voxel_regions
+from gausslite.datasets.registration import ColourCamera
+from gausslite.datasets.source import Source
+from gausslite.domain.frame import Frame
+from gausslite.domain.pose import UpAxis
+from gausslite.domain.region import Region
+from gausslite.domain.relevance import RelevanceMap
+from gausslite.errors import DatasetError, InvalidInputError
+from gausslite.evaluation.held_out import HoldOut
+from gausslite.evaluation.quality.pairs import HomePair
+from gausslite.evaluation.views import HeldOutView
+from gausslite.mission.settings import SceneKnowledge
+from gausslite.perception.fixed import RegionAttention
+from gausslite.perception.vocabulary import head_of
+
+_WALKS = (0, 1)
+_FIRST_WALK_SHARE = 2 / 3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scene:
+    """A task in a place, in memory: every trial on it sees the same frames and the same masks."""
+
+    task: str
+    training: Sequence[Frame]
+    masks: Sequence[RelevanceMap]
+    held_out: Sequence[HeldOutView]
+    knowledge: SceneKnowledge
+
+    @property
+    def roi_share(self) -> float:
+        """Share of the pixels that show the region, over the held-out views that show it at all."""
+        shares = [float(view.roi.mean()) for view in self.held_out if view.roi.any()]
+        return float(np.mean(shares)) if shares else 0.0
+
+
+@runtime_checkable
+class ScenePlan(Protocol):
+    """A scene before its frames are made."""
+
+    @property
+    def name(self) -> str:
+        """A short name for tables and files."""
+        ...
+
+    @property
+    def task(self) -> str:
+        """What the robot is asked to do."""
+        ...
+
+    def settings(self) -> Mapping[str, object]:
+        """All that its frames depend on, for telling finished trials from others."""
+        ...
+
+    def load(self, size: tuple[int, int]) -> Scene:
+        """Make the frames at (width, height). Raises DatasetError, InvalidInputError."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class HomeScenePlan:
+    """A pair in its simulated home: both training walks with a real camera's flaws, held-out views without."""
+
+    pair: HomePair
+    frames: int = 60
+    views: int = 24
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name, value in (("frames", self.frames), ("views", self.views)):
+            if value < 2:
+                raise InvalidInputError(f"{name}: expected at least 2, got {value}")
+
+    @property
+    def name(self) -> str:
+        """Such as home-3-search."""
+        return self.pair.name
+
+    @property
+    def task(self) -> str:
+        """The pair's."""
+        return self.pair.task
+
+    def settings(self) -> Mapping[str, object]:
+        """The walks and the objects."""
+        return {
+            "specs": [self._spec(*walk) for walk in self._training_walks()] + [self._held_out_spec()],
+            "task": self.task,
+            "objects": list(self.pair.objects),
+        }
+
+    def load(self, size: tuple[int, int]) -> Scene:
+        """Both walks one after the other, as one mission."""
+        walks = [open_source(f"{self._spec(*walk)}&size={size[0]}x{size[1]}") for walk in self._training_walks()]
+        training = [walk.frame(i) for walk in walks for i in range(len(walk))]
+        beside = open_source(f"{self._held_out_spec()}&size={size[0]}x{size[1]}")
+        regions = choose_regions(walks[0].regions(), self.pair.objects)
+        views = [HeldOutView.of(beside.frame(i), regions) for i in range(len(beside))]
+        return _scene(self.task, training, views, regions, SceneKnowledge.of(walks[0]))
+
+    def _training_walks(self) -> list[tuple[int, int]]:
+        first = max(1, round(_FIRST_WALK_SHARE * self.frames))
+        return list(zip(_WALKS, (first, self.frames - first), strict=True))
+
+    def _spec(self, trajectory: int, frames: int) -> str:
+        return f"sim:home-{self.pair.home}?seed={self.seed}&trajectory={trajectory}&frames={frames}"
+
+    def _held_out_spec(self) -> str:
+        return f"{self._spec(2, self.views)}&noise=0&exposure=0"
+
+
+@dataclass(frozen=True, slots=True)
+class RealScenePlan:
+    """A real sequence and the objects of one kind in it; every eighth frame is held out.
+
+    frames, when given, thins the sequence to about that many training frames.
+    """
+
+    folder: Path
+    roi: Path
+    kind: str
+    objects: tuple[str, ...]
+    frames: int | None = None
+    up_axis: UpAxis | None = None
+    colour_camera: ColourCamera | None = None
+    hold_out: HoldOut = field(default_factory=HoldOut)
+
+    @property
+    def name(self) -> str:
+        """Such as redkitchen-chair."""
+        return f"{self.folder.name}-{self.kind}"
+
+    @property
+    def task(self) -> str:
+        """A search for the kind."""
+        return f"Find the {self.kind}"
+
+    def settings(self) -> Mapping[str, object]:
+        """The folder, the objects and what is used of the frames."""
+        camera = None if self.colour_camera is None else str(self.colour_camera)
+        used = {"frames": self.frames, "up": self.up_axis, "hold_out": self.hold_out.every, "colour_camera": camera}
+        return {"folder": str(self.folder.resolve()), "objects": list(self.objects), **used}
+
+    def load(self, size: tuple[int, int]) -> Scene:
+        """The frames with depth, split."""
+        source = open_source(str(self.folder), self.up_axis, self.colour_camera)
+        regions = choose_regions(balls_for_small_objects(load_voxel_regions(self.roi)), self.objects)
+        training, held_out = self.hold_out.split(self._positions(source))
+        views = [HeldOutView.of(source.frame(i, size), regions) for i in held_out]
+        frames = [source.frame(i, size) for i in training]
+        return _scene(self.task, frames, views, regions, SceneKnowledge(source.up_axis))
+
+    def _positions(self, source: Source) -> list[int]:
+        if self.frames is None:
+            return list(range(len(source)))
+        count = min(len(source), round(self.frames * self.hold_out.every / (self.hold_out.every - 1)))
+        return sorted({round(i) for i in np.linspace(0, len(source) - 1, count)})
+
+
+def real_plans(
+    folder: Path,
+    roi: Path,
+    frames: int | None = None,
+    up_axis: UpAxis | None = None,
+    colour_camera: ColourCamera | None = None,
+) -> list[RealScenePlan]:
+    """One plan for each kind of object in the file: mug_1 and mug_2 are the kind mug. Raises DatasetError."""
+    kinds: dict[str, list[str]] = {}
+    for name in load_voxel_regions(roi):
+        kinds.setdefault(head_of(name), []).append(name)
+    return [
+        RealScenePlan(folder, roi, kind, tuple(objects), frames, up_axis, colour_camera)
+        for kind, objects in kinds.items()
+    ]
+
+
+class RecalledAttention:
+    """An Attention that knows each training frame's mask from before, so that no policy pays for making it."""
+
+    def __init__(self, scene: Scene) -> None:
+        pairs = zip(scene.training, scene.masks, strict=True)
+        self._masks = {frame.T_world_camera.tobytes(): mask for frame, mask in pairs}
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """None: nothing has to be found."""
+        return ()
+
+    def attend(self, frame: Frame, rendered_depth_m: Float32[ndarray, "h w"] | None = None) -> RelevanceMap:
+        """The ground truth."""
+        del rendered_depth_m
+        return self._masks[frame.T_world_camera.tobytes()]
+
+    def late(self) -> None:
+        """Nothing: every frame's relevance is known at once."""
+        return
+
+
+def _scene(
+    task: str,
+    training: Sequence[Frame],
+    views: Sequence[HeldOutView],
+    regions: Sequence[Region],
+    knowledge: SceneKnowledge,
+) -> Scene:
+    usable = [frame for frame in training if frame.has_depth]
+    seen = [view for view in views if view.frame.has_depth]
+    if not usable or not seen:
+        raise DatasetError(f"{task!r}: expected training frames and held-out views with depth, got none")
+    attention = RegionAttention(regions)
+    return Scene(task, usable, [attention.attend(frame) for frame in usable], seen, knowledge)

@@ -1,0 +1,147 @@
+"""Many trials, one after the other; what is finished is kept in a folder and never run twice."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Float32
+from numpy import ndarray
+
+from gausslite.errors import GaussLiteError, StorageError
+from gausslite.evaluation.compare import PerceptualDistance
+from gausslite.evaluation.pictures import comparison_sheet, write_png
+from gausslite.evaluation.quality.scenes import Scene, ScenePlan
+from gausslite.evaluation.quality.trials import (
+    PICTURES,
+    Budget,
+    Conditions,
+    Pictures,
+    Trial,
+    TrialResult,
+    Variant,
+    run_trial,
+)
+from gausslite.evaluation.views import most_telling
+from gausslite.mission.results import prepare_folder, write_json
+
+
+@runtime_checkable
+class Watcher(Protocol):
+    """Is told how a study goes on."""
+
+    def frame(self, gaussians: int) -> None:
+        """A frame was mapped."""
+        ...
+
+    def finished(self, trial: Trial, result: TrialResult, kept: bool) -> None:
+        """A trial has its result; kept says that it had it before."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Study:
+    """Every variant on every scene, from every seed, within each budget."""
+
+    plans: Sequence[ScenePlan]
+    variants: Sequence[Variant]
+    budgets: Sequence[Budget]
+    seeds: Sequence[int]
+    conditions: Conditions
+
+    def trials(self, plan: ScenePlan) -> list[Trial]:
+        """Those on one scene, each seed's variants beside each other."""
+        return [
+            Trial(plan, variant, budget, seed, self.conditions)
+            for budget in self.budgets
+            for seed in self.seeds
+            for variant in self.variants
+        ]
+
+    @property
+    def count(self) -> int:
+        """Trials in all."""
+        return len(self.plans) * len(self.budgets) * len(self.seeds) * len(self.variants)
+
+
+class Archive:
+    """A folder of finished trials: in trials/ a record each and what its map looked like, in sheets/ comparisons."""
+
+    def __init__(self, folder: Path) -> None:
+        """Raises StorageError where the folder cannot be written."""
+        self._trials, self._sheets = folder / "trials", folder / "sheets"
+        for part in (self._trials, self._sheets):
+            prepare_folder(part)
+
+    def recall(self, trial: Trial, with_lpips: bool) -> TrialResult | None:
+        """The result of a finished trial; None when there is none, or one without the LPIPS that is wanted now."""
+        try:
+            result = TrialResult.from_json(json.loads(self._record(trial).read_text())["result"])
+        except (OSError, ValueError, KeyError, GaussLiteError):
+            return None
+        return None if with_lpips and result.scores.full_lpips is None else result
+
+    def keep(self, trial: Trial, result: TrialResult, pictures: Pictures) -> None:
+        """Write a finished trial, its record last. Raises StorageError."""
+        for position, picture in pictures.items():
+            write_png(self._picture(trial, position), picture)
+        write_json(self._record(trial), {"settings": _summary(trial), "result": result.as_json()})
+
+    def draw_sheets(self, trials: Sequence[Trial], scene: Scene) -> None:
+        """Write ground truth and these trials' maps side by side, with crops of the region. Raises StorageError."""
+        for position in sorted(most_telling(scene.held_out, PICTURES)):
+            drawings = {trial.variant.label: self._drawing(trial, position) for trial in trials}
+            sheet = comparison_sheet(scene.held_out[position], drawings)
+            write_png(self._sheets / f"{trials[0].plan.name}-view-{position:03d}.png", sheet)
+
+    def _drawing(self, trial: Trial, position: int) -> Float32[ndarray, "h w 3"]:
+        import cv2
+
+        path = self._picture(trial, position)
+        image = cv2.imread(str(path), cv2.IMREAD_COLOR)
+        if image is None:
+            raise StorageError(f"{path}: expected a kept picture; remove the folder to draw it again")
+        return np.ascontiguousarray(image[..., ::-1]).astype(np.float32) / np.float32(255.0)
+
+    def _record(self, trial: Trial) -> Path:
+        return self._trials / f"{trial.key}.json"
+
+    def _picture(self, trial: Trial, position: int) -> Path:
+        return self._trials / f"{trial.key}-view-{position:03d}.png"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Finished:
+    """A trial and what it gave."""
+
+    trial: Trial
+    result: TrialResult
+
+
+def run_study(
+    study: Study, archive: Archive, perceptual: PerceptualDistance | None, watcher: Watcher
+) -> list[Finished]:
+    """Run what is not finished yet. A scene's frames are made only if one of its trials needs them."""
+    finished = []
+    for plan in study.plans:
+        scene: Scene | None = None
+        for trial in study.trials(plan):
+            result = archive.recall(trial, perceptual is not None)
+            kept = result is not None
+            if result is None:
+                scene = plan.load(study.conditions.size) if scene is None else scene
+                result, pictures = run_trial(trial, scene, perceptual, watcher.frame)
+                archive.keep(trial, result, pictures)
+            finished.append(Finished(trial, result))
+            watcher.finished(trial, result, kept)
+        if scene is not None:
+            archive.draw_sheets(study.trials(plan)[: len(study.variants)], scene)
+    return finished
+
+
+def _summary(trial: Trial) -> Mapping[str, object]:
+    return {"scene": dict(trial.plan.settings()), "mission": str(trial.mission), "conditions": str(trial.conditions)}

@@ -1,0 +1,197 @@
+"""One trial: one policy maps one scene from one seed within the budget, and is scored on the held-out views."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from enum import StrEnum
+from typing import Any
+
+from jaxtyping import UInt8
+from numpy import ndarray
+
+from gausslite.errors import InvalidInputError
+from gausslite.evaluation.compare import MapScores, PerceptualDistance, average, score_view
+from gausslite.evaluation.fitted import draw_fitted
+from gausslite.evaluation.pictures import as_bytes
+from gausslite.evaluation.quality.scenes import RecalledAttention, Scene, ScenePlan
+from gausslite.evaluation.views import MapViewer, most_telling
+from gausslite.mapping.pace import Pace
+from gausslite.mission.build import build_attention, build_mapper
+from gausslite.mission.settings import MissionSettings, PerceptionSettings
+from gausslite.optimize.view_fit import ViewPrior
+from gausslite.perception.attention import Attention
+from gausslite.perception.fixed import NoAttention
+from gausslite.pipeline import TaskMapper
+from gausslite.render.choose import choose_rasterizer
+
+PICTURES = 2
+
+
+class Equal(StrEnum):
+    """What all policies get the same of, a frame."""
+
+    ITERATIONS = "iterations"
+    TIME = "time"
+
+
+@dataclass(frozen=True, slots=True)
+class Budget:
+    """What every policy may spend: Gaussians in all, and iterations or 1 / rate_hz seconds a frame."""
+
+    max_gaussians: int = 60_000
+    equal: Equal = Equal.ITERATIONS
+    iterations: int = 8
+    rate_hz: float = 4.0
+
+
+@dataclass(frozen=True, slots=True)
+class Variant:
+    """A policy with components switched off; label names it in tables."""
+
+    label: str
+    policy: str
+    without: frozenset[str] = frozenset()
+
+
+@dataclass(frozen=True, slots=True)
+class Eyes:
+    """How the task's region is found: by ground-truth masks, or by the task's words and a detector.
+
+    detector None with words means the words are looked up among the scene's ground-truth objects.
+    """
+
+    words: bool = False
+    detector: PerceptionSettings = field(default_factory=PerceptionSettings)
+
+
+@dataclass(frozen=True, slots=True)
+class Conditions:
+    """What is the same for every trial of a study.
+
+    view_prior says how wrong poses and colours may be, for mapping; with fit_views the held-out views are scored a
+    second time with their own pose and colours fitted.
+    """
+
+    size: tuple[int, int]
+    eyes: Eyes = field(default_factory=Eyes)
+    view_prior: ViewPrior = field(default_factory=ViewPrior)
+    fit_views: bool = False
+    threads: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """Everything that decides a result."""
+
+    plan: ScenePlan
+    variant: Variant
+    budget: Budget
+    seed: int
+    conditions: Conditions
+
+    @property
+    def mission(self) -> MissionSettings:
+        """How the robot maps. Raises InvalidInputError for an unknown policy or component."""
+        timed = self.budget.equal is Equal.TIME
+        return MissionSettings(
+            policy=self.variant.policy,
+            without=self.variant.without,
+            max_gaussians=self.budget.max_gaussians,
+            iterations=None if timed else self.budget.iterations,
+            rate_hz=self.budget.rate_hz if timed else None,
+            seed=self.seed,
+            threads=self.conditions.threads,
+            view_prior=self.conditions.view_prior,
+        )
+
+    @property
+    def key(self) -> str:
+        """A name that changes with every setting, down to the policy's own."""
+        settings = {
+            "scene": dict(self.plan.settings()),
+            "mission": str(self.mission),
+            "mapper": str(self.mission.mapper_settings()),
+            "conditions": str(self.conditions),
+        }
+        digest = hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:12]
+        return f"{self.plan.name}-{self.variant.label}-{self.budget.equal}-{self.seed}-{digest}".replace("+", "with-")
+
+
+@dataclass(frozen=True, slots=True)
+class TrialResult:
+    """What a trial gave; roi_share is that of the held-out views. ms_per_frame counts perception and mapping.
+
+    fitted are the scores with each view's pose and colours fitted, None where that was not asked for.
+    """
+
+    scores: MapScores
+    fitted: MapScores | None
+    roi_share: float
+    gaussians: int
+    iterations_mean: float
+    ms_per_frame: float
+
+    def as_json(self) -> dict[str, object]:
+        """For the record."""
+        return asdict(self)
+
+    @classmethod
+    def from_json(cls, stored: dict[str, Any]) -> TrialResult:
+        """From as_json's. Raises InvalidInputError for anything else."""
+        try:
+            fitted = None if stored["fitted"] is None else MapScores(**stored["fitted"])
+            return cls(**{**stored, "scores": MapScores(**stored["scores"]), "fitted": fitted})
+        except (TypeError, KeyError) as error:
+            raise InvalidInputError(f"a kept trial: expected its figures, got {error}") from None
+
+
+Pictures = dict[int, UInt8[ndarray, "h w 3"]]
+"""What a map looks like from the most telling held-out views, by their position."""
+
+
+def run_trial(
+    trial: Trial, scene: Scene, perceptual: PerceptualDistance | None, on_frame: Callable[[int], None]
+) -> tuple[TrialResult, Pictures]:
+    """Map and judge; on_frame hears the number of Gaussians after each frame. Raises GaussLiteError."""
+    settings = trial.mission
+    attention = _attention(trial, scene)
+    loop = TaskMapper(attention, build_mapper(settings), pace=Pace(settings.pace))
+    outcomes = []
+    for frame in scene.training:
+        outcomes.append(loop.process(frame))
+        on_frame(outcomes[-1].gaussians)
+    gaussians = loop.gaussians()
+    viewer = MapViewer(gaussians, choose_rasterizer(threads=trial.conditions.threads))
+    shown = most_telling(scene.held_out, PICTURES)
+    scores, fitted, pictures = [], [], {}
+    for i, view in enumerate(scene.held_out):
+        drawn = viewer.draw_frame(view.frame)
+        scores.append(score_view(drawn, view, perceptual))
+        if trial.conditions.fit_views:
+            fitted.append(score_view(draw_fitted(viewer, view.frame), view, perceptual))
+        if i in shown:
+            pictures[i] = as_bytes(drawn.rgb)
+    result = TrialResult(
+        scores=average(scores),
+        fitted=average(fitted) if fitted else None,
+        roi_share=scene.roi_share,
+        gaussians=len(gaussians),
+        iterations_mean=sum(outcome.iterations for outcome in outcomes) / len(outcomes),
+        ms_per_frame=1e3 * sum(outcome.budget.seconds for outcome in outcomes) / len(outcomes),
+    )
+    return result, pictures
+
+
+def _attention(trial: Trial, scene: Scene) -> Attention:
+    """What does not follow the task is not told of it: marked Gaussians would be spared when room is short."""
+    components = trial.mission.mapper_settings().components
+    if not (components.sb or components.roi or components.sis or components.gfd):
+        return NoAttention()
+    if not trial.conditions.eyes.words:
+        return RecalledAttention(scene)
+    from gausslite.task.rules import RuleParser
+
+    return build_attention(RuleParser().parse(scene.task), scene.knowledge, trial.conditions.eyes.detector)

@@ -1,0 +1,175 @@
+"""The quality benchmark on one small home: fair trials, kept results, tables that say what was measured."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+
+from gausslite.cli.main import main
+from gausslite.datasets.simulated.family import HOME_COUNT, HOMES
+from gausslite.errors import InvalidInputError
+from gausslite.evaluation.compare import MapScores
+from gausslite.evaluation.quality.ablation import cumulative_variants
+from gausslite.evaluation.quality.pairs import HOME_PAIRS, Kind, choose_pairs
+from gausslite.evaluation.quality.scenes import HomeScenePlan
+from gausslite.evaluation.quality.study import Archive, Finished, Study
+from gausslite.evaluation.quality.tables import FULL_METRICS, ROI_METRICS, Scoreboard, ablation_table, quality_table
+from gausslite.evaluation.quality.trials import Budget, Conditions, Equal, Trial, TrialResult, Variant
+from gausslite.perception.vocabulary import same_kind
+from gausslite.task.rules import RuleParser
+
+PLAN = HomeScenePlan(choose_pairs(["home-8-manipulation"])[0], frames=4, views=3)
+CONDITIONS = Conditions((96, 72))
+TASK, UNIFORM = Variant("task", "task"), Variant("uniform", "uniform")
+
+
+def scores(roi_psnr: float | None, full_psnr: float = 20.0) -> MapScores:
+    return MapScores(roi_psnr, 0.8, full_psnr, 0.7, 0.02, 1.0, 3, 2, 900, 0.03)
+
+
+def finished(variant: Variant, seed: int, roi_psnr: float, budget: Budget, plan: HomeScenePlan = PLAN) -> Finished:
+    trial = Trial(plan, variant, budget, seed, CONDITIONS)
+    return Finished(trial, TrialResult(scores(roi_psnr), scores(roi_psnr + 1), 0.011, 900, 8.0, 12.5))
+
+
+def test_there_are_three_tasks_of_three_kinds_in_each_home() -> None:
+    assert {(pair.home, pair.kind) for pair in HOME_PAIRS} == {(h, k) for h in range(1, HOME_COUNT + 1) for k in Kind}
+    assert len({pair.task for pair in HOME_PAIRS}) == len(HOME_PAIRS) == 24
+
+
+@pytest.mark.parametrize("pair", HOME_PAIRS, ids=lambda pair: pair.name)
+def test_the_words_of_a_task_mean_its_objects(pair) -> None:
+    graph = RuleParser().parse(pair.task)
+    assert not graph.warnings
+    for name in pair.objects:
+        assert any(same_kind(target, name) for target in graph.targets), (graph.targets, name)
+
+
+def test_a_task_is_about_things_that_are_there() -> None:
+    import numpy as np
+
+    names = {item.name for item in HOMES[PLAN.pair.home - 1].furnish(np.random.default_rng(0))}
+    for pair in choose_pairs([f"home-{PLAN.pair.home}"]):
+        assert set(pair.objects) <= names
+
+
+def test_pairs_are_chosen_by_name_or_home() -> None:
+    assert choose_pairs([]) == HOME_PAIRS
+    assert [pair.name for pair in choose_pairs(["home-2", "home-5-search"])] == [
+        "home-2-manipulation",
+        "home-2-search",
+        "home-2-navigation",
+        "home-5-search",
+    ]
+    with pytest.raises(InvalidInputError, match=r"pairs: expected names such as home-3 .*, got home-9"):
+        choose_pairs(["home-1", "home-9"])
+
+
+def test_components_come_one_by_one() -> None:
+    variants = cumulative_variants()
+    assert [variant.label for variant in variants] == ["none", "+SB", "+MVO", "+ROI", "+SIS", "+GFD"]
+    off = [variant.without for variant in variants]
+    assert all(len(a - b) == 1 and b < a for a, b in pairwise(off))
+    assert not off[-1]
+
+
+def test_a_trials_key_changes_with_each_of_its_settings() -> None:
+    trial = Trial(PLAN, TASK, Budget(), 0, CONDITIONS)
+    others = [
+        replace(trial, seed=1),
+        replace(trial, conditions=Conditions((64, 48))),
+        replace(trial, variant=UNIFORM),
+        replace(trial, budget=Budget(iterations=9)),
+        replace(trial, budget=Budget(equal=Equal.TIME)),
+        replace(trial, plan=replace(PLAN, frames=5)),
+        replace(trial, plan=HomeScenePlan(choose_pairs(["home-8-search"])[0], 4, 3)),
+    ]
+    assert len({each.key for each in (trial, *others)}) == 1 + len(others)
+    assert trial.key == Trial(PLAN, TASK, Budget(), 0, CONDITIONS).key
+
+
+def test_what_is_finished_is_recalled_unless_lpips_is_wanted(tmp_path: Path) -> None:
+    archive, one = Archive(tmp_path), finished(TASK, 0, 25.0, Budget())
+    assert archive.recall(one.trial, with_lpips=False) is None
+    archive.keep(one.trial, one.result, {})
+    assert archive.recall(one.trial, with_lpips=False) == one.result
+    assert archive.recall(one.trial, with_lpips=True) is None
+    assert archive.recall(replace(one.trial, seed=1), with_lpips=False) is None
+    (record,) = (tmp_path / "trials").glob("*.json")
+    record.write_text("{}")
+    assert archive.recall(one.trial, with_lpips=False) is None
+
+
+def test_the_board_knows_means_spreads_and_margins() -> None:
+    budget = Budget()
+    board = Scoreboard(
+        [finished(*each, budget) for each in ((TASK, 0, 26.0), (TASK, 1, 28.0), (UNIFORM, 0, 24.5), (UNIFORM, 1, 24.5))]
+    )
+    figure = board.figure(PLAN.name, "task", ROI_METRICS[0], budget)
+    assert figure is not None
+    assert (figure.mean, figure.spread) == (27.0, 1.0)
+    assert board.margin(PLAN.name, ROI_METRICS[0], budget) == pytest.approx(2.5)
+    assert board.figure(PLAN.name, "task", FULL_METRICS[2], budget) is None
+    table = quality_table(board)
+    for text in ("27.00 ± 1.00", "+2.50", "not computed", "ahead of the best other in 1 of 1", "1.1%", "| 28.00 |"):
+        assert text in table
+    (summary,) = board.as_json()["summary"]
+    assert (summary["ahead_in"], summary["scenes"]) == (1, 1)
+
+
+def test_the_ablations_table_has_a_row_a_component_and_both_budgets() -> None:
+    budgets = [Budget(equal=equal) for equal in Equal]
+    board = Scoreboard([finished(v, 0, 20.0 + i, b) for b in budgets for i, v in enumerate(cumulative_variants())])
+    table = ablation_table(board)
+    assert "| +GFD | 25.00 ± 0.00 | 20.00 ± 0.00 | 25.00 ± 0.00 | 20.00 ± 0.00 |" in table
+    assert "ROI PSNR, equal time" in table
+
+
+def test_a_study_counts_its_trials() -> None:
+    study = Study([PLAN], [TASK, UNIFORM], [Budget(), Budget(equal=Equal.TIME)], [0, 1, 2], CONDITIONS)
+    assert study.count == len(study.trials(PLAN)) == 12
+
+
+def test_the_command_measures_keeps_and_resumes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("embreex", reason="the simulated homes need the extra `sim`")
+    pytest.importorskip("gausslite.render._kernels", reason="the native kernels are not built")
+    asked = ["--pairs", "home-8-manipulation", "--size", "96x72", "--frames", "4", "--views", "3"]
+    budget = ["--max-gaussians", "1500", "--iterations", "2", "--threads", "1", "--fit-views"]
+    command = ["bench", "quality", "--out", str(tmp_path), "--policies", "task,uniform", *asked, *budget]
+    assert main(command) == 0
+    first = capsys.readouterr()
+    assert "`task` is ahead of" in first.out
+    report = json.loads((tmp_path / "quality.json").read_text())
+    (scene,) = report["scenes"]
+    assert scene["task"] == "Prepare to pick up the drill on the workbench"
+    assert [each["variant"] for each in scene["results"]] == ["task", "uniform"]
+    assert all(trial["gaussians"] <= 1500 for each in scene["results"] for trial in each["trials"])
+    assert list((tmp_path / "sheets").glob("home-8-manipulation-view-*.png"))
+    assert main(command) == 0
+    again = capsys.readouterr()
+    assert again.err.count("(kept)") == 2
+    assert json.loads((tmp_path / "quality.json").read_text())["scenes"] == report["scenes"]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["quality", "--policies", "best"], "policy: expected one of task"),
+        (["quality", "--pairs", "home-0"], "pairs: expected names such as home-3"),
+        (["quality", "--real", "nowhere"], "--real: expected a folder and its regions"),
+        (["quality", "--frames", "1", "--pairs", "home-1"], "frames: expected at least 2, got 1"),
+        (["ablation", "--pair", "kitchen"], "pairs: expected names"),
+        (["ablation", "--lpips-weights", "none.pth"], "none.pth: expected a file of LPIPS weights"),
+    ],
+)
+def test_wrong_options_are_one_line(
+    options: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["bench", *options, "--out", str(tmp_path)]) == 2
+    line = capsys.readouterr().err
+    assert message in line
+    assert line.count("\n") == 1
