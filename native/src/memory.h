@@ -26,10 +26,11 @@ class Buffer {
 
   // Makes room for `count` elements; on growth the first `kept` stay and the others are zero.
   __attribute__((always_inline)) void reserve(size_t count, size_t kept = 0) {
-    if (count <= capacity_) return;
-    const size_t wanted = count + count / 4 + 64;
-    data_ = static_cast<T*>(grow_memory(data_, kept * sizeof(T), capacity_ * sizeof(T), wanted * sizeof(T)));
-    capacity_ = wanted;
+    if (count > capacity_) grow_to(count + count / 4 + 64, kept);
+  }
+  // The same without headroom, for what never grows again.
+  __attribute__((always_inline)) void reserve_exactly(size_t count) {
+    if (count > capacity_) grow_to(count, 0);
   }
   __attribute__((always_inline)) T* data() { return data_; }
   __attribute__((always_inline)) const T* data() const { return data_; }
@@ -38,6 +39,11 @@ class Buffer {
   __attribute__((always_inline)) size_t capacity() const { return capacity_; }
 
  private:
+  __attribute__((always_inline)) void grow_to(size_t wanted, size_t kept) {
+    data_ = static_cast<T*>(grow_memory(data_, kept * sizeof(T), capacity_ * sizeof(T), wanted * sizeof(T)));
+    capacity_ = wanted;
+  }
+
   T* data_ = nullptr;
   size_t capacity_ = 0;
 };

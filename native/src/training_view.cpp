@@ -30,7 +30,7 @@ TrainingView::TrainingView(const Stages& stages, int width, int height, const ui
       masked_(weight != nullptr),
       inside_{kInsidePlane, 0.0, {}, {}, {}, {}},
       mask_{kMaskPlane, 0.0, {}, {}, {}, {}} {
-  planes_.reserve(size_t(plane_) * kPlanes);
+  planes_.reserve_exactly(size_t(plane_) * kPlanes);
   float* p = planes_.data();
   for (int y = 0; y < height; ++y) {
     for (int x = 0; x < width; ++x) {

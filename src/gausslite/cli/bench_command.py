@@ -6,28 +6,17 @@ import argparse
 import json
 import shlex
 import sys
-from dataclasses import asdict
 from pathlib import Path
 
-from gausslite.cli.arguments import add_regions
+from gausslite.cli import bench_loop_command
 from gausslite.cli.bench_gpu import run_gpu
 from gausslite.cli.bench_quality import configure_ablation, configure_quality
-from gausslite.cli.map_command import choose_attention
-from gausslite.cli.progress import MappingBar
-from gausslite.datasets.open import open_source
-from gausslite.datasets.selection import frame_size, select_frames
-from gausslite.domain.voxels import VoxelGrid
 from gausslite.evaluation.bench_cycles import FLOOR_CYCLES, BlockCost
 from gausslite.evaluation.bench_gpu import GPU_GAUSSIANS
-from gausslite.evaluation.bench_loop import Latency, LoopBench, LoopTiming
 from gausslite.evaluation.bench_raster import GAUSSIANS, OPERATIONS, SIZES, RasterBench, RasterTiming
 from gausslite.evaluation.bench_region import SHARES_PERCENT, RegionCost
-from gausslite.mission.build import build_mapper
-from gausslite.mission.options import add_budget, add_detector, add_frames, add_policy, mission_settings, names, numbers
-from gausslite.mission.results import as_text, peak_rss_mib, write_json
-
-_HOME = "sim:home?seed=0&trajectory=0"
-_HOME_TASK = "Pick up the mug on the table"
+from gausslite.mission.options import names, numbers
+from gausslite.mission.results import write_json
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -36,7 +25,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     summary = "the rasterizer's stages on a small procedural room"
     _configure_raster(benches.add_parser("raster", help=summary, description=f"Measure {summary}."))
     summary = "the whole loop of one robot on a sequence"
-    _configure_loop(benches.add_parser("loop", help=summary, description=f"Measure {summary}."))
+    bench_loop_command.configure(benches.add_parser("loop", help=summary, description=f"Measure {summary}."))
     summary = "training on a GPU, beside gsplat called plainly"
     _configure_gpu(benches.add_parser("gpu", help=summary, description=f"Measure {summary}."))
     summary = "every policy's maps on held-out views, at the same budget"
@@ -64,18 +53,6 @@ def _configure_raster(parser: argparse.ArgumentParser) -> None:
     add("--json", action="store_true", help="print JSON for scripts: each case's least times, without shares")
     add("--details", metavar="FILE", type=Path, help="write everything that was measured here, as JSON")
     parser.set_defaults(run=run_raster)
-
-
-def _configure_loop(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("source", metavar="SOURCE", nargs="?", default=_HOME, help="as in map (default: %(default)s)")
-    add_frames(parser)
-    parser.add_argument("--task", metavar="TEXT", help=f'as in map (on the default source "{_HOME_TASK}")')
-    add_detector(parser)
-    add_regions(parser)
-    add_policy(parser)
-    add_budget(parser)
-    parser.add_argument("--json", action="store_true", help="print JSON for scripts")
-    parser.set_defaults(run=run_loop)
 
 
 def _configure_gpu(parser: argparse.ArgumentParser) -> None:
@@ -112,60 +89,6 @@ def run_raster(options: argparse.Namespace) -> int:
             options.details, {"command": shlex.join(sys.argv), "cases": [timing.details() for timing in timings]}
         )
     return 0
-
-
-def run_loop(options: argparse.Namespace) -> int:
-    """Map the sequence with a clock between the steps and print the figures. Reading frames is not counted."""
-    if options.source == _HOME and options.policy != "uniform" and not _says_what_matters(options):
-        options.task = _HOME_TASK
-    settings = mission_settings(options)
-    source = open_source(options.source, options.up, options.colour_camera)
-    positions = select_frames(source, options.frames)
-    size = frame_size(options.size, source)
-    attention, _ = choose_attention(options, source)
-    bench = LoopBench(attention, build_mapper(settings), VoxelGrid(), settings.pace)
-    costs = []
-    with MappingBar(len(positions), "bench") as bar:
-        for done, position in enumerate(positions, start=1):
-            cost = bench.process(source.frame(position, size))
-            if cost is not None:
-                costs.append(cost)
-                bar.show(done, cost.gaussians, cost.roi_share)
-    timing = LoopTiming.of(costs)
-    if options.json:
-        case = {"source": options.source, "task": options.task, "size": list(size), "rate": options.rate}
-        skipped = len(positions) - len(costs)
-        print(as_text({**case, **asdict(timing), "frames_skipped": skipped, "peak_rss_mib": peak_rss_mib()}))
-    else:
-        print(f"{options.source} at {size[0]}x{size[1]}\n{loop_lines(timing)}\n  peak memory {peak_rss_mib():.0f} MiB")
-    return 0
-
-
-def _says_what_matters(options: argparse.Namespace) -> bool:
-    return bool(options.task or options.roi or options.objects or options.roi_ball)
-
-
-def loop_lines(timing: LoopTiming) -> str:
-    """The figures of a run, one kind a line."""
-
-    def percentiles(name: str, latency: Latency) -> str:
-        values = (latency.p50_ms, latency.p90_ms, latency.p99_ms, latency.max_ms)
-        return f"  {name:<12}" + "".join(f"{value:9.1f}" for value in values)
-
-    return "\n".join(
-        [
-            f"  {timing.frames} frames, {timing.hz:.2f} Hz, {timing.iterations_mean:.1f} iterations a frame "
-            f"(at least {timing.iterations_min}), {timing.gaussians} Gaussians, ROI {timing.roi_share:.1%}",
-            f"  {'ms':<12}" + "".join(f"{name:>9}" for name in ("p50", "p90", "p99", "max")),
-            percentiles("frame", timing.latency),
-            percentiles("perception", timing.perception),
-            percentiles("mapping", timing.mapping),
-            percentiles("ROI words", timing.words),
-            *(percentiles(f" {name}", latency) for name, latency in timing.steps.items()),
-            f"  {timing.frames_short} frames trained too little; for want of time went without "
-            + ", ".join(f"{name}: {count}" for name, count in timing.reliefs.items()),
-        ]
-    )
 
 
 def raster_lines(timing: RasterTiming) -> str:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from gausslite.domain.frame import Frame
+from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.errors import DatasetError
 from gausslite.mapping.mapper import GaussianMapper
@@ -15,6 +17,8 @@ from gausslite.mapping.pace import FrameBudget, Pace, PaceSettings, Relief, Step
 from gausslite.mapping.roi import RoiLedger
 from gausslite.perception.attention import Attention
 from gausslite.pipeline import TaskMapper
+from gausslite.render.cpu import CpuRasterizer
+from gausslite.render.rasterizer import Rasterizer, StepReport
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,9 +120,41 @@ class LoopBench:
         """With a pace each frame trains until its time is up, without one for a fixed number of iterations."""
         self._loop = TaskMapper(attention, mapper, RoiLedger(grid), Pace(pace))
 
+    def gaussians(self) -> Gaussians:
+        """A copy of the map."""
+        return self._loop.gaussians()
+
     def process(self, frame: Frame) -> FrameCost | None:
         """What one frame cost; None when it was skipped for want of depth."""
         outcome = self._loop.process(frame)
         if outcome.skipped is not None:
             return None
         return FrameCost(outcome.budget, outcome.iterations, outcome.gaussians, outcome.roi_share)
+
+
+class KernelClock:
+    """A Rasterizer that adds up the kernels' own clocks over its steps, where the backend has them."""
+
+    def __init__(self, inner: Rasterizer) -> None:
+        self._inner = inner
+        self._stages_ms = inner.stage_times_ms if isinstance(inner, CpuRasterizer) else None
+        self._seconds = 0.0
+        self.name = inner.name
+        self.forward = inner.forward
+        self.backward = inner.backward
+        self.prepare_view = inner.prepare_view
+        self.holding = inner.holding
+
+    def step(self, *arguments: Any, **options: Any) -> StepReport:
+        """The inner one's step."""
+        report = self._inner.step(*arguments, **options)
+        if self._stages_ms is not None:
+            self._seconds += sum(self._stages_ms().values()) / 1e3
+        return report
+
+    def overhead_percent(self, costs: Sequence[FrameCost]) -> float | None:
+        """The share of these frames' iterations that was spent outside the kernels; None without their clocks."""
+        total_s = sum(cost.of(Step.WARM_UP) + cost.of(Step.ACTIVE) for cost in costs)
+        if self._stages_ms is None or total_s == 0.0:
+            return None
+        return 100.0 * (1.0 - self._seconds / total_s)

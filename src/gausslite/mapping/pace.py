@@ -95,7 +95,7 @@ class Pace:
         self._begun_s = self._clock()
         self._steps_s, self._iterations = {}, 0
         if self._settings is not None:
-            expected = {step: forecast.seconds for step, forecast in self._forecasts.items()}
+            expected = {step: forecast.mean_s for step, forecast in self._forecasts.items()}
             self._reliefs = choose_reliefs(self._settings, expected, self._reliefs)
 
     def spares(self, relief: Relief) -> bool:
@@ -104,13 +104,13 @@ class Pace:
 
     def has_time_for(self, step: Step) -> bool:
         """True when the step is expected to end in time for what must follow it."""
-        return self._settings is None or self._left_s() > self._forecasts[step].seconds
+        return self._settings is None or self._left_s() > self._forecasts[step].cautious_s
 
     def trains_on(self, step: Step, counted: int) -> bool:
         """True while the frame goes on training: another iteration fits, or (untimed) fewer than `counted` are done."""
         if self._settings is None or counted == 0:
             return self._iterations < counted
-        return self._left_s() > self._forecasts[step].seconds
+        return self._left_s() > self._forecasts[step].cautious_s
 
     @contextmanager
     def timing(self, step: Step) -> Iterator[None]:
@@ -131,7 +131,7 @@ class Pace:
     def _left_s(self) -> float:
         """What is left of the frame's time once the region's words are made."""
         assert self._settings is not None
-        words_s = 0.0 if self.spares(Relief.WORDS) else self._forecasts[Step.WORDS].seconds
+        words_s = 0.0 if self.spares(Relief.WORDS) else self._forecasts[Step.WORDS].cautious_s
         return self._begun_s + self._settings.seconds_per_frame - self._clock() - words_s
 
 
@@ -139,7 +139,7 @@ def choose_reliefs(
     settings: PaceSettings, expected_s: Mapping[Step, float], before: frozenset[Relief]
 ) -> frozenset[Relief]:
     """What to go without so that the least iterations fit, given what each step costs and the frame before did."""
-    iteration_s = max(expected_s[Step.WARM_UP], expected_s[Step.ACTIVE])
+    iteration_s = (expected_s[Step.WARM_UP] + expected_s[Step.ACTIVE]) / 2
     needed_s = sum(expected_s[step] for step in _FIXED) + settings.least_iterations * iteration_s
     chosen: set[Relief] = set()
     for relief in settings.reliefs:
@@ -157,8 +157,12 @@ class _Forecast:
         self._spread_s = 0.0
 
     @property
-    def seconds(self) -> float:
-        return (self._mean_s or 0.0) + self._spread_s
+    def mean_s(self) -> float:
+        return self._mean_s or 0.0
+
+    @property
+    def cautious_s(self) -> float:
+        return self.mean_s + self._spread_s
 
     def learn(self, seconds: float) -> None:
         if self._mean_s is None:

@@ -1,0 +1,167 @@
+"""`gausslite bench loop`: one robot's whole loop on a sequence, its time, its memory, and what the rate costs."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import asdict
+
+from gausslite.cli.arguments import add_regions, asked_regions
+from gausslite.cli.map_command import choose_attention
+from gausslite.cli.progress import MappingBar
+from gausslite.datasets.open import open_source
+from gausslite.datasets.selection import frame_size, select_frames
+from gausslite.datasets.source import Source
+from gausslite.domain.voxels import VoxelGrid
+from gausslite.errors import InvalidInputError
+from gausslite.evaluation.bench_gap import RateGap
+from gausslite.evaluation.bench_loop import FrameCost, KernelClock, Latency, LoopBench, LoopTiming
+from gausslite.evaluation.bench_memory import MemoryTrend, back_and_forth, resident_mib
+from gausslite.evaluation.held_out import HoldOut
+from gausslite.evaluation.views import HeldOutView
+from gausslite.mapping.mapper import GaussianMapper
+from gausslite.mission.build import build_mapper
+from gausslite.mission.options import add_budget, add_detector, add_frames, add_policy, mission_settings
+from gausslite.mission.results import as_text, peak_rss_mib
+from gausslite.render.choose import choose_rasterizer
+
+_HOME = "sim:home?seed=0&trajectory=0"
+_HOME_TASK = "Pick up the mug on the table"
+_MEMORY_SAMPLES = 40
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `gausslite bench loop`."""
+    parser.add_argument("source", metavar="SOURCE", nargs="?", default=_HOME, help="as in map (default: %(default)s)")
+    add_frames(parser)
+    parser.add_argument("--task", metavar="TEXT", help=f'as in map (on the default source "{_HOME_TASK}")')
+    add_detector(parser)
+    add_regions(parser)
+    add_policy(parser)
+    add_budget(parser)
+    add = parser.add_argument_group("benchmark").add_argument
+    add("--loop", metavar="N", type=int, help="map N frames, the sequence back and forth, and watch the memory")
+    add(
+        "--unlimited",
+        metavar="N",
+        type=int,
+        help="also map with N iterations a frame and compare ROI PSNR; every 8th frame is held out",
+    )
+    add("--json", action="store_true", help="print JSON for scripts")
+    parser.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Map the sequence with a clock between the steps and print the figures. Reading frames is not counted."""
+    if options.source == _HOME and options.policy != "uniform" and not _says_what_matters(options):
+        options.task = _HOME_TASK
+    if options.loop is not None and options.loop < 2:
+        raise InvalidInputError(f"--loop: expected at least 2 frames, got {options.loop}")
+    source = open_source(options.source, options.up, options.colour_camera)
+    positions: Sequence[int] = select_frames(source, options.frames)
+    held_out: Sequence[int] = ()
+    if options.unlimited is not None:
+        positions, held_out = HoldOut().split(positions)
+    size = frame_size(options.size, source)
+    mapped = [positions[step] for step in back_and_forth(len(positions), options.loop or len(positions))]
+    clock = KernelClock(choose_rasterizer(options.rasterizer, options.threads))
+    bench, costs, memory = _play(options, source, mapped, clock)
+    timing = LoopTiming.of(costs)
+    gap = None if options.unlimited is None else _gap(options, source, positions, held_out, bench)
+    overhead = clock.overhead_percent(costs)
+    if options.json:
+        report = {
+            "source": options.source,
+            "task": options.task,
+            "size": list(size),
+            "rate": options.rate,
+            **asdict(timing),
+            "frames_skipped": len(mapped) - len(costs),
+            "overhead_percent": overhead,
+            "memory": None if memory is None else asdict(memory),
+            "rate_gap": None if gap is None else {**asdict(gap), "gap_db": gap.gap_db},
+            "peak_rss_mib": peak_rss_mib(),
+        }
+        print(as_text(report))
+        return 0
+    print(f"{options.source} at {size[0]}x{size[1]}\n{loop_lines(timing)}")
+    if overhead is not None:
+        print(f"  {overhead:.1f} % of the time of iterations is spent outside the kernels")
+    if gap is not None:
+        print(
+            f"  ROI PSNR on {gap.views} held-out views: {gap.in_time_db:.2f} dB; with {gap.iterations} iterations a "
+            f"frame {gap.unlimited_db:.2f} dB, gap {gap.gap_db:.2f} dB"
+        )
+    if memory is not None:
+        print(
+            f"  memory {memory.start_mib:.0f}, {memory.middle_mib:.0f}, {memory.end_mib:.0f} MiB at the start, middle "
+            f"and end; {memory.mib_per_1000_frames:+.2f} MiB per 1000 frames over the second half"
+        )
+    print(f"  peak memory {peak_rss_mib():.0f} MiB")
+    return 0
+
+
+def _play(
+    options: argparse.Namespace, source: Source, positions: Sequence[int], rasterizer: KernelClock
+) -> tuple[LoopBench, list[FrameCost], MemoryTrend | None]:
+    """Run the loop over these positions; memory is sampled where the sequence is looped."""
+    settings, size = mission_settings(options), frame_size(options.size, source)
+    mapper = GaussianMapper(settings.mapper_settings(), rasterizer, settings.seed)
+    bench = LoopBench(choose_attention(options, source)[0], mapper, VoxelGrid(), settings.pace)
+    costs, samples_mib = [], []
+    every = max(1, len(positions) // _MEMORY_SAMPLES)
+    with MappingBar(len(positions), "bench") as bar:
+        for done, position in enumerate(positions, start=1):
+            cost = bench.process(source.frame(position, size))
+            if cost is not None:
+                costs.append(cost)
+                bar.show(done, cost.gaussians, cost.roi_share)
+            if options.loop is not None and (done % every == 0 or done == 1):
+                samples_mib.append(resident_mib())
+    return bench, costs, MemoryTrend.of(samples_mib, every) if options.loop is not None else None
+
+
+def _gap(
+    options: argparse.Namespace, source: Source, positions: Sequence[int], held_out: Sequence[int], bench: LoopBench
+) -> RateGap:
+    """Map the same frames again with counted iterations and score both maps where neither was trained."""
+    size = frame_size(options.size, source)
+    in_time = bench.gaussians()
+    patient = argparse.Namespace(**{**vars(options), "rate": None, "iterations": options.unlimited})
+    loop = LoopBench(choose_attention(patient, source)[0], build_mapper(mission_settings(patient)), VoxelGrid())
+    with MappingBar(len(positions), "unlimited") as bar:
+        for done, position in enumerate(positions, start=1):
+            cost = loop.process(source.frame(position, size))
+            if cost is not None:
+                bar.show(done, cost.gaussians, cost.roi_share)
+    regions = asked_regions(options, source)
+    views = [HeldOutView.of(source.frame(position, size), regions) for position in held_out]
+    rasterizer = choose_rasterizer(options.rasterizer, options.threads)
+    return RateGap.of(in_time, loop.gaussians(), options.unlimited, views, rasterizer)
+
+
+def _says_what_matters(options: argparse.Namespace) -> bool:
+    return bool(options.task or options.roi or options.objects or options.roi_ball)
+
+
+def loop_lines(timing: LoopTiming) -> str:
+    """The figures of a run, one kind a line."""
+
+    def percentiles(name: str, latency: Latency) -> str:
+        values = (latency.p50_ms, latency.p90_ms, latency.p99_ms, latency.max_ms)
+        return f"  {name:<12}" + "".join(f"{value:9.1f}" for value in values)
+
+    return "\n".join(
+        [
+            f"  {timing.frames} frames, {timing.hz:.2f} Hz, {timing.iterations_mean:.1f} iterations a frame "
+            f"(at least {timing.iterations_min}), {timing.gaussians} Gaussians, ROI {timing.roi_share:.1%}",
+            f"  {'ms':<12}" + "".join(f"{name:>9}" for name in ("p50", "p90", "p99", "max")),
+            percentiles("frame", timing.latency),
+            percentiles("perception", timing.perception),
+            percentiles("mapping", timing.mapping),
+            percentiles("ROI words", timing.words),
+            *(percentiles(f" {name}", latency) for name, latency in timing.steps.items()),
+            f"  {timing.frames_short} frames trained too little; for want of time went without "
+            + ", ".join(f"{name}: {count}" for name, count in timing.reliefs.items()),
+        ]
+    )
