@@ -1,0 +1,55 @@
+#!/usr/bin/env bash
+# Runs the native kernels' tests under the compiler's sanitizers: tools/sanitize.sh address|thread [PYTHON] [PYTEST ARGUMENTS].
+# `address` brings the undefined-behaviour sanitizer along. PYTHON needs the test extra, nanobind and cmake.
+set -euo pipefail
+root=$(cd "$(dirname "$0")/.." && pwd)
+fail() { echo "sanitize: $1" >&2; exit 1; }
+
+kind=${1:-}
+case $kind in
+  address) sanitizers=address,undefined runtimes="libasan.so libubsan.so" ;;
+  thread) sanitizers=thread runtimes=libtsan.so ;;
+  *) fail "expected address or thread, got '$kind'" ;;
+esac
+python=$(command -v "${2:-python3}") || fail "no such Python: $2"
+python=$("$python" -c 'import sys; print(sys.executable)')
+shift $(($# < 2 ? $# : 2))
+compiler=${CXX:-g++}
+
+# The runtime must be loaded before Python is, and libstdc++ with it: it intercepts what that throws.
+preload=
+for library in $runtimes libstdc++.so; do
+  path=$("$compiler" -print-file-name="$library" 2>/dev/null) || fail "no compiler $compiler"
+  [ -e "$path" ] || fail "$compiler has no $library here; nothing was checked"
+  preload=$preload${preload:+:}$(readlink -f "$path")
+done
+
+# The thread sanitizer's shadow memory has fixed places; a kernel that shuffles addresses widely collides with them.
+calm=()
+if [ "$kind" = thread ]; then
+  calm=(setarch "$(uname -m)" -R)
+  "${calm[@]}" true 2>/dev/null || calm=()
+fi
+export ASAN_OPTIONS=detect_leaks=0  # CPython keeps much until the process ends, and all of it would be reported
+export UBSAN_OPTIONS=print_stacktrace=1 TSAN_OPTIONS=halt_on_error=1 PYTHONMALLOC=malloc OMP_NUM_THREADS=1
+checked() { env LD_PRELOAD="$preload" "${calm[@]}" "$python" "$@"; }
+checked -c pass || fail "the $kind sanitizer's runtime does not start on this machine; nothing was checked"
+
+# One form beside the portable one: instrumenting all of them takes many minutes and finds nothing more in the stages.
+build=$root/build/sanitize-$kind
+PATH=$(dirname "$python"):$PATH
+cmake -S "$root/native" -B "$build" -DGAUSSLITE_SANITIZE=$sanitizers -DGAUSSLITE_FORMS="avx2;neon" \
+  -DCMAKE_CXX_COMPILER="$compiler" -DPython_EXECUTABLE="$python" -Dnanobind_DIR="$("$python" -m nanobind --cmake_dir)" >/dev/null
+cmake --build "$build" --parallel "$(nproc)" >/dev/null
+
+# The package is copied beside its module, so that neither an installed one nor the working tree's is touched.
+rm -rf "$build/package"
+mkdir "$build/package"
+cp -r "$root/src/gausslite" "$build/package/"
+rm -f "$build"/package/gausslite/render/_kernels*.so
+cp "$build"/_kernels*.so "$build/package/gausslite/render/"
+export PYTHONPATH=$build/package PYTHONDONTWRITEBYTECODE=1
+cd "$root"
+[ $# -gt 0 ] || set -- tests/unit/test_cpu_kernels.py
+# Uncaptured: a sanitizer writes its report and ends the process, and pytest would take the report with it.
+checked -m pytest -q --capture=no -p no:cacheprovider "$@"
