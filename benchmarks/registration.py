@@ -19,7 +19,7 @@ from gausslite.errors import GaussLiteError
 from gausslite.evaluation.compare import average, score_view
 from gausslite.evaluation.held_out import HoldOut
 from gausslite.evaluation.views import HeldOutView, MapViewer
-from gausslite.mapping.policies import POLICIES
+from gausslite.mapping.policies import POLICIES, TASK
 from gausslite.mission.build import build_mapper
 from gausslite.mission.options import add_budget, add_frames, names
 from gausslite.mission.settings import MissionSettings
@@ -34,7 +34,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("source", metavar="SOURCE")
     parser.add_argument("--objects", metavar="A,B", type=names, default=(), help="regions of the task (default: all)")
-    parser.add_argument("--policy", choices=sorted(POLICIES), default="task")
+    parser.add_argument("--policy", choices=sorted(POLICIES), default=TASK)
     parser.add_argument("--masks", metavar="TEXT", type=ColourCamera.parse, help="colour camera behind the ROI masks")
     add_frames(parser)
     add_budget(parser)
@@ -60,7 +60,7 @@ def measure(options: argparse.Namespace) -> str:
         seed=options.seed,
         threads=options.threads,
     )
-    attention = RegionAttention(regions) if options.policy == "task" else NoAttention()
+    attention = RegionAttention(regions) if options.policy == TASK else NoAttention()
     mapper = TaskMapper(attention, build_mapper(settings))
     for position in train:
         mapper.process(source.frame(position, size))

@@ -15,7 +15,7 @@ def stored(settings: KeyframeSettings, frames: int) -> KeyframeStore:
     store, rasterizer = KeyframeStore(settings), CpuRasterizer(threads=1)
     for index in range(frames):
         frame = wall_frame(index)
-        store.offer(window_view(Keyframe(frame, middle_relevance(frame)), rasterizer, settings.roi_margin_px))
+        store.offer(window_view(Keyframe(frame, middle_relevance(frame)), rasterizer, settings))
     return store
 
 
@@ -44,5 +44,5 @@ def test_tiles_touch_the_region_and_its_margin() -> None:
 
 def test_a_view_knows_whether_it_shows_the_region() -> None:
     frame, rasterizer = wall_frame(), CpuRasterizer(threads=1)
-    assert window_view(Keyframe(frame, middle_relevance(frame)), rasterizer, 5).shows_region
-    assert not window_view(Keyframe(frame, RelevanceMap.nothing(48, 64)), rasterizer, 5).shows_region
+    assert window_view(Keyframe(frame, middle_relevance(frame)), rasterizer, KeyframeSettings()).shows_region
+    assert not window_view(Keyframe(frame, RelevanceMap.nothing(48, 64)), rasterizer, KeyframeSettings()).shows_region

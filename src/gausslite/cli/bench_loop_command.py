@@ -20,6 +20,7 @@ from gausslite.evaluation.bench_memory import MemoryTrend, back_and_forth, resid
 from gausslite.evaluation.held_out import HoldOut
 from gausslite.evaluation.views import HeldOutView
 from gausslite.mapping.mapper import GaussianMapper
+from gausslite.mapping.policies import TASK
 from gausslite.mission.build import build_mapper
 from gausslite.mission.options import add_budget, add_detector, add_frames, add_policy, mission_settings
 from gausslite.mission.results import as_text, peak_rss_mib
@@ -53,7 +54,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Map the sequence with a clock between the steps and print the figures. Reading frames is not counted."""
-    if options.source == _HOME and options.policy != "uniform" and not _says_what_matters(options):
+    if options.source == _HOME and options.policy == TASK and not _says_what_matters(options):
         options.task = _HOME_TASK
     if options.loop is not None and options.loop < 2:
         raise InvalidInputError(f"--loop: expected at least 2 frames, got {options.loop}")

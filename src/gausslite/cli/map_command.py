@@ -17,6 +17,7 @@ from gausslite.datasets.source import Source
 from gausslite.domain.task import TaskGraph
 from gausslite.errors import GaussLiteError, InvalidInputError
 from gausslite.mapping.pace import Pace
+from gausslite.mapping.policies import TASK
 from gausslite.mission.build import build_attention, build_mapper
 from gausslite.mission.options import add_budget, add_detector, add_policy, mission_settings, perception_settings
 from gausslite.mission.results import peak_rss_mib, prepare_folder, write_results
@@ -131,7 +132,7 @@ def choose_attention(options: argparse.Namespace, source: Source) -> tuple[Atten
 
         graph = RuleParser().parse(options.task)
         return build_attention(graph, SceneKnowledge.of(source), perception_settings(options)), graph
-    if not regions and options.policy != "uniform":
+    if not regions and options.policy == TASK:
         raise InvalidInputError(
             "--task: expected a task in words, or regions with --roi FILE.npz or --roi-ball X,Y,Z,R"
         )

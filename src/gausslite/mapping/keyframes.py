@@ -15,6 +15,8 @@ from gausslite.domain.relevance import RelevanceMap
 from gausslite.mapping.settings import KeyframeSettings
 from gausslite.render.rasterizer import TILE_PX, Rasterizer, TrainingView
 
+_SSIM_WINDOW_PX = 11
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Keyframe:
@@ -48,15 +50,25 @@ class WindowView:
         return bool(self.active_tiles.any())
 
 
-def window_view(keyframe: Keyframe, rasterizer: Rasterizer, roi_margin_px: int) -> WindowView:
+def window_view(keyframe: Keyframe, rasterizer: Rasterizer, settings: KeyframeSettings) -> WindowView:
     """Make a frame ready to train on; the margin gives SSIM's window its neighbours at the region's border."""
     frame, relevance = keyframe.frame, keyframe.relevance
+    tiles, weight = tiles_of(relevance.roi, settings.roi_margin_px), relevance.weight
+    if settings.surroundings_weight > 0:
+        beside = np.float32(settings.surroundings_weight) * _well_inside(tiles, weight.shape)
+        weight = np.maximum(weight, beside)
     return WindowView(
         keyframe=keyframe,
-        training_view=rasterizer.prepare_view(frame.rgb, frame.depth_m, frame.camera, relevance.weight),
+        training_view=rasterizer.prepare_view(frame.rgb, frame.depth_m, frame.camera, weight),
         T_camera_world=inverse(frame.T_world_camera),
-        active_tiles=tiles_of(relevance.roi, roi_margin_px),
+        active_tiles=tiles,
     )
+
+
+def _well_inside(tiles: Bool[ndarray, "th tw"], shape: tuple[int, ...]) -> Bool[ndarray, "h w"]:
+    """Pixels whose whole SSIM window lies in these tiles: beyond them nothing is drawn to compare with."""
+    drawn = np.repeat(np.repeat(tiles, TILE_PX, axis=0), TILE_PX, axis=1)[: shape[0], : shape[1]]
+    return cv2.erode(drawn.astype(np.uint8), np.ones((_SSIM_WINDOW_PX, _SSIM_WINDOW_PX), np.uint8)) > 0
 
 
 def tiles_of(region: Bool[ndarray, "h w"], margin_px: int) -> Bool[ndarray, "th tw"]:

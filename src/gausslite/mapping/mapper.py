@@ -151,7 +151,7 @@ class GaussianMapper:
             self._keyframes.revise(self._view(self._refiner.fit_again(view.keyframe)))
 
     def _view(self, keyframe: Keyframe) -> WindowView:
-        return window_view(keyframe, self._rasterizer, self._settings.keyframes.roi_margin_px)
+        return window_view(keyframe, self._rasterizer, self._settings.keyframes)
 
     def _seed(self, keyframe: Keyframe, sight: MapSight | None, pace: Pace) -> int:
         """Add Gaussians where the map does not explain the frame, within the cap."""

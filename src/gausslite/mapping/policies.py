@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from gausslite.errors import InvalidInputError
-from gausslite.mapping.settings import Components, MapperSettings
+from gausslite.mapping.baselines import gaussian_slam_policy, monogs_policy, splatam_policy, uniform_policy
+from gausslite.mapping.settings import MapperSettings
 
 
 def task_policy() -> MapperSettings:
@@ -13,12 +14,16 @@ def task_policy() -> MapperSettings:
     return MapperSettings()
 
 
-def uniform_policy() -> MapperSettings:
-    """The baseline: uniform seeds and full-image training on the same window of views, at the same budget."""
-    return MapperSettings(components=Components(sb=False, mvo=True, roi=False, sis=False, gfd=False))
+TASK = "task"
+"""The one policy that asks what matters; the others map everything alike."""
 
-
-POLICIES: dict[str, Callable[[], MapperSettings]] = {"task": task_policy, "uniform": uniform_policy}
+POLICIES: dict[str, Callable[[], MapperSettings]] = {
+    TASK: task_policy,
+    "uniform": uniform_policy,
+    "gaussian-slam": gaussian_slam_policy,
+    "splatam": splatam_policy,
+    "monogs": monogs_policy,
+}
 
 
 def policy(name: str) -> MapperSettings:

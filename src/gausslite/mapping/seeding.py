@@ -129,7 +129,7 @@ class Seeder:
         """SIS: scale s0·m, identity rotation, observed colour, and the active flag of the seed's pixel."""
         settings, count = self._settings, len(pixels)
         active = relevance.roi.ravel()[pixels]
-        scale_m = spacing_m
+        scale_m = spacing_m * np.float32(settings.plain_scale)
         if self._components.sis:
             scale_m = spacing_m * np.where(active, settings.roi_scale, settings.background_scale).astype(np.float32)
         rows, columns = np.divmod(pixels, frame.camera.width_px)

@@ -41,7 +41,10 @@ class ActivePhase(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class SeedingSettings:
-    """Where new Gaussians go and how they start (Sec. III-C). Seed counts are for 640x480 and scale with the pixels."""
+    """Where new Gaussians go and how they start (Sec. III-C). Seed counts are for 640x480 and scale with the pixels.
+
+    roi_scale and background_scale are the paper's multipliers m of s0; plain_scale is m without SIS.
+    """
 
     first_frame_seeds: int = 60_000
     later_seeds: int = 10_000
@@ -56,6 +59,7 @@ class SeedingSettings:
     opacity: float = 0.5
     roi_scale: float = 0.5
     background_scale: float = 0.7
+    plain_scale: float = 1.0
     edge_floor: float = 0.01
 
     def __post_init__(self) -> None:
@@ -71,6 +75,7 @@ class SeedingSettings:
             "max_depth_m",
             "roi_scale",
             "background_scale",
+            "plain_scale",
             "edge_floor",
         ):
             _require(getattr(self, name) > 0, f"seeding {name}", "more than 0", getattr(self, name))
@@ -78,28 +83,39 @@ class SeedingSettings:
 
 @dataclass(frozen=True, slots=True)
 class KeyframeSettings:
-    """Which frames are kept to train on: every `every`th, the `window` latest of them, and `buffer` of the mission."""
+    """Which frames are kept to train on: every `every`th, the `window` latest of them, and `buffer` of the mission.
+
+    surroundings_weight, 0 to 1: what pixels beside the region count in the active phase's loss, in the tiles that it
+    draws anyway; 0 is the paper's binary mask.
+    """
 
     every: int = 5
     window: int = 24
     buffer: int = 96
     roi_margin_px: int = 5
+    surroundings_weight: float = 0.0
 
     def __post_init__(self) -> None:
         for name in ("every", "window", "buffer"):
             _require(getattr(self, name) >= 1, f"keyframes {name}", "at least 1", getattr(self, name))
         _require(self.roi_margin_px >= 0, "keyframes roi_margin_px", "at least 0", self.roi_margin_px)
+        weight = self.surroundings_weight
+        _require(0 <= weight <= 1, "keyframes surroundings_weight", "0 to 1", weight)
 
 
 @dataclass(frozen=True, slots=True)
 class OptimizationSettings:
-    """How a frame trains the map (Sec. III-D): first warm-up iterations on the full image, then active ones."""
+    """How a frame trains the map (Sec. III-D): first warm-up iterations on the full image, then active ones.
+
+    isotropic: Gaussians are made spheres again after every frame.
+    """
 
     warmup_iterations: int = 2
     active_iterations: int = 6
     active_phase: ActivePhase = ActivePhase.EXACT
     loss: LossWeights = field(default_factory=LossWeights)
     adam: AdamSettings = ONLINE_RATES
+    isotropic: bool = False
 
     def __post_init__(self) -> None:
         for name in ("warmup_iterations", "active_iterations"):

@@ -11,7 +11,7 @@ from gausslite.mapping.pace import Pace, Step
 from gausslite.mapping.settings import ActivePhase, MapperSettings
 from gausslite.optimize.density import densify, prune
 from gausslite.optimize.parameters import SplatTable
-from gausslite.render.rasterizer import EVERYTHING, RGB, Rasterizer, StepReport, Subset
+from gausslite.render.rasterizer import EVERYTHING, LOG_SCALE, RGB, Rasterizer, StepReport, Subset
 
 _COLOUR_RANGE = (-0.25, 1.25)
 """Somewhat beyond what can be shown, so that overlapping Gaussians still add up to black and white."""
@@ -51,6 +51,8 @@ class Trainer:
             done = self._until_density_control(views, showing, done, pace)
             self._control_density(extent_m, pace)
         self._bound_colours()
+        if self._settings.optimization.isotropic:
+            self._make_spheres()
         return done
 
     def _showing_region(self, views: Sequence[WindowView]) -> list[WindowView]:
@@ -124,6 +126,11 @@ class Trainer:
             subset=subset,
             trainable=table.active if frozen else None,
         )
+
+    def _make_spheres(self) -> None:
+        """Each Gaussian gets the geometric mean of its scales."""
+        log_scales = self._table.rows[:, LOG_SCALE]
+        log_scales[:] = log_scales.mean(axis=1, keepdims=True)
 
     def _bound_colours(self) -> None:
         """Colours that no view checks for a while must not run away."""
