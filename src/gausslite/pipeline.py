@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.relevance import RelevanceMap
+from gausslite.domain.state import State, nested, part
 from gausslite.domain.subset import VoxelWords
 from gausslite.mapping.coverage import MapSight
 from gausslite.mapping.mapper import GaussianMapper
@@ -58,6 +59,27 @@ class TaskMapper:
     def gaussians(self) -> Gaussians:
         """A copy of the map."""
         return self._mapper.gaussians()
+
+    def memory_mib(self) -> dict[str, float]:
+        """What of the map's memory is reserved or held, in MiB."""
+        return self._mapper.memory_mib()
+
+    def state(self) -> State:
+        """All that the next frame depends on, save the clock; valid until then."""
+        ledger: State = {} if self._ledger is None else self._ledger.state()
+        return {
+            **nested("mapper", self._mapper.state()),
+            **nested("attention", self._attention.state()),
+            **nested("ledger", ledger),
+        }
+
+    def restore(self, state: State) -> None:
+        """Go on from what a loop of the same settings and task handed out. Raises MapFileError, InvalidInputError."""
+        self._mapper.restore(part(state, "mapper"))
+        self._attention.restore(part(state, "attention"))
+        words = part(state, "ledger")
+        if self._ledger is not None and words:
+            self._ledger.restore(words)
 
     def process(self, frame: Frame) -> FrameOutcome:
         """Take one frame from its pixels to the words on its region."""

@@ -18,6 +18,7 @@ from gausslite.domain.camera import Camera
 from gausslite.domain.frame import Frame
 from gausslite.domain.region import BallRegion
 from gausslite.domain.relevance import RelevanceMap
+from gausslite.domain.state import State
 from gausslite.domain.task import TaskGraph
 from gausslite.domain.voxels import Box
 from gausslite.errors import (
@@ -74,6 +75,12 @@ class Gate:
 
     def late(self) -> None:
         return None
+
+    def state(self) -> State:
+        return {}
+
+    def restore(self, state: State) -> None:
+        del state
 
 
 def ball_attention(_graph: TaskGraph) -> Attention:

@@ -61,6 +61,39 @@ def test_the_cap_holds_and_active_kappa_and_target_stay_together(actions: list[t
         assert np.isfinite(table.rows).all()
 
 
+class WatchedTable(SplatTable):
+    """A table that looks at itself after each change, also between the steps of one densification."""
+
+    changes = 0
+
+    def append_rows(self, *columns: np.ndarray) -> None:
+        super().append_rows(*columns)
+        self._look()
+
+    def keep(self, mask: np.ndarray) -> None:
+        super().keep(mask)
+        self._look()
+
+    def _look(self) -> None:
+        self.changes += 1
+        assert self.count <= self.capacity == CAPACITY
+        # memory was reserved once, and every view lies inside it
+        assert np.shares_memory(self.rows, self._rows) or self.count == 0
+        assert self._rows.shape == self._first_moment.shape == self._second_moment.shape == (CAPACITY, 16)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(CAPACITY - 12, CAPACITY), st.integers(0, 2**31))
+def test_the_cap_holds_at_every_instant_inside_seeding_and_densification(held: int, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    table = WatchedTable(CAPACITY)
+    table.append(born(held, True, rng))
+    act(table, "densify", seed, 0)
+    act(table, "insert", seed, 60)
+    act(table, "densify", seed, 0)
+    assert table.changes > 3
+
+
 @settings(max_examples=60, deadline=None)
 @given(st.integers(1, 40), st.integers(0, 2**31), st.integers(0, 40))
 def test_the_tasks_seeds_always_fit_and_active_gaussians_go_last(held: int, seed: int, wanted: int) -> None:

@@ -10,6 +10,7 @@ from mapping_scenes import wall_frame
 from gausslite.domain.frame import Frame
 from gausslite.domain.region import BallRegion
 from gausslite.domain.relevance import RelevanceMap
+from gausslite.domain.state import State
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.pace import Pace, PaceSettings, Relief, Step
@@ -101,6 +102,12 @@ class SlowAttention:
 
     def late(self) -> None:
         return None
+
+    def state(self) -> State:
+        return {}
+
+    def restore(self, state: State) -> None:
+        del state
 
 
 def test_words_that_had_to_wait_come_with_the_next_frame() -> None:

@@ -96,7 +96,8 @@ class Player:
         if self._settings.out is not None:
             seconds = time.monotonic() - self._started_s
             report = mission_report(self._settings.agent_id, status, gaussians, counters, seconds)
-            write_results(self._settings.out, gaussians, report)
+            memory_mib = self._robot.do(lambda mapper: mapper.memory_mib()).result()
+            write_results(self._settings.out, gaussians, {**report, "memory_mib": memory_mib})
         _log.info(
             "mission %s: %d frames at %.2f Hz, %d Gaussians, %d bytes of the task's region sent",
             "interrupted" if self._stopping.is_set() else "done",

@@ -21,6 +21,7 @@ from gausslite.mapping.policies import TASK
 from gausslite.mission.build import build_attention, build_mapper
 from gausslite.mission.options import add_budget, add_detector, add_policy, mission_settings, perception_settings
 from gausslite.mission.results import peak_rss_mib, prepare_folder, write_results
+from gausslite.mission.saved_run import resume_run, save_run
 from gausslite.mission.settings import SceneKnowledge
 from gausslite.perception.attention import Attention
 from gausslite.perception.fixed import NoAttention, RegionAttention
@@ -38,6 +39,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_policy(parser)
     add_budget(parser)
     parser.add_argument("--out", metavar="DIR", type=Path, required=True, help="gets map.ply and report.json")
+    add = parser.add_argument_group("save and resume").add_argument
+    add("--save-state", metavar="FILE", type=Path, help="save the whole run here at its end, to go on with --resume")
+    add("--resume", metavar="FILE", type=Path, help="go on from a saved run, with the frames after its last one")
     parser.set_defaults(run=run)
 
 
@@ -50,6 +54,11 @@ def run(options: argparse.Namespace) -> int:
     attention, graph = choose_attention(options, source)
     mapper = TaskMapper(attention, build_mapper(settings), pace=Pace(settings.pace))
     prepare_folder(options.out)
+    if options.save_state is not None:
+        prepare_folder(options.save_state.parent)
+    if options.resume is not None:
+        last_index = resume_run(options.resume, mapper, graph)
+        positions = [position for position in positions if source.indices()[position] > last_index]
     mission = _play(source, positions, size, mapper)
     if mission.stopped is not None and not mission.outcomes:
         raise mission.stopped
@@ -67,11 +76,15 @@ def run(options: argparse.Namespace) -> int:
         "gaussians": len(gaussians),
         "active_gaussians": active,
         "max_gaussians": settings.max_gaussians,
+        "resumed_from": None if options.resume is None else str(options.resume),
         "peak_rss_mib": peak_rss_mib(),
+        "memory_mib": mapper.memory_mib(),
         "notes": list(attention.notes),
         "stopped_by": None if mission.stopped is None else str(mission.stopped),
     }
     write_results(options.out, gaussians, report)
+    if options.save_state is not None and mission.outcomes:
+        save_run(options.save_state, mapper, graph, mission.outcomes[-1].index)
     if mission.stopped is not None:
         # what was mapped until then is kept, and the exit code says that it is not all
         raise mission.stopped

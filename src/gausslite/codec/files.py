@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import tempfile
+from collections.abc import Iterable
 from pathlib import Path
 
 from gausslite.errors import StorageError
@@ -15,15 +16,21 @@ def write_whole(path: Path, data: bytes) -> None:
 
     Raises StorageError naming the file when the folder cannot be written or the disk is full.
     """
+    write_whole_parts(path, [data])
+
+
+def write_whole_parts(path: Path, parts: Iterable[bytes | memoryview]) -> None:
+    """As `write_whole`, for what need not be in memory twice."""
     temporary: Path | None = None
     try:
         if path.exists() and not path.is_file():
             # a device or a pipe must be written to, never replaced
-            path.write_bytes(data)
+            with path.open("wb") as device:
+                device.writelines(parts)
             return
         with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}.", delete=False) as file:
             temporary = Path(file.name)
-            file.write(data)
+            file.writelines(parts)
             file.flush()
             os.fsync(file.fileno())
         temporary.chmod(0o644)

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float64
 from numpy import ndarray
+from numpy.typing import NDArray
 
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import inverse
 from gausslite.domain.relevance import RelevanceMap
+from gausslite.domain.state import State, nested, part, take_counts, whole_numbers
+from gausslite.errors import MapFileError
+from gausslite.mapping.checkpoint import frame_of, frame_state, relevance_of, relevance_state
 from gausslite.mapping.settings import KeyframeSettings
 from gausslite.render.rasterizer import TILE_PX, Rasterizer, TrainingView
 
@@ -33,6 +39,22 @@ class Keyframe:
     def as_recorded(self) -> Frame:
         """The frame as it came."""
         return self.frame if self.recorded is None else self.recorded
+
+    def state(self) -> State:
+        """The keyframe as named arrays."""
+        recorded = {} if self.recorded is None else frame_state(self.recorded)
+        return {
+            **nested("frame", frame_state(self.frame)),
+            **nested("relevance", relevance_state(self.relevance)),
+            **nested("recorded", recorded),
+        }
+
+    @classmethod
+    def of(cls, state: State) -> Keyframe:
+        """The keyframe again. Raises MapFileError, InvalidInputError."""
+        frame = frame_of(part(state, "frame"))
+        recorded = part(state, "recorded")
+        return cls(frame, relevance_of(part(state, "relevance"), frame), frame_of(recorded) if recorded else None)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -118,6 +140,38 @@ class KeyframeStore:
     def of(self, frame: Frame) -> WindowView | None:
         """The window's view of a frame as it came; None where it is no keyframe of the window (any more)."""
         return next((view for view in self._window if view.keyframe.as_recorded is frame), None)
+
+    @property
+    def image_bytes(self) -> int:
+        """Memory of all keyframes' images, without what the rasterizer prepares of those in the window."""
+        held = dict.fromkeys([*self._buffer, *(view.keyframe for view in self._window)])
+        return sum(array.nbytes for keyframe in held for array in keyframe.state().values())
+
+    def state(self) -> State:
+        """All keyframes once, and which of them are the window and which the buffer."""
+        window = [view.keyframe for view in self._window]
+        places = {id(keyframe): place for place, keyframe in enumerate(dict.fromkeys([*self._buffer, *window]))}
+        state: dict[str, NDArray[Any]] = {
+            "window": whole_numbers(*(places[id(keyframe)] for keyframe in window)),
+            "buffer": whole_numbers(*(places[id(keyframe)] for keyframe in self._buffer)),
+            "offered": whole_numbers(self._offered),
+        }
+        for place, keyframe in enumerate(dict.fromkeys([*self._buffer, *window])):
+            state |= nested(str(place), keyframe.state())
+        return state
+
+    def restore(self, state: State, view_of: Callable[[Keyframe], WindowView]) -> None:
+        """Take over the keyframes of another store; view_of makes one ready to train on. Raises MapFileError."""
+        window, buffer = (take_counts(state, name, len(state.get(name, ()))) for name in ("window", "buffer"))
+        if len(window) > self._settings.window or len(buffer) > self._settings.buffer:
+            raise MapFileError(
+                f"state keyframes: expected at most {self._settings.window} and {self._settings.buffer}, "
+                f"got {len(window)} and {len(buffer)}"
+            )
+        keyframes = {place: Keyframe.of(part(state, str(place))) for place in sorted({*window, *buffer})}
+        self._window = [view_of(keyframes[place]) for place in window]
+        self._buffer = [keyframes[place] for place in buffer]
+        [self._offered] = take_counts(state, "offered", 1)
 
     def _thin(self) -> None:
         """Drop the keyframe that is closest in time to its neighbours; the first and the last stay."""

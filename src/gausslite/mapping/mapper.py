@@ -14,7 +14,10 @@ from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.pose import inverse
 from gausslite.domain.relevance import RelevanceMap
+from gausslite.domain.state import State, nested, part, take, take_counts, whole_numbers
+from gausslite.errors import MapFileError
 from gausslite.mapping.budget import insert
+from gausslite.mapping.checkpoint import generator_state, set_generator
 from gausslite.mapping.coverage import MapSight
 from gausslite.mapping.keyframes import Keyframe, KeyframeStore, WindowView, window_view
 from gausslite.mapping.pace import Pace, Relief, Step
@@ -27,6 +30,8 @@ from gausslite.render.rasterizer import MEAN, Rasterizer, Rendering
 
 _EXTENT_PER_DEPTH = 1.0 / 3.0
 """The scene's extent as a fraction of the farthest depth seen, as SplaTAM's released configuration takes it."""
+
+_MAX_EXTENT_M = 1e6
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,6 +140,43 @@ class GaussianMapper:
     def keyframes(self) -> list[Keyframe]:
         """The keyframes remembered of the whole mission, oldest first (for joint refinement)."""
         return list(self._keyframes.buffer)
+
+    def memory_mib(self) -> dict[str, float]:
+        """MiB of the table and of Adam's moments, both reserved at the start, and of the keyframes' images."""
+        return {
+            "table": self._table.table_bytes / 2**20,
+            "optimizer": self._table.optimizer_bytes / 2**20,
+            "keyframes": self._keyframes.image_bytes / 2**20,
+        }
+
+    def state(self) -> State:
+        """All that the next frame's mapping depends on, as views; valid until then."""
+        return {
+            **nested("table", self._table.state()),
+            **nested("keyframes", self._keyframes.state()),
+            **nested("trainer", self._trainer.state()),
+            **nested("refiner", self._refiner.state()),
+            "generator": generator_state(self._rng),
+            "extent_m": np.array([self._extent_m]),
+            "frames": whole_numbers(self._revision, self._skipped),
+        }
+
+    def restore(self, state: State) -> None:
+        """Go on from what a mapper of the same settings handed out: the next frames give the same bits as there.
+
+        Raises MapFileError for a state that is none, QuotaError for one beyond max_gaussians. After an error this
+        mapper must not be used.
+        """
+        self._table.restore(part(state, "table"))
+        self._keyframes.restore(part(state, "keyframes"), self._view)
+        self._trainer.restore(part(state, "trainer"))
+        self._refiner.restore(part(state, "refiner"))
+        set_generator(self._rng, take(state, "generator", (6,), np.uint64))
+        [extent_m] = take(state, "extent_m", (1,), np.float64)
+        if not 0 <= extent_m <= _MAX_EXTENT_M:
+            raise MapFileError(f"state extent_m: expected 0 to {_MAX_EXTENT_M:g} m, got {extent_m}")
+        self._extent_m = float(extent_m)
+        self._revision, self._skipped = take_counts(state, "frames", 2)
 
     def _observe(self, frame: Frame, relevance: RelevanceMap) -> WindowView:
         """Make the frame ready to train on, with its pose and colours refined where they may be wrong."""

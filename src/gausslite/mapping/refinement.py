@@ -11,7 +11,8 @@ from numpy import ndarray
 
 from gausslite.domain.camera import Camera
 from gausslite.domain.frame import Frame
-from gausslite.domain.pose import inverse
+from gausslite.domain.pose import inverse, require_rigid
+from gausslite.domain.state import State, take, take_counts, whole_numbers
 from gausslite.mapping.keyframes import Keyframe, WindowView
 from gausslite.optimize.view_fit import ViewPrior, fit_colour, fit_pose
 from gausslite.render.rasterizer import Rendering
@@ -33,6 +34,17 @@ class ViewRefiner:
     def needed(self) -> bool:
         """False where poses and colours are trusted."""
         return self._prior.moves or self._prior.colours
+
+    def state(self) -> State:
+        """How far the last pose was corrected, and whose turn it was."""
+        return {"T_said_refined": self._T_said_refined, "turn": whole_numbers(self._turn)}
+
+    def restore(self, state: State) -> None:
+        """Go on where another refiner stood. Raises MapFileError, PoseError."""
+        T_said_refined = take(state, "T_said_refined", (4, 4), np.float64)
+        require_rigid("state T_said_refined", T_said_refined)
+        self._T_said_refined = T_said_refined.copy()
+        [self._turn] = take_counts(state, "turn", 1)
 
     def settle(self, recorded: Frame) -> Frame:
         """A new frame with the pose and colours to map it with; an odometry's error is much like a frame ago."""

@@ -7,6 +7,7 @@ from jaxtyping import Bool, Int64, UInt64
 from numpy import ndarray
 
 from gausslite.domain.gaussians import Gaussians
+from gausslite.domain.state import State, take
 from gausslite.domain.subset import VoxelWords
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.domain.words import take_voxels, tombstones, unite, words_of
@@ -35,6 +36,16 @@ class RoiLedger:
     def forget(self) -> None:
         """Treat every voxel as new at the next call (the receiver lost what it had)."""
         self._keys, self._states = np.zeros(0, np.int64), np.zeros((0, 3), np.uint64)
+
+    def state(self) -> State:
+        """The last words given."""
+        return {"keys": self._keys, "states": self._states}
+
+    def restore(self, state: State) -> None:
+        """Take over what another ledger said. Raises MapFileError, ShapeError."""
+        keys = take(state, "keys", (None,), np.int64)
+        self._states = take(state, "states", (len(keys), 3), np.uint64).copy()
+        self._keys = keys.copy()
 
     def _unchanged(self, keys: Int64[ndarray, " v"], states: UInt64[ndarray, "v 3"]) -> Bool[ndarray, " v"]:
         if len(self._keys) == 0:

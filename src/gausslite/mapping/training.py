@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from gausslite.domain.state import State, take_counts, whole_numbers
 from gausslite.mapping.keyframes import WindowView
 from gausslite.mapping.pace import Pace, Step
 from gausslite.mapping.settings import ActivePhase, MapperSettings
@@ -38,6 +39,14 @@ class Trainer:
     def iterations(self) -> int:
         """Iterations run since the start."""
         return self._iterations
+
+    def state(self) -> State:
+        """The counts by which density control takes its turns; between two frames nothing else is kept."""
+        return {"counts": whole_numbers(self._iterations, self._since_pruned, self._since_densified)}
+
+    def restore(self, state: State) -> None:
+        """Go on where another trainer stood. Raises MapFileError."""
+        self._iterations, self._since_pruned, self._since_densified = take_counts(state, "counts", 3)
 
     def train(self, views: Sequence[WindowView], extent_m: float, pace: Pace) -> int:
         """Train on these views for as long as the pace allows and return the number of iterations.

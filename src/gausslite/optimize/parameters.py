@@ -8,12 +8,23 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int, Int16, UInt32
 from numpy import ndarray
 
-from gausslite.domain.arrays import require_array
+from gausslite.domain.arrays import require_array, require_finite
 from gausslite.domain.gaussians import Gaussians
-from gausslite.errors import InvalidInputError, QuotaError
+from gausslite.domain.state import State, take
+from gausslite.errors import InvalidInputError, MapFileError, QuotaError
 from gausslite.render.rasterizer import LOG_SCALE, LOGIT, MEAN, QUAT, RGB, ROW_WIDTH
 
+_COLUMNS: dict[str, tuple[int | None, type[np.generic]]] = {
+    "rows": (ROW_WIDTH, np.float32),
+    "first_moment": (ROW_WIDTH, np.float32),
+    "second_moment": (ROW_WIDTH, np.float32),
+    "active": (None, np.bool_),
+    "kappa": (None, np.uint32),
+    "target": (None, np.int16),
+}
 _MIN_SCALE_M = 1e-7
+_MAX_LOG_SCALE = 80.0
+"""Beyond it the scale is not a float32."""
 _MIN_OPACITY = 1e-6
 
 
@@ -57,6 +68,16 @@ class SplatTable:
     def room(self) -> int:
         """How many Gaussians still fit."""
         return self._capacity - self._count
+
+    @property
+    def table_bytes(self) -> int:
+        """Memory reserved for the Gaussians and what each carries."""
+        return sum(column.nbytes for column in (self._rows, self._active, self._kappa, self._target))
+
+    @property
+    def optimizer_bytes(self) -> int:
+        """Memory reserved for Adam's two moments."""
+        return self._first_moment.nbytes + self._second_moment.nbytes
 
     @property
     def rows(self) -> Float32[ndarray, "n 16"]:
@@ -126,6 +147,27 @@ class SplatTable:
         for column in (self._rows, self._first_moment, self._second_moment, self._active, self._kappa, self._target):
             column[first_gap : len(kept)] = column[moved]
         self._count = len(kept)
+
+    def state(self) -> State:
+        """Everything the table holds, as views of it."""
+        return {name: getattr(self, name) for name in _COLUMNS}
+
+    def restore(self, state: State) -> None:
+        """Take over another table's contents. Raises QuotaError when they do not fit, MapFileError, ShapeError."""
+        rows = take(state, "rows", (None, ROW_WIDTH), np.float32)
+        if len(rows) > self._capacity:
+            raise QuotaError(f"max_gaussians: expected at least the {len(rows)} saved ones, got {self._capacity}")
+        columns = {
+            name: take(state, name, (len(rows),) if width is None else (len(rows), width), dtype)
+            for name, (width, dtype) in _COLUMNS.items()
+        }
+        for name in ("rows", "first_moment", "second_moment"):
+            require_finite(f"state {name}", columns[name])
+        if (rows[:, LOG_SCALE] > _MAX_LOG_SCALE).any() or (columns["second_moment"] < 0).any():
+            raise MapFileError("state table: expected scales and second moments that training can reach, got others")
+        for name, column in columns.items():
+            getattr(self, f"_{name}")[: len(rows)] = column
+        self._count = len(rows)
 
     def to_gaussians(self, ids: Int[ndarray, " m"] | None = None) -> Gaussians:
         """Copies of all Gaussians, or of these rows, as physical values."""

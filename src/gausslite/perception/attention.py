@@ -11,6 +11,7 @@ from numpy import ndarray
 
 from gausslite.domain.frame import Frame
 from gausslite.domain.relevance import Detection, RelevanceMap
+from gausslite.domain.state import State
 from gausslite.domain.task import TaskGraph
 from gausslite.perception.detect import Detector, Segmenter
 from gausslite.perception.memory import Remembered
@@ -42,6 +43,14 @@ class Attention(Protocol):
     @property
     def notes(self) -> tuple[str, ...]:
         """What the operator should know of the frames so far, one line each."""
+        ...
+
+    def state(self) -> State:
+        """What the next frame's relevance depends on besides that frame."""
+        ...
+
+    def restore(self, state: State) -> None:
+        """Go on from what an attention to the same task handed out. Raises MapFileError."""
         ...
 
 
@@ -81,6 +90,14 @@ class TaskAttention:
         """Nothing: every frame's relevance is known at once."""
         return
 
+    def state(self) -> State:
+        """The objects and targets that are followed."""
+        return self._tracker.state()
+
+    def restore(self, state: State) -> None:
+        """Follow on what another attention to this task followed. Raises MapFileError, InvalidInputError."""
+        self._tracker.restore(state)
+
 
 class AttentionBeside:
     """An Attention that follows a task graph and never waits: its detector runs beside, on an executor of one thread.
@@ -115,6 +132,14 @@ class AttentionBeside:
         """Nouns without a class, anchors that have not come into view, keyframes that were never looked at."""
         overtaken = (f"detector too slow: {self._replaced} keyframes were overtaken",) if self._replaced else ()
         return (*self._warnings, *self._tracker.notes, *overtaken)
+
+    def state(self) -> State:
+        """The objects and targets that are followed; what the detector is busy with is not among them."""
+        return self._tracker.state()
+
+    def restore(self, state: State) -> None:
+        """Follow on what another attention to this task followed. Raises MapFileError, InvalidInputError."""
+        self._tracker.restore(state)
 
     def attend(self, frame: Frame, rendered_depth_m: Float32[ndarray, "h w"] | None = None) -> RelevanceMap:
         """Weight 1 on the pixels of the targets known so far. Raises what the detector raised."""

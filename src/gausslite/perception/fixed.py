@@ -11,6 +11,7 @@ from numpy import ndarray
 from gausslite.domain.frame import Frame
 from gausslite.domain.region import Region
 from gausslite.domain.relevance import NO_TARGET, RelevanceMap
+from gausslite.domain.state import State
 from gausslite.errors import InvalidInputError
 
 
@@ -39,6 +40,14 @@ class RegionAttention:
         """Nothing: every frame's relevance is known at once."""
         return
 
+    def state(self) -> State:
+        """Nothing: every frame is judged by itself."""
+        return {}
+
+    def restore(self, state: State) -> None:
+        """Nothing to take over."""
+        del state
+
 
 class NoAttention:
     """An Attention for uniform maps: nothing is relevant."""
@@ -56,3 +65,11 @@ class NoAttention:
     def late(self) -> None:
         """Nothing: every frame's relevance is known at once."""
         return
+
+    def state(self) -> State:
+        """Nothing: every frame is judged by itself."""
+        return {}
+
+    def restore(self, state: State) -> None:
+        """Nothing to take over."""
+        del state

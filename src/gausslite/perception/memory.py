@@ -91,8 +91,9 @@ class Remembered:
 class ObjectMemory:
     """Everything a task's nouns have named so far; bounded, the least seen goes first."""
 
-    def __init__(self) -> None:
-        self._objects: list[Remembered] = []
+    def __init__(self, objects: Sequence[Remembered] = ()) -> None:
+        """Empty, or with what an earlier memory held, oldest first."""
+        self._objects = list(objects)
 
     @property
     def objects(self) -> tuple[Remembered, ...]:

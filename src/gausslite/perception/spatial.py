@@ -90,6 +90,10 @@ class SpatialFilter:
         """Take one frame's sightings into the memory."""
         self._memory.observe(sightings)
 
+    def remember(self, objects: Sequence[Remembered]) -> None:
+        """Start from objects of an earlier life, oldest first."""
+        self._memory = ObjectMemory(objects)
+
     def keep(self, sighting: Sighting) -> bool:
         """Any relation of the target holds (Sec. III-B.3); True without relations or without their anchors.
 

@@ -4,16 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float32, Float64
 from numpy import ndarray
+from numpy.typing import NDArray
 
 from gausslite.domain.frame import Frame
-from gausslite.domain.pose import UpAxis, rotation_angle_deg, translation_m, unit_up_axis
+from gausslite.domain.pose import UpAxis, require_rigid, rotation_angle_deg, translation_m, unit_up_axis
 from gausslite.domain.relevance import NO_TARGET, Detection, RelevanceMap
+from gausslite.domain.state import State, nested, part, take, take_counts, whole_numbers
 from gausslite.domain.task import TaskGraph
-from gausslite.errors import InvalidInputError
+from gausslite.errors import InvalidInputError, MapFileError
+from gausslite.perception.checkpoint import frustum_of as frustum_of_state
+from gausslite.perception.checkpoint import frustum_state, remembered_of, remembered_state
 from gausslite.perception.detect import Segmenter
 from gausslite.perception.memory import Remembered
 from gausslite.perception.reproject import Frustum, cut_by_depth, frustum_of, reprojected_box_px
@@ -52,7 +57,7 @@ class TargetTracker:
         self._settings = settings
         self._segmenter = segmenter
         self._filter = SpatialFilter(graph, settings.up_axis, settings.spatial)
-        self._keyframe: Frame | None = None
+        self._T_world_keyframe: Float64[ndarray, "4 4"] | None = None
         self._frames_since = 0
         self._kept: list[Frustum] = []
 
@@ -66,18 +71,45 @@ class TargetTracker:
         """The objects that the task's nouns have named so far, where they were seen."""
         return self._filter.remembered
 
+    def state(self) -> State:
+        """The objects seen so far, the detections that are carried on, and where they were made."""
+        pose = np.zeros((0, 4, 4)) if self._T_world_keyframe is None else self._T_world_keyframe[None]
+        state: dict[str, NDArray[Any]] = {"T_world_keyframe": pose, "frames_since": whole_numbers(self._frames_since)}
+        state["counts"] = whole_numbers(len(self._kept), len(self.remembered))
+        for i, frustum in enumerate(self._kept):
+            state |= nested(f"kept-{i}", frustum_state(frustum))
+        for i, each in enumerate(self.remembered):
+            state |= nested(f"object-{i}", remembered_state(each))
+        return state
+
+    def restore(self, state: State) -> None:
+        """Remember and carry on what another attention to this task did. Raises MapFileError, InvalidInputError."""
+        poses = take(state, "T_world_keyframe", (None, 4, 4), np.float64)
+        kept, objects = take_counts(state, "counts", 2)
+        if len(poses) > 1 or kept + objects > len(state):
+            raise MapFileError(f"state attention: expected {kept} detections and {objects} objects, got fewer")
+        for pose in poses:
+            require_rigid("state T_world_keyframe", pose)
+        self._kept = [frustum_of_state(part(state, f"kept-{i}")) for i in range(kept)]
+        strangers = {frustum.detection.phrase for frustum in self._kept} - set(self._graph.targets)
+        if strangers:
+            raise MapFileError(f"state attention: expected targets of the task, got {len(strangers)} other phrases")
+        self._filter.remember([remembered_of(part(state, f"object-{i}")) for i in range(objects)])
+        self._T_world_keyframe = poses[0].copy() if len(poses) else None
+        [self._frames_since] = take_counts(state, "frames_since", 1)
+
     def wants_detection(self, frame: Frame) -> bool:
         """True for the first frame, after some frames, and once the camera went far; such a frame is a keyframe."""
-        key = self._keyframe
+        T_world_keyframe = self._T_world_keyframe
         self._frames_since += 1
         due = (
-            key is None
+            T_world_keyframe is None
             or self._frames_since >= self._settings.max_frames
-            or translation_m(key.T_world_camera, frame.T_world_camera) > self._settings.max_translation_m
-            or rotation_angle_deg(key.T_world_camera, frame.T_world_camera) > self._settings.max_rotation_deg
+            or translation_m(T_world_keyframe, frame.T_world_camera) > self._settings.max_translation_m
+            or rotation_angle_deg(T_world_keyframe, frame.T_world_camera) > self._settings.max_rotation_deg
         )
         if due:
-            self._keyframe, self._frames_since = frame, 0
+            self._T_world_keyframe, self._frames_since = frame.T_world_camera, 0
         return due
 
     def take(self, frame: Frame, depth_m: Float32[ndarray, "h w"], found: Sequence[Detection]) -> RelevanceMap:

@@ -19,6 +19,7 @@ from gausslite.domain.frame import Frame
 from gausslite.domain.pose import UpAxis
 from gausslite.domain.region import Region
 from gausslite.domain.relevance import RelevanceMap
+from gausslite.domain.state import State
 from gausslite.errors import DatasetError, InvalidInputError
 from gausslite.evaluation.held_out import HoldOut
 from gausslite.evaluation.quality.pairs import HomePair
@@ -208,6 +209,14 @@ class RecalledAttention:
     def late(self) -> None:
         """Nothing: every frame's relevance is known at once."""
         return
+
+    def state(self) -> State:
+        """Nothing: every frame's relevance is looked up."""
+        return {}
+
+    def restore(self, state: State) -> None:
+        """Nothing to take over."""
+        del state
 
 
 def _scene(

@@ -1,0 +1,64 @@
+"""Remembered objects and carried detections as named arrays, so that attention can go on in another process."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gausslite.domain.camera import Camera
+from gausslite.domain.pose import require_rigid
+from gausslite.domain.relevance import Detection
+from gausslite.domain.state import State, take, take_counts, take_text, text, whole_numbers
+from gausslite.errors import MapFileError
+from gausslite.perception.memory import Remembered
+from gausslite.perception.reproject import Frustum
+
+
+def frustum_state(frustum: Frustum) -> dict[str, NDArray[Any]]:
+    """A carried detection and the camera that saw it."""
+    detection, camera = frustum.detection, frustum.camera
+    intrinsics = (camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px)
+    return {
+        "phrase": text(detection.phrase),
+        "mask": detection.mask,
+        "numbers": np.array([detection.score, *detection.box_px, *intrinsics, frustum.near_m, frustum.far_m]),
+        "T_world_camera": frustum.T_world_camera,
+    }
+
+
+def frustum_of(state: State) -> Frustum:
+    """The carried detection again. Raises MapFileError, InvalidInputError."""
+    numbers = take(state, "numbers", (11,), np.float64)
+    if not np.isfinite(numbers).all():
+        raise MapFileError("state numbers: expected finite ones, got others")
+    score, left, top, right, bottom, fx_px, fy_px, cx_px, cy_px, near_m, far_m = (float(value) for value in numbers)
+    mask = take(state, "mask", (None, None), np.bool_).copy()
+    T_world_camera = take(state, "T_world_camera", (4, 4), np.float64).copy()
+    require_rigid("state T_world_camera", T_world_camera)
+    detection = Detection(take_text(state, "phrase"), score, (left, top, right, bottom), mask)
+    camera = Camera(fx_px, fy_px, cx_px, cy_px, mask.shape[1], mask.shape[0])
+    return Frustum(detection, camera, T_world_camera, near_m, far_m)
+
+
+def remembered_state(each: Remembered) -> dict[str, NDArray[Any]]:
+    """An object over all its sightings."""
+    return {
+        "phrase": text(each.phrase),
+        "place_m": np.array([*each.centroid_m, each.radius_m]),
+        "cells": each.cells,
+        "counts": each.counts,
+        "seen": whole_numbers(each.seen),
+    }
+
+
+def remembered_of(state: State) -> Remembered:
+    """The object again. Raises MapFileError, InvalidInputError."""
+    place_m = take(state, "place_m", (4,), np.float64)
+    cells = take(state, "cells", (None,), np.int64).copy()
+    counts = take(state, "counts", cells.shape, np.int64).copy()
+    if not np.isfinite(place_m).all() or (counts < 1).any() or (cells[1:] <= cells[:-1]).any() or len(cells) == 0:
+        raise MapFileError("state object: expected a finite place and ascending cells with counts, got others")
+    [seen] = take_counts(state, "seen", 1)
+    return Remembered(take_text(state, "phrase"), place_m[:3].copy(), float(place_m[3]), cells, counts, seen)
