@@ -19,6 +19,7 @@ from gausslite.evaluation.pictures import as_bytes
 from gausslite.evaluation.quality.scenes import RecalledAttention, Scene, ScenePlan
 from gausslite.evaluation.views import MapViewer, most_telling
 from gausslite.mapping.pace import Pace
+from gausslite.mapping.policies import TASK
 from gausslite.mission.build import build_attention, build_mapper
 from gausslite.mission.settings import MissionSettings, PerceptionSettings
 from gausslite.optimize.view_fit import ViewPrior
@@ -188,7 +189,8 @@ def run_trial(
 def _attention(trial: Trial, scene: Scene) -> Attention:
     """What does not follow the task is not told of it: marked Gaussians would be spared when room is short."""
     components = trial.mission.mapper_settings().components
-    if not (components.sb or components.roi or components.sis or components.gfd):
+    follows = components.sb or components.roi or components.sis or components.gfd
+    if trial.variant.policy != TASK or not follows:
         return NoAttention()
     if not trial.conditions.eyes.words:
         return RecalledAttention(scene)
