@@ -100,6 +100,14 @@ class TaskMapper:
             detection_lag_frames=lag_frames,
         )
 
+    def rehearse(self) -> bool:
+        """One more iteration while no frame waits; False when nothing has been mapped yet."""
+        return self._mapper.rehearse()
+
+    def words(self) -> VoxelWords | None:
+        """What changed in the task's region since words were last made; None without a ledger."""
+        return None if self._ledger is None else self._ledger.changed(self._mapper.roi_gaussians())
+
     def _look(self, frame: Frame) -> MapSight | None:
         """The one drawing of a frame: attention takes its depth, seeding what it leaves open."""
         if self._pace.spares(Relief.SEEDING):
@@ -121,7 +129,7 @@ class TaskMapper:
         return late.lag_frames
 
     def _changed_roi(self) -> VoxelWords | None:
-        if self._ledger is None or self._pace.spares(Relief.WORDS):
+        if self._pace.spares(Relief.WORDS):
             return None
         with self._pace.timing(Step.WORDS):
-            return self._ledger.changed(self._mapper.roi_gaussians())
+            return self.words()

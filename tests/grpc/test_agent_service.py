@@ -45,6 +45,7 @@ from gausslite.wire.server import Service
 from gausslite.wire.spool import Spool
 from gausslite.wire.uplink import Uplink
 from gausslite.wire.uplink_values import UplinkSettings
+from gausslite_agent.load import Drops, LoadSettings
 from gausslite_agent.player import MissionState
 from gausslite_agent.robot import Outcome, Robot
 from gausslite_agent.servicer import AgentServicer
@@ -99,7 +100,7 @@ def agent(attention: object = ball_attention, uplink: Uplink | None = None, queu
     loops: list[asyncio.AbstractEventLoop] = []
     bells: list[Bell] = []
     on_change = lambda: loops[0].call_soon_threadsafe(lambda: bells[0].ring())  # noqa: E731
-    robot = Robot(SETTINGS, GRID, attention, uplink, on_change, queue_frames)  # type: ignore[arg-type]
+    robot = Robot(SETTINGS, GRID, attention, uplink, on_change, LoadSettings(queue_frames))  # type: ignore[arg-type]
 
     def register(server: grpc.aio.Server) -> None:
         loops.append(asyncio.get_running_loop())
@@ -194,6 +195,53 @@ def test_a_full_queue_drops_the_oldest_waiting_frame_and_says_so() -> None:
         outcomes = [future.result(20).outcome for future in (first, *waiting)]
     assert outcomes == [Outcome.MAPPED, Outcome.DROPPED, Outcome.DROPPED, Outcome.MAPPED, Outcome.MAPPED]
     assert "queue of 2 frames" in waiting[0].result().reason
+
+
+def test_a_queue_may_drop_the_newest_frame_instead() -> None:
+    gate = Gate(ball_attention(RuleParser().parse(TASK)), threading.Event())
+    robot = Robot(SETTINGS, GRID, lambda _graph: gate, load=LoadSettings(queue_frames=2, drops=Drops.NEWEST))
+    robot.assign(RuleParser().parse(TASK)).result(20)
+    first = robot.submit(frame(0))
+    assert gate.reached.wait(20)
+    waiting = [robot.submit(frame(index)) for index in range(1, 5)]
+    gate.opened.set()
+    outcomes = [future.result(20).outcome for future in (first, *waiting)]
+    robot.close()
+    assert outcomes == [Outcome.MAPPED, Outcome.MAPPED, Outcome.MAPPED, Outcome.DROPPED, Outcome.DROPPED]
+    assert "overload: 2 frames were dropped" in robot.status().load_notes
+
+
+def test_idle_time_is_trained_in_up_to_its_bound_and_work_comes_in_between() -> None:
+    robot = Robot(SETTINGS, GRID, ball_attention, load=LoadSettings(idle_iterations=5))
+    robot.assign(RuleParser().parse(TASK)).result(20)
+    robot.submit(frame(0)).result(20)
+    # each of these waits behind one iteration at most
+    trained = [robot.do(lambda mapper: mapper.gaussians()).result(20) for _ in range(9)]
+    status = robot.status()
+    assert (status.idle_iterations, status.iterations) == (5, 2)
+    assert not np.array_equal(trained[0].opacities, trained[-1].opacities)
+    np.testing.assert_array_equal(trained[-2].opacities, trained[-1].opacities)
+    robot.submit(frame(1)).result(20)
+    robot.settle().result(20)
+    settled = robot.do(lambda mapper: mapper.gaussians()).result(20)
+    np.testing.assert_array_equal(settled.opacities, robot.do(lambda mapper: mapper.gaussians()).result(20).opacities)
+    assert robot.status().idle_iterations <= 10
+    robot.close()
+
+
+def test_without_idle_iterations_the_map_stays_as_the_frame_left_it() -> None:
+    robot = Robot(SETTINGS, GRID, ball_attention)
+    robot.assign(RuleParser().parse(TASK)).result(20)
+    robot.submit(frame(0)).result(20)
+    robot.settle().result(20)
+    assert robot.status().idle_iterations == 0
+    robot.close()
+
+
+@pytest.mark.parametrize("wrong", [{"queue_frames": 0}, {"idle_iterations": -1}])
+def test_load_settings_name_what_is_wrong(wrong: dict[str, int]) -> None:
+    with pytest.raises(InvalidInputError, match="expected"):
+        LoadSettings(**wrong)
 
 
 def test_frames_that_wait_when_the_agent_ends_are_dropped() -> None:

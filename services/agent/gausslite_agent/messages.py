@@ -65,7 +65,7 @@ def status_to_message(
             voxels_waiting=uplink.voxels_waiting,
             subsets_rejected=uplink.subsets_rejected,
         ),
-        notes=robot.notes,
+        notes=(*robot.notes, *robot.load_notes),
     )
 
 

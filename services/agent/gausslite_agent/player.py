@@ -86,6 +86,7 @@ class Player:
 
     def _finish(self) -> None:
         self._state = MissionState.DRAINING
+        self._robot.settle().result()
         gaussians = self._robot.do(lambda mapper: mapper.gaussians()).result()
         uplink, counters = self._robot.uplink, UplinkCounters()
         if uplink is not None:

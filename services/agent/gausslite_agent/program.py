@@ -49,6 +49,7 @@ async def _serve(settings: AgentSettings) -> None:
             lambda graph: build_attention(graph, _scene(settings, stand_in), settings.perception),
             uplink,
             on_change=lambda: _ring(loop, news),
+            load=settings.load,
         )
         stack.callback(robot.close)
         player = Player(settings, robot, parser, client)

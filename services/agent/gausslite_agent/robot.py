@@ -1,7 +1,8 @@
 """One robot's mapper on one worker thread, with a short queue of frames before it.
 
-When frames come faster than they are mapped the OLDEST waiting one is dropped and says so: a live robot wants the
-newest view. Everything that touches the map runs on the worker, so the mapper needs no lock.
+When frames come faster than they are mapped one is dropped and says so: by default the OLDEST that waits, since a live
+robot wants the newest view. While none comes the worker may train on what it has seen, one iteration at a time.
+Everything that touches the map runs on the worker, so the mapper needs no lock.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from enum import Enum
 from typing import TypeVar
@@ -20,13 +22,14 @@ from gausslite.domain.task import TaskGraph
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.errors import MismatchError, UnavailableError
 from gausslite.mapping.mapper import GaussianMapper
-from gausslite.mapping.pace import Pace
+from gausslite.mapping.pace import Pace, Relief
 from gausslite.mapping.roi import RoiLedger
 from gausslite.mission.build import build_mapper
 from gausslite.mission.settings import MissionSettings
 from gausslite.perception.attention import Attention
-from gausslite.pipeline import TaskMapper
+from gausslite.pipeline import FrameOutcome, TaskMapper
 from gausslite.wire.uplink import Uplink
+from gausslite_agent.load import Drops, LoadSettings
 
 _Result = TypeVar("_Result")
 
@@ -55,7 +58,11 @@ class FrameReport:
 
 @dataclass(frozen=True, slots=True)
 class RobotStatus:
-    """Totals so far; busy_s is the time spent on perception and mapping, notes what the attention has to say."""
+    """Totals so far; busy_s is the time spent on perception and mapping, notes what the attention has to say.
+
+    short counts the frames that trained less than they should, without_* those that went without something for want
+    of time; max_detection_lag is the greatest age, in frames, at which a detection came.
+    """
 
     graph: TaskGraph | None = None
     map_revision: int = 0
@@ -67,7 +74,23 @@ class RobotStatus:
     iterations: int = 0
     busy_s: float = 0.0
     roi_share_sum: float = 0.0
+    idle_iterations: int = 0
+    short: int = 0
+    without_words: int = 0
+    without_seeding: int = 0
+    max_detection_lag: int = 0
     notes: tuple[str, ...] = ()
+
+    @property
+    def load_notes(self) -> tuple[str, ...]:
+        """What was left undone for want of time, one line each."""
+        told = (
+            (self.dropped, "frames were dropped"),
+            (self.short, "frames trained too little"),
+            (self.without_words, "frames told their words later"),
+            (self.without_seeding, "frames were not seeded"),
+        )
+        return tuple(f"overload: {count} {what}" for count, what in told if count)
 
     @property
     def hz(self) -> float:
@@ -103,13 +126,15 @@ class Robot:
         attention: Callable[[TaskGraph], Attention],
         uplink: Uplink | None = None,
         on_change: Callable[[], None] = lambda: None,
-        queue_frames: int = 4,
+        load: LoadSettings | None = None,
     ) -> None:
         """Reserve the map's memory. on_change is called on the worker after each mapped frame."""
         self._settings, self._grid, self._make_attention = settings, grid, attention
         self.uplink = uplink
         self._on_change = on_change
-        self._queue_frames = queue_frames
+        self._load = load or LoadSettings()
+        # how many iterations may still be rehearsed, and whether words are due for those that were; worker only
+        self._rehearsals_left, self._resting, self._untold = 0, False, False
         self._mapper = build_mapper(settings)
         self._ledger = RoiLedger(grid)
         self._task_mapper: TaskMapper | None = None
@@ -140,12 +165,12 @@ class Robot:
         with self._lock:
             if self._status.graph is None:
                 raise MismatchError("frames: expected a task first, got none yet; call AssignTask")
-            overtaken = self._waiting.popleft() if len(self._waiting) >= self._queue_frames else None
             future: Future[FrameReport] = Future()
             self._waiting.append((frame, future))
-        if overtaken is not None:
-            reason = f"the queue of {self._queue_frames} frames was full; a newer frame took its place"
-            overtaken[1].set_result(self._count(FrameReport(overtaken[0].index, Outcome.DROPPED, reason)))
+            dropped = self._overflow()
+        if dropped is not None:
+            reason = f"the queue of {self._load.queue_frames} frames was full; the {self._load.drops} gave way"
+            dropped[1].set_result(self._count(FrameReport(dropped[0].index, Outcome.DROPPED, reason)))
         self._start(self._map_next)
         return future
 
@@ -157,6 +182,10 @@ class Robot:
         """Run a function of the mapper on the worker, between two frames."""
         return self._start(lambda: function(self._mapper))
 
+    def settle(self) -> Future[None]:
+        """Rehearse no more until the next frame, and tell what rehearsing has changed."""
+        return self._start(self._end_rest)
+
     def revision(self) -> int:
         """The map's revision; it rises over restarts too."""
         return self.status().map_revision
@@ -167,6 +196,12 @@ class Robot:
         while self._waiting:
             frame, future = self._waiting.popleft()
             future.set_result(self._count(FrameReport(frame.index, Outcome.DROPPED, "the agent is ending")))
+
+    def _overflow(self) -> tuple[Frame, Future[FrameReport]] | None:
+        """The frame that is one too many for the queue; the lock is held."""
+        if len(self._waiting) <= self._load.queue_frames:
+            return None
+        return self._waiting.popleft() if self._load.drops is Drops.OLDEST else self._waiting.pop()
 
     def _start(self, work: Callable[[], _Result]) -> Future[_Result]:
         try:
@@ -191,6 +226,36 @@ class Robot:
         except Exception as error:
             # the one who waits for this frame is told; the worker goes on
             future.set_exception(error)
+        self._rehearsals_left = self._load.idle_iterations
+        if not self._resting and self._rehearsals_left > 0:
+            self._rest()
+
+    def _rest(self) -> None:
+        """One iteration while no frame waits, then this again, behind all work that has come meanwhile."""
+        with self._lock:
+            self._resting = not self._waiting
+        if not self._resting:
+            return
+        assert self._task_mapper is not None
+        if self._rehearsals_left == 0 or not self._task_mapper.rehearse():
+            self._end_rest()
+            return
+        self._rehearsals_left -= 1
+        self._untold = True
+        with self._lock:
+            self._status = replace(self._status, idle_iterations=self._status.idle_iterations + 1)
+        # the executor takes no more work once the robot is closing
+        with suppress(UnavailableError):
+            self._start(self._rest)
+
+    def _end_rest(self) -> None:
+        self._rehearsals_left, self._resting = 0, False
+        if not self._untold or self._task_mapper is None:
+            return
+        self._untold = False
+        words = self._task_mapper.words()
+        if self.uplink is not None and words is not None:
+            self.uplink.offer(words)
 
     def _map(self, frame: Frame) -> FrameReport:
         assert self._task_mapper is not None
@@ -201,12 +266,25 @@ class Robot:
             return self._count(FrameReport(frame.index, Outcome.SKIPPED, done.skipped, gaussians=done.gaussians))
         if self.uplink is not None and done.words is not None:
             self.uplink.offer(done.words)
+            self._untold = False
         report = FrameReport(
             frame.index, Outcome.MAPPED, "", done.iterations, done.gaussians, done.roi_share, done.budget.seconds
         )
+        self._note_load(done)
         self._count(report)
         self._on_change()
         return report
+
+    def _note_load(self, done: FrameOutcome) -> None:
+        with self._lock:
+            status = self._status
+            self._status = replace(
+                status,
+                short=status.short + done.budget.short,
+                without_words=status.without_words + (Relief.WORDS in done.budget.reliefs),
+                without_seeding=status.without_seeding + (Relief.SEEDING in done.budget.reliefs),
+                max_detection_lag=max(status.max_detection_lag, done.detection_lag_frames or 0),
+            )
 
     def _count(self, report: FrameReport) -> FrameReport:
         with self._lock:

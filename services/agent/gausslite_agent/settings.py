@@ -23,8 +23,10 @@ from gausslite.mission.options import (
 from gausslite.mission.settings import MissionSettings, PerceptionSettings
 from gausslite.task.validate import require_task_text
 from gausslite.wire.uplink_values import UplinkSettings
+from gausslite_agent.load import Drops, LoadSettings
 
 _MAX_DRAIN_S = 86400.0
+_IDLE_ITERATIONS = 64
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,6 +71,7 @@ class AgentSettings:
     play: PlaySettings | None
     link: LinkSettings
     mission: MissionSettings
+    load: LoadSettings
 
 
 def parse_arguments(arguments: Sequence[str] | None = None) -> AgentSettings:
@@ -101,7 +104,14 @@ def parse_arguments(arguments: Sequence[str] | None = None) -> AgentSettings:
         play,
         link,
         mission_settings(options),
+        _load_settings(options),
     )
+
+
+def _load_settings(options: argparse.Namespace) -> LoadSettings:
+    """Counted iterations make a map that can be made again, so there idle time is left idle unless asked for."""
+    idle = options.idle if options.idle is not None else (0 if options.rate is None else _IDLE_ITERATIONS)
+    return LoadSettings(options.queue, options.drop, idle)
 
 
 def _require_sense(options: argparse.Namespace) -> None:
@@ -137,7 +147,21 @@ def _parser() -> argparse.ArgumentParser:
     add_voxel_size(parser)
     add_policy(parser)
     add_budget(parser)
+    _add_load(parser)
     return parser
+
+
+def _add_load(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument_group("load").add_argument
+    add("--queue", metavar="N", type=int, default=4, help="frames that may wait (default: %(default)s)")
+    add(
+        "--drop",
+        choices=list(Drops),
+        type=Drops,
+        default=Drops.OLDEST,
+        help="what a full queue drops (default: oldest)",
+    )
+    add("--idle", metavar="N", type=int, help="iterations while no frame waits (default: 64 at a --rate, else 0)")
 
 
 def _add_camera(parser: argparse.ArgumentParser) -> None:

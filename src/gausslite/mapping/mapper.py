@@ -113,6 +113,13 @@ class GaussianMapper:
         self._revision += 1
         return MappedFrame(frame.index, seeded, iterations, self.count)
 
+    def rehearse(self) -> bool:
+        """One more iteration on the window's keyframes; False when there are none yet."""
+        if not self._keyframes.window:
+            return False
+        self._trainer.rehearse(self._keyframes.window, self._extent_m)
+        return True
+
     def revise(self, frame: Frame, relevance: RelevanceMap) -> bool:
         """Take what came to be known of an earlier frame; False when it is no keyframe of the window (any more)."""
         view = self._keyframes.of(frame)

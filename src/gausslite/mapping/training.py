@@ -64,6 +64,19 @@ class Trainer:
             self._make_spheres()
         return done
 
+    def rehearse(self, views: Sequence[WindowView], extent_m: float) -> None:
+        """One iteration on views of earlier frames, for time in which none waits; the phases take turns as ever."""
+        showing, pace = self._showing_region(views), Pace()
+        step = self._next_step(self._iterations, bool(showing), pace)
+        if step is None:
+            return
+        table = self._table
+        with self._rasterizer.holding(table.rows, table.first_moment, table.second_moment):
+            self._iterate(step, views if step is Step.WARM_UP else showing)
+        self._count_trained()
+        self._control_density(extent_m, pace)
+        self._bound_colours()
+
     def _showing_region(self, views: Sequence[WindowView]) -> list[WindowView]:
         """The views of the active phase; none where the component is off, so that all iterations are warm-ups."""
         optimization = self._settings.optimization
