@@ -14,6 +14,8 @@ from gausslite.errors import MapFileError
 State = Mapping[str, NDArray[Any]]
 """Owners prefix the names of their parts with "part/"."""
 
+_LARGEST_MEASURE = 1e6
+
 
 def nested(prefix: str, state: State) -> dict[str, NDArray[Any]]:
     """The same arrays, their names one level deeper."""
@@ -45,6 +47,14 @@ def take_counts(state: State, name: str, count: int) -> tuple[int, ...]:
     if min(values, default=0) < 0:
         raise MapFileError(f"state {name}: expected counts of at least 0, got {min(values)}")
     return values
+
+
+def take_measures(state: State, name: str, count: int) -> tuple[float, ...]:
+    """Metres, pixels and the like: numbers that float32 can still reckon with. Raises MapFileError, ShapeError."""
+    values = take(state, name, (count,), np.float64)
+    if not (np.abs(values) <= _LARGEST_MEASURE).all():
+        raise MapFileError(f"state {name}: expected numbers of at most {_LARGEST_MEASURE:g}, got others")
+    return tuple(float(value) for value in values)
 
 
 def text(value: str) -> NDArray[np.uint8]:

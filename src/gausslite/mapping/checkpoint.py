@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from gausslite.domain.camera import Camera
 from gausslite.domain.frame import Frame
 from gausslite.domain.relevance import RelevanceMap
-from gausslite.domain.state import State, take, whole_numbers
+from gausslite.domain.state import State, take, take_measures, whole_numbers
 from gausslite.errors import MapFileError
 
 _LOW = (1 << 64) - 1
@@ -34,7 +34,7 @@ def frame_of(state: State) -> Frame:
     """The frame again; its arrays are copies. Raises MapFileError, InvalidInputError."""
     index, capture_time_ns = (int(value) for value in take(state, "stamp", (2,), np.int64))
     depth_m = take(state, "depth_m", (None, None), np.float32).copy()
-    fx_px, fy_px, cx_px, cy_px = (float(value) for value in take(state, "camera", (4,), np.float64))
+    fx_px, fy_px, cx_px, cy_px = take_measures(state, "camera", 4)
     camera = Camera(fx_px, fy_px, cx_px, cy_px, depth_m.shape[1], depth_m.shape[0])
     rgb = take(state, "rgb", (*depth_m.shape, 3), np.uint8).copy()
     T_world_camera = take(state, "T_world_camera", (4, 4), np.float64).copy()

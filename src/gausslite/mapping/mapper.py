@@ -14,8 +14,7 @@ from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.pose import inverse
 from gausslite.domain.relevance import RelevanceMap
-from gausslite.domain.state import State, nested, part, take, take_counts, whole_numbers
-from gausslite.errors import MapFileError
+from gausslite.domain.state import State, nested, part, take, take_counts, take_measures, whole_numbers
 from gausslite.mapping.budget import insert
 from gausslite.mapping.checkpoint import generator_state, set_generator
 from gausslite.mapping.coverage import MapSight
@@ -30,8 +29,6 @@ from gausslite.render.rasterizer import MEAN, Rasterizer, Rendering
 
 _EXTENT_PER_DEPTH = 1.0 / 3.0
 """The scene's extent as a fraction of the farthest depth seen, as SplaTAM's released configuration takes it."""
-
-_MAX_EXTENT_M = 1e6
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,10 +176,7 @@ class GaussianMapper:
         self._trainer.restore(part(state, "trainer"))
         self._refiner.restore(part(state, "refiner"))
         set_generator(self._rng, take(state, "generator", (6,), np.uint64))
-        [extent_m] = take(state, "extent_m", (1,), np.float64)
-        if not 0 <= extent_m <= _MAX_EXTENT_M:
-            raise MapFileError(f"state extent_m: expected 0 to {_MAX_EXTENT_M:g} m, got {extent_m}")
-        self._extent_m = float(extent_m)
+        [self._extent_m] = take_measures(state, "extent_m", 1)
         self._revision, self._skipped = take_counts(state, "frames", 2)
 
     def _observe(self, frame: Frame, relevance: RelevanceMap) -> WindowView:

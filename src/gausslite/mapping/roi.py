@@ -11,6 +11,7 @@ from gausslite.domain.state import State, take
 from gausslite.domain.subset import VoxelWords
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.domain.words import take_voxels, tombstones, unite, words_of
+from gausslite.errors import MapFileError
 
 
 class RoiLedger:
@@ -44,6 +45,8 @@ class RoiLedger:
     def restore(self, state: State) -> None:
         """Take over what another ledger said. Raises MapFileError, ShapeError."""
         keys = take(state, "keys", (None,), np.int64)
+        if (keys[1:] <= keys[:-1]).any():
+            raise MapFileError("state keys: expected strictly ascending voxel keys, got others")
         self._states = take(state, "states", (len(keys), 3), np.uint64).copy()
         self._keys = keys.copy()
 

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import mmap
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float32, Int, Int16, UInt32
 from numpy import ndarray
+from numpy.typing import NDArray
 
 from gausslite.domain.arrays import require_array, require_finite
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.state import State, take
 from gausslite.errors import InvalidInputError, MapFileError, QuotaError
-from gausslite.render.rasterizer import LOG_SCALE, LOGIT, MEAN, QUAT, RGB, ROW_WIDTH
+from gausslite.render.rasterizer import GRAD_2D_SUM, LOG_SCALE, LOGIT, MEAN, QUAT, RGB, ROW_WIDTH
 
 _COLUMNS: dict[str, tuple[int | None, type[np.generic]]] = {
     "rows": (ROW_WIDTH, np.float32),
@@ -25,6 +27,9 @@ _COLUMNS: dict[str, tuple[int | None, type[np.generic]]] = {
 _MIN_SCALE_M = 1e-7
 _MAX_LOG_SCALE = 80.0
 """Beyond it the scale is not a float32."""
+_MOST_PER_SECOND, _ROUNDING = 1e6, 1e-30
+"""By Cauchy and Schwarz a first moment's square is at most (1 - b1)^2 / ((1 - b2) (1 - b1^2 / b2)) times the second: 53
+for Adam's usual betas. This leaves room for others, and for what float32 rounds to 0."""
 _MIN_OPACITY = 1e-6
 
 
@@ -163,8 +168,8 @@ class SplatTable:
         }
         for name in ("rows", "first_moment", "second_moment"):
             require_finite(f"state {name}", columns[name])
-        if (rows[:, LOG_SCALE] > _MAX_LOG_SCALE).any() or (columns["second_moment"] < 0).any():
-            raise MapFileError("state table: expected scales and second moments that training can reach, got others")
+        if (rows[:, LOG_SCALE] > _MAX_LOG_SCALE).any() or not _belong_together(*_moments(columns)):
+            raise MapFileError("state table: expected scales and moments that training can reach, got others")
         for name, column in columns.items():
             getattr(self, f"_{name}")[: len(rows)] = column
         self._count = len(rows)
@@ -173,6 +178,16 @@ class SplatTable:
         """Copies of all Gaussians, or of these rows, as physical values."""
         chosen = np.arange(self._count) if ids is None else ids
         return rows_to_gaussians(self.rows[chosen], self.active[chosen], self.kappa[chosen], self.target[chosen])
+
+
+def _moments(columns: State) -> tuple[NDArray[Any], NDArray[Any]]:
+    return columns["first_moment"][:, :GRAD_2D_SUM], columns["second_moment"][:, :GRAD_2D_SUM]
+
+
+def _belong_together(first: Float32[ndarray, "n 14"], second: Float32[ndarray, "n 14"]) -> bool:
+    """False for a first moment so large beside the second that one step would throw the Gaussian away."""
+    allowed = _MOST_PER_SECOND * second.astype(np.float64) + _ROUNDING
+    return bool((second >= 0).all() and (np.square(first.astype(np.float64)) <= allowed).all())
 
 
 def gaussians_to_rows(gaussians: Gaussians) -> Float32[ndarray, "n 16"]:

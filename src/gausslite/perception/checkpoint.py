@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from gausslite.domain.camera import Camera
 from gausslite.domain.pose import require_rigid
 from gausslite.domain.relevance import Detection
-from gausslite.domain.state import State, take, take_counts, take_text, text, whole_numbers
+from gausslite.domain.state import State, take, take_counts, take_measures, take_text, text, whole_numbers
 from gausslite.errors import MapFileError
 from gausslite.perception.memory import Remembered
 from gausslite.perception.reproject import Frustum
@@ -30,10 +30,8 @@ def frustum_state(frustum: Frustum) -> dict[str, NDArray[Any]]:
 
 def frustum_of(state: State) -> Frustum:
     """The carried detection again. Raises MapFileError, InvalidInputError."""
-    numbers = take(state, "numbers", (11,), np.float64)
-    if not np.isfinite(numbers).all():
-        raise MapFileError("state numbers: expected finite ones, got others")
-    score, left, top, right, bottom, fx_px, fy_px, cx_px, cy_px, near_m, far_m = (float(value) for value in numbers)
+    numbers = take_measures(state, "numbers", 11)
+    score, left, top, right, bottom, fx_px, fy_px, cx_px, cy_px, near_m, far_m = numbers
     mask = take(state, "mask", (None, None), np.bool_).copy()
     T_world_camera = take(state, "T_world_camera", (4, 4), np.float64).copy()
     require_rigid("state T_world_camera", T_world_camera)
@@ -55,10 +53,10 @@ def remembered_state(each: Remembered) -> dict[str, NDArray[Any]]:
 
 def remembered_of(state: State) -> Remembered:
     """The object again. Raises MapFileError, InvalidInputError."""
-    place_m = take(state, "place_m", (4,), np.float64)
+    x_m, y_m, z_m, radius_m = take_measures(state, "place_m", 4)
     cells = take(state, "cells", (None,), np.int64).copy()
     counts = take(state, "counts", cells.shape, np.int64).copy()
-    if not np.isfinite(place_m).all() or (counts < 1).any() or (cells[1:] <= cells[:-1]).any() or len(cells) == 0:
-        raise MapFileError("state object: expected a finite place and ascending cells with counts, got others")
+    if (counts < 1).any() or (cells[1:] <= cells[:-1]).any() or len(cells) == 0:
+        raise MapFileError("state object: expected ascending cells with counts, got others")
     [seen] = take_counts(state, "seen", 1)
-    return Remembered(take_text(state, "phrase"), place_m[:3].copy(), float(place_m[3]), cells, counts, seen)
+    return Remembered(take_text(state, "phrase"), np.array([x_m, y_m, z_m]), radius_m, cells, counts, seen)
