@@ -14,7 +14,7 @@ from gausslite.errors import InvalidInputError, KernelError
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.settings import MapperSettings, SeedingSettings
 from gausslite.optimize.density import DensitySettings
-from gausslite.render.rasterizer import AdamSettings, LossWeights, Rasterizer
+from gausslite.render.rasterizer import AdamSettings, LossWeights, Rasterizer, Subset
 
 pytest.importorskip("torch", reason="torch is not installed")
 pytest.importorskip("gsplat", reason="gsplat is not installed; pip install gausslite[cuda]")
@@ -129,3 +129,16 @@ def test_a_device_that_torch_does_not_have_is_named() -> None:
             CudaRasterizer("cuda")
     with pytest.raises(KernelError, match="expected device cuda, cuda:N or cpu, got meta"):
         CudaRasterizer("meta")
+
+
+def test_what_may_not_be_written_can_be_drawn_and_trained_on() -> None:
+    rasterizer, frame = CudaRasterizer("cpu"), wall_frame(0, SIZE)
+    lent, rgb, trainable = tables(), frame.rgb.copy(), np.ones(4, np.bool_)
+    tiles = np.ones((1, 2), np.bool_)
+    rows = lent[0].copy()
+    for array in (rgb, trainable, tiles, rows):
+        array.flags.writeable = False
+    rasterizer.forward(rows, frame.camera, np.eye(4), Subset(tiles=tiles))
+    view = rasterizer.prepare_view(rgb, frame.depth_m, frame.camera)
+    report = rasterizer.step(*lent, view, np.eye(4), LossWeights(), AdamSettings(), trainable=trainable)
+    assert len(report.visible) == 4

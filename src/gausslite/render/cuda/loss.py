@@ -14,6 +14,7 @@ from torch.nn.functional import conv2d
 
 from gausslite.domain.camera import Camera
 from gausslite.render.cuda.projection import Lens
+from gausslite.render.cuda.tables import carried
 from gausslite.render.rasterizer import TILE_PX, LossWeights
 
 MIN_DEPTH_ALPHA = 0.5
@@ -102,8 +103,8 @@ class CudaView:
         device: torch.device,
     ) -> CudaView:
         """Carry the images to the device, colours in [0, 1], with the sums that no drawing changes."""
-        colours = torch.from_numpy(np.ascontiguousarray(rgb)).to(device).float() / 255.0
-        measured_m = torch.from_numpy(np.ascontiguousarray(depth_m)).to(device)
+        colours = carried(rgb, device).float() / 255.0
+        measured_m = carried(depth_m, device)
         planes = colours.permute(2, 0, 1)
         blurred = _blur(torch.cat([planes, planes * planes]))
         means = blurred[:3]
@@ -119,7 +120,7 @@ class CudaView:
             colours[part],
             measured_m[part],
             similar[:, window.rows, window.columns],
-            torch.from_numpy(np.ascontiguousarray(weight[part])).to(device),
+            carried(weight[part], device),
             float(weight.sum(dtype=np.float64)),
         )
         return cls(camera, lens, plain, masked)
@@ -156,9 +157,13 @@ def _ssim_sum(rgb: Float32[Tensor, "h w 3"], target: Target) -> Float32[Tensor, 
 
 
 def _blur(planes: Float32[Tensor, "k h w"]) -> Float32[Tensor, "k h w"]:
-    """Every plane under an 11x11 Gaussian, as two passes of eleven."""
+    """Every plane under an 11x11 Gaussian, as two passes of eleven.
+
+    Depthwise, which torch computes in full single precision; of an ordinary convolution it may round the factors to
+    ten bits on a GPU, and variances would be lost in that.
+    """
     offsets = torch.arange(-_REACH_PX, _REACH_PX + 1, dtype=torch.float64, device=planes.device)
     kernel = torch.exp(-offsets.square() / (2.0 * _SIGMA_PX**2))
-    kernel = (kernel / kernel.sum()).to(planes.dtype)
-    lines = conv2d(planes[:, None], kernel.reshape(1, 1, 1, -1), padding=(0, _REACH_PX))
-    return conv2d(lines, kernel.reshape(1, 1, -1, 1), padding=(_REACH_PX, 0))[:, 0]
+    kernel = (kernel / kernel.sum()).to(planes.dtype).expand(len(planes), 1, 1, -1)
+    lines = conv2d(planes[None], kernel, padding=(0, _REACH_PX), groups=len(planes))
+    return conv2d(lines, kernel.transpose(2, 3), padding=(_REACH_PX, 0), groups=len(planes))[0]

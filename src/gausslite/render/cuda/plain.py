@@ -14,6 +14,7 @@ from torch import Tensor
 from gausslite.domain.camera import Camera
 from gausslite.render.cuda.kernels import load_gsplat
 from gausslite.render.cuda.loss import CudaView, training_loss
+from gausslite.render.cuda.tables import carried
 from gausslite.render.rasterizer import LOG_SCALE, LOGIT, MEAN, NEAR_M, QUAT, RGB, LossWeights
 
 Rasterization = Callable[..., tuple[Tensor, Tensor, dict[str, Any]]]
@@ -42,12 +43,12 @@ class PlainTraining:
         rasterization: Rasterization,
     ) -> None:
         device = view.plain.rgb.device
-        on_device = torch.from_numpy(rows).to(device, copy=True)
+        on_device = carried(rows, device)
         self._parameters = [
             torch.nn.Parameter(on_device[:, columns].clone()) for columns in (MEAN, QUAT, LOG_SCALE, LOGIT, RGB)
         ]
         self._adam = torch.optim.Adam(self._parameters, lr=0.0, eps=1e-15)
-        self._pose = torch.from_numpy(T_camera_world.astype(np.float32)).to(device)[None]
+        self._pose = carried(T_camera_world.astype(np.float32), device)[None]
         self._intrinsics = _intrinsics(view.camera).to(device)[None]
         self._view, self._loss, self._rasterization = view, loss, rasterization
 

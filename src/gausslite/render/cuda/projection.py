@@ -13,6 +13,7 @@ from torch.nn.functional import logsigmoid, normalize
 
 from gausslite.domain.camera import Camera
 from gausslite.render.cuda.kernels import Footprints, Kernels
+from gausslite.render.cuda.tables import carried
 from gausslite.render.rasterizer import LOG_SCALE, LOGIT, MEAN, NEAR_M, QUAT, RGB, TILE_PX, UPDATES
 from gausslite.render.reference.projection import LOW_PASS_PX2, MIN_ALPHA
 
@@ -28,6 +29,7 @@ class Lens:
     size: tuple[int, int]
     intrinsics: Float32[Tensor, "3 3"]
     shift_px: Float32[Tensor, "2"]
+    half_size_px: Float32[Tensor, "2"]
 
     @classmethod
     def of(cls, camera: Camera, device: torch.device) -> Lens:
@@ -39,6 +41,7 @@ class Lens:
             (camera.width_px, camera.height_px),
             torch.tensor(intrinsics, dtype=torch.float32, device=device),
             torch.tensor(shift_px, dtype=torch.float32, device=device),
+            torch.tensor(middle_px, dtype=torch.float32, device=device),
         )
 
 
@@ -77,16 +80,19 @@ def visible_rows(
     ids: Int64[Tensor, " k"] | None,
     tiles: Bool[ndarray, "th tw"] | None,
 ) -> Int64[Tensor, " m"]:
-    """Numbers of the rows (among `ids`) whose ellipse can touch a pixel of `tiles`, ascending."""
+    """Numbers of the rows (among `ids`) whose ellipse can touch a pixel of `tiles`, ascending.
+
+    What cannot be drawn is projected like the rest and left out at the end: the host waits for one number only.
+    """
     candidates = rows if ids is None else rows[ids]
     drawable = torch.isfinite(candidates[:, :UPDATES]).all(dim=1) & (candidates[:, QUAT] != 0).any(dim=1)
     drawable &= candidates[:, MEAN] @ T_camera_world[2, :3] + T_camera_world[2, 3] >= NEAR_M
-    chosen = torch.nonzero(drawable)[:, 0]
-    footprints = project(kernels, candidates[chosen], lens, T_camera_world)
-    finite = torch.isfinite(footprints.conics).all(dim=1) & torch.isfinite(footprints.means_px).all(dim=1)
-    finite &= torch.isfinite(footprints.radius_px).all(dim=1) & (footprints.opacities > MIN_ALPHA)
-    touching = _touches(footprints.means_px[finite], footprints.radius_px[finite], lens.size, tiles)
-    chosen = chosen[finite][touching]
+    footprints = project(kernels, candidates, lens, T_camera_world)
+    boxes_px = torch.cat([footprints.means_px, footprints.radius_px], dim=1)
+    drawable &= torch.isfinite(footprints.conics).all(dim=1) & torch.isfinite(boxes_px).all(dim=1)
+    drawable &= footprints.opacities > MIN_ALPHA
+    boxes_px = torch.where(drawable[:, None], boxes_px, 0.0)
+    chosen = torch.nonzero(drawable & _touches(boxes_px[:, :2], boxes_px[:, 2:], lens, tiles))[:, 0]
     return chosen if ids is None else ids[chosen]
 
 
@@ -99,18 +105,18 @@ def _unit(quats_wxyz: Float32[Tensor, "m 4"]) -> Float32[Tensor, "m 4"]:
 def _touches(
     means_px: Float32[Tensor, "m 2"],
     radius_px: Float32[Tensor, "m 2"],
-    size: tuple[int, int],
+    lens: Lens,
     tiles: Bool[ndarray, "th tw"] | None,
 ) -> Bool[Tensor, " m"]:
     """True where the bounding box holds the centre of a pixel of the tiles (of the image, when they are None)."""
-    last = torch.tensor(size, dtype=torch.float32, device=means_px.device) - 1.0
+    last = 2.0 * lens.half_size_px - 1.0
     low = torch.ceil(means_px - radius_px - 0.5).clamp(min=0.0)
     high = torch.minimum(torch.floor(means_px + radius_px - 0.5), last)
     hit = (low <= high).all(dim=1)
     if tiles is None:
         return hit
     # how many of the tiles lie in the box, by four corners of a summed-area table
-    table = torch.from_numpy(np.pad(tiles.cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0)))).to(means_px.device)
+    table = carried(np.pad(tiles.cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0))), means_px.device)
     x0, y0 = (torch.minimum(low, last).long() // TILE_PX).unbind(dim=1)
     x1, y1 = (high.clamp(min=0.0).long() // TILE_PX + 1).unbind(dim=1)
     return hit & (table[y1, x1] - table[y0, x1] - table[y1, x0] + table[y0, x0] > 0)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -25,7 +25,7 @@ from gausslite.render.checks import (
 from gausslite.render.cuda.kernels import Footprints, GsplatKernels, Kernels, TorchKernels, load_gsplat
 from gausslite.render.cuda.loss import CudaView, Window, training_loss
 from gausslite.render.cuda.projection import Lens, project, visible_rows
-from gausslite.render.cuda.tables import DeviceTables, HostTables
+from gausslite.render.cuda.tables import DeviceTables, HostTables, carried
 from gausslite.render.rasterizer import (
     EVERYTHING,
     AdamSettings,
@@ -40,7 +40,7 @@ from gausslite.render.rasterizer import (
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Drawn:
-    """A drawn window with its graph: leaves (the visible rows, the pose), the means between, the images."""
+    """A drawn window with its graph: leaves (the visible rows, the pose if asked), the means between, the images."""
 
     visible: Int64[Tensor, " m"]
     rows: Float32[Tensor, "m 16"]
@@ -56,7 +56,7 @@ class _Context:
 
     owner: CudaRasterizer
     drawn: _Drawn
-    camera: Camera
+    lens: Lens
     n: int
     T_camera_world: Float64[ndarray, "4 4"]
 
@@ -119,14 +119,15 @@ class CudaRasterizer:
         """Draw the splats. Raises ShapeError, InvalidInputError for ids that are not ascending rows."""
         require_table("rows", rows)
         require_scene(len(rows), camera, T_camera_world, subset)
-        on_device = torch.from_numpy(rows).to(self._kernels.device)
-        drawn = self._draw(on_device, camera, Lens.of(camera, self._kernels.device), T_camera_world, subset)
+        on_device = carried(rows, self._kernels.device)
+        lens = Lens.of(camera, self._kernels.device)
+        drawn = self._draw(on_device, lens, T_camera_world, subset, Window.whole(camera), pose_too=True)
         channels = drawn.channels.detach().cpu().numpy()
         return Rendering(
             np.ascontiguousarray(channels[..., :3]),
             np.ascontiguousarray(channels[..., 3]),
             drawn.alpha.detach().cpu().numpy(),
-            _Context(self, drawn, camera, len(rows), T_camera_world.copy()),
+            _Context(self, drawn, lens, len(rows), T_camera_world.copy()),
         )
 
     def backward(
@@ -145,14 +146,15 @@ class CudaRasterizer:
             raise InvalidInputError("rendering: expected one of this rasterizer, got another's")
         require_image_gradients(rendering, d_rgb, d_depth_m, d_alpha)
         drawn = context.drawn
-        d_channels = torch.from_numpy(np.concatenate([d_rgb, d_depth_m[..., None]], axis=2))
+        d_channels = np.concatenate([d_rgb, d_depth_m[..., None]], axis=2)
         device = self._kernels.device
-        gradients, d_pose, norms = _pull_back(
-            drawn,
+        gradients, d_means_px, d_pose = torch.autograd.grad(
             (drawn.channels, drawn.alpha),
-            (d_channels.to(device), torch.from_numpy(np.ascontiguousarray(d_alpha)).to(device)),
-            context.camera,
+            (drawn.rows, drawn.means_px, drawn.T_camera_world),
+            (carried(d_channels, device), carried(d_alpha, device)),
+            retain_graph=True,
         )
+        norms = _norms_2d(d_means_px, context.lens)
         visible = drawn.visible.cpu().numpy()
         d_rows = np.zeros((context.n, gradients.shape[1]), np.float32)
         d_rows[visible] = gradients.cpu().numpy()
@@ -199,12 +201,12 @@ class CudaRasterizer:
         if trainable is not None:
             require_array("trainable", trainable, (len(rows),), np.bool_)
         target = view.masked if masked else view.plain
-        drawn = self._draw(self._held.rows, view.camera, view.lens, T_camera_world, subset, target.window)
+        drawn = self._draw(self._held.rows, view.lens, T_camera_world, subset, target.window)
         value = training_loss(drawn.channels, drawn.alpha, target, loss)
-        gradients, _, norms = _pull_back(drawn, (value,), (torch.ones_like(value),), view.camera)
-        moving = drawn.visible
+        gradients, d_means_px = torch.autograd.grad(value, (drawn.rows, drawn.means_px))
+        moving, norms = drawn.visible, _norms_2d(d_means_px, view.lens)
         if trainable is not None:
-            updated = torch.from_numpy(trainable).to(moving.device)[moving]
+            updated = torch.nonzero(carried(trainable, moving.device)[moving])[:, 0]
             moving, gradients, norms = moving[updated], gradients[updated], norms[updated]
         self._held.update(moving, gradients, norms, adam)
         return _DeviceReport(value.detach(), drawn.visible)
@@ -233,19 +235,18 @@ class CudaRasterizer:
     def _draw(
         self,
         rows: Float32[Tensor, "n 16"],
-        camera: Camera,
         lens: Lens,
         T_camera_world: Float64[ndarray, "4 4"],
         subset: Subset,
-        window: Window | None = None,
+        window: Window,
+        pose_too: bool = False,
     ) -> _Drawn:
-        """Project the visible rows and blend them in the window (by default the whole image)."""
+        """Project the visible rows and blend them in the window; pose_too: ready for gradients by the pose."""
         device = self._kernels.device
-        window = window or Window.whole(camera)
-        pose = torch.from_numpy(T_camera_world.astype(np.float32)).to(device)
-        ids = None if subset.ids is None else torch.from_numpy(subset.ids.astype(np.int64)).to(device)
+        pose = carried(T_camera_world.astype(np.float32), device)
+        ids = None if subset.ids is None else carried(subset.ids.astype(np.int64), device)
         visible = visible_rows(self._kernels, rows, lens, pose, ids, subset.tiles)
-        leaves, pose = rows[visible].requires_grad_(), pose.requires_grad_()
+        leaves, pose = rows[visible].requires_grad_(), pose.requires_grad_(pose_too)
         footprints = project(self._kernels, leaves, lens, pose)
         channels, alpha = self._composite(footprints, window, subset.tiles)
         return _Drawn(visible, leaves, pose, footprints.means_px, channels, alpha)
@@ -261,9 +262,10 @@ class CudaRasterizer:
             return nothing.expand(height_px, width_px, 4), nothing.expand(height_px, width_px)
         shown = None
         if tiles is not None:
-            shown = torch.from_numpy(np.ascontiguousarray(tiles[window.tile_rows, window.tile_columns])).to(device)
-        moved_px = footprints.means_px - torch.tensor(window.origin_px, dtype=torch.float32, device=device)
-        part = Footprints(moved_px, footprints.conics, footprints.opacities, footprints.channels, footprints.radius_px)
+            shown = carried(tiles[window.tile_rows, window.tile_columns], device)
+        left, top = window.origin_px
+        moved_px = torch.stack([footprints.means_px[:, 0] - left, footprints.means_px[:, 1] - top], dim=1)
+        part = replace(footprints, means_px=moved_px)
         return self._kernels.composite(part, window.size, shown)
 
 
@@ -281,15 +283,10 @@ def _kernels_for(device: str) -> Kernels:
         raise KernelError(f"cuda backend: needs gsplat; pip install gausslite[cuda] ({reason})") from reason
 
 
-def _pull_back(
-    drawn: _Drawn, outputs: tuple[Tensor, ...], d_outputs: tuple[Tensor, ...], camera: Camera
-) -> tuple[Float32[Tensor, "m 16"], Float32[Tensor, "4 4"], Float32[Tensor, " m"]]:
-    """Gradients by the visible rows and the pose, and the norms of those by their means in the image."""
-    gradients, d_pose, d_means_px = torch.autograd.grad(
-        outputs, (drawn.rows, drawn.T_camera_world, drawn.means_px), d_outputs, retain_graph=True
-    )
-    half_size = torch.tensor([camera.width_px / 2.0, camera.height_px / 2.0], device=d_means_px.device)
-    return gradients, d_pose, (d_means_px * half_size).norm(dim=1)
+def _norms_2d(d_means_px: Float32[Tensor, "m 2"], lens: Lens) -> Float32[Tensor, " m"]:
+    """Norms of the gradients by the means in the image, in half widths and half heights."""
+    norms: Tensor = (d_means_px * lens.half_size_px).norm(dim=1)
+    return norms
 
 
 def _twist_gradient(d_pose: Float64[ndarray, "4 4"], T_camera_world: Float64[ndarray, "4 4"]) -> Float64[ndarray, "6"]:

@@ -3,13 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from jaxtyping import Float32, Int64
 from numpy import ndarray
+from numpy.typing import NDArray
 from torch import Tensor
 
 from gausslite.render.rasterizer import GRAD_2D_COUNT, GRAD_2D_SUM, UPDATES, AdamSettings
+
+
+def carried(array: NDArray[Any], device: torch.device) -> Tensor:
+    """The array on the device; of one that may not be written, which torch refuses to share, a copy."""
+    writable = array if array.flags.writeable and array.flags.c_contiguous else array.copy(order="C")
+    return torch.from_numpy(writable).to(device)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,7 +73,7 @@ class DeviceTables:
         first[:, trained].lerp_(gradient, 1.0 - adam.beta1)
         second[:, trained].mul_(adam.beta2).addcmul_(gradient, gradient, value=1.0 - adam.beta2)
         updates = rows[:, UPDATES, None] + 1.0
-        rates = torch.from_numpy(adam.row_rates()[trained]).to(rows.device)
+        rates = carried(adam.row_rates()[trained], rows.device)
         first_unbiased = first[:, trained] / (1.0 - adam.beta1**updates)
         second_unbiased = second[:, trained] / (1.0 - adam.beta2**updates)
         rows[:, trained] -= rates * first_unbiased / (second_unbiased.sqrt() + adam.epsilon)
