@@ -189,7 +189,7 @@ NB_MODULE(_kernels, m) {
   m.def("usable_simd", &usable_forms, "Instruction sets this build has and this machine runs, fastest first.");
   m.def("core_clock_ghz", &core_clock_ghz, "The clock of this core, by a chain of additions.");
 
-  nb::class_<TrainingView>(m, "View", "A training image made ready: padded, planar, SSIM moments cached.")
+  nb::class_<TrainingView>(m, "View", "A training image made ready: padded, tiled, SSIM moments cached.")
       .def_prop_ro("width", &TrainingView::width)
       .def_prop_ro("height", &TrainingView::height);
 

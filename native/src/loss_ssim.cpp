@@ -47,17 +47,23 @@ class Columns {
   size_t map_;
 };
 
-// The rows of a plane that row k of the squares reaches; beyond the image they are zero.
-struct Rows {
-  const float* row[kSpan];
+// A square lies on two tiles; beyond the image there is nothing.
+struct Square {
+  const float *upper, *lower;
 
-  Rows(const float* plane, const float* zeros, int k, int tiles_x, int tiles_y) {
-    for (int i = 0; i < kSpan; ++i) {
-      const int y = k * kTile - kLead + i;
-      row[i] = y >= 0 && y < tiles_y * kTile ? plane + int64_t(y) * tiles_x * kTile : zeros;
-    }
-  }
+  GAUSSLITE_INLINE Pack16 row(int i) const { return row_between(upper, lower, i); }
 };
+
+Square image_square(const SquareRow& row, int x, int channel) {
+  const size_t at = image_tile(x) + size_t(channel) * kSquare;
+  return {row.above != nullptr ? row.above->image.data() + at : kNoSquares,
+          row.below != nullptr ? row.below->image.data() + at : kNoSquares};
+}
+
+Square target_square(const float* tiles, int tiles_x, int tiles_y, int k, int x, int channel) {
+  const float* lower = tiles + ((size_t(k) * size_t(tiles_x) + size_t(x)) * kTargets + size_t(channel)) * kSquare;
+  return {k > 0 ? lower - size_t(tiles_x) * kTargets * kSquare : kNoSquares, k < tiles_y ? lower : kNoSquares};
+}
 
 template <class Get>
 GAUSSLITE_INLINE void blur_and_transpose(Get get, float* out) {
@@ -71,7 +77,9 @@ GAUSSLITE_INLINE void blur_and_transpose(Get get, float* out) {
 GAUSSLITE_INLINE Pack16 column(const float* columns, int i) { return load(columns + (i - kRadius) * kTile); }
 
 // Where SsimTargets::moments has the mean of a channel; the mean square is behind it.
-size_t moments_at(size_t square, int channel) { return (square * 3 + size_t(channel)) * 2 * kSquare; }
+size_t moments_at(int tiles_x, int k, int channel, int x) {
+  return ((size_t(k) * 3 + size_t(channel)) * size_t(tiles_x) + size_t(x)) * 2 * kSquare;
+}
 
 // Forms SSIM and its derivatives in one square. Returns the sum of SSIM times the (negative) weights.
 double derive(Columns& columns, int x, const float* moments, const float* weights, float scale) {
@@ -104,34 +112,31 @@ double derive(Columns& columns, int x, const float* moments, const float* weight
 
 }  // namespace
 
-void derive_ssim(Workspace& ws, const Training& training, int k, int thread) {
+void derive_ssim(Workspace& ws, const Training& training, const SquareRow& row, int thread) {
   const Targets& t = training.targets;
+  const int k = row.k;
   const uint8_t* reach = t.ssim.reach + size_t(k) * size_t(ws.tiles_x);
   double& loss = training.ssim_sums[k] = 0.0;
   if (!std::any_of(reach, reach + ws.tiles_x, [](uint8_t r) { return r == kWeighted; })) return;
   Buffer<float>& memory = ws.scratch[size_t(thread)].ssim;
   memory.reserve(ssim_scratch_floats(ws.tiles_x));
-  const float* zeros = memory.data() + Columns::floats(ws.tiles_x);
   Columns columns(memory.data(), ws.tiles_x);
   for (int channel = 0; channel < 3; ++channel) {
-    const Rows image(ws.image.data() + channel * ws.plane, zeros, k, ws.tiles_x, ws.tiles_y);
-    const Rows target(t.rgb + channel * ws.plane, zeros, k, ws.tiles_x, ws.tiles_y);
     // Square x is blurred down, x - 1 derived, x - 2 blurred along: each needs its right neighbour's former step.
     for (int x = 0; x < ws.tiles_x + 2; ++x) {
       if (x < ws.tiles_x && reach[x] != kUnreached) {
-        const int at = x * kTile;
-        const auto x_at = [&](int i) { return load(image.row[i] + at); };
-        const auto y_at = [&](int i) { return load(target.row[i] + at); };
-        blur_and_transpose(x_at, columns.blurred(0, x));
-        blur_and_transpose([&](int i) { return x_at(i) * x_at(i); }, columns.blurred(1, x));
-        blur_and_transpose([&](int i) { return x_at(i) * y_at(i); }, columns.blurred(2, x));
+        const Square image = image_square(row, x, channel),
+                     target = target_square(t.tiles, ws.tiles_x, ws.tiles_y, k, x, channel);
+        blur_and_transpose([&](int i) { return image.row(i); }, columns.blurred(0, x));
+        blur_and_transpose([&](int i) { return image.row(i) * image.row(i); }, columns.blurred(1, x));
+        blur_and_transpose([&](int i) { return image.row(i) * target.row(i); }, columns.blurred(2, x));
       }
       const int middle = x - 1;
       if (middle >= 0 && middle < ws.tiles_x) {
-        const size_t square = size_t(k) * size_t(ws.tiles_x) + size_t(middle);
         if (reach[middle] == kWeighted) {
-          loss += derive(columns, middle, t.ssim.moments + moments_at(square, channel),
-                         t.ssim.weights + square * kSquare, training.loss.ssim);
+          const float* weights = t.ssim.weights + (size_t(k) * size_t(ws.tiles_x) + size_t(middle)) * kSquare;
+          loss += derive(columns, middle, t.ssim.moments + moments_at(ws.tiles_x, k, channel, middle), weights,
+                         training.loss.ssim);
         } else {
           for (int m = 0; m < kSsimMaps; ++m) std::fill_n(columns.derivative(m, middle), kSquare, 0.0f);
         }
@@ -140,28 +145,26 @@ void derive_ssim(Workspace& ws, const Training& training, int k, int thread) {
       if (last >= 0 && reach[last] != kUnreached) {
         for (int m = 0; m < kSsimMaps; ++m) {
           const float* in = columns.derivative(m, last);
-          blur_and_transpose([&](int i) { return column(in, i); }, ws.ssim_square(k, last, channel, m));
+          blur_and_transpose([&](int i) { return column(in, i); }, row.squares + ssim_square(last, channel, m));
         }
       }
     }
   }
 }
 
-size_t ssim_scratch_floats(int tiles_x) { return Columns::floats(tiles_x) + size_t(tiles_x) * kTile; }
+size_t ssim_scratch_floats(int tiles_x) { return Columns::floats(tiles_x); }
 
-void prepare_ssim(const float* rgb, int tiles_x, int tiles_y, float* moments, float* scratch) {
-  const float* zeros = scratch + Columns::floats(tiles_x);
+void prepare_ssim(const float* target_tiles, int tiles_x, int tiles_y, float* moments, float* scratch) {
   Columns columns(scratch, tiles_x);
   for (int k = 0; k <= tiles_y; ++k) {
     for (int channel = 0; channel < 3; ++channel) {
-      const Rows target(rgb + int64_t(channel) * tiles_x * tiles_y * kSquare, zeros, k, tiles_x, tiles_y);
       for (int x = 0; x < tiles_x; ++x) {
-        const auto y_at = [&](int i) { return load(target.row[i] + x * kTile); };
-        blur_and_transpose(y_at, columns.blurred(0, x));
-        blur_and_transpose([&](int i) { return y_at(i) * y_at(i); }, columns.blurred(1, x));
+        const Square target = target_square(target_tiles, tiles_x, tiles_y, k, x, channel);
+        blur_and_transpose([&](int i) { return target.row(i); }, columns.blurred(0, x));
+        blur_and_transpose([&](int i) { return target.row(i) * target.row(i); }, columns.blurred(1, x));
       }
       for (int x = 0; x < tiles_x; ++x) {
-        float* out = moments + moments_at(size_t(k) * size_t(tiles_x) + size_t(x), channel);
+        float* out = moments + moments_at(tiles_x, k, channel, x);
         for (int m = 0; m < 2; ++m, out += kSquare) {
           const float* in = columns.blurred(m, x);
           blur([&](int i) { return column(in, i); }, [&](int i, Pack16 sum) { store(out + i * kTile, sum); });

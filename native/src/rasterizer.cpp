@@ -176,7 +176,7 @@ void Rasterizer::backward(const ImageGradients& input, float* d_rows, double* d_
 Training Rasterizer::begin_training(const TrainingView& view, bool masked, const LossWeights& loss) {
   const double weight_sum = view.weight_sum(masked);
   const double per_pixel = weight_sum > 0.0 ? 1.0 / weight_sum : 0.0;
-  const size_t tiles = size_t(ws_.tiles_x) * size_t(ws_.tiles_y), squares = tiles + size_t(ws_.tiles_x);
+  const size_t tiles = size_t(ws_.tiles_x) * size_t(ws_.tiles_y);
   l1_sums_.reserve(tiles);
   ssim_sums_.reserve(size_t(ws_.tiles_y) + 1);
   const Training training{
@@ -188,10 +188,12 @@ Training Rasterizer::begin_training(const TrainingView& view, bool masked, const
     want_blocks(training.targets.weighted_blocks);
   } else {
     want_blocks(training.targets.reached_blocks);
-    ws_.ssim_squares.reserve(squares * 3 * kSsimMaps * kSquare);
     // One more than there are strips in work, and one that waits for the strip below it.
     const int tapes = std::max(2, std::min(team_.size() + 2, ws_.tiles_y));
+    const size_t rows = size_t(StripSchedule::square_places(tapes));
     if (ws_.tapes.size() < size_t(tapes)) ws_.tapes.resize(size_t(tapes));
+    if (ws_.ssim_squares.size() < rows) ws_.ssim_squares.resize(rows);
+    for (Buffer<float>& squares : ws_.ssim_squares) squares.reserve(ssim_square(ws_.tiles_x, 0, 0));
     schedule_.start(ws_.tiles_y, tapes);
   }
   return training;
@@ -201,15 +203,16 @@ void Rasterizer::train_with_ssim(const Training& training, int thread) {
   StageTimes spent;
   double started_ms = now_ms();
   for (StripTask task; (task = schedule_.next()).kind != StripTask::kNone;) {
-    StripTape& tape = ws_.tapes[size_t(task.tape)];
+    const auto tape = [&](int i) { return task.tapes[i] >= 0 ? &ws_.tapes[size_t(task.tapes[i])] : nullptr; };
+    const auto squares = [&](int i) { return ws_.ssim_squares[size_t(task.squares[i])].data(); };
     double StageTimes::*stage = &StageTimes::raster;
     if (task.kind == StripTask::kDraw) {
-      stages_.draw_on_tape(ws_, training, tape, task.index, thread);
+      stages_.draw_on_tape(ws_, training, *tape(0), task.index, thread);
     } else if (task.kind == StripTask::kDerive) {
-      stages_.derive_ssim(ws_, training, task.index, thread);
+      stages_.derive_ssim(ws_, training, {task.index, tape(0), tape(1), squares(0)}, thread);
       stage = &StageTimes::loss;
     } else {
-      stages_.walk_back_on_tape(ws_, training, tape, task.index);
+      stages_.walk_back_on_tape(ws_, training, {task.index, *tape(0), squares(0), squares(1)});
       stage = &StageTimes::backward;
     }
     schedule_.finish(task);

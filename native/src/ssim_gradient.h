@@ -5,7 +5,6 @@
 
 #include "ssim_window.h"
 #include "stages.h"
-#include "tile_chunk.h"
 
 namespace gausslite::GAUSSLITE_ISA {
 
@@ -14,49 +13,47 @@ struct TileColours {
   alignas(64) float value[3][kSquare];
 };
 
-alignas(64) inline constexpr float kNoSquare[kSquare] = {};
-
-// Windows reach beyond the image's edge, but nothing there can change.
-GAUSSLITE_INLINE void clear_beyond(TileColours& colours, int columns, int rows) {
-  for (int channel = 0; channel < 3; ++channel) {
-    for (int i = 0; i < kTile; ++i) {
-      for (int x = i < rows ? columns : 0; x < kTile; ++x) colours.value[channel][i * kTile + x] = 0.0f;
-    }
+// Windows reach beyond the image's edge, where there is no image and nothing to change.
+GAUSSLITE_INLINE void clear_beyond_edge(const Camera& camera, int tile_x, int tile_y, float* colours) {
+  const int columns = camera.width - tile_x * kTile, rows = camera.height - tile_y * kTile;
+  if (columns >= kTile && rows >= kTile) return;
+  for (int i = 0; i < 3 * kSquare; ++i) {
+    if (i % kTile >= columns || i / kTile % kTile >= rows) colours[i] = 0.0f;
   }
 }
 
+// The tile's part of a channel: `image` and `target` are its pixels, `upper` and `lower` the three maps of the squares
+// that it lies between.
+GAUSSLITE_INLINE void ssim_gradient(const float* image, const float* target, const float* upper, const float* lower,
+                                    float* out) {
+  const auto blurred = [&](int map, auto set) {
+    blur([&](int i) { return row_between(upper + map * kSquare, lower + map * kSquare, i); }, set);
+  };
+  blurred(0, [&](int i, Pack16 by_x) { store(out + i * kTile, by_x); });
+  blurred(1, [&](int i, Pack16 by_xx) {
+    const Pack16 x = load(image + i * kTile);
+    store(out + i * kTile, fma(x + x, by_xx, load(out + i * kTile)));
+  });
+  blurred(2, [&](int i, Pack16 by_xy) {
+    store(out + i * kTile, fma(load(target + i * kTile), by_xy, load(out + i * kTile)));
+  });
+}
+
 // Returns false, and nothing in `out`, where no window around a weight reaches the tile.
-GAUSSLITE_INLINE bool ssim_gradient(Workspace& ws, const Targets& targets, const TilePosition& tile, TileColours& out) {
-  const size_t square = size_t(tile.y) * size_t(ws.tiles_x) + size_t(tile.x);
-  const bool above = targets.ssim.reach[square] != kUnreached;
-  const bool below = targets.ssim.reach[square + size_t(ws.tiles_x)] != kUnreached;
+GAUSSLITE_INLINE bool ssim_gradient(const Workspace& ws, const Targets& targets, const TapedStrip& taped, int x,
+                                    TileColours& out) {
+  const size_t tile = size_t(taped.strip) * size_t(ws.tiles_x) + size_t(x);
+  const bool above = targets.ssim.reach[tile] != kUnreached;
+  const bool below = targets.ssim.reach[tile + size_t(ws.tiles_x)] != kUnreached;
   if (!above && !below) return false;
   for (int channel = 0; channel < 3; ++channel) {
-    const float* image = ws.image.data() + channel * ws.plane + tile.corner;
-    const float* target = targets.rgb + channel * ws.plane + tile.corner;
-    float* to = out.value[channel];
-    const auto blurred = [&](int map, auto set) {
-      const float* upper = above ? ws.ssim_square(tile.y, tile.x, channel, map) : kNoSquare;
-      const float* lower = below ? ws.ssim_square(tile.y + 1, tile.x, channel, map) : kNoSquare;
-      // The tile's first row is the middle of the upper square.
-      constexpr int kFirst = kTile / 2 - kRadius;
-      blur(
-          [&](int i) {
-            return load(i < kTile - kFirst ? upper + (i + kFirst) * kTile : lower + (i + kFirst - kTile) * kTile);
-          },
-          set);
-    };
-    blurred(0, [&](int i, Pack16 by_x) { store(to + i * kTile, by_x); });
-    blurred(1, [&](int i, Pack16 by_xx) {
-      const Pack16 x = load(image + i * ws.padded_width);
-      store(to + i * kTile, fma(x + x, by_xx, load(to + i * kTile)));
-    });
-    blurred(2, [&](int i, Pack16 by_xy) {
-      store(to + i * kTile, fma(load(target + i * ws.padded_width), by_xy, load(to + i * kTile)));
-    });
+    const size_t at = ssim_square(x, channel, 0);
+    ssim_gradient(taped.tape.image.data() + image_tile(x) + size_t(channel) * kSquare,
+                  targets.tiles + (tile * kTargets + size_t(channel)) * kSquare,
+                  above ? taped.upper_squares + at : kNoSquares, below ? taped.lower_squares + at : kNoSquares,
+                  out.value[channel]);
   }
-  const int columns = ws.camera.width - tile.x * kTile, rows = ws.camera.height - tile.y * kTile;
-  if (columns < kTile || rows < kTile) clear_beyond(out, columns, rows);
+  clear_beyond_edge(ws.camera, x, taped.strip, out.value[0]);
   return true;
 }
 

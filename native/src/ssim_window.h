@@ -9,7 +9,9 @@ namespace gausslite::GAUSSLITE_ISA {
 
 constexpr int kRadius = 5, kTaps = 2 * kRadius + 1;
 constexpr int kSpan = kTile + 2 * kRadius;  // rows, or columns, that the windows of a square reach
-constexpr int kLead = kTile / 2 + kRadius;  // the first of them is this far above the tile row's first row
+
+// As many maps as one square has, where there is none.
+alignas(64) inline constexpr float kNoSquares[kSsimMaps * kSquare] = {};
 
 // Gaussian of sigma 1.5 px, normalised over its 11 taps; element k is the weight at distance k.
 constexpr float kWindow[kRadius + 1] = {0.26601171f, 0.21300553f, 0.10936070f, 0.03600077f, 0.00759876f, 0.00102838f};
@@ -30,6 +32,14 @@ GAUSSLITE_INLINE void blur(Get get, Set set) {
       total = fma(seen[i + kRadius - k] + seen[i + kRadius + k], Pack16(kWindow[k]), total);
     set(i, total);
   }
+}
+
+// The i-th of the 26 rows that a square's windows reach, when the square is the lower half of `upper` and the upper
+// half of `lower`.
+GAUSSLITE_INLINE Pack16 row_between(const float* upper, const float* lower, int i) {
+  constexpr int kFirst = kTile / 2 - kRadius;
+  const int row = i + kFirst;
+  return load(row < kTile ? upper + row * kTile : lower + (row - kTile) * kTile);
 }
 
 }  // namespace gausslite::GAUSSLITE_ISA

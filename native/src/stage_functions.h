@@ -14,12 +14,12 @@ void bin_strip(Workspace&, int strip, const DepthKey* keys, int count);
 void draw_strip(Workspace&, int strip, int thread);
 void train_strip(Workspace&, const Training&, int strip, int thread);
 void draw_on_tape(Workspace&, const Training&, StripTape&, int strip, int thread);
-void derive_ssim(Workspace&, const Training&, int k, int thread);
-void walk_back_on_tape(Workspace&, const Training&, const StripTape&, int strip);
+void derive_ssim(Workspace&, const Training&, const SquareRow&, int thread);
+void walk_back_on_tape(Workspace&, const Training&, const TapedStrip&);
 void backward_strip(Workspace&, int strip, int thread);
 void update(Workspace&, const Update&, int thread);
 void gradients(Workspace&, const GradientOutput&, int thread);
-void prepare_ssim(const float* rgb, int tiles_x, int tiles_y, float* moments, float* scratch);
+void prepare_ssim(const float* target_tiles, int tiles_x, int tiles_y, float* moments, float* scratch);
 size_t ssim_scratch_floats(int tiles_x);
 
 }  // namespace gausslite::GAUSSLITE_ISA

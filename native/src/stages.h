@@ -22,16 +22,17 @@ enum Reach : uint8_t { kUnreached, kReached, kWeighted };
 
 // By rows k = 0 ... tile rows of the squares that loss_ssim.cpp describes; within a square by columns.
 struct SsimTargets {
-  const float* moments;  // [square][channel][mean, mean square][16][16]
-  const float* weights;  // [square][16][16]
-  const uint8_t* reach;  // [square]
+  const float* moments;  // [row][channel][square][mean, mean square][16][16]
+  const float* weights;  // [row][square][16][16]
+  const uint8_t* reach;  // [row][square]
 };
 
-// The targets of one training image, planar and padded like Workspace::image.
+constexpr int kTargets = 4;
+
+// The targets of one training image, by tiles.
 struct Targets {
-  const float* rgb;                 // three planes
-  const float* depth_m;             // 0 where there is no measurement
-  const float* weight;              // 0 outside the image
+  const float* tiles;               // [tile][red, green, blue, depth in metres or 0][16][16]
+  const float* weights;             // [tile][16][16]; 0 outside the image
   const uint16_t* weighted_blocks;  // by tile: the blocks that have a pixel with a weight
   const uint16_t* reached_blocks;   // ... and those that have one in an SSIM window around it
   SsimTargets ssim;
@@ -62,6 +63,20 @@ struct GradientOutput {
   double* d_twist;      // [segments][6]
 };
 
+// What a row of SSIM squares is formed from, and where its derivatives go.
+struct SquareRow {
+  int k;
+  const StripTape *above, *below;  // of the tile rows k - 1 and k; null beyond the image
+  float* squares;
+};
+
+// A strip that can be walked back: its tape, and the rows of squares that its gradient comes from.
+struct TapedStrip {
+  int strip;
+  const StripTape& tape;
+  const float *upper_squares, *lower_squares;
+};
+
 struct Stages {
   // Projects this thread's segments, packs the visible splats and hands their depth keys to the tile rows that they
   // touch.
@@ -73,16 +88,16 @@ struct Stages {
   // The same with SSIM, which looks beyond the tile, in three parts. Draws a strip and keeps its tape.
   void (*draw_on_tape)(Workspace&, const Training&, StripTape&, int strip, int thread);
   // SSIM in row k of the squares, once tile rows k - 1 and k are drawn.
-  void (*derive_ssim)(Workspace&, const Training&, int k, int thread);
+  void (*derive_ssim)(Workspace&, const Training&, const SquareRow&, int thread);
   // Compares a strip and walks it back, once rows `strip` and `strip` + 1 of the squares are derived.
-  void (*walk_back_on_tape)(Workspace&, const Training&, const StripTape&, int strip);
+  void (*walk_back_on_tape)(Workspace&, const Training&, const TapedStrip&);
   // From image_gradient to gradient rows, for the tile row that draw_strip has drawn.
   void (*backward_strip)(Workspace&, int strip, int thread);
   // From gradient rows to parameters, over this thread's segments.
   void (*update)(Workspace&, const Update&, int thread);
   void (*gradients)(Workspace&, const GradientOutput&, int thread);
   // The blurred target and its blurred square (SsimTargets::moments), once per training image.
-  void (*prepare_ssim)(const float* rgb, int tiles_x, int tiles_y, float* moments, float* scratch);
+  void (*prepare_ssim)(const float* target_tiles, int tiles_x, int tiles_y, float* moments, float* scratch);
   size_t (*ssim_scratch_floats)(int tiles_x);
 };
 

@@ -13,17 +13,26 @@ int pop(std::vector<int>& stack) {
   return last;
 }
 
+// Numbers 0 ... count - 1, the lowest on top.
+void fill(std::vector<int>& stack, int count) {
+  stack.clear();
+  for (int i = count - 1; i >= 0; --i) stack.push_back(i);
+}
+
 }  // namespace
 
-void StripSchedule::start(int strips, int tapes) {
+void StripSchedule::start(int strips, int tape_places) {
   strips_ = strips;
   next_draw_ = walks_taken_ = 0;
-  free_tapes_.clear();
-  for (int tape = tapes - 1; tape >= 0; --tape) free_tapes_.push_back(tape);
-  tape_of_strip_.assign(size_t(strips), 0);
-  derive_waits_.assign(size_t(strips) + 1, 2);
-  derive_waits_.front() = derive_waits_.back() = 1;
+  fill(free_tapes_, tape_places);
+  fill(free_squares_, square_places(tape_places));
+  tape_of_strip_.assign(size_t(strips), -1);
+  squares_of_row_.assign(size_t(strips) + 1, -1);
   walk_waits_.assign(size_t(strips), 2);
+  for (std::vector<int>* strips_beside : {&derive_waits_, &row_users_}) {
+    strips_beside->assign(size_t(strips) + 1, 2);
+    strips_beside->front() = strips_beside->back() = 1;
+  }
   derivable_.clear();
   walkable_.clear();
 }
@@ -45,15 +54,19 @@ bool StripSchedule::take(StripTask& task) {
   if (!walkable_.empty()) {
     task.kind = StripTask::kWalkBack;
     task.index = pop(walkable_);
-    task.tape = tape_of_strip_[size_t(task.index)];
+    task.tapes[0] = tape_of_strip_[size_t(task.index)];
+    for (int i = 0; i < 2; ++i) task.squares[i] = squares_of_row_[size_t(task.index + i)];
     ++walks_taken_;
   } else if (!derivable_.empty()) {
     task.kind = StripTask::kDerive;
     task.index = pop(derivable_);
+    if (task.index > 0) task.tapes[0] = tape_of_strip_[size_t(task.index - 1)];
+    if (task.index < strips_) task.tapes[1] = tape_of_strip_[size_t(task.index)];
+    task.squares[0] = squares_of_row_[size_t(task.index)] = pop(free_squares_);
   } else if (next_draw_ < strips_ && !free_tapes_.empty()) {
     task.kind = StripTask::kDraw;
     task.index = next_draw_++;
-    task.tape = tape_of_strip_[size_t(task.index)] = pop(free_tapes_);
+    task.tapes[0] = tape_of_strip_[size_t(task.index)] = pop(free_tapes_);
   } else {
     return false;
   }
@@ -72,7 +85,10 @@ void StripSchedule::finish(const StripTask& task) {
         if (strip >= 0 && strip < strips_ && --walk_waits_[size_t(strip)] == 0) walkable_.push_back(strip);
       }
     } else {
-      free_tapes_.push_back(task.tape);
+      free_tapes_.push_back(task.tapes[0]);
+      for (const int k : {task.index, task.index + 1}) {
+        if (--row_users_[size_t(k)] == 0) free_squares_.push_back(squares_of_row_[size_t(k)]);
+      }
     }
   }
   changes_.fetch_add(1, std::memory_order_release);

@@ -11,18 +11,23 @@
 
 namespace gausslite {
 
+// Tapes and rows of squares are kept in few places, which are numbered and used again.
 struct StripTask {
   enum Kind { kDraw, kDerive, kWalkBack, kNone };
   Kind kind = kNone;
-  int index = 0;  // of the strip, or of the row of squares
-  int tape = 0;   // where the strip's tape is: one of the tapes that `start` was told of
+  int index = 0;            // of the strip, or of the row of squares
+  int tapes[2] = {-1, -1};  // the strip's; to derive a row, those of the strips above and below it, -1 beyond the image
+  int squares[2] = {-1, -1};  // the row's; to walk a strip back, those of the rows at its upper and lower half
 };
 
 // Strips are drawn from the top down, and walked back as soon as it can be: so that few tapes wait, and those shortly.
-// With at least two tapes there is always something that can be done.
+// With at least two places for tapes there is always something that can be done.
 class StripSchedule {
  public:
-  void start(int strips, int tapes);
+  // A row lies between two strips, one of which at least still has its tape.
+  static int square_places(int tape_places) { return 2 * tape_places; }
+
+  void start(int strips, int tape_places);
   // Waits for a task; kNone when all are taken.
   StripTask next();
   void finish(const StripTask& task);
@@ -32,8 +37,9 @@ class StripSchedule {
 
   std::mutex mutex_;
   int strips_ = 0, next_draw_ = 0, walks_taken_ = 0;
-  std::vector<int> free_tapes_, tape_of_strip_;
+  std::vector<int> free_tapes_, free_squares_, tape_of_strip_, squares_of_row_;
   std::vector<int> derive_waits_, walk_waits_;  // parts that are still missing
+  std::vector<int> row_users_;                  // strips beside a row that are not walked back yet
   std::vector<int> derivable_, walkable_;
   std::atomic<uint32_t> changes_{0};
 };

@@ -3,12 +3,17 @@
 #include <algorithm>
 
 #include "block_backward.h"
+#include "block_forward.h"
 #include "stage_functions.h"
-#include "tile_pixels.h"
+#include "tile_chunk.h"
 
 namespace gausslite::GAUSSLITE_ISA {
 
 namespace {
+
+void load_pixels(const Workspace& ws, const float* planes, const TilePosition& tile, int b, Pack16 (&out)[5]) {
+  for (int k = 0; k < 5; ++k) out[k] = load_block(planes + k * ws.plane + tile.block(ws, b), ws.padded_width);
+}
 
 void backward_tile(Workspace& ws, const TileList& list, const TilePosition& tile) {
   Splat records[kChunk];

@@ -2,12 +2,22 @@
 // Stage 4: draw the tiles of a strip, keeping what the backward pass needs to walk the same lists.
 #include <algorithm>
 
+#include "block_forward.h"
 #include "stage_functions.h"
-#include "tile_pixels.h"
+#include "tile_chunk.h"
 
 namespace gausslite::GAUSSLITE_ISA {
 
 namespace {
+
+void store_pixels(Workspace& ws, const TilePosition& tile, int b, const BlockState& state) {
+  float* out = ws.image.data() + tile.block(ws, b);
+  store_block(out, ws.padded_width, state.r);
+  store_block(out + ws.plane, ws.padded_width, state.g);
+  store_block(out + 2 * ws.plane, ws.padded_width, state.b);
+  store_block(out + 3 * ws.plane, ws.padded_width, state.depth);
+  store_block(out + 4 * ws.plane, ws.padded_width, state.transmittance);
+}
 
 void draw_tile(Workspace& ws, TileList& list, const TilePosition& tile) {
   Splat records[kChunk];

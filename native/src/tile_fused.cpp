@@ -6,14 +6,18 @@
 #include <algorithm>
 
 #include "block_backward.h"
+#include "block_forward.h"
 #include "loss_l1.h"
 #include "ssim_gradient.h"
 #include "stage_functions.h"
-#include "tile_pixels.h"
+#include "tile_chunk.h"
 
 namespace gausslite::GAUSSLITE_ISA {
 
 namespace {
+
+// Where block b is in sixteen rows of sixteen pixels.
+GAUSSLITE_INLINE int corner_in_tile(int b) { return (b >> 2) * kBlock * kTile + (b & 3) * kBlock; }
 
 struct TileGradient {
   BlockGradient block[kBlocks];
@@ -93,13 +97,13 @@ void walk_back_tile(Workspace& ws, const StripTape& tape, const TileTape& taped,
 }
 
 // The L1 terms of one block, and their gradient.
-GAUSSLITE_INLINE Pack16 compare(const Workspace& ws, const Training& training, int64_t at, const Pack16 (&image)[5],
+GAUSSLITE_INLINE Pack16 compare(const Training& training, size_t t, int b, const Pack16 (&image)[5],
                                 Pack16 (&gradient)[5]) {
-  const Targets& t = training.targets;
+  const float* targets = training.targets.tiles + t * kTargets * kSquare + corner_in_tile(b);
   Pack16 rgb[3];
-  for (int k = 0; k < 3; ++k) rgb[k] = load_block(t.rgb + k * ws.plane + at, ws.padded_width);
-  const Pack16 measured_m = load_block(t.depth_m + at, ws.padded_width),
-               weight = load_block(t.weight + at, ws.padded_width);
+  for (int k = 0; k < 3; ++k) rgb[k] = load_block(targets + k * kSquare, kTile);
+  const Pack16 measured_m = load_block(targets + 3 * kSquare, kTile);
+  const Pack16 weight = load_block(training.targets.weights + t * kSquare + corner_in_tile(b), kTile);
   return l1_of_pixels(image, rgb, measured_m, weight, training.loss, gradient);
 }
 
@@ -114,23 +118,11 @@ void train_tile(Workspace& ws, const Training& training, size_t t, const TilePos
     const BlockState& s = state[b];
     const Pack16 image[5] = {s.r, s.g, s.b, s.depth, s.transmittance};
     Pack16 by[5];
-    loss = loss + compare(ws, training, tile.block(ws, b), image, by);
+    loss = loss + compare(training, t, b, image, by);
     gradient.start(b, by, image);
   }
   training.l1_sums[t] = double(sum(loss));
   walk_back_tile(ws, mine.tape, taped, tile, gradient);
-}
-
-// Colours of the pixels beyond the image's edge are zero: that is how SSIM sees them.
-void clear_padding(Workspace& ws, int strip) {
-  const int width = ws.camera.width, stride = ws.padded_width;
-  for (int y = strip * kTile; y < (strip + 1) * kTile; ++y) {
-    const int from = y < ws.camera.height ? width : 0;
-    for (int k = 0; k < 3; ++k) {
-      float* row = ws.image.data() + k * ws.plane + int64_t(y) * stride;
-      std::fill(row + from, row + stride, 0.0f);
-    }
-  }
 }
 
 bool any_tile(const uint16_t* blocks, int tiles_x) {
@@ -162,40 +154,47 @@ void draw_on_tape(Workspace& ws, const Training& training, StripTape& tape, int 
   const DepthKey* keys = sort_strip(ws, strip, thread, count);
   bin_strip(ws, strip, keys, count);
   tape.tiles.reserve(size_t(ws.tiles_x));
+  tape.image.reserve(image_tile(ws.tiles_x));
   for (int x = 0; x < ws.tiles_x; ++x) {
     const size_t t = first + size_t(x);
     if (training.targets.reached_blocks[t] == 0) continue;
     const TilePosition tile(ws, x, strip);
     BlockState state[kBlocks];
     tape.tiles[size_t(x)] = draw(ws, tape, ws.tiles[t], tile, state);
-    for (int b = 0; b < kBlocks; ++b) store_pixels(ws, tile, b, state[b]);
+    float* image = tape.image.data() + image_tile(x);
+    for (int b = 0; b < kBlocks; ++b) {
+      const Pack16 pixels[kImagePlanes] = {state[b].r, state[b].g, state[b].b, state[b].depth, state[b].transmittance};
+      for (int k = 0; k < kImagePlanes; ++k) store_block(image + k * kSquare + corner_in_tile(b), kTile, pixels[k]);
+    }
+    clear_beyond_edge(ws.camera, x, strip, image);
   }
   ws.scratch[size_t(thread)].block_evaluations += tape.alpha_count;
-  clear_padding(ws, strip);
 }
 
-void walk_back_on_tape(Workspace& ws, const Training& training, const StripTape& tape, int strip) {
+void walk_back_on_tape(Workspace& ws, const Training& training, const TapedStrip& taped) {
+  const StripTape& tape = taped.tape;
   for (int x = 0; x < ws.tiles_x; ++x) {
-    const size_t t = size_t(strip) * size_t(ws.tiles_x) + size_t(x);
+    const size_t t = size_t(taped.strip) * size_t(ws.tiles_x) + size_t(x);
     training.l1_sums[t] = 0.0;
     if (training.targets.reached_blocks[t] == 0) continue;
-    const TilePosition tile(ws, x, strip);
+    const TileTape& drawn = tape.tiles[size_t(x)];
+    if (drawn.entries == 0 && training.targets.weighted_blocks[t] == 0) continue;
+    const TilePosition tile(ws, x, taped.strip);
+    prefetch_rows(ws, tape.records.data() + drawn.first_record, chunk_size(drawn.entries, 0), tile);
     TileColours by_ssim;
-    prefetch_rows(ws, &tape.records[tape.tiles[size_t(x)].first_record], chunk_size(tape.tiles[size_t(x)].entries, 0),
-                  tile);
-    const bool reached = ssim_gradient(ws, training.targets, tile, by_ssim);
+    const bool reached = ssim_gradient(ws, training.targets, taped, x, by_ssim);
     TileGradient gradient;
     Pack16 loss(0.0f);
     for (int b = 0; b < kBlocks; ++b) {
-      Pack16 image[5], by[5];
-      load_pixels(ws, ws.image.data(), tile, b, image);
-      loss = loss + compare(ws, training, tile.block(ws, b), image, by);
-      const int corner = (b >> 2) * kBlock * kTile + (b & 3) * kBlock;
-      for (int k = 0; reached && k < 3; ++k) by[k] = by[k] + load_block(by_ssim.value[k] + corner, kTile);
+      Pack16 image[kImagePlanes], by[kImagePlanes];
+      for (int k = 0; k < kImagePlanes; ++k)
+        image[k] = load_block(tape.image.data() + image_tile(x) + k * kSquare + corner_in_tile(b), kTile);
+      loss = loss + compare(training, t, b, image, by);
+      for (int k = 0; reached && k < 3; ++k) by[k] = by[k] + load_block(by_ssim.value[k] + corner_in_tile(b), kTile);
       gradient.start(b, by, image);
     }
     training.l1_sums[t] = double(sum(loss));
-    walk_back_tile(ws, tape, tape.tiles[size_t(x)], tile, gradient);
+    walk_back_tile(ws, tape, drawn, tile, gradient);
   }
 }
 

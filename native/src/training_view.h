@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// A training image, prepared once: planar, padded to whole tiles, with the blurred target that SSIM needs,
+// A training image, prepared once: cut into tiles, padded to whole ones, with the blurred target that SSIM needs,
 // and where its weights are.
 #pragma once
 
@@ -24,22 +24,23 @@ class TrainingView {
  private:
   // One way of weighing the pixels, and where its weights are.
   struct Weights {
-    int plane;
     double sum = 0.0;
-    Buffer<uint16_t> weighted_blocks, reached_blocks;  // Targets
-    Buffer<float> squares;                             // SsimTargets
+    Buffer<float> tiles;  // Targets
+    Buffer<uint16_t> weighted_blocks, reached_blocks;
+    Buffer<float> squares;  // SsimTargets
     Buffer<uint8_t> reach;
   };
-  void locate(Weights& weights) const;
-  void cut_squares(Weights& weights) const;
-  size_t squares() const { return size_t(tiles_y_ + 1) * size_t(tiles_x_); }
+  // weight: height x width, or null for 1 everywhere.
+  void weigh(Weights& weights, const float* weight) const;
+  void reach_out(Weights& weights) const;
+  size_t tile_count() const { return size_t(tiles_y_) * size_t(tiles_x_); }
+  size_t square_count() const { return size_t(tiles_y_ + 1) * size_t(tiles_x_); }
+  size_t tile_of(int x, int y) const { return size_t(y / kTile) * size_t(tiles_x_) + size_t(x / kTile); }
   const Weights& weights(bool masked) const { return masked && masked_ ? mask_ : inside_; }
 
-  int width_, height_, tiles_x_, tiles_y_, padded_width_;
-  int64_t plane_;
+  int width_, height_, tiles_x_, tiles_y_;
   bool masked_;
-  Buffer<float> planes_;  // r g b, depth, inside (1 in the image, 0 in the padding), mask
-  Buffer<float> moments_;
+  Buffer<float> tiles_, moments_;  // Targets, SsimTargets
   Weights inside_, mask_;
 };
 

@@ -76,10 +76,18 @@ struct StripTape {
   Buffer<Splat> records;
   Buffer<BlockLists> lists;
   Buffer<float> alphas;
+  Buffer<float> image;  // [tile][red, green, blue, depth, transmittance][16][16]
   size_t record_count = 0, list_count = 0, alpha_count = 0;
 
   void rewind() { record_count = list_count = alpha_count = 0; }
 };
+
+// Where StripTape::image has a tile.
+constexpr int kImagePlanes = 5;
+inline size_t image_tile(int x) { return size_t(x) * kImagePlanes * kSquare; }
+
+// Where a row of SSIM squares (loss_ssim.cpp) has a map: sixteen rows of sixteen floats.
+inline size_t ssim_square(int x, int channel, int map) { return size_t((x * 3 + channel) * kSsimMaps + map) * kSquare; }
 
 struct ThreadScratch {
   std::vector<KeyList> strips;  // by tile row: the splats of this thread's segments that touch it
@@ -115,8 +123,9 @@ struct Workspace {
   // image: red, green, blue, depth, transmittance; image_gradient: by red, green, blue, depth, alpha.
   std::vector<TileList> tiles;
   Buffer<float> image, image_gradient;
-  Buffer<float> ssim_squares;    // derivatives of SSIM, blurred along the rows; see ssim_square
-  std::vector<StripTape> tapes;  // strips that are drawn and not yet walked back
+  // A training step with SSIM reuses few of these, so that they stay in cache.
+  std::vector<StripTape> tapes;             // strips that are drawn and not yet walked back
+  std::vector<Buffer<float>> ssim_squares;  // a row of them each: derivatives of SSIM, blurred along the image rows
   // Gradient rows are owned by one (splat, tile row) pair each, so that no two threads add to the same one and the sum
   // over a splat's rows has a fixed order: results do not depend on the number of threads. `tag` marks the rows written
   // in this pass; stale ones count as zero and are never cleared.
@@ -126,12 +135,6 @@ struct Workspace {
 
   std::vector<ThreadScratch> scratch;
   std::atomic<int> ticket{0};  // dynamic scheduling of tile rows; reset between stages
-
-  // Row k, column x of the squares that the SSIM loss is formed in (loss_ssim.cpp): 16 rows of 16 floats.
-  float* ssim_square(int k, int x, int channel, int map) {
-    return ssim_squares.data() +
-           (((size_t(k) * size_t(tiles_x) + size_t(x)) * 3 + size_t(channel)) * kSsimMaps + size_t(map)) * kSquare;
-  }
 };
 
 }  // namespace gausslite

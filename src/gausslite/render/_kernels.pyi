@@ -12,7 +12,7 @@ def core_clock_ghz() -> float:
     """The clock of this core, by a chain of additions."""
 
 class View:
-    """A training image made ready: padded, planar, SSIM moments cached."""
+    """A training image made ready: padded, tiled, SSIM moments cached."""
 
     @property
     def width(self) -> int: ...

@@ -125,7 +125,7 @@ class AdamSettings:
 
 @runtime_checkable
 class TrainingView(Protocol):
-    """An image prepared once for many steps (padded, planar, SSIM moments cached); opaque outside its backend."""
+    """An image prepared once for many steps (padded, tiled, SSIM moments cached); opaque outside its backend."""
 
     @property
     def camera(self) -> Camera:
