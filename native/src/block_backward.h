@@ -89,7 +89,7 @@ GAUSSLITE_INLINE void walk_back(const Splat* records, const uint8_t* list, int n
       const Pack16 own = weight * q;
       g.behind = g.behind - own;
       g.transmittance = g.transmittance - weight;
-      const Pack16 odds = alpha * rough_reciprocal(Pack16(1.0f) - alpha);
+      const Pack16 odds = alpha * reciprocal(Pack16(1.0f) - alpha);
       store(values[i], keep(unclamped, fnma(g.behind, odds, own)));
       sums.colours[entry] = add_colours(weight, g.by_column, sums.colours[entry]);
     }

@@ -22,5 +22,6 @@ constexpr float kMinSurfaceAlpha = 0.5f;               // below it a pixel has n
 constexpr int kTile = 16;    // pixels per side
 constexpr int kBlock = 4;    // pixels per side: sixteen pixels, one Pack16
 constexpr int kBlocks = 16;  // blocks per tile
+constexpr int kBlocksAcross = 4;
 
 }  // namespace gausslite

@@ -2,6 +2,7 @@
 // Stage 1: parameter rows to visible splats, and their depth keys to the tile rows that they touch.
 #include <algorithm>
 #include <cmath>
+#include <cstring>
 
 #include "projection.h"
 #include "stage_functions.h"
@@ -10,42 +11,56 @@ namespace gausslite::GAUSSLITE_ISA {
 
 namespace {
 
-// The half-spaces of the view frustum, widened for a splat's extent. At most 3.33 standard deviations of a splat are
-// above 1/255; the clamped tangent makes its projected scale at most 1.3 times sqrt(1 + tan^2) / z.
-struct Frustum {
-  float tan_x, tan_y, reach_x, reach_y, pixel;
-
-  explicit Frustum(const Camera& c) {
-    const float half_width = 0.5f * float(c.width), half_height = 0.5f * float(c.height);
-    tan_x = (half_width + std::fabs(c.cx - half_width)) / c.fx;
-    tan_y = (half_height + std::fabs(c.cy - half_height)) / c.fy;
-    reach_x = 1.5f * std::sqrt(1.0f + tan_x * tan_x);
-    reach_y = 1.5f * std::sqrt(1.0f + tan_y * tan_y);
-    pixel = 2.0f / std::min(c.fx, c.fy);
+// The half-spaces of the frustum through the active part of the image, widened for a splat's extent. At most 3.33
+// standard deviations of a splat are above 1/255; the clamped tangent makes its projected scale at most 1.3 times
+// sqrt(1 + tan^2) / z, where tan is that of the farthest image corner.
+class Frustum {
+ public:
+  explicit Frustum(const Workspace& ws) : camera_(ws.camera) {
+    const Camera& c = camera_;
+    left_ = (float(ws.active.x0) - c.cx) / c.fx;
+    right_ = (float(ws.active.x1) - c.cx) / c.fx;
+    top_ = (float(ws.active.y0) - c.cy) / c.fy;
+    bottom_ = (float(ws.active.y1) - c.cy) / c.fy;
+    reach_x_ = reach(c.width, c.cx, c.fx);
+    reach_y_ = reach(c.height, c.cy, c.fy);
+    pixel_ = 2.0f / std::min(c.fx, c.fy);
   }
 
-  GAUSSLITE_INLINE Mask16 may_touch(const Pack16* row, const Camera& camera) const {
+  // `row` needs the mean and the scales only.
+  GAUSSLITE_INLINE Mask16 may_touch(const Pack16* row) const {
     Pack16 x, y, z;
-    to_camera_frame(row, camera, x, y, z);
+    to_camera_frame(row, camera_, x, y, z);
     const Pack16 largest = max(row[kLogScale], max(row[kLogScale + 1], row[kLogScale + 2]));
-    const Pack16 radius = fma(exp2_fast(largest * kLog2E), Pack16(3.4f), z * pixel);
-    return (z >= Pack16(kNearM)) & (abs(x) - z * tan_x <= radius * reach_x) & (abs(y) - z * tan_y <= radius * reach_y);
+    const Pack16 radius = fma(exp2_fast(largest * kLog2E), Pack16(3.4f), z * pixel_);
+    const Pack16 reach_x = radius * reach_x_, reach_y = radius * reach_y_;
+    return (z >= Pack16(kNearM)) & (x - z * right_ <= reach_x) & (z * left_ - x <= reach_x) &
+           (y - z * bottom_ <= reach_y) & (z * top_ - y <= reach_y);
   }
+
+ private:
+  static float reach(int pixels, float centre, float focal) {
+    const float half = 0.5f * float(pixels), tangent = (half + std::fabs(centre - half)) / focal;
+    return 1.5f * std::sqrt(1.0f + tangent * tangent);
+  }
+
+  const Camera& camera_;
+  float left_, right_, top_, bottom_, reach_x_, reach_y_, pixel_;
 };
 
-// The pixels whose centres are in the bounding box of alpha >= 1/255, both ends included, and their 4x4 blocks.
+// The 4x4 blocks of the pixels whose centres are in the bounding box of alpha >= 1/255, both ends included.
 struct Box {
-  Pack16 x0, x1, y0, y1, block_x0, block_x1, block_y0, block_y1;
+  Pack16 block_x0, block_x1, block_y0, block_y1;
   Mask16 visible, elongated;
 
   GAUSSLITE_INLINE Box(const Projection& p, const Camera& camera) {
     const Pack16 above = p.log2_opacity - kLog2MinAlpha, zero(0.0f);
     const Pack16 square = max(above * (2.0f * kLn2), zero);
     const Pack16 reach_x = sqrt(square * p.cov_xx), reach_y = sqrt(square * p.cov_yy);
-    x0 = max(ceil(p.mean_x - reach_x - 0.5f), zero);
-    y0 = max(ceil(p.mean_y - reach_y - 0.5f), zero);
-    x1 = min(floor(p.mean_x + reach_x - 0.5f), Pack16(float(camera.width - 1)));
-    y1 = min(floor(p.mean_y + reach_y - 0.5f), Pack16(float(camera.height - 1)));
+    const Pack16 x0 = max(ceil(p.mean_x - reach_x - 0.5f), zero);
+    const Pack16 y0 = max(ceil(p.mean_y - reach_y - 0.5f), zero);
+    const Pack16 x1 = min(floor(p.mean_x + reach_x - 0.5f), Pack16(float(camera.width - 1)));
+    const Pack16 y1 = min(floor(p.mean_y + reach_y - 0.5f), Pack16(float(camera.height - 1)));
     visible = (above > zero) & (x0 <= x1) & (y0 <= y1);
 
     block_x0 = floor(x0 * 0.25f);
@@ -70,22 +85,26 @@ GAUSSLITE_INLINE Mask16 is_sound(const Pack16* row, const Projection& p) {
   return (total + conic + shape == Pack16(0.0f)) & (p.conic_xx > Pack16(0.0f)) & (p.conic_yy > Pack16(0.0f));
 }
 
-// The box in integers, lane by lane.
+// The box in whole blocks, lane by lane.
 struct BoxLanes {
   alignas(64) int32_t x0[16], x1[16], y0[16], y1[16];
 
   GAUSSLITE_INLINE explicit BoxLanes(const Box& box) {
-    store_int(x0, box.x0);
-    store_int(x1, box.x1);
-    store_int(y0, box.y0);
-    store_int(y1, box.y1);
+    store_int(x0, box.block_x0);
+    store_int(x1, box.block_x1);
+    store_int(y0, box.block_y0);
+    store_int(y1, box.block_y1);
   }
 };
 
+struct TileColumns {
+  uint32_t first, last;
+};
+
 // True when the tile row has an active tile in these columns.
-GAUSSLITE_INLINE bool row_is_active(const Workspace& ws, int tile_y, int tile_x0, int tile_x1) {
-  const uint16_t* before = &ws.active_before[size_t(tile_y) * (ws.tiles_x + 1)];
-  return before[tile_x1 + 1] > before[tile_x0];
+GAUSSLITE_INLINE bool row_is_active(const Workspace& ws, uint32_t tile_y, TileColumns columns) {
+  const uint16_t* before = &ws.active_before[size_t(tile_y) * (uint32_t(ws.tiles_x) + 1)];
+  return before[columns.last + 1] > before[columns.first];
 }
 
 // Gradient rows are handed out in blocks, so that the shared counter is touched rarely. Row 0 is nobody's.
@@ -109,51 +128,60 @@ class Segment {
 
   // Packs lane `lane` of a group, or skips it when all of its tiles are inactive.
   GAUSSLITE_INLINE void add(const Splat& splat, const BoxLanes& box, int lane, uint32_t id, bool elongated) {
-    const int tile_x0 = box.x0[lane] / kTile, tile_x1 = box.x1[lane] / kTile;
-    int first = box.y0[lane] / kTile, last = box.y1[lane] / kTile;
+    const uint32_t x0 = uint32_t(box.x0[lane]), x1 = uint32_t(box.x1[lane]), y0 = uint32_t(box.y0[lane]),
+                   y1 = uint32_t(box.y1[lane]);
+    uint32_t first = y0 / kBlocksAcross, last = y1 / kBlocksAcross;
+    const TileColumns columns{x0 / kBlocksAcross, x1 / kBlocksAcross};
     if (ws_.active_tiles != nullptr) {
-      while (first <= last && !row_is_active(ws_, first, tile_x0, tile_x1)) ++first;
-      while (first < last && !row_is_active(ws_, last, tile_x0, tile_x1)) --last;
+      while (first <= last && !row_is_active(ws_, first, columns)) ++first;
       if (first > last) return;
+      while (!row_is_active(ws_, last, columns)) --last;
     }
-    const uint32_t rows = uint32_t(last - first + 1);
+    const uint32_t rows = last - first + 1;
     const uint32_t gradient_row = take_gradient_rows(ws_, mine_, rows);
     Splat& out = ws_.splats[slot_];
     out = splat;
-    out.block_x0 = uint16_t(box.x0[lane] / kBlock);
-    out.block_x1 = uint16_t(box.x1[lane] / kBlock);
-    out.block_y0 = uint16_t(box.y0[lane] / kBlock);
-    out.block_y1 = uint16_t(box.y1[lane] / kBlock);
-    out.gradient_row = gradient_row - uint32_t(first);
+    // One store for the four.
+    const uint64_t blocks = uint64_t(x0 | x1 << 16) | uint64_t(y0 | y1 << 16) << 32;
+    std::memcpy(&out.block_x0, &blocks, sizeof blocks);
+    out.gradient_row = gradient_row - first;
     out.elongated = elongated;
     ws_.visible[slot_] = {id, gradient_row, rows};
-
-    const uint32_t depth = __builtin_bit_cast(uint32_t, splat.depth);
-    for (int y = first; y <= last; ++y) {
-      if (ws_.active_tiles != nullptr && !row_is_active(ws_, y, tile_x0, tile_x1)) continue;
-      KeyList& strip = mine_.strips[size_t(y)];
-      strip.keys[strip.count++] = {depth, slot_};
-    }
+    add_keys(__builtin_bit_cast(uint32_t, splat.depth), first, last, columns);
     ++slot_;
   }
 
  private:
+  // One or two rows are the rule. The second key is written always and counted only when it is one: no branch to
+  // mispredict.
+  GAUSSLITE_INLINE void add_keys(uint32_t depth, uint32_t first, uint32_t last, TileColumns columns) {
+    if (ws_.active_tiles == nullptr) {
+      add_key(depth, first, true);
+      add_key(depth, first + 1, last > first);
+      for (uint32_t y = first + 2; y <= last; ++y) add_key(depth, y, true);
+    } else {
+      for (uint32_t y = first; y <= last; ++y) add_key(depth, y, row_is_active(ws_, y, columns));
+    }
+  }
+
+  GAUSSLITE_INLINE void add_key(uint32_t depth, uint32_t tile_y, bool counts) {
+    KeyList& strip = mine_.strips[size_t(tile_y)];
+    strip.keys[strip.count] = {depth, slot_};
+    strip.count += counts;
+  }
+
   Workspace& ws_;
   ThreadScratch& mine_;
   uint32_t slot_;
 };
 
-GAUSSLITE_INLINE void project_group(const Workspace& ws, const Frustum& frustum, uint32_t begin, int lanes,
+// Projects the `lanes` rows that `ids` names.
+GAUSSLITE_INLINE void project_group(const Workspace& ws, const Frustum& frustum, const uint32_t* ids, int lanes,
                                     Segment& segment) {
   Pack16 row[16];
-  uint32_t ids[16];
-  for (int j = 0; j < 16; ++j) {
-    const uint32_t entry = begin + uint32_t(std::min(j, lanes - 1));
-    ids[j] = ws.ids != nullptr ? ws.ids[entry] : entry;
-    row[j] = load(ws.rows + size_t(kRowWidth) * ids[j]);
-  }
+  for (int j = 0; j < 16; ++j) row[j] = load(ws.rows + size_t(kRowWidth) * ids[std::min(j, lanes - 1)]);
   transpose(row);
-  const Mask16 candidates = frustum.may_touch(row, ws.camera) & first_lanes(lanes);
+  const Mask16 candidates = frustum.may_touch(row) & first_lanes(lanes);
   if (!any(candidates)) return;
 
   Projection p;
@@ -189,21 +217,54 @@ GAUSSLITE_INLINE void project_group(const Workspace& ws, const Frustum& frustum,
   }
 }
 
+// Of rows [begin, end), the ids of those that may touch the active part of the image. Looking at eight columns of a row
+// costs less than projecting it, and the rows that are left fill their groups.
+GAUSSLITE_INLINE uint32_t find_candidates(const Workspace& ws, const Frustum& frustum, uint32_t begin, uint32_t end,
+                                          uint32_t* ids) {
+  uint32_t count = 0;
+  for (uint32_t i = begin; i < end; i += 16) {
+    uint32_t candidates = (1u << ((end - i) % 16)) - 1u;
+    if (end - i >= 16) {
+      const float* first = ws.rows + size_t(kRowWidth) * i;
+      Pack16 row[8];
+      for (int k = 0; k < 4; ++k) {
+        row[k] = load_block(first + kRowWidth * k, 4 * kRowWidth);
+        row[4 + k] = load_block(first + kRowWidth * k + 4, 4 * kRowWidth);
+      }
+      transpose_quads(row[0], row[1], row[2], row[3]);
+      transpose_quads(row[4], row[5], row[6], row[7]);
+      candidates = bits(frustum.may_touch(row));
+    }
+    for (uint32_t j = 0; j < 16; ++j) {
+      ids[count] = i + j;
+      count += candidates >> j & 1u;
+    }
+  }
+  return count;
+}
+
 }  // namespace
 
 void project(Workspace& ws, int thread) {
   ThreadScratch& mine = ws.scratch[size_t(thread)];
-  const Frustum frustum(ws.camera);
+  const Frustum frustum(ws);
+  uint32_t found[kSegment + 16];
   mine.next_row = mine.last_row = 0;
-  for (int y = 0; y < ws.tiles_y; ++y) mine.strips[size_t(y)].count = 0;
+  // The list after the last row takes second keys that do not count.
+  const int lists = ws.tiles_y + 1;
+  for (int y = 0; y < lists; ++y) mine.strips[size_t(y)].count = 0;
   for (uint32_t s = uint32_t(thread); s < ws.segments; s += uint32_t(ws.threads)) {
     const uint32_t begin = s * kSegment, end = std::min(ws.count, begin + kSegment);
-    for (int y = 0; y < ws.tiles_y; ++y) {
+    for (int y = 0; y < lists; ++y) {
       KeyList& strip = mine.strips[size_t(y)];
-      strip.keys.reserve(strip.count + kSegment, strip.count);
+      strip.keys.reserve(strip.count + kSegment + 1, strip.count);
     }
+    const uint32_t* ids = ws.ids != nullptr ? ws.ids + begin : found;
+    const uint32_t count = ws.ids != nullptr ? end - begin : find_candidates(ws, frustum, begin, end, found);
     Segment segment(ws, mine, begin);
-    for (uint32_t i = begin; i < end; i += 16) project_group(ws, frustum, i, int(std::min(16u, end - i)), segment);
+    for (uint32_t i = 0; i < count; i += 16) {
+      project_group(ws, frustum, ids + i, int(std::min(16u, count - i)), segment);
+    }
     ws.segment_visible[s] = segment.slot() - begin;
     uint32_t* ends = &ws.segment_keys[size_t(s) * size_t(ws.tiles_y)];
     for (int y = 0; y < ws.tiles_y; ++y) ends[y] = mine.strips[size_t(y)].count;

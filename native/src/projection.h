@@ -19,6 +19,8 @@ struct Projection {
   Pack16 qw, qx, qy, qz, inverse_norm;  // the unit quaternion, and 1 / the length of the raw one
   Pack16 cov_xx, cov_xy, cov_yy;        // image covariance, px^2
   Pack16 conic_xx, conic_xy, conic_yy;  // its inverse
+  Pack16 cross[3];                      // M0 x M1
+  Pack16 inverse_determinant;           // of the image covariance
   Pack16 mean_x, mean_y;                // px
   Pack16 transparency, log2_opacity;    // 1 - opacity, and log2(opacity)
 };
@@ -64,14 +66,15 @@ GAUSSLITE_INLINE void invert_covariance(Projection& o) {
   o.cov_xx = square0 + kDilationPx2;
   o.cov_yy = square1 + kDilationPx2;
   o.cov_xy = dot3(o.M0, o.M1);
-  const Pack16 cross[3] = {o.M0[1] * o.M1[2] - o.M0[2] * o.M1[1], o.M0[2] * o.M1[0] - o.M0[0] * o.M1[2],
-                           o.M0[0] * o.M1[1] - o.M0[1] * o.M1[0]};
+  o.cross[0] = o.M0[1] * o.M1[2] - o.M0[2] * o.M1[1];
+  o.cross[1] = o.M0[2] * o.M1[0] - o.M0[0] * o.M1[2];
+  o.cross[2] = o.M0[0] * o.M1[1] - o.M0[1] * o.M1[0];
   const Pack16 determinant =
-      dot3(cross, cross) + fma(Pack16(kDilationPx2), square0 + square1, Pack16(kDilationPx2 * kDilationPx2));
-  const Pack16 inverse = Pack16(1.0f) / determinant;
-  o.conic_xx = o.cov_yy * inverse;
-  o.conic_xy = -(o.cov_xy * inverse);
-  o.conic_yy = o.cov_xx * inverse;
+      dot3(o.cross, o.cross) + fma(Pack16(kDilationPx2), square0 + square1, Pack16(kDilationPx2 * kDilationPx2));
+  o.inverse_determinant = Pack16(1.0f) / determinant;
+  o.conic_xx = o.cov_yy * o.inverse_determinant;
+  o.conic_xy = -(o.cov_xy * o.inverse_determinant);
+  o.conic_yy = o.cov_xx * o.inverse_determinant;
 }
 
 // `row` holds sixteen parameter rows, transposed: row[k] is column k.

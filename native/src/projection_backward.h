@@ -15,17 +15,13 @@ struct ParameterGradients {
   Pack16 twist[6];
 };
 
-// The gradient by the covariance entries xx, xy, yy, from the moments of v = dL/d ln(alpha). As ln(alpha) = ... - d^T K
-// d / 2, the gradient by the conic K is -1/2 sum of v d d^T, and that by the covariance is -K (dL/dK) K.
-GAUSSLITE_INLINE void covariance_gradient(const Projection& p, const Pack16* moments, Pack16& by_xx, Pack16& by_xy,
-                                          Pack16& by_yy) {
-  const Pack16 A = p.conic_xx, B = p.conic_xy, C = p.conic_yy;
-  const Pack16 g_xx = moments[3] * -0.5f, g_xy = moments[4] * -0.5f, g_yy = moments[5] * -0.5f;
-  const Pack16 k00 = A * g_xx + B * g_xy, k01 = A * g_xy + B * g_yy, k10 = B * g_xx + C * g_xy,
-               k11 = B * g_xy + C * g_yy;
-  by_xx = -(k00 * A + k01 * B);
-  by_xy = -(k00 * B + k01 * C) * 2.0f;
-  by_yy = -(k10 * B + k11 * C);
+// K m for column j of M, where K is the conic. K (M M^T + d I) = I and the adjugate of a sum of 2x2 matrices is the sum
+// of theirs, so that K m_j = (sum over i of n_i (n_i m_j) + d m_j) / determinant with n_i = m_i turned by 90 degrees.
+// n_j m_j is exactly zero: nothing cancels, as the entries of K times those of a needle's long axis would.
+GAUSSLITE_INLINE void conic_times_axis(const Projection& p, int j, Pack16& x, Pack16& y) {
+  const int k = (j + 1) % 3, l = (j + 2) % 3;
+  x = (p.M1[k] * p.cross[l] - p.M1[l] * p.cross[k] + p.M0[j] * kDilationPx2) * p.inverse_determinant;
+  y = (p.M0[l] * p.cross[k] - p.M0[k] * p.cross[l] + p.M1[j] * kDilationPx2) * p.inverse_determinant;
 }
 
 // `by_R` is the gradient by the rotation matrix of the unit quaternion; the result is by the raw one.
@@ -58,14 +54,16 @@ GAUSSLITE_INLINE void backward16(const Pack16* row, const Pack16* image, const C
   const Pack16 half_x = by_mean_x * (0.5f * float(camera.width)), half_y = by_mean_y * (0.5f * float(camera.height));
   out.mean_2d_norm = sqrt(half_x * half_x + half_y * half_y);
 
-  // Covariance = M M^T + 0.3 I with M = P R S.
-  Pack16 by_xx, by_xy, by_yy;
-  covariance_gradient(p, image + kMoments, by_xx, by_xy, by_yy);
-  const Pack16 twice_xx = by_xx + by_xx, twice_yy = by_yy + by_yy;
+  // Covariance = M M^T + 0.3 I with M = P R S. As ln(alpha) = ... - d^T K d / 2, column m of M has the gradient K S K
+  // m, where S holds the second moments of v.
+  const Pack16 *moments = image + kMoments, S_xx = moments[3], S_xy = moments[4], S_yy = moments[5];
   Pack16 by_P0[3] = {0.0f, 0.0f, 0.0f}, by_P1[3] = {0.0f, 0.0f, 0.0f}, by_R[3][3];
   for (int j = 0; j < 3; ++j) {
-    const Pack16 by_M0 = twice_xx * p.M0[j] + by_xy * p.M1[j], by_M1 = twice_yy * p.M1[j] + by_xy * p.M0[j];
-    out.column[kLogScale + j] = by_M0 * p.M0[j] + by_M1 * p.M1[j];
+    Pack16 x, y;
+    conic_times_axis(p, j, x, y);
+    const Pack16 Sx = S_xx * x + S_xy * y, Sy = S_xy * x + S_yy * y;
+    out.column[kLogScale + j] = x * Sx + y * Sy;
+    const Pack16 by_M0 = p.conic_xx * Sx + p.conic_xy * Sy, by_M1 = p.conic_xy * Sx + p.conic_yy * Sy;
     const Pack16 scaled0 = by_M0 * p.scale[j], scaled1 = by_M1 * p.scale[j];
     for (int i = 0; i < 3; ++i) {
       by_R[i][j] = p.P0[i] * scaled0 + p.P1[i] * scaled1;

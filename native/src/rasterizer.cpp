@@ -59,11 +59,12 @@ void Rasterizer::begin_frame(const FrameInput& input) {
   ws_.gradient_rows_used = 0;
   ws_.ticket = 0;
   for (ThreadScratch& scratch : ws_.scratch) {
-    if (scratch.strips.size() < size_t(ws_.tiles_y)) scratch.strips.resize(size_t(ws_.tiles_y));
+    if (scratch.strips.size() <= size_t(ws_.tiles_y)) scratch.strips.resize(size_t(ws_.tiles_y) + 1);
     scratch.block_evaluations = 0;
   }
   ws_.wanted_blocks.reserve(tiles);
   want_blocks(nullptr);
+  ws_.active = {0, input.camera.width, 0, input.camera.height};
   if (input.active_tiles != nullptr) count_active_tiles();
   times_ = {};
   last_mark_ms_ = now_ms();
@@ -86,11 +87,17 @@ void Rasterizer::next_tag() {
 void Rasterizer::count_active_tiles() {
   const size_t stride = size_t(ws_.tiles_x) + 1;
   ws_.active_before.reserve(stride * size_t(ws_.tiles_y));
+  auto& box = ws_.active;
+  box = {ws_.camera.width, 0, ws_.camera.height, 0};
   for (int y = 0; y < ws_.tiles_y; ++y) {
     uint16_t* before = &ws_.active_before[stride * size_t(y)];
     before[0] = 0;
     for (int x = 0; x < ws_.tiles_x; ++x) {
-      before[x + 1] = uint16_t(before[x] + (ws_.active_tiles[size_t(y) * size_t(ws_.tiles_x) + size_t(x)] != 0));
+      const bool active = ws_.active_tiles[size_t(y) * size_t(ws_.tiles_x) + size_t(x)] != 0;
+      before[x + 1] = uint16_t(before[x] + active);
+      if (!active) continue;
+      box = {std::min(box.x0, x * kTile), std::max(box.x1, (x + 1) * kTile), std::min(box.y0, y * kTile),
+             std::max(box.y1, (y + 1) * kTile)};
     }
   }
 }

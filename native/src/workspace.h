@@ -109,7 +109,10 @@ struct Workspace {
   const uint32_t* ids = nullptr;
   uint32_t count = 0;
   const uint8_t* active_tiles = nullptr;  // null: all
-  Buffer<uint16_t> active_before;         // [tile row][tile column + 1]: active tiles to the left
+  struct {
+    int x0, x1, y0, y1;
+  } active;                        // pixels: the smallest box around the active tiles, ends not included
+  Buffer<uint16_t> active_before;  // [tile row][tile column + 1]: active tiles to the left
 
   // Projection. A segment's visible splats are packed to its front: slots segment * kSegment + 0 .. segment_visible.
   Buffer<Splat> splats;

@@ -18,7 +18,7 @@ from splat_scenes import (
 
 from gausslite.render.rasterizer import EVERYTHING, Rasterizer, SplatGradients, Subset
 
-TOLERANCE = 7e-4
+TOLERANCE = 1e-4
 
 
 def gradients(rasterizer: Rasterizer, scene: Scene, subset: Subset = EVERYTHING) -> SplatGradients:

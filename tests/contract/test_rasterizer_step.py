@@ -23,7 +23,7 @@ from gausslite.render.rasterizer import (
 )
 from gausslite.render.reference.loss import training_loss
 
-TOLERANCE = 1e-3
+TOLERANCE = 1e-4
 SATURATED_TOLERANCE = {"cuda": 0.1}
 """Of the backends that clamp and stop otherwise than the seam says, on whole images with saturated pixels: a nearly
 opaque splat then gets a gradient from pixels that give it none, and the other way round."""

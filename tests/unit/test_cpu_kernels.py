@@ -69,9 +69,11 @@ def test_every_instruction_set_draws_what_the_portable_form_draws(simd: str) -> 
     assert gradients(came, rows).visible.tolist() == gradients(wanted, rows).visible.tolist()
 
 
+@pytest.mark.parametrize("simd", kernels.usable_simd())
 @pytest.mark.parametrize("threads", [2, 3])
-def test_gradients_have_the_same_bits_for_any_number_of_threads(threads: int) -> None:
-    alone, team = gradients(CpuRasterizer(1), random_rows()), gradients(CpuRasterizer(threads), random_rows())
+def test_gradients_have_the_same_bits_for_any_number_of_threads(threads: int, simd: str) -> None:
+    rows = random_rows()
+    alone, team = gradients(CpuRasterizer(1, simd), rows), gradients(CpuRasterizer(threads, simd), rows)
     np.testing.assert_array_equal(team.d_rows, alone.d_rows)
     np.testing.assert_array_equal(team.d_twist, alone.d_twist)
     np.testing.assert_array_equal(team.mean_2d_norm, alone.mean_2d_norm)

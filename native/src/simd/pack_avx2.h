@@ -71,11 +71,12 @@ GAUSSLITE_INLINE Pack16 sqrt(Pack16 a) { return {_mm256_sqrt_ps(a.lo), _mm256_sq
 GAUSSLITE_INLINE Pack16 floor(Pack16 a) { return {_mm256_floor_ps(a.lo), _mm256_floor_ps(a.hi)}; }
 GAUSSLITE_INLINE Pack16 ceil(Pack16 a) { return {_mm256_ceil_ps(a.lo), _mm256_ceil_ps(a.hi)}; }
 
-// rcpps and rsqrtps have 12 bits; one Newton step makes them as good as the other forms.
-GAUSSLITE_INLINE Pack16 rough_reciprocal(Pack16 a) {
+// rcpps and rsqrtps have 12 bits, which one Newton step doubles.
+GAUSSLITE_INLINE Pack16 reciprocal(Pack16 a) {
   const Pack16 r{_mm256_rcp_ps(a.lo), _mm256_rcp_ps(a.hi)};
   return r * fnma(a, r, Pack16(2.0f));
 }
+GAUSSLITE_INLINE Pack16 rough_reciprocal(Pack16 a) { return reciprocal(a); }
 GAUSSLITE_INLINE Pack16 rough_inverse_sqrt(Pack16 a) {
   const Pack16 r{_mm256_rsqrt_ps(a.lo), _mm256_rsqrt_ps(a.hi)};
   return r * fnma(a * 0.5f, r * r, Pack16(1.5f));

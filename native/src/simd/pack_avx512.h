@@ -47,6 +47,10 @@ GAUSSLITE_INLINE Pack16 floor(Pack16 a) { return _mm512_roundscale_ps(a.v, _MM_F
 GAUSSLITE_INLINE Pack16 ceil(Pack16 a) { return _mm512_roundscale_ps(a.v, _MM_FROUND_TO_POS_INF | _MM_FROUND_NO_EXC); }
 GAUSSLITE_INLINE Pack16 rough_reciprocal(Pack16 a) { return _mm512_rcp14_ps(a.v); }
 GAUSSLITE_INLINE Pack16 rough_inverse_sqrt(Pack16 a) { return _mm512_rsqrt14_ps(a.v); }
+GAUSSLITE_INLINE Pack16 reciprocal(Pack16 a) {
+  const Pack16 r = rough_reciprocal(a);
+  return r * fnma(a, r, Pack16(2.0f));
+}
 
 GAUSSLITE_INLINE Mask16 operator<(Pack16 a, Pack16 b) { return {_mm512_cmp_ps_mask(a.v, b.v, _CMP_LT_OQ)}; }
 GAUSSLITE_INLINE Mask16 operator<=(Pack16 a, Pack16 b) { return {_mm512_cmp_ps_mask(a.v, b.v, _CMP_LE_OQ)}; }

@@ -92,16 +92,21 @@ GAUSSLITE_INLINE Pack16 fnma(Pack16 a, Pack16 b, Pack16 c) {
           vfmsq_f32(c.q[3], a.q[3], b.q[3])};
 }
 
-// The estimates have 8 bits; one Newton step brings them to 15 and more.
-GAUSSLITE_INLINE float32x4_t reciprocal_of(float32x4_t a) {
+// The estimates have 8 bits; one Newton step brings them to 15 and more, two to nearly all.
+GAUSSLITE_INLINE float32x4_t rough_reciprocal_of(float32x4_t a) {
   const float32x4_t r = vrecpeq_f32(a);
+  return vmulq_f32(r, vrecpsq_f32(a, r));
+}
+GAUSSLITE_INLINE float32x4_t reciprocal_of(float32x4_t a) {
+  const float32x4_t r = rough_reciprocal_of(a);
   return vmulq_f32(r, vrecpsq_f32(a, r));
 }
 GAUSSLITE_INLINE float32x4_t inverse_sqrt_of(float32x4_t a) {
   const float32x4_t r = vrsqrteq_f32(a);
   return vmulq_f32(r, vrsqrtsq_f32(vmulq_f32(a, r), r));
 }
-GAUSSLITE_UNARY(rough_reciprocal, reciprocal_of)
+GAUSSLITE_UNARY(reciprocal, reciprocal_of)
+GAUSSLITE_UNARY(rough_reciprocal, rough_reciprocal_of)
 GAUSSLITE_UNARY(rough_inverse_sqrt, inverse_sqrt_of)
 
 GAUSSLITE_COMPARISON(operator<, vcltq_f32)
