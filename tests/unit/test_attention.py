@@ -17,7 +17,8 @@ from gausslite.perception.attention import TaskAttention
 from gausslite.perception.fixed import RegionAttention
 from gausslite.perception.ground_truth import RegionDetector
 from gausslite.perception.memory import Sighting
-from gausslite.perception.spatial import SpatialFilter, SpatialSettings, best_depth_m
+from gausslite.perception.relate import SpatialSettings
+from gausslite.perception.spatial import SpatialFilter, best_depth_m
 from gausslite.perception.tracker import AttentionSettings
 from gausslite.perception.vectors import classes_for
 

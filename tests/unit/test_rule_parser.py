@@ -98,13 +98,13 @@ def test_what_is_to_be_left_alone_is_no_target_and_said(text, excluded):
 
 
 def test_a_relation_without_a_predicate_becomes_near_and_is_said():
-    graph = RuleParser().parse("Find the shoe behind the couch")
+    graph = RuleParser().parse("Find the shoe opposite the couch")
     assert graph.relations == (Relation(Predicate.NEAR, "shoe", "couch"),)
-    assert graph.warnings == ("'behind' 'couch' is not supported yet: read as near",)
+    assert graph.warnings == ("'opposite' 'couch' is no relation that is known: read as near",)
 
 
 def test_far_from_is_not_turned_into_near():
-    graph = RuleParser().parse("Find the chair farthest from the door")
+    graph = RuleParser().parse("Find the chair far from the door")
     assert graph.relations == ()
     assert graph.anchors == ("door",)
     assert len(graph.warnings) == 1

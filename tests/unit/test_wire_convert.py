@@ -57,7 +57,9 @@ def test_a_frame_survives(lossless: bool) -> None:
 
 
 def test_a_task_graph_survives() -> None:
-    assert convert.graph_from_message(convert.graph_to_message(GRAPH)) == GRAPH
+    relations = tuple(Relation(predicate, "mug", "table") for predicate in Predicate)
+    for graph in (GRAPH, TaskGraph("id", "", ("mug",), ("table",), relations)):
+        assert convert.graph_from_message(convert.graph_to_message(graph)) == graph
 
 
 @pytest.mark.parametrize(
@@ -70,7 +72,7 @@ def test_a_task_graph_survives() -> None:
         {"text": "x" * 5000},
         {"relations": [task_pb2.Relation(predicate=task_pb2.PREDICATE_ON, target="mug", anchor="chair")]},
         {"relations": [task_pb2.Relation(target="mug", anchor="table")]},
-        {"relations": [task_pb2.Relation(predicate=9, target="mug", anchor="table")]},  # type: ignore[arg-type]
+        {"relations": [task_pb2.Relation(predicate=99, target="mug", anchor="table")]},  # type: ignore[arg-type]
     ],
 )
 def test_a_graph_without_sense_is_refused(change: dict[str, object]) -> None:

@@ -7,11 +7,23 @@ from enum import StrEnum
 
 
 class Predicate(StrEnum):
-    """Spatial predicates the relation filter can evaluate."""
+    """Spatial predicates the relation filter can evaluate; the paper has the first two.
+
+    BETWEEN is said once for each of its anchors: between(t, a) and between(t, b) are one relation.
+    """
 
     NEAR = "near"
     ON = "on"
     CLOSEST_TO = "closest_to"
+    FARTHEST_FROM = "farthest_from"
+    UNDER = "under"
+    INSIDE = "inside"
+    ABOVE = "above"
+    BEHIND = "behind"
+    IN_FRONT_OF = "in_front_of"
+    LEFT_OF = "left_of"
+    RIGHT_OF = "right_of"
+    BETWEEN = "between"
 
 
 @dataclass(frozen=True, slots=True)

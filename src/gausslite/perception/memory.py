@@ -21,25 +21,28 @@ _MAX_OBJECTS: Final = 500
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sighting:
-    """One object in one frame: its centroid in the world, the cells of its surface, and its radius.
+    """One object in one frame: its centroid in the world, the cells of its surface, its radius, and who saw it.
 
     The radius is twice the median distance of its points to the centroid: masks of chairs let background through, and
-    the outermost points would measure that.
+    the outermost points would measure that. eye_m is the camera's centre, None where no camera saw it.
     """
 
     phrase: str
     centroid_m: Float64[ndarray, "3"]
     radius_m: float
     cells: Int64[ndarray, " k"]
+    eye_m: Float64[ndarray, "3"] | None = None
 
     @classmethod
-    def of_points(cls, phrase: str, points_m: Float64[ndarray, "n 3"]) -> Sighting:
+    def of_points(
+        cls, phrase: str, points_m: Float64[ndarray, "n 3"], eye_m: Float64[ndarray, "3"] | None = None
+    ) -> Sighting:
         """From the points of an object's mask; the centroid is their median, points far outside are left out."""
         centroid = np.median(points_m, axis=0)
         distances = np.linalg.norm(points_m - centroid, axis=1)
         radius_m = 2.0 * float(np.median(distances))
         own = points_m[distances <= 2.0 * max(radius_m, _MIN_REACH_M)]
-        return cls(phrase, centroid, radius_m, np.unique(_CELLS.keys(own.astype(np.float32))))
+        return cls(phrase, centroid, radius_m, np.unique(_CELLS.keys(own.astype(np.float32))), eye_m)
 
 
 @dataclass(slots=True, eq=False)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64
@@ -12,25 +11,11 @@ from numpy import ndarray
 from gausslite.domain.camera import Camera, lift
 from gausslite.domain.pose import UpAxis, transform_points, unit_up_axis
 from gausslite.domain.task import Predicate, Relation, TaskGraph
-from gausslite.errors import InvalidInputError
 from gausslite.perception.memory import ObjectMemory, Remembered, Sighting
+from gausslite.perception.relate import Geometry, SpatialSettings, distance_m
 
 _MIN_PIXELS = 8
 _MAX_PIXELS = 4000
-_FOOTPRINT_SLACK_M = 0.10
-
-
-@dataclass(frozen=True, slots=True)
-class SpatialSettings:
-    """near: distance under near_m. on: higher than the anchor, and less than on_m aside or over it."""
-
-    near_m: float = 1.0
-    on_m: float = 0.5
-
-    def __post_init__(self) -> None:
-        for name in ("near_m", "on_m"):
-            if not (np.isfinite(getattr(self, name)) and getattr(self, name) > 0):
-                raise InvalidInputError(f"spatial {name}: expected a positive length, got {getattr(self, name)}")
 
 
 def best_depth_m(
@@ -60,7 +45,7 @@ def sight(
     rows, columns = rows[::step], columns[::step]
     centres_px = np.stack([columns, rows], axis=1) + 0.5
     points = lift(centres_px, depth_m[rows, columns].astype(np.float64), camera)
-    return Sighting.of_points(phrase, transform_points(T_world_camera, points))
+    return Sighting.of_points(phrase, transform_points(T_world_camera, points), T_world_camera[:3, 3])
 
 
 class SpatialFilter:
@@ -71,8 +56,7 @@ class SpatialFilter:
             target: tuple(relation for relation in graph.relations if relation.target == target)
             for target in graph.targets
         }
-        self._settings = settings
-        self._up = np.array(unit_up_axis(up_axis))
+        self._geometry = Geometry(np.array(unit_up_axis(up_axis)), settings)
         self._memory = ObjectMemory()
 
     @property
@@ -98,47 +82,35 @@ class SpatialFilter:
         """Any relation of the target holds (Sec. III-B.3); True without relations or without their anchors.
 
         A target is judged by the anchors that were seen; while none of them was, it is kept, for want of evidence.
+        All the anchors of `between` make one relation.
         """
-        judged = [each for each in self._relations.get(sighting.phrase, ()) if self._memory.named(each.anchor)]
-        return not judged or any(self._holds(relation, sighting) for relation in judged)
+        relations = self._relations.get(sighting.phrase, ())
+        seen = [each for each in relations if self._memory.named(each.anchor)]
+        held = [self._holds(each, sighting) for each in seen if each.predicate is not Predicate.BETWEEN]
+        anchors = [self._others(each, sighting) for each in relations if each.predicate is Predicate.BETWEEN]
+        between = self._geometry.between(sighting, anchors) if anchors else None
+        judged = held if between is None else [*held, between]
+        return not judged or any(judged)
+
+    def _others(self, relation: Relation, sighting: Sighting) -> list[Remembered]:
+        """The relation's anchors without the target itself."""
+        return [each for each in self._memory.named(relation.anchor) if not each.is_at(sighting)]
 
     def _holds(self, relation: Relation, sighting: Sighting) -> bool:
-        if relation.predicate is Predicate.CLOSEST_TO:
-            return self._is_closest(relation, sighting)
-        anchors = [each for each in self._memory.named(relation.anchor) if not each.is_at(sighting)]
-        if relation.predicate is Predicate.ON:
-            return any(self._is_on(sighting.centroid_m, anchor) for anchor in anchors)
-        return any(_distance_m(sighting.centroid_m, anchor.centroid_m) < self._settings.near_m for anchor in anchors)
+        if relation.predicate in (Predicate.CLOSEST_TO, Predicate.FARTHEST_FROM):
+            return self._is_extreme(relation, sighting)
+        anchors = self._others(relation, sighting)
+        return any(self._geometry.holds(relation.predicate, sighting, anchor) for anchor in anchors)
 
-    def _is_on(self, centroid_m: Float64[ndarray, "3"], anchor: Remembered) -> bool:
-        """Higher than the anchor's centroid, and less than on_m aside of it or over its footprint."""
-        height_m, aside_m = self._offset_m(centroid_m, anchor.centroid_m[None])
-        if height_m[0] <= 0.0:
-            return False
-        if aside_m[0] < self._settings.on_m:
-            return True
-        _, beside_m = self._offset_m(centroid_m, anchor.footprint_m().astype(np.float64))
-        return bool(beside_m.min() < _FOOTPRINT_SLACK_M)
-
-    def _offset_m(
-        self, point_m: Float64[ndarray, "3"], from_m: Float64[ndarray, "n 3"]
-    ) -> tuple[Float64[ndarray, " n"], Float64[ndarray, " n"]]:
-        """How much higher, and how far aside horizontally, a point is from others."""
-        offset = point_m - from_m
-        height = offset @ self._up
-        return height, np.linalg.norm(offset - height[:, None] * self._up, axis=1)
-
-    def _is_closest(self, relation: Relation, sighting: Sighting) -> bool:
-        """Only the candidate with the least distance to an anchor, of all that were ever seen, is the closest."""
+    def _is_extreme(self, relation: Relation, sighting: Sighting) -> bool:
+        """Of all candidates that were ever seen, only the one with the least (most) distance to its nearest anchor."""
+        sign = 1.0 if relation.predicate is Predicate.CLOSEST_TO else -1.0
         anchors = self._memory.named(relation.anchor)
         best, least_m = None, np.inf
         for candidate in self._memory.confirmed(relation.target):
-            for anchor in anchors:
-                distance_m = _distance_m(candidate.centroid_m, anchor.centroid_m)
-                if candidate is not anchor and distance_m < least_m:
-                    best, least_m = candidate, distance_m
+            to_anchors_m = [
+                distance_m(candidate.centroid_m, each.centroid_m) for each in anchors if each is not candidate
+            ]
+            if to_anchors_m and sign * min(to_anchors_m) < least_m:
+                best, least_m = candidate, sign * min(to_anchors_m)
         return best is not None and best.matches(sighting)
-
-
-def _distance_m(a_m: Float64[ndarray, "3"], b_m: Float64[ndarray, "3"]) -> float:
-    return float(np.linalg.norm(a_m - b_m))

@@ -21,8 +21,9 @@ from gausslite.perception.checkpoint import frustum_of as frustum_of_state
 from gausslite.perception.checkpoint import frustum_state, remembered_of, remembered_state
 from gausslite.perception.detect import Segmenter
 from gausslite.perception.memory import Remembered
+from gausslite.perception.relate import SpatialSettings
 from gausslite.perception.reproject import Frustum, cut_by_depth, frustum_of, reprojected_box_px
-from gausslite.perception.spatial import SpatialFilter, SpatialSettings, sight
+from gausslite.perception.spatial import SpatialFilter, sight
 from gausslite.perception.vocabulary import is_generic
 
 

@@ -11,7 +11,7 @@ from gausslite.task.reading import Kind, Piece
 
 _SUPPORTED: Final = frozenset(predicate.value for predicate in Predicate)
 # said as a distance the filter must not turn round
-_NEVER_NEAR: Final = frozenset({"farthest_from", "far_from"})
+_NEVER_NEAR: Final = frozenset({"far_from"})
 _SOURCES: Final = {"from_under": "under", "from_inside": "inside", "from_behind": "behind", "from_near": "near"}
 _DESTINATIONS: Final = frozenset({"to", "on", "inside", "near", "under", "behind", "in_front_of", "above", "between"})
 
@@ -200,10 +200,10 @@ class GraphBuilder:
         self._anchor(noun.text)
         clause.last_relation = relation
         if relation in _NEVER_NEAR:
-            self.warnings.append(f"{_said(relation)} {noun.text!r} is not supported yet: the relation is dropped")
+            self.warnings.append(f"{_said(relation)} {noun.text!r} is no relation that is known: it is dropped")
             return
         if relation not in _SUPPORTED:
-            self.warnings.append(f"{_said(relation)} {noun.text!r} is not supported yet: read as near")
+            self.warnings.append(f"{_said(relation)} {noun.text!r} is no relation that is known: read as near")
         predicate = Predicate(relation) if relation in _SUPPORTED else Predicate.NEAR
         for subject in clause.subjects:
             found = Relation(predicate, subject, noun.text)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-# a relation that is no Predicate yet is kept as `near`, with a warning; the names below say what the words mean
+# a relation that is no Predicate is kept as `near`, with a warning; the names below say what the words mean
 _BY_RELATION: Final = {
     "near": "near|next to|beside|by|close to|closer to|adjacent to|alongside|at|around|against|nearby to|touching|"
     "attached to|connected to|in the vicinity of|next|surrounding|along|close by|by the side of|at the side of|"

@@ -24,15 +24,15 @@ _sym_db = _symbol_database.Default()
 
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x17gausslite/v1/task.proto\x12\x0cgausslite.v1\"V\n\x08Relation\x12*\n\tpredicate\x18\x01 \x01(\x0e\x32\x17.gausslite.v1.Predicate\x12\x0e\n\x06target\x18\x02 \x01(\t\x12\x0e\n\x06\x61nchor\x18\x03 \x01(\t\"\x89\x01\n\tTaskGraph\x12\x0f\n\x07task_id\x18\x01 \x01(\t\x12\x0c\n\x04text\x18\x02 \x01(\t\x12\x0f\n\x07targets\x18\x03 \x03(\t\x12\x0f\n\x07\x61nchors\x18\x04 \x03(\t\x12)\n\trelations\x18\x05 \x03(\x0b\x32\x16.gausslite.v1.Relation\x12\x10\n\x08warnings\x18\x06 \x03(\t*f\n\tPredicate\x12\x19\n\x15PREDICATE_UNSPECIFIED\x10\x00\x12\x12\n\x0ePREDICATE_NEAR\x10\x01\x12\x10\n\x0cPREDICATE_ON\x10\x02\x12\x18\n\x14PREDICATE_CLOSEST_TO\x10\x03\x62\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x17gausslite/v1/task.proto\x12\x0cgausslite.v1\"V\n\x08Relation\x12*\n\tpredicate\x18\x01 \x01(\x0e\x32\x17.gausslite.v1.Predicate\x12\x0e\n\x06target\x18\x02 \x01(\t\x12\x0e\n\x06\x61nchor\x18\x03 \x01(\t\"\x89\x01\n\tTaskGraph\x12\x0f\n\x07task_id\x18\x01 \x01(\t\x12\x0c\n\x04text\x18\x02 \x01(\t\x12\x0f\n\x07targets\x18\x03 \x03(\t\x12\x0f\n\x07\x61nchors\x18\x04 \x03(\t\x12)\n\trelations\x18\x05 \x03(\x0b\x32\x16.gausslite.v1.Relation\x12\x10\n\x08warnings\x18\x06 \x03(\t*\xba\x02\n\tPredicate\x12\x19\n\x15PREDICATE_UNSPECIFIED\x10\x00\x12\x12\n\x0ePREDICATE_NEAR\x10\x01\x12\x10\n\x0cPREDICATE_ON\x10\x02\x12\x18\n\x14PREDICATE_CLOSEST_TO\x10\x03\x12\x1b\n\x17PREDICATE_FARTHEST_FROM\x10\x04\x12\x13\n\x0fPREDICATE_UNDER\x10\x05\x12\x14\n\x10PREDICATE_INSIDE\x10\x06\x12\x13\n\x0fPREDICATE_ABOVE\x10\x07\x12\x14\n\x10PREDICATE_BEHIND\x10\x08\x12\x19\n\x15PREDICATE_IN_FRONT_OF\x10\t\x12\x15\n\x11PREDICATE_LEFT_OF\x10\n\x12\x16\n\x12PREDICATE_RIGHT_OF\x10\x0b\x12\x15\n\x11PREDICATE_BETWEEN\x10\x0c\x62\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
 _builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'gausslite.v1.task_pb2', _globals)
 if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
-  _globals['_PREDICATE']._serialized_start=269
-  _globals['_PREDICATE']._serialized_end=371
+  _globals['_PREDICATE']._serialized_start=270
+  _globals['_PREDICATE']._serialized_end=584
   _globals['_RELATION']._serialized_start=41
   _globals['_RELATION']._serialized_end=127
   _globals['_TASKGRAPH']._serialized_start=130

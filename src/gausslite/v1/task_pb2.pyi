@@ -32,6 +32,17 @@ class _PredicateEnumTypeWrapper(_enum_type_wrapper._EnumTypeWrapper[_Predicate.V
     PREDICATE_NEAR: _Predicate.ValueType  # 1
     PREDICATE_ON: _Predicate.ValueType  # 2
     PREDICATE_CLOSEST_TO: _Predicate.ValueType  # 3
+    PREDICATE_FARTHEST_FROM: _Predicate.ValueType  # 4
+    PREDICATE_UNDER: _Predicate.ValueType  # 5
+    PREDICATE_INSIDE: _Predicate.ValueType  # 6
+    PREDICATE_ABOVE: _Predicate.ValueType  # 7
+    PREDICATE_BEHIND: _Predicate.ValueType  # 8
+    """The sides are those of whoever looks."""
+    PREDICATE_IN_FRONT_OF: _Predicate.ValueType  # 9
+    PREDICATE_LEFT_OF: _Predicate.ValueType  # 10
+    PREDICATE_RIGHT_OF: _Predicate.ValueType  # 11
+    PREDICATE_BETWEEN: _Predicate.ValueType  # 12
+    """Said once for each anchor: between(t, a) and between(t, b) are one relation."""
 
 class Predicate(_Predicate, metaclass=_PredicateEnumTypeWrapper): ...
 
@@ -39,6 +50,17 @@ PREDICATE_UNSPECIFIED: Predicate.ValueType  # 0
 PREDICATE_NEAR: Predicate.ValueType  # 1
 PREDICATE_ON: Predicate.ValueType  # 2
 PREDICATE_CLOSEST_TO: Predicate.ValueType  # 3
+PREDICATE_FARTHEST_FROM: Predicate.ValueType  # 4
+PREDICATE_UNDER: Predicate.ValueType  # 5
+PREDICATE_INSIDE: Predicate.ValueType  # 6
+PREDICATE_ABOVE: Predicate.ValueType  # 7
+PREDICATE_BEHIND: Predicate.ValueType  # 8
+"""The sides are those of whoever looks."""
+PREDICATE_IN_FRONT_OF: Predicate.ValueType  # 9
+PREDICATE_LEFT_OF: Predicate.ValueType  # 10
+PREDICATE_RIGHT_OF: Predicate.ValueType  # 11
+PREDICATE_BETWEEN: Predicate.ValueType  # 12
+"""Said once for each anchor: between(t, a) and between(t, b) are one relation."""
 Global___Predicate: _TypeAlias = Predicate  # noqa: Y015
 
 @_typing.final

@@ -22,11 +22,7 @@ from gausslite.wire.images import decode_colour, decode_depth, encode_colour, en
 
 MAX_IMAGE_PX = 1 << 23
 
-_PREDICATES = {
-    Predicate.NEAR: task_pb2.PREDICATE_NEAR,
-    Predicate.ON: task_pb2.PREDICATE_ON,
-    Predicate.CLOSEST_TO: task_pb2.PREDICATE_CLOSEST_TO,
-}
+_PREDICATES = {each: task_pb2.Predicate.Value(f"PREDICATE_{each.name}") for each in Predicate}
 _PREDICATES_BACK = {number: predicate for predicate, number in _PREDICATES.items()}
 
 
@@ -61,7 +57,9 @@ def graph_from_message(message: task_pb2.TaskGraph) -> TaskGraph:
     """A task graph within the bounds of `task.validate`. Raises TaskError."""
     for relation in message.relations:
         if relation.predicate not in _PREDICATES_BACK:
-            raise TaskError(f"task relation: expected near, on or closest_to, got predicate {relation.predicate}")
+            raise TaskError(
+                f"task relation: expected one of {', '.join(Predicate)}, got predicate {relation.predicate}"
+            )
     graph = TaskGraph(
         message.task_id,
         message.text,
