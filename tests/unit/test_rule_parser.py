@@ -26,16 +26,21 @@ def as_row(text: str) -> dict[str, object]:
     return {"text": text, "targets": list(graph.targets), "anchors": list(graph.anchors), "relations": relations}
 
 
+def as_sets(row: dict[str, object]) -> tuple[set[str], set[str], set[tuple[str, ...]]]:
+    """Order does not matter to a graph."""
+    return set(row["targets"]), set(row["anchors"]), {tuple(relation) for relation in row["relations"]}
+
+
 @pytest.mark.parametrize("row", SENTENCES[:PAPER_SENTENCES], ids=lambda row: row["text"])
 def test_the_papers_tasks(row):
     assert as_row(row["text"]) == row
 
 
 def test_graphs_of_ordinary_sentences_are_exact():
-    wrong = [row["text"] for row in SENTENCES if as_row(row["text"]) != row]
+    wrong = [row["text"] for row in SENTENCES if as_sets(as_row(row["text"])) != as_sets(row)]
     share = 1 - len(wrong) / len(SENTENCES)
     print(f"exact graphs: {share:.1%} of {len(SENTENCES)}; wrong: {wrong}")
-    assert len(SENTENCES) >= 80
+    assert len(SENTENCES) >= 170
     assert share >= 0.90, wrong
 
 
@@ -89,12 +94,50 @@ def test_a_phrase_that_is_too_long_is_refused():
         ("Go to the door without bumping into the table", "table"),
         ("Map the chairs except the stool", "stool"),
         ("Don't touch the lamp, pick up the book", "lamp"),
+        ("Clean the desk but leave the laptop alone", "laptop"),
+        ("Be careful not to break the bowl and pick up the spoon", "bowl"),
     ],
 )
 def test_what_is_to_be_left_alone_is_no_target_and_said(text, excluded):
     graph = RuleParser().parse(text)
     assert excluded not in graph.queries
     assert any(repr(excluded) in warning for warning in graph.warnings)
+
+
+@pytest.mark.parametrize(
+    ("text", "targets", "anchors"),
+    [
+        ("Pick this up", ("object",), ()),
+        ("Put that on the tray", ("object",), ("tray",)),
+        ("Leave it on the porch", ("object",), ("porch",)),
+        ("Clean them", ("object",), ()),
+    ],
+)
+def test_what_is_pointed_at_is_any_object_and_said(text, targets, anchors):
+    graph = RuleParser().parse(text)
+    assert (graph.targets, graph.anchors) == (targets, anchors)
+    assert "points at something without a name" in graph.warnings[0]
+
+
+@pytest.mark.parametrize(
+    ("text", "relations"),
+    [
+        ("Go to the desk and take the mug on it", (Relation(Predicate.ON, "mug", "desk"),)),
+        ("Clean the table and everything on it", (Relation(Predicate.ON, "object", "table"),)),
+        ("Find the vase and put it on the shelf", ()),
+        ("Take the vase on the desk and wipe it", (Relation(Predicate.ON, "vase", "desk"),)),
+    ],
+)
+def test_it_is_what_was_named_before(text, relations):
+    graph = RuleParser().parse(text)
+    assert graph.relations == relations
+    assert graph.warnings == ()
+
+
+@pytest.mark.parametrize("predicate", sorted(set(Predicate) - {Predicate.BETWEEN}))
+def test_every_predicate_can_be_said(predicate):
+    graph = RuleParser().parse(f"Find the mug {predicate.replace('_', ' ')} the table")
+    assert graph.relations == (Relation(predicate, "mug", "table"),)
 
 
 def test_a_relation_without_a_predicate_becomes_near_and_is_said():

@@ -28,6 +28,7 @@ TOOL_VERBS: Final = words(
     "declutter organize organise sort clear hoover rake shovel mow paint cut cover spray water repair fix"
 )
 SEARCH_VERBS: Final = words("look search hunt check scan inspect explore watch scout browse survey examine patrol")
+INSPECTION_VERBS: Final = words("check scan inspect survey examine")
 OTHER_VERBS: Final = words(
     "pick grab grasp lift hold collect gather retrieve remove catch seize lower raise open close shut press push turn "
     "switch rotate touch hit bump knock break disturb move tilt flip fill empty refill squeeze assemble disassemble "
@@ -42,6 +43,8 @@ OTHER_VERBS: Final = words(
 )
 # "move to the chair" goes there, "move the chair to the door" takes it there
 MOVING_VERBS: Final = words("move roll run advance")
+# "hand the nurse the towel": the first noun is who gets the second
+GIVING_VERBS: Final = words("hand give bring pass fetch get send offer serve show throw feed find grab")
 DELIVERY_VERBS: Final = CARRY_VERBS | PLACE_VERBS
 VERBS: Final = GO_VERBS | DELIVERY_VERBS | TOOL_VERBS | SEARCH_VERBS | OTHER_VERBS
 
@@ -54,6 +57,12 @@ IRREGULAR_VERBS: Final = {
     "running": "run", "closing": "close", "sitting": "sit", "stopping": "stop", "measuring": "measure",
     "scratching": "scratch", "spilling": "spill", "scaring": "scare", "waking": "wake", "navigating": "navigate",
 }  # fmt: skip
+# participles that do not end in -ed: "the box left on the table"
+IRREGULAR_PARTICIPLES: Final = words(
+    "fell went got came stood sat lay ran left kept hidden lost stuck hung laid found put set seen made built held "
+    "thrown fallen broken sunk bent spilt"
+)
+COPULAS: Final = words("is are was were be been being isn't aren't looks seems appears gets stays")
 
 # particles that belong to the verb before them: "pick up", "turn on the lamp", "look at", "search for"
 PARTICLES: Final = words("up down off out over away around about back through along past at into across onto for")
@@ -62,7 +71,7 @@ ON_IN_PARTICLE_VERBS: Final = words("turn switch power put bring check focus con
 DETERMINERS: Final = words(
     "a an the this that these those my your his her its our their any some all every each both several many few "
     "another other others more enough whole entire one two three four five six seven eight nine ten dozen most various "
-    "different multiple single either first second third last next following same such only"
+    "different multiple single either whichever first second third last next following same such only"
 )
 PRONOUNS: Final = words(
     "i me you he him she it we us they them myself yourself itself themselves here there mine yours who whom whose "
@@ -74,13 +83,16 @@ STAND_INS: Final = {
     "everyone": "person", "somebody": "person", "anybody": "person", "everybody": "person", "what": "object",
     "whatever": "object", "what's": "object",
 }  # fmt: skip
+# an ordinal that belongs to a name
+COMPOUND_OPENERS: Final = frozenset({("first", "aid"), ("second", "hand")})
 FILLERS: Final = words(
     "please could would should can may might must will shall do does did is are was were be been being am has have had "
     "having let lets let's so very really just now then carefully quickly slowly gently safely also too again robot's "
     "kindly hey ok okay hello sure able going gonna ready order task mission job goal as if whether that because while "
     "when once until before after during immediately already still yet always currently possible else necessary "
+    "instead fast soon later today tonight tomorrow whenever possible together "
     "nearby visible available present exactly directly right straight precisely approximately about almost "
-    "anywhere everywhere somewhere together alone afterwards finally firstly next "
+    "anywhere somewhere together alone afterwards finally firstly next "
     "located standing sitting lying placed resting hanging positioned situated kept found stored leaning mounted "
     "parked seated attached "
     "i'd i'll i'm we're you're there's where's it's that's here's i've we've want wants wanted need needs needed like "
@@ -95,11 +107,14 @@ PLACES: Final = words(
     "location site map surface house home building apartment floorplan indoors outdoors way side corner middle center "
     "centre top bottom edge end front back rear left right half part rest remainder interior inside outside distance "
     "position pose state status condition direction everywhere background foreground sight ground-truth height level "
-    "perimeter neighbourhood neighborhood premises presence existence absence geometry details detail"
+    "perimeter neighbourhood neighborhood premises presence existence absence geometry details detail "
+    "underside topside exterior tip lot"
 )
+# with a noun before them they are a place of their own: the living room, the parking lot
+COMPOUND_PLACES: Final = words("room area lot space site zone building house field station spot view")
 ROUTES: Final = words("path way route road course trajectory passage line shortcut track trail")
 MEASURES: Final = words(
-    "picture photo photograph image video model reconstruction kind type sort piece pair set group pile stack lot lots "
+    "picture photo photograph image video model reconstruction kind type sort piece pair set group pile stack lots "
     "number row bunch couple list total cluster collection copy amount view scan map sample none instance instances "
     "section look tour record inventory close-up closeup overview"
 )

@@ -44,6 +44,11 @@ def noun_phrase(words: Sequence[str], determined: bool, superlative: bool) -> No
     return NounPhrase(tuple(kept), determined, superlative)
 
 
+def known_phrase(text: str) -> NounPhrase:
+    """The phrase of an object that was named before."""
+    return NounPhrase(tuple(text.split()), True, False)
+
+
 def adjectives_only(words: Sequence[str]) -> bool:
     """True for "red" or "big old": something is described and nothing named."""
     return all(word in lexicon.ADJECTIVES and word not in lexicon.NOUNS for word in words)

@@ -9,15 +9,22 @@ from enum import Enum
 from typing import Final
 
 from gausslite.task import lexicon
+from gausslite.task.idioms import plain_words
 from gausslite.task.phrases import NounPhrase, adjectives_only, noun_phrase
 from gausslite.task.prepositions import LONGEST_PREPOSITION, PREPOSITIONS
+from gausslite.task.singular import singular
+from gausslite.task.verbs import is_participle, verb_base
 from gausslite.task.words import words
 
 _TOKEN: Final = re.compile(r"[^\W\d_][\w'’-]*|\d[\w.]*|[,/&+;.!?:()]")
-_ALSO: Final = re.compile(r"\b(?:as well as|along with|together with|in addition to)\b")
 _BREAKS: Final = words(". ; : ! ? then while before after until when once if whether where because afterwards")
 _RELATIVES: Final = frozenset({"that", "which", "who"})
 _BACK_REFERENCES: Final = frozenset({"it", "them"})
+_POINTING: Final = frozenset({"this", "that", "these", "those"})
+_SUBJECTS: Final = frozenset({"i", "we", "you", "he", "she", "they"})
+# "go stand", "help clean": the second is what is to be done
+_LEADING_VERBS: Final = frozenset({"go", "come", "help", "start", "stop", "begin"})
+_ADVERB_ENDINGS: Final = ("wise", "wards")
 _PARTICLES_ONLY: Final = words("up down out away back forward backward apart upstairs downstairs")
 _LONGEST_NEGATION: Final = max(len(words) for words in lexicon.NEGATIONS)
 _SUPERLATIVES: Final = frozenset({"closest", "nearest"})
@@ -33,6 +40,7 @@ class Kind(Enum):
     BREAK = "break"
     NEGATION = "negation"
     BACK_REFERENCE = "back reference"
+    POINTING = "pointing"
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,33 +55,12 @@ class Piece:
 
 def tokens_of(text: str) -> list[str]:
     """Lower-case words, numbers and the punctuation that matters."""
-    return _TOKEN.findall(_ALSO.sub(" and ", text))
+    return _TOKEN.findall(plain_words(text))
 
 
 def read(text: str) -> list[Piece]:
     """The pieces of one normalised sentence, in order."""
     return _Reader(tokens_of(text)).read()
-
-
-def verb_base(word: str) -> str | None:
-    """The base form of a known verb in any of its forms, or None."""
-    if word in lexicon.VERBS:
-        return word
-    if word in lexicon.IRREGULAR_VERBS:
-        return lexicon.IRREGULAR_VERBS[word]
-    for ending, replacements in (
-        ("ies", ("y",)),
-        ("ing", ("", "e")),
-        ("es", ("", "e")),
-        ("s", ("",)),
-        ("ed", ("", "e")),
-    ):
-        if word.endswith(ending) and len(word) > len(ending) + 1:
-            stem = word[: -len(ending)]
-            for replacement in replacements:
-                if stem + replacement in lexicon.VERBS:
-                    return stem + replacement
-    return None
 
 
 class _Reader:
@@ -86,6 +73,7 @@ class _Reader:
         self.words: list[str] = []
         self.determined = False
         self.superlative = False
+        self.relative_at = -2
 
     def read(self) -> list[Piece]:
         while self.at < len(self.tokens):
@@ -184,9 +172,12 @@ class _Reader:
             self._emit(Kind.JOIN, word)
         elif word in _BACK_REFERENCES:
             self._emit(Kind.BACK_REFERENCE, word)
-        elif word in _RELATIVES and self._follows_noun():
+        elif word in _RELATIVES and self._follows_noun() and not self._starts_known_noun(1):
             self._close()
-        elif word in lexicon.DETERMINERS or word[0].isdigit() or (word.endswith(("'s", "s'")) and len(word) > 3):
+            self.relative_at = self.at
+        elif word in _POINTING and not self._points_at_noun():
+            self._emit(Kind.POINTING, word)
+        elif self._determines(word):
             self._determiner()
         elif word in _SUPERLATIVES:
             self.superlative = True
@@ -200,6 +191,10 @@ class _Reader:
             self._close()
         elif not self._verb(word):
             self._content(word)
+
+    def _determines(self, word: str) -> bool:
+        article = word in lexicon.DETERMINERS and (word, self._peek()) not in lexicon.COMPOUND_OPENERS
+        return article or word[0].isdigit() or (word.endswith(("'s", "s'")) and len(word) > 3)
 
     def _determiner(self) -> None:
         if self.words:
@@ -216,21 +211,62 @@ class _Reader:
         """Take the word as a verb if it stands where a verb can stand."""
         base = verb_base(word)
         after, gerund = self._peek(), word.endswith("ing")
-        if base is None:
-            return self._unknown_verb(word, after)
-        if self._peek(-1) in _RELATIVES:
+        if self._has_subject(word):
             return True
+        if base is None:
+            return self._is_state(word, after) or self._unknown_verb(word, after)
         if self.words:
-            return gerund and word not in lexicon.NOUNS and self._participle(after)
+            return word not in lexicon.NOUNS and self._describes(word, after)
         if self.determined or (self._last() is Kind.PREPOSITION and not gerund):
             return False
         if self._last() is Kind.NOUN and gerund and self._participle(after):
             return True
         could_be_noun = noun_phrase([word], False, False).known and base not in lexicon.GO_VERBS
+        if self._last() is Kind.VERB and self.pieces[-1].word in _LEADING_VERBS:
+            could_be_noun = False
+        if not self.pieces and base in lexicon.TOOL_VERBS and (after in PREPOSITIONS or after in lexicon.PLACES):
+            could_be_noun = False
         if could_be_noun and not (self._starts_noun(after) or after in lexicon.PARTICLES):
             return False
         self._emit(Kind.VERB, base, gerund)
         return True
+
+    def _describes(self, word: str, after: str) -> bool:
+        """A verb behind its noun: "the boxes stacked on the cart", "the shelf holds the cans"."""
+        if word.endswith("ing") or (word.endswith("s") and after in lexicon.DETERMINERS):
+            return self._participle(after)
+        return is_participle(word) and after in PREPOSITIONS and self._participle(after)
+
+    def _has_subject(self, word: str) -> bool:
+        """In "the screws that fell" and "I lost my wallet" the word is what the subject does, whatever it is."""
+        if self.words or self.determined or word in lexicon.NOUNS:
+            return False
+        if self.relative_at == self.at - 1:
+            return True
+        before = self._peek(-1)
+        return before in _SUBJECTS and verb_base(word) is None
+
+    def _is_state(self, word: str, after: str) -> bool:
+        """In "whether the light is blinking" the last word names no object."""
+        if self.words and is_participle(word) and word not in lexicon.NOUNS and after in PREPOSITIONS:
+            self._close()
+            return True
+        plain = not (self.words or self.determined) and singular(word) not in lexicon.NOUNS
+        return plain and self._peek(-1) in lexicon.COPULAS and not self._starts_noun(after)
+
+    def _starts_known_noun(self, ahead: int) -> bool:
+        """True where a noun of the lexicon follows, perhaps after adjectives."""
+        while self._peek(ahead) in lexicon.ADJECTIVES:
+            ahead += 1
+        word = self._peek(ahead)
+        return bool(word) and singular(word) in lexicon.NOUNS and verb_base(word) is None
+
+    def _points_at_noun(self) -> bool:
+        """In "this mug" the word describes a noun; in "pick this up" it stands for one."""
+        after = self._peek()
+        return (
+            bool(after) and (after in lexicon.DETERMINERS or self._starts_noun(after)) and after not in _PARTICLES_ONLY
+        )
 
     def _unknown_verb(self, word: str, after: str) -> bool:
         """In "rearrange the cushions" only a verb can stand before the article."""
@@ -251,11 +287,9 @@ class _Reader:
         return False
 
     def _content(self, word: str) -> None:
-        if (
-            word.endswith("ly")
-            and word not in lexicon.NOUNS
-            and not (self.determined and not self._starts_noun(self._peek()))
-        ):
+        final_noun = self.determined and not self._starts_noun(self._peek())
+        adverb = word.endswith(_ADVERB_ENDINGS) or (word.endswith("ly") and not final_noun)
+        if adverb and word not in lexicon.NOUNS:
             return
         # "the red and blue mugs": an adjective on its own waits for the noun of the next phrase
         if not self.words and self._last() is Kind.JOIN and len(self.pieces) >= 2:

@@ -19,18 +19,18 @@ class RuleParser:
         pieces = read(normalise_text(text))
         _require_sense(text, pieces)
         builder = GraphBuilder()
-        for before, piece, after in zip([None, *pieces], pieces, [*pieces[1:], None], strict=False):
-            builder.add(before, piece, after)
-        builder.finish()
-        if not builder.targets:
-            raise TaskError(_nothing_named(text, tuple(builder.excluded)))
+        for at, piece in enumerate(pieces):
+            builder.add(pieces[at - 1] if at else None, piece, pieces[at + 1 :])
+        draft = builder.finish()
+        if not draft.targets:
+            raise TaskError(_nothing_named(text, tuple(draft.excluded)))
         graph = TaskGraph(
             task_id=task_id_of(text),
             text=text.strip(),
-            targets=tuple(builder.targets),
-            anchors=tuple(builder.anchors),
-            relations=tuple(builder.relations),
-            warnings=tuple(builder.warnings),
+            targets=tuple(draft.targets),
+            anchors=tuple(draft.anchors),
+            relations=tuple(draft.relations),
+            warnings=tuple(draft.warnings),
         )
         require_graph(graph)
         return graph

@@ -1,0 +1,41 @@
+"""Say in plain words what English says with an idiom: "get rid of the dust" is "remove the dust"."""
+
+from __future__ import annotations
+
+import re
+from typing import Final
+
+_PLAIN: Final = {
+    # a light verb with the noun that carries the meaning
+    r"(?:have|take|get|give me|catch) an? (?:\w+ ){0,2}(?:look|glance|peek|view) (?:at|of|around|over|into)": "look at",
+    r"(?:have|take) an? (?:\w+ )?look (?=under|behind|inside|in|on|for)": "look ",
+    r"keep (?:an|your|a close|a watchful) eye on|keep watch (?:over|on)": "watch",
+    r"get rid of|do away with|dispose of": "remove",
+    r"(?:take|get) (?:good )?(?:care|hold) of": "handle",
+    r"make (?:your|its) way (?=to|toward|into|through|past)": "go ",
+    r"find (?:your|its) way (?=to|toward|into|through|past)": "go ",
+    r"be careful (?:not to|to not)|make sure (?:not to|you don't|to not)|try not to|take care not to": "do not",
+    r"(?:watch out|look out|be careful|beware) (?:for|of|with)": "avoid",
+    r"(?:stay|keep|steer|remain|stand) (?:well )?(?:clear|away|off) (?:of|from)": "avoid",
+    r"keep (?:your|a safe|some|a) distance (?:from|to)": "avoid",
+    r"pay (?:no|not any) attention to|(?:do not|don't|never) (?:care|worry|bother) (?:about|with)": "ignore",
+    r"pay (?:\w+ )?attention to|focus (?:only )?on|concentrate on": "look at",
+    r"(?:with the exception|to the exclusion) of|other than|but for": "except",
+    r"(everything|everyone|all|anything) but": r"\1 except",
+    r"as well as|along with|together with|in addition to|and also|plus": "and",
+    r"in between": "between",
+    r"the one(?= (?:on|in|near|under|behind|next|that|by|closest|nearest|farthest|at|to|with))": "the object",
+}
+_IDIOMS: Final = tuple((re.compile(rf"\b(?:{idiom})(?!\w)"), plain) for idiom, plain in _PLAIN.items())
+_LEFT_ALONE: Final = re.compile(
+    r"\bleav(?:e|ing) ((?:\w+ ){1,4})(?:alone|untouched|undisturbed|unchanged|in peace|as (?:it is|is|they are)"
+    r"|where (?:it is|they are))\b"
+)
+
+
+def plain_words(text: str) -> str:
+    """One normalised sentence without the idioms of the table."""
+    text = _LEFT_ALONE.sub(r"do not touch \1", text)
+    for idiom, plain in _IDIOMS:
+        text = idiom.sub(plain, text)
+    return text
