@@ -32,6 +32,7 @@ using Colours = nb::ndarray<const float, nb::numpy, nb::shape<-1, -1, 3>, nb::c_
 using ByteColours = nb::ndarray<const uint8_t, nb::numpy, nb::shape<-1, -1, 3>, nb::c_contig, nb::device::cpu>;
 using TileMask = nb::ndarray<const bool, nb::numpy, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
 using Flags = nb::ndarray<const bool, nb::numpy, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
+using Counts = nb::ndarray<uint32_t, nb::numpy, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 using Ids = nb::ndarray<const uint32_t, nb::numpy, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 using Intrinsics = std::tuple<double, double, double, double, int, int>;  // fx fy cx cy, width, height
 
@@ -151,24 +152,29 @@ std::unique_ptr<TrainingView> prepare_view(const Rasterizer& self, ByteColours r
                                         weight ? weight->data() : nullptr);
 }
 
-nb::tuple step(Rasterizer& self, RowTable rows, RowTable first_moment, RowTable second_moment, const TrainingView& view,
-               const Intrinsics& intrinsics, Matrix4 T_camera_world, std::tuple<float, float, float> loss,
-               const std::vector<float>& rates, std::tuple<double, double, double> adam, bool masked,
-               std::optional<TileMask> tiles, std::optional<Ids> ids, std::optional<Flags> trainable) {
+double step(Rasterizer& self, RowTable rows, RowTable first_moment, RowTable second_moment, const TrainingView& view,
+            const Intrinsics& intrinsics, Matrix4 T_camera_world, std::tuple<float, float, float> loss,
+            const std::vector<float>& rates, std::tuple<double, double, double> adam, bool masked,
+            std::optional<TileMask> tiles, std::optional<Ids> ids, std::optional<Flags> trainable,
+            std::optional<Counts> trained, std::optional<Flags> counted) {
   const size_t n = rows.shape(0);
   const Scene scene(rows.data(), n, intrinsics, T_camera_world, tiles, ids);
-  require(first_moment.shape(0) == n && second_moment.shape(0) == n && (!trainable || trainable->shape(0) == n),
+  require(first_moment.shape(0) == n && second_moment.shape(0) == n && (!trainable || trainable->shape(0) == n) &&
+              (!trained || trained->shape(0) == n) && (!counted || counted->shape(0) == n),
           "tables: lengths disagree");
   require(view.width() == scene.input.camera.width && view.height() == scene.input.camera.height, "view: wrong size");
   require(rates.size() == 16, "rates: expected 16");
-  const OptimizerState state{rows.data(), first_moment.data(), second_moment.data(),
-                             trainable ? reinterpret_cast<const uint8_t*>(trainable->data()) : nullptr};
+  const auto flags = [](const std::optional<Flags>& of) {
+    return of ? reinterpret_cast<const uint8_t*>(of->data()) : nullptr;
+  };
+  const OptimizerState state{
+      rows.data(),   first_moment.data(), second_moment.data(), flags(trainable), trained ? trained->data() : nullptr,
+      flags(counted)};
   AdamOptions options;
   std::copy_n(rates.begin(), 16, options.rates);
   std::tie(options.beta1, options.beta2, options.epsilon) = adam;
   const LossWeights weights{std::get<0>(loss), std::get<1>(loss), std::get<2>(loss)};
-  const double value = work(self, [&] { return self.step(scene.input, state, view, masked, weights, options); });
-  return nb::make_tuple(value, visible_ids(self));
+  return work(self, [&] { return self.step(scene.input, state, view, masked, weights, options); });
 }
 
 nb::dict stage_times(const Rasterizer& self) {
@@ -209,7 +215,10 @@ NB_MODULE(_kernels, m) {
            nb::arg("second_moment").noconvert(), nb::arg("view"), nb::arg("intrinsics"),
            nb::arg("T_camera_world").noconvert(), nb::arg("loss"), nb::arg("rates"), nb::arg("adam"), nb::arg("masked"),
            nb::arg("tiles").noconvert().none(), nb::arg("ids").noconvert().none(),
-           nb::arg("trainable").noconvert().none(), "The loss and the visible rows.")
+           nb::arg("trainable").noconvert().none(), nb::arg("trained").noconvert().none(),
+           nb::arg("counted").noconvert().none(), "The loss.")
+      .def("visible", &visible_ids, "The rows that the last forward or step found visible, ascending.")
+      .def_prop_ro("steps_ms", &Rasterizer::steps_ms, "Milliseconds that all steps took so far.")
       .def("stage_times_ms", &stage_times, "Milliseconds of the last call's stages.")
       .def_prop_ro("block_evaluations", &Rasterizer::block_evaluations,
                    "How often the last forward or step composited a splat on a 4x4 block of pixels.");

@@ -226,6 +226,7 @@ void Rasterizer::train_with_ssim(const Training& training, int thread) {
     const double now = now_ms();
     spent.*stage += now - std::exchange(started_ms, now);
   }
+  spent.backward += now_ms() - started_ms;  // the wait for the last strips, which others walk back
   if (thread == 0) {
     times_.raster = spent.raster;
     times_.loss = spent.loss;
@@ -235,10 +236,11 @@ void Rasterizer::train_with_ssim(const Training& training, int thread) {
 
 double Rasterizer::step(const FrameInput& input, const OptimizerState& state, const TrainingView& view, bool masked,
                         const LossWeights& loss, const AdamOptions& adam) {
+  const double started_ms = now_ms();
   begin_frame(input);
   const Training training = begin_training(view, masked, loss);
   const bool with_ssim = loss.ssim != 0.0f;
-  Update update{state.rows, state.first_moment, state.second_moment, state.trainable, {}};
+  Update update{state.rows, state.first_moment, state.second_moment, state.trainable, state.trained, state.counted, {}};
   std::copy_n(adam.rates, 16, update.adam.rates);
   update.adam.beta1 = float(adam.beta1);
   update.adam.beta2 = float(adam.beta2);
@@ -271,6 +273,7 @@ double Rasterizer::step(const FrameInput& input, const OptimizerState& state, co
   double total = with_ssim && view.weight_sum(masked) > 0.0 ? double(loss.ssim) : 0.0;
   for (int t = 0; t < ws_.tiles_x * ws_.tiles_y; ++t) total += l1_sums_[size_t(t)];
   for (int k = 0; with_ssim && k <= ws_.tiles_y; ++k) total += ssim_sums_[size_t(k)];
+  steps_ms_ += now_ms() - started_ms;
   return total;
 }
 

@@ -43,6 +43,8 @@ struct OptimizerState {
   float* first_moment;
   float* second_moment;
   const uint8_t* trainable;  // null: all
+  uint32_t* trained;         // as in Update
+  const uint8_t* counted;
 };
 
 struct AdamOptions {
@@ -64,6 +66,8 @@ class Rasterizer {
   const Stages& stages() const { return stages_; }
   int threads() const { return team_.size(); }
   const StageTimes& times() const { return times_; }
+  // What all steps took so far.
+  double steps_ms() const { return steps_ms_; }
   // How often the last frame composited a splat on a 4x4 block of pixels.
   uint64_t block_evaluations() const;
   // True when the last frame had this many rows and pixels.
@@ -111,6 +115,7 @@ class Rasterizer {
   AdamCorrections corrections_;
   StageTimes times_;
   double last_mark_ms_ = 0.0;
+  double steps_ms_ = 0.0;
 };
 
 }  // namespace gausslite

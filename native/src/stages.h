@@ -54,6 +54,8 @@ struct Update {
   float* first_moment;
   float* second_moment;
   const uint8_t* trainable;  // null: all
+  uint32_t* trained;         // rises by one for each row that moves and is counted; null: nobody counts
+  const uint8_t* counted;    // null: all
   AdamSettings adam;
 };
 

@@ -109,7 +109,10 @@ void update(Workspace& ws, const Update& job, int thread) {
     g.column[kGradCount] = Pack16(1.0f);
     transpose(g.column);
     for (int j = 0; j < group.lanes; ++j) {
-      if (job.trainable == nullptr || job.trainable[group.id[j]]) adam.step(group.id[j], g.column[j]);
+      const uint32_t id = group.id[j];
+      if (job.trainable != nullptr && !job.trainable[id]) continue;
+      adam.step(id, g.column[j]);
+      if (job.trained != nullptr && (job.counted == nullptr || job.counted[id])) ++job.trained[id];
     }
   });
 }

@@ -20,6 +20,7 @@ from gausslite.render.rasterizer import (
     Rasterizer,
     StepReport,
     Subset,
+    Tally,
 )
 from gausslite.render.reference.loss import training_loss
 
@@ -227,6 +228,36 @@ def test_frozen_rows_are_untouched_and_the_others_move_as_ever(rasterizer: Raste
     ):
         np.testing.assert_array_equal(after[~trainable], before[~trainable])
         assert relative_error(after[trainable], unheld[trainable]) < 1e-4
+
+
+def test_a_tally_counts_the_rows_that_moved_and_no_others(rasterizer: Rasterizer, oracle: Rasterizer) -> None:
+    scene = scene_named("medium splats")
+    view = picture_for(scene, oracle).view(rasterizer, scene)
+    lent, rng = tables(scene, seasoned=False), np.random.default_rng(6)
+    trainable, among = rng.random((2, len(scene.rows))) < 0.5
+    everywhere, some = (Tally(np.full(len(scene.rows), 7, np.uint32), choice) for choice in (None, among))
+    with rasterizer.holding(*lent):
+        for step in range(10):
+            rasterizer.step(*lent, view, scene.T_camera_world, LOSS, ADAM, trainable=trainable, tally=everywhere)
+            if step < 3:
+                rasterizer.step(*lent, view, scene.T_camera_world, LOSS, ADAM, tally=some)
+    trained = lent[0][:, UPDATES]
+    np.testing.assert_array_equal(some.counts[~among], 7)
+    assert set(some.counts[among]) == {7, 10}
+    np.testing.assert_array_equal(everywhere.counts[~trainable], 7)
+    np.testing.assert_array_equal((everywhere.counts - 7 + 3 * (trained > 0))[trainable], trained[trainable])
+
+
+def test_a_tally_of_another_length_or_that_may_not_be_written_is_refused(
+    rasterizer: Rasterizer, oracle: Rasterizer
+) -> None:
+    scene = scene_named("medium splats")
+    view = picture_for(scene, oracle).view(rasterizer, scene)
+    sealed = np.zeros(len(scene.rows), np.uint32)
+    sealed.flags.writeable = False
+    for counts in (np.zeros(len(scene.rows) - 1, np.uint32), sealed):
+        with pytest.raises(ShapeError, match="tally counts"):
+            rasterizer.step(*tables(scene, seasoned=False), view, scene.T_camera_world, LOSS, ADAM, tally=Tally(counts))
 
 
 def test_pixels_of_weight_zero_do_not_matter_to_a_masked_step(rasterizer: Rasterizer, oracle: Rasterizer) -> None:

@@ -15,7 +15,7 @@ from gausslite.datasets.source import Source
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.errors import InvalidInputError
 from gausslite.evaluation.bench_gap import RateGap
-from gausslite.evaluation.bench_loop import FrameCost, KernelClock, Latency, LoopBench, LoopTiming
+from gausslite.evaluation.bench_loop import FrameCost, Latency, LoopBench, LoopTiming, overhead_percent
 from gausslite.evaluation.bench_memory import MemoryTrend, back_and_forth, resident_mib
 from gausslite.evaluation.held_out import HoldOut
 from gausslite.evaluation.views import HeldOutView
@@ -25,6 +25,7 @@ from gausslite.mission.build import build_mapper
 from gausslite.mission.options import add_budget, add_detector, add_frames, add_policy, mission_settings
 from gausslite.mission.results import as_text, peak_rss_mib
 from gausslite.render.choose import choose_rasterizer
+from gausslite.render.rasterizer import Rasterizer
 
 _HOME = "sim:home?seed=0&trajectory=0"
 _HOME_TASK = "Pick up the mug on the table"
@@ -65,11 +66,11 @@ def run(options: argparse.Namespace) -> int:
         positions, held_out = HoldOut().split(positions)
     size = frame_size(options.size, source)
     mapped = [positions[step] for step in back_and_forth(len(positions), options.loop or len(positions))]
-    clock = KernelClock(choose_rasterizer(options.rasterizer, options.threads))
-    bench, costs, memory = _play(options, source, mapped, clock)
+    rasterizer = choose_rasterizer(options.rasterizer, options.threads)
+    bench, costs, memory = _play(options, source, mapped, rasterizer)
     timing = LoopTiming.of(costs)
     gap = None if options.unlimited is None else _gap(options, source, positions, held_out, bench)
-    overhead = clock.overhead_percent(costs)
+    overhead = overhead_percent(costs, rasterizer)
     if options.json:
         report = {
             "source": options.source,
@@ -103,7 +104,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _play(
-    options: argparse.Namespace, source: Source, positions: Sequence[int], rasterizer: KernelClock
+    options: argparse.Namespace, source: Source, positions: Sequence[int], rasterizer: Rasterizer
 ) -> tuple[LoopBench, list[FrameCost], MemoryTrend | None]:
     """Run the loop over these positions; memory is sampled where the sequence is looped."""
     settings, size = mission_settings(options), frame_size(options.size, source)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -18,7 +17,7 @@ from gausslite.mapping.roi import RoiLedger
 from gausslite.perception.attention import Attention
 from gausslite.pipeline import TaskMapper
 from gausslite.render.cpu import CpuRasterizer
-from gausslite.render.rasterizer import Rasterizer, StepReport
+from gausslite.render.rasterizer import Rasterizer
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,29 +131,12 @@ class LoopBench:
         return FrameCost(outcome.budget, outcome.iterations, outcome.gaussians, outcome.roi_share)
 
 
-class KernelClock:
-    """A Rasterizer that adds up the kernels' own clocks over its steps, where the backend has them."""
+def overhead_percent(costs: Sequence[FrameCost], rasterizer: Rasterizer) -> float | None:
+    """The share of these frames' iterations that passed outside the kernels' steps, which must be all that it ever ran.
 
-    def __init__(self, inner: Rasterizer) -> None:
-        self._inner = inner
-        self._stages_ms = inner.stage_times_ms if isinstance(inner, CpuRasterizer) else None
-        self._seconds = 0.0
-        self.name = inner.name
-        self.forward = inner.forward
-        self.backward = inner.backward
-        self.prepare_view = inner.prepare_view
-        self.holding = inner.holding
-
-    def step(self, *arguments: Any, **options: Any) -> StepReport:
-        """The inner one's step."""
-        report = self._inner.step(*arguments, **options)
-        if self._stages_ms is not None:
-            self._seconds += sum(self._stages_ms().values()) / 1e3
-        return report
-
-    def overhead_percent(self, costs: Sequence[FrameCost]) -> float | None:
-        """The share of these frames' iterations that was spent outside the kernels; None without their clocks."""
-        total_s = sum(cost.of(Step.WARM_UP) + cost.of(Step.ACTIVE) for cost in costs)
-        if self._stages_ms is None or total_s == 0.0:
-            return None
-        return 100.0 * (1.0 - self._seconds / total_s)
+    None for a backend without a clock.
+    """
+    total_s = sum(cost.of(Step.WARM_UP) + cost.of(Step.ACTIVE) for cost in costs)
+    if not isinstance(rasterizer, CpuRasterizer) or total_s == 0.0:
+        return None
+    return 100.0 * (1.0 - rasterizer.steps_s() / total_s)

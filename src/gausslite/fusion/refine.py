@@ -21,7 +21,7 @@ from gausslite.fusion.keyframes import TeamKeyframe
 from gausslite.optimize.density import DensitySettings, densify, prune
 from gausslite.optimize.parameters import SplatTable, gaussians_to_rows
 from gausslite.optimize.rates import ONLINE_RATES
-from gausslite.render.rasterizer import AdamSettings, LossWeights, Rasterizer, StepReport, TrainingView
+from gausslite.render.rasterizer import AdamSettings, LossWeights, Rasterizer, StepReport, Tally, TrainingView
 
 _FOOTPRINT_ALPHA = 0.5
 _IN_FRONT_M, _IN_FRONT_SHARE = 0.05, 0.05
@@ -169,7 +169,7 @@ def _train(
     rasterizer: Rasterizer,
     settings: RefineSettings,
 ) -> StepReport:
-    report = rasterizer.step(
+    return rasterizer.step(
         table.rows,
         table.first_moment,
         table.second_moment,
@@ -178,9 +178,8 @@ def _train(
         settings.loss,
         settings.adam,
         masked=True,
+        tally=Tally(table.kappa),
     )
-    table.kappa[report.visible] += 1
-    return report
 
 
 def _density_control_is_due(iteration: int, density: DensitySettings) -> bool:

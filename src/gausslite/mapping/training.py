@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TypeAlias
 
 import numpy as np
+from jaxtyping import Float32
+from numpy import ndarray
 
 from gausslite.domain.state import State, take_counts, whole_numbers
 from gausslite.mapping.keyframes import WindowView
@@ -12,12 +15,13 @@ from gausslite.mapping.pace import Pace, Step
 from gausslite.mapping.settings import ActivePhase, MapperSettings
 from gausslite.optimize.density import densify, prune
 from gausslite.optimize.parameters import SplatTable
-from gausslite.render.rasterizer import EVERYTHING, LOG_SCALE, RGB, Rasterizer, StepReport, Subset
+from gausslite.render.rasterizer import LOG_SCALE, RGB, Rasterizer, Subset, Tally
 
 _COLOUR_RANGE = (-0.25, 1.25)
 """Somewhat beyond what can be shown, so that overlapping Gaussians still add up to black and white."""
-_READ_EVERY = 8
-"""So many reports of the active phase wait to be read together, so that a device runs on meanwhile."""
+_Rows: TypeAlias = Float32[ndarray, "n 16"]
+_Tables: TypeAlias = tuple[_Rows, _Rows, _Rows]
+"""Rows and Adam's moments, as they are lent to the rasterizer."""
 
 
 class Trainer:
@@ -33,7 +37,6 @@ class Trainer:
         self._iterations = 0
         self._since_pruned = 0
         self._since_densified = 0
-        self._unread: list[StepReport] = []
 
     @property
     def iterations(self) -> int:
@@ -71,9 +74,9 @@ class Trainer:
         if step is None:
             return
         table = self._table
-        with self._rasterizer.holding(table.rows, table.first_moment, table.second_moment):
-            self._iterate(step, views if step is Step.WARM_UP else showing)
-        self._count_trained()
+        lent = table.rows, table.first_moment, table.second_moment
+        with self._rasterizer.holding(*lent):
+            self._iterate(lent, step, views if step is Step.WARM_UP else showing)
         self._control_density(extent_m, pace)
         self._bound_colours()
 
@@ -97,56 +100,46 @@ class Trainer:
     ) -> int:
         """Iterate until density control is due or time is up, the tables on loan to the rasterizer; `done` then."""
         table = self._table
-        with self._rasterizer.holding(table.rows, table.first_moment, table.second_moment):
+        lent = table.rows, table.first_moment, table.second_moment
+        with self._rasterizer.holding(*lent):
             while (step := self._next_step(done, bool(showing), pace)) is not None:
                 with pace.timing(step):
-                    self._iterate(step, views if step is Step.WARM_UP else showing)
+                    self._iterate(lent, step, views if step is Step.WARM_UP else showing)
                 done += 1
                 if self._prune_is_due(pace) or self._densify_is_due(pace):
                     break
-        self._count_trained()
         return done
 
-    def _iterate(self, step: Step, views: Sequence[WindowView]) -> None:
+    def _iterate(self, lent: _Tables, step: Step, views: Sequence[WindowView]) -> None:
         """One iteration on a view drawn at random: over its full image, or over the task's region alone."""
         view = views[int(self._rng.integers(len(views)))]
         if step is Step.WARM_UP:
-            self._step(view, masked=False, subset=EVERYTHING)
+            self._warm_up(lent, view)
         else:
-            self._active_phase(view)
+            self._active_phase(lent, view)
         self._iterations += 1
         self._since_pruned += 1
         self._since_densified += 1
 
-    def _active_phase(self, view: WindowView) -> None:
-        table, phase = self._table, self._settings.optimization.active_phase
-        ids = np.flatnonzero(table.active).astype(np.uint32) if phase is ActivePhase.ACTIVE_ONLY else None
-        self._unread.append(self._step(view, masked=True, subset=Subset(tiles=view.active_tiles, ids=ids)))
-        if len(self._unread) == _READ_EVERY:
-            self._count_trained()
+    def _warm_up(self, lent: _Tables, view: WindowView) -> None:
+        optimization = self._settings.optimization
+        self._rasterizer.step(*lent, view.training_view, view.T_camera_world, optimization.loss, optimization.adam)
 
-    def _count_trained(self) -> None:
-        """Kappa: active Gaussians that an iteration of the active phase trained."""
-        table = self._table
-        for report in self._unread:
-            visible = report.visible
-            table.kappa[visible[table.active[visible]]] += 1
-        self._unread.clear()
-
-    def _step(self, view: WindowView, masked: bool, subset: Subset) -> StepReport:
+    def _active_phase(self, lent: _Tables, view: WindowView) -> None:
+        """Kappa counts the active Gaussians that it trains."""
         table, optimization = self._table, self._settings.optimization
-        frozen = masked and optimization.active_phase is ActivePhase.FROZEN_BACKGROUND
-        return self._rasterizer.step(
-            table.rows,
-            table.first_moment,
-            table.second_moment,
+        phase = optimization.active_phase
+        ids = np.flatnonzero(table.active).astype(np.uint32) if phase is ActivePhase.ACTIVE_ONLY else None
+        self._rasterizer.step(
+            *lent,
             view.training_view,
             view.T_camera_world,
             optimization.loss,
             optimization.adam,
-            masked=masked,
-            subset=subset,
-            trainable=table.active if frozen else None,
+            masked=True,
+            subset=Subset(view.active_tiles, ids),
+            trainable=table.active if phase is ActivePhase.FROZEN_BACKGROUND else None,
+            tally=Tally(table.kappa, table.active),
         )
 
     def _make_spheres(self) -> None:

@@ -70,8 +70,17 @@ class Engine:
         tiles: Bool[ndarray, "th tw"] | None,
         ids: UInt32[ndarray, " m"] | None,
         trainable: Bool[ndarray, " n"] | None,
-    ) -> tuple[float, UInt32[ndarray, " m"]]:
-        """The loss and the visible rows; adam is beta1, beta2, epsilon."""
+        trained: UInt32[ndarray, " n"] | None,
+        counted: Bool[ndarray, " n"] | None,
+    ) -> float:
+        """The loss; adam is beta1, beta2, epsilon. trained rises by one for each row that moved and is counted."""
+
+    def visible(self) -> UInt32[ndarray, " m"]:
+        """The rows that the last forward or step found visible, ascending."""
+
+    @property
+    def steps_ms(self) -> float:
+        """Milliseconds that all steps took so far."""
 
     def stage_times_ms(self) -> dict[str, float]:
         """Milliseconds of the last call's stages."""

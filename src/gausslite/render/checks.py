@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float32, Float64, UInt8, UInt32
+from jaxtyping import Bool, Float32, Float64, UInt8, UInt32
 from numpy import ndarray
 
 from gausslite.domain.arrays import require_array
 from gausslite.domain.camera import Camera
 from gausslite.errors import InvalidInputError, ShapeError
-from gausslite.render.rasterizer import ROW_WIDTH, TILE_PX, Rendering, Subset
+from gausslite.render.rasterizer import ROW_WIDTH, TILE_PX, Rendering, Subset, Tally
 
 
 def require_table(name: str, table: Float32[ndarray, "n 16"], n: int | None = None) -> None:
@@ -38,6 +38,19 @@ def require_scene(n: int, camera: Camera, T_camera_world: Float64[ndarray, "4 4"
     if subset.ids is not None:
         require_array("subset ids", subset.ids, (None,), np.uint32)
         _require_ascending(subset.ids, n)
+
+
+def require_marks(n: int, trainable: Bool[ndarray, " n"] | None, tally: Tally | None) -> None:
+    """Raise ShapeError unless what is said of single rows is said of all n, and the tally can be written."""
+    if trainable is not None:
+        require_array("trainable", trainable, (n,), np.bool_)
+    if tally is None:
+        return
+    require_array("tally counts", tally.counts, (n,), np.uint32)
+    if not (tally.counts.flags.writeable and tally.counts.flags.c_contiguous):
+        raise ShapeError("tally counts: expected a contiguous array that may be written, got another")
+    if tally.among is not None:
+        require_array("tally among", tally.among, (n,), np.bool_)
 
 
 def require_image_gradients(

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import os
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any, TypeAlias
+from weakref import ref
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, UInt8
+from jaxtyping import Bool, Float32, Float64, UInt8, UInt32
 from numpy import ndarray
 
-from gausslite.domain.arrays import require_array
 from gausslite.domain.camera import Camera
 from gausslite.errors import InvalidInputError, KernelError, ShapeError
 from gausslite.render.checks import (
     require_image_gradients,
+    require_marks,
     require_scene,
     require_table,
     require_tables,
@@ -24,12 +27,12 @@ from gausslite.render.checks import (
 from gausslite.render.rasterizer import (
     EVERYTHING,
     AdamSettings,
-    HostReport,
     LossWeights,
     Rendering,
     SplatGradients,
     StepReport,
     Subset,
+    Tally,
     TrainingView,
 )
 
@@ -39,12 +42,15 @@ if TYPE_CHECKING:
 SIMD_VARIABLE = "GAUSSLITE_SIMD"
 MAX_THREADS = 256
 
+_Tables: TypeAlias = tuple[Float32[ndarray, "n 16"], Float32[ndarray, "n 16"], Float32[ndarray, "n 16"]]
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CpuView:
     """A training image inside the native backend."""
 
     camera: Camera
+    intrinsics: tuple[float, float, float, float, int, int]
     native: _kernels.View
 
 
@@ -56,6 +62,24 @@ class _Drawn:
     frame: int
     rows: Float32[ndarray, "n 16"]
     T_camera_world: Float64[ndarray, "4 4"]
+
+
+class _Report:
+    """What a step did. The visible rows stay in the kernels' memory until they are read, or drawn over."""
+
+    __slots__ = ("__weakref__", "_engine", "_visible", "loss")
+
+    def __init__(self, loss: float, engine: _kernels.Engine) -> None:
+        self.loss = loss
+        self._engine = engine
+        self._visible: UInt32[ndarray, " m"] | None = None
+
+    @property
+    def visible(self) -> UInt32[ndarray, " m"]:
+        """The visible rows, ascending."""
+        if self._visible is None:
+            self._visible = self._engine.visible()
+        return self._visible
 
 
 class CpuRasterizer:
@@ -70,6 +94,8 @@ class CpuRasterizer:
         kernels = _load_kernels()
         self._simd = _choose_simd(simd, kernels.usable_simd())
         self._engine: _kernels.Engine = kernels.Engine(self._simd, _choose_threads(threads))
+        self._latest: ref[_Report] | None = None
+        self._held: _Tables | None = None
 
     @property
     def name(self) -> str:
@@ -97,6 +123,7 @@ class CpuRasterizer:
         require_table("rows", rows)
         require_scene(len(rows), camera, T_camera_world, subset)
         T_camera_world = np.ascontiguousarray(T_camera_world)
+        self._settle_report()
         rgb, depth_m, alpha, frame = self._engine.forward(
             rows, _intrinsics(camera), T_camera_world, _contiguous(subset.tiles), _contiguous(subset.ids)
         )
@@ -139,7 +166,7 @@ class CpuRasterizer:
         native = self._engine.prepare_view(
             np.ascontiguousarray(rgb), np.ascontiguousarray(depth_m), _contiguous(weight)
         )
-        return CpuView(camera, native)
+        return CpuView(camera, _intrinsics(camera), native)
 
     def step(
         self,
@@ -153,48 +180,72 @@ class CpuRasterizer:
         masked: bool = False,
         subset: Subset = EVERYTHING,
         trainable: Bool[ndarray, " n"] | None = None,
+        tally: Tally | None = None,
     ) -> StepReport:
         """One whole iteration in place. Raises ShapeError, also for a view of another backend."""
         if not isinstance(view, CpuView):
             raise ShapeError(f"view: expected one that this backend prepared, got {type(view).__name__}")
-        require_tables(rows, first_moment, second_moment)
+        if not self._holds(rows, first_moment, second_moment):
+            require_tables(rows, first_moment, second_moment)
         require_scene(len(rows), view.camera, T_camera_world, subset)
-        if trainable is not None:
-            require_array("trainable", trainable, (len(rows),), np.bool_)
-        value, visible = self._engine.step(
+        require_marks(len(rows), trainable, tally)
+        self._settle_report()
+        value = self._engine.step(
             rows,
             first_moment,
             second_moment,
             view.native,
-            _intrinsics(view.camera),
+            view.intrinsics,
             np.ascontiguousarray(T_camera_world),
             (loss.colour, loss.depth, loss.ssim),
-            adam.row_rates().tolist(),
+            _row_rates(adam),
             (adam.beta1, adam.beta2, adam.epsilon),
             masked,
             _contiguous(subset.tiles),
             _contiguous(subset.ids),
             _contiguous(trainable),
+            None if tally is None else tally.counts,
+            None if tally is None else _contiguous(tally.among),
         )
-        return HostReport(value, visible)
+        report = _Report(value, self._engine)
+        self._latest = ref(report)
+        return report
 
+    @contextmanager
     def holding(
         self,
         rows: Float32[ndarray, "n 16"],
         first_moment: Float32[ndarray, "n 16"],
         second_moment: Float32[ndarray, "n 16"],
-    ) -> AbstractContextManager[None]:
-        """Nothing to carry: steps work on the arrays themselves. Raises ShapeError."""
+    ) -> Iterator[None]:
+        """Nothing to carry: steps work on the arrays themselves, which are checked once here. Raises ShapeError."""
         require_tables(rows, first_moment, second_moment)
-        return nullcontext()
+        self._held = rows, first_moment, second_moment
+        try:
+            yield
+        finally:
+            self._held = None
 
     def stage_times_ms(self) -> dict[str, float]:
         """Milliseconds that the stages of the latest call took: project, raster, loss, backward, update."""
         return self._engine.stage_times_ms()
 
+    def steps_s(self) -> float:
+        """Seconds that all steps so far spent in the kernels."""
+        return self._engine.steps_ms / 1e3
+
     def block_evaluations(self) -> int:
         """How often the latest forward or step composited a splat on a 4x4 block of pixels."""
         return self._engine.block_evaluations
+
+    def _holds(self, *tables: Float32[ndarray, "n 16"]) -> bool:
+        return self._held is not None and all(a is b for a, b in zip(tables, self._held, strict=True))
+
+    def _settle_report(self) -> None:
+        """A report that somebody still holds gets its rows before the kernels draw over them."""
+        report = None if self._latest is None else self._latest()
+        if report is not None:
+            _ = report.visible
 
 
 def usable_simd() -> tuple[str, ...]:
@@ -233,6 +284,11 @@ def _choose_threads(asked: int | None) -> int:
     if not 1 <= asked <= MAX_THREADS:
         raise KernelError(f"threads: expected 1 to {MAX_THREADS}, got {asked}")
     return asked
+
+
+@lru_cache(maxsize=8)
+def _row_rates(adam: AdamSettings) -> tuple[float, ...]:
+    return tuple(adam.row_rates().tolist())
 
 
 def _intrinsics(camera: Camera) -> tuple[float, float, float, float, int, int]:

@@ -123,6 +123,14 @@ class AdamSettings:
         return rates
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Tally:
+    """How often rows were trained: `counts` rises by one in each step that moves the row; among: of these rows only."""
+
+    counts: UInt32[ndarray, " n"]
+    among: Bool[ndarray, " n"] | None = None
+
+
 @runtime_checkable
 class TrainingView(Protocol):
     """An image prepared once for many steps (padded, tiled, SSIM moments cached); opaque outside its backend."""
@@ -207,12 +215,13 @@ class Rasterizer(Protocol):
         masked: bool = False,
         subset: Subset = EVERYTHING,
         trainable: Bool[ndarray, " n"] | None = None,
+        tally: Tally | None = None,
     ) -> StepReport:
         """One whole iteration in place: forward, loss, backward, sparse Adam on the visible (and trainable) rows.
 
         masked=True weighs every loss term by the view's weight and divides by the weights' sum. Only rows that are
         visible and trainable change, with their moments: their UPDATES count rises by one, and the density
-        statistics of the first moment are added up. Raises ShapeError.
+        statistics of the first moment are added up, and so is the tally. Raises ShapeError.
         """
         ...
 
@@ -224,8 +233,8 @@ class Rasterizer(Protocol):
     ) -> AbstractContextManager[None]:
         """Lend the tables to the backend for many steps: until the context ends they are its own.
 
-        A device keeps them and brings them up to date on leaving, also when leaving by an error; inside, nobody else
-        reads or changes the arrays, and steps name the same arrays. Without it every step carries them there and
-        back. One loan at a time. Raises ShapeError.
+        A device keeps them and brings them up to date on leaving, also when leaving by an error, and tallies with
+        them; inside, nobody else reads or changes the arrays, and steps name the same arrays. Without it every step
+        carries them there and back. One loan at a time. Raises ShapeError.
         """
         ...

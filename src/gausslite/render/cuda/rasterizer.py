@@ -12,11 +12,11 @@ from jaxtyping import Bool, Float32, Float64, Int64, UInt8, UInt32
 from numpy import ndarray
 from torch import Tensor
 
-from gausslite.domain.arrays import require_array
 from gausslite.domain.camera import Camera
 from gausslite.errors import InvalidInputError, KernelError, ShapeError
 from gausslite.render.checks import (
     require_image_gradients,
+    require_marks,
     require_scene,
     require_table,
     require_tables,
@@ -34,6 +34,7 @@ from gausslite.render.rasterizer import (
     SplatGradients,
     StepReport,
     Subset,
+    Tally,
     TrainingView,
 )
 
@@ -184,6 +185,7 @@ class CudaRasterizer:
         masked: bool = False,
         subset: Subset = EVERYTHING,
         trainable: Bool[ndarray, " n"] | None = None,
+        tally: Tally | None = None,
     ) -> StepReport:
         """One whole iteration: in place on the device during a loan, else carried there and back.
 
@@ -194,12 +196,11 @@ class CudaRasterizer:
         tables = HostTables(rows, first_moment, second_moment)
         if self._held is None:
             with self.holding(rows, first_moment, second_moment):
-                return self.step(*tables.arrays, view, T_camera_world, loss, adam, masked, subset, trainable)
+                return self.step(*tables.arrays, view, T_camera_world, loss, adam, masked, subset, trainable, tally)
         if not self._held.host.same_memory_as(tables):
             raise InvalidInputError("step: expected the tables that are on loan, got others")
         require_scene(len(rows), view.camera, T_camera_world, subset)
-        if trainable is not None:
-            require_array("trainable", trainable, (len(rows),), np.bool_)
+        require_marks(len(rows), trainable, tally)
         target = view.masked if masked else view.plain
         drawn = self._draw(self._held.rows, view.lens, T_camera_world, subset, target.window)
         value = training_loss(drawn.channels, drawn.alpha, target, loss)
@@ -209,6 +210,8 @@ class CudaRasterizer:
             updated = torch.nonzero(carried(trainable, moving.device)[moving])[:, 0]
             moving, gradients, norms = moving[updated], gradients[updated], norms[updated]
         self._held.update(moving, gradients, norms, adam)
+        if tally is not None:
+            self._held.count(moving, tally)
         return _DeviceReport(value.detach(), drawn.visible)
 
     @contextmanager

@@ -11,7 +11,10 @@ from numpy import ndarray
 from numpy.typing import NDArray
 from torch import Tensor
 
-from gausslite.render.rasterizer import GRAD_2D_COUNT, GRAD_2D_SUM, UPDATES, AdamSettings
+from gausslite.render.rasterizer import GRAD_2D_COUNT, GRAD_2D_SUM, UPDATES, AdamSettings, Tally
+
+_COUNT_EVERY = 8
+"""So many tallies wait to be written together, so that the device runs on meanwhile."""
 
 
 def carried(array: NDArray[Any], device: torch.device) -> Tensor:
@@ -50,11 +53,25 @@ class DeviceTables:
         self.rows, self.first_moment, self.second_moment = (
             torch.from_numpy(array).to(device, copy=True) for array in host.arrays
         )
+        self._uncounted: list[tuple[Int64[Tensor, " m"], Tally]] = []
 
     def write_back(self) -> None:
         """Bring the caller's arrays up to date."""
+        self._write_tallies()
         for array, tensor in zip(self.host.arrays, (self.rows, self.first_moment, self.second_moment), strict=True):
             torch.from_numpy(array).copy_(tensor)
+
+    def count(self, moved: Int64[Tensor, " m"], tally: Tally) -> None:
+        """These rows were trained; the tally learns of it by the end of the loan."""
+        self._uncounted.append((moved, tally))
+        if len(self._uncounted) == _COUNT_EVERY:
+            self._write_tallies()
+
+    def _write_tallies(self) -> None:
+        for moved, tally in self._uncounted:
+            rows = moved.cpu().numpy()
+            tally.counts[rows if tally.among is None else rows[tally.among[rows]]] += 1
+        self._uncounted.clear()
 
     @torch.no_grad()
     def update(

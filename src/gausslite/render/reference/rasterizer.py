@@ -11,11 +11,11 @@ from jaxtyping import Bool, Float32, Float64, UInt8
 from numpy import ndarray
 from torch import Tensor
 
-from gausslite.domain.arrays import require_array
 from gausslite.domain.camera import Camera
 from gausslite.errors import ShapeError
 from gausslite.render.checks import (
     require_image_gradients,
+    require_marks,
     require_scene,
     require_table,
     require_tables,
@@ -33,6 +33,7 @@ from gausslite.render.rasterizer import (
     SplatGradients,
     StepReport,
     Subset,
+    Tally,
     TrainingView,
 )
 from gausslite.render.reference.compositing import draw, draw_backward
@@ -121,24 +122,25 @@ class ReferenceRasterizer:
         masked: bool = False,
         subset: Subset = EVERYTHING,
         trainable: Bool[ndarray, " n"] | None = None,
+        tally: Tally | None = None,
     ) -> StepReport:
         """One whole iteration in place. Raises ShapeError, also for a view of another backend."""
         if not isinstance(view, ReferenceView):
             raise ShapeError(f"view: expected one that this backend prepared, got {type(view).__name__}")
         require_tables(rows, first_moment, second_moment)
+        require_marks(len(rows), trainable, tally)
         drawn = _draw(rows, view.camera, T_camera_world, subset)
         images = drawn.images.requires_grad_()
         value = training_loss(images, view, loss, masked)
         (d_images,) = torch.autograd.grad(value, images)
         d_rows, _, visible, norms = _pull_back(drawn, d_images)
-        updated = np.ones(len(visible), np.bool_)
-        if trainable is not None:
-            require_array("trainable", trainable, (len(rows),), np.bool_)
-            updated = trainable[visible]
+        updated = np.ones(len(visible), np.bool_) if trainable is None else trainable[visible]
         moving = visible[updated]
         _adam(rows, first_moment, second_moment, d_rows, moving, adam)
         first_moment[moving, GRAD_2D_SUM] += norms[updated].astype(np.float32)
         first_moment[moving, GRAD_2D_COUNT] += 1.0
+        if tally is not None:
+            tally.counts[moving if tally.among is None else moving[tally.among[moving]]] += 1
         return HostReport(value.item(), visible.astype(np.uint32))
 
     def holding(
