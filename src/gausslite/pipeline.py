@@ -12,6 +12,7 @@ from gausslite.domain.subset import VoxelWords
 from gausslite.mapping.coverage import MapSight
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.pace import FrameBudget, Pace, Relief, Step
+from gausslite.mapping.retask import Reread
 from gausslite.mapping.roi import RoiLedger
 from gausslite.perception.attention import Attention
 
@@ -22,7 +23,8 @@ class FrameOutcome:
 
     budget says how its time was spent, from the image to the words; skipped says why the frame was not mapped, None
     when it was; words are what changed in the task's region, None without a ledger, when the frame was skipped, and
-    when they wait for the next one. detection_lag_frames is the age of a detection that came with this frame.
+    when they wait for the next one. detection_lag_frames is the age of a detection that came with this frame. reread is
+    what it did for a new task beside.
     """
 
     index: int
@@ -33,6 +35,7 @@ class FrameOutcome:
     skipped: str | None
     words: VoxelWords | None
     detection_lag_frames: int | None
+    reread: Reread
 
 
 class TaskMapper:
@@ -50,6 +53,16 @@ class TaskMapper:
         self._mapper = mapper
         self._ledger = ledger
         self._pace = pace or Pace()
+
+    def assign(self, attention: Attention) -> None:
+        """Map for another task from the next frame on.
+
+        Earlier keyframes are looked at again, newest first and a few a frame; what was said of the old region stands.
+        """
+        self._attention = attention
+        self._mapper.begin_task()
+        if self._ledger is not None:
+            self._ledger.release()
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -87,6 +100,7 @@ class TaskMapper:
         sight = self._look(frame)
         relevance = self._attend(frame, sight)
         lag_frames = self._catch_up()
+        reread = self._reread()
         mapped = self._mapper.map_frame(frame, relevance, self._pace, sight)
         words = self._changed_roi() if mapped.skipped is None else None
         return FrameOutcome(
@@ -98,6 +112,7 @@ class TaskMapper:
             skipped=mapped.skipped,
             words=words,
             detection_lag_frames=lag_frames,
+            reread=reread,
         )
 
     def rehearse(self) -> bool:
@@ -127,6 +142,22 @@ class TaskMapper:
         with self._pace.timing(Step.VIEW):
             self._mapper.revise(late.frame, late.relevance)
         return late.lag_frames
+
+    def _reread(self) -> Reread:
+        """Judge earlier keyframes for a new task: one a frame, more where there is time, up to a fixed number."""
+        keyframes = seeded = 0
+        while (keyframe := self._mapper.next_to_judge) is not None:
+            if keyframes == self._mapper.settings.retask.keyframes_a_frame:
+                break
+            if keyframes > 0 and not self._pace.has_time_for(Step.REREADING):
+                break
+            with self._pace.timing(Step.REREADING):
+                relevance = self._attention.look_back(keyframe.as_recorded)
+                if relevance is None:
+                    break
+                seeded += self._mapper.judge(keyframe, relevance)
+                keyframes += 1
+        return Reread(keyframes, seeded)
 
     def _changed_roi(self) -> VoxelWords | None:
         if self._pace.spares(Relief.WORDS):

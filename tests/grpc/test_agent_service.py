@@ -77,6 +77,9 @@ class Gate:
     def late(self) -> None:
         return None
 
+    def look_back(self, frame: Frame) -> RelevanceMap | None:
+        return self.inner.look_back(frame)
+
     def state(self) -> State:
         return {}
 

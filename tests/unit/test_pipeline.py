@@ -67,7 +67,7 @@ def test_time_is_a_budget_for_the_whole_frame_words_included() -> None:
     loop = ticking_loop(60.0)
     for index in range(4):
         budget = loop.process(wall_frame(index, SIZE, shift_m=0.1 * index)).budget
-        assert set(Step) - {Step.DENSITY, Step.DRAWING} <= set(budget.steps_s)
+        assert set(Step) - {Step.DENSITY, Step.DRAWING, Step.REREADING} <= set(budget.steps_s)
         # an iteration is one second of work and some looks at the clock
         assert budget.seconds <= 60.0 + 8.0
         assert not budget.short
@@ -102,6 +102,9 @@ class SlowAttention:
 
     def late(self) -> None:
         return None
+
+    def look_back(self, frame: Frame) -> RelevanceMap:
+        return self.attend(frame)
 
     def state(self) -> State:
         return {}

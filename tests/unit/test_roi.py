@@ -6,6 +6,7 @@ import numpy as np
 from test_parameters import some_gaussians
 
 from gausslite.domain.gaussians import Gaussians
+from gausslite.domain.subset import VoxelWords
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.domain.words import words_of
 from gausslite.mapping.roi import RoiLedger
@@ -86,6 +87,37 @@ def test_after_forget_everything_is_told_again() -> None:
     before = ledger.changed(gaussians)
     ledger.forget()
     np.testing.assert_array_equal(ledger.changed(gaussians).keys, before.keys)
+
+
+def test_words_on_an_earlier_tasks_region_stand_and_are_neither_taken_back_nor_followed() -> None:
+    ledger, gaussians = RoiLedger(GRID), active_gaussians()
+    ledger.changed(gaussians)
+    ledger.release()
+    gaussians.active[:] = False
+    gaussians.rgb[:] = 0.0
+    assert len(ledger.changed(gaussians)) == 0
+    assert len(ledger.changed(gaussians.take(np.arange(0)))) == 0
+
+
+def test_a_released_word_gives_way_to_one_that_was_trained_as_much_and_to_no_other() -> None:
+    ledger, gaussians = RoiLedger(GRID), active_gaussians()
+    gaussians.kappa[:] = 10
+    told = {int(key): int(total) for key, total in zip(*_sums(ledger.changed(gaussians)), strict=True)}
+    ledger.release()
+    less = gaussians.take(np.arange(len(gaussians)))
+    less.kappa[:] = 9
+    assert len(ledger.changed(less)) == 0
+    assert len(ledger.beyond_released(words_of(less, GRID))) == 0
+    less.kappa[:] = 11
+    again = {int(key): int(total) for key, total in zip(*_sums(ledger.changed(less)), strict=True)}
+    assert set(again) == set(told)
+    assert all(again[key] >= told[key] for key in told)
+    # from now on these are ordinary words of the region: what vanishes is taken back
+    assert ledger.changed(less.take(np.arange(0))).keys.tolist() == sorted(told)
+
+
+def _sums(words: VoxelWords) -> tuple[list[int], list[int]]:
+    return words.keys.tolist(), words.kappa_sums.tolist()
 
 
 def test_applying_all_changes_in_order_rebuilds_the_whole() -> None:

@@ -12,7 +12,6 @@ from enum import Enum
 from gausslite.datasets.selection import frame_size, select_frames
 from gausslite.datasets.source import Source
 from gausslite.domain.frame import Frame
-from gausslite.domain.words import words_of
 from gausslite.errors import GaussLiteError
 from gausslite.evaluation.held_out import HoldOut
 from gausslite.mission.results import write_results
@@ -112,8 +111,7 @@ class Player:
         link = self._settings.link
         drained = uplink.drain(link.drain_s)
         if link.handover and drained:
-            gaussians = self._robot.do(lambda mapper: mapper.gaussians()).result()
-            uplink.offer(words_of(gaussians, link.grid), Purpose.HANDOVER)
+            uplink.offer(self._robot.handover_words().result(), Purpose.HANDOVER)
             drained = uplink.drain(link.drain_s)
             self._contribute_keyframes(uplink)
         if not drained:

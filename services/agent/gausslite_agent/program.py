@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 
 from gausslite.domain.pose import unit_up_axis
-from gausslite.mission.build import build_attention
+from gausslite.mission.build import Attentions
 from gausslite.mission.results import prepare_folder
 from gausslite.mission.settings import SceneKnowledge
 from gausslite.task.parser import TaskParser
@@ -43,10 +43,12 @@ async def _serve(settings: AgentSettings) -> None:
     with ExitStack() as stack:
         parser = _parser(settings.link, stack)
         uplink, client = _uplink(settings, stack)
+        # the scene is there once the first task is
+        attentions = functools.cache(lambda: Attentions(_scene(settings, stand_in), settings.perception))
         robot = Robot(
             settings.mission,
             settings.link.grid,
-            lambda graph: build_attention(graph, _scene(settings, stand_in), settings.perception),
+            lambda graph: attentions().to(graph),
             uplink,
             on_change=lambda: _ring(loop, news),
             load=settings.load,

@@ -28,6 +28,7 @@ def mission_report(
         "iterations": robot.iterations,
         "idle_iterations": robot.idle_iterations,
         "max_detection_lag_frames": robot.max_detection_lag,
+        "keyframes_reread": robot.reread,
         "hz": robot.hz,
         "seconds": seconds,
         "gaussians": len(gaussians),

@@ -18,8 +18,10 @@ from enum import Enum
 from typing import TypeVar
 
 from gausslite.domain.frame import Frame
+from gausslite.domain.subset import VoxelWords
 from gausslite.domain.task import TaskGraph
 from gausslite.domain.voxels import VoxelGrid
+from gausslite.domain.words import words_of
 from gausslite.errors import MismatchError, UnavailableError
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.pace import Pace, Relief
@@ -61,7 +63,8 @@ class RobotStatus:
     """Totals so far; busy_s is the time spent on perception and mapping, notes what the attention has to say.
 
     short counts the frames that trained less than they should, without_* those that went without something for want
-    of time; max_detection_lag is the greatest age, in frames, at which a detection came.
+    of time; max_detection_lag is the greatest age, in frames, at which a detection came; reread counts the keyframes
+    that were looked at again for a new task.
     """
 
     graph: TaskGraph | None = None
@@ -79,6 +82,7 @@ class RobotStatus:
     without_words: int = 0
     without_seeding: int = 0
     max_detection_lag: int = 0
+    reread: int = 0
     notes: tuple[str, ...] = ()
 
     @property
@@ -157,7 +161,10 @@ class Robot:
             return self._status
 
     def assign(self, graph: TaskGraph) -> Future[None]:
-        """Map for this task from the next frame on; the map stays. The future raises ModelFileError and the like."""
+        """Map for this task from the next frame on; the map stays, and earlier keyframes are looked at again.
+
+        A task that asks the same as the one in force changes nothing. The future raises ModelFileError and the like.
+        """
         return self.do(lambda _mapper: self._begin(graph))
 
     def submit(self, frame: Frame) -> Future[FrameReport]:
@@ -186,6 +193,10 @@ class Robot:
         """Rehearse no more until the next frame, and tell what rehearsing has changed."""
         return self._start(self._end_rest)
 
+    def handover_words(self) -> Future[VoxelWords]:
+        """Words on the whole map, but for voxels of an earlier task's region that were told when trained more."""
+        return self.do(lambda mapper: self._ledger.beyond_released(words_of(mapper.gaussians(), self._grid)))
+
     def revision(self) -> int:
         """The map's revision; it rises over restarts too."""
         return self.status().map_revision
@@ -210,11 +221,15 @@ class Robot:
             raise UnavailableError("agent: ending; no more work is taken") from error
 
     def _begin(self, graph: TaskGraph) -> None:
-        attention = self._make_attention(graph)
-        ledger = self._ledger if self.uplink is not None else None
-        self._task_mapper = TaskMapper(attention, self._mapper, ledger, Pace(self._settings.pace))
+        now = self.status().graph
+        if self._task_mapper is None:
+            ledger = self._ledger if self.uplink is not None else None
+            attention = self._make_attention(graph)
+            self._task_mapper = TaskMapper(attention, self._mapper, ledger, Pace(self._settings.pace))
+        elif now is None or not graph.asks_the_same_as(now):
+            self._task_mapper.assign(self._make_attention(graph))
         with self._lock:
-            self._status = replace(self._status, graph=graph, notes=attention.notes)
+            self._status = replace(self._status, graph=graph, notes=self._task_mapper.notes)
 
     def _map_next(self) -> None:
         with self._lock:
@@ -284,6 +299,7 @@ class Robot:
                 without_words=status.without_words + (Relief.WORDS in done.budget.reliefs),
                 without_seeding=status.without_seeding + (Relief.SEEDING in done.budget.reliefs),
                 max_detection_lag=max(status.max_detection_lag, done.detection_lag_frames or 0),
+                reread=status.reread + done.reread.keyframes,
             )
 
     def _count(self, report: FrameReport) -> FrameReport:

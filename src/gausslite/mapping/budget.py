@@ -13,8 +13,9 @@ from gausslite.optimize.parameters import SplatTable
 def insert(table: SplatTable, seeds: Seeds, newborn_opacity: float, rng: np.random.Generator) -> int:
     """Add the seeds, the task's first, and return how many were added; the table never exceeds its capacity.
 
-    For the task's seeds others give way: inactive before active, the most transparent first. For the rest only
-    inactive Gaussians more transparent than a newborn give way; seeds that still do not fit are left out at random.
+    For the task's seeds others give way: inactive before active, what an earlier task had made dense before the rest
+    of the background, the most transparent first. For the rest only inactive Gaussians more transparent than a newborn
+    give way; seeds that still do not fit are left out at random.
     """
     roi = _at_random(len(seeds.roi), table.capacity, rng)
     _evict(table, len(roi) - table.room, np.ones(table.count, np.bool_))
@@ -26,11 +27,12 @@ def insert(table: SplatTable, seeds: Seeds, newborn_opacity: float, rng: np.rand
 
 
 def _evict(table: SplatTable, count: int, candidates: Bool[ndarray, " n"]) -> None:
-    """Drop up to `count` of the candidates, inactive before active, the most transparent first."""
+    """Drop up to `count` of the candidates: an earlier task's surplus, the other inactive ones, the active ones."""
     if count <= 0:
         return
     rows = np.flatnonzero(candidates)
-    order = np.lexsort((table.opacities[rows], table.active[rows]))
+    retired = ~table.active[rows] & (table.kappa[rows] > 0)
+    order = np.lexsort((table.opacities[rows], ~retired, table.active[rows]))
     kept = np.ones(table.count, np.bool_)
     kept[rows[order[:count]]] = False
     table.keep(kept)

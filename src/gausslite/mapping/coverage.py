@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float32
+from jaxtyping import Bool, Float32, Int64
 from numpy import ndarray
 
 from gausslite.domain.camera import project
@@ -57,23 +57,27 @@ def too_coarse(
     shape = (-(-height // _CELL_PX), -(-width // _CELL_PX))
     rows, columns = np.nonzero(region & (frame.depth_m > 0))
     wanted = _count(rows, columns, shape) / pixels_per_active
-    held = _count(*_seen_at(frame, active_means_m), shape)
+    _, held_rows, held_columns = seen_at(frame, active_means_m)
+    held = _count(held_rows, held_columns, shape)
     lacking = np.repeat(np.repeat(held < wanted, _CELL_PX, axis=0), _CELL_PX, axis=1)[:height, :width]
     result: Bool[ndarray, "h w"] = lacking & region & (frame.depth_m > 0)
     return result
 
 
-def _seen_at(frame: Frame, means_m: Float32[ndarray, "n 3"]) -> tuple[ndarray, ndarray]:
-    """Pixel rows and columns of the means that lie on the surface the frame sees."""
+def seen_at(
+    frame: Frame, means_m: Float32[ndarray, "n 3"]
+) -> tuple[Int64[ndarray, " s"], Int64[ndarray, " s"], Int64[ndarray, " s"]]:
+    """Which of the means lie on the surface that the frame sees (ascending), and their pixels' rows and columns."""
     points = transform_points(inverse(frame.T_world_camera), means_m)
-    points = points[points[:, 2] > NEAR_M]
+    ids = np.flatnonzero(points[:, 2] > NEAR_M)
+    points = points[ids]
     columns, rows = np.floor(project(points, frame.camera)).astype(np.int64).T
     height, width = frame.depth_m.shape
     inside = (rows >= 0) & (rows < height) & (columns >= 0) & (columns < width)
-    rows, columns, z_m = rows[inside], columns[inside], points[inside, 2]
+    ids, rows, columns, z_m = ids[inside], rows[inside], columns[inside], points[inside, 2]
     depth_m = frame.depth_m[rows, columns]
     on_surface = np.abs(z_m - depth_m) < _SAME_SURFACE * depth_m
-    return rows[on_surface], columns[on_surface]
+    return ids[on_surface], rows[on_surface], columns[on_surface]
 
 
 def _count(rows: ndarray, columns: ndarray, shape: tuple[int, int]) -> ndarray:

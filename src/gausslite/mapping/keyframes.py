@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -29,11 +29,13 @@ class Keyframe:
     """A frame and what in it was relevant when it was mapped.
 
     recorded: the frame as it came, where it is mapped with another pose or other colours; None where it is not.
+    judged: False while what in it is relevant to the present task is not known; nothing is marked then.
     """
 
     frame: Frame
     relevance: RelevanceMap
     recorded: Frame | None = None
+    judged: bool = True
 
     @property
     def as_recorded(self) -> Frame:
@@ -47,6 +49,7 @@ class Keyframe:
             **nested("frame", frame_state(self.frame)),
             **nested("relevance", relevance_state(self.relevance)),
             **nested("recorded", recorded),
+            "judged": whole_numbers(self.judged),
         }
 
     @classmethod
@@ -54,7 +57,9 @@ class Keyframe:
         """The keyframe again. Raises MapFileError, InvalidInputError."""
         frame = frame_of(part(state, "frame"))
         recorded = part(state, "recorded")
-        return cls(frame, relevance_of(part(state, "relevance"), frame), frame_of(recorded) if recorded else None)
+        relevance = relevance_of(part(state, "relevance"), frame)
+        [judged] = take_counts(state, "judged", 1)
+        return cls(frame, relevance, frame_of(recorded) if recorded else None, bool(judged))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -137,6 +142,36 @@ class KeyframeStore:
         self._window = [view if _same_frame(old.keyframe, view.keyframe) else old for old in self._window]
         self._buffer = [view.keyframe if _same_frame(old, view.keyframe) else old for old in self._buffer]
 
+    def begin_task(self) -> None:
+        """The task is another one: no keyframe is judged, and none shows a region before it is."""
+        nothing = {k.frame.depth_m.shape: RelevanceMap.nothing(*k.frame.depth_m.shape) for k in self._held()}
+        fresh = {
+            id(old): replace(old, relevance=nothing[old.frame.depth_m.shape], judged=False) for old in self._held()
+        }
+        self._buffer = [fresh[id(keyframe)] for keyframe in self._buffer]
+        self._window = [
+            replace(view, keyframe=fresh[id(view.keyframe)], active_tiles=np.zeros_like(view.active_tiles))
+            for view in self._window
+        ]
+
+    @property
+    def next_to_judge(self) -> Keyframe | None:
+        """The newest keyframe that is not judged; None when all are."""
+        newest_first = (*(view.keyframe for view in reversed(self._window)), *reversed(self._buffer))
+        return next((keyframe for keyframe in newest_first if not keyframe.judged), None)
+
+    def judge(self, keyframe: Keyframe, view_of: Callable[[Keyframe], WindowView]) -> None:
+        """Put a judged keyframe in its place; one that shows the region comes back into the window if there is room.
+
+        Room is made by the oldest view that is judged and does not show it.
+        """
+        self._buffer = [keyframe if _same_frame(old, keyframe) else old for old in self._buffer]
+        if any(_same_frame(view.keyframe, keyframe) for view in self._window):
+            self.revise(view_of(keyframe))
+        elif keyframe.relevance.roi.any() and self._make_room():
+            # it is older than all that were judged before it
+            self._window.insert(0, view_of(keyframe))
+
     def of(self, frame: Frame) -> WindowView | None:
         """The window's view of a frame as it came; None where it is no keyframe of the window (any more)."""
         return next((view for view in self._window if view.keyframe.as_recorded is frame), None)
@@ -144,19 +179,18 @@ class KeyframeStore:
     @property
     def image_bytes(self) -> int:
         """Memory of all keyframes' images, without what the rasterizer prepares of those in the window."""
-        held = dict.fromkeys([*self._buffer, *(view.keyframe for view in self._window)])
-        return sum(array.nbytes for keyframe in held for array in keyframe.state().values())
+        return sum(array.nbytes for keyframe in self._held() for array in keyframe.state().values())
 
     def state(self) -> State:
         """All keyframes once, and which of them are the window and which the buffer."""
         window = [view.keyframe for view in self._window]
-        places = {id(keyframe): place for place, keyframe in enumerate(dict.fromkeys([*self._buffer, *window]))}
+        places = {id(keyframe): place for place, keyframe in enumerate(self._held())}
         state: dict[str, NDArray[Any]] = {
             "window": whole_numbers(*(places[id(keyframe)] for keyframe in window)),
             "buffer": whole_numbers(*(places[id(keyframe)] for keyframe in self._buffer)),
             "offered": whole_numbers(self._offered),
         }
-        for place, keyframe in enumerate(dict.fromkeys([*self._buffer, *window])):
+        for place, keyframe in enumerate(self._held()):
             state |= nested(str(place), keyframe.state())
         return state
 
@@ -172,6 +206,19 @@ class KeyframeStore:
         self._window = [view_of(keyframes[place]) for place in window]
         self._buffer = [keyframes[place] for place in buffer]
         [self._offered] = take_counts(state, "offered", 1)
+
+    def _held(self) -> list[Keyframe]:
+        """Every keyframe once."""
+        return list(dict.fromkeys([*self._buffer, *(view.keyframe for view in self._window)]))
+
+    def _make_room(self) -> bool:
+        """Let one view go from a full window that does without it; False where all of them are needed."""
+        if len(self._window) < self._settings.window:
+            return True
+        idle = [i for i, view in enumerate(self._window) if view.keyframe.judged and not view.shows_region]
+        if idle:
+            del self._window[idle[0]]
+        return bool(idle)
 
     def _thin(self) -> None:
         """Drop the keyframe that is closest in time to its neighbours; the first and the last stay."""

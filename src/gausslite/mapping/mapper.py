@@ -21,7 +21,8 @@ from gausslite.mapping.coverage import MapSight
 from gausslite.mapping.keyframes import Keyframe, KeyframeStore, WindowView, window_view
 from gausslite.mapping.pace import Pace, Relief, Step
 from gausslite.mapping.refinement import ViewRefiner
-from gausslite.mapping.seeding import MapState, Seeder
+from gausslite.mapping.retask import cast_votes, release_all
+from gausslite.mapping.seeding import MapState, Seeder, Seeds
 from gausslite.mapping.settings import MapperSettings
 from gausslite.mapping.training import Trainer
 from gausslite.optimize.parameters import SplatTable
@@ -122,8 +123,38 @@ class GaussianMapper:
         view = self._keyframes.of(frame)
         if view is None:
             return False
-        self._keyframes.revise(self._view(replace(view.keyframe, relevance=relevance)))
+        if view.keyframe.judged:
+            self._keyframes.revise(self._view(replace(view.keyframe, relevance=relevance)))
+        else:
+            self.judge(view.keyframe, relevance)
         return True
+
+    def begin_task(self) -> None:
+        """Map for another task from now on: nothing counts as its region until keyframes are judged for it.
+
+        The map, kappa and the optimiser's state stay; what was the old region gives way first when room is short.
+        """
+        release_all(self._table)
+        self._keyframes.begin_task()
+
+    @property
+    def next_to_judge(self) -> Keyframe | None:
+        """The newest keyframe whose relevance to the present task is not known; None when all are judged."""
+        return self._keyframes.next_to_judge
+
+    def judge(self, keyframe: Keyframe, relevance: RelevanceMap) -> int:
+        """Take what of an earlier keyframe is relevant to the present task; returns how many Gaussians were seeded.
+
+        What it shows of the region becomes active, and is seeded where the map is too coarse for it, within the cap.
+        """
+        require_array("relevance weight", relevance.weight, keyframe.frame.depth_m.shape, np.float32)
+        frame, table = keyframe.frame, self._table
+        self._keyframes.judge(replace(keyframe, relevance=relevance, judged=True), self._view)
+        cast_votes(table, frame, relevance)
+        if not relevance.roi.any():
+            return 0
+        seeds = self._seeder.seed_region(frame, relevance, table.rows[:, MEAN][table.active])
+        return insert(table, Seeds(seeds, Gaussians.empty()), self._settings.seeding.opacity, self._rng)
 
     def look(self, frame: Frame) -> MapSight | None:
         """How the map looks from a frame; None while it is empty."""

@@ -23,6 +23,7 @@ class Step(StrEnum):
 
     DRAWING = "drawing"
     ATTENTION = "attention"
+    REREADING = "rereading"
     VIEW = "view"
     SEEDING = "seeding"
     WARM_UP = "warm_up"

@@ -15,32 +15,51 @@ from gausslite.errors import MapFileError
 
 
 class RoiLedger:
-    """Knows the last word given on each voxel, as three numbers: Σκ, count and a fingerprint of the contents."""
+    """Knows the last word given on each voxel, as three numbers: Σκ, count and a fingerprint of the contents.
+
+    Words on what was an earlier task's region are released: they stand as they were given, whatever becomes of those
+    Gaussians, until the voxel holds a region again that was trained as much.
+    """
 
     def __init__(self, grid: VoxelGrid) -> None:
         self._grid = grid
         self._keys = np.zeros(0, np.int64)
         self._states = np.zeros((0, 3), np.uint64)
+        self._released = np.zeros(0, np.bool_)
 
     def changed(self, gaussians: Gaussians) -> VoxelWords:
         """Words on the voxels whose active Gaussians are new or changed since the last call.
 
-        A voxel that held active Gaussians then and holds none now gets a tombstone (count 0).
+        A voxel that held active Gaussians then and holds none now gets a tombstone (count 0), unless it is released.
         """
-        words = words_of(gaussians.take(gaussians.active), self._grid)
+        words = self.beyond_released(words_of(gaussians.take(gaussians.active), self._grid))
         states = np.stack([words.kappa_sums, words.counts.astype(np.uint64), _fingerprints(words)], axis=1)
         same = self._unchanged(words.keys, states)
-        vanished = np.setdiff1d(self._keys, words.keys, assume_unique=True)
-        self._keys, self._states = words.keys, states
+        absent = ~np.isin(self._keys, words.keys, assume_unique=True)
+        vanished = self._keys[absent & ~self._released]
+        self._remember(words.keys, states, absent & self._released)
         return unite(take_voxels(words, ~same), tombstones(vanished))
+
+    def release(self) -> None:
+        """The task is another one: what was said stays true of its time, and is neither taken back nor followed."""
+        self._released = np.ones(len(self._keys), np.bool_)
+
+    def beyond_released(self, words: VoxelWords) -> VoxelWords:
+        """These words without those that would replace a released one that was trained more."""
+        released, sums = self._keys[self._released], self._states[self._released, 0]
+        if len(released) == 0:
+            return words
+        place = np.minimum(np.searchsorted(released, words.keys), len(released) - 1)
+        return take_voxels(words, (released[place] != words.keys) | (words.kappa_sums >= sums[place]))
 
     def forget(self) -> None:
         """Treat every voxel as new at the next call (the receiver lost what it had)."""
         self._keys, self._states = np.zeros(0, np.int64), np.zeros((0, 3), np.uint64)
+        self._released = np.zeros(0, np.bool_)
 
     def state(self) -> State:
         """The last words given."""
-        return {"keys": self._keys, "states": self._states}
+        return {"keys": self._keys, "states": self._states, "released": self._released}
 
     def restore(self, state: State) -> None:
         """Take over what another ledger said. Raises MapFileError, ShapeError."""
@@ -48,7 +67,17 @@ class RoiLedger:
         if (keys[1:] <= keys[:-1]).any():
             raise MapFileError("state keys: expected strictly ascending voxel keys, got others")
         self._states = take(state, "states", (len(keys), 3), np.uint64).copy()
+        self._released = take(state, "released", (len(keys),), np.bool_).copy()
         self._keys = keys.copy()
+
+    def _remember(
+        self, keys: Int64[ndarray, " v"], states: UInt64[ndarray, "v 3"], still_released: Bool[ndarray, " k"]
+    ) -> None:
+        """These are the last words now, beside those of before that stay released."""
+        all_keys = np.concatenate([keys, self._keys[still_released]])
+        order = np.argsort(all_keys, kind="stable")
+        self._states = np.concatenate([states, self._states[still_released]])[order]
+        self._keys, self._released = all_keys[order], order >= len(keys)
 
     def _unchanged(self, keys: Int64[ndarray, " v"], states: UInt64[ndarray, "v 3"]) -> Bool[ndarray, " v"]:
         if len(self._keys) == 0:

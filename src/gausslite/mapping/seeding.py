@@ -66,6 +66,19 @@ class Seeder:
             rest=self._gaussians(frame, relevance, rest_pool, weight),
         )
 
+    def seed_region(self, frame: Frame, relevance: RelevanceMap, active_means_m: Float32[ndarray, "n 3"]) -> Gaussians:
+        """New Gaussians where the map is too coarse for the region in an earlier frame; as many as a first frame gets.
+
+        What surrounds the region was seeded when the frame was mapped.
+        """
+        settings = self._settings
+        if not self._components.sb:
+            return Gaussians.empty()
+        coarse = too_coarse(frame, relevance.roi, active_means_m, settings.roi_pixels_per_active)
+        pixels = coarse & (frame.depth_m <= settings.max_depth_m)
+        budget = round(settings.roi_share * settings.first_frame_seeds * pixels.size / _REFERENCE_PIXELS)
+        return self._gaussians(frame, relevance, self._roi_pool(pixels, budget), self._pixel_weight(frame))
+
     def _pools(self, frame: Frame, relevance: RelevanceMap, state: MapState) -> tuple[_Pool, _Pool]:
         """SB: the ROI share of the seeds is drawn from the region, the rest elsewhere; without SB from one pool."""
         settings = self._settings

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
 from gausslite.errors import InvalidInputError
+from gausslite.mapping.retask import RetaskSettings
 from gausslite.optimize.density import DensitySettings
 from gausslite.optimize.rates import ONLINE_RATES
 from gausslite.optimize.view_fit import ViewPrior
@@ -146,6 +147,7 @@ class MapperSettings:
     keyframes: KeyframeSettings = field(default_factory=KeyframeSettings)
     optimization: OptimizationSettings = field(default_factory=OptimizationSettings)
     density: DensitySettings = field(default_factory=DensitySettings)
+    retask: RetaskSettings = field(default_factory=RetaskSettings)
     view_prior: ViewPrior = field(default_factory=ViewPrior)
 
     def __post_init__(self) -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 from gausslite.domain.task import TaskGraph
 from gausslite.errors import InvalidInputError
@@ -12,6 +14,9 @@ from gausslite.perception.attention import Attention, AttentionBeside, TaskAtten
 from gausslite.perception.tracker import AttentionSettings
 from gausslite.render.choose import choose_rasterizer
 
+if TYPE_CHECKING:
+    from gausslite.perception.yolo import YoloSegDetector
+
 
 def build_mapper(settings: MissionSettings) -> GaussianMapper:
     """A mapper with an empty map. Raises KernelError, InvalidInputError."""
@@ -20,24 +25,44 @@ def build_mapper(settings: MissionSettings) -> GaussianMapper:
 
 
 def build_attention(graph: TaskGraph, scene: SceneKnowledge, perception: PerceptionSettings) -> Attention:
-    """Attention to a task: by the user's YOLO-seg file or, without one, by the scene's own ground truth.
+    """Attention to one task alone; see Attentions."""
+    return Attentions(scene, perception).to(graph)
 
-    With `beside` the network runs on a thread of its own. Raises ModelFileError for a bad file and InvalidInputError
-    when there is neither file nor ground truth.
-    """
-    settings = AttentionSettings(up_axis=scene.up_axis)
-    if perception.model is not None:
-        from gausslite.perception.yolo import load_yolo
 
-        yolo = load_yolo(perception.model, threads=perception.threads)
-        segmenter = yolo if perception.resegment else None
-        if perception.beside:
-            return AttentionBeside(graph, yolo, ThreadPoolExecutor(1, "detector"), settings, segmenter)
-        return TaskAttention(graph, yolo, settings, segmenter)
-    if not scene.regions:
-        raise InvalidInputError(
-            "detector: the sequence has no ground-truth regions; name a YOLO-seg ONNX file with --detector"
-        )
-    from gausslite.perception.ground_truth import RegionDetector
+class Attentions:
+    """Makes the attention to each task of a mission. The network is loaded with the first, and shared by all."""
 
-    return TaskAttention(graph, RegionDetector(scene.regions), settings)
+    def __init__(self, scene: SceneKnowledge, perception: PerceptionSettings) -> None:
+        self._scene = scene
+        self._perception = perception
+        self._yolo: YoloSegDetector | None = None
+        self._executor: ThreadPoolExecutor | None = None
+
+    def to(self, graph: TaskGraph) -> Attention:
+        """Attention to a task: by the user's YOLO-seg file or, without one, by the scene's own ground truth.
+
+        With `beside` the network runs on a thread of its own. Raises ModelFileError for a bad file and
+        InvalidInputError when there is neither file nor ground truth.
+        """
+        settings = AttentionSettings(up_axis=self._scene.up_axis)
+        if self._perception.model is not None:
+            yolo = self._loaded(self._perception.model)
+            segmenter = yolo if self._perception.resegment else None
+            if self._perception.beside:
+                self._executor = self._executor or ThreadPoolExecutor(1, "detector")
+                return AttentionBeside(graph, yolo, self._executor, settings, segmenter)
+            return TaskAttention(graph, yolo, settings, segmenter)
+        if not self._scene.regions:
+            raise InvalidInputError(
+                "detector: the sequence has no ground-truth regions; name a YOLO-seg ONNX file with --detector"
+            )
+        from gausslite.perception.ground_truth import RegionDetector
+
+        return TaskAttention(graph, RegionDetector(self._scene.regions), settings)
+
+    def _loaded(self, model: Path) -> YoloSegDetector:
+        if self._yolo is None:
+            from gausslite.perception.yolo import load_yolo
+
+            self._yolo = load_yolo(model, threads=self._perception.threads)
+        return self._yolo

@@ -23,6 +23,7 @@ _COLUMNS: dict[str, tuple[int | None, type[np.generic]]] = {
     "active": (None, np.bool_),
     "kappa": (None, np.uint32),
     "target": (None, np.int16),
+    "votes": (None, np.int16),
 }
 _MIN_SCALE_M = 1e-7
 _MAX_LOG_SCALE = 80.0
@@ -51,6 +52,7 @@ class SplatTable:
             self._active = np.zeros(capacity, np.bool_)
             self._kappa = np.zeros(capacity, np.uint32)
             self._target = np.zeros(capacity, np.int16)
+            self._votes = np.zeros(capacity, np.int16)
         except (OSError, MemoryError, OverflowError, ValueError):
             raise InvalidInputError(
                 f"max_gaussians: expected as many as there is memory for, 200 bytes each, got {capacity}"
@@ -77,7 +79,8 @@ class SplatTable:
     @property
     def table_bytes(self) -> int:
         """Memory reserved for the Gaussians and what each carries."""
-        return sum(column.nbytes for column in (self._rows, self._active, self._kappa, self._target))
+        beside = (self._active, self._kappa, self._target, self._votes)
+        return self._rows.nbytes + sum(column.nbytes for column in beside)
 
     @property
     def optimizer_bytes(self) -> int:
@@ -101,7 +104,7 @@ class SplatTable:
 
     @property
     def active(self) -> Bool[ndarray, " n"]:
-        """The paper's a: seeded inside the task's region."""
+        """The paper's a: seeded inside the task's region, or found there when the task changed."""
         return self._active[: self._count]
 
     @property
@@ -113,6 +116,14 @@ class SplatTable:
     def target(self) -> Int16[ndarray, " n"]:
         """Index into TaskGraph.targets, -1 for none."""
         return self._target[: self._count]
+
+    @property
+    def votes(self) -> Int16[ndarray, " n"]:
+        """Views that show each Gaussian inside the present task's region, less those that show it outside.
+
+        A newborn has the vote of the view it was seeded from, or of its parent.
+        """
+        return self._votes[: self._count]
 
     @property
     def opacities(self) -> Float32[ndarray, " n"]:
@@ -138,6 +149,7 @@ class SplatTable:
         self._first_moment[new] = 0.0
         self._second_moment[new] = 0.0
         self._active[new], self._kappa[new], self._target[new] = active, kappa, target
+        self._votes[new] = np.where(active, 1, -1)
         self._count += len(rows)
 
     def keep(self, mask: Bool[ndarray, " n"]) -> None:
@@ -149,7 +161,8 @@ class SplatTable:
         # rows before the first gap stay where they are
         first_gap = int(np.argmin(mask))
         moved = kept[first_gap:]
-        for column in (self._rows, self._first_moment, self._second_moment, self._active, self._kappa, self._target):
+        for name in _COLUMNS:
+            column = getattr(self, f"_{name}")
             column[first_gap : len(kept)] = column[moved]
         self._count = len(kept)
 

@@ -40,6 +40,13 @@ class Attention(Protocol):
         """What the latest call of `attend` has come to know of an earlier frame."""
         ...
 
+    def look_back(self, frame: Frame) -> RelevanceMap | None:
+        """The relevance of an earlier frame, attended to for another task; None where it is not known yet: ask again.
+
+        Asked from the newest such frame to the oldest, one at a time.
+        """
+        ...
+
     @property
     def notes(self) -> tuple[str, ...]:
         """What the operator should know of the frames so far, one line each."""
@@ -90,6 +97,10 @@ class TaskAttention:
         """Nothing: every frame's relevance is known at once."""
         return
 
+    def look_back(self, frame: Frame) -> RelevanceMap:
+        """Detect on an earlier frame."""
+        return self._tracker.look_back(frame, self._detector.detect(frame, self._graph.queries))
+
     def state(self) -> State:
         """The objects and targets that are followed."""
         return self._tracker.state()
@@ -104,7 +115,7 @@ class AttentionBeside:
 
     One detection runs at a time; of the keyframes that come meanwhile the newest waits and replaces an older one. What
     was found on a keyframe is taken when it is there and carried over to the frame at hand; the keyframe's own
-    relevance comes late. One thread at a time calls it.
+    relevance comes late. A look back at an earlier frame takes turns with them. One thread at a time calls it.
     """
 
     def __init__(
@@ -126,6 +137,7 @@ class AttentionBeside:
         self._running: tuple[_Keyframe, Future[list[Detection]]] | None = None
         self._waiting: _Keyframe | None = None
         self._late: LateRelevance | None = None
+        self._looking_back: tuple[Frame, Future[list[Detection]]] | None = None
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -156,6 +168,13 @@ class AttentionBeside:
     def late(self) -> LateRelevance | None:
         """The relevance of the keyframe whose detection the latest frame found done."""
         return self._late
+
+    def look_back(self, frame: Frame) -> RelevanceMap | None:
+        """What was found on an earlier frame; the first call has it looked at. Raises what the detector raised."""
+        if self._looking_back is None or self._looking_back[0] is not frame:
+            self._looking_back = frame, self._executor.submit(self._detector.detect, frame, self._graph.queries)
+        _, found = self._looking_back
+        return self._tracker.look_back(frame, found.result()) if found.done() else None
 
     def _collect(self) -> LateRelevance | None:
         """Take what was found, if the detector is done."""

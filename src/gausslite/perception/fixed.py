@@ -40,6 +40,10 @@ class RegionAttention:
         """Nothing: every frame's relevance is known at once."""
         return
 
+    def look_back(self, frame: Frame) -> RelevanceMap:
+        """As for any other frame."""
+        return self.attend(frame)
+
     def state(self) -> State:
         """Nothing: every frame is judged by itself."""
         return {}
@@ -65,6 +69,10 @@ class NoAttention:
     def late(self) -> None:
         """Nothing: every frame's relevance is known at once."""
         return
+
+    def look_back(self, frame: Frame) -> RelevanceMap:
+        """As for any other frame."""
+        return self.attend(frame)
 
     def state(self) -> State:
         """Nothing: every frame is judged by itself."""

@@ -115,17 +115,14 @@ class TargetTracker:
 
     def take(self, frame: Frame, depth_m: Float32[ndarray, "h w"], found: Sequence[Detection]) -> RelevanceMap:
         """What was detected on a frame: the targets that fit the task's relations, from now on carried over."""
-        detections = self._without_anchors_as_objects(found)
-        placed = [sight(each.phrase, each.mask, depth_m, frame.camera, frame.T_world_camera) for each in detections]
-        self._filter.observe([sighting for sighting in placed if sighting is not None])
-        targets = [
-            detection
-            for detection, sighting in zip(detections, placed, strict=True)
-            if detection.phrase in self._graph.targets and sighting is not None and self._filter.keep(sighting)
-        ]
+        targets = self._observe(frame, depth_m, found)
         lifted = [frustum_of(detection, depth_m, frame) for detection in targets]
         self._kept = [frustum for frustum in lifted if frustum is not None]
         return merge(targets, self._graph.targets, frame)
+
+    def look_back(self, frame: Frame, found: Sequence[Detection]) -> RelevanceMap:
+        """What was detected on an earlier frame: it is remembered, but newer detections are carried on."""
+        return merge(self._observe(frame, frame.depth_m, found), self._graph.targets, frame)
 
     def carry_over(self, frame: Frame) -> RelevanceMap:
         """The latest targets as they are seen from another frame."""
@@ -141,6 +138,17 @@ class TargetTracker:
             for (frustum, box), mask in zip(in_view, masks, strict=True)
         ]
         return merge(shown, self._graph.targets, frame)
+
+    def _observe(self, frame: Frame, depth_m: Float32[ndarray, "h w"], found: Sequence[Detection]) -> list[Detection]:
+        """Remember what was detected; the targets that fit the task's relations."""
+        detections = self._without_anchors_as_objects(found)
+        placed = [sight(each.phrase, each.mask, depth_m, frame.camera, frame.T_world_camera) for each in detections]
+        self._filter.observe([sighting for sighting in placed if sighting is not None])
+        return [
+            detection
+            for detection, sighting in zip(detections, placed, strict=True)
+            if detection.phrase in self._graph.targets and sighting is not None and self._filter.keep(sighting)
+        ]
 
     def _without_anchors_as_objects(self, detections: Sequence[Detection]) -> list[Detection]:
         """The object on the desk is not the desk itself, although a desk is an object."""
