@@ -142,13 +142,12 @@ nb::tuple backward(Rasterizer& self, uint64_t frame, size_t row_count, Colours d
   return nb::make_tuple(d_rows, d_twist, visible, norms);
 }
 
-std::unique_ptr<TrainingView> prepare_view(const Rasterizer& self, ByteColours rgb, Plane depth_m,
-                                           std::optional<Plane> weight) {
+std::unique_ptr<TrainingView> make_view(ByteColours rgb, Plane depth_m, std::optional<Plane> weight) {
   const size_t height = rgb.shape(0), width = rgb.shape(1);
   const auto fits = [&](const Plane& plane) { return plane.shape(0) == height && plane.shape(1) == width; };
   require(fits(depth_m) && (!weight || fits(*weight)), "view: sizes disagree");
   nb::gil_scoped_release unlocked;
-  return std::make_unique<TrainingView>(self.stages(), int(width), int(height), rgb.data(), depth_m.data(),
+  return std::make_unique<TrainingView>(int(width), int(height), rgb.data(), depth_m.data(),
                                         weight ? weight->data() : nullptr);
 }
 
@@ -195,7 +194,9 @@ NB_MODULE(_kernels, m) {
   m.def("usable_simd", &usable_forms, "Instruction sets this build has and this machine runs, fastest first.");
   m.def("core_clock_ghz", &core_clock_ghz, "The clock of this core, by a chain of additions.");
 
-  nb::class_<TrainingView>(m, "View", "A training image made ready: padded, tiled, SSIM moments cached.")
+  nb::class_<TrainingView>(m, "View", "A training image made ready: cut into tiles, and where its weights are.")
+      .def(nb::new_(&make_view), nb::arg("rgb").noconvert(), nb::arg("depth_m").noconvert(),
+           nb::arg("weight").noconvert().none())
       .def_prop_ro("width", &TrainingView::width)
       .def_prop_ro("height", &TrainingView::height);
 
@@ -209,8 +210,6 @@ NB_MODULE(_kernels, m) {
       .def("backward", &backward, nb::arg("frame"), nb::arg("row_count"), nb::arg("d_rgb").noconvert(),
            nb::arg("d_depth_m").noconvert(), nb::arg("d_alpha").noconvert(),
            "d_rows, d_twist, visible rows, mean_2d_norm.")
-      .def("prepare_view", &prepare_view, nb::arg("rgb").noconvert(), nb::arg("depth_m").noconvert(),
-           nb::arg("weight").noconvert().none())
       .def("step", &step, nb::arg("rows").noconvert(), nb::arg("first_moment").noconvert(),
            nb::arg("second_moment").noconvert(), nb::arg("view"), nb::arg("intrinsics"),
            nb::arg("T_camera_world").noconvert(), nb::arg("loss"), nb::arg("rates"), nb::arg("adam"), nb::arg("masked"),

@@ -58,10 +58,7 @@ Shelf& shelf() {
 
 size_t alignment_of(size_t bytes) { return bytes >= kHugePage / 2 ? kHugePage : kCacheLine; }
 
-size_t rounded(size_t bytes) {
-  const size_t alignment = alignment_of(bytes);
-  return (bytes + alignment - 1) / alignment * alignment;
-}
+size_t rounded(size_t bytes) { return (bytes + kCacheLine - 1) / kCacheLine * kCacheLine; }
 
 }  // namespace
 
@@ -70,10 +67,10 @@ void* grow_memory(void* old, size_t kept, size_t old_bytes, size_t bytes) {
   const size_t alignment = alignment_of(bytes), size = rounded(bytes);
   void* fresh = alignment == kHugePage ? shelf().take(size) : nullptr;
   if (fresh == nullptr) {
-    fresh = std::aligned_alloc(alignment, size);
-    if (fresh == nullptr) throw std::bad_alloc();
+    if (posix_memalign(&fresh, alignment, size) != 0) throw std::bad_alloc();
 #if defined(__linux__) && defined(MADV_HUGEPAGE)
-    if (alignment == kHugePage) madvise(fresh, size, MADV_HUGEPAGE);
+    // Whole ones only: what is left over would bring in one more of them.
+    if (size >= kHugePage) madvise(fresh, size / kHugePage * kHugePage, MADV_HUGEPAGE);
 #endif
   }
   if (kept > 0) std::memcpy(fresh, old, kept);

@@ -63,7 +63,6 @@ class Rasterizer {
  public:
   Rasterizer(const Stages& stages, int threads);
 
-  const Stages& stages() const { return stages_; }
   int threads() const { return team_.size(); }
   const StageTimes& times() const { return times_; }
   // What all steps took so far.

@@ -5,6 +5,7 @@
 
 #include "ssim_window.h"
 #include "stages.h"
+#include "target_pixels.h"
 
 namespace gausslite::GAUSSLITE_ISA {
 
@@ -24,8 +25,8 @@ GAUSSLITE_INLINE void clear_beyond_edge(const Camera& camera, int tile_x, int ti
 
 // The tile's part of a channel: `image` and `target` are its pixels, `upper` and `lower` the three maps of the squares
 // that it lies between.
-GAUSSLITE_INLINE void ssim_gradient(const float* image, const float* target, const float* upper, const float* lower,
-                                    float* out) {
+GAUSSLITE_INLINE void ssim_gradient(const float* image, const TargetTile& target, int channel, const float* upper,
+                                    const float* lower, float* out) {
   const auto blurred = [&](int map, auto set) {
     blur([&](int i) { return row_between(upper + map * kSquare, lower + map * kSquare, i); }, set);
   };
@@ -35,7 +36,7 @@ GAUSSLITE_INLINE void ssim_gradient(const float* image, const float* target, con
     store(out + i * kTile, fma(x + x, by_xx, load(out + i * kTile)));
   });
   blurred(2, [&](int i, Pack16 by_xy) {
-    store(out + i * kTile, fma(load(target + i * kTile), by_xy, load(out + i * kTile)));
+    store(out + i * kTile, fma(colour_row(target, channel, i), by_xy, load(out + i * kTile)));
   });
 }
 
@@ -43,13 +44,12 @@ GAUSSLITE_INLINE void ssim_gradient(const float* image, const float* target, con
 GAUSSLITE_INLINE bool ssim_gradient(const Workspace& ws, const Targets& targets, const TapedStrip& taped, int x,
                                     TileColours& out) {
   const size_t tile = size_t(taped.strip) * size_t(ws.tiles_x) + size_t(x);
-  const bool above = targets.ssim.reach[tile] != kUnreached;
-  const bool below = targets.ssim.reach[tile + size_t(ws.tiles_x)] != kUnreached;
+  const bool above = targets.reach[tile] != kUnreached;
+  const bool below = targets.reach[tile + size_t(ws.tiles_x)] != kUnreached;
   if (!above && !below) return false;
   for (int channel = 0; channel < 3; ++channel) {
     const size_t at = ssim_square(x, channel, 0);
-    ssim_gradient(taped.tape.image.data() + image_tile(x) + size_t(channel) * kSquare,
-                  targets.tiles + (tile * kTargets + size_t(channel)) * kSquare,
+    ssim_gradient(taped.tape.image.data() + image_tile(x) + size_t(channel) * kSquare, targets.tiles[tile], channel,
                   above ? taped.upper_squares + at : kNoSquares, below ? taped.lower_squares + at : kNoSquares,
                   out.value[channel]);
   }

@@ -19,7 +19,5 @@ void walk_back_on_tape(Workspace&, const Training&, const TapedStrip&);
 void backward_strip(Workspace&, int strip, int thread);
 void update(Workspace&, const Update&, int thread);
 void gradients(Workspace&, const GradientOutput&, int thread);
-void prepare_ssim(const float* target_tiles, int tiles_x, int tiles_y, float* moments, float* scratch);
-size_t ssim_scratch_floats(int tiles_x);
 
 }  // namespace gausslite::GAUSSLITE_ISA

@@ -5,9 +5,8 @@
 namespace gausslite::GAUSSLITE_ISA {
 
 const Stages& stages() {
-  static constexpr Stages kStages{project,     draw_strip,        train_strip,        draw_on_tape,
-                                  derive_ssim, walk_back_on_tape, backward_strip,     update,
-                                  gradients,   prepare_ssim,      ssim_scratch_floats};
+  static constexpr Stages kStages{project,           draw_strip,     train_strip, draw_on_tape, derive_ssim,
+                                  walk_back_on_tape, backward_strip, update,      gradients};
   return kStages;
 }
 

@@ -20,22 +20,23 @@ struct AdamSettings {
 // What the weights make of a square of the SSIM loss: without a weight in it or beside it, nothing is blurred there.
 enum Reach : uint8_t { kUnreached, kReached, kWeighted };
 
-// By rows k = 0 ... tile rows of the squares that loss_ssim.cpp describes; within a square by columns.
-struct SsimTargets {
-  const float* moments;  // [row][channel][square][mean, mean square][16][16]
-  const float* weights;  // [row][square][16][16]
-  const uint8_t* reach;  // [row][square]
+// A tile of a training image, sixteen rows of sixteen pixels of each.
+struct alignas(64) TargetTile {
+  uint8_t rgb[3][kSquare];
+  float depth_m[kSquare];  // 0: not measured
 };
-
-constexpr int kTargets = 4;
 
 // The targets of one training image, by tiles.
 struct Targets {
-  const float* tiles;               // [tile][red, green, blue, depth in metres or 0][16][16]
-  const float* weights;             // [tile][16][16]; 0 outside the image
-  const uint16_t* weighted_blocks;  // by tile: the blocks that have a pixel with a weight
+  const TargetTile* tiles;
+  const float* weights;  // [place][16][16]; 0 outside the image
+  const uint32_t* weight_places;
+  const uint16_t* weighted_blocks;  // the blocks that have a pixel with a weight
   const uint16_t* reached_blocks;   // ... and those that have one in an SSIM window around it
-  SsimTargets ssim;
+  const uint8_t* reach;             // [row][square] for rows k = 0 ... tile rows of the squares of loss_ssim.cpp
+
+  // Tiles that weigh the same everywhere, all 0 or all 1, share theirs.
+  const float* tile_weights(size_t tile) const { return weights + size_t(weight_places[tile]) * kSquare; }
 };
 
 struct LossSettings {
@@ -98,9 +99,6 @@ struct Stages {
   // From gradient rows to parameters, over this thread's segments.
   void (*update)(Workspace&, const Update&, int thread);
   void (*gradients)(Workspace&, const GradientOutput&, int thread);
-  // The blurred target and its blurred square (SsimTargets::moments), once per training image.
-  void (*prepare_ssim)(const float* target_tiles, int tiles_x, int tiles_y, float* moments, float* scratch);
-  size_t (*ssim_scratch_floats)(int tiles_x);
 };
 
 // The forms; dispatch.cpp refers to those that this build has.

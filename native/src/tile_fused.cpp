@@ -10,6 +10,7 @@
 #include "loss_l1.h"
 #include "ssim_gradient.h"
 #include "stage_functions.h"
+#include "target_pixels.h"
 #include "tile_chunk.h"
 
 namespace gausslite::GAUSSLITE_ISA {
@@ -99,11 +100,12 @@ void walk_back_tile(Workspace& ws, const StripTape& tape, const TileTape& taped,
 // The L1 terms of one block, and their gradient.
 GAUSSLITE_INLINE Pack16 compare(const Training& training, size_t t, int b, const Pack16 (&image)[5],
                                 Pack16 (&gradient)[5]) {
-  const float* targets = training.targets.tiles + t * kTargets * kSquare + corner_in_tile(b);
+  const TargetTile& target = training.targets.tiles[t];
+  const int corner = corner_in_tile(b);
   Pack16 rgb[3];
-  for (int k = 0; k < 3; ++k) rgb[k] = load_block(targets + k * kSquare, kTile);
-  const Pack16 measured_m = load_block(targets + 3 * kSquare, kTile);
-  const Pack16 weight = load_block(training.targets.weights + t * kSquare + corner_in_tile(b), kTile);
+  for (int k = 0; k < 3; ++k) rgb[k] = colour_block(target, k, corner);
+  const Pack16 measured_m = load_block(target.depth_m + corner, kTile);
+  const Pack16 weight = load_block(training.targets.tile_weights(t) + corner, kTile);
   return l1_of_pixels(image, rgb, measured_m, weight, training.loss, gradient);
 }
 

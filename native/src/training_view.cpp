@@ -3,90 +3,138 @@
 
 #include <algorithm>
 #include <cmath>
+#include <numeric>
 
 namespace gausslite {
 
 namespace {
 
-constexpr int kBlocksPerSide = kTile / kBlock;
-constexpr int kReachInBlocks = 2;  // an SSIM window reaches 5 px: from a block into the second one beside it
+constexpr int kReachInBlocks = 2;          // an SSIM window reaches 5 px: from a block into the second one beside it
+constexpr uint32_t kZeros = 0, kOnes = 1;  // shared places
 
-uint16_t block_bit(int x, int y) { return uint16_t(1u << (y % kBlocksPerSide * kBlocksPerSide + x % kBlocksPerSide)); }
+uint16_t block_bit(int x, int y) { return uint16_t(1u << (y % kBlocksAcross * kBlocksAcross + x % kBlocksAcross)); }
+
+uint16_t blocks_with_weight(const float* tile) {
+  uint16_t blocks = 0;
+  for (int i = 0; i < kSquare; ++i) {
+    if (tile[i] != 0.0f) blocks |= block_bit(i % kTile / kBlock, i / kTile / kBlock);
+  }
+  return blocks;
+}
+
+// A tile's blocks in the middle of 8x8, and all within reach of them: bit 8 row + column.
+uint64_t surroundings(uint16_t blocks) {
+  uint64_t grid = 0;
+  for (int y = 0; y < kBlocksAcross; ++y) {
+    grid |= uint64_t(blocks >> (kBlocksAcross * y) & 0xF) << (8 * (y + kReachInBlocks) + kReachInBlocks);
+  }
+  grid |= grid << 1 | grid << 2 | grid >> 1 | grid >> 2;
+  return grid | grid << 8 | grid << 16 | grid >> 8 | grid >> 16;
+}
 
 int tiles(int pixels) { return (pixels + kTile - 1) / kTile; }
 
 }  // namespace
 
-TrainingView::TrainingView(const Stages& stages, int width, int height, const uint8_t* rgb, const float* depth_m,
-                           const float* weight)
+TrainingView::TrainingView(int width, int height, const uint8_t* rgb, const float* depth_m, const float* weight)
     : width_(width), height_(height), tiles_x_(tiles(width)), tiles_y_(tiles(height)), masked_(weight != nullptr) {
-  tiles_.reserve_exactly(tile_count() * kTargets * kSquare);
-  for (int y = 0; y < height; ++y) {
-    for (int x = 0; x < width; ++x) {
-      const int64_t from = int64_t(y) * width + x;
-      float* to = &tiles_[tile_of(x, y) * kTargets * kSquare + size_t(y % kTile * kTile + x % kTile)];
-      for (int k = 0; k < 3; ++k) to[k * kSquare] = float(rgb[3 * from + k]) / 255.0f;
-      // Whatever a sensor writes for "no return", a depth that is not a positive number is not compared.
-      to[3 * kSquare] = std::isfinite(depth_m[from]) && depth_m[from] > 0.0f ? depth_m[from] : 0.0f;
-    }
-  }
+  tiles_.reserve_exactly(tile_count());
+  for (size_t t = 0; t < tile_count(); ++t) cut(t, rgb, depth_m);
   weigh(inside_, nullptr);
   if (masked_) weigh(mask_, weight);
-  moments_.reserve_exactly(square_count() * 3 * 2 * kSquare);
-  Buffer<float> scratch;
-  scratch.reserve(stages.ssim_scratch_floats(tiles_x_));
-  stages.prepare_ssim(tiles_.data(), tiles_x_, tiles_y_, moments_.data(), scratch.data());
 }
 
-// The squares of the SSIM loss lie half a tile higher than the tiles and have their columns one after the other.
-void TrainingView::weigh(Weights& weights, const float* weight) const {
-  weights.tiles.reserve_exactly(tile_count() * kSquare);
-  weights.weighted_blocks.reserve(tile_count());
-  weights.squares.reserve_exactly(square_count() * kSquare);
-  weights.reach.reserve(square_count());
-  for (int y = 0; y < height_; ++y) {
-    for (int x = 0; x < width_; ++x) {
-      const float w = weight != nullptr ? weight[int64_t(y) * width_ + x] : 1.0f;
-      if (w == 0.0f) continue;
-      const size_t tile = tile_of(x, y), square = tile_of(x, y + kTile / 2);
-      weights.sum += double(w);
-      weights.tiles[tile * kSquare + size_t(y % kTile * kTile + x % kTile)] = w;
-      weights.weighted_blocks[tile] |= block_bit(x / kBlock, y / kBlock);
-      weights.squares[square * kSquare + size_t(x % kTile * kTile + (y + kTile / 2) % kTile)] = w;
-      weights.reach[square] = kWeighted;
+TrainingView::Extent TrainingView::extent(size_t tile) const {
+  const int x = int(tile % size_t(tiles_x_)) * kTile, y = int(tile / size_t(tiles_x_)) * kTile;
+  return {x, y, std::min(kTile, width_ - x), std::min(kTile, height_ - y)};
+}
+
+void TrainingView::cut(size_t tile, const uint8_t* rgb, const float* depth_m) {
+  const Extent part = extent(tile);
+  TargetTile& out = tiles_[tile];
+  for (int y = 0; y < part.rows; ++y) {
+    const int64_t from = int64_t(part.y + y) * width_ + part.x;
+    for (int k = 0; k < 3; ++k) {
+      for (int x = 0; x < part.columns; ++x) out.rgb[k][y * kTile + x] = rgb[3 * (from + x) + k];
+    }
+    for (int x = 0; x < part.columns; ++x) {
+      // Whatever a sensor writes for "no return", a depth that is not a positive number is not compared.
+      const float depth = depth_m[from + x];
+      out.depth_m[y * kTile + x] = std::isfinite(depth) && depth > 0.0f ? depth : 0.0f;
     }
   }
-  reach_out(weights);
 }
 
-// From the blocks and squares with a weight to those that its windows reach.
-void TrainingView::reach_out(Weights& weights) const {
-  weights.reached_blocks.reserve(tile_count());
-  const int last_x = (width_ - 1) / kBlock, last_y = (height_ - 1) / kBlock;
-  for (int y = 0; y <= last_y; ++y) {
-    for (int x = 0; x <= last_x; ++x) {
-      if ((weights.weighted_blocks[tile_of(x * kBlock, y * kBlock)] & block_bit(x, y)) == 0) continue;
-      for (int v = std::max(0, y - kReachInBlocks); v <= std::min(last_y, y + kReachInBlocks); ++v) {
-        for (int u = std::max(0, x - kReachInBlocks); u <= std::min(last_x, x + kReachInBlocks); ++u)
-          weights.reached_blocks[tile_of(u * kBlock, v * kBlock)] |= block_bit(u, v);
+void TrainingView::weigh(Weights& weights, const float* weight) const {
+  weights.places.reserve_exactly(tile_count());
+  weights.weighted_blocks.reserve_exactly(tile_count());
+  weights.values.reserve(2 * kSquare);
+  std::fill_n(&weights.values[kOnes * kSquare], kSquare, 1.0f);
+  uint32_t used = 2;
+  for (size_t t = 0; t < tile_count(); ++t) {
+    const Extent part = extent(t);
+    float own[kSquare] = {};
+    for (int y = 0; y < part.rows; ++y) {
+      float* row = own + y * kTile;
+      if (weight != nullptr) {
+        std::copy_n(weight + int64_t(part.y + y) * width_ + part.x, part.columns, row);
+      } else {
+        std::fill_n(row, part.columns, 1.0f);
       }
     }
+    bool zeros = true, ones = true;
+    for (const float w : own) {
+      zeros &= w == 0.0f;
+      ones &= w == 1.0f;
+    }
+    weights.places[t] = zeros ? kZeros : ones ? kOnes : used;
+    weights.weighted_blocks[t] = zeros ? uint16_t(0) : ones ? uint16_t(0xFFFF) : blocks_with_weight(own);
+    weights.sum += zeros ? 0.0 : ones ? double(kSquare) : std::accumulate(own, own + kSquare, 0.0);
+    if (zeros || ones) continue;
+    weights.values.reserve((size_t(used) + 1) * kSquare, size_t(used) * kSquare);
+    std::copy_n(own, kSquare, &weights.values[size_t(used++) * kSquare]);
+  }
+  reach_blocks(weights);
+  reach_squares(weights);
+}
+
+// From the blocks with a weight to those that its windows reach.
+void TrainingView::reach_blocks(Weights& weights) const {
+  weights.reached_blocks.reserve_exactly(tile_count());
+  const int blocks_x = (width_ + kBlock - 1) / kBlock, blocks_y = (height_ + kBlock - 1) / kBlock;
+  for (size_t t = 0; t < tile_count(); ++t) {
+    if (weights.weighted_blocks[t] == 0) continue;
+    const Extent part = extent(t);
+    const int first_x = part.x / kBlock - kReachInBlocks, first_y = part.y / kBlock - kReachInBlocks;
+    for (uint64_t left = surroundings(weights.weighted_blocks[t]); left != 0; left &= left - 1) {
+      const int bit = __builtin_ctzll(left), x = first_x + bit % 8, y = first_y + bit / 8;
+      if (x >= 0 && x < blocks_x && y >= 0 && y < blocks_y)
+        weights.reached_blocks[tile_of(x * kBlock, y * kBlock)] |= block_bit(x, y);
+    }
+  }
+}
+
+// The squares of the SSIM loss lie half a tile higher than the tiles.
+void TrainingView::reach_squares(Weights& weights) const {
+  constexpr uint16_t kUpperHalf = 0x00FF, kLowerHalf = 0xFF00;
+  weights.reach.reserve_exactly(square_count());
+  const size_t across = size_t(tiles_x_);
+  for (size_t t = 0; t < tile_count(); ++t) {
+    if ((weights.weighted_blocks[t] & kUpperHalf) != 0) weights.reach[t] = kWeighted;
+    if ((weights.weighted_blocks[t] & kLowerHalf) != 0) weights.reach[t + across] = kWeighted;
   }
   for (size_t i = 0; i < square_count(); ++i) {
     if (weights.reach[i] != kWeighted) continue;
-    const size_t x = i % size_t(tiles_x_);
+    const size_t x = i % across;
     if (x > 0) weights.reach[i - 1] = std::max(weights.reach[i - 1], uint8_t(kReached));
-    if (x + 1 < size_t(tiles_x_)) weights.reach[i + 1] = std::max(weights.reach[i + 1], uint8_t(kReached));
+    if (x + 1 < across) weights.reach[i + 1] = std::max(weights.reach[i + 1], uint8_t(kReached));
   }
 }
 
 Targets TrainingView::targets(bool masked) const {
   const Weights& w = weights(masked);
-  return {tiles_.data(),
-          w.tiles.data(),
-          w.weighted_blocks.data(),
-          w.reached_blocks.data(),
-          {moments_.data(), w.squares.data(), w.reach.data()}};
+  return {tiles_.data(),           w.values.data(), w.places.data(), w.weighted_blocks.data(),
+          w.reached_blocks.data(), w.reach.data()};
 }
 
 }  // namespace gausslite

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// A training image, prepared once: cut into tiles, padded to whole ones, with the blurred target that SSIM needs,
-// and where its weights are.
+// A training image, prepared once: cut into tiles, padded to whole ones, and where its weights are. A mapper draws one
+// of many, so that it comes from memory each time: it is kept in as few bytes as say the same.
 #pragma once
 
 #include <cstdint>
@@ -13,8 +13,7 @@ namespace gausslite {
 class TrainingView {
  public:
   // rgb: height x width x 3 bytes; depth_m, weight: height x width; weight may be null (1 everywhere).
-  TrainingView(const Stages& stages, int width, int height, const uint8_t* rgb, const float* depth_m,
-               const float* weight);
+  TrainingView(int width, int height, const uint8_t* rgb, const float* depth_m, const float* weight);
 
   int width() const { return width_; }
   int height() const { return height_; }
@@ -22,17 +21,24 @@ class TrainingView {
   double weight_sum(bool masked) const { return weights(masked).sum; }
 
  private:
-  // One way of weighing the pixels, and where its weights are.
+  // One way of weighing the pixels, and where its weights are. Tiles of zeros and of ones share one place each.
   struct Weights {
     double sum = 0.0;
-    Buffer<float> tiles;  // Targets
+    Buffer<float> values;
+    Buffer<uint32_t> places;
     Buffer<uint16_t> weighted_blocks, reached_blocks;
-    Buffer<float> squares;  // SsimTargets
     Buffer<uint8_t> reach;
   };
+  // The part of a tile that lies inside the image.
+  struct Extent {
+    int x, y, columns, rows;
+  };
+  Extent extent(size_t tile) const;
+  void cut(size_t tile, const uint8_t* rgb, const float* depth_m);
   // weight: height x width, or null for 1 everywhere.
   void weigh(Weights& weights, const float* weight) const;
-  void reach_out(Weights& weights) const;
+  void reach_blocks(Weights& weights) const;
+  void reach_squares(Weights& weights) const;
   size_t tile_count() const { return size_t(tiles_y_) * size_t(tiles_x_); }
   size_t square_count() const { return size_t(tiles_y_ + 1) * size_t(tiles_x_); }
   size_t tile_of(int x, int y) const { return size_t(y / kTile) * size_t(tiles_x_) + size_t(x / kTile); }
@@ -40,7 +46,7 @@ class TrainingView {
 
   int width_, height_, tiles_x_, tiles_y_;
   bool masked_;
-  Buffer<float> tiles_, moments_;  // Targets, SsimTargets
+  Buffer<TargetTile> tiles_;
   Weights inside_, mask_;
 };
 

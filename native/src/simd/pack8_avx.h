@@ -5,6 +5,7 @@
 #include <immintrin.h>
 
 #include <cstdint>
+#include <cstring>
 
 namespace gausslite::GAUSSLITE_ISA {
 
@@ -31,6 +32,13 @@ GAUSSLITE_INLINE Pack8 keep_if(bool yes, Pack8 a) {
 template <int a, int b, int c, int d, int e, int f, int g, int h>
 GAUSSLITE_INLINE Pack8 permute(Pack8 x) {
   return _mm256_permutevar8x32_ps(x.v, _mm256_setr_epi32(a, b, c, d, e, f, g, h));
+}
+
+// Four rows of four bytes.
+GAUSSLITE_INLINE __m128i byte_block(const uint8_t* p, int64_t stride) {
+  int32_t row[4];
+  for (int i = 0; i < 4; ++i) std::memcpy(&row[i], p + i * stride, sizeof row[i]);
+  return _mm_setr_epi32(row[0], row[1], row[2], row[3]);
 }
 
 }  // namespace gausslite::GAUSSLITE_ISA

@@ -167,6 +167,16 @@ GAUSSLITE_INLINE Pack16 load_block(const float* p, int64_t stride) {
   return {_mm256_insertf128_ps(_mm256_castps128_ps256(_mm_loadu_ps(p)), _mm_loadu_ps(p + stride), 1),
           _mm256_insertf128_ps(_mm256_castps128_ps256(_mm_loadu_ps(p + 2 * stride)), _mm_loadu_ps(p + 3 * stride), 1)};
 }
+GAUSSLITE_INLINE Pack16 pack_of_bytes(__m128i bytes) {
+  return {_mm256_cvtepi32_ps(_mm256_cvtepu8_epi32(bytes)),
+          _mm256_cvtepi32_ps(_mm256_cvtepu8_epi32(_mm_srli_si128(bytes, 8)))};
+}
+GAUSSLITE_INLINE Pack16 load_bytes(const uint8_t* p) {
+  return pack_of_bytes(_mm_loadu_si128(reinterpret_cast<const __m128i*>(p)));
+}
+GAUSSLITE_INLINE Pack16 load_byte_block(const uint8_t* p, int64_t stride) {
+  return pack_of_bytes(byte_block(p, stride));
+}
 GAUSSLITE_INLINE void store_block(float* p, int64_t stride, Pack16 a) {
   _mm_storeu_ps(p, _mm256_castps256_ps128(a.lo));
   _mm_storeu_ps(p + stride, _mm256_extractf128_ps(a.lo, 1));

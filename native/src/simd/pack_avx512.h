@@ -108,6 +108,14 @@ GAUSSLITE_INLINE Pack16 load_block(const float* p, int64_t stride) {
   return _mm512_insertf32x4(v, _mm_loadu_ps(p + 3 * stride), 3);
 }
 
+GAUSSLITE_INLINE Pack16 pack_of_bytes(__m128i bytes) { return _mm512_cvtepi32_ps(_mm512_cvtepu8_epi32(bytes)); }
+GAUSSLITE_INLINE Pack16 load_bytes(const uint8_t* p) {
+  return pack_of_bytes(_mm_loadu_si128(reinterpret_cast<const __m128i*>(p)));
+}
+GAUSSLITE_INLINE Pack16 load_byte_block(const uint8_t* p, int64_t stride) {
+  return pack_of_bytes(byte_block(p, stride));
+}
+
 GAUSSLITE_INLINE void store_block(float* p, int64_t stride, Pack16 a) {
   _mm_storeu_ps(p, _mm512_castps512_ps128(a.v));
   _mm_storeu_ps(p + stride, _mm512_extractf32x4_ps(a.v, 1));

@@ -6,6 +6,7 @@
 #include <arm_neon.h>
 
 #include <cstdint>
+#include <cstring>
 
 namespace gausslite::GAUSSLITE_ISA {
 
@@ -177,6 +178,17 @@ GAUSSLITE_INLINE void transpose_groups(Pack16& a, Pack16& b, Pack16& c, Pack16& 
 
 GAUSSLITE_INLINE Pack16 load_block(const float* p, int64_t stride) {
   return {vld1q_f32(p), vld1q_f32(p + stride), vld1q_f32(p + 2 * stride), vld1q_f32(p + 3 * stride)};
+}
+GAUSSLITE_INLINE Pack16 pack_of_bytes(uint8x16_t bytes) {
+  const uint16x8_t lo = vmovl_u8(vget_low_u8(bytes)), hi = vmovl_high_u8(bytes);
+  return {vcvtq_f32_u32(vmovl_u16(vget_low_u16(lo))), vcvtq_f32_u32(vmovl_high_u16(lo)),
+          vcvtq_f32_u32(vmovl_u16(vget_low_u16(hi))), vcvtq_f32_u32(vmovl_high_u16(hi))};
+}
+GAUSSLITE_INLINE Pack16 load_bytes(const uint8_t* p) { return pack_of_bytes(vld1q_u8(p)); }
+GAUSSLITE_INLINE Pack16 load_byte_block(const uint8_t* p, int64_t stride) {
+  uint32_t rows[4];
+  for (int i = 0; i < 4; ++i) std::memcpy(&rows[i], p + i * stride, sizeof rows[i]);
+  return pack_of_bytes(vreinterpretq_u8_u32(vld1q_u32(rows)));
 }
 GAUSSLITE_INLINE void store_block(float* p, int64_t stride, Pack16 a) {
   for (int i = 0; i < 4; ++i) vst1q_f32(p + i * stride, a.q[i]);

@@ -206,6 +206,13 @@ GAUSSLITE_INLINE Pack16 load_block(const float* p, int64_t stride) {
   GAUSSLITE_EACH a.q[i] = load_quad(p + i * stride);
   return a;
 }
+// Sixteen bytes as numbers from 0 to 255, side by side or as a block.
+GAUSSLITE_INLINE Pack16 load_byte_block(const uint8_t* p, int64_t stride) {
+  Pack16 a;
+  for (int i = 0; i < 16; ++i) a.q[i / 4][i % 4] = float(p[i / 4 * stride + i % 4]);
+  return a;
+}
+GAUSSLITE_INLINE Pack16 load_bytes(const uint8_t* p) { return load_byte_block(p, 4); }
 GAUSSLITE_INLINE void store_block(float* p, int64_t stride, Pack16 a) {
   GAUSSLITE_EACH store_quad(p + i * stride, a.q[i]);
 }

@@ -12,8 +12,14 @@ def core_clock_ghz() -> float:
     """The clock of this core, by a chain of additions."""
 
 class View:
-    """A training image made ready: padded, tiled, SSIM moments cached."""
+    """A training image made ready: cut into tiles, and where its weights are."""
 
+    def __init__(
+        self,
+        rgb: UInt8[ndarray, "h w 3"],
+        depth_m: Float32[ndarray, "h w"],
+        weight: Float32[ndarray, "h w"] | None,
+    ) -> None: ...
     @property
     def width(self) -> int: ...
     @property
@@ -49,12 +55,6 @@ class Engine:
     ) -> tuple[Float32[ndarray, "n 16"], Float64[ndarray, "6"], UInt32[ndarray, " m"], Float32[ndarray, " m"]]:
         """d_rows, d_twist, visible rows and mean_2d_norm."""
 
-    def prepare_view(
-        self,
-        rgb: UInt8[ndarray, "h w 3"],
-        depth_m: Float32[ndarray, "h w"],
-        weight: Float32[ndarray, "h w"] | None,
-    ) -> View: ...
     def step(
         self,
         rows: Float32[ndarray, "n 16"],

@@ -163,9 +163,7 @@ class CpuRasterizer:
     ) -> TrainingView:
         """Make an image ready to train on. Raises ShapeError, InvalidInputError for weights outside [0, 1]."""
         require_view(rgb, depth_m, camera, weight)
-        native = self._engine.prepare_view(
-            np.ascontiguousarray(rgb), np.ascontiguousarray(depth_m), _contiguous(weight)
-        )
+        native = _load_kernels().View(np.ascontiguousarray(rgb), np.ascontiguousarray(depth_m), _contiguous(weight))
         return CpuView(camera, _intrinsics(camera), native)
 
     def step(

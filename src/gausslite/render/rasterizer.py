@@ -133,7 +133,7 @@ class Tally:
 
 @runtime_checkable
 class TrainingView(Protocol):
-    """An image prepared once for many steps (padded, tiled, SSIM moments cached); opaque outside its backend."""
+    """An image prepared once for many steps (padded, tiled); opaque outside its backend."""
 
     @property
     def camera(self) -> Camera:
