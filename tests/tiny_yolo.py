@@ -18,7 +18,10 @@ MASK_COEFFICIENTS = 32
 
 
 def write_tiny_yolo(
-    path: Path, names: Sequence[str], boxes: Sequence[tuple[float, float, float, float, int, float]]
+    path: Path,
+    names: Sequence[str],
+    boxes: Sequence[tuple[float, float, float, float, int, float]],
+    named: bool = True,
 ) -> Path:
     """Write a model that answers every image with these boxes: centre x, y, width, height, class, score."""
     output = np.zeros((1, 4 + len(names) + MASK_COEFFICIENTS, max(len(boxes), 1)), np.float32)
@@ -53,7 +56,7 @@ def write_tiny_yolo(
         [numpy_helper.from_array(value, name) for name, value in constants.items()],
     )
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 13)], ir_version=8)
-    helper.set_model_props(model, {"names": str(dict(enumerate(names)))} if names else {})
+    helper.set_model_props(model, {"names": str(dict(enumerate(names)))} if named else {})
     onnx.save(model, str(path))
     return path
 

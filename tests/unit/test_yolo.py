@@ -88,9 +88,9 @@ def test_a_noun_without_a_class_is_said_and_not_found(tmp_path):
 
 
 def test_segment_matches_instances_of_any_class_to_boxes(tmp_path):
-    detector = load_yolo(write_tiny_yolo(tmp_path / "tiny.onnx", NAMES, [CUP]), threads=1)
+    segmenter = load_yolo(write_tiny_yolo(tmp_path / "tiny.onnx", NAMES, [CUP]), threads=1).segmenter()
     boxes = np.array([[30, 16, 64, 50], [80, 0, 120, 30]], np.float32)
-    first, second = detector.segment(frame_with_red_square(), boxes)
+    first, second = segmenter.segment(frame_with_red_square(), boxes)
     assert first is not None
     assert first.sum() > 0.97 * 32 * 32
     assert second is None
@@ -122,7 +122,9 @@ def test_a_model_of_boxes_only_is_refused(tmp_path):
 
 
 def test_a_model_without_class_names_is_refused(tmp_path):
-    _refused(write_tiny_yolo(tmp_path / "tiny.onnx", (), []), "class names in the metadata field 'names'")
+    _refused(
+        write_tiny_yolo(tmp_path / "tiny.onnx", NAMES, [], named=False), "class names in the metadata field 'names'"
+    )
 
 
 def test_settings_are_checked():

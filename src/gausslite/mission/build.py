@@ -47,7 +47,7 @@ class Attentions:
         settings = AttentionSettings(up_axis=self._scene.up_axis)
         if self._perception.model is not None:
             yolo = self._loaded(self._perception.model)
-            segmenter = yolo if self._perception.resegment else None
+            segmenter = yolo.segmenter() if self._perception.resegment else None
             if self._perception.beside:
                 self._executor = self._executor or ThreadPoolExecutor(1, "detector")
                 return AttentionBeside(graph, yolo, self._executor, settings, segmenter)

@@ -30,13 +30,66 @@ class Detector(Protocol):
         ...
 
 
+@dataclass(frozen=True, slots=True)
+class Box:
+    """Where a detector of boxes saw what a phrase names; box_px is (left, top, right, bottom)."""
+
+    phrase: str
+    score: float
+    box_px: tuple[float, float, float, float]
+
+
+@runtime_checkable
+class BoxDetector(Protocol):
+    """Finds the objects that noun phrases name, but not their outlines."""
+
+    def boxes(self, frame: Frame, queries: Sequence[str]) -> list[Box]:
+        """All instances of each query, best first."""
+        ...
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What this detector could not do with the queries so far, one line each."""
+        ...
+
+
 @runtime_checkable
 class Segmenter(Protocol):
-    """Cuts known boxes out of a new image, without asking again what they hold."""
+    """Cuts known boxes out of an image, without asking again what they hold."""
 
     def segment(self, frame: Frame, boxes_px: Float32[ndarray, "n 4"]) -> list[Bool[ndarray, "h w"] | None]:
         """One mask a box (left, top, right, bottom); None where the box holds no clear object."""
         ...
+
+
+class SegmentedDetector:
+    """A Detector made of one that finds boxes and segmenters that cut them out, each asked for what the last left."""
+
+    def __init__(self, detector: BoxDetector, segmenters: Sequence[Segmenter]) -> None:
+        self._detector = detector
+        self._segmenters = tuple(segmenters)
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What the detector of boxes could not do."""
+        return self._detector.warnings
+
+    def detect(self, frame: Frame, queries: Sequence[str]) -> list[Detection]:
+        """The boxes that any segmenter has a mask for, in the detector's order."""
+        boxes = self._detector.boxes(frame, queries)
+        masks: list[Bool[ndarray, "h w"] | None] = [None] * len(boxes)
+        for segmenter in self._segmenters:
+            open_rows = [row for row, mask in enumerate(masks) if mask is None]
+            if not open_rows:
+                break
+            table = np.array([boxes[row].box_px for row in open_rows], np.float32)
+            for row, mask in zip(open_rows, segmenter.segment(frame, table), strict=True):
+                masks[row] = mask
+        return [
+            Detection(box.phrase, box.score, box.box_px, mask)
+            for box, mask in zip(boxes, masks, strict=True)
+            if mask is not None
+        ]
 
 
 @dataclass(frozen=True, slots=True)

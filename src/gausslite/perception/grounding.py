@@ -1,0 +1,226 @@
+"""Grounding DINO in an ONNX file of the user's: boxes of whatever a noun phrase names, one phrase a forward pass."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+import cv2
+import numpy as np
+from jaxtyping import Float32, Int64, UInt8
+from numpy import ndarray
+
+from gausslite.domain.frame import Frame
+from gausslite.errors import InvalidInputError, ModelFileError
+from gausslite.perception.detect import Box, BoxFractions, concerns_many_objects
+from gausslite.perception.grounding_text import PhraseInput, Tokenizer, phrase_input
+from gausslite.perception.model_file import open_session, run_once
+
+INPUTS: Final = ("pixel_values", "input_ids", "attention_mask", "token_type_ids", "pixel_mask")
+OUTPUTS: Final = ("logits", "pred_boxes")
+_NEEDED: Final = frozenset({"pixel_values", "input_ids"})
+# of the images that the network was trained on, red, green and blue
+_MEAN: Final = np.array([0.485, 0.456, 0.406], np.float32)
+_DEVIATION: Final = np.array([0.229, 0.224, 0.225], np.float32)
+_SHORT_SIDE_PX: Final = 800
+_LONG_SIDE_PX: Final = 1333
+_TRIAL: Final = "object"
+
+
+@dataclass(frozen=True, slots=True)
+class GroundingSettings:
+    """Which boxes count (comment in Sec. III-B.2): box_score for the phrase, text_score for its noun itself.
+
+    With one phrase a pass, text_score keeps "red mug" from finding what is only red. max_iou is ours: the network
+    seldom repeats itself, and two boxes of one phrase over one thing would weigh it twice.
+    """
+
+    box_score: float = 0.20
+    text_score: float = 0.25
+    max_iou: float = 0.7
+    max_boxes: int = 50
+    box_fractions: BoxFractions = field(default_factory=BoxFractions)
+    threads: int | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("box_score", "text_score", "max_iou"):
+            if not 0.0 < getattr(self, name) < 1.0:
+                raise InvalidInputError(f"detector {name}: expected between 0 and 1, got {getattr(self, name)}")
+        if not 1 <= self.max_boxes <= 1000:
+            raise InvalidInputError(f"detector max_boxes: expected 1 to 1000, got {self.max_boxes}")
+        if self.threads is not None and self.threads < 1:
+            raise InvalidInputError(f"detector threads: expected at least 1, got {self.threads}")
+
+
+class GroundingDino:
+    """A BoxDetector for any phrase; what it reads of one is prepared once and kept, for a mission repeats itself."""
+
+    def __init__(self, model_path: Path, tokenizer: Tokenizer, settings: GroundingSettings | None = None) -> None:
+        """Open and try the model once, so that a wrong file is refused here. Raises ModelFileError."""
+        self._settings = settings or GroundingSettings()
+        self._tokenizer = tokenizer
+        self._session = open_session(model_path, self._settings.threads)
+        self._types = _input_types(model_path, self._session)
+        shapes = {each.name: each.shape for each in self._session.get_inputs()}
+        self._size_px = tuple(side if isinstance(side, int) else None for side in shapes["pixel_values"][2:])
+        length = shapes["input_ids"][1]
+        self._length = length if isinstance(length, int) else None
+        self._phrases: dict[str, PhraseInput] = {}
+        self._try_once(model_path)
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """None: any phrase can be asked for."""
+        return ()
+
+    def boxes(self, frame: Frame, queries: Sequence[str]) -> list[Box]:
+        """All instances of each query, best first; boxes that span too much are left out."""
+        pixel_values, pixel_mask = self._picture(frame.rgb)
+        many = concerns_many_objects(queries)
+        found: list[Box] = []
+        for query in queries:
+            logits, centred = self._run(pixel_values, pixel_mask, self._phrase(query))
+            limit = self._settings.box_fractions.limit(query, many)
+            found += self._chosen(query, logits, centred, limit, (frame.camera.width_px, frame.camera.height_px))
+        return found
+
+    def _chosen(
+        self,
+        query: str,
+        logits: Float32[ndarray, "q l"],
+        centred: Float32[ndarray, "q 4"],
+        limit: float,
+        size_px: tuple[int, int],
+    ) -> list[Box]:
+        """The boxes that are sure enough, not too large, and distinct."""
+        scores, noun_scores = phrase_scores(logits, self._phrase(query).is_noun)
+        boxes_px = corners_px(centred, size_px)
+        shares = (boxes_px[:, 2:] - boxes_px[:, :2]).prod(axis=1) / (size_px[0] * size_px[1])
+        sure = (scores >= self._settings.box_score) & (noun_scores >= self._settings.text_score)
+        rows = np.flatnonzero(sure & (shares > 0) & (shares <= limit))
+        if len(rows) == 0:
+            return []
+        boxes = boxes_px[rows].astype(np.float64)
+        boxes[:, 2:] -= boxes[:, :2]
+        order = cv2.dnn.NMSBoxes(boxes.tolist(), scores[rows].tolist(), 0.0, self._settings.max_iou)
+        chosen = rows[np.asarray(order, np.int64).reshape(-1)[: self._settings.max_boxes]]
+        found = []
+        for row in chosen:
+            left, top, right, bottom = (float(edge) for edge in boxes_px[row])
+            found.append(Box(query, float(scores[row]), (left, top, right, bottom)))
+        return found
+
+    def _phrase(self, query: str) -> PhraseInput:
+        if query not in self._phrases:
+            self._phrases[query] = phrase_input(query, self._tokenizer, self._length)
+        return self._phrases[query]
+
+    def _picture(self, rgb: UInt8[ndarray, "h w 3"]) -> tuple[Float32[ndarray, "1 3 H W"], Int64[ndarray, "1 H W"]]:
+        """The image in the network's size, its proportions kept where a mask can say what is left over."""
+        height, width = self._size_px
+        if height is None or width is None:
+            return picture(rgb, fitting_size_px(rgb.shape[0], rgb.shape[1]), keep_proportions=True)
+        return picture(rgb, (height, width), keep_proportions="pixel_mask" in self._types)
+
+    def _run(
+        self, pixel_values: Float32[ndarray, "1 3 H W"], pixel_mask: Int64[ndarray, "1 H W"], phrase: PhraseInput
+    ) -> tuple[Float32[ndarray, "q l"], Float32[ndarray, "q 4"]]:
+        logits, boxes = self._session.run(list(OUTPUTS), self._feed(pixel_values, pixel_mask, phrase))
+        return logits[0].astype(np.float32), boxes[0].astype(np.float32)
+
+    def _feed(
+        self, pixel_values: Float32[ndarray, "1 3 H W"], pixel_mask: Int64[ndarray, "1 H W"], phrase: PhraseInput
+    ) -> dict[str, Any]:
+        given = (pixel_values, phrase.input_ids, phrase.attention_mask, phrase.token_type_ids, pixel_mask)
+        named = zip(INPUTS, given, strict=True)
+        return {name: array.astype(self._types[name]) for name, array in named if name in self._types}
+
+    def _try_once(self, path: Path) -> None:
+        rgb = np.zeros((48, 64, 3), np.uint8)
+        outputs = run_once(path, self._session, self._feed(*self._picture(rgb), self._phrase(_TRIAL)))
+        shapes = {each.name: out.shape for each, out in zip(self._session.get_outputs(), outputs, strict=True)}
+        logits, boxes = shapes["logits"], shapes["pred_boxes"]
+        tokens = self._phrase(_TRIAL).input_ids.shape[1]
+        if not (len(logits) == 3 and logits[2] >= tokens and boxes == (1, logits[1], 4) and logits[0] == 1):
+            raise ModelFileError(
+                f"model {path}: expected logits [1, q, {tokens} or more] and pred_boxes [1, q, 4], "
+                f"got {list(logits)} and {list(boxes)}"
+            )
+
+
+def phrase_scores(
+    logits: Float32[ndarray, "q l"], is_noun: Sequence[bool]
+) -> tuple[Float32[ndarray, " q"], Float32[ndarray, " q"]]:
+    """How sure each box is of the phrase (the likeliest of all tokens) and of its noun (the likeliest of its own)."""
+    # -inf stands where the network has no token
+    likely = 1.0 / (1.0 + np.exp(-np.clip(logits, -80.0, 80.0)))
+    nouns = np.zeros(logits.shape[1], np.bool_)
+    nouns[: len(is_noun)] = is_noun
+    own = likely[:, nouns].max(axis=1) if nouns.any() else np.zeros(len(logits))
+    return likely.max(axis=1).astype(np.float32), own.astype(np.float32)
+
+
+def corners_px(centred: Float32[ndarray, "q 4"], size_px: tuple[int, int]) -> Float32[ndarray, "q 4"]:
+    """Boxes (centre x, y, width, height, in shares of an image of width, height) as corners, clipped to the image."""
+    half = centred[:, 2:] / 2
+    corners = np.concatenate([centred[:, :2] - half, centred[:, :2] + half], axis=1)
+    size = np.array([*size_px, *size_px], np.float32)
+    clipped: Float32[ndarray, "q 4"] = np.clip(corners * size, 0, size).astype(np.float32)
+    return clipped
+
+
+def fitting_size_px(height_px: int, width_px: int) -> tuple[int, int]:
+    """The size (height, width) that the network was trained at: 800 on the short side, at most 1333 on the long."""
+    short, long = sorted((height_px, width_px))
+    scale = min(_SHORT_SIDE_PX / short, _LONG_SIDE_PX / long)
+    return max(1, round(height_px * scale)), max(1, round(width_px * scale))
+
+
+def picture(
+    rgb: UInt8[ndarray, "h w 3"], size_px: tuple[int, int], keep_proportions: bool
+) -> tuple[Float32[ndarray, "1 3 H W"], Int64[ndarray, "1 H W"]]:
+    """The image scaled into size_px (height, width) from the top left corner, standardised; the mask says where it is.
+
+    The network measures boxes in shares of the masked part, so that they need no correction for the rest.
+    """
+    (height, width), (h, w) = size_px, rgb.shape[:2]
+    scale_y, scale_x = height / h, width / w
+    if keep_proportions:
+        scale_y = scale_x = min(scale_y, scale_x)
+    inner_h, inner_w = min(height, max(1, round(h * scale_y))), min(width, max(1, round(w * scale_x)))
+    shrinks = inner_w < w
+    scaled = cv2.resize(rgb, (inner_w, inner_h), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
+    values = np.zeros((1, 3, height, width), np.float32)
+    values[0, :, :inner_h, :inner_w] = ((scaled.astype(np.float32) / 255 - _MEAN) / _DEVIATION).transpose(2, 0, 1)
+    mask = np.zeros((1, height, width), np.int64)
+    mask[:, :inner_h, :inner_w] = 1
+    return values, mask
+
+
+def is_grounding(names_in: Sequence[str], names_out: Sequence[str]) -> bool:
+    """True for a network with the inputs and outputs of Grounding DINO."""
+    return set(names_in) >= _NEEDED and set(OUTPUTS) <= set(names_out)
+
+
+def _input_types(path: Path, session: Any) -> dict[str, type[np.generic]]:
+    """The type of each input, all of which must be known ones."""
+    known = {"tensor(float)": np.float32, "tensor(float16)": np.float16, "tensor(int64)": np.int64,
+             "tensor(int32)": np.int32, "tensor(bool)": np.bool_}  # fmt: skip
+    inputs = {each.name: each for each in session.get_inputs()}
+    outputs = [each.name for each in session.get_outputs()]
+    fits = (
+        is_grounding(list(inputs), outputs)
+        and set(inputs) <= set(INPUTS)
+        and all(each.type in known for each in inputs.values())
+        and len(inputs["pixel_values"].shape) == 4
+        and len(inputs["input_ids"].shape) == 2
+    )
+    if not fits:
+        came = ", ".join(f"{each.name} {each.shape} {each.type}" for each in inputs.values())
+        raise ModelFileError(
+            f"model {path}: expected Grounding DINO with inputs {', '.join(INPUTS)} and outputs {', '.join(OUTPUTS)}, "
+            f"got {came} and {', '.join(outputs)}"
+        )
+    return {name: known[each.type] for name, each in inputs.items()}

@@ -1,0 +1,103 @@
+"""A YOLO-seg or FastSAM network from an ONNX file: images in, candidates and their masks out; it knows no nouns."""
+
+from __future__ import annotations
+
+import ast
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from jaxtyping import Bool, Float32
+from numpy import ndarray
+
+from gausslite.domain.frame import Frame
+from gausslite.errors import ModelFileError
+from gausslite.perception.model_file import open_session, run_once
+from gausslite.perception.yolo_decode import MASK_COEFFICIENTS, Candidates, Letterbox, decode, letterbox, mask_of
+
+_DEFAULT_SIDE_PX: Final = 640
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Answer:
+    """What the network said about one image, before any threshold."""
+
+    output: Float32[ndarray, "rows a"]
+    prototypes: Float32[ndarray, "32 ph pw"]
+    placed: Letterbox
+    size_px: tuple[int, int]
+    network_size_px: tuple[int, int]
+
+    def candidates(self, min_score: float) -> Candidates:
+        """The boxes whose best class reaches min_score, in any order."""
+        return decode(self.output, self.placed, self.size_px, min_score)
+
+    def masks(self, found: Candidates) -> list[Bool[ndarray, "h w"]]:
+        """One mask a candidate, zero outside its box."""
+        sizes_px = (self.size_px, self.network_size_px)
+        return [
+            mask_of(coefficients, self.prototypes, box, self.placed, sizes_px)
+            for coefficients, box in zip(found.coefficients, found.boxes_px, strict=True)
+        ]
+
+
+class YoloSegNetwork:
+    """A session with one image in, and out of it [1, 4+c+32, A] and [1, 32, h, w] for c classes."""
+
+    def __init__(self, path: Path, threads: int | None = None) -> None:
+        """Open and try the file once, so that a wrong one is refused here. Raises ModelFileError."""
+        self.path = path
+        self._session = open_session(path, threads)
+        self._input, self._height_px, self._width_px = _input_of(path, self._session)
+        blank = np.zeros((1, 3, self._height_px, self._width_px), np.float32)
+        outputs = run_once(path, self._session, {self._input: blank})
+        self.names = _class_names(self._session)
+        self._boxes_at, self._prototypes_at = _output_order(path, outputs, len(self.names))
+        self.classes = int(outputs[self._boxes_at].shape[1]) - 4 - MASK_COEFFICIENTS
+
+    def answer(self, frame: Frame) -> Answer:
+        """Run the network on a frame's colours."""
+        tensor, placed = letterbox(frame.rgb, self._height_px, self._width_px)
+        outputs = self._session.run(None, {self._input: tensor})
+        size_px = (frame.camera.height_px, frame.camera.width_px)
+        network_size_px = (self._height_px, self._width_px)
+        return Answer(outputs[self._boxes_at][0], outputs[self._prototypes_at][0], placed, size_px, network_size_px)
+
+
+def _input_of(path: Path, session: Any) -> tuple[str, int, int]:
+    inputs = session.get_inputs()
+    shape = inputs[0].shape
+    if len(inputs) != 1 or len(shape) != 4 or shape[1] not in (3, None) or inputs[0].type != "tensor(float)":
+        came = ", ".join(f"{each.name} {each.shape} {each.type}" for each in inputs)
+        raise ModelFileError(f"model {path}: expected one float input [1, 3, height, width], got {came}")
+    height, width = (side if isinstance(side, int) else _DEFAULT_SIDE_PX for side in shape[2:])
+    return str(inputs[0].name), height, width
+
+
+def _class_names(session: Any) -> tuple[str, ...]:
+    """The classes' names in the file's metadata; none where they are missing or unreadable."""
+    text = session.get_modelmeta().custom_metadata_map.get("names", "")
+    try:
+        names = ast.literal_eval(text)
+        return tuple(str(names[index]) for index in range(len(names)))
+    except (ValueError, SyntaxError, TypeError, KeyError, MemoryError, RecursionError):
+        return ()
+
+
+def _output_order(path: Path, outputs: list[Float32[ndarray, "..."]], classes: int) -> tuple[int, int]:
+    """Where boxes and prototypes are among the outputs; classes 0: as many as there are rows for."""
+    came = " and ".join(str(list(each.shape)) for each in outputs)
+    least = 4 + max(classes, 1) + MASK_COEFFICIENTS
+    rows = str(least) if classes else "4+c+32"
+    boxes = [
+        i for i, each in enumerate(outputs)
+        if each.ndim == 3 and (each.shape[1] == least if classes else each.shape[1] >= least) and len(each) == 1
+    ]  # fmt: skip
+    prototypes = [i for i, each in enumerate(outputs) if each.ndim == 4 and each.shape[:2] == (1, MASK_COEFFICIENTS)]
+    if len(boxes) != 1 or len(prototypes) != 1:
+        hint = " (boxes only, no masks)" if len(outputs) == 1 else ""
+        raise ModelFileError(
+            f"model {path}: expected a YOLO-seg network with outputs [1, {rows}, A] and [1, 32, h, w], got {came}{hint}"
+        )
+    return boxes[0], prototypes[0]
