@@ -11,6 +11,7 @@ from pathlib import Path
 from gausslite.cli import bench_loop_command
 from gausslite.cli.bench_gpu import run_gpu
 from gausslite.cli.bench_quality import configure_ablation, configure_quality
+from gausslite.cli.bench_retask import configure_retask
 from gausslite.evaluation.bench_cycles import FLOOR_CYCLES, BlockCost
 from gausslite.evaluation.bench_gpu import GPU_GAUSSIANS
 from gausslite.evaluation.bench_raster import GAUSSIANS, OPERATIONS, SIZES, RasterBench, RasterTiming
@@ -32,6 +33,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     configure_quality(benches.add_parser("quality", help=summary, description=f"Score {summary}."))
     summary = "the paper's components, switched on one by one"
     configure_ablation(benches.add_parser("ablation", help=summary, description=f"Score {summary}."))
+    summary = "how soon a map serves a task that came in the middle"
+    configure_retask(benches.add_parser("retask", help=summary, description=f"Measure {summary}."))
 
 
 def _configure_raster(parser: argparse.ArgumentParser) -> None:

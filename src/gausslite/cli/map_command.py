@@ -18,11 +18,12 @@ from gausslite.domain.task import TaskGraph
 from gausslite.errors import GaussLiteError, InvalidInputError
 from gausslite.mapping.pace import Pace
 from gausslite.mapping.policies import TASK
-from gausslite.mission.build import build_attention, build_mapper
+from gausslite.mission.build import Attentions, build_attention, build_mapper
 from gausslite.mission.options import add_budget, add_detector, add_policy, mission_settings, perception_settings
 from gausslite.mission.results import peak_rss_mib, prepare_folder, write_results
-from gausslite.mission.saved_run import resume_run, save_run
+from gausslite.mission.saved_run import last_frame, resume_run, save_run
 from gausslite.mission.settings import SceneKnowledge
+from gausslite.mission.turns import TaskPlan, Turn
 from gausslite.perception.attention import Attention
 from gausslite.perception.fixed import NoAttention, RegionAttention
 from gausslite.pipeline import FrameOutcome, TaskMapper
@@ -33,6 +34,13 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_source(parser)
     parser.add_argument(
         "--task", metavar="TEXT", help='what the robot is to do, such as "Pick up the mug on the table"'
+    )
+    parser.add_argument(
+        "--then",
+        metavar="FRAME:TASK",
+        action="append",
+        default=[],
+        help="another task from this frame number on; may be repeated",
     )
     add_detector(parser)
     add_regions(parser)
@@ -48,10 +56,15 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Map the sequence and write the results."""
     settings = mission_settings(options)
+    turns = [Turn.parse(text) for text in options.then]
     source = open_source(options.source, options.up, options.colour_camera)
     positions = select_frames(source, options.frames)
     size = frame_size(options.size, source)
-    attention, graph = choose_attention(options, source)
+    attention, first = choose_attention(options, source)
+    plan, attentions = _plan(first, turns), Attentions(SceneKnowledge.of(source), perception_settings(options))
+    graph = first if options.resume is None or not plan.turns else plan.at(last_frame(options.resume))
+    if graph is not None and graph is not first:
+        attention = attentions.to(graph)
     mapper = TaskMapper(attention, build_mapper(settings), pace=Pace(settings.pace))
     prepare_folder(options.out)
     if options.save_state is not None:
@@ -59,7 +72,7 @@ def run(options: argparse.Namespace) -> int:
     if options.resume is not None:
         last_index = resume_run(options.resume, mapper, graph)
         positions = [position for position in positions if source.indices()[position] > last_index]
-    mission = _play(source, positions, size, mapper)
+    mission = _Player(source, size, mapper, plan, attentions).play(positions, graph)
     if mission.stopped is not None and not mission.outcomes:
         raise mission.stopped
     gaussians = mapper.gaussians()
@@ -67,7 +80,8 @@ def run(options: argparse.Namespace) -> int:
     report = {
         "source": options.source,
         "colour_camera": None if options.colour_camera is None else str(options.colour_camera),
-        "task": None if graph is None else {"text": graph.text, **as_json(graph)},
+        "task": None if first is None else {"text": first.text, **as_json(first)},
+        "then": [{"frame": frame, "text": later.text, **as_json(later)} for frame, later in plan.turns],
         "policy": options.policy,
         "without": sorted(settings.without),
         "size": list(size),
@@ -79,12 +93,13 @@ def run(options: argparse.Namespace) -> int:
         "resumed_from": None if options.resume is None else str(options.resume),
         "peak_rss_mib": peak_rss_mib(),
         "memory_mib": mapper.memory_mib(),
-        "notes": list(attention.notes),
+        "notes": list(mapper.notes),
         "stopped_by": None if mission.stopped is None else str(mission.stopped),
     }
     write_results(options.out, gaussians, report)
     if options.save_state is not None and mission.outcomes:
-        save_run(options.save_state, mapper, graph, mission.outcomes[-1].index)
+        last_index = mission.outcomes[-1].index
+        save_run(options.save_state, mapper, plan.at(last_index), last_index)
     if mission.stopped is not None:
         # what was mapped until then is kept, and the exit code says that it is not all
         raise mission.stopped
@@ -112,25 +127,58 @@ class _Mission:
             "frames_skipped": len(self.outcomes) - len(mapped),
             "iterations": sum(outcome.iterations for outcome in mapped),
             "roi_share": sum(outcome.roi_share for outcome in mapped) / max(len(mapped), 1),
+            "keyframes_reread": sum(outcome.reread.keyframes for outcome in self.outcomes),
+            "seeded_in_keyframes": sum(outcome.reread.seeded for outcome in self.outcomes),
             "hz": len(mapped) / busy_s if busy_s > 0 else 0.0,
             "seconds": self.seconds,
         }
 
 
-def _play(source: Source, positions: Sequence[int], size: tuple[int, int], mapper: TaskMapper) -> _Mission:
-    started_s = time.perf_counter()
-    outcomes: list[FrameOutcome] = []
-    stopped: GaussLiteError | None = None
-    with MappingBar(len(positions)) as bar:
-        for position in positions:
-            try:
-                frame = source.frame(position, size)
-            except GaussLiteError as error:
-                stopped = error
-                break
-            outcomes.append(mapper.process(frame))
-            bar.show(len(outcomes), outcomes[-1].gaussians, outcomes[-1].roi_share)
-    return _Mission(tuple(outcomes), time.perf_counter() - started_s, stopped)
+@dataclass(frozen=True, slots=True)
+class _Player:
+    """Plays a source to a loop, which is given each task when its turn has come."""
+
+    source: Source
+    size: tuple[int, int]
+    mapper: TaskMapper
+    plan: TaskPlan
+    attentions: Attentions
+
+    def play(self, positions: Sequence[int], graph: TaskGraph | None) -> _Mission:
+        """Map these frames; graph is the task that the loop has now."""
+        started_s = time.perf_counter()
+        outcomes: list[FrameOutcome] = []
+        stopped: GaussLiteError | None = None
+        indices = self.source.indices()
+        with MappingBar(len(positions)) as bar:
+            for position in positions:
+                try:
+                    frame = self.source.frame(position, self.size)
+                except GaussLiteError as error:
+                    stopped = error
+                    break
+                graph = self._turn(graph, indices[position])
+                outcomes.append(self.mapper.process(frame))
+                bar.show(len(outcomes), outcomes[-1].gaussians, outcomes[-1].roi_share)
+        return _Mission(tuple(outcomes), time.perf_counter() - started_s, stopped)
+
+    def _turn(self, now: TaskGraph | None, index: int) -> TaskGraph | None:
+        """The task of this frame, assigned where it asks for other things than the one before."""
+        graph = self.plan.at(index)
+        if graph is not None and now is not None and not graph.asks_the_same_as(now):
+            self.mapper.assign(self.attentions.to(graph))
+        return graph
+
+
+def _plan(first: TaskGraph | None, turns: Sequence[Turn]) -> TaskPlan:
+    """The tasks of --task and --then."""
+    if not turns:
+        return TaskPlan(first)
+    if first is None:
+        raise InvalidInputError("--then: follows a task in words; give the first with --task TEXT")
+    from gausslite.task.rules import RuleParser
+
+    return TaskPlan(first, tuple((turn.frame, RuleParser().parse(turn.text)) for turn in turns))
 
 
 def choose_attention(options: argparse.Namespace, source: Source) -> tuple[Attention, TaskGraph | None]:

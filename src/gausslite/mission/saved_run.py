@@ -40,5 +40,14 @@ def resume_run(path: Path, loop: TaskMapper, graph: TaskGraph | None) -> int:
     return int(last_index)
 
 
+def last_frame(path: Path) -> int:
+    """The number of a saved run's last frame. Raises MapFileError."""
+    try:
+        [last_index] = take(part(read_state(path), "about"), "last_index", (1,), np.int64)
+    except GaussLiteError as error:
+        raise MapFileError(f"{path}: {error}") from error
+    return int(last_index)
+
+
 def _task(graph: TaskGraph | None) -> str:
     return "" if graph is None else graph.text

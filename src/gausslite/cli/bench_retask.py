@@ -1,0 +1,66 @@
+"""`gausslite bench retask`: how soon a map serves a task that came in the middle of the mission."""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+import sys
+from pathlib import Path
+
+from gausslite.codec.files import write_whole
+from gausslite.evaluation.curves import draw_panels
+from gausslite.evaluation.pictures import write_png
+from gausslite.evaluation.quality.retask import RetaskBench, TaskChange, recovery_table
+from gausslite.mission.options import names
+from gausslite.mission.results import prepare_folder, write_json
+from gausslite.mission.settings import MissionSettings
+
+_CHANGES = (
+    "home-4-manipulation:home-4-navigation",
+    "home-1-search:home-1-navigation",
+    "home-8-navigation:home-8-search",
+)
+
+
+def configure_retask(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `bench retask`."""
+    add = parser.add_argument
+    add("--out", metavar="DIR", type=Path, required=True, help="gets retask.md, retask.json and retask.png")
+    add("--changes", metavar="A:B,...", type=names, default=_CHANGES, help=f"default: {','.join(_CHANGES)}")
+    add("--before", metavar="N", type=int, default=48, help="frames before the change (default: %(default)s)")
+    add("--after", metavar="N", type=int, default=48, help="frames after it (default: %(default)s)")
+    add("--views", metavar="N", type=int, default=12, help="held-out views (default: %(default)s)")
+    add("--max-gaussians", metavar="N", type=int, default=60_000, help="hard cap (default: %(default)s)")
+    add("--iterations", metavar="N", type=int, default=8, help="a frame (default: %(default)s)")
+    add("--rate", metavar="HZ", type=float, default=4.0, help="frames a second (default: %(default)s)")
+    add("--timed", action="store_true", help="as many iterations as fit into a frame's time, instead of --iterations")
+    add("--seed", metavar="S", type=int, default=0, help="seed of every random choice (default: 0)")
+    add("--threads", metavar="N", type=int, help="threads (default: all the processor allows)")
+    parser.set_defaults(run=run_retask)
+
+
+def run_retask(options: argparse.Namespace) -> int:
+    """Map each change three times, and write the table, the figures and the curves."""
+    settings = MissionSettings(
+        max_gaussians=options.max_gaussians,
+        iterations=None if options.timed else options.iterations,
+        rate_hz=options.rate if options.timed else None,
+        seed=options.seed,
+        threads=options.threads,
+    )
+    changes = [TaskChange.parse(text) for text in options.changes]
+    bench = RetaskBench(settings, options.rate, options.before, options.after, options.views)
+    prepare_folder(options.out)
+    recoveries = []
+    for change in changes:
+        recoveries.append(bench.run(change))
+        print(recovery_table(recoveries[-1:]).splitlines()[-1], file=sys.stderr, flush=True)
+    table = recovery_table(recoveries)
+    command = shlex.join(["gausslite", *sys.argv[1:]])
+    write_whole(options.out / "retask.md", f"# bench retask\n\n`{command}`\n\n{table}".encode())
+    write_json(options.out / "retask.json", {"command": command, "changes": [each.as_json() for each in recoveries]})
+    panels = {each.change.name: each.points for each in recoveries}
+    write_png(options.out / "retask.png", draw_panels(panels, "seconds of mapping since the change", "ROI PSNR, dB"))
+    print(table)
+    print(f"→ {options.out / 'retask.md'}")
+    return 0
