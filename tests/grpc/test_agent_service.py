@@ -232,6 +232,31 @@ def test_idle_time_is_trained_in_up_to_its_bound_and_work_comes_in_between() -> 
     robot.close()
 
 
+def test_another_task_turns_the_map_to_it_and_the_same_question_changes_nothing() -> None:
+    asked: list[str] = []
+
+    def attention(graph: TaskGraph) -> Attention:
+        asked.append(graph.text)
+        x_m = 0.0 if "mug" in graph.targets else 0.3
+        return RegionAttention([BallRegion((x_m, 0.0, 1.2), 0.2)])
+
+    with agent(attention) as a:
+        a.client.assign_task(TASK)
+        for index in range(3):
+            a.robot.submit(frame(index)).result(20)
+        first = a.robot.do(lambda mapper: mapper.gaussians()).result(20)
+        a.client.assign_task("Take the mug on the table")
+        same = a.robot.do(lambda mapper: mapper.gaussians()).result(20)
+        np.testing.assert_array_equal(same.active, first.active)
+        assert asked == [TASK]
+        a.client.assign_task("Find the chair")
+        a.robot.submit(frame(3)).result(20)
+        turned = a.robot.do(lambda mapper: mapper.gaussians()).result(20)
+        assert a.robot.status().reread == 1
+    assert asked == [TASK, "Find the chair"]
+    assert turned.means_m[turned.active][:, 0].mean() > first.means_m[first.active][:, 0].mean() + 0.1
+
+
 def test_without_idle_iterations_the_map_stays_as_the_frame_left_it() -> None:
     robot = Robot(SETTINGS, GRID, ball_attention)
     robot.assign(RuleParser().parse(TASK)).result(20)
