@@ -1,12 +1,15 @@
-"""End a program that is still starting: one line and a known exit code for Ctrl-C and SIGTERM, no traceback.
+"""A known end for Ctrl-C and SIGTERM: without a traceback while a program starts, between two steps of its work later.
 
-Programs call this before they import anything else, because most of a start is imports. A handler of our own and not
-the system's, because the first process of a container ignores signals it has no handler for.
+Programs call `end_quietly_while_starting` before they import anything else, because most of a start is imports. A
+handler of our own and not the system's, because the first process of a container ignores signals it has no handler for.
 """
+
+from __future__ import annotations
 
 import os
 import signal
-from types import FrameType
+import threading
+from types import FrameType, TracebackType
 
 
 class _QuietEnd:
@@ -32,3 +35,31 @@ def started() -> None:
         signal.signal(signal.SIGINT, signal.default_int_handler)
     if isinstance(signal.getsignal(signal.SIGTERM), _QuietEnd):
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
+
+
+class AfterThisStep:
+    """Within it the first Ctrl-C is only noted, so that the step at hand is finished and what was made can be kept.
+
+    A second Ctrl-C interrupts as ever. Away from the main thread, which alone may take signals, nothing changes.
+    """
+
+    def __init__(self) -> None:
+        self.asked = False
+        self._takes_signals = threading.current_thread() is threading.main_thread()
+        self._before = signal.getsignal(signal.SIGINT)
+
+    def __enter__(self) -> AfterThisStep:
+        if self._takes_signals:
+            signal.signal(signal.SIGINT, self._note)
+        return self
+
+    def __exit__(
+        self, _kind: type[BaseException] | None, _error: BaseException | None, _: TracebackType | None
+    ) -> None:
+        if self._takes_signals:
+            signal.signal(signal.SIGINT, self._before)
+
+    def _note(self, _number: int, _frame: FrameType | None) -> None:
+        if self.asked:
+            raise KeyboardInterrupt
+        self.asked = True

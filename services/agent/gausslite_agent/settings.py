@@ -111,7 +111,7 @@ def parse_arguments(arguments: Sequence[str] | None = None) -> AgentSettings:
 def _load_settings(options: argparse.Namespace) -> LoadSettings:
     """Counted iterations make a map that can be made again, so there idle time is left idle unless asked for."""
     idle = options.idle if options.idle is not None else (0 if options.rate is None else _IDLE_ITERATIONS)
-    return LoadSettings(options.queue, options.drop, idle)
+    return LoadSettings(options.queue, Drops(options.drop), idle)
 
 
 def _require_sense(options: argparse.Namespace) -> None:
@@ -156,9 +156,8 @@ def _add_load(parser: argparse.ArgumentParser) -> None:
     add("--queue", metavar="N", type=int, default=4, help="frames that may wait (default: %(default)s)")
     add(
         "--drop",
-        choices=list(Drops),
-        type=Drops,
-        default=Drops.OLDEST,
+        choices=[str(each) for each in Drops],
+        default=str(Drops.OLDEST),
         help="what a full queue drops (default: oldest)",
     )
     add("--idle", metavar="N", type=int, help="iterations while no frame waits (default: 64 at a --rate, else 0)")

@@ -17,7 +17,7 @@ from gausslite.evaluation.bench_gpu import GPU_GAUSSIANS
 from gausslite.evaluation.bench_raster import GAUSSIANS, OPERATIONS, SIZES, RasterBench, RasterTiming
 from gausslite.evaluation.bench_region import SHARES_PERCENT, RegionCost
 from gausslite.mission.options import names, numbers
-from gausslite.mission.results import write_json
+from gausslite.mission.results import prepare_file, write_json
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -71,6 +71,8 @@ def run_raster(options: argparse.Namespace) -> int:
     """Measure every case and print a block of lines for each, or one list of records."""
     from gausslite.render.cpu import usable_simd
 
+    if options.details is not None:
+        prepare_file(options.details)
     bench = RasterBench(
         sizes=options.sizes,
         gaussians=options.gaussians,

@@ -64,6 +64,7 @@ def run(options: argparse.Namespace) -> int:
     held_out: Sequence[int] = ()
     if options.unlimited is not None:
         positions, held_out = HoldOut().split(positions)
+        _check_gap(options, source, held_out)
     size = frame_size(options.size, source)
     mapped = [positions[step] for step in back_and_forth(len(positions), options.loop or len(positions))]
     rasterizer = choose_rasterizer(options.rasterizer, options.threads)
@@ -129,7 +130,7 @@ def _gap(
     """Map the same frames again with counted iterations and score both maps where neither was trained."""
     size = frame_size(options.size, source)
     in_time = bench.gaussians()
-    patient = argparse.Namespace(**{**vars(options), "rate": None, "iterations": options.unlimited})
+    patient = _patient(options)
     loop = LoopBench(choose_attention(patient, source)[0], build_mapper(mission_settings(patient)), VoxelGrid())
     with MappingBar(len(positions), "unlimited") as bar:
         for done, position in enumerate(positions, start=1):
@@ -140,6 +141,21 @@ def _gap(
     views = [HeldOutView.of(source.frame(position, size), regions) for position in held_out]
     rasterizer = choose_rasterizer(options.rasterizer, options.threads)
     return RateGap.of(in_time, loop.gaussians(), options.unlimited, views, rasterizer)
+
+
+def _patient(options: argparse.Namespace) -> argparse.Namespace:
+    return argparse.Namespace(**{**vars(options), "rate": None, "iterations": options.unlimited})
+
+
+def _check_gap(options: argparse.Namespace, source: Source, held_out: Sequence[int]) -> None:
+    """Say before two runs what would leave nothing to compare after them."""
+    mission_settings(_patient(options))
+    if not held_out:
+        raise InvalidInputError("--unlimited: expected at least 8 frames, so that one is held out; got fewer")
+    if not asked_regions(options, source):
+        raise InvalidInputError(
+            "--unlimited: expected regions to score, with --roi FILE.npz, --objects A,B or --roi-ball X,Y,Z,R; got none"
+        )
 
 
 def _says_what_matters(options: argparse.Namespace) -> bool:

@@ -113,7 +113,7 @@ def _add_common(parser: argparse.ArgumentParser, seeds: tuple[int, ...]) -> None
 
 
 def _homes(options: argparse.Namespace, pairs: Sequence[HomePair]) -> list[HomeScenePlan]:
-    return [HomeScenePlan(pair, options.frames or 60, options.views) for pair in pairs]
+    return [HomeScenePlan(pair, 60 if options.frames is None else options.frames, options.views) for pair in pairs]
 
 
 def _real(options: argparse.Namespace) -> list[ScenePlan]:

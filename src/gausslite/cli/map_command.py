@@ -16,11 +16,12 @@ from gausslite.datasets.selection import frame_size, select_frames
 from gausslite.datasets.source import Source
 from gausslite.domain.task import TaskGraph
 from gausslite.errors import GaussLiteError, InvalidInputError
+from gausslite.interrupts import AfterThisStep
 from gausslite.mapping.pace import Pace
 from gausslite.mapping.policies import TASK
 from gausslite.mission.build import Attentions, build_attention, build_mapper
 from gausslite.mission.options import add_budget, add_detector, add_policy, mission_settings, perception_settings
-from gausslite.mission.results import peak_rss_mib, prepare_folder, write_results
+from gausslite.mission.results import peak_rss_mib, prepare_file, prepare_folder, write_results
 from gausslite.mission.saved_run import last_frame, resume_run, save_run
 from gausslite.mission.settings import SceneKnowledge
 from gausslite.mission.turns import TaskPlan, Turn
@@ -68,12 +69,15 @@ def run(options: argparse.Namespace) -> int:
     mapper = TaskMapper(attention, build_mapper(settings), pace=Pace(settings.pace))
     prepare_folder(options.out)
     if options.save_state is not None:
-        prepare_folder(options.save_state.parent)
+        prepare_file(options.save_state)
+    last_index = -1
     if options.resume is not None:
         last_index = resume_run(options.resume, mapper, graph)
         positions = [position for position in positions if source.indices()[position] > last_index]
     mission = _Player(source, size, mapper, plan, attentions).play(positions, graph)
-    if mission.stopped is not None and not mission.outcomes:
+    if mission.outcomes:
+        last_index = mission.outcomes[-1].index
+    elif mission.stopped is not None:
         raise mission.stopped
     gaussians = mapper.gaussians()
     active = int(gaussians.active.sum())
@@ -94,11 +98,9 @@ def run(options: argparse.Namespace) -> int:
         "peak_rss_mib": peak_rss_mib(),
         "memory_mib": mapper.memory_mib(),
         "notes": list(mapper.notes),
-        "stopped_by": None if mission.stopped is None else str(mission.stopped),
     }
     write_results(options.out, gaussians, report)
-    if options.save_state is not None and mission.outcomes:
-        last_index = mission.outcomes[-1].index
+    if options.save_state is not None:
         save_run(options.save_state, mapper, plan.at(last_index), last_index)
     if mission.stopped is not None:
         # what was mapped until then is kept, and the exit code says that it is not all
@@ -112,11 +114,11 @@ def run(options: argparse.Namespace) -> int:
 
 @dataclass(frozen=True, slots=True)
 class _Mission:
-    """The outcomes of all frames, and the time they took; stopped is the bad frame that ended it early."""
+    """The outcomes of all frames, and their time; stopped is the bad frame, or the Ctrl-C, that ended it early."""
 
     outcomes: tuple[FrameOutcome, ...]
     seconds: float
-    stopped: GaussLiteError | None
+    stopped: GaussLiteError | KeyboardInterrupt | None
 
     def summary(self) -> dict[str, object]:
         """Totals for the report; hz is mapped frames per second of perception and mapping, without reading files."""
@@ -131,6 +133,7 @@ class _Mission:
             "seeded_in_keyframes": sum(outcome.reread.seeded for outcome in self.outcomes),
             "hz": len(mapped) / busy_s if busy_s > 0 else 0.0,
             "seconds": self.seconds,
+            "stopped_by": None if self.stopped is None else str(self.stopped) or "interrupted",
         }
 
 
@@ -148,10 +151,13 @@ class _Player:
         """Map these frames; graph is the task that the loop has now."""
         started_s = time.perf_counter()
         outcomes: list[FrameOutcome] = []
-        stopped: GaussLiteError | None = None
+        stopped: GaussLiteError | KeyboardInterrupt | None = None
         indices = self.source.indices()
-        with MappingBar(len(positions)) as bar:
+        with MappingBar(len(positions)) as bar, AfterThisStep() as interrupt:
             for position in positions:
+                if interrupt.asked:
+                    stopped = KeyboardInterrupt()
+                    break
                 try:
                     frame = self.source.frame(position, self.size)
                 except GaussLiteError as error:

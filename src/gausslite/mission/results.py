@@ -25,6 +25,13 @@ def prepare_folder(folder: Path) -> None:
         raise StorageError(f"{folder}: expected a folder that can be written, got {error.strerror}") from error
 
 
+def prepare_file(path: Path) -> None:
+    """Make the folder a file will lie in and check that it can be written there. Raises StorageError."""
+    if path.is_dir():
+        raise StorageError(f"{path}: expected the name of a file, got a folder")
+    prepare_folder(path.parent)
+
+
 def write_results(folder: Path, gaussians: Gaussians, report: Mapping[str, object]) -> None:
     """Write map.ply and report.json. Raises StorageError."""
     write_ply(folder / "map.ply", gaussians)

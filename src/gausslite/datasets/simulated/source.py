@@ -68,7 +68,7 @@ class HomeSettings:
     @property
     def world(self) -> str:
         """The home's name in a spec."""
-        return f"sim:home-{self.home}" if self.home else "sim:home"
+        return _world(self.home)
 
     @classmethod
     def parse(cls, query: str, home: int = 0) -> HomeSettings:
@@ -83,8 +83,14 @@ class HomeSettings:
                 chosen["size_px"] = (int(match.group(1)), int(match.group(2)))
             else:
                 wanted = "&".join([*(f"{name}=N" for name in _NUMBERS), "size=WxH", *(f"{n}=X" for n in _STRENGTHS)])
-                raise DatasetError(f"sim:home: {key}={value}: expected {wanted}, each of them optional")
+                raise DatasetError(
+                    f"{_world(home)}: {key}={value}: expected {wanted}, each of them optional; N whole, X 0 to 10"
+                )
         return cls(home, **chosen)
+
+
+def _world(home: int) -> str:
+    return f"sim:home-{home}" if home else "sim:home"
 
 
 @lru_cache(maxsize=2)

@@ -30,6 +30,7 @@ from gausslite.perception.vocabulary import head_of
 
 _WALKS = (0, 1)
 _FIRST_WALK_SHARE = 2 / 3
+_MOST_FRAMES = 100_000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -83,8 +84,8 @@ class HomeScenePlan:
 
     def __post_init__(self) -> None:
         for name, value in (("frames", self.frames), ("views", self.views)):
-            if value < 2:
-                raise InvalidInputError(f"{name}: expected at least 2, got {value}")
+            if not 2 <= value <= _MOST_FRAMES:
+                raise InvalidInputError(f"{name}: expected 2 to {_MOST_FRAMES}, got {value}")
 
     @property
     def name(self) -> str:
