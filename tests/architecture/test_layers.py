@@ -50,5 +50,5 @@ def test_help_lists_every_command_without_numpy() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
     assert done.returncode == 0, done.stderr
-    for command in ("map", "demo", "parse", "eval", "fuse", "bench"):
+    for command in ("map", "demo", "parse", "eval", "fuse", "models", "bench"):
         assert command in done.stdout

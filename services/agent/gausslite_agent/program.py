@@ -68,9 +68,10 @@ def _require_usable(settings: AgentSettings) -> None:
     if settings.out is not None:
         prepare_folder(settings.out)
     if settings.perception.model is not None:
-        from gausslite.perception.yolo import load_yolo
+        from gausslite.perception.families import Networks
 
-        load_yolo(settings.perception.model, settings.perception.threads)
+        asked = settings.perception
+        Networks(settings.perception.model, asked.segmenter, asked.vocabulary, asked.threads)
 
 
 async def _live(settings: AgentSettings, stand_in: StandIn | None, player: Player, uplink: Uplink | None) -> None:

@@ -158,6 +158,10 @@ def _plan(options: argparse.Namespace, stage: _Stage) -> TeamPlan:
         shared += ["--detector", str(options.detector.absolute())]
     if options.resegment:
         shared += ["--resegment"]
+    if options.segmenter is not None:
+        shared += ["--segmenter", options.segmenter]
+    if options.vocabulary is not None:
+        shared += ["--vocabulary", str(options.vocabulary.absolute())]
     if options.rate is not None:
         shared += ["--rate", str(options.rate)]
     if options.iterations is not None:

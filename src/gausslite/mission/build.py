@@ -15,7 +15,7 @@ from gausslite.perception.tracker import AttentionSettings
 from gausslite.render.choose import choose_rasterizer
 
 if TYPE_CHECKING:
-    from gausslite.perception.yolo import YoloSegDetector
+    from gausslite.perception.families import Networks
 
 
 def build_mapper(settings: MissionSettings) -> GaussianMapper:
@@ -35,34 +35,36 @@ class Attentions:
     def __init__(self, scene: SceneKnowledge, perception: PerceptionSettings) -> None:
         self._scene = scene
         self._perception = perception
-        self._yolo: YoloSegDetector | None = None
+        self._networks: Networks | None = None
         self._executor: ThreadPoolExecutor | None = None
 
     def to(self, graph: TaskGraph) -> Attention:
-        """Attention to a task: by the user's YOLO-seg file or, without one, by the scene's own ground truth.
+        """Attention to a task: by the user's model files or, without one, by the scene's own ground truth.
 
         With `beside` the network runs on a thread of its own. Raises ModelFileError for a bad file and
         InvalidInputError when there is neither file nor ground truth.
         """
         settings = AttentionSettings(up_axis=self._scene.up_axis)
         if self._perception.model is not None:
-            yolo = self._loaded(self._perception.model)
-            segmenter = yolo.segmenter() if self._perception.resegment else None
+            networks = self._loaded(self._perception.model)
+            detector = networks.detector
+            segmenter = networks.segmenter if self._perception.resegment else None
             if self._perception.beside:
                 self._executor = self._executor or ThreadPoolExecutor(1, "detector")
-                return AttentionBeside(graph, yolo, self._executor, settings, segmenter)
-            return TaskAttention(graph, yolo, settings, segmenter)
+                return AttentionBeside(graph, detector, self._executor, settings, segmenter)
+            return TaskAttention(graph, detector, settings, segmenter)
         if not self._scene.regions:
             raise InvalidInputError(
-                "detector: the sequence has no ground-truth regions; name a YOLO-seg ONNX file with --detector"
+                "detector: the sequence has no ground-truth regions; name an ONNX file with --detector"
             )
         from gausslite.perception.ground_truth import RegionDetector
 
         return TaskAttention(graph, RegionDetector(self._scene.regions), settings)
 
-    def _loaded(self, model: Path) -> YoloSegDetector:
-        if self._yolo is None:
-            from gausslite.perception.yolo import load_yolo
+    def _loaded(self, model: Path) -> Networks:
+        if self._networks is None:
+            from gausslite.perception.families import Networks
 
-            self._yolo = load_yolo(model, threads=self._perception.threads)
-        return self._yolo
+            asked = self._perception
+            self._networks = Networks(model, asked.segmenter, asked.vocabulary, asked.threads)
+        return self._networks

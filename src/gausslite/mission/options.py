@@ -14,6 +14,7 @@ from gausslite.mission.settings import DEFAULT_MAX_GAUSSIANS, MissionSettings, P
 from gausslite.optimize.view_fit import ViewPrior
 from gausslite.render.choose import BACKENDS
 
+_DETECTOR_HELP = "a YOLO-seg or Grounding DINO model (default: the source's ground truth)"
 _RELIEF_HELP = "what gives way, in order, where that time is short (default: words,seeding)"
 
 
@@ -38,10 +39,12 @@ def add_colour_camera(parser: argparse.ArgumentParser) -> None:
 
 
 def add_detector(parser: argparse.ArgumentParser) -> None:
-    """Add --detector and --resegment: what finds the task's nouns."""
+    """Add --detector, --segmenter, --vocabulary and --resegment: what finds the task's nouns and outlines them."""
     add = parser.add_argument_group("perception").add_argument
-    add("--detector", metavar="FILE.onnx", type=Path, help="a YOLO-seg model (default: the source's ground truth)")
-    add("--resegment", action="store_true", help="run the detector's masks on every frame (slower)")
+    add("--detector", metavar="FILE.onnx", type=Path, help=_DETECTOR_HELP)
+    add("--segmenter", metavar="FILE.onnx|yolo|cut", help="a FastSAM model, the detector's masks, or depth and colour")
+    add("--vocabulary", metavar="FILE.txt", type=Path, help="Grounding DINO's words (default: vocab.txt beside it)")
+    add("--resegment", action="store_true", help="cut boxes out anew on every frame (slower)")
 
 
 def add_policy(parser: argparse.ArgumentParser) -> None:
@@ -89,9 +92,14 @@ def add_voxel_size(parser: argparse.ArgumentParser) -> None:
 
 def perception_settings(options: argparse.Namespace) -> PerceptionSettings:
     """What add_detector and add_budget asked for: at a rate detections run beside, on one thread."""
-    if options.rate is None:
-        return PerceptionSettings(options.detector, options.resegment, options.threads)
-    return PerceptionSettings(options.detector, options.resegment, threads=1, beside=True)
+    return PerceptionSettings(
+        options.detector,
+        options.resegment,
+        options.threads if options.rate is None else 1,
+        beside=options.rate is not None,
+        segmenter=options.segmenter,
+        vocabulary=options.vocabulary,
+    )
 
 
 def mission_settings(options: argparse.Namespace) -> MissionSettings:

@@ -35,7 +35,10 @@ class SceneKnowledge:
 
 @dataclass(frozen=True, slots=True)
 class PerceptionSettings:
-    """What finds the task's nouns: a YOLO-seg file, or ground truth without one.
+    """What finds the task's nouns: a YOLO-seg or Grounding DINO file, or ground truth without one.
+
+    segmenter names what cuts boxes out: "yolo", "cut" or a FastSAM file; None takes the model's own masks or the cut.
+    vocabulary is Grounding DINO's; None looks for vocab.txt beside the model.
 
     resegment runs the network on frames between detections too; without it masks are cut by depth inside the
     re-projected boxes, which on a real kitchen is as exact at a third of the time. With beside, mapping does not wait
@@ -46,6 +49,8 @@ class PerceptionSettings:
     resegment: bool = False
     threads: int | None = None
     beside: bool = False
+    segmenter: str | None = None
+    vocabulary: Path | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -11,7 +11,7 @@ import numpy as np
 from gausslite.domain.frame import Frame
 from gausslite.domain.relevance import Detection
 from gausslite.errors import InvalidInputError, ModelFileError
-from gausslite.perception.detect import BoxFractions, concerns_many_objects
+from gausslite.perception.detect import Box, BoxFractions, concerns_many_objects
 from gausslite.perception.everything import EverythingSegmenter
 from gausslite.perception.vectors import TextVectors, classes_for
 from gausslite.perception.yolo_decode import Candidates, suppress
@@ -39,7 +39,7 @@ class YoloSettings:
 
 
 class YoloSegDetector:
-    """A Detector over one YOLO-seg file whose metadata names its classes."""
+    """A Detector, and a BoxDetector, over one YOLO-seg file whose metadata names its classes."""
 
     def __init__(
         self, model_path: Path, vectors: TextVectors | None = None, settings: YoloSettings | None = None
@@ -71,23 +71,41 @@ class YoloSegDetector:
 
     def detect(self, frame: Frame, queries: Sequence[str]) -> list[Detection]:
         """All instances of each query with their masks, best first; boxes that span too much are left out."""
-        wanted = {query: self._classes(query) for query in queries}
-        if not any(wanted.values()):
+        wanted = self._wanted(queries)
+        if not wanted:
             return []
         answer = self._network.answer(frame)
         found = self._distinct(answer.candidates(self._settings.min_score), wanted)
         masks = answer.masks(found)
-        many = concerns_many_objects(queries)
-        shares = (found.boxes_px[:, 2:] - found.boxes_px[:, :2]).prod(axis=1) / frame.depth_m.size
-        detections = []
+        return [
+            Detection(box.phrase, box.score, box.box_px, masks[row])
+            for row, box in self._answers(found, wanted, concerns_many_objects(queries), frame.depth_m.size)
+            if masks[row].any()
+        ]
+
+    def boxes(self, frame: Frame, queries: Sequence[str]) -> list[Box]:
+        """As `detect`, for others to cut out."""
+        wanted = self._wanted(queries)
+        if not wanted:
+            return []
+        found = self._distinct(self._network.answer(frame).candidates(self._settings.min_score), wanted)
+        answers = self._answers(found, wanted, concerns_many_objects(queries), frame.depth_m.size)
+        return [box for _, box in answers]
+
+    def _wanted(self, queries: Sequence[str]) -> dict[str, tuple[int, ...]]:
+        """The classes of each query that has any."""
+        return {query: classes for query in queries if (classes := self._classes(query))}
+
+    def _answers(
+        self, found: Candidates, wanted: Mapping[str, tuple[int, ...]], many: bool, pixels: int
+    ) -> Iterator[tuple[int, Box]]:
+        """The candidates that answer each query, with their rows; those that span too much are left out."""
+        shares = (found.boxes_px[:, 2:] - found.boxes_px[:, :2]).prod(axis=1) / pixels
         for query, indices in wanted.items():
             for row in np.flatnonzero(np.isin(found.classes, indices)):
-                limit = self._settings.box_fractions.limit(self.class_names[found.classes[row]], many)
-                if shares[row] <= limit and masks[row].any():
+                if shares[row] <= self._settings.box_fractions.limit(self.class_names[found.classes[row]], many):
                     left, top, right, bottom = (float(edge) for edge in found.boxes_px[row])
-                    box_px = (left, top, right, bottom)
-                    detections.append(Detection(query, float(found.scores[row]), box_px, masks[row]))
-        return detections
+                    yield int(row), Box(query, float(found.scores[row]), (left, top, right, bottom))
 
     def _distinct(self, found: Candidates, wanted: Mapping[str, tuple[int, ...]]) -> Candidates:
         """The candidates of the wanted classes, one an object."""

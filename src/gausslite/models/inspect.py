@@ -1,0 +1,51 @@
+"""What a model file is: checked from the outside in, down to its inputs and outputs and the family they belong to."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from gausslite.errors import ModelFileError
+from gausslite.perception.families import Family, family_of
+from gausslite.perception.model_file import open_session, require_listed_checksum, sha256_of
+
+
+@dataclass(frozen=True, slots=True)
+class ModelSheet:
+    """A file that a session could be made of; tensors as "name [shape] type"."""
+
+    path: Path
+    size_bytes: int
+    sha256: str
+    family: Family
+    provider: str
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+
+
+def inspect(path: Path) -> ModelSheet:
+    """Open a model and describe it. Raises ModelFileError when it is damaged, or of no family that GaussLite knows."""
+    session = open_session(path, threads=1)
+    described = [
+        tuple(f"{each.name} {each.shape} {each.type.removeprefix('tensor').strip('()')}" for each in side)
+        for side in (session.get_inputs(), session.get_outputs())
+    ]
+    family = family_of(path, session)
+    provider = str(session.get_providers()[0]).removesuffix("ExecutionProvider")
+    return ModelSheet(path, path.stat().st_size, sha256_of(path), family, provider, *described)
+
+
+def verify(path: Path, sha256: str | None) -> str:
+    """Say what was checked. Raises ModelFileError when the file is not what it should be."""
+    if not path.is_file():
+        raise ModelFileError(f"model {path}: expected a file, found {'a folder' if path.is_dir() else 'nothing'}")
+    checked = []
+    if sha256 is not None:
+        found = sha256_of(path)
+        if found != sha256:
+            raise ModelFileError(f"model {path}: expected SHA-256 {sha256}, got {found}")
+        checked.append("SHA-256")
+    require_listed_checksum(path)
+    if path.suffix == ".onnx":
+        checked.append(f"a whole {inspect(path).family} network")
+    return " and ".join(checked) or f"{path.stat().st_size} bytes; no SHA-256 is known for it"

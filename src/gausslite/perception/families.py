@@ -1,0 +1,105 @@
+"""Which kind of network a model file holds, told by its inputs and outputs, and the detector and segmenter it makes."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from pathlib import Path
+from typing import Any, Final
+
+from gausslite.errors import InvalidInputError, ModelFileError
+from gausslite.perception.detect import Detector, SegmentedDetector, Segmenter
+from gausslite.perception.model_file import open_session
+from gausslite.perception.yolo_decode import MASK_COEFFICIENTS
+
+VOCABULARY: Final = "vocab.txt"
+OWN, CUT = "yolo", "cut"
+
+
+class Family(StrEnum):
+    """The kinds of networks that are understood."""
+
+    GROUNDING_DINO = "Grounding DINO"
+    YOLO_SEG = "YOLO-seg or FastSAM"
+
+
+def family_of(path: Path, session: Any) -> Family:
+    """The family of an open model. Raises ModelFileError for an unknown one."""
+    from gausslite.perception.grounding import is_grounding
+
+    inputs, outputs = session.get_inputs(), session.get_outputs()
+    if is_grounding([each.name for each in inputs], [each.name for each in outputs]):
+        return Family.GROUNDING_DINO
+    image = len(inputs) == 1 and len(inputs[0].shape) == 4
+    # an open size is known once the network has run
+    sides = [each.shape[1] for each in outputs if len(each.shape) == 4]
+    masks = any(not isinstance(side, int) or side == MASK_COEFFICIENTS for side in sides)
+    if image and masks and len(outputs) == 2:
+        return Family.YOLO_SEG
+    came = " → ".join(", ".join(f"{each.name} {each.shape}" for each in side) for side in (inputs, outputs))
+    hint = " (boxes only, no masks)" if image and len(outputs) == 1 else ""
+    raise ModelFileError(f"model {path}: expected {' or '.join(Family)}, got {came}{hint}")
+
+
+class Networks:
+    """The detector and the segmenters of one mission, each file opened once."""
+
+    def __init__(self, detector: Path, segmenter: str | None, vocabulary: Path | None, threads: int | None) -> None:
+        """segmenter: "yolo" (the detector's own masks), "cut" (by depth and colour) or the path of a FastSAM file.
+
+        None takes the detector's own masks where it has some. Raises ModelFileError, InvalidInputError, KernelError.
+        """
+        family = family_of(detector, open_session(detector, threads))
+        if family is Family.GROUNDING_DINO:
+            self._open_grounding(detector, segmenter, vocabulary, threads)
+        else:
+            self._open_yolo(detector, segmenter, threads)
+
+    @property
+    def detector(self) -> Detector:
+        """What finds the task's nouns, with masks."""
+        return self._detector
+
+    @property
+    def segmenter(self) -> Segmenter:
+        """What cuts known boxes out of further images."""
+        return self._segmenter
+
+    def _open_grounding(self, path: Path, segmenter: str | None, vocabulary: Path | None, threads: int | None) -> None:
+        from gausslite.perception.grounding import GroundingDino, GroundingSettings
+        from gausslite.perception.grounding_text import BertTokenizer
+
+        if segmenter == OWN:
+            raise InvalidInputError(f"segmenter: {path} finds boxes only; expected cut or a FastSAM file, got {OWN}")
+        tokenizer = BertTokenizer(vocabulary or path.parent / VOCABULARY)
+        network = GroundingDino(path, tokenizer, GroundingSettings(threads=threads))
+        self._segmenter: Segmenter = _segmenter(segmenter or CUT, threads)
+        self._detector: Detector = SegmentedDetector(network, _in_turn(self._segmenter))
+
+    def _open_yolo(self, path: Path, segmenter: str | None, threads: int | None) -> None:
+        from gausslite.perception.yolo import load_yolo
+
+        network = load_yolo(path, threads)
+        if segmenter in (None, OWN):
+            self._segmenter, self._detector = network.segmenter(), network
+        else:
+            self._segmenter = _segmenter(str(segmenter), threads)
+            self._detector = SegmentedDetector(network, _in_turn(self._segmenter))
+
+
+def _segmenter(name: str, threads: int | None) -> Segmenter:
+    """The cut, or a file's masks of everything."""
+    from gausslite.perception.cut import CutSegmenter
+
+    if name == CUT:
+        return CutSegmenter()
+    from gausslite.perception.everything import EverythingSegmenter
+    from gausslite.perception.yolo_network import YoloSegNetwork
+
+    return EverythingSegmenter(YoloSegNetwork(Path(name), threads))
+
+
+def _in_turn(first: Segmenter) -> tuple[Segmenter, ...]:
+    """A network may see nothing where the detector saw something; then depth and colour still cut it out."""
+    from gausslite.perception.cut import CutSegmenter
+
+    return (first,) if isinstance(first, CutSegmenter) else (first, CutSegmenter())
