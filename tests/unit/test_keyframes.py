@@ -20,7 +20,7 @@ def stored(settings: KeyframeSettings, frames: int) -> KeyframeStore:
 
 
 def test_every_fifth_frame_is_kept_and_the_window_holds_the_latest() -> None:
-    store = stored(KeyframeSettings(every=5, window=3), 23)
+    store = stored(KeyframeSettings(every=5, window=3, region_views=0), 23)
     assert [view.keyframe.frame.index for view in store.window] == [10, 15, 20]
     assert [keyframe.frame.index for keyframe in store.buffer] == [0, 5, 10, 15, 20]
 
@@ -31,6 +31,32 @@ def test_the_buffer_is_bounded_and_stays_spread_over_the_mission() -> None:
     assert len(kept) == 8
     assert (kept[0], kept[-1]) == (0, 63)
     assert max(np.diff(kept)) <= 20
+
+
+def test_frames_that_show_the_region_stay_ready_to_train_on_and_spread_over_the_mission() -> None:
+    store = stored(KeyframeSettings(every=8, window=2, region_views=6), 40)
+    kept = [view.keyframe.frame.index for view in store.window]
+    assert kept[-2:] == [24, 32]
+    assert len(set(kept)) == len(kept) <= 8
+    assert {0, 39} <= set(kept)
+    assert max(np.diff(sorted(kept))) <= 16
+
+
+def test_a_frame_without_the_region_is_kept_at_its_turn_only() -> None:
+    settings, rasterizer = KeyframeSettings(every=4, region_views=6), CpuRasterizer(threads=1)
+    store = KeyframeStore(settings)
+    for index in range(9):
+        store.offer(window_view(Keyframe(wall_frame(index), RelevanceMap.nothing(48, 64)), rasterizer, settings))
+    assert [view.keyframe.frame.index for view in store.window] == [0, 4, 8]
+
+
+def test_a_view_of_the_region_goes_once_it_turns_out_not_to_show_it() -> None:
+    settings, rasterizer = KeyframeSettings(every=4, region_views=6), CpuRasterizer(threads=1)
+    store = stored(settings, 3)
+    wrong = store.window[0].keyframe
+    assert wrong.frame.index == 1
+    store.revise(window_view(Keyframe(wrong.frame, RelevanceMap.nothing(48, 64)), rasterizer, settings))
+    assert [view.keyframe.frame.index for view in store.window] == [2, 0]
 
 
 def test_tiles_touch_the_region_and_its_margin() -> None:

@@ -54,7 +54,7 @@ def loop(max_gaussians: int = 400, window: int = 2) -> TaskMapper:
     mapper_settings = MapperSettings(
         max_gaussians=max_gaussians,
         seeding=SeedingSettings(first_frame_seeds=60_000, later_seeds=20_000),
-        keyframes=KeyframeSettings(every=2, window=window, buffer=3),
+        keyframes=KeyframeSettings(every=2, window=window, buffer=3, region_views=2),
         density=DensitySettings(densify_every=7, prune_every=5),
         view_prior=ViewPrior(0.01, 0.5, 0.1, 0.05),
     )
@@ -134,7 +134,7 @@ def test_another_task_or_too_small_a_cap_is_told(saved: Path) -> None:
         resume_run(saved, loop(), None)
     with pytest.raises(MapFileError, match="max_gaussians: expected at least"):
         resume_run(saved, loop(max_gaussians=10), GRAPH)
-    with pytest.raises(MapFileError, match="expected at most 1 and 3"):
+    with pytest.raises(MapFileError, match="expected at most 1, 2 and 3"):
         resume_run(saved, loop(window=1), GRAPH)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -108,18 +108,25 @@ def tiles_of(region: Bool[ndarray, "h w"], margin_px: int) -> Bool[ndarray, "th 
 
 
 class KeyframeStore:
-    """Every `every`th mapped frame; the latest `window` are ready to train on, at most `buffer` are remembered."""
+    """Every `every`th mapped frame; the latest `window` are ready to train on, at most `buffer` are remembered.
+
+    Beside them `region_views` frames that show the task's region are ready to train on, whenever they were mapped.
+    """
 
     def __init__(self, settings: KeyframeSettings) -> None:
         self._settings = settings
-        self._window: list[WindowView] = []
+        self._latest: list[WindowView] = []
+        self._region: list[WindowView] = []
         self._buffer: list[Keyframe] = []
         self._offered = 0
 
     @property
     def window(self) -> tuple[WindowView, ...]:
-        """The most recent keyframes, oldest first."""
-        return tuple(self._window)
+        """What is ready to train on: the views of the region that are no longer or never were among the most recent
+        keyframes, and those, each oldest first.
+        """
+        latest = {id(view.keyframe) for view in self._latest}
+        return (*(view for view in self._region if id(view.keyframe) not in latest), *self._latest)
 
     @property
     def buffer(self) -> tuple[Keyframe, ...]:
@@ -127,19 +134,27 @@ class KeyframeStore:
         return tuple(self._buffer)
 
     def offer(self, view: WindowView) -> None:
-        """Keep this mapped frame if it is the turn of a keyframe."""
-        due = self._offered % self._settings.every == 0
+        """Keep this mapped frame if it shows the region or it is the turn of a keyframe."""
+        settings = self._settings
+        due = self._offered % settings.every == 0
         self._offered += 1
+        if view.shows_region:
+            self._keep_for_region([*self._region, view])
         if not due:
             return
-        self._window = [*self._window, view][-self._settings.window :]
+        self._latest = [*self._latest, view][-settings.window :]
         self._buffer.append(view.keyframe)
-        if len(self._buffer) > self._settings.buffer:
-            self._thin()
+        if len(self._buffer) > settings.buffer:
+            del self._buffer[_most_crowded(self._buffer)]
 
     def revise(self, view: WindowView) -> None:
-        """Put what came to be known later in the place of a frame that is still in the window."""
-        self._window = [view if _same_frame(old.keyframe, view.keyframe) else old for old in self._window]
+        """Put what came to be known later in the place of a frame that is still in the window.
+
+        A frame that turns out not to show the region stays only as one of the most recent keyframes.
+        """
+        revised = [view if _same_frame(old.keyframe, view.keyframe) else old for old in self._region]
+        self._region = [each for each in revised if each.shows_region or not each.keyframe.judged]
+        self._latest = [view if _same_frame(old.keyframe, view.keyframe) else old for old in self._latest]
         self._buffer = [view.keyframe if _same_frame(old, view.keyframe) else old for old in self._buffer]
 
     def begin_task(self) -> None:
@@ -149,32 +164,36 @@ class KeyframeStore:
             id(old): replace(old, relevance=nothing[old.frame.depth_m.shape], judged=False) for old in self._held()
         }
         self._buffer = [fresh[id(keyframe)] for keyframe in self._buffer]
-        self._window = [
-            replace(view, keyframe=fresh[id(view.keyframe)], active_tiles=np.zeros_like(view.active_tiles))
-            for view in self._window
-        ]
+        views = {
+            id(view.keyframe): replace(
+                view, keyframe=fresh[id(view.keyframe)], active_tiles=np.zeros_like(view.active_tiles)
+            )
+            for view in self.window
+        }
+        self._latest = [views[id(view.keyframe)] for view in self._latest]
+        self._region = [views[id(view.keyframe)] for view in self._region]
 
     @property
     def next_to_judge(self) -> Keyframe | None:
         """The newest keyframe that is not judged; None when all are."""
-        newest_first = (*(view.keyframe for view in reversed(self._window)), *reversed(self._buffer))
+        newest_first = (*(view.keyframe for view in reversed(self.window)), *reversed(self._buffer))
         return next((keyframe for keyframe in newest_first if not keyframe.judged), None)
 
     def judge(self, keyframe: Keyframe, view_of: Callable[[Keyframe], WindowView]) -> None:
-        """Put a judged keyframe in its place; one that shows the region comes back into the window if there is room.
-
-        Room is made by the oldest view that is judged and does not show it.
-        """
+        """Put a judged keyframe in its place; one that shows the region is ready to train on again."""
         self._buffer = [keyframe if _same_frame(old, keyframe) else old for old in self._buffer]
-        if any(_same_frame(view.keyframe, keyframe) for view in self._window):
-            self.revise(view_of(keyframe))
-        elif keyframe.relevance.roi.any() and self._make_room():
-            # it is older than all that were judged before it
-            self._window.insert(0, view_of(keyframe))
+        shows_region = bool(keyframe.relevance.roi.any())
+        ready = any(_same_frame(view.keyframe, keyframe) for view in self.window)
+        if not ready and not shows_region:
+            return
+        view = view_of(keyframe)
+        self.revise(view)
+        if shows_region and not any(_same_frame(each.keyframe, keyframe) for each in self._region):
+            self._keep_for_region(sorted([*self._region, view], key=_captured_ns))
 
     def of(self, frame: Frame) -> WindowView | None:
         """The window's view of a frame as it came; None where it is no keyframe of the window (any more)."""
-        return next((view for view in self._window if view.keyframe.as_recorded is frame), None)
+        return next((view for view in self.window if view.keyframe.as_recorded is frame), None)
 
     @property
     def image_bytes(self) -> int:
@@ -182,50 +201,56 @@ class KeyframeStore:
         return sum(array.nbytes for keyframe in self._held() for array in keyframe.state().values())
 
     def state(self) -> State:
-        """All keyframes once, and which of them are the window and which the buffer."""
-        window = [view.keyframe for view in self._window]
-        places = {id(keyframe): place for place, keyframe in enumerate(self._held())}
+        """All keyframes once, and which of them are the latest, views of the region, and the buffer."""
+        held = self._held()
+        places = {id(keyframe): place for place, keyframe in enumerate(held)}
         state: dict[str, NDArray[Any]] = {
-            "window": whole_numbers(*(places[id(keyframe)] for keyframe in window)),
+            "window": whole_numbers(*(places[id(view.keyframe)] for view in self._latest)),
+            "region": whole_numbers(*(places[id(view.keyframe)] for view in self._region)),
             "buffer": whole_numbers(*(places[id(keyframe)] for keyframe in self._buffer)),
             "offered": whole_numbers(self._offered),
         }
-        for place, keyframe in enumerate(self._held()):
+        for place, keyframe in enumerate(held):
             state |= nested(str(place), keyframe.state())
         return state
 
     def restore(self, state: State, view_of: Callable[[Keyframe], WindowView]) -> None:
         """Take over the keyframes of another store; view_of makes one ready to train on. Raises MapFileError."""
-        window, buffer = (take_counts(state, name, len(state.get(name, ()))) for name in ("window", "buffer"))
-        if len(window) > self._settings.window or len(buffer) > self._settings.buffer:
-            raise MapFileError(
-                f"state keyframes: expected at most {self._settings.window} and {self._settings.buffer}, "
-                f"got {len(window)} and {len(buffer)}"
-            )
-        keyframes = {place: Keyframe.of(part(state, str(place))) for place in sorted({*window, *buffer})}
-        self._window = [view_of(keyframes[place]) for place in window]
+        settings, lists = self._settings, ("window", "region", "buffer")
+        latest, region, buffer = (take_counts(state, name, len(state.get(name, ()))) for name in lists)
+        most = settings.window, settings.region_views, settings.buffer
+        came = len(latest), len(region), len(buffer)
+        if any(count > limit for count, limit in zip(came, most, strict=True)):
+            limits, counts = ("{}, {} and {}".format(*numbers) for numbers in (most, came))
+            raise MapFileError(f"state keyframes ({', '.join(lists)}): expected at most {limits}, got {counts}")
+        keyframes = {place: Keyframe.of(part(state, str(place))) for place in sorted({*latest, *region, *buffer})}
+        views = {place: view_of(keyframes[place]) for place in sorted({*latest, *region})}
+        self._latest = [views[place] for place in latest]
+        self._region = [views[place] for place in region]
         self._buffer = [keyframes[place] for place in buffer]
         [self._offered] = take_counts(state, "offered", 1)
 
     def _held(self) -> list[Keyframe]:
-        """Every keyframe once."""
-        return list(dict.fromkeys([*self._buffer, *(view.keyframe for view in self._window)]))
+        """Every keyframe once, the buffer's first."""
+        views = (*self._latest, *self._region)
+        return list(dict.fromkeys([*self._buffer, *(view.keyframe for view in views)]))
 
-    def _make_room(self) -> bool:
-        """Let one view go from a full window that does without it; False where all of them are needed."""
-        if len(self._window) < self._settings.window:
-            return True
-        idle = [i for i, view in enumerate(self._window) if view.keyframe.judged and not view.shows_region]
-        if idle:
-            del self._window[idle[0]]
-        return bool(idle)
+    def _keep_for_region(self, views: list[WindowView]) -> None:
+        """These are the views of the region, without the one that is missed least where they are too many."""
+        if len(views) > self._settings.region_views:
+            del views[_most_crowded([view.keyframe for view in views])]
+        self._region = views[: self._settings.region_views]
 
-    def _thin(self) -> None:
-        """Drop the keyframe that is closest in time to its neighbours; the first and the last stay."""
-        times = np.array([keyframe.frame.capture_time_ns for keyframe in self._buffer])
-        gaps = times[2:] - times[:-2]
-        drop = 1 + int(np.argmin(gaps)) if len(gaps) else 0
-        del self._buffer[drop]
+
+def _captured_ns(view: WindowView) -> int:
+    return view.keyframe.frame.capture_time_ns
+
+
+def _most_crowded(keyframes: Sequence[Keyframe]) -> int:
+    """The place of the keyframe that is closest in time to its neighbours; the first and the last are spared."""
+    times = np.array([keyframe.frame.capture_time_ns for keyframe in keyframes])
+    gaps = np.abs(times[2:] - times[:-2])  # a second recording's clock may begin anew
+    return 1 + int(np.argmin(gaps)) if len(gaps) else 0
 
 
 def _same_frame(a: Keyframe, b: Keyframe) -> bool:

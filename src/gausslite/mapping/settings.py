@@ -86,20 +86,24 @@ class SeedingSettings:
 class KeyframeSettings:
     """Which frames are kept to train on: every `every`th, the `window` latest of them, and `buffer` of the mission.
 
+    region_views: of all frames that show the task's region so many more stay ready to train on, spread over the
+    mission; 0 is the paper's window. Each takes as much memory as a frame of the window.
     surroundings_weight, 0 to 1: what pixels beside the region count in the active phase's loss, in the tiles that it
-    draws anyway; 0 is the paper's binary mask.
+    draws anyway; 0 is the paper's binary mask, which lets what stands beside the region move as it likes.
     """
 
     every: int = 5
     window: int = 24
     buffer: int = 96
+    region_views: int = 24
     roi_margin_px: int = 5
-    surroundings_weight: float = 0.0
+    surroundings_weight: float = 0.3
 
     def __post_init__(self) -> None:
         for name in ("every", "window", "buffer"):
             _require(getattr(self, name) >= 1, f"keyframes {name}", "at least 1", getattr(self, name))
-        _require(self.roi_margin_px >= 0, "keyframes roi_margin_px", "at least 0", self.roi_margin_px)
+        for name in ("region_views", "roi_margin_px"):
+            _require(getattr(self, name) >= 0, f"keyframes {name}", "at least 0", getattr(self, name))
         weight = self.surroundings_weight
         _require(0 <= weight <= 1, "keyframes surroundings_weight", "0 to 1", weight)
 
