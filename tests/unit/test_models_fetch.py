@@ -220,7 +220,13 @@ def test_the_command_lists_fetches_verifies_and_inspects(tmp_path, capsys, monke
     assert main(["models", "verify", path]) == 0
     assert main(["models", "inspect", path]) == 0
     said = capsys.readouterr().out
-    for expected in (path, "here", "a whole YOLO-seg or FastSAM network", "images [1, 3, 64, 64] float", "CPU"):
+    for expected in (
+        path,
+        "here",
+        "the checksum in SHA256SUMS and a whole YOLO-seg or FastSAM network",
+        "images [1, 3, 64, 64] float",
+        "CPU",
+    ):
         assert expected in said
     (folder / "tiny.onnx").write_bytes(shelf.data[:-1])
     assert main(["models", "verify", path]) == 2

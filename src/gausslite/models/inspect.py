@@ -7,7 +7,7 @@ from pathlib import Path
 
 from gausslite.errors import ModelFileError
 from gausslite.perception.families import Family, family_of
-from gausslite.perception.model_file import open_session, require_listed_checksum, sha256_of
+from gausslite.perception.model_file import CHECKSUMS, listed_checksum, open_session, require_listed_checksum, sha256_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,6 +46,8 @@ def verify(path: Path, sha256: str | None) -> str:
             raise ModelFileError(f"model {path}: expected SHA-256 {sha256}, got {found}")
         checked.append("SHA-256")
     require_listed_checksum(path)
+    if listed_checksum(path) is not None:
+        checked.append(f"the checksum in {CHECKSUMS}")
     if path.suffix == ".onnx":
         checked.append(f"a whole {inspect(path).family} network")
     return " and ".join(checked) or f"{path.stat().st_size} bytes; no SHA-256 is known for it"
