@@ -65,6 +65,10 @@ class UnavailableError(GaussLiteError):
     """A service is starting, draining or cannot be reached."""
 
 
+class LanguageModelError(GaussLiteError):
+    """A language model failed, took too long, or answered what is no task graph."""
+
+
 class StorageError(GaussLiteError):
     """Durable storage refused a write (disk full, folder not writable)."""
 

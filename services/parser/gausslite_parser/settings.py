@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 import argparse
+import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+
+from gausslite.task.backends import BackendSettings, add_backend, backend_of
 
 DEFAULT_LISTEN = "127.0.0.1:50051"
 
 
 @dataclass(frozen=True, slots=True)
 class ParserSettings:
-    """Where to listen: HOST:PORT (port 0 = any free one) or unix:PATH."""
+    """Where to listen, HOST:PORT (port 0 = any free one) or unix:PATH, and who reads the tasks."""
 
     listen: str = DEFAULT_LISTEN
+    backend: BackendSettings = field(default_factory=BackendSettings)
 
 
 def parse_arguments(arguments: Sequence[str] | None = None) -> ParserSettings:
-    """Settings from the command line; ends the process with code 2 on a wrong option."""
+    """Settings from the command line; ends the process with code 2 on a wrong option. Raises InvalidInputError."""
     parser = argparse.ArgumentParser(
         prog="gausslite-parser", description="Serve gausslite.v1.ParserService: task text in, task graph out."
     )
@@ -27,4 +31,6 @@ def parse_arguments(arguments: Sequence[str] | None = None) -> ParserSettings:
         metavar="ADDRESS",
         help="HOST:PORT (port 0 = any free one) or unix:PATH; default %(default)s",
     )
-    return ParserSettings(parser.parse_args(arguments).listen)
+    add_backend(parser)
+    options = parser.parse_args(arguments)
+    return ParserSettings(options.listen, backend_of(options, os.environ))

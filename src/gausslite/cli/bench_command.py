@@ -10,6 +10,7 @@ from pathlib import Path
 
 from gausslite.cli import bench_loop_command
 from gausslite.cli.bench_gpu import run_gpu
+from gausslite.cli.bench_parser import configure_parser
 from gausslite.cli.bench_quality import configure_ablation, configure_quality
 from gausslite.cli.bench_retask import configure_retask
 from gausslite.evaluation.bench_cycles import FLOOR_CYCLES, BlockCost
@@ -29,6 +30,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     bench_loop_command.configure(benches.add_parser("loop", help=summary, description=f"Measure {summary}."))
     summary = "training on a GPU, beside gsplat called plainly"
     _configure_gpu(benches.add_parser("gpu", help=summary, description=f"Measure {summary}."))
+    summary = "a task parser's graphs on sentences whose graphs are known"
+    configure_parser(benches.add_parser("parser", help=summary, description=f"Score {summary}."))
     summary = "every policy's maps on held-out views, at the same budget"
     configure_quality(benches.add_parser("quality", help=summary, description=f"Score {summary}."))
     summary = "the paper's components, switched on one by one"

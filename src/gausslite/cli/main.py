@@ -21,7 +21,7 @@ _COMMANDS = {
     "eval": "score a map on frames of a sequence, inside regions and over the whole image",
     "fuse": "vote several map files into one, voxel by voxel",
     "models": "list, fetch, verify and inspect the model files that find and outline objects",
-    "bench": "measure the rasterizer, the whole mapping loop, the GPU, or the quality of maps",
+    "bench": "measure the rasterizer, the whole mapping loop, the GPU, the quality of maps, or a task parser",
 }
 _MODULES = {name: f"gausslite.cli.{name}_command" for name in _COMMANDS}
 

@@ -4,22 +4,23 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 
 from gausslite.domain.task import TaskGraph
+from gausslite.task.backends import add_backend, backend_of, open_parser
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the options of `gausslite parse`."""
     parser.add_argument("text", metavar="TEXT", help='for example "Pick up the mug on the table"')
     parser.add_argument("--json", action="store_true", help="print JSON for scripts")
+    add_backend(parser)
     parser.set_defaults(run=run)
 
 
 def run(options: argparse.Namespace) -> int:
     """Parse and print."""
-    from gausslite.task.rules import RuleParser
-
-    graph = RuleParser().parse(options.text)
+    graph = open_parser(backend_of(options, os.environ)).parse(options.text)
     print(json.dumps(as_json(graph)) if options.json else _as_text(graph))
     return 0
 

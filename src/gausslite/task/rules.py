@@ -5,9 +5,10 @@ from __future__ import annotations
 from gausslite.domain.task import TaskGraph
 from gausslite.errors import TaskError
 from gausslite.task.graph_builder import GraphBuilder
-from gausslite.task.parser import normalise_text, task_id_of
+from gausslite.task.ground import grounded_graph
+from gausslite.task.parser import normalise_text
 from gausslite.task.reading import Kind, Piece, read
-from gausslite.task.validate import EXAMPLE, require_graph, require_task_text
+from gausslite.task.validate import EXAMPLE, require_task_text
 
 
 class RuleParser:
@@ -24,16 +25,7 @@ class RuleParser:
         draft = builder.finish()
         if not draft.targets:
             raise TaskError(_nothing_named(text, tuple(draft.excluded)))
-        graph = TaskGraph(
-            task_id=task_id_of(text),
-            text=text.strip(),
-            targets=tuple(draft.targets),
-            anchors=tuple(draft.anchors),
-            relations=tuple(draft.relations),
-            warnings=tuple(draft.warnings),
-        )
-        require_graph(graph)
-        return graph
+        return grounded_graph(text, draft.targets, draft.anchors, draft.relations, draft.warnings)
 
 
 def _require_sense(text: str, pieces: list[Piece]) -> None:

@@ -1,0 +1,129 @@
+"""Make a graph of what a parser found, and keep nothing in it that the sentence does not say."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from gausslite.domain.task import Relation, TaskGraph
+from gausslite.errors import TaskError
+from gausslite.task import lexicon
+from gausslite.task.parser import normalise_text, task_id_of
+from gausslite.task.phrases import noun_phrase
+from gausslite.task.reading import tokens_of
+from gausslite.task.singular import singular
+from gausslite.task.validate import EXAMPLE, LIMITS, require_graph, require_task_text
+from gausslite.task.words import words
+
+# words for any object: they, or a place, a "this" or an "everything" in the sentence, entail one another
+_ANY_OBJECT = (
+    lexicon.GENERIC
+    | lexicon.PLACES
+    | lexicon.ROOMS
+    | {word for word, noun in lexicon.STAND_INS.items() if noun == "object"}
+    | words("this that these those it them one ones whatever everywhere")
+)
+_PEOPLE = words(
+    "person people man woman child baby kid human pedestrian worker patient visitor guest user operator nurse doctor "
+    "technician someone anyone everyone somebody anybody everybody who whoever"
+)
+_SAME = tuple(
+    words(line)
+    for line in (
+        "sofa couch", "fridge refrigerator", "tv television", "bike bicycle", "phone cellphone telephone smartphone",
+        "trash garbage rubbish litter waste", "tap faucet", "cupboard cabinet", "rug carpet", "elevator lift",
+        "mug cup",
+        "laptop notebook computer", "bin can", "photo picture", "shelf bookshelf", "purse handbag", "plane airplane",
+    )
+)  # fmt: skip
+_ARTICLES = words("a an the this that these those my your his her its our their some any all every each")
+
+
+def grounded_graph(
+    text: str,
+    targets: Sequence[str],
+    anchors: Sequence[str],
+    relations: Sequence[Relation],
+    warnings: Sequence[str] = (),
+) -> TaskGraph:
+    """The one way from any parser's answer to a task graph.
+
+    Phrases lose their article and plural. A target or anchor whose head noun the sentence neither contains nor entails
+    is dropped, a relation between nouns that are not listed too; `warnings` names both. Raises TaskError when the
+    text is no task, no target is left, or the graph is out of bounds.
+    """
+    require_task_text(text)
+    said = _words_of(text)
+    notes = list(warnings)
+
+    def keep(role: str, phrases: Sequence[str]) -> tuple[str, ...]:
+        plain = [(phrase, plain_phrase(phrase)) for phrase in phrases]
+        notes.extend(
+            f"{role} {_short(phrase)} is not in the sentence: it is dropped"
+            for phrase, noun in plain
+            if not _is_said(noun, said)
+        )
+        return tuple(dict.fromkeys(noun for _, noun in plain if _is_said(noun, said)))
+
+    kept_targets, kept_anchors = keep("target", targets), keep("anchor", anchors)
+    if not kept_targets:
+        shown = " ".join(text.split())[:60]
+        raise TaskError(
+            f"task targets: expected at least one object of the sentence, such as in {EXAMPLE}, got {shown!r}"
+        )
+    graph = TaskGraph(
+        task_id=task_id_of(text),
+        text=text.strip(),
+        targets=kept_targets,
+        anchors=kept_anchors,
+        relations=_between_known(relations, kept_targets, kept_anchors, notes.append),
+        warnings=tuple(notes[: LIMITS.max_warnings]),
+    )
+    require_graph(graph)
+    return graph
+
+
+def plain_phrase(phrase: str) -> str:
+    """A noun phrase as a detector gets it: lower case, no article, the head in the singular, nothing after "of"."""
+    tokens = normalise_text(phrase).split(" of ")[0].split()
+    while len(tokens) > 1 and tokens[0] in _ARTICLES:
+        tokens = tokens[1:]
+    return noun_phrase(tokens, False, False).text if tokens else ""
+
+
+def _between_known(
+    relations: Sequence[Relation], targets: tuple[str, ...], anchors: tuple[str, ...], note: Callable[[str], None]
+) -> tuple[Relation, ...]:
+    kept: dict[Relation, None] = {}
+    for each in relations:
+        relation = Relation(each.predicate, plain_phrase(each.target), plain_phrase(each.anchor))
+        if relation.target in targets and relation.anchor in anchors:
+            kept[relation] = None
+        else:
+            note(
+                f"{each.predicate} joins {_short(each.target)} to {_short(each.anchor)}, not both known: it is dropped"
+            )
+    return tuple(kept)
+
+
+def _short(phrase: str) -> str:
+    return repr(phrase[: LIMITS.max_phrase_chars])
+
+
+def _words_of(text: str) -> frozenset[str]:
+    """Every word of a sentence as it stands and in the singular, the parts of hyphenated words too."""
+    tokens = tokens_of(normalise_text(text).replace("-", " ")) + normalise_text(text).split()
+    bare = [token.strip(".,;:!?()\"'").removesuffix("'s") for token in tokens]
+    return frozenset(bare) | frozenset(singular(token) for token in bare) | frozenset(tokens)
+
+
+def _is_said(phrase: str, said: frozenset[str]) -> bool:
+    head = phrase.split()[-1] if phrase else ""
+    if not head:
+        return False
+    if head in said or head.split("-")[-1] in said:
+        return True
+    if head in lexicon.GENERIC:
+        return bool(said & _ANY_OBJECT)
+    if head == "person":
+        return bool(said & _PEOPLE)
+    return any(head in group and said & group for group in _SAME)

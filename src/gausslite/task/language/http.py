@@ -1,0 +1,163 @@
+"""Any server that speaks OpenAI's chat completions: one POST, one deadline, one bounded answer."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import math
+import socket
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Any, Final
+from urllib.parse import urlsplit
+
+from gausslite.errors import InvalidInputError, LanguageModelError
+from gausslite.task.language.model import MAX_ANSWER_BYTES, Message
+from gausslite.task.language.prompt import ANSWER_SCHEMA
+
+_MAX_ANSWER_TOKENS: Final = 1024
+
+
+class ResponseFormat(StrEnum):
+    """How a server is asked for JSON: not all of them know every dialect."""
+
+    JSON_SCHEMA = "json_schema"
+    JSON_OBJECT = "json_object"
+    NONE = "none"
+
+
+@dataclass(frozen=True, slots=True)
+class HttpSettings:
+    """url: the server's base, such as http://localhost:8000/v1; the key is never shown."""
+
+    url: str
+    model: str
+    response_format: ResponseFormat = ResponseFormat.JSON_SCHEMA
+    timeout_s: float = 10.0
+    api_key: str | None = field(default=None, repr=False)
+
+    def __post_init__(self) -> None:
+        try:
+            parts = urlsplit(self.url)
+            usable = parts.scheme in ("http", "https") and bool(parts.hostname) and parts.port != 0
+        except ValueError:
+            usable = False
+        if not usable or not self.url.isascii() or any(character.isspace() for character in self.url):
+            raise InvalidInputError("backend http url: expected http://localhost:8000/v1 or alike, got another thing")
+        if parts.username is not None or parts.password is not None or parts.query or parts.fragment:
+            raise InvalidInputError("backend http url: expected no user, password, query or fragment, got one")
+        if not self.model.strip():
+            raise InvalidInputError("backend http model: expected the name of a model, got none")
+        if not (math.isfinite(self.timeout_s) and 0 < self.timeout_s <= 600):
+            raise InvalidInputError(f"backend http timeout: expected up to 600 seconds, got {self.timeout_s}")
+        if self.api_key is not None and not (self.api_key.isascii() and self.api_key.isprintable()):
+            raise InvalidInputError("backend http key: expected printable ASCII, got other characters")
+
+
+class HttpLanguageModel:
+    """A LanguageModel behind a URL. Follows no redirect, so that the key goes nowhere else."""
+
+    def __init__(self, settings: HttpSettings) -> None:
+        self._settings = settings
+        self._parts = urlsplit(settings.url)
+
+    @property
+    def version(self) -> str:
+        """The server, the model's name and the dialect."""
+        return f"{self._settings.url} {self._settings.model} {self._settings.response_format}"
+
+    def complete(self, messages: Sequence[Message]) -> str:
+        """The text of the first choice. Raises LanguageModelError."""
+        connection = self._connection()
+        deadline_s = time.monotonic() + self._settings.timeout_s
+        try:
+            with _cut_at(deadline_s) as (cut, sockets):
+                try:
+                    connection.connect()
+                    sockets.append(connection.sock)
+                    status, body = self._exchange(connection, messages)
+                except (OSError, http.client.HTTPException, ValueError) as error:
+                    if cut.is_set() or isinstance(error, TimeoutError):
+                        within = f"{self._settings.timeout_s:g} s"
+                        raise LanguageModelError(f"language model: no answer within {within}") from None
+                    raise LanguageModelError(f"language model: the call failed with {type(error).__name__}") from None
+        finally:
+            connection.close()
+        if cut.is_set():
+            raise LanguageModelError(f"language model: no answer within {self._settings.timeout_s:g} s")
+        if status != http.client.OK:
+            raise LanguageModelError(f"language model: expected status 200, got {status}")
+        return _content_of(body)
+
+    def _connection(self) -> http.client.HTTPConnection:
+        kind = http.client.HTTPSConnection if self._parts.scheme == "https" else http.client.HTTPConnection
+        return kind(self._parts.hostname or "", self._parts.port, timeout=self._settings.timeout_s)
+
+    def _exchange(self, connection: http.client.HTTPConnection, messages: Sequence[Message]) -> tuple[int, bytes]:
+        headers = {"Content-Type": "application/json", "Accept": "application/json"}
+        if self._settings.api_key:
+            headers["Authorization"] = f"Bearer {self._settings.api_key}"
+        body = json.dumps(self._request(messages)).encode()
+        connection.request("POST", f"{self._parts.path.rstrip('/')}/chat/completions", body, headers)
+        with connection.getresponse() as response:
+            answer = response.read(MAX_ANSWER_BYTES + 1)
+            if len(answer) > MAX_ANSWER_BYTES:
+                raise LanguageModelError(f"language model: expected up to {MAX_ANSWER_BYTES} bytes, got more")
+            if response.length:
+                raise http.client.IncompleteRead(answer, response.length)
+            return response.status, answer
+
+    def _request(self, messages: Sequence[Message]) -> dict[str, Any]:
+        request: dict[str, Any] = {
+            "model": self._settings.model,
+            "messages": [{"role": str(each.role), "content": each.text} for each in messages],
+            "temperature": 0,
+            "max_tokens": _MAX_ANSWER_TOKENS,
+        }
+        if self._settings.response_format is ResponseFormat.JSON_SCHEMA:
+            schema = {"name": "task_graph", "strict": True, "schema": ANSWER_SCHEMA}
+            request["response_format"] = {"type": "json_schema", "json_schema": schema}
+        elif self._settings.response_format is ResponseFormat.JSON_OBJECT:
+            request["response_format"] = {"type": "json_object"}
+        return request
+
+
+@contextmanager
+def _cut_at(deadline_s: float) -> Iterator[tuple[threading.Event, list[socket.socket]]]:
+    """Shut the sockets at the deadline: a socket's own time-out begins anew with every byte that drips in.
+
+    They are handed over because a connection forgets its socket once the response owns it.
+    """
+    cut = threading.Event()
+    sockets: list[socket.socket] = []
+
+    def shut() -> None:
+        cut.set()
+        for each in sockets:
+            with suppress(OSError):  # it has ended by itself
+                each.shutdown(socket.SHUT_RDWR)
+
+    timer = threading.Timer(max(0.0, deadline_s - time.monotonic()), shut)
+    timer.daemon = True
+    timer.start()
+    try:
+        yield cut, sockets
+    finally:
+        timer.cancel()
+
+
+def _content_of(body: bytes) -> str:
+    try:
+        choice = json.loads(body)["choices"][0]
+        content, ended = choice["message"]["content"], choice.get("finish_reason")
+    except (ValueError, LookupError, TypeError, AttributeError, RecursionError):
+        raise LanguageModelError("language model: expected choices[0].message.content, got another thing") from None
+    if ended == "length":
+        raise LanguageModelError(f"language model: an answer within {_MAX_ANSWER_TOKENS} tokens was cut off")
+    if not isinstance(content, str):
+        raise LanguageModelError("language model: expected text as the answer, got another thing")
+    return content

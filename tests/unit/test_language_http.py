@@ -1,0 +1,163 @@
+"""The http backend against a server in this process that is good, slow, hostile or talks nonsense."""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+
+import pytest
+
+from gausslite.errors import LanguageModelError
+from gausslite.task.backends import Backend, BackendSettings, open_parser
+from gausslite.task.language.http import HttpLanguageModel, HttpSettings, ResponseFormat
+from gausslite.task.language.prompt import ANSWER_SCHEMA, messages_for
+
+GOOD = json.dumps(
+    {
+        "targets": ["mug"],
+        "anchors": ["table"],
+        "relations": [{"predicate": "on", "target": "mug", "anchor": "table"}],
+    }
+)
+MESSAGES = messages_for("Pick up the mug on the table")
+ENDED = threading.Event()
+Act = Callable[[BaseHTTPRequestHandler], None]
+
+
+def says(content: object, **choice: object) -> bytes:
+    return json.dumps({"choices": [{"message": {"content": content}, **choice}]}).encode()
+
+
+def sends(body: bytes, status: int = 200, **headers: str) -> Act:
+    def act(handler: BaseHTTPRequestHandler) -> None:
+        handler.send_response(status)
+        for name, value in {"Content-Length": str(len(body)), **headers}.items():
+            handler.send_header(name, value)
+        handler.end_headers()
+        handler.wfile.write(body)
+
+    return act
+
+
+def drips(handler: BaseHTTPRequestHandler) -> None:
+    handler.send_response(200)
+    handler.send_header("Content-Length", "60000")
+    handler.end_headers()
+    while not ENDED.wait(0.02):
+        handler.wfile.write(b" ")
+        handler.wfile.flush()
+
+
+def is_silent(handler: BaseHTTPRequestHandler) -> None:
+    ENDED.wait(20)
+
+
+def pours(handler: BaseHTTPRequestHandler) -> None:
+    handler.send_response(200)
+    handler.end_headers()
+    while not ENDED.is_set():
+        handler.wfile.write(b"x" * 65536)
+
+
+@contextmanager
+def server(act: Act) -> Iterator[tuple[str, list[tuple[str, dict[str, str], dict[str, object]]]]]:
+    """The base URL of a server that answers by `act`, and what it was asked: path, headers, body."""
+    asked: list[tuple[str, dict[str, str], dict[str, object]]] = []
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_POST(self) -> None:
+            body = json.loads(self.rfile.read(int(self.headers["Content-Length"])))
+            asked.append((self.path, dict(self.headers), body))
+            try:
+                act(self)
+            except OSError:
+                self.close_connection = True  # the client has gone
+
+        def log_message(self, format: str, *args: object) -> None:
+            return
+
+    ENDED.clear()
+    serving = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+    thread = threading.Thread(target=serving.serve_forever, kwargs={"poll_interval": 0.01})
+    thread.start()
+    try:
+        yield f"http://127.0.0.1:{serving.server_address[1]}/v1", asked
+    finally:
+        ENDED.set()
+        serving.shutdown()
+        thread.join()
+        serving.server_close()
+
+
+@pytest.mark.parametrize("dialect", list(ResponseFormat))
+def test_a_good_server_is_asked_as_it_understands(dialect: ResponseFormat) -> None:
+    with server(sends(says(GOOD))) as (url, asked):
+        assert HttpLanguageModel(HttpSettings(url, "phi", dialect)).complete(MESSAGES) == GOOD
+    [(path, headers, body)] = asked
+    assert path == "/v1/chat/completions"
+    assert body["model"] == "phi"
+    assert body["messages"][-1] == {"role": "user", "content": "Pick up the mug on the table"}
+    assert "Authorization" not in headers
+    expected = {
+        ResponseFormat.NONE: None,
+        ResponseFormat.JSON_OBJECT: {"type": "json_object"},
+        ResponseFormat.JSON_SCHEMA: {
+            "type": "json_schema",
+            "json_schema": {"name": "task_graph", "strict": True, "schema": ANSWER_SCHEMA},
+        },
+    }
+    assert body.get("response_format") == expected[dialect]
+
+
+@pytest.mark.parametrize(
+    ("act", "expected"),
+    [
+        (is_silent, "no answer within 0.3 s"),
+        (drips, "no answer within 0.3 s"),
+        (pours, "up to 65536 bytes, got more"),
+        (sends(b"", 500), "expected status 200, got 500"),
+        (sends(b"", 302, Location="http://127.0.0.1:1/"), "expected status 200, got 302"),
+        (sends(says(GOOD), 401), "expected status 200, got 401"),
+        (lambda handler: handler.wfile.write(b"SSH-2.0-what\r\n"), "failed with BadStatusLine"),
+        (lambda handler: handler.wfile.write(b"HTTP/1.1 200 OK\r\n" + b"A: b\r\n" * 200), "failed with HTTPException"),
+        (sends(says(GOOD), 200, **{"Content-Length": "9000"}), "failed with IncompleteRead"),
+        (sends(b"[" * 60_000), "choices"),
+        (sends(b"\xff\xfe"), "choices"),
+        (sends(b"{}"), "choices"),
+        (sends(says(None)), "expected text as the answer"),
+        (sends(says(GOOD[:20], finish_reason="length")), "cut off"),
+    ],
+)  # fmt: skip
+def test_a_slow_hostile_or_broken_server_fails_in_one_line_and_in_time(act: Act, expected: str) -> None:
+    with server(act) as (url, _):
+        model = HttpLanguageModel(
+            HttpSettings(url, "phi", timeout_s=0.3 if "within" in expected else 20.0, api_key="secret")
+        )
+        with pytest.raises(LanguageModelError, match=expected) as caught:
+            model.complete(MESSAGES)
+    assert "secret" not in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_the_key_goes_to_the_server_and_nowhere_else(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(0)
+    with server(sends(b"secret", 403)) as (url, asked):
+        settings = BackendSettings(Backend.HTTP, "phi", url, api_key="secret")
+        graph = open_parser(settings).parse("Pick up the mug on the table")
+    assert asked[0][1]["Authorization"] == "Bearer secret"
+    assert "secret" not in caplog.text
+    assert "secret" not in repr(graph)
+
+
+def test_the_chosen_backend_answers_once_and_its_failure_is_said() -> None:
+    with server(sends(says(GOOD))) as (url, asked):
+        parser = open_parser(BackendSettings(Backend.HTTP, "phi", url))
+        graphs = [parser.parse("Pick up the mug on the table") for _ in range(2)]
+        assert graphs[0].warnings == ()
+        assert graphs[0] == graphs[1]
+        assert len(asked) == 1
+        assert parser.parse("Find the vase").warnings[0].startswith("backend http failed")
+    assert parser.parse("Find the lamp").warnings[0].startswith("backend http failed (language model: the call failed")

@@ -1,0 +1,189 @@
+"""What a language model answers becomes a graph only as far as the sentence says it; else rules read the task."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gausslite.domain.task import Predicate, Relation
+from gausslite.errors import InvalidInputError, LanguageModelError, TaskError
+from gausslite.task.backends import Backend, BackendSettings, open_parser
+from gausslite.task.language.answer import graph_of_answer
+from gausslite.task.language.model import Message, Role
+from gausslite.task.language.parsers import CachedParser, FallbackParser, LanguageParser
+from gausslite.task.language.prompt import MAX_PHRASES, MAX_RELATIONS, messages_for
+from gausslite.task.rules import RuleParser
+from gausslite.task.validate import require_graph
+
+TASK = "Pick up the mugs on the table"
+
+
+def answer(targets: object = ("mug",), anchors: object = ("table",), *relations: object) -> str:
+    return json.dumps({"targets": targets, "anchors": anchors, "relations": relations})
+
+
+def relation(predicate: str = "on", target: str = "mug", anchor: str = "table") -> dict[str, str]:
+    return {"predicate": predicate, "target": target, "anchor": anchor}
+
+
+class Told:
+    """A model that says what it was told to, or fails."""
+
+    version = "1"
+
+    def __init__(self, *answers: str) -> None:
+        self.answers = list(answers)
+        self.asked: list[Sequence[Message]] = []
+
+    def complete(self, messages: Sequence[Message]) -> str:
+        self.asked.append(messages)
+        if not self.answers:
+            raise LanguageModelError("language model: told nothing")
+        return self.answers.pop(0)
+
+
+def test_a_good_answer_is_the_graph_that_rules_give():
+    assert graph_of_answer(TASK, answer(["The mugs"], ["the table"], relation())) == RuleParser().parse(TASK)
+
+
+def test_an_answer_within_prose_is_found():
+    said = f"Sure! Here it is:\n```json\n{answer()}\n```\nAnything else? {{}}"
+    assert graph_of_answer(TASK, said).targets == ("mug",)
+
+
+def test_an_invented_object_is_dropped_and_named():
+    graph = graph_of_answer(TASK, answer(["mug", "dragon"], ["table", "castle"], relation(), relation(anchor="castle")))
+    assert (graph.targets, graph.anchors) == (("mug",), ("table",))
+    assert graph.relations == (Relation(Predicate.ON, "mug", "table"),)
+    assert [name for name in ("dragon", "castle") if any(repr(name) in said for said in graph.warnings)] == [
+        "dragon", "castle",
+    ]  # fmt: skip
+    assert len(graph.warnings) == 3
+
+
+@pytest.mark.parametrize(
+    ("task", "target"),
+    [
+        ("Tidy the couch", "sofa"),
+        ("Is anyone here?", "person"),
+        ("Clean this up", "object"),
+        ("Explore the kitchen", "object"),
+        ("Pick up the t-shirts", "t-shirt"),
+        ("Fill the kid's bottle of water", "bottle of water"),
+        ("Wipe the coffee-table", "table"),
+    ],
+)
+def test_what_the_sentence_entails_is_kept(task, target):
+    graph = graph_of_answer(task, answer([target], []))
+    assert len(graph.targets) == 1
+    assert graph.warnings == ()
+
+
+@pytest.mark.parametrize(
+    "said",
+    [
+        "", "no idea", "{", "{}", "[]", "null", answer(["dragon"], []), answer([], []), answer("mug", []),
+        answer([3], []), answer([""], []), answer(["mug\u0000"], []), answer(["mug" * 40], []),
+        answer(["mug"] * (MAX_PHRASES + 1), []), answer(["mug"], ["table"], *[relation()] * (MAX_RELATIONS + 1)),
+        answer(["mug"], ["table"], relation("beneath")), answer(["mug"], ["table"], {"predicate": "on"}),
+        answer(["mug"], ["table"], {**relation(), "predicate": ["on"]}), answer(["mug"], ["table"], "on"),
+        '{"targets": ["mug"], "anchors": [], "relations": [], "note": ""}', '{"targets": ' + "[" * 60_000,
+        '{"targets": ' + "9" * 10_000 + "}", "x" * 70_000,
+    ],
+)  # fmt: skip
+def test_nonsense_falls_back_to_rules_and_says_so(said):
+    graph = FallbackParser(LanguageParser(Told(said)), "http", RuleParser()).parse(TASK)
+    assert graph.relations == (Relation(Predicate.ON, "mug", "table"),)
+    assert graph.warnings[0].startswith("backend http failed (language model")
+    assert graph.warnings[0].isprintable()
+    assert len(graph.warnings[0]) < 400
+
+
+JSON = st.recursive(
+    st.none() | st.booleans() | st.floats() | st.text(max_size=50) | st.sampled_from(("mug", "table", "on", "near")),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=9), inner, max_size=4),
+    max_leaves=12,
+)
+PHRASES = st.lists(st.text(max_size=45) | st.sampled_from(("mug", "the mugs", "table", "vase")), max_size=9)
+ROWS = st.lists(
+    st.fixed_dictionaries(
+        {
+            "predicate": st.sampled_from((*Predicate, "within")),
+            "target": st.sampled_from(("mug", "vase", "")),
+            "anchor": st.sampled_from(("table", "Table", "mug")),
+        }
+    ),
+    max_size=4,
+)
+SHAPED = st.fixed_dictionaries({"targets": PHRASES | JSON, "anchors": PHRASES, "relations": ROWS | JSON})
+
+
+@given(st.text(max_size=300) | JSON.map(json.dumps) | SHAPED.map(json.dumps))
+def test_any_answer_gives_a_graph_of_the_sentence_or_is_refused(said):
+    try:
+        graph = graph_of_answer(TASK, said)
+    except LanguageModelError as error:
+        message = str(error)
+    else:
+        require_graph(graph)
+        message = ""
+        assert {phrase.split()[-1] for phrase in graph.queries} <= {"mug", "table", "pick", "up", "the", "on"}
+    assert "\n" not in message
+
+
+def test_a_task_without_sense_is_refused_before_the_model_is_asked():
+    model = Told(answer())
+    with pytest.raises(TaskError, match="names an object"):
+        LanguageParser(model).parse("!?")
+    assert model.asked == []
+
+
+def test_answers_are_remembered_failures_are_not_and_the_memory_is_bounded():
+    model = Told(answer())
+    parser = CachedParser(LanguageParser(model), "http", "1", capacity=1)
+    assert parser.parse(TASK) is parser.parse(TASK)
+    assert len(model.asked) == 1
+    for _ in range(2):
+        with pytest.raises(LanguageModelError):
+            parser.parse("Find the table")
+    model.answers = [answer(["table"], []), answer(["mug"], [])]
+    parser.parse("Find the table")
+    parser.parse(TASK)
+    assert len(model.asked) == 5
+
+
+def test_the_prompts_own_examples_are_graphs_by_its_own_schema():
+    messages = messages_for("Find the mug")
+    assert messages[0].role is Role.SYSTEM
+    assert messages[-1] == Message(Role.USER, "Find the mug")
+    shots = list(zip(messages[1:-1:2], messages[2:-1:2], strict=True))
+    assert len(shots) >= 4
+    for asked, answered in shots:
+        assert graph_of_answer(asked.text, answered.text).warnings == ()
+
+
+@pytest.mark.parametrize(
+    ("settings", "expected"),
+    [
+        ({"backend": Backend.HTTP}, "expected --llm-model"),
+        ({"backend": Backend.ONNX}, "expected --llm-model"),
+        ({"backend": Backend.HTTP, "model": "m"}, "expected --llm-url"),
+        ({"timeout_s": float("nan")}, "up to 600 seconds"),
+        ({"backend": Backend.HTTP, "model": "m", "url": "ftp://host"}, "backend http url"),
+        ({"backend": Backend.HTTP, "model": "m", "url": "http://me:secret@host/v1"}, "no user, password"),
+        ({"backend": Backend.HTTP, "model": "m", "url": "http://host", "api_key": "a\nb"}, "backend http key"),
+        ({"backend": Backend.ONNX, "model": "/nowhere"}, "/nowhere: expected a folder with genai_config.json"),
+    ],
+)
+def test_wrong_settings_are_refused(settings, expected):
+    with pytest.raises(InvalidInputError, match=expected) as caught:
+        open_parser(BackendSettings(**settings))
+    assert "secret" not in str(caught.value)
+
+
+def test_the_key_is_never_shown():
+    assert "secret" not in repr(BackendSettings(api_key="secret"))
