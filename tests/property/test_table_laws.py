@@ -70,6 +70,10 @@ class WatchedTable(SplatTable):
         super().append_rows(*columns)
         self._look()
 
+    def replace(self, ids: np.ndarray, gaussians: Gaussians) -> None:
+        super().replace(ids, gaussians)
+        self._look()
+
     def keep(self, mask: np.ndarray) -> None:
         super().keep(mask)
         self._look()

@@ -51,6 +51,26 @@ def test_for_the_rest_only_inactive_ones_fainter_than_a_newborn_give_way() -> No
     np.testing.assert_allclose(np.sort(table.opacities), [0.1, 0.3, 0.5, 0.7, 0.8, 0.9], rtol=1e-4)
 
 
+def test_seeds_take_the_rows_of_those_that_gave_way_with_fresh_state_and_no_other_row_moves() -> None:
+    table = full_table()
+    before = table.rows.copy()
+    table.first_moment[:], table.second_moment[:] = 1.0, 2.0
+    insert_into(table, 3, 0)
+    taken = table.target == 7
+    assert taken.sum() == 3
+    np.testing.assert_array_equal(table.rows[~taken], before[~taken])
+    for moment, value in ((table.first_moment, 1.0), (table.second_moment, 2.0)):
+        assert not moment[taken].any()
+        assert (moment[~taken] == value).all()
+
+
+def test_of_equally_faint_ones_the_earlier_gives_way() -> None:
+    table = SplatTable(4)
+    table.append(gaussians([0.2, 0.2, 0.1, 0.2], active=False))
+    insert_into(table, 2, 0)
+    assert table.target.tolist() == [7, -1, 7, -1]
+
+
 def test_the_tasks_seeds_are_served_before_the_rest() -> None:
     table = SplatTable(5)
     assert insert_into(table, 4, 4) == 5

@@ -139,17 +139,19 @@ def test_views_that_show_the_new_region_come_back_into_a_window_that_does_not() 
 
 
 def test_room_for_the_new_region_is_made_in_the_old_one_first() -> None:
-    table = SplatTable(60)
     before = some_gaussians(60)
     before.active[:] = np.arange(60) < 20
     before.kappa[:] = np.where(np.arange(60) < 40, 7, 0)
-    table.append(before)
     seeds = some_gaussians(15)
+    before.target[:], seeds.target[:] = 0, 9
+    table = SplatTable(60)
+    table.append(before)
     insert(table, Seeds(seeds, Gaussians.empty()), 0.5, np.random.default_rng(0))
     kept = table.to_gaussians()
     # 20 of this task, 20 of an earlier one, 20 of the background
-    assert (int(kept.active[:45].sum()), int((kept.kappa[:45] == 7).sum()), len(kept)) == (20, 25, 60)
-    assert int((~kept.active[:45] & (kept.kappa[:45] == 0)).sum()) == 20
+    old = kept.take(kept.target == 0)
+    assert (int(old.active.sum()), int((old.kappa == 7).sum()), len(old), len(kept)) == (20, 25, 45, 60)
+    assert int((~old.active & (old.kappa == 0)).sum()) == 20
 
 
 def test_the_server_keeps_what_it_was_told_of_the_old_region() -> None:

@@ -59,7 +59,8 @@ class Gaussians:
 
     def take(self, rows: NDArray[Any]) -> Gaussians:
         """The Gaussians at these indices, or where this boolean mask is true."""
-        return Gaussians(*(getattr(self, field.name)[rows] for field in fields(self)))
+        chosen = np.flatnonzero(rows) if rows.dtype == np.bool_ else rows
+        return Gaussians(*(np.take(getattr(self, field.name), chosen, axis=0) for field in fields(self)))
 
     @classmethod
     def concatenate(cls, parts: list[Gaussians]) -> Gaussians:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Int64
+from jaxtyping import Bool, Float32, Int64, UInt32, UInt64
 from numpy import ndarray
 from numpy.typing import NDArray
 
@@ -19,18 +20,50 @@ def no_words() -> VoxelWords:
     return VoxelWords(np.zeros(0, np.int64), np.zeros(0, np.uint64), np.zeros(0, np.uint32), Gaussians.empty())
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Occupied:
+    """The voxels that hold some of these points, in ascending order: rows[starts[i] : starts[i] + counts[i]] lie in
+    keys[i], in the order in which they came.
+    """
+
+    keys: Int64[ndarray, " v"]
+    starts: Int64[ndarray, " v"]
+    counts: Int64[ndarray, " v"]
+    rows: Int64[ndarray, " n"]
+
+    @classmethod
+    def by(cls, points_m: Float32[ndarray, "n 3"], grid: VoxelGrid) -> Occupied:
+        """Sort points into voxels. Raises InvalidInputError for points out of the grid's reach."""
+        keys = grid.keys(points_m)
+        rows = np.argsort(keys, kind="stable")
+        keys = keys[rows]
+        first = np.ones(len(keys), np.bool_)
+        np.not_equal(keys[1:], keys[:-1], out=first[1:])
+        starts = np.flatnonzero(first)
+        return cls(keys[starts], starts, np.diff(starts, append=len(keys)), rows)
+
+    def sums(self, values: UInt32[ndarray, " n"] | UInt64[ndarray, " n"]) -> UInt64[ndarray, " v"]:
+        """The sum over each voxel of one value a point."""
+        if len(self.starts) == 0:
+            return np.zeros(0, np.uint64)
+        sums: UInt64[ndarray, " v"] = np.add.reduceat(values[self.rows], self.starts, dtype=np.uint64)
+        return sums
+
+    def rows_in(self, chosen: Bool[ndarray, " v"]) -> Int64[ndarray, " m"]:
+        """The points in these voxels, voxel by voxel."""
+        rows: Int64[ndarray, " m"] = self.rows[np.repeat(chosen, self.counts)]
+        return rows
+
+
 def words_of(gaussians: Gaussians, grid: VoxelGrid) -> VoxelWords:
     """A complete word on every voxel that holds any of these Gaussians (Sec. III-E), stable within a voxel.
 
     Raises InvalidInputError for means out of the grid's reach.
     """
-    keys = grid.keys(gaussians.means_m)
-    order = np.argsort(keys, kind="stable")
-    present, starts, counts = np.unique(keys[order], return_index=True, return_counts=True)
-    ordered = gaussians.take(order)
-    kappa = ordered.kappa.astype(np.uint64)
-    sums = np.add.reduceat(kappa, starts) if len(starts) else np.zeros(0, np.uint64)
-    return VoxelWords(present, sums, counts.astype(np.uint32), ordered)
+    voxels = Occupied.by(gaussians.means_m, grid)
+    return VoxelWords(
+        voxels.keys, voxels.sums(gaussians.kappa), voxels.counts.astype(np.uint32), gaussians.take(voxels.rows)
+    )
 
 
 def tombstones(keys: Int64[ndarray, " k"]) -> VoxelWords:

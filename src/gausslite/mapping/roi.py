@@ -10,7 +10,7 @@ from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.state import State, take
 from gausslite.domain.subset import VoxelWords
 from gausslite.domain.voxels import VoxelGrid
-from gausslite.domain.words import take_voxels, tombstones, unite, words_of
+from gausslite.domain.words import Occupied, take_voxels, tombstones, unite
 from gausslite.errors import MapFileError
 
 
@@ -32,13 +32,17 @@ class RoiLedger:
 
         A voxel that held active Gaussians then and holds none now gets a tombstone (count 0), unless it is released.
         """
-        words = self.beyond_released(words_of(gaussians.take(gaussians.active), self._grid))
-        states = np.stack([words.kappa_sums, words.counts.astype(np.uint64), _fingerprints(words)], axis=1)
-        same = self._unchanged(words.keys, states)
-        absent = ~np.isin(self._keys, words.keys, assume_unique=True)
+        active = gaussians if gaussians.active.all() else gaussians.take(gaussians.active)
+        voxels = Occupied.by(active.means_m, self._grid)
+        keys, kappa_sums, counts = voxels.keys, voxels.sums(active.kappa), voxels.counts.astype(np.uint32)
+        states = np.stack([kappa_sums, counts.astype(np.uint64), voxels.sums(_fingerprints(active))], axis=1)
+        heard = self._outgrow_released(keys, kappa_sums)
+        new = heard & ~self._unchanged(keys, states)
+        absent = ~np.isin(self._keys, keys[heard], assume_unique=True)
         vanished = self._keys[absent & ~self._released]
-        self._remember(words.keys, states, absent & self._released)
-        return unite(take_voxels(words, ~same), tombstones(vanished))
+        self._remember(keys[heard], states[heard], absent & self._released)
+        words = VoxelWords(keys[new], kappa_sums[new], counts[new], active.take(voxels.rows_in(new)))
+        return unite(words, tombstones(vanished)) if len(vanished) else words
 
     def release(self) -> None:
         """The task is another one: what was said stays true of its time, and is neither taken back nor followed."""
@@ -46,11 +50,7 @@ class RoiLedger:
 
     def beyond_released(self, words: VoxelWords) -> VoxelWords:
         """These words without those that would replace a released one that was trained more."""
-        released, sums = self._keys[self._released], self._states[self._released, 0]
-        if len(released) == 0:
-            return words
-        place = np.minimum(np.searchsorted(released, words.keys), len(released) - 1)
-        return take_voxels(words, (released[place] != words.keys) | (words.kappa_sums >= sums[place]))
+        return take_voxels(words, self._outgrow_released(words.keys, words.kappa_sums))
 
     def forget(self) -> None:
         """Treat every voxel as new at the next call (the receiver lost what it had)."""
@@ -70,6 +70,15 @@ class RoiLedger:
         self._released = take(state, "released", (len(keys),), np.bool_).copy()
         self._keys = keys.copy()
 
+    def _outgrow_released(self, keys: Int64[ndarray, " v"], kappa_sums: UInt64[ndarray, " v"]) -> Bool[ndarray, " v"]:
+        """True for voxels on which no released word was trained more."""
+        released, sums = self._keys[self._released], self._states[self._released, 0]
+        if len(released) == 0:
+            return np.ones(len(keys), np.bool_)
+        place = np.minimum(np.searchsorted(released, keys), len(released) - 1)
+        outgrown: Bool[ndarray, " v"] = (released[place] != keys) | (kappa_sums >= sums[place])
+        return outgrown
+
     def _remember(
         self, keys: Int64[ndarray, " v"], states: UInt64[ndarray, "v 3"], still_released: Bool[ndarray, " k"]
     ) -> None:
@@ -87,15 +96,18 @@ class RoiLedger:
         return same
 
 
-def _fingerprints(words: VoxelWords) -> UInt64[ndarray, " v"]:
-    """A number per voxel that changes with any value of its Gaussians, whatever their order."""
-    g = words.gaussians
-    columns = np.concatenate([g.means_m, g.quats_wxyz, g.scales_m, g.opacities[:, None], g.rgb], axis=1)
-    bits = np.ascontiguousarray(columns).view(np.uint32).astype(np.uint64)
+def _fingerprints(gaussians: Gaussians) -> UInt64[ndarray, " n"]:
+    """A number per Gaussian that changes with any of its values; a voxel's is their sum, whatever their order."""
+    g = gaussians
+    columns = [*g.means_m.T, *g.quats_wxyz.T, *g.scales_m.T, g.opacities, *g.rgb.T]
     # odd multipliers from a fixed seed: equal Gaussians give equal numbers in every run
-    multipliers = np.random.default_rng(0).integers(0, 2**64, bits.shape[1], np.uint64) | np.uint64(1)
-    mixed = _mix((bits * multipliers).sum(axis=1, dtype=np.uint64) + g.target.astype(np.uint64))
-    return _sums(mixed, words.offsets[:-1])
+    multipliers = np.random.default_rng(0).integers(0, 2**64, len(columns), np.uint64) | np.uint64(1)
+    total = g.target.astype(np.uint64)
+    product = np.empty_like(total)
+    # column by column, so that what is summed stays in cache
+    for column, multiplier in zip(columns, multipliers, strict=True):
+        total += np.multiply(column.view(np.uint32), multiplier, out=product)
+    return _mix(total)
 
 
 def _mix(values: UInt64[ndarray, " n"]) -> UInt64[ndarray, " n"]:
@@ -103,10 +115,3 @@ def _mix(values: UInt64[ndarray, " n"]) -> UInt64[ndarray, " n"]:
     mixed = (values ^ (values >> np.uint64(31))) * np.uint64(0x9E3779B97F4A7C15)
     result: UInt64[ndarray, " n"] = mixed ^ (mixed >> np.uint64(29))
     return result
-
-
-def _sums(values: UInt64[ndarray, " n"], starts: Int64[ndarray, " v"]) -> UInt64[ndarray, " v"]:
-    if len(starts) == 0:
-        return np.zeros(0, np.uint64)
-    sums: UInt64[ndarray, " v"] = np.add.reduceat(values, starts)
-    return sums

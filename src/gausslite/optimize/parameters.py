@@ -144,13 +144,12 @@ class SplatTable:
         """Add raw rows with fresh optimiser state. Raises QuotaError when they do not fit."""
         if len(rows) > self.room:
             raise QuotaError(f"table: expected at most {self.room} more Gaussians, got {len(rows)}")
-        new = slice(self._count, self._count + len(rows))
-        self._rows[new] = rows
-        self._first_moment[new] = 0.0
-        self._second_moment[new] = 0.0
-        self._active[new], self._kappa[new], self._target[new] = active, kappa, target
-        self._votes[new] = np.where(active, 1, -1)
+        self._put(slice(self._count, self._count + len(rows)), rows, active, kappa, target)
         self._count += len(rows)
+
+    def replace(self, ids: Int[ndarray, " m"], gaussians: Gaussians) -> None:
+        """Put these Gaussians, with fresh optimiser state, in the rows of others."""
+        self._put(ids, gaussians_to_rows(gaussians), gaussians.active, gaussians.kappa, gaussians.target)
 
     def keep(self, mask: Bool[ndarray, " n"]) -> None:
         """Drop the Gaussians where mask is false; the others keep their order and their optimiser state."""
@@ -163,7 +162,7 @@ class SplatTable:
         moved = kept[first_gap:]
         for name in _COLUMNS:
             column = getattr(self, f"_{name}")
-            column[first_gap : len(kept)] = column[moved]
+            column[first_gap : len(kept)] = column.take(moved, axis=0)
         self._count = len(kept)
 
     def state(self) -> State:
@@ -190,7 +189,23 @@ class SplatTable:
     def to_gaussians(self, ids: Int[ndarray, " m"] | None = None) -> Gaussians:
         """Copies of all Gaussians, or of these rows, as physical values."""
         chosen = np.arange(self._count) if ids is None else ids
-        return rows_to_gaussians(self.rows[chosen], self.active[chosen], self.kappa[chosen], self.target[chosen])
+        columns = self.rows, self.active, self.kappa, self.target
+        return rows_to_gaussians(*(column.take(chosen, axis=0) for column in columns))
+
+    def _put(
+        self,
+        place: slice | Int[ndarray, " m"],
+        rows: Float32[ndarray, "m 16"],
+        active: Bool[ndarray, " m"],
+        kappa: UInt32[ndarray, " m"],
+        target: Int16[ndarray, " m"],
+    ) -> None:
+        """A newborn's optimiser state is empty, its vote its view's."""
+        self._rows[place] = rows
+        self._first_moment[place] = 0.0
+        self._second_moment[place] = 0.0
+        self._active[place], self._kappa[place], self._target[place] = active, kappa, target
+        self._votes[place] = np.where(active, 1, -1)
 
 
 def _moments(columns: State) -> tuple[NDArray[Any], NDArray[Any]]:
@@ -223,7 +238,7 @@ def rows_to_gaussians(
 ) -> Gaussians:
     """Raw rows to physical values, with quaternions of unit length."""
     quats = rows[:, QUAT]
-    length = np.linalg.norm(quats, axis=1, keepdims=True)
+    length = np.sqrt(np.einsum("ij,ij->i", quats, quats))[:, None]
     return Gaussians(
         means_m=rows[:, MEAN].copy(),
         quats_wxyz=(quats / np.maximum(length, np.float32(1e-12))).astype(np.float32),
