@@ -2,23 +2,18 @@
 
 from __future__ import annotations
 
-import asyncio
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, field
 
 import grpc
 import numpy as np
 import pytest
+from agent_running import TASK, Gate, agent, ball_attention
 from fusion_team import CAMERA, GRID, frame, team
-from serving import serving
 
 from gausslite.domain.camera import Camera
 from gausslite.domain.frame import Frame
 from gausslite.domain.region import BallRegion
-from gausslite.domain.relevance import RelevanceMap
-from gausslite.domain.state import State
 from gausslite.domain.task import TaskGraph
 from gausslite.domain.voxels import Box
 from gausslite.errors import (
@@ -28,98 +23,19 @@ from gausslite.errors import (
     ModelFileError,
     RevisionGoneError,
     TaskError,
-    UnavailableError,
 )
 from gausslite.fusion.memory import MemoryStore
-from gausslite.mission.settings import MissionSettings
 from gausslite.perception.attention import Attention, TaskAttention
 from gausslite.perception.fixed import RegionAttention
 from gausslite.perception.ground_truth import RegionDetector
 from gausslite.task.rules import RuleParser
 from gausslite.v1 import agent_service_pb2 as pb
-from gausslite.v1 import agent_service_pb2_grpc as pb_grpc
 from gausslite.wire import convert
-from gausslite.wire.bell import Bell
-from gausslite.wire.clients import AgentClient, FusionClient
-from gausslite.wire.server import Service
+from gausslite.wire.clients import FusionClient
 from gausslite.wire.spool import Spool
 from gausslite.wire.uplink import Uplink
 from gausslite.wire.uplink_values import UplinkSettings
-from gausslite_agent.load import Drops, LoadSettings
-from gausslite_agent.player import MissionState
-from gausslite_agent.robot import Outcome, Robot
-from gausslite_agent.servicer import AgentServicer
-
-SETTINGS = MissionSettings(max_gaussians=2000, iterations=2, threads=1)
-TASK = "Pick up the mug on the table"
-
-
-@dataclass
-class Gate:
-    """An attention that lets a test hold the worker at a frame, and fails on demand."""
-
-    inner: Attention
-    opened: threading.Event
-    fail_at: int | None = None
-    reached: threading.Event = field(default_factory=threading.Event)
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        return self.inner.notes
-
-    def attend(self, frame: Frame, rendered_depth_m: np.ndarray | None = None) -> RelevanceMap:
-        self.reached.set()
-        assert self.opened.wait(20)
-        if frame.index == self.fail_at:
-            raise ZeroDivisionError("a bug")
-        return self.inner.attend(frame, rendered_depth_m)
-
-    def late(self) -> None:
-        return None
-
-    def look_back(self, frame: Frame) -> RelevanceMap | None:
-        return self.inner.look_back(frame)
-
-    def state(self) -> State:
-        return {}
-
-    def restore(self, state: State) -> None:
-        del state
-
-
-def ball_attention(_graph: TaskGraph) -> Attention:
-    return RegionAttention([BallRegion((0.0, 0.0, 1.2), 0.2)])
-
-
-@dataclass(frozen=True)
-class Agent:
-    robot: Robot
-    client: AgentClient
-    stub: pb_grpc.AgentServiceStub
-
-
-@contextmanager
-def agent(attention: object = ball_attention, uplink: Uplink | None = None, queue_frames: int = 4) -> Iterator[Agent]:
-    loops: list[asyncio.AbstractEventLoop] = []
-    bells: list[Bell] = []
-    on_change = lambda: loops[0].call_soon_threadsafe(lambda: bells[0].ring())  # noqa: E731
-    robot = Robot(SETTINGS, GRID, attention, uplink, on_change, LoadSettings(queue_frames))  # type: ignore[arg-type]
-
-    def register(server: grpc.aio.Server) -> None:
-        loops.append(asyncio.get_running_loop())
-        bells.append(Bell())
-        servicer = AgentServicer("robot", robot, RuleParser(), bells[0], lambda: MissionState.MAPPING)
-        servicer.service().register(server)
-
-    try:
-        with (
-            serving([Service("gausslite.v1.AgentService", register)]) as running,
-            AgentClient(running.address) as client,
-            grpc.insecure_channel(running.address) as channel,
-        ):
-            yield Agent(robot, client, pb_grpc.AgentServiceStub(channel))
-    finally:
-        robot.close()
+from gausslite_agent.robot import Robot
 
 
 def test_a_task_comes_in_words_or_as_a_graph() -> None:
@@ -187,51 +103,6 @@ def test_each_frame_has_its_outcome_in_order() -> None:
     assert status.hz > 0
 
 
-def test_a_full_queue_drops_the_oldest_waiting_frame_and_says_so() -> None:
-    gate = Gate(ball_attention(RuleParser().parse(TASK)), threading.Event())
-    with agent(lambda _graph: gate, queue_frames=2) as a:
-        a.client.assign_task(TASK)
-        first = a.robot.submit(frame(0))
-        assert gate.reached.wait(20)
-        waiting = [a.robot.submit(frame(index)) for index in range(1, 5)]
-        gate.opened.set()
-        outcomes = [future.result(20).outcome for future in (first, *waiting)]
-    assert outcomes == [Outcome.MAPPED, Outcome.DROPPED, Outcome.DROPPED, Outcome.MAPPED, Outcome.MAPPED]
-    assert "queue of 2 frames" in waiting[0].result().reason
-
-
-def test_a_queue_may_drop_the_newest_frame_instead() -> None:
-    gate = Gate(ball_attention(RuleParser().parse(TASK)), threading.Event())
-    robot = Robot(SETTINGS, GRID, lambda _graph: gate, load=LoadSettings(queue_frames=2, drops=Drops.NEWEST))
-    robot.assign(RuleParser().parse(TASK)).result(20)
-    first = robot.submit(frame(0))
-    assert gate.reached.wait(20)
-    waiting = [robot.submit(frame(index)) for index in range(1, 5)]
-    gate.opened.set()
-    outcomes = [future.result(20).outcome for future in (first, *waiting)]
-    robot.close()
-    assert outcomes == [Outcome.MAPPED, Outcome.MAPPED, Outcome.MAPPED, Outcome.DROPPED, Outcome.DROPPED]
-    assert "overload: 2 frames were dropped" in robot.status().load_notes
-
-
-def test_idle_time_is_trained_in_up_to_its_bound_and_work_comes_in_between() -> None:
-    robot = Robot(SETTINGS, GRID, ball_attention, load=LoadSettings(idle_iterations=5))
-    robot.assign(RuleParser().parse(TASK)).result(20)
-    robot.submit(frame(0)).result(20)
-    # each of these waits behind one iteration at most
-    trained = [robot.do(lambda mapper: mapper.gaussians()).result(20) for _ in range(9)]
-    status = robot.status()
-    assert (status.idle_iterations, status.iterations) == (5, 2)
-    assert not np.array_equal(trained[0].opacities, trained[-1].opacities)
-    np.testing.assert_array_equal(trained[-2].opacities, trained[-1].opacities)
-    robot.submit(frame(1)).result(20)
-    robot.settle().result(20)
-    settled = robot.do(lambda mapper: mapper.gaussians()).result(20)
-    np.testing.assert_array_equal(settled.opacities, robot.do(lambda mapper: mapper.gaussians()).result(20).opacities)
-    assert robot.status().idle_iterations <= 10
-    robot.close()
-
-
 def test_another_task_turns_the_map_to_it_and_the_same_question_changes_nothing() -> None:
     asked: list[str] = []
 
@@ -252,37 +123,10 @@ def test_another_task_turns_the_map_to_it_and_the_same_question_changes_nothing(
         a.client.assign_task("Find the chair")
         a.robot.submit(frame(3)).result(20)
         turned = a.robot.do(lambda mapper: mapper.gaussians()).result(20)
-        assert a.robot.status().reread == 1
+        # all three showed the first region, and views of the region are remembered
+        assert a.robot.status().reread == 3
     assert asked == [TASK, "Find the chair"]
     assert turned.means_m[turned.active][:, 0].mean() > first.means_m[first.active][:, 0].mean() + 0.1
-
-
-def test_without_idle_iterations_the_map_stays_as_the_frame_left_it() -> None:
-    robot = Robot(SETTINGS, GRID, ball_attention)
-    robot.assign(RuleParser().parse(TASK)).result(20)
-    robot.submit(frame(0)).result(20)
-    robot.settle().result(20)
-    assert robot.status().idle_iterations == 0
-    robot.close()
-
-
-@pytest.mark.parametrize("wrong", [{"queue_frames": 0}, {"idle_iterations": -1}])
-def test_load_settings_name_what_is_wrong(wrong: dict[str, int]) -> None:
-    with pytest.raises(InvalidInputError, match="expected"):
-        LoadSettings(**wrong)
-
-
-def test_frames_that_wait_when_the_agent_ends_are_dropped() -> None:
-    gate = Gate(ball_attention(RuleParser().parse(TASK)), threading.Event())
-    robot = Robot(SETTINGS, GRID, lambda _graph: gate)
-    robot.assign(RuleParser().parse(TASK)).result(20)
-    futures = [robot.submit(frame(index)) for index in range(3)]
-    assert gate.reached.wait(20)
-    threading.Timer(0.05, gate.opened.set).start()
-    robot.close()
-    assert [future.result(0).outcome for future in futures] == [Outcome.MAPPED, Outcome.DROPPED, Outcome.DROPPED]
-    with pytest.raises(UnavailableError, match="ending"):
-        robot.do(lambda mapper: mapper.count)
 
 
 def test_a_bug_in_one_frame_ends_its_stream_and_not_the_agent() -> None:

@@ -1,0 +1,91 @@
+"""The robot under load: what a full queue drops, what idle time is used for, and what each is told."""
+
+from __future__ import annotations
+
+import threading
+
+import numpy as np
+import pytest
+from agent_running import SETTINGS, TASK, Gate, agent, ball_attention
+from fusion_team import GRID, frame
+
+from gausslite.errors import (
+    InvalidInputError,
+    UnavailableError,
+)
+from gausslite.task.rules import RuleParser
+from gausslite_agent.load import Drops, LoadSettings
+from gausslite_agent.robot import Outcome, Robot
+
+
+def test_a_full_queue_drops_the_oldest_waiting_frame_and_says_so() -> None:
+    gate = Gate(ball_attention(RuleParser().parse(TASK)), threading.Event())
+    with agent(lambda _graph: gate, queue_frames=2) as a:
+        a.client.assign_task(TASK)
+        first = a.robot.submit(frame(0))
+        assert gate.reached.wait(20)
+        waiting = [a.robot.submit(frame(index)) for index in range(1, 5)]
+        gate.opened.set()
+        outcomes = [future.result(20).outcome for future in (first, *waiting)]
+    assert outcomes == [Outcome.MAPPED, Outcome.DROPPED, Outcome.DROPPED, Outcome.MAPPED, Outcome.MAPPED]
+    assert "queue of 2 frames" in waiting[0].result().reason
+
+
+def test_a_queue_may_drop_the_newest_frame_instead() -> None:
+    gate = Gate(ball_attention(RuleParser().parse(TASK)), threading.Event())
+    robot = Robot(SETTINGS, GRID, lambda _graph: gate, load=LoadSettings(queue_frames=2, drops=Drops.NEWEST))
+    robot.assign(RuleParser().parse(TASK)).result(20)
+    first = robot.submit(frame(0))
+    assert gate.reached.wait(20)
+    waiting = [robot.submit(frame(index)) for index in range(1, 5)]
+    gate.opened.set()
+    outcomes = [future.result(20).outcome for future in (first, *waiting)]
+    robot.close()
+    assert outcomes == [Outcome.MAPPED, Outcome.MAPPED, Outcome.MAPPED, Outcome.DROPPED, Outcome.DROPPED]
+    assert "overload: 2 frames were dropped" in robot.status().load_notes
+
+
+def test_idle_time_is_trained_in_up_to_its_bound_and_work_comes_in_between() -> None:
+    robot = Robot(SETTINGS, GRID, ball_attention, load=LoadSettings(idle_iterations=5))
+    robot.assign(RuleParser().parse(TASK)).result(20)
+    robot.submit(frame(0)).result(20)
+    # each of these waits behind one iteration at most
+    trained = [robot.do(lambda mapper: mapper.gaussians()).result(20) for _ in range(9)]
+    status = robot.status()
+    assert (status.idle_iterations, status.iterations) == (5, 2)
+    assert not np.array_equal(trained[0].opacities, trained[-1].opacities)
+    np.testing.assert_array_equal(trained[-2].opacities, trained[-1].opacities)
+    robot.submit(frame(1)).result(20)
+    robot.settle().result(20)
+    settled = robot.do(lambda mapper: mapper.gaussians()).result(20)
+    np.testing.assert_array_equal(settled.opacities, robot.do(lambda mapper: mapper.gaussians()).result(20).opacities)
+    assert robot.status().idle_iterations <= 10
+    robot.close()
+
+
+def test_without_idle_iterations_the_map_stays_as_the_frame_left_it() -> None:
+    robot = Robot(SETTINGS, GRID, ball_attention)
+    robot.assign(RuleParser().parse(TASK)).result(20)
+    robot.submit(frame(0)).result(20)
+    robot.settle().result(20)
+    assert robot.status().idle_iterations == 0
+    robot.close()
+
+
+@pytest.mark.parametrize("wrong", [{"queue_frames": 0}, {"idle_iterations": -1}])
+def test_load_settings_name_what_is_wrong(wrong: dict[str, int]) -> None:
+    with pytest.raises(InvalidInputError, match="expected"):
+        LoadSettings(**wrong)
+
+
+def test_frames_that_wait_when_the_agent_ends_are_dropped() -> None:
+    gate = Gate(ball_attention(RuleParser().parse(TASK)), threading.Event())
+    robot = Robot(SETTINGS, GRID, lambda _graph: gate)
+    robot.assign(RuleParser().parse(TASK)).result(20)
+    futures = [robot.submit(frame(index)) for index in range(3)]
+    assert gate.reached.wait(20)
+    threading.Timer(0.05, gate.opened.set).start()
+    robot.close()
+    assert [future.result(0).outcome for future in futures] == [Outcome.MAPPED, Outcome.DROPPED, Outcome.DROPPED]
+    with pytest.raises(UnavailableError, match="ending"):
+        robot.do(lambda mapper: mapper.count)
