@@ -175,6 +175,8 @@ class GraphBuilder:
             self._sought(noun)
         elif pending == "of":
             self._part_of(noun)
+        elif pending == "beyond" and clause.verb in lexicon.DELIVERY_VERBS:
+            self._draft.anchor(noun.text)
         elif pending == "with":
             if noun.known and clause.subjects:
                 self._accompanied(noun)

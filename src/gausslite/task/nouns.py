@@ -56,7 +56,8 @@ _OBJECTS: Final = words(
     "sandbox manhole crosswalk tire wheel weed hedge log stump root seed fertilizer sprinkler nozzle faucet tap "
     "drain gutter chimney tile plank board lumber wood scrap metal wire spring gear bearing shaft coil circuit "
     "breaker transformer inverter seat armrest leg arm edge pad notepad sticker label stamp coin money bill cash "
-    "ticket passport badge shed sled doorstep doormat pool bathrobe"
+    "ticket passport badge shed sled doorstep doormat pool bathrobe awning wiring "
+    "plumbing piping lighting bedding carving flooring siding"
 )
 NOUNS: Final = (
     _OBJECTS

@@ -243,12 +243,13 @@ class _Reader:
             return False
         if self.relative_at == self.at - 1:
             return True
-        before = self._peek(-1)
-        return before in _SUBJECTS and verb_base(word) is None
+        return self._peek(-1) in _SUBJECTS and (verb_base(word) is None or self.relative_at == self.at - 2)
 
     def _is_state(self, word: str, after: str) -> bool:
         """In "whether the light is blinking" the last word names no object."""
-        if self.words and is_participle(word) and word not in lexicon.NOUNS and after in PREPOSITIONS:
+        unknown = bool(self.words) and word.endswith("ing") and singular(self.words[-1]) in lexicon.NOUNS
+        participle = bool(self.words) and (unknown or is_participle(word))
+        if participle and word not in lexicon.NOUNS and after in PREPOSITIONS:
             self._close()
             return True
         plain = not (self.words or self.determined) and singular(word) not in lexicon.NOUNS
