@@ -47,7 +47,8 @@ def module_interface() -> Interface:
         elif not name.startswith("_"):
             interface[name] = _parameters(value)
     # nb::new_ makes an object in __new__
-    interface["Engine.__init__"] = _parameters(kernels.Engine.__new__)[1:]
+    for made in (kernels.Engine, kernels.View):
+        interface[f"{made.__name__}.__init__"] = _parameters(made.__new__)[1:]
     return interface
 
 

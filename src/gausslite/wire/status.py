@@ -32,7 +32,7 @@ _TABLE: tuple[tuple[type[GaussLiteError], grpc.StatusCode, str], ...] = (
     (errors.StorageError, grpc.StatusCode.RESOURCE_EXHAUSTED, "STORAGE"),
     (errors.NotPermittedError, grpc.StatusCode.PERMISSION_DENIED, "NOT_PERMITTED"),
     (errors.UnavailableError, grpc.StatusCode.UNAVAILABLE, "UNAVAILABLE"),
-    (errors.LanguageModelError, grpc.StatusCode.UNAVAILABLE, "LANGUAGE_MODEL"),
+    (errors.LanguageModelError, grpc.StatusCode.INTERNAL, "LANGUAGE_MODEL"),
     (errors.KernelError, grpc.StatusCode.FAILED_PRECONDITION, "KERNEL"),
     (GaussLiteError, grpc.StatusCode.INTERNAL, "INTERNAL"),
 )
