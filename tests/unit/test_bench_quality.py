@@ -71,7 +71,8 @@ def test_pairs_are_chosen_by_name_or_home() -> None:
 
 def test_components_come_one_by_one() -> None:
     variants = cumulative_variants()
-    assert [variant.label for variant in variants] == ["none", "+SB", "+MVO", "+ROI", "+SIS", "+GFD"]
+    labels = [variant.label for variant in variants]
+    assert labels == ["none", "+SB", "+MVO", "+ROI", "+SIS", "+GFD", "+views", "+surroundings"]
     off = [variant.without for variant in variants]
     assert all(len(a - b) == 1 and b < a for a, b in pairwise(off))
     assert not off[-1]

@@ -8,8 +8,8 @@ from mapping_scenes import middle_relevance, wall_frame
 
 from gausslite.errors import InvalidInputError
 from gausslite.mapping.mapper import GaussianMapper
-from gausslite.mapping.policies import POLICIES, TASK, policy
-from gausslite.mapping.settings import KeyframeSettings, MapperSettings
+from gausslite.mapping.policies import BEYOND_SWITCHES, PAPER_SWITCHES, POLICIES, SWITCHES, TASK, policy, without
+from gausslite.mapping.settings import Components, KeyframeSettings, MapperSettings
 from gausslite.render.cpu import CpuRasterizer
 
 BASELINES = sorted(POLICIES.keys() - {TASK})
@@ -54,3 +54,23 @@ def test_surroundings_change_the_map_and_count_a_little_by_default() -> None:
 def test_an_unknown_policy_is_refused() -> None:
     with pytest.raises(InvalidInputError, match="policy"):
         policy("best")
+
+
+@pytest.mark.parametrize("name", SWITCHES)
+def test_a_switch_turns_its_own_part_off_and_no_other(name: str) -> None:
+    on, off = policy(TASK), without(policy(TASK), {name})
+    assert off != on
+    assert without(off, {name}) == off
+    changed = [part for part in PAPER_SWITCHES if getattr(off.components, part) != getattr(on.components, part)]
+    assert changed == [part for part in PAPER_SWITCHES if part == name]
+
+
+def test_with_everything_off_what_is_left_knows_no_task() -> None:
+    bare = without(policy(TASK), SWITCHES)
+    assert bare.components == Components(sb=False, mvo=False, roi=False, sis=False, gfd=False)
+    assert without(policy(TASK), BEYOND_SWITCHES).keyframes == KeyframeSettings(region_views=0, surroundings_weight=0.0)
+
+
+def test_an_unknown_switch_is_refused() -> None:
+    with pytest.raises(InvalidInputError, match=r"without: expected names among sb, .*, got light, sound"):
+        without(policy(TASK), {"sound", "light", "sb"})

@@ -1,8 +1,9 @@
-"""Name the ways to spend a budget: for the task, or evenly over everything."""
+"""Name the ways to spend a budget, for the task or evenly over everything, and what can be switched off in them."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
+from dataclasses import replace
 
 from gausslite.errors import InvalidInputError
 from gausslite.mapping.baselines import gaussian_slam_policy, monogs_policy, splatam_policy, uniform_policy
@@ -10,7 +11,7 @@ from gausslite.mapping.settings import MapperSettings
 
 
 def task_policy() -> MapperSettings:
-    """All five components of the paper."""
+    """All five components of the paper, and what came to stay beyond it."""
     return MapperSettings()
 
 
@@ -31,3 +32,27 @@ def policy(name: str) -> MapperSettings:
     if name not in POLICIES:
         raise InvalidInputError(f"policy: expected one of {', '.join(POLICIES)}, got {name!r}")
     return POLICIES[name]()
+
+
+PAPER_SWITCHES = ("sb", "mvo", "roi", "sis", "gfd")
+"""The paper's components (Sec. III-C, III-D), in the order of its ablation."""
+
+BEYOND_SWITCHES: dict[str, Callable[[MapperSettings], MapperSettings]] = {
+    "views": lambda settings: replace(settings, keyframes=replace(settings.keyframes, region_views=0)),
+    "surroundings": lambda settings: replace(settings, keyframes=replace(settings.keyframes, surroundings_weight=0.0)),
+}
+"""What came beyond the paper, in the order of our ablation, and how each is switched off."""
+
+SWITCHES = (*PAPER_SWITCHES, *BEYOND_SWITCHES)
+
+
+def without(settings: MapperSettings, names: Collection[str]) -> MapperSettings:
+    """These settings with the named parts switched off. Raises InvalidInputError for a name that is none of them."""
+    unknown = sorted(set(names) - set(SWITCHES))
+    if unknown:
+        raise InvalidInputError(f"without: expected names among {', '.join(SWITCHES)}, got {', '.join(unknown)}")
+    off = dict.fromkeys((name for name in PAPER_SWITCHES if name in names), False)
+    settings = replace(settings, components=replace(settings.components, **off))
+    for name in (each for each in BEYOND_SWITCHES if each in names):
+        settings = BEYOND_SWITCHES[name](settings)
+    return settings

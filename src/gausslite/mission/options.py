@@ -9,7 +9,7 @@ from gausslite.datasets.registration import ColourCamera
 from gausslite.domain.pose import UpAxis
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.mapping.pace import PaceSettings, Relief
-from gausslite.mapping.policies import POLICIES
+from gausslite.mapping.policies import POLICIES, SWITCHES
 from gausslite.mission.settings import DEFAULT_MAX_GAUSSIANS, MissionSettings, PerceptionSettings
 from gausslite.optimize.view_fit import ViewPrior
 from gausslite.render.choose import BACKENDS
@@ -51,7 +51,7 @@ def add_policy(parser: argparse.ArgumentParser) -> None:
     """Add --policy, --without, --view-error and --rasterizer: how the map is made."""
     add = parser.add_argument_group("mapping").add_argument
     add("--policy", choices=sorted(POLICIES), default="task", help="how to spend the budget (default: task)")
-    add("--without", metavar="A,B", type=names, default=(), help="components off: sb mvo roi sis gfd")
+    add("--without", metavar="A,B", type=names, default=(), help=f"parts of the policy off: {' '.join(SWITCHES)}")
     add("--rasterizer", choices=BACKENDS, default="auto", help="what draws and trains the map (default: auto)")
     add_view_error(parser)
 

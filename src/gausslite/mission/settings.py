@@ -11,8 +11,8 @@ from gausslite.domain.pose import UpAxis
 from gausslite.domain.region import Region
 from gausslite.errors import InvalidInputError
 from gausslite.mapping.pace import PaceSettings, Relief
-from gausslite.mapping.policies import policy
-from gausslite.mapping.settings import Components, MapperSettings
+from gausslite.mapping.policies import policy, without
+from gausslite.mapping.settings import MapperSettings
 from gausslite.optimize.view_fit import ViewPrior
 
 DEFAULT_MAX_GAUSSIANS = 150_000
@@ -57,9 +57,9 @@ class PerceptionSettings:
 class MissionSettings:
     """How one robot maps.
 
-    without switches components off by name (sb, mvo, roi, sis, gfd). rate_hz, when given, replaces the fixed number
-    of iterations by what fits into 1 / rate_hz seconds a frame; where that is less than least_iterations, the reliefs
-    give way. view_prior: how wrong poses and colours of frames may be.
+    without switches parts of the policy off by name (see `gausslite.mapping.policies.without`). rate_hz, when given,
+    replaces the fixed number of iterations by what fits into 1 / rate_hz seconds a frame; where that is less than
+    least_iterations, the reliefs give way. view_prior: how wrong poses and colours of frames may be.
     """
 
     policy: str = "task"
@@ -98,17 +98,8 @@ class MissionSettings:
         if self.iterations is not None:
             optimization = optimization.with_iterations(self.iterations)
         return replace(
-            base,
+            without(base, self.without),
             max_gaussians=self.max_gaussians,
-            components=_without(base.components, self.without),
             optimization=optimization,
             view_prior=self.view_prior,
         )
-
-
-def _without(components: Components, names: frozenset[str]) -> Components:
-    known = ("sb", "mvo", "roi", "sis", "gfd")
-    unknown = sorted(names - set(known))
-    if unknown:
-        raise InvalidInputError(f"without: expected names among {', '.join(known)}, got {', '.join(unknown)}")
-    return replace(components, **dict.fromkeys(names, False))
