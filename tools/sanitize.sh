@@ -11,7 +11,7 @@ case $kind in
   thread) sanitizers=thread runtimes=libtsan.so ;;
   *) fail "expected address or thread, got '$kind'" ;;
 esac
-python=$(command -v "${2:-python3}") || fail "no such Python: $2"
+python=$(command -v "${2:-python3}") || fail "no such Python: ${2:-python3}"
 python=$("$python" -c 'import sys; print(sys.executable)')
 shift $(($# < 2 ? $# : 2))
 compiler=${CXX:-g++}

@@ -91,11 +91,15 @@ def player(options: AgentSettings, address: str | None = None) -> Iterator[tuple
             uplink.close()
 
 
+def seen(wall: Wall, options: AgentSettings) -> StandIn:
+    assert options.play is not None
+    return StandIn.of(wall, options.play)
+
+
 def test_a_mission_leaves_a_map_a_report_and_its_region_on_the_server(tmp_path: Path) -> None:
     store, options = MemoryStore(), settings(tmp_path)
-    assert options.play is not None
     with team(store) as fusion, player(options, fusion.client.address) as (mission, robot):
-        mission.play(Wall(), options.play)
+        mission.play(seen(Wall(), options))
         assert mission.state == MissionState.DONE
         count = robot.status().gaussians
         [agent] = fusion.client.status().agents
@@ -112,9 +116,8 @@ def test_a_mission_leaves_a_map_a_report_and_its_region_on_the_server(tmp_path: 
 
 def test_handover_brings_the_whole_map_and_the_keyframes(tmp_path: Path) -> None:
     options = settings(tmp_path, "--handover")
-    assert options.play is not None
     with team() as fusion, player(options, fusion.client.address) as (mission, robot):
-        mission.play(Wall(), options.play)
+        mission.play(seen(Wall(), options))
         [agent] = fusion.client.status().agents
         keyframes = robot.do(lambda mapper: mapper.keyframes()).result(20)
     report = json.loads((tmp_path / "report.json").read_text())
@@ -126,10 +129,9 @@ def test_handover_brings_the_whole_map_and_the_keyframes(tmp_path: Path) -> None
 
 def test_alone_it_maps_and_sends_nothing(tmp_path: Path) -> None:
     options = settings(tmp_path, "--hold-out", "4", "--frames", "0:6")
-    assert options.play is not None
     wall = Wall()
     with player(options) as (mission, _):
-        mission.play(wall, options.play)
+        mission.play(seen(wall, options))
     report = json.loads((tmp_path / "report.json").read_text())
     assert wall.asked == [0, 1, 2, 4, 5]
     assert (report["frames"], report["bytes_sent"], report["map_shared_percent"]) == (5, 0, 0)
@@ -137,9 +139,8 @@ def test_alone_it_maps_and_sends_nothing(tmp_path: Path) -> None:
 
 def test_a_mission_that_is_stopped_writes_what_it_has(tmp_path: Path) -> None:
     options, wall = settings(tmp_path), Wall(10_000)
-    assert options.play is not None
     with player(options) as (mission, _):
-        thread = threading.Thread(target=mission.play, args=(wall, options.play))
+        thread = threading.Thread(target=mission.play, args=(seen(wall, options),))
         thread.start()
         assert wall.reached.wait(20)
         mission.stop()
@@ -152,15 +153,12 @@ def test_a_mission_that_is_stopped_writes_what_it_has(tmp_path: Path) -> None:
 
 def test_what_is_wrong_is_raised_before_or_when_it_is_met(tmp_path: Path) -> None:
     options = settings(tmp_path)
-    assert options.play is not None
-    with player(options) as (mission, _), pytest.raises(DatasetError, match="frame-3"):
-        mission.play(Wall(broken_at=3), options.play)
     with player(replace(options, task="!")) as (mission, _), pytest.raises(TaskError):
-        mission.play(Wall(), options.play)
-    with player(options) as (mission, _), pytest.raises(InvalidInputError, match="size"):
-        mission.play(Wall(), PlaySettings("wall", size="big"))
+        mission.play(seen(Wall(), options))
+    with pytest.raises(InvalidInputError, match="size"):
+        StandIn.of(Wall(), PlaySettings("wall", size="big"))
     with player(replace(options, out=tmp_path / "gone")) as (mission, _), pytest.raises(StorageError, match="gone"):
-        mission.play(Wall(), options.play)
+        mission.play(seen(Wall(), options))
 
 
 @pytest.mark.parametrize(
@@ -168,6 +166,13 @@ def test_what_is_wrong_is_raised_before_or_when_it_is_met(tmp_path: Path) -> Non
     [
         (["--source", "/nowhere"], "--task"),
         (["--source", "/nowhere", "--task", "Pick up the mug"], "/nowhere"),
+        (["--source", "sim:attic", "--task", "Pick up the mug"], "sim:attic"),
+        (["--source", "sim:home?trajectory=9", "--task", "Pick up the mug"], "trajectory"),
+        (["--source", "sim:home", "--task", "Pick up the mug", "--frames", "500:"], "500:"),
+        (["--source", "sim:home", "--task", "Pick up the mug", "--size", "big"], "size"),
+        (["--source", "sim:home", "--task", "Pick up the mug", "--hold-out", "1"], "hold-out"),
+        (["--threads", "0"], "threads"),
+        (["--max-gaussians", "0"], "max_gaussians"),
         (["--agent-id", ""], "--agent-id"),
         (["--voxel-size", "nan"], "voxel"),
         (["--rate", "-1"], "rate"),
@@ -234,12 +239,24 @@ def test_without_a_mapped_frame_nothing_is_written_over(tmp_path: Path) -> None:
     assert (tmp_path / "map.ply").read_text() == "of an earlier life"
 
 
-def test_a_simulated_home_is_built_when_it_is_needed_and_a_folder_is_looked_at_now() -> None:
-    with pytest.raises(DatasetError, match="/nowhere"):
-        StandIn(PlaySettings("/nowhere"), None)
-    late = StandIn(PlaySettings("sim:attic"), None)
-    with pytest.raises(DatasetError, match="sim:attic"):
-        late.source()
+def test_a_damaged_frame_ends_the_mission_and_what_was_mapped_is_sent_and_written(tmp_path: Path) -> None:
+    options = settings(tmp_path)
+    with team() as fusion, player(options, fusion.client.address) as (mission, _):
+        with pytest.raises(DatasetError, match="frame-3"):
+            mission.play(seen(Wall(broken_at=3), options))
+        [agent] = fusion.client.status().agents
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert report["frames"] == 3
+    assert "frame-3.png" in report["stopped_by"]
+    assert agent.gaussians == read_ply(tmp_path / "map.ply").active.sum() > 0
+
+
+def test_a_first_frame_that_is_damaged_writes_nothing_over(tmp_path: Path) -> None:
+    options = settings(tmp_path)
+    (tmp_path / "map.ply").write_text("of an earlier life")
+    with player(options) as (mission, _), pytest.raises(DatasetError, match="frame-0"):
+        mission.play(seen(Wall(broken_at=0), options))
+    assert (tmp_path / "map.ply").read_text() == "of an earlier life"
 
 
 def test_what_fails_at_the_very_end_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

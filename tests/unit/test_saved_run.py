@@ -28,7 +28,8 @@ from gausslite.mapping.checkpoint import generator_state, set_generator
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.roi import RoiLedger
 from gausslite.mapping.settings import KeyframeSettings, MapperSettings, SeedingSettings
-from gausslite.mission.saved_run import resume_run, save_run
+from gausslite.mission.saved_run import RunTerms, SavedRun, save_run
+from gausslite.mission.settings import MissionSettings
 from gausslite.optimize.density import DensitySettings
 from gausslite.optimize.view_fit import ViewPrior
 from gausslite.perception.attention import TaskAttention
@@ -47,6 +48,7 @@ GRAPH = TaskGraph(
 )
 REGIONS = {"mug": BallRegion((0.1, -0.1, 2.0), 0.3), "table": BallRegion((0.0, 0.3, 2.0), 0.5)}
 FRAMES, CUT = 11, 5
+TERMS = RunTerms.of(MissionSettings(), task=GRAPH.text)
 
 
 def loop(max_gaussians: int = 400, window: int = 2) -> TaskMapper:
@@ -90,9 +92,9 @@ def fingerprint(run: TaskMapper, words: list[VoxelWords | None]) -> dict[str, in
 
 def go_on(path: str) -> None:
     """In a process of its own: take the run up, map the rest and print the fingerprint."""
-    run = loop()
-    last_index = resume_run(Path(path), run, GRAPH)
-    print(json.dumps(fingerprint(run, words_of_run(run, last_index + 1, FRAMES))))
+    run, saved = loop(), SavedRun.read(Path(path))
+    saved.restore(run)
+    print(json.dumps(fingerprint(run, words_of_run(run, saved.last_index + 1, FRAMES))))
 
 
 def test_a_run_cut_in_two_gives_the_same_bits_as_one_in_one_go(tmp_path: Path) -> None:
@@ -100,7 +102,7 @@ def test_a_run_cut_in_two_gives_the_same_bits_as_one_in_one_go(tmp_path: Path) -
     words = words_of_run(whole, 0, FRAMES)
     first = loop()
     words_of_run(first, 0, CUT)
-    save_run(tmp_path / "run.state", first, GRAPH, CUT - 1)
+    save_run(tmp_path / "run.state", first, TERMS, CUT - 1)
     code = f"import sys; sys.path[:0] = {sys.path!r}; import test_saved_run; test_saved_run.go_on(sys.argv[1])"
     done = subprocess.run(
         [sys.executable, "-c", code, str(tmp_path / "run.state")], capture_output=True, text=True, timeout=120
@@ -115,9 +117,11 @@ def test_saving_changes_nothing_and_restoring_gives_back_what_was_saved(tmp_path
     run, same = loop(), loop()
     words_of_run(run, 0, CUT)
     before = {name: array.copy() for name, array in run.state().items()}
-    save_run(tmp_path / "run.state", run, GRAPH, CUT - 1)
+    save_run(tmp_path / "run.state", run, TERMS, CUT - 1)
     assert_same(run.state(), before)
-    assert resume_run(tmp_path / "run.state", same, GRAPH) == CUT - 1
+    saved = SavedRun.read(tmp_path / "run.state")
+    saved.restore(same)
+    assert (saved.last_index, saved.terms) == (CUT - 1, TERMS)
     assert_same(same.state(), before)
 
 
@@ -125,17 +129,37 @@ def test_saving_changes_nothing_and_restoring_gives_back_what_was_saved(tmp_path
 def saved(tmp_path: Path) -> Path:
     run, path = loop(), tmp_path / "run.state"
     words_of_run(run, 0, 3)
-    save_run(path, run, GRAPH, 2)
+    save_run(path, run, TERMS, 2)
     return path
 
 
-def test_another_task_or_too_small_a_cap_is_told(saved: Path) -> None:
-    with pytest.raises(MismatchError, match="expected a run for '', got one for 'Pick up"):
-        resume_run(saved, loop(), None)
+def test_other_terms_are_told_all_at_once(saved: Path) -> None:
+    run = SavedRun.read(saved)
+    run.require(TERMS)
+    other = RunTerms.of(MissionSettings(policy="uniform", rate_hz=4.0, max_gaussians=9), task="Find the chair")
+    with pytest.raises(MismatchError) as told:
+        run.require(other)
+    assert str(told.value) == (
+        f"{saved}: expected the options of the saved run, --max-gaussians '150000' (got '9'), --policy 'task' (got "
+        "'uniform'), --rate 'default' (got '4'), --task 'Pick up the mug on the table' (got 'Find the chair')"
+    )
+    # an option that only one of them knows counts as well
+    assert RunTerms({}).differences(RunTerms({"size": "1x2"})) == ("--size '1x2' (got '')",)
+
+
+def test_a_loop_that_is_too_small_is_told(saved: Path) -> None:
     with pytest.raises(MapFileError, match="max_gaussians: expected at least"):
-        resume_run(saved, loop(max_gaussians=10), GRAPH)
+        SavedRun.read(saved).restore(loop(max_gaussians=10))
     with pytest.raises(MapFileError, match="expected at most 1, 2 and 3"):
-        resume_run(saved, loop(window=1), GRAPH)
+        SavedRun.read(saved).restore(loop(window=1))
+
+
+@pytest.mark.parametrize("terms", ["", "[1]", '{"a": 1}', "[" * 100_000, "\0"])
+def test_terms_that_are_none_are_told(terms: str, saved: Path) -> None:
+    state = read_state(saved)
+    write_state(saved, {**state, "about/terms": np.frombuffer(terms.encode(), np.uint8)})
+    with pytest.raises(MapFileError, match=r"run\.state: state terms: expected options"):
+        SavedRun.read(saved)
 
 
 def test_a_file_cut_anywhere_or_with_any_byte_turned_is_told(saved: Path) -> None:
@@ -187,7 +211,7 @@ def test_impossible_declarations_are_told_before_memory_is_taken(count: int, con
 def state(tmp_path_factory: pytest.TempPathFactory) -> State:
     run, path = loop(), tmp_path_factory.mktemp("states") / "run.state"
     words_of_run(run, 0, 2)
-    save_run(path, run, GRAPH, 1)
+    save_run(path, run, TERMS, 1)
     return read_state(path)
 
 
@@ -251,6 +275,27 @@ def test_the_command_line_says_it_in_one_line(
     assert main(map_command(sequence, tmp_path / "out", "--resume", str(path))) == 2
     [line] = capsys.readouterr().err.splitlines()
     assert "run.state" in line
+
+
+def test_other_options_are_told_before_anything_is_done(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    sequence = write_seven_scenes(tmp_path / "kitchen")
+    state = str(tmp_path / "run.state")
+    assert main(map_command(sequence, tmp_path / "out", "--save-state", state)) == 0
+    capsys.readouterr()
+    for options, told in (
+        (("--max-gaussians", "149"), "--max-gaussians '150' (got '149')"),
+        (("--size", "32x24"), "--size '"),
+        (("--rate", "5"), "--rate 'default' (got '5')"),
+        (("--policy", "uniform"), "--policy 'task' (got 'uniform')"),
+        (("--roi-ball", "0,0,1,0.4"), "--roi-ball '0.0,0.0,2.0,0.4' (got '0.0,0.0,2.0,0.4 0.0,0.0,1.0,0.4')"),
+    ):
+        assert main(map_command(sequence, tmp_path / "other", *options, "--resume", state)) == 2
+        [line] = capsys.readouterr().err.splitlines()
+        assert told in line
+    assert not (tmp_path / "other").exists()
+    more = ("--resume", state, "--task", "Find the mug")
+    assert main(["map", str(sequence), "--threads", "1", "--out", str(tmp_path / "other"), *more]) == 2
+    assert "--task '' (got 'Find the mug')" in capsys.readouterr().err
 
 
 def test_the_command_line_goes_on_after_the_last_frame(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -5,15 +5,10 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Iterator, Sequence
 from concurrent.futures import Future
 from enum import Enum
 
-from gausslite.datasets.selection import frame_size, select_frames
-from gausslite.datasets.source import Source
-from gausslite.domain.frame import Frame
-from gausslite.errors import GaussLiteError
-from gausslite.evaluation.held_out import HoldOut
+from gausslite.errors import DatasetError, GaussLiteError
 from gausslite.mission.results import write_results
 from gausslite.task.parser import TaskParser
 from gausslite.wire.clients import FusionClient
@@ -22,7 +17,8 @@ from gausslite.wire.uplink import Uplink
 from gausslite.wire.uplink_values import UplinkCounters
 from gausslite_agent.report import mission_report
 from gausslite_agent.robot import FrameReport, Robot
-from gausslite_agent.settings import AgentSettings, PlaySettings
+from gausslite_agent.settings import AgentSettings
+from gausslite_agent.stand_in import StandIn
 
 _log = logging.getLogger(__name__)
 
@@ -60,30 +56,42 @@ class Player:
         """Give the robot the task of the command line."""
         self._robot.assign(self._parser.parse(self._settings.task or "")).result()
 
-    def play(self, source: Source, play: PlaySettings) -> None:
-        """Map every frame, then end the mission. Raises what the source, the disk or the task raise."""
+    def play(self, stand_in: StandIn) -> None:
+        """Map every frame, then end the mission. Raises what the disk or the task raise.
+
+        A damaged frame ends the mission early: what was mapped until then is sent and written, then it is raised.
+        """
         self._started_s = time.monotonic()
-        frames = _frames(source, play)
         self.assign()
         self._state = MissionState.MAPPING
+        damaged: DatasetError | None = None
         waiting: Future[FrameReport] | None = None
-        for frame in frames:
-            # one frame is read while the one before is mapped
-            if waiting is not None:
-                self._note(waiting.result())
-            if self._stopping.is_set():
-                break
-            waiting = self._robot.submit(frame)
+        try:
+            for frame in stand_in.frames():
+                # one frame is read while the one before is mapped
+                if waiting is not None:
+                    self._note(waiting.result())
+                if self._stopping.is_set():
+                    break
+                waiting = self._robot.submit(frame)
+        except DatasetError as error:
+            damaged = error
         if waiting is not None:
             waiting.result()
-        self._finish()
+        if damaged is None:
+            self._finish()
+            return
+        if self._robot.status().mapped > 0:
+            self._finish(str(damaged))
+        raise damaged
 
     def conclude(self) -> None:
         """End a mission whose frames were sent: write what is mapped, if anything is. Raises StorageError."""
         if self._robot.status().mapped > 0:
             self._finish()
 
-    def _finish(self) -> None:
+    def _finish(self, ended_by: str | None = None) -> None:
+        """Send what waits and write the results; ended_by says what kept the mission from its last frame."""
         self._state = MissionState.DRAINING
         self._robot.settle().result()
         gaussians = self._robot.do(lambda mapper: mapper.gaussians()).result()
@@ -97,10 +105,12 @@ class Player:
             seconds = time.monotonic() - self._started_s
             report = mission_report(self._settings.agent_id, status, gaussians, counters, seconds)
             memory_mib = self._robot.do(lambda mapper: mapper.memory_mib()).result()
-            write_results(self._settings.out, gaussians, {**report, "memory_mib": memory_mib})
+            stopped_by = "interrupted" if self._stopping.is_set() else ended_by
+            about = {**report, "memory_mib": memory_mib, "stopped_by": stopped_by}
+            write_results(self._settings.out, gaussians, about)
         _log.info(
             "mission %s: %d frames at %.2f Hz, %d Gaussians, %d bytes of the task's region sent",
-            "interrupted" if self._stopping.is_set() else "done",
+            "interrupted" if self._stopping.is_set() else "ended early" if ended_by else "done",
             *(status.mapped, status.hz, len(gaussians), counters.roi_bytes),
         )
         if not self._stopping.is_set():
@@ -131,12 +141,3 @@ class Player:
     def _note(self, report: FrameReport) -> None:
         if report.reason:
             _log.info("frame %d %s: %s", report.index, report.outcome.value, report.reason)
-
-
-def _frames(source: Source, play: PlaySettings) -> Iterator[Frame]:
-    """The chosen frames, read as they are asked for; wrong choices are raised at once."""
-    size = frame_size(play.size, source)
-    positions: Sequence[int] = select_frames(source, play.frames)
-    if play.hold_out is not None:
-        positions, _ = HoldOut(play.hold_out).split(positions)
-    return (source.frame(position, size) for position in positions)

@@ -38,17 +38,16 @@ def run(arguments: Sequence[str] | None = None) -> int:
 async def _serve(settings: AgentSettings) -> None:
     """Build the robot, serve it, play its source; close in the reverse order."""
     _require_usable(settings)
-    stand_in = None if settings.play is None else StandIn(settings.play, settings.up_axis)
+    stand_in = None if settings.play is None else StandIn.open(settings.play, settings.up_axis)
     loop, news = asyncio.get_running_loop(), Bell()
     with ExitStack() as stack:
         parser = _parser(settings.link, stack)
         uplink, client = _uplink(settings, stack)
-        # the scene is there once the first task is
-        attentions = functools.cache(lambda: Attentions(_scene(settings, stand_in), settings.perception))
+        attentions = Attentions(settings.perception, lambda: _scene(settings, stand_in))
         robot = Robot(
             settings.mission,
             settings.link.grid,
-            lambda graph: attentions().to(graph),
+            attentions.to,
             uplink,
             on_change=lambda: _ring(loop, news),
             load=settings.load,
@@ -67,11 +66,6 @@ def _require_usable(settings: AgentSettings) -> None:
         unit_up_axis(settings.up_axis)
     if settings.out is not None:
         prepare_folder(settings.out)
-    if settings.perception.model is not None:
-        from gausslite.perception.families import Networks
-
-        asked = settings.perception
-        Networks(settings.perception.model, asked.segmenter, asked.vocabulary, asked.threads)
 
 
 async def _live(settings: AgentSettings, stand_in: StandIn | None, player: Player, uplink: Uplink | None) -> None:
@@ -94,7 +88,7 @@ async def _live(settings: AgentSettings, stand_in: StandIn | None, player: Playe
 def _begin(settings: AgentSettings, stand_in: StandIn | None, player: Player) -> None:
     """Play the source, or take the task and wait for frames; without either do nothing."""
     if stand_in is not None:
-        player.play(stand_in.source(), stand_in.play)
+        player.play(stand_in)
     elif settings.task is not None:
         player.assign()
 
@@ -118,7 +112,7 @@ def _uplink(settings: AgentSettings, stack: ExitStack) -> tuple[Uplink | None, F
 
 def _scene(settings: AgentSettings, stand_in: StandIn | None) -> SceneKnowledge:
     if stand_in is not None:
-        return SceneKnowledge.of(stand_in.source())
+        return SceneKnowledge.of(stand_in.source)
     return SceneKnowledge() if settings.up_axis is None else SceneKnowledge(unit_up_axis(settings.up_axis))
 
 

@@ -1,34 +1,40 @@
-"""The sequence that stands in for the robot's camera, opened while the agent already answers if that takes long."""
+"""The sequence that stands in for the robot's camera; what is wrong with it is told before anything is served."""
 
 from __future__ import annotations
 
-import threading
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
-from gausslite.datasets.open import is_simulated, open_source
+from gausslite.datasets.open import open_source
+from gausslite.datasets.selection import frame_size, select_frames
 from gausslite.datasets.source import Source
+from gausslite.domain.frame import Frame
 from gausslite.domain.pose import UpAxis
+from gausslite.evaluation.held_out import HoldOut
 from gausslite_agent.settings import PlaySettings
 
 
+@dataclass(frozen=True, slots=True)
 class StandIn:
-    """Opens a sequence once, whoever asks first; the others wait for it.
+    """A sequence, which of its frames are mapped, and the size of their images."""
 
-    A folder is opened here and now, so that a wrong path is told before anything is served. A simulated home takes
-    seconds to build and waits for the first `source`.
-    """
+    source: Source
+    positions: Sequence[int]
+    size: tuple[int, int]
 
-    def __init__(self, play: PlaySettings, up_axis: UpAxis | None) -> None:
-        """Raises DatasetError and the like for a folder."""
-        self.play = play
-        self._up_axis = up_axis
-        self._opening = threading.Lock()
-        self._source: Source | None = None
-        if not is_simulated(play.source):
-            self.source()
+    @classmethod
+    def open(cls, play: PlaySettings, up_axis: UpAxis | None) -> StandIn:
+        """Look at a folder, or at the settings of a simulated home. Raises DatasetError, InvalidInputError."""
+        return cls.of(open_source(play.source, up_axis, play.colour_camera), play)
 
-    def source(self) -> Source:
-        """The opened sequence. Raises what opening raises, every time."""
-        with self._opening:
-            if self._source is None:
-                self._source = open_source(self.play.source, self._up_axis, self.play.colour_camera)
-            return self._source
+    @classmethod
+    def of(cls, source: Source, play: PlaySettings) -> StandIn:
+        """The chosen frames of a sequence. Raises DatasetError when there are none, InvalidInputError."""
+        positions: Sequence[int] = select_frames(source, play.frames)
+        if play.hold_out is not None:
+            positions, _ = HoldOut(play.hold_out).split(positions)
+        return cls(source, positions, frame_size(play.size, source))
+
+    def frames(self) -> Iterator[Frame]:
+        """Each read when it is asked for. Raises DatasetError for a damaged one."""
+        return (self.source.frame(position, self.size) for position in self.positions)

@@ -17,6 +17,7 @@ from gausslite.evaluation.quality.study import Archive, Study, run_study
 from gausslite.evaluation.quality.tables import Scoreboard, ablation_table, quality_table
 from gausslite.evaluation.quality.trials import Budget, Conditions, Equal, Eyes, Trial, TrialResult, Variant
 from gausslite.mapping.policies import POLICIES
+from gausslite.mission.build import open_networks
 from gausslite.mission.options import add_colour_camera, add_view_error, names, up_axis
 from gausslite.mission.results import write_json
 from gausslite.mission.settings import PerceptionSettings
@@ -145,7 +146,8 @@ def _eyes(options: argparse.Namespace) -> Eyes:
 def _run(study: Study, options: argparse.Namespace) -> Scoreboard:
     for plan in study.plans:
         for trial in study.trials(plan):
-            trial.mission.mapper_settings()  # a wrong name or number is told before hours of work
+            _ = trial.mission  # a wrong name or number is told before hours of work, and so is a wrong file
+    open_networks(study.conditions.eyes.detector)
     perceptual = None
     if options.lpips_weights:
         from gausslite.evaluation.lpips import load_lpips

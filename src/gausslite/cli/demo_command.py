@@ -15,14 +15,24 @@ from gausslite.datasets.open import open_source
 from gausslite.datasets.regions import choose_regions
 from gausslite.datasets.selection import frame_size, select_frames
 from gausslite.domain.region import Region
+from gausslite.domain.voxels import VoxelGrid
 from gausslite.errors import InvalidInputError
 from gausslite.evaluation.compare import MapScores
 from gausslite.evaluation.held_out import HoldOut
 from gausslite.evaluation.pictures import write_png
 from gausslite.evaluation.team import TeamScores, Viewpoints, score_team
 from gausslite.fusion.terms import MAX_REFINE_ITERATIONS
-from gausslite.mission.options import add_budget, add_colour_camera, add_detector, add_voxel_size, names
+from gausslite.mission.build import open_networks
+from gausslite.mission.options import (
+    add_budget,
+    add_colour_camera,
+    add_detector,
+    add_voxel_size,
+    names,
+    perception_settings,
+)
 from gausslite.mission.results import prepare_folder, write_json
+from gausslite.mission.settings import MissionSettings
 from gausslite.perception.vocabulary import same_kind
 from gausslite.render.choose import choose_rasterizer
 
@@ -63,6 +73,7 @@ def run(options: argparse.Namespace) -> int:
         raise InvalidInputError(
             f"--refine-iterations: expected 0 to {MAX_REFINE_ITERATIONS}, got {options.refine_iterations}"
         )
+    _require_usable(options)
     stage = _simulated_stage(options) if options.source is None else _recorded_stage(options)
     regions = _scored_regions(options, stage.regions)
     prepare_folder(options.out)
@@ -85,6 +96,21 @@ def run(options: argparse.Namespace) -> int:
     print(_table(agents, scores.scores))
     print(f"report, maps and pictures are in {options.out}")
     return 0
+
+
+def _require_usable(options: argparse.Namespace) -> None:
+    """Say before a home is built what every agent would say for itself. Raises InvalidInputError, ModelFileError."""
+    MissionSettings(
+        max_gaussians=options.max_gaussians,
+        iterations=options.iterations,
+        rate_hz=options.rate,
+        least_iterations=options.least,
+        reliefs=options.relief,
+        seed=options.seed,
+        threads=options.threads,
+    )
+    VoxelGrid(options.voxel_size)
+    open_networks(perception_settings(options))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -149,7 +175,12 @@ def _scored_regions(options: argparse.Namespace, regions: Mapping[str, Region]) 
 def _plan(options: argparse.Namespace, stage: _Stage) -> TeamPlan:
     width, height = stage.size
     shared = ["--size", f"{width}x{height}", "--max-gaussians", str(options.max_gaussians), "--seed", str(options.seed)]
-    shared += ["--threads", str(options.threads or 1), "--voxel-size", str(options.voxel_size)]
+    shared += [
+        "--threads",
+        str(1 if options.threads is None else options.threads),
+        "--voxel-size",
+        str(options.voxel_size),
+    ]
     if stage.hold_out is not None:
         shared += ["--hold-out", str(stage.hold_out)]
     if options.colour_camera is not None:
@@ -163,7 +194,7 @@ def _plan(options: argparse.Namespace, stage: _Stage) -> TeamPlan:
     if options.vocabulary is not None:
         shared += ["--vocabulary", str(options.vocabulary.absolute())]
     if options.rate is not None:
-        shared += ["--rate", str(options.rate)]
+        shared += ["--rate", str(options.rate), "--least", str(options.least), "--relief", ",".join(options.relief)]
     if options.iterations is not None:
         shared += ["--iterations", str(options.iterations)]
     return TeamPlan(stage.agents, tuple(shared), options.voxel_size, options.refine_iterations, options.seed)

@@ -41,6 +41,7 @@ def run(options: argparse.Namespace) -> int:
     """Draw the map from every selected frame with depth, compare, print the means."""
     from tqdm import tqdm
 
+    rasterizer = choose_rasterizer(threads=options.threads)
     gaussians = read_ply(options.map)
     source = open_source(options.source, options.up, options.colour_camera)
     positions = select_frames(source, options.frames)
@@ -50,7 +51,7 @@ def run(options: argparse.Namespace) -> int:
             raise DatasetError(f"--hold-out {options.hold_out}: expected at least that many frames, got fewer")
     chosen = asked_regions(options, source)
     size = frame_size(options.size, source)
-    viewer = MapViewer(gaussians, choose_rasterizer(threads=options.threads))
+    viewer = MapViewer(gaussians, rasterizer)
     if options.pictures is not None:
         prepare_folder(options.pictures)
     pictured = set(positions[:: max(1, len(positions) // _PICTURES)])

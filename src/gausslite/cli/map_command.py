@@ -3,31 +3,30 @@
 from __future__ import annotations
 
 import argparse
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from gausslite.cli.arguments import add_regions, add_source, asked_regions
+from gausslite.cli.mapping_run import MappingRun
 from gausslite.cli.parse_command import as_json
-from gausslite.cli.progress import MappingBar
 from gausslite.datasets.open import open_source
 from gausslite.datasets.selection import frame_size, select_frames
 from gausslite.datasets.source import Source
+from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.task import TaskGraph
-from gausslite.errors import GaussLiteError, InvalidInputError
-from gausslite.interrupts import AfterThisStep
+from gausslite.errors import InvalidInputError
 from gausslite.mapping.pace import Pace
 from gausslite.mapping.policies import TASK
 from gausslite.mission.build import Attentions, build_attention, build_mapper
 from gausslite.mission.options import add_budget, add_detector, add_policy, mission_settings, perception_settings
 from gausslite.mission.results import peak_rss_mib, prepare_file, prepare_folder, write_results
-from gausslite.mission.saved_run import last_frame, resume_run, save_run
-from gausslite.mission.settings import SceneKnowledge
+from gausslite.mission.saved_run import RunTerms, SavedRun, save_run
+from gausslite.mission.settings import MissionSettings, SceneKnowledge
 from gausslite.mission.turns import TaskPlan, Turn
 from gausslite.perception.attention import Attention
 from gausslite.perception.fixed import NoAttention, RegionAttention
-from gausslite.pipeline import FrameOutcome, TaskMapper
+from gausslite.pipeline import TaskMapper
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -55,125 +54,106 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Map the sequence and write the results."""
-    settings = mission_settings(options)
-    turns = [Turn.parse(text) for text in options.then]
-    source = open_source(options.source, options.up, options.colour_camera)
-    positions = select_frames(source, options.frames)
-    size = frame_size(options.size, source)
-    attention, first = choose_attention(options, source)
-    plan, attentions = _plan(first, turns), Attentions(SceneKnowledge.of(source), perception_settings(options))
-    graph = first if options.resume is None or not plan.turns else plan.at(last_frame(options.resume))
-    if graph is not None and graph is not first:
-        attention = attentions.to(graph)
-    mapper = TaskMapper(attention, build_mapper(settings), pace=Pace(settings.pace))
+    """Map the sequence and write the results; whatever can be told before the work is."""
+    asked = _Asked.of(options)
+    saved = asked.saved_run(options)
     prepare_folder(options.out)
     if options.save_state is not None:
         prepare_file(options.save_state)
-    last_index = -1
-    if options.resume is not None:
-        last_index = resume_run(options.resume, mapper, graph)
-        positions = [position for position in positions if source.indices()[position] > last_index]
-    mission = _Player(source, size, mapper, plan, attentions).play(positions, graph)
-    if mission.outcomes:
-        last_index = mission.outcomes[-1].index
-    elif mission.stopped is not None:
+    last_index = -1 if saved is None else saved.last_index
+    graph = asked.plan.at(last_index)
+    attentions = Attentions(perception_settings(options), lambda: SceneKnowledge.of(asked.source))
+    attention = _region_attention(options, asked.source) if graph is None else attentions.to(graph)
+    mapper = TaskMapper(attention, build_mapper(asked.settings), pace=Pace(asked.settings.pace))
+    if saved is not None:
+        saved.restore(mapper)
+    mission = MappingRun(asked.source, asked.size, mapper, asked.plan, attentions).play(asked.after(last_index), graph)
+    if not mission.outcomes and mission.stopped is not None:
         raise mission.stopped
     gaussians = mapper.gaussians()
-    active = int(gaussians.active.sum())
-    report = {
-        "source": options.source,
-        "colour_camera": None if options.colour_camera is None else str(options.colour_camera),
-        "task": None if first is None else {"text": first.text, **as_json(first)},
-        "then": [{"frame": frame, "text": later.text, **as_json(later)} for frame, later in plan.turns],
-        "policy": options.policy,
-        "without": sorted(settings.without),
-        "size": list(size),
-        "seed": settings.seed,
-        **mission.summary(),
-        "gaussians": len(gaussians),
-        "active_gaussians": active,
-        "max_gaussians": settings.max_gaussians,
-        "resumed_from": None if options.resume is None else str(options.resume),
-        "peak_rss_mib": peak_rss_mib(),
-        "memory_mib": mapper.memory_mib(),
-        "notes": list(mapper.notes),
-    }
+    report = {**asked.report(options), **mission.summary(), **_held(mapper, gaussians)}
     write_results(options.out, gaussians, report)
     if options.save_state is not None:
-        save_run(options.save_state, mapper, plan.at(last_index), last_index)
+        last_index = mission.outcomes[-1].index if mission.outcomes else last_index
+        save_run(options.save_state, mapper, asked.terms(options, last_index), last_index)
     if mission.stopped is not None:
         # what was mapped until then is kept, and the exit code says that it is not all
         raise mission.stopped
     print(
         f"{report['frames']} frames at {report['hz']:.1f} Hz, {len(gaussians)} Gaussians "
-        f"({active} of the task) → {options.out / 'map.ply'}"
+        f"({report['active_gaussians']} of the task) → {options.out / 'map.ply'}"
     )
     return 0
 
 
 @dataclass(frozen=True, slots=True)
-class _Mission:
-    """The outcomes of all frames, and their time; stopped is the bad frame, or the Ctrl-C, that ended it early."""
+class _Asked:
+    """What the command line asks for, as far as it can be known without drawing, loading or training anything."""
 
-    outcomes: tuple[FrameOutcome, ...]
-    seconds: float
-    stopped: GaussLiteError | KeyboardInterrupt | None
+    settings: MissionSettings
+    source: Source
+    positions: Sequence[int]
+    size: tuple[int, int]
+    plan: TaskPlan
 
-    def summary(self) -> dict[str, object]:
-        """Totals for the report; hz is mapped frames per second of perception and mapping, without reading files."""
-        mapped = [outcome for outcome in self.outcomes if outcome.skipped is None]
-        busy_s = sum(outcome.budget.seconds for outcome in mapped)
+    @classmethod
+    def of(cls, options: argparse.Namespace) -> _Asked:
+        settings = mission_settings(options)
+        plan = _plan(asked_task(options), [Turn.parse(text) for text in options.then])
+        source = open_source(options.source, options.up, options.colour_camera)
+        return cls(settings, source, select_frames(source, options.frames), frame_size(options.size, source), plan)
+
+    def saved_run(self, options: argparse.Namespace) -> SavedRun | None:
+        """The run of --resume. Raises MapFileError, MismatchError when it was begun on other terms."""
+        if options.resume is None:
+            return None
+        saved = SavedRun.read(options.resume)
+        saved.require(self.terms(options, saved.last_index))
+        return saved
+
+    def terms(self, options: argparse.Namespace, last_index: int) -> RunTerms:
+        """What must be the same when a run goes on after the frame of this number."""
+        graph = self.plan.at(last_index)
+        return RunTerms.of(
+            self.settings,
+            size=f"{self.size[0]}x{self.size[1]}",
+            task="" if graph is None else graph.text,
+            roi="" if options.roi is None else options.roi.name,
+            objects=",".join(options.objects),
+            roi_ball=" ".join(f"{','.join(map(str, ball.centre_m))},{ball.radius_m}" for ball in options.roi_ball),
+        )
+
+    def after(self, index: int) -> list[int]:
+        """The positions of the frames with greater numbers."""
+        indices = self.source.indices()
+        return [position for position in self.positions if indices[position] > index]
+
+    def report(self, options: argparse.Namespace) -> dict[str, object]:
+        """As a part of the report."""
+        first = self.plan.first
         return {
-            "frames": len(mapped),
-            "frames_skipped": len(self.outcomes) - len(mapped),
-            "iterations": sum(outcome.iterations for outcome in mapped),
-            "roi_share": sum(outcome.roi_share for outcome in mapped) / max(len(mapped), 1),
-            "keyframes_reread": sum(outcome.reread.keyframes for outcome in self.outcomes),
-            "seeded_in_keyframes": sum(outcome.reread.seeded for outcome in self.outcomes),
-            "hz": len(mapped) / busy_s if busy_s > 0 else 0.0,
-            "seconds": self.seconds,
-            "stopped_by": None if self.stopped is None else str(self.stopped) or "interrupted",
+            "source": options.source,
+            "colour_camera": None if options.colour_camera is None else str(options.colour_camera),
+            "task": None if first is None else {"text": first.text, **as_json(first)},
+            "then": [{"frame": frame, "text": later.text, **as_json(later)} for frame, later in self.plan.turns],
+            "policy": options.policy,
+            "without": sorted(self.settings.without),
+            "size": list(self.size),
+            "seed": self.settings.seed,
+            "max_gaussians": self.settings.max_gaussians,
+            "resumed_from": None if options.resume is None else str(options.resume),
         }
 
 
-@dataclass(frozen=True, slots=True)
-class _Player:
-    """Plays a source to a loop, which is given each task when its turn has come."""
-
-    source: Source
-    size: tuple[int, int]
-    mapper: TaskMapper
-    plan: TaskPlan
-    attentions: Attentions
-
-    def play(self, positions: Sequence[int], graph: TaskGraph | None) -> _Mission:
-        """Map these frames; graph is the task that the loop has now."""
-        started_s = time.perf_counter()
-        outcomes: list[FrameOutcome] = []
-        stopped: GaussLiteError | KeyboardInterrupt | None = None
-        indices = self.source.indices()
-        with MappingBar(len(positions)) as bar, AfterThisStep() as interrupt:
-            for position in positions:
-                if interrupt.asked:
-                    stopped = KeyboardInterrupt()
-                    break
-                try:
-                    frame = self.source.frame(position, self.size)
-                except GaussLiteError as error:
-                    stopped = error
-                    break
-                graph = self._turn(graph, indices[position])
-                outcomes.append(self.mapper.process(frame))
-                bar.show(len(outcomes), outcomes[-1].gaussians, outcomes[-1].roi_share)
-        return _Mission(tuple(outcomes), time.perf_counter() - started_s, stopped)
-
-    def _turn(self, now: TaskGraph | None, index: int) -> TaskGraph | None:
-        """The task of this frame, assigned where it asks for other things than the one before."""
-        graph = self.plan.at(index)
-        if graph is not None and now is not None and not graph.asks_the_same_as(now):
-            self.mapper.assign(self.attentions.to(graph))
-        return graph
+def _held(mapper: TaskMapper, gaussians: Gaussians) -> dict[str, object]:
+    """What the map holds, and what it takes."""
+    return {
+        "gaussians": len(gaussians),
+        "active_gaussians": int(gaussians.active.sum()),
+        "peak_rss_mib": peak_rss_mib(),
+        "memory_mib": mapper.memory_mib(),
+        "notes": list(mapper.notes),
+    }
 
 
 def _plan(first: TaskGraph | None, turns: Sequence[Turn]) -> TaskPlan:
@@ -187,20 +167,35 @@ def _plan(first: TaskGraph | None, turns: Sequence[Turn]) -> TaskPlan:
     return TaskPlan(first, tuple((turn.frame, RuleParser().parse(turn.text)) for turn in turns))
 
 
-def choose_attention(options: argparse.Namespace, source: Source) -> tuple[Attention, TaskGraph | None]:
-    """A task in words, or regions of space, or (for a uniform map) nothing to attend to."""
-    regions = asked_regions(options, source)
+def asked_task(options: argparse.Namespace) -> TaskGraph | None:
+    """The task in words, None where regions of space (or nothing, for a uniform map) take its place.
+
+    Raises InvalidInputError for options that contradict each other, TaskError.
+    """
+    regions = options.roi is not None or options.objects or options.roi_ball
     if options.task is not None and regions:
         raise InvalidInputError("--task: give either a task in words, or regions with --roi or --roi-ball, not both")
     if options.detector is not None and options.task is None:
         raise InvalidInputError("--detector: finds the nouns of a task; give the task with --task TEXT")
-    if options.task is not None:
-        from gausslite.task.rules import RuleParser
+    if options.task is None:
+        if not regions and options.policy == TASK:
+            raise InvalidInputError(
+                "--task: expected a task in words, or regions with --roi FILE.npz or --roi-ball X,Y,Z,R"
+            )
+        return None
+    from gausslite.task.rules import RuleParser
 
-        graph = RuleParser().parse(options.task)
-        return build_attention(graph, SceneKnowledge.of(source), perception_settings(options)), graph
-    if not regions and options.policy == TASK:
-        raise InvalidInputError(
-            "--task: expected a task in words, or regions with --roi FILE.npz or --roi-ball X,Y,Z,R"
-        )
-    return RegionAttention(regions) if regions else NoAttention(), None
+    return RuleParser().parse(options.task)
+
+
+def choose_attention(options: argparse.Namespace, source: Source) -> tuple[Attention, TaskGraph | None]:
+    """A task in words, or regions of space, or (for a uniform map) nothing to attend to."""
+    graph = asked_task(options)
+    if graph is None:
+        return _region_attention(options, source), None
+    return build_attention(graph, SceneKnowledge.of(source), perception_settings(options)), graph
+
+
+def _region_attention(options: argparse.Namespace, source: Source) -> Attention:
+    regions = asked_regions(options, source)
+    return RegionAttention(regions) if regions else NoAttention()

@@ -30,13 +30,8 @@ def open_source(spec: str, up_axis: UpAxis | None = None, colour_camera: ColourC
     return source if colour_camera is None else RegisteredSource(source, colour_camera)
 
 
-def is_simulated(spec: str) -> bool:
-    """True for a sequence that is made, which can take seconds, and not read."""
-    return spec.startswith(_SIMULATED)
-
-
 def _open(spec: str, up_axis: UpAxis | None) -> Source:
-    if is_simulated(spec):
+    if spec.startswith(_SIMULATED):
         # the simulated home needs the optional ray caster; files do not
         from gausslite.datasets.simulated.source import open_simulated
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gausslite.domain.task import TaskGraph
@@ -26,45 +27,47 @@ def build_mapper(settings: MissionSettings) -> GaussianMapper:
 
 def build_attention(graph: TaskGraph, scene: SceneKnowledge, perception: PerceptionSettings) -> Attention:
     """Attention to one task alone; see Attentions."""
-    return Attentions(scene, perception).to(graph)
+    return Attentions(perception, lambda: scene).to(graph)
+
+
+def open_networks(perception: PerceptionSettings) -> Networks | None:
+    """The user's model files, opened and tried; None without any. Raises ModelFileError, InvalidInputError."""
+    if perception.model is None:
+        return None
+    from gausslite.perception.families import Networks
+
+    return Networks(perception.model, perception.segmenter, perception.vocabulary, perception.threads)
 
 
 class Attentions:
-    """Makes the attention to each task of a mission. The network is loaded with the first, and shared by all."""
+    """Makes the attention to each task of a mission. The network is loaded once, here, and shared by all."""
 
-    def __init__(self, scene: SceneKnowledge, perception: PerceptionSettings) -> None:
-        self._scene = scene
+    def __init__(self, perception: PerceptionSettings, scene: Callable[[], SceneKnowledge]) -> None:
+        """Asks for the scene with the first task, as a simulated one takes seconds to build. Raises ModelFileError."""
         self._perception = perception
-        self._networks: Networks | None = None
+        self._scene = functools.cache(scene)
+        self._networks = open_networks(perception)
         self._executor: ThreadPoolExecutor | None = None
 
     def to(self, graph: TaskGraph) -> Attention:
         """Attention to a task: by the user's model files or, without one, by the scene's own ground truth.
 
-        With `beside` the network runs on a thread of its own. Raises ModelFileError for a bad file and
-        InvalidInputError when there is neither file nor ground truth.
+        With `beside` the network runs on a thread of its own. Raises InvalidInputError when there is neither file nor
+        ground truth.
         """
-        settings = AttentionSettings(up_axis=self._scene.up_axis)
-        if self._perception.model is not None:
-            networks = self._loaded(self._perception.model)
-            detector = networks.detector
-            segmenter = networks.segmenter if self._perception.resegment else None
+        scene = self._scene()
+        settings = AttentionSettings(up_axis=scene.up_axis)
+        if self._networks is not None:
+            detector = self._networks.detector
+            segmenter = self._networks.segmenter if self._perception.resegment else None
             if self._perception.beside:
                 self._executor = self._executor or ThreadPoolExecutor(1, "detector")
                 return AttentionBeside(graph, detector, self._executor, settings, segmenter)
             return TaskAttention(graph, detector, settings, segmenter)
-        if not self._scene.regions:
+        if not scene.regions:
             raise InvalidInputError(
                 "detector: the sequence has no ground-truth regions; name an ONNX file with --detector"
             )
         from gausslite.perception.ground_truth import RegionDetector
 
-        return TaskAttention(graph, RegionDetector(self._scene.regions), settings)
-
-    def _loaded(self, model: Path) -> Networks:
-        if self._networks is None:
-            from gausslite.perception.families import Networks
-
-            asked = self._perception
-            self._networks = Networks(model, asked.segmenter, asked.vocabulary, asked.threads)
-        return self._networks
+        return TaskAttention(graph, RegionDetector(scene.regions), settings)

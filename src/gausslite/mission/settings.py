@@ -14,6 +14,7 @@ from gausslite.mapping.pace import PaceSettings, Relief
 from gausslite.mapping.policies import policy, without
 from gausslite.mapping.settings import MapperSettings
 from gausslite.optimize.view_fit import ViewPrior
+from gausslite.render.cpu import MAX_THREADS
 
 DEFAULT_MAX_GAUSSIANS = 150_000
 """What two cores keep busy at 640x480; the paper's cap of a million is for a GPU."""
@@ -83,6 +84,10 @@ class MissionSettings:
             raise InvalidInputError(f"iterations: expected 0 to 10000, got {self.iterations}")
         if not 0 <= self.seed < 1 << 32:
             raise InvalidInputError(f"seed: expected 0 to {(1 << 32) - 1}, got {self.seed}")
+        if self.threads is not None and not 1 <= self.threads <= MAX_THREADS:
+            raise InvalidInputError(f"threads: expected 1 to {MAX_THREADS}, got {self.threads}")
+        # an unknown policy or component, or a cap of nothing
+        self.mapper_settings()
 
     @property
     def pace(self) -> PaceSettings | None:

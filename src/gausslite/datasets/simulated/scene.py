@@ -99,8 +99,13 @@ class HomeScene:
         return np.asarray(free >= 0)
 
 
+def require_ray_caster() -> None:
+    """Raises DatasetError without the extra `sim`; asked for first, so that it is told before a home is built."""
+    _ray_caster()
+
+
 def _ray_caster() -> Callable[[Float32[ndarray, "m 3 3"]], Any]:
-    """What makes a ray caster of triangles; asked for first, so that a missing extra is told at once."""
+    """What makes a ray caster of triangles. Raises DatasetError."""
     try:
         from embreex.mesh_construction import TriangleMesh
         from embreex.rtcore_scene import EmbreeScene

@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 import re
+import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any
 from urllib.parse import parse_qsl
 
 import numpy as np
+from jaxtyping import Float64
+from numpy import ndarray
 
 from gausslite.datasets.images import RgbdImage, resize_rgbd
 from gausslite.datasets.simulated.exposure import camera_gain
 from gausslite.datasets.simulated.family import HOME_COUNT, home_plan
 from gausslite.datasets.simulated.plan import HomePlan
 from gausslite.datasets.simulated.regions import InstanceRegion, ItemImages
-from gausslite.datasets.simulated.scene import HomeScene
+from gausslite.datasets.simulated.scene import HomeScene, require_ray_caster
 from gausslite.datasets.simulated.sensor import colour_image, noisy_colour, noisy_depth
 from gausslite.datasets.simulated.view import View, draw
 from gausslite.datasets.source import Source, require_position
@@ -93,30 +96,43 @@ def _world(home: int) -> str:
     return f"sim:home-{home}" if home else "sim:home"
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Place:
+    """A home that stands: what to draw, and its objects by name."""
+
+    plan: HomePlan
+    scene: HomeScene
+    regions: Mapping[str, Region]
+
+
+_building = threading.Lock()
+
+
 @lru_cache(maxsize=2)
-def _built(home: int, seed: int) -> tuple[HomePlan, HomeScene]:
-    """The home of this number and seed, shared by every source of the process."""
+def _built(home: int, seed: int) -> _Place:
+    """The home of this number and seed, shared by every source of the process; call it with `_building` held."""
     plan = home_plan(home, seed)
-    return plan, HomeScene(plan)
+    scene = HomeScene(plan)
+    images = ItemImages(scene)
+    regions = {name: InstanceRegion(name, scene.names.index(name), images) for name in scene.object_names}
+    return _Place(plan, scene, regions)
 
 
 class SimulatedHome:
     """A walk through a home with z up. Every frame is the same whenever and wherever it is asked for.
 
-    Frame numbers run from 0 to frames - 1, times are those numbers at 30 Hz. Raises DatasetError, also where the
-    extra `sim` is not installed.
+    Frame numbers run from 0 to frames - 1, times are those numbers at 30 Hz. The home is built, which takes seconds,
+    for the first frame or region that is asked for; what is wrong with the settings is told before. Raises
+    DatasetError where the extra `sim` is not installed.
     """
 
     def __init__(self, settings: HomeSettings, up_axis: UpAxis | None = None) -> None:
+        require_ray_caster()
         width, height = settings.size_px
         focal = _FOCAL_PER_WIDTH * width
         self._settings = settings
         self._camera = Camera(focal, focal, width / 2, height / 2, width, height)
-        self._plan, self._scene = _built(settings.home, settings.seed)
-        self._poses = self._plan.walks[settings.trajectory](settings.frames)
         self._up_axis = unit_up_axis(up_axis or (0.0, 0.0, 1.0))
-        names, images = self._scene.names, ItemImages(self._scene)
-        self._regions = {name: InstanceRegion(name, names.index(name), images) for name in self._scene.object_names}
 
     @property
     def name(self) -> str:
@@ -140,11 +156,11 @@ class SimulatedHome:
     def frame(self, i: int, size: tuple[int, int] | None = None) -> Frame:
         """The frame at position i. Raises DatasetError."""
         require_position(self.name, i, len(self))
-        settings, T_world_camera = self._settings, self._poses[i]
-        view = self._exposed(draw(self._scene, self._camera, T_world_camera, settings.gloss), i)
+        settings, place, T_world_camera = self._settings, self._place, self._poses[i]
+        view = self._exposed(draw(place.scene, self._camera, T_world_camera, settings.gloss), i)
         if settings.noise > 0:
             rng = np.random.default_rng([settings.seed, settings.trajectory, i])
-            noise = self._plan.sensor.switched(settings.holes, settings.flying)
+            noise = place.plan.sensor.switched(settings.holes, settings.flying)
             rgb = noisy_colour(view, noise, settings.noise, rng)
             depth_m = noisy_depth(view, noise, settings.noise, rng)
         else:
@@ -158,11 +174,20 @@ class SimulatedHome:
 
     def regions(self) -> Mapping[str, Region]:
         """Every object by name: table, chair_1 ..., mug, sofa ...; walls, floors and ceilings are none."""
-        return dict(self._regions)
+        return dict(self._place.regions)
+
+    @cached_property
+    def _place(self) -> _Place:
+        with _building:
+            return _built(self._settings.home, self._settings.seed)
+
+    @cached_property
+    def _poses(self) -> Float64[ndarray, "n 4 4"]:
+        return self._place.plan.walks[self._settings.trajectory](self._settings.frames)
 
     def _exposed(self, view: View, i: int) -> View:
         """The view as a camera takes it whose exposure follows the light."""
-        drift = self._settings.exposure * self._plan.exposure_drift
+        drift = self._settings.exposure * self._place.plan.exposure_drift
         if drift == 0:
             return view
         return replace(view, rgb=view.rgb * camera_gain(i / len(self), drift, self._settings.trajectory))
