@@ -31,6 +31,7 @@ from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.v1 import fusion_service_pb2_grpc as pb_grpc
 from gausslite.wire.clients import FusionClient
 from gausslite.wire.server import Service
+from gausslite.wire.tls import Tls
 from gausslite_fusion_server.refinement import Refinery
 from gausslite_fusion_server.servicer import FusionServicer
 
@@ -72,9 +73,15 @@ def request(session_id: str, subset: RoiSubset, grid: VoxelGrid = GRID) -> pb.Co
 
 @contextmanager
 def team(
-    store: FusionStore | None = None, settings: TeamSettings | None = None, refine: RefineSettings | None = None
+    store: FusionStore | None = None,
+    settings: TeamSettings | None = None,
+    refine: RefineSettings | None = None,
+    tls: Tls | None = None,
 ) -> Iterator[Team]:
-    """A fusion server on a free port with the reference rasterizer; the store stays the caller's."""
+    """A fusion server on a free port with the reference rasterizer; the store stays the caller's.
+
+    With tls its own client shows the server's certificate; stub and channel are of no use then.
+    """
     team_map = TeamMap(store or MemoryStore(), settings or TeamSettings(grid=GRID))
     settings_of_refinement = refine or RefineSettings(iterations=3, report_every=1)
     servicer = FusionServicer(team_map, Refinery(settings_of_refinement, ReferenceRasterizer))
@@ -86,8 +93,8 @@ def team(
 
     try:
         with (
-            serving([Service(servicer.service().name, register)]) as running,
-            FusionClient(running.address) as client,
+            serving([Service(servicer.service().name, register)], tls=tls) as running,
+            FusionClient(running.address, tls=tls) as client,
             grpc.insecure_channel(running.address) as channel,
         ):
             yield Team(servicer, client, pb_grpc.FusionServiceStub(channel), channel, loops[0])

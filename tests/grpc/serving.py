@@ -8,16 +8,17 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from gausslite.wire.server import RunningServer, Service, start_server
+from gausslite.wire.tls import Tls
 
 
 @contextmanager
-def serving(services: list[Service], listen: str = "127.0.0.1:0") -> Iterator[RunningServer]:
+def serving(services: list[Service], listen: str = "127.0.0.1:0", tls: Tls | None = None) -> Iterator[RunningServer]:
     """A running server; it is drained at the end."""
     loop = asyncio.new_event_loop()
     thread = threading.Thread(target=loop.run_forever)
     thread.start()
     try:
-        running = asyncio.run_coroutine_threadsafe(start_server(listen, services), loop).result(10)
+        running = asyncio.run_coroutine_threadsafe(start_server(listen, services, tls), loop).result(10)
         try:
             yield running
         finally:

@@ -129,7 +129,9 @@ def test_the_health_check_of_a_container(capsys: pytest.CaptureFixture[str]) -> 
     with serving([parser_service(RuleParser())]) as server:
         assert main([server.address]) == 0
     assert main([server.address]) == 1
-    assert main([]) == 2
-    refused, usage = capsys.readouterr().err.splitlines()
+    with pytest.raises(SystemExit) as usage_error:
+        main([])
+    assert usage_error.value.code == 2
+    refused, usage, *_ = capsys.readouterr().err.splitlines()
     assert server.address in refused
     assert usage.startswith("usage")

@@ -22,7 +22,7 @@ from gausslite.wire.uplink import Uplink
 from gausslite_agent.player import Player
 from gausslite_agent.robot import Robot
 from gausslite_agent.servicer import AgentServicer
-from gausslite_agent.settings import AgentSettings, LinkSettings, parse_arguments
+from gausslite_agent.settings import AgentSettings, parse_arguments
 from gausslite_agent.stand_in import StandIn
 
 
@@ -41,7 +41,7 @@ async def _serve(settings: AgentSettings) -> None:
     stand_in = None if settings.play is None else StandIn.open(settings.play, settings.up_axis)
     loop, news = asyncio.get_running_loop(), Bell()
     with ExitStack() as stack:
-        parser = _parser(settings.link, stack)
+        parser = _parser(settings, stack)
         uplink, client = _uplink(settings, stack)
         attentions = Attentions(settings.perception, lambda: _scene(settings, stand_in))
         robot = Robot(
@@ -57,7 +57,7 @@ async def _serve(settings: AgentSettings) -> None:
         servicer = AgentServicer(settings.agent_id, robot, parser, news, lambda: player.state)
 
         mission = functools.partial(_live, settings, stand_in, player, uplink)
-        await serve_until_stopped(settings.listen, [servicer.service()], mission)
+        await serve_until_stopped(settings.listen, [servicer.service()], mission, settings.tls)
 
 
 def _require_usable(settings: AgentSettings) -> None:
@@ -93,10 +93,10 @@ def _begin(settings: AgentSettings, stand_in: StandIn | None, player: Player) ->
         player.assign()
 
 
-def _parser(link: LinkSettings, stack: ExitStack) -> TaskParser:
-    if link.parser is None:
+def _parser(settings: AgentSettings, stack: ExitStack) -> TaskParser:
+    if settings.link.parser is None:
         return RuleParser()
-    return stack.enter_context(ParserClient(link.parser, patient=True))
+    return stack.enter_context(ParserClient(settings.link.parser, patient=True, tls=settings.tls))
 
 
 def _uplink(settings: AgentSettings, stack: ExitStack) -> tuple[Uplink | None, FusionClient | None]:
@@ -104,7 +104,7 @@ def _uplink(settings: AgentSettings, stack: ExitStack) -> tuple[Uplink | None, F
     if link.fusion is None:
         return None, None
     spool = Spool(link.spool, settings.agent_id, link.grid)
-    client = FusionClient(link.fusion, mission_id=link.mission_id)
+    client = FusionClient(link.fusion, mission_id=link.mission_id, tls=settings.tls)
     uplink = Uplink(client, settings.agent_id, spool, link.grid, link.uplink)
     stack.callback(uplink.close)
     return uplink, client

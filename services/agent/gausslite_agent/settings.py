@@ -22,6 +22,7 @@ from gausslite.mission.options import (
 )
 from gausslite.mission.settings import MissionSettings, PerceptionSettings
 from gausslite.task.validate import require_task_text
+from gausslite.wire.tls import Tls, add_tls, service_tls
 from gausslite.wire.uplink_values import UplinkSettings
 from gausslite_agent.load import Drops, LoadSettings
 
@@ -72,6 +73,7 @@ class AgentSettings:
     link: LinkSettings
     mission: MissionSettings
     load: LoadSettings
+    tls: Tls | None = None
 
 
 def parse_arguments(arguments: Sequence[str] | None = None) -> AgentSettings:
@@ -105,6 +107,7 @@ def parse_arguments(arguments: Sequence[str] | None = None) -> AgentSettings:
         link,
         mission_settings(options),
         _load_settings(options),
+        service_tls(options),
     )
 
 
@@ -148,6 +151,7 @@ def _parser() -> argparse.ArgumentParser:
     add_policy(parser)
     add_budget(parser)
     _add_load(parser)
+    add_tls(parser)
     return parser
 
 

@@ -54,6 +54,6 @@ async def _serve(settings: ServerSettings, store: FusionStore) -> None:
             servicer.drain()
 
     try:
-        await serve_until_stopped(settings.listen, [servicer.service()], drain_when_stopping)
+        await serve_until_stopped(settings.listen, [servicer.service()], drain_when_stopping, settings.tls)
     finally:
         servicer.close()

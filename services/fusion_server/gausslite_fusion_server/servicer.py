@@ -35,6 +35,7 @@ from gausslite.wire.bell import Bell
 from gausslite.wire.convert import box_from_message, frame_from_message, grid_from_message, grid_to_message
 from gausslite.wire.server import Service
 from gausslite.wire.status import code_and_reason
+from gausslite.wire.tls import require_speaks_for
 from gausslite_fusion_server.changes import change_blocks
 from gausslite_fusion_server.door import Door
 from gausslite_fusion_server.refinement import RefineOrder, Refinery
@@ -82,6 +83,7 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
 
     async def JoinSession(self, request: pb.JoinSessionRequest, context: Any) -> pb.JoinSessionResponse:
         """Enter the mission."""
+        require_speaks_for(context, request.agent_id)
         grid = grid_from_message(request.grid)
         asked = Charter(request.mission_id, request.world_frame, grid.size_m)
         joined = await self._work(self._team.join, request.agent_id, asked, request.fresh_map)

@@ -12,6 +12,7 @@ from gausslite.errors import InvalidInputError
 from gausslite.fusion.refine import RefineSettings
 from gausslite.fusion.terms import MAX_REFINE_ITERATIONS, Quotas, TeamSettings
 from gausslite.render.choose import BACKENDS
+from gausslite.wire.tls import Tls, add_tls, service_tls
 
 MEMORY = "memory"
 _MAX_STORE_MB = 1 << 24
@@ -27,6 +28,7 @@ class ServerSettings:
     team: TeamSettings = field(default_factory=TeamSettings)
     refine: RefineSettings = field(default_factory=RefineSettings)
     rasterizer: str = "auto"
+    tls: Tls | None = None
 
 
 def parse_arguments(arguments: Sequence[str] | None = None) -> ServerSettings:
@@ -52,6 +54,7 @@ def parse_arguments(arguments: Sequence[str] | None = None) -> ServerSettings:
         TeamSettings(VoxelGrid(options.voxel_size), options.mission, options.world_frame, quotas),
         RefineSettings(iterations=options.refine_iterations),
         options.rasterizer,
+        service_tls(options),
     )
 
 
@@ -88,4 +91,5 @@ def _parser() -> argparse.ArgumentParser:
     add("--quota-keyframe-pixels", type=int, default=quotas.keyframe_pixels, metavar="N", help="largest keyframe image")
     add("--refine-iterations", type=int, default=ours.refine.iterations, metavar="N", help="when a request names none")
     add("--rasterizer", choices=BACKENDS, default=ours.rasterizer, help="backend of the refinement")
+    add_tls(parser)
     return parser

@@ -21,4 +21,5 @@ def run(arguments: Sequence[str] | None = None) -> int:
     except GaussLiteError as error:
         print(f"gausslite-parser: {error}", file=sys.stderr)
         return 2
-    return run_service("gausslite-parser", lambda: serve_until_stopped(settings.listen, [parser_service(parser)]))
+    services = [parser_service(parser)]
+    return run_service("gausslite-parser", lambda: serve_until_stopped(settings.listen, services, tls=settings.tls))

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from gausslite.task.backends import BackendSettings, add_backend, backend_of
+from gausslite.wire.tls import Tls, add_tls, service_tls
 
 DEFAULT_LISTEN = "127.0.0.1:50051"
 
@@ -18,6 +19,7 @@ class ParserSettings:
 
     listen: str = DEFAULT_LISTEN
     backend: BackendSettings = field(default_factory=BackendSettings)
+    tls: Tls | None = None
 
 
 def parse_arguments(arguments: Sequence[str] | None = None) -> ParserSettings:
@@ -32,5 +34,6 @@ def parse_arguments(arguments: Sequence[str] | None = None) -> ParserSettings:
         help="HOST:PORT (port 0 = any free one) or unix:PATH; default %(default)s",
     )
     add_backend(parser)
+    add_tls(parser)
     options = parser.parse_args(arguments)
-    return ParserSettings(options.listen, backend_of(options, os.environ))
+    return ParserSettings(options.listen, backend_of(options, os.environ), service_tls(options))

@@ -5,14 +5,10 @@ A client is safe to use from many threads. Streams are iterators; closing one ca
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any, TypeVar
 
 import google_crc32c
-import grpc
 from jaxtyping import Float32, Float64, UInt8
 from numpy import ndarray
 
@@ -31,28 +27,13 @@ from gausslite.v1 import (
     parser_service_pb2_grpc,
 )
 from gausslite.wire import convert
+from gausslite.wire.channel import DEADLINE_S, ServiceChannel
 from gausslite.wire.images import decode_colour, decode_depth
 from gausslite.wire.server import MAX_MESSAGE_BYTES
-from gausslite.wire.status import from_rpc_error
+from gausslite.wire.tls import Tls
 
-DEADLINE_S = 30.0
 # a snapshot's block may come from a server with a larger limit of its own
 _WATCH_LIMITS = CodecLimits(max_bytes=MAX_MESSAGE_BYTES, max_voxels=2_000_000, max_gaussians=2_000_000)
-_RETRIED = {
-    "gausslite.v1.ParserService": ("ParseTask",),
-    "gausslite.v1.AgentService": ("AssignTask", "GetAgentStatus", "RenderView"),
-    "gausslite.v1.FusionService": ("JoinSession", "GetSessionStatus", "LeaveSession"),
-}
-_RETRY_POLICY = {
-    "maxAttempts": 4,
-    "initialBackoff": "0.2s",
-    "maxBackoff": "2s",
-    "backoffMultiplier": 2,
-    "retryableStatusCodes": ["UNAVAILABLE"],
-}
-
-
-ClientKind = TypeVar("ClientKind", bound="_Client")
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,56 +55,13 @@ class Export:
     agent_id: str = ""
 
 
-class _Client:
-    """Owns one channel. Raises our errors for what the server or the transport says."""
-
-    def __init__(self, address: str, deadline_s: float = DEADLINE_S) -> None:
-        self.address = address
-        self._deadline_s = deadline_s
-        methods = [{"service": service, "method": name} for service, names in _RETRIED.items() for name in names]
-        config = {"methodConfig": [{"name": methods, "retryPolicy": _RETRY_POLICY}]}
-        options = (
-            ("grpc.service_config", json.dumps(config)),
-            ("grpc.max_receive_message_length", MAX_MESSAGE_BYTES),
-            ("grpc.max_send_message_length", MAX_MESSAGE_BYTES),
-            ("grpc.max_reconnect_backoff_ms", 2000),
-        )
-        self._channel = grpc.insecure_channel(address, options=options)
-
-    def close(self) -> None:
-        """End the channel and every call on it."""
-        self._channel.close()
-
-    def __enter__(self: ClientKind) -> ClientKind:
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self.close()
-
-    @contextmanager
-    def _our_errors(self) -> Iterator[None]:
-        try:
-            yield
-        except grpc.RpcError as error:
-            raise from_rpc_error(error, self.address) from error
-
-    def _call(self, method: Any, request: Any, deadline_s: float | None = None) -> Any:
-        with self._our_errors():
-            return method(request, timeout=self._deadline_s if deadline_s is None else deadline_s)
-
-    def _stream(self, call: Any) -> Iterator[Any]:
-        try:
-            with self._our_errors():
-                yield from call
-        finally:
-            call.cancel()
-
-
-class ParserClient(_Client):
+class ParserClient(ServiceChannel):
     """The parser service as a task.TaskParser. With `patient` a call waits, within its deadline, for it to start."""
 
-    def __init__(self, address: str, deadline_s: float = DEADLINE_S, patient: bool = False) -> None:
-        super().__init__(address, deadline_s)
+    def __init__(
+        self, address: str, deadline_s: float = DEADLINE_S, patient: bool = False, tls: Tls | None = None
+    ) -> None:
+        super().__init__(address, deadline_s, tls)
         self._patient = patient
         self._stub = parser_service_pb2_grpc.ParserServiceStub(self._channel)
 
@@ -135,11 +73,11 @@ class ParserClient(_Client):
         return convert.graph_from_message(response.graph)
 
 
-class AgentClient(_Client):
+class AgentClient(ServiceChannel):
     """One robot's mapper."""
 
-    def __init__(self, address: str, deadline_s: float = DEADLINE_S) -> None:
-        super().__init__(address, deadline_s)
+    def __init__(self, address: str, deadline_s: float = DEADLINE_S, tls: Tls | None = None) -> None:
+        super().__init__(address, deadline_s, tls)
         self._stub = agent_service_pb2_grpc.AgentServiceStub(self._channel)
 
     def assign_task(self, task: str | TaskGraph) -> TaskGraph:
@@ -194,11 +132,13 @@ def is_done(status: agent_service_pb2.GetAgentStatusResponse) -> bool:
     return status.state == agent_service_pb2.AGENT_STATE_DONE
 
 
-class FusionClient(_Client):
+class FusionClient(ServiceChannel):
     """The team's map."""
 
-    def __init__(self, address: str, deadline_s: float = DEADLINE_S, mission_id: str = "") -> None:
-        super().__init__(address, deadline_s)
+    def __init__(
+        self, address: str, deadline_s: float = DEADLINE_S, mission_id: str = "", tls: Tls | None = None
+    ) -> None:
+        super().__init__(address, deadline_s, tls)
         self.mission_id = mission_id
         self._stub = fusion_service_pb2_grpc.FusionServiceStub(self._channel)
 

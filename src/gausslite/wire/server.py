@@ -23,6 +23,7 @@ from grpc_reflection.v1alpha import reflection
 
 from gausslite.errors import GaussLiteError, InvalidInputError, UnavailableError
 from gausslite.wire.status import to_status
+from gausslite.wire.tls import Tls
 
 MAX_MESSAGE_BYTES = 16 << 20
 """Both ends refuse more; a frame of two megapixels with PNG depth fits several times."""
@@ -60,8 +61,8 @@ class RunningServer:
         await self._server.stop(grace_s)
 
 
-async def start_server(listen: str, services: Sequence[Service]) -> RunningServer:
-    """Serve on HOST:PORT (port 0 = any free one) or unix:PATH, with health and reflection.
+async def start_server(listen: str, services: Sequence[Service], tls: Tls | None = None) -> RunningServer:
+    """Serve on HOST:PORT (port 0 = any free one) or unix:PATH, with health and reflection; encrypted with `tls`.
 
     Raises UnavailableError when the address is taken, InvalidInputError when it is none.
     """
@@ -76,7 +77,7 @@ async def start_server(listen: str, services: Sequence[Service]) -> RunningServe
     names = [service.name for service in services]
     reflection.enable_server_reflection([*names, health.SERVICE_NAME, reflection.SERVICE_NAME], server)
     try:
-        port = server.add_insecure_port(listen)
+        port = server.add_insecure_port(listen) if tls is None else server.add_secure_port(listen, tls.of_server())
     except RuntimeError:
         port = 0
     if port == 0:
@@ -87,7 +88,11 @@ async def start_server(listen: str, services: Sequence[Service]) -> RunningServe
 
 
 async def serve_until_stopped(
-    listen: str, services: Sequence[Service], until: Callable[[], Awaitable[None]] | None = None, grace_s: float = 5.0
+    listen: str,
+    services: Sequence[Service],
+    until: Callable[[], Awaitable[None]] | None = None,
+    tls: Tls | None = None,
+    grace_s: float = 5.0,
 ) -> None:
     """Serve until SIGTERM or SIGINT, or until `until` returns; then drain. Prints nothing; logs where it listens.
 
@@ -97,8 +102,9 @@ async def serve_until_stopped(
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, stopping.set)
-    running = await start_server(listen, services)
-    _log.info("%s listening on %s", ", ".join(service.name for service in services), running.address)
+    running = await start_server(listen, services, tls)
+    names = ", ".join(service.name for service in services)
+    _log.info("%s listening on %s%s", names, running.address, "" if tls is None else ", encrypted")
     waits: list[asyncio.Future[Any]] = [asyncio.ensure_future(stopping.wait())]
     if until is not None:
         waits.append(asyncio.ensure_future(until()))

@@ -1,0 +1,26 @@
+"""Certificates for tests, by the script that operators try encryption with."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from gausslite.wire.tls import Tls
+
+SCRIPT = Path(__file__).resolve().parents[2] / "deploy" / "make_certificates.sh"
+
+
+def make_certificates(folder: Path, *names: str) -> Path:
+    """A folder with an authority and a certificate for each name."""
+    if shutil.which("openssl") is None:
+        pytest.skip("certificates need the program openssl")
+    subprocess.run(["bash", str(SCRIPT), str(folder), *names], check=True, timeout=60)
+    return folder
+
+
+def identity(folder: Path, name: str) -> Tls:
+    """Who shows this name, and believes the folder's authority."""
+    return Tls.read(folder / f"{name}.pem", folder / f"{name}.key", folder / "ca.pem")
