@@ -15,7 +15,8 @@ from gausslite.errors import (
 )
 from gausslite.task.rules import RuleParser
 from gausslite_agent.load import Drops, LoadSettings
-from gausslite_agent.robot import Outcome, Robot
+from gausslite_agent.robot import Robot
+from gausslite_agent.status import Outcome
 
 
 def test_a_full_queue_drops_the_oldest_waiting_frame_and_says_so() -> None:

@@ -233,7 +233,7 @@ def test_without_a_mapped_frame_nothing_is_written_over(tmp_path: Path) -> None:
     options = replace(settings(tmp_path), play=None)
     (tmp_path / "map.ply").write_text("of an earlier life")
     with player(options) as (mission, _):
-        mission.assign()
+        mission.begin()
         mission.stop()
         mission.conclude()
     assert (tmp_path / "map.ply").read_text() == "of an earlier life"

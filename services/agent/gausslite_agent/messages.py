@@ -11,7 +11,7 @@ from gausslite.wire.convert import graph_to_message
 from gausslite.wire.images import encode_colour, encode_depth
 from gausslite.wire.uplink_values import UplinkCounters
 from gausslite_agent.player import MissionState
-from gausslite_agent.robot import FrameReport, Outcome, RobotStatus
+from gausslite_agent.status import FrameReport, Outcome, RobotStatus
 
 _STATES = {
     MissionState.IDLE: pb.AGENT_STATE_IDLE,

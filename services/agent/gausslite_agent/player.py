@@ -16,9 +16,11 @@ from gausslite.wire.spool import Purpose
 from gausslite.wire.uplink import Uplink
 from gausslite.wire.uplink_values import UplinkCounters
 from gausslite_agent.report import mission_report
-from gausslite_agent.robot import FrameReport, Robot
+from gausslite_agent.robot import Robot
+from gausslite_agent.saved_mission import EarlierLife
 from gausslite_agent.settings import AgentSettings
 from gausslite_agent.stand_in import StandIn
+from gausslite_agent.status import FrameReport
 
 _log = logging.getLogger(__name__)
 
@@ -35,8 +37,17 @@ class MissionState(Enum):
 class Player:
     """Runs one mission from a source. `play` blocks: call it on a thread; `stop` makes it end after its frame."""
 
-    def __init__(self, settings: AgentSettings, robot: Robot, parser: TaskParser, client: FusionClient | None) -> None:
+    def __init__(
+        self,
+        settings: AgentSettings,
+        robot: Robot,
+        parser: TaskParser,
+        client: FusionClient | None,
+        earlier: EarlierLife | None = None,
+    ) -> None:
+        """With `earlier` the robot has taken up a saved mission, and the player goes on with it."""
         self._settings, self._robot, self._parser, self._client = settings, robot, parser, client
+        self._earlier = earlier
         self._stopping = threading.Event()
         self._state = MissionState.IDLE
         self._started_s = time.monotonic()
@@ -52,9 +63,16 @@ class Player:
         """End the mission early: what is mapped is written, nothing more is sent."""
         self._stopping.set()
 
-    def assign(self) -> None:
-        """Give the robot the task of the command line."""
-        self._robot.assign(self._parser.parse(self._settings.task or "")).result()
+    def begin(self) -> None:
+        """Give the robot the task of the command line, unless its saved mission was begun with it.
+
+        So a task that came on the way stays in force. Raises TaskError, ModelFileError and the like.
+        """
+        earlier, asked = self._earlier, self._settings.task
+        if earlier is not None:
+            _log.info("goes on with %r after frame %d", earlier.graph.text, earlier.last_index)
+        if asked is not None and (earlier is None or asked != earlier.asked):
+            self._robot.assign(self._parser.parse(asked)).result()
 
     def play(self, stand_in: StandIn) -> None:
         """Map every frame, then end the mission. Raises what the disk or the task raise.
@@ -62,12 +80,13 @@ class Player:
         A damaged frame ends the mission early: what was mapped until then is sent and written, then it is raised.
         """
         self._started_s = time.monotonic()
-        self.assign()
+        self.begin()
         self._state = MissionState.MAPPING
+        last_index = -1 if self._earlier is None else self._earlier.last_index
         damaged: DatasetError | None = None
         waiting: Future[FrameReport] | None = None
         try:
-            for frame in stand_in.frames():
+            for frame in stand_in.frames(last_index):
                 # one frame is read while the one before is mapped
                 if waiting is not None:
                     self._note(waiting.result())
@@ -89,11 +108,15 @@ class Player:
         """End a mission whose frames were sent: write what is mapped, if anything is. Raises StorageError."""
         if self._robot.status().mapped > 0:
             self._finish()
+        elif self._earlier is not None:
+            # there may be another task than before
+            self._save()
 
     def _finish(self, ended_by: str | None = None) -> None:
-        """Send what waits and write the results; ended_by says what kept the mission from its last frame."""
+        """Save, send what waits and write the results; ended_by says what kept the mission from its last frame."""
         self._state = MissionState.DRAINING
         self._robot.settle().result()
+        self._save()
         gaussians = self._robot.do(lambda mapper: mapper.gaussians()).result()
         uplink, counters = self._robot.uplink, UplinkCounters()
         if uplink is not None:
@@ -106,8 +129,9 @@ class Player:
             report = mission_report(self._settings.agent_id, status, gaussians, counters, seconds)
             memory_mib = self._robot.do(lambda mapper: mapper.memory_mib()).result()
             stopped_by = "interrupted" if self._stopping.is_set() else ended_by
-            about = {**report, "memory_mib": memory_mib, "stopped_by": stopped_by}
-            write_results(self._settings.out, gaussians, about)
+            resumed = None if self._earlier is None else self._earlier.last_index
+            about = {"memory_mib": memory_mib, "stopped_by": stopped_by, "resumed_after_frame": resumed}
+            write_results(self._settings.out, gaussians, {**report, **about})
         _log.info(
             "mission %s: %d frames at %.2f Hz, %d Gaussians, %d bytes of the task's region sent",
             "interrupted" if self._stopping.is_set() else "ended early" if ended_by else "done",
@@ -115,6 +139,12 @@ class Player:
         )
         if not self._stopping.is_set():
             self._state = MissionState.DONE
+
+    def _save(self) -> None:
+        """First of all, since sending and drawing up results can take minutes that a robot may not have."""
+        settings = self._settings
+        if settings.state is not None:
+            self._robot.save(settings.state, settings.terms, settings.task or "").result()
 
     def _empty(self, uplink: Uplink) -> None:
         """Bring the rest to the server: the region, then (when asked) everything else and the keyframes."""

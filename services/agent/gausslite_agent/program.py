@@ -9,7 +9,7 @@ from contextlib import ExitStack
 
 from gausslite.domain.pose import unit_up_axis
 from gausslite.mission.build import Attentions
-from gausslite.mission.results import prepare_folder
+from gausslite.mission.results import prepare_file, prepare_folder
 from gausslite.mission.settings import SceneKnowledge
 from gausslite.task.parser import TaskParser
 from gausslite.task.rules import RuleParser
@@ -21,6 +21,7 @@ from gausslite.wire.spool import Spool
 from gausslite.wire.uplink import Uplink
 from gausslite_agent.player import Player
 from gausslite_agent.robot import Robot
+from gausslite_agent.saved_mission import SavedMission
 from gausslite_agent.servicer import AgentServicer
 from gausslite_agent.settings import AgentSettings, parse_arguments
 from gausslite_agent.stand_in import StandIn
@@ -39,10 +40,11 @@ async def _serve(settings: AgentSettings) -> None:
     """Build the robot, serve it, play its source; close in the reverse order."""
     _require_usable(settings)
     stand_in = None if settings.play is None else StandIn.open(settings.play, settings.up_axis)
+    saved = _saved_mission(settings)
     loop, news = asyncio.get_running_loop(), Bell()
     with ExitStack() as stack:
         parser = _parser(settings, stack)
-        uplink, client = _uplink(settings, stack)
+        uplink, client = _uplink(settings, stack, goes_on=saved is not None)
         attentions = Attentions(settings.perception, lambda: _scene(settings, stand_in))
         robot = Robot(
             settings.mission,
@@ -53,7 +55,11 @@ async def _serve(settings: AgentSettings) -> None:
             load=settings.load,
         )
         stack.callback(robot.close)
-        player = Player(settings, robot, parser, client)
+        earlier = None
+        if saved is not None:
+            await asyncio.wrap_future(robot.resume(saved))
+            earlier, saved = saved.life, None
+        player = Player(settings, robot, parser, client, earlier)
         servicer = AgentServicer(settings.agent_id, robot, parser, news, lambda: player.state)
 
         mission = functools.partial(_live, settings, stand_in, player, uplink)
@@ -66,11 +72,20 @@ def _require_usable(settings: AgentSettings) -> None:
         unit_up_axis(settings.up_axis)
     if settings.out is not None:
         prepare_folder(settings.out)
+    if settings.state is not None:
+        prepare_file(settings.state)
+
+
+def _saved_mission(settings: AgentSettings) -> SavedMission | None:
+    """The mission of an earlier life. Raises MapFileError, MismatchError."""
+    if settings.state is None or not settings.state.exists():
+        return None
+    return SavedMission.read(settings.state, settings.terms)
 
 
 async def _live(settings: AgentSettings, stand_in: StandIn | None, player: Player, uplink: Uplink | None) -> None:
     """Work through the mission, then serve on unless told otherwise; what is mapped then is written at the end."""
-    work = asyncio.ensure_future(asyncio.to_thread(_begin, settings, stand_in, player))
+    work = asyncio.ensure_future(asyncio.to_thread(_begin, stand_in, player))
     try:
         await asyncio.shield(work)
         if not settings.exit_when_done or stand_in is None:
@@ -85,12 +100,12 @@ async def _live(settings: AgentSettings, stand_in: StandIn | None, player: Playe
             await asyncio.to_thread(player.conclude)
 
 
-def _begin(settings: AgentSettings, stand_in: StandIn | None, player: Player) -> None:
-    """Play the source, or take the task and wait for frames; without either do nothing."""
+def _begin(stand_in: StandIn | None, player: Player) -> None:
+    """Play the source, or take the task and wait for frames."""
     if stand_in is not None:
         player.play(stand_in)
-    elif settings.task is not None:
-        player.assign()
+    else:
+        player.begin()
 
 
 def _parser(settings: AgentSettings, stack: ExitStack) -> TaskParser:
@@ -99,13 +114,13 @@ def _parser(settings: AgentSettings, stack: ExitStack) -> TaskParser:
     return stack.enter_context(ParserClient(settings.link.parser, patient=True, tls=settings.tls))
 
 
-def _uplink(settings: AgentSettings, stack: ExitStack) -> tuple[Uplink | None, FusionClient | None]:
+def _uplink(settings: AgentSettings, stack: ExitStack, goes_on: bool) -> tuple[Uplink | None, FusionClient | None]:
     link = settings.link
     if link.fusion is None:
         return None, None
     spool = Spool(link.spool, settings.agent_id, link.grid)
     client = FusionClient(link.fusion, mission_id=link.mission_id, tls=settings.tls)
-    uplink = Uplink(client, settings.agent_id, spool, link.grid, link.uplink)
+    uplink = Uplink(client, settings.agent_id, spool, link.grid, link.uplink, goes_on)
     stack.callback(uplink.close)
     return uplink, client
 

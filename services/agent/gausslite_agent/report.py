@@ -5,7 +5,7 @@ from __future__ import annotations
 from gausslite.domain.gaussians import Gaussians
 from gausslite.mission.results import peak_rss_mib
 from gausslite.wire.uplink_values import UplinkCounters
-from gausslite_agent.robot import RobotStatus
+from gausslite_agent.status import RobotStatus
 
 
 def mission_report(

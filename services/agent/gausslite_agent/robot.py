@@ -13,8 +13,8 @@ from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import dataclass, replace
-from enum import Enum
+from dataclasses import replace
+from pathlib import Path
 from typing import TypeVar
 
 from gausslite.domain.frame import Frame
@@ -27,97 +27,16 @@ from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.pace import Pace, Relief
 from gausslite.mapping.roi import RoiLedger
 from gausslite.mission.build import build_mapper
+from gausslite.mission.saved_run import RunTerms, save_run
 from gausslite.mission.settings import MissionSettings
 from gausslite.perception.attention import Attention
 from gausslite.pipeline import FrameOutcome, TaskMapper
 from gausslite.wire.uplink import Uplink
 from gausslite_agent.load import Drops, LoadSettings
+from gausslite_agent.saved_mission import EarlierLife, SavedMission
+from gausslite_agent.status import FrameReport, Outcome, RobotStatus
 
 _Result = TypeVar("_Result")
-
-
-class Outcome(Enum):
-    """What became of a frame."""
-
-    MAPPED = "mapped"
-    SKIPPED = "skipped"
-    DROPPED = "dropped"
-    REJECTED = "rejected"
-
-
-@dataclass(frozen=True, slots=True)
-class FrameReport:
-    """The outcome of one frame; reason says why it was not mapped."""
-
-    index: int
-    outcome: Outcome
-    reason: str = ""
-    iterations: int = 0
-    gaussians: int = 0
-    roi_share: float = 0.0
-    seconds: float = 0.0
-
-
-@dataclass(frozen=True, slots=True)
-class RobotStatus:
-    """Totals so far; busy_s is the time spent on perception and mapping, notes what the attention has to say.
-
-    short counts the frames that trained less than they should, without_* those that went without something for want
-    of time; max_detection_lag is the greatest age, in frames, at which a detection came; reread counts the keyframes
-    that were looked at again for a new task.
-    """
-
-    graph: TaskGraph | None = None
-    map_revision: int = 0
-    gaussians: int = 0
-    mapped: int = 0
-    skipped: int = 0
-    dropped: int = 0
-    rejected: int = 0
-    iterations: int = 0
-    busy_s: float = 0.0
-    roi_share_sum: float = 0.0
-    idle_iterations: int = 0
-    short: int = 0
-    without_words: int = 0
-    without_seeding: int = 0
-    max_detection_lag: int = 0
-    reread: int = 0
-    notes: tuple[str, ...] = ()
-
-    @property
-    def load_notes(self) -> tuple[str, ...]:
-        """What was left undone for want of time, one line each."""
-        told = (
-            (self.dropped, "frames were dropped"),
-            (self.short, "frames trained too little"),
-            (self.without_words, "frames told their words later"),
-            (self.without_seeding, "frames were not seeded"),
-        )
-        return tuple(f"overload: {count} {what}" for count, what in told if count)
-
-    @property
-    def hz(self) -> float:
-        """Mapped frames per second of perception and mapping."""
-        return self.mapped / self.busy_s if self.busy_s > 0 else 0.0
-
-    @property
-    def roi_share(self) -> float:
-        """Mean share of the pixels in the task's region."""
-        return self.roi_share_sum / max(self.mapped, 1)
-
-    def plus(self, report: FrameReport) -> RobotStatus:
-        """The totals with one more frame."""
-        if report.outcome is not Outcome.MAPPED:
-            return replace(self, **{report.outcome.value: getattr(self, report.outcome.value) + 1})
-        return replace(
-            self,
-            mapped=self.mapped + 1,
-            gaussians=report.gaussians,
-            iterations=self.iterations + report.iterations,
-            busy_s=self.busy_s + report.seconds,
-            roi_share_sum=self.roi_share_sum + report.roi_share,
-        )
 
 
 class Robot:
@@ -142,6 +61,7 @@ class Robot:
         self._mapper = build_mapper(settings)
         self._ledger = RoiLedger(grid)
         self._task_mapper: TaskMapper | None = None
+        self._last_index = -1
         # revisions of an earlier life must not be taken for ones of this
         self._first_revision = time.time_ns() // 1000
         self._status = RobotStatus(map_revision=self._first_revision)
@@ -166,6 +86,17 @@ class Robot:
         A task that asks the same as the one in force changes nothing. The future raises ModelFileError and the like.
         """
         return self.do(lambda _mapper: self._begin(graph))
+
+    def resume(self, saved: SavedMission) -> Future[None]:
+        """Take up a mission where it was saved, before any frame is mapped. The future raises MapFileError."""
+        return self._start(lambda: self._take_up(saved))
+
+    def save(self, path: Path, terms: RunTerms, asked: str) -> Future[bool]:
+        """Save the mission after the frame at hand, to be resumed in another life; False when there is no task yet.
+
+        `asked` is the task of the command line. The future raises StorageError.
+        """
+        return self._start(lambda: self._save(path, terms, asked))
 
     def submit(self, frame: Frame) -> Future[FrameReport]:
         """Queue a frame. Raises MismatchError when there is no task yet, UnavailableError after `close`."""
@@ -231,6 +162,30 @@ class Robot:
         with self._lock:
             self._status = replace(self._status, graph=graph, notes=self._task_mapper.notes)
 
+    def _take_up(self, saved: SavedMission) -> None:
+        self._begin(saved.life.graph)
+        assert self._task_mapper is not None
+        saved.run.restore(self._task_mapper)
+        self._last_index = saved.life.last_index
+        # also where the clock was set back between the two lives
+        self._first_revision = max(self._first_revision, saved.life.map_revision + 1)
+        with self._lock:
+            revision = self._first_revision + self._mapper.revision
+            self._status = replace(self._status, gaussians=self._mapper.count, map_revision=revision)
+        if self.uplink is not None:
+            # the spool lets go of what it has; the rest was on its way, or told later in a life that ended unsaved
+            words = words_of(self._mapper.roi_gaussians(), self._grid)
+            self.uplink.offer(self._ledger.beyond_released(words))
+        self._on_change()
+
+    def _save(self, path: Path, terms: RunTerms, asked: str) -> bool:
+        graph, loop = self.status().graph, self._task_mapper
+        if graph is None or loop is None:
+            return False
+        life = EarlierLife(self._last_index, graph, asked, self.revision())
+        save_run(path, loop, terms, life.last_index, life.state())
+        return True
+
     def _map_next(self) -> None:
         with self._lock:
             if not self._waiting:
@@ -275,6 +230,7 @@ class Robot:
     def _map(self, frame: Frame) -> FrameReport:
         assert self._task_mapper is not None
         done = self._task_mapper.process(frame)
+        self._last_index = frame.index
         with self._lock:
             self._status = replace(self._status, notes=self._task_mapper.notes)
         if done.skipped is not None:

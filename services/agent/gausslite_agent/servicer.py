@@ -28,7 +28,8 @@ from gausslite.wire.uplink_values import UplinkCounters
 from gausslite_agent.history import MapHistory
 from gausslite_agent.messages import blank_view, report_to_message, status_to_message, view_to_message
 from gausslite_agent.player import MissionState
-from gausslite_agent.robot import FrameReport, Robot
+from gausslite_agent.robot import Robot
+from gausslite_agent.status import FrameReport
 
 _OUTCOMES_AHEAD = 16
 

@@ -20,6 +20,7 @@ from gausslite.mission.options import (
     mission_settings,
     perception_settings,
 )
+from gausslite.mission.saved_run import RunTerms
 from gausslite.mission.settings import MissionSettings, PerceptionSettings
 from gausslite.task.validate import require_task_text
 from gausslite.wire.tls import Tls, add_tls, service_tls
@@ -74,6 +75,12 @@ class AgentSettings:
     mission: MissionSettings
     load: LoadSettings
     tls: Tls | None = None
+    state: Path | None = None
+
+    @property
+    def terms(self) -> RunTerms:
+        """What must be the same when a saved mission goes on."""
+        return RunTerms.of(self.mission, agent_id=self.agent_id, voxel_size=f"{self.link.grid.size_m:g}")
 
 
 def parse_arguments(arguments: Sequence[str] | None = None) -> AgentSettings:
@@ -108,6 +115,7 @@ def parse_arguments(arguments: Sequence[str] | None = None) -> AgentSettings:
         mission_settings(options),
         _load_settings(options),
         service_tls(options),
+        options.state,
     )
 
 
@@ -142,6 +150,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--agent-id", default="agent", metavar="NAME", help="this robot's name in the team; default %(default)s")
     add("--task", metavar="TEXT", help="what the robot is to do; otherwise it waits for AssignTask")
     add("--out", metavar="DIR", type=Path, help="gets map.ply and report.json at the end of the mission")
+    add("--state", metavar="FILE", type=Path, help="go on from this mission if it is there; save it here at the end")
     add("--exit-when-done", action="store_true", help="end after the mission instead of serving on")
     _add_camera(parser)
     add_frames(parser)

@@ -35,6 +35,8 @@ class StandIn:
             positions, _ = HoldOut(play.hold_out).split(positions)
         return cls(source, positions, frame_size(play.size, source))
 
-    def frames(self) -> Iterator[Frame]:
-        """Each read when it is asked for. Raises DatasetError for a damaged one."""
-        return (self.source.frame(position, self.size) for position in self.positions)
+    def frames(self, after_index: int = -1) -> Iterator[Frame]:
+        """Those with greater numbers, each read when it is asked for. Raises DatasetError for a damaged one."""
+        indices = self.source.indices()
+        chosen = (position for position in self.positions if indices[position] > after_index)
+        return (self.source.frame(position, self.size) for position in chosen)

@@ -67,6 +67,7 @@ def run(options: argparse.Namespace) -> int:
     mapper = TaskMapper(attention, build_mapper(asked.settings), pace=Pace(asked.settings.pace))
     if saved is not None:
         saved.restore(mapper)
+        saved = None  # as large as the map and its keyframes, and copied
     mission = MappingRun(asked.source, asked.size, mapper, asked.plan, attentions).play(asked.after(last_index), graph)
     if not mission.outcomes and mission.stopped is not None:
         raise mission.stopped

@@ -43,10 +43,18 @@ class Uplink:
     """Owns the spool, the client and one thread. `offer` never waits for the network."""
 
     def __init__(
-        self, client: FusionClient, agent_id: str, spool: Spool, grid: VoxelGrid, settings: UplinkSettings | None = None
+        self,
+        client: FusionClient,
+        agent_id: str,
+        spool: Spool,
+        grid: VoxelGrid,
+        settings: UplinkSettings | None = None,
+        goes_on: bool = False,
     ) -> None:
+        """goes_on: the robot has its map from an earlier life, so that what it said then stands."""
         self._client, self._agent_id, self._spool, self._grid = client, agent_id, spool, grid
         self._settings = settings or UplinkSettings()
+        self._goes_on = goes_on
         self._counters = UplinkCounters()
         self._roi_voxels: set[int] = set()
         self._damaged: set[int] = set()
@@ -177,8 +185,11 @@ class Uplink:
     def _joined(self) -> Session:
         if self._session is None:
             # a robot that begins with nothing cannot take back what it said in an earlier life
-            fresh = self._spool.is_new and self._counters.joins == 0
+            fresh = self._spool.is_new and not self._goes_on and self._counters.joins == 0
             self._session = self._client.join(self._agent_id, self._grid, self._settings.world_frame, fresh)
+            if self._session.highest_map_revision == 0:
+                # it has nothing of what an earlier life sent
+                self._spool.forget_what_was_sent()
             self._sequence = 0
             self._subset_bytes = min(self._subset_bytes, self._session.max_subset_bytes or MAX_SUBSET_BYTES)
             with self._changed:
