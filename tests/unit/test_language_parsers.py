@@ -50,6 +50,31 @@ def test_a_good_answer_is_the_graph_that_rules_give():
     assert graph_of_answer(TASK, answer(["The mugs"], ["the table"], relation())) == RuleParser().parse(TASK)
 
 
+@pytest.mark.parametrize(
+    ("task", "answered", "kept"),
+    [
+        ("Pick up the mug without touching the vase", ["mug", "vase"], ("mug",)),
+        ("Map the chairs except the stool", ["chair", "stools"], ("chair",)),
+        ("Clean the desk but leave the old laptop alone", ["desk", "laptop"], ("desk",)),
+        ("Ignore the glass, bring the plastic cup", ["plastic cup", "glass"], ("plastic cup",)),
+        ("Take the red mug, not the blue mug", ["mug"], ("mug",)),
+        ("Take the red mug, not the blue mug", ["red mug", "blue mug"], ("red mug",)),
+        ("Take everything off the table except the tray", ["object", "tray"], ("object",)),
+        ("Avoid the trash cans", ["trash can"], ("trash can",)),
+    ],
+)
+def test_a_target_that_the_sentence_excludes_is_dropped_and_named(task, answered, kept):
+    graph = graph_of_answer(task, answer(answered, []))
+    assert graph.targets == kept
+    said = [warning for warning in graph.warnings if "is to be left alone: it is dropped" in warning]
+    assert len(said) == len(answered) - len(kept)
+
+
+def test_an_answer_of_excluded_objects_alone_is_refused():
+    with pytest.raises(LanguageModelError, match="expected at least one object"):
+        graph_of_answer("Pick up the mug without touching the vase", answer(["vase"], []))
+
+
 def test_an_answer_within_prose_is_found():
     said = f"Sure! Here it is:\n```json\n{answer()}\n```\nAnything else? {{}}"
     assert graph_of_answer(TASK, said).targets == ("mug",)

@@ -17,6 +17,7 @@ class Clause:
         self.orphans: list[tuple[str, NounPhrase]] = []
         self.last_relation: str | None = None
         self.superlative = False
+        self.aside = False
         self.joined = False
         self.part = False
         self.route = False
@@ -31,16 +32,23 @@ def names_object(noun: NounPhrase, pending: str | None, after: Piece | None) -> 
     """False for the robot itself, and for places, routes and measures that stand for something else."""
     if len(noun.words) == 1 and noun.head in lexicon.SELVES:
         return False
-    if noun.head in lexicon.COMPOUND_PLACES and len(noun.words) > 1 and not adjectives_only(noun.words[:-1]):
+    leads_on = after is not None and after.kind is Kind.PREPOSITION and after.word == "of"
+    compound = len(noun.words) > 1 and not adjectives_only(noun.words[:-1])
+    if compound and noun.head in lexicon.PLACES and not leads_on:
         return True
+    unlikely = lexicon.TIMES if noun.determined else lexicon.MANNERS | lexicon.TIMES
+    if noun.head in unlikely and len(noun.words) == 1 and pending not in (None, "from", "of", "to", "on"):
+        return False
     if noun.head in lexicon.PLACES:
         return noun.head in lexicon.SOLID_PLACES and pending not in (None, "inside", "to")
     if noun.head in lexicon.ROUTES:
         return pending not in (None, "of", "for", "to")
-    leads_on = after is not None and after.kind is Kind.PREPOSITION and after.word == "of"
-    return noun.head not in lexicon.MEASURES or (noun.known and not leads_on)
+    if noun.head in lexicon.MEASURES and pending not in (None, "of"):
+        return True
+    return noun.head not in lexicon.MEASURES or ((noun.known or compound) and not leads_on)
 
 
 def described(adjective: NounPhrase, noun: NounPhrase) -> NounPhrase:
     """In "red and blue mugs", red takes the head that it shares."""
-    return NounPhrase((*adjective.words, noun.head), adjective.determined, noun.superlative)
+    words = adjective.words[:-1] if adjective.head in ("one", "ones") else adjective.words
+    return NounPhrase((*words, noun.head), adjective.determined, noun.superlative)

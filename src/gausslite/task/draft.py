@@ -23,6 +23,20 @@ class GraphDraft:
         self.excluded: list[str] = []
         self.whole_place: str | None = None
         self.unnamed: str | None = None
+        self._asides: set[str] = set()
+
+    def target(self, phrase: str, aside: bool = False) -> None:
+        """An object of the task, or one that is only mentioned aside: it counts if the sentence asks for no other."""
+        if phrase not in self.targets:
+            self.targets.append(phrase)
+            if aside:
+                self._asides.add(phrase)
+        if not aside:
+            self._asides.discard(phrase)
+
+    def mean(self, phrases: Sequence[str]) -> None:
+        """What was mentioned aside is what "it" means later."""
+        self._asides.difference_update(phrases)
 
     def anchor(self, phrase: str) -> None:
         """A noun that locates, listed once."""
@@ -58,6 +72,16 @@ class GraphDraft:
             self.targets.append("object")
         if self.unnamed is not None and "object" in self.targets:
             self.warnings.append(f"{self.unnamed!r} points at something without a name: every object is a target")
+        self._drop_asides()
         self.targets = [target for target in self.targets if target not in self.excluded]
         self.relations = [relation for relation in self.relations if relation.target in self.targets]
         self.warnings += [f"{phrase!r} is to be left alone and is no target" for phrase in self.excluded]
+
+    def _drop_asides(self) -> None:
+        """In "the baby sleeps, close the curtains" the baby is none of the task's business."""
+        if not self._asides.issuperset(self.targets):
+            self.targets = [target for target in self.targets if target not in self._asides]
+            located = {relation.anchor for relation in self.relations if relation.target in self._asides}
+            self.relations = [relation for relation in self.relations if relation.target in self.targets]
+            located -= {relation.anchor for relation in self.relations}
+            self.anchors = [anchor for anchor in self.anchors if anchor not in located]

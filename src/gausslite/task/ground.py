@@ -7,10 +7,12 @@ from collections.abc import Callable, Sequence
 from gausslite.domain.task import Relation, TaskGraph
 from gausslite.errors import TaskError
 from gausslite.task import lexicon
+from gausslite.task.graph_builder import draft_of
 from gausslite.task.parser import normalise_text, task_id_of
 from gausslite.task.phrases import noun_phrase
-from gausslite.task.reading import tokens_of
+from gausslite.task.reading import read
 from gausslite.task.singular import singular
+from gausslite.task.tokens import tokens_of
 from gausslite.task.validate import EXAMPLE, LIMITS, require_graph, require_task_text
 from gausslite.task.words import words
 
@@ -48,8 +50,8 @@ def grounded_graph(
     """The one way from any parser's answer to a task graph.
 
     Phrases lose their article and plural. A target or anchor whose head noun the sentence neither contains nor entails
-    is dropped, a relation between nouns that are not listed too; `warnings` names both. Raises TaskError when the
-    text is no task, no target is left, or the graph is out of bounds.
+    is dropped, a target that the sentence says to leave alone, and a relation between nouns that are not listed;
+    `warnings` names them. Raises TaskError when the text is no task, no target is left, or the graph is out of bounds.
     """
     require_task_text(text)
     said = _words_of(text)
@@ -64,7 +66,7 @@ def grounded_graph(
         )
         return tuple(dict.fromkeys(noun for _, noun in plain if _is_said(noun, said)))
 
-    kept_targets, kept_anchors = keep("target", targets), keep("anchor", anchors)
+    kept_targets, kept_anchors = _allowed(text, keep("target", targets), notes.append), keep("anchor", anchors)
     if not kept_targets:
         shown = " ".join(text.split())[:60]
         raise TaskError(
@@ -80,6 +82,24 @@ def grounded_graph(
     )
     require_graph(graph)
     return graph
+
+
+def _allowed(text: str, targets: tuple[str, ...], note: Callable[[str], None]) -> tuple[str, ...]:
+    """The targets without those that the rules read as to be left alone; "mug" stays where only "the blue mug" is."""
+    draft = draft_of(read(normalise_text(text)))
+    kept: list[str] = []
+    for target in targets:
+        forbidden = any(_same_object(target, phrase) for phrase in draft.excluded)
+        if forbidden and not any(_same_object(target, wanted) for wanted in draft.targets):
+            note(f"target {_short(target)} is to be left alone: it is dropped")
+        else:
+            kept.append(target)
+    return tuple(kept)
+
+
+def _same_object(one: str, other: str) -> bool:
+    """True where one phrase is the other, or the other with more words before it."""
+    return f" {one}".endswith(f" {other}") or f" {other}".endswith(f" {one}")
 
 
 def plain_phrase(phrase: str) -> str:

@@ -6,6 +6,18 @@ import re
 from typing import Final
 
 _PLAIN: Final = {
+    # short forms
+    r"(it|there|that|what|who|where|here|which|how|he|she)'s": r"\1 is",
+    r"(i|you|we|they|it)'(?:ve|d|ll|m|re)": r"\1",
+    r"(is|are|was|were|does|did|has|have|would|could|should|must)n't": r"\1 not",
+    r"let's": "let us",
+    r"(there|where|what|who)s": r"\1 is",
+    r"(where|how|what|who)'d": r"\1 did",
+    r"u": "you",
+    r"gimme": "give me",
+    r"lemme": "let me",
+    r"be so (?:kind|good) as to|be (?:kind|good) enough to|in order to": "to",
+    r"so(?: that)?(?= (?:i|you|we|he|she|they|it|the|my|our|nobody|no|people|everyone|everybody)\b)": "because",
     # a light verb with the noun that carries the meaning
     r"(?:have|take|get|give me|catch) an? (?:\w+ ){0,2}(?:look|glance|peek|view) (?:at|of|around|over|into)": "look at",
     r"(?:have|take) an? (?:\w+ )?look (?=under|behind|inside|in|on|for)": "look ",
@@ -19,17 +31,21 @@ _PLAIN: Final = {
     r"(?:stay|keep|steer|remain|stand) (?:well )?(?:clear|away|off) (?:of|from)": "avoid",
     r"keep (?:your|a safe|some|a) distance (?:from|to)": "avoid",
     r"pay (?:no|not any) attention to|(?:do not|don't|never) (?:care|worry|bother) (?:about|with)": "ignore",
+    r"give (?:\w+ )?priority to|prioriti[sz]e|spend (?:\w+ )*?(?:time|effort|budget) on": "look at",
+    r"how (?:far|close|near) (?:is|are) (.{2,60}?) (?:from|to)": r"measure \1 and",
     r"pay (?:\w+ )?attention to|focus (?:only )?on|concentrate on": "look at",
     r"(?:with the exception|to the exclusion) of|other than|but for": "except",
     r"(everything|everyone|all|anything) but": r"\1 except",
     r"as well as|along with|together with|in addition to|and also|plus": "and",
     r"in between": "between",
-    r"the one(?= (?:on|in|near|under|behind|next|that|by|closest|nearest|farthest|at|to|with))": "the object",
+    r"((?:every|all|any) (?:\w+ ){0,2}\w+) but(?= (?:the|a|an|my|this|that|those) )": r"\1 except",
+    # the noun carries the meaning and the verb before it none
+    r"give (.{2,60}?) an? (?:\w+ )?(rinse|wipe|wash|clean|scrub|polish|sweep|shake|push|pull|kick|stir)": r"\2 \1",
 }
 _IDIOMS: Final = tuple((re.compile(rf"\b(?:{idiom})(?!\w)"), plain) for idiom, plain in _PLAIN.items())
 _LEFT_ALONE: Final = re.compile(
     r"\bleav(?:e|ing) ((?:\w+ ){1,4})(?:alone|untouched|undisturbed|unchanged|in peace|as (?:it is|is|they are)"
-    r"|where (?:it is|they are))\b"
+    r"|be|for (?:now|later)|where (?:it is|they are))\b"
 )
 
 

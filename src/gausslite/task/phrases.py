@@ -7,9 +7,10 @@ from dataclasses import dataclass
 
 from gausslite.task import lexicon
 from gausslite.task.singular import singular
+from gausslite.task.words import words
 
-# in a compound the drinking kind, alone the reading kind
-_COMPOUND_HEADS = {"glasses": "glass"}
+# "glasses" to drink from have a singular, and those to see with have none
+_DRINKS = words("wine beer water champagne drinking cocktail juice whisky whiskey shot pint milk measuring dirty empty")
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +41,7 @@ def noun_phrase(words: Sequence[str], determined: bool, superlative: bool) -> No
     """Build the phrase from the words as they were written."""
     kept = list(words)
     last = kept[-1]
-    kept[-1] = _COMPOUND_HEADS.get(last, singular(last)) if len(kept) > 1 else singular(last)
+    kept[-1] = "glass" if last == "glasses" and _DRINKS.intersection(kept) else singular(last)
     return NounPhrase(tuple(kept), determined, superlative)
 
 

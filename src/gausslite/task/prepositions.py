@@ -36,4 +36,3 @@ _BY_RELATION: Final = {
     "with": "with|using|by means of|by using",
 }
 PREPOSITIONS: Final = {words: relation for relation, line in _BY_RELATION.items() for words in line.split("|")}
-LONGEST_PREPOSITION: Final = max(len(words.split()) for words in PREPOSITIONS)

@@ -2,42 +2,44 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from typing import Final
 
 from gausslite.task import lexicon
-from gausslite.task.idioms import plain_words
+from gausslite.task.clauses import MODALS, NOMINATIVES, SUBJECTS, WISHES, Mood, commands, moods_of
 from gausslite.task.phrases import NounPhrase, adjectives_only, noun_phrase
-from gausslite.task.prepositions import LONGEST_PREPOSITION, PREPOSITIONS
-from gausslite.task.singular import singular
-from gausslite.task.verbs import is_participle, verb_base
+from gausslite.task.prepositions import PREPOSITIONS
+from gausslite.task.tagging import tagged
+from gausslite.task.tags import Tag
+from gausslite.task.tokens import units_of
+from gausslite.task.verb_forms import verb_base
+from gausslite.task.verbs import BELONGING_VERBS, HOLDING_VERBS
 from gausslite.task.words import words
 
-_TOKEN: Final = re.compile(r"[^\W\d_][\w'’-]*|\d[\w.]*|[,/&+;.!?:()]")
-_BREAKS: Final = words(". ; : ! ? then while before after until when once if whether where because afterwards")
-_RELATIVES: Final = frozenset({"that", "which", "who"})
-_BACK_REFERENCES: Final = frozenset({"it", "them"})
-_POINTING: Final = frozenset({"this", "that", "these", "those"})
-_SUBJECTS: Final = frozenset({"i", "we", "you", "he", "she", "they"})
-# "go stand", "help clean": the second is what is to be done
-_LEADING_VERBS: Final = frozenset({"go", "come", "help", "start", "stop", "begin"})
-_ADVERB_ENDINGS: Final = ("wise", "wards")
-_PARTICLES_ONLY: Final = words("up down out away back forward backward apart upstairs downstairs")
-_LONGEST_NEGATION: Final = max(len(words) for words in lexicon.NEGATIONS)
-_SUPERLATIVES: Final = frozenset({"closest", "nearest"})
+_POINTING: Final = words("this that these those")
+_SUPERLATIVES: Final = words("closest nearest")
+_RELATIVES: Final = words("that which who whom")
+_HAVING: Final = words("has have had")
+_DOING: Final = words("do does did")
+_REFUSALS: Final = WISHES | words("care touch mean")
+_IN_A_NOUN: Final = frozenset({Tag.NOUN, Tag.ADJECTIVE})
+# "the drawer open", "is empty"
+_BEFORE_A_STATE: Final = frozenset({Tag.NOUN, Tag.STAND_IN, Tag.AUXILIARY})
+_OPENS_OBJECT: Final = frozenset({Tag.DETERMINER, Tag.NOUN, Tag.ADJECTIVE, Tag.STAND_IN})
 
 
 class Kind(Enum):
     """What a piece of a sentence is."""
 
     VERB = "verb"
+    BELONGS = "belongs"
     NOUN = "noun"
     PREPOSITION = "preposition"
     JOIN = "join"
     BREAK = "break"
+    ASIDE = "aside"
     NEGATION = "negation"
     BACK_REFERENCE = "back reference"
     POINTING = "pointing"
@@ -53,45 +55,65 @@ class Piece:
     gerund: bool = False
 
 
-def tokens_of(text: str) -> list[str]:
-    """Lower-case words, numbers and the punctuation that matters."""
-    return _TOKEN.findall(plain_words(text))
-
-
 def read(text: str) -> list[Piece]:
     """The pieces of one normalised sentence, in order."""
-    return _Reader(tokens_of(text)).read()
+    return _Reader(tagged(units_of(text))).read()
 
 
 class _Reader:
-    """Walks the tokens once, collecting the words of the noun phrase that is open."""
+    """Walks the tagged words once, collecting the words of the noun phrase that is open."""
 
-    def __init__(self, tokens: Sequence[str]) -> None:
-        self.tokens = tokens
+    def __init__(self, said: Sequence[tuple[str, Tag]]) -> None:
+        self.said = said
+        self.moods = moods_of(said)
         self.at = 0
         self.pieces: list[Piece] = []
         self.words: list[str] = []
         self.determined = False
         self.superlative = False
-        self.relative_at = -2
+        self.modal = False
+        self.subject_at = 0
+        self.relative_from: int | None = None
+        self._read: dict[Tag, Callable[[str], None]] = {
+            Tag.NOUN: self._noun,
+            Tag.ADJECTIVE: self._adjective,
+            Tag.DETERMINER: self._determiner,
+            Tag.VERB: self._verb,
+            Tag.ING: self._ing,
+            Tag.PARTICIPLE: self._participle,
+            Tag.PREPOSITION: self._preposition,
+            Tag.JOIN: lambda word: self._emit(Kind.JOIN, word),
+            Tag.BREAK: self._break,
+            Tag.STAND_IN: self._stand_in,
+            Tag.AUXILIARY: self._auxiliary,
+            Tag.RELATIVE: self._relative,
+            Tag.PRONOUN: self._pronoun,
+            Tag.BACK_REFERENCE: self._back_reference,
+            Tag.NEGATION: self._negation,
+        }
 
     def read(self) -> list[Piece]:
-        while self.at < len(self.tokens):
-            if not (self._negation() or self._preposition()):
-                self._word(self.tokens[self.at])
-                self.at += 1
+        mood = Mood.TASK
+        for at, (word, tag) in enumerate(self.said):
+            self.at = at
+            mood = self.moods.get(at, mood)
+            if mood is Mood.ASIDE and at in self.moods:
+                self._emit(Kind.ASIDE, word)
+            if mood is not Mood.REASON:
+                self._read.get(tag, self._skip)(word)
         self._close()
         return self.pieces
 
-    def _peek(self, ahead: int = 1) -> str:
+    def _tag(self, ahead: int) -> Tag | None:
         position = self.at + ahead
-        return self.tokens[position] if 0 <= position < len(self.tokens) else ""
+        return self.said[position][1] if 0 <= position < len(self.said) else None
+
+    def _word(self, ahead: int) -> str:
+        position = self.at + ahead
+        return self.said[position][0] if 0 <= position < len(self.said) else ""
 
     def _last(self) -> Kind | None:
         return self.pieces[-1].kind if self.pieces else None
-
-    def _follows_noun(self) -> bool:
-        return bool(self.words) or self._last() is Kind.NOUN
 
     def _emit(self, kind: Kind, word: str, gerund: bool = False) -> None:
         self._close()
@@ -105,196 +127,164 @@ class _Reader:
             )
         self.words, self.determined, self.superlative = [], False, False
 
-    def _negation(self) -> bool:
-        if self.words and self.tokens[self.at] == "no":
-            return False
-        gerund = self._peek().endswith("ing") and verb_base(self._peek()) and self._peek() not in lexicon.ADJECTIVES
-        if self.tokens[self.at] in ("avoid", "avoiding") and gerund:
-            self._emit(Kind.NEGATION, "avoid")
-            self.at += 1
-            return True
-        for length in range(_LONGEST_NEGATION, 0, -1):
-            said = tuple(self.tokens[self.at : self.at + length])
-            if len(said) == length and said in lexicon.NEGATIONS:
-                self._emit(Kind.NEGATION, " ".join(said))
-                self.at += length
-                return True
-        return False
+    def _skip(self, _word: str) -> None:
+        self._close()
 
-    def _preposition(self) -> bool:
-        for length in range(LONGEST_PREPOSITION, 0, -1):
-            said = " ".join(self.tokens[self.at : self.at + length])
-            relation = PREPOSITIONS.get(said)
-            if relation is None or len(self.tokens) < self.at + length:
-                continue
-            after = self._peek(length)
-            if said in _SUPERLATIVES and not (self._follows_noun() and after in lexicon.DETERMINERS):
-                return False
-            if length == 1 and self._is_particle(said, after):
-                self.at += 1
-                return True
-            if self._is_purpose(said, after):
-                self._close()
-            else:
-                self._emit(Kind.PREPOSITION, relation)
-            self.at += length
-            return True
-        return False
-
-    def _is_particle(self, word: str, after: str) -> bool:
-        """`on` in "turn on the lamp" and `off` in "turn the lamp off" belong to the verb."""
-        if not self.words and self._last() is Kind.VERB:
-            if word in ("on", "in"):
-                return self.pieces[-1].word in lexicon.ON_IN_PARTICLE_VERBS and word == "on"
-            return word in lexicon.PARTICLES
-        ends = not after or after in lexicon.CONJUNCTIONS or after in _BREAKS
-        return ends and word not in ("to", "of")
-
-    def _is_purpose(self, said: str, after: str) -> bool:
-        """The word "to" before a verb, or any preposition before a gerund, opens a clause and not a place."""
-        base = verb_base(after)
-        if base is None:
-            return False
-        if after.endswith("ing") and after not in lexicon.NOUNS:
-            return said in ("to", "for", "by", "before", "after")
-        beyond = self._peek(2)
-        plain_noun = after in lexicon.NOUNS and not self._starts_noun(beyond) and beyond not in lexicon.PARTICLES
-        return said == "to" and not plain_noun
-
-    def _starts_noun(self, word: str) -> bool:
-        known = word in lexicon.CONJUNCTIONS or word in _BREAKS or word in lexicon.FILLERS or word in PREPOSITIONS
-        return bool(word) and not known
-
-    def _word(self, word: str) -> None:
-        if word in _BREAKS:
-            self._emit(Kind.BREAK, word)
-        elif word in lexicon.CONJUNCTIONS or word in "()":
-            self._emit(Kind.JOIN, word)
-        elif word in _BACK_REFERENCES:
-            self._emit(Kind.BACK_REFERENCE, word)
-        elif word in _RELATIVES and self._follows_noun() and not self._starts_known_noun(1):
-            self._close()
-            self.relative_at = self.at
-        elif word in _POINTING and not self._points_at_noun():
-            self._emit(Kind.POINTING, word)
-        elif self._determines(word):
-            self._determiner()
-        elif word in _SUPERLATIVES:
-            self.superlative = True
-        elif word in lexicon.PRONOUNS or (word in _PARTICLES_ONLY and (self.words or not self.determined)):
-            self._close()
-        elif word in lexicon.STAND_INS:
-            self._close()
-            self.words.append(lexicon.STAND_INS[word])
-            self._close()
-        elif word in lexicon.FILLERS and not self._belongs_to_noun(word):
-            self._close()
-        elif not self._verb(word):
-            self._content(word)
-
-    def _determines(self, word: str) -> bool:
-        article = word in lexicon.DETERMINERS and (word, self._peek()) not in lexicon.COMPOUND_OPENERS
-        return article or word[0].isdigit() or (word.endswith(("'s", "s'")) and len(word) > 3)
-
-    def _determiner(self) -> None:
-        if self.words:
-            self._close()
-        self.determined = True
-
-    def _belongs_to_noun(self, word: str) -> bool:
-        """In "the standing lamp" a participle describes a noun; "the trash can" is no modal verb."""
-        if word == "can":
-            return (bool(self.words) or self.determined) and verb_base(self._peek()) is None
-        return self.determined and not self.words and word.endswith("ing") and self._starts_noun(self._peek())
-
-    def _verb(self, word: str) -> bool:
-        """Take the word as a verb if it stands where a verb can stand."""
-        base = verb_base(word)
-        after, gerund = self._peek(), word.endswith("ing")
-        if self._has_subject(word):
-            return True
-        if base is None:
-            return self._is_state(word, after) or self._unknown_verb(word, after)
-        if self.words:
-            return word not in lexicon.NOUNS and self._describes(word, after)
-        if self.determined or (self._last() is Kind.PREPOSITION and not gerund):
-            return False
-        if self._last() is Kind.NOUN and gerund and self._participle(after):
-            return True
-        could_be_noun = noun_phrase([word], False, False).known and base not in lexicon.GO_VERBS
-        if self._last() is Kind.VERB and self.pieces[-1].word in _LEADING_VERBS:
-            could_be_noun = False
-        if not self.pieces and base in lexicon.TOOL_VERBS and (after in PREPOSITIONS or after in lexicon.PLACES):
-            could_be_noun = False
-        if could_be_noun and not (self._starts_noun(after) or after in lexicon.PARTICLES):
-            return False
-        self._emit(Kind.VERB, base, gerund)
-        return True
-
-    def _describes(self, word: str, after: str) -> bool:
-        """A verb behind its noun: "the boxes stacked on the cart", "the shelf holds the cans"."""
-        if word.endswith("ing") or (word.endswith("s") and after in lexicon.DETERMINERS):
-            return self._participle(after)
-        return is_participle(word) and after in PREPOSITIONS and self._participle(after)
-
-    def _has_subject(self, word: str) -> bool:
-        """In "the screws that fell" and "I lost my wallet" the word is what the subject does, whatever it is."""
-        if self.words or self.determined or word in lexicon.NOUNS:
-            return False
-        if self.relative_at == self.at - 1:
-            return True
-        return self._peek(-1) in _SUBJECTS and (verb_base(word) is None or self.relative_at == self.at - 2)
-
-    def _is_state(self, word: str, after: str) -> bool:
-        """In "whether the light is blinking" the last word names no object."""
-        unknown = bool(self.words) and word.endswith("ing") and singular(self.words[-1]) in lexicon.NOUNS
-        participle = bool(self.words) and (unknown or is_participle(word))
-        if participle and word not in lexicon.NOUNS and after in PREPOSITIONS:
-            self._close()
-            return True
-        plain = not (self.words or self.determined) and singular(word) not in lexicon.NOUNS
-        return plain and self._peek(-1) in lexicon.COPULAS and not self._starts_noun(after)
-
-    def _starts_known_noun(self, ahead: int) -> bool:
-        """True where a noun of the lexicon follows, perhaps after adjectives."""
-        while self._peek(ahead) in lexicon.ADJECTIVES:
-            ahead += 1
-        word = self._peek(ahead)
-        return bool(word) and singular(word) in lexicon.NOUNS and verb_base(word) is None
-
-    def _points_at_noun(self) -> bool:
-        """In "this mug" the word describes a noun; in "pick this up" it stands for one."""
-        after = self._peek()
-        return (
-            bool(after) and (after in lexicon.DETERMINERS or self._starts_noun(after)) and after not in _PARTICLES_ONLY
-        )
-
-    def _unknown_verb(self, word: str, after: str) -> bool:
-        """In "rearrange the cushions" only a verb can stand before the article."""
-        opens = not (self.words or self.determined or self._follows_noun() or self._last() is Kind.PREPOSITION)
-        if opens and word not in lexicon.NOUNS and after in lexicon.DETERMINERS:
-            self._emit(Kind.VERB, word)
-            return True
-        return False
-
-    def _participle(self, after: str) -> bool:
-        """In "the person holding a cup" the cup is beside the person."""
-        if after in lexicon.DETERMINERS:
-            self._emit(Kind.PREPOSITION, "near")
-            return True
-        if after in PREPOSITIONS or not after:
-            self._close()
-            return True
-        return False
-
-    def _content(self, word: str) -> None:
-        final_noun = self.determined and not self._starts_noun(self._peek())
-        adverb = word.endswith(_ADVERB_ENDINGS) or (word.endswith("ly") and not final_noun)
-        if adverb and word not in lexicon.NOUNS:
-            return
+    def _noun(self, word: str) -> None:
         # "the red and blue mugs": an adjective on its own waits for the noun of the next phrase
         if not self.words and self._last() is Kind.JOIN and len(self.pieces) >= 2:
             before = self.pieces[-2].noun
             if before is not None and adjectives_only(before.words):
                 self.determined = before.determined
         self.words.append(word)
+
+    def _adjective(self, word: str) -> None:
+        if word.endswith(("'s", "s'")):
+            self._determiner(word)
+            self.words = []
+        elif word in _SUPERLATIVES:
+            self.superlative = True
+        elif self._tag(-1) in _BEFORE_A_STATE and self._tag(1) not in _IN_A_NOUN:
+            self._close()
+        else:
+            self.words.append(word)
+
+    def _determiner(self, word: str) -> None:
+        if word.endswith(("'s", "s'")):
+            self.words = []
+        self._close()
+        self.determined, self.subject_at = True, self.at
+
+    def _stand_in(self, word: str) -> None:
+        self._close()
+        # "what does the sign say", "what is that thing"
+        if word == "what" and (
+            self._word(1) in _DOING or (self._tag(2) in _OPENS_OBJECT and self._tag(1) is Tag.AUXILIARY)
+        ):
+            return
+        self.words.append(lexicon.STAND_INS.get(word, "person"))
+        self._close()
+
+    def _back_reference(self, word: str) -> None:
+        self._emit(Kind.POINTING if word in _POINTING else Kind.BACK_REFERENCE, word)
+
+    def _break(self, word: str) -> None:
+        if word == "that" and self._tag(-1) is not None:
+            self._close()
+            return
+        self._emit(Kind.BREAK, word)
+
+    def _negation(self, word: str) -> None:
+        if self._tag(-1) is Tag.PRONOUN and self._word(-1) != "you" and verb_base(self._word(1)) not in _REFUSALS:
+            self._close()  # "I can't find my phone"
+            return
+        stative = self._tag(-1) is Tag.AUXILIARY and self._word(-1) != "do" and self._tag(1) is not Tag.VERB
+        if stative:
+            self._close()
+        else:
+            self._emit(Kind.NEGATION, word)
+
+    def _pronoun(self, word: str) -> None:
+        """In "ignore the cars, I only want the bikes" a new sentence begins."""
+        self._close()
+        if word in NOMINATIVES and self._last() is Kind.JOIN and self.at - 1 in self.moods:
+            self._emit(Kind.BREAK, word)
+
+    def _relative(self, word: str) -> None:
+        self._close()
+        if word in _RELATIVES and self._last() is Kind.NOUN:
+            self.relative_from = len(self.pieces)
+
+    def _end_relative_subject(self, finite: bool) -> None:
+        """In "the mug that my wife uses" and "the mug my wife uses" the wife is none of the task's business."""
+        self._close()
+        adjacent = self.subject_at > 0 and self.said[self.subject_at - 1][1] is Tag.NOUN
+        if finite and adjacent and [piece.kind for piece in self.pieces[-2:]] == [Kind.NOUN, Kind.NOUN]:
+            self.pieces.pop()
+        if self.relative_from is not None and self.relative_from == len(self.pieces) - 1:
+            self.pieces.pop()
+        self.relative_from = None
+
+    def _auxiliary(self, word: str) -> None:
+        self._end_relative_subject(finite=True)
+        if word in _HAVING and self._last() is Kind.NOUN and self._tag(1) in _OPENS_OBJECT:
+            self._emit(Kind.PREPOSITION, "near")
+        self.modal = word in MODALS and self._last() is Kind.NOUN
+
+    def _verb(self, word: str) -> None:
+        self._end_relative_subject(finite=True)
+        base = verb_base(word) or word
+        subject = self._tag(-1)
+        self.modal, must = word in MODALS and subject in SUBJECTS, self.modal
+        if must and self._subject_is_thing():
+            if base in BELONGING_VERBS:
+                self._emit(Kind.BELONGS, base)
+        elif subject not in SUBJECTS or commands(self.said, self.at) or (subject is Tag.PRONOUN and base in WISHES):
+            self._emit(Kind.VERB, base)
+        elif base in BELONGING_VERBS and subject is not Tag.PRONOUN:
+            self._emit(Kind.BELONGS, base)
+        elif subject in (Tag.NOUN, Tag.RELATIVE, Tag.STAND_IN) and self._tag(1) in _OPENS_OBJECT:
+            self._act(base)
+        else:
+            self._close()
+
+    def _act(self, base: str) -> None:
+        """The cans are near the shelf that holds them; who left a bag, and what a key opens, are not asked for."""
+        if base in HOLDING_VERBS:
+            self._emit(Kind.PREPOSITION, "near")
+        elif self._tag(-1) is Tag.STAND_IN:
+            self.pieces.pop()
+        else:
+            self._emit(Kind.PREPOSITION, "purpose")
+
+    def _subject_is_thing(self) -> bool:
+        noun = self.pieces[-1].noun
+        return noun is not None and noun.head not in lexicon.SELVES
+
+    def _ing(self, word: str) -> None:
+        before, after = self._tag(-1), self._tag(1)
+        opens = self.determined or before not in (Tag.NOUN, Tag.PREPOSITION, Tag.NEGATION, Tag.VERB)
+        if opens and after in _IN_A_NOUN and lexicon.ADJECTIVES.issuperset(self.words):
+            self.words.append(word)  # "the leaking pipe"
+        elif self.words or before in (Tag.NOUN, Tag.STAND_IN, Tag.AUXILIARY, Tag.RELATIVE):
+            self._happening(after)
+        else:
+            self._emit(Kind.VERB, verb_base(word) or word, gerund=True)
+
+    def _happening(self, after: Tag | None) -> None:
+        """In "the person holding a cup" the cup is beside the person; in "the cat sleeping here" nothing is."""
+        if after in _OPENS_OBJECT:
+            self._emit(Kind.PREPOSITION, "near")
+        else:
+            self._close()
+
+    def _participle(self, word: str) -> None:
+        before, after = self._tag(-1), self._tag(1)
+        if after in _IN_A_NOUN and before not in (Tag.NOUN, Tag.STAND_IN, Tag.PRONOUN):
+            self.words.append(word)
+            return
+        self._end_relative_subject(finite=after is Tag.PRONOUN)
+        if self.modal and self._subject_is_thing():
+            self._emit(Kind.BELONGS, verb_base(word) or word)
+        elif after in _OPENS_OBJECT and self._last() is Kind.NOUN:
+            self.pieces.pop()  # who dropped it is none of the task's business
+        self.modal = False
+
+    def _preposition(self, word: str) -> None:
+        relation = PREPOSITIONS[word]
+        before, after = self._tag(-1), self._tag(1)
+        if word == "of" and before is Tag.DETERMINER and not self.words:
+            return
+        directly = not self.words and self._last() is Kind.VERB and before is Tag.VERB
+        if directly and self._is_particle(word):
+            return
+        if after is Tag.ING and word in ("for", "by", "before", "after"):
+            self._close()
+            return
+        self._emit(Kind.PREPOSITION, relation)
+
+    def _is_particle(self, word: str) -> bool:
+        """`on` in "turn on the lamp" belongs to the verb, `at` in "look at the lamp" says nothing more."""
+        if word == "on":
+            return self.pieces[-1].word in lexicon.ON_IN_PARTICLE_VERBS
+        return word in lexicon.PARTICLES

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from gausslite.domain.task import TaskGraph
 from gausslite.errors import TaskError
-from gausslite.task.graph_builder import GraphBuilder
+from gausslite.task.graph_builder import draft_of
 from gausslite.task.ground import grounded_graph
 from gausslite.task.parser import normalise_text
 from gausslite.task.reading import Kind, Piece, read
@@ -19,10 +19,7 @@ class RuleParser:
         require_task_text(text)
         pieces = read(normalise_text(text))
         _require_sense(text, pieces)
-        builder = GraphBuilder()
-        for at, piece in enumerate(pieces):
-            builder.add(pieces[at - 1] if at else None, piece, pieces[at + 1 :])
-        draft = builder.finish()
+        draft = draft_of(pieces)
         if not draft.targets:
             raise TaskError(_nothing_named(text, tuple(draft.excluded)))
         return grounded_graph(text, draft.targets, draft.anchors, draft.relations, draft.warnings)

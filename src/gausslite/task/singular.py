@@ -18,11 +18,11 @@ _IRREGULAR: Final = {
     "humans": "human", "rubbish": "rubbish", "quizzes": "quiz", "policemen": "policeman", "workmen": "workman",
 }  # fmt: skip
 # plural in form, one thing in use; or singular although they end in s
-_UNCHANGED: Final = words(
+PLURAL_ONLY: Final = words(
     "scissors glasses sunglasses eyeglasses headphones earphones pants jeans trousers shorts pliers tongs tweezers "
-    "binoculars goggles clothes stairs valuables electronics groceries gas bus lens news series "
-    "species canvas atlas chaos always mass pass chess press cutlery pajamas pyjamas overalls tights leggings clippers "
-    "shears remains goods supplies premises outdoors upstairs downstairs"
+    "binoculars goggles clothes stairs valuables electronics groceries gas bus lens news series species thermos "
+    "asbestos christmas canvas atlas chaos always mass pass chess press cutlery pajamas pyjamas overalls tights "
+    "leggings clippers shears remains goods supplies premises outdoors upstairs downstairs"
 )
 
 
@@ -30,7 +30,7 @@ def singular(word: str) -> str:
     """The singular of one lower-case English word; words that have none come back unchanged."""
     if word in _IRREGULAR:
         return _IRREGULAR[word]
-    if word in _UNCHANGED or len(word) <= 3 or not word.endswith("s") or word.endswith(("ss", "us", "is", "'s")):
+    if word in PLURAL_ONLY or len(word) <= 3 or not word.endswith("s") or word.endswith(("ss", "us", "is", "'s")):
         return word
     if word.endswith("ies"):
         return word[:-3] + "y"

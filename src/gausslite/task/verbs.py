@@ -1,32 +1,105 @@
-"""The forms of verbs."""
+"""The verbs a task is said with, grouped by what becomes of the nouns around them."""
 
 from __future__ import annotations
 
-from gausslite.task import lexicon
+from typing import Final
 
+from gausslite.task.words import words
 
-def verb_base(word: str) -> str | None:
-    """The base form of a known verb in any of its forms, or None."""
-    if word in lexicon.VERBS:
-        return word
-    if word in lexicon.IRREGULAR_VERBS:
-        return lexicon.IRREGULAR_VERBS[word]
-    for ending, replacements in (
-        ("ies", ("y",)),
-        ("ing", ("", "e")),
-        ("es", ("", "e")),
-        ("s", ("",)),
-        ("ed", ("", "e")),
-    ):
-        if word.endswith(ending) and len(word) > len(ending) + 1:
-            stem = word[: -len(ending)]
-            for replacement in replacements:
-                if stem + replacement in lexicon.VERBS:
-                    return stem + replacement
-    return None
-
-
-def is_participle(word: str) -> bool:
-    """True for "stacked", "left" or "lying": what may stand behind a noun and before a place."""
-    regular = word.endswith("ed") or (word.endswith("ing") and verb_base(word) is not None)
-    return regular or word in lexicon.IRREGULAR_PARTICIPLES
+GO_VERBS: Final = words(
+    "go navigate drive move walk head proceed travel come approach reach follow cross enter exit return run roll fly "
+    "advance get steer park dock explore patrol roam tour wander visit escort hurry rush climb descend crawl cruise "
+    "swim sail taxi land jog race ascend"
+)
+CARRY_VERBS: Final = words(
+    "bring take carry deliver fetch hand pass give transport haul transfer relocate send shift drag push pull slide "
+    "connect attach plug mount fasten screw glue tape tow wheel cart ferry lug hoist ship mail forward weld solder "
+    "bolt nail clamp tie hook clip pin staple join lead escort guide ride"
+)
+PLACE_VERBS: Final = words(
+    "put place set drop leave stack hang throw load insert pour store stow deposit unload position arrange rest dump "
+    "toss lay pile plant tuck slip stick wedge shove stuff cram squeeze sprinkle spread scatter bury park fling hurl "
+    "lean prop return pack file deploy install transplant tip ladle scoop spoon funnel drain discard recycle stash "
+    "lodge drape embed immerse dip suspend fit pop"
+)
+TOOL_VERBS: Final = words(
+    "clean wipe vacuum sweep mop wash scrub dust polish rinse disinfect sanitize sanitise tidy brush dry sterilize "
+    "declutter organize organise sort clear hoover rake shovel mow paint cut cover spray water repair fix hose swab "
+    "scrape sand iron weed dig sponge steam sterilise wax degrease deice sharpen lubricate oil grease"
+)
+SEARCH_VERBS: Final = words(
+    "look search hunt check scan inspect explore watch scout browse survey examine patrol scour comb sift probe"
+)
+INSPECTION_VERBS: Final = words("check scan inspect survey examine test monitor probe assess audit")
+LOOKING_VERBS: Final = (
+    SEARCH_VERBS | GO_VERBS | words("find locate identify detect spot map reconstruct photograph count track avoid")
+)
+# "move to the chair" goes there, "move the chair to the door" takes it there
+MOVING_VERBS: Final = words("move roll run advance return get land park dock drive fly race")
+# "hand the nurse the towel": the first noun is who gets the second
+GIVING_VERBS: Final = words(
+    "hand give bring pass fetch get send offer serve show throw feed find grab lend buy read toss"
+)
+# "load the van with boxes" moves the boxes
+FILLING_VERBS: Final = words("load reload stock restock")
+# "the mugs belong in the cupboard", "the boxes go on the shelf": said of things that are to be taken there
+BELONGING_VERBS: Final = words("belong go come")
+# "the shelf that holds the cans": what is held is near, as nothing is in "the key that opens the cabinet"
+HOLDING_VERBS: Final = words(
+    "hold contain have carry wear support cover store house surround touch face hug hide show display"
+)
+DELIVERY_VERBS: Final = CARRY_VERBS | PLACE_VERBS
+_OTHER_VERBS: Final = words(
+    # with the hands
+    "pick grab grasp lift hold collect gather retrieve remove catch seize lower raise open close shut press push turn "
+    "switch rotate touch hit bump knock break disturb move tilt flip fill empty refill squeeze assemble disassemble "
+    "manipulate handle serve cook feed harvest prune recycle swap change replace unplug unlock lock light aim stir "
+    "tighten loosen fold unfold wrap unwrap unpack untie sew knit drill hammer saw unscrew peel chop slice dice grate "
+    "mix blend whisk bake fry boil roast grill heat warm cool freeze thaw chill toast brew crush smash tear rip bend "
+    "straighten stretch squash pluck trim shave bathe dress soak dampen wring reload unblock block unclog adjust align "
+    "calibrate tune configure uninstall unmount dismount detach unfasten secure unhook latch unlatch unbolt disconnect "
+    "rewire refuel recharge restock replenish top patch mend restore rebuild renew update upgrade twist spin swivel "
+    "nudge wind unwind coil uncoil unroll dim brighten mute unmute activate deactivate enable disable trigger operate "
+    "reboot restart reset silence defrost fertilize reap glean herd milk shear saddle walk pet stroke pat steady "
+    "kick punch crank pump flush pry poke tap grip clasp clench pinch yank tug seal unseal cap uncap cork uncork plow "
+    "plough till sow flatten level shake strip extract excavate free release trap dismantle demolish rock"
+    # with the eyes and in words
+    " find locate identify detect recognize recognise spot seek discover determine point show tell see view observe "
+    "monitor photograph capture record map reconstruct model measure count track list report describe mark label "
+    "localize localise verify assess evaluate review focus attend concentrate read test document catalog catalogue "
+    "digitize film image audit compare gaze watch oversee supervise log note sketch draw write print type sign stamp "
+    "highlight circle tag annotate classify categorize categorise group separate distinguish estimate calculate weigh "
+    "warn alert notify inform remind ask answer reply speak talk say shout call sing play hear listen smell sniff "
+    "taste feel sense confirm ensure double-check recount pinpoint trace face eye peek peer glance"
+    # on the way and in general
+    " avoid dodge evade circumvent bypass pass circle stop wait stay keep mind beware prepare start begin try help "
+    "make use need want know build sit stand step select choose plan compute plot route work supply charge guide lead "
+    "obstruct harm damage scratch spill scare wake block interact collide contact dispose hurt crash stain drop "
+    "pause resume continue finish end complete cancel abort halt chase pursue hide jump hop leap duck crouch kneel "
+    "buy sell order rent borrow lend owe post export import evacuate rescue save extinguish ignite smother quench "
+    "guard protect shield defend sleep think believe guess suspect wonder imagine assume expect hope wish remember "
+    "recall forget learn teach let allow remain bother worry care belong contain include own steal lose die live "
+    "swap switch trade share split merge combine divide bite chew eat drink sip wear dust strew infest shatter"
+    # rarer ones
+    " discard dispose abandon absorb accompany acquire aid apply appraise assist beat boost brace bundle center centre "
+    "chuck collate comfort compile compress conceal conduct consume convey cradle crop curl cycle dab decant decorate "
+    "deflate dip direct discharge dish display dispatch dissolve distribute donate drape ease eject elevate eliminate "
+    "embed encircle engage enlarge erase erect exchange expose extend fish fit flick fumigate grind heave hitch "
+    "immerse inflate initiate inventory invert isolate jerk jiggle jot kill lace lash lick line link litter lodge "
+    "loop magnify maintain marinate massage mist moisten mulch nest obtain orient outline overturn package pad paste "
+    "peg perform pierce pitch pivot pop preheat preserve produce provide puncture purge quarantine raid ram rank "
+    "receive reinforce relay remedy request restrain retain retract reverse revolve rub ruin salvage seat season "
+    "segment simmer siphon skim slam snap snatch snip soothe splash squirt stabilise stabilize stash stitch strain "
+    "strap suck surround suspend swipe tack tally target tend terminate tether thread throttle tick treat truck unbox "
+    "uncover undo unhitch unveil usher vacate validate vent visualise visualize whip widen winch zip unzip zoom "
+    "support house wet rid roam teach greet meet welcome invite introduce accept reject approve reserve book cater "
+    "celebrate gift hail signal wink nod shrug point salute collide crack pack unwind sprawl rest recline snooze nap "
+    "relax play pose queue gather crowd swarm graze nibble peck hatch roost burrow"
+    # what things do by themselves
+    " fall lie hang lurk dwell float sink drift dangle hover perch bounce skid exist occur happen leak drip flow blink "
+    "flash beep ring buzz hum smoke burn glow shine rattle wobble vibrate function fail matter depend grow bloom wilt "
+    "rust rot sprout fade crack squeak stink bark meow cry laugh smile wave sway swing spring blow melt overflow "
+    "collapse tumble topple trip slump arrive forgive excuse pardon thank appreciate trouble bother surprise show "
+    "appear seem look become weave bind sting deal meet swell"
+)
+VERBS: Final = GO_VERBS | DELIVERY_VERBS | TOOL_VERBS | SEARCH_VERBS | INSPECTION_VERBS | _OTHER_VERBS

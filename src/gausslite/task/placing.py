@@ -1,0 +1,200 @@
+"""Put a noun where its preposition and its verb say: target, anchor, or in a relation to what was named before."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+from gausslite.domain.task import Predicate
+from gausslite.task import lexicon
+from gausslite.task.clause import Clause
+from gausslite.task.draft import GraphDraft
+from gausslite.task.phrases import NounPhrase, known_phrase
+from gausslite.task.reading import Kind, Piece
+from gausslite.task.verbs import (
+    DELIVERY_VERBS,
+    FILLING_VERBS,
+    GIVING_VERBS,
+    GO_VERBS,
+    INSPECTION_VERBS,
+    LOOKING_VERBS,
+    MOVING_VERBS,
+    PLACE_VERBS,
+    SEARCH_VERBS,
+)
+from gausslite.task.words import words
+
+_SOURCES: Final = {f"from_{place}": place for place in ("on", "under", "inside", "behind", "near")}
+# after "on the table" these say where something goes, and others say where the table is
+_FINAL_DESTINATIONS: Final = words("on inside")
+_DESTINATIONS: Final = words("to on inside near under behind in_front_of above between left_of right_of")
+
+
+class NounPlacer:
+    """Fills a draft with the nouns of one clause after another."""
+
+    def __init__(self, draft: GraphDraft) -> None:
+        self._draft = draft
+        self.clause = Clause()
+
+    def end_clause(self, verb: str | None) -> None:
+        """Begin another clause. One whose only nouns are places ("look under the bed") means those places.
+
+        In "in the kitchen, find the mug" the place belongs to the clause that follows.
+        """
+        before = self.clause
+        orphans, before.orphans = before.orphans, []
+        if not before.aside:
+            for _, noun in orphans:
+                self._draft.drop_anchor(noun.text)
+                self.target(noun)
+            orphans = []
+        self.clause = Clause(verb=verb, referents=before.subjects or before.referents)
+        self.clause.orphans = orphans
+
+    def place(self, noun: NounPhrase, pending: str | None, joined: bool, following: Sequence[Piece]) -> None:
+        """Place one noun, knowing the preposition before it, whether it is joined, and the pieces that follow."""
+        clause, after = self.clause, following[0] if following else None
+        if pending == "of" and clause.skip_of:
+            pending, joined = clause.handed_on, clause.handed_joined
+            clause.skip_of, clause.handed_on = False, None
+        if pending is None:
+            if joined and clause.last_relation is not None and self._belongs_to_anchor(noun, after):
+                self.relate(clause.last_relation, noun)
+            elif self._is_receiver(after):
+                self._draft.anchor(noun.text)
+            else:
+                self.target(noun, joined and clause.last_relation is None)
+            return
+        self.by_preposition(pending, noun, following)
+
+    def by_preposition(self, pending: str, noun: NounPhrase, following: Sequence[Piece] = ()) -> None:
+        """What the noun is to the clause's objects, by the preposition before it."""
+        clause = self.clause
+        if pending == "to":
+            self._towards(noun)
+        elif pending == "for":
+            self._sought(noun)
+        elif pending == "of":
+            self._part_of(noun)
+        elif pending == "purpose":
+            clause.last_relation = "with"
+        elif pending == "beyond" and clause.verb in DELIVERY_VERBS:
+            self._draft.anchor(noun.text)
+        elif pending == "with" and clause.verb == "compare":
+            self.target(noun, joined=True)
+        elif pending == "with" and clause.verb in FILLING_VERBS and clause.subjects:
+            self._filled_with(noun)
+        elif pending == "with":
+            if noun.known and (clause.subjects or clause.verb is None):
+                self._accompanied(noun)
+        elif pending == "from" or pending in _SOURCES:
+            self._taken_from(pending, noun)
+        elif clause.last_relation in ("to", "with") or (
+            clause.verb in PLACE_VERBS and self._is_last_place(pending, following)
+        ):
+            self._draft.anchor(noun.text)
+            clause.last_relation = clause.last_relation if clause.last_relation == "with" else "to"
+        else:
+            self.relate(pending, noun)
+
+    def _accompanied(self, noun: NounPhrase) -> None:
+        """Who looks for a man with a hat is to see the hat; who wipes with a sponge is to have it."""
+        if self.clause.verb in LOOKING_VERBS:
+            self.relate("near", noun)
+        else:
+            self._draft.anchor(noun.text)
+            self.clause.last_relation = "with"
+
+    def _filled_with(self, noun: NounPhrase) -> None:
+        """Who loads the van with boxes is to move the boxes."""
+        places, self.clause.subjects = self.clause.subjects, []
+        self._draft.targets = [target for target in self._draft.targets if target not in places]
+        for place in places:
+            self._draft.anchor(place)
+        self.target(noun)
+
+    def _is_receiver(self, after: Piece | None) -> bool:
+        """In "hand the nurse the towel" the nurse locates where the towel goes."""
+        clause = self.clause
+        follows = after is not None and after.kind is Kind.NOUN
+        return follows and clause.verb in GIVING_VERBS and not clause.subjects
+
+    def _is_last_place(self, pending: str, following: Sequence[Piece]) -> bool:
+        """Of "on the table into the sink" only the sink is where it goes; "on the shelf in the garage" is one place."""
+        more = [piece.word for piece in following[:1] if piece.kind is Kind.PREPOSITION]
+        rooms = [piece.noun for piece in following[1:2] if piece.noun and piece.noun.head in lexicon.ROOMS]
+        final = "to" in more or (pending == "on" and bool(_FINAL_DESTINATIONS.intersection(more)) and not rooms)
+        return bool(self.clause.subjects) and pending in _DESTINATIONS and not final
+
+    def _belongs_to_anchor(self, noun: NounPhrase, after: Piece | None) -> bool:
+        """Near the sink and the stove: both locate. On the table and the keys: the keys are a target of their own."""
+        if after is not None and after.kind is Kind.PREPOSITION and after.word not in ("of", "to", "for", "with"):
+            return False
+        if self.clause.last_relation == "between":
+            return True
+        return noun.head in lexicon.LANDMARKS and self.clause.last_relation not in ("on", "inside", "with")
+
+    def target(self, noun: NounPhrase, joined: bool = False) -> None:
+        """Make the noun a target: the clause is about it from here on, or about it too."""
+        clause = self.clause
+        self._draft.target(noun.text, aside=clause.aside)
+        clause.subjects = [*clause.subjects, noun.text] if joined else [noun.text]
+        clause.joined = joined
+        clause.last_relation = None
+        clause.superlative = noun.superlative or (joined and clause.superlative)
+        clause.part = noun.head in lexicon.PARTS
+        orphans, clause.orphans = clause.orphans, []
+        for relation, anchor in orphans:
+            self.relate(relation, anchor)
+
+    def relate(self, relation: str, noun: NounPhrase) -> None:
+        """Say where the clause's objects are; a place that is named before them waits for them."""
+        clause = self.clause
+        clause.last_relation = relation
+        if not clause.subjects:
+            clause.orphans.append((relation, noun))
+            return
+        self._draft.relate(relation, clause.subjects, noun.text)
+
+    def _towards(self, noun: NounPhrase) -> None:
+        clause = self.clause
+        if clause.superlative and clause.subjects:
+            self.relate(Predicate.CLOSEST_TO, noun)
+        elif clause.route or not clause.subjects or clause.verb in GO_VERBS - MOVING_VERBS:
+            self.target(noun, joined=bool(clause.subjects))
+            clause.route = False
+        else:
+            self._draft.anchor(noun.text)
+            clause.last_relation = "to"
+
+    def _sought(self, noun: NounPhrase) -> None:
+        """Searching the desk for keys seeks the keys near the desk; inspecting it for wear seeks no object."""
+        clause = self.clause
+        if clause.subjects and clause.verb in INSPECTION_VERBS and noun.head in lexicon.DEFECTS:
+            return
+        if clause.subjects and clause.verb in SEARCH_VERBS:
+            places, clause.subjects = clause.subjects, []
+            self._draft.targets = [target for target in self._draft.targets if target not in places]
+            self.target(noun)
+            for place in map(known_phrase, places):
+                self.relate("inside" if place.head in lexicon.CONTAINERS | lexicon.ROOMS else "near", place)
+        elif not clause.subjects:
+            self.target(noun)
+
+    def _part_of(self, noun: NounPhrase) -> None:
+        clause = self.clause
+        if clause.orphans:
+            return
+        if not clause.subjects:
+            self.target(noun)
+        elif (clause.part or noun.determined) and clause.last_relation is None:
+            self.relate("near", noun)
+
+    def _taken_from(self, pending: str, noun: NounPhrase) -> None:
+        if self.clause.verb in GO_VERBS - MOVING_VERBS and self.clause.subjects:
+            self._draft.anchor(noun.text)
+        elif pending in _SOURCES:
+            self.relate(_SOURCES[pending], noun)
+        else:
+            self.relate("inside" if noun.head in lexicon.CONTAINERS | lexicon.ROOMS else "on", noun)

@@ -1,0 +1,171 @@
+"""Say what part of speech each word of a sentence may be, and at what cost; `tags` then chooses."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+from gausslite.task import lexicon
+from gausslite.task.prepositions import PREPOSITIONS
+from gausslite.task.singular import PLURAL_ONLY, singular
+from gausslite.task.tags import Tag, best_tags
+from gausslite.task.verb_forms import base_of_ed, base_of_ing, base_of_s, verb_base
+from gausslite.task.verbs import GO_VERBS, SEARCH_VERBS, TOOL_VERBS, VERBS
+from gausslite.task.words import words
+
+Options = dict[Tag, int]
+
+# one line for words that may be the same things; the number is the cost in the unit of `tags`
+_CLOSED_LINES: Final = (
+    ("d0", "a an the my your his our their its every whose no"),
+    ("d0 o3", "her"),
+    ("d0 k2", "this these those"),
+    ("d0 k4 w0 s13", "that"),
+    ("d0 w0", "which"),
+    ("d0 n3", "one"),
+    ("d0 t15", "all both each more most"),
+    ("d0 s3", "first second third last next"),
+    ("d5 a0 n9", "half"),
+    ("k0", "it them"),
+    ("o0", "i me you he him she we us they myself yourself itself themselves himself herself mine yours"),
+    (
+        "x0",
+        "is are was were be been being am could would should will shall may might must does did has had having ought",
+    ),
+    ("x4 n0", "can"),
+    ("a0 p2", "closest nearest"),
+    ("x0 v15", "do have"),
+    ("v0", "let lets"),
+    ("i3 w0", "who"),
+    ("w0", "whom where how why"),
+    ("s0 w5", "when"),
+    ("s0", ". ; : ! ? then while until if whether because unless although though since once as than"),
+    ("s0 p2", "before after"),
+    ("c0", "and or , / & plus but + ( ) nor"),
+    ("p0 u0", "to"),
+    ("t0", "away out apart forward forwards backward backwards upstairs downstairs aside"),
+    ("t0 n8 a5 v15", "back"),
+    ("t0 p20", "up down"),
+    ("t0 p3", "off"),
+    ("t3 p2", "around"),
+    ("t0 p2", "outside"),
+    ("p0 t5", "over inside"),
+    ("p0 t10", "in on under below above behind along through past across by near"),
+    ("p0 g0", "touching facing surrounding"),
+    ("p3 v0", "like"),
+    ("a0 e3 n9 t12", "left"),
+    ("a0 n5 t8", "right"),
+    ("n0", "ones everywhere"),
+    ("i0 d8", "what whatever"),
+)
+# "go stand", "help clean": the second is what is to be done
+_LEADING: Final = words("go come help")
+_MAINLY_VERBS: Final = GO_VERBS | TOOL_VERBS | SEARCH_VERBS | words("stop")
+_NEVER_NOUNS: Final = GO_VERBS | words(
+    "belong bring put take get find fetch make keep give hold grab need want do lie be say see hear "
+    "know think eat sit seem contain include become lose forget boil"
+)
+_POSSESSIVES: Final = ("'s", "s'")
+_NOUNS: Final = (
+    lexicon.NOUNS
+    | lexicon.PLACES
+    | lexicon.ROUTES
+    | lexicon.MEASURES
+    | lexicon.PARTS
+    | lexicon.SELVES
+    | lexicon.COMPOUND_GERUNDS
+)
+_ADJECTIVE_ENDINGS: Final = ("ful", "ous", "able", "ible", "less", "ish", "most")
+_VERB_ENDINGS: Final = ("ize", "ise", "ify", "ate")
+_VERB_OPENINGS: Final = ("re", "un", "dis", "de", "over", "pre", "mis")
+
+
+def _options(line: str) -> Options:
+    return {Tag(each[0]): int(each[1:]) for each in line.split()}
+
+
+_CLOSED: Final[dict[str, Options]] = (
+    {word: {Tag.PREPOSITION: 0} for word in PREPOSITIONS}
+    | {" ".join(negation): {Tag.NEGATION: 0} for negation in lexicon.NEGATIONS}
+    | {word: {Tag.DETERMINER: 0} for word in lexicon.DETERMINERS}
+    | {word: {Tag.STAND_IN: 0} for word in lexicon.STAND_INS}
+    | {word: _options(line) for line, said in _CLOSED_LINES for word in said.split()}
+)
+
+
+def tagged(units: Sequence[str]) -> list[tuple[str, Tag]]:
+    """Words with their parts of speech; adverbs, which no graph needs, are left out."""
+    kept = [unit for unit in units if not is_adverb(unit)]
+    neighbours = zip(["", *kept], kept, [*kept[1:], ""], strict=False)
+    return list(zip(kept, best_tags([_candidates(*three) for three in neighbours]), strict=True))
+
+
+def is_adverb(word: str) -> bool:
+    """True for "carefully", "please" and "clockwise"."""
+    if word in lexicon.ADVERBS:
+        return True
+    ending = word.endswith(("ly", "wise", "wards"))
+    return ending and not (word in lexicon.ADJECTIVES or singular(word) in _NOUNS or word in VERBS or word in _CLOSED)
+
+
+def _candidates(before: str, word: str, after: str) -> Options:
+    if before in _LEADING and word in VERBS:
+        return {Tag.VERB: 0}
+    if (word, after) in lexicon.COMPOUND_OPENERS:
+        return {Tag.ADJECTIVE: 0}
+    closed = _CLOSED.get(word)
+    if closed is not None:
+        return closed
+    if word[0].isdigit():
+        return {Tag.DETERMINER: 0, Tag.NOUN: 5}
+    if word.endswith(_POSSESSIVES) and len(word) > 3:
+        return {Tag.ADJECTIVE: 0, Tag.DETERMINER: 0}
+    is_noun = singular(word) in _NOUNS or word in _NOUNS or word in PLURAL_ONLY
+    options = _as_verb(before, word, is_noun)
+    if word in lexicon.ADJECTIVES:
+        options[Tag.ADJECTIVE] = 0
+    if is_noun:
+        options[Tag.NOUN] = 5 if before == "to" and word in _MAINLY_VERBS else 0
+    elif options:
+        options.setdefault(Tag.NOUN, _as_rare_noun(before, word))
+    else:
+        options = {
+            Tag.NOUN: 5,
+            Tag.ADJECTIVE: 3 if word.endswith(_ADJECTIVE_ENDINGS) else 20 if word.endswith("s") else 12,
+            Tag.VERB: 40,
+        }
+    return options
+
+
+def _as_rare_noun(before: str, word: str) -> int:
+    """A verb may be a noun behind another noun: a stop button, a call panel."""
+    if word in lexicon.ADJECTIVES or not before or before in _CLOSED or verb_base(word) in _NEVER_NOUNS:
+        return 30
+    return 20 if word.endswith("s") else 12
+
+
+def _as_verb(before: str, word: str, is_noun: bool) -> Options:
+    """What the word may be if it is a form of a verb, known or by its ending."""
+    options: Options = {}
+    if word in VERBS:
+        usual = not is_noun or (before == "to" and word in _MAINLY_VERBS)
+        options[Tag.VERB] = 0 if usual else 5 if word in _MAINLY_VERBS else 12
+        if before in _NOUNS:  # no single thing "bring"
+            options[Tag.VERB] += 8
+    elif base_of_s(word) is not None:
+        options[Tag.VERB] = 2 if not is_noun else 8 if base_of_s(word) in _MAINLY_VERBS else 18
+    elif not is_noun and (word.endswith(_VERB_ENDINGS) or _prefixed(word)):
+        options[Tag.VERB] = 5
+    if base_of_ing(word) is not None:
+        options[Tag.ING] = 10 if is_noun else 0
+    elif word.endswith("ing") and len(word) > 5 and not is_noun:
+        options |= {Tag.ING: 5, Tag.NOUN: 6}
+    if base_of_ed(word) is not None:
+        options[Tag.PARTICIPLE] = 8 if is_noun else 0
+    elif word.endswith("ed") and len(word) > 4 and not is_noun:
+        options[Tag.PARTICIPLE] = 3
+    return options
+
+
+def _prefixed(word: str) -> bool:
+    return any(word.startswith(opening) and word[len(opening) :] in VERBS for opening in _VERB_OPENINGS)

@@ -1,0 +1,38 @@
+"""Cut a sentence into words, keeping together what English reads as one: "next to", "do not"."""
+
+from __future__ import annotations
+
+import re
+from typing import Final
+
+from gausslite.task import lexicon
+from gausslite.task.idioms import plain_words
+from gausslite.task.prepositions import PREPOSITIONS
+
+_TOKEN: Final = re.compile(r"[^\W\d_][\w'’-]*|\d[\w.]*|[,/&+;.!?:()]")
+_COMPOUNDS: Final = {
+    first: sorted((unit for unit in units if unit[0] == first), key=len, reverse=True)
+    for units in [
+        [tuple(said.split()) for said in PREPOSITIONS if " " in said] + [n for n in lexicon.NEGATIONS if len(n) > 1]
+    ]
+    for first in {unit[0] for unit in units}
+}
+
+
+def tokens_of(text: str) -> list[str]:
+    """Lower-case words, numbers and the punctuation that matters."""
+    return _TOKEN.findall(plain_words(text))
+
+
+def units_of(text: str) -> list[str]:
+    """The tokens of a text, with prepositions and negations of several words as one unit each."""
+    tokens = tokens_of(text)
+    units: list[str] = []
+    at = 0
+    while at < len(tokens):
+        length = next(
+            (len(unit) for unit in _COMPOUNDS.get(tokens[at], ()) if tuple(tokens[at : at + len(unit)]) == unit), 1
+        )
+        units.append(" ".join(tokens[at : at + length]))
+        at += length
+    return units
