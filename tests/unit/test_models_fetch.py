@@ -1,14 +1,12 @@
-"""Fetching model files from a real server in process: whole or not at all, from where it was cut off, never wrong."""
+"""Model files of the catalogue: fetched, held to their checksums, listed, verified and inspected."""
 
 from __future__ import annotations
 
 import hashlib
-import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from dataclasses import replace
 
 import pytest
+from model_shelf import DIGEST, Shelf, left_in, nothing_shown, serving
 from tiny_yolo import write_tiny_yolo
 
 from gausslite.cli.main import main
@@ -17,162 +15,10 @@ from gausslite.errors import (
     GaussLiteError,
     InvalidInputError,
     ModelFileError,
-    QuotaError,
-    UnavailableError,
 )
 from gausslite.models.catalogue import CATALOGUE, ModelEntry, entry_named, read_catalogue
-from gausslite.models.download import Wanted, download, require_safe
 from gausslite.models.fetch import fetch
 from gausslite.perception.model_file import listed_checksum
-
-DATA = bytes(range(256)) * 3000
-DIGEST = hashlib.sha256(DATA).hexdigest()
-
-
-class Shelf:
-    """What the server has, how it behaves, and what it was asked for."""
-
-    def __init__(self) -> None:
-        self.data, self.tag = DATA, '"v1"'
-        self.cut_at: int | None = None
-        self.redirect: str | None = None
-        self.says_length = True
-        self.asked: list[str | None] = []
-
-
-@contextmanager
-def serving(shelf: Shelf) -> Iterator[str]:
-    class Handler(BaseHTTPRequestHandler):
-        def do_GET(self) -> None:
-            wanted = self.headers.get("Range")
-            shelf.asked.append(wanted)
-            if shelf.redirect is not None:
-                self.send_response(302)
-                self.send_header("Location", shelf.redirect)
-                self.end_headers()
-                return
-            if not self.path.endswith("/thing.bin") and not self.path.endswith(".onnx"):
-                self.send_error(404)
-                return
-            start = int(wanted[6:-1]) if wanted and self.headers.get("If-Range") == shelf.tag else 0
-            self.send_response(206 if start else 200)
-            if start:
-                self.send_header("Content-Range", f"bytes {start}-{len(shelf.data) - 1}/{len(shelf.data)}")
-            if shelf.says_length:
-                self.send_header("Content-Length", str(len(shelf.data) - start))
-            self.send_header("ETag", shelf.tag)
-            self.end_headers()
-            self.wfile.write(shelf.data[start : shelf.cut_at])
-
-        def log_message(self, *_: object) -> None:
-            """Quiet."""
-
-    server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-    thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
-    thread.start()
-    try:
-        yield f"http://127.0.0.1:{server.server_port}/files"
-    finally:
-        server.shutdown()
-        server.server_close()
-        thread.join()
-
-
-def wanted(base: str, folder, sha256: str | None = DIGEST, max_bytes: int = 1 << 20) -> Wanted:
-    return Wanted(f"{base}/thing.bin", folder / "thing.bin", max_bytes, sha256)
-
-
-def nothing_shown(have: int, total: int | None) -> None:
-    """No bar in tests."""
-
-
-def left_in(folder) -> list[str]:
-    return sorted(path.name for path in folder.iterdir())
-
-
-def test_a_file_comes_whole_and_leaves_nothing_else(tmp_path):
-    shown = []
-    with serving(Shelf()) as base:
-        download(wanted(base, tmp_path), lambda have, total: shown.append((have, total)))
-    assert (tmp_path / "thing.bin").read_bytes() == DATA
-    assert left_in(tmp_path) == ["thing.bin"]
-    assert shown[0] == (0, len(DATA))
-    assert shown[-1] == (len(DATA), len(DATA))
-
-
-def test_what_was_cut_off_goes_on_where_it_ended(tmp_path):
-    shelf = Shelf()
-    with serving(shelf) as base:
-        shelf.cut_at = 500_000
-        with pytest.raises(UnavailableError, match="run it again to go on"):
-            download(wanted(base, tmp_path), nothing_shown)
-        assert not (tmp_path / "thing.bin").exists()
-        shelf.cut_at = None
-        download(wanted(base, tmp_path), nothing_shown)
-    assert shelf.asked == [None, "bytes=500000-"]
-    assert (tmp_path / "thing.bin").read_bytes() == DATA
-    assert left_in(tmp_path) == ["thing.bin"]
-
-
-@pytest.mark.parametrize("tag", ['"v2"', 'W/"v1"'])
-def test_another_file_on_the_server_is_begun_anew(tmp_path, tag):
-    shelf = Shelf()
-    with serving(shelf) as base:
-        shelf.cut_at, shelf.tag = 1000, '"v1"' if tag == '"v2"' else tag
-        with pytest.raises(UnavailableError):
-            download(wanted(base, tmp_path), nothing_shown)
-        shelf.cut_at, shelf.tag, shelf.data = None, tag, DATA[::-1]
-        download(wanted(base, tmp_path, hashlib.sha256(DATA[::-1]).hexdigest()), nothing_shown)
-    assert (tmp_path / "thing.bin").read_bytes() == DATA[::-1]
-
-
-def test_a_wrong_file_is_not_kept_and_does_not_spoil_the_next_try(tmp_path):
-    shelf = Shelf()
-    with serving(shelf) as base:
-        shelf.data = b"\1" + DATA[1:]
-        with pytest.raises(ChecksumError, match="the file was not kept"):
-            download(wanted(base, tmp_path), nothing_shown)
-        assert left_in(tmp_path) == []
-        shelf.data = DATA
-        download(wanted(base, tmp_path), nothing_shown)
-    assert (tmp_path / "thing.bin").read_bytes() == DATA
-
-
-@pytest.mark.parametrize("says_length", [True, False])
-def test_a_file_that_is_too_large_is_never_written_past_its_limit(tmp_path, says_length):
-    shelf = Shelf()
-    shelf.says_length = says_length
-    with serving(shelf) as base, pytest.raises(QuotaError, match="at most 1000 bytes"):
-        download(wanted(base, tmp_path, max_bytes=1000), nothing_shown)
-    assert sum(path.stat().st_size for path in tmp_path.glob(".thing.bin.part")) <= 1000
-    assert not (tmp_path / "thing.bin").exists()
-
-
-@pytest.mark.parametrize(
-    "url", ["http://example.org/a", "ftp://localhost/a", "file:///etc/passwd", "https://", "x", ""]
-)
-def test_only_https_is_safe_but_for_this_machine(url):
-    with pytest.raises(InvalidInputError, match="expected an https:// address"):
-        require_safe(url)
-    require_safe("https://example.org/a")
-    require_safe("http://localhost:8000/a")
-
-
-def test_a_redirect_to_an_unsafe_address_is_not_followed(tmp_path):
-    shelf = Shelf()
-    shelf.redirect = "http://example.org/thing.bin"
-    with serving(shelf) as base, pytest.raises(InvalidInputError, match=r"example\.org"):
-        download(wanted(base, tmp_path), nothing_shown)
-
-
-def test_a_server_that_has_no_such_file_or_is_not_there_is_told_in_one_line(tmp_path):
-    with serving(Shelf()) as base:
-        with pytest.raises(UnavailableError, match="404"):
-            download(Wanted(f"{base}/other", tmp_path / "other", 10), nothing_shown)
-        gone = base
-    with pytest.raises(UnavailableError, match="cannot be reached") as caught:
-        download(Wanted(f"{gone}/thing.bin", tmp_path / "thing.bin", 10), nothing_shown)
-    assert "\n" not in str(caught.value)
 
 
 def entry(max_mib: int = 1, sha256: str | None = None) -> ModelEntry:
@@ -184,10 +30,43 @@ def test_a_fetched_model_is_held_to_its_checksum_from_then_on(tmp_path):
     shelf.data = write_tiny_yolo(tmp_path / "source.onnx", ["cup"], []).read_bytes()
     folder = tmp_path / "models"
     with serving(shelf) as base:
-        path = fetch(entry(), base, folder, None, nothing_shown)
-        assert fetch(entry(), base, folder, None, nothing_shown) == path
+        first, again = (fetch(entry(), base, folder, None, nothing_shown) for _ in range(2))
     assert len(shelf.asked) == 1
-    assert listed_checksum(path) == hashlib.sha256(shelf.data).hexdigest()
+    assert listed_checksum(first.path) == first.sha256 == hashlib.sha256(shelf.data).hexdigest()
+    assert (first.vouched_by, again.vouched_by) == ("", "SHA256SUMS")
+    assert again == replace(first, vouched_by="SHA256SUMS")
+
+
+def test_a_file_that_changed_since_it_was_fetched_is_not_written_down_as_right(tmp_path):
+    shelf, folder = Shelf(), tmp_path / "models"
+    shelf.data = write_tiny_yolo(tmp_path / "source.onnx", ["cup"], []).read_bytes()
+    with serving(shelf) as base:
+        path = fetch(entry(), base, folder, None, nothing_shown).path
+        noted = listed_checksum(path)
+        path.write_bytes(shelf.data + b"more")
+        with pytest.raises(ChecksumError, match="as SHA256SUMS says"):
+            fetch(entry(), base, folder, None, nothing_shown)
+        # nor is what the server has now taken for what it had
+        path.unlink()
+        shelf.data = write_tiny_yolo(tmp_path / "other.onnx", ["bowl"], []).read_bytes()
+        with pytest.raises(ChecksumError, match="the file was not kept"):
+            fetch(entry(), base, folder, None, nothing_shown)
+        assert listed_checksum(path) == noted
+        # but for somebody who says so
+        digest = hashlib.sha256(shelf.data).hexdigest()
+        fetched = fetch(entry(sha256="0" * 64), base, folder, digest.upper(), nothing_shown)
+    assert (fetched.vouched_by, fetched.sha256, listed_checksum(path)) == ("--sha256", digest, digest)
+
+
+def test_the_catalogues_sum_is_enforced(tmp_path):
+    shelf = Shelf()
+    shelf.data = write_tiny_yolo(tmp_path / "source.onnx", ["cup"], []).read_bytes()
+    folder, digest = tmp_path / "models", hashlib.sha256(shelf.data).hexdigest()
+    with serving(shelf) as base:
+        with pytest.raises(ChecksumError, match="the file was not kept"):
+            fetch(entry(sha256="0" * 64), base, folder, None, nothing_shown)
+        assert not (folder / "tiny.onnx").exists()
+        assert fetch(entry(sha256=digest), base, folder, None, nothing_shown).vouched_by == "the catalogue"
 
 
 def test_a_web_page_under_a_models_name_is_not_kept(tmp_path):
@@ -214,7 +93,13 @@ def test_the_command_lists_fetches_verifies_and_inspects(tmp_path, capsys, monke
     shelf.data = write_tiny_yolo(tmp_path / "source.onnx", ["cup"], []).read_bytes()
     with serving(shelf) as base:
         monkeypatch.setenv("GAUSSLITE_MODELS_URL", base)
-        assert main(["models", "fetch", "tiny", "--catalogue", str(catalogue), "--folder", str(folder)]) == 0
+        command = ["models", "fetch", "tiny", "--catalogue", str(catalogue), "--folder", str(folder)]
+        assert main(command) == 0
+        assert "tiny.onnx: not verified: nobody named its SHA-256 beforehand" in capsys.readouterr().err
+        assert main([*command, "--sha256", hashlib.sha256(shelf.data).hexdigest()]) == 0
+        first = capsys.readouterr()
+        assert "tiny.onnx: verified: its SHA-256 is the one that --sha256 names" in first.err
+        assert first.out == f"{folder / 'tiny.onnx'}\n"
     path = str(folder / "tiny.onnx")
     assert main(["models", "list", "--catalogue", str(catalogue), "--folder", str(folder)]) == 0
     assert main(["models", "verify", path]) == 0

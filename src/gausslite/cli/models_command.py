@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,6 +15,7 @@ from gausslite.errors import InvalidInputError
 if TYPE_CHECKING:
     from gausslite.models.catalogue import ModelEntry
     from gausslite.models.download import Progress
+    from gausslite.models.fetch import Fetched
 
 _BASE_URL = "GAUSSLITE_MODELS_URL"
 
@@ -41,7 +43,7 @@ def _add_list(parser: argparse.ArgumentParser) -> None:
 def _add_fetch(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("names", metavar="NAME", nargs="+", help="names that `gausslite models list` prints")
     parser.add_argument("--base-url", metavar="URL", help=f"where the files lie (default: ${_BASE_URL})")
-    parser.add_argument("--sha256", metavar="HEX", help="what a single file must have (default: the catalogue's)")
+    parser.add_argument("--sha256", metavar="HEX", help="the file's (default: the catalogue's, else SHA256SUMS')")
     _add_catalogue(parser)
     _add_folder(parser)
     parser.set_defaults(run=_fetch)
@@ -81,8 +83,9 @@ def _fetch(options: argparse.Namespace) -> int:
     known = _entries(options)
     for entry in [entry_named(known, name) for name in options.names]:
         with _bar(entry.file_name) as progress:
-            path = fetch(entry, base_url, options.folder, options.sha256, progress)
-        print(path)
+            fetched = fetch(entry, base_url, options.folder, options.sha256, progress)
+        print(fetched.path)
+        print(f"{fetched.path.name}: {_assurance(fetched)}", file=sys.stderr)
     return 0
 
 
@@ -105,6 +108,16 @@ def _inspect(options: argparse.Namespace) -> int:
         for tensor in tensors:
             print(f"{label:9} {tensor}")
     return 0
+
+
+def _assurance(fetched: Fetched) -> str:
+    """What is known of a file that came over the network, said as plainly as what is not."""
+    if fetched.vouched_by:
+        return f"verified: its SHA-256 is the one that {fetched.vouched_by} names"
+    return (
+        f"not verified: nobody named its SHA-256 beforehand; it is {fetched.sha256}, compare it with its maker's "
+        "(it is written down in SHA256SUMS, which holds the file to it from now on)"
+    )
 
 
 @contextmanager

@@ -3,39 +3,60 @@
 from __future__ import annotations
 
 import re
+from dataclasses import dataclass
 from pathlib import Path
 
 from gausslite.codec.files import write_whole
 from gausslite.errors import ChecksumError, InvalidInputError
 from gausslite.models.catalogue import ModelEntry
 from gausslite.models.download import Progress, Wanted, download
-from gausslite.perception.model_file import CHECKSUMS, sha256_of
+from gausslite.perception.model_file import CHECKSUMS, listed_checksum, sha256_of
 
 
-def fetch(entry: ModelEntry, base_url: str, folder: Path, sha256: str | None, progress: Progress) -> Path:
-    """The file in the folder, brought there if it is not there yet; sha256 goes before the catalogue's.
+@dataclass(frozen=True, slots=True)
+class Fetched:
+    """A file that is here, its SHA-256, and who said beforehand that it must have it; empty where nobody did."""
 
-    From then on SHA256SUMS in the folder holds the file to what it was. Raises what `download` raises, and
-    ModelFileError for a file that is no ONNX model though its name says so.
+    path: Path
+    sha256: str
+    vouched_by: str
+
+
+def fetch(entry: ModelEntry, base_url: str, folder: Path, sha256: str | None, progress: Progress) -> Fetched:
+    """The file in the folder, brought there if it is not there yet.
+
+    It must have the given SHA-256, else the catalogue's, else the one that SHA256SUMS in the folder lists. Where there
+    is none of them it is taken as it comes; SHA256SUMS holds it to what it was from then on. Raises what `download`
+    raises, ChecksumError for another file, and ModelFileError for one that is no ONNX model though its name says so.
     """
-    expected = (sha256 or entry.sha256 or "").lower() or None
-    if expected is not None and not re.fullmatch(r"[0-9a-f]{64}", expected):
-        raise InvalidInputError(f"--sha256: expected 64 hex digits, got {sha256!r}")
-    wanted = Wanted(f"{base_url.rstrip('/')}/{entry.path}", folder / entry.file_name, entry.max_bytes, expected)
-    path = wanted.path
-    if path.is_file() and expected is not None:
-        if (found := sha256_of(path)) != expected:
-            raise ChecksumError(
-                f"{path}: expected SHA-256 {expected}, got {found}; move the file away to fetch it anew"
-            )
-    elif not path.is_file():
+    path = folder / entry.file_name
+    expected, vouched_by = _expected(entry, path, sha256)
+    wanted = Wanted(f"{base_url.rstrip('/')}/{entry.path}", path, entry.max_bytes, expected)
+    if not path.is_file():
         download(wanted, progress)
-    _note_checksum(path)
-    return path
+    found = sha256_of(path)
+    if expected not in (None, found):
+        asked = f"expected SHA-256 {expected} as {vouched_by} says"
+        raise ChecksumError(f"{path}: {asked}, got {found}; move the file away to fetch it anew")
+    if listed_checksum(path) != found:
+        _note_checksum(path, found)
+    return Fetched(path, found, vouched_by)
 
 
-def _note_checksum(path: Path) -> None:
+def _expected(entry: ModelEntry, path: Path, sha256: str | None) -> tuple[str | None, str]:
+    """The SHA-256 that the file must have and who says so. Raises InvalidInputError for what is none."""
+    if sha256 is not None:
+        if not re.fullmatch(r"[0-9a-f]{64}", sha256.lower()):
+            raise InvalidInputError(f"--sha256: expected 64 hex digits, got {sha256!r}")
+        return sha256.lower(), "--sha256"
+    if entry.sha256 is not None:
+        return entry.sha256, "the catalogue"
+    listed = listed_checksum(path)
+    return (listed, CHECKSUMS) if listed is not None else (None, "")
+
+
+def _note_checksum(path: Path, sha256: str) -> None:
     listing = path.parent / CHECKSUMS
     lines = listing.read_text(encoding="utf-8").splitlines() if listing.is_file() else []
     kept = [line for line in lines if line.partition(" ")[2].strip().removeprefix("*") != path.name]
-    write_whole(listing, "".join(f"{line}\n" for line in [*kept, f"{sha256_of(path)}  {path.name}"]).encode())
+    write_whole(listing, "".join(f"{line}\n" for line in [*kept, f"{sha256}  {path.name}"]).encode())
