@@ -10,6 +10,7 @@ from gausslite.domain.camera import Camera
 from gausslite.domain.frame import Frame
 from gausslite.errors import InvalidInputError
 from gausslite.perception.everything import EverythingSegmenter, EverythingSettings
+from gausslite.perception.model_file import open_model
 from gausslite.perception.yolo_network import YoloSegNetwork
 
 SURE = (24.0, 32.0, 16.0, 16.0, 0, 0.9)
@@ -24,7 +25,9 @@ def frame_with_red_square() -> Frame:
 
 
 def segmenter(tmp_path, *boxes, names=("object",)):
-    return EverythingSegmenter(YoloSegNetwork(write_tiny_yolo(tmp_path / "tiny.onnx", names, boxes, named=False)))
+    return EverythingSegmenter(
+        YoloSegNetwork(open_model(write_tiny_yolo(tmp_path / "tiny.onnx", names, boxes, named=False)))
+    )
 
 
 def masks(tmp_path, *boxes, asked=(BOX,), names=("object",)):

@@ -14,7 +14,7 @@ from gausslite.domain.frame import Frame
 from gausslite.errors import InvalidInputError, KernelError, ModelFileError
 from gausslite.perception.detect import Box, SegmentedDetector
 from gausslite.perception.families import Family, Networks, family_of
-from gausslite.perception.model_file import choose_providers, open_session
+from gausslite.perception.model_file import choose_providers, open_model
 
 # in the network's pixels; in the image columns 32 to 64, rows 16 to 48
 CUP = (24.0, 32.0, 16.0, 16.0, 0, 0.9)
@@ -39,11 +39,11 @@ def found_pixels(networks: Networks) -> int:
 
 def test_a_family_is_told_by_inputs_and_outputs(tmp_path):
     grounding = write_tiny_grounding(tmp_path / "dino.onnx", [((0.5, 0.5, 0.2, 0.2), {})])
-    assert family_of(grounding, open_session(grounding, 1)) is Family.GROUNDING_DINO
-    assert family_of(yolo(tmp_path), open_session(yolo(tmp_path), 1)) is Family.YOLO_SEG
+    assert family_of(open_model(grounding, 1)) is Family.GROUNDING_DINO
+    assert family_of(open_model(yolo(tmp_path), 1)) is Family.YOLO_SEG
     boxes = write_boxes_only(tmp_path / "boxes.onnx")
     with pytest.raises(ModelFileError, match=r"boxes only, no masks"):
-        family_of(boxes, open_session(boxes, 1))
+        family_of(open_model(boxes, 1))
 
 
 @pytest.mark.parametrize("name", [None, "yolo"])
@@ -52,6 +52,23 @@ def test_a_yolo_file_brings_its_own_masks(tmp_path, name):
     assert found_pixels(networks) > 0.97 * 32 * 32
     (mask,) = networks.segmenter.segment(frame(), np.array([[32, 16, 64, 48]], np.float32))
     assert mask.sum() > 0.97 * 32 * 32
+
+
+@pytest.mark.parametrize(("segmenter", "sessions"), [(None, 1), ("cut", 1), ("everything.onnx", 2)])
+def test_each_file_is_opened_once(tmp_path, monkeypatch, segmenter, sessions):
+    import onnxruntime
+
+    opened, session_of = [], onnxruntime.InferenceSession
+
+    def counted(path, *more, **named):
+        opened.append(path)
+        return session_of(path, *more, **named)
+
+    monkeypatch.chdir(tmp_path)
+    yolo(tmp_path, "everything.onnx", ("object",))
+    monkeypatch.setattr(onnxruntime, "InferenceSession", counted)
+    Networks(yolo(tmp_path), segmenter, None, 1)
+    assert len(opened) == len(set(opened)) == sessions
 
 
 def test_the_cut_replaces_a_networks_masks_where_it_is_asked_for(tmp_path):
@@ -124,7 +141,7 @@ def test_what_is_no_model_is_told_before_a_session_is_made(tmp_path, content, ex
     path = tmp_path / "model.onnx"
     path.write_bytes(content)
     with pytest.raises(ModelFileError, match=expected):
-        open_session(path, 1)
+        open_model(path, 1)
 
 
 def test_a_damaged_bit_is_told_where_a_checksum_lies_beside_the_file(tmp_path):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -15,6 +17,7 @@ from gausslite.errors import InvalidInputError, ModelFileError
 from gausslite.perception.detect import Box
 from gausslite.perception.grounding import GroundingDino, GroundingSettings, corners_px, phrase_scores, picture
 from gausslite.perception.grounding_text import BertTokenizer, phrase_input
+from gausslite.perception.model_file import open_model
 
 LEFT, RIGHT = (0.25, 0.5, 0.25, 0.5), (0.75, 0.5, 0.25, 0.5)
 SURE, UNSURE = 2.0, -1.2
@@ -29,7 +32,9 @@ def frame(height: int = 60, width: int = 80, blue: int = NEUTRAL_BLUE) -> Frame:
 
 
 def detector(tmp_path, answers, limits: GroundingSettings | None = None, **layout) -> GroundingDino:
-    return GroundingDino(write_tiny_grounding(tmp_path / "tiny.onnx", answers, **layout), TinyTokenizer(), limits)
+    return GroundingDino(
+        open_model(write_tiny_grounding(tmp_path / "tiny.onnx", answers, **layout)), TinyTokenizer(), limits
+    )
 
 
 LAYOUTS = (
@@ -90,7 +95,7 @@ def test_padding_is_masked_and_counts_for_nothing(tmp_path):
 
 def test_a_file_with_another_interface_is_refused(tmp_path):
     with pytest.raises(ModelFileError, match="expected Grounding DINO with inputs pixel_values") as caught:
-        GroundingDino(write_tiny_yolo(tmp_path / "yolo.onnx", ["cup"], []), TinyTokenizer())
+        GroundingDino(open_model(write_tiny_yolo(tmp_path / "yolo.onnx", ["cup"], [])), TinyTokenizer())
     assert "\n" not in str(caught.value)
 
 
@@ -106,7 +111,7 @@ def test_settings_are_checked():
     with pytest.raises(InvalidInputError, match="max_boxes"):
         GroundingSettings(max_boxes=0)
     with pytest.raises(InvalidInputError, match="threads"):
-        GroundingSettings(threads=0)
+        open_model(Path("any.onnx"), threads=0)
 
 
 def test_the_noun_stays_when_a_phrase_is_too_long():

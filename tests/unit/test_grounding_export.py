@@ -14,6 +14,7 @@ from gausslite.domain.frame import Frame
 from gausslite.perception.detect import BoxFractions
 from gausslite.perception.grounding import INPUTS, OUTPUTS, GroundingDino, GroundingSettings, picture
 from gausslite.perception.grounding_text import phrase_input
+from gausslite.perception.model_file import open_model
 
 torch = pytest.importorskip("torch", reason="the reference extra brings torch, which this network is made with")
 transformers = pytest.importorskip("transformers", reason="transformers, which has Grounding DINO, is not installed")
@@ -84,8 +85,8 @@ def network_inputs(seed: int, phrase: str):
 
 @pytest.mark.parametrize("phrase", ["red mug", "table", "red table"])
 def test_every_box_and_score_is_torchs(network, path, phrase):
-    lenient = GroundingSettings(0.001, 0.001, max_iou=0.999, box_fractions=BoxFractions(1.0, 1.0, 1.0, 1.0), threads=1)
-    detector = GroundingDino(path, TinyTokenizer(), lenient)
+    lenient = GroundingSettings(0.001, 0.001, max_iou=0.999, box_fractions=BoxFractions(1.0, 1.0, 1.0, 1.0))
+    detector = GroundingDino(open_model(path, 1), TinyTokenizer(), lenient)
     text = phrase_input(phrase, TinyTokenizer(), TOKENS)
     for seed in SEEDS:
         frame = Frame(0, 0, rgb(seed), np.ones((48, 96), np.float32), Camera(90, 90, 48, 24, 96, 48), np.eye(4))

@@ -12,6 +12,7 @@ from gausslite.domain.camera import Camera
 from gausslite.domain.frame import Frame
 from gausslite.errors import InvalidInputError, ModelFileError
 from gausslite.perception.detect import BoxFractions
+from gausslite.perception.model_file import open_model
 from gausslite.perception.yolo import YoloSegDetector, YoloSettings, load_yolo
 
 NAMES = ("cup", "chair", "dining table")
@@ -71,7 +72,7 @@ def test_boxes_that_span_too_much_are_left_out(tmp_path):
     huge = (32.0, 32.0, 64.0, 24.0, 0, 0.9)
     path = write_tiny_yolo(tmp_path / "tiny.onnx", NAMES, [huge])
     assert load_yolo(path).detect(frame_with_red_square(), ["cup"]) == []
-    lenient = YoloSegDetector(path, None, YoloSettings(box_fractions=BoxFractions(small=1.0)))
+    lenient = YoloSegDetector(open_model(path), None, YoloSettings(box_fractions=BoxFractions(small=1.0)))
     assert len(lenient.detect(frame_with_red_square(), ["cup"])) == 1
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from gausslite.errors import ModelFileError
 from gausslite.perception.families import Family, family_of
-from gausslite.perception.model_file import CHECKSUMS, listed_checksum, open_session, require_listed_checksum, sha256_of
+from gausslite.perception.model_file import CHECKSUMS, listed_checksum, open_model, require_listed_checksum, sha256_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,12 +25,13 @@ class ModelSheet:
 
 def inspect(path: Path) -> ModelSheet:
     """Open a model and describe it. Raises ModelFileError when it is damaged, or of no family that GaussLite knows."""
-    session = open_session(path, threads=1)
+    model = open_model(path, threads=1)
+    session = model.session
     described = [
         tuple(f"{each.name} {each.shape} {each.type.removeprefix('tensor').strip('()')}" for each in side)
         for side in (session.get_inputs(), session.get_outputs())
     ]
-    family = family_of(path, session)
+    family = family_of(model)
     provider = str(session.get_providers()[0]).removesuffix("ExecutionProvider")
     return ModelSheet(path, path.stat().st_size, sha256_of(path), family, provider, *described)
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from enum import StrEnum
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from gausslite.errors import InvalidInputError, ModelFileError
 from gausslite.perception.detect import Detector, SegmentedDetector, Segmenter
-from gausslite.perception.model_file import open_session
+from gausslite.perception.model_file import OpenModel, open_model
 from gausslite.perception.yolo_decode import MASK_COEFFICIENTS
 
 VOCABULARY: Final = "vocab.txt"
@@ -22,11 +22,11 @@ class Family(StrEnum):
     YOLO_SEG = "YOLO-seg or FastSAM"
 
 
-def family_of(path: Path, session: Any) -> Family:
+def family_of(model: OpenModel) -> Family:
     """The family of an open model. Raises ModelFileError for an unknown one."""
     from gausslite.perception.grounding import is_grounding
 
-    inputs, outputs = session.get_inputs(), session.get_outputs()
+    inputs, outputs = model.session.get_inputs(), model.session.get_outputs()
     if is_grounding([each.name for each in inputs], [each.name for each in outputs]):
         return Family.GROUNDING_DINO
     image = len(inputs) == 1 and len(inputs[0].shape) == 4
@@ -37,7 +37,7 @@ def family_of(path: Path, session: Any) -> Family:
         return Family.YOLO_SEG
     came = " → ".join(", ".join(f"{each.name} {each.shape}" for each in side) for side in (inputs, outputs))
     hint = " (boxes only, no masks)" if image and len(outputs) == 1 else ""
-    raise ModelFileError(f"model {path}: expected {' or '.join(Family)}, got {came}{hint}")
+    raise ModelFileError(f"model {model.path}: expected {' or '.join(Family)}, got {came}{hint}")
 
 
 class Networks:
@@ -48,11 +48,11 @@ class Networks:
 
         None takes the detector's own masks where it has some. Raises ModelFileError, InvalidInputError, KernelError.
         """
-        family = family_of(detector, open_session(detector, threads))
-        if family is Family.GROUNDING_DINO:
-            self._open_grounding(detector, segmenter, vocabulary, threads)
+        model = open_model(detector, threads)
+        if family_of(model) is Family.GROUNDING_DINO:
+            self._use_grounding(model, segmenter, vocabulary, threads)
         else:
-            self._open_yolo(detector, segmenter, threads)
+            self._use_yolo(model, segmenter, threads)
 
     @property
     def detector(self) -> Detector:
@@ -64,21 +64,25 @@ class Networks:
         """What cuts known boxes out of further images."""
         return self._segmenter
 
-    def _open_grounding(self, path: Path, segmenter: str | None, vocabulary: Path | None, threads: int | None) -> None:
-        from gausslite.perception.grounding import GroundingDino, GroundingSettings
+    def _use_grounding(
+        self, model: OpenModel, segmenter: str | None, vocabulary: Path | None, threads: int | None
+    ) -> None:
+        from gausslite.perception.grounding import GroundingDino
         from gausslite.perception.grounding_text import BertTokenizer
 
         if segmenter == OWN:
-            raise InvalidInputError(f"segmenter: {path} finds boxes only; expected cut or a FastSAM file, got {OWN}")
-        tokenizer = BertTokenizer(vocabulary or path.parent / VOCABULARY)
-        network = GroundingDino(path, tokenizer, GroundingSettings(threads=threads))
+            raise InvalidInputError(
+                f"segmenter: {model.path} finds boxes only; expected cut or a FastSAM file, got {OWN}"
+            )
+        tokenizer = BertTokenizer(vocabulary or model.path.parent / VOCABULARY)
+        network = GroundingDino(model, tokenizer)
         self._segmenter: Segmenter = _segmenter(segmenter or CUT, threads)
         self._detector: Detector = SegmentedDetector(network, _in_turn(self._segmenter))
 
-    def _open_yolo(self, path: Path, segmenter: str | None, threads: int | None) -> None:
-        from gausslite.perception.yolo import load_yolo
+    def _use_yolo(self, model: OpenModel, segmenter: str | None, threads: int | None) -> None:
+        from gausslite.perception.yolo import yolo_of
 
-        network = load_yolo(path, threads)
+        network = yolo_of(model)
         if segmenter in (None, OWN):
             self._segmenter, self._detector = network.segmenter(), network
         else:
@@ -95,7 +99,7 @@ def _segmenter(name: str, threads: int | None) -> Segmenter:
     from gausslite.perception.everything import EverythingSegmenter
     from gausslite.perception.yolo_network import YoloSegNetwork
 
-    return EverythingSegmenter(YoloSegNetwork(Path(name), threads))
+    return EverythingSegmenter(YoloSegNetwork(open_model(Path(name), threads)))
 
 
 def _in_turn(first: Segmenter) -> tuple[Segmenter, ...]:

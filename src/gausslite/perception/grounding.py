@@ -16,7 +16,7 @@ from gausslite.domain.frame import Frame
 from gausslite.errors import InvalidInputError, ModelFileError
 from gausslite.perception.detect import Box, BoxFractions, concerns_many_objects
 from gausslite.perception.grounding_text import PhraseInput, Tokenizer, phrase_input
-from gausslite.perception.model_file import open_session, run_once
+from gausslite.perception.model_file import OpenModel, run_once
 
 INPUTS: Final = ("pixel_values", "input_ids", "attention_mask", "token_type_ids", "pixel_mask")
 OUTPUTS: Final = ("logits", "pred_boxes")
@@ -42,7 +42,6 @@ class GroundingSettings:
     max_iou: float = 0.7
     max_boxes: int = 50
     box_fractions: BoxFractions = field(default_factory=BoxFractions)
-    threads: int | None = None
 
     def __post_init__(self) -> None:
         for name in ("box_score", "text_score", "max_iou"):
@@ -50,25 +49,23 @@ class GroundingSettings:
                 raise InvalidInputError(f"detector {name}: expected between 0 and 1, got {getattr(self, name)}")
         if not 1 <= self.max_boxes <= 1000:
             raise InvalidInputError(f"detector max_boxes: expected 1 to 1000, got {self.max_boxes}")
-        if self.threads is not None and self.threads < 1:
-            raise InvalidInputError(f"detector threads: expected at least 1, got {self.threads}")
 
 
 class GroundingDino:
     """A BoxDetector for any phrase; what it reads of one is prepared once and kept, for a mission repeats itself."""
 
-    def __init__(self, model_path: Path, tokenizer: Tokenizer, settings: GroundingSettings | None = None) -> None:
-        """Open and try the model once, so that a wrong file is refused here. Raises ModelFileError."""
+    def __init__(self, model: OpenModel, tokenizer: Tokenizer, settings: GroundingSettings | None = None) -> None:
+        """Try the model once, so that a wrong file is refused here. Raises ModelFileError."""
         self._settings = settings or GroundingSettings()
         self._tokenizer = tokenizer
-        self._session = open_session(model_path, self._settings.threads)
-        self._types = _input_types(model_path, self._session)
+        self._session = model.session
+        self._types = _input_types(model.path, self._session)
         shapes = {each.name: each.shape for each in self._session.get_inputs()}
         self._size_px = tuple(side if isinstance(side, int) else None for side in shapes["pixel_values"][2:])
         length = shapes["input_ids"][1]
         self._length = length if isinstance(length, int) else None
         self._phrases: dict[str, PhraseInput] = {}
-        self._try_once(model_path)
+        self._try_once(model)
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -137,15 +134,15 @@ class GroundingDino:
         named = zip(INPUTS, given, strict=True)
         return {name: array.astype(self._types[name]) for name, array in named if name in self._types}
 
-    def _try_once(self, path: Path) -> None:
+    def _try_once(self, model: OpenModel) -> None:
         rgb = np.zeros((48, 64, 3), np.uint8)
-        outputs = run_once(path, self._session, self._feed(*self._picture(rgb), self._phrase(_TRIAL)))
+        outputs = run_once(model, self._feed(*self._picture(rgb), self._phrase(_TRIAL)))
         shapes = {each.name: out.shape for each, out in zip(self._session.get_outputs(), outputs, strict=True)}
         logits, boxes = shapes["logits"], shapes["pred_boxes"]
         tokens = self._phrase(_TRIAL).input_ids.shape[1]
         if not (len(logits) == 3 and logits[2] >= tokens and boxes == (1, logits[1], 4) and logits[0] == 1):
             raise ModelFileError(
-                f"model {path}: expected logits [1, q, {tokens} or more] and pred_boxes [1, q, 4], "
+                f"model {model.path}: expected logits [1, q, {tokens} or more] and pred_boxes [1, q, 4], "
                 f"got {list(logits)} and {list(boxes)}"
             )
 

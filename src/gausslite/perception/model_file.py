@@ -6,10 +6,11 @@ import functools
 import hashlib
 import os
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO, Final
 
-from gausslite.errors import ModelFileError
+from gausslite.errors import InvalidInputError, ModelFileError
 
 CHECKSUMS: Final = "SHA256SUMS"
 """The list of checksums that may lie in a model's folder, as `sha256sum` writes it; a file in it must agree."""
@@ -29,8 +30,21 @@ _STRANGERS: Final = (
 _PROVIDERS: Final = ("CUDAExecutionProvider", "TensorrtExecutionProvider", "CPUExecutionProvider")
 
 
-def open_session(path: Path, threads: int | None) -> Any:
-    """An inference session on the best processor there is. Raises ModelFileError for anything but a whole model."""
+@dataclass(frozen=True, slots=True, eq=False)
+class OpenModel:
+    """A model file and the inference session that was made of it."""
+
+    path: Path
+    session: Any
+
+
+def open_model(path: Path, threads: int | None = None) -> OpenModel:
+    """A session on the best processor there is; threads None leaves their number to the runtime.
+
+    Raises ModelFileError for anything but a whole model, InvalidInputError.
+    """
+    if threads is not None and threads < 1:
+        raise InvalidInputError(f"detector threads: expected at least 1, got {threads}")
     require_onnx(path)
     require_listed_checksum(path)
     runtime = _runtime()
@@ -39,21 +53,22 @@ def open_session(path: Path, threads: int | None) -> Any:
     if threads is not None:
         options.intra_op_num_threads = threads
     try:
-        return runtime.InferenceSession(str(path), options, providers=list(_providers()))
+        session = runtime.InferenceSession(str(path), options, providers=list(_providers()))
     except Exception as error:
         # the runtime has a dozen exception types without a common base, and none says more than this
         raise ModelFileError(f"model {path}: expected a readable ONNX model, but {_first_line(error)}") from error
+    return OpenModel(path, session)
 
 
-def run_once(path: Path, session: Any, inputs: dict[str, Any]) -> list[Any]:
+def run_once(model: OpenModel, inputs: dict[str, Any]) -> list[Any]:
     """All outputs for these inputs: shapes may be open in a file, and some damage shows only when the network runs.
 
     Raises ModelFileError.
     """
     try:
-        outputs: list[Any] = session.run(None, inputs)
+        outputs: list[Any] = model.session.run(None, inputs)
     except Exception as error:
-        raise ModelFileError(f"model {path}: expected a network that runs, but {_first_line(error)}") from error
+        raise ModelFileError(f"model {model.path}: expected a network that runs, but {_first_line(error)}") from error
     return outputs
 
 

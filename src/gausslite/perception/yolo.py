@@ -13,6 +13,7 @@ from gausslite.domain.relevance import Detection
 from gausslite.errors import InvalidInputError, ModelFileError
 from gausslite.perception.detect import Box, BoxFractions, concerns_many_objects
 from gausslite.perception.everything import EverythingSegmenter
+from gausslite.perception.model_file import OpenModel, open_model
 from gausslite.perception.vectors import TextVectors, classes_for
 from gausslite.perception.yolo_decode import Candidates, suppress
 from gausslite.perception.yolo_network import YoloSegNetwork
@@ -20,13 +21,12 @@ from gausslite.perception.yolo_network import YoloSegNetwork
 
 @dataclass(frozen=True, slots=True)
 class YoloSettings:
-    """How sure and how distinct a box must be; threads None leaves the choice to the runtime."""
+    """How sure and how distinct a box must be."""
 
     min_score: float = 0.25
     max_iou: float = 0.7
     max_boxes: int = 100
     box_fractions: BoxFractions = field(default_factory=BoxFractions)
-    threads: int | None = None
 
     def __post_init__(self) -> None:
         for name in ("min_score", "max_iou"):
@@ -34,25 +34,23 @@ class YoloSettings:
                 raise InvalidInputError(f"detector {name}: expected between 0 and 1, got {getattr(self, name)}")
         if not 1 <= self.max_boxes <= 1000:
             raise InvalidInputError(f"detector max_boxes: expected 1 to 1000, got {self.max_boxes}")
-        if self.threads is not None and self.threads < 1:
-            raise InvalidInputError(f"detector threads: expected at least 1, got {self.threads}")
 
 
 class YoloSegDetector:
     """A Detector, and a BoxDetector, over one YOLO-seg file whose metadata names its classes."""
 
     def __init__(
-        self, model_path: Path, vectors: TextVectors | None = None, settings: YoloSettings | None = None
+        self, model: OpenModel, vectors: TextVectors | None = None, settings: YoloSettings | None = None
     ) -> None:
-        """Open and try the model once, so that a wrong file is refused here. Raises ModelFileError.
+        """Try the model once, so that a wrong file is refused here. Raises ModelFileError.
 
         Without vectors, nouns find their classes by name and by a short list of synonyms alone.
         """
         self._settings = settings or YoloSettings()
         self._vectors = vectors
-        self._network = YoloSegNetwork(model_path, self._settings.threads)
+        self._network = YoloSegNetwork(model)
         if not self._network.names:
-            raise ModelFileError(f"model {model_path}: expected class names in the metadata field 'names', got none")
+            raise ModelFileError(f"model {model.path}: expected class names in the metadata field 'names', got none")
         self._warnings: dict[str, None] = {}
 
     @property
@@ -120,6 +118,11 @@ class YoloSegDetector:
         return classes
 
 
-def load_yolo(model_path: Path, threads: int | None = None) -> YoloSegDetector:
+def yolo_of(model: OpenModel) -> YoloSegDetector:
     """The detector with its defaults and the text vectors that lie beside the file. Raises ModelFileError."""
-    return YoloSegDetector(model_path, TextVectors.beside(model_path), YoloSettings(threads=threads))
+    return YoloSegDetector(model, TextVectors.beside(model.path))
+
+
+def load_yolo(path: Path, threads: int | None = None) -> YoloSegDetector:
+    """As yolo_of, for a file that is not open yet."""
+    return yolo_of(open_model(path, threads))

@@ -13,7 +13,7 @@ from numpy import ndarray
 
 from gausslite.domain.frame import Frame
 from gausslite.errors import ModelFileError
-from gausslite.perception.model_file import open_session, run_once
+from gausslite.perception.model_file import OpenModel, run_once
 from gausslite.perception.yolo_decode import MASK_COEFFICIENTS, Candidates, Letterbox, decode, letterbox, mask_of
 
 _DEFAULT_SIDE_PX: Final = 640
@@ -45,15 +45,14 @@ class Answer:
 class YoloSegNetwork:
     """A session with one image in, and out of it [1, 4+c+32, A] and [1, 32, h, w] for c classes."""
 
-    def __init__(self, path: Path, threads: int | None = None) -> None:
-        """Open and try the file once, so that a wrong one is refused here. Raises ModelFileError."""
-        self.path = path
-        self._session = open_session(path, threads)
-        self._input, self._height_px, self._width_px = _input_of(path, self._session)
+    def __init__(self, model: OpenModel) -> None:
+        """Try the model once, so that a wrong one is refused here. Raises ModelFileError."""
+        self.path, self._session = model.path, model.session
+        self._input, self._height_px, self._width_px = _input_of(model.path, self._session)
         blank = np.zeros((1, 3, self._height_px, self._width_px), np.float32)
-        outputs = run_once(path, self._session, {self._input: blank})
+        outputs = run_once(model, {self._input: blank})
         self.names = _class_names(self._session)
-        self._boxes_at, self._prototypes_at = _output_order(path, outputs, len(self.names))
+        self._boxes_at, self._prototypes_at = _output_order(model.path, outputs, len(self.names))
         self.classes = int(outputs[self._boxes_at].shape[1]) - 4 - MASK_COEFFICIENTS
 
     def answer(self, frame: Frame) -> Answer:
