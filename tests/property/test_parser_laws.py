@@ -6,17 +6,24 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gausslite.errors import TaskError
+from gausslite.task import lexicon
+from gausslite.task.clauses import MODALS, WISHES
 from gausslite.task.lexicon import NOUNS
 from gausslite.task.parser import task_id_of
+from gausslite.task.prepositions import PREPOSITIONS
 from gausslite.task.rules import RuleParser
 from gausslite.task.validate import require_graph
 from gausslite.task.words import words
 
 WORDS = st.sampled_from(
     sorted(
-        words(
+        (lexicon.DETERMINERS | lexicon.ADVERBS | PREPOSITIONS.keys() | lexicon.STAND_INS.keys() | MODALS | WISHES)
+        | {" ".join(said) for said in lexicon.NEGATIONS}
+        | words(
             "pick up put find avoid without not ignore the a red closest nearest to from on in of for with and or , / "
-            "; it that mug table chairs map go door picture path is don't touching"
+            "; : . ! + it them this that these mug table chairs map go door picture path is are was don't touching who "
+            "which what where when while whether because so until then before after i you we they me her one "
+            "ones everything put leave left right holding stands needs belong lost found u there's mug's 3 back up down out off"
         )
     )
 )

@@ -62,7 +62,7 @@ def commands(said: Tagged, at: int) -> bool:
         return True
     if subject is Tag.RELATIVE or verb_base(word) != word or _is_asked_about(said, subject_at):
         return False
-    return subject is not Tag.NOUN or not before.endswith("s")
+    return subject is not Tag.NOUN or not (before.endswith("s") or verb_base(word) in BELONGING_VERBS)
 
 
 def _is_asked_about(said: Tagged, subject_at: int) -> bool:

@@ -40,7 +40,7 @@ class GraphBuilder:
             self._verb(before, piece)
         elif piece.kind is Kind.BELONGS:
             self._clause.verb = "put" if piece.word in BELONGING_VERBS else piece.word
-            self._clause.last_relation = None
+            self._clause.last_relation, self._negated = None, False
         elif piece.kind is Kind.NOUN and piece.noun is not None:
             self._noun(before, piece.noun, after)
         elif piece.kind is Kind.PREPOSITION:

@@ -22,7 +22,7 @@ _PLAIN: Final = {
     r"(?:have|take|get|give me|catch) an? (?:\w+ ){0,2}(?:look|glance|peek|view) (?:at|of|around|over|into)": "look at",
     r"(?:have|take) an? (?:\w+ )?look (?=under|behind|inside|in|on|for)": "look ",
     r"keep (?:an|your|a close|a watchful) eye on|keep watch (?:over|on)": "watch",
-    r"get rid of|do away with|dispose of": "remove",
+    r"get rid of|do away with|dispose of|throw (?:away|out)": "remove",
     r"(?:take|get) (?:good )?(?:care|hold) of": "handle",
     r"make (?:your|its) way (?=to|toward|into|through|past)": "go ",
     r"find (?:your|its) way (?=to|toward|into|through|past)": "go ",

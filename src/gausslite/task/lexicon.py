@@ -48,7 +48,8 @@ COMPOUND_GERUNDS: Final = words(
 )
 # the robot itself, and how a person may be spoken to
 SELVES: Final = words(
-    "robot drone agent arm gripper rover bot dear darling sweetheart honey mate buddy sir madam pal friend"
+    "robot drone agent arm gripper rover bot task mission goal objective job aim assignment duty idea clue dear "
+    "darling sweetheart honey mate buddy sir madam pal friend"
 )
 
 # nouns that say where or how, not what: the object is the one after "of", or none at all
@@ -59,8 +60,8 @@ PLACES: Final = words(
     "position pose state status condition direction everywhere background foreground sight ground-truth height level "
     "perimeter neighbourhood neighborhood premises presence existence absence geometry details detail underside "
     "topside exterior tip lot size colour color shape weight temperature humidity smell speed damage wear corrosion "
-    "safety progress time purpose moment minute hour day week morning afternoon evening night noon bother trouble "
-    "favour favor kindness matter"
+    "safety progress time purpose pressure voltage moment minute hour day week morning afternoon evening night "
+    "noon bother trouble favour favor kindness matter"
 )
 # behind a preposition and without an article they say how or why: by hand, for lunch, in order
 MANNERS: Final = words(
@@ -76,14 +77,14 @@ ROUTES: Final = words("path way route road course trajectory passage line shortc
 MEASURES: Final = words(
     "picture photo photograph image video model reconstruction kind type sort piece pair set group pile stack lots "
     "number row bunch couple list total cluster collection copy amount view scan map sample none instance instances "
-    "section suit bit heap batch handful slice lump chunk strip look tour record inventory close-up closeup overview"
+    "section suit bit heap batch handful slice lump chunk strip record inventory close-up closeup overview"
 )
 # places that are solid things too, unless something is in them
 SOLID_PLACES: Final = words("building house home corner site front back")
 # what an inspection looks for in the thing that it inspects
 DEFECTS: Final = words(
     "leak crack dent scratch rust stain hole corrosion damage wear tear mold mould rot chip blockage fault defect "
-    "wetness"
+    "wetness gap fraying blister failure error hazard sign pest disease"
 )
 PARTS: Final = words(
     "handle leg lid knob button screen cable door wheel seat armrest drawer shelf cap label display spout hinge arm "
@@ -98,19 +99,18 @@ ADJECTIVES: Final = words(
     "fragile hot cold warm clear transparent striped loose left right upper lower top bottom front back rear "
     "suspicious unknown dangerous moving static movable fallen spilled unused used nearest closest relevant important "
     "leftmost rightmost highest lowest biggest largest smallest tallest free main far deep shallow strong weak loud "
-    "quiet fresh stale ripe raw sharp blunt smooth rough sticky greasy muddy rusty shiny plain spare extra missing "
-    "electric electronic wireless portable safe unsafe sick ill tired busy young elderly friendly oily curly woolly "
-    "silly early local nice good bad fine great pretty cute cheap expensive high low foreign modern ancient antique "
-    "tidy messy woollen rubber steel iron brass copper cotton concrete turquoise violet maroon navy crimson scarlet "
-    "ivory cream tan bronze teal lilac magenta cyan"
+    "quiet fresh stale ripe raw sharp blunt smooth rough sticky greasy muddy rusty shiny plain spare extra quarter "
+    "double missing electric electronic wireless portable safe unsafe sick ill tired busy young elderly friendly oily "
+    "curly woolly silly early local nice good bad fine great pretty cute cheap expensive high low foreign modern "
+    "ancient antique tidy messy woollen rubber steel iron brass copper cotton concrete turquoise violet maroon navy "
+    "crimson scarlet ivory cream tan bronze teal lilac magenta cyan"
 )
 
 # words that only ever hide or forbid what comes after them
-NEGATIONS: Final = (
-    ("without",), ("do", "not"), ("don't",), ("dont",), ("never",), ("ignore",), ("ignoring",), ("except", "for"),
-    ("except",), ("excluding",), ("exclude",), ("but", "not"), ("not", "to"), ("not",), ("other", "than"),
-    ("rather", "than"), ("instead", "of"), ("apart", "from"), ("aside", "from"), ("skip",), ("skipping",),
-    ("disregard",), ("disregarding",), ("besides",), ("must", "not"), ("should", "not"), ("leave", "out"),
-    ("leaving", "out"), ("no",), ("avoid", "touching"), ("avoid", "hitting"), ("forget", "about"), ("forget",),
-    ("doesn't",), ("can't",), ("cannot",), ("shouldn't",), ("mustn't",), ("omit",), ("neglect",), ("avoid", "bumping"),
-)  # fmt: skip
+_FORBIDDING: Final = (
+    "without|neither|nor|do not|don't|dont|never|ignore|ignoring|except for|except|excluding|exclude|"
+    "but not|not to|not|other than|rather than|instead of|apart from|aside from|skip|skipping|disregard|"
+    "disregarding|besides|must not|should not|leave out|leaving out|avoid touching|avoid hitting|"
+    "forget about|forget|doesn't|can't|cannot|shouldn't|mustn't|omit|neglect|avoid bumping"
+)
+NEGATIONS: Final = frozenset(tuple(said.split()) for said in _FORBIDDING.split("|"))

@@ -26,7 +26,7 @@ CONTAINERS: Final = words(
     "briefcase carrier cage hutch kennel crib cot pram tote pail caddy cellar shed barn greenhouse tent cubby "
     "cubbyhole glovebox boot cup mug glass bottle can thermos jug pitcher cooker kiln chamber compartment slot hole "
     "folder binder hopper silo casket coffin wallet quiver holster sheath sleeve wrapper packet sachet pack bundle "
-    "bathroom bedroom office garage room"
+    "bathroom bedroom office garage room car truck lorry bus ambulance helicopter boat plane taxi train"
 )
 _OBJECTS: Final = words(
     "mug cup glass bottle plate bowl fork knife spoon pan pot kettle teapot jug pitcher can jar lid tray napkin towel "

@@ -71,6 +71,8 @@ class NounPlacer:
     def by_preposition(self, pending: str, noun: NounPhrase, following: Sequence[Piece] = ()) -> None:
         """What the noun is to the clause's objects, by the preposition before it."""
         clause = self.clause
+        if pending == "closer":
+            pending = "to" if clause.verb in DELIVERY_VERBS else "near"
         if pending == "to":
             self._towards(noun)
         elif pending == "for":
@@ -79,6 +81,8 @@ class NounPlacer:
             self._part_of(noun)
         elif pending == "purpose":
             clause.last_relation = "with"
+        elif pending == "when":
+            return
         elif pending == "beyond" and clause.verb in DELIVERY_VERBS:
             self._draft.anchor(noun.text)
         elif pending == "with" and clause.verb == "compare":
@@ -100,7 +104,7 @@ class NounPlacer:
 
     def _accompanied(self, noun: NounPhrase) -> None:
         """Who looks for a man with a hat is to see the hat; who wipes with a sponge is to have it."""
-        if self.clause.verb in LOOKING_VERBS:
+        if self.clause.verb in LOOKING_VERBS or noun.head in lexicon.PARTS:
             self.relate("near", noun)
         else:
             self._draft.anchor(noun.text)

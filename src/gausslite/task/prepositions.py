@@ -6,9 +6,10 @@ from typing import Final
 
 # a relation that is no Predicate is kept as `near`, with a warning; the names below say what the words mean
 _BY_RELATION: Final = {
-    "near": "near|next to|beside|by|close to|closer to|adjacent to|alongside|at|around|against|nearby to|touching|"
+    "near": "near|next to|beside|by|close to|adjacent to|alongside|at|around|against|nearby to|touching|"
     "attached to|connected to|in the vicinity of|next|surrounding|along|close by|by the side of|at the side of|"
     "right next to|in reach of|within reach of|leaning on|leaning against",
+    "closer": "closer to",
     "on": "on|on top of|upon|atop|resting on|on the top of|at the top of|on the surface of|mounted on|on to",
     "closest_to": "closest to|nearest to|nearest|closest|most close to|nearest from|closest from",
     "farthest_from": "farthest from|furthest from|farthest to",
@@ -23,7 +24,8 @@ _BY_RELATION: Final = {
     "between": "between|in between|among|amongst|amid",
     "opposite": "opposite|opposite to|across from|facing|opposite of",
     "outside": "outside|outside of|out in front of",
-    "beyond": "beyond|past|through|across|via",
+    "beyond": "beyond|past|through|across|via|up|down",
+    "when": "before|after|during|like|until|since|despite|per",
     "from": "from",
     "from_on": "off|off of|from the top of|from on top of|from atop",
     "from_under": "out from under|out from underneath|from under|from underneath|from below|from beneath",

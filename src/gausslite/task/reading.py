@@ -15,12 +15,14 @@ from gausslite.task.tagging import tagged
 from gausslite.task.tags import Tag
 from gausslite.task.tokens import units_of
 from gausslite.task.verb_forms import verb_base
-from gausslite.task.verbs import BELONGING_VERBS, HOLDING_VERBS
+from gausslite.task.verbs import BELONGING_VERBS, DELIVERY_VERBS, GO_VERBS, HOLDING_VERBS
 from gausslite.task.words import words
 
 _POINTING: Final = words("this that these those")
 _SUPERLATIVES: Final = words("closest nearest")
 _RELATIVES: Final = words("that which who whom")
+# "bring in the boxes" needs an object before any place
+_TAKES_AN_OBJECT: Final = DELIVERY_VERBS - GO_VERBS - words("rest lean pack slide place")
 _HAVING: Final = words("has have had")
 _DOING: Final = words("do does did")
 _REFUSALS: Final = WISHES | words("care touch mean")
@@ -96,7 +98,9 @@ class _Reader:
         mood = Mood.TASK
         for at, (word, tag) in enumerate(self.said):
             self.at = at
-            mood = self.moods.get(at, mood)
+            before, mood = mood, self.moods.get(at, mood)
+            if before is Mood.ASIDE and mood is Mood.TASK and tag is Tag.JOIN:
+                tag = Tag.BREAK
             if mood is Mood.ASIDE and at in self.moods:
                 self._emit(Kind.ASIDE, word)
             if mood is not Mood.REASON:
@@ -178,11 +182,22 @@ class _Reader:
         if self._tag(-1) is Tag.PRONOUN and self._word(-1) != "you" and verb_base(self._word(1)) not in _REFUSALS:
             self._close()  # "I can't find my phone"
             return
+        if self._tag(1) is Tag.AUXILIARY and self._tag(2) in (Tag.PARTICIPLE, Tag.VERB):
+            self._forbid(word)
+            return
         stative = self._tag(-1) is Tag.AUXILIARY and self._word(-1) != "do" and self._tag(1) is not Tag.VERB
         if stative:
             self._close()
         else:
             self._emit(Kind.NEGATION, word)
+
+    def _forbid(self, word: str) -> None:
+        """In "the lamp and the vase must not be touched" what is excluded stands before."""
+        self._close()
+        at = len(self.pieces)
+        while at and self.pieces[at - 1].kind in (Kind.NOUN, Kind.JOIN):
+            at -= 1
+        self.pieces.insert(at, Piece(Kind.NEGATION, word))
 
     def _pronoun(self, word: str) -> None:
         """In "ignore the cars, I only want the bikes" a new sentence begins."""
@@ -223,7 +238,7 @@ class _Reader:
             self._emit(Kind.VERB, base)
         elif base in BELONGING_VERBS and subject is not Tag.PRONOUN:
             self._emit(Kind.BELONGS, base)
-        elif subject in (Tag.NOUN, Tag.RELATIVE, Tag.STAND_IN) and self._tag(1) in _OPENS_OBJECT:
+        elif subject in (Tag.NOUN, Tag.RELATIVE, Tag.STAND_IN) and self._tag(1) in _OPENS_OBJECT | {Tag.PRONOUN}:
             self._act(base)
         else:
             self._close()
@@ -232,7 +247,7 @@ class _Reader:
         """The cans are near the shelf that holds them; who left a bag, and what a key opens, are not asked for."""
         if base in HOLDING_VERBS:
             self._emit(Kind.PREPOSITION, "near")
-        elif self._tag(-1) is Tag.STAND_IN:
+        elif self._tag(-1) is Tag.STAND_IN and self._last() is Kind.NOUN:
             self.pieces.pop()
         else:
             self._emit(Kind.PREPOSITION, "purpose")
@@ -285,6 +300,7 @@ class _Reader:
 
     def _is_particle(self, word: str) -> bool:
         """`on` in "turn on the lamp" belongs to the verb, `at` in "look at the lamp" says nothing more."""
-        if word == "on":
-            return self.pieces[-1].word in lexicon.ON_IN_PARTICLE_VERBS
+        if word in ("on", "in"):
+            verb = self.pieces[-1].word
+            return verb in _TAKES_AN_OBJECT or (word == "on" and verb in lexicon.ON_IN_PARTICLE_VERBS)
         return word in lexicon.PARTICLES

@@ -39,9 +39,9 @@ _CLOSED_LINES: Final = (
     ("i3 w0", "who"),
     ("w0", "whom where how why"),
     ("s0 w5", "when"),
-    ("s0", ". ; : ! ? then while until if whether because unless although though since once as than"),
-    ("s0 p2", "before after"),
-    ("c0", "and or , / & plus but + ( ) nor"),
+    ("s0", ". ; : ! ? then while if whether because unless although though once as than"),
+    ("s0 p2", "before after until since"),
+    ("c0", "and or , / & plus but + ( )"),
     ("p0 u0", "to"),
     ("t0", "away out apart forward forwards backward backwards upstairs downstairs aside"),
     ("t0 n8 a5 v15", "back"),
@@ -148,7 +148,7 @@ def _as_verb(before: str, word: str, is_noun: bool) -> Options:
     """What the word may be if it is a form of a verb, known or by its ending."""
     options: Options = {}
     if word in VERBS:
-        usual = not is_noun or (before == "to" and word in _MAINLY_VERBS)
+        usual = not is_noun or (word in _MAINLY_VERBS and (before == "to" or (before == "and" and word in GO_VERBS)))
         options[Tag.VERB] = 0 if usual else 5 if word in _MAINLY_VERBS else 12
         if before in _NOUNS:  # no single thing "bring"
             options[Tag.VERB] += 8
