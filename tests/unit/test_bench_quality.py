@@ -14,7 +14,7 @@ from gausslite.datasets.simulated.family import HOME_COUNT, HOMES
 from gausslite.errors import InvalidInputError
 from gausslite.evaluation.compare import MapScores
 from gausslite.evaluation.quality.ablation import cumulative_variants
-from gausslite.evaluation.quality.pairs import HOME_PAIRS, Kind, choose_pairs
+from gausslite.evaluation.quality.pairs import HOME_PAIRS, WHOLE_HOMES, Kind, choose_pairs
 from gausslite.evaluation.quality.scenes import HomeScenePlan
 from gausslite.evaluation.quality.study import Archive, Finished, Study
 from gausslite.evaluation.quality.tables import FULL_METRICS, ROI_METRICS, Scoreboard, ablation_table, quality_table
@@ -37,7 +37,8 @@ def finished(variant: Variant, seed: int, roi_psnr: float, budget: Budget, plan:
 
 
 def test_there_are_three_tasks_of_three_kinds_in_each_home() -> None:
-    assert {(pair.home, pair.kind) for pair in HOME_PAIRS} == {(h, k) for h in range(1, HOME_COUNT + 1) for k in Kind}
+    kinds = set(Kind) - {Kind.EVERYTHING}
+    assert {(pair.home, pair.kind) for pair in HOME_PAIRS} == {(h, k) for h in range(1, HOME_COUNT + 1) for k in kinds}
     assert len({pair.task for pair in HOME_PAIRS}) == len(HOME_PAIRS) == 24
 
 
@@ -65,6 +66,7 @@ def test_pairs_are_chosen_by_name_or_home() -> None:
         "home-2-navigation",
         "home-5-search",
     ]
+    assert choose_pairs(["home-7-everything"]) == (WHOLE_HOMES[6],)
     with pytest.raises(InvalidInputError, match=r"pairs: expected names such as home-3 .*, got home-9"):
         choose_pairs(["home-1", "home-9"])
 

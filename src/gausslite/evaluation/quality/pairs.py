@@ -1,4 +1,4 @@
-"""The 24 pairs of a simulated home and a task, each with the objects that the task is about."""
+"""The 24 pairs of a simulated home and a task, each with the objects that the task is about, and whole homes."""
 
 from __future__ import annotations
 
@@ -15,11 +15,13 @@ class Kind(StrEnum):
     MANIPULATION = "manipulation"
     SEARCH = "search"
     NAVIGATION = "navigation"
+    EVERYTHING = "everything"
+    """No task of the 24: a home's things all at once, to see what following a task costs where everything matters."""
 
 
 @dataclass(frozen=True, slots=True)
 class HomePair:
-    """A task in one of the homes; objects are the ground truth of what it is about."""
+    """A task in one of the homes; objects are the ground truth of what it is about, none named means all."""
 
     home: int
     kind: Kind
@@ -63,14 +65,18 @@ HOME_PAIRS = (
     HomePair(8, Kind.NAVIGATION, "Navigate to the ladder", ("ladder",)),
 )
 
+WHOLE_HOMES = tuple(HomePair(home, Kind.EVERYTHING, "Inspect everything", ()) for home in range(1, 9))
+"""Each home with all its things as the region, more than half of the image; chosen by their full names alone."""
+
 
 def choose_pairs(asked: Sequence[str]) -> tuple[HomePair, ...]:
     """The pairs whose name is, or begins with, one of these ("home-3" is three of them); all when none is asked for.
 
     Raises InvalidInputError.
     """
-    chosen = tuple(pair for pair in HOME_PAIRS if not asked or any(_fits(pair.name, name) for name in asked))
-    unknown = [name for name in asked if not any(_fits(pair.name, name) for pair in HOME_PAIRS)]
+    tasks = tuple(pair for pair in HOME_PAIRS if not asked or any(_fits(pair.name, name) for name in asked))
+    chosen = (*tasks, *(whole for whole in WHOLE_HOMES if whole.name in asked))
+    unknown = [name for name in asked if not any(_fits(pair.name, name) for pair in chosen)]
     if unknown:
         kinds = ", ".join(Kind)
         raise InvalidInputError(
