@@ -41,7 +41,7 @@ def act(table: SplatTable, action: str, seed: int, amount: int) -> None:
     elif action == "densify":
         table.first_moment[:, GRAD_2D_SUM] = rng.random(table.count)
         table.first_moment[:, GRAD_2D_COUNT] = 1.0
-        densify(table, DensitySettings(min_mean_gradient=0.5, max_growth=1.0), 2.0, rng)
+        densify(table, DensitySettings(min_mean_gradient=0.5, max_growth=1.0), 2.0)
     elif action == "prune":
         prune(table, DensitySettings(min_opacity=0.1))
     else:

@@ -86,7 +86,7 @@ def refine(
             report = _train(table, view, T_camera_world, rasterizer, settings)
             if _density_control_is_due(iteration, settings.density):
                 loan.close()
-                _control_density(table, iteration, settings, extent_m, rng)
+                _control_density(table, iteration, settings, extent_m)
                 loan.enter_context(_holding(table, rasterizer))
             due = iteration % settings.report_every == 0 or iteration == settings.iterations
             if due and not go_on(RefineProgress(iteration, settings.iterations, report.loss, table.count)):
@@ -186,12 +186,10 @@ def _density_control_is_due(iteration: int, density: DensitySettings) -> bool:
     return iteration % density.densify_every == 0 or iteration % density.prune_every == 0
 
 
-def _control_density(
-    table: SplatTable, iteration: int, settings: RefineSettings, extent_m: float, rng: np.random.Generator
-) -> None:
+def _control_density(table: SplatTable, iteration: int, settings: RefineSettings, extent_m: float) -> None:
     """Clone, split and prune as the mapper does; a map that would vanish altogether is left alone."""
     if iteration % settings.density.densify_every == 0 and iteration < settings.iterations:
-        densify(table, settings.density, extent_m, rng)
+        densify(table, settings.density, extent_m)
     if iteration % settings.density.prune_every == 0 and (table.opacities >= settings.density.min_opacity).any():
         prune(table, settings.density)
 

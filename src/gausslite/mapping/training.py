@@ -167,7 +167,7 @@ class Trainer:
             self._since_pruned = 0
         if self._densify_is_due(pace):
             with pace.timing(Step.DENSITY):
-                densify(self._table, density, extent_m, self._rng)
+                densify(self._table, density, extent_m)
             self._since_densified = 0
 
 

@@ -11,10 +11,12 @@ from numpy import ndarray
 
 from gausslite.errors import InvalidInputError
 from gausslite.optimize.parameters import SplatTable
-from gausslite.render.rasterizer import GRAD_2D_COUNT, GRAD_2D_SUM, LOG_SCALE, MEAN, QUAT, UPDATES
+from gausslite.render.rasterizer import GRAD_2D_COUNT, GRAD_2D_SUM, LOG_SCALE, LOGIT, MEAN, QUAT, UPDATES
 
 _SPLIT_SHRINK = 1.6
-"""Each half of a split Gaussian is this much smaller (Kerbl et al. 2023)."""
+"""Each half of a split Gaussian is this much shorter (Kerbl et al. 2023)."""
+_SPLIT_APART = math.sqrt(1.0 - 1.0 / _SPLIT_SHRINK**2)
+"""How far each half is from the middle, in standard deviations of the whole: both together then spread as it did."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,18 +53,20 @@ class Densified:
     split: int
 
 
-def densify(table: SplatTable, settings: DensitySettings, extent_m: float, rng: np.random.Generator) -> Densified:
+def densify(table: SplatTable, settings: DensitySettings, extent_m: float) -> Densified:
     """Clone small and split large Gaussians whose image gradient stays high, as far as the cap and max_growth allow.
 
-    Where that is short the largest gradients go first. Children inherit active, kappa and target and start with
-    fresh optimiser state; a split puts its first half in the parent's row. The statistics start anew.
+    Where that is short the largest gradients go first. Children together look like their parent, so that a map is
+    as good right after as before: online there is no time to mend what copies of full opacity and halves thrown at
+    random (Kerbl et al. 2023) break. They inherit active, kappa and target and start with fresh optimiser state; a
+    split puts its first half in the parent's row. The statistics start anew.
     """
     most = min(table.room, math.ceil(settings.max_growth * table.count))
     chosen = _most_wanted(_mean_gradient(table), settings.min_mean_gradient, most)
     largest_scale_m = np.exp(table.rows[chosen][:, LOG_SCALE].max(axis=1, initial=-np.inf))
     small = largest_scale_m <= settings.percent_dense * extent_m
     to_clone, to_split = chosen[small], chosen[~small]
-    _split(table, to_split, rng)
+    _split(table, to_split)
     _clone(table, to_clone)
     table.first_moment[:, [GRAD_2D_SUM, GRAD_2D_COUNT]] = 0.0
     return Densified(cloned=len(to_clone), split=len(to_split))
@@ -91,21 +95,27 @@ def _most_wanted(gradient: Float32[ndarray, " n"], threshold: float, most: int) 
 
 
 def _clone(table: SplatTable, parents: Int64[ndarray, " m"]) -> None:
+    """Two in the same place, each of an alpha of 1 - sqrt(1 - alpha): they hide as much as the one."""
+    half_depth = 0.5 * np.logaddexp(0.0, table.rows[parents, LOGIT].astype(np.float64))  # -log(1 - alpha) / 2
+    table.rows[parents, LOGIT] = np.log(-np.expm1(-half_depth)) + half_depth
     rows = table.rows[parents]
     rows[:, UPDATES] = 0.0
     table.append_rows(rows, table.active[parents], table.kappa[parents], table.target[parents])
 
 
-def _split(table: SplatTable, parents: Int64[ndarray, " m"], rng: np.random.Generator) -> None:
-    halves = []
-    for _ in range(2):
-        rows = table.rows[parents]
-        local = rng.standard_normal((len(parents), 3), np.float32) * np.exp(rows[:, LOG_SCALE])
-        rows[:, MEAN] += _rotate(rows[:, QUAT], local)
-        rows[:, LOG_SCALE] -= np.float32(np.log(_SPLIT_SHRINK))
-        rows[:, UPDATES] = 0.0
-        halves.append(rows)
-    first, second = halves
+def _split(table: SplatTable, parents: Int64[ndarray, " m"]) -> None:
+    """Two shorter ones side by side on the longest axis."""
+    rows = table.rows[parents]
+    each, longest = np.arange(len(rows)), rows[:, LOG_SCALE].argmax(axis=1)
+    log_scales = rows[:, LOG_SCALE]
+    apart_m = np.zeros((len(rows), 3), np.float32)
+    apart_m[each, longest] = np.float32(_SPLIT_APART) * np.exp(log_scales[each, longest])
+    log_scales[each, longest] -= np.float32(math.log(_SPLIT_SHRINK))
+    rows[:, UPDATES] = 0.0
+    first, second = rows, rows.copy()
+    aside_m = _rotate(rows[:, QUAT], apart_m)
+    first[:, MEAN] += aside_m
+    second[:, MEAN] -= aside_m
     table.rows[parents] = first
     table.first_moment[parents] = 0.0
     table.second_moment[parents] = 0.0
