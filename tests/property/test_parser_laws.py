@@ -23,7 +23,8 @@ WORDS = st.sampled_from(
             "pick up put find avoid without not ignore the a red closest nearest to from on in of for with and or , / "
             "; : . ! + it them this that these mug table chairs map go door picture path is are was don't touching who "
             "which what where when while whether because so until then before after i you we they me her one "
-            "ones everything put leave left right holding stands needs belong lost found u there's mug's 3 back up down out off"
+            "ones everything put leave left right holding stands needs belong lost found u there's mug's 3 back up "
+            "down out off"
         )
     )
 )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from gausslite.task import lexicon
 from gausslite.task.phrases import NounPhrase, adjectives_only
-from gausslite.task.reading import Kind, Piece
+from gausslite.task.pieces import Kind, Piece
 
 
 class Clause:
@@ -20,6 +20,8 @@ class Clause:
         self.aside = False
         self.joined = False
         self.part = False
+        self.between = False
+        self.stated = False
         self.route = False
         self.skip_of = False
         self.handed_joined = False
@@ -37,10 +39,12 @@ def names_object(noun: NounPhrase, pending: str | None, after: Piece | None) -> 
     if compound and noun.head in lexicon.PLACES and not leads_on:
         return True
     unlikely = lexicon.TIMES if noun.determined else lexicon.MANNERS | lexicon.TIMES
-    if noun.head in unlikely and len(noun.words) == 1 and pending not in (None, "from", "of", "to", "on"):
+    if noun.head in unlikely and adjectives_only(noun.words[:-1]) and pending not in (None, "from", "of", "to", "on"):
         return False
+    if noun.head in lexicon.BUILDINGS:
+        return pending != "inside" or bool(noun.words[1:])
     if noun.head in lexicon.PLACES:
-        return noun.head in lexicon.SOLID_PLACES and pending not in (None, "inside", "to")
+        return noun.head in lexicon.SOLID_PLACES and pending not in (None, "inside", "to") and not leads_on
     if noun.head in lexicon.ROUTES:
         return pending not in (None, "of", "for", "to")
     if noun.head in lexicon.MEASURES and pending not in (None, "of"):

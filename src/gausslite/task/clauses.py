@@ -14,7 +14,8 @@ from gausslite.task.words import words
 Tagged = Sequence[tuple[str, Tag]]
 
 NOMINATIVES: Final = words("i you we he she they")
-MODALS: Final = words("has have must should ought need needs")
+MODALS: Final = words("must should ought")
+PERHAPS_MODAL: Final = words("has have had need needs")
 WISHES: Final = words("need want like love require prefer seek")
 SUBJECTS: Final = frozenset({Tag.NOUN, Tag.STAND_IN, Tag.PRONOUN, Tag.RELATIVE, Tag.BACK_REFERENCE})
 _LOST: Final = words("missing lost gone")
@@ -117,6 +118,12 @@ def _mood(said: Tagged, start: int, end: int, before: Mood) -> Mood:
     return before if elliptic and before is Mood.TASK else Mood.ASIDE
 
 
+def is_modal(said: Tagged, at: int) -> bool:
+    """True for "must", and for "has" in "has to go", "needs" in "needs to be moved" or "needs cleaning"."""
+    after = said[at + 1][1] if at + 1 < len(said) else None
+    return said[at][0] in MODALS or (said[at][0] in PERHAPS_MODAL and after in (Tag.INFINITIVE, Tag.ING))
+
+
 def _asks(said: Tagged, at: int) -> bool:
     """A command, a wish, or what has to become of a thing."""
     word, tag = said[at]
@@ -127,7 +134,7 @@ def _asks(said: Tagged, at: int) -> bool:
         return before not in SUBJECTS and before is not Tag.AUXILIARY and before is not Tag.DETERMINER
     if word in _LOST and before is Tag.AUXILIARY:
         return True
-    if word in MODALS and before in SUBJECTS and before is not Tag.PRONOUN:
+    if is_modal(said, at) and before in SUBJECTS and before is not Tag.PRONOUN:
         return True
     if tag is not Tag.VERB:
         return False

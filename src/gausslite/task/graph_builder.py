@@ -9,8 +9,8 @@ from gausslite.task import lexicon
 from gausslite.task.clause import Clause, described, names_object
 from gausslite.task.draft import GraphDraft
 from gausslite.task.phrases import NounPhrase, adjectives_only, known_phrase
+from gausslite.task.pieces import Kind, Piece
 from gausslite.task.placing import NounPlacer
-from gausslite.task.reading import Kind, Piece
 from gausslite.task.verbs import BELONGING_VERBS
 
 
@@ -29,7 +29,9 @@ class GraphBuilder:
         self._draft = GraphDraft()
         self._placer = NounPlacer(self._draft)
         self._pending: str | None = None
+        self._also: str | None = None  # in "under or behind the couch", under
         self._negated = False
+        self._corrects = False
         self._adjectives: list[NounPhrase] = []
         self._following: Sequence[Piece] = ()
 
@@ -46,9 +48,10 @@ class GraphBuilder:
         elif piece.kind is Kind.PREPOSITION:
             # "all but the lighter, to the tent": the exception is over
             self._negated = self._negated and (before is None or before.kind is not Kind.JOIN or before.word == "or")
-            self._pending = piece.word
+            self._also = self._pending if before is not None and before.kind is Kind.JOIN else None
+            self._pending, self._clause.stated = piece.word, piece.stated
         elif piece.kind is Kind.NEGATION:
-            self._negate()
+            self._negation(piece.word)
         elif piece.kind in (Kind.BREAK, Kind.ASIDE):
             self._new_clause(None)
             self._negated, self._clause.aside = False, piece.kind is Kind.ASIDE
@@ -62,6 +65,15 @@ class GraphBuilder:
         self._new_clause(None)
         self._draft.settle()
         return self._draft
+
+    def _negation(self, word: str) -> None:
+        """Two of them cancel out: "ignore everything except the signs" asks for the signs."""
+        if self._negated and self._draft.excluded[-1:] == ["object"]:
+            self._draft.excluded.pop()
+            self._negated = False
+            return
+        self._corrects = word == "not" and not self._draft.targets
+        self._negate()
 
     def _negate(self) -> None:
         self._pending, self._negated = None, True
@@ -87,7 +99,8 @@ class GraphBuilder:
             self._negated = False
         self._pending = None
         self._clause.verb_since_negation = True
-        if not same_negation and (self._clause.subjects or self._clause.orphans):
+        spoken_for = self._clause.subjects or (self._clause.orphans and self._clause.verb)
+        if not same_negation and spoken_for:
             self._new_clause(piece.word)
         else:
             self._clause.verb = piece.word
@@ -132,11 +145,16 @@ class GraphBuilder:
         self._pending = None
 
     def _noun(self, before: Piece | None, noun: NounPhrase, after: Piece | None) -> None:
-        if noun.head in ("one", "ones"):
-            noun = self._another(noun)
         joined = before is not None and before.kind is Kind.JOIN
+        if joined and self._corrects and self._clause.nouns_since_negation:
+            self._negated = False  # "not the wooden spoon, the metal one"
+        if noun.head in ("one", "ones"):
+            if self._negated and len(noun.words) == 1:
+                return  # "this mug, not that one"
+            noun = self._another(noun)
         pending, self._pending = self._pending, None
-        if adjectives_only(noun.words):
+        leads_on = after is not None and after.kind is Kind.PREPOSITION and after.word == "of"
+        if adjectives_only(noun.words) and not (leads_on and noun.head in lexicon.PLACES):
             if after is not None and after.kind is Kind.JOIN:
                 self._adjectives.append(noun)
             return
@@ -150,6 +168,9 @@ class GraphBuilder:
                 self._exclude(each, pending)
             else:
                 self._placer.place(each, pending, joined, self._following)
+                if self._also is not None:
+                    self._placer.by_preposition(self._also, each)
+        self._also = None
 
     def _another(self, one: NounPhrase) -> NounPhrase:
         """In "the blue one" the noun is the one that the task is about."""

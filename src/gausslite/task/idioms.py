@@ -5,6 +5,9 @@ from __future__ import annotations
 import re
 from typing import Final
 
+_NUMBER: Final = r"(?:a few|a couple of|several|some|at least|about|one|two|three|four|five|half an?|a|\d+)"
+_LENGTH: Final = r"(?:met(?:er|re)s?|feet|foot|steps?|cm|m|inch(?:es)?|paces?|yards?|centimet(?:er|re)s?)"
+_DISTANCE: Final = rf"{_NUMBER}(?: (?:one|two|three|a|\d+))? {_LENGTH}"
 _PLAIN: Final = {
     # short forms
     r"(it|there|that|what|who|where|here|which|how|he|she)'s": r"\1 is",
@@ -14,22 +17,32 @@ _PLAIN: Final = {
     r"(there|where|what|who)s": r"\1 is",
     r"(where|how|what|who)'d": r"\1 did",
     r"u": "you",
+    r"sth|smth": "something",
+    r"(?:step|task|item|phase) \d+ ?[:.)]": ";",
+    r"(?:there is )?no need to": "do not",
+    r", (?:just|only)(?= (?:the|a|an|my)\b)": "; ",
     r"gimme": "give me",
     r"lemme": "let me",
     r"be so (?:kind|good) as to|be (?:kind|good) enough to|in order to": "to",
     r"so(?: that)?(?= (?:i|you|we|he|she|they|it|the|my|our|nobody|no|people|everyone|everybody)\b)": "because",
     # a light verb with the noun that carries the meaning
     r"(?:have|take|get|give me|catch) an? (?:\w+ ){0,2}(?:look|glance|peek|view) (?:at|of|around|over|into)": "look at",
-    r"(?:have|take) an? (?:\w+ )?look (?=under|behind|inside|in|on|for)": "look ",
+    r"(?:have|take) an? (?:\w+ )?look(?= (?:under|behind|inside|in|on|for)\b)": "look",
+    r"(?:take|make) (?:a )?note of|take stock of": "look at",
     r"keep (?:an|your|a close|a watchful) eye on|keep watch (?:over|on)": "watch",
     r"get rid of|do away with|dispose of|throw (?:away|out)": "remove",
     r"(?:take|get) (?:good )?(?:care|hold) of": "handle",
-    r"make (?:your|its) way (?=to|toward|into|through|past)": "go ",
-    r"find (?:your|its) way (?=to|toward|into|through|past)": "go ",
+    r"(?:make|find) (?:your|its) way(?= (?:to|towards?|into|through|past|out|back)\b)": "go",
     r"be careful (?:not to|to not)|make sure (?:not to|you don't|to not)|try not to|take care not to": "do not",
     r"(?:watch out|look out|be careful|beware) (?:for|of|with)": "avoid",
     r"(?:stay|keep|steer|remain|stand) (?:well )?(?:clear|away|off) (?:of|from)": "avoid",
     r"keep (?:your|a safe|some|a) distance (?:from|to)": "avoid",
+    rf"(?:keep|stay|remain) {_DISTANCE} (?:away )?from": "avoid",
+    rf"{_DISTANCE} (?:away )?from|not (?:\w+ )?far (?:away )?from": "near",
+    rf"{_DISTANCE}(?= (?:behind|in front|left|right|above|below|under|to the|inside|next)\b)": "",
+    r"across the (?:street|road|hall|hallway|room|corridor|aisle) from": "opposite",
+    r"right(?= (?:next|beside|behind|under|above|in front|by|inside|at|below|between|on top)\b)": "",
+    r"in (?:a|one) (?:\w+ )?(?:row|line|pile|stack|heap|circle)": "",
     r"pay (?:no|not any) attention to|(?:do not|don't|never) (?:care|worry|bother) (?:about|with)": "ignore",
     r"give (?:\w+ )?priority to|prioriti[sz]e|spend (?:\w+ )*?(?:time|effort|budget) on": "look at",
     r"how (?:far|close|near) (?:is|are) (.{2,60}?) (?:from|to)": r"measure \1 and",
@@ -43,6 +56,7 @@ _PLAIN: Final = {
     r"give (.{2,60}?) an? (?:\w+ )?(rinse|wipe|wash|clean|scrub|polish|sweep|shake|push|pull|kick|stir)": r"\2 \1",
 }
 _IDIOMS: Final = tuple((re.compile(rf"\b(?:{idiom})(?!\w)"), plain) for idiom, plain in _PLAIN.items())
+_ARROW: Final = re.compile(r"\s*(?:->|=>|\u2192)\s*")
 _LEFT_ALONE: Final = re.compile(
     r"\bleav(?:e|ing) ((?:\w+ ){1,4})(?:alone|untouched|undisturbed|unchanged|in peace|as (?:it is|is|they are)"
     r"|be|for (?:now|later)|where (?:it is|they are))\b"
@@ -51,6 +65,7 @@ _LEFT_ALONE: Final = re.compile(
 
 def plain_words(text: str) -> str:
     """One normalised sentence without the idioms of the table."""
+    text = _ARROW.sub(" to ", text)
     text = _LEFT_ALONE.sub(r"do not touch \1", text)
     for idiom, plain in _IDIOMS:
         text = idiom.sub(plain, text)

@@ -35,7 +35,7 @@ ADVERBS: Final = words(
     "soon later today tonight tomorrow yesterday sometime sometimes whenever maybe perhaps probably certainly exactly "
     "directly straight precisely about approximately roughly nearly nearby anywhere somewhere together alone "
     "afterwards finally firstly even ever quite rather pretty otherwise therefore however anyway indeed twice "
-    "possible necessary ago overhead only"
+    "possible necessary ago overhead only able"
 )
 # gerunds that say what a thing is for: the charging station, a washing machine
 COMPOUND_GERUNDS: Final = words(
@@ -55,19 +55,19 @@ SELVES: Final = words(
 # nouns that say where or how, not what: the object is the one after "of", or none at all
 PLACES: Final = words(
     "scene environment surroundings room area world space place vicinity workspace view region zone spot location "
-    "site map surface house home building apartment floorplan indoors outdoors way side corner middle center centre "
-    "top bottom edge end front back rear left right half part rest remainder interior inside outside distance "
-    "position pose state status condition direction everywhere background foreground sight ground-truth height level "
-    "perimeter neighbourhood neighborhood premises presence existence absence geometry details detail underside "
-    "topside exterior tip lot size colour color shape weight temperature humidity smell speed damage wear corrosion "
-    "safety progress time purpose pressure voltage moment minute hour day week morning afternoon evening night "
-    "noon bother trouble favour favor kindness matter"
+    "site map surface home floorplan indoors outdoors way side corner middle center centre top bottom edge end front "
+    "back rear left right half part rest remainder interior inside outside distance position pose state status "
+    "condition direction everywhere background foreground sight ground-truth height level perimeter neighbourhood "
+    "neighborhood premises presence existence absence geometry details detail underside topside exterior tip lot size "
+    "colour color shape weight temperature humidity smell speed damage wear corrosion safety progress time purpose "
+    "pressure voltage moment minute hour day week morning afternoon evening night noon bother trouble favour favor "
+    "kindness matter texture appearance structure"
 )
 # behind a preposition and without an article they say how or why: by hand, for lunch, in order
 MANNERS: Final = words(
     "hand order name care noon night lunch dinner breakfast work help fun need turn number type kind letter ease "
     "caution love sleep school total general advance bulk use case detail pair fire mistake chance hurry place focus "
-    "bloom"
+    "bloom resolution quality"
 )
 TIMES: Final = words(
     "date metre meter centimetre centimeter inch foot percent degree second idea problem reason question job sun rain "
@@ -80,11 +80,16 @@ MEASURES: Final = words(
     "section suit bit heap batch handful slice lump chunk strip record inventory close-up closeup overview"
 )
 # places that are solid things too, unless something is in them
-SOLID_PLACES: Final = words("building house home corner site front back")
+SOLID_PLACES: Final = words("home corner site front back")
+BUILDINGS: Final = words("building house apartment")
 # what an inspection looks for in the thing that it inspects
 DEFECTS: Final = words(
     "leak crack dent scratch rust stain hole corrosion damage wear tear mold mould rot chip blockage fault defect "
     "wetness gap fraying blister failure error hazard sign pest disease"
+)
+CLOTHING: Final = words(
+    "jacket coat shirt vest hat dress suit t-shirt tshirt uniform trousers jeans skirt sweater jumper hoodie cap "
+    "scarf gown apron overalls shorts boots shoes helmet blouse cardigan pullover costume kilt"
 )
 PARTS: Final = words(
     "handle leg lid knob button screen cable door wheel seat armrest drawer shelf cap label display spout hinge arm "

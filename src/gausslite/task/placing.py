@@ -10,7 +10,7 @@ from gausslite.task import lexicon
 from gausslite.task.clause import Clause
 from gausslite.task.draft import GraphDraft
 from gausslite.task.phrases import NounPhrase, known_phrase
-from gausslite.task.reading import Kind, Piece
+from gausslite.task.pieces import Kind, Piece
 from gausslite.task.verbs import (
     DELIVERY_VERBS,
     FILLING_VERBS,
@@ -28,6 +28,7 @@ _SOURCES: Final = {f"from_{place}": place for place in ("on", "under", "inside",
 # after "on the table" these say where something goes, and others say where the table is
 _FINAL_DESTINATIONS: Final = words("on inside")
 _DESTINATIONS: Final = words("to on inside near under behind in_front_of above between left_of right_of")
+_PAST: Final = words("past beyond")
 
 
 class NounPlacer:
@@ -43,14 +44,16 @@ class NounPlacer:
         In "in the kitchen, find the mug" the place belongs to the clause that follows.
         """
         before = self.clause
-        orphans, before.orphans = before.orphans, []
         if not before.aside:
-            for _, noun in orphans:
-                self._draft.drop_anchor(noun.text)
-                self.target(noun)
-            orphans = []
+            self._mean_places()
         self.clause = Clause(verb=verb, referents=before.subjects or before.referents)
-        self.clause.orphans = orphans
+        self.clause.orphans = before.orphans
+
+    def _mean_places(self) -> None:
+        orphans, self.clause.orphans = self.clause.orphans, []
+        for _, noun in orphans:
+            self._draft.drop_anchor(noun.text)
+            self.target(noun, joined=True)
 
     def place(self, noun: NounPhrase, pending: str | None, joined: bool, following: Sequence[Piece]) -> None:
         """Place one noun, knowing the preposition before it, whether it is joined, and the pieces that follow."""
@@ -60,9 +63,10 @@ class NounPlacer:
             clause.skip_of, clause.handed_on = False, None
         if pending is None:
             if joined and clause.last_relation is not None and self._belongs_to_anchor(noun, after):
-                self.relate(clause.last_relation, noun)
-            elif self._is_receiver(after):
+                self._locate_too(clause.last_relation, noun)
+            elif self._is_receiver(following):
                 self._draft.anchor(noun.text)
+                clause.last_relation = "to"
             else:
                 self.target(noun, joined and clause.last_relation is None)
             return
@@ -83,9 +87,14 @@ class NounPlacer:
             clause.last_relation = "with"
         elif pending == "when":
             return
-        elif pending == "beyond" and clause.verb in DELIVERY_VERBS:
+        elif pending == "via":
+            self.target(noun)
+            clause.route = True
+        elif pending == "inside" and noun.head in lexicon.CLOTHING:
+            self.relate("near", noun)
+        elif pending in _PAST and clause.verb in DELIVERY_VERBS:
             self._draft.anchor(noun.text)
-        elif pending == "with" and clause.verb == "compare":
+        elif self._is_passed(pending) or (pending == "with" and clause.verb == "compare"):
             self.target(noun, joined=True)
         elif pending == "with" and clause.verb in FILLING_VERBS and clause.subjects:
             self._filled_with(noun)
@@ -95,16 +104,28 @@ class NounPlacer:
         elif pending == "from" or pending in _SOURCES:
             self._taken_from(pending, noun)
         elif clause.last_relation in ("to", "with") or (
-            clause.verb in PLACE_VERBS and self._is_last_place(pending, following)
+            clause.verb in PLACE_VERBS and not clause.stated and self._is_last_place(pending, following)
         ):
             self._draft.anchor(noun.text)
             clause.last_relation = clause.last_relation if clause.last_relation == "with" else "to"
+            clause.between = pending == "between"
         else:
             self.relate(pending, noun)
 
+    def _is_passed(self, pending: str) -> bool:
+        return pending == "past" and self.clause.verb in GO_VERBS and bool(self.clause.subjects)
+
+    def _locate_too(self, relation: str, noun: NounPhrase) -> None:
+        if relation in ("to", "with"):
+            self._draft.anchor(noun.text)
+        else:
+            self.relate(relation, noun)
+
     def _accompanied(self, noun: NounPhrase) -> None:
         """Who looks for a man with a hat is to see the hat; who wipes with a sponge is to have it."""
-        if self.clause.verb in LOOKING_VERBS or noun.head in lexicon.PARTS:
+        if self.clause.last_relation == "to":
+            self._draft.anchor(noun.text)
+        elif self.clause.verb in LOOKING_VERBS or noun.head in lexicon.PARTS:
             self.relate("near", noun)
         else:
             self._draft.anchor(noun.text)
@@ -118,10 +139,12 @@ class NounPlacer:
             self._draft.anchor(place)
         self.target(noun)
 
-    def _is_receiver(self, after: Piece | None) -> bool:
+    def _is_receiver(self, following: Sequence[Piece]) -> bool:
         """In "hand the nurse the towel" the nurse locates where the towel goes."""
         clause = self.clause
-        follows = after is not None and after.kind is Kind.NOUN
+        while len(following) > 1 and following[0].kind is Kind.PREPOSITION and following[1].kind is Kind.NOUN:
+            following = following[2:]  # "bring the man in the wheelchair a drink"
+        follows = bool(following) and following[0].kind is Kind.NOUN
         return follows and clause.verb in GIVING_VERBS and not clause.subjects
 
     def _is_last_place(self, pending: str, following: Sequence[Piece]) -> bool:
@@ -135,7 +158,7 @@ class NounPlacer:
         """Near the sink and the stove: both locate. On the table and the keys: the keys are a target of their own."""
         if after is not None and after.kind is Kind.PREPOSITION and after.word not in ("of", "to", "for", "with"):
             return False
-        if self.clause.last_relation == "between":
+        if self.clause.last_relation == "between" or self.clause.between:
             return True
         return noun.head in lexicon.LANDMARKS and self.clause.last_relation not in ("on", "inside", "with")
 
@@ -163,6 +186,8 @@ class NounPlacer:
 
     def _towards(self, noun: NounPhrase) -> None:
         clause = self.clause
+        if clause.verb in GO_VERBS:
+            self._mean_places()  # "between the shelves to the exit"
         if clause.superlative and clause.subjects:
             self.relate(Predicate.CLOSEST_TO, noun)
         elif clause.route or not clause.subjects or clause.verb in GO_VERBS - MOVING_VERBS:
@@ -196,7 +221,8 @@ class NounPlacer:
             self.relate("near", noun)
 
     def _taken_from(self, pending: str, noun: NounPhrase) -> None:
-        if self.clause.verb in GO_VERBS - MOVING_VERBS and self.clause.subjects:
+        going = self.clause.verb in GO_VERBS - MOVING_VERBS and self.clause.subjects
+        if going or self.clause.last_relation == "with":
             self._draft.anchor(noun.text)
         elif pending in _SOURCES:
             self.relate(_SOURCES[pending], noun)

@@ -7,24 +7,35 @@ from typing import Final
 # a relation that is no Predicate is kept as `near`, with a warning; the names below say what the words mean
 _BY_RELATION: Final = {
     "near": "near|next to|beside|by|close to|adjacent to|alongside|at|around|against|nearby to|touching|"
-    "attached to|connected to|in the vicinity of|next|surrounding|along|close by|by the side of|at the side of|"
-    "right next to|in reach of|within reach of|leaning on|leaning against",
+    "connected to|in the vicinity of|next|surrounding|along|close by|by the side of|"
+    "at the side of|right next to|in reach of|within reach of|leaning on|leaning against|at the end of|"
+    "at the foot of|at the base of|at the edge of|on either side of|on both sides of|within arm's reach of|"
+    "within easy reach of|tied to|chained to|hooked to|leashed to|plugged into|propped against|"
+    "resting against",
     "closer": "closer to",
-    "on": "on|on top of|upon|atop|resting on|on the top of|at the top of|on the surface of|mounted on|on to",
+    "on": "on|on top of|upon|atop|resting on|on the top of|at the top of|on the surface of|mounted on|on to|"
+    "on the side of|attached to|stuck to|stuck on|taped to|glued to|pinned to|nailed to|screwed to|"
+    "bolted to|fixed to|fastened to|clipped to|hung on|hanging on|hanging from|hung from|mounted to|"
+    "hung up on|hanging off",
     "closest_to": "closest to|nearest to|nearest|closest|most close to|nearest from|closest from",
-    "farthest_from": "farthest from|furthest from|farthest to",
+    "farthest_from": "farthest from|furthest from|farthest to|farthest away from|furthest away from|most distant from|"
+    "furthest to",
     "far_from": "far from|away from|far away from|clear of|far off",
     "inside": "in|inside|inside of|within|in the middle of|in the center of|in the centre of|in the corner of",
     "under": "under|underneath|beneath|below|underneath of",
     "above": "above|over",
-    "behind": "behind|in back of|at the back of|in the back of",
+    "behind": "behind|in back of|at the back of|in the back of|to the rear of|at the rear of|on the other side of|"
+    "on the far side of|round the back of|around the back of",
     "in_front_of": "in front of|at the front of|before the front of|ahead of",
-    "left_of": "left of|to the left of|on the left of|on the left side of|to the left side of|left to",
-    "right_of": "right of|to the right of|on the right of|on the right side of|to the right side of|right to",
+    "left_of": "left of|to the left of|on the left of|on the left side of|to the left side of|left to|"
+    "on the left-hand side of|on the left hand side of|at the left of|left side of",
+    "right_of": "right of|to the right of|on the right of|on the right side of|to the right side of|right to|"
+    "on the right-hand side of|on the right hand side of|at the right of|right side of",
     "between": "between|in between|among|amongst|amid",
     "opposite": "opposite|opposite to|across from|facing|opposite of",
     "outside": "outside|outside of|out in front of",
-    "beyond": "beyond|past|through|across|via|up|down",
+    "beyond": "beyond",
+    "past": "past|through|across|via|up|down",
     "when": "before|after|during|like|until|since|despite|per",
     "from": "from",
     "from_on": "off|off of|from the top of|from on top of|from atop",

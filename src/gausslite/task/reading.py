@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from enum import Enum
 from typing import Final
 
 from gausslite.task import lexicon
-from gausslite.task.clauses import MODALS, NOMINATIVES, SUBJECTS, WISHES, Mood, commands, moods_of
-from gausslite.task.phrases import NounPhrase, adjectives_only, noun_phrase
+from gausslite.task.clauses import NOMINATIVES, SUBJECTS, WISHES, Mood, commands, is_modal, moods_of
+from gausslite.task.phrases import adjectives_only, noun_phrase
+from gausslite.task.pieces import Kind, Piece
 from gausslite.task.prepositions import PREPOSITIONS
 from gausslite.task.tagging import tagged
 from gausslite.task.tags import Tag
@@ -21,40 +20,19 @@ from gausslite.task.words import words
 _POINTING: Final = words("this that these those")
 _SUPERLATIVES: Final = words("closest nearest")
 _RELATIVES: Final = words("that which who whom")
+# "go around the table to the sofa" passes the one and reaches the other
+_WAYS: Final = words("near past above")
 # "bring in the boxes" needs an object before any place
-_TAKES_AN_OBJECT: Final = DELIVERY_VERBS - GO_VERBS - words("rest lean pack slide place")
+_TAKES_AN_OBJECT: Final = DELIVERY_VERBS - GO_VERBS - words("rest lean pack slide place hide")
 _HAVING: Final = words("has have had")
 _DOING: Final = words("do does did")
 _REFUSALS: Final = WISHES | words("care touch mean")
 _IN_A_NOUN: Final = frozenset({Tag.NOUN, Tag.ADJECTIVE})
 # "the drawer open", "is empty"
 _BEFORE_A_STATE: Final = frozenset({Tag.NOUN, Tag.STAND_IN, Tag.AUXILIARY})
+# what stands before a place where something is, and not where it is to go
+_STATES: Final = frozenset({Tag.AUXILIARY, Tag.RELATIVE, Tag.PARTICIPLE, Tag.ING})
 _OPENS_OBJECT: Final = frozenset({Tag.DETERMINER, Tag.NOUN, Tag.ADJECTIVE, Tag.STAND_IN})
-
-
-class Kind(Enum):
-    """What a piece of a sentence is."""
-
-    VERB = "verb"
-    BELONGS = "belongs"
-    NOUN = "noun"
-    PREPOSITION = "preposition"
-    JOIN = "join"
-    BREAK = "break"
-    ASIDE = "aside"
-    NEGATION = "negation"
-    BACK_REFERENCE = "back reference"
-    POINTING = "pointing"
-
-
-@dataclass(frozen=True, slots=True)
-class Piece:
-    """One piece: the verb's base form, the preposition's relation, the joint's word, or a noun phrase."""
-
-    kind: Kind
-    word: str
-    noun: NounPhrase | None = None
-    gerund: bool = False
 
 
 def read(text: str) -> list[Piece]:
@@ -84,6 +62,7 @@ class _Reader:
             Tag.ING: self._ing,
             Tag.PARTICIPLE: self._participle,
             Tag.PREPOSITION: self._preposition,
+            Tag.PARTICLE: self._particle,
             Tag.JOIN: lambda word: self._emit(Kind.JOIN, word),
             Tag.BREAK: self._break,
             Tag.STAND_IN: self._stand_in,
@@ -119,9 +98,9 @@ class _Reader:
     def _last(self) -> Kind | None:
         return self.pieces[-1].kind if self.pieces else None
 
-    def _emit(self, kind: Kind, word: str, gerund: bool = False) -> None:
+    def _emit(self, kind: Kind, word: str, gerund: bool = False, stated: bool = False) -> None:
         self._close()
-        self.pieces.append(Piece(kind, word, gerund=gerund))
+        self.pieces.append(Piece(kind, word, gerund=gerund, stated=stated))
 
     def _close(self) -> None:
         """End the open noun phrase."""
@@ -224,13 +203,13 @@ class _Reader:
         self._end_relative_subject(finite=True)
         if word in _HAVING and self._last() is Kind.NOUN and self._tag(1) in _OPENS_OBJECT:
             self._emit(Kind.PREPOSITION, "near")
-        self.modal = word in MODALS and self._last() is Kind.NOUN
+        self.modal = is_modal(self.said, self.at) and self._last() is Kind.NOUN
 
     def _verb(self, word: str) -> None:
         self._end_relative_subject(finite=True)
         base = verb_base(word) or word
         subject = self._tag(-1)
-        self.modal, must = word in MODALS and subject in SUBJECTS, self.modal
+        self.modal, must = is_modal(self.said, self.at) and subject in SUBJECTS, self.modal
         if must and self._subject_is_thing():
             if base in BELONGING_VERBS:
                 self._emit(Kind.BELONGS, base)
@@ -292,11 +271,18 @@ class _Reader:
             return
         directly = not self.words and self._last() is Kind.VERB and before is Tag.VERB
         if directly and self._is_particle(word):
+            if relation in _WAYS and self.pieces[-1].word in GO_VERBS:
+                self._emit(Kind.PREPOSITION, "via")
             return
         if after is Tag.ING and word in ("for", "by", "before", "after"):
             self._close()
             return
-        self._emit(Kind.PREPOSITION, relation)
+        self._emit(Kind.PREPOSITION, relation, stated=before in _STATES)
+
+    def _particle(self, word: str) -> None:
+        self._close()
+        if word in PREPOSITIONS and (self._tag(1), self._tag(2)) == (Tag.JOIN, Tag.PREPOSITION):
+            self._emit(Kind.PREPOSITION, PREPOSITIONS[word])  # "under or behind the couch"
 
     def _is_particle(self, word: str) -> bool:
         """`on` in "turn on the lamp" belongs to the verb, `at` in "look at the lamp" says nothing more."""

@@ -7,7 +7,8 @@ from gausslite.errors import TaskError
 from gausslite.task.graph_builder import draft_of
 from gausslite.task.ground import grounded_graph
 from gausslite.task.parser import normalise_text
-from gausslite.task.reading import Kind, Piece, read
+from gausslite.task.pieces import Kind, Piece
+from gausslite.task.reading import read
 from gausslite.task.validate import EXAMPLE, require_task_text
 
 

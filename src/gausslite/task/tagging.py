@@ -53,7 +53,7 @@ _CLOSED_LINES: Final = (
     ("p0 t10", "in on under below above behind along through past across by near"),
     ("p0 g0", "touching facing surrounding"),
     ("p3 v0", "like"),
-    ("a0 e3 n9 t12", "left"),
+    ("a0 e3 n9 t20", "left"),
     ("a0 n5 t8", "right"),
     ("n0", "ones everywhere"),
     ("i0 d8", "what whatever"),

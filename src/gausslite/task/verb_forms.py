@@ -24,7 +24,8 @@ _IRREGULAR: Final = {
     "drunk": "drink", "drank": "drink", "chosen": "choose", "knew": "know", "known": "know", "thought": "think",
     "burnt": "burn", "dug": "dig", "bound": "bind", "dealt": "deal", "heard": "hear",
     "leant": "lean", "leapt": "leap", "meant": "mean", "shown": "show", "slept": "sleep", "stung": "sting",
-    "swung": "swing", "done": "do", "lent": "lend", "sprung": "spring", "woven": "weave", "strewn": "strew",
+    "swung": "swing", "done": "do", "lent": "lend", "hurt": "hurt",
+    "sprung": "spring", "woven": "weave", "strewn": "strew",
 }  # fmt: skip
 _ODD_SPELLINGS: Final = {"lying": "lie", "tying": "tie", "dying": "die", "does": "do", "goes": "go", "undoes": "undo"}
 

@@ -19,8 +19,8 @@ CARRY_VERBS: Final = words(
 PLACE_VERBS: Final = words(
     "put place set drop leave stack hang throw load insert pour store stow deposit unload position arrange rest dump "
     "toss lay pile plant tuck slip stick wedge shove stuff cram squeeze sprinkle spread scatter bury park fling hurl "
-    "lean prop return pack file deploy install transplant tip ladle scoop spoon funnel drain discard recycle stash "
-    "lodge drape embed immerse dip suspend fit pop"
+    "lean prop return pack file deploy install transplant tip slide hide ladle scoop spoon funnel drain discard "
+    "recycle stash lodge drape embed immerse dip suspend fit pop"
 )
 TOOL_VERBS: Final = words(
     "clean wipe vacuum sweep mop wash scrub dust polish rinse disinfect sanitize sanitise tidy brush dry sterilize "
