@@ -11,6 +11,7 @@ from pathlib import Path
 from gausslite.cli import bench_loop_command
 from gausslite.cli.bench_gpu import run_gpu
 from gausslite.cli.bench_parser import configure_parser
+from gausslite.cli.bench_perception import configure_perception
 from gausslite.cli.bench_quality import configure_ablation, configure_quality
 from gausslite.cli.bench_retask import configure_retask
 from gausslite.evaluation.bench_cycles import FLOOR_CYCLES, BlockCost
@@ -32,6 +33,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     _configure_gpu(benches.add_parser("gpu", help=summary, description=f"Measure {summary}."))
     summary = "a task parser's graphs on sentences whose graphs are known"
     configure_parser(benches.add_parser("parser", help=summary, description=f"Score {summary}."))
+    summary = "a detector's masks against ground truth, before and after they are placed in space and followed"
+    configure_perception(benches.add_parser("perception", help=summary, description=f"Score {summary}."))
     summary = "every policy's maps on held-out views, at the same budget"
     configure_quality(benches.add_parser("quality", help=summary, description=f"Score {summary}."))
     summary = "the paper's components, switched on one by one"

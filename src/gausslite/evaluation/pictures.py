@@ -35,21 +35,21 @@ def comparison_sheet(view: HeldOutView, drawings: Mapping[str, Float32[ndarray, 
     for name, drawing in drawings.items():
         require_array(f"drawing {name}", drawing, truth_rgb.shape, np.float32)
     columns = {"ground truth": truth_rgb} | {name: as_bytes(drawing) for name, drawing in drawings.items()}
-    rows = [[_cell(_outlined(image, view.roi), label) for label, image in columns.items()]]
+    rows = [[cell(outlined(image, view.roi), label) for label, image in columns.items()]]
     rows += [
-        [_cell(_crop(image, piece), f"{label}: detail") for label, image in columns.items()]
+        [cell(_crop(image, piece), f"{label}: detail") for label, image in columns.items()]
         for piece in _telling_pieces(view.roi)
     ]
     if drawings:
         truth = truth_rgb / np.float32(255.0)
         differences = [as_bytes(_DIFFERENCE_GAIN * np.abs(drawing - truth)) for drawing in drawings.values()]
-        region = _cell(_lit(truth_rgb, view.roi), "region of the task")
+        region = cell(lit(truth_rgb, view.roi), "region of the task")
         cells = [
-            _cell(_outlined(difference, view.roi), f"{name}: difference x{_DIFFERENCE_GAIN:g}")
+            cell(outlined(difference, view.roi), f"{name}: difference x{_DIFFERENCE_GAIN:g}")
             for name, difference in zip(drawings, differences, strict=True)
         ]
         rows.append([region, *cells])
-    return _grid(rows)
+    return grid(rows)
 
 
 def write_png(path: Path, image: UInt8[ndarray, "h w 3"]) -> None:
@@ -66,7 +66,8 @@ def as_bytes(image: Float32[ndarray, "h w 3"]) -> UInt8[ndarray, "h w 3"]:
     return rounded
 
 
-def _outlined(image: UInt8[ndarray, "h w 3"], roi: Bool[ndarray, "h w"]) -> UInt8[ndarray, "h w 3"]:
+def outlined(image: UInt8[ndarray, "h w 3"], roi: Bool[ndarray, "h w"]) -> UInt8[ndarray, "h w 3"]:
+    """The image with the region's outline drawn in."""
     import cv2
 
     contours = cv2.findContours(roi.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0]
@@ -75,7 +76,7 @@ def _outlined(image: UInt8[ndarray, "h w 3"], roi: Bool[ndarray, "h w"]) -> UInt
     return out
 
 
-def _lit(image: UInt8[ndarray, "h w 3"], roi: Bool[ndarray, "h w"]) -> UInt8[ndarray, "h w 3"]:
+def lit(image: UInt8[ndarray, "h w 3"], roi: Bool[ndarray, "h w"]) -> UInt8[ndarray, "h w 3"]:
     """The image with everything outside the region dimmed."""
     dimmed: UInt8[ndarray, "h w 3"] = np.where(roi[..., None], image, image // 4)
     return dimmed
@@ -113,7 +114,7 @@ def _crop(image: UInt8[ndarray, "h w 3"], piece: Bool[ndarray, "h w"]) -> UInt8[
     return enlarged
 
 
-def _cell(image: UInt8[ndarray, "h w 3"], label: str) -> UInt8[ndarray, "H W 3"]:
+def cell(image: UInt8[ndarray, "h w 3"], label: str) -> UInt8[ndarray, "H W 3"]:
     """The image, wide enough to be read, under a line of text that is shrunk to fit."""
     import cv2
 
@@ -130,7 +131,7 @@ def _cell(image: UInt8[ndarray, "h w 3"], label: str) -> UInt8[ndarray, "H W 3"]
     return np.concatenate([header, image])
 
 
-def _grid(rows: list[list[UInt8[ndarray, "_ _ 3"]]]) -> UInt8[ndarray, "H W 3"]:
+def grid(rows: list[list[UInt8[ndarray, "_ _ 3"]]]) -> UInt8[ndarray, "H W 3"]:
     """Cells of one size in rows, with gaps between them and round them."""
     cell_height, cell_width = rows[0][0].shape[:2]
     sheet = np.full(

@@ -47,7 +47,8 @@ def remembered_state(each: Remembered) -> dict[str, NDArray[Any]]:
         "place_m": np.array([*each.centroid_m, each.radius_m]),
         "cells": each.cells,
         "counts": each.counts,
-        "seen": whole_numbers(each.seen),
+        "seen": whole_numbers(each.seen, each.missed),
+        "best": np.array([each.best_score, each.farthest_m]),
     }
 
 
@@ -58,5 +59,7 @@ def remembered_of(state: State) -> Remembered:
     counts = take(state, "counts", cells.shape, np.int64).copy()
     if (counts < 1).any() or (cells[1:] <= cells[:-1]).any() or len(cells) == 0:
         raise MapFileError("state object: expected ascending cells with counts, got others")
-    [seen] = take_counts(state, "seen", 1)
-    return Remembered(take_text(state, "phrase"), np.array([x_m, y_m, z_m]), radius_m, cells, counts, seen)
+    seen, missed = take_counts(state, "seen", 2)
+    best_score, farthest_m = take_measures(state, "best", 2)
+    place = (take_text(state, "phrase"), np.array([x_m, y_m, z_m]), radius_m, cells, counts)
+    return Remembered(*place, seen, missed, best_score, farthest_m)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from itertools import combinations, product
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float32, Float64
 from numpy import ndarray
 
 from gausslite.domain.task import Predicate
@@ -15,6 +15,7 @@ from gausslite.errors import InvalidInputError
 from gausslite.perception.memory import Remembered, Sighting
 
 _FOOTPRINT_SLACK_M = 0.10
+_MAX_SAMPLE = 400
 # what stands slantwise behind is still behind; what stands beside is not
 _MIN_SLOPE = 0.5
 
@@ -142,3 +143,17 @@ _SIDES = {
 def distance_m(a_m: Float64[ndarray, "3"], b_m: Float64[ndarray, "3"]) -> float:
     """The Euclidean distance of two points."""
     return float(np.linalg.norm(a_m - b_m))
+
+
+def apart_m(one: Remembered, other: Remembered) -> float:
+    """How far one object's cells lie from the nearest of another's, on average.
+
+    A table of which only an end was seen yet has its centroid elsewhere, but not the edge that a chair stands at.
+    """
+    cells, others = (_sample(each.footprint_m(), _MAX_SAMPLE) for each in (one, other))
+    squared = np.square(cells[:, None] - others[None]).sum(axis=2)
+    return float(np.sqrt(squared.min(axis=1)).mean())
+
+
+def _sample(cells_m: Float32[ndarray, "n 3"], most: int) -> Float64[ndarray, "k 3"]:
+    return cells_m[:: -(-len(cells_m) // most)].astype(np.float64)

@@ -5,14 +5,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64
+from jaxtyping import Float32
 from numpy import ndarray
 
-from gausslite.domain.camera import Camera, lift
+from gausslite.domain.camera import lift
+from gausslite.domain.frame import Frame
 from gausslite.domain.pose import UpAxis, transform_points, unit_up_axis
+from gausslite.domain.relevance import Detection
 from gausslite.domain.task import Predicate, Relation, TaskGraph
+from gausslite.perception.evidence import EvidenceSettings, Outlook
 from gausslite.perception.memory import ObjectMemory, Remembered, Sighting
-from gausslite.perception.relate import Geometry, SpatialSettings, distance_m
+from gausslite.perception.relate import Geometry, SpatialSettings, apart_m
 
 _MIN_PIXELS = 8
 _MAX_PIXELS = 4000
@@ -27,36 +30,35 @@ def best_depth_m(
     return np.where(rendered_m > 0, rendered_m, sensor_m)
 
 
-def sight(
-    phrase: str,
-    mask: Bool[ndarray, "h w"],
-    depth_m: Float32[ndarray, "h w"],
-    camera: Camera,
-    T_world_camera: Float64[ndarray, "4 4"],
-) -> Sighting | None:
-    """Lift a mask to its centroid in the world; None where too few of its pixels have depth.
+def sight(detection: Detection, depth_m: Float32[ndarray, "h w"], frame: Frame) -> Sighting | None:
+    """Lift a detection's mask to its centroid in the world; None where too few of its pixels have depth.
 
     Instead of the one pixel at the 2D centroid, which may lie beside the object, all its pixels are lifted.
     """
-    rows, columns = np.nonzero(mask & (depth_m > 0))
+    rows, columns = np.nonzero(detection.mask & (depth_m > 0))
     if len(rows) < _MIN_PIXELS:
         return None
     step = max(1, len(rows) // _MAX_PIXELS)
     rows, columns = rows[::step], columns[::step]
     centres_px = np.stack([columns, rows], axis=1) + 0.5
-    points = lift(centres_px, depth_m[rows, columns].astype(np.float64), camera)
-    return Sighting.of_points(phrase, transform_points(T_world_camera, points), T_world_camera[:3, 3])
+    points = lift(centres_px, depth_m[rows, columns].astype(np.float64), frame.camera)
+    T_world_camera = frame.T_world_camera
+    points_m = transform_points(T_world_camera, points)
+    return Sighting.of_points(detection.phrase, points_m, T_world_camera[:3, 3], detection.score)
 
 
 class SpatialFilter:
     """Evaluates the graph's relations against everything seen so far; anchors stay where they were last seen."""
 
-    def __init__(self, graph: TaskGraph, up_axis: UpAxis, settings: SpatialSettings) -> None:
+    def __init__(
+        self, graph: TaskGraph, up_axis: UpAxis, settings: SpatialSettings, evidence: EvidenceSettings | None = None
+    ) -> None:
         self._relations = {
             target: tuple(relation for relation in graph.relations if relation.target == target)
             for target in graph.targets
         }
         self._geometry = Geometry(np.array(unit_up_axis(up_axis)), settings)
+        self._evidence = evidence or EvidenceSettings()
         self._memory = ObjectMemory()
 
     @property
@@ -70,9 +72,19 @@ class SpatialFilter:
         needed = dict.fromkeys(each.anchor for relations in self._relations.values() for each in relations)
         return tuple(anchor for anchor in needed if not self._memory.named(anchor))
 
-    def observe(self, sightings: Sequence[Sighting]) -> None:
-        """Take one frame's sightings into the memory."""
-        self._memory.observe(sightings)
+    def observe(self, sightings: Sequence[Sighting], outlook: Outlook | None = None) -> None:
+        """Take one frame's sightings into the memory; with an outlook, also what it should have shown and did not."""
+        self._memory.observe(sightings, None if outlook is None else outlook.shows_place_of)
+
+    def believes(self, sighting: Sighting) -> bool:
+        """True when what was sighted is there for all that is known of it."""
+        shown = self._memory.showing(sighting)
+        return shown is not None and self._evidence.believes(shown)
+
+    def wants_another(self, sighting: Sighting) -> bool:
+        """True when another look could settle whether it is there."""
+        shown = self._memory.showing(sighting)
+        return shown is not None and self._evidence.wants_another(shown)
 
     def remember(self, objects: Sequence[Remembered]) -> None:
         """Start from objects of an earlier life, oldest first."""
@@ -94,7 +106,7 @@ class SpatialFilter:
 
     def _others(self, relation: Relation, sighting: Sighting) -> list[Remembered]:
         """The relation's anchors without the target itself."""
-        return [each for each in self._memory.named(relation.anchor) if not each.is_at(sighting)]
+        return [each for each in self._credible(relation.anchor) if not each.is_at(sighting)]
 
     def _holds(self, relation: Relation, sighting: Sighting) -> bool:
         if relation.predicate in (Predicate.CLOSEST_TO, Predicate.FARTHEST_FROM):
@@ -103,14 +115,22 @@ class SpatialFilter:
         return any(self._geometry.holds(relation.predicate, sighting, anchor) for anchor in anchors)
 
     def _is_extreme(self, relation: Relation, sighting: Sighting) -> bool:
-        """Of all candidates that were ever seen, only the one with the least (most) distance to its nearest anchor."""
+        """Of all firm candidates, only the one whose surface is least (most) apart from that of its nearest anchor."""
         sign = 1.0 if relation.predicate is Predicate.CLOSEST_TO else -1.0
-        anchors = self._memory.named(relation.anchor)
+        anchors = self._credible(relation.anchor)
         best, least_m = None, np.inf
-        for candidate in self._memory.confirmed(relation.target):
-            to_anchors_m = [
-                distance_m(candidate.centroid_m, each.centroid_m) for each in anchors if each is not candidate
-            ]
+        for candidate in self._firm(relation.target):
+            to_anchors_m = [apart_m(candidate, each) for each in anchors if each is not candidate]
             if to_anchors_m and sign * min(to_anchors_m) < least_m:
                 best, least_m = candidate, sign * min(to_anchors_m)
         return best is not None and best.matches(sighting)
+
+    def _firm(self, phrase: str) -> list[Remembered]:
+        """The objects that may decide between all that answer a phrase; the believed ones while there is none."""
+        credible = self._credible(phrase)
+        return [each for each in credible if self._evidence.is_firm(each)] or credible
+
+    def _credible(self, phrase: str) -> list[Remembered]:
+        """The believed objects that answer a phrase, or all while none is."""
+        named = self._memory.named(phrase)
+        return [each for each in named if self._evidence.believes(each)] or named

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -20,6 +20,8 @@ from gausslite.errors import InvalidInputError, MapFileError
 from gausslite.perception.checkpoint import frustum_of as frustum_of_state
 from gausslite.perception.checkpoint import frustum_state, remembered_of, remembered_state
 from gausslite.perception.detect import Segmenter
+from gausslite.perception.evidence import EvidenceSettings, Outlook
+from gausslite.perception.layers import front_layer
 from gausslite.perception.memory import Remembered
 from gausslite.perception.relate import SpatialSettings
 from gausslite.perception.reproject import Frustum, cut_by_depth, frustum_of, reprojected_box_px
@@ -39,6 +41,7 @@ class AttentionSettings:
     max_rotation_deg: float = 15.0
     max_frames: int = 5
     spatial: SpatialSettings = field(default_factory=SpatialSettings)
+    evidence: EvidenceSettings = field(default_factory=EvidenceSettings)
 
     def __post_init__(self) -> None:
         for name in ("max_translation_m", "max_rotation_deg"):
@@ -57,10 +60,11 @@ class TargetTracker:
         self._graph = graph
         self._settings = settings
         self._segmenter = segmenter
-        self._filter = SpatialFilter(graph, settings.up_axis, settings.spatial)
+        self._filter = SpatialFilter(graph, settings.up_axis, settings.spatial, settings.evidence)
         self._T_world_keyframe: Float64[ndarray, "4 4"] | None = None
         self._frames_since = 0
         self._kept: list[Frustum] = []
+        self._unsettled = False
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -75,7 +79,10 @@ class TargetTracker:
     def state(self) -> State:
         """The objects seen so far, the detections that are carried on, and where they were made."""
         pose = np.zeros((0, 4, 4)) if self._T_world_keyframe is None else self._T_world_keyframe[None]
-        state: dict[str, NDArray[Any]] = {"T_world_keyframe": pose, "frames_since": whole_numbers(self._frames_since)}
+        state: dict[str, NDArray[Any]] = {
+            "T_world_keyframe": pose,
+            "since": whole_numbers(self._frames_since, self._unsettled),
+        }
         state["counts"] = whole_numbers(len(self._kept), len(self.remembered))
         for i, frustum in enumerate(self._kept):
             state |= nested(f"kept-{i}", frustum_state(frustum))
@@ -97,7 +104,8 @@ class TargetTracker:
             raise MapFileError(f"state attention: expected targets of the task, got {len(strangers)} other phrases")
         self._filter.remember([remembered_of(part(state, f"object-{i}")) for i in range(objects)])
         self._T_world_keyframe = poses[0].copy() if len(poses) else None
-        [self._frames_since] = take_counts(state, "frames_since", 1)
+        self._frames_since, unsettled = take_counts(state, "since", 2)
+        self._unsettled = unsettled > 0
 
     def wants_detection(self, frame: Frame) -> bool:
         """True for the first frame, after some frames, and once the camera went far; such a frame is a keyframe."""
@@ -106,6 +114,7 @@ class TargetTracker:
         due = (
             T_world_keyframe is None
             or self._frames_since >= self._settings.max_frames
+            or (self._unsettled and self._frames_since == 1)
             or translation_m(T_world_keyframe, frame.T_world_camera) > self._settings.max_translation_m
             or rotation_angle_deg(T_world_keyframe, frame.T_world_camera) > self._settings.max_rotation_deg
         )
@@ -141,14 +150,18 @@ class TargetTracker:
 
     def _observe(self, frame: Frame, depth_m: Float32[ndarray, "h w"], found: Sequence[Detection]) -> list[Detection]:
         """Remember what was detected; the targets that fit the task's relations."""
-        detections = self._without_anchors_as_objects(found)
-        placed = [sight(each.phrase, each.mask, depth_m, frame.camera, frame.T_world_camera) for each in detections]
-        self._filter.observe([sighting for sighting in placed if sighting is not None])
-        return [
-            detection
+        detections = [
+            replace(each, mask=front_layer(each.mask, depth_m)) for each in self._without_anchors_as_objects(found)
+        ]
+        placed = [sight(each, depth_m, frame) for each in detections]
+        self._filter.observe([sighting for sighting in placed if sighting is not None], Outlook(frame, frame.depth_m))
+        targets = [
+            (detection, sighting)
             for detection, sighting in zip(detections, placed, strict=True)
             if detection.phrase in self._graph.targets and sighting is not None and self._filter.keep(sighting)
         ]
+        self._unsettled = any(self._filter.wants_another(sighting) for _, sighting in targets)
+        return [detection for detection, sighting in targets if self._filter.believes(sighting)]
 
     def _without_anchors_as_objects(self, detections: Sequence[Detection]) -> list[Detection]:
         """The object on the desk is not the desk itself, although a desk is an object."""

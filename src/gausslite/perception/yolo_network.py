@@ -54,9 +54,16 @@ class YoloSegNetwork:
         self.names = _class_names(self._session)
         self._boxes_at, self._prototypes_at = _output_order(model.path, outputs, len(self.names))
         self.classes = int(outputs[self._boxes_at].shape[1]) - 4 - MASK_COEFFICIENTS
+        self._latest: tuple[Frame, Answer] | None = None
 
     def answer(self, frame: Frame) -> Answer:
-        """Run the network on a frame's colours."""
+        """Run the network on a frame's colours; asked again about the same frame, give the same answer."""
+        latest = self._latest
+        if latest is None or latest[0] is not frame:
+            latest = self._latest = frame, self._run(frame)
+        return latest[1]
+
+    def _run(self, frame: Frame) -> Answer:
         tensor, placed = letterbox(frame.rgb, self._height_px, self._width_px)
         outputs = self._session.run(None, {self._input: tensor})
         size_px = (frame.camera.height_px, frame.camera.width_px)
