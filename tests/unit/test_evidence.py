@@ -95,8 +95,12 @@ def test_after_a_first_faint_detection_the_next_frame_is_looked_at_too():
         assert detector.calls == calls
 
 
-def test_one_missed_detection_does_not_unmake_an_object_and_many_do():
-    assert lit([0.9, None, 0.4], 3) == [True, False, True]
+def test_detections_that_miss_an_object_do_not_unmake_it_at_once():
+    assert lit([0.9, None, None, None, 0.4], 5) == [True, True, True, False, True]
+    assert lit([0.9, None, None, 0.9, None, None, None], 7) == [True] * 6 + [False]
+
+
+def test_what_most_looks_at_its_place_missed_is_not_believed():
     assert not any(lit([0.4, *[None] * 9, 0.4], 11))
 
 

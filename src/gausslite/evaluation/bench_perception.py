@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
@@ -29,8 +29,8 @@ class Step(StrEnum):
     """How far perception has come.
 
     detected: the detector's own masks. related: cut to the object's layer of depth and judged by the task's relations.
-    believed: and by the evidence for each object; up to here the detector sees every frame. followed: as a mission
-    does it, detecting on keyframes alone.
+    believed: and by the evidence for each object; up to here the detector sees every frame, and a frame shows what it
+    found there. followed: as a mission does it, detecting on keyframes alone and carrying targets on.
     """
 
     DETECTED = "detected"
@@ -128,9 +128,10 @@ class _Asked:
     def __init__(self, question: Question, detector: Detector, up_axis: UpAxis, segmenter: Segmenter | None) -> None:
         self._question = question
         self._detector = _OnceAFrame(detector)
+        alone = AttentionSettings(up_axis=up_axis, max_frames=1, max_passed_over=0)
         settings = {
-            Step.RELATED: AttentionSettings(up_axis=up_axis, max_frames=1, evidence=EvidenceSettings.none()),
-            Step.BELIEVED: AttentionSettings(up_axis=up_axis, max_frames=1),
+            Step.RELATED: replace(alone, evidence=EvidenceSettings.none()),
+            Step.BELIEVED: alone,
             Step.FOLLOWED: AttentionSettings(up_axis=up_axis),
         }
         self._attentions = {

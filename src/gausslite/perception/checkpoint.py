@@ -25,6 +25,7 @@ def frustum_state(frustum: Frustum) -> dict[str, NDArray[Any]]:
         "mask": detection.mask,
         "numbers": np.array([detection.score, *detection.box_px, *intrinsics, frustum.near_m, frustum.far_m]),
         "T_world_camera": frustum.T_world_camera,
+        "passed_over": whole_numbers(frustum.passed_over),
     }
 
 
@@ -37,7 +38,8 @@ def frustum_of(state: State) -> Frustum:
     require_rigid("state T_world_camera", T_world_camera)
     detection = Detection(take_text(state, "phrase"), score, (left, top, right, bottom), mask)
     camera = Camera(fx_px, fy_px, cx_px, cy_px, mask.shape[1], mask.shape[0])
-    return Frustum(detection, camera, T_world_camera, near_m, far_m)
+    [passed_over] = take_counts(state, "passed_over", 1)
+    return Frustum(detection, camera, T_world_camera, near_m, far_m, passed_over)
 
 
 def remembered_state(each: Remembered) -> dict[str, NDArray[Any]]:

@@ -24,13 +24,17 @@ _SLACK_SHARE: Final = 0.02
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Frustum:
-    """A detection's box between the depths its mask spans, with the camera that saw it."""
+    """A detection's box between the depths its mask spans, with the camera that saw it.
+
+    passed_over counts the detections since then that did not find its object again.
+    """
 
     detection: Detection
     camera: Camera
     T_world_camera: Float64[ndarray, "4 4"]
     near_m: float
     far_m: float
+    passed_over: int = 0
 
     def corners_m(self) -> Float64[ndarray, "8 3"]:
         """The frustum's corners in the world: the near face first, then the far one."""

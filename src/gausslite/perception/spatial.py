@@ -81,6 +81,16 @@ class SpatialFilter:
         shown = self._memory.showing(sighting)
         return shown is not None and self._evidence.believes(shown)
 
+    def is_sure_of(self, sighting: Sighting) -> bool:
+        """True when what was sighted could not be two mistakes."""
+        shown = self._memory.showing(sighting)
+        return shown is not None and self._evidence.is_firm(shown)
+
+    def are_one(self, sighting: Sighting, other: Sighting) -> bool:
+        """True when two sightings show one and the same object."""
+        shown = self._memory.showing(sighting)
+        return shown is not None and shown is self._memory.showing(other)
+
     def wants_another(self, sighting: Sighting) -> bool:
         """True when another look could settle whether it is there."""
         shown = self._memory.showing(sighting)

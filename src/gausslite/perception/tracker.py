@@ -22,7 +22,7 @@ from gausslite.perception.checkpoint import frustum_state, remembered_of, rememb
 from gausslite.perception.detect import Segmenter
 from gausslite.perception.evidence import EvidenceSettings, Outlook
 from gausslite.perception.layers import front_layer
-from gausslite.perception.memory import Remembered
+from gausslite.perception.memory import Remembered, Sighting
 from gausslite.perception.relate import SpatialSettings
 from gausslite.perception.reproject import Frustum, cut_by_depth, frustum_of, reprojected_box_px
 from gausslite.perception.spatial import SpatialFilter, sight
@@ -33,13 +33,15 @@ from gausslite.perception.vocabulary import is_generic
 class AttentionSettings:
     """up_axis points up in the world, by default that of a level first camera; max_* say when to detect anew.
 
-    How far the camera may go between two detections is a comment in Sec. III-B.2.
+    How far the camera may go between two detections is a comment in Sec. III-B.2. A target that was believed is carried
+    on over up to max_passed_over detections that do not find it.
     """
 
     up_axis: UpAxis = (0.0, -1.0, 0.0)
     max_translation_m: float = 1.0
     max_rotation_deg: float = 15.0
     max_frames: int = 5
+    max_passed_over: int = 2
     spatial: SpatialSettings = field(default_factory=SpatialSettings)
     evidence: EvidenceSettings = field(default_factory=EvidenceSettings)
 
@@ -48,6 +50,8 @@ class AttentionSettings:
             if not getattr(self, name) > 0:
                 raise InvalidInputError(f"attention {name}: expected a positive number, got {getattr(self, name)}")
         unit_up_axis(self.up_axis)
+        if self.max_passed_over < 0:
+            raise InvalidInputError(f"attention max_passed_over: expected at least 0, got {self.max_passed_over}")
         if self.max_frames < 1:
             raise InvalidInputError(f"attention max_frames: expected at least 1, got {self.max_frames}")
 
@@ -124,32 +128,57 @@ class TargetTracker:
 
     def take(self, frame: Frame, depth_m: Float32[ndarray, "h w"], found: Sequence[Detection]) -> RelevanceMap:
         """What was detected on a frame: the targets that fit the task's relations, from now on carried over."""
-        targets = self._observe(frame, depth_m, found)
+        sighted = self._observe(frame, depth_m, found)
+        targets = [detection for detection, _ in sighted]
+        passed_over = self._passed_over(frame, depth_m, [sighting for _, sighting in sighted])
         lifted = [frustum_of(detection, depth_m, frame) for detection in targets]
-        self._kept = [frustum for frustum in lifted if frustum is not None]
-        return merge(targets, self._graph.targets, frame)
+        self._kept = [*(frustum for frustum in lifted if frustum is not None), *(old for old, _ in passed_over)]
+        return merge([*targets, *(shown for _, shown in passed_over)], self._graph.targets, frame)
 
     def look_back(self, frame: Frame, found: Sequence[Detection]) -> RelevanceMap:
         """What was detected on an earlier frame: it is remembered, but newer detections are carried on."""
-        return merge(self._observe(frame, frame.depth_m, found), self._graph.targets, frame)
+        sighted = self._observe(frame, frame.depth_m, found)
+        return merge([detection for detection, _ in sighted], self._graph.targets, frame)
 
     def carry_over(self, frame: Frame) -> RelevanceMap:
         """The latest targets as they are seen from another frame."""
-        boxes = [(frustum, reprojected_box_px(frustum, frame)) for frustum in self._kept]
-        in_view = [(frustum, box) for frustum, box in boxes if box is not None]
-        masks = [cut_by_depth(frustum, box, frame) for frustum, box in in_view]
-        if self._segmenter is not None and in_view:
-            table = np.asarray([box for _, box in in_view], np.float32)
+        shown = self._shown(frame)
+        if self._segmenter is not None and shown:
+            table = np.asarray([detection.box_px for _, detection in shown], np.float32)
             cut_again = self._segmenter.segment(frame, table)
-            masks = [new if new is not None else old for new, old in zip(cut_again, masks, strict=True)]
-        shown = [
-            Detection(frustum.detection.phrase, frustum.detection.score, box, mask)
-            for (frustum, box), mask in zip(in_view, masks, strict=True)
-        ]
-        return merge(shown, self._graph.targets, frame)
+            shown = [
+                (frustum, detection if mask is None else replace(detection, mask=mask))
+                for (frustum, detection), mask in zip(shown, cut_again, strict=True)
+            ]
+        return merge([detection for _, detection in shown], self._graph.targets, frame)
 
-    def _observe(self, frame: Frame, depth_m: Float32[ndarray, "h w"], found: Sequence[Detection]) -> list[Detection]:
-        """Remember what was detected; the targets that fit the task's relations."""
+    def _shown(self, frame: Frame) -> list[tuple[Frustum, Detection]]:
+        """The detections that are carried and in view of this frame, as it sees them."""
+        boxes = [(frustum, reprojected_box_px(frustum, frame)) for frustum in self._kept]
+        return [
+            (frustum, replace(frustum.detection, box_px=box, mask=cut_by_depth(frustum, box, frame)))
+            for frustum, box in boxes
+            if box is not None
+        ]
+
+    def _passed_over(
+        self, frame: Frame, depth_m: Float32[ndarray, "h w"], found: Sequence[Sighting]
+    ) -> list[tuple[Frustum, Detection]]:
+        """What is carried and in view, was not found again, and yet is still believed: detectors blink."""
+        left = []
+        for frustum, shown in self._shown(frame):
+            sighting = sight(shown, depth_m, frame)
+            if sighting is None or frustum.passed_over >= self._settings.max_passed_over:
+                continue
+            again = any(self._filter.are_one(sighting, other) for other in found)
+            if not again and self._filter.is_sure_of(sighting) and self._filter.keep(sighting):
+                left.append((replace(frustum, passed_over=frustum.passed_over + 1), shown))
+        return left
+
+    def _observe(
+        self, frame: Frame, depth_m: Float32[ndarray, "h w"], found: Sequence[Detection]
+    ) -> list[tuple[Detection, Sighting]]:
+        """Remember what was detected; the targets that are believed and fit the task's relations."""
         detections = [
             replace(each, mask=front_layer(each.mask, depth_m)) for each in self._without_anchors_as_objects(found)
         ]
@@ -161,7 +190,7 @@ class TargetTracker:
             if detection.phrase in self._graph.targets and sighting is not None and self._filter.keep(sighting)
         ]
         self._unsettled = any(self._filter.wants_another(sighting) for _, sighting in targets)
-        return [detection for detection, sighting in targets if self._filter.believes(sighting)]
+        return [(detection, sighting) for detection, sighting in targets if self._filter.believes(sighting)]
 
     def _without_anchors_as_objects(self, detections: Sequence[Detection]) -> list[Detection]:
         """The object on the desk is not the desk itself, although a desk is an object."""
