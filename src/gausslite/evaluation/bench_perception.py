@@ -185,10 +185,10 @@ class _Tally:
         objects: Mapping[str, Bool[ndarray, "h w"]],
     ) -> None:
         self._shares.append(float(mask.mean()))
-        marked, shared = np.count_nonzero(mask & known), np.count_nonzero(mask & truth)
+        marked, shared = int(np.count_nonzero(mask & known)), int(np.count_nonzero(mask & truth))
         self._marked += marked
         self._shared += shared
-        self._true += np.count_nonzero(truth)
+        self._true += int(np.count_nonzero(truth))
         self._right_frames += bool(2 * shared > marked)
         for name, pixels in objects.items():
             size = np.count_nonzero(pixels)
