@@ -30,7 +30,11 @@ WORDS = st.sampled_from(
 )
 
 
-@given(st.text(max_size=200) | st.lists(WORDS, max_size=25).map(" ".join))
+@given(
+    st.text(max_size=200)
+    | st.lists(WORDS, max_size=25).map(" ".join)
+    | st.builds(lambda words, times: " ".join(words) * times, st.lists(WORDS | st.text(), max_size=4), st.just(20_000))
+)
 def test_any_text_gives_a_valid_graph_or_one_line(text):
     try:
         graph = RuleParser().parse(text)

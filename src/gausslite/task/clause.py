@@ -22,6 +22,8 @@ class Clause:
         self.part = False
         self.between = False
         self.stated = False
+        self.by_reference = False
+        self.mentioned = False
         self.route = False
         self.skip_of = False
         self.handed_joined = False
@@ -33,6 +35,8 @@ class Clause:
 def names_object(noun: NounPhrase, pending: str | None, after: Piece | None) -> bool:
     """False for the robot itself, and for places, routes and measures that stand for something else."""
     if len(noun.words) == 1 and noun.head in lexicon.SELVES:
+        return False
+    if noun.head in lexicon.TASK_WORDS and pending is None:
         return False
     leads_on = after is not None and after.kind is Kind.PREPOSITION and after.word == "of"
     compound = len(noun.words) > 1 and not adjectives_only(noun.words[:-1])

@@ -125,6 +125,7 @@ class GraphBuilder:
         if pending is None:
             clause.subjects = clause.subjects or list(clause.referents)
             if not clause.aside:
+                clause.by_reference = bool(clause.verb and clause.subjects)
                 self._draft.mean(clause.subjects)
             return
         named, subjects = (clause.subjects[:-1], clause.subjects[-1:]) if clause.joined else (

@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from gausslite.domain.task import Relation, TaskGraph
 from gausslite.errors import TaskError
 from gausslite.task import lexicon
+from gausslite.task.draft import GraphDraft
 from gausslite.task.graph_builder import draft_of
 from gausslite.task.parser import normalise_text, task_id_of
 from gausslite.task.phrases import noun_phrase
@@ -23,10 +24,6 @@ _ANY_OBJECT = (
     | lexicon.ROOMS
     | {word for word, noun in lexicon.STAND_INS.items() if noun == "object"}
     | words("this that these those it them one ones whatever everywhere")
-)
-_PEOPLE = words(
-    "person people man woman child baby kid human pedestrian worker patient visitor guest user operator nurse doctor "
-    "technician someone anyone everyone somebody anybody everybody who whoever"
 )
 _SAME = tuple(
     words(line)
@@ -46,27 +43,20 @@ def grounded_graph(
     anchors: Sequence[str],
     relations: Sequence[Relation],
     warnings: Sequence[str] = (),
+    draft: GraphDraft | None = None,
 ) -> TaskGraph:
     """The one way from any parser's answer to a task graph.
 
     Phrases lose their article and plural. A target or anchor whose head noun the sentence neither contains nor entails
     is dropped, a target that the sentence says to leave alone, and a relation between nouns that are not listed;
-    `warnings` names them. Raises TaskError when the text is no task, no target is left, or the graph is out of bounds.
+    `warnings` names them. The rules hand over their own `draft`; for other parsers it is read here. Raises TaskError
+    when the text is no task, no target is left, or the graph is out of bounds.
     """
     require_task_text(text)
-    said = _words_of(text)
-    notes = list(warnings)
-
-    def keep(role: str, phrases: Sequence[str]) -> tuple[str, ...]:
-        plain = [(phrase, plain_phrase(phrase)) for phrase in phrases]
-        notes.extend(
-            f"{role} {_short(phrase)} is not in the sentence: it is dropped"
-            for phrase, noun in plain
-            if not _is_said(noun, said)
-        )
-        return tuple(dict.fromkeys(noun for _, noun in plain if _is_said(noun, said)))
-
-    kept_targets, kept_anchors = _allowed(text, keep("target", targets), notes.append), keep("anchor", anchors)
+    said, notes = _words_of(text), list(warnings)
+    draft = draft or draft_of(read(normalise_text(text)))
+    kept_targets = _allowed(draft, _kept("target", targets, said, notes.append), notes.append)
+    kept_anchors = _kept("anchor", anchors, said, notes.append)
     if not kept_targets:
         shown = " ".join(text.split())[:60]
         raise TaskError(
@@ -84,9 +74,20 @@ def grounded_graph(
     return graph
 
 
-def _allowed(text: str, targets: tuple[str, ...], note: Callable[[str], None]) -> tuple[str, ...]:
+def _kept(role: str, phrases: Sequence[str], said: frozenset[str], note: Callable[[str], None]) -> tuple[str, ...]:
+    """The phrases whose head the sentence says or entails, plain and once."""
+    kept: dict[str, None] = {}
+    for phrase in phrases:
+        noun = plain_phrase(phrase)
+        if _is_said(noun, said):
+            kept[noun] = None
+        else:
+            note(f"{role} {_short(phrase)} is not in the sentence: it is dropped")
+    return tuple(kept)
+
+
+def _allowed(draft: GraphDraft, targets: tuple[str, ...], note: Callable[[str], None]) -> tuple[str, ...]:
     """The targets without those that the rules read as to be left alone; "mug" stays where only "the blue mug" is."""
-    draft = draft_of(read(normalise_text(text)))
     kept: list[str] = []
     for target in targets:
         forbidden = any(_same_object(target, phrase) for phrase in draft.excluded)
@@ -145,5 +146,5 @@ def _is_said(phrase: str, said: frozenset[str]) -> bool:
     if head in lexicon.GENERIC:
         return bool(said & _ANY_OBJECT)
     if head == "person":
-        return bool(said & _PEOPLE)
+        return bool(said & lexicon.PEOPLE)
     return any(head in group and said & group for group in _SAME)

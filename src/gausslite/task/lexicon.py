@@ -48,10 +48,11 @@ COMPOUND_GERUNDS: Final = words(
 )
 # the robot itself, and how a person may be spoken to
 SELVES: Final = words(
-    "robot drone agent arm gripper rover bot task mission goal objective job aim assignment duty idea clue dear "
-    "darling sweetheart honey mate buddy sir madam pal friend"
+    "robot drone agent arm gripper rover bot dear darling sweetheart honey mate buddy sir madam pal friend"
 )
 
+# what a sentence may say about itself: "the goal is to", "any idea where"
+TASK_WORDS: Final = words("task mission goal objective job aim assignment duty idea clue question problem")
 # nouns that say where or how, not what: the object is the one after "of", or none at all
 PLACES: Final = words(
     "scene environment surroundings room area world space place vicinity workspace view region zone spot location "
@@ -86,6 +87,10 @@ BUILDINGS: Final = words("building house apartment")
 DEFECTS: Final = words(
     "leak crack dent scratch rust stain hole corrosion damage wear tear mold mould rot chip blockage fault defect "
     "wetness gap fraying blister failure error hazard sign pest disease"
+)
+PEOPLE: Final = words(
+    "person people man woman child baby kid human pedestrian worker patient visitor guest user operator nurse doctor "
+    "technician someone anyone everyone somebody anybody everybody who whoever"
 )
 CLOTHING: Final = words(
     "jacket coat shirt vest hat dress suit t-shirt tshirt uniform trousers jeans skirt sweater jumper hoodie cap "

@@ -44,10 +44,26 @@ class NounPlacer:
         In "in the kitchen, find the mug" the place belongs to the clause that follows.
         """
         before = self.clause
-        if not before.aside:
+        if (
+            before.mentioned
+            and before.referents
+            and before.verb in SEARCH_VERBS
+            and before.orphans
+            and not before.subjects
+        ):
+            self._seek_there(before)
+        elif not before.aside:
             self._mean_places()
         self.clause = Clause(verb=verb, referents=before.subjects or before.referents)
-        self.clause.orphans = before.orphans
+        self.clause.orphans, self.clause.mentioned = before.orphans, before.aside
+
+    def _seek_there(self, clause: Clause) -> None:
+        """In "I lost my wallet, look under the bed" the wallet is sought there."""
+        clause.subjects = list(clause.referents)
+        self._draft.mean(clause.subjects)
+        orphans, clause.orphans = clause.orphans, []
+        for relation, noun in orphans:
+            self.relate(relation, noun)
 
     def _mean_places(self) -> None:
         orphans, self.clause.orphans = self.clause.orphans, []
@@ -90,7 +106,7 @@ class NounPlacer:
         elif pending == "via":
             self.target(noun)
             clause.route = True
-        elif pending == "inside" and noun.head in lexicon.CLOTHING:
+        elif pending == "inside" and noun.head in lexicon.CLOTHING and self._is_about_people():
             self.relate("near", noun)
         elif pending in _PAST and clause.verb in DELIVERY_VERBS:
             self._draft.anchor(noun.text)
@@ -103,14 +119,22 @@ class NounPlacer:
                 self._accompanied(noun)
         elif pending == "from" or pending in _SOURCES:
             self._taken_from(pending, noun)
-        elif clause.last_relation in ("to", "with") or (
-            clause.verb in PLACE_VERBS and not clause.stated and self._is_last_place(pending, following)
-        ):
+        elif clause.last_relation in ("to", "with") or self._is_brought(pending, following):
             self._draft.anchor(noun.text)
             clause.last_relation = clause.last_relation if clause.last_relation == "with" else "to"
             clause.between = pending == "between"
         else:
             self.relate(pending, noun)
+
+    def _is_about_people(self) -> bool:
+        return any(subject.split()[-1] in lexicon.PEOPLE for subject in self.clause.subjects)
+
+    def _is_brought(self, pending: str, following: Sequence[Piece]) -> bool:
+        """In "take the chair and push it under the desk" and "put the mug on the desk" they are not there yet."""
+        clause = self.clause
+        if clause.by_reference and clause.verb in DELIVERY_VERBS and pending in _DESTINATIONS:
+            return True
+        return clause.verb in PLACE_VERBS and not clause.stated and self._is_last_place(pending, following)
 
     def _is_passed(self, pending: str) -> bool:
         return pending == "past" and self.clause.verb in GO_VERBS and bool(self.clause.subjects)
@@ -167,7 +191,7 @@ class NounPlacer:
         clause = self.clause
         self._draft.target(noun.text, aside=clause.aside)
         clause.subjects = [*clause.subjects, noun.text] if joined else [noun.text]
-        clause.joined = joined
+        clause.joined, clause.by_reference = joined, False
         clause.last_relation = None
         clause.superlative = noun.superlative or (joined and clause.superlative)
         clause.part = noun.head in lexicon.PARTS

@@ -23,7 +23,7 @@ class RuleParser:
         draft = draft_of(pieces)
         if not draft.targets:
             raise TaskError(_nothing_named(text, tuple(draft.excluded)))
-        return grounded_graph(text, draft.targets, draft.anchors, draft.relations, draft.warnings)
+        return grounded_graph(text, draft.targets, draft.anchors, draft.relations, draft.warnings, draft)
 
 
 def _require_sense(text: str, pieces: list[Piece]) -> None:

@@ -50,7 +50,7 @@ c  5  5  0  5  7 15  5  5 20  5  0  0  5  3  5 10  0 10
 s  8  8  0  3  5 15  5  5 30 10  0  0  5  0  0 10  0  0
 w 25 15  0  0 30  7  0 20 40  5 20 20 20  0  3  0 10 20
 o 20 20 15  0 10  3  0  0  0  0  0  0  5 15 10 20  0  0
-i 40 10 30 10  7  5  0  0  5  3  0  0  0 10 40 40  0  0
+i 40 20 30 10  7  5  0  0  5  3  0  0  0 10 40 40  0  0
 k 40 20 30 20 20 20  5  0  5  5  0  0 10 40 40 40 10  0
 q  5  5  0  0  0 10 10 10 30  5 20 20 20  5  0  0 20 20
 """
@@ -63,7 +63,7 @@ def _table(text: str) -> dict[Tag | None, dict[Tag | None, int]]:
     return {None if row[0] == "^" else Tag(row[0]): dict(zip(columns, map(int, row[1:]), strict=True)) for row in rows}
 
 
-_BEHIND: Final = _table(_COSTS)
+COST_BEHIND: Final = _table(_COSTS)
 
 
 def best_tags(candidates: Sequence[Mapping[Tag, int]]) -> list[Tag]:
@@ -75,12 +75,12 @@ def best_tags(candidates: Sequence[Mapping[Tag, int]]) -> list[Tag]:
         origins: dict[Tag, Tag | None] = {}
         for tag, own_cost in options.items():
             cost, origin = min(
-                ((so_far + _BEHIND[before][tag], before) for before, so_far in paths.items()), key=_first
+                ((so_far + COST_BEHIND[before][tag], before) for before, so_far in paths.items()), key=_first
             )
             reached[tag], origins[tag] = cost + own_cost, origin
         paths = reached
         came_from.append(origins)
-    last = min(paths, key=lambda tag: paths[tag] + _BEHIND[tag][None])
+    last = min(paths, key=lambda tag: paths[tag] + COST_BEHIND[tag][None])
     found: list[Tag] = []
     for origins in reversed(came_from):
         if last is not None:

@@ -27,7 +27,7 @@ _IRREGULAR: Final = {
     "swung": "swing", "done": "do", "lent": "lend", "hurt": "hurt",
     "sprung": "spring", "woven": "weave", "strewn": "strew",
 }  # fmt: skip
-_ODD_SPELLINGS: Final = {"lying": "lie", "tying": "tie", "dying": "die", "does": "do", "goes": "go", "undoes": "undo"}
+_ODD_SPELLINGS: Final = {"does": "do", "goes": "go", "undoes": "undo"}
 
 
 def base_of_s(word: str) -> str | None:
@@ -35,7 +35,7 @@ def base_of_s(word: str) -> str | None:
     if word in _ODD_SPELLINGS:
         return _ODD_SPELLINGS[word]
     if word.endswith("ies"):
-        return _known(word[:-3] + "y")
+        return _known(word[:-3] + "y", word[:-1])
     if word.endswith("es"):
         return _known(word[:-2], word[:-1])
     return _known(word[:-1]) if word.endswith("s") else None
@@ -45,6 +45,8 @@ def base_of_ing(word: str) -> str | None:
     """From "sitting" and "placing" to "sit" and "place"."""
     if word in _ODD_SPELLINGS:
         return _ODD_SPELLINGS[word]
+    if word.endswith("ying"):
+        return _known(word[:-3], word[:-4] + "ie")
     return _stem(word[:-3]) if word.endswith("ing") else None
 
 
@@ -53,7 +55,7 @@ def base_of_ed(word: str) -> str | None:
     if word in _IRREGULAR:
         return _IRREGULAR[word]
     if word.endswith("ied"):
-        return _known(word[:-3] + "y")
+        return _known(word[:-3] + "y", word[:-1])
     return _stem(word[:-2]) if word.endswith("ed") else None
 
 

@@ -9,7 +9,7 @@ from gausslite.task.words import words
 GO_VERBS: Final = words(
     "go navigate drive move walk head proceed travel come approach reach follow cross enter exit return run roll fly "
     "advance get steer park dock explore patrol roam tour wander visit escort hurry rush climb descend crawl cruise "
-    "swim sail taxi land jog race ascend"
+    "swim sail land jog race ascend"
 )
 CARRY_VERBS: Final = words(
     "bring take carry deliver fetch hand pass give transport haul transfer relocate send shift drag push pull slide "

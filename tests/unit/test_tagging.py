@@ -1,0 +1,107 @@
+"""Words become parts of speech by what stands beside them; the cheapest path is the cheapest of all."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gausslite.task.clauses import Mood, moods_of
+from gausslite.task.parser import normalise_text
+from gausslite.task.tagging import tagged
+from gausslite.task.tags import COST_BEHIND, Tag, best_tags
+from gausslite.task.tokens import units_of
+from gausslite.task.verb_forms import base_of_ed, base_of_ing, base_of_s, verb_base
+from gausslite.task.verbs import VERBS
+
+TAGS = st.sampled_from(sorted(Tag, key=lambda tag: tag.value))
+OPTIONS = st.dictionaries(TAGS, st.integers(0, 40), min_size=1, max_size=3)
+
+
+def path_cost(candidates: Sequence[Mapping[Tag, int]], path: Sequence[Tag]) -> int:
+    own = sum(options[tag] for options, tag in zip(candidates, path, strict=True))
+    return own + sum(COST_BEHIND[before][after] for before, after in itertools.pairwise([None, *path, None]))
+
+
+def tags_of(text: str) -> dict[str, Tag]:
+    return dict(tagged(units_of(normalise_text(text))))
+
+
+@given(st.lists(OPTIONS, max_size=5))
+def test_no_other_path_is_cheaper(candidates):
+    found = best_tags(candidates)
+    assert len(found) == len(candidates)
+    assert path_cost(candidates, found) == min(path_cost(candidates, path) for path in itertools.product(*candidates))
+
+
+@pytest.mark.parametrize(
+    ("text", "word", "tag"),
+    [
+        ("Water the plant", "water", Tag.VERB),
+        ("Bring the plant some water", "water", Tag.NOUN),
+        ("Clean the light", "light", Tag.NOUN),
+        ("Light the candles", "light", Tag.VERB),
+        ("Take out the light box", "light", Tag.ADJECTIVE),
+        ("Find the dustpan and dust the shelf", "dust", Tag.VERB),
+        ("Wipe off the dust", "dust", Tag.NOUN),
+        ("Take the laundry out and fold it", "fold", Tag.VERB),
+        ("Go to the bus stop", "stop", Tag.NOUN),
+        ("The mugs on the rack belong in the cupboard", "belong", Tag.VERB),
+        ("Which shelf holds the cans", "holds", Tag.VERB),
+        ("Empty the trash can by the door", "can", Tag.NOUN),
+        ("Can you open the door", "can", Tag.AUXILIARY),
+        ("Go to the charging station", "charging", Tag.NOUN),
+        ("Find the person holding a cup", "holding", Tag.ING),
+        ("Someone left a pram in the hall", "left", Tag.PARTICIPLE),
+        ("Open the left drawer", "left", Tag.ADJECTIVE),
+        ("Find the mug that is on the desk", "that", Tag.RELATIVE),
+        ("Bring that mug", "that", Tag.DETERMINER),
+        ("Glorb the wug", "glorb", Tag.VERB),
+        ("Bring the glorb", "glorb", Tag.NOUN),
+    ],
+)
+def test_a_word_is_read_by_its_neighbours(text, word, tag):
+    assert tags_of(text)[word] is tag
+
+
+@pytest.mark.parametrize(
+    ("text", "moods"),
+    [
+        ("Close the curtains, the sun is strong", [Mood.TASK, Mood.ASIDE]),
+        ("The bin is full, empty it", [Mood.ASIDE, Mood.TASK]),
+        ("Close the door because the dog is out", [Mood.TASK, Mood.REASON]),
+        ("Turn off the lamp so that the baby can sleep", [Mood.TASK, Mood.REASON]),
+        ("If the door is open, close it", [Mood.TASK, Mood.TASK]),
+        ("Where is the mug", [Mood.TASK]),
+        ("I think the mug is on the table", [Mood.ASIDE]),
+        ("I need the mug", [Mood.TASK]),
+        ("The mugs go in the cupboard", [Mood.TASK]),
+        ("Bring the mug and the plate", [Mood.TASK]),
+        ("Bring the mug and fetch the plate", [Mood.TASK, Mood.TASK]),
+    ],
+)
+def test_a_clause_asks_states_or_gives_a_reason(text, moods):
+    assert list(moods_of(tagged(units_of(normalise_text(text)))).values()) == moods
+
+
+def test_regular_forms_lead_back_to_a_known_verb():
+    for verb in VERBS:
+        stem = verb.removesuffix("e")
+        present = (verb.removesuffix("ie") + "y" if verb.endswith("ie") else stem) + "ing"
+        assert verb_base(verb) == verb
+        for form, base_of in ((verb + "s", base_of_s), (present, base_of_ing), (stem + "ed", base_of_ed)):
+            assert base_of(form) in VERBS, form
+
+
+@pytest.mark.parametrize(
+    ("form", "base"),
+    [
+        ("carries", "carry"), ("carried", "carry"), ("dropping", "drop"), ("placing", "place"), ("lying", "lie"),
+        ("washes", "wash"), ("left", "leave"), ("hung", "hang"), ("stood", "stand"), ("table", None), ("red", None),
+    ],
+)  # fmt: skip
+def test_verb_forms(form, base):
+    assert verb_base(form) == base
