@@ -2,18 +2,26 @@
 
 from __future__ import annotations
 
+import sqlite3
 import threading
+from pathlib import Path
 
 import numpy as np
 import pytest
 from agent_running import SETTINGS, TASK, Gate, agent, ball_attention
-from fusion_team import GRID, frame
+from fusion_team import CAMERA, GRID, frame, team
 
 from gausslite.errors import (
     InvalidInputError,
     UnavailableError,
 )
+from gausslite.fusion.memory import MemoryStore
 from gausslite.task.rules import RuleParser
+from gausslite.v1 import agent_service_pb2 as pb
+from gausslite.wire.clients import FusionClient
+from gausslite.wire.spool import Spool
+from gausslite.wire.uplink import Uplink
+from gausslite.wire.uplink_values import UplinkSettings
 from gausslite_agent.load import Drops, LoadSettings
 from gausslite_agent.robot import Robot
 from gausslite_agent.status import Outcome
@@ -90,3 +98,24 @@ def test_frames_that_wait_when_the_agent_ends_are_dropped() -> None:
     assert [future.result(0).outcome for future in futures] == [Outcome.MAPPED, Outcome.DROPPED, Outcome.DROPPED]
     with pytest.raises(UnavailableError, match="ending"):
         robot.do(lambda mapper: mapper.count)
+
+
+def test_a_spool_without_room_ends_no_mission_and_all_is_told_once_it_has_some(tmp_path: Path) -> None:
+    store, spool = MemoryStore(), Spool(tmp_path / "robot.spool", "robot", GRID)
+    with team(store) as fusion:
+        uplink = Uplink(FusionClient(fusion.client.address), "robot", spool, GRID, UplinkSettings(interval_s=0.0))
+        with agent(uplink=uplink) as a:
+            a.client.assign_task(TASK)
+            limit = sqlite3.connect(tmp_path / "robot.spool")
+            limit.execute("CREATE TRIGGER full BEFORE INSERT ON words BEGIN SELECT RAISE(ABORT, 'disk full'); END")
+            outcomes = list(a.client.ingest([frame(0, CAMERA), frame(1, CAMERA)]))
+            assert [each.outcome for each in outcomes] == [pb.FRAME_OUTCOME_MAPPED] * 2
+            assert any("disk full" in note for note in a.client.status().notes)
+            limit.execute("DROP TRIGGER full")
+            limit.close()
+            list(a.client.ingest([frame(2, CAMERA)]))
+            assert not any("disk full" in note for note in a.client.status().notes)
+            assert uplink.drain(20.0)
+            active = a.robot.do(lambda mapper: mapper.roi_gaussians()).result()
+        uplink.close()
+    assert int(store.table()["robot"].counts.sum()) == len(active) > 0

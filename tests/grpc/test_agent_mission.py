@@ -172,6 +172,7 @@ def test_what_is_wrong_is_raised_before_or_when_it_is_met(tmp_path: Path) -> Non
         (["--source", "sim:home", "--task", "Pick up the mug", "--size", "big"], "size"),
         (["--source", "sim:home", "--task", "Pick up the mug", "--hold-out", "1"], "hold-out"),
         (["--threads", "0"], "threads"),
+        (["--task", "Pick up the mug"], "name an ONNX file with --detector"),
         (["--max-gaussians", "0"], "max_gaussians"),
         (["--agent-id", ""], "--agent-id"),
         (["--voxel-size", "nan"], "voxel"),

@@ -97,6 +97,16 @@ def test_a_quota_counts_what_is_held_and_not_what_was_sent() -> None:
         assert t.client.join("ant", GRID).session_id != session
 
 
+def test_a_robot_whose_name_another_one_took_is_told_to_stop() -> None:
+    with team() as t:
+        first, second = (t.client.join("ant", GRID).session_id for _ in range(2))
+        with pytest.raises(MismatchError, match="another robot has joined under this name"):
+            t.say(first, said("ant", 1, {0: [1]}))
+        with pytest.raises(MismatchError):
+            t.client.leave(first)
+        assert t.say(second, said("ant", 1, {0: [1]}))[0].status == ACCEPTED
+
+
 def test_an_unknown_session_is_told_to_join_again() -> None:
     with team() as t:
         with pytest.raises(SessionUnknownError):
@@ -105,10 +115,6 @@ def test_an_unknown_session_is_told_to_join_again() -> None:
             t.client.contribute_keyframes("never given", [frame(0)])
         with pytest.raises(SessionUnknownError):
             t.client.leave("never given")
-        first = t.client.join("ant", GRID).session_id
-        t.client.join("ant", GRID)
-        with pytest.raises(SessionUnknownError):
-            t.say(first, said("ant", 1, {0: [1]}))
         with pytest.raises(grpc.RpcError) as caught:
             t.stub.LeaveSession(pb.LeaveSessionRequest(session_id="x"))
         assert caught.value.code() is grpc.StatusCode.NOT_FOUND

@@ -8,7 +8,7 @@ import time
 from concurrent.futures import Future
 from enum import Enum
 
-from gausslite.errors import DatasetError, GaussLiteError
+from gausslite.errors import GaussLiteError, StorageError
 from gausslite.mission.results import write_results
 from gausslite.task.parser import TaskParser
 from gausslite.wire.clients import FusionClient
@@ -75,15 +75,15 @@ class Player:
             self._robot.assign(self._parser.parse(asked)).result()
 
     def play(self, stand_in: StandIn) -> None:
-        """Map every frame, then end the mission. Raises what the disk or the task raise.
+        """Map every frame, then end the mission. Raises what the source, the disk or the task raise.
 
-        A damaged frame ends the mission early: what was mapped until then is sent and written, then it is raised.
+        Such an error ends the mission early: what was mapped until then is sent and written, then it is raised.
         """
         self._started_s = time.monotonic()
         self.begin()
         self._state = MissionState.MAPPING
         last_index = -1 if self._earlier is None else self._earlier.last_index
-        damaged: DatasetError | None = None
+        failure: GaussLiteError | None = None
         waiting: Future[FrameReport] | None = None
         try:
             for frame in stand_in.frames(last_index):
@@ -93,16 +93,16 @@ class Player:
                 if self._stopping.is_set():
                     break
                 waiting = self._robot.submit(frame)
-        except DatasetError as error:
-            damaged = error
-        if waiting is not None:
-            waiting.result()
-        if damaged is None:
+            if waiting is not None:
+                waiting.result()
+        except GaussLiteError as error:
+            failure = error
+        if failure is None:
             self._finish()
             return
         if self._robot.status().mapped > 0:
-            self._finish(str(damaged))
-        raise damaged
+            self._finish(str(failure))
+        raise failure
 
     def conclude(self) -> None:
         """End a mission whose frames were sent: write what is mapped, if anything is. Raises StorageError."""
@@ -151,9 +151,13 @@ class Player:
         link = self._settings.link
         drained = uplink.drain(link.drain_s)
         if link.handover and drained:
-            uplink.offer(self._robot.handover_words().result(), Purpose.HANDOVER)
-            drained = uplink.drain(link.drain_s)
-            self._contribute_keyframes(uplink)
+            try:
+                uplink.offer(self._robot.handover_words().result(), Purpose.HANDOVER)
+            except StorageError as error:
+                _log.warning("handover: %s", error)
+            else:
+                drained = uplink.drain(link.drain_s)
+                self._contribute_keyframes(uplink)
         if not drained:
             _log.warning("uplink: not everything arrived: %s", uplink.counters())
 

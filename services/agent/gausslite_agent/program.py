@@ -7,6 +7,7 @@ import functools
 from collections.abc import Sequence
 from contextlib import ExitStack
 
+from gausslite.datasets.open import is_simulated
 from gausslite.domain.pose import unit_up_axis
 from gausslite.mission.build import Attentions
 from gausslite.mission.results import prepare_file, prepare_folder
@@ -46,6 +47,8 @@ async def _serve(settings: AgentSettings) -> None:
         parser = _parser(settings, stack)
         uplink, client = _uplink(settings, stack, goes_on=saved is not None)
         attentions = Attentions(settings.perception, lambda: _scene(settings, stand_in))
+        if settings.task is not None and not (settings.play and is_simulated(settings.play.source)):
+            attentions.require_sight()
         robot = Robot(
             settings.mission,
             settings.link.grid,

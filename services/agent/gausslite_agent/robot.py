@@ -7,6 +7,7 @@ Everything that touches the map runs on the worker, so the mapper needs no lock.
 
 from __future__ import annotations
 
+import logging
 import threading
 import time
 from collections import deque
@@ -22,7 +23,7 @@ from gausslite.domain.subset import VoxelWords
 from gausslite.domain.task import TaskGraph
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.domain.words import words_of
-from gausslite.errors import MismatchError, UnavailableError
+from gausslite.errors import MismatchError, StorageError, UnavailableError
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.pace import Pace, Relief
 from gausslite.mapping.roi import RoiLedger
@@ -36,6 +37,7 @@ from gausslite_agent.load import Drops, LoadSettings
 from gausslite_agent.saved_mission import EarlierLife, SavedMission
 from gausslite_agent.status import FrameReport, Outcome, RobotStatus
 
+_log = logging.getLogger(__name__)
 _Result = TypeVar("_Result")
 
 
@@ -172,10 +174,8 @@ class Robot:
         with self._lock:
             revision = self._first_revision + self._mapper.revision
             self._status = replace(self._status, gaussians=self._mapper.count, map_revision=revision)
-        if self.uplink is not None:
-            # the spool lets go of what it has; the rest was on its way, or told later in a life that ended unsaved
-            words = words_of(self._mapper.roi_gaussians(), self._grid)
-            self.uplink.offer(self._ledger.beyond_released(words))
+        # the spool lets go of what it has; the rest was on its way, or told later in a life that ended unsaved
+        self._tell(self._ledger.beyond_released(words_of(self._mapper.roi_gaussians(), self._grid)))
         self._on_change()
 
     def _save(self, path: Path, terms: RunTerms, asked: str) -> bool:
@@ -223,9 +223,7 @@ class Robot:
         if not self._untold or self._task_mapper is None:
             return
         self._untold = False
-        words = self._task_mapper.words()
-        if self.uplink is not None and words is not None:
-            self.uplink.offer(words)
+        self._tell(self._task_mapper.words())
 
     def _map(self, frame: Frame) -> FrameReport:
         assert self._task_mapper is not None
@@ -235,8 +233,8 @@ class Robot:
             self._status = replace(self._status, notes=self._task_mapper.notes)
         if done.skipped is not None:
             return self._count(FrameReport(frame.index, Outcome.SKIPPED, done.skipped, gaussians=done.gaussians))
-        if self.uplink is not None and done.words is not None:
-            self.uplink.offer(done.words)
+        if done.words is not None:
+            self._tell(done.words)
             self._untold = False
         report = FrameReport(
             frame.index, Outcome.MAPPED, "", done.iterations, done.gaussians, done.roi_share, done.budget.seconds
@@ -245,6 +243,22 @@ class Robot:
         self._count(report)
         self._on_change()
         return report
+
+    def _tell(self, words: VoxelWords | None) -> None:
+        """Give words to the uplink. A spool without room ends no mission: all is told again once it has some."""
+        if self.uplink is None or words is None:
+            return
+        untold_because = ""
+        try:
+            self.uplink.offer(words)
+        except StorageError as error:
+            untold_because = str(error)
+            self._ledger.forget()
+        with self._lock:
+            before = self._status.untold_because
+            self._status = replace(self._status, untold_because=untold_because)
+        if untold_because and not before:
+            _log.warning("%s", untold_because)
 
     def _note_load(self, done: FrameOutcome) -> None:
         with self._lock:

@@ -36,7 +36,7 @@ class RobotStatus:
 
     short counts the frames that trained less than they should, without_* those that went without something for want
     of time; max_detection_lag is the greatest age, in frames, at which a detection came; reread counts the keyframes
-    that were looked at again for a new task.
+    that were looked at again for a new task. untold_because says why the uplink could not take the newest words.
     """
 
     graph: TaskGraph | None = None
@@ -55,18 +55,20 @@ class RobotStatus:
     without_seeding: int = 0
     max_detection_lag: int = 0
     reread: int = 0
+    untold_because: str = ""
     notes: tuple[str, ...] = ()
 
     @property
     def load_notes(self) -> tuple[str, ...]:
-        """What was left undone for want of time, one line each."""
+        """What was left undone for want of time or of room, one line each."""
         told = (
             (self.dropped, "frames were dropped"),
             (self.short, "frames trained too little"),
             (self.without_words, "frames told their words later"),
             (self.without_seeding, "frames were not seeded"),
         )
-        return tuple(f"overload: {count} {what}" for count, what in told if count)
+        overload = tuple(f"overload: {count} {what}" for count, what in told if count)
+        return (*overload, f"nothing more is told: {self.untold_because}") if self.untold_because else overload
 
     @property
     def hz(self) -> float:

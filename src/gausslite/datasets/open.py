@@ -30,8 +30,13 @@ def open_source(spec: str, up_axis: UpAxis | None = None, colour_camera: ColourC
     return source if colour_camera is None else RegisteredSource(source, colour_camera)
 
 
+def is_simulated(spec: str) -> bool:
+    """True for a place whose regions are known, but take seconds to build."""
+    return spec.startswith(_SIMULATED)
+
+
 def _open(spec: str, up_axis: UpAxis | None) -> Source:
-    if spec.startswith(_SIMULATED):
+    if is_simulated(spec):
         # the simulated home needs the optional ray caster; files do not
         from gausslite.datasets.simulated.source import open_simulated
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import secrets
 import time
+from collections import deque
 from dataclasses import dataclass, replace
 from threading import RLock
 from typing import NamedTuple
@@ -24,6 +25,8 @@ from gausslite.fusion.store import Charter, FusionStore, PutOutcome, Session
 from gausslite.fusion.tally import Tally, TeamStatus, contribution
 from gausslite.fusion.terms import Holding, TeamSettings, agree, named, require_name, shown
 from gausslite.fusion.vote import FusedMap, concatenate, elect, fuse
+
+_REMEMBERED_SESSIONS = 1000
 
 
 class Joined(NamedTuple):
@@ -61,6 +64,7 @@ class TeamMap:
         self._ledger = RevisionLedger(begin, settings.remembered_vanished)
         self._pool = KeyframePool(settings.quotas.keyframes_per_agent, settings.quotas.keyframe_pixels)
         self._sessions = {session.session_id: session for session in store.sessions()}
+        self._replaced: deque[str] = deque(maxlen=_REMEMBERED_SESSIONS)
         self._tallies: dict[str, Tally] = {}
         self._refined: RefinedMap | None = None
         stakes = store.stakes()
@@ -117,14 +121,24 @@ class TeamMap:
                 self._forget(agent_id)
             session = Session(secrets.token_hex(16), agent_id)
             self._store.save_session(session)
-            self._sessions = {key: old for key, old in self._sessions.items() if old.agent_id != agent_id}
+            for ended in [key for key, old in self._sessions.items() if old.agent_id == agent_id]:
+                del self._sessions[ended]
+                self._replaced.append(ended)
             self._sessions[session.session_id] = session
             return Joined(session, self._store.highest_map_revision(agent_id), self._ledger.revision)
 
     def session(self, session_id: str) -> Session:
-        """The session of this id. Raises SessionUnknownError."""
+        """The session of this id. Raises SessionUnknownError, MismatchError when its agent has joined anew since.
+
+        No agent does that while it still uses the session, so the other one is a second robot of the same name; were
+        the first to join again, both would go on throwing each other out.
+        """
         with self._lock:
-            session = self._sessions.get(session_id)
+            session, replaced = self._sessions.get(session_id), session_id in self._replaced
+        if replaced:
+            raise MismatchError(
+                "session: another robot has joined under this name; give each its own agent id"
+            )
         if session is None:
             raise SessionUnknownError(f"session {shown(session_id)}: not known here; join, then send every voxel again")
         return session

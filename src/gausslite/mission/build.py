@@ -49,6 +49,13 @@ class Attentions:
         self._networks = open_networks(perception)
         self._executor: ThreadPoolExecutor | None = None
 
+    def require_sight(self) -> None:
+        """Raise InvalidInputError when there is neither file nor ground truth to find anything with."""
+        if self._networks is None and not self._scene().regions:
+            raise InvalidInputError(
+                "detector: the sequence has no ground-truth regions; name an ONNX file with --detector"
+            )
+
     def to(self, graph: TaskGraph) -> Attention:
         """Attention to a task: by the user's model files or, without one, by the scene's own ground truth.
 
@@ -64,10 +71,7 @@ class Attentions:
                 self._executor = self._executor or ThreadPoolExecutor(1, "detector")
                 return AttentionBeside(graph, detector, self._executor, settings, segmenter)
             return TaskAttention(graph, detector, settings, segmenter)
-        if not scene.regions:
-            raise InvalidInputError(
-                "detector: the sequence has no ground-truth regions; name an ONNX file with --detector"
-            )
+        self.require_sight()
         from gausslite.perception.ground_truth import RegionDetector
 
         return TaskAttention(graph, RegionDetector(scene.regions), settings)
