@@ -1,4 +1,4 @@
-"""Every rpc of the fusion service on a real server in process, and every error code that applies to it."""
+"""Joining, contributing and exporting on a real fusion server in process, and every error code that applies."""
 
 from __future__ import annotations
 
@@ -6,15 +6,12 @@ import threading
 from pathlib import Path
 
 import grpc
-import numpy as np
 import pytest
-from fusion_team import CAMERA, GRID, Team, frame, keys, request, said, team, words
-from grpc_health.v1 import health_pb2, health_pb2_grpc
+from fusion_team import GRID, frame, request, said, team, words
 
 from gausslite.codec.ply import gaussians_from_ply
-from gausslite.domain.camera import Camera
 from gausslite.domain.subset import RoiSubset
-from gausslite.domain.voxels import Box, VoxelGrid
+from gausslite.domain.voxels import VoxelGrid
 from gausslite.errors import (
     InvalidInputError,
     MismatchError,
@@ -24,7 +21,6 @@ from gausslite.errors import (
     UnavailableError,
 )
 from gausslite.fusion.memory import MemoryStore
-from gausslite.fusion.refine import RefineSettings
 from gausslite.fusion.sqlite import SqliteStore
 from gausslite.fusion.terms import Quotas, TeamSettings
 from gausslite.v1 import fusion_service_pb2 as pb
@@ -167,155 +163,6 @@ def test_a_fresh_map_and_a_forgotten_agent_leave_nothing() -> None:
         assert len(gaussians_from_ply(t.client.export(Export()))) == 0
 
 
-def test_a_watcher_gets_the_snapshot_and_then_what_changes() -> None:
-    with team() as t:
-        ant, bee = (t.client.join(name, GRID).session_id for name in ("ant", "bee"))
-        t.say(ant, said("ant", 1, {0: [5], 1: [1]}))
-        watch = t.client.watch()
-        first = next(watch)
-        assert first.snapshot
-        assert first.last
-        assert first.words.keys.tolist() == keys(0, 1).tolist()
-        assert first.winners == ("ant", "ant")
-        t.say(bee, said("bee", 1, {0: [1], 1: [2]}))
-        second = next(watch)
-        assert not second.snapshot
-        assert second.words.keys.tolist() == keys(1).tolist()
-        assert second.winners == ("bee",)
-        t.say(ant, said("ant", 2, {0: []}))
-        assert next(watch).winners == ("bee",)
-        t.client.leave(bee, forget=True)
-        third = next(watch)
-        assert dict(zip(third.words.keys.tolist(), third.words.counts.tolist(), strict=True)) == {
-            keys(0)[0]: 0,
-            keys(1)[0]: 1,
-        }
-        watch.close()
-        late = t.client.watch(first.revision)
-        summed_up = next(late)
-        assert not summed_up.snapshot
-        assert summed_up.revision == third.revision
-        assert summed_up.words.counts.tolist() == [0, 1]
-        late.close()
-        current = t.client.watch(third.revision)
-        nothing = next(current)
-        assert nothing.last
-        assert nothing.words is None
-        current.close()
-
-
-def test_a_watcher_of_a_region_sees_that_region_alone() -> None:
-    with team() as t:
-        session = t.client.join("ant", GRID).session_id
-        t.say(session, said("ant", 1, {0: [1], 5: [1]}))
-        watch = t.client.watch(region=Box((0.4, 0.0, 0.0), (0.6, 0.1, 2.0)))
-        assert next(watch).words.keys.tolist() == keys(5).tolist()
-        t.say(session, said("ant", 2, {0: []}))
-        assert next(watch).words is None
-        t.say(session, said("ant", 3, {5: []}))
-        assert next(watch).words.counts.tolist() == [0]
-        watch.close()
-        upside_down = pb.WatchFusedMapRequest()
-        upside_down.region.min_m.x = 1.0
-        with pytest.raises(grpc.RpcError) as caught:
-            next(t.stub.WatchFusedMap(upside_down))
-        assert caught.value.code() is grpc.StatusCode.INVALID_ARGUMENT
-
-
-def test_a_revision_of_another_life_is_out_of_range() -> None:
-    with team() as t:
-        for revision in (1, t.client.join("ant", GRID).fused_revision + 1000):
-            with pytest.raises(RevisionGoneError):
-                next(t.client.watch(revision))
-
-
-def test_a_large_map_comes_in_several_blocks_of_one_revision() -> None:
-    with team() as t:
-        session = t.client.join("ant", GRID).session_id
-        for part in range(3):
-            t.say(session, said("ant", part + 1, {cell: [1] * 8 for cell in range(part * 1000, part * 1000 + 1000)}))
-        blocks = []
-        for block in t.client.watch():
-            blocks.append(block)
-            if block.last:
-                break
-        assert len(blocks) > 1
-        assert len({block.revision for block in blocks}) == 1
-        assert [block.last for block in blocks] == [False] * (len(blocks) - 1) + [True]
-        assert np.concatenate([block.words.keys for block in blocks]).tolist() == keys(*range(3000)).tolist()
-
-
-def test_keyframes_are_kept_within_bounds_and_bad_ones_reported() -> None:
-    with team(settings=TeamSettings(grid=GRID, quotas=Quotas(keyframes_per_agent=2, keyframe_pixels=32 * 24))) as t:
-        session = t.client.join("ant", GRID).session_id
-        large = Camera(40.0, 40.0, 32.0, 12.0, 64, 24)
-        assert t.client.contribute_keyframes(session, [frame(1), frame(2), frame(3), frame(3), frame(4, large)]) == 4
-        status = t.client.status()
-        assert status.keyframes == status.agents[0].keyframes == 2
-        broken = pb.ContributeKeyframesRequest(session_id=session)
-        broken.keyframe.index = 77
-        answer = t.stub.ContributeKeyframes(iter([broken]))
-        assert answer.accepted == 0
-        assert answer.rejected[0].index == 77
-        assert answer.rejected[0].reason
-
-
-def contributed(t: Team) -> str:
-    session = t.client.join("ant", GRID).session_id
-    t.say(session, said("ant", 1, {cell: [3] * 4 for cell in (-1, 0, 1)}))
-    t.client.contribute_keyframes(session, [frame(1), frame(2)])
-    return session
-
-
-def test_refinement_reports_ends_and_lies_over_the_vote() -> None:
-    with team() as t:
-        with pytest.raises(MismatchError, match="refined map"):
-            t.client.export(Export("refined"))
-        session = contributed(t)
-        progress = list(t.client.refine(iterations=4))
-        assert [p.done for p in progress] == [False] * (len(progress) - 1) + [True]
-        assert progress[-1].iteration == progress[-1].iterations == 4
-        assert t.client.status().refined
-        refined, voted = (gaussians_from_ply(t.client.export(Export(name))) for name in ("refined", "vote"))
-        assert refined.rgb.tobytes() != voted.rgb.tobytes()
-        t.say(session, said("ant", 2, {0: [90]}))
-        assert sorted(gaussians_from_ply(t.client.export(Export("refined"))).kappa.tolist())[-1] == 90
-        with pytest.raises(InvalidInputError, match="expected none with REFINED"):
-            t.client.export(Export("refined", "ant"))
-
-
-def test_closing_the_refinement_cancels_it_and_another_can_start() -> None:
-    with team(refine=RefineSettings(iterations=20_000, report_every=1)) as t:
-        contributed(t)
-        running = t.client.refine()
-        assert next(running).iteration >= 1
-        with pytest.raises(QuotaError, match="one at a time"):
-            list(t.client.refine(iterations=1))
-        running.close()
-        while True:
-            try:
-                assert list(t.client.refine(iterations=1))[-1].done
-                break
-            except QuotaError:
-                continue
-        with pytest.raises(QuotaError, match="iterations"):
-            list(t.client.refine(iterations=2_000_000_000))
-
-
-def test_a_refinement_without_anything_to_learn_from_is_refused() -> None:
-    with team() as t:
-        with pytest.raises(MismatchError, match="0 Gaussians and 0 keyframes"):
-            list(t.client.refine())
-        session = t.client.join("ant", GRID).session_id
-        t.say(session, said("ant", 1, {0: [1]}))
-        with pytest.raises(MismatchError, match="1 Gaussians and 0 keyframes"):
-            list(t.client.refine())
-        behind = np.diag([1.0, -1.0, -1.0, 1.0])
-        t.client.contribute_keyframes(session, [frame(1, CAMERA, behind)])
-        with pytest.raises(InvalidInputError, match="of which none does"):
-            list(t.client.refine())
-
-
 def test_an_export_of_nobody_or_of_no_strategy_is_invalid() -> None:
     with team() as t:
         with pytest.raises(InvalidInputError, match="no agents yet"):
@@ -388,15 +235,3 @@ def test_a_draining_server_ends_open_streams_and_takes_no_more() -> None:
         with pytest.raises(grpc.RpcError) as caught:
             t.stub.GetSessionStatus(pb.GetSessionStatusRequest())
         assert caught.value.code() is grpc.StatusCode.UNAVAILABLE
-
-
-def test_health_answers_while_a_refinement_runs() -> None:
-    with team(refine=RefineSettings(iterations=20_000, report_every=1)) as t:
-        contributed(t)
-        running = t.client.refine()
-        next(running)
-        check = health_pb2_grpc.HealthStub(t.channel).Check
-        for _ in range(3):
-            answer = check(health_pb2.HealthCheckRequest(service="gausslite.v1.FusionService"), timeout=5)
-            assert answer.status == health_pb2.HealthCheckResponse.SERVING
-        running.close()

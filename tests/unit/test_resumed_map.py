@@ -1,0 +1,78 @@
+"""`gausslite map --resume` goes on after the last frame, and says in one line what keeps it from that."""
+
+from __future__ import annotations
+
+import json
+import struct
+import zlib
+from pathlib import Path
+
+import pytest
+from tiny_sequences import write_seven_scenes
+
+from gausslite.cli.main import main
+from gausslite.codec.state_file import MAGIC, VERSION
+
+HEAD = struct.pack("<8sIIQ", MAGIC, VERSION, 0, 28)
+EMPTY = HEAD + struct.pack("<I", zlib.crc32(HEAD))
+
+
+def map_command(folder: Path, out: Path, *more: str) -> list[str]:
+    common = ["--roi-ball", "0,0,2,0.4", "--threads", "1", "--max-gaussians", "150"]
+    return ["map", str(folder), *common, "--out", str(out), *more]
+
+
+@pytest.mark.parametrize("contents", [None, b"", b"remember the milk", MAGIC, EMPTY])
+def test_the_command_line_says_it_in_one_line(
+    contents: bytes | None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "run.state"
+    if contents is not None:
+        path.write_bytes(contents)
+    sequence = write_seven_scenes(tmp_path / "kitchen")
+    assert main(map_command(sequence, tmp_path / "out", "--resume", str(path))) == 2
+    [line] = capsys.readouterr().err.splitlines()
+    assert "run.state" in line
+
+
+def test_other_options_are_told_before_anything_is_done(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    sequence = write_seven_scenes(tmp_path / "kitchen")
+    state = str(tmp_path / "run.state")
+    assert main(map_command(sequence, tmp_path / "out", "--save-state", state)) == 0
+    capsys.readouterr()
+    for options, told in (
+        (("--max-gaussians", "149"), "--max-gaussians '150' (got '149')"),
+        (("--size", "32x24"), "--size '"),
+        (("--rate", "5"), "--rate 'default' (got '5')"),
+        (("--policy", "uniform"), "--policy 'task' (got 'uniform')"),
+        (("--roi-ball", "0,0,1,0.4"), "--roi-ball '0.0,0.0,2.0,0.4' (got '0.0,0.0,2.0,0.4 0.0,0.0,1.0,0.4')"),
+    ):
+        assert main(map_command(sequence, tmp_path / "other", *options, "--resume", state)) == 2
+        [line] = capsys.readouterr().err.splitlines()
+        assert told in line
+    assert not (tmp_path / "other").exists()
+    more = ("--resume", state, "--task", "Find the mug")
+    assert main(["map", str(sequence), "--threads", "1", "--out", str(tmp_path / "other"), *more]) == 2
+    assert "--task '' (got 'Find the mug')" in capsys.readouterr().err
+
+
+def test_the_command_line_goes_on_after_the_last_frame(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    sequence = write_seven_scenes(tmp_path / "kitchen", tuple(range(0, 24, 4)))
+
+    def map_frames(name: str, *more: str) -> tuple[bytes, dict[str, object]]:
+        assert main(map_command(sequence, tmp_path / name, *more)) == 0
+        report = json.loads((tmp_path / name / "report.json").read_text())
+        return (tmp_path / name / "map.ply").read_bytes(), report
+
+    state = str(tmp_path / "states" / "run.state")
+    whole, report = map_frames("whole")
+    map_frames("first", "--frames", "0:12", "--save-state", state)
+    resumed, rest = map_frames("rest", "--resume", state)
+    assert resumed == whole
+    assert (report["frames"], rest["frames"], rest["resumed_from"]) == (6, 3, state)
+    memory = report["memory_mib"]
+    assert isinstance(memory, dict)
+    assert memory["table"] == pytest.approx(150 * 73 / 2**20, abs=1e-6)
+    assert memory["optimizer"] == pytest.approx(150 * 128 / 2**20, abs=1e-6)
+    assert memory["keyframes"] > 0
+    capsys.readouterr()
