@@ -43,10 +43,8 @@ def base_of_s(word: str) -> str | None:
 
 def base_of_ing(word: str) -> str | None:
     """From "sitting" and "placing" to "sit" and "place"."""
-    if word in _ODD_SPELLINGS:
-        return _ODD_SPELLINGS[word]
     if word.endswith("ying"):
-        return _known(word[:-3], word[:-4] + "ie")
+        return _known(word[:-3], word[:-3] + "e", word[:-4] + "ie")
     return _stem(word[:-3]) if word.endswith("ing") else None
 
 
