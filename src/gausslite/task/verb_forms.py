@@ -27,13 +27,10 @@ _IRREGULAR: Final = {
     "swung": "swing", "done": "do", "lent": "lend", "hurt": "hurt",
     "sprung": "spring", "woven": "weave", "strewn": "strew",
 }  # fmt: skip
-_ODD_SPELLINGS: Final = {"does": "do", "goes": "go", "undoes": "undo"}
 
 
 def base_of_s(word: str) -> str | None:
     """From "holds" and "carries" to "hold" and "carry"; None for what is no such form of a known verb."""
-    if word in _ODD_SPELLINGS:
-        return _ODD_SPELLINGS[word]
     if word.endswith("ies"):
         return _known(word[:-3] + "y", word[:-1])
     if word.endswith("es"):
