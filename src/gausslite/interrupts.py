@@ -11,6 +11,8 @@ import signal
 import threading
 from types import FrameType, TracebackType
 
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
 
 class _QuietEnd:
     """A signal handler that ends the process at once; nothing that would need closing has been opened yet."""
@@ -25,7 +27,7 @@ class _QuietEnd:
 
 def end_quietly_while_starting(program: str) -> None:
     """From now on SIGINT and SIGTERM end the process with code 130 or 143. Call it on the main thread."""
-    for number in (signal.SIGINT, signal.SIGTERM):
+    for number in _SIGNALS:
         signal.signal(number, _QuietEnd(program))
 
 
@@ -37,29 +39,36 @@ def started() -> None:
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
-class AfterThisStep:
-    """Within it the first Ctrl-C is only noted, so that the step at hand is finished and what was made can be kept.
+class Terminated(KeyboardInterrupt):
+    """SIGTERM, as what Ctrl-C is to Python."""
 
-    A second Ctrl-C interrupts as ever. Away from the main thread, which alone may take signals, nothing changes.
+
+class AfterThisStep:
+    """Within it the first Ctrl-C or SIGTERM is only noted, so that the step at hand is finished and kept.
+
+    asked is then what to raise in the end; a second signal raises it at once. Away from the main thread, which alone
+    may take signals, nothing changes.
     """
 
     def __init__(self) -> None:
-        self.asked = False
+        self.asked: KeyboardInterrupt | None = None
         self._takes_signals = threading.current_thread() is threading.main_thread()
-        self._before = signal.getsignal(signal.SIGINT)
+        self._before = {number: signal.getsignal(number) for number in _SIGNALS}
 
     def __enter__(self) -> AfterThisStep:
         if self._takes_signals:
-            signal.signal(signal.SIGINT, self._note)
+            for number in _SIGNALS:
+                signal.signal(number, self._note)
         return self
 
     def __exit__(
         self, _kind: type[BaseException] | None, _error: BaseException | None, _: TracebackType | None
     ) -> None:
         if self._takes_signals:
-            signal.signal(signal.SIGINT, self._before)
+            for number, handler in self._before.items():
+                signal.signal(number, handler)
 
-    def _note(self, _number: int, _frame: FrameType | None) -> None:
-        if self.asked:
-            raise KeyboardInterrupt
-        self.asked = True
+    def _note(self, number: int, _frame: FrameType | None) -> None:
+        if self.asked is not None:
+            raise self.asked
+        self.asked = Terminated() if number == signal.SIGTERM else KeyboardInterrupt()

@@ -22,8 +22,9 @@ def mapped(sequence: Path, out: Path, *more: str) -> int:
     return main(["map", str(sequence), *common, "--out", str(out), *more])
 
 
-def test_ctrl_c_ends_after_the_frame_at_hand_and_the_run_can_go_on(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_ends_the_run_after_the_frame_at_hand_and_it_can_go_on(
+    number: signal.Signals, code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     sequence = write_seven_scenes(tmp_path / "kitchen", tuple(range(0, 24, 4)))
     state = str(tmp_path / "run.state")
@@ -32,12 +33,12 @@ def test_ctrl_c_ends_after_the_frame_at_hand_and_the_run_can_go_on(
 
     def read_and_press(source: SevenScenesSource, position: int, size: tuple[int, int]) -> Frame:
         if position == 2:
-            signal.raise_signal(signal.SIGINT)
+            signal.raise_signal(number)
         return read(source, position, size)
 
     with monkeypatch.context() as patched:
         patched.setattr(SevenScenesSource, "frame", read_and_press)
-        assert mapped(sequence, tmp_path / "first", "--save-state", state) == 130
+        assert mapped(sequence, tmp_path / "first", "--save-state", state) == code
     report = json.loads((tmp_path / "first" / "report.json").read_text())
     assert (report["frames"], report["stopped_by"]) == (3, "interrupted")
     assert mapped(sequence, tmp_path / "rest", "--resume", state) == 0

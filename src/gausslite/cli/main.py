@@ -12,7 +12,7 @@ from collections.abc import Sequence
 
 from gausslite import __version__
 from gausslite.errors import GaussLiteError
-from gausslite.interrupts import started
+from gausslite.interrupts import Terminated, started
 
 _COMMANDS = {
     "map": "map one sequence for one task, write map.ply and report.json",
@@ -38,6 +38,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _fail(str(error))
     except OSError as error:
         return _fail(_describe(error))
+    except Terminated:
+        print("gausslite: terminated", file=sys.stderr)
+        return 143
     except KeyboardInterrupt:
         print("gausslite: interrupted", file=sys.stderr)
         return 130

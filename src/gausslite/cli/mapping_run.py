@@ -1,4 +1,4 @@
-"""Play a sequence to a mapping loop until its end, a damaged frame or Ctrl-C, and sum up what became of it."""
+"""Play a sequence to a mapping loop until its end, a damaged frame, Ctrl-C or SIGTERM, and sum up what became of it."""
 
 from __future__ import annotations
 
@@ -59,8 +59,8 @@ class MappingRun:
         indices = self.source.indices()
         with MappingBar(len(positions)) as bar, AfterThisStep() as interrupt:
             for position in positions:
-                if interrupt.asked:
-                    stopped = KeyboardInterrupt()
+                if interrupt.asked is not None:
+                    stopped = interrupt.asked
                     break
                 try:
                     frame = self.source.frame(position, self.size)

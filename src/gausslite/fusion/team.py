@@ -136,9 +136,7 @@ class TeamMap:
         with self._lock:
             session, replaced = self._sessions.get(session_id), session_id in self._replaced
         if replaced:
-            raise MismatchError(
-                "session: another robot has joined under this name; give each its own agent id"
-            )
+            raise MismatchError("session: another robot has joined under this name; give each its own agent id")
         if session is None:
             raise SessionUnknownError(f"session {shown(session_id)}: not known here; join, then send every voxel again")
         return session
