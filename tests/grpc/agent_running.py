@@ -43,6 +43,7 @@ class Gate:
     inner: Attention
     opened: threading.Event
     fail_at: int | None = None
+    failure: Exception = field(default_factory=lambda: ZeroDivisionError("a bug"))
     reached: threading.Event = field(default_factory=threading.Event)
 
     @property
@@ -53,7 +54,7 @@ class Gate:
         self.reached.set()
         assert self.opened.wait(20)
         if frame.index == self.fail_at:
-            raise ZeroDivisionError("a bug")
+            raise self.failure
         return self.inner.attend(frame, rendered_depth_m)
 
     def late(self) -> None:

@@ -100,6 +100,21 @@ def test_frames_that_wait_when_the_agent_ends_are_dropped() -> None:
         robot.do(lambda mapper: mapper.count)
 
 
+def test_a_frame_that_cannot_be_mapped_is_rejected_and_the_stream_goes_on() -> None:
+    opened = threading.Event()
+    opened.set()
+    fussy = Gate(
+        ball_attention(RuleParser().parse(TASK)), opened, fail_at=1, failure=InvalidInputError("points: too far")
+    )
+    with agent(lambda _graph: fussy) as a:
+        a.client.assign_task(TASK)
+        outcomes = list(a.client.ingest([frame(i, CAMERA) for i in range(3)]))
+        assert a.client.status().frames_rejected == 1
+    mapped, rejected = pb.FRAME_OUTCOME_MAPPED, pb.FRAME_OUTCOME_REJECTED
+    assert [each.outcome for each in outcomes] == [mapped, rejected, mapped]
+    assert outcomes[1].reason == "points: too far"
+
+
 def test_a_spool_without_room_ends_no_mission_and_all_is_told_once_it_has_some(tmp_path: Path) -> None:
     store, spool = MemoryStore(), Spool(tmp_path / "robot.spool", "robot", GRID)
     with team(store) as fusion:

@@ -23,7 +23,7 @@ from gausslite.domain.subset import VoxelWords
 from gausslite.domain.task import TaskGraph
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.domain.words import words_of
-from gausslite.errors import MismatchError, StorageError, UnavailableError
+from gausslite.errors import InvalidInputError, MismatchError, StorageError, UnavailableError
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.pace import Pace, Relief
 from gausslite.mapping.roi import RoiLedger
@@ -193,6 +193,9 @@ class Robot:
             frame, future = self._waiting.popleft()
         try:
             future.set_result(self._map(frame))
+        except InvalidInputError as error:
+            # such as a pose so far off that its voxels have no numbers: the frames after it may be fine
+            future.set_result(self.reject(frame.index, str(error)))
         except Exception as error:
             # the one who waits for this frame is told; the worker goes on
             future.set_exception(error)
