@@ -118,7 +118,7 @@ def test_prune_drops_the_transparent() -> None:
     table = table_of([0.1] * 3, [0.0] * 3, capacity=4)
     table.rows[:, LOGIT] = (-6.0, 0.0, -5.0)
     assert prune(table, SETTINGS) == 1
-    assert table.target.tolist() == [1, 2]
+    assert sorted(table.target.tolist()) == [1, 2]
 
 
 def test_an_empty_table_survives_both() -> None:

@@ -6,6 +6,8 @@ import itertools
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from gausslite.errors import InvalidInputError
 from gausslite.mapping.pace import FrameBudget, Pace, PaceSettings, Relief, Step, choose_reliefs
@@ -73,7 +75,7 @@ def test_a_frame_ends_in_its_time_up_to_one_iteration(seed: int) -> None:
 
 def test_time_that_is_left_is_filled() -> None:
     clock = WorkClock()
-    pace = Pace(PaceSettings(100.0), clock)
+    pace = Pace(PaceSettings(100.0, 4), clock)
     counts = [run_frame(pace, clock, CHEAP)[1] for _ in range(20)]
     # four fixed steps, the words at the end, and no room left for one more
     assert counts[-1] == 94
@@ -82,7 +84,7 @@ def test_time_that_is_left_is_filled() -> None:
 
 def test_the_steps_add_up_to_the_frame() -> None:
     clock = WorkClock()
-    budget, done = run_frame(Pace(PaceSettings(50.0), clock), clock, CHEAP)
+    budget, done = run_frame(Pace(PaceSettings(50.0, 4), clock), clock, CHEAP)
     assert sum(budget.steps_s.values()) == pytest.approx(budget.seconds)
     assert budget.steps_s[Step.WARM_UP] + budget.steps_s[Step.ACTIVE] == pytest.approx(done)
 
@@ -90,15 +92,45 @@ def test_the_steps_add_up_to_the_frame() -> None:
 def test_reliefs_give_way_in_their_order_and_only_as_far_as_needed() -> None:
     # five fixed steps and four iterations cost 9, the words 1 of it and drawing with seeding 2
     for budget_s, expected in ((9.0, set()), (8.0, {Relief.WORDS}), (7.0, {Relief.WORDS, Relief.SEEDING})):
-        assert choose_reliefs(PaceSettings(budget_s), CHEAP, frozenset()) == expected
-    first_seeding = PaceSettings(8.0, reliefs=(Relief.SEEDING, Relief.WORDS))
-    assert choose_reliefs(first_seeding, CHEAP, frozenset()) == {Relief.SEEDING}
-    assert choose_reliefs(PaceSettings(1.0, reliefs=()), CHEAP, frozenset()) == frozenset()
+        assert choose_reliefs(PaceSettings(budget_s, 4), CHEAP, frozenset(), 2) == expected
+    first_seeding = PaceSettings(8.0, 4, reliefs=(Relief.SEEDING, Relief.WORDS))
+    assert choose_reliefs(first_seeding, CHEAP, frozenset(), 2) == {Relief.SEEDING}
+    assert choose_reliefs(PaceSettings(1.0, reliefs=()), CHEAP, frozenset(), 2) == frozenset()
+
+
+@given(st.integers(0, 30), st.integers(0, 30), st.floats(1.0, 20.0))
+def test_the_least_iterations_cost_the_opening_warm_ups_and_the_regions_own(
+    least: int, opening: int, warm_up_s: float
+) -> None:
+    costs = {**CHEAP, Step.WARM_UP: warm_up_s}
+    needed_s = 5.0 + min(opening, least) * warm_up_s + max(0, least - opening)
+    for spare_s, reliefs in ((1e-6, frozenset()), (-1e-6, frozenset({Relief.WORDS}))):
+        assert choose_reliefs(PaceSettings(needed_s + spare_s, least), costs, frozenset(), opening) == reliefs
+
+
+@pytest.mark.parametrize(
+    ("done", "left_s", "expected"), [(0, 60.0, True), (5, 19.5, True), (5, 18.5, False), (13, 10.5, False)]
+)
+def test_a_warm_up_is_affordable_while_the_least_iterations_still_fit_after_it(
+    done: int, left_s: float, expected: bool
+) -> None:
+    clock = WorkClock()
+    pace = Pace(PaceSettings(60.0, 15), clock)
+    for step, seconds in ((Step.WARM_UP, 10.0), (Step.ACTIVE, 1.0)):
+        with pace.timing(step):
+            clock.work(seconds)
+    begun_s = clock.now_s
+    pace.begin()
+    for _ in range(done):
+        with pace.timing(Step.ACTIVE):
+            clock.work(1.0)
+    clock.now_s = begun_s + 60.0 - left_s
+    assert pace.affords(Step.WARM_UP, Step.ACTIVE) is expected
 
 
 def test_under_lasting_overload_nothing_is_left_out_twice_on_end_and_short_frames_are_counted() -> None:
     clock = WorkClock()
-    pace = Pace(PaceSettings(5.0), clock)
+    pace = Pace(PaceSettings(5.0, 4), clock)
     budgets = [run_frame(pace, clock, {**CHEAP, Step.SEEDING: 10.0})[0] for _ in range(20)]
     for before, after in itertools.pairwise(budgets):
         assert not before.reliefs & after.reliefs
@@ -109,7 +141,7 @@ def test_under_lasting_overload_nothing_is_left_out_twice_on_end_and_short_frame
 
 def test_a_step_that_was_dear_once_is_tried_again() -> None:
     clock = WorkClock()
-    pace = Pace(PaceSettings(20.0), clock)
+    pace = Pace(PaceSettings(20.0, 4), clock)
     with pace.timing(Step.DENSITY):
         clock.work(30.0)
     assert not pace.has_time_for(Step.DENSITY)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from test_parameters import some_gaussians
 
 from gausslite.domain.gaussians import Gaussians
@@ -136,3 +137,12 @@ def test_applying_all_changes_in_order_rebuilds_the_whole() -> None:
         int(key): (int(kappa), int(count))
         for key, kappa, count in zip(whole.keys, whole.kappa_sums, whole.counts, strict=True)
     }
+
+
+@pytest.mark.parametrize(("reach_m", "in_16_bits"), [(0.0, True), (0.9, True), (50.0, False)])
+def test_short_keys_are_in_the_order_of_the_keys(reach_m: float, in_16_bits: bool) -> None:
+    points_m = np.random.default_rng(0).uniform(-reach_m, reach_m, (400, 3)).astype(np.float32)
+    keys = VoxelGrid().keys(points_m)
+    short = VoxelGrid().short_keys(keys)
+    assert (short.dtype == np.uint16) is in_16_bits
+    np.testing.assert_array_equal(np.argsort(short, kind="stable"), np.argsort(keys, kind="stable"))

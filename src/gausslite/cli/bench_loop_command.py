@@ -15,7 +15,7 @@ from gausslite.datasets.source import Source
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.errors import InvalidInputError
 from gausslite.evaluation.bench_gap import RateGap
-from gausslite.evaluation.bench_loop import FrameCost, Latency, LoopBench, LoopTiming, overhead_percent
+from gausslite.evaluation.bench_loop import FrameCost, Latency, LoopBench, LoopTiming, Overhead
 from gausslite.evaluation.bench_memory import MemoryTrend, back_and_forth, resident_mib
 from gausslite.evaluation.held_out import HoldOut
 from gausslite.evaluation.views import HeldOutView
@@ -71,7 +71,7 @@ def run(options: argparse.Namespace) -> int:
     bench, costs, memory = _play(options, source, mapped, rasterizer)
     timing = LoopTiming.of(costs)
     gap = None if options.unlimited is None else _gap(options, source, positions, held_out, bench)
-    overhead = overhead_percent(costs, rasterizer)
+    overhead = Overhead.of(costs, rasterizer)
     if options.json:
         report = {
             "source": options.source,
@@ -80,7 +80,9 @@ def run(options: argparse.Namespace) -> int:
             "rate": options.rate,
             **asdict(timing),
             "frames_skipped": len(mapped) - len(costs),
-            "overhead_percent": overhead,
+            "overhead_percent": None if overhead is None else overhead.all,
+            "overhead_full_image_percent": None if overhead is None else overhead.full_image,
+            "overhead_region_percent": None if overhead is None else overhead.region,
             "memory": None if memory is None else asdict(memory),
             "rate_gap": None if gap is None else {**asdict(gap), "gap_db": gap.gap_db},
             "peak_rss_mib": peak_rss_mib(),
@@ -89,7 +91,7 @@ def run(options: argparse.Namespace) -> int:
         return 0
     print(f"{options.source} at {size[0]}x{size[1]}\n{loop_lines(timing)}")
     if overhead is not None:
-        print(f"  {overhead:.1f} % of the time of iterations is spent outside the kernels")
+        print(overhead_line(overhead))
     if gap is not None:
         print(
             f"  ROI PSNR on {gap.views} held-out views: {gap.in_time_db:.2f} dB; with {gap.iterations} iterations a "
@@ -160,6 +162,13 @@ def _check_gap(options: argparse.Namespace, source: Source, held_out: Sequence[i
 
 def _says_what_matters(options: argparse.Namespace) -> bool:
     return bool(options.task or options.roi or options.objects or options.roi_ball)
+
+
+def overhead_line(overhead: Overhead) -> str:
+    """How much of the iterations' time the kernels do not have."""
+    parts = (("full images", overhead.full_image), ("the region", overhead.region))
+    apart = ", ".join(f"on {name} {share:.1f} %" for name, share in parts if share is not None)
+    return f"  {overhead.all:.1f} % of the time of iterations is spent outside the kernels: {apart}"
 
 
 def loop_lines(timing: LoopTiming) -> str:

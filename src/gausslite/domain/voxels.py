@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float32, Int64
+from jaxtyping import Bool, Float32, Int64, UInt16
 from numpy import ndarray
 
 from gausslite.errors import InvalidInputError
@@ -44,6 +44,22 @@ class VoxelGrid:
         """The (i, j, k) of the voxels with these keys."""
         ijk = np.stack([(keys >> (2 * _BITS_PER_AXIS)) & _MASK, (keys >> _BITS_PER_AXIS) & _MASK, keys & _MASK], axis=1)
         return ijk - _OFFSET
+
+    def short_keys(self, keys: Int64[ndarray, " n"]) -> Int64[ndarray, " n"] | UInt16[ndarray, " n"]:
+        """Numbers in the order of these keys, in 16 bits where the voxels lie close enough: those sort much faster."""
+        if len(keys) == 0:
+            return keys
+        axes = keys >> (2 * _BITS_PER_AXIS), (keys >> _BITS_PER_AXIS) & _MASK, keys & _MASK
+        (first_i, count_i), (first_j, count_j), (first_k, count_k) = (
+            (low := int(axis.min()), int(axis.max()) - low + 1) for axis in axes
+        )
+        if count_i * count_j * count_k > 1 << 16:
+            return keys
+        i, j, k = axes
+        short: UInt16[ndarray, " n"] = (((i - first_i) * count_j + j - first_j) * count_k + k - first_k).astype(
+            np.uint16
+        )
+        return short
 
     def centres_m(self, keys: Int64[ndarray, " n"]) -> Float32[ndarray, "n 3"]:
         """The centres of the voxels with these keys."""

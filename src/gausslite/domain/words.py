@@ -35,7 +35,7 @@ class Occupied:
     def by(cls, points_m: Float32[ndarray, "n 3"], grid: VoxelGrid) -> Occupied:
         """Sort points into voxels. Raises InvalidInputError for points out of the grid's reach."""
         keys = grid.keys(points_m)
-        rows = np.argsort(keys, kind="stable")
+        rows = np.argsort(grid.short_keys(keys), kind="stable")
         keys = keys[rows]
         first = np.ones(len(keys), np.bool_)
         np.not_equal(keys[1:], keys[:-1], out=first[1:])

@@ -131,12 +131,22 @@ class LoopBench:
         return FrameCost(outcome.budget, outcome.iterations, outcome.gaussians, outcome.roi_share)
 
 
-def overhead_percent(costs: Sequence[FrameCost], rasterizer: Rasterizer) -> float | None:
-    """The share of these frames' iterations that passed outside the kernels' steps, which must be all that it ever ran.
+@dataclass(frozen=True, slots=True)
+class Overhead:
+    """The percentage of iterations' time that passes outside the kernels' steps; None where there was no such step."""
 
-    None for a backend without a clock.
-    """
-    total_s = sum(cost.of(Step.WARM_UP) + cost.of(Step.ACTIVE) for cost in costs)
-    if not isinstance(rasterizer, CpuRasterizer) or total_s == 0.0:
-        return None
-    return 100.0 * (1.0 - rasterizer.steps_s() / total_s)
+    all: float
+    full_image: float | None
+    region: float | None
+
+    @classmethod
+    def of(cls, costs: Sequence[FrameCost], rasterizer: Rasterizer) -> Overhead | None:
+        """Of these frames, whose steps must be all that the rasterizer ever ran; None for a backend without a clock."""
+        full_s, region_s = (sum(cost.of(step) for cost in costs) for step in (Step.WARM_UP, Step.ACTIVE))
+        if not isinstance(rasterizer, CpuRasterizer) or full_s + region_s == 0.0:
+            return None
+        return cls(
+            all=100.0 * (1.0 - rasterizer.steps_s() / (full_s + region_s)),
+            full_image=None if full_s == 0.0 else 100.0 * (1.0 - rasterizer.steps_s(masked=False) / full_s),
+            region=None if region_s == 0.0 else 100.0 * (1.0 - rasterizer.steps_s(masked=True) / region_s),
+        )

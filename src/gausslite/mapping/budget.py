@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
-from jaxtyping import Bool, Int64
+from jaxtyping import Float32, Int64
 from numpy import ndarray
 
 from gausslite.domain.gaussians import Gaussians
@@ -21,9 +23,8 @@ def insert(table: SplatTable, seeds: Seeds, newborn_opacity: float, rng: np.rand
     full table is not moved about.
     """
     roi = seeds.roi.take(_at_random(len(seeds.roi), table.capacity, rng))
-    _settle(table, roi, _giving_way(table, np.ones(table.count, np.bool_), len(roi) - table.room))
-    fainter = ~table.active & (table.opacities < newborn_opacity)
-    giving_way = _giving_way(table, fainter, len(seeds.rest) - table.room)
+    _settle(table, roi, _giving_way(table, None, len(roi) - table.room))
+    giving_way = _giving_way(table, newborn_opacity, len(seeds.rest) - table.room)
     rest = seeds.rest.take(_at_random(len(seeds.rest), table.room + len(giving_way), rng))
     _settle(table, rest, giving_way)
     return len(roi) + len(rest)
@@ -35,25 +36,36 @@ def _settle(table: SplatTable, seeds: Gaussians, rows: Int64[ndarray, " m"]) -> 
     table.append(seeds.take(np.arange(len(rows), len(seeds))))
 
 
-def _giving_way(table: SplatTable, candidates: Bool[ndarray, " n"], count: int) -> Int64[ndarray, " k"]:
-    """Up to `count` of the candidates: an earlier task's surplus, the other inactive ones, the active ones."""
-    inactive, worked_on = candidates & ~table.active, table.kappa > 0
+def _giving_way(table: SplatTable, below_opacity: float | None, count: int) -> Int64[ndarray, " k"]:
+    """Up to `count` rows: an earlier task's surplus, the other inactive ones, the active ones.
+
+    below_opacity: only inactive ones more transparent than this.
+    """
     chosen = np.zeros(0, np.int64)
-    for group in (inactive & worked_on, inactive & ~worked_on, candidates & table.active):
-        faintest = _faintest_of(table, np.flatnonzero(group), count - len(chosen))
+    if count <= 0:
+        return chosen
+    logits, worked_on = table.rows[:, LOGIT].copy(), table.kappa > 0
+    inactive = ~table.active
+    if below_opacity is not None:
+        inactive &= logits < math.log(below_opacity) - math.log1p(-below_opacity)
+    groups = [inactive & worked_on, inactive & ~worked_on]
+    if below_opacity is None:
+        groups.append(table.active)
+    for group in groups:
+        faintest = _faintest_of(logits, np.flatnonzero(group), count - len(chosen))
         chosen = np.concatenate([chosen, faintest])
     return chosen
 
 
-def _faintest_of(table: SplatTable, rows: Int64[ndarray, " m"], count: int) -> Int64[ndarray, " k"]:
+def _faintest_of(logits: Float32[ndarray, " n"], rows: Int64[ndarray, " m"], count: int) -> Int64[ndarray, " k"]:
     """Up to `count` of these ascending rows, the most transparent; of equal ones the earlier."""
     if count >= len(rows):
         return rows
     if count <= 0:
         return rows[:0]
-    logits = table.rows[rows, LOGIT]
-    limit = np.partition(logits, count - 1)[count - 1]
-    below, level = np.flatnonzero(logits < limit), np.flatnonzero(logits == limit)
+    among = logits[rows]
+    limit = np.partition(among, count - 1)[count - 1]
+    below, level = np.flatnonzero(among < limit), np.flatnonzero(among == limit)
     faintest: Int64[ndarray, " k"] = rows[np.concatenate([below, level[: count - len(below)]])]
     return faintest
 

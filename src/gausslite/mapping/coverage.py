@@ -53,6 +53,8 @@ def too_coarse(
 
     This is what makes a region that was first mapped as background (the detector saw it late) the task's own.
     """
+    if not region.any():
+        return np.zeros_like(region)
     height, width = region.shape
     shape = (-(-height // _CELL_PX), -(-width // _CELL_PX))
     rows, columns = np.nonzero(region & (frame.depth_m > 0))
@@ -70,11 +72,12 @@ def seen_at(
     """Which of the means lie on the surface that the frame sees (ascending), and their pixels' rows and columns."""
     points = transform_points(inverse(frame.T_world_camera), means_m)
     ids = np.flatnonzero(points[:, 2] > NEAR_M)
-    points = points[ids]
-    columns, rows = np.floor(project(points, frame.camera)).astype(np.int64).T
+    points = points.take(ids, axis=0)
+    x_px, y_px = np.ascontiguousarray(project(points, frame.camera).T)
     height, width = frame.depth_m.shape
-    inside = (rows >= 0) & (rows < height) & (columns >= 0) & (columns < width)
-    ids, rows, columns, z_m = ids[inside], rows[inside], columns[inside], points[inside, 2]
+    inside = np.flatnonzero((y_px >= 0) & (y_px < height) & (x_px >= 0) & (x_px < width))
+    ids, z_m = ids[inside], points[inside, 2]
+    rows, columns = y_px[inside].astype(np.int64), x_px[inside].astype(np.int64)
     depth_m = frame.depth_m[rows, columns]
     on_surface = np.abs(z_m - depth_m) < _SAME_SURFACE * depth_m
     return ids[on_surface], rows[on_surface], columns[on_surface]

@@ -101,9 +101,11 @@ def _well_inside(tiles: Bool[ndarray, "th tw"], shape: tuple[int, ...]) -> Bool[
 def tiles_of(region: Bool[ndarray, "h w"], margin_px: int) -> Bool[ndarray, "th tw"]:
     """The tiles that touch the region grown by margin_px."""
     kernel = np.ones((2 * margin_px + 1, 2 * margin_px + 1), np.uint8)
-    grown = cv2.dilate(region.astype(np.uint8), kernel)
-    by_rows = np.maximum.reduceat(grown, np.arange(0, grown.shape[0], TILE_PX), axis=0)
-    tiles: Bool[ndarray, "th tw"] = np.maximum.reduceat(by_rows, np.arange(0, grown.shape[1], TILE_PX), axis=1) > 0
+    grown = cv2.dilate(region.view(np.uint8), kernel)
+    height, width = region.shape
+    filled = np.pad(grown, ((0, -height % TILE_PX), (0, -width % TILE_PX)))
+    by_rows = filled.reshape(-1, TILE_PX, filled.shape[1]).max(axis=1)
+    tiles: Bool[ndarray, "th tw"] = by_rows.reshape(len(by_rows), -1, TILE_PX).any(axis=2)
     return tiles
 
 

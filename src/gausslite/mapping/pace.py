@@ -49,12 +49,13 @@ _FIXED = (Step.DRAWING, Step.ATTENTION, Step.VIEW, Step.SEEDING, Step.WORDS)
 class PaceSettings:
     """A frame's time, from the image in memory to the region's words.
 
-    least_iterations are trained in every frame. Where the time does not suffice for them, the reliefs give way in
-    their order, none of them in two frames on end; where it still does not, the frame trains less and counts as short.
+    least_iterations are trained in every frame. Where the time gets short for them, warm-ups give way to the region's
+    iterations, but for those that a frame begins with; where it does not suffice, the reliefs give way in their order,
+    none of them in two frames on end; where it still does not, the frame trains less and counts as short.
     """
 
     seconds_per_frame: float = 0.25
-    least_iterations: int = 4
+    least_iterations: int = 15
     reliefs: tuple[Relief, ...] = (Relief.WORDS, Relief.SEEDING)
 
     def __post_init__(self) -> None:
@@ -87,6 +88,7 @@ class Pace:
         self._reliefs: frozenset[Relief] = frozenset()
         self._begun_s = clock()
         self._iterations = 0
+        self._opening = 0
 
     def begin(self) -> None:
         """A frame has come: its time runs from now, and what it goes without is decided."""
@@ -94,10 +96,10 @@ class Pace:
             if step not in self._steps_s:
                 self._forecasts[step].fade()
         self._begun_s = self._clock()
-        self._steps_s, self._iterations = {}, 0
         if self._settings is not None:
             expected = {step: forecast.mean_s for step, forecast in self._forecasts.items()}
-            self._reliefs = choose_reliefs(self._settings, expected, self._reliefs)
+            self._reliefs = choose_reliefs(self._settings, expected, self._reliefs, self._opening)
+        self._steps_s, self._iterations, self._opening = {}, 0, 0
 
     def spares(self, relief: Relief) -> bool:
         """True when this frame goes without it."""
@@ -113,6 +115,14 @@ class Pace:
             return self._iterations < counted
         return self._left_s() > self._forecasts[step].cautious_s
 
+    def affords(self, step: Step, cheaper: Step) -> bool:
+        """True when after this iteration the frame still reaches its least number of them with the cheaper kind."""
+        if self._settings is None:
+            return True
+        missing = max(0, self._settings.least_iterations - self._iterations - 1)
+        needed_s = self._forecasts[step].cautious_s + missing * self._forecasts[cheaper].mean_s
+        return self._left_s() > needed_s
+
     @contextmanager
     def timing(self, step: Step) -> Iterator[None]:
         """Measure a step, and expect the next of its kind to cost about as much."""
@@ -121,6 +131,7 @@ class Pace:
         seconds = self._clock() - started_s
         self._steps_s[step] = self._steps_s.get(step, 0.0) + seconds
         self._forecasts[step].learn(seconds)
+        self._opening += step is Step.WARM_UP and self._opening == self._iterations
         self._iterations += step in (Step.WARM_UP, Step.ACTIVE)
 
     def end(self) -> FrameBudget:
@@ -137,11 +148,15 @@ class Pace:
 
 
 def choose_reliefs(
-    settings: PaceSettings, expected_s: Mapping[Step, float], before: frozenset[Relief]
+    settings: PaceSettings, expected_s: Mapping[Step, float], before: frozenset[Relief], opening: int
 ) -> frozenset[Relief]:
-    """What to go without so that the least iterations fit, given what each step costs and the frame before did."""
-    iteration_s = (expected_s[Step.WARM_UP] + expected_s[Step.ACTIVE]) / 2
-    needed_s = sum(expected_s[step] for step in _FIXED) + settings.least_iterations * iteration_s
+    """What to go without so that the least iterations fit, given what each step costs and what the frame before spared.
+
+    opening: with how many warm-ups a frame begins.
+    """
+    warm_ups = min(opening, settings.least_iterations)
+    needed_s = sum(expected_s[step] for step in _FIXED) + warm_ups * expected_s[Step.WARM_UP]
+    needed_s += (settings.least_iterations - warm_ups) * expected_s[Step.ACTIVE]
     chosen: set[Relief] = set()
     for relief in settings.reliefs:
         if needed_s > settings.seconds_per_frame and relief not in before:

@@ -16,8 +16,7 @@ def edge_magnitude(rgb: UInt8[ndarray, "h w 3"]) -> Float32[ndarray, "h w"]:
     # Sobel's kernels sum to 8 times the slope
     dx = cv2.Sobel(luminance, cv2.CV_32F, 1, 0, ksize=3, scale=0.125)
     dy = cv2.Sobel(luminance, cv2.CV_32F, 0, 1, ksize=3, scale=0.125)
-    magnitude: Float32[ndarray, "h w"] = np.hypot(dx, dy)
-    return magnitude
+    return np.asarray(cv2.magnitude(dx, dy))
 
 
 def sample_pixels(

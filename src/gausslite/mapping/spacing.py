@@ -29,9 +29,9 @@ def neighbour_distance_px(
     pixels: flat indices of seeds drawn from `pool`. stratified: they were drawn one a cell.
     """
     width = pool.shape[1]
-    seeds = np.zeros(pool.shape, np.float32)
-    seeds.ravel()[pixels] = 1.0
-    density = _round_about(seeds) / np.maximum(_round_about(pool.astype(np.float32)), 1.0)
+    seeds = np.zeros(pool.shape, np.bool_)
+    seeds.ravel()[pixels] = True
+    density = _round_about(seeds) / np.maximum(_round_about(pool), 1.0)
     rows, columns = np.divmod(pixels, width)
     local = density[rows // _BLOCK_PX, columns // _BLOCK_PX]
     factor = _MEDIAN_STRATIFIED if stratified else _MEDIAN_SCATTERED
@@ -48,9 +48,10 @@ def initial_spacing_m(
     return spacing
 
 
-def _round_about(image: Float32[ndarray, "h w"]) -> Float32[ndarray, "bh bw"]:
-    """Sums over each block of 16x16 pixels and its neighbours."""
-    height, width = image.shape
-    by_rows = np.add.reduceat(image, np.arange(0, height, _BLOCK_PX), axis=0)
-    blocks = np.add.reduceat(by_rows, np.arange(0, width, _BLOCK_PX), axis=1)
+def _round_about(marked: Bool[ndarray, "h w"]) -> Float32[ndarray, "bh bw"]:
+    """How many pixels are marked in each block of 16x16 and its neighbours."""
+    height, width = marked.shape
+    filled = np.pad(marked, ((0, -height % _BLOCK_PX), (0, -width % _BLOCK_PX)))
+    by_rows = filled.reshape(-1, _BLOCK_PX, filled.shape[1]).sum(axis=1, dtype=np.uint16)
+    blocks = by_rows.reshape(len(by_rows), -1, _BLOCK_PX).sum(axis=2, dtype=np.uint16).astype(np.float32)
     return np.asarray(cv2.boxFilter(blocks, -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT))

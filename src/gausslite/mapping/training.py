@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Bool, Float32, UInt32
 from numpy import ndarray
 
 from gausslite.domain.state import State, take_counts, whole_numbers
@@ -21,7 +22,26 @@ _COLOUR_RANGE = (-0.25, 1.25)
 """Somewhat beyond what can be shown, so that overlapping Gaussians still add up to black and white."""
 _Rows: TypeAlias = Float32[ndarray, "n 16"]
 _Tables: TypeAlias = tuple[_Rows, _Rows, _Rows]
-"""Rows and Adam's moments, as they are lent to the rasterizer."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Loan:
+    """What the rasterizer works on until rows move: Adam's tables, and what the active phase is told of their rows."""
+
+    tables: _Tables
+    active_ids: UInt32[ndarray, " m"] | None
+    trainable: Bool[ndarray, " n"] | None
+    tally: Tally
+
+    @classmethod
+    def of(cls, table: SplatTable, phase: ActivePhase) -> _Loan:
+        """All of this table, for as long as it is neither grown nor shrunk. Kappa counts active Gaussians only."""
+        return cls(
+            tables=(table.rows, table.first_moment, table.second_moment),
+            active_ids=np.flatnonzero(table.active).astype(np.uint32) if phase is ActivePhase.ACTIVE_ONLY else None,
+            trainable=table.active if phase is ActivePhase.FROZEN_BACKGROUND else None,
+            tally=Tally(table.kappa, table.active),
+        )
 
 
 class Trainer:
@@ -54,8 +74,8 @@ class Trainer:
     def train(self, views: Sequence[WindowView], extent_m: float, pace: Pace) -> int:
         """Train on these views for as long as the pace allows and return the number of iterations.
 
-        The two phases take turns in the settings' proportion. Where the time left is too short for a warm-up, an
-        active iteration may still fit.
+        The two phases take turns in the settings' proportion. Where the time left is too short for a warm-up, or for
+        the frame's least iterations after it, active ones take its place.
         """
         showing = self._showing_region(views)
         done = 0
@@ -73,10 +93,9 @@ class Trainer:
         step = self._next_step(self._iterations, bool(showing), pace)
         if step is None:
             return
-        table = self._table
-        lent = table.rows, table.first_moment, table.second_moment
-        with self._rasterizer.holding(*lent):
-            self._iterate(lent, step, views if step is Step.WARM_UP else showing)
+        loan = _Loan.of(self._table, self._settings.optimization.active_phase)
+        with self._rasterizer.holding(*loan.tables):
+            self._iterate(loan, step, views if step is Step.WARM_UP else showing)
         self._control_density(extent_m, pace)
         self._bound_colours()
 
@@ -91,6 +110,8 @@ class Trainer:
         optimization = self._settings.optimization
         counted = optimization.iterations
         warming_up = not region_in_view or done % counted < optimization.warmup_iterations
+        if region_in_view and done >= counted:
+            warming_up = warming_up and pace.affords(Step.WARM_UP, Step.ACTIVE)
         if warming_up and pace.trains_on(Step.WARM_UP, counted):
             return Step.WARM_UP
         return Step.ACTIVE if region_in_view and pace.trains_on(Step.ACTIVE, counted) else None
@@ -99,47 +120,45 @@ class Trainer:
         self, views: Sequence[WindowView], showing: Sequence[WindowView], done: int, pace: Pace
     ) -> int:
         """Iterate until density control is due or time is up, the tables on loan to the rasterizer; `done` then."""
-        table = self._table
-        lent = table.rows, table.first_moment, table.second_moment
-        with self._rasterizer.holding(*lent):
+        loan = _Loan.of(self._table, self._settings.optimization.active_phase)
+        with self._rasterizer.holding(*loan.tables):
             while (step := self._next_step(done, bool(showing), pace)) is not None:
                 with pace.timing(step):
-                    self._iterate(lent, step, views if step is Step.WARM_UP else showing)
+                    self._iterate(loan, step, views if step is Step.WARM_UP else showing)
                 done += 1
                 if self._prune_is_due(pace) or self._densify_is_due(pace):
                     break
         return done
 
-    def _iterate(self, lent: _Tables, step: Step, views: Sequence[WindowView]) -> None:
+    def _iterate(self, loan: _Loan, step: Step, views: Sequence[WindowView]) -> None:
         """One iteration on a view drawn at random: over its full image, or over the task's region alone."""
         view = views[int(self._rng.integers(len(views)))]
         if step is Step.WARM_UP:
-            self._warm_up(lent, view)
+            self._warm_up(loan, view)
         else:
-            self._active_phase(lent, view)
+            self._active_phase(loan, view)
         self._iterations += 1
         self._since_pruned += 1
         self._since_densified += 1
 
-    def _warm_up(self, lent: _Tables, view: WindowView) -> None:
+    def _warm_up(self, loan: _Loan, view: WindowView) -> None:
         optimization = self._settings.optimization
-        self._rasterizer.step(*lent, view.training_view, view.T_camera_world, optimization.loss, optimization.adam)
-
-    def _active_phase(self, lent: _Tables, view: WindowView) -> None:
-        """Kappa counts the active Gaussians that it trains."""
-        table, optimization = self._table, self._settings.optimization
-        phase = optimization.active_phase
-        ids = np.flatnonzero(table.active).astype(np.uint32) if phase is ActivePhase.ACTIVE_ONLY else None
         self._rasterizer.step(
-            *lent,
+            *loan.tables, view.training_view, view.T_camera_world, optimization.loss, optimization.adam
+        )
+
+    def _active_phase(self, loan: _Loan, view: WindowView) -> None:
+        optimization = self._settings.optimization
+        self._rasterizer.step(
+            *loan.tables,
             view.training_view,
             view.T_camera_world,
             optimization.loss,
             optimization.adam,
             masked=True,
-            subset=Subset(view.active_tiles, ids),
-            trainable=table.active if phase is ActivePhase.FROZEN_BACKGROUND else None,
-            tally=Tally(table.kappa, table.active),
+            subset=Subset(view.active_tiles, loan.active_ids),
+            trainable=loan.trainable,
+            tally=loan.tally,
         )
 
     def _make_spheres(self) -> None:
@@ -149,8 +168,9 @@ class Trainer:
 
     def _bound_colours(self) -> None:
         """Colours that no view checks for a while must not run away."""
-        colours = self._table.rows[:, RGB]
-        np.clip(colours, *_COLOUR_RANGE, out=colours)
+        # channel by channel: NumPy takes twice as long over three columns at once
+        for channel in self._table.rows[:, RGB].T:
+            np.clip(channel, *_COLOUR_RANGE, out=channel)
 
     def _prune_is_due(self, pace: Pace) -> bool:
         return _due(self._since_pruned, self._settings.density.prune_every, pace)

@@ -76,7 +76,7 @@ def add_budget(parser: argparse.ArgumentParser) -> None:
     per_frame.add_argument("--iterations", metavar="N", type=int, help="iterations a frame (default: 8)")
     per_frame.add_argument("--rate", metavar="HZ", type=float, help="frames a second: as many iterations as fit")
     least = PaceSettings().least_iterations
-    add("--least", metavar="N", type=int, default=least, help="at --rate, iterations to find time for (default: 4)")
+    add("--least", metavar="N", type=int, default=least, help="at --rate, iterations to find time for (default: 15)")
     add("--relief", metavar="A,B", type=reliefs, default=PaceSettings().reliefs, help=_RELIEF_HELP)
     add("--seed", metavar="S", type=int, default=0, help="seed of every random choice (default: 0)")
     add("--threads", metavar="N", type=int, help="threads (default: all the processor allows)")

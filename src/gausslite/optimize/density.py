@@ -68,7 +68,8 @@ def densify(table: SplatTable, settings: DensitySettings, extent_m: float) -> De
     to_clone, to_split = chosen[small], chosen[~small]
     _split(table, to_split)
     _clone(table, to_clone)
-    table.first_moment[:, [GRAD_2D_SUM, GRAD_2D_COUNT]] = 0.0
+    for statistic in (GRAD_2D_SUM, GRAD_2D_COUNT):
+        table.first_moment[:, statistic] = 0.0
     return Densified(cloned=len(to_clone), split=len(to_split))
 
 

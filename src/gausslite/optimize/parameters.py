@@ -152,18 +152,17 @@ class SplatTable:
         self._put(ids, gaussians_to_rows(gaussians), gaussians.active, gaussians.kappa, gaussians.target)
 
     def keep(self, mask: Bool[ndarray, " n"]) -> None:
-        """Drop the Gaussians where mask is false; the others keep their order and their optimiser state."""
+        """Drop the Gaussians where mask is false; the others keep their optimiser state.
+
+        The last ones, in their order, take the rows of those that leave, so that no more rows move than fall vacant.
+        """
         require_array("keep mask", mask, (self._count,), np.bool_)
-        kept = np.flatnonzero(mask)
-        if len(kept) == self._count:
-            return
-        # rows before the first gap stay where they are
-        first_gap = int(np.argmin(mask))
-        moved = kept[first_gap:]
+        kept = int(np.count_nonzero(mask))
+        vacant, moved = np.flatnonzero(~mask[:kept]), kept + np.flatnonzero(mask[kept:])
         for name in _COLUMNS:
             column = getattr(self, f"_{name}")
-            column[first_gap : len(kept)] = column.take(moved, axis=0)
-        self._count = len(kept)
+            column[vacant] = column[moved]
+        self._count = kept
 
     def state(self) -> State:
         """Everything the table holds, as views of it."""

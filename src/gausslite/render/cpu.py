@@ -96,6 +96,7 @@ class CpuRasterizer:
         self._engine: _kernels.Engine = kernels.Engine(self._simd, _choose_threads(threads))
         self._latest: ref[_Report] | None = None
         self._held: _Tables | None = None
+        self._masked_ms = 0.0
 
     @property
     def name(self) -> str:
@@ -188,6 +189,7 @@ class CpuRasterizer:
         require_scene(len(rows), view.camera, T_camera_world, subset)
         require_marks(len(rows), trainable, tally)
         self._settle_report()
+        before_ms = self._engine.steps_ms
         value = self._engine.step(
             rows,
             first_moment,
@@ -205,6 +207,8 @@ class CpuRasterizer:
             None if tally is None else tally.counts,
             None if tally is None else _contiguous(tally.among),
         )
+        if masked:
+            self._masked_ms += self._engine.steps_ms - before_ms
         report = _Report(value, self._engine)
         self._latest = ref(report)
         return report
@@ -228,9 +232,11 @@ class CpuRasterizer:
         """Milliseconds that the stages of the latest call took: project, raster, loss, backward, update."""
         return self._engine.stage_times_ms()
 
-    def steps_s(self) -> float:
-        """Seconds that all steps so far spent in the kernels."""
-        return self._engine.steps_ms / 1e3
+    def steps_s(self, masked: bool | None = None) -> float:
+        """Seconds that all steps so far spent in the kernels, or only those masked to a region, or only the others."""
+        if masked is None:
+            return self._engine.steps_ms / 1e3
+        return (self._masked_ms if masked else self._engine.steps_ms - self._masked_ms) / 1e3
 
     def block_evaluations(self) -> int:
         """How often the latest forward or step composited a splat on a 4x4 block of pixels."""
