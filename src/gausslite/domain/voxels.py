@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float32, Int64, UInt16
+from jaxtyping import Bool, Float32, Float64, Int64
 from numpy import ndarray
 
 from gausslite.errors import InvalidInputError
@@ -32,38 +32,52 @@ class VoxelGrid:
 
     def keys(self, points_m: Float32[ndarray, "n 3"]) -> Int64[ndarray, " n"]:
         """The key of the voxel that holds each point. Raises InvalidInputError for points out of reach."""
-        # float64: the key must not depend on how a float32 quotient happens to round
-        index = np.floor(points_m.astype(np.float64) / self.size_m)
-        if not (np.abs(index) < _OFFSET).all():
-            raise InvalidInputError(f"points: expected coordinates within ±{self.reach_m:g} m, got one outside")
-        ijk = index.astype(np.int64) + _OFFSET
-        packed: Int64[ndarray, " n"] = (ijk[:, 0] << (2 * _BITS_PER_AXIS)) | (ijk[:, 1] << _BITS_PER_AXIS) | ijk[:, 2]
-        return packed
+        return _pack(self._voxel_of(points_m))
+
+    def grouped(self, points_m: Float32[ndarray, "n 3"]) -> tuple[Int64[ndarray, " n"], Int64[ndarray, " v"]]:
+        """The points by the keys of their voxels, those of one voxel as they came, and where in that each voxel begins.
+
+        Raises InvalidInputError for points out of reach.
+        """
+        axes = self._voxel_of(points_m)
+        low, high = (bound(axes, axis=1, initial=0.0) for bound in (np.min, np.max))
+        width_i, width_j, width_k = high - low + 1
+        # voxels of a small region have numbers of 16 bits in the order of their keys, and those sort much faster
+        if width_i * width_j * width_k <= 1 << 16:
+            axes -= low[:, None]
+            numbers = (np.array([width_j * width_k, width_k, 1.0]) @ axes).astype(np.uint16)
+        else:
+            numbers = _pack(axes)
+        rows = np.argsort(numbers, kind="stable")
+        numbers = numbers[rows]
+        first = np.ones(len(rows), np.bool_)
+        np.not_equal(numbers[1:], numbers[:-1], out=first[1:])
+        return rows, np.flatnonzero(first)
 
     def indices(self, keys: Int64[ndarray, " n"]) -> Int64[ndarray, "n 3"]:
         """The (i, j, k) of the voxels with these keys."""
         ijk = np.stack([(keys >> (2 * _BITS_PER_AXIS)) & _MASK, (keys >> _BITS_PER_AXIS) & _MASK, keys & _MASK], axis=1)
         return ijk - _OFFSET
 
-    def short_keys(self, keys: Int64[ndarray, " n"]) -> Int64[ndarray, " n"] | UInt16[ndarray, " n"]:
-        """Numbers in the order of these keys, in 16 bits where the voxels lie close enough: those sort much faster."""
-        if len(keys) == 0:
-            return keys
-        axes = keys >> (2 * _BITS_PER_AXIS), (keys >> _BITS_PER_AXIS) & _MASK, keys & _MASK
-        (first_i, count_i), (first_j, count_j), (first_k, count_k) = (
-            (low := int(axis.min()), int(axis.max()) - low + 1) for axis in axes
-        )
-        if count_i * count_j * count_k > 1 << 16:
-            return keys
-        i, j, k = axes
-        short: UInt16[ndarray, " n"] = (((i - first_i) * count_j + j - first_j) * count_k + k - first_k).astype(
-            np.uint16
-        )
-        return short
-
     def centres_m(self, keys: Int64[ndarray, " n"]) -> Float32[ndarray, "n 3"]:
         """The centres of the voxels with these keys."""
         return ((self.indices(keys) + 0.5) * self.size_m).astype(np.float32)
+
+    def _voxel_of(self, points_m: Float32[ndarray, "n 3"]) -> Float64[ndarray, "3 n"]:
+        """Whole numbers i, j, k of each point's voxel, axis by axis."""
+        # float64: the key must not depend on how a float32 quotient happens to round
+        axes = np.ascontiguousarray(points_m.T, np.float64)
+        axes /= self.size_m
+        np.floor(axes, out=axes)
+        if not (np.abs(axes) < _OFFSET).all():
+            raise InvalidInputError(f"points: expected coordinates within ±{self.reach_m:g} m, got one outside")
+        return axes
+
+
+def _pack(axes: Float64[ndarray, "3 n"]) -> Int64[ndarray, " n"]:
+    i, j, k = axes.astype(np.int64) + _OFFSET
+    packed: Int64[ndarray, " n"] = (i << (2 * _BITS_PER_AXIS)) | (j << _BITS_PER_AXIS) | k
+    return packed
 
 
 @dataclass(frozen=True, slots=True)

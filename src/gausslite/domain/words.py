@@ -34,13 +34,8 @@ class Occupied:
     @classmethod
     def by(cls, points_m: Float32[ndarray, "n 3"], grid: VoxelGrid) -> Occupied:
         """Sort points into voxels. Raises InvalidInputError for points out of the grid's reach."""
-        keys = grid.keys(points_m)
-        rows = np.argsort(grid.short_keys(keys), kind="stable")
-        keys = keys[rows]
-        first = np.ones(len(keys), np.bool_)
-        np.not_equal(keys[1:], keys[:-1], out=first[1:])
-        starts = np.flatnonzero(first)
-        return cls(keys[starts], starts, np.diff(starts, append=len(keys)), rows)
+        rows, starts = grid.grouped(points_m)
+        return cls(grid.keys(points_m[rows[starts]]), starts, np.diff(starts, append=len(rows)), rows)
 
     def sums(self, values: UInt32[ndarray, " n"] | UInt64[ndarray, " n"]) -> UInt64[ndarray, " v"]:
         """The sum over each voxel of one value a point."""

@@ -240,7 +240,7 @@ def rows_to_gaussians(
     length = np.sqrt(np.einsum("ij,ij->i", quats, quats))[:, None]
     return Gaussians(
         means_m=rows[:, MEAN].copy(),
-        quats_wxyz=(quats / np.maximum(length, np.float32(1e-12))).astype(np.float32),
+        quats_wxyz=quats / np.maximum(length, np.float32(1e-12)),
         scales_m=np.exp(rows[:, LOG_SCALE]),
         opacities=_sigmoid(rows[:, LOGIT]),
         rgb=rows[:, RGB].copy(),
