@@ -13,6 +13,9 @@ from gausslite.task.pieces import Kind, Piece
 from gausslite.task.placing import NounPlacer
 from gausslite.task.verbs import BELONGING_VERBS
 
+# "drone, fly to the roof" speaks to it, "find the drone" does not
+_ADDRESSED = (("drone",), ("rover",))
+
 
 def draft_of(pieces: Sequence[Piece]) -> GraphDraft:
     """The draft of a whole sentence."""
@@ -97,7 +100,7 @@ class GraphBuilder:
         )
         if not same_negation:
             self._negated = False
-        self._pending = None
+        self._pending, self._adjectives = None, []
         self._clause.verb_since_negation = True
         spoken_for = self._clause.subjects or (self._clause.orphans and self._clause.verb)
         if not same_negation and spoken_for:
@@ -146,6 +149,8 @@ class GraphBuilder:
         self._pending = None
 
     def _noun(self, before: Piece | None, noun: NounPhrase, after: Piece | None) -> None:
+        if noun.words in _ADDRESSED and not (noun.determined or self._clause.verb or self._pending):
+            return
         joined = before is not None and before.kind is Kind.JOIN
         if joined and self._corrects and self._clause.nouns_since_negation:
             self._negated = False  # "not the wooden spoon, the metal one"

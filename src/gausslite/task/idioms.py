@@ -17,6 +17,7 @@ _PLAIN: Final = {
     r"(there|where|what|who)s": r"\1 is",
     r"(where|how|what|who)'d": r"\1 did",
     r"u": "you",
+    r"take (?:a|two|three|\d+) (?:\w+ )?steps?": "go",
     r"sth|smth": "something",
     r"(?:step|task|item|phase) \d+ ?[:.)]": ";",
     r"(?:there is )?no need to": "do not",

@@ -10,10 +10,6 @@ from gausslite.task.words import words
 __all__ = ["CONTAINERS", "LANDMARKS", "NOUNS", "ROOMS"]
 
 
-# particles that belong to the verb before them: "pick up", "turn on the lamp", "look at", "search for"
-PARTICLES: Final = words("up down off out over away around about back through along past at into across onto for")
-ON_IN_PARTICLE_VERBS: Final = words("turn switch power put bring check focus concentrate spot home work plug report")
-
 DETERMINERS: Final = words(
     "a an the this that these those my your his her its our their any some all every each both several many few "
     "another other others more much enough whole entire one two three four five six seven eight nine ten eleven "
@@ -47,9 +43,7 @@ COMPOUND_GERUNDS: Final = words(
     "steering swinging wedding wrapping writing"
 )
 # the robot itself, and how a person may be spoken to
-SELVES: Final = words(
-    "robot drone agent arm gripper rover bot dear darling sweetheart honey mate buddy sir madam pal friend"
-)
+SELVES: Final = words("robot agent arm gripper bot dear darling sweetheart honey mate buddy sir madam pal friend")
 
 # what a sentence may say about itself: "the goal is to", "any idea where"
 TASK_WORDS: Final = words("task mission goal objective job aim assignment duty idea clue question problem")
@@ -60,9 +54,9 @@ PLACES: Final = words(
     "back rear left right half part rest remainder interior inside outside distance position pose state status "
     "condition direction everywhere background foreground sight ground-truth height level perimeter neighbourhood "
     "neighborhood premises presence existence absence geometry details detail underside topside exterior tip lot size "
-    "colour color shape weight temperature humidity smell speed damage wear corrosion safety progress time purpose "
-    "pressure voltage moment minute hour day week morning afternoon evening night noon bother trouble favour favor "
-    "kindness matter texture appearance structure"
+    "colour color shape temperature humidity smell speed damage wear corrosion safety progress time purpose pressure "
+    "voltage moment minute hour day week morning afternoon evening night noon bother trouble favour favor kindness "
+    "matter texture appearance structure"
 )
 # behind a preposition and without an article they say how or why: by hand, for lunch, in order
 MANNERS: Final = words(
@@ -78,7 +72,8 @@ ROUTES: Final = words("path way route road course trajectory passage line shortc
 MEASURES: Final = words(
     "picture photo photograph image video model reconstruction kind type sort piece pair set group pile stack lots "
     "number row bunch couple list total cluster collection copy amount view scan map sample none instance instances "
-    "section suit bit heap batch handful slice lump chunk strip record inventory close-up closeup overview"
+    "section suit bit heap batch handful slice lump chunk strip loaf record inventory close-up closeup overview "
+    "weight"
 )
 # places that are solid things too, unless something is in them
 SOLID_PLACES: Final = words("home corner site front back")
@@ -113,7 +108,8 @@ ADJECTIVES: Final = words(
     "double missing electric electronic wireless portable safe unsafe sick ill tired busy young elderly friendly oily "
     "curly woolly silly early local nice good bad fine great pretty cute cheap expensive high low foreign modern "
     "ancient antique tidy messy woollen rubber steel iron brass copper cotton concrete turquoise violet maroon navy "
-    "crimson scarlet ivory cream tan bronze teal lilac magenta cyan"
+    "crimson scarlet ivory cream tan bronze teal lilac magenta cyan vertical horizontal upright final initial "
+    "original correct proper exact current previous"
 )
 
 # words that only ever hide or forbid what comes after them

@@ -62,7 +62,8 @@ _OBJECTS: Final = words(
     "stamp coin money bill cash ticket passport badge shed sled doorstep doormat pool bathrobe awning wiring plumbing "
     "piping lighting bedding carving flooring siding scaffolding wrap weld cover lift jack clip clamp peg grip splash "
     "seal strap latch hatch winch hoist crane drop iron polish spray paint oil grease wax trap track guard guide "
-    "print sketch note stock pack file pass switchgear stick mail patch emergency building house apartment"
+    "print sketch note stock pack file pass switchgear stick mail patch emergency building house apartment head cream "
+    "weight suit eye ear nose mouth hand foot finger knee neck eyewash age"
 )
 NOUNS: Final = (
     _OBJECTS

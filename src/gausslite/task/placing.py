@@ -21,6 +21,7 @@ from gausslite.task.verbs import (
     MOVING_VERBS,
     PLACE_VERBS,
     SEARCH_VERBS,
+    STOPPING_VERBS,
 )
 from gausslite.task.words import words
 
@@ -99,6 +100,8 @@ class NounPlacer:
             self._sought(noun)
         elif pending == "of":
             self._part_of(noun)
+        elif pending == "purpose" and clause.route:
+            self.target(noun)
         elif pending == "purpose":
             clause.last_relation = "with"
         elif pending == "when":
@@ -124,6 +127,8 @@ class NounPlacer:
             clause.last_relation = clause.last_relation if clause.last_relation == "with" else "to"
             clause.between = pending == "between"
         else:
+            if clause.orphans and clause.verb in GO_VERBS | STOPPING_VERBS:
+                self._mean_places()  # "stop behind the car near the tree"
             self.relate(pending, noun)
 
     def _is_about_people(self) -> bool:
@@ -210,7 +215,7 @@ class NounPlacer:
 
     def _towards(self, noun: NounPhrase) -> None:
         clause = self.clause
-        if clause.verb in GO_VERBS:
+        if clause.verb in GO_VERBS | STOPPING_VERBS:
             self._mean_places()  # "between the shelves to the exit"
         if clause.superlative and clause.subjects:
             self.relate(Predicate.CLOSEST_TO, noun)

@@ -13,8 +13,8 @@ from gausslite.task.prepositions import PREPOSITIONS
 from gausslite.task.tagging import tagged
 from gausslite.task.tags import Tag
 from gausslite.task.tokens import units_of
-from gausslite.task.verb_forms import verb_base
-from gausslite.task.verbs import BELONGING_VERBS, DELIVERY_VERBS, GO_VERBS, HOLDING_VERBS
+from gausslite.task.verb_forms import is_particle, verb_base
+from gausslite.task.verbs import ASPECT_VERBS, BELONGING_VERBS, GO_VERBS, HOLDING_VERBS
 from gausslite.task.words import words
 
 _POINTING: Final = words("this that these those")
@@ -22,16 +22,18 @@ _SUPERLATIVES: Final = words("closest nearest")
 _RELATIVES: Final = words("that which who whom")
 # "go around the table to the sofa" passes the one and reaches the other
 _WAYS: Final = words("near past above")
-# "bring in the boxes" needs an object before any place
-_TAKES_AN_OBJECT: Final = DELIVERY_VERBS - GO_VERBS - words("rest lean pack slide place hide")
 _HAVING: Final = words("has have had")
 _DOING: Final = words("do does did")
 _REFUSALS: Final = WISHES | words("care touch mean")
 _IN_A_NOUN: Final = frozenset({Tag.NOUN, Tag.ADJECTIVE})
 # "the drawer open", "is empty"
 _BEFORE_A_STATE: Final = frozenset({Tag.NOUN, Tag.STAND_IN, Tag.AUXILIARY})
+_BEFORE_A_GERUND: Final = frozenset({Tag.NOUN, Tag.PREPOSITION, Tag.NEGATION, Tag.VERB, Tag.AUXILIARY})
+_DESCRIBED: Final = frozenset({Tag.NOUN, Tag.PARTICIPLE})
 # what stands before a place where something is, and not where it is to go
 _STATES: Final = frozenset({Tag.AUXILIARY, Tag.RELATIVE, Tag.PARTICIPLE, Tag.ING})
+# "that is not open" forbids nothing, "that is not a duck" does
+_FORBIDDEN: Final = frozenset({Tag.VERB, Tag.DETERMINER, Tag.NOUN})
 _OPENS_OBJECT: Final = frozenset({Tag.DETERMINER, Tag.NOUN, Tag.ADJECTIVE, Tag.STAND_IN})
 
 
@@ -78,7 +80,7 @@ class _Reader:
         for at, (word, tag) in enumerate(self.said):
             self.at = at
             before, mood = mood, self.moods.get(at, mood)
-            if before is Mood.ASIDE and mood is Mood.TASK and tag is Tag.JOIN:
+            if tag is Tag.JOIN and mood is Mood.TASK and (before is Mood.ASIDE or self._asks_anew(at)):
                 tag = Tag.BREAK
             if mood is Mood.ASIDE and at in self.moods:
                 self._emit(Kind.ASIDE, word)
@@ -86,6 +88,10 @@ class _Reader:
                 self._read.get(tag, self._skip)(word)
         self._close()
         return self.pieces
+
+    def _asks_anew(self, at: int) -> bool:
+        """In "if it is no trouble, could you come" the question begins a sentence of its own."""
+        return at in self.moods and self._tag(1) is Tag.AUXILIARY
 
     def _tag(self, ahead: int) -> Tag | None:
         position = self.at + ahead
@@ -164,7 +170,7 @@ class _Reader:
         if self._tag(1) is Tag.AUXILIARY and self._tag(2) in (Tag.PARTICIPLE, Tag.VERB):
             self._forbid(word)
             return
-        stative = self._tag(-1) is Tag.AUXILIARY and self._word(-1) != "do" and self._tag(1) is not Tag.VERB
+        stative = self._tag(-1) is Tag.AUXILIARY and self._word(-1) != "do" and self._tag(1) not in _FORBIDDEN
         if stative:
             self._close()
         else:
@@ -237,9 +243,14 @@ class _Reader:
 
     def _ing(self, word: str) -> None:
         before, after = self._tag(-1), self._tag(1)
-        opens = self.determined or before not in (Tag.NOUN, Tag.PREPOSITION, Tag.NEGATION, Tag.VERB)
+        opens = self.determined or before not in _BEFORE_A_GERUND
+        opens = opens or (before is Tag.VERB and self._last() is Kind.VERB and self.pieces[-1].word not in ASPECT_VERBS)
         if opens and after in _IN_A_NOUN and lexicon.ADJECTIVES.issuperset(self.words):
             self.words.append(word)  # "the leaking pipe"
+        elif before is Tag.PREPOSITION and self._last() is Kind.NOUN and self._tag(-2) in _DESCRIBED:
+            self._close()  # "a cloth for wiping the table"
+            if after in _OPENS_OBJECT:
+                self._emit(Kind.PREPOSITION, "purpose")
         elif self.words or before in (Tag.NOUN, Tag.STAND_IN, Tag.AUXILIARY, Tag.RELATIVE):
             self._happening(after)
         else:
@@ -270,10 +281,12 @@ class _Reader:
         if word == "of" and before is Tag.DETERMINER and not self.words:
             return
         directly = not self.words and self._last() is Kind.VERB and before is Tag.VERB
-        if directly and self._is_particle(word):
+        if directly and is_particle(self.pieces[-1].word, word):
             if relation in _WAYS and self.pieces[-1].word in GO_VERBS:
                 self._emit(Kind.PREPOSITION, "via")
             return
+        if relation == "to" and self._last() is Kind.NOUN and (before is Tag.ING or self._tag(-2) is Tag.RELATIVE):
+            relation = "purpose"  # "the door that leads to the hall"
         if after is Tag.ING and word in ("for", "by", "before", "after"):
             self._close()
             return
@@ -283,10 +296,3 @@ class _Reader:
         self._close()
         if word in PREPOSITIONS and (self._tag(1), self._tag(2)) == (Tag.JOIN, Tag.PREPOSITION):
             self._emit(Kind.PREPOSITION, PREPOSITIONS[word])  # "under or behind the couch"
-
-    def _is_particle(self, word: str) -> bool:
-        """`on` in "turn on the lamp" belongs to the verb, `at` in "look at the lamp" says nothing more."""
-        if word in ("on", "in"):
-            verb = self.pieces[-1].word
-            return verb in _TAKES_AN_OBJECT or (word == "on" and verb in lexicon.ON_IN_PARTICLE_VERBS)
-        return word in lexicon.PARTICLES

@@ -43,7 +43,7 @@ _CLOSED_LINES: Final = (
     ("s0 p2", "before after until since"),
     ("c0", "and or , / & plus but + ( )"),
     ("p0 u0", "to"),
-    ("t0", "away out apart forward forwards backward backwards upstairs downstairs aside"),
+    ("t0", "away out apart ahead forward forwards backward backwards upstairs downstairs aside"),
     ("t0 n8 a5 v15", "back"),
     ("t0 p20", "up down"),
     ("t0 p3", "off"),
@@ -53,14 +53,14 @@ _CLOSED_LINES: Final = (
     ("p0 t10", "in on under below above behind along through past across by near"),
     ("p0 g0", "touching facing surrounding"),
     ("p3 v0", "like"),
-    ("a0 e3 n9 t20", "left"),
-    ("a0 n5 t8", "right"),
+    ("a0 e3 n14 t20", "left"),
+    ("a0 n14 t8", "right"),
     ("n0", "ones everywhere"),
     ("i0 d8", "what whatever"),
 )
 # "go stand", "help clean": the second is what is to be done
 _LEADING: Final = words("go come help")
-_MAINLY_VERBS: Final = GO_VERBS | TOOL_VERBS | SEARCH_VERBS | words("stop")
+_MAINLY_VERBS: Final = GO_VERBS | TOOL_VERBS | SEARCH_VERBS | words("stop hand")
 _NEVER_NOUNS: Final = GO_VERBS | words(
     "belong bring put take get find fetch make keep give hold grab need want do lie be say see hear "
     "know think eat sit seem contain include become lose forget boil"
@@ -113,6 +113,8 @@ def _candidates(before: str, word: str, after: str) -> Options:
         return {Tag.VERB: 0}
     if (word, after) in lexicon.COMPOUND_OPENERS:
         return {Tag.ADJECTIVE: 0}
+    if after == "of" and word in ("one", "half"):
+        return {Tag.DETERMINER: 0} if word == "one" else {Tag.NOUN: 0}
     closed = _CLOSED.get(word)
     if closed is not None:
         return closed

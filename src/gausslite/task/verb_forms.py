@@ -1,10 +1,11 @@
-"""English verb forms to base forms, for the verbs that are known."""
+"""English verb forms to base forms, and the particles that belong to verbs, for the verbs that are known."""
 
 from __future__ import annotations
 
 from typing import Final
 
-from gausslite.task.verbs import VERBS
+from gausslite.task.verbs import DELIVERY_VERBS, GO_VERBS, VERBS
+from gausslite.task.words import words
 
 # past forms and participles that do not end in -ed
 _IRREGULAR: Final = {
@@ -27,6 +28,10 @@ _IRREGULAR: Final = {
     "swung": "swing", "done": "do", "lent": "lend", "hurt": "hurt",
     "sprung": "spring", "woven": "weave", "strewn": "strew",
 }  # fmt: skip
+_PARTICLES: Final = words("up down off out over away around about back through along past at into across onto for")
+_SWITCHED_ON: Final = words("turn switch power put bring check focus concentrate spot home work plug report")
+# "bring in the boxes" needs an object before any place
+_TAKES_AN_OBJECT: Final = DELIVERY_VERBS - GO_VERBS - words("rest lean pack slide place hide")
 
 
 def base_of_s(word: str) -> str | None:
@@ -59,6 +64,13 @@ def verb_base(word: str) -> str | None:
     if word in VERBS:
         return word
     return base_of_s(word) or base_of_ing(word) or base_of_ed(word)
+
+
+def is_particle(verb: str, word: str) -> bool:
+    """True for `on` in "turn on the lamp", and for `at` in "look at the lamp", which says no more than the verb."""
+    if word in ("on", "in"):
+        return verb in _TAKES_AN_OBJECT or (word == "on" and verb in _SWITCHED_ON)
+    return word in _PARTICLES
 
 
 def _stem(stem: str) -> str | None:

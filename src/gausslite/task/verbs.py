@@ -36,9 +36,15 @@ LOOKING_VERBS: Final = (
 )
 # "move to the chair" goes there, "move the chair to the door" takes it there
 MOVING_VERBS: Final = words("move roll run advance return get land park dock drive fly race")
+# "stop behind the car" means the car
+STOPPING_VERBS: Final = words("stop wait stand stay sit park halt pause")
 # "hand the nurse the towel": the first noun is who gets the second
 GIVING_VERBS: Final = words(
     "hand give bring pass fetch get send offer serve show throw feed find grab lend buy read toss"
+)
+# "keep wiping tables", not "take folding chairs"
+ASPECT_VERBS: Final = words(
+    "start stop begin keep continue finish mind avoid try resume go come consider need want like help"
 )
 # "load the van with boxes" moves the boxes
 FILLING_VERBS: Final = words("load reload stock restock")
