@@ -155,7 +155,7 @@ double step(Rasterizer& self, RowTable rows, RowTable first_moment, RowTable sec
             const Intrinsics& intrinsics, Matrix4 T_camera_world, std::tuple<float, float, float> loss,
             const std::vector<float>& rates, std::tuple<double, double, double> adam, bool masked,
             std::optional<TileMask> tiles, std::optional<Ids> ids, std::optional<Flags> trainable,
-            std::optional<Counts> trained, std::optional<Flags> counted) {
+            std::optional<Counts> trained, std::optional<Flags> counted, uint64_t loan) {
   const size_t n = rows.shape(0);
   const Scene scene(rows.data(), n, intrinsics, T_camera_world, tiles, ids);
   require(first_moment.shape(0) == n && second_moment.shape(0) == n && (!trainable || trainable->shape(0) == n) &&
@@ -166,9 +166,13 @@ double step(Rasterizer& self, RowTable rows, RowTable first_moment, RowTable sec
   const auto flags = [](const std::optional<Flags>& of) {
     return of ? reinterpret_cast<const uint8_t*>(of->data()) : nullptr;
   };
-  const OptimizerState state{
-      rows.data(),   first_moment.data(), second_moment.data(), flags(trainable), trained ? trained->data() : nullptr,
-      flags(counted)};
+  const OptimizerState state{rows.data(),
+                             first_moment.data(),
+                             second_moment.data(),
+                             flags(trainable),
+                             trained ? trained->data() : nullptr,
+                             flags(counted),
+                             loan};
   AdamOptions options;
   std::copy_n(rates.begin(), 16, options.rates);
   std::tie(options.beta1, options.beta2, options.epsilon) = adam;
@@ -215,7 +219,7 @@ NB_MODULE(_kernels, m) {
            nb::arg("T_camera_world").noconvert(), nb::arg("loss"), nb::arg("rates"), nb::arg("adam"), nb::arg("masked"),
            nb::arg("tiles").noconvert().none(), nb::arg("ids").noconvert().none(),
            nb::arg("trainable").noconvert().none(), nb::arg("trained").noconvert().none(),
-           nb::arg("counted").noconvert().none(), "The loss.")
+           nb::arg("counted").noconvert().none(), nb::arg("loan"), "The loss.")
       .def("visible", &visible_ids, "The rows that the last forward or step found visible, ascending.")
       .def_prop_ro("steps_ms", &Rasterizer::steps_ms, "Milliseconds that all steps took so far.")
       .def("stage_times_ms", &stage_times, "Milliseconds of the last call's stages.")

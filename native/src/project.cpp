@@ -4,49 +4,13 @@
 #include <cmath>
 #include <cstring>
 
+#include "candidates.h"
 #include "projection.h"
 #include "stage_functions.h"
 
 namespace gausslite::GAUSSLITE_ISA {
 
 namespace {
-
-// The half-spaces of the frustum through the active part of the image, widened for a splat's extent. At most 3.33
-// standard deviations of a splat are above 1/255; the clamped tangent makes its projected scale at most 1.3 times
-// sqrt(1 + tan^2) / z, where tan is that of the farthest image corner.
-class Frustum {
- public:
-  explicit Frustum(const Workspace& ws) : camera_(ws.camera) {
-    const Camera& c = camera_;
-    left_ = (float(ws.active.x0) - c.cx) / c.fx;
-    right_ = (float(ws.active.x1) - c.cx) / c.fx;
-    top_ = (float(ws.active.y0) - c.cy) / c.fy;
-    bottom_ = (float(ws.active.y1) - c.cy) / c.fy;
-    reach_x_ = reach(c.width, c.cx, c.fx);
-    reach_y_ = reach(c.height, c.cy, c.fy);
-    pixel_ = 2.0f / std::min(c.fx, c.fy);
-  }
-
-  // `row` needs the mean and the scales only.
-  GAUSSLITE_INLINE Mask16 may_touch(const Pack16* row) const {
-    Pack16 x, y, z;
-    to_camera_frame(row, camera_, x, y, z);
-    const Pack16 largest = max(row[kLogScale], max(row[kLogScale + 1], row[kLogScale + 2]));
-    const Pack16 radius = fma(exp2_fast(largest * kLog2E), Pack16(3.4f), z * pixel_);
-    const Pack16 reach_x = radius * reach_x_, reach_y = radius * reach_y_;
-    return (z >= Pack16(kNearM)) & (x - z * right_ <= reach_x) & (z * left_ - x <= reach_x) &
-           (y - z * bottom_ <= reach_y) & (z * top_ - y <= reach_y);
-  }
-
- private:
-  static float reach(int pixels, float centre, float focal) {
-    const float half = 0.5f * float(pixels), tangent = (half + std::fabs(centre - half)) / focal;
-    return 1.5f * std::sqrt(1.0f + tangent * tangent);
-  }
-
-  const Camera& camera_;
-  float left_, right_, top_, bottom_, reach_x_, reach_y_, pixel_;
-};
 
 // The 4x4 blocks of the pixels whose centres are in the bounding box of alpha >= 1/255, both ends included.
 struct Box {
@@ -103,8 +67,7 @@ struct TileColumns {
 
 // True when the tile row has an active tile in these columns.
 GAUSSLITE_INLINE bool row_is_active(const Workspace& ws, uint32_t tile_y, TileColumns columns) {
-  const uint16_t* before = &ws.active_before[size_t(tile_y) * (uint32_t(ws.tiles_x) + 1)];
-  return before[columns.last + 1] > before[columns.first];
+  return ws.count_active(columns.first, columns.last, tile_y, tile_y) > 0;
 }
 
 // Gradient rows are handed out in blocks, so that the shared counter is touched rarely. Row 0 is nobody's.
@@ -181,7 +144,7 @@ GAUSSLITE_INLINE void project_group(const Workspace& ws, const Frustum& frustum,
   Pack16 row[16];
   for (int j = 0; j < 16; ++j) row[j] = load(ws.rows + size_t(kRowWidth) * ids[std::min(j, lanes - 1)]);
   transpose(row);
-  const Mask16 candidates = frustum.may_touch(row) & first_lanes(lanes);
+  const Mask16 candidates = frustum.may_touch(row, largest_log_scale(row)) & first_lanes(lanes);
   if (!any(candidates)) return;
 
   Projection p;
@@ -217,32 +180,6 @@ GAUSSLITE_INLINE void project_group(const Workspace& ws, const Frustum& frustum,
   }
 }
 
-// Of rows [begin, end), the ids of those that may touch the active part of the image. Looking at eight columns of a row
-// costs less than projecting it, and the rows that are left fill their groups.
-GAUSSLITE_INLINE uint32_t find_candidates(const Workspace& ws, const Frustum& frustum, uint32_t begin, uint32_t end,
-                                          uint32_t* ids) {
-  uint32_t count = 0;
-  for (uint32_t i = begin; i < end; i += 16) {
-    uint32_t candidates = (1u << ((end - i) % 16)) - 1u;
-    if (end - i >= 16) {
-      const float* first = ws.rows + size_t(kRowWidth) * i;
-      Pack16 row[8];
-      for (int k = 0; k < 4; ++k) {
-        row[k] = load_block(first + kRowWidth * k, 4 * kRowWidth);
-        row[4 + k] = load_block(first + kRowWidth * k + 4, 4 * kRowWidth);
-      }
-      transpose_quads(row[0], row[1], row[2], row[3]);
-      transpose_quads(row[4], row[5], row[6], row[7]);
-      candidates = bits(frustum.may_touch(row));
-    }
-    for (uint32_t j = 0; j < 16; ++j) {
-      ids[count] = i + j;
-      count += candidates >> j & 1u;
-    }
-  }
-  return count;
-}
-
 }  // namespace
 
 void project(Workspace& ws, int thread) {
@@ -253,21 +190,24 @@ void project(Workspace& ws, int thread) {
   // The list after the last row takes second keys that do not count.
   const int lists = ws.tiles_y + 1;
   for (int y = 0; y < lists; ++y) mine.strips[size_t(y)].count = 0;
-  for (uint32_t s = uint32_t(thread); s < ws.segments; s += uint32_t(ws.threads)) {
+  for (uint32_t s; (s = ws.segment_ticket.fetch_add(1, std::memory_order_relaxed)) < ws.segments;) {
     const uint32_t begin = s * kSegment, end = std::min(ws.count, begin + kSegment);
+    ws.segment_thread[s] = uint32_t(thread);
+    KeySpan* spans = &ws.segment_keys[size_t(s) * size_t(ws.tiles_y)];
     for (int y = 0; y < lists; ++y) {
       KeyList& strip = mine.strips[size_t(y)];
       strip.keys.reserve(strip.count + kSegment + 1, strip.count);
+      if (y < ws.tiles_y) spans[y].begin = strip.count;
     }
     const uint32_t* ids = ws.ids != nullptr ? ws.ids + begin : found;
     const uint32_t count = ws.ids != nullptr ? end - begin : find_candidates(ws, frustum, begin, end, found);
     Segment segment(ws, mine, begin);
     for (uint32_t i = 0; i < count; i += 16) {
+      for (uint32_t j = i + 16; j < std::min(i + 32, count); ++j) prefetch(ws.rows + size_t(kRowWidth) * ids[j]);
       project_group(ws, frustum, ids + i, int(std::min(16u, count - i)), segment);
     }
     ws.segment_visible[s] = segment.slot() - begin;
-    uint32_t* ends = &ws.segment_keys[size_t(s) * size_t(ws.tiles_y)];
-    for (int y = 0; y < ws.tiles_y; ++y) ends[y] = mine.strips[size_t(y)].count;
+    for (int y = 0; y < ws.tiles_y; ++y) spans[y].end = mine.strips[size_t(y)].count;
   }
 }
 

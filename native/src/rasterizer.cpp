@@ -3,6 +3,7 @@
 
 #include <algorithm>
 #include <chrono>
+#include <functional>
 
 namespace gausslite {
 
@@ -10,15 +11,6 @@ namespace {
 
 double now_ms() {
   return std::chrono::duration<double, std::milli>(std::chrono::steady_clock::now().time_since_epoch()).count();
-}
-
-// The k-th tile row to work on, from the middle outwards: the heaviest rows tend to be there, and starting with them
-// leaves the threads little to wait for at the end.
-int strip_of_ticket(int ticket, int strips) {
-  const int middle = strips / 2;
-  const int away = (ticket + 1) / 2;
-  const int strip = ticket % 2 == 0 ? middle + away : middle - away;
-  return strip >= 0 && strip < strips ? strip : -1;
 }
 
 // Rows of the image that member `thread` works on.
@@ -51,13 +43,16 @@ void Rasterizer::begin_frame(const FrameInput& input) {
   ws_.splats.reserve(size_t(ws_.count) + 1);
   ws_.visible.reserve(size_t(ws_.count) + 1);
   ws_.segment_visible.reserve(ws_.segments + 1);
+  ws_.segment_thread.reserve(ws_.segments + 1);
   ws_.segment_keys.reserve(size_t(ws_.segments + 1) * size_t(ws_.tiles_y));
+  ws_.keeps_bounds = ws_.knows_bounds = false;
   const size_t tiles = size_t(ws_.tiles_x) * size_t(ws_.tiles_y);
   if (ws_.tiles.size() < tiles) ws_.tiles.resize(tiles);
   ws_.image.reserve(5 * size_t(ws_.plane));
   ws_.image_gradient.reserve(5 * size_t(ws_.plane));
   ws_.gradient_rows_used = 0;
   ws_.ticket = 0;
+  ws_.segment_ticket = 0;
   for (ThreadScratch& scratch : ws_.scratch) {
     if (scratch.strips.size() <= size_t(ws_.tiles_y)) scratch.strips.resize(size_t(ws_.tiles_y) + 1);
     scratch.block_evaluations = 0;
@@ -86,15 +81,19 @@ void Rasterizer::next_tag() {
 
 void Rasterizer::count_active_tiles() {
   const size_t stride = size_t(ws_.tiles_x) + 1;
-  ws_.active_before.reserve(stride * size_t(ws_.tiles_y));
+  ws_.active_before.reserve(stride * (size_t(ws_.tiles_y) + 1));
+  std::fill_n(ws_.active_before.data(), stride, 0u);
   auto& box = ws_.active;
   box = {ws_.camera.width, 0, ws_.camera.height, 0};
   for (int y = 0; y < ws_.tiles_y; ++y) {
-    uint16_t* before = &ws_.active_before[stride * size_t(y)];
+    const uint32_t* above = &ws_.active_before[stride * size_t(y)];
+    uint32_t* before = &ws_.active_before[stride * (size_t(y) + 1)];
     before[0] = 0;
+    uint32_t in_row = 0;
     for (int x = 0; x < ws_.tiles_x; ++x) {
       const bool active = ws_.active_tiles[size_t(y) * size_t(ws_.tiles_x) + size_t(x)] != 0;
-      before[x + 1] = uint16_t(before[x] + active);
+      in_row += active;
+      before[x + 1] = above[x + 1] + in_row;
       if (!active) continue;
       box = {std::min(box.x0, x * kTile), std::max(box.x1, (x + 1) * kTile), std::min(box.y0, y * kTile),
              std::max(box.y1, (y + 1) * kTile)};
@@ -109,12 +108,29 @@ void Rasterizer::mark(double StageTimes::*stage) {
   times_.*stage = now - std::exchange(last_mark_ms_, now);
 }
 
+// The bounds of rows that are lent are kept from the first step that looks at all of them.
+void Rasterizer::use_bounds(uint64_t loan) {
+  ws_.knows_bounds = loan != 0 && loan == bounds_loan_;
+  ws_.keeps_bounds = loan != 0 && (ws_.knows_bounds || ws_.ids == nullptr);
+  if (ws_.keeps_bounds) ws_.bounds.reserve(size_t(row_count_) + 16);
+  bounds_loan_ = 0;  // until the step is done
+}
+
+// The heaviest tile rows come first: then the threads have little to wait for at the end.
+void Rasterizer::order_strips() {
+  strip_order_.clear();
+  for (int y = 0; y < ws_.tiles_y; ++y) {
+    uint32_t keys = 0;
+    for (const ThreadScratch& scratch : ws_.scratch) keys += scratch.strips[size_t(y)].count;
+    strip_order_.emplace_back(keys, y);
+  }
+  std::sort(strip_order_.begin(), strip_order_.end(), std::greater<>());
+}
+
 template <class F>
 void Rasterizer::for_each_strip(F f) {
-  const int tickets = 2 * (ws_.tiles_y / 2 + 1);
-  for (int ticket; (ticket = ws_.ticket.fetch_add(1, std::memory_order_relaxed)) < tickets;) {
-    const int strip = strip_of_ticket(ticket, ws_.tiles_y);
-    if (strip >= 0) f(strip);
+  for (int i; (i = ws_.ticket.fetch_add(1, std::memory_order_relaxed)) < ws_.tiles_y;) {
+    f(strip_order_[size_t(i)].second);
   }
 }
 
@@ -122,54 +138,34 @@ void Rasterizer::forward(const FrameInput& input, const ImageOutput& output) {
   begin_frame(input);
   team_.run([&](int thread) {
     stages_.project(ws_, thread);
-    team_.barrier([&] { mark(&StageTimes::project); });
+    team_.barrier([&] {
+      order_strips();
+      mark(&StageTimes::project);
+    });
     for_each_strip([&](int strip) { stages_.draw_strip(ws_, strip, thread); });
     team_.barrier([&] { mark(&StageTimes::raster); });
     const Band band(ws_.camera.height, thread, team_.size());
-    export_rows(output, band.begin, band.end);
+    export_image(ws_, output, band.begin, band.end);
   });
-}
-
-void Rasterizer::export_rows(const ImageOutput& output, int begin, int end) const {
-  const float* image = ws_.image.data();
-  for (int y = begin; y < end; ++y) {
-    for (int x = 0; x < ws_.camera.width; ++x) {
-      const int64_t from = int64_t(y) * ws_.padded_width + x, to = int64_t(y) * ws_.camera.width + x;
-      for (int k = 0; k < 3; ++k) output.rgb[3 * to + k] = image[k * ws_.plane + from];
-      output.depth_m[to] = image[3 * ws_.plane + from];
-      output.alpha[to] = 1.0f - image[4 * ws_.plane + from];
-    }
-  }
-}
-
-void Rasterizer::import_gradients(const ImageGradients& input, int begin, int end) {
-  float* gradient = ws_.image_gradient.data();
-  for (int y = begin; y < end; ++y) {
-    for (int x = 0; x < ws_.padded_width; ++x) {
-      const int64_t from = int64_t(y) * ws_.camera.width + x, to = int64_t(y) * ws_.padded_width + x;
-      const bool inside = y < ws_.camera.height && x < ws_.camera.width;
-      for (int k = 0; k < 3; ++k) gradient[k * ws_.plane + to] = inside ? input.d_rgb[3 * from + k] : 0.0f;
-      gradient[3 * ws_.plane + to] = inside ? input.d_depth_m[from] : 0.0f;
-      gradient[4 * ws_.plane + to] = inside ? input.d_alpha[from] : 0.0f;
-    }
-  }
 }
 
 void Rasterizer::backward(const ImageGradients& input, float* d_rows, double* d_twist, float* mean_2d_norm) {
   last_mark_ms_ = now_ms();
   ws_.ticket = 0;
+  ws_.segment_ticket = 0;
   next_tag();  // a second backward of the same forward must not add to the first one's rows
   prepare_gradient_rows();
   twist_sums_.reserve(6 * size_t(ws_.segments) + 6);
+  std::fill_n(twist_sums_.data(), 6 * size_t(ws_.segments), 0.0);
   norms_by_slot_.reserve(size_t(ws_.count) + 1);
   const GradientOutput output{d_rows, norms_by_slot_.data(), twist_sums_.data()};
   team_.run([&](int thread) {
     const Band band(ws_.tiles_y * kTile, thread, team_.size());
-    import_gradients(input, band.begin, band.end);
+    import_gradients(ws_, input, band.begin, band.end);
     team_.barrier();
     for_each_strip([&](int strip) { stages_.backward_strip(ws_, strip, thread); });
     team_.barrier([&] { mark(&StageTimes::backward); });
-    stages_.gradients(ws_, output, thread);
+    stages_.gradients(ws_, output);
     team_.barrier([&] { mark(&StageTimes::update); });
   });
   std::fill_n(d_twist, 6, 0.0);
@@ -238,6 +234,7 @@ double Rasterizer::step(const FrameInput& input, const OptimizerState& state, co
                         const LossWeights& loss, const AdamOptions& adam) {
   const double started_ms = now_ms();
   begin_frame(input);
+  use_bounds(state.loan);
   const Training training = begin_training(view, masked, loss);
   const bool with_ssim = loss.ssim != 0.0f;
   Update update{state.rows, state.first_moment, state.second_moment, state.trainable, state.trained, state.counted, {}};
@@ -252,6 +249,8 @@ double Rasterizer::step(const FrameInput& input, const OptimizerState& state, co
     stages_.project(ws_, thread);
     team_.barrier([&] {
       prepare_gradient_rows();
+      order_strips();
+      ws_.segment_ticket = 0;
       mark(&StageTimes::project);
     });
     if (with_ssim) {
@@ -266,10 +265,11 @@ double Rasterizer::step(const FrameInput& input, const OptimizerState& state, co
         mark(&StageTimes::raster);
       }
     });
-    stages_.update(ws_, update, thread);
+    stages_.update(ws_, update);
     team_.barrier([&] { mark(&StageTimes::update); });
   });
 
+  if (ws_.keeps_bounds) bounds_loan_ = state.loan;
   double total = with_ssim && view.weight_sum(masked) > 0.0 ? double(loss.ssim) : 0.0;
   for (int t = 0; t < ws_.tiles_x * ws_.tiles_y; ++t) total += l1_sums_[size_t(t)];
   for (int k = 0; with_ssim && k <= ws_.tiles_y; ++k) total += ssim_sums_[size_t(k)];

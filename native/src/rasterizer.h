@@ -3,8 +3,11 @@
 #pragma once
 
 #include <mutex>
+#include <utility>
+#include <vector>
 
 #include "adam_corrections.h"
+#include "image_exchange.h"
 #include "stages.h"
 #include "strip_schedule.h"
 #include "team.h"
@@ -22,18 +25,6 @@ struct FrameInput {
   Camera camera;
 };
 
-struct ImageOutput {
-  float* rgb;      // height x width x 3
-  float* depth_m;  // height x width
-  float* alpha;    // height x width
-};
-
-struct ImageGradients {
-  const float* d_rgb;
-  const float* d_depth_m;
-  const float* d_alpha;
-};
-
 struct LossWeights {
   float colour, depth, ssim;
 };
@@ -45,6 +36,7 @@ struct OptimizerState {
   const uint8_t* trainable;  // null: all
   uint32_t* trained;         // as in Update
   const uint8_t* counted;
+  uint64_t loan;  // numbers a time in which these rows change by steps alone; 0: others may change them in between
 };
 
 struct AdamOptions {
@@ -95,9 +87,9 @@ class Rasterizer {
   void train_with_ssim(const Training& training, int thread);
   void next_tag();
   void count_active_tiles();
+  void use_bounds(uint64_t loan);
+  void order_strips();
   void prepare_gradient_rows();
-  void export_rows(const ImageOutput& output, int begin, int end) const;
-  void import_gradients(const ImageGradients& input, int begin, int end);
   void mark(double StageTimes::*stage);
   template <class F>
   void for_each_strip(F f);
@@ -109,6 +101,8 @@ class Rasterizer {
   uint32_t row_count_ = 0;
   std::mutex mutex_;
   StripSchedule schedule_;
+  std::vector<std::pair<uint32_t, int>> strip_order_;  // keys and tile row, most keys first
+  uint64_t bounds_loan_ = 0;                           // the loan in which the bounds are true
   Buffer<double> l1_sums_, ssim_sums_, twist_sums_;
   Buffer<float> norms_by_slot_;
   AdamCorrections corrections_;

@@ -17,7 +17,7 @@ void draw_on_tape(Workspace&, const Training&, StripTape&, int strip, int thread
 void derive_ssim(Workspace&, const Training&, const SquareRow&, int thread);
 void walk_back_on_tape(Workspace&, const Training&, const TapedStrip&);
 void backward_strip(Workspace&, int strip, int thread);
-void update(Workspace&, const Update&, int thread);
-void gradients(Workspace&, const GradientOutput&, int thread);
+void update(Workspace&, const Update&);
+void gradients(Workspace&, const GradientOutput&);
 
 }  // namespace gausslite::GAUSSLITE_ISA

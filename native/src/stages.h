@@ -63,7 +63,7 @@ struct Update {
 struct GradientOutput {
   float* d_rows;        // zeroed by the caller
   float* mean_2d_norm;  // by visible splat
-  double* d_twist;      // [segments][6]
+  double* d_twist;      // [segments][6], zeroed by the caller
 };
 
 // What a row of SSIM squares is formed from, and where its derivatives go.
@@ -81,8 +81,8 @@ struct TapedStrip {
 };
 
 struct Stages {
-  // Projects this thread's segments, packs the visible splats and hands their depth keys to the tile rows that they
-  // touch.
+  // Projects the segments that are left to do, packs the visible splats and hands their depth keys to the tile rows
+  // that they touch.
   void (*project)(Workspace&, int thread);
   // Sorts, bins and draws a tile row into Workspace::image.
   void (*draw_strip)(Workspace&, int strip, int thread);
@@ -96,9 +96,9 @@ struct Stages {
   void (*walk_back_on_tape)(Workspace&, const Training&, const TapedStrip&);
   // From image_gradient to gradient rows, for the tile row that draw_strip has drawn.
   void (*backward_strip)(Workspace&, int strip, int thread);
-  // From gradient rows to parameters, over this thread's segments.
-  void (*update)(Workspace&, const Update&, int thread);
-  void (*gradients)(Workspace&, const GradientOutput&, int thread);
+  // From gradient rows to parameters, over the segments that are left to do.
+  void (*update)(Workspace&, const Update&);
+  void (*gradients)(Workspace&, const GradientOutput&);
 };
 
 // The forms; dispatch.cpp refers to those that this build has.

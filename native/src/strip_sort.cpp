@@ -16,10 +16,9 @@ constexpr int kDigits = 3, kDigitBits = 8, kDigitValues = 1 << kDigitBits;
 template <class F>
 GAUSSLITE_INLINE void for_each_key(const Workspace& ws, int strip, F f) {
   for (uint32_t segment = 0; segment < ws.segments; ++segment) {
-    const KeyList& list = ws.scratch[segment % uint32_t(ws.threads)].strips[size_t(strip)];
-    const uint32_t* ends = &ws.segment_keys[size_t(segment) * size_t(ws.tiles_y) + size_t(strip)];
-    const uint32_t begin = segment >= uint32_t(ws.threads) ? *(ends - size_t(ws.threads) * size_t(ws.tiles_y)) : 0;
-    for (uint32_t i = begin; i < *ends; ++i) f(list.keys[i]);
+    const KeyList& list = ws.scratch[ws.segment_thread[segment]].strips[size_t(strip)];
+    const KeySpan& span = ws.segment_keys[size_t(segment) * size_t(ws.tiles_y) + size_t(strip)];
+    for (uint32_t i = span.begin; i < span.end; ++i) f(list.keys[i]);
   }
 }
 

@@ -1,10 +1,11 @@
 // SPDX-License-Identifier: Apache-2.0
-// Stage 7: image gradients to parameters, for the visible splats of this thread's segments: either written out as
+// Stage 7: image gradients to parameters, for the visible splats, a segment at a time: either written out as
 // gradients, or fed to Adam on the spot, while the three rows of a splat (parameters and two moments) are in cache.
 #include <algorithm>
 #include <cstring>
 #include <limits>
 
+#include "candidates.h"
 #include "projection_backward.h"
 #include "stage_functions.h"
 
@@ -37,10 +38,10 @@ struct Group {
   }
 };
 
-// Calls f(segment, group, slot) for the visible splats of this thread's segments, sixteen at a time.
+// Calls f(segment, group, slot) for the visible splats of the segments that are left to do, sixteen at a time.
 template <class F>
-GAUSSLITE_INLINE void for_each_group(const Workspace& ws, int thread, F f) {
-  for (uint32_t s = uint32_t(thread); s < ws.segments; s += uint32_t(ws.threads)) {
+GAUSSLITE_INLINE void for_each_group(Workspace& ws, F f) {
+  for (uint32_t s; (s = ws.segment_ticket.fetch_add(1, std::memory_order_relaxed)) < ws.segments;) {
     const uint32_t begin = s * kSegment, end = begin + ws.segment_visible[s];
     for (uint32_t slot = begin; slot < end; slot += 16) {
       const Group group(ws, slot, int(std::min(16u, end - slot)));
@@ -99,9 +100,14 @@ class Adam {
 
 }  // namespace
 
-void update(Workspace& ws, const Update& job, int thread) {
+void update(Workspace& ws, const Update& job) {
   const Adam adam(job);
-  for_each_group(ws, thread, [&](uint32_t, const Group& group, uint32_t) {
+  for_each_group(ws, [&](uint32_t, const Group& group, uint32_t) {
+    // By the time the gradients are known the moments have come from memory.
+    for (const uint32_t id : group.id) {
+      prefetch(job.first_moment + size_t(kRowWidth) * id);
+      prefetch(job.second_moment + size_t(kRowWidth) * id);
+    }
     ParameterGradients g;
     backward16<false>(group.row, group.image, ws.camera, g);
     drop_unsound(g);
@@ -112,15 +118,14 @@ void update(Workspace& ws, const Update& job, int thread) {
       const uint32_t id = group.id[j];
       if (job.trainable != nullptr && !job.trainable[id]) continue;
       adam.step(id, g.column[j]);
+      if (ws.keeps_bounds) note_bounds(ws.bounds[id], job.rows + size_t(kRowWidth) * id);
       if (job.trained != nullptr && (job.counted == nullptr || job.counted[id])) ++job.trained[id];
     }
   });
 }
 
-void gradients(Workspace& ws, const GradientOutput& job, int thread) {
-  for (uint32_t s = uint32_t(thread); s < ws.segments; s += uint32_t(ws.threads))
-    std::fill_n(job.d_twist + 6 * size_t(s), 6, 0.0);
-  for_each_group(ws, thread, [&](uint32_t segment, const Group& group, uint32_t slot) {
+void gradients(Workspace& ws, const GradientOutput& job) {
+  for_each_group(ws, [&](uint32_t segment, const Group& group, uint32_t slot) {
     ParameterGradients g;
     backward16<true>(group.row, group.image, ws.camera, g);
     drop_unsound(g);

@@ -54,7 +54,17 @@ constexpr int kSquare = kTile * kTile;
 constexpr int kSsimMaps = 3;  // what SSIM blurs: x, xx, xy on the way forward, their derivatives on the way back
 constexpr int kChunk = 64;  // splats of a tile that are handled at a time: their records stay in the first-level cache
 constexpr int kPrefetchAhead = 24;  // keys
-constexpr int kSegment = 4096;      // parameter rows that are projected as a unit, always by the same thread
+constexpr int kSegment = 2048;      // parameter rows that are projected as a unit, by whichever thread is free
+
+// Where a row's splat is and how far it may reach: its mean, and the largest of its log scales.
+struct RowBounds {
+  float mean[3], log_scale;
+};
+
+// A segment's keys in its thread's list of a tile row.
+struct KeySpan {
+  uint32_t begin, end;
+};
 
 // The entries of a chunk that touch each block, in order. Rows have slack for whole-register writes.
 struct BlockLists {
@@ -112,14 +122,19 @@ struct Workspace {
   struct {
     int x0, x1, y0, y1;
   } active;                        // pixels: the smallest box around the active tiles, ends not included
-  Buffer<uint16_t> active_before;  // [tile row][tile column + 1]: active tiles to the left
+  Buffer<uint32_t> active_before;  // [tile row + 1][tile column + 1]: active tiles above and to the left
 
   // Projection. A segment's visible splats are packed to its front: slots segment * kSegment + 0 .. segment_visible.
   Buffer<Splat> splats;
   Buffer<Visible> visible;
   Buffer<uint32_t> segment_visible;
-  Buffer<uint32_t> segment_keys;  // [segment][tile row]: end of the segment's keys in its thread's list
+  Buffer<uint32_t> segment_thread;  // who projected it
+  Buffer<KeySpan> segment_keys;     // [segment][tile row]
   uint32_t segments = 0;
+  // While rows change by training steps alone, their bounds are kept from step to step: a step that looks for the rows
+  // in sight then reads 16 bytes of each instead of 64. Where they are kept and not known yet, projection notes them.
+  Buffer<RowBounds> bounds;
+  bool keeps_bounds = false, knows_bounds = false;
 
   // Raster. Lists hold the wanted blocks of a tile only: those of the active tiles that the loss depends on.
   Buffer<uint16_t> wanted_blocks;
@@ -136,8 +151,17 @@ struct Workspace {
   std::atomic<uint32_t> gradient_rows_used{0};
   uint32_t tag = 0;
 
+  // The active tiles in these columns and rows, ends included.
+  __attribute__((always_inline)) uint32_t count_active(uint32_t x0, uint32_t x1, uint32_t y0, uint32_t y1) const {
+    const size_t stride = size_t(tiles_x) + 1;
+    const uint32_t *above = &active_before[stride * y0], *within = &active_before[stride * (size_t(y1) + 1)];
+    return (within[x1 + 1] - within[x0]) - (above[x1 + 1] - above[x0]);
+  }
+
   std::vector<ThreadScratch> scratch;
-  std::atomic<int> ticket{0};  // dynamic scheduling of tile rows; reset between stages
+  // Dynamic scheduling of tile rows and of segments; reset between stages.
+  std::atomic<int> ticket{0};
+  std::atomic<uint32_t> segment_ticket{0};
 };
 
 }  // namespace gausslite

@@ -72,8 +72,12 @@ class Engine:
         trainable: Bool[ndarray, " n"] | None,
         trained: UInt32[ndarray, " n"] | None,
         counted: Bool[ndarray, " n"] | None,
+        loan: int,
     ) -> float:
-        """The loss; adam is beta1, beta2, epsilon. trained rises by one for each row that moved and is counted."""
+        """The loss; adam is beta1, beta2, epsilon. trained rises by one for each row that moved and is counted.
+
+        loan: numbers a time in which the rows change by steps of this number alone; 0 where others may change them.
+        """
 
     def visible(self) -> UInt32[ndarray, " m"]:
         """The rows that the last forward or step found visible, ascending."""

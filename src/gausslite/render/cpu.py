@@ -97,6 +97,7 @@ class CpuRasterizer:
         self._latest: ref[_Report] | None = None
         self._held: _Tables | None = None
         self._masked_ms = 0.0
+        self._loans = 0
 
     @property
     def name(self) -> str:
@@ -184,7 +185,8 @@ class CpuRasterizer:
         """One whole iteration in place. Raises ShapeError, also for a view of another backend."""
         if not isinstance(view, CpuView):
             raise ShapeError(f"view: expected one that this backend prepared, got {type(view).__name__}")
-        if not self._holds(rows, first_moment, second_moment):
+        held = self._holds(rows, first_moment, second_moment)
+        if not held:
             require_tables(rows, first_moment, second_moment)
         require_scene(len(rows), view.camera, T_camera_world, subset)
         require_marks(len(rows), trainable, tally)
@@ -206,6 +208,7 @@ class CpuRasterizer:
             _contiguous(trainable),
             None if tally is None else tally.counts,
             None if tally is None else _contiguous(tally.among),
+            self._loans if held else 0,
         )
         if masked:
             self._masked_ms += self._engine.steps_ms - before_ms
@@ -220,8 +223,12 @@ class CpuRasterizer:
         first_moment: Float32[ndarray, "n 16"],
         second_moment: Float32[ndarray, "n 16"],
     ) -> Iterator[None]:
-        """Nothing to carry: steps work on the arrays themselves, which are checked once here. Raises ShapeError."""
+        """Nothing to carry: steps work on the arrays themselves, which are checked once here. Raises ShapeError.
+
+        As nobody else changes the rows, the kernels keep where each one is from step to step.
+        """
         require_tables(rows, first_moment, second_moment)
+        self._loans += 1
         self._held = rows, first_moment, second_moment
         try:
             yield
