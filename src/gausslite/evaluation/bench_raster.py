@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
@@ -98,6 +98,7 @@ class RasterBench:
         ours = _Ours(rasterizer, table, view)
         contenders: list[_Ours | Yardstick] = [ours]
         with ExitStack() as at_end:
+            at_end.enter_context(ours.holding())
             if self.yardstick is not None:
                 other = Yardstick(self.yardstick, rasterizer.threads, _table(table.count), view)
                 at_end.callback(other.close)
@@ -136,6 +137,10 @@ class _Ours:
         self._d_rgb = np.full(view.rgb.shape, 1e-5, np.float32)
         self._d_depth_m = np.full(view.depth_m.shape, 1e-5, np.float32)
         self._d_alpha = np.zeros(view.depth_m.shape, np.float32)
+
+    def holding(self) -> AbstractContextManager[None]:
+        """Lend the table to the rasterizer for the whole case."""
+        return self._train.holding()
 
     def fused_l1(self) -> None:
         """One whole iteration with L1 on colour and depth."""

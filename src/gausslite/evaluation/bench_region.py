@@ -64,7 +64,8 @@ def region_costs(
         seconds: list[list[float]] = [[] for _ in steps]
         for done in range(0, repetitions, TURN):
             for step, times in zip(steps, seconds, strict=True):
-                times += timed([functools.partial(step, loss)], min(TURN, repetitions - done))[0]
+                with step.holding():
+                    times += timed([functools.partial(step, loss)], min(TURN, repetitions - done))[0]
         full, *regions = [Duration.of(times) for times in seconds]
         costs += [RegionCost(*case, name, region, full) for case, region in zip(cases, regions, strict=True)]
     return tuple(costs)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 
 import numpy as np
@@ -56,20 +57,22 @@ class RestingStep:
         pixels: Bool[ndarray, "h w"] | None = None,
         tiles: Bool[ndarray, "th tw"] | None = None,
     ) -> None:
-        self._rasterizer, self._table = rasterizer, table
+        self._rasterizer = rasterizer
+        self._lent = table.rows, table.first_moment, table.second_moment
         self._pose = view.T_camera_world
         weight = None if pixels is None else pixels.astype(np.float32)
         self._view = rasterizer.prepare_view(view.rgb, view.depth_m, view.camera, weight)
         self._masked = pixels is not None
         self._subset = EVERYTHING if tiles is None else Subset(tiles=tiles)
 
+    def holding(self) -> AbstractContextManager[None]:
+        """Lend the tables for many iterations, as the mapper does."""
+        return self._rasterizer.holding(*self._lent)
+
     def __call__(self, loss: LossWeights) -> None:
         """One iteration."""
-        table = self._table
         self._rasterizer.step(
-            table.rows,
-            table.first_moment,
-            table.second_moment,
+            *self._lent,
             self._view,
             self._pose,
             loss,
