@@ -70,6 +70,14 @@ def test_what_is_seen_through_a_chairs_slats_is_not_the_chair():
     assert np.array_equal(front, (depth_m == 1.5) | (depth_m == 0.0))
 
 
+def test_a_few_pixels_between_do_not_join_a_bottle_to_the_wall_behind():
+    depth_m, mask = np.full((120, 160), 2.2, np.float32), np.zeros((120, 160), np.bool_)
+    mask[40:70, 70:80] = True
+    depth_m[40:66, 70:80] = 1.9
+    depth_m[66, 70:80] = np.linspace(1.9, 2.2, 10)
+    assert np.array_equal(front_layer(mask, depth_m), mask & (depth_m < 1.97))
+
+
 def test_a_table_that_recedes_is_one_layer():
     depth_m = np.broadcast_to(np.linspace(0.8, 4.0, 120, dtype=np.float32)[:, None], (120, 160))
     assert np.array_equal(front_layer(WHOLE, depth_m), WHOLE)

@@ -11,6 +11,7 @@ from numpy import ndarray
 _BIN: Final = 0.02
 _GAP_BINS: Final = 2
 _SPARSE_SHARE: Final = 0.005
+_SPARSE_TO_PEAK: Final = 0.06
 _OWN_SHARE: Final = 0.3
 _MIN_PIXELS: Final = 8
 
@@ -26,7 +27,7 @@ def front_layer(mask: Bool[ndarray, "h w"], depth_m: Float32[ndarray, "h w"]) ->
         return mask
     bins = ((log_depths - log_depths.min()) / _BIN).astype(np.int64)
     counts = np.bincount(bins)
-    filled = np.flatnonzero(counts > _SPARSE_SHARE * len(bins))
+    filled = np.flatnonzero(counts > max(_SPARSE_SHARE * len(bins), _SPARSE_TO_PEAK * float(counts.max())))
     layer = np.cumsum(np.diff(filled, prepend=filled[0]) > _GAP_BINS)
     shares = np.bincount(layer, weights=counts[filled]) / len(bins)
     nearest = filled[layer == np.flatnonzero(shares >= min(_OWN_SHARE, shares.max()))[0]]
