@@ -11,8 +11,8 @@ from numpy import ndarray
 _BIN: Final = 0.02
 _GAP_BINS: Final = 2
 _SPARSE_SHARE: Final = 0.005
-_SPARSE_TO_PEAK: Final = 0.06
-_OWN_SHARE: Final = 0.3
+_SPARSE_TO_PEAK: Final = 0.05
+_OWN_SHARE: Final = 0.15
 _MIN_PIXELS: Final = 8
 
 
