@@ -55,6 +55,7 @@ def test_what_the_operator_can_mend_is_one_line_and_code_2(tmp_path: Path) -> No
     assert "voxel size_m" in ends_with_one_line("--voxel-size", "0")
     assert "--store-max-mb" in ends_with_one_line("--store-max-mb", "0")
     assert "--refine-iterations" in ends_with_one_line("--refine-iterations", "1000000")
+    assert "mission: expected UTF-8 text" in ends_with_one_line("--mission", "husky-\udcff")
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()

@@ -11,6 +11,7 @@ from gausslite.datasets.registration import ColourCamera
 from gausslite.domain.pose import UpAxis
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.errors import InvalidInputError
+from gausslite.fusion.terms import require_name
 from gausslite.mission.options import (
     add_budget,
     add_detector,
@@ -127,9 +128,10 @@ def _load_settings(options: argparse.Namespace) -> LoadSettings:
 
 def _require_sense(options: argparse.Namespace) -> None:
     """What would show only in the middle of a mission is refused here."""
-    agent_id = options.agent_id.encode(errors="replace")
-    if not 1 <= len(agent_id) <= 255:
-        raise InvalidInputError(f"--agent-id: expected 1 to 255 bytes, got {len(agent_id)}")
+    for name in ("agent_id", "mission", "world_frame"):
+        require_name(f"--{name.replace('_', '-')}", getattr(options, name))
+    if not options.agent_id:
+        raise InvalidInputError("--agent-id: expected a name, got an empty text")
     if not 0 <= options.drain_timeout <= _MAX_DRAIN_S:
         raise InvalidInputError(f"--drain-timeout: expected 0 to {_MAX_DRAIN_S:g} s, got {options.drain_timeout}")
     for name in ("parser", "fusion"):

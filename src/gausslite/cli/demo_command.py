@@ -74,9 +74,9 @@ def run(options: argparse.Namespace) -> int:
             f"--refine-iterations: expected 0 to {MAX_REFINE_ITERATIONS}, got {options.refine_iterations}"
         )
     _require_usable(options)
+    prepare_folder(options.out)
     stage = _simulated_stage(options) if options.source is None else _recorded_stage(options)
     regions = _scored_regions(options, stage.regions)
-    prepare_folder(options.out)
     with running_team(_plan(options, stage), options.out.absolute()) as team:
         watch_missions(team)
         maps = collect_maps(team, options.out)

@@ -43,6 +43,10 @@ class TeamSettings:
     quotas: Quotas = field(default_factory=Quotas)
     remembered_vanished: int = 100_000
 
+    def __post_init__(self) -> None:
+        require_name("mission", self.mission_id)
+        require_name("world frame", self.world_frame)
+
     @property
     def offer(self) -> Charter:
         """These terms as a charter that may still have empty names."""
@@ -58,8 +62,11 @@ def shown(name: str) -> str:
 
 
 def require_name(what: str, name: str) -> None:
-    """Raise InvalidInputError unless the name has at most MAX_NAME_BYTES bytes."""
-    size = len(name.encode())
+    """Raise InvalidInputError unless the name is text of at most MAX_NAME_BYTES bytes."""
+    try:
+        size = len(name.encode())
+    except UnicodeEncodeError:
+        raise InvalidInputError(f"{what}: expected UTF-8 text, got other bytes") from None
     if size > MAX_NAME_BYTES:
         raise InvalidInputError(f"{what}: expected at most {MAX_NAME_BYTES} bytes, got {size}")
 
