@@ -10,6 +10,7 @@ import pytest
 from gausslite.domain.task import Predicate, Relation, TaskGraph
 from gausslite.errors import TaskError
 from gausslite.evaluation.bench_parser import SENTENCES as BENCH_SENTENCES
+from gausslite.task import lexicon
 from gausslite.task.nouns import LANDMARKS
 from gausslite.task.parser import task_id_of
 from gausslite.task.rules import RuleParser
@@ -42,6 +43,24 @@ def test_graphs_of_ordinary_sentences_are_exact():
     print(f"exact graphs: {share:.1%} of {len(SENTENCES)}; wrong: {wrong}")
     assert len(SENTENCES) >= 600
     assert share >= 0.95, wrong
+
+
+FRAMES = [
+    "Clean the {}",
+    "Find the {} on the shelf",
+    "Bring me the red {} and the glorb",
+    "Where is the {}?",
+    "Is the {} under the shelf broken?",
+    "Put the {} next to the shelf",
+]
+
+
+@pytest.mark.parametrize("at", range(len(FRAMES)))
+def test_every_everyday_noun_is_read_as_one(at):
+    no_objects = lexicon.PLACES | lexicon.MEASURES | lexicon.SELVES | lexicon.ROUTES | lexicon.TASK_WORDS
+    parser, adjective = RuleParser(), "red " if "red" in FRAMES[at] else ""
+    for noun in sorted(lexicon.NOUNS - no_objects - lexicon.ADJECTIVES)[at :: len(FRAMES)]:
+        assert adjective + singular(noun) in parser.parse(FRAMES[at].format(noun)).targets
 
 
 def test_a_sentence_takes_less_than_10_ms():

@@ -52,7 +52,7 @@ def names_object(noun: NounPhrase, pending: str | None, after: Piece | None) -> 
     if noun.head in lexicon.ROUTES:
         return pending not in (None, "of", "for", "to")
     if noun.head in lexicon.MEASURES and pending not in (None, "of"):
-        return True
+        return not leads_on
     return noun.head not in lexicon.MEASURES or ((noun.known or compound) and not leads_on)
 
 

@@ -132,7 +132,7 @@ class GraphBuilder:
                 self._draft.mean(clause.subjects)
             return
         named, subjects = (clause.subjects[:-1], clause.subjects[-1:]) if clause.joined else (
-            clause.referents, clause.subjects
+            clause.referents or self._draft.targets[-2:-1], clause.subjects
         )  # fmt: skip
         if named and subjects:
             clause.subjects = subjects

@@ -216,7 +216,9 @@ class _Reader:
         base = verb_base(word) or word
         subject = self._tag(-1)
         self.modal, must = is_modal(self.said, self.at) and subject in SUBJECTS, self.modal
-        if must and self._subject_is_thing():
+        if subject is Tag.INFINITIVE and self._tag(-2) is Tag.STAND_IN and self._tag(1) not in _OPENS_OBJECT:
+            self._close()  # "something to write with"
+        elif must and self._subject_is_thing():
             if base in BELONGING_VERBS:
                 self._emit(Kind.BELONGS, base)
         elif subject not in SUBJECTS or commands(self.said, self.at) or (subject is Tag.PRONOUN and base in WISHES):
@@ -287,7 +289,7 @@ class _Reader:
             return
         if relation == "to" and self._last() is Kind.NOUN and (before is Tag.ING or self._tag(-2) is Tag.RELATIVE):
             relation = "purpose"  # "the door that leads to the hall"
-        if after is Tag.ING and word in ("for", "by", "before", "after"):
+        if after is Tag.PREPOSITION or (after is Tag.ING and word in ("for", "by", "before", "after")):
             self._close()
             return
         self._emit(Kind.PREPOSITION, relation, stated=before in _STATES)
