@@ -45,18 +45,17 @@ class NounPlacer:
         In "in the kitchen, find the mug" the place belongs to the clause that follows.
         """
         before = self.clause
-        if (
-            before.mentioned
-            and before.referents
-            and before.verb in SEARCH_VERBS
-            and before.orphans
-            and not before.subjects
-        ):
+        if self._looks_for_what_was_lost():
             self._seek_there(before)
         elif not before.aside:
             self._mean_places()
         self.clause = Clause(verb=verb, referents=before.subjects or before.referents)
         self.clause.orphans, self.clause.mentioned = before.orphans, before.aside
+
+    def _looks_for_what_was_lost(self) -> bool:
+        clause = self.clause
+        places_only = clause.verb in SEARCH_VERBS and bool(clause.orphans) and not clause.subjects
+        return places_only and clause.mentioned and bool(clause.referents)
 
     def _seek_there(self, clause: Clause) -> None:
         """In "I lost my wallet, look under the bed" the wallet is sought there."""
@@ -94,21 +93,13 @@ class NounPlacer:
         clause = self.clause
         if pending == "closer":
             pending = "to" if clause.verb in DELIVERY_VERBS else "near"
-        if pending == "to":
-            self._towards(noun)
-        elif pending == "for":
-            self._sought(noun)
-        elif pending == "of":
-            self._part_of(noun)
-        elif pending == "purpose" and clause.route:
-            self.target(noun)
-        elif pending == "purpose":
-            clause.last_relation = "with"
+        plainly = {"to": self._towards, "for": self._sought, "of": self._part_of, "via": self._on_the_way}
+        if pending in plainly:
+            plainly[pending](noun)
         elif pending == "when":
             return
-        elif pending == "via":
-            self.target(noun)
-            clause.route = True
+        elif pending == "purpose":
+            self._led_to(noun)
         elif pending == "inside" and noun.head in lexicon.CLOTHING and self._is_about_people():
             self.relate("near", noun)
         elif pending in _PAST and clause.verb in DELIVERY_VERBS:
@@ -130,6 +121,17 @@ class NounPlacer:
             if clause.orphans and clause.verb in GO_VERBS | STOPPING_VERBS:
                 self._mean_places()  # "stop behind the car near the tree"
             self.relate(pending, noun)
+
+    def _on_the_way(self, noun: NounPhrase) -> None:
+        self.target(noun)
+        self.clause.route = True
+
+    def _led_to(self, noun: NounPhrase) -> None:
+        """A path that leads to a cabin makes it a goal; a door that does, or a key that opens it, does not."""
+        if self.clause.route:
+            self.target(noun)
+        else:
+            self.clause.last_relation = "with"
 
     def _is_about_people(self) -> bool:
         return any(subject.split()[-1] in lexicon.PEOPLE for subject in self.clause.subjects)

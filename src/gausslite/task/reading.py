@@ -240,7 +240,7 @@ class _Reader:
             self._emit(Kind.PREPOSITION, "purpose")
 
     def _subject_is_thing(self) -> bool:
-        noun = self.pieces[-1].noun
+        noun = self.pieces[-1].noun if self.pieces else None
         return noun is not None and noun.head not in lexicon.SELVES
 
     def _ing(self, word: str) -> None:

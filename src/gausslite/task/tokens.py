@@ -10,12 +10,14 @@ from gausslite.task.idioms import plain_words
 from gausslite.task.prepositions import PREPOSITIONS
 
 _TOKEN: Final = re.compile(r"[^\W\d_][\w'’-]*|\d[\w.]*|[,/&+;.!?:()]")
+_UNITS: Final = [
+    *(tuple(said.split()) for said in PREPOSITIONS if " " in said),
+    *(negation for negation in lexicon.NEGATIONS if len(negation) > 1),
+]
+# by their first word, the longest first
 _COMPOUNDS: Final = {
-    first: sorted((unit for unit in units if unit[0] == first), key=len, reverse=True)
-    for units in [
-        [tuple(said.split()) for said in PREPOSITIONS if " " in said] + [n for n in lexicon.NEGATIONS if len(n) > 1]
-    ]
-    for first in {unit[0] for unit in units}
+    first: sorted((unit for unit in _UNITS if unit[0] == first), key=len, reverse=True)
+    for first in {unit[0] for unit in _UNITS}
 }
 
 
