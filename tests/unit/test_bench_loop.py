@@ -8,7 +8,7 @@ import pytest
 
 from gausslite.cli.main import main
 from gausslite.errors import DatasetError
-from gausslite.evaluation.bench_loop import FrameCost, Latency, LoopTiming
+from gausslite.evaluation.bench_loop import CostLog, FrameCost, Latency, LoopTiming
 from gausslite.mapping.pace import FrameBudget, Relief, Step
 
 SMALL = ("--size", "96x72", "--max-gaussians", "1500", "--threads", "1")
@@ -39,6 +39,14 @@ def test_steps_reliefs_and_short_frames_are_counted() -> None:
     assert timing.steps["drawing"].max_ms == 0.0
     assert timing.reliefs == {"words": 0, "seeding": 2}
     assert timing.frames_short == 1
+
+
+def test_the_log_gives_back_what_it_was_told() -> None:
+    log, told = CostLog(), [cost(0.06, 4), cost(0.26, 8), cost(0.1, 0)]
+    for each in told:
+        log.append(each)
+    assert log.costs() == told
+    assert CostLog().costs() == []
 
 
 def test_no_mapped_frame_is_an_error() -> None:

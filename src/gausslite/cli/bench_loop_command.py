@@ -15,7 +15,7 @@ from gausslite.datasets.source import Source
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.errors import InvalidInputError
 from gausslite.evaluation.bench_gap import RateGap
-from gausslite.evaluation.bench_loop import FrameCost, Latency, LoopBench, LoopTiming, Overhead
+from gausslite.evaluation.bench_loop import CostLog, FrameCost, Latency, LoopBench, LoopTiming, Overhead
 from gausslite.evaluation.bench_memory import MemoryTrend, back_and_forth, resident_mib
 from gausslite.evaluation.held_out import HoldOut
 from gausslite.evaluation.views import HeldOutView
@@ -113,17 +113,17 @@ def _play(
     settings, size = mission_settings(options), frame_size(options.size, source)
     mapper = GaussianMapper(settings.mapper_settings(), rasterizer, settings.seed)
     bench = LoopBench(choose_attention(options, source)[0], mapper, VoxelGrid(), settings.pace)
-    costs, samples_mib = [], []
+    log, samples_mib = CostLog(), []
     every = max(1, len(positions) // _MEMORY_SAMPLES)
     with MappingBar(len(positions), "bench") as bar:
         for done, position in enumerate(positions, start=1):
             cost = bench.process(source.frame(position, size))
             if cost is not None:
-                costs.append(cost)
+                log.append(cost)
                 bar.show(done, cost.gaussians, cost.roi_share)
             if options.loop is not None and (done % every == 0 or done == 1):
                 samples_mib.append(resident_mib())
-    return bench, costs, MemoryTrend.of(samples_mib, every) if options.loop is not None else None
+    return bench, log.costs(), MemoryTrend.of(samples_mib, every) if options.loop is not None else None
 
 
 def _gap(

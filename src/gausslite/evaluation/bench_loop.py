@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from array import array
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -63,6 +64,32 @@ class FrameCost:
     def of(self, step: Step) -> float:
         """Seconds of one step; 0 where the frame went without it."""
         return self.budget.steps_s.get(step, 0.0)
+
+
+class CostLog:
+    """What each frame cost, as a few numbers: the memory of a long run is to be the loop's and not its record's."""
+
+    def __init__(self) -> None:
+        self._numbers = array("d")
+
+    def append(self, cost: FrameCost) -> None:
+        """Keep one more."""
+        budget = cost.budget
+        self._numbers.extend((budget.seconds, budget.short, cost.iterations, cost.gaussians, cost.roi_share))
+        self._numbers.extend(relief in budget.reliefs for relief in Relief)
+        self._numbers.extend(map(cost.of, Step))
+
+    def costs(self) -> list[FrameCost]:
+        """All that were kept, in order."""
+        return [_cost_of(row) for row in np.asarray(self._numbers).reshape(-1, 5 + len(Relief) + len(Step)).tolist()]
+
+
+def _cost_of(row: list[float]) -> FrameCost:
+    """A frame's cost from the numbers that the log keeps of it."""
+    (seconds, short, iterations, gaussians, roi_share), beside = row[:5], row[5:]
+    reliefs = frozenset(relief for relief, went_without in zip(Relief, beside, strict=False) if went_without)
+    steps_s = {step: step_s for step, step_s in zip(Step, beside[len(Relief) :], strict=True) if step_s > 0.0}
+    return FrameCost(FrameBudget(seconds, steps_s, reliefs, bool(short)), int(iterations), int(gaussians), roi_share)
 
 
 @dataclass(frozen=True, slots=True)
