@@ -16,6 +16,8 @@ def require_array(name: str, value: NDArray[Any], shape: tuple[int | None, ...],
     if not isinstance(value, np.ndarray) or value.dtype != expected:
         came = getattr(value, "dtype", type(value).__name__)
         raise ShapeError(f"{name}: expected an array of {expected}, got {came}")
+    if value.shape == shape:
+        return
     fits = len(value.shape) == len(shape) and all(
         want is None or want == have for want, have in zip(shape, value.shape, strict=True)
     )

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import partial
 
 from gausslite.errors import InvalidInputError
 
@@ -123,12 +124,11 @@ class Pace:
         needed_s = self._forecasts[step].cautious_s + missing * self._forecasts[cheaper].mean_s
         return self._left_s() > needed_s
 
-    @contextmanager
-    def timing(self, step: Step) -> Iterator[None]:
+    def timing(self, step: Step) -> AbstractContextManager[None]:
         """Measure a step, and expect the next of its kind to cost about as much."""
-        started_s = self._clock()
-        yield
-        seconds = self._clock() - started_s
+        return _Timing(self._clock, partial(self._took, step))
+
+    def _took(self, step: Step, seconds: float) -> None:
         self._steps_s[step] = self._steps_s.get(step, 0.0) + seconds
         self._forecasts[step].learn(seconds)
         self._opening += step is Step.WARM_UP and self._opening == self._iterations
@@ -163,6 +163,24 @@ def choose_reliefs(
             chosen.add(relief)
             needed_s -= sum(expected_s[step] for step in _SPARED[relief])
     return frozenset(chosen)
+
+
+class _Timing:
+    """Tells how long its block took, unless that raised; round every iteration a generator would cost more."""
+
+    __slots__ = ("_clock", "_started_s", "_tell")
+
+    def __init__(self, clock: Clock, tell: Callable[[float], None]) -> None:
+        self._clock = clock
+        self._tell = tell
+        self._started_s = 0.0
+
+    def __enter__(self) -> None:
+        self._started_s = self._clock()
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if kind is None:
+            self._tell(self._clock() - self._started_s)
 
 
 class _Forecast:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
 
@@ -20,6 +20,7 @@ from gausslite.render.rasterizer import LOG_SCALE, RGB, Rasterizer, Subset, Tall
 
 _COLOUR_RANGE = (-0.25, 1.25)
 """Somewhat beyond what can be shown, so that overlapping Gaussians still add up to black and white."""
+_DRAWS = 16
 _Rows: TypeAlias = Float32[ndarray, "n 16"]
 _Tables: TypeAlias = tuple[_Rows, _Rows, _Rows]
 
@@ -95,7 +96,7 @@ class Trainer:
             return
         loan = _Loan.of(self._table, self._settings.optimization.active_phase)
         with self._rasterizer.holding(*loan.tables):
-            self._iterate(loan, step, views if step is Step.WARM_UP else showing)
+            self._iterate(loan, step, views if step is Step.WARM_UP else showing, self._rng.random())
         self._control_density(extent_m, pace)
         self._bound_colours()
 
@@ -121,18 +122,19 @@ class Trainer:
     ) -> int:
         """Iterate until density control is due or time is up, the tables on loan to the rasterizer; `done` then."""
         loan = _Loan.of(self._table, self._settings.optimization.active_phase)
+        draws = _uniform(self._rng)
         with self._rasterizer.holding(*loan.tables):
             while (step := self._next_step(done, bool(showing), pace)) is not None:
                 with pace.timing(step):
-                    self._iterate(loan, step, views if step is Step.WARM_UP else showing)
+                    self._iterate(loan, step, views if step is Step.WARM_UP else showing, next(draws))
                 done += 1
                 if self._prune_is_due(pace) or self._densify_is_due(pace):
                     break
         return done
 
-    def _iterate(self, loan: _Loan, step: Step, views: Sequence[WindowView]) -> None:
-        """One iteration on a view drawn at random: over its full image, or over the task's region alone."""
-        view = views[int(self._rng.integers(len(views)))]
+    def _iterate(self, loan: _Loan, step: Step, views: Sequence[WindowView], draw: float) -> None:
+        """One iteration on the view that `draw`, from 0 to 1, picks: its full image, or the task's region alone."""
+        view = views[int(draw * len(views))]
         if step is Step.WARM_UP:
             self._warm_up(loan, view)
         else:
@@ -189,6 +191,12 @@ class Trainer:
             with pace.timing(Step.DENSITY):
                 densify(self._table, density, extent_m)
             self._since_densified = 0
+
+
+def _uniform(rng: np.random.Generator) -> Iterator[float]:
+    """Numbers in [0, 1), drawn some at a time: between two iterations a call of the generator is dear."""
+    while True:
+        yield from rng.random(_DRAWS).tolist()
 
 
 def _due(since: int, every: int, pace: Pace) -> bool:

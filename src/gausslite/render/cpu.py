@@ -42,7 +42,8 @@ if TYPE_CHECKING:
 SIMD_VARIABLE = "GAUSSLITE_SIMD"
 MAX_THREADS = 256
 
-_Tables: TypeAlias = tuple[Float32[ndarray, "n 16"], Float32[ndarray, "n 16"], Float32[ndarray, "n 16"]]
+_Table: TypeAlias = Float32[ndarray, "n 16"]
+_Tables: TypeAlias = tuple[_Table, _Table, _Table]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -249,8 +250,9 @@ class CpuRasterizer:
         """How often the latest forward or step composited a splat on a 4x4 block of pixels."""
         return self._engine.block_evaluations
 
-    def _holds(self, *tables: Float32[ndarray, "n 16"]) -> bool:
-        return self._held is not None and all(a is b for a, b in zip(tables, self._held, strict=True))
+    def _holds(self, rows: _Table, first_moment: _Table, second_moment: _Table) -> bool:
+        held = self._held
+        return held is not None and rows is held[0] and first_moment is held[1] and second_moment is held[2]
 
     def _settle_report(self) -> None:
         """A report that somebody still holds gets its rows before the kernels draw over them."""
