@@ -22,7 +22,7 @@ _LOST: Final = words("missing lost gone")
 _OTHERS: Final = words("i he she they")
 _REASONS: Final = words("because since as although though")
 _CONDITIONS: Final = words("if whether when once until unless before after while")
-_SEQUELS: Final = words("then")
+_TIMES: Final = words("when once until before after while")
 _STARKER_JOINS: Final = words(", but +")
 _PREDICATES: Final = frozenset({Tag.VERB, Tag.AUXILIARY, Tag.PARTICIPLE})
 _QUESTION_OPENERS: Final = frozenset({Tag.AUXILIARY, Tag.STAND_IN, Tag.RELATIVE})
@@ -110,11 +110,14 @@ def _mood(said: Tagged, start: int, end: int, before: Mood) -> Mood:
     clause = said[first:end]
     if opener[1] is Tag.BREAK and opener[0] in _REASONS:
         return Mood.REASON
+    if clause and opener[0] in _TIMES and clause[0][0] in _OTHERS | {"we"}:
+        return Mood.ASIDE  # "while I hold the door"
     if not clause or (opener[1] is Tag.BREAK and opener[0] in _CONDITIONS):
         return Mood.TASK
     if any(_asks(said, at) for at in range(first, end)) or clause[0][1] in _QUESTION_OPENERS or clause[0][0] == "which":
         return Mood.TASK
-    elliptic = clause[0][1] is Tag.PREPOSITION or opener[0] in _SEQUELS
+    # "bring the hammer. And the nails."
+    elliptic = not any(tag in (Tag.AUXILIARY, Tag.VERB, Tag.PRONOUN) for _, tag in clause)
     return before if elliptic and before is Mood.TASK else Mood.ASIDE
 
 

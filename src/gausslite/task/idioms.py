@@ -27,8 +27,9 @@ _PLAIN: Final = {
     r"be so (?:kind|good) as to|be (?:kind|good) enough to|in order to": "to",
     r"so(?: that)?(?= (?:i|you|we|he|she|they|it|the|my|our|nobody|no|people|everyone|everybody)\b)": "because",
     # a light verb with the noun that carries the meaning
-    r"(?:have|take|get|give me|catch) an? (?:\w+ ){0,2}(?:look|glance|peek|view) (?:at|of|around|over|into)": "look at",
-    r"(?:have|take) an? (?:\w+ )?look(?= (?:under|behind|inside|in|on|for)\b)": "look",
+    r"(?:have|take|get|give me|catch|(?:i|we) (?:would )?(?:like|want|need)) an? (?:\w+ ){0,2}"
+    r"(?:look|glance|peek|view) (?:at|of|around|over|into)": "look at",
+    r"(?:have|take) an? (?:\w+ )?look(?= (?:under|behind|inside|in|on|for|if|whether)\b)": "look",
     r"(?:take|make) (?:a )?note of|take stock of": "look at",
     r"keep (?:an|your|a close|a watchful) eye on|keep watch (?:over|on)": "watch",
     r"get rid of|do away with|dispose of|throw (?:away|out)": "remove",

@@ -29,6 +29,8 @@ _SOURCES: Final = {f"from_{place}": place for place in ("on", "under", "inside",
 # after "on the table" these say where something goes, and others say where the table is
 _FINAL_DESTINATIONS: Final = words("on inside")
 _DESTINATIONS: Final = words("to on inside near under behind in_front_of above between left_of right_of")
+# what is compared or swapped with something is a target as much as that is
+_PAIRING: Final = words("compare swap exchange")
 _PAST: Final = words("past beyond")
 
 
@@ -104,7 +106,7 @@ class NounPlacer:
             self.relate("near", noun)
         elif pending in _PAST and clause.verb in DELIVERY_VERBS:
             self._draft.anchor(noun.text)
-        elif self._is_passed(pending) or (pending == "with" and clause.verb == "compare"):
+        elif self._is_passed(pending) or (pending == "with" and clause.verb in _PAIRING):
             self.target(noun, joined=True)
         elif pending == "with" and clause.verb in FILLING_VERBS and clause.subjects:
             self._filled_with(noun)

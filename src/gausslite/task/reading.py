@@ -84,6 +84,8 @@ class _Reader:
                 tag = Tag.BREAK
             if mood is Mood.ASIDE and at in self.moods:
                 self._emit(Kind.ASIDE, word)
+                if tag in (Tag.BREAK, Tag.JOIN):
+                    continue
             if mood is not Mood.REASON:
                 self._read.get(tag, self._skip)(word)
         self._close()
@@ -158,10 +160,9 @@ class _Reader:
         self._emit(Kind.POINTING if word in _POINTING else Kind.BACK_REFERENCE, word)
 
     def _break(self, word: str) -> None:
-        if word == "that" and self._tag(-1) is not None:
-            self._close()
-            return
-        self._emit(Kind.BREAK, word)
+        self._close()
+        if word != "that":
+            self._emit(Kind.BREAK, word)
 
     def _negation(self, word: str) -> None:
         if self._tag(-1) is Tag.PRONOUN and self._word(-1) != "you" and verb_base(self._word(1)) not in _REFUSALS:
@@ -170,8 +171,7 @@ class _Reader:
         if self._tag(1) is Tag.AUXILIARY and self._tag(2) in (Tag.PARTICIPLE, Tag.VERB):
             self._forbid(word)
             return
-        stative = self._tag(-1) is Tag.AUXILIARY and self._word(-1) != "do" and self._tag(1) not in _FORBIDDEN
-        if stative:
+        if self._tag(-1) is Tag.AUXILIARY and self._word(-1) != "do" and self._tag(1) not in _FORBIDDEN:
             self._close()
         else:
             self._emit(Kind.NEGATION, word)
