@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -18,7 +19,7 @@ from gausslite.evaluation.quality.pairs import HOME_PAIRS, WHOLE_HOMES, Kind, ch
 from gausslite.evaluation.quality.scenes import HomeScenePlan
 from gausslite.evaluation.quality.study import Archive, Finished, Study
 from gausslite.evaluation.quality.tables import FULL_METRICS, ROI_METRICS, Scoreboard, ablation_table, quality_table
-from gausslite.evaluation.quality.trials import Budget, Conditions, Equal, Trial, TrialResult, Variant
+from gausslite.evaluation.quality.trials import Budget, Conditions, Equal, Trial, TrialResult, Variant, clock_for
 from gausslite.perception.vocabulary import same_kind
 from gausslite.task.rules import RuleParser
 
@@ -74,7 +75,7 @@ def test_pairs_are_chosen_by_name_or_home() -> None:
 def test_components_come_one_by_one() -> None:
     variants = cumulative_variants()
     labels = [variant.label for variant in variants]
-    assert labels == ["none", "+SB", "+MVO", "+ROI", "+SIS", "+GFD", "+views", "+surroundings"]
+    assert labels == ["none", "+SB", "+MVO", "+ROI", "+SIS", "+GFD", "+views", "+surroundings", "+scaffold"]
     off = [variant.without for variant in variants]
     assert all(len(a - b) == 1 and b < a for a, b in pairwise(off))
     assert not off[-1]
@@ -93,6 +94,11 @@ def test_a_trials_key_changes_with_each_of_its_settings() -> None:
     ]
     assert len({each.key for each in (trial, *others)}) == 1 + len(others)
     assert trial.key == Trial(PLAN, TASK, Budget(), 0, CONDITIONS).key
+
+
+def test_a_single_thread_is_timed_by_the_processor() -> None:
+    assert clock_for(1) is time.process_time
+    assert clock_for(2) is clock_for(None) is time.perf_counter
 
 
 def test_what_is_finished_is_recalled_unless_lpips_is_wanted(tmp_path: Path) -> None:
@@ -130,6 +136,18 @@ def test_the_ablations_table_has_a_row_a_component_and_both_budgets() -> None:
     table = ablation_table(board)
     assert "| +GFD | 25.00 ± 0.00 | 20.00 ± 0.00 | 25.00 ± 0.00 | 20.00 ± 0.00 |" in table
     assert "ROI PSNR, equal time" in table
+    assert "mean over" not in table
+
+
+def test_the_ablation_of_several_scenes_ends_with_their_mean() -> None:
+    other = HomeScenePlan(choose_pairs(["home-8-search"])[0], frames=4, views=3)
+    board = Scoreboard([finished(TASK, 0, 20.0, Budget()), finished(TASK, 0, 23.0, Budget(), other)])
+    assert ablation_table(board).endswith(
+        "The mean over these 2\n\n"
+        + "\n".join(
+            ["| components | ROI PSNR, equal iterations | full PSNR |", "|---|---|---|", "| task | 21.50 | 20.00 |\n"]
+        )
+    )
 
 
 def test_a_study_counts_its_trials() -> None:

@@ -24,9 +24,9 @@ def full_table() -> SplatTable:
     return table
 
 
-def insert_into(table: SplatTable, roi: int, rest: int) -> int:
+def insert_into(table: SplatTable, roi: int, rest: int, scaffold: int = 0) -> int:
     seeds = Seeds(gaussians([NEWBORN] * roi, True, 7), gaussians([NEWBORN] * rest, False, 8))
-    return insert(table, seeds, NEWBORN, np.random.default_rng(0))
+    return insert(table, seeds, NEWBORN, np.random.default_rng(0), scaffold)
 
 
 def test_with_room_nobody_gives_way() -> None:
@@ -81,3 +81,17 @@ def test_more_seeds_of_the_task_than_the_whole_cap() -> None:
     table = full_table()
     assert insert_into(table, 50, 50) == 6
     assert (table.target == 7).all()
+
+
+def test_the_scaffold_stays_and_of_the_region_the_faintest_give_way_instead() -> None:
+    table = full_table()
+    assert insert_into(table, 3, 0, scaffold=2) == 3
+    np.testing.assert_allclose(np.sort(table.opacities[~table.active]), [0.7, 0.9], rtol=1e-4)
+    np.testing.assert_allclose(np.sort(table.opacities[table.active]), [0.5, 0.5, 0.5, 0.8], rtol=1e-4)
+
+
+def test_without_as_many_inactive_ones_as_the_scaffold_none_of_them_gives_way() -> None:
+    table = full_table()
+    assert insert_into(table, 50, 0, scaffold=5) == 3
+    assert table.count == 6
+    np.testing.assert_allclose(np.sort(table.opacities[~table.active]), [0.2, 0.7, 0.9], rtol=1e-4)

@@ -44,7 +44,13 @@ def configure_quality(parser: argparse.ArgumentParser) -> None:
 def configure_ablation(parser: argparse.ArgumentParser) -> None:
     """Add the options of `bench ablation`."""
     add = parser.add_argument
-    add("--pair", metavar="NAME", default=_ABLATION_PAIR, help="the home and task (default: %(default)s)")
+    add(
+        "--pair",
+        metavar="A,B",
+        type=names,
+        default=(_ABLATION_PAIR,),
+        help=f"home and task (default: {_ABLATION_PAIR})",
+    )
     _add_common(parser, seeds=(0, 1, 2))
     parser.set_defaults(run=run_ablation)
 
@@ -66,7 +72,7 @@ def run_quality(options: argparse.Namespace) -> int:
 
 def run_ablation(options: argparse.Namespace) -> int:
     """Switch the components on one by one, at equal iterations and at equal time; write ablation.md and .json."""
-    plans: list[ScenePlan] = [*_homes(options, choose_pairs([options.pair])), *_real(options)]
+    plans: list[ScenePlan] = [*_homes(options, choose_pairs(options.pair)), *_real(options)]
     budgets = [_budget(options, equal) for equal in Equal]
     study = Study(plans, cumulative_variants(), budgets, options.seeds, _conditions(options, Eyes()))
     board = _run(study, options)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from jaxtyping import Float32, Int64
+from jaxtyping import Bool, Float32, Int64
 from numpy import ndarray
 
 from gausslite.domain.gaussians import Gaussians
@@ -14,17 +14,19 @@ from gausslite.optimize.parameters import SplatTable
 from gausslite.render.rasterizer import LOGIT
 
 
-def insert(table: SplatTable, seeds: Seeds, newborn_opacity: float, rng: np.random.Generator) -> int:
+def insert(table: SplatTable, seeds: Seeds, newborn_opacity: float, rng: np.random.Generator, scaffold: int = 0) -> int:
     """Add the seeds, the task's first, and return how many were added; the table never exceeds its capacity.
 
     For the task's seeds others give way: inactive before active, what an earlier task had made dense before the rest
-    of the background, the most transparent first. For the rest only inactive Gaussians more transparent than a newborn
-    give way; seeds that still do not fit are left out at random. Seeds take the rows of those that give way, so that a
-    full table is not moved about.
+    of the background, the most transparent first; but `scaffold` of the inactive ones stay, so that a region as large
+    as the image does not take it all. For the rest only inactive Gaussians more transparent than a newborn give way;
+    seeds that still do not fit are left out at random. Seeds take the rows of those that give way, so that a full table
+    is not moved about.
     """
-    roi = seeds.roi.take(_at_random(len(seeds.roi), table.capacity, rng))
-    _settle(table, roi, _giving_way(table, None, len(roi) - table.room))
-    giving_way = _giving_way(table, newborn_opacity, len(seeds.rest) - table.room)
+    giving_way = _for_the_region(table, len(seeds.roi) - table.room, scaffold)
+    roi = seeds.roi.take(_at_random(len(seeds.roi), table.room + len(giving_way), rng))
+    _settle(table, roi, giving_way)
+    giving_way = _for_the_rest(table, len(seeds.rest) - table.room, newborn_opacity)
     rest = seeds.rest.take(_at_random(len(seeds.rest), table.room + len(giving_way), rng))
     _settle(table, rest, giving_way)
     return len(roi) + len(rest)
@@ -36,25 +38,31 @@ def _settle(table: SplatTable, seeds: Gaussians, rows: Int64[ndarray, " m"]) -> 
     table.append(seeds.take(np.arange(len(rows), len(seeds))))
 
 
-def _giving_way(table: SplatTable, below_opacity: float | None, count: int) -> Int64[ndarray, " k"]:
-    """Up to `count` rows: an earlier task's surplus, the other inactive ones, the active ones.
-
-    below_opacity: only inactive ones more transparent than this.
-    """
-    chosen = np.zeros(0, np.int64)
+def _for_the_region(table: SplatTable, count: int, scaffold: int) -> Int64[ndarray, " k"]:
+    """Up to `count` rows: an earlier task's surplus, the other inactive ones down to the scaffold, the active ones."""
     if count <= 0:
-        return chosen
+        return np.zeros(0, np.int64)
+    spared = max(0, int(np.count_nonzero(~table.active)) - scaffold)
+    background = _inactive(table, min(count, spared), ~table.active)
+    logits = table.rows[:, LOGIT].copy()
+    region = _faintest_of(logits, np.flatnonzero(table.active), count - len(background))
+    return np.concatenate([background, region])
+
+
+def _for_the_rest(table: SplatTable, count: int, below_opacity: float) -> Int64[ndarray, " k"]:
+    """Up to `count` rows of inactive ones more transparent than this, an earlier task's surplus first."""
+    if count <= 0:
+        return np.zeros(0, np.int64)
+    fainter = table.rows[:, LOGIT] < math.log(below_opacity) - math.log1p(-below_opacity)
+    return _inactive(table, count, ~table.active & fainter)
+
+
+def _inactive(table: SplatTable, count: int, candidates: Bool[ndarray, " n"]) -> Int64[ndarray, " k"]:
+    """Up to `count` of these rows, those worked on for an earlier task first, the faintest of each."""
     logits, worked_on = table.rows[:, LOGIT].copy(), table.kappa > 0
-    inactive = ~table.active
-    if below_opacity is not None:
-        inactive &= logits < math.log(below_opacity) - math.log1p(-below_opacity)
-    groups = [inactive & worked_on, inactive & ~worked_on]
-    if below_opacity is None:
-        groups.append(table.active)
-    for group in groups:
-        faintest = _faintest_of(logits, np.flatnonzero(group), count - len(chosen))
-        chosen = np.concatenate([chosen, faintest])
-    return chosen
+    surplus = _faintest_of(logits, np.flatnonzero(candidates & worked_on), count)
+    others = _faintest_of(logits, np.flatnonzero(candidates & ~worked_on), count - len(surplus))
+    return np.concatenate([surplus, others])
 
 
 def _faintest_of(logits: Float32[ndarray, " n"], rows: Int64[ndarray, " m"], count: int) -> Int64[ndarray, " k"]:

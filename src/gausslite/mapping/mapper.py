@@ -154,7 +154,7 @@ class GaussianMapper:
         if not relevance.roi.any():
             return 0
         seeds = self._seeder.seed_region(frame, relevance, table.rows[:, MEAN][table.active])
-        return insert(table, Seeds(seeds, Gaussians.empty()), self._settings.seeding.opacity, self._rng)
+        return self._insert(Seeds(seeds, Gaussians.empty()))
 
     def look(self, frame: Frame) -> MapSight | None:
         """How the map looks from a frame; None while it is empty."""
@@ -235,7 +235,12 @@ class GaussianMapper:
         with pace.timing(Step.SEEDING):
             state = MapState(table.room, sight, table.rows[:, MEAN][table.active])
             seeds = self._seeder.seed(frame, keyframe.relevance, state)
-            return insert(table, seeds, self._settings.seeding.opacity, self._rng)
+            return self._insert(seeds)
+
+    def _insert(self, seeds: Seeds) -> int:
+        """Add them within the cap; returns how many were added."""
+        seeding, table = self._settings.seeding, self._table
+        return insert(table, seeds, seeding.opacity, self._rng, int(seeding.scaffold_share * table.capacity))
 
     def _train(self, current: WindowView, pace: Pace) -> int:
         """MVO: train on views drawn from the window and the current one; without it on the current one alone."""

@@ -45,6 +45,7 @@ class SeedingSettings:
     """Where new Gaussians go and how they start (Sec. III-C). Seed counts are for 640x480 and scale with the pixels.
 
     roi_scale and background_scale are the paper's multipliers m of s0; plain_scale is m without SIS.
+    scaffold_share: what the region's seeds leave of the cap to the background, however large the region is.
     """
 
     first_frame_seeds: int = 60_000
@@ -55,6 +56,7 @@ class SeedingSettings:
     roi_pixels_per_active: float = 4.0
     reserved_views: float = 4.0
     sparsest: float = 0.1
+    scaffold_share: float = 0.3
     depth_error_factor: float = 40.0
     max_depth_m: float = 10.0
     opacity: float = 0.5
@@ -66,7 +68,7 @@ class SeedingSettings:
     def __post_init__(self) -> None:
         for name in ("first_frame_seeds", "later_seeds"):
             _require(getattr(self, name) >= 1, f"seeding {name}", "at least 1", getattr(self, name))
-        for name in ("roi_share", "min_alpha", "roi_min_alpha", "sparsest"):
+        for name in ("roi_share", "min_alpha", "roi_min_alpha", "sparsest", "scaffold_share"):
             _require(0 <= getattr(self, name) <= 1, f"seeding {name}", "0 to 1", getattr(self, name))
         _require(0 < self.opacity < 1, "seeding opacity", "more than 0 and less than 1", self.opacity)
         for name in (

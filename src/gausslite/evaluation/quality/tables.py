@@ -172,18 +172,30 @@ def quality_table(board: Scoreboard) -> str:
 
 
 def ablation_table(board: Scoreboard) -> str:
-    """One row a component, ROI and full PSNR at every budget, scene by scene."""
+    """One row a component, ROI and full PSNR at every budget, scene by scene and on average."""
     blocks = []
     for scene in board.scenes:
-        header = ["components"]
-        for budget in board.budgets:
-            header += [f"ROI PSNR, equal {budget.equal}", "full PSNR"]
-        rows = [header]
-        for variant in board.variants:
-            shown = [(metric, budget) for budget in board.budgets for metric in (ROI_METRICS[0], FULL_METRICS[0])]
-            rows.append([variant, *(_text(board.figure(scene, variant, *each), each[0]) for each in shown)])
-        blocks += [f"## {scene}: {board.task(scene)} (ROI {board.roi_share(scene):.1%})", _markdown(rows)]
+        title = f"## {scene}: {board.task(scene)} (ROI {board.roi_share(scene):.1%})"
+        blocks += [title, _by_component(board, [scene])]
+    if len(board.scenes) > 1:
+        blocks += [f"## The mean over these {len(board.scenes)}", _by_component(board, board.scenes)]
     return "\n\n".join(blocks) + "\n"
+
+
+def _by_component(board: Scoreboard, scenes: Sequence[str]) -> str:
+    """With the spread over the seeds where it is a single scene."""
+    shown = [(metric, budget) for budget in board.budgets for metric in (ROI_METRICS[0], FULL_METRICS[0])]
+    header = ["components"]
+    for budget in board.budgets:
+        header += [f"ROI PSNR, equal {budget.equal}", "full PSNR"]
+    rows = [header]
+    for variant in board.variants:
+        if len(scenes) == 1:
+            cells = [_text(board.figure(scenes[0], variant, *each), each[0]) for each in shown]
+        else:
+            cells = [_number(board.mean(scenes, variant, *each), each[0]) for each in shown]
+        rows.append([variant, *cells])
+    return _markdown(rows)
 
 
 def _by_place(board: Scoreboard, metrics: Sequence[Metric], budget: Budget) -> str:
@@ -194,7 +206,7 @@ def _by_place(board: Scoreboard, metrics: Sequence[Metric], budget: Budget) -> s
     for variant in board.variants:
         for metric in metrics:
             columns = [board.mean(scenes, variant, metric, budget) for scenes in (*places.values(), board.scenes)]
-            cells = [_NOT_COMPUTED if v is None else f"{metric.factor * v:.{metric.digits}f}" for v in columns]
+            cells = [_number(value, metric) for value in columns]
             rows.append([variant if metric is metrics[0] else "", metric.title, *cells])
     return _markdown(rows)
 
@@ -227,6 +239,10 @@ def _in_words(board: Scoreboard, budget: Budget) -> str:
 
 def _text(figure: Figure | None, metric: Metric) -> str:
     return _NOT_COMPUTED if figure is None else figure.as_text(metric.digits, metric.factor)
+
+
+def _number(value: float | None, metric: Metric) -> str:
+    return _NOT_COMPUTED if value is None else f"{metric.factor * value:.{metric.digits}f}"
 
 
 def _markdown(rows: Sequence[Sequence[str]]) -> str:
