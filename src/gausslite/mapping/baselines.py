@@ -2,8 +2,9 @@
 
 Each seeds, scales, weighs its loss and controls density as its released configuration does. What those leave to the
 hardware is the engine's: Adam's rates (ONLINE_RATES: the customary ones trail by decibels in so few iterations),
-seeds thinned as the cap nears, multi-view training on 24 keyframes, and refined views where they are asked for. The
-scale of MonoGS' seeds and the number of SplaTAM's were varied (docs/quality.md). None of them knows a task.
+seeds thinned as the cap nears, clones and halves that look like their parent, multi-view training on 24 keyframes, and
+refined views where they are asked for. The scale of MonoGS' seeds and the number of SplaTAM's were varied
+(docs/quality.md). None of them knows a task.
 """
 
 from __future__ import annotations
