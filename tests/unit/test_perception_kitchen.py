@@ -68,6 +68,17 @@ def test_the_chair_closest_to_the_table(kitchen, detector, shared_dir):
     assert np.abs(table.centroid_m - regions["table_1"].centroid_m).max() < 0.2
 
 
+def test_the_closest_chair_is_known_while_an_end_of_the_table_is_all_that_was_seen(kitchen, detector, shared_dir):
+    regions = load_voxel_regions(shared_dir / "data" / "redkitchen" / "roi_voxels.npz")
+    attention = attention_to("Identify the chair closest to the table", kitchen, detector)
+    for number in (0, 8, 20, 44, 56, 64):
+        frame = kitchen.frame(kitchen.indices().index(number), (320, 240))
+        roi = attention.attend(frame).roi
+        assert not (roi & regions["chair_2"].mask(frame)).any()
+        if number in (0, 8, 20):
+            assert (roi & regions["chair_3"].mask(frame)).any()
+
+
 def test_mugs_on_the_table_are_kept_and_an_absent_object_lights_nothing(kitchen, detector):
     mugs = attention_to("Pick up the mug on the table", kitchen, detector)
     umbrella = attention_to("Pick up the umbrella", kitchen, detector)
