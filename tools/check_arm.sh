@@ -43,6 +43,6 @@ rm -f "$folder"/sources/gausslite/render/_kernels*.so
 cp "$folder"/build/_kernels*.so "$folder/sources/gausslite/render/"
 
 cd "$root"
-[ $# -gt 0 ] || set -- tests/unit/test_cpu_kernels.py tests/unit/test_cpu_loans.py tests/contract -k "neon or test_cpu"
+[ $# -gt 0 ] || set -- tests/unit/test_cpu_kernels.py tests/unit/test_cpu_choices.py tests/unit/test_cpu_loans.py tests/contract -k "neon or test_cpu"
 export PYTHONPATH=$folder/sources:$folder/packages PYTHONDONTWRITEBYTECODE=1 OMP_NUM_THREADS=1
 exec qemu-aarch64-static -L "$sysroot" "$sysroot/usr/bin/python3.11" -m pytest -q -p no:cacheprovider "$@"

@@ -50,6 +50,6 @@ rm -f "$build"/package/gausslite/render/_kernels*.so
 cp "$build"/_kernels*.so "$build/package/gausslite/render/"
 export PYTHONPATH=$build/package PYTHONDONTWRITEBYTECODE=1
 cd "$root"
-[ $# -gt 0 ] || set -- tests/unit/test_cpu_kernels.py tests/unit/test_cpu_loans.py
+[ $# -gt 0 ] || set -- tests/unit/test_cpu_kernels.py tests/unit/test_cpu_choices.py tests/unit/test_cpu_loans.py
 # Uncaptured: a sanitizer writes its report and ends the process, and pytest would take the report with it.
 checked -m pytest -q --capture=no -p no:cacheprovider "$@"

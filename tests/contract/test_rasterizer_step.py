@@ -2,91 +2,33 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
-from splat_scenes import GROUPS, Picture, Scene, picture_near, relative_error, scene_for, scene_named
+from splat_scenes import GROUPS, Picture, Scene, relative_error, scene_for, scene_named
+from step_training import ADAM, LOSS, gradient_seen, picture_for, tables, train
 
-from gausslite.errors import ShapeError
 from gausslite.render.rasterizer import (
     EVERYTHING,
     GRAD_2D_COUNT,
     GRAD_2D_SUM,
     UPDATES,
-    AdamSettings,
     LossWeights,
     Rasterizer,
-    StepReport,
     Subset,
-    Tally,
 )
 from gausslite.render.reference.loss import training_loss
 
 TOLERANCE = 1e-4
+
+
 SATURATED_TOLERANCE = {"cuda": 0.1}
+
+
 """Of the backends that clamp and stop otherwise than the seam says, on whole images with saturated pixels: a nearly
 opaque splat then gets a gradient from pixels that give it none, and the other way round."""
-LOSS, ADAM = LossWeights(), AdamSettings()
-
-
-@dataclass
-class Trained:
-    """The three tables before and after, and what the step said."""
-
-    before: tuple[np.ndarray, np.ndarray, np.ndarray]
-    rows: np.ndarray
-    first_moment: np.ndarray
-    second_moment: np.ndarray
-    report: StepReport
-
-
-def tables(scene: Scene, seasoned: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """New rows with empty moments, or rows with some updates behind them and moments to match."""
-    rng = np.random.default_rng(0)
-    rows = scene.rows.copy()
-    if not seasoned:
-        return rows, np.zeros_like(rows), np.zeros_like(rows)
-    rows[:, UPDATES] = rng.integers(0, 30, len(rows))
-    first = np.zeros_like(rows)
-    second = np.zeros_like(rows)
-    moved = (rows[:, UPDATES] > 0)[:, None]
-    first[:, :14] = rng.normal(0, 1e-4, (len(rows), 14)) * moved
-    second[:, :14] = rng.uniform(1e-9, 1e-7, (len(rows), 14)) * moved
-    first[:, GRAD_2D_SUM] = rng.uniform(0, 1, len(rows))
-    first[:, GRAD_2D_COUNT] = rng.integers(0, 9, len(rows))
-    return rows, first, second
-
-
-def train(
-    rasterizer: Rasterizer,
-    scene: Scene,
-    picture: Picture,
-    *,
-    loss: LossWeights = LOSS,
-    masked: bool = False,
-    subset: Subset = EVERYTHING,
-    trainable: np.ndarray | None = None,
-    seasoned: bool = False,
-) -> Trained:
-    before = tables(scene, seasoned)
-    rows, first, second = (table.copy() for table in before)
-    view = picture.view(rasterizer, scene)
-    report = rasterizer.step(rows, first, second, view, scene.T_camera_world, loss, ADAM, masked, subset, trainable)
-    return Trained(before, rows, first, second, report)
-
-
-def picture_for(scene: Scene, oracle: Rasterizer, subset: Subset = EVERYTHING) -> Picture:
-    return picture_near(oracle.forward(scene.rows, scene.camera, scene.T_camera_world, subset))
-
-
-def gradient_seen(trained: Trained) -> np.ndarray:
-    """The gradient that the step fed to Adam, from the change of the first moment."""
-    change = trained.first_moment.astype(np.float64) - ADAM.beta1 * trained.before[1]
-    change[:, 14:] = 0.0
-    moved = trained.rows[:, UPDATES] != trained.before[0][:, UPDATES]
-    return change * moved[:, None] / (1.0 - ADAM.beta1)
 
 
 CASES = {
@@ -204,88 +146,6 @@ def test_density_statistics_count_the_steps_seen(rasterizer: Rasterizer, oracle:
     assert not came.second_moment[:, 14:].any()
 
 
-def test_rows_out_of_sight_are_untouched(rasterizer: Rasterizer, oracle: Rasterizer) -> None:
-    scene = scene_named("outside the view")
-    done = train(rasterizer, scene, picture_for(scene, oracle), seasoned=True)
-    hidden = np.setdiff1d(np.arange(len(scene.rows)), done.report.visible)
-    assert len(hidden) > 10
-    for after, before in zip((done.rows, done.first_moment, done.second_moment), done.before, strict=True):
-        np.testing.assert_array_equal(after[hidden], before[hidden])
-
-
-def test_frozen_rows_are_untouched_and_the_others_move_as_ever(rasterizer: Rasterizer, oracle: Rasterizer) -> None:
-    scene = scene_named("medium splats")
-    picture = picture_for(scene, oracle)
-    trainable = np.random.default_rng(5).random(len(scene.rows)) < 0.5
-    free = train(rasterizer, scene, picture, seasoned=True)
-    held = train(rasterizer, scene, picture, trainable=trainable, seasoned=True)
-    np.testing.assert_array_equal(held.report.visible, free.report.visible)
-    for after, before, unheld in zip(
-        (held.rows, held.first_moment, held.second_moment),
-        held.before,
-        (free.rows, free.first_moment, free.second_moment),
-        strict=True,
-    ):
-        np.testing.assert_array_equal(after[~trainable], before[~trainable])
-        assert relative_error(after[trainable], unheld[trainable]) < 1e-4
-
-
-def test_a_tally_counts_the_rows_that_moved_and_no_others(rasterizer: Rasterizer, oracle: Rasterizer) -> None:
-    scene = scene_named("medium splats")
-    view = picture_for(scene, oracle).view(rasterizer, scene)
-    lent, rng = tables(scene, seasoned=False), np.random.default_rng(6)
-    trainable, among = rng.random((2, len(scene.rows))) < 0.5
-    everywhere, some = (Tally(np.full(len(scene.rows), 7, np.uint32), choice) for choice in (None, among))
-    with rasterizer.holding(*lent):
-        for step in range(10):
-            rasterizer.step(*lent, view, scene.T_camera_world, LOSS, ADAM, trainable=trainable, tally=everywhere)
-            if step < 3:
-                rasterizer.step(*lent, view, scene.T_camera_world, LOSS, ADAM, tally=some)
-    trained = lent[0][:, UPDATES]
-    np.testing.assert_array_equal(some.counts[~among], 7)
-    assert set(some.counts[among]) == {7, 10}
-    np.testing.assert_array_equal(everywhere.counts[~trainable], 7)
-    np.testing.assert_array_equal((everywhere.counts - 7 + 3 * (trained > 0))[trainable], trained[trainable])
-
-
-def test_a_tally_of_another_length_or_that_may_not_be_written_is_refused(
-    rasterizer: Rasterizer, oracle: Rasterizer
-) -> None:
-    scene = scene_named("medium splats")
-    view = picture_for(scene, oracle).view(rasterizer, scene)
-    sealed = np.zeros(len(scene.rows), np.uint32)
-    sealed.flags.writeable = False
-    for counts in (np.zeros(len(scene.rows) - 1, np.uint32), sealed):
-        with pytest.raises(ShapeError, match="tally counts"):
-            rasterizer.step(*tables(scene, seasoned=False), view, scene.T_camera_world, LOSS, ADAM, tally=Tally(counts))
-
-
-def test_pixels_of_weight_zero_do_not_matter_to_a_masked_step(rasterizer: Rasterizer, oracle: Rasterizer) -> None:
-    scene = scene_named("medium splats")
-    picture = picture_for(scene, oracle)
-    other_rgb, other_depth_m = 255 - picture.rgb, picture.depth_m + np.float32(0.5)
-    unseen = picture.weight == 0
-    changed = Picture(
-        np.where(unseen[..., None], other_rgb, picture.rgb),
-        np.where(unseen, other_depth_m, picture.depth_m),
-        picture.weight,
-    )
-    loss = replace(LOSS, ssim=0.0)
-    first = train(rasterizer, scene, picture, loss=loss, masked=True)
-    second = train(rasterizer, scene, changed, loss=loss, masked=True)
-    assert first.report.loss == pytest.approx(second.report.loss, rel=1e-6)
-    assert relative_error(second.first_moment, first.first_moment) < 1e-5
-
-
-def test_an_empty_mask_has_no_loss_and_no_gradient(rasterizer: Rasterizer, oracle: Rasterizer) -> None:
-    scene = scene_named("medium splats")
-    picture = replace(picture_for(scene, oracle), weight=np.zeros(scene.size, np.float32))
-    done = train(rasterizer, scene, picture, masked=True)
-    assert done.report.loss == 0.0
-    assert np.abs(gradient_seen(done)).max() < 1e-9
-    assert np.isfinite(done.rows).all()
-
-
 def test_a_step_on_an_empty_map_costs_the_whole_image(rasterizer: Rasterizer, oracle: Rasterizer) -> None:
     scene = Scene(np.zeros((0, 16), np.float32), scene_named("odd size").camera, np.eye(4))
     picture = picture_for(scene, oracle)
@@ -303,20 +163,6 @@ def test_thirty_steps_reduce_the_loss(rasterizer: Rasterizer, oracle: Rasterizer
     losses = [rasterizer.step(rows, first, second, view, scene.T_camera_world, LOSS, ADAM).loss for _ in range(30)]
     assert losses[-1] < 0.8 * losses[0]
     assert rows[:, UPDATES].max() == 30
-
-
-def test_moments_of_another_length_are_refused(rasterizer: Rasterizer, oracle: Rasterizer) -> None:
-    scene = scene_named("medium splats")
-    view = picture_for(scene, oracle).view(rasterizer, scene)
-    rows, first, second = tables(scene, seasoned=False)
-    with pytest.raises((ShapeError, TypeError)):
-        rasterizer.step(rows, first[:-1], second, view, scene.T_camera_world, LOSS, ADAM)
-
-
-def test_a_view_of_another_size_than_its_camera_is_refused(rasterizer: Rasterizer) -> None:
-    camera = scene_named("odd size").camera
-    with pytest.raises(ShapeError, match="rgb"):
-        rasterizer.prepare_view(np.zeros((4, 4, 3), np.uint8), np.zeros((4, 4), np.float32), camera)
 
 
 def test_tables_on_loan_end_up_as_step_by_step(rasterizer: Rasterizer, oracle: Rasterizer) -> None:
