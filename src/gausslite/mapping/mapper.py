@@ -165,12 +165,13 @@ class GaussianMapper:
         return self._rasterizer.forward(self._table.rows, camera, inverse(T_world_camera))
 
     def gaussians(self) -> Gaussians:
-        """A copy of the map as physical values."""
-        return self._table.to_gaussians()
+        """A copy of the map as physical values, as it is shown (`OptimizationSettings.averaged_updates`)."""
+        return self._table.to_gaussians(averaged=self._settings.optimization.averaged_updates > 0)
 
     def roi_gaussians(self) -> Gaussians:
         """A copy of the active Gaussians: the task's part of the map."""
-        return self._table.to_gaussians(np.flatnonzero(self._table.active))
+        averaged = self._settings.optimization.averaged_updates > 0
+        return self._table.to_gaussians(np.flatnonzero(self._table.active), averaged)
 
     def keyframes(self) -> list[Keyframe]:
         """The keyframes remembered of the whole mission, oldest first (for joint refinement)."""

@@ -41,6 +41,7 @@ BEYOND_SWITCHES: dict[str, Callable[[MapperSettings], MapperSettings]] = {
     "views": lambda settings: replace(settings, keyframes=replace(settings.keyframes, region_views=0)),
     "surroundings": lambda settings: replace(settings, keyframes=replace(settings.keyframes, surroundings_weight=0.0)),
     "scaffold": lambda settings: replace(settings, seeding=replace(settings.seeding, scaffold_share=0.0)),
+    "means": lambda settings: replace(settings, optimization=replace(settings.optimization, averaged_updates=0.0)),
 }
 """What came beyond the paper, in the order of our ablation, and how each is switched off."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
@@ -115,6 +116,8 @@ class OptimizationSettings:
     """How a frame trains the map (Sec. III-D): first warm-up iterations on the full image, then active ones.
 
     isotropic: Gaussians are made spheres again after every frame.
+    averaged_updates: the map is shown as the mean of each Gaussian over about its last so many updates, since views
+    that contradict each other move it to and fro; 0 shows it as training left it. Training itself knows no means.
     """
 
     warmup_iterations: int = 2
@@ -123,10 +126,13 @@ class OptimizationSettings:
     loss: LossWeights = field(default_factory=LossWeights)
     adam: AdamSettings = ONLINE_RATES
     isotropic: bool = False
+    averaged_updates: float = 32.0
 
     def __post_init__(self) -> None:
         for name in ("warmup_iterations", "active_iterations"):
             _require(getattr(self, name) >= 0, f"optimization {name}", "at least 0", getattr(self, name))
+        averaged = self.averaged_updates
+        _require(0 <= averaged < math.inf, "optimization averaged_updates", "at least 0", averaged)
 
     @property
     def iterations(self) -> int:

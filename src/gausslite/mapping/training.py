@@ -86,6 +86,7 @@ class Trainer:
         self._bound_colours()
         if self._settings.optimization.isotropic:
             self._make_spheres()
+        self._average()
         return done
 
     def rehearse(self, views: Sequence[WindowView], extent_m: float) -> None:
@@ -99,6 +100,8 @@ class Trainer:
             self._iterate(loan, step, views if step is Step.WARM_UP else showing, self._rng.random())
         self._control_density(extent_m, pace)
         self._bound_colours()
+        if self._iterations % self._settings.optimization.iterations == 0:
+            self._average()
 
     def _showing_region(self, views: Sequence[WindowView]) -> list[WindowView]:
         """The views of the active phase; none where the component is off, so that all iterations are warm-ups."""
@@ -173,6 +176,10 @@ class Trainer:
         # channel by channel: NumPy takes twice as long over three columns at once
         for channel in self._table.rows[:, RGB].T:
             np.clip(channel, *_COLOUR_RANGE, out=channel)
+
+    def _average(self) -> None:
+        if self._settings.optimization.averaged_updates > 0:
+            self._table.average(self._settings.optimization.averaged_updates)
 
     def _prune_is_due(self, pace: Pace) -> bool:
         return _due(self._since_pruned, self._settings.density.prune_every, pace)

@@ -97,8 +97,9 @@ def _most_wanted(gradient: Float32[ndarray, " n"], threshold: float, most: int) 
 
 def _clone(table: SplatTable, parents: Int64[ndarray, " m"]) -> None:
     """Two in the same place, each of an alpha of 1 - sqrt(1 - alpha): they hide as much as the one."""
-    half_depth = 0.5 * np.logaddexp(0.0, table.rows[parents, LOGIT].astype(np.float64))  # -log(1 - alpha) / 2
-    table.rows[parents, LOGIT] = np.log(-np.expm1(-half_depth)) + half_depth
+    for rows in (table.rows, table.mean_rows):
+        half_depth = 0.5 * np.logaddexp(0.0, rows[parents, LOGIT].astype(np.float64))  # -log(1 - alpha) / 2
+        rows[parents, LOGIT] = np.log(-np.expm1(-half_depth)) + half_depth
     rows = table.rows[parents]
     rows[:, UPDATES] = 0.0
     table.append_rows(rows, table.active[parents], table.kappa[parents], table.target[parents])
@@ -118,6 +119,7 @@ def _split(table: SplatTable, parents: Int64[ndarray, " m"]) -> None:
     first[:, MEAN] += aside_m
     second[:, MEAN] -= aside_m
     table.rows[parents] = first
+    table.mean_rows[parents] = first
     table.first_moment[parents] = 0.0
     table.second_moment[parents] = 0.0
     table.append_rows(second, table.active[parents], table.kappa[parents], table.target[parents])

@@ -14,12 +14,13 @@ from gausslite.domain.arrays import require_array, require_finite
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.state import State, take
 from gausslite.errors import InvalidInputError, MapFileError, QuotaError
-from gausslite.render.rasterizer import GRAD_2D_SUM, LOG_SCALE, LOGIT, MEAN, QUAT, RGB, ROW_WIDTH
+from gausslite.render.rasterizer import GRAD_2D_SUM, LOG_SCALE, LOGIT, MEAN, QUAT, RGB, ROW_WIDTH, UPDATES
 
 _COLUMNS: dict[str, tuple[int | None, type[np.generic]]] = {
     "rows": (ROW_WIDTH, np.float32),
     "first_moment": (ROW_WIDTH, np.float32),
     "second_moment": (ROW_WIDTH, np.float32),
+    "mean_rows": (ROW_WIDTH, np.float32),
     "active": (None, np.bool_),
     "kappa": (None, np.uint32),
     "target": (None, np.int16),
@@ -32,10 +33,13 @@ _MOST_PER_SECOND, _ROUNDING = 1e6, 1e-30
 """By Cauchy and Schwarz a first moment's square is at most (1 - b1)^2 / ((1 - b2) (1 - b1^2 / b2)) times the second: 53
 for Adam's usual betas. This leaves room for others, and for what float32 rounds to 0."""
 _MIN_OPACITY = 1e-6
+_ROWS_IN_CACHE = 4096
+_SHORTEST_LIFE = 8.0
+"""A row's mean reaches as far as is asked once it has had so many times as many updates."""
 
 
 class SplatTable:
-    """Rows of raw parameters, Adam's two moments and what each Gaussian carries beside them (Sec. III-A).
+    """Rows of raw parameters, their running means, Adam's two moments and what each Gaussian carries (Sec. III-A).
 
     `capacity` is the hard cap: `count` never exceeds it, not even for an instant. All arrays are views of the first
     `count` rows; a view taken before `append`, `append_rows` or `keep` is stale after it.
@@ -49,13 +53,14 @@ class SplatTable:
         self._count = 0
         try:
             self._rows, self._first_moment, self._second_moment = (_row_memory(capacity) for _ in range(3))
+            self._mean_rows = _row_memory(capacity)
             self._active = np.zeros(capacity, np.bool_)
             self._kappa = np.zeros(capacity, np.uint32)
             self._target = np.zeros(capacity, np.int16)
             self._votes = np.zeros(capacity, np.int16)
         except (OSError, MemoryError, OverflowError, ValueError):
             raise InvalidInputError(
-                f"max_gaussians: expected as many as there is memory for, 200 bytes each, got {capacity}"
+                f"max_gaussians: expected as many as there is memory for, 270 bytes each, got {capacity}"
             ) from None
 
     def __len__(self) -> int:
@@ -80,7 +85,7 @@ class SplatTable:
     def table_bytes(self) -> int:
         """Memory reserved for the Gaussians and what each carries."""
         beside = (self._active, self._kappa, self._target, self._votes)
-        return self._rows.nbytes + sum(column.nbytes for column in beside)
+        return self._rows.nbytes + self._mean_rows.nbytes + sum(column.nbytes for column in beside)
 
     @property
     def optimizer_bytes(self) -> int:
@@ -101,6 +106,11 @@ class SplatTable:
     def second_moment(self) -> Float32[ndarray, "n 16"]:
         """Adam's second moment."""
         return self._second_moment[: self._count]
+
+    @property
+    def mean_rows(self) -> Float32[ndarray, "n 16"]:
+        """The rows' running means, as far as `average` carried them on; a newborn's is its row."""
+        return self._mean_rows[: self._count]
 
     @property
     def active(self) -> Bool[ndarray, " n"]:
@@ -177,18 +187,35 @@ class SplatTable:
             name: take(state, name, (len(rows),) if width is None else (len(rows), width), dtype)
             for name, (width, dtype) in _COLUMNS.items()
         }
-        for name in ("rows", "first_moment", "second_moment"):
+        for name in ("rows", "first_moment", "second_moment", "mean_rows"):
             require_finite(f"state {name}", columns[name])
-        if (rows[:, LOG_SCALE] > _MAX_LOG_SCALE).any() or not _belong_together(*_moments(columns)):
-            raise MapFileError("state table: expected scales and moments that training can reach, got others")
+        mean_rows = columns["mean_rows"]
+        too_large = max(values[:, LOG_SCALE].max(initial=-np.inf) for values in (rows, mean_rows)) > _MAX_LOG_SCALE
+        unborn = (mean_rows[:, UPDATES] < 0).any() or (mean_rows[:, UPDATES] > rows[:, UPDATES]).any()
+        if too_large or unborn or not _belong_together(*_moments(columns)):
+            raise MapFileError("state table: expected scales, means and moments that training can reach, got others")
         for name, column in columns.items():
             getattr(self, f"_{name}")[: len(rows)] = column
         self._count = len(rows)
 
-    def to_gaussians(self, ids: Int[ndarray, " m"] | None = None) -> Gaussians:
-        """Copies of all Gaussians, or of these rows, as physical values."""
+    def average(self, horizon: float) -> None:
+        """Carry on the mean of each row over about its last `horizon` updates, and at most an eighth of all it had: a
+        row that is still on its way must not be held back by where it was.
+        """
+        all_moved = np.flatnonzero(self.rows[:, UPDATES] != self.mean_rows[:, UPDATES])
+        for start in range(0, len(all_moved), _ROWS_IN_CACHE):
+            moved = all_moved[start : start + _ROWS_IN_CACHE]
+            rows, mean = self.rows.take(moved, axis=0), self.mean_rows.take(moved, axis=0)
+            reach = np.minimum(np.float32(horizon), rows[:, UPDATES] / _SHORTEST_LIFE)
+            share = -np.expm1((mean[:, UPDATES] - rows[:, UPDATES]) / reach)
+            mean += share[:, None] * (rows - mean)
+            mean[:, UPDATES] = rows[:, UPDATES]
+            self.mean_rows[moved] = mean
+
+    def to_gaussians(self, ids: Int[ndarray, " m"] | None = None, averaged: bool = False) -> Gaussians:
+        """Copies of all Gaussians, or of these rows, as physical values; their running means where asked."""
         chosen = np.arange(self._count) if ids is None else ids
-        columns = self.rows, self.active, self.kappa, self.target
+        columns = self.mean_rows if averaged else self.rows, self.active, self.kappa, self.target
         return rows_to_gaussians(*(column.take(chosen, axis=0) for column in columns))
 
     def _put(
@@ -201,6 +228,7 @@ class SplatTable:
     ) -> None:
         """A newborn's optimiser state is empty, its vote its view's."""
         self._rows[place] = rows
+        self._mean_rows[place] = rows
         self._first_moment[place] = 0.0
         self._second_moment[place] = 0.0
         self._active[place], self._kappa[place], self._target[place] = active, kappa, target
