@@ -21,7 +21,8 @@ from gausslite.render.rasterizer import LOG_SCALE, MEAN, RGB
 
 pytest.importorskip("gausslite.render._kernels", reason="the native kernels are not built")
 
-from gausslite.render.cpu import CpuRasterizer, usable_simd
+from gausslite.render.cpu import CpuRasterizer
+from gausslite.render.cpu_kernels import usable_simd
 
 KEYS = [
     "gaussians",

@@ -7,7 +7,8 @@ import pytest
 from cpu_scenes import CAMERA, random_rows, view_of
 
 from gausslite.errors import InvalidInputError, KernelError, ShapeError
-from gausslite.render.cpu import SIMD_VARIABLE, CpuRasterizer
+from gausslite.render.cpu import CpuRasterizer
+from gausslite.render.cpu_kernels import SIMD_VARIABLE
 from gausslite.render.rasterizer import AdamSettings, LossWeights
 
 kernels = pytest.importorskip("gausslite.render._kernels", reason="the native kernels are not built")

@@ -75,7 +75,7 @@ def _configure_gpu(parser: argparse.ArgumentParser) -> None:
 
 def run_raster(options: argparse.Namespace) -> int:
     """Measure every case and print a block of lines for each, or one list of records."""
-    from gausslite.render.cpu import usable_simd
+    from gausslite.render.cpu_kernels import usable_simd
 
     if options.details is not None:
         prepare_file(options.details)

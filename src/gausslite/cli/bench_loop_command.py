@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 
 from gausslite.cli.arguments import add_regions, asked_regions
 from gausslite.cli.map_command import choose_attention
@@ -71,39 +71,63 @@ def run(options: argparse.Namespace) -> int:
     bench, costs, memory = _play(options, source, mapped, rasterizer)
     timing = LoopTiming.of(costs)
     gap = None if options.unlimited is None else _gap(options, source, positions, held_out, bench)
-    overhead = Overhead.of(costs, rasterizer)
-    if options.json:
-        report = {
+    findings = _Findings(timing, Overhead.of(costs, rasterizer), gap, memory, len(mapped) - len(costs))
+    print(as_text(findings.report(options, size)) if options.json else findings.lines(options.source, size))
+    return 0
+
+
+@dataclass(frozen=True, slots=True)
+class _Findings:
+    """What a run showed, for scripts and for people."""
+
+    timing: LoopTiming
+    overhead: Overhead | None
+    gap: RateGap | None
+    memory: MemoryTrend | None
+    frames_skipped: int
+
+    def report(self, options: argparse.Namespace, size: tuple[int, int]) -> dict[str, object]:
+        """The figures under the names that scripts read."""
+        overhead, gap = self.overhead, self.gap
+        return {
             "source": options.source,
             "task": options.task,
             "size": list(size),
             "rate": options.rate,
-            **asdict(timing),
-            "frames_skipped": len(mapped) - len(costs),
+            **asdict(self.timing),
+            "frames_skipped": self.frames_skipped,
             "overhead_percent": None if overhead is None else overhead.all,
             "overhead_full_image_percent": None if overhead is None else overhead.full_image,
             "overhead_region_percent": None if overhead is None else overhead.region,
-            "memory": None if memory is None else asdict(memory),
+            "memory": None if self.memory is None else asdict(self.memory),
             "rate_gap": None if gap is None else {**asdict(gap), "gap_db": gap.gap_db},
             "peak_rss_mib": peak_rss_mib(),
         }
-        print(as_text(report))
-        return 0
-    print(f"{options.source} at {size[0]}x{size[1]}\n{loop_lines(timing)}")
-    if overhead is not None:
-        print(overhead_line(overhead))
-    if gap is not None:
-        print(
-            f"  ROI PSNR on {gap.views} held-out views: {gap.in_time_db:.2f} dB; with {gap.iterations} iterations a "
-            f"frame {gap.unlimited_db:.2f} dB, gap {gap.gap_db:.2f} dB"
-        )
-    if memory is not None:
-        print(
-            f"  memory {memory.start_mib:.0f}, {memory.middle_mib:.0f}, {memory.end_mib:.0f} MiB at the start, middle "
-            f"and end; {memory.mib_per_1000_frames:+.2f} MiB per 1000 frames over the second half"
-        )
-    print(f"  peak memory {peak_rss_mib():.0f} MiB")
-    return 0
+
+    def lines(self, name: str, size: tuple[int, int]) -> str:
+        """The figures as one reads them."""
+        lines = [f"{name} at {size[0]}x{size[1]}", loop_lines(self.timing)]
+        if self.overhead is not None:
+            lines.append(overhead_line(self.overhead))
+        if self.gap is not None:
+            lines.append(_gap_line(self.gap))
+        if self.memory is not None:
+            lines.append(_memory_line(self.memory))
+        return "\n".join([*lines, f"  peak memory {peak_rss_mib():.0f} MiB"])
+
+
+def _gap_line(gap: RateGap) -> str:
+    return (
+        f"  ROI PSNR on {gap.views} held-out views: {gap.in_time_db:.2f} dB; with {gap.iterations} iterations a "
+        f"frame {gap.unlimited_db:.2f} dB, gap {gap.gap_db:.2f} dB"
+    )
+
+
+def _memory_line(memory: MemoryTrend) -> str:
+    return (
+        f"  memory {memory.start_mib:.0f}, {memory.middle_mib:.0f}, {memory.end_mib:.0f} MiB at the start, middle "
+        f"and end; {memory.mib_per_1000_frames:+.2f} MiB per 1000 frames over the second half"
+    )
 
 
 def _play(

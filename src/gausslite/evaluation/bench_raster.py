@@ -17,7 +17,8 @@ from gausslite.evaluation.bench_scene import BenchView, held_view, seed_rows
 from gausslite.evaluation.bench_step import LOSSES, TURN, Duration, RestingStep, timed
 from gausslite.evaluation.bench_yardstick import Yardstick
 from gausslite.optimize.parameters import SplatTable
-from gausslite.render.cpu import CpuRasterizer, core_clock_ghz
+from gausslite.render.cpu import CpuRasterizer
+from gausslite.render.cpu_kernels import core_clock_ghz
 from gausslite.render.rasterizer import Rendering
 
 SIZES = ((320, 240), (640, 480))

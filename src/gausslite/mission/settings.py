@@ -14,7 +14,7 @@ from gausslite.mapping.pace import PaceSettings, Relief
 from gausslite.mapping.policies import policy, without
 from gausslite.mapping.settings import MapperSettings
 from gausslite.optimize.view_fit import ViewPrior
-from gausslite.render.cpu import MAX_THREADS
+from gausslite.render.cpu_kernels import MAX_THREADS
 
 DEFAULT_MAX_GAUSSIANS = 150_000
 """What two cores keep busy at 640x480; the paper's cap of a million is for a GPU."""

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 from weakref import ref
 
 import numpy as np
@@ -15,7 +14,7 @@ from jaxtyping import Bool, Float32, Float64, UInt8, UInt32
 from numpy import ndarray
 
 from gausslite.domain.camera import Camera
-from gausslite.errors import InvalidInputError, KernelError, ShapeError
+from gausslite.errors import InvalidInputError, ShapeError
 from gausslite.render.checks import (
     require_image_gradients,
     require_marks,
@@ -24,6 +23,7 @@ from gausslite.render.checks import (
     require_tables,
     require_view,
 )
+from gausslite.render.cpu_kernels import choose_simd, choose_threads, load_kernels
 from gausslite.render.rasterizer import (
     EVERYTHING,
     AdamSettings,
@@ -38,9 +38,6 @@ from gausslite.render.rasterizer import (
 
 if TYPE_CHECKING:
     from gausslite.render import _kernels
-
-SIMD_VARIABLE = "GAUSSLITE_SIMD"
-MAX_THREADS = 256
 
 _Table: TypeAlias = Float32[ndarray, "n 16"]
 _Tables: TypeAlias = tuple[_Table, _Table, _Table]
@@ -92,9 +89,8 @@ class CpuRasterizer:
     """
 
     def __init__(self, threads: int | None = None, simd: str | None = None) -> None:
-        kernels = _load_kernels()
-        self._simd = _choose_simd(simd, kernels.usable_simd())
-        self._engine: _kernels.Engine = kernels.Engine(self._simd, _choose_threads(threads))
+        self._simd = choose_simd(simd)
+        self._engine: _kernels.Engine = load_kernels().Engine(self._simd, choose_threads(threads))
         self._latest: ref[_Report] | None = None
         self._held: _Tables | None = None
         self._masked_ms = 0.0
@@ -166,7 +162,7 @@ class CpuRasterizer:
     ) -> TrainingView:
         """Make an image ready to train on. Raises ShapeError, InvalidInputError for weights outside [0, 1]."""
         require_view(rgb, depth_m, camera, weight)
-        native = _load_kernels().View(np.ascontiguousarray(rgb), np.ascontiguousarray(depth_m), _contiguous(weight))
+        native = load_kernels().View(np.ascontiguousarray(rgb), np.ascontiguousarray(depth_m), _contiguous(weight))
         return CpuView(camera, _intrinsics(camera), native)
 
     def step(
@@ -259,44 +255,6 @@ class CpuRasterizer:
         report = None if self._latest is None else self._latest()
         if report is not None:
             _ = report.visible
-
-
-def usable_simd() -> tuple[str, ...]:
-    """Instruction sets this build has and this machine runs, fastest first. Raises KernelError."""
-    return tuple(_load_kernels().usable_simd())
-
-
-def core_clock_ghz() -> float:
-    """The clock of the core that this runs on, measured in a millisecond or two. Raises KernelError."""
-    clock_ghz: float = _load_kernels().core_clock_ghz()
-    return clock_ghz
-
-
-def _load_kernels() -> Any:
-    try:
-        from gausslite.render import _kernels
-    except ImportError as reason:
-        raise KernelError(
-            f"native kernels: not built for this Python; install the package again ({reason})"
-        ) from reason
-    return _kernels
-
-
-def _choose_simd(asked: str | None, usable: list[str]) -> str:
-    chosen = asked or os.environ.get(SIMD_VARIABLE) or usable[0]
-    if chosen not in usable:
-        source = "simd" if asked else SIMD_VARIABLE
-        raise KernelError(f"{source}: expected one of {', '.join(usable)} on this machine, got {chosen}")
-    return chosen
-
-
-def _choose_threads(asked: int | None) -> int:
-    if asked is None:
-        available = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-        return min(available, MAX_THREADS)
-    if not 1 <= asked <= MAX_THREADS:
-        raise KernelError(f"threads: expected 1 to {MAX_THREADS}, got {asked}")
-    return asked
 
 
 @lru_cache(maxsize=8)
