@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from gausslite.errors import InvalidInputError
 from gausslite.mapping.pace import FrameBudget, Pace, PaceSettings, Relief, Step, choose_reliefs
 
-CHEAP = dict.fromkeys(Step, 1.0)
+CHEAP = {**dict.fromkeys(Step, 1.0), Step.SETTLING: 0.0}
 
 
 class WorkClock:
@@ -43,6 +43,8 @@ def run_frame(pace: Pace, clock: WorkClock, costs: dict[Step, float], counted: i
         with pace.timing(step):
             clock.work(costs[step])
         done += 1
+    with pace.timing(Step.SETTLING):
+        clock.work(costs[Step.SETTLING])
     if not pace.spares(Relief.WORDS):
         with pace.timing(Step.WORDS):
             clock.work(costs[Step.WORDS])
@@ -65,8 +67,9 @@ def test_a_frame_ends_in_its_time_up_to_one_iteration(seed: int) -> None:
     for frame in range(60):
         costs = {**CHEAP, Step.WARM_UP: rng.uniform(4, 12), Step.ACTIVE: rng.uniform(1, 4)}
         costs[Step.SEEDING], costs[Step.WORDS] = rng.uniform(2, 10), rng.uniform(1, 4)
+        costs[Step.SETTLING] = rng.uniform(1, 8)
         budget, done = run_frame(pace, clock, costs)
-        surprise = 0.0 if frame else costs[Step.WORDS]
+        surprise = 0.0 if frame else costs[Step.SETTLING] + costs[Step.WORDS]
         # the words, too, may cost more than they used to
         assert budget.seconds <= 100.0 + costs[Step.WARM_UP] + surprise + 4.0
         assert done >= 2

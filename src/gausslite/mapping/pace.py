@@ -30,6 +30,7 @@ class Step(StrEnum):
     WARM_UP = "warm_up"
     ACTIVE = "active"
     DENSITY = "density"
+    SETTLING = "settling"
     WORDS = "words"
 
 
@@ -43,7 +44,7 @@ class Relief(StrEnum):
 
 
 _SPARED = {Relief.WORDS: (Step.WORDS,), Relief.SEEDING: (Step.DRAWING, Step.SEEDING)}
-_FIXED = (Step.DRAWING, Step.ATTENTION, Step.VIEW, Step.SEEDING, Step.WORDS)
+_FIXED = (Step.DRAWING, Step.ATTENTION, Step.VIEW, Step.SEEDING, Step.SETTLING, Step.WORDS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,10 +142,12 @@ class Pace:
         return FrameBudget(seconds, dict(self._steps_s), self._reliefs, self._iterations < least)
 
     def _left_s(self) -> float:
-        """What is left of the frame's time once the region's words are made."""
+        """What is left of the frame's time once what follows training is done: the means carried on, the words made."""
         assert self._settings is not None
-        words_s = 0.0 if self.spares(Relief.WORDS) else self._forecasts[Step.WORDS].cautious_s
-        return self._begun_s + self._settings.seconds_per_frame - self._clock() - words_s
+        later_s = 0.0 if self.spares(Relief.WORDS) else self._forecasts[Step.WORDS].cautious_s
+        if Step.SETTLING not in self._steps_s:
+            later_s += self._forecasts[Step.SETTLING].cautious_s
+        return self._begun_s + self._settings.seconds_per_frame - self._clock() - later_s
 
 
 def choose_reliefs(

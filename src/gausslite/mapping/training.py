@@ -83,10 +83,11 @@ class Trainer:
         while self._next_step(done, bool(showing), pace) is not None:
             done = self._until_density_control(views, showing, done, pace)
             self._control_density(extent_m, pace)
-        self._bound_colours()
-        if self._settings.optimization.isotropic:
-            self._make_spheres()
-        self._average()
+        with pace.timing(Step.SETTLING):
+            self._bound_colours()
+            if self._settings.optimization.isotropic:
+                self._make_spheres()
+            self._average()
         return done
 
     def rehearse(self, views: Sequence[WindowView], extent_m: float) -> None:
