@@ -11,9 +11,10 @@ from gausslite.datasets.open import open_source
 from gausslite.datasets.regions import load_voxel_regions
 from gausslite.datasets.source import Source
 from gausslite.perception.attention import TaskAttention
+from gausslite.perception.model_file import open_model
 from gausslite.perception.tracker import AttentionSettings
 from gausslite.perception.vectors import TextVectors, classes_for
-from gausslite.perception.yolo import YoloSegDetector, load_yolo
+from gausslite.perception.yolo import YoloSegDetector, yolo_of
 from gausslite.task.rules import RuleParser
 
 
@@ -24,7 +25,7 @@ def kitchen(shared_dir: Path) -> Source:
 
 @pytest.fixture(scope="module")
 def detector(shared_dir: Path) -> YoloSegDetector:
-    return load_yolo(shared_dir / "models" / "yolo11n-seg_int8.onnx")
+    return yolo_of(open_model(shared_dir / "models" / "yolo11n-seg_int8.onnx"))
 
 
 def attention_to(text: str, kitchen: Source, detector: YoloSegDetector) -> TaskAttention:

@@ -13,9 +13,13 @@ from gausslite.domain.frame import Frame
 from gausslite.errors import InvalidInputError, ModelFileError
 from gausslite.perception.detect import BoxFractions
 from gausslite.perception.model_file import open_model
-from gausslite.perception.yolo import YoloSegDetector, YoloSettings, load_yolo
+from gausslite.perception.yolo import YoloSegDetector, YoloSettings, yolo_of
 
 NAMES = ("cup", "chair", "dining table")
+
+
+def load_yolo(path: Path) -> YoloSegDetector:
+    return yolo_of(open_model(path, threads=1))
 
 
 def frame_with_red_square() -> Frame:
@@ -89,7 +93,7 @@ def test_a_noun_without_a_class_is_said_and_not_found(tmp_path):
 
 
 def test_segment_matches_instances_of_any_class_to_boxes(tmp_path):
-    segmenter = load_yolo(write_tiny_yolo(tmp_path / "tiny.onnx", NAMES, [CUP]), threads=1).segmenter()
+    segmenter = load_yolo(write_tiny_yolo(tmp_path / "tiny.onnx", NAMES, [CUP])).segmenter()
     boxes = np.array([[30, 16, 64, 50], [80, 0, 120, 30]], np.float32)
     first, second = segmenter.segment(frame_with_red_square(), boxes)
     assert first is not None

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
 
@@ -13,7 +12,7 @@ from gausslite.domain.relevance import Detection
 from gausslite.errors import InvalidInputError, ModelFileError
 from gausslite.perception.detect import Box, BoxFractions, concerns_many_objects
 from gausslite.perception.everything import EverythingSegmenter
-from gausslite.perception.model_file import OpenModel, open_model
+from gausslite.perception.model_file import OpenModel
 from gausslite.perception.vectors import TextVectors, classes_for
 from gausslite.perception.yolo_decode import Candidates, suppress
 from gausslite.perception.yolo_network import YoloSegNetwork
@@ -121,8 +120,3 @@ class YoloSegDetector:
 def yolo_of(model: OpenModel) -> YoloSegDetector:
     """The detector with its defaults and the text vectors that lie beside the file. Raises ModelFileError."""
     return YoloSegDetector(model, TextVectors.beside(model.path))
-
-
-def load_yolo(path: Path, threads: int | None = None) -> YoloSegDetector:
-    """As yolo_of, for a file that is not open yet."""
-    return yolo_of(open_model(path, threads))
