@@ -17,9 +17,10 @@ from gausslite.evaluation.compare import MapScores
 from gausslite.evaluation.quality.ablation import cumulative_variants
 from gausslite.evaluation.quality.pairs import HOME_PAIRS, WHOLE_HOMES, Kind, choose_pairs
 from gausslite.evaluation.quality.scenes import HomeScenePlan
-from gausslite.evaluation.quality.study import Archive, Finished, Study
+from gausslite.evaluation.quality.study import Archive, Finished, Study, run_study
 from gausslite.evaluation.quality.tables import FULL_METRICS, ROI_METRICS, Scoreboard, ablation_table, quality_table
 from gausslite.evaluation.quality.trials import Budget, Conditions, Equal, Trial, TrialResult, Variant, clock_for
+from gausslite.optimize.view_fit import ViewPrior
 from gausslite.perception.vocabulary import same_kind
 from gausslite.task.rules import RuleParser
 
@@ -95,6 +96,25 @@ def test_a_trials_key_changes_with_each_of_its_settings() -> None:
     ]
     assert len({each.key for each in (trial, *others)}) == 1 + len(others)
     assert trial.key == Trial(PLAN, TASK, Budget(), 0, CONDITIONS).key
+
+
+def test_a_map_that_knows_no_task_is_the_same_for_every_task_of_its_place() -> None:
+    search = HomeScenePlan(choose_pairs(["home-8-search"])[0], 4, 3)
+    here, there = Trial(PLAN, UNIFORM, Budget(), 0, CONDITIONS), Trial(search, UNIFORM, Budget(), 0, CONDITIONS)
+    assert (here.map_key, here.follows_task) == (there.map_key, False)
+    for other in (
+        replace(here, seed=1),
+        replace(here, budget=Budget(iterations=9)),
+        replace(here, conditions=replace(CONDITIONS, view_prior=ViewPrior(0.01))),
+        replace(here, plan=replace(PLAN, frames=5)),
+        replace(here, plan=HomeScenePlan(choose_pairs(["home-7-search"])[0], 4, 3)),
+        replace(here, variant=Variant("monogs", "monogs")),
+    ):
+        assert other.map_key != here.map_key
+    ours, theirs = Trial(PLAN, TASK, Budget(), 0, CONDITIONS), Trial(search, TASK, Budget(), 0, CONDITIONS)
+    assert ours.follows_task
+    assert ours.map_key != theirs.map_key
+    assert not replace(ours, variant=cumulative_variants()[0]).follows_task
 
 
 def test_a_single_thread_is_timed_by_the_processor() -> None:
@@ -175,6 +195,35 @@ def test_the_command_measures_keeps_and_resumes(tmp_path: Path, capsys: pytest.C
     again = capsys.readouterr()
     assert again.err.count("(kept)") == 2
     assert json.loads((tmp_path / "quality.json").read_text())["scenes"] == report["scenes"]
+
+
+def test_a_map_is_made_once_for_all_tasks_that_it_does_not_know(tmp_path: Path) -> None:
+    pytest.importorskip("embreex", reason="the simulated homes need the extra `sim`")
+    pytest.importorskip("gausslite.render._kernels", reason="the native kernels are not built")
+    plans = [HomeScenePlan(pair, frames=4, views=3) for pair in choose_pairs(["home-8"])]
+    conditions = Conditions((96, 72), threads=1)
+    together = Study(plans, [TASK, UNIFORM], [Budget(max_gaussians=1500, iterations=1)], [0], conditions)
+    seen = Frames()
+    results = run_study(together, Archive(tmp_path / "together"), None, seen)
+    assert seen.count == (3 + 1) * len(plans[0].load((96, 72)).training)
+    alone = replace(together, plans=plans[2:], variants=[UNIFORM])
+    [last] = run_study(alone, Archive(tmp_path / "alone"), None, seen)
+    assert results[-1].trial.key == last.trial.key
+    assert results[-1].result.scores == last.result.scores
+
+
+class Frames:
+    """Counts the frames that a study maps."""
+
+    def __init__(self) -> None:
+        self.count = 0
+
+    def frame(self, gaussians: int) -> None:
+        del gaussians
+        self.count += 1
+
+    def finished(self, trial: Trial, result: TrialResult, kept: bool) -> None:
+        del trial, result, kept
 
 
 @pytest.mark.parametrize(

@@ -68,6 +68,10 @@ class ScenePlan(Protocol):
         """All that its frames depend on, for telling finished trials from others."""
         ...
 
+    def place(self) -> Mapping[str, object]:
+        """What its training frames depend on: plans of one place share the maps that know no task."""
+        ...
+
     def load(self, size: tuple[int, int]) -> Scene:
         """Make the frames at (width, height). Raises DatasetError, InvalidInputError."""
         ...
@@ -104,6 +108,10 @@ class HomeScenePlan:
             "task": self.task,
             "objects": list(self.pair.objects),
         }
+
+    def place(self) -> Mapping[str, object]:
+        """The training walks."""
+        return {"specs": [self._spec(*walk) for walk in self._training_walks()]}
 
     def load(self, size: tuple[int, int]) -> Scene:
         """Both walks one after the other, as one mission."""
@@ -152,10 +160,14 @@ class RealScenePlan:
         return f"Find the {self.kind}"
 
     def settings(self) -> Mapping[str, object]:
-        """The folder, the objects and what is used of the frames."""
+        """The place and the objects."""
+        return {**self.place(), "objects": list(self.objects)}
+
+    def place(self) -> Mapping[str, object]:
+        """The folder and what is used of its frames."""
         camera = None if self.colour_camera is None else str(self.colour_camera)
         used = {"frames": self.frames, "up": self.up_axis, "hold_out": self.hold_out.every, "colour_camera": camera}
-        return {"folder": str(self.folder.resolve()), "objects": list(self.objects), **used}
+        return {"folder": str(self.folder.resolve()), **used}
 
     def load(self, size: tuple[int, int]) -> Scene:
         """The frames with depth, split."""

@@ -20,11 +20,13 @@ from gausslite.evaluation.quality.trials import (
     PICTURES,
     Budget,
     Conditions,
+    MadeMap,
     Pictures,
     Trial,
     TrialResult,
     Variant,
-    run_trial,
+    judge_map,
+    make_map,
 )
 from gausslite.evaluation.views import most_telling
 from gausslite.mission.results import prepare_folder, write_json
@@ -122,19 +124,43 @@ class Finished:
     result: TrialResult
 
 
+class _Shelf:
+    """Maps that know no task, kept for the other tasks in the same place: what is judged again is not made again."""
+
+    def __init__(self) -> None:
+        self._place: Mapping[str, object] = {}
+        self._maps: dict[str, MadeMap] = {}
+
+    def enter(self, plan: ScenePlan) -> None:
+        """Forget the maps of another place."""
+        if plan.place() != self._place:
+            self._place, self._maps = plan.place(), {}
+
+    def take(self, trial: Trial, scene: Scene, watcher: Watcher) -> MadeMap:
+        """The trial's map, made unless it is here. Raises GaussLiteError."""
+        made = self._maps.get(trial.map_key)
+        if made is None:
+            made = make_map(trial, scene, watcher.frame)
+        if not trial.follows_task:
+            self._maps[trial.map_key] = made
+        return made
+
+
 def run_study(
     study: Study, archive: Archive, perceptual: PerceptualDistance | None, watcher: Watcher
 ) -> list[Finished]:
     """Run what is not finished yet. A scene's frames are made only if one of its trials needs them."""
-    finished = []
+    finished, shelf = [], _Shelf()
     for plan in study.plans:
         scene: Scene | None = None
+        shelf.enter(plan)
         for trial in study.trials(plan):
             result = archive.recall(trial, perceptual is not None)
             kept = result is not None
             if result is None:
                 scene = plan.load(study.conditions.size) if scene is None else scene
-                result, pictures = run_trial(trial, scene, perceptual, watcher.frame)
+                made = shelf.take(trial, scene, watcher)
+                result, pictures = judge_map(made, scene, study.conditions, perceptual)
                 archive.keep(trial, result, pictures)
             finished.append(Finished(trial, result))
             watcher.finished(trial, result, kept)

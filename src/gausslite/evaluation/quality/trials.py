@@ -5,14 +5,16 @@ from __future__ import annotations
 import hashlib
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from enum import StrEnum
+from statistics import fmean
 from typing import Any
 
 from jaxtyping import UInt8
 from numpy import ndarray
 
+from gausslite.domain.gaussians import Gaussians
 from gausslite.errors import InvalidInputError
 from gausslite.evaluation.compare import MapScores, PerceptualDistance, average, score_view
 from gausslite.evaluation.fitted import draw_fitted
@@ -110,16 +112,31 @@ class Trial:
         )
 
     @property
+    def follows_task(self) -> bool:
+        """False where nothing in the policy asks for the task's region: its map is the same for every task."""
+        components = self.mission.mapper_settings().components
+        follows = components.sb or components.roi or components.sis or components.gfd
+        return self.variant.policy == TASK and follows
+
+    @property
     def key(self) -> str:
         """A name that changes with every setting, down to the policy's own."""
+        digest = self._digest(self.plan.settings())
+        return f"{self.plan.name}-{self.variant.label}-{self.budget.equal}-{self.seed}-{digest}".replace("+", "with-")
+
+    @property
+    def map_key(self) -> str:
+        """A name that changes with all that the map depends on, the task among it only where it is followed."""
+        return self._digest(self.plan.settings() if self.follows_task else self.plan.place())
+
+    def _digest(self, scene: Mapping[str, object]) -> str:
         settings = {
-            "scene": dict(self.plan.settings()),
+            "scene": dict(scene),
             "mission": str(self.mission),
             "mapper": str(self.mission.mapper_settings()),
             "conditions": str(self.conditions),
         }
-        digest = hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:12]
-        return f"{self.plan.name}-{self.variant.label}-{self.budget.equal}-{self.seed}-{digest}".replace("+", "with-")
+        return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:12]
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,10 +171,17 @@ Pictures = dict[int, UInt8[ndarray, "h w 3"]]
 """What a map looks like from the most telling held-out views, by their position."""
 
 
-def run_trial(
-    trial: Trial, scene: Scene, perceptual: PerceptualDistance | None, on_frame: Callable[[int], None]
-) -> tuple[TrialResult, Pictures]:
-    """Map and judge; on_frame hears the number of Gaussians after each frame. Raises GaussLiteError."""
+@dataclass(frozen=True, slots=True, eq=False)
+class MadeMap:
+    """A trial's map at the end of its mission. ms_per_frame counts perception and mapping."""
+
+    gaussians: Gaussians
+    iterations_mean: float
+    ms_per_frame: float
+
+
+def make_map(trial: Trial, scene: Scene, on_frame: Callable[[int], None]) -> MadeMap:
+    """Map the scene; on_frame hears the number of Gaussians after each frame. Raises GaussLiteError."""
     settings = trial.mission
     attention = _attention(trial, scene)
     loop = TaskMapper(attention, build_mapper(settings), pace=Pace(settings.pace, clock_for(settings.threads)))
@@ -165,14 +189,24 @@ def run_trial(
     for frame in scene.training:
         outcomes.append(loop.process(frame))
         on_frame(outcomes[-1].gaussians)
-    gaussians = loop.gaussians()
-    viewer = MapViewer(gaussians, choose_rasterizer(threads=trial.conditions.threads))
+    return MadeMap(
+        gaussians=loop.gaussians(),
+        iterations_mean=fmean(outcome.iterations for outcome in outcomes),
+        ms_per_frame=1e3 * fmean(outcome.budget.seconds for outcome in outcomes),
+    )
+
+
+def judge_map(
+    made: MadeMap, scene: Scene, conditions: Conditions, perceptual: PerceptualDistance | None
+) -> tuple[TrialResult, Pictures]:
+    """Score a map on the scene's held-out views, and draw those that tell most. Raises GaussLiteError."""
+    viewer = MapViewer(made.gaussians, choose_rasterizer(threads=conditions.threads))
     shown = most_telling(scene.held_out, PICTURES)
     scores, fitted, pictures = [], [], {}
     for i, view in enumerate(scene.held_out):
         drawn = viewer.draw_frame(view.frame)
         scores.append(score_view(drawn, view, perceptual))
-        if trial.conditions.fit_views:
+        if conditions.fit_views:
             fitted.append(score_view(draw_fitted(viewer, view.frame), view, perceptual))
         if i in shown:
             pictures[i] = as_bytes(drawn.rgb)
@@ -180,9 +214,9 @@ def run_trial(
         scores=average(scores),
         fitted=average(fitted) if fitted else None,
         roi_share=scene.roi_share,
-        gaussians=len(gaussians),
-        iterations_mean=sum(outcome.iterations for outcome in outcomes) / len(outcomes),
-        ms_per_frame=1e3 * sum(outcome.budget.seconds for outcome in outcomes) / len(outcomes),
+        gaussians=len(made.gaussians),
+        iterations_mean=made.iterations_mean,
+        ms_per_frame=made.ms_per_frame,
     )
     return result, pictures
 
@@ -194,9 +228,7 @@ def clock_for(threads: int | None) -> Clock:
 
 def _attention(trial: Trial, scene: Scene) -> Attention:
     """What does not follow the task is not told of it: marked Gaussians would be spared when room is short."""
-    components = trial.mission.mapper_settings().components
-    follows = components.sb or components.roi or components.sis or components.gfd
-    if trial.variant.policy != TASK or not follows:
+    if not trial.follows_task:
         return NoAttention()
     if not trial.conditions.eyes.words:
         return RecalledAttention(scene)
