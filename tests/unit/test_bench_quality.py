@@ -16,7 +16,7 @@ from gausslite.errors import InvalidInputError
 from gausslite.evaluation.compare import MapScores
 from gausslite.evaluation.quality.ablation import cumulative_variants
 from gausslite.evaluation.quality.pairs import HOME_PAIRS, WHOLE_HOMES, Kind, choose_pairs
-from gausslite.evaluation.quality.scenes import HomeScenePlan
+from gausslite.evaluation.quality.scenes import HomeScenePlan, RealScenePlan, Trust
 from gausslite.evaluation.quality.study import Archive, Finished, Study, run_study
 from gausslite.evaluation.quality.tables import FULL_METRICS, ROI_METRICS, Scoreboard, ablation_table, quality_table
 from gausslite.evaluation.quality.trials import Budget, Conditions, Equal, Trial, TrialResult, Variant, clock_for
@@ -92,6 +92,7 @@ def test_a_trials_key_changes_with_each_of_its_settings() -> None:
         replace(trial, budget=Budget(iterations=9)),
         replace(trial, budget=Budget(equal=Equal.TIME)),
         replace(trial, plan=replace(PLAN, frames=5)),
+        replace(trial, plan=replace(PLAN, trust=Trust(fit_views=True))),
         replace(trial, plan=HomeScenePlan(choose_pairs(["home-8-search"])[0], 4, 3)),
     ]
     assert len({each.key for each in (trial, *others)}) == 1 + len(others)
@@ -105,7 +106,7 @@ def test_a_map_that_knows_no_task_is_the_same_for_every_task_of_its_place() -> N
     for other in (
         replace(here, seed=1),
         replace(here, budget=Budget(iterations=9)),
-        replace(here, conditions=replace(CONDITIONS, view_prior=ViewPrior(0.01))),
+        replace(here, plan=replace(PLAN, trust=Trust(ViewPrior(0.01)))),
         replace(here, plan=replace(PLAN, frames=5)),
         replace(here, plan=HomeScenePlan(choose_pairs(["home-7-search"])[0], 4, 3)),
         replace(here, variant=Variant("monogs", "monogs")),
@@ -115,6 +116,15 @@ def test_a_map_that_knows_no_task_is_the_same_for_every_task_of_its_place() -> N
     assert ours.follows_task
     assert ours.map_key != theirs.map_key
     assert not replace(ours, variant=cumulative_variants()[0]).follows_task
+
+
+def test_homes_are_believed_and_real_cameras_are_not(tmp_path: Path) -> None:
+    assert Trust() == PLAN.trust
+    assert not Trial(PLAN, TASK, Budget(), 0, CONDITIONS).mission.view_prior.moves
+    real = RealScenePlan(tmp_path, tmp_path / "roi.npz", "mug", ("mug_1",))
+    mission = Trial(real, UNIFORM, Budget(), 0, CONDITIONS).mission
+    assert ViewPrior.parse(str(mission.view_prior)) == ViewPrior(0.01, 0.5, 0.1, 0.03)
+    assert real.trust.fit_views
 
 
 def test_a_single_thread_is_timed_by_the_processor() -> None:

@@ -12,7 +12,7 @@ from gausslite.codec.files import write_whole
 from gausslite.errors import InvalidInputError
 from gausslite.evaluation.quality.ablation import cumulative_variants
 from gausslite.evaluation.quality.pairs import HomePair, choose_pairs
-from gausslite.evaluation.quality.scenes import HomeScenePlan, ScenePlan, real_plans
+from gausslite.evaluation.quality.scenes import REAL_CAMERA, HomeScenePlan, ScenePlan, Trust, real_plans
 from gausslite.evaluation.quality.study import Archive, Study, run_study
 from gausslite.evaluation.quality.tables import Scoreboard, ablation_table, quality_table
 from gausslite.evaluation.quality.trials import Budget, Conditions, Equal, Eyes, Trial, TrialResult, Variant
@@ -106,8 +106,12 @@ def _add_common(parser: argparse.ArgumentParser, seeds: tuple[int, ...]) -> None
     )
     add("--threads", metavar="N", type=int, help="threads (default: all the processor allows)")
     add("--lpips-weights", metavar="PATH", type=Path, action="append", default=[], help="AlexNet's and LPIPS' weights")
-    add_view_error(parser)
-    add("--fit-views", action="store_true", help="score a second time with each view's pose and colours fitted")
+    add_view_error(parser, default=None, shown=f"homes trusted, real {REAL_CAMERA.view_prior}")
+    add(
+        "--fit-views",
+        action=argparse.BooleanOptionalAction,
+        help="score a second time with each view's pose and colours fitted (default: real sequences only)",
+    )
     real = parser.add_argument_group("a real sequence")
     real.add_argument(
         "--real", metavar="FOLDER", type=Path, help="measure on this sequence (too, when homes are named)"
@@ -120,7 +124,8 @@ def _add_common(parser: argparse.ArgumentParser, seeds: tuple[int, ...]) -> None
 
 
 def _homes(options: argparse.Namespace, pairs: Sequence[HomePair]) -> list[HomeScenePlan]:
-    return [HomeScenePlan(pair, 60 if options.frames is None else options.frames, options.views) for pair in pairs]
+    frames, trust = 60 if options.frames is None else options.frames, _trust(options, Trust())
+    return [HomeScenePlan(pair, frames, options.views, trust=trust) for pair in pairs]
 
 
 def _real(options: argparse.Namespace) -> list[ScenePlan]:
@@ -130,7 +135,15 @@ def _real(options: argparse.Namespace) -> list[ScenePlan]:
         )
     if options.real is None:
         return []
-    return [*real_plans(options.real, options.roi, options.frames, options.up, options.colour_camera)]
+    trust = _trust(options, REAL_CAMERA)
+    return [*real_plans(options.real, options.roi, options.frames, options.up, options.colour_camera, trust)]
+
+
+def _trust(options: argparse.Namespace, usual: Trust) -> Trust:
+    return Trust(
+        usual.view_prior if options.view_error is None else options.view_error,
+        usual.fit_views if options.fit_views is None else options.fit_views,
+    )
 
 
 def _budget(options: argparse.Namespace, equal: Equal) -> Budget:
@@ -138,7 +151,7 @@ def _budget(options: argparse.Namespace, equal: Equal) -> Budget:
 
 
 def _conditions(options: argparse.Namespace, eyes: Eyes) -> Conditions:
-    return Conditions(options.size, eyes, options.view_error, options.fit_views, options.threads)
+    return Conditions(options.size, eyes, options.threads)
 
 
 def _eyes(options: argparse.Namespace) -> Eyes:

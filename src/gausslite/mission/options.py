@@ -15,6 +15,7 @@ from gausslite.optimize.view_fit import ViewPrior
 from gausslite.render.choose import BACKENDS
 
 _DETECTOR_HELP = "a YOLO-seg or Grounding DINO model (default: the source's ground truth)"
+_TRUSTED = ViewPrior()
 _RELIEF_HELP = "what gives way, in order, where that time is short (default: words,seeding)"
 
 
@@ -56,14 +57,16 @@ def add_policy(parser: argparse.ArgumentParser) -> None:
     add_view_error(parser)
 
 
-def add_view_error(parser: argparse.ArgumentParser) -> None:
-    """Add --view-error, for cameras whose poses and colours cannot be trusted to the pixel."""
+def add_view_error(
+    parser: argparse.ArgumentParser, default: ViewPrior | None = _TRUSTED, shown: str = "trusted"
+) -> None:
+    """Add --view-error, for cameras whose poses and colours cannot be trusted to the pixel; shown tells the default."""
     parser.add_argument(
         "--view-error",
         metavar="M,DEG[,GAIN,OFFSET]",
         type=ViewPrior.parse,
-        default=ViewPrior(),
-        help="how wrong poses (and colours, from 0 to 1) may be; keyframes are refined within that (default: trusted)",
+        default=default,
+        help=f"how wrong poses (and colours, from 0 to 1) may be; keyframes are refined within that (default: {shown})",
     )
 
 

@@ -28,7 +28,6 @@ class RunTerms:
     @classmethod
     def of(cls, settings: MissionSettings, **beside: str) -> RunTerms:
         """How the robot maps, and what else the caller holds to; threads and backend are free to change."""
-        prior = settings.view_prior
         options = {
             "policy": settings.policy,
             "without": ",".join(sorted(settings.without)),
@@ -38,7 +37,7 @@ class RunTerms:
             "least": str(settings.least_iterations),
             "relief": ",".join(settings.reliefs),
             "seed": str(settings.seed),
-            "view_error": f"{prior.translation_m:g},{prior.rotation_deg:g},{prior.gain:g},{prior.offset:g}",
+            "view_error": str(settings.view_prior),
         }
         return cls({**options, **beside})
 

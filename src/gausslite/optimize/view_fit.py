@@ -65,6 +65,10 @@ class ViewPrior:
             raise InvalidInputError(f"view error: expected M,DEG or M,DEG,GAIN,OFFSET, got {text[:40]!r}")
         return cls(*values)
 
+    def __str__(self) -> str:
+        """The text that parse reads."""
+        return f"{self.translation_m:g},{self.rotation_deg:g},{self.gain:g},{self.offset:g}"
+
     @property
     def moves(self) -> bool:
         """False where poses are trusted."""

@@ -25,6 +25,7 @@ from gausslite.evaluation.held_out import HoldOut
 from gausslite.evaluation.quality.pairs import HomePair
 from gausslite.evaluation.views import HeldOutView
 from gausslite.mission.settings import SceneKnowledge
+from gausslite.optimize.view_fit import ViewPrior
 from gausslite.perception.fixed import RegionAttention
 from gausslite.perception.vocabulary import head_of
 
@@ -50,6 +51,22 @@ class Scene:
         return float(np.mean(shares)) if shares else 0.0
 
 
+@dataclass(frozen=True, slots=True)
+class Trust:
+    """How far what is said of a scene's views can be believed.
+
+    view_prior says how wrong poses and colours may be, for mapping; with fit_views the held-out views are scored a
+    second time with their own pose and colours fitted.
+    """
+
+    view_prior: ViewPrior = field(default_factory=ViewPrior)
+    fit_views: bool = False
+
+
+REAL_CAMERA = Trust(ViewPrior(translation_m=0.01, rotation_deg=0.5, gain=0.1, offset=0.03), fit_views=True)
+"""A hand-held camera that sets its own exposure, tracked to about a centimetre."""
+
+
 @runtime_checkable
 class ScenePlan(Protocol):
     """A scene before its frames are made."""
@@ -64,8 +81,13 @@ class ScenePlan(Protocol):
         """What the robot is asked to do."""
         ...
 
+    @property
+    def trust(self) -> Trust:
+        """How far its views are believed, by every policy alike."""
+        ...
+
     def settings(self) -> Mapping[str, object]:
-        """All that its frames depend on, for telling finished trials from others."""
+        """All that its frames and scores depend on, for telling finished trials from others."""
         ...
 
     def place(self) -> Mapping[str, object]:
@@ -85,6 +107,7 @@ class HomeScenePlan:
     frames: int = 60
     views: int = 24
     seed: int = 0
+    trust: Trust = field(default_factory=Trust)
 
     def __post_init__(self) -> None:
         for name, value in (("frames", self.frames), ("views", self.views)):
@@ -107,6 +130,7 @@ class HomeScenePlan:
             "specs": [self._spec(*walk) for walk in self._training_walks()] + [self._held_out_spec()],
             "task": self.task,
             "objects": list(self.pair.objects),
+            "trust": str(self.trust),
         }
 
     def place(self) -> Mapping[str, object]:
@@ -147,6 +171,7 @@ class RealScenePlan:
     frames: int | None = None
     up_axis: UpAxis | None = None
     colour_camera: ColourCamera | None = None
+    trust: Trust = REAL_CAMERA
     hold_out: HoldOut = field(default_factory=HoldOut)
 
     @property
@@ -161,7 +186,7 @@ class RealScenePlan:
 
     def settings(self) -> Mapping[str, object]:
         """The place and the objects."""
-        return {**self.place(), "objects": list(self.objects)}
+        return {**self.place(), "objects": list(self.objects), "trust": str(self.trust)}
 
     def place(self) -> Mapping[str, object]:
         """The folder and what is used of its frames."""
@@ -191,13 +216,14 @@ def real_plans(
     frames: int | None = None,
     up_axis: UpAxis | None = None,
     colour_camera: ColourCamera | None = None,
+    trust: Trust = REAL_CAMERA,
 ) -> list[RealScenePlan]:
     """One plan for each kind of object in the file: mug_1 and mug_2 are the kind mug. Raises DatasetError."""
     kinds: dict[str, list[str]] = {}
     for name in load_voxel_regions(roi):
         kinds.setdefault(head_of(name), []).append(name)
     return [
-        RealScenePlan(folder, roi, kind, tuple(objects), frames, up_axis, colour_camera)
+        RealScenePlan(folder, roi, kind, tuple(objects), frames, up_axis, colour_camera, trust)
         for kind, objects in kinds.items()
     ]
 

@@ -160,7 +160,7 @@ def run_study(
             if result is None:
                 scene = plan.load(study.conditions.size) if scene is None else scene
                 made = shelf.take(trial, scene, watcher)
-                result, pictures = judge_map(made, scene, study.conditions, perceptual)
+                result, pictures = judge_map(made, trial, scene, perceptual)
                 archive.keep(trial, result, pictures)
             finished.append(Finished(trial, result))
             watcher.finished(trial, result, kept)

@@ -25,7 +25,6 @@ from gausslite.mapping.pace import Clock, Pace
 from gausslite.mapping.policies import TASK
 from gausslite.mission.build import build_attention, build_mapper
 from gausslite.mission.settings import MissionSettings, PerceptionSettings
-from gausslite.optimize.view_fit import ViewPrior
 from gausslite.perception.attention import Attention
 from gausslite.perception.fixed import NoAttention
 from gausslite.pipeline import TaskMapper
@@ -73,16 +72,10 @@ class Eyes:
 
 @dataclass(frozen=True, slots=True)
 class Conditions:
-    """What is the same for every trial of a study.
-
-    view_prior says how wrong poses and colours may be, for mapping; with fit_views the held-out views are scored a
-    second time with their own pose and colours fitted.
-    """
+    """What is the same for every trial of a study."""
 
     size: tuple[int, int]
     eyes: Eyes = field(default_factory=Eyes)
-    view_prior: ViewPrior = field(default_factory=ViewPrior)
-    fit_views: bool = False
     threads: int | None = None
 
 
@@ -108,7 +101,7 @@ class Trial:
             rate_hz=self.budget.rate_hz if timed else None,
             seed=self.seed,
             threads=self.conditions.threads,
-            view_prior=self.conditions.view_prior,
+            view_prior=self.plan.trust.view_prior,
         )
 
     @property
@@ -197,16 +190,16 @@ def make_map(trial: Trial, scene: Scene, on_frame: Callable[[int], None]) -> Mad
 
 
 def judge_map(
-    made: MadeMap, scene: Scene, conditions: Conditions, perceptual: PerceptualDistance | None
+    made: MadeMap, trial: Trial, scene: Scene, perceptual: PerceptualDistance | None
 ) -> tuple[TrialResult, Pictures]:
     """Score a map on the scene's held-out views, and draw those that tell most. Raises GaussLiteError."""
-    viewer = MapViewer(made.gaussians, choose_rasterizer(threads=conditions.threads))
+    viewer = MapViewer(made.gaussians, choose_rasterizer(threads=trial.conditions.threads))
     shown = most_telling(scene.held_out, PICTURES)
     scores, fitted, pictures = [], [], {}
     for i, view in enumerate(scene.held_out):
         drawn = viewer.draw_frame(view.frame)
         scores.append(score_view(drawn, view, perceptual))
-        if conditions.fit_views:
+        if trial.plan.trust.fit_views:
             fitted.append(score_view(draw_fitted(viewer, view.frame), view, perceptual))
         if i in shown:
             pictures[i] = as_bytes(drawn.rgb)
