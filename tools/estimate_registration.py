@@ -11,7 +11,7 @@ from __future__ import annotations
 import argparse
 import sys
 
-from gausslite.datasets.alignment import align
+from gausslite.datasets.alignment import estimate_colour_camera
 from gausslite.datasets.open import open_source
 from gausslite.datasets.selection import select_frames
 from gausslite.errors import GaussLiteError
@@ -26,13 +26,12 @@ def main() -> int:
     try:
         source = open_source(options.source)
         positions = select_frames(source, options.frames)
-        positions = positions[:: max(1, len(positions) // max(1, options.count))]
-        found = align([source.frame(position) for position in positions])
+        found = estimate_colour_camera(source, positions, options.count)
     except GaussLiteError as error:
         print(f"estimate_registration: {error}", file=sys.stderr)
         return 2
     print(
-        f"{len(positions)} frames, {found.edge_points} depth edge points; colour's gradient there is "
+        f"{found.edge_points} depth edge points; colour's gradient there is "
         f"{found.score_before:.2f} times its surroundings as it is, {found.score:.2f} times with this camera",
         file=sys.stderr,
     )

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+from tiny_sequences import write_replica, write_seven_scenes, write_tum
 
-from gausslite.datasets.alignment import align
+from gausslite.datasets.alignment import align, find_registration
 from gausslite.datasets.intrinsics import FileIntrinsics
 from gausslite.datasets.open import open_source
 from gausslite.datasets.registration import ColourCamera, register_depth
 from gausslite.domain.camera import Camera
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import inverse
+from gausslite.domain.region import Region
 from gausslite.errors import DatasetError
 
 DEPTH_CAMERA = Camera(300.0, 300.0, 162.0, 118.5, 320, 240)
@@ -39,6 +42,53 @@ def test_a_known_colour_camera_is_found() -> None:
     assert found.camera.turn_deg == pytest.approx(truth.turn_deg, abs=0.15)
     assert found.camera.intrinsics.cx == pytest.approx(truth.intrinsics.cx, abs=1.0)
     assert found.camera.intrinsics.cy == pytest.approx(truth.intrinsics.cy, abs=1.0)
+
+
+class ApartSource:
+    """The simulated home with its depth camera beside the colour camera, as a recording that does not register it."""
+
+    def __init__(self, truth: ColourCamera) -> None:
+        self._home = open_source("sim:home?seed=0&trajectory=0&frames=6&size=320x240&noise=0")
+        self._T_colour_depth = truth.depth_to_colour()
+        self.name, self.camera, self.up_axis = "apart", DEPTH_CAMERA, self._home.up_axis
+        self.depth_registered = False
+
+    def __len__(self) -> int:
+        return len(self._home)
+
+    def frame(self, i: int, size: tuple[int, int] | None = None) -> Frame:
+        assert size is None
+        return unregister(self._home.frame(i), self._T_colour_depth)
+
+    def indices(self) -> list[int]:
+        return list(range(len(self)))
+
+    def regions(self) -> dict[str, Region]:
+        return {}
+
+
+def test_depth_that_is_not_registered_is_registered_to_what_the_images_say() -> None:
+    pytest.importorskip("embreex", reason="the simulated home needs the extra `sim`")
+    k = open_source("sim:home?frames=6&size=320x240").camera
+    beside = ColourCamera(FileIntrinsics(k.fx_px, k.fy_px, k.cx_px - 0.5, k.cy_px - 0.5), (-0.05, 0.0, 0.0))
+    source = ApartSource(beside)
+    found, why = find_registration(source)
+    assert found is not None
+    assert found.offset_m == pytest.approx(beside.offset_m, abs=0.006)
+    assert "becomes" in why
+    source.depth_registered = True
+    assert find_registration(source) == (None, "the layout's depth is registered to colour")
+
+
+@pytest.mark.parametrize(
+    ("write", "registered"), [(write_tum, True), (write_replica, True), (write_seven_scenes, False)]
+)
+def test_layouts_know_whether_their_depth_is_registered(write, registered: bool, tmp_path: Path) -> None:
+    source = open_source(str(write(tmp_path / "fr1")))
+    assert source.depth_registered is registered
+    camera, why = find_registration(source)
+    assert camera is None
+    assert registered or "expected at least 1000 depth edge points" in why
 
 
 def test_images_without_depth_edges_are_refused() -> None:

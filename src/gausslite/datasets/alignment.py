@@ -17,6 +17,7 @@ from numpy import ndarray
 
 from gausslite.datasets.intrinsics import FileIntrinsics
 from gausslite.datasets.registration import ColourCamera
+from gausslite.datasets.source import Source
 from gausslite.domain.camera import Camera
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import transform_points
@@ -31,6 +32,7 @@ _BLURS_PX = (4.0, 2.0, 1.0)
 _HALVINGS = 5
 _FINER = 0.25
 _LEAST_GAIN = 1e-6
+_CONVINCING = 1.2
 # zoom against the depth camera; shift in pixels (x, y); offset in metres (x, y); roll in degrees
 _START = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0])
 _FIRST_STEPS = np.array([0.03, 8.0, 8.0, 0.016, 0.016, 0.5])
@@ -38,6 +40,10 @@ _SHIFTS_AND_OFFSETS = ((1, 3), (2, 4))
 _LEAPS_M, _LEAPS_PX = np.linspace(-0.12, 0.12, 25), np.linspace(-6.0, 6.0, 7)
 _LEAP_LEVEL = 1  # more blur hides which hill is higher, less makes them too narrow to hit
 _FOLD = 256
+
+
+class TooFewEdgesError(DatasetError):
+    """The depth images hold too few edges to align by."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,17 +75,43 @@ class _Gradients:
     along_columns: Float32[ndarray, "h w"]
 
 
+def estimate_colour_camera(source: Source, positions: Sequence[int], count: int = 40) -> Alignment:
+    """Align about `count` of these frames, spread evenly. Raises TooFewEdgesError, DatasetError, PoseError."""
+    chosen = positions[:: max(1, len(positions) // max(1, count))]
+    return align([source.frame(position) for position in chosen])
+
+
+def find_registration(source: Source) -> tuple[ColourCamera | None, str]:
+    """What to register the source's depth to, None for nothing, and why.
+
+    Looked for only where the layout leaves it to the reader, and believed only where it is clearly better than to
+    take the images as registered. Raises DatasetError, PoseError for frames that cannot be read.
+    """
+    if source.depth_registered:
+        return None, "the layout's depth is registered to colour"
+    try:
+        found = estimate_colour_camera(source, range(len(source)))
+    except TooFewEdgesError as error:
+        return None, str(error)
+    why = (
+        f"colour's gradient under depth edges, {found.score_before:.2f} of what it is around, becomes {found.score:.2f}"
+    )
+    return (found.camera if found.score > _CONVINCING * found.score_before else None), why
+
+
 def align(frames: Sequence[Frame]) -> Alignment:
     """Estimate focal length, principal point, offset in x and y, and roll; 40 frames of a furnished room are plenty.
 
     The other three numbers of a pose are left at zero: a tilt of a degree looks like a moved principal point, and an
-    offset along the view like a zoom. Raises DatasetError when the depth images hold too few edges.
+    offset along the view like a zoom. Raises TooFewEdgesError when the depth images hold too few edges.
     """
     edges = [_depth_edges(frame) for frame in frames]
     points = [points for edge in edges for points in (edge.along_rows, edge.along_columns)]
     depths_m = np.concatenate([np.empty((0, 3)), *points])[:, 2]
     if len(depths_m) < _MIN_EDGE_POINTS:
-        raise DatasetError(f"alignment: expected at least {_MIN_EDGE_POINTS} depth edge points, got {len(depths_m)}")
+        raise TooFewEdgesError(
+            f"alignment: expected at least {_MIN_EDGE_POINTS} depth edge points, got {len(depths_m)}"
+        )
     depth_camera, reference_m = frames[0].camera, float(np.median(depths_m))
     gradients: list[_Gradients] = []
 

@@ -125,6 +125,11 @@ class RegisteredSource:
         """The wrapped source's; the world is the same."""
         return self._source.up_axis
 
+    @property
+    def depth_registered(self) -> bool:
+        """True now."""
+        return True
+
     def __len__(self) -> int:
         return len(self._source)
 

@@ -72,6 +72,11 @@ class ReplicaSource:
         """Z unless told otherwise."""
         return self._up_axis
 
+    @property
+    def depth_registered(self) -> bool:
+        """True: both are drawn by one camera."""
+        return True
+
     def __len__(self) -> int:
         return len(self._numbers)
 

@@ -73,6 +73,11 @@ class SevenScenesSource:
         """
         return self._up_axis
 
+    @property
+    def depth_registered(self) -> bool:
+        """False: colour and depth are each as their own camera saw them."""
+        return False
+
     def __len__(self) -> int:
         return len(self._numbers)
 

@@ -32,6 +32,11 @@ class Source(Protocol):
         """The unit vector of the world frame that points up."""
         ...
 
+    @property
+    def depth_registered(self) -> bool:
+        """True when the recording brought its depth into the colour image's pixels."""
+        ...
+
     def __len__(self) -> int: ...
 
     def frame(self, i: int, size: tuple[int, int] | None = None) -> Frame:

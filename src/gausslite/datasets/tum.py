@@ -77,6 +77,11 @@ class TumSource:
         """z, as the motion capture system was set up, unless told otherwise."""
         return self._up_axis
 
+    @property
+    def depth_registered(self) -> bool:
+        """True, by the layout."""
+        return True
+
     def __len__(self) -> int:
         return len(self._matches)
 

@@ -16,6 +16,11 @@ from gausslite.render.choose import BACKENDS
 
 _DETECTOR_HELP = "a YOLO-seg or Grounding DINO model (default: the source's ground truth)"
 _TRUSTED = ViewPrior()
+COLOUR_CAMERA_METAVAR = "FX,FY,CX,CY[,TX,TY,TZ[,RX,RY,RZ]]"
+COLOUR_CAMERA_HELP = (
+    "register depth to this camera (pixels as data sets count); then where the depth camera sits seen from it "
+    "(metres) and how it is turned (rotation vector, degrees)"
+)
 _RELIEF_HELP = "what gives way, in order, where that time is short (default: words,seeding)"
 
 
@@ -32,10 +37,9 @@ def add_colour_camera(parser: argparse.ArgumentParser) -> None:
     """Add --colour-camera, for sequences whose depth is not registered to colour."""
     parser.add_argument(
         "--colour-camera",
-        metavar="FX,FY,CX,CY[,TX,TY,TZ[,RX,RY,RZ]]",
+        metavar=COLOUR_CAMERA_METAVAR,
         type=ColourCamera.parse,
-        help="register depth to this camera (pixels as data sets count); then where the depth camera sits seen from it "
-        "(metres) and how it is turned (rotation vector, degrees)",
+        help=COLOUR_CAMERA_HELP,
     )
 
 

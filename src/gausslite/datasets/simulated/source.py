@@ -150,6 +150,11 @@ class SimulatedHome:
         """Z."""
         return self._up_axis
 
+    @property
+    def depth_registered(self) -> bool:
+        """True: both are drawn by one camera."""
+        return True
+
     def __len__(self) -> int:
         return self._settings.frames
 
