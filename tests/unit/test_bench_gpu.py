@@ -64,7 +64,7 @@ def test_every_size_of_map_is_measured_and_a_whole_frame(bench: GpuBench) -> Non
         assert all(rate.best[name] >= rate.median[name] > 0 for name in rate.best)
         assert str(rate.gaussians) in rate_line(rate)
     assert frame.iterations == 8
-    assert {"seeding", "warm_up", "active", "density"} <= set(frame.steps_ms)
+    assert {"seeding", "warm_up", "active", "pruning", "densifying"} <= set(frame.steps_ms)
     record = json.loads(json.dumps(gpu_record("a device", rates, frame)))
     assert [case["gaussians"] for case in record["rates"]] == [60, 90]
     assert "the paper allows 500" in frame_lines(frame)

@@ -131,7 +131,7 @@ def test_a_pace_replaces_the_number_of_iterations_and_counts_steps_by_their_name
     mapper = mapper_of()
     # every look at this clock takes a second, and so does every step
     clock = itertools.count()
-    pace = Pace(PaceSettings(seconds_per_frame=60.0), clock=lambda: float(next(clock)))
+    pace = Pace(PaceSettings(seconds_per_frame=60.0, run_over=0.0), clock=lambda: float(next(clock)))
     frame = wall_frame(0, SIZE)
     pace.begin()
     outcome = mapper.map_frame(frame, middle_relevance(frame), pace)
@@ -148,14 +148,14 @@ def test_density_control_waits_for_time_but_not_for_ever() -> None:
     frame, clock = wall_frame(0, SIZE), itertools.count()
     mapper = mapper_of(settings)
     pace = Pace(PaceSettings(seconds_per_frame=100.0, least_iterations=0), clock=lambda: float(next(clock)))
-    with pace.timing(Step.DENSITY):
+    with pace.timing(Step.DENSIFYING):
         # it once took very long
         next(itertools.islice(clock, 200, None))
     densified = []
     for _ in range(3):
         pace.begin()
         iterations = mapper.map_frame(frame, middle_relevance(frame), pace).iterations
-        densified.append((iterations, pace.end().steps_s.get(Step.DENSITY, 0.0)))
+        densified.append((iterations, pace.end().steps_s.get(Step.DENSIFYING, 0.0)))
     assert densified[0][0] >= 20
     assert densified[0][1] > 0
 

@@ -106,6 +106,7 @@ def _require_usable(options: argparse.Namespace) -> None:
         rate_hz=options.rate,
         least_iterations=options.least,
         reliefs=options.relief,
+        run_over=options.run_over,
         seed=options.seed,
         threads=options.threads,
     )
@@ -195,6 +196,7 @@ def _plan(options: argparse.Namespace, stage: _Stage) -> TeamPlan:
         shared += ["--vocabulary", str(options.vocabulary.absolute())]
     if options.rate is not None:
         shared += ["--rate", str(options.rate), "--least", str(options.least), "--relief", ",".join(options.relief)]
+        shared += ["--run-over", str(options.run_over)]
     if options.iterations is not None:
         shared += ["--iterations", str(options.iterations)]
     return TeamPlan(stage.agents, tuple(shared), options.voxel_size, options.refine_iterations, options.seed)

@@ -29,7 +29,8 @@ class Step(StrEnum):
     SEEDING = "seeding"
     WARM_UP = "warm_up"
     ACTIVE = "active"
-    DENSITY = "density"
+    PRUNING = "pruning"
+    DENSIFYING = "densifying"
     SETTLING = "settling"
     WORDS = "words"
 
@@ -44,7 +45,8 @@ class Relief(StrEnum):
 
 
 _SPARED = {Relief.WORDS: (Step.WORDS,), Relief.SEEDING: (Step.DRAWING, Step.SEEDING)}
-_FIXED = (Step.DRAWING, Step.ATTENTION, Step.VIEW, Step.SEEDING, Step.SETTLING, Step.WORDS)
+_FIXED = frozenset((Step.DRAWING, Step.ATTENTION, Step.VIEW, Step.SEEDING, Step.SETTLING, Step.WORDS))
+_ITERATIONS = frozenset((Step.WARM_UP, Step.ACTIVE))
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,13 +54,16 @@ class PaceSettings:
     """A frame's time, from the image in memory to the region's words.
 
     least_iterations are trained in every frame. Where the time gets short for them, warm-ups give way to the region's
-    iterations, but for those that a frame begins with; where it does not suffice, the reliefs give way in their order,
-    none of them in two frames on end; where it still does not, the frame trains less and counts as short.
+    iterations, but for the one that a frame begins with, and what can wait for another frame waits; where that does
+    not suffice, the reliefs give way in their order, none of them in two frames on end. A frame that is behind in
+    spite of it may run over, by the share run_over of its time and for the least iterations alone; the frames after
+    it have that much less until it is made up. A frame that trains less even so counts as short.
     """
 
     seconds_per_frame: float = 0.25
     least_iterations: int = 15
     reliefs: tuple[Relief, ...] = (Relief.WORDS, Relief.SEEDING)
+    run_over: float = 0.15
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.seconds_per_frame) and self.seconds_per_frame > 0):
@@ -67,6 +72,13 @@ class PaceSettings:
             raise InvalidInputError(f"least_iterations: expected at least 0, got {self.least_iterations}")
         if len(set(self.reliefs)) != len(self.reliefs):
             raise InvalidInputError(f"reliefs: expected each once, got {', '.join(self.reliefs)}")
+        if not 0 <= self.run_over <= 1:
+            raise InvalidInputError(f"run_over: expected a share of a frame's time, 0 to 1, got {self.run_over}")
+
+    @property
+    def run_over_s(self) -> float:
+        """The most that a frame may be late, and that frames before it may have taken of its time."""
+        return self.run_over * self.seconds_per_frame
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +92,11 @@ class FrameBudget:
 
 
 class Pace:
-    """Tells one frame after the other what it has time for. With settings None iterations are counted instead."""
+    """Tells one frame after the other what it has time for. With settings None iterations are counted instead.
+
+    A frame is due once the time of a frame has passed, less what those before it are behind. Time between two frames
+    makes up for nothing. What a frame is late by beyond the share that it may run over is forgiven: the rate suffers.
+    """
 
     def __init__(self, settings: PaceSettings | None = None, clock: Clock = time.perf_counter) -> None:
         self._settings = settings
@@ -88,42 +104,45 @@ class Pace:
         self._forecasts = {step: _Forecast() for step in Step}
         self._steps_s: dict[Step, float] = {}
         self._reliefs: frozenset[Relief] = frozenset()
-        self._begun_s = clock()
         self._iterations = 0
-        self._opening = 0
+        self._cheapest = Step.WARM_UP
+        self._begun_s = clock()
+        self._behind_s = 0.0
+        self._training_due_s = 0.0
 
     def begin(self) -> None:
         """A frame has come: its time runs from now, and what it goes without is decided."""
         for step in Step:
             if step not in self._steps_s:
                 self._forecasts[step].fade()
+        self._cheapest = Step.ACTIVE if Step.ACTIVE in self._steps_s else Step.WARM_UP
         self._begun_s = self._clock()
+        self._steps_s, self._iterations = {}, 0
         if self._settings is not None:
             expected = {step: forecast.mean_s for step, forecast in self._forecasts.items()}
-            self._reliefs = choose_reliefs(self._settings, expected, self._reliefs, self._opening)
-        self._steps_s, self._iterations, self._opening = {}, 0, 0
+            time_s = self._settings.seconds_per_frame - self._behind_s
+            self._reliefs = choose_reliefs(self._settings, time_s, expected, self._reliefs, self._cheapest)
+            self._look_ahead()
 
     def spares(self, relief: Relief) -> bool:
         """True when this frame goes without it."""
         return relief in self._reliefs
 
     def has_time_for(self, step: Step) -> bool:
-        """True when the step is expected to end in time for what must follow it."""
-        return self._settings is None or self._left_s() > self._forecasts[step].cautious_s
+        """True when with this step the frame is expected to be done in time, its least iterations among the rest."""
+        if self._settings is None:
+            return True
+        missing = max(0, self._settings.least_iterations - self._iterations - (step in _ITERATIONS))
+        needed_s = self._forecasts[step].cautious_s + missing * self._forecasts[self._cheapest].mean_s
+        return self._clock() + needed_s < self._training_due_s
 
     def trains_on(self, step: Step, counted: int) -> bool:
         """True while the frame goes on training: another iteration fits, or (untimed) fewer than `counted` are done."""
         if self._settings is None or counted == 0:
             return self._iterations < counted
-        return self._left_s() > self._forecasts[step].cautious_s
-
-    def affords(self, step: Step, cheaper: Step) -> bool:
-        """True when after this iteration the frame still reaches its least number of them with the cheaper kind."""
-        if self._settings is None:
-            return True
-        missing = max(0, self._settings.least_iterations - self._iterations - 1)
-        needed_s = self._forecasts[step].cautious_s + missing * self._forecasts[cheaper].mean_s
-        return self._left_s() > needed_s
+        too_few = self._iterations < self._settings.least_iterations
+        late_s = self._settings.run_over_s if too_few else 0.0
+        return self._clock() + self._forecasts[step].cautious_s < self._training_due_s + late_s
 
     def timing(self, step: Step) -> AbstractContextManager[None]:
         """Measure a step, and expect the next of its kind to cost about as much."""
@@ -132,37 +151,46 @@ class Pace:
     def _took(self, step: Step, seconds: float) -> None:
         self._steps_s[step] = self._steps_s.get(step, 0.0) + seconds
         self._forecasts[step].learn(seconds)
-        self._opening += step is Step.WARM_UP and self._opening == self._iterations
-        self._iterations += step in (Step.WARM_UP, Step.ACTIVE)
+        if step in _ITERATIONS:
+            self._iterations += 1
+        if step is Step.ACTIVE:
+            self._cheapest = step
+        elif step in _FIXED and self._settings is not None:
+            self._look_ahead()
 
     def end(self) -> FrameBudget:
-        """The frame is done."""
-        least = 0 if self._settings is None else self._settings.least_iterations
+        """The frame is done; what it took beyond its time is missing to the next ones."""
         seconds = self._clock() - self._begun_s
-        return FrameBudget(seconds, dict(self._steps_s), self._reliefs, self._iterations < least)
+        short = False
+        if self._settings is not None:
+            behind_s = self._behind_s + seconds - self._settings.seconds_per_frame
+            self._behind_s = min(max(behind_s, 0.0), self._settings.run_over_s)
+            short = self._iterations < self._settings.least_iterations
+        return FrameBudget(seconds, dict(self._steps_s), self._reliefs, short)
 
-    def _left_s(self) -> float:
-        """What is left of the frame's time once what follows training is done: the means carried on, the words made."""
+    def _look_ahead(self) -> None:
+        """Until when the frame may train or do what can wait, so that it still does in time what it must."""
         assert self._settings is not None
-        later_s = 0.0 if self.spares(Relief.WORDS) else self._forecasts[Step.WORDS].cautious_s
-        if Step.SETTLING not in self._steps_s:
-            later_s += self._forecasts[Step.SETTLING].cautious_s
-        return self._begun_s + self._settings.seconds_per_frame - self._clock() - later_s
+        spared = {step for relief in self._reliefs for step in _SPARED[relief]}
+        ahead = _FIXED - spared - self._steps_s.keys()
+        due_s = self._begun_s + self._settings.seconds_per_frame - self._behind_s
+        self._training_due_s = due_s - sum(self._forecasts[step].cautious_s for step in ahead)
 
 
 def choose_reliefs(
-    settings: PaceSettings, expected_s: Mapping[Step, float], before: frozenset[Relief], opening: int
+    settings: PaceSettings, time_s: float, expected_s: Mapping[Step, float], before: frozenset[Relief], cheapest: Step
 ) -> frozenset[Relief]:
-    """What to go without so that the least iterations fit, given what each step costs and what the frame before spared.
+    """What to go without so that the least iterations fit into this time.
 
-    opening: with how many warm-ups a frame begins.
+    expected_s: what each step costs; before: what the frame before went without; cheapest: of what kind iterations may
+    be, all but the warm-up that a frame begins with.
     """
-    warm_ups = min(opening, settings.least_iterations)
-    needed_s = sum(expected_s[step] for step in _FIXED) + warm_ups * expected_s[Step.WARM_UP]
-    needed_s += (settings.least_iterations - warm_ups) * expected_s[Step.ACTIVE]
+    needed_s = sum(expected_s[step] for step in _FIXED)
+    if settings.least_iterations > 0:
+        needed_s += expected_s[Step.WARM_UP] + (settings.least_iterations - 1) * expected_s[cheapest]
     chosen: set[Relief] = set()
     for relief in settings.reliefs:
-        if needed_s > settings.seconds_per_frame and relief not in before:
+        if needed_s > time_s and relief not in before:
             chosen.add(relief)
             needed_s -= sum(expected_s[step] for step in _SPARED[relief])
     return frozenset(chosen)

@@ -75,13 +75,13 @@ class Trainer:
     def train(self, views: Sequence[WindowView], extent_m: float, pace: Pace) -> int:
         """Train on these views for as long as the pace allows and return the number of iterations.
 
-        The two phases take turns in the settings' proportion. Where the time left is too short for a warm-up, or for
-        the frame's least iterations after it, active ones take its place.
+        The two phases take turns in the settings' proportion, a warm-up first. Where the time left is too short for
+        another, or for the frame's least iterations after it, active ones take its place.
         """
         showing = self._showing_region(views)
-        done = 0
-        while self._next_step(done, bool(showing), pace) is not None:
-            done = self._until_density_control(views, showing, done, pace)
+        done, time_is_up = 0, False
+        while not time_is_up:
+            done, time_is_up = self._until_density_control(views, showing, done, pace)
             self._control_density(extent_m, pace)
         with pace.timing(Step.SETTLING):
             self._bound_colours()
@@ -115,16 +115,18 @@ class Trainer:
         optimization = self._settings.optimization
         counted = optimization.iterations
         warming_up = not region_in_view or done % counted < optimization.warmup_iterations
-        if region_in_view and done >= counted:
-            warming_up = warming_up and pace.affords(Step.WARM_UP, Step.ACTIVE)
+        if region_in_view and done > 0:
+            warming_up = warming_up and pace.has_time_for(Step.WARM_UP)
         if warming_up and pace.trains_on(Step.WARM_UP, counted):
             return Step.WARM_UP
         return Step.ACTIVE if region_in_view and pace.trains_on(Step.ACTIVE, counted) else None
 
     def _until_density_control(
         self, views: Sequence[WindowView], showing: Sequence[WindowView], done: int, pace: Pace
-    ) -> int:
-        """Iterate until density control is due or time is up, the tables on loan to the rasterizer; `done` then."""
+    ) -> tuple[int, bool]:
+        """Iterate until density control is due or time is up, the tables on loan to the rasterizer; `done` and which
+        of both then.
+        """
         loan = _Loan.of(self._table, self._settings.optimization.active_phase)
         draws = _uniform(self._rng)
         with self._rasterizer.holding(*loan.tables):
@@ -133,8 +135,8 @@ class Trainer:
                     self._iterate(loan, step, views if step is Step.WARM_UP else showing, next(draws))
                 done += 1
                 if self._prune_is_due(pace) or self._densify_is_due(pace):
-                    break
-        return done
+                    return done, False
+        return done, True
 
     def _iterate(self, loan: _Loan, step: Step, views: Sequence[WindowView], draw: float) -> None:
         """One iteration on the view that `draw`, from 0 to 1, picks: its full image, or the task's region alone."""
@@ -183,20 +185,20 @@ class Trainer:
             self._table.average(self._settings.optimization.averaged_updates)
 
     def _prune_is_due(self, pace: Pace) -> bool:
-        return _due(self._since_pruned, self._settings.density.prune_every, pace)
+        return _due(self._since_pruned, self._settings.density.prune_every, Step.PRUNING, pace)
 
     def _densify_is_due(self, pace: Pace) -> bool:
-        return _due(self._since_densified, self._settings.density.densify_every, pace)
+        return _due(self._since_densified, self._settings.density.densify_every, Step.DENSIFYING, pace)
 
     def _control_density(self, extent_m: float, pace: Pace) -> None:
         """Clone, split and prune when their turn has come, and later where a frame has no time for it."""
         density = self._settings.density
         if self._prune_is_due(pace):
-            with pace.timing(Step.DENSITY):
+            with pace.timing(Step.PRUNING):
                 prune(self._table, density)
             self._since_pruned = 0
         if self._densify_is_due(pace):
-            with pace.timing(Step.DENSITY):
+            with pace.timing(Step.DENSIFYING):
                 densify(self._table, density, extent_m)
             self._since_densified = 0
 
@@ -207,6 +209,6 @@ def _uniform(rng: np.random.Generator) -> Iterator[float]:
         yield from rng.random(_DRAWS).tolist()
 
 
-def _due(since: int, every: int, pace: Pace) -> bool:
+def _due(since: int, every: int, step: Step, pace: Pace) -> bool:
     """Density control may be late by as many iterations again as lie between two of its turns."""
-    return since >= 2 * every or (since >= every and pace.has_time_for(Step.DENSITY))
+    return since >= 2 * every or (since >= every and pace.has_time_for(step))

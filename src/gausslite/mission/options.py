@@ -22,6 +22,7 @@ COLOUR_CAMERA_HELP = (
     "(metres) and how it is turned (rotation vector, degrees)"
 )
 _RELIEF_HELP = "what gives way, in order, where that time is short (default: words,seeding)"
+_RUN_OVER_HELP = "by what share of its time a frame that is short of them may be late (default: %(default)s)"
 
 
 def add_frames(parser: argparse.ArgumentParser) -> None:
@@ -75,16 +76,18 @@ def add_view_error(
 
 
 def add_budget(parser: argparse.ArgumentParser) -> None:
-    """Add --max-gaussians, --iterations or --rate with --least and --relief, --seed and --threads: the map's cost."""
+    """Add --max-gaussians, --iterations or --rate with what gives way for it, --seed and --threads: the map's cost."""
     group = parser.add_argument_group("budget")
     add = group.add_argument
     add("--max-gaussians", metavar="N", type=int, default=DEFAULT_MAX_GAUSSIANS, help="hard cap (default: %(default)s)")
     per_frame = group.add_mutually_exclusive_group()
     per_frame.add_argument("--iterations", metavar="N", type=int, help="iterations a frame (default: 8)")
     per_frame.add_argument("--rate", metavar="HZ", type=float, help="frames a second: as many iterations as fit")
-    least = PaceSettings().least_iterations
+    pace = PaceSettings()
+    least = pace.least_iterations
     add("--least", metavar="N", type=int, default=least, help="at --rate, iterations to find time for (default: 15)")
-    add("--relief", metavar="A,B", type=reliefs, default=PaceSettings().reliefs, help=_RELIEF_HELP)
+    add("--relief", metavar="A,B", type=reliefs, default=pace.reliefs, help=_RELIEF_HELP)
+    add("--run-over", metavar="SHARE", type=float, default=pace.run_over, help=_RUN_OVER_HELP)
     add("--seed", metavar="S", type=int, default=0, help="seed of every random choice (default: 0)")
     add("--threads", metavar="N", type=int, help="threads (default: all the processor allows)")
 
@@ -119,6 +122,7 @@ def mission_settings(options: argparse.Namespace) -> MissionSettings:
         rate_hz=options.rate,
         least_iterations=options.least,
         reliefs=options.relief,
+        run_over=options.run_over,
         seed=options.seed,
         threads=options.threads,
         backend=options.rasterizer,

@@ -36,6 +36,7 @@ class RunTerms:
             "rate": _or_default(settings.rate_hz),
             "least": str(settings.least_iterations),
             "relief": ",".join(settings.reliefs),
+            "run_over": str(settings.run_over),
             "seed": str(settings.seed),
             "view_error": str(settings.view_prior),
         }

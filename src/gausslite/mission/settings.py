@@ -60,7 +60,8 @@ class MissionSettings:
 
     without switches parts of the policy off by name (see `gausslite.mapping.policies.without`). rate_hz, when given,
     replaces the fixed number of iterations by what fits into 1 / rate_hz seconds a frame; where that is less than
-    least_iterations, the reliefs give way. view_prior: how wrong poses and colours of frames may be.
+    least_iterations, the reliefs give way, and a frame may be late by the share run_over of its time. view_prior: how
+    wrong poses and colours of frames may be.
     """
 
     policy: str = "task"
@@ -70,6 +71,7 @@ class MissionSettings:
     rate_hz: float | None = None
     least_iterations: int = _PACE.least_iterations
     reliefs: tuple[Relief, ...] = _PACE.reliefs
+    run_over: float = _PACE.run_over
     seed: int = 0
     threads: int | None = None
     backend: str = "auto"
@@ -80,6 +82,8 @@ class MissionSettings:
             raise InvalidInputError(f"rate: expected 0.01 to 1000 Hz, got {self.rate_hz}")
         if not 0 <= self.least_iterations <= 10_000:
             raise InvalidInputError(f"least iterations: expected 0 to 10000, got {self.least_iterations}")
+        if not 0 <= self.run_over <= 1:
+            raise InvalidInputError(f"run over: expected a share of a frame's time, 0 to 1, got {self.run_over}")
         if self.iterations is not None and not 0 <= self.iterations <= 10_000:
             raise InvalidInputError(f"iterations: expected 0 to 10000, got {self.iterations}")
         if not 0 <= self.seed < 1 << 32:
@@ -94,7 +98,7 @@ class MissionSettings:
         """The time a frame may take and what it goes without when short; None where iterations are counted instead."""
         if self.rate_hz is None:
             return None
-        return PaceSettings(1.0 / self.rate_hz, self.least_iterations, self.reliefs)
+        return PaceSettings(1.0 / self.rate_hz, self.least_iterations, self.reliefs, self.run_over)
 
     def mapper_settings(self) -> MapperSettings:
         """The named policy with this mission's cap, iterations and switches."""
