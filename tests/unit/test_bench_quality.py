@@ -16,7 +16,7 @@ from gausslite.errors import InvalidInputError
 from gausslite.evaluation.compare import MapScores
 from gausslite.evaluation.quality.ablation import cumulative_variants
 from gausslite.evaluation.quality.pairs import HOME_PAIRS, WHOLE_HOMES, Kind, choose_pairs
-from gausslite.evaluation.quality.scenes import HomeScenePlan, RealScenePlan, Trust
+from gausslite.evaluation.quality.scenes import HomeScenePlan, RealScenePlan, Trust, choose_kinds
 from gausslite.evaluation.quality.study import Archive, Finished, Study, run_study
 from gausslite.evaluation.quality.tables import FULL_METRICS, ROI_METRICS, Scoreboard, ablation_table, quality_table
 from gausslite.evaluation.quality.trials import Budget, Conditions, Equal, Trial, TrialResult, Variant, clock_for
@@ -71,6 +71,14 @@ def test_pairs_are_chosen_by_name_or_home() -> None:
     assert choose_pairs(["home-7-everything"]) == (WHOLE_HOMES[6],)
     with pytest.raises(InvalidInputError, match=r"pairs: expected names such as home-3 .*, got home-9"):
         choose_pairs(["home-1", "home-9"])
+
+
+def test_a_real_sequences_kinds_are_chosen_by_name() -> None:
+    mug, chair = (RealScenePlan(Path("kitchen"), Path("roi.npz"), kind, (f"{kind}_1",)) for kind in ("mug", "chair"))
+    assert choose_kinds([mug, chair], []) == [mug, chair]
+    assert choose_kinds([mug, chair], ["chair"]) == [chair]
+    with pytest.raises(InvalidInputError, match="kinds: expected names among mug, chair, got cup"):
+        choose_kinds([mug, chair], ["mug", "cup"])
 
 
 def test_components_come_one_by_one() -> None:
@@ -165,20 +173,24 @@ def test_the_ablations_table_has_a_row_a_component_and_both_budgets() -> None:
     budgets = [Budget(equal=equal) for equal in Equal]
     board = Scoreboard([finished(v, 0, 20.0 + i, b) for b in budgets for i, v in enumerate(cumulative_variants())])
     table = ablation_table(board)
-    assert "| +GFD | 25.00 ± 0.00 | 20.00 ± 0.00 | 25.00 ± 0.00 | 20.00 ± 0.00 |" in table
-    assert "ROI PSNR, equal time" in table
+    one = "25.00 ± 0.00 | 20.00 ± 0.00 | 26.00 ± 0.00 | 20.00 ± 0.00"
+    assert f"| +GFD | {one} | {one} |" in table
+    assert "ROI PSNR, views fitted, equal time" in table
     assert "mean over" not in table
+
+
+def test_without_fitted_views_the_ablation_shows_raw_ones_alone() -> None:
+    one = finished(TASK, 0, 20.0, Budget())
+    board = Scoreboard([replace(one, result=replace(one.result, fitted=None))])
+    assert "| components | ROI PSNR, equal iterations | full PSNR, equal iterations |\n" in ablation_table(board)
 
 
 def test_the_ablation_of_several_scenes_ends_with_their_mean() -> None:
     other = HomeScenePlan(choose_pairs(["home-8-search"])[0], frames=4, views=3)
     board = Scoreboard([finished(TASK, 0, 20.0, Budget()), finished(TASK, 0, 23.0, Budget(), other)])
-    assert ablation_table(board).endswith(
-        "The mean over these 2\n\n"
-        + "\n".join(
-            ["| components | ROI PSNR, equal iterations | full PSNR |", "|---|---|---|", "| task | 21.50 | 20.00 |\n"]
-        )
-    )
+    table = ablation_table(board)
+    assert "The mean over these 2\n\n| components | ROI PSNR, equal iterations |" in table
+    assert table.endswith("| task | 21.50 | 20.00 | 22.50 | 20.00 |\n")
 
 
 def test_a_study_counts_its_trials() -> None:
@@ -236,12 +248,24 @@ class Frames:
         del trial, result, kept
 
 
+def test_the_ablation_is_run_within_the_budget_that_is_asked_for(tmp_path: Path) -> None:
+    pytest.importorskip("embreex", reason="the simulated homes need the extra `sim`")
+    pytest.importorskip("gausslite.render._kernels", reason="the native kernels are not built")
+    asked = ["--pair", "home-8-manipulation", "--size", "96x72", "--frames", "2", "--views", "2", "--seeds", "0"]
+    budget = ["--equal", "time", "--rate", "200", "--max-gaussians", "500", "--threads", "1"]
+    assert main(["bench", "ablation", "--out", str(tmp_path), *asked, *budget]) == 0
+    report = json.loads((tmp_path / "ablation.json").read_text())
+    assert [(each["equal"], each["rate_hz"]) for each in report["budgets"]] == [("time", 200.0)]
+    assert len(report["scenes"][0]["results"]) == len(cumulative_variants())
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
         (["quality", "--policies", "best"], "policy: expected one of task"),
         (["quality", "--pairs", "home-0"], "pairs: expected names such as home-3"),
         (["quality", "--real", "nowhere"], "--real: expected a folder and its regions"),
+        (["quality", "--kinds", "mug"], "--kinds: expected a real sequence to choose from"),
         (["quality", "--frames", "1", "--pairs", "home-1"], "frames: expected 2 to 100000, got 1"),
         (["quality", "--threads", "0"], "threads: expected 1 to 256, got 0"),
         (["quality", "--max-gaussians", "0"], "max_gaussians: expected at least 1, got 0"),

@@ -15,7 +15,14 @@ from gausslite.datasets.registration import ColourCamera
 from gausslite.errors import InvalidInputError
 from gausslite.evaluation.quality.ablation import cumulative_variants
 from gausslite.evaluation.quality.pairs import HomePair, choose_pairs
-from gausslite.evaluation.quality.scenes import REAL_CAMERA, HomeScenePlan, ScenePlan, Trust, real_plans
+from gausslite.evaluation.quality.scenes import (
+    REAL_CAMERA,
+    HomeScenePlan,
+    ScenePlan,
+    Trust,
+    choose_kinds,
+    real_plans,
+)
 from gausslite.evaluation.quality.study import Archive, Study, run_study
 from gausslite.evaluation.quality.tables import Scoreboard, ablation_table, quality_table
 from gausslite.evaluation.quality.trials import Budget, Conditions, Equal, Eyes, Trial, TrialResult, Variant
@@ -27,6 +34,7 @@ from gausslite.mission.settings import PerceptionSettings
 
 _ABLATION_PAIR = "home-4-manipulation"
 _AUTO, _NONE = "auto", "none"
+_BOTH = "both"
 
 
 def configure_quality(parser: argparse.ArgumentParser) -> None:
@@ -34,13 +42,7 @@ def configure_quality(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("--pairs", metavar="A,B", type=names, default=(), help="such as home-3,home-4-search (default: all 24)")
     add("--policies", metavar="A,B", type=names, default=tuple(POLICIES), help="ours first (default: all there are)")
-    add(
-        "--equal",
-        choices=[str(each) for each in Equal],
-        default=str(Equal.ITERATIONS),
-        help="a frame: same count or time",
-    )
-    _add_common(parser, seeds=(0,))
+    _add_common(parser, seeds=(0,), equal=str(Equal.ITERATIONS))
     add("--perception", metavar="gt|words|FILE.onnx", default="gt", help="masks given (default), or found by the task")
     parser.set_defaults(run=run_quality)
 
@@ -52,10 +54,10 @@ def configure_ablation(parser: argparse.ArgumentParser) -> None:
         "--pair",
         metavar="A,B",
         type=names,
-        default=(_ABLATION_PAIR,),
-        help=f"home and task (default: {_ABLATION_PAIR})",
+        default=(),
+        help=f"home and task (default: {_ABLATION_PAIR}, none beside a real sequence)",
     )
-    _add_common(parser, seeds=(0, 1, 2))
+    _add_common(parser, seeds=(0, 1, 2), equal=_BOTH)
     parser.set_defaults(run=run_ablation)
 
 
@@ -64,28 +66,35 @@ def run_quality(options: argparse.Namespace) -> int:
     variants = [Variant(name, name) for name in options.policies]
     if not variants:
         raise InvalidInputError(f"policies: expected names among {', '.join(POLICIES)}, got none")
-    plans = _real(options)
-    if options.pairs or not plans:
-        plans = [*_homes(options, choose_pairs(options.pairs)), *plans]
-    budgets = [_budget(options, Equal(options.equal))]
-    study = Study(plans, variants, budgets, options.seeds, _conditions(options, _eyes(options)))
+    study = Study(
+        _plans(options, options.pairs, ()),
+        variants,
+        _budgets(options),
+        options.seeds,
+        _conditions(options, _eyes(options)),
+    )
     board = _run(study, options)
     _write(options.out, "quality", quality_table(board), board)
     return 0
 
 
 def run_ablation(options: argparse.Namespace) -> int:
-    """Switch the components on one by one, at equal iterations and at equal time; write ablation.md and .json."""
-    plans: list[ScenePlan] = [*_homes(options, choose_pairs(options.pair)), *_real(options)]
-    budgets = [_budget(options, equal) for equal in Equal]
-    study = Study(plans, cumulative_variants(), budgets, options.seeds, _conditions(options, Eyes()))
+    """Switch the components on one by one and write ablation.md and ablation.json."""
+    plans = _plans(options, options.pair, (_ABLATION_PAIR,))
+    study = Study(plans, cumulative_variants(), _budgets(options), options.seeds, _conditions(options, Eyes()))
     board = _run(study, options)
     _write(options.out, "ablation", ablation_table(board), board)
     return 0
 
 
-def _add_common(parser: argparse.ArgumentParser, seeds: tuple[int, ...]) -> None:
+def _add_common(parser: argparse.ArgumentParser, seeds: tuple[int, ...], equal: str) -> None:
     add = parser.add_argument
+    add(
+        "--equal",
+        choices=[*(str(each) for each in Equal), _BOTH],
+        default=equal,
+        help="what everyone gets the same of, a frame (default: %(default)s)",
+    )
     shown = ",".join(str(seed) for seed in seeds)
     add("--out", metavar="DIR", type=Path, required=True, help="gets tables and sheets; finished trials there are kept")
     add("--seeds", metavar="N,...", type=whole_numbers, default=seeds, help=f"seeds of the mapper (default: {shown})")
@@ -123,6 +132,7 @@ def _add_common(parser: argparse.ArgumentParser, seeds: tuple[int, ...]) -> None
     real.add_argument(
         "--roi", metavar="FILE.npz", type=Path, help="its ground-truth regions; one pair a kind of object"
     )
+    real.add_argument("--kinds", metavar="A,B", type=names, default=(), help="such as mug,chair (default: all in FILE)")
     real.add_argument("--up", metavar="X,Y,Z", type=up_axis, help="its upward direction, if not the source's")
     real.add_argument(
         "--colour-camera",
@@ -132,6 +142,13 @@ def _add_common(parser: argparse.ArgumentParser, seeds: tuple[int, ...]) -> None
         help=f"{COLOUR_CAMERA_HELP}; none: as recorded; auto: found from the images' edges where the layout does not "
         "register depth, such as 7-Scenes (default)",
     )
+
+
+def _plans(options: argparse.Namespace, asked: Sequence[str], usual: Sequence[str]) -> list[ScenePlan]:
+    """The homes' pairs that are asked for and the real sequence; with neither the usual pairs."""
+    real = _real(options)
+    homes = _homes(options, choose_pairs(asked or usual)) if asked or not real else []
+    return [*homes, *real]
 
 
 def _homes(options: argparse.Namespace, pairs: Sequence[HomePair]) -> list[HomeScenePlan]:
@@ -145,9 +162,12 @@ def _real(options: argparse.Namespace) -> list[ScenePlan]:
             "--real: expected a folder and its regions, --real FOLDER --roi FILE.npz; got one of them"
         )
     if options.real is None:
+        if options.kinds:
+            raise InvalidInputError("--kinds: expected a real sequence to choose from, --real FOLDER; got none")
         return []
     trust = _trust(options, REAL_CAMERA)
-    return [*real_plans(options.real, options.roi, options.frames, options.up, _colour_camera(options), trust)]
+    plans = real_plans(options.real, options.roi, options.frames, options.up, _colour_camera(options), trust)
+    return [*choose_kinds(plans, options.kinds)]
 
 
 def _colour_camera(options: argparse.Namespace) -> ColourCamera | None:
@@ -166,8 +186,9 @@ def _trust(options: argparse.Namespace, usual: Trust) -> Trust:
     )
 
 
-def _budget(options: argparse.Namespace, equal: Equal) -> Budget:
-    return Budget(options.max_gaussians, equal, options.iterations, options.rate)
+def _budgets(options: argparse.Namespace) -> list[Budget]:
+    asked = list(Equal) if options.equal == _BOTH else [Equal(options.equal)]
+    return [Budget(options.max_gaussians, equal, options.iterations, options.rate) for equal in asked]
 
 
 def _conditions(options: argparse.Namespace, eyes: Eyes) -> Conditions:

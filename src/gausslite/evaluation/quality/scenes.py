@@ -228,6 +228,15 @@ def real_plans(
     ]
 
 
+def choose_kinds(plans: Sequence[RealScenePlan], asked: Sequence[str]) -> list[RealScenePlan]:
+    """Those about a kind that is asked for; all when none is. Raises InvalidInputError for a kind that is not there."""
+    known = [plan.kind for plan in plans]
+    unknown = [kind for kind in asked if kind not in known]
+    if unknown:
+        raise InvalidInputError(f"kinds: expected names among {', '.join(known)}, got {', '.join(unknown)}")
+    return [plan for plan in plans if not asked or plan.kind in asked]
+
+
 class RecalledAttention:
     """An Attention that knows each training frame's mask from before, so that no policy pays for making it."""
 

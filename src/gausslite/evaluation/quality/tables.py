@@ -172,7 +172,7 @@ def quality_table(board: Scoreboard) -> str:
 
 
 def ablation_table(board: Scoreboard) -> str:
-    """One row a component, ROI and full PSNR at every budget, scene by scene and on average."""
+    """One row a component, ROI and full PSNR at every budget, scene by scene and on average, fitted too where asked."""
     blocks = []
     for scene in board.scenes:
         title = f"## {scene}: {board.task(scene)} (ROI {board.roi_share(scene):.1%})"
@@ -183,12 +183,12 @@ def ablation_table(board: Scoreboard) -> str:
 
 
 def _by_component(board: Scoreboard, scenes: Sequence[str]) -> str:
-    """With the spread over the seeds where it is a single scene."""
-    shown = [(metric, budget) for budget in board.budgets for metric in (ROI_METRICS[0], FULL_METRICS[0])]
-    header = ["components"]
-    for budget in board.budgets:
-        header += [f"ROI PSNR, equal {budget.equal}", "full PSNR"]
-    rows = [header]
+    """With the spread over the seeds where it is a single scene, with fitted views where all scenes have them."""
+    columns = [("ROI PSNR", ROI_METRICS[0]), ("full PSNR", FULL_METRICS[0])]
+    if board.mean(scenes, board.variants[0], FITTED_METRICS[1], board.budgets[0]) is not None:
+        columns += zip(("ROI PSNR, views fitted", "full PSNR, views fitted"), FITTED_METRICS, strict=True)
+    shown = [(metric, budget) for budget in board.budgets for _, metric in columns]
+    rows = [["components", *(f"{title}, equal {budget.equal}" for budget in board.budgets for title, _ in columns)]]
     for variant in board.variants:
         if len(scenes) == 1:
             cells = [_text(board.figure(scenes[0], variant, *each), each[0]) for each in shown]
