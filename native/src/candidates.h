@@ -4,7 +4,6 @@
 #pragma once
 
 #include <algorithm>
-#include <cmath>
 #include <cstring>
 
 #include "projection.h"
@@ -16,37 +15,35 @@ GAUSSLITE_INLINE Pack16 largest_log_scale(const Pack16* row) {
   return max(row[kLogScale], max(row[kLogScale + 1], row[kLogScale + 2]));
 }
 
-// The half-spaces of the frustum through the active part of the image, widened for a splat's extent. At most 3.33
-// standard deviations of a splat are above 1/255; the clamped tangent makes its projected scale at most 1.3 times
-// sqrt(1 + tan^2) / z, where tan is that of the farthest image corner.
-class Frustum {
+// Where in the image a splat may be, by its mean and the largest of its scales alone. With a scale s along all axes its
+// image covariance is s^2 J J^T + 0.3 I, and no direction of a real splat is longer. At most 3.33 standard deviations
+// of it are above 1/255.
+class Sight {
  public:
-  explicit Frustum(const Workspace& ws) : camera_(ws.camera) {
-    const Camera& c = camera_;
-    left_ = (float(ws.active.x0) - c.cx) / c.fx;
-    right_ = (float(ws.active.x1) - c.cx) / c.fx;
-    top_ = (float(ws.active.y0) - c.cy) / c.fy;
-    bottom_ = (float(ws.active.y1) - c.cy) / c.fy;
-    reach_x_ = reach(c.width, c.cx, c.fx);
-    reach_y_ = reach(c.height, c.cy, c.fy);
-    pixel_ = 2.0f / std::min(c.fx, c.fy);
-  }
+  explicit Sight(const Workspace& ws)
+      : camera_(ws.camera),
+        limit_u_(kTangentLimit * 0.5f * float(camera_.width) / camera_.fx),
+        limit_v_(kTangentLimit * 0.5f * float(camera_.height) / camera_.fy),
+        x0_(float(ws.active.x0)),
+        x1_(float(ws.active.x1)),
+        y0_(float(ws.active.y0)),
+        y1_(float(ws.active.y1)) {}
 
+  // Which lanes may touch the box round the active tiles.
   GAUSSLITE_INLINE Mask16 may_touch(const Pack16* mean, Pack16 largest_log_scale) const {
-    return holds(Cone(*this, mean, largest_log_scale));
+    return holds(Extent(*this, mean, largest_log_scale));
   }
 
-  // Which lanes may touch an active tile; the frustum reaches round all of them and what lies between.
+  // Which lanes may touch an active tile; the box holds all of them and what lies between.
   GAUSSLITE_INLINE uint32_t may_touch_active(const Workspace& ws, const Pack16* mean, Pack16 largest_log_scale) const {
-    const Cone cone(*this, mean, largest_log_scale);
-    uint32_t left = bits(holds(cone)), out = 0;
+    const Extent extent(*this, mean, largest_log_scale);
+    uint32_t left = bits(holds(extent)), out = 0;
     if (left == 0 || ws.active_tiles == nullptr) return left;
-    const Pack16 inverse_z = Pack16(1.0f) / cone.z;
     alignas(64) int32_t x0[16], x1[16], y0[16], y1[16];
-    store_int(x0, tile((cone.x - cone.reach_x) * inverse_z, camera_.fx, camera_.cx, ws.tiles_x));
-    store_int(x1, tile((cone.x + cone.reach_x) * inverse_z, camera_.fx, camera_.cx, ws.tiles_x));
-    store_int(y0, tile((cone.y - cone.reach_y) * inverse_z, camera_.fy, camera_.cy, ws.tiles_y));
-    store_int(y1, tile((cone.y + cone.reach_y) * inverse_z, camera_.fy, camera_.cy, ws.tiles_y));
+    store_int(x0, tile(extent.x - extent.reach_x, ws.tiles_x));
+    store_int(x1, tile(extent.x + extent.reach_x, ws.tiles_x));
+    store_int(y0, tile(extent.y - extent.reach_y, ws.tiles_y));
+    store_int(y1, tile(extent.y + extent.reach_y, ws.tiles_y));
     for (; left != 0; left &= left - 1) {
       const int j = __builtin_ctz(left);
       const bool touches = ws.count_active(uint32_t(x0[j]), uint32_t(x1[j]), uint32_t(y0[j]), uint32_t(y1[j])) > 0;
@@ -56,36 +53,39 @@ class Frustum {
   }
 
  private:
-  // Sixteen splats in the camera frame, and how far they may reach to either side at their depth.
-  struct Cone {
-    Pack16 x, y, z, reach_x, reach_y;
+  // Sixteen splats: depth, mean and reach in pixels.
+  struct Extent {
+    Pack16 z, x, y, reach_x, reach_y;
 
-    GAUSSLITE_INLINE Cone(const Frustum& frustum, const Pack16* mean, Pack16 largest_log_scale) {
-      to_camera_frame(mean, frustum.camera_, x, y, z);
-      const Pack16 radius = fma(exp2_fast(largest_log_scale * kLog2E), Pack16(3.4f), z * frustum.pixel_);
-      reach_x = radius * frustum.reach_x_;
-      reach_y = radius * frustum.reach_y_;
+    GAUSSLITE_INLINE Extent(const Sight& sight, const Pack16* mean, Pack16 largest_log_scale) {
+      const Camera& c = sight.camera_;
+      to_camera_frame(mean, c, x, y, z);
+      const Pack16 inverse_z = Pack16(1.0f) / z, u = x * inverse_z, v = y * inverse_z;
+      const Pack16 angle = exp2_fast(largest_log_scale * kLog2E) * inverse_z;
+      x = fma(u, Pack16(c.fx), Pack16(c.cx));
+      y = fma(v, Pack16(c.fy), Pack16(c.cy));
+      reach_x = reach(angle * c.fx, min(abs(u), Pack16(sight.limit_u_)));
+      reach_y = reach(angle * c.fy, min(abs(v), Pack16(sight.limit_v_)));
+    }
+
+    // `size`: the scale in pixels, seen straight on. A little wider than 3.33, against rounding.
+    GAUSSLITE_INLINE static Pack16 reach(Pack16 size, Pack16 tangent) {
+      return sqrt(fma(size * size, fma(tangent, tangent, Pack16(1.0f)), Pack16(kDilationPx2))) * 3.35f;
     }
   };
 
-  GAUSSLITE_INLINE Mask16 holds(const Cone& c) const {
-    return (c.z >= Pack16(kNearM)) & (c.x - c.z * right_ <= c.reach_x) & (c.z * left_ - c.x <= c.reach_x) &
-           (c.y - c.z * bottom_ <= c.reach_y) & (c.z * top_ - c.y <= c.reach_y);
+  GAUSSLITE_INLINE Mask16 holds(const Extent& e) const {
+    return (e.z >= Pack16(kNearM)) & (e.x - e.reach_x <= Pack16(x1_)) & (e.x + e.reach_x >= Pack16(x0_)) &
+           (e.y - e.reach_y <= Pack16(y1_)) & (e.y + e.reach_y >= Pack16(y0_));
   }
 
-  // The tile column or row that a tangent is in, or the nearest one of the image.
-  GAUSSLITE_INLINE static Pack16 tile(Pack16 tangent, float focal, float centre, int tiles) {
-    const Pack16 at = fma(tangent, Pack16(focal / kTile), Pack16(centre / kTile));
-    return floor(min(max(at, Pack16(0.0f)), Pack16(float(tiles - 1))));
-  }
-
-  static float reach(int pixels, float centre, float focal) {
-    const float half = 0.5f * float(pixels), tangent = (half + std::fabs(centre - half)) / focal;
-    return 1.5f * std::sqrt(1.0f + tangent * tangent);
+  // The tile column or row that a pixel is in, or the nearest one of the image.
+  GAUSSLITE_INLINE static Pack16 tile(Pack16 pixel, int tiles) {
+    return floor(min(max(pixel * (1.0f / kTile), Pack16(0.0f)), Pack16(float(tiles - 1))));
   }
 
   const Camera& camera_;
-  float left_, right_, top_, bottom_, reach_x_, reach_y_, pixel_;
+  float limit_u_, limit_v_, x0_, x1_, y0_, y1_;
 };
 
 // Notes the bounds of a row that has changed.
@@ -118,9 +118,26 @@ GAUSSLITE_INLINE void find_bounds(const float* rows, Pack16 (&bounds)[4]) {
   bounds[3] = largest_log_scale(row);
 }
 
+// Writes first + j for each bit j of `lanes`, in order, and returns how many; up to sixteen places are overwritten.
+GAUSSLITE_INLINE uint32_t list_lanes(uint32_t* out, uint32_t first, uint32_t lanes) {
+#if defined(GAUSSLITE_USE_AVX512)
+  const __m512i numbers = _mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
+  const __m512i ids = _mm512_add_epi32(numbers, _mm512_set1_epi32(int(first)));
+  _mm512_storeu_si512(out, _mm512_maskz_compress_epi32(__mmask16(lanes), ids));
+  return uint32_t(__builtin_popcount(lanes));
+#else
+  uint32_t count = 0;
+  for (uint32_t j = 0; j < 16; ++j) {
+    out[count] = first + j;
+    count += lanes >> j & 1u;
+  }
+  return count;
+#endif
+}
+
 // Of rows [begin, end), the ids of those that may touch an active tile. A test of its own costs less than
 // projecting a row, and the rows that are left fill their groups. The last rows, too few for a group, all count.
-GAUSSLITE_INLINE uint32_t find_candidates(Workspace& ws, const Frustum& frustum, uint32_t begin, uint32_t end,
+GAUSSLITE_INLINE uint32_t find_candidates(Workspace& ws, const Sight& sight, uint32_t begin, uint32_t end,
                                           uint32_t* ids) {
   uint32_t count = 0;
   for (uint32_t i = begin; i < end; i += 16) {
@@ -132,13 +149,10 @@ GAUSSLITE_INLINE uint32_t find_candidates(Workspace& ws, const Frustum& frustum,
       } else {
         find_bounds(ws.rows + size_t(kRowWidth) * i, bounds);
       }
-      candidates = frustum.may_touch_active(ws, bounds, bounds[3]);
+      candidates = sight.may_touch_active(ws, bounds, bounds[3]);
       if (ws.keeps_bounds && !ws.knows_bounds) store_bounds(&ws.bounds[i], bounds);
     }
-    for (uint32_t j = 0; j < 16; ++j) {
-      ids[count] = i + j;
-      count += candidates >> j & 1u;
-    }
+    count += list_lanes(ids + count, i, candidates);
   }
   return count;
 }

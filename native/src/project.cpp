@@ -139,12 +139,12 @@ class Segment {
 };
 
 // Projects the `lanes` rows that `ids` names.
-GAUSSLITE_INLINE void project_group(const Workspace& ws, const Frustum& frustum, const uint32_t* ids, int lanes,
+GAUSSLITE_INLINE void project_group(const Workspace& ws, const Sight& sight, const uint32_t* ids, int lanes,
                                     Segment& segment) {
   Pack16 row[16];
   for (int j = 0; j < 16; ++j) row[j] = load(ws.rows + size_t(kRowWidth) * ids[std::min(j, lanes - 1)]);
   transpose(row);
-  const Mask16 candidates = frustum.may_touch(row, largest_log_scale(row)) & first_lanes(lanes);
+  const Mask16 candidates = sight.may_touch(row, largest_log_scale(row)) & first_lanes(lanes);
   if (!any(candidates)) return;
 
   Projection p;
@@ -184,7 +184,7 @@ GAUSSLITE_INLINE void project_group(const Workspace& ws, const Frustum& frustum,
 
 void project(Workspace& ws, int thread) {
   ThreadScratch& mine = ws.scratch[size_t(thread)];
-  const Frustum frustum(ws);
+  const Sight sight(ws);
   uint32_t found[kSegment + 16];
   mine.next_row = mine.last_row = 0;
   // The list after the last row takes second keys that do not count.
@@ -200,11 +200,11 @@ void project(Workspace& ws, int thread) {
       if (y < ws.tiles_y) spans[y].begin = strip.count;
     }
     const uint32_t* ids = ws.ids != nullptr ? ws.ids + begin : found;
-    const uint32_t count = ws.ids != nullptr ? end - begin : find_candidates(ws, frustum, begin, end, found);
+    const uint32_t count = ws.ids != nullptr ? end - begin : find_candidates(ws, sight, begin, end, found);
     Segment segment(ws, mine, begin);
     for (uint32_t i = 0; i < count; i += 16) {
       for (uint32_t j = i + 16; j < std::min(i + 32, count); ++j) prefetch(ws.rows + size_t(kRowWidth) * ids[j]);
-      project_group(ws, frustum, ids + i, int(std::min(16u, count - i)), segment);
+      project_group(ws, sight, ids + i, int(std::min(16u, count - i)), segment);
     }
     ws.segment_visible[s] = segment.slot() - begin;
     for (int y = 0; y < ws.tiles_y; ++y) spans[y].end = mine.strips[size_t(y)].count;
