@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -110,9 +111,8 @@ class HomeScenePlan:
     trust: Trust = field(default_factory=Trust)
 
     def __post_init__(self) -> None:
-        for name, value in (("frames", self.frames), ("views", self.views)):
-            if not 2 <= value <= _MOST_FRAMES:
-                raise InvalidInputError(f"{name}: expected 2 to {_MOST_FRAMES}, got {value}")
+        _require_count("frames", self.frames)
+        _require_count("views", self.views)
 
     @property
     def name(self) -> str:
@@ -174,10 +174,17 @@ class RealScenePlan:
     trust: Trust = REAL_CAMERA
     hold_out: HoldOut = field(default_factory=HoldOut)
 
+    def __post_init__(self) -> None:
+        if not self.kind or "/" in self.kind:
+            objects = ", ".join(self.objects)
+            raise InvalidInputError(f"{self.roi}: expected names of objects that can name files, got {objects}")
+        if self.frames is not None:
+            _require_count("frames", self.frames)
+
     @property
     def name(self) -> str:
         """Such as redkitchen-chair."""
-        return f"{self.folder.name}-{self.kind}"
+        return f"{self.folder.resolve().name}-{self.kind}"
 
     @property
     def task(self) -> str:
@@ -185,8 +192,9 @@ class RealScenePlan:
         return f"Find the {self.kind}"
 
     def settings(self) -> Mapping[str, object]:
-        """The place and the objects."""
-        return {**self.place(), "objects": list(self.objects), "trust": str(self.trust)}
+        """The place, the objects and the file that says where they are."""
+        regions = hashlib.sha256(self.roi.read_bytes()).hexdigest()
+        return {**self.place(), "objects": list(self.objects), "regions": regions, "trust": str(self.trust)}
 
     def place(self) -> Mapping[str, object]:
         """The folder and what is used of its frames."""
@@ -241,8 +249,8 @@ class RecalledAttention:
     """An Attention that knows each training frame's mask from before, so that no policy pays for making it."""
 
     def __init__(self, scene: Scene) -> None:
-        pairs = zip(scene.training, scene.masks, strict=True)
-        self._masks = {frame.T_world_camera.tobytes(): mask for frame, mask in pairs}
+        # by frame and not by pose: a robot that stands still sees what moves, and other holes
+        self._masks = dict(zip(scene.training, scene.masks, strict=True))
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -252,7 +260,7 @@ class RecalledAttention:
     def attend(self, frame: Frame, rendered_depth_m: Float32[ndarray, "h w"] | None = None) -> RelevanceMap:
         """The ground truth."""
         del rendered_depth_m
-        return self._masks[frame.T_world_camera.tobytes()]
+        return self._masks[frame]
 
     def late(self) -> None:
         """Nothing: every frame's relevance is known at once."""
@@ -271,6 +279,11 @@ class RecalledAttention:
         del state
 
 
+def _require_count(name: str, count: int) -> None:
+    if not 2 <= count <= _MOST_FRAMES:
+        raise InvalidInputError(f"{name}: expected 2 to {_MOST_FRAMES}, got {count}")
+
+
 def _scene(
     task: str,
     training: Sequence[Frame],
@@ -281,6 +294,8 @@ def _scene(
     usable = [frame for frame in training if frame.has_depth]
     seen = [view for view in views if view.frame.has_depth]
     if not usable or not seen:
-        raise DatasetError(f"{task!r}: expected training frames and held-out views with depth, got none")
+        raise DatasetError(
+            f"{task!r}: expected training frames and held-out views with depth, got {len(usable)} and {len(seen)}"
+        )
     attention = RegionAttention(regions)
     return Scene(task, usable, [attention.attend(frame) for frame in usable], seen, knowledge)

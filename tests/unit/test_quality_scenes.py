@@ -1,0 +1,64 @@
+"""What a trial is judged on: masks that belong to their frames, real sequences told apart, wrong ones named early."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mapping_scenes import middle_relevance, wall_frame
+from tiny_sequences import write_seven_scenes
+
+from gausslite.domain.relevance import RelevanceMap
+from gausslite.errors import DatasetError, InvalidInputError
+from gausslite.evaluation.quality.scenes import RealScenePlan, RecalledAttention, Scene, real_plans
+from gausslite.mission.settings import SceneKnowledge
+
+
+def write_regions(path: Path, *voxels: tuple[int, int, int], name: str = "mug_1") -> Path:
+    arrays = {name: np.array(voxels, np.int32)}
+    np.savez(path, voxel_size_m=0.1, **arrays)
+    return path
+
+
+def test_two_frames_from_one_place_have_masks_of_their_own() -> None:
+    frames = [wall_frame(0), wall_frame(1)]
+    masks = [middle_relevance(frames[0]), RelevanceMap.nothing(*frames[1].depth_m.shape)]
+    attention = RecalledAttention(Scene("Find it", frames, masks, [], SceneKnowledge()))
+    assert [attention.attend(frame) for frame in frames] == masks
+    assert attention.look_back(frames[0]) is masks[0]
+
+
+def test_other_regions_under_the_same_names_are_another_scene(tmp_path: Path) -> None:
+    path = write_regions(tmp_path / "roi.npz", (0, 0, 20))
+    [plan] = real_plans(tmp_path, path)
+    before = plan.settings()
+    assert plan.settings() == before
+    write_regions(path, (0, 0, 20), (1, 0, 20))
+    assert plan.settings() != before
+
+
+def test_a_sequence_is_named_by_its_folder_wherever_one_stands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "kitchen").mkdir()
+    monkeypatch.chdir(tmp_path / "kitchen")
+    assert RealScenePlan(Path(), Path("roi.npz"), "mug", ("mug_1",)).name == "kitchen-mug"
+
+
+@pytest.mark.parametrize("frames", [-5, 0, 1])
+def test_too_few_frames_of_a_real_sequence_are_told_at_once(frames: int, tmp_path: Path) -> None:
+    with pytest.raises(InvalidInputError, match=f"frames: expected 2 to 100000, got {frames}"):
+        real_plans(tmp_path, write_regions(tmp_path / "roi.npz", (0, 0, 20)), frames)
+
+
+@pytest.mark.parametrize("name", ["left/right_1", "_"])
+def test_an_object_whose_name_cannot_name_a_file_is_told_at_once(name: str, tmp_path: Path) -> None:
+    path = write_regions(tmp_path / "roi.npz", (0, 0, 20), name=name)
+    with pytest.raises(InvalidInputError, match=r"roi\.npz: expected names of objects that can name files, got"):
+        real_plans(tmp_path, path)
+
+
+def test_a_sequence_too_short_to_hold_a_view_out_says_what_there_was(tmp_path: Path) -> None:
+    folder = write_seven_scenes(tmp_path / "kitchen")
+    [plan] = real_plans(folder, write_regions(tmp_path / "roi.npz", (0, 0, 20)))
+    with pytest.raises(DatasetError, match="expected training frames and held-out views with depth, got 3 and 0"):
+        plan.load((16, 16))
