@@ -46,6 +46,9 @@ def test_other_options_are_told_before_anything_is_done(tmp_path: Path, capsys: 
         (("--rate", "5"), "--rate 'default' (got '5')"),
         (("--policy", "uniform"), "--policy 'task' (got 'uniform')"),
         (("--roi-ball", "0,0,1,0.4"), "--roi-ball '0.0,0.0,2.0,0.4' (got '0.0,0.0,2.0,0.4 0.0,0.0,1.0,0.4')"),
+        (("--colour-camera", "20,20,7.5,5.5"), "--colour-camera '' (got '20,20,7.5,5.5,0,0,0,0,0,0')"),
+        (("--up", "0,-1,0"), "--up '' (got '0.0,-1.0,0.0')"),
+        (("--resegment", "--segmenter", "cut"), "--resegment '' (got 'yes'), "),
     ):
         assert main(map_command(sequence, tmp_path / "other", *options, "--resume", state)) == 2
         [line] = capsys.readouterr().err.splitlines()
@@ -76,3 +79,13 @@ def test_the_command_line_goes_on_after_the_last_frame(tmp_path: Path, capsys: p
     assert memory["optimizer"] == pytest.approx(150 * 128 / 2**20, abs=1e-6)
     assert memory["keyframes"] > 0
     capsys.readouterr()
+
+
+@pytest.mark.parametrize("name", ["map.ply", "report.json"])
+def test_a_saved_run_does_not_take_the_place_of_a_result(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    sequence = write_seven_scenes(tmp_path / "kitchen")
+    assert main(map_command(sequence, tmp_path / "out", "--save-state", str(tmp_path / "out" / name))) == 2
+    [line] = capsys.readouterr().err.splitlines()
+    assert f"{name}: expected a name of its own, got that of a result of" in line

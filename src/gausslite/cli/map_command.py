@@ -20,7 +20,7 @@ from gausslite.mapping.pace import Pace
 from gausslite.mapping.policies import TASK
 from gausslite.mission.build import Attentions, build_attention, build_mapper
 from gausslite.mission.options import add_budget, add_detector, add_policy, mission_settings, perception_settings
-from gausslite.mission.results import peak_rss_mib, prepare_file, prepare_folder, write_results
+from gausslite.mission.results import peak_rss_mib, prepare_beside, prepare_folder, write_results
 from gausslite.mission.saved_run import RunTerms, SavedRun, save_run
 from gausslite.mission.settings import MissionSettings, SceneKnowledge
 from gausslite.mission.turns import TaskPlan, Turn
@@ -59,7 +59,7 @@ def run(options: argparse.Namespace) -> int:
     saved = asked.saved_run(options)
     prepare_folder(options.out)
     if options.save_state is not None:
-        prepare_file(options.save_state)
+        prepare_beside(options.save_state, options.out)
     last_index = -1 if saved is None else saved.last_index
     graph = asked.plan.at(last_index)
     attentions = Attentions(perception_settings(options), lambda: SceneKnowledge.of(asked.source))
@@ -119,7 +119,10 @@ class _Asked:
             self.settings,
             size=f"{self.size[0]}x{self.size[1]}",
             task="" if graph is None else graph.text,
-            roi="" if options.roi is None else options.roi.name,
+            colour_camera="" if options.colour_camera is None else str(options.colour_camera),
+            up="" if options.up is None else ",".join(map(str, options.up)),
+            **{name: _file_name(getattr(options, name)) for name in ("detector", "segmenter", "vocabulary", "roi")},
+            resegment="yes" if options.resegment else "",
             objects=",".join(options.objects),
             roi_ball=" ".join(f"{','.join(map(str, ball.centre_m))},{ball.radius_m}" for ball in options.roi_ball),
         )
@@ -144,6 +147,11 @@ class _Asked:
             "max_gaussians": self.settings.max_gaussians,
             "resumed_from": None if options.resume is None else str(options.resume),
         }
+
+
+def _file_name(path: Path | str | None) -> str:
+    """Where it lies may change between two runs."""
+    return "" if path is None else Path(path).name
 
 
 def _held(mapper: TaskMapper, gaussians: Gaussians) -> dict[str, object]:

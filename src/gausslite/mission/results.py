@@ -13,6 +13,8 @@ from gausslite.codec.ply import write_ply
 from gausslite.domain.gaussians import Gaussians
 from gausslite.errors import StorageError
 
+_MAP, _REPORT = "map.ply", "report.json"
+
 
 def prepare_folder(folder: Path) -> None:
     """Make the folder and check that it can be written, before hours of work. Raises StorageError."""
@@ -32,10 +34,17 @@ def prepare_file(path: Path) -> None:
     prepare_folder(path.parent)
 
 
+def prepare_beside(path: Path, folder: Path) -> None:
+    """prepare_file for one that must not take the place of this folder's results. Raises StorageError."""
+    if path.resolve() in {(folder / name).resolve() for name in (_MAP, _REPORT)}:
+        raise StorageError(f"{path}: expected a name of its own, got that of a result of {folder}")
+    prepare_file(path)
+
+
 def write_results(folder: Path, gaussians: Gaussians, report: Mapping[str, object]) -> None:
     """Write map.ply and report.json. Raises StorageError."""
-    write_ply(folder / "map.ply", gaussians)
-    write_json(folder / "report.json", report)
+    write_ply(folder / _MAP, gaussians)
+    write_json(folder / _REPORT, report)
 
 
 def write_json(path: Path, report: Mapping[str, object]) -> None:
