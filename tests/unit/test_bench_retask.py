@@ -50,6 +50,31 @@ def test_a_change_is_between_two_tasks_of_one_home(text: str) -> None:
         TaskChange.parse(text)
 
 
+def test_the_table_names_the_time_that_was_mapped() -> None:
+    brief = Recovery(CHANGE, {name: [(0.25, 20.0), (1.5, 21.0)] for name in (CHANGED, RESTARTED, ALWAYS)}, 4, 2, 9, 5)
+    assert "→ after 1.5 s of further mapping." in recovery_table([brief])
+    assert "→ after 10 s of further mapping." in recovery_table([recovery([3.0, 0.9, 0.4, 1.5])])
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--rate", "0"], "rate: expected 0.01 to 1000 Hz, got 0.0"),
+        (["--rate", "nan"], "rate: expected 0.01 to 1000 Hz, got nan"),
+        (["--rate=-4"], "rate: expected 0.01 to 1000 Hz, got -4.0"),
+        (["--changes", ""], "changes: expected such as home-4-manipulation:home-4-navigation, got none"),
+        (["--before", "0"], "retask before: expected at least 1, got 0"),
+    ],
+)
+def test_wrong_options_are_one_line(
+    options: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["bench", "retask", "--out", str(tmp_path / "out"), *options]) == 2
+    [line] = capsys.readouterr().err.splitlines()
+    assert message in line
+    assert not (tmp_path / "out").exists()
+
+
 def test_the_three_maps_get_the_same_frames_after_the_change() -> None:
     settings = MissionSettings(max_gaussians=2000, iterations=2, threads=1)
     bench = RetaskBench(settings, before=3, after=3, views=3, size=(96, 72), check_every=2)
@@ -59,6 +84,11 @@ def test_the_three_maps_get_the_same_frames_after_the_change() -> None:
     # keyframes, and views kept because they showed the first task's region
     assert found.reread == found.most_reread == 2
     json.dumps(found.as_json())
+
+
+def test_a_single_look_is_seen_in_the_picture() -> None:
+    once = draw_panels({"a": {"line": [(0.25, 20.0)]}}, "seconds", "dB")
+    assert (once[60:] == (255, 208, 0)).all(axis=2).any()
 
 
 def test_curves_are_drawn_one_panel_below_the_other() -> None:

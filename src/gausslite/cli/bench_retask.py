@@ -5,12 +5,14 @@ from __future__ import annotations
 import argparse
 import shlex
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 from gausslite.codec.files import write_whole
+from gausslite.errors import InvalidInputError
 from gausslite.evaluation.curves import draw_panels
 from gausslite.evaluation.pictures import write_png
-from gausslite.evaluation.quality.retask import RetaskBench, TaskChange, recovery_table
+from gausslite.evaluation.quality.retask import Recovery, RetaskBench, TaskChange, recovery_table
 from gausslite.mission.options import names
 from gausslite.mission.results import prepare_folder, write_json
 from gausslite.mission.settings import MissionSettings
@@ -40,7 +42,7 @@ def configure_retask(parser: argparse.ArgumentParser) -> None:
 
 
 def run_retask(options: argparse.Namespace) -> int:
-    """Map each change three times, and write the table, the figures and the curves."""
+    """Map each change three times; what is known is written after each, so that an interrupt loses one change alone."""
     settings = MissionSettings(
         max_gaussians=options.max_gaussians,
         iterations=None if options.timed else options.iterations,
@@ -49,18 +51,23 @@ def run_retask(options: argparse.Namespace) -> int:
         threads=options.threads,
     )
     changes = [TaskChange.parse(text) for text in options.changes]
+    if not changes:
+        raise InvalidInputError(f"changes: expected such as {_CHANGES[0]}, got none")
     bench = RetaskBench(settings, options.rate, options.before, options.after, options.views)
     prepare_folder(options.out)
-    recoveries = []
+    recoveries: list[Recovery] = []
     for change in changes:
         recoveries.append(bench.run(change))
         print(recovery_table(recoveries[-1:]).splitlines()[-1], file=sys.stderr, flush=True)
-    table = recovery_table(recoveries)
-    command = shlex.join(["gausslite", *sys.argv[1:]])
-    write_whole(options.out / "retask.md", f"# bench retask\n\n`{command}`\n\n{table}".encode())
-    write_json(options.out / "retask.json", {"command": command, "changes": [each.as_json() for each in recoveries]})
-    panels = {each.change.name: each.points for each in recoveries}
-    write_png(options.out / "retask.png", draw_panels(panels, "seconds of mapping since the change", "ROI PSNR, dB"))
-    print(table)
+        _write(options.out, recoveries)
+    print(recovery_table(recoveries))
     print(f"→ {options.out / 'retask.md'}")
     return 0
+
+
+def _write(folder: Path, recoveries: Sequence[Recovery]) -> None:
+    command = shlex.join(["gausslite", *sys.argv[1:]])
+    write_whole(folder / "retask.md", f"# bench retask\n\n`{command}`\n\n{recovery_table(recoveries)}".encode())
+    write_json(folder / "retask.json", {"command": command, "changes": [each.as_json() for each in recoveries]})
+    panels = {each.change.name: each.points for each in recoveries}
+    write_png(folder / "retask.png", draw_panels(panels, "seconds of mapping since the change", "ROI PSNR, dB"))

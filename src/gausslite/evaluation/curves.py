@@ -46,6 +46,8 @@ def _panel(title: str, curves: Curves, x_label: str, y_label: str) -> UInt8[ndar
     for (name, line), colour in zip(curves.items(), _COLOURS, strict=False):
         path = np.array([place(point) for point in line], np.int32)
         cv2.polylines(image, [path], False, colour, 2, cv2.LINE_AA)
+        for point in path:
+            cv2.circle(image, point.tolist(), 3, colour, -1, cv2.LINE_AA)
         at = (_MARGIN_PX + 170 * list(curves).index(name), 40)
         cv2.line(image, (at[0], at[1] - 4), (at[0] + 18, at[1] - 4), colour, 2)
         _write(image, name, (at[0] + 24, at[1]))

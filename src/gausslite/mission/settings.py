@@ -21,6 +21,12 @@ DEFAULT_MAX_GAUSSIANS = 150_000
 _PACE = PaceSettings()
 
 
+def require_rate(rate_hz: float) -> None:
+    """Raise InvalidInputError for no number of frames a second."""
+    if not 0.01 <= rate_hz <= 1000:
+        raise InvalidInputError(f"rate: expected 0.01 to 1000 Hz, got {rate_hz}")
+
+
 @dataclass(frozen=True, slots=True)
 class SceneKnowledge:
     """What is known of a place before the robot looks: which way is up and, in tests, where the objects are."""
@@ -78,8 +84,8 @@ class MissionSettings:
     view_prior: ViewPrior = field(default_factory=ViewPrior)
 
     def __post_init__(self) -> None:
-        if self.rate_hz is not None and not 0.01 <= self.rate_hz <= 1000:
-            raise InvalidInputError(f"rate: expected 0.01 to 1000 Hz, got {self.rate_hz}")
+        if self.rate_hz is not None:
+            require_rate(self.rate_hz)
         if not 0 <= self.least_iterations <= 10_000:
             raise InvalidInputError(f"least iterations: expected 0 to 10000, got {self.least_iterations}")
         if not 0 <= self.run_over <= 1:

@@ -14,7 +14,7 @@ from gausslite.evaluation.quality.scenes import HomeScenePlan, RecalledAttention
 from gausslite.evaluation.views import MIN_ROI_PIXELS, MapViewer
 from gausslite.mapping.pace import Pace
 from gausslite.mission.build import build_mapper
-from gausslite.mission.settings import MissionSettings
+from gausslite.mission.settings import MissionSettings, require_rate
 from gausslite.perception.fixed import RegionAttention
 from gausslite.pipeline import TaskMapper
 from gausslite.render.choose import choose_rasterizer
@@ -68,6 +68,7 @@ class RetaskBench:
     check_every: int = 4
 
     def __post_init__(self) -> None:
+        require_rate(self.rate_hz)
         for name in ("before", "after", "check_every"):
             if getattr(self, name) < 1:
                 raise InvalidInputError(f"retask {name}: expected at least 1, got {getattr(self, name)}")
@@ -152,9 +153,14 @@ class Recovery:
 
 
 def recovery_table(recoveries: Sequence[Recovery]) -> str:
-    """One row for each change: the three maps at the change and after GOAL_S, and when the gap had closed."""
+    """One row for each change: the three maps at the change and after GOAL_S, and when the gap had closed.
+
+    Where mapping ended before GOAL_S, its last look stands there.
+    """
+    looks = sorted({each.points[CHANGED][each.at(GOAL_S)][0] for each in recoveries})
     lines = [
-        f"ROI PSNR of the new region in dB, first frame after the change → after {GOAL_S:g} s of further mapping.",
+        "ROI PSNR of the new region in dB, first frame after the change → after "
+        f"{' or '.join(f'{when:g}' for when in looks)} s of further mapping.",
         "",
         f"| change | {CHANGED} | {RESTARTED} | {ALWAYS} | gap then | within {GOAL_DB:g} dB after |",
         "|---|---|---|---|---|---|",
