@@ -112,7 +112,7 @@ def test_fitting_a_view_never_lowers_its_whole_score(shift_m: float) -> None:
     assert psnr(fitted.rgb, frame.rgb) >= psnr(raw.rgb, frame.rgb)
 
 
-@pytest.mark.parametrize("text", ["", "1", "0.1,0.2,0.3", "a,b", "-1,0", "nan,0", "0.1,inf"])
+@pytest.mark.parametrize("text", ["", "1", "0.1,0.2,0.3", "a,b", "-1,0", "nan,0", "0.1,inf", "1e300,0", "0,0,0,1e200"])
 def test_an_error_that_makes_no_sense_is_refused(text: str) -> None:
     with pytest.raises(InvalidInputError, match="view"):
         ViewPrior.parse(text)

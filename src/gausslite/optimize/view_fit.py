@@ -34,6 +34,8 @@ _INDEPENDENT_PX = 64.0
 _FIT_TRANSLATION_M, _FIT_ROTATION_DEG, _FIT_GAIN, _FIT_OFFSET = 0.005, 0.2, 0.05, 0.015
 """How far a fit itself is off on a map in the making (measured where poses are exact), the same for all its pixels."""
 _OUTLYING, _LEAST_DEVIATION = 2.0, 0.005
+_LARGEST_PRIOR = 1000.0
+"""Nobody knows less than that of a view, and squares of it are still numbers."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,8 +53,10 @@ class ViewPrior:
 
     def __post_init__(self) -> None:
         for name in ("translation_m", "rotation_deg", "gain", "offset"):
-            if not 0 <= getattr(self, name) < np.inf:
-                raise InvalidInputError(f"view prior {name}: expected at least 0, got {getattr(self, name)}")
+            if not 0 <= getattr(self, name) <= _LARGEST_PRIOR:
+                raise InvalidInputError(
+                    f"view prior {name}: expected 0 to {_LARGEST_PRIOR:g}, got {getattr(self, name)}"
+                )
 
     @classmethod
     def parse(cls, text: str) -> ViewPrior:
