@@ -58,11 +58,15 @@ def run(options: argparse.Namespace) -> int:
     scores = []
     for position in tqdm(positions, desc="eval", unit="view", disable=options.json):
         view = HeldOutView.of(source.frame(position, size), chosen)
+        if not view.frame.has_depth:
+            continue
         drawn = draw_fitted(viewer, view.frame) if options.fit_views else viewer.draw_frame(view.frame)
         scores.append(score_view(drawn, view))
         if options.pictures is not None and position in pictured:
             sheet = comparison_sheet(view, {options.map.stem: drawn.rgb})
             write_png(options.pictures / f"view-{view.frame.index:06d}.png", sheet)
+    if not scores:
+        raise DatasetError(f"{options.source}: expected a frame with depth, so that its region is known; got none")
     result = average(scores)
     print(as_text(asdict(result)) if options.json else _as_line(result))
     return 0

@@ -80,10 +80,13 @@ def run(options: argparse.Namespace) -> int:
     if mission.stopped is not None:
         # what was mapped until then is kept, and the exit code says that it is not all
         raise mission.stopped
+    skipped = f" ({report['frames_skipped']} skipped, without depth)" if report["frames_skipped"] else ""
     print(
-        f"{report['frames']} frames at {report['hz']:.1f} Hz, {len(gaussians)} Gaussians "
+        f"{report['frames']} frames{skipped} at {report['hz']:.1f} Hz, {len(gaussians)} Gaussians "
         f"({report['active_gaussians']} of the task) → {options.out / 'map.ply'}"
     )
+    for note in mapper.notes:
+        print(f"  {note}")
     return 0
 
 

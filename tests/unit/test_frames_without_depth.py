@@ -1,0 +1,50 @@
+"""Frames without a depth reading are neither mapped nor scored, and the operator hears of that at the end."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from tiny_sequences import write_depth, write_seven_scenes
+
+from gausslite.cli.main import main
+
+pytest.importorskip("gausslite.render._kernels", reason="the native kernels are not built")
+
+
+def blinded(folder: Path, *numbers: int) -> Path:
+    """A sequence of frames 0, 4 and 8, of which these have no depth."""
+    write_seven_scenes(folder)
+    for number in numbers:
+        write_depth(folder / f"frame-{number:06d}.depth.png", value=0)
+    return folder
+
+
+def map_uniformly(sequence: Path, out: Path) -> int:
+    return main(["map", str(sequence), "--policy", "uniform", "--max-gaussians", "150", "--out", str(out)])
+
+
+def test_the_run_says_how_many_frames_it_skipped(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert map_uniformly(blinded(tmp_path / "one", 4), tmp_path / "out") == 0
+    assert capsys.readouterr().out.startswith("2 frames (1 skipped, without depth) at ")
+    assert map_uniformly(blinded(tmp_path / "none"), tmp_path / "out") == 0
+    assert capsys.readouterr().out.startswith("3 frames at ")
+
+
+def test_what_cannot_be_told_from_its_region_is_not_scored(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert map_uniformly(blinded(tmp_path / "one", 4), tmp_path / "out") == 0
+    capsys.readouterr()
+    score = ["eval", str(tmp_path / "out" / "map.ply")]
+    assert main([*score, str(tmp_path / "one"), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["n_views"] == 2
+    assert main([*score, str(blinded(tmp_path / "all", 0, 4, 8)), "--json"]) == 2
+    [line] = capsys.readouterr().err.splitlines()
+    assert "all: expected a frame with depth, so that its region is known; got none" in line
+
+
+def test_what_was_not_found_is_said_at_the_end(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("embreex", reason="the simulated home needs the extra `sim`")
+    small = ["--size", "64x48", "--max-gaussians", "200", "--iterations", "1"]
+    assert main(["map", "sim:home?frames=1", "--task", "Find the unicorn", *small, "--out", str(tmp_path)]) == 0
+    assert "\n  no region answers 'unicorn'; the regions are " in capsys.readouterr().out
