@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import replace
 
 import numpy as np
@@ -14,7 +15,9 @@ from gausslite.errors import InvalidInputError
 from gausslite.evaluation.fitted import draw_fitted
 from gausslite.evaluation.metrics import psnr
 from gausslite.evaluation.views import MapViewer
+from gausslite.mapping.keyframes import Keyframe, window_view
 from gausslite.mapping.mapper import GaussianMapper
+from gausslite.mapping.refinement import ViewRefiner
 from gausslite.mapping.settings import KeyframeSettings, MapperSettings
 from gausslite.optimize.view_fit import ColourAffine, ViewPrior, fit_colour, fit_pose
 from gausslite.render.cpu import CpuRasterizer
@@ -102,6 +105,19 @@ def test_keyframes_told_in_contradiction_come_to_agree() -> None:
     before = errors_m([k.recorded.T_world_camera for k in keyframes if k.recorded is not None])
     after = errors_m([k.frame.T_world_camera for k in keyframes])
     assert np.std(after) < 0.5 * np.std(before)
+
+
+@pytest.mark.parametrize("refits", [0, 1, 2, 9])
+def test_keyframes_that_may_change_are_fitted_again_equally_often(refits: int) -> None:
+    rasterizer, settings = CpuRasterizer(threads=1), KeyframeSettings()
+    frames = [wall_frame(index, SIZE) for index in range(5)]
+    keyframes = [Keyframe(frame, middle_relevance(frame), recorded=frame if frame.index else None) for frame in frames]
+    window = [window_view(keyframe, rasterizer, settings) for keyframe in keyframes]
+    refiner = ViewRefiner(LOOSE, lambda camera, T_world_camera: picture_of(frames[0]), refits)
+    turns = [refiner.next_turns(window) for _ in range(4)]
+    assert [len(turn) for turn in turns] == [min(refits, 4)] * 4
+    fitted = Counter(view.keyframe.frame.index for turn in turns for view in turn)
+    assert fitted == Counter({frame.index: min(refits, 4) for frame in frames[1:]})
 
 
 @pytest.mark.parametrize("shift_m", [0.0, 0.02, 0.5])

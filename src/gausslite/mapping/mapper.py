@@ -64,7 +64,7 @@ class GaussianMapper:
             self._table.append(known)
         self._seeder = Seeder(settings.seeding, settings.components, self._rng)
         self._keyframes = KeyframeStore(settings.keyframes)
-        self._refiner = ViewRefiner(settings.view_prior, self.render)
+        self._refiner = ViewRefiner(settings.view_prior, self.render, settings.keyframes.refits)
         self._trainer = Trainer(settings, self._table, rasterizer, self._rng)
         self._extent_m = 0.0
         self._revision = 0
@@ -216,13 +216,12 @@ class GaussianMapper:
         self._extent_m = max(self._extent_m, float(frame.depth_m.max()) * _EXTENT_PER_DEPTH)
         if not self._refiner.needed or self._table.count == 0:
             return self._view(Keyframe(frame, relevance))
-        self._refine_keyframe()
+        self._refine_keyframes()
         return self._view(Keyframe(self._refiner.settle(frame), relevance, recorded=frame))
 
-    def _refine_keyframe(self) -> None:
-        """One keyframe of the window, fitted again to the map as it has become."""
-        view = self._refiner.next_turn(self._keyframes.window)
-        if view is not None:
+    def _refine_keyframes(self) -> None:
+        """Some keyframes of the window, fitted again to the map as it has become."""
+        for view in self._refiner.next_turns(self._keyframes.window):
             self._keyframes.revise(self._view(self._refiner.fit_again(view.keyframe)))
 
     def _view(self, keyframe: Keyframe) -> WindowView:

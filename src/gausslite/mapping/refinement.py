@@ -24,8 +24,9 @@ Draw = Callable[[Camera, Float64[ndarray, "4 4"]], Rendering]
 class ViewRefiner:
     """Knows how far the last frame's pose was corrected, and whose turn it is among the keyframes."""
 
-    def __init__(self, prior: ViewPrior, draw: Draw) -> None:
+    def __init__(self, prior: ViewPrior, draw: Draw, refits: int) -> None:
         self._prior = prior
+        self._refits = refits
         self._draw = draw
         self._T_said_refined = np.eye(4)
         self._turn = 0
@@ -53,13 +54,13 @@ class ViewRefiner:
         self._T_said_refined = inverse(recorded.T_world_camera) @ frame.T_world_camera
         return frame
 
-    def next_turn(self, window: Sequence[WindowView]) -> WindowView | None:
-        """The keyframe to fit again now: one a frame, each in turn; None while there is none that may change."""
+    def next_turns(self, window: Sequence[WindowView]) -> list[WindowView]:
+        """The keyframes to fit again with this frame, each in turn; none while there is none that may change."""
         refinable = [view for view in window if view.keyframe.recorded is not None]
-        if not refinable:
-            return None
-        self._turn = (self._turn + 1) % len(refinable)
-        return refinable[self._turn]
+        count = min(self._refits, len(refinable))
+        first = self._turn + 1
+        self._turn = (self._turn + count) % max(len(refinable), 1)
+        return [refinable[turn % len(refinable)] for turn in range(first, first + count)]
 
     def fit_again(self, keyframe: Keyframe) -> Keyframe:
         """The keyframe as it fits the map of now."""

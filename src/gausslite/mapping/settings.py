@@ -93,6 +93,8 @@ class KeyframeSettings:
     mission; 0 is the paper's window. Each takes as much memory as a frame of the window.
     surroundings_weight, 0 to 1: what pixels beside the region count in the active phase's loss, in the tiles that it
     draws anyway; 0 is the paper's binary mask, which lets what stands beside the region move as it likes.
+    refits: where views may be wrong (`MapperSettings.view_prior`) so many of those ready to train on are fitted to the
+    map again with each frame, in turns.
     """
 
     every: int = 5
@@ -101,11 +103,12 @@ class KeyframeSettings:
     region_views: int = 24
     roi_margin_px: int = 5
     surroundings_weight: float = 0.3
+    refits: int = 2
 
     def __post_init__(self) -> None:
         for name in ("every", "window", "buffer"):
             _require(getattr(self, name) >= 1, f"keyframes {name}", "at least 1", getattr(self, name))
-        for name in ("region_views", "roi_margin_px"):
+        for name in ("region_views", "roi_margin_px", "refits"):
             _require(getattr(self, name) >= 0, f"keyframes {name}", "at least 0", getattr(self, name))
         weight = self.surroundings_weight
         _require(0 <= weight <= 1, "keyframes surroundings_weight", "0 to 1", weight)

@@ -31,8 +31,11 @@ _SAME_SURFACE = 0.05
 """What is drawn within this fraction of the measured depth is the surface the photograph shows."""
 _INDEPENDENT_PX = 64.0
 """Residuals of neighbouring pixels agree: one in a cell of 8x8 counts against the prior."""
-_FIT_TRANSLATION_M, _FIT_ROTATION_DEG, _FIT_GAIN, _FIT_OFFSET = 0.005, 0.2, 0.05, 0.015
-"""How far a fit itself is off on a map in the making (measured where poses are exact), the same for all its pixels."""
+_FIT_TRANSLATION_M, _FIT_ROTATION_DEG, _FIT_GAIN, _FIT_OFFSET = 0.002, 0.1, 0.05, 0.015
+"""How far a fit itself is off on a map in the making (measured where poses are exact), the same for all its pixels.
+
+What is not believed of a true correction stays as a contradiction between views, so these must not be too large.
+"""
 _OUTLYING, _LEAST_DEVIATION = 2.0, 0.005
 _LARGEST_PRIOR = 1000.0
 """Nobody knows less than that of a view, and squares of it are still numbers."""
