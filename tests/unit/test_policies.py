@@ -10,6 +10,7 @@ from gausslite.errors import InvalidInputError
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.policies import BEYOND_SWITCHES, PAPER_SWITCHES, POLICIES, SWITCHES, TASK, policy, without
 from gausslite.mapping.settings import Components, KeyframeSettings, MapperSettings
+from gausslite.mission.settings import MissionSettings
 from gausslite.render.cpu import CpuRasterizer
 
 BASELINES = sorted(POLICIES.keys() - {TASK})
@@ -63,6 +64,15 @@ def test_a_switch_turns_its_own_part_off_and_no_other(name: str) -> None:
     assert without(off, {name}) == off
     changed = [part for part in PAPER_SWITCHES if getattr(off.components, part) != getattr(on.components, part)]
     assert changed == [part for part in PAPER_SWITCHES if part == name]
+
+
+@pytest.mark.parametrize("name", SWITCHES)
+@pytest.mark.parametrize("iterations", [None, 4])
+def test_a_mission_maps_without_what_is_switched_off(name: str, iterations: int | None) -> None:
+    mission = MissionSettings(without=frozenset({name}), iterations=iterations)
+    settings = mission.mapper_settings()
+    assert without(settings, {name}) == settings
+    assert settings.optimization.iterations == (iterations or policy(TASK).optimization.iterations)
 
 
 def test_with_everything_off_what_is_left_knows_no_task() -> None:

@@ -108,13 +108,8 @@ class MissionSettings:
 
     def mapper_settings(self) -> MapperSettings:
         """The named policy with this mission's cap, iterations and switches."""
-        base = policy(self.policy)
+        base = without(policy(self.policy), self.without)
         optimization = base.optimization
         if self.iterations is not None:
             optimization = optimization.with_iterations(self.iterations)
-        return replace(
-            without(base, self.without),
-            max_gaussians=self.max_gaussians,
-            optimization=optimization,
-            view_prior=self.view_prior,
-        )
+        return replace(base, max_gaussians=self.max_gaussians, optimization=optimization, view_prior=self.view_prior)
