@@ -151,33 +151,75 @@ std::unique_ptr<TrainingView> make_view(ByteColours rgb, Plane depth_m, std::opt
                                         weight ? weight->data() : nullptr);
 }
 
-double step(Rasterizer& self, RowTable rows, RowTable first_moment, RowTable second_moment, const TrainingView& view,
-            const Intrinsics& intrinsics, Matrix4 T_camera_world, std::tuple<float, float, float> loss,
-            const std::vector<float>& rates, std::tuple<double, double, double> adam, bool masked,
-            std::optional<TileMask> tiles, std::optional<Ids> ids, std::optional<Flags> trainable,
-            std::optional<Counts> trained, std::optional<Flags> counted, uint64_t loan) {
-  const size_t n = rows.shape(0);
-  const Scene scene(rows.data(), n, intrinsics, T_camera_world, tiles, ids);
-  require(first_moment.shape(0) == n && second_moment.shape(0) == n && (!trainable || trainable->shape(0) == n) &&
-              (!trained || trained->shape(0) == n) && (!counted || counted->shape(0) == n),
-          "tables: lengths disagree");
-  require(view.width() == scene.input.camera.width && view.height() == scene.input.camera.height, "view: wrong size");
-  require(rates.size() == 16, "rates: expected 16");
-  const auto flags = [](const std::optional<Flags>& of) {
-    return of ? reinterpret_cast<const uint8_t*>(of->data()) : nullptr;
-  };
-  const OptimizerState state{rows.data(),
-                             first_moment.data(),
-                             second_moment.data(),
-                             flags(trainable),
-                             trained ? trained->data() : nullptr,
-                             flags(counted),
-                             loan};
-  AdamOptions options;
-  std::copy_n(rates.begin(), 16, options.rates);
-  std::tie(options.beta1, options.beta2, options.epsilon) = adam;
-  const LossWeights weights{std::get<0>(loss), std::get<1>(loss), std::get<2>(loss)};
-  return work(self, [&] { return self.step(scene.input, state, view, masked, weights, options); });
+// What a step looks at, carried over once for as long as the arrays are the same; it keeps them alive, not their
+// values.
+struct StepScene {
+  const TrainingView& view;  // its owner is kept alive by the binding
+  Intrinsics intrinsics;
+  Matrix4 T_camera_world;
+  std::optional<TileMask> tiles;
+  std::optional<Ids> ids;
+
+  StepScene(const TrainingView& view, const Intrinsics& intrinsics, Matrix4 T_camera_world,
+            std::optional<TileMask> tiles, std::optional<Ids> ids)
+      : view(view), intrinsics(intrinsics), T_camera_world(T_camera_world), tiles(tiles), ids(ids) {}
+};
+
+// What a step changes and how.
+struct StepTraining {
+  RowTable rows, first_moment, second_moment;
+  LossWeights loss;
+  AdamOptions adam;
+  bool masked;
+  std::optional<Flags> trainable;
+  std::optional<Counts> trained;
+  std::optional<Flags> counted;
+  uint64_t loan;
+
+  StepTraining(std::tuple<RowTable, RowTable, RowTable> tables, std::tuple<float, float, float> weights,
+               const std::vector<float>& rates, std::tuple<double, double, double> constants, bool masked,
+               std::optional<Flags> trainable, std::optional<Counts> trained, std::optional<Flags> counted,
+               uint64_t loan)
+      : rows(std::get<0>(tables)),
+        first_moment(std::get<1>(tables)),
+        second_moment(std::get<2>(tables)),
+        loss{std::get<0>(weights), std::get<1>(weights), std::get<2>(weights)},
+        masked(masked),
+        trainable(trainable),
+        trained(trained),
+        counted(counted),
+        loan(loan) {
+    const size_t n = rows.shape(0);
+    require(first_moment.shape(0) == n && second_moment.shape(0) == n && (!trainable || trainable->shape(0) == n) &&
+                (!trained || trained->shape(0) == n) && (!counted || counted->shape(0) == n),
+            "tables: lengths disagree");
+    require(rates.size() == 16, "rates: expected 16");
+    std::copy_n(rates.begin(), 16, adam.rates);
+    std::tie(adam.beta1, adam.beta2, adam.epsilon) = constants;
+  }
+
+  OptimizerState state() const {
+    const auto flags = [](const std::optional<Flags>& of) {
+      return of ? reinterpret_cast<const uint8_t*>(of->data()) : nullptr;
+    };
+    return {rows.data(),
+            first_moment.data(),
+            second_moment.data(),
+            flags(trainable),
+            trained ? trained->data() : nullptr,
+            flags(counted),
+            loan};
+  }
+};
+
+double step(Rasterizer& self, const StepScene& seen, const StepTraining& training) {
+  const Scene scene(training.rows.data(), training.rows.shape(0), seen.intrinsics, seen.T_camera_world, seen.tiles,
+                    seen.ids);
+  const Camera& camera = scene.input.camera;
+  require(seen.view.width() == camera.width && seen.view.height() == camera.height, "view: wrong size");
+  const OptimizerState state = training.state();
+  return work(self,
+              [&] { return self.step(scene.input, state, seen.view, training.masked, training.loss, training.adam); });
 }
 
 nb::dict stage_times(const Rasterizer& self) {
@@ -204,6 +246,19 @@ NB_MODULE(_kernels, m) {
       .def_prop_ro("width", &TrainingView::width)
       .def_prop_ro("height", &TrainingView::height);
 
+  nb::class_<StepScene>(m, "StepScene", "What a step looks at; it keeps the arrays, not their values.")
+      .def(nb::init<const TrainingView&, const Intrinsics&, Matrix4, std::optional<TileMask>, std::optional<Ids>>(),
+           nb::keep_alive<1, 2>(), nb::arg("view"), nb::arg("intrinsics"), nb::arg("T_camera_world").noconvert(),
+           nb::arg("tiles").noconvert().none(), nb::arg("ids").noconvert().none());
+
+  nb::class_<StepTraining>(m, "StepTraining", "What a step changes and how; it keeps the arrays, not their values.")
+      .def(nb::init<std::tuple<RowTable, RowTable, RowTable>, std::tuple<float, float, float>,
+                    const std::vector<float>&, std::tuple<double, double, double>, bool, std::optional<Flags>,
+                    std::optional<Counts>, std::optional<Flags>, uint64_t>(),
+           nb::arg("tables").noconvert(), nb::arg("loss"), nb::arg("rates"), nb::arg("adam"), nb::arg("masked"),
+           nb::arg("trainable").noconvert().none(), nb::arg("trained").noconvert().none(),
+           nb::arg("counted").noconvert().none(), nb::arg("loan"));
+
   nb::class_<Rasterizer>(m, "Engine", "Scratch memory and a team of threads; it never keeps the splats.")
       .def(nb::new_(&make_rasterizer), nb::arg("simd"), nb::arg("threads"))
       .def_prop_ro("threads", &Rasterizer::threads)
@@ -214,12 +269,7 @@ NB_MODULE(_kernels, m) {
       .def("backward", &backward, nb::arg("frame"), nb::arg("row_count"), nb::arg("d_rgb").noconvert(),
            nb::arg("d_depth_m").noconvert(), nb::arg("d_alpha").noconvert(),
            "d_rows, d_twist, visible rows, mean_2d_norm.")
-      .def("step", &step, nb::arg("rows").noconvert(), nb::arg("first_moment").noconvert(),
-           nb::arg("second_moment").noconvert(), nb::arg("view"), nb::arg("intrinsics"),
-           nb::arg("T_camera_world").noconvert(), nb::arg("loss"), nb::arg("rates"), nb::arg("adam"), nb::arg("masked"),
-           nb::arg("tiles").noconvert().none(), nb::arg("ids").noconvert().none(),
-           nb::arg("trainable").noconvert().none(), nb::arg("trained").noconvert().none(),
-           nb::arg("counted").noconvert().none(), nb::arg("loan"), "The loss.")
+      .def("step", &step, nb::arg("scene"), nb::arg("training"), "The loss.")
       .def("visible", &visible_ids, "The rows that the last forward or step found visible, ascending.")
       .def_prop_ro("steps_ms", &Rasterizer::steps_ms, "Milliseconds that all steps took so far.")
       .def("stage_times_ms", &stage_times, "Milliseconds of the last call's stages.")

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from gausslite.domain.camera import Camera
+from gausslite.errors import InvalidInputError, ShapeError
 from gausslite.render.cpu import CpuRasterizer
-from gausslite.render.rasterizer import AdamSettings, LossWeights, Subset
+from gausslite.render.rasterizer import AdamSettings, LossWeights, Subset, Tally
 
 kernels = pytest.importorskip("gausslite.render._kernels", reason="the native kernels are not built")
 
@@ -74,6 +75,58 @@ def test_a_loan_changes_no_bit_however_fast_the_rows_move(simd: str, loss: LossW
     assert {len(ids) > 0 for ids in without[3:]} == {True}
     for a, b in zip(with_loan, without, strict=True):
         np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_a_step_sees_what_its_arrays_hold_now_though_they_were_seen_before(masked: bool) -> None:
+    rng, rasterizer = np.random.default_rng(2), CpuRasterizer(2)
+    size = (CAMERA.height_px, CAMERA.width_px)
+    view = rasterizer.prepare_view(
+        rng.integers(0, 256, (*size, 3), np.uint8), np.full(size, 2.0, np.float32), CAMERA, np.ones(size, np.float32)
+    )
+    trained: list[list[np.ndarray]] = []
+    for fresh in (False, True):
+        rows = random_rows(800)
+        lent = rows, np.zeros_like(rows), np.zeros_like(rows)
+        counts, among, trainable = np.zeros(800, np.uint32), np.ones(800, bool), np.ones(800, bool)
+        T_camera_world, tally = np.eye(4), Tally(counts, among)
+        subset = Subset(np.ones((6, 7), bool))
+        assert subset.tiles is not None
+        with rasterizer.holding(*lent):
+            for i in range(6):
+                T_camera_world[:] = pose(0.3 * i)
+                subset.tiles[:] = scattered_tiles(i)
+                trainable[:], among[:] = np.arange(800) % 3 != i % 3, np.arange(800) % 2 == i % 2
+                told = (T_camera_world, subset, trainable, tally)
+                if fresh:
+                    told = (
+                        T_camera_world.copy(),
+                        Subset(subset.tiles.copy()),
+                        trainable.copy(),
+                        Tally(counts, among.copy()),
+                    )
+                rasterizer.step(*lent, view, told[0], LossWeights(), FAST, masked, *told[1:])
+        trained.append([*lent, counts])
+    for a, b in zip(*trained, strict=True):
+        np.testing.assert_array_equal(a, b)
+    assert trained[0][3].any()
+
+
+def test_what_is_wrong_is_refused_each_time_it_comes() -> None:
+    size = (CAMERA.height_px, CAMERA.width_px)
+    rasterizer, rows = CpuRasterizer(1), random_rows(10)
+    view = rasterizer.prepare_view(np.zeros((*size, 3), np.uint8), np.ones(size, np.float32), CAMERA)
+    lent, loss = (rows, np.zeros_like(rows), np.zeros_like(rows)), LossWeights()
+    few, tiles = Subset(ids=np.array([9], np.uint32)), Subset(np.ones((2, 2), bool))
+    with rasterizer.holding(*lent):
+        rasterizer.step(*lent, view, pose(0.0), loss, FAST, subset=few)
+        for _ in range(2):
+            with pytest.raises(ShapeError, match="subset tiles"):
+                rasterizer.step(*lent, view, pose(0.0), loss, FAST, subset=tiles)
+    fewer = tuple(table[:9].copy() for table in lent)
+    for lending in (rasterizer.holding(*fewer), nullcontext()):
+        with lending, pytest.raises(InvalidInputError, match="subset ids"):
+            rasterizer.step(*fewer, view, pose(0.0), loss, FAST, subset=few)
 
 
 @pytest.mark.parametrize("simd", kernels.usable_simd())

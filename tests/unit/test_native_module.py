@@ -49,12 +49,16 @@ def module_interface() -> Interface:
     # nb::new_ makes an object in __new__
     for made in (kernels.Engine, kernels.View):
         interface[f"{made.__name__}.__init__"] = _parameters(made.__new__)[1:]
+    for made in (kernels.StepScene, kernels.StepTraining):
+        interface[f"{made.__name__}.__init__"] = _parameters(made.__init__)[1:]
     return interface
 
 
 def _parameters(function: Any) -> tuple[str, ...]:
     """Names of the last overload's parameters, from what nanobind keeps of the binding."""
-    signature = re.sub(r"\[[^][]*(\[[^][]*\])*[^][]*\]", "", function.__nb_signature__[-1][0])
+    signature = function.__nb_signature__[-1][0]
+    while "[" in signature:
+        signature = re.sub(r"\[[^][]*\]", "", signature)
     inner = re.search(r"\((.*)\)", signature)[1]
     return tuple(part.split(":")[0].strip() for part in inner.split(",") if part.strip())
 

@@ -19,7 +19,7 @@ from gausslite.domain.state import State, nested, part, take_counts, whole_numbe
 from gausslite.errors import MapFileError
 from gausslite.mapping.checkpoint import frame_of, frame_state, relevance_of, relevance_state
 from gausslite.mapping.settings import KeyframeSettings
-from gausslite.render.rasterizer import TILE_PX, Rasterizer, TrainingView
+from gausslite.render.rasterizer import TILE_PX, Rasterizer, Subset, TrainingView
 
 _SSIM_WINDOW_PX = 11
 
@@ -64,17 +64,17 @@ class Keyframe:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WindowView:
-    """A keyframe made ready to train on. active_tiles: the 16x16 tiles that touch the region and its margin."""
+    """A keyframe made ready to train on. region: the 16x16 tiles that touch the task's region and its margin."""
 
     keyframe: Keyframe
     training_view: TrainingView
     T_camera_world: Float64[ndarray, "4 4"]
-    active_tiles: Bool[ndarray, "th tw"]
+    region: Subset
 
     @property
     def shows_region(self) -> bool:
         """True when any pixel belongs to the task's region."""
-        return bool(self.active_tiles.any())
+        return self.region.tiles is not None and bool(self.region.tiles.any())
 
 
 def window_view(keyframe: Keyframe, rasterizer: Rasterizer, settings: KeyframeSettings) -> WindowView:
@@ -88,7 +88,7 @@ def window_view(keyframe: Keyframe, rasterizer: Rasterizer, settings: KeyframeSe
         keyframe=keyframe,
         training_view=rasterizer.prepare_view(frame.rgb, frame.depth_m, frame.camera, weight),
         T_camera_world=inverse(frame.T_world_camera),
-        active_tiles=tiles,
+        region=Subset(tiles),
     )
 
 
@@ -167,9 +167,7 @@ class KeyframeStore:
         }
         self._buffer = [fresh[id(keyframe)] for keyframe in self._buffer]
         views = {
-            id(view.keyframe): replace(
-                view, keyframe=fresh[id(view.keyframe)], active_tiles=np.zeros_like(view.active_tiles)
-            )
+            id(view.keyframe): replace(view, keyframe=fresh[id(view.keyframe)], region=_no_region(view.keyframe.frame))
             for view in self.window
         }
         self._latest = [views[id(view.keyframe)] for view in self._latest]
@@ -242,6 +240,10 @@ class KeyframeStore:
         if len(views) > self._settings.region_views:
             del views[_most_crowded([view.keyframe for view in views])]
         self._region = views[: self._settings.region_views]
+
+
+def _no_region(frame: Frame) -> Subset:
+    return Subset(tiles_of(np.zeros(frame.depth_m.shape, np.bool_), margin_px=0))
 
 
 def _captured_ns(view: WindowView) -> int:

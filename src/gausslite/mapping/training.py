@@ -164,7 +164,7 @@ class Trainer:
             optimization.loss,
             optimization.adam,
             masked=True,
-            subset=Subset(view.active_tiles, loan.active_ids),
+            subset=view.region if loan.active_ids is None else Subset(view.region.tiles, loan.active_ids),
             trainable=loan.trainable,
             tally=loan.tally,
         )

@@ -25,6 +25,38 @@ class View:
     @property
     def height(self) -> int: ...
 
+class StepScene:
+    """What a step looks at; it keeps the arrays, not their values."""
+
+    def __init__(
+        self,
+        view: View,
+        intrinsics: tuple[float, float, float, float, int, int],
+        T_camera_world: Float64[ndarray, "4 4"],
+        tiles: Bool[ndarray, "th tw"] | None,
+        ids: UInt32[ndarray, " m"] | None,
+    ) -> None: ...
+
+class StepTraining:
+    """What a step changes and how; it keeps the arrays, not their values."""
+
+    def __init__(
+        self,
+        tables: tuple[Float32[ndarray, "n 16"], Float32[ndarray, "n 16"], Float32[ndarray, "n 16"]],
+        loss: tuple[float, float, float],
+        rates: Sequence[float],
+        adam: tuple[float, float, float],
+        masked: bool,
+        trainable: Bool[ndarray, " n"] | None,
+        trained: UInt32[ndarray, " n"] | None,
+        counted: Bool[ndarray, " n"] | None,
+        loan: int,
+    ) -> None:
+        """The values of adam are beta1, beta2, epsilon. trained rises by one for each row that moved and is counted.
+
+        loan: numbers a time in which the rows change by steps of this number alone; 0 where others may change them.
+        """
+
 class Engine:
     """Scratch memory and a team of threads; it never keeps the splats."""
 
@@ -55,29 +87,8 @@ class Engine:
     ) -> tuple[Float32[ndarray, "n 16"], Float64[ndarray, "6"], UInt32[ndarray, " m"], Float32[ndarray, " m"]]:
         """d_rows, d_twist, visible rows and mean_2d_norm."""
 
-    def step(
-        self,
-        rows: Float32[ndarray, "n 16"],
-        first_moment: Float32[ndarray, "n 16"],
-        second_moment: Float32[ndarray, "n 16"],
-        view: View,
-        intrinsics: tuple[float, float, float, float, int, int],
-        T_camera_world: Float64[ndarray, "4 4"],
-        loss: tuple[float, float, float],
-        rates: Sequence[float],
-        adam: tuple[float, float, float],
-        masked: bool,
-        tiles: Bool[ndarray, "th tw"] | None,
-        ids: UInt32[ndarray, " m"] | None,
-        trainable: Bool[ndarray, " n"] | None,
-        trained: UInt32[ndarray, " n"] | None,
-        counted: Bool[ndarray, " n"] | None,
-        loan: int,
-    ) -> float:
-        """The loss; adam is beta1, beta2, epsilon. trained rises by one for each row that moved and is counted.
-
-        loan: numbers a time in which the rows change by steps of this number alone; 0 where others may change them.
-        """
+    def step(self, scene: StepScene, training: StepTraining) -> float:
+        """The loss."""
 
     def visible(self) -> UInt32[ndarray, " m"]:
         """The rows that the last forward or step found visible, ascending."""

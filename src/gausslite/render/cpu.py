@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import lru_cache
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING
 from weakref import ref
 
 import numpy as np
@@ -17,12 +16,11 @@ from gausslite.domain.camera import Camera
 from gausslite.errors import InvalidInputError, ShapeError
 from gausslite.render.checks import (
     require_image_gradients,
-    require_marks,
     require_scene,
     require_table,
-    require_tables,
     require_view,
 )
+from gausslite.render.cpu_arguments import CpuView, Loans, contiguous, intrinsics
 from gausslite.render.cpu_kernels import choose_simd, choose_threads, load_kernels
 from gausslite.render.rasterizer import (
     EVERYTHING,
@@ -38,18 +36,6 @@ from gausslite.render.rasterizer import (
 
 if TYPE_CHECKING:
     from gausslite.render import _kernels
-
-_Table: TypeAlias = Float32[ndarray, "n 16"]
-_Tables: TypeAlias = tuple[_Table, _Table, _Table]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class CpuView:
-    """A training image inside the native backend."""
-
-    camera: Camera
-    intrinsics: tuple[float, float, float, float, int, int]
-    native: _kernels.View
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -92,9 +78,8 @@ class CpuRasterizer:
         self._simd = choose_simd(simd)
         self._engine: _kernels.Engine = load_kernels().Engine(self._simd, choose_threads(threads))
         self._latest: ref[_Report] | None = None
-        self._held: _Tables | None = None
+        self._loans = Loans()
         self._masked_ms = 0.0
-        self._loans = 0
 
     @property
     def name(self) -> str:
@@ -124,7 +109,7 @@ class CpuRasterizer:
         T_camera_world = np.ascontiguousarray(T_camera_world)
         self._settle_report()
         rgb, depth_m, alpha, frame = self._engine.forward(
-            rows, _intrinsics(camera), T_camera_world, _contiguous(subset.tiles), _contiguous(subset.ids)
+            rows, intrinsics(camera), T_camera_world, contiguous(subset.tiles), contiguous(subset.ids)
         )
         return Rendering(rgb, depth_m, alpha, _Drawn(self, frame, rows, T_camera_world))
 
@@ -162,8 +147,8 @@ class CpuRasterizer:
     ) -> TrainingView:
         """Make an image ready to train on. Raises ShapeError, InvalidInputError for weights outside [0, 1]."""
         require_view(rgb, depth_m, camera, weight)
-        native = load_kernels().View(np.ascontiguousarray(rgb), np.ascontiguousarray(depth_m), _contiguous(weight))
-        return CpuView(camera, _intrinsics(camera), native)
+        native = load_kernels().View(np.ascontiguousarray(rgb), np.ascontiguousarray(depth_m), contiguous(weight))
+        return CpuView(camera, intrinsics(camera), native)
 
     def step(
         self,
@@ -182,31 +167,11 @@ class CpuRasterizer:
         """One whole iteration in place. Raises ShapeError, also for a view of another backend."""
         if not isinstance(view, CpuView):
             raise ShapeError(f"view: expected one that this backend prepared, got {type(view).__name__}")
-        held = self._holds(rows, first_moment, second_moment)
-        if not held:
-            require_tables(rows, first_moment, second_moment)
-        require_scene(len(rows), view.camera, T_camera_world, subset)
-        require_marks(len(rows), trainable, tally)
+        scene = view.scene(len(rows), T_camera_world, subset, masked)
+        training = self._loans.training((rows, first_moment, second_moment), (loss, adam), masked, trainable, tally)
         self._settle_report()
         before_ms = self._engine.steps_ms
-        value = self._engine.step(
-            rows,
-            first_moment,
-            second_moment,
-            view.native,
-            view.intrinsics,
-            np.ascontiguousarray(T_camera_world),
-            (loss.colour, loss.depth, loss.ssim),
-            _row_rates(adam),
-            (adam.beta1, adam.beta2, adam.epsilon),
-            masked,
-            _contiguous(subset.tiles),
-            _contiguous(subset.ids),
-            _contiguous(trainable),
-            None if tally is None else tally.counts,
-            None if tally is None else _contiguous(tally.among),
-            self._loans if held else 0,
-        )
+        value = self._engine.step(scene, training)
         if masked:
             self._masked_ms += self._engine.steps_ms - before_ms
         report = _Report(value, self._engine)
@@ -224,13 +189,8 @@ class CpuRasterizer:
 
         As nobody else changes the rows, the kernels keep where each one is from step to step.
         """
-        require_tables(rows, first_moment, second_moment)
-        self._loans += 1
-        self._held = rows, first_moment, second_moment
-        try:
+        with self._loans.lend((rows, first_moment, second_moment)):
             yield
-        finally:
-            self._held = None
 
     def stage_times_ms(self) -> dict[str, float]:
         """Milliseconds that the stages of the latest call took: project, raster, loss, backward, update."""
@@ -246,25 +206,8 @@ class CpuRasterizer:
         """How often the latest forward or step composited a splat on a 4x4 block of pixels."""
         return self._engine.block_evaluations
 
-    def _holds(self, rows: _Table, first_moment: _Table, second_moment: _Table) -> bool:
-        held = self._held
-        return held is not None and rows is held[0] and first_moment is held[1] and second_moment is held[2]
-
     def _settle_report(self) -> None:
         """A report that somebody still holds gets its rows before the kernels draw over them."""
         report = None if self._latest is None else self._latest()
         if report is not None:
             _ = report.visible
-
-
-@lru_cache(maxsize=8)
-def _row_rates(adam: AdamSettings) -> tuple[float, ...]:
-    return tuple(adam.row_rates().tolist())
-
-
-def _intrinsics(camera: Camera) -> tuple[float, float, float, float, int, int]:
-    return camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px, camera.width_px, camera.height_px
-
-
-def _contiguous(array: ndarray | None) -> ndarray | None:
-    return None if array is None else np.ascontiguousarray(array)
