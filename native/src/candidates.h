@@ -23,11 +23,14 @@ class Sight {
   explicit Sight(const Workspace& ws)
       : camera_(ws.camera),
         limit_u_(kTangentLimit * 0.5f * float(camera_.width) / camera_.fx),
-        limit_v_(kTangentLimit * 0.5f * float(camera_.height) / camera_.fy),
-        x0_(float(ws.active.x0)),
-        x1_(float(ws.active.x1)),
-        y0_(float(ws.active.y0)),
-        y1_(float(ws.active.y1)) {}
+        limit_v_(kTangentLimit * 0.5f * float(camera_.height) / camera_.fy) {
+    const bool everywhere = ws.active_tiles == nullptr;
+    const auto [x0, x1, y0, y1] = everywhere ? ActiveTiles::Box{0, ws.tiles_x, 0, ws.tiles_y} : ws.active.box();
+    left_ = float(x0 * kTile);
+    right_ = float(x1 * kTile);
+    top_ = float(y0 * kTile);
+    bottom_ = float(y1 * kTile);
+  }
 
   // Which lanes may touch the box round the active tiles.
   GAUSSLITE_INLINE Mask16 may_touch(const Pack16* mean, Pack16 largest_log_scale) const {
@@ -46,8 +49,7 @@ class Sight {
     store_int(y1, tile(extent.y + extent.reach_y, ws.tiles_y));
     for (; left != 0; left &= left - 1) {
       const int j = __builtin_ctz(left);
-      const bool touches = ws.count_active(uint32_t(x0[j]), uint32_t(x1[j]), uint32_t(y0[j]), uint32_t(y1[j])) > 0;
-      out |= uint32_t(touches) << j;
+      out |= uint32_t(ws.active.any(uint32_t(x0[j]), uint32_t(x1[j]), uint32_t(y0[j]), uint32_t(y1[j]))) << j;
     }
     return out;
   }
@@ -75,8 +77,8 @@ class Sight {
   };
 
   GAUSSLITE_INLINE Mask16 holds(const Extent& e) const {
-    return (e.z >= Pack16(kNearM)) & (e.x - e.reach_x <= Pack16(x1_)) & (e.x + e.reach_x >= Pack16(x0_)) &
-           (e.y - e.reach_y <= Pack16(y1_)) & (e.y + e.reach_y >= Pack16(y0_));
+    return (e.z >= Pack16(kNearM)) & (e.x - e.reach_x <= Pack16(right_)) & (e.x + e.reach_x >= Pack16(left_)) &
+           (e.y - e.reach_y <= Pack16(bottom_)) & (e.y + e.reach_y >= Pack16(top_));
   }
 
   // The tile column or row that a pixel is in, or the nearest one of the image.
@@ -85,7 +87,7 @@ class Sight {
   }
 
   const Camera& camera_;
-  float limit_u_, limit_v_, x0_, x1_, y0_, y1_;
+  float limit_u_, limit_v_, left_, right_, top_, bottom_;
 };
 
 // Notes the bounds of a row that has changed.

@@ -67,7 +67,7 @@ struct TileColumns {
 
 // True when the tile row has an active tile in these columns.
 GAUSSLITE_INLINE bool row_is_active(const Workspace& ws, uint32_t tile_y, TileColumns columns) {
-  return ws.count_active(columns.first, columns.last, tile_y, tile_y) > 0;
+  return ws.active.any(columns.first, columns.last, tile_y, tile_y);
 }
 
 // Gradient rows are handed out in blocks, so that the shared counter is touched rarely. Row 0 is nobody's.

@@ -59,8 +59,7 @@ void Rasterizer::begin_frame(const FrameInput& input) {
   }
   ws_.wanted_blocks.reserve(tiles);
   want_blocks(nullptr);
-  ws_.active = {0, input.camera.width, 0, input.camera.height};
-  if (input.active_tiles != nullptr) count_active_tiles();
+  if (input.active_tiles != nullptr) ws_.active.look_at(input.active_tiles, ws_.tiles_x, ws_.tiles_y);
   times_ = {};
   last_mark_ms_ = now_ms();
 }
@@ -77,28 +76,6 @@ void Rasterizer::want_blocks(const uint16_t* blocks) {
 // Memory is zeroed when it grows, so 0 would read as written.
 void Rasterizer::next_tag() {
   if (++ws_.tag == 0) ++ws_.tag;
-}
-
-void Rasterizer::count_active_tiles() {
-  const size_t stride = size_t(ws_.tiles_x) + 1;
-  ws_.active_before.reserve(stride * (size_t(ws_.tiles_y) + 1));
-  std::fill_n(ws_.active_before.data(), stride, 0u);
-  auto& box = ws_.active;
-  box = {ws_.camera.width, 0, ws_.camera.height, 0};
-  for (int y = 0; y < ws_.tiles_y; ++y) {
-    const uint32_t* above = &ws_.active_before[stride * size_t(y)];
-    uint32_t* before = &ws_.active_before[stride * (size_t(y) + 1)];
-    before[0] = 0;
-    uint32_t in_row = 0;
-    for (int x = 0; x < ws_.tiles_x; ++x) {
-      const bool active = ws_.active_tiles[size_t(y) * size_t(ws_.tiles_x) + size_t(x)] != 0;
-      in_row += active;
-      before[x + 1] = above[x + 1] + in_row;
-      if (!active) continue;
-      box = {std::min(box.x0, x * kTile), std::max(box.x1, (x + 1) * kTile), std::min(box.y0, y * kTile),
-             std::max(box.y1, (y + 1) * kTile)};
-    }
-  }
 }
 
 void Rasterizer::prepare_gradient_rows() { ws_.gradient_rows.reserve(size_t(ws_.gradient_rows_used.load()) * 16); }

@@ -86,7 +86,6 @@ class Rasterizer {
   Training begin_training(const TrainingView& view, bool masked, const LossWeights& loss);
   void train_with_ssim(const Training& training, int thread);
   void next_tag();
-  void count_active_tiles();
   void use_bounds(uint64_t loan);
   void order_strips();
   void prepare_gradient_rows();

@@ -6,6 +6,7 @@
 #include <cstdint>
 #include <vector>
 
+#include "active_tiles.h"
 #include "camera.h"
 #include "memory.h"
 
@@ -119,10 +120,7 @@ struct Workspace {
   const uint32_t* ids = nullptr;
   uint32_t count = 0;
   const uint8_t* active_tiles = nullptr;  // null: all
-  struct {
-    int x0, x1, y0, y1;
-  } active;                        // pixels: the smallest box around the active tiles, ends not included
-  Buffer<uint32_t> active_before;  // [tile row + 1][tile column + 1]: active tiles above and to the left
+  ActiveTiles active;                     // where they are; of the last frame that named some
 
   // Projection. A segment's visible splats are packed to its front: slots segment * kSegment + 0 .. segment_visible.
   Buffer<Splat> splats;
@@ -150,13 +148,6 @@ struct Workspace {
   Buffer<float> gradient_rows;
   std::atomic<uint32_t> gradient_rows_used{0};
   uint32_t tag = 0;
-
-  // The active tiles in these columns and rows, ends included.
-  __attribute__((always_inline)) uint32_t count_active(uint32_t x0, uint32_t x1, uint32_t y0, uint32_t y1) const {
-    const size_t stride = size_t(tiles_x) + 1;
-    const uint32_t *above = &active_before[stride * y0], *within = &active_before[stride * (size_t(y1) + 1)];
-    return (within[x1 + 1] - within[x0]) - (above[x1 + 1] - above[x0]);
-  }
 
   std::vector<ThreadScratch> scratch;
   // Dynamic scheduling of tile rows and of segments; reset between stages.

@@ -1,0 +1,57 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "active_tiles.h"
+
+#include <algorithm>
+
+namespace gausslite {
+
+void ActiveTiles::look_at(const uint8_t* active, int across, int down) {
+  across_ = size_t(across);
+  box_ = {across, 0, down, 0};
+  for (int y = 0; y < down; ++y) {
+    for (int x = 0; x < across; ++x) {
+      if (!active[y * across + x]) continue;
+      box_ = {std::min(box_.x0, x), std::max(box_.x1, x + 1), std::min(box_.y0, y), y + 1};
+    }
+  }
+  count(active, size_t(down));
+  look_near(active, size_t(down));
+}
+
+void ActiveTiles::count(const uint8_t* active, size_t down) {
+  const size_t stride = across_ + 1;
+  before_.reserve(stride * (down + 1));
+  std::fill_n(before_.data(), stride, 0u);
+  for (size_t y = 0; y < down; ++y) {
+    const uint32_t* above = &before_[stride * y];
+    uint32_t* before = &before_[stride * (y + 1)];
+    before[0] = 0;
+    uint32_t in_row = 0;
+    for (size_t x = 0; x < across_; ++x) {
+      in_row += active[y * across_ + x] != 0;
+      before[x + 1] = above[x + 1] + in_row;
+    }
+  }
+}
+
+// First along each row of tiles, which is the lowest row of bits, then from the rows below.
+void ActiveTiles::look_near(const uint8_t* active, size_t down) {
+  constexpr uint32_t kRow = (1u << kNear) - 1u, kEveryRow = 0x1111u;
+  const size_t tiles = across_ * down;
+  near_.reserve(tiles);
+  for (size_t t = 0; t < tiles; ++t) {
+    const size_t columns = std::min<size_t>(kNear, across_ - t % across_);
+    uint32_t row = 0;
+    for (size_t w = 0; w < columns; ++w) row |= active[t + w] ? kRow << w : 0u;
+    near_[t] = uint16_t(row & kRow);
+  }
+  for (size_t t = 0; t < tiles; ++t) {
+    uint32_t rows = 0;
+    for (size_t h = 0, below = t; h < kNear && below < tiles; ++h, below += across_) {
+      rows |= (near_[below] & kRow) * kEveryRow << (kNear * h);
+    }
+    near_[t] = uint16_t(rows);
+  }
+}
+
+}  // namespace gausslite
