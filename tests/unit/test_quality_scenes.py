@@ -12,6 +12,7 @@ from tiny_sequences import write_seven_scenes
 from gausslite.domain.relevance import RelevanceMap
 from gausslite.errors import DatasetError, InvalidInputError
 from gausslite.evaluation.quality.scenes import RealScenePlan, RecalledAttention, Scene, real_plans
+from gausslite.evaluation.quality.trials import Budget, Conditions, Eyes, Trial, Variant, make_map
 from gausslite.mission.settings import SceneKnowledge
 
 
@@ -53,8 +54,18 @@ def test_too_few_frames_of_a_real_sequence_are_told_at_once(frames: int, tmp_pat
 @pytest.mark.parametrize("name", ["left/right_1", "_"])
 def test_an_object_whose_name_cannot_name_a_file_is_told_at_once(name: str, tmp_path: Path) -> None:
     path = write_regions(tmp_path / "roi.npz", (0, 0, 20), name=name)
-    with pytest.raises(InvalidInputError, match=r"roi\.npz: expected names of objects that can name files, got"):
+    with pytest.raises(InvalidInputError, match=r"roi\.npz: expected objects that can name files, got"):
         real_plans(tmp_path, path)
+
+
+def test_the_words_of_a_task_find_the_regions_of_a_real_sequence(tmp_path: Path) -> None:
+    folder = write_seven_scenes(tmp_path / "kitchen", tuple(range(0, 36, 4)))
+    wall = [(x, y, z) for x in range(-4, 4) for y in range(-4, 4) for z in (19, 20)]
+    [plan] = real_plans(folder, write_regions(tmp_path / "roi.npz", *wall, name="mug_1"))
+    trial = Trial(
+        plan, Variant("task", "task"), Budget(200, iterations=1), 0, Conditions((16, 16), Eyes(words=True), 1)
+    )
+    assert make_map(trial, plan.load((16, 16)), lambda _: None).gaussians.active.any()
 
 
 def test_a_sequence_too_short_to_hold_a_view_out_says_what_there_was(tmp_path: Path) -> None:

@@ -176,8 +176,7 @@ class RealScenePlan:
 
     def __post_init__(self) -> None:
         if not self.kind or "/" in self.kind:
-            objects = ", ".join(self.objects)
-            raise InvalidInputError(f"{self.roi}: expected names of objects that can name files, got {objects}")
+            raise InvalidInputError(f"{self.roi}: expected objects that can name files, got {', '.join(self.objects)}")
         if self.frames is not None:
             _require_count("frames", self.frames)
 
@@ -205,11 +204,12 @@ class RealScenePlan:
     def load(self, size: tuple[int, int]) -> Scene:
         """The frames with depth, split."""
         source = open_source(str(self.folder), self.up_axis, self.colour_camera)
-        regions = choose_regions(balls_for_small_objects(load_voxel_regions(self.roi)), self.objects)
+        known = balls_for_small_objects(load_voxel_regions(self.roi))
+        regions = choose_regions(known, self.objects)
         training, held_out = self.hold_out.split(self._positions(source))
         views = [HeldOutView.of(source.frame(i, size), regions) for i in held_out]
-        frames = [source.frame(i, size) for i in training]
-        return _scene(self.task, frames, views, regions, SceneKnowledge(source.up_axis))
+        knowledge = SceneKnowledge(source.up_axis, known)
+        return _scene(self.task, [source.frame(i, size) for i in training], views, regions, knowledge)
 
     def _positions(self, source: Source) -> list[int]:
         if self.frames is None:
@@ -294,8 +294,7 @@ def _scene(
     usable = [frame for frame in training if frame.has_depth]
     seen = [view for view in views if view.frame.has_depth]
     if not usable or not seen:
-        raise DatasetError(
-            f"{task!r}: expected training frames and held-out views with depth, got {len(usable)} and {len(seen)}"
-        )
+        came = f"{len(usable)} and {len(seen)}"
+        raise DatasetError(f"{task!r}: expected training frames and held-out views with depth, got {came}")
     attention = RegionAttention(regions)
     return Scene(task, usable, [attention.attend(frame) for frame in usable], seen, knowledge)
