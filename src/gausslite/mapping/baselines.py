@@ -1,4 +1,4 @@
-"""The mappers others compare with, as settings of this engine: same cap, same poses, same window of views.
+"""The mappers others compare with, as settings of this engine: same cap, same poses, same window of latest views.
 
 Each seeds, scales, weighs its loss and controls density as its released configuration does. What those leave to the
 hardware is the engine's: Adam's rates (ONLINE_RATES: the customary ones trail by decibels in so few iterations),
