@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
 import time
 from dataclasses import replace
 from itertools import pairwise
@@ -133,6 +136,25 @@ def test_homes_are_believed_and_real_cameras_are_not(tmp_path: Path) -> None:
     mission = Trial(real, UNIFORM, Budget(), 0, CONDITIONS).mission
     assert ViewPrior.parse(str(mission.view_prior)) == ViewPrior(0.01, 0.5, 0.1, 0.03)
     assert real.trust.fit_views
+
+
+def test_a_trials_key_is_the_same_in_every_process() -> None:
+    program = (
+        "from gausslite.evaluation.quality.ablation import cumulative_variants\n"
+        "from gausslite.evaluation.quality.pairs import HOME_PAIRS\n"
+        "from gausslite.evaluation.quality.scenes import HomeScenePlan\n"
+        "from gausslite.evaluation.quality.trials import Budget, Conditions, Trial\n"
+        "for variant in cumulative_variants():\n"
+        "    print(Trial(HomeScenePlan(HOME_PAIRS[0]), variant, Budget(), 0, Conditions((96, 72))).key)\n"
+    )
+    keys = [
+        subprocess.run(
+            [sys.executable, "-c", program], env={**os.environ, "PYTHONHASHSEED": seed}, capture_output=True, check=True
+        ).stdout.split()
+        for seed in ("1", "2")
+    ]
+    assert keys[0] == keys[1]
+    assert len(set(keys[0])) == len(cumulative_variants())
 
 
 def test_a_single_thread_is_timed_by_the_processor() -> None:

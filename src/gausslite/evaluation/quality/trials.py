@@ -6,7 +6,7 @@ import hashlib
 import json
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from enum import StrEnum
 from statistics import fmean
 from typing import Any
@@ -123,9 +123,10 @@ class Trial:
         return self._digest(self.plan.settings() if self.follows_task else self.plan.place())
 
     def _digest(self, scene: Mapping[str, object]) -> str:
+        # the mapper's settings tell what is switched off; a set of names has another order in every process
         settings = {
             "scene": dict(scene),
-            "mission": str(self.mission),
+            "mission": str(replace(self.mission, without=frozenset())),
             "mapper": str(self.mission.mapper_settings()),
             "conditions": str(self.conditions),
         }
