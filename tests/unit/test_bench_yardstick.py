@@ -71,11 +71,11 @@ def test_the_library_gets_the_splats_the_view_and_every_operation(library: Path)
     table = SplatTable(60)
     table.append_rows(seed_rows(60), np.zeros(60, np.bool_), np.zeros(60, np.uint32), np.zeros(60, np.int16))
     other = Yardstick(library, 3, table, view)
-    other.fused_l1()
-    other.fused_l1_ssim()
-    other.forward()
-    other.backward()
-    other.close()
+    with other.turn():
+        other.fused_l1()
+        other.fused_l1_ssim()
+        other.forward()
+        other.backward()
 
     assert noted(library, "threads") == [3]
     assert noted(library, "size", 2) == [40, 24]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, ExitStack
+from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
@@ -98,13 +98,9 @@ class RasterBench:
         """Ours and the other's operations take turns, so that a busy minute of the machine strikes both."""
         ours = _Ours(rasterizer, table, view)
         contenders: list[_Ours | Yardstick] = [ours]
-        with ExitStack() as at_end:
-            at_end.enter_context(ours.holding())
-            if self.yardstick is not None:
-                other = Yardstick(self.yardstick, rasterizer.threads, _table(table.count), view)
-                at_end.callback(other.close)
-                contenders.append(other)
-            seconds, clock_ghz = _take_turns(contenders, self.repetitions)
+        if self.yardstick is not None:
+            contenders.append(Yardstick(self.yardstick, rasterizer.threads, _table(table.count), view))
+        seconds, clock_ghz = _take_turns(contenders, self.repetitions)
         durations = [{name: Duration.of(times) for name, times in each.items()} for each in seconds]
         blocks = {
             name: BlockCost.of(ours.evaluations[name], clock_ghz, rasterizer.threads, stages)
@@ -139,8 +135,8 @@ class _Ours:
         self._d_depth_m = np.full(view.depth_m.shape, 1e-5, np.float32)
         self._d_alpha = np.zeros(view.depth_m.shape, np.float32)
 
-    def holding(self) -> AbstractContextManager[None]:
-        """Lend the table to the rasterizer for the whole case."""
+    def turn(self) -> AbstractContextManager[None]:
+        """Lend the table to the rasterizer for as long as it is measured."""
         return self._train.holding()
 
     def fused_l1(self) -> None:
@@ -189,10 +185,11 @@ def _take_turns(
         for contender, times in zip(contenders, seconds, strict=True):
             # idle threads of the one before may still be spinning on our cores
             time.sleep(_SETTLE_S)
-            for fused in LOSSES:
-                times[fused] += timed([getattr(contender, fused)], turn)[0]
-            clock_ghz = max(clock_ghz, core_clock_ghz())
-            forward, backward = timed([contender.forward, contender.backward], turn)
+            with contender.turn():
+                for fused in LOSSES:
+                    times[fused] += timed([getattr(contender, fused)], turn)[0]
+                clock_ghz = max(clock_ghz, core_clock_ghz())
+                forward, backward = timed([contender.forward, contender.backward], turn)
             times["forward"] += forward
             times["backward"] += backward
     return seconds, clock_ghz

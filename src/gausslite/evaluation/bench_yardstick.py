@@ -7,6 +7,8 @@ pixels. It exports gl_new, gl_free, gl_setup, gl_forward, gl_set_grad, gl_backwa
 from __future__ import annotations
 
 import ctypes
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -55,12 +57,19 @@ class Yardstick:
         intrinsics = (camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px)
         pose = view.T_camera_world
         self._camera = np.concatenate([pose[:3, :3].ravel(), pose[:3, 3], intrinsics]).astype(np.float32)
-        self._handle = ctypes.c_void_p(self._lib.gl_new(threads))
-        self._lib.gl_setup(self._handle, self._camera.ctypes.data, camera.width_px, camera.height_px, None, 0)
+        self._size_px = camera.width_px, camera.height_px
+        self._threads = threads
+        self._handle = ctypes.c_void_p()
 
-    def close(self) -> None:
-        """End its threads and free its memory."""
-        self._lib.gl_free(self._handle)
+    @contextmanager
+    def turn(self) -> Iterator[None]:
+        """Its threads and memory, for as long as it is measured: idle threads may wake now and then at our cost."""
+        self._handle = ctypes.c_void_p(self._lib.gl_new(self._threads))
+        try:
+            self._lib.gl_setup(self._handle, self._camera.ctypes.data, *self._size_px, None, 0)
+            yield
+        finally:
+            self._lib.gl_free(self._handle)
 
     def fused_l1(self) -> None:
         """One whole iteration with L1 on colour and depth."""
