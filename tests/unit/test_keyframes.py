@@ -6,8 +6,9 @@ import numpy as np
 from mapping_scenes import middle_relevance, wall_frame
 
 from gausslite.domain.relevance import RelevanceMap
+from gausslite.mapping.baselines import uniform_policy
 from gausslite.mapping.keyframes import Keyframe, KeyframeStore, tiles_of, window_view
-from gausslite.mapping.settings import KeyframeSettings
+from gausslite.mapping.settings import Components, KeyframeSettings
 from gausslite.render.cpu import CpuRasterizer
 
 
@@ -48,6 +49,19 @@ def test_a_frame_without_the_region_is_kept_at_its_turn_only() -> None:
     for index in range(9):
         store.offer(window_view(Keyframe(wall_frame(index), RelevanceMap.nothing(48, 64)), rasterizer, settings))
     assert [view.keyframe.frame.index for view in store.window] == [0, 4, 8]
+
+
+def test_a_policy_that_follows_no_task_keeps_as_many_views_of_anything() -> None:
+    settings, rasterizer = KeyframeSettings(every=8, window=2, region_views=6), CpuRasterizer(threads=1)
+    store = KeyframeStore(settings, follows_task=False)
+    for index in range(40):
+        store.offer(window_view(Keyframe(wall_frame(index), RelevanceMap.nothing(48, 64)), rasterizer, settings))
+    kept = [view.keyframe.frame.index for view in store.window]
+    assert kept == [view.keyframe.frame.index for view in stored(settings, 40).window]
+    store.revise(store.window[0])
+    assert [view.keyframe.frame.index for view in store.window] == kept
+    assert not uniform_policy().components.follow_task
+    assert Components(sb=False, roi=False, sis=False).follow_task
 
 
 def test_a_view_of_the_region_goes_once_it_turns_out_not_to_show_it() -> None:

@@ -112,11 +112,13 @@ def tiles_of(region: Bool[ndarray, "h w"], margin_px: int) -> Bool[ndarray, "th 
 class KeyframeStore:
     """Every `every`th mapped frame; the latest `window` are ready to train on, at most `buffer` are remembered.
 
-    Beside them `region_views` frames that show the task's region are ready to train on, whenever they were mapped.
+    Beside them `region_views` frames are ready to train on, whenever they were mapped: those that show the task's
+    region, or any, for a policy that follows no task and would have fewer views otherwise.
     """
 
-    def __init__(self, settings: KeyframeSettings) -> None:
+    def __init__(self, settings: KeyframeSettings, follows_task: bool = True) -> None:
         self._settings = settings
+        self._follows_task = follows_task
         self._latest: list[WindowView] = []
         self._region: list[WindowView] = []
         self._buffer: list[Keyframe] = []
@@ -140,7 +142,7 @@ class KeyframeStore:
         settings = self._settings
         due = self._offered % settings.every == 0
         self._offered += 1
-        if view.shows_region:
+        if self._counts(view):
             self._keep_for_region([*self._region, view])
         if not due:
             return
@@ -155,7 +157,7 @@ class KeyframeStore:
         A frame that turns out not to show the region stays only as one of the most recent keyframes.
         """
         revised = [view if _same_frame(old.keyframe, view.keyframe) else old for old in self._region]
-        self._region = [each for each in revised if each.shows_region or not each.keyframe.judged]
+        self._region = [each for each in revised if self._counts(each) or not each.keyframe.judged]
         self._latest = [view if _same_frame(old.keyframe, view.keyframe) else old for old in self._latest]
         self._buffer = [view.keyframe if _same_frame(old, view.keyframe) else old for old in self._buffer]
 
@@ -229,6 +231,10 @@ class KeyframeStore:
         self._region = [views[place] for place in region]
         self._buffer = [keyframes[place] for place in buffer]
         [self._offered] = take_counts(state, "offered", 1)
+
+    def _counts(self, view: WindowView) -> bool:
+        """True for a frame that may stay ready to train on beyond its turn among the latest."""
+        return view.shows_region or not self._follows_task
 
     def _held(self) -> list[Keyframe]:
         """Every keyframe once, the buffer's first."""

@@ -63,7 +63,7 @@ class GaussianMapper:
         if known is not None:
             self._table.append(known)
         self._seeder = Seeder(settings.seeding, settings.components, self._rng)
-        self._keyframes = KeyframeStore(settings.keyframes)
+        self._keyframes = KeyframeStore(settings.keyframes, settings.components.follow_task)
         self._refiner = ViewRefiner(settings.view_prior, self.render, settings.keyframes.refits)
         self._trainer = Trainer(settings, self._table, rasterizer, self._rng)
         self._extent_m = 0.0

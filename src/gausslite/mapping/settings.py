@@ -29,6 +29,11 @@ class Components:
     gfd: bool = True
     """Gradient-focused densification: seeds prefer image edges."""
 
+    @property
+    def follow_task(self) -> bool:
+        """False where none of them asks for the task's region: the map is the same for every task."""
+        return self.sb or self.roi or self.sis or self.gfd
+
 
 class ActivePhase(StrEnum):
     """What an active-phase iteration draws and moves; its loss is masked to the region in every case."""
@@ -89,8 +94,9 @@ class SeedingSettings:
 class KeyframeSettings:
     """Which frames are kept to train on: every `every`th, the `window` latest of them, and `buffer` of the mission.
 
-    region_views: of all frames that show the task's region so many more stay ready to train on, spread over the
-    mission; 0 is the paper's window. Each takes as much memory as a frame of the window.
+    region_views: of all frames that show the task's region (of all frames, where no component follows a task) so many
+    more stay ready to train on, spread over the mission; 0 is the paper's window. Each takes as much memory as a frame
+    of the window.
     surroundings_weight, 0 to 1: what pixels beside the region count in the active phase's loss, in the tiles that it
     draws anyway; 0 is the paper's binary mask, which lets what stands beside the region move as it likes.
     refits: where views may be wrong (`MapperSettings.view_prior`) so many of those ready to train on are fitted to the

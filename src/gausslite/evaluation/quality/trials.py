@@ -107,9 +107,7 @@ class Trial:
     @property
     def follows_task(self) -> bool:
         """False where nothing in the policy asks for the task's region: its map is the same for every task."""
-        components = self.mission.mapper_settings().components
-        follows = components.sb or components.roi or components.sis or components.gfd
-        return self.variant.policy == TASK and follows
+        return self.variant.policy == TASK and self.mission.mapper_settings().components.follow_task
 
     @property
     def key(self) -> str:
