@@ -187,6 +187,8 @@ def test_the_board_knows_means_spreads_and_margins() -> None:
     table = quality_table(board)
     for text in ("27.00 ± 1.00", "+2.50", "not computed", "ahead of the best other in 1 of 1", "1.1%", "| 28.00 |"):
         assert text in table
+    assert "by +2.50 dB inside the mask on average and by +0.00 dB over the full image with views fitted." in table
+    assert "| 28.00 ± 1.00 | 25.50 ± 0.00 | +2.50 | +0.00 |" in table
     (summary,) = board.as_json()["summary"]
     assert (summary["ahead_in"], summary["scenes"]) == (1, 1)
 

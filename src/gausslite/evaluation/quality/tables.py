@@ -42,6 +42,7 @@ FITTED_METRICS = (
     Metric("PSNR, views fitted↑", "roi_psnr", 2, fitted=True),
     Metric("PSNR, views fitted↑", "full_psnr", 2, fitted=True),
 )
+RAW_PSNR = (ROI_METRICS[0], FULL_METRICS[0])
 _NOT_COMPUTED = "not computed"
 
 
@@ -92,6 +93,10 @@ class Scoreboard:
         known = [other.mean for other in others if other is not None]
         return ours.mean - max(known) if ours is not None and known else None
 
+    def margins(self, metric: Metric, budget: Budget) -> list[float]:
+        """Of the scenes that have the figure."""
+        return [m for scene in self.scenes if (m := self.margin(scene, metric, budget)) is not None]
+
     def roi_share(self, scene: str) -> float:
         """Share of the held-out views' pixels in the region."""
         return next(each.result.roi_share for each in self._finished if each.trial.plan.name == scene)
@@ -140,11 +145,8 @@ class Scoreboard:
         return {"scene": scene, "task": self.task(scene), "roi_share": self.roi_share(scene), "results": results}
 
     def _summary(self, budget: Budget) -> dict[str, object]:
-        margins = {
-            metric.name: [self.margin(scene, metric, budget) for scene in self.scenes]
-            for metric in (ROI_METRICS[0], ROI_METRICS[1], FULL_METRICS[0], *FITTED_METRICS)
-        }
-        known = {name: [m for m in listed if m is not None] for name, listed in margins.items()}
+        metrics = (*RAW_PSNR, ROI_METRICS[1], *FITTED_METRICS)
+        known = {metric.name: self.margins(metric, budget) for metric in metrics}
         return {
             "equal": str(budget.equal),
             "ahead_in": sum(margin > 0 for margin in known["roi_psnr"]),
@@ -165,9 +167,11 @@ def quality_table(board: Scoreboard) -> str:
             "Over the full image:",
             _by_place(board, (*FULL_METRICS, *fitted[1:]), budget),
             "Pair by pair, ROI PSNR in dB (mean ± spread over the seeds):",
-            _by_scene(board, budget),
-            _in_words(board, budget),
+            _by_scene(board, RAW_PSNR, budget),
         ]
+        if fitted:
+            blocks += ["The same with each view's pose and colours fitted:", _by_scene(board, FITTED_METRICS, budget)]
+        blocks.append(_in_words(board, budget))
     return "\n\n".join(blocks) + "\n"
 
 
@@ -211,12 +215,12 @@ def _by_place(board: Scoreboard, metrics: Sequence[Metric], budget: Budget) -> s
     return _markdown(rows)
 
 
-def _by_scene(board: Scoreboard, budget: Budget) -> str:
-    psnr, full = ROI_METRICS[0], FULL_METRICS[0]
+def _by_scene(board: Scoreboard, roi_and_full: tuple[Metric, Metric], budget: Budget) -> str:
+    roi, _ = roi_and_full
     rows = [["pair", "task", "ROI", *board.variants, "margin", "full margin"]]
     for scene in board.scenes:
-        cells = [_text(board.figure(scene, variant, psnr, budget), psnr) for variant in board.variants]
-        margins = [board.margin(scene, metric, budget) for metric in (psnr, full)]
+        cells = [_text(board.figure(scene, variant, roi, budget), roi) for variant in board.variants]
+        margins = [board.margin(scene, metric, budget) for metric in roi_and_full]
         signed = ["" if margin is None else f"{margin:+.2f}" for margin in margins]
         rows.append([scene, board.task(scene), f"{board.roi_share(scene):.1%}", *cells, *signed])
     return _markdown(rows)
@@ -224,13 +228,14 @@ def _by_scene(board: Scoreboard, budget: Budget) -> str:
 
 def _in_words(board: Scoreboard, budget: Budget) -> str:
     lines = []
-    margins = [m for scene in board.scenes if (m := board.margin(scene, ROI_METRICS[0], budget)) is not None]
-    if margins:
-        full = [m for scene in board.scenes if (m := board.margin(scene, FULL_METRICS[0], budget)) is not None]
-        lines.append(
-            f"`{board.variants[0]}` is ahead of the best other in {sum(m > 0 for m in margins)} of {len(margins)}, "
-            f"by {fmean(margins):+.2f} dB inside the mask on average and by {fmean(full):+.2f} dB over the full image."
-        )
+    for (roi, full), how in ((RAW_PSNR, ""), (FITTED_METRICS, " with views fitted")):
+        margins, beside = board.margins(roi, budget), board.margins(full, budget)
+        if margins:
+            ahead = f"{sum(m > 0 for m in margins)} of {len(margins)}"
+            lines.append(
+                f"`{board.variants[0]}` is ahead of the best other in {ahead}, by {fmean(margins):+.2f} dB inside the "
+                f"mask on average and by {fmean(beside):+.2f} dB over the full image{how}."
+            )
     for variant in board.variants:
         iterations, ms = board.cost(variant, budget)
         lines.append(f"`{variant}`: {iterations:.1f} iterations and {ms:.0f} ms a frame.")
