@@ -47,6 +47,7 @@ class Wall:
     count: int = 8
     name: str = "wall"
     up_axis: tuple[float, float, float] = (0.0, -1.0, 0.0)
+    depth_registered: bool = True
     camera: Camera = CAMERA
     broken_at: int | None = None
     asked: list[int] = field(default_factory=list)

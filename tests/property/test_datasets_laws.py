@@ -27,6 +27,7 @@ class Numbered:
     name = "numbered"
     camera = Camera(1.0, 1.0, 1.0, 1.0, 2, 2)
     up_axis = (0.0, 0.0, 1.0)
+    depth_registered = True
 
     def __init__(self, numbers: list[int]) -> None:
         self._numbers = numbers
