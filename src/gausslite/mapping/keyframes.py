@@ -126,8 +126,8 @@ class KeyframeStore:
 
     @property
     def window(self) -> tuple[WindowView, ...]:
-        """What is ready to train on: the views of the region that are no longer or never were among the most recent
-        keyframes, and those, each oldest first.
+        """What is ready to train on: the views kept for the mission that are no longer or never were among the most
+        recent keyframes, and those, each oldest first.
         """
         latest = {id(view.keyframe) for view in self._latest}
         return (*(view for view in self._region if id(view.keyframe) not in latest), *self._latest)
@@ -142,7 +142,7 @@ class KeyframeStore:
         settings = self._settings
         due = self._offered % settings.every == 0
         self._offered += 1
-        if self._counts(view):
+        if self._may_stay(view):
             self._keep_for_region([*self._region, view])
         if not due:
             return
@@ -157,7 +157,7 @@ class KeyframeStore:
         A frame that turns out not to show the region stays only as one of the most recent keyframes.
         """
         revised = [view if _same_frame(old.keyframe, view.keyframe) else old for old in self._region]
-        self._region = [each for each in revised if self._counts(each) or not each.keyframe.judged]
+        self._region = [each for each in revised if self._may_stay(each) or not each.keyframe.judged]
         self._latest = [view if _same_frame(old.keyframe, view.keyframe) else old for old in self._latest]
         self._buffer = [view.keyframe if _same_frame(old, view.keyframe) else old for old in self._buffer]
 
@@ -232,7 +232,7 @@ class KeyframeStore:
         self._buffer = [keyframes[place] for place in buffer]
         [self._offered] = take_counts(state, "offered", 1)
 
-    def _counts(self, view: WindowView) -> bool:
+    def _may_stay(self, view: WindowView) -> bool:
         """True for a frame that may stay ready to train on beyond its turn among the latest."""
         return view.shows_region or not self._follows_task
 
