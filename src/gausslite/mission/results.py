@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import resource
+import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -17,12 +18,13 @@ _MAP, _REPORT = "map.ply", "report.json"
 
 
 def prepare_folder(folder: Path) -> None:
-    """Make the folder and check that it can be written, before hours of work. Raises StorageError."""
+    """Make the folder and check that it can be written, before hours of work. Raises StorageError.
+
+    The file of the check has no name of ours, so that programs that start together do not take it from each other.
+    """
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        probe = folder / ".gausslite-write-test"
-        probe.write_bytes(b"")
-        probe.unlink()
+        tempfile.TemporaryFile(dir=folder).close()
     except OSError as error:
         raise StorageError(f"{folder}: expected a folder that can be written, got {error.strerror}") from error
 

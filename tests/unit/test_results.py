@@ -1,0 +1,24 @@
+"""Folders for results: checked before hours of work, by any number of programs at once."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
+
+from gausslite.errors import StorageError
+from gausslite.mission.results import prepare_folder
+
+
+def test_programs_that_start_together_share_a_new_folder(tmp_path: Path) -> None:
+    folder = tmp_path / "new" / "out"
+    with ThreadPoolExecutor(8) as programs:
+        list(programs.map(prepare_folder, [folder] * 2000))
+    assert not list(folder.iterdir())
+
+
+def test_what_cannot_hold_results_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "file").write_bytes(b"")
+    with pytest.raises(StorageError, match="file: expected a folder that can be written"):
+        prepare_folder(tmp_path / "file")
