@@ -11,6 +11,7 @@ from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from gausslite.cli.main import main
@@ -56,8 +57,6 @@ def test_the_words_of_a_task_mean_its_objects(pair) -> None:
 
 
 def test_a_task_is_about_things_that_are_there() -> None:
-    import numpy as np
-
     names = {item.name for item in HOMES[PLAN.pair.home - 1].furnish(np.random.default_rng(0))}
     for pair in choose_pairs([f"home-{PLAN.pair.home}"]):
         assert set(pair.objects) <= names
@@ -169,8 +168,21 @@ def test_what_is_finished_is_recalled_unless_lpips_is_wanted(tmp_path: Path) -> 
     assert archive.recall(one.trial, with_lpips=False) == one.result
     assert archive.recall(one.trial, with_lpips=True) is None
     assert archive.recall(replace(one.trial, seed=1), with_lpips=False) is None
-    (record,) = (tmp_path / "trials").glob("*.json")
-    record.write_text("{}")
+
+
+def test_a_trial_whose_picture_is_gone_is_not_kept(tmp_path: Path) -> None:
+    archive, one = Archive(tmp_path), finished(TASK, 0, 25.0, Budget())
+    archive.keep(one.trial, one.result, {position: np.zeros((72, 96, 3), np.uint8) for position in (0, 2)})
+    assert archive.recall(one.trial, with_lpips=False) == one.result
+    next((tmp_path / "trials").glob("*-view-002.png")).unlink()
+    assert archive.recall(one.trial, with_lpips=False) is None
+
+
+@pytest.mark.parametrize("record", ["{}", "[]", "1", "", '{"result": {}, "pictures": []}'])
+def test_what_is_no_record_is_not_recalled(record: str, tmp_path: Path) -> None:
+    archive, one = Archive(tmp_path), finished(TASK, 0, 25.0, Budget())
+    archive.keep(one.trial, one.result, {})
+    next((tmp_path / "trials").glob("*.json")).write_text(record)
     assert archive.recall(one.trial, with_lpips=False) is None
 
 
@@ -241,6 +253,9 @@ def test_the_command_measures_keeps_and_resumes(tmp_path: Path, capsys: pytest.C
     again = capsys.readouterr()
     assert again.err.count("(kept)") == 2
     assert json.loads((tmp_path / "quality.json").read_text())["scenes"] == report["scenes"]
+    next((tmp_path / "trials").glob("home-8-manipulation-task-*.png")).unlink()
+    assert main([*command, "--seeds", "0,1"]) == 0
+    assert capsys.readouterr().err.count("(kept)") == 1
 
 
 def test_a_map_is_made_once_for_all_tasks_that_it_does_not_know(tmp_path: Path) -> None:

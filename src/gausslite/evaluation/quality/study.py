@@ -80,18 +80,25 @@ class Archive:
             prepare_folder(part)
 
     def recall(self, trial: Trial, with_lpips: bool) -> TrialResult | None:
-        """The result of a finished trial; None when there is none, or one without the LPIPS that is wanted now."""
+        """The result of a finished trial; None when there is none, one whose pictures are gone, or one without the
+        LPIPS that is wanted now.
+        """
         try:
-            result = TrialResult.from_json(json.loads(self._record(trial).read_text())["result"])
-        except (OSError, ValueError, KeyError, GaussLiteError):
+            record = json.loads(self._record(trial).read_text())
+            result = TrialResult.from_json(record["result"])
+            pictures = [self._picture(trial, position) for position in record["pictures"]]
+        except (OSError, ValueError, KeyError, TypeError, GaussLiteError):
             return None
-        return None if with_lpips and result.scores.full_lpips is None else result
+        if with_lpips and result.scores.full_lpips is None:
+            return None
+        return result if all(picture.is_file() for picture in pictures) else None
 
     def keep(self, trial: Trial, result: TrialResult, pictures: Pictures) -> None:
         """Write a finished trial, its record last. Raises StorageError."""
         for position, picture in pictures.items():
             write_png(self._picture(trial, position), picture)
-        write_json(self._record(trial), {"settings": _summary(trial), "result": result.as_json()})
+        record = {"settings": _summary(trial), "pictures": sorted(pictures), "result": result.as_json()}
+        write_json(self._record(trial), record)
 
     def draw_sheets(self, trials: Sequence[Trial], scene: Scene) -> None:
         """Write ground truth and these trials' maps side by side, with crops of the region. Raises StorageError."""
@@ -106,7 +113,7 @@ class Archive:
         path = self._picture(trial, position)
         image = cv2.imread(str(path), cv2.IMREAD_COLOR)
         if image is None:
-            raise StorageError(f"{path}: expected a kept picture; remove the folder to draw it again")
+            raise StorageError(f"{path}: expected a kept picture; remove it, and its trial is made again")
         return np.ascontiguousarray(image[..., ::-1]).astype(np.float32) / np.float32(255.0)
 
     def _record(self, trial: Trial) -> Path:
