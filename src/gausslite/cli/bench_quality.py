@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import shlex
 import sys
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -23,9 +24,9 @@ from gausslite.evaluation.quality.scenes import (
     choose_kinds,
     real_plans,
 )
-from gausslite.evaluation.quality.study import Archive, Study, run_study
+from gausslite.evaluation.quality.study import Archive, Finished, Origin, Study, expected_origins, run_study
 from gausslite.evaluation.quality.tables import Scoreboard, ablation_table, quality_table
-from gausslite.evaluation.quality.trials import Budget, Conditions, Equal, Eyes, Trial, TrialResult, Variant
+from gausslite.evaluation.quality.trials import Budget, Conditions, Equal, Eyes, Variant
 from gausslite.mapping.policies import POLICIES
 from gausslite.mission.build import open_networks
 from gausslite.mission.options import COLOUR_CAMERA_HELP, COLOUR_CAMERA_METAVAR, add_view_error, names, up_axis
@@ -97,6 +98,7 @@ def _add_common(parser: argparse.ArgumentParser, seeds: tuple[int, ...], equal: 
     )
     shown = ",".join(str(seed) for seed in seeds)
     add("--out", metavar="DIR", type=Path, required=True, help="gets tables and sheets; finished trials there are kept")
+    add("--reuse-other-code", action="store_true", help="take finished trials of other code too (default: made again)")
     add("--seeds", metavar="N,...", type=whole_numbers, default=seeds, help=f"seeds of the mapper (default: {shown})")
     add("--size", metavar="WxH", type=size, default=(320, 240), help="image size (default: 320x240)")
     add("--frames", metavar="N", type=int, help="training frames (default: 60 in a home, all of a real sequence)")
@@ -214,8 +216,22 @@ def _run(study: Study, options: argparse.Namespace) -> Scoreboard:
 
         perceptual = load_lpips(options.lpips_weights)
     archive = Archive(options.out)
+    _warn_of_other_code(expected_origins(study, archive, perceptual is not None, options.reuse_other_code))
     with _StudyBar(study.count) as bar:
-        return Scoreboard(run_study(study, archive, perceptual, bar))
+        finished = run_study(study, archive, perceptual, bar, options.reuse_other_code)
+    origins = Counter(each.origin for each in finished)
+    print(f"trials: {', '.join(f'{count} {origin}' for origin, count in origins.items())}", file=sys.stderr)
+    return Scoreboard(finished)
+
+
+def _warn_of_other_code(expected: Counter[Origin]) -> None:
+    """Before hours of work: whoever knows that the code's change leaves the figures alone can stop and keep them."""
+    if again := expected[Origin.MADE_AGAIN]:
+        line = f"{again} finished trials of other code will be made again; --reuse-other-code takes them as they are"
+        print(line, file=sys.stderr)
+    if reused := expected[Origin.KEPT_OF_OTHER_CODE]:
+        line = f"{reused} finished trials of other code are taken as they are: figures may not compare"
+        print(line, file=sys.stderr)
 
 
 class _StudyBar:
@@ -248,12 +264,12 @@ class _StudyBar:
         text = f"frame {self._frames}, {gaussians / 1e3:.1f}k Gaussians"
         self._bar.set_postfix_str(text, refresh=self._on_terminal)
 
-    def finished(self, trial: Trial, result: TrialResult, kept: bool) -> None:
+    def finished(self, done: Finished) -> None:
         """Leave the trial's figures on the screen."""
         self._frames = 0
-        scores = result.scores
+        trial, scores = done.trial, done.result.scores
         roi = "no view shows the region" if scores.roi_psnr is None else f"ROI {scores.roi_psnr:.2f} dB"
-        how = " (kept)" if kept else ""
+        how = "" if done.origin is Origin.MADE else f" ({done.origin})"
         self._bar.write(
             f"{trial.plan.name} {trial.variant.label} equal {trial.budget.equal} seed {trial.seed}: "
             f"{roi}, full {scores.full_psnr:.2f} dB{how}",

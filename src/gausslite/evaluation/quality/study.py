@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from enum import StrEnum
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
@@ -15,6 +17,7 @@ from numpy import ndarray
 from gausslite.errors import GaussLiteError, StorageError
 from gausslite.evaluation.compare import PerceptualDistance
 from gausslite.evaluation.pictures import comparison_sheet, write_png
+from gausslite.evaluation.quality.fingerprint import code_fingerprint
 from gausslite.evaluation.quality.scenes import Scene, ScenePlan
 from gausslite.evaluation.quality.trials import (
     PICTURES,
@@ -32,6 +35,15 @@ from gausslite.evaluation.views import most_telling
 from gausslite.mission.results import prepare_folder, write_json
 
 
+class Origin(StrEnum):
+    """How a study came by a trial's result."""
+
+    MADE = "made"
+    MADE_AGAIN = "made again, as other code had made the kept one"
+    KEPT = "kept"
+    KEPT_OF_OTHER_CODE = "kept, made by other code"
+
+
 @runtime_checkable
 class Watcher(Protocol):
     """Is told how a study goes on."""
@@ -40,8 +52,8 @@ class Watcher(Protocol):
         """A frame was mapped."""
         ...
 
-    def finished(self, trial: Trial, result: TrialResult, kept: bool) -> None:
-        """A trial has its result; kept says that it had it before."""
+    def finished(self, done: Finished) -> None:
+        """A trial has its result."""
         ...
 
 
@@ -70,6 +82,28 @@ class Study:
         return len(self.plans) * len(self.budgets) * len(self.seeds) * len(self.variants)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Finished:
+    """A trial, what it gave, and whether that was known before."""
+
+    trial: Trial
+    result: TrialResult
+    origin: Origin
+
+    @property
+    def of_other_code(self) -> bool:
+        """Whether its figures are of other code than this program's."""
+        return self.origin is Origin.KEPT_OF_OTHER_CODE
+
+
+@dataclass(frozen=True, slots=True)
+class Kept:
+    """A result from an archive, and the fingerprint of the code that gave it."""
+
+    result: TrialResult
+    code: str
+
+
 class Archive:
     """A folder of finished trials: in trials/ a record each and what its map looked like, in sheets/ comparisons."""
 
@@ -79,25 +113,30 @@ class Archive:
         for part in (self._trials, self._sheets):
             prepare_folder(part)
 
-    def recall(self, trial: Trial, with_lpips: bool) -> TrialResult | None:
-        """The result of a finished trial; None when there is none, one whose pictures are gone, or one without the
-        LPIPS that is wanted now.
+    def recall(self, trial: Trial, with_lpips: bool) -> Kept | None:
+        """The result of a finished trial, whatever code gave it; None when there is none, one whose pictures are gone,
+        or one without the LPIPS that is wanted now.
         """
         try:
             record = json.loads(self._record(trial).read_text())
-            result = TrialResult.from_json(record["result"])
+            kept = Kept(TrialResult.from_json(record["result"]), str(record["code"]))
             pictures = [self._picture(trial, position) for position in record["pictures"]]
         except (OSError, ValueError, KeyError, TypeError, GaussLiteError):
             return None
-        if with_lpips and result.scores.full_lpips is None:
+        if with_lpips and kept.result.scores.full_lpips is None:
             return None
-        return result if all(picture.is_file() for picture in pictures) else None
+        return kept if all(picture.is_file() for picture in pictures) else None
 
     def keep(self, trial: Trial, result: TrialResult, pictures: Pictures) -> None:
-        """Write a finished trial, its record last. Raises StorageError."""
+        """Write a trial that this program finished, its record last. Raises StorageError."""
         for position, picture in pictures.items():
             write_png(self._picture(trial, position), picture)
-        record = {"settings": _summary(trial), "pictures": sorted(pictures), "result": result.as_json()}
+        record = {
+            "settings": _summary(trial),
+            "code": code_fingerprint(),
+            "pictures": sorted(pictures),
+            "result": result.as_json(),
+        }
         write_json(self._record(trial), record)
 
     def draw_sheets(self, trials: Sequence[Trial], scene: Scene) -> None:
@@ -123,14 +162,6 @@ class Archive:
         return self._trials / f"{trial.key}-view-{position:03d}.png"
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Finished:
-    """A trial and what it gave."""
-
-    trial: Trial
-    result: TrialResult
-
-
 class _Shelf:
     """Maps that know no task, kept for the other tasks in the same place: what is judged again is not made again."""
 
@@ -154,26 +185,49 @@ class _Shelf:
 
 
 def run_study(
-    study: Study, archive: Archive, perceptual: PerceptualDistance | None, watcher: Watcher
+    study: Study,
+    archive: Archive,
+    perceptual: PerceptualDistance | None,
+    watcher: Watcher,
+    reuse_other_code: bool = False,
 ) -> list[Finished]:
-    """Run what is not finished yet. A scene's frames are made only if one of its trials needs them."""
+    """Run what is not finished yet. A scene's frames are made only if one of its trials needs them.
+
+    What other code finished is made again, unless it may be reused.
+    """
     finished, shelf = [], _Shelf()
     for plan in study.plans:
         scene: Scene | None = None
         shelf.enter(plan)
         for trial in study.trials(plan):
-            result = archive.recall(trial, perceptual is not None)
-            kept = result is not None
-            if result is None:
+            kept, origin = _look_up(trial, archive, perceptual is not None, reuse_other_code)
+            if kept is not None:
+                result = kept.result
+            else:
                 scene = plan.load(study.conditions.size) if scene is None else scene
                 made = shelf.take(trial, scene, watcher)
                 result, pictures = judge_map(made, trial, scene, perceptual)
                 archive.keep(trial, result, pictures)
-            finished.append(Finished(trial, result))
-            watcher.finished(trial, result, kept)
+            finished.append(Finished(trial, result, origin))
+            watcher.finished(finished[-1])
         if scene is not None:
             archive.draw_sheets(study.trials(plan)[: len(study.variants)], scene)
     return finished
+
+
+def expected_origins(study: Study, archive: Archive, with_lpips: bool, reuse_other_code: bool) -> Counter[Origin]:
+    """How many trials run_study would make and how many it would take from the archive."""
+    trials = (trial for plan in study.plans for trial in study.trials(plan))
+    return Counter(_look_up(trial, archive, with_lpips, reuse_other_code)[1] for trial in trials)
+
+
+def _look_up(trial: Trial, archive: Archive, with_lpips: bool, reuse_other_code: bool) -> tuple[Kept | None, Origin]:
+    kept = archive.recall(trial, with_lpips)
+    if kept is None:
+        return None, Origin.MADE
+    if kept.code == code_fingerprint():
+        return kept, Origin.KEPT
+    return (kept, Origin.KEPT_OF_OTHER_CODE) if reuse_other_code else (None, Origin.MADE_AGAIN)
 
 
 def _summary(trial: Trial) -> Mapping[str, object]:

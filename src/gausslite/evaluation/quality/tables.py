@@ -73,6 +73,13 @@ class Scoreboard:
         """Whether views were scored fitted too."""
         return any(each.result.fitted is not None for each in self._finished)
 
+    @property
+    def notes(self) -> list[str]:
+        """What a reader must know first: that trials of other code are among them."""
+        others, count = sum(each.of_other_code for each in self._finished), len(self._finished)
+        text = f"**{others} of these {count} trials were made by other code: their figures may not compare.**"
+        return [text] if others else []
+
     def figure(self, scene: str, variant: str, metric: Metric, budget: Budget) -> Figure | None:
         """Over the seeds; None where no trial has it."""
         results = [each.result for each in self._of(scene, variant, budget)]
@@ -137,7 +144,7 @@ class Scoreboard:
                         "equal": str(budget.equal),
                         **{name: None if figure is None else asdict(figure) for name, figure in figures.items()},
                         "trials": [
-                            {"seed": each.trial.seed, **each.result.as_json()}
+                            {"seed": each.trial.seed, "other_code": each.of_other_code, **each.result.as_json()}
                             for each in self._of(scene, variant, budget)
                         ],
                     }
@@ -157,7 +164,7 @@ class Scoreboard:
 
 def quality_table(board: Scoreboard) -> str:
     """The comparison of policies: by place as in the paper's Replica table, then pair by pair, then the sum of it."""
-    blocks = []
+    blocks = board.notes
     fitted = FITTED_METRICS if board.has_fitted else ()
     for budget in board.budgets:
         blocks += [
@@ -177,7 +184,7 @@ def quality_table(board: Scoreboard) -> str:
 
 def ablation_table(board: Scoreboard) -> str:
     """One row a component, ROI and full PSNR at every budget, scene by scene and on average, fitted too where asked."""
-    blocks = []
+    blocks = board.notes
     for scene in board.scenes:
         title = f"## {scene}: {board.task(scene)} (ROI {board.roi_share(scene):.1%})"
         blocks += [title, _by_component(board, [scene])]

@@ -1,0 +1,42 @@
+"""Tell one state of the code from another: figures are compared only where the same code gave them."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+from collections.abc import Sequence
+from importlib.util import find_spec
+from pathlib import Path
+
+import gausslite
+
+_PACKAGE = Path(gausslite.__file__).parent
+_NEVER_ENTERED = ("cli", "fusion", "v1", "wire")
+"""Rooms that a trial has no business in: a change there is none of its result."""
+
+
+@functools.cache
+def code_fingerprint() -> str:
+    """Of this package's sources and kernels as they lie on disk when it is first asked for.
+
+    Other libraries are not in it, nor is the processor. Read once: a program goes on with the code it started with.
+    """
+    return fingerprint(deciding_files())
+
+
+def fingerprint(files: Sequence[Path]) -> str:
+    """A short text that changes with every byte of these files, their names and their order."""
+    digest = hashlib.sha256()
+    for path in files:
+        content = path.read_bytes()
+        digest.update(f"{path.name} {len(content)}\n".encode() + content)
+    return digest.hexdigest()[:16]
+
+
+def deciding_files() -> list[Path]:
+    """All that a trial may run, in an order that is the same everywhere."""
+    sources = [path for path in _PACKAGE.rglob("*.py") if path.relative_to(_PACKAGE).parts[0] not in _NEVER_ENTERED]
+    sources.sort(key=lambda path: path.relative_to(_PACKAGE).as_posix())
+    # an editable install keeps the kernels elsewhere than the sources
+    kernels = find_spec("gausslite.render._kernels")
+    return sources if kernels is None or kernels.origin is None else [*sources, Path(kernels.origin)]
