@@ -80,10 +80,17 @@ def test_the_three_maps_get_the_same_frames_after_the_change() -> None:
     bench = RetaskBench(settings, before=3, after=3, views=3, size=(96, 72), check_every=2)
     found = bench.run(CHANGE)
     assert set(found.points) == {CHANGED, RESTARTED, ALWAYS}
-    assert all([when for when, _ in line] == [0.25, 0.5] for line in found.points.values())
+    assert all([when for when, _ in line] == [0.25, 0.5, 0.75] for line in found.points.values())
     # keyframes, and views kept because they showed the first task's region
     assert found.reread == found.most_reread == 2
     json.dumps(found.as_json())
+
+
+@pytest.mark.parametrize(("after", "looks"), [(1, [0.25]), (2, [0.25, 0.5]), (4, [0.25, 1.0])])
+def test_the_first_and_the_last_frame_are_looked_at(after: int, looks: list[float]) -> None:
+    settings = MissionSettings(max_gaussians=500, iterations=1, threads=1)
+    found = RetaskBench(settings, before=1, after=after, views=3, size=(64, 48)).run(CHANGE)
+    assert all([when for when, _ in line] == looks for line in found.points.values())
 
 
 def test_a_single_look_is_seen_in_the_picture() -> None:

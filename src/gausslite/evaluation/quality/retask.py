@@ -56,7 +56,8 @@ class TaskChange:
 class RetaskBench:
     """What every map gets: `before` frames for the first task (the restarted one has none), then `after` more.
 
-    A frame is 1 / rate_hz seconds of mapping; every check_every frames the maps are looked at.
+    A frame is 1 / rate_hz seconds of mapping; the maps are looked at after the first frame, the last, and every
+    check_every frames.
     """
 
     settings: MissionSettings
@@ -87,12 +88,13 @@ class RetaskBench:
         loops = {CHANGED: changed, RESTARTED: restarted, ALWAYS: always}
         points: dict[str, list[tuple[float, float]]] = {name: [] for name in loops}
         reread = seeded = most_reread = most_seeded = 0
-        for done, frame in enumerate(scene.training[self.before :], start=1):
+        later = scene.training[self.before :]
+        for done, frame in enumerate(later, start=1):
             for name, loop in loops.items():
                 outcome = loop.process(frame)
                 reread, most_reread = reread + outcome.reread.keyframes, max(most_reread, outcome.reread.keyframes)
                 seeded, most_seeded = seeded + outcome.reread.seeded, max(most_seeded, outcome.reread.seeded)
-                if done == 1 or done % self.check_every == 0:
+                if done in (1, len(later)) or done % self.check_every == 0:
                     points[name].append((done / self.rate_hz, self._region_psnr(loop, scene)))
         return Recovery(change, points, reread, most_reread, seeded, most_seeded)
 
