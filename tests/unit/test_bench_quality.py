@@ -35,7 +35,7 @@ TASK, UNIFORM = Variant("task", "task"), Variant("uniform", "uniform")
 
 
 def scores(roi_psnr: float | None, full_psnr: float = 20.0) -> MapScores:
-    return MapScores(roi_psnr, 0.8, full_psnr, 0.7, 0.02, 1.0, 3, 2, 900, 0.03)
+    return MapScores(roi_psnr, 0.8, full_psnr, 0.7, 0.02, 0.938, 3, 2, 900, 0.03)
 
 
 def finished(variant: Variant, seed: int, roi_psnr: float, budget: Budget, plan: HomeScenePlan = PLAN) -> Finished:
@@ -251,6 +251,7 @@ def test_the_board_knows_means_spreads_and_margins() -> None:
     assert board.margin(PLAN.name, ROI_METRICS[0], budget) == pytest.approx(2.5)
     assert board.figure(PLAN.name, "task", FULL_METRICS[2], budget) is None
     table = quality_table(board)
+    assert "|  | covered [%]↑ | 93.8 | 93.8 |" in table
     for text in ("27.00 ± 1.00", "+2.50", "not computed", "ahead of the best other in 1 of 1", "1.1%", "| 28.00 |"):
         assert text in table
     assert "by +2.50 dB inside the mask on average and by +0.00 dB over the full image with views fitted." in table

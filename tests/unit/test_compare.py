@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from sample_gaussians import plain_gaussians
@@ -70,6 +72,20 @@ def test_an_empty_map_is_black_and_covers_nothing() -> None:
     assert scores.full_psnr == pytest.approx(psnr(np.zeros_like(frame.rgb), frame.rgb))
     assert scores.roi_covered == 0.0
     assert scores.roi_depth_l1_m is None
+
+
+def test_coverage_tells_the_left_half_of_a_map_from_the_whole_where_depth_was_measured() -> None:
+    whole = wall()
+    half = whole.take(whole.means_m[:, 0] < 0.0)
+    frame = frame_of(whole)
+    on_the_right = frame.depth_m * (np.arange(CAMERA.width_px, dtype=np.float32) >= 10)
+    view = HeldOutView(replace(frame, depth_m=on_the_right), np.ones(frame.depth_m.shape, np.bool_))
+    scores = [evaluate(gaussians, [view], ReferenceRasterizer()) for gaussians in (whole, half)]
+    assert scores[0].roi_covered == pytest.approx(1.0)
+    drawn = MapViewer(half, ReferenceRasterizer()).draw_frame(frame)
+    assert scores[1].roi_covered == pytest.approx((drawn.alpha[:, 10:] > 0.5).mean()) == pytest.approx(0.5, abs=0.1)
+    unmeasured = HeldOutView(replace(frame, depth_m=np.zeros_like(on_the_right)), view.roi)
+    assert evaluate(whole, [unmeasured], ReferenceRasterizer()).roi_covered is None
 
 
 def test_a_view_with_few_roi_pixels_counts_for_the_whole_image_only() -> None:

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gausslite.errors import InvalidInputError, ShapeError
-from gausslite.evaluation.metrics import depth_l1_m, psnr, ssim, ssim_map
+from gausslite.evaluation.metrics import covered_share, depth_l1_m, psnr, ssim, ssim_map
 
 
 def image(seed: int, height: int = 20, width: int = 24) -> np.ndarray:
@@ -79,6 +79,14 @@ def test_depth_error_counts_pixels_that_both_know() -> None:
     assert depth_l1_m(drawn, measured) == pytest.approx((0.5 + 0.25) / 2)
     assert depth_l1_m(drawn, measured, np.array([[False, True, True, True]])) == pytest.approx(0.25)
     assert depth_l1_m(drawn, measured, np.array([[False, True, True, False]])) is None
+
+
+def test_coverage_counts_the_measured_pixels_alone() -> None:
+    drawn = np.array([[1.0, 2.0, 0.0, 4.0]], np.float32)
+    measured = np.array([[1.5, 0.0, 3.0, 4.25]], np.float32)
+    assert covered_share(drawn, measured) == pytest.approx(2 / 3)
+    assert covered_share(drawn, measured, np.array([[False, True, True, True]])) == 0.5
+    assert covered_share(drawn, measured, np.array([[False, True, False, False]])) is None
 
 
 def test_images_that_do_not_match_are_refused() -> None:

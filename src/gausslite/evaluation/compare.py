@@ -18,7 +18,7 @@ from numpy import ndarray
 
 from gausslite.domain.gaussians import Gaussians
 from gausslite.errors import InvalidInputError
-from gausslite.evaluation.metrics import depth_l1_m, psnr, ssim_map
+from gausslite.evaluation.metrics import covered_share, depth_l1_m, psnr, ssim_map
 from gausslite.evaluation.views import MIN_ROI_PIXELS, HeldOutView, MapViewer
 from gausslite.render.rasterizer import Rasterizer, Rendering
 
@@ -36,12 +36,14 @@ class PerceptualDistance(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class RoiScore:
-    """One view's figures inside the region. covered: share of its pixels drawn with alpha above 0.5."""
+    """One view's figures inside the region. covered: share of its pixels with measured depth that the map draws, with
+    alpha above 0.5; depth error is known there alone.
+    """
 
     psnr: float
     ssim: float
     depth_l1_m: float | None
-    covered: float
+    covered: float | None
     lpips: float | None = None
 
 
@@ -60,7 +62,8 @@ class ViewScore:
 
 @dataclass(frozen=True, slots=True)
 class MapScores:
-    """Means over the views: PSNR in dB, depth in metres. None where no view has such a figure, or LPIPS had no weights.
+    """Means over the views: PSNR in dB, depth in metres, coverage a share. None where no view has such a figure, or
+    LPIPS had no weights.
 
     n_views and n_roi_views count the views behind the full and the ROI figures; roi_pixels sums the region's pixels
     over the latter.
@@ -99,7 +102,7 @@ def score_view(drawn: Rendering, view: HeldOutView, perceptual: PerceptualDistan
             psnr(drawn.rgb, rgb, view.roi),
             float(similarity[view.roi].mean()),
             depth_l1_m(depth_m, view.frame.depth_m, view.roi),
-            float((drawn.alpha[view.roi] > _COVERED_ALPHA).mean()),
+            covered_share(depth_m, view.frame.depth_m, view.roi),
             None if distance is None else float(distance[view.roi].mean()),
         )
     return ViewScore(
@@ -124,7 +127,7 @@ def average(scores: Sequence[ViewScore]) -> MapScores:
         full_psnr=fmean(score.psnr for score in scores),
         full_ssim=fmean(score.ssim for score in scores),
         roi_depth_l1_m=_mean_or_none(roi.depth_l1_m for roi in rois if roi.depth_l1_m is not None),
-        roi_covered=_mean_or_none(roi.covered for roi in rois),
+        roi_covered=_mean_or_none(roi.covered for roi in rois if roi.covered is not None),
         n_views=len(scores),
         n_roi_views=len(rois),
         roi_pixels=sum(score.roi_pixels for score in scores if score.roi is not None),

@@ -48,16 +48,35 @@ def ssim_map(a: Shaped[ndarray, "h w 3"], b: Shaped[ndarray, "h w 3"]) -> Float6
 def depth_l1_m(
     depth_m: Float32[ndarray, "h w"], measured_m: Float32[ndarray, "h w"], mask: Bool[ndarray, "h w"] | None = None
 ) -> float | None:
-    """Mean absolute depth difference in metres where both are positive; None where there is no such pixel."""
-    if depth_m.shape != measured_m.shape:
-        raise ShapeError(f"depth: expected the measured shape {measured_m.shape}, got {depth_m.shape}")
-    both = (depth_m > 0) & (measured_m > 0)
-    if mask is not None:
-        require_array("mask", mask, depth_m.shape, np.bool_)
-        both &= mask
+    """Mean absolute depth difference in metres where both are positive; None where there is no such pixel.
+
+    Holes in what is judged do not count, so that `covered_share` belongs beside it.
+    """
+    both = _measured(depth_m, measured_m, mask) & (depth_m > 0)
     if not both.any():
         return None
     return float(np.abs(depth_m[both].astype(np.float64) - measured_m[both]).mean())
+
+
+def covered_share(
+    depth_m: Float32[ndarray, "h w"], measured_m: Float32[ndarray, "h w"], mask: Bool[ndarray, "h w"] | None = None
+) -> float | None:
+    """Share of the pixels with a measured depth that have a depth at all; None where nothing was measured."""
+    measured = _measured(depth_m, measured_m, mask)
+    return float((depth_m[measured] > 0).mean()) if measured.any() else None
+
+
+def _measured(
+    depth_m: Float32[ndarray, "h w"], measured_m: Float32[ndarray, "h w"], mask: Bool[ndarray, "h w"] | None
+) -> Bool[ndarray, "h w"]:
+    if depth_m.shape != measured_m.shape:
+        raise ShapeError(f"depth: expected the measured shape {measured_m.shape}, got {depth_m.shape}")
+    measured: Bool[ndarray, "h w"] = measured_m > 0
+    if mask is None:
+        return measured
+    require_array("mask", mask, depth_m.shape, np.bool_)
+    measured &= mask
+    return measured
 
 
 def _unit_images(

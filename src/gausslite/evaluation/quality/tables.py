@@ -31,6 +31,7 @@ ROI_METRICS = (
     Metric("SSIM↑", "roi_ssim", 3),
     Metric("LPIPS↓", "roi_lpips", 3),
     Metric("depth L1 [cm]↓", "roi_depth_l1_m", 2, 100.0),
+    Metric("covered [%]↑", "roi_covered", 1, 100.0),
 )
 FULL_METRICS = (
     Metric("PSNR↑", "full_psnr", 2),
