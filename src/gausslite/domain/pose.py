@@ -23,11 +23,13 @@ def require_rigid(name: str, T: Float[ndarray, "4 4"]) -> None:
     if not np.allclose(T[3], (0.0, 0.0, 0.0, 1.0), atol=1e-6):
         raise PoseError(f"{name}: expected a last row 0 0 0 1, got {T[3].tolist()}")
     R = T[:3, :3]
-    deviation = float(np.abs(R @ R.T - np.eye(3)).max())
-    if deviation > _RIGIDITY_TOLERANCE or np.linalg.det(R) < 0:
+    # numbers whose squares overflow give infinity or NaN, and neither is within the tolerance
+    with np.errstate(over="ignore", invalid="ignore"):
+        deviation, determinant = float(np.abs(R @ R.T - np.eye(3)).max()), float(np.linalg.det(R))
+    if not deviation <= _RIGIDITY_TOLERANCE or determinant < 0:
         raise PoseError(
             f"{name}: expected a rotation (orthonormal, determinant +1), "
-            f"got deviation {deviation:.3g} and determinant {np.linalg.det(R):.3g}"
+            f"got deviation {deviation:.3g} and determinant {determinant:.3g}"
         )
 
 
