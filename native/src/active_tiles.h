@@ -24,16 +24,22 @@ class ActiveTiles {
   // Whether any tile in these columns and rows, ends included, is active.
   __attribute__((always_inline)) bool any(uint32_t x0, uint32_t x1, uint32_t y0, uint32_t y1) const {
     const uint32_t across = x1 - x0, down = y1 - y0;
-    if ((across | down) < kNear) return near_[size_t(y0) * across_ + x0] >> (kNear * down + across) & 1u;
+    if ((across | down) < kNear) return any_near(y0 * uint32_t(across_) + x0, kNear * down + across);
     const uint32_t *above = &before_[(across_ + 1) * y0], *within = &before_[(across_ + 1) * (size_t(y1) + 1)];
     return within[x1 + 1] - within[x0] != above[x1 + 1] - above[x0];
+  }
+
+  // The same for boxes of up to kNear tiles a side, without a branch: `place` is y0 times the tiles across plus x0, and
+  // `size` is kNear (y1 - y0) + x1 - x0.
+  static constexpr uint32_t kNear = 4;  // a power of two: few splats reach over more
+  __attribute__((always_inline)) bool any_near(uint32_t place, uint32_t size) const {
+    return near_[place] >> size & 1u;
   }
 
  private:
   void count(const uint8_t* active, size_t down);
   void look_near(const uint8_t* active, size_t down);
 
-  static constexpr uint32_t kNear = 4;  // tiles, a power of two: few splats reach over more
   size_t across_ = 0;
   Box box_{};
   Buffer<uint16_t> near_;    // [tile]: bit 4 h + w says whether any is active from it to h rows down and w columns on

@@ -70,16 +70,11 @@ GAUSSLITE_INLINE void walk_back(const Splat* records, const uint8_t* list, int n
       const int entry = list[begin + i];
       const Splat& s = records[entry];
       Pack16 alpha;
-      Mask16 unclamped;
       if (kFromAlphas) {
         alpha = load(alphas);
         alphas += 16;
-        unclamped = alpha < Pack16(kBelowMaxAlpha);
       } else {
-        const Pack16 exponent = log2_alpha(s, pixel_x, pixel_y);
-        const Mask16 counts = (exponent >= Pack16(kLog2MinAlpha)) & (g.transmittance >= Pack16(kMinTransmittance));
-        alpha = keep(counts, exp2_fast(min(exponent, Pack16(kLog2MaxAlpha))));
-        unclamped = exponent < Pack16(kLog2MaxAlpha);
+        alpha = keep(g.transmittance >= Pack16(kMinTransmittance), alpha_of(s, pixel_x, pixel_y));
       }
       const Pack16 weight = alpha * g.transmittance;
       Pack16 q = fma(g.by[0], Pack16(s.r), g.by[4]);
@@ -88,9 +83,9 @@ GAUSSLITE_INLINE void walk_back(const Splat* records, const uint8_t* list, int n
       q = fma(g.by[3], Pack16(s.depth), q);
       const Pack16 own = weight * q;
       g.behind = g.behind - own;
-      g.transmittance = g.transmittance - weight;
+      g.transmittance = fnma(alpha, g.transmittance, g.transmittance);
       const Pack16 odds = alpha * reciprocal(Pack16(1.0f) - alpha);
-      store(values[i], keep(unclamped, fnma(g.behind, odds, own)));
+      store(values[i], keep(alpha < Pack16(kBelowMaxAlpha), fnma(g.behind, odds, own)));
       sums.colours[entry] = add_colours(weight, g.by_column, sums.colours[entry]);
     }
     batch.add(list + begin, taken, b, sums.moments);

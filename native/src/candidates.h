@@ -40,18 +40,19 @@ class Sight {
   // Which lanes may touch an active tile; the box holds all of them and what lies between.
   GAUSSLITE_INLINE uint32_t may_touch_active(const Workspace& ws, const Pack16* mean, Pack16 largest_log_scale) const {
     const Extent extent(*this, mean, largest_log_scale);
-    uint32_t left = bits(holds(extent)), out = 0;
-    if (left == 0 || ws.active_tiles == nullptr) return left;
-    alignas(64) int32_t x0[16], x1[16], y0[16], y1[16];
-    store_int(x0, tile(extent.x - extent.reach_x, ws.tiles_x));
-    store_int(x1, tile(extent.x + extent.reach_x, ws.tiles_x));
-    store_int(y0, tile(extent.y - extent.reach_y, ws.tiles_y));
-    store_int(y1, tile(extent.y + extent.reach_y, ws.tiles_y));
-    for (; left != 0; left &= left - 1) {
-      const int j = __builtin_ctz(left);
-      out |= uint32_t(ws.active.any(uint32_t(x0[j]), uint32_t(x1[j]), uint32_t(y0[j]), uint32_t(y1[j]))) << j;
-    }
-    return out;
+    const uint32_t held = bits(holds(extent));
+    if (ws.active_tiles == nullptr) return held;
+    // All lanes are looked up, wanted or not: no branch to mispredict. Those that reach over many tiles just count.
+    const Pack16 x0 = tile(extent.x - extent.reach_x, ws.tiles_x), y0 = tile(extent.y - extent.reach_y, ws.tiles_y);
+    const Pack16 across = tile(extent.x + extent.reach_x, ws.tiles_x) - x0;
+    const Pack16 down = tile(extent.y + extent.reach_y, ws.tiles_y) - y0;
+    const Pack16 most(float(ActiveTiles::kNear - 1));
+    alignas(64) int32_t place[16], size[16];
+    store_int(place, fma(y0, Pack16(float(ws.tiles_x)), x0));
+    store_int(size, fma(min(down, most), Pack16(float(ActiveTiles::kNear)), min(across, most)));
+    uint32_t touching = bits((across > most) | (down > most));
+    for (int j = 0; j < 16; ++j) touching |= uint32_t(ws.active.any_near(uint32_t(place[j]), uint32_t(size[j]))) << j;
+    return held & touching;
   }
 
  private:
@@ -63,7 +64,7 @@ class Sight {
       const Camera& c = sight.camera_;
       to_camera_frame(mean, c, x, y, z);
       const Pack16 inverse_z = Pack16(1.0f) / z, u = x * inverse_z, v = y * inverse_z;
-      const Pack16 angle = exp2_fast(largest_log_scale * kLog2E) * inverse_z;
+      const Pack16 angle = exp(largest_log_scale) * inverse_z;
       x = fma(u, Pack16(c.fx), Pack16(c.cx));
       y = fma(v, Pack16(c.fy), Pack16(c.cy));
       reach_x = reach(angle * c.fx, min(abs(u), Pack16(sight.limit_u_)));

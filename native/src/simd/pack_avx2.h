@@ -109,6 +109,20 @@ GAUSSLITE_INLINE Pack16 scale_by_power(Pack16 a, Pack16 e) {
           _mm256_castsi256_ps(_mm256_add_epi32(_mm256_castps_si256(a.hi), hi))};
 }
 
+// Bits of 2^(k / 8), less what k adds where power_of_steps moves it to the exponent.
+alignas(32) constexpr uint32_t kPowers[8] = {0x3F800000, 0x3F7B95C2, 0x3F7837F0, 0x3F75FED7,
+                                             0x3F7504F3, 0x3F75672A, 0x3F7744FD, 0x3F7AC0C7};
+constexpr int kPowerSteps = 8;
+GAUSSLITE_INLINE __m256 power_of_steps(__m256 shifted) {
+  const __m256i steps = _mm256_castps_si256(shifted);
+  const __m256i powers = _mm256_load_si256(reinterpret_cast<const __m256i*>(kPowers));
+  const __m256i power = _mm256_permutevar8x32_epi32(powers, steps);
+  return _mm256_castsi256_ps(_mm256_add_epi32(_mm256_slli_epi32(steps, 20), power));
+}
+GAUSSLITE_INLINE Pack16 power_of_steps(Pack16 shifted) {
+  return {power_of_steps(shifted.lo), power_of_steps(shifted.hi)};
+}
+
 GAUSSLITE_INLINE __m256 exponent_of(__m256 a) {
   const __m256i biased = _mm256_srli_epi32(_mm256_castps_si256(a), 23);
   return _mm256_cvtepi32_ps(_mm256_sub_epi32(biased, _mm256_set1_epi32(127)));

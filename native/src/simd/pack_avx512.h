@@ -68,6 +68,17 @@ GAUSSLITE_INLINE Pack16 scale_by_power(Pack16 a, Pack16 e) { return _mm512_scale
 GAUSSLITE_INLINE Pack16 exponent(Pack16 a) { return _mm512_getexp_ps(a.v); }
 GAUSSLITE_INLINE Pack16 mantissa(Pack16 a) { return _mm512_getmant_ps(a.v, _MM_MANT_NORM_1_2, _MM_MANT_SIGN_zero); }
 
+// Bits of 2^(k / 16), less what k adds where power_of_steps moves it to the exponent.
+alignas(64) constexpr uint32_t kPowers[16] = {0x3F800000, 0x3F7DAAC3, 0x3F7B95C2, 0x3F79C3D3, 0x3F7837F0, 0x3F76F532,
+                                              0x3F75FED7, 0x3F75583F, 0x3F7504F3, 0x3F7508A4, 0x3F75672A, 0x3F76248C,
+                                              0x3F7744FD, 0x3F78CCDF, 0x3F7AC0C7, 0x3F7D257D};
+constexpr int kPowerSteps = 16;
+GAUSSLITE_INLINE Pack16 power_of_steps(Pack16 shifted) {
+  const __m512i steps = _mm512_castps_si512(shifted.v);
+  const __m512i power = _mm512_permutexvar_epi32(steps, _mm512_load_si512(kPowers));
+  return _mm512_castsi512_ps(_mm512_add_epi32(_mm512_slli_epi32(steps, 19), power));
+}
+
 template <int kLane>
 GAUSSLITE_INLINE Pack16 spread_in_quads(Pack16 a) {
   return _mm512_permute_ps(a.v, kLane * 0x55);

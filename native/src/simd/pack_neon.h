@@ -137,6 +137,12 @@ GAUSSLITE_INLINE float32x4_t mantissa_of(float32x4_t a) {
 }
 GAUSSLITE_INLINE Pack16 fraction(Pack16 e) { return e - floor(e); }
 GAUSSLITE_LANEWISE(scale_by_power, scaled_by_power)
+constexpr int kPowerSteps = 1;
+GAUSSLITE_INLINE float32x4_t power_of_bits(float32x4_t shifted) {
+  const int32x4_t exponents = vshlq_n_s32(vreinterpretq_s32_f32(shifted), 23);
+  return vreinterpretq_f32_s32(vaddq_s32(exponents, vdupq_n_s32(0x3F800000)));
+}
+GAUSSLITE_UNARY(power_of_steps, power_of_bits)
 GAUSSLITE_UNARY(exponent, exponent_of)
 GAUSSLITE_UNARY(mantissa, mantissa_of)
 

@@ -162,6 +162,13 @@ GAUSSLITE_INLINE Pack16 mantissa(Pack16 a) {
   return a;
 }
 
+// 2^(k / kPowerSteps), the numbers k being in the lowest bits of the mantissas.
+constexpr int kPowerSteps = 1;
+GAUSSLITE_INLINE Pack16 power_of_steps(Pack16 shifted) {
+  GAUSSLITE_EACH shifted.q[i] = (Quad)(((QuadInt)shifted.q[i] << 23) + 0x3F800000);
+  return shifted;
+}
+
 GAUSSLITE_INLINE float sum(Pack16 a) {
   const Quad s = (a.q[0] + a.q[2]) + (a.q[1] + a.q[3]);
   return (s[0] + s[2]) + (s[1] + s[3]);
