@@ -10,7 +10,13 @@ namespace gausslite::GAUSSLITE_ISA {
 
 namespace {
 
-constexpr int kRoomEvery = 1024;
+// A splat and the column of a tile that its bounding box meets. They are noted first and tested then, neither with a
+// branch to mispredict: which tiles a splat meets, and with which blocks, cannot be foretold.
+struct Touch {
+  uint32_t slot, x;
+};
+
+constexpr int kTouches = 256;  // are tested at a time
 
 alignas(64) constexpr float kBlockX[16] = {.5f, 4.5f, 8.5f, 12.5f, .5f, 4.5f, 8.5f, 12.5f,
                                            .5f, 4.5f, 8.5f, 12.5f, .5f, 4.5f, 8.5f, 12.5f};
@@ -25,7 +31,7 @@ GAUSSLITE_INLINE uint32_t touched_blocks(const Splat& s, float tile_x, float til
   const Pack16 zero(0.0f);
   const Pack16 left = load(kBlockX) + (tile_x - s.mean_x), top = load(kBlockY) + (tile_y - s.mean_y);
   const Pack16 right = left + 3.0f, bottom = top + 3.0f;
-  const Pack16 dx = max(left, zero) + min(right, zero), dy = max(top, zero) + min(bottom, zero);
+  const Pack16 dx = min(max(left, zero), right), dy = min(max(top, zero), bottom);
   const Pack16 xx(s.quad_xx), xy(s.quad_xy), yy(s.quad_yy);
   const Pack16 y_on_side = min(max(dx * s.slope_y, top), bottom), x_on_side = min(max(dy * s.slope_x, left), right);
   const Pack16 vertical = fma(fma(xx, dx, xy * y_on_side), dx, yy * y_on_side * y_on_side);
@@ -33,12 +39,22 @@ GAUSSLITE_INLINE uint32_t touched_blocks(const Splat& s, float tile_x, float til
   return bits(min(vertical, horizontal) <= Pack16(s.log2_opacity - kLog2MinAlpha));
 }
 
-// The blocks of one tile row or column range as mask bits: rows [first, last] of four.
-GAUSSLITE_INLINE uint32_t row_bits(int first, int last) {
-  return (0xFFFFu << (4 * first)) & (0xFFFFu >> (12 - 4 * last));
-}
-GAUSSLITE_INLINE uint32_t column_bits(int first, int last) {
-  return ((0xFu << first) & (0xFu >> (3 - last))) * 0x1111u;
+// Appends the splats to the lists of the tiles where they touch a wanted block.
+GAUSSLITE_INLINE void list_touches(const Workspace& ws, int strip, const Touch* touches, int n, const uint16_t* wanted,
+                                   TileList* tiles) {
+  for (int x = 0; x < ws.tiles_x; ++x) {
+    tiles[x].slots.reserve(tiles[x].count + kTouches + 1 + kChunk, tiles[x].count);
+    tiles[x].blocks.reserve(tiles[x].count + kTouches + 1 + kChunk, tiles[x].count);
+  }
+  for (int i = 0; i < n; ++i) {
+    const auto [slot, x] = touches[i];
+    const uint32_t blocks = wanted[x] & touched_blocks(ws.splats[slot], float(x * kTile), float(strip * kTile));
+    // Written always, kept only when a block is touched.
+    TileList& tile = tiles[x];
+    tile.slots[tile.count] = slot;
+    tile.blocks[tile.count] = uint16_t(blocks);
+    tile.count += blocks != 0;
+  }
 }
 
 }  // namespace
@@ -47,29 +63,25 @@ void bin_strip(Workspace& ws, int strip, const DepthKey* keys, int count) {
   TileList* tiles = &ws.tiles[size_t(strip) * size_t(ws.tiles_x)];
   const uint16_t* wanted = &ws.wanted_blocks[size_t(strip) * size_t(ws.tiles_x)];
   for (int x = 0; x < ws.tiles_x; ++x) tiles[x].count = 0;
+  Touch touches[kTouches + 2];
+  int n = 0;
   for (int i = 0; i < count; ++i) {
-    if (i % kRoomEvery == 0) {
-      for (int x = 0; x < ws.tiles_x; ++x) {
-        tiles[x].slots.reserve(tiles[x].count + kRoomEvery + kChunk, tiles[x].count);
-        tiles[x].blocks.reserve(tiles[x].count + kRoomEvery + kChunk, tiles[x].count);
-      }
-    }
     prefetch(&ws.splats[keys[i + kPrefetchAhead].slot]);
     const uint32_t slot = keys[i].slot;
-    const Splat& s = ws.splats[slot];
-    const uint32_t rows = row_bits(std::max(s.block_y0 - 4 * strip, 0), std::min(s.block_y1 - 4 * strip, 3));
-    for (int x = s.block_x0 / 4; x <= s.block_x1 / 4; ++x) {
-      if (wanted[x] == 0) continue;
-      uint32_t blocks =
-          rows & wanted[x] & column_bits(std::max(s.block_x0 - 4 * x, 0), std::min(s.block_x1 - 4 * x, 3));
-      if (s.elongated) blocks &= touched_blocks(s, float(x * kTile), float(strip * kTile));
-      // Written always, kept only when a block is touched: no branch to mispredict.
-      TileList& tile = tiles[x];
-      tile.slots[tile.count] = slot;
-      tile.blocks[tile.count] = uint16_t(blocks);
-      tile.count += blocks != 0;
+    const uint32_t x0 = uint32_t(ws.splats[slot].tile_x0), x1 = uint32_t(ws.splats[slot].tile_x1);
+    // Two columns at a time, because one or two are the rule.
+    for (uint32_t x = x0; x <= x1; x += 2) {
+      touches[n] = {slot, x};
+      n += wanted[x] != 0;
+      touches[n] = {slot, x + 1};
+      n += (x < x1) & (wanted[x + 1] != 0);
+      if (n >= kTouches) {
+        list_touches(ws, strip, touches, n, wanted, tiles);
+        n = 0;
+      }
     }
   }
+  list_touches(ws, strip, touches, n, wanted, tiles);
   // The tile stages prefetch a chunk ahead: slot 0 is as good as any.
   for (int x = 0; x < ws.tiles_x; ++x) {
     tiles[x].slots.reserve(tiles[x].count + kChunk, tiles[x].count);

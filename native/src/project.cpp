@@ -12,31 +12,24 @@ namespace gausslite::GAUSSLITE_ISA {
 
 namespace {
 
-// The 4x4 blocks of the pixels whose centres are in the bounding box of alpha >= 1/255, both ends included.
+// The tiles, from first to last, of the pixels whose centres are in the bounding box of alpha >= 1/255.
 struct Box {
-  Pack16 block_x0, block_x1, block_y0, block_y1;
-  Mask16 visible, elongated;
+  Pack16 x0, x1, y0, y1;
+  Mask16 visible;
 
   GAUSSLITE_INLINE Box(const Projection& p, const Camera& camera) {
     const Pack16 above = p.log2_opacity - kLog2MinAlpha, zero(0.0f);
     const Pack16 square = max(above * (2.0f * kLn2), zero);
     const Pack16 reach_x = sqrt(square * p.cov_xx), reach_y = sqrt(square * p.cov_yy);
-    const Pack16 x0 = max(ceil(p.mean_x - reach_x - 0.5f), zero);
-    const Pack16 y0 = max(ceil(p.mean_y - reach_y - 0.5f), zero);
-    const Pack16 x1 = min(floor(p.mean_x + reach_x - 0.5f), Pack16(float(camera.width - 1)));
-    const Pack16 y1 = min(floor(p.mean_y + reach_y - 0.5f), Pack16(float(camera.height - 1)));
-    visible = (above > zero) & (x0 <= x1) & (y0 <= y1);
-
-    block_x0 = floor(x0 * 0.25f);
-    block_x1 = floor(x1 * 0.25f);
-    block_y0 = floor(y0 * 0.25f);
-    block_y1 = floor(y1 * 0.25f);
-    // In a box of one row or column, or of four blocks with a roundish splat, the exact test would save less than it
-    // costs.
-    const Pack16 across = block_x1 - block_x0, down = block_y1 - block_y0, one(1.0f);
-    const Mask16 slanted = p.cov_xy * p.cov_xy > p.cov_xx * p.cov_yy * 0.3f;
-    const Mask16 many = (across + one) * (down + one) > Pack16(4.0f);
-    elongated = (across > zero) & (down > zero) & (slanted | many);
+    const Pack16 left = max(ceil(p.mean_x - reach_x - 0.5f), zero);
+    const Pack16 top = max(ceil(p.mean_y - reach_y - 0.5f), zero);
+    const Pack16 right = min(floor(p.mean_x + reach_x - 0.5f), Pack16(float(camera.width - 1)));
+    const Pack16 bottom = min(floor(p.mean_y + reach_y - 0.5f), Pack16(float(camera.height - 1)));
+    visible = (above > zero) & (left <= right) & (top <= bottom);
+    x0 = floor(left * (1.0f / kTile));
+    x1 = floor(right * (1.0f / kTile));
+    y0 = floor(top * (1.0f / kTile));
+    y1 = floor(bottom * (1.0f / kTile));
   }
 };
 
@@ -49,26 +42,44 @@ GAUSSLITE_INLINE Mask16 is_sound(const Pack16* row, const Projection& p) {
   return (total + conic + shape == Pack16(0.0f)) & (p.conic_xx > Pack16(0.0f)) & (p.conic_yy > Pack16(0.0f));
 }
 
-// The box in whole blocks, lane by lane.
+// Sixteen splats' boxes, lane by lane; those of invisible ones are of no use, but lie in the image.
 struct BoxLanes {
   alignas(64) int32_t x0[16], x1[16], y0[16], y1[16];
 
-  GAUSSLITE_INLINE explicit BoxLanes(const Box& box) {
-    store_int(x0, box.block_x0);
-    store_int(x1, box.block_x1);
-    store_int(y0, box.block_y0);
-    store_int(y1, box.block_y1);
+  GAUSSLITE_INLINE BoxLanes(const Box& box, Mask16 visible) {
+    store_int(x0, keep(visible, box.x0));
+    store_int(x1, keep(visible, box.x1));
+    store_int(y0, keep(visible, box.y0));
+    store_int(y1, keep(visible, box.y1));
+  }
+
+  // Whether the box of a lane meets an active tile in one of its tile rows.
+  GAUSSLITE_INLINE bool active_in(const ActiveTiles& active, int lane, int y) const {
+    return active.any(uint32_t(x0[lane]), uint32_t(x1[lane]), uint32_t(y), uint32_t(y));
+  }
+
+  // Leaves out the upper and lower rows without an active tile; returns which lanes have one.
+  GAUSSLITE_INLINE uint32_t narrow(const ActiveTiles& active, int tiles_x) {
+    uint32_t out = 0;
+    for (int j = 0; j < 16; ++j) {
+      const int upper = y0[j], lower = y1[j], across = x1[j] - x0[j];
+      bool in_upper, in_lower;
+      // One or two rows and few columns are the rule, where there is no branch to mispredict.
+      if (lower - upper <= 1 && across < int(ActiveTiles::kNear)) [[likely]] {
+        in_upper = active.any_near(uint32_t(upper * tiles_x + x0[j]), uint32_t(across));
+        in_lower = active.any_near(uint32_t(lower * tiles_x + x0[j]), uint32_t(across));
+        y0[j] = in_upper ? upper : lower;
+        y1[j] = in_lower ? lower : upper;
+      } else {
+        while (y0[j] < lower && !active_in(active, j, y0[j])) ++y0[j];
+        while (y1[j] > y0[j] && !active_in(active, j, y1[j])) --y1[j];
+        in_upper = in_lower = active_in(active, j, y0[j]);
+      }
+      out |= uint32_t(in_upper | in_lower) << j;
+    }
+    return out;
   }
 };
-
-struct TileColumns {
-  uint32_t first, last;
-};
-
-// True when the tile row has an active tile in these columns.
-GAUSSLITE_INLINE bool row_is_active(const Workspace& ws, uint32_t tile_y, TileColumns columns) {
-  return ws.active.any(columns.first, columns.last, tile_y, tile_y);
-}
 
 // Gradient rows are handed out in blocks, so that the shared counter is touched rarely. Row 0 is nobody's.
 GAUSSLITE_INLINE uint32_t take_gradient_rows(Workspace& ws, ThreadScratch& mine, uint32_t rows) {
@@ -82,6 +93,7 @@ GAUSSLITE_INLINE uint32_t take_gradient_rows(Workspace& ws, ThreadScratch& mine,
   return first;
 }
 
+// Where the visible splats of a segment go, and their keys.
 class Segment {
  public:
   GAUSSLITE_INLINE Segment(Workspace& ws, ThreadScratch& mine, uint32_t first_slot)
@@ -89,47 +101,39 @@ class Segment {
 
   GAUSSLITE_INLINE uint32_t slot() const { return slot_; }
 
-  // Packs lane `lane` of a group, or skips it when all of its tiles are inactive.
-  GAUSSLITE_INLINE void add(const Splat& splat, const BoxLanes& box, int lane, uint32_t id, bool elongated) {
-    const uint32_t x0 = uint32_t(box.x0[lane]), x1 = uint32_t(box.x1[lane]), y0 = uint32_t(box.y0[lane]),
-                   y1 = uint32_t(box.y1[lane]);
-    uint32_t first = y0 / kBlocksAcross, last = y1 / kBlocksAcross;
-    const TileColumns columns{x0 / kBlocksAcross, x1 / kBlocksAcross};
-    if (ws_.active_tiles != nullptr) {
-      while (first <= last && !row_is_active(ws_, first, columns)) ++first;
-      if (first > last) return;
-      while (!row_is_active(ws_, last, columns)) --last;
+  // Adds the `visible` lanes of a group: `splats` are complete but for their gradient rows. Every lane is written, and
+  // only then counted or not: no branch to mispredict. One or two tile rows are the rule, the others are `tall`.
+  GAUSSLITE_INLINE void add(const Pack16 (&splats)[16], const float* depth, const uint32_t* ids, const BoxLanes& boxes,
+                            uint32_t visible, uint32_t tall) {
+    uint32_t rows = 0;
+    for (int j = 0; j < 16; ++j) rows += (visible >> j & 1u) * uint32_t(boxes.y1[j] - boxes.y0[j] + 1);
+    uint32_t slot = slot_, gradient_row = take_gradient_rows(ws_, mine_, rows);
+    for (int j = 0; j < 16; ++j) {
+      const uint32_t counts = visible >> j & 1u;
+      const int first = boxes.y0[j], last = boxes.y1[j];
+      const uint32_t height = uint32_t(last - first + 1);
+      Splat& splat = ws_.splats[slot];
+      store(reinterpret_cast<float*>(&splat), splats[j]);
+      splat.gradient_row = gradient_row - uint32_t(first);
+      ws_.visible[slot] = {ids[j], gradient_row, height};
+      const DepthKey key{__builtin_bit_cast(uint32_t, depth[j]), slot};
+      add_key(key, first, counts);
+      if (visible & tall & 1u << j) [[unlikely]] {
+        for (int y = first + 1; y <= last; ++y)
+          add_key(key, y, ws_.active_tiles == nullptr || boxes.active_in(ws_.active, j, y));
+      } else {
+        add_key(key, first + 1, counts & uint32_t(last > first));
+      }
+      slot += counts;
+      gradient_row += counts * height;
     }
-    const uint32_t rows = last - first + 1;
-    const uint32_t gradient_row = take_gradient_rows(ws_, mine_, rows);
-    Splat& out = ws_.splats[slot_];
-    out = splat;
-    // One store for the four.
-    const uint64_t blocks = uint64_t(x0 | x1 << 16) | uint64_t(y0 | y1 << 16) << 32;
-    std::memcpy(&out.block_x0, &blocks, sizeof blocks);
-    out.gradient_row = gradient_row - first;
-    out.elongated = elongated;
-    ws_.visible[slot_] = {id, gradient_row, rows};
-    add_keys(__builtin_bit_cast(uint32_t, splat.depth), first, last, columns);
-    ++slot_;
+    slot_ = slot;
   }
 
  private:
-  // One or two rows are the rule. The second key is written always and counted only when it is one: no branch to
-  // mispredict.
-  GAUSSLITE_INLINE void add_keys(uint32_t depth, uint32_t first, uint32_t last, TileColumns columns) {
-    if (ws_.active_tiles == nullptr) {
-      add_key(depth, first, true);
-      add_key(depth, first + 1, last > first);
-      for (uint32_t y = first + 2; y <= last; ++y) add_key(depth, y, true);
-    } else {
-      for (uint32_t y = first; y <= last; ++y) add_key(depth, y, row_is_active(ws_, y, columns));
-    }
-  }
-
-  GAUSSLITE_INLINE void add_key(uint32_t depth, uint32_t tile_y, bool counts) {
+  GAUSSLITE_INLINE void add_key(const DepthKey& key, int tile_y, uint32_t counts) {
     KeyList& strip = mine_.strips[size_t(tile_y)];
-    strip.keys[strip.count] = {depth, slot_};
+    strip.keys[strip.count] = key;
     strip.count += counts;
   }
 
@@ -142,7 +146,11 @@ class Segment {
 GAUSSLITE_INLINE void project_group(const Workspace& ws, const Sight& sight, const uint32_t* ids, int lanes,
                                     Segment& segment) {
   Pack16 row[16];
-  for (int j = 0; j < 16; ++j) row[j] = load(ws.rows + size_t(kRowWidth) * ids[std::min(j, lanes - 1)]);
+  uint32_t id[16];
+  for (int j = 0; j < 16; ++j) {
+    id[j] = ids[std::min(j, lanes - 1)];
+    row[j] = load(ws.rows + size_t(kRowWidth) * id[j]);
+  }
   transpose(row);
   const Mask16 candidates = sight.may_touch(row, largest_log_scale(row)) & first_lanes(lanes);
   if (!any(candidates)) return;
@@ -150,11 +158,14 @@ GAUSSLITE_INLINE void project_group(const Workspace& ws, const Sight& sight, con
   Projection p;
   project16(row, ws.camera, p);
   const Box box(p, ws.camera);
-  uint32_t visible = bits(candidates & box.visible & is_sound(row, p));
+  const Mask16 in_sight = candidates & box.visible & is_sound(row, p);
+  uint32_t visible = bits(in_sight);
   if (visible == 0) return;
 
-  const uint32_t elongated = bits(box.elongated);
-  const BoxLanes lanes_of_box(box);
+  BoxLanes boxes(box, in_sight);
+  if (ws.active_tiles != nullptr && (visible &= boxes.narrow(ws.active, ws.tiles_x)) == 0) return;
+  uint32_t tall = 0;
+  for (int j = 0; j < 16; ++j) tall |= uint32_t(boxes.y1[j] - boxes.y0[j] > 1) << j;
   Pack16 out[16] = {p.mean_x,
                     p.mean_y,
                     p.conic_xx * (0.5f * kLog2E),
@@ -167,17 +178,14 @@ GAUSSLITE_INLINE void project_group(const Workspace& ws, const Sight& sight, con
                     p.z,
                     p.cov_xy / p.cov_xx,
                     p.cov_xy / p.cov_yy,
-                    Pack16(0.0f),
-                    Pack16(0.0f),
+                    box.x0,
+                    box.x1,
                     Pack16(0.0f),
                     Pack16(0.0f)};
   transpose(out);
-  alignas(64) Splat splats[16];
-  for (int j = 0; j < 16; ++j) store(reinterpret_cast<float*>(&splats[j]), out[j]);
-  for (; visible != 0; visible &= visible - 1) {
-    const int lane = __builtin_ctz(visible);
-    segment.add(splats[lane], lanes_of_box, lane, ids[lane], elongated >> lane & 1u);
-  }
+  alignas(64) float depth[16];
+  store(depth, p.z);
+  segment.add(out, depth, id, boxes, visible, tall);
 }
 
 }  // namespace

@@ -19,6 +19,13 @@ struct Band {
   Band(int height, int thread, int threads) : begin(height * thread / threads), end(height * (thread + 1) / threads) {}
 };
 
+// The blocks of a tile that are inside the image, which goes on for so many pixels from the tile's corner.
+uint16_t blocks_inside(int columns, int rows) {
+  const int across = std::min((columns + kBlock - 1) / kBlock, kBlocksAcross);
+  const int down = std::min((rows + kBlock - 1) / kBlock, kBlocksAcross);
+  return uint16_t(((1u << across) - 1u) * 0x1111u & ((1u << kBlocksAcross * down) - 1u));
+}
+
 }  // namespace
 
 Rasterizer::Rasterizer(const Stages& stages, int threads) : stages_(stages), team_(threads) {
@@ -57,19 +64,21 @@ void Rasterizer::begin_frame(const FrameInput& input) {
     if (scratch.strips.size() <= size_t(ws_.tiles_y)) scratch.strips.resize(size_t(ws_.tiles_y) + 1);
     scratch.block_evaluations = 0;
   }
-  ws_.wanted_blocks.reserve(tiles);
-  want_blocks(nullptr);
+  ws_.wanted_blocks.reserve(tiles + 1);
   if (input.active_tiles != nullptr) ws_.active.look_at(input.active_tiles, ws_.tiles_x, ws_.tiles_y);
   times_ = {};
   last_mark_ms_ = now_ms();
 }
 
-// Of the active tiles, the blocks that the loss depends on; null: all.
+// Of the active tiles, the blocks that the loss depends on; null: all inside the image.
 void Rasterizer::want_blocks(const uint16_t* blocks) {
-  const size_t tiles = size_t(ws_.tiles_x) * size_t(ws_.tiles_y);
-  for (size_t t = 0; t < tiles; ++t) {
-    const bool active = ws_.active_tiles == nullptr || ws_.active_tiles[t];
-    ws_.wanted_blocks[t] = !active ? uint16_t(0) : blocks != nullptr ? blocks[t] : uint16_t(0xFFFF);
+  for (int y = 0, t = 0; y < ws_.tiles_y; ++y) {
+    for (int x = 0; x < ws_.tiles_x; ++x, ++t) {
+      const bool active = ws_.active_tiles == nullptr || ws_.active_tiles[t];
+      const uint16_t blocks_here =
+          blocks != nullptr ? blocks[t] : blocks_inside(ws_.camera.width - x * kTile, ws_.camera.height - y * kTile);
+      ws_.wanted_blocks[size_t(t)] = active ? blocks_here : uint16_t(0);
+    }
   }
 }
 
@@ -113,6 +122,7 @@ void Rasterizer::for_each_strip(F f) {
 
 void Rasterizer::forward(const FrameInput& input, const ImageOutput& output) {
   begin_frame(input);
+  want_blocks(nullptr);
   team_.run([&](int thread) {
     stages_.project(ws_, thread);
     team_.barrier([&] {

@@ -19,11 +19,10 @@ struct alignas(64) Splat {
   float quad_xx, quad_xy, quad_yy;
   float log2_opacity;
   float r, g, b, depth;
-  float slope_y;  // the dy that minimises the quadric for dx = 1 ...
-  float slope_x;  // ... and the dx for dy = 1: the exact ellipse-block test needs them
-  uint16_t block_x0, block_x1, block_y0, block_y1;  // 4x4 blocks that its bounding box touches, both ends included
-  uint32_t gradient_row;  // its image gradients of tile row y are in row gradient_row + y (modulo 2^32)
-  uint32_t elongated;     // 1 when the bounding box is a poor stand-in for the ellipse
+  float slope_y;           // the dy that minimises the quadric for dx = 1 ...
+  float slope_x;           // ... and the dx for dy = 1: the ellipse-block test needs them
+  float tile_x0, tile_x1;  // columns of the first and the last tile that its bounding box touches
+  uint32_t gradient_row;   // its image gradients of tile row y are in row gradient_row + y (modulo 2^32)
 };
 static_assert(sizeof(Splat) == 64);
 
@@ -53,7 +52,7 @@ struct TileList {
 
 constexpr int kSquare = kTile * kTile;
 constexpr int kSsimMaps = 3;  // what SSIM blurs: x, xx, xy on the way forward, their derivatives on the way back
-constexpr int kChunk = 64;  // splats of a tile that are handled at a time: their records stay in the first-level cache
+constexpr int kChunk = 128;  // splats of a tile that are handled at a time: their records stay in the first-level cache
 constexpr int kPrefetchAhead = 24;  // keys
 constexpr int kSegment = 2048;      // parameter rows that are projected as a unit, by whichever thread is free
 
