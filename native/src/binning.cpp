@@ -59,8 +59,7 @@ GAUSSLITE_INLINE void list_touches(const Workspace& ws, int strip, const Touch* 
 
 }  // namespace
 
-void bin_strip(Workspace& ws, int strip, const DepthKey* keys, int count) {
-  TileList* tiles = &ws.tiles[size_t(strip) * size_t(ws.tiles_x)];
+void bin_strip(const Workspace& ws, int strip, const DepthKey* keys, int count, TileList* tiles) {
   const uint16_t* wanted = &ws.wanted_blocks[size_t(strip) * size_t(ws.tiles_x)];
   for (int x = 0; x < ws.tiles_x; ++x) tiles[x].count = 0;
   Touch touches[kTouches + 2];

@@ -107,7 +107,7 @@ GAUSSLITE_INLINE float* gradient_row(Workspace& ws, const Splat& splat, const Ti
 }
 
 GAUSSLITE_INLINE void prefetch_rows(Workspace& ws, const Splat* records, int n, const TilePosition& tile) {
-  for (int i = 0; i < n; ++i) __builtin_prefetch(gradient_row(ws, records[i], tile), 0, 2);
+  for (int i = 0; i < n; ++i) prefetch_to_write(gradient_row(ws, records[i], tile));
 }
 
 // Moves a chunk's moments from the tile's centre to the splats' means, in pixels, and adds them to the gradient rows of
@@ -117,16 +117,15 @@ GAUSSLITE_INLINE void add_to_rows(Workspace& ws, const Splat* records, int n, co
   const float centre_x = float(tile.x * kTile + kTile / 2), centre_y = float(tile.y * kTile + kTile / 2);
   alignas(32) const float centres[8] = {centre_x, centre_y, centre_x, centre_y, centre_x, centre_y, centre_x, centre_y};
   const Pack8 centre = load8(centres), units = load8(kMomentUnits);
+  const Pack16 tagged(__builtin_bit_cast(float, ws.tag));
   for (int i = 0; i < n; ++i) {
     const Pack8 offset = broadcast_pair(&records[i].mean_x) - centre;
     const Pack8 moments = shift_moments(load8(sums.moments.of[i]), offset + offset) * units;
     float* row = gradient_row(ws, records[i], tile);
     uint32_t tag;
     std::memcpy(&tag, row + kRowTag, sizeof tag);
-    const bool fresh = tag == ws.tag;
-    store8(row, moments + keep_if(fresh, load8(row)));
-    store8(row + 8, sum_of_quads(sums.colours[i]) + keep_if(fresh, load8(row + 8)));
-    std::memcpy(row + kRowTag, &ws.tag, sizeof ws.tag);
+    const Pack16 total = join(moments, sum_of_quads(sums.colours[i])) + keep_if(tag == ws.tag, load(row));
+    store(row, select(first_lanes(kRowTag), total, tagged));
   }
 }
 

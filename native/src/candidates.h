@@ -63,7 +63,7 @@ class Sight {
     GAUSSLITE_INLINE Extent(const Sight& sight, const Pack16* mean, Pack16 largest_log_scale) {
       const Camera& c = sight.camera_;
       to_camera_frame(mean, c, x, y, z);
-      const Pack16 inverse_z = Pack16(1.0f) / z, u = x * inverse_z, v = y * inverse_z;
+      const Pack16 inverse_z = reciprocal(z), u = x * inverse_z, v = y * inverse_z;
       const Pack16 angle = exp(largest_log_scale) * inverse_z;
       x = fma(u, Pack16(c.fx), Pack16(c.cx));
       y = fma(v, Pack16(c.fy), Pack16(c.cy));
@@ -73,7 +73,8 @@ class Sight {
 
     // `size`: the scale in pixels, seen straight on. A little wider than 3.33, against rounding.
     GAUSSLITE_INLINE static Pack16 reach(Pack16 size, Pack16 tangent) {
-      return sqrt(fma(size * size, fma(tangent, tangent, Pack16(1.0f)), Pack16(kDilationPx2))) * 3.35f;
+      const Pack16 square = fma(size * size, fma(tangent, tangent, Pack16(1.0f)), Pack16(kDilationPx2));
+      return square * rough_inverse_sqrt(square) * 3.35f;
     }
   };
 

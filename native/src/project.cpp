@@ -198,7 +198,7 @@ void project(Workspace& ws, int thread) {
   // The list after the last row takes second keys that do not count.
   const int lists = ws.tiles_y + 1;
   for (int y = 0; y < lists; ++y) mine.strips[size_t(y)].count = 0;
-  for (uint32_t s; (s = ws.segment_ticket.fetch_add(1, std::memory_order_relaxed)) < ws.segments;) {
+  for (uint32_t s; (s = ws.take_segment(thread)) < ws.segments;) {
     const uint32_t begin = s * kSegment, end = std::min(ws.count, begin + kSegment);
     ws.segment_thread[s] = uint32_t(thread);
     KeySpan* spans = &ws.segment_keys[size_t(s) * size_t(ws.tiles_y)];
@@ -212,6 +212,7 @@ void project(Workspace& ws, int thread) {
     Segment segment(ws, mine, begin);
     for (uint32_t i = 0; i < count; i += 16) {
       for (uint32_t j = i + 16; j < std::min(i + 32, count); ++j) prefetch(ws.rows + size_t(kRowWidth) * ids[j]);
+      for (uint32_t j = 0; j < 16; ++j) prefetch_to_write(&ws.splats[segment.slot() + j]);
       project_group(ws, sight, ids + i, int(std::min(16u, count - i)), segment);
     }
     ws.segment_visible[s] = segment.slot() - begin;

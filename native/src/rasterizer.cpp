@@ -5,6 +5,8 @@
 #include <chrono>
 #include <functional>
 
+#include "row_layout.h"
+
 namespace gausslite {
 
 namespace {
@@ -30,7 +32,7 @@ uint16_t blocks_inside(int columns, int rows) {
 
 Rasterizer::Rasterizer(const Stages& stages, int threads) : stages_(stages), team_(threads) {
   ws_.threads = threads;
-  ws_.scratch.resize(size_t(threads));
+  ws_.scratch = std::vector<ThreadScratch>(size_t(threads));
 }
 
 void Rasterizer::begin_frame(const FrameInput& input) {
@@ -54,12 +56,9 @@ void Rasterizer::begin_frame(const FrameInput& input) {
   ws_.segment_keys.reserve(size_t(ws_.segments + 1) * size_t(ws_.tiles_y));
   ws_.keeps_bounds = ws_.knows_bounds = false;
   const size_t tiles = size_t(ws_.tiles_x) * size_t(ws_.tiles_y);
-  if (ws_.tiles.size() < tiles) ws_.tiles.resize(tiles);
-  ws_.image.reserve(5 * size_t(ws_.plane));
-  ws_.image_gradient.reserve(5 * size_t(ws_.plane));
   ws_.gradient_rows_used = 0;
   ws_.ticket = 0;
-  ws_.segment_ticket = 0;
+  ws_.hand_out_segments();
   for (ThreadScratch& scratch : ws_.scratch) {
     if (scratch.strips.size() <= size_t(ws_.tiles_y)) scratch.strips.resize(size_t(ws_.tiles_y) + 1);
     scratch.block_evaluations = 0;
@@ -87,7 +86,10 @@ void Rasterizer::next_tag() {
   if (++ws_.tag == 0) ++ws_.tag;
 }
 
-void Rasterizer::prepare_gradient_rows() { ws_.gradient_rows.reserve(size_t(ws_.gradient_rows_used.load()) * 16); }
+// One more than there are: the update reads the row after a splat's only one before it knows that there is none.
+void Rasterizer::prepare_gradient_rows() {
+  ws_.gradient_rows.reserve((size_t(ws_.gradient_rows_used.load()) + 1) * kRowWidth);
+}
 
 void Rasterizer::mark(double StageTimes::*stage) {
   const double now = now_ms();
@@ -123,6 +125,10 @@ void Rasterizer::for_each_strip(F f) {
 void Rasterizer::forward(const FrameInput& input, const ImageOutput& output) {
   begin_frame(input);
   want_blocks(nullptr);
+  const size_t tiles = size_t(ws_.tiles_x) * size_t(ws_.tiles_y);
+  if (ws_.tiles.size() < tiles) ws_.tiles.resize(tiles);
+  ws_.image.reserve(5 * size_t(ws_.plane));
+  ws_.image_gradient.reserve(5 * size_t(ws_.plane));
   team_.run([&](int thread) {
     stages_.project(ws_, thread);
     team_.barrier([&] {
@@ -139,7 +145,7 @@ void Rasterizer::forward(const FrameInput& input, const ImageOutput& output) {
 void Rasterizer::backward(const ImageGradients& input, float* d_rows, double* d_twist, float* mean_2d_norm) {
   last_mark_ms_ = now_ms();
   ws_.ticket = 0;
-  ws_.segment_ticket = 0;
+  ws_.hand_out_segments();
   next_tag();  // a second backward of the same forward must not add to the first one's rows
   prepare_gradient_rows();
   twist_sums_.reserve(6 * size_t(ws_.segments) + 6);
@@ -152,7 +158,7 @@ void Rasterizer::backward(const ImageGradients& input, float* d_rows, double* d_
     team_.barrier();
     for_each_strip([&](int strip) { stages_.backward_strip(ws_, strip, thread); });
     team_.barrier([&] { mark(&StageTimes::backward); });
-    stages_.gradients(ws_, output);
+    stages_.gradients(ws_, output, thread);
     team_.barrier([&] { mark(&StageTimes::update); });
   });
   std::fill_n(d_twist, 6, 0.0);
@@ -167,6 +173,9 @@ Training Rasterizer::begin_training(const TrainingView& view, bool masked, const
   const double weight_sum = view.weight_sum(masked);
   const double per_pixel = weight_sum > 0.0 ? 1.0 / weight_sum : 0.0;
   const size_t tiles = size_t(ws_.tiles_x) * size_t(ws_.tiles_y);
+  for (ThreadScratch& scratch : ws_.scratch) {
+    if (scratch.tiles.size() < size_t(ws_.tiles_x)) scratch.tiles.resize(size_t(ws_.tiles_x));
+  }
   l1_sums_.reserve(tiles);
   ssim_sums_.reserve(size_t(ws_.tiles_y) + 1);
   const Training training{
@@ -237,7 +246,7 @@ double Rasterizer::step(const FrameInput& input, const OptimizerState& state, co
     team_.barrier([&] {
       prepare_gradient_rows();
       order_strips();
-      ws_.segment_ticket = 0;
+      ws_.hand_out_segments();
       mark(&StageTimes::project);
     });
     if (with_ssim) {
@@ -252,7 +261,7 @@ double Rasterizer::step(const FrameInput& input, const OptimizerState& state, co
         mark(&StageTimes::raster);
       }
     });
-    stages_.update(ws_, update);
+    stages_.update(ws_, update, thread);
     team_.barrier([&] { mark(&StageTimes::update); });
   });
 

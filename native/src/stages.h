@@ -97,8 +97,8 @@ struct Stages {
   // From image_gradient to gradient rows, for the tile row that draw_strip has drawn.
   void (*backward_strip)(Workspace&, int strip, int thread);
   // From gradient rows to parameters, over the segments that are left to do.
-  void (*update)(Workspace&, const Update&);
-  void (*gradients)(Workspace&, const GradientOutput&);
+  void (*update)(Workspace&, const Update&, int thread);
+  void (*gradients)(Workspace&, const GradientOutput&, int thread);
 };
 
 // The forms; dispatch.cpp refers to those that this build has.

@@ -44,7 +44,7 @@ void draw_tile(Workspace& ws, TileList& list, const TilePosition& tile) {
 void draw_strip(Workspace& ws, int strip, int thread) {
   int count = 0;
   const DepthKey* keys = sort_strip(ws, strip, thread, count);
-  bin_strip(ws, strip, keys, count);
+  bin_strip(ws, strip, keys, count, &ws.tiles[size_t(strip) * size_t(ws.tiles_x)]);
   for (int x = 0; x < ws.tiles_x; ++x) {
     const size_t t = size_t(strip) * size_t(ws.tiles_x) + size_t(x);
     const TilePosition tile(ws, x, strip);

@@ -112,7 +112,7 @@ GAUSSLITE_INLINE Pack16 compare(const Training& training, size_t t, int b, const
 void train_tile(Workspace& ws, const Training& training, size_t t, const TilePosition& tile, ThreadScratch& mine) {
   BlockState state[kBlocks];
   mine.tape.rewind();
-  const TileTape taped = draw(ws, mine.tape, ws.tiles[t], tile, state);
+  const TileTape taped = draw(ws, mine.tape, mine.tiles[size_t(tile.x)], tile, state);
   mine.block_evaluations += mine.tape.alpha_count;
   TileGradient gradient;
   Pack16 loss(0.0f);
@@ -138,13 +138,13 @@ void train_strip(Workspace& ws, const Training& training, int strip, int thread)
   const size_t first = size_t(strip) * size_t(ws.tiles_x);
   std::fill_n(training.l1_sums + first, ws.tiles_x, 0.0);
   if (!any_tile(training.targets.weighted_blocks + first, ws.tiles_x)) return;
+  ThreadScratch& mine = ws.scratch[size_t(thread)];
   int count = 0;
   const DepthKey* keys = sort_strip(ws, strip, thread, count);
-  bin_strip(ws, strip, keys, count);
+  bin_strip(ws, strip, keys, count, mine.tiles.data());
   for (int x = 0; x < ws.tiles_x; ++x) {
     const size_t t = first + size_t(x);
-    if (training.targets.weighted_blocks[t] != 0)
-      train_tile(ws, training, t, TilePosition(ws, x, strip), ws.scratch[size_t(thread)]);
+    if (training.targets.weighted_blocks[t] != 0) train_tile(ws, training, t, TilePosition(ws, x, strip), mine);
   }
 }
 
@@ -152,9 +152,10 @@ void draw_on_tape(Workspace& ws, const Training& training, StripTape& tape, int 
   const size_t first = size_t(strip) * size_t(ws.tiles_x);
   tape.rewind();
   if (!any_tile(training.targets.reached_blocks + first, ws.tiles_x)) return;
+  ThreadScratch& mine = ws.scratch[size_t(thread)];
   int count = 0;
   const DepthKey* keys = sort_strip(ws, strip, thread, count);
-  bin_strip(ws, strip, keys, count);
+  bin_strip(ws, strip, keys, count, mine.tiles.data());
   tape.tiles.reserve(size_t(ws.tiles_x));
   tape.image.reserve(image_tile(ws.tiles_x));
   for (int x = 0; x < ws.tiles_x; ++x) {
@@ -162,7 +163,7 @@ void draw_on_tape(Workspace& ws, const Training& training, StripTape& tape, int 
     if (training.targets.reached_blocks[t] == 0) continue;
     const TilePosition tile(ws, x, strip);
     BlockState state[kBlocks];
-    tape.tiles[size_t(x)] = draw(ws, tape, ws.tiles[t], tile, state);
+    tape.tiles[size_t(x)] = draw(ws, tape, mine.tiles[size_t(x)], tile, state);
     float* image = tape.image.data() + image_tile(x);
     for (int b = 0; b < kBlocks; ++b) {
       const Pack16 pixels[kImagePlanes] = {state[b].r, state[b].g, state[b].b, state[b].depth, state[b].transmittance};
@@ -170,7 +171,7 @@ void draw_on_tape(Workspace& ws, const Training& training, StripTape& tape, int 
     }
     clear_beyond_edge(ws.camera, x, strip, image);
   }
-  ws.scratch[size_t(thread)].block_evaluations += tape.alpha_count;
+  mine.block_evaluations += tape.alpha_count;
 }
 
 void walk_back_on_tape(Workspace& ws, const Training& training, const TapedStrip& taped) {

@@ -24,26 +24,35 @@ struct Group {
       const Visible& splat = ws.visible[slot + uint32_t(std::min(j, n - 1))];
       id[j] = splat.id;
       row[j] = load(ws.rows + size_t(kRowWidth) * splat.id);
-      image[j] = Pack16(0.0f);
-      if (j >= n) continue;
-      for (uint32_t r = 0; r < splat.gradient_rows; ++r) {
-        const float* gradient = ws.gradient_rows.data() + size_t(kRowWidth) * (splat.gradient_row + r);
-        uint32_t tag;
-        std::memcpy(&tag, gradient + kRowTag, sizeof tag);
-        if (tag == ws.tag) image[j] = image[j] + load(gradient);
-      }
+      // One or two are the rule. Both are read always, and only then counted or not: no branch to mispredict.
+      const uint32_t rows = j < n ? splat.gradient_rows : 0;
+      image[j] = gradient(ws, splat.gradient_row, rows > 0) + gradient(ws, splat.gradient_row + 1, rows > 1);
+      for (uint32_t r = 2; r < rows; ++r) image[j] = image[j] + gradient(ws, splat.gradient_row + r, true);
     }
     transpose(row);
     transpose(image);
+  }
+
+ private:
+  // A gradient row, or zeros if this pass has not written it.
+  GAUSSLITE_INLINE static Pack16 gradient(const Workspace& ws, uint32_t index, bool counts) {
+    const float* row = ws.gradient_rows.data() + size_t(kRowWidth) * index;
+    uint32_t tag;
+    std::memcpy(&tag, row + kRowTag, sizeof tag);
+    return keep_if(counts & (tag == ws.tag), load(row));
   }
 };
 
 // Calls f(segment, group, slot) for the visible splats of the segments that are left to do, sixteen at a time.
 template <class F>
-GAUSSLITE_INLINE void for_each_group(Workspace& ws, F f) {
-  for (uint32_t s; (s = ws.segment_ticket.fetch_add(1, std::memory_order_relaxed)) < ws.segments;) {
+GAUSSLITE_INLINE void for_each_group(Workspace& ws, int thread, F f) {
+  for (uint32_t s; (s = ws.take_segment(thread)) < ws.segments;) {
     const uint32_t begin = s * kSegment, end = begin + ws.segment_visible[s];
     for (uint32_t slot = begin; slot < end; slot += 16) {
+      for (uint32_t next = slot + 16; next < std::min(slot + 32, end); ++next) {
+        const Visible& splat = ws.visible[next];
+        prefetch(ws.rows + size_t(kRowWidth) * splat.id);
+      }
       const Group group(ws, slot, int(std::min(16u, end - slot)));
       f(s, group, slot);
     }
@@ -100,13 +109,13 @@ class Adam {
 
 }  // namespace
 
-void update(Workspace& ws, const Update& job) {
+void update(Workspace& ws, const Update& job, int thread) {
   const Adam adam(job);
-  for_each_group(ws, [&](uint32_t, const Group& group, uint32_t) {
+  for_each_group(ws, thread, [&](uint32_t, const Group& group, uint32_t) {
     // By the time the gradients are known the moments have come from memory.
     for (const uint32_t id : group.id) {
-      prefetch(job.first_moment + size_t(kRowWidth) * id);
-      prefetch(job.second_moment + size_t(kRowWidth) * id);
+      prefetch_to_write(job.first_moment + size_t(kRowWidth) * id);
+      prefetch_to_write(job.second_moment + size_t(kRowWidth) * id);
     }
     ParameterGradients g;
     backward16<false>(group.row, group.image, ws.camera, g);
@@ -124,8 +133,8 @@ void update(Workspace& ws, const Update& job) {
   });
 }
 
-void gradients(Workspace& ws, const GradientOutput& job) {
-  for_each_group(ws, [&](uint32_t segment, const Group& group, uint32_t slot) {
+void gradients(Workspace& ws, const GradientOutput& job, int thread) {
+  for_each_group(ws, thread, [&](uint32_t segment, const Group& group, uint32_t slot) {
     ParameterGradients g;
     backward16<true>(group.row, group.image, ws.camera, g);
     drop_unsound(g);

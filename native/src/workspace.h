@@ -37,7 +37,8 @@ struct DepthKey {
   uint32_t depth, slot;  // bits of the positive float depth; index into Workspace::splats
 };
 
-struct KeyList {
+// Aligned, as ThreadScratch is, so that what one thread counts is in no cache line of another's.
+struct alignas(64) KeyList {
   Buffer<DepthKey> keys;
   uint32_t count = 0;
 };
@@ -53,7 +54,7 @@ struct TileList {
 constexpr int kSquare = kTile * kTile;
 constexpr int kSsimMaps = 3;  // what SSIM blurs: x, xx, xy on the way forward, their derivatives on the way back
 constexpr int kChunk = 128;  // splats of a tile that are handled at a time: their records stay in the first-level cache
-constexpr int kPrefetchAhead = 24;  // keys
+constexpr int kPrefetchAhead = 64;  // keys
 constexpr int kSegment = 2048;      // parameter rows that are projected as a unit, by whichever thread is free
 
 // Where a row's splat is and how far it may reach: its mean, and the largest of its log scales.
@@ -99,13 +100,15 @@ inline size_t image_tile(int x) { return size_t(x) * kImagePlanes * kSquare; }
 // Where a row of SSIM squares (loss_ssim.cpp) has a map: sixteen rows of sixteen floats.
 inline size_t ssim_square(int x, int channel, int map) { return size_t((x * 3 + channel) * kSsimMaps + map) * kSquare; }
 
-struct ThreadScratch {
+struct alignas(64) ThreadScratch {
   std::vector<KeyList> strips;  // by tile row: the splats of this thread's segments that touch it
   Buffer<DepthKey> sorted[2];
-  StripTape tape;                       // of one tile, where a loss looks at each pixel alone
-  Buffer<float> ssim;                   // columns of the SSIM loss
-  uint32_t next_row = 0, last_row = 0;  // the block of gradient rows this thread is handing out
-  uint64_t block_evaluations = 0;       // block list entries that it composited in this frame
+  std::vector<TileList> tiles;                          // of the strip that it trains on
+  StripTape tape;                                       // of one tile, where a loss looks at each pixel alone
+  Buffer<float> ssim;                                   // columns of the SSIM loss
+  uint32_t next_row = 0, last_row = 0;                  // the block of gradient rows this thread is handing out
+  uint64_t block_evaluations = 0;                       // block list entries that it composited in this frame
+  alignas(64) std::atomic<uint32_t> segments_taken{0};  // of its own
 };
 
 struct Workspace {
@@ -136,7 +139,7 @@ struct Workspace {
   // Raster. Lists hold the wanted blocks of a tile only: those of the active tiles that the loss depends on.
   Buffer<uint16_t> wanted_blocks;
   // image: red, green, blue, depth, transmittance; image_gradient: by red, green, blue, depth, alpha.
-  std::vector<TileList> tiles;
+  std::vector<TileList> tiles;  // of the image that was drawn last, for its way back
   Buffer<float> image, image_gradient;
   // A training step with SSIM reuses few of these, so that they stay in cache.
   std::vector<StripTape> tapes;             // strips that are drawn and not yet walked back
@@ -150,8 +153,22 @@ struct Workspace {
 
   std::vector<ThreadScratch> scratch;
   // Dynamic scheduling of tile rows and of segments; reset between stages.
-  std::atomic<int> ticket{0};
-  std::atomic<uint32_t> segment_ticket{0};
+  alignas(64) std::atomic<int> ticket{0};
+
+  void hand_out_segments() {
+    for (ThreadScratch& s : scratch) s.segments_taken.store(0, std::memory_order_relaxed);
+  }
+  // The next segment for this thread, or `segments`. A thread's own come first: the same ones in every stage and step,
+  // whose rows, moments and splats it has in its caches. Then it helps the others.
+  __attribute__((always_inline)) uint32_t take_segment(int thread) {
+    const uint32_t count = uint32_t(threads);
+    for (uint32_t i = 0; i < count; ++i) {
+      const uint32_t owner = (uint32_t(thread) + i) % count;
+      const uint32_t taken = scratch[owner].segments_taken.fetch_add(1, std::memory_order_relaxed);
+      if (taken * count + owner < segments) return taken * count + owner;
+    }
+    return segments;
+  }
 };
 
 }  // namespace gausslite

@@ -83,5 +83,7 @@ GAUSSLITE_INLINE void transpose(Pack16 (&r)[16]) {
 }
 
 GAUSSLITE_INLINE void prefetch(const void* p) { __builtin_prefetch(p, 0, 3); }
+// The same for what will be written: no other core keeps it then, and the store need not wait until it is given up.
+GAUSSLITE_INLINE void prefetch_to_write(const void* p) { __builtin_prefetch(p, 1, 3); }
 
 }  // namespace gausslite::GAUSSLITE_ISA

@@ -25,9 +25,6 @@ GAUSSLITE_INLINE Pack8 operator+(Pack8 a, Pack8 b) { return _mm256_add_ps(a.v, b
 GAUSSLITE_INLINE Pack8 operator-(Pack8 a, Pack8 b) { return _mm256_sub_ps(a.v, b.v); }
 GAUSSLITE_INLINE Pack8 operator*(Pack8 a, Pack8 b) { return _mm256_mul_ps(a.v, b.v); }
 GAUSSLITE_INLINE Pack8 fnma(Pack8 a, Pack8 b, Pack8 c) { return _mm256_fnmadd_ps(a.v, b.v, c.v); }
-GAUSSLITE_INLINE Pack8 keep_if(bool yes, Pack8 a) {
-  return _mm256_and_ps(a.v, _mm256_castsi256_ps(_mm256_set1_epi32(-int32_t(yes))));
-}
 
 template <int a, int b, int c, int d, int e, int f, int g, int h>
 GAUSSLITE_INLINE Pack8 permute(Pack8 x) {

@@ -94,6 +94,10 @@ GAUSSLITE_COMPARISON(operator==, _CMP_EQ_OQ)
 #undef GAUSSLITE_COMPARISON
 
 GAUSSLITE_INLINE Pack16 keep(Mask16 m, Pack16 a) { return {_mm256_and_ps(m.lo, a.lo), _mm256_and_ps(m.hi, a.hi)}; }
+GAUSSLITE_INLINE Pack16 keep_if(bool yes, Pack16 a) {
+  const __m256 mask = _mm256_castsi256_ps(_mm256_set1_epi32(-int(yes)));
+  return {_mm256_and_ps(mask, a.lo), _mm256_and_ps(mask, a.hi)};
+}
 GAUSSLITE_INLINE Pack16 select(Mask16 m, Pack16 yes, Pack16 no) {
   return {_mm256_blendv_ps(no.lo, yes.lo, m.lo), _mm256_blendv_ps(no.hi, yes.hi, m.hi)};
 }
@@ -197,5 +201,7 @@ GAUSSLITE_INLINE void store_block(float* p, int64_t stride, Pack16 a) {
   _mm_storeu_ps(p + 2 * stride, _mm256_castps256_ps128(a.hi));
   _mm_storeu_ps(p + 3 * stride, _mm256_extractf128_ps(a.hi, 1));
 }
+
+GAUSSLITE_INLINE Pack16 join(Pack8 lo, Pack8 hi) { return {lo.v, hi.v}; }
 
 }  // namespace gausslite::GAUSSLITE_ISA

@@ -59,6 +59,7 @@ GAUSSLITE_INLINE Mask16 operator>=(Pack16 a, Pack16 b) { return {_mm512_cmp_ps_m
 GAUSSLITE_INLINE Mask16 operator==(Pack16 a, Pack16 b) { return {_mm512_cmp_ps_mask(a.v, b.v, _CMP_EQ_OQ)}; }
 
 GAUSSLITE_INLINE Pack16 keep(Mask16 m, Pack16 a) { return _mm512_maskz_mov_ps(m.v, a.v); }
+GAUSSLITE_INLINE Pack16 keep_if(bool yes, Pack16 a) { return _mm512_maskz_mov_ps(__mmask16(-int(yes)), a.v); }
 GAUSSLITE_INLINE Pack16 select(Mask16 m, Pack16 yes, Pack16 no) { return _mm512_mask_mov_ps(no.v, m.v, yes.v); }
 GAUSSLITE_INLINE float sum(Pack16 a) { return _mm512_reduce_add_ps(a.v); }
 
@@ -138,5 +139,7 @@ GAUSSLITE_INLINE Pack8 sum_of_quads(Pack16 a) {
   const __m256 half = _mm256_add_ps(_mm512_castps512_ps256(a.v), _mm512_extractf32x8_ps(a.v, 1));
   return _mm256_zextps128_ps256(_mm_add_ps(_mm256_castps256_ps128(half), _mm256_extractf128_ps(half, 1)));
 }
+
+GAUSSLITE_INLINE Pack16 join(Pack8 lo, Pack8 hi) { return _mm512_insertf32x8(_mm512_castps256_ps512(lo.v), hi.v, 1); }
 
 }  // namespace gausslite::GAUSSLITE_ISA

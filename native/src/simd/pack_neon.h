@@ -121,6 +121,10 @@ GAUSSLITE_INLINE Pack16 select(Mask16 m, Pack16 yes, Pack16 no) {
           vbslq_f32(m.q[2], yes.q[2], no.q[2]), vbslq_f32(m.q[3], yes.q[3], no.q[3])};
 }
 GAUSSLITE_INLINE Pack16 keep(Mask16 m, Pack16 a) { return select(m, a, Pack16(0.0f)); }
+GAUSSLITE_INLINE Pack16 keep_if(bool yes, Pack16 a) {
+  const uint32x4_t mask = vdupq_n_u32(uint32_t(-int(yes)));
+  return select({mask, mask, mask, mask}, a, Pack16(0.0f));
+}
 
 // Adds floor(e) to the float's exponent field; e below -126 gives about 2^-126, above 127 about 2^127.
 GAUSSLITE_INLINE float32x4_t scaled_by_power(float32x4_t a, float32x4_t e) {
@@ -222,10 +226,6 @@ GAUSSLITE_INLINE Pack8 operator*(Pack8 a, Pack8 b) { return {vmulq_f32(a.lo, b.l
 GAUSSLITE_INLINE Pack8 fnma(Pack8 a, Pack8 b, Pack8 c) {
   return {vfmsq_f32(c.lo, a.lo, b.lo), vfmsq_f32(c.hi, a.hi, b.hi)};
 }
-GAUSSLITE_INLINE Pack8 keep_if(bool yes, Pack8 a) {
-  const uint32x4_t mask = vdupq_n_u32(yes ? ~0u : 0u);
-  return {vbslq_f32(mask, a.lo, vdupq_n_f32(0.0f)), vbslq_f32(mask, a.hi, vdupq_n_f32(0.0f))};
-}
 
 // Two table look-ups in the 32 bytes of x.
 template <int a, int b, int c, int d, int e, int f, int g, int h>
@@ -238,5 +238,7 @@ GAUSSLITE_INLINE Pack8 sum_of_quads(Pack16 a) { return {added_quads(a), vdupq_n_
 GAUSSLITE_INLINE void pair_groups(Pack16 a, Pack16 b, Pack8 (&out)[4]) {
   for (int k = 0; k < 4; ++k) out[k] = {a.q[k], b.q[k]};
 }
+
+GAUSSLITE_INLINE Pack16 join(Pack8 lo, Pack8 hi) { return {lo.lo, lo.hi, hi.lo, hi.hi}; }
 
 }  // namespace gausslite::GAUSSLITE_ISA

@@ -141,6 +141,12 @@ GAUSSLITE_INLINE Pack16 keep(Mask16 m, Pack16 a) {
   GAUSSLITE_EACH a.q[i] = (Quad)(m.q[i] & (QuadInt)a.q[i]);
   return a;
 }
+GAUSSLITE_INLINE Pack16 keep_if(bool yes, Pack16 a) {
+  const int32_t mask = -int32_t(yes);
+  return keep({QuadInt{mask, mask, mask, mask}, QuadInt{mask, mask, mask, mask}, QuadInt{mask, mask, mask, mask},
+               QuadInt{mask, mask, mask, mask}},
+              a);
+}
 GAUSSLITE_INLINE Pack16 select(Mask16 m, Pack16 yes, Pack16 no) {
   GAUSSLITE_EACH yes.q[i] = choose(m.q[i], yes.q[i], no.q[i]);
   return yes;
@@ -248,7 +254,6 @@ GAUSSLITE_INLINE Pack8 operator+(Pack8 a, Pack8 b) { return {a.lo + b.lo, a.hi +
 GAUSSLITE_INLINE Pack8 operator-(Pack8 a, Pack8 b) { return {a.lo - b.lo, a.hi - b.hi}; }
 GAUSSLITE_INLINE Pack8 operator*(Pack8 a, Pack8 b) { return {a.lo * b.lo, a.hi * b.hi}; }
 GAUSSLITE_INLINE Pack8 fnma(Pack8 a, Pack8 b, Pack8 c) { return c - a * b; }
-GAUSSLITE_INLINE Pack8 keep_if(bool yes, Pack8 a) { return yes ? a : Pack8(0.0f); }
 
 // Lane k of the result is the lane of x that the k-th argument names.
 template <int a, int b, int c, int d, int e, int f, int g, int h>
@@ -262,6 +267,16 @@ GAUSSLITE_INLINE Pack8 sum_of_quads(Pack16 a) { return {(a.q[0] + a.q[2]) + (a.q
 // Group k of a followed by group k of b, for k = 0 ... 3.
 GAUSSLITE_INLINE void pair_groups(Pack16 a, Pack16 b, Pack8 (&out)[4]) {
   for (int k = 0; k < 4; ++k) out[k] = {a.q[k], b.q[k]};
+}
+
+// The eight floats of `lo`, then those of `hi`.
+GAUSSLITE_INLINE Pack16 join(Pack8 lo, Pack8 hi) {
+  Pack16 a;
+  a.q[0] = lo.lo;
+  a.q[1] = lo.hi;
+  a.q[2] = hi.lo;
+  a.q[3] = hi.hi;
+  return a;
 }
 
 }  // namespace gausslite::GAUSSLITE_ISA
