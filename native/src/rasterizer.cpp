@@ -201,7 +201,7 @@ Training Rasterizer::begin_training(const TrainingView& view, bool masked, const
 void Rasterizer::train_with_ssim(const Training& training, int thread) {
   StageTimes spent;
   double started_ms = now_ms();
-  for (StripTask task; (task = schedule_.next()).kind != StripTask::kNone;) {
+  for (StripTask task; (task = schedule_.next(thread)).kind != StripTask::kNone;) {
     const auto tape = [&](int i) { return task.tapes[i] >= 0 ? &ws_.tapes[size_t(task.tapes[i])] : nullptr; };
     const auto squares = [&](int i) { return ws_.ssim_squares[size_t(task.squares[i])].data(); };
     double StageTimes::*stage = &StageTimes::raster;

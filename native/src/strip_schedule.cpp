@@ -1,6 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "strip_schedule.h"
 
+#include <cstddef>
+
 #include "team.h"
 
 namespace gausslite {
@@ -11,6 +13,17 @@ int pop(std::vector<int>& stack) {
   const int last = stack.back();
   stack.pop_back();
   return last;
+}
+
+// The latest number on the stack that belongs to this thread; -1 if none does.
+int pop_own(std::vector<int>& stack, const std::vector<int>& thread_of, int thread) {
+  for (size_t i = stack.size(); i-- > 0;) {
+    const int own = stack[i];
+    if (thread_of[size_t(own)] != thread) continue;
+    stack.erase(stack.begin() + std::ptrdiff_t(i));
+    return own;
+  }
+  return -1;
 }
 
 // Numbers 0 ... count - 1, the lowest on top.
@@ -27,6 +40,8 @@ void StripSchedule::start(int strips, int tape_places) {
   fill(free_tapes_, tape_places);
   fill(free_squares_, square_places(tape_places));
   tape_of_strip_.assign(size_t(strips), -1);
+  drawn_by_.assign(size_t(strips), -1);
+  tape_used_by_.resize(size_t(tape_places), -1);
   squares_of_row_.assign(size_t(strips) + 1, -1);
   walk_waits_.assign(size_t(strips), 2);
   for (std::vector<int>* strips_beside : {&derive_waits_, &row_users_}) {
@@ -37,39 +52,46 @@ void StripSchedule::start(int strips, int tape_places) {
   walkable_.clear();
 }
 
-StripTask StripSchedule::next() {
+StripTask StripSchedule::next(int thread) {
   for (;;) {
     const uint32_t seen = changes_.load(std::memory_order_acquire);
     {
       const std::lock_guard lock(mutex_);
       StripTask task;
-      if (walks_taken_ == strips_ || take(task)) return task;
+      if (walks_taken_ == strips_ || take(task, thread)) return task;
     }
     wait_while(changes_, seen);
   }
 }
 
-// Walking back comes first: it frees a tape, and the strip is the likeliest to be still in cache.
-bool StripSchedule::take(StripTask& task) {
-  if (!walkable_.empty()) {
-    task.kind = StripTask::kWalkBack;
-    task.index = pop(walkable_);
-    task.tapes[0] = tape_of_strip_[size_t(task.index)];
-    for (int i = 0; i < 2; ++i) task.squares[i] = squares_of_row_[size_t(task.index + i)];
-    ++walks_taken_;
-  } else if (!derivable_.empty()) {
+// A thread first walks back what it has drawn itself: that frees a tape, and the tape is in its caches. What another
+// one has drawn it walks back only when there is nothing else to do.
+bool StripSchedule::take(StripTask& task, int thread) {
+  int strip = pop_own(walkable_, drawn_by_, thread);
+  if (strip < 0 && !derivable_.empty()) {
     task.kind = StripTask::kDerive;
     task.index = pop(derivable_);
     if (task.index > 0) task.tapes[0] = tape_of_strip_[size_t(task.index - 1)];
     if (task.index < strips_) task.tapes[1] = tape_of_strip_[size_t(task.index)];
     task.squares[0] = squares_of_row_[size_t(task.index)] = pop(free_squares_);
-  } else if (next_draw_ < strips_ && !free_tapes_.empty()) {
+    return true;
+  }
+  if (strip < 0 && next_draw_ < strips_ && !free_tapes_.empty()) {
+    const int own_tape = pop_own(free_tapes_, tape_used_by_, thread),
+              tape = own_tape >= 0 ? own_tape : pop(free_tapes_);
     task.kind = StripTask::kDraw;
     task.index = next_draw_++;
-    task.tapes[0] = tape_of_strip_[size_t(task.index)] = pop(free_tapes_);
-  } else {
-    return false;
+    task.tapes[0] = tape_of_strip_[size_t(task.index)] = tape;
+    drawn_by_[size_t(task.index)] = tape_used_by_[size_t(tape)] = thread;
+    return true;
   }
+  if (strip < 0 && !walkable_.empty()) strip = pop(walkable_);
+  if (strip < 0) return false;
+  task.kind = StripTask::kWalkBack;
+  task.index = strip;
+  task.tapes[0] = tape_of_strip_[size_t(strip)];
+  for (int i = 0; i < 2; ++i) task.squares[i] = squares_of_row_[size_t(strip + i)];
+  ++walks_taken_;
   return true;
 }
 

@@ -28,16 +28,17 @@ class StripSchedule {
   static int square_places(int tape_places) { return 2 * tape_places; }
 
   void start(int strips, int tape_places);
-  // Waits for a task; kNone when all are taken.
-  StripTask next();
+  // Waits for a task for this thread; kNone when all are taken.
+  StripTask next(int thread);
   void finish(const StripTask& task);
 
  private:
-  bool take(StripTask& task);
+  bool take(StripTask& task, int thread);
 
   std::mutex mutex_;
   int strips_ = 0, next_draw_ = 0, walks_taken_ = 0;
   std::vector<int> free_tapes_, free_squares_, tape_of_strip_, squares_of_row_;
+  std::vector<int> drawn_by_, tape_used_by_;    // threads: by strip, and by place
   std::vector<int> derive_waits_, walk_waits_;  // parts that are still missing
   std::vector<int> row_users_;                  // strips beside a row that are not walked back yet
   std::vector<int> derivable_, walkable_;
