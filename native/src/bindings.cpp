@@ -176,14 +176,14 @@ struct StepTraining {
   std::optional<Flags> counted;
   uint64_t loan;
 
-  StepTraining(std::tuple<RowTable, RowTable, RowTable> tables, std::tuple<float, float, float> weights,
+  StepTraining(std::tuple<RowTable, RowTable, RowTable> tables, std::tuple<float, float, float, bool> weights,
                const std::vector<float>& rates, std::tuple<double, double, double> constants, bool masked,
                std::optional<Flags> trainable, std::optional<Counts> trained, std::optional<Flags> counted,
                uint64_t loan)
       : rows(std::get<0>(tables)),
         first_moment(std::get<1>(tables)),
         second_moment(std::get<2>(tables)),
-        loss{std::get<0>(weights), std::get<1>(weights), std::get<2>(weights)},
+        loss{std::get<0>(weights), std::get<1>(weights), std::get<2>(weights), std::get<3>(weights)},
         masked(masked),
         trainable(trainable),
         trained(trained),
@@ -252,7 +252,7 @@ NB_MODULE(_kernels, m) {
            nb::arg("tiles").noconvert().none(), nb::arg("ids").noconvert().none());
 
   nb::class_<StepTraining>(m, "StepTraining", "What a step changes and how; it keeps the arrays, not their values.")
-      .def(nb::init<std::tuple<RowTable, RowTable, RowTable>, std::tuple<float, float, float>,
+      .def(nb::init<std::tuple<RowTable, RowTable, RowTable>, std::tuple<float, float, float, bool>,
                     const std::vector<float>&, std::tuple<double, double, double>, bool, std::optional<Flags>,
                     std::optional<Counts>, std::optional<Flags>, uint64_t>(),
            nb::arg("tables").noconvert(), nb::arg("loss"), nb::arg("rates"), nb::arg("adam"), nb::arg("masked"),

@@ -27,6 +27,7 @@ struct FrameInput {
 
 struct LossWeights {
   float colour, depth, ssim;
+  bool by_share;  // the loss times the view's share: a pixel of weight 1 then counts the same in every step
 };
 
 struct OptimizerState {

@@ -19,6 +19,8 @@ class TrainingView {
   int height() const { return height_; }
   Targets targets(bool masked) const;
   double weight_sum(bool masked) const { return weights(masked).sum; }
+  // The mean weight: how much of the image counts.
+  double share(bool masked) const { return weights(masked).sum / inside_.sum; }
 
  private:
   // One way of weighing the pixels, and where its weights are. Tiles of zeros and of ones share one place each.

@@ -37,6 +37,8 @@ CASES = {
     "colour alone": {"loss": LossWeights(1.0, 0.0, 0.0)},
     "depth alone": {"loss": LossWeights(0.0, 1.0, 0.0)},
     "structure alone": {"loss": LossWeights(0.0, 0.0, 1.0)},
+    "masked, by share": {"loss": LossWeights(by_share=True), "masked": True},
+    "by share": {"loss": LossWeights(by_share=True)},
     "structure alone, masked": {"loss": LossWeights(0.0, 0.0, 1.0), "masked": True},
     "without structure, masked": {"loss": LossWeights(0.8, 1.0, 0.0), "masked": True},
     "some tiles, masked": {

@@ -120,10 +120,14 @@ class KeyframeSettings:
         _require(0 <= weight <= 1, "keyframes surroundings_weight", "0 to 1", weight)
 
 
+_ALIKE_IN_BOTH_PHASES = LossWeights(by_share=True)
+
+
 @dataclass(frozen=True, slots=True)
 class OptimizationSettings:
     """How a frame trains the map (Sec. III-D): first warm-up iterations on the full image, then active ones.
 
+    loss: by share, so that warm-ups and the active phase, whose masks are small, do not undo each other in Adam.
     isotropic: Gaussians are made spheres again after every frame.
     averaged_updates: the map is shown as the mean of each Gaussian over about its last so many updates, since views
     that contradict each other move it to and fro; 0 shows it as training left it. Training itself knows no means.
@@ -132,7 +136,7 @@ class OptimizationSettings:
     warmup_iterations: int = 2
     active_iterations: int = 6
     active_phase: ActivePhase = ActivePhase.EXACT
-    loss: LossWeights = field(default_factory=LossWeights)
+    loss: LossWeights = _ALIKE_IN_BOTH_PHASES
     adam: AdamSettings = ONLINE_RATES
     isotropic: bool = False
     averaged_updates: float = 32.0

@@ -43,7 +43,7 @@ class StepTraining:
     def __init__(
         self,
         tables: tuple[Float32[ndarray, "n 16"], Float32[ndarray, "n 16"], Float32[ndarray, "n 16"]],
-        loss: tuple[float, float, float],
+        loss: tuple[float, float, float, bool],
         rates: Sequence[float],
         adam: tuple[float, float, float],
         masked: bool,

@@ -107,7 +107,7 @@ class Loans:
         marks = contiguous(trainable), None if tally is None else tally.counts, contiguous(among)
         native: _kernels.StepTraining = load_kernels().StepTraining(
             tables,
-            (loss.colour, loss.depth, loss.ssim),
+            (loss.colour, loss.depth, loss.ssim, loss.by_share),
             _row_rates(adam),
             (adam.beta1, adam.beta2, adam.epsilon),
             masked,

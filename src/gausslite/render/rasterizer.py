@@ -95,11 +95,16 @@ class LossWeights:
       colour / (3W) · Σ w |rgb − image|   summed over the three channels
     + depth / W · Σ w |depth / alpha − measured|   where alpha > 0.5 and measured > 0
     + ssim · (1 − Σ w SSIM / (3W))   11x11 Gaussian window, sigma 1.5, zero padding, C1 = 1e-4, C2 = 9e-4
+
+    by_share multiplies all of it by W over the number of pixels, so that a pixel of weight 1 counts the same in every
+    step, whatever the mask. Adam divides by how large gradients were lately: without it, steps masked to a small
+    region make those on the full image next to nothing to the Gaussians that both move.
     """
 
     colour: float = 0.8
     depth: float = 1.0
     ssim: float = 0.2
+    by_share: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -219,7 +224,7 @@ class Rasterizer(Protocol):
     ) -> StepReport:
         """One whole iteration in place: forward, loss, backward, sparse Adam on the visible (and trainable) rows.
 
-        masked=True weighs every loss term by the view's weight and divides by the weights' sum. Only rows that are
+        masked=True weighs every loss term by the view's weight, as LossWeights says. Only rows that are
         visible and trainable change, with their moments: their UPDATES count rises by one, and the density
         statistics of the first moment are added up, and so is the tally. Raises ShapeError.
         """

@@ -73,7 +73,7 @@ class Window:
 class Target:
     """What a window of a view is compared with. similar: the view's own share of the similarity, mean and variance.
 
-    A weight of None is 1 everywhere.
+    A weight of None is 1 everywhere. share: the mean weight over the whole image.
     """
 
     window: Window
@@ -82,6 +82,7 @@ class Target:
     similar: Float32[Tensor, "6 h w"]
     weight: Float32[Tensor, "h w"] | None
     weight_sum: float
+    share: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -109,19 +110,20 @@ class CudaView:
         blurred = _blur(torch.cat([planes, planes * planes]))
         means = blurred[:3]
         similar = torch.cat([means, blurred[3:] - means * means])
-        plain = Target(Window.whole(camera), colours, measured_m, similar, None, float(depth_m.size))
+        plain = Target(Window.whole(camera), colours, measured_m, similar, None, float(depth_m.size), 1.0)
         lens = Lens.of(camera, device)
         if weight is None:
             return cls(camera, lens, plain, plain)
         window = Window.around(weight, camera)
-        part = (window.rows, window.columns)
+        part, weight_sum = (window.rows, window.columns), float(weight.sum(dtype=np.float64))
         masked = Target(
             window,
             colours[part],
             measured_m[part],
             similar[:, window.rows, window.columns],
             carried(weight[part], device),
-            float(weight.sum(dtype=np.float64)),
+            weight_sum,
+            weight_sum / depth_m.size,
         )
         return cls(camera, lens, plain, masked)
 
@@ -142,7 +144,8 @@ def training_loss(
     total = loss.colour * colour + loss.depth * depth
     if loss.ssim != 0.0:
         total = total - loss.ssim * (weight * _ssim_sum(rgb, target)).sum() / 3.0
-    return loss.ssim + total / target.weight_sum
+    value = loss.ssim + total / target.weight_sum
+    return value * target.share if loss.by_share else value
 
 
 def _ssim_sum(rgb: Float32[Tensor, "h w 3"], target: Target) -> Float32[Tensor, "h w"]:

@@ -42,7 +42,8 @@ def training_loss(
     error_m = (depth_m[measured] / alpha[measured] - view.depth_m[measured]).abs()
     depth = (weight[measured] * error_m).sum() / total
     similarity = (weight[..., None] * ssim_map(rgb, view.rgb)).sum() / (3.0 * total)
-    return loss.colour * colour + loss.depth * depth + loss.ssim * (1.0 - similarity)
+    value = loss.colour * colour + loss.depth * depth + loss.ssim * (1.0 - similarity)
+    return value * (total / weight.numel()) if loss.by_share else value
 
 
 def ssim_map(a: Float64[Tensor, "h w 3"], b: Float64[Tensor, "h w 3"]) -> Float64[Tensor, "h w 3"]:
