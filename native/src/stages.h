@@ -96,7 +96,7 @@ struct Stages {
   void (*walk_back_on_tape)(Workspace&, const Training&, const TapedStrip&);
   // From image_gradient to gradient rows, for the tile row that draw_strip has drawn.
   void (*backward_strip)(Workspace&, int strip, int thread);
-  // From gradient rows to parameters, over the segments that are left to do.
+  // From gradient rows to parameters, a thread's own segments first.
   void (*update)(Workspace&, const Update&, int thread);
   void (*gradients)(Workspace&, const GradientOutput&, int thread);
 };

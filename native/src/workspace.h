@@ -21,7 +21,7 @@ struct alignas(64) Splat {
   float r, g, b, depth;
   float slope_y;           // the dy that minimises the quadric for dx = 1 ...
   float slope_x;           // ... and the dx for dy = 1: the ellipse-block test needs them
-  float tile_x0, tile_x1;  // columns of the first and the last tile that its bounding box touches
+  float tile_x0, tile_x1;  // whole: columns of the first and the last tile that its bounding box touches
   uint32_t gradient_row;   // its image gradients of tile row y are in row gradient_row + y (modulo 2^32)
 };
 static_assert(sizeof(Splat) == 64);
@@ -55,7 +55,7 @@ constexpr int kSquare = kTile * kTile;
 constexpr int kSsimMaps = 3;  // what SSIM blurs: x, xx, xy on the way forward, their derivatives on the way back
 constexpr int kChunk = 128;  // splats of a tile that are handled at a time: their records stay in the first-level cache
 constexpr int kPrefetchAhead = 64;  // keys
-constexpr int kSegment = 2048;      // parameter rows that are projected as a unit, by whichever thread is free
+constexpr int kSegment = 2048;      // parameter rows that are projected as a unit, by their own thread unless it is late
 
 // Where a row's splat is and how far it may reach: its mean, and the largest of its log scales.
 struct RowBounds {

@@ -63,6 +63,15 @@ def test_a_record_tells_which_code_made_it(tmp_path: Path) -> None:
     assert archive.recall(one.trial, with_lpips=False) == Kept(one.result, "of yesterday")
 
 
+def test_code_that_changes_while_a_trial_runs_is_not_told_of_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    archive, one, begun = Archive(tmp_path), finished(TASK, 0, 25.0, Budget()), code_fingerprint()
+    monkeypatch.setattr("gausslite.evaluation.quality.study.code_fingerprint", lambda: "of later")
+    archive.keep(one.trial, one.result, {})
+    assert archive.recall(one.trial, with_lpips=False) == Kept(one.result, begun)
+
+
 def test_a_fingerprint_changes_with_every_byte_and_name(tmp_path: Path) -> None:
     files = [tmp_path / "a.py", tmp_path / "b.py"]
     seen = set()

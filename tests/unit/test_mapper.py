@@ -10,6 +10,7 @@ import pytest
 from mapping_scenes import middle_relevance, wall_frame
 
 from gausslite.domain.relevance import RelevanceMap
+from gausslite.domain.state import part
 from gausslite.errors import InvalidInputError, ShapeError
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.pace import Pace, PaceSettings, Step
@@ -24,6 +25,7 @@ from gausslite.mapping.settings import (
 )
 from gausslite.optimize.density import DensitySettings
 from gausslite.render.cpu import CpuRasterizer
+from gausslite.render.rasterizer import RGB, LossWeights
 
 SIZE = (48, 32)
 SMALL = MapperSettings(
@@ -67,6 +69,19 @@ def test_kappa_counts_active_phase_iterations_of_active_gaussians_only() -> None
     assert not gaussians.kappa[~gaussians.active].any()
     assert 0 < gaussians.kappa.max() <= 2 * SMALL.optimization.active_iterations
     assert (gaussians.target[gaussians.active] == 0).all()
+
+
+@pytest.mark.parametrize(("loss", "alike"), [(MapperSettings().optimization.loss, True), (LossWeights(), False)])
+def test_gradients_are_as_large_in_the_active_phase_as_in_a_warm_up(loss: LossWeights, alike: bool) -> None:
+    sizes = []
+    for warm_ups in (0, 1):
+        trained = OptimizationSettings(warmup_iterations=warm_ups, active_iterations=1 - warm_ups, loss=loss)
+        mapper = mapper_of(replace(SMALL, optimization=trained))
+        map_wall(mapper, 1)
+        second_moment = part(mapper.state(), "table")["second_moment"]
+        sizes.append(float(np.median(second_moment[mapper.gaussians().active, RGB])))
+    # a mean over the mask, a ninth of the image, makes their squares many times as large
+    assert (0.5 < sizes[0] / sizes[1] < 2.0) is alike
 
 
 def test_where_no_view_shows_the_region_every_iteration_is_a_warm_up() -> None:

@@ -96,9 +96,9 @@ class LossWeights:
     + depth / W · Σ w |depth / alpha − measured|   where alpha > 0.5 and measured > 0
     + ssim · (1 − Σ w SSIM / (3W))   11x11 Gaussian window, sigma 1.5, zero padding, C1 = 1e-4, C2 = 9e-4
 
-    by_share multiplies all of it by W over the number of pixels, so that a pixel of weight 1 counts the same in every
-    step, whatever the mask. Adam divides by how large gradients were lately: without it, steps masked to a small
-    region make those on the full image next to nothing to the Gaussians that both move.
+    by_share multiplies all of it by W over the number of pixels, so that on images of one size a pixel of weight 1
+    counts the same in every step, whatever the mask. Adam divides by how large gradients were lately: without it,
+    steps masked to a small region make those on the full image next to nothing to the Gaussians that both move.
     """
 
     colour: float = 0.8

@@ -105,10 +105,14 @@ class Kept:
 
 
 class Archive:
-    """A folder of finished trials: in trials/ a record each and what its map looked like, in sheets/ comparisons."""
+    """A folder of finished trials: in trials/ a record each and what its map looked like, in sheets/ comparisons.
+
+    code is the fingerprint of what runs now, taken before any trial does: the files may change while one runs.
+    """
 
     def __init__(self, folder: Path) -> None:
         """Raises StorageError where the folder cannot be written."""
+        self.code = code_fingerprint()
         self._trials, self._sheets = folder / "trials", folder / "sheets"
         for part in (self._trials, self._sheets):
             prepare_folder(part)
@@ -133,7 +137,7 @@ class Archive:
             write_png(self._picture(trial, position), picture)
         record = {
             "settings": _summary(trial),
-            "code": code_fingerprint(),
+            "code": self.code,
             "pictures": sorted(pictures),
             "result": result.as_json(),
         }
@@ -225,7 +229,7 @@ def _look_up(trial: Trial, archive: Archive, with_lpips: bool, reuse_other_code:
     kept = archive.recall(trial, with_lpips)
     if kept is None:
         return None, Origin.MADE
-    if kept.code == code_fingerprint():
+    if kept.code == archive.code:
         return kept, Origin.KEPT
     return (kept, Origin.KEPT_OF_OTHER_CODE) if reuse_other_code else (None, Origin.MADE_AGAIN)
 
