@@ -32,7 +32,7 @@ _IN_FRONT_M, _IN_FRONT_SHARE = 0.05, 0.05
 class RefineSettings:
     """How long and how freely to refine. The map may grow by the factor headroom, never beyond max_gaussians.
 
-    loss: a mean over each view's footprint. All steps are masked, unlike the mapper's; by share gave the same map.
+    loss: a mean over each view's footprint. All steps are masked, unlike the mapper's; by share gave 0.05 dB less.
     """
 
     iterations: int = 500
