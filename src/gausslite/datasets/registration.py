@@ -85,6 +85,12 @@ class ColourCamera:
         T[:3, 3] = self.offset_m
         return T
 
+    def enlarged(self, across: float, down: float) -> ColourCamera:
+        """The same camera for images so many times as wide and as high."""
+        k = self.intrinsics
+        cx, cy = (k.cx + 0.5) * across - 0.5, (k.cy + 0.5) * down - 0.5
+        return replace(self, intrinsics=FileIntrinsics(k.fx * across, k.fy * down, cx, cy))
+
     def camera(self, width_px: int, height_px: int) -> Camera:
         """Its Camera (pixel centres at +0.5)."""
         return self.intrinsics.camera("colour camera", width_px, height_px)
