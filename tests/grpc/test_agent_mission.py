@@ -48,6 +48,7 @@ class Wall:
     name: str = "wall"
     up_axis: tuple[float, float, float] = (0.0, -1.0, 0.0)
     depth_registered: bool = True
+    left_out: str = ""
     camera: Camera = CAMERA
     broken_at: int | None = None
     asked: list[int] = field(default_factory=list)

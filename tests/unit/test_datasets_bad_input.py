@@ -133,7 +133,7 @@ CASES: list[tuple[str, Damage, type[GaussLiteError], str]] = [
     ("replica", lambda f: (f / "traj.txt").write_text("1 2\n" * 3), DatasetError, "traj.txt line 1: expected 16"),
     (
         "replica",
-        lambda f: (f / "traj.txt").write_text(("nan " * 16 + "\n") * 3),
+        lambda f: (f / "traj.txt").write_text(("nan " + "1 " * 15 + "\n") * 3),
         PoseError,
         "line 1: .* nan",
     ),
@@ -183,6 +183,56 @@ def test_a_depth_image_without_returns_is_no_error(tmp_path: Path) -> None:
     folder = write_seven_scenes(tmp_path / "seq")
     write_depth(folder / "frame-000004.depth.png", 0)
     assert not open_source(str(folder)).frame(1).has_depth
+
+
+NOWHERE = "-inf -inf -inf -inf\n" * 3
+
+
+@pytest.mark.parametrize(
+    "lost", [NOWHERE + "0 0 0 1\n", NOWHERE.replace("-inf", "nan") + "nan nan nan nan\n", "0 0 0 0\n" * 4]
+)
+def test_frames_without_a_pose_are_no_part_of_the_sequence(tmp_path: Path, lost: str) -> None:
+    seven = write_seven_scenes(tmp_path / "seq")
+    (seven / SEVEN_POSE).write_text(lost)
+    replica = write_replica(tmp_path / "office0")
+    rows = (replica / "traj.txt").read_text().splitlines()
+    (replica / "traj.txt").write_text("\n".join([rows[0], lost.replace("\n", " "), rows[2]]))
+    for folder, numbers in ((seven, [0, 8]), (replica, [0, 2])):
+        source = open_source(str(folder))
+        assert source.indices() == numbers
+        assert [source.frame(i).index for i in range(len(source))] == numbers
+        assert source.left_out == "1 of 3 colour images are left out, without a pose"
+
+
+def test_a_tracker_that_was_lost_is_a_gap_in_the_trajectory(tmp_path: Path) -> None:
+    folder = write_tum(tmp_path / "fr1", frames=30)
+    whole = open_source(str(folder))
+    assert len(whole) == 30
+    assert whole.left_out == ""
+    rows = (folder / "groundtruth.txt").read_text().splitlines()
+    lost = [" ".join([row.split()[0], *["nan"] * 7]) if 10.3 < float(row.split()[0]) < 10.5 else row for row in rows]
+    (folder / "groundtruth.txt").write_text("\n".join(lost))
+    source = open_source(str(folder))
+    times = [source.frame(i).capture_time_ns * 1e-9 for i in range(len(source))]
+    assert len(times) == 24
+    assert not any(10.31 < time < 10.49 for time in times)
+    assert source.left_out == ("6 of 30 colour images are left out, without a pose at their time or depth within 20 ms")
+
+
+@pytest.mark.parametrize(
+    ("layout", "file", "content"),
+    [
+        ("tum", "groundtruth.txt", "9.9 nan nan nan nan nan nan nan\n10.9 nan nan nan nan nan nan nan\n"),
+        ("seven", "frame-*.pose.txt", NOWHERE + "0 0 0 1\n"),
+        ("replica", "traj.txt", ("nan " * 16 + "\n") * 3),
+    ],
+)
+def test_a_sequence_without_any_pose_is_refused(tmp_path: Path, layout: str, file: str, content: str) -> None:
+    folder = WRITERS[layout](tmp_path / FOLDERS[layout])
+    for path in folder.glob(file):
+        path.write_text(content)
+    with pytest.raises(DatasetError, match=r"expected (frames with a pose, got none|at least 2 poses, got 0)"):
+        open_source(str(folder))
 
 
 def test_a_position_outside_the_sequence_is_refused(tmp_path: Path) -> None:

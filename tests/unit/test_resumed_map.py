@@ -18,7 +18,7 @@ EMPTY = HEAD + struct.pack("<I", zlib.crc32(HEAD))
 
 
 def map_command(folder: Path, out: Path, *more: str) -> list[str]:
-    common = ["--roi-ball", "0,0,2,0.4", "--threads", "1", "--max-gaussians", "150"]
+    common = ["--roi-ball", "0,0,2,0.4", "--threads", "1", "--max-gaussians", "150", "--colour-camera", "none"]
     return ["map", str(folder), *common, "--out", str(out), *more]
 
 

@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 
+from gausslite.datasets.alignment import find_registration
+from gausslite.datasets.open import open_source
+from gausslite.datasets.registration import ColourCamera, RegisteredSource
 from gausslite.datasets.source import Source
+from gausslite.domain.pose import UpAxis
 from gausslite.domain.region import BallRegion, Region
-from gausslite.mission.options import add_frames, names, numbers
+from gausslite.mission.options import AS_RECORDED, LOOK, add_frames, names, numbers
 
 
 def add_source(parser: argparse.ArgumentParser) -> None:
@@ -17,7 +22,29 @@ def add_source(parser: argparse.ArgumentParser) -> None:
         metavar="SOURCE",
         help='a folder (TUM, 7-Scenes or Replica layout) or "sim:home?seed=0&trajectory=0", sim:home-1 to sim:home-8',
     )
-    add_frames(parser)
+    add_frames(parser, may_look=True)
+
+
+def open_told(
+    spec: str, up_axis: UpAxis | None, colour_camera: ColourCamera | str | None
+) -> tuple[Source, ColourCamera | None]:
+    """Open a sequence and tell, on stderr, what a user would not expect of it; the camera that depth is registered to.
+
+    What is asked for may be LOOK, AS_RECORDED or, for as recorded without having said so, None. Raises DatasetError,
+    PoseError, InvalidInputError.
+    """
+    source = open_source(spec, up_axis)
+    if source.left_out:
+        print(f"{spec}: {source.left_out}", file=sys.stderr)
+    if colour_camera is None and not source.depth_registered:
+        hint = f"--colour-camera {LOOK} looks for the camera to register it to, {AS_RECORDED} takes it as it is"
+        print(f"{spec}: its layout leaves open whether depth is registered to colour; {hint}", file=sys.stderr)
+    if colour_camera == LOOK:
+        colour_camera, why = find_registration(source)
+        print(f"--colour-camera {colour_camera or AS_RECORDED}: {why}", file=sys.stderr)
+    if not isinstance(colour_camera, ColourCamera):
+        return source, None
+    return RegisteredSource(source, colour_camera), colour_camera
 
 
 def add_regions(parser: argparse.ArgumentParser) -> None:

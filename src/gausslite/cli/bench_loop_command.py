@@ -6,10 +6,9 @@ import argparse
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 
-from gausslite.cli.arguments import add_regions, asked_regions
+from gausslite.cli.arguments import add_regions, asked_regions, open_told
 from gausslite.cli.map_command import choose_attention
 from gausslite.cli.progress import MappingBar
-from gausslite.datasets.open import open_source
 from gausslite.datasets.selection import frame_size, select_frames
 from gausslite.datasets.source import Source
 from gausslite.domain.voxels import VoxelGrid
@@ -35,7 +34,7 @@ _MEMORY_SAMPLES = 40
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the options of `gausslite bench loop`."""
     parser.add_argument("source", metavar="SOURCE", nargs="?", default=_HOME, help="as in map (default: %(default)s)")
-    add_frames(parser)
+    add_frames(parser, may_look=True)
     parser.add_argument("--task", metavar="TEXT", help=f'as in map (on the default source "{_HOME_TASK}")')
     add_detector(parser)
     add_regions(parser)
@@ -59,7 +58,7 @@ def run(options: argparse.Namespace) -> int:
         options.task = _HOME_TASK
     if options.loop is not None and options.loop < 2:
         raise InvalidInputError(f"--loop: expected at least 2 frames, got {options.loop}")
-    source = open_source(options.source, options.up, options.colour_camera)
+    source, _ = open_told(options.source, options.up, options.colour_camera)
     positions: Sequence[int] = select_frames(source, options.frames)
     held_out: Sequence[int] = ()
     if options.unlimited is not None:

@@ -9,8 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
-from gausslite.cli.arguments import add_source
-from gausslite.datasets.open import open_source
+from gausslite.cli.arguments import add_source, open_told
 from gausslite.datasets.selection import frame_size, select_frames
 from gausslite.datasets.source import Source
 from gausslite.domain.region import Region
@@ -52,7 +51,7 @@ def run_perception(options: argparse.Namespace) -> int:
 
     if options.detector is None:
         raise InvalidInputError("--detector: expected a model file, since ground truth has nothing to be measured by")
-    source = open_source(options.source, options.up, options.colour_camera)
+    source, _ = open_told(options.source, options.up, options.colour_camera)
     positions, size = select_frames(source, options.frames), frame_size(options.size, source)
     regions = _regions(options, source)
     questions = [*_asked(options.task, regions), *_absent(options.absent, regions)]

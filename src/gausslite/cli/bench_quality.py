@@ -9,10 +9,8 @@ from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
+from gausslite.cli.arguments import open_told
 from gausslite.codec.files import write_whole
-from gausslite.datasets.alignment import find_registration
-from gausslite.datasets.open import open_source
-from gausslite.datasets.registration import ColourCamera
 from gausslite.errors import InvalidInputError
 from gausslite.evaluation.quality.ablation import cumulative_variants
 from gausslite.evaluation.quality.pairs import HomePair, choose_pairs
@@ -29,12 +27,11 @@ from gausslite.evaluation.quality.tables import Scoreboard, ablation_table, qual
 from gausslite.evaluation.quality.trials import Budget, Conditions, Equal, Eyes, Variant
 from gausslite.mapping.policies import POLICIES
 from gausslite.mission.build import open_networks
-from gausslite.mission.options import COLOUR_CAMERA_HELP, COLOUR_CAMERA_METAVAR, add_view_error, names, up_axis
+from gausslite.mission.options import LOOK, add_colour_camera, add_view_error, names, up_axis
 from gausslite.mission.results import write_json
 from gausslite.mission.settings import PerceptionSettings
 
 _ABLATION_PAIR = "home-4-manipulation"
-_AUTO, _NONE = "auto", "none"
 _BOTH = "both"
 
 
@@ -136,14 +133,7 @@ def _add_common(parser: argparse.ArgumentParser, seeds: tuple[int, ...], equal: 
     )
     real.add_argument("--kinds", metavar="A,B", type=names, default=(), help="such as mug,chair (default: all in FILE)")
     real.add_argument("--up", metavar="X,Y,Z", type=up_axis, help="its upward direction, if not the source's")
-    real.add_argument(
-        "--colour-camera",
-        metavar=f"auto|none|{COLOUR_CAMERA_METAVAR}",
-        type=lambda text: text if text in (_AUTO, _NONE) else ColourCamera.parse(text),
-        default=_AUTO,
-        help=f"{COLOUR_CAMERA_HELP}; none: as recorded; auto: found from the images' edges where the layout does not "
-        "register depth, such as 7-Scenes (default)",
-    )
+    add_colour_camera(real, may_look=True, default=LOOK)
 
 
 def _plans(options: argparse.Namespace, asked: Sequence[str], usual: Sequence[str]) -> list[ScenePlan]:
@@ -168,17 +158,9 @@ def _real(options: argparse.Namespace) -> list[ScenePlan]:
             raise InvalidInputError("--kinds: expected a real sequence to choose from, --real FOLDER; got none")
         return []
     trust = _trust(options, REAL_CAMERA)
-    plans = real_plans(options.real, options.roi, options.frames, options.up, _colour_camera(options), trust)
+    _, camera = open_told(str(options.real), options.up, options.colour_camera)
+    plans = real_plans(options.real, options.roi, options.frames, options.up, camera, trust)
     return [*choose_kinds(plans, options.kinds)]
-
-
-def _colour_camera(options: argparse.Namespace) -> ColourCamera | None:
-    """What depth is registered to: as asked, or found where a layout leaves it to the reader."""
-    if options.colour_camera != _AUTO:
-        return None if options.colour_camera == _NONE else options.colour_camera
-    camera, why = find_registration(open_source(str(options.real), options.up))
-    print(f"--colour-camera {camera or _NONE}: {why}", file=sys.stderr)
-    return camera
 
 
 def _trust(options: argparse.Namespace, usual: Trust) -> Trust:

@@ -9,10 +9,12 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import FrameType
 
+from gausslite.cli.arguments import open_told
 from gausslite.cli.team import AgentPlan, Team, TeamPlan, agent_report, collect_maps, running_team, watch_missions
 from gausslite.codec.ply import read_ply
 from gausslite.datasets.open import open_source
 from gausslite.datasets.regions import choose_regions
+from gausslite.datasets.registration import ColourCamera
 from gausslite.datasets.selection import frame_size, select_frames
 from gausslite.domain.region import Region
 from gausslite.domain.voxels import VoxelGrid
@@ -56,7 +58,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--objects", metavar="A,B", type=names, default=(), help="score these (default: the tasks' nouns)"
     )
     parser.add_argument("--size", metavar="WxH", help=f"image size (default: as it is; {_HOME_SIZE} in the home)")
-    add_colour_camera(parser)
+    add_colour_camera(parser, may_look=True)
     add_voxel_size(parser)
     parser.add_argument("--refine-iterations", metavar="N", type=int, default=500, help="0 leaves refinement out")
     add_detector(parser)
@@ -84,7 +86,7 @@ def run(options: argparse.Namespace) -> int:
     scores = _score(options, stage, list(regions.values()), maps)
     report = {
         "source": options.source or stage.agents[0].source,
-        "colour_camera": None if options.colour_camera is None else str(options.colour_camera),
+        "colour_camera": None if stage.colour_camera is None else str(stage.colour_camera),
         "size": list(stage.size),
         "seed": options.seed,
         "agents": agents,
@@ -123,6 +125,7 @@ class _Stage:
     hold_out: int | None
     held_out: tuple[Viewpoints, ...]
     regions: Mapping[str, Region]
+    colour_camera: ColourCamera | None = None
 
 
 def _simulated_stage(options: argparse.Namespace) -> _Stage:
@@ -145,7 +148,7 @@ def _simulated_stage(options: argparse.Namespace) -> _Stage:
 
 def _recorded_stage(options: argparse.Namespace) -> _Stage:
     """One sequence in two parts; every eighth frame of each is kept from mapping."""
-    source = open_source(options.source, colour_camera=options.colour_camera)
+    source, camera = open_told(options.source, None, options.colour_camera)
     middle = source.indices()[len(source) // 2]
     first, second = options.frames_a or f":{middle}", options.frames_b or f"{middle}:"
     size = frame_size(options.size, source)
@@ -154,7 +157,7 @@ def _recorded_stage(options: argparse.Namespace) -> _Stage:
         train, held = HoldOut(_HOLD_OUT).split(select_frames(source, frames))
         agents.append(AgentPlan(f"agent-{letter}", task, str(options.source), frames, len(train)))
         held_out.append(Viewpoints(source, held, size))
-    return _Stage(tuple(agents), size, _HOLD_OUT, tuple(held_out), source.regions())
+    return _Stage(tuple(agents), size, _HOLD_OUT, tuple(held_out), source.regions(), camera)
 
 
 def _scored_regions(options: argparse.Namespace, regions: Mapping[str, Region]) -> dict[str, Region]:
@@ -184,8 +187,8 @@ def _plan(options: argparse.Namespace, stage: _Stage) -> TeamPlan:
     ]
     if stage.hold_out is not None:
         shared += ["--hold-out", str(stage.hold_out)]
-    if options.colour_camera is not None:
-        shared += ["--colour-camera", str(options.colour_camera)]
+    if stage.colour_camera is not None:
+        shared += ["--colour-camera", str(stage.colour_camera)]
     if options.detector is not None:
         shared += ["--detector", str(options.detector.absolute())]
     if options.resegment:

@@ -6,9 +6,8 @@ import argparse
 from dataclasses import asdict
 from pathlib import Path
 
-from gausslite.cli.arguments import add_regions, add_source, asked_regions
+from gausslite.cli.arguments import add_regions, add_source, asked_regions, open_told
 from gausslite.codec.ply import read_ply
-from gausslite.datasets.open import open_source
 from gausslite.datasets.selection import frame_size, select_frames
 from gausslite.errors import DatasetError
 from gausslite.evaluation.compare import MapScores, average, score_view
@@ -43,7 +42,7 @@ def run(options: argparse.Namespace) -> int:
 
     rasterizer = choose_rasterizer(threads=options.threads)
     gaussians = read_ply(options.map)
-    source = open_source(options.source, options.up, options.colour_camera)
+    source, _ = open_told(options.source, options.up, options.colour_camera)
     positions = select_frames(source, options.frames)
     if options.hold_out is not None:
         positions = HoldOut(options.hold_out).split(positions)[1]

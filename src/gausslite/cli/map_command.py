@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from gausslite.cli.arguments import add_regions, add_source, asked_regions
+from gausslite.cli.arguments import add_regions, add_source, asked_regions, open_told
 from gausslite.cli.mapping_run import MappingRun
 from gausslite.cli.parse_command import as_json
-from gausslite.datasets.open import open_source
+from gausslite.datasets.registration import ColourCamera
 from gausslite.datasets.selection import frame_size, select_frames
 from gausslite.datasets.source import Source
 from gausslite.domain.gaussians import Gaussians
@@ -99,13 +99,15 @@ class _Asked:
     positions: Sequence[int]
     size: tuple[int, int]
     plan: TaskPlan
+    colour_camera: ColourCamera | None
 
     @classmethod
     def of(cls, options: argparse.Namespace) -> _Asked:
         settings = mission_settings(options)
         plan = _plan(asked_task(options), [Turn.parse(text) for text in options.then])
-        source = open_source(options.source, options.up, options.colour_camera)
-        return cls(settings, source, select_frames(source, options.frames), frame_size(options.size, source), plan)
+        source, camera = open_told(options.source, options.up, options.colour_camera)
+        positions, size = select_frames(source, options.frames), frame_size(options.size, source)
+        return cls(settings, source, positions, size, plan, camera)
 
     def saved_run(self, options: argparse.Namespace) -> SavedRun | None:
         """The run of --resume. Raises MapFileError, MismatchError when it was begun on other terms."""
@@ -122,7 +124,7 @@ class _Asked:
             self.settings,
             size=f"{self.size[0]}x{self.size[1]}",
             task="" if graph is None else graph.text,
-            colour_camera="" if options.colour_camera is None else str(options.colour_camera),
+            colour_camera="" if self.colour_camera is None else str(self.colour_camera),
             up="" if options.up is None else ",".join(map(str, options.up)),
             **{name: _file_name(getattr(options, name)) for name in ("detector", "segmenter", "vocabulary", "roi")},
             resegment="yes" if options.resegment else "",
@@ -140,7 +142,7 @@ class _Asked:
         first = self.plan.first
         return {
             "source": options.source,
-            "colour_camera": None if options.colour_camera is None else str(options.colour_camera),
+            "colour_camera": None if self.colour_camera is None else str(self.colour_camera),
             "task": None if first is None else {"text": first.text, **as_json(first)},
             "then": [{"frame": frame, "text": later.text, **as_json(later)} for frame, later in self.plan.turns],
             "policy": options.policy,

@@ -12,6 +12,11 @@ from gausslite.errors import PoseError
 _REPAIRABLE_DEVIATION = 0.05
 
 
+def is_lost(numbers: Float64[ndarray, "..."]) -> bool:
+    """True for what trackers write where they knew no pose: not one finite number, or zeros alone."""
+    return not np.isfinite(numbers).any() or not numbers.any()
+
+
 def nearest_rigid(place: str, matrix: Float64[ndarray, "4 4"]) -> Float64[ndarray, "4 4"]:
     """Replace a rotation that is orthonormal up to rounding (|R Rᵀ - I| <= 0.05) by the nearest exact one.
 

@@ -136,6 +136,11 @@ class RegisteredSource:
         """True now."""
         return True
 
+    @property
+    def left_out(self) -> str:
+        """The wrapped source's."""
+        return self._source.left_out
+
     def __len__(self) -> int:
         return len(self._source)
 

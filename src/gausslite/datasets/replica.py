@@ -7,11 +7,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float64
+from numpy import ndarray
 
 from gausslite.datasets.images import DepthUnits, load_rgbd
 from gausslite.datasets.intrinsics import find_beside_or_above, read_json_camera
-from gausslite.datasets.poses import nearest_rigid
-from gausslite.datasets.source import require_frames, require_position
+from gausslite.datasets.poses import is_lost, nearest_rigid
+from gausslite.datasets.source import require_frames, require_position, tell_left_out
 from gausslite.datasets.text_files import parse_numbers, read_rows
 from gausslite.domain.camera import Camera
 from gausslite.domain.frame import Frame
@@ -27,7 +29,8 @@ _COLOUR_NAME = re.compile(r"frame(\d{6})\.(?:jpg|png)")
 class ReplicaSource:
     """A folder with results/frame%06d.jpg, results/depth%06d.png and traj.txt, one 4x4 row-major pose a row.
 
-    cam_params.json lies in or above the folder. Times are the frame numbers at 30 Hz. Raises DatasetError, PoseError.
+    cam_params.json lies in or above the folder. Frames whose pose has no finite number, or zeros alone, are no part of
+    the sequence. Times are the frame numbers at 30 Hz. Raises DatasetError, PoseError.
     """
 
     def __init__(self, folder: Path, up_axis: UpAxis | None = None) -> None:
@@ -37,7 +40,6 @@ class ReplicaSource:
         colours = {int(match.group(1)): results / match.group(0) for match in found if match}
         require_frames(results, len(colours), "images named frame000000.jpg")
         self._colours = dict(sorted(colours.items()))
-        self._numbers = list(self._colours)
         camera_path = find_beside_or_above(folder, _CAMERA_FILE)
         if camera_path is None:
             raise DatasetError(f"{folder}: the camera is unknown: expected {_CAMERA_FILE} here or one folder above")
@@ -45,11 +47,13 @@ class ReplicaSource:
         self._units = DepthUnits(per_metre)
         self._trajectory = folder / "traj.txt"
         self._pose_rows = read_rows(self._trajectory)
-        if len(self._pose_rows) <= self._numbers[-1]:
+        last = max(self._colours)
+        if len(self._pose_rows) <= last:
             raise DatasetError(
-                f"{self._trajectory}: expected a pose for each of frames 0 to {self._numbers[-1]}, "
-                f"got {len(self._pose_rows)} rows"
+                f"{self._trajectory}: expected a pose for each of frames 0 to {last}, got {len(self._pose_rows)} rows"
             )
+        self._numbers = [number for number in self._colours if not self._is_lost(number)]
+        require_frames(folder, len(self._numbers), "frames with a pose")
         self._up_axis = unit_up_axis(up_axis or (0.0, 0.0, 1.0))
 
     @staticmethod
@@ -77,6 +81,11 @@ class ReplicaSource:
         """True: both are drawn by one camera."""
         return True
 
+    @property
+    def left_out(self) -> str:
+        """Frames without a pose."""
+        return tell_left_out(len(self._colours) - len(self._numbers), len(self._colours), "without a pose")
+
     def __len__(self) -> int:
         return len(self._numbers)
 
@@ -84,9 +93,7 @@ class ReplicaSource:
         """The frame at position i. Raises DatasetError, PoseError."""
         require_position(self.name, i, len(self))
         number = self._numbers[i]
-        place, fields = self._pose_rows[number]
-        numbers = parse_numbers(place, fields, 16, "a 4x4 pose, row by row")
-        T_world_camera = nearest_rigid(place, np.array(numbers).reshape(4, 4))
+        T_world_camera = nearest_rigid(self._pose_rows[number][0], self._read_matrix(number))
         depth = self._folder / "results" / f"depth{number:06d}.png"
         image = load_rgbd(self._colours[number], depth, self._camera, self._units, size)
         return Frame(number, number * 10**9 // _RATE_HZ, image.rgb, image.depth_m, image.camera, T_world_camera)
@@ -98,3 +105,13 @@ class ReplicaSource:
     def regions(self) -> Mapping[str, Region]:
         """None are known."""
         return {}
+
+    def _is_lost(self, number: int) -> bool:
+        try:
+            return is_lost(self._read_matrix(number)[:3])
+        except DatasetError:
+            return False  # a damaged row is the matter of its own frame, which may not even be wanted
+
+    def _read_matrix(self, number: int) -> Float64[ndarray, "4 4"]:
+        place, fields = self._pose_rows[number]
+        return np.array(parse_numbers(place, fields, 16, "a 4x4 pose, row by row")).reshape(4, 4)

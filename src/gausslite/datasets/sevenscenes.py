@@ -12,9 +12,9 @@ from numpy import ndarray
 
 from gausslite.datasets.images import DepthUnits, load_rgbd, read_colour
 from gausslite.datasets.intrinsics import INTRINSICS_FILE, FileIntrinsics, find_beside_or_above, read_matrix
-from gausslite.datasets.poses import estimate_up, nearest_rigid
+from gausslite.datasets.poses import estimate_up, is_lost, nearest_rigid
 from gausslite.datasets.regions import balls_for_small_objects, load_voxel_regions
-from gausslite.datasets.source import require_frames, require_position
+from gausslite.datasets.source import require_frames, require_position, tell_left_out
 from gausslite.datasets.text_files import parse_numbers, read_rows
 from gausslite.domain.camera import Camera
 from gausslite.domain.frame import Frame
@@ -36,7 +36,8 @@ class SevenScenesSource:
     """A folder of frame-%06d.color.{png,jpg}, .depth.png (mm; 0 and 65535 invalid) and .pose.txt (camera to world).
 
     The camera comes from camera-intrinsics.txt in or above the folder; without one, 640x480 images get the values
-    the 7-Scenes authors state. Times are the frame numbers at 30 Hz. Raises DatasetError.
+    the 7-Scenes authors state. Frames whose pose the tracker had lost (no finite number in it, or zeros) are no part of
+    the sequence. Times are the frame numbers at 30 Hz. Raises DatasetError.
     """
 
     def __init__(self, folder: Path, up_axis: UpAxis | None = None) -> None:
@@ -45,7 +46,8 @@ class SevenScenesSource:
         colours = {int(match.group(1)): folder / match.group(0) for match in found if match}
         require_frames(folder, len(colours), "images named frame-000000.color.png or .jpg")
         self._colours = dict(sorted(colours.items()))
-        self._numbers = list(self._colours)
+        self._numbers = [number for number in self._colours if not self._is_lost(number)]
+        require_frames(folder, len(self._numbers), "frames with a pose")
         first = read_colour(self._colours[self._numbers[0]])
         self._camera = _camera(folder, first.shape[1], first.shape[0])
         self._up_axis = unit_up_axis(up_axis) if up_axis else self._estimate_up_axis()
@@ -78,6 +80,11 @@ class SevenScenesSource:
         """False: colour and depth are each as their own camera saw them."""
         return False
 
+    @property
+    def left_out(self) -> str:
+        """Frames without a pose."""
+        return tell_left_out(len(self._colours) - len(self._numbers), len(self._colours), "without a pose")
+
     def __len__(self) -> int:
         return len(self._numbers)
 
@@ -102,6 +109,12 @@ class SevenScenesSource:
     def _pose_path(self, number: int) -> Path:
         return self._folder / f"frame-{number:06d}.pose.txt"
 
+    def _is_lost(self, number: int) -> bool:
+        try:
+            return is_lost(_read_matrix(self._pose_path(number))[:3])
+        except DatasetError:
+            return False  # a damaged file is the matter of its own frame, which may not even be wanted
+
     def _estimate_up_axis(self) -> UpAxis:
         rotations = []
         for number in self._numbers[:: max(1, len(self._numbers) // _UP_POSES)]:
@@ -114,11 +127,14 @@ class SevenScenesSource:
 
 
 def _read_pose(path: Path) -> Float64[ndarray, "4 4"]:
+    return nearest_rigid(str(path), _read_matrix(path))
+
+
+def _read_matrix(path: Path) -> Float64[ndarray, "4 4"]:
     rows = read_rows(path)
     if len(rows) != 4:
         raise DatasetError(f"{path}: expected the 4 rows of a 4x4 pose, got {len(rows)}")
-    numbers = [parse_numbers(place, fields, 4, "a row of a 4x4 pose") for place, fields in rows]
-    return nearest_rigid(str(path), np.array(numbers))
+    return np.array([parse_numbers(place, fields, 4, "a row of a 4x4 pose") for place, fields in rows])
 
 
 def _camera(folder: Path, width_px: int, height_px: int) -> Camera:

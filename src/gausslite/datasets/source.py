@@ -37,6 +37,11 @@ class Source(Protocol):
         """True when the recording brought its depth into the colour image's pixels."""
         ...
 
+    @property
+    def left_out(self) -> str:
+        """How much of the recording is no part of the sequence, and why; empty where all of it is."""
+        ...
+
     def __len__(self) -> int: ...
 
     def frame(self, i: int, size: tuple[int, int] | None = None) -> Frame:
@@ -59,6 +64,11 @@ def require_position(source_name: str, i: int, count: int) -> None:
     """Raise DatasetError unless i is one of the positions 0 .. count - 1."""
     if not 0 <= i < count:
         raise DatasetError(f"{source_name}: expected a position from 0 to {count - 1}, got {i}")
+
+
+def tell_left_out(count: int, recorded: int, why: str) -> str:
+    """The line of `Source.left_out`."""
+    return f"{count} of {recorded} colour images are left out, {why}" if count else ""
 
 
 def require_frames(folder: Path, count: int, wanted: str) -> None:

@@ -13,8 +13,8 @@ from numpy import ndarray
 
 from gausslite.datasets.images import DepthUnits, load_rgbd, read_colour
 from gausslite.datasets.intrinsics import INTRINSICS_FILE, FileIntrinsics, find_beside_or_above, read_matrix
-from gausslite.datasets.poses import pose_from_quaternion, slerp
-from gausslite.datasets.source import require_frames, require_position
+from gausslite.datasets.poses import is_lost, pose_from_quaternion, slerp
+from gausslite.datasets.source import require_frames, require_position, tell_left_out
 from gausslite.datasets.text_files import parse_numbers, read_rows
 from gausslite.domain.camera import Camera
 from gausslite.domain.frame import Frame
@@ -46,13 +46,14 @@ class TumSource:
 
     A colour image goes with the depth image nearest in time, at most 20 ms away, and with the pose interpolated
     (lerp and slerp) at the colour's stamp between two poses at most 0.1 s apart; colour images without either are no
-    part of the sequence. Frame numbers count the rows of rgb.txt from 0. The lens distortion of fr1 and fr2 (up to
-    a few pixels in the corners) is left in. Raises DatasetError, PoseError.
+    part of the sequence. Poses that the tracker had lost (not one finite number) count as missing. Frame numbers count
+    the rows of rgb.txt from 0. The lens distortion of fr1 and fr2 (up to a few pixels in the corners) is left in.
+    Raises DatasetError, PoseError.
     """
 
     def __init__(self, folder: Path, up_axis: UpAxis | None = None) -> None:
         self._folder = folder
-        self._matches = _associate(folder)
+        self._matches, self._recorded = _associate(folder)
         first = read_colour(self._matches[0].colour)
         self._camera = _camera(folder, first.shape[1], first.shape[0])
         self._up_axis = unit_up_axis(up_axis or (0.0, 0.0, 1.0))
@@ -82,6 +83,12 @@ class TumSource:
         """True, by the layout."""
         return True
 
+    @property
+    def left_out(self) -> str:
+        """Colour images without depth or pose at their time."""
+        why = "without a pose at their time or depth within 20 ms"
+        return tell_left_out(self._recorded - len(self), self._recorded, why)
+
     def __len__(self) -> int:
         return len(self._matches)
 
@@ -102,7 +109,8 @@ class TumSource:
         return {}
 
 
-def _associate(folder: Path) -> list[_Match]:
+def _associate(folder: Path) -> tuple[list[_Match], int]:
+    """The colour images that have depth and a pose, and how many there are in all."""
     colour_times, colour_names = _read_stamps(folder / "rgb.txt")
     depth_times, depth_names = _read_stamps(folder / "depth.txt")
     trajectory = _Trajectory(folder / "groundtruth.txt")
@@ -115,7 +123,7 @@ def _associate(folder: Path) -> list[_Match]:
             matches.append(_Match(number, float(time_s), folder / name, depth, T_world_camera))
     wanted = "a colour image with depth within 20 ms (rgb.txt, depth.txt) and poses around it (groundtruth.txt)"
     require_frames(folder, len(matches), wanted)
-    return matches
+    return matches, len(colour_names)
 
 
 def _read_stamps(path: Path) -> tuple[Float64[ndarray, " n"], list[str]]:
@@ -140,13 +148,14 @@ class _Trajectory:
         rows = read_rows(path)
         meaning = "time tx ty tz qx qy qz qw"
         table = np.array([parse_numbers(place, fields, 8, meaning) for place, fields in rows])
-        if len(table) < 2:
-            raise DatasetError(f"{path}: expected at least 2 poses, got {len(table)}")
-        for (place, _), row in zip(rows, table, strict=True):
-            pose_from_quaternion(place, row[1:4], row[4:8])
+        known = np.array([not is_lost(row[1:]) for row in table], np.bool_)
+        if np.count_nonzero(known) < 2:
+            raise DatasetError(f"{path}: expected at least 2 poses, got {np.count_nonzero(known)}")
+        for i in np.flatnonzero(known):
+            pose_from_quaternion(rows[i][0], table[i, 1:4], table[i, 4:8])
         if not (np.isfinite(table[:, 0]).all() and (np.diff(table[:, 0]) >= 0).all()):
             raise DatasetError(f"{path}: expected finite times in ascending order")
-        self._path, self._table = path, table
+        self._path, self._table = path, table[known]
 
     def at(self, time_s: float) -> Float64[ndarray, "4 4"] | None:
         """The interpolated pose; None outside the recording and in its gaps."""

@@ -16,31 +16,40 @@ from gausslite.render.choose import BACKENDS
 
 _DETECTOR_HELP = "a YOLO-seg or Grounding DINO model (default: the source's ground truth)"
 _TRUSTED = ViewPrior()
-COLOUR_CAMERA_METAVAR = "FX,FY,CX,CY[,TX,TY,TZ[,RX,RY,RZ]]"
-COLOUR_CAMERA_HELP = (
+LOOK, AS_RECORDED = "auto", "none"
+_COLOUR_CAMERA_METAVAR = "FX,FY,CX,CY[,TX,TY,TZ[,RX,RY,RZ]]"
+_COLOUR_CAMERA_HELP = (
     "register depth to this camera (pixels as data sets count); then where the depth camera sits seen from it "
     "(metres) and how it is turned (rotation vector, degrees)"
+)
+_LOOK_HELP = (
+    "; none: as recorded; auto: found from the images' edges where the layout does not register depth, such as "
+    "7-Scenes (default: {})"
 )
 _RELIEF_HELP = "what gives way, in order, where that time is short (default: words,seeding)"
 _RUN_OVER_HELP = "by what share of its time a frame that is short of them may be late (default: %(default)s)"
 
 
-def add_frames(parser: argparse.ArgumentParser) -> None:
+def add_frames(parser: argparse.ArgumentParser, may_look: bool = False) -> None:
     """Add --frames, --size, --up and --colour-camera: what of a sequence is used, and how its cameras stand."""
     add = parser.add_argument_group("frames").add_argument
     add("--frames", metavar="START:STOP:STEP", default=":", help="frame numbers to use (default: all)")
     add("--size", metavar="WxH", help="resize images to this size (default: as they are)")
     add("--up", metavar="X,Y,Z", type=up_axis, help="the world's upward direction, if not the source's")
-    add_colour_camera(parser)
+    add_colour_camera(parser, may_look)
 
 
-def add_colour_camera(parser: argparse.ArgumentParser) -> None:
-    """Add --colour-camera, for sequences whose depth is not registered to colour."""
+def add_colour_camera(parser: argparse._ActionsContainer, may_look: bool = False, default: str | None = None) -> None:
+    """Add --colour-camera, for sequences whose depth is not registered to colour.
+
+    may_look: "auto" and "none" are answers too, for programs that can look at the whole sequence first.
+    """
     parser.add_argument(
         "--colour-camera",
-        metavar=COLOUR_CAMERA_METAVAR,
-        type=ColourCamera.parse,
-        help=COLOUR_CAMERA_HELP,
+        metavar=f"{LOOK}|{AS_RECORDED}|{_COLOUR_CAMERA_METAVAR}" if may_look else _COLOUR_CAMERA_METAVAR,
+        type=colour_camera if may_look else ColourCamera.parse,
+        default=default,
+        help=_COLOUR_CAMERA_HELP + (_LOOK_HELP.format(default or AS_RECORDED) if may_look else ""),
     )
 
 
@@ -148,6 +157,11 @@ def up_axis(text: str) -> UpAxis:
     """Read "x,y,z"; argparse reports what is wrong."""
     x, y, z = numbers(text, 3)
     return (x, y, z)
+
+
+def colour_camera(text: str) -> ColourCamera | str:
+    """Read LOOK, AS_RECORDED or a camera. Raises InvalidInputError."""
+    return text if text in (LOOK, AS_RECORDED) else ColourCamera.parse(text)
 
 
 def numbers(text: str, count: int) -> list[float]:

@@ -155,6 +155,11 @@ class SimulatedHome:
         """True: both are drawn by one camera."""
         return True
 
+    @property
+    def left_out(self) -> str:
+        """Nothing."""
+        return ""
+
     def __len__(self) -> int:
         return self._settings.frames
 

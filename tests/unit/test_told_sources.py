@@ -1,0 +1,46 @@
+"""What a user would not expect of a sequence is told when it is opened: images left out, depth nobody registered."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from tiny_sequences import write_seven_scenes, write_tum
+
+from gausslite.cli.arguments import open_told
+from gausslite.datasets.registration import ColourCamera
+from gausslite.mission.options import AS_RECORDED, LOOK
+
+CAMERA = ColourCamera.parse("20,20,7.5,5.5,-0.01,0,0")
+
+
+def test_depth_that_nobody_registered_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    seven, tum = str(write_seven_scenes(tmp_path / "seq")), str(write_tum(tmp_path / "fr1"))
+    assert open_told(seven, None, None)[1] is None
+    [line] = capsys.readouterr().err.splitlines()
+    assert line.startswith(
+        f"{seven}: its layout leaves open whether depth is registered to colour; --colour-camera auto "
+    )
+    for spec, asked in ((seven, AS_RECORDED), (seven, CAMERA), (tum, None)):
+        open_told(spec, None, asked)
+        assert capsys.readouterr().err == ""
+
+
+def test_depth_is_registered_as_asked(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    seven = str(write_seven_scenes(tmp_path / "seq"))
+    source, camera = open_told(seven, None, CAMERA)
+    assert camera == CAMERA
+    assert source.depth_registered
+    assert source.camera == CAMERA.camera(16, 12)
+    source, camera = open_told(seven, None, LOOK)
+    assert (camera, source.depth_registered) == (None, False)
+    assert "--colour-camera none: alignment: expected at least 1000 depth edge points" in capsys.readouterr().err
+
+
+def test_images_that_are_left_out_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = write_tum(tmp_path / "fr1", frames=4)
+    rows = (folder / "depth.txt").read_text().splitlines()
+    (folder / "depth.txt").write_text("\n".join(rows[:3]))
+    open_told(str(folder), None, None)
+    [line] = capsys.readouterr().err.splitlines()
+    assert line == (f"{folder}: 1 of 4 colour images are left out, without a pose at their time or depth within 20 ms")
