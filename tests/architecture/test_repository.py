@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import subprocess
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -21,6 +22,15 @@ def _tracked(*patterns: str) -> list[Path]:
 def test_readme_has_exactly_the_two_commands() -> None:
     readme = (ROOT / "README.md").read_text()
     assert re.findall(r"<!-- command: (\w+) -->", readme) == ["demo", "tests"]
+
+
+def test_an_older_python_is_refused_before_pip_searches() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    wanted = project["project"]["requires-python"].removeprefix(">=")
+    [refusal] = project["tool"]["scikit-build"]["overrides"]
+    assert refusal["if"] == {"python-version": f"<{wanted}"}
+    assert refusal["fail"] is True
+    assert f"needs Python {wanted} or newer" in refusal["messages"]["after-failure"]
 
 
 def test_no_source_file_grows_past_reading() -> None:
