@@ -20,7 +20,7 @@ from gausslite.datasets.simulated.family import HOME_COUNT, HOMES
 from gausslite.errors import InvalidInputError
 from gausslite.evaluation.quality.ablation import cumulative_variants
 from gausslite.evaluation.quality.pairs import HOME_PAIRS, WHOLE_HOMES, Kind, choose_pairs
-from gausslite.evaluation.quality.scenes import HomeScenePlan, RealScenePlan, Trust, choose_kinds
+from gausslite.evaluation.quality.scenes import HomeScenePlan, RealScenePlan, Trust, UnseenRegionError, choose_kinds
 from gausslite.evaluation.quality.study import Archive, Finished, Study, run_study
 from gausslite.evaluation.quality.tables import FULL_METRICS, ROI_METRICS, Scoreboard, ablation_table, quality_table
 from gausslite.evaluation.quality.trials import Budget, Conditions, Equal, Trial, Variant, clock_for
@@ -160,7 +160,14 @@ def test_the_board_knows_means_spreads_and_margins() -> None:
     assert board.figure(PLAN.name, "task", FULL_METRICS[2], budget) is None
     table = quality_table(board)
     assert "|  | covered [%]↑ | 93.8 | 93.8 |" in table
-    for text in ("27.00 ± 1.00", "+2.50", "not computed", "ahead of the best other in 1 of 1", "1.1%", "| 28.00 |"):
+    for text in (
+        "27.00 ± 1.00",
+        "+2.50",
+        "not computed",
+        "ahead of the best other in 1 of 1",
+        "| 1.1% in 2 of 3 views |",
+        "| 28.00 |",
+    ):
         assert text in table
     assert "by +2.50 dB inside the mask on average and by +0.00 dB over the full image with views fitted." in table
     assert "| 28.00 ± 1.00 | 25.50 ± 0.00 | +2.50 | +0.00 |" in table
@@ -248,6 +255,9 @@ class Frames:
 
     def finished(self, done: Finished) -> None:
         del done
+
+    def left_out(self, trials: int, why: UnseenRegionError) -> None:
+        del trials, why
 
 
 def test_the_ablation_is_run_within_the_budget_that_is_asked_for(tmp_path: Path) -> None:

@@ -13,12 +13,13 @@ from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.region import BallRegion
 from gausslite.errors import InvalidInputError
-from gausslite.evaluation.compare import average, evaluate, score_view
+from gausslite.evaluation.compare import MOST_DB, average, evaluate, score_view
 from gausslite.evaluation.metrics import psnr
 from gausslite.evaluation.views import HeldOutView, MapViewer
 
 pytest.importorskip("torch", reason="the reference rasterizer needs torch, which is not installed")
 
+from gausslite.render.rasterizer import Rendering
 from gausslite.render.reference import ReferenceRasterizer
 
 CAMERA = Camera(40.0, 40.0, 20.0, 16.0, 40, 32)
@@ -57,6 +58,13 @@ def test_the_map_itself_scores_as_well_as_bytes_allow() -> None:
     assert scores.roi_depth_l1_m == pytest.approx(0.0, abs=1e-5)
     assert scores.roi_covered == pytest.approx(1.0)
     assert (scores.n_views, scores.n_roi_views, scores.roi_pixels) == (2, 2, 400)
+
+
+def test_an_equal_picture_leaves_means_that_are_numbers() -> None:
+    frame = frame_of(wall())
+    drawn = Rendering(frame.rgb / np.float32(255.0), frame.depth_m, np.ones_like(frame.depth_m), None)
+    scores = average([score_view(drawn, view_with(frame, 100)), score_view(drawn, view_with(frame, 0))])
+    assert scores.roi_psnr == scores.full_psnr == MOST_DB
 
 
 def test_another_map_scores_worse() -> None:

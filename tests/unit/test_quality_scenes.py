@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 from mapping_scenes import middle_relevance, wall_frame
 from tiny_sequences import write_seven_scenes
 
+from gausslite.cli.main import main
 from gausslite.domain.relevance import RelevanceMap
 from gausslite.errors import DatasetError, InvalidInputError
 from gausslite.evaluation.quality.scenes import RealScenePlan, RecalledAttention, Scene, real_plans
@@ -73,3 +75,62 @@ def test_a_sequence_too_short_to_hold_a_view_out_says_what_there_was(tmp_path: P
     [plan] = real_plans(folder, write_regions(tmp_path / "roi.npz", (0, 0, 20)))
     with pytest.raises(DatasetError, match="expected training frames and held-out views with depth, got 3 and 0"):
         plan.load((16, 16))
+
+
+WALL = [(x, y, z) for x in range(-4, 4) for y in range(-4, 4) for z in (19, 20)]
+
+
+def write_kitchen(folder: Path, **regions: list[tuple[int, int, int]]) -> tuple[Path, Path]:
+    """Nine views of a wall two metres away, and a file of regions."""
+    roi = folder / "roi.npz"
+    np.savez(roi, voxel_size_m=0.1, **{name: np.array(voxels, np.int32) for name, voxels in regions.items()})
+    return write_seven_scenes(folder / "kitchen", tuple(range(0, 36, 4))), roi
+
+
+def bench_quality(kitchen: Path, roi: Path, out: Path) -> int:
+    asked = ["--real", str(kitchen), "--roi", str(roi), "--size", "16x16", "--policies", "task", "--iterations", "1"]
+    return main(["bench", "quality", *asked, "--max-gaussians", "150", "--threads", "1", "--out", str(out)])
+
+
+def test_a_kind_that_no_held_out_view_shows_is_left_out_and_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("gausslite.render._kernels", reason="the native kernels are not built")
+    kitchen, roi = write_kitchen(tmp_path, mug_1=WALL, lamp_1=[(500, 500, 500)])
+    assert bench_quality(kitchen, roi, tmp_path / "out") == 0
+    said = capsys.readouterr()
+    why = "kitchen-lamp: expected held-out views that show at least 64 pixels of lamp_1 at 16x16, got none of 1"
+    assert f"left out: {why}" in said.err
+    assert re.search(r"\| kitchen-mug \| Find the mug \| [\d.]+% in 1 of 1 views \|", said.out)
+    assert "kitchen-lamp" not in said.out
+
+
+def test_regions_of_another_sequence_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("gausslite.render._kernels", reason="the native kernels are not built")
+    kitchen, roi = write_kitchen(tmp_path, lamp_1=[(500, 500, 500)])
+    assert bench_quality(kitchen, roi, tmp_path / "out") == 2
+    assert "gausslite: kitchen-lamp: expected held-out views that show" in capsys.readouterr().err
+    assert not (tmp_path / "out" / "quality.md").exists()
+
+
+def test_a_map_of_regions_that_were_never_seen_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("gausslite.render._kernels", reason="the native kernels are not built")
+    kitchen, roi = write_kitchen(tmp_path, mug_1=WALL, lamp_1=[(500, 500, 500)])
+    for name, told in (("lamp_1", True), ("mug_1", False)):
+        asked = ["--roi", str(roi), "--objects", name, "--max-gaussians", "150", "--threads", "1"]
+        assert main(["map", str(kitchen), *asked, "--out", str(tmp_path / name)]) == 0
+        assert ("none of these frames shows the region" in capsys.readouterr().out) is told
+    assert (
+        main(["eval", str(tmp_path / "mug_1" / "map.ply"), str(kitchen), "--roi", str(roi), "--objects", "lamp_1"]) == 0
+    )
+    assert capsys.readouterr().out.startswith("no view shows 64 pixels of the region; full PSNR ")
+    assert main(["eval", str(tmp_path / "mug_1" / "map.ply"), str(kitchen)]) == 0
+    assert capsys.readouterr().out.startswith("no region was asked for; full PSNR ")
+
+
+def test_a_rates_cost_is_not_measured_where_no_view_shows_the_region(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    kitchen, roi = write_kitchen(tmp_path, lamp_1=[(500, 500, 500)])
+    assert main(["bench", "loop", str(kitchen), "--roi", str(roi), "--unlimited", "2"]) == 2
+    assert "--unlimited: expected a held-out frame that shows the region, got none" in capsys.readouterr().err

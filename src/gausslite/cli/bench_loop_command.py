@@ -173,14 +173,17 @@ def _patient(options: argparse.Namespace) -> argparse.Namespace:
 
 
 def _check_gap(options: argparse.Namespace, source: Source, held_out: Sequence[int]) -> None:
-    """Say before two runs what would leave nothing to compare after them."""
+    """Say before two runs what would leave nothing to compare after them. Raises InvalidInputError, DatasetError."""
     mission_settings(_patient(options))
     if not held_out:
         raise InvalidInputError("--unlimited: expected at least 8 frames, so that one is held out; got fewer")
-    if not asked_regions(options, source):
+    regions, size = asked_regions(options, source), frame_size(options.size, source)
+    if not regions:
         raise InvalidInputError(
             "--unlimited: expected regions to score, with --roi FILE.npz, --objects A,B or --roi-ball X,Y,Z,R; got none"
         )
+    if not any(HeldOutView.of(source.frame(position, size), regions).shows_region for position in held_out):
+        raise InvalidInputError("--unlimited: expected a held-out frame that shows the region, got none")
 
 
 def _says_what_matters(options: argparse.Namespace) -> bool:

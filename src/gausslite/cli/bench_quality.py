@@ -19,6 +19,7 @@ from gausslite.evaluation.quality.scenes import (
     HomeScenePlan,
     ScenePlan,
     Trust,
+    UnseenRegionError,
     choose_kinds,
     real_plans,
 )
@@ -245,6 +246,11 @@ class _StudyBar:
         self._frames += 1
         text = f"frame {self._frames}, {gaussians / 1e3:.1f}k Gaussians"
         self._bar.set_postfix_str(text, refresh=self._on_terminal)
+
+    def left_out(self, trials: int, why: UnseenRegionError) -> None:
+        """Say which scene is not measured, and why."""
+        self._bar.write(f"left out: {why}", file=sys.stderr)
+        self._bar.update(trials)
 
     def finished(self, done: Finished) -> None:
         """Leave the trial's figures on the screen."""

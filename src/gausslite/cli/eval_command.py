@@ -14,7 +14,7 @@ from gausslite.evaluation.compare import MapScores, average, score_view
 from gausslite.evaluation.fitted import draw_fitted
 from gausslite.evaluation.held_out import HoldOut
 from gausslite.evaluation.pictures import comparison_sheet, write_png
-from gausslite.evaluation.views import HeldOutView, MapViewer
+from gausslite.evaluation.views import MIN_ROI_PIXELS, HeldOutView, MapViewer
 from gausslite.mission.results import as_text, prepare_folder
 from gausslite.render.choose import choose_rasterizer
 
@@ -67,12 +67,12 @@ def run(options: argparse.Namespace) -> int:
     if not scores:
         raise DatasetError(f"{options.source}: expected a frame with depth, so that its region is known; got none")
     result = average(scores)
-    print(as_text(asdict(result)) if options.json else _as_line(result))
+    print(as_text(asdict(result)) if options.json else _as_line(result, bool(chosen)))
     return 0
 
 
-def _as_line(scores: MapScores) -> str:
-    roi = "no view shows the region"
+def _as_line(scores: MapScores, asked: bool) -> str:
+    roi = f"no view shows {MIN_ROI_PIXELS} pixels of the region" if asked else "no region was asked for"
     if scores.roi_psnr is not None and scores.roi_ssim is not None:
         roi = f"ROI PSNR {scores.roi_psnr:.2f} dB, SSIM {scores.roi_ssim:.3f} on {scores.n_roi_views} views"
     return f"{roi}; full PSNR {scores.full_psnr:.2f} dB, SSIM {scores.full_ssim:.3f} on {scores.n_views} views"

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from gausslite.cli.arguments import add_regions, add_source, asked_regions, open_told
-from gausslite.cli.mapping_run import MappingRun
+from gausslite.cli.mapping_run import MappingRun, Mission
 from gausslite.cli.parse_command import as_json
 from gausslite.datasets.registration import ColourCamera
 from gausslite.datasets.selection import frame_size, select_frames
@@ -72,7 +72,8 @@ def run(options: argparse.Namespace) -> int:
     if not mission.outcomes and mission.stopped is not None:
         raise mission.stopped
     gaussians = mapper.gaussians()
-    report = {**asked.report(options), **mission.summary(), **_held(mapper, gaussians)}
+    notes = mapper.notes if graph is not None else _unseen_regions(options, mission)
+    report = {**asked.report(options), **mission.summary(), **_held(mapper, gaussians), "notes": list(notes)}
     write_results(options.out, gaussians, report)
     if options.save_state is not None:
         last_index = mission.outcomes[-1].index if mission.outcomes else last_index
@@ -85,7 +86,7 @@ def run(options: argparse.Namespace) -> int:
         f"{report['frames']} frames{skipped} at {report['hz']:.1f} Hz, {len(gaussians)} Gaussians "
         f"({report['active_gaussians']} of the task) → {options.out / 'map.ply'}"
     )
-    for note in mapper.notes:
+    for note in notes:
         print(f"  {note}")
     return 0
 
@@ -159,6 +160,14 @@ def _file_name(path: Path | str | None) -> str:
     return "" if path is None else Path(path).name
 
 
+def _unseen_regions(options: argparse.Namespace, mission: Mission) -> tuple[str, ...]:
+    """What to tell of regions of space that were asked for and never seen."""
+    seen = any(outcome.roi_share > 0 for outcome in mission.outcomes)
+    if seen or not (options.roi or options.objects or options.roi_ball):
+        return ()
+    return ("none of these frames shows the region that was asked for; is it of another sequence, or in other units?",)
+
+
 def _held(mapper: TaskMapper, gaussians: Gaussians) -> dict[str, object]:
     """What the map holds, and what it takes."""
     return {
@@ -166,7 +175,6 @@ def _held(mapper: TaskMapper, gaussians: Gaussians) -> dict[str, object]:
         "active_gaussians": int(gaussians.active.sum()),
         "peak_rss_mib": peak_rss_mib(),
         "memory_mib": mapper.memory_mib(),
-        "notes": list(mapper.notes),
     }
 
 

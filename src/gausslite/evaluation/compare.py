@@ -2,7 +2,8 @@
 
 Averages are those of the field: each view has its own PSNR, SSIM and depth error (inside the region, over the
 region's pixels of that view), and a map's score is the mean over the views. Views that show fewer than
-MIN_ROI_PIXELS of the region count for the whole image only. SSIM is the plain one, not the multi-scale variant.
+MIN_ROI_PIXELS of the region count for the whole image only. A view's PSNR is at most MOST_DB. SSIM is the plain one,
+not the multi-scale variant.
 """
 
 from __future__ import annotations
@@ -19,9 +20,11 @@ from numpy import ndarray
 from gausslite.domain.gaussians import Gaussians
 from gausslite.errors import InvalidInputError
 from gausslite.evaluation.metrics import covered_share, depth_l1_m, psnr, ssim_map
-from gausslite.evaluation.views import MIN_ROI_PIXELS, HeldOutView, MapViewer
+from gausslite.evaluation.views import HeldOutView, MapViewer
 from gausslite.render.rasterizer import Rasterizer, Rendering
 
+MOST_DB = 100.0
+"""A view's PSNR where map and photograph are equal, as in a saturated region: with infinity no mean would be left."""
 _COVERED_ALPHA = 0.5
 
 
@@ -95,11 +98,10 @@ def score_view(drawn: Rendering, view: HeldOutView, perceptual: PerceptualDistan
     similarity = ssim_map(drawn.rgb, rgb)
     depth_m = drawn.expected_depth_m(_COVERED_ALPHA)
     distance = None if perceptual is None else perceptual.distance_map(drawn.rgb, rgb)
-    roi_pixels = int(np.count_nonzero(view.roi))
     roi = None
-    if roi_pixels >= MIN_ROI_PIXELS:
+    if view.shows_region:
         roi = RoiScore(
-            psnr(drawn.rgb, rgb, view.roi),
+            min(psnr(drawn.rgb, rgb, view.roi), MOST_DB),
             float(similarity[view.roi].mean()),
             depth_l1_m(depth_m, view.frame.depth_m, view.roi),
             covered_share(depth_m, view.frame.depth_m, view.roi),
@@ -107,9 +109,9 @@ def score_view(drawn: Rendering, view: HeldOutView, perceptual: PerceptualDistan
         )
     return ViewScore(
         index=view.frame.index,
-        psnr=psnr(drawn.rgb, rgb),
+        psnr=min(psnr(drawn.rgb, rgb), MOST_DB),
         ssim=float(similarity.mean()),
-        roi_pixels=roi_pixels,
+        roi_pixels=int(np.count_nonzero(view.roi)),
         roi=roi,
         depth_l1_m=depth_l1_m(depth_m, view.frame.depth_m),
         lpips=None if distance is None else float(distance.mean()),

@@ -40,6 +40,11 @@ class HeldOutView:
             roi |= region.mask(frame)
         return cls(frame, roi)
 
+    @property
+    def shows_region(self) -> bool:
+        """Whether enough of the region is seen to be judged."""
+        return int(np.count_nonzero(self.roi)) >= MIN_ROI_PIXELS
+
 
 def most_telling(views: Sequence[HeldOutView], count: int) -> set[int]:
     """From each of `count` stretches of the sequence, the view with the largest region."""

@@ -11,7 +11,7 @@ from gausslite.errors import InvalidInputError
 from gausslite.evaluation.metrics import psnr
 from gausslite.evaluation.quality.pairs import HOME_PAIRS, HomePair
 from gausslite.evaluation.quality.scenes import HomeScenePlan, RecalledAttention, Scene
-from gausslite.evaluation.views import MIN_ROI_PIXELS, MapViewer
+from gausslite.evaluation.views import MapViewer
 from gausslite.mapping.pace import Pace
 from gausslite.mission.build import build_mapper
 from gausslite.mission.settings import MissionSettings, require_rate
@@ -104,7 +104,7 @@ class RetaskBench:
     def _region_psnr(self, loop: TaskMapper, scene: Scene) -> float:
         """Mean over the held-out views that show the new task's region."""
         viewer = MapViewer(loop.gaussians(), choose_rasterizer(threads=self.settings.threads))
-        views = [view for view in scene.held_out if view.roi.sum() >= MIN_ROI_PIXELS]
+        views = [view for view in scene.held_out if view.shows_region]
         if not views:
             raise InvalidInputError(f"{scene.task!r}: expected held-out views that show its region, got none")
         return fmean(psnr(viewer.draw_frame(view.frame).rgb, view.frame.rgb, view.roi) for view in views)

@@ -24,7 +24,7 @@ from gausslite.domain.state import State
 from gausslite.errors import DatasetError, InvalidInputError
 from gausslite.evaluation.held_out import HoldOut
 from gausslite.evaluation.quality.pairs import HomePair
-from gausslite.evaluation.views import HeldOutView
+from gausslite.evaluation.views import MIN_ROI_PIXELS, HeldOutView
 from gausslite.mission.settings import SceneKnowledge
 from gausslite.optimize.view_fit import ViewPrior
 from gausslite.perception.fixed import RegionAttention
@@ -33,6 +33,10 @@ from gausslite.perception.vocabulary import head_of
 _WALKS = (0, 1)
 _FIRST_WALK_SHARE = 2 / 3
 _MOST_FRAMES = 100_000
+
+
+class UnseenRegionError(DatasetError):
+    """No held-out view shows enough of the task's region: there is nothing to judge a map by."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -202,12 +206,17 @@ class RealScenePlan:
         return {"folder": str(self.folder.resolve()), **used}
 
     def load(self, size: tuple[int, int]) -> Scene:
-        """The frames with depth, split."""
+        """The frames with depth, split. Raises UnseenRegionError too."""
         source = open_source(str(self.folder), self.up_axis, self.colour_camera)
         known = balls_for_small_objects(load_voxel_regions(self.roi))
         regions = choose_regions(known, self.objects)
         training, held_out = self.hold_out.split(self._positions(source))
         views = [HeldOutView.of(source.frame(i, size), regions) for i in held_out]
+        if views and not any(view.shows_region for view in views):
+            raise UnseenRegionError(
+                f"{self.name}: expected held-out views that show at least {MIN_ROI_PIXELS} pixels of "
+                f"{', '.join(self.objects)} at {size[0]}x{size[1]}, got none of {len(views)}"
+            )
         knowledge = SceneKnowledge(source.up_axis, known)
         return _scene(self.task, [source.frame(i, size) for i in training], views, regions, knowledge)
 

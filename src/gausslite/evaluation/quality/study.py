@@ -18,7 +18,7 @@ from gausslite.errors import GaussLiteError, StorageError
 from gausslite.evaluation.compare import PerceptualDistance
 from gausslite.evaluation.pictures import comparison_sheet, write_png
 from gausslite.evaluation.quality.fingerprint import code_fingerprint
-from gausslite.evaluation.quality.scenes import Scene, ScenePlan
+from gausslite.evaluation.quality.scenes import Scene, ScenePlan, UnseenRegionError
 from gausslite.evaluation.quality.trials import (
     PICTURES,
     Budget,
@@ -54,6 +54,10 @@ class Watcher(Protocol):
 
     def finished(self, done: Finished) -> None:
         """A trial has its result."""
+        ...
+
+    def left_out(self, trials: int, why: UnseenRegionError) -> None:
+        """A scene's trials are not made, as there is nothing to judge them by."""
         ...
 
 
@@ -197,25 +201,38 @@ def run_study(
 ) -> list[Finished]:
     """Run what is not finished yet. A scene's frames are made only if one of its trials needs them.
 
-    What other code finished is made again, unless it may be reused.
+    What other code finished is made again, unless it may be reused. A scene whose region is in no held-out view is left
+    out. Raises UnseenRegionError where that leaves nothing.
     """
-    finished, shelf = [], _Shelf()
+    finished: list[Finished] = []
+    shelf = _Shelf()
+    unseen: UnseenRegionError | None = None
     for plan in study.plans:
-        scene: Scene | None = None
         shelf.enter(plan)
-        for trial in study.trials(plan):
-            kept, origin = _look_up(trial, archive, perceptual is not None, reuse_other_code)
+        trials = study.trials(plan)
+        looked_up = [_look_up(trial, archive, perceptual is not None, reuse_other_code) for trial in trials]
+        scene: Scene | None = None
+        if any(kept is None for kept, _ in looked_up):
+            try:
+                scene = plan.load(study.conditions.size)
+            except UnseenRegionError as error:
+                unseen = error
+                watcher.left_out(len(trials), error)
+                continue
+        for trial, (kept, origin) in zip(trials, looked_up, strict=True):
             if kept is not None:
                 result = kept.result
             else:
-                scene = plan.load(study.conditions.size) if scene is None else scene
+                assert scene is not None
                 made = shelf.take(trial, scene, watcher)
                 result, pictures = judge_map(made, trial, scene, perceptual)
                 archive.keep(trial, result, pictures)
             finished.append(Finished(trial, result, origin))
             watcher.finished(finished[-1])
         if scene is not None:
-            archive.draw_sheets(study.trials(plan)[: len(study.variants)], scene)
+            archive.draw_sheets(trials[: len(study.variants)], scene)
+    if unseen is not None and not finished:
+        raise unseen
     return finished
 
 

@@ -109,6 +109,11 @@ class Scoreboard:
         """Share of the held-out views' pixels in the region."""
         return next(each.result.roi_share for each in self._finished if each.trial.plan.name == scene)
 
+    def shown(self, scene: str) -> str:
+        """How much of the region there is to judge by, such as "0.7% in 4 of 5 views"."""
+        scores = next(each.result.scores for each in self._finished if each.trial.plan.name == scene)
+        return f"{self.roi_share(scene):.1%} in {scores.n_roi_views} of {scores.n_views} views"
+
     def task(self, scene: str) -> str:
         """What the robot was asked to do."""
         return next(each.trial.plan.task for each in self._finished if each.trial.plan.name == scene)
@@ -187,7 +192,7 @@ def ablation_table(board: Scoreboard) -> str:
     """One row a component, ROI and full PSNR at every budget, scene by scene and on average, fitted too where asked."""
     blocks = board.notes
     for scene in board.scenes:
-        title = f"## {scene}: {board.task(scene)} (ROI {board.roi_share(scene):.1%})"
+        title = f"## {scene}: {board.task(scene)} (ROI {board.shown(scene)})"
         blocks += [title, _by_component(board, [scene])]
     if len(board.scenes) > 1:
         blocks += [f"## The mean over these {len(board.scenes)}", _by_component(board, board.scenes)]
@@ -230,7 +235,7 @@ def _by_scene(board: Scoreboard, roi_and_full: tuple[Metric, Metric], budget: Bu
         cells = [_text(board.figure(scene, variant, roi, budget), roi) for variant in board.variants]
         margins = [board.margin(scene, metric, budget) for metric in roi_and_full]
         signed = ["" if margin is None else f"{margin:+.2f}" for margin in margins]
-        rows.append([scene, board.task(scene), f"{board.roi_share(scene):.1%}", *cells, *signed])
+        rows.append([scene, board.task(scene), board.shown(scene), *cells, *signed])
     return _markdown(rows)
 
 
