@@ -54,6 +54,17 @@ def test_a_connection_that_breaks_is_tried_again() -> None:
     assert len(server.subsets) == 3
 
 
+def test_trouble_is_logged_once_and_so_is_its_end(caplog: pytest.LogCaptureFixture) -> None:
+    answers = iter([*[UnavailableError("draining")] * 3, accepted(), UnavailableError("draining"), accepted()])
+    caplog.set_level("INFO", logger="gausslite.wire.uplink")
+    with scripted(lambda *_: next(answers)) as (_, address), uplink(address) as link:
+        for voxel in (1, 2):
+            link.offer(words({voxel: [5]}))
+            assert link.drain(WAIT_S)
+    again = f"uplink: fusion server {address} takes words again"
+    assert [record.getMessage() for record in caplog.records] == ["uplink: draining; will go on trying", again] * 2
+
+
 def test_damage_is_sent_once_more_and_then_given_up() -> None:
     answers = iter([rejected("CHECKSUM"), rejected("CHECKSUM")])
     with scripted(lambda *_: next(answers)) as (server, address), uplink(address) as link:

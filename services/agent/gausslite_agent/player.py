@@ -159,7 +159,11 @@ class Player:
                 drained = uplink.drain(link.drain_s)
                 self._contribute_keyframes(uplink)
         if not drained:
-            _log.warning("uplink: not everything arrived: %s", uplink.counters())
+            spool = self._settings.link.spool
+            kept = (
+                "they are lost when this process ends" if spool is None else f"they stay in {spool} for the next life"
+            )
+            _log.warning("uplink: words on %d voxels wait still; %s", uplink.counters().voxels_waiting, kept)
 
     def _contribute_keyframes(self, uplink: Uplink) -> None:
         assert self._client is not None

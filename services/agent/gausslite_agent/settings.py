@@ -24,6 +24,7 @@ from gausslite.mission.options import (
 from gausslite.mission.saved_run import RunTerms
 from gausslite.mission.settings import MissionSettings, PerceptionSettings
 from gausslite.task.validate import require_task_text
+from gausslite.wire.address import require_callable
 from gausslite.wire.tls import Tls, add_tls, service_tls
 from gausslite.wire.uplink_values import UplinkSettings
 from gausslite_agent.load import Drops, LoadSettings
@@ -135,8 +136,9 @@ def _require_sense(options: argparse.Namespace) -> None:
     if not 0 <= options.drain_timeout <= _MAX_DRAIN_S:
         raise InvalidInputError(f"--drain-timeout: expected 0 to {_MAX_DRAIN_S:g} s, got {options.drain_timeout}")
     for name in ("parser", "fusion"):
-        if getattr(options, name) == "":
-            raise InvalidInputError(f"--{name}: expected HOST:PORT or unix:PATH, got an empty text")
+        address = getattr(options, name)
+        if address is not None:
+            require_callable(f"--{name}", address)
     if options.task is not None:
         require_task_text(options.task)
 

@@ -32,6 +32,9 @@ _Kind = TypeVar("_Kind", bound="ServiceChannel")
 class ServiceChannel:
     """Owns one channel, encrypted with `tls`. Raises our errors for what the server or the transport says."""
 
+    kind = "service"
+    """What answers there, in an operator's words."""
+
     def __init__(self, address: str, deadline_s: float = DEADLINE_S, tls: Tls | None = None) -> None:
         self.address = address
         self._deadline_s = deadline_s
@@ -44,6 +47,10 @@ class ServiceChannel:
             ("grpc.max_reconnect_backoff_ms", 2000),
         )
         self._channel = open_channel(address, tls, options)
+
+    def __str__(self) -> str:
+        """Such as "parser localhost:50051", for an operator who gave several addresses."""
+        return f"{self.kind} {self.address}"
 
     def close(self) -> None:
         """End the channel and every call on it."""
@@ -60,7 +67,7 @@ class ServiceChannel:
         try:
             yield
         except grpc.RpcError as error:
-            raise from_rpc_error(error, self.address) from error
+            raise from_rpc_error(error, str(self)) from error
 
     def _call(self, method: Any, request: Any, deadline_s: float | None = None) -> Any:
         with self._our_errors():

@@ -58,6 +58,8 @@ class Export:
 class ParserClient(ServiceChannel):
     """The parser service as a task.TaskParser. With `patient` a call waits, within its deadline, for it to start."""
 
+    kind = "parser"
+
     def __init__(
         self, address: str, deadline_s: float = DEADLINE_S, patient: bool = False, tls: Tls | None = None
     ) -> None:
@@ -75,6 +77,8 @@ class ParserClient(ServiceChannel):
 
 class AgentClient(ServiceChannel):
     """One robot's mapper."""
+
+    kind = "agent"
 
     def __init__(self, address: str, deadline_s: float = DEADLINE_S, tls: Tls | None = None) -> None:
         super().__init__(address, deadline_s, tls)
@@ -134,6 +138,8 @@ def is_done(status: agent_service_pb2.GetAgentStatusResponse) -> bool:
 
 class FusionClient(ServiceChannel):
     """The team's map."""
+
+    kind = "fusion server"
 
     def __init__(
         self, address: str, deadline_s: float = DEADLINE_S, mission_id: str = "", tls: Tls | None = None

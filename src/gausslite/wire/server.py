@@ -22,6 +22,7 @@ from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection
 
 from gausslite.errors import GaussLiteError, InvalidInputError, UnavailableError
+from gausslite.wire.address import UNIX, host_and_port
 from gausslite.wire.status import to_status
 from gausslite.wire.tls import Tls
 
@@ -204,14 +205,12 @@ def _require_free(listen: str) -> None:
     """Try the address first: gRPC takes over a unix socket that another server still answers on, and writes lines of
     its own to stderr about a port in use.
     """
-    if listen.startswith("unix:"):
-        _require_free_socket(listen, Path(listen.removeprefix("unix:")))
+    if listen.startswith(UNIX):
+        _require_free_socket(listen, Path(listen.removeprefix(UNIX)))
         return
-    host, _, port = listen.rpartition(":")
-    if not host or not (port.isascii() and port.isdigit() and len(port) <= 5) or int(port) > 65535:
-        raise InvalidInputError(f"listen: expected HOST:PORT or unix:PATH, got {listen!r}")
+    host, port = host_and_port("listen", listen)
     try:
-        resolved = socket.getaddrinfo(host.strip("[]"), int(port), type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
+        resolved = socket.getaddrinfo(host.strip("[]"), port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
         for family, kind, protocol, _, address in resolved:
             with socket.socket(family, kind, protocol) as probe:
                 probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)

@@ -63,6 +63,7 @@ class Uplink:
         self._subset_bytes = MAX_SUBSET_BYTES
         self._allowance = Allowance(self._settings.kbps)
         self._backoff_s = 0.0
+        self._trouble = ""
         self._next_round_s = 0.0
         self._draining = self._closing = self._hurrying = False
         # guards the counters and flags; waited on by the thread and by drain
@@ -162,7 +163,7 @@ class Uplink:
         if problem is not None:
             raise problem
         if sent:
-            raise UnavailableError(f"{self._client.address}: the stream ended before {len(sent)} subsets were answered")
+            raise UnavailableError(f"{self._client}: the stream ended before {len(sent)} subsets were answered")
         return True
 
     def _exchange(
@@ -260,7 +261,10 @@ class Uplink:
 
     def _recover(self, error: GaussLiteError) -> None:
         """Make ready for another try: join anew, send less at once, or just wait."""
-        _log.warning("uplink: %s", error)
+        if str(error) != self._trouble:
+            # said once and not with every try: a robot may be out of reach for hours
+            _log.warning("uplink: %s; will go on trying", error)
+            self._trouble = str(error)
         if isinstance(error, SessionUnknownError):
             self._session = None
             self._spool.forget_what_was_sent()
@@ -272,6 +276,9 @@ class Uplink:
             self._next_round_s = time.monotonic() + self._backoff_s
 
     def _after_round(self, sent: bool) -> None:
+        if sent and self._trouble:
+            _log.info("uplink: %s takes words again", self._client)
+            self._trouble = ""
         with self._changed:
             self._backoff_s = 0.0
             self._counters = replace(self._counters, connected=self._session is not None)

@@ -1,0 +1,25 @@
+"""Addresses as an operator writes them: HOST:PORT or unix:PATH."""
+
+from __future__ import annotations
+
+from gausslite.errors import InvalidInputError
+
+UNIX = "unix:"
+_LAST_PORT = 65535
+
+
+def host_and_port(name: str, address: str) -> tuple[str, int]:
+    """The two parts of HOST:PORT. Raises InvalidInputError that begins with the name."""
+    host, _, port = address.rpartition(":")
+    if not host or not (port.isascii() and port.isdigit() and len(port) <= 5) or int(port) > _LAST_PORT:
+        raise InvalidInputError(f"{name}: expected HOST:PORT or unix:PATH, got {address!r}")
+    return host, int(port)
+
+
+def require_callable(name: str, address: str) -> None:
+    """Raise InvalidInputError for what nobody can answer at: gRPC would take a missing port for 443 and try forever."""
+    if address.startswith(UNIX) and address != UNIX:
+        return
+    _, port = host_and_port(name, address)
+    if port == 0:
+        raise InvalidInputError(f"{name}: expected the port that the service listens on, got {address!r}")
