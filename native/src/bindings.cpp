@@ -177,7 +177,7 @@ struct StepTraining {
   uint64_t loan;
 
   StepTraining(std::tuple<RowTable, RowTable, RowTable> tables, std::tuple<float, float, float, bool> weights,
-               const std::vector<float>& rates, std::tuple<double, double, double> constants, bool masked,
+               const std::vector<float>& rates, std::tuple<double, double, double, double> constants, bool masked,
                std::optional<Flags> trainable, std::optional<Counts> trained, std::optional<Flags> counted,
                uint64_t loan)
       : rows(std::get<0>(tables)),
@@ -195,7 +195,7 @@ struct StepTraining {
             "tables: lengths disagree");
     require(rates.size() == 16, "rates: expected 16");
     std::copy_n(rates.begin(), 16, adam.rates);
-    std::tie(adam.beta1, adam.beta2, adam.epsilon) = constants;
+    std::tie(adam.beta1, adam.beta2, adam.epsilon, adam.full_rate_updates) = constants;
   }
 
   OptimizerState state() const {
@@ -253,7 +253,7 @@ NB_MODULE(_kernels, m) {
 
   nb::class_<StepTraining>(m, "StepTraining", "What a step changes and how; it keeps the arrays, not their values.")
       .def(nb::init<std::tuple<RowTable, RowTable, RowTable>, std::tuple<float, float, float, bool>,
-                    const std::vector<float>&, std::tuple<double, double, double>, bool, std::optional<Flags>,
+                    const std::vector<float>&, std::tuple<double, double, double, double>, bool, std::optional<Flags>,
                     std::optional<Counts>, std::optional<Flags>, uint64_t>(),
            nb::arg("tables").noconvert(), nb::arg("loss"), nb::arg("rates"), nb::arg("adam"), nb::arg("masked"),
            nb::arg("trainable").noconvert().none(), nb::arg("trained").noconvert().none(),

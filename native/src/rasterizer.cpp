@@ -238,7 +238,7 @@ double Rasterizer::step(const FrameInput& input, const OptimizerState& state, co
   update.adam.beta1 = float(adam.beta1);
   update.adam.beta2 = float(adam.beta2);
   update.adam.epsilon = float(adam.epsilon);
-  update.adam.corrections = corrections_.table(adam.beta1, adam.beta2);
+  update.adam.corrections = corrections_.table(adam.beta1, adam.beta2, adam.full_rate_updates);
   update.adam.correction_count = AdamCorrections::kCount;
 
   team_.run([&](int thread) {

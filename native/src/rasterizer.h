@@ -42,7 +42,7 @@ struct OptimizerState {
 
 struct AdamOptions {
   float rates[16];
-  double beta1, beta2, epsilon;
+  double beta1, beta2, epsilon, full_rate_updates;
 };
 
 // Milliseconds of the last call's stages, as its first thread saw them. With SSIM strips are drawn, compared and walked

@@ -13,7 +13,7 @@ namespace gausslite {
 struct AdamSettings {
   float rates[16];
   float beta1, beta2, epsilon;
-  const float* corrections;  // 1 / (1 - beta^t) for beta1 and beta2 in turn, t = 1 ... correction_count
+  const float* corrections;  // AdamCorrections::table
   int correction_count;
 };
 

@@ -11,6 +11,7 @@ from gausslite.render.rasterizer import (
     EVERYTHING,
     GRAD_2D_COUNT,
     GRAD_2D_SUM,
+    MOST_COUNTED_UPDATES,
     UPDATES,
     AdamSettings,
     LossWeights,
@@ -40,6 +41,7 @@ def tables(scene: Scene, seasoned: bool) -> tuple[np.ndarray, np.ndarray, np.nda
     if not seasoned:
         return rows, np.zeros_like(rows), np.zeros_like(rows)
     rows[:, UPDATES] = rng.integers(0, 30, len(rows))
+    rows[::7, UPDATES] = 3 * MOST_COUNTED_UPDATES
     first = np.zeros_like(rows)
     second = np.zeros_like(rows)
     moved = (rows[:, UPDATES] > 0)[:, None]
@@ -60,11 +62,12 @@ def train(
     subset: Subset = EVERYTHING,
     trainable: np.ndarray | None = None,
     seasoned: bool = False,
+    adam: AdamSettings = ADAM,
 ) -> Trained:
     before = tables(scene, seasoned)
     rows, first, second = (table.copy() for table in before)
     view = picture.view(rasterizer, scene)
-    report = rasterizer.step(rows, first, second, view, scene.T_camera_world, loss, ADAM, masked, subset, trainable)
+    report = rasterizer.step(rows, first, second, view, scene.T_camera_world, loss, adam, masked, subset, trainable)
     return Trained(before, rows, first, second, report)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -14,6 +15,7 @@ from gausslite.render.rasterizer import (
     EVERYTHING,
     GRAD_2D_COUNT,
     GRAD_2D_SUM,
+    MOST_COUNTED_UPDATES,
     UPDATES,
     LossWeights,
     Rasterizer,
@@ -119,9 +121,11 @@ def test_step_equals_the_separate_path(rasterizer: Rasterizer, oracle: Rasterize
     assert relative_error(grown, separate.mean_2d_norm) < TOLERANCE
 
 
-def test_rows_move_by_adams_rule(rasterizer: Rasterizer, oracle: Rasterizer) -> None:
+@pytest.mark.parametrize("full_rate_updates", [math.inf, 9.0])
+def test_rows_move_by_adams_rule(rasterizer: Rasterizer, oracle: Rasterizer, full_rate_updates: float) -> None:
     scene = scene_named("medium splats")
-    done = train(rasterizer, scene, picture_for(scene, oracle), seasoned=True)
+    slowing = replace(ADAM, full_rate_updates=full_rate_updates)
+    done = train(rasterizer, scene, picture_for(scene, oracle), seasoned=True, adam=slowing)
     moved = done.report.visible
     before, after = done.before[0][moved, :14].astype(np.float64), done.rows[moved, :14]
     gradient = gradient_seen(done)[moved, :14]
@@ -131,7 +135,8 @@ def test_rows_move_by_adams_rule(rasterizer: Rasterizer, oracle: Rasterizer) -> 
     np.testing.assert_array_equal(updates[:, 0], done.before[0][moved, UPDATES] + 1)
     first_unbiased = done.first_moment[moved, :14] / (1 - ADAM.beta1**updates)
     second_unbiased = done.second_moment[moved, :14] / (1 - ADAM.beta2**updates)
-    step = ADAM.row_rates()[:14] * first_unbiased / (np.sqrt(second_unbiased) + ADAM.epsilon)
+    slowed = np.sqrt(np.minimum(1.0, full_rate_updates / np.minimum(updates, MOST_COUNTED_UPDATES)))
+    step = slowed * ADAM.row_rates()[:14] * first_unbiased / (np.sqrt(second_unbiased) + ADAM.epsilon)
     assert relative_error(after - before, -step) < TOLERANCE
     assert not done.rows[:, 15].any()
 

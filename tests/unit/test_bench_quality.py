@@ -73,7 +73,7 @@ def test_a_real_sequences_kinds_are_chosen_by_name() -> None:
 def test_components_come_one_by_one() -> None:
     variants = cumulative_variants()
     labels = [variant.label for variant in variants]
-    beyond = ["+views", "+surroundings", "+scaffold", "+means"]
+    beyond = ["+views", "+surroundings", "+scaffold", "+means", "+settling"]
     assert labels == ["none", "+SB", "+MVO", "+ROI", "+SIS", "+GFD", *beyond]
     off = [variant.without for variant in variants]
     assert all(len(a - b) == 1 and b < a for a, b in pairwise(off))

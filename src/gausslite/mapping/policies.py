@@ -8,6 +8,7 @@ from dataclasses import replace
 from gausslite.errors import InvalidInputError
 from gausslite.mapping.baselines import gaussian_slam_policy, monogs_policy, splatam_policy, uniform_policy
 from gausslite.mapping.settings import MapperSettings
+from gausslite.optimize.rates import ONLINE_RATES
 
 
 def task_policy() -> MapperSettings:
@@ -42,6 +43,7 @@ BEYOND_SWITCHES: dict[str, Callable[[MapperSettings], MapperSettings]] = {
     "surroundings": lambda settings: replace(settings, keyframes=replace(settings.keyframes, surroundings_weight=0.0)),
     "scaffold": lambda settings: replace(settings, seeding=replace(settings.seeding, scaffold_share=0.0)),
     "means": lambda settings: replace(settings, optimization=replace(settings.optimization, averaged_updates=0.0)),
+    "settling": lambda settings: replace(settings, optimization=replace(settings.optimization, adam=ONLINE_RATES)),
 }
 """What came beyond the paper, in the order of our ablation, and how each is switched off."""
 

@@ -9,7 +9,7 @@ from enum import StrEnum
 from gausslite.errors import InvalidInputError
 from gausslite.mapping.retask import RetaskSettings
 from gausslite.optimize.density import DensitySettings
-from gausslite.optimize.rates import ONLINE_RATES
+from gausslite.optimize.rates import SETTLING_RATES
 from gausslite.optimize.view_fit import ViewPrior
 from gausslite.render.rasterizer import AdamSettings, LossWeights
 
@@ -137,7 +137,7 @@ class OptimizationSettings:
     active_iterations: int = 6
     active_phase: ActivePhase = ActivePhase.EXACT
     loss: LossWeights = _ALIKE_IN_BOTH_PHASES
-    adam: AdamSettings = ONLINE_RATES
+    adam: AdamSettings = SETTLING_RATES
     isotropic: bool = False
     averaged_updates: float = 32.0
 

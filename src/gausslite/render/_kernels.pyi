@@ -45,14 +45,15 @@ class StepTraining:
         tables: tuple[Float32[ndarray, "n 16"], Float32[ndarray, "n 16"], Float32[ndarray, "n 16"]],
         loss: tuple[float, float, float, bool],
         rates: Sequence[float],
-        adam: tuple[float, float, float],
+        adam: tuple[float, float, float, float],
         masked: bool,
         trainable: Bool[ndarray, " n"] | None,
         trained: UInt32[ndarray, " n"] | None,
         counted: Bool[ndarray, " n"] | None,
         loan: int,
     ) -> None:
-        """The values of adam are beta1, beta2, epsilon. trained rises by one for each row that moved and is counted.
+        """The values of adam are beta1, beta2, epsilon, full_rate_updates. trained rises by one for each row that moved
+        and is counted.
 
         loan: numbers a time in which the rows change by steps of this number alone; 0 where others may change them.
         """

@@ -109,7 +109,7 @@ class Loans:
             tables,
             (loss.colour, loss.depth, loss.ssim, loss.by_share),
             _row_rates(adam),
-            (adam.beta1, adam.beta2, adam.epsilon),
+            (adam.beta1, adam.beta2, adam.epsilon, adam.full_rate_updates),
             masked,
             *marks,
             self._number if on_loan else 0,

@@ -20,6 +20,7 @@ the centre of at least one drawn pixel.
 
 from __future__ import annotations
 
+import math
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from typing import Any, Protocol, runtime_checkable
@@ -35,6 +36,9 @@ MEAN, LOG_SCALE, QUAT, LOGIT, RGB = slice(0, 3), slice(3, 6), slice(6, 10), 10, 
 UPDATES = 14
 GRAD_2D_SUM, GRAD_2D_COUNT = 14, 15
 """Columns of the first-moment table, not of the rows."""
+
+MOST_COUNTED_UPDATES = 20_000
+"""Further updates of a splat count as so many: its bias corrections are 1 by then."""
 
 TILE_PX = 16
 NEAR_M = 0.05
@@ -109,7 +113,11 @@ class LossWeights:
 
 @dataclass(frozen=True, slots=True)
 class AdamSettings:
-    """Learning rates per group (FIELD defaults) and Adam's constants; bias correction counts updates per splat."""
+    """Learning rates per group (FIELD defaults) and Adam's constants; bias correction counts updates per splat.
+
+    full_rate_updates: in the t-th update of a splat its rates are multiplied by √(full_rate_updates / t) where that is
+    below 1, for t up to MOST_COUNTED_UPDATES and no less after them. inf, the default, keeps them as they are.
+    """
 
     means: float = 1e-4
     log_scales: float = 5e-3
@@ -119,6 +127,7 @@ class AdamSettings:
     beta1: float = 0.9
     beta2: float = 0.999
     epsilon: float = 1e-15
+    full_rate_updates: float = math.inf
 
     def row_rates(self) -> Float32[ndarray, "16"]:
         """The learning rate of each column of a row; zero for the spare ones."""

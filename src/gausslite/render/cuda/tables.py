@@ -11,7 +11,14 @@ from numpy import ndarray
 from numpy.typing import NDArray
 from torch import Tensor
 
-from gausslite.render.rasterizer import GRAD_2D_COUNT, GRAD_2D_SUM, UPDATES, AdamSettings, Tally
+from gausslite.render.rasterizer import (
+    GRAD_2D_COUNT,
+    GRAD_2D_SUM,
+    MOST_COUNTED_UPDATES,
+    UPDATES,
+    AdamSettings,
+    Tally,
+)
 
 _COUNT_EVERY = 8
 """So many tallies wait to be written together, so that the device runs on meanwhile."""
@@ -89,11 +96,12 @@ class DeviceTables:
         gradient = gradients[:, trained]
         first[:, trained].lerp_(gradient, 1.0 - adam.beta1)
         second[:, trained].mul_(adam.beta2).addcmul_(gradient, gradient, value=1.0 - adam.beta2)
-        updates = rows[:, UPDATES, None] + 1.0
+        updates = (rows[:, UPDATES, None] + 1.0).clamp(max=MOST_COUNTED_UPDATES)
+        slowed = (adam.full_rate_updates / updates).clamp(max=1.0).sqrt()
         rates = carried(adam.row_rates()[trained], rows.device)
         first_unbiased = first[:, trained] / (1.0 - adam.beta1**updates)
         second_unbiased = second[:, trained] / (1.0 - adam.beta2**updates)
-        rows[:, trained] -= rates * first_unbiased / (second_unbiased.sqrt() + adam.epsilon)
+        rows[:, trained] -= slowed * rates * first_unbiased / (second_unbiased.sqrt() + adam.epsilon)
         rows[:, UPDATES] += 1.0
         first[:, GRAD_2D_SUM] += mean_2d_norm
         first[:, GRAD_2D_COUNT] += 1.0

@@ -25,6 +25,7 @@ from gausslite.render.rasterizer import (
     EVERYTHING,
     GRAD_2D_COUNT,
     GRAD_2D_SUM,
+    MOST_COUNTED_UPDATES,
     UPDATES,
     AdamSettings,
     HostReport,
@@ -193,10 +194,11 @@ def _adam(
     gradient = d_rows[moving, columns]
     first = adam.beta1 * first_moment[moving, columns].astype(np.float64) + (1.0 - adam.beta1) * gradient
     second = adam.beta2 * second_moment[moving, columns].astype(np.float64) + (1.0 - adam.beta2) * gradient**2
-    updates = rows[moving, UPDATES].astype(np.float64)[:, None] + 1.0
+    updates = np.minimum(rows[moving, UPDATES].astype(np.float64)[:, None] + 1.0, MOST_COUNTED_UPDATES)
+    slowed = np.sqrt(np.minimum(1.0, adam.full_rate_updates / updates))
     first_unbiased = first / (1.0 - adam.beta1**updates)
     second_unbiased = second / (1.0 - adam.beta2**updates)
-    step = adam.row_rates()[columns] * first_unbiased / (np.sqrt(second_unbiased) + adam.epsilon)
+    step = slowed * adam.row_rates()[columns] * first_unbiased / (np.sqrt(second_unbiased) + adam.epsilon)
     rows[moving, columns] = (rows[moving, columns] - step).astype(np.float32)
     rows[moving, UPDATES] += 1.0
     first_moment[moving, columns] = first.astype(np.float32)
