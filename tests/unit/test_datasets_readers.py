@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -10,7 +11,8 @@ import pytest
 from tiny_sequences import HEIGHT, WIDTH, write_depth, write_replica, write_seven_scenes, write_tum
 
 from gausslite.datasets.open import open_source
-from gausslite.datasets.selection import select_frames
+from gausslite.datasets.selection import modest_size, select_frames
+from gausslite.domain.camera import Camera
 from gausslite.domain.region import BallRegion, VoxelRegion
 from gausslite.errors import DatasetError, InvalidInputError
 
@@ -79,6 +81,28 @@ def test_resizing_averages_colour_and_never_mixes_depth(tmp_path: Path) -> None:
     blocks = whole.rgb.reshape(HEIGHT // 2, 2, WIDTH // 2, 2, 3).mean(axis=(1, 3))
     assert np.abs(half.rgb - blocks).max() <= 0.76
     assert (half.camera.fx_px, half.camera.cx_px) == (10.0, 4.0)
+
+
+@pytest.mark.parametrize(
+    ("recorded", "modest"),
+    [
+        ((640, 480), (320, 240)),
+        ((480, 640), (240, 320)),
+        ((1280, 720), (370, 208)),
+        ((1296, 968), (321, 240)),
+        ((160, 120), (160, 120)),
+    ],
+)
+def test_a_modest_size_stretches_nothing(recorded: tuple[int, int], modest: tuple[int, int]) -> None:
+    assert modest_size(Camera(500.0, 500.0, 320.0, 240.0, *recorded)) == modest
+
+
+@pytest.mark.parametrize("write", [write_tum, write_seven_scenes, write_replica])
+def test_every_layout_knows_the_regions_beside_it(write: Callable[[Path], Path], tmp_path: Path) -> None:
+    folder = write(tmp_path / "fr1")
+    assert open_source(str(folder)).regions() == {}
+    np.savez(folder / "roi_voxels.npz", voxel_size_m=0.1, mug_1=np.zeros((1, 3), np.int32))
+    assert list(open_source(str(folder)).regions()) == ["mug_1"]
 
 
 def test_a_folder_that_holds_one_sequence_stands_for_it(tmp_path: Path) -> None:

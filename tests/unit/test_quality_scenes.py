@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
 
@@ -134,3 +135,27 @@ def test_a_rates_cost_is_not_measured_where_no_view_shows_the_region(
     kitchen, roi = write_kitchen(tmp_path, lamp_1=[(500, 500, 500)])
     assert main(["bench", "loop", str(kitchen), "--roi", str(roi), "--unlimited", "2"]) == 2
     assert "--unlimited: expected a held-out frame that shows the region, got none" in capsys.readouterr().err
+
+
+def test_a_real_sequences_own_regions_are_the_usual_ones(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("gausslite.render._kernels", reason="the native kernels are not built")
+    kitchen, roi = write_kitchen(tmp_path, mug_1=WALL)
+    asked = ["bench", "quality", "--real", str(kitchen), "--policies", "task", "--iterations", "1", "--threads", "1"]
+    asked += ["--max-gaussians", "150", "--out", str(tmp_path / "out")]
+    assert main(asked) == 2
+    assert f"and no {kitchen / 'roi_voxels.npz'}" in capsys.readouterr().err
+    roi.rename(kitchen / "roi_voxels.npz")
+    assert main(asked) == 0
+    # 16x12 is its own size, which has fewer pixels than 320x240
+    [record] = (tmp_path / "out" / "trials").glob("kitchen-mug-task-*.json")
+    assert "size=(16, 12)" in json.loads(record.read_text())["settings"]["conditions"]
+
+
+def test_wrong_kinds_are_told_before_the_colour_camera_is_looked_for(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    kitchen, roi = write_kitchen(tmp_path, mug_1=WALL)
+    asked = ["--real", str(kitchen), "--roi", str(roi), "--kinds", "mugs", "--out", str(tmp_path / "out")]
+    assert main(["bench", "quality", *asked]) == 2
+    [line] = capsys.readouterr().err.splitlines()
+    assert "kinds: expected names among mug, got mugs" in line

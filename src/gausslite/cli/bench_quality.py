@@ -7,16 +7,21 @@ import shlex
 import sys
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from gausslite.cli.arguments import open_told
+from gausslite.cli.progress import progress_bar
 from gausslite.codec.files import write_whole
+from gausslite.datasets.regions import REGIONS_FILE
+from gausslite.datasets.selection import modest_size
 from gausslite.errors import InvalidInputError
 from gausslite.evaluation.quality.ablation import cumulative_variants
 from gausslite.evaluation.quality.pairs import HomePair, choose_pairs
 from gausslite.evaluation.quality.scenes import (
     REAL_CAMERA,
     HomeScenePlan,
+    RealScenePlan,
     ScenePlan,
     Trust,
     UnseenRegionError,
@@ -34,6 +39,7 @@ from gausslite.mission.settings import PerceptionSettings
 
 _ABLATION_PAIR = "home-4-manipulation"
 _BOTH = "both"
+_HOME_SIZE = (320, 240)
 
 
 def configure_quality(parser: argparse.ArgumentParser) -> None:
@@ -65,13 +71,9 @@ def run_quality(options: argparse.Namespace) -> int:
     variants = [Variant(name, name) for name in options.policies]
     if not variants:
         raise InvalidInputError(f"policies: expected names among {', '.join(POLICIES)}, got none")
-    study = Study(
-        _plans(options, options.pairs, ()),
-        variants,
-        _budgets(options),
-        options.seeds,
-        _conditions(options, _eyes(options)),
-    )
+    plans, own_size = _plans(options, options.pairs, ())
+    conditions = Conditions(options.size or own_size, _eyes(options), options.threads)
+    study = Study(plans, variants, _budgets(options), options.seeds, conditions)
     board = _run(study, options)
     _write(options.out, "quality", quality_table(board), board)
     return 0
@@ -79,8 +81,9 @@ def run_quality(options: argparse.Namespace) -> int:
 
 def run_ablation(options: argparse.Namespace) -> int:
     """Switch the components on one by one and write ablation.md and ablation.json."""
-    plans = _plans(options, options.pair, (_ABLATION_PAIR,))
-    study = Study(plans, cumulative_variants(), _budgets(options), options.seeds, _conditions(options, Eyes()))
+    plans, own_size = _plans(options, options.pair, (_ABLATION_PAIR,))
+    conditions = Conditions(options.size or own_size, Eyes(), options.threads)
+    study = Study(plans, cumulative_variants(), _budgets(options), options.seeds, conditions)
     board = _run(study, options)
     _write(options.out, "ablation", ablation_table(board), board)
     return 0
@@ -98,7 +101,7 @@ def _add_common(parser: argparse.ArgumentParser, seeds: tuple[int, ...], equal: 
     add("--out", metavar="DIR", type=Path, required=True, help="gets tables and sheets; finished trials there are kept")
     add("--reuse-other-code", action="store_true", help="take finished trials of other code too (default: made again)")
     add("--seeds", metavar="N,...", type=whole_numbers, default=seeds, help=f"seeds of the mapper (default: {shown})")
-    add("--size", metavar="WxH", type=size, default=(320, 240), help="image size (default: 320x240)")
+    add("--size", metavar="WxH", type=size, help="image size (default: 320x240, a real sequence's in its proportions)")
     add("--frames", metavar="N", type=int, help="training frames (default: 60 in a home, all of a real sequence)")
     add("--views", metavar="N", type=int, default=24, help="held-out views in a home (default: %(default)s)")
     budget = Budget()
@@ -130,18 +133,25 @@ def _add_common(parser: argparse.ArgumentParser, seeds: tuple[int, ...], equal: 
         "--real", metavar="FOLDER", type=Path, help="measure on this sequence (too, when homes are named)"
     )
     real.add_argument(
-        "--roi", metavar="FILE.npz", type=Path, help="its ground-truth regions; one pair a kind of object"
+        "--roi",
+        metavar="FILE.npz",
+        type=Path,
+        help=f"its regions (default: FOLDER/{REGIONS_FILE}), a pair a kind of object",
     )
     real.add_argument("--kinds", metavar="A,B", type=names, default=(), help="such as mug,chair (default: all in FILE)")
     real.add_argument("--up", metavar="X,Y,Z", type=up_axis, help="its upward direction, if not the source's")
     add_colour_camera(real, may_look=True, default=LOOK)
 
 
-def _plans(options: argparse.Namespace, asked: Sequence[str], usual: Sequence[str]) -> list[ScenePlan]:
-    """The homes' pairs that are asked for and the real sequence; with neither the usual pairs."""
+def _plans(
+    options: argparse.Namespace, asked: Sequence[str], usual: Sequence[str]
+) -> tuple[list[ScenePlan], tuple[int, int]]:
+    """The homes' pairs that are asked for and the real sequence, with neither the usual pairs; and a size for them."""
     real = _real(options)
-    homes = _homes(options, choose_pairs(asked or usual)) if asked or not real else []
-    return [*homes, *real]
+    if real is None:
+        return [*_homes(options, choose_pairs(asked or usual))], _HOME_SIZE
+    plans, own_size = real
+    return [*(_homes(options, choose_pairs(asked)) if asked else ()), *plans], own_size
 
 
 def _homes(options: argparse.Namespace, pairs: Sequence[HomePair]) -> list[HomeScenePlan]:
@@ -149,19 +159,23 @@ def _homes(options: argparse.Namespace, pairs: Sequence[HomePair]) -> list[HomeS
     return [HomeScenePlan(pair, frames, options.views, trust=trust) for pair in pairs]
 
 
-def _real(options: argparse.Namespace) -> list[ScenePlan]:
-    if (options.real is None) != (options.roi is None):
-        raise InvalidInputError(
-            "--real: expected a folder and its regions, --real FOLDER --roi FILE.npz; got one of them"
-        )
+def _real(options: argparse.Namespace) -> tuple[list[RealScenePlan], tuple[int, int]] | None:
+    """The plans of the real sequence, and a size in its proportions; None where none is asked for."""
     if options.real is None:
-        if options.kinds:
-            raise InvalidInputError("--kinds: expected a real sequence to choose from, --real FOLDER; got none")
-        return []
-    trust = _trust(options, REAL_CAMERA)
-    _, camera = open_told(str(options.real), options.up, options.colour_camera)
-    plans = real_plans(options.real, options.roi, options.frames, options.up, camera, trust)
-    return [*choose_kinds(plans, options.kinds)]
+        for name in ("roi", "kinds"):
+            if getattr(options, name):
+                raise InvalidInputError(f"--{name}: expected a real sequence it belongs to, --real FOLDER; got none")
+        return None
+    roi = options.roi or options.real / REGIONS_FILE
+    if options.roi is None and not roi.is_file():
+        raise InvalidInputError(
+            f"--real: expected a folder and its regions, --real FOLDER --roi FILE.npz; got none, and no {roi}"
+        )
+    # what is wrong with the options is told before anything is looked for in the images
+    plans = real_plans(options.real, roi, options.frames, options.up, trust=_trust(options, REAL_CAMERA))
+    chosen = choose_kinds(plans, options.kinds)
+    source, camera = open_told(str(options.real), options.up, options.colour_camera)
+    return [replace(plan, colour_camera=camera) for plan in chosen], modest_size(source.camera)
 
 
 def _trust(options: argparse.Namespace, usual: Trust) -> Trust:
@@ -174,10 +188,6 @@ def _trust(options: argparse.Namespace, usual: Trust) -> Trust:
 def _budgets(options: argparse.Namespace) -> list[Budget]:
     asked = list(Equal) if options.equal == _BOTH else [Equal(options.equal)]
     return [Budget(options.max_gaussians, equal, options.iterations, options.rate) for equal in asked]
-
-
-def _conditions(options: argparse.Namespace, eyes: Eyes) -> Conditions:
-    return Conditions(options.size, eyes, options.threads)
 
 
 def _eyes(options: argparse.Namespace) -> Eyes:
@@ -221,18 +231,8 @@ class _StudyBar:
     """A bar over trials, and a line for each."""
 
     def __init__(self, count: int) -> None:
-        from tqdm import tqdm
-
-        on_terminal = sys.stderr.isatty()
-        self._bar = tqdm(
-            total=count,
-            desc="trials",
-            unit="trial",
-            mininterval=0.2 if on_terminal else 10.0,
-            dynamic_ncols=on_terminal,
-            file=sys.stderr,
-        )
-        self._on_terminal = on_terminal
+        self._bar = progress_bar(count, "trials", "trial")
+        self._on_terminal = sys.stderr.isatty()
         self._frames = 0
 
     def __enter__(self) -> _StudyBar:

@@ -235,8 +235,9 @@ def _table(agents: Mapping[str, Mapping[str, object]], scores: Mapping[str, MapS
         )
     lines += ["", f"{'map':<15}{'ROI PSNR':>10}{'ROI SSIM':>10}{'full PSNR':>11}"]
     for name, score in scores.items():
-        roi_psnr, roi_ssim = (float("nan") if v is None else v for v in (score.roi_psnr, score.roi_ssim))
-        lines.append(f"{name:<15}{roi_psnr:>7.2f} dB{roi_ssim:>10.3f}{score.full_psnr:>8.2f} dB")
+        roi_psnr = "-" if score.roi_psnr is None else f"{score.roi_psnr:.2f} dB"
+        roi_ssim = "-" if score.roi_ssim is None else f"{score.roi_ssim:.3f}"
+        lines.append(f"{name:<15}{roi_psnr:>10}{roi_ssim:>10}{score.full_psnr:>8.2f} dB")
     return "\n".join(lines) + "\n"
 
 

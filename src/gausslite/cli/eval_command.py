@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
 from gausslite.cli.arguments import add_regions, add_source, asked_regions, open_told
+from gausslite.cli.progress import progress_bar
 from gausslite.codec.ply import read_ply
 from gausslite.datasets.selection import frame_size, select_frames
 from gausslite.errors import DatasetError
@@ -38,8 +40,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Draw the map from every selected frame with depth, compare, print the means."""
-    from tqdm import tqdm
-
     rasterizer = choose_rasterizer(threads=options.threads)
     gaussians = read_ply(options.map)
     source, _ = open_told(options.source, options.up, options.colour_camera)
@@ -55,7 +55,7 @@ def run(options: argparse.Namespace) -> int:
         prepare_folder(options.pictures)
     pictured = set(positions[:: max(1, len(positions) // _PICTURES)])
     scores = []
-    for position in tqdm(positions, desc="eval", unit="view", disable=options.json):
+    for position in _shown(positions, options.json):
         view = HeldOutView.of(source.frame(position, size), chosen)
         if not view.frame.has_depth:
             continue
@@ -69,6 +69,17 @@ def run(options: argparse.Namespace) -> int:
     result = average(scores)
     print(as_text(asdict(result)) if options.json else _as_line(result, bool(chosen)))
     return 0
+
+
+def _shown(positions: Sequence[int], quiet: bool) -> Iterator[int]:
+    """The positions, with a bar unless scripts read what is printed."""
+    if quiet:
+        yield from positions
+        return
+    with progress_bar(len(positions), "eval", "view") as bar:
+        for position in positions:
+            yield position
+            bar.update()
 
 
 def _as_line(scores: MapScores, asked: bool) -> str:

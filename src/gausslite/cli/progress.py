@@ -5,24 +5,30 @@ from __future__ import annotations
 import sys
 import time
 from types import TracebackType
+from typing import Any
+
+from tqdm import tqdm
+
+
+def progress_bar(total: int, label: str, unit: str, row: int = 0) -> tqdm[Any]:
+    """A bar on stderr, redrawn at once on a terminal; elsewhere a line every ten seconds."""
+    on_terminal = sys.stderr.isatty()
+    return tqdm(
+        total=total,
+        desc=label,
+        unit=unit,
+        position=row if on_terminal else 0,
+        mininterval=0.2 if on_terminal else 10.0,
+        dynamic_ncols=on_terminal,
+        file=sys.stderr,
+    )
 
 
 class MappingBar:
-    """A progress bar over frames. Draws on a terminal; elsewhere it prints a line every few seconds."""
+    """A progress bar over frames, with the figures."""
 
     def __init__(self, total: int, label: str = "map", row: int = 0) -> None:
-        from tqdm import tqdm
-
-        on_terminal = sys.stderr.isatty()
-        self._bar = tqdm(
-            total=total,
-            desc=label,
-            unit="frame",
-            position=row if on_terminal else 0,
-            mininterval=0.2 if on_terminal else 10.0,
-            dynamic_ncols=on_terminal,
-            file=sys.stderr,
-        )
+        self._bar = progress_bar(total, label, "frame", row)
         self._start = time.monotonic()
 
     def __enter__(self) -> MappingBar:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -12,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from gausslite.cli.processes import ProcessGroup, ServiceProcess
-from gausslite.cli.progress import MappingBar
+from gausslite.cli.progress import MappingBar, progress_bar
 from gausslite.codec.files import write_whole
 from gausslite.errors import UnavailableError
 from gausslite.wire.clients import AgentClient, Export, FusionClient, is_done
@@ -156,9 +155,7 @@ def _wait_until(holds: Callable[[], bool], name: str, service: ServiceProcess) -
 
 
 def _refine(client: FusionClient, plan: TeamPlan) -> None:
-    from tqdm import tqdm
-
-    with tqdm(total=plan.refine_iterations, desc="refine", unit="it", file=sys.stderr, mininterval=1.0) as bar:
+    with progress_bar(plan.refine_iterations, "refine", "it") as bar:
         for progress in client.refine(iterations=plan.refine_iterations, seed=plan.seed):
             bar.set_postfix_str(f"loss {progress.loss:.4f}, {progress.gaussians / 1e3:.1f}k Gaussians", refresh=False)
             bar.update(progress.iteration - bar.n)

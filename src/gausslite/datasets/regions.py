@@ -11,6 +11,8 @@ import numpy as np
 from gausslite.domain.region import BallRegion, Region, VoxelRegion
 from gausslite.errors import DatasetError, InvalidInputError
 
+REGIONS_FILE = "roi_voxels.npz"
+"""Where a sequence's own regions are, in its folder."""
 _SIZE_KEY = "voxel_size_m"
 _MAX_SIDE_VOXELS = 512
 _MAX_INDEX = 100_000
@@ -51,6 +53,12 @@ def load_voxel_regions(path: Path) -> dict[str, VoxelRegion]:
     return regions
 
 
+def regions_beside(folder: Path) -> dict[str, Region]:
+    """Those of a sequence's own file, small objects as balls; none where there is no file. Raises DatasetError."""
+    path = folder / REGIONS_FILE
+    return balls_for_small_objects(load_voxel_regions(path)) if path.is_file() else {}
+
+
 def balls_for_small_objects(regions: Mapping[str, VoxelRegion]) -> dict[str, Region]:
     """Replace small objects by a ball of 0.10 m round their centroid.
 
@@ -70,10 +78,12 @@ def balls_for_small_objects(regions: Mapping[str, VoxelRegion]) -> dict[str, Reg
 
 def choose_regions(regions: Mapping[str, Region], names: Sequence[str]) -> list[Region]:
     """The regions with these names; all of them when no name is given. Raises InvalidInputError."""
+    if not regions:
+        raise InvalidInputError("objects: expected regions to choose from, with --roi FILE.npz; the sequence has none")
     unknown = [name for name in names if name not in regions]
-    if unknown or not regions:
-        known = ", ".join(sorted(regions)) or "none"
-        raise InvalidInputError(f"objects: expected names among {known}; got {', '.join(unknown) or 'none'}")
+    if unknown:
+        known = ", ".join(sorted(regions))
+        raise InvalidInputError(f"objects: expected names among {known}; got {', '.join(unknown)}")
     return [regions[name] for name in names] if names else list(regions.values())
 
 

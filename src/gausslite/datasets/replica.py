@@ -13,6 +13,7 @@ from numpy import ndarray
 from gausslite.datasets.images import DepthUnits, load_rgbd
 from gausslite.datasets.intrinsics import find_beside_or_above, read_json_camera
 from gausslite.datasets.poses import is_lost, nearest_rigid
+from gausslite.datasets.regions import regions_beside
 from gausslite.datasets.source import require_frames, require_position, tell_left_out
 from gausslite.datasets.text_files import parse_numbers, read_rows
 from gausslite.domain.camera import Camera
@@ -103,8 +104,8 @@ class ReplicaSource:
         return list(self._numbers)
 
     def regions(self) -> Mapping[str, Region]:
-        """None are known."""
-        return {}
+        """From roi_voxels.npz when it is there; small objects as a ball of 0.10 m round their centroid."""
+        return regions_beside(self._folder)
 
     def _is_lost(self, number: int) -> bool:
         try:

@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import math
+
 from gausslite.datasets.source import Source
+from gausslite.domain.camera import Camera
 from gausslite.errors import DatasetError, InvalidInputError
+
+_MODEST_PIXELS = 320 * 240
 
 
 def select_frames(source: Source, selection: str) -> list[int]:
@@ -35,6 +40,12 @@ def frame_size(text: str | None, source: Source) -> tuple[int, int]:
     if not (16 <= width <= 4096 and 16 <= height <= 4096):
         raise InvalidInputError(f"size: expected sides of 16 to 4096 pixels, got {text!r}")
     return width, height
+
+
+def modest_size(camera: Camera) -> tuple[int, int]:
+    """The camera's own proportions in at most as many pixels as 320x240, so that nothing is stretched."""
+    share = min(1.0, math.sqrt(_MODEST_PIXELS / (camera.width_px * camera.height_px)))
+    return round(share * camera.width_px), round(share * camera.height_px)
 
 
 def _parse(selection: str) -> tuple[int, int | None, int]:

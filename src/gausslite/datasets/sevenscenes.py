@@ -13,7 +13,7 @@ from numpy import ndarray
 from gausslite.datasets.images import DepthUnits, load_rgbd, read_colour
 from gausslite.datasets.intrinsics import INTRINSICS_FILE, FileIntrinsics, find_beside_or_above, read_matrix
 from gausslite.datasets.poses import estimate_up, is_lost, nearest_rigid
-from gausslite.datasets.regions import balls_for_small_objects, load_voxel_regions
+from gausslite.datasets.regions import regions_beside
 from gausslite.datasets.source import require_frames, require_position, tell_left_out
 from gausslite.datasets.text_files import parse_numbers, read_rows
 from gausslite.domain.camera import Camera
@@ -27,7 +27,6 @@ _RATE_HZ = 30
 _COLOUR_NAME = re.compile(r"frame-(\d{6})\.color\.(?:png|jpg)")
 _KINECT = FileIntrinsics(585.0, 585.0, 320.0, 240.0)
 _KINECT_SIZE = (640, 480)
-_REGIONS_FILE = "roi_voxels.npz"
 _UP_POSES = 64
 _LEVEL_FIRST_VIEW_UP = (0.0, -1.0, 0.0)
 
@@ -103,8 +102,7 @@ class SevenScenesSource:
 
     def regions(self) -> Mapping[str, Region]:
         """From roi_voxels.npz when it is there; small objects as a ball of 0.10 m round their centroid."""
-        path = self._folder / _REGIONS_FILE
-        return balls_for_small_objects(load_voxel_regions(path)) if path.is_file() else {}
+        return regions_beside(self._folder)
 
     def _pose_path(self, number: int) -> Path:
         return self._folder / f"frame-{number:06d}.pose.txt"

@@ -14,6 +14,7 @@ from numpy import ndarray
 from gausslite.datasets.images import DepthUnits, load_rgbd, read_colour
 from gausslite.datasets.intrinsics import INTRINSICS_FILE, FileIntrinsics, find_beside_or_above, read_matrix
 from gausslite.datasets.poses import is_lost, pose_from_quaternion, slerp
+from gausslite.datasets.regions import regions_beside
 from gausslite.datasets.source import require_frames, require_position, tell_left_out
 from gausslite.datasets.text_files import parse_numbers, read_rows
 from gausslite.domain.camera import Camera
@@ -105,8 +106,8 @@ class TumSource:
         return [match.number for match in self._matches]
 
     def regions(self) -> Mapping[str, Region]:
-        """None are known."""
-        return {}
+        """From roi_voxels.npz when it is there; small objects as a ball of 0.10 m round their centroid."""
+        return regions_beside(self._folder)
 
 
 def _associate(folder: Path) -> tuple[list[_Match], int]:

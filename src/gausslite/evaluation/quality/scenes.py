@@ -232,7 +232,6 @@ def real_plans(
     roi: Path,
     frames: int | None = None,
     up_axis: UpAxis | None = None,
-    colour_camera: ColourCamera | None = None,
     trust: Trust = REAL_CAMERA,
 ) -> list[RealScenePlan]:
     """One plan for each kind of object in the file: mug_1 and mug_2 are the kind mug. Raises DatasetError."""
@@ -240,7 +239,7 @@ def real_plans(
     for name in load_voxel_regions(roi):
         kinds.setdefault(head_of(name), []).append(name)
     return [
-        RealScenePlan(folder, roi, kind, tuple(objects), frames, up_axis, colour_camera, trust)
+        RealScenePlan(folder, roi, kind, tuple(objects), frames, up_axis, trust=trust)
         for kind, objects in kinds.items()
     ]
 
