@@ -34,8 +34,8 @@ _HALVINGS = 5
 _FINER = 0.25
 _LEAST_GAIN = 1e-6
 _CONVINCING = 1.2
-# frames that do not belong together come to 0.9, wrong cameras to 1.4 where frames are few, right ones to 1.75 and more
-_CLEAR_SCORE = 1.5
+# frames that do not belong together come to 0.9, wrong cameras mostly stay below this, right ones come to 1.5 to 1.95
+_CLEAR_SCORE = 1.4
 # steps and blurs are in pixels: images much larger than these would be searched within arm's length
 _MAX_SIDE_PX = 640
 # zoom against the depth camera; shift in pixels (x, y); offset in metres (x, y); roll in degrees
