@@ -117,12 +117,15 @@ class ApartSource:
         self.name, self.camera, self.up_axis = "apart", DEPTH_CAMERA, self._home.up_axis
         self.depth_registered = False
         self.left_out = ""
+        self.damaged: int | None = None
 
     def __len__(self) -> int:
         return len(self._home)
 
     def frame(self, i: int, size: tuple[int, int] | None = None) -> Frame:
         assert size is None
+        if i == self.damaged:
+            raise DatasetError("apart: expected a whole image file, got one cut short")
         return unregister(self._home.frame(i), self._T_colour_depth)
 
     def indices(self) -> list[int]:
@@ -137,6 +140,7 @@ def test_depth_that_is_not_registered_is_registered_to_what_the_images_say() -> 
     k = open_source("sim:home?frames=6&size=320x240").camera
     beside = ColourCamera(FileIntrinsics(k.fx_px, k.fy_px, k.cx_px - 0.5, k.cy_px - 0.5), (-0.05, 0.0, 0.0))
     source = ApartSource(beside)
+    source.damaged = 2
     found, why = find_registration(source)
     assert found is not None
     assert found.offset_m == pytest.approx(beside.offset_m, abs=0.006)

@@ -7,6 +7,7 @@ A pattern search climbs that score on blurred images first, from the best of a c
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -22,7 +23,7 @@ from gausslite.datasets.source import Source
 from gausslite.domain.camera import Camera
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import transform_points
-from gausslite.errors import DatasetError
+from gausslite.errors import DatasetError, PoseError
 
 _MIN_EDGE_POINTS = 1000
 _JUMP_M, _JUMP_SHARE = 0.06, 0.05
@@ -93,22 +94,32 @@ class _Gradients:
 
 
 def estimate_colour_camera(source: Source, positions: Sequence[int], count: int = 40) -> Alignment:
-    """Align about `count` of these frames, spread evenly. Raises TooFewEdgesError, DatasetError, PoseError."""
+    """Align about `count` of these frames, spread evenly. Raises TooFewEdgesError.
+
+    Those that cannot be read are passed over: who maps them is told then.
+    """
     chosen = positions[:: max(1, len(positions) // max(1, count))]
     full = source.camera
     shrink = _MAX_SIDE_PX / max(full.width_px, full.height_px)
     if shrink >= 1:
-        return align([source.frame(position) for position in chosen])
+        return align(_readable(source, chosen))
     size = round(full.width_px * shrink), round(full.height_px * shrink)
-    found = align([source.frame(position, size) for position in chosen])
+    found = align(_readable(source, chosen, size))
     return replace(found, camera=found.camera.enlarged(full.width_px / size[0], full.height_px / size[1]))
+
+
+def _readable(source: Source, positions: Sequence[int], size: tuple[int, int] | None = None) -> list[Frame]:
+    frames = []
+    for position in positions:
+        with contextlib.suppress(DatasetError, PoseError):
+            frames.append(source.frame(position, size))
+    return frames
 
 
 def find_registration(source: Source) -> tuple[ColourCamera | None, str]:
     """What to register the source's depth to, None for nothing, and why.
 
-    Looked for only where the layout leaves it to the reader, and believed only where it is convincing. Raises
-    DatasetError, PoseError for frames that cannot be read.
+    Looked for only where the layout leaves it to the reader, and believed only where it is convincing.
     """
     if source.depth_registered:
         return None, "the layout's depth is registered to colour"
