@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from dataclasses import replace
 
@@ -18,7 +19,7 @@ from gausslite.evaluation.views import MapViewer
 from gausslite.mapping.keyframes import Keyframe, window_view
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.refinement import ViewRefiner
-from gausslite.mapping.settings import KeyframeSettings, MapperSettings
+from gausslite.mapping.settings import KeyframeSettings, MapperSettings, OptimizationSettings
 from gausslite.optimize.view_fit import ColourAffine, ViewPrior, fit_colour, fit_pose
 from gausslite.render.cpu import CpuRasterizer
 from gausslite.render.rasterizer import Rendering
@@ -72,8 +73,13 @@ def test_known_colours_are_found_again_and_undone() -> None:
     assert np.abs(found.of_map(photograph).astype(int) - frame.rgb).max() <= 4
 
 
-def mapped(prior: ViewPrior, tell: float = 0.0) -> GaussianMapper:
-    settings = MapperSettings(max_gaussians=2000, keyframes=KeyframeSettings(every=1), view_prior=prior)
+def mapped(prior: ViewPrior, tell: float = 0.0, settling_updates: float = 150.0) -> GaussianMapper:
+    settings = MapperSettings(
+        max_gaussians=2000,
+        keyframes=KeyframeSettings(every=1),
+        optimization=OptimizationSettings(settling_updates=settling_updates),
+        view_prior=prior,
+    )
     mapper = GaussianMapper(settings, CpuRasterizer(threads=1), seed=0)
     for index in range(4):
         frame = displaced(wall_frame(index, SIZE, shift_m=0.05 * index), tell * (index % 2), 0.0)
@@ -92,6 +98,20 @@ def test_a_prior_that_is_all_but_sure_makes_all_but_the_same_map() -> None:
     for keyframe in sure[1:]:
         np.testing.assert_allclose(keyframe.frame.T_world_camera, keyframe.recorded.T_world_camera, atol=1e-9)
         assert (keyframe.frame.rgb == keyframe.recorded.rgb).all()
+
+
+@pytest.mark.parametrize(("prior", "slows"), [(ViewPrior(), False), (ViewPrior(0.01, 0.5), True)])
+def test_gaussians_settle_where_views_may_be_wrong(prior: ViewPrior, slows: bool) -> None:
+    settling, restless = (mapped(prior, settling_updates=updates) for updates in (1.0, math.inf))
+    before = [mapper.gaussians().rgb for mapper in (settling, restless)]
+    frame = wall_frame(4, SIZE, shift_m=0.2)
+    for mapper in (settling, restless):
+        mapper.map_frame(frame, middle_relevance(frame))
+    moved = [
+        float(np.abs(mapper.gaussians().rgb[: len(old)] - old).mean())
+        for mapper, old in zip((settling, restless), before, strict=True)
+    ]
+    assert moved[0] < 0.7 * moved[1] if slows else moved[0] == moved[1]
 
 
 def test_keyframes_told_in_contradiction_come_to_agree() -> None:

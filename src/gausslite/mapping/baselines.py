@@ -1,7 +1,7 @@
 """The mappers others compare with, as settings of this engine: same cap, same poses, as many views.
 
 Each seeds, scales, weighs its loss and controls density as its released configuration does. What those leave to the
-hardware is the engine's: Adam's rates (SETTLING_RATES: the customary ones trail by decibels in so few iterations),
+hardware is the engine's: Adam's rates (ONLINE_RATES: the customary ones trail by decibels in so few iterations),
 seeds thinned as the cap nears, clones and halves that look like their parent, refined views where they are asked for,
 and the views to train on: the 24 latest keyframes and, where the task policy has 24 frames that show its region, 24 of
 any, spread over the mission as well. The scale of MonoGS' seeds and the number of SplaTAM's were varied

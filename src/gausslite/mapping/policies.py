@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Collection
 from dataclasses import replace
 
 from gausslite.errors import InvalidInputError
 from gausslite.mapping.baselines import gaussian_slam_policy, monogs_policy, splatam_policy, uniform_policy
 from gausslite.mapping.settings import MapperSettings
-from gausslite.optimize.rates import ONLINE_RATES
 
 
 def task_policy() -> MapperSettings:
@@ -43,7 +43,9 @@ BEYOND_SWITCHES: dict[str, Callable[[MapperSettings], MapperSettings]] = {
     "surroundings": lambda settings: replace(settings, keyframes=replace(settings.keyframes, surroundings_weight=0.0)),
     "scaffold": lambda settings: replace(settings, seeding=replace(settings.seeding, scaffold_share=0.0)),
     "means": lambda settings: replace(settings, optimization=replace(settings.optimization, averaged_updates=0.0)),
-    "settling": lambda settings: replace(settings, optimization=replace(settings.optimization, adam=ONLINE_RATES)),
+    "settling": lambda settings: replace(
+        settings, optimization=replace(settings.optimization, settling_updates=math.inf)
+    ),
 }
 """What came beyond the paper, in the order of our ablation, and how each is switched off."""
 

@@ -34,7 +34,7 @@ class ViewRefiner:
     @property
     def needed(self) -> bool:
         """False where poses and colours are trusted."""
-        return self._prior.moves or self._prior.colours
+        return not self._prior.trusts
 
     def state(self) -> State:
         """How far the last pose was corrected, and whose turn it was."""

@@ -9,7 +9,7 @@ from enum import StrEnum
 from gausslite.errors import InvalidInputError
 from gausslite.mapping.retask import RetaskSettings
 from gausslite.optimize.density import DensitySettings
-from gausslite.optimize.rates import SETTLING_RATES
+from gausslite.optimize.rates import ONLINE_RATES
 from gausslite.optimize.view_fit import ViewPrior
 from gausslite.render.rasterizer import AdamSettings, LossWeights
 
@@ -129,6 +129,9 @@ class OptimizationSettings:
 
     loss: by share, so that warm-ups and the active phase, whose masks are small, do not undo each other in Adam.
     isotropic: Gaussians are made spheres again after every frame.
+    settling_updates: where views may be wrong (`MapperSettings.view_prior`) a Gaussian has the full rates for so many
+    updates, and falling ones after them (`AdamSettings.full_rate_updates`): steps of one size would keep it moving to
+    and fro between what its views say. inf never slows it.
     averaged_updates: the map is shown as the mean of each Gaussian over about its last so many updates, since views
     that contradict each other move it to and fro; 0 shows it as training left it. Training itself knows no means.
     """
@@ -137,7 +140,8 @@ class OptimizationSettings:
     active_iterations: int = 6
     active_phase: ActivePhase = ActivePhase.EXACT
     loss: LossWeights = _ALIKE_IN_BOTH_PHASES
-    adam: AdamSettings = SETTLING_RATES
+    adam: AdamSettings = ONLINE_RATES
+    settling_updates: float = 150.0
     isotropic: bool = False
     averaged_updates: float = 32.0
 
@@ -146,6 +150,7 @@ class OptimizationSettings:
             _require(getattr(self, name) >= 0, f"optimization {name}", "at least 0", getattr(self, name))
         averaged = self.averaged_updates
         _require(0 <= averaged < math.inf, "optimization averaged_updates", "at least 0", averaged)
+        _require(self.settling_updates > 0, "optimization settling_updates", "more than 0", self.settling_updates)
 
     @property
     def iterations(self) -> int:
@@ -177,6 +182,13 @@ class MapperSettings:
 
     def __post_init__(self) -> None:
         _require(self.max_gaussians >= 1, "max_gaussians", "at least 1", self.max_gaussians)
+
+    @property
+    def adam(self) -> AdamSettings:
+        """The optimiser's rates, for views that are trusted or not."""
+        if self.view_prior.trusts:
+            return self.optimization.adam
+        return replace(self.optimization.adam, full_rate_updates=self.optimization.settling_updates)
 
 
 def _require(holds: bool, name: str, wanted: str, came: float) -> None:

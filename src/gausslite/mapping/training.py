@@ -52,6 +52,7 @@ class Trainer:
         self, settings: MapperSettings, table: SplatTable, rasterizer: Rasterizer, rng: np.random.Generator
     ) -> None:
         self._settings = settings
+        self._adam = settings.adam
         self._table = table
         self._rasterizer = rasterizer
         self._rng = rng
@@ -151,9 +152,7 @@ class Trainer:
 
     def _warm_up(self, loan: _Loan, view: WindowView) -> None:
         optimization = self._settings.optimization
-        self._rasterizer.step(
-            *loan.tables, view.training_view, view.T_camera_world, optimization.loss, optimization.adam
-        )
+        self._rasterizer.step(*loan.tables, view.training_view, view.T_camera_world, optimization.loss, self._adam)
 
     def _active_phase(self, loan: _Loan, view: WindowView) -> None:
         optimization = self._settings.optimization
@@ -162,7 +161,7 @@ class Trainer:
             view.training_view,
             view.T_camera_world,
             optimization.loss,
-            optimization.adam,
+            self._adam,
             masked=True,
             subset=view.region if loan.active_ids is None else Subset(view.region.tiles, loan.active_ids),
             trainable=loan.trainable,

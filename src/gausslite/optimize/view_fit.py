@@ -77,6 +77,11 @@ class ViewPrior:
         return f"{self.translation_m:g},{self.rotation_deg:g},{self.gain:g},{self.offset:g}"
 
     @property
+    def trusts(self) -> bool:
+        """True where nothing that is said of a view may be wrong."""
+        return not self.moves and not self.colours
+
+    @property
     def moves(self) -> bool:
         """False where poses are trusted."""
         return self.translation_m > 0 or self.rotation_deg > 0
