@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -68,6 +69,19 @@ def test_replica_reads_the_camera_from_above_and_its_depth_scale(tmp_path: Path)
     assert (source.camera.width_px, source.camera.cx_px) == (WIDTH, 8.0)
     assert source.frame(2).depth_m[2, 2] == pytest.approx(6553 / 6553.5)
     assert len(source) == 3
+
+
+@pytest.mark.parametrize(("write", "value"), [(write_tum, 5000), (write_seven_scenes, 2000)])
+def test_a_camera_file_says_other_depth_units_in_any_layout(
+    write: Callable[[Path], Path], value: int, tmp_path: Path
+) -> None:
+    folder = write(tmp_path / "mine")
+    (folder / "camera-intrinsics.txt").unlink(missing_ok=True)
+    camera = {"w": WIDTH, "h": HEIGHT, "fx": 20, "fy": 21, "cx": 7.5, "cy": 5.5, "scale": 2500}
+    (folder / "cam_params.json").write_text(json.dumps({"camera": camera}))
+    frame = open_source(str(folder)).frame(0)
+    assert frame.camera == Camera(20.0, 21.0, 8.0, 6.0, WIDTH, HEIGHT)
+    assert frame.depth_m[2, 2] == pytest.approx(value / 2500)
 
 
 def test_resizing_averages_colour_and_never_mixes_depth(tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ from gausslite.domain.camera import Camera
 from gausslite.errors import DatasetError, InvalidInputError
 
 INTRINSICS_FILE = "camera-intrinsics.txt"
+CAMERA_FILE = "cam_params.json"
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,6 +36,18 @@ class FileIntrinsics:
 def find_beside_or_above(folder: Path, name: str) -> Path | None:
     """The file of this name in the folder or in the one above it."""
     return next((path for path in (folder / name, folder.parent / name) if path.is_file()), None)
+
+
+def told_camera(folder: Path, width_px: int, height_px: int) -> tuple[Camera, float | None] | None:
+    """The camera of cam_params.json with the depth units of a metre, or of camera-intrinsics.txt without; None where
+    neither is in or above the folder. Raises DatasetError.
+    """
+    camera_path, matrix_path = (find_beside_or_above(folder, name) for name in (CAMERA_FILE, INTRINSICS_FILE))
+    if camera_path is not None:
+        return read_json_camera(camera_path)
+    if matrix_path is not None:
+        return read_matrix(matrix_path).camera(str(matrix_path), width_px, height_px), None
+    return None
 
 
 def read_matrix(path: Path) -> FileIntrinsics:

@@ -11,7 +11,7 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from gausslite.datasets.images import DepthUnits, load_rgbd
-from gausslite.datasets.intrinsics import find_beside_or_above, read_json_camera
+from gausslite.datasets.intrinsics import CAMERA_FILE, find_beside_or_above, read_json_camera
 from gausslite.datasets.poses import is_lost, nearest_rigid
 from gausslite.datasets.regions import regions_beside
 from gausslite.datasets.source import require_frames, require_position, tell_left_out
@@ -23,7 +23,6 @@ from gausslite.domain.region import Region
 from gausslite.errors import DatasetError
 
 _RATE_HZ = 30
-_CAMERA_FILE = "cam_params.json"
 _COLOUR_NAME = re.compile(r"frame(\d{6})\.(?:jpg|png)")
 
 
@@ -41,9 +40,9 @@ class ReplicaSource:
         colours = {int(match.group(1)): results / match.group(0) for match in found if match}
         require_frames(results, len(colours), "images named frame000000.jpg")
         self._colours = dict(sorted(colours.items()))
-        camera_path = find_beside_or_above(folder, _CAMERA_FILE)
+        camera_path = find_beside_or_above(folder, CAMERA_FILE)
         if camera_path is None:
-            raise DatasetError(f"{folder}: the camera is unknown: expected {_CAMERA_FILE} here or one folder above")
+            raise DatasetError(f"{folder}: the camera is unknown: expected {CAMERA_FILE} here or one folder above")
         self._camera, per_metre = read_json_camera(camera_path)
         self._units = DepthUnits(per_metre)
         self._trajectory = folder / "traj.txt"

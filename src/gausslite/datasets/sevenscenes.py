@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from gausslite.datasets.images import DepthUnits, load_rgbd, read_colour
-from gausslite.datasets.intrinsics import INTRINSICS_FILE, FileIntrinsics, find_beside_or_above, read_matrix
+from gausslite.datasets.intrinsics import CAMERA_FILE, INTRINSICS_FILE, FileIntrinsics, told_camera
 from gausslite.datasets.poses import estimate_up, is_lost, nearest_rigid
 from gausslite.datasets.regions import regions_beside
 from gausslite.datasets.source import require_frames, require_position, tell_left_out
@@ -34,9 +35,10 @@ _LEVEL_FIRST_VIEW_UP = (0.0, -1.0, 0.0)
 class SevenScenesSource:
     """A folder of frame-%06d.color.{png,jpg}, .depth.png (mm; 0 and 65535 invalid) and .pose.txt (camera to world).
 
-    The camera comes from camera-intrinsics.txt in or above the folder; without one, 640x480 images get the values
-    the 7-Scenes authors state. Frames whose pose the tracker had lost (no finite number in it, or zeros) are no part of
-    the sequence. Times are the frame numbers at 30 Hz. Raises DatasetError.
+    The camera comes from cam_params.json (which says other depth units too) or camera-intrinsics.txt in or above the
+    folder; without one, 640x480 images get the values the 7-Scenes authors state. Frames whose pose the tracker had
+    lost (no finite number in it, or zeros) are no part of the sequence. Times are the frame numbers at 30 Hz. Raises
+    DatasetError.
     """
 
     def __init__(self, folder: Path, up_axis: UpAxis | None = None) -> None:
@@ -48,7 +50,8 @@ class SevenScenesSource:
         self._numbers = [number for number in self._colours if not self._is_lost(number)]
         require_frames(folder, len(self._numbers), "frames with a pose")
         first = read_colour(self._colours[self._numbers[0]])
-        self._camera = _camera(folder, first.shape[1], first.shape[0])
+        self._camera, per_metre = _camera(folder, first.shape[1], first.shape[0])
+        self._units = replace(_UNITS, per_metre=per_metre or _UNITS.per_metre)
         self._up_axis = unit_up_axis(up_axis) if up_axis else self._estimate_up_axis()
 
     @staticmethod
@@ -93,7 +96,7 @@ class SevenScenesSource:
         number = self._numbers[i]
         T_world_camera = _read_pose(self._pose_path(number))
         depth = self._folder / f"frame-{number:06d}.depth.png"
-        image = load_rgbd(self._colours[number], depth, self._camera, _UNITS, size)
+        image = load_rgbd(self._colours[number], depth, self._camera, self._units, size)
         return Frame(number, number * 10**9 // _RATE_HZ, image.rgb, image.depth_m, image.camera, T_world_camera)
 
     def indices(self) -> Sequence[int]:
@@ -135,12 +138,14 @@ def _read_matrix(path: Path) -> Float64[ndarray, "4 4"]:
     return np.array([parse_numbers(place, fields, 4, "a row of a 4x4 pose") for place, fields in rows])
 
 
-def _camera(folder: Path, width_px: int, height_px: int) -> Camera:
-    path = find_beside_or_above(folder, INTRINSICS_FILE)
-    if path is not None:
-        return read_matrix(path).camera(str(path), width_px, height_px)
+def _camera(folder: Path, width_px: int, height_px: int) -> tuple[Camera, float | None]:
+    """The camera and, where they are told, the depth units of a metre."""
+    told = told_camera(folder, width_px, height_px)
+    if told is not None:
+        return told
     if (width_px, height_px) != _KINECT_SIZE:
         raise DatasetError(
-            f"{folder}: the camera of {width_px}x{height_px} images is unknown: expected the file {INTRINSICS_FILE}"
+            f"{folder}: the camera of {width_px}x{height_px} images is unknown: "
+            f"expected the file {INTRINSICS_FILE} or {CAMERA_FILE}"
         )
-    return _KINECT.camera(str(folder), width_px, height_px)
+    return _KINECT.camera(str(folder), width_px, height_px), None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +12,7 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from gausslite.datasets.images import DepthUnits, load_rgbd, read_colour
-from gausslite.datasets.intrinsics import INTRINSICS_FILE, FileIntrinsics, find_beside_or_above, read_matrix
+from gausslite.datasets.intrinsics import CAMERA_FILE, INTRINSICS_FILE, FileIntrinsics, told_camera
 from gausslite.datasets.poses import is_lost, pose_from_quaternion, slerp
 from gausslite.datasets.regions import regions_beside
 from gausslite.datasets.source import require_frames, require_position, tell_left_out
@@ -56,7 +56,8 @@ class TumSource:
         self._folder = folder
         self._matches, self._recorded = _associate(folder)
         first = read_colour(self._matches[0].colour)
-        self._camera = _camera(folder, first.shape[1], first.shape[0])
+        self._camera, per_metre = _camera(folder, first.shape[1], first.shape[0])
+        self._units = replace(_UNITS, per_metre=per_metre or _UNITS.per_metre)
         self._up_axis = unit_up_axis(up_axis or (0.0, 0.0, 1.0))
 
     @staticmethod
@@ -71,7 +72,9 @@ class TumSource:
 
     @property
     def camera(self) -> Camera:
-        """By the folder's name (fr1, fr2, fr3), or from camera-intrinsics.txt in or above the folder."""
+        """From cam_params.json (which says other depth units too) or camera-intrinsics.txt in or above the folder;
+        without one by its name (fr1, fr2, fr3).
+        """
         return self._camera
 
     @property
@@ -97,7 +100,7 @@ class TumSource:
         """The frame at position i. Raises DatasetError."""
         require_position(self.name, i, len(self))
         match = self._matches[i]
-        image = load_rgbd(match.colour, match.depth, self._camera, _UNITS, size)
+        image = load_rgbd(match.colour, match.depth, self._camera, self._units, size)
         time_ns = round(match.time_s * 1e9)
         return Frame(match.number, time_ns, image.rgb, image.depth_m, image.camera, match.T_world_camera)
 
@@ -173,14 +176,15 @@ class _Trajectory:
         return pose_from_quaternion(str(self._path), a[1:4] + share * (b[1:4] - a[1:4]), slerp(a[4:8], b[4:8], share))
 
 
-def _camera(folder: Path, width_px: int, height_px: int) -> Camera:
-    path = find_beside_or_above(folder, INTRINSICS_FILE)
-    if path is not None:
-        return read_matrix(path).camera(str(path), width_px, height_px)
+def _camera(folder: Path, width_px: int, height_px: int) -> tuple[Camera, float | None]:
+    """The camera and, where they are told, the depth units of a metre."""
+    told = told_camera(folder, width_px, height_px)
+    if told is not None:
+        return told
     group = re.search(r"(?:freiburg|fr)([123])", folder.resolve().name)
     if group is None:
         raise DatasetError(
             f"{folder}: the camera is unknown: expected a folder named after fr1, fr2 or fr3 (or freiburg1 ...), "
-            f"or the file {INTRINSICS_FILE}"
+            f"or the file {INTRINSICS_FILE} or {CAMERA_FILE}"
         )
-    return _INTRINSICS[group.group(1)].camera(str(folder), width_px, height_px)
+    return _INTRINSICS[group.group(1)].camera(str(folder), width_px, height_px), None
