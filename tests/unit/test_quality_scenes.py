@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mapping_scenes import middle_relevance, wall_frame
-from tiny_sequences import write_seven_scenes
+from tiny_sequences import write_depth, write_seven_scenes
 
 from gausslite.cli.main import main
 from gausslite.domain.relevance import RelevanceMap
@@ -46,6 +46,7 @@ def test_a_sequence_is_named_by_its_folder_wherever_one_stands(tmp_path: Path, m
     (tmp_path / "kitchen").mkdir()
     monkeypatch.chdir(tmp_path / "kitchen")
     assert RealScenePlan(Path(), Path("roi.npz"), "mug", ("mug_1",)).name == "kitchen-mug"
+    assert RealScenePlan(tmp_path / "chess" / "seq-01", Path("roi.npz"), "mug", ("mug_1",)).name == "chess-seq-01-mug"
 
 
 @pytest.mark.parametrize("frames", [-5, 0, 1])
@@ -104,6 +105,15 @@ def test_a_kind_that_no_held_out_view_shows_is_left_out_and_told(
     assert f"left out: {why}" in said.err
     assert re.search(r"\| kitchen-mug \| Find the mug \| [\d.]+% in 1 of 1 views \|", said.out)
     assert "kitchen-lamp" not in said.out
+
+
+def test_a_sequence_without_depth_is_not_said_to_lack_the_region(tmp_path: Path) -> None:
+    kitchen, roi = write_kitchen(tmp_path, mug_1=WALL)
+    for path in kitchen.glob("*.depth.png"):
+        write_depth(path, value=0)
+    [plan] = real_plans(kitchen, roi)
+    with pytest.raises(DatasetError, match="expected training frames and held-out views with depth, got 0 and 0"):
+        plan.load((16, 16))
 
 
 def test_regions_of_another_sequence_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -33,6 +34,8 @@ from gausslite.perception.vocabulary import head_of
 _WALKS = (0, 1)
 _FIRST_WALK_SHARE = 2 / 3
 _MOST_FRAMES = 100_000
+_NUMBERED = re.compile(r"seq-?\d+")
+"""Folders whose name says nothing without that of the folder above."""
 
 
 class UnseenRegionError(DatasetError):
@@ -187,7 +190,9 @@ class RealScenePlan:
     @property
     def name(self) -> str:
         """Such as redkitchen-chair."""
-        return f"{self.folder.resolve().name}-{self.kind}"
+        folder = self.folder.resolve()
+        place = f"{folder.parent.name}-{folder.name}" if _NUMBERED.fullmatch(folder.name) else folder.name
+        return f"{place}-{self.kind}"
 
     @property
     def task(self) -> str:
@@ -212,6 +217,7 @@ class RealScenePlan:
         regions = choose_regions(known, self.objects)
         training, held_out = self.hold_out.split(self._positions(source))
         views = [HeldOutView.of(source.frame(i, size), regions) for i in held_out]
+        views = [view for view in views if view.frame.has_depth]
         if views and not any(view.shows_region for view in views):
             raise UnseenRegionError(
                 f"{self.name}: expected held-out views that show at least {MIN_ROI_PIXELS} pixels of "
