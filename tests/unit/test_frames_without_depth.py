@@ -32,6 +32,12 @@ def test_the_run_says_how_many_frames_it_skipped(tmp_path: Path, capsys: pytest.
     assert capsys.readouterr().out.startswith("3 frames at ")
 
 
+def test_a_sequence_without_any_depth_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert map_uniformly(blinded(tmp_path / "none", 0, 4, 8), tmp_path / "out") == 2
+    assert "none: expected frames with depth, got none in 3" in capsys.readouterr().err
+    assert not (tmp_path / "out" / "map.ply").exists()
+
+
 def test_what_cannot_be_told_from_its_region_is_not_scored(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert map_uniformly(blinded(tmp_path / "one", 4), tmp_path / "out") == 0
     capsys.readouterr()

@@ -42,6 +42,14 @@ def test_other_regions_under_the_same_names_are_another_scene(tmp_path: Path) ->
     assert plan.settings() != before
 
 
+def test_another_camera_is_another_scene(tmp_path: Path) -> None:
+    folder = write_seven_scenes(tmp_path / "kitchen")
+    [plan] = real_plans(folder, write_regions(tmp_path / "roi.npz", (0, 0, 20)))
+    before = plan.place()
+    (folder / "camera-intrinsics.txt").write_text("21 0 7.5\n0 21 5.5\n0 0 1\n")
+    assert plan.place() != before
+
+
 def test_a_sequence_is_named_by_its_folder_wherever_one_stands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "kitchen").mkdir()
     monkeypatch.chdir(tmp_path / "kitchen")

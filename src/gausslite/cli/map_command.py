@@ -15,7 +15,7 @@ from gausslite.datasets.selection import frame_size, select_frames
 from gausslite.datasets.source import Source
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.task import TaskGraph
-from gausslite.errors import InvalidInputError
+from gausslite.errors import DatasetError, InvalidInputError
 from gausslite.mapping.pace import Pace
 from gausslite.mapping.policies import TASK
 from gausslite.mission.build import Attentions, build_attention, build_mapper
@@ -72,6 +72,8 @@ def run(options: argparse.Namespace) -> int:
     if not mission.outcomes and mission.stopped is not None:
         raise mission.stopped
     gaussians = mapper.gaussians()
+    if len(gaussians) == 0 and mission.outcomes and all(each.skipped is not None for each in mission.outcomes):
+        raise DatasetError(f"{options.source}: expected frames with depth, got none in {len(mission.outcomes)}")
     notes = mapper.notes if graph is not None else _unseen_regions(options, mission)
     report = {**asked.report(options), **mission.summary(), **_held(mapper, gaussians), "notes": list(notes)}
     write_results(options.out, gaussians, report)

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float32
 from numpy import ndarray
 
+from gausslite.datasets.intrinsics import CAMERA_FILE, INTRINSICS_FILE, find_beside_or_above
 from gausslite.datasets.open import open_source
 from gausslite.datasets.regions import balls_for_small_objects, choose_regions, load_voxel_regions
 from gausslite.datasets.registration import ColourCamera
@@ -205,10 +206,12 @@ class RealScenePlan:
         return {**self.place(), "objects": list(self.objects), "regions": regions, "trust": str(self.trust)}
 
     def place(self) -> Mapping[str, object]:
-        """The folder and what is used of its frames."""
+        """The folder, what is used of its frames, and the files that say what camera took them."""
+        cameras = [find_beside_or_above(self.folder, name) for name in (CAMERA_FILE, INTRINSICS_FILE)]
+        files = {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in cameras if path is not None}
         camera = None if self.colour_camera is None else str(self.colour_camera)
         used = {"frames": self.frames, "up": self.up_axis, "hold_out": self.hold_out.every, "colour_camera": camera}
-        return {"folder": str(self.folder.resolve()), **used}
+        return {"folder": str(self.folder.resolve()), **used, **files}
 
     def load(self, size: tuple[int, int]) -> Scene:
         """The frames with depth, split. Raises UnseenRegionError too."""
