@@ -18,6 +18,15 @@ from gausslite.domain.region import BallRegion, VoxelRegion
 from gausslite.errors import DatasetError, InvalidInputError
 
 
+def test_tum_takes_poses_that_lie_far_apart_at_their_own_images(tmp_path: Path) -> None:
+    folder = write_tum(tmp_path / "fr1", frames=7)
+    # keyframes' poses, 0.2 s apart: at the first image, just before the last, and at none
+    (folder / "groundtruth.txt").write_text("10.0 1 0 0 0 0 0 1\n10.194 2 0 0 0 0 0 1\n10.4 3 0 0 0 0 0 1\n")
+    source = open_source(str(folder))
+    assert source.indices() == [0, 6]
+    assert [source.frame(i).T_world_camera[0, 3] for i in range(2)] == [1.0, 2.0]
+
+
 def test_tum_interpolates_the_pose_at_the_colours_time(tmp_path: Path) -> None:
     source = open_source(str(write_tum(tmp_path / "rgbd_dataset_freiburg2_x")))
     frame = source.frame(1)

@@ -26,6 +26,7 @@ from gausslite.errors import DatasetError
 _UNITS = DepthUnits(per_metre=5000.0)
 _MAX_DEPTH_LAG_S = 0.020
 _MAX_POSE_GAP_S = 0.100
+_MAX_POSE_LAG_S = 0.010
 _INTRINSICS = {
     "1": FileIntrinsics(517.3, 516.5, 318.6, 255.3),
     "2": FileIntrinsics(520.9, 521.0, 325.1, 249.7),
@@ -46,10 +47,10 @@ class TumSource:
     """A folder with rgb.txt, depth.txt and groundtruth.txt.
 
     A colour image goes with the depth image nearest in time, at most 20 ms away, and with the pose interpolated
-    (lerp and slerp) at the colour's stamp between two poses at most 0.1 s apart; colour images without either are no
-    part of the sequence. Poses that the tracker had lost (not one finite number) count as missing. Frame numbers count
-    the rows of rgb.txt from 0. The lens distortion of fr1 and fr2 (up to a few pixels in the corners) is left in.
-    Raises DatasetError, PoseError.
+    (lerp and slerp) at the colour's stamp between two poses at most 0.1 s apart, or else with one at most 10 ms away;
+    colour images without either are no part of the sequence. Poses that the tracker had lost (not one finite number)
+    count as missing. Frame numbers count the rows of rgb.txt from 0. The lens distortion of fr1 and fr2 (up to a few
+    pixels in the corners) is left in. Raises DatasetError, PoseError.
     """
 
     def __init__(self, folder: Path, up_axis: UpAxis | None = None) -> None:
@@ -162,15 +163,17 @@ class _Trajectory:
         self._path, self._table = path, table[known]
 
     def at(self, time_s: float) -> Float64[ndarray, "4 4"] | None:
-        """The interpolated pose; None outside the recording and in its gaps."""
+        """The interpolated pose; None outside the recording and in its gaps, but for what is next to a pose there."""
         times = self._table[:, 0]
         after = int(np.searchsorted(times, time_s))
-        if after == len(times) or (after == 0 and times[0] != time_s):
-            return None
-        before = max(after - 1, 0)
+        before, after = max(after - 1, 0), min(after, len(times) - 1)
         gap_s = float(times[after] - times[before])
-        if gap_s > _MAX_POSE_GAP_S:
-            return None
+        if before == after or gap_s > _MAX_POSE_GAP_S:
+            # poses of keyframes alone lie far apart, each at its image's stamp
+            nearest = int(np.abs(times - time_s).argmin())
+            if abs(float(times[nearest]) - time_s) > _MAX_POSE_LAG_S:
+                return None
+            before, after, gap_s = nearest, nearest, 0.0
         share = (time_s - float(times[before])) / gap_s if gap_s > 0 else 0.0
         a, b = self._table[before], self._table[after]
         return pose_from_quaternion(str(self._path), a[1:4] + share * (b[1:4] - a[1:4]), slerp(a[4:8], b[4:8], share))
