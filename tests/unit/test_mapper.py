@@ -53,6 +53,15 @@ def region_error(mapper: GaussianMapper) -> float:
     return float(np.abs(drawn.rgb - frame.rgb / 255.0)[middle_relevance(frame).roi].mean())
 
 
+def test_a_stray_reading_does_not_widen_the_scene() -> None:
+    mapper = mapper_of()
+    frame = wall_frame(0, SIZE)
+    frame.depth_m[3, 5] = 60.0
+    mapper.map_frame(frame, middle_relevance(frame))
+    farthest_m = mapper.settings.seeding.max_depth_m
+    assert mapper.state()["extent_m"] == pytest.approx([farthest_m / 3])
+
+
 def test_the_map_comes_to_look_like_the_wall() -> None:
     mapper = mapper_of()
     map_wall(mapper, 1)

@@ -213,7 +213,9 @@ class GaussianMapper:
 
     def _observe(self, frame: Frame, relevance: RelevanceMap) -> WindowView:
         """Make the frame ready to train on, with its pose and colours refined where they may be wrong."""
-        self._extent_m = max(self._extent_m, float(frame.depth_m.max()) * _EXTENT_PER_DEPTH)
+        # nothing is seeded farther away, and one stray reading would count for the whole mission
+        farthest_m = min(float(frame.depth_m.max()), self._settings.seeding.max_depth_m)
+        self._extent_m = max(self._extent_m, farthest_m * _EXTENT_PER_DEPTH)
         if not self._refiner.needed or self._table.count == 0:
             return self._view(Keyframe(frame, relevance))
         self._refine_keyframes()
