@@ -287,7 +287,8 @@ def _sigmoid(logits: Float32[ndarray, " n"]) -> Float32[ndarray, " n"]:
 def _row_memory(capacity: int) -> Float32[ndarray, "capacity 16"]:
     """Zeroed rows on whole pages (so 64-byte aligned), in huge pages where the system has them."""
     size = capacity * ROW_WIDTH * np.dtype(np.float32).itemsize
-    memory = mmap.mmap(-1, size)
+    # private: what processes could share, which is what mmap gives unasked, seldom gets huge pages
+    memory = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE)
     huge_pages = getattr(mmap, "MADV_HUGEPAGE", None)
     if huge_pages is not None:
         memory.madvise(huge_pages)
