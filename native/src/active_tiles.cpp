@@ -8,12 +8,15 @@ namespace gausslite {
 void ActiveTiles::look_at(const uint8_t* active, int across, int down) {
   across_ = size_t(across);
   box_ = {across, 0, down, 0};
+  int tiles = 0;
   for (int y = 0; y < down; ++y) {
     for (int x = 0; x < across; ++x) {
       if (!active[y * across + x]) continue;
+      ++tiles;
       box_ = {std::min(box_.x0, x), std::max(box_.x1, x + 1), std::min(box_.y0, y), y + 1};
     }
   }
+  fill_box_ = tiles == (box_.x1 - box_.x0) * (box_.y1 - box_.y0);
   count(active, size_t(down));
   look_near(active, size_t(down));
 }
@@ -38,7 +41,9 @@ void ActiveTiles::count(const uint8_t* active, size_t down) {
 void ActiveTiles::look_near(const uint8_t* active, size_t down) {
   constexpr uint32_t kRow = (1u << kNear) - 1u, kEveryRow = 0x1111u;
   const size_t tiles = across_ * down;
-  near_.reserve(tiles);
+  near_.reserve(tiles + 1);
+  far_place_ = uint32_t(tiles);
+  near_[tiles] = uint16_t(~0u);
   for (size_t t = 0; t < tiles; ++t) {
     const size_t columns = std::min<size_t>(kNear, across_ - t % across_);
     uint32_t row = 0;

@@ -15,6 +15,38 @@ GAUSSLITE_INLINE Pack16 largest_log_scale(const Pack16* row) {
   return max(row[kLogScale], max(row[kLogScale + 1], row[kLogScale + 2]));
 }
 
+// Writes first + j for each bit j of `lanes`, in order, and returns how many; up to sixteen places are overwritten.
+GAUSSLITE_INLINE uint32_t list_lanes(uint32_t* out, uint32_t first, uint32_t lanes) {
+#if defined(GAUSSLITE_USE_AVX512)
+  const __m512i numbers = _mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
+  const __m512i ids = _mm512_add_epi32(numbers, _mm512_set1_epi32(int(first)));
+  _mm512_storeu_si512(out, _mm512_maskz_compress_epi32(__mmask16(lanes), ids));
+  return uint32_t(__builtin_popcount(lanes));
+#else
+  uint32_t count = 0;
+  for (uint32_t j = 0; j < 16; ++j) {
+    out[count] = first + j;
+    count += lanes >> j & 1u;
+  }
+  return count;
+#endif
+}
+
+// The same with whole numbers in place of first + j.
+GAUSSLITE_INLINE void list_lanes(uint32_t* out, Pack16 numbers, uint32_t lanes) {
+#if defined(GAUSSLITE_USE_AVX512)
+  _mm512_storeu_si512(out, _mm512_maskz_compress_epi32(__mmask16(lanes), _mm512_cvttps_epi32(numbers.v)));
+#else
+  alignas(64) int32_t number[16];
+  store_int(number, numbers);
+  uint32_t count = 0;
+  for (uint32_t j = 0; j < 16; ++j) {
+    out[count] = uint32_t(number[j]);
+    count += lanes >> j & 1u;
+  }
+#endif
+}
+
 // Where in the image a splat may be, by its mean and the largest of its scales alone. With a scale s along all axes its
 // image covariance is s^2 J J^T + 0.3 I, and no direction of a real splat is longer. At most 3.33 standard deviations
 // of it are above 1/255.
@@ -37,22 +69,24 @@ class Sight {
     return holds(Extent(*this, mean, largest_log_scale));
   }
 
-  // Which lanes may touch an active tile; the box holds all of them and what lies between.
-  GAUSSLITE_INLINE uint32_t may_touch_active(const Workspace& ws, const Pack16* mean, Pack16 largest_log_scale) const {
+  // Appends to `ids` the rows first ... first + 15 that may touch that box; and to `boxes`, unless it is null, the
+  // tiles that each of them reaches, as a place and a size of ActiveTiles. Returns how many.
+  GAUSSLITE_INLINE uint32_t list_in_box(const Workspace& ws, const Pack16* mean, Pack16 largest_log_scale,
+                                        uint32_t first, uint32_t* ids, uint32_t* boxes) const {
     const Extent extent(*this, mean, largest_log_scale);
     const uint32_t held = bits(holds(extent));
-    if (ws.active_tiles == nullptr) return held;
-    // All lanes are looked up, wanted or not: no branch to mispredict. Those that reach over many tiles just count.
-    const Pack16 x0 = tile(extent.x - extent.reach_x, ws.tiles_x), y0 = tile(extent.y - extent.reach_y, ws.tiles_y);
-    const Pack16 across = tile(extent.x + extent.reach_x, ws.tiles_x) - x0;
-    const Pack16 down = tile(extent.y + extent.reach_y, ws.tiles_y) - y0;
-    const Pack16 most(float(ActiveTiles::kNear - 1));
-    alignas(64) int32_t place[16], size[16];
-    store_int(place, fma(y0, Pack16(float(ws.tiles_x)), x0));
-    store_int(size, fma(min(down, most), Pack16(float(ActiveTiles::kNear)), min(across, most)));
-    uint32_t touching = bits((across > most) | (down > most));
-    for (int j = 0; j < 16; ++j) touching |= uint32_t(ws.active.any_near(uint32_t(place[j]), uint32_t(size[j]))) << j;
-    return held & touching;
+    if (held == 0) return 0;
+    if (boxes != nullptr) {
+      const Pack16 x0 = tile(extent.x - extent.reach_x, ws.tiles_x), y0 = tile(extent.y - extent.reach_y, ws.tiles_y);
+      const Pack16 across = tile(extent.x + extent.reach_x, ws.tiles_x) - x0;
+      const Pack16 down = tile(extent.y + extent.reach_y, ws.tiles_y) - y0;
+      const Pack16 most(float(ActiveTiles::kNear - 1)), sizes(float(ActiveTiles::kSizes));
+      const Pack16 place = select((across > most) | (down > most), Pack16(float(ws.active.far_place())),
+                                  fma(y0, Pack16(float(ws.tiles_x)), x0));
+      const Pack16 size = fma(min(down, most), Pack16(float(ActiveTiles::kNear)), min(across, most));
+      list_lanes(boxes, fma(place, sizes, size), held);
+    }
+    return list_lanes(ids, first, held);
   }
 
  private:
@@ -93,20 +127,21 @@ class Sight {
 };
 
 // Notes the bounds of a row that has changed.
-GAUSSLITE_INLINE void note_bounds(RowBounds& bounds, const float* row) {
-  std::memcpy(bounds.mean, row + kMean, sizeof bounds.mean);
-  bounds.log_scale = std::max(row[kLogScale], std::max(row[kLogScale + 1], row[kLogScale + 2]));
+GAUSSLITE_INLINE void note_bounds(Workspace& ws, uint32_t id, const float* row) {
+  GroupBounds& group = ws.bounds[id / 16];
+  for (int k = 0; k < 3; ++k) group.mean[k][id % 16] = row[kMean + k];
+  group.log_scale[id % 16] = std::max(row[kLogScale], std::max(row[kLogScale + 1], row[kLogScale + 2]));
 }
 
-// Sixteen rows' bounds, transposed, from what is known of them.
-GAUSSLITE_INLINE void load_bounds(const RowBounds* from, Pack16 (&bounds)[4]) {
-  for (int k = 0; k < 4; ++k) bounds[k] = load_block(from[k].mean, 16);
-  transpose_quads(bounds[0], bounds[1], bounds[2], bounds[3]);
+// Sixteen rows' bounds, from what is known of them.
+GAUSSLITE_INLINE void load_bounds(const GroupBounds& from, Pack16 (&bounds)[4]) {
+  for (int k = 0; k < 3; ++k) bounds[k] = load(from.mean[k]);
+  bounds[3] = load(from.log_scale);
 }
 
-GAUSSLITE_INLINE void store_bounds(RowBounds* to, Pack16 (&bounds)[4]) {
-  transpose_quads(bounds[0], bounds[1], bounds[2], bounds[3]);
-  for (int k = 0; k < 4; ++k) store_block(to[k].mean, 16, bounds[k]);
+GAUSSLITE_INLINE void store_bounds(GroupBounds& to, const Pack16 (&bounds)[4]) {
+  for (int k = 0; k < 3; ++k) store(to.mean[k], bounds[k]);
+  store(to.log_scale, bounds[3]);
 }
 
 // ... and from the rows themselves.
@@ -122,42 +157,32 @@ GAUSSLITE_INLINE void find_bounds(const float* rows, Pack16 (&bounds)[4]) {
   bounds[3] = largest_log_scale(row);
 }
 
-// Writes first + j for each bit j of `lanes`, in order, and returns how many; up to sixteen places are overwritten.
-GAUSSLITE_INLINE uint32_t list_lanes(uint32_t* out, uint32_t first, uint32_t lanes) {
-#if defined(GAUSSLITE_USE_AVX512)
-  const __m512i numbers = _mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
-  const __m512i ids = _mm512_add_epi32(numbers, _mm512_set1_epi32(int(first)));
-  _mm512_storeu_si512(out, _mm512_maskz_compress_epi32(__mmask16(lanes), ids));
-  return uint32_t(__builtin_popcount(lanes));
-#else
-  uint32_t count = 0;
-  for (uint32_t j = 0; j < 16; ++j) {
-    out[count] = first + j;
-    count += lanes >> j & 1u;
-  }
-  return count;
-#endif
-}
-
 // Of rows [begin, end), the ids of those that may touch an active tile. A test of its own costs less than
 // projecting a row, and the rows that are left fill their groups. The last rows, too few for a group, all count.
 GAUSSLITE_INLINE uint32_t find_candidates(Workspace& ws, const Sight& sight, uint32_t begin, uint32_t end,
                                           uint32_t* ids) {
-  uint32_t count = 0;
-  for (uint32_t i = begin; i < end; i += 16) {
-    uint32_t candidates = (1u << ((end - i) % 16)) - 1u;
-    if (end - i >= 16) {
-      Pack16 bounds[4];
-      if (ws.knows_bounds) {
-        load_bounds(&ws.bounds[i], bounds);
-      } else {
-        find_bounds(ws.rows + size_t(kRowWidth) * i, bounds);
-      }
-      candidates = sight.may_touch_active(ws, bounds, bounds[3]);
-      if (ws.keeps_bounds && !ws.knows_bounds) store_bounds(&ws.bounds[i], bounds);
+  const bool by_tile = ws.active_tiles != nullptr && !ws.active.fill_box();
+  uint32_t boxes[kSegment + 16], in_box = 0, count = 0, i = begin;
+  for (; i + 16 <= end; i += 16) {
+    Pack16 bounds[4];
+    if (ws.knows_bounds) {
+      load_bounds(ws.bounds[i / 16], bounds);
+    } else {
+      find_bounds(ws.rows + size_t(kRowWidth) * i, bounds);
+      if (ws.keeps_bounds) store_bounds(ws.bounds[i / 16], bounds);
     }
-    count += list_lanes(ids + count, i, candidates);
+    in_box += sight.list_in_box(ws, bounds, bounds[3], i, ids + in_box, by_tile ? boxes + in_box : nullptr);
   }
+  if (!by_tile) {
+    count = in_box;
+  } else {
+    // Written always, and only then counted or not: no branch to mispredict.
+    for (uint32_t k = 0; k < in_box; ++k) {
+      ids[count] = ids[k];
+      count += ws.active.any_near(boxes[k] / ActiveTiles::kSizes, boxes[k] % ActiveTiles::kSizes);
+    }
+  }
+  for (; i < end; ++i) ids[count++] = i;
   return count;
 }
 

@@ -31,6 +31,33 @@ struct Box {
     y0 = floor(top * (1.0f / kTile));
     y1 = floor(bottom * (1.0f / kTile));
   }
+
+  // Which lanes' boxes are larger than narrow() can tell of: few.
+  GAUSSLITE_INLINE uint32_t large() const {
+    return bits(((x1 - x0 > Pack16(kMostAcross)) | (y1 - y0 > Pack16(1.0f))) & visible);
+  }
+
+  // Of the boxes that are not large, leaves out the upper or lower row of tiles if none in it is active; returns which
+  // lanes have an active one. All are looked up, wanted or not: no branch to mispredict.
+  GAUSSLITE_INLINE uint32_t narrow(const ActiveTiles& active, Pack16 tiles_x) {
+    alignas(64) int32_t upper[16], lower[16], across[16];
+    store_int(upper, keep(visible, fma(y0, tiles_x, x0)));
+    store_int(lower, keep(visible, fma(y1, tiles_x, x0)));
+    store_int(across, keep(visible, min(x1 - x0, Pack16(kMostAcross))));
+    uint32_t in_upper = 0, in_lower = 0;
+    for (int j = 0; j < 16; ++j) {
+      in_upper |= uint32_t(active.any_near(uint32_t(upper[j]), uint32_t(across[j]))) << j;
+      in_lower |= uint32_t(active.any_near(uint32_t(lower[j]), uint32_t(across[j]))) << j;
+    }
+    const uint32_t small = ~large();
+    const Pack16 first = y0, last = y1;
+    y0 = select(mask_of(in_upper | ~small), first, last);
+    y1 = select(mask_of(in_lower | ~small), last, first);
+    return (in_upper | in_lower) & small;
+  }
+
+ private:
+  static constexpr float kMostAcross = float(ActiveTiles::kNear - 1);
 };
 
 // Rows with a NaN or infinite parameter, and splats whose projection overflows, are not drawn at all.
@@ -46,11 +73,11 @@ GAUSSLITE_INLINE Mask16 is_sound(const Pack16* row, const Projection& p) {
 struct BoxLanes {
   alignas(64) int32_t x0[16], x1[16], y0[16], y1[16];
 
-  GAUSSLITE_INLINE BoxLanes(const Box& box, Mask16 visible) {
-    store_int(x0, keep(visible, box.x0));
-    store_int(x1, keep(visible, box.x1));
-    store_int(y0, keep(visible, box.y0));
-    store_int(y1, keep(visible, box.y1));
+  GAUSSLITE_INLINE explicit BoxLanes(const Box& box) {
+    store_int(x0, keep(box.visible, box.x0));
+    store_int(x1, keep(box.visible, box.x1));
+    store_int(y0, keep(box.visible, box.y0));
+    store_int(y1, keep(box.visible, box.y1));
   }
 
   // Whether the box of a lane meets an active tile in one of its tile rows.
@@ -58,26 +85,11 @@ struct BoxLanes {
     return active.any(uint32_t(x0[lane]), uint32_t(x1[lane]), uint32_t(y), uint32_t(y));
   }
 
-  // Leaves out the upper and lower rows without an active tile; returns which lanes have one.
-  GAUSSLITE_INLINE uint32_t narrow(const ActiveTiles& active, int tiles_x) {
-    uint32_t out = 0;
-    for (int j = 0; j < 16; ++j) {
-      const int upper = y0[j], lower = y1[j], across = x1[j] - x0[j];
-      bool in_upper, in_lower;
-      // One or two rows and few columns are the rule, where there is no branch to mispredict.
-      if (lower - upper <= 1 && across < int(ActiveTiles::kNear)) [[likely]] {
-        in_upper = active.any_near(uint32_t(upper * tiles_x + x0[j]), uint32_t(across));
-        in_lower = active.any_near(uint32_t(lower * tiles_x + x0[j]), uint32_t(across));
-        y0[j] = in_upper ? upper : lower;
-        y1[j] = in_lower ? lower : upper;
-      } else {
-        while (y0[j] < lower && !active_in(active, j, y0[j])) ++y0[j];
-        while (y1[j] > y0[j] && !active_in(active, j, y1[j])) --y1[j];
-        in_upper = in_lower = active_in(active, j, y0[j]);
-      }
-      out |= uint32_t(in_upper | in_lower) << j;
-    }
-    return out;
+  // As Box::narrow for one that is larger; returns whether it has an active tile.
+  GAUSSLITE_INLINE bool narrow(const ActiveTiles& active, int lane) {
+    while (y0[lane] < y1[lane] && !active_in(active, lane, y0[lane])) ++y0[lane];
+    while (y1[lane] > y0[lane] && !active_in(active, lane, y1[lane])) --y1[lane];
+    return active_in(active, lane, y0[lane]);
   }
 };
 
@@ -157,13 +169,22 @@ GAUSSLITE_INLINE void project_group(const Workspace& ws, const Sight& sight, con
 
   Projection p;
   project16(row, ws.camera, p);
-  const Box box(p, ws.camera);
-  const Mask16 in_sight = candidates & box.visible & is_sound(row, p);
-  uint32_t visible = bits(in_sight);
+  Box box(p, ws.camera);
+  box.visible = box.visible & candidates & is_sound(row, p);
+  uint32_t visible = bits(box.visible);
   if (visible == 0) return;
 
-  BoxLanes boxes(box, in_sight);
-  if (ws.active_tiles != nullptr && (visible &= boxes.narrow(ws.active, ws.tiles_x)) == 0) return;
+  uint32_t large = 0;
+  if (ws.active_tiles != nullptr) {
+    large = box.large();
+    visible &= box.narrow(ws.active, Pack16(float(ws.tiles_x))) | large;
+  }
+  BoxLanes boxes(box);
+  for (; large != 0; large &= large - 1) {
+    const int j = __builtin_ctz(large);
+    if (!boxes.narrow(ws.active, j)) visible &= ~(1u << j);
+  }
+  if (visible == 0) return;
   uint32_t tall = 0;
   for (int j = 0; j < 16; ++j) tall |= uint32_t(boxes.y1[j] - boxes.y0[j] > 1) << j;
   Pack16 out[16] = {p.mean_x,

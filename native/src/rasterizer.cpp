@@ -100,7 +100,7 @@ void Rasterizer::mark(double StageTimes::*stage) {
 void Rasterizer::use_bounds(uint64_t loan) {
   ws_.knows_bounds = loan != 0 && loan == bounds_loan_;
   ws_.keeps_bounds = loan != 0 && (ws_.knows_bounds || ws_.ids == nullptr);
-  if (ws_.keeps_bounds) ws_.bounds.reserve(size_t(row_count_) + 16);
+  if (ws_.keeps_bounds) ws_.bounds.reserve(size_t(row_count_) / 16 + 1);
   bounds_loan_ = 0;  // until the step is done
 }
 

@@ -43,18 +43,24 @@ struct Group {
   }
 };
 
-// Calls f(segment, group, slot) for the visible splats of the segments that are left to do, sixteen at a time.
-template <class F>
-GAUSSLITE_INLINE void for_each_group(Workspace& ws, int thread, F f) {
+// Where a group begins, and where its segment ends.
+struct Slots {
+  uint32_t first, end;
+
+  // The one that lane j's follower is in; the last one again where there is none.
+  GAUSSLITE_INLINE uint32_t next(int j) const { return std::min(first + 16 + uint32_t(j), end - 1); }
+};
+
+// Calls f(segment, group, slots) for the visible splats of the segments that are left to do, sixteen at a time, after
+// ask_for(splat) for each of the first sixteen of a segment; f does that for those that follow it.
+template <class Ask, class F>
+GAUSSLITE_INLINE void for_each_group(Workspace& ws, int thread, Ask ask_for, F f) {
   for (uint32_t s; (s = ws.take_segment(thread)) < ws.segments;) {
     const uint32_t begin = s * kSegment, end = begin + ws.segment_visible[s];
+    for (uint32_t slot = begin; slot < std::min(begin + 16, end); ++slot) ask_for(ws.visible[slot]);
     for (uint32_t slot = begin; slot < end; slot += 16) {
-      for (uint32_t next = slot + 16; next < std::min(slot + 32, end); ++next) {
-        const Visible& splat = ws.visible[next];
-        prefetch(ws.rows + size_t(kRowWidth) * splat.id);
-      }
       const Group group(ws, slot, int(std::min(16u, end - slot)));
-      f(s, group, slot);
+      f(s, group, Slots{slot, end});
     }
   }
 }
@@ -111,12 +117,13 @@ class Adam {
 
 void update(Workspace& ws, const Update& job, int thread) {
   const Adam adam(job);
-  for_each_group(ws, thread, [&](uint32_t, const Group& group, uint32_t) {
-    // By the time the gradients are known the moments have come from memory.
-    for (const uint32_t id : group.id) {
-      prefetch_to_write(job.first_moment + size_t(kRowWidth) * id);
-      prefetch_to_write(job.second_moment + size_t(kRowWidth) * id);
-    }
+  const auto ask_for = [&](const Visible& splat) {
+    const size_t at = size_t(kRowWidth) * splat.id;
+    prefetch_to_write(job.rows + at);
+    prefetch_to_write(job.first_moment + at);
+    prefetch_to_write(job.second_moment + at);
+  };
+  for_each_group(ws, thread, ask_for, [&](uint32_t, const Group& group, const Slots& slots) {
     ParameterGradients g;
     backward16<false>(group.row, group.image, ws.camera, g);
     drop_unsound(g);
@@ -125,16 +132,19 @@ void update(Workspace& ws, const Update& job, int thread) {
     transpose(g.column);
     for (int j = 0; j < group.lanes; ++j) {
       const uint32_t id = group.id[j];
+      // Between the updates, not in one burst: a core waits for some two dozen lines at a time and then for all.
+      ask_for(ws.visible[slots.next(j)]);
       if (job.trainable != nullptr && !job.trainable[id]) continue;
       adam.step(id, g.column[j]);
-      if (ws.keeps_bounds) note_bounds(ws.bounds[id], job.rows + size_t(kRowWidth) * id);
+      if (ws.keeps_bounds) note_bounds(ws, id, job.rows + size_t(kRowWidth) * id);
       if (job.trained != nullptr && (job.counted == nullptr || job.counted[id])) ++job.trained[id];
     }
   });
 }
 
 void gradients(Workspace& ws, const GradientOutput& job, int thread) {
-  for_each_group(ws, thread, [&](uint32_t segment, const Group& group, uint32_t slot) {
+  const auto ask_for = [&](const Visible& splat) { prefetch(ws.rows + size_t(kRowWidth) * splat.id); };
+  for_each_group(ws, thread, ask_for, [&](uint32_t segment, const Group& group, const Slots& slots) {
     ParameterGradients g;
     backward16<true>(group.row, group.image, ws.camera, g);
     drop_unsound(g);
@@ -145,8 +155,9 @@ void gradients(Workspace& ws, const GradientOutput& job, int thread) {
     store(norms, g.mean_2d_norm);
     transpose(g.column);
     for (int j = 0; j < group.lanes; ++j) {
+      ask_for(ws.visible[slots.next(j)]);
       store(job.d_rows + size_t(kRowWidth) * group.id[j], g.column[j]);
-      job.mean_2d_norm[slot + uint32_t(j)] = norms[j];
+      job.mean_2d_norm[slots.first + uint32_t(j)] = norms[j];
     }
   });
 }

@@ -55,11 +55,11 @@ constexpr int kSquare = kTile * kTile;
 constexpr int kSsimMaps = 3;  // what SSIM blurs: x, xx, xy on the way forward, their derivatives on the way back
 constexpr int kChunk = 128;  // splats of a tile that are handled at a time: their records stay in the first-level cache
 constexpr int kPrefetchAhead = 64;  // keys
-constexpr int kSegment = 2048;      // parameter rows that are projected as a unit, by their own thread unless it is late
+constexpr int kSegment = 2048;  // parameter rows that are projected as a unit, by their own thread unless it is late
 
-// Where a row's splat is and how far it may reach: its mean, and the largest of its log scales.
-struct RowBounds {
-  float mean[3], log_scale;
+// Where the splats of sixteen rows are and how far they may reach: their means, and the largest of their log scales.
+struct alignas(64) GroupBounds {
+  float mean[3][16], log_scale[16];
 };
 
 // A segment's keys in its thread's list of a tile row.
@@ -133,7 +133,7 @@ struct Workspace {
   uint32_t segments = 0;
   // While rows change by training steps alone, their bounds are kept from step to step: a step that looks for the rows
   // in sight then reads 16 bytes of each instead of 64. Where they are kept and not known yet, projection notes them.
-  Buffer<RowBounds> bounds;
+  Buffer<GroupBounds> bounds;  // of rows 16 k ... 16 k + 15
   bool keeps_bounds = false, knows_bounds = false;
 
   // Raster. Lists hold the wanted blocks of a tile only: those of the active tiles that the loss depends on.

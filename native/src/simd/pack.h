@@ -76,6 +76,8 @@ GAUSSLITE_INLINE Pack16 log2(Pack16 x) {
 // True where a number is neither NaN nor infinite: x times 0 is 0 only then.
 GAUSSLITE_INLINE Mask16 is_finite(Pack16 x) { return x * 0.0f == Pack16(0.0f); }
 
+GAUSSLITE_INLINE Mask16 first_lanes(int n) { return mask_of((1u << n) - 1u); }
+
 // The 16x16 transpose: sixteen rows become sixteen columns.
 GAUSSLITE_INLINE void transpose(Pack16 (&r)[16]) {
   for (int i = 0; i < 16; i += 4) transpose_quads(r[i], r[i + 1], r[i + 2], r[i + 3]);

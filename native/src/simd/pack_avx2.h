@@ -20,10 +20,11 @@ GAUSSLITE_INLINE uint32_t bits(Mask16 m) {
   return uint32_t(_mm256_movemask_ps(m.lo)) | uint32_t(_mm256_movemask_ps(m.hi)) << 8;
 }
 GAUSSLITE_INLINE bool any(Mask16 m) { return _mm256_movemask_ps(_mm256_or_ps(m.lo, m.hi)) != 0; }
-GAUSSLITE_INLINE Mask16 first_lanes(int n) {
-  const __m256i count = _mm256_set1_epi32(n);
-  return {_mm256_castsi256_ps(_mm256_cmpgt_epi32(count, _mm256_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7))),
-          _mm256_castsi256_ps(_mm256_cmpgt_epi32(count, _mm256_setr_epi32(8, 9, 10, 11, 12, 13, 14, 15)))};
+GAUSSLITE_INLINE Mask16 mask_of(uint32_t bits) {
+  const __m256i all = _mm256_set1_epi32(int(bits));
+  const __m256i lo = _mm256_setr_epi32(1, 2, 4, 8, 16, 32, 64, 128), hi = _mm256_slli_epi32(lo, 8);
+  return {_mm256_castsi256_ps(_mm256_cmpeq_epi32(_mm256_and_si256(all, lo), lo)),
+          _mm256_castsi256_ps(_mm256_cmpeq_epi32(_mm256_and_si256(all, hi), hi))};
 }
 
 struct Pack16 {

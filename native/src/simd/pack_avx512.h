@@ -19,7 +19,7 @@ GAUSSLITE_INLINE Mask16 operator&(Mask16 a, Mask16 b) { return {__mmask16(a.v & 
 GAUSSLITE_INLINE Mask16 operator|(Mask16 a, Mask16 b) { return {__mmask16(a.v | b.v)}; }
 GAUSSLITE_INLINE uint32_t bits(Mask16 m) { return m.v; }
 GAUSSLITE_INLINE bool any(Mask16 m) { return m.v != 0; }
-GAUSSLITE_INLINE Mask16 first_lanes(int n) { return {__mmask16((1u << n) - 1u)}; }
+GAUSSLITE_INLINE Mask16 mask_of(uint32_t bits) { return {__mmask16(bits)}; }
 
 struct Pack16 {
   __m512 v;

@@ -50,12 +50,12 @@ GAUSSLITE_INLINE uint32_t bits(Mask16 m) {
 GAUSSLITE_INLINE bool any(Mask16 m) {
   return vmaxvq_u32(vorrq_u32(vorrq_u32(m.q[0], m.q[1]), vorrq_u32(m.q[2], m.q[3]))) != 0;
 }
-GAUSSLITE_INLINE uint32x4_t lanes_below(int n, int first) {
-  const int32x4_t lanes{first, first + 1, first + 2, first + 3};
-  return vcltq_s32(lanes, vdupq_n_s32(n));
+GAUSSLITE_INLINE uint32x4_t lanes_of(uint32_t bits, uint32_t first) {
+  const uint32x4_t own = {first, first << 1, first << 2, first << 3};
+  return vtstq_u32(vdupq_n_u32(bits), own);
 }
-GAUSSLITE_INLINE Mask16 first_lanes(int n) {
-  return {{lanes_below(n, 0), lanes_below(n, 4), lanes_below(n, 8), lanes_below(n, 12)}};
+GAUSSLITE_INLINE Mask16 mask_of(uint32_t bits) {
+  return {{lanes_of(bits, 1u), lanes_of(bits, 1u << 4), lanes_of(bits, 1u << 8), lanes_of(bits, 1u << 12)}};
 }
 
 GAUSSLITE_INLINE Pack16 load(const float* p) {

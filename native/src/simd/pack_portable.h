@@ -56,9 +56,10 @@ GAUSSLITE_INLINE bool any(Mask16 m) {
   const QuadInt quads = (m.q[0] | m.q[1]) | (m.q[2] | m.q[3]);
   return (quads[0] | quads[1] | quads[2] | quads[3]) != 0;
 }
-GAUSSLITE_INLINE Mask16 first_lanes(int n) {
+// Lane k is true where bit k is set.
+GAUSSLITE_INLINE Mask16 mask_of(uint32_t bits) {
   Mask16 m;
-  for (int i = 0; i < 16; ++i) m.q[i / 4][i % 4] = i < n ? -1 : 0;
+  for (int i = 0; i < 16; ++i) m.q[i / 4][i % 4] = -int32_t(bits >> i & 1u);
   return m;
 }
 
