@@ -75,6 +75,12 @@ class Squares {
     }
   }
 
+  // Whether anything is drawn in one of the two tiles.
+  GAUSSLITE_INLINE bool drawn(const Workspace& ws, int x) const {
+    return (row_.above != nullptr && ws.wanted_blocks[upper_ + size_t(x)] != 0) ||
+           (row_.below != nullptr && ws.wanted_blocks[lower_ + size_t(x)] != 0);
+  }
+
   // The weights of a square, by columns: in `scratch`, or where they are when they are the same everywhere.
   const float* weights(int x, float* scratch) const {
     const float* upper = row_.above != nullptr ? targets_.tile_weights(upper_ + size_t(x)) : kNoSquares;
@@ -104,12 +110,19 @@ GAUSSLITE_INLINE void blur_and_transpose(Get get, float* out) {
   for (int i = 0; i < kTile; ++i) store(out + i * kTile, rows[i]);
 }
 
-void blur_down(const Squares& squares, int x, int channel, Columns& columns) {
+// `drawn`: whether anything is; where nothing is, the image is zero, and what is blurred of it too.
+void blur_down(const Squares& squares, int x, int channel, bool drawn, Columns& columns) {
   alignas(64) float image[kSpan * kTile], target[kSpan * kTile];
-  squares.image_rows(x, channel, image);
   squares.target_rows(x, channel, target);
-  const auto X = [&](int i) { return load(image + i * kTile); };
   const auto Y = [&](int i) { return load(target + i * kTile); };
+  if (!drawn) {
+    for (const int k : {0, 3}) std::fill_n(columns.blurred(k, x), kSquare, 0.0f);
+    blur_and_transpose(Y, columns.blurred(1, x));
+    blur_and_transpose([&](int i) { return Y(i) * Y(i); }, columns.blurred(2, x));
+    return;
+  }
+  squares.image_rows(x, channel, image);
+  const auto X = [&](int i) { return load(image + i * kTile); };
   blur_and_transpose(X, columns.blurred(0, x));
   blur_and_transpose(Y, columns.blurred(1, x));
   blur_and_transpose([&](int i) { return fma(X(i), X(i), Y(i) * Y(i)); }, columns.blurred(2, x));
@@ -158,7 +171,7 @@ void derive_ssim(Workspace& ws, const Training& training, const SquareRow& row, 
   for (int channel = 0; channel < 3; ++channel) {
     // Square x is blurred down, x - 1 derived, x - 2 blurred along: each needs its right neighbour's former step.
     for (int x = 0; x < ws.tiles_x + 2; ++x) {
-      if (x < ws.tiles_x && reach[x] != kUnreached) blur_down(squares, x, channel, columns);
+      if (x < ws.tiles_x && reach[x] != kUnreached) blur_down(squares, x, channel, squares.drawn(ws, x), columns);
       const int middle = x - 1;
       if (middle >= 0 && middle < ws.tiles_x) {
         if (reach[middle] == kWeighted) {
@@ -169,7 +182,8 @@ void derive_ssim(Workspace& ws, const Training& training, const SquareRow& row, 
         }
       }
       const int last = x - 2;
-      if (last >= 0 && reach[last] != kUnreached) {
+      // Where nothing is drawn, nothing is to be changed.
+      if (last >= 0 && reach[last] != kUnreached && squares.drawn(ws, last)) {
         for (int m = 0; m < kSsimMaps; ++m) {
           const float* in = columns.derivative(m, last);
           blur_and_transpose([&](int i) { return column(in, i); }, row.squares + ssim_square(last, channel, m));

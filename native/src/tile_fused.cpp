@@ -161,6 +161,12 @@ void draw_on_tape(Workspace& ws, const Training& training, StripTape& tape, int 
   for (int x = 0; x < ws.tiles_x; ++x) {
     const size_t t = first + size_t(x);
     if (training.targets.reached_blocks[t] == 0) continue;
+    if (ws.wanted_blocks[t] == 0 && training.targets.weighted_blocks[t] == 0) {
+      // Windows reach into it, but it is not to be drawn: they see black.
+      tape.tiles[size_t(x)].entries = 0;
+      std::fill_n(tape.image.data() + image_tile(x), 3 * kSquare, 0.0f);
+      continue;
+    }
     const TilePosition tile(ws, x, strip);
     BlockState state[kBlocks];
     tape.tiles[size_t(x)] = draw(ws, tape, mine.tiles[size_t(x)], tile, state);
