@@ -26,43 +26,87 @@ GAUSSLITE_INLINE Pack16 alpha_of(const Splat& splat, Pack16 pixel_x, Pack16 pixe
   return keep(exponent >= Pack16(kLog2MinAlpha), exp2_fast(min(exponent, Pack16(kLog2MaxAlpha))));
 }
 
+// A block while splats are added to it. A pixel stays as it is once it is finished.
+template <bool kKeepAlphas>
+class OpenBlock {
+ public:
+  GAUSSLITE_INLINE OpenBlock(const BlockState& state, float* alphas)
+      : s_(state), unfinished_(state.transmittance), alphas_(alphas) {}
+
+  GAUSSLITE_INLINE BlockState state() const {
+    BlockState out = s_;
+    if constexpr (!kOneRegister) out.transmittance = unfinished_;
+    return out;
+  }
+  GAUSSLITE_INLINE float* alphas() const { return alphas_; }
+  GAUSSLITE_INLINE bool any_open() const { return any(open()); }
+
+  GAUSSLITE_INLINE void add(const Splat& splat, Pack16 alpha) {
+    const Mask16 open_now = open();
+    const Pack16 open_alpha = keep(open_now, alpha);
+    if (kKeepAlphas) {
+      store(alphas_, open_alpha);
+      alphas_ += 16;
+    }
+    const Pack16 weight = open_alpha * unfinished_;
+    s_.r = fma(weight, Pack16(splat.r), s_.r);
+    s_.g = fma(weight, Pack16(splat.g), s_.g);
+    s_.b = fma(weight, Pack16(splat.b), s_.b);
+    s_.depth = fma(weight, Pack16(splat.depth), s_.depth);
+    if constexpr (kOneRegister) {
+      // One fused step is all that an entry waits for.
+      unfinished_ = fnma(alpha, unfinished_, unfinished_);
+      s_.transmittance = select(open_now, unfinished_, s_.transmittance);
+    } else {
+      // Registers are scarce, and there is other work while an entry waits.
+      unfinished_ = unfinished_ - weight;
+    }
+  }
+
+ private:
+  GAUSSLITE_INLINE Mask16 open() const { return unfinished_ >= Pack16(kMinTransmittance); }
+
+  BlockState s_;
+  // With kOneRegister, the transmittance that would be left if no pixel ever finished; else that which is left.
+  Pack16 unfinished_;
+  float* alphas_;
+};
+
 // Composites a list until it ends or all sixteen pixels are finished; returns how many entries it took. With
 // kKeepAlphas they are appended at `alphas`, for the way back.
 template <bool kKeepAlphas>
 GAUSSLITE_INLINE int composite(const Splat* records, const uint8_t* list, int n, Pack16 pixel_x, Pack16 pixel_y,
                                BlockState& state, float*& alphas) {
-  BlockState s = state;
-  // What would be left if no pixel ever finished. One fused step an entry is all that an entry waits for.
-  Pack16 unfinished = s.transmittance;
-  Mask16 open = unfinished >= Pack16(kMinTransmittance);
-  const auto add = [&](const Splat& splat, Pack16 alpha) {
-    const Pack16 open_alpha = keep(open, alpha);
-    if (kKeepAlphas) {
-      store(alphas, open_alpha);
-      alphas += 16;
-    }
-    const Pack16 weight = open_alpha * unfinished;
-    s.r = fma(weight, Pack16(splat.r), s.r);
-    s.g = fma(weight, Pack16(splat.g), s.g);
-    s.b = fma(weight, Pack16(splat.b), s.b);
-    s.depth = fma(weight, Pack16(splat.depth), s.depth);
-    unfinished = fnma(alpha, unfinished, unfinished);
-    s.transmittance = select(open, unfinished, s.transmittance);
-    open = unfinished >= Pack16(kMinTransmittance);
-  };
+  if (n == 0) return 0;
+  OpenBlock<kKeepAlphas> block(state, alphas);
+  const auto splat = [&](int i) -> const Splat& { return records[list[i]]; };
+  const auto alpha = [&](int i) { return alpha_of(splat(i), pixel_x, pixel_y); };
   int taken = 0;
-  // Two alphas side by side: a core does not look far enough ahead to find the second one's work by itself.
-  for (; taken + 1 < n && any(open); taken += 2) {
-    const Splat &first = records[list[taken]], &second = records[list[taken + 1]];
-    const Pack16 alpha = alpha_of(first, pixel_x, pixel_y), next_alpha = alpha_of(second, pixel_x, pixel_y);
-    add(first, alpha);
-    add(second, next_alpha);
+  // Two alphas side by side, because a core does not look far enough ahead to find the second one's work by itself;
+  // and, where there are registers for it, while the two before them are added. Beyond its end a list has slack.
+  if constexpr (kOneRegister) {
+    Pack16 first = alpha(0), second = alpha(1);
+    for (; taken + 1 < n && block.any_open(); taken += 2) {
+      const Pack16 third = alpha(taken + 2), fourth = alpha(taken + 3);
+      block.add(splat(taken), first);
+      block.add(splat(taken + 1), second);
+      first = third;
+      second = fourth;
+    }
+    if (taken < n && block.any_open()) block.add(splat(taken++), first);
+  } else {
+    for (; taken + 1 < n && block.any_open(); taken += 2) {
+      const Pack16 first = alpha(taken), second = alpha(taken + 1);
+      block.add(splat(taken), first);
+      block.add(splat(taken + 1), second);
+    }
+    if (taken < n && block.any_open()) {
+      block.add(splat(taken), alpha(taken));
+      ++taken;
+    }
   }
-  if (taken < n && any(open)) {
-    const Splat& last = records[list[taken++]];
-    add(last, alpha_of(last, pixel_x, pixel_y));
-  }
-  state = s;
+  state = block.state();
+  alphas = block.alphas();
   return taken;
 }
 

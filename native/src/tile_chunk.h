@@ -2,12 +2,55 @@
 // A tile's splats in chunks: their records gathered side by side, and their block masks turned into one list per block.
 #pragma once
 
+#include <algorithm>
 #include <cstring>
 
 #include "simd/pack.h"
 #include "workspace.h"
 
 namespace gausslite::GAUSSLITE_ISA {
+
+// For each byte, which bits are set, in ascending order of the entries that they stand for: bits 0, 2, 4, 6 for entries
+// 0 to 3, the others for entries 4 to 7.
+struct SetBits {
+  uint64_t numbers[256] = {};  // bytes; on a big-endian machine they would be the other way round
+  uint8_t count[256] = {};
+
+  constexpr SetBits() {
+    for (uint32_t byte = 0; byte < 256; ++byte) {
+      for (uint64_t entry = 0; entry < 8; ++entry) {
+        const uint64_t bit = entry < 4 ? 2 * entry : 2 * entry - 7;
+        if ((byte >> bit & 1u) != 0) numbers[byte] |= entry << (8 * count[byte]++);
+      }
+    }
+  }
+};
+inline constexpr SetBits kSetBits;
+
+// The masks of eight entries, transposed: byte b of half 0 says which of them touch block b, of half 1 block 8 + b.
+struct BlockBytes {
+  uint64_t half[2];
+
+  GAUSSLITE_INLINE explicit BlockBytes(const uint16_t* masks) {
+    constexpr uint64_t kLow = 0x00FF00FF00FF00FFu;
+    uint64_t a, b;
+    std::memcpy(&a, masks, sizeof a);
+    std::memcpy(&b, masks + 4, sizeof b);
+    half[0] = transposed((a & kLow) | (b & kLow) << 8);
+    half[1] = transposed((a >> 8 & kLow) | (b & ~kLow));
+  }
+
+ private:
+  // Eight rows of eight bits, by exchanging the off-diagonal quarters of ever larger squares.
+  GAUSSLITE_INLINE static uint64_t transposed(uint64_t rows) {
+    uint64_t swap = (rows ^ rows >> 7) & 0x00AA00AA00AA00AAu;
+    rows ^= swap ^ swap << 7;
+    swap = (rows ^ rows >> 14) & 0x0000CCCC0000CCCCu;
+    rows ^= swap ^ swap << 14;
+    swap = (rows ^ rows >> 28) & 0x00000000F0F0F0F0u;
+    return rows ^ swap ^ swap << 28;
+  }
+};
 
 // Turns n masks of 16 blocks into 16 lists of entries: a bit-matrix transpose.
 #if defined(GAUSSLITE_USE_AVX512)
@@ -28,18 +71,29 @@ GAUSSLITE_INLINE void list_blocks(const uint16_t* blocks, int n, BlockLists& lis
       count[b] += uint32_t(__builtin_popcount(touching));
     }
   }
-  for (int b = 0; b < kBlocks; ++b) lists.count[b] = uint16_t(count[b]);
+  lists.end(count);
 }
 #else
+// Eight entries at a time: their masks become sixteen bytes, one per block, each of which a table turns into numbers.
+// No branch: how many blocks an entry touches is as good as random.
 GAUSSLITE_INLINE void list_blocks(const uint16_t* blocks, int n, BlockLists& lists) {
   uint32_t count[kBlocks] = {};
-  for (int i = 0; i < n; ++i) {
-    for (uint32_t left = blocks[i]; left != 0; left &= left - 1) {
-      const int b = __builtin_ctz(left);
-      lists.entry[b][count[b]++] = uint8_t(i);
+  const auto list = [&](const uint16_t* masks, int i) {
+    const BlockBytes bytes(masks);
+    const uint64_t first = uint64_t(i) * 0x0101010101010101u;
+    for (int b = 0; b < kBlocks; ++b) {
+      const uint32_t entries = uint32_t(bytes.half[b / 8] >> (8 * (b % 8))) & 0xFFu;
+      const uint64_t numbers = kSetBits.numbers[entries] + first;
+      std::memcpy(lists.entry[b] + count[b], &numbers, sizeof numbers);
+      count[b] += kSetBits.count[entries];
     }
-  }
-  for (int b = 0; b < kBlocks; ++b) lists.count[b] = uint16_t(count[b]);
+  };
+  int i = 0;
+  for (; i + 8 <= n; i += 8) list(blocks + i, i);
+  uint16_t last[8] = {};
+  std::copy(blocks + i, blocks + n, last);
+  list(last, i);
+  lists.end(count);
 }
 #endif
 

@@ -4,6 +4,7 @@
 
 #include <atomic>
 #include <cstdint>
+#include <cstring>
 #include <vector>
 
 #include "active_tiles.h"
@@ -71,6 +72,14 @@ struct KeySpan {
 struct BlockLists {
   alignas(64) uint8_t entry[kBlocks][kChunk + 32];
   uint16_t count[kBlocks];
+
+  // Once all are listed. Behind its end each list names entry 0 a few times, for loops that look ahead.
+  __attribute__((always_inline)) void end(const uint32_t (&counts)[kBlocks]) {
+    for (int b = 0; b < kBlocks; ++b) {
+      count[b] = uint16_t(counts[b]);
+      std::memset(entry[b] + counts[b], 0, 4);
+    }
+  }
 };
 
 // What a drawn tile leaves for its way back.

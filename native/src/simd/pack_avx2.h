@@ -10,6 +10,8 @@
 
 namespace gausslite::GAUSSLITE_ISA {
 
+constexpr bool kOneRegister = false;
+
 struct Mask16 {
   __m256 lo, hi;
 };
@@ -79,8 +81,9 @@ GAUSSLITE_INLINE Pack16 reciprocal(Pack16 a) {
 }
 GAUSSLITE_INLINE Pack16 rough_reciprocal(Pack16 a) { return reciprocal(a); }
 GAUSSLITE_INLINE Pack16 rough_inverse_sqrt(Pack16 a) {
+  // Not a * 0.5f: half of the smallest float is a number that processors multiply by slowly.
   const Pack16 r{_mm256_rsqrt_ps(a.lo), _mm256_rsqrt_ps(a.hi)};
-  return r * fnma(a * 0.5f, r * r, Pack16(1.5f));
+  return r * fnma(a * r, r * 0.5f, Pack16(1.5f));
 }
 
 #define GAUSSLITE_COMPARISON(name, predicate)                                            \

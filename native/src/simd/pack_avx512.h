@@ -11,6 +11,8 @@
 
 namespace gausslite::GAUSSLITE_ISA {
 
+constexpr bool kOneRegister = true;
+
 struct Mask16 {
   __mmask16 v;
 };

@@ -10,6 +10,8 @@
 
 namespace gausslite::GAUSSLITE_ISA {
 
+constexpr bool kOneRegister = false;
+
 struct Mask16 {
   uint32x4_t q[4];
 };

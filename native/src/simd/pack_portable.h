@@ -31,6 +31,9 @@ GAUSSLITE_INLINE Quad floor_quad(Quad a) {
   return choose(small, whole - choose(whole > a, quad(1.0f), quad(0.0f)), a);
 }
 
+// Whether a pack is one register, so that there is room for many.
+constexpr bool kOneRegister = false;
+
 // Sixteen truth values, one per lane.
 struct Mask16 {
   QuadInt q[4];
