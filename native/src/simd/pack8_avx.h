@@ -24,6 +24,7 @@ GAUSSLITE_INLINE Pack8 broadcast_pair(const float* p) {
 GAUSSLITE_INLINE Pack8 operator+(Pack8 a, Pack8 b) { return _mm256_add_ps(a.v, b.v); }
 GAUSSLITE_INLINE Pack8 operator-(Pack8 a, Pack8 b) { return _mm256_sub_ps(a.v, b.v); }
 GAUSSLITE_INLINE Pack8 operator*(Pack8 a, Pack8 b) { return _mm256_mul_ps(a.v, b.v); }
+GAUSSLITE_INLINE Pack8 fma(Pack8 a, Pack8 b, Pack8 c) { return _mm256_fmadd_ps(a.v, b.v, c.v); }
 GAUSSLITE_INLINE Pack8 fnma(Pack8 a, Pack8 b, Pack8 c) { return _mm256_fnmadd_ps(a.v, b.v, c.v); }
 
 template <int a, int b, int c, int d, int e, int f, int g, int h>

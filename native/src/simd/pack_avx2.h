@@ -206,6 +206,8 @@ GAUSSLITE_INLINE void store_block(float* p, int64_t stride, Pack16 a) {
   _mm_storeu_ps(p + 3 * stride, _mm256_extractf128_ps(a.hi, 1));
 }
 
+GAUSSLITE_INLINE Pack8 lower(Pack16 a) { return a.lo; }
+GAUSSLITE_INLINE Pack8 upper(Pack16 a) { return a.hi; }
 GAUSSLITE_INLINE Pack16 join(Pack8 lo, Pack8 hi) { return {lo.v, hi.v}; }
 
 }  // namespace gausslite::GAUSSLITE_ISA

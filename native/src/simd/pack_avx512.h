@@ -142,6 +142,8 @@ GAUSSLITE_INLINE Pack8 sum_of_quads(Pack16 a) {
   return _mm256_zextps128_ps256(_mm_add_ps(_mm256_castps256_ps128(half), _mm256_extractf128_ps(half, 1)));
 }
 
+GAUSSLITE_INLINE Pack8 lower(Pack16 a) { return _mm512_castps512_ps256(a.v); }
+GAUSSLITE_INLINE Pack8 upper(Pack16 a) { return _mm512_extractf32x8_ps(a.v, 1); }
 GAUSSLITE_INLINE Pack16 join(Pack8 lo, Pack8 hi) { return _mm512_insertf32x8(_mm512_castps256_ps512(lo.v), hi.v, 1); }
 
 }  // namespace gausslite::GAUSSLITE_ISA

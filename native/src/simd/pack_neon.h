@@ -225,6 +225,9 @@ GAUSSLITE_INLINE Pack8 broadcast_pair(const float* p) {
 GAUSSLITE_INLINE Pack8 operator+(Pack8 a, Pack8 b) { return {vaddq_f32(a.lo, b.lo), vaddq_f32(a.hi, b.hi)}; }
 GAUSSLITE_INLINE Pack8 operator-(Pack8 a, Pack8 b) { return {vsubq_f32(a.lo, b.lo), vsubq_f32(a.hi, b.hi)}; }
 GAUSSLITE_INLINE Pack8 operator*(Pack8 a, Pack8 b) { return {vmulq_f32(a.lo, b.lo), vmulq_f32(a.hi, b.hi)}; }
+GAUSSLITE_INLINE Pack8 fma(Pack8 a, Pack8 b, Pack8 c) {
+  return {vfmaq_f32(c.lo, a.lo, b.lo), vfmaq_f32(c.hi, a.hi, b.hi)};
+}
 GAUSSLITE_INLINE Pack8 fnma(Pack8 a, Pack8 b, Pack8 c) {
   return {vfmsq_f32(c.lo, a.lo, b.lo), vfmsq_f32(c.hi, a.hi, b.hi)};
 }
@@ -241,6 +244,8 @@ GAUSSLITE_INLINE void pair_groups(Pack16 a, Pack16 b, Pack8 (&out)[4]) {
   for (int k = 0; k < 4; ++k) out[k] = {a.q[k], b.q[k]};
 }
 
+GAUSSLITE_INLINE Pack8 lower(Pack16 a) { return {a.q[0], a.q[1]}; }
+GAUSSLITE_INLINE Pack8 upper(Pack16 a) { return {a.q[2], a.q[3]}; }
 GAUSSLITE_INLINE Pack16 join(Pack8 lo, Pack8 hi) { return {lo.lo, lo.hi, hi.lo, hi.hi}; }
 
 }  // namespace gausslite::GAUSSLITE_ISA

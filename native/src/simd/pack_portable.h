@@ -257,6 +257,7 @@ GAUSSLITE_INLINE Pack8 broadcast_pair(const float* p) {
 GAUSSLITE_INLINE Pack8 operator+(Pack8 a, Pack8 b) { return {a.lo + b.lo, a.hi + b.hi}; }
 GAUSSLITE_INLINE Pack8 operator-(Pack8 a, Pack8 b) { return {a.lo - b.lo, a.hi - b.hi}; }
 GAUSSLITE_INLINE Pack8 operator*(Pack8 a, Pack8 b) { return {a.lo * b.lo, a.hi * b.hi}; }
+GAUSSLITE_INLINE Pack8 fma(Pack8 a, Pack8 b, Pack8 c) { return {a.lo * b.lo + c.lo, a.hi * b.hi + c.hi}; }
 GAUSSLITE_INLINE Pack8 fnma(Pack8 a, Pack8 b, Pack8 c) { return c - a * b; }
 
 // Lane k of the result is the lane of x that the k-th argument names.
@@ -273,7 +274,9 @@ GAUSSLITE_INLINE void pair_groups(Pack16 a, Pack16 b, Pack8 (&out)[4]) {
   for (int k = 0; k < 4; ++k) out[k] = {a.q[k], b.q[k]};
 }
 
-// The eight floats of `lo`, then those of `hi`.
+// The first and the last eight floats; and of `lo` and `hi` those of `lo` first.
+GAUSSLITE_INLINE Pack8 lower(Pack16 a) { return {a.q[0], a.q[1]}; }
+GAUSSLITE_INLINE Pack8 upper(Pack16 a) { return {a.q[2], a.q[3]}; }
 GAUSSLITE_INLINE Pack16 join(Pack8 lo, Pack8 hi) {
   Pack16 a;
   a.q[0] = lo.lo;
