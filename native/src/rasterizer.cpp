@@ -107,12 +107,21 @@ void Rasterizer::use_bounds(uint64_t loan) {
 // The heaviest tile rows come first: then the threads have little to wait for at the end.
 void Rasterizer::order_strips() {
   strip_order_.clear();
-  for (int y = 0; y < ws_.tiles_y; ++y) {
-    uint32_t keys = 0;
-    for (const ThreadScratch& scratch : ws_.scratch) keys += scratch.strips[size_t(y)].count;
-    strip_order_.emplace_back(keys, y);
-  }
+  for (int y = 0; y < ws_.tiles_y; ++y) strip_order_.emplace_back(keys_of_strip(y), y);
   std::sort(strip_order_.begin(), strip_order_.end(), std::greater<>());
+}
+
+uint32_t Rasterizer::keys_of_strip(int y) const {
+  uint32_t keys = 0;
+  for (const ThreadScratch& scratch : ws_.scratch) keys += scratch.strips[size_t(y)].count;
+  return keys;
+}
+
+// With SSIM strips are begun side by side instead.
+void Rasterizer::schedule_strips() {
+  strip_weights_.clear();
+  for (int y = 0; y < ws_.tiles_y; ++y) strip_weights_.push_back(keys_of_strip(y));
+  schedule_.start(strip_weights_, team_.size(), StripSchedule::tape_places(team_.size()));
 }
 
 template <class F>
@@ -187,13 +196,11 @@ Training Rasterizer::begin_training(const TrainingView& view, bool masked, const
     want_blocks(training.targets.weighted_blocks);
   } else {
     want_blocks(training.targets.reached_blocks);
-    // One more than there are strips in work, and one that waits for the strip below it.
-    const int tapes = std::max(2, std::min(team_.size() + 2, ws_.tiles_y));
+    const int tapes = StripSchedule::tape_places(team_.size());
     const size_t rows = size_t(StripSchedule::square_places(tapes));
     if (ws_.tapes.size() < size_t(tapes)) ws_.tapes.resize(size_t(tapes));
     if (ws_.ssim_squares.size() < rows) ws_.ssim_squares.resize(rows);
     for (Buffer<float>& squares : ws_.ssim_squares) squares.reserve(ssim_square(ws_.tiles_x, 0, 0));
-    schedule_.start(ws_.tiles_y, tapes);
   }
   return training;
 }
@@ -245,7 +252,11 @@ double Rasterizer::step(const FrameInput& input, const OptimizerState& state, co
     stages_.project(ws_, thread);
     team_.barrier([&] {
       prepare_gradient_rows();
-      order_strips();
+      if (with_ssim) {
+        schedule_strips();
+      } else {
+        order_strips();
+      }
       ws_.hand_out_segments();
       mark(&StageTimes::project);
     });

@@ -89,6 +89,8 @@ class Rasterizer {
   void next_tag();
   void use_bounds(uint64_t loan);
   void order_strips();
+  void schedule_strips();
+  uint32_t keys_of_strip(int y) const;
   void prepare_gradient_rows();
   void mark(double StageTimes::*stage);
   template <class F>
@@ -102,7 +104,8 @@ class Rasterizer {
   std::mutex mutex_;
   StripSchedule schedule_;
   std::vector<std::pair<uint32_t, int>> strip_order_;  // keys and tile row, most keys first
-  uint64_t bounds_loan_ = 0;                           // the loan in which the bounds are true
+  std::vector<uint32_t> strip_weights_;
+  uint64_t bounds_loan_ = 0;  // the loan in which the bounds are true
   Buffer<double> l1_sums_, ssim_sums_, twist_sums_;
   Buffer<float> norms_by_slot_;
   AdamCorrections corrections_;

@@ -1,7 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "strip_schedule.h"
 
+#include <algorithm>
 #include <cstddef>
+#include <numeric>
 
 #include "team.h"
 
@@ -15,11 +17,12 @@ int pop(std::vector<int>& stack) {
   return last;
 }
 
-// The latest number on the stack that belongs to this thread; -1 if none does.
-int pop_own(std::vector<int>& stack, const std::vector<int>& thread_of, int thread) {
+// The latest number on the stack for which is_own holds; -1 if there is none.
+template <class F>
+int pop_own(std::vector<int>& stack, F is_own) {
   for (size_t i = stack.size(); i-- > 0;) {
     const int own = stack[i];
-    if (thread_of[size_t(own)] != thread) continue;
+    if (!is_own(own)) continue;
     stack.erase(stack.begin() + std::ptrdiff_t(i));
     return own;
   }
@@ -34,9 +37,25 @@ void fill(std::vector<int>& stack, int count) {
 
 }  // namespace
 
-void StripSchedule::start(int strips, int tape_places) {
-  strips_ = strips;
-  next_draw_ = walks_taken_ = 0;
+void StripSchedule::start(const std::vector<uint32_t>& weights, int threads, int tape_places) {
+  const int strips = int(weights.size());
+  strips_ = not_drawn_ = strips;
+  walks_taken_ = 0;
+  // edges[t]: above it, t of so many threads' share of the work.
+  std::vector<int> edges(size_t(threads) + 1, strips);
+  const uint64_t total = std::accumulate(weights.begin(), weights.end(), uint64_t{0});
+  uint64_t above = 0;
+  for (int strip = 0, t = 0; strip <= strips && t < threads; ++strip) {
+    for (; t < threads && above * uint64_t(threads) >= total * uint64_t(t); ++t) edges[size_t(t)] = strip;
+    if (strip < strips) above += weights[size_t(strip)];
+  }
+  edges[0] = 0;
+  fronts_.clear();
+  for (int t = 0; t < threads; ++t) {
+    const int first = edges[size_t(t)], count = edges[size_t(t) + 1] - first;
+    const bool upwards = t % 2 == 0 && t + 1 < threads;
+    fronts_.push_back({upwards ? first + count - 1 : first, count, upwards ? -1 : 1});
+  }
   fill(free_tapes_, tape_places);
   fill(free_squares_, square_places(tape_places));
   tape_of_strip_.assign(size_t(strips), -1);
@@ -64,35 +83,69 @@ StripTask StripSchedule::next(int thread) {
   }
 }
 
-// A thread first walks back what it has drawn itself: that frees a tape, and the tape is in its caches. What another
-// one has drawn it walks back only when there is nothing else to do.
+// What lies in its own caches comes first, and walking back first of all: that frees a tape. What others have drawn a
+// thread looks at only when nothing is left of its own strips.
 bool StripSchedule::take(StripTask& task, int thread) {
-  int strip = pop_own(walkable_, drawn_by_, thread);
-  if (strip < 0 && !derivable_.empty()) {
-    task.kind = StripTask::kDerive;
-    task.index = pop(derivable_);
-    if (task.index > 0) task.tapes[0] = tape_of_strip_[size_t(task.index - 1)];
-    if (task.index < strips_) task.tapes[1] = tape_of_strip_[size_t(task.index)];
-    task.squares[0] = squares_of_row_[size_t(task.index)] = pop(free_squares_);
-    return true;
+  const bool can_draw = not_drawn_ > 0 && !free_tapes_.empty();
+  if (const int strip = pop_own_strip(thread); strip >= 0) {
+    task = walk_back(strip);
+  } else if (const int row = pop_own_row(thread); row >= 0) {
+    task = derive(row);
+  } else if (can_draw && fronts_[size_t(thread)].left > 0) {
+    task = draw(thread);
+  } else if (!derivable_.empty()) {
+    task = derive(pop(derivable_));
+  } else if (!walkable_.empty()) {
+    task = walk_back(pop(walkable_));
+  } else if (can_draw) {
+    task = draw(thread);
+  } else {
+    return false;
   }
-  if (strip < 0 && next_draw_ < strips_ && !free_tapes_.empty()) {
-    const int own_tape = pop_own(free_tapes_, tape_used_by_, thread),
-              tape = own_tape >= 0 ? own_tape : pop(free_tapes_);
-    task.kind = StripTask::kDraw;
-    task.index = next_draw_++;
-    task.tapes[0] = tape_of_strip_[size_t(task.index)] = tape;
-    drawn_by_[size_t(task.index)] = tape_used_by_[size_t(tape)] = thread;
-    return true;
-  }
-  if (strip < 0 && !walkable_.empty()) strip = pop(walkable_);
-  if (strip < 0) return false;
-  task.kind = StripTask::kWalkBack;
-  task.index = strip;
-  task.tapes[0] = tape_of_strip_[size_t(strip)];
-  for (int i = 0; i < 2; ++i) task.squares[i] = squares_of_row_[size_t(strip + i)];
-  ++walks_taken_;
   return true;
+}
+
+// Of its own strips the next one; when they are drawn, the next one of whoever has most left.
+StripTask StripSchedule::draw(int thread) {
+  Front* front = &fronts_[size_t(thread)];
+  if (front->left == 0) {
+    front = &*std::max_element(fronts_.begin(), fronts_.end(),
+                               [](const Front& a, const Front& b) { return a.left < b.left; });
+  }
+  const int strip = front->next;
+  front->next += front->step;
+  --front->left;
+  --not_drawn_;
+  int tape = pop_own(free_tapes_, [&](int place) { return tape_used_by_[size_t(place)] == thread; });
+  if (tape < 0) tape = pop(free_tapes_);
+  tape_of_strip_[size_t(strip)] = tape;
+  drawn_by_[size_t(strip)] = tape_used_by_[size_t(tape)] = thread;
+  return {StripTask::kDraw, strip, {tape, -1}, {-1, -1}};
+}
+
+StripTask StripSchedule::derive(int row) {
+  const int above = row > 0 ? tape_of_strip_[size_t(row - 1)] : -1;
+  const int below = row < strips_ ? tape_of_strip_[size_t(row)] : -1;
+  const int squares = squares_of_row_[size_t(row)] = pop(free_squares_);
+  return {StripTask::kDerive, row, {above, below}, {squares, -1}};
+}
+
+StripTask StripSchedule::walk_back(int strip) {
+  ++walks_taken_;
+  return {StripTask::kWalkBack,
+          strip,
+          {tape_of_strip_[size_t(strip)], -1},
+          {squares_of_row_[size_t(strip)], squares_of_row_[size_t(strip) + 1]}};
+}
+
+int StripSchedule::pop_own_strip(int thread) {
+  return pop_own(walkable_, [&](int strip) { return drawn_by_[size_t(strip)] == thread; });
+}
+
+int StripSchedule::pop_own_row(int thread) {
+  return pop_own(derivable_, [&](int row) {
+    return (row > 0 && drawn_by_[size_t(row - 1)] == thread) || (row < strips_ && drawn_by_[size_t(row)] == thread);
+  });
 }
 
 void StripSchedule::finish(const StripTask& task) {
