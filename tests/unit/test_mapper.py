@@ -212,3 +212,5 @@ def test_iterations_scale_in_proportion() -> None:
     more = OptimizationSettings().with_iterations(16)
     assert (more.warmup_iterations, more.active_iterations) == (4, 12)
     assert OptimizationSettings().with_iterations(0).iterations == 0
+    few = [OptimizationSettings().with_iterations(count) for count in (1, 2, 3)]
+    assert [(each.warmup_iterations, each.active_iterations) for each in few] == [(0, 1), (1, 1), (1, 2)]

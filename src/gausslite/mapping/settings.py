@@ -158,9 +158,11 @@ class OptimizationSettings:
         return self.warmup_iterations + self.active_iterations
 
     def with_iterations(self, iterations: int) -> OptimizationSettings:
-        """The same proportion of the two phases in this many iterations a frame."""
+        """The same proportion of the two phases in this many iterations a frame, and of two at least one a warm-up."""
         _require(iterations >= 0, "optimization iterations", "at least 0", iterations)
         warmup = round(iterations * self.warmup_iterations / max(self.iterations, 1))
+        if self.warmup_iterations > 0:
+            warmup = max(warmup, min(1, iterations // 2))
         return replace(self, warmup_iterations=warmup, active_iterations=iterations - warmup)
 
 
