@@ -8,7 +8,11 @@ import sys
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from typing import Any
+
+from tqdm import tqdm
 
 from gausslite.cli.arguments import open_told
 from gausslite.cli.progress import progress_bar
@@ -17,6 +21,7 @@ from gausslite.datasets.regions import REGIONS_FILE
 from gausslite.datasets.selection import modest_size
 from gausslite.errors import InvalidInputError
 from gausslite.evaluation.quality.ablation import cumulative_variants
+from gausslite.evaluation.quality.pacing import first_scene, kept_rate, measure_rate, pacing_trials
 from gausslite.evaluation.quality.pairs import HomePair, choose_pairs
 from gausslite.evaluation.quality.scenes import (
     REAL_CAMERA,
@@ -39,6 +44,7 @@ from gausslite.mission.settings import PerceptionSettings
 
 _ABLATION_PAIR = "home-4-manipulation"
 _BOTH = "both"
+_RATE_FILE = "rate.json"
 _HOME_SIZE = (320, 240)
 
 
@@ -117,8 +123,8 @@ def _add_common(parser: argparse.ArgumentParser, seeds: tuple[int, ...], equal: 
         "--rate",
         metavar="HZ",
         type=float,
-        default=budget.rate_hz,
-        help="frames a second at equal time (default: %(default)s)",
+        help="frames a second at equal time (default: as many as uniform mapping makes with --iterations, "
+        f"measured on the first scene and kept in DIR/{_RATE_FILE})",
     )
     add("--threads", metavar="N", type=int, help="threads (default: all the processor allows)")
     add("--lpips-weights", metavar="PATH", type=Path, action="append", default=[], help="AlexNet's and LPIPS' weights")
@@ -209,12 +215,33 @@ def _run(study: Study, options: argparse.Namespace) -> Scoreboard:
 
         perceptual = load_lpips(options.lpips_weights)
     archive = Archive(options.out)
+    study = _paced(study, options.out / _RATE_FILE)
     _warn_of_other_code(expected_origins(study, archive, perceptual is not None, options.reuse_other_code))
     with _StudyBar(study.count) as bar:
         finished = run_study(study, archive, perceptual, bar, options.reuse_other_code)
     origins = Counter(each.origin for each in finished)
     print(f"trials: {', '.join(f'{count} {origin}' for origin, count in origins.items())}", file=sys.stderr)
     return Scoreboard(finished)
+
+
+def _paced(study: Study, path: Path) -> Study:
+    """The study with a rate, where none was asked for."""
+    trials = pacing_trials(study)
+    if not trials:
+        return study
+    rate_hz = kept_rate(path, trials)
+    if rate_hz is None:
+        trial, scene = first_scene(trials)
+        with progress_bar(len(scene.training), f"uniform mapping of {trial.plan.name}", "frame") as bar:
+            rate_hz = measure_rate(path, trial, scene, partial(_advance, bar))
+    what = f"{1e3 / rate_hz:.3g} ms a frame, as uniform mapping takes for {trials[0].budget}"
+    print(f"equal time: {what} ({path})", file=sys.stderr)
+    return study.paced(rate_hz)
+
+
+def _advance(bar: tqdm[Any], gaussians: int) -> None:
+    del gaussians
+    bar.update(1)
 
 
 def _warn_of_other_code(expected: Counter[Origin]) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from pathlib import Path
 from typing import Protocol, runtime_checkable
@@ -79,6 +79,11 @@ class Study:
             for seed in self.seeds
             for variant in self.variants
         ]
+
+    def paced(self, rate_hz: float) -> Study:
+        """The same, with this rate where one was still to be measured."""
+        budgets = [replace(each, rate_hz=rate_hz) if each.awaits_rate else each for each in self.budgets]
+        return replace(self, budgets=budgets)
 
     @property
     def count(self) -> int:

@@ -174,7 +174,7 @@ def quality_table(board: Scoreboard) -> str:
     fitted = FITTED_METRICS if board.has_fitted else ()
     for budget in board.budgets:
         blocks += [
-            f"## Equal {budget.equal}, at most {budget.max_gaussians} Gaussians",
+            f"## Equal {budget.equal} ({budget}), at most {budget.max_gaussians} Gaussians",
             "Inside the task's ground-truth mask (the mean over a place's tasks):",
             _by_place(board, (*ROI_METRICS, *fitted[:1]), budget),
             "Over the full image:",

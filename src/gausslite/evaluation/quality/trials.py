@@ -42,12 +42,26 @@ class Equal(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Budget:
-    """What every policy may spend: Gaussians in all, and iterations or 1 / rate_hz seconds a frame."""
+    """What every policy may spend: Gaussians in all, and iterations or 1 / rate_hz seconds a frame.
+
+    rate_hz None: a rate is still to be measured (`pacing`), where it is time that is equal.
+    """
 
     max_gaussians: int = 60_000
     equal: Equal = Equal.ITERATIONS
     iterations: int = 8
-    rate_hz: float = 4.0
+    rate_hz: float | None = None
+
+    @property
+    def awaits_rate(self) -> bool:
+        """True where time is equal and nobody has said yet how much there is."""
+        return self.equal is Equal.TIME and self.rate_hz is None
+
+    def __str__(self) -> str:
+        """What a frame gets of what is equal."""
+        if self.equal is Equal.ITERATIONS:
+            return f"{self.iterations} iterations a frame"
+        return "time" if self.rate_hz is None else f"{1e3 / self.rate_hz:.3g} ms a frame"
 
 
 @dataclass(frozen=True, slots=True)
