@@ -32,6 +32,13 @@ GAUSSLITE_INLINE Mask16 mask_of(uint32_t bits) {
 struct Pack16 {
   __m256 lo, hi;
   Pack16() = default;
+  // Half by half: as a block of 64 bytes the compiler copies it through memory and through general registers.
+  GAUSSLITE_INLINE Pack16(const Pack16& other) : lo(other.lo), hi(other.hi) {}
+  GAUSSLITE_INLINE Pack16& operator=(const Pack16& other) {
+    lo = other.lo;
+    hi = other.hi;
+    return *this;
+  }
   GAUSSLITE_INLINE Pack16(__m256 a, __m256 b) : lo(a), hi(b) {}
   GAUSSLITE_INLINE Pack16(float x) : lo(_mm256_set1_ps(x)), hi(lo) {}
 };
