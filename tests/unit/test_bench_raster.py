@@ -15,7 +15,7 @@ from gausslite.cli.main import main
 from gausslite.errors import InvalidInputError
 from gausslite.evaluation.bench_cycles import BlockCost
 from gausslite.evaluation.bench_raster import RasterBench
-from gausslite.evaluation.bench_region import Layout, tiles_of_share
+from gausslite.evaluation.bench_region import Layout, regions_of_share
 from gausslite.evaluation.bench_scene import held_view, seed_rows
 from gausslite.render.rasterizer import LOG_SCALE, MEAN, RGB
 
@@ -97,8 +97,10 @@ def test_details_hold_every_figure_of_every_case(tmp_path: Path, capsys: pytest.
         assert set(case["operations"]) == {"fused_l1", "fused_l1_ssim", "forward", "backward"}
         assert case["blocks"]["fused_l1"]["evaluations"] == case["blocks"]["fused_l1_ssim"]["evaluations"] > 0
         regions = [(each["share_percent"], each["layout"], each["loss"]) for each in case["regions"]]
-        assert len(set(regions)) == 2 * 2 * 2
+        assert len(set(regions)) == 2 * 3 * 2
         assert all(each["ratio"] > 0 for each in case["regions"])
+        whole = [each["work_share"] for each in case["regions"] if each["share_percent"] == 100]
+        assert whole == [1.0] * 6
 
 
 def test_cycles_are_those_of_all_threads_in_the_stages_that_evaluate_blocks() -> None:
@@ -108,23 +110,39 @@ def test_cycles_are_those_of_all_threads_in_the_stages_that_evaluate_blocks() ->
     assert cost.floor_share == pytest.approx(34 / 68)
 
 
-@pytest.mark.parametrize("layout", Layout)
+@pytest.mark.parametrize("layout", [Layout.COMPACT, Layout.SCATTERED])
 def test_a_smaller_share_of_tiles_lies_inside_a_larger_one(layout: Layout) -> None:
-    shares = [tiles_of_share((240, 320), percent, layout) for percent in (0.1, 5, 20, 50, 100)]
+    shares = [regions_of_share((240, 320), percent, layout)[0] for percent in (0.1, 5, 20, 50, 100)]
     assert [int(tiles.sum()) for tiles in shares] == [1, 15, 60, 150, 300]
     for smaller, larger in itertools.pairwise(shares):
         assert not (smaller & ~larger).any()
 
 
 def test_a_compact_region_lies_round_the_middle() -> None:
-    rows, columns = np.nonzero(tiles_of_share((160, 160), 36, Layout.COMPACT))
+    rows, columns = np.nonzero(*regions_of_share((160, 160), 36, Layout.COMPACT))
     assert {*rows, *columns} == set(range(2, 8))
+
+
+@pytest.mark.parametrize(("percent", "count"), [(100, 1), (50, 2), (20, 5), (5, 20)])
+def test_bands_cover_the_image_once(percent: float, count: int) -> None:
+    bands = regions_of_share((240, 330), percent, Layout.BANDS)
+    assert len(bands) == count
+    assert np.sum(bands, axis=0).tolist() == np.ones((15, 21), int).tolist()
+    assert {int(band.sum()) for band in bands} <= {315 // count, -(-315 // count)}
+    assert max(int(np.ptp(np.nonzero(band)[1])) for band in bands) <= 21 // count + 1
+
+
+def test_of_many_narrow_bands_some_are_enough() -> None:
+    bands = regions_of_share((240, 320), 0.1, Layout.BANDS)
+    assert len(bands) == 20
+    assert {int(band.sum()) for band in bands} == {1}
+    assert np.sum(bands, axis=0).max() == 1
 
 
 @pytest.mark.parametrize("percent", [0.0, -1.0, 100.5, float("nan")])
 def test_a_share_that_is_none_is_told(percent: float) -> None:
     with pytest.raises(InvalidInputError, match="region share: expected more than 0 and at most 100"):
-        tiles_of_share((32, 32), percent, Layout.COMPACT)
+        regions_of_share((32, 32), percent, Layout.COMPACT)
 
 
 @pytest.mark.parametrize("text", ["", "0,5", "5,,7", "101", "-1", "nan", "x"])

@@ -135,7 +135,7 @@ def _region_line(cost: RegionCost) -> str:
     return (
         f"  {cost.share_percent:5g} % {cost.layout:<9} {cost.loss:<13} {cost.region.min_ms:8.2f} / "
         f"{cost.region.median_ms:8.2f}   full {cost.full.min_ms:8.2f} / {cost.full.median_ms:8.2f}   "
-        f"ratio {cost.ratio:.3f}"
+        f"ratio {cost.ratio:.3f}, of the work {cost.work_share:.3f}"
     )
 
 

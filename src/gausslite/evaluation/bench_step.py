@@ -42,6 +42,13 @@ class Duration:
         """Minimum and median of these times."""
         return cls(float(np.min(seconds)) * 1e3, float(np.median(seconds)) * 1e3)
 
+    @classmethod
+    def mean(cls, durations: Sequence[Duration]) -> Duration:
+        """Of several things: the mean of their minima, and of their medians."""
+        return cls(
+            float(np.mean([each.min_ms for each in durations])), float(np.mean([each.median_ms for each in durations]))
+        )
+
 
 class RestingStep:
     """Whole iterations with learning rates of zero: the splats stay, so every run does the same work.
