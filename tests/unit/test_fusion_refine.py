@@ -13,6 +13,9 @@ from gausslite.errors import InvalidInputError, QuotaError
 from gausslite.fusion.keyframes import KeyframePool, TeamKeyframe
 from gausslite.fusion.refine import RefineProgress, RefineSettings, refine
 from gausslite.optimize.density import DensitySettings
+from gausslite.optimize.rates import ONLINE_RATES
+from gausslite.render.cpu import CpuRasterizer
+from gausslite.render.rasterizer import AdamSettings
 from gausslite.render.reference import ReferenceRasterizer
 
 CAMERA = Camera(30.0, 30.0, 12.0, 9.0, 24, 18)
@@ -60,6 +63,26 @@ def test_the_same_seed_gives_the_same_map() -> None:
     maps = [refine(patch(0.2), views, ReferenceRasterizer(), QUICK, always) for _ in range(2)]
     assert maps[0].rgb.tobytes() == maps[1].rgb.tobytes()
     assert maps[0].means_m.tobytes() == maps[1].means_m.tobytes()
+
+
+def test_gaussians_come_to_rest_between_views_that_contradict_each_other() -> None:
+    views = [view(1, 200), view(2, 30)]
+    undisturbed = DensitySettings(densify_every=1000, prune_every=1000)
+
+    def last_steps(adam: AdamSettings) -> float:
+        longer, shorter = (
+            refine(
+                patch(0.2),
+                views,
+                CpuRasterizer(1, "portable"),
+                RefineSettings(iterations=iterations, density=undisturbed, adam=adam),
+                always,
+            )
+            for iterations in (204, 200)
+        )
+        return float(np.abs(longer.rgb - shorter.rgb).mean())
+
+    assert last_steps(RefineSettings().adam) < 0.6 * last_steps(ONLINE_RATES)
 
 
 def test_what_stands_in_front_of_the_map_teaches_nothing() -> None:

@@ -20,7 +20,7 @@ from gausslite.errors import InvalidInputError, QuotaError
 from gausslite.fusion.keyframes import TeamKeyframe
 from gausslite.optimize.density import DensitySettings, densify, prune
 from gausslite.optimize.parameters import SplatTable, gaussians_to_rows
-from gausslite.optimize.rates import ONLINE_RATES
+from gausslite.optimize.rates import REFINE_RATES
 from gausslite.render.rasterizer import AdamSettings, LossWeights, Rasterizer, StepReport, Tally, TrainingView
 
 _FOOTPRINT_ALPHA = 0.5
@@ -42,7 +42,7 @@ class RefineSettings:
     report_every: int = 10
     max_prepared_views: int = 48
     loss: LossWeights = field(default_factory=LossWeights)
-    adam: AdamSettings = ONLINE_RATES
+    adam: AdamSettings = REFINE_RATES
     density: DensitySettings = field(default_factory=DensitySettings)
 
     def __post_init__(self) -> None:
