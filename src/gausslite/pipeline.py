@@ -10,6 +10,7 @@ from gausslite.domain.relevance import RelevanceMap
 from gausslite.domain.state import State, nested, part
 from gausslite.domain.subset import VoxelWords
 from gausslite.mapping.coverage import MapSight
+from gausslite.mapping.keyframes import Keyframe
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.pace import FrameBudget, Pace, Relief, Step
 from gausslite.mapping.retask import Reread
@@ -72,6 +73,10 @@ class TaskMapper:
     def gaussians(self) -> Gaussians:
         """A copy of the map."""
         return self._mapper.gaussians()
+
+    def keyframes(self) -> list[Keyframe]:
+        """The keyframes remembered of the whole mission, oldest first."""
+        return self._mapper.keyframes()
 
     def memory_mib(self) -> dict[str, float]:
         """What of the map's memory is reserved or held, in MiB."""

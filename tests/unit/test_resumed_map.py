@@ -81,7 +81,23 @@ def test_the_command_line_goes_on_after_the_last_frame(tmp_path: Path, capsys: p
     capsys.readouterr()
 
 
-@pytest.mark.parametrize("name", ["map.ply", "report.json"])
+def test_what_was_looked_for_is_not_looked_for_again(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    sequence = write_seven_scenes(tmp_path / "kitchen", tuple(range(0, 24, 4)))
+    state = str(tmp_path / "run.state")
+    found = ["--colour-camera", "20,20,7.5,5.5,-0.01,0,0,0,0,0", "--view-error", "0.01,0.5,0.1,0.03"]
+    first = map_command(sequence, tmp_path / "first", "--frames", "0:12", "--save-state", state, *found)
+    assert main(first) == 0
+    capsys.readouterr()
+    rest = map_command(sequence, tmp_path / "rest", "--resume", state, "--colour-camera", "auto")
+    assert main(rest) == 0
+    assert "--colour-camera" not in capsys.readouterr().err
+    report = json.loads((tmp_path / "rest" / "report.json").read_text())
+    assert (report["frames"], report["colour_camera"], report["view_error"]) == (3, found[1], found[3])
+    assert main([*rest, "--view-error", "none"]) == 2
+    assert "--view-error '0.01,0.5,0.1,0.03' (got '0,0,0,0')" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["map.ply", "report.json", "preview.png"])
 def test_a_saved_run_does_not_take_the_place_of_a_result(
     name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

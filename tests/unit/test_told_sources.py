@@ -7,9 +7,11 @@ from pathlib import Path
 import pytest
 from tiny_sequences import write_seven_scenes, write_tum
 
-from gausslite.cli.arguments import open_told
+from gausslite.cli.arguments import believe_told, open_told
+from gausslite.datasets.open import open_source
 from gausslite.datasets.registration import ColourCamera
 from gausslite.mission.options import AS_RECORDED, LOOK
+from gausslite.optimize.view_fit import ViewPrior
 
 CAMERA = ColourCamera.parse("20,20,7.5,5.5,-0.01,0,0")
 
@@ -35,6 +37,34 @@ def test_depth_is_registered_as_asked(tmp_path: Path, capsys: pytest.CaptureFixt
     source, camera = open_told(seven, None, LOOK)
     assert (camera, source.depth_registered) == (None, False)
     assert "--colour-camera none: alignment: expected at least 1000 depth edge points" in capsys.readouterr().err
+
+
+def test_a_program_that_looks_by_default_says_so_and_only_where_it_has_to(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    seven, tum = str(write_seven_scenes(tmp_path / "seq")), str(write_tum(tmp_path / "fr1"))
+    assert open_told(seven, None, None, LOOK)[1] is None
+    looking, found = capsys.readouterr().err.splitlines()
+    assert looking.endswith("; looking for its colour camera now, --colour-camera none takes it as it is")
+    assert found.startswith("--colour-camera none: alignment: expected at least 1000 depth edge points")
+    assert open_told(seven, None, CAMERA, LOOK)[1] == CAMERA
+    for spec, asked in ((seven, AS_RECORDED), (tum, None)):
+        assert open_told(spec, None, asked, LOOK)[1] is None
+    assert capsys.readouterr().err == ""
+
+
+def test_what_is_believed_of_views_is_told_where_it_was_measured(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    tum = write_tum(tmp_path / "fr1")
+    source = open_source(str(tum))
+    said = ViewPrior(0.01, 0.5)
+    assert believe_told(str(tum), source, said) == said
+    assert believe_told("sim:home", source, LOOK).trusts
+    assert capsys.readouterr().err == ""
+    assert believe_told(str(tum), source, LOOK).trusts
+    [line] = capsys.readouterr().err.splitlines()
+    assert line == "--view-error none: 0 pairs of its frames can be compared, too few to tell"
 
 
 def test_images_that_are_left_out_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

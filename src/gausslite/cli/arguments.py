@@ -7,37 +7,57 @@ import sys
 from pathlib import Path
 
 from gausslite.datasets.alignment import find_registration
-from gausslite.datasets.open import open_source
+from gausslite.datasets.open import is_simulated, open_source
 from gausslite.datasets.registration import ColourCamera, RegisteredSource
 from gausslite.datasets.source import Source
 from gausslite.domain.pose import UpAxis
 from gausslite.domain.region import BallRegion, Region
-from gausslite.mission.options import AS_RECORDED, LOOK, add_frames, names, numbers
+from gausslite.mission.options import AS_RECORDED, LOOK, TRUSTED, add_frames, names, numbers
+from gausslite.optimize.view_error import measure_view_error
+from gausslite.optimize.view_fit import ViewPrior
 
 
-def add_source(parser: argparse.ArgumentParser) -> None:
-    """Add SOURCE and what of it is used."""
+def add_source(parser: argparse.ArgumentParser, by_default: str = AS_RECORDED) -> None:
+    """Add SOURCE and what of it is used; by_default as in `add_frames`."""
     parser.add_argument(
         "source",
         metavar="SOURCE",
         help='a folder (TUM, 7-Scenes or Replica layout) or "sim:home?seed=0&trajectory=0", sim:home-1 to sim:home-8',
     )
-    add_frames(parser, may_look=True)
+    add_frames(parser, may_look=True, by_default=by_default)
 
 
 def open_told(
-    spec: str, up_axis: UpAxis | None, colour_camera: ColourCamera | str | None
+    spec: str,
+    up_axis: UpAxis | None,
+    colour_camera: ColourCamera | str | None,
+    by_default: str = AS_RECORDED,
 ) -> tuple[Source, ColourCamera | None]:
     """Open a sequence and tell, on stderr, what a user would not expect of it; the camera that depth is registered to.
 
-    What is asked for may be LOOK, AS_RECORDED or, for as recorded without having said so, None. Raises DatasetError,
-    PoseError, InvalidInputError.
+    What is asked for may be LOOK, AS_RECORDED or None, for nothing; then it is by_default, one of the two. Raises
+    DatasetError, PoseError, InvalidInputError.
     """
+    return register_told(spec, open_recorded(spec, up_axis), colour_camera, by_default)
+
+
+def open_recorded(spec: str, up_axis: UpAxis | None) -> Source:
+    """Open a sequence as it was recorded and tell what is left out of it. Raises DatasetError, InvalidInputError."""
     source = open_source(spec, up_axis)
     if source.left_out:
         print(f"{spec}: {source.left_out}", file=sys.stderr)
+    return source
+
+
+def register_told(
+    spec: str, source: Source, colour_camera: ColourCamera | str | None, by_default: str
+) -> tuple[Source, ColourCamera | None]:
+    """The second half of open_told: bring depth into the colour camera; looking for that takes seconds."""
     if colour_camera is None and not source.depth_registered:
+        colour_camera = by_default
         hint = f"--colour-camera {LOOK} looks for the camera to register it to, {AS_RECORDED} takes it as it is"
+        if by_default == LOOK:
+            hint = f"looking for its colour camera now, --colour-camera {AS_RECORDED} takes it as it is"
         print(f"{spec}: its layout leaves open whether depth is registered to colour; {hint}", file=sys.stderr)
     if colour_camera == LOOK:
         colour_camera, why = find_registration(source)
@@ -45,6 +65,20 @@ def open_told(
     if not isinstance(colour_camera, ColourCamera):
         return source, None
     return RegisteredSource(source, colour_camera), colour_camera
+
+
+def believe_told(spec: str, source: Source, view_error: ViewPrior | str) -> ViewPrior:
+    """How wrong the views may be, as said or, for LOOK, as a recording itself tells; that is told on stderr.
+
+    Poses of a simulated home are exact.
+    """
+    if isinstance(view_error, ViewPrior):
+        return view_error
+    if is_simulated(spec):
+        return ViewPrior()
+    found, why = measure_view_error(source)
+    print(f"--view-error {TRUSTED if found.trusts else found}: {why}", file=sys.stderr)
+    return found
 
 
 def add_regions(parser: argparse.ArgumentParser) -> None:

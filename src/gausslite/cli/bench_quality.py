@@ -146,7 +146,7 @@ def _add_common(parser: argparse.ArgumentParser, seeds: tuple[int, ...], equal: 
     )
     real.add_argument("--kinds", metavar="A,B", type=names, default=(), help="such as mug,chair (default: all in FILE)")
     real.add_argument("--up", metavar="X,Y,Z", type=up_axis, help="its upward direction, if not the source's")
-    add_colour_camera(real, may_look=True, default=LOOK)
+    add_colour_camera(real, may_look=True, by_default=LOOK)
 
 
 def _plans(
@@ -180,7 +180,7 @@ def _real(options: argparse.Namespace) -> tuple[list[RealScenePlan], tuple[int, 
     # what is wrong with the options is told before anything is looked for in the images
     plans = real_plans(options.real, roi, options.frames, options.up, trust=_trust(options, REAL_CAMERA))
     chosen = choose_kinds(plans, options.kinds)
-    source, camera = open_told(str(options.real), options.up, options.colour_camera)
+    source, camera = open_told(str(options.real), options.up, options.colour_camera, LOOK)
     return [replace(plan, colour_camera=camera) for plan in chosen], modest_size(source.camera)
 
 

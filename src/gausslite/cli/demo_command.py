@@ -26,6 +26,7 @@ from gausslite.evaluation.team import TeamScores, Viewpoints, score_team
 from gausslite.fusion.terms import MAX_REFINE_ITERATIONS
 from gausslite.mission.build import open_networks
 from gausslite.mission.options import (
+    LOOK,
     add_budget,
     add_colour_camera,
     add_detector,
@@ -58,7 +59,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--objects", metavar="A,B", type=names, default=(), help="score these (default: the tasks' nouns)"
     )
     parser.add_argument("--size", metavar="WxH", help=f"image size (default: as it is; {_HOME_SIZE} in the home)")
-    add_colour_camera(parser, may_look=True)
+    add_colour_camera(parser, may_look=True, by_default=LOOK)
     add_voxel_size(parser)
     parser.add_argument("--refine-iterations", metavar="N", type=int, default=500, help="0 leaves refinement out")
     add_detector(parser)
@@ -148,7 +149,7 @@ def _simulated_stage(options: argparse.Namespace) -> _Stage:
 
 def _recorded_stage(options: argparse.Namespace) -> _Stage:
     """One sequence in two parts; every eighth frame of each is kept from mapping."""
-    source, camera = open_told(options.source, None, options.colour_camera)
+    source, camera = open_told(options.source, None, options.colour_camera, LOOK)
     middle = source.indices()[len(source) // 2]
     first, second = options.frames_a or f":{middle}", options.frames_b or f"{middle}:"
     size = frame_size(options.size, source)

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from gausslite.cli.arguments import add_regions, add_source, asked_regions, open_told
 from gausslite.cli.progress import progress_bar
 from gausslite.codec.ply import read_ply
+from gausslite.datasets.registration import ColourCamera
 from gausslite.datasets.selection import frame_size, select_frames
 from gausslite.errors import DatasetError
 from gausslite.evaluation.compare import MapScores, average, score_view
@@ -17,20 +19,25 @@ from gausslite.evaluation.fitted import draw_fitted
 from gausslite.evaluation.held_out import HoldOut
 from gausslite.evaluation.pictures import comparison_sheet, write_png
 from gausslite.evaluation.views import MIN_ROI_PIXELS, HeldOutView, MapViewer
-from gausslite.mission.results import as_text, prepare_folder
+from gausslite.mission.options import AS_RECORDED, LOOK, colour_camera
+from gausslite.mission.results import as_text, prepare_folder, read_report
 from gausslite.render.choose import choose_rasterizer
 
 _PICTURES = 8
+_AS_MADE = f"as the report beside MAP says, without one {LOOK}"
+_FIT_AS_MADE = "where the report beside MAP says that views were refined"
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the options of `gausslite eval`."""
     parser.add_argument("map", metavar="MAP", type=Path, help="a PLY file")
-    add_source(parser)
+    add_source(parser, by_default=_AS_MADE)
     add_regions(parser)
     parser.add_argument("--hold-out", metavar="N", type=int, help="score every Nth selected frame only")
     parser.add_argument(
-        "--fit-views", action="store_true", help="fit each view's pose and colours first (for real cameras)"
+        "--fit-views",
+        action=argparse.BooleanOptionalAction,
+        help=f"fit each view's pose and colours first, for real cameras (default: {_FIT_AS_MADE})",
     )
     parser.add_argument("--pictures", metavar="DIR", type=Path, help="write side-by-side pictures of a few views")
     parser.add_argument("--threads", metavar="N", type=int, help="threads (default: all the processor allows)")
@@ -42,7 +49,8 @@ def run(options: argparse.Namespace) -> int:
     """Draw the map from every selected frame with depth, compare, print the means."""
     rasterizer = choose_rasterizer(threads=options.threads)
     gaussians = read_ply(options.map)
-    source, _ = open_told(options.source, options.up, options.colour_camera)
+    made = _MadeWith.of(options)
+    source, _ = open_told(options.source, options.up, made.colour_camera, LOOK)
     positions = select_frames(source, options.frames)
     if options.hold_out is not None:
         positions = HoldOut(options.hold_out).split(positions)[1]
@@ -59,7 +67,7 @@ def run(options: argparse.Namespace) -> int:
         view = HeldOutView.of(source.frame(position, size), chosen)
         if not view.frame.has_depth:
             continue
-        drawn = draw_fitted(viewer, view.frame) if options.fit_views else viewer.draw_frame(view.frame)
+        drawn = draw_fitted(viewer, view.frame) if made.fit_views else viewer.draw_frame(view.frame)
         scores.append(score_view(drawn, view))
         if options.pictures is not None and position in pictured:
             sheet = comparison_sheet(view, {options.map.stem: drawn.rgb})
@@ -67,8 +75,33 @@ def run(options: argparse.Namespace) -> int:
     if not scores:
         raise DatasetError(f"{options.source}: expected a frame with depth, so that its region is known; got none")
     result = average(scores)
-    print(as_text(asdict(result)) if options.json else _as_line(result, bool(chosen)))
+    if options.json:
+        print(as_text({**asdict(result), "fitted": made.fit_views}))
+    else:
+        print(_as_line(result, bool(chosen)) + (", each view's pose and colours fitted" if made.fit_views else ""))
     return 0
+
+
+@dataclass(frozen=True, slots=True)
+class _MadeWith:
+    """How a map is scored: as asked for, or with what the report beside it says that it was made with."""
+
+    colour_camera: ColourCamera | str | None
+    fit_views: bool
+
+    @classmethod
+    def of(cls, options: argparse.Namespace) -> _MadeWith:
+        report, told = read_report(options.map.parent), []
+        camera, fit_views = options.colour_camera, options.fit_views
+        if camera is None and "colour_camera" in report:
+            camera = colour_camera(str(report["colour_camera"] or AS_RECORDED))
+            told += [f"--colour-camera {camera}"] if camera != AS_RECORDED else []
+        if fit_views is None:
+            fit_views = report.get("view_error") is not None
+            told += ["--fit-views"] if fit_views else []
+        if told:
+            print(f"as the report beside {options.map.name} says: {' '.join(told)}", file=sys.stderr)
+        return cls(camera, fit_views)
 
 
 def _shown(positions: Sequence[int], quiet: bool) -> Iterator[int]:

@@ -15,7 +15,7 @@ from gausslite.errors import GaussLiteError
 from gausslite.interrupts import Terminated, started
 
 _COMMANDS = {
-    "map": "map one sequence for one task, write map.ply and report.json",
+    "map": "map one sequence for one task, write map.ply, report.json and preview.png",
     "demo": "run parser, fusion server and two agents as real processes, fuse and score their maps",
     "parse": "read a task sentence into targets, anchors and relations",
     "eval": "score a map on frames of a sequence, inside regions and over the whole image",

@@ -4,10 +4,17 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-from gausslite.cli.arguments import add_regions, add_source, asked_regions, open_told
+from gausslite.cli.arguments import (
+    add_regions,
+    add_source,
+    asked_regions,
+    believe_told,
+    open_recorded,
+    register_told,
+)
 from gausslite.cli.mapping_run import MappingRun, Mission
 from gausslite.cli.parse_command import as_json
 from gausslite.datasets.registration import ColourCamera
@@ -16,22 +23,39 @@ from gausslite.datasets.source import Source
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.task import TaskGraph
 from gausslite.errors import DatasetError, InvalidInputError
+from gausslite.evaluation.held_out import HoldOut
+from gausslite.evaluation.pictures import write_png
+from gausslite.evaluation.preview import preview
+from gausslite.evaluation.views import MapViewer
 from gausslite.mapping.pace import Pace
 from gausslite.mapping.policies import TASK
 from gausslite.mission.build import Attentions, build_attention, build_mapper
-from gausslite.mission.options import add_budget, add_detector, add_policy, mission_settings, perception_settings
-from gausslite.mission.results import peak_rss_mib, prepare_beside, prepare_folder, write_results
+from gausslite.mission.options import (
+    AS_RECORDED,
+    LOOK,
+    TRUSTED,
+    add_budget,
+    add_detector,
+    add_policy,
+    colour_camera,
+    known_view_error,
+    mission_settings,
+    perception_settings,
+)
+from gausslite.mission.results import PREVIEW, peak_rss_mib, prepare_beside, prepare_folder, write_results
 from gausslite.mission.saved_run import RunTerms, SavedRun, save_run
 from gausslite.mission.settings import MissionSettings, SceneKnowledge
 from gausslite.mission.turns import TaskPlan, Turn
+from gausslite.optimize.view_fit import ViewPrior
 from gausslite.perception.attention import Attention
 from gausslite.perception.fixed import NoAttention, RegionAttention
 from gausslite.pipeline import TaskMapper
+from gausslite.render.choose import choose_rasterizer
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the options of `gausslite map`."""
-    add_source(parser)
+    add_source(parser, by_default=LOOK)
     parser.add_argument(
         "--task", metavar="TEXT", help='what the robot is to do, such as "Pick up the mug on the table"'
     )
@@ -44,9 +68,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     add_detector(parser)
     add_regions(parser)
-    add_policy(parser)
+    add_policy(parser, may_look=True)
     add_budget(parser)
-    parser.add_argument("--out", metavar="DIR", type=Path, required=True, help="gets map.ply and report.json")
+    parser.add_argument("--hold-out", metavar="N", type=int, help="keep every Nth frame from mapping, for `eval`")
+    parser.add_argument(
+        "--out", metavar="DIR", type=Path, required=True, help="gets map.ply, report.json and preview.png"
+    )
     add = parser.add_argument_group("save and resume").add_argument
     add("--save-state", metavar="FILE", type=Path, help="save the whole run here at its end, to go on with --resume")
     add("--resume", metavar="FILE", type=Path, help="go on from a saved run, with the frames after its last one")
@@ -56,14 +83,19 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Map the sequence and write the results; whatever can be told before the work is."""
     asked = _Asked.of(options)
-    saved = asked.saved_run(options)
+    saved = None if options.resume is None else SavedRun.read(options.resume)
+    if saved is not None:
+        asked = asked.as_saved(options, saved)
     prepare_folder(options.out)
     if options.save_state is not None:
         prepare_beside(options.save_state, options.out)
     last_index = -1 if saved is None else saved.last_index
     graph = asked.plan.at(last_index)
-    attentions = Attentions(perception_settings(options), lambda: SceneKnowledge.of(asked.source))
-    attention = _region_attention(options, asked.source) if graph is None else attentions.to(graph)
+    recorded = asked.source
+    attentions = Attentions(perception_settings(options), lambda: SceneKnowledge.of(recorded))
+    attention = _region_attention(options, recorded) if graph is None else attentions.to(graph)
+    if saved is None:
+        asked = asked.looked_at(options)
     mapper = TaskMapper(attention, build_mapper(asked.settings), pace=Pace(asked.settings.pace))
     if saved is not None:
         saved.restore(mapper)
@@ -74,9 +106,12 @@ def run(options: argparse.Namespace) -> int:
     gaussians = mapper.gaussians()
     if len(gaussians) == 0 and mission.outcomes and all(each.skipped is not None for each in mission.outcomes):
         raise DatasetError(f"{options.source}: expected frames with depth, got none in {len(mission.outcomes)}")
-    notes = mapper.notes if graph is not None else _unseen_regions(options, mission)
+    notes = (*mapper.notes, *_unseen(options, mission))
     report = {**asked.report(options), **mission.summary(), **_held(mapper, gaussians), "notes": list(notes)}
     write_results(options.out, gaussians, report)
+    if mapper.keyframes():
+        viewer = MapViewer(gaussians, choose_rasterizer(asked.settings.backend, asked.settings.threads))
+        write_png(options.out / PREVIEW, preview(viewer, mapper.keyframes()))
     if options.save_state is not None:
         last_index = mission.outcomes[-1].index if mission.outcomes else last_index
         save_run(options.save_state, mapper, asked.terms(options, last_index), last_index)
@@ -86,7 +121,7 @@ def run(options: argparse.Namespace) -> int:
     skipped = f" ({report['frames_skipped']} skipped, without depth)" if report["frames_skipped"] else ""
     print(
         f"{report['frames']} frames{skipped} at {report['hz']:.1f} Hz, {len(gaussians)} Gaussians "
-        f"({report['active_gaussians']} of the task) → {options.out / 'map.ply'}"
+        f"({report['active_gaussians']} of the task) → {options.out / 'map.ply'}; look at {PREVIEW} beside it"
     )
     for note in notes:
         print(f"  {note}")
@@ -95,7 +130,10 @@ def run(options: argparse.Namespace) -> int:
 
 @dataclass(frozen=True, slots=True)
 class _Asked:
-    """What the command line asks for, as far as it can be known without drawing, loading or training anything."""
+    """What the command line asks for, as far as it can be known without drawing, loading or training anything.
+
+    Views are trusted and frames are as recorded until the sequence is looked at, which takes seconds.
+    """
 
     settings: MissionSettings
     source: Source
@@ -108,17 +146,32 @@ class _Asked:
     def of(cls, options: argparse.Namespace) -> _Asked:
         settings = mission_settings(options)
         plan = _plan(asked_task(options), [Turn.parse(text) for text in options.then])
-        source, camera = open_told(options.source, options.up, options.colour_camera)
+        source = open_recorded(options.source, options.up)
         positions, size = select_frames(source, options.frames), frame_size(options.size, source)
-        return cls(settings, source, positions, size, plan, camera)
+        if options.hold_out is not None:
+            positions, _ = HoldOut(options.hold_out).split(positions)
+        return cls(settings, source, positions, size, plan, None)
 
-    def saved_run(self, options: argparse.Namespace) -> SavedRun | None:
-        """The run of --resume. Raises MapFileError, MismatchError when it was begun on other terms."""
-        if options.resume is None:
-            return None
-        saved = SavedRun.read(options.resume)
-        saved.require(self.terms(options, saved.last_index))
-        return saved
+    def looked_at(
+        self, options: argparse.Namespace, camera: ColourCamera | str | None = None, view_error: ViewPrior | None = None
+    ) -> _Asked:
+        """With the camera and trust that are asked for, or given here; what is neither is looked for in the frames."""
+        given = options.colour_camera if camera is None else camera
+        source, registered_to = register_told(options.source, self.source, given, LOOK)
+        believed = believe_told(options.source, source, options.view_error if view_error is None else view_error)
+        settings = replace(self.settings, view_prior=believed)
+        return replace(self, settings=settings, source=source, colour_camera=registered_to)
+
+    def as_saved(self, options: argparse.Namespace, saved: SavedRun) -> _Asked:
+        """looked_at, where what was found is that of a saved run. Raises MismatchError where it had other terms."""
+        camera, view_error = None, None
+        if options.colour_camera in (None, LOOK):
+            camera = colour_camera(saved.terms.options.get("colour_camera") or AS_RECORDED)
+        if options.view_error == LOOK:
+            view_error = known_view_error(saved.terms.options.get("view_error") or TRUSTED)
+        asked = self.looked_at(options, camera, view_error)
+        saved.require(asked.terms(options, saved.last_index))
+        return asked
 
     def terms(self, options: argparse.Namespace, last_index: int) -> RunTerms:
         """What must be the same when a run goes on after the frame of this number."""
@@ -132,6 +185,7 @@ class _Asked:
             **{name: _file_name(getattr(options, name)) for name in ("detector", "segmenter", "vocabulary", "roi")},
             resegment="yes" if options.resegment else "",
             objects=",".join(options.objects),
+            hold_out="" if options.hold_out is None else str(options.hold_out),
             roi_ball=" ".join(f"{','.join(map(str, ball.centre_m))},{ball.radius_m}" for ball in options.roi_ball),
         )
 
@@ -146,6 +200,7 @@ class _Asked:
         return {
             "source": options.source,
             "colour_camera": None if self.colour_camera is None else str(self.colour_camera),
+            "view_error": None if self.settings.view_prior.trusts else str(self.settings.view_prior),
             "task": None if first is None else {"text": first.text, **as_json(first)},
             "then": [{"frame": frame, "text": later.text, **as_json(later)} for frame, later in self.plan.turns],
             "policy": options.policy,
@@ -153,6 +208,7 @@ class _Asked:
             "size": list(self.size),
             "seed": self.settings.seed,
             "max_gaussians": self.settings.max_gaussians,
+            "hold_out": options.hold_out,
             "resumed_from": None if options.resume is None else str(options.resume),
         }
 
@@ -162,10 +218,13 @@ def _file_name(path: Path | str | None) -> str:
     return "" if path is None else Path(path).name
 
 
-def _unseen_regions(options: argparse.Namespace, mission: Mission) -> tuple[str, ...]:
-    """What to tell of regions of space that were asked for and never seen."""
-    seen = any(outcome.roi_share > 0 for outcome in mission.outcomes)
-    if seen or not (options.roi or options.objects or options.roi_ball):
+def _unseen(options: argparse.Namespace, mission: Mission) -> tuple[str, ...]:
+    """What to tell of a task, or of regions of space, of which nothing was ever seen."""
+    if any(outcome.roi_share > 0 for outcome in mission.outcomes):
+        return ()
+    if options.task is not None:
+        return ("nothing that the task is about was found in any of these frames",)
+    if not (options.roi or options.objects or options.roi_ball):
         return ()
     return ("none of these frames shows the region that was asked for; is it of another sequence, or in other units?",)
 

@@ -11,15 +11,13 @@ import numpy as np
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import inverse
 from gausslite.evaluation.views import MapViewer
-from gausslite.optimize.view_fit import ViewPrior, fit_colour, fit_pose
+from gausslite.optimize.view_fit import HAND_HELD, ViewPrior, fit_colour, fit_pose
 from gausslite.render.rasterizer import Rendering
 
-FIT_PRIOR = ViewPrior(translation_m=0.03, rotation_deg=1.0, gain=0.2, offset=0.06)
-"""Wide enough for a hand-held camera without a tracker of its own; a map cannot explain itself by more."""
 _ROUNDS = 4
 
 
-def draw_fitted(viewer: MapViewer, frame: Frame, prior: ViewPrior = FIT_PRIOR) -> Rendering:
+def draw_fitted(viewer: MapViewer, frame: Frame, prior: ViewPrior = HAND_HELD) -> Rendering:
     """The map from the pose that fits the frame, in its colours; of all rounds the one nearest to the frame.
 
     The first candidate is the unfitted drawing, so over the whole image the answer is never worse than that.

@@ -52,6 +52,17 @@ def comparison_sheet(view: HeldOutView, drawings: Mapping[str, Float32[ndarray, 
     return grid(rows)
 
 
+def side_by_side(
+    photograph: UInt8[ndarray, "h w 3"], drawing: Float32[ndarray, "h w 3"], roi: Bool[ndarray, "h w"], label: str
+) -> list[UInt8[ndarray, "H W 3"]]:
+    """A row for a grid: the photograph with the region outlined, the map from there, and its largest piece in both."""
+    pair = ((photograph, label), (as_bytes(drawing), "map"))
+    row = [cell(outlined(image, roi), name) for image, name in pair]
+    for piece in _telling_pieces(roi)[:1]:
+        row += [cell(_crop(image, piece), f"{name}: detail") for image, name in pair]
+    return row
+
+
 def write_png(path: Path, image: UInt8[ndarray, "h w 3"]) -> None:
     """Write an RGB image as PNG. Raises StorageError naming the file."""
     import cv2

@@ -48,10 +48,15 @@ class HeldOutView:
 
 def most_telling(views: Sequence[HeldOutView], count: int) -> set[int]:
     """From each of `count` stretches of the sequence, the view with the largest region."""
+    return largest_of_stretches([int(np.count_nonzero(view.roi)) for view in views], count)
+
+
+def largest_of_stretches(roi_pixels: Sequence[int], count: int) -> set[int]:
+    """The largest region's position in each of `count` stretches; passes over those too small to judge, if it can."""
     if count < 1:
         return set()
-    pixels = np.array([np.count_nonzero(view.roi) for view in views])
-    stretches = [part for part in np.array_split(np.arange(len(views)), count) if len(part)]
+    pixels = np.array(roi_pixels)
+    stretches = [part for part in np.array_split(np.arange(len(pixels)), count) if len(part)]
     best = {int(part[np.argmax(pixels[part])]) for part in stretches}
     return {i for i in best if pixels[i] >= MIN_ROI_PIXELS} or best
 

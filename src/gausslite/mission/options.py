@@ -17,6 +17,7 @@ from gausslite.render.choose import BACKENDS
 _DETECTOR_HELP = "a YOLO-seg or Grounding DINO model (default: the source's ground truth)"
 _TRUSTED = ViewPrior()
 LOOK, AS_RECORDED = "auto", "none"
+TRUSTED = AS_RECORDED
 _COLOUR_CAMERA_METAVAR = "FX,FY,CX,CY[,TX,TY,TZ[,RX,RY,RZ]]"
 _COLOUR_CAMERA_HELP = (
     "register depth to this camera (pixels as data sets count); then where the depth camera sits seen from it "
@@ -26,30 +27,38 @@ _LOOK_HELP = (
     "; none: as recorded; auto: found from the images' edges where the layout does not register depth, such as "
     "7-Scenes (default: {})"
 )
+_VIEW_ERROR_METAVAR = "M,DEG[,GAIN,OFFSET]"
+_VIEW_ERROR_HELP = (
+    "how wrong poses (and colours, from 0 to 1) may be; keyframes are refined within that; none: they are trusted{} "
+    "(default: {})"
+)
+_MEASURE_HELP = "; auto: measured on pairs of a recording's frames"
 _RELIEF_HELP = "what gives way, in order, where that time is short (default: words,seeding)"
 _RUN_OVER_HELP = "by what share of its time a frame that is short of them may be late (default: %(default)s)"
 
 
-def add_frames(parser: argparse.ArgumentParser, may_look: bool = False) -> None:
+def add_frames(parser: argparse.ArgumentParser, may_look: bool = False, by_default: str = AS_RECORDED) -> None:
     """Add --frames, --size, --up and --colour-camera: what of a sequence is used, and how its cameras stand."""
     add = parser.add_argument_group("frames").add_argument
     add("--frames", metavar="START:STOP:STEP", default=":", help="frame numbers to use (default: all)")
     add("--size", metavar="WxH", help="resize images to this size (default: as they are)")
     add("--up", metavar="X,Y,Z", type=up_axis, help="the world's upward direction, if not the source's")
-    add_colour_camera(parser, may_look)
+    add_colour_camera(parser, may_look, by_default)
 
 
-def add_colour_camera(parser: argparse._ActionsContainer, may_look: bool = False, default: str | None = None) -> None:
+def add_colour_camera(
+    parser: argparse._ActionsContainer, may_look: bool = False, by_default: str = AS_RECORDED
+) -> None:
     """Add --colour-camera, for sequences whose depth is not registered to colour.
 
-    may_look: "auto" and "none" are answers too, for programs that can look at the whole sequence first.
+    may_look: "auto" and "none" are answers too, for programs that can look at the whole sequence first. by_default says
+    in the help what the program does where nothing is asked for, which is None.
     """
     parser.add_argument(
         "--colour-camera",
         metavar=f"{LOOK}|{AS_RECORDED}|{_COLOUR_CAMERA_METAVAR}" if may_look else _COLOUR_CAMERA_METAVAR,
         type=colour_camera if may_look else ColourCamera.parse,
-        default=default,
-        help=_COLOUR_CAMERA_HELP + (_LOOK_HELP.format(default or AS_RECORDED) if may_look else ""),
+        help=_COLOUR_CAMERA_HELP + (_LOOK_HELP.format(by_default) if may_look else ""),
     )
 
 
@@ -62,25 +71,34 @@ def add_detector(parser: argparse.ArgumentParser) -> None:
     add("--resegment", action="store_true", help="cut boxes out anew on every frame (slower)")
 
 
-def add_policy(parser: argparse.ArgumentParser) -> None:
-    """Add --policy, --without, --view-error and --rasterizer: how the map is made."""
+def add_policy(parser: argparse.ArgumentParser, may_look: bool = False) -> None:
+    """Add --policy, --without, --view-error and --rasterizer: how the map is made.
+
+    may_look: what is believed of views is measured on the sequence unless it is said, for programs that have it whole.
+    """
     add = parser.add_argument_group("mapping").add_argument
     add("--policy", choices=sorted(POLICIES), default="task", help="how to spend the budget (default: task)")
     add("--without", metavar="A,B", type=names, default=(), help=f"parts of the policy off: {' '.join(SWITCHES)}")
     add("--rasterizer", choices=BACKENDS, default="auto", help="what draws and trains the map (default: auto)")
-    add_view_error(parser)
+    if may_look:
+        add_view_error(parser, LOOK, LOOK, may_look)
+    else:
+        add_view_error(parser)
 
 
 def add_view_error(
-    parser: argparse.ArgumentParser, default: ViewPrior | None = _TRUSTED, shown: str = "trusted"
+    parser: argparse.ArgumentParser,
+    default: ViewPrior | str | None = _TRUSTED,
+    shown: str = TRUSTED,
+    may_look: bool = False,
 ) -> None:
     """Add --view-error, for cameras whose poses and colours cannot be trusted to the pixel; shown tells the default."""
     parser.add_argument(
         "--view-error",
-        metavar="M,DEG[,GAIN,OFFSET]",
-        type=ViewPrior.parse,
+        metavar=f"{LOOK}|{TRUSTED}|{_VIEW_ERROR_METAVAR}" if may_look else f"{TRUSTED}|{_VIEW_ERROR_METAVAR}",
+        type=view_error if may_look else known_view_error,
         default=default,
-        help=f"how wrong poses (and colours, from 0 to 1) may be; keyframes are refined within that (default: {shown})",
+        help=_VIEW_ERROR_HELP.format(_MEASURE_HELP if may_look else "", shown),
     )
 
 
@@ -122,7 +140,7 @@ def perception_settings(options: argparse.Namespace) -> PerceptionSettings:
 
 
 def mission_settings(options: argparse.Namespace) -> MissionSettings:
-    """What add_policy and add_budget asked for. Raises InvalidInputError."""
+    """What add_policy and add_budget asked for; views to be looked at are trusted so far. Raises InvalidInputError."""
     return MissionSettings(
         policy=options.policy,
         without=frozenset(options.without),
@@ -135,7 +153,7 @@ def mission_settings(options: argparse.Namespace) -> MissionSettings:
         seed=options.seed,
         threads=options.threads,
         backend=options.rasterizer,
-        view_prior=options.view_error,
+        view_prior=options.view_error if isinstance(options.view_error, ViewPrior) else _TRUSTED,
     )
 
 
@@ -162,6 +180,16 @@ def up_axis(text: str) -> UpAxis:
 def colour_camera(text: str) -> ColourCamera | str:
     """Read LOOK, AS_RECORDED or a camera. Raises InvalidInputError."""
     return text if text in (LOOK, AS_RECORDED) else ColourCamera.parse(text)
+
+
+def view_error(text: str) -> ViewPrior | str:
+    """Read LOOK, or what known_view_error does. Raises InvalidInputError."""
+    return text if text == LOOK else known_view_error(text)
+
+
+def known_view_error(text: str) -> ViewPrior:
+    """Read TRUSTED or numbers. Raises InvalidInputError."""
+    return _TRUSTED if text == TRUSTED else ViewPrior.parse(text)
 
 
 def numbers(text: str, count: int) -> list[float]:

@@ -15,6 +15,7 @@ from gausslite.domain.gaussians import Gaussians
 from gausslite.errors import StorageError
 
 _MAP, _REPORT = "map.ply", "report.json"
+PREVIEW = "preview.png"
 
 
 def prepare_folder(folder: Path) -> None:
@@ -38,7 +39,7 @@ def prepare_file(path: Path) -> None:
 
 def prepare_beside(path: Path, folder: Path) -> None:
     """prepare_file for one that must not take the place of this folder's results. Raises StorageError."""
-    if path.resolve() in {(folder / name).resolve() for name in (_MAP, _REPORT)}:
+    if path.resolve() in {(folder / name).resolve() for name in (_MAP, _REPORT, PREVIEW)}:
         raise StorageError(f"{path}: expected a name of its own, got that of a result of {folder}")
     prepare_file(path)
 
@@ -47,6 +48,15 @@ def write_results(folder: Path, gaussians: Gaussians, report: Mapping[str, objec
     """Write map.ply and report.json. Raises StorageError."""
     write_ply(folder / _MAP, gaussians)
     write_json(folder / _REPORT, report)
+
+
+def read_report(folder: Path) -> Mapping[str, object]:
+    """The report that a program left here; empty where there is none, or something else by its name."""
+    try:
+        report = json.loads((folder / _REPORT).read_bytes())
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return report if isinstance(report, dict) else {}
 
 
 def write_json(path: Path, report: Mapping[str, object]) -> None:

@@ -27,7 +27,7 @@ _COLOUR_BLUR_PX = 4.0
 _STEPS_PER_BLUR = 3
 _MOST_PIXELS, _FEWEST_PIXELS = 12_000, 200
 _CLOSED_ALPHA = 0.8
-_SAME_SURFACE = 0.05
+SAME_SURFACE = 0.05
 """What is drawn within this fraction of the measured depth is the surface the photograph shows."""
 _INDEPENDENT_PX = 64.0
 """Residuals of neighbouring pixels agree: one in a cell of 8x8 counts against the prior."""
@@ -92,6 +92,10 @@ class ViewPrior:
         return self.gain > 0 or self.offset > 0
 
 
+HAND_HELD = ViewPrior(translation_m=0.03, rotation_deg=1.0, gain=0.2, offset=0.06)
+"""Wide enough for a hand-held camera without a tracker of its own; a map cannot explain itself by more."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class ColourAffine:
     """photograph = gain · map + offset in each channel, for colours in [0, 1]."""
@@ -117,7 +121,7 @@ SAME_COLOUR = ColourAffine(np.ones(3), np.zeros(3))
 
 def fit_colour(drawn: Rendering, frame: Frame, prior: ViewPrior) -> ColourAffine:
     """The colour that brings the drawn image nearest to the frame's, where the map is closed."""
-    pixels = _agreeing_pixels(drawn, frame)
+    pixels = agreeing_pixels(drawn, frame)
     if not prior.colours or len(pixels) < _FEWEST_PIXELS:
         return SAME_COLOUR
     # detail that the map lacks would pull the gain below 1
@@ -139,7 +143,7 @@ def fit_pose(
 
     The prior holds the answer near frame.T_world_camera; the search starts at the pose drawn.
     """
-    pixels = _agreeing_pixels(drawn, frame)
+    pixels = agreeing_pixels(drawn, frame)
     if not prior.moves or len(pixels) < _FEWEST_PIXELS:
         return frame.T_world_camera
     points = back_project(drawn.expected_depth_m(_CLOSED_ALPHA), frame.camera).reshape(-1, 3)[pixels]
@@ -150,10 +154,10 @@ def fit_pose(
         images = _Images.of(drawn, frame, pixels, blur_px)
         for _ in range(_STEPS_PER_BLUR):
             jacobian, residual = _linearise(images, points, T_camera_drawn, frame.camera)
-            strayed = np.append(_twist(T_camera_drawn @ T_drawn_said), (0.0, 0.0))
+            strayed = np.append(twist(T_camera_drawn @ T_drawn_said), (0.0, 0.0))
             change = _least_squares(-jacobian, residual, strayed, deviations, _pixel_share(drawn))
             T_camera_drawn = _exponential(change[:6]) @ T_camera_drawn
-    strayed = _twist(T_camera_drawn @ T_drawn_said)
+    strayed = twist(T_camera_drawn @ T_drawn_said)
     strayed[:3] *= _trust(prior.translation_m, _FIT_TRANSLATION_M)
     strayed[3:] *= _trust(prior.rotation_deg, _FIT_ROTATION_DEG)
     T_world_camera: Float64[ndarray, "4 4"] = frame.T_world_camera @ inverse(_exponential(strayed))
@@ -186,14 +190,14 @@ class _Images:
         return cls(model.ravel()[pixels].astype(np.float64), np.stack([photograph, dx, dy], axis=2))
 
 
-def _agreeing_pixels(drawn: Rendering, frame: Frame) -> Int64[ndarray, " n"]:
+def agreeing_pixels(drawn: Rendering, frame: Frame) -> Int64[ndarray, " n"]:
     """Of an even grid of at most _MOST_PIXELS pixels those where the map is closed and has the depth measured."""
     height, width = drawn.alpha.shape
     stride = int(np.ceil(np.sqrt(height * width / _MOST_PIXELS)))
     grid = np.zeros((height, width), np.bool_)
     grid[stride // 2 :: stride, stride // 2 :: stride] = True
     apart_m = np.abs(drawn.expected_depth_m(_CLOSED_ALPHA) - frame.depth_m)
-    return np.flatnonzero(grid & (drawn.alpha > _CLOSED_ALPHA) & (apart_m < _SAME_SURFACE * frame.depth_m))
+    return np.flatnonzero(grid & (drawn.alpha > _CLOSED_ALPHA) & (apart_m < SAME_SURFACE * frame.depth_m))
 
 
 def _pixel_share(drawn: Rendering) -> float:
@@ -249,7 +253,7 @@ def _least_squares(
     return change
 
 
-def _twist(T: Float64[ndarray, "4 4"]) -> Float64[ndarray, "6"]:
+def twist(T: Float64[ndarray, "4 4"]) -> Float64[ndarray, "6"]:
     """Translation and rotation vector of a small motion."""
     return np.concatenate([T[:3, 3], cv2.Rodrigues(T[:3, :3])[0].ravel()])
 
