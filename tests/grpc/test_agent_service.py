@@ -155,7 +155,7 @@ def test_a_view_shows_the_map() -> None:
 
 @pytest.mark.parametrize(
     ("camera", "T_world_camera"),
-    [(Camera(1.0, 1.0, 1.0, 1.0, 16384, 16384), np.eye(4)), (CAMERA, np.full((4, 4), np.nan)), (CAMERA, np.eye(3))],
+    [(Camera(1e4, 1e4, 1.0, 1.0, 16384, 16384), np.eye(4)), (CAMERA, np.full((4, 4), np.nan)), (CAMERA, np.eye(3))],
 )
 def test_a_view_from_nowhere_is_refused(camera: Camera, T_world_camera: np.ndarray) -> None:
     request = pb.RenderViewRequest(

@@ -102,6 +102,8 @@ def bomb_png(width: int, height: int) -> bytes:
         ("depth_png", encode_depth(np.ones((24, 32), np.float32)), "got 32x24"),
         ("camera", geometry_pb2.Camera(), "camera"),
         ("camera", geometry_pb2.Camera(fx_px=1, fy_px=1, width_px=9000, height_px=9000), "pixels"),
+        ("camera", geometry_pb2.Camera(fx_px=1e-9, fy_px=1, width_px=64, height_px=48), "camera fx_px"),
+        ("camera", geometry_pb2.Camera(fx_px=1, fy_px=1, cy_px=1e30, width_px=64, height_px=48), "camera fy_px"),
         ("t_world_camera", geometry_pb2.RigidTransform(row_major=[1.0]), "16 numbers"),
     ],
 )
@@ -118,6 +120,14 @@ def test_a_pose_that_is_not_rigid_is_refused(value: float) -> None:
     encoded = convert.frame_to_message(some_frame())
     encoded.t_world_camera.row_major[0] = value
     with pytest.raises(PoseError, match="t_world_camera"):
+        convert.frame_from_message(encoded)
+
+
+@pytest.mark.parametrize("value", [4_649_776.0, -1e12, 1e300])
+def test_a_pose_too_far_from_the_worlds_origin_is_refused(value: float) -> None:
+    encoded = convert.frame_to_message(some_frame())
+    encoded.t_world_camera.row_major[7] = value
+    with pytest.raises(PoseError, match="within 10000 m of the world's origin"):
         convert.frame_from_message(encoded)
 
 

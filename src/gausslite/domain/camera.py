@@ -15,6 +15,8 @@ from numpy import ndarray
 from gausslite.errors import InvalidInputError
 
 _MAX_SIDE_PX = 16384
+_MAX_SLOPE = 100.0
+"""Of a ray against the optical axis, 89.4 degrees: what lies beyond is no pinhole, and its points lie anywhere."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,6 +43,13 @@ class Camera:
             value = getattr(self, name)
             if not 1 <= value <= _MAX_SIDE_PX:
                 raise InvalidInputError(f"camera {name}: expected 1 to {_MAX_SIDE_PX}, got {value}")
+        for axis, side_px in (("x", self.width_px), ("y", self.height_px)):
+            focal_px, centre_px = getattr(self, f"f{axis}_px"), getattr(self, f"c{axis}_px")
+            if max(abs(centre_px), abs(side_px - centre_px)) > _MAX_SLOPE * focal_px:
+                raise InvalidInputError(
+                    f"camera f{axis}_px: expected rays within a slope of {_MAX_SLOPE:g}, "
+                    f"got {focal_px} with c{axis}_px {centre_px} and {side_px} pixels"
+                )
 
     def resized(self, width_px: int, height_px: int) -> Camera:
         """The same camera for an image scaled to this size."""
