@@ -99,9 +99,9 @@ class TaskMapper:
         if self._ledger is not None and words:
             self._ledger.restore(words)
 
-    def process(self, frame: Frame) -> FrameOutcome:
-        """Take one frame from its pixels to the words on its region."""
-        self._pace.begin()
+    def process(self, frame: Frame, waited_s: float = 0.0) -> FrameOutcome:
+        """Take one frame, which has waited this long for its turn, from its pixels to the words on its region."""
+        self._pace.begin(waited_s)
         sight = self._look(frame)
         relevance = self._attend(frame, sight)
         lag_frames = self._catch_up()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sqlite3
 import threading
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -50,6 +51,32 @@ def test_a_queue_may_drop_the_newest_frame_instead() -> None:
     robot.close()
     assert outcomes == [Outcome.MAPPED, Outcome.MAPPED, Outcome.MAPPED, Outcome.DROPPED, Outcome.DROPPED]
     assert "overload: 2 frames were dropped" in robot.status().load_notes
+
+
+def test_a_waiting_frame_nobody_asks_for_any_more_gives_way_like_any_other() -> None:
+    gate = Gate(ball_attention(RuleParser().parse(TASK)), threading.Event())
+    robot = Robot(SETTINGS, GRID, lambda _graph: gate, load=LoadSettings(queue_frames=1))
+    robot.assign(RuleParser().parse(TASK)).result(20)
+    first = robot.submit(frame(0))
+    assert gate.reached.wait(20)
+    given_up = robot.submit(frame(1))
+    given_up.cancel()
+    last = robot.submit(frame(2))
+    gate.opened.set()
+    assert (first.result(20).outcome, given_up.result(20).outcome) == (Outcome.MAPPED, Outcome.DROPPED)
+    assert last.result(20).outcome == Outcome.MAPPED
+    robot.close()
+
+
+def test_a_frame_that_has_waited_has_less_time_so_that_the_queue_gets_shorter() -> None:
+    robot = Robot(replace(SETTINGS, rate_hz=5.0, least_iterations=0, run_over=1.0), GRID, ball_attention)
+    robot.assign(RuleParser().parse(TASK)).result(20)
+    busy = threading.Event()
+    robot.do(lambda _mapper: busy.wait(20))
+    waited = robot.submit(frame(0))
+    threading.Timer(0.2, busy.set).start()
+    assert waited.result(20).iterations == 0
+    robot.close()
 
 
 def after_a_frame(robot: Robot) -> Gaussians:

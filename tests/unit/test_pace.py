@@ -28,9 +28,11 @@ class WorkClock:
         self.now_s += seconds
 
 
-def run_frame(pace: Pace, clock: WorkClock, costs: dict[Step, float], counted: int = 8) -> tuple[FrameBudget, int]:
+def run_frame(
+    pace: Pace, clock: WorkClock, costs: dict[Step, float], counted: int = 8, waited_s: float = 0.0
+) -> tuple[FrameBudget, int]:
     """One frame whose steps cost this much; every fourth iteration is a warm-up."""
-    pace.begin()
+    pace.begin(waited_s)
     if not pace.spares(Relief.SEEDING):
         for step in (Step.DRAWING, Step.SEEDING):
             with pace.timing(step):
@@ -198,6 +200,21 @@ def test_what_a_frame_ran_over_is_given_back_by_the_next_ones() -> None:
     assert not any(budget.short for budget in budgets)
     # and without that share the same frame trains too little
     assert surprised([50.0], run_over=0.0)[0].short
+
+
+def test_what_a_stall_has_left_waiting_is_made_up_by_the_share_that_may_be_run_over() -> None:
+    clock, costs = WorkClock(), {**CHEAP, Step.WARM_UP: ITERATION_S, Step.ACTIVE: ITERATION_S}
+    pace = Pace(PaceSettings(FRAME_S, 15, reliefs=(), run_over=RUN_OVER_S / FRAME_S), clock)
+    run_frame(pace, clock, costs)
+    came_s = [clock.now_s + i * FRAME_S for i in range(40)]
+    clock.work(3 * FRAME_S)
+    waited_s = []
+    for each_s in came_s:
+        clock.work(max(0.0, each_s - clock.now_s))
+        waited_s.append(clock.now_s - each_s)
+        assert not run_frame(pace, clock, costs, waited_s=waited_s[-1])[0].short
+    assert waited_s[1:16] == sorted(waited_s[1:16], reverse=True)
+    assert max(waited_s[20:]) <= ITERATION_S
 
 
 def test_a_frame_runs_over_for_its_least_iterations_alone() -> None:

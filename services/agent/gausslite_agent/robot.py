@@ -14,7 +14,7 @@ from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TypeVar
 
@@ -39,6 +39,22 @@ from gausslite_agent.status import FrameReport, Outcome, RobotStatus
 
 _log = logging.getLogger(__name__)
 _Result = TypeVar("_Result")
+
+
+def _promise() -> Future[FrameReport]:
+    """A report to come, whether or not the one who waits for it gives up."""
+    future: Future[FrameReport] = Future()
+    future.set_running_or_notify_cancel()
+    return future
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Waiting:
+    """A frame in the queue, its report to come, and since when it waits."""
+
+    frame: Frame
+    future: Future[FrameReport] = field(default_factory=_promise)
+    since_s: float = field(default_factory=time.monotonic)
 
 
 class Robot:
@@ -67,7 +83,7 @@ class Robot:
         # revisions of an earlier life must not be taken for ones of this
         self._first_revision = time.time_ns() // 1000
         self._status = RobotStatus(map_revision=self._first_revision)
-        self._waiting: deque[tuple[Frame, Future[FrameReport]]] = deque()
+        self._waiting: deque[_Waiting] = deque()
         # guards the status and the queue
         self._lock = threading.Lock()
         self._worker = ThreadPoolExecutor(1, "mapper")
@@ -105,14 +121,14 @@ class Robot:
         with self._lock:
             if self._status.graph is None:
                 raise MismatchError("frames: expected a task first, got none yet; call AssignTask")
-            future: Future[FrameReport] = Future()
-            self._waiting.append((frame, future))
+            come = _Waiting(frame)
+            self._waiting.append(come)
             dropped = self._overflow()
         if dropped is not None:
             reason = f"the queue of {self._load.queue_frames} frames was full; the {self._load.drops} gave way"
-            dropped[1].set_result(self._count(FrameReport(dropped[0].index, Outcome.DROPPED, reason)))
+            dropped.future.set_result(self._count(FrameReport(dropped.frame.index, Outcome.DROPPED, reason)))
         self._start(self._map_next)
-        return future
+        return come.future
 
     def reject(self, index: int, reason: str) -> FrameReport:
         """Count a frame that was none."""
@@ -138,10 +154,10 @@ class Robot:
         """End the worker after the frame it is at; frames that wait are dropped."""
         self._worker.shutdown(wait=True, cancel_futures=True)
         while self._waiting:
-            frame, future = self._waiting.popleft()
-            future.set_result(self._count(FrameReport(frame.index, Outcome.DROPPED, "the agent is ending")))
+            left = self._waiting.popleft()
+            left.future.set_result(self._count(FrameReport(left.frame.index, Outcome.DROPPED, "the agent is ending")))
 
-    def _overflow(self) -> tuple[Frame, Future[FrameReport]] | None:
+    def _overflow(self) -> _Waiting | None:
         """The frame that is one too many for the queue; the lock is held."""
         if len(self._waiting) <= self._load.queue_frames:
             return None
@@ -190,15 +206,15 @@ class Robot:
         with self._lock:
             if not self._waiting:
                 return
-            frame, future = self._waiting.popleft()
+            next_one = self._waiting.popleft()
         try:
-            future.set_result(self._map(frame))
+            next_one.future.set_result(self._map(next_one))
         except InvalidInputError as error:
-            # such as a pose so far off that its voxels have no numbers: the frames after it may be fine
-            future.set_result(self.reject(frame.index, str(error)))
+            # the frames after it may be fine
+            next_one.future.set_result(self.reject(next_one.frame.index, str(error)))
         except Exception as error:
             # the one who waits for this frame is told; the worker goes on
-            future.set_exception(error)
+            next_one.future.set_exception(error)
         self._rehearsals_left = self._load.idle_iterations
         if not self._resting and self._rehearsals_left > 0:
             self._rest()
@@ -228,9 +244,10 @@ class Robot:
         self._untold = False
         self._tell(self._task_mapper.words())
 
-    def _map(self, frame: Frame) -> FrameReport:
+    def _map(self, come: _Waiting) -> FrameReport:
         assert self._task_mapper is not None
-        done = self._task_mapper.process(frame)
+        frame = come.frame
+        done = self._task_mapper.process(frame, time.monotonic() - come.since_s)
         self._last_index = frame.index
         with self._lock:
             self._status = replace(self._status, notes=self._task_mapper.notes)

@@ -94,8 +94,9 @@ class FrameBudget:
 class Pace:
     """Tells one frame after the other what it has time for. With settings None iterations are counted instead.
 
-    A frame is due once the time of a frame has passed, less what those before it are behind. Time between two frames
-    makes up for nothing. What a frame is late by beyond the share that it may run over is forgiven: the rate suffers.
+    A frame is due once the time of a frame has passed, less what those before it are behind, or less the time that it
+    has waited for its turn. Time between two frames makes up for nothing. What a frame is late by beyond the share that
+    it may run over is forgiven: the rate suffers.
     """
 
     def __init__(self, settings: PaceSettings | None = None, clock: Clock = time.perf_counter) -> None:
@@ -110,8 +111,11 @@ class Pace:
         self._behind_s = 0.0
         self._training_due_s = 0.0
 
-    def begin(self) -> None:
-        """A frame has come: its time runs from now, and what it goes without is decided."""
+    def begin(self, waited_s: float = 0.0) -> None:
+        """It is a frame's turn: its time runs from now, and what it goes without is decided.
+
+        waited_s is how long it has been there: frames that wait get less, or a queue would never grow shorter.
+        """
         for step in Step:
             if step not in self._steps_s:
                 self._forecasts[step].fade()
@@ -119,6 +123,7 @@ class Pace:
         self._begun_s = self._clock()
         self._steps_s, self._iterations = {}, 0
         if self._settings is not None:
+            self._behind_s = min(max(self._behind_s, waited_s), self._settings.run_over_s)
             expected = {step: forecast.mean_s for step, forecast in self._forecasts.items()}
             time_s = self._settings.seconds_per_frame - self._behind_s
             self._reliefs = choose_reliefs(self._settings, time_s, expected, self._reliefs, self._cheapest)
