@@ -13,6 +13,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+import grpc
 import pytest
 from fusion_team import CAMERA, GRID, frame, team
 from tiny_yolo import write_tiny_yolo
@@ -25,7 +26,8 @@ from gausslite.errors import DatasetError, InvalidInputError, StorageError, Task
 from gausslite.fusion.memory import MemoryStore
 from gausslite.perception.fixed import RegionAttention
 from gausslite.task.rules import RuleParser
-from gausslite.v1.agent_service_pb2 import FRAME_OUTCOME_MAPPED
+from gausslite.v1.agent_service_pb2 import FRAME_OUTCOME_MAPPED, AssignTaskRequest
+from gausslite.v1.agent_service_pb2_grpc import AgentServiceStub
 from gausslite.wire.clients import AgentClient, FusionClient
 from gausslite.wire.process import run_service
 from gausslite.wire.server import serve_until_stopped
@@ -216,6 +218,19 @@ def test_a_real_process_ends_cleanly_on_sigterm(tmp_path: Path) -> None:
         p.send_signal(signal.SIGTERM)
         assert p.wait(30) == 0
         assert "ended" in p.stderr.read()
+
+
+def test_who_assigns_a_task_is_told_which_parser_does_not_answer(tmp_path: Path) -> None:
+    address = f"unix:{tmp_path}/agent.sock"
+    command = [sys.executable, "-m", "gausslite_agent", "--listen", address, "--parser", "127.0.0.1:1"]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as p:
+        assert p.stderr is not None
+        assert "listening on" in p.stderr.readline()
+        # a plain stub, since the client would try again
+        with grpc.insecure_channel(address) as channel, pytest.raises(grpc.RpcError, match=r"parser 127\.0\.0\.1:1: "):
+            AgentServiceStub(channel).AssignTask(AssignTaskRequest(text="Pick up the cup"), timeout=20.0)
+        p.send_signal(signal.SIGTERM)
+        assert p.wait(30) == 0
 
 
 def test_frames_that_were_sent_leave_a_map_and_a_report_on_sigterm(tmp_path: Path) -> None:

@@ -44,7 +44,8 @@ async def _serve(settings: AgentSettings) -> None:
     saved = _saved_mission(settings)
     loop, news = asyncio.get_running_loop(), Bell()
     with ExitStack() as stack:
-        parser = _parser(settings, stack)
+        # the task of the command line may wait for a parser to start; who assigns one is told that there is none
+        at_start, asked = (_parser(settings, stack, patient) for patient in (True, False))
         uplink, client = _uplink(settings, stack, goes_on=saved is not None)
         attentions = Attentions(settings.perception, lambda: _scene(settings, stand_in))
         if settings.task is not None and not (settings.play and is_simulated(settings.play.source)):
@@ -62,8 +63,8 @@ async def _serve(settings: AgentSettings) -> None:
         if saved is not None:
             await asyncio.wrap_future(robot.resume(saved))
             earlier, saved = saved.life, None
-        player = Player(settings, robot, parser, client, earlier)
-        servicer = AgentServicer(settings.agent_id, robot, parser, news, lambda: player.state)
+        player = Player(settings, robot, at_start, client, earlier)
+        servicer = AgentServicer(settings.agent_id, robot, asked, news, lambda: player.state)
 
         mission = functools.partial(_live, settings, stand_in, player, uplink)
         await serve_until_stopped(settings.listen, [servicer.service()], mission, settings.tls)
@@ -111,10 +112,10 @@ def _begin(stand_in: StandIn | None, player: Player) -> None:
         player.begin()
 
 
-def _parser(settings: AgentSettings, stack: ExitStack) -> TaskParser:
+def _parser(settings: AgentSettings, stack: ExitStack, patient: bool) -> TaskParser:
     if settings.link.parser is None:
         return RuleParser()
-    return stack.enter_context(ParserClient(settings.link.parser, patient=True, tls=settings.tls))
+    return stack.enter_context(ParserClient(settings.link.parser, patient=patient, tls=settings.tls))
 
 
 def _uplink(settings: AgentSettings, stack: ExitStack, goes_on: bool) -> tuple[Uplink | None, FusionClient | None]:
