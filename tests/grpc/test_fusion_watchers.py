@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import grpc
 import numpy as np
 import pytest
 from fusion_team import GRID, keys, said, team
 
+from gausslite.domain.subset import VoxelWords
 from gausslite.domain.voxels import Box
+from gausslite.domain.words import no_words
 from gausslite.errors import (
     RevisionGoneError,
 )
 from gausslite.v1 import fusion_service_pb2 as pb
+from gausslite.wire.convert import MapUpdate
 
 
 def test_a_watcher_gets_the_snapshot_and_then_what_changes() -> None:
@@ -74,6 +79,42 @@ def test_a_revision_of_another_life_is_out_of_range() -> None:
         for revision in (1, t.client.join("ant", GRID).fused_revision + 1000):
             with pytest.raises(RevisionGoneError):
                 next(t.client.watch(revision))
+
+
+def follow(updates: Iterator[MapUpdate], held: VoxelWords) -> VoxelWords:
+    """What is held after the next revision."""
+    for update in updates:
+        held = update.over(held)
+        if update.last:
+            break
+    return held
+
+
+def test_update_over_update_is_the_fused_map() -> None:
+    with team() as t:
+        ant, bee = (t.client.join(name, GRID).session_id for name in ("ant", "bee"))
+        watch = t.client.watch()
+        held = follow(watch, no_words())
+        assert len(held) == 0
+        many = {cell: [1] * 8 for cell in range(3000)}
+        for change in (
+            lambda: t.say(ant, said("ant", 1, {0: [5], 1: [1]})),
+            lambda: t.say(bee, said("bee", 1, {1: [2], **{cell: many[cell] for cell in range(2, 1500)}})),
+            lambda: t.say(ant, said("ant", 2, {0: [], 1: [7, 1]})),
+            lambda: t.client.leave(bee, forget=True),
+        ):
+            change()
+            held = follow(watch, held)
+            now = follow(t.client.watch(), no_words())
+            assert held.keys.tolist() == now.keys.tolist()
+            assert held.kappa_sums.tolist() == now.kappa_sums.tolist()
+            np.testing.assert_array_equal(held.gaussians.means_m, now.gaussians.means_m)
+        # a second snapshot begins anew, however many parts it has
+        for part in range(3):
+            t.say(ant, said("ant", 3 + part, {cell: many[cell] for cell in range(part * 1000, part * 1000 + 1000)}))
+        again = follow(t.client.watch(), held)
+        assert again.keys.tolist() == keys(*range(3000)).tolist()
+        watch.close()
 
 
 def test_a_large_map_comes_in_several_blocks_of_one_revision() -> None:

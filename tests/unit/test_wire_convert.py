@@ -164,7 +164,7 @@ def test_a_map_block_is_checked() -> None:
     subset = encode_subset(RoiSubset("a", "", 1, 4, words), grid)
     provenance = gaussians_pb2.Provenance(agent_ids=["a", "b"], winner=[1, 0])
     block = gaussians_pb2.MapBlock(revision=4, snapshot=True, last=True, subset=subset, provenance=provenance)
-    update = convert.map_update_from_message(block, DEFAULT_LIMITS)
+    update = convert.map_update_from_message(block, DEFAULT_LIMITS, first=True)
     assert update.winners == ("b", "a")
     assert update.grid == grid
     assert update.words is not None
@@ -172,8 +172,8 @@ def test_a_map_block_is_checked() -> None:
     for winner in ([1], [1, 2]):
         block.provenance.winner[:] = winner
         with pytest.raises(InvalidInputError, match="provenance"):
-            convert.map_update_from_message(block, DEFAULT_LIMITS)
-    nothing = convert.map_update_from_message(gaussians_pb2.MapBlock(revision=4, last=True), DEFAULT_LIMITS)
+            convert.map_update_from_message(block, DEFAULT_LIMITS, first=True)
+    nothing = convert.map_update_from_message(gaussians_pb2.MapBlock(revision=4, last=True), DEFAULT_LIMITS, first=True)
     assert nothing.words is None
 
 

@@ -127,8 +127,10 @@ class AgentClient(ServiceChannel):
             region=None if region is None else convert.box_to_message(region),
             roi_only=roi_only,
         )
+        first = True
         for response in self._stream(self._stub.WatchMap(request)):
-            yield convert.map_update_from_message(response.block, _WATCH_LIMITS)
+            yield (update := convert.map_update_from_message(response.block, _WATCH_LIMITS, first))
+            first = update.last
 
 
 def is_done(status: agent_service_pb2.GetAgentStatusResponse) -> bool:
@@ -189,8 +191,10 @@ class FusionClient(ServiceChannel):
             since_revision=since_revision,
             region=None if region is None else convert.box_to_message(region),
         )
+        first = True
         for response in self._stream(self._stub.WatchFusedMap(request)):
-            yield convert.map_update_from_message(response.block, _WATCH_LIMITS)
+            yield (update := convert.map_update_from_message(response.block, _WATCH_LIMITS, first))
+            first = update.last
 
     def refine(
         self, iterations: int = 0, max_gaussians: int = 0, seed: int = 0

@@ -15,6 +15,7 @@ from gausslite.domain.pose import require_rigid
 from gausslite.domain.subset import VoxelWords
 from gausslite.domain.task import Predicate, Relation, TaskGraph
 from gausslite.domain.voxels import Box, VoxelGrid
+from gausslite.domain.words import no_words, take_voxels, unite
 from gausslite.errors import InvalidInputError, TaskError
 from gausslite.task.validate import require_graph
 from gausslite.v1 import gaussians_pb2, geometry_pb2, task_pb2
@@ -28,14 +29,26 @@ _PREDICATES_BACK = {number: predicate for predicate, number in _PREDICATES.items
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MapUpdate:
-    """Part of a map at a revision: words to put over what is held; winners name the agent of each voxel, or nothing."""
+    """Part of a map at a revision: words to put over what is held; winners name the agent of each voxel, or nothing.
+
+    It is the first or the last part of its revision, or both; after the last one what is held is a whole map.
+    """
 
     revision: int
     snapshot: bool
+    first: bool
     last: bool
     words: VoxelWords | None
     grid: VoxelGrid | None
     winners: tuple[str, ...]
+
+    def over(self, held: VoxelWords) -> VoxelWords:
+        """What a watcher holds after this update: begin with `no_words()`, and hold on to a map without tombstones."""
+        before = no_words() if self.snapshot and self.first else held
+        if self.words is None:
+            return before
+        kept = take_voxels(before, ~np.isin(before.keys, self.words.keys))
+        return unite(kept, take_voxels(self.words, self.words.counts > 0))
 
 
 def graph_to_message(graph: TaskGraph) -> task_pb2.TaskGraph:
@@ -154,8 +167,11 @@ def box_from_message(message: geometry_pb2.Box) -> Box:
     return Box((low.x, low.y, low.z), (high.x, high.y, high.z))
 
 
-def map_update_from_message(message: gaussians_pb2.MapBlock, limits: CodecLimits) -> MapUpdate:
-    """A checked block of a map. Raises CodecError, ChecksumError, InvalidInputError."""
+def map_update_from_message(message: gaussians_pb2.MapBlock, limits: CodecLimits, first: bool) -> MapUpdate:
+    """A checked block of a map, and whether it is the first of its revision.
+
+    Raises CodecError, ChecksumError, InvalidInputError.
+    """
     words, grid = None, None
     if message.subset:
         subset, grid = decode_subset(message.subset, limits)
@@ -163,4 +179,5 @@ def map_update_from_message(message: gaussians_pb2.MapBlock, limits: CodecLimits
     names, winner = message.provenance.agent_ids, message.provenance.winner
     if len(winner) not in (0, 0 if words is None else len(words)) or any(i >= len(names) for i in winner):
         raise InvalidInputError("map block provenance: expected one known agent for each voxel")
-    return MapUpdate(message.revision, message.snapshot, message.last, words, grid, tuple(names[i] for i in winner))
+    winners = tuple(names[i] for i in winner)
+    return MapUpdate(message.revision, message.snapshot, first, message.last, words, grid, winners)
