@@ -153,7 +153,9 @@ Global___VoxelGrid: _TypeAlias = VoxelGrid  # noqa: Y015
 
 @_typing.final
 class EncodedFrame(_message.Message):
-    """One posed RGB-D image. T_world_camera takes camera points (x right, y down, z forward) to the world."""
+    """One posed RGB-D image. T_world_camera takes camera points (x right, y down, z forward) to the world; the camera stays
+    within 10 km of the world's origin along each axis.
+    """
 
     DESCRIPTOR: _descriptor.Descriptor
 
@@ -165,6 +167,7 @@ class EncodedFrame(_message.Message):
     T_WORLD_CAMERA_FIELD_NUMBER: _builtins.int
     index: _builtins.int
     capture_time_ns: _builtins.int
+    """By the robot's own clock. It rises from frame to frame: the keyframes that stay are spread over the mission by it."""
     colour: _builtins.bytes
     """JPEG or PNG, 8 bits a channel."""
     depth_png: _builtins.bytes
