@@ -10,9 +10,15 @@ import sys
 import time
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
 from gausslite.codec.ply import read_ply
+from gausslite.datasets.open import open_source
+from gausslite.datasets.registration import ColourCamera
+from gausslite.domain.camera import back_project
+from gausslite.domain.pose import transform_points
 
 pytest.importorskip("embreex", reason="the simulated home needs the extra `sim`")
 
@@ -58,6 +64,41 @@ def test_the_demo_maps_fuses_scores_and_ends_everything(tmp_path: Path) -> None:
     assert sizes["vote"] < sizes["concatenation"] == both
     assert list((out / "pictures").glob("*.png"))
     assert not _children_named(str(out))
+
+
+def _write_recording(folder: Path) -> None:
+    """A walk through the simulated home in 7-Scenes layout, with the voxels of its mug."""
+    home = open_source("sim:home?seed=0&trajectory=0&frames=16&size=128x96")
+    mug = next(region for name, region in home.regions().items() if "mug" in name)
+    folder.mkdir()
+    k = home.camera
+    np.savetxt(folder / "camera-intrinsics.txt", [[k.fx_px, 0, k.cx_px - 0.5], [0, k.fy_px, k.cy_px - 0.5], [0, 0, 1]])
+    points = []
+    for i in range(len(home)):
+        frame = home.frame(i)
+        cv2.imwrite(str(folder / f"frame-{i:06d}.color.png"), frame.rgb[..., ::-1])
+        cv2.imwrite(str(folder / f"frame-{i:06d}.depth.png"), (frame.depth_m * 1000).astype(np.uint16))
+        np.savetxt(folder / f"frame-{i:06d}.pose.txt", frame.T_world_camera)
+        points.append(transform_points(frame.T_world_camera, back_project(frame.depth_m, k)[mug.mask(frame)]))
+    voxels = np.unique(np.floor(np.concatenate(points) / 0.02).astype(np.int64), axis=0)
+    np.savez(folder / "roi_voxels.npz", mug_1=voxels, voxel_size_m=0.02)
+
+
+def test_a_recordings_robots_register_and_refine_as_the_demo_was_told(tmp_path: Path) -> None:
+    folder, out = tmp_path / "walk", tmp_path / "demo"
+    _write_recording(folder)
+    camera = ",".join(np.loadtxt(folder / "camera-intrinsics.txt")[[0, 1, 0, 1], [0, 1, 2, 2]].astype(str))
+    told = ("--colour-camera", camera, "--view-error", "0.01,0.5,0.1,0.03")
+    tasks = ("--source", folder, "--task-a", "Find the mug", "--task-b", "Find the mug")
+    command = [sys.executable, "-m", "gausslite", "demo", *SMALL, *map(str, tasks), *told, "--out", str(out)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=280)
+    assert done.returncode == 0, done.stderr
+    assert "each held-out view's pose and colours fitted" in done.stdout
+    report = json.loads((out / "report.json").read_text())
+    assert ColourCamera.parse(report["colour_camera"]) == ColourCamera.parse(camera)
+    assert report["view_error"] == "0.01,0.5,0.1,0.03"
+    assert report["scored"] == {"objects": ["mug_1"], "views": 2, "fitted": True}
+    assert [agent["frames"] for agent in report["agents"].values()] == [7, 7]
 
 
 @pytest.mark.skipif(not Path("/proc/self/cmdline").exists(), reason="needs /proc to see processes")

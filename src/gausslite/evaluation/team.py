@@ -13,6 +13,7 @@ from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.region import Region
 from gausslite.errors import InvalidInputError
 from gausslite.evaluation.compare import MapScores, ViewScore, average, score_view
+from gausslite.evaluation.fitted import draw_fitted
 from gausslite.evaluation.pictures import comparison_sheet
 from gausslite.evaluation.views import HeldOutView, MapViewer, most_telling
 from gausslite.render.rasterizer import Rasterizer
@@ -40,11 +41,13 @@ def score_team(
     viewpoints: Iterable[Viewpoints],
     regions: Sequence[Region],
     rasterizer: Rasterizer,
+    fit_views: bool = False,
     sheets: int = 4,
 ) -> TeamScores:
     """Draw every map from every view; the sheets show the views with the most of the region, spread over the sequence.
 
-    Raises InvalidInputError without a single view with depth.
+    With fit_views each drawing is in the pose and colours that fit the view (`draw_fitted`). Raises InvalidInputError
+    without a single view with depth.
     """
     views = [view for point in viewpoints for view in _views(point, regions)]
     if not views:
@@ -56,7 +59,7 @@ def score_team(
     for i, view in enumerate(views):
         drawings: dict[str, Float32[ndarray, "h w 3"]] = {}
         for name, viewer in viewers.items():
-            drawn = viewer.draw_frame(view.frame)
+            drawn = draw_fitted(viewer, view.frame) if fit_views else viewer.draw_frame(view.frame)
             scores[name].append(score_view(drawn, view))
             drawings[name] = drawn.rgb
         if i in shown:
