@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import sqlite3
 import threading
 from dataclasses import replace
@@ -69,14 +70,23 @@ def test_a_waiting_frame_nobody_asks_for_any_more_gives_way_like_any_other() -> 
 
 
 def test_a_frame_that_has_waited_has_less_time_so_that_the_queue_gets_shorter() -> None:
-    robot = Robot(replace(SETTINGS, rate_hz=5.0, least_iterations=0, run_over=1.0), GRID, ball_attention)
+    now_us = itertools.count(step=10)
+    settings = replace(SETTINGS, rate_hz=5.0, least_iterations=15)
+    robot = Robot(settings, GRID, ball_attention, clock=lambda: (next(now_us) + stalled_us) / 1e6)
+    stalled_us = 0
     robot.assign(RuleParser().parse(TASK)).result(20)
     busy = threading.Event()
     robot.do(lambda _mapper: busy.wait(20))
-    waited = robot.submit(frame(0))
-    threading.Timer(0.2, busy.set).start()
-    assert waited.result(20).iterations == 0
+    waited = [robot.submit(frame(index)) for index in range(3)]
+    stalled_us = 1_000_000
+    busy.set()
+    reports = [each.result(20) for each in waited]
+    status = robot.status()
     robot.close()
+    assert [each.iterations for each in reports] == [15, 15, 15]
+    assert status.short == 0
+    assert all(each.age_s >= 1.0 + each.seconds for each in reports)
+    assert status.ages_s == tuple(each.age_s for each in reports)
 
 
 def after_a_frame(robot: Robot) -> Gaussians:

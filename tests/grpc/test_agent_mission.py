@@ -111,6 +111,7 @@ def test_a_mission_leaves_a_map_a_report_and_its_region_on_the_server(tmp_path: 
     assert len(written) == count == report["gaussians"]
     assert report["frames"] == 8
     assert report["hz"] > 0
+    assert report["frame_age_p99_s"] >= report["frame_age_p50_s"] > 0
     assert 0 < report["roi_share"] < 1
     assert report["bytes_sent"] == agent.roi_bytes > 0
     assert report["handover_bytes"] == agent.handover_bytes == agent.keyframes == 0

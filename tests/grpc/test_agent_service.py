@@ -97,6 +97,8 @@ def test_each_frame_has_its_outcome_in_order() -> None:
     assert "depth" in answers[1].reason
     assert answers[0].iterations == 2
     assert answers[0].roi_share > 0
+    assert answers[0].age_seconds >= answers[0].seconds > 0
+    assert status.age_p99_seconds >= status.age_p50_seconds > 0
     counts = status.frames_mapped, status.frames_skipped, status.frames_dropped, status.frames_rejected
     assert counts == (2, 1, 0, 1)
     assert status.gaussians == answers[3].gaussians > 0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections import deque
 
 import numpy as np
 import pytest
@@ -202,19 +203,40 @@ def test_what_a_frame_ran_over_is_given_back_by_the_next_ones() -> None:
     assert surprised([50.0], run_over=0.0)[0].short
 
 
-def test_what_a_stall_has_left_waiting_is_made_up_by_the_share_that_may_be_run_over() -> None:
+def after_a_stall(every_s: float, latest: int = 40) -> tuple[list[float], list[int]]:
+    """Frames that come so often to a pace of 100 s after 300 s in which none was begun, of those that wait the latest:
+    how long each has waited for its turn, and its iterations.
+    """
     clock, costs = WorkClock(), {**CHEAP, Step.WARM_UP: ITERATION_S, Step.ACTIVE: ITERATION_S}
     pace = Pace(PaceSettings(FRAME_S, 15, reliefs=(), run_over=RUN_OVER_S / FRAME_S), clock)
     run_frame(pace, clock, costs)
-    came_s = [clock.now_s + i * FRAME_S for i in range(40)]
+    came_s = deque(clock.now_s + i * every_s for i in range(60))
     clock.work(3 * FRAME_S)
-    waited_s = []
-    for each_s in came_s:
-        clock.work(max(0.0, each_s - clock.now_s))
-        waited_s.append(clock.now_s - each_s)
-        assert not run_frame(pace, clock, costs, waited_s=waited_s[-1])[0].short
-    assert waited_s[1:16] == sorted(waited_s[1:16], reverse=True)
-    assert max(waited_s[20:]) <= ITERATION_S
+    waited_s, iterations = [], []
+    while came_s:
+        while len(came_s) > latest and came_s[latest] <= clock.now_s:
+            came_s.popleft()
+        clock.work(max(0.0, came_s[0] - clock.now_s))
+        waited_s.append(clock.now_s - came_s.popleft())
+        budget, done = run_frame(pace, clock, costs, waited_s=waited_s[-1])
+        assert not budget.short
+        iterations.append(done)
+    return waited_s, iterations
+
+
+def test_a_frame_that_waits_trains_no_more_than_the_least_until_what_a_stall_has_left_waiting_is_made_up() -> None:
+    waited_s, iterations = after_a_stall(every_s=FRAME_S)
+    # such a frame takes 65 of a hundred
+    assert waited_s[:10] == pytest.approx([300.0, *(300.0 - 35.0 * i for i in range(1, 9)), 0.0], abs=ITERATION_S)
+    assert iterations[:8] == [15] * 8
+    assert max(waited_s[9:]) <= ITERATION_S
+    assert min(iterations[9:]) >= 22
+
+
+def test_a_queue_that_is_always_full_leaves_frames_their_time_but_for_the_share_that_may_be_run_over() -> None:
+    _, iterations = after_a_stall(every_s=FRAME_S / 3, latest=4)
+    assert max(iterations[:5]) == 15
+    assert min(iterations[12:]) >= 17
 
 
 def test_a_frame_runs_over_for_its_least_iterations_alone() -> None:

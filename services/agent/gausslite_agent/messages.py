@@ -37,6 +37,7 @@ def report_to_message(report: FrameReport) -> pb.IngestFramesResponse:
         gaussians=report.gaussians,
         roi_share=report.roi_share,
         seconds=report.seconds,
+        age_seconds=report.age_s,
     )
 
 
@@ -65,6 +66,8 @@ def status_to_message(
             voxels_waiting=uplink.voxels_waiting,
             subsets_rejected=uplink.subsets_rejected,
         ),
+        age_p50_seconds=robot.age_s(50),
+        age_p99_seconds=robot.age_s(99),
         notes=(*robot.notes, *robot.load_notes),
     )
 

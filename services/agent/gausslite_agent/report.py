@@ -30,6 +30,8 @@ def mission_report(
         "max_detection_lag_frames": robot.max_detection_lag,
         "keyframes_reread": robot.reread,
         "hz": robot.hz,
+        "frame_age_p50_s": robot.age_s(50),
+        "frame_age_p99_s": robot.age_s(99),
         "seconds": seconds,
         "gaussians": len(gaussians),
         "active_gaussians": active,

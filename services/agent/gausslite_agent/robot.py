@@ -25,7 +25,7 @@ from gausslite.domain.voxels import VoxelGrid
 from gausslite.domain.words import words_of
 from gausslite.errors import InvalidInputError, MismatchError, StorageError, UnavailableError
 from gausslite.mapping.mapper import GaussianMapper
-from gausslite.mapping.pace import Pace, Relief
+from gausslite.mapping.pace import Clock, Pace, Relief
 from gausslite.mapping.roi import RoiLedger
 from gausslite.mission.build import build_mapper
 from gausslite.mission.saved_run import RunTerms, save_run
@@ -50,11 +50,11 @@ def _promise() -> Future[FrameReport]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Waiting:
-    """A frame in the queue, its report to come, and since when it waits."""
+    """A frame in the queue, since when it waits, and its report to come."""
 
     frame: Frame
+    since_s: float
     future: Future[FrameReport] = field(default_factory=_promise)
-    since_s: float = field(default_factory=time.monotonic)
 
 
 class Robot:
@@ -68,12 +68,14 @@ class Robot:
         uplink: Uplink | None = None,
         on_change: Callable[[], None] = lambda: None,
         load: LoadSettings | None = None,
+        clock: Clock = time.monotonic,
     ) -> None:
         """Reserve the map's memory. on_change is called on the worker after each mapped frame."""
         self._settings, self._grid, self._make_attention = settings, grid, attention
         self.uplink = uplink
         self._on_change = on_change
         self._load = load or LoadSettings()
+        self._clock = clock
         # how many iterations may still be rehearsed, and whether words are due for those that were; worker only
         self._rehearsals_left, self._resting, self._untold = 0, False, False
         self._mapper = build_mapper(settings)
@@ -121,7 +123,7 @@ class Robot:
         with self._lock:
             if self._status.graph is None:
                 raise MismatchError("frames: expected a task first, got none yet; call AssignTask")
-            come = _Waiting(frame)
+            come = _Waiting(frame, self._clock())
             self._waiting.append(come)
             dropped = self._overflow()
         if dropped is not None:
@@ -174,7 +176,7 @@ class Robot:
         if self._task_mapper is None:
             ledger = self._ledger if self.uplink is not None else None
             attention = self._make_attention(graph)
-            self._task_mapper = TaskMapper(attention, self._mapper, ledger, Pace(self._settings.pace))
+            self._task_mapper = TaskMapper(attention, self._mapper, ledger, Pace(self._settings.pace, self._clock))
         elif now is None or not graph.asks_the_same_as(now):
             self._task_mapper.assign(self._make_attention(graph))
         with self._lock:
@@ -247,7 +249,7 @@ class Robot:
     def _map(self, come: _Waiting) -> FrameReport:
         assert self._task_mapper is not None
         frame = come.frame
-        done = self._task_mapper.process(frame, time.monotonic() - come.since_s)
+        done = self._task_mapper.process(frame, self._clock() - come.since_s)
         self._last_index = frame.index
         with self._lock:
             self._status = replace(self._status, notes=self._task_mapper.notes)
@@ -257,7 +259,13 @@ class Robot:
             self._tell(done.words)
             self._untold = False
         report = FrameReport(
-            frame.index, Outcome.MAPPED, "", done.iterations, done.gaussians, done.roi_share, done.budget.seconds
+            frame.index,
+            Outcome.MAPPED,
+            iterations=done.iterations,
+            gaussians=done.gaussians,
+            roi_share=done.roi_share,
+            seconds=done.budget.seconds,
+            age_s=self._clock() - come.since_s,
         )
         self._note_load(done)
         self._count(report)

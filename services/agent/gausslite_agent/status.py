@@ -5,7 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from enum import Enum
 
+import numpy as np
+
 from gausslite.domain.task import TaskGraph
+
+_AGES_KEPT = 1000
 
 
 class Outcome(Enum):
@@ -19,7 +23,10 @@ class Outcome(Enum):
 
 @dataclass(frozen=True, slots=True)
 class FrameReport:
-    """The outcome of one frame; reason says why it was not mapped."""
+    """The outcome of one frame; reason says why it was not mapped.
+
+    seconds is what it took, age_s how long ago it had come when it was mapped, its wait in the queue included.
+    """
 
     index: int
     outcome: Outcome
@@ -28,6 +35,7 @@ class FrameReport:
     gaussians: int = 0
     roi_share: float = 0.0
     seconds: float = 0.0
+    age_s: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,6 +45,7 @@ class RobotStatus:
     short counts the frames that trained less than they should, without_* those that went without something for want
     of time; max_detection_lag is the greatest age, in frames, at which a detection came; reread counts the keyframes
     that were looked at again for a new task. untold_because says why the uplink could not take the newest words.
+    ages_s are those of the latest mapped frames.
     """
 
     graph: TaskGraph | None = None
@@ -56,6 +65,7 @@ class RobotStatus:
     max_detection_lag: int = 0
     reread: int = 0
     untold_because: str = ""
+    ages_s: tuple[float, ...] = ()
     notes: tuple[str, ...] = ()
 
     @property
@@ -80,6 +90,10 @@ class RobotStatus:
         """Mean share of the pixels in the task's region."""
         return self.roi_share_sum / max(self.mapped, 1)
 
+    def age_s(self, percent: float) -> float:
+        """The age that so many of the latest frames had not passed when they were mapped; 0 before the first."""
+        return float(np.percentile(self.ages_s, percent)) if self.ages_s else 0.0
+
     def plus(self, report: FrameReport) -> RobotStatus:
         """The totals with one more frame."""
         if report.outcome is not Outcome.MAPPED:
@@ -91,4 +105,5 @@ class RobotStatus:
             iterations=self.iterations + report.iterations,
             busy_s=self.busy_s + report.seconds,
             roi_share_sum=self.roi_share_sum + report.roi_share,
+            ages_s=(*self.ages_s[1 - _AGES_KEPT :], report.age_s),
         )

@@ -94,9 +94,10 @@ class FrameBudget:
 class Pace:
     """Tells one frame after the other what it has time for. With settings None iterations are counted instead.
 
-    A frame is due once the time of a frame has passed, less what those before it are behind, or less the time that it
-    has waited for its turn. Time between two frames makes up for nothing. What a frame is late by beyond the share that
-    it may run over is forgiven: the rate suffers.
+    A frame is due once the time of a frame has passed, less what those before it are behind. Time between two frames
+    makes up for nothing. What a frame is late by beyond the share that it may run over is forgiven: the rate suffers.
+    One that could have been begun before its turn came, because it was there and the frame before it had had its time,
+    less that share, is due by as much earlier; its least iterations have their time all the same.
     """
 
     def __init__(self, settings: PaceSettings | None = None, clock: Clock = time.perf_counter) -> None:
@@ -108,13 +109,16 @@ class Pace:
         self._iterations = 0
         self._cheapest = Step.WARM_UP
         self._begun_s = clock()
-        self._behind_s = 0.0
-        self._training_due_s = 0.0
+        self._could_begin_s = -math.inf
+        self._behind_s = self._waited_s = 0.0
+        self._training_due_s = self._least_due_s = 0.0
 
     def begin(self, waited_s: float = 0.0) -> None:
         """It is a frame's turn: its time runs from now, and what it goes without is decided.
 
-        waited_s is how long it has been there: frames that wait get less, or a queue would never grow shorter.
+        waited_s is how long it has been there: frames that wait get less, or a queue would never grow shorter. But no
+        frame could begin before those ahead of it had their time, or one queue that is always full would leave all of
+        them no more than the least.
         """
         for step in Step:
             if step not in self._steps_s:
@@ -123,7 +127,10 @@ class Pace:
         self._begun_s = self._clock()
         self._steps_s, self._iterations = {}, 0
         if self._settings is not None:
-            self._behind_s = min(max(self._behind_s, waited_s), self._settings.run_over_s)
+            in_turn_s = self._could_begin_s + self._settings.seconds_per_frame - self._settings.run_over_s
+            self._could_begin_s = min(self._begun_s, max(self._begun_s - waited_s, in_turn_s))
+            self._waited_s = self._begun_s - self._could_begin_s
+            self._behind_s = min(max(self._behind_s, self._waited_s), self._settings.run_over_s)
             expected = {step: forecast.mean_s for step, forecast in self._forecasts.items()}
             time_s = self._settings.seconds_per_frame - self._behind_s
             self._reliefs = choose_reliefs(self._settings, time_s, expected, self._reliefs, self._cheapest)
@@ -146,8 +153,8 @@ class Pace:
         if self._settings is None or counted == 0:
             return self._iterations < counted
         too_few = self._iterations < self._settings.least_iterations
-        late_s = self._settings.run_over_s if too_few else 0.0
-        return self._clock() + self._forecasts[step].cautious_s < self._training_due_s + late_s
+        due_s = self._least_due_s if too_few else self._training_due_s
+        return self._clock() + self._forecasts[step].cautious_s < due_s
 
     def timing(self, step: Step) -> AbstractContextManager[None]:
         """Measure a step, and expect the next of its kind to cost about as much."""
@@ -174,12 +181,15 @@ class Pace:
         return FrameBudget(seconds, dict(self._steps_s), self._reliefs, short)
 
     def _look_ahead(self) -> None:
-        """Until when the frame may train or do what can wait, so that it still does in time what it must."""
+        """Until when the frame may train or do what can wait, and until when its least iterations may take, so that it
+        still does in time what it must.
+        """
         assert self._settings is not None
         spared = {step for relief in self._reliefs for step in _SPARED[relief]}
         ahead = _FIXED - spared - self._steps_s.keys()
-        due_s = self._begun_s + self._settings.seconds_per_frame - self._behind_s
-        self._training_due_s = due_s - sum(self._forecasts[step].cautious_s for step in ahead)
+        training_s = self._settings.seconds_per_frame - sum(self._forecasts[step].cautious_s for step in ahead)
+        self._training_due_s = self._begun_s + training_s - max(self._behind_s, self._waited_s)
+        self._least_due_s = self._begun_s + training_s - self._behind_s + self._settings.run_over_s
 
 
 def choose_reliefs(

@@ -154,6 +154,7 @@ class IngestFramesResponse(_message.Message):
     GAUSSIANS_FIELD_NUMBER: _builtins.int
     ROI_SHARE_FIELD_NUMBER: _builtins.int
     SECONDS_FIELD_NUMBER: _builtins.int
+    AGE_SECONDS_FIELD_NUMBER: _builtins.int
     index: _builtins.int
     outcome: Global___FrameOutcome.ValueType
     reason: _builtins.str
@@ -162,6 +163,9 @@ class IngestFramesResponse(_message.Message):
     roi_share: _builtins.float
     """Fraction of the pixels in the task's region."""
     seconds: _builtins.float
+    """What perception and mapping took."""
+    age_seconds: _builtins.float
+    """From when the frame had come until it was mapped: its wait in the queue, and `seconds`."""
     def __init__(
         self,
         *,
@@ -172,10 +176,11 @@ class IngestFramesResponse(_message.Message):
         gaussians: _builtins.int = ...,
         roi_share: _builtins.float = ...,
         seconds: _builtins.float = ...,
+        age_seconds: _builtins.float = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["gaussians", b"gaussians", "index", b"index", "iterations", b"iterations", "outcome", b"outcome", "reason", b"reason", "roi_share", b"roi_share", "seconds", b"seconds"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["age_seconds", b"age_seconds", "gaussians", b"gaussians", "index", b"index", "iterations", b"iterations", "outcome", b"outcome", "reason", b"reason", "roi_share", b"roi_share", "seconds", b"seconds"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
@@ -213,6 +218,8 @@ class GetAgentStatusResponse(_message.Message):
     ROI_SHARE_FIELD_NUMBER: _builtins.int
     UPLINK_FIELD_NUMBER: _builtins.int
     NOTES_FIELD_NUMBER: _builtins.int
+    AGE_P50_SECONDS_FIELD_NUMBER: _builtins.int
+    AGE_P99_SECONDS_FIELD_NUMBER: _builtins.int
     agent_id: _builtins.str
     state: Global___AgentState.ValueType
     map_revision: _builtins.int
@@ -225,6 +232,9 @@ class GetAgentStatusResponse(_message.Message):
     """Mapped frames per second of perception and mapping."""
     roi_share: _builtins.float
     """Mean fraction of the pixels in the task's region."""
+    age_p50_seconds: _builtins.float
+    """What half, and 99 of a hundred, of the latest frames' age_seconds did not pass; 0 before the first."""
+    age_p99_seconds: _builtins.float
     @_builtins.property
     def graph(self) -> _task_pb2.TaskGraph: ...
     @_builtins.property
@@ -249,10 +259,12 @@ class GetAgentStatusResponse(_message.Message):
         roi_share: _builtins.float = ...,
         uplink: Global___UplinkStatus | None = ...,
         notes: _abc.Iterable[_builtins.str] | None = ...,
+        age_p50_seconds: _builtins.float = ...,
+        age_p99_seconds: _builtins.float = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["graph", b"graph", "uplink", b"uplink"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["agent_id", b"agent_id", "frames_dropped", b"frames_dropped", "frames_mapped", b"frames_mapped", "frames_rejected", b"frames_rejected", "frames_skipped", b"frames_skipped", "gaussians", b"gaussians", "graph", b"graph", "hz", b"hz", "map_revision", b"map_revision", "notes", b"notes", "roi_share", b"roi_share", "state", b"state", "uplink", b"uplink"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["age_p50_seconds", b"age_p50_seconds", "age_p99_seconds", b"age_p99_seconds", "agent_id", b"agent_id", "frames_dropped", b"frames_dropped", "frames_mapped", b"frames_mapped", "frames_rejected", b"frames_rejected", "frames_skipped", b"frames_skipped", "gaussians", b"gaussians", "graph", b"graph", "hz", b"hz", "map_revision", b"map_revision", "notes", b"notes", "roi_share", b"roi_share", "state", b"state", "uplink", b"uplink"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
