@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from gausslite.domain.frame import Frame
@@ -48,12 +49,17 @@ class TaskMapper:
         mapper: GaussianMapper,
         ledger: RoiLedger | None = None,
         pace: Pace | None = None,
+        tell: Callable[[VoxelWords], None] = lambda _words: None,
     ) -> None:
-        """Without a pace each frame gets the fixed number of iterations of the mapper's settings."""
+        """Without a pace each frame gets the fixed number of iterations of the mapper's settings.
+
+        `tell` is given each frame's words within its time.
+        """
         self._attention = attention
         self._mapper = mapper
         self._ledger = ledger
         self._pace = pace or Pace()
+        self._tell = tell
 
     def assign(self, attention: Attention) -> None:
         """Map for another task from the next frame on.
@@ -107,7 +113,7 @@ class TaskMapper:
         lag_frames = self._catch_up()
         reread = self._reread()
         mapped = self._mapper.map_frame(frame, relevance, self._pace, sight)
-        words = self._changed_roi() if mapped.skipped is None else None
+        words = self._tell_changed_roi() if mapped.skipped is None else None
         return FrameOutcome(
             index=frame.index,
             iterations=mapped.iterations,
@@ -164,8 +170,11 @@ class TaskMapper:
                 keyframes += 1
         return Reread(keyframes, seeded)
 
-    def _changed_roi(self) -> VoxelWords | None:
+    def _tell_changed_roi(self) -> VoxelWords | None:
         if self._pace.spares(Relief.WORDS):
             return None
         with self._pace.timing(Step.WORDS):
-            return self.words()
+            words = self.words()
+            if words is not None:
+                self._tell(words)
+            return words

@@ -14,12 +14,13 @@ from agent_running import SETTINGS, TASK, Gate, agent, ball_attention
 from fusion_team import CAMERA, GRID, frame, team
 
 from gausslite.domain.gaussians import Gaussians
+from gausslite.domain.subset import VoxelWords
 from gausslite.errors import InvalidInputError, UnavailableError
 from gausslite.fusion.memory import MemoryStore
 from gausslite.task.rules import RuleParser
 from gausslite.v1 import agent_service_pb2 as pb
 from gausslite.wire.clients import FusionClient
-from gausslite.wire.spool import Spool
+from gausslite.wire.spool import Purpose, Spool
 from gausslite.wire.uplink import Uplink
 from gausslite.wire.uplink_values import UplinkSettings
 from gausslite_agent.load import Drops, LoadSettings
@@ -87,6 +88,28 @@ def test_a_frame_that_has_waited_has_less_time_so_that_the_queue_gets_shorter() 
     assert status.short == 0
     assert all(each.age_s >= 1.0 + each.seconds for each in reports)
     assert status.ages_s == tuple(each.age_s for each in reports)
+
+
+class SlowDisk(Spool):
+    """Takes a second for all that it is offered, on a clock that nothing else moves."""
+
+    now_s = 0.0
+
+    def offer(self, words: VoxelWords, purpose: Purpose) -> None:
+        self.now_s += 1.0
+        super().offer(words, purpose)
+
+
+def test_what_a_frame_takes_to_tell_its_words_is_part_of_its_time() -> None:
+    with team(MemoryStore()) as fusion:
+        spool = SlowDisk(None, "robot", GRID)
+        uplink = Uplink(FusionClient(fusion.client.address), "robot", spool, GRID)
+        robot = Robot(SETTINGS, GRID, ball_attention, uplink, clock=lambda: spool.now_s)
+        robot.assign(RuleParser().parse(TASK)).result(20)
+        report = robot.submit(frame(0)).result(20)
+        robot.close()
+        uplink.close()
+    assert (report.outcome, report.seconds, report.age_s) == (Outcome.MAPPED, 1.0, 1.0)
 
 
 def after_a_frame(robot: Robot) -> Gaussians:

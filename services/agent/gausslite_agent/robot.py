@@ -176,7 +176,8 @@ class Robot:
         if self._task_mapper is None:
             ledger = self._ledger if self.uplink is not None else None
             attention = self._make_attention(graph)
-            self._task_mapper = TaskMapper(attention, self._mapper, ledger, Pace(self._settings.pace, self._clock))
+            pace = Pace(self._settings.pace, self._clock)
+            self._task_mapper = TaskMapper(attention, self._mapper, ledger, pace, self._tell)
         elif now is None or not graph.asks_the_same_as(now):
             self._task_mapper.assign(self._make_attention(graph))
         with self._lock:
@@ -244,7 +245,9 @@ class Robot:
         if not self._untold or self._task_mapper is None:
             return
         self._untold = False
-        self._tell(self._task_mapper.words())
+        words = self._task_mapper.words()
+        if words is not None:
+            self._tell(words)
 
     def _map(self, come: _Waiting) -> FrameReport:
         assert self._task_mapper is not None
@@ -256,7 +259,6 @@ class Robot:
         if done.skipped is not None:
             return self._count(FrameReport(frame.index, Outcome.SKIPPED, done.skipped, gaussians=done.gaussians))
         if done.words is not None:
-            self._tell(done.words)
             self._untold = False
         report = FrameReport(
             frame.index,
@@ -272,9 +274,9 @@ class Robot:
         self._on_change()
         return report
 
-    def _tell(self, words: VoxelWords | None) -> None:
+    def _tell(self, words: VoxelWords) -> None:
         """Give words to the uplink. A spool without room ends no mission: all is told again once it has some."""
-        if self.uplink is None or words is None:
+        if self.uplink is None:
             return
         untold_because = ""
         try:
