@@ -140,6 +140,28 @@ def test_idle_time_is_trained_in_up_to_its_bound_and_work_comes_in_between() -> 
     robot.close()
 
 
+def fail() -> None:
+    raise MemoryError("a moment without memory")
+
+
+def test_an_idle_iteration_that_fails_is_logged_and_the_next_frame_is_followed_by_others(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    robot = Robot(SETTINGS, GRID, ball_attention, load=LoadSettings(idle_iterations=3))
+    robot.assign(RuleParser().parse(TASK)).result(20)
+    with monkeypatch.context() as broken:
+        robot.do(lambda mapper: broken.setattr(mapper, "rehearse", fail)).result(20)
+        robot.submit(frame(0)).result(20)
+        robot.do(lambda _mapper: None).result(20)
+    assert "a moment without memory" in caplog.text
+    assert robot.status().idle_iterations == 0
+    robot.submit(frame(1)).result(20)
+    for _ in range(9):
+        robot.do(lambda _mapper: None).result(20)
+    assert robot.status().idle_iterations == 3
+    robot.close()
+
+
 def test_without_idle_iterations_the_map_stays_as_the_frame_left_it() -> None:
     robot = Robot(SETTINGS, GRID, ball_attention)
     robot.assign(RuleParser().parse(TASK)).result(20)

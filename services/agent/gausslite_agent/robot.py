@@ -223,11 +223,21 @@ class Robot:
             self._rest()
 
     def _rest(self) -> None:
-        """One iteration while no frame waits, then this again, behind all work that has come meanwhile."""
+        """One iteration while no frame waits, then this again, behind all work that has come meanwhile.
+
+        An error ends it until the next frame has been mapped: nobody waits for this, so it is logged.
+        """
         with self._lock:
             self._resting = not self._waiting
         if not self._resting:
             return
+        try:
+            self._rehearse()
+        except Exception:
+            _log.exception("an idle iteration failed; the next frame is followed by others")
+            self._rehearsals_left, self._resting = 0, False
+
+    def _rehearse(self) -> None:
         assert self._task_mapper is not None
         if self._rehearsals_left == 0 or not self._task_mapper.rehearse():
             self._end_rest()
