@@ -13,7 +13,7 @@ from fusion_team import COMMAND, GRID, request, said, server_process
 from gausslite.codec.ply import gaussians_from_ply
 from gausslite.errors import UnavailableError
 from gausslite.v1 import fusion_service_pb2 as pb
-from gausslite.wire.clients import Export
+from gausslite.wire.clients import Export, FusionClient
 
 
 def test_after_a_kill_the_acknowledged_is_there_and_a_resend_is_stale(tmp_path: Path) -> None:
@@ -45,6 +45,19 @@ def ends_with_one_line(*arguments: str) -> str:
     assert done.stdout == ""
     [line] = done.stderr.splitlines()
     return line
+
+
+class Hasty(FusionClient):
+    silence_s = 0.5
+
+
+def test_a_watcher_learns_that_the_server_went_away_without_a_word() -> None:
+    with server_process() as (process, client), Hasty(client.address) as hasty:
+        watch = hasty.watch()
+        next(watch)
+        process.send_signal(signal.SIGSTOP)
+        with pytest.raises(UnavailableError):
+            next(watch)
 
 
 def test_what_the_operator_can_mend_is_one_line_and_code_2(tmp_path: Path) -> None:

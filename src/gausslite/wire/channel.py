@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 
 import grpc
 
-from gausslite.wire.server import MAX_MESSAGE_BYTES
+from gausslite.wire.server import SILENCE_S, connection_options
 from gausslite.wire.status import from_rpc_error
 from gausslite.wire.tls import Tls, open_channel
 
@@ -34,6 +34,8 @@ class ServiceChannel:
 
     kind = "service"
     """What answers there, in an operator's words."""
+    silence_s = SILENCE_S
+    """When a stream ends, with UnavailableError, on which nothing comes: twice this after the last sign of life."""
 
     def __init__(self, address: str, deadline_s: float = DEADLINE_S, tls: Tls | None = None) -> None:
         self.address = address
@@ -42,8 +44,7 @@ class ServiceChannel:
         config = {"methodConfig": [{"name": methods, "retryPolicy": _RETRY_POLICY}]}
         options = (
             ("grpc.service_config", json.dumps(config)),
-            ("grpc.max_receive_message_length", MAX_MESSAGE_BYTES),
-            ("grpc.max_send_message_length", MAX_MESSAGE_BYTES),
+            *connection_options(self.silence_s),
             ("grpc.max_reconnect_backoff_ms", 2000),
         )
         self._channel = open_channel(address, tls, options)

@@ -29,12 +29,31 @@ from gausslite.wire.tls import Tls
 MAX_MESSAGE_BYTES = 16 << 20
 """Both ends refuse more; a frame of two megapixels with PNG depth fits several times."""
 
+SILENCE_S = 15.0
+"""After so long without a byte either end of a connection asks whether the other is there, and waits as long for it."""
+
+
+def connection_options(silence_s: float) -> tuple[tuple[str, int], ...]:
+    """What both ends of a connection are set to.
+
+    Who only listens, such as a watcher, sends nothing, and would wait for ever on a network that went away silently.
+    """
+    return (
+        ("grpc.max_receive_message_length", MAX_MESSAGE_BYTES),
+        ("grpc.max_send_message_length", MAX_MESSAGE_BYTES),
+        ("grpc.keepalive_time_ms", round(1000 * silence_s)),
+        ("grpc.http2.ping_timeout_ms", round(1000 * silence_s)),
+        ("grpc.http2.max_pings_without_data", 0),
+    )
+
+
 _log = logging.getLogger(__name__)
 # what the system keeps of a unix socket's path
 _MAX_SOCKET_PATH_BYTES = 107
 _OPTIONS = (
-    ("grpc.max_receive_message_length", MAX_MESSAGE_BYTES),
-    ("grpc.max_send_message_length", MAX_MESSAGE_BYTES),
+    *connection_options(SILENCE_S),
+    # callers ask as often, and on streams that are quiet for hours
+    ("grpc.http2.min_ping_interval_without_data_ms", round(500 * SILENCE_S)),
     # a second server on the port must fail, not share it
     ("grpc.so_reuseport", 0),
 )
