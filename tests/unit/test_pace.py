@@ -13,6 +13,8 @@ from hypothesis import strategies as st
 from gausslite.errors import InvalidInputError
 from gausslite.mapping.pace import FrameBudget, Pace, PaceSettings, Relief, Step, choose_reliefs
 
+TRIED = [step for step in Step if step not in (Step.REREADING, Step.PRUNING, Step.DENSIFYING)]
+"""The steps of `run_frame`."""
 CHEAP = {**dict.fromkeys(Step, 1.0), Step.SETTLING: 0.0}
 
 
@@ -30,27 +32,35 @@ class WorkClock:
 
 
 def run_frame(
-    pace: Pace, clock: WorkClock, costs: dict[Step, float], counted: int = 8, waited_s: float = 0.0
+    pace: Pace,
+    clock: WorkClock,
+    costs: dict[Step, float],
+    counted: int = 8,
+    waited_s: float = 0.0,
+    stall: tuple[Step, float] | None = None,
 ) -> tuple[FrameBudget, int]:
-    """One frame whose steps cost this much; every fourth iteration is a warm-up."""
+    """One frame whose steps cost this much, and the first of the kind in `stall` so much more; every fourth iteration
+    is a warm-up.
+    """
+    stalls_s = dict([stall] if stall else [])
+
+    def take(step: Step) -> None:
+        with pace.timing(step):
+            clock.work(costs[step] + stalls_s.pop(step, 0.0))
+
     pace.begin(waited_s)
     if not pace.spares(Relief.SEEDING):
-        for step in (Step.DRAWING, Step.SEEDING):
-            with pace.timing(step):
-                clock.work(costs[step])
-    for step in (Step.ATTENTION, Step.VIEW):
-        with pace.timing(step):
-            clock.work(costs[step])
+        take(Step.DRAWING)
+        take(Step.SEEDING)
+    take(Step.ATTENTION)
+    take(Step.VIEW)
     done = 0
     while pace.trains_on(step := Step.ACTIVE if done % 4 else Step.WARM_UP, counted):
-        with pace.timing(step):
-            clock.work(costs[step])
+        take(step)
         done += 1
-    with pace.timing(Step.SETTLING):
-        clock.work(costs[Step.SETTLING])
+    take(Step.SETTLING)
     if not pace.spares(Relief.WORDS):
-        with pace.timing(Step.WORDS):
-            clock.work(costs[Step.WORDS])
+        take(Step.WORDS)
     return pace.end(), done
 
 
@@ -179,8 +189,9 @@ def test_frames_at_the_rate_are_late_by_the_share_that_may_be_run_over_at_most(
 ) -> None:
     behind_s = 0.0
     for view_s, budget in zip(views_s, surprised(views_s, run_over), strict=True):
-        # a frame whose view alone takes longer ends at once; what was not tried is expected to cost less than it does
-        assert behind_s + budget.seconds <= max(FRAME_S * (1 + run_over), behind_s + view_s + 4.0) + ITERATION_S
+        # a frame whose view alone takes longer trains once; what was not tried is expected to cost less than it does
+        longest_s = max(FRAME_S * (1 + run_over), behind_s + view_s + 4.0) + ITERATION_S
+        assert behind_s + budget.seconds <= longest_s + 1e-9
         behind_s = min(max(0.0, behind_s + budget.seconds - FRAME_S), run_over * FRAME_S)
 
 
@@ -269,6 +280,43 @@ def test_a_step_that_was_dear_once_is_tried_again() -> None:
         pace.begin()
         frames += 1
         assert frames < 40
+
+
+@settings(deadline=None)
+@given(st.sampled_from(TRIED), st.floats(1.0, 1e6))
+def test_a_machine_that_stood_still_for_once_leaves_no_frame_after_it_without_its_iterations(
+    stalled: Step, frames: float
+) -> None:
+    clock, costs = WorkClock(), {**CHEAP, Step.WARM_UP: ITERATION_S, Step.ACTIVE: ITERATION_S}
+    pace = Pace(PaceSettings(FRAME_S, 15, reliefs=()), clock)
+    before = [run_frame(pace, clock, costs)[1] for _ in range(10)][-1]
+    run_frame(pace, clock, costs, stall=(stalled, frames * FRAME_S))
+    after = [run_frame(pace, clock, costs)[1] for _ in range(20)]
+    assert min(after) >= 15
+    assert min(after[10:]) >= before - 1
+
+
+def test_a_first_iteration_that_took_forever_is_not_held_against_its_kind_for_long() -> None:
+    clock, costs = WorkClock(), {**CHEAP, Step.WARM_UP: ITERATION_S, Step.ACTIVE: ITERATION_S}
+    pace = Pace(PaceSettings(FRAME_S, 15), clock)
+    run_frame(pace, clock, costs, stall=(Step.ACTIVE, 100 * FRAME_S))
+    assert max(run_frame(pace, clock, costs)[1] for _ in range(10)) >= 15
+
+
+@pytest.mark.parametrize(("least", "expected"), [(0, 0), (1, 1), (15, 1)])
+def test_the_iteration_that_a_frame_begins_with_is_trained_whatever_time_is_left(least: int, expected: int) -> None:
+    clock = WorkClock()
+    pace = Pace(PaceSettings(10.0, least), clock)
+    assert run_frame(pace, clock, {**CHEAP, Step.VIEW: 100.0})[1] == expected
+
+
+def test_what_costs_more_from_now_on_is_expected_to_soon() -> None:
+    clock, costs = WorkClock(), {**CHEAP, Step.WARM_UP: 1.0, Step.ACTIVE: 1.0, Step.WORDS: 1e-6}
+    pace = Pace(PaceSettings(FRAME_S, 15, reliefs=()), clock)
+    for _ in range(5):
+        run_frame(pace, clock, costs)
+    late_s = [run_frame(pace, clock, {**costs, Step.WORDS: 60.0})[0].seconds - FRAME_S for _ in range(12)]
+    assert max(late_s[8:]) <= 1.0
 
 
 def test_settings_name_what_is_wrong() -> None:

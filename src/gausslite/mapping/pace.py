@@ -17,6 +17,11 @@ Clock = Callable[[], float]
 
 _LEARNING = 0.2
 _FADING = 0.95
+_ITERATIONS_FADING = 0.5
+_BELIEVED = 4.0
+"""How many times what was expected, with care, a step's cost counts for at most, once it is ..."""
+_BELIEVED_SHARE = 0.1
+"""... more than this share of a frame's time."""
 
 
 class Step(StrEnum):
@@ -103,7 +108,8 @@ class Pace:
     def __init__(self, settings: PaceSettings | None = None, clock: Clock = time.perf_counter) -> None:
         self._settings = settings
         self._clock = clock
-        self._forecasts = {step: _Forecast() for step in Step}
+        believed_s = math.inf if settings is None else _BELIEVED_SHARE * settings.seconds_per_frame
+        self._forecasts = {step: _Forecast(believed_s) for step in Step}
         self._steps_s: dict[Step, float] = {}
         self._reliefs: frozenset[Relief] = frozenset()
         self._iterations = 0
@@ -122,7 +128,8 @@ class Pace:
         """
         for step in Step:
             if step not in self._steps_s:
-                self._forecasts[step].fade()
+                # a frame that has too little time for any would not find out how many it has time for
+                self._forecasts[step].fade(_ITERATIONS_FADING if step in _ITERATIONS else _FADING)
         self._cheapest = Step.ACTIVE if Step.ACTIVE in self._steps_s else Step.WARM_UP
         self._begun_s = self._clock()
         self._steps_s, self._iterations = {}, 0
@@ -149,10 +156,15 @@ class Pace:
         return self._clock() + needed_s < self._training_due_s
 
     def trains_on(self, step: Step, counted: int) -> bool:
-        """True while the frame goes on training: another iteration fits, or (untimed) fewer than `counted` are done."""
+        """True while the frame goes on training: another iteration fits, or (untimed) fewer than `counted` are done.
+
+        The first of the least iterations is trained whatever time is left.
+        """
         if self._settings is None or counted == 0:
             return self._iterations < counted
         too_few = self._iterations < self._settings.least_iterations
+        if too_few and self._iterations == 0:
+            return True
         due_s = self._least_due_s if too_few else self._training_due_s
         return self._clock() + self._forecasts[step].cautious_s < due_s
 
@@ -230,9 +242,14 @@ class _Timing:
 
 
 class _Forecast:
-    """What a step will cost: its running mean and as much again as it usually strays from that."""
+    """What a step will cost: its running mean and as much again as it usually strays from that.
 
-    def __init__(self) -> None:
+    A time far above that says more about the machine (it stood still, it swapped) than about the step, and is believed
+    in part. One up to believed_s is believed whole, and so is the first.
+    """
+
+    def __init__(self, believed_s: float) -> None:
+        self._believed_s = believed_s
         self._mean_s: float | None = None
         self._spread_s = 0.0
 
@@ -248,11 +265,11 @@ class _Forecast:
         if self._mean_s is None:
             self._mean_s = seconds
             return
-        surprise_s = seconds - self._mean_s
+        surprise_s = min(seconds, max(_BELIEVED * self.cautious_s, self._believed_s)) - self._mean_s
         self._mean_s += _LEARNING * surprise_s
         self._spread_s += _LEARNING * (abs(surprise_s) - self._spread_s)
 
-    def fade(self) -> None:
+    def fade(self, share: float) -> None:
         """Expect less of what was not tried, so that one slow time does not rule it out for good."""
-        self._mean_s = None if self._mean_s is None else _FADING * self._mean_s
-        self._spread_s *= _FADING
+        self._mean_s = None if self._mean_s is None else share * self._mean_s
+        self._spread_s *= share
