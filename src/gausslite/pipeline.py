@@ -163,12 +163,20 @@ class TaskMapper:
             if keyframes > 0 and not self._pace.has_time_for(Step.REREADING):
                 break
             with self._pace.timing(Step.REREADING):
-                relevance = self._attention.look_back(keyframe.as_recorded)
+                relevance = self._look_back(keyframe)
                 if relevance is None:
                     break
                 seeded += self._mapper.judge(keyframe, relevance)
                 keyframes += 1
         return Reread(keyframes, seeded)
+
+    def _look_back(self, keyframe: Keyframe) -> RelevanceMap | None:
+        """The relevance of an earlier keyframe. One that cannot be judged costs this frame, and no other."""
+        try:
+            return self._attention.look_back(keyframe.as_recorded)
+        except Exception:
+            self._mapper.pass_over(keyframe)
+            raise
 
     def _tell_changed_roi(self) -> VoxelWords | None:
         if self._pace.spares(Relief.WORDS):

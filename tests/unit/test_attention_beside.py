@@ -126,6 +126,32 @@ def test_what_the_detector_raises_comes_with_a_later_frame() -> None:
         attention.attend(frame_at(1))
 
 
+class BrokenOnce(RegionDetector):
+    """Fails the first time."""
+
+    failed = False
+
+    def detect(self, frame: Frame, queries: tuple[str, ...]) -> list[Detection]:
+        if not self.failed:
+            self.failed = True
+            raise MemoryError("a moment without memory")
+        return super().detect(frame, queries)
+
+
+def test_what_the_detector_raises_on_an_earlier_frame_is_raised_once_and_the_frame_looked_at_again() -> None:
+    executor, earlier = WorkInHand(), frame_at(0)
+    attention = AttentionBeside(TASK, BrokenOnce({"mug": MUG}), executor)
+    assert attention.look_back(earlier) is None
+    executor.run_next()
+    with pytest.raises(MemoryError, match="a moment"):
+        attention.look_back(earlier)
+    assert attention.look_back(earlier) is None
+    executor.run_next()
+    relevance = attention.look_back(earlier)
+    assert relevance is not None
+    np.testing.assert_array_equal(relevance.roi, MUG.mask(earlier))
+
+
 def test_a_keyframe_of_the_window_is_given_its_late_relevance() -> None:
     executor = WorkInHand()
     mapper = GaussianMapper(

@@ -14,7 +14,7 @@ from test_parameters import some_gaussians
 from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.region import BallRegion
-from gausslite.domain.relevance import NO_TARGET
+from gausslite.domain.relevance import NO_TARGET, RelevanceMap
 from gausslite.domain.state import State
 from gausslite.domain.task import Predicate, Relation, TaskGraph
 from gausslite.domain.voxels import VoxelGrid
@@ -100,6 +100,31 @@ def test_where_time_is_short_one_keyframe_is_read_a_frame() -> None:
     late.restore(loop.state())
     late.assign(B)
     assert [outcome.reread.keyframes for outcome in play(late, 4, 9)] == [1, 1, 1, 1, 0]
+
+
+class Unreadable(RegionAttention):
+    """Raises for an earlier frame, whenever it is asked."""
+
+    def __init__(self, index: int) -> None:
+        super().__init__([RIGHT])
+        self._index = index
+
+    def look_back(self, frame: Frame) -> RelevanceMap:
+        if frame.index == self._index:
+            raise MemoryError("a moment without memory")
+        return super().look_back(frame)
+
+
+def test_a_keyframe_that_cannot_be_judged_costs_one_frame_and_is_passed_over() -> None:
+    loop = loop_of()
+    play(loop, 0, 4)
+    loop.assign(Unreadable(2))
+    with pytest.raises(MemoryError, match="a moment"):
+        loop.process(frame_at(4))
+    outcomes = play(loop, 5, 7)
+    assert [outcome.reread.keyframes for outcome in outcomes] == [2, 0]
+    shown = {keyframe.frame.index: bool(keyframe.relevance.roi.any()) for keyframe in loop.keyframes()}
+    assert [shown[index] for index in range(4)] == [True, True, False, True]
 
 
 def test_what_is_seen_is_active_where_the_new_task_is_also_when_it_returns() -> None:

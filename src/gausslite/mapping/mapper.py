@@ -156,6 +156,12 @@ class GaussianMapper:
         seeds = self._seeder.seed_region(frame, relevance, table.rows[:, MEAN][table.active])
         return self._insert(Seeds(seeds, Gaussians.empty()))
 
+    def pass_over(self, keyframe: Keyframe) -> None:
+        """What of an earlier keyframe is relevant to the present task will not be known: it shows no region, and casts
+        no votes either.
+        """
+        self._keyframes.judge(replace(keyframe, judged=True), self._view)
+
     def look(self, frame: Frame) -> MapSight | None:
         """How the map looks from a frame; None while it is empty."""
         return MapSight.of(self.render(frame.camera, frame.T_world_camera)) if self.count > 0 else None

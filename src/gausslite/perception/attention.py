@@ -170,11 +170,17 @@ class AttentionBeside:
         return self._late
 
     def look_back(self, frame: Frame) -> RelevanceMap | None:
-        """What was found on an earlier frame; the first call has it looked at. Raises what the detector raised."""
+        """What was found on an earlier frame; the first call has it looked at.
+
+        Raises what the detector raised, once: who asks again has it looked at again.
+        """
         if self._looking_back is None or self._looking_back[0] is not frame:
             self._looking_back = frame, self._executor.submit(self._detector.detect, frame, self._graph.queries)
         _, found = self._looking_back
-        return self._tracker.look_back(frame, found.result()) if found.done() else None
+        if not found.done():
+            return None
+        self._looking_back = None
+        return self._tracker.look_back(frame, found.result())
 
     def _collect(self) -> LateRelevance | None:
         """Take what was found, if the detector is done."""
