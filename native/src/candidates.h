@@ -81,9 +81,10 @@ class Sight {
       const Pack16 across = tile(extent.x + extent.reach_x, ws.tiles_x) - x0;
       const Pack16 down = tile(extent.y + extent.reach_y, ws.tiles_y) - y0;
       const Pack16 most(float(ActiveTiles::kNear - 1)), sizes(float(ActiveTiles::kSizes));
-      const Pack16 place = select((across > most) | (down > most), Pack16(float(ws.active.far_place())),
-                                  fma(y0, Pack16(float(ws.tiles_x)), x0));
-      const Pack16 size = fma(min(down, most), Pack16(float(ActiveTiles::kNear)), min(across, most));
+      const Mask16 far = (across > most) | (down > most);
+      const Pack16 place = select(far, Pack16(float(ws.active.far_place())), fma(y0, Pack16(float(ws.tiles_x)), x0));
+      // Zero at the far place: a float has no room for more behind the largest images' number of tiles.
+      const Pack16 size = select(far, Pack16(0.0f), fma(down, Pack16(float(ActiveTiles::kNear)), across));
       list_lanes(boxes, fma(place, sizes, size), held);
     }
     return list_lanes(ids, first, held);

@@ -11,16 +11,20 @@ struct Form {
   const Stages& (*stages)();
 };
 
-#if defined(GAUSSLITE_HAS_AVX2)
-bool has_avx2() { return __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma"); }
+#if defined(GAUSSLITE_HAS_AVX2) || defined(GAUSSLITE_HAS_AVX512)
+// All that CMakeLists.txt lets the compiler use: a virtual machine may lack any of it.
+bool has_avx2() {
+  return __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma") && __builtin_cpu_supports("bmi") &&
+         __builtin_cpu_supports("bmi2") && __builtin_cpu_supports("popcnt");
+}
 #endif
 
 #if defined(GAUSSLITE_HAS_AVX512)
 // VBMI2 (Ice Lake and Zen 4 onwards) brings the byte compression that builds the block lists.
 bool has_avx512() {
-  return __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma") && __builtin_cpu_supports("avx512f") &&
-         __builtin_cpu_supports("avx512bw") && __builtin_cpu_supports("avx512dq") &&
-         __builtin_cpu_supports("avx512vl") && __builtin_cpu_supports("avx512vbmi2");
+  return has_avx2() && __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") &&
+         __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("avx512vl") &&
+         __builtin_cpu_supports("avx512vbmi2");
 }
 #endif
 

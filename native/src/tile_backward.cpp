@@ -53,7 +53,7 @@ void backward_tile(Workspace& ws, const TileList& list, const TilePosition& tile
 void backward_strip(Workspace& ws, int strip, int) {
   for (int x = 0; x < ws.tiles_x; ++x) {
     const size_t t = size_t(strip) * size_t(ws.tiles_x) + size_t(x);
-    if (ws.active_tiles == nullptr || ws.active_tiles[t]) backward_tile(ws, ws.tiles[t], TilePosition(ws, x, strip));
+    if (ws.wanted_blocks[t] != 0) backward_tile(ws, ws.tiles[t], TilePosition(ws, x, strip));
   }
 }
 

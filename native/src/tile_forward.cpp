@@ -48,7 +48,7 @@ void draw_strip(Workspace& ws, int strip, int thread) {
   for (int x = 0; x < ws.tiles_x; ++x) {
     const size_t t = size_t(strip) * size_t(ws.tiles_x) + size_t(x);
     const TilePosition tile(ws, x, strip);
-    if (ws.active_tiles != nullptr && !ws.active_tiles[t]) {
+    if (ws.wanted_blocks[t] == 0) {
       for (int b = 0; b < kBlocks; ++b) store_pixels(ws, tile, b, BlockState{});
     } else {
       draw_tile(ws, ws.tiles[t], tile);

@@ -126,7 +126,8 @@ struct Workspace {
   int64_t plane = 0;  // floats in one padded image plane
   int threads = 1;
 
-  // Input of the frame. `count` entries: rows `ids[0..count)`, or rows 0..count when ids is null.
+  // Input of the frame. `count` entries: rows `ids[0..count)`, or rows 0..count when ids is null. Of these the way back
+  // reads the rows alone: whoever asks for it keeps them.
   const float* rows = nullptr;
   const uint32_t* ids = nullptr;
   uint32_t count = 0;
