@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 // The extension module gausslite.render._kernels. Shapes were checked by render/cpu.py, whose messages name the
-// argument; the array types here are the second line. Work runs without the interpreter lock.
+// argument; the array types here are the second line. Work runs without the interpreter lock, and that file sees to it
+// that a rasterizer has one call at a time.
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/optional.h>
@@ -91,14 +92,6 @@ struct Scene {
   }
 };
 
-// Work that holds the rasterizer and not the interpreter.
-template <class F>
-auto work(Rasterizer& rasterizer, F f) {
-  nb::gil_scoped_release unlocked;
-  const std::lock_guard<std::mutex> mine(rasterizer.mutex());
-  return f();
-}
-
 std::unique_ptr<Rasterizer> make_rasterizer(const std::string& simd, int threads) {
   const Stages* stages = find_stages(simd);
   require(stages != nullptr, "simd: not usable here");
@@ -120,11 +113,11 @@ nb::tuple forward(Rasterizer& self, ConstRowTable rows, const Intrinsics& intrin
   auto depth_m = new_array<float>(height, width);
   auto alpha = new_array<float>(height, width);
   const ImageOutput output{rgb.data(), depth_m.data(), alpha.data()};
-  const uint64_t frame = work(self, [&] {
+  {
+    nb::gil_scoped_release unlocked;
     self.forward(scene.input, output);
-    return self.frame();
-  });
-  return nb::make_tuple(rgb, depth_m, alpha, frame);
+  }
+  return nb::make_tuple(rgb, depth_m, alpha, self.frame());
 }
 
 nb::tuple backward(Rasterizer& self, uint64_t frame, size_t row_count, Colours d_rgb, Plane d_depth_m, Plane d_alpha) {
@@ -138,7 +131,10 @@ nb::tuple backward(Rasterizer& self, uint64_t frame, size_t row_count, Colours d
   auto visible = visible_ids(self);
   auto norms = new_array<float>(visible.size());
   const ImageGradients input{d_rgb.data(), d_depth_m.data(), d_alpha.data()};
-  work(self, [&] { self.backward(input, d_rows.data(), d_twist.data(), norms.data()); });
+  {
+    nb::gil_scoped_release unlocked;
+    self.backward(input, d_rows.data(), d_twist.data(), norms.data());
+  }
   return nb::make_tuple(d_rows, d_twist, visible, norms);
 }
 
@@ -218,8 +214,8 @@ double step(Rasterizer& self, const StepScene& seen, const StepTraining& trainin
   const Camera& camera = scene.input.camera;
   require(seen.view.width() == camera.width && seen.view.height() == camera.height, "view: wrong size");
   const OptimizerState state = training.state();
-  return work(self,
-              [&] { return self.step(scene.input, state, seen.view, training.masked, training.loss, training.adam); });
+  nb::gil_scoped_release unlocked;
+  return self.step(scene.input, state, seen.view, training.masked, training.loss, training.adam);
 }
 
 nb::dict stage_times(const Rasterizer& self) {

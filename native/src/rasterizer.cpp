@@ -261,7 +261,12 @@ double Rasterizer::step(const FrameInput& input, const OptimizerState& state, co
       mark(&StageTimes::project);
     });
     if (with_ssim) {
-      train_with_ssim(training, thread);
+      try {
+        train_with_ssim(training, thread);
+      } catch (...) {
+        schedule_.stop();
+        throw;
+      }
     } else {
       for_each_strip([&](int strip) { stages_.train_strip(ws_, training, strip, thread); });
     }

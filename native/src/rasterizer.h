@@ -2,7 +2,6 @@
 // The order of the stages: forward, backward, and the whole training step in one call.
 #pragma once
 
-#include <mutex>
 #include <utility>
 #include <vector>
 
@@ -51,7 +50,7 @@ struct StageTimes {
   double project = 0.0, raster = 0.0, loss = 0.0, backward = 0.0, update = 0.0;
 };
 
-// Calls from several threads are served one after the other.
+// One call at a time: whoever owns it sees to that. A call that throws (memory that cannot be had) leaves it usable.
 class Rasterizer {
  public:
   Rasterizer(const Stages& stages, int threads);
@@ -79,8 +78,6 @@ class Rasterizer {
   uint32_t visible_count() const;
   void copy_visible(uint32_t* ids) const;
 
-  std::mutex& mutex() { return mutex_; }
-
  private:
   void begin_frame(const FrameInput& input);
   void want_blocks(const uint16_t* blocks);
@@ -101,7 +98,6 @@ class Rasterizer {
   Workspace ws_;
   uint64_t frame_ = 0;
   uint32_t row_count_ = 0;
-  std::mutex mutex_;
   StripSchedule schedule_;
   std::vector<std::pair<uint32_t, int>> strip_order_;  // keys and tile row, most keys first
   std::vector<uint32_t> strip_weights_;

@@ -41,18 +41,17 @@ void StripSchedule::start(const std::vector<uint32_t>& weights, int threads, int
   const int strips = int(weights.size());
   strips_ = not_drawn_ = strips;
   walks_taken_ = 0;
-  // edges[t]: above it, t of so many threads' share of the work.
-  std::vector<int> edges(size_t(threads) + 1, strips);
+  edges_.assign(size_t(threads) + 1, strips);
   const uint64_t total = std::accumulate(weights.begin(), weights.end(), uint64_t{0});
   uint64_t above = 0;
   for (int strip = 0, t = 0; strip <= strips && t < threads; ++strip) {
-    for (; t < threads && above * uint64_t(threads) >= total * uint64_t(t); ++t) edges[size_t(t)] = strip;
+    for (; t < threads && above * uint64_t(threads) >= total * uint64_t(t); ++t) edges_[size_t(t)] = strip;
     if (strip < strips) above += weights[size_t(strip)];
   }
-  edges[0] = 0;
+  edges_[0] = 0;
   fronts_.clear();
   for (int t = 0; t < threads; ++t) {
-    const int first = edges[size_t(t)], count = edges[size_t(t) + 1] - first;
+    const int first = edges_[size_t(t)], count = edges_[size_t(t) + 1] - first;
     const bool upwards = t % 2 == 0 && t + 1 < threads;
     fronts_.push_back({upwards ? first + count - 1 : first, count, upwards ? -1 : 1});
   }
@@ -165,6 +164,15 @@ void StripSchedule::finish(const StripTask& task) {
         if (--row_users_[size_t(k)] == 0) free_squares_.push_back(squares_of_row_[size_t(k)]);
       }
     }
+  }
+  changes_.fetch_add(1, std::memory_order_release);
+  changes_.notify_all();
+}
+
+void StripSchedule::stop() {
+  {
+    const std::lock_guard lock(mutex_);
+    walks_taken_ = strips_;
   }
   changes_.fetch_add(1, std::memory_order_release);
   changes_.notify_all();

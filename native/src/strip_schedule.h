@@ -37,6 +37,8 @@ class StripSchedule {
   // Waits for a task for this thread; kNone when all are taken.
   StripTask next(int thread);
   void finish(const StripTask& task);
+  // No more tasks for anybody: one of the threads cannot finish its own.
+  void stop();
 
  private:
   // Strips of a thread that are not drawn yet: `next` and `left` - 1 behind it, upwards (-1) or downwards (1).
@@ -54,6 +56,7 @@ class StripSchedule {
   std::mutex mutex_;
   int strips_ = 0, not_drawn_ = 0, walks_taken_ = 0;
   std::vector<Front> fronts_;
+  std::vector<int> edges_;  // [t]: above it, t threads' share of the work
   std::vector<int> free_tapes_, free_squares_, tape_of_strip_, squares_of_row_;
   std::vector<int> drawn_by_, tape_used_by_;    // threads: by strip, and by place
   std::vector<int> derive_waits_, walk_waits_;  // parts that are still missing

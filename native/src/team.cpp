@@ -13,6 +13,9 @@ namespace {
 constexpr int kSpins = 200'000;
 constexpr int kYields = 400;
 
+// Leaves a job in which another member failed.
+struct Left {};
+
 }  // namespace
 
 uint32_t wait_while(const std::atomic<uint32_t>& value, uint32_t old) {
@@ -30,10 +33,17 @@ uint32_t wait_while(const std::atomic<uint32_t>& value, uint32_t old) {
 }
 
 Team::Team(int threads) : size_(threads) {
-  for (int member = 1; member < threads; ++member) threads_.emplace_back([this, member] { serve(member); });
+  try {
+    for (int member = 1; member < threads; ++member) threads_.emplace_back([this, member] { serve(member); });
+  } catch (...) {
+    dismiss();
+    throw;
+  }
 }
 
-Team::~Team() {
+Team::~Team() { dismiss(); }
+
+void Team::dismiss() {
   quit_ = true;
   call_.fetch_add(1, std::memory_order_release);
   call_.notify_all();
@@ -41,30 +51,54 @@ Team::~Team() {
 }
 
 void Team::serve(int member) {
+  // The first throw asks for memory of the thread's own, and a process that cannot have it is ended: so it comes now.
+  try {
+    throw Left{};
+  } catch (const Left&) {
+  }
   for (uint32_t seen = 0;;) {
     // The calls are counted one by one: `run` returns only after every member has finished, so none can be missed.
     seen = wait_while(call_, seen);
     if (quit_) return;
-    (*job_)(member);
+    attempt(member);
     if (running_.fetch_sub(1, std::memory_order_acq_rel) == 1) running_.notify_one();
   }
 }
 
-void Team::run(const std::function<void(int)>& job) {
-  if (size_ == 1) {
-    job(0);
-    return;
-  }
-  job_ = &job;
+void Team::run(const Job& job) {
+  job_ = job;
+  arrived_.store(0, std::memory_order_relaxed);
+  failed_.store(false, std::memory_order_relaxed);
+  error_ = nullptr;
   running_.store(uint32_t(size_ - 1), std::memory_order_relaxed);
-  call_.fetch_add(1, std::memory_order_release);
-  call_.notify_all();
-  job(0);
+  if (size_ > 1) {
+    call_.fetch_add(1, std::memory_order_release);
+    call_.notify_all();
+  }
+  attempt(0);
   for (uint32_t left = running_.load(std::memory_order_acquire); left != 0;) left = wait_while(running_, left);
+  if (error_) std::rethrow_exception(error_);
+}
+
+// A member that fails lets go of those who wait for it at a barrier.
+void Team::attempt(int member) {
+  try {
+    job_.call(job_.job, member);
+  } catch (const Left&) {
+  } catch (...) {
+    {
+      const std::lock_guard lock(error_mutex_);
+      if (!error_) error_ = std::current_exception();
+    }
+    failed_.store(true, std::memory_order_release);
+    generation_.fetch_add(1, std::memory_order_release);
+    generation_.notify_all();
+  }
 }
 
 void Team::barrier(const std::function<void()>& last) {
   const uint32_t generation = generation_.load(std::memory_order_acquire);
+  if (failed_.load(std::memory_order_acquire)) throw Left{};
   if (arrived_.fetch_add(1, std::memory_order_acq_rel) + 1 == uint32_t(size_)) {
     if (last) last();
     arrived_.store(0, std::memory_order_relaxed);
@@ -72,6 +106,7 @@ void Team::barrier(const std::function<void()>& last) {
     generation_.notify_all();
   } else {
     wait_while(generation_, generation);
+    if (failed_.load(std::memory_order_acquire)) throw Left{};
   }
 }
 

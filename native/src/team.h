@@ -4,7 +4,9 @@
 
 #include <atomic>
 #include <cstdint>
+#include <exception>
 #include <functional>
+#include <mutex>
 #include <thread>
 #include <vector>
 
@@ -25,19 +27,35 @@ class Team {
 
   int size() const { return size_; }
 
-  // Runs job(member) on every member and returns when all are done. The job must not throw.
-  void run(const std::function<void(int)>& job);
+  // Runs job(member) on every member and returns when all are done. Throws what the first member threw that did; the
+  // others then leave the job at their next barrier.
+  template <class F>
+  void run(const F& job) {
+    run({&job, [](const void* job, int member) { (*static_cast<const F*>(job))(member); }});
+  }
 
   // Inside a job: waits for all members. The last one to arrive calls `last` before the others go on.
   void barrier(const std::function<void()>& last = {});
 
  private:
+  // A call to a job of any type, which allocates nothing.
+  struct Job {
+    const void* job;
+    void (*call)(const void* job, int member);
+  };
+
+  void run(const Job& job);
   void serve(int member);
+  void attempt(int member);
+  void dismiss();
 
   int size_;
   std::vector<std::thread> threads_;
-  const std::function<void(int)>* job_ = nullptr;
+  Job job_{};
   bool quit_ = false;
+  std::mutex error_mutex_;
+  std::exception_ptr error_;  // the first one of this run
+  std::atomic<bool> failed_{false};
   alignas(64) std::atomic<uint32_t> call_{0};
   alignas(64) std::atomic<uint32_t> running_{0};
   alignas(64) std::atomic<uint32_t> arrived_{0};

@@ -9,7 +9,7 @@ import pytest
 from splat_scenes import Picture, relative_error, scene_named
 from step_training import ADAM, LOSS, gradient_seen, picture_for, tables, train
 
-from gausslite.errors import ShapeError
+from gausslite.errors import InvalidInputError, ShapeError
 from gausslite.render.rasterizer import (
     UPDATES,
     Rasterizer,
@@ -59,6 +59,19 @@ def test_a_tally_counts_the_rows_that_moved_and_no_others(rasterizer: Rasterizer
     assert set(some.counts[among]) == {7, 10}
     np.testing.assert_array_equal(everywhere.counts[~trainable], 7)
     np.testing.assert_array_equal((everywhere.counts - 7 + 3 * (trained > 0))[trainable], trained[trainable])
+
+
+def test_tables_are_lent_one_at_a_time(rasterizer: Rasterizer) -> None:
+    scene = scene_named("medium splats")
+    lent, others = tables(scene, seasoned=False), tables(scene, seasoned=False)
+    with (
+        rasterizer.holding(*lent),
+        pytest.raises(InvalidInputError, match="no other tables on loan"),
+        rasterizer.holding(*others),
+    ):
+        pass
+    with rasterizer.holding(*others):
+        pass
 
 
 def test_a_tally_of_another_length_or_that_may_not_be_written_is_refused(

@@ -9,6 +9,7 @@ import pytest
 from cpu_scenes import CAMERA, random_rows, view_of
 
 from gausslite.domain.camera import Camera
+from gausslite.errors import InvalidInputError
 from gausslite.render.cpu import CpuRasterizer
 from gausslite.render.cpu_kernels import core_clock_ghz
 from gausslite.render.rasterizer import AdamSettings, LossWeights, SplatGradients, Subset
@@ -17,6 +18,7 @@ kernels = pytest.importorskip("gausslite.render._kernels", reason="the native ke
 
 
 L1_ONLY, WITH_SSIM = LossWeights(ssim=0.0), LossWeights()
+STILL = AdamSettings(means=0.0, log_scales=0.0, quats=0.0, opacity_logits=0.0, rgb=0.0)
 
 
 def gradients(rasterizer: CpuRasterizer, rows: np.ndarray) -> SplatGradients:
@@ -200,6 +202,35 @@ def test_calls_from_several_threads_are_served_one_after_the_other() -> None:
     assert len(came) == 4
     for image in came:
         np.testing.assert_array_equal(image, wanted)
+
+
+def test_a_report_tells_of_its_own_step_whoever_steps_beside() -> None:
+    rasterizer = CpuRasterizer(2)
+    hidden = random_rows(2000)
+    hidden[:, 2] = -5.0
+    wrong: list[int] = []
+
+    def train_on(rows: np.ndarray, visible: int) -> None:
+        moments, view = (np.zeros_like(rows), np.zeros_like(rows)), view_of(rasterizer)
+        for _ in range(60):
+            report = rasterizer.step(rows, *moments, view, np.eye(4), L1_ONLY, STILL)
+            drawn = rasterizer.forward(rows, CAMERA, np.eye(4))
+            if len(report.visible) != visible:
+                wrong.append(len(report.visible))
+            try:
+                rasterizer.backward(drawn, drawn.rgb, drawn.depth_m, drawn.alpha)
+            except InvalidInputError:
+                continue  # the other one drew in between, and that is told
+
+    shown = random_rows(300)
+    seen = len(gradients(rasterizer, shown).visible)
+    assert seen > 0
+    trainers = [threading.Thread(target=train_on, args=case) for case in ((shown, seen), (hidden, 0))]
+    for trainer in trainers:
+        trainer.start()
+    for trainer in trainers:
+        trainer.join()
+    assert wrong == []
 
 
 @pytest.mark.parametrize("simd", kernels.usable_simd())

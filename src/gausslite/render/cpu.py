@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from threading import RLock
 from typing import TYPE_CHECKING
 from weakref import ref
 
@@ -13,7 +14,7 @@ from jaxtyping import Bool, Float32, Float64, UInt8, UInt32
 from numpy import ndarray
 
 from gausslite.domain.camera import Camera
-from gausslite.errors import InvalidInputError, ShapeError
+from gausslite.errors import InvalidInputError, KernelError, ShapeError
 from gausslite.render.checks import (
     require_image_gradients,
     require_scene,
@@ -51,23 +52,27 @@ class _Drawn:
 class _Report:
     """What a step did. The visible rows stay in the kernels' memory until they are read, or drawn over."""
 
-    __slots__ = ("__weakref__", "_engine", "_visible", "loss")
+    __slots__ = ("__weakref__", "_engine", "_lock", "_visible", "loss")
 
-    def __init__(self, loss: float, engine: _kernels.Engine) -> None:
+    def __init__(self, loss: float, engine: _kernels.Engine, lock: RLock) -> None:
         self.loss = loss
         self._engine = engine
+        self._lock = lock
         self._visible: UInt32[ndarray, " m"] | None = None
 
     @property
     def visible(self) -> UInt32[ndarray, " m"]:
         """The visible rows, ascending."""
-        if self._visible is None:
-            self._visible = self._engine.visible()
-        return self._visible
+        with self._lock:
+            if self._visible is None:
+                self._visible = self._engine.visible()
+            return self._visible
 
 
 class CpuRasterizer:
     """C++ kernels with a persistent team of threads; results do not depend on the number of threads.
+
+    Calls from several Python threads are served one after the other.
 
     threads: by default one per core this process may use. simd: `avx512`, `avx2`, `neon` or `portable`; by default
     the environment variable GAUSSLITE_SIMD, and without it the fastest this machine runs. Raises KernelError when the
@@ -76,7 +81,12 @@ class CpuRasterizer:
 
     def __init__(self, threads: int | None = None, simd: str | None = None) -> None:
         self._simd = choose_simd(simd)
-        self._engine: _kernels.Engine = load_kernels().Engine(self._simd, choose_threads(threads))
+        count = choose_threads(threads)
+        try:
+            self._engine: _kernels.Engine = load_kernels().Engine(self._simd, count)
+        except RuntimeError as reason:
+            raise KernelError(f"threads: expected as many as can be started, {count} cannot ({reason})") from reason
+        self._lock = RLock()
         self._latest: ref[_Report] | None = None
         self._loans = Loans()
         self._masked_ms = 0.0
@@ -107,10 +117,11 @@ class CpuRasterizer:
         require_table("rows", rows)
         require_scene(len(rows), camera, T_camera_world, subset)
         T_camera_world = np.ascontiguousarray(T_camera_world)
-        self._settle_report()
-        rgb, depth_m, alpha, frame = self._engine.forward(
-            rows, intrinsics(camera), T_camera_world, contiguous(subset.tiles), contiguous(subset.ids)
-        )
+        with self._lock:
+            self._settle_report()
+            rgb, depth_m, alpha, frame = self._engine.forward(
+                rows, intrinsics(camera), T_camera_world, contiguous(subset.tiles), contiguous(subset.ids)
+            )
         return Rendering(rgb, depth_m, alpha, _Drawn(self, frame, rows, T_camera_world))
 
     def backward(
@@ -126,16 +137,17 @@ class CpuRasterizer:
         backend's latest.
         """
         drawn = rendering.context
-        if not isinstance(drawn, _Drawn) or drawn.owner is not self or drawn.frame != self._engine.frame:
-            raise InvalidInputError("rendering: expected the latest forward of this rasterizer, got another one")
-        require_image_gradients(rendering, d_rgb, d_depth_m, d_alpha)
-        d_rows, d_twist, visible, norms = self._engine.backward(
-            drawn.frame,
-            len(drawn.rows),
-            np.ascontiguousarray(d_rgb),
-            np.ascontiguousarray(d_depth_m),
-            np.ascontiguousarray(d_alpha),
-        )
+        with self._lock:
+            if not isinstance(drawn, _Drawn) or drawn.owner is not self or drawn.frame != self._engine.frame:
+                raise InvalidInputError("rendering: expected the latest forward of this rasterizer, got another one")
+            require_image_gradients(rendering, d_rgb, d_depth_m, d_alpha)
+            d_rows, d_twist, visible, norms = self._engine.backward(
+                drawn.frame,
+                len(drawn.rows),
+                np.ascontiguousarray(d_rgb),
+                np.ascontiguousarray(d_depth_m),
+                np.ascontiguousarray(d_alpha),
+            )
         return SplatGradients(d_rows, d_twist, visible, norms)
 
     def prepare_view(
@@ -167,15 +179,16 @@ class CpuRasterizer:
         """One whole iteration in place. Raises ShapeError, also for a view of another backend."""
         if not isinstance(view, CpuView):
             raise ShapeError(f"view: expected one that this backend prepared, got {type(view).__name__}")
-        scene = view.scene(len(rows), T_camera_world, subset, masked)
-        training = self._loans.training((rows, first_moment, second_moment), (loss, adam), masked, trainable, tally)
-        self._settle_report()
-        before_ms = self._engine.steps_ms
-        value = self._engine.step(scene, training)
-        if masked:
-            self._masked_ms += self._engine.steps_ms - before_ms
-        report = _Report(value, self._engine)
-        self._latest = ref(report)
+        with self._lock:
+            scene = view.scene(len(rows), T_camera_world, subset, masked)
+            training = self._loans.training((rows, first_moment, second_moment), (loss, adam), masked, trainable, tally)
+            self._settle_report()
+            before_ms = self._engine.steps_ms
+            value = self._engine.step(scene, training)
+            if masked:
+                self._masked_ms += self._engine.steps_ms - before_ms
+            report = _Report(value, self._engine, self._lock)
+            self._latest = ref(report)
         return report
 
     @contextmanager
@@ -185,8 +198,9 @@ class CpuRasterizer:
         first_moment: Float32[ndarray, "n 16"],
         second_moment: Float32[ndarray, "n 16"],
     ) -> Iterator[None]:
-        """Nothing to carry: steps work on the arrays themselves, which are checked once here. Raises ShapeError.
+        """Nothing to carry: steps work on the arrays themselves, which are checked once here.
 
+        Raises ShapeError, InvalidInputError where tables are on loan already.
         As nobody else changes the rows, the kernels keep where each one is from step to step.
         """
         with self._loans.lend((rows, first_moment, second_moment)):
@@ -194,17 +208,20 @@ class CpuRasterizer:
 
     def stage_times_ms(self) -> dict[str, float]:
         """Milliseconds that the stages of the latest call took: project, raster, loss, backward, update."""
-        return self._engine.stage_times_ms()
+        with self._lock:
+            return self._engine.stage_times_ms()
 
     def steps_s(self, masked: bool | None = None) -> float:
         """Seconds that all steps so far spent in the kernels, or only those masked to a region, or only the others."""
-        if masked is None:
-            return self._engine.steps_ms / 1e3
-        return (self._masked_ms if masked else self._engine.steps_ms - self._masked_ms) / 1e3
+        with self._lock:
+            if masked is None:
+                return self._engine.steps_ms / 1e3
+            return (self._masked_ms if masked else self._engine.steps_ms - self._masked_ms) / 1e3
 
     def block_evaluations(self) -> int:
         """How often the latest forward or step composited a splat on a 4x4 block of pixels."""
-        return self._engine.block_evaluations
+        with self._lock:
+            return self._engine.block_evaluations
 
     def _settle_report(self) -> None:
         """A report that somebody still holds gets its rows before the kernels draw over them."""

@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float32, Float64
 from numpy import ndarray
 
 from gausslite.domain.camera import Camera
+from gausslite.errors import InvalidInputError
 from gausslite.render.checks import require_marks, require_scene, require_tables
 from gausslite.render.cpu_kernels import load_kernels
 from gausslite.render.rasterizer import AdamSettings, LossWeights, Subset, Tally
@@ -77,8 +78,10 @@ class Loans:
 
     @contextmanager
     def lend(self, tables: _Tables) -> Iterator[None]:
-        """Until this ends, the tables change by steps alone. Raises ShapeError."""
+        """Until this ends, the tables change by steps alone. Raises ShapeError, InvalidInputError for a second loan."""
         require_tables(*tables)
+        if self._held is not None:
+            raise InvalidInputError("holding: expected no other tables on loan, got a second loan")
         self._number += 1
         self._held = tables
         try:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +13,7 @@ from numpy import ndarray
 from torch import Tensor
 
 from gausslite.domain.camera import Camera
-from gausslite.errors import ShapeError
+from gausslite.errors import InvalidInputError, ShapeError
 from gausslite.render.checks import (
     require_image_gradients,
     require_marks,
@@ -56,6 +57,9 @@ class _Drawn:
 
 class ReferenceRasterizer:
     """Float64 torch with autograd inside, on one CPU: the oracle every other backend is measured against."""
+
+    def __init__(self) -> None:
+        self._lent = False
 
     @property
     def name(self) -> str:
@@ -144,15 +148,22 @@ class ReferenceRasterizer:
             tally.counts[moving if tally.among is None else moving[tally.among[moving]]] += 1
         return HostReport(value.item(), visible.astype(np.uint32))
 
+    @contextmanager
     def holding(
         self,
         rows: Float32[ndarray, "n 16"],
         first_moment: Float32[ndarray, "n 16"],
         second_moment: Float32[ndarray, "n 16"],
-    ) -> AbstractContextManager[None]:
-        """Nothing to carry: steps work on the arrays themselves. Raises ShapeError."""
+    ) -> Iterator[None]:
+        """Nothing to carry. Raises ShapeError, InvalidInputError for a second loan before the first is over."""
         require_tables(rows, first_moment, second_moment)
-        return nullcontext()
+        if self._lent:
+            raise InvalidInputError("holding: expected no other tables on loan, got a second loan")
+        self._lent = True
+        try:
+            yield
+        finally:
+            self._lent = False
 
 
 def _draw(

@@ -1,0 +1,97 @@
+"""What the native backend does where memory or threads cannot be had: an error, and it goes on working.
+
+The limits are set in processes of their own; sanitizers, which ask for terabytes of addresses, cannot run these.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+pytest.importorskip("gausslite.render._kernels", reason="the native kernels are not built")
+resource = pytest.importorskip("resource", reason="this system has no limits for processes")
+
+PREPARE = """
+import resource, sys
+import numpy as np
+from gausslite.domain.camera import Camera
+from gausslite.errors import KernelError
+from gausslite.render.cpu import CpuRasterizer
+from gausslite.render.rasterizer import AdamSettings, LossWeights
+
+def limit_to(more_bytes):
+    pages = int(open("/proc/self/statm").read().split()[0])
+    wanted = resource.RLIM_INFINITY if more_bytes is None else pages * resource.getpagesize() + more_bytes
+    resource.setrlimit(resource.RLIMIT_AS, (wanted, resource.RLIM_INFINITY))
+"""
+
+SHORT_OF_MEMORY = (
+    PREPARE
+    + """
+threads, ssim, mebibytes = int(sys.argv[1]), float(sys.argv[2]), int(sys.argv[3])
+rng = np.random.default_rng(0)
+rows = np.zeros((60_000, 16), np.float32)
+rows[:, :3] = rng.uniform(-1, 1, (len(rows), 3)) + (0, 0, 3)
+rows[:, 3:6], rows[:, 6], rows[:, 11:14] = -2.5, 1.0, 0.5
+camera = Camera(300.0, 300.0, 160.0, 120.0, 320, 240)
+rasterizer = CpuRasterizer(threads)
+view = rasterizer.prepare_view(np.zeros((240, 320, 3), np.uint8), np.ones((240, 320), np.float32), camera)
+few = rows[:100].copy()
+
+def step(table):
+    moments = np.zeros_like(table), np.zeros_like(table)
+    return rasterizer.step(table, *moments, view, np.eye(4), LossWeights(ssim=ssim), AdamSettings()).loss
+
+before = step(few.copy())
+untouched, moments = rows.copy(), (np.zeros_like(rows), np.zeros_like(rows))
+limit_to(mebibytes << 20)
+try:
+    rasterizer.step(rows, *moments, view, np.eye(4), LossWeights(ssim=ssim), AdamSettings())
+    refused = False
+except MemoryError:
+    refused = True
+limit_to(None)
+print("refused" if refused else "done", (rows == untouched).all())
+assert step(few.copy()) == before
+print("works", step(rows) > 0)
+"""
+)
+
+SHORT_OF_THREADS = (
+    PREPARE
+    + """
+limit_to(200 << 20)
+try:
+    CpuRasterizer(200)
+except KernelError as error:
+    print(error)
+limit_to(None)
+print(CpuRasterizer(2).threads)
+"""
+)
+
+
+def run(program: str, *arguments: object) -> list[str]:
+    done = subprocess.run(
+        [sys.executable, "-c", program, *map(str, arguments)], capture_output=True, text=True, timeout=120, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout.splitlines()
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="limits of addresses are told as Linux does")
+@pytest.mark.parametrize("threads", [1, 2, 3])
+@pytest.mark.parametrize("ssim", [0.0, 0.2])
+def test_a_step_without_memory_changes_nothing_and_the_next_one_works(threads: int, ssim: float) -> None:
+    told = [run(SHORT_OF_MEMORY, threads, ssim, mebibytes) for mebibytes in (2, 8, 12, 16, 24)]
+    assert {tuple(lines) for lines in told} <= {("refused True", "works True"), ("done False", "works True")}
+    assert ["refused True", "works True"] in told
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="limits of addresses are told as Linux does")
+def test_threads_that_cannot_be_started_are_told() -> None:
+    said, works = run(SHORT_OF_THREADS)
+    assert said.startswith("threads: expected as many as can be started, 200 cannot")
+    assert works == "2"
