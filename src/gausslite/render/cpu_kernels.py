@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import math
 import os
+from pathlib import Path
 from typing import Any
 
 from gausslite.errors import KernelError
 
 SIMD_VARIABLE = "GAUSSLITE_SIMD"
 MAX_THREADS = 256
+_CPU_LIMIT = Path("/sys/fs/cgroup/cpu.max")
+"""Of control groups, version 2: microseconds in a period, or `max`."""
 
 
 def usable_simd() -> tuple[str, ...]:
@@ -43,11 +47,23 @@ def choose_simd(asked: str | None) -> str:
     return chosen
 
 
+def cores_allowed(limit: Path = _CPU_LIMIT) -> int:
+    """How many cores' time a container may spend (`docker run --cpus`), rounded up; MAX_THREADS where none is told."""
+    try:
+        quota, period = limit.read_text().split()
+        return max(1, math.ceil(int(quota) / int(period)))
+    except (OSError, ValueError, ZeroDivisionError):
+        return MAX_THREADS
+
+
 def choose_threads(asked: int | None) -> int:
-    """How many threads: as asked, else one per core this process may use. Raises KernelError."""
+    """How many threads: as asked, else one per core this process may use. Raises KernelError.
+
+    Threads beyond the cores would cost far more than they bring: each stage waits for the last of them.
+    """
     if asked is None:
         available = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-        return min(available, MAX_THREADS)
+        return min(available, cores_allowed(), MAX_THREADS)
     if not 1 <= asked <= MAX_THREADS:
         raise KernelError(f"threads: expected 1 to {MAX_THREADS}, got {asked}")
     return asked

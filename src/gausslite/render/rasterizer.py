@@ -30,6 +30,7 @@ from jaxtyping import Bool, Float32, Float64, UInt8, UInt32
 from numpy import ndarray
 
 from gausslite.domain.camera import Camera
+from gausslite.errors import InvalidInputError
 
 ROW_WIDTH = 16
 MEAN, LOG_SCALE, QUAT, LOGIT, RGB = slice(0, 3), slice(3, 6), slice(6, 10), 10, slice(11, 14)
@@ -110,6 +111,12 @@ class LossWeights:
     ssim: float = 0.2
     by_share: bool = False
 
+    def __post_init__(self) -> None:
+        for name in ("colour", "depth", "ssim"):
+            weight = getattr(self, name)
+            if not 0.0 <= weight < math.inf:
+                raise InvalidInputError(f"loss weight {name}: expected a finite number of at least 0, got {weight}")
+
 
 @dataclass(frozen=True, slots=True)
 class AdamSettings:
@@ -128,6 +135,19 @@ class AdamSettings:
     beta2: float = 0.999
     epsilon: float = 1e-15
     full_rate_updates: float = math.inf
+
+    def __post_init__(self) -> None:
+        for name in ("means", "log_scales", "quats", "opacity_logits", "rgb"):
+            rate = getattr(self, name)
+            if not 0.0 <= rate < math.inf:
+                raise InvalidInputError(f"adam rate {name}: expected a finite number of at least 0, got {rate}")
+        for name in ("beta1", "beta2"):
+            if not 0.0 <= getattr(self, name) < 1.0:
+                raise InvalidInputError(f"adam {name}: expected at least 0 and less than 1, got {getattr(self, name)}")
+        if not 0.0 < self.epsilon < math.inf:
+            raise InvalidInputError(f"adam epsilon: expected a finite number above 0, got {self.epsilon}")
+        if not self.full_rate_updates > 0.0:
+            raise InvalidInputError(f"adam full_rate_updates: expected more than 0, got {self.full_rate_updates}")
 
     def row_rates(self) -> Float32[ndarray, "16"]:
         """The learning rate of each column of a row; zero for the spare ones."""
@@ -249,6 +269,6 @@ class Rasterizer(Protocol):
 
         A device keeps them and brings them up to date on leaving, also when leaving by an error, and tallies with
         them; inside, nobody else reads or changes the arrays, and steps name the same arrays. Without it every step
-        carries them there and back. One loan at a time. Raises ShapeError.
+        carries them there and back. Raises ShapeError, InvalidInputError for a second loan before the first is over.
         """
         ...
