@@ -66,7 +66,7 @@ def test_every_case_is_measured_on_every_instruction_set() -> None:
     for timing in timings:
         assert timing.yardstick == {}
         assert timing.regions == ()
-        assert set(timing.stages_ms) == set(timing.blocks) == {"fused_l1", "fused_l1_ssim"}
+        assert set(timing.stages_ms) == {"fused_l1", "fused_l1_ssim"}
         assert all(0 < duration.min_ms <= duration.median_ms for duration in timing.durations.values())
 
 
@@ -95,7 +95,7 @@ def test_details_hold_every_figure_of_every_case(tmp_path: Path, capsys: pytest.
     assert [case["gaussians"] for case in cases] == [20, 40]
     for case in cases:
         assert set(case["operations"]) == {"fused_l1", "fused_l1_ssim", "forward", "backward"}
-        assert case["blocks"]["fused_l1"]["evaluations"] == case["blocks"]["fused_l1_ssim"]["evaluations"] > 0
+        assert case["blocks"]["evaluations"] > 0
         regions = [(each["share_percent"], each["layout"], each["loss"]) for each in case["regions"]]
         assert len(set(regions)) == 2 * 3 * 2
         assert all(each["ratio"] > 0 for each in case["regions"])
@@ -103,11 +103,10 @@ def test_details_hold_every_figure_of_every_case(tmp_path: Path, capsys: pytest.
         assert whole == [1.0] * 6
 
 
-def test_cycles_are_those_of_all_threads_in_the_stages_that_evaluate_blocks() -> None:
+def test_cycles_are_those_of_all_threads_in_the_stage_that_evaluates_blocks() -> None:
     stages = {"project": 5.0, "raster": 2.0, "loss": 7.0, "backward": 1.0, "update": 9.0}
     cost = BlockCost.of(evaluations=300_000, clock_ghz=3.4, threads=2, stages_ms=stages)
-    assert cost.cycles == pytest.approx(2 * 3.0e-3 * 3.4e9 / 300_000)
-    assert cost.floor_share == pytest.approx(34 / 68)
+    assert cost.cycles == pytest.approx(2 * 2.0e-3 * 3.4e9 / 300_000)
 
 
 @pytest.mark.parametrize("layout", [Layout.COMPACT, Layout.SCATTERED])

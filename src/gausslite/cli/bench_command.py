@@ -14,7 +14,7 @@ from gausslite.cli.bench_parser import configure_parser
 from gausslite.cli.bench_perception import configure_perception
 from gausslite.cli.bench_quality import configure_ablation, configure_quality
 from gausslite.cli.bench_retask import configure_retask
-from gausslite.evaluation.bench_cycles import FLOOR_CYCLES, BlockCost
+from gausslite.evaluation.bench_cycles import BlockCost
 from gausslite.evaluation.bench_gpu import GPU_GAUSSIANS
 from gausslite.evaluation.bench_raster import GAUSSIANS, OPERATIONS, SIZES, RasterBench, RasterTiming
 from gausslite.evaluation.bench_region import SHARES_PERCENT, RegionCost
@@ -119,15 +119,14 @@ def raster_lines(timing: RasterTiming) -> str:
         lines.append(line)
         if stages:
             lines.append("    " + "  ".join(f"{stage} {ms:.2f}" for stage, ms in stages.items()))
-            lines.append(f"    {_block_line(timing.blocks[name])}")
+    lines.append(f"  {_block_line(timing.blocks)}")
     lines += [_region_line(cost) for cost in timing.regions]
     return "\n".join(lines)
 
 
 def _block_line(cost: BlockCost) -> str:
     return (
-        f"{cost.evaluations} block evaluations at {cost.clock_ghz:.2f} GHz: {cost.cycles:.1f} cycles each, "
-        f"the arithmetic floor of {FLOOR_CYCLES:.0f} is {cost.floor_share:.0%} of that"
+        f"{cost.evaluations} block evaluations at {cost.clock_ghz:.2f} GHz: {cost.cycles:.1f} cycles each in fused_l1"
     )
 
 

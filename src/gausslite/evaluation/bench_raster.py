@@ -31,8 +31,8 @@ _SETTLE_S = 0.02
 class RasterTiming:
     """What each operation took, whole calls as the mapper pays for them.
 
-    stages_ms and blocks: of each fused step, least times. yardstick is the other library's and regions are what shares
-    of the image cost; both are empty when they were not asked for.
+    stages_ms: of each fused step, least times. blocks: of the step with L1. yardstick is the other library's and
+    regions are what shares of the image cost; both are empty when they were not asked for.
     """
 
     gaussians: int
@@ -42,7 +42,7 @@ class RasterTiming:
     simd: str
     durations: Mapping[str, Duration]
     stages_ms: Mapping[str, Mapping[str, float]]
-    blocks: Mapping[str, BlockCost]
+    blocks: BlockCost
     yardstick: Mapping[str, Duration] = field(default_factory=dict)
     regions: Sequence[RegionCost] = ()
 
@@ -57,7 +57,7 @@ class RasterTiming:
             **self._case(),
             "operations": {name: asdict(duration) for name, duration in self.durations.items()},
             "stages_ms_min": {name: dict(stages) for name, stages in self.stages_ms.items()},
-            "blocks": {name: {**asdict(cost), "floor_share": cost.floor_share} for name, cost in self.blocks.items()},
+            "blocks": asdict(self.blocks),
             "yardstick": {name: asdict(duration) for name, duration in self.yardstick.items()},
             "regions": [{**asdict(cost), "ratio": cost.ratio} for cost in self.regions],
         }
@@ -102,10 +102,7 @@ class RasterBench:
             contenders.append(Yardstick(self.yardstick, rasterizer.threads, _table(table.count), view))
         seconds, clock_ghz = _take_turns(contenders, self.repetitions)
         durations = [{name: Duration.of(times) for name, times in each.items()} for each in seconds]
-        blocks = {
-            name: BlockCost.of(ours.evaluations[name], clock_ghz, rasterizer.threads, stages)
-            for name, stages in ours.stages_ms.items()
-        }
+        blocks = BlockCost.of(ours.evaluations, clock_ghz, rasterizer.threads, ours.stages_ms["fused_l1"])
         return RasterTiming(
             gaussians=table.count,
             width=view.camera.width_px,
@@ -125,7 +122,7 @@ class _Ours:
 
     def __init__(self, rasterizer: CpuRasterizer, table: SplatTable, view: BenchView) -> None:
         self.stages_ms: dict[str, dict[str, float]] = {}
-        self.evaluations: dict[str, int] = {}
+        self.evaluations = 0
         self._rasterizer = rasterizer
         self._table = table
         self._view = view
@@ -160,7 +157,7 @@ class _Ours:
 
     def _step(self, name: str) -> None:
         self._train(LOSSES[name])
-        self.evaluations[name] = self._rasterizer.block_evaluations()
+        self.evaluations = self._rasterizer.block_evaluations()
         least = self.stages_ms.setdefault(name, {})
         for stage, ms in self._rasterizer.stage_times_ms().items():
             least[stage] = min(ms, least.get(stage, ms))
