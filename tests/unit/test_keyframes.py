@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from mapping_scenes import middle_relevance, wall_frame
 
@@ -32,6 +34,33 @@ def test_the_buffer_is_bounded_and_stays_spread_over_the_mission() -> None:
     assert len(kept) == 8
     assert (kept[0], kept[-1]) == (0, 63)
     assert max(np.diff(kept)) <= 20
+
+
+def test_of_large_images_fewer_are_kept() -> None:
+    pixels = wall_frame(0).depth_m.size
+    settings = KeyframeSettings(every=1, window=4, buffer=8, region_views=4, max_pixels=8 * pixels)
+    store = stored(settings, 40)
+    assert [keyframe.frame.index for keyframe in store.buffer][::3] == [0, 39]
+    assert len(store.buffer) == 4
+    assert len(store.window) <= 4
+    assert store.image_bytes <= 8 * pixels * 14
+    tiny = settings.for_images_of(10**9)
+    assert (tiny.window, tiny.buffer, tiny.region_views) == (1, 1, 1)
+    assert KeyframeSettings().for_images_of(1280 * 720) == KeyframeSettings()
+    assert KeyframeSettings(region_views=0).for_images_of(10**9).region_views == 0
+
+
+def test_once_larger_images_come_smaller_ones_make_room() -> None:
+    settings, rasterizer = KeyframeSettings(every=1, window=4, buffer=8, region_views=4), CpuRasterizer(threads=1)
+    large = wall_frame(40)
+    store = KeyframeStore(replace(settings, max_pixels=4 * large.depth_m.size))
+    for index in range(20):
+        frame = wall_frame(index, size=(16, 12))
+        store.offer(window_view(Keyframe(frame, middle_relevance(frame)), rasterizer, settings))
+    assert len(store.buffer) == 8
+    store.offer(window_view(Keyframe(large, middle_relevance(large)), rasterizer, settings))
+    assert (len(store.buffer), len(store.window)) == (2, 1)
+    assert store.buffer[-1].frame is large
 
 
 def test_frames_that_show_the_region_stay_ready_to_train_on_and_spread_over_the_mission() -> None:

@@ -117,8 +117,9 @@ class KeyframeStore:
     """
 
     def __init__(self, settings: KeyframeSettings, follows_task: bool = True) -> None:
-        self._settings = settings
+        self._settings = self._room = settings
         self._follows_task = follows_task
+        self._largest_px = 1
         self._latest: list[WindowView] = []
         self._region: list[WindowView] = []
         self._buffer: list[Keyframe] = []
@@ -139,16 +140,16 @@ class KeyframeStore:
 
     def offer(self, view: WindowView) -> None:
         """Keep this mapped frame if it shows the region or it is the turn of a keyframe."""
-        settings = self._settings
-        due = self._offered % settings.every == 0
+        self._make_room_for(view.keyframe)
+        due = self._offered % self._settings.every == 0
         self._offered += 1
         if self._may_stay(view):
             self._keep_for_region([*self._region, view])
         if not due:
             return
-        self._latest = [*self._latest, view][-settings.window :]
+        self._latest = [*self._latest, view][-self._room.window :]
         self._buffer.append(view.keyframe)
-        if len(self._buffer) > settings.buffer:
+        while len(self._buffer) > self._room.buffer:
             del self._buffer[_most_crowded(self._buffer)]
 
     def revise(self, view: WindowView) -> None:
@@ -230,7 +231,16 @@ class KeyframeStore:
         self._latest = [views[place] for place in latest]
         self._region = [views[place] for place in region]
         self._buffer = [keyframes[place] for place in buffer]
+        for keyframe in keyframes.values():
+            self._make_room_for(keyframe)
         [self._offered] = take_counts(state, "offered", 1)
+
+    def _make_room_for(self, keyframe: Keyframe) -> None:
+        """The largest image that came says how many may stay from now on."""
+        pixels = keyframe.frame.depth_m.size
+        if pixels > self._largest_px:
+            self._largest_px = pixels
+            self._room = self._settings.for_images_of(pixels)
 
     def _may_stay(self, view: WindowView) -> bool:
         """True for a frame that may stay ready to train on beyond its turn among the latest."""
@@ -243,9 +253,9 @@ class KeyframeStore:
 
     def _keep_for_region(self, views: list[WindowView]) -> None:
         """These are the views of the region, without the one that is missed least where they are too many."""
-        if len(views) > self._settings.region_views:
+        while len(views) > self._room.region_views:
             del views[_most_crowded([view.keyframe for view in views])]
-        self._region = views[: self._settings.region_views]
+        self._region = views
 
 
 def _no_region(frame: Frame) -> Subset:

@@ -101,6 +101,8 @@ class KeyframeSettings:
     draws anyway; 0 is the paper's binary mask, which lets what stands beside the region move as it likes.
     refits: where views may be wrong (`MapperSettings.view_prior`) so many of those ready to train on are fitted to the
     map again with each frame, in turns.
+    max_pixels: of larger images than 1280x720 or so fewer are kept, so that all of them have no more pixels than this;
+    a pixel takes about 13 bytes, 20 where its view may be wrong.
     """
 
     every: int = 5
@@ -110,14 +112,25 @@ class KeyframeSettings:
     roi_margin_px: int = 5
     surroundings_weight: float = 0.3
     refits: int = 2
+    max_pixels: int = 160_000_000
 
     def __post_init__(self) -> None:
-        for name in ("every", "window", "buffer"):
+        for name in ("every", "window", "buffer", "max_pixels"):
             _require(getattr(self, name) >= 1, f"keyframes {name}", "at least 1", getattr(self, name))
         for name in ("region_views", "roi_margin_px", "refits"):
             _require(getattr(self, name) >= 0, f"keyframes {name}", "at least 0", getattr(self, name))
         weight = self.surroundings_weight
         _require(0 <= weight <= 1, "keyframes surroundings_weight", "0 to 1", weight)
+
+    def for_images_of(self, pixels: int) -> KeyframeSettings:
+        """The same with as many images of this size as have room: one of each kind, however large they are."""
+        share = min(1.0, self.max_pixels / (pixels * (self.window + self.region_views + self.buffer)))
+        return replace(
+            self,
+            window=max(1, int(share * self.window)),
+            buffer=max(1, int(share * self.buffer)),
+            region_views=min(self.region_views, max(1, int(share * self.region_views))),
+        )
 
 
 _ALIKE_IN_BOTH_PHASES = LossWeights(by_share=True)
