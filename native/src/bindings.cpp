@@ -268,6 +268,7 @@ NB_MODULE(_kernels, m) {
       .def("step", &step, nb::arg("scene"), nb::arg("training"), "The loss.")
       .def("visible", &visible_ids, "The rows that the last forward or step found visible, ascending.")
       .def_prop_ro("steps_ms", &Rasterizer::steps_ms, "Milliseconds that all steps took so far.")
+      .def_prop_ro("masked_steps_ms", &Rasterizer::masked_steps_ms, "... and those masked to a region.")
       .def("stage_times_ms", &stage_times, "Milliseconds of the last call's stages.")
       .def_prop_ro("block_evaluations", &Rasterizer::block_evaluations,
                    "How often the last forward or step composited a splat on a 4x4 block of pixels.");

@@ -286,7 +286,9 @@ double Rasterizer::step(const FrameInput& input, const OptimizerState& state, co
   if (loss.by_share) total *= view.share(masked);
   for (int t = 0; t < ws_.tiles_x * ws_.tiles_y; ++t) total += l1_sums_[size_t(t)];
   for (int k = 0; with_ssim && k <= ws_.tiles_y; ++k) total += ssim_sums_[size_t(k)];
-  steps_ms_ += now_ms() - started_ms;
+  const double took_ms = now_ms() - started_ms;
+  steps_ms_ += took_ms;
+  if (masked) masked_steps_ms_ += took_ms;
   return total;
 }
 

@@ -57,8 +57,9 @@ class Rasterizer {
 
   int threads() const { return team_.size(); }
   const StageTimes& times() const { return times_; }
-  // What all steps took so far.
+  // What all steps took so far, and those masked to a region.
   double steps_ms() const { return steps_ms_; }
+  double masked_steps_ms() const { return masked_steps_ms_; }
   // How often the last frame composited a splat on a 4x4 block of pixels.
   uint64_t block_evaluations() const;
   // True when the last frame had this many rows and pixels.
@@ -107,7 +108,7 @@ class Rasterizer {
   AdamCorrections corrections_;
   StageTimes times_;
   double last_mark_ms_ = 0.0;
-  double steps_ms_ = 0.0;
+  double steps_ms_ = 0.0, masked_steps_ms_ = 0.0;
 };
 
 }  // namespace gausslite

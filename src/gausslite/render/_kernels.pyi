@@ -98,6 +98,10 @@ class Engine:
     def steps_ms(self) -> float:
         """Milliseconds that all steps took so far."""
 
+    @property
+    def masked_steps_ms(self) -> float:
+        """... and those masked to a region."""
+
     def stage_times_ms(self) -> dict[str, float]:
         """Milliseconds of the last call's stages."""
 

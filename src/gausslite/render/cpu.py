@@ -89,7 +89,6 @@ class CpuRasterizer:
         self._lock = RLock()
         self._latest: ref[_Report] | None = None
         self._loans = Loans()
-        self._masked_ms = 0.0
 
     @property
     def name(self) -> str:
@@ -183,11 +182,7 @@ class CpuRasterizer:
             scene = view.scene(len(rows), T_camera_world, subset, masked)
             training = self._loans.training((rows, first_moment, second_moment), (loss, adam), masked, trainable, tally)
             self._settle_report()
-            before_ms = self._engine.steps_ms
-            value = self._engine.step(scene, training)
-            if masked:
-                self._masked_ms += self._engine.steps_ms - before_ms
-            report = _Report(value, self._engine, self._lock)
+            report = _Report(self._engine.step(scene, training), self._engine, self._lock)
             self._latest = ref(report)
         return report
 
@@ -214,9 +209,9 @@ class CpuRasterizer:
     def steps_s(self, masked: bool | None = None) -> float:
         """Seconds that all steps so far spent in the kernels, or only those masked to a region, or only the others."""
         with self._lock:
-            if masked is None:
-                return self._engine.steps_ms / 1e3
-            return (self._masked_ms if masked else self._engine.steps_ms - self._masked_ms) / 1e3
+            all_ms, masked_ms = self._engine.steps_ms, self._engine.masked_steps_ms
+        spent_ms = all_ms if masked is None else masked_ms if masked else all_ms - masked_ms
+        return spent_ms / 1e3
 
     def block_evaluations(self) -> int:
         """How often the latest forward or step composited a splat on a 4x4 block of pixels."""
