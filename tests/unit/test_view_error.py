@@ -14,7 +14,7 @@ from gausslite.datasets.source import Source
 from gausslite.domain.frame import Frame
 from gausslite.domain.region import Region
 from gausslite.errors import DatasetError
-from gausslite.optimize.view_error import measure_view_error
+from gausslite.mission.view_error import measure_view_error
 
 FRAMES = 40
 pytest.importorskip("embreex", reason="the simulated home needs the extra `sim`")

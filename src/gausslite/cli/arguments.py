@@ -13,7 +13,7 @@ from gausslite.datasets.source import Source
 from gausslite.domain.pose import UpAxis
 from gausslite.domain.region import BallRegion, Region
 from gausslite.mission.options import AS_RECORDED, LOOK, TRUSTED, add_frames, names, numbers
-from gausslite.optimize.view_error import measure_view_error
+from gausslite.mission.view_error import measure_view_error
 from gausslite.optimize.view_fit import ViewPrior
 
 

@@ -113,7 +113,8 @@ class KeyframeStore:
     """Every `every`th mapped frame; the latest `window` are ready to train on, at most `buffer` are remembered.
 
     Beside them `region_views` frames are ready to train on, whenever they were mapped: those that show the task's
-    region, or any, for a policy that follows no task and would have fewer views otherwise.
+    region, or any, for a policy that follows no task and would have fewer views otherwise. Once large images have come
+    there is room for fewer (`KeyframeSettings.max_pixels`).
     """
 
     def __init__(self, settings: KeyframeSettings, follows_task: bool = True) -> None:
