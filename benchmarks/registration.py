@@ -11,20 +11,20 @@ from __future__ import annotations
 import argparse
 import sys
 
+from gausslite.config.options import add_budget, add_frames, names
 from gausslite.datasets.open import open_source
 from gausslite.datasets.regions import choose_regions
-from gausslite.datasets.registration import ColourCamera
+from gausslite.datasets.registered_source import DepthRegistration
 from gausslite.datasets.selection import frame_size, select_frames
 from gausslite.errors import GaussLiteError
 from gausslite.evaluation.compare import average, score_view
-from gausslite.evaluation.held_out import HoldOut
+from gausslite.evaluation.held_out import HeldOutSplit
 from gausslite.evaluation.views import HeldOutView, MapViewer
 from gausslite.mapping.policies import POLICIES, TASK
 from gausslite.mission.build import build_mapper
-from gausslite.mission.options import add_budget, add_frames, names
 from gausslite.mission.settings import MissionSettings
-from gausslite.perception.fixed import NoAttention, RegionAttention
-from gausslite.pipeline import TaskMapper
+from gausslite.mission.task_mapper import TaskMapper
+from gausslite.perception.fixed_relevance import NoTaskEstimator, RegionRelevanceEstimator
 from gausslite.render.choose import choose_rasterizer
 
 HOLD_OUT = 8
@@ -35,7 +35,9 @@ def main() -> int:
     parser.add_argument("source", metavar="SOURCE")
     parser.add_argument("--objects", metavar="A,B", type=names, default=(), help="regions of the task (default: all)")
     parser.add_argument("--policy", choices=sorted(POLICIES), default=TASK)
-    parser.add_argument("--masks", metavar="TEXT", type=ColourCamera.parse, help="colour camera behind the ROI masks")
+    parser.add_argument(
+        "--masks", metavar="TEXT", type=DepthRegistration.parse, help="colour camera behind the ROI masks"
+    )
     add_frames(parser)
     add_budget(parser)
     options = parser.parse_args()
@@ -52,7 +54,7 @@ def measure(options: argparse.Namespace) -> str:
     source = open_source(options.source, options.up, options.colour_camera)
     masks = open_source(options.source, options.up, options.masks or options.colour_camera)
     size, regions = frame_size(options.size, source), choose_regions(source.regions(), options.objects)
-    train, held_out = HoldOut(HOLD_OUT).split(select_frames(source, options.frames))
+    train, held_out = HeldOutSplit(HOLD_OUT).split(select_frames(source, options.frames))
     settings = MissionSettings(
         options.policy,
         max_gaussians=options.max_gaussians,
@@ -60,7 +62,7 @@ def measure(options: argparse.Namespace) -> str:
         seed=options.seed,
         threads=options.threads,
     )
-    attention = RegionAttention(regions) if options.policy == TASK else NoAttention()
+    attention = RegionRelevanceEstimator(regions) if options.policy == TASK else NoTaskEstimator()
     mapper = TaskMapper(attention, build_mapper(settings))
     for position in train:
         mapper.process(source.frame(position, size))

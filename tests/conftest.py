@@ -8,7 +8,10 @@ import pytest
 from jaxtyping import install_import_hook
 
 # an int is a float here, as it is for the type checker
-install_import_hook("gausslite", "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))")
+install_import_hook(
+    ("gausslite", "gausslite_sim", "gausslite_bench"),
+    "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))",
+)
 
 
 @pytest.fixture(scope="session")

@@ -11,7 +11,7 @@ from __future__ import annotations
 import argparse
 import sys
 
-from gausslite.datasets.alignment import estimate_colour_camera
+from gausslite.calibration.registration import estimate_colour_camera
 from gausslite.datasets.open import open_source
 from gausslite.datasets.selection import select_frames
 from gausslite.errors import GaussLiteError

@@ -45,11 +45,11 @@ cmake --build "$build" --parallel "$(nproc)" >/dev/null
 # The package is copied beside its module, so that neither an installed one nor the working tree's is touched.
 rm -rf "$build/package"
 mkdir "$build/package"
-cp -r "$root/src/gausslite" "$build/package/"
+cp -r "$root/src/." "$build/package/"
 rm -f "$build"/package/gausslite/render/_kernels*.so
 cp "$build"/_kernels*.so "$build/package/gausslite/render/"
 export PYTHONPATH=$build/package PYTHONDONTWRITEBYTECODE=1
 cd "$root"
-[ $# -gt 0 ] || set -- tests/unit/test_cpu_kernels.py tests/unit/test_cpu_choices.py tests/unit/test_cpu_loans.py
+[ $# -gt 0 ] || set -- tests/core/render/test_cpu_kernels.py tests/core/render/test_cpu_choices.py tests/core/render/test_cpu_bindings.py
 # Uncaptured: a sanitizer writes its report and ends the process, and pytest would take the report with it.
 checked -m pytest -q --capture=no -p no:cacheprovider "$@"

@@ -43,7 +43,7 @@ class Terminated(KeyboardInterrupt):
     """SIGTERM, as what Ctrl-C is to Python."""
 
 
-class AfterThisStep:
+class DeferredInterrupt:
     """Within it the first Ctrl-C or SIGTERM is only noted, so that the step at hand is finished and kept.
 
     asked is then what to raise in the end; a second signal raises it at once. Away from the main thread, which alone
@@ -55,7 +55,7 @@ class AfterThisStep:
         self._takes_signals = threading.current_thread() is threading.main_thread()
         self._before = {number: signal.getsignal(number) for number in _SIGNALS}
 
-    def __enter__(self) -> AfterThisStep:
+    def __enter__(self) -> DeferredInterrupt:
         if self._takes_signals:
             for number in _SIGNALS:
                 signal.signal(number, self._note)

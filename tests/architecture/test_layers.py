@@ -28,8 +28,8 @@ def test_import_rules_hold() -> None:
     [
         "gausslite.cli.main",
         "gausslite.domain.frame",
-        "gausslite.pipeline",
-        "gausslite.perception.attention",
+        "gausslite.mission.task_mapper",
+        "gausslite.perception.relevance_estimator",
         "gausslite.fusion.vote",
         "gausslite.wire.clients",
     ],

@@ -8,7 +8,7 @@ import numpy as np
 from splat_scenes import Picture, Scene, picture_near
 
 from gausslite.render.rasterizer import (
-    EVERYTHING,
+    FULL_FRAME,
     GRAD_2D_COUNT,
     GRAD_2D_SUM,
     MOST_COUNTED_UPDATES,
@@ -59,7 +59,7 @@ def train(
     *,
     loss: LossWeights = LOSS,
     masked: bool = False,
-    subset: Subset = EVERYTHING,
+    subset: Subset = FULL_FRAME,
     trainable: np.ndarray | None = None,
     seasoned: bool = False,
     adam: AdamSettings = ADAM,
@@ -71,7 +71,7 @@ def train(
     return Trained(before, rows, first, second, report)
 
 
-def picture_for(scene: Scene, oracle: Rasterizer, subset: Subset = EVERYTHING) -> Picture:
+def picture_for(scene: Scene, oracle: Rasterizer, subset: Subset = FULL_FRAME) -> Picture:
     return picture_near(oracle.forward(scene.rows, scene.camera, scene.T_camera_world, subset))
 
 

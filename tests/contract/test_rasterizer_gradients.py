@@ -16,12 +16,12 @@ from splat_scenes import (
     scene_named,
 )
 
-from gausslite.render.rasterizer import EVERYTHING, TILE_PX, Rasterizer, SplatGradients, Subset
+from gausslite.render.rasterizer import FULL_FRAME, TILE_PX, Rasterizer, SplatGradients, Subset
 
 TOLERANCE = 1e-4
 
 
-def gradients(rasterizer: Rasterizer, scene: Scene, subset: Subset = EVERYTHING) -> SplatGradients:
+def gradients(rasterizer: Rasterizer, scene: Scene, subset: Subset = FULL_FRAME) -> SplatGradients:
     drawn = rasterizer.forward(scene.rows, scene.camera, scene.T_camera_world, subset)
     return rasterizer.backward(drawn, *random_image_gradients(scene))
 

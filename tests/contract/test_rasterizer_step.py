@@ -12,7 +12,7 @@ from splat_scenes import GROUPS, Picture, Scene, relative_error, scene_for, scen
 from step_training import ADAM, LOSS, gradient_seen, picture_for, tables, train
 
 from gausslite.render.rasterizer import (
-    EVERYTHING,
+    FULL_FRAME,
     GRAD_2D_COUNT,
     GRAD_2D_SUM,
     MOST_COUNTED_UPDATES,
@@ -59,7 +59,7 @@ CASES = {
 def test_step_feeds_adam_the_oracles_gradient(rasterizer: Rasterizer, oracle: Rasterizer, case: str) -> None:
     options = CASES[case]
     scene = scene_named("medium splats")
-    picture = picture_for(scene, oracle, options.get("subset", EVERYTHING))
+    picture = picture_for(scene, oracle, options.get("subset", FULL_FRAME))
     came, wanted = train(rasterizer, scene, picture, **options), train(oracle, scene, picture, **options)
     assert came.report.loss == pytest.approx(wanted.report.loss, rel=1e-4)
     np.testing.assert_array_equal(came.report.visible, wanted.report.visible)

@@ -13,7 +13,7 @@ from gausslite.errors import InvalidInputError, ShapeError
 from gausslite.render.rasterizer import (
     UPDATES,
     Rasterizer,
-    Tally,
+    UpdateCounter,
 )
 
 
@@ -48,7 +48,7 @@ def test_a_tally_counts_the_rows_that_moved_and_no_others(rasterizer: Rasterizer
     view = picture_for(scene, oracle).view(rasterizer, scene)
     lent, rng = tables(scene, seasoned=False), np.random.default_rng(6)
     trainable, among = rng.random((2, len(scene.rows))) < 0.5
-    everywhere, some = (Tally(np.full(len(scene.rows), 7, np.uint32), choice) for choice in (None, among))
+    everywhere, some = (UpdateCounter(np.full(len(scene.rows), 7, np.uint32), choice) for choice in (None, among))
     with rasterizer.holding(*lent):
         for step in range(10):
             rasterizer.step(*lent, view, scene.T_camera_world, LOSS, ADAM, trainable=trainable, tally=everywhere)
@@ -83,7 +83,9 @@ def test_a_tally_of_another_length_or_that_may_not_be_written_is_refused(
     sealed.flags.writeable = False
     for counts in (np.zeros(len(scene.rows) - 1, np.uint32), sealed):
         with pytest.raises(ShapeError, match="tally counts"):
-            rasterizer.step(*tables(scene, seasoned=False), view, scene.T_camera_world, LOSS, ADAM, tally=Tally(counts))
+            rasterizer.step(
+                *tables(scene, seasoned=False), view, scene.T_camera_world, LOSS, ADAM, tally=UpdateCounter(counts)
+            )
 
 
 def test_pixels_of_weight_zero_do_not_matter_to_a_masked_step(rasterizer: Rasterizer, oracle: Rasterizer) -> None:

@@ -16,7 +16,7 @@ import pytest
 
 from gausslite.codec.ply import read_ply
 from gausslite.datasets.open import open_source
-from gausslite.datasets.registration import ColourCamera
+from gausslite.datasets.registered_source import DepthRegistration
 from gausslite.domain.camera import back_project
 from gausslite.domain.pose import transform_points
 
@@ -95,7 +95,7 @@ def test_a_recordings_robots_register_and_refine_as_the_demo_was_told(tmp_path: 
     assert done.returncode == 0, done.stderr
     assert "each held-out view's pose and colours fitted" in done.stdout
     report = json.loads((out / "report.json").read_text())
-    assert ColourCamera.parse(report["colour_camera"]) == ColourCamera.parse(camera)
+    assert DepthRegistration.parse(report["colour_camera"]) == DepthRegistration.parse(camera)
     assert report["view_error"] == "0.01,0.5,0.1,0.03"
     assert report["scored"] == {"objects": ["mug_1"], "views": 2, "fitted": True}
     assert [agent["frames"] for agent in report["agents"].values()] == [7, 7]

@@ -10,8 +10,8 @@ from gausslite.v1 import agent_service_pb2 as pb
 from gausslite.wire.convert import graph_to_message
 from gausslite.wire.images import encode_colour, encode_depth
 from gausslite.wire.uplink_values import UplinkCounters
-from gausslite_agent.player import MissionState
-from gausslite_agent.status import FrameReport, Outcome, RobotStatus
+from gausslite_agent.mission_runner import MissionState
+from gausslite_agent.status import FrameReport, Outcome, WorkerStatus
 
 _STATES = {
     MissionState.IDLE: pb.AGENT_STATE_IDLE,
@@ -42,7 +42,7 @@ def report_to_message(report: FrameReport) -> pb.IngestFramesResponse:
 
 
 def status_to_message(
-    agent_id: str, state: MissionState, robot: RobotStatus, uplink: UplinkCounters
+    agent_id: str, state: MissionState, robot: WorkerStatus, uplink: UplinkCounters
 ) -> pb.GetAgentStatusResponse:
     """How the agent is doing."""
     return pb.GetAgentStatusResponse(

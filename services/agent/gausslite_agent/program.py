@@ -9,23 +9,23 @@ from contextlib import ExitStack
 
 from gausslite.datasets.open import is_simulated
 from gausslite.domain.pose import unit_up_axis
-from gausslite.mission.build import Attentions
+from gausslite.mission.build import RelevanceEstimatorFactory
 from gausslite.mission.results import prepare_file, prepare_folder
 from gausslite.mission.settings import SceneKnowledge
 from gausslite.task.parser import TaskParser
 from gausslite.task.rules import RuleParser
-from gausslite.wire.bell import Bell
+from gausslite.wire.change_notifier import ChangeNotifier
 from gausslite.wire.clients import FusionClient, ParserClient
 from gausslite.wire.process import run_service
 from gausslite.wire.server import serve_until_stopped
 from gausslite.wire.spool import Spool
 from gausslite.wire.uplink import Uplink
-from gausslite_agent.player import Player
-from gausslite_agent.robot import Robot
-from gausslite_agent.saved_mission import SavedMission
+from gausslite_agent.mapping_worker import MappingWorker
+from gausslite_agent.mission_checkpoint import SavedAgentMission
+from gausslite_agent.mission_runner import AgentMission
+from gausslite_agent.replay_source import ReplaySource
 from gausslite_agent.servicer import AgentServicer
 from gausslite_agent.settings import AgentSettings, parse_arguments
-from gausslite_agent.stand_in import StandIn
 
 
 def run(arguments: Sequence[str] | None = None) -> int:
@@ -40,17 +40,17 @@ def run(arguments: Sequence[str] | None = None) -> int:
 async def _serve(settings: AgentSettings) -> None:
     """Build the robot, serve it, play its source; close in the reverse order."""
     _require_usable(settings)
-    stand_in = None if settings.play is None else StandIn.open(settings.play, settings.up_axis)
+    stand_in = None if settings.play is None else ReplaySource.open(settings.play, settings.up_axis)
     saved = _saved_mission(settings)
-    loop, news = asyncio.get_running_loop(), Bell()
+    loop, news = asyncio.get_running_loop(), ChangeNotifier()
     with ExitStack() as stack:
         # the task of the command line may wait for a parser to start; who assigns one is told that there is none
         at_start, asked = (_parser(settings, stack, patient) for patient in (True, False))
         uplink, client = _uplink(settings, stack, goes_on=saved is not None)
-        attentions = Attentions(settings.perception, lambda: _scene(settings, stand_in))
+        attentions = RelevanceEstimatorFactory(settings.perception, lambda: _scene(settings, stand_in))
         if settings.task is not None and not (settings.play and is_simulated(settings.play.source)):
             attentions.require_sight()
-        robot = Robot(
+        robot = MappingWorker(
             settings.mission,
             settings.link.grid,
             attentions.to,
@@ -63,7 +63,7 @@ async def _serve(settings: AgentSettings) -> None:
         if saved is not None:
             await asyncio.wrap_future(robot.resume(saved))
             earlier, saved = saved.life, None
-        player = Player(settings, robot, at_start, client, earlier)
+        player = AgentMission(settings, robot, at_start, client, earlier)
         servicer = AgentServicer(settings.agent_id, robot, asked, news, lambda: player.state)
 
         mission = functools.partial(_live, settings, stand_in, player, uplink)
@@ -80,14 +80,16 @@ def _require_usable(settings: AgentSettings) -> None:
         prepare_file(settings.state)
 
 
-def _saved_mission(settings: AgentSettings) -> SavedMission | None:
+def _saved_mission(settings: AgentSettings) -> SavedAgentMission | None:
     """The mission of an earlier life. Raises MapFileError, MismatchError."""
     if settings.state is None or not settings.state.exists():
         return None
-    return SavedMission.read(settings.state, settings.terms)
+    return SavedAgentMission.read(settings.state, settings.terms)
 
 
-async def _live(settings: AgentSettings, stand_in: StandIn | None, player: Player, uplink: Uplink | None) -> None:
+async def _live(
+    settings: AgentSettings, stand_in: ReplaySource | None, player: AgentMission, uplink: Uplink | None
+) -> None:
     """Work through the mission, then serve on unless told otherwise; what is mapped then is written at the end."""
     work = asyncio.ensure_future(asyncio.to_thread(_begin, stand_in, player))
     try:
@@ -104,7 +106,7 @@ async def _live(settings: AgentSettings, stand_in: StandIn | None, player: Playe
             await asyncio.to_thread(player.conclude)
 
 
-def _begin(stand_in: StandIn | None, player: Player) -> None:
+def _begin(stand_in: ReplaySource | None, player: AgentMission) -> None:
     """Play the source, or take the task and wait for frames."""
     if stand_in is not None:
         player.play(stand_in)
@@ -129,12 +131,12 @@ def _uplink(settings: AgentSettings, stack: ExitStack, goes_on: bool) -> tuple[U
     return uplink, client
 
 
-def _scene(settings: AgentSettings, stand_in: StandIn | None) -> SceneKnowledge:
+def _scene(settings: AgentSettings, stand_in: ReplaySource | None) -> SceneKnowledge:
     if stand_in is not None:
         return SceneKnowledge.of(stand_in.source)
     return SceneKnowledge() if settings.up_axis is None else SceneKnowledge(unit_up_axis(settings.up_axis))
 
 
-def _ring(loop: asyncio.AbstractEventLoop, news: Bell) -> None:
+def _ring(loop: asyncio.AbstractEventLoop, news: ChangeNotifier) -> None:
     if not loop.is_closed():
         loop.call_soon_threadsafe(news.ring)

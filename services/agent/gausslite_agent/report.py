@@ -5,11 +5,11 @@ from __future__ import annotations
 from gausslite.domain.gaussians import Gaussians
 from gausslite.mission.results import peak_rss_mib
 from gausslite.wire.uplink_values import UplinkCounters
-from gausslite_agent.status import RobotStatus
+from gausslite_agent.status import WorkerStatus
 
 
 def mission_report(
-    agent_id: str, robot: RobotStatus, gaussians: Gaussians, uplink: UplinkCounters, seconds: float
+    agent_id: str, robot: WorkerStatus, gaussians: Gaussians, uplink: UplinkCounters, seconds: float
 ) -> dict[str, object]:
     """The figures of a mission. map_shared_percent is the task's share of the map; bytes_sent is what it cost."""
     graph, active = robot.graph, int(gaussians.active.sum())

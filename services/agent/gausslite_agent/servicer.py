@@ -7,13 +7,13 @@ from collections.abc import AsyncIterator, Callable
 from typing import Any
 
 from gausslite.domain.task import TaskGraph
-from gausslite.domain.words import inside
+from gausslite.domain.voxel_operations import crop_to_box
 from gausslite.errors import InvalidInputError
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.task.parser import TaskParser
 from gausslite.v1 import agent_service_pb2 as pb
 from gausslite.v1 import agent_service_pb2_grpc as pb_grpc
-from gausslite.wire.bell import Bell
+from gausslite.wire.change_notifier import ChangeNotifier
 from gausslite.wire.convert import (
     box_from_message,
     camera_from_message,
@@ -25,10 +25,10 @@ from gausslite.wire.convert import (
 from gausslite.wire.map_blocks import map_blocks
 from gausslite.wire.server import Service
 from gausslite.wire.uplink_values import UplinkCounters
-from gausslite_agent.history import MapHistory
+from gausslite_agent.map_changes import MapChangeLog
+from gausslite_agent.mapping_worker import MappingWorker
 from gausslite_agent.messages import blank_view, report_to_message, status_to_message, view_to_message
-from gausslite_agent.player import MissionState
-from gausslite_agent.robot import Robot
+from gausslite_agent.mission_runner import MissionState
 from gausslite_agent.status import FrameReport
 
 _OUTCOMES_AHEAD = 16
@@ -40,14 +40,14 @@ class AgentServicer(pb_grpc.AgentServiceServicer):
     def __init__(
         self,
         agent_id: str,
-        robot: Robot,
+        robot: MappingWorker,
         parser: TaskParser,
-        news: Bell,
+        news: ChangeNotifier,
         state: Callable[[], MissionState],
     ) -> None:
         self._agent_id, self._robot, self._parser, self._news, self._state = agent_id, robot, parser, news, state
         # touched on the robot's worker only
-        self._histories = {roi_only: MapHistory(robot.grid, roi_only) for roi_only in (False, True)}
+        self._histories = {roi_only: MapChangeLog(robot.grid, roi_only) for roi_only in (False, True)}
 
     def service(self) -> Service:
         """Ready for a server."""
@@ -106,7 +106,7 @@ class AgentServicer(pb_grpc.AgentServiceServicer):
             history.update(mapper.gaussians(), self._robot.revision())
             words = history.since(since)
             if region is not None:
-                words = inside(words, region, self._robot.grid)
+                words = crop_to_box(words, region, self._robot.grid)
             blocks = map_blocks(words, self._robot.grid, self._agent_id, history.revision, snapshot=since == 0)
             return [pb.WatchMapResponse(block=block) for block in blocks]
 

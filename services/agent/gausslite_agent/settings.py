@@ -7,12 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from gausslite.datasets.registration import ColourCamera
-from gausslite.domain.pose import UpAxis
-from gausslite.domain.voxels import VoxelGrid
-from gausslite.errors import InvalidInputError
-from gausslite.fusion.terms import require_name
-from gausslite.mission.options import (
+from gausslite.config.options import (
     add_budget,
     add_detector,
     add_frames,
@@ -21,7 +16,12 @@ from gausslite.mission.options import (
     mission_settings,
     perception_settings,
 )
-from gausslite.mission.saved_run import RunTerms
+from gausslite.datasets.registered_source import DepthRegistration
+from gausslite.domain.pose import UpAxis
+from gausslite.domain.voxels import VoxelGrid
+from gausslite.errors import InvalidInputError
+from gausslite.fusion.limits import require_name
+from gausslite.mission.checkpoint import ResumeConfig
 from gausslite.mission.settings import MissionSettings, PerceptionSettings
 from gausslite.task.validate import require_task_text
 from gausslite.wire.address import require_callable
@@ -44,7 +44,7 @@ class PlaySettings:
     frames: str = ":"
     size: str | None = None
     hold_out: int | None = None
-    colour_camera: ColourCamera | None = None
+    colour_camera: DepthRegistration | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,9 +80,9 @@ class AgentSettings:
     state: Path | None = None
 
     @property
-    def terms(self) -> RunTerms:
+    def terms(self) -> ResumeConfig:
         """What must be the same when a saved mission goes on."""
-        return RunTerms.of(self.mission, agent_id=self.agent_id, voxel_size=f"{self.link.grid.size_m:g}")
+        return ResumeConfig.of(self.mission, agent_id=self.agent_id, voxel_size=f"{self.link.grid.size_m:g}")
 
 
 def parse_arguments(arguments: Sequence[str] | None = None) -> AgentSettings:

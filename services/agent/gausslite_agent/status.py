@@ -39,7 +39,7 @@ class FrameReport:
 
 
 @dataclass(frozen=True, slots=True)
-class RobotStatus:
+class WorkerStatus:
     """Totals so far; busy_s is the time spent on perception and mapping, notes what the attention has to say.
 
     short counts the frames that trained less than they should, without_* those that went without something for want
@@ -94,7 +94,7 @@ class RobotStatus:
         """The age that so many of the latest frames had not passed when they were mapped; 0 before the first."""
         return float(np.percentile(self.ages_s, percent)) if self.ages_s else 0.0
 
-    def plus(self, report: FrameReport) -> RobotStatus:
+    def plus(self, report: FrameReport) -> WorkerStatus:
         """The totals with one more frame."""
         if report.outcome is not Outcome.MAPPED:
             return replace(self, **{report.outcome.value: getattr(self, report.outcome.value) + 1})

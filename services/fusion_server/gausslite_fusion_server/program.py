@@ -6,14 +6,14 @@ import asyncio
 import contextlib
 from collections.abc import Sequence
 
-from gausslite.fusion.memory import MemoryStore
-from gausslite.fusion.sqlite import SqliteStore
+from gausslite.fusion.engine import FusionEngine
+from gausslite.fusion.memory_store import MemoryStore
+from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.fusion.store import FusionStore
-from gausslite.fusion.team import TeamMap
 from gausslite.render.rasterizer import Rasterizer
 from gausslite.wire.process import run_service
 from gausslite.wire.server import serve_until_stopped
-from gausslite_fusion_server.refinement import Refinery
+from gausslite_fusion_server.refinement_worker import RefinementWorker
 from gausslite_fusion_server.servicer import FusionServicer
 from gausslite_fusion_server.settings import ServerSettings, parse_arguments
 
@@ -44,7 +44,7 @@ async def _serve(settings: ServerSettings, store: FusionStore) -> None:
 
         return choose_rasterizer(settings.rasterizer)
 
-    servicer = FusionServicer(TeamMap(store, settings.team), Refinery(settings.refine, chosen_rasterizer))
+    servicer = FusionServicer(FusionEngine(store, settings.team), RefinementWorker(settings.refine, chosen_rasterizer))
 
     async def drain_when_stopping() -> None:
         try:

@@ -13,7 +13,7 @@ import google_crc32c
 
 from gausslite.codec.ply import ply_bytes
 from gausslite.codec.subset_codec import MAX_SUBSET_BYTES, decode_subset
-from gausslite.domain.subset import VoxelWords
+from gausslite.domain.voxel_batch import VoxelBatch
 from gausslite.errors import (
     GaussLiteError,
     InvalidInputError,
@@ -24,21 +24,21 @@ from gausslite.errors import (
     StorageError,
     UnavailableError,
 )
+from gausslite.fusion.engine import Changes, FusionEngine
 from gausslite.fusion.keyframes import TeamKeyframe
-from gausslite.fusion.store import Charter
-from gausslite.fusion.tally import AgentContribution, Tally
-from gausslite.fusion.team import Changes, TeamMap
+from gausslite.fusion.store import MissionConfig
+from gausslite.fusion.traffic import AgentContribution, TrafficCounters
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.v1 import fusion_service_pb2_grpc as pb_grpc
 from gausslite.v1.gaussians_pb2 import MapBlock
-from gausslite.wire.bell import Bell
+from gausslite.wire.change_notifier import ChangeNotifier
 from gausslite.wire.convert import box_from_message, frame_from_message, grid_from_message, grid_to_message
 from gausslite.wire.server import Service
 from gausslite.wire.status import code_and_reason
 from gausslite.wire.tls import require_speaks_for
-from gausslite_fusion_server.changes import change_blocks
-from gausslite_fusion_server.door import Door
-from gausslite_fusion_server.refinement import RefineOrder, Refinery
+from gausslite_fusion_server.change_blocks import change_blocks
+from gausslite_fusion_server.drain_gate import DrainGate
+from gausslite_fusion_server.refinement_worker import RefinementWorker, RefineRequest
 
 _CHUNK_BYTES = 1 << 20
 _MAX_REPORTED_REJECTIONS = 1000
@@ -57,12 +57,12 @@ _ACCEPTED, _STALE, _REJECTED = (
 class FusionServicer(pb_grpc.FusionServiceServicer):
     """Serves one team's map. All work runs in threads, so that the event loop answers health checks at any time."""
 
-    def __init__(self, team: TeamMap, refinery: Refinery) -> None:
+    def __init__(self, team: FusionEngine, refinery: RefinementWorker) -> None:
         self._team = team
         self._refinery = refinery
         self._workers = ThreadPoolExecutor(_WORKERS, "fusion")
-        self._news = Bell()
-        self._door = Door()
+        self._news = ChangeNotifier()
+        self._door = DrainGate()
 
     def service(self) -> Service:
         """The servicer, ready for a server."""
@@ -85,7 +85,7 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         """Enter the mission."""
         require_speaks_for(context, request.agent_id)
         grid = grid_from_message(request.grid)
-        asked = Charter(request.mission_id, request.world_frame, grid.size_m)
+        asked = MissionConfig(request.mission_id, request.world_frame, grid.size_m)
         joined = await self._work(self._team.join, request.agent_id, asked, request.fresh_map)
         self._news.ring()
         return pb.JoinSessionResponse(
@@ -146,7 +146,7 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         """Joint optimisation, with its progress; closing the stream cancels it."""
         self._door.require_open()
         self._team.require_mission(request.mission_id)
-        order = RefineOrder(request.iterations, request.max_gaussians, request.seed)
+        order = RefineRequest(request.iterations, request.max_gaussians, request.seed)
         response = pb.RefineFusedMapResponse()
         async for progress in self._refinery.run(self._team, order):
             self._door.require_open()
@@ -176,9 +176,9 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         self._team.require_mission(request.mission_id)
         status = await self._work(self._team.status)
         return pb.GetSessionStatusResponse(
-            mission_id=status.charter.mission_id,
+            mission_id=status.mission_config.mission_id,
             grid=grid_to_message(self._team.grid),
-            world_frame=status.charter.world_frame,
+            world_frame=status.mission_config.world_frame,
             fused_revision=status.revision,
             fused_gaussians=status.fused_gaussians,
             fused_voxels=status.fused_voxels,
@@ -197,7 +197,11 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         """Store one block; a bad one is an outcome, and only what concerns the whole stream is raised."""
         agent_id = self._team.session(request.session_id).agent_id
         size = len(request.subset)
-        sent = Tally(handover_bytes=size) if request.purpose == pb.PURPOSE_HANDOVER else Tally(roi_bytes=size)
+        sent = (
+            TrafficCounters(handover_bytes=size)
+            if request.purpose == pb.PURPOSE_HANDOVER
+            else TrafficCounters(roi_bytes=size)
+        )
         outcome = pb.SubsetOutcome(sequence=request.sequence)
         try:
             subset, grid = decode_subset(request.subset)
@@ -206,12 +210,14 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
             raise
         except GaussLiteError as error:
             outcome.status, outcome.reason, outcome.message = _REJECTED, code_and_reason(error)[1], str(error)
-            self._team.note(agent_id, sent.plus(Tally(subsets_rejected=1)))
+            self._team.note(agent_id, sent.plus(TrafficCounters(subsets_rejected=1)))
             return outcome
         accepted = len(put.accepted) > 0 or len(put.stale) == 0
         outcome.status = _ACCEPTED if accepted else _STALE
         outcome.accepted_voxels, outcome.stale_voxels = len(put.accepted), len(put.stale)
-        self._team.note(agent_id, sent.plus(Tally(subsets_accepted=int(accepted), subsets_stale=int(not accepted))))
+        self._team.note(
+            agent_id, sent.plus(TrafficCounters(subsets_accepted=int(accepted), subsets_stale=int(not accepted)))
+        )
         return outcome
 
     def _take_view(self, request: pb.ContributeKeyframesRequest) -> None:
@@ -229,7 +235,7 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         data = ply_bytes(self._chosen(request).gaussians)
         return data, google_crc32c.value(data)
 
-    def _chosen(self, request: pb.ExportFusedMapRequest) -> VoxelWords:
+    def _chosen(self, request: pb.ExportFusedMapRequest) -> VoxelBatch:
         match request.strategy:
             case pb.FUSION_STRATEGY_VOTE:
                 return self._team.voted(request.agent_id)

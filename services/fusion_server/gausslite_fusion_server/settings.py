@@ -9,8 +9,8 @@ from pathlib import Path
 
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.errors import InvalidInputError
-from gausslite.fusion.refine import RefineSettings
-from gausslite.fusion.terms import MAX_REFINE_ITERATIONS, Quotas, TeamSettings
+from gausslite.fusion.joint_refinement import RefineSettings
+from gausslite.fusion.limits import MAX_REFINE_ITERATIONS, FusionSettings, Quotas
 from gausslite.render.choose import BACKENDS
 from gausslite.wire.tls import Tls, add_tls, service_tls
 
@@ -25,7 +25,7 @@ class ServerSettings:
     listen: str = "127.0.0.1:50052"
     store: Path | None = None
     store_max_bytes: int | None = None
-    team: TeamSettings = field(default_factory=TeamSettings)
+    team: FusionSettings = field(default_factory=FusionSettings)
     refine: RefineSettings = field(default_factory=RefineSettings)
     rasterizer: str = "auto"
     tls: Tls | None = None
@@ -51,7 +51,7 @@ def parse_arguments(arguments: Sequence[str] | None = None) -> ServerSettings:
         options.listen,
         None if options.store == MEMORY else Path(options.store),
         None if options.store_max_mb is None else options.store_max_mb << 20,
-        TeamSettings(VoxelGrid(options.voxel_size), options.mission, options.world_frame, quotas),
+        FusionSettings(VoxelGrid(options.voxel_size), options.mission, options.world_frame, quotas),
         RefineSettings(iterations=options.refine_iterations),
         options.rasterizer,
         service_tls(options),

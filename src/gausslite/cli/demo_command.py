@@ -9,23 +9,11 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from types import FrameType
 
-from gausslite.cli.arguments import believe_told, open_recorded, register_told
+from gausslite.calibration.view_fit import PoseExposurePrior
+from gausslite.cli.source_options import open_recorded, register_with_warnings, resolve_pose_prior
 from gausslite.cli.team import AgentPlan, Team, TeamPlan, agent_report, collect_maps, running_team, watch_missions
 from gausslite.codec.ply import read_ply
-from gausslite.datasets.open import open_source
-from gausslite.datasets.regions import choose_regions
-from gausslite.datasets.registration import ColourCamera
-from gausslite.datasets.selection import frame_size, select_frames
-from gausslite.domain.region import Region
-from gausslite.domain.voxels import VoxelGrid
-from gausslite.errors import InvalidInputError
-from gausslite.evaluation.compare import MapScores
-from gausslite.evaluation.held_out import HoldOut
-from gausslite.evaluation.pictures import write_png
-from gausslite.evaluation.team import TeamScores, Viewpoints, score_team
-from gausslite.fusion.terms import MAX_REFINE_ITERATIONS
-from gausslite.mission.build import open_networks
-from gausslite.mission.options import (
+from gausslite.config.options import (
     LOOK,
     add_budget,
     add_colour_camera,
@@ -35,9 +23,21 @@ from gausslite.mission.options import (
     names,
     perception_settings,
 )
+from gausslite.datasets.open import open_source
+from gausslite.datasets.regions import choose_regions
+from gausslite.datasets.registered_source import DepthRegistration
+from gausslite.datasets.selection import frame_size, select_frames
+from gausslite.domain.region import Region
+from gausslite.domain.voxels import VoxelGrid
+from gausslite.errors import InvalidInputError
+from gausslite.evaluation.compare import MapScores
+from gausslite.evaluation.held_out import HeldOutSplit
+from gausslite.evaluation.pictures import write_png
+from gausslite.evaluation.team import TeamScores, Viewpoints, score_team
+from gausslite.fusion.limits import MAX_REFINE_ITERATIONS
+from gausslite.mission.build import open_networks
 from gausslite.mission.results import prepare_folder, write_json
 from gausslite.mission.settings import MissionSettings
-from gausslite.optimize.view_fit import ViewPrior
 from gausslite.perception.vocabulary import same_kind
 from gausslite.render.choose import choose_rasterizer
 
@@ -90,7 +90,7 @@ def run(options: argparse.Namespace) -> int:
     report = {
         "source": options.source or stage.agents[0].source,
         "colour_camera": None if stage.colour_camera is None else str(stage.colour_camera),
-        "view_error": None if stage.view_prior.trusts else str(stage.view_prior),
+        "view_error": None if stage.view_prior.is_exact else str(stage.view_prior),
         "size": list(stage.size),
         "seed": options.seed,
         "agents": agents,
@@ -114,7 +114,7 @@ def _require_usable(options: argparse.Namespace) -> None:
         max_gaussians=options.max_gaussians,
         iterations=options.iterations,
         rate_hz=options.rate,
-        least_iterations=options.least,
+        min_iterations=options.least,
         reliefs=options.relief,
         run_over=options.run_over,
         seed=options.seed,
@@ -133,13 +133,13 @@ class _Stage:
     hold_out: int | None
     held_out: tuple[Viewpoints, ...]
     regions: Mapping[str, Region]
-    colour_camera: ColourCamera | None = None
-    view_prior: ViewPrior = field(default_factory=ViewPrior)
+    colour_camera: DepthRegistration | None = None
+    view_prior: PoseExposurePrior = field(default_factory=PoseExposurePrior)
 
     @property
     def fit_views(self) -> bool:
         """Maps of refined views stand a little beside the poses that were said, and are judged like that."""
-        return not self.view_prior.trusts
+        return not self.view_prior.is_exact
 
 
 def _simulated_stage(options: argparse.Namespace) -> _Stage:
@@ -163,7 +163,7 @@ def _simulated_stage(options: argparse.Namespace) -> _Stage:
         None,
         (Viewpoints(held_out, range(len(held_out)), size),),
         _scored_regions(options, held_out.regions()),
-        view_prior=believe_told(specs[2], held_out, options.view_error),
+        view_prior=resolve_pose_prior(specs[2], held_out, options.view_error),
     )
 
 
@@ -175,11 +175,11 @@ def _recorded_stage(options: argparse.Namespace) -> _Stage:
     size, regions = frame_size(options.size, recorded), _scored_regions(options, recorded.regions())
     agents, held_out = [], []
     for letter, task, frames in (("a", options.task_a, first), ("b", options.task_b, second)):
-        train, held = HoldOut(_HOLD_OUT).split(select_frames(recorded, frames))
+        train, held = HeldOutSplit(_HOLD_OUT).split(select_frames(recorded, frames))
         agents.append(AgentPlan(f"agent-{letter}", task, str(options.source), frames, len(train)))
         held_out.append(held)
-    source, camera = register_told(options.source, recorded, options.colour_camera, LOOK)
-    view_prior = believe_told(options.source, source, options.view_error)
+    source, camera = register_with_warnings(options.source, recorded, options.colour_camera, LOOK)
+    view_prior = resolve_pose_prior(options.source, source, options.view_error)
     views = tuple(Viewpoints(source, held, size) for held in held_out)
     return _Stage(tuple(agents), size, _HOLD_OUT, views, regions, camera, view_prior)
 
@@ -213,7 +213,7 @@ def _plan(options: argparse.Namespace, stage: _Stage) -> TeamPlan:
         shared += ["--hold-out", str(stage.hold_out)]
     if stage.colour_camera is not None:
         shared += ["--colour-camera", str(stage.colour_camera)]
-    if not stage.view_prior.trusts:
+    if not stage.view_prior.is_exact:
         shared += ["--view-error", str(stage.view_prior)]
     if options.detector is not None:
         shared += ["--detector", str(options.detector.absolute())]

@@ -8,18 +8,18 @@ from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from gausslite.cli.arguments import add_regions, add_source, asked_regions, open_told
 from gausslite.cli.progress import progress_bar
+from gausslite.cli.source_options import add_regions, add_source, asked_regions, open_with_warnings
 from gausslite.codec.ply import read_ply
-from gausslite.datasets.registration import ColourCamera
+from gausslite.config.options import AS_RECORDED, LOOK, colour_camera
+from gausslite.datasets.registered_source import DepthRegistration
 from gausslite.datasets.selection import frame_size, select_frames
 from gausslite.errors import DatasetError
 from gausslite.evaluation.compare import MapScores, average, score_view
 from gausslite.evaluation.fitted import draw_fitted
-from gausslite.evaluation.held_out import HoldOut
+from gausslite.evaluation.held_out import HeldOutSplit
 from gausslite.evaluation.pictures import comparison_sheet, write_png
 from gausslite.evaluation.views import MIN_ROI_PIXELS, HeldOutView, MapViewer
-from gausslite.mission.options import AS_RECORDED, LOOK, colour_camera
 from gausslite.mission.results import as_text, prepare_folder, read_report
 from gausslite.render.choose import choose_rasterizer
 
@@ -50,10 +50,10 @@ def run(options: argparse.Namespace) -> int:
     rasterizer = choose_rasterizer(threads=options.threads)
     gaussians = read_ply(options.map)
     made = _MadeWith.of(options)
-    source, _ = open_told(options.source, options.up, made.colour_camera, LOOK)
+    source, _ = open_with_warnings(options.source, options.up, made.colour_camera, LOOK)
     positions = select_frames(source, options.frames)
     if options.hold_out is not None:
-        positions = HoldOut(options.hold_out).split(positions)[1]
+        positions = HeldOutSplit(options.hold_out).split(positions)[1]
         if not positions:
             raise DatasetError(f"--hold-out {options.hold_out}: expected at least that many frames, got fewer")
     chosen = asked_regions(options, source)
@@ -86,7 +86,7 @@ def run(options: argparse.Namespace) -> int:
 class _MadeWith:
     """How a map is scored: as asked for, or with what the report beside it says that it was made with."""
 
-    colour_camera: ColourCamera | str | None
+    colour_camera: DepthRegistration | str | None
     fit_views: bool
 
     @classmethod

@@ -6,10 +6,10 @@ import argparse
 from pathlib import Path
 
 from gausslite.codec.ply import read_ply, write_ply
+from gausslite.config.options import add_voxel_size
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.errors import InvalidInputError
 from gausslite.fusion.offline import fuse_maps
-from gausslite.mission.options import add_voxel_size
 from gausslite.mission.results import as_text, prepare_folder
 
 

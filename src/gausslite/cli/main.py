@@ -23,7 +23,7 @@ _COMMANDS = {
     "models": "list, fetch, verify and inspect the model files that find and outline objects",
     "bench": "measure the rasterizer, the whole mapping loop, the GPU, the quality of maps, or a task parser",
 }
-_MODULES = {name: f"gausslite.cli.{name}_command" for name in _COMMANDS}
+_MODULES = {name: f"gausslite.cli.{name}_command" for name in _COMMANDS} | {"bench": "gausslite_bench.cli.main"}
 
 
 def main(argv: Sequence[str] | None = None) -> int:

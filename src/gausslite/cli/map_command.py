@@ -7,30 +7,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from gausslite.cli.arguments import (
+from gausslite.calibration.view_fit import PoseExposurePrior
+from gausslite.cli.mapping_run import MappingRun, Mission
+from gausslite.cli.parse_command import as_json
+from gausslite.cli.source_options import (
     add_regions,
     add_source,
     asked_regions,
-    believe_told,
     open_recorded,
-    register_told,
+    register_with_warnings,
+    resolve_pose_prior,
 )
-from gausslite.cli.mapping_run import MappingRun, Mission
-from gausslite.cli.parse_command import as_json
-from gausslite.datasets.registration import ColourCamera
-from gausslite.datasets.selection import frame_size, select_frames
-from gausslite.datasets.source import Source
-from gausslite.domain.gaussians import Gaussians
-from gausslite.domain.task import TaskGraph
-from gausslite.errors import DatasetError, InvalidInputError
-from gausslite.evaluation.held_out import HoldOut
-from gausslite.evaluation.pictures import write_png
-from gausslite.evaluation.preview import preview
-from gausslite.evaluation.views import MapViewer
-from gausslite.mapping.pace import Pace
-from gausslite.mapping.policies import TASK
-from gausslite.mission.build import Attentions, build_attention, build_mapper
-from gausslite.mission.options import (
+from gausslite.config.options import (
     AS_RECORDED,
     LOOK,
     TRUSTED,
@@ -42,14 +30,26 @@ from gausslite.mission.options import (
     mission_settings,
     perception_settings,
 )
+from gausslite.datasets.registered_source import DepthRegistration
+from gausslite.datasets.selection import frame_size, select_frames
+from gausslite.datasets.source import Source
+from gausslite.domain.gaussians import Gaussians
+from gausslite.domain.task import TaskGraph
+from gausslite.errors import DatasetError, InvalidInputError
+from gausslite.evaluation.held_out import HeldOutSplit
+from gausslite.evaluation.pictures import write_png
+from gausslite.evaluation.preview import preview
+from gausslite.evaluation.views import MapViewer
+from gausslite.mapping.frame_scheduler import FrameScheduler
+from gausslite.mapping.policies import TASK
+from gausslite.mission.build import RelevanceEstimatorFactory, build_mapper, build_relevance_estimator
+from gausslite.mission.checkpoint import ResumeConfig, SavedRun, save_run
 from gausslite.mission.results import PREVIEW, peak_rss_mib, prepare_beside, prepare_folder, write_results
-from gausslite.mission.saved_run import RunTerms, SavedRun, save_run
 from gausslite.mission.settings import MissionSettings, SceneKnowledge
-from gausslite.mission.turns import TaskPlan, Turn
-from gausslite.optimize.view_fit import ViewPrior
-from gausslite.perception.attention import Attention
-from gausslite.perception.fixed import NoAttention, RegionAttention
-from gausslite.pipeline import TaskMapper
+from gausslite.mission.task_mapper import TaskMapper
+from gausslite.mission.task_schedule import TaskSchedule, TaskSwitch
+from gausslite.perception.fixed_relevance import NoTaskEstimator, RegionRelevanceEstimator
+from gausslite.perception.relevance_estimator import RelevanceEstimator
 from gausslite.render.choose import choose_rasterizer
 
 
@@ -92,11 +92,11 @@ def run(options: argparse.Namespace) -> int:
     last_index = -1 if saved is None else saved.last_index
     graph = asked.plan.at(last_index)
     recorded = asked.source
-    attentions = Attentions(perception_settings(options), lambda: SceneKnowledge.of(recorded))
+    attentions = RelevanceEstimatorFactory(perception_settings(options), lambda: SceneKnowledge.of(recorded))
     attention = _region_attention(options, recorded) if graph is None else attentions.to(graph)
     if saved is None:
         asked = asked.looked_at(options)
-    mapper = TaskMapper(attention, build_mapper(asked.settings), pace=Pace(asked.settings.pace))
+    mapper = TaskMapper(attention, build_mapper(asked.settings), pace=FrameScheduler(asked.settings.pace))
     if saved is not None:
         saved.restore(mapper)
         saved = None  # as large as the map and its keyframes, and copied
@@ -139,26 +139,29 @@ class _Asked:
     source: Source
     positions: Sequence[int]
     size: tuple[int, int]
-    plan: TaskPlan
-    colour_camera: ColourCamera | None
+    plan: TaskSchedule
+    colour_camera: DepthRegistration | None
 
     @classmethod
     def of(cls, options: argparse.Namespace) -> _Asked:
         settings = mission_settings(options)
-        plan = _plan(asked_task(options), [Turn.parse(text) for text in options.then])
+        plan = _plan(asked_task(options), [TaskSwitch.parse(text) for text in options.then])
         source = open_recorded(options.source, options.up)
         positions, size = select_frames(source, options.frames), frame_size(options.size, source)
         if options.hold_out is not None:
-            positions, _ = HoldOut(options.hold_out).split(positions)
+            positions, _ = HeldOutSplit(options.hold_out).split(positions)
         return cls(settings, source, positions, size, plan, None)
 
     def looked_at(
-        self, options: argparse.Namespace, camera: ColourCamera | str | None = None, view_error: ViewPrior | None = None
+        self,
+        options: argparse.Namespace,
+        camera: DepthRegistration | str | None = None,
+        view_error: PoseExposurePrior | None = None,
     ) -> _Asked:
         """With the camera and trust that are asked for, or given here; what is neither is looked for in the frames."""
         given = options.colour_camera if camera is None else camera
-        source, registered_to = register_told(options.source, self.source, given, LOOK)
-        believed = believe_told(options.source, source, options.view_error if view_error is None else view_error)
+        source, registered_to = register_with_warnings(options.source, self.source, given, LOOK)
+        believed = resolve_pose_prior(options.source, source, options.view_error if view_error is None else view_error)
         settings = replace(self.settings, view_prior=believed)
         return replace(self, settings=settings, source=source, colour_camera=registered_to)
 
@@ -173,10 +176,10 @@ class _Asked:
         saved.require(asked.terms(options, saved.last_index))
         return asked
 
-    def terms(self, options: argparse.Namespace, last_index: int) -> RunTerms:
+    def terms(self, options: argparse.Namespace, last_index: int) -> ResumeConfig:
         """What must be the same when a run goes on after the frame of this number."""
         graph = self.plan.at(last_index)
-        return RunTerms.of(
+        return ResumeConfig.of(
             self.settings,
             size=f"{self.size[0]}x{self.size[1]}",
             task="" if graph is None else graph.text,
@@ -200,7 +203,7 @@ class _Asked:
         return {
             "source": options.source,
             "colour_camera": None if self.colour_camera is None else str(self.colour_camera),
-            "view_error": None if self.settings.view_prior.trusts else str(self.settings.view_prior),
+            "view_error": None if self.settings.view_prior.is_exact else str(self.settings.view_prior),
             "task": None if first is None else {"text": first.text, **as_json(first)},
             "then": [{"frame": frame, "text": later.text, **as_json(later)} for frame, later in self.plan.turns],
             "policy": options.policy,
@@ -239,15 +242,15 @@ def _held(mapper: TaskMapper, gaussians: Gaussians) -> dict[str, object]:
     }
 
 
-def _plan(first: TaskGraph | None, turns: Sequence[Turn]) -> TaskPlan:
+def _plan(first: TaskGraph | None, turns: Sequence[TaskSwitch]) -> TaskSchedule:
     """The tasks of --task and --then."""
     if not turns:
-        return TaskPlan(first)
+        return TaskSchedule(first)
     if first is None:
         raise InvalidInputError("--then: follows a task in words; give the first with --task TEXT")
     from gausslite.task.rules import RuleParser
 
-    return TaskPlan(first, tuple((turn.frame, RuleParser().parse(turn.text)) for turn in turns))
+    return TaskSchedule(first, tuple((turn.frame, RuleParser().parse(turn.text)) for turn in turns))
 
 
 def asked_task(options: argparse.Namespace) -> TaskGraph | None:
@@ -271,14 +274,14 @@ def asked_task(options: argparse.Namespace) -> TaskGraph | None:
     return RuleParser().parse(options.task)
 
 
-def choose_attention(options: argparse.Namespace, source: Source) -> tuple[Attention, TaskGraph | None]:
+def choose_attention(options: argparse.Namespace, source: Source) -> tuple[RelevanceEstimator, TaskGraph | None]:
     """A task in words, or regions of space, or (for a uniform map) nothing to attend to."""
     graph = asked_task(options)
     if graph is None:
         return _region_attention(options, source), None
-    return build_attention(graph, SceneKnowledge.of(source), perception_settings(options)), graph
+    return build_relevance_estimator(graph, SceneKnowledge.of(source), perception_settings(options)), graph
 
 
-def _region_attention(options: argparse.Namespace, source: Source) -> Attention:
+def _region_attention(options: argparse.Namespace, source: Source) -> RelevanceEstimator:
     regions = asked_regions(options, source)
-    return RegionAttention(regions) if regions else NoAttention()
+    return RegionRelevanceEstimator(regions) if regions else NoTaskEstimator()

@@ -10,10 +10,10 @@ from gausslite.cli.progress import MappingBar
 from gausslite.datasets.source import Source
 from gausslite.domain.task import TaskGraph
 from gausslite.errors import GaussLiteError
-from gausslite.interrupts import AfterThisStep
-from gausslite.mission.build import Attentions
-from gausslite.mission.turns import TaskPlan
-from gausslite.pipeline import FrameOutcome, TaskMapper
+from gausslite.interrupts import DeferredInterrupt
+from gausslite.mission.build import RelevanceEstimatorFactory
+from gausslite.mission.task_mapper import FrameOutcome, TaskMapper
+from gausslite.mission.task_schedule import TaskSchedule
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,8 +48,8 @@ class MappingRun:
     source: Source
     size: tuple[int, int]
     mapper: TaskMapper
-    plan: TaskPlan
-    attentions: Attentions
+    plan: TaskSchedule
+    attentions: RelevanceEstimatorFactory
 
     def play(self, positions: Sequence[int], graph: TaskGraph | None) -> Mission:
         """Map these frames; graph is the task that the loop has now."""
@@ -57,7 +57,7 @@ class MappingRun:
         outcomes: list[FrameOutcome] = []
         stopped: GaussLiteError | KeyboardInterrupt | None = None
         indices = self.source.indices()
-        with MappingBar(len(positions)) as bar, AfterThisStep() as interrupt:
+        with MappingBar(len(positions)) as bar, DeferredInterrupt() as interrupt:
             for position in positions:
                 if interrupt.asked is not None:
                     stopped = interrupt.asked

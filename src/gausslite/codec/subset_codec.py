@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from gausslite.codec import columns
 from gausslite.domain.arrays import require_finite
 from gausslite.domain.gaussians import Gaussians
-from gausslite.domain.subset import RoiSubset, VoxelWords
+from gausslite.domain.voxel_batch import RoiSubset, VoxelBatch
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.errors import ChecksumError, CodecError, GaussLiteError, InvalidInputError
 
@@ -117,7 +117,7 @@ def decode_subset(data: bytes, limits: CodecLimits = DEFAULT_LIMITS) -> tuple[Ro
         raise CodecError(f"subset: {error}") from error
 
 
-def split_words(words: VoxelWords, max_bytes: int = MAX_SUBSET_BYTES) -> list[VoxelWords]:
+def split_words(words: VoxelBatch, max_bytes: int = MAX_SUBSET_BYTES) -> list[VoxelBatch]:
     """Cut words on voxel boundaries into parts whose messages are at most max_bytes, however badly they compress.
 
     A voxel too full for a message of its own keeps its most opaque Gaussians; its kappa sum stays the whole total.
@@ -185,7 +185,7 @@ def _unpack(body: bytes, layout: _Layout) -> list[NDArray[Any]]:
     return out
 
 
-def _quantise(words: VoxelWords, grid: VoxelGrid) -> list[NDArray[Any]]:
+def _quantise(words: VoxelBatch, grid: VoxelGrid) -> list[NDArray[Any]]:
     g = words.gaussians
     voxel = np.repeat(grid.indices(words.keys), words.counts, axis=0)
     return [
@@ -199,7 +199,7 @@ def _quantise(words: VoxelWords, grid: VoxelGrid) -> list[NDArray[Any]]:
     ]
 
 
-def _dequantise(raw: list[NDArray[Any]], grid: VoxelGrid) -> VoxelWords:
+def _dequantise(raw: list[NDArray[Any]], grid: VoxelGrid) -> VoxelBatch:
     keys, kappa_sums, counts, means, scales, quats, opacities, rgb, kappa, target, active = raw
     n = len(means)
     if int(counts.sum(dtype=np.uint64)) != n:
@@ -217,7 +217,7 @@ def _dequantise(raw: list[NDArray[Any]], grid: VoxelGrid) -> VoxelWords:
         kappa.astype(np.uint32),
         target.astype(np.int16),
     )
-    return VoxelWords(keys, kappa_sums, counts, gaussians)
+    return VoxelBatch(keys, kappa_sums, counts, gaussians)
 
 
 def _require_encodable(gaussians: Gaussians) -> None:
@@ -260,14 +260,14 @@ def _unshuffle(raw: bytes, dtype: str, shape: tuple[int, ...]) -> NDArray[Any]:
     return np.ascontiguousarray(planes.T).reshape(-1).view(dtype).reshape(shape)
 
 
-def _slice(words: VoxelWords, start: int, stop: int) -> VoxelWords:
+def _slice(words: VoxelBatch, start: int, stop: int) -> VoxelBatch:
     rows = np.arange(words.offsets[start], words.offsets[stop])
-    return VoxelWords(
+    return VoxelBatch(
         words.keys[start:stop], words.kappa_sums[start:stop], words.counts[start:stop], words.gaussians.take(rows)
     )
 
 
-def _thin(words: VoxelWords, most: int) -> VoxelWords:
+def _thin(words: VoxelBatch, most: int) -> VoxelBatch:
     if not (words.counts > most).any():
         return words
     keep = np.ones(len(words.gaussians), np.bool_)
@@ -275,6 +275,6 @@ def _thin(words: VoxelWords, most: int) -> VoxelWords:
         begin, end = words.offsets[i], words.offsets[i + 1]
         faintest = np.argsort(-words.gaussians.opacities[begin:end], kind="stable")[most:]
         keep[begin + faintest] = False
-    return VoxelWords(
+    return VoxelBatch(
         words.keys, words.kappa_sums, np.minimum(words.counts, most).astype(np.uint32), words.gaussians.take(keep)
     )

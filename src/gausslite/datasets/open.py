@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
 
-from gausslite.datasets.registration import ColourCamera, RegisteredSource
+from gausslite.datasets.registered_source import DepthRegistration, RegisteredSource
 from gausslite.datasets.replica import ReplicaSource
 from gausslite.datasets.sevenscenes import SevenScenesSource
 from gausslite.datasets.source import Source
@@ -18,9 +20,10 @@ _LAYOUTS = (
     "or Replica (results/frame000000.jpg, traj.txt)"
 )
 _SIMULATED = "sim:"
+_SIMULATOR = "gausslite_sim.source"
 
 
-def open_source(spec: str, up_axis: UpAxis | None = None, colour_camera: ColourCamera | None = None) -> Source:
+def open_source(spec: str, up_axis: UpAxis | None = None, colour_camera: DepthRegistration | None = None) -> Source:
     """The sequence in a folder, or a simulated one ("sim:home?seed=0&trajectory=0").
 
     A folder that only holds one folder with a sequence stands for it. A colour camera given here says that colour
@@ -37,8 +40,8 @@ def is_simulated(spec: str) -> bool:
 
 def _open(spec: str, up_axis: UpAxis | None) -> Source:
     if is_simulated(spec):
-        # the simulated home needs the optional ray caster; files do not
-        from gausslite.datasets.simulated.source import open_simulated
+        # the simulator is a package of its own, which the core does not import
+        open_simulated: Callable[[str, UpAxis | None], Source] = import_module(_SIMULATOR).open_simulated
 
         return open_simulated(spec.removeprefix(_SIMULATED), up_axis)
     folder = Path(spec).expanduser()

@@ -81,7 +81,7 @@ def _pack(axes: Float64[ndarray, "3 n"]) -> Int64[ndarray, " n"]:
 
 
 @dataclass(frozen=True, slots=True)
-class Box:
+class AxisAlignedBox:
     """A part of the world, in metres; a voxel belongs to it when its centre does. Raises InvalidInputError."""
 
     min_m: tuple[float, float, float]
@@ -100,7 +100,7 @@ class Box:
 
 
 @dataclass(frozen=True, slots=True)
-class AgentStake:
+class VoxelScore:
     """One agent's total on one voxel."""
 
     agent_id: str
@@ -113,7 +113,7 @@ class VoxelVotes:
     """The outcome on one voxel: stakes sorted best first; margin is the lead in kappa_sum over the second."""
 
     key: int
-    stakes: tuple[AgentStake, ...]
+    stakes: tuple[VoxelScore, ...]
 
     @property
     def winner(self) -> str:

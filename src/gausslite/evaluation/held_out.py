@@ -12,7 +12,7 @@ Item = TypeVar("Item")
 
 
 @dataclass(frozen=True, slots=True)
-class HoldOut:
+class HeldOutSplit:
     """The last of every `every` positions of a sequence is kept from mapping."""
 
     every: int = 8

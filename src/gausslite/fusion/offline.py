@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from gausslite.domain.gaussians import Gaussians
+from gausslite.domain.voxel_operations import group_by_voxel
 from gausslite.domain.voxels import VoxelGrid
-from gausslite.domain.words import words_of
 from gausslite.fusion.vote import FusedMap, fuse
 
 
 def fuse_maps(maps: Mapping[str, Gaussians], grid: VoxelGrid) -> FusedMap:
     """The voxel vote over complete maps by agent id (Sec. III-E). Raises InvalidInputError for means out of reach."""
-    return fuse({agent_id: words_of(gaussians, grid) for agent_id, gaussians in maps.items()})
+    return fuse({agent_id: group_by_voxel(gaussians, grid) for agent_id, gaussians in maps.items()})

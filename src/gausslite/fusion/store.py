@@ -14,12 +14,12 @@ import numpy as np
 from jaxtyping import Int32, Int64, UInt32, UInt64
 from numpy import ndarray
 
-from gausslite.domain.subset import RoiSubset, VoxelWords
+from gausslite.domain.voxel_batch import RoiSubset, VoxelBatch
 from gausslite.errors import InvalidInputError
 
 
 @dataclass(frozen=True, slots=True)
-class Charter:
+class MissionConfig:
     """What all words in one store have in common; set once, by the first agent that joins."""
 
     mission_id: str
@@ -28,7 +28,7 @@ class Charter:
 
 
 @dataclass(frozen=True, slots=True)
-class Session:
+class SessionRecord:
     """An agent's right to contribute, from joining until leaving or joining again."""
 
     session_id: str
@@ -44,7 +44,7 @@ class PutOutcome:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class StakeTable:
+class VoxelScoreTable:
     """The totals of every word (tombstones too), without the Gaussians: all that the vote looks at.
 
     agent indexes `agents`, which is sorted; rows are in the order of (agent, key).
@@ -60,7 +60,7 @@ class StakeTable:
 
 @runtime_checkable
 class FusionStore(Protocol):
-    """Owns the register, the charter and the sessions. Every method may be called from any thread.
+    """Owns the register, the mission_config and the sessions. Every method may be called from any thread.
 
     What a method has returned from is as durable as the store is: after a kill the next life of a durable store
     has it. All raise StorageError when the storage refuses; the store stays usable for what it still can do.
@@ -82,31 +82,31 @@ class FusionStore(Protocol):
         """The newest revision among an agent's words; 0 when it has none."""
         ...
 
-    def stakes(self, keys: Int64[ndarray, " k"] | None = None) -> StakeTable:
+    def stakes(self, keys: Int64[ndarray, " k"] | None = None) -> VoxelScoreTable:
         """Totals of all agents, on these voxels or on all."""
         ...
 
-    def words(self, agent_id: str, keys: Int64[ndarray, " k"] | None = None) -> VoxelWords:
+    def words(self, agent_id: str, keys: Int64[ndarray, " k"] | None = None) -> VoxelBatch:
         """An agent's latest words (tombstones too), on these voxels or on all; none for an unknown agent."""
         ...
 
-    def table(self, keys: Int64[ndarray, " k"] | None = None) -> dict[str, VoxelWords]:
+    def table(self, keys: Int64[ndarray, " k"] | None = None) -> dict[str, VoxelBatch]:
         """Every agent's words at one instant."""
         ...
 
-    def charter(self) -> Charter | None:
+    def mission_config(self) -> MissionConfig | None:
         """What was agreed by the first to join; None before that."""
         ...
 
-    def set_charter(self, charter: Charter) -> None:
+    def set_mission_config(self, mission_config: MissionConfig) -> None:
         """Agree on this from now on."""
         ...
 
-    def sessions(self) -> tuple[Session, ...]:
+    def sessions(self) -> tuple[SessionRecord, ...]:
         """All sessions that were saved and not ended, by session id."""
         ...
 
-    def save_session(self, session: Session) -> None:
+    def save_session(self, session: SessionRecord) -> None:
         """Remember a session; it replaces any other session of the same agent."""
         ...
 

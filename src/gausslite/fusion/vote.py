@@ -14,14 +14,14 @@ from jaxtyping import Bool, Int32, Int64, UInt32, UInt64
 from numpy import ndarray
 
 from gausslite.domain.gaussians import Gaussians
-from gausslite.domain.subset import VoxelWords
-from gausslite.domain.voxels import AgentStake, VoxelVotes
-from gausslite.domain.words import gather_rows
-from gausslite.fusion.store import StakeTable
+from gausslite.domain.voxel_batch import VoxelBatch
+from gausslite.domain.voxel_operations import gather_rows
+from gausslite.domain.voxels import VoxelScore, VoxelVotes
+from gausslite.fusion.store import VoxelScoreTable
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Election:
+class VoteResult:
     """The stakes on every voxel that has any, best first within a voxel; empty words hold no stake.
 
     Voxel i has the key keys[i] (ascending) and the stakes offsets[i] : offsets[i + 1]; the first one wins.
@@ -51,7 +51,7 @@ class Election:
             yield VoxelVotes(
                 key,
                 tuple(
-                    AgentStake(self.agents[self.agent[row]], int(self.kappa_sums[row]), int(self.counts[row]))
+                    VoxelScore(self.agents[self.agent[row]], int(self.kappa_sums[row]), int(self.counts[row]))
                     for row in rows
                 ),
             )
@@ -61,8 +61,8 @@ class Election:
 class FusedMap:
     """The winners' words on every voxel that has any, and the election that chose them."""
 
-    words: VoxelWords
-    election: Election
+    words: VoxelBatch
+    election: VoteResult
 
     @property
     def gaussians(self) -> Gaussians:
@@ -82,11 +82,11 @@ class FusedMap:
         return won
 
 
-def elect(stakes: StakeTable) -> Election:
+def elect(stakes: VoxelScoreTable) -> VoteResult:
     """Rank the stakes of each voxel by (higher Σkappa, more Gaussians, lower agent id)."""
     order, first = _ranked(stakes)
     keys = stakes.keys[order]
-    return Election(
+    return VoteResult(
         stakes.agents,
         keys[first],
         np.append(np.flatnonzero(first), len(order)).astype(np.int64),
@@ -96,13 +96,13 @@ def elect(stakes: StakeTable) -> Election:
     )
 
 
-def fuse(words_by_agent: Mapping[str, VoxelWords]) -> FusedMap:
+def fuse(words_by_agent: Mapping[str, VoxelBatch]) -> FusedMap:
     """The fused map of these agents' latest words; the order of the mapping plays no part."""
     stakes, gaussians, starts = _side_by_side(words_by_agent)
     order, first = _ranked(stakes)
     winners = order[first]
     counts = stakes.counts[winners]
-    words = VoxelWords(
+    words = VoxelBatch(
         stakes.keys[winners],
         stakes.kappa_sums[winners],
         counts,
@@ -111,14 +111,14 @@ def fuse(words_by_agent: Mapping[str, VoxelWords]) -> FusedMap:
     return FusedMap(words, elect(stakes))
 
 
-def concatenate(words_by_agent: Mapping[str, VoxelWords]) -> VoxelWords:
+def concatenate(words_by_agent: Mapping[str, VoxelBatch]) -> VoxelBatch:
     """Every agent's Gaussians side by side: within a voxel by agent id; totals are added up."""
     stakes, gaussians, starts = _side_by_side(words_by_agent)
     order = np.lexsort((stakes.agent, stakes.keys))
     order = order[stakes.counts[order] > 0]
     keys, first = np.unique(stakes.keys[order], return_index=True)
     counts = stakes.counts[order]
-    return VoxelWords(
+    return VoxelBatch(
         keys,
         np.add.reduceat(stakes.kappa_sums[order], first) if len(first) else np.zeros(0, np.uint64),
         np.add.reduceat(counts, first).astype(np.uint32) if len(first) else np.zeros(0, np.uint32),
@@ -126,7 +126,7 @@ def concatenate(words_by_agent: Mapping[str, VoxelWords]) -> VoxelWords:
     )
 
 
-def _ranked(stakes: StakeTable) -> tuple[Int64[ndarray, " s"], Bool[ndarray, " s"]]:
+def _ranked(stakes: VoxelScoreTable) -> tuple[Int64[ndarray, " s"], Bool[ndarray, " s"]]:
     """Rows of non-empty words sorted by voxel and then best first, and where each voxel begins."""
     # the bitwise complement of an unsigned number sorts it from the highest down
     order = np.lexsort((stakes.agent, ~stakes.counts, ~stakes.kappa_sums, stakes.keys))
@@ -137,12 +137,12 @@ def _ranked(stakes: StakeTable) -> tuple[Int64[ndarray, " s"], Bool[ndarray, " s
     return order, first
 
 
-def _side_by_side(words_by_agent: Mapping[str, VoxelWords]) -> tuple[StakeTable, Gaussians, Int64[ndarray, " w"]]:
+def _side_by_side(words_by_agent: Mapping[str, VoxelBatch]) -> tuple[VoxelScoreTable, Gaussians, Int64[ndarray, " w"]]:
     """All words as one table, all Gaussians as one array, and the row at which each word's Gaussians start."""
     agents = tuple(sorted(words_by_agent))
     parts = [words_by_agent[agent_id] for agent_id in agents]
     counts = np.concatenate([np.zeros(0, np.uint32), *(part.counts for part in parts)])
-    stakes = StakeTable(
+    stakes = VoxelScoreTable(
         agents,
         np.repeat(np.arange(len(agents), dtype=np.int32), [len(part) for part in parts]),
         np.concatenate([np.zeros(0, np.int64), *(part.keys for part in parts)]),

@@ -20,19 +20,19 @@ _MEDIAN_STEP_PX = 4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class MapSight:
+class RenderedView:
     """How the map looks from a frame: how opaque it is, and how far away (0 where it shows nothing)."""
 
     alpha: Float32[ndarray, "h w"]
     depth_m: Float32[ndarray, "h w"]
 
     @classmethod
-    def of(cls, rendering: Rendering) -> MapSight:
+    def of(cls, rendering: Rendering) -> RenderedView:
         """What a rendering from the frame's pose shows."""
         return cls(rendering.alpha, rendering.expected_depth_m())
 
 
-def drawn_behind(frame: Frame, sight: MapSight, depth_error_factor: float) -> Bool[ndarray, "h w"]:
+def drawn_behind(frame: Frame, sight: RenderedView, depth_error_factor: float) -> Bool[ndarray, "h w"]:
     """Pixels that the map draws far behind what is measured there.
 
     Far means more than depth_error_factor times the median depth error, taken over every fourth row and column.
@@ -46,7 +46,7 @@ def drawn_behind(frame: Frame, sight: MapSight, depth_error_factor: float) -> Bo
     return far
 
 
-def too_coarse(
+def undersampled(
     frame: Frame, region: Bool[ndarray, "h w"], active_means_m: Float32[ndarray, "n 3"], pixels_per_active: float
 ) -> Bool[ndarray, "h w"]:
     """Pixels of the region in 8x8 cells that hold less than one active Gaussian for `pixels_per_active` pixels.

@@ -15,16 +15,16 @@ from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.pose import inverse
 from gausslite.domain.relevance import RelevanceMap
 from gausslite.domain.state import State, nested, part, take, take_counts, take_measures, whole_numbers
-from gausslite.mapping.budget import insert
 from gausslite.mapping.checkpoint import generator_state, set_generator
-from gausslite.mapping.coverage import MapSight
+from gausslite.mapping.coverage import RenderedView
+from gausslite.mapping.eviction import insert
+from gausslite.mapping.frame_scheduler import FrameScheduler, SkippableStage, Stage
 from gausslite.mapping.keyframes import Keyframe, KeyframeStore, WindowView, window_view
-from gausslite.mapping.pace import Pace, Relief, Step
-from gausslite.mapping.refinement import ViewRefiner
-from gausslite.mapping.retask import cast_votes, release_all
-from gausslite.mapping.seeding import MapState, Seeder, Seeds
+from gausslite.mapping.seeding import Seeder, SeedingContext, Seeds
 from gausslite.mapping.settings import MapperSettings
+from gausslite.mapping.task_change import clear_roi, vote_on_relevance
 from gausslite.mapping.training import Trainer
+from gausslite.mapping.view_refinement import ViewRefiner
 from gausslite.optimize.parameters import SplatTable
 from gausslite.render.rasterizer import MEAN, Rasterizer, Rendering
 
@@ -91,7 +91,11 @@ class GaussianMapper:
         return self._settings
 
     def map_frame(
-        self, frame: Frame, relevance: RelevanceMap, pace: Pace | None = None, sight: MapSight | None = None
+        self,
+        frame: Frame,
+        relevance: RelevanceMap,
+        pace: FrameScheduler | None = None,
+        sight: RenderedView | None = None,
     ) -> MappedFrame:
         """Take one frame into the map, in the time that the pace gives; by default iterations are counted.
 
@@ -99,13 +103,13 @@ class GaussianMapper:
         frame without a depth reading is skipped and counted. Raises ShapeError when relevance and frame differ in size.
         """
         require_array("relevance weight", relevance.weight, frame.depth_m.shape, np.float32)
-        pace = Pace() if pace is None else pace
+        pace = FrameScheduler() if pace is None else pace
         if not frame.has_depth:
             self._skipped += 1
             return MappedFrame(frame.index, 0, 0, self.count, "no pixel has a depth reading")
-        with pace.timing(Step.VIEW):
+        with pace.timing(Stage.VIEW):
             view = self._observe(frame, relevance)
-        seeded = 0 if pace.spares(Relief.SEEDING) else self._seed(view.keyframe, sight, pace)
+        seeded = 0 if pace.spares(SkippableStage.SEEDING) else self._seed(view.keyframe, sight, pace)
         iterations = self._train(view, pace)
         self._keyframes.offer(view)
         self._revision += 1
@@ -134,7 +138,7 @@ class GaussianMapper:
 
         The map, kappa and the optimiser's state stay; what was the old region gives way first when room is short.
         """
-        release_all(self._table)
+        clear_roi(self._table)
         self._keyframes.begin_task()
 
     @property
@@ -150,7 +154,7 @@ class GaussianMapper:
         require_array("relevance weight", relevance.weight, keyframe.frame.depth_m.shape, np.float32)
         frame, table = keyframe.frame, self._table
         self._keyframes.judge(replace(keyframe, relevance=relevance, judged=True), self._view)
-        cast_votes(table, frame, relevance)
+        vote_on_relevance(table, frame, relevance)
         if not relevance.roi.any():
             return 0
         seeds = self._seeder.seed_region(frame, relevance, table.rows[:, MEAN][table.active])
@@ -162,9 +166,9 @@ class GaussianMapper:
         """
         self._keyframes.judge(replace(keyframe, judged=True), self._view)
 
-    def look(self, frame: Frame) -> MapSight | None:
+    def look(self, frame: Frame) -> RenderedView | None:
         """How the map looks from a frame; None while it is empty."""
-        return MapSight.of(self.render(frame.camera, frame.T_world_camera)) if self.count > 0 else None
+        return RenderedView.of(self.render(frame.camera, frame.T_world_camera)) if self.count > 0 else None
 
     def render(self, camera: Camera, T_world_camera: Float64[ndarray, "4 4"]) -> Rendering:
         """Draw the map from a pose."""
@@ -235,13 +239,13 @@ class GaussianMapper:
     def _view(self, keyframe: Keyframe) -> WindowView:
         return window_view(keyframe, self._rasterizer, self._settings.keyframes)
 
-    def _seed(self, keyframe: Keyframe, sight: MapSight | None, pace: Pace) -> int:
+    def _seed(self, keyframe: Keyframe, sight: RenderedView | None, pace: FrameScheduler) -> int:
         """Add Gaussians where the map does not explain the frame, within the cap."""
         frame, table = keyframe.frame, self._table
         if sight is None or keyframe.recorded is not None:
             sight = self.look(frame)
-        with pace.timing(Step.SEEDING):
-            state = MapState(table.room, sight, table.rows[:, MEAN][table.active])
+        with pace.timing(Stage.SEEDING):
+            state = SeedingContext(table.room, sight, table.rows[:, MEAN][table.active])
             seeds = self._seeder.seed(frame, keyframe.relevance, state)
             return self._insert(seeds)
 
@@ -250,7 +254,7 @@ class GaussianMapper:
         seeding, table = self._settings.seeding, self._table
         return insert(table, seeds, seeding.opacity, self._rng, int(seeding.scaffold_share * table.capacity))
 
-    def _train(self, current: WindowView, pace: Pace) -> int:
+    def _train(self, current: WindowView, pace: FrameScheduler) -> int:
         """MVO: train on views drawn from the window and the current one; without it on the current one alone."""
         views = (*self._keyframes.window, current) if self._settings.components.mvo else (current,)
         return self._trainer.train(views, self._extent_m, pace)

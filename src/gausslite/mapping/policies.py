@@ -35,7 +35,7 @@ def policy(name: str) -> MapperSettings:
     return POLICIES[name]()
 
 
-PAPER_SWITCHES = ("sb", "mvo", "roi", "sis", "gfd")
+PAPER_ABLATION_FLAGS = ("sb", "mvo", "roi", "sis", "gfd")
 """The paper's components (Sec. III-C, III-D), in the order of its ablation."""
 
 BEYOND_SWITCHES: dict[str, Callable[[MapperSettings], MapperSettings]] = {
@@ -49,15 +49,15 @@ BEYOND_SWITCHES: dict[str, Callable[[MapperSettings], MapperSettings]] = {
 }
 """What came beyond the paper, in the order of our ablation, and how each is switched off."""
 
-SWITCHES = (*PAPER_SWITCHES, *BEYOND_SWITCHES)
+ABLATION_FLAGS = (*PAPER_ABLATION_FLAGS, *BEYOND_SWITCHES)
 
 
 def without(settings: MapperSettings, names: Collection[str]) -> MapperSettings:
     """These settings with the named parts switched off. Raises InvalidInputError for a name that is none of them."""
-    unknown = sorted(set(names) - set(SWITCHES))
+    unknown = sorted(set(names) - set(ABLATION_FLAGS))
     if unknown:
-        raise InvalidInputError(f"without: expected names among {', '.join(SWITCHES)}, got {', '.join(unknown)}")
-    off = dict.fromkeys((name for name in PAPER_SWITCHES if name in names), False)
+        raise InvalidInputError(f"without: expected names among {', '.join(ABLATION_FLAGS)}, got {', '.join(unknown)}")
+    off = dict.fromkeys((name for name in PAPER_ABLATION_FLAGS if name in names), False)
     settings = replace(settings, components=replace(settings.components, **off))
     for name in (each for each in BEYOND_SWITCHES if each in names):
         settings = BEYOND_SWITCHES[name](settings)

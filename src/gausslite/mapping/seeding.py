@@ -13,7 +13,7 @@ from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.pose import transform_points
 from gausslite.domain.relevance import RelevanceMap
-from gausslite.mapping.coverage import MapSight, drawn_behind, too_coarse
+from gausslite.mapping.coverage import RenderedView, drawn_behind, undersampled
 from gausslite.mapping.sampling import edge_magnitude, sample_pixels, sample_stratified
 from gausslite.mapping.settings import Components, SeedingSettings
 from gausslite.mapping.spacing import initial_spacing_m, neighbour_distance_px
@@ -22,13 +22,13 @@ _REFERENCE_PIXELS = 640 * 480
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class MapState:
+class SeedingContext:
     """What seeding needs to know of the map: how many Gaussians still fit, how it looks from the frame (None while it
     is empty), and where its active Gaussians are.
     """
 
     room: int
-    sight: MapSight | None
+    sight: RenderedView | None
     active_means_m: Float32[ndarray, "n 3"]
 
 
@@ -57,7 +57,7 @@ class Seeder:
         self._components = components
         self._rng = rng
 
-    def seed(self, frame: Frame, relevance: RelevanceMap, state: MapState) -> Seeds:
+    def seed(self, frame: Frame, relevance: RelevanceMap, state: SeedingContext) -> Seeds:
         """New Gaussians for this frame."""
         weight = self._pixel_weight(frame)
         roi_pool, rest_pool = self._pools(frame, relevance, state)
@@ -74,12 +74,12 @@ class Seeder:
         settings = self._settings
         if not self._components.sb:
             return Gaussians.empty()
-        coarse = too_coarse(frame, relevance.roi, active_means_m, settings.roi_pixels_per_active)
+        coarse = undersampled(frame, relevance.roi, active_means_m, settings.roi_pixels_per_active)
         pixels = coarse & (frame.depth_m <= settings.max_depth_m)
         budget = round(settings.roi_share * settings.first_frame_seeds * pixels.size / _REFERENCE_PIXELS)
         return self._gaussians(frame, relevance, self._roi_pool(pixels, budget), self._pixel_weight(frame))
 
-    def _pools(self, frame: Frame, relevance: RelevanceMap, state: MapState) -> tuple[_Pool, _Pool]:
+    def _pools(self, frame: Frame, relevance: RelevanceMap, state: SeedingContext) -> tuple[_Pool, _Pool]:
         """SB: the ROI share of the seeds is drawn from the region, the rest elsewhere; without SB from one pool."""
         settings = self._settings
         budget = self._budget(frame, state)
@@ -92,7 +92,7 @@ class Seeder:
         if not self._components.sb:
             return _Pool(np.zeros_like(seedable), 0, False), self._rest_pool(open_pixels, budget, state.room)
         roi_budget = int(settings.roi_share * budget)
-        coarse = too_coarse(frame, relevance.roi, state.active_means_m, settings.roi_pixels_per_active)
+        coarse = undersampled(frame, relevance.roi, state.active_means_m, settings.roi_pixels_per_active)
         roi_pixels = relevance.roi & (roi_open | (coarse & seedable))
         rest_pixels = open_pixels & ~relevance.roi
         return self._roi_pool(roi_pixels, roi_budget), self._rest_pool(rest_pixels, budget - roi_budget, state.room)
@@ -113,7 +113,7 @@ class Seeder:
         density = min(densest, max(affordable, settings.sparsest * densest))
         return _Pool(pixels, min(budget, int(np.ceil(density * np.count_nonzero(pixels)))), self._components.sis)
 
-    def _budget(self, frame: Frame, state: MapState) -> int:
+    def _budget(self, frame: Frame, state: SeedingContext) -> int:
         """N, for this image size."""
         seeds = self._settings.first_frame_seeds if state.sight is None else self._settings.later_seeds
         return max(1, round(seeds * frame.depth_m.size / _REFERENCE_PIXELS))

@@ -6,11 +6,11 @@ import math
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
+from gausslite.calibration.view_fit import PoseExposurePrior
 from gausslite.errors import InvalidInputError
-from gausslite.mapping.retask import RetaskSettings
+from gausslite.mapping.task_change import TaskChangeSettings
 from gausslite.optimize.density import DensitySettings
 from gausslite.optimize.rates import ONLINE_RATES
-from gausslite.optimize.view_fit import ViewPrior
 from gausslite.render.rasterizer import AdamSettings, LossWeights
 
 
@@ -192,8 +192,8 @@ class MapperSettings:
     keyframes: KeyframeSettings = field(default_factory=KeyframeSettings)
     optimization: OptimizationSettings = field(default_factory=OptimizationSettings)
     density: DensitySettings = field(default_factory=DensitySettings)
-    retask: RetaskSettings = field(default_factory=RetaskSettings)
-    view_prior: ViewPrior = field(default_factory=ViewPrior)
+    retask: TaskChangeSettings = field(default_factory=TaskChangeSettings)
+    view_prior: PoseExposurePrior = field(default_factory=PoseExposurePrior)
 
     def __post_init__(self) -> None:
         _require(self.max_gaussians >= 1, "max_gaussians", "at least 1", self.max_gaussians)
@@ -201,7 +201,7 @@ class MapperSettings:
     @property
     def adam(self) -> AdamSettings:
         """The optimiser's rates, for views that are trusted or not."""
-        if self.view_prior.trusts:
+        if self.view_prior.is_exact:
             return self.optimization.adam
         return replace(self.optimization.adam, full_rate_updates=self.optimization.settling_updates)
 

@@ -11,12 +11,12 @@ from jaxtyping import Bool, Float32, UInt32
 from numpy import ndarray
 
 from gausslite.domain.state import State, take_counts, whole_numbers
+from gausslite.mapping.frame_scheduler import FrameScheduler, Stage
 from gausslite.mapping.keyframes import WindowView
-from gausslite.mapping.pace import Pace, Step
 from gausslite.mapping.settings import ActivePhase, MapperSettings
 from gausslite.optimize.density import densify, prune
 from gausslite.optimize.parameters import SplatTable
-from gausslite.render.rasterizer import LOG_SCALE, RGB, Rasterizer, Subset, Tally
+from gausslite.render.rasterizer import LOG_SCALE, RGB, Rasterizer, Subset, UpdateCounter
 
 _COLOUR_RANGE = (-0.25, 1.25)
 """Somewhat beyond what can be shown, so that overlapping Gaussians still add up to black and white."""
@@ -32,7 +32,7 @@ class _Loan:
     tables: _Tables
     active_ids: UInt32[ndarray, " m"] | None
     trainable: Bool[ndarray, " n"] | None
-    tally: Tally
+    tally: UpdateCounter
 
     @classmethod
     def of(cls, table: SplatTable, phase: ActivePhase) -> _Loan:
@@ -41,7 +41,7 @@ class _Loan:
             tables=(table.rows, table.first_moment, table.second_moment),
             active_ids=np.flatnonzero(table.active).astype(np.uint32) if phase is ActivePhase.ACTIVE_ONLY else None,
             trainable=table.active if phase is ActivePhase.FROZEN_BACKGROUND else None,
-            tally=Tally(table.kappa, table.active),
+            tally=UpdateCounter(table.kappa, table.active),
         )
 
 
@@ -73,7 +73,7 @@ class Trainer:
         """Go on where another trainer stood. Raises MapFileError."""
         self._iterations, self._since_pruned, self._since_densified = take_counts(state, "counts", 3)
 
-    def train(self, views: Sequence[WindowView], extent_m: float, pace: Pace) -> int:
+    def train(self, views: Sequence[WindowView], extent_m: float, pace: FrameScheduler) -> int:
         """Train on these views for as long as the pace allows and return the number of iterations.
 
         The two phases take turns in the settings' proportion, a warm-up first. Where the time left is too short for
@@ -84,7 +84,7 @@ class Trainer:
         while not time_is_up:
             done, time_is_up = self._until_density_control(views, showing, done, pace)
             self._control_density(extent_m, pace)
-        with pace.timing(Step.SETTLING):
+        with pace.timing(Stage.SETTLING):
             self._bound_colours()
             if self._settings.optimization.isotropic:
                 self._make_spheres()
@@ -93,13 +93,13 @@ class Trainer:
 
     def rehearse(self, views: Sequence[WindowView], extent_m: float) -> None:
         """One iteration on views of earlier frames, for time in which none waits; the phases take turns as ever."""
-        showing, pace = self._showing_region(views), Pace()
+        showing, pace = self._showing_region(views), FrameScheduler()
         step = self._next_step(self._iterations, bool(showing), pace)
         if step is None:
             return
         loan = _Loan.of(self._table, self._settings.optimization.active_phase)
         with self._rasterizer.holding(*loan.tables):
-            self._iterate(loan, step, views if step is Step.WARM_UP else showing, self._rng.random())
+            self._iterate(loan, step, views if step is Stage.WARM_UP else showing, self._rng.random())
         self._control_density(extent_m, pace)
         self._bound_colours()
         if self._iterations % self._settings.optimization.iterations == 0:
@@ -112,18 +112,18 @@ class Trainer:
             return []
         return [view for view in views if view.shows_region]
 
-    def _next_step(self, done: int, region_in_view: bool, pace: Pace) -> Step | None:
+    def _next_step(self, done: int, region_in_view: bool, pace: FrameScheduler) -> Stage | None:
         optimization = self._settings.optimization
         counted = optimization.iterations
         warming_up = not region_in_view or done % counted < optimization.warmup_iterations
         if region_in_view and done > 0:
-            warming_up = warming_up and pace.has_time_for(Step.WARM_UP)
-        if warming_up and pace.trains_on(Step.WARM_UP, counted):
-            return Step.WARM_UP
-        return Step.ACTIVE if region_in_view and pace.trains_on(Step.ACTIVE, counted) else None
+            warming_up = warming_up and pace.has_time_for(Stage.WARM_UP)
+        if warming_up and pace.trains_on(Stage.WARM_UP, counted):
+            return Stage.WARM_UP
+        return Stage.ACTIVE if region_in_view and pace.trains_on(Stage.ACTIVE, counted) else None
 
     def _until_density_control(
-        self, views: Sequence[WindowView], showing: Sequence[WindowView], done: int, pace: Pace
+        self, views: Sequence[WindowView], showing: Sequence[WindowView], done: int, pace: FrameScheduler
     ) -> tuple[int, bool]:
         """Iterate until density control is due or time is up, the tables on loan to the rasterizer; `done` and which
         of both then.
@@ -133,16 +133,16 @@ class Trainer:
         with self._rasterizer.holding(*loan.tables):
             while (step := self._next_step(done, bool(showing), pace)) is not None:
                 with pace.timing(step):
-                    self._iterate(loan, step, views if step is Step.WARM_UP else showing, next(draws))
+                    self._iterate(loan, step, views if step is Stage.WARM_UP else showing, next(draws))
                 done += 1
                 if self._prune_is_due(pace) or self._densify_is_due(pace):
                     return done, False
         return done, True
 
-    def _iterate(self, loan: _Loan, step: Step, views: Sequence[WindowView], draw: float) -> None:
+    def _iterate(self, loan: _Loan, step: Stage, views: Sequence[WindowView], draw: float) -> None:
         """One iteration on the view that `draw`, from 0 to 1, picks: its full image, or the task's region alone."""
         view = views[int(draw * len(views))]
-        if step is Step.WARM_UP:
+        if step is Stage.WARM_UP:
             self._warm_up(loan, view)
         else:
             self._active_phase(loan, view)
@@ -183,21 +183,21 @@ class Trainer:
         if self._settings.optimization.averaged_updates > 0:
             self._table.average(self._settings.optimization.averaged_updates)
 
-    def _prune_is_due(self, pace: Pace) -> bool:
-        return _due(self._since_pruned, self._settings.density.prune_every, Step.PRUNING, pace)
+    def _prune_is_due(self, pace: FrameScheduler) -> bool:
+        return _due(self._since_pruned, self._settings.density.prune_every, Stage.PRUNING, pace)
 
-    def _densify_is_due(self, pace: Pace) -> bool:
-        return _due(self._since_densified, self._settings.density.densify_every, Step.DENSIFYING, pace)
+    def _densify_is_due(self, pace: FrameScheduler) -> bool:
+        return _due(self._since_densified, self._settings.density.densify_every, Stage.DENSIFYING, pace)
 
-    def _control_density(self, extent_m: float, pace: Pace) -> None:
+    def _control_density(self, extent_m: float, pace: FrameScheduler) -> None:
         """Clone, split and prune when their turn has come, and later where a frame has no time for it."""
         density = self._settings.density
         if self._prune_is_due(pace):
-            with pace.timing(Step.PRUNING):
+            with pace.timing(Stage.PRUNING):
                 prune(self._table, density)
             self._since_pruned = 0
         if self._densify_is_due(pace):
-            with pace.timing(Step.DENSIFYING):
+            with pace.timing(Stage.DENSIFYING):
                 densify(self._table, density, extent_m)
             self._since_densified = 0
 
@@ -208,6 +208,6 @@ def _uniform(rng: np.random.Generator) -> Iterator[float]:
         yield from rng.random(_DRAWS).tolist()
 
 
-def _due(since: int, every: int, step: Step, pace: Pace) -> bool:
+def _due(since: int, every: int, step: Stage, pace: FrameScheduler) -> bool:
     """Density control may be late by as many iterations again as lie between two of its turns."""
     return since >= 2 * every or (since >= every and pace.has_time_for(step))

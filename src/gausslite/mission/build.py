@@ -11,12 +11,12 @@ from gausslite.domain.task import TaskGraph
 from gausslite.errors import InvalidInputError
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mission.settings import MissionSettings, PerceptionSettings, SceneKnowledge
-from gausslite.perception.attention import Attention, AttentionBeside, TaskAttention
-from gausslite.perception.tracker import AttentionSettings
+from gausslite.perception.relevance_estimator import AsyncRelevanceEstimator, RelevanceEstimator, TaskRelevanceEstimator
+from gausslite.perception.tracker import TrackerSettings
 from gausslite.render.choose import choose_rasterizer
 
 if TYPE_CHECKING:
-    from gausslite.perception.families import Networks
+    from gausslite.perception.model_registry import ModelRegistry
 
 
 def build_mapper(settings: MissionSettings) -> GaussianMapper:
@@ -25,21 +25,23 @@ def build_mapper(settings: MissionSettings) -> GaussianMapper:
     return GaussianMapper(settings.mapper_settings(), rasterizer, seed=settings.seed)
 
 
-def build_attention(graph: TaskGraph, scene: SceneKnowledge, perception: PerceptionSettings) -> Attention:
-    """Attention to one task alone; see Attentions."""
-    return Attentions(perception, lambda: scene).to(graph)
+def build_relevance_estimator(
+    graph: TaskGraph, scene: SceneKnowledge, perception: PerceptionSettings
+) -> RelevanceEstimator:
+    """RelevanceEstimator to one task alone; see RelevanceEstimatorFactory."""
+    return RelevanceEstimatorFactory(perception, lambda: scene).to(graph)
 
 
-def open_networks(perception: PerceptionSettings) -> Networks | None:
+def open_networks(perception: PerceptionSettings) -> ModelRegistry | None:
     """The user's model files, opened and tried; None without any. Raises ModelFileError, InvalidInputError."""
     if perception.model is None:
         return None
-    from gausslite.perception.families import Networks
+    from gausslite.perception.model_registry import ModelRegistry
 
-    return Networks(perception.model, perception.segmenter, perception.vocabulary, perception.threads)
+    return ModelRegistry(perception.model, perception.segmenter, perception.vocabulary, perception.threads)
 
 
-class Attentions:
+class RelevanceEstimatorFactory:
     """Makes the attention to each task of a mission. The network is loaded once, here, and shared by all."""
 
     def __init__(self, perception: PerceptionSettings, scene: Callable[[], SceneKnowledge]) -> None:
@@ -56,22 +58,22 @@ class Attentions:
                 "detector: the sequence has no ground-truth regions; name an ONNX file with --detector"
             )
 
-    def to(self, graph: TaskGraph) -> Attention:
-        """Attention to a task: by the user's model files or, without one, by the scene's own ground truth.
+    def to(self, graph: TaskGraph) -> RelevanceEstimator:
+        """RelevanceEstimator to a task: by the user's model files or, without one, by the scene's own ground truth.
 
         With `beside` the network runs on a thread of its own. Raises InvalidInputError when there is neither file nor
         ground truth.
         """
         scene = self._scene()
-        settings = AttentionSettings(up_axis=scene.up_axis)
+        settings = TrackerSettings(up_axis=scene.up_axis)
         if self._networks is not None:
             detector = self._networks.detector
             segmenter = self._networks.segmenter if self._perception.resegment else None
             if self._perception.beside:
                 self._executor = self._executor or ThreadPoolExecutor(1, "detector")
-                return AttentionBeside(graph, detector, self._executor, settings, segmenter)
-            return TaskAttention(graph, detector, settings, segmenter)
+                return AsyncRelevanceEstimator(graph, detector, self._executor, settings, segmenter)
+            return TaskRelevanceEstimator(graph, detector, settings, segmenter)
         self.require_sight()
         from gausslite.perception.ground_truth import RegionDetector
 
-        return TaskAttention(graph, RegionDetector(scene.regions), settings)
+        return TaskRelevanceEstimator(graph, RegionDetector(scene.regions), settings)

@@ -6,19 +6,19 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from gausslite.calibration.view_fit import PoseExposurePrior
 from gausslite.datasets.source import Source
 from gausslite.domain.pose import UpAxis
 from gausslite.domain.region import Region
 from gausslite.errors import InvalidInputError
-from gausslite.mapping.pace import PaceSettings, Relief
+from gausslite.mapping.frame_scheduler import SchedulerSettings, SkippableStage
 from gausslite.mapping.policies import policy, without
 from gausslite.mapping.settings import MapperSettings
-from gausslite.optimize.view_fit import ViewPrior
 from gausslite.render.cpu_kernels import MAX_THREADS
 
 DEFAULT_MAX_GAUSSIANS = 150_000
 """What two cores keep busy at 640x480; the paper's cap of a million is for a GPU."""
-_PACE = PaceSettings()
+_PACE = SchedulerSettings()
 
 
 def require_rate(rate_hz: float) -> None:
@@ -66,7 +66,7 @@ class MissionSettings:
 
     without switches parts of the policy off by name (see `gausslite.mapping.policies.without`). rate_hz, when given,
     replaces the fixed number of iterations by what fits into 1 / rate_hz seconds a frame; where that is less than
-    least_iterations, the reliefs give way, and a frame may be late by the share run_over of its time. view_prior: how
+    min_iterations, the reliefs give way, and a frame may be late by the share run_over of its time. view_prior: how
     wrong poses and colours of frames may be.
     """
 
@@ -75,19 +75,19 @@ class MissionSettings:
     max_gaussians: int = DEFAULT_MAX_GAUSSIANS
     iterations: int | None = None
     rate_hz: float | None = None
-    least_iterations: int = _PACE.least_iterations
-    reliefs: tuple[Relief, ...] = _PACE.reliefs
+    min_iterations: int = _PACE.min_iterations
+    reliefs: tuple[SkippableStage, ...] = _PACE.reliefs
     run_over: float = _PACE.run_over
     seed: int = 0
     threads: int | None = None
     backend: str = "auto"
-    view_prior: ViewPrior = field(default_factory=ViewPrior)
+    view_prior: PoseExposurePrior = field(default_factory=PoseExposurePrior)
 
     def __post_init__(self) -> None:
         if self.rate_hz is not None:
             require_rate(self.rate_hz)
-        if not 0 <= self.least_iterations <= 10_000:
-            raise InvalidInputError(f"least iterations: expected 0 to 10000, got {self.least_iterations}")
+        if not 0 <= self.min_iterations <= 10_000:
+            raise InvalidInputError(f"least iterations: expected 0 to 10000, got {self.min_iterations}")
         if not 0 <= self.run_over <= 1:
             raise InvalidInputError(f"run over: expected a share of a frame's time, 0 to 1, got {self.run_over}")
         if self.iterations is not None and not 0 <= self.iterations <= 10_000:
@@ -100,11 +100,11 @@ class MissionSettings:
         self.mapper_settings()
 
     @property
-    def pace(self) -> PaceSettings | None:
+    def pace(self) -> SchedulerSettings | None:
         """The time a frame may take and what it goes without when short; None where iterations are counted instead."""
         if self.rate_hz is None:
             return None
-        return PaceSettings(1.0 / self.rate_hz, self.least_iterations, self.reliefs, self.run_over)
+        return SchedulerSettings(1.0 / self.rate_hz, self.min_iterations, self.reliefs, self.run_over)
 
     def mapper_settings(self) -> MapperSettings:
         """The named policy with this mission's cap, iterations and switches."""

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from gausslite.errors import ModelFileError
-from gausslite.perception.families import Family, family_of
 from gausslite.perception.model_file import CHECKSUMS, listed_checksum, open_model, require_listed_checksum, sha256_of
+from gausslite.perception.model_registry import Family, family_of
 
 
 @dataclass(frozen=True, slots=True)

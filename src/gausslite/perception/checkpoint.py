@@ -1,4 +1,4 @@
-"""Remembered objects and carried detections as named arrays, so that attention can go on in another process."""
+"""Landmark objects and carried detections as named arrays, so that attention can go on in another process."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from gausslite.domain.pose import require_rigid
 from gausslite.domain.relevance import Detection
 from gausslite.domain.state import State, take, take_counts, take_measures, take_text, text, whole_numbers
 from gausslite.errors import MapFileError
-from gausslite.perception.memory import Remembered
+from gausslite.perception.object_map import Landmark
 from gausslite.perception.reproject import Frustum
 
 
@@ -42,7 +42,7 @@ def frustum_of(state: State) -> Frustum:
     return Frustum(detection, camera, T_world_camera, near_m, far_m, passed_over)
 
 
-def remembered_state(each: Remembered) -> dict[str, NDArray[Any]]:
+def remembered_state(each: Landmark) -> dict[str, NDArray[Any]]:
     """An object over all its sightings."""
     return {
         "phrase": text(each.phrase),
@@ -54,7 +54,7 @@ def remembered_state(each: Remembered) -> dict[str, NDArray[Any]]:
     }
 
 
-def remembered_of(state: State) -> Remembered:
+def remembered_of(state: State) -> Landmark:
     """The object again. Raises MapFileError, InvalidInputError."""
     x_m, y_m, z_m, radius_m = take_measures(state, "place_m", 4)
     cells = take(state, "cells", (None,), np.int64).copy()
@@ -64,4 +64,4 @@ def remembered_of(state: State) -> Remembered:
     seen, missed = take_counts(state, "seen", 2)
     best_score, farthest_m = take_measures(state, "best", 2)
     place = (take_text(state, "phrase"), np.array([x_m, y_m, z_m]), radius_m, cells, counts)
-    return Remembered(*place, seen, missed, best_score, farthest_m)
+    return Landmark(*place, seen, missed, best_score, farthest_m)

@@ -31,7 +31,7 @@ class Detector(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
-class Box:
+class DetectedBox:
     """Where a detector of boxes saw what a phrase names; box_px is (left, top, right, bottom)."""
 
     phrase: str
@@ -43,7 +43,7 @@ class Box:
 class BoxDetector(Protocol):
     """Finds the objects that noun phrases name, but not their outlines."""
 
-    def boxes(self, frame: Frame, queries: Sequence[str]) -> list[Box]:
+    def boxes(self, frame: Frame, queries: Sequence[str]) -> list[DetectedBox]:
         """All instances of each query, best first."""
         ...
 

@@ -13,7 +13,7 @@ from gausslite.domain.camera import project
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import inverse, transform_points
 from gausslite.errors import InvalidInputError
-from gausslite.perception.memory import Remembered
+from gausslite.perception.object_map import Landmark
 
 _FIRM: Final = 3
 _NEAR_M: Final = 0.05
@@ -46,17 +46,17 @@ class EvidenceSettings:
         """Every detection counts."""
         return cls(min_seen=1, sure_score=0.0, min_share=0.0)
 
-    def believes(self, each: Remembered) -> bool:
+    def believes(self, each: Landmark) -> bool:
         """True when there is enough to go by."""
         often = each.seen >= self.min_seen or each.best_score >= self.sure_score
         return often and each.seen >= self.min_share * (each.seen + each.missed)
 
-    def is_firm(self, each: Remembered) -> bool:
+    def is_firm(self, each: Landmark) -> bool:
         """True when it is believed and could not be two mistakes: one false candidate would decide a superlative."""
         often = each.seen >= _FIRM * self.min_seen or each.best_score >= self.sure_score
         return often and self.believes(each)
 
-    def wants_another(self, each: Remembered) -> bool:
+    def wants_another(self, each: Landmark) -> bool:
         """True when one more sighting could settle it."""
         return not self.believes(each) and each.seen + 1 >= self.min_seen
 
@@ -68,7 +68,7 @@ class Outlook:
     frame: Frame
     depth_m: Float32[ndarray, "h w"]
 
-    def shows_place_of(self, each: Remembered) -> bool:
+    def shows_place_of(self, each: Landmark) -> bool:
         """True when most of the object's cells lie in view with nothing before them, no farther than it was seen from.
 
         An object that is gone still has its place: then what lies behind is seen.

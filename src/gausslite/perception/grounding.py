@@ -14,7 +14,7 @@ from numpy import ndarray
 
 from gausslite.domain.frame import Frame
 from gausslite.errors import InvalidInputError, ModelFileError
-from gausslite.perception.detect import Box, BoxFractions, concerns_many_objects
+from gausslite.perception.detect import BoxFractions, DetectedBox, concerns_many_objects
 from gausslite.perception.grounding_text import PhraseInput, Tokenizer, phrase_input
 from gausslite.perception.model_file import OpenModel, run_once
 
@@ -72,11 +72,11 @@ class GroundingDino:
         """None: any phrase can be asked for."""
         return ()
 
-    def boxes(self, frame: Frame, queries: Sequence[str]) -> list[Box]:
+    def boxes(self, frame: Frame, queries: Sequence[str]) -> list[DetectedBox]:
         """All instances of each query, best first; boxes that span too much are left out."""
         pixel_values, pixel_mask = self._picture(frame.rgb)
         many = concerns_many_objects(queries)
-        found: list[Box] = []
+        found: list[DetectedBox] = []
         for query in queries:
             logits, centred = self._run(pixel_values, pixel_mask, self._phrase(query))
             limit = self._settings.box_fractions.limit(query, many)
@@ -90,7 +90,7 @@ class GroundingDino:
         centred: Float32[ndarray, "q 4"],
         limit: float,
         size_px: tuple[int, int],
-    ) -> list[Box]:
+    ) -> list[DetectedBox]:
         """The boxes that are sure enough, not too large, and distinct."""
         scores, noun_scores = phrase_scores(logits, self._phrase(query).is_noun)
         boxes_px = corners_px(centred, size_px)
@@ -106,7 +106,7 @@ class GroundingDino:
         found = []
         for row in chosen:
             left, top, right, bottom = (float(edge) for edge in boxes_px[row])
-            found.append(Box(query, float(scores[row]), (left, top, right, bottom)))
+            found.append(DetectedBox(query, float(scores[row]), (left, top, right, bottom)))
         return found
 
     def _phrase(self, query: str) -> PhraseInput:

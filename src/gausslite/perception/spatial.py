@@ -14,8 +14,8 @@ from gausslite.domain.pose import UpAxis, transform_points, unit_up_axis
 from gausslite.domain.relevance import Detection
 from gausslite.domain.task import Predicate, Relation, TaskGraph
 from gausslite.perception.evidence import EvidenceSettings, Outlook
-from gausslite.perception.memory import ObjectMemory, Remembered, Sighting
-from gausslite.perception.relate import Geometry, SpatialSettings, apart_m
+from gausslite.perception.object_map import Landmark, ObjectMap, Observation
+from gausslite.perception.relations import Geometry, SpatialSettings, apart_m
 
 _MIN_PIXELS = 8
 _MAX_PIXELS = 4000
@@ -30,7 +30,7 @@ def best_depth_m(
     return np.where(rendered_m > 0, rendered_m, sensor_m)
 
 
-def sight(detection: Detection, depth_m: Float32[ndarray, "h w"], frame: Frame) -> Sighting | None:
+def sight(detection: Detection, depth_m: Float32[ndarray, "h w"], frame: Frame) -> Observation | None:
     """Lift a detection's mask to its centroid in the world; None where too few of its pixels have depth.
 
     Instead of the one pixel at the 2D centroid, which may lie beside the object, all its pixels are lifted.
@@ -44,7 +44,7 @@ def sight(detection: Detection, depth_m: Float32[ndarray, "h w"], frame: Frame) 
     points = lift(centres_px, depth_m[rows, columns].astype(np.float64), frame.camera)
     T_world_camera = frame.T_world_camera
     points_m = transform_points(T_world_camera, points)
-    return Sighting.of_points(detection.phrase, points_m, T_world_camera[:3, 3], detection.score)
+    return Observation.of_points(detection.phrase, points_m, T_world_camera[:3, 3], detection.score)
 
 
 class SpatialFilter:
@@ -59,10 +59,10 @@ class SpatialFilter:
         }
         self._geometry = Geometry(np.array(unit_up_axis(up_axis)), settings)
         self._evidence = evidence or EvidenceSettings()
-        self._memory = ObjectMemory()
+        self._memory = ObjectMap()
 
     @property
-    def remembered(self) -> tuple[Remembered, ...]:
+    def remembered(self) -> tuple[Landmark, ...]:
         """Every object seen so far, where it was seen on average."""
         return self._memory.objects
 
@@ -72,35 +72,35 @@ class SpatialFilter:
         needed = dict.fromkeys(each.anchor for relations in self._relations.values() for each in relations)
         return tuple(anchor for anchor in needed if not self._memory.named(anchor))
 
-    def observe(self, sightings: Sequence[Sighting], outlook: Outlook | None = None) -> None:
+    def observe(self, sightings: Sequence[Observation], outlook: Outlook | None = None) -> None:
         """Take one frame's sightings into the memory; with an outlook, also what it should have shown and did not."""
         self._memory.observe(sightings, None if outlook is None else outlook.shows_place_of)
 
-    def believes(self, sighting: Sighting) -> bool:
+    def believes(self, sighting: Observation) -> bool:
         """True when what was sighted is there for all that is known of it."""
         shown = self._memory.showing(sighting)
         return shown is not None and self._evidence.believes(shown)
 
-    def is_sure_of(self, sighting: Sighting) -> bool:
+    def is_sure_of(self, sighting: Observation) -> bool:
         """True when what was sighted could not be two mistakes."""
         shown = self._memory.showing(sighting)
         return shown is not None and self._evidence.is_firm(shown)
 
-    def are_one(self, sighting: Sighting, other: Sighting) -> bool:
+    def are_one(self, sighting: Observation, other: Observation) -> bool:
         """True when two sightings show one and the same object."""
         shown = self._memory.showing(sighting)
         return shown is not None and shown is self._memory.showing(other)
 
-    def wants_another(self, sighting: Sighting) -> bool:
+    def wants_another(self, sighting: Observation) -> bool:
         """True when another look could settle whether it is there."""
         shown = self._memory.showing(sighting)
         return shown is not None and self._evidence.wants_another(shown)
 
-    def remember(self, objects: Sequence[Remembered]) -> None:
+    def remember(self, objects: Sequence[Landmark]) -> None:
         """Start from objects of an earlier life, oldest first."""
-        self._memory = ObjectMemory(objects)
+        self._memory = ObjectMap(objects)
 
-    def keep(self, sighting: Sighting) -> bool:
+    def keep(self, sighting: Observation) -> bool:
         """Any relation of the target holds (Sec. III-B.3); True without relations or without their anchors.
 
         A target is judged by the anchors that were seen; while none of them was, it is kept, for want of evidence.
@@ -114,17 +114,17 @@ class SpatialFilter:
         judged = held if between is None else [*held, between]
         return not judged or any(judged)
 
-    def _others(self, relation: Relation, sighting: Sighting) -> list[Remembered]:
+    def _others(self, relation: Relation, sighting: Observation) -> list[Landmark]:
         """The relation's anchors without the target itself."""
         return [each for each in self._credible(relation.anchor) if not each.is_at(sighting)]
 
-    def _holds(self, relation: Relation, sighting: Sighting) -> bool:
+    def _holds(self, relation: Relation, sighting: Observation) -> bool:
         if relation.predicate in (Predicate.CLOSEST_TO, Predicate.FARTHEST_FROM):
             return self._is_extreme(relation, sighting)
         anchors = self._others(relation, sighting)
         return any(self._geometry.holds(relation.predicate, sighting, anchor) for anchor in anchors)
 
-    def _is_extreme(self, relation: Relation, sighting: Sighting) -> bool:
+    def _is_extreme(self, relation: Relation, sighting: Observation) -> bool:
         """Of all firm candidates, only the one whose surface is least (most) apart from that of its nearest anchor."""
         sign = 1.0 if relation.predicate is Predicate.CLOSEST_TO else -1.0
         anchors = self._credible(relation.anchor)
@@ -135,12 +135,12 @@ class SpatialFilter:
                 best, least_m = candidate, sign * min(to_anchors_m)
         return best is not None and best.matches(sighting)
 
-    def _firm(self, phrase: str) -> list[Remembered]:
+    def _firm(self, phrase: str) -> list[Landmark]:
         """The objects that may decide between all that answer a phrase; the believed ones while there is none."""
         credible = self._credible(phrase)
         return [each for each in credible if self._evidence.is_firm(each)] or credible
 
-    def _credible(self, phrase: str) -> list[Remembered]:
+    def _credible(self, phrase: str) -> list[Landmark]:
         """The believed objects that answer a phrase, or all while none is."""
         named = self._memory.named(phrase)
         return [each for each in named if self._evidence.believes(each)] or named

@@ -21,16 +21,16 @@ from gausslite.perception.checkpoint import frustum_of as frustum_of_state
 from gausslite.perception.checkpoint import frustum_state, remembered_of, remembered_state
 from gausslite.perception.detect import Segmenter
 from gausslite.perception.evidence import EvidenceSettings, Outlook
-from gausslite.perception.layers import front_layer
-from gausslite.perception.memory import Remembered, Sighting
-from gausslite.perception.relate import SpatialSettings
+from gausslite.perception.foreground import foreground_mask
+from gausslite.perception.object_map import Landmark, Observation
+from gausslite.perception.relations import SpatialSettings
 from gausslite.perception.reproject import Frustum, cut_by_depth, frustum_of, reprojected_box_px
 from gausslite.perception.spatial import SpatialFilter, sight
 from gausslite.perception.vocabulary import is_generic
 
 
 @dataclass(frozen=True, slots=True)
-class AttentionSettings:
+class TrackerSettings:
     """up_axis points up in the world, by default that of a level first camera; max_* say when to detect anew.
 
     How far the camera may go between two detections is a comment in Sec. III-B.2. A target that was believed is carried
@@ -59,7 +59,7 @@ class AttentionSettings:
 class TargetTracker:
     """Owns the latest keyframe and the memory of objects, and asks no detector itself. One thread at a time."""
 
-    def __init__(self, graph: TaskGraph, settings: AttentionSettings, segmenter: Segmenter | None) -> None:
+    def __init__(self, graph: TaskGraph, settings: TrackerSettings, segmenter: Segmenter | None) -> None:
         """Without a segmenter, carried boxes are cut out by depth alone."""
         self._graph = graph
         self._settings = settings
@@ -76,7 +76,7 @@ class TargetTracker:
         return tuple(f"anchor {name!r} not seen yet: its targets are kept" for name in self._filter.unseen_anchors)
 
     @property
-    def remembered(self) -> tuple[Remembered, ...]:
+    def remembered(self) -> tuple[Landmark, ...]:
         """The objects that the task's nouns have named so far, where they were seen."""
         return self._filter.remembered
 
@@ -162,7 +162,7 @@ class TargetTracker:
         ]
 
     def _passed_over(
-        self, frame: Frame, depth_m: Float32[ndarray, "h w"], found: Sequence[Sighting]
+        self, frame: Frame, depth_m: Float32[ndarray, "h w"], found: Sequence[Observation]
     ) -> list[tuple[Frustum, Detection]]:
         """What is carried and in view, was not found again, and yet is still believed: detectors blink."""
         left = []
@@ -177,10 +177,10 @@ class TargetTracker:
 
     def _observe(
         self, frame: Frame, depth_m: Float32[ndarray, "h w"], found: Sequence[Detection]
-    ) -> list[tuple[Detection, Sighting]]:
+    ) -> list[tuple[Detection, Observation]]:
         """Remember what was detected; the targets that are believed and fit the task's relations."""
         detections = [
-            replace(each, mask=front_layer(each.mask, depth_m)) for each in self._without_anchors_as_objects(found)
+            replace(each, mask=foreground_mask(each.mask, depth_m)) for each in self._without_anchors_as_objects(found)
         ]
         placed = [sight(each, depth_m, frame) for each in detections]
         self._filter.observe([sighting for sighting in placed if sighting is not None], Outlook(frame, frame.depth_m))

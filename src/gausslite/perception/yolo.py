@@ -10,8 +10,8 @@ import numpy as np
 from gausslite.domain.frame import Frame
 from gausslite.domain.relevance import Detection
 from gausslite.errors import InvalidInputError, ModelFileError
-from gausslite.perception.detect import Box, BoxFractions, concerns_many_objects
-from gausslite.perception.everything import EverythingSegmenter
+from gausslite.perception.class_agnostic import ClassAgnosticSegmenter
+from gausslite.perception.detect import BoxFractions, DetectedBox, concerns_many_objects
 from gausslite.perception.model_file import OpenModel
 from gausslite.perception.vectors import TextVectors, classes_for
 from gausslite.perception.yolo_decode import Candidates, suppress
@@ -62,9 +62,9 @@ class YoloSegDetector:
         """The queries that no class of the network fits."""
         return tuple(self._warnings)
 
-    def segmenter(self) -> EverythingSegmenter:
+    def segmenter(self) -> ClassAgnosticSegmenter:
         """A Segmenter over the same network: all it sees in an image, of whatever class."""
-        return EverythingSegmenter(self._network)
+        return ClassAgnosticSegmenter(self._network)
 
     def detect(self, frame: Frame, queries: Sequence[str]) -> list[Detection]:
         """All instances of each query with their masks, best first; boxes that span too much are left out."""
@@ -80,7 +80,7 @@ class YoloSegDetector:
             if masks[row].any()
         ]
 
-    def boxes(self, frame: Frame, queries: Sequence[str]) -> list[Box]:
+    def boxes(self, frame: Frame, queries: Sequence[str]) -> list[DetectedBox]:
         """As `detect`, for others to cut out."""
         wanted = self._wanted(queries)
         if not wanted:
@@ -95,14 +95,14 @@ class YoloSegDetector:
 
     def _answers(
         self, found: Candidates, wanted: Mapping[str, tuple[int, ...]], many: bool, pixels: int
-    ) -> Iterator[tuple[int, Box]]:
+    ) -> Iterator[tuple[int, DetectedBox]]:
         """The candidates that answer each query, with their rows; those that span too much are left out."""
         shares = (found.boxes_px[:, 2:] - found.boxes_px[:, :2]).prod(axis=1) / pixels
         for query, indices in wanted.items():
             for row in np.flatnonzero(np.isin(found.classes, indices)):
                 if shares[row] <= self._settings.box_fractions.limit(self.class_names[found.classes[row]], many):
                     left, top, right, bottom = (float(edge) for edge in found.boxes_px[row])
-                    yield int(row), Box(query, float(found.scores[row]), (left, top, right, bottom))
+                    yield int(row), DetectedBox(query, float(found.scores[row]), (left, top, right, bottom))
 
     def _distinct(self, found: Candidates, wanted: Mapping[str, tuple[int, ...]]) -> Candidates:
         """The candidates of the wanted classes, one an object."""

@@ -9,7 +9,7 @@ from numpy import ndarray
 from gausslite.domain.arrays import require_array
 from gausslite.domain.camera import Camera
 from gausslite.errors import InvalidInputError, ShapeError
-from gausslite.render.rasterizer import ROW_WIDTH, TILE_PX, Rendering, Subset, Tally
+from gausslite.render.rasterizer import ROW_WIDTH, TILE_PX, Rendering, Subset, UpdateCounter
 
 
 def require_table(name: str, table: Float32[ndarray, "n 16"], n: int | None = None) -> None:
@@ -40,7 +40,7 @@ def require_scene(n: int, camera: Camera, T_camera_world: Float64[ndarray, "4 4"
         _require_ascending(subset.ids, n)
 
 
-def require_marks(n: int, trainable: Bool[ndarray, " n"] | None, tally: Tally | None) -> None:
+def require_marks(n: int, trainable: Bool[ndarray, " n"] | None, tally: UpdateCounter | None) -> None:
     """Raise ShapeError unless what is said of single rows is said of all n, and the tally can be written."""
     if trainable is not None:
         require_array("trainable", trainable, (n,), np.bool_)

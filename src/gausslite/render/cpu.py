@@ -24,15 +24,15 @@ from gausslite.render.checks import (
 from gausslite.render.cpu_arguments import CpuView, Loans, contiguous, intrinsics
 from gausslite.render.cpu_kernels import choose_simd, choose_threads, load_kernels
 from gausslite.render.rasterizer import (
-    EVERYTHING,
+    FULL_FRAME,
     AdamSettings,
     LossWeights,
     Rendering,
     SplatGradients,
     StepReport,
     Subset,
-    Tally,
     TrainingView,
+    UpdateCounter,
 )
 
 if TYPE_CHECKING:
@@ -110,7 +110,7 @@ class CpuRasterizer:
         rows: Float32[ndarray, "n 16"],
         camera: Camera,
         T_camera_world: Float64[ndarray, "4 4"],
-        subset: Subset = EVERYTHING,
+        subset: Subset = FULL_FRAME,
     ) -> Rendering:
         """Draw the splats. Raises ShapeError, InvalidInputError for ids that are not ascending rows."""
         require_table("rows", rows)
@@ -171,9 +171,9 @@ class CpuRasterizer:
         loss: LossWeights,
         adam: AdamSettings,
         masked: bool = False,
-        subset: Subset = EVERYTHING,
+        subset: Subset = FULL_FRAME,
         trainable: Bool[ndarray, " n"] | None = None,
-        tally: Tally | None = None,
+        tally: UpdateCounter | None = None,
     ) -> StepReport:
         """One whole iteration in place. Raises ShapeError, also for a view of another backend."""
         if not isinstance(view, CpuView):

@@ -17,7 +17,7 @@ from gausslite.domain.camera import Camera
 from gausslite.errors import InvalidInputError
 from gausslite.render.checks import require_marks, require_scene, require_tables
 from gausslite.render.cpu_kernels import load_kernels
-from gausslite.render.rasterizer import AdamSettings, LossWeights, Subset, Tally
+from gausslite.render.rasterizer import AdamSettings, LossWeights, Subset, UpdateCounter
 
 if TYPE_CHECKING:
     from gausslite.render import _kernels
@@ -96,7 +96,7 @@ class Loans:
         rules: tuple[LossWeights, AdamSettings],
         masked: bool,
         trainable: Bool[ndarray, " n"] | None,
-        tally: Tally | None,
+        tally: UpdateCounter | None,
     ) -> _kernels.StepTraining:
         """What a step changes and how; kept for the next step on the same loan. Raises ShapeError."""
         asked, known = (*tables, *rules, trainable, tally), self._trainings.get(masked)

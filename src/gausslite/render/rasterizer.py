@@ -57,7 +57,7 @@ class Subset:
     ids: UInt32[ndarray, " m"] | None = None
 
 
-EVERYTHING = Subset()
+FULL_FRAME = Subset()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -158,7 +158,7 @@ class AdamSettings:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Tally:
+class UpdateCounter:
     """How often rows were trained: `counts` rises by one in each step that moves the row; among: of these rows only."""
 
     counts: UInt32[ndarray, " n"]
@@ -212,7 +212,7 @@ class Rasterizer(Protocol):
         rows: Float32[ndarray, "n 16"],
         camera: Camera,
         T_camera_world: Float64[ndarray, "4 4"],
-        subset: Subset = EVERYTHING,
+        subset: Subset = FULL_FRAME,
     ) -> Rendering:
         """Draw the splats. Raises ShapeError."""
         ...
@@ -247,9 +247,9 @@ class Rasterizer(Protocol):
         loss: LossWeights,
         adam: AdamSettings,
         masked: bool = False,
-        subset: Subset = EVERYTHING,
+        subset: Subset = FULL_FRAME,
         trainable: Bool[ndarray, " n"] | None = None,
-        tally: Tally | None = None,
+        tally: UpdateCounter | None = None,
     ) -> StepReport:
         """One whole iteration in place: forward, loss, backward, sparse Adam on the visible (and trainable) rows.
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from gausslite.task import lexicon
 from gausslite.task.phrases import NounPhrase, adjectives_only
-from gausslite.task.pieces import Kind, Piece
+from gausslite.task.pieces import Piece, TokenKind
 
 
 class Clause:
@@ -38,7 +38,7 @@ def names_object(noun: NounPhrase, pending: str | None, after: Piece | None) -> 
         return False
     if noun.head in lexicon.TASK_WORDS and pending is None:
         return False
-    leads_on = after is not None and after.kind is Kind.PREPOSITION and after.word == "of"
+    leads_on = after is not None and after.kind is TokenKind.PREPOSITION and after.word == "of"
     compound = len(noun.words) > 1 and not adjectives_only(noun.words[:-1])
     if compound and noun.head in lexicon.PLACES and not leads_on:
         return True

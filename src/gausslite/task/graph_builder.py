@@ -9,7 +9,7 @@ from gausslite.task import lexicon
 from gausslite.task.clause import Clause, described, names_object
 from gausslite.task.draft import GraphDraft
 from gausslite.task.phrases import NounPhrase, adjectives_only, known_phrase
-from gausslite.task.pieces import Kind, Piece
+from gausslite.task.pieces import Piece, TokenKind
 from gausslite.task.placing import NounPlacer
 from gausslite.task.verbs import BELONGING_VERBS
 
@@ -41,26 +41,28 @@ class GraphBuilder:
     def add(self, before: Piece | None, piece: Piece, following: Sequence[Piece]) -> None:
         """Read one piece, knowing the one before it and all that follow."""
         after, self._following = (following[0] if following else None), following
-        if piece.kind is Kind.VERB:
+        if piece.kind is TokenKind.VERB:
             self._verb(before, piece)
-        elif piece.kind is Kind.BELONGS:
+        elif piece.kind is TokenKind.BELONGS:
             self._clause.verb = "put" if piece.word in BELONGING_VERBS else piece.word
             self._clause.last_relation, self._negated = None, False
-        elif piece.kind is Kind.NOUN and piece.noun is not None:
+        elif piece.kind is TokenKind.NOUN and piece.noun is not None:
             self._noun(before, piece.noun, after)
-        elif piece.kind is Kind.PREPOSITION:
+        elif piece.kind is TokenKind.PREPOSITION:
             # "all but the lighter, to the tent": the exception is over
-            self._negated = self._negated and (before is None or before.kind is not Kind.JOIN or before.word == "or")
-            self._also = self._pending if before is not None and before.kind is Kind.JOIN else None
+            self._negated = self._negated and (
+                before is None or before.kind is not TokenKind.JOIN or before.word == "or"
+            )
+            self._also = self._pending if before is not None and before.kind is TokenKind.JOIN else None
             self._pending, self._clause.stated = piece.word, piece.stated
-        elif piece.kind is Kind.NEGATION:
+        elif piece.kind is TokenKind.NEGATION:
             self._negation(piece.word)
-        elif piece.kind in (Kind.BREAK, Kind.ASIDE):
+        elif piece.kind in (TokenKind.BREAK, TokenKind.ASIDE):
             self._new_clause(None)
-            self._negated, self._clause.aside = False, piece.kind is Kind.ASIDE
-        elif piece.kind is Kind.BACK_REFERENCE:
+            self._negated, self._clause.aside = False, piece.kind is TokenKind.ASIDE
+        elif piece.kind is TokenKind.BACK_REFERENCE:
             self._back_reference(piece.word, before)
-        elif piece.kind is Kind.POINTING:
+        elif piece.kind is TokenKind.POINTING:
             self._pointing(piece.word, before, after)
 
     def finish(self) -> GraphDraft:
@@ -85,9 +87,9 @@ class GraphBuilder:
 
     def _leaves_alone(self) -> bool:
         """In "take the cups and leave the plates" nothing says where the plates would be left."""
-        rest = [piece.kind for piece in self._following if piece.kind not in (Kind.NOUN, Kind.JOIN)]
-        named = bool(self._following) and self._following[0].kind is Kind.NOUN
-        return named and (not rest or rest[0] in (Kind.BREAK, Kind.VERB))
+        rest = [piece.kind for piece in self._following if piece.kind not in (TokenKind.NOUN, TokenKind.JOIN)]
+        named = bool(self._following) and self._following[0].kind is TokenKind.NOUN
+        return named and (not rest or rest[0] in (TokenKind.BREAK, TokenKind.VERB))
 
     def _verb(self, before: Piece | None, piece: Piece) -> None:
         if piece.word == "leave" and self._draft.targets and self._leaves_alone():
@@ -96,7 +98,7 @@ class GraphBuilder:
         same_negation = self._negated and (
             self._clause.nouns_since_negation == 0
             or piece.gerund
-            or (before is not None and before.kind is Kind.JOIN and before.word == "or")
+            or (before is not None and before.kind is TokenKind.JOIN and before.word == "or")
         )
         if not same_negation:
             self._negated = False
@@ -119,7 +121,7 @@ class GraphBuilder:
     def _back_reference(self, word: str, before: Piece | None) -> None:
         """The words "it" and "them" are the clause's objects, or behind a preposition what was named before these."""
         clause = self._clause
-        if not clause.referents and not clause.subjects and before is not None and before.kind is Kind.VERB:
+        if not clause.referents and not clause.subjects and before is not None and before.kind is TokenKind.VERB:
             self._pointing(word, before, None)
             return
         pending, self._pending = self._pending, None
@@ -151,7 +153,7 @@ class GraphBuilder:
     def _noun(self, before: Piece | None, noun: NounPhrase, after: Piece | None) -> None:
         if noun.words in _ADDRESSED and not (noun.determined or self._clause.verb or self._pending):
             return
-        joined = before is not None and before.kind is Kind.JOIN
+        joined = before is not None and before.kind is TokenKind.JOIN
         if joined and self._corrects and self._clause.nouns_since_negation:
             self._negated = False  # "not the wooden spoon, the metal one"
         if noun.head in ("one", "ones"):
@@ -159,9 +161,9 @@ class GraphBuilder:
                 return  # "this mug, not that one"
             noun = self._another(noun)
         pending, self._pending = self._pending, None
-        leads_on = after is not None and after.kind is Kind.PREPOSITION and after.word == "of"
+        leads_on = after is not None and after.kind is TokenKind.PREPOSITION and after.word == "of"
         if adjectives_only(noun.words) and not (leads_on and noun.head in lexicon.PLACES):
-            if after is not None and after.kind is Kind.JOIN:
+            if after is not None and after.kind is TokenKind.JOIN:
                 self._adjectives.append(noun)
             return
         if not names_object(noun, pending, after):
@@ -192,7 +194,7 @@ class GraphBuilder:
             self._clause.route = True
         elif noun.head in lexicon.PLACES and pending is None:
             self._draft.whole_place = noun.text
-        leads_on = after is not None and after.kind is Kind.PREPOSITION and after.word == "of"
+        leads_on = after is not None and after.kind is TokenKind.PREPOSITION and after.word == "of"
         self._clause.handed_on = pending if leads_on else None
         self._clause.skip_of, self._clause.handed_joined = leads_on, joined
 

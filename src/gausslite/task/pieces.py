@@ -8,7 +8,7 @@ from enum import Enum
 from gausslite.task.phrases import NounPhrase
 
 
-class Kind(Enum):
+class TokenKind(Enum):
     """What a piece of a sentence is."""
 
     VERB = "verb"
@@ -30,7 +30,7 @@ class Piece:
     stated: the place is where something is ("that is on"), and not where it is to go.
     """
 
-    kind: Kind
+    kind: TokenKind
     word: str
     noun: NounPhrase | None = None
     gerund: bool = False

@@ -10,7 +10,7 @@ from gausslite.task import lexicon
 from gausslite.task.clause import Clause
 from gausslite.task.draft import GraphDraft
 from gausslite.task.phrases import NounPhrase, known_phrase
-from gausslite.task.pieces import Kind, Piece
+from gausslite.task.pieces import Piece, TokenKind
 from gausslite.task.verbs import (
     DELIVERY_VERBS,
     FILLING_VERBS,
@@ -175,21 +175,21 @@ class NounPlacer:
     def _is_receiver(self, following: Sequence[Piece]) -> bool:
         """In "hand the nurse the towel" the nurse locates where the towel goes."""
         clause = self.clause
-        while len(following) > 1 and following[0].kind is Kind.PREPOSITION and following[1].kind is Kind.NOUN:
+        while len(following) > 1 and following[0].kind is TokenKind.PREPOSITION and following[1].kind is TokenKind.NOUN:
             following = following[2:]  # "bring the man in the wheelchair a drink"
-        follows = bool(following) and following[0].kind is Kind.NOUN
+        follows = bool(following) and following[0].kind is TokenKind.NOUN
         return follows and clause.verb in GIVING_VERBS and not clause.subjects
 
     def _is_last_place(self, pending: str, following: Sequence[Piece]) -> bool:
         """Of "on the table into the sink" only the sink is where it goes; "on the shelf in the garage" is one place."""
-        more = [piece.word for piece in following[:1] if piece.kind is Kind.PREPOSITION]
+        more = [piece.word for piece in following[:1] if piece.kind is TokenKind.PREPOSITION]
         rooms = [piece.noun for piece in following[1:2] if piece.noun and piece.noun.head in lexicon.ROOMS]
         final = "to" in more or (pending == "on" and bool(_FINAL_DESTINATIONS.intersection(more)) and not rooms)
         return bool(self.clause.subjects) and pending in _DESTINATIONS and not final
 
     def _belongs_to_anchor(self, noun: NounPhrase, after: Piece | None) -> bool:
         """Near the sink and the stove: both locate. On the table and the keys: the keys are a target of their own."""
-        if after is not None and after.kind is Kind.PREPOSITION and after.word not in ("of", "to", "for", "with"):
+        if after is not None and after.kind is TokenKind.PREPOSITION and after.word not in ("of", "to", "for", "with"):
             return False
         if self.clause.last_relation == "between" or self.clause.between:
             return True

@@ -8,7 +8,7 @@ from typing import Final
 from gausslite.task import lexicon
 from gausslite.task.clauses import NOMINATIVES, SUBJECTS, WISHES, Mood, commands, is_modal, moods_of
 from gausslite.task.phrases import adjectives_only, noun_phrase
-from gausslite.task.pieces import Kind, Piece
+from gausslite.task.pieces import Piece, TokenKind
 from gausslite.task.prepositions import PREPOSITIONS
 from gausslite.task.tagging import tagged
 from gausslite.task.tags import Tag
@@ -65,7 +65,7 @@ class _Reader:
             Tag.PARTICIPLE: self._participle,
             Tag.PREPOSITION: self._preposition,
             Tag.PARTICLE: self._particle,
-            Tag.JOIN: lambda word: self._emit(Kind.JOIN, word),
+            Tag.JOIN: lambda word: self._emit(TokenKind.JOIN, word),
             Tag.BREAK: self._break,
             Tag.STAND_IN: self._stand_in,
             Tag.AUXILIARY: self._auxiliary,
@@ -83,7 +83,7 @@ class _Reader:
             if tag is Tag.JOIN and mood is Mood.TASK and (before is Mood.ASIDE or self._asks_anew(at)):
                 tag = Tag.BREAK
             if mood is Mood.ASIDE and at in self.moods:
-                self._emit(Kind.ASIDE, word)
+                self._emit(TokenKind.ASIDE, word)
                 if tag in (Tag.BREAK, Tag.JOIN):
                     continue
             if mood is not Mood.REASON:
@@ -103,10 +103,10 @@ class _Reader:
         position = self.at + ahead
         return self.said[position][0] if 0 <= position < len(self.said) else ""
 
-    def _last(self) -> Kind | None:
+    def _last(self) -> TokenKind | None:
         return self.pieces[-1].kind if self.pieces else None
 
-    def _emit(self, kind: Kind, word: str, gerund: bool = False, stated: bool = False) -> None:
+    def _emit(self, kind: TokenKind, word: str, gerund: bool = False, stated: bool = False) -> None:
         self._close()
         self.pieces.append(Piece(kind, word, gerund=gerund, stated=stated))
 
@@ -114,7 +114,7 @@ class _Reader:
         """End the open noun phrase."""
         if self.words:
             self.pieces.append(
-                Piece(Kind.NOUN, self.words[-1], noun_phrase(self.words, self.determined, self.superlative))
+                Piece(TokenKind.NOUN, self.words[-1], noun_phrase(self.words, self.determined, self.superlative))
             )
         self.words, self.determined, self.superlative = [], False, False
 
@@ -123,7 +123,7 @@ class _Reader:
 
     def _noun(self, word: str) -> None:
         # "the red and blue mugs": an adjective on its own waits for the noun of the next phrase
-        if not self.words and self._last() is Kind.JOIN and len(self.pieces) >= 2:
+        if not self.words and self._last() is TokenKind.JOIN and len(self.pieces) >= 2:
             before = self.pieces[-2].noun
             if before is not None and adjectives_only(before.words):
                 self.determined = before.determined
@@ -157,12 +157,12 @@ class _Reader:
         self._close()
 
     def _back_reference(self, word: str) -> None:
-        self._emit(Kind.POINTING if word in _POINTING else Kind.BACK_REFERENCE, word)
+        self._emit(TokenKind.POINTING if word in _POINTING else TokenKind.BACK_REFERENCE, word)
 
     def _break(self, word: str) -> None:
         self._close()
         if word != "that":
-            self._emit(Kind.BREAK, word)
+            self._emit(TokenKind.BREAK, word)
 
     def _negation(self, word: str) -> None:
         if self._tag(-1) is Tag.PRONOUN and self._word(-1) != "you" and verb_base(self._word(1)) not in _REFUSALS:
@@ -174,32 +174,32 @@ class _Reader:
         if self._tag(-1) is Tag.AUXILIARY and self._word(-1) != "do" and self._tag(1) not in _FORBIDDEN:
             self._close()
         else:
-            self._emit(Kind.NEGATION, word)
+            self._emit(TokenKind.NEGATION, word)
 
     def _forbid(self, word: str) -> None:
         """In "the lamp and the vase must not be touched" what is excluded stands before."""
         self._close()
         at = len(self.pieces)
-        while at and self.pieces[at - 1].kind in (Kind.NOUN, Kind.JOIN):
+        while at and self.pieces[at - 1].kind in (TokenKind.NOUN, TokenKind.JOIN):
             at -= 1
-        self.pieces.insert(at, Piece(Kind.NEGATION, word))
+        self.pieces.insert(at, Piece(TokenKind.NEGATION, word))
 
     def _pronoun(self, word: str) -> None:
         """In "ignore the cars, I only want the bikes" a new sentence begins."""
         self._close()
-        if word in NOMINATIVES and self._last() is Kind.JOIN and self.at - 1 in self.moods:
-            self._emit(Kind.BREAK, word)
+        if word in NOMINATIVES and self._last() is TokenKind.JOIN and self.at - 1 in self.moods:
+            self._emit(TokenKind.BREAK, word)
 
     def _relative(self, word: str) -> None:
         self._close()
-        if word in _RELATIVES and self._last() is Kind.NOUN:
+        if word in _RELATIVES and self._last() is TokenKind.NOUN:
             self.relative_from = len(self.pieces)
 
     def _end_relative_subject(self, finite: bool) -> None:
         """In "the mug that my wife uses" and "the mug my wife uses" the wife is none of the task's business."""
         self._close()
         adjacent = self.subject_at > 0 and self.said[self.subject_at - 1][1] is Tag.NOUN
-        if finite and adjacent and [piece.kind for piece in self.pieces[-2:]] == [Kind.NOUN, Kind.NOUN]:
+        if finite and adjacent and [piece.kind for piece in self.pieces[-2:]] == [TokenKind.NOUN, TokenKind.NOUN]:
             self.pieces.pop()
         if self.relative_from is not None and self.relative_from == len(self.pieces) - 1:
             self.pieces.pop()
@@ -207,9 +207,9 @@ class _Reader:
 
     def _auxiliary(self, word: str) -> None:
         self._end_relative_subject(finite=True)
-        if word in _HAVING and self._last() is Kind.NOUN and self._tag(1) in _OPENS_OBJECT:
-            self._emit(Kind.PREPOSITION, "near")
-        self.modal = is_modal(self.said, self.at) and self._last() is Kind.NOUN
+        if word in _HAVING and self._last() is TokenKind.NOUN and self._tag(1) in _OPENS_OBJECT:
+            self._emit(TokenKind.PREPOSITION, "near")
+        self.modal = is_modal(self.said, self.at) and self._last() is TokenKind.NOUN
 
     def _verb(self, word: str) -> None:
         self._end_relative_subject(finite=True)
@@ -220,11 +220,11 @@ class _Reader:
             self._close()  # "something to write with"
         elif must and self._subject_is_thing():
             if base in BELONGING_VERBS:
-                self._emit(Kind.BELONGS, base)
+                self._emit(TokenKind.BELONGS, base)
         elif subject not in SUBJECTS or commands(self.said, self.at) or (subject is Tag.PRONOUN and base in WISHES):
-            self._emit(Kind.VERB, base)
+            self._emit(TokenKind.VERB, base)
         elif base in BELONGING_VERBS and subject is not Tag.PRONOUN:
-            self._emit(Kind.BELONGS, base)
+            self._emit(TokenKind.BELONGS, base)
         elif subject in (Tag.NOUN, Tag.RELATIVE, Tag.STAND_IN) and self._tag(1) in _OPENS_OBJECT | {Tag.PRONOUN}:
             self._act(base)
         else:
@@ -233,11 +233,11 @@ class _Reader:
     def _act(self, base: str) -> None:
         """The cans are near the shelf that holds them; who left a bag, and what a key opens, are not asked for."""
         if base in HOLDING_VERBS:
-            self._emit(Kind.PREPOSITION, "near")
-        elif self._tag(-1) is Tag.STAND_IN and self._last() is Kind.NOUN:
+            self._emit(TokenKind.PREPOSITION, "near")
+        elif self._tag(-1) is Tag.STAND_IN and self._last() is TokenKind.NOUN:
             self.pieces.pop()
         else:
-            self._emit(Kind.PREPOSITION, "purpose")
+            self._emit(TokenKind.PREPOSITION, "purpose")
 
     def _subject_is_thing(self) -> bool:
         noun = self.pieces[-1].noun if self.pieces else None
@@ -246,22 +246,24 @@ class _Reader:
     def _ing(self, word: str) -> None:
         before, after = self._tag(-1), self._tag(1)
         opens = self.determined or before not in _BEFORE_A_GERUND
-        opens = opens or (before is Tag.VERB and self._last() is Kind.VERB and self.pieces[-1].word not in ASPECT_VERBS)
+        opens = opens or (
+            before is Tag.VERB and self._last() is TokenKind.VERB and self.pieces[-1].word not in ASPECT_VERBS
+        )
         if opens and after in _IN_A_NOUN and lexicon.ADJECTIVES.issuperset(self.words):
             self.words.append(word)  # "the leaking pipe"
-        elif before is Tag.PREPOSITION and self._last() is Kind.NOUN and self._tag(-2) in _DESCRIBED:
+        elif before is Tag.PREPOSITION and self._last() is TokenKind.NOUN and self._tag(-2) in _DESCRIBED:
             self._close()  # "a cloth for wiping the table"
             if after in _OPENS_OBJECT:
-                self._emit(Kind.PREPOSITION, "purpose")
+                self._emit(TokenKind.PREPOSITION, "purpose")
         elif self.words or before in (Tag.NOUN, Tag.STAND_IN, Tag.AUXILIARY, Tag.RELATIVE):
             self._happening(after)
         else:
-            self._emit(Kind.VERB, verb_base(word) or word, gerund=True)
+            self._emit(TokenKind.VERB, verb_base(word) or word, gerund=True)
 
     def _happening(self, after: Tag | None) -> None:
         """In "the person holding a cup" the cup is beside the person; in "the cat sleeping here" nothing is."""
         if after in _OPENS_OBJECT:
-            self._emit(Kind.PREPOSITION, "near")
+            self._emit(TokenKind.PREPOSITION, "near")
         else:
             self._close()
 
@@ -272,8 +274,8 @@ class _Reader:
             return
         self._end_relative_subject(finite=after is Tag.PRONOUN)
         if self.modal and self._subject_is_thing():
-            self._emit(Kind.BELONGS, verb_base(word) or word)
-        elif after in _OPENS_OBJECT and self._last() is Kind.NOUN:
+            self._emit(TokenKind.BELONGS, verb_base(word) or word)
+        elif after in _OPENS_OBJECT and self._last() is TokenKind.NOUN:
             self.pieces.pop()  # who dropped it is none of the task's business
         self.modal = False
 
@@ -282,19 +284,19 @@ class _Reader:
         before, after = self._tag(-1), self._tag(1)
         if word == "of" and before is Tag.DETERMINER and not self.words:
             return
-        directly = not self.words and self._last() is Kind.VERB and before is Tag.VERB
+        directly = not self.words and self._last() is TokenKind.VERB and before is Tag.VERB
         if directly and is_particle(self.pieces[-1].word, word):
             if relation in _WAYS and self.pieces[-1].word in GO_VERBS:
-                self._emit(Kind.PREPOSITION, "via")
+                self._emit(TokenKind.PREPOSITION, "via")
             return
-        if relation == "to" and self._last() is Kind.NOUN and (before is Tag.ING or self._tag(-2) is Tag.RELATIVE):
+        if relation == "to" and self._last() is TokenKind.NOUN and (before is Tag.ING or self._tag(-2) is Tag.RELATIVE):
             relation = "purpose"  # "the door that leads to the hall"
         if after is Tag.PREPOSITION or (after is Tag.ING and word in ("for", "by", "before", "after")):
             self._close()
             return
-        self._emit(Kind.PREPOSITION, relation, stated=before in _STATES)
+        self._emit(TokenKind.PREPOSITION, relation, stated=before in _STATES)
 
     def _particle(self, word: str) -> None:
         self._close()
         if word in PREPOSITIONS and (self._tag(1), self._tag(2)) == (Tag.JOIN, Tag.PREPOSITION):
-            self._emit(Kind.PREPOSITION, PREPOSITIONS[word])  # "under or behind the couch"
+            self._emit(TokenKind.PREPOSITION, PREPOSITIONS[word])  # "under or behind the couch"

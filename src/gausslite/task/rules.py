@@ -7,7 +7,7 @@ from gausslite.errors import TaskError
 from gausslite.task.graph_builder import draft_of
 from gausslite.task.ground import grounded_graph
 from gausslite.task.parser import normalise_text
-from gausslite.task.pieces import Kind, Piece
+from gausslite.task.pieces import Piece, TokenKind
 from gausslite.task.reading import read
 from gausslite.task.validate import EXAMPLE, require_task_text
 
@@ -29,7 +29,7 @@ class RuleParser:
 def _require_sense(text: str, pieces: list[Piece]) -> None:
     """Unknown words alone are noise; next to a verb, an article or a preposition they may be rare objects."""
     nouns = [piece.noun for piece in pieces if piece.noun is not None]
-    structured = any(piece.kind in (Kind.VERB, Kind.PREPOSITION) for piece in pieces)
+    structured = any(piece.kind in (TokenKind.VERB, TokenKind.PREPOSITION) for piece in pieces)
     if not structured and not any(noun.known or noun.determined for noun in nouns):
         raise TaskError(_nothing_named(text, ()))
 

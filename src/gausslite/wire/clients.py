@@ -16,7 +16,7 @@ from gausslite.codec.subset_codec import CodecLimits
 from gausslite.domain.camera import Camera
 from gausslite.domain.frame import Frame
 from gausslite.domain.task import TaskGraph
-from gausslite.domain.voxels import Box, VoxelGrid
+from gausslite.domain.voxels import AxisAlignedBox, VoxelGrid
 from gausslite.errors import ChecksumError, CodecError
 from gausslite.v1 import (
     agent_service_pb2,
@@ -119,7 +119,7 @@ class AgentClient(ServiceChannel):
         return decode_colour(response.colour_png, *size), decode_depth(response.depth_png, *size)
 
     def watch_map(
-        self, since_revision: int = 0, region: Box | None = None, roi_only: bool = False
+        self, since_revision: int = 0, region: AxisAlignedBox | None = None, roi_only: bool = False
     ) -> Iterator[convert.MapUpdate]:
         """The map as it grows, without end. Raises RevisionGoneError when since_revision is no longer kept."""
         request = agent_service_pb2.WatchMapRequest(
@@ -184,7 +184,7 @@ class FusionClient(ServiceChannel):
         )
         return int(self._call(self._stub.ContributeKeyframes, requests, 10 * self._deadline_s).accepted)
 
-    def watch(self, since_revision: int = 0, region: Box | None = None) -> Iterator[convert.MapUpdate]:
+    def watch(self, since_revision: int = 0, region: AxisAlignedBox | None = None) -> Iterator[convert.MapUpdate]:
         """The fused map as it changes, without end. Raises RevisionGoneError when since_revision is no longer kept."""
         request = fusion_service_pb2.WatchFusedMapRequest(
             mission_id=self.mission_id,

@@ -12,10 +12,10 @@ from gausslite.codec.subset_codec import CodecLimits, decode_subset
 from gausslite.domain.camera import Camera
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import require_rigid
-from gausslite.domain.subset import VoxelWords
 from gausslite.domain.task import Predicate, Relation, TaskGraph
-from gausslite.domain.voxels import Box, VoxelGrid
-from gausslite.domain.words import no_words, take_voxels, unite
+from gausslite.domain.voxel_batch import VoxelBatch
+from gausslite.domain.voxel_operations import empty_batch, merge_batches, take_voxels
+from gausslite.domain.voxels import AxisAlignedBox, VoxelGrid
 from gausslite.errors import InvalidInputError, TaskError
 from gausslite.task.validate import require_graph
 from gausslite.v1 import gaussians_pb2, geometry_pb2, task_pb2
@@ -38,17 +38,17 @@ class MapUpdate:
     snapshot: bool
     first: bool
     last: bool
-    words: VoxelWords | None
+    words: VoxelBatch | None
     grid: VoxelGrid | None
     winners: tuple[str, ...]
 
-    def over(self, held: VoxelWords) -> VoxelWords:
-        """What a watcher holds after this update: begin with `no_words()`, and hold on to a map without tombstones."""
-        before = no_words() if self.snapshot and self.first else held
+    def over(self, held: VoxelBatch) -> VoxelBatch:
+        """What a watcher holds after this update: begin with `empty_batch()`, keep a map without tombstones."""
+        before = empty_batch() if self.snapshot and self.first else held
         if self.words is None:
             return before
         kept = take_voxels(before, ~np.isin(before.keys, self.words.keys))
-        return unite(kept, take_voxels(self.words, self.words.counts > 0))
+        return merge_batches(kept, take_voxels(self.words, self.words.counts > 0))
 
 
 def graph_to_message(graph: TaskGraph) -> task_pb2.TaskGraph:
@@ -155,16 +155,16 @@ def grid_from_message(message: geometry_pb2.VoxelGrid) -> VoxelGrid:
     return VoxelGrid(message.size_m)
 
 
-def box_to_message(box: Box) -> geometry_pb2.Box:
+def box_to_message(box: AxisAlignedBox) -> geometry_pb2.Box:
     """A box as a message."""
     low, high = (geometry_pb2.Point(x=p[0], y=p[1], z=p[2]) for p in (box.min_m, box.max_m))
     return geometry_pb2.Box(min_m=low, max_m=high)
 
 
-def box_from_message(message: geometry_pb2.Box) -> Box:
+def box_from_message(message: geometry_pb2.Box) -> AxisAlignedBox:
     """A checked box. Raises InvalidInputError."""
     low, high = message.min_m, message.max_m
-    return Box((low.x, low.y, low.z), (high.x, high.y, high.z))
+    return AxisAlignedBox((low.x, low.y, low.z), (high.x, high.y, high.z))
 
 
 def map_update_from_message(message: gaussians_pb2.MapBlock, limits: CodecLimits, first: bool) -> MapUpdate:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 
 from gausslite.codec.subset_codec import encode_subset, split_words
-from gausslite.domain.subset import RoiSubset, VoxelWords
+from gausslite.domain.voxel_batch import RoiSubset, VoxelBatch
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.v1.gaussians_pb2 import MapBlock, Provenance
 
@@ -13,12 +13,12 @@ _BLOCK_BYTES = 1 << 19
 
 
 def map_blocks(
-    words: VoxelWords,
+    words: VoxelBatch,
     grid: VoxelGrid,
     speaker: str,
     revision: int,
     snapshot: bool,
-    provenance: Callable[[VoxelWords], Provenance] | None = None,
+    provenance: Callable[[VoxelBatch], Provenance] | None = None,
 ) -> Iterator[MapBlock]:
     """The blocks of one revision, at least one, encoded one by one as they are asked for.
 

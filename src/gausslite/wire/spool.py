@@ -19,7 +19,7 @@ from jaxtyping import Int64
 from numpy import ndarray
 
 from gausslite.codec.records import from_bytes, to_records
-from gausslite.domain.subset import VoxelWords
+from gausslite.domain.voxel_batch import VoxelBatch
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.errors import MismatchError, StorageError
 
@@ -57,11 +57,11 @@ class Purpose(IntEnum):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Picked:
+class SpoolBatch:
     """Words to send, with the version of each, so that a newer word that comes meanwhile is not taken for sent."""
 
     purpose: Purpose
-    words: VoxelWords
+    words: VoxelBatch
     versions: Int64[ndarray, " v"]
 
 
@@ -90,7 +90,7 @@ class Spool:
                 f"got {held[0]!r} and {held[1]} m; choose another file"
             )
 
-    def offer(self, words: VoxelWords, purpose: Purpose) -> None:
+    def offer(self, words: VoxelBatch, purpose: Purpose) -> None:
         """Keep these words in place of older ones on their voxels; what is unchanged stays as it was."""
         records = to_records(words.gaussians)
         offsets = words.offsets.tolist()
@@ -110,7 +110,7 @@ class Spool:
                 ),
             )
 
-    def pick(self, max_bytes: int, growth_share: float) -> Picked | None:
+    def pick(self, max_bytes: int, growth_share: float) -> SpoolBatch | None:
         """Waiting words whose kappa grew most, for about max_bytes on the wire but at least one; None when none is due.
 
         A word already sent is due once its kappa has changed by growth_share of what was sent.
@@ -128,7 +128,7 @@ class Spool:
                 return _picked(purpose, sorted(rows))
         return None
 
-    def settle(self, picked: Picked) -> None:
+    def settle(self, picked: SpoolBatch) -> None:
         """These words need not be sent again: the server has them, or will never take them."""
         triples = zip(
             picked.versions.tolist(), picked.words.kappa_sums.tolist(), picked.words.keys.tolist(), strict=True
@@ -178,12 +178,12 @@ class Spool:
         return None if row is None else row[0]
 
 
-def _picked(purpose: Purpose, rows: list[_Row]) -> Picked:
+def _picked(purpose: Purpose, rows: list[_Row]) -> SpoolBatch:
     keys, versions, sums, counts, blobs = zip(*rows, strict=True)
-    words = VoxelWords(
+    words = VoxelBatch(
         np.array(keys, np.int64),
         np.array(sums, np.uint64),
         np.array(counts, np.uint32),
         from_bytes(b"".join(blobs)),
     )
-    return Picked(purpose, words, np.array(versions, np.int64))
+    return SpoolBatch(purpose, words, np.array(versions, np.int64))

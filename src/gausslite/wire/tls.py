@@ -1,4 +1,4 @@
-"""Who this process is on the network, and whom it trusts: certificates for its connections, when it is given some."""
+"""Who this process is on the network, and whom it is_exact: certificates for its connections, when it is given some."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 from gausslite.codec.subset_codec import MAX_SUBSET_BYTES, encode_subset, split_words
-from gausslite.domain.subset import RoiSubset, VoxelWords
+from gausslite.domain.voxel_batch import RoiSubset, VoxelBatch
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.errors import (
     GaussLiteError,
@@ -27,9 +27,9 @@ from gausslite.errors import (
     UnavailableError,
 )
 from gausslite.v1 import fusion_service_pb2 as pb
-from gausslite.wire.bandwidth import Allowance
 from gausslite.wire.clients import FusionClient, Session
-from gausslite.wire.spool import Picked, Purpose, Spool
+from gausslite.wire.spool import Purpose, Spool, SpoolBatch
+from gausslite.wire.token_bucket import TokenBucket
 from gausslite.wire.uplink_values import UplinkCounters, UplinkSettings
 
 _log = logging.getLogger(__name__)
@@ -61,7 +61,7 @@ class Uplink:
         self._session: Session | None = None
         self._sequence = 0
         self._subset_bytes = MAX_SUBSET_BYTES
-        self._allowance = Allowance(self._settings.kbps)
+        self._allowance = TokenBucket(self._settings.kbps)
         self._backoff_s = 0.0
         self._trouble = ""
         self._next_round_s = 0.0
@@ -71,7 +71,7 @@ class Uplink:
         self._thread = threading.Thread(target=self._run, name="uplink", daemon=True)
         self._thread.start()
 
-    def offer(self, words: VoxelWords, purpose: Purpose = Purpose.ROI) -> None:
+    def offer(self, words: VoxelBatch, purpose: Purpose = Purpose.ROI) -> None:
         """Take these words to be sent; on each voxel they replace what was not sent yet. Raises StorageError."""
         if len(words):
             self._spool.offer(words, purpose)
@@ -156,7 +156,7 @@ class Uplink:
         if picked is None:
             return False
         session = self._joined()
-        sent: dict[int, tuple[Picked, int]] = {}
+        sent: dict[int, tuple[SpoolBatch, int]] = {}
         requests = list(self._requests(picked, session, sent))
         self._allowance.spend(sum(size for _, size in sent.values()))
         problem = self._exchange(requests, sent)
@@ -167,7 +167,7 @@ class Uplink:
         return True
 
     def _exchange(
-        self, requests: list[pb.ContributeSubsetsRequest], sent: dict[int, tuple[Picked, int]]
+        self, requests: list[pb.ContributeSubsetsRequest], sent: dict[int, tuple[SpoolBatch, int]]
     ) -> GaussLiteError | None:
         """Send on one stream and settle what is answered; the last problem that needs another try."""
         problem: GaussLiteError | None = None
@@ -198,14 +198,14 @@ class Uplink:
         return self._session
 
     def _requests(
-        self, picked: Picked, session: Session, sent: dict[int, tuple[Picked, int]]
+        self, picked: SpoolBatch, session: Session, sent: dict[int, tuple[SpoolBatch, int]]
     ) -> Iterator[pb.ContributeSubsetsRequest]:
         start = 0
         for part in split_words(picked.words, self._subset_bytes):
             stop = start + len(part)
             self._sequence += 1
             stamp = self._spool.next_stamp(session.highest_map_revision)
-            words = Picked(picked.purpose, part, picked.versions[start:stop])
+            words = SpoolBatch(picked.purpose, part, picked.versions[start:stop])
             start = stop
             try:
                 data = encode_subset(
@@ -222,7 +222,7 @@ class Uplink:
                 subset=data,
             )
 
-    def _take_outcome(self, outcome: pb.SubsetOutcome, part: Picked, size: int) -> GaussLiteError | None:
+    def _take_outcome(self, outcome: pb.SubsetOutcome, part: SpoolBatch, size: int) -> GaussLiteError | None:
         """Settle one subset; the error to recover from when it has to be sent again."""
         keys = set(part.words.keys.tolist())
         rejected = outcome.status == pb.SUBSET_STATUS_REJECTED
@@ -239,13 +239,13 @@ class Uplink:
             self._spool.settle(part)
         return None
 
-    def _drop(self, part: Picked, reason: str) -> None:
+    def _drop(self, part: SpoolBatch, reason: str) -> None:
         _log.warning("uplink: words on %d voxels are dropped: %s", len(part.words), reason)
         self._spool.settle(part)
         with self._changed:
             self._counters = replace(self._counters, subsets_rejected=self._counters.subsets_rejected + 1)
 
-    def _count(self, part: Picked, size: int, keys: set[int], rejected: bool) -> None:
+    def _count(self, part: SpoolBatch, size: int, keys: set[int], rejected: bool) -> None:
         is_roi = part.purpose is Purpose.ROI
         with self._changed:
             c = self._counters

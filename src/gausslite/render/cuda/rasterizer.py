@@ -27,15 +27,15 @@ from gausslite.render.cuda.loss import CudaView, Window, training_loss
 from gausslite.render.cuda.projection import Lens, project, visible_rows
 from gausslite.render.cuda.tables import DeviceTables, HostTables, carried
 from gausslite.render.rasterizer import (
-    EVERYTHING,
+    FULL_FRAME,
     AdamSettings,
     LossWeights,
     Rendering,
     SplatGradients,
     StepReport,
     Subset,
-    Tally,
     TrainingView,
+    UpdateCounter,
 )
 
 
@@ -115,7 +115,7 @@ class CudaRasterizer:
         rows: Float32[ndarray, "n 16"],
         camera: Camera,
         T_camera_world: Float64[ndarray, "4 4"],
-        subset: Subset = EVERYTHING,
+        subset: Subset = FULL_FRAME,
     ) -> Rendering:
         """Draw the splats. Raises ShapeError, InvalidInputError for ids that are not ascending rows."""
         require_table("rows", rows)
@@ -183,9 +183,9 @@ class CudaRasterizer:
         loss: LossWeights,
         adam: AdamSettings,
         masked: bool = False,
-        subset: Subset = EVERYTHING,
+        subset: Subset = FULL_FRAME,
         trainable: Bool[ndarray, " n"] | None = None,
-        tally: Tally | None = None,
+        tally: UpdateCounter | None = None,
     ) -> StepReport:
         """One whole iteration: in place on the device during a loan, else carried there and back.
 

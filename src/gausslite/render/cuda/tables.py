@@ -17,7 +17,7 @@ from gausslite.render.rasterizer import (
     MOST_COUNTED_UPDATES,
     UPDATES,
     AdamSettings,
-    Tally,
+    UpdateCounter,
 )
 
 _COUNT_EVERY = 8
@@ -60,7 +60,7 @@ class DeviceTables:
         self.rows, self.first_moment, self.second_moment = (
             torch.from_numpy(array).to(device, copy=True) for array in host.arrays
         )
-        self._uncounted: list[tuple[Int64[Tensor, " m"], Tally]] = []
+        self._uncounted: list[tuple[Int64[Tensor, " m"], UpdateCounter]] = []
 
     def write_back(self) -> None:
         """Bring the caller's arrays up to date."""
@@ -68,7 +68,7 @@ class DeviceTables:
         for array, tensor in zip(self.host.arrays, (self.rows, self.first_moment, self.second_moment), strict=True):
             torch.from_numpy(array).copy_(tensor)
 
-    def count(self, moved: Int64[Tensor, " m"], tally: Tally) -> None:
+    def count(self, moved: Int64[Tensor, " m"], tally: UpdateCounter) -> None:
         """These rows were trained; the tally learns of it by the end of the loan."""
         self._uncounted.append((moved, tally))
         if len(self._uncounted) == _COUNT_EVERY:

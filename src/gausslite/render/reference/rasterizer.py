@@ -23,7 +23,7 @@ from gausslite.render.checks import (
     require_view,
 )
 from gausslite.render.rasterizer import (
-    EVERYTHING,
+    FULL_FRAME,
     GRAD_2D_COUNT,
     GRAD_2D_SUM,
     MOST_COUNTED_UPDATES,
@@ -35,8 +35,8 @@ from gausslite.render.rasterizer import (
     SplatGradients,
     StepReport,
     Subset,
-    Tally,
     TrainingView,
+    UpdateCounter,
 )
 from gausslite.render.reference.compositing import draw, draw_backward
 from gausslite.render.reference.loss import ReferenceView, training_loss
@@ -71,7 +71,7 @@ class ReferenceRasterizer:
         rows: Float32[ndarray, "n 16"],
         camera: Camera,
         T_camera_world: Float64[ndarray, "4 4"],
-        subset: Subset = EVERYTHING,
+        subset: Subset = FULL_FRAME,
     ) -> Rendering:
         """Draw the splats. Raises ShapeError, InvalidInputError for ids that are not ascending rows."""
         drawn = _draw(rows, camera, T_camera_world, subset)
@@ -125,9 +125,9 @@ class ReferenceRasterizer:
         loss: LossWeights,
         adam: AdamSettings,
         masked: bool = False,
-        subset: Subset = EVERYTHING,
+        subset: Subset = FULL_FRAME,
         trainable: Bool[ndarray, " n"] | None = None,
-        tally: Tally | None = None,
+        tally: UpdateCounter | None = None,
     ) -> StepReport:
         """One whole iteration in place. Raises ShapeError, also for a view of another backend."""
         if not isinstance(view, ReferenceView):

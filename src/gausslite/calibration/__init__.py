@@ -1,0 +1,1 @@
+"""Estimate what the recording does not state: depth registration, pose and exposure errors."""

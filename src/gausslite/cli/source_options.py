@@ -1,0 +1,121 @@
+"""Options that several sub-commands share beside those of a mission: the sequence and ground-truth regions."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+from gausslite.calibration.pose_exposure_error import measure_view_error
+from gausslite.calibration.registration import find_registration
+from gausslite.calibration.view_fit import PoseExposurePrior
+from gausslite.config.options import AS_RECORDED, LOOK, TRUSTED, add_frames, names, numbers
+from gausslite.datasets.open import is_simulated, open_source
+from gausslite.datasets.registered_source import DepthRegistration, RegisteredSource
+from gausslite.datasets.source import Source
+from gausslite.domain.pose import UpAxis
+from gausslite.domain.region import BallRegion, Region
+
+
+def add_source(parser: argparse.ArgumentParser, by_default: str = AS_RECORDED) -> None:
+    """Add SOURCE and what of it is used; by_default as in `add_frames`."""
+    parser.add_argument(
+        "source",
+        metavar="SOURCE",
+        help='a folder (TUM, 7-Scenes or Replica layout) or "sim:home?seed=0&trajectory=0", sim:home-1 to sim:home-8',
+    )
+    add_frames(parser, may_look=True, by_default=by_default)
+
+
+def open_with_warnings(
+    spec: str,
+    up_axis: UpAxis | None,
+    colour_camera: DepthRegistration | str | None,
+    by_default: str = AS_RECORDED,
+) -> tuple[Source, DepthRegistration | None]:
+    """Open a sequence and tell, on stderr, what a user would not expect of it; the camera that depth is registered to.
+
+    What is asked for may be LOOK, AS_RECORDED or None, for nothing; then it is by_default, one of the two. Raises
+    DatasetError, PoseError, InvalidInputError.
+    """
+    return register_with_warnings(spec, open_recorded(spec, up_axis), colour_camera, by_default)
+
+
+def open_recorded(spec: str, up_axis: UpAxis | None) -> Source:
+    """Open a sequence as it was recorded and tell what is left out of it. Raises DatasetError, InvalidInputError."""
+    source = open_source(spec, up_axis)
+    if source.left_out:
+        print(f"{spec}: {source.left_out}", file=sys.stderr)
+    return source
+
+
+def register_with_warnings(
+    spec: str, source: Source, colour_camera: DepthRegistration | str | None, by_default: str
+) -> tuple[Source, DepthRegistration | None]:
+    """The second half of open_with_warnings: bring depth into the colour camera; looking for that takes seconds."""
+    if colour_camera is None and not source.depth_registered:
+        colour_camera = by_default
+        hint = f"--colour-camera {LOOK} looks for the camera to register it to, {AS_RECORDED} takes it as it is"
+        if by_default == LOOK:
+            hint = f"looking for its colour camera now, --colour-camera {AS_RECORDED} takes it as it is"
+        print(f"{spec}: its layout leaves open whether depth is registered to colour; {hint}", file=sys.stderr)
+    if colour_camera == LOOK:
+        colour_camera, why = find_registration(source)
+        print(f"--colour-camera {colour_camera or AS_RECORDED}: {why}", file=sys.stderr)
+    if not isinstance(colour_camera, DepthRegistration):
+        return source, None
+    return RegisteredSource(source, colour_camera), colour_camera
+
+
+def resolve_pose_prior(spec: str, source: Source, view_error: PoseExposurePrior | str) -> PoseExposurePrior:
+    """How wrong the views may be, as said or, for LOOK, as a recording itself tells; that is told on stderr.
+
+    Poses of a simulated home are exact.
+    """
+    if isinstance(view_error, PoseExposurePrior):
+        return view_error
+    if is_simulated(spec):
+        return PoseExposurePrior()
+    found, why = measure_view_error(source)
+    print(f"--view-error {TRUSTED if found.is_exact else found}: {why}", file=sys.stderr)
+    return found
+
+
+def add_regions(parser: argparse.ArgumentParser) -> None:
+    """Add --roi, --objects and --roi-ball: ground-truth regions of space."""
+    parser.add_argument("--roi", metavar="FILE.npz", type=Path, help="voxel file of ground-truth regions")
+    parser.add_argument(
+        "--objects", metavar="A,B", type=names, default=(), help="objects of --roi (default: all) or of SOURCE"
+    )
+    parser.add_argument(
+        "--roi-ball",
+        metavar="X,Y,Z,R",
+        type=ball,
+        action="append",
+        default=[],
+        help="a ball in metres; may be repeated",
+    )
+
+
+def ball(text: str) -> BallRegion:
+    """Read "x,y,z,r" in metres; argparse reports what is wrong."""
+    x, y, z, radius_m = numbers(text, 4)
+    if radius_m <= 0:
+        raise argparse.ArgumentTypeError(f"expected a radius above 0, got {radius_m}")
+    return BallRegion((x, y, z), radius_m)
+
+
+def asked_regions(options: argparse.Namespace, source: Source) -> list[Region]:
+    """The objects of --roi (those of --objects, or all) and every --roi-ball; --objects alone names the source's own.
+
+    Empty when none is asked for. Raises InvalidInputError, DatasetError.
+    """
+    from gausslite.datasets.regions import balls_for_small_objects, choose_regions, load_voxel_regions
+
+    asked: list[Region] = []
+    if options.roi is not None:
+        asked += choose_regions(balls_for_small_objects(load_voxel_regions(options.roi)), options.objects)
+    elif options.objects:
+        asked += choose_regions(source.regions(), options.objects)
+    balls: list[BallRegion] = options.roi_ball
+    return [*asked, *balls]

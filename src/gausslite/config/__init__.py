@@ -1,0 +1,1 @@
+"""Program options shared by the command line and the services."""

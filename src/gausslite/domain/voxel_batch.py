@@ -1,0 +1,72 @@
+"""What leaves a robot: its latest word on some voxels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Int64, UInt32, UInt64
+from numpy import ndarray
+
+from gausslite.domain.arrays import require_array
+from gausslite.domain.gaussians import Gaussians
+from gausslite.errors import InvalidInputError
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class VoxelBatch:
+    """A complete word on each listed voxel.
+
+    keys are strictly ascending; gaussians are sorted by voxel, counts[i] of them in keys[i]; a count of 0 is a
+    tombstone (nothing there any more). kappa_sums are TOTALS over the voxel, never increments, so that a word may
+    arrive twice or out of order without changing the outcome.
+    """
+
+    keys: Int64[ndarray, " v"]
+    kappa_sums: UInt64[ndarray, " v"]
+    counts: UInt32[ndarray, " v"]
+    gaussians: Gaussians
+
+    def __post_init__(self) -> None:
+        v = len(self.keys)
+        require_array("words keys", self.keys, (v,), np.int64)
+        require_array("words kappa_sums", self.kappa_sums, (v,), np.uint64)
+        require_array("words counts", self.counts, (v,), np.uint32)
+        if v > 1 and not (np.diff(self.keys) > 0).all():
+            raise InvalidInputError("words keys: expected strictly ascending voxel keys")
+        total = int(self.counts.sum(dtype=np.int64))
+        if total != len(self.gaussians):
+            raise InvalidInputError(
+                f"words counts: expected a sum of {len(self.gaussians)} (the Gaussians present), got {total}"
+            )
+
+    def __len__(self) -> int:
+        return len(self.keys)
+
+    @property
+    def offsets(self) -> Int64[ndarray, " v1"]:
+        """gaussians[offsets[i] : offsets[i + 1]] belong to keys[i]."""
+        return np.concatenate([np.zeros(1, np.int64), np.cumsum(self.counts, dtype=np.int64)])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RoiSubset:
+    """One message of an agent: its words on some voxels as of `map_revision` of its map.
+
+    Per voxel the word with the highest map_revision is the agent's latest; sequence numbers the messages of a session
+    so that the receiver can acknowledge them cumulatively.
+    """
+
+    agent_id: str
+    session_id: str
+    sequence: int
+    map_revision: int
+    words: VoxelBatch
+
+    def __post_init__(self) -> None:
+        if not self.agent_id:
+            raise InvalidInputError("subset agent_id: expected a name, got an empty string")
+        if self.sequence < 0 or self.map_revision < 0:
+            raise InvalidInputError(
+                f"subset sequence and map_revision: expected at least 0, got {self.sequence} and {self.map_revision}"
+            )

@@ -1,0 +1,1 @@
+"""`gausslite bench`: one module per benchmark."""

@@ -1,0 +1,73 @@
+"""`gausslite bench retask`: how soon a map serves a task that came in the middle of the mission."""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from gausslite.codec.files import write_whole
+from gausslite.config.options import names
+from gausslite.errors import InvalidInputError
+from gausslite.evaluation.pictures import write_png
+from gausslite.mission.results import prepare_folder, write_json
+from gausslite.mission.settings import MissionSettings
+from gausslite_bench.curves import draw_panels
+from gausslite_bench.task_change import Recovery, TaskChange, TaskChangeBench, recovery_table
+
+_CHANGES = (
+    "home-4-manipulation:home-4-navigation",
+    "home-1-search:home-1-navigation",
+    "home-8-navigation:home-8-search",
+)
+
+
+def configure_retask(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `bench retask`."""
+    add = parser.add_argument
+    add("--out", metavar="DIR", type=Path, required=True, help="gets retask.md, retask.json and retask.png")
+    add("--changes", metavar="A:B,...", type=names, default=_CHANGES, help=f"default: {','.join(_CHANGES)}")
+    add("--before", metavar="N", type=int, default=48, help="frames before the change (default: %(default)s)")
+    add("--after", metavar="N", type=int, default=48, help="frames after it (default: %(default)s)")
+    add("--views", metavar="N", type=int, default=12, help="held-out views (default: %(default)s)")
+    add("--max-gaussians", metavar="N", type=int, default=60_000, help="hard cap (default: %(default)s)")
+    add("--iterations", metavar="N", type=int, default=8, help="a frame (default: %(default)s)")
+    add("--rate", metavar="HZ", type=float, default=4.0, help="frames a second (default: %(default)s)")
+    add("--timed", action="store_true", help="as many iterations as fit into a frame's time, instead of --iterations")
+    add("--seed", metavar="S", type=int, default=0, help="seed of every random choice (default: 0)")
+    add("--threads", metavar="N", type=int, help="threads (default: all the processor allows)")
+    parser.set_defaults(run=run_retask)
+
+
+def run_retask(options: argparse.Namespace) -> int:
+    """Map each change three times; what is known is written after each, so that an interrupt loses one change alone."""
+    settings = MissionSettings(
+        max_gaussians=options.max_gaussians,
+        iterations=None if options.timed else options.iterations,
+        rate_hz=options.rate if options.timed else None,
+        seed=options.seed,
+        threads=options.threads,
+    )
+    changes = [TaskChange.parse(text) for text in options.changes]
+    if not changes:
+        raise InvalidInputError(f"changes: expected such as {_CHANGES[0]}, got none")
+    bench = TaskChangeBench(settings, options.rate, options.before, options.after, options.views)
+    prepare_folder(options.out)
+    recoveries: list[Recovery] = []
+    for change in changes:
+        recoveries.append(bench.run(change))
+        print(recovery_table(recoveries[-1:]).splitlines()[-1], file=sys.stderr, flush=True)
+        _write(options.out, recoveries)
+    print(recovery_table(recoveries))
+    print(f"→ {options.out / 'retask.md'}")
+    return 0
+
+
+def _write(folder: Path, recoveries: Sequence[Recovery]) -> None:
+    command = shlex.join(["gausslite", *sys.argv[1:]])
+    write_whole(folder / "retask.md", f"# bench retask\n\n`{command}`\n\n{recovery_table(recoveries)}".encode())
+    write_json(folder / "retask.json", {"command": command, "changes": [each.as_json() for each in recoveries]})
+    panels = {each.change.name: each.points for each in recoveries}
+    write_png(folder / "retask.png", draw_panels(panels, "seconds of mapping since the change", "ROI PSNR, dB"))

@@ -1,0 +1,74 @@
+"""All simulated homes by number: 0 is the two rooms that the tests and the demo know, 1 to 8 are the hard ones."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from gausslite_sim import layout, trajectories
+from gausslite_sim.homes import (
+    bedroom,
+    kitchen_diner,
+    living_room,
+    lounge,
+    meeting_room,
+    open_office,
+    study,
+    workshop,
+)
+from gausslite_sim.items import Item
+from gausslite_sim.lighting import Lighting
+from gausslite_sim.materials import Painter, paint
+from gausslite_sim.plan import HomePlan
+from gausslite_sim.sensor_noise import SensorNoise
+from gausslite_sim.walks import Key, walk_through
+
+_EXPOSURE_DRIFT = 0.12
+_SENSOR = SensorNoise(dark_loss=0.55, gloss_loss=0.5)
+
+
+@dataclass(frozen=True, slots=True)
+class Home:
+    """What a module of `homes` offers."""
+
+    furnish: Callable[[np.random.Generator], Sequence[Item]]
+    painters: Callable[[], dict[str, Painter]]
+    lighting: Lighting
+    walks: Sequence[Sequence[Key]]
+
+
+HOMES = tuple(
+    Home(module.furnish, module.painters, module.LIGHTING, module.WALKS)
+    for module in (
+        living_room,
+        bedroom,
+        kitchen_diner,
+        study,
+        open_office,
+        meeting_room,
+        lounge,
+        workshop,
+    )
+)
+HOME_COUNT = len(HOMES)
+
+
+def home_plan(number: int, seed: int) -> HomePlan:
+    """The home of this number, 0 to HOME_COUNT; the seed shifts its things and grains its materials."""
+    if number == 0:
+        textures = layout.paint_textures(seed)
+        return HomePlan(seed, layout.furnish(seed), textures, layout.LIGHTING, trajectories.WALKS)
+    home = HOMES[number - 1]
+    items = home.furnish(np.random.default_rng([seed, number, 2]))
+    used = {part.texture for item in items for part in item.parts}
+    return HomePlan(
+        seed,
+        items,
+        paint(home.painters(), used, seed),
+        home.lighting,
+        tuple(walk_through(keys) for keys in home.walks),
+        _EXPOSURE_DRIFT,
+        _SENSOR,
+    )

@@ -1,0 +1,183 @@
+"""Where everything is: a kitchen (x 0 to 4.2 m) and a living room (x 4.3 to 8.1 m) joined by a wide doorway."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gausslite_sim import furniture, prints, textures
+from gausslite_sim.items import Item, Part, placed
+from gausslite_sim.lighting import Lamp, Lighting
+from gausslite_sim.mesh import Vector, box, merged
+from gausslite_sim.textures import Texture
+
+KITCHEN_END_M, LIVING_START_M, LENGTH_M = 4.2, 4.3, 8.1
+WIDTH_M, HEIGHT_M = 4.5, 2.6
+DOORWAY_M = (1.45, 3.05)
+DOORWAY_HEIGHT_M = 2.15
+TABLE_CENTRE_M = (2.0, 2.2)
+TABLE_TOP_M = 0.74
+LIGHTING = Lighting((Lamp((2.0, 2.0, 2.45), 1.0), Lamp((6.2, 2.3, 2.45), 1.0), Lamp((0.3, 2.2, 1.6), 0.35)))
+"""A ceiling lamp in each room, and the window."""
+_WORKTOP_M = 0.885
+
+
+def paint_textures(seed: int) -> dict[str, Texture]:
+    """Every texture of the home by name."""
+    rng = np.random.default_rng([seed, 1])
+    return _materials(rng) | _pictures(rng)
+
+
+def _materials(rng: np.random.Generator) -> dict[str, Texture]:
+    """What repeats."""
+    return {
+        "oak": textures.wood(rng, (0.80, 0.58, 0.34)),
+        "walnut": textures.wood(rng, (0.46, 0.30, 0.20), 0.6),
+        "cherry": textures.wood(rng, (0.66, 0.34, 0.20), 0.5),
+        "planks": textures.planks(rng, (0.74, 0.54, 0.36)),
+        "tiles": textures.checker_tiles(rng, (0.86, 0.84, 0.78), (0.42, 0.44, 0.46)),
+        "kitchen_wall": textures.wallpaper(rng, (0.90, 0.86, 0.70), (0.80, 0.56, 0.30)),
+        "living_wall": textures.wallpaper(rng, (0.66, 0.76, 0.78), (0.30, 0.46, 0.50)),
+        "ceiling": textures.plaster(rng, (0.92, 0.92, 0.90)),
+        "plaid": textures.plaid(rng, (0.84, 0.80, 0.70), (0.70, 0.18, 0.16), (0.12, 0.20, 0.36)),
+        "sofa_cloth": textures.cloth(rng, (0.30, 0.40, 0.56)),
+        "seat_cloth": textures.cloth(rng, (0.72, 0.62, 0.46), 0.36),
+        "shade_cloth": textures.cloth(rng, (0.96, 0.86, 0.64), 0.3),
+        "worktop": textures.mottled(rng, (0.40, 0.40, 0.42), 0.7),
+        "glaze": textures.mottled(rng, (0.94, 0.93, 0.90), 0.15),
+        "paper": textures.brushed(rng, (0.90, 0.86, 0.76)),
+        "steel": textures.brushed(rng, (0.72, 0.74, 0.78)),
+        "rubber": textures.mottled(rng, (0.16, 0.16, 0.18), 0.4),
+        "terracotta": textures.mottled(rng, (0.76, 0.42, 0.28), 0.5),
+        "apple": textures.mottled(rng, (0.80, 0.20, 0.16), 0.6),
+        "orange": textures.mottled(rng, (0.96, 0.58, 0.14), 0.4),
+        "bark": textures.wood(rng, (0.44, 0.36, 0.22), 0.2),
+    }
+
+
+def _pictures(rng: np.random.Generator) -> dict[str, Texture]:
+    """What is fitted to a face."""
+    return {
+        "mug_print": prints.mug_print(rng),
+        "vase_print": prints.vase_print(rng),
+        "cover_red": prints.book_cover(rng, (0.62, 0.16, 0.16)),
+        "cover_blue": prints.book_cover(rng, (0.14, 0.26, 0.50)),
+        "cover_green": prints.book_cover(rng, (0.14, 0.38, 0.24)),
+        "book_row": prints.book_row(rng),
+        "screen": prints.television(rng),
+        "painting_1": prints.painting(rng),
+        "painting_2": prints.painting(rng),
+        "cushion": prints.rug(rng, (0.16, 0.44, 0.42)),
+        "newspaper": prints.newspaper(rng),
+        "carton": prints.carton(rng, (0.72, 0.54, 0.34), "FRAGILE"),
+        "cereal": prints.carton(rng, (0.95, 0.74, 0.18), "CRUNCH"),
+        "doors": prints.panelled(rng, (0.84, 0.72, 0.52), 2, 1),
+        "drawers": prints.panelled(rng, (0.58, 0.38, 0.24), 2, 2),
+        "door": prints.panelled(rng, (0.88, 0.84, 0.76), 1, 2),
+        "fridge": prints.fridge_front(rng),
+        "window": prints.window_view(rng),
+        "calendar": prints.calendar(rng),
+        "rug": prints.rug(rng, (0.62, 0.16, 0.14)),
+        "leaf": prints.leaf_veins(rng),
+    }
+
+
+def furnish(seed: int) -> list[Item]:
+    """Every item in the world frame (z up); the seed shifts and turns what a hand would move."""
+    rng = np.random.default_rng([seed, 2])
+    return [*_rooms(), *_dining(rng), *_kitchen(), *_living(rng)]
+
+
+def _rooms() -> list[Item]:
+    thick, far = 0.06, LENGTH_M
+    low, high = DOORWAY_M
+    middle = (KITCHEN_END_M + LIVING_START_M) / 2
+    items = []
+    for name, x0, x1, paper, floor, partition in (
+        ("kitchen", 0.0, KITCHEN_END_M, "kitchen_wall", "tiles", (KITCHEN_END_M, middle)),
+        ("living", LIVING_START_M, far, "living_wall", "planks", (middle, LIVING_START_M)),
+    ):
+        outer = (-thick, 0.0) if name == "kitchen" else (far, far + thick)
+        left, right = min(x0, partition[0], outer[0]), max(x1, partition[1], outer[1])
+        walls = [
+            box((outer[0], 0, 0), (outer[1], WIDTH_M, HEIGHT_M)),
+            box((left, -thick, 0), (right, 0, HEIGHT_M)),
+            box((left, WIDTH_M, 0), (right, WIDTH_M + thick, HEIGHT_M)),
+            box((partition[0], 0, 0), (partition[1], low, HEIGHT_M)),
+            box((partition[0], high, 0), (partition[1], WIDTH_M, HEIGHT_M)),
+            box((partition[0], low, DOORWAY_HEIGHT_M), (partition[1], high, HEIGHT_M)),
+        ]
+        items += [
+            Item(f"{name}_walls", [Part(merged(walls), paper)], is_room=True),
+            Item(f"{name}_floor", [Part(box((left, 0, -thick), (right, WIDTH_M, 0)), floor)], is_room=True),
+            Item(
+                f"{name}_ceiling",
+                [Part(box((left, 0, HEIGHT_M), (right, WIDTH_M, HEIGHT_M + thick)), "ceiling")],
+                is_room=True,
+            ),
+        ]
+    return items
+
+
+def _dining(rng: np.random.Generator) -> list[Item]:
+    """The table, what stands on it and the chairs round it."""
+    x, y = TABLE_CENTRE_M
+
+    def on_table(name: str, parts: list[Part], dx: float, dy: float, yaw_deg: float) -> Item:
+        shift = rng.uniform(-0.03, 0.03, 2)
+        position = (x + dx + shift[0], y + dy + shift[1], TABLE_TOP_M)
+        return _placed(name, parts, position, yaw_deg + rng.uniform(-15, 15))
+
+    items = [_placed("table", furniture.table(), (x, y, 0), 0)]
+    for name, dx, dy, yaw_deg in (
+        ("chair_1", -0.32, -0.62, 180),
+        ("chair_2", 0.36, 0.64, 0),
+        ("chair_3", 0.92, -0.1, -90),
+    ):
+        shift = rng.uniform(-0.03, 0.03, 2)
+        turn = yaw_deg + rng.uniform(-10, 10)
+        items.append(_placed(name, furniture.chair(), (x + dx + shift[0], y + dy + shift[1], 0), turn))
+    return [
+        *items,
+        on_table("mug", furniture.mug(), 0.34, -0.20, -60),
+        on_table("vase", furniture.vase(), -0.22, 0.18, 0),
+        on_table("books", furniture.books(), -0.42, -0.18, 10),
+        on_table("bowl", furniture.bowl(), 0.12, 0.14, 0),
+        on_table("newspaper", furniture.lying_sheet("newspaper", 0.3, 0.36, 0.004), 0.5, 0.18, 20),
+    ]
+
+
+def _kitchen() -> list[Item]:
+    back = WIDTH_M
+    return [
+        _placed("fridge", furniture.cupboard((0.62, 0.62, 1.75), "fridge", "steel"), (0.33, back, 0), 0),
+        _placed("counter", furniture.cupboard((2.4, 0.58, 0.85), "doors", "oak", 3, "worktop"), (1.9, back, 0), 0),
+        _placed("cupboard", furniture.cupboard((1.8, 0.34, 0.62), "doors", "oak", 2), (1.6, back, 1.5), 0),
+        _placed("kettle", furniture.kettle(), (1.2, back - 0.3, _WORKTOP_M), 30),
+        _placed("cereal", furniture.carton("cereal", 0.2, 0.07, 0.3), (1.75, back - 0.25, _WORKTOP_M), 12),
+        _placed("mug_2", furniture.mug(), (2.25, back - 0.36, _WORKTOP_M), 200),
+        _placed("window", furniture.flat_picture("window", 1.3, 1.1, 0.05), (0, 2.2, 1.0), 90),
+        _placed("door", furniture.flat_picture("door", 0.85, 2.05), (0.9, 0, 0), 180),
+        _placed("calendar", furniture.flat_picture("calendar", 0.42, 0.55, 0.008), (2.0, 0, 1.25), 180),
+        _placed("picture_1", furniture.flat_picture("painting_1", 0.7, 0.7), (3.1, 0, 1.2), 180),
+    ]
+
+
+def _living(rng: np.random.Generator) -> list[Item]:
+    back = WIDTH_M
+    return [
+        _placed("sofa", furniture.sofa(), (6.3, 0.46, 0), 180),
+        _placed("picture_2", furniture.flat_picture("painting_2", 0.9, 0.9), (6.3, 0, 1.15), 180),
+        _placed("rug", furniture.lying_sheet("rug", 2.0, 1.5, 0.008), (6.3, 2.0, 0), 0),
+        _placed("stool", furniture.stool(), (6.9 + rng.uniform(-0.05, 0.05), 1.6, 0.008), 20),
+        _placed("cabinet", furniture.cupboard((1.5, 0.42, 0.52), "drawers", "walnut", 2, "walnut"), (6.3, back, 0), 0),
+        _placed("tv", furniture.television(), (6.3, back - 0.2, 0.555), 0),
+        _placed("shelf", furniture.shelf(), (LENGTH_M, 2.2, 0), -90),
+        _placed("plant", furniture.plant(), (7.65, 4.05, 0), 0),
+        _placed("lamp", furniture.lamp(), (7.7, 0.42, 0), 0),
+        _placed("chair_4", furniture.chair(), (4.95, 3.75, 0), 35 + rng.uniform(-10, 10)),
+        _placed("box", furniture.carton("carton", 0.5, 0.4, 0.36), (4.75, 0.55, 0), 15),
+    ]
+
+
+def _placed(name: str, parts: list[Part], position_m: Vector, yaw_deg: float) -> Item:
+    return Item(name, placed(parts, position_m, yaw_deg))

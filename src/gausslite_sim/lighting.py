@@ -1,0 +1,135 @@
+"""The light of a home, fixed and the same from every side: lamps with soft shadows, dark corners, coloured bounce."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Bool, Float32, Float64, Int64
+from numpy import ndarray
+
+from gausslite_sim.mesh import Mesh, Vector
+from gausslite_sim.textures import Colour
+
+_LAMP_RADIUS_M = 0.25
+_LAMP_RAYS = 6
+_SKY_RAYS = 24
+_SKY_REACH_M = 1.0
+_LAMP_SHARE = 0.85
+_FALLOFF_PER_M2 = 0.06
+_LIFT_M = 2e-3
+_BRIGHTNESS = (0.08, 1.2)
+_BOUNCES = 2
+
+
+@dataclass(frozen=True, slots=True)
+class Lamp:
+    """A lamp of some size, or a window seen as one."""
+
+    position_m: Vector
+    strength: float
+    colour: Colour = (1.0, 1.0, 1.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Lighting:
+    """The lamps, the light that comes from everywhere, and the share of its light that a surface hands on."""
+
+    lamps: tuple[Lamp, ...]
+    ambient: float = 0.62
+    bounce: float = 0.0
+
+
+@runtime_checkable
+class Surroundings(Protocol):
+    """What light needs to know of the things it falls on."""
+
+    def occluded(
+        self, origins_m: Float32[ndarray, "r 3"], directions: Float32[ndarray, "r 3"], reach: float
+    ) -> Bool[ndarray, " r"]:
+        """Whether something lies within `reach` lengths of the direction."""
+        ...
+
+    def first_triangle(
+        self, origins_m: Float32[ndarray, "r 3"], directions: Float32[ndarray, "r 3"]
+    ) -> Int64[ndarray, " r"]:
+        """The first triangle along each ray, -1 where there is none."""
+        ...
+
+
+def vertex_light(
+    mesh: Mesh, albedo: Float64[ndarray, "m 3"], around: Surroundings, lighting: Lighting, seed: int
+) -> Float32[ndarray, "n 3"]:
+    """Brightness of each vertex, about 1 on a table under a lamp; albedo is each triangle's mean colour, 0 to 1."""
+    rng = np.random.default_rng([seed, 3])
+    normals = mesh.normals
+    origins = (mesh.positions_m + _LIFT_M * normals).astype(np.float32)
+    light = np.repeat(lighting.ambient * _openness(origins, normals, around, rng)[:, None], 3, axis=1)
+    for lamp in lighting.lamps:
+        shade = _lamp(origins, normals, np.array(lamp.position_m), around, rng)
+        light += _LAMP_SHARE * lamp.strength * np.multiply.outer(shade, lamp.colour)
+    if lighting.bounce > 0:
+        light += lighting.bounce * _bounced(light, albedo, mesh, _seen(origins, normals, around, rng))
+    return np.clip(light, *_BRIGHTNESS).astype(np.float32)
+
+
+def _openness(
+    origins: Float32[ndarray, "n 3"], normals: Float64[ndarray, "n 3"], around: Surroundings, rng: np.random.Generator
+) -> Float64[ndarray, " n"]:
+    """Share of the half space round the normal, weighted by cosine, that is free for a metre."""
+    n = len(origins)
+    directions = _cosine_directions(normals, rng)
+    hidden = around.occluded(np.repeat(origins, _SKY_RAYS, axis=0), directions, _SKY_REACH_M)
+    return np.asarray(1.0 - hidden.reshape(n, _SKY_RAYS).mean(axis=1))
+
+
+def _seen(
+    origins: Float32[ndarray, "n 3"], normals: Float64[ndarray, "n 3"], around: Surroundings, rng: np.random.Generator
+) -> Int64[ndarray, "n k"]:
+    """Triangles that each vertex sees in random directions, -1 for none."""
+    directions = _cosine_directions(normals, rng)
+    seen: Int64[ndarray, "n k"] = around.first_triangle(np.repeat(origins, _SKY_RAYS, axis=0), directions).reshape(
+        -1, _SKY_RAYS
+    )
+    return seen
+
+
+def _bounced(
+    light: Float64[ndarray, "n 3"], albedo: Float64[ndarray, "m 3"], mesh: Mesh, seen: Int64[ndarray, "n k"]
+) -> Float64[ndarray, "n 3"]:
+    """What each vertex gets from the surfaces it sees, once and then again."""
+    gathered = np.zeros_like(light)
+    for _ in range(_BOUNCES):
+        sent = albedo * (light + gathered)[mesh.faces].mean(axis=1)
+        sent = np.concatenate([sent, np.zeros((1, 3))])  # where a ray leaves the home (-1) nothing comes back
+        gathered = np.mean([sent[column] for column in seen.T], axis=0)
+    return gathered
+
+
+def _cosine_directions(normals: Float64[ndarray, "n 3"], rng: np.random.Generator) -> Float32[ndarray, "r 3"]:
+    """_SKY_RAYS unit directions a vertex, spread by the cosine to its normal."""
+    points = rng.standard_normal((len(normals), _SKY_RAYS, 3))
+    points /= np.linalg.norm(points, axis=2, keepdims=True)
+    # a point on the unit sphere that touches the surface from outside is spread by the cosine
+    directions = (points + 1.001 * normals[:, None, :]).reshape(-1, 3)
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    return directions.astype(np.float32)
+
+
+def _lamp(
+    origins: Float32[ndarray, "n 3"],
+    normals: Float64[ndarray, "n 3"],
+    position_m: Float64[ndarray, "3"],
+    around: Surroundings,
+    rng: np.random.Generator,
+) -> Float64[ndarray, " n"]:
+    """Lambert's law for a lamp of some size, so that its shadows have soft edges."""
+    n = len(origins)
+    spots = position_m + _LAMP_RADIUS_M * rng.uniform(-1, 1, (n, _LAMP_RAYS, 3)) * (1, 1, 0.2)
+    towards = spots - origins[:, None, :]
+    squared = np.square(towards).sum(axis=2)
+    cosine = np.clip((towards * normals[:, None, :]).sum(axis=2) / np.sqrt(squared), 0, 1)
+    rays = towards.reshape(-1, 3).astype(np.float32)
+    hidden = around.occluded(np.repeat(origins, _LAMP_RAYS, axis=0), rays, 0.98).reshape(n, _LAMP_RAYS)
+    return np.asarray((cosine / (1 + _FALLOFF_PER_M2 * squared) * ~hidden).mean(axis=1))

@@ -1,0 +1,137 @@
+"""A home as one triangle soup in a ray caster, with what each triangle looks like and belongs to."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float32, Float64, Int64
+from numpy import ndarray
+from numpy.typing import NDArray
+
+from gausslite.errors import DatasetError
+from gausslite_sim.atlas import TextureAtlas
+from gausslite_sim.lighting import vertex_light
+from gausslite_sim.mesh import merged
+from gausslite_sim.plan import HomePlan
+from gausslite_sim.textures import SIDE_PX
+
+NOTHING = -1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Triangles:
+    """Per triangle: texture coordinates, light and normals of its corners, its own unit normal, texture, item, gloss
+    and texels per metre.
+    """
+
+    uv: Float32[ndarray, "m 3 2"]
+    light: Float32[ndarray, "m 3 3"]
+    corner_normals: Float32[ndarray, "m 3 3"]
+    normal: Float32[ndarray, "m 3"]
+    texture: Int64[ndarray, " m"]
+    item: Int64[ndarray, " m"]
+    gloss: Float32[ndarray, " m"]
+    texels_per_m: Float32[ndarray, " m"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Hits:
+    """Where rays end: triangle (NOTHING if none), its barycentric coordinates, and the lengths along the directions."""
+
+    triangle: Int64[ndarray, " r"]
+    barycentric: Float32[ndarray, "r 2"]
+    distance: Float32[ndarray, " r"]
+
+
+class HomeScene:
+    """Owns the ray caster and the tables of one home. Raises DatasetError without the extra `sim`."""
+
+    def __init__(self, plan: HomePlan) -> None:
+        new_caster = _ray_caster()
+        items, textures = plan.items, plan.textures
+        texture_ids = {name: i for i, name in enumerate(textures)}
+        self.lamps = plan.lighting.lamps
+        self.names = tuple(item.name for item in items)
+        self.object_names = tuple(item.name for item in items if not item.is_room)
+        self.atlas = TextureAtlas(list(textures.values()))
+        parts = [(i, part) for i, item in enumerate(items) for part in item.parts]
+        whole = merged([part.mesh for _, part in parts])
+        counts = [len(part.mesh.faces) for _, part in parts]
+        repeats_m = np.repeat([textures[part.texture].repeat_m or 1.0 for _, part in parts], counts)
+        corners_m = whole.positions_m[whole.faces]
+        uv = whole.uv[whole.faces] / repeats_m[:, None, None]
+        texture = np.repeat([texture_ids[part.texture] for _, part in parts], counts)
+        albedo = np.array([each.rgb.mean(axis=(0, 1)) / 255.0 for each in textures.values()])
+        self._embree = new_caster(corners_m.astype(np.float32))
+        light = vertex_light(whole, albedo[texture], self, plan.lighting, plan.seed)
+        self.triangles = Triangles(
+            uv=uv.astype(np.float32),
+            light=light[whole.faces],
+            corner_normals=whole.normals[whole.faces].astype(np.float32),
+            normal=_unit_normals(corners_m),
+            texture=texture,
+            item=np.repeat([i for i, _ in parts], counts),
+            gloss=np.array([each.gloss for each in textures.values()], np.float32)[texture],
+            texels_per_m=_texels_per_m(corners_m, uv),
+        )
+
+    def cast(self, origins_m: Float32[ndarray, "r 3"], directions: Float32[ndarray, "r 3"]) -> Hits:
+        """The first surface along each ray."""
+        result = self._embree.run(origins_m, directions, output=True)
+        barycentric = np.stack([result["u"], result["v"]], axis=1)
+        return Hits(result["primID"].astype(np.int64), barycentric, result["tfar"])
+
+    def first_triangle(
+        self, origins_m: Float32[ndarray, "r 3"], directions: Float32[ndarray, "r 3"]
+    ) -> Int64[ndarray, " r"]:
+        """The first triangle along each ray, NOTHING where there is none."""
+        return np.asarray(self._embree.run(origins_m, directions), np.int64)
+
+    def occluded(
+        self, origins_m: Float32[ndarray, "r 3"], directions: Float32[ndarray, "r 3"], reach: float
+    ) -> Bool[ndarray, " r"]:
+        """Whether something lies within `reach` lengths of the direction."""
+        reaches = np.full(len(origins_m), reach, np.float32)
+        free = self._embree.run(origins_m, directions, dists=reaches, query="OCCLUDED")
+        return np.asarray(free >= 0)
+
+
+def require_ray_caster() -> None:
+    """Raises DatasetError without the extra `sim`; asked for first, so that it is told before a home is built."""
+    _ray_caster()
+
+
+def _ray_caster() -> Callable[[Float32[ndarray, "m 3 3"]], Any]:
+    """What makes a ray caster of triangles. Raises DatasetError."""
+    try:
+        from embreex.mesh_construction import TriangleMesh
+        from embreex.rtcore_scene import EmbreeScene
+    except ImportError:
+        raise DatasetError(
+            "sim:home: the simulated home needs the extra `sim`; install it with: pip install 'gausslite[sim]'"
+        ) from None
+
+    def new_caster(corners_m: Float32[ndarray, "m 3 3"]) -> Any:
+        caster = EmbreeScene()
+        TriangleMesh(caster, corners_m)
+        return caster
+
+    return new_caster
+
+
+def _unit_normals(corners_m: Float64[ndarray, "m 3 3"]) -> Float32[ndarray, "m 3"]:
+    normals = np.cross(corners_m[:, 1] - corners_m[:, 0], corners_m[:, 2] - corners_m[:, 0])
+    length = np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    return np.asarray(normals / length, np.float32)
+
+
+def _texels_per_m(corners_m: Float64[ndarray, "m 3 3"], uv: Float64[ndarray, "m 3 2"]) -> Float32[ndarray, " m"]:
+    """How finely a triangle is textured, from its areas on the picture and in the world."""
+    a, b = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
+    on_picture = np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
+    in_world = np.linalg.norm(np.cross(corners_m[:, 1] - corners_m[:, 0], corners_m[:, 2] - corners_m[:, 0]), axis=1)
+    ratio: NDArray[np.float64] = SIDE_PX * np.sqrt(on_picture / np.maximum(in_world, 1e-12))
+    return ratio.astype(np.float32)

@@ -1,0 +1,98 @@
+"""The colour of a surface where a ray meets it: texture times light, and what a glossy one mirrors."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float32, Int64
+from numpy import ndarray
+
+from gausslite_sim.scene import NOTHING, Hits, HomeScene
+
+_WHITE = 255.0
+_LIFT_M = 3e-3
+_HEAD_ON = 0.35
+"""Of what a surface mirrors at a grazing view, the share that it mirrors head-on (Schlick 1994)."""
+_BLUR_PER_M = 0.06
+"""Width of a mirrored pixel per metre of the way: polished, not silvered."""
+_HIGHLIGHT_EXPONENT = 90.0
+_HIGHLIGHT = 2.5
+
+
+def facing_of(scene: HomeScene, hits: Hits, directions: Float32[ndarray, "n 3"]) -> Float32[ndarray, " n"]:
+    """|cos| of the angle between ray and surface."""
+    along = np.einsum("nc,nc->n", directions, scene.triangles.normal[hits.triangle])
+    facing: Float32[ndarray, " n"] = np.abs(along) / np.sqrt(np.einsum("nc,nc->n", directions, directions))
+    return facing
+
+
+def matt_colour(scene: HomeScene, hits: Hits, pixel_m: Float32[ndarray, " n"]) -> Float32[ndarray, "n 3"]:
+    """Texture times light, 0 to 255, of pixels this wide on the surface; black where nothing is hit."""
+    table, triangle = scene.triangles, hits.triangle
+    weights = _corner_weights(hits)
+    uv = np.einsum("nk,nkc->nc", weights, table.uv[triangle])
+    light = np.einsum("nk,nkc->nc", weights, table.light[triangle])
+    rgb = scene.atlas.sample(table.texture[triangle], uv, pixel_m * table.texels_per_m[triangle])
+    rgb *= light * (triangle != NOTHING)[:, None]
+    return rgb
+
+
+def add_reflections(
+    scene: HomeScene,
+    rgb: Float32[ndarray, "n 3"],
+    hits: Hits,
+    directions: Float32[ndarray, "n 3"],
+    eye_m: Float32[ndarray, "3"],
+    mirror: float,
+) -> None:
+    """Mix into the glossy hits' colours, in place, what they mirror of the home and its lamps."""
+    triangle = hits.triangle
+    glossy = np.flatnonzero((triangle != NOTHING) & (scene.triangles.gloss[triangle] > 0))
+    if len(glossy) == 0:
+        return
+    towards = directions[glossy] / np.linalg.norm(directions[glossy], axis=1, keepdims=True)
+    normals = _smooth_normals(scene, hits, glossy, towards)
+    cosine = -np.einsum("nc,nc->n", towards, normals)
+    mirrored = towards + 2 * cosine[:, None] * normals
+    points = eye_m + hits.distance[glossy, None] * directions[glossy] + np.float32(_LIFT_M) * normals
+    strength = np.float32(mirror) * scene.triangles.gloss[triangle[glossy]]
+    share = strength * (_HEAD_ON + (1 - _HEAD_ON) * (1 - np.clip(cosine, 0, 1)) ** 5)
+    there = scene.cast(np.ascontiguousarray(points, np.float32), np.ascontiguousarray(mirrored, np.float32))
+    seen = matt_colour(scene, there, np.float32(_BLUR_PER_M) * np.minimum(there.distance, 10.0))
+    rgb[glossy] += share[:, None] * (seen - rgb[glossy])
+    rgb[glossy] += strength[:, None] * _highlights(scene, points, mirrored)
+
+
+def _highlights(
+    scene: HomeScene, points_m: Float32[ndarray, "n 3"], mirrored: Float32[ndarray, "n 3"]
+) -> Float32[ndarray, "n 3"]:
+    """The lamps that the mirrored rays nearly meet and nothing hides, as soft spots (Phong 1975)."""
+    spots = np.zeros_like(points_m)
+    for lamp in scene.lamps:
+        to_lamp = np.asarray(lamp.position_m, np.float32) - points_m
+        along = np.einsum("nc,nc->n", to_lamp, mirrored) / np.linalg.norm(to_lamp, axis=1)
+        spot = np.clip(along, 0, 1) ** _HIGHLIGHT_EXPONENT
+        bright = np.flatnonzero(spot > 0.01)
+        hidden = scene.occluded(np.ascontiguousarray(points_m[bright]), np.ascontiguousarray(to_lamp[bright]), 0.95)
+        bright = bright[~hidden]
+        colour = _HIGHLIGHT * lamp.strength * _WHITE * np.asarray(lamp.colour, np.float32)
+        spots[bright] += spot[bright, None] * colour
+    return spots
+
+
+def _smooth_normals(
+    scene: HomeScene, hits: Hits, chosen: Int64[ndarray, " n"], towards: Float32[ndarray, "n 3"]
+) -> Float32[ndarray, "n 3"]:
+    """The normals of the corners, mixed at the hit and turned against the ray."""
+    weights = _corner_weights(hits)[chosen]
+    normals = np.einsum("nk,nkc->nc", weights, scene.triangles.corner_normals[hits.triangle[chosen]])
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-6)
+    facing_away = np.einsum("nc,nc->n", normals, towards) > 0
+    turned: Float32[ndarray, "n 3"] = np.where(facing_away[:, None], -normals, normals)
+    return turned
+
+
+def _corner_weights(hits: Hits) -> Float32[ndarray, "n 3"]:
+    weights = np.empty((len(hits.triangle), 3), np.float32)
+    weights[:, 1:] = hits.barycentric
+    weights[:, 0] = 1.0 - weights[:, 1] - weights[:, 2]
+    return weights

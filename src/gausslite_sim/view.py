@@ -1,0 +1,130 @@
+"""Draw the home from a camera: exact depth, exact items, colour smoothed at the edges of things."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float32, Float64, Int64
+from numpy import ndarray
+
+from gausslite.domain.camera import Camera
+from gausslite_sim.scene import NOTHING, Hits, HomeScene
+from gausslite_sim.shading import add_reflections, facing_of, matt_colour
+
+_SUBSAMPLES = np.array([(-0.125, -0.375), (0.375, -0.125), (0.125, 0.375), (-0.375, 0.125)], np.float32)
+"""Offsets from a pixel's centre, in pixels, of the rays that smooth an edge."""
+_STEP = 0.03
+"""Neighbours whose depths differ by more than this share lie on different surfaces."""
+_CREASE = 0.1
+"""And those whose angles of incidence differ by more than this cosine, on different faces."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class View:
+    """What a perfect camera sees. item indexes HomeScene.names (NOTHING outside); facing is |cos| of the incidence;
+    gloss is the share that the surface mirrors.
+    """
+
+    rgb: Float32[ndarray, "h w 3"]
+    depth_m: Float32[ndarray, "h w"]
+    item: Int64[ndarray, "h w"]
+    facing: Float32[ndarray, "h w"]
+    gloss: Float32[ndarray, "h w"]
+
+
+def draw(scene: HomeScene, camera: Camera, T_world_camera: Float64[ndarray, "4 4"], mirror: float = 1.0) -> View:
+    """Render one view; colours 0 to 255. Depth is that of the ray through the pixel's centre.
+
+    mirror scales what glossy surfaces mirror; 0 makes all of them matt.
+    """
+    shape = (camera.height_px, camera.width_px)
+    columns, rows = _pixel_centres(camera)
+    directions = _directions(columns, rows, camera, T_world_camera)
+    hits = _cast_from(scene, directions, T_world_camera)
+    depth_m = _depth(hits)
+    rgb, facing = _shade(scene, hits, directions, camera, T_world_camera, mirror)
+    item = np.where(hits.triangle == NOTHING, NOTHING, scene.triangles.item[hits.triangle])
+    texture = scene.triangles.texture[hits.triangle]
+    edge = np.flatnonzero(_edges(*(image.reshape(shape) for image in (item, texture, depth_m, facing))))
+    if len(edge):
+        fine_columns = (columns[edge, None] + _SUBSAMPLES[:, 0]).ravel()
+        fine_rows = (rows[edge, None] + _SUBSAMPLES[:, 1]).ravel()
+        fine = _directions(fine_columns, fine_rows, camera, T_world_camera)
+        fine_rgb, _ = _shade(scene, _cast_from(scene, fine, T_world_camera), fine, camera, T_world_camera, mirror)
+        rgb[edge] = fine_rgb.reshape(-1, len(_SUBSAMPLES), 3).mean(axis=1)
+    gloss = mirror * np.where(hits.triangle == NOTHING, np.float32(0), scene.triangles.gloss[hits.triangle])
+    return View(rgb.reshape(*shape, 3), *(image.reshape(shape) for image in (depth_m, item, facing, gloss)))
+
+
+def items_seen(scene: HomeScene, camera: Camera, T_world_camera: Float64[ndarray, "4 4"]) -> Int64[ndarray, "h w"]:
+    """The item in each pixel, exactly."""
+    directions = _directions(*_pixel_centres(camera), camera, T_world_camera)
+    triangle = _cast_from(scene, directions, T_world_camera).triangle
+    item: Int64[ndarray, " n"] = np.where(triangle == NOTHING, NOTHING, scene.triangles.item[triangle])
+    return item.reshape(camera.height_px, camera.width_px)
+
+
+def _pixel_centres(camera: Camera) -> tuple[Float32[ndarray, " n"], Float32[ndarray, " n"]]:
+    rows, columns = np.divmod(np.arange(camera.height_px * camera.width_px), camera.width_px)
+    return columns.astype(np.float32) + np.float32(0.5), rows.astype(np.float32) + np.float32(0.5)
+
+
+def _directions(
+    columns: Float32[ndarray, " n"],
+    rows: Float32[ndarray, " n"],
+    camera: Camera,
+    T_world_camera: Float64[ndarray, "4 4"],
+) -> Float32[ndarray, "n 3"]:
+    """Rays one metre long along the optical axis, so that a length along them is a depth."""
+    x = (columns - np.float32(camera.cx_px)) / np.float32(camera.fx_px)
+    y = (rows - np.float32(camera.cy_px)) / np.float32(camera.fy_px)
+    R = T_world_camera[:3, :3].astype(np.float32)
+    # not a matrix product: its rounding may depend on the number of rays and of cores
+    directions: Float32[ndarray, "n 3"] = np.stack([R[k, 0] * x + R[k, 1] * y + R[k, 2] for k in range(3)], axis=1)
+    return directions
+
+
+def _cast_from(scene: HomeScene, directions: Float32[ndarray, "n 3"], T_world_camera: Float64[ndarray, "4 4"]) -> Hits:
+    eye = np.broadcast_to(T_world_camera[:3, 3].astype(np.float32), directions.shape)
+    return scene.cast(np.ascontiguousarray(eye), directions)
+
+
+def _depth(hits: Hits) -> Float32[ndarray, " n"]:
+    depth_m: Float32[ndarray, " n"] = np.where(hits.triangle == NOTHING, np.float32(0), hits.distance)
+    return depth_m
+
+
+def _shade(
+    scene: HomeScene,
+    hits: Hits,
+    directions: Float32[ndarray, "n 3"],
+    camera: Camera,
+    T_world_camera: Float64[ndarray, "4 4"],
+    mirror: float,
+) -> tuple[Float32[ndarray, "n 3"], Float32[ndarray, " n"]]:
+    """Colour times light at each hit, and how squarely the ray meets the surface; black where nothing is hit."""
+    facing = facing_of(scene, hits, directions)
+    # between the footprint across the slope and the one along it
+    pixel_m = hits.distance / np.float32(camera.fx_px) / np.sqrt(np.maximum(facing, 0.05))
+    rgb = matt_colour(scene, hits, pixel_m)
+    if mirror > 0:
+        add_reflections(scene, rgb, hits, directions, T_world_camera[:3, 3].astype(np.float32), mirror)
+    return rgb, facing
+
+
+def _edges(
+    item: Int64[ndarray, "h w"],
+    texture: Int64[ndarray, "h w"],
+    depth_m: Float32[ndarray, "h w"],
+    facing: Float32[ndarray, "h w"],
+) -> Bool[ndarray, "h w"]:
+    """Pixels next to another item, another surface or a crease."""
+    edge = np.zeros(item.shape, np.bool_)
+    for a, b in (((slice(None), slice(1, None)), (slice(None), slice(-1))), ((slice(1, None),), (slice(-1),))):
+        differs = (item[a] != item[b]) | (texture[a] != texture[b])
+        differs |= np.abs(depth_m[a] - depth_m[b]) > _STEP * depth_m[a]
+        differs |= np.abs(facing[a] - facing[b]) > _CREASE
+        edge[a] |= differs
+        edge[b] |= differs
+    return edge

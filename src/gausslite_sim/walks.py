@@ -1,0 +1,53 @@
+"""Walks through a home: smooth curves through places and what is looked at from there."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from jaxtyping import Float64
+from numpy import ndarray
+
+from gausslite_sim.mesh import Vector
+
+Walk = Callable[[int], Float64[ndarray, "n 4 4"]]
+"""T_world_camera of this many frames, evenly spread over the walk (z up; OpenCV camera axes, no roll)."""
+Key = tuple[Vector, Vector]
+"""(eye, looked at) in metres."""
+
+
+def walk_through(keys: Sequence[Key]) -> Walk:
+    """The walk from the first of these places to the last."""
+    places = np.array(keys)
+
+    def poses(frames: int) -> Float64[ndarray, "n 4 4"]:
+        share = np.linspace(0.0, 1.0, frames) if frames > 1 else np.array([0.5])
+        return looking(_curve(places[:, 0], share), _curve(places[:, 1], share))
+
+    return poses
+
+
+def looking(eyes_m: Float64[ndarray, "n 3"], targets_m: Float64[ndarray, "n 3"]) -> Float64[ndarray, "n 4 4"]:
+    """T_world_camera of cameras at the eyes that look at the targets."""
+    return np.stack([_look_at(eye, target) for eye, target in zip(eyes_m, targets_m, strict=True)])
+
+
+def _curve(keys: Float64[ndarray, "k 3"], share: Float64[ndarray, " n"]) -> Float64[ndarray, "n 3"]:
+    """The Catmull-Rom spline through the keys at these shares of its way."""
+    padded = np.concatenate([2 * keys[:1] - keys[1:2], keys, 2 * keys[-1:] - keys[-2:-1]])
+    place = share * (len(keys) - 1)
+    i = np.minimum(place.astype(np.int64), len(keys) - 2)
+    t = (place - i)[:, None]
+    p0, p1, p2, p3 = (padded[i + k] for k in range(4))
+    bent = 2 * p1 + (p2 - p0) * t + (2 * p0 - 5 * p1 + 4 * p2 - p3) * t**2 + (3 * p1 - p0 - 3 * p2 + p3) * t**3
+    return np.asarray(0.5 * bent)
+
+
+def _look_at(eye_m: Float64[ndarray, "3"], target_m: Float64[ndarray, "3"]) -> Float64[ndarray, "4 4"]:
+    forward = (target_m - eye_m) / np.linalg.norm(target_m - eye_m)
+    right = np.cross(forward, (0.0, 0.0, 1.0))
+    right /= np.linalg.norm(right)
+    T = np.eye(4)
+    T[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
+    T[:3, 3] = eye_m
+    return T

@@ -1,0 +1,94 @@
+"""The GPU's benchmark on tiny cases over the stand-in: what it measures and prints, never how long it took."""
+
+from __future__ import annotations
+
+import inspect
+import json
+from typing import Any
+
+import pytest
+
+from gausslite.cli.main import main
+from gausslite.errors import InvalidInputError
+from gausslite.render.rasterizer import LossWeights
+from gausslite_bench.cli.gpu import frame_lines, gpu_record, rate_heading, rate_line
+from gausslite_bench.raster.gpu import GpuBench
+from gausslite_bench.raster.scene import held_view, seed_rows
+from gausslite_bench.raster.step import RESTING
+
+pytest.importorskip("torch", reason="torch is not installed")
+pytest.importorskip("gsplat", reason="gsplat is not installed; pip install gausslite[cuda]")
+
+import gsplat
+import torch
+
+from gausslite.render.cuda import CudaRasterizer
+from gausslite.render.cuda.kernels import TorchKernels
+from gausslite.render.cuda.plain import PlainTraining
+from gausslite.render.cuda.projection import Lens, project
+
+torch.set_num_threads(1)
+SIZE = (48, 32)
+
+
+def rasterization(*args: Any, **options: Any) -> tuple[torch.Tensor, torch.Tensor, dict[str, Any]]:
+    """gsplat.rasterization by its own signature, over the stand-in's operations: one view, all splats before it."""
+    asked = inspect.signature(gsplat.rasterization).bind(*args, **options).arguments
+    quats, logits = asked["quats"], asked["opacities"].logit()[:, None]
+    columns = [asked["means"], asked["scales"].log(), quats, logits, asked["colors"], torch.zeros_like(quats[:, :2])]
+    kernels, size = TorchKernels(), (asked["width"], asked["height"])
+    lens = Lens.of(held_view(*size).camera, kernels.device)
+    rows = torch.cat(columns, dim=1)
+    channels, alpha = kernels.composite(project(kernels, rows, lens, asked["viewmats"][0]), size, None)
+    return channels[None], alpha[None, ..., None], {}
+
+
+@pytest.fixture(scope="module")
+def bench() -> GpuBench:
+    return GpuBench(
+        CudaRasterizer("cpu"),
+        gaussians=(60, 90),
+        frame_gaussians=80,
+        size=SIZE,
+        repetitions=1,
+        frames=1,
+        rasterization=rasterization,
+    )
+
+
+def test_every_size_of_map_is_measured_and_a_whole_frame(bench: GpuBench) -> None:
+    rates, frame = list(bench.rates()), bench.frame()
+    assert [rate.gaussians for rate in rates] == [60, 90]
+    for rate in rates:
+        assert set(rate.best) == set(rate.median) == {"whole", "region", "gsplat"}
+        assert all(rate.best[name] >= rate.median[name] > 0 for name in rate.best)
+        assert str(rate.gaussians) in rate_line(rate)
+    assert frame.iterations == 8
+    assert {"seeding", "warm_up", "active", "pruning", "densifying"} <= set(frame.steps_ms)
+    record = json.loads(json.dumps(gpu_record("a device", rates, frame)))
+    assert [case["gaussians"] for case in record["rates"]] == [60, 90]
+    assert "the paper allows 500" in frame_lines(frame)
+    assert "48x32" in rate_heading("a device", bench)
+
+
+def test_gsplat_called_plainly_has_the_loss_of_our_step() -> None:
+    rasterizer, view, loss = CudaRasterizer("cpu"), held_view(*SIZE), LossWeights()
+    prepared = rasterizer.prepare_view(view.rgb, view.depth_m, view.camera)
+    rows = seed_rows(60)
+    step = rasterizer.step(rows, rows * 0, rows * 0, prepared, view.T_camera_world, loss, RESTING)
+    plain = PlainTraining(rows[step.visible], prepared, view.T_camera_world, loss, rasterization)
+    assert plain.train(2) == pytest.approx(step.loss, rel=1e-5)
+
+
+def test_no_repetitions_are_refused() -> None:
+    with pytest.raises(InvalidInputError, match="repetitions: expected 1 to 100000, got 0"):
+        GpuBench(CudaRasterizer("cpu"), repetitions=0)
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has a GPU")
+def test_without_a_gpu_the_command_says_so_in_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["bench", "gpu"]) == 2
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert said.err.count("\n") == 1
+    assert "expected a CUDA device" in said.err

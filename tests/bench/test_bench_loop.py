@@ -1,0 +1,83 @@
+"""The loop's benchmark on a few small frames: what it counts and prints, never how long it took."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from gausslite.cli.main import main
+from gausslite.errors import DatasetError
+from gausslite.mapping.frame_scheduler import FrameTiming, SkippableStage, Stage
+from gausslite_bench.loop.bench import CostLog, FrameCost, Latency, LoopTiming
+
+SMALL = ("--size", "96x72", "--max-gaussians", "1500", "--threads", "1")
+
+
+def cost(perception_s: float, iterations: int) -> FrameCost:
+    steps_s = {Stage.ATTENTION: perception_s, Stage.SEEDING: 0.03, Stage.WORDS: 0.01}
+    budget = FrameTiming(sum(steps_s.values()), steps_s, frozenset({SkippableStage.SEEDING}), short=iterations < 5)
+    return FrameCost(budget, iterations, gaussians=100 * iterations, roi_share=0.5)
+
+
+def test_percentiles_of_equal_times_are_that_time() -> None:
+    latency = Latency.of([0.25] * 7)
+    assert (latency.p50_ms, latency.p90_ms, latency.p99_ms, latency.max_ms) == pytest.approx((250.0,) * 4)
+
+
+def test_hz_is_frames_by_the_sum_of_their_latencies() -> None:
+    timing = LoopTiming.of([cost(0.06, 4), cost(0.26, 8)])
+    assert timing.hz == pytest.approx(2 / 0.4)
+    assert (timing.iterations_mean, timing.iterations_min, timing.gaussians) == (6.0, 4, 800)
+    assert timing.latency.max_ms == pytest.approx(300.0)
+    assert timing.mapping.max_ms == pytest.approx(30.0)
+
+
+def test_steps_reliefs_and_short_frames_are_counted() -> None:
+    timing = LoopTiming.of([cost(0.06, 4), cost(0.26, 8)])
+    assert timing.steps["seeding"].p50_ms == pytest.approx(30.0)
+    assert timing.steps["drawing"].max_ms == 0.0
+    assert timing.reliefs == {"words": 0, "seeding": 2}
+    assert timing.frames_short == 1
+
+
+def test_the_log_gives_back_what_it_was_told() -> None:
+    log, told = CostLog(), [cost(0.06, 4), cost(0.26, 8), cost(0.1, 0)]
+    for each in told:
+        log.append(each)
+    assert log.costs() == told
+    assert CostLog().costs() == []
+
+
+def test_no_mapped_frame_is_an_error() -> None:
+    with pytest.raises(DatasetError, match="at least one frame with depth"):
+        LoopTiming.of([])
+
+
+@pytest.mark.parametrize("budget", [("--iterations", "2"), ("--rate", "200")])
+def test_the_home_is_mapped_and_the_figures_are_json(
+    budget: tuple[str, str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("embreex", reason="the simulated home needs the extra `sim`")
+    pytest.importorskip("gausslite.render._kernels", reason="the native kernels are not built")
+    assert main(["bench", "loop", "--frames", "0:4", *SMALL, *budget, "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["task"] == "Pick up the mug on the table"
+    assert (report["frames"], report["frames_skipped"], report["size"]) == (4, 0, [96, 72])
+    assert 0 < report["gaussians"] <= 1500
+    assert report["hz"] > 0
+    assert report["peak_rss_mib"] > 0
+    for part in ("latency", "perception", "mapping", "words"):
+        times = report[part]
+        assert 0 < times["p50_ms"] <= times["p90_ms"] <= times["p99_ms"] <= times["max_ms"]
+    if budget[0] == "--iterations":
+        assert (report["iterations_mean"], report["iterations_min"]) == (2.0, 2)
+
+
+def test_lines_name_every_step(capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("embreex", reason="the simulated home needs the extra `sim`")
+    pytest.importorskip("gausslite.render._kernels", reason="the native kernels are not built")
+    assert main(["bench", "loop", "--policy", "uniform", "--frames", "0:2", *SMALL, "--iterations", "1"]) == 0
+    printed = capsys.readouterr().out
+    for word in ("2 frames", "Hz", "p99", "perception", "mapping", "ROI words", "peak memory"):
+        assert word in printed

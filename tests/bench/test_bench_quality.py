@@ -1,0 +1,296 @@
+"""The quality benchmark on one small home: fair trials, kept results, tables that say what was measured."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from quality_results import CONDITIONS, PLAN, TASK, UNIFORM, finished
+
+from gausslite.calibration.view_fit import PoseExposurePrior
+from gausslite.cli.main import main
+from gausslite.errors import InvalidInputError
+from gausslite.perception.vocabulary import same_kind
+from gausslite.task.rules import RuleParser
+from gausslite_bench.quality.ablation import cumulative_variants
+from gausslite_bench.quality.pairs import HOME_PAIRS, WHOLE_HOMES, TaskKind, choose_pairs
+from gausslite_bench.quality.scenes import HomeScenePlan, PosePolicy, RealScenePlan, UnseenRegionError, choose_kinds
+from gausslite_bench.quality.study import Archive, Finished, Study, run_study
+from gausslite_bench.quality.tables import FULL_METRICS, ROI_METRICS, Scoreboard, ablation_table, quality_table
+from gausslite_bench.quality.trials import Budget, BudgetMode, Conditions, Trial, Variant, clock_for
+from gausslite_sim.family import HOME_COUNT, HOMES
+
+
+def test_there_are_three_tasks_of_three_kinds_in_each_home() -> None:
+    kinds = set(TaskKind) - {TaskKind.FULL_FRAME}
+    assert {(pair.home, pair.kind) for pair in HOME_PAIRS} == {(h, k) for h in range(1, HOME_COUNT + 1) for k in kinds}
+    assert len({pair.task for pair in HOME_PAIRS}) == len(HOME_PAIRS) == 24
+
+
+@pytest.mark.parametrize("pair", HOME_PAIRS, ids=lambda pair: pair.name)
+def test_the_words_of_a_task_mean_its_objects(pair) -> None:
+    graph = RuleParser().parse(pair.task)
+    assert not graph.warnings
+    for name in pair.objects:
+        assert any(same_kind(target, name) for target in graph.targets), (graph.targets, name)
+
+
+def test_a_task_is_about_things_that_are_there() -> None:
+    names = {item.name for item in HOMES[PLAN.pair.home - 1].furnish(np.random.default_rng(0))}
+    for pair in choose_pairs([f"home-{PLAN.pair.home}"]):
+        assert set(pair.objects) <= names
+
+
+def test_pairs_are_chosen_by_name_or_home() -> None:
+    assert choose_pairs([]) == HOME_PAIRS
+    assert [pair.name for pair in choose_pairs(["home-2", "home-5-search"])] == [
+        "home-2-manipulation",
+        "home-2-search",
+        "home-2-navigation",
+        "home-5-search",
+    ]
+    assert choose_pairs(["home-7-everything"]) == (WHOLE_HOMES[6],)
+    with pytest.raises(InvalidInputError, match=r"pairs: expected names such as home-3 .*, got home-9"):
+        choose_pairs(["home-1", "home-9"])
+
+
+def test_a_real_sequences_kinds_are_chosen_by_name() -> None:
+    mug, chair = (RealScenePlan(Path("kitchen"), Path("roi.npz"), kind, (f"{kind}_1",)) for kind in ("mug", "chair"))
+    assert choose_kinds([mug, chair], []) == [mug, chair]
+    assert choose_kinds([mug, chair], ["chair"]) == [chair]
+    with pytest.raises(InvalidInputError, match="kinds: expected names among mug, chair, got cup"):
+        choose_kinds([mug, chair], ["mug", "cup"])
+
+
+def test_components_come_one_by_one() -> None:
+    variants = cumulative_variants()
+    labels = [variant.label for variant in variants]
+    beyond = ["+views", "+surroundings", "+scaffold", "+means", "+settling"]
+    assert labels == ["none", "+SB", "+MVO", "+ROI", "+SIS", "+GFD", *beyond]
+    off = [variant.without for variant in variants]
+    assert all(len(a - b) == 1 and b < a for a, b in pairwise(off))
+    assert not off[-1]
+
+
+def test_a_trials_key_changes_with_each_of_its_settings() -> None:
+    trial = Trial(PLAN, TASK, Budget(), 0, CONDITIONS)
+    others = [
+        replace(trial, seed=1),
+        replace(trial, conditions=Conditions((64, 48))),
+        replace(trial, variant=UNIFORM),
+        replace(trial, budget=Budget(iterations=9)),
+        replace(trial, budget=Budget(equal=BudgetMode.TIME)),
+        replace(trial, plan=replace(PLAN, frames=5)),
+        replace(trial, plan=replace(PLAN, trust=PosePolicy(fit_views=True))),
+        replace(trial, plan=HomeScenePlan(choose_pairs(["home-8-search"])[0], 4, 3)),
+    ]
+    assert len({each.key for each in (trial, *others)}) == 1 + len(others)
+    assert trial.key == Trial(PLAN, TASK, Budget(), 0, CONDITIONS).key
+
+
+def test_a_map_that_knows_no_task_is_the_same_for_every_task_of_its_place() -> None:
+    search = HomeScenePlan(choose_pairs(["home-8-search"])[0], 4, 3)
+    here, there = Trial(PLAN, UNIFORM, Budget(), 0, CONDITIONS), Trial(search, UNIFORM, Budget(), 0, CONDITIONS)
+    assert (here.map_key, here.follows_task) == (there.map_key, False)
+    for other in (
+        replace(here, seed=1),
+        replace(here, budget=Budget(iterations=9)),
+        replace(here, plan=replace(PLAN, trust=PosePolicy(PoseExposurePrior(0.01)))),
+        replace(here, plan=replace(PLAN, frames=5)),
+        replace(here, plan=HomeScenePlan(choose_pairs(["home-7-search"])[0], 4, 3)),
+        replace(here, variant=Variant("monogs", "monogs")),
+    ):
+        assert other.map_key != here.map_key
+    ours, theirs = Trial(PLAN, TASK, Budget(), 0, CONDITIONS), Trial(search, TASK, Budget(), 0, CONDITIONS)
+    assert ours.follows_task
+    assert ours.map_key != theirs.map_key
+    assert not replace(ours, variant=cumulative_variants()[0]).follows_task
+
+
+def test_homes_are_believed_and_real_cameras_are_not(tmp_path: Path) -> None:
+    assert PosePolicy() == PLAN.trust
+    assert not Trial(PLAN, TASK, Budget(), 0, CONDITIONS).mission.view_prior.moves
+    real = RealScenePlan(tmp_path, tmp_path / "roi.npz", "mug", ("mug_1",))
+    mission = Trial(real, UNIFORM, Budget(), 0, CONDITIONS).mission
+    assert PoseExposurePrior.parse(str(mission.view_prior)) == PoseExposurePrior(0.01, 0.5, 0.1, 0.03)
+    assert real.trust.fit_views
+
+
+def test_a_trials_key_is_the_same_in_every_process() -> None:
+    program = (
+        "from gausslite_bench.quality.ablation import cumulative_variants\n"
+        "from gausslite_bench.quality.pairs import HOME_PAIRS\n"
+        "from gausslite_bench.quality.scenes import HomeScenePlan\n"
+        "from gausslite_bench.quality.trials import Budget, Conditions, Trial\n"
+        "for variant in cumulative_variants():\n"
+        "    print(Trial(HomeScenePlan(HOME_PAIRS[0]), variant, Budget(), 0, Conditions((96, 72))).key)\n"
+    )
+    keys = [
+        subprocess.run(
+            [sys.executable, "-c", program], env={**os.environ, "PYTHONHASHSEED": seed}, capture_output=True, check=True
+        ).stdout.split()
+        for seed in ("1", "2")
+    ]
+    assert keys[0] == keys[1]
+    assert len(set(keys[0])) == len(cumulative_variants())
+
+
+def test_a_single_thread_is_timed_by_the_processor() -> None:
+    assert clock_for(1) is time.process_time
+    assert clock_for(2) is clock_for(None) is time.perf_counter
+
+
+def test_the_board_knows_means_spreads_and_margins() -> None:
+    budget = Budget()
+    board = Scoreboard(
+        [finished(*each, budget) for each in ((TASK, 0, 26.0), (TASK, 1, 28.0), (UNIFORM, 0, 24.5), (UNIFORM, 1, 24.5))]
+    )
+    figure = board.figure(PLAN.name, "task", ROI_METRICS[0], budget)
+    assert figure is not None
+    assert (figure.mean, figure.spread) == (27.0, 1.0)
+    assert board.margin(PLAN.name, ROI_METRICS[0], budget) == pytest.approx(2.5)
+    assert board.figure(PLAN.name, "task", FULL_METRICS[2], budget) is None
+    table = quality_table(board)
+    assert "|  | covered [%]↑ | 93.8 | 93.8 |" in table
+    for text in (
+        "27.00 ± 1.00",
+        "+2.50",
+        "not computed",
+        "ahead of the best other in 1 of 1",
+        "| 1.1% in 2 of 3 views |",
+        "| 28.00 |",
+    ):
+        assert text in table
+    assert "by +2.50 dB inside the mask on average and by +0.00 dB over the full image with views fitted." in table
+    assert "| 28.00 ± 1.00 | 25.50 ± 0.00 | +2.50 | +0.00 |" in table
+    (summary,) = board.as_json()["summary"]
+    assert (summary["ahead_in"], summary["scenes"]) == (1, 1)
+
+
+def test_the_ablations_table_has_a_row_a_component_and_both_budgets() -> None:
+    budgets = [Budget(equal=equal) for equal in BudgetMode]
+    board = Scoreboard([finished(v, 0, 20.0 + i, b) for b in budgets for i, v in enumerate(cumulative_variants())])
+    table = ablation_table(board)
+    one = "25.00 ± 0.00 | 20.00 ± 0.00 | 26.00 ± 0.00 | 20.00 ± 0.00"
+    assert f"| +GFD | {one} | {one} |" in table
+    assert "ROI PSNR, views fitted, equal time" in table
+    assert "mean over" not in table
+
+
+def test_without_fitted_views_the_ablation_shows_raw_ones_alone() -> None:
+    one = finished(TASK, 0, 20.0, Budget())
+    board = Scoreboard([replace(one, result=replace(one.result, fitted=None))])
+    assert "| components | ROI PSNR, equal iterations | full PSNR, equal iterations |\n" in ablation_table(board)
+
+
+def test_the_ablation_of_several_scenes_ends_with_their_mean() -> None:
+    other = HomeScenePlan(choose_pairs(["home-8-search"])[0], frames=4, views=3)
+    board = Scoreboard([finished(TASK, 0, 20.0, Budget()), finished(TASK, 0, 23.0, Budget(), other)])
+    table = ablation_table(board)
+    assert "The mean over these 2\n\n| components | ROI PSNR, equal iterations |" in table
+    assert table.endswith("| task | 21.50 | 20.00 | 22.50 | 20.00 |\n")
+
+
+def test_a_study_counts_its_trials() -> None:
+    study = Study([PLAN], [TASK, UNIFORM], [Budget(), Budget(equal=BudgetMode.TIME)], [0, 1, 2], CONDITIONS)
+    assert study.count == len(study.trials(PLAN)) == 12
+
+
+def test_the_command_measures_keeps_and_resumes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("embreex", reason="the simulated homes need the extra `sim`")
+    pytest.importorskip("gausslite.render._kernels", reason="the native kernels are not built")
+    asked = ["--pairs", "home-8-manipulation", "--size", "96x72", "--frames", "4", "--views", "3"]
+    budget = ["--max-gaussians", "1500", "--iterations", "2", "--threads", "1", "--fit-views"]
+    command = ["bench", "quality", "--out", str(tmp_path), "--policies", "task,uniform", *asked, *budget]
+    assert main(command) == 0
+    first = capsys.readouterr()
+    assert "`task` is ahead of" in first.out
+    report = json.loads((tmp_path / "quality.json").read_text())
+    (scene,) = report["scenes"]
+    assert scene["task"] == "Prepare to pick up the drill on the workbench"
+    assert [each["variant"] for each in scene["results"]] == ["task", "uniform"]
+    assert all(trial["gaussians"] <= 1500 for each in scene["results"] for trial in each["trials"])
+    assert list((tmp_path / "sheets").glob("home-8-manipulation-view-*.png"))
+    assert main(command) == 0
+    again = capsys.readouterr()
+    assert again.err.count("(kept)") == 2
+    assert json.loads((tmp_path / "quality.json").read_text())["scenes"] == report["scenes"]
+    next((tmp_path / "trials").glob("home-8-manipulation-task-*.png")).unlink()
+    assert main([*command, "--seeds", "0,1"]) == 0
+    assert capsys.readouterr().err.count("(kept)") == 1
+
+
+def test_a_map_is_made_once_for_all_tasks_that_it_does_not_know(tmp_path: Path) -> None:
+    pytest.importorskip("embreex", reason="the simulated homes need the extra `sim`")
+    pytest.importorskip("gausslite.render._kernels", reason="the native kernels are not built")
+    plans = [HomeScenePlan(pair, frames=4, views=3) for pair in choose_pairs(["home-8"])]
+    conditions = Conditions((96, 72), threads=1)
+    together = Study(plans, [TASK, UNIFORM], [Budget(max_gaussians=1500, iterations=1)], [0], conditions)
+    seen = Frames()
+    results = run_study(together, Archive(tmp_path / "together"), None, seen)
+    assert seen.count == (3 + 1) * len(plans[0].load((96, 72)).training)
+    alone = replace(together, plans=plans[2:], variants=[UNIFORM])
+    [last] = run_study(alone, Archive(tmp_path / "alone"), None, seen)
+    assert results[-1].trial.key == last.trial.key
+    assert results[-1].result.scores == last.result.scores
+
+
+class Frames:
+    """Counts the frames that a study maps."""
+
+    def __init__(self) -> None:
+        self.count = 0
+
+    def frame(self, gaussians: int) -> None:
+        del gaussians
+        self.count += 1
+
+    def finished(self, done: Finished) -> None:
+        del done
+
+    def left_out(self, trials: int, why: UnseenRegionError) -> None:
+        del trials, why
+
+
+def test_the_ablation_is_run_within_the_budget_that_is_asked_for(tmp_path: Path) -> None:
+    pytest.importorskip("embreex", reason="the simulated homes need the extra `sim`")
+    pytest.importorskip("gausslite.render._kernels", reason="the native kernels are not built")
+    asked = ["--pair", "home-8-manipulation", "--size", "96x72", "--frames", "2", "--views", "2", "--seeds", "0"]
+    budget = ["--equal", "time", "--rate", "200", "--max-gaussians", "500", "--threads", "1"]
+    assert main(["bench", "ablation", "--out", str(tmp_path), *asked, *budget]) == 0
+    report = json.loads((tmp_path / "ablation.json").read_text())
+    assert [(each["equal"], each["rate_hz"]) for each in report["budgets"]] == [("time", 200.0)]
+    assert len(report["scenes"][0]["results"]) == len(cumulative_variants())
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["quality", "--policies", "best"], "policy: expected one of task"),
+        (["quality", "--pairs", "home-0"], "pairs: expected names such as home-3"),
+        (["quality", "--real", "nowhere"], "--real: expected a folder and its regions"),
+        (["quality", "--kinds", "mug"], "--kinds: expected a real sequence it belongs to"),
+        (["quality", "--roi", "regions.npz"], "--roi: expected a real sequence it belongs to"),
+        (["quality", "--frames", "1", "--pairs", "home-1"], "frames: expected 2 to 100000, got 1"),
+        (["quality", "--threads", "0"], "threads: expected 1 to 256, got 0"),
+        (["quality", "--max-gaussians", "0"], "max_gaussians: expected at least 1, got 0"),
+        (["quality", "--perception", "none.onnx"], "model none.onnx: expected"),
+        (["ablation", "--pair", "kitchen"], "pairs: expected names"),
+        (["ablation", "--lpips-weights", "none.pth"], "none.pth: expected a file of LPIPS weights"),
+    ],
+)
+def test_wrong_options_are_one_line(
+    options: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["bench", *options, "--out", str(tmp_path)]) == 2
+    line = capsys.readouterr().err
+    assert message in line
+    assert line.count("\n") == 1

@@ -1,0 +1,177 @@
+"""The rasterizer's benchmark on tiny cases: what it measures and prints, never how long it took."""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gausslite.cli.main import main
+from gausslite.errors import InvalidInputError
+from gausslite.render.rasterizer import LOG_SCALE, MEAN, RGB
+from gausslite_bench.cli.main import counts, percentages, sizes
+from gausslite_bench.raster.bench import RasterBench
+from gausslite_bench.raster.cycles import BlockCost
+from gausslite_bench.raster.region import Layout, regions_of_share
+from gausslite_bench.raster.scene import held_view, seed_rows
+
+pytest.importorskip("gausslite.render._kernels", reason="the native kernels are not built")
+
+from gausslite.render.cpu import CpuRasterizer
+from gausslite.render.cpu_kernels import usable_simd
+
+KEYS = [
+    "gaussians",
+    "width",
+    "height",
+    "threads",
+    "simd",
+    "fused_l1_ms_min",
+    "fused_l1_ssim_ms_min",
+    "forward_ms_min",
+    "backward_ms_min",
+]
+
+
+def test_seeds_draw_the_room_that_the_held_view_shows() -> None:
+    view = held_view(96, 72)
+    drawn = CpuRasterizer(threads=1).forward(seed_rows(30_000), view.camera, view.T_camera_world)
+    seen = drawn.alpha > 0.9
+    assert seen.mean() > 0.7
+    assert np.median(np.abs(drawn.expected_depth_m() - view.depth_m)[seen]) < 0.03
+    assert np.median(np.abs(drawn.rgb - view.rgb / 255.0)[seen]) < 0.08
+
+
+def test_seeds_lie_in_the_room_and_are_the_same_every_time() -> None:
+    rows = seed_rows(600)
+    assert (np.abs(rows[:, MEAN]) < 2.61).all()
+    assert ((rows[:, RGB] >= 0) & (rows[:, RGB] <= 1)).all()
+    assert (np.exp(rows[:, LOG_SCALE]) <= 0.2001).all()
+    np.testing.assert_array_equal(rows, seed_rows(600))
+
+
+def test_fewer_seeds_than_views_are_refused() -> None:
+    with pytest.raises(InvalidInputError, match="at least 12, one a view, got 5"):
+        seed_rows(5)
+
+
+def test_every_case_is_measured_on_every_instruction_set() -> None:
+    bench = RasterBench([(48, 32), (32, 32)], [50], simd=usable_simd(), threads=1, repetitions=1)
+    timings = list(bench.run())
+    assert [(t.width, t.simd) for t in timings] == [(width, simd) for width in (48, 32) for simd in usable_simd()]
+    for timing in timings:
+        assert timing.yardstick == {}
+        assert timing.regions == ()
+        assert set(timing.stages_ms) == {"fused_l1", "fused_l1_ssim"}
+        assert all(0 < duration.min_ms <= duration.median_ms for duration in timing.durations.values())
+
+
+def test_json_is_a_list_of_flat_records(capsys: pytest.CaptureFixture[str]) -> None:
+    small = ["--sizes", "32x32", "--gaussians", "20,40", "--threads", "1", "--simd", "portable", "--reps", "2"]
+    assert main(["bench", "raster", *small, "--json"]) == 0
+    records = json.loads(capsys.readouterr().out)
+    assert [record["gaussians"] for record in records] == [20, 40]
+    assert [list(record) for record in records] == [KEYS, KEYS]
+    assert {(record["simd"], record["threads"], record["width"]) for record in records} == {("portable", 1, 32)}
+
+
+def test_lines_name_the_case_and_every_operation(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["bench", "raster", "--sizes", "32x32", "--gaussians", "20", "--threads", "1", "--reps", "1"]) == 0
+    printed = capsys.readouterr().out
+    for word in ("20 Gaussians, 32x32", "fused_l1 ", "fused_l1_ssim", "forward", "backward", "raster"):
+        assert word in printed
+
+
+def test_details_hold_every_figure_of_every_case(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "details.json"
+    small = ["--sizes", "48x32", "--gaussians", "20,40", "--threads", "1", "--reps", "1", "--shares", "10,100"]
+    assert main(["bench", "raster", *small, "--details", str(file)]) == 0
+    assert "10 % compact   fused_l1 " in capsys.readouterr().out
+    cases = json.loads(file.read_text())["cases"]
+    assert [case["gaussians"] for case in cases] == [20, 40]
+    for case in cases:
+        assert set(case["operations"]) == {"fused_l1", "fused_l1_ssim", "forward", "backward"}
+        assert case["blocks"]["evaluations"] > 0
+        regions = [(each["share_percent"], each["layout"], each["loss"]) for each in case["regions"]]
+        assert len(set(regions)) == 2 * 3 * 2
+        assert all(each["ratio"] > 0 for each in case["regions"])
+        whole = [each["work_share"] for each in case["regions"] if each["share_percent"] == 100]
+        assert whole == [1.0] * 6
+
+
+def test_cycles_are_those_of_all_threads_in_the_stage_that_evaluates_blocks() -> None:
+    stages = {"project": 5.0, "raster": 2.0, "loss": 7.0, "backward": 1.0, "update": 9.0}
+    cost = BlockCost.of(evaluations=300_000, clock_ghz=3.4, threads=2, stages_ms=stages)
+    assert cost.cycles == pytest.approx(2 * 2.0e-3 * 3.4e9 / 300_000)
+
+
+@pytest.mark.parametrize("layout", [Layout.COMPACT, Layout.SCATTERED])
+def test_a_smaller_share_of_tiles_lies_inside_a_larger_one(layout: Layout) -> None:
+    shares = [regions_of_share((240, 320), percent, layout)[0] for percent in (0.1, 5, 20, 50, 100)]
+    assert [int(tiles.sum()) for tiles in shares] == [1, 15, 60, 150, 300]
+    for smaller, larger in itertools.pairwise(shares):
+        assert not (smaller & ~larger).any()
+
+
+def test_a_compact_region_lies_round_the_middle() -> None:
+    rows, columns = np.nonzero(*regions_of_share((160, 160), 36, Layout.COMPACT))
+    assert {*rows, *columns} == set(range(2, 8))
+
+
+@pytest.mark.parametrize(("percent", "count"), [(100, 1), (50, 2), (20, 5), (5, 20)])
+def test_bands_cover_the_image_once(percent: float, count: int) -> None:
+    bands = regions_of_share((240, 330), percent, Layout.BANDS)
+    assert len(bands) == count
+    assert np.sum(bands, axis=0).tolist() == np.ones((15, 21), int).tolist()
+    assert {int(band.sum()) for band in bands} <= {315 // count, -(-315 // count)}
+    assert max(int(np.ptp(np.nonzero(band)[1])) for band in bands) <= 21 // count + 1
+
+
+def test_of_many_narrow_bands_some_are_enough() -> None:
+    bands = regions_of_share((240, 320), 0.1, Layout.BANDS)
+    assert len(bands) == 20
+    assert {int(band.sum()) for band in bands} == {1}
+    assert np.sum(bands, axis=0).max() == 1
+
+
+@pytest.mark.parametrize("percent", [0.0, -1.0, 100.5, float("nan")])
+def test_a_share_that_is_none_is_told(percent: float) -> None:
+    with pytest.raises(InvalidInputError, match="region share: expected more than 0 and at most 100"):
+        regions_of_share((32, 32), percent, Layout.COMPACT)
+
+
+@pytest.mark.parametrize("text", ["", "0,5", "5,,7", "101", "-1", "nan", "x"])
+def test_percents_that_are_none_are_told(text: str) -> None:
+    with pytest.raises(argparse.ArgumentTypeError, match="expected"):
+        percentages(text)
+
+
+def test_no_shares_can_be_asked_for() -> None:
+    assert percentages("0") == ()
+    assert percentages("5,20.5") == (5.0, 20.5)
+
+
+def test_a_file_that_is_no_library_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    library = tmp_path / "other.so"
+    library.write_text("not a library")
+    small = ["--sizes", "32x32", "--gaussians", "20", "--threads", "1", "--reps", "1"]
+    assert main(["bench", "raster", *small, "--yardstick", str(library)]) == 2
+    said = capsys.readouterr().err
+    assert "other.so: expected a shared library with gl_new" in said
+    assert said.count("\n") == 1
+
+
+@pytest.mark.parametrize("text", ["", "32", "32x", "32x32x3", "0x5", "axb"])
+def test_sizes_that_are_none_are_told(text: str) -> None:
+    with pytest.raises(argparse.ArgumentTypeError, match="expected"):
+        sizes(text)
+
+
+@pytest.mark.parametrize("text", ["", "0", "-3", "1.5"])
+def test_counts_that_are_none_are_told(text: str) -> None:
+    with pytest.raises(argparse.ArgumentTypeError, match="expected whole numbers"):
+        counts(text)

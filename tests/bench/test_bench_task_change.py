@@ -1,0 +1,137 @@
+"""The benchmark of a task that changes, its table and its picture; and `map --then` on a tiny home."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gausslite.cli.main import main
+from gausslite.errors import InvalidInputError
+from gausslite.mission.settings import MissionSettings
+from gausslite.mission.task_schedule import TaskSchedule, TaskSwitch
+from gausslite.task.rules import RuleParser
+from gausslite_bench.curves import draw_panels
+from gausslite_bench.task_change import (
+    ALWAYS,
+    CHANGED,
+    RESTARTED,
+    Recovery,
+    TaskChange,
+    TaskChangeBench,
+    recovery_table,
+)
+
+CHANGE = TaskChange.parse("home-8-navigation:home-8-search")
+
+
+def recovery(gaps_db: list[float]) -> Recovery:
+    seconds = [0.25, 5.0, 10.0, 11.0]
+    changed = [(when, 20.0 - gap) for when, gap in zip(seconds, gaps_db, strict=True)]
+    always = [(when, 20.0) for when in seconds]
+    return Recovery(CHANGE, {CHANGED: changed, RESTARTED: changed, ALWAYS: always}, 4, 2, 100, 50)
+
+
+def test_a_map_has_recovered_when_it_is_near_and_stays_near() -> None:
+    assert recovery([3.0, 0.9, 1.1, 0.5]).recovered_s == 11.0
+    assert recovery([0.1, 0.9, 0.1, 0.5]).recovered_s == 0.25
+    assert recovery([3.0, 0.9, 0.1, 1.5]).recovered_s is None
+    assert recovery([3.0, 0.9, 0.4, 1.5]).gap_db(2) == pytest.approx(0.4)
+    assert "| 17.00 → 19.60 | 17.00 → 19.60 | 20.00 → 20.00 | 0.40 | never |" in recovery_table(
+        [recovery([3.0, 0.9, 0.4, 1.5])]
+    )
+
+
+@pytest.mark.parametrize("text", ["home-8-search", "home-8-search:home-7-search", "home-8-search:home-8-search", ""])
+def test_a_change_is_between_two_tasks_of_one_home(text: str) -> None:
+    with pytest.raises(InvalidInputError, match="task change"):
+        TaskChange.parse(text)
+
+
+def test_the_table_names_the_time_that_was_mapped() -> None:
+    brief = Recovery(CHANGE, {name: [(0.25, 20.0), (1.5, 21.0)] for name in (CHANGED, RESTARTED, ALWAYS)}, 4, 2, 9, 5)
+    assert "→ after 1.5 s of further mapping." in recovery_table([brief])
+    assert "→ after 10 s of further mapping." in recovery_table([recovery([3.0, 0.9, 0.4, 1.5])])
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--rate", "0"], "rate: expected 0.01 to 1000 Hz, got 0.0"),
+        (["--rate", "nan"], "rate: expected 0.01 to 1000 Hz, got nan"),
+        (["--rate=-4"], "rate: expected 0.01 to 1000 Hz, got -4.0"),
+        (["--changes", ""], "changes: expected such as home-4-manipulation:home-4-navigation, got none"),
+        (["--before", "0"], "retask before: expected at least 1, got 0"),
+    ],
+)
+def test_wrong_options_are_one_line(
+    options: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["bench", "retask", "--out", str(tmp_path / "out"), *options]) == 2
+    [line] = capsys.readouterr().err.splitlines()
+    assert message in line
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_three_maps_get_the_same_frames_after_the_change() -> None:
+    settings = MissionSettings(max_gaussians=2000, iterations=2, threads=1)
+    bench = TaskChangeBench(settings, before=3, after=3, views=3, size=(96, 72), check_every=2)
+    found = bench.run(CHANGE)
+    assert set(found.points) == {CHANGED, RESTARTED, ALWAYS}
+    assert all([when for when, _ in line] == [0.25, 0.5, 0.75] for line in found.points.values())
+    # keyframes, and views kept because they showed the first task's region
+    assert found.reread == found.most_reread == 2
+    json.dumps(found.as_json())
+
+
+@pytest.mark.parametrize(("after", "looks"), [(1, [0.25]), (2, [0.25, 0.5]), (4, [0.25, 1.0])])
+def test_the_first_and_the_last_frame_are_looked_at(after: int, looks: list[float]) -> None:
+    settings = MissionSettings(max_gaussians=500, iterations=1, threads=1)
+    found = TaskChangeBench(settings, before=1, after=after, views=3, size=(64, 48)).run(CHANGE)
+    assert all([when for when, _ in line] == looks for line in found.points.values())
+
+
+def test_a_single_look_is_seen_in_the_picture() -> None:
+    once = draw_panels({"a": {"line": [(0.25, 20.0)]}}, "seconds", "dB")
+    assert (once[60:] == (255, 208, 0)).all(axis=2).any()
+
+
+def test_curves_are_drawn_one_panel_below_the_other() -> None:
+    points = recovery([3.0, 0.9, 0.4, 0.2]).points
+    one = draw_panels({"a": points}, "seconds", "dB")
+    assert len(draw_panels({"a": points, "b": points}, "seconds", "dB")) == 2 * len(one)
+    assert len(np.unique(one.reshape(-1, 3), axis=0)) > 4
+
+
+def test_the_task_in_force_is_that_of_the_latest_turn() -> None:
+    parse = RuleParser().parse
+    first, second, third = parse("Find the mug"), parse("Find the bowl"), parse("Find the chair")
+    plan = TaskSchedule(first, ((20, third), (10, second)))
+    assert [plan.at(frame) for frame in (0, 9, 10, 19, 20, 99)] == [first, first, second, second, third, third]
+    assert TaskSwitch.parse("7: Find the mug ") == TaskSwitch(7, "Find the mug")
+
+
+@pytest.mark.parametrize("text", ["Find the mug", "x:Find the mug", "7:", "-1:Find the mug"])
+def test_a_turn_that_is_none_is_told(text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    command = ["map", "sim:home?frames=2", "--task", "Find the mug", f"--then={text}", "--out", str(tmp_path)]
+    assert main(command) == 2
+    assert "--then" in capsys.readouterr().err
+
+
+def test_a_mission_whose_task_changes_can_be_cut_in_two(tmp_path: Path) -> None:
+    def map_home(name: str, *more: str) -> tuple[bytes, dict[str, object]]:
+        common = ["--size", "64x48", "--max-gaussians", "500", "--iterations", "2", "--threads", "1"]
+        tasks = ["--task", "Pick up the mug on the table", "--then", "6:Find the chair"]
+        out = str(tmp_path / name)
+        assert main(["map", "sim:home?seed=0&trajectory=0&frames=14", *common, *tasks, "--out", out, *more]) == 0
+        report = json.loads((tmp_path / name / "report.json").read_text())
+        return (tmp_path / name / "map.ply").read_bytes(), report
+
+    state = str(tmp_path / "run.state")
+    whole, report = map_home("whole")
+    # all six frames before showed the first task's region and are remembered for that
+    assert report["keyframes_reread"] == 6
+    map_home("first", "--frames", "0:7", "--save-state", state)
+    assert map_home("rest", "--resume", state)[0] == whole

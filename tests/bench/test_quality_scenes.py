@@ -1,0 +1,179 @@
+"""What a trial is judged on: masks that belong to their frames, real sequences told apart, wrong ones named early."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mapping_scenes import middle_relevance, wall_frame
+from tiny_sequences import write_depth, write_seven_scenes
+
+from gausslite.cli.main import main
+from gausslite.domain.relevance import RelevanceMap
+from gausslite.errors import DatasetError, InvalidInputError
+from gausslite.mission.settings import SceneKnowledge
+from gausslite_bench.quality.scenes import RealScenePlan, RecordedRelevanceEstimator, Scene, real_plans
+from gausslite_bench.quality.trials import Budget, Conditions, PerceptionMode, Trial, Variant, make_map
+
+
+def write_regions(path: Path, *voxels: tuple[int, int, int], name: str = "mug_1") -> Path:
+    arrays = {name: np.array(voxels, np.int32)}
+    np.savez(path, voxel_size_m=0.1, **arrays)
+    return path
+
+
+def test_two_frames_from_one_place_have_masks_of_their_own() -> None:
+    frames = [wall_frame(0), wall_frame(1)]
+    masks = [middle_relevance(frames[0]), RelevanceMap.nothing(*frames[1].depth_m.shape)]
+    attention = RecordedRelevanceEstimator(Scene("Find it", frames, masks, [], SceneKnowledge()))
+    assert [attention.attend(frame) for frame in frames] == masks
+    assert attention.look_back(frames[0]) is masks[0]
+
+
+def test_other_regions_under_the_same_names_are_another_scene(tmp_path: Path) -> None:
+    path = write_regions(tmp_path / "roi.npz", (0, 0, 20))
+    [plan] = real_plans(tmp_path, path)
+    before = plan.settings()
+    assert plan.settings() == before
+    write_regions(path, (0, 0, 20), (1, 0, 20))
+    assert plan.settings() != before
+
+
+def test_another_camera_is_another_scene(tmp_path: Path) -> None:
+    folder = write_seven_scenes(tmp_path / "kitchen")
+    [plan] = real_plans(folder, write_regions(tmp_path / "roi.npz", (0, 0, 20)))
+    before = plan.place()
+    (folder / "camera-intrinsics.txt").write_text("21 0 7.5\n0 21 5.5\n0 0 1\n")
+    assert plan.place() != before
+
+
+def test_a_sequence_is_named_by_its_folder_wherever_one_stands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "kitchen").mkdir()
+    monkeypatch.chdir(tmp_path / "kitchen")
+    assert RealScenePlan(Path(), Path("roi.npz"), "mug", ("mug_1",)).name == "kitchen-mug"
+    assert RealScenePlan(tmp_path / "chess" / "seq-01", Path("roi.npz"), "mug", ("mug_1",)).name == "chess-seq-01-mug"
+
+
+@pytest.mark.parametrize("frames", [-5, 0, 1])
+def test_too_few_frames_of_a_real_sequence_are_told_at_once(frames: int, tmp_path: Path) -> None:
+    with pytest.raises(InvalidInputError, match=f"frames: expected 2 to 100000, got {frames}"):
+        real_plans(tmp_path, write_regions(tmp_path / "roi.npz", (0, 0, 20)), frames)
+
+
+@pytest.mark.parametrize("name", ["left/right_1", "_"])
+def test_an_object_whose_name_cannot_name_a_file_is_told_at_once(name: str, tmp_path: Path) -> None:
+    path = write_regions(tmp_path / "roi.npz", (0, 0, 20), name=name)
+    with pytest.raises(InvalidInputError, match=r"roi\.npz: expected objects that can name files, got"):
+        real_plans(tmp_path, path)
+
+
+def test_the_words_of_a_task_find_the_regions_of_a_real_sequence(tmp_path: Path) -> None:
+    folder = write_seven_scenes(tmp_path / "kitchen", tuple(range(0, 36, 4)))
+    wall = [(x, y, z) for x in range(-4, 4) for y in range(-4, 4) for z in (19, 20)]
+    [plan] = real_plans(folder, write_regions(tmp_path / "roi.npz", *wall, name="mug_1"))
+    trial = Trial(
+        plan, Variant("task", "task"), Budget(200, iterations=1), 0, Conditions((16, 16), PerceptionMode(words=True), 1)
+    )
+    assert make_map(trial, plan.load((16, 16)), lambda _: None).gaussians.active.any()
+
+
+def test_a_sequence_too_short_to_hold_a_view_out_says_what_there_was(tmp_path: Path) -> None:
+    folder = write_seven_scenes(tmp_path / "kitchen")
+    [plan] = real_plans(folder, write_regions(tmp_path / "roi.npz", (0, 0, 20)))
+    with pytest.raises(DatasetError, match="expected training frames and held-out views with depth, got 3 and 0"):
+        plan.load((16, 16))
+
+
+WALL = [(x, y, z) for x in range(-4, 4) for y in range(-4, 4) for z in (19, 20)]
+
+
+def write_kitchen(folder: Path, **regions: list[tuple[int, int, int]]) -> tuple[Path, Path]:
+    """Nine views of a wall two metres away, and a file of regions."""
+    roi = folder / "roi.npz"
+    np.savez(roi, voxel_size_m=0.1, **{name: np.array(voxels, np.int32) for name, voxels in regions.items()})
+    return write_seven_scenes(folder / "kitchen", tuple(range(0, 36, 4))), roi
+
+
+def bench_quality(kitchen: Path, roi: Path, out: Path) -> int:
+    asked = ["--real", str(kitchen), "--roi", str(roi), "--size", "16x16", "--policies", "task", "--iterations", "1"]
+    return main(["bench", "quality", *asked, "--max-gaussians", "150", "--threads", "1", "--out", str(out)])
+
+
+def test_a_kind_that_no_held_out_view_shows_is_left_out_and_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("gausslite.render._kernels", reason="the native kernels are not built")
+    kitchen, roi = write_kitchen(tmp_path, mug_1=WALL, lamp_1=[(500, 500, 500)])
+    assert bench_quality(kitchen, roi, tmp_path / "out") == 0
+    said = capsys.readouterr()
+    why = "kitchen-lamp: expected held-out views that show at least 64 pixels of lamp_1 at 16x16, got none of 1"
+    assert f"left out: {why}" in said.err
+    assert re.search(r"\| kitchen-mug \| Find the mug \| [\d.]+% in 1 of 1 views \|", said.out)
+    assert "kitchen-lamp" not in said.out
+
+
+def test_a_sequence_without_depth_is_not_said_to_lack_the_region(tmp_path: Path) -> None:
+    kitchen, roi = write_kitchen(tmp_path, mug_1=WALL)
+    for path in kitchen.glob("*.depth.png"):
+        write_depth(path, value=0)
+    [plan] = real_plans(kitchen, roi)
+    with pytest.raises(DatasetError, match="expected training frames and held-out views with depth, got 0 and 0"):
+        plan.load((16, 16))
+
+
+def test_regions_of_another_sequence_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("gausslite.render._kernels", reason="the native kernels are not built")
+    kitchen, roi = write_kitchen(tmp_path, lamp_1=[(500, 500, 500)])
+    assert bench_quality(kitchen, roi, tmp_path / "out") == 2
+    assert "gausslite: kitchen-lamp: expected held-out views that show" in capsys.readouterr().err
+    assert not (tmp_path / "out" / "quality.md").exists()
+
+
+def test_a_map_of_regions_that_were_never_seen_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("gausslite.render._kernels", reason="the native kernels are not built")
+    kitchen, roi = write_kitchen(tmp_path, mug_1=WALL, lamp_1=[(500, 500, 500)])
+    for name, told in (("lamp_1", True), ("mug_1", False)):
+        asked = ["--roi", str(roi), "--objects", name, "--max-gaussians", "150", "--threads", "1"]
+        assert main(["map", str(kitchen), *asked, "--out", str(tmp_path / name)]) == 0
+        assert ("none of these frames shows the region" in capsys.readouterr().out) is told
+    assert (
+        main(["eval", str(tmp_path / "mug_1" / "map.ply"), str(kitchen), "--roi", str(roi), "--objects", "lamp_1"]) == 0
+    )
+    assert capsys.readouterr().out.startswith("no view shows 64 pixels of the region; full PSNR ")
+    assert main(["eval", str(tmp_path / "mug_1" / "map.ply"), str(kitchen)]) == 0
+    assert capsys.readouterr().out.startswith("no region was asked for; full PSNR ")
+
+
+def test_a_rates_cost_is_not_measured_where_no_view_shows_the_region(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    kitchen, roi = write_kitchen(tmp_path, lamp_1=[(500, 500, 500)])
+    assert main(["bench", "loop", str(kitchen), "--roi", str(roi), "--unlimited", "2"]) == 2
+    assert "--unlimited: expected a held-out frame that shows the region, got none" in capsys.readouterr().err
+
+
+def test_a_real_sequences_own_regions_are_the_usual_ones(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("gausslite.render._kernels", reason="the native kernels are not built")
+    kitchen, roi = write_kitchen(tmp_path, mug_1=WALL)
+    asked = ["bench", "quality", "--real", str(kitchen), "--policies", "task", "--iterations", "1", "--threads", "1"]
+    asked += ["--max-gaussians", "150", "--out", str(tmp_path / "out")]
+    assert main(asked) == 2
+    assert f"and no {kitchen / 'roi_voxels.npz'}" in capsys.readouterr().err
+    roi.rename(kitchen / "roi_voxels.npz")
+    assert main(asked) == 0
+    # 16x12 is its own size, which has fewer pixels than 320x240
+    [record] = (tmp_path / "out" / "trials").glob("kitchen-mug-task-*.json")
+    assert "size=(16, 12)" in json.loads(record.read_text())["settings"]["conditions"]
+
+
+def test_wrong_kinds_are_told_before_the_colour_camera_is_looked_for(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    kitchen, roi = write_kitchen(tmp_path, mug_1=WALL)
+    asked = ["--real", str(kitchen), "--roi", str(roi), "--kinds", "mugs", "--out", str(tmp_path / "out")]
+    assert main(["bench", "quality", *asked]) == 2
+    [line] = capsys.readouterr().err.splitlines()
+    assert "kinds: expected names among mug, got mugs" in line

@@ -1,0 +1,90 @@
+"""How wrong a recording's poses are is told from its frames: not at all where they are exact, else about as much."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from gausslite.calibration.pose_exposure_error import measure_view_error
+from gausslite.datasets.images import RgbdImage, resize_rgbd
+from gausslite.datasets.open import open_source
+from gausslite.datasets.source import Source
+from gausslite.domain.frame import Frame
+from gausslite.domain.region import Region
+from gausslite.errors import DatasetError
+
+FRAMES = 40
+pytest.importorskip("embreex", reason="the simulated home needs the extra `sim`")
+
+
+class Recording:
+    """A walk through a simulated home whose poses a tracker got wrong, and whose camera sets its own exposure."""
+
+    def __init__(self, home: Source, translation_m: float, rotation_deg: float, gain: float = 0.0) -> None:
+        self._frames = [home.frame(i) for i in range(FRAMES)]
+        self.name, self.camera, self.up_axis = "recording", home.camera, home.up_axis
+        self.depth_registered, self.left_out = True, ""
+        self.damaged: set[int] = set()
+        rng = np.random.default_rng(0)
+        self._T_true_said = [np.eye(4) for _ in range(FRAMES)]
+        for T in self._T_true_said:
+            T[:3, :3] = cv2.Rodrigues(np.radians(rng.normal(0.0, rotation_deg, 3)))[0]
+            T[:3, 3] = rng.normal(0.0, translation_m, 3)
+        self._gains = rng.normal(1.0, gain, FRAMES)
+
+    def __len__(self) -> int:
+        return FRAMES
+
+    def frame(self, i: int, size: tuple[int, int] | None = None) -> Frame:
+        if i in self.damaged:
+            raise DatasetError("recording: expected a whole image file, got one cut short")
+        seen = self._frames[i]
+        image = resize_rgbd(RgbdImage(seen.rgb, seen.depth_m, self.camera), size)
+        rgb = np.clip(image.rgb * self._gains[i], 0, 255).astype(np.uint8)
+        T_world_camera = seen.T_world_camera @ self._T_true_said[i]
+        return replace(seen, rgb=rgb, depth_m=image.depth_m, camera=image.camera, T_world_camera=T_world_camera)
+
+    def indices(self) -> list[int]:
+        return list(range(FRAMES))
+
+    def regions(self) -> dict[str, Region]:
+        return {}
+
+
+@pytest.fixture(scope="module")
+def home() -> Source:
+    """With the depth noise, holes and flying pixels of a sensor."""
+    return open_source(f"sim:home-7?seed=0&trajectory=0&frames={FRAMES}&size=200x150&exposure=0")
+
+
+def test_exact_poses_are_trusted(home: Source) -> None:
+    found, why = measure_view_error(Recording(home, 0.0, 0.0))
+    assert found.is_exact
+    assert why.startswith("24 pairs of its frames agree to ")
+
+
+@pytest.mark.parametrize(("translation_m", "rotation_deg"), [(0.01, 0.5), (0.005, 0.2)])
+def test_wrong_poses_are_found_to_be_about_as_wrong_as_they_are(
+    home: Source, translation_m: float, rotation_deg: float
+) -> None:
+    found, _ = measure_view_error(Recording(home, translation_m, rotation_deg))
+    assert translation_m / 2 < found.translation_m < translation_m * 1.5
+    assert rotation_deg / 2 < found.rotation_deg < rotation_deg * 1.5
+
+
+def test_an_exposure_that_changes_is_found_beside_wrong_poses(home: Source) -> None:
+    fixed, changing = (measure_view_error(Recording(home, 0.01, 0.5, gain))[0] for gain in (0.0, 0.2))
+    assert 1.5 * fixed.gain < changing.gain < 0.3
+
+
+def test_frames_that_cannot_be_read_are_passed_over_and_too_few_tell_nothing(home: Source) -> None:
+    recording = Recording(home, 0.01, 0.5)
+    recording.damaged = set(range(0, FRAMES, 4))
+    assert measure_view_error(recording)[0].moves
+    recording.damaged = set(range(2, FRAMES))
+    found, why = measure_view_error(recording)
+    assert found.is_exact
+    assert why.endswith("can be compared, too few to tell")

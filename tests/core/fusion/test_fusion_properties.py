@@ -1,0 +1,235 @@
+"""The fusion law as laws: whatever happens on the way, the fused map is a function of the agents' latest words."""
+
+from __future__ import annotations
+
+import tempfile
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gausslite.domain.gaussians import Gaussians
+from gausslite.domain.voxel_batch import RoiSubset, VoxelBatch
+from gausslite.domain.voxel_operations import at_keys, group_by_voxel, merge_batches, take_voxels, tombstones
+from gausslite.domain.voxels import VoxelGrid
+from gausslite.fusion.memory_store import MemoryStore
+from gausslite.fusion.offline import fuse_maps
+from gausslite.fusion.sqlite_store import SqliteStore
+from gausslite.fusion.store import FusionStore
+from gausslite.fusion.vote import FusedMap, concatenate, elect, fuse
+
+GRID = VoxelGrid(0.10)
+AGENTS = ("ant", "bee", "cat", "dog")
+
+
+def gaussians_in(cells: list[tuple[int, int]], seed: int) -> Gaussians:
+    """Gaussians with the kappa given, each somewhere in the voxel (cell, 0, 0)."""
+    rng = np.random.default_rng(seed)
+    n = len(cells)
+    columns = rng.random((n, 14), np.float32)
+    means = columns[:, :3] * 0.098 + 0.001
+    means[:, 0] += np.array([cell for cell, _ in cells], np.float32) * np.float32(0.1)
+    return Gaussians(
+        means.astype(np.float32),
+        columns[:, 3:7],
+        columns[:, 7:10],
+        columns[:, 10],
+        columns[:, 11:14],
+        np.ones(n, np.bool_),
+        np.array([kappa for _, kappa in cells], np.uint32),
+        np.zeros(n, np.int16),
+    )
+
+
+# Strategies draw plain numbers and the tests build from them: the shape checks that run in our types use random
+# numbers of their own, which hypothesis does not allow while it draws.
+Spec = tuple[list[tuple[int, int]], list[int], int]
+WORDS = st.tuples(
+    st.lists(st.tuples(st.integers(0, 5), st.integers(0, 3)), max_size=8),
+    st.lists(st.integers(0, 5), max_size=4),
+    st.integers(0, 2**16),
+)
+"""(voxel, kappa) of few Gaussians on few voxels, so that ties are common; voxels that may be tombstones; a seed."""
+TABLES = st.dictionaries(st.sampled_from(AGENTS), WORDS, max_size=4)
+HISTORIES = st.dictionaries(st.sampled_from(AGENTS), st.lists(WORDS, max_size=4), max_size=4)
+law = settings(max_examples=40, deadline=None)
+
+
+def words_from(spec: Spec) -> VoxelBatch:
+    cells, buried, seed = spec
+    present = group_by_voxel(gaussians_in(cells, seed), GRID)
+    centres = np.array([(0.1 * cell + 0.05, 0.05, 0.05) for cell in buried], np.float32).reshape(-1, 3)
+    return merge_batches(present, tombstones(np.setdiff1d(GRID.keys(centres), present.keys)))
+
+
+def table_from(specs: dict[str, Spec]) -> dict[str, VoxelBatch]:
+    return {agent_id: words_from(spec) for agent_id, spec in specs.items()}
+
+
+def subsets_from(history: dict[str, list[Spec]]) -> list[RoiSubset]:
+    """What up to four agents said, each of them with rising map revisions."""
+    return [
+        RoiSubset(agent_id, "s", revision + 1, revision, words_from(spec))
+        for agent_id, specs in history.items()
+        for revision, spec in enumerate(specs)
+    ]
+
+
+def stored(messages: list[RoiSubset], store: FusionStore | None = None) -> FusionStore:
+    store = store or MemoryStore()
+    for message in messages:
+        store.put(message)
+    return store
+
+
+def assert_same_words(a: VoxelBatch, b: VoxelBatch) -> None:
+    assert a.keys.tolist() == b.keys.tolist()
+    assert a.kappa_sums.tolist() == b.kappa_sums.tolist()
+    assert a.counts.tolist() == b.counts.tolist()
+    for field in fields(Gaussians):
+        assert getattr(a.gaussians, field.name).tobytes() == getattr(b.gaussians, field.name).tobytes(), field.name
+
+
+def assert_same_map(a: FusedMap, b: FusedMap) -> None:
+    """Bit for bit the same Gaussians, and the same account of who won where."""
+    assert_same_words(a.words, b.words)
+    assert list(a.election.votes()) == list(b.election.votes())
+
+
+@law
+@given(HISTORIES, st.randoms(use_true_random=False))
+def test_duplicates_and_any_order_leave_the_map_as_it_is(history: dict[str, list[Spec]], random) -> None:
+    subsets = subsets_from(history)
+    shuffled = random.sample(subsets + subsets, 2 * len(subsets))
+    assert_same_map(fuse(stored(shuffled).table()), fuse(stored(subsets).table()))
+    assert_same_words(concatenate(stored(shuffled).table()), concatenate(stored(subsets).table()))
+
+
+@law
+@given(HISTORIES, st.integers(0, 20), st.integers(0, 20))
+def test_a_connection_that_drops_and_resumes_leaves_no_trace(
+    history: dict[str, list[Spec]], dropped: int, again: int
+) -> None:
+    subsets = subsets_from(history)
+    resumed = subsets[:dropped] + subsets[max(0, dropped - again) :]
+    assert_same_map(fuse(stored(resumed).table()), fuse(stored(subsets).table()))
+
+
+@law
+@given(HISTORIES, st.sampled_from(AGENTS))
+def test_removing_an_agent_equals_never_having_had_it(history: dict[str, list[Spec]], leaver: str) -> None:
+    subsets = subsets_from(history)
+    store = stored(subsets)
+    store.remove_agent(leaver)
+    assert_same_map(fuse(store.table()), fuse(stored([s for s in subsets if s.agent_id != leaver]).table()))
+
+
+@law
+@given(TABLES, st.randoms(use_true_random=False))
+def test_adding_agents_in_any_order_commutes(specs: dict[str, Spec], random) -> None:
+    table = table_from(specs)
+    agents = random.sample(sorted(table), len(table))
+    assert_same_map(fuse({agent: table[agent] for agent in agents}), fuse(table))
+
+
+@law
+@given(TABLES, st.integers(1, 4))
+def test_the_shards_united_are_the_whole(specs: dict[str, Spec], shards: int) -> None:
+    table = table_from(specs)
+    parts = [
+        fuse({agent: take_voxels(words, words.keys % shards == shard) for agent, words in table.items()})
+        for shard in range(shards)
+    ]
+    united = parts[0].words
+    for part in parts[1:]:
+        united = merge_batches(united, part.words)
+    whole = fuse(table)
+    assert_same_words(united, whole.words)
+    votes = sorted((vote for part in parts for vote in part.election.votes()), key=lambda vote: vote.key)
+    assert votes == list(whole.election.votes())
+
+
+@law
+@given(TABLES)
+def test_the_winner_is_the_most_trained_then_the_denser_then_the_lower_id(specs: dict[str, Spec]) -> None:
+    table = table_from(specs)
+    fused = fuse(table)
+    expected = {}
+    for agent_id, words in table.items():
+        for key, kappa_sum, count in zip(
+            words.keys.tolist(), words.kappa_sums.tolist(), words.counts.tolist(), strict=True
+        ):
+            rank = (-kappa_sum, -count, agent_id)
+            if count > 0 and (key not in expected or rank < expected[key]):
+                expected[key] = rank
+    assert {vote.key: vote.winner for vote in fused.election.votes()} == {k: rank[2] for k, rank in expected.items()}
+    for key, (_, _, agent_id) in expected.items():
+        keys = np.array([key], np.int64)
+        assert_same_words(at_keys(fused.words, keys), at_keys(table[agent_id], keys))
+
+
+@law
+@given(TABLES)
+def test_provenance_and_margin_agree_with_the_votes(specs: dict[str, Spec]) -> None:
+    table = table_from(specs)
+    fused = fuse(table)
+    votes = list(fused.election.votes())
+    assert len(fused.provenance) == len(fused.gaussians) == int(fused.words.counts.sum())
+    owners = [vote.winner for vote, count in zip(votes, fused.words.counts.tolist(), strict=True) for _ in range(count)]
+    assert [fused.election.agents[index] for index in fused.provenance] == owners
+    assert all(vote.margin >= 0 and vote.stakes[0].count > 0 for vote in votes)
+    assert sum(int(fused.won_by(agent_id).sum()) for agent_id in table) == len(votes)
+
+
+@law
+@given(TABLES)
+def test_concatenation_keeps_everyone(specs: dict[str, Spec]) -> None:
+    table = table_from(specs)
+    everything = concatenate(table)
+    assert len(everything.gaussians) == sum(len(words.gaussians) for words in table.values())
+    assert int(everything.kappa_sums.sum()) == sum(int(words.kappa_sums.sum()) for words in table.values())
+    assert_same_words(group_by_voxel(everything.gaussians, GRID), everything)
+
+
+@law
+@given(HISTORIES)
+def test_the_vote_on_stored_totals_is_the_vote_on_the_words(history: dict[str, list[Spec]]) -> None:
+    subsets = subsets_from(history)
+    store = stored(subsets)
+    assert list(elect(store.stakes()).votes()) == list(fuse(store.table()).election.votes())
+
+
+@law
+@given(HISTORIES)
+def test_every_store_gives_the_same_map(history: dict[str, list[Spec]]) -> None:
+    subsets = subsets_from(history)
+    with tempfile.TemporaryDirectory() as folder:
+        on_disk = SqliteStore(Path(folder) / "store.sqlite")
+        try:
+            outcomes = [(on_disk.put(s), memory.put(s)) for memory in [MemoryStore()] for s in subsets]
+            for ours, theirs in outcomes:
+                assert ours.accepted.tolist() == theirs.accepted.tolist()
+                assert ours.stale.tolist() == theirs.stale.tolist()
+            assert_same_map(fuse(on_disk.table()), fuse(stored(subsets).table()))
+        finally:
+            on_disk.close()
+
+
+@pytest.mark.parametrize(
+    ("kappas_a", "kappas_b", "winner"),
+    [([5], [1, 1], "ant"), ([2], [1, 1], "bee"), ([1, 1], [2], "ant"), ([1, 1], [1, 1], "ant"), ([0], [0, 0], "bee")],
+)
+def test_ties_go_to_more_gaussians_and_then_to_the_lower_id(
+    kappas_a: list[int], kappas_b: list[int], winner: str
+) -> None:
+    a, b = (gaussians_in([(0, kappa) for kappa in kappas], 1) for kappas in (kappas_a, kappas_b))
+    for maps in ({"ant": a, "bee": b}, {"bee": b, "ant": a}):
+        assert [vote.winner for vote in fuse_maps(maps, GRID).election.votes()] == [winner]
+
+
+def test_no_words_fuse_to_an_empty_map() -> None:
+    assert len(fuse({}).gaussians) == len(concatenate({}).gaussians) == 0
+    assert len(fuse_maps({"ant": Gaussians.empty()}, GRID).gaussians) == 0

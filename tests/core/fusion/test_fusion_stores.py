@@ -1,0 +1,271 @@
+"""One suite for every store: the register's rules, sessions and the mission; then what only a durable store must do."""
+
+from __future__ import annotations
+
+import signal
+import sqlite3
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from threading import Thread
+
+import numpy as np
+import pytest
+
+from gausslite.domain.gaussians import Gaussians
+from gausslite.domain.voxel_batch import RoiSubset, VoxelBatch
+from gausslite.domain.voxel_operations import at_keys, gather_rows
+from gausslite.errors import InvalidInputError, StorageError
+from gausslite.fusion.memory_store import MemoryStore
+from gausslite.fusion.sqlite_store import SqliteStore
+from gausslite.fusion.store import FusionStore, MissionConfig, SessionRecord
+
+KEYS = (11, 22, 33)
+
+
+def said(agent_id: str, revision: int, counts: dict[int, int], kappa: int = 1, seed: int = 0) -> RoiSubset:
+    """A message with so many Gaussians of this kappa in each voxel."""
+    n = sum(counts.values())
+    numbers = np.random.default_rng(seed).random((n, 14), np.float32)
+    gaussians = Gaussians(
+        numbers[:, :3],
+        numbers[:, 3:7],
+        numbers[:, 7:10],
+        numbers[:, 10],
+        numbers[:, 11:14],
+        np.arange(n) % 2 == 0,
+        np.full(n, kappa, np.uint32),
+        np.full(n, -1, np.int16),
+    )
+    keys = sorted(counts)
+    per_voxel = np.array([counts[key] for key in keys], np.uint32)
+    words = VoxelBatch(np.array(keys, np.int64), per_voxel.astype(np.uint64) * np.uint64(kappa), per_voxel, gaussians)
+    return RoiSubset(agent_id, "session", revision, revision, words)
+
+
+@pytest.fixture(params=["memory", "sqlite"])
+def store(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[FusionStore]:
+    store: FusionStore = MemoryStore() if request.param == "memory" else SqliteStore(tmp_path / "store.sqlite")
+    yield store
+    store.close()
+
+
+def test_what_was_put_is_what_is_read(store: FusionStore) -> None:
+    message = said("ant", 1, {11: 2, 22: 0, 33: 5})
+    outcome = store.put(message)
+    assert outcome.accepted.tolist() == list(KEYS)
+    assert outcome.stale.tolist() == []
+    words = store.words("ant")
+    assert words.keys.tolist() == list(KEYS)
+    assert words.counts.tolist() == [2, 0, 5]
+    assert words.gaussians.means_m.tobytes() == message.words.gaussians.means_m.tobytes()
+    assert words.gaussians.active.tolist() == message.words.gaussians.active.tolist()
+    assert store.agents() == ("ant",)
+
+
+def test_the_highest_revision_wins_and_an_equal_one_is_stale(store: FusionStore) -> None:
+    store.put(said("ant", 5, {11: 2, 22: 2}))
+    assert store.put(said("ant", 5, {11: 4})).stale.tolist() == [11]
+    assert store.put(said("ant", 4, {11: 4})).stale.tolist() == [11]
+    later = store.put(said("ant", 6, {11: 1, 33: 1}))
+    assert later.accepted.tolist() == [11, 33]
+    assert store.words("ant").counts.tolist() == [1, 2, 1]
+    assert store.highest_map_revision("ant") == 6
+    assert store.highest_map_revision("bee") == 0
+
+
+def test_a_tombstone_is_kept_so_that_an_older_word_cannot_come_back(store: FusionStore) -> None:
+    store.put(said("ant", 2, {11: 0}))
+    assert store.put(said("ant", 1, {11: 3})).stale.tolist() == [11]
+    assert store.words("ant").counts.tolist() == [0]
+
+
+def test_agents_do_not_touch_each_other(store: FusionStore) -> None:
+    store.put(said("ant", 9, {11: 2}))
+    store.put(said("bee", 1, {11: 1, 22: 1}))
+    stakes = store.stakes()
+    assert stakes.agents == ("ant", "bee")
+    assert stakes.agent.tolist() == [0, 1, 1]
+    assert stakes.keys.tolist() == [11, 11, 22]
+    assert stakes.map_revisions.tolist() == [9, 1, 1]
+    assert stakes.counts.tolist() == [2, 1, 1]
+    assert store.remove_agent("ant").tolist() == [11]
+    assert store.agents() == ("bee",)
+    assert len(store.words("ant")) == 0
+    assert store.remove_agent("nobody").tolist() == []
+
+
+def test_reading_some_voxels_is_reading_all_and_choosing(store: FusionStore) -> None:
+    store.put(said("ant", 1, {11: 2, 22: 3, 33: 0}))
+    store.put(said("bee", 1, {22: 1}))
+    wanted = np.array([33, 22, 99, 22], np.int64)
+    for agent_id, words in store.table(wanted).items():
+        expected = at_keys(store.words(agent_id), wanted)
+        assert words.keys.tolist() == expected.keys.tolist()
+        assert words.gaussians.means_m.tobytes() == expected.gaussians.means_m.tobytes()
+    assert store.stakes(wanted).keys.tolist() == [22, 33, 22]
+    assert len(store.stakes(np.zeros(0, np.int64)).keys) == 0
+
+
+def test_an_empty_message_changes_nothing(store: FusionStore) -> None:
+    assert len(store.put(said("ant", 1, {})).accepted) == 0
+    assert store.agents() == ()
+
+
+def test_a_revision_beyond_the_columns_is_refused_whole(store: FusionStore) -> None:
+    with pytest.raises(InvalidInputError, match="map_revision"):
+        store.put(said("ant", 2**63, {11: 1}))
+    assert store.agents() == ()
+
+
+def test_an_agent_has_one_session_and_the_charter_is_remembered(store: FusionStore) -> None:
+    assert store.mission_config() is None
+    mission_config = MissionConfig("mission", "world", 0.1)
+    store.set_mission_config(mission_config)
+    assert store.mission_config() == mission_config
+    store.save_session(SessionRecord("one", "ant"))
+    store.save_session(SessionRecord("two", "bee"))
+    store.save_session(SessionRecord("three", "ant"))
+    assert store.sessions() == (SessionRecord("three", "ant"), SessionRecord("two", "bee"))
+    store.end_session("three")
+    store.end_session("three")
+    assert store.sessions() == (SessionRecord("two", "bee"),)
+
+
+def test_threads_may_put_at_once(store: FusionStore) -> None:
+    def talk(agent_id: str) -> None:
+        for revision in range(20):
+            store.put(said(agent_id, revision, {11: 1, 22: revision % 3}))
+
+    threads = [Thread(target=talk, args=(name,)) for name in ("ant", "bee", "cat")]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert store.stakes().map_revisions.tolist() == [19] * 6
+
+
+def test_a_sqlite_store_survives_being_closed_and_opened(tmp_path: Path) -> None:
+    path = tmp_path / "store.sqlite"
+    store = SqliteStore(path)
+    store.put(said("ant", 3, {11: 2}))
+    store.save_session(SessionRecord("one", "ant"))
+    store.set_mission_config(MissionConfig("m", "w", 0.1))
+    store.close()
+    again = SqliteStore(path)
+    assert again.words("ant").counts.tolist() == [2]
+    assert again.sessions() == (SessionRecord("one", "ant"),)
+    assert again.mission_config() == MissionConfig("m", "w", 0.1)
+    again.close()
+
+
+CHILD = """
+import sys
+from pathlib import Path
+sys.path.insert(0, sys.argv[2])
+from test_fusion_stores import said
+from gausslite.fusion.sqlite_store import SqliteStore
+store = SqliteStore(Path(sys.argv[1]))
+for revision in range(1, 1_000_000):
+    store.put(said("ant", revision, {11: 3, 100 + revision: 2}, seed=revision))
+    print(revision, flush=True)
+"""
+
+
+def test_what_was_acknowledged_survives_a_kill(tmp_path: Path) -> None:
+    path = tmp_path / "store.sqlite"
+    child = subprocess.Popen(
+        [sys.executable, "-c", CHILD, str(path), str(Path(__file__).parent)], stdout=subprocess.PIPE, text=True
+    )
+    assert child.stdout is not None
+    acknowledged = 0
+    for line in child.stdout:
+        acknowledged = int(line)
+        if acknowledged >= 12:
+            child.send_signal(signal.SIGKILL)
+            break
+    acknowledged = max([acknowledged, *(int(line) for line in child.stdout if line.endswith("\n"))])
+    child.stdout.close()
+    child.wait()
+    store = SqliteStore(path)
+    words = store.words("ant")
+    assert set(range(101, 101 + acknowledged)) <= set(words.keys.tolist())
+    assert store.highest_map_revision("ant") in (acknowledged, acknowledged + 1)
+    assert words.counts.tolist()[0] == 3
+    store.close()
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [(b"no database at all, only text " * 40, "expected an undamaged GaussLite store"), (None, "another program's")],
+)
+def test_a_foreign_file_is_one_clear_error(tmp_path: Path, content: bytes | None, message: str) -> None:
+    path = tmp_path / "foreign.sqlite"
+    if content is None:
+        with sqlite3.connect(path) as db:
+            db.execute("CREATE TABLE songs (title TEXT)")
+        db.close()
+    else:
+        path.write_bytes(content)
+    with pytest.raises(StorageError, match=message) as caught:
+        SqliteStore(path)
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def _damaged(path: Path) -> None:
+    store = SqliteStore(path)
+    store.put(said("ant", 1, dict.fromkeys(range(60), 40)))
+    store.close()
+    data = bytearray(path.read_bytes())
+    data[4096 : len(data) // 2] = bytes(len(data) // 2 - 4096)
+    path.write_bytes(data)
+
+
+def _newer_schema(path: Path) -> None:
+    SqliteStore(path).close()
+    with sqlite3.connect(path) as db:
+        db.execute("PRAGMA user_version = 77")
+    db.close()
+
+
+@pytest.mark.parametrize(("spoil", "message"), [(_damaged, "undamaged"), (_newer_schema, "schema version 1, got 77")])
+def test_a_damaged_or_newer_store_is_one_clear_error(
+    tmp_path: Path, spoil: Callable[[Path], None], message: str
+) -> None:
+    path = tmp_path / "store.sqlite"
+    spoil(path)
+    with pytest.raises(StorageError, match=message) as caught:
+        SqliteStore(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_an_unwritable_place_is_one_clear_error(tmp_path: Path) -> None:
+    with pytest.raises(StorageError, match="cannot be opened"):
+        SqliteStore(tmp_path / "no" / "such" / "folder" / "store.sqlite")
+    with pytest.raises(StorageError):
+        SqliteStore(tmp_path)
+
+
+def test_a_second_server_on_the_same_file_is_told_so(tmp_path: Path) -> None:
+    first = SqliteStore(tmp_path / "store.sqlite")
+    with pytest.raises(StorageError, match="in use by another server"):
+        SqliteStore(tmp_path / "store.sqlite")
+    first.close()
+
+
+def test_a_full_disk_refuses_the_message_and_keeps_the_rest(tmp_path: Path) -> None:
+    store = SqliteStore(tmp_path / "store.sqlite", max_bytes=200_000)
+    store.put(said("ant", 1, {11: 3}))
+    with pytest.raises(StorageError, match="no room left"):
+        store.put(said("ant", 2, {11: 1, 22: 10_000}))
+    assert store.words("ant").counts.tolist() == [3]
+    store.put(said("ant", 3, {11: 2}))
+    assert store.words("ant").counts.tolist() == [2]
+    store.close()
+
+
+def test_gathering_rows_runs_through_every_run() -> None:
+    rows = gather_rows(np.array([5, 0, 9]), np.array([2, 0, 3], np.uint32))
+    assert rows.tolist() == [5, 6, 9, 10, 11]

@@ -1,0 +1,148 @@
+"""Joint refinement on a small scene: it learns where the map is seen, leaves the rest, and stops when told."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from sample_gaussians import plain_gaussians
+
+from gausslite.domain.camera import Camera
+from gausslite.domain.frame import Frame
+from gausslite.domain.gaussians import Gaussians
+from gausslite.errors import InvalidInputError, QuotaError
+from gausslite.fusion.joint_refinement import RefineProgress, RefineSettings, refine
+from gausslite.fusion.keyframes import KeyframePool, TeamKeyframe
+from gausslite.optimize.density import DensitySettings
+from gausslite.optimize.rates import ONLINE_RATES
+from gausslite.render.cpu import CpuRasterizer
+from gausslite.render.rasterizer import AdamSettings
+from gausslite.render.reference import ReferenceRasterizer
+
+CAMERA = Camera(30.0, 30.0, 12.0, 9.0, 24, 18)
+QUICK = RefineSettings(iterations=6, report_every=2, density=DensitySettings(densify_every=100, prune_every=100))
+
+
+def patch(rgb: float) -> Gaussians:
+    """A grey wall patch, four by four Gaussians at 1 m."""
+    grid = np.linspace(-0.15, 0.15, 4, dtype=np.float32)
+    x, y = np.meshgrid(grid, grid)
+    means = np.stack([x.ravel(), y.ravel(), np.ones(x.size)], axis=1)
+    return plain_gaussians(means, scales_m=0.05, rgb=rgb, active=False, target=np.arange(x.size))
+
+
+def view(index: int, grey: int, depth_m: float = 1.0) -> TeamKeyframe:
+    size = (CAMERA.height_px, CAMERA.width_px)
+    rgb, depth = np.full((*size, 3), grey, np.uint8), np.full(size, depth_m, np.float32)
+    return TeamKeyframe("ant", Frame(index, index, rgb, depth, CAMERA, np.eye(4)))
+
+
+def always(_: RefineProgress) -> bool:
+    return True
+
+
+def test_the_map_moves_towards_what_the_keyframes_show() -> None:
+    before = patch(0.2)
+    heard: list[RefineProgress] = []
+
+    def listen(progress: RefineProgress) -> bool:
+        heard.append(progress)
+        return True
+
+    after = refine(before, [view(1, 200), view(2, 200)], ReferenceRasterizer(), QUICK, listen)
+    assert after.rgb.mean() > before.rgb.mean() + 0.005
+    assert after.active.all()
+    assert (after.kappa > 0).any()
+    assert after.target.tolist() == before.target.tolist()
+    assert [progress.iteration for progress in heard] == [2, 4, 6]
+    assert heard[-1].loss < heard[0].loss
+    assert {progress.gaussians for progress in heard} == {16}
+
+
+def test_the_same_seed_gives_the_same_map() -> None:
+    views = [view(1, 200), view(2, 30)]
+    maps = [refine(patch(0.2), views, ReferenceRasterizer(), QUICK, always) for _ in range(2)]
+    assert maps[0].rgb.tobytes() == maps[1].rgb.tobytes()
+    assert maps[0].means_m.tobytes() == maps[1].means_m.tobytes()
+
+
+def test_gaussians_come_to_rest_between_views_that_contradict_each_other() -> None:
+    views = [view(1, 200), view(2, 30)]
+    undisturbed = DensitySettings(densify_every=1000, prune_every=1000)
+
+    def last_steps(adam: AdamSettings) -> float:
+        longer, shorter = (
+            refine(
+                patch(0.2),
+                views,
+                CpuRasterizer(1, "portable"),
+                RefineSettings(iterations=iterations, density=undisturbed, adam=adam),
+                always,
+            )
+            for iterations in (204, 200)
+        )
+        return float(np.abs(longer.rgb - shorter.rgb).mean())
+
+    assert last_steps(RefineSettings().adam) < 0.6 * last_steps(ONLINE_RATES)
+
+
+def test_what_stands_in_front_of_the_map_teaches_nothing() -> None:
+    with pytest.raises(InvalidInputError, match="1 of which none does"):
+        refine(patch(0.2), [view(1, 250, depth_m=0.5)], ReferenceRasterizer(), QUICK, always)
+
+
+def test_a_keyframe_weight_of_zero_teaches_nothing() -> None:
+    weightless = TeamKeyframe("ant", view(1, 200).frame, np.zeros((18, 24), np.float32))
+    with pytest.raises(InvalidInputError, match="none does"):
+        refine(patch(0.2), [weightless], ReferenceRasterizer(), QUICK, always)
+
+
+def test_it_stops_when_told_to() -> None:
+    heard = []
+
+    def stop_at_once(progress: RefineProgress) -> bool:
+        heard.append(progress.iteration)
+        return False
+
+    refine(patch(0.2), [view(1, 200)], ReferenceRasterizer(), QUICK, stop_at_once)
+    assert heard == [2]
+
+
+def test_growth_stays_under_the_cap_and_views_beyond_the_cache_still_teach() -> None:
+    eager = DensitySettings(densify_every=1, min_mean_gradient=0.0, prune_every=2, min_opacity=0.0)
+    settings = RefineSettings(iterations=6, headroom=2.0, max_gaussians=20, max_prepared_views=1, density=eager)
+    after = refine(patch(0.2), [view(1, 200), view(2, 200)], ReferenceRasterizer(), settings, always)
+    assert 16 < len(after) <= 20
+
+
+def test_a_map_whose_gaussians_all_fade_is_not_pruned_away() -> None:
+    strict = DensitySettings(densify_every=100, prune_every=1, min_opacity=1.1)
+    after = refine(
+        patch(0.2), [view(1, 200)], ReferenceRasterizer(), RefineSettings(iterations=2, density=strict), always
+    )
+    assert len(after) == 16
+
+
+def test_nothing_or_too_much_to_refine_is_refused() -> None:
+    with pytest.raises(InvalidInputError, match="got an empty one"):
+        refine(Gaussians.empty(), [view(1, 200)], ReferenceRasterizer(), QUICK, always)
+    with pytest.raises(QuotaError, match="at most 3 Gaussians, got 16"):
+        refine(patch(0.2), [view(1, 200)], ReferenceRasterizer(), RefineSettings(max_gaussians=3), always)
+    for wrong in ({"iterations": 0}, {"headroom": 0.5}, {"max_gaussians": 0}):
+        with pytest.raises(InvalidInputError, match="refine"):
+            RefineSettings(**wrong)
+
+
+def test_the_pool_keeps_the_newest_of_each_agent_and_replaces_a_resent_one() -> None:
+    pool = KeyframePool(max_per_agent=2, max_pixels=18 * 24)
+    for keyframe in (view(3, 1), view(1, 1), view(2, 1), view(3, 9)):
+        pool.add(keyframe)
+    pool.add(TeamKeyframe("aardvark", view(7, 1).frame))
+    assert [(k.agent_id, k.frame.index) for k in pool.keyframes()] == [("aardvark", 7), ("ant", 2), ("ant", 3)]
+    assert pool.keyframes()[-1].frame.rgb[0, 0, 0] == 9
+    assert (len(pool), pool.count("ant"), pool.count("bee")) == (3, 2, 0)
+    pool.remove_agent("ant")
+    assert len(pool) == 1
+    with pytest.raises(QuotaError, match="at most 1 pixels"):
+        KeyframePool(2, max_pixels=1).add(view(1, 1))
+    with pytest.raises(InvalidInputError, match="limits of at least 1"):
+        KeyframePool(max_per_agent=0, max_pixels=1)

@@ -1,0 +1,218 @@
+"""The mapper as a whole, on a tiny wall, on the native rasterizer."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from mapping_scenes import middle_relevance, wall_frame
+
+from gausslite.domain.relevance import RelevanceMap
+from gausslite.domain.state import part
+from gausslite.errors import InvalidInputError, ShapeError
+from gausslite.mapping.frame_scheduler import FrameScheduler, SchedulerSettings, Stage
+from gausslite.mapping.mapper import GaussianMapper
+from gausslite.mapping.policies import policy
+from gausslite.mapping.settings import (
+    ActivePhase,
+    Components,
+    KeyframeSettings,
+    MapperSettings,
+    OptimizationSettings,
+    SeedingSettings,
+)
+from gausslite.optimize.density import DensitySettings
+from gausslite.render.cpu import CpuRasterizer
+from gausslite.render.rasterizer import RGB, LossWeights
+
+SIZE = (48, 32)
+SMALL = MapperSettings(
+    max_gaussians=400,
+    seeding=SeedingSettings(first_frame_seeds=60_000, later_seeds=20_000),
+    keyframes=KeyframeSettings(every=2, window=3),
+    density=DensitySettings(densify_every=7, prune_every=5),
+)
+
+
+def mapper_of(settings: MapperSettings = SMALL, seed: int = 0) -> GaussianMapper:
+    return GaussianMapper(settings, CpuRasterizer(threads=1), seed)
+
+
+def map_wall(mapper: GaussianMapper, frames: int) -> None:
+    for index in range(frames):
+        frame = wall_frame(index, SIZE, shift_m=0.1 * index)
+        mapper.map_frame(frame, middle_relevance(frame))
+        assert mapper.count <= mapper.settings.max_gaussians
+
+
+def region_error(mapper: GaussianMapper) -> float:
+    frame = wall_frame(0, SIZE, shift_m=0.05)
+    drawn = mapper.render(frame.camera, frame.T_world_camera)
+    return float(np.abs(drawn.rgb - frame.rgb / 255.0)[middle_relevance(frame).roi].mean())
+
+
+def test_a_stray_reading_does_not_widen_the_scene() -> None:
+    mapper = mapper_of()
+    frame = wall_frame(0, SIZE)
+    frame.depth_m[3, 5] = 60.0
+    mapper.map_frame(frame, middle_relevance(frame))
+    farthest_m = mapper.settings.seeding.max_depth_m
+    assert mapper.state()["extent_m"] == pytest.approx([farthest_m / 3])
+
+
+def test_the_map_comes_to_look_like_the_wall() -> None:
+    mapper = mapper_of()
+    map_wall(mapper, 1)
+    early = region_error(mapper)
+    map_wall(mapper, 4)
+    assert region_error(mapper) < min(early, 0.12)
+    assert mapper.revision == 5
+
+
+def test_kappa_counts_active_phase_iterations_of_active_gaussians_only() -> None:
+    mapper = mapper_of()
+    map_wall(mapper, 2)
+    gaussians = mapper.gaussians()
+    assert not gaussians.kappa[~gaussians.active].any()
+    assert 0 < gaussians.kappa.max() <= 2 * SMALL.optimization.active_iterations
+    assert (gaussians.target[gaussians.active] == 0).all()
+
+
+@pytest.mark.parametrize(("loss", "alike"), [(MapperSettings().optimization.loss, True), (LossWeights(), False)])
+def test_gradients_are_as_large_in_the_active_phase_as_in_a_warm_up(loss: LossWeights, alike: bool) -> None:
+    sizes = []
+    for warm_ups in (0, 1):
+        trained = OptimizationSettings(warmup_iterations=warm_ups, active_iterations=1 - warm_ups, loss=loss)
+        mapper = mapper_of(replace(SMALL, optimization=trained))
+        map_wall(mapper, 1)
+        second_moment = part(mapper.state(), "table")["second_moment"]
+        sizes.append(float(np.median(second_moment[mapper.gaussians().active, RGB])))
+    # a mean over the mask, a ninth of the image, makes their squares many times as large
+    assert (0.5 < sizes[0] / sizes[1] < 2.0) is alike
+
+
+def test_where_no_view_shows_the_region_every_iteration_is_a_warm_up() -> None:
+    mapper = mapper_of()
+    frame = wall_frame(0, SIZE)
+    outcome = mapper.map_frame(frame, RelevanceMap.nothing(*frame.depth_m.shape))
+    assert outcome.iterations == 8
+    assert not mapper.gaussians().kappa.any()
+    assert not mapper.gaussians().active.any()
+
+
+def test_the_active_phase_finds_the_keyframes_that_show_the_region() -> None:
+    mapper = mapper_of()
+    map_wall(mapper, 1)
+    before = int(mapper.gaussians().kappa.max())
+    away = wall_frame(1, SIZE)
+    mapper.map_frame(away, RelevanceMap.nothing(*away.depth_m.shape))
+    assert mapper.gaussians().kappa.max() > before
+
+
+@pytest.mark.parametrize("phase", list(ActivePhase))
+def test_each_kind_of_active_phase_trains_the_region(phase: ActivePhase) -> None:
+    optimization = OptimizationSettings(warmup_iterations=0, active_iterations=8, active_phase=phase)
+    mapper = mapper_of(replace(SMALL, optimization=optimization, density=DensitySettings()))
+    frame = wall_frame(0, SIZE)
+    mapper.map_frame(frame, middle_relevance(frame))
+    still = mapper.gaussians()
+    untrained = np.isclose(still.opacities, 0.5, atol=1e-6)
+    assert not untrained[still.active & (still.kappa > 0)].any()
+    if phase is not ActivePhase.EXACT:
+        assert untrained[~still.active].all()
+    else:
+        assert not untrained[~still.active].all()
+
+
+def test_a_frame_without_depth_is_skipped_and_counted() -> None:
+    mapper = mapper_of()
+    frame = wall_frame(3, SIZE)
+    frame.depth_m[:] = 0.0
+    outcome = mapper.map_frame(frame, middle_relevance(frame))
+    assert outcome.skipped == "no pixel has a depth reading"
+    assert (outcome.index, outcome.iterations, mapper.count, mapper.revision, mapper.skipped) == (3, 0, 0, 0, 1)
+
+
+def test_a_relevance_map_of_another_size_is_refused() -> None:
+    with pytest.raises(ShapeError, match="relevance weight"):
+        mapper_of().map_frame(wall_frame(0, SIZE), RelevanceMap.nothing(8, 8))
+
+
+def test_the_same_seed_gives_the_same_map_and_another_seed_another() -> None:
+    maps = []
+    for seed in (0, 0, 1):
+        mapper = mapper_of(seed=seed)
+        map_wall(mapper, 3)
+        maps.append(mapper.gaussians())
+    np.testing.assert_array_equal(maps[0].means_m, maps[1].means_m)
+    np.testing.assert_array_equal(maps[0].kappa, maps[1].kappa)
+    assert len(maps[2]) != len(maps[0]) or not np.array_equal(maps[0].means_m, maps[2].means_m)
+
+
+def test_a_pace_replaces_the_number_of_iterations_and_counts_steps_by_their_names() -> None:
+    mapper = mapper_of()
+    # every look at this clock takes a second, and so does every step
+    clock = itertools.count()
+    pace = FrameScheduler(SchedulerSettings(seconds_per_frame=60.0, run_over=0.0), clock=lambda: float(next(clock)))
+    frame = wall_frame(0, SIZE)
+    pace.begin()
+    outcome = mapper.map_frame(frame, middle_relevance(frame), pace)
+    budget = pace.end()
+    assert 8 < outcome.iterations < 30
+    # an iteration is one second of work and some looks at the clock
+    assert budget.seconds <= 60.0 + 8.0
+    assert budget.steps_s[Stage.WARM_UP] + budget.steps_s[Stage.ACTIVE] == outcome.iterations
+    assert budget.steps_s[Stage.SEEDING] == budget.steps_s[Stage.VIEW] == 1.0
+
+
+def test_density_control_waits_for_time_but_not_for_ever() -> None:
+    settings = replace(SMALL, density=DensitySettings(densify_every=10, prune_every=1000))
+    frame, clock = wall_frame(0, SIZE), itertools.count()
+    mapper = mapper_of(settings)
+    pace = FrameScheduler(
+        SchedulerSettings(seconds_per_frame=100.0, min_iterations=0), clock=lambda: float(next(clock))
+    )
+    with pace.timing(Stage.DENSIFYING):
+        # it once took very long
+        next(itertools.islice(clock, 200, None))
+    densified = []
+    for _ in range(3):
+        pace.begin()
+        iterations = mapper.map_frame(frame, middle_relevance(frame), pace).iterations
+        densified.append((iterations, pace.end().steps_s.get(Stage.DENSIFYING, 0.0)))
+    assert densified[0][0] >= 20
+    assert densified[0][1] > 0
+
+
+def test_expected_depth_is_that_of_the_wall() -> None:
+    mapper = mapper_of(replace(SMALL, max_gaussians=1500, components=Components(sis=False)))
+    map_wall(mapper, 3)
+    frame = wall_frame(0, SIZE)
+    sight = mapper.look(frame)
+    assert sight is not None
+    depth_m = sight.depth_m
+    assert (depth_m > 0).mean() > 0.5
+    assert np.median(depth_m[depth_m > 0]) == pytest.approx(2.0, abs=0.05)
+
+
+def test_keyframes_are_offered_for_refinement() -> None:
+    mapper = mapper_of()
+    map_wall(mapper, 5)
+    assert [keyframe.frame.index for keyframe in mapper.keyframes()] == [0, 2, 4]
+
+
+def test_policies_by_name() -> None:
+    assert policy("task").components == Components()
+    assert policy("uniform").components == Components(sb=False, mvo=True, roi=False, sis=False, gfd=False)
+    with pytest.raises(InvalidInputError, match="task, uniform"):
+        policy("lavish")
+
+
+def test_iterations_scale_in_proportion() -> None:
+    more = OptimizationSettings().with_iterations(16)
+    assert (more.warmup_iterations, more.active_iterations) == (4, 12)
+    assert OptimizationSettings().with_iterations(0).iterations == 0
+    few = [OptimizationSettings().with_iterations(count) for count in (1, 2, 3)]
+    assert [(each.warmup_iterations, each.active_iterations) for each in few] == [(0, 1), (1, 1), (1, 2)]

@@ -1,0 +1,257 @@
+"""A saved run goes on bit for bit in another process, and a file that is none is one line."""
+
+from __future__ import annotations
+
+import json
+import struct
+import subprocess
+import sys
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mapping_scenes import wall_frame
+
+from gausslite.calibration.view_fit import PoseExposurePrior
+from gausslite.codec.state_file import MAGIC, VERSION, read_state, write_state
+from gausslite.domain.frame import Frame
+from gausslite.domain.region import BallRegion
+from gausslite.domain.state import State, part
+from gausslite.domain.task import Predicate, Relation, TaskGraph
+from gausslite.domain.voxel_batch import VoxelBatch
+from gausslite.domain.voxels import VoxelGrid
+from gausslite.errors import GaussLiteError, MapFileError, MismatchError
+from gausslite.mapping.checkpoint import generator_state, set_generator
+from gausslite.mapping.mapper import GaussianMapper
+from gausslite.mapping.sent_voxels import SentVoxelTracker
+from gausslite.mapping.settings import KeyframeSettings, MapperSettings, SeedingSettings
+from gausslite.mission.checkpoint import ResumeConfig, SavedRun, save_run
+from gausslite.mission.settings import MissionSettings
+from gausslite.mission.task_mapper import TaskMapper
+from gausslite.optimize.density import DensitySettings
+from gausslite.perception.ground_truth import RegionDetector
+from gausslite.perception.relevance_estimator import TaskRelevanceEstimator
+from gausslite.perception.tracker import TrackerSettings
+from gausslite.render.cpu import CpuRasterizer
+
+GRAPH = TaskGraph(
+    task_id="t",
+    text="Pick up the mug on the table",
+    targets=("mug",),
+    anchors=("table",),
+    relations=(Relation(Predicate.ON, "mug", "table"),),
+    warnings=(),
+)
+REGIONS = {"mug": BallRegion((0.1, -0.1, 2.0), 0.3), "table": BallRegion((0.0, 0.3, 2.0), 0.5)}
+FRAMES, CUT = 11, 5
+TERMS = ResumeConfig.of(MissionSettings(), task=GRAPH.text)
+
+
+def loop(max_gaussians: int = 400, window: int = 2) -> TaskMapper:
+    """Poses refined, density control every few iterations, a window smaller than the buffer, a buffer that thins."""
+    mapper_settings = MapperSettings(
+        max_gaussians=max_gaussians,
+        seeding=SeedingSettings(first_frame_seeds=60_000, later_seeds=20_000),
+        keyframes=KeyframeSettings(every=2, window=window, buffer=3, region_views=2),
+        density=DensitySettings(densify_every=7, prune_every=5),
+        view_prior=PoseExposurePrior(0.01, 0.5, 0.1, 0.05),
+    )
+    attention = TaskRelevanceEstimator(GRAPH, RegionDetector(REGIONS), TrackerSettings(max_frames=3))
+    mapper = GaussianMapper(mapper_settings, CpuRasterizer(threads=1), seed=3)
+    return TaskMapper(attention, mapper, SentVoxelTracker(VoxelGrid()))
+
+
+def frames(first: int, end: int) -> Iterator[Frame]:
+    return (wall_frame(i, (48, 32), shift_m=0.03 * i) for i in range(first, end))
+
+
+def words_of_run(run: TaskMapper, first: int, end: int) -> list[VoxelBatch | None]:
+    return [run.process(frame).words for frame in frames(first, end)]
+
+
+def assert_same(came: State, wanted: State) -> None:
+    assert set(came) == set(wanted)
+    for name in wanted:
+        assert came[name].dtype == wanted[name].dtype, name
+        assert came[name].shape == wanted[name].shape, name
+        assert came[name].tobytes() == wanted[name].tobytes(), name
+
+
+def fingerprint(run: TaskMapper, words: list[VoxelBatch | None]) -> dict[str, int]:
+    """What two processes can compare: a checksum of each array of the state, and of the words."""
+    sums = {name: zlib.crc32(array.tobytes()) for name, array in run.state().items()}
+    for i, each in enumerate(words):
+        assert each is not None
+        sums[f"words {i}"] = zlib.crc32(each.keys.tobytes() + each.gaussians.means_m.tobytes() + each.counts.tobytes())
+    return sums
+
+
+def go_on(path: str) -> None:
+    """In a process of its own: take the run up, map the rest and print the fingerprint."""
+    run, saved = loop(), SavedRun.read(Path(path))
+    saved.restore(run)
+    print(json.dumps(fingerprint(run, words_of_run(run, saved.last_index + 1, FRAMES))))
+
+
+def test_a_run_cut_in_two_gives_the_same_bits_as_one_in_one_go(tmp_path: Path) -> None:
+    whole = loop()
+    words = words_of_run(whole, 0, FRAMES)
+    first = loop()
+    words_of_run(first, 0, CUT)
+    save_run(tmp_path / "run.state", first, TERMS, CUT - 1)
+    code = f"import sys; sys.path[:0] = {sys.path!r}; import test_checkpoint; test_checkpoint.go_on(sys.argv[1])"
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(tmp_path / "run.state")], capture_output=True, text=True, timeout=120
+    )
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout) == fingerprint(whole, words[CUT:])
+    assert whole.state()["mapper/table/kappa"].max() > 0
+    assert len(whole.state()["mapper/keyframes/buffer"]) == 3
+
+
+def test_saving_changes_nothing_and_restoring_gives_back_what_was_saved(tmp_path: Path) -> None:
+    run, same = loop(), loop()
+    words_of_run(run, 0, CUT)
+    before = {name: array.copy() for name, array in run.state().items()}
+    save_run(tmp_path / "run.state", run, TERMS, CUT - 1)
+    assert_same(run.state(), before)
+    saved = SavedRun.read(tmp_path / "run.state")
+    saved.restore(same)
+    assert (saved.last_index, saved.terms) == (CUT - 1, TERMS)
+    assert_same(same.state(), before)
+
+
+@pytest.fixture
+def saved(tmp_path: Path) -> Path:
+    run, path = loop(), tmp_path / "run.state"
+    words_of_run(run, 0, 3)
+    save_run(path, run, TERMS, 2)
+    return path
+
+
+def test_other_terms_are_told_all_at_once(saved: Path) -> None:
+    run = SavedRun.read(saved)
+    run.require(TERMS)
+    other = ResumeConfig.of(MissionSettings(policy="uniform", rate_hz=4.0, max_gaussians=9), task="Find the chair")
+    with pytest.raises(MismatchError) as told:
+        run.require(other)
+    assert str(told.value) == (
+        f"{saved}: expected the options of the saved run, --max-gaussians '150000' (got '9'), --policy 'task' (got "
+        "'uniform'), --rate 'default' (got '4'), --task 'Pick up the mug on the table' (got 'Find the chair')"
+    )
+    # an option that only one of them knows counts as well
+    assert ResumeConfig({}).differences(ResumeConfig({"size": "1x2"})) == ("--size '1x2' (got '')",)
+
+
+def test_a_loop_that_is_too_small_is_told(saved: Path) -> None:
+    with pytest.raises(MapFileError, match="max_gaussians: expected at least"):
+        SavedRun.read(saved).restore(loop(max_gaussians=10))
+    with pytest.raises(MapFileError, match="expected at most 1, 2 and 3"):
+        SavedRun.read(saved).restore(loop(window=1))
+
+
+@pytest.mark.parametrize("terms", ["", "[1]", '{"a": 1}', "[" * 100_000, "\0"])
+def test_terms_that_are_none_are_told(terms: str, saved: Path) -> None:
+    state = read_state(saved)
+    write_state(saved, {**state, "about/terms": np.frombuffer(terms.encode(), np.uint8)})
+    with pytest.raises(MapFileError, match=r"run\.state: state terms: expected options"):
+        SavedRun.read(saved)
+
+
+def test_a_file_cut_anywhere_or_with_any_byte_turned_is_told(saved: Path) -> None:
+    data = saved.read_bytes()
+    damaged = saved.with_name("damaged.state")
+    places = [*range(0, 64), *np.linspace(64, len(data) - 1, 60).astype(int).tolist()]
+    for place in places:
+        damaged.write_bytes(data[:place])
+        with pytest.raises(MapFileError):
+            read_state(damaged)
+        damaged.write_bytes(data[:place] + bytes([data[place] ^ 0x40]) + data[place + 1 :])
+        with pytest.raises(MapFileError):
+            read_state(damaged)
+    damaged.write_bytes(data + b"more")
+    with pytest.raises(MapFileError, match="not whole"):
+        read_state(damaged)
+
+
+def forged(count: int, contents: bytes) -> bytes:
+    """A file whose sizes and checksum are right, whatever its table of contents says."""
+    size = 24 + len(contents) + 4
+    data = struct.pack("<8sIIQ", MAGIC, VERSION, count, size) + contents
+    return data + struct.pack("<I", zlib.crc32(data))
+
+
+@pytest.mark.parametrize(
+    ("count", "contents"),
+    [
+        (1 << 31, b""),
+        (1, struct.pack("<HBB", 1, 6, 1) + b"x" + struct.pack("<Q", 1 << 62)),
+        (1, struct.pack("<HBB", 1, 6, 2) + b"x" + struct.pack("<QQ", 1 << 63, 1 << 63)),
+        (1, struct.pack("<HBB", 1, 6, 255) + b"x"),
+        (1, struct.pack("<HBB", 1, 99, 0) + b"x"),
+        (1, struct.pack("<HBB", 65535, 6, 0) + b"x"),
+        (1, struct.pack("<HBB", 1, 1, 0) + b"\xff" + b"\0"),
+        (1, struct.pack("<HBB", 1, 0, 1) + b"x" + struct.pack("<Q", 1) + b"\7"),
+        (2, (struct.pack("<HBB", 1, 1, 0) + b"x") * 2 + b"\0\0"),
+        (0, b"left over"),
+    ],
+)
+def test_impossible_declarations_are_told_before_memory_is_taken(count: int, contents: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "forged.state"
+    path.write_bytes(forged(count, contents))
+    with pytest.raises(MapFileError, match=r"forged\.state: expected an undamaged saved run"):
+        read_state(path)
+
+
+@pytest.fixture(scope="module")
+def state(tmp_path_factory: pytest.TempPathFactory) -> State:
+    run, path = loop(), tmp_path_factory.mktemp("states") / "run.state"
+    words_of_run(run, 0, 2)
+    save_run(path, run, TERMS, 1)
+    return read_state(path)
+
+
+def forgeries(array: np.ndarray) -> Iterator[np.ndarray]:
+    """Another length, another type, and every byte the same."""
+    yield np.concatenate([array.ravel(), array.ravel(), np.zeros(1, array.dtype)])
+    yield array.astype(np.float64 if array.dtype != np.float64 else np.float32)
+    for byte in (0, 1) if array.dtype == np.bool_ else (0, 1, 127, 128, 255):
+        same = array.copy()
+        same.reshape(-1).view(np.uint8)[:] = byte
+        yield same
+
+
+def test_whatever_one_array_is_made_to_be_it_is_told_or_can_be_mapped_on(state: State) -> None:
+    saved = part(state, "loop")
+    told = 0
+    for name, array in saved.items():
+        for forged_array in (None, *forgeries(array)):
+            fresh = loop()
+            others = {other: each for other, each in saved.items() if other != name}
+            try:
+                fresh.restore(others if forged_array is None else {**others, name: forged_array})
+            except GaussLiteError:
+                told += 1
+                continue
+            words_of_run(fresh, 2, 3)
+    assert told > 3 * len(saved)
+
+
+def test_a_generator_goes_on_where_another_stood_even_in_the_middle_of_a_draw() -> None:
+    a, b = np.random.default_rng(5), np.random.default_rng(6)
+    a.integers(0, 2**32, 3, np.uint32)  # leaves half a draw behind
+    set_generator(b, generator_state(a))
+    np.testing.assert_array_equal(a.integers(0, 2**32, 9, np.uint32), b.integers(0, 2**32, 9, np.uint32))
+    np.testing.assert_array_equal(a.standard_normal(9), b.standard_normal(9))
+
+
+def test_all_types_and_shapes_come_back(tmp_path: Path) -> None:
+    arrays = {
+        f"{dtype}-{shape}": np.arange(int(np.prod(shape)), dtype=np.int64).reshape(shape).astype(dtype)
+        for dtype in ("?", "u1", "i2", "u4", "i8", "u8", "f4", "f8")
+        for shape in ((), (0,), (3,), (2, 0, 5), (2, 3, 4))
+    }
+    write_state(tmp_path / "all.state", arrays)
+    assert_same(read_state(tmp_path / "all.state"), arrays)

@@ -1,0 +1,74 @@
+"""Ctrl-C and a wrong place for the state lose nothing of a mapping run."""
+
+from __future__ import annotations
+
+import json
+import signal
+from pathlib import Path
+
+import pytest
+from tiny_sequences import write_seven_scenes
+
+from gausslite.cli.main import main
+from gausslite.datasets.sevenscenes import SevenScenesSource
+from gausslite.domain.frame import Frame
+from gausslite.interrupts import DeferredInterrupt
+
+pytest.importorskip("gausslite.render._kernels", reason="the native kernels are not built")
+
+
+def mapped(sequence: Path, out: Path, *more: str) -> int:
+    # nothing is looked for: these tests count which frames are read
+    common = ["--roi-ball", "0,0,2,0.4", "--threads", "1", "--max-gaussians", "150"]
+    common += ["--colour-camera", "none", "--view-error", "none"]
+    return main(["map", str(sequence), *common, "--out", str(out), *more])
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_ends_the_run_after_the_frame_at_hand_and_it_can_go_on(
+    number: signal.Signals, code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sequence = write_seven_scenes(tmp_path / "kitchen", tuple(range(0, 24, 4)))
+    state = str(tmp_path / "run.state")
+    assert mapped(sequence, tmp_path / "whole") == 0
+    read = SevenScenesSource.frame
+
+    def read_and_press(source: SevenScenesSource, position: int, size: tuple[int, int]) -> Frame:
+        if position == 2:
+            signal.raise_signal(number)
+        return read(source, position, size)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(SevenScenesSource, "frame", read_and_press)
+        assert mapped(sequence, tmp_path / "first", "--save-state", state) == code
+    report = json.loads((tmp_path / "first" / "report.json").read_text())
+    assert (report["frames"], report["stopped_by"]) == (3, "interrupted")
+    assert mapped(sequence, tmp_path / "rest", "--resume", state) == 0
+    assert (tmp_path / "rest" / "map.ply").read_bytes() == (tmp_path / "whole" / "map.ply").read_bytes()
+
+
+def test_a_second_ctrl_c_interrupts_at_once() -> None:
+    before = signal.getsignal(signal.SIGINT)
+    with DeferredInterrupt() as interrupt:
+        signal.raise_signal(signal.SIGINT)
+        assert interrupt.asked
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_a_folder_in_the_place_of_the_state_is_told_before_the_work(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    sequence = write_seven_scenes(tmp_path / "kitchen")
+    assert mapped(sequence, tmp_path / "out", "--save-state", str(tmp_path)) == 2
+    assert "expected the name of a file, got a folder" in capsys.readouterr().err
+    assert not (tmp_path / "out" / "map.ply").exists()
+
+
+def test_a_resumed_run_without_new_frames_saves_its_state_again(tmp_path: Path) -> None:
+    sequence = write_seven_scenes(tmp_path / "kitchen")
+    first, second = tmp_path / "first.state", tmp_path / "second.state"
+    assert mapped(sequence, tmp_path / "out", "--save-state", str(first)) == 0
+    assert mapped(sequence, tmp_path / "again", "--resume", str(first), "--save-state", str(second)) == 0
+    assert second.read_bytes() == first.read_bytes()

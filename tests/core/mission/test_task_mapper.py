@@ -1,0 +1,130 @@
+"""The loop of one robot, frame in, words out."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+from mapping_scenes import wall_frame
+
+from gausslite.domain.frame import Frame
+from gausslite.domain.region import BallRegion
+from gausslite.domain.relevance import RelevanceMap
+from gausslite.domain.state import State
+from gausslite.domain.voxels import VoxelGrid
+from gausslite.mapping.frame_scheduler import FrameScheduler, SchedulerSettings, SkippableStage, Stage
+from gausslite.mapping.mapper import GaussianMapper
+from gausslite.mapping.sent_voxels import SentVoxelTracker
+from gausslite.mapping.settings import MapperSettings, SeedingSettings
+from gausslite.mission.task_mapper import TaskMapper
+from gausslite.perception.fixed_relevance import NoTaskEstimator, RegionRelevanceEstimator
+from gausslite.render.cpu import CpuRasterizer
+
+SIZE = (32, 24)
+BALL = RegionRelevanceEstimator([BallRegion((0.0, 0.0, 2.0), 0.5)])
+
+
+def small_mapper() -> GaussianMapper:
+    settings = MapperSettings(max_gaussians=200, seeding=SeedingSettings(later_seeds=20_000))
+    return GaussianMapper(settings, CpuRasterizer(threads=1))
+
+
+def test_words_of_all_frames_add_up_to_the_active_part_of_the_map() -> None:
+    loop = TaskMapper(BALL, small_mapper(), SentVoxelTracker(VoxelGrid(0.25)))
+    counts: dict[int, int] = {}
+    for index in range(3):
+        outcome = loop.process(wall_frame(index, SIZE, shift_m=0.1 * index))
+        assert outcome.words is not None
+        counts.update(zip(outcome.words.keys.tolist(), outcome.words.counts.tolist(), strict=True))
+    gaussians = loop.gaussians()
+    assert sum(counts.values()) == int(gaussians.active.sum()) > 0
+    assert (outcome.index, outcome.gaussians, outcome.iterations) == (2, len(gaussians), 8)
+    assert 0 < outcome.roi_share < 1
+    assert outcome.budget.seconds >= sum(outcome.budget.steps_s.values()) > 0
+
+
+def test_without_a_ledger_there_are_no_words() -> None:
+    assert TaskMapper(NoTaskEstimator(), small_mapper()).process(wall_frame(0, SIZE)).words is None
+
+
+def test_a_frame_without_depth_is_passed_over() -> None:
+    frame = wall_frame(0, SIZE)
+    frame.depth_m[:] = 0.0
+    outcome = TaskMapper(BALL, small_mapper(), SentVoxelTracker(VoxelGrid())).process(frame)
+    assert outcome.skipped == "no pixel has a depth reading"
+    assert outcome.words is None
+    assert outcome.iterations == 0
+
+
+def ticking_loop(seconds_per_frame: float) -> TaskMapper:
+    """A loop with a clock on which every look takes a second."""
+    clock = itertools.count()
+    pace = FrameScheduler(SchedulerSettings(seconds_per_frame, run_over=0.0), clock=lambda: float(next(clock)))
+    return TaskMapper(BALL, small_mapper(), SentVoxelTracker(VoxelGrid(0.25)), pace)
+
+
+def test_time_is_a_budget_for_the_whole_frame_words_included() -> None:
+    loop = ticking_loop(60.0)
+    for index in range(4):
+        budget = loop.process(wall_frame(index, SIZE, shift_m=0.1 * index)).budget
+        assert set(Stage) - {Stage.PRUNING, Stage.DENSIFYING, Stage.DRAWING, Stage.REEVALUATION} <= set(budget.steps_s)
+        # an iteration is one second of work and some looks at the clock
+        assert budget.seconds <= 60.0 + 8.0
+        assert not budget.short
+    # but for the iteration that every frame begins with
+    assert ticking_loop(1e-6).process(wall_frame(0, SIZE)).iterations == 1
+
+
+def test_the_same_clock_gives_the_same_map() -> None:
+    maps = []
+    for _ in range(2):
+        loop = ticking_loop(60.0)
+        for index in range(3):
+            loop.process(wall_frame(index, SIZE, shift_m=0.1 * index))
+        maps.append(loop.gaussians())
+    np.testing.assert_array_equal(maps[0].means_m, maps[1].means_m)
+    np.testing.assert_array_equal(maps[0].kappa, maps[1].kappa)
+
+
+class SlowAttention:
+    """Takes ten seconds for every frame, on a clock that nothing else moves."""
+
+    notes = ()
+
+    def __init__(self) -> None:
+        self.now_s = 0.0
+
+    def clock(self) -> float:
+        return self.now_s
+
+    def attend(self, frame: Frame, rendered_depth_m: np.ndarray | None = None) -> RelevanceMap:
+        self.now_s += 10.0
+        return BALL.attend(frame, rendered_depth_m)
+
+    def late(self) -> None:
+        return None
+
+    def look_back(self, frame: Frame) -> RelevanceMap:
+        return self.attend(frame)
+
+    def state(self) -> State:
+        return {}
+
+    def restore(self, state: State) -> None:
+        del state
+
+
+def test_words_that_had_to_wait_come_with_the_next_frame() -> None:
+    slow = SlowAttention()
+    pace = FrameScheduler(SchedulerSettings(5.0, reliefs=(SkippableStage.WORDS,)), slow.clock)
+    loop = TaskMapper(slow, small_mapper(), SentVoxelTracker(VoxelGrid(0.25)), pace)
+    counts: dict[int, int] = {}
+    waited = []
+    for index in range(5):
+        outcome = loop.process(wall_frame(index, SIZE, shift_m=0.1 * index))
+        waited.append(outcome.words is None)
+        assert outcome.budget.short
+        if outcome.words is not None:
+            counts.update(zip(outcome.words.keys.tolist(), outcome.words.counts.tolist(), strict=True))
+    assert waited == [False, True, False, True, False]
+    assert sum(counts.values()) == int(loop.gaussians().active.sum()) > 0

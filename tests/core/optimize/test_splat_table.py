@@ -1,0 +1,99 @@
+"""The table of splats: conversions, optimiser state across every change, and the cap."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from sample_gaussians import some_gaussians
+
+from gausslite.errors import InvalidInputError, QuotaError, ShapeError
+from gausslite.optimize.parameters import SplatTable, gaussians_to_rows, rows_to_gaussians
+
+
+def test_physical_values_survive_the_way_through_raw_rows() -> None:
+    before = some_gaussians(50)
+    after = rows_to_gaussians(gaussians_to_rows(before), before.active, before.kappa, before.target)
+    for name in ("means_m", "quats_wxyz", "scales_m", "opacities", "rgb"):
+        np.testing.assert_allclose(getattr(after, name), getattr(before, name), rtol=1e-5, atol=1e-6)
+    for name in ("active", "kappa", "target"):
+        np.testing.assert_array_equal(getattr(after, name), getattr(before, name))
+
+
+def test_rows_stay_finite_for_opacities_of_zero_and_one_and_scales_of_zero() -> None:
+    flat = some_gaussians(2)
+    flat.opacities[:] = (0.0, 1.0)
+    flat.scales_m[:] = 0.0
+    assert np.isfinite(gaussians_to_rows(flat)).all()
+
+
+def test_memory_is_aligned_and_reserved_once() -> None:
+    table = SplatTable(100)
+    address = table.rows.__array_interface__["data"][0]
+    assert address % 64 == 0
+    table.append(some_gaussians(60))
+    table.keep(np.arange(60) % 2 == 0)
+    table.append(some_gaussians(70))
+    assert table.rows.__array_interface__["data"][0] == address
+    assert (table.count, table.room) == (100, 0)
+
+
+def test_append_beyond_the_cap_is_refused_and_changes_nothing() -> None:
+    table = SplatTable(10)
+    table.append(some_gaussians(8))
+    with pytest.raises(QuotaError, match="at most 2"):
+        table.append(some_gaussians(3))
+    assert table.count == 8
+
+
+def test_keep_moves_only_the_last_rows_with_their_optimiser_state() -> None:
+    table = SplatTable(20)
+    table.append(some_gaussians(20))
+    table.first_moment[:] = np.arange(20)[:, None]
+    table.second_moment[:] = 100 + np.arange(20)[:, None]
+    rows, kappa = table.rows.copy(), table.kappa.copy()
+    mask = np.random.default_rng(1).random(20) < 0.6
+    table.keep(mask)
+    stood = np.arange(mask.sum())
+    stood[~mask[: len(stood)]] = len(stood) + np.flatnonzero(mask[len(stood) :])
+    assert set(stood) == set(np.flatnonzero(mask))
+    np.testing.assert_array_equal(table.rows, rows[stood])
+    np.testing.assert_array_equal(table.kappa, kappa[stood])
+    np.testing.assert_array_equal(table.first_moment[:, 0], stood)
+    np.testing.assert_array_equal(table.second_moment[:, 0], 100 + stood)
+
+
+def test_append_keeps_the_state_of_the_others_and_starts_fresh_where_rows_were_used_before() -> None:
+    table = SplatTable(20)
+    table.append(some_gaussians(20))
+    table.first_moment[:] = 7.0
+    table.second_moment[:] = 8.0
+    table.keep(np.arange(20) < 10)
+    table.append(some_gaussians(5))
+    assert (table.first_moment[:10] == 7.0).all()
+    assert (table.second_moment[:10] == 8.0).all()
+    assert not table.first_moment[10:].any()
+    assert not table.second_moment[10:].any()
+
+
+def test_to_gaussians_copies() -> None:
+    table = SplatTable(5)
+    table.append(some_gaussians(5))
+    copied = table.to_gaussians(np.array([4, 1]))
+    table.rows[:] = 0.0
+    table.kappa[:] = 0
+    expected = some_gaussians(5).take(np.array([4, 1]))
+    np.testing.assert_allclose(copied.means_m, expected.means_m)
+    np.testing.assert_array_equal(copied.kappa, expected.kappa)
+
+
+@pytest.mark.parametrize("capacity", [10**12, 10**18, 10**30])
+def test_more_than_memory_is_refused_by_name(capacity: int) -> None:
+    with pytest.raises(InvalidInputError, match="max_gaussians: expected as many as there is memory for"):
+        SplatTable(capacity)
+
+
+def test_bad_arguments_are_named() -> None:
+    with pytest.raises(InvalidInputError, match="capacity"):
+        SplatTable(0)
+    with pytest.raises(ShapeError, match="keep mask"):
+        SplatTable(3).keep(np.ones(2, np.bool_))

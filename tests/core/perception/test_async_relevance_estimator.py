@@ -1,0 +1,159 @@
+"""Detection beside mapping: never waited for, one at a time, and what it found belongs to the frame it was made on."""
+
+from __future__ import annotations
+
+from concurrent.futures import Executor
+
+import numpy as np
+import pytest
+from deferred_executor import WorkInHand
+from mapping_scenes import wall_frame
+
+from gausslite.domain.frame import Frame
+from gausslite.domain.region import BallRegion
+from gausslite.domain.relevance import Detection
+from gausslite.domain.task import TaskGraph
+from gausslite.errors import ModelFileError
+from gausslite.mapping.mapper import GaussianMapper
+from gausslite.mapping.settings import KeyframeSettings, MapperSettings
+from gausslite.mission.task_mapper import TaskMapper
+from gausslite.perception.ground_truth import RegionDetector
+from gausslite.perception.relevance_estimator import AsyncRelevanceEstimator, TaskRelevanceEstimator
+from gausslite.perception.tracker import TrackerSettings
+from gausslite.render.cpu import CpuRasterizer
+
+SIZE = (64, 48)
+MUG = BallRegion((0.0, 0.0, 2.0), 0.4)
+TASK = TaskGraph("id", "a task", ("mug",), (), ())
+
+
+class BrokenDetector:
+    warnings = ()
+
+    def detect(self, frame: Frame, queries: tuple[str, ...]) -> list[Detection]:
+        raise ModelFileError("model: broken")
+
+
+def frame_at(index: int) -> Frame:
+    return wall_frame(index, SIZE, shift_m=0.02 * index)
+
+
+def beside(executor: Executor, every: int = 3) -> AsyncRelevanceEstimator:
+    return AsyncRelevanceEstimator(TASK, RegionDetector({"mug": MUG}), executor, TrackerSettings(max_frames=every))
+
+
+def test_nothing_is_marked_until_the_first_detection_is_there() -> None:
+    executor = WorkInHand()
+    attention = beside(executor)
+    assert not any(attention.attend(frame_at(index)).roi.any() for index in range(3))
+    executor.run_next()
+    frame = frame_at(3)
+    truth, carried = MUG.mask(frame), attention.attend(frame).roi
+    assert (truth & carried).sum() / (truth | carried).sum() > 0.8
+
+
+def test_late_relevance_is_that_of_the_frame_it_was_made_on() -> None:
+    executor = WorkInHand()
+    attention = beside(executor)
+    frames = [frame_at(index) for index in range(3)]
+    for frame in frames:
+        attention.attend(frame)
+        assert attention.late() is None
+    executor.run_next()
+    attention.attend(frame_at(3))
+    late = attention.late()
+    assert late is not None
+    assert late.frame is frames[0]
+    assert late.lag_frames == 3
+    at_once = TaskRelevanceEstimator(TASK, RegionDetector({"mug": MUG})).attend(frames[0])
+    np.testing.assert_array_equal(late.relevance.target, at_once.target)
+    attention.attend(frame_at(4))
+    assert attention.late() is None
+
+
+def test_one_detection_runs_at_a_time_and_the_newest_keyframe_waits() -> None:
+    executor = WorkInHand()
+    attention = beside(executor, every=2)
+    for index in range(9):
+        attention.attend(frame_at(index))
+        assert executor.frames == [0]
+    assert attention.notes == ("detector too slow: 3 keyframes were overtaken",)
+    executor.run_next()
+    attention.attend(frame_at(9))
+    assert executor.frames == [8]
+
+
+def test_a_detector_that_is_quick_enough_sees_the_same_keyframes_as_one_that_is_waited_for() -> None:
+    executor = WorkInHand()
+    attention = beside(executor)
+    seen = []
+    for index in range(10):
+        attention.attend(frame_at(index))
+        seen += executor.frames
+        while executor.jobs:
+            executor.run_next()
+    assert seen == [0, 3, 6, 9]
+
+
+def test_what_the_detector_raises_comes_with_a_later_frame() -> None:
+    executor = WorkInHand()
+    attention = AsyncRelevanceEstimator(TASK, BrokenDetector(), executor)
+    attention.attend(frame_at(0))
+    executor.run_next()
+    with pytest.raises(ModelFileError, match="broken"):
+        attention.attend(frame_at(1))
+
+
+class BrokenOnce(RegionDetector):
+    """Fails the first time."""
+
+    failed = False
+
+    def detect(self, frame: Frame, queries: tuple[str, ...]) -> list[Detection]:
+        if not self.failed:
+            self.failed = True
+            raise MemoryError("a moment without memory")
+        return super().detect(frame, queries)
+
+
+def test_what_the_detector_raises_on_an_earlier_frame_is_raised_once_and_the_frame_looked_at_again() -> None:
+    executor, earlier = WorkInHand(), frame_at(0)
+    attention = AsyncRelevanceEstimator(TASK, BrokenOnce({"mug": MUG}), executor)
+    assert attention.look_back(earlier) is None
+    executor.run_next()
+    with pytest.raises(MemoryError, match="a moment"):
+        attention.look_back(earlier)
+    assert attention.look_back(earlier) is None
+    executor.run_next()
+    relevance = attention.look_back(earlier)
+    assert relevance is not None
+    np.testing.assert_array_equal(relevance.roi, MUG.mask(earlier))
+
+
+def test_a_keyframe_of_the_window_is_given_its_late_relevance() -> None:
+    executor = WorkInHand()
+    mapper = GaussianMapper(
+        MapperSettings(max_gaussians=500, keyframes=KeyframeSettings(every=2, window=2)), CpuRasterizer(threads=1)
+    )
+    loop = TaskMapper(beside(executor, every=9), mapper)
+    first = loop.process(frame_at(0))
+    assert first.detection_lag_frames is None
+    assert not mapper.keyframes()[0].relevance.roi.any()
+    executor.run_next()
+    second = loop.process(frame_at(1))
+    assert second.detection_lag_frames == 1
+    np.testing.assert_array_equal(mapper.keyframes()[0].relevance.roi, MUG.mask(frame_at(0)))
+    assert mapper.gaussians().kappa.any()
+
+
+def test_a_frame_that_left_the_window_is_not_revised() -> None:
+    executor = WorkInHand()
+    mapper = GaussianMapper(
+        MapperSettings(max_gaussians=500, keyframes=KeyframeSettings(every=1, window=2)), CpuRasterizer(threads=1)
+    )
+    loop = TaskMapper(beside(executor, every=9), mapper)
+    for index in range(4):
+        loop.process(frame_at(index))
+    executor.run_next()
+    assert loop.process(frame_at(4)).detection_lag_frames == 4
+    assert not mapper.keyframes()[0].relevance.roi.any()

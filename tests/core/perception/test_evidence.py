@@ -1,0 +1,192 @@
+"""An object counts once there is evidence for it: a layer of depth of its own, sightings that agree, no empty looks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+
+from gausslite.domain.camera import Camera
+from gausslite.domain.frame import Frame
+from gausslite.domain.relevance import Detection
+from gausslite.domain.task import Predicate, Relation, TaskGraph
+from gausslite.errors import InvalidInputError
+from gausslite.perception.evidence import EvidenceSettings, Outlook
+from gausslite.perception.foreground import foreground_mask
+from gausslite.perception.object_map import Landmark, ObjectMap, Observation
+from gausslite.perception.relations import SpatialSettings
+from gausslite.perception.relevance_estimator import TaskRelevanceEstimator
+from gausslite.perception.spatial import SpatialFilter
+from gausslite.perception.tracker import TrackerSettings
+
+CAMERA = Camera(100.0, 100.0, 80.0, 60.0, 160, 120)
+WHOLE = np.ones((120, 160), np.bool_)
+
+
+def frame_at(x_m: float = 0.0, index: int = 0, wall_m: float = 2.0) -> Frame:
+    T_world_camera = np.eye(4)
+    T_world_camera[0, 3] = x_m
+    depth_m = np.full((120, 160), wall_m, np.float32)
+    return Frame(index, 0, np.zeros((120, 160, 3), np.uint8), depth_m, CAMERA, T_world_camera)
+
+
+def seen_from_the_origin(z_m: float = 2.0, score: float = 0.4) -> Landmark:
+    grid = np.stack(np.meshgrid(np.linspace(-0.2, 0.2, 9), np.linspace(-0.2, 0.2, 9)), axis=-1).reshape(-1, 2)
+    points_m = np.column_stack([grid, np.full(len(grid), z_m)])
+    return Landmark.from_sighting(Observation.of_points("mug", points_m, np.zeros(3), score))
+
+
+@dataclass
+class Script:
+    """A detector that answers call after call with what it was given: a score, or None for nothing."""
+
+    scores: Sequence[float | None]
+    calls: int = 0
+    warnings: tuple[str, ...] = field(default=())
+
+    def detect(self, frame: Frame, queries: Sequence[str]) -> list[Detection]:
+        score = self.scores[min(self.calls, len(self.scores) - 1)]
+        self.calls += 1
+        mask = np.zeros(frame.depth_m.shape, np.bool_)
+        mask[50:70, 70:90] = True
+        return [] if score is None else [Detection("mug", score, (70.0, 50.0, 90.0, 70.0), mask)]
+
+
+def lit(scores: Sequence[float | None], frames: int, max_frames: int = 1) -> list[bool]:
+    detector = Script(scores)
+    attention = TaskRelevanceEstimator(
+        TaskGraph("id", "find the mug", ("mug",), (), ()), detector, TrackerSettings(max_frames=max_frames)
+    )
+    return [bool(attention.attend(frame_at(index=index)).roi.any()) for index in range(frames)]
+
+
+def test_what_is_seen_through_a_chairs_slats_is_not_the_chair():
+    depth_m = np.full((120, 160), 1.5, np.float32)
+    depth_m[:, ::4] = 3.0
+    depth_m[0, 1] = 0.0
+    front = foreground_mask(WHOLE, depth_m)
+    assert np.array_equal(front, (depth_m == 1.5) | (depth_m == 0.0))
+
+
+def test_a_few_pixels_between_do_not_join_a_bottle_to_the_wall_behind():
+    depth_m, mask = np.full((120, 160), 2.2, np.float32), np.zeros((120, 160), np.bool_)
+    mask[40:70, 70:80] = True
+    depth_m[40:66, 70:80] = 1.9
+    depth_m[66, 70:80] = np.linspace(1.9, 2.2, 10)
+    assert np.array_equal(foreground_mask(mask, depth_m), mask & (depth_m < 1.97))
+
+
+def test_a_table_that_recedes_is_one_layer():
+    depth_m = np.broadcast_to(np.linspace(0.8, 4.0, 120, dtype=np.float32)[:, None], (120, 160))
+    assert np.array_equal(foreground_mask(WHOLE, depth_m), WHOLE)
+
+
+def test_a_mask_without_depth_is_left_alone():
+    assert np.array_equal(foreground_mask(WHOLE, np.zeros((120, 160), np.float32)), WHOLE)
+
+
+def test_a_faint_detection_counts_from_its_second_sighting_and_a_sure_one_at_once():
+    assert lit([0.4], 3) == [False, True, True]
+    assert lit([0.9], 3) == [True, True, True]
+    assert lit([0.4, None], 3) == [False, False, False]
+
+
+def test_after_a_first_faint_detection_the_next_frame_is_looked_at_too():
+    assert lit([0.4], 6, max_frames=5) == [False, True, True, True, True, True]
+    settled, unsettled = Script([None]), Script([0.4, None])
+    for detector, calls in ((settled, 1), (unsettled, 2)):
+        attention = TaskRelevanceEstimator(TaskGraph("id", "find the mug", ("mug",), (), ()), detector)
+        for index in range(5):
+            attention.attend(frame_at(index=index))
+        assert detector.calls == calls
+
+
+def test_detections_that_miss_an_object_do_not_unmake_it_at_once():
+    assert lit([0.9, None, None, None, 0.4], 5) == [True, True, True, False, True]
+    assert lit([0.9, None, None, 0.9, None, None, None], 7) == [True] * 6 + [False]
+
+
+def test_what_most_looks_at_its_place_missed_is_not_believed():
+    assert not any(lit([0.4, *[None] * 9, 0.4], 11))
+
+
+@pytest.mark.parametrize(
+    ("frame", "shown"),
+    [
+        (frame_at(), True),
+        (frame_at(wall_m=3.0), True),  # it is gone: its place is in view
+        (frame_at(wall_m=1.0), False),  # something stands before it
+        (frame_at(wall_m=0.0), False),  # nothing is known there
+        (frame_at(x_m=3.0), False),  # out of view
+    ],
+)
+def test_a_view_misses_only_what_it_could_show(frame, shown):
+    assert Outlook(frame, frame.depth_m).shows_place_of(seen_from_the_origin()) is shown
+
+
+def test_nobody_is_blamed_for_not_seeing_from_farther_than_ever():
+    away = frame_at(wall_m=9.0)
+    away.T_world_camera[2, 3] = -3.0
+    assert not Outlook(away, away.depth_m).shows_place_of(seen_from_the_origin())
+
+
+def test_the_order_of_sightings_does_not_matter_for_what_is_known():
+    rng = np.random.default_rng(0)
+    sightings = [
+        Observation.of_points("mug", rng.uniform(-0.1, 0.1, (200, 3)), np.array([0.0, 0.0, -z]), score)
+        for z, score in ((1.0, 0.3), (2.0, 0.7), (1.5, 0.5))
+    ]
+    for order in ((0, 1, 2), (2, 0, 1)):
+        memory = ObjectMap()
+        for number in order:
+            memory.observe([sightings[number]])
+        memory.observe([], lambda each: True)
+        (mug,) = memory.objects
+        assert (mug.seen, mug.missed, mug.best_score) == (3, 1, 0.7)
+        assert mug.farthest_m == pytest.approx(2.0, abs=0.05)
+
+
+def cloud(phrase: str, score: float, *low_and_high_m: tuple[float, float]) -> Observation:
+    axes = [np.arange(low, high, 0.03) for low, high in low_and_high_m]
+    points_m = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 3)
+    return Observation.of_points(phrase, points_m, np.zeros(3), score)
+
+
+def closest_chair() -> SpatialFilter:
+    relation = Relation(Predicate.CLOSEST_TO, "chair", "table")
+    graph = TaskGraph("id", "the chair closest to the table", ("chair",), ("table",), (relation,))
+    return SpatialFilter(graph, (0.0, -1.0, 0.0), SpatialSettings())
+
+
+def test_the_closest_is_told_from_a_part_of_the_table():
+    at_its_side, at_its_end = (
+        cloud("chair", 0.9, (0.6, 0.9), (-0.3, 0.3), (0.45, 0.5)),
+        cloud("chair", 0.9, (-0.7, -0.6), (-0.3, 0.3), (-0.2, 0.2)),
+    )
+    parts = [cloud("table", 0.9, (-0.4, right_m), (0.0, 0.05), (-0.4, 0.4)) for right_m in (0.9, 1.6)]
+    for part in parts:
+        kept = closest_chair()
+        kept.observe([part, at_its_side, at_its_end])
+        assert kept.keep(at_its_side)
+        assert not kept.keep(at_its_end)
+
+
+def test_a_faint_candidate_does_not_decide_which_is_the_closest():
+    table = cloud("table", 0.9, (-0.4, 0.4), (0.0, 0.05), (-0.4, 0.4))
+    faint, sure = (
+        cloud("chair", score, (x_m, x_m + 0.3), (-0.3, 0.3), (0.0, 0.3)) for score, x_m in ((0.3, 0.5), (0.9, 1.5))
+    )
+    kept = closest_chair()
+    for _ in range(3):
+        kept.observe([table, faint, sure])
+    assert kept.believes(faint)
+    assert kept.keep(sure)
+    assert not kept.keep(faint)
+
+
+@pytest.mark.parametrize("settings", [{"min_seen": 0}, {"sure_score": -0.1}, {"min_share": 1.1}])
+def test_settings_are_checked(settings):
+    with pytest.raises(InvalidInputError):
+        EvidenceSettings(**settings)

@@ -1,0 +1,220 @@
+"""RelevanceEstimator on a made-up room: keyframes, re-projection, and the relations of Sec. III-B.3."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from gausslite.domain.camera import Camera
+from gausslite.domain.frame import Frame
+from gausslite.domain.region import BallRegion
+from gausslite.domain.relevance import NO_TARGET
+from gausslite.domain.task import Predicate, Relation, TaskGraph
+from gausslite.errors import InvalidInputError
+from gausslite.perception.fixed_relevance import RegionRelevanceEstimator
+from gausslite.perception.ground_truth import RegionDetector
+from gausslite.perception.object_map import Observation
+from gausslite.perception.relations import SpatialSettings
+from gausslite.perception.relevance_estimator import TaskRelevanceEstimator
+from gausslite.perception.spatial import SpatialFilter, best_depth_m
+from gausslite.perception.tracker import TrackerSettings
+from gausslite.perception.vectors import classes_for
+
+CAMERA = Camera(100.0, 100.0, 80.0, 60.0, 160, 120)
+UP = (0.0, -1.0, 0.0)
+
+
+def frame_at(x_m: float = 0.0, index: int = 0, turn_deg: float = 0.0) -> Frame:
+    """A wall 2 m ahead, seen from a camera that has moved sideways and turned about the vertical."""
+    T_world_camera = np.eye(4)
+    angle = np.radians(turn_deg)
+    T_world_camera[:3, :3] = [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
+    T_world_camera[0, 3] = x_m
+    rays_x = (np.arange(160) + 0.5 - 80) / 100
+    depth = 2.0 / (np.cos(angle) - np.sin(angle) * rays_x)
+    depth_m = np.broadcast_to(depth, (120, 160)).astype(np.float32)
+    return Frame(index, 0, np.zeros((120, 160, 3), np.uint8), depth_m, CAMERA, T_world_camera)
+
+
+def graph_of(*relations: Relation, targets: tuple[str, ...] = ("mug",)) -> TaskGraph:
+    anchors = tuple(dict.fromkeys(each.anchor for each in relations))
+    return TaskGraph("id", "a task", targets, anchors, relations)
+
+
+def sighting(phrase: str, *centre_m: float, radius_m: float = 0.1) -> Observation:
+    rng = np.random.default_rng(0)
+    return Observation.of_points(phrase, np.asarray(centre_m) + rng.uniform(-radius_m, radius_m, (300, 3)))
+
+
+@dataclass
+class CountingDetector:
+    """Counts its calls; the masks come from regions."""
+
+    inner: RegionDetector
+    calls: int = 0
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        return self.inner.warnings
+
+    def detect(self, frame, queries):
+        self.calls += 1
+        return self.inner.detect(frame, queries)
+
+
+MUG = BallRegion((0.0, 0.0, 2.0), 0.2)
+
+
+def test_a_target_without_relations_is_marked():
+    attention = TaskRelevanceEstimator(graph_of(), RegionDetector({"mug_1": MUG}))
+    relevance = attention.attend(frame_at())
+    assert np.array_equal(relevance.roi, MUG.mask(frame_at()))
+    assert set(np.unique(relevance.target)) == {NO_TARGET, 0}
+
+
+def test_detection_runs_on_the_first_frame_on_motion_and_after_some_frames():
+    detector = CountingDetector(RegionDetector({"mug": MUG}))
+    attention = TaskRelevanceEstimator(graph_of(), detector, TrackerSettings(max_frames=4))
+    calls = []
+    for index, (x_m, turn_deg) in enumerate(
+        [(0, 0), (0.1, 0), (0.2, 0), (0.2, 16), (0.2, 16), (1.3, 16), *[(1.3, 16)] * 4]
+    ):
+        attention.attend(frame_at(x_m, index, turn_deg))
+        calls.append(detector.calls)
+    assert calls == [1, 1, 1, 2, 2, 3, 3, 3, 3, 4]
+
+
+@pytest.mark.parametrize(("x_m", "turn_deg"), [(0.2, 0.0), (-0.3, 0.0), (0.1, 8.0)])
+def test_between_detections_the_mask_follows_the_object(x_m, turn_deg):
+    detector = CountingDetector(RegionDetector({"mug": MUG}))
+    attention = TaskRelevanceEstimator(graph_of(), detector)
+    attention.attend(frame_at())
+    moved = frame_at(x_m, 1, turn_deg)
+    truth, carried = MUG.mask(moved), attention.attend(moved).roi
+    assert detector.calls == 1
+    assert (truth & carried).sum() / (truth | carried).sum() > 0.85
+
+
+def test_an_object_that_leaves_the_view_is_not_carried_over():
+    attention = TaskRelevanceEstimator(graph_of(), RegionDetector({"mug": MUG}), TrackerSettings(max_translation_m=9))
+    attention.attend(frame_at())
+    assert not attention.attend(frame_at(5.0, 1)).roi.any()
+
+
+def test_without_depth_nothing_is_marked():
+    frame = frame_at()
+    dark = Frame(0, 0, frame.rgb, np.zeros_like(frame.depth_m), CAMERA, frame.T_world_camera)
+    assert not TaskRelevanceEstimator(graph_of(), RegionDetector({"mug": MUG})).attend(dark).roi.any()
+
+
+def test_the_maps_depth_comes_before_the_sensors():
+    sensor, rendered = np.full((2, 2), 3.0, np.float32), np.array([[1, 0], [0, 2]], np.float32)
+    assert best_depth_m(sensor, rendered).tolist() == [[1, 3], [3, 2]]
+    assert best_depth_m(sensor, None) is sensor
+
+
+def test_a_target_is_kept_while_its_anchor_was_never_seen_and_that_is_said():
+    graph = graph_of(Relation(Predicate.ON, "mug", "table"))
+    attention = TaskRelevanceEstimator(graph, RegionDetector({"mug": MUG}))
+    assert attention.attend(frame_at()).roi.any()
+    assert "anchor 'table' not seen yet: its targets are kept" in attention.notes
+
+
+def test_an_anchor_is_remembered_after_it_left_the_view():
+    kept = SpatialFilter(graph_of(Relation(Predicate.NEAR, "mug", "sink")), UP, SpatialSettings())
+    kept.observe([sighting("sink", 0, 0, 0)])
+    kept.observe([])
+    assert kept.keep(sighting("mug", 0.9, 0, 0))
+    assert not kept.keep(sighting("mug", 1.2, 0, 0))
+
+
+@pytest.mark.parametrize(
+    ("centre_m", "expected"),
+    [((0, -0.3, 0), True), ((0.4, -0.3, 0), True), ((0, 0.3, 0), False), ((0.8, -0.3, 0), False)],
+)
+def test_on_means_higher_and_not_aside(centre_m, expected):
+    kept = SpatialFilter(graph_of(Relation(Predicate.ON, "mug", "table")), UP, SpatialSettings())
+    kept.observe([sighting("table", 0, 0, 0)])
+    assert kept.keep(sighting("mug", *centre_m)) is expected
+
+
+def test_on_a_long_table_means_over_its_footprint():
+    kept = SpatialFilter(graph_of(Relation(Predicate.ON, "mug", "table")), UP, SpatialSettings())
+    x, z = np.meshgrid(np.linspace(-1, 1, 80), np.linspace(-0.4, 0.4, 40))
+    kept.observe([Observation.of_points("table", np.stack([x.ravel(), np.zeros(x.size), z.ravel()], axis=1))])
+    assert kept.keep(sighting("mug", 0.9, -0.1, 0.3, radius_m=0.04))
+    assert not kept.keep(sighting("mug", 1.4, -0.1, 0.3, radius_m=0.04))
+
+
+def test_closest_to_is_one_candidate_of_all_that_were_seen():
+    kept = SpatialFilter(
+        graph_of(Relation(Predicate.CLOSEST_TO, "chair", "table"), targets=("chair",)), UP, SpatialSettings()
+    )
+    near, far = sighting("chair", 0.8, 0, 0), sighting("chair", 2.0, 0, 0)
+    kept.observe([sighting("table", 0, 0, 0), far])
+    assert kept.keep(far)
+    kept.observe([near, far])
+    kept.observe([near])
+    assert kept.keep(near)
+    assert not kept.keep(far)
+
+
+def test_any_relation_of_several_is_enough():
+    near_sink, near_stove = (Relation(Predicate.NEAR, "mug", anchor) for anchor in ("sink", "stove"))
+    kept = SpatialFilter(graph_of(near_sink, near_stove), UP, SpatialSettings())
+    kept.observe([sighting("sink", 0, 0, 0), sighting("stove", 5, 0, 0)])
+    assert kept.keep(sighting("mug", 5.5, 0, 0))
+    assert not kept.keep(sighting("mug", 2.5, 0, 0))
+
+
+def test_partial_views_of_one_table_grow_into_its_true_centre():
+    kept = SpatialFilter(graph_of(Relation(Predicate.NEAR, "mug", "table")), UP, SpatialSettings())
+    for _ in range(3):
+        for left in (-1.0, -0.6, -0.2):
+            x, z = np.meshgrid(np.arange(left, left + 1.2, 0.02), np.arange(-0.4, 0.4, 0.02))
+            kept.observe([Observation.of_points("table", np.stack([x.ravel(), np.zeros(x.size), z.ravel()], axis=1))])
+    (table,) = kept.remembered
+    assert table.seen == 9
+    assert np.abs(table.centroid_m - (0, 0, 0)).max() < 0.06
+
+
+def test_the_object_on_the_desk_is_not_the_desk():
+    regions = {"desk": BallRegion((0.3, 0.2, 2.0), 0.2), "book": BallRegion((0.3, -0.2, 2.0), 0.15)}
+    graph = graph_of(Relation(Predicate.ON, "object", "desk"), targets=("object",))
+    relevance = TaskRelevanceEstimator(graph, RegionDetector(regions)).attend(frame_at())
+    assert np.array_equal(relevance.roi, regions["book"].mask(frame_at()))
+
+
+def test_region_detector_answers_by_head_noun_and_says_what_it_cannot_find():
+    detector = RegionDetector({"mug_1": MUG, "mug_2": BallRegion((0.4, 0, 2), 0.1), "wall": BallRegion((0, 0, 2), 3)})
+    assert len(detector.detect(frame_at(), ["red mug"])) == 2
+    assert len(detector.detect(frame_at(), ["cup"])) == 2
+    assert len(detector.detect(frame_at(), ["object"])) == 2
+    assert detector.detect(frame_at(), ["umbrella"]) == []
+    assert detector.warnings == ("no region answers 'umbrella'; the regions are mug_1, mug_2, wall",)
+
+
+def test_region_attention_numbers_its_regions():
+    other = BallRegion((0.5, 0, 2.0), 0.1)
+    relevance = RegionRelevanceEstimator([MUG, other]).attend(frame_at())
+    assert np.array_equal(relevance.target == 1, other.mask(frame_at()))
+    with pytest.raises(InvalidInputError, match="at least one region"):
+        RegionRelevanceEstimator([])
+
+
+def test_nouns_find_classes_by_name_head_and_synonym():
+    names = ("person", "chair", "cup", "dining table", "couch")
+    assert classes_for("mug", names, None) == (2,)
+    assert classes_for("lawn chair", names, None) == (1,)
+    assert classes_for("wooden desk", names, None) == (3,)
+    assert classes_for("sofa", names, None) == (4,)
+    assert classes_for("umbrella", names, None) == ()
+    assert classes_for("thing", names, None) == (0, 1, 2, 3, 4)
+
+
+@pytest.mark.parametrize("settings", [{"up_axis": (0.0, 0.0, 0.0)}, {"max_frames": 0}, {"max_rotation_deg": -1.0}])
+def test_settings_are_checked(settings):
+    with pytest.raises(InvalidInputError):
+        TrackerSettings(**settings)

@@ -1,0 +1,140 @@
+"""While tables are lent the kernels remember where each row is; nothing that they draw or train may depend on it."""
+
+from __future__ import annotations
+
+from contextlib import nullcontext
+
+import numpy as np
+import pytest
+
+from gausslite.domain.camera import Camera
+from gausslite.errors import InvalidInputError, ShapeError
+from gausslite.render.cpu import CpuRasterizer
+from gausslite.render.rasterizer import AdamSettings, LossWeights, Subset, UpdateCounter
+
+kernels = pytest.importorskip("gausslite.render._kernels", reason="the native kernels are not built")
+
+CAMERA = Camera(75.0, 74.0, 50.3, 39.7, 101, 83)
+FAST = AdamSettings(means=5e-2, log_scales=2e-1, quats=1e-1, opacity_logits=2e-1, rgb=1e-1)
+"""Rates that throw Gaussians in and out of sight within a few steps."""
+
+
+def random_rows(n: int = 5000) -> np.ndarray:
+    rng = np.random.default_rng(0)
+    rows = np.zeros((n, 16), np.float32)
+    rows[:, :3] = rng.uniform((-2, -2, -0.5), (2, 2, 4), (n, 3))
+    rows[:, 3:6] = np.log(rng.uniform(0.005, 0.1, (n, 3)))
+    rows[:, 6:10] = rng.normal(size=(n, 4))
+    rows[:, 10] = rng.normal(0.0, 2.0, n)
+    rows[:, 11:14] = rng.random((n, 3))
+    return rows
+
+
+def pose(turned_rad: float) -> np.ndarray:
+    T_camera_world = np.eye(4)
+    T_camera_world[0, [0, 2]] = np.cos(turned_rad), np.sin(turned_rad)
+    T_camera_world[2, [0, 2]] = -np.sin(turned_rad), np.cos(turned_rad)
+    return T_camera_world
+
+
+def scattered_tiles(seed: int) -> np.ndarray:
+    return np.random.default_rng(seed).random((6, 7)) < 0.2
+
+
+def train(rasterizer: CpuRasterizer, lending: bool, loss: LossWeights) -> list[np.ndarray]:
+    """Steps of all kinds from several poses, in two rounds with a change of the rows between them."""
+    rng = np.random.default_rng(1)
+    size = (CAMERA.height_px, CAMERA.width_px)
+    view = rasterizer.prepare_view(
+        rng.integers(0, 256, (*size, 3), np.uint8),
+        rng.uniform(0, 4, size).astype(np.float32),
+        CAMERA,
+        (rng.random(size) < 0.5).astype(np.float32),
+    )
+    rows = random_rows()
+    lent = rows, np.zeros_like(rows), np.zeros_like(rows)
+    few = np.arange(0, len(rows), 3, dtype=np.uint32)
+    trainable = rng.random(len(rows)) < 0.5
+    seen = []
+    for _ in range(2):
+        with rasterizer.holding(*lent) if lending else nullcontext():
+            for i in range(12):
+                subset = (Subset(ids=few), Subset(), Subset(scattered_tiles(i)), Subset(scattered_tiles(i), few))[i % 4]
+                report = rasterizer.step(
+                    *lent, view, pose(0.3 * i), loss, FAST, i % 2 == 1, subset, trainable if i % 5 == 0 else None
+                )
+                seen.append(report.visible)
+        rows[::2, :3] = rows[::2, 2::-1]
+    return [*lent, *seen]
+
+
+@pytest.mark.parametrize("loss", [LossWeights(ssim=0.0), LossWeights()])
+@pytest.mark.parametrize("simd", kernels.usable_simd())
+def test_a_loan_changes_no_bit_however_fast_the_rows_move(simd: str, loss: LossWeights) -> None:
+    with_loan, without = (train(CpuRasterizer(2, simd), lending, loss) for lending in (True, False))
+    assert {len(ids) > 0 for ids in without[3:]} == {True}
+    for a, b in zip(with_loan, without, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_a_step_sees_what_its_arrays_hold_now_though_they_were_seen_before(masked: bool) -> None:
+    rng, rasterizer = np.random.default_rng(2), CpuRasterizer(2)
+    size = (CAMERA.height_px, CAMERA.width_px)
+    view = rasterizer.prepare_view(
+        rng.integers(0, 256, (*size, 3), np.uint8), np.full(size, 2.0, np.float32), CAMERA, np.ones(size, np.float32)
+    )
+    trained: list[list[np.ndarray]] = []
+    for fresh in (False, True):
+        rows = random_rows(800)
+        lent = rows, np.zeros_like(rows), np.zeros_like(rows)
+        counts, among, trainable = np.zeros(800, np.uint32), np.ones(800, bool), np.ones(800, bool)
+        T_camera_world, tally = np.eye(4), UpdateCounter(counts, among)
+        subset = Subset(np.ones((6, 7), bool))
+        assert subset.tiles is not None
+        with rasterizer.holding(*lent):
+            for i in range(6):
+                T_camera_world[:] = pose(0.3 * i)
+                subset.tiles[:] = scattered_tiles(i)
+                trainable[:], among[:] = np.arange(800) % 3 != i % 3, np.arange(800) % 2 == i % 2
+                told = (T_camera_world, subset, trainable, tally)
+                if fresh:
+                    told = (
+                        T_camera_world.copy(),
+                        Subset(subset.tiles.copy()),
+                        trainable.copy(),
+                        UpdateCounter(counts, among.copy()),
+                    )
+                rasterizer.step(*lent, view, told[0], LossWeights(), FAST, masked, *told[1:])
+        trained.append([*lent, counts])
+    for a, b in zip(*trained, strict=True):
+        np.testing.assert_array_equal(a, b)
+    assert trained[0][3].any()
+
+
+def test_what_is_wrong_is_refused_each_time_it_comes() -> None:
+    size = (CAMERA.height_px, CAMERA.width_px)
+    rasterizer, rows = CpuRasterizer(1), random_rows(10)
+    view = rasterizer.prepare_view(np.zeros((*size, 3), np.uint8), np.ones(size, np.float32), CAMERA)
+    lent, loss = (rows, np.zeros_like(rows), np.zeros_like(rows)), LossWeights()
+    few, tiles = Subset(ids=np.array([9], np.uint32)), Subset(np.ones((2, 2), bool))
+    with rasterizer.holding(*lent):
+        rasterizer.step(*lent, view, pose(0.0), loss, FAST, subset=few)
+        for _ in range(2):
+            with pytest.raises(ShapeError, match="subset tiles"):
+                rasterizer.step(*lent, view, pose(0.0), loss, FAST, subset=tiles)
+    fewer = tuple(table[:9].copy() for table in lent)
+    for lending in (rasterizer.holding(*fewer), nullcontext()):
+        with lending, pytest.raises(InvalidInputError, match="subset ids"):
+            rasterizer.step(*fewer, view, pose(0.0), loss, FAST, subset=few)
+
+
+@pytest.mark.parametrize("simd", kernels.usable_simd())
+@pytest.mark.parametrize("seed", range(4))
+def test_scattered_tiles_look_as_they_do_in_the_whole_image(seed: int, simd: str) -> None:
+    rasterizer, tiles = CpuRasterizer(2, simd), scattered_tiles(seed)
+    pixels = tiles.repeat(16, 0).repeat(16, 1)[: CAMERA.height_px, : CAMERA.width_px]
+    whole = rasterizer.forward(random_rows(), CAMERA, pose(0.1 * seed))
+    part = rasterizer.forward(random_rows(), CAMERA, pose(0.1 * seed), Subset(tiles))
+    np.testing.assert_array_equal(part.rgb, np.where(pixels[..., None], whole.rgb, 0))
+    np.testing.assert_array_equal(part.depth_m, np.where(pixels, whole.depth_m, 0))

@@ -1,0 +1,30 @@
+"""The sanitizers' script says in one line what it is missing."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+SCRIPT = Path(__file__).resolve().parents[3] / "tools" / "sanitize.sh"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ([], "sanitize: expected address or thread, got ''"),
+        (["memory"], "sanitize: expected address or thread, got 'memory'"),
+        (["address"], "sanitize: no such Python: python3"),
+        (["thread", "snake"], "sanitize: no such Python: snake"),
+    ],
+)
+def test_what_is_missing_is_one_line(arguments: list[str], said: str, tmp_path: Path) -> None:
+    bash, dirname = shutil.which("bash"), shutil.which("dirname")
+    assert bash is not None
+    assert dirname is not None
+    (tmp_path / "dirname").symlink_to(dirname)
+    command = [bash, str(SCRIPT), *arguments]
+    done = subprocess.run(command, env={"PATH": str(tmp_path)}, capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stderr) == (1, f"{said}\n")

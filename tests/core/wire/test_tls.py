@@ -1,0 +1,175 @@
+"""Encrypted services: who is believed, who may speak for which robot, and that nothing secret is ever said."""
+
+from __future__ import annotations
+
+import importlib
+import logging
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from certificates import SCRIPT, identity, make_certificates
+from fusion_team import GRID, team
+from sample_gaussians import plain_gaussians
+from serving import serving
+
+from gausslite.domain.voxel_operations import group_by_voxel
+from gausslite.errors import InvalidInputError, NotPermittedError, UnavailableError
+from gausslite.task.rules import RuleParser
+from gausslite.wire.clients import FusionClient, ParserClient
+from gausslite.wire.health import main as ask_health
+from gausslite.wire.spool import Spool
+from gausslite.wire.tls import Tls
+from gausslite.wire.uplink import Uplink
+from gausslite.wire.uplink_values import UplinkSettings
+from gausslite_parser.servicer import parser_service
+
+_FILES = (("cert", "server.pem"), ("key", "server.key"), ("ca", "ca.pem"))
+
+
+@pytest.fixture(scope="module")
+def certs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_certificates(tmp_path_factory.mktemp("certs"), "server", "husky-1", "husky-2")
+
+
+@pytest.fixture(scope="module")
+def strangers(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_certificates(tmp_path_factory.mktemp("strangers"), "server", "husky-1")
+
+
+def test_a_client_of_the_same_authority_is_served_and_others_are_not(certs: Path, strangers: Path) -> None:
+    with serving([parser_service(RuleParser())], tls=identity(certs, "server")) as server:
+        with ParserClient(server.address, tls=identity(certs, "husky-1")) as client:
+            assert client.parse("Pick up the mug").targets == ("mug",)
+        nameless = Tls(authorities=(certs / "ca.pem").read_bytes())
+        forged = Tls(identity(strangers, "husky-1").identity, nameless.authorities)
+        for other in (None, nameless, forged, identity(strangers, "husky-1")):
+            with ParserClient(server.address, deadline_s=1.0, tls=other) as client, pytest.raises(UnavailableError):
+                client.parse("Pick up the mug")
+
+
+def test_a_server_without_authorities_asks_for_no_certificate(certs: Path) -> None:
+    with serving([parser_service(RuleParser())], tls=Tls(identity(certs, "server").identity)) as server:
+        anyone = Tls(authorities=(certs / "ca.pem").read_bytes())
+        with ParserClient(server.address, tls=anyone) as client:
+            assert client.parse("Pick up the mug").targets == ("mug",)
+
+
+def test_a_server_of_another_name_is_not_believed(certs: Path, tmp_path: Path) -> None:
+    listen = f"unix:{tmp_path}/x.sock"
+    with serving([parser_service(RuleParser())], listen, identity(certs, "server")):
+        trusted = identity(certs, "husky-1")
+        with ParserClient(listen, tls=trusted) as client:
+            # a socket's host is localhost, which the certificate names
+            assert client.parse("Pick up the mug").targets == ("mug",)
+    with (
+        serving([parser_service(RuleParser())], "127.0.0.2:0", identity(certs, "server")) as elsewhere,
+        ParserClient(elsewhere.address, deadline_s=1.0, tls=identity(certs, "husky-1")) as client,
+        pytest.raises(UnavailableError),
+    ):
+        client.parse("Pick up the mug")
+
+
+def test_a_robot_speaks_for_itself_alone(certs: Path) -> None:
+    with (
+        team(tls=identity(certs, "server")) as fusion,
+        FusionClient(fusion.client.address, tls=identity(certs, "husky-1")) as client,
+    ):
+        with pytest.raises(NotPermittedError, match="'husky-2': expected a certificate that names it, got one for"):
+            client.join("husky-2", GRID)
+        assert client.join("husky-1", GRID).session_id
+
+
+def test_an_uplink_brings_its_words_over_an_encrypted_connection(certs: Path) -> None:
+    words = group_by_voxel(plain_gaussians(np.linspace(0, 1, 60)), GRID)
+    with team(tls=identity(certs, "server")) as fusion:
+        for name in ("husky-1", "husky-2"):
+            client = FusionClient(fusion.client.address, tls=identity(certs, name))
+            # the second one shows the first one's name
+            uplink = Uplink(client, "husky-1", Spool(None, "husky-1", GRID), GRID, UplinkSettings(interval_s=0.0))
+            uplink.offer(words)
+            assert uplink.drain(20.0) == (name == "husky-1")
+            counters = uplink.counters()
+            uplink.close()
+            assert ("expected a certificate that names it" in counters.stopped_because) == (name == "husky-2")
+        [agent] = fusion.client.status().agents
+        assert agent.gaussians == 20
+
+
+def test_health_is_asked_over_tls(certs: Path) -> None:
+    options = [f"--tls-{kind}={certs / name}" for kind, name in _FILES]
+    with serving([parser_service(RuleParser())], tls=identity(certs, "server")) as server:
+        assert ask_health([server.address, *options]) == 0
+        assert ask_health([server.address]) == 1
+    assert ask_health([server.address, options[0]]) == 2
+
+
+@pytest.mark.parametrize("module", ["gausslite_parser", "gausslite_fusion_server", "gausslite_agent"])
+def test_each_service_listens_encrypted_and_never_says_its_key(module: str, certs: Path, tmp_path: Path) -> None:
+    listen = f"unix:{tmp_path}/s.sock"
+    options = [f"--tls-{kind}={certs / name}" for kind, name in _FILES]
+    command = [sys.executable, "-m", module, "--listen", listen, *options]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stderr is not None
+        started = process.stderr.readline()
+        assert ask_health([listen, *options]) == 0
+        assert ask_health([listen]) == 1
+        process.send_signal(signal.SIGTERM)
+        said = started + process.stderr.read()
+        assert process.wait(30) == 0, said
+    assert f"listening on {listen}, encrypted" in started
+    for line in (certs / "server.key").read_text().splitlines():
+        assert line not in said
+
+
+@pytest.mark.parametrize("module", ["gausslite_parser", "gausslite_fusion_server", "gausslite_agent"])
+def test_wrong_files_are_one_line_before_anything_is_served(
+    module: str, certs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = importlib.import_module(f"{module}.program").run
+    cert, key, ca = (str(certs / name) for _, name in _FILES)
+    (tmp_path / "notes").write_text("remember the milk")
+    notes, other_key = str(tmp_path / "notes"), str(certs / "husky-1.key")
+    locked = tmp_path / "locked.key"
+    lock = ["openssl", "pkcs8", "-topk8", "-in", key, "-out", str(locked), "-passout", "pass:secret-word"]
+    subprocess.run(lock, check=True, timeout=60)
+    for options, told in (
+        (("--tls-cert", cert), "--tls-cert: expected a certificate and its key"),
+        (("--tls-key", key), "--tls-cert: expected a certificate and its key"),
+        (("--tls-ca", ca), "--tls-ca: expected --tls-cert and --tls-key beside it"),
+        (("--tls-cert", cert, "--tls-key", other_key), "KEY_VALUES_MISMATCH"),
+        (("--tls-cert", cert, "--tls-key", notes), f"expected a certificate and its key {notes}"),
+        (("--tls-cert", cert, "--tls-key", str(locked)), "expected a key without a passphrase"),
+        (("--tls-cert", str(certs), "--tls-key", key), "expected a PEM file, got a folder"),
+        (("--tls-cert", "/nowhere.pem", "--tls-key", key), "/nowhere.pem: expected a PEM file, got nothing"),
+        (("--tls-cert", cert, "--tls-key", key, "--tls-ca", notes), f"--tls-ca {notes}: expected certificates"),
+    ):
+        assert run(["--listen", "nowhere", *options]) == 2
+        [line] = capsys.readouterr().err.splitlines()
+        assert told in line
+
+
+def test_a_key_is_in_no_representation(certs: Path, caplog: pytest.LogCaptureFixture) -> None:
+    tls = identity(certs, "server")
+    logging.getLogger("test").error("%s %r", tls, [tls])
+    secret = (certs / "server.key").read_text().splitlines()[1]
+    assert secret not in caplog.text
+    assert "BEGIN PRIVATE KEY" not in caplog.text
+
+
+@pytest.mark.parametrize("arguments", [[], ["folder"], ["folder", "../x"], ["folder", "a b"]])
+def test_the_script_says_what_it_expects(arguments: list[str], tmp_path: Path) -> None:
+    done = subprocess.run(
+        ["bash", str(SCRIPT), *(argument.replace("folder", str(tmp_path)) for argument in arguments)],
+        capture_output=True, text=True, timeout=60,
+    )  # fmt: skip
+    assert done.returncode == 1
+    assert done.stderr.startswith("make_certificates: expected")
+
+
+def test_certificate_without_its_key_is_refused_by_name() -> None:
+    with pytest.raises(InvalidInputError, match="--tls-cert and --tls-key"):
+        Tls.read(Path("x.pem"), None, None)

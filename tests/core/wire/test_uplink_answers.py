@@ -1,0 +1,187 @@
+"""What the uplink does about each answer of a server, and about whatever is lost on the way."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from fusion_team import team, words
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from serving import serving
+from uplink_running import WAIT_S, ScriptedServer, accepted, held, rejected, said, scripted, uplink
+
+from gausslite.codec.subset_codec import decode_subset
+from gausslite.domain.voxel_batch import VoxelBatch
+from gausslite.domain.voxels import VoxelGrid
+from gausslite.errors import (
+    GaussLiteError,
+    InvalidInputError,
+    MismatchError,
+    NotPermittedError,
+    QuotaError,
+    SessionUnknownError,
+    StorageError,
+    UnavailableError,
+)
+from gausslite.fusion.memory_store import MemoryStore
+from gausslite.v1 import fusion_service_pb2 as pb
+from gausslite.v1 import fusion_service_pb2_grpc as pb_grpc
+from gausslite.wire.server import Service
+
+
+def test_a_server_that_lost_its_memory_gets_everything_again() -> None:
+    answers = iter([accepted(), SessionUnknownError("gone"), accepted()])
+    with scripted(lambda *_: next(answers)) as (server, address), uplink(address) as link:
+        link.offer(words({1: [5], 2: [7]}))
+        assert link.drain(WAIT_S)
+        link.offer(words({3: [1]}))
+        assert link.drain(WAIT_S)
+        assert link.counters().joins == 2
+    assert server.subsets[-1].keys.tolist() == words({1: [5], 2: [7], 3: [1]}).keys.tolist()
+    assert server.joined == [True, False]
+    assert server.revisions == sorted(set(server.revisions))
+    assert server.revisions[0] > 100
+
+
+def test_a_connection_that_breaks_is_tried_again() -> None:
+    answers = iter([UnavailableError("draining"), GaussLiteError("a bug"), accepted()])
+    with scripted(lambda *_: next(answers)) as (server, address), uplink(address) as link:
+        link.offer(words({1: [5]}))
+        assert link.drain(WAIT_S)
+        assert link.counters().connected
+    assert len(server.subsets) == 3
+
+
+def test_trouble_is_logged_once_and_so_is_its_end(caplog: pytest.LogCaptureFixture) -> None:
+    answers = iter([*[UnavailableError("draining")] * 3, accepted(), UnavailableError("draining"), accepted()])
+    caplog.set_level("INFO", logger="gausslite.wire.uplink")
+    with scripted(lambda *_: next(answers)) as (_, address), uplink(address) as link:
+        for voxel in (1, 2):
+            link.offer(words({voxel: [5]}))
+            assert link.drain(WAIT_S)
+    again = f"uplink: fusion server {address} takes words again"
+    assert [record.getMessage() for record in caplog.records] == ["uplink: draining; will go on trying", again] * 2
+
+
+def test_damage_is_sent_once_more_and_then_given_up() -> None:
+    answers = iter([rejected("CHECKSUM"), rejected("CHECKSUM")])
+    with scripted(lambda *_: next(answers)) as (server, address), uplink(address) as link:
+        link.offer(words({1: [5]}))
+        assert link.drain(WAIT_S)
+        assert link.counters().subsets_rejected == 1
+    np.testing.assert_array_equal(server.subsets[0].gaussians.means_m, server.subsets[1].gaussians.means_m)
+
+
+@pytest.mark.parametrize("answer", [InvalidInputError("no such codec"), None])
+def test_words_that_nobody_will_ever_take_are_dropped(answer: GaussLiteError | None) -> None:
+    answers = iter([] if answer is None else [answer])
+    bad = words({1: [5]})
+    if answer is None:
+        bad.gaussians.rgb[0] = np.nan
+    with scripted(lambda *_: next(answers, accepted())) as (server, address), uplink(address) as link:
+        link.offer(bad)
+        assert link.drain(WAIT_S)
+        assert link.counters().subsets_rejected == 1
+        link.offer(words({2: [5]}))
+        assert link.drain(WAIT_S)
+    assert server.subsets[-1].keys.tolist() == words({2: [5]}).keys.tolist()
+
+
+def test_a_rejected_subset_is_dropped_and_the_next_goes_on() -> None:
+    answers = iter([rejected("INVALID_INPUT"), accepted()])
+    with scripted(lambda *_: next(answers)) as (_, address), uplink(address) as link:
+        link.offer(words({1: [5]}))
+        assert link.drain(WAIT_S)
+        link.offer(words({2: [5]}))
+        assert link.drain(WAIT_S)
+        counters = link.counters()
+    assert (counters.subsets_rejected, counters.voxels_sent) == (1, 1)
+
+
+FULL = [rejected("QUOTA"), rejected("STORAGE"), QuotaError("full"), StorageError("full")]
+
+
+@pytest.mark.parametrize("exhausted", FULL)
+def test_a_full_server_gets_smaller_messages_later(exhausted: pb.SubsetOutcome | GaussLiteError) -> None:
+    answers = iter([exhausted])
+    cells = {cell: [1] * 5000 for cell in range(8)}
+    with scripted(lambda *_: next(answers, accepted())) as (server, address), uplink(address) as link:
+        link.offer(words(cells))
+        assert link.drain(WAIT_S)
+    assert [len(subset) for subset in server.subsets] == [8, 4, 4]
+    assert sorted(set(server.revisions)) == server.revisions
+
+
+@pytest.mark.parametrize("final", [MismatchError("another grid"), NotPermittedError("not you")])
+def test_what_only_the_operator_can_mend_stops_the_uplink(final: GaussLiteError) -> None:
+    with scripted(lambda *_: final) as (server, address), uplink(address) as link:
+        link.offer(words({1: [5]}))
+        assert not link.drain(WAIT_S)
+        assert link.counters().stopped_because == str(final)
+        link.offer(words({2: [5]}))
+        assert not link.drain(WAIT_S)
+        assert link.counters().voxels_waiting == 2
+    assert len(server.subsets) == 1
+
+
+def test_another_grid_is_told_by_the_real_server() -> None:
+    with team() as fusion, uplink(fusion.client.address, grid=VoxelGrid(0.2)) as link:
+        link.offer(words({}))
+        empty = np.zeros(1, np.uint64), np.zeros(1, np.uint32), words({}).gaussians
+        link.offer(VoxelBatch(VoxelGrid(0.2).keys(np.zeros((1, 3), np.float32)), *empty))
+        assert not link.drain(WAIT_S)
+        assert "0.2" in link.counters().stopped_because
+
+
+class FlakyServer(ScriptedServer):
+    """Stores what comes, but now and then loses the message, the ack, or everything."""
+
+    def __init__(self, faults: list[str]) -> None:
+        super().__init__(self._store_or_fail)
+        self.store = MemoryStore()
+        self._faults = iter(faults)
+
+    async def ContributeSubsets(self, request_iterator: Any, context: Any) -> Any:
+        async for request in request_iterator:
+            fault = next(self._faults, "none")
+            if fault == "message lost":
+                raise UnavailableError("cut")
+            subset, _ = decode_subset(request.subset)
+            if fault == "memory lost":
+                self.store = MemoryStore()
+                raise SessionUnknownError("restarted")
+            put = self.store.put(subset)
+            if fault == "ack lost":
+                raise UnavailableError("cut")
+            status = pb.SUBSET_STATUS_ACCEPTED if len(put.accepted) else pb.SUBSET_STATUS_STALE
+            outcome = pb.SubsetOutcome(sequence=request.sequence, status=status)
+            yield pb.ContributeSubsetsResponse(acknowledged=request.sequence, outcomes=[outcome])
+
+    def _store_or_fail(self, *_: object) -> pb.SubsetOutcome:
+        raise AssertionError
+
+
+FAULTS = st.lists(st.sampled_from(["none", "message lost", "ack lost", "memory lost"]), max_size=4)
+OFFERS = st.lists(
+    st.dictionaries(st.integers(0, 5), st.lists(st.integers(0, 9), max_size=3), max_size=4), min_size=1, max_size=4
+)
+
+
+@given(offers=OFFERS, faults=FAULTS, together=st.booleans())
+@settings(max_examples=25, deadline=None)
+def test_whatever_is_lost_on_the_way_the_server_ends_with_the_newest_words(
+    offers: list[dict[int, list[int]]], faults: list[str], together: bool
+) -> None:
+    server = FlakyServer(faults)
+    service = Service(
+        "gausslite.v1.FusionService",
+        lambda running: pb_grpc.add_FusionServiceServicer_to_server(server, running),
+    )
+    with serving([service]) as running, uplink(running.address) as link:
+        for offer in offers:
+            link.offer(words(offer))
+            assert together or link.drain(WAIT_S)
+        assert link.drain(WAIT_S)
+    assert held(server.store) == said(*offers)

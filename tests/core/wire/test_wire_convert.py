@@ -1,0 +1,190 @@
+"""Messages to nouns and back, and what is refused at that border."""
+
+from __future__ import annotations
+
+import contextlib
+import struct
+import zlib
+
+import cv2
+import numpy as np
+import pytest
+from google.protobuf.message import DecodeError
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gausslite.codec.subset_codec import DEFAULT_LIMITS, encode_subset
+from gausslite.domain.camera import Camera
+from gausslite.domain.frame import Frame
+from gausslite.domain.gaussians import Gaussians
+from gausslite.domain.image_bytes import image_size
+from gausslite.domain.task import Predicate, Relation, TaskGraph
+from gausslite.domain.voxel_batch import RoiSubset, VoxelBatch
+from gausslite.domain.voxels import AxisAlignedBox, VoxelGrid
+from gausslite.errors import GaussLiteError, InvalidInputError, PoseError, TaskError
+from gausslite.v1 import agent_service_pb2, gaussians_pb2, geometry_pb2, task_pb2
+from gausslite.wire import convert
+from gausslite.wire.clients import is_done
+from gausslite.wire.images import decode_colour, encode_colour, encode_depth
+
+CAMERA = Camera(500.0, 501.0, 32.5, 24.5, 64, 48)
+GRAPH = TaskGraph(
+    "id", "Pick up the mug on the table", ("mug",), ("table",), (Relation(Predicate.ON, "mug", "table"),), ("odd",)
+)
+
+
+def some_frame() -> Frame:
+    rng = np.random.default_rng(0)
+    smooth = cv2.resize(rng.integers(0, 256, (6, 8, 3), np.uint8), (64, 48))
+    depth_m = rng.uniform(0.1, 70.0, (48, 64)).astype(np.float32)
+    depth_m[0] = 0
+    T = np.eye(4)
+    T[:3, 3] = 1, 2, 3
+    return Frame(7, 123_456_789, np.ascontiguousarray(smooth), depth_m, CAMERA, T)
+
+
+@pytest.mark.parametrize("lossless", [True, False])
+def test_a_frame_survives(lossless: bool) -> None:
+    sent = some_frame()
+    got = convert.frame_from_message(convert.frame_to_message(sent, lossless))
+    assert (got.index, got.capture_time_ns, got.camera) == (sent.index, sent.capture_time_ns, sent.camera)
+    np.testing.assert_array_equal(got.T_world_camera, sent.T_world_camera)
+    in_reach = sent.depth_m < 65.535
+    assert np.abs(got.depth_m - sent.depth_m)[in_reach].max() <= 0.00051
+    assert not got.depth_m[~in_reach].any()
+    difference = np.abs(got.rgb.astype(int) - sent.rgb)
+    assert difference.max() == 0 if lossless else difference.mean() < 3
+
+
+def test_a_task_graph_survives() -> None:
+    relations = tuple(Relation(predicate, "mug", "table") for predicate in Predicate)
+    for graph in (GRAPH, TaskGraph("id", "", ("mug",), ("table",), relations)):
+        assert convert.graph_from_message(convert.graph_to_message(graph)) == graph
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"targets": []},
+        {"targets": [" "]},
+        {"targets": ["x" * 300]},
+        {"anchors": ["a"] * 100},
+        {"text": "x" * 5000},
+        {"relations": [task_pb2.Relation(predicate=task_pb2.PREDICATE_ON, target="mug", anchor="chair")]},
+        {"relations": [task_pb2.Relation(target="mug", anchor="table")]},
+        {"relations": [task_pb2.Relation(predicate=99, target="mug", anchor="table")]},  # type: ignore[arg-type]
+    ],
+)
+def test_a_graph_without_sense_is_refused(change: dict[str, object]) -> None:
+    message = convert.graph_to_message(GRAPH)
+    for name in change:
+        message.ClearField(name)  # type: ignore[arg-type]
+    message.MergeFrom(task_pb2.TaskGraph(**change))  # type: ignore[arg-type]
+    with pytest.raises(TaskError, match=r"^task "):
+        convert.graph_from_message(message)
+
+
+def bomb_png(width: int, height: int) -> bytes:
+    """A PNG that declares a huge image in few bytes."""
+    header = b"IHDR" + struct.pack(">IIBBBBB", width, height, 16, 0, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + header + struct.pack(">I", zlib.crc32(header))
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("colour", b"", "frame colour"),
+        ("colour", b"GIF89a", "frame colour"),
+        ("colour", bomb_png(60000, 60000), "expected the camera's 64x48, got 60000x60000"),
+        ("colour", bomb_png(64, 48), "damaged"),
+        ("depth_png", b"", "frame depth_png"),
+        ("depth_png", encode_colour(np.zeros((48, 64, 3), np.uint8), lossless=True), "16-bit PNG"),
+        ("depth_png", encode_depth(np.ones((24, 32), np.float32)), "got 32x24"),
+        ("camera", geometry_pb2.Camera(), "camera"),
+        ("camera", geometry_pb2.Camera(fx_px=1, fy_px=1, width_px=9000, height_px=9000), "pixels"),
+        ("camera", geometry_pb2.Camera(fx_px=1e-9, fy_px=1, width_px=64, height_px=48), "camera fx_px"),
+        ("camera", geometry_pb2.Camera(fx_px=1, fy_px=1, cy_px=1e30, width_px=64, height_px=48), "camera fy_px"),
+        ("t_world_camera", geometry_pb2.RigidTransform(row_major=[1.0]), "16 numbers"),
+    ],
+)
+def test_a_bad_frame_names_its_field(name: str, value: object, message: str) -> None:
+    encoded = convert.frame_to_message(some_frame())
+    encoded.ClearField(name)  # type: ignore[arg-type]
+    encoded.MergeFrom(geometry_pb2.EncodedFrame(**{name: value}))  # type: ignore[arg-type]
+    with pytest.raises(InvalidInputError, match=message):
+        convert.frame_from_message(encoded)
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("-inf"), 3.0, 1e200])
+def test_a_pose_that_is_not_rigid_is_refused(value: float) -> None:
+    encoded = convert.frame_to_message(some_frame())
+    encoded.t_world_camera.row_major[0] = value
+    with pytest.raises(PoseError, match="t_world_camera"):
+        convert.frame_from_message(encoded)
+
+
+@pytest.mark.parametrize("value", [4_649_776.0, -1e12, 1e300])
+def test_a_pose_too_far_from_the_worlds_origin_is_refused(value: float) -> None:
+    encoded = convert.frame_to_message(some_frame())
+    encoded.t_world_camera.row_major[7] = value
+    with pytest.raises(PoseError, match="within 10000 m of the world's origin"):
+        convert.frame_from_message(encoded)
+
+
+FRAME_BYTES = convert.frame_to_message(some_frame()).SerializeToString()
+
+
+@given(st.data())
+@settings(max_examples=200, deadline=None)
+def test_any_bytes_are_a_frame_or_a_deliberate_error(data: st.DataObject) -> None:
+    noisy = bytearray(FRAME_BYTES)
+    for _ in range(data.draw(st.integers(1, 4))):
+        noisy[data.draw(st.integers(0, len(noisy) - 1))] = data.draw(st.integers(0, 255))
+    with contextlib.suppress(GaussLiteError, DecodeError):
+        convert.frame_from_message(geometry_pb2.EncodedFrame.FromString(bytes(noisy)))
+
+
+@given(st.binary(max_size=200))
+@settings(max_examples=200, deadline=None)
+def test_image_sizes_are_read_from_any_bytes(noise: bytes) -> None:
+    for head in (b"", b"\xff\xd8", b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"):
+        image_size(head + noise)
+    with pytest.raises(InvalidInputError):
+        decode_colour(noise, 64, 48)
+
+
+def test_image_sizes() -> None:
+    image = np.zeros((48, 64, 3), np.uint8)
+    assert image_size(encode_colour(image)) == image_size(encode_colour(image, lossless=True)) == (64, 48)
+
+
+def test_a_map_block_is_checked() -> None:
+    grid = VoxelGrid()
+    words = VoxelBatch(np.array([5, 9]), np.zeros(2, np.uint64), np.zeros(2, np.uint32), Gaussians.empty())
+    subset = encode_subset(RoiSubset("a", "", 1, 4, words), grid)
+    provenance = gaussians_pb2.Provenance(agent_ids=["a", "b"], winner=[1, 0])
+    block = gaussians_pb2.MapBlock(revision=4, snapshot=True, last=True, subset=subset, provenance=provenance)
+    update = convert.map_update_from_message(block, DEFAULT_LIMITS, first=True)
+    assert update.winners == ("b", "a")
+    assert update.grid == grid
+    assert update.words is not None
+    assert update.words.keys.tolist() == [5, 9]
+    for winner in ([1], [1, 2]):
+        block.provenance.winner[:] = winner
+        with pytest.raises(InvalidInputError, match="provenance"):
+            convert.map_update_from_message(block, DEFAULT_LIMITS, first=True)
+    nothing = convert.map_update_from_message(gaussians_pb2.MapBlock(revision=4, last=True), DEFAULT_LIMITS, first=True)
+    assert nothing.words is None
+
+
+def test_a_box_survives_and_knows_what_it_holds() -> None:
+    box = AxisAlignedBox((-1.0, -1.0, -1.0), (1.0, 2.0, 3.0))
+    assert convert.box_from_message(convert.box_to_message(box)) == box
+    points = np.array([[0, 0, 0], [1, 2, 3], [1.1, 0, 0]], np.float32)
+    assert box.holds(points).tolist() == [True, True, False]
+
+
+def test_is_done() -> None:
+    status = agent_service_pb2.GetAgentStatusResponse
+    assert is_done(status(state=agent_service_pb2.AGENT_STATE_DONE))
+    assert not is_done(status(state=agent_service_pb2.AGENT_STATE_DRAINING))

@@ -1,0 +1,226 @@
+"""The robot under load: what a full queue drops, what idle time is used for, and what each is told."""
+
+from __future__ import annotations
+
+import itertools
+import sqlite3
+import threading
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from agent_running import SETTINGS, TASK, Gate, agent, ball_attention
+from fusion_team import CAMERA, GRID, frame, team
+
+from gausslite.domain.gaussians import Gaussians
+from gausslite.domain.voxel_batch import VoxelBatch
+from gausslite.errors import InvalidInputError, UnavailableError
+from gausslite.fusion.memory_store import MemoryStore
+from gausslite.task.rules import RuleParser
+from gausslite.v1 import agent_service_pb2 as pb
+from gausslite.wire.clients import FusionClient
+from gausslite.wire.spool import Purpose, Spool
+from gausslite.wire.uplink import Uplink
+from gausslite.wire.uplink_values import UplinkSettings
+from gausslite_agent.load import Drops, LoadSettings
+from gausslite_agent.mapping_worker import MappingWorker
+from gausslite_agent.status import Outcome
+
+
+def test_a_full_queue_drops_the_oldest_waiting_frame_and_says_so() -> None:
+    gate = Gate(ball_attention(RuleParser().parse(TASK)), threading.Event())
+    with agent(lambda _graph: gate, queue_frames=2) as a:
+        a.client.assign_task(TASK)
+        first = a.robot.submit(frame(0))
+        assert gate.reached.wait(20)
+        waiting = [a.robot.submit(frame(index)) for index in range(1, 5)]
+        gate.opened.set()
+        outcomes = [future.result(20).outcome for future in (first, *waiting)]
+    assert outcomes == [Outcome.MAPPED, Outcome.DROPPED, Outcome.DROPPED, Outcome.MAPPED, Outcome.MAPPED]
+    assert "queue of 2 frames" in waiting[0].result().reason
+
+
+def test_a_queue_may_drop_the_newest_frame_instead() -> None:
+    gate = Gate(ball_attention(RuleParser().parse(TASK)), threading.Event())
+    robot = MappingWorker(SETTINGS, GRID, lambda _graph: gate, load=LoadSettings(queue_frames=2, drops=Drops.NEWEST))
+    robot.assign(RuleParser().parse(TASK)).result(20)
+    first = robot.submit(frame(0))
+    assert gate.reached.wait(20)
+    waiting = [robot.submit(frame(index)) for index in range(1, 5)]
+    gate.opened.set()
+    outcomes = [future.result(20).outcome for future in (first, *waiting)]
+    robot.close()
+    assert outcomes == [Outcome.MAPPED, Outcome.MAPPED, Outcome.MAPPED, Outcome.DROPPED, Outcome.DROPPED]
+    assert "overload: 2 frames were dropped" in robot.status().load_notes
+
+
+def test_a_waiting_frame_nobody_asks_for_any_more_gives_way_like_any_other() -> None:
+    gate = Gate(ball_attention(RuleParser().parse(TASK)), threading.Event())
+    robot = MappingWorker(SETTINGS, GRID, lambda _graph: gate, load=LoadSettings(queue_frames=1))
+    robot.assign(RuleParser().parse(TASK)).result(20)
+    first = robot.submit(frame(0))
+    assert gate.reached.wait(20)
+    given_up = robot.submit(frame(1))
+    given_up.cancel()
+    last = robot.submit(frame(2))
+    gate.opened.set()
+    assert (first.result(20).outcome, given_up.result(20).outcome) == (Outcome.MAPPED, Outcome.DROPPED)
+    assert last.result(20).outcome == Outcome.MAPPED
+    robot.close()
+
+
+def test_a_frame_that_has_waited_has_less_time_so_that_the_queue_gets_shorter() -> None:
+    now_us = itertools.count(step=10)
+    settings = replace(SETTINGS, rate_hz=5.0, min_iterations=15)
+    robot = MappingWorker(settings, GRID, ball_attention, clock=lambda: (next(now_us) + stalled_us) / 1e6)
+    stalled_us = 0
+    robot.assign(RuleParser().parse(TASK)).result(20)
+    busy = threading.Event()
+    robot.do(lambda _mapper: busy.wait(20))
+    waited = [robot.submit(frame(index)) for index in range(3)]
+    stalled_us = 1_000_000
+    busy.set()
+    reports = [each.result(20) for each in waited]
+    status = robot.status()
+    robot.close()
+    assert [each.iterations for each in reports] == [15, 15, 15]
+    assert status.short == 0
+    assert all(each.age_s >= 1.0 + each.seconds for each in reports)
+    assert status.ages_s == tuple(each.age_s for each in reports)
+
+
+class SlowDisk(Spool):
+    """Takes a second for all that it is offered, on a clock that nothing else moves."""
+
+    now_s = 0.0
+
+    def offer(self, words: VoxelBatch, purpose: Purpose) -> None:
+        self.now_s += 1.0
+        super().offer(words, purpose)
+
+
+def test_what_a_frame_takes_to_tell_its_words_is_part_of_its_time() -> None:
+    with team(MemoryStore()) as fusion:
+        spool = SlowDisk(None, "robot", GRID)
+        uplink = Uplink(FusionClient(fusion.client.address), "robot", spool, GRID)
+        robot = MappingWorker(SETTINGS, GRID, ball_attention, uplink, clock=lambda: spool.now_s)
+        robot.assign(RuleParser().parse(TASK)).result(20)
+        report = robot.submit(frame(0)).result(20)
+        robot.close()
+        uplink.close()
+    assert (report.outcome, report.seconds, report.age_s) == (Outcome.MAPPED, 1.0, 1.0)
+
+
+def after_a_frame(robot: MappingWorker) -> Gaussians:
+    robot.assign(RuleParser().parse(TASK)).result(20)
+    robot.submit(frame(0)).result(20)
+    gaussians: Gaussians = robot.do(lambda mapper: mapper.gaussians()).result(20)
+    robot.close()
+    return gaussians
+
+
+def test_idle_time_is_trained_in_up_to_its_bound_and_work_comes_in_between() -> None:
+    left = [after_a_frame(MappingWorker(SETTINGS, GRID, ball_attention)) for _ in range(2)]
+    np.testing.assert_array_equal(left[0].opacities, left[1].opacities)
+    robot = MappingWorker(SETTINGS, GRID, ball_attention, load=LoadSettings(idle_iterations=5))
+    robot.assign(RuleParser().parse(TASK)).result(20)
+    robot.submit(frame(0)).result(20)
+    # each of these waits behind one iteration at most
+    trained = [robot.do(lambda mapper: mapper.gaussians()).result(20) for _ in range(9)]
+    status = robot.status()
+    assert (status.idle_iterations, status.iterations) == (5, 2)
+    assert not np.array_equal(left[0].opacities, trained[-1].opacities)
+    np.testing.assert_array_equal(trained[-2].opacities, trained[-1].opacities)
+    robot.submit(frame(1)).result(20)
+    robot.settle().result(20)
+    settled = robot.do(lambda mapper: mapper.gaussians()).result(20)
+    np.testing.assert_array_equal(settled.opacities, robot.do(lambda mapper: mapper.gaussians()).result(20).opacities)
+    assert robot.status().idle_iterations <= 10
+    robot.close()
+
+
+def fail() -> None:
+    raise MemoryError("a moment without memory")
+
+
+def test_an_idle_iteration_that_fails_is_logged_and_the_next_frame_is_followed_by_others(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    robot = MappingWorker(SETTINGS, GRID, ball_attention, load=LoadSettings(idle_iterations=3))
+    robot.assign(RuleParser().parse(TASK)).result(20)
+    with monkeypatch.context() as broken:
+        robot.do(lambda mapper: broken.setattr(mapper, "rehearse", fail)).result(20)
+        robot.submit(frame(0)).result(20)
+        robot.do(lambda _mapper: None).result(20)
+    assert "a moment without memory" in caplog.text
+    assert robot.status().idle_iterations == 0
+    robot.submit(frame(1)).result(20)
+    for _ in range(9):
+        robot.do(lambda _mapper: None).result(20)
+    assert robot.status().idle_iterations == 3
+    robot.close()
+
+
+def test_without_idle_iterations_the_map_stays_as_the_frame_left_it() -> None:
+    robot = MappingWorker(SETTINGS, GRID, ball_attention)
+    robot.assign(RuleParser().parse(TASK)).result(20)
+    robot.submit(frame(0)).result(20)
+    robot.settle().result(20)
+    assert robot.status().idle_iterations == 0
+    robot.close()
+
+
+@pytest.mark.parametrize("wrong", [{"queue_frames": 0}, {"idle_iterations": -1}])
+def test_load_settings_name_what_is_wrong(wrong: dict[str, int]) -> None:
+    with pytest.raises(InvalidInputError, match="expected"):
+        LoadSettings(**wrong)
+
+
+def test_frames_that_wait_when_the_agent_ends_are_dropped() -> None:
+    gate = Gate(ball_attention(RuleParser().parse(TASK)), threading.Event())
+    robot = MappingWorker(SETTINGS, GRID, lambda _graph: gate)
+    robot.assign(RuleParser().parse(TASK)).result(20)
+    futures = [robot.submit(frame(index)) for index in range(3)]
+    assert gate.reached.wait(20)
+    threading.Timer(0.05, gate.opened.set).start()
+    robot.close()
+    assert [future.result(0).outcome for future in futures] == [Outcome.MAPPED, Outcome.DROPPED, Outcome.DROPPED]
+    with pytest.raises(UnavailableError, match="ending"):
+        robot.do(lambda mapper: mapper.count)
+
+
+def test_a_frame_that_cannot_be_mapped_is_rejected_and_the_stream_goes_on() -> None:
+    opened = threading.Event()
+    opened.set()
+    fussy = Gate(
+        ball_attention(RuleParser().parse(TASK)), opened, fail_at=1, failure=InvalidInputError("points: too far")
+    )
+    with agent(lambda _graph: fussy) as a:
+        a.client.assign_task(TASK)
+        outcomes = list(a.client.ingest([frame(i, CAMERA) for i in range(3)]))
+        assert a.client.status().frames_rejected == 1
+    mapped, rejected = pb.FRAME_OUTCOME_MAPPED, pb.FRAME_OUTCOME_REJECTED
+    assert [each.outcome for each in outcomes] == [mapped, rejected, mapped]
+    assert outcomes[1].reason == "points: too far"
+
+
+def test_a_spool_without_room_ends_no_mission_and_all_is_told_once_it_has_some(tmp_path: Path) -> None:
+    store, spool = MemoryStore(), Spool(tmp_path / "robot.spool", "robot", GRID)
+    with team(store) as fusion:
+        uplink = Uplink(FusionClient(fusion.client.address), "robot", spool, GRID, UplinkSettings(interval_s=0.0))
+        with agent(uplink=uplink) as a:
+            a.client.assign_task(TASK)
+            limit = sqlite3.connect(tmp_path / "robot.spool")
+            limit.execute("CREATE TRIGGER full BEFORE INSERT ON words BEGIN SELECT RAISE(ABORT, 'disk full'); END")
+            outcomes = list(a.client.ingest([frame(0, CAMERA), frame(1, CAMERA)]))
+            assert [each.outcome for each in outcomes] == [pb.FRAME_OUTCOME_MAPPED] * 2
+            assert any("disk full" in note for note in a.client.status().notes)
+            limit.execute("DROP TRIGGER full")
+            limit.close()
+            list(a.client.ingest([frame(2, CAMERA)]))
+            assert not any("disk full" in note for note in a.client.status().notes)
+            assert uplink.drain(20.0)
+            active = a.robot.do(lambda mapper: mapper.roi_gaussians()).result()
+        uplink.close()
+    assert int(store.table()["robot"].counts.sum()) == len(active) > 0

@@ -1,0 +1,299 @@
+"""A whole mission: a played sequence ends in a map, a report and everything on the server."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import grpc
+import pytest
+from fusion_team import CAMERA, GRID, frame, team
+from tiny_yolo import write_tiny_yolo
+
+from gausslite.codec.ply import read_ply
+from gausslite.domain.camera import Camera
+from gausslite.domain.frame import Frame
+from gausslite.domain.region import BallRegion, Region
+from gausslite.errors import DatasetError, InvalidInputError, StorageError, TaskError
+from gausslite.fusion.memory_store import MemoryStore
+from gausslite.perception.fixed_relevance import RegionRelevanceEstimator
+from gausslite.task.rules import RuleParser
+from gausslite.v1.agent_service_pb2 import FRAME_OUTCOME_MAPPED, AssignTaskRequest
+from gausslite.v1.agent_service_pb2_grpc import AgentServiceStub
+from gausslite.wire.clients import AgentClient, FusionClient
+from gausslite.wire.process import run_service
+from gausslite.wire.server import serve_until_stopped
+from gausslite.wire.spool import Spool
+from gausslite.wire.uplink import Uplink
+from gausslite.wire.uplink_values import UplinkSettings
+from gausslite_agent.mapping_worker import MappingWorker
+from gausslite_agent.mission_runner import AgentMission, MissionState
+from gausslite_agent.replay_source import ReplaySource
+from gausslite_agent.settings import AgentSettings, PlaySettings, parse_arguments
+
+MUG = BallRegion((0.0, 0.0, 1.2), 0.2)
+
+
+@dataclass
+class Wall:
+    """A sequence of views of one wall."""
+
+    count: int = 8
+    name: str = "wall"
+    up_axis: tuple[float, float, float] = (0.0, -1.0, 0.0)
+    depth_registered: bool = True
+    left_out: str = ""
+    camera: Camera = CAMERA
+    broken_at: int | None = None
+    asked: list[int] = field(default_factory=list)
+    reached: threading.Event = field(default_factory=threading.Event)
+
+    def __len__(self) -> int:
+        return self.count
+
+    def frame(self, i: int, size: tuple[int, int] | None = None) -> Frame:
+        if i == self.broken_at:
+            raise DatasetError(f"wall/frame-{i}.png: expected an image, got noise")
+        self.asked.append(i)
+        if len(self.asked) == 2:
+            self.reached.set()
+        return frame(i, CAMERA)
+
+    def indices(self) -> Sequence[int]:
+        return range(self.count)
+
+    def regions(self) -> Mapping[str, Region]:
+        return {"mug": MUG}
+
+
+def settings(out: Path | None, *more: str) -> AgentSettings:
+    asked = ["--agent-id", "robot", "--task", "Pick up the mug", "--max-gaussians", "2000", "--iterations", "2"]
+    asked += ["--source", "wall", "--threads", "1", *more]
+    return parse_arguments([*asked, "--out", str(out)] if out is not None else asked)
+
+
+@contextmanager
+def player(options: AgentSettings, address: str | None = None) -> Iterator[tuple[AgentMission, MappingWorker]]:
+    client = None if address is None else FusionClient(address)
+    uplink = None
+    if client is not None:
+        uplink = Uplink(client, "robot", Spool(None, "robot", GRID), GRID, UplinkSettings(interval_s=0.0))
+    robot = MappingWorker(options.mission, GRID, lambda _graph: RegionRelevanceEstimator([MUG]), uplink)
+    try:
+        yield AgentMission(options, robot, RuleParser(), client), robot
+    finally:
+        robot.close()
+        if uplink is not None:
+            uplink.close()
+
+
+def seen(wall: Wall, options: AgentSettings) -> ReplaySource:
+    assert options.play is not None
+    return ReplaySource.of(wall, options.play)
+
+
+def test_a_mission_leaves_a_map_a_report_and_its_region_on_the_server(tmp_path: Path) -> None:
+    store, options = MemoryStore(), settings(tmp_path)
+    with team(store) as fusion, player(options, fusion.client.address) as (mission, robot):
+        mission.play(seen(Wall(), options))
+        assert mission.state == MissionState.DONE
+        count = robot.status().gaussians
+        [agent] = fusion.client.status().agents
+    written, report = read_ply(tmp_path / "map.ply"), json.loads((tmp_path / "report.json").read_text())
+    assert len(written) == count == report["gaussians"]
+    assert report["frames"] == 8
+    assert report["hz"] > 0
+    assert report["frame_age_p99_s"] >= report["frame_age_p50_s"] > 0
+    assert 0 < report["roi_share"] < 1
+    assert report["bytes_sent"] == agent.roi_bytes > 0
+    assert report["handover_bytes"] == agent.handover_bytes == agent.keyframes == 0
+    assert report["map_shared_percent"] == pytest.approx(100 * written.active.mean())
+    assert agent.gaussians == written.active.sum()
+
+
+def test_handover_brings_the_whole_map_and_the_keyframes(tmp_path: Path) -> None:
+    options = settings(tmp_path, "--handover")
+    with team() as fusion, player(options, fusion.client.address) as (mission, robot):
+        mission.play(seen(Wall(), options))
+        [agent] = fusion.client.status().agents
+        keyframes = robot.do(lambda mapper: mapper.keyframes()).result(20)
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert agent.gaussians == report["gaussians"]
+    assert agent.handover_bytes == report["handover_bytes"] > 0
+    assert agent.roi_bytes == report["bytes_sent"] > 0
+    assert agent.keyframes == len(keyframes) > 0
+
+
+def test_alone_it_maps_and_sends_nothing(tmp_path: Path) -> None:
+    options = settings(tmp_path, "--hold-out", "4", "--frames", "0:6")
+    wall = Wall()
+    with player(options) as (mission, _):
+        mission.play(seen(wall, options))
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert wall.asked == [0, 1, 2, 4, 5]
+    assert (report["frames"], report["bytes_sent"], report["map_shared_percent"]) == (5, 0, 0)
+
+
+def test_a_mission_that_is_stopped_writes_what_it_has(tmp_path: Path) -> None:
+    options, wall = settings(tmp_path), Wall(10_000)
+    with player(options) as (mission, _):
+        thread = threading.Thread(target=mission.play, args=(seen(wall, options),))
+        thread.start()
+        assert wall.reached.wait(20)
+        mission.stop()
+        thread.join(20)
+        assert not thread.is_alive()
+        assert mission.state == MissionState.DRAINING
+    assert json.loads((tmp_path / "report.json").read_text())["frames"] < 10_000
+    assert len(read_ply(tmp_path / "map.ply")) > 0
+
+
+def test_what_is_wrong_is_raised_before_or_when_it_is_met(tmp_path: Path) -> None:
+    options = settings(tmp_path)
+    with player(replace(options, task="!")) as (mission, _), pytest.raises(TaskError):
+        mission.play(seen(Wall(), options))
+    with pytest.raises(InvalidInputError, match="size"):
+        ReplaySource.of(Wall(), PlaySettings("wall", size="big"))
+    with player(replace(options, out=tmp_path / "gone")) as (mission, _), pytest.raises(StorageError, match="gone"):
+        mission.play(seen(Wall(), options))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--source", "/nowhere"], "--task"),
+        (["--source", "/nowhere", "--task", "Pick up the mug"], "/nowhere"),
+        (["--source", "sim:attic", "--task", "Pick up the mug"], "sim:attic"),
+        (["--source", "sim:home?trajectory=9", "--task", "Pick up the mug"], "trajectory"),
+        (["--source", "sim:home", "--task", "Pick up the mug", "--frames", "500:"], "500:"),
+        (["--source", "sim:home", "--task", "Pick up the mug", "--size", "big"], "size"),
+        (["--source", "sim:home", "--task", "Pick up the mug", "--hold-out", "1"], "hold-out"),
+        (["--threads", "0"], "threads"),
+        (["--task", "Pick up the mug"], "name an ONNX file with --detector"),
+        (["--max-gaussians", "0"], "max_gaussians"),
+        (["--agent-id", ""], "--agent-id"),
+        (["--agent-id", "husky-\udcff"], "--agent-id: expected UTF-8 text"),
+        (["--mission", "x" * 256], "--mission: expected at most 255 bytes"),
+        (["--world-frame", "\udcff"], "--world-frame: expected UTF-8 text"),
+        (["--voxel-size", "nan"], "voxel"),
+        (["--rate", "-1"], "rate"),
+        (["--listen", "nowhere"], "HOST:PORT"),
+        (["--out", "/dev/null/x"], "/dev/null/x"),
+        (["--uplink-kbps", "0"], "kbps"),
+        (["--drain-timeout", "nan"], "--drain-timeout"),
+        (["--fusion", ""], "--fusion: expected HOST:PORT or unix:PATH"),
+        (["--fusion", "10.0.0.7"], "--fusion: expected HOST:PORT or unix:PATH"),
+        (["--parser", "localhost:http"], "--parser: expected HOST:PORT or unix:PATH"),
+        (["--parser", "localhost:0"], "--parser: expected the port that the service listens on"),
+        (["--up", "0,0,0"], "up axis"),
+        (["--task", "!"], "task text"),
+        (["--seed", "-1"], "seed"),
+        (["--max-gaussians", "3000000000000"], "max_gaussians"),
+        (["--detector", __file__], "expected a readable ONNX model"),
+        (["--detector", "/nowhere.onnx"], "/nowhere.onnx"),
+    ],
+)
+def test_a_wrong_command_line_is_one_line_and_code_2(
+    arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from gausslite_agent.program import run
+
+    assert run(["--listen", "127.0.0.1:0", *arguments]) == 2
+    [line] = capsys.readouterr().err.splitlines()
+    assert message in line
+
+
+def test_a_real_process_ends_cleanly_on_sigterm(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "gausslite_agent", "--listen", f"unix:{tmp_path}/agent.sock"]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as p:
+        assert p.stderr is not None
+        assert "listening on" in p.stderr.readline()
+        p.send_signal(signal.SIGTERM)
+        assert p.wait(30) == 0
+        assert "ended" in p.stderr.read()
+
+
+def test_who_assigns_a_task_is_told_which_parser_does_not_answer(tmp_path: Path) -> None:
+    address = f"unix:{tmp_path}/agent.sock"
+    command = [sys.executable, "-m", "gausslite_agent", "--listen", address, "--parser", "127.0.0.1:1"]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as p:
+        assert p.stderr is not None
+        assert "listening on" in p.stderr.readline()
+        # a plain stub, since the client would try again
+        with grpc.insecure_channel(address) as channel, pytest.raises(grpc.RpcError, match=r"parser 127\.0\.0\.1:1: "):
+            AgentServiceStub(channel).AssignTask(AssignTaskRequest(text="Pick up the cup"), timeout=20.0)
+        p.send_signal(signal.SIGTERM)
+        assert p.wait(30) == 0
+
+
+def test_frames_that_were_sent_leave_a_map_and_a_report_on_sigterm(tmp_path: Path) -> None:
+    model = write_tiny_yolo(tmp_path / "tiny.onnx", ["cup"], [(32, 32, 30, 30, 0, 0.9)])
+    address, out = f"unix:{tmp_path}/agent.sock", tmp_path / "out"
+    command = [sys.executable, "-m", "gausslite_agent", "--listen", address, "--out", str(out), "--threads", "1"]
+    command += ["--detector", str(model), "--task", "Pick up the cup", "--max-gaussians", "2000", "--iterations", "1"]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as p:
+        assert p.stderr is not None
+        assert "listening on" in p.stderr.readline()
+        with AgentClient(address) as client:
+            client.assign_task("Pick up the cup")
+            outcomes = list(client.ingest([frame(i, CAMERA) for i in range(2)]))
+        p.send_signal(signal.SIGTERM)
+        said = p.stderr.read()
+        assert p.wait(30) == 0, said
+    report = json.loads((out / "report.json").read_text())
+    assert [outcome.outcome for outcome in outcomes] == [FRAME_OUTCOME_MAPPED] * 2
+    assert report["frames"] == 2
+    assert len(read_ply(out / "map.ply")) == report["gaussians"] > 0
+
+
+def test_without_a_mapped_frame_nothing_is_written_over(tmp_path: Path) -> None:
+    options = replace(settings(tmp_path), play=None)
+    (tmp_path / "map.ply").write_text("of an earlier life")
+    with player(options) as (mission, _):
+        mission.begin()
+        mission.stop()
+        mission.conclude()
+    assert (tmp_path / "map.ply").read_text() == "of an earlier life"
+
+
+def test_a_damaged_frame_ends_the_mission_and_what_was_mapped_is_sent_and_written(tmp_path: Path) -> None:
+    options = settings(tmp_path)
+    with team() as fusion, player(options, fusion.client.address) as (mission, _):
+        with pytest.raises(DatasetError, match="frame-3"):
+            mission.play(seen(Wall(broken_at=3), options))
+        [agent] = fusion.client.status().agents
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert report["frames"] == 3
+    assert "frame-3.png" in report["stopped_by"]
+    assert agent.gaussians == read_ply(tmp_path / "map.ply").active.sum() > 0
+
+
+def test_a_first_frame_that_is_damaged_writes_nothing_over(tmp_path: Path) -> None:
+    options = settings(tmp_path)
+    (tmp_path / "map.ply").write_text("of an earlier life")
+    with player(options) as (mission, _), pytest.raises(DatasetError, match="frame-0"):
+        mission.play(seen(Wall(broken_at=0), options))
+    assert (tmp_path / "map.ply").read_text() == "of an earlier life"
+
+
+def test_what_fails_at_the_very_end_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    async def serve() -> None:
+        async def until() -> None:
+            try:
+                signal.raise_signal(signal.SIGTERM)
+                await asyncio.Event().wait()
+            finally:
+                raise StorageError("map.ply: the disk is full")
+
+        await serve_until_stopped(f"unix:{tmp_path}/x.sock", [], until)
+
+    assert run_service("program", serve) == 2
+    assert "program: map.ply: the disk is full" in capsys.readouterr().err

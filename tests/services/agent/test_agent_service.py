@@ -1,0 +1,265 @@
+"""The agent service in process: every rpc, every outcome of a frame, every code that applies."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+
+import grpc
+import numpy as np
+import pytest
+from agent_running import TASK, Gate, agent, ball_attention
+from fusion_team import CAMERA, GRID, frame, team
+
+from gausslite.domain.camera import Camera
+from gausslite.domain.frame import Frame
+from gausslite.domain.region import BallRegion
+from gausslite.domain.task import TaskGraph
+from gausslite.domain.voxels import AxisAlignedBox
+from gausslite.errors import (
+    GaussLiteError,
+    InvalidInputError,
+    MismatchError,
+    ModelFileError,
+    RevisionGoneError,
+    TaskError,
+)
+from gausslite.fusion.memory_store import MemoryStore
+from gausslite.perception.fixed_relevance import RegionRelevanceEstimator
+from gausslite.perception.ground_truth import RegionDetector
+from gausslite.perception.relevance_estimator import RelevanceEstimator, TaskRelevanceEstimator
+from gausslite.task.rules import RuleParser
+from gausslite.v1 import agent_service_pb2 as pb
+from gausslite.wire import convert
+from gausslite.wire.clients import FusionClient
+from gausslite.wire.spool import Spool
+from gausslite.wire.uplink import Uplink
+from gausslite.wire.uplink_values import UplinkSettings
+from gausslite_agent.mapping_worker import MappingWorker
+
+
+def test_a_task_comes_in_words_or_as_a_graph() -> None:
+    with agent() as a:
+        graph = a.client.assign_task(TASK)
+        assert graph == RuleParser().parse(TASK)
+        assert a.client.assign_task(graph) == graph
+        assert convert.graph_from_message(a.client.status().graph) == graph
+
+
+def test_what_the_attention_cannot_find_is_told_to_the_operator() -> None:
+    mug = RegionDetector({"mug_1": BallRegion((0.0, 0.0, 1.2), 0.2)})
+    with agent(lambda graph: TaskRelevanceEstimator(graph, mug)) as a:
+        a.client.assign_task("Pick up the mug on the table")
+        assert list(a.client.status().notes) == ["anchor 'table' not seen yet: its targets are kept"]
+        list(a.client.ingest([frame(0)]))
+        assert any("no region answers 'table'" in note for note in a.client.status().notes)
+
+
+def test_a_task_without_sense_is_refused() -> None:
+    with agent() as a:
+        with pytest.raises(TaskError):
+            a.client.assign_task(" ")
+        with pytest.raises(TaskError, match="targets"):
+            a.client.assign_task(TaskGraph("", "", (), (), ()))
+        with pytest.raises(grpc.RpcError) as caught:
+            a.stub.AssignTask(pb.AssignTaskRequest())
+        assert caught.value.code() is grpc.StatusCode.INVALID_ARGUMENT  # type: ignore[attr-defined]
+
+
+def test_an_attention_that_cannot_be_made_is_told_to_who_assigned() -> None:
+    def broken(_graph: TaskGraph) -> RelevanceEstimator:
+        raise ModelFileError("model.onnx: expected a YOLO-seg model, got a text")
+
+    with agent(broken) as a, pytest.raises(ModelFileError, match=r"model\.onnx"):
+        a.client.assign_task(TASK)
+
+
+def test_frames_need_a_task_first() -> None:
+    with agent() as a, pytest.raises(MismatchError, match="AssignTask"):
+        list(a.client.ingest([frame(0)]))
+
+
+def test_each_frame_has_its_outcome_in_order() -> None:
+    dark = Frame(1, 1, np.zeros((24, 32, 3), np.uint8), np.zeros((24, 32), np.float32), CAMERA, np.eye(4))
+    requests = [
+        pb.IngestFramesRequest(frame=convert.frame_to_message(each)) for each in (frame(0), dark, frame(2), frame(3))
+    ]
+    requests[2].frame.t_world_camera.row_major[0] = float("nan")
+    with agent() as a:
+        a.client.assign_task(TASK)
+        answers = list(a.stub.IngestFrames(iter(requests)))
+        status = a.client.status()
+    assert [answer.index for answer in answers] == [0, 1, 2, 3]
+    assert [answer.outcome for answer in answers] == [
+        pb.FRAME_OUTCOME_MAPPED, pb.FRAME_OUTCOME_SKIPPED, pb.FRAME_OUTCOME_REJECTED, pb.FRAME_OUTCOME_MAPPED,
+    ]  # fmt: skip
+    assert "t_world_camera" in answers[2].reason
+    assert "depth" in answers[1].reason
+    assert answers[0].iterations == 2
+    assert answers[0].roi_share > 0
+    assert answers[0].age_seconds >= answers[0].seconds > 0
+    assert status.age_p99_seconds >= status.age_p50_seconds > 0
+    counts = status.frames_mapped, status.frames_skipped, status.frames_dropped, status.frames_rejected
+    assert counts == (2, 1, 0, 1)
+    assert status.gaussians == answers[3].gaussians > 0
+    assert status.hz > 0
+
+
+def test_another_task_turns_the_map_to_it_and_the_same_question_changes_nothing() -> None:
+    asked: list[str] = []
+
+    def attention(graph: TaskGraph) -> RelevanceEstimator:
+        asked.append(graph.text)
+        x_m = 0.0 if "mug" in graph.targets else 0.3
+        return RegionRelevanceEstimator([BallRegion((x_m, 0.0, 1.2), 0.2)])
+
+    with agent(attention) as a:
+        a.client.assign_task(TASK)
+        for index in range(3):
+            a.robot.submit(frame(index)).result(20)
+        first = a.robot.do(lambda mapper: mapper.gaussians()).result(20)
+        a.client.assign_task("Take the mug on the table")
+        same = a.robot.do(lambda mapper: mapper.gaussians()).result(20)
+        np.testing.assert_array_equal(same.active, first.active)
+        assert asked == [TASK]
+        a.client.assign_task("Find the chair")
+        a.robot.submit(frame(3)).result(20)
+        turned = a.robot.do(lambda mapper: mapper.gaussians()).result(20)
+        # all three showed the first region, and views of the region are remembered
+        assert a.robot.status().reread == 3
+    assert asked == [TASK, "Find the chair"]
+    assert turned.means_m[turned.active][:, 0].mean() > first.means_m[first.active][:, 0].mean() + 0.1
+
+
+def test_a_bug_in_one_frame_ends_its_stream_and_not_the_agent() -> None:
+    opened = threading.Event()
+    opened.set()
+    gate = Gate(ball_attention(RuleParser().parse(TASK)), opened, fail_at=1)
+    with agent(lambda _graph: gate) as a:
+        a.client.assign_task(TASK)
+        with pytest.raises(GaussLiteError, match="unforeseen"):
+            list(a.client.ingest([frame(0), frame(1)]))
+        [answer] = a.client.ingest([frame(2)])
+        assert answer.outcome == pb.FRAME_OUTCOME_MAPPED
+
+
+def test_a_view_shows_the_map() -> None:
+    with agent() as a:
+        rgb, depth_m = a.client.render(CAMERA, np.eye(4))
+        assert not rgb.any()
+        assert not depth_m.any()
+        a.client.assign_task(TASK)
+        list(a.client.ingest([frame(index) for index in range(3)]))
+        rgb, depth_m = a.client.render(CAMERA, np.eye(4))
+    assert rgb.shape == (24, 32, 3)
+    assert np.median(depth_m[depth_m > 0]) == pytest.approx(1.2, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    ("camera", "T_world_camera"),
+    [(Camera(1e4, 1e4, 1.0, 1.0, 16384, 16384), np.eye(4)), (CAMERA, np.full((4, 4), np.nan)), (CAMERA, np.eye(3))],
+)
+def test_a_view_from_nowhere_is_refused(camera: Camera, T_world_camera: np.ndarray) -> None:
+    request = pb.RenderViewRequest(
+        camera=convert.camera_to_message(camera), t_world_camera={"row_major": T_world_camera.reshape(-1).tolist()}
+    )
+    with agent() as a:
+        with pytest.raises(grpc.RpcError) as caught:
+            a.stub.RenderView(request)
+        assert caught.value.code() is grpc.StatusCode.INVALID_ARGUMENT  # type: ignore[attr-defined]
+        assert a.client.status().agent_id == "robot"
+
+
+def follow(updates: Iterator[convert.MapUpdate], table: dict[int, int]) -> int:
+    """Apply updates up to the next complete revision; `table` holds the Gaussians per voxel."""
+    for update in updates:
+        if update.snapshot:
+            table.clear()
+        if update.words is not None:
+            for key, count in zip(update.words.keys.tolist(), update.words.counts.tolist(), strict=True):
+                table[key] = count
+                if count == 0:
+                    del table[key]
+        if update.last:
+            return update.revision
+    raise AssertionError("the stream ended")
+
+
+def counts_now(robot: MappingWorker) -> dict[int, int]:
+    keys = GRID.keys(robot.do(lambda mapper: mapper.gaussians()).result(20).means_m)
+    return dict(zip(*(part.tolist() for part in np.unique(keys, return_counts=True)), strict=True))
+
+
+def test_a_watcher_follows_the_map() -> None:
+    with agent() as a:
+        a.client.assign_task(TASK)
+        updates = a.client.watch_map()
+        seen: dict[int, int] = {}
+        revision = follow(updates, seen)
+        assert seen == {}
+        for index in range(3):
+            list(a.client.ingest([frame(index)]))
+            before, revision = revision, follow(updates, seen)
+            assert revision > before
+            assert seen == counts_now(a.robot)
+        updates.close()
+        list(a.client.ingest([frame(3)]))
+        resumed = a.client.watch_map(since_revision=revision)
+        follow(resumed, seen)
+        resumed.close()
+        assert seen == counts_now(a.robot)
+
+
+def test_a_watcher_may_ask_for_a_region_and_for_the_task_alone() -> None:
+    with agent() as a:
+        a.client.assign_task(TASK)
+        list(a.client.ingest([frame(0)]))
+        shown: list[dict[int, int]] = []
+        box = AxisAlignedBox((-0.1, -0.1, 0.0), (0.1, 0.1, 5.0))
+        for region, roi_only in ((None, False), (box, False), (None, True)):
+            updates = a.client.watch_map(region=region, roi_only=roi_only)
+            shown.append({})
+            follow(updates, shown[-1])
+            updates.close()
+        gaussians = a.robot.do(lambda mapper: mapper.gaussians()).result(20)
+    everything, in_box, of_task = shown
+    assert 0 < len(in_box) < len(everything)
+    assert in_box.items() <= everything.items()
+    assert sum(of_task.values()) == gaussians.active.sum()
+
+
+@pytest.mark.parametrize("since", [1, 2**62])
+def test_a_revision_that_is_not_kept_is_out_of_range(since: int) -> None:
+    with agent() as a, pytest.raises(RevisionGoneError, match="since_revision"):
+        next(iter(a.client.watch_map(since_revision=since)))
+
+
+def test_an_upside_down_region_is_refused() -> None:
+    request = pb.WatchMapRequest(region={"min_m": {"x": 1.0}, "max_m": {"x": -1.0}})
+    with agent() as a, pytest.raises(grpc.RpcError) as caught:
+        next(a.stub.WatchMap(request))
+    assert caught.value.code() is grpc.StatusCode.INVALID_ARGUMENT  # type: ignore[attr-defined]
+    with pytest.raises(InvalidInputError, match="box"):
+        AxisAlignedBox((1.0, 0.0, 0.0), (-1.0, 0.0, 0.0))
+
+
+def test_only_the_tasks_region_leaves_the_robot() -> None:
+    store = MemoryStore()
+    with team(store) as fusion:
+        client = FusionClient(fusion.client.address)
+        uplink = Uplink(client, "robot", Spool(None, "robot", GRID), GRID, UplinkSettings(interval_s=0.0))
+        try:
+            with agent(uplink=uplink) as a:
+                a.client.assign_task(TASK)
+                list(a.client.ingest([frame(index) for index in range(3)]))
+                assert uplink.drain(20.0)
+                status = a.client.status()
+                gaussians = a.robot.do(lambda mapper: mapper.gaussians()).result(20)
+        finally:
+            uplink.close()
+    held = store.words("robot")
+    assert held.gaussians.active.all()
+    assert len(held.gaussians) == gaussians.active.sum() < len(gaussians)
+    assert status.uplink.connected
+    assert status.uplink.bytes_sent > 0
+    assert status.uplink.voxels_waiting == 0

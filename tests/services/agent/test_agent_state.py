@@ -1,0 +1,263 @@
+"""A mission saved with --state goes on in the agent's next life, for the team as well."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fusion_team import CAMERA, GRID, Team, frame, team
+from tiny_yolo import write_tiny_yolo
+
+from gausslite.codec.ply import read_ply
+from gausslite.codec.state_file import read_state, write_state
+from gausslite.domain.frame import Frame
+from gausslite.domain.gaussians import Gaussians
+from gausslite.domain.region import BallRegion
+from gausslite.domain.voxel_batch import VoxelBatch
+from gausslite.domain.voxel_operations import group_by_voxel
+from gausslite.errors import MapFileError, MismatchError
+from gausslite.fusion.memory_store import MemoryStore
+from gausslite.mission.checkpoint import ResumeConfig
+from gausslite.perception.fixed_relevance import RegionRelevanceEstimator
+from gausslite.task.rules import RuleParser
+from gausslite.wire.clients import AgentClient, FusionClient
+from gausslite.wire.spool import Spool
+from gausslite.wire.uplink import Uplink
+from gausslite.wire.uplink_values import UplinkSettings
+from gausslite_agent.mapping_worker import MappingWorker
+from gausslite_agent.mission_checkpoint import MissionCheckpoint, SavedAgentMission
+from gausslite_agent.mission_runner import AgentMission
+from gausslite_agent.program import run
+from gausslite_agent.settings import AgentSettings, parse_arguments
+
+MUG, TASK, LATER = BallRegion((0.0, 0.0, 1.2), 0.2), "Pick up the mug", "Find the chair"
+
+
+def settings(state: Path, *more: str) -> AgentSettings:
+    asked = ["--agent-id", "robot", "--task", TASK, "--max-gaussians", "2000", "--iterations", "2"]
+    return parse_arguments([*asked, "--threads", "1", "--state", str(state), *more])
+
+
+@contextmanager
+def life(
+    options: AgentSettings, fusion: Team | None = None, spool: Path | None = None
+) -> Iterator[tuple[AgentMission, MappingWorker]]:
+    """An agent as its program builds it."""
+    saved = SavedAgentMission.read(options.state, options.terms) if options.state and options.state.exists() else None
+    uplink = None
+    if fusion is not None:
+        client = FusionClient(fusion.client.address)
+        held = Spool(spool, "robot", GRID)
+        uplink = Uplink(client, "robot", held, GRID, UplinkSettings(interval_s=0.0), goes_on=saved is not None)
+    robot = MappingWorker(options.mission, GRID, lambda _graph: RegionRelevanceEstimator([MUG]), uplink)
+    try:
+        if saved is not None:
+            robot.resume(saved).result()
+        player = AgentMission(options, robot, RuleParser(), None, None if saved is None else saved.life)
+        player.begin()
+        yield player, robot
+    finally:
+        robot.close()
+        if uplink is not None:
+            uplink.close()
+
+
+def red_frame(i: int) -> Frame:
+    """A view whose middle the tiny detector takes for a cup."""
+    plain = frame(i, CAMERA)
+    rgb = np.zeros_like(plain.rgb)
+    rgb[6:18, 8:24, 0] = 255
+    return replace(plain, rgb=rgb)
+
+
+def map_frames(robot: MappingWorker, *indices: int) -> None:
+    for i in indices:
+        robot.submit(frame(i, CAMERA)).result()
+
+
+def the_map(robot: MappingWorker) -> Gaussians:
+    return robot.do(lambda mapper: mapper.gaussians()).result()
+
+
+def region_words(robot: MappingWorker) -> VoxelBatch:
+    return group_by_voxel(robot.do(lambda mapper: mapper.roi_gaussians()).result(), GRID)
+
+
+def totals(words: VoxelBatch) -> dict[int, tuple[int, int]]:
+    """Sum of kappa and count of each voxel that is not empty."""
+    columns = words.keys.tolist(), words.kappa_sums.tolist(), words.counts.tolist()
+    return {key: (kappa, count) for key, kappa, count in zip(*columns, strict=True) if count}
+
+
+def held_by(store: MemoryStore) -> dict[int, tuple[int, int]]:
+    return totals(store.table()["robot"])
+
+
+def test_a_mission_in_two_lives_gives_the_map_and_the_words_of_one(tmp_path: Path) -> None:
+    whole, first, second = MemoryStore(), MemoryStore(), settings(tmp_path / "x.state")
+    with team(whole) as fusion, life(settings(tmp_path / "whole.state"), fusion) as (player, robot):
+        map_frames(robot, *range(8))
+        player.conclude()
+        wanted = the_map(robot)
+    with team(first) as fusion:
+        for indices in (range(4), range(4, 8)):
+            with life(second, fusion, tmp_path / "robot.spool") as (player, robot):
+                map_frames(robot, *indices)
+                player.conclude()
+        came = the_map_of(second)
+    for column in ("means_m", "opacities", "kappa", "active"):
+        np.testing.assert_array_equal(getattr(came, column), getattr(wanted, column))
+    assert held_by(first) == held_by(whole)
+    assert wanted.kappa.max() > 0
+
+
+def the_map_of(options: AgentSettings) -> Gaussians:
+    with life(options) as (_, robot):
+        return the_map(robot)
+
+
+@pytest.mark.parametrize("keeps_spool", [True, False])
+def test_the_fused_map_follows_the_robot_through_lives_that_end_well_and_badly(
+    keeps_spool: bool, tmp_path: Path
+) -> None:
+    """The third life ends unsaved: on the voxels that the robot knows, the server is as it is."""
+    store, options = MemoryStore(), settings(tmp_path / "robot.state")
+    spool = tmp_path / "robot.spool" if keeps_spool else None
+    with team(store) as fusion:
+        with life(options, fusion, spool) as (player, robot):
+            map_frames(robot, 0, 1, 2)
+            player.conclude()
+            seen = robot.revision()
+        with life(options, fusion, spool) as (player, robot):
+            assert robot.revision() > seen
+            map_frames(robot, 3, 4)
+            player.conclude()
+            assert held_by(store) == totals(region_words(robot))
+            kept = region_words(robot)
+        with life(options, fusion, spool) as (_, robot):
+            map_frames(robot, 5, 6)
+            assert robot.uplink is not None
+            assert robot.uplink.drain(20.0)
+        with life(options, fusion, spool) as (player, robot):
+            assert robot.status().graph == RuleParser().parse(TASK)
+            assert robot.uplink is not None
+            assert robot.uplink.drain(20.0)
+            words = region_words(robot)
+            np.testing.assert_array_equal(words.kappa_sums, kept.kappa_sums)
+            assert held_by(store).items() >= totals(words).items()
+
+
+def test_a_server_that_lost_everything_between_two_lives_gets_it_again(tmp_path: Path) -> None:
+    options, store = settings(tmp_path / "robot.state"), MemoryStore()
+    with team() as fusion, life(options, fusion, tmp_path / "robot.spool") as (player, robot):
+        map_frames(robot, 0, 1)
+        player.conclude()
+    with team(store) as fusion, life(options, fusion, tmp_path / "robot.spool") as (player, robot):
+        map_frames(robot, 2)
+        player.conclude()
+        assert held_by(store) == totals(region_words(robot))
+
+
+def test_a_task_that_came_on_the_way_stays_and_another_command_line_replaces_it(tmp_path: Path) -> None:
+    options = settings(tmp_path / "robot.state")
+    with life(options) as (player, robot):
+        map_frames(robot, 0)
+        robot.assign(RuleParser().parse(LATER)).result()
+        player.conclude()
+    for command_line, wanted in ((TASK, LATER), ("Find the lamp", "Find the lamp"), (None, "Find the lamp")):
+        with life(replace(options, task=command_line)) as (player, robot):
+            graph = robot.status().graph
+            assert graph is not None
+            assert graph.text == wanted
+            player.conclude()
+
+
+def test_watchers_never_see_a_revision_twice_even_if_the_clock_was_set_back(tmp_path: Path) -> None:
+    options = settings(tmp_path / "robot.state")
+    with life(options) as (player, robot):
+        map_frames(robot, 0)
+        player.conclude()
+        seen = robot.revision()
+    state = read_state(tmp_path / "robot.state")
+    far_off = seen + 10**15
+    write_state(tmp_path / "robot.state", {**state, "beside/map_revision": np.array([far_off])})
+    with life(options) as (_, robot):
+        assert robot.revision() > far_off
+
+
+def test_what_is_no_mission_of_this_agent_is_told(tmp_path: Path) -> None:
+    options = settings(tmp_path / "robot.state")
+    with life(options) as (player, robot):
+        map_frames(robot, 0)
+        player.conclude()
+    state = read_state(tmp_path / "robot.state")
+    other = ResumeConfig.of(options.mission, agent_id="other", voxel_size="0.2")
+    with pytest.raises(MismatchError, match=r"--agent-id 'robot' \(got 'other'\), --voxel-size '0.1' \(got '0.2'\)"):
+        SavedAgentMission.read(tmp_path / "robot.state", other)
+    for name, data in (("graph", b"\xff\xff"), ("graph", b""), ("asked", b"\xff")):
+        write_state(tmp_path / "bad.state", {**state, f"beside/{name}": np.frombuffer(data, np.uint8)})
+        with pytest.raises(MapFileError, match=r"bad\.state: expected the state of an agent's mission"):
+            SavedAgentMission.read(tmp_path / "bad.state", options.terms)
+
+
+def test_a_wrong_file_is_one_line_before_the_agent_listens(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    options = settings(tmp_path / "robot.state")
+    with life(options) as (player, robot):
+        map_frames(robot, 0)
+        player.conclude()
+    (tmp_path / "notes").write_text("remember the milk")
+    listen = ["--listen", "127.0.0.1:0", "--agent-id", "robot", "--iterations", "2"]
+    for arguments, told in (
+        (["--state", str(tmp_path / "robot.state")], "--max-gaussians '2000' (got '150000')"),
+        (["--state", str(tmp_path / "notes")], "notes: expected the file of a saved run"),
+        (["--state", str(tmp_path)], "expected the name of a file, got a folder"),
+        (["--state", "/dev/null/x"], "/dev/null"),
+    ):
+        assert run([*listen, *arguments]) == 2
+        [line] = capsys.readouterr().err.splitlines()
+        assert told in line
+
+
+def test_a_real_agent_ended_in_its_mission_goes_on_with_it(tmp_path: Path) -> None:
+    model = write_tiny_yolo(tmp_path / "tiny.onnx", ["cup"], [(32, 32, 20, 20, 0, 0.9)])
+    address, store = f"unix:{tmp_path}/agent.sock", MemoryStore()
+    command = [sys.executable, "-m", "gausslite_agent", "--listen", address, "--out", str(tmp_path), "--threads", "1"]
+    command += ["--detector", str(model), "--task", "Pick up the cup", "--max-gaussians", "2000", "--iterations", "1"]
+    command += ["--state", str(tmp_path / "a.state"), "--spool", str(tmp_path / "a.spool"), "--agent-id", "robot"]
+    kappas, revisions = [], []
+    with team(store) as fusion:
+        for indices in (range(3), range(3, 6)):
+            with subprocess.Popen(
+                [*command, "--fusion", fusion.client.address], stderr=subprocess.PIPE, text=True
+            ) as p:
+                assert p.stderr is not None
+                assert "listening on" in p.stderr.readline()
+                with AgentClient(address) as client:
+                    if indices.start == 0:
+                        client.assign_task("Pick up the cup")
+                    revisions.append(client.status().map_revision)
+                    list(client.ingest([red_frame(i) for i in indices], lossless=True))
+                    revisions.append(client.status().map_revision)
+                p.send_signal(signal.SIGTERM)
+                said = p.stderr.read()
+                assert p.wait(30) == 0, said
+            kappas.append(int(read_ply(tmp_path / "map.ply").kappa.sum()))
+        [agent] = fusion.client.status().agents
+    assert "after frame 2" in said
+    assert 0 < kappas[0] < kappas[1]
+    assert revisions == sorted(set(revisions))
+    assert agent.gaussians > 0
+    assert SavedAgentMission.read(tmp_path / "a.state", _terms(command)).life == MissionCheckpoint(
+        5, RuleParser().parse("Pick up the cup"), "Pick up the cup", revisions[-1]
+    )
+
+
+def _terms(command: list[str]) -> ResumeConfig:
+    return parse_arguments(command[3:]).terms

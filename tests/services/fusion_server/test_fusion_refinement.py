@@ -1,0 +1,103 @@
+"""Keyframes and the joint refinement, on a real server in process."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from fusion_team import CAMERA, GRID, Team, frame, said, team
+from grpc_health.v1 import health_pb2, health_pb2_grpc
+
+from gausslite.codec.ply import gaussians_from_ply
+from gausslite.domain.camera import Camera
+from gausslite.errors import (
+    InvalidInputError,
+    MismatchError,
+    QuotaError,
+)
+from gausslite.fusion.joint_refinement import RefineSettings
+from gausslite.fusion.limits import FusionSettings, Quotas
+from gausslite.v1 import fusion_service_pb2 as pb
+from gausslite.wire.clients import Export
+
+
+def test_keyframes_are_kept_within_bounds_and_bad_ones_reported() -> None:
+    with team(settings=FusionSettings(grid=GRID, quotas=Quotas(keyframes_per_agent=2, keyframe_pixels=32 * 24))) as t:
+        session = t.client.join("ant", GRID).session_id
+        large = Camera(40.0, 40.0, 32.0, 12.0, 64, 24)
+        assert t.client.contribute_keyframes(session, [frame(1), frame(2), frame(3), frame(3), frame(4, large)]) == 4
+        status = t.client.status()
+        assert status.keyframes == status.agents[0].keyframes == 2
+        broken = pb.ContributeKeyframesRequest(session_id=session)
+        broken.keyframe.index = 77
+        answer = t.stub.ContributeKeyframes(iter([broken]))
+        assert answer.accepted == 0
+        assert answer.rejected[0].index == 77
+        assert answer.rejected[0].reason
+
+
+def contributed(t: Team) -> str:
+    session = t.client.join("ant", GRID).session_id
+    t.say(session, said("ant", 1, {cell: [3] * 4 for cell in (-1, 0, 1)}))
+    t.client.contribute_keyframes(session, [frame(1), frame(2)])
+    return session
+
+
+def test_refinement_reports_ends_and_lies_over_the_vote() -> None:
+    with team() as t:
+        with pytest.raises(MismatchError, match="refined map"):
+            t.client.export(Export("refined"))
+        session = contributed(t)
+        progress = list(t.client.refine(iterations=4))
+        assert [p.done for p in progress] == [False] * (len(progress) - 1) + [True]
+        assert progress[-1].iteration == progress[-1].iterations == 4
+        assert t.client.status().refined
+        refined, voted = (gaussians_from_ply(t.client.export(Export(name))) for name in ("refined", "vote"))
+        assert refined.rgb.tobytes() != voted.rgb.tobytes()
+        t.say(session, said("ant", 2, {0: [90]}))
+        assert sorted(gaussians_from_ply(t.client.export(Export("refined"))).kappa.tolist())[-1] == 90
+        with pytest.raises(InvalidInputError, match="expected none with REFINED"):
+            t.client.export(Export("refined", "ant"))
+
+
+def test_closing_the_refinement_cancels_it_and_another_can_start() -> None:
+    with team(refine=RefineSettings(iterations=20_000, report_every=1)) as t:
+        contributed(t)
+        running = t.client.refine()
+        assert next(running).iteration >= 1
+        with pytest.raises(QuotaError, match="one at a time"):
+            list(t.client.refine(iterations=1))
+        running.close()
+        while True:
+            try:
+                assert list(t.client.refine(iterations=1))[-1].done
+                break
+            except QuotaError:
+                continue
+        with pytest.raises(QuotaError, match="iterations"):
+            list(t.client.refine(iterations=2_000_000_000))
+
+
+def test_a_refinement_without_anything_to_learn_from_is_refused() -> None:
+    with team() as t:
+        with pytest.raises(MismatchError, match="0 Gaussians and 0 keyframes"):
+            list(t.client.refine())
+        session = t.client.join("ant", GRID).session_id
+        t.say(session, said("ant", 1, {0: [1]}))
+        with pytest.raises(MismatchError, match="1 Gaussians and 0 keyframes"):
+            list(t.client.refine())
+        behind = np.diag([1.0, -1.0, -1.0, 1.0])
+        t.client.contribute_keyframes(session, [frame(1, CAMERA, behind)])
+        with pytest.raises(InvalidInputError, match="of which none does"):
+            list(t.client.refine())
+
+
+def test_health_answers_while_a_refinement_runs() -> None:
+    with team(refine=RefineSettings(iterations=20_000, report_every=1)) as t:
+        contributed(t)
+        running = t.client.refine()
+        next(running)
+        check = health_pb2_grpc.HealthStub(t.channel).Check
+        for _ in range(3):
+            answer = check(health_pb2.HealthCheckRequest(service="gausslite.v1.FusionService"), timeout=5)
+            assert answer.status == health_pb2.HealthCheckResponse.SERVING
+        running.close()

@@ -1,0 +1,133 @@
+"""Watchers of the fused map, on a real server in process: a snapshot, then what changes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import grpc
+import numpy as np
+import pytest
+from fusion_team import GRID, keys, said, team
+
+from gausslite.domain.voxel_batch import VoxelBatch
+from gausslite.domain.voxel_operations import empty_batch
+from gausslite.domain.voxels import AxisAlignedBox
+from gausslite.errors import (
+    RevisionGoneError,
+)
+from gausslite.v1 import fusion_service_pb2 as pb
+from gausslite.wire.convert import MapUpdate
+
+
+def test_a_watcher_gets_the_snapshot_and_then_what_changes() -> None:
+    with team() as t:
+        ant, bee = (t.client.join(name, GRID).session_id for name in ("ant", "bee"))
+        t.say(ant, said("ant", 1, {0: [5], 1: [1]}))
+        watch = t.client.watch()
+        first = next(watch)
+        assert first.snapshot
+        assert first.last
+        assert first.words.keys.tolist() == keys(0, 1).tolist()
+        assert first.winners == ("ant", "ant")
+        t.say(bee, said("bee", 1, {0: [1], 1: [2]}))
+        second = next(watch)
+        assert not second.snapshot
+        assert second.words.keys.tolist() == keys(1).tolist()
+        assert second.winners == ("bee",)
+        t.say(ant, said("ant", 2, {0: []}))
+        assert next(watch).winners == ("bee",)
+        t.client.leave(bee, forget=True)
+        third = next(watch)
+        assert dict(zip(third.words.keys.tolist(), third.words.counts.tolist(), strict=True)) == {
+            keys(0)[0]: 0,
+            keys(1)[0]: 1,
+        }
+        watch.close()
+        late = t.client.watch(first.revision)
+        summed_up = next(late)
+        assert not summed_up.snapshot
+        assert summed_up.revision == third.revision
+        assert summed_up.words.counts.tolist() == [0, 1]
+        late.close()
+        current = t.client.watch(third.revision)
+        nothing = next(current)
+        assert nothing.last
+        assert nothing.words is None
+        current.close()
+
+
+def test_a_watcher_of_a_region_sees_that_region_alone() -> None:
+    with team() as t:
+        session = t.client.join("ant", GRID).session_id
+        t.say(session, said("ant", 1, {0: [1], 5: [1]}))
+        watch = t.client.watch(region=AxisAlignedBox((0.4, 0.0, 0.0), (0.6, 0.1, 2.0)))
+        assert next(watch).words.keys.tolist() == keys(5).tolist()
+        t.say(session, said("ant", 2, {0: []}))
+        assert next(watch).words is None
+        t.say(session, said("ant", 3, {5: []}))
+        assert next(watch).words.counts.tolist() == [0]
+        watch.close()
+        upside_down = pb.WatchFusedMapRequest()
+        upside_down.region.min_m.x = 1.0
+        with pytest.raises(grpc.RpcError) as caught:
+            next(t.stub.WatchFusedMap(upside_down))
+        assert caught.value.code() is grpc.StatusCode.INVALID_ARGUMENT
+
+
+def test_a_revision_of_another_life_is_out_of_range() -> None:
+    with team() as t:
+        for revision in (1, t.client.join("ant", GRID).fused_revision + 1000):
+            with pytest.raises(RevisionGoneError):
+                next(t.client.watch(revision))
+
+
+def follow(updates: Iterator[MapUpdate], held: VoxelBatch) -> VoxelBatch:
+    """What is held after the next revision."""
+    for update in updates:
+        held = update.over(held)
+        if update.last:
+            break
+    return held
+
+
+def test_update_over_update_is_the_fused_map() -> None:
+    with team() as t:
+        ant, bee = (t.client.join(name, GRID).session_id for name in ("ant", "bee"))
+        watch = t.client.watch()
+        held = follow(watch, empty_batch())
+        assert len(held) == 0
+        many = {cell: [1] * 8 for cell in range(3000)}
+        for change in (
+            lambda: t.say(ant, said("ant", 1, {0: [5], 1: [1]})),
+            lambda: t.say(bee, said("bee", 1, {1: [2], **{cell: many[cell] for cell in range(2, 1500)}})),
+            lambda: t.say(ant, said("ant", 2, {0: [], 1: [7, 1]})),
+            lambda: t.client.leave(bee, forget=True),
+        ):
+            change()
+            held = follow(watch, held)
+            now = follow(t.client.watch(), empty_batch())
+            assert held.keys.tolist() == now.keys.tolist()
+            assert held.kappa_sums.tolist() == now.kappa_sums.tolist()
+            np.testing.assert_array_equal(held.gaussians.means_m, now.gaussians.means_m)
+        # a second snapshot begins anew, however many parts it has
+        for part in range(3):
+            t.say(ant, said("ant", 3 + part, {cell: many[cell] for cell in range(part * 1000, part * 1000 + 1000)}))
+        again = follow(t.client.watch(), held)
+        assert again.keys.tolist() == keys(*range(3000)).tolist()
+        watch.close()
+
+
+def test_a_large_map_comes_in_several_blocks_of_one_revision() -> None:
+    with team() as t:
+        session = t.client.join("ant", GRID).session_id
+        for part in range(3):
+            t.say(session, said("ant", part + 1, {cell: [1] * 8 for cell in range(part * 1000, part * 1000 + 1000)}))
+        blocks = []
+        for block in t.client.watch():
+            blocks.append(block)
+            if block.last:
+                break
+        assert len(blocks) > 1
+        assert len({block.revision for block in blocks}) == 1
+        assert [block.last for block in blocks] == [False] * (len(blocks) - 1) + [True]
+        assert np.concatenate([block.words.keys for block in blocks]).tolist() == keys(*range(3000)).tolist()

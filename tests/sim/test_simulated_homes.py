@@ -1,0 +1,133 @@
+"""The family of simulated homes: full of named things, held-out views off the walks, a switch for each hardship."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from gausslite.datasets.open import open_source
+from gausslite.datasets.source import Source
+from gausslite.domain.pose import require_rigid
+from gausslite.errors import DatasetError
+from gausslite_sim.exposure import camera_gain
+from gausslite_sim.family import HOME_COUNT, HOMES
+from gausslite_sim.homes import workshop
+from gausslite_sim.materials import paint
+from gausslite_sim.walks import walk_through
+
+
+@pytest.fixture(scope="module", params=range(1, HOME_COUNT + 1))
+def furnished(request: pytest.FixtureRequest) -> tuple:
+    home = HOMES[request.param - 1]
+    return home, home.furnish(np.random.default_rng(0))
+
+
+def test_a_home_is_full_of_things_with_names_of_their_own(furnished: tuple) -> None:
+    home, items = furnished
+    names = [item.name for item in items]
+    assert len(set(names)) == len(names)
+    assert sum(not item.is_room for item in items) >= 25
+    assert {part.texture for item in items for part in item.parts} <= home.painters().keys()
+
+
+def test_everything_stands_inside_the_room(furnished: tuple) -> None:
+    _, items = furnished
+    walls = next(item for item in items if item.name == "walls").parts[0].mesh.positions_m
+    for item in items:
+        points = np.concatenate([part.mesh.positions_m for part in item.parts])
+        if not item.is_room:
+            assert (points > walls.min(axis=0) - 0.13).all(), item.name
+            assert (points < walls.max(axis=0) + 0.13).all(), item.name
+        for part in item.parts:
+            np.testing.assert_allclose(np.linalg.norm(part.mesh.normals, axis=1), 1.0, atol=0.02)
+
+
+def test_held_out_views_lie_off_the_walks(furnished: tuple) -> None:
+    home, items = furnished
+    walls = next(item for item in items if item.name == "walls").parts[0].mesh.positions_m
+    *training, held_out = (walk_through(keys)(40) for keys in home.walks)
+    for T in (*np.concatenate(training), *held_out):
+        require_rigid("pose", T)
+        assert (T[:2, 3] > 0.25).all()
+        assert (T[:2, 3] < walls.max(axis=0)[:2] - 0.2).all()
+    walked = np.concatenate(training)[:, :3, 3]
+    nearest_m = np.linalg.norm(held_out[:, None, :3, 3] - walked[None], axis=2).min(axis=1)
+    assert np.median(nearest_m) > 0.3
+
+
+def test_gain_strays_no_further_than_it_may() -> None:
+    gains = np.stack([camera_gain(share, 0.12, 1) for share in np.linspace(0, 1, 50)])
+    assert np.abs(gains - 1).max() <= 0.12 + 1e-6
+    assert gains.std(axis=0).min() > 0.02
+    assert np.abs(np.diff(gains, axis=0)).max() < 0.03
+
+
+def test_a_texture_does_not_depend_on_its_neighbours() -> None:
+    painters = workshop.painters()
+    alone, among = paint(painters, ["packet"], 0), paint(painters, ["rubber", "packet"], 0)
+    np.testing.assert_array_equal(alone["packet"].rgb, among["packet"].rgb)
+    assert not np.array_equal(alone["packet"].rgb, paint(painters, ["packet"], 1)["packet"].rgb)
+
+
+def workshop_walk(options: str = "", trajectory: int = 0) -> Source:
+    return open_source(f"sim:home-8?trajectory={trajectory}&frames=10&size=80x60{options}")
+
+
+def test_a_workshop_shows_what_it_should() -> None:
+    pytest.importorskip("embreex", reason="the simulated homes need the extra `sim`")
+    source = workshop_walk("&noise=0", trajectory=2)
+    regions = source.regions()
+    shares = {
+        name: max(float(regions[name].mask(source.frame(i)).mean()) for i in range(len(source)))
+        for name in ("drill", "toolbox", "workbench", "ladder", "rack")
+    }
+    expected = {
+        "drill": (0.004, 0.03),
+        "toolbox": (0.02, 0.12),
+        "workbench": (0.2, 0.5),
+        "ladder": (0.01, 0.1),
+        "rack": (0.02, 0.2),
+    }
+    for name, (low, high) in expected.items():
+        assert low < shares[name] < high, (name, shares[name])
+    assert min(float(source.frame(i).depth_m.min()) for i in range(len(source))) > 0.3
+
+
+def test_each_hardship_has_its_switch() -> None:
+    pytest.importorskip("embreex", reason="the simulated homes need the extra `sim`")
+    clean = "&noise=0&exposure=0&gloss=0"
+    frames = {
+        "clean": workshop_walk(clean).frame(4),
+        "exposure": workshop_walk("&noise=0&gloss=0").frame(4),
+        "gloss": workshop_walk("&noise=0&exposure=0").frame(4),
+        "noise": workshop_walk("&holes=0&flying=0").frame(4),
+        "holes": workshop_walk("&flying=0").frame(4),
+        "flying": workshop_walk("&holes=0").frame(4),
+    }
+    exact = frames["clean"].depth_m
+    for name in ("exposure", "gloss"):
+        assert not np.array_equal(frames[name].rgb, frames["clean"].rgb)
+        np.testing.assert_array_equal(frames[name].depth_m, exact)
+    ratio = frames["exposure"].rgb.mean(axis=(0, 1)) / frames["clean"].rgb.mean(axis=(0, 1))
+    assert 0.005 < np.abs(ratio - 1).max() < 0.13
+    assert (frames["noise"].depth_m > 0).mean() > 0.999
+    assert (frames["holes"].depth_m == 0).mean() > 0.01
+    errors = {name: np.abs(frames[name].depth_m - exact) for name in ("noise", "flying")}
+    assert (errors["noise"] > 0.05).mean() < (errors["flying"] > 0.05).mean()
+
+
+def test_homes_are_numbered_and_the_spec_says_so() -> None:
+    for world in ("home-0", f"home-{HOME_COUNT + 1}", "home-12", "home-x"):
+        with pytest.raises(DatasetError, match=rf"sim:{world}: expected sim:home, or one of sim:home-1 to"):
+            open_source(f"sim:{world}")
+    with pytest.raises(DatasetError, match=r"sim:home-2: gloss: expected 0 to 10, got 11"):
+        open_source("sim:home-2?gloss=11")
+
+
+def test_the_seed_moves_what_a_hand_would_move() -> None:
+    def middle(name: str, seed: int) -> np.ndarray:
+        items = workshop.furnish(np.random.default_rng(seed))
+        return next(item for item in items if item.name == name).parts[0].mesh.positions_m.mean(axis=0)
+
+    assert 1e-4 < np.linalg.norm(middle("drill", 0) - middle("drill", 1)) < 0.1
+    np.testing.assert_array_equal(middle("workbench", 0), middle("workbench", 1))

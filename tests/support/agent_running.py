@@ -1,0 +1,105 @@
+"""A robot and its service in this process, and an attention that tests can hold and break."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+
+import grpc
+import numpy as np
+from fusion_team import GRID
+from serving import serving
+
+from gausslite.domain.frame import Frame
+from gausslite.domain.region import BallRegion
+from gausslite.domain.relevance import RelevanceMap
+from gausslite.domain.state import State
+from gausslite.domain.task import TaskGraph
+from gausslite.mission.settings import MissionSettings
+from gausslite.perception.fixed_relevance import RegionRelevanceEstimator
+from gausslite.perception.relevance_estimator import RelevanceEstimator
+from gausslite.task.rules import RuleParser
+from gausslite.v1 import agent_service_pb2_grpc as pb_grpc
+from gausslite.wire.change_notifier import ChangeNotifier
+from gausslite.wire.clients import AgentClient
+from gausslite.wire.server import Service
+from gausslite.wire.uplink import Uplink
+from gausslite_agent.load import LoadSettings
+from gausslite_agent.mapping_worker import MappingWorker
+from gausslite_agent.mission_runner import MissionState
+from gausslite_agent.servicer import AgentServicer
+
+SETTINGS = MissionSettings(max_gaussians=2000, iterations=2, threads=1)
+TASK = "Pick up the mug on the table"
+
+
+@dataclass
+class Gate:
+    """An attention that lets a test hold the worker at a frame, and fails on demand."""
+
+    inner: RelevanceEstimator
+    opened: threading.Event
+    fail_at: int | None = None
+    failure: Exception = field(default_factory=lambda: ZeroDivisionError("a bug"))
+    reached: threading.Event = field(default_factory=threading.Event)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        return self.inner.notes
+
+    def attend(self, frame: Frame, rendered_depth_m: np.ndarray | None = None) -> RelevanceMap:
+        self.reached.set()
+        assert self.opened.wait(20)
+        if frame.index == self.fail_at:
+            raise self.failure
+        return self.inner.attend(frame, rendered_depth_m)
+
+    def late(self) -> None:
+        return None
+
+    def look_back(self, frame: Frame) -> RelevanceMap | None:
+        return self.inner.look_back(frame)
+
+    def state(self) -> State:
+        return {}
+
+    def restore(self, state: State) -> None:
+        del state
+
+
+def ball_attention(_graph: TaskGraph) -> RelevanceEstimator:
+    return RegionRelevanceEstimator([BallRegion((0.0, 0.0, 1.2), 0.2)])
+
+
+@dataclass(frozen=True)
+class Agent:
+    robot: MappingWorker
+    client: AgentClient
+    stub: pb_grpc.AgentServiceStub
+
+
+@contextmanager
+def agent(attention: object = ball_attention, uplink: Uplink | None = None, queue_frames: int = 4) -> Iterator[Agent]:
+    loops: list[asyncio.AbstractEventLoop] = []
+    bells: list[ChangeNotifier] = []
+    on_change = lambda: loops[0].call_soon_threadsafe(lambda: bells[0].ring())  # noqa: E731
+    robot = MappingWorker(SETTINGS, GRID, attention, uplink, on_change, LoadSettings(queue_frames))  # type: ignore[arg-type]
+
+    def register(server: grpc.aio.Server) -> None:
+        loops.append(asyncio.get_running_loop())
+        bells.append(ChangeNotifier())
+        servicer = AgentServicer("robot", robot, RuleParser(), bells[0], lambda: MissionState.MAPPING)
+        servicer.service().register(server)
+
+    try:
+        with (
+            serving([Service("gausslite.v1.AgentService", register)]) as running,
+            AgentClient(running.address) as client,
+            grpc.insecure_channel(running.address) as channel,
+        ):
+            yield Agent(robot, client, pb_grpc.AgentServiceStub(channel))
+    finally:
+        robot.close()

@@ -1,0 +1,28 @@
+"""An executor that runs submitted work when the test says so."""
+
+from __future__ import annotations
+
+from concurrent.futures import Executor, Future
+
+
+class WorkInHand(Executor):
+    """Runs what was submitted when the test says so."""
+
+    def __init__(self) -> None:
+        self.jobs: list[tuple[Future, object, tuple]] = []
+
+    def submit(self, function, /, *arguments):
+        future: Future = Future()
+        self.jobs.append((future, function, arguments))
+        return future
+
+    def run_next(self) -> None:
+        future, function, arguments = self.jobs.pop(0)
+        try:
+            future.set_result(function(*arguments))
+        except Exception as error:
+            future.set_exception(error)
+
+    @property
+    def frames(self) -> list[int]:
+        return [arguments[0].index for _, _, arguments in self.jobs]

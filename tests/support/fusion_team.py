@@ -1,0 +1,154 @@
+"""Agents, words and a fusion server in process, for the tests of the service."""
+
+from __future__ import annotations
+
+import asyncio
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import grpc
+import numpy as np
+from sample_gaussians import plain_gaussians
+from serving import serving
+
+from gausslite.codec.subset_codec import encode_subset
+from gausslite.domain.camera import Camera
+from gausslite.domain.frame import Frame
+from gausslite.domain.voxel_batch import RoiSubset, VoxelBatch
+from gausslite.domain.voxel_operations import group_by_voxel, merge_batches, tombstones
+from gausslite.domain.voxels import VoxelGrid
+from gausslite.fusion.engine import FusionEngine
+from gausslite.fusion.joint_refinement import RefineSettings
+from gausslite.fusion.limits import FusionSettings
+from gausslite.fusion.memory_store import MemoryStore
+from gausslite.fusion.store import FusionStore
+from gausslite.render.reference import ReferenceRasterizer
+from gausslite.v1 import fusion_service_pb2 as pb
+from gausslite.v1 import fusion_service_pb2_grpc as pb_grpc
+from gausslite.wire.clients import FusionClient
+from gausslite.wire.server import Service
+from gausslite.wire.tls import Tls
+from gausslite_fusion_server.refinement_worker import RefinementWorker
+from gausslite_fusion_server.servicer import FusionServicer
+
+GRID = VoxelGrid(0.10)
+COMMAND = [sys.executable, "-m", "gausslite_fusion_server"]
+CAMERA = Camera(40.0, 40.0, 16.0, 12.0, 32, 24)
+
+
+@dataclass(frozen=True)
+class Team:
+    """A running server and ways to speak to it."""
+
+    servicer: FusionServicer
+    client: FusionClient
+    stub: pb_grpc.FusionServiceStub
+    channel: grpc.Channel
+    loop: asyncio.AbstractEventLoop
+
+    def drain(self) -> None:
+        """Begin to drain, as on SIGTERM."""
+        self.loop.call_soon_threadsafe(self.servicer.drain)
+
+    def say(self, session_id: str, *subsets: RoiSubset, grid: VoxelGrid = GRID) -> list[pb.SubsetOutcome]:
+        """Send these messages on one stream and collect what became of each."""
+        return self.send(*(request(session_id, subset, grid) for subset in subsets))
+
+    def send(self, *requests: pb.ContributeSubsetsRequest) -> list[pb.SubsetOutcome]:
+        return [outcome for answer in self.client.contribute(requests, 20.0) for outcome in answer.outcomes]
+
+
+def request(session_id: str, subset: RoiSubset, grid: VoxelGrid = GRID) -> pb.ContributeSubsetsRequest:
+    return pb.ContributeSubsetsRequest(
+        session_id=session_id,
+        sequence=subset.sequence,
+        purpose=pb.PURPOSE_ROI,
+        subset=encode_subset(subset, grid),
+    )
+
+
+@contextmanager
+def team(
+    store: FusionStore | None = None,
+    settings: FusionSettings | None = None,
+    refine: RefineSettings | None = None,
+    tls: Tls | None = None,
+) -> Iterator[Team]:
+    """A fusion server on a free port with the reference rasterizer; the store stays the caller's.
+
+    With tls its own client shows the server's certificate; stub and channel are of no use then.
+    """
+    team_map = FusionEngine(store or MemoryStore(), settings or FusionSettings(grid=GRID))
+    settings_of_refinement = refine or RefineSettings(iterations=3, report_every=1)
+    servicer = FusionServicer(team_map, RefinementWorker(settings_of_refinement, ReferenceRasterizer))
+    loops = []
+
+    def register(server: grpc.aio.Server) -> None:
+        loops.append(asyncio.get_running_loop())
+        servicer.service().register(server)
+
+    try:
+        with (
+            serving([Service(servicer.service().name, register)], tls=tls) as running,
+            FusionClient(running.address, tls=tls) as client,
+            grpc.insecure_channel(running.address) as channel,
+        ):
+            yield Team(servicer, client, pb_grpc.FusionServiceStub(channel), channel, loops[0])
+    finally:
+        servicer.close()
+
+
+@contextmanager
+def server_process(*arguments: str) -> Iterator[tuple[subprocess.Popen[bytes], FusionClient]]:
+    """A server in a process of its own that is ready to answer; killed at the end."""
+    with tempfile.TemporaryDirectory() as folder:
+        address = f"unix:{folder}/fusion.sock"
+        process = subprocess.Popen([*COMMAND, "--listen", address, *arguments], stderr=subprocess.DEVNULL)
+        try:
+            options = [("grpc.initial_reconnect_backoff_ms", 100), ("grpc.max_reconnect_backoff_ms", 200)]
+            with grpc.insecure_channel(address, options) as channel:
+                grpc.channel_ready_future(channel).result(30)
+            with FusionClient(address, deadline_s=20.0) as client:
+                yield process, client
+        finally:
+            process.kill()
+            process.wait(20)
+
+
+def words(cells: dict[int, Sequence[int]]) -> VoxelBatch:
+    """For each cell along x the kappas of the Gaussians in it; none at all is a tombstone."""
+    kappas = [(cell, kappa) for cell in sorted(cells) for kappa in cells[cell]]
+    n = len(kappas)
+    numbers = np.random.default_rng(n).random((n, 3), np.float32)
+    corners = np.array([[0.1 * cell, 0, 1.0] for cell, _ in kappas] or np.zeros((0, 3)))
+    means = numbers * 0.08 + 0.01 + corners
+    gaussians = plain_gaussians(means, rgb=numbers, kappa=[kappa for _, kappa in kappas])
+    return merge_batches(
+        group_by_voxel(gaussians, GRID), tombstones(keys(*(cell for cell in cells if not cells[cell])))
+    )
+
+
+def keys(*cells: int) -> np.ndarray:
+    centres = np.array([(0.1 * cell + 0.05, 0.05, 1.05) for cell in sorted(cells)], np.float32).reshape(-1, 3)
+    return GRID.keys(centres)
+
+
+def said(agent_id: str, revision: int, cells: dict[int, Sequence[int]]) -> RoiSubset:
+    return RoiSubset(agent_id, "", revision, revision, words(cells))
+
+
+def frame(index: int, camera: Camera = CAMERA, T_world_camera: np.ndarray | None = None) -> Frame:
+    """A view from the origin along z, a grey wall 1.2 m away."""
+    size = (camera.height_px, camera.width_px)
+    return Frame(
+        index,
+        index * 1_000_000,
+        np.full((*size, 3), 120, np.uint8),
+        np.full(size, 1.2, np.float32),
+        camera,
+        np.eye(4) if T_world_camera is None else T_world_camera,
+    )

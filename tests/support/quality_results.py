@@ -1,0 +1,23 @@
+"""A small scene of the quality benchmark, two policies, and results without their hours of work."""
+
+from __future__ import annotations
+
+from gausslite.evaluation.compare import MapScores
+from gausslite_bench.quality.pairs import choose_pairs
+from gausslite_bench.quality.scenes import HomeScenePlan
+from gausslite_bench.quality.study import Finished, Origin
+from gausslite_bench.quality.trials import Budget, Conditions, Trial, TrialResult, Variant
+
+PLAN = HomeScenePlan(choose_pairs(["home-8-manipulation"])[0], frames=4, views=3)
+CONDITIONS = Conditions((96, 72))
+TASK, UNIFORM = Variant("task", "task"), Variant("uniform", "uniform")
+
+
+def scores(roi_psnr: float | None, full_psnr: float = 20.0) -> MapScores:
+    return MapScores(roi_psnr, 0.8, full_psnr, 0.7, 0.02, 0.938, 3, 2, 900, 0.03)
+
+
+def finished(variant: Variant, seed: int, roi_psnr: float, budget: Budget, plan: HomeScenePlan = PLAN) -> Finished:
+    trial = Trial(plan, variant, budget, seed, CONDITIONS)
+    result = TrialResult(scores(roi_psnr), scores(roi_psnr + 1), 0.011, 900, 8.0, 12.5)
+    return Finished(trial, result, Origin.MADE)

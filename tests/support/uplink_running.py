@@ -1,0 +1,110 @@
+"""An uplink beside a real fusion server, or beside one that says what a test tells it to."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from fusion_team import GRID, words
+from serving import serving
+
+from gausslite.codec.subset_codec import decode_subset
+from gausslite.domain.voxel_batch import VoxelBatch
+from gausslite.domain.voxels import VoxelGrid
+from gausslite.errors import (
+    GaussLiteError,
+)
+from gausslite.fusion.memory_store import MemoryStore
+from gausslite.v1 import fusion_service_pb2 as pb
+from gausslite.v1 import fusion_service_pb2_grpc as pb_grpc
+from gausslite.wire.clients import FusionClient
+from gausslite.wire.server import Service
+from gausslite.wire.spool import Spool
+from gausslite.wire.uplink import Uplink
+from gausslite.wire.uplink_values import UplinkSettings
+
+EAGER = UplinkSettings(interval_s=0.0, growth_share=0.0, first_backoff_s=0.01)
+WAIT_S = 20.0
+
+
+@contextmanager
+def uplink(
+    address: str, options: UplinkSettings = EAGER, spool: Path | None = None, grid: VoxelGrid = GRID
+) -> Iterator[Uplink]:
+    link = Uplink(FusionClient(address), "robot", Spool(spool, "robot", grid), grid, options)
+    try:
+        yield link
+    finally:
+        link.close()
+
+
+def held(store: MemoryStore) -> dict[int, list[int]]:
+    """Per voxel the kappas the server holds of the robot."""
+    table = store.words("robot")
+    return {
+        key: table.gaussians.kappa[start:end].tolist()
+        for key, start, end in zip(table.keys.tolist(), table.offsets[:-1], table.offsets[1:], strict=True)
+    }
+
+
+def said(*offers: dict[int, list[int]]) -> dict[int, list[int]]:
+    """Per voxel what these offers leave behind."""
+    last: dict[int, list[int]] = {}
+    for offer in offers:
+        table = words(offer)
+        for key, start, end in zip(table.keys.tolist(), table.offsets[:-1], table.offsets[1:], strict=True):
+            last[key] = table.gaussians.kappa[start:end].tolist()
+    return last
+
+
+class ScriptedServer(pb_grpc.FusionServiceServicer):
+    """Answers each subset as a script says, and remembers what came."""
+
+    def __init__(self, answer: Callable[[int, VoxelBatch], pb.SubsetOutcome | GaussLiteError]) -> None:
+        self._answer = answer
+        self.joined: list[bool] = []
+        self.subsets: list[VoxelBatch] = []
+        self.messages: list[bytes] = []
+        self.revisions: list[int] = []
+        self.came = threading.Event()
+
+    async def JoinSession(self, request: pb.JoinSessionRequest, context: Any) -> pb.JoinSessionResponse:
+        self.joined.append(request.fresh_map)
+        return pb.JoinSessionResponse(session_id=f"s{len(self.joined)}", highest_map_revision=100)
+
+    async def ContributeSubsets(self, request_iterator: Any, context: Any) -> Any:
+        async for request in request_iterator:
+            subset, _ = decode_subset(request.subset)
+            self.subsets.append(subset.words)
+            self.messages.append(request.subset)
+            self.revisions.append(subset.map_revision)
+            self.came.set()
+            answer = self._answer(len(self.subsets), subset.words)
+            if isinstance(answer, GaussLiteError):
+                raise answer
+            answer.sequence = request.sequence
+            yield pb.ContributeSubsetsResponse(acknowledged=request.sequence, outcomes=[answer])
+
+
+def accepted() -> pb.SubsetOutcome:
+    return pb.SubsetOutcome(status=pb.SUBSET_STATUS_ACCEPTED)
+
+
+def rejected(reason: str) -> pb.SubsetOutcome:
+    return pb.SubsetOutcome(status=pb.SUBSET_STATUS_REJECTED, reason=reason, message="scripted")
+
+
+@contextmanager
+def scripted(
+    answer: Callable[[int, VoxelBatch], pb.SubsetOutcome | GaussLiteError],
+) -> Iterator[tuple[ScriptedServer, str]]:
+    servicer = ScriptedServer(answer)
+    service = Service(
+        "gausslite.v1.FusionService",
+        lambda server: pb_grpc.add_FusionServiceServicer_to_server(servicer, server),
+    )
+    with serving([service]) as running:
+        yield servicer, running.address
