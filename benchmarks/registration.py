@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """What registering depth to colour is worth: map all but every eighth frame, score those, print one line.
 
-    benchmarks/registration.py SOURCE --colour-camera TEXT [--masks TEXT] [--objects mug_1,mug_2] [--policy uniform]
+    benchmarks/registration.py SOURCE --register-depth TEXT [--masks TEXT] [--objects mug_1,mug_2] [--policy uniform]
 
 ROI pixels come from the source seen through --masks, so that several settings are scored on the same pixels.
 """
@@ -18,7 +18,7 @@ from gausslite.datasets.registered_source import DepthRegistration
 from gausslite.datasets.selection import frame_size, select_frames
 from gausslite.errors import GaussLiteError
 from gausslite.evaluation.compare import average, score_view
-from gausslite.evaluation.held_out import HeldOutSplit
+from gausslite.datasets.held_out import HeldOutSplit
 from gausslite.evaluation.views import HeldOutView, MapViewer
 from gausslite.mapping.policies import POLICIES, TASK
 from gausslite.mission.build import build_mapper
@@ -51,8 +51,8 @@ def main() -> int:
 
 def measure(options: argparse.Namespace) -> str:
     """One line: settings, ROI and full PSNR with SSIM, Gaussians."""
-    source = open_source(options.source, options.up, options.colour_camera)
-    masks = open_source(options.source, options.up, options.masks or options.colour_camera)
+    source = open_source(options.source, options.up, options.register_depth)
+    masks = open_source(options.source, options.up, options.masks or options.register_depth)
     size, regions = frame_size(options.size, source), choose_regions(source.regions(), options.objects)
     train, held_out = HeldOutSplit(HOLD_OUT).split(select_frames(source, options.frames))
     settings = MissionSettings(
@@ -74,7 +74,7 @@ def measure(options: argparse.Namespace) -> str:
     result = average(scores)
     roi = "none" if result.roi_psnr is None else f"{result.roi_psnr:.2f} dB ({result.roi_ssim:.3f})"
     return (
-        f"{options.policy} {','.join(options.objects)} seed {options.seed} camera {options.colour_camera}: ROI {roi}, "
+        f"{options.policy} {','.join(options.objects)} seed {options.seed} camera {options.register_depth}: ROI {roi}, "
         f"full {result.full_psnr:.2f} dB ({result.full_ssim:.3f}), {len(mapper.gaussians())} Gaussians"
     )
 

@@ -10,8 +10,8 @@ from gausslite.datasets.regions import choose_regions
 from gausslite.errors import InvalidInputError
 from gausslite.evaluation.metrics import psnr
 from gausslite.evaluation.views import MapViewer
-from gausslite.mapping.frame_scheduler import FrameScheduler
 from gausslite.mission.build import build_mapper
+from gausslite.mission.frame_scheduler import FrameScheduler
 from gausslite.mission.settings import MissionSettings, require_rate
 from gausslite.mission.task_mapper import TaskMapper
 from gausslite.perception.fixed_relevance import RegionRelevanceEstimator
@@ -78,7 +78,7 @@ class TaskChangeBench:
         """Map three times. Raises DatasetError, InvalidInputError."""
         scene = HomeScenePlan(change.after, self.before + self.after, self.views).load(self.size)
         old_region = RegionRelevanceEstimator(choose_regions(scene.knowledge.regions, change.before.objects))
-        earlier = replace(scene, masks=[old_region.attend(frame) for frame in scene.training])
+        earlier = replace(scene, masks=[old_region.estimate(frame) for frame in scene.training])
         first, second = RecordedRelevanceEstimator(earlier), RecordedRelevanceEstimator(scene)
         changed, always, restarted = self._loop(first), self._loop(second), self._loop(second)
         for frame in scene.training[: self.before]:
@@ -99,7 +99,9 @@ class TaskChangeBench:
         return Recovery(change, points, reread, most_reread, seeded, most_seeded)
 
     def _loop(self, attention: RecordedRelevanceEstimator) -> TaskMapper:
-        return TaskMapper(attention, build_mapper(self.settings), pace=FrameScheduler(self.settings.pace))
+        return TaskMapper(
+            attention, build_mapper(self.settings), scheduler=FrameScheduler(self.settings.scheduler_settings)
+        )
 
     def _region_psnr(self, loop: TaskMapper, scene: Scene) -> float:
         """Mean over the held-out views that show the new task's region."""

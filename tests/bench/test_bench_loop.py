@@ -8,15 +8,18 @@ import pytest
 
 from gausslite.cli.main import main
 from gausslite.errors import DatasetError
-from gausslite.mapping.frame_scheduler import FrameTiming, SkippableStage, Stage
+from gausslite.mapping.stages import SkippableStage, Stage
+from gausslite.mission.frame_scheduler import FrameTiming
 from gausslite_bench.loop.bench import CostLog, FrameCost, Latency, LoopTiming
 
 SMALL = ("--size", "96x72", "--max-gaussians", "1500", "--threads", "1")
 
 
 def cost(perception_s: float, iterations: int) -> FrameCost:
-    steps_s = {Stage.ATTENTION: perception_s, Stage.SEEDING: 0.03, Stage.WORDS: 0.01}
-    budget = FrameTiming(sum(steps_s.values()), steps_s, frozenset({SkippableStage.SEEDING}), short=iterations < 5)
+    steps_s = {Stage.RELEVANCE: perception_s, Stage.SEEDING: 0.03, Stage.PUBLISHING: 0.01}
+    budget = FrameTiming(
+        sum(steps_s.values()), steps_s, frozenset({SkippableStage.SEEDING}), under_trained=iterations < 5
+    )
     return FrameCost(budget, iterations, gaussians=100 * iterations, roi_share=0.5)
 
 
@@ -36,8 +39,8 @@ def test_hz_is_frames_by_the_sum_of_their_latencies() -> None:
 def test_steps_reliefs_and_short_frames_are_counted() -> None:
     timing = LoopTiming.of([cost(0.06, 4), cost(0.26, 8)])
     assert timing.steps["seeding"].p50_ms == pytest.approx(30.0)
-    assert timing.steps["drawing"].max_ms == 0.0
-    assert timing.reliefs == {"words": 0, "seeding": 2}
+    assert timing.steps["rendering"].max_ms == 0.0
+    assert timing.skipped_stages == {"publishing": 0, "seeding": 2}
     assert timing.frames_short == 1
 
 

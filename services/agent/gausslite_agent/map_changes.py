@@ -8,7 +8,7 @@ import numpy as np
 
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.voxel_batch import VoxelBatch
-from gausslite.domain.voxel_operations import at_keys, empty_batch, group_by_voxel, merge_batches, tombstones
+from gausslite.domain.voxel_operations import empty_batch, group_by_voxel, merge_batches, select_keys, tombstones
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.errors import RevisionGoneError
 from gausslite.mapping.sent_voxels import SentVoxelTracker
@@ -49,5 +49,5 @@ class MapChangeLog:
                 f"since_revision: expected {first} to {self.revision}, got {revision}; watch from 0"
             )
         keys = np.array(sorted(key for key, at in self._changed_at.items() if at > revision), np.int64)
-        present = at_keys(self._words, keys)
+        present = select_keys(self._words, keys)
         return merge_batches(present, tombstones(np.setdiff1d(keys, present.keys)))

@@ -24,11 +24,12 @@ from gausslite.domain.voxel_batch import VoxelBatch
 from gausslite.domain.voxel_operations import group_by_voxel
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.errors import InvalidInputError, MismatchError, StorageError, UnavailableError
-from gausslite.mapping.frame_scheduler import Clock, FrameScheduler, SkippableStage
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.sent_voxels import SentVoxelTracker
+from gausslite.mapping.stages import SkippableStage
 from gausslite.mission.build import build_mapper
 from gausslite.mission.checkpoint import ResumeConfig, save_run
+from gausslite.mission.frame_scheduler import Clock, FrameScheduler
 from gausslite.mission.settings import MissionSettings
 from gausslite.mission.task_mapper import FrameOutcome, TaskMapper
 from gausslite.perception.relevance_estimator import RelevanceEstimator
@@ -176,9 +177,9 @@ class MappingWorker:
         if self._task_mapper is None:
             ledger = self._ledger if self.uplink is not None else None
             attention = self._make_attention(graph)
-            pace = FrameScheduler(self._settings.pace, self._clock)
-            self._task_mapper = TaskMapper(attention, self._mapper, ledger, pace, self._tell)
-        elif now is None or not graph.asks_the_same_as(now):
+            scheduler = FrameScheduler(self._settings.scheduler_settings, self._clock)
+            self._task_mapper = TaskMapper(attention, self._mapper, ledger, scheduler, self._tell)
+        elif now is None or not graph.is_equivalent_to(now):
             self._task_mapper.assign(self._make_attention(graph))
         with self._lock:
             self._status = replace(self._status, graph=graph, notes=self._task_mapper.notes)
@@ -276,7 +277,7 @@ class MappingWorker:
             iterations=done.iterations,
             gaussians=done.gaussians,
             roi_share=done.roi_share,
-            seconds=done.budget.seconds,
+            seconds=done.timing.seconds,
             age_s=self._clock() - come.since_s,
         )
         self._note_load(done)
@@ -305,9 +306,9 @@ class MappingWorker:
             status = self._status
             self._status = replace(
                 status,
-                short=status.short + done.budget.short,
-                without_words=status.without_words + (SkippableStage.WORDS in done.budget.reliefs),
-                without_seeding=status.without_seeding + (SkippableStage.SEEDING in done.budget.reliefs),
+                short=status.short + done.timing.under_trained,
+                without_words=status.without_words + (SkippableStage.PUBLISHING in done.timing.skipped_stages),
+                without_seeding=status.without_seeding + (SkippableStage.SEEDING in done.timing.skipped_stages),
                 max_detection_lag=max(status.max_detection_lag, done.detection_lag_frames or 0),
                 reread=status.reread + done.reread.keyframes,
             )

@@ -34,8 +34,8 @@ class MissionCheckpoint:
         data = graph_to_message(self.graph).SerializeToString()
         return {
             "graph": np.frombuffer(data, np.uint8),
-            "asked": text(self.asked),
-            "map_revision": whole_numbers(self.map_revision),
+            "asked": encode_text(self.asked),
+            "map_revision": int_array(self.map_revision),
         }
 
 
@@ -52,10 +52,10 @@ class SavedAgentMission:
         run = SavedRun.read(path)
         run.require(terms)
         try:
-            data = take(run.beside, "graph", (None,), np.uint8).tobytes()
+            data = get_array(run.beside, "graph", (None,), np.uint8).tobytes()
             graph = graph_from_message(task_pb2.TaskGraph.FromString(data))
-            [map_revision] = take_counts(run.beside, "map_revision", 1)
-            asked = take_text(run.beside, "asked")
+            [map_revision] = get_counts(run.beside, "map_revision", 1)
+            asked = get_text(run.beside, "asked")
         except (GaussLiteError, DecodeError) as error:
             raise MapFileError(f"{path}: expected the state of an agent's mission: {error}") from error
         return cls(run, MissionCheckpoint(run.last_index, graph, asked, map_revision))

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
+from gausslite.datasets.held_out import HeldOutSplit
 from gausslite.datasets.open import open_source
 from gausslite.datasets.selection import frame_size, select_frames
 from gausslite.datasets.source import Source
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import UpAxis
-from gausslite.evaluation.held_out import HeldOutSplit
 from gausslite_agent.settings import PlaySettings
 
 
@@ -25,7 +25,7 @@ class ReplaySource:
     @classmethod
     def open(cls, play: PlaySettings, up_axis: UpAxis | None) -> ReplaySource:
         """Look at a folder, or at the settings of a simulated home. Raises DatasetError, InvalidInputError."""
-        return cls.of(open_source(play.source, up_axis, play.colour_camera), play)
+        return cls.of(open_source(play.source, up_axis, play.depth_registration), play)
 
     @classmethod
     def of(cls, source: Source, play: PlaySettings) -> ReplaySource:

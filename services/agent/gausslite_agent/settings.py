@@ -37,14 +37,14 @@ _IDLE_ITERATIONS = 64
 class PlaySettings:
     """A sequence that stands in for the robot's camera; hold_out keeps every n-th frame from mapping.
 
-    colour_camera is given when the sequence's depth is not registered to its colour.
+    depth_registration is given when the sequence's depth is not registered to its colour.
     """
 
     source: str
     frames: str = ":"
     size: str | None = None
     hold_out: int | None = None
-    colour_camera: DepthRegistration | None = None
+    depth_registration: DepthRegistration | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,7 +93,7 @@ def parse_arguments(arguments: Sequence[str] | None = None) -> AgentSettings:
     _require_sense(options)
     play = None
     if options.source is not None:
-        play = PlaySettings(options.source, options.frames, options.size, options.hold_out, options.colour_camera)
+        play = PlaySettings(options.source, options.frames, options.size, options.test_every, options.register_depth)
     link = LinkSettings(
         options.parser,
         options.fusion,
@@ -123,8 +123,12 @@ def parse_arguments(arguments: Sequence[str] | None = None) -> AgentSettings:
 
 def _load_settings(options: argparse.Namespace) -> LoadSettings:
     """Counted iterations make a map that can be made again, so there idle time is left idle unless asked for."""
-    idle = options.idle if options.idle is not None else (0 if options.rate is None else _IDLE_ITERATIONS)
-    return LoadSettings(options.queue, Drops(options.drop), idle)
+    idle = (
+        options.idle_iterations
+        if options.idle_iterations is not None
+        else (0 if options.rate is None else _IDLE_ITERATIONS)
+    )
+    return LoadSettings(options.queue, Drops(options.queue_policy), idle)
 
 
 def _require_sense(options: argparse.Namespace) -> None:
@@ -172,18 +176,23 @@ def _add_load(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument_group("load").add_argument
     add("--queue", metavar="N", type=int, default=4, help="frames that may wait (default: %(default)s)")
     add(
-        "--drop",
+        "--queue-policy",
         choices=[str(each) for each in Drops],
         default=str(Drops.OLDEST),
         help="what a full queue drops (default: oldest)",
     )
-    add("--idle", metavar="N", type=int, help="iterations while no frame waits (default: 64 at a --rate, else 0)")
+    add(
+        "--idle-iterations",
+        metavar="N",
+        type=int,
+        help="iterations while no frame waits (default: 64 at a --rate, else 0)",
+    )
 
 
 def _add_camera(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument_group("camera").add_argument
     add("--source", metavar="SPEC", help='a folder or "sim:home?seed=0&trajectory=0"')
-    add("--hold-out", metavar="N", type=int, help="keep every N-th frame from mapping, for scoring")
+    add("--test-every", metavar="N", type=int, help="keep every N-th frame from mapping, for scoring")
 
 
 def _add_team(parser: argparse.ArgumentParser) -> None:

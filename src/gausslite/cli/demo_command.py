@@ -23,6 +23,7 @@ from gausslite.config.options import (
     names,
     perception_settings,
 )
+from gausslite.datasets.held_out import HeldOutSplit
 from gausslite.datasets.open import open_source
 from gausslite.datasets.regions import choose_regions
 from gausslite.datasets.registered_source import DepthRegistration
@@ -31,7 +32,6 @@ from gausslite.domain.region import Region
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.errors import InvalidInputError
 from gausslite.evaluation.compare import MapScores
-from gausslite.evaluation.held_out import HeldOutSplit
 from gausslite.evaluation.pictures import write_png
 from gausslite.evaluation.team import TeamScores, Viewpoints, score_team
 from gausslite.fusion.limits import MAX_REFINE_ITERATIONS
@@ -89,8 +89,8 @@ def run(options: argparse.Namespace) -> int:
     scores = _score(options, stage, maps)
     report = {
         "source": options.source or stage.agents[0].source,
-        "colour_camera": None if stage.colour_camera is None else str(stage.colour_camera),
-        "view_error": None if stage.view_prior.is_exact else str(stage.view_prior),
+        "colour_camera": None if stage.depth_registration is None else str(stage.depth_registration),
+        "view_error": None if stage.pose_prior.is_exact else str(stage.pose_prior),
         "size": list(stage.size),
         "seed": options.seed,
         "agents": agents,
@@ -114,9 +114,9 @@ def _require_usable(options: argparse.Namespace) -> None:
         max_gaussians=options.max_gaussians,
         iterations=options.iterations,
         rate_hz=options.rate,
-        min_iterations=options.least,
-        reliefs=options.relief,
-        run_over=options.run_over,
+        min_iterations=options.min_iterations,
+        skip_stages=options.skip_stages,
+        deadline_slack=options.deadline_slack,
         seed=options.seed,
         threads=options.threads,
     )
@@ -133,19 +133,19 @@ class _Stage:
     hold_out: int | None
     held_out: tuple[Viewpoints, ...]
     regions: Mapping[str, Region]
-    colour_camera: DepthRegistration | None = None
-    view_prior: PoseExposurePrior = field(default_factory=PoseExposurePrior)
+    depth_registration: DepthRegistration | None = None
+    pose_prior: PoseExposurePrior = field(default_factory=PoseExposurePrior)
 
     @property
     def fit_views(self) -> bool:
         """Maps of refined views stand a little beside the poses that were said, and are judged like that."""
-        return not self.view_prior.is_exact
+        return not self.pose_prior.is_exact
 
 
 def _simulated_stage(options: argparse.Namespace) -> _Stage:
     """Two walks through one home; the held-out views lie off both."""
-    if options.colour_camera is not None:
-        raise InvalidInputError("--colour-camera: belongs to a recorded sequence; name it with --source")
+    if options.register_depth is not None:
+        raise InvalidInputError("--register-depth: belongs to a recorded sequence; name it with --source")
     specs = [
         _HOME.format(seed=options.seed, trajectory=walk, frames=_HOME_VIEWS if walk == 2 else _HOME_FRAMES)
         for walk in range(3)
@@ -163,7 +163,7 @@ def _simulated_stage(options: argparse.Namespace) -> _Stage:
         None,
         (Viewpoints(held_out, range(len(held_out)), size),),
         _scored_regions(options, held_out.regions()),
-        view_prior=resolve_pose_prior(specs[2], held_out, options.view_error),
+        pose_prior=resolve_pose_prior(specs[2], held_out, options.pose_prior),
     )
 
 
@@ -178,10 +178,10 @@ def _recorded_stage(options: argparse.Namespace) -> _Stage:
         train, held = HeldOutSplit(_HOLD_OUT).split(select_frames(recorded, frames))
         agents.append(AgentPlan(f"agent-{letter}", task, str(options.source), frames, len(train)))
         held_out.append(held)
-    source, camera = register_with_warnings(options.source, recorded, options.colour_camera, LOOK)
-    view_prior = resolve_pose_prior(options.source, source, options.view_error)
+    source, camera = register_with_warnings(options.source, recorded, options.register_depth, LOOK)
+    pose_prior = resolve_pose_prior(options.source, source, options.pose_prior)
     views = tuple(Viewpoints(source, held, size) for held in held_out)
-    return _Stage(tuple(agents), size, _HOLD_OUT, views, regions, camera, view_prior)
+    return _Stage(tuple(agents), size, _HOLD_OUT, views, regions, camera, pose_prior)
 
 
 def _scored_regions(options: argparse.Namespace, regions: Mapping[str, Region]) -> dict[str, Region]:
@@ -210,11 +210,11 @@ def _plan(options: argparse.Namespace, stage: _Stage) -> TeamPlan:
         str(options.voxel_size),
     ]
     if stage.hold_out is not None:
-        shared += ["--hold-out", str(stage.hold_out)]
-    if stage.colour_camera is not None:
-        shared += ["--colour-camera", str(stage.colour_camera)]
-    if not stage.view_prior.is_exact:
-        shared += ["--view-error", str(stage.view_prior)]
+        shared += ["--test-every", str(stage.hold_out)]
+    if stage.depth_registration is not None:
+        shared += ["--register-depth", str(stage.depth_registration)]
+    if not stage.pose_prior.is_exact:
+        shared += ["--pose-prior", str(stage.pose_prior)]
     if options.detector is not None:
         shared += ["--detector", str(options.detector.absolute())]
     if options.resegment:
@@ -224,8 +224,8 @@ def _plan(options: argparse.Namespace, stage: _Stage) -> TeamPlan:
     if options.vocabulary is not None:
         shared += ["--vocabulary", str(options.vocabulary.absolute())]
     if options.rate is not None:
-        shared += ["--rate", str(options.rate), "--least", str(options.least), "--relief", ",".join(options.relief)]
-        shared += ["--run-over", str(options.run_over)]
+        shared += ["--rate", str(options.rate), "--min-iterations", str(options.min_iterations), "--skip-stages", ",".join(options.skip_stages)]
+        shared += ["--deadline-slack", str(options.deadline_slack)]
     if options.iterations is not None:
         shared += ["--iterations", str(options.iterations)]
     return TeamPlan(stage.agents, tuple(shared), options.voxel_size, options.refine_iterations, options.seed)

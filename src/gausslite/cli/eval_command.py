@@ -11,13 +11,13 @@ from pathlib import Path
 from gausslite.cli.progress import progress_bar
 from gausslite.cli.source_options import add_regions, add_source, asked_regions, open_with_warnings
 from gausslite.codec.ply import read_ply
-from gausslite.config.options import AS_RECORDED, LOOK, colour_camera
+from gausslite.config.options import AS_RECORDED, LOOK, depth_registration
+from gausslite.datasets.held_out import HeldOutSplit
 from gausslite.datasets.registered_source import DepthRegistration
 from gausslite.datasets.selection import frame_size, select_frames
 from gausslite.errors import DatasetError
 from gausslite.evaluation.compare import MapScores, average, score_view
 from gausslite.evaluation.fitted import draw_fitted
-from gausslite.evaluation.held_out import HeldOutSplit
 from gausslite.evaluation.pictures import comparison_sheet, write_png
 from gausslite.evaluation.views import MIN_ROI_PIXELS, HeldOutView, MapViewer
 from gausslite.mission.results import as_text, prepare_folder, read_report
@@ -33,7 +33,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("map", metavar="MAP", type=Path, help="a PLY file")
     add_source(parser, by_default=_AS_MADE)
     add_regions(parser)
-    parser.add_argument("--hold-out", metavar="N", type=int, help="score every Nth selected frame only")
+    parser.add_argument("--test-every", metavar="N", type=int, help="score every Nth selected frame only")
     parser.add_argument(
         "--fit-views",
         action=argparse.BooleanOptionalAction,
@@ -50,12 +50,12 @@ def run(options: argparse.Namespace) -> int:
     rasterizer = choose_rasterizer(threads=options.threads)
     gaussians = read_ply(options.map)
     made = _MadeWith.of(options)
-    source, _ = open_with_warnings(options.source, options.up, made.colour_camera, LOOK)
+    source, _ = open_with_warnings(options.source, options.up, made.depth_registration, LOOK)
     positions = select_frames(source, options.frames)
-    if options.hold_out is not None:
-        positions = HeldOutSplit(options.hold_out).split(positions)[1]
+    if options.test_every is not None:
+        positions = HeldOutSplit(options.test_every).split(positions)[1]
         if not positions:
-            raise DatasetError(f"--hold-out {options.hold_out}: expected at least that many frames, got fewer")
+            raise DatasetError(f"--test-every {options.test_every}: expected at least that many frames, got fewer")
     chosen = asked_regions(options, source)
     size = frame_size(options.size, source)
     viewer = MapViewer(gaussians, rasterizer)
@@ -86,16 +86,16 @@ def run(options: argparse.Namespace) -> int:
 class _MadeWith:
     """How a map is scored: as asked for, or with what the report beside it says that it was made with."""
 
-    colour_camera: DepthRegistration | str | None
+    depth_registration: DepthRegistration | str | None
     fit_views: bool
 
     @classmethod
     def of(cls, options: argparse.Namespace) -> _MadeWith:
         report, told = read_report(options.map.parent), []
-        camera, fit_views = options.colour_camera, options.fit_views
+        camera, fit_views = options.register_depth, options.fit_views
         if camera is None and "colour_camera" in report:
-            camera = colour_camera(str(report["colour_camera"] or AS_RECORDED))
-            told += [f"--colour-camera {camera}"] if camera != AS_RECORDED else []
+            camera = depth_registration(str(report["colour_camera"] or AS_RECORDED))
+            told += [f"--register-depth {camera}"] if camera != AS_RECORDED else []
         if fit_views is None:
             fit_views = report.get("view_error") is not None
             told += ["--fit-views"] if fit_views else []

@@ -25,25 +25,25 @@ from gausslite.config.options import (
     add_budget,
     add_detector,
     add_policy,
-    colour_camera,
+    depth_registration,
     known_view_error,
     mission_settings,
     perception_settings,
 )
+from gausslite.datasets.held_out import HeldOutSplit
 from gausslite.datasets.registered_source import DepthRegistration
 from gausslite.datasets.selection import frame_size, select_frames
 from gausslite.datasets.source import Source
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.task import TaskGraph
 from gausslite.errors import DatasetError, InvalidInputError
-from gausslite.evaluation.held_out import HeldOutSplit
 from gausslite.evaluation.pictures import write_png
 from gausslite.evaluation.preview import preview
 from gausslite.evaluation.views import MapViewer
-from gausslite.mapping.frame_scheduler import FrameScheduler
 from gausslite.mapping.policies import TASK
 from gausslite.mission.build import RelevanceEstimatorFactory, build_mapper, build_relevance_estimator
 from gausslite.mission.checkpoint import ResumeConfig, SavedRun, save_run
+from gausslite.mission.frame_scheduler import FrameScheduler
 from gausslite.mission.results import PREVIEW, peak_rss_mib, prepare_beside, prepare_folder, write_results
 from gausslite.mission.settings import MissionSettings, SceneKnowledge
 from gausslite.mission.task_mapper import TaskMapper
@@ -60,7 +60,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--task", metavar="TEXT", help='what the robot is to do, such as "Pick up the mug on the table"'
     )
     parser.add_argument(
-        "--then",
+        "--task-at",
         metavar="FRAME:TASK",
         action="append",
         default=[],
@@ -70,7 +70,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_regions(parser)
     add_policy(parser, may_look=True)
     add_budget(parser)
-    parser.add_argument("--hold-out", metavar="N", type=int, help="keep every Nth frame from mapping, for `eval`")
+    parser.add_argument("--test-every", metavar="N", type=int, help="keep every Nth frame from mapping, for `eval`")
     parser.add_argument(
         "--out", metavar="DIR", type=Path, required=True, help="gets map.ply, report.json and preview.png"
     )
@@ -96,7 +96,9 @@ def run(options: argparse.Namespace) -> int:
     attention = _region_attention(options, recorded) if graph is None else attentions.to(graph)
     if saved is None:
         asked = asked.looked_at(options)
-    mapper = TaskMapper(attention, build_mapper(asked.settings), pace=FrameScheduler(asked.settings.pace))
+    mapper = TaskMapper(
+        attention, build_mapper(asked.settings), scheduler=FrameScheduler(asked.settings.scheduler_settings)
+    )
     if saved is not None:
         saved.restore(mapper)
         saved = None  # as large as the map and its keyframes, and copied
@@ -140,39 +142,39 @@ class _Asked:
     positions: Sequence[int]
     size: tuple[int, int]
     plan: TaskSchedule
-    colour_camera: DepthRegistration | None
+    depth_registration: DepthRegistration | None
 
     @classmethod
     def of(cls, options: argparse.Namespace) -> _Asked:
         settings = mission_settings(options)
-        plan = _plan(asked_task(options), [TaskSwitch.parse(text) for text in options.then])
+        plan = _plan(asked_task(options), [TaskSwitch.parse(text) for text in options.task_at])
         source = open_recorded(options.source, options.up)
         positions, size = select_frames(source, options.frames), frame_size(options.size, source)
-        if options.hold_out is not None:
-            positions, _ = HeldOutSplit(options.hold_out).split(positions)
+        if options.test_every is not None:
+            positions, _ = HeldOutSplit(options.test_every).split(positions)
         return cls(settings, source, positions, size, plan, None)
 
     def looked_at(
         self,
         options: argparse.Namespace,
         camera: DepthRegistration | str | None = None,
-        view_error: PoseExposurePrior | None = None,
+        pose_prior: PoseExposurePrior | None = None,
     ) -> _Asked:
         """With the camera and trust that are asked for, or given here; what is neither is looked for in the frames."""
-        given = options.colour_camera if camera is None else camera
+        given = options.register_depth if camera is None else camera
         source, registered_to = register_with_warnings(options.source, self.source, given, LOOK)
-        believed = resolve_pose_prior(options.source, source, options.view_error if view_error is None else view_error)
-        settings = replace(self.settings, view_prior=believed)
-        return replace(self, settings=settings, source=source, colour_camera=registered_to)
+        believed = resolve_pose_prior(options.source, source, options.pose_prior if pose_prior is None else pose_prior)
+        settings = replace(self.settings, pose_prior=believed)
+        return replace(self, settings=settings, source=source, depth_registration=registered_to)
 
     def as_saved(self, options: argparse.Namespace, saved: SavedRun) -> _Asked:
         """looked_at, where what was found is that of a saved run. Raises MismatchError where it had other terms."""
-        camera, view_error = None, None
-        if options.colour_camera in (None, LOOK):
-            camera = colour_camera(saved.terms.options.get("colour_camera") or AS_RECORDED)
-        if options.view_error == LOOK:
-            view_error = known_view_error(saved.terms.options.get("view_error") or TRUSTED)
-        asked = self.looked_at(options, camera, view_error)
+        camera, pose_prior = None, None
+        if options.register_depth in (None, LOOK):
+            camera = depth_registration(saved.terms.options.get("colour_camera") or AS_RECORDED)
+        if options.pose_prior == LOOK:
+            pose_prior = known_view_error(saved.terms.options.get("view_error") or TRUSTED)
+        asked = self.looked_at(options, camera, pose_prior)
         saved.require(asked.terms(options, saved.last_index))
         return asked
 
@@ -183,12 +185,12 @@ class _Asked:
             self.settings,
             size=f"{self.size[0]}x{self.size[1]}",
             task="" if graph is None else graph.text,
-            colour_camera="" if self.colour_camera is None else str(self.colour_camera),
+            colour_camera="" if self.depth_registration is None else str(self.depth_registration),
             up="" if options.up is None else ",".join(map(str, options.up)),
             **{name: _file_name(getattr(options, name)) for name in ("detector", "segmenter", "vocabulary", "roi")},
             resegment="yes" if options.resegment else "",
             objects=",".join(options.objects),
-            hold_out="" if options.hold_out is None else str(options.hold_out),
+            hold_out="" if options.test_every is None else str(options.test_every),
             roi_ball=" ".join(f"{','.join(map(str, ball.centre_m))},{ball.radius_m}" for ball in options.roi_ball),
         )
 
@@ -202,8 +204,8 @@ class _Asked:
         first = self.plan.first
         return {
             "source": options.source,
-            "colour_camera": None if self.colour_camera is None else str(self.colour_camera),
-            "view_error": None if self.settings.view_prior.is_exact else str(self.settings.view_prior),
+            "colour_camera": None if self.depth_registration is None else str(self.depth_registration),
+            "view_error": None if self.settings.pose_prior.is_exact else str(self.settings.pose_prior),
             "task": None if first is None else {"text": first.text, **as_json(first)},
             "then": [{"frame": frame, "text": later.text, **as_json(later)} for frame, later in self.plan.turns],
             "policy": options.policy,
@@ -211,7 +213,7 @@ class _Asked:
             "size": list(self.size),
             "seed": self.settings.seed,
             "max_gaussians": self.settings.max_gaussians,
-            "hold_out": options.hold_out,
+            "hold_out": options.test_every,
             "resumed_from": None if options.resume is None else str(options.resume),
         }
 
@@ -243,11 +245,11 @@ def _held(mapper: TaskMapper, gaussians: Gaussians) -> dict[str, object]:
 
 
 def _plan(first: TaskGraph | None, turns: Sequence[TaskSwitch]) -> TaskSchedule:
-    """The tasks of --task and --then."""
+    """The tasks of --task and --task-at."""
     if not turns:
         return TaskSchedule(first)
     if first is None:
-        raise InvalidInputError("--then: follows a task in words; give the first with --task TEXT")
+        raise InvalidInputError("--task-at: follows a task in words; give the first with --task TEXT")
     from gausslite.task.rules import RuleParser
 
     return TaskSchedule(first, tuple((turn.frame, RuleParser().parse(turn.text)) for turn in turns))

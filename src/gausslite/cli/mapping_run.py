@@ -27,7 +27,7 @@ class Mission:
     def summary(self) -> dict[str, object]:
         """Totals for the report; hz is mapped frames per second of perception and mapping, without reading files."""
         mapped = [outcome for outcome in self.outcomes if outcome.skipped is None]
-        busy_s = sum(outcome.budget.seconds for outcome in mapped)
+        busy_s = sum(outcome.timing.seconds for outcome in mapped)
         return {
             "frames": len(mapped),
             "frames_skipped": len(self.outcomes) - len(mapped),
@@ -75,6 +75,6 @@ class MappingRun:
     def _turn(self, now: TaskGraph | None, index: int) -> TaskGraph | None:
         """The task of this frame, assigned where it asks for other things than the one before."""
         graph = self.plan.at(index)
-        if graph is not None and now is not None and not graph.asks_the_same_as(now):
+        if graph is not None and now is not None and not graph.is_equivalent_to(now):
             self.mapper.assign(self.attentions.to(graph))
         return graph

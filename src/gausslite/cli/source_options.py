@@ -30,7 +30,7 @@ def add_source(parser: argparse.ArgumentParser, by_default: str = AS_RECORDED) -
 def open_with_warnings(
     spec: str,
     up_axis: UpAxis | None,
-    colour_camera: DepthRegistration | str | None,
+    depth_registration: DepthRegistration | str | None,
     by_default: str = AS_RECORDED,
 ) -> tuple[Source, DepthRegistration | None]:
     """Open a sequence and tell, on stderr, what a user would not expect of it; the camera that depth is registered to.
@@ -38,7 +38,7 @@ def open_with_warnings(
     What is asked for may be LOOK, AS_RECORDED or None, for nothing; then it is by_default, one of the two. Raises
     DatasetError, PoseError, InvalidInputError.
     """
-    return register_with_warnings(spec, open_recorded(spec, up_axis), colour_camera, by_default)
+    return register_with_warnings(spec, open_recorded(spec, up_axis), depth_registration, by_default)
 
 
 def open_recorded(spec: str, up_axis: UpAxis | None) -> Source:
@@ -50,34 +50,34 @@ def open_recorded(spec: str, up_axis: UpAxis | None) -> Source:
 
 
 def register_with_warnings(
-    spec: str, source: Source, colour_camera: DepthRegistration | str | None, by_default: str
+    spec: str, source: Source, depth_registration: DepthRegistration | str | None, by_default: str
 ) -> tuple[Source, DepthRegistration | None]:
     """The second half of open_with_warnings: bring depth into the colour camera; looking for that takes seconds."""
-    if colour_camera is None and not source.depth_registered:
-        colour_camera = by_default
-        hint = f"--colour-camera {LOOK} looks for the camera to register it to, {AS_RECORDED} takes it as it is"
+    if depth_registration is None and not source.depth_registered:
+        depth_registration = by_default
+        hint = f"--register-depth {LOOK} looks for the camera to register it to, {AS_RECORDED} takes it as it is"
         if by_default == LOOK:
-            hint = f"looking for its colour camera now, --colour-camera {AS_RECORDED} takes it as it is"
+            hint = f"looking for its colour camera now, --register-depth {AS_RECORDED} takes it as it is"
         print(f"{spec}: its layout leaves open whether depth is registered to colour; {hint}", file=sys.stderr)
-    if colour_camera == LOOK:
-        colour_camera, why = find_registration(source)
-        print(f"--colour-camera {colour_camera or AS_RECORDED}: {why}", file=sys.stderr)
-    if not isinstance(colour_camera, DepthRegistration):
+    if depth_registration == LOOK:
+        depth_registration, why = find_registration(source)
+        print(f"--register-depth {depth_registration or AS_RECORDED}: {why}", file=sys.stderr)
+    if not isinstance(depth_registration, DepthRegistration):
         return source, None
-    return RegisteredSource(source, colour_camera), colour_camera
+    return RegisteredSource(source, depth_registration), depth_registration
 
 
-def resolve_pose_prior(spec: str, source: Source, view_error: PoseExposurePrior | str) -> PoseExposurePrior:
+def resolve_pose_prior(spec: str, source: Source, pose_prior: PoseExposurePrior | str) -> PoseExposurePrior:
     """How wrong the views may be, as said or, for LOOK, as a recording itself tells; that is told on stderr.
 
     Poses of a simulated home are exact.
     """
-    if isinstance(view_error, PoseExposurePrior):
-        return view_error
+    if isinstance(pose_prior, PoseExposurePrior):
+        return pose_prior
     if is_simulated(spec):
         return PoseExposurePrior()
     found, why = measure_view_error(source)
-    print(f"--view-error {TRUSTED if found.is_exact else found}: {why}", file=sys.stderr)
+    print(f"--pose-prior {TRUSTED if found.is_exact else found}: {why}", file=sys.stderr)
     return found
 
 

@@ -9,8 +9,9 @@ from gausslite.calibration.view_fit import PoseExposurePrior
 from gausslite.datasets.registered_source import DepthRegistration
 from gausslite.domain.pose import UpAxis
 from gausslite.domain.voxels import VoxelGrid
-from gausslite.mapping.frame_scheduler import SchedulerSettings, SkippableStage
 from gausslite.mapping.policies import ABLATION_FLAGS, POLICIES
+from gausslite.mapping.stages import SkippableStage
+from gausslite.mission.frame_scheduler import SchedulerSettings
 from gausslite.mission.settings import DEFAULT_MAX_GAUSSIANS, MissionSettings, PerceptionSettings
 from gausslite.render.choose import BACKENDS
 
@@ -38,7 +39,7 @@ _RUN_OVER_HELP = "by what share of its time a frame that is short of them may be
 
 
 def add_frames(parser: argparse.ArgumentParser, may_look: bool = False, by_default: str = AS_RECORDED) -> None:
-    """Add --frames, --size, --up and --colour-camera: what of a sequence is used, and how its cameras stand."""
+    """Add --frames, --size, --up and --register-depth: what of a sequence is used, and how its cameras stand."""
     add = parser.add_argument_group("frames").add_argument
     add("--frames", metavar="START:STOP:STEP", default=":", help="frame numbers to use (default: all)")
     add("--size", metavar="WxH", help="resize images to this size (default: as they are)")
@@ -49,15 +50,15 @@ def add_frames(parser: argparse.ArgumentParser, may_look: bool = False, by_defau
 def add_colour_camera(
     parser: argparse._ActionsContainer, may_look: bool = False, by_default: str = AS_RECORDED
 ) -> None:
-    """Add --colour-camera, for sequences whose depth is not registered to colour.
+    """Add --register-depth, for sequences whose depth is not registered to colour.
 
     may_look: "auto" and "none" are answers too, for programs that can look at the whole sequence first. by_default says
     in the help what the program does where nothing is asked for, which is None.
     """
     parser.add_argument(
-        "--colour-camera",
+        "--register-depth",
         metavar=f"{LOOK}|{AS_RECORDED}|{_COLOUR_CAMERA_METAVAR}" if may_look else _COLOUR_CAMERA_METAVAR,
-        type=colour_camera if may_look else DepthRegistration.parse,
+        type=depth_registration if may_look else DepthRegistration.parse,
         help=_COLOUR_CAMERA_HELP + (_LOOK_HELP.format(by_default) if may_look else ""),
     )
 
@@ -72,13 +73,13 @@ def add_detector(parser: argparse.ArgumentParser) -> None:
 
 
 def add_policy(parser: argparse.ArgumentParser, may_look: bool = False) -> None:
-    """Add --policy, --without, --view-error and --rasterizer: how the map is made.
+    """Add --policy, --disable, --pose-prior and --rasterizer: how the map is made.
 
     may_look: what is believed of views is measured on the sequence unless it is said, for programs that have it whole.
     """
     add = parser.add_argument_group("mapping").add_argument
     add("--policy", choices=sorted(POLICIES), default="task", help="how to spend the budget (default: task)")
-    add("--without", metavar="A,B", type=names, default=(), help=f"parts of the policy off: {' '.join(ABLATION_FLAGS)}")
+    add("--disable", metavar="A,B", type=names, default=(), help=f"parts of the policy off: {' '.join(ABLATION_FLAGS)}")
     add("--rasterizer", choices=BACKENDS, default="auto", help="what draws and trains the map (default: auto)")
     if may_look:
         add_view_error(parser, LOOK, LOOK, may_look)
@@ -92,11 +93,11 @@ def add_view_error(
     shown: str = TRUSTED,
     may_look: bool = False,
 ) -> None:
-    """Add --view-error, for cameras whose poses and colours cannot be trusted to the pixel; shown tells the default."""
+    """Add --pose-prior, for cameras whose poses and colours cannot be trusted to the pixel; shown tells the default."""
     parser.add_argument(
-        "--view-error",
+        "--pose-prior",
         metavar=f"{LOOK}|{TRUSTED}|{_VIEW_ERROR_METAVAR}" if may_look else f"{TRUSTED}|{_VIEW_ERROR_METAVAR}",
-        type=view_error if may_look else known_view_error,
+        type=pose_prior if may_look else known_view_error,
         default=default,
         help=_VIEW_ERROR_HELP.format(_MEASURE_HELP if may_look else "", shown),
     )
@@ -112,9 +113,9 @@ def add_budget(parser: argparse.ArgumentParser) -> None:
     per_frame.add_argument("--rate", metavar="HZ", type=float, help="frames a second: as many iterations as fit")
     pace = SchedulerSettings()
     least = pace.min_iterations
-    add("--least", metavar="N", type=int, default=least, help="at --rate, iterations to find time for (default: 15)")
-    add("--relief", metavar="A,B", type=reliefs, default=pace.reliefs, help=_RELIEF_HELP)
-    add("--run-over", metavar="SHARE", type=float, default=pace.run_over, help=_RUN_OVER_HELP)
+    add("--min-iterations", metavar="N", type=int, default=least, help="at --rate, iterations to find time for (default: 15)")
+    add("--skip-stages", metavar="A,B", type=skip_stages, default=pace.skip_stages, help=_RELIEF_HELP)
+    add("--deadline-slack", metavar="SHARE", type=float, default=pace.deadline_slack, help=_RUN_OVER_HELP)
     add("--seed", metavar="S", type=int, default=0, help="seed of every random choice (default: 0)")
     add("--threads", metavar="N", type=int, help="threads (default: all the processor allows)")
 
@@ -143,17 +144,17 @@ def mission_settings(options: argparse.Namespace) -> MissionSettings:
     """What add_policy and add_budget asked for; views to be looked at are trusted so far. Raises InvalidInputError."""
     return MissionSettings(
         policy=options.policy,
-        without=frozenset(options.without),
+        without=frozenset(options.disable),
         max_gaussians=options.max_gaussians,
         iterations=options.iterations,
         rate_hz=options.rate,
-        min_iterations=options.least,
-        reliefs=options.relief,
-        run_over=options.run_over,
+        min_iterations=options.min_iterations,
+        skip_stages=options.skip_stages,
+        deadline_slack=options.deadline_slack,
         seed=options.seed,
         threads=options.threads,
         backend=options.rasterizer,
-        view_prior=options.view_error if isinstance(options.view_error, PoseExposurePrior) else _TRUSTED,
+        pose_prior=options.pose_prior if isinstance(options.pose_prior, PoseExposurePrior) else _TRUSTED,
     )
 
 
@@ -162,7 +163,7 @@ def names(text: str) -> tuple[str, ...]:
     return tuple(part.strip() for part in text.split(",") if part.strip())
 
 
-def reliefs(text: str) -> tuple[SkippableStage, ...]:
+def skip_stages(text: str) -> tuple[SkippableStage, ...]:
     """Read "words,seeding"; argparse reports what is wrong."""
     try:
         return tuple(dict.fromkeys(SkippableStage(name) for name in names(text)))
@@ -177,12 +178,12 @@ def up_axis(text: str) -> UpAxis:
     return (x, y, z)
 
 
-def colour_camera(text: str) -> DepthRegistration | str:
+def depth_registration(text: str) -> DepthRegistration | str:
     """Read LOOK, AS_RECORDED or a camera. Raises InvalidInputError."""
     return text if text in (LOOK, AS_RECORDED) else DepthRegistration.parse(text)
 
 
-def view_error(text: str) -> PoseExposurePrior | str:
+def pose_prior(text: str) -> PoseExposurePrior | str:
     """Read LOOK, or what known_view_error does. Raises InvalidInputError."""
     return text if text == LOOK else known_view_error(text)
 

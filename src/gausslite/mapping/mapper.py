@@ -18,15 +18,15 @@ from gausslite.domain.state import State, nested, part, take, take_counts, take_
 from gausslite.mapping.checkpoint import generator_state, set_generator
 from gausslite.mapping.coverage import RenderedView
 from gausslite.mapping.eviction import insert
-from gausslite.mapping.frame_scheduler import FrameScheduler, SkippableStage, Stage
 from gausslite.mapping.keyframes import Keyframe, KeyframeStore, WindowView, window_view
 from gausslite.mapping.seeding import Seeder, SeedingContext, Seeds
 from gausslite.mapping.settings import MapperSettings
+from gausslite.mapping.stages import CountedScheduler, SkippableStage, Stage, StageScheduler
 from gausslite.mapping.task_change import clear_roi, vote_on_relevance
 from gausslite.mapping.training import Trainer
 from gausslite.mapping.view_refinement import ViewRefiner
 from gausslite.optimize.parameters import SplatTable
-from gausslite.render.rasterizer import MEAN, Rasterizer, Rendering
+from gausslite.render.rasterizer import Rasterizer, Rendering
 
 _EXTENT_PER_DEPTH = 1.0 / 3.0
 """The scene's extent as a fraction of the farthest depth seen, as SplaTAM's released configuration takes it."""
@@ -64,7 +64,7 @@ class GaussianMapper:
             self._table.append(known)
         self._seeder = Seeder(settings.seeding, settings.components, self._rng)
         self._keyframes = KeyframeStore(settings.keyframes, settings.components.follow_task)
-        self._refiner = ViewRefiner(settings.view_prior, self.render, settings.keyframes.refits)
+        self._refiner = ViewRefiner(settings.pose_prior, self.render, settings.keyframes.refits)
         self._trainer = Trainer(settings, self._table, rasterizer, self._rng)
         self._extent_m = 0.0
         self._revision = 0
@@ -94,23 +94,23 @@ class GaussianMapper:
         self,
         frame: Frame,
         relevance: RelevanceMap,
-        pace: FrameScheduler | None = None,
+        scheduler: StageScheduler | None = None,
         sight: RenderedView | None = None,
     ) -> MappedFrame:
-        """Take one frame into the map, in the time that the pace gives; by default iterations are counted.
+        """Take one frame into the map, in the time that the scheduler gives; by default iterations are counted.
 
         sight is how the map looks from the frame, drawn here unless it is given and the frame's pose is trusted. A
         frame without a depth reading is skipped and counted. Raises ShapeError when relevance and frame differ in size.
         """
         require_array("relevance weight", relevance.weight, frame.depth_m.shape, np.float32)
-        pace = FrameScheduler() if pace is None else pace
+        scheduler = CountedScheduler() if scheduler is None else scheduler
         if not frame.has_depth:
             self._skipped += 1
             return MappedFrame(frame.index, 0, 0, self.count, "no pixel has a depth reading")
-        with pace.timing(Stage.VIEW):
+        with scheduler.timing(Stage.VIEW_PREPARATION):
             view = self._observe(frame, relevance)
-        seeded = 0 if pace.spares(SkippableStage.SEEDING) else self._seed(view.keyframe, sight, pace)
-        iterations = self._train(view, pace)
+        seeded = 0 if scheduler.skips(SkippableStage.SEEDING) else self._seed(view.keyframe, sight, scheduler)
+        iterations = self._train(view, scheduler)
         self._keyframes.offer(view)
         self._revision += 1
         return MappedFrame(frame.index, seeded, iterations, self.count)
@@ -157,7 +157,7 @@ class GaussianMapper:
         vote_on_relevance(table, frame, relevance)
         if not relevance.roi.any():
             return 0
-        seeds = self._seeder.seed_region(frame, relevance, table.rows[:, MEAN][table.active])
+        seeds = self._seeder.seed_region(frame, relevance, table.means_m[table.active])
         return self._insert(Seeds(seeds, Gaussians.empty()))
 
     def pass_over(self, keyframe: Keyframe) -> None:
@@ -176,7 +176,7 @@ class GaussianMapper:
 
     def gaussians(self) -> Gaussians:
         """A copy of the map as physical values, as it is shown (`OptimizationSettings.averaged_updates`)."""
-        return self._table.to_gaussians(averaged=self._settings.optimization.averaged_updates > 0)
+        return self._table.to_gaussians(use_ema=self._settings.optimization.averaged_updates > 0)
 
     def roi_gaussians(self) -> Gaussians:
         """A copy of the active Gaussians: the task's part of the map."""
@@ -198,13 +198,13 @@ class GaussianMapper:
     def state(self) -> State:
         """All that the next frame's mapping depends on, as views; valid until then."""
         return {
-            **nested("table", self._table.state()),
-            **nested("keyframes", self._keyframes.state()),
-            **nested("trainer", self._trainer.state()),
-            **nested("refiner", self._refiner.state()),
+            **add_prefix("table", self._table.state()),
+            **add_prefix("keyframes", self._keyframes.state()),
+            **add_prefix("trainer", self._trainer.state()),
+            **add_prefix("refiner", self._refiner.state()),
             "generator": generator_state(self._rng),
             "extent_m": np.array([self._extent_m]),
-            "frames": whole_numbers(self._revision, self._skipped),
+            "frames": int_array(self._revision, self._skipped),
         }
 
     def restore(self, state: State) -> None:
@@ -213,13 +213,13 @@ class GaussianMapper:
         Raises MapFileError for a state that is none, QuotaError for one beyond max_gaussians. After an error this
         mapper must not be used.
         """
-        self._table.restore(part(state, "table"))
-        self._keyframes.restore(part(state, "keyframes"), self._view)
-        self._trainer.restore(part(state, "trainer"))
-        self._refiner.restore(part(state, "refiner"))
-        set_generator(self._rng, take(state, "generator", (6,), np.uint64))
-        [self._extent_m] = take_measures(state, "extent_m", 1)
-        self._revision, self._skipped = take_counts(state, "frames", 2)
+        self._table.restore(select_prefix(state, "table"))
+        self._keyframes.restore(select_prefix(state, "keyframes"), self._view)
+        self._trainer.restore(select_prefix(state, "trainer"))
+        self._refiner.restore(select_prefix(state, "refiner"))
+        set_generator(self._rng, get_array(state, "generator", (6,), np.uint64))
+        [self._extent_m] = get_floats(state, "extent_m", 1)
+        self._revision, self._skipped = get_counts(state, "frames", 2)
 
     def _observe(self, frame: Frame, relevance: RelevanceMap) -> WindowView:
         """Make the frame ready to train on, with its pose and colours refined where they may be wrong."""
@@ -239,13 +239,13 @@ class GaussianMapper:
     def _view(self, keyframe: Keyframe) -> WindowView:
         return window_view(keyframe, self._rasterizer, self._settings.keyframes)
 
-    def _seed(self, keyframe: Keyframe, sight: RenderedView | None, pace: FrameScheduler) -> int:
+    def _seed(self, keyframe: Keyframe, sight: RenderedView | None, scheduler: StageScheduler) -> int:
         """Add Gaussians where the map does not explain the frame, within the cap."""
         frame, table = keyframe.frame, self._table
         if sight is None or keyframe.recorded is not None:
             sight = self.look(frame)
-        with pace.timing(Stage.SEEDING):
-            state = SeedingContext(table.room, sight, table.rows[:, MEAN][table.active])
+        with scheduler.timing(Stage.SEEDING):
+            state = SeedingContext(table.free_slots, sight, table.means_m[table.active])
             seeds = self._seeder.seed(frame, keyframe.relevance, state)
             return self._insert(seeds)
 
@@ -254,7 +254,7 @@ class GaussianMapper:
         seeding, table = self._settings.seeding, self._table
         return insert(table, seeds, seeding.opacity, self._rng, int(seeding.scaffold_share * table.capacity))
 
-    def _train(self, current: WindowView, pace: FrameScheduler) -> int:
+    def _train(self, current: WindowView, scheduler: StageScheduler) -> int:
         """MVO: train on views drawn from the window and the current one; without it on the current one alone."""
         views = (*self._keyframes.window, current) if self._settings.components.mvo else (current,)
-        return self._trainer.train(views, self._extent_m, pace)
+        return self._trainer.train(views, self._extent_m, scheduler)

@@ -11,12 +11,12 @@ from jaxtyping import Bool, Float32, UInt32
 from numpy import ndarray
 
 from gausslite.domain.state import State, take_counts, whole_numbers
-from gausslite.mapping.frame_scheduler import FrameScheduler, Stage
 from gausslite.mapping.keyframes import WindowView
 from gausslite.mapping.settings import ActivePhase, MapperSettings
+from gausslite.mapping.stages import CountedScheduler, Stage, StageScheduler
 from gausslite.optimize.density import densify, prune
 from gausslite.optimize.parameters import SplatTable
-from gausslite.render.rasterizer import LOG_SCALE, RGB, Rasterizer, Subset, UpdateCounter
+from gausslite.render.rasterizer import Rasterizer, Subset, UpdateCounter
 
 _COLOUR_RANGE = (-0.25, 1.25)
 """Somewhat beyond what can be shown, so that overlapping Gaussians still add up to black and white."""
@@ -32,7 +32,7 @@ class _Loan:
     tables: _Tables
     active_ids: UInt32[ndarray, " m"] | None
     trainable: Bool[ndarray, " n"] | None
-    tally: UpdateCounter
+    update_counter: UpdateCounter
 
     @classmethod
     def of(cls, table: SplatTable, phase: ActivePhase) -> _Loan:
@@ -41,7 +41,7 @@ class _Loan:
             tables=(table.rows, table.first_moment, table.second_moment),
             active_ids=np.flatnonzero(table.active).astype(np.uint32) if phase is ActivePhase.ACTIVE_ONLY else None,
             trainable=table.active if phase is ActivePhase.FROZEN_BACKGROUND else None,
-            tally=UpdateCounter(table.kappa, table.active),
+            update_counter=UpdateCounter(table.kappa, table.active),
         )
 
 
@@ -67,14 +67,14 @@ class Trainer:
 
     def state(self) -> State:
         """The counts by which density control takes its turns; between two frames nothing else is kept."""
-        return {"counts": whole_numbers(self._iterations, self._since_pruned, self._since_densified)}
+        return {"counts": int_array(self._iterations, self._since_pruned, self._since_densified)}
 
     def restore(self, state: State) -> None:
         """Go on where another trainer stood. Raises MapFileError."""
-        self._iterations, self._since_pruned, self._since_densified = take_counts(state, "counts", 3)
+        self._iterations, self._since_pruned, self._since_densified = get_counts(state, "counts", 3)
 
-    def train(self, views: Sequence[WindowView], extent_m: float, pace: FrameScheduler) -> int:
-        """Train on these views for as long as the pace allows and return the number of iterations.
+    def train(self, views: Sequence[WindowView], extent_m: float, scheduler: StageScheduler) -> int:
+        """Train on these views for as long as the scheduler allows and return the number of iterations.
 
         The two phases take turns in the settings' proportion, a warm-up first. Where the time left is too short for
         another, or for the frame's least iterations after it, active ones take its place.
@@ -82,9 +82,9 @@ class Trainer:
         showing = self._showing_region(views)
         done, time_is_up = 0, False
         while not time_is_up:
-            done, time_is_up = self._until_density_control(views, showing, done, pace)
-            self._control_density(extent_m, pace)
-        with pace.timing(Stage.SETTLING):
+            done, time_is_up = self._until_density_control(views, showing, done, scheduler)
+            self._control_density(extent_m, scheduler)
+        with scheduler.timing(Stage.FINALISATION):
             self._bound_colours()
             if self._settings.optimization.isotropic:
                 self._make_spheres()
@@ -93,14 +93,14 @@ class Trainer:
 
     def rehearse(self, views: Sequence[WindowView], extent_m: float) -> None:
         """One iteration on views of earlier frames, for time in which none waits; the phases take turns as ever."""
-        showing, pace = self._showing_region(views), FrameScheduler()
-        step = self._next_step(self._iterations, bool(showing), pace)
+        showing, scheduler = self._showing_region(views), CountedScheduler()
+        step = self._next_step(self._iterations, bool(showing), scheduler)
         if step is None:
             return
         loan = _Loan.of(self._table, self._settings.optimization.active_phase)
-        with self._rasterizer.holding(*loan.tables):
+        with self._rasterizer.bind_tables(*loan.tables):
             self._iterate(loan, step, views if step is Stage.WARM_UP else showing, self._rng.random())
-        self._control_density(extent_m, pace)
+        self._control_density(extent_m, scheduler)
         self._bound_colours()
         if self._iterations % self._settings.optimization.iterations == 0:
             self._average()
@@ -112,30 +112,30 @@ class Trainer:
             return []
         return [view for view in views if view.shows_region]
 
-    def _next_step(self, done: int, region_in_view: bool, pace: FrameScheduler) -> Stage | None:
+    def _next_step(self, done: int, region_in_view: bool, scheduler: StageScheduler) -> Stage | None:
         optimization = self._settings.optimization
         counted = optimization.iterations
         warming_up = not region_in_view or done % counted < optimization.warmup_iterations
         if region_in_view and done > 0:
-            warming_up = warming_up and pace.has_time_for(Stage.WARM_UP)
-        if warming_up and pace.trains_on(Stage.WARM_UP, counted):
+            warming_up = warming_up and scheduler.has_time_for(Stage.WARM_UP)
+        if warming_up and scheduler.trains_on(Stage.WARM_UP, counted):
             return Stage.WARM_UP
-        return Stage.ACTIVE if region_in_view and pace.trains_on(Stage.ACTIVE, counted) else None
+        return Stage.ACTIVE if region_in_view and scheduler.trains_on(Stage.ACTIVE, counted) else None
 
     def _until_density_control(
-        self, views: Sequence[WindowView], showing: Sequence[WindowView], done: int, pace: FrameScheduler
+        self, views: Sequence[WindowView], showing: Sequence[WindowView], done: int, scheduler: StageScheduler
     ) -> tuple[int, bool]:
         """Iterate until density control is due or time is up, the tables on loan to the rasterizer; `done` and which
         of both then.
         """
         loan = _Loan.of(self._table, self._settings.optimization.active_phase)
         draws = _uniform(self._rng)
-        with self._rasterizer.holding(*loan.tables):
-            while (step := self._next_step(done, bool(showing), pace)) is not None:
-                with pace.timing(step):
+        with self._rasterizer.bind_tables(*loan.tables):
+            while (step := self._next_step(done, bool(showing), scheduler)) is not None:
+                with scheduler.timing(step):
                     self._iterate(loan, step, views if step is Stage.WARM_UP else showing, next(draws))
                 done += 1
-                if self._prune_is_due(pace) or self._densify_is_due(pace):
+                if self._prune_is_due(scheduler) or self._densify_is_due(scheduler):
                     return done, False
         return done, True
 
@@ -165,39 +165,36 @@ class Trainer:
             masked=True,
             subset=view.region if loan.active_ids is None else Subset(view.region.tiles, loan.active_ids),
             trainable=loan.trainable,
-            tally=loan.tally,
+            update_counter=loan.update_counter,
         )
 
     def _make_spheres(self) -> None:
         """Each Gaussian gets the geometric mean of its scales."""
-        log_scales = self._table.rows[:, LOG_SCALE]
-        log_scales[:] = log_scales.mean(axis=1, keepdims=True)
+        self._table.make_isotropic()
 
     def _bound_colours(self) -> None:
         """Colours that no view checks for a while must not run away."""
-        # channel by channel: NumPy takes twice as long over three columns at once
-        for channel in self._table.rows[:, RGB].T:
-            np.clip(channel, *_COLOUR_RANGE, out=channel)
+        self._table.clip_colours(*_COLOUR_RANGE)
 
     def _average(self) -> None:
         if self._settings.optimization.averaged_updates > 0:
-            self._table.average(self._settings.optimization.averaged_updates)
+            self._table.update_ema(self._settings.optimization.averaged_updates)
 
-    def _prune_is_due(self, pace: FrameScheduler) -> bool:
-        return _due(self._since_pruned, self._settings.density.prune_every, Stage.PRUNING, pace)
+    def _prune_is_due(self, scheduler: StageScheduler) -> bool:
+        return _due(self._since_pruned, self._settings.density.prune_every, Stage.PRUNING, scheduler)
 
-    def _densify_is_due(self, pace: FrameScheduler) -> bool:
-        return _due(self._since_densified, self._settings.density.densify_every, Stage.DENSIFYING, pace)
+    def _densify_is_due(self, scheduler: StageScheduler) -> bool:
+        return _due(self._since_densified, self._settings.density.densify_every, Stage.DENSIFICATION, scheduler)
 
-    def _control_density(self, extent_m: float, pace: FrameScheduler) -> None:
+    def _control_density(self, extent_m: float, scheduler: StageScheduler) -> None:
         """Clone, split and prune when their turn has come, and later where a frame has no time for it."""
         density = self._settings.density
-        if self._prune_is_due(pace):
-            with pace.timing(Stage.PRUNING):
+        if self._prune_is_due(scheduler):
+            with scheduler.timing(Stage.PRUNING):
                 prune(self._table, density)
             self._since_pruned = 0
-        if self._densify_is_due(pace):
-            with pace.timing(Stage.DENSIFYING):
+        if self._densify_is_due(scheduler):
+            with scheduler.timing(Stage.DENSIFICATION):
                 densify(self._table, density, extent_m)
             self._since_densified = 0
 
@@ -208,6 +205,6 @@ def _uniform(rng: np.random.Generator) -> Iterator[float]:
         yield from rng.random(_DRAWS).tolist()
 
 
-def _due(since: int, every: int, step: Stage, pace: FrameScheduler) -> bool:
+def _due(since: int, every: int, step: Stage, scheduler: StageScheduler) -> bool:
     """Density control may be late by as many iterations again as lie between two of its turns."""
-    return since >= 2 * every or (since >= every and pace.has_time_for(step))
+    return since >= 2 * every or (since >= every and scheduler.has_time_for(step))

@@ -35,10 +35,10 @@ class ResumeConfig:
             "iterations": _or_default(settings.iterations),
             "rate": _or_default(settings.rate_hz),
             "least": str(settings.min_iterations),
-            "relief": ",".join(settings.reliefs),
-            "run_over": str(settings.run_over),
+            "relief": ",".join(settings.skip_stages),
+            "deadline_slack": str(settings.deadline_slack),
             "seed": str(settings.seed),
-            "view_error": str(settings.view_prior),
+            "view_error": str(settings.pose_prior),
         }
         return cls({**options, **beside})
 
@@ -68,10 +68,10 @@ class SavedRun:
         """Raises MapFileError for a file that is none."""
         saved = read_state(path)
         with _in_file(path):
-            about = part(saved, "about")
-            [last_index] = take(about, "last_index", (1,), np.int64)
-            terms = ResumeConfig(_texts(take_text(about, "terms")))
-            return cls(path, terms, int(last_index), part(saved, "beside"), part(saved, "loop"))
+            about = select_prefix(saved, "about")
+            [last_index] = get_array(about, "last_index", (1,), np.int64)
+            terms = ResumeConfig(_texts(get_text(about, "terms")))
+            return cls(path, terms, int(last_index), select_prefix(saved, "beside"), select_prefix(saved, "loop"))
 
     def require(self, terms: ResumeConfig) -> None:
         """Raise MismatchError naming the options that are not those of the saved run."""
@@ -91,8 +91,10 @@ class SavedRun:
 
 def save_run(path: Path, loop: TaskMapper, terms: ResumeConfig, last_index: int, beside: State | None = None) -> None:
     """Save a run whose last frame had this number. Raises StorageError."""
-    about: State = {"terms": text(json.dumps(dict(terms.options))), "last_index": whole_numbers(last_index)}
-    write_state(path, {**nested("about", about), **nested("loop", loop.state()), **nested("beside", beside or {})})
+    about: State = {"terms": encode_text(json.dumps(dict(terms.options))), "last_index": int_array(last_index)}
+    write_state(
+        path, {**add_prefix("about", about), **add_prefix("loop", loop.state()), **add_prefix("beside", beside or {})}
+    )
 
 
 @contextmanager

@@ -11,9 +11,10 @@ from gausslite.datasets.source import Source
 from gausslite.domain.pose import UpAxis
 from gausslite.domain.region import Region
 from gausslite.errors import InvalidInputError
-from gausslite.mapping.frame_scheduler import SchedulerSettings, SkippableStage
 from gausslite.mapping.policies import policy, without
 from gausslite.mapping.settings import MapperSettings
+from gausslite.mapping.stages import SkippableStage
+from gausslite.mission.frame_scheduler import SchedulerSettings
 from gausslite.render.cpu_kernels import MAX_THREADS
 
 DEFAULT_MAX_GAUSSIANS = 150_000
@@ -66,7 +67,7 @@ class MissionSettings:
 
     without switches parts of the policy off by name (see `gausslite.mapping.policies.without`). rate_hz, when given,
     replaces the fixed number of iterations by what fits into 1 / rate_hz seconds a frame; where that is less than
-    min_iterations, the reliefs give way, and a frame may be late by the share run_over of its time. view_prior: how
+    min_iterations, the skip_stages give way, and a frame may be late by the share deadline_slack of its time. pose_prior: how
     wrong poses and colours of frames may be.
     """
 
@@ -76,20 +77,20 @@ class MissionSettings:
     iterations: int | None = None
     rate_hz: float | None = None
     min_iterations: int = _PACE.min_iterations
-    reliefs: tuple[SkippableStage, ...] = _PACE.reliefs
-    run_over: float = _PACE.run_over
+    skip_stages: tuple[SkippableStage, ...] = _PACE.skip_stages
+    deadline_slack: float = _PACE.deadline_slack
     seed: int = 0
     threads: int | None = None
     backend: str = "auto"
-    view_prior: PoseExposurePrior = field(default_factory=PoseExposurePrior)
+    pose_prior: PoseExposurePrior = field(default_factory=PoseExposurePrior)
 
     def __post_init__(self) -> None:
         if self.rate_hz is not None:
             require_rate(self.rate_hz)
         if not 0 <= self.min_iterations <= 10_000:
             raise InvalidInputError(f"least iterations: expected 0 to 10000, got {self.min_iterations}")
-        if not 0 <= self.run_over <= 1:
-            raise InvalidInputError(f"run over: expected a share of a frame's time, 0 to 1, got {self.run_over}")
+        if not 0 <= self.deadline_slack <= 1:
+            raise InvalidInputError(f"run over: expected a share of a frame's time, 0 to 1, got {self.deadline_slack}")
         if self.iterations is not None and not 0 <= self.iterations <= 10_000:
             raise InvalidInputError(f"iterations: expected 0 to 10000, got {self.iterations}")
         if not 0 <= self.seed < 1 << 32:
@@ -104,7 +105,7 @@ class MissionSettings:
         """The time a frame may take and what it goes without when short; None where iterations are counted instead."""
         if self.rate_hz is None:
             return None
-        return SchedulerSettings(1.0 / self.rate_hz, self.min_iterations, self.reliefs, self.run_over)
+        return SchedulerSettings(1.0 / self.rate_hz, self.min_iterations, self.skip_stages, self.deadline_slack)
 
     def mapper_settings(self) -> MapperSettings:
         """The named policy with this mission's cap, iterations and switches."""
@@ -112,4 +113,4 @@ class MissionSettings:
         optimization = base.optimization
         if self.iterations is not None:
             optimization = optimization.with_iterations(self.iterations)
-        return replace(base, max_gaussians=self.max_gaussians, optimization=optimization, view_prior=self.view_prior)
+        return replace(base, max_gaussians=self.max_gaussians, optimization=optimization, pose_prior=self.pose_prior)

@@ -11,11 +11,12 @@ from gausslite.domain.relevance import RelevanceMap
 from gausslite.domain.state import State, nested, part
 from gausslite.domain.voxel_batch import VoxelBatch
 from gausslite.mapping.coverage import RenderedView
-from gausslite.mapping.frame_scheduler import FrameScheduler, FrameTiming, SkippableStage, Stage
 from gausslite.mapping.keyframes import Keyframe
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.sent_voxels import SentVoxelTracker
+from gausslite.mapping.stages import SkippableStage, Stage
 from gausslite.mapping.task_change import Reevaluation
+from gausslite.mission.frame_scheduler import FrameScheduler, FrameTiming
 from gausslite.perception.relevance_estimator import RelevanceEstimator
 
 
@@ -33,7 +34,7 @@ class FrameOutcome:
     iterations: int
     gaussians: int
     roi_share: float
-    budget: FrameTiming
+    timing: FrameTiming
     skipped: str | None
     words: VoxelBatch | None
     detection_lag_frames: int | None
@@ -48,17 +49,17 @@ class TaskMapper:
         attention: RelevanceEstimator,
         mapper: GaussianMapper,
         ledger: SentVoxelTracker | None = None,
-        pace: FrameScheduler | None = None,
+        scheduler: FrameScheduler | None = None,
         tell: Callable[[VoxelBatch], None] = lambda _words: None,
     ) -> None:
-        """Without a pace each frame gets the fixed number of iterations of the mapper's settings.
+        """Without a scheduler each frame gets the fixed number of iterations of the mapper's settings.
 
         `tell` is given each frame's words within its time.
         """
         self._attention = attention
         self._mapper = mapper
         self._ledger = ledger
-        self._pace = pace or FrameScheduler()
+        self._scheduler = scheduler or FrameScheduler()
         self._tell = tell
 
     def assign(self, attention: RelevanceEstimator) -> None:
@@ -92,34 +93,34 @@ class TaskMapper:
         """All that the next frame depends on, save the clock; valid until then."""
         ledger: State = {} if self._ledger is None else self._ledger.state()
         return {
-            **nested("mapper", self._mapper.state()),
-            **nested("attention", self._attention.state()),
-            **nested("ledger", ledger),
+            **add_prefix("mapper", self._mapper.state()),
+            **add_prefix("attention", self._attention.state()),
+            **add_prefix("ledger", ledger),
         }
 
     def restore(self, state: State) -> None:
         """Go on from what a loop of the same settings and task handed out. Raises MapFileError, InvalidInputError."""
-        self._mapper.restore(part(state, "mapper"))
-        self._attention.restore(part(state, "attention"))
-        words = part(state, "ledger")
+        self._mapper.restore(select_prefix(state, "mapper"))
+        self._attention.restore(select_prefix(state, "attention"))
+        words = select_prefix(state, "ledger")
         if self._ledger is not None and words:
             self._ledger.restore(words)
 
     def process(self, frame: Frame, waited_s: float = 0.0) -> FrameOutcome:
         """Take one frame, which has waited this long for its turn, from its pixels to the words on its region."""
-        self._pace.begin(waited_s)
+        self._scheduler.begin(waited_s)
         sight = self._look(frame)
         relevance = self._attend(frame, sight)
         lag_frames = self._catch_up()
         reread = self._reread()
-        mapped = self._mapper.map_frame(frame, relevance, self._pace, sight)
+        mapped = self._mapper.map_frame(frame, relevance, self._scheduler, sight)
         words = self._tell_changed_roi() if mapped.skipped is None else None
         return FrameOutcome(
             index=frame.index,
             iterations=mapped.iterations,
             gaussians=mapped.gaussians,
             roi_share=relevance.roi_share,
-            budget=self._pace.end(),
+            timing=self._scheduler.end(),
             skipped=mapped.skipped,
             words=words,
             detection_lag_frames=lag_frames,
@@ -136,21 +137,21 @@ class TaskMapper:
 
     def _look(self, frame: Frame) -> RenderedView | None:
         """The one drawing of a frame: attention takes its depth, seeding what it leaves open."""
-        if self._pace.spares(SkippableStage.SEEDING):
+        if self._scheduler.skips(SkippableStage.SEEDING):
             return None
-        with self._pace.timing(Stage.DRAWING):
+        with self._scheduler.timing(Stage.RENDERING):
             return self._mapper.look(frame)
 
     def _attend(self, frame: Frame, sight: RenderedView | None) -> RelevanceMap:
-        with self._pace.timing(Stage.ATTENTION):
-            return self._attention.attend(frame, None if sight is None else sight.depth_m)
+        with self._scheduler.timing(Stage.RELEVANCE):
+            return self._attention.estimate(frame, None if sight is None else sight.depth_m)
 
     def _catch_up(self) -> int | None:
         """Give an earlier keyframe the relevance that was not known when it was mapped; its age in frames."""
         late = self._attention.late()
         if late is None:
             return None
-        with self._pace.timing(Stage.VIEW):
+        with self._scheduler.timing(Stage.VIEW_PREPARATION):
             self._mapper.revise(late.frame, late.relevance)
         return late.lag_frames
 
@@ -160,9 +161,9 @@ class TaskMapper:
         while (keyframe := self._mapper.next_to_judge) is not None:
             if keyframes == self._mapper.settings.retask.keyframes_a_frame:
                 break
-            if keyframes > 0 and not self._pace.has_time_for(Stage.REEVALUATION):
+            if keyframes > 0 and not self._scheduler.has_time_for(Stage.REEVALUATION):
                 break
-            with self._pace.timing(Stage.REEVALUATION):
+            with self._scheduler.timing(Stage.REEVALUATION):
                 relevance = self._look_back(keyframe)
                 if relevance is None:
                     break
@@ -173,15 +174,15 @@ class TaskMapper:
     def _look_back(self, keyframe: Keyframe) -> RelevanceMap | None:
         """The relevance of an earlier keyframe. One that cannot be judged costs this frame, and no other."""
         try:
-            return self._attention.look_back(keyframe.as_recorded)
+            return self._attention.evaluate_past(keyframe.as_recorded)
         except Exception:
             self._mapper.pass_over(keyframe)
             raise
 
     def _tell_changed_roi(self) -> VoxelBatch | None:
-        if self._pace.spares(SkippableStage.WORDS):
+        if self._scheduler.skips(SkippableStage.PUBLISHING):
             return None
-        with self._pace.timing(Stage.WORDS):
+        with self._scheduler.timing(Stage.PUBLISHING):
             words = self.words()
             if words is not None:
                 self._tell(words)

@@ -20,7 +20,7 @@ class TaskSwitch:
         """Read "120:Find the mug". Raises InvalidInputError."""
         number, colon, words = text.partition(":")
         if not (colon and number.isascii() and number.isdigit() and len(number) < 10 and words.strip()):
-            raise InvalidInputError(f"--then: expected a frame and a task such as '120:Find the mug', got {text!r}")
+            raise InvalidInputError(f"--task-at: expected a frame and a task such as '120:Find the mug', got {text!r}")
         return cls(int(number), words.strip())
 
 

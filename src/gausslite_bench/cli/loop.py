@@ -10,11 +10,11 @@ from gausslite.cli.map_command import choose_attention
 from gausslite.cli.progress import MappingBar
 from gausslite.cli.source_options import add_regions, asked_regions, open_with_warnings
 from gausslite.config.options import add_budget, add_detector, add_frames, add_policy, mission_settings
+from gausslite.datasets.held_out import HeldOutSplit
 from gausslite.datasets.selection import frame_size, select_frames
 from gausslite.datasets.source import Source
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.errors import InvalidInputError
-from gausslite.evaluation.held_out import HeldOutSplit
 from gausslite.evaluation.views import HeldOutView
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.policies import TASK
@@ -58,7 +58,7 @@ def run(options: argparse.Namespace) -> int:
         options.task = _HOME_TASK
     if options.loop is not None and options.loop < 2:
         raise InvalidInputError(f"--loop: expected at least 2 frames, got {options.loop}")
-    source, _ = open_with_warnings(options.source, options.up, options.colour_camera)
+    source, _ = open_with_warnings(options.source, options.up, options.register_depth)
     positions: Sequence[int] = select_frames(source, options.frames)
     held_out: Sequence[int] = ()
     if options.unlimited is not None:
@@ -135,7 +135,7 @@ def _play(
     """Run the loop over these positions; memory is sampled where the sequence is looped."""
     settings, size = mission_settings(options), frame_size(options.size, source)
     mapper = GaussianMapper(settings.mapper_settings(), rasterizer, settings.seed)
-    bench = LoopBench(choose_attention(options, source)[0], mapper, VoxelGrid(), settings.pace)
+    bench = LoopBench(choose_attention(options, source)[0], mapper, VoxelGrid(), settings.scheduler_settings)
     log, samples_mib = CostLog(), []
     every = max(1, len(positions) // _MEMORY_SAMPLES)
     with MappingBar(len(positions), "bench") as bar:
@@ -215,6 +215,6 @@ def loop_lines(timing: LoopTiming) -> str:
             percentiles("ROI words", timing.words),
             *(percentiles(f" {name}", latency) for name, latency in timing.steps.items()),
             f"  {timing.frames_short} frames trained too little; for want of time went without "
-            + ", ".join(f"{name}: {count}" for name, count in timing.reliefs.items()),
+            + ", ".join(f"{name}: {count}" for name, count in timing.skipped_stages.items()),
         ]
     )

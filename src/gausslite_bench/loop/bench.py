@@ -12,9 +12,10 @@ from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.errors import DatasetError
-from gausslite.mapping.frame_scheduler import FrameScheduler, FrameTiming, SchedulerSettings, SkippableStage, Stage
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.sent_voxels import SentVoxelTracker
+from gausslite.mapping.stages import SkippableStage, Stage
+from gausslite.mission.frame_scheduler import FrameScheduler, FrameTiming, SchedulerSettings
 from gausslite.mission.task_mapper import TaskMapper
 from gausslite.perception.relevance_estimator import RelevanceEstimator
 from gausslite.render.cpu import CpuRasterizer
@@ -41,7 +42,7 @@ class Latency:
 class FrameCost:
     """One mapped frame: its latency from the image in memory to the words that would leave the robot, and its steps."""
 
-    budget: FrameTiming
+    timing: FrameTiming
     iterations: int
     gaussians: int
     roi_share: float
@@ -49,21 +50,21 @@ class FrameCost:
     @property
     def perception_s(self) -> float:
         """Seconds of attention."""
-        return self.of(Stage.ATTENTION)
+        return self.of(Stage.RELEVANCE)
 
     @property
     def words_s(self) -> float:
         """Seconds that making the region's words took."""
-        return self.of(Stage.WORDS)
+        return self.of(Stage.PUBLISHING)
 
     @property
     def mapping_s(self) -> float:
         """Seconds of all else: drawing, seeding and training."""
-        return self.budget.seconds - self.perception_s - self.words_s
+        return self.timing.seconds - self.perception_s - self.words_s
 
     def of(self, step: Stage) -> float:
         """Seconds of one step; 0 where the frame went without it."""
-        return self.budget.steps_s.get(step, 0.0)
+        return self.timing.stages_s.get(step, 0.0)
 
 
 class CostLog:
@@ -74,9 +75,9 @@ class CostLog:
 
     def append(self, cost: FrameCost) -> None:
         """Keep one more."""
-        budget = cost.budget
-        self._numbers.extend((budget.seconds, budget.short, cost.iterations, cost.gaussians, cost.roi_share))
-        self._numbers.extend(relief in budget.reliefs for relief in SkippableStage)
+        timing = cost.timing
+        self._numbers.extend((timing.seconds, timing.under_trained, cost.iterations, cost.gaussians, cost.roi_share))
+        self._numbers.extend(relief in timing.skipped_stages for relief in SkippableStage)
         self._numbers.extend(map(cost.of, Stage))
 
     def costs(self) -> list[FrameCost]:
@@ -90,16 +91,20 @@ class CostLog:
 def _cost_of(row: list[float]) -> FrameCost:
     """A frame's cost from the numbers that the log keeps of it."""
     (seconds, short, iterations, gaussians, roi_share), beside = row[:5], row[5:]
-    reliefs = frozenset(relief for relief, went_without in zip(SkippableStage, beside, strict=False) if went_without)
+    skipped_stages = frozenset(
+        relief for relief, went_without in zip(SkippableStage, beside, strict=False) if went_without
+    )
     steps_s = {step: step_s for step, step_s in zip(Stage, beside[len(SkippableStage) :], strict=True) if step_s > 0.0}
-    return FrameCost(FrameTiming(seconds, steps_s, reliefs, bool(short)), int(iterations), int(gaussians), roi_share)
+    return FrameCost(
+        FrameTiming(seconds, steps_s, skipped_stages, bool(short)), int(iterations), int(gaussians), roi_share
+    )
 
 
 @dataclass(frozen=True, slots=True)
 class LoopTiming:
     """The figures of a run. hz is what the loop sustains when frames are always at hand; the last frame's Gaussians.
 
-    steps: each step's time in a frame. frames_short trained less than they should; reliefs counts the frames that
+    steps: each step's time in a frame. frames_short trained less than they should; skipped_stages counts the frames that
     went without something for want of time.
     """
 
@@ -113,7 +118,7 @@ class LoopTiming:
     words: Latency
     steps: dict[str, Latency]
     frames_short: int
-    reliefs: dict[str, int]
+    skipped_stages: dict[str, int]
     roi_share: float
     gaussians: int
 
@@ -125,16 +130,18 @@ class LoopTiming:
         iterations = [cost.iterations for cost in costs]
         return cls(
             frames=len(costs),
-            hz=len(costs) / sum(cost.budget.seconds for cost in costs),
+            hz=len(costs) / sum(cost.timing.seconds for cost in costs),
             iterations_mean=float(np.mean(iterations)),
             iterations_min=min(iterations),
-            latency=Latency.of([cost.budget.seconds for cost in costs]),
+            latency=Latency.of([cost.timing.seconds for cost in costs]),
             perception=Latency.of([cost.perception_s for cost in costs]),
             mapping=Latency.of([cost.mapping_s for cost in costs]),
             words=Latency.of([cost.words_s for cost in costs]),
             steps={step.value: Latency.of([cost.of(step) for cost in costs]) for step in Stage},
-            frames_short=sum(cost.budget.short for cost in costs),
-            reliefs={relief.value: sum(relief in cost.budget.reliefs for cost in costs) for relief in SkippableStage},
+            frames_short=sum(cost.timing.under_trained for cost in costs),
+            skipped_stages={
+                relief.value: sum(relief in cost.timing.skipped_stages for cost in costs) for relief in SkippableStage
+            },
             roi_share=float(np.mean([cost.roi_share for cost in costs])),
             gaussians=costs[-1].gaussians,
         )
@@ -148,10 +155,10 @@ class LoopBench:
         attention: RelevanceEstimator,
         mapper: GaussianMapper,
         grid: VoxelGrid,
-        pace: SchedulerSettings | None = None,
+        scheduler: SchedulerSettings | None = None,
     ) -> None:
-        """With a pace each frame trains until its time is up, without one for a fixed number of iterations."""
-        self._loop = TaskMapper(attention, mapper, SentVoxelTracker(grid), FrameScheduler(pace))
+        """With a scheduler each frame trains until its time is up, without one for a fixed number of iterations."""
+        self._loop = TaskMapper(attention, mapper, SentVoxelTracker(grid), FrameScheduler(scheduler))
 
     def gaussians(self) -> Gaussians:
         """A copy of the map."""
@@ -162,7 +169,7 @@ class LoopBench:
         outcome = self._loop.process(frame)
         if outcome.skipped is not None:
             return None
-        return FrameCost(outcome.budget, outcome.iterations, outcome.gaussians, outcome.roi_share)
+        return FrameCost(outcome.timing, outcome.iterations, outcome.gaussians, outcome.roi_share)
 
 
 @dataclass(frozen=True, slots=True)

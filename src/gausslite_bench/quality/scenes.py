@@ -14,6 +14,7 @@ from jaxtyping import Float32
 from numpy import ndarray
 
 from gausslite.calibration.view_fit import PoseExposurePrior
+from gausslite.datasets.held_out import HeldOutSplit
 from gausslite.datasets.intrinsics import CAMERA_FILE, INTRINSICS_FILE, find_beside_or_above
 from gausslite.datasets.open import open_source
 from gausslite.datasets.regions import balls_for_small_objects, choose_regions, load_voxel_regions
@@ -25,7 +26,6 @@ from gausslite.domain.region import Region
 from gausslite.domain.relevance import RelevanceMap
 from gausslite.domain.state import State
 from gausslite.errors import DatasetError, InvalidInputError
-from gausslite.evaluation.held_out import HeldOutSplit
 from gausslite.evaluation.views import MIN_ROI_PIXELS, HeldOutView
 from gausslite.mission.settings import SceneKnowledge
 from gausslite.perception.fixed_relevance import RegionRelevanceEstimator
@@ -64,11 +64,11 @@ class Scene:
 class PosePolicy:
     """How far what is said of a scene's views can be believed.
 
-    view_prior says how wrong poses and colours may be, for mapping; with fit_views the held-out views are scored a
+    pose_prior says how wrong poses and colours may be, for mapping; with fit_views the held-out views are scored a
     second time with their own pose and colours fitted.
     """
 
-    view_prior: PoseExposurePrior = field(default_factory=PoseExposurePrior)
+    pose_prior: PoseExposurePrior = field(default_factory=PoseExposurePrior)
     fit_views: bool = False
 
 
@@ -178,7 +178,7 @@ class RealScenePlan:
     objects: tuple[str, ...]
     frames: int | None = None
     up_axis: UpAxis | None = None
-    colour_camera: DepthRegistration | None = None
+    depth_registration: DepthRegistration | None = None
     trust: PosePolicy = REAL_CAMERA
     hold_out: HeldOutSplit = field(default_factory=HeldOutSplit)
 
@@ -209,13 +209,13 @@ class RealScenePlan:
         """The folder, what is used of its frames, and the files that say what camera took them."""
         cameras = [find_beside_or_above(self.folder, name) for name in (CAMERA_FILE, INTRINSICS_FILE)]
         files = {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in cameras if path is not None}
-        camera = None if self.colour_camera is None else str(self.colour_camera)
+        camera = None if self.depth_registration is None else str(self.depth_registration)
         used = {"frames": self.frames, "up": self.up_axis, "hold_out": self.hold_out.every, "colour_camera": camera}
         return {"folder": str(self.folder.resolve()), **used, **files}
 
     def load(self, size: tuple[int, int]) -> Scene:
         """The frames with depth, split. Raises UnseenRegionError too."""
-        source = open_source(str(self.folder), self.up_axis, self.colour_camera)
+        source = open_source(str(self.folder), self.up_axis, self.depth_registration)
         known = balls_for_small_objects(load_voxel_regions(self.roi))
         regions = choose_regions(known, self.objects)
         training, held_out = self.hold_out.split(self._positions(source))
@@ -274,7 +274,7 @@ class RecordedRelevanceEstimator:
         """None: nothing has to be found."""
         return ()
 
-    def attend(self, frame: Frame, rendered_depth_m: Float32[ndarray, "h w"] | None = None) -> RelevanceMap:
+    def estimate(self, frame: Frame, rendered_depth_m: Float32[ndarray, "h w"] | None = None) -> RelevanceMap:
         """The ground truth."""
         del rendered_depth_m
         return self._masks[frame]
@@ -283,9 +283,9 @@ class RecordedRelevanceEstimator:
         """Nothing: every frame's relevance is known at once."""
         return
 
-    def look_back(self, frame: Frame) -> RelevanceMap:
+    def evaluate_past(self, frame: Frame) -> RelevanceMap:
         """The ground truth."""
-        return self.attend(frame)
+        return self.estimate(frame)
 
     def state(self) -> State:
         """Nothing: every frame's relevance is looked up."""
@@ -314,4 +314,4 @@ def _scene(
         came = f"{len(usable)} and {len(seen)}"
         raise DatasetError(f"{task!r}: expected training frames and held-out views with depth, got {came}")
     attention = RegionRelevanceEstimator(regions)
-    return Scene(task, usable, [attention.attend(frame) for frame in usable], seen, knowledge)
+    return Scene(task, usable, [attention.estimate(frame) for frame in usable], seen, knowledge)

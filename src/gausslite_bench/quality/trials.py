@@ -20,9 +20,9 @@ from gausslite.evaluation.compare import MapScores, PerceptualDistance, average,
 from gausslite.evaluation.fitted import draw_fitted
 from gausslite.evaluation.pictures import as_bytes
 from gausslite.evaluation.views import MapViewer, most_telling
-from gausslite.mapping.frame_scheduler import Clock, FrameScheduler
 from gausslite.mapping.policies import TASK
 from gausslite.mission.build import build_mapper, build_relevance_estimator
+from gausslite.mission.frame_scheduler import Clock, FrameScheduler
 from gausslite.mission.settings import MissionSettings, PerceptionSettings
 from gausslite.mission.task_mapper import TaskMapper
 from gausslite.perception.fixed_relevance import NoTaskEstimator
@@ -115,7 +115,7 @@ class Trial:
             rate_hz=self.budget.rate_hz if timed else None,
             seed=self.seed,
             threads=self.conditions.threads,
-            view_prior=self.plan.trust.view_prior,
+            pose_prior=self.plan.trust.pose_prior,
         )
 
     @property
@@ -191,7 +191,9 @@ def make_map(trial: Trial, scene: Scene, on_frame: Callable[[int], None]) -> Mad
     settings = trial.mission
     attention = _attention(trial, scene)
     loop = TaskMapper(
-        attention, build_mapper(settings), pace=FrameScheduler(settings.pace, clock_for(settings.threads))
+        attention,
+        build_mapper(settings),
+        scheduler=FrameScheduler(settings.scheduler_settings, clock_for(settings.threads)),
     )
     outcomes = []
     for frame in scene.training:
@@ -200,7 +202,7 @@ def make_map(trial: Trial, scene: Scene, on_frame: Callable[[int], None]) -> Mad
     return MadeMap(
         gaussians=loop.gaussians(),
         iterations_mean=fmean(outcome.iterations for outcome in outcomes),
-        ms_per_frame=1e3 * fmean(outcome.budget.seconds for outcome in outcomes),
+        ms_per_frame=1e3 * fmean(outcome.timing.seconds for outcome in outcomes),
     )
 
 

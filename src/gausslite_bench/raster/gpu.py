@@ -16,10 +16,10 @@ from gausslite.domain.frame import Frame
 from gausslite.domain.pose import inverse
 from gausslite.domain.relevance import RelevanceMap
 from gausslite.errors import InvalidInputError
-from gausslite.mapping.frame_scheduler import FrameScheduler
 from gausslite.mapping.keyframes import tiles_of
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.settings import MapperSettings
+from gausslite.mission.frame_scheduler import FrameScheduler
 from gausslite.optimize.density import DensitySettings
 from gausslite.optimize.parameters import SplatTable, rows_to_gaussians
 from gausslite.render.rasterizer import FULL_FRAME, Subset
@@ -28,8 +28,8 @@ from gausslite_bench.raster.step import LOSSES, RESTING, TURN, Duration
 
 if TYPE_CHECKING:
     from gausslite.render.cuda import CudaRasterizer
+    from gausslite.render.cuda.gsplat_baseline import Rasterization
     from gausslite.render.cuda.loss import CudaView
-    from gausslite.render.cuda.plain import Rasterization
 
 GPU_GAUSSIANS = (100_000, 300_000, 1_000_000, 3_000_000)
 FRAME_GAUSSIANS = 1_000_000
@@ -111,28 +111,28 @@ class GpuBench:
             density=DensitySettings(densify_every=MapperSettings().optimization.iterations, prune_every=8),
         )
         mapper = GaussianMapper(settings, self.rasterizer, known=_table(self.frame_gaussians).to_gaussians())
-        pace, weight = FrameScheduler(), _region(self.size).astype(np.float32)
+        scheduler, weight = FrameScheduler(), _region(self.size).astype(np.float32)
         relevance = RelevanceMap(weight, np.where(weight > 0, 0, -1).astype(np.int16))
         budgets, iterations = [], 0
         for index in range(_FRAME_WARM_UP + self.frames):
             frame = Frame(index, index, view.rgb, view.depth_m, view.camera, inverse(view.T_camera_world))
-            pace.begin()
-            iterations = mapper.map_frame(frame, relevance, pace).iterations
-            budgets.append(pace.end())
+            scheduler.begin()
+            iterations = mapper.map_frame(frame, relevance, scheduler).iterations
+            budgets.append(scheduler.end())
         timed = budgets[_FRAME_WARM_UP:]
-        steps = {step for budget in timed for step in budget.steps_s}
+        steps = {step for budget in timed for step in budget.stages_s}
         return FrameCost(
             mapper.count,
             iterations,
             Duration.of([budget.seconds for budget in timed]),
-            {str(step): 1e3 * float(np.median([b.steps_s.get(step, 0.0) for b in timed])) for step in sorted(steps)},
+            {str(step): 1e3 * float(np.median([b.stages_s.get(step, 0.0) for b in timed])) for step in sorted(steps)},
         )
 
     def _plainly(self, count: int, view: BenchView, ours: _Ours) -> Callable[[int], float]:
-        from gausslite.render.cuda.plain import PlainTraining, gsplats_rasterization
+        from gausslite.render.cuda.gsplat_baseline import GsplatBaseline, load_gsplat_rasterization
 
-        draw = self.rasterization or gsplats_rasterization()
-        return PlainTraining(seed_rows(count), ours.view, view.T_camera_world, _LOSS, draw).train
+        draw = self.rasterization or load_gsplat_rasterization()
+        return GsplatBaseline(seed_rows(count), ours.view, view.T_camera_world, _LOSS, draw).train
 
 
 class _Ours:
@@ -143,7 +143,7 @@ class _Ours:
         self.view: CudaView = rasterizer.prepare_view(view.rgb, view.depth_m, view.camera, region.astype(np.float32))
         self._rasterizer, self._table, self._pose = rasterizer, table, view.T_camera_world
         self._tiles = tiles_of(region, _MARGIN_PX)
-        at_end.enter_context(rasterizer.holding(table.rows, table.first_moment, table.second_moment))
+        at_end.enter_context(rasterizer.bind_tables(table.rows, table.first_moment, table.second_moment))
 
     def whole(self, iterations: int) -> float:
         """So many iterations over the whole image, waited for; the last one's loss."""

@@ -12,7 +12,6 @@ from mapping_scenes import middle_relevance, wall_frame
 from gausslite.domain.relevance import RelevanceMap
 from gausslite.domain.state import part
 from gausslite.errors import InvalidInputError, ShapeError
-from gausslite.mapping.frame_scheduler import FrameScheduler, SchedulerSettings, Stage
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.policies import policy
 from gausslite.mapping.settings import (
@@ -23,6 +22,8 @@ from gausslite.mapping.settings import (
     OptimizationSettings,
     SeedingSettings,
 )
+from gausslite.mapping.stages import Stage
+from gausslite.mission.frame_scheduler import FrameScheduler, SchedulerSettings
 from gausslite.optimize.density import DensitySettings
 from gausslite.render.cpu import CpuRasterizer
 from gausslite.render.rasterizer import RGB, LossWeights
@@ -87,7 +88,7 @@ def test_gradients_are_as_large_in_the_active_phase_as_in_a_warm_up(loss: LossWe
         trained = OptimizationSettings(warmup_iterations=warm_ups, active_iterations=1 - warm_ups, loss=loss)
         mapper = mapper_of(replace(SMALL, optimization=trained))
         map_wall(mapper, 1)
-        second_moment = part(mapper.state(), "table")["second_moment"]
+        second_moment = select_prefix(mapper.state(), "table")["second_moment"]
         sizes.append(float(np.median(second_moment[mapper.gaussians().active, RGB])))
     # a mean over the mask, a ninth of the image, makes their squares many times as large
     assert (0.5 < sizes[0] / sizes[1] < 2.0) is alike
@@ -96,7 +97,7 @@ def test_gradients_are_as_large_in_the_active_phase_as_in_a_warm_up(loss: LossWe
 def test_where_no_view_shows_the_region_every_iteration_is_a_warm_up() -> None:
     mapper = mapper_of()
     frame = wall_frame(0, SIZE)
-    outcome = mapper.map_frame(frame, RelevanceMap.nothing(*frame.depth_m.shape))
+    outcome = mapper.map_frame(frame, RelevanceMap.empty(*frame.depth_m.shape))
     assert outcome.iterations == 8
     assert not mapper.gaussians().kappa.any()
     assert not mapper.gaussians().active.any()
@@ -107,7 +108,7 @@ def test_the_active_phase_finds_the_keyframes_that_show_the_region() -> None:
     map_wall(mapper, 1)
     before = int(mapper.gaussians().kappa.max())
     away = wall_frame(1, SIZE)
-    mapper.map_frame(away, RelevanceMap.nothing(*away.depth_m.shape))
+    mapper.map_frame(away, RelevanceMap.empty(*away.depth_m.shape))
     assert mapper.gaussians().kappa.max() > before
 
 
@@ -137,7 +138,7 @@ def test_a_frame_without_depth_is_skipped_and_counted() -> None:
 
 def test_a_relevance_map_of_another_size_is_refused() -> None:
     with pytest.raises(ShapeError, match="relevance weight"):
-        mapper_of().map_frame(wall_frame(0, SIZE), RelevanceMap.nothing(8, 8))
+        mapper_of().map_frame(wall_frame(0, SIZE), RelevanceMap.empty(8, 8))
 
 
 def test_the_same_seed_gives_the_same_map_and_another_seed_another() -> None:
@@ -155,33 +156,35 @@ def test_a_pace_replaces_the_number_of_iterations_and_counts_steps_by_their_name
     mapper = mapper_of()
     # every look at this clock takes a second, and so does every step
     clock = itertools.count()
-    pace = FrameScheduler(SchedulerSettings(seconds_per_frame=60.0, run_over=0.0), clock=lambda: float(next(clock)))
+    scheduler = FrameScheduler(
+        SchedulerSettings(seconds_per_frame=60.0, deadline_slack=0.0), clock=lambda: float(next(clock))
+    )
     frame = wall_frame(0, SIZE)
-    pace.begin()
-    outcome = mapper.map_frame(frame, middle_relevance(frame), pace)
-    budget = pace.end()
+    scheduler.begin()
+    outcome = mapper.map_frame(frame, middle_relevance(frame), scheduler)
+    budget = scheduler.end()
     assert 8 < outcome.iterations < 30
     # an iteration is one second of work and some looks at the clock
     assert budget.seconds <= 60.0 + 8.0
-    assert budget.steps_s[Stage.WARM_UP] + budget.steps_s[Stage.ACTIVE] == outcome.iterations
-    assert budget.steps_s[Stage.SEEDING] == budget.steps_s[Stage.VIEW] == 1.0
+    assert budget.stages_s[Stage.WARM_UP] + budget.stages_s[Stage.ACTIVE] == outcome.iterations
+    assert budget.stages_s[Stage.SEEDING] == budget.stages_s[Stage.VIEW_PREPARATION] == 1.0
 
 
 def test_density_control_waits_for_time_but_not_for_ever() -> None:
     settings = replace(SMALL, density=DensitySettings(densify_every=10, prune_every=1000))
     frame, clock = wall_frame(0, SIZE), itertools.count()
     mapper = mapper_of(settings)
-    pace = FrameScheduler(
+    scheduler = FrameScheduler(
         SchedulerSettings(seconds_per_frame=100.0, min_iterations=0), clock=lambda: float(next(clock))
     )
-    with pace.timing(Stage.DENSIFYING):
+    with scheduler.timing(Stage.DENSIFICATION):
         # it once took very long
         next(itertools.islice(clock, 200, None))
     densified = []
     for _ in range(3):
-        pace.begin()
-        iterations = mapper.map_frame(frame, middle_relevance(frame), pace).iterations
-        densified.append((iterations, pace.end().steps_s.get(Stage.DENSIFYING, 0.0)))
+        scheduler.begin()
+        iterations = mapper.map_frame(frame, middle_relevance(frame), scheduler).iterations
+        densified.append((iterations, scheduler.end().stages_s.get(Stage.DENSIFICATION, 0.0)))
     assert densified[0][0] >= 20
     assert densified[0][1] > 0
 

@@ -21,12 +21,12 @@ from gausslite.domain.voxels import VoxelGrid
 from gausslite.errors import InvalidInputError
 from gausslite.mapping.coverage import seen_at
 from gausslite.mapping.eviction import insert
-from gausslite.mapping.frame_scheduler import FrameScheduler, SchedulerSettings
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.seeding import Seeds
 from gausslite.mapping.sent_voxels import SentVoxelTracker
 from gausslite.mapping.settings import KeyframeSettings, MapperSettings, SeedingSettings
 from gausslite.mapping.task_change import TaskChangeSettings
+from gausslite.mission.frame_scheduler import FrameScheduler, SchedulerSettings
 from gausslite.mission.task_mapper import FrameOutcome, TaskMapper
 from gausslite.optimize.density import DensitySettings
 from gausslite.optimize.parameters import SplatTable
@@ -78,7 +78,7 @@ def test_the_cap_holds_at_every_instant() -> None:
         assert all(outcome.gaussians <= 300 for outcome in outcomes)
         loop.assign(attention)
     state = loop.state()
-    assert all(len(state[f"mapper/table/{name}"]) <= 300 for name in ("rows", "active", "votes"))
+    assert all(len(state[f"mapper/table/{name}"]) <= 300 for name in ("rows", "active", "roi_evidence"))
 
 
 def test_no_frame_does_more_for_a_new_task_than_its_bound_and_all_keyframes_are_read_once() -> None:
@@ -97,7 +97,7 @@ def test_where_time_is_short_one_keyframe_is_read_a_frame() -> None:
     loop = loop_of()
     play(loop, 0, 4)
     late = TaskMapper(
-        A, GaussianMapper(MapperSettings(), CpuRasterizer(threads=1)), pace=FrameScheduler(SchedulerSettings(1e-6))
+        A, GaussianMapper(MapperSettings(), CpuRasterizer(threads=1)), scheduler=FrameScheduler(SchedulerSettings(1e-6))
     )
     late.restore(loop.state())
     late.assign(B)
@@ -111,10 +111,10 @@ class Unreadable(RegionRelevanceEstimator):
         super().__init__([RIGHT])
         self._index = index
 
-    def look_back(self, frame: Frame) -> RelevanceMap:
+    def evaluate_past(self, frame: Frame) -> RelevanceMap:
         if frame.index == self._index:
             raise MemoryError("a moment without memory")
-        return super().look_back(frame)
+        return super().evaluate_past(frame)
 
 
 def test_a_keyframe_that_cannot_be_judged_costs_one_frame_and_is_passed_over() -> None:
@@ -216,8 +216,8 @@ def test_a_run_saved_in_the_middle_of_rereading_goes_on_to_the_same_bits() -> No
 def test_the_same_question_in_other_words_is_the_same_task() -> None:
     on = Relation(Predicate.ON, "mug", "table")
     one = TaskGraph("1", "Pick up the mug on the table", ("mug",), ("table",), (on,))
-    assert one.asks_the_same_as(replace(one, task_id="2", text="Take the mug from the table"))
-    assert not one.asks_the_same_as(replace(one, relations=()))
+    assert one.is_equivalent_to(replace(one, task_id="2", text="Take the mug from the table"))
+    assert not one.is_equivalent_to(replace(one, relations=()))
 
 
 def test_a_task_attention_remembers_what_it_finds_in_earlier_views_but_carries_on_the_newest() -> None:
@@ -226,10 +226,10 @@ def test_a_task_attention_remembers_what_it_finds_in_earlier_views_but_carries_o
     regions = {"mug_1": LEFT, "mug_2": RIGHT, "lamp": BallRegion((0.75, 0.1, 2.0), 0.15)}
     attention = TaskRelevanceEstimator(graph, RegionDetector(regions), TrackerSettings(max_frames=100))
     away = wall_frame(9, SIZE, shift_m=-0.6)
-    attention.attend(away)
+    attention.estimate(away)
     assert attention.notes
     # an earlier view knows the lamp
-    found = attention.look_back(wall_frame(0, SIZE, shift_m=0.3))
+    found = attention.evaluate_past(wall_frame(0, SIZE, shift_m=0.3))
     assert not attention.notes
     assert (found.roi == RIGHT.mask(wall_frame(0, SIZE, shift_m=0.3))).all()
 

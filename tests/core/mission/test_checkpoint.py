@@ -56,7 +56,7 @@ def loop(max_gaussians: int = 400, window: int = 2) -> TaskMapper:
         seeding=SeedingSettings(first_frame_seeds=60_000, later_seeds=20_000),
         keyframes=KeyframeSettings(every=2, window=window, buffer=3, region_views=2),
         density=DensitySettings(densify_every=7, prune_every=5),
-        view_prior=PoseExposurePrior(0.01, 0.5, 0.1, 0.05),
+        pose_prior=PoseExposurePrior(0.01, 0.5, 0.1, 0.05),
     )
     attention = TaskRelevanceEstimator(GRAPH, RegionDetector(REGIONS), TrackerSettings(max_frames=3))
     mapper = GaussianMapper(mapper_settings, CpuRasterizer(threads=1), seed=3)
@@ -224,7 +224,7 @@ def forgeries(array: np.ndarray) -> Iterator[np.ndarray]:
 
 
 def test_whatever_one_array_is_made_to_be_it_is_told_or_can_be_mapped_on(state: State) -> None:
-    saved = part(state, "loop")
+    saved = select_prefix(state, "loop")
     told = 0
     for name, array in saved.items():
         for forged_array in (None, *forgeries(array)):

@@ -20,7 +20,7 @@ pytest.importorskip("gausslite.render._kernels", reason="the native kernels are 
 def mapped(sequence: Path, out: Path, *more: str) -> int:
     # nothing is looked for: these tests count which frames are read
     common = ["--roi-ball", "0,0,2,0.4", "--threads", "1", "--max-gaussians", "150"]
-    common += ["--colour-camera", "none", "--view-error", "none"]
+    common += ["--register-depth", "none", "--pose-prior", "none"]
     return main(["map", str(sequence), *common, "--out", str(out), *more])
 
 

@@ -18,7 +18,7 @@ EMPTY = HEAD + struct.pack("<I", zlib.crc32(HEAD))
 
 
 def map_command(folder: Path, out: Path, *more: str) -> list[str]:
-    common = ["--roi-ball", "0,0,2,0.4", "--threads", "1", "--max-gaussians", "150", "--colour-camera", "none"]
+    common = ["--roi-ball", "0,0,2,0.4", "--threads", "1", "--max-gaussians", "150", "--register-depth", "none"]
     return ["map", str(folder), *common, "--out", str(out), *more]
 
 
@@ -46,7 +46,7 @@ def test_other_options_are_told_before_anything_is_done(tmp_path: Path, capsys: 
         (("--rate", "5"), "--rate 'default' (got '5')"),
         (("--policy", "uniform"), "--policy 'task' (got 'uniform')"),
         (("--roi-ball", "0,0,1,0.4"), "--roi-ball '0.0,0.0,2.0,0.4' (got '0.0,0.0,2.0,0.4 0.0,0.0,1.0,0.4')"),
-        (("--colour-camera", "20,20,7.5,5.5"), "--colour-camera '' (got '20,20,7.5,5.5,0,0,0,0,0,0')"),
+        (("--register-depth", "20,20,7.5,5.5"), "--register-depth '' (got '20,20,7.5,5.5,0,0,0,0,0,0')"),
         (("--up", "0,-1,0"), "--up '' (got '0.0,-1.0,0.0')"),
         (("--resegment", "--segmenter", "cut"), "--resegment '' (got 'yes'), "),
     ):
@@ -84,17 +84,17 @@ def test_the_command_line_goes_on_after_the_last_frame(tmp_path: Path, capsys: p
 def test_what_was_looked_for_is_not_looked_for_again(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     sequence = write_seven_scenes(tmp_path / "kitchen", tuple(range(0, 24, 4)))
     state = str(tmp_path / "run.state")
-    found = ["--colour-camera", "20,20,7.5,5.5,-0.01,0,0,0,0,0", "--view-error", "0.01,0.5,0.1,0.03"]
+    found = ["--register-depth", "20,20,7.5,5.5,-0.01,0,0,0,0,0", "--pose-prior", "0.01,0.5,0.1,0.03"]
     first = map_command(sequence, tmp_path / "first", "--frames", "0:12", "--save-state", state, *found)
     assert main(first) == 0
     capsys.readouterr()
-    rest = map_command(sequence, tmp_path / "rest", "--resume", state, "--colour-camera", "auto")
+    rest = map_command(sequence, tmp_path / "rest", "--resume", state, "--register-depth", "auto")
     assert main(rest) == 0
-    assert "--colour-camera" not in capsys.readouterr().err
+    assert "--register-depth" not in capsys.readouterr().err
     report = json.loads((tmp_path / "rest" / "report.json").read_text())
     assert (report["frames"], report["colour_camera"], report["view_error"]) == (3, found[1], found[3])
-    assert main([*rest, "--view-error", "none"]) == 2
-    assert "--view-error '0.01,0.5,0.1,0.03' (got '0,0,0,0')" in capsys.readouterr().err
+    assert main([*rest, "--pose-prior", "none"]) == 2
+    assert "--pose-prior '0.01,0.5,0.1,0.03' (got '0,0,0,0')" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("name", ["map.ply", "report.json", "preview.png"])

@@ -12,10 +12,11 @@ from gausslite.domain.region import BallRegion
 from gausslite.domain.relevance import RelevanceMap
 from gausslite.domain.state import State
 from gausslite.domain.voxels import VoxelGrid
-from gausslite.mapping.frame_scheduler import FrameScheduler, SchedulerSettings, SkippableStage, Stage
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.sent_voxels import SentVoxelTracker
 from gausslite.mapping.settings import MapperSettings, SeedingSettings
+from gausslite.mapping.stages import SkippableStage, Stage
+from gausslite.mission.frame_scheduler import FrameScheduler, SchedulerSettings
 from gausslite.mission.task_mapper import TaskMapper
 from gausslite.perception.fixed_relevance import NoTaskEstimator, RegionRelevanceEstimator
 from gausslite.render.cpu import CpuRasterizer
@@ -40,7 +41,7 @@ def test_words_of_all_frames_add_up_to_the_active_part_of_the_map() -> None:
     assert sum(counts.values()) == int(gaussians.active.sum()) > 0
     assert (outcome.index, outcome.gaussians, outcome.iterations) == (2, len(gaussians), 8)
     assert 0 < outcome.roi_share < 1
-    assert outcome.budget.seconds >= sum(outcome.budget.steps_s.values()) > 0
+    assert outcome.timing.seconds >= sum(outcome.timing.stages_s.values()) > 0
 
 
 def test_without_a_ledger_there_are_no_words() -> None:
@@ -59,18 +60,22 @@ def test_a_frame_without_depth_is_passed_over() -> None:
 def ticking_loop(seconds_per_frame: float) -> TaskMapper:
     """A loop with a clock on which every look takes a second."""
     clock = itertools.count()
-    pace = FrameScheduler(SchedulerSettings(seconds_per_frame, run_over=0.0), clock=lambda: float(next(clock)))
-    return TaskMapper(BALL, small_mapper(), SentVoxelTracker(VoxelGrid(0.25)), pace)
+    scheduler = FrameScheduler(
+        SchedulerSettings(seconds_per_frame, deadline_slack=0.0), clock=lambda: float(next(clock))
+    )
+    return TaskMapper(BALL, small_mapper(), SentVoxelTracker(VoxelGrid(0.25)), scheduler)
 
 
 def test_time_is_a_budget_for_the_whole_frame_words_included() -> None:
     loop = ticking_loop(60.0)
     for index in range(4):
-        budget = loop.process(wall_frame(index, SIZE, shift_m=0.1 * index)).budget
-        assert set(Stage) - {Stage.PRUNING, Stage.DENSIFYING, Stage.DRAWING, Stage.REEVALUATION} <= set(budget.steps_s)
+        budget = loop.process(wall_frame(index, SIZE, shift_m=0.1 * index)).timing
+        assert set(Stage) - {Stage.PRUNING, Stage.DENSIFICATION, Stage.RENDERING, Stage.REEVALUATION} <= set(
+            budget.stages_s
+        )
         # an iteration is one second of work and some looks at the clock
         assert budget.seconds <= 60.0 + 8.0
-        assert not budget.short
+        assert not budget.under_trained
     # but for the iteration that every frame begins with
     assert ticking_loop(1e-6).process(wall_frame(0, SIZE)).iterations == 1
 
@@ -97,15 +102,15 @@ class SlowAttention:
     def clock(self) -> float:
         return self.now_s
 
-    def attend(self, frame: Frame, rendered_depth_m: np.ndarray | None = None) -> RelevanceMap:
+    def estimate(self, frame: Frame, rendered_depth_m: np.ndarray | None = None) -> RelevanceMap:
         self.now_s += 10.0
-        return BALL.attend(frame, rendered_depth_m)
+        return BALL.estimate(frame, rendered_depth_m)
 
     def late(self) -> None:
         return None
 
-    def look_back(self, frame: Frame) -> RelevanceMap:
-        return self.attend(frame)
+    def evaluate_past(self, frame: Frame) -> RelevanceMap:
+        return self.estimate(frame)
 
     def state(self) -> State:
         return {}
@@ -116,14 +121,14 @@ class SlowAttention:
 
 def test_words_that_had_to_wait_come_with_the_next_frame() -> None:
     slow = SlowAttention()
-    pace = FrameScheduler(SchedulerSettings(5.0, reliefs=(SkippableStage.WORDS,)), slow.clock)
-    loop = TaskMapper(slow, small_mapper(), SentVoxelTracker(VoxelGrid(0.25)), pace)
+    scheduler = FrameScheduler(SchedulerSettings(5.0, skip_stages=(SkippableStage.PUBLISHING,)), slow.clock)
+    loop = TaskMapper(slow, small_mapper(), SentVoxelTracker(VoxelGrid(0.25)), scheduler)
     counts: dict[int, int] = {}
     waited = []
     for index in range(5):
         outcome = loop.process(wall_frame(index, SIZE, shift_m=0.1 * index))
         waited.append(outcome.words is None)
-        assert outcome.budget.short
+        assert outcome.timing.under_trained
         if outcome.words is not None:
             counts.update(zip(outcome.words.keys.tolist(), outcome.words.counts.tolist(), strict=True))
     assert waited == [False, True, False, True, False]

@@ -11,18 +11,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gausslite.errors import InvalidInputError
-from gausslite.mapping.frame_scheduler import (
-    FrameScheduler,
-    FrameTiming,
-    SchedulerSettings,
-    SkippableStage,
-    Stage,
-    choose_reliefs,
-)
+from gausslite.mapping.stages import SkippableStage, Stage
+from gausslite.mission.frame_scheduler import FrameScheduler, FrameTiming, SchedulerSettings, choose_skipped_stages
 
-TRIED = [step for step in Stage if step not in (Stage.REEVALUATION, Stage.PRUNING, Stage.DENSIFYING)]
+TRIED = [step for step in Stage if step not in (Stage.REEVALUATION, Stage.PRUNING, Stage.DENSIFICATION)]
 """The steps of `run_frame`."""
-CHEAP = {**dict.fromkeys(Stage, 1.0), Stage.SETTLING: 0.0}
+CHEAP = {**dict.fromkeys(Stage, 1.0), Stage.FINALISATION: 0.0}
 
 
 class WorkClock:
@@ -39,7 +33,7 @@ class WorkClock:
 
 
 def run_frame(
-    pace: FrameScheduler,
+    scheduler: FrameScheduler,
     clock: WorkClock,
     costs: dict[Stage, float],
     counted: int = 8,
@@ -52,64 +46,64 @@ def run_frame(
     stalls_s = dict([stall] if stall else [])
 
     def take(step: Stage) -> None:
-        with pace.timing(step):
+        with scheduler.timing(step):
             clock.work(costs[step] + stalls_s.pop(step, 0.0))
 
-    pace.begin(waited_s)
-    if not pace.spares(SkippableStage.SEEDING):
-        take(Stage.DRAWING)
+    scheduler.begin(waited_s)
+    if not scheduler.skips(SkippableStage.SEEDING):
+        take(Stage.RENDERING)
         take(Stage.SEEDING)
-    take(Stage.ATTENTION)
-    take(Stage.VIEW)
+    take(Stage.RELEVANCE)
+    take(Stage.VIEW_PREPARATION)
     done = 0
-    while pace.trains_on(step := Stage.ACTIVE if done % 4 else Stage.WARM_UP, counted):
+    while scheduler.trains_on(step := Stage.ACTIVE if done % 4 else Stage.WARM_UP, counted):
         take(step)
         done += 1
-    take(Stage.SETTLING)
-    if not pace.spares(SkippableStage.WORDS):
-        take(Stage.WORDS)
-    return pace.end(), done
+    take(Stage.FINALISATION)
+    if not scheduler.skips(SkippableStage.PUBLISHING):
+        take(Stage.PUBLISHING)
+    return scheduler.end(), done
 
 
 def test_without_settings_iterations_are_counted_whatever_they_cost() -> None:
     clock = WorkClock()
-    pace = FrameScheduler(clock=clock)
+    scheduler = FrameScheduler(clock=clock)
     for seconds in (0.0, 1.0, 1e6):
-        budget, done = run_frame(pace, clock, dict.fromkeys(Stage, seconds), counted=5)
-        assert (done, budget.reliefs, budget.short) == (5, frozenset(), False)
-        assert pace.has_time_for(Stage.DENSIFYING)
+        budget, done = run_frame(scheduler, clock, dict.fromkeys(Stage, seconds), counted=5)
+        assert (done, budget.skipped_stages, budget.under_trained) == (5, frozenset(), False)
+        assert scheduler.has_time_for(Stage.DENSIFICATION)
 
 
 @pytest.mark.parametrize("seed", range(5))
 def test_a_frame_ends_in_its_time_up_to_one_iteration(seed: int) -> None:
     rng, clock = np.random.default_rng(seed), WorkClock()
-    pace = FrameScheduler(SchedulerSettings(100.0, min_iterations=2), clock)
+    scheduler = FrameScheduler(SchedulerSettings(100.0, min_iterations=2), clock)
     for frame in range(60):
         costs = {**CHEAP, Stage.WARM_UP: rng.uniform(4, 12), Stage.ACTIVE: rng.uniform(1, 4)}
-        costs[Stage.SEEDING], costs[Stage.WORDS] = rng.uniform(2, 10), rng.uniform(1, 4)
-        costs[Stage.SETTLING] = rng.uniform(1, 8)
-        budget, done = run_frame(pace, clock, costs)
-        surprise = 0.0 if frame else costs[Stage.SETTLING] + costs[Stage.WORDS]
+        costs[Stage.SEEDING], costs[Stage.PUBLISHING] = rng.uniform(2, 10), rng.uniform(1, 4)
+        costs[Stage.FINALISATION] = rng.uniform(1, 8)
+        budget, done = run_frame(scheduler, clock, costs)
+        surprise = 0.0 if frame else costs[Stage.FINALISATION] + costs[Stage.PUBLISHING]
         # the words, too, may cost more than they used to
         assert budget.seconds <= 100.0 + costs[Stage.WARM_UP] + surprise + 4.0
         assert done >= 2
-        assert not budget.short
+        assert not budget.under_trained
 
 
 def test_time_that_is_left_is_filled() -> None:
     clock = WorkClock()
-    pace = FrameScheduler(SchedulerSettings(100.0, 4), clock)
-    counts = [run_frame(pace, clock, CHEAP)[1] for _ in range(20)]
+    scheduler = FrameScheduler(SchedulerSettings(100.0, 4), clock)
+    counts = [run_frame(scheduler, clock, CHEAP)[1] for _ in range(20)]
     # four fixed steps, the words at the end, and no room left for one more
     assert counts[-1] == 94
-    assert pace.end().seconds == pytest.approx(99.0)
+    assert scheduler.end().seconds == pytest.approx(99.0)
 
 
 def test_the_steps_add_up_to_the_frame() -> None:
     clock = WorkClock()
     budget, done = run_frame(FrameScheduler(SchedulerSettings(50.0, 4), clock), clock, CHEAP)
-    assert sum(budget.steps_s.values()) == pytest.approx(budget.seconds)
-    assert budget.steps_s[Stage.WARM_UP] + budget.steps_s[Stage.ACTIVE] == pytest.approx(done)
+    assert sum(budget.stages_s.values()) == pytest.approx(budget.seconds)
+    assert budget.stages_s[Stage.WARM_UP] + budget.stages_s[Stage.ACTIVE] == pytest.approx(done)
 
 
 def test_reliefs_give_way_in_their_order_and_only_as_far_as_needed() -> None:
@@ -117,13 +111,15 @@ def test_reliefs_give_way_in_their_order_and_only_as_far_as_needed() -> None:
     four = SchedulerSettings(min_iterations=4)
     for time_s, expected in (
         (9.0, set()),
-        (8.0, {SkippableStage.WORDS}),
-        (7.0, {SkippableStage.WORDS, SkippableStage.SEEDING}),
+        (8.0, {SkippableStage.PUBLISHING}),
+        (7.0, {SkippableStage.PUBLISHING, SkippableStage.SEEDING}),
     ):
-        assert choose_reliefs(four, time_s, CHEAP, frozenset(), Stage.ACTIVE) == expected
-    first_seeding = SchedulerSettings(min_iterations=4, reliefs=(SkippableStage.SEEDING, SkippableStage.WORDS))
-    assert choose_reliefs(first_seeding, 8.0, CHEAP, frozenset(), Stage.ACTIVE) == {SkippableStage.SEEDING}
-    assert choose_reliefs(SchedulerSettings(reliefs=()), 1.0, CHEAP, frozenset(), Stage.ACTIVE) == frozenset()
+        assert choose_skipped_stages(four, time_s, CHEAP, frozenset(), Stage.ACTIVE) == expected
+    first_seeding = SchedulerSettings(min_iterations=4, skip_stages=(SkippableStage.SEEDING, SkippableStage.PUBLISHING))
+    assert choose_skipped_stages(first_seeding, 8.0, CHEAP, frozenset(), Stage.ACTIVE) == {SkippableStage.SEEDING}
+    assert (
+        choose_skipped_stages(SchedulerSettings(skip_stages=()), 1.0, CHEAP, frozenset(), Stage.ACTIVE) == frozenset()
+    )
 
 
 @given(st.integers(0, 30), st.sampled_from([Stage.WARM_UP, Stage.ACTIVE]), st.floats(1.0, 20.0))
@@ -132,32 +128,32 @@ def test_the_least_iterations_cost_a_warm_up_and_else_the_cheapest_kind(
 ) -> None:
     costs = {**CHEAP, Stage.WARM_UP: warm_up_s}
     needed_s = 5.0 + (warm_up_s + (least - 1) * costs[cheapest] if least else 0.0)
-    for spare_s, reliefs in ((1e-6, frozenset()), (-1e-6, frozenset({SkippableStage.WORDS}))):
-        pace = SchedulerSettings(min_iterations=least)
-        assert choose_reliefs(pace, needed_s + spare_s, costs, frozenset(), cheapest) == reliefs
+    for spare_s, skip_stages in ((1e-6, frozenset()), (-1e-6, frozenset({SkippableStage.PUBLISHING}))):
+        scheduler = SchedulerSettings(min_iterations=least)
+        assert choose_skipped_stages(scheduler, needed_s + spare_s, costs, frozenset(), cheapest) == skip_stages
 
 
 @pytest.mark.parametrize(
     ("done", "left_s", "expected"), [(0, 60.0, True), (5, 19.5, True), (5, 18.5, False), (13, 10.5, False)]
 )
-@pytest.mark.parametrize("step", [Stage.WARM_UP, Stage.DENSIFYING])
+@pytest.mark.parametrize("step", [Stage.WARM_UP, Stage.DENSIFICATION])
 def test_there_is_time_for_a_step_while_the_least_iterations_still_fit_after_it(
     step: Stage, done: int, left_s: float, expected: bool
 ) -> None:
     clock = WorkClock()
-    pace = FrameScheduler(SchedulerSettings(60.0, 15), clock)
+    scheduler = FrameScheduler(SchedulerSettings(60.0, 15), clock)
     # what is no iteration itself leaves one more to do
-    costs = {Stage.WARM_UP: 10.0, Stage.DENSIFYING: 9.0, Stage.ACTIVE: 1.0}
+    costs = {Stage.WARM_UP: 10.0, Stage.DENSIFICATION: 9.0, Stage.ACTIVE: 1.0}
     for each, seconds in costs.items():
-        with pace.timing(each):
+        with scheduler.timing(each):
             clock.work(seconds)
     begun_s = clock.now_s
-    pace.begin()
+    scheduler.begin()
     for _ in range(done):
-        with pace.timing(Stage.ACTIVE):
+        with scheduler.timing(Stage.ACTIVE):
             clock.work(1.0)
     clock.now_s = begun_s + 60.0 - left_s
-    assert pace.has_time_for(step) is expected
+    assert scheduler.has_time_for(step) is expected
 
 
 @pytest.mark.parametrize(("frame_s", "done", "spare_s"), [(30.0, 2.0, 9.0), (14.0, 1.0, 2.0)])
@@ -165,45 +161,45 @@ def test_the_fixed_steps_to_come_have_their_time_set_aside_but_for_those_gone_wi
     frame_s: float, done: float, spare_s: float
 ) -> None:
     clock = WorkClock()
-    pace = FrameScheduler(SchedulerSettings(frame_s, 4, reliefs=(SkippableStage.SEEDING,)), clock)
+    scheduler = FrameScheduler(SchedulerSettings(frame_s, 4, skip_stages=(SkippableStage.SEEDING,)), clock)
     for step, seconds in {**CHEAP, Stage.SEEDING: 8.0, Stage.REEVALUATION: 5.0}.items():
-        with pace.timing(step):
+        with scheduler.timing(step):
             clock.work(seconds)
-    pace.begin()
+    scheduler.begin()
     # all that must be done costs 16, 7 without drawing and seeding
-    assert pace.spares(SkippableStage.SEEDING) is (frame_s < 16.0)
-    for step in (Stage.DRAWING, Stage.ATTENTION)[-int(done) :]:
-        with pace.timing(step):
+    assert scheduler.skips(SkippableStage.SEEDING) is (frame_s < 16.0)
+    for step in (Stage.RENDERING, Stage.RELEVANCE)[-int(done) :]:
+        with scheduler.timing(step):
             clock.work(1.0)
     clock.work(spare_s - 0.1)
-    assert pace.has_time_for(Stage.REEVALUATION)
+    assert scheduler.has_time_for(Stage.REEVALUATION)
     clock.work(0.2)
-    assert not pace.has_time_for(Stage.REEVALUATION)
+    assert not scheduler.has_time_for(Stage.REEVALUATION)
 
 
 FRAME_S, RUN_OVER_S, ITERATION_S = 100.0, 20.0, 4.0
 """Fifteen iterations and four fixed steps beside the view cost 64 of a hundred."""
 
 
-def surprised(views_s: list[float], run_over: float = RUN_OVER_S / FRAME_S) -> list[FrameTiming]:
+def surprised(views_s: list[float], deadline_slack: float = RUN_OVER_S / FRAME_S) -> list[FrameTiming]:
     """Frames whose steps cost what they always do, but for the view: that costs what nobody could expect."""
     clock, costs = WorkClock(), {**CHEAP, Stage.WARM_UP: ITERATION_S, Stage.ACTIVE: ITERATION_S}
-    pace = FrameScheduler(SchedulerSettings(FRAME_S, 15, reliefs=(), run_over=run_over), clock)
-    run_frame(pace, clock, costs)
-    return [run_frame(pace, clock, {**costs, Stage.VIEW: view_s})[0] for view_s in views_s]
+    scheduler = FrameScheduler(SchedulerSettings(FRAME_S, 15, skip_stages=(), deadline_slack=deadline_slack), clock)
+    run_frame(scheduler, clock, costs)
+    return [run_frame(scheduler, clock, {**costs, Stage.VIEW_PREPARATION: view_s})[0] for view_s in views_s]
 
 
 @settings(deadline=None, max_examples=40)
 @given(st.lists(st.floats(0.0, 3 * FRAME_S), min_size=1, max_size=8), st.floats(0.0, 1.0))
 def test_frames_at_the_rate_are_late_by_the_share_that_may_be_run_over_at_most(
-    views_s: list[float], run_over: float
+    views_s: list[float], deadline_slack: float
 ) -> None:
     behind_s = 0.0
-    for view_s, budget in zip(views_s, surprised(views_s, run_over), strict=True):
+    for view_s, budget in zip(views_s, surprised(views_s, deadline_slack), strict=True):
         # a frame whose view alone takes longer trains once; what was not tried is expected to cost less than it does
-        longest_s = max(FRAME_S * (1 + run_over), behind_s + view_s + 4.0) + ITERATION_S
+        longest_s = max(FRAME_S * (1 + deadline_slack), behind_s + view_s + 4.0) + ITERATION_S
         assert behind_s + budget.seconds <= longest_s + 1e-9
-        behind_s = min(max(0.0, behind_s + budget.seconds - FRAME_S), run_over * FRAME_S)
+        behind_s = min(max(0.0, behind_s + budget.seconds - FRAME_S), deadline_slack * FRAME_S)
 
 
 @settings(deadline=None, max_examples=40)
@@ -213,25 +209,27 @@ def test_where_the_time_suffices_over_a_few_frames_no_frame_is_short(data: st.Da
     for _ in range(data.draw(st.integers(1, 8))):
         views_s.append(data.draw(st.floats(0.0, FRAME_S + RUN_OVER_S - behind_s - 64.0 - 1e-6)))
         behind_s = max(0.0, behind_s + views_s[-1] + 64.0 - FRAME_S)
-    assert not any(budget.short for budget in surprised(views_s))
+    assert not any(budget.under_trained for budget in surprised(views_s))
 
 
 def test_what_a_frame_ran_over_is_given_back_by_the_next_ones() -> None:
     budgets = surprised([50.0, *[10.0] * 5])
     assert budgets[0].seconds == pytest.approx(114.0)
     assert sum(budget.seconds for budget in budgets) <= 6 * FRAME_S
-    assert not any(budget.short for budget in budgets)
+    assert not any(budget.under_trained for budget in budgets)
     # and without that share the same frame trains too little
-    assert surprised([50.0], run_over=0.0)[0].short
+    assert surprised([50.0], deadline_slack=0.0)[0].under_trained
 
 
 def after_a_stall(every_s: float, latest: int = 40) -> tuple[list[float], list[int]]:
-    """Frames that come so often to a pace of 100 s after 300 s in which none was begun, of those that wait the latest:
+    """Frames that come so often to a scheduler of 100 s after 300 s in which none was begun, of those that wait the latest:
     how long each has waited for its turn, and its iterations.
     """
     clock, costs = WorkClock(), {**CHEAP, Stage.WARM_UP: ITERATION_S, Stage.ACTIVE: ITERATION_S}
-    pace = FrameScheduler(SchedulerSettings(FRAME_S, 15, reliefs=(), run_over=RUN_OVER_S / FRAME_S), clock)
-    run_frame(pace, clock, costs)
+    scheduler = FrameScheduler(
+        SchedulerSettings(FRAME_S, 15, skip_stages=(), deadline_slack=RUN_OVER_S / FRAME_S), clock
+    )
+    run_frame(scheduler, clock, costs)
     came_s = deque(clock.now_s + i * every_s for i in range(60))
     clock.work(3 * FRAME_S)
     waited_s, iterations = [], []
@@ -240,8 +238,8 @@ def after_a_stall(every_s: float, latest: int = 40) -> tuple[list[float], list[i
             came_s.popleft()
         clock.work(max(0.0, came_s[0] - clock.now_s))
         waited_s.append(clock.now_s - came_s.popleft())
-        budget, done = run_frame(pace, clock, costs, waited_s=waited_s[-1])
-        assert not budget.short
+        budget, done = run_frame(scheduler, clock, costs, waited_s=waited_s[-1])
+        assert not budget.under_trained
         iterations.append(done)
     return waited_s, iterations
 
@@ -264,31 +262,31 @@ def test_a_queue_that_is_always_full_leaves_frames_their_time_but_for_the_share_
 def test_a_frame_runs_over_for_its_least_iterations_alone() -> None:
     for view_s in (0.0, 20.0, 35.0):
         assert surprised([view_s])[0].seconds <= FRAME_S
-    steps_s = surprised([45.0])[0].steps_s
+    steps_s = surprised([45.0])[0].stages_s
     assert steps_s[Stage.WARM_UP] + steps_s[Stage.ACTIVE] == 15 * ITERATION_S
 
 
 def test_under_lasting_overload_nothing_is_left_out_twice_on_end_and_short_frames_are_counted() -> None:
     clock = WorkClock()
-    pace = FrameScheduler(SchedulerSettings(5.0, 4), clock)
-    budgets = [run_frame(pace, clock, {**CHEAP, Stage.SEEDING: 10.0})[0] for _ in range(20)]
+    scheduler = FrameScheduler(SchedulerSettings(5.0, 4), clock)
+    budgets = [run_frame(scheduler, clock, {**CHEAP, Stage.SEEDING: 10.0})[0] for _ in range(20)]
     for before, after in itertools.pairwise(budgets):
-        assert not before.reliefs & after.reliefs
+        assert not before.skipped_stages & after.skipped_stages
     for relief in SkippableStage:
-        assert 8 <= sum(relief in budget.reliefs for budget in budgets) <= 10
-    assert sum(budget.short for budget in budgets) > 0
+        assert 8 <= sum(relief in budget.skipped_stages for budget in budgets) <= 10
+    assert sum(budget.under_trained for budget in budgets) > 0
 
 
 def test_a_step_that_was_dear_once_is_tried_again() -> None:
     clock = WorkClock()
-    pace = FrameScheduler(SchedulerSettings(20.0, 4), clock)
-    with pace.timing(Stage.DENSIFYING):
+    scheduler = FrameScheduler(SchedulerSettings(20.0, 4), clock)
+    with scheduler.timing(Stage.DENSIFICATION):
         clock.work(30.0)
-    assert not pace.has_time_for(Stage.DENSIFYING)
+    assert not scheduler.has_time_for(Stage.DENSIFICATION)
     frames = 0
-    while not pace.has_time_for(Stage.DENSIFYING):
-        run_frame(pace, clock, CHEAP)
-        pace.begin()
+    while not scheduler.has_time_for(Stage.DENSIFICATION):
+        run_frame(scheduler, clock, CHEAP)
+        scheduler.begin()
         frames += 1
         assert frames < 40
 
@@ -299,41 +297,41 @@ def test_a_machine_that_stood_still_for_once_leaves_no_frame_after_it_without_it
     stalled: Stage, frames: float
 ) -> None:
     clock, costs = WorkClock(), {**CHEAP, Stage.WARM_UP: ITERATION_S, Stage.ACTIVE: ITERATION_S}
-    pace = FrameScheduler(SchedulerSettings(FRAME_S, 15, reliefs=()), clock)
-    before = [run_frame(pace, clock, costs)[1] for _ in range(10)][-1]
-    run_frame(pace, clock, costs, stall=(stalled, frames * FRAME_S))
-    after = [run_frame(pace, clock, costs)[1] for _ in range(20)]
+    scheduler = FrameScheduler(SchedulerSettings(FRAME_S, 15, skip_stages=()), clock)
+    before = [run_frame(scheduler, clock, costs)[1] for _ in range(10)][-1]
+    run_frame(scheduler, clock, costs, stall=(stalled, frames * FRAME_S))
+    after = [run_frame(scheduler, clock, costs)[1] for _ in range(20)]
     assert min(after) >= 15
     assert min(after[10:]) >= before - 1
 
 
 def test_a_first_iteration_that_took_forever_is_not_held_against_its_kind_for_long() -> None:
     clock, costs = WorkClock(), {**CHEAP, Stage.WARM_UP: ITERATION_S, Stage.ACTIVE: ITERATION_S}
-    pace = FrameScheduler(SchedulerSettings(FRAME_S, 15), clock)
-    run_frame(pace, clock, costs, stall=(Stage.ACTIVE, 100 * FRAME_S))
-    assert max(run_frame(pace, clock, costs)[1] for _ in range(10)) >= 15
+    scheduler = FrameScheduler(SchedulerSettings(FRAME_S, 15), clock)
+    run_frame(scheduler, clock, costs, stall=(Stage.ACTIVE, 100 * FRAME_S))
+    assert max(run_frame(scheduler, clock, costs)[1] for _ in range(10)) >= 15
 
 
 @pytest.mark.parametrize(("least", "expected"), [(0, 0), (1, 1), (15, 1)])
 def test_the_iteration_that_a_frame_begins_with_is_trained_whatever_time_is_left(least: int, expected: int) -> None:
     clock = WorkClock()
-    pace = FrameScheduler(SchedulerSettings(10.0, least), clock)
-    assert run_frame(pace, clock, {**CHEAP, Stage.VIEW: 100.0})[1] == expected
+    scheduler = FrameScheduler(SchedulerSettings(10.0, least), clock)
+    assert run_frame(scheduler, clock, {**CHEAP, Stage.VIEW_PREPARATION: 100.0})[1] == expected
 
 
 def test_what_costs_more_from_now_on_is_expected_to_soon() -> None:
-    clock, costs = WorkClock(), {**CHEAP, Stage.WARM_UP: 1.0, Stage.ACTIVE: 1.0, Stage.WORDS: 1e-6}
-    pace = FrameScheduler(SchedulerSettings(FRAME_S, 15, reliefs=()), clock)
+    clock, costs = WorkClock(), {**CHEAP, Stage.WARM_UP: 1.0, Stage.ACTIVE: 1.0, Stage.PUBLISHING: 1e-6}
+    scheduler = FrameScheduler(SchedulerSettings(FRAME_S, 15, skip_stages=()), clock)
     for _ in range(5):
-        run_frame(pace, clock, costs)
-    late_s = [run_frame(pace, clock, {**costs, Stage.WORDS: 60.0})[0].seconds - FRAME_S for _ in range(12)]
+        run_frame(scheduler, clock, costs)
+    late_s = [run_frame(scheduler, clock, {**costs, Stage.PUBLISHING: 60.0})[0].seconds - FRAME_S for _ in range(12)]
     assert max(late_s[8:]) <= 1.0
 
 
 def test_settings_name_what_is_wrong() -> None:
-    wrongs = {"seconds_per_frame": 0.0}, {"seconds_per_frame": np.nan}, {"min_iterations": -1}, {"run_over": 1.5}
+    wrongs = {"seconds_per_frame": 0.0}, {"seconds_per_frame": np.nan}, {"min_iterations": -1}, {"deadline_slack": 1.5}
     for wrong in wrongs:
         with pytest.raises(InvalidInputError, match=next(iter(wrong))):
             SchedulerSettings(**wrong)
     with pytest.raises(InvalidInputError, match="each once, got words, words"):
-        SchedulerSettings(reliefs=(SkippableStage.WORDS, SkippableStage.WORDS))
+        SchedulerSettings(skip_stages=(SkippableStage.PUBLISHING, SkippableStage.PUBLISHING))

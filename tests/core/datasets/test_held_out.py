@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from gausslite.datasets.held_out import HeldOutSplit
 from gausslite.errors import InvalidInputError
-from gausslite.evaluation.held_out import HeldOutSplit
 
 
 def test_every_eighth_position_is_kept_by_default() -> None:
