@@ -19,12 +19,12 @@ from gausslite.calibration.view_fit import (
     SAME_SURFACE,
     PoseExposurePrior,
     agreeing_pixels,
-    fit_colour,
+    fit_exposure,
     fit_pose,
     twist,
 )
 from gausslite.datasets.registered_source import register_depth
-from gausslite.datasets.selection import modest_size
+from gausslite.datasets.selection import downscaled_size
 from gausslite.datasets.source import Source
 from gausslite.domain.camera import back_project
 from gausslite.domain.frame import Frame
@@ -40,7 +40,7 @@ _EXACT_M, _EXACT_DEG = 0.003, 0.1
 """Simulated homes, whose poses are exact, seem to err by up to 2 mm and 0.05 degrees."""
 
 
-def measure_view_error(source: Source) -> tuple[PoseExposurePrior, str]:
+def estimate_pose_exposure_prior(source: Source) -> tuple[PoseExposurePrior, str]:
     """How wrong the source's views are, all trusted where poses are exact as far as this can tell; and why.
 
     Frames that cannot be read are passed over: who maps them is told then.
@@ -48,7 +48,7 @@ def measure_view_error(source: Source) -> tuple[PoseExposurePrior, str]:
     motions, gains, offsets = [], [], []
     for drawn, frame in _pairs(source):
         fitted = fit_pose(drawn, inverse(frame.T_world_camera), frame, HANDHELD_PRIOR)
-        colour = fit_colour(drawn, frame, HANDHELD_PRIOR)
+        colour = fit_exposure(drawn, frame, HANDHELD_PRIOR)
         motions.append(twist(inverse(frame.T_world_camera) @ fitted))
         gains.append(colour.gain - 1.0)
         offsets.append(colour.offset)
@@ -73,7 +73,7 @@ def _of_one_view(between_two: ndarray) -> float:
 
 def _pairs(source: Source) -> Iterator[tuple[Rendering, Frame]]:
     """Frames, and what another one says they should look like; spread over the source, and far apart in time."""
-    count, size = len(source), modest_size(source.camera)
+    count, size = len(source), downscaled_size(source.camera)
     reach = count // 4
     for position in sorted({round(spot) for spot in np.linspace(0, count - 1, _SPOTS)}):
         towards_middle = 1 if position < count // 2 else -1

@@ -93,7 +93,7 @@ class _Gradients:
     along_columns: Float32[ndarray, "h w"]
 
 
-def estimate_colour_camera(source: Source, positions: Sequence[int], count: int = 40) -> Alignment:
+def estimate_depth_registration(source: Source, positions: Sequence[int], count: int = 40) -> Alignment:
     """Align about `count` of these frames, spread evenly. Raises TooFewEdgesError.
 
     Those that cannot be read are passed over: who maps them is told then.
@@ -124,7 +124,7 @@ def find_registration(source: Source) -> tuple[DepthRegistration | None, str]:
     if source.depth_registered:
         return None, "the layout's depth is registered to colour"
     try:
-        found = estimate_colour_camera(source, range(len(source)))
+        found = estimate_depth_registration(source, range(len(source)))
     except TooFewEdgesError as error:
         return None, str(error)
     why = (

@@ -79,15 +79,15 @@ class PoseExposurePrior:
     @property
     def is_exact(self) -> bool:
         """True where nothing that is said of a view may be wrong."""
-        return not self.moves and not self.colours
+        return not self.has_pose_error and not self.has_exposure_error
 
     @property
-    def moves(self) -> bool:
+    def has_pose_error(self) -> bool:
         """False where poses are trusted."""
         return self.translation_m > 0 or self.rotation_deg > 0
 
     @property
-    def colours(self) -> bool:
+    def has_exposure_error(self) -> bool:
         """False where colours are trusted."""
         return self.gain > 0 or self.offset > 0
 
@@ -103,12 +103,12 @@ class AffineExposure:
     gain: Float64[ndarray, "3"]
     offset: Float64[ndarray, "3"]
 
-    def of_photograph(self, drawn: Float[ndarray, "h w 3"]) -> Float32[ndarray, "h w 3"]:
+    def to_photograph(self, drawn: Float[ndarray, "h w 3"]) -> Float32[ndarray, "h w 3"]:
         """What the map draws, in the photograph's colours, clipped to [0, 1]."""
         coloured: Float32[ndarray, "h w 3"] = np.clip(drawn * self.gain + self.offset, 0.0, 1.0).astype(np.float32)
         return coloured
 
-    def of_map(self, rgb: UInt8[ndarray, "h w 3"]) -> UInt8[ndarray, "h w 3"]:
+    def to_map(self, rgb: UInt8[ndarray, "h w 3"]) -> UInt8[ndarray, "h w 3"]:
         """A photograph in the map's colours, rounded to 8 bits."""
         value = np.arange(256)[:, None] / 255.0
         table = np.clip((value - self.offset) / self.gain, 0.0, 1.0)
@@ -119,10 +119,10 @@ class AffineExposure:
 IDENTITY_EXPOSURE = AffineExposure(np.ones(3), np.zeros(3))
 
 
-def fit_colour(drawn: Rendering, frame: Frame, prior: PoseExposurePrior) -> AffineExposure:
+def fit_exposure(drawn: Rendering, frame: Frame, prior: PoseExposurePrior) -> AffineExposure:
     """The colour that brings the drawn image nearest to the frame's, where the map is closed."""
     pixels = agreeing_pixels(drawn, frame)
-    if not prior.colours or len(pixels) < _FEWEST_PIXELS:
+    if not prior.has_exposure_error or len(pixels) < _FEWEST_PIXELS:
         return IDENTITY_EXPOSURE
     # detail that the map lacks would pull the gain below 1
     model = _softened(drawn.rgb)[pixels].astype(np.float64)
@@ -144,7 +144,7 @@ def fit_pose(
     The prior holds the answer near frame.T_world_camera; the search starts at the pose drawn.
     """
     pixels = agreeing_pixels(drawn, frame)
-    if not prior.moves or len(pixels) < _FEWEST_PIXELS:
+    if not prior.has_pose_error or len(pixels) < _FEWEST_PIXELS:
         return frame.T_world_camera
     points = back_project(drawn.expected_depth_m(_CLOSED_ALPHA), frame.camera).reshape(-1, 3)[pixels]
     deviations = np.array([prior.translation_m] * 3 + [np.radians(prior.rotation_deg)] * 3 + [1.0, 1.0])

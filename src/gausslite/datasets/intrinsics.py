@@ -38,7 +38,7 @@ def find_beside_or_above(folder: Path, name: str) -> Path | None:
     return next((path for path in (folder / name, folder.parent / name) if path.is_file()), None)
 
 
-def told_camera(folder: Path, width_px: int, height_px: int) -> tuple[Camera, float | None] | None:
+def read_folder_camera(folder: Path, width_px: int, height_px: int) -> tuple[Camera, float | None] | None:
     """The camera of cam_params.json with the depth units of a metre, or of camera-intrinsics.txt without; None where
     neither is in or above the folder. Raises DatasetError.
     """

@@ -23,14 +23,14 @@ _SIMULATED = "sim:"
 _SIMULATOR = "gausslite_sim.source"
 
 
-def open_source(spec: str, up_axis: UpAxis | None = None, colour_camera: DepthRegistration | None = None) -> Source:
+def open_source(spec: str, up_axis: UpAxis | None = None, depth_registration: DepthRegistration | None = None) -> Source:
     """The sequence in a folder, or a simulated one ("sim:home?seed=0&trajectory=0").
 
     A folder that only holds one folder with a sequence stands for it. A colour camera given here says that colour
     and depth are not registered: depth is then moved into it. Raises DatasetError, PoseError, InvalidInputError.
     """
     source = _open(spec, up_axis)
-    return source if colour_camera is None else RegisteredSource(source, colour_camera)
+    return source if depth_registration is None else RegisteredSource(source, depth_registration)
 
 
 def is_simulated(spec: str) -> bool:

@@ -137,9 +137,9 @@ class RegisteredSource:
         return True
 
     @property
-    def left_out(self) -> str:
+    def excluded_frames(self) -> str:
         """The wrapped source's."""
-        return self._source.left_out
+        return self._source.excluded_frames
 
     def __len__(self) -> int:
         return len(self._source)

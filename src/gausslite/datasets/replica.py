@@ -14,7 +14,7 @@ from gausslite.datasets.images import DepthUnits, load_rgbd
 from gausslite.datasets.intrinsics import CAMERA_FILE, find_beside_or_above, read_json_camera
 from gausslite.datasets.poses import is_lost, nearest_rigid
 from gausslite.datasets.regions import regions_beside
-from gausslite.datasets.source import require_frames, require_position, tell_left_out
+from gausslite.datasets.source import require_frames, require_position, excluded_frames_note
 from gausslite.datasets.text_files import parse_numbers, read_rows
 from gausslite.domain.camera import Camera
 from gausslite.domain.frame import Frame
@@ -82,9 +82,9 @@ class ReplicaSource:
         return True
 
     @property
-    def left_out(self) -> str:
+    def excluded_frames(self) -> str:
         """Frames without a pose."""
-        return tell_left_out(len(self._colours) - len(self._numbers), len(self._colours), "without a pose")
+        return excluded_frames_note(len(self._colours) - len(self._numbers), len(self._colours), "without a pose")
 
     def __len__(self) -> int:
         return len(self._numbers)

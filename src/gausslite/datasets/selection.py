@@ -42,7 +42,7 @@ def frame_size(text: str | None, source: Source) -> tuple[int, int]:
     return width, height
 
 
-def modest_size(camera: Camera) -> tuple[int, int]:
+def downscaled_size(camera: Camera) -> tuple[int, int]:
     """The camera's own proportions in at most as many pixels as 320x240, so that nothing is stretched."""
     share = min(1.0, math.sqrt(_MODEST_PIXELS / (camera.width_px * camera.height_px)))
     return round(share * camera.width_px), round(share * camera.height_px)

@@ -12,10 +12,10 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from gausslite.datasets.images import DepthUnits, load_rgbd, read_colour
-from gausslite.datasets.intrinsics import CAMERA_FILE, INTRINSICS_FILE, FileIntrinsics, told_camera
+from gausslite.datasets.intrinsics import CAMERA_FILE, INTRINSICS_FILE, FileIntrinsics, read_folder_camera
 from gausslite.datasets.poses import estimate_up, is_lost, nearest_rigid
 from gausslite.datasets.regions import regions_beside
-from gausslite.datasets.source import require_frames, require_position, tell_left_out
+from gausslite.datasets.source import require_frames, require_position, excluded_frames_note
 from gausslite.datasets.text_files import parse_numbers, read_rows
 from gausslite.domain.camera import Camera
 from gausslite.domain.frame import Frame
@@ -83,9 +83,9 @@ class SevenScenesSource:
         return False
 
     @property
-    def left_out(self) -> str:
+    def excluded_frames(self) -> str:
         """Frames without a pose."""
-        return tell_left_out(len(self._colours) - len(self._numbers), len(self._colours), "without a pose")
+        return excluded_frames_note(len(self._colours) - len(self._numbers), len(self._colours), "without a pose")
 
     def __len__(self) -> int:
         return len(self._numbers)
@@ -140,7 +140,7 @@ def _read_matrix(path: Path) -> Float64[ndarray, "4 4"]:
 
 def _camera(folder: Path, width_px: int, height_px: int) -> tuple[Camera, float | None]:
     """The camera and, where they are told, the depth units of a metre."""
-    told = told_camera(folder, width_px, height_px)
+    told = read_folder_camera(folder, width_px, height_px)
     if told is not None:
         return told
     if (width_px, height_px) != _KINECT_SIZE:

@@ -38,7 +38,7 @@ class Source(Protocol):
         ...
 
     @property
-    def left_out(self) -> str:
+    def excluded_frames(self) -> str:
         """How much of the recording is no part of the sequence, and why; empty where all of it is."""
         ...
 
@@ -66,8 +66,8 @@ def require_position(source_name: str, i: int, count: int) -> None:
         raise DatasetError(f"{source_name}: expected a position from 0 to {count - 1}, got {i}")
 
 
-def tell_left_out(count: int, recorded: int, why: str) -> str:
-    """The line of `Source.left_out`."""
+def excluded_frames_note(count: int, recorded: int, why: str) -> str:
+    """The line of `Source.excluded_frames`."""
     return f"{count} of {recorded} colour images are left out, {why}" if count else ""
 
 

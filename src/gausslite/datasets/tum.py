@@ -12,10 +12,10 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from gausslite.datasets.images import DepthUnits, load_rgbd, read_colour
-from gausslite.datasets.intrinsics import CAMERA_FILE, INTRINSICS_FILE, FileIntrinsics, told_camera
+from gausslite.datasets.intrinsics import CAMERA_FILE, INTRINSICS_FILE, FileIntrinsics, read_folder_camera
 from gausslite.datasets.poses import is_lost, pose_from_quaternion, slerp
 from gausslite.datasets.regions import regions_beside
-from gausslite.datasets.source import require_frames, require_position, tell_left_out
+from gausslite.datasets.source import require_frames, require_position, excluded_frames_note
 from gausslite.datasets.text_files import parse_numbers, read_rows
 from gausslite.domain.camera import Camera
 from gausslite.domain.frame import Frame
@@ -89,10 +89,10 @@ class TumSource:
         return True
 
     @property
-    def left_out(self) -> str:
+    def excluded_frames(self) -> str:
         """Colour images without depth or pose at their time."""
         why = "without a pose at their time or depth within 20 ms"
-        return tell_left_out(self._recorded - len(self), self._recorded, why)
+        return excluded_frames_note(self._recorded - len(self), self._recorded, why)
 
     def __len__(self) -> int:
         return len(self._matches)
@@ -181,7 +181,7 @@ class _Trajectory:
 
 def _camera(folder: Path, width_px: int, height_px: int) -> tuple[Camera, float | None]:
     """The camera and, where they are told, the depth units of a metre."""
-    told = told_camera(folder, width_px, height_px)
+    told = read_folder_camera(folder, width_px, height_px)
     if told is not None:
         return told
     group = re.search(r"(?:freiburg|fr)([123])", folder.resolve().name)

@@ -41,7 +41,7 @@ def splatam_policy() -> MapperSettings:
     return MapperSettings(
         components=_NO_TASK,
         seeding=SeedingSettings(
-            first_frame_seeds=76_800, later_seeds=8_000, min_alpha=0.5, depth_error_factor=50.0, plain_scale=0.5
+            first_frame_seeds=76_800, later_seeds=8_000, min_alpha=0.5, depth_error_factor=50.0, init_scale=0.5
         ),
         optimization=OptimizationSettings(loss=LossWeights(colour=0.4, depth=1.0, ssim=0.1), isotropic=True),
         density=DensitySettings(min_mean_gradient=_NEVER),
@@ -54,6 +54,6 @@ def monogs_policy() -> MapperSettings:
     """
     return MapperSettings(
         components=_NO_TASK,
-        seeding=SeedingSettings(first_frame_seeds=9_600, later_seeds=4_800, min_alpha=1.0, plain_scale=math.sqrt(0.05)),
+        seeding=SeedingSettings(first_frame_seeds=9_600, later_seeds=4_800, min_alpha=1.0, init_scale=math.sqrt(0.05)),
         optimization=OptimizationSettings(loss=LossWeights(colour=0.95, depth=0.05, ssim=0.0)),
     )

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from gausslite.domain.camera import Camera
 from gausslite.domain.frame import Frame
 from gausslite.domain.relevance import RelevanceMap
-from gausslite.domain.state import State, take, take_measures, whole_numbers
+from gausslite.domain.state import State, get_array, get_floats, int_array
 from gausslite.errors import MapFileError
 
 _LOW = (1 << 64) - 1
@@ -22,7 +22,7 @@ def frame_state(frame: Frame) -> dict[str, NDArray[Any]]:
     """A frame, its camera and pose."""
     camera = frame.camera
     return {
-        "stamp": whole_numbers(frame.index, frame.capture_time_ns),
+        "stamp": int_array(frame.index, frame.capture_time_ns),
         "rgb": frame.rgb,
         "depth_m": frame.depth_m,
         "camera": np.array([camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px]),
@@ -32,12 +32,12 @@ def frame_state(frame: Frame) -> dict[str, NDArray[Any]]:
 
 def frame_of(state: State) -> Frame:
     """The frame again; its arrays are copies. Raises MapFileError, InvalidInputError."""
-    index, capture_time_ns = (int(value) for value in take(state, "stamp", (2,), np.int64))
-    depth_m = take(state, "depth_m", (None, None), np.float32).copy()
-    fx_px, fy_px, cx_px, cy_px = take_measures(state, "camera", 4)
+    index, capture_time_ns = (int(value) for value in get_array(state, "stamp", (2,), np.int64))
+    depth_m = get_array(state, "depth_m", (None, None), np.float32).copy()
+    fx_px, fy_px, cx_px, cy_px = get_floats(state, "camera", 4)
     camera = Camera(fx_px, fy_px, cx_px, cy_px, depth_m.shape[1], depth_m.shape[0])
-    rgb = take(state, "rgb", (*depth_m.shape, 3), np.uint8).copy()
-    T_world_camera = take(state, "T_world_camera", (4, 4), np.float64).copy()
+    rgb = get_array(state, "rgb", (*depth_m.shape, 3), np.uint8).copy()
+    T_world_camera = get_array(state, "T_world_camera", (4, 4), np.float64).copy()
     return Frame(index, capture_time_ns, rgb, depth_m, camera, T_world_camera)
 
 
@@ -48,10 +48,10 @@ def relevance_state(relevance: RelevanceMap) -> dict[str, NDArray[Any]]:
 
 def relevance_of(state: State, frame: Frame) -> RelevanceMap:
     """The relevance of this frame again. Raises MapFileError, ShapeError."""
-    weight = take(state, "weight", frame.depth_m.shape, np.float32).copy()
+    weight = get_array(state, "weight", frame.depth_m.shape, np.float32).copy()
     if not ((weight >= 0) & (weight <= 1)).all():
         raise MapFileError("state weight: expected values in [0, 1], got others")
-    return RelevanceMap(weight, take(state, "target", frame.depth_m.shape, np.int16).copy())
+    return RelevanceMap(weight, get_array(state, "target", frame.depth_m.shape, np.int16).copy())
 
 
 def generator_state(rng: np.random.Generator) -> UInt64[ndarray, "6"]:

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
-from jaxtyping import Bool, Float32, Int64
+from jaxtyping import Bool, Int64
 from numpy import ndarray
 
 from gausslite.domain.gaussians import Gaussians
 from gausslite.mapping.seeding import Seeds
 from gausslite.optimize.parameters import SplatTable
-from gausslite.render.rasterizer import LOGIT
 
 
 def insert(table: SplatTable, seeds: Seeds, newborn_opacity: float, rng: np.random.Generator, scaffold: int = 0) -> int:
@@ -23,11 +20,11 @@ def insert(table: SplatTable, seeds: Seeds, newborn_opacity: float, rng: np.rand
     seeds that still do not fit are left out at random. Seeds take the rows of those that give way, so that a full table
     is not moved about.
     """
-    giving_way = _for_the_region(table, len(seeds.roi) - table.room, scaffold)
-    roi = seeds.roi.take(_at_random(len(seeds.roi), table.room + len(giving_way), rng))
+    giving_way = _for_the_region(table, len(seeds.roi) - table.free_slots, scaffold)
+    roi = seeds.roi.take(_at_random(len(seeds.roi), table.free_slots + len(giving_way), rng))
     _settle(table, roi, giving_way)
-    giving_way = _for_the_rest(table, len(seeds.rest) - table.room, newborn_opacity)
-    rest = seeds.rest.take(_at_random(len(seeds.rest), table.room + len(giving_way), rng))
+    giving_way = _for_the_rest(table, len(seeds.rest) - table.free_slots, newborn_opacity)
+    rest = seeds.rest.take(_at_random(len(seeds.rest), table.free_slots + len(giving_way), rng))
     _settle(table, rest, giving_way)
     return len(roi) + len(rest)
 
@@ -44,8 +41,7 @@ def _for_the_region(table: SplatTable, count: int, scaffold: int) -> Int64[ndarr
         return np.zeros(0, np.int64)
     spared = max(0, int(np.count_nonzero(~table.active)) - scaffold)
     background = _inactive(table, min(count, spared), ~table.active)
-    logits = table.rows[:, LOGIT].copy()
-    region = _faintest_of(logits, np.flatnonzero(table.active), count - len(background))
+    region = table.most_transparent(np.flatnonzero(table.active), count - len(background))
     return np.concatenate([background, region])
 
 
@@ -53,29 +49,15 @@ def _for_the_rest(table: SplatTable, count: int, below_opacity: float) -> Int64[
     """Up to `count` rows of inactive ones more transparent than this, an earlier task's surplus first."""
     if count <= 0:
         return np.zeros(0, np.int64)
-    fainter = table.rows[:, LOGIT] < math.log(below_opacity) - math.log1p(-below_opacity)
-    return _inactive(table, count, ~table.active & fainter)
+    return _inactive(table, count, ~table.active & table.has_lower_opacity(below_opacity))
 
 
 def _inactive(table: SplatTable, count: int, candidates: Bool[ndarray, " n"]) -> Int64[ndarray, " k"]:
     """Up to `count` of these rows, those worked on for an earlier task first, the faintest of each."""
-    logits, worked_on = table.rows[:, LOGIT].copy(), table.kappa > 0
-    surplus = _faintest_of(logits, np.flatnonzero(candidates & worked_on), count)
-    others = _faintest_of(logits, np.flatnonzero(candidates & ~worked_on), count - len(surplus))
+    worked_on = table.kappa > 0
+    surplus = table.most_transparent(np.flatnonzero(candidates & worked_on), count)
+    others = table.most_transparent(np.flatnonzero(candidates & ~worked_on), count - len(surplus))
     return np.concatenate([surplus, others])
-
-
-def _faintest_of(logits: Float32[ndarray, " n"], rows: Int64[ndarray, " m"], count: int) -> Int64[ndarray, " k"]:
-    """Up to `count` of these ascending rows, the most transparent; of equal ones the earlier."""
-    if count >= len(rows):
-        return rows
-    if count <= 0:
-        return rows[:0]
-    among = logits[rows]
-    limit = np.partition(among, count - 1)[count - 1]
-    below, level = np.flatnonzero(among < limit), np.flatnonzero(among == limit)
-    faintest: Int64[ndarray, " k"] = rows[np.concatenate([below, level[: count - len(below)]])]
-    return faintest
 
 
 def _at_random(wanted: int, fits: int, rng: np.random.Generator) -> Int64[ndarray, " n"]:

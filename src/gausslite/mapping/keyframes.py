@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import inverse
 from gausslite.domain.relevance import RelevanceMap
-from gausslite.domain.state import State, nested, part, take_counts, whole_numbers
+from gausslite.domain.state import State, add_prefix, get_counts, int_array, select_prefix
 from gausslite.errors import MapFileError
 from gausslite.mapping.checkpoint import frame_of, frame_state, relevance_of, relevance_state
 from gausslite.mapping.settings import KeyframeSettings
@@ -29,13 +29,13 @@ class Keyframe:
     """A frame and what in it was relevant when it was mapped.
 
     recorded: the frame as it came, where it is mapped with another pose or other colours; None where it is not.
-    judged: False while what in it is relevant to the present task is not known; nothing is marked then.
+    evaluated: False while what in it is relevant to the present task is not known; nothing is marked then.
     """
 
     frame: Frame
     relevance: RelevanceMap
     recorded: Frame | None = None
-    judged: bool = True
+    evaluated: bool = True
 
     @property
     def as_recorded(self) -> Frame:
@@ -46,20 +46,20 @@ class Keyframe:
         """The keyframe as named arrays."""
         recorded = {} if self.recorded is None else frame_state(self.recorded)
         return {
-            **nested("frame", frame_state(self.frame)),
-            **nested("relevance", relevance_state(self.relevance)),
-            **nested("recorded", recorded),
-            "judged": whole_numbers(self.judged),
+            **add_prefix("frame", frame_state(self.frame)),
+            **add_prefix("relevance", relevance_state(self.relevance)),
+            **add_prefix("recorded", recorded),
+            "evaluated": int_array(self.evaluated),
         }
 
     @classmethod
     def of(cls, state: State) -> Keyframe:
         """The keyframe again. Raises MapFileError, InvalidInputError."""
-        frame = frame_of(part(state, "frame"))
-        recorded = part(state, "recorded")
-        relevance = relevance_of(part(state, "relevance"), frame)
-        [judged] = take_counts(state, "judged", 1)
-        return cls(frame, relevance, frame_of(recorded) if recorded else None, bool(judged))
+        frame = frame_of(select_prefix(state, "frame"))
+        recorded = select_prefix(state, "recorded")
+        relevance = relevance_of(select_prefix(state, "relevance"), frame)
+        [evaluated] = get_counts(state, "evaluated", 1)
+        return cls(frame, relevance, frame_of(recorded) if recorded else None, bool(evaluated))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -81,8 +81,8 @@ def window_view(keyframe: Keyframe, rasterizer: Rasterizer, settings: KeyframeSe
     """Make a frame ready to train on; the margin gives SSIM's window its neighbours at the region's border."""
     frame, relevance = keyframe.frame, keyframe.relevance
     tiles, weight = tiles_of(relevance.roi, settings.roi_margin_px), relevance.weight
-    if settings.surroundings_weight > 0:
-        beside = np.float32(settings.surroundings_weight) * _well_inside(tiles, weight.shape)
+    if settings.roi_context_weight > 0:
+        beside = np.float32(settings.roi_context_weight) * _well_inside(tiles, weight.shape)
         weight = np.maximum(weight, beside)
     return WindowView(
         keyframe=keyframe,
@@ -153,21 +153,21 @@ class KeyframeStore:
         while len(self._buffer) > self._room.buffer:
             del self._buffer[_most_crowded(self._buffer)]
 
-    def revise(self, view: WindowView) -> None:
+    def replace_view(self, view: WindowView) -> None:
         """Put what came to be known later in the place of a frame that is still in the window.
 
         A frame that turns out not to show the region stays only as one of the most recent keyframes.
         """
         revised = [view if _same_frame(old.keyframe, view.keyframe) else old for old in self._region]
-        self._region = [each for each in revised if self._may_stay(each) or not each.keyframe.judged]
+        self._region = [each for each in revised if self._may_stay(each) or not each.keyframe.evaluated]
         self._latest = [view if _same_frame(old.keyframe, view.keyframe) else old for old in self._latest]
         self._buffer = [view.keyframe if _same_frame(old, view.keyframe) else old for old in self._buffer]
 
-    def begin_task(self) -> None:
-        """The task is another one: no keyframe is judged, and none shows a region before it is."""
-        nothing = {k.frame.depth_m.shape: RelevanceMap.nothing(*k.frame.depth_m.shape) for k in self._held()}
+    def reset_roi(self) -> None:
+        """The task is another one: no keyframe is evaluated, and none shows a region before it is."""
+        nothing = {k.frame.depth_m.shape: RelevanceMap.empty(*k.frame.depth_m.shape) for k in self._held()}
         fresh = {
-            id(old): replace(old, relevance=nothing[old.frame.depth_m.shape], judged=False) for old in self._held()
+            id(old): replace(old, relevance=nothing[old.frame.depth_m.shape], evaluated=False) for old in self._held()
         }
         self._buffer = [fresh[id(keyframe)] for keyframe in self._buffer]
         views = {
@@ -178,20 +178,20 @@ class KeyframeStore:
         self._region = [views[id(view.keyframe)] for view in self._region]
 
     @property
-    def next_to_judge(self) -> Keyframe | None:
-        """The newest keyframe that is not judged; None when all are."""
+    def next_unevaluated(self) -> Keyframe | None:
+        """The newest keyframe that is not evaluated; None when all are."""
         newest_first = (*(view.keyframe for view in reversed(self.window)), *reversed(self._buffer))
-        return next((keyframe for keyframe in newest_first if not keyframe.judged), None)
+        return next((keyframe for keyframe in newest_first if not keyframe.evaluated), None)
 
-    def judge(self, keyframe: Keyframe, view_of: Callable[[Keyframe], WindowView]) -> None:
-        """Put a judged keyframe in its place; one that shows the region is ready to train on again."""
+    def evaluate(self, keyframe: Keyframe, view_of: Callable[[Keyframe], WindowView]) -> None:
+        """Put a evaluated keyframe in its place; one that shows the region is ready to train on again."""
         self._buffer = [keyframe if _same_frame(old, keyframe) else old for old in self._buffer]
         shows_region = bool(keyframe.relevance.roi.any())
         ready = any(_same_frame(view.keyframe, keyframe) for view in self.window)
         if not ready and not shows_region:
             return
         view = view_of(keyframe)
-        self.revise(view)
+        self.replace_view(view)
         if shows_region and not any(_same_frame(each.keyframe, keyframe) for each in self._region):
             self._keep_for_region(sorted([*self._region, view], key=_captured_ns))
 
@@ -209,32 +209,32 @@ class KeyframeStore:
         held = self._held()
         places = {id(keyframe): place for place, keyframe in enumerate(held)}
         state: dict[str, NDArray[Any]] = {
-            "window": whole_numbers(*(places[id(view.keyframe)] for view in self._latest)),
-            "region": whole_numbers(*(places[id(view.keyframe)] for view in self._region)),
-            "buffer": whole_numbers(*(places[id(keyframe)] for keyframe in self._buffer)),
-            "offered": whole_numbers(self._offered),
+            "window": int_array(*(places[id(view.keyframe)] for view in self._latest)),
+            "region": int_array(*(places[id(view.keyframe)] for view in self._region)),
+            "buffer": int_array(*(places[id(keyframe)] for keyframe in self._buffer)),
+            "offered": int_array(self._offered),
         }
         for place, keyframe in enumerate(held):
-            state |= nested(str(place), keyframe.state())
+            state |= add_prefix(str(place), keyframe.state())
         return state
 
     def restore(self, state: State, view_of: Callable[[Keyframe], WindowView]) -> None:
         """Take over the keyframes of another store; view_of makes one ready to train on. Raises MapFileError."""
         settings, lists = self._settings, ("window", "region", "buffer")
-        latest, region, buffer = (take_counts(state, name, len(state.get(name, ()))) for name in lists)
+        latest, region, buffer = (get_counts(state, name, len(state.get(name, ()))) for name in lists)
         most = settings.window, settings.region_views, settings.buffer
         came = len(latest), len(region), len(buffer)
         if any(count > limit for count, limit in zip(came, most, strict=True)):
             limits, counts = ("{}, {} and {}".format(*numbers) for numbers in (most, came))
             raise MapFileError(f"state keyframes ({', '.join(lists)}): expected at most {limits}, got {counts}")
-        keyframes = {place: Keyframe.of(part(state, str(place))) for place in sorted({*latest, *region, *buffer})}
+        keyframes = {place: Keyframe.of(select_prefix(state, str(place))) for place in sorted({*latest, *region, *buffer})}
         views = {place: view_of(keyframes[place]) for place in sorted({*latest, *region})}
         self._latest = [views[place] for place in latest]
         self._region = [views[place] for place in region]
         self._buffer = [keyframes[place] for place in buffer]
         for keyframe in keyframes.values():
             self._make_room_for(keyframe)
-        [self._offered] = take_counts(state, "offered", 1)
+        [self._offered] = get_counts(state, "offered", 1)
 
     def _make_room_for(self, keyframe: Keyframe) -> None:
         """The largest image that came says how many may stay from now on."""

@@ -14,7 +14,7 @@ from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.pose import inverse
 from gausslite.domain.relevance import RelevanceMap
-from gausslite.domain.state import State, nested, part, take, take_counts, take_measures, whole_numbers
+from gausslite.domain.state import State, add_prefix, get_array, get_counts, get_floats, int_array, select_prefix
 from gausslite.mapping.checkpoint import generator_state, set_generator
 from gausslite.mapping.coverage import RenderedView
 from gausslite.mapping.eviction import insert
@@ -64,7 +64,7 @@ class GaussianMapper:
             self._table.append(known)
         self._seeder = Seeder(settings.seeding, settings.components, self._rng)
         self._keyframes = KeyframeStore(settings.keyframes, settings.components.follow_task)
-        self._refiner = ViewRefiner(settings.pose_prior, self.render, settings.keyframes.refits)
+        self._refiner = ViewRefiner(settings.pose_prior, self.render, settings.keyframes.pose_updates_per_frame)
         self._trainer = Trainer(settings, self._table, rasterizer, self._rng)
         self._extent_m = 0.0
         self._revision = 0
@@ -115,58 +115,58 @@ class GaussianMapper:
         self._revision += 1
         return MappedFrame(frame.index, seeded, iterations, self.count)
 
-    def rehearse(self) -> bool:
+    def idle_step(self) -> bool:
         """One more iteration on the window's keyframes; False when there are none yet."""
         if not self._keyframes.window:
             return False
-        self._trainer.rehearse(self._keyframes.window, self._extent_m)
+        self._trainer.idle_step(self._keyframes.window, self._extent_m)
         return True
 
-    def revise(self, frame: Frame, relevance: RelevanceMap) -> bool:
+    def update_relevance(self, frame: Frame, relevance: RelevanceMap) -> bool:
         """Take what came to be known of an earlier frame; False when it is no keyframe of the window (any more)."""
         view = self._keyframes.of(frame)
         if view is None:
             return False
-        if view.keyframe.judged:
-            self._keyframes.revise(self._view(replace(view.keyframe, relevance=relevance)))
+        if view.keyframe.evaluated:
+            self._keyframes.replace_view(self._view(replace(view.keyframe, relevance=relevance)))
         else:
-            self.judge(view.keyframe, relevance)
+            self.evaluate_keyframe(view.keyframe, relevance)
         return True
 
-    def begin_task(self) -> None:
-        """Map for another task from now on: nothing counts as its region until keyframes are judged for it.
+    def reset_roi(self) -> None:
+        """Map for another task from now on: nothing counts as its region until keyframes are evaluated for it.
 
         The map, kappa and the optimiser's state stay; what was the old region gives way first when room is short.
         """
         clear_roi(self._table)
-        self._keyframes.begin_task()
+        self._keyframes.reset_roi()
 
     @property
-    def next_to_judge(self) -> Keyframe | None:
-        """The newest keyframe whose relevance to the present task is not known; None when all are judged."""
-        return self._keyframes.next_to_judge
+    def next_unevaluated(self) -> Keyframe | None:
+        """The newest keyframe whose relevance to the present task is not known; None when all are evaluated."""
+        return self._keyframes.next_unevaluated
 
-    def judge(self, keyframe: Keyframe, relevance: RelevanceMap) -> int:
+    def evaluate_keyframe(self, keyframe: Keyframe, relevance: RelevanceMap) -> int:
         """Take what of an earlier keyframe is relevant to the present task; returns how many Gaussians were seeded.
 
         What it shows of the region becomes active, and is seeded where the map is too coarse for it, within the cap.
         """
         require_array("relevance weight", relevance.weight, keyframe.frame.depth_m.shape, np.float32)
         frame, table = keyframe.frame, self._table
-        self._keyframes.judge(replace(keyframe, relevance=relevance, judged=True), self._view)
+        self._keyframes.evaluate(replace(keyframe, relevance=relevance, evaluated=True), self._view)
         vote_on_relevance(table, frame, relevance)
         if not relevance.roi.any():
             return 0
         seeds = self._seeder.seed_region(frame, relevance, table.means_m[table.active])
         return self._insert(Seeds(seeds, Gaussians.empty()))
 
-    def pass_over(self, keyframe: Keyframe) -> None:
+    def mark_unavailable(self, keyframe: Keyframe) -> None:
         """What of an earlier keyframe is relevant to the present task will not be known: it shows no region, and casts
         no votes either.
         """
-        self._keyframes.judge(replace(keyframe, judged=True), self._view)
+        self._keyframes.evaluate(replace(keyframe, evaluated=True), self._view)
 
-    def look(self, frame: Frame) -> RenderedView | None:
+    def render_view(self, frame: Frame) -> RenderedView | None:
         """How the map looks from a frame; None while it is empty."""
         return RenderedView.of(self.render(frame.camera, frame.T_world_camera)) if self.count > 0 else None
 
@@ -175,12 +175,12 @@ class GaussianMapper:
         return self._rasterizer.forward(self._table.rows, camera, inverse(T_world_camera))
 
     def gaussians(self) -> Gaussians:
-        """A copy of the map as physical values, as it is shown (`OptimizationSettings.averaged_updates`)."""
-        return self._table.to_gaussians(use_ema=self._settings.optimization.averaged_updates > 0)
+        """A copy of the map as physical values, as it is shown (`OptimizationSettings.ema_updates`)."""
+        return self._table.to_gaussians(use_ema=self._settings.optimization.ema_updates > 0)
 
     def roi_gaussians(self) -> Gaussians:
         """A copy of the active Gaussians: the task's part of the map."""
-        averaged = self._settings.optimization.averaged_updates > 0
+        averaged = self._settings.optimization.ema_updates > 0
         return self._table.to_gaussians(np.flatnonzero(self._table.active), averaged)
 
     def keyframes(self) -> list[Keyframe]:
@@ -234,7 +234,7 @@ class GaussianMapper:
     def _refine_keyframes(self) -> None:
         """Some keyframes of the window, fitted again to the map as it has become."""
         for view in self._refiner.next_turns(self._keyframes.window):
-            self._keyframes.revise(self._view(self._refiner.fit_again(view.keyframe)))
+            self._keyframes.replace_view(self._view(self._refiner.fit_again(view.keyframe)))
 
     def _view(self, keyframe: Keyframe) -> WindowView:
         return window_view(keyframe, self._rasterizer, self._settings.keyframes)
@@ -243,7 +243,7 @@ class GaussianMapper:
         """Add Gaussians where the map does not explain the frame, within the cap."""
         frame, table = keyframe.frame, self._table
         if sight is None or keyframe.recorded is not None:
-            sight = self.look(frame)
+            sight = self.render_view(frame)
         with scheduler.timing(Stage.SEEDING):
             state = SeedingContext(table.free_slots, sight, table.means_m[table.active])
             seeds = self._seeder.seed(frame, keyframe.relevance, state)
@@ -252,7 +252,7 @@ class GaussianMapper:
     def _insert(self, seeds: Seeds) -> int:
         """Add them within the cap; returns how many were added."""
         seeding, table = self._settings.seeding, self._table
-        return insert(table, seeds, seeding.opacity, self._rng, int(seeding.scaffold_share * table.capacity))
+        return insert(table, seeds, seeding.opacity, self._rng, int(seeding.background_share * table.capacity))
 
     def _train(self, current: WindowView, scheduler: StageScheduler) -> int:
         """MVO: train on views drawn from the window and the current one; without it on the current one alone."""

@@ -35,30 +35,30 @@ def policy(name: str) -> MapperSettings:
     return POLICIES[name]()
 
 
-PAPER_ABLATION_FLAGS = ("sb", "mvo", "roi", "sis", "gfd")
+PAPER_FLAGS = ("sb", "mvo", "roi", "sis", "gfd")
 """The paper's components (Sec. III-C, III-D), in the order of its ablation."""
 
-BEYOND_SWITCHES: dict[str, Callable[[MapperSettings], MapperSettings]] = {
-    "views": lambda settings: replace(settings, keyframes=replace(settings.keyframes, region_views=0)),
-    "surroundings": lambda settings: replace(settings, keyframes=replace(settings.keyframes, surroundings_weight=0.0)),
-    "scaffold": lambda settings: replace(settings, seeding=replace(settings.seeding, scaffold_share=0.0)),
-    "means": lambda settings: replace(settings, optimization=replace(settings.optimization, averaged_updates=0.0)),
-    "settling": lambda settings: replace(
-        settings, optimization=replace(settings.optimization, settling_updates=math.inf)
+EXTENSION_FLAGS: dict[str, Callable[[MapperSettings], MapperSettings]] = {
+    "mission-keyframes": lambda settings: replace(settings, keyframes=replace(settings.keyframes, region_views=0)),
+    "roi-context": lambda settings: replace(settings, keyframes=replace(settings.keyframes, roi_context_weight=0.0)),
+    "background-reserve": lambda settings: replace(settings, seeding=replace(settings.seeding, background_share=0.0)),
+    "ema": lambda settings: replace(settings, optimization=replace(settings.optimization, ema_updates=0.0)),
+    "lr-decay": lambda settings: replace(
+        settings, optimization=replace(settings.optimization, lr_decay_after_updates=math.inf)
     ),
 }
 """What came beyond the paper, in the order of our ablation, and how each is switched off."""
 
-ABLATION_FLAGS = (*PAPER_ABLATION_FLAGS, *BEYOND_SWITCHES)
+ABLATION_FLAGS = (*PAPER_FLAGS, *EXTENSION_FLAGS)
 
 
-def without(settings: MapperSettings, names: Collection[str]) -> MapperSettings:
+def disable(settings: MapperSettings, names: Collection[str]) -> MapperSettings:
     """These settings with the named parts switched off. Raises InvalidInputError for a name that is none of them."""
     unknown = sorted(set(names) - set(ABLATION_FLAGS))
     if unknown:
-        raise InvalidInputError(f"without: expected names among {', '.join(ABLATION_FLAGS)}, got {', '.join(unknown)}")
-    off = dict.fromkeys((name for name in PAPER_ABLATION_FLAGS if name in names), False)
+        raise InvalidInputError(f"disable: expected names among {', '.join(ABLATION_FLAGS)}, got {', '.join(unknown)}")
+    off = dict.fromkeys((name for name in PAPER_FLAGS if name in names), False)
     settings = replace(settings, components=replace(settings.components, **off))
-    for name in (each for each in BEYOND_SWITCHES if each in names):
-        settings = BEYOND_SWITCHES[name](settings)
+    for name in (each for each in EXTENSION_FLAGS if each in names):
+        settings = EXTENSION_FLAGS[name](settings)
     return settings

@@ -27,8 +27,8 @@ class SeedingContext:
     is empty), and where its active Gaussians are.
     """
 
-    room: int
-    sight: RenderedView | None
+    free_slots: int
+    rendered: RenderedView | None
     active_means_m: Float32[ndarray, "n 3"]
 
 
@@ -85,17 +85,17 @@ class Seeder:
         budget = self._budget(frame, state)
         seedable = (frame.depth_m > 0) & (frame.depth_m <= settings.max_depth_m)
         roi_open = open_pixels = seedable
-        if state.sight is not None:
-            behind = drawn_behind(frame, state.sight, settings.depth_error_factor)
-            open_pixels = seedable & (behind | (state.sight.alpha < settings.min_alpha))
-            roi_open = seedable & (behind | (state.sight.alpha < settings.roi_min_alpha))
+        if state.rendered is not None:
+            behind = drawn_behind(frame, state.rendered, settings.depth_error_factor)
+            open_pixels = seedable & (behind | (state.rendered.alpha < settings.min_alpha))
+            roi_open = seedable & (behind | (state.rendered.alpha < settings.roi_min_alpha))
         if not self._components.sb:
-            return _Pool(np.zeros_like(seedable), 0, False), self._rest_pool(open_pixels, budget, state.room)
+            return _Pool(np.zeros_like(seedable), 0, False), self._rest_pool(open_pixels, budget, state.free_slots)
         roi_budget = int(settings.roi_share * budget)
         coarse = undersampled(frame, relevance.roi, state.active_means_m, settings.roi_pixels_per_active)
         roi_pixels = relevance.roi & (roi_open | (coarse & seedable))
         rest_pixels = open_pixels & ~relevance.roi
-        return self._roi_pool(roi_pixels, roi_budget), self._rest_pool(rest_pixels, budget - roi_budget, state.room)
+        return self._roi_pool(roi_pixels, roi_budget), self._rest_pool(rest_pixels, budget - roi_budget, state.free_slots)
 
     def _roi_pool(self, pixels: Bool[ndarray, "h w"], budget: int) -> _Pool:
         """No denser than the active Gaussians that the region is to have; its room is made by others."""
@@ -115,7 +115,7 @@ class Seeder:
 
     def _budget(self, frame: Frame, state: SeedingContext) -> int:
         """N, for this image size."""
-        seeds = self._settings.first_frame_seeds if state.sight is None else self._settings.later_seeds
+        seeds = self._settings.first_frame_seeds if state.rendered is None else self._settings.later_seeds
         return max(1, round(seeds * frame.depth_m.size / _REFERENCE_PIXELS))
 
     def _pixel_weight(self, frame: Frame) -> Float32[ndarray, "h w"]:
@@ -142,7 +142,7 @@ class Seeder:
         """SIS: scale s0·m, identity rotation, observed colour, and the active flag of the seed's pixel."""
         settings, count = self._settings, len(pixels)
         active = relevance.roi.ravel()[pixels]
-        scale_m = spacing_m * np.float32(settings.plain_scale)
+        scale_m = spacing_m * np.float32(settings.init_scale)
         if self._components.sis:
             scale_m = spacing_m * np.where(active, settings.roi_scale, settings.background_scale).astype(np.float32)
         rows, columns = np.divmod(pixels, frame.camera.width_px)

@@ -7,9 +7,9 @@ from jaxtyping import Bool, Int64, UInt64
 from numpy import ndarray
 
 from gausslite.domain.gaussians import Gaussians
-from gausslite.domain.state import State, take
+from gausslite.domain.state import State, get_array
 from gausslite.domain.voxel_batch import VoxelBatch
-from gausslite.domain.voxel_operations import VoxelIndex, merge_batches, take_voxels, tombstones
+from gausslite.domain.voxel_operations import VoxelIndex, merge_batches, select_voxels, tombstones
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.errors import MapFileError
 
@@ -33,7 +33,7 @@ class SentVoxelTracker:
         A voxel that held active Gaussians then and holds none now gets a tombstone (count 0), unless it is released.
         """
         active = gaussians if gaussians.active.all() else gaussians.take(gaussians.active)
-        voxels = VoxelIndex.by(active.means_m, self._grid)
+        voxels = VoxelIndex.from_points(active.means_m, self._grid)
         keys, kappa_sums, counts = voxels.keys, voxels.sums(active.kappa), voxels.counts.astype(np.uint32)
         states = np.stack([kappa_sums, counts.astype(np.uint64), voxels.sums(_fingerprints(active))], axis=1)
         heard = self._outgrow_released(keys, kappa_sums)
@@ -50,7 +50,7 @@ class SentVoxelTracker:
 
     def beyond_released(self, words: VoxelBatch) -> VoxelBatch:
         """These words without those that would replace a released one that was trained more."""
-        return take_voxels(words, self._outgrow_released(words.keys, words.kappa_sums))
+        return select_voxels(words, self._outgrow_released(words.keys, words.kappa_sums))
 
     def forget(self) -> None:
         """Treat every voxel as new at the next call (the receiver lost what it had)."""
@@ -63,11 +63,11 @@ class SentVoxelTracker:
 
     def restore(self, state: State) -> None:
         """Take over what another ledger said. Raises MapFileError, ShapeError."""
-        keys = take(state, "keys", (None,), np.int64)
+        keys = get_array(state, "keys", (None,), np.int64)
         if (keys[1:] <= keys[:-1]).any():
             raise MapFileError("state keys: expected strictly ascending voxel keys, got others")
-        self._states = take(state, "states", (len(keys), 3), np.uint64).copy()
-        self._released = take(state, "released", (len(keys),), np.bool_).copy()
+        self._states = get_array(state, "states", (len(keys), 3), np.uint64).copy()
+        self._released = get_array(state, "released", (len(keys),), np.bool_).copy()
         self._keys = keys.copy()
 
     def _outgrow_released(self, keys: Int64[ndarray, " v"], kappa_sums: UInt64[ndarray, " v"]) -> Bool[ndarray, " v"]:

@@ -50,8 +50,8 @@ class ActivePhase(StrEnum):
 class SeedingSettings:
     """Where new Gaussians go and how they start (Sec. III-C). Seed counts are for 640x480 and scale with the pixels.
 
-    roi_scale and background_scale are the paper's multipliers m of s0; plain_scale is m without SIS.
-    scaffold_share: what the region's seeds leave of the cap to the background, however large the region is.
+    roi_scale and background_scale are the paper's multipliers m of s0; init_scale is m without SIS.
+    background_share: what the region's seeds leave of the cap to the background, however large the region is.
     """
 
     first_frame_seeds: int = 60_000
@@ -62,19 +62,19 @@ class SeedingSettings:
     roi_pixels_per_active: float = 4.0
     reserved_views: float = 4.0
     sparsest: float = 0.1
-    scaffold_share: float = 0.3
+    background_share: float = 0.3
     depth_error_factor: float = 40.0
     max_depth_m: float = 10.0
     opacity: float = 0.5
     roi_scale: float = 0.5
     background_scale: float = 0.7
-    plain_scale: float = 1.0
+    init_scale: float = 1.0
     edge_floor: float = 0.01
 
     def __post_init__(self) -> None:
         for name in ("first_frame_seeds", "later_seeds"):
             _require(getattr(self, name) >= 1, f"seeding {name}", "at least 1", getattr(self, name))
-        for name in ("roi_share", "min_alpha", "roi_min_alpha", "sparsest", "scaffold_share"):
+        for name in ("roi_share", "min_alpha", "roi_min_alpha", "sparsest", "background_share"):
             _require(0 <= getattr(self, name) <= 1, f"seeding {name}", "0 to 1", getattr(self, name))
         _require(0 < self.opacity < 1, "seeding opacity", "more than 0 and less than 1", self.opacity)
         for name in (
@@ -84,7 +84,7 @@ class SeedingSettings:
             "max_depth_m",
             "roi_scale",
             "background_scale",
-            "plain_scale",
+            "init_scale",
             "edge_floor",
         ):
             _require(getattr(self, name) > 0, f"seeding {name}", "more than 0", getattr(self, name))
@@ -97,9 +97,9 @@ class KeyframeSettings:
     region_views: of all frames that show the task's region (of all frames, where no component follows a task) so many
     more stay ready to train on, spread over the mission; 0 is the paper's window. Each takes as much memory as a frame
     of the window.
-    surroundings_weight, 0 to 1: what pixels beside the region count in the active phase's loss, in the tiles that it
+    roi_context_weight, 0 to 1: what pixels beside the region count in the active phase's loss, in the tiles that it
     draws anyway; 0 is the paper's binary mask, which lets what stands beside the region move as it likes.
-    refits: where views may be wrong (`MapperSettings.view_prior`) so many of those ready to train on are fitted to the
+    pose_updates_per_frame: where views may be wrong (`MapperSettings.pose_prior`) so many of those ready to train on are fitted to the
     map again with each frame, in turns.
     max_pixels: of larger images than 1280x720 or so fewer are kept, so that all of them have no more pixels than this;
     a pixel takes about 13 bytes, 20 where its view may be wrong.
@@ -110,17 +110,17 @@ class KeyframeSettings:
     buffer: int = 96
     region_views: int = 24
     roi_margin_px: int = 5
-    surroundings_weight: float = 0.3
-    refits: int = 2
+    roi_context_weight: float = 0.3
+    pose_updates_per_frame: int = 2
     max_pixels: int = 160_000_000
 
     def __post_init__(self) -> None:
         for name in ("every", "window", "buffer", "max_pixels"):
             _require(getattr(self, name) >= 1, f"keyframes {name}", "at least 1", getattr(self, name))
-        for name in ("region_views", "roi_margin_px", "refits"):
+        for name in ("region_views", "roi_margin_px", "pose_updates_per_frame"):
             _require(getattr(self, name) >= 0, f"keyframes {name}", "at least 0", getattr(self, name))
-        weight = self.surroundings_weight
-        _require(0 <= weight <= 1, "keyframes surroundings_weight", "0 to 1", weight)
+        weight = self.roi_context_weight
+        _require(0 <= weight <= 1, "keyframes roi_context_weight", "0 to 1", weight)
 
     def for_images_of(self, pixels: int) -> KeyframeSettings:
         """The same with as many images of this size as have room: one of each kind, however large they are."""
@@ -133,7 +133,7 @@ class KeyframeSettings:
         )
 
 
-_ALIKE_IN_BOTH_PHASES = LossWeights(by_share=True)
+_ALIKE_IN_BOTH_PHASES = LossWeights(normalise_by_image=True)
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,10 +142,10 @@ class OptimizationSettings:
 
     loss: by share, so that warm-ups and the active phase, whose masks are small, do not undo each other in Adam.
     isotropic: Gaussians are made spheres again after every frame.
-    settling_updates: where views may be wrong (`MapperSettings.view_prior`) a Gaussian has the full rates for so many
-    updates, and falling ones after them (`AdamSettings.full_rate_updates`): steps of one size would keep it moving to
+    lr_decay_after_updates: where views may be wrong (`MapperSettings.pose_prior`) a Gaussian has the full rates for so many
+    updates, and falling ones after them (`AdamSettings.decay_after_updates`): steps of one size would keep it moving to
     and fro between what its views say. inf never slows it.
-    averaged_updates: the map is shown as the mean of each Gaussian over about its last so many updates, since views
+    ema_updates: the map is shown as the mean of each Gaussian over about its last so many updates, since views
     that contradict each other move it to and fro; 0 shows it as training left it. Training itself knows no means.
     """
 
@@ -154,16 +154,16 @@ class OptimizationSettings:
     active_phase: ActivePhase = ActivePhase.EXACT
     loss: LossWeights = _ALIKE_IN_BOTH_PHASES
     adam: AdamSettings = ONLINE_RATES
-    settling_updates: float = 150.0
+    lr_decay_after_updates: float = 150.0
     isotropic: bool = False
-    averaged_updates: float = 32.0
+    ema_updates: float = 32.0
 
     def __post_init__(self) -> None:
         for name in ("warmup_iterations", "active_iterations"):
             _require(getattr(self, name) >= 0, f"optimization {name}", "at least 0", getattr(self, name))
-        averaged = self.averaged_updates
-        _require(0 <= averaged < math.inf, "optimization averaged_updates", "at least 0", averaged)
-        _require(self.settling_updates > 0, "optimization settling_updates", "more than 0", self.settling_updates)
+        averaged = self.ema_updates
+        _require(0 <= averaged < math.inf, "optimization ema_updates", "at least 0", averaged)
+        _require(self.lr_decay_after_updates > 0, "optimization lr_decay_after_updates", "more than 0", self.lr_decay_after_updates)
 
     @property
     def iterations(self) -> int:
@@ -183,7 +183,7 @@ class OptimizationSettings:
 class MapperSettings:
     """A whole mapping policy. max_gaussians is a hard cap: memory for exactly that many is reserved at the start.
 
-    view_prior: how wrong poses and colours of frames may be; keyframes are refined where it is not 0.
+    pose_prior: how wrong poses and colours of frames may be; keyframes are refined where it is not 0.
     """
 
     max_gaussians: int = 1_000_000
@@ -192,8 +192,8 @@ class MapperSettings:
     keyframes: KeyframeSettings = field(default_factory=KeyframeSettings)
     optimization: OptimizationSettings = field(default_factory=OptimizationSettings)
     density: DensitySettings = field(default_factory=DensitySettings)
-    retask: TaskChangeSettings = field(default_factory=TaskChangeSettings)
-    view_prior: PoseExposurePrior = field(default_factory=PoseExposurePrior)
+    task_change: TaskChangeSettings = field(default_factory=TaskChangeSettings)
+    pose_prior: PoseExposurePrior = field(default_factory=PoseExposurePrior)
 
     def __post_init__(self) -> None:
         _require(self.max_gaussians >= 1, "max_gaussians", "at least 1", self.max_gaussians)
@@ -201,9 +201,9 @@ class MapperSettings:
     @property
     def adam(self) -> AdamSettings:
         """The optimiser's rates, for views that are trusted or not."""
-        if self.view_prior.is_exact:
+        if self.pose_prior.is_exact:
             return self.optimization.adam
-        return replace(self.optimization.adam, full_rate_updates=self.optimization.settling_updates)
+        return replace(self.optimization.adam, decay_after_updates=self.optimization.lr_decay_after_updates)
 
 
 def _require(holds: bool, name: str, wanted: str, came: float) -> None:

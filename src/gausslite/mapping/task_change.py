@@ -16,20 +16,19 @@ from gausslite.domain.relevance import NO_TARGET, RelevanceMap
 from gausslite.errors import InvalidInputError
 from gausslite.mapping.coverage import seen_at
 from gausslite.optimize.parameters import SplatTable
-from gausslite.render.rasterizer import MEAN
 
 _MOST_VOTES = 100
 
 
 @dataclass(frozen=True, slots=True)
 class TaskChangeSettings:
-    """How fast a new task's region is read out of earlier views: keyframes_a_frame at most while a frame is mapped."""
+    """How fast a new task's region is read out of earlier views: keyframes_per_frame at most while a frame is mapped."""
 
-    keyframes_a_frame: int = 3
+    keyframes_per_frame: int = 3
 
     def __post_init__(self) -> None:
-        if self.keyframes_a_frame < 1:
-            raise InvalidInputError(f"retask keyframes_a_frame: expected at least 1, got {self.keyframes_a_frame}")
+        if self.keyframes_per_frame < 1:
+            raise InvalidInputError(f"retask keyframes_per_frame: expected at least 1, got {self.keyframes_per_frame}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,15 +43,15 @@ def clear_roi(table: SplatTable) -> None:
     """Nothing is known to be in a region any more; what was is background from now on, and gives way first."""
     table.active[:] = False
     table.target[:] = NO_TARGET
-    table.votes[:] = 0
+    table.roi_evidence[:] = 0
 
 
 def vote_on_relevance(table: SplatTable, frame: Frame, relevance: RelevanceMap) -> None:
     """Let one view vote on every Gaussian it sees, and mark those active that more views have inside than outside."""
-    seen, rows, columns = seen_at(frame, table.rows[:, MEAN])
+    seen, rows, columns = seen_at(frame, table.means_m)
     inside = relevance.roi[rows, columns]
-    votes = np.clip(table.votes[seen] + np.where(inside, 1, -1), -_MOST_VOTES, _MOST_VOTES)
-    table.votes[seen] = votes
+    votes = np.clip(table.roi_evidence[seen] + np.where(inside, 1, -1), -_MOST_VOTES, _MOST_VOTES)
+    table.roi_evidence[seen] = votes
     table.active[seen] = votes > 0
     named = np.where(inside, relevance.target[rows, columns], table.target[seen])
     table.target[seen] = np.where(votes > 0, named, NO_TARGET)

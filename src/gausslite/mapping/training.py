@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, UInt32
 from numpy import ndarray
 
-from gausslite.domain.state import State, take_counts, whole_numbers
+from gausslite.domain.state import State, get_counts, int_array
 from gausslite.mapping.keyframes import WindowView
 from gausslite.mapping.settings import ActivePhase, MapperSettings
 from gausslite.mapping.stages import CountedScheduler, Stage, StageScheduler
@@ -91,7 +91,7 @@ class Trainer:
             self._average()
         return done
 
-    def rehearse(self, views: Sequence[WindowView], extent_m: float) -> None:
+    def idle_step(self, views: Sequence[WindowView], extent_m: float) -> None:
         """One iteration on views of earlier frames, for time in which none waits; the phases take turns as ever."""
         showing, scheduler = self._showing_region(views), CountedScheduler()
         step = self._next_step(self._iterations, bool(showing), scheduler)
@@ -177,8 +177,8 @@ class Trainer:
         self._table.clip_colours(*_COLOUR_RANGE)
 
     def _average(self) -> None:
-        if self._settings.optimization.averaged_updates > 0:
-            self._table.update_ema(self._settings.optimization.averaged_updates)
+        if self._settings.optimization.ema_updates > 0:
+            self._table.update_ema(self._settings.optimization.ema_updates)
 
     def _prune_is_due(self, scheduler: StageScheduler) -> bool:
         return _due(self._since_pruned, self._settings.density.prune_every, Stage.PRUNING, scheduler)

@@ -9,11 +9,11 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from gausslite.calibration.view_fit import PoseExposurePrior, fit_colour, fit_pose
+from gausslite.calibration.view_fit import PoseExposurePrior, fit_exposure, fit_pose
 from gausslite.domain.camera import Camera
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import inverse, require_rigid
-from gausslite.domain.state import State, take, take_counts, whole_numbers
+from gausslite.domain.state import State, get_array, get_counts, int_array
 from gausslite.mapping.keyframes import Keyframe, WindowView
 from gausslite.render.rasterizer import Rendering
 
@@ -24,9 +24,9 @@ Draw = Callable[[Camera, Float64[ndarray, "4 4"]], Rendering]
 class ViewRefiner:
     """Knows how far the last frame's pose was corrected, and whose turn it is among the keyframes."""
 
-    def __init__(self, prior: PoseExposurePrior, draw: Draw, refits: int) -> None:
+    def __init__(self, prior: PoseExposurePrior, draw: Draw, pose_updates_per_frame: int) -> None:
         self._prior = prior
-        self._refits = refits
+        self._refits = pose_updates_per_frame
         self._draw = draw
         self._T_said_refined = np.eye(4)
         self._turn = 0
@@ -38,18 +38,18 @@ class ViewRefiner:
 
     def state(self) -> State:
         """How far the last pose was corrected, and whose turn it was."""
-        return {"T_said_refined": self._T_said_refined, "turn": whole_numbers(self._turn)}
+        return {"T_said_refined": self._T_said_refined, "turn": int_array(self._turn)}
 
     def restore(self, state: State) -> None:
         """Go on where another refiner stood. Raises MapFileError, PoseError."""
-        T_said_refined = take(state, "T_said_refined", (4, 4), np.float64)
+        T_said_refined = get_array(state, "T_said_refined", (4, 4), np.float64)
         require_rigid("state T_said_refined", T_said_refined)
         self._T_said_refined = T_said_refined.copy()
-        [self._turn] = take_counts(state, "turn", 1)
+        [self._turn] = get_counts(state, "turn", 1)
 
     def settle(self, recorded: Frame) -> Frame:
         """A new frame with the pose and colours to map it with; an odometry's error is much like a frame ago."""
-        start = recorded.T_world_camera @ self._T_said_refined if self._prior.moves else recorded.T_world_camera
+        start = recorded.T_world_camera @ self._T_said_refined if self._prior.has_pose_error else recorded.T_world_camera
         frame = self._fit(recorded, start)
         self._T_said_refined = inverse(recorded.T_world_camera) @ frame.T_world_camera
         return frame
@@ -71,5 +71,5 @@ class ViewRefiner:
     def _fit(self, recorded: Frame, T_world_drawn: Float64[ndarray, "4 4"]) -> Frame:
         drawn = self._draw(recorded.camera, T_world_drawn)
         T_world_camera = fit_pose(drawn, inverse(T_world_drawn), recorded, self._prior)
-        colour = fit_colour(drawn, recorded, self._prior)
-        return replace(recorded, rgb=colour.of_map(recorded.rgb), T_world_camera=T_world_camera)
+        colour = fit_exposure(drawn, recorded, self._prior)
+        return replace(recorded, rgb=colour.to_map(recorded.rgb), T_world_camera=T_world_camera)

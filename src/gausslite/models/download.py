@@ -38,7 +38,7 @@ Progress = Callable[[int, int | None], None]
 
 
 @dataclass(frozen=True, slots=True)
-class Wanted:
+class DownloadRequest:
     """A file to bring: where from, where to, the most bytes it may have and, if known, its SHA-256."""
 
     url: str
@@ -47,10 +47,10 @@ class Wanted:
     sha256: str | None = None
 
     def __post_init__(self) -> None:
-        require_safe(self.url)
+        require_https(self.url)
 
 
-def require_safe(url: str) -> None:
+def require_https(url: str) -> None:
     """Raises InvalidInputError for anything but HTTPS; plain HTTP may come from this machine itself."""
     try:
         parts = urllib.parse.urlsplit(url)
@@ -61,7 +61,7 @@ def require_safe(url: str) -> None:
         raise InvalidInputError(f"URL {url!r}: expected an https:// address (http:// only for this machine itself)")
 
 
-def download(wanted: Wanted, progress: Progress) -> None:
+def download(wanted: DownloadRequest, progress: Progress) -> None:
     """Bring the file. What was cut off stays beside it as `.NAME.part` and is gone on with, if it is the same file.
 
     Raises UnavailableError when the server fails, QuotaError when the file is too large, ChecksumError when it is
@@ -82,7 +82,7 @@ def download(wanted: Wanted, progress: Progress) -> None:
         raise StorageError(f"{wanted.path}: cannot be written: {error.strerror or error}") from error
 
 
-def _fill(wanted: Wanted, file: BinaryIO, part: Path, progress: Progress) -> None:
+def _fill(wanted: DownloadRequest, file: BinaryIO, part: Path, progress: Progress) -> None:
     """Add to the part what is missing of it."""
     have = part.stat().st_size
     tag = _tag_of(part)
@@ -116,7 +116,7 @@ def _answer(url: str, have: int, tag: str | None) -> Iterator[Any]:
         headers |= {"Range": f"bytes={have}-", "If-Range": tag}
     opener = urllib.request.build_opener(_SafeRedirects())
     try:
-        # require_safe saw the scheme, and _SafeRedirects sees every further one
+        # require_https saw the scheme, and _SafeRedirects sees every further one
         answer = opener.open(urllib.request.Request(url, headers=headers), timeout=_TIMEOUT_S)  # noqa: S310
     except urllib.error.HTTPError as error:
         error.close()
@@ -131,7 +131,7 @@ class _SafeRedirects(urllib.request.HTTPRedirectHandler):
     """Follows a server to another address only where that is as safe as the first had to be."""
 
     def redirect_request(self, req: Any, fp: Any, code: int, msg: str, headers: Any, newurl: str) -> Any:
-        require_safe(newurl)
+        require_https(newurl)
         return super().redirect_request(req, fp, code, msg, headers, newurl)
 
 
@@ -148,7 +148,7 @@ def _length(answer: Any, have: int) -> int | None:
     return have + int(text) if text is not None and text.isascii() and text.isdigit() else None
 
 
-def _require_room(wanted: Wanted, total: int | None, have: int) -> None:
+def _require_room(wanted: DownloadRequest, total: int | None, have: int) -> None:
     if total is None:
         return
     if total > wanted.max_bytes:
@@ -158,11 +158,11 @@ def _require_room(wanted: Wanted, total: int | None, have: int) -> None:
         raise StorageError(f"{wanted.path}: expected {total - have >> 20} MiB of free disk, got {free >> 20}")
 
 
-def _too_large(wanted: Wanted, size: int) -> QuotaError:
+def _too_large(wanted: DownloadRequest, size: int) -> QuotaError:
     return QuotaError(f"{wanted.url}: expected at most {wanted.max_bytes} bytes, got {size} or more")
 
 
-def _require_expected(wanted: Wanted, part: Path) -> None:
+def _require_expected(wanted: DownloadRequest, part: Path) -> None:
     """Keep nothing that is not what was asked for: going on with wrong bytes would never end well."""
     try:
         found = sha256_of(part) if wanted.sha256 is not None else None

@@ -6,8 +6,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from gausslite.errors import ModelFileError
-from gausslite.perception.model_file import CHECKSUMS, listed_checksum, open_model, require_listed_checksum, sha256_of
-from gausslite.perception.model_registry import Family, family_of
+from gausslite.perception.model_file import (
+    CHECKSUM_FILE,
+    listed_checksum,
+    open_model,
+    require_listed_checksum,
+    sha256_of,
+)
+from gausslite.perception.model_registry import ModelFamily, identify_family
 
 
 @dataclass(frozen=True, slots=True)
@@ -17,7 +23,7 @@ class ModelSheet:
     path: Path
     size_bytes: int
     sha256: str
-    family: Family
+    family: ModelFamily
     provider: str
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
@@ -31,7 +37,7 @@ def inspect(path: Path) -> ModelSheet:
         tuple(f"{each.name} {each.shape} {each.type.removeprefix('tensor').strip('()')}" for each in side)
         for side in (session.get_inputs(), session.get_outputs())
     ]
-    family = family_of(model)
+    family = identify_family(model)
     provider = str(session.get_providers()[0]).removesuffix("ExecutionProvider")
     return ModelSheet(path, path.stat().st_size, sha256_of(path), family, provider, *described)
 
@@ -48,7 +54,7 @@ def verify(path: Path, sha256: str | None) -> str:
         checked.append("SHA-256")
     require_listed_checksum(path)
     if listed_checksum(path) is not None:
-        checked.append(f"the checksum in {CHECKSUMS}")
+        checked.append(f"the checksum in {CHECKSUM_FILE}")
     if path.suffix == ".onnx":
         checked.append(f"a whole {inspect(path).family} network")
     return " and ".join(checked) or f"{path.stat().st_size} bytes; no SHA-256 is known for it"

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from gausslite.calibration.pose_exposure_error import measure_view_error
+from gausslite.calibration.pose_exposure_error import estimate_pose_exposure_prior
 from gausslite.datasets.images import RgbdImage, resize_rgbd
 from gausslite.datasets.open import open_source
 from gausslite.datasets.source import Source
@@ -26,7 +26,7 @@ class Recording:
     def __init__(self, home: Source, translation_m: float, rotation_deg: float, gain: float = 0.0) -> None:
         self._frames = [home.frame(i) for i in range(FRAMES)]
         self.name, self.camera, self.up_axis = "recording", home.camera, home.up_axis
-        self.depth_registered, self.left_out = True, ""
+        self.depth_registered, self.excluded_frames = True, ""
         self.damaged: set[int] = set()
         rng = np.random.default_rng(0)
         self._T_true_said = [np.eye(4) for _ in range(FRAMES)]
@@ -61,7 +61,7 @@ def home() -> Source:
 
 
 def test_exact_poses_are_trusted(home: Source) -> None:
-    found, why = measure_view_error(Recording(home, 0.0, 0.0))
+    found, why = estimate_pose_exposure_prior(Recording(home, 0.0, 0.0))
     assert found.is_exact
     assert why.startswith("24 pairs of its frames agree to ")
 
@@ -70,21 +70,21 @@ def test_exact_poses_are_trusted(home: Source) -> None:
 def test_wrong_poses_are_found_to_be_about_as_wrong_as_they_are(
     home: Source, translation_m: float, rotation_deg: float
 ) -> None:
-    found, _ = measure_view_error(Recording(home, translation_m, rotation_deg))
+    found, _ = estimate_pose_exposure_prior(Recording(home, translation_m, rotation_deg))
     assert translation_m / 2 < found.translation_m < translation_m * 1.5
     assert rotation_deg / 2 < found.rotation_deg < rotation_deg * 1.5
 
 
 def test_an_exposure_that_changes_is_found_beside_wrong_poses(home: Source) -> None:
-    fixed, changing = (measure_view_error(Recording(home, 0.01, 0.5, gain))[0] for gain in (0.0, 0.2))
+    fixed, changing = (estimate_pose_exposure_prior(Recording(home, 0.01, 0.5, gain))[0] for gain in (0.0, 0.2))
     assert 1.5 * fixed.gain < changing.gain < 0.3
 
 
 def test_frames_that_cannot_be_read_are_passed_over_and_too_few_tell_nothing(home: Source) -> None:
     recording = Recording(home, 0.01, 0.5)
     recording.damaged = set(range(0, FRAMES, 4))
-    assert measure_view_error(recording)[0].moves
+    assert estimate_pose_exposure_prior(recording)[0].has_pose_error
     recording.damaged = set(range(2, FRAMES))
-    found, why = measure_view_error(recording)
+    found, why = estimate_pose_exposure_prior(recording)
     assert found.is_exact
     assert why.endswith("can be compared, too few to tell")

@@ -75,7 +75,7 @@ class EnlargedSource:
         k = small.camera
         self.camera = k.resized(4 * k.width_px, 4 * k.height_px)
         self.name, self.up_axis, self.depth_registered = "enlarged", small.up_axis, False
-        self.left_out = ""
+        self.excluded_frames = ""
 
     def __len__(self) -> int:
         return len(self._small)
@@ -116,7 +116,7 @@ class ApartSource:
         self._T_colour_depth = truth.depth_to_colour()
         self.name, self.camera, self.up_axis = "apart", DEPTH_CAMERA, self._home.up_axis
         self.depth_registered = False
-        self.left_out = ""
+        self.excluded_frames = ""
         self.damaged: int | None = None
 
     def __len__(self) -> int:

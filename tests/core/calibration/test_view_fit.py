@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from mapping_scenes import middle_relevance, wall_frame
 
-from gausslite.calibration.view_fit import AffineExposure, PoseExposurePrior, fit_colour, fit_pose
+from gausslite.calibration.view_fit import AffineExposure, PoseExposurePrior, fit_exposure, fit_pose
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import inverse, rotation_angle_deg, translation_m
 from gausslite.errors import InvalidInputError
-from gausslite.evaluation.fitted import draw_fitted
+from gausslite.evaluation.fitted import render_fitted
 from gausslite.evaluation.metrics import psnr
 from gausslite.evaluation.views import MapViewer
 from gausslite.mapping.keyframes import Keyframe, window_view
@@ -67,19 +67,19 @@ def test_the_tighter_the_prior_the_nearer_the_pose_stays_to_what_was_said() -> N
 def test_known_colours_are_found_again_and_undone() -> None:
     frame = wall_frame(size=SIZE)
     colour = AffineExposure(np.array([0.8, 0.9, 0.7]), np.array([0.05, 0.0, 0.1]))
-    photograph = np.rint(colour.of_photograph(picture_of(frame).rgb) * 255).astype(np.uint8)
-    found = fit_colour(picture_of(frame), replace(frame, rgb=photograph), LOOSE)
+    photograph = np.rint(colour.to_photograph(picture_of(frame).rgb) * 255).astype(np.uint8)
+    found = fit_exposure(picture_of(frame), replace(frame, rgb=photograph), LOOSE)
     np.testing.assert_allclose(found.gain, colour.gain, atol=0.01)
     np.testing.assert_allclose(found.offset, colour.offset, atol=0.01)
-    assert np.abs(found.of_map(photograph).astype(int) - frame.rgb).max() <= 4
+    assert np.abs(found.to_map(photograph).astype(int) - frame.rgb).max() <= 4
 
 
-def mapped(prior: PoseExposurePrior, tell: float = 0.0, settling_updates: float = 150.0) -> GaussianMapper:
+def mapped(prior: PoseExposurePrior, tell: float = 0.0, lr_decay_after_updates: float = 150.0) -> GaussianMapper:
     settings = MapperSettings(
         max_gaussians=2000,
         keyframes=KeyframeSettings(every=1),
-        optimization=OptimizationSettings(settling_updates=settling_updates),
-        view_prior=prior,
+        optimization=OptimizationSettings(lr_decay_after_updates=lr_decay_after_updates),
+        pose_prior=prior,
     )
     mapper = GaussianMapper(settings, CpuRasterizer(threads=1), seed=0)
     for index in range(4):
@@ -103,7 +103,7 @@ def test_a_prior_that_is_all_but_sure_makes_all_but_the_same_map() -> None:
 
 @pytest.mark.parametrize(("prior", "slows"), [(PoseExposurePrior(), False), (PoseExposurePrior(0.01, 0.5), True)])
 def test_gaussians_settle_where_views_may_be_wrong(prior: PoseExposurePrior, slows: bool) -> None:
-    settling, restless = (mapped(prior, settling_updates=updates) for updates in (1.0, math.inf))
+    settling, restless = (mapped(prior, lr_decay_after_updates=updates) for updates in (1.0, math.inf))
     before = [mapper.gaussians().rgb for mapper in (settling, restless)]
     frame = wall_frame(4, SIZE, shift_m=0.2)
     for mapper in (settling, restless):
@@ -128,24 +128,24 @@ def test_keyframes_told_in_contradiction_come_to_agree() -> None:
     assert np.std(after) < 0.5 * np.std(before)
 
 
-@pytest.mark.parametrize("refits", [0, 1, 2, 9])
-def test_keyframes_that_may_change_are_fitted_again_equally_often(refits: int) -> None:
+@pytest.mark.parametrize("pose_updates_per_frame", [0, 1, 2, 9])
+def test_keyframes_that_may_change_are_fitted_again_equally_often(pose_updates_per_frame: int) -> None:
     rasterizer, settings = CpuRasterizer(threads=1), KeyframeSettings()
     frames = [wall_frame(index, SIZE) for index in range(5)]
     keyframes = [Keyframe(frame, middle_relevance(frame), recorded=frame if frame.index else None) for frame in frames]
     window = [window_view(keyframe, rasterizer, settings) for keyframe in keyframes]
-    refiner = ViewRefiner(LOOSE, lambda camera, T_world_camera: picture_of(frames[0]), refits)
+    refiner = ViewRefiner(LOOSE, lambda camera, T_world_camera: picture_of(frames[0]), pose_updates_per_frame)
     turns = [refiner.next_turns(window) for _ in range(4)]
-    assert [len(turn) for turn in turns] == [min(refits, 4)] * 4
+    assert [len(turn) for turn in turns] == [min(pose_updates_per_frame, 4)] * 4
     fitted = Counter(view.keyframe.frame.index for turn in turns for view in turn)
-    assert fitted == Counter({frame.index: min(refits, 4) for frame in frames[1:]})
+    assert fitted == Counter({frame.index: min(pose_updates_per_frame, 4) for frame in frames[1:]})
 
 
 @pytest.mark.parametrize("shift_m", [0.0, 0.02, 0.5])
 def test_fitting_a_view_never_lowers_its_whole_score(shift_m: float) -> None:
     viewer = MapViewer(mapped(PoseExposurePrior()).gaussians(), CpuRasterizer(threads=1))
     frame = displaced(wall_frame(9, SIZE, shift_m=0.03), shift_m, 0.0)
-    raw, fitted = viewer.draw_frame(frame), draw_fitted(viewer, frame)
+    raw, fitted = viewer.render_frame(frame), render_fitted(viewer, frame)
     assert psnr(fitted.rgb, frame.rgb) >= psnr(raw.rgb, frame.rgb)
 
 

@@ -76,7 +76,7 @@ def test_a_frame_without_the_region_is_kept_at_its_turn_only() -> None:
     settings, rasterizer = KeyframeSettings(every=4, region_views=6), CpuRasterizer(threads=1)
     store = KeyframeStore(settings)
     for index in range(9):
-        store.offer(window_view(Keyframe(wall_frame(index), RelevanceMap.nothing(48, 64)), rasterizer, settings))
+        store.offer(window_view(Keyframe(wall_frame(index), RelevanceMap.empty(48, 64)), rasterizer, settings))
     assert [view.keyframe.frame.index for view in store.window] == [0, 4, 8]
 
 
@@ -84,10 +84,10 @@ def test_a_policy_that_follows_no_task_keeps_as_many_views_of_anything() -> None
     settings, rasterizer = KeyframeSettings(every=8, window=2, region_views=6), CpuRasterizer(threads=1)
     store = KeyframeStore(settings, follows_task=False)
     for index in range(40):
-        store.offer(window_view(Keyframe(wall_frame(index), RelevanceMap.nothing(48, 64)), rasterizer, settings))
+        store.offer(window_view(Keyframe(wall_frame(index), RelevanceMap.empty(48, 64)), rasterizer, settings))
     kept = [view.keyframe.frame.index for view in store.window]
     assert kept == [view.keyframe.frame.index for view in stored(settings, 40).window]
-    store.revise(store.window[0])
+    store.replace_view(store.window[0])
     assert [view.keyframe.frame.index for view in store.window] == kept
     assert not uniform_policy().components.follow_task
     assert Components(sb=False, roi=False, sis=False).follow_task
@@ -98,7 +98,7 @@ def test_a_view_of_the_region_goes_once_it_turns_out_not_to_show_it() -> None:
     store = stored(settings, 3)
     wrong = store.window[0].keyframe
     assert wrong.frame.index == 1
-    store.revise(window_view(Keyframe(wrong.frame, RelevanceMap.nothing(48, 64)), rasterizer, settings))
+    store.replace_view(window_view(Keyframe(wrong.frame, RelevanceMap.empty(48, 64)), rasterizer, settings))
     assert [view.keyframe.frame.index for view in store.window] == [2, 0]
 
 
@@ -114,4 +114,4 @@ def test_tiles_touch_the_region_and_its_margin() -> None:
 def test_a_view_knows_whether_it_shows_the_region() -> None:
     frame, rasterizer = wall_frame(), CpuRasterizer(threads=1)
     assert window_view(Keyframe(frame, middle_relevance(frame)), rasterizer, KeyframeSettings()).shows_region
-    assert not window_view(Keyframe(frame, RelevanceMap.nothing(48, 64)), rasterizer, KeyframeSettings()).shows_region
+    assert not window_view(Keyframe(frame, RelevanceMap.empty(48, 64)), rasterizer, KeyframeSettings()).shows_region

@@ -10,7 +10,7 @@ import pytest
 from mapping_scenes import middle_relevance, wall_frame
 
 from gausslite.domain.relevance import RelevanceMap
-from gausslite.domain.state import part
+from gausslite.domain.state import select_prefix
 from gausslite.errors import InvalidInputError, ShapeError
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.policies import policy
@@ -193,7 +193,7 @@ def test_expected_depth_is_that_of_the_wall() -> None:
     mapper = mapper_of(replace(SMALL, max_gaussians=1500, components=Components(sis=False)))
     map_wall(mapper, 3)
     frame = wall_frame(0, SIZE)
-    sight = mapper.look(frame)
+    sight = mapper.render_view(frame)
     assert sight is not None
     depth_m = sight.depth_m
     assert (depth_m > 0).mean() > 0.5

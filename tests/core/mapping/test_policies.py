@@ -10,12 +10,12 @@ from gausslite.errors import InvalidInputError
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.policies import (
     ABLATION_FLAGS,
-    BEYOND_SWITCHES,
-    PAPER_ABLATION_FLAGS,
+    EXTENSION_FLAGS,
+    PAPER_FLAGS,
     POLICIES,
     TASK,
     policy,
-    without,
+    disable,
 )
 from gausslite.mapping.settings import Components, KeyframeSettings, MapperSettings
 from gausslite.mission.settings import MissionSettings
@@ -54,8 +54,8 @@ def test_splatam_keeps_its_gaussians_spheres() -> None:
 
 def test_surroundings_change_the_map_and_count_a_little_by_default() -> None:
     plain = mapped(MapperSettings(2000)).gaussians()
-    none = mapped(MapperSettings(2000, keyframes=KeyframeSettings(surroundings_weight=0.0))).gaussians()
-    some = mapped(MapperSettings(2000, keyframes=KeyframeSettings(surroundings_weight=0.3))).gaussians()
+    none = mapped(MapperSettings(2000, keyframes=KeyframeSettings(roi_context_weight=0.0))).gaussians()
+    some = mapped(MapperSettings(2000, keyframes=KeyframeSettings(roi_context_weight=0.3))).gaussians()
     np.testing.assert_array_equal(plain.rgb, some.rgb)
     assert not np.array_equal(plain.rgb, none.rgb)
 
@@ -67,11 +67,11 @@ def test_an_unknown_policy_is_refused() -> None:
 
 @pytest.mark.parametrize("name", ABLATION_FLAGS)
 def test_a_switch_turns_its_own_part_off_and_no_other(name: str) -> None:
-    on, off = policy(TASK), without(policy(TASK), {name})
+    on, off = policy(TASK), disable(policy(TASK), {name})
     assert off != on
-    assert without(off, {name}) == off
-    changed = [part for part in PAPER_ABLATION_FLAGS if getattr(off.components, part) != getattr(on.components, part)]
-    assert changed == [part for part in PAPER_ABLATION_FLAGS if part == name]
+    assert disable(off, {name}) == off
+    changed = [part for part in PAPER_FLAGS if getattr(off.components, part) != getattr(on.components, part)]
+    assert changed == [part for part in PAPER_FLAGS if part == name]
 
 
 @pytest.mark.parametrize("name", ABLATION_FLAGS)
@@ -79,16 +79,16 @@ def test_a_switch_turns_its_own_part_off_and_no_other(name: str) -> None:
 def test_a_mission_maps_without_what_is_switched_off(name: str, iterations: int | None) -> None:
     mission = MissionSettings(without=frozenset({name}), iterations=iterations)
     settings = mission.mapper_settings()
-    assert without(settings, {name}) == settings
+    assert disable(settings, {name}) == settings
     assert settings.optimization.iterations == (iterations or policy(TASK).optimization.iterations)
 
 
 def test_with_everything_off_what_is_left_knows_no_task() -> None:
-    bare = without(policy(TASK), ABLATION_FLAGS)
+    bare = disable(policy(TASK), ABLATION_FLAGS)
     assert bare.components == Components(sb=False, mvo=False, roi=False, sis=False, gfd=False)
-    assert without(policy(TASK), BEYOND_SWITCHES).keyframes == KeyframeSettings(region_views=0, surroundings_weight=0.0)
+    assert disable(policy(TASK), EXTENSION_FLAGS).keyframes == KeyframeSettings(region_views=0, roi_context_weight=0.0)
 
 
 def test_an_unknown_switch_is_refused() -> None:
     with pytest.raises(InvalidInputError, match=r"without: expected names among sb, .*, got light, sound"):
-        without(policy(TASK), {"sound", "light", "sb"})
+        disable(policy(TASK), {"sound", "light", "sb"})

@@ -13,7 +13,7 @@ from gausslite.mapping.seeding import Seeder, SeedingContext
 from gausslite.mapping.settings import Components, SeedingSettings
 
 NO_MEANS = np.zeros((0, 3), np.float32)
-EMPTY = SeedingContext(room=1_000_000, sight=None, active_means_m=NO_MEANS)
+EMPTY = SeedingContext(free_slots=1_000_000, rendered=None, active_means_m=NO_MEANS)
 OFF = {"sb": False, "mvo": False, "roi": False, "sis": False, "gfd": False}
 
 
@@ -43,7 +43,7 @@ def test_without_budgeting_there_is_one_pool_and_flags_still_follow_the_pixels()
 
 def test_seeds_lie_on_the_surface_and_carry_its_colour() -> None:
     frame = wall_frame(shift_m=0.5)
-    rest = seeder().seed(frame, RelevanceMap.nothing(48, 64), EMPTY).rest
+    rest = seeder().seed(frame, RelevanceMap.empty(48, 64), EMPTY).rest
     np.testing.assert_allclose(rest.means_m[:, 2], 2.0, rtol=1e-6)
     columns = np.floor((rest.means_m[:, 0] - 0.5) / 2.0 * 64 + 32).astype(int)
     rows = np.floor(rest.means_m[:, 1] / 2.0 * 64 + 24).astype(int)
@@ -67,7 +67,7 @@ def test_gradient_focus_prefers_edges() -> None:
     frame = wall_frame(size=(128, 96))
     frame.rgb[:] = 100
     frame.rgb[:, 62:66] = 255
-    nothing = RelevanceMap.nothing(96, 128)
+    nothing = RelevanceMap.empty(96, 128)
     shares = []
     for gfd in (False, True):
         few = seeder(SeedingSettings(first_frame_seeds=10_000), gfd=gfd)
@@ -81,13 +81,13 @@ def test_later_frames_seed_only_what_the_map_does_not_explain() -> None:
     alpha = np.ones((48, 64))
     alpha[:, :10] = 0.3
     state = SeedingContext(1_000_000, RenderedView.of(rendering_of(alpha, frame.depth_m)), NO_MEANS)
-    rest = seeder().seed(frame, RelevanceMap.nothing(48, 64), state).rest
+    rest = seeder().seed(frame, RelevanceMap.empty(48, 64), state).rest
     assert 0 < len(rest) <= 10_000 * 64 * 48 / (640 * 480)
     assert (rest.means_m[:, 0] / 2.0 * 64 + 32 < 10).all()
 
 
 def test_as_room_gets_short_seeds_get_sparser_and_larger() -> None:
-    frame, nothing = wall_frame(), RelevanceMap.nothing(48, 64)
+    frame, nothing = wall_frame(), RelevanceMap.empty(48, 64)
     plenty = seeder(sis=True).seed(frame, nothing, EMPTY).rest
     short = seeder(sis=True).seed(frame, nothing, SeedingContext(1000, None, NO_MEANS)).rest
     full = seeder(sis=True).seed(frame, nothing, SeedingContext(0, None, NO_MEANS)).rest
@@ -99,7 +99,7 @@ def test_pixels_without_depth_or_beyond_reach_are_not_seeded() -> None:
     frame = wall_frame()
     frame.depth_m[:, :32] = 0.0
     frame.depth_m[:, 48:] = 11.0
-    rest = seeder(sis=True).seed(frame, RelevanceMap.nothing(48, 64), EMPTY).rest
+    rest = seeder(sis=True).seed(frame, RelevanceMap.empty(48, 64), EMPTY).rest
     np.testing.assert_allclose(rest.means_m[:, 2], 2.0, rtol=1e-6)
 
 

@@ -143,7 +143,7 @@ def test_applying_all_changes_in_order_rebuilds_the_whole() -> None:
 @pytest.mark.parametrize("count", [0, 400])
 def test_points_are_grouped_in_the_order_of_their_keys(reach_m: float, count: int) -> None:
     points_m = np.random.default_rng(0).uniform(-reach_m, reach_m, (count, 3)).astype(np.float32) + np.float32(7.0)
-    rows, starts = VoxelGrid().grouped(points_m)
+    rows, starts = VoxelGrid().sort_by_voxel(points_m)
     keys = VoxelGrid().keys(points_m)
     np.testing.assert_array_equal(rows, np.argsort(keys, kind="stable"))
     np.testing.assert_array_equal(keys[rows[starts]], np.unique(keys))

@@ -48,7 +48,7 @@ def loop_of(max_gaussians: int = 1500, every: int = 1, buffer: int = 8, window: 
         seeding=SeedingSettings(first_frame_seeds=60_000, later_seeds=20_000),
         keyframes=KeyframeSettings(every=every, window=window, buffer=buffer, region_views=2),
         density=DensitySettings(densify_every=7, prune_every=5),
-        retask=TaskChangeSettings(keyframes_a_frame=2),
+        task_change=TaskChangeSettings(keyframes_per_frame=2),
     )
     return TaskMapper(A, GaussianMapper(settings, CpuRasterizer(threads=1)), SentVoxelTracker(GRID))
 
@@ -158,7 +158,7 @@ def test_views_that_show_the_new_region_come_back_into_a_window_that_does_not() 
     for index in range(12, 18):
         trained.append(loop.process(wall_frame(index, SIZE, shift_m=-1.1)))
         assert len(mapper._keyframes.window) <= 3 + 2
-    assert mapper.next_to_judge is None
+    assert mapper.next_unevaluated is None
     assert sum(outcome.reread.seeded for outcome in trained) > 0
     assert any(view.shows_region for view in mapper._keyframes.window)
     for keyframe in mapper.keyframes():
@@ -251,5 +251,5 @@ def test_beside_mapping_a_look_back_is_ready_when_the_detector_is_and_takes_turn
 
 
 def test_at_least_one_keyframe_a_frame_is_asked_for() -> None:
-    with pytest.raises(InvalidInputError, match="keyframes_a_frame"):
-        TaskChangeSettings(keyframes_a_frame=0)
+    with pytest.raises(InvalidInputError, match="keyframes_per_frame"):
+        TaskChangeSettings(keyframes_per_frame=0)

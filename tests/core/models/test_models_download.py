@@ -13,11 +13,11 @@ from gausslite.errors import (
     QuotaError,
     UnavailableError,
 )
-from gausslite.models.download import Wanted, download, require_safe
+from gausslite.models.download import DownloadRequest, download, require_https
 
 
-def wanted(base: str, folder, sha256: str | None = DIGEST, max_bytes: int = 1 << 20) -> Wanted:
-    return Wanted(f"{base}/thing.bin", folder / "thing.bin", max_bytes, sha256)
+def wanted(base: str, folder, sha256: str | None = DIGEST, max_bytes: int = 1 << 20) -> DownloadRequest:
+    return DownloadRequest(f"{base}/thing.bin", folder / "thing.bin", max_bytes, sha256)
 
 
 def test_a_file_comes_whole_and_leaves_nothing_else(tmp_path):
@@ -83,9 +83,9 @@ def test_a_file_that_is_too_large_is_never_written_past_its_limit(tmp_path, says
 )
 def test_only_https_is_safe_but_for_this_machine(url):
     with pytest.raises(InvalidInputError, match="expected an https:// address"):
-        require_safe(url)
-    require_safe("https://example.org/a")
-    require_safe("http://localhost:8000/a")
+        require_https(url)
+    require_https("https://example.org/a")
+    require_https("http://localhost:8000/a")
 
 
 def test_a_redirect_to_an_unsafe_address_is_not_followed(tmp_path):
@@ -98,8 +98,8 @@ def test_a_redirect_to_an_unsafe_address_is_not_followed(tmp_path):
 def test_a_server_that_has_no_such_file_or_is_not_there_is_told_in_one_line(tmp_path):
     with serving(Shelf()) as base:
         with pytest.raises(UnavailableError, match="404"):
-            download(Wanted(f"{base}/other", tmp_path / "other", 10), nothing_shown)
+            download(DownloadRequest(f"{base}/other", tmp_path / "other", 10), nothing_shown)
         gone = base
     with pytest.raises(UnavailableError, match="cannot be reached") as caught:
-        download(Wanted(f"{gone}/thing.bin", tmp_path / "thing.bin", 10), nothing_shown)
+        download(DownloadRequest(f"{gone}/thing.bin", tmp_path / "thing.bin", 10), nothing_shown)
     assert "\n" not in str(caught.value)

@@ -33,8 +33,8 @@ def test_a_fetched_model_is_held_to_its_checksum_from_then_on(tmp_path):
         first, again = (fetch(entry(), base, folder, None, nothing_shown) for _ in range(2))
     assert len(shelf.asked) == 1
     assert listed_checksum(first.path) == first.sha256 == hashlib.sha256(shelf.data).hexdigest()
-    assert (first.vouched_by, again.vouched_by) == ("", "SHA256SUMS")
-    assert again == replace(first, vouched_by="SHA256SUMS")
+    assert (first.checksum_source, again.checksum_source) == ("", "SHA256SUMS")
+    assert again == replace(first, checksum_source="SHA256SUMS")
 
 
 def test_a_file_that_changed_since_it_was_fetched_is_not_written_down_as_right(tmp_path):
@@ -55,7 +55,7 @@ def test_a_file_that_changed_since_it_was_fetched_is_not_written_down_as_right(t
         # but for somebody who says so
         digest = hashlib.sha256(shelf.data).hexdigest()
         fetched = fetch(entry(sha256="0" * 64), base, folder, digest.upper(), nothing_shown)
-    assert (fetched.vouched_by, fetched.sha256, listed_checksum(path)) == ("--sha256", digest, digest)
+    assert (fetched.checksum_source, fetched.sha256, listed_checksum(path)) == ("--sha256", digest, digest)
 
 
 def test_the_catalogues_sum_is_enforced(tmp_path):
@@ -66,7 +66,7 @@ def test_the_catalogues_sum_is_enforced(tmp_path):
         with pytest.raises(ChecksumError, match="the file was not kept"):
             fetch(entry(sha256="0" * 64), base, folder, None, nothing_shown)
         assert not (folder / "tiny.onnx").exists()
-        assert fetch(entry(sha256=digest), base, folder, None, nothing_shown).vouched_by == "the catalogue"
+        assert fetch(entry(sha256=digest), base, folder, None, nothing_shown).checksum_source == "the catalogue"
 
 
 def test_a_web_page_under_a_models_name_is_not_kept(tmp_path):
