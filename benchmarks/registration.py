@@ -70,7 +70,7 @@ def measure(options: argparse.Namespace) -> str:
     scores = []
     for position in held_out:
         view = HeldOutView(source.frame(position, size), HeldOutView.of(masks.frame(position, size), regions).roi)
-        scores.append(score_view(viewer.draw_frame(view.frame), view))
+        scores.append(score_view(viewer.render_frame(view.frame), view))
     result = average(scores)
     roi = "none" if result.roi_psnr is None else f"{result.roi_psnr:.2f} dB ({result.roi_ssim:.3f})"
     return (

@@ -16,7 +16,7 @@ from gausslite.mission.settings import MissionSettings, require_rate
 from gausslite.mission.task_mapper import TaskMapper
 from gausslite.perception.fixed_relevance import RegionRelevanceEstimator
 from gausslite.render.choose import choose_rasterizer
-from gausslite_bench.quality.pairs import HOME_PAIRS, HomePair
+from gausslite_bench.quality.home_tasks import HOME_TASKS, HomeTask
 from gausslite_bench.quality.scenes import HomeScenePlan, RecordedRelevanceEstimator, Scene
 
 GOAL_DB, GOAL_S = 1.0, 10.0
@@ -28,8 +28,8 @@ CHANGED, RESTARTED, ALWAYS = "task changed", "restarted", "always on it"
 class TaskChange:
     """Two tasks in one home, one after the other."""
 
-    before: HomePair
-    after: HomePair
+    before: HomeTask
+    after: HomeTask
 
     def __post_init__(self) -> None:
         if self.before.home != self.after.home or self.before == self.after:
@@ -40,7 +40,7 @@ class TaskChange:
     @classmethod
     def parse(cls, text: str) -> TaskChange:
         """Read "home-4-search:home-4-navigation". Raises InvalidInputError."""
-        pairs = {pair.name: pair for pair in HOME_PAIRS}
+        pairs = {pair.name: pair for pair in HOME_TASKS}
         names = text.split(":")
         if len(names) != 2 or not all(name in pairs for name in names):
             raise InvalidInputError(f"task change: expected such as home-4-search:home-4-navigation, got {text!r}")
@@ -78,7 +78,7 @@ class TaskChangeBench:
         """Map three times. Raises DatasetError, InvalidInputError."""
         scene = HomeScenePlan(change.after, self.before + self.after, self.views).load(self.size)
         old_region = RegionRelevanceEstimator(choose_regions(scene.knowledge.regions, change.before.objects))
-        earlier = replace(scene, masks=[old_region.estimate(frame) for frame in scene.training])
+        earlier = replace(scene, masks=[old_region.estimate(frame).relevance for frame in scene.training])
         first, second = RecordedRelevanceEstimator(earlier), RecordedRelevanceEstimator(scene)
         changed, always, restarted = self._loop(first), self._loop(second), self._loop(second)
         for frame in scene.training[: self.before]:
@@ -109,7 +109,7 @@ class TaskChangeBench:
         views = [view for view in scene.held_out if view.shows_region]
         if not views:
             raise InvalidInputError(f"{scene.task!r}: expected held-out views that show its region, got none")
-        return fmean(psnr(viewer.draw_frame(view.frame).rgb, view.frame.rgb, view.roi) for view in views)
+        return fmean(psnr(viewer.render_frame(view.frame).rgb, view.frame.rgb, view.roi) for view in views)
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,9 +12,9 @@ from gausslite.cli.main import main
 from gausslite.errors import InvalidInputError
 from gausslite.render.rasterizer import LossWeights
 from gausslite_bench.cli.gpu import frame_lines, gpu_record, rate_heading, rate_line
-from gausslite_bench.raster.gpu import GpuBench
-from gausslite_bench.raster.scene import held_view, seed_rows
-from gausslite_bench.raster.step import RESTING
+from gausslite_bench.raster.gpu_rates import GpuBench
+from gausslite_bench.raster.procedural_room import held_view, seed_rows
+from gausslite_bench.raster.repeated_step import RESTING
 
 pytest.importorskip("torch", reason="torch is not installed")
 pytest.importorskip("gsplat", reason="gsplat is not installed; pip install gausslite[cuda]")
@@ -23,8 +23,8 @@ import gsplat
 import torch
 
 from gausslite.render.cuda import CudaRasterizer
+from gausslite.render.cuda.gsplat_baseline import GsplatBaseline
 from gausslite.render.cuda.kernels import TorchKernels
-from gausslite.render.cuda.plain import PlainTraining
 from gausslite.render.cuda.projection import Lens, project
 
 torch.set_num_threads(1)
@@ -76,7 +76,7 @@ def test_gsplat_called_plainly_has_the_loss_of_our_step() -> None:
     prepared = rasterizer.prepare_view(view.rgb, view.depth_m, view.camera)
     rows = seed_rows(60)
     step = rasterizer.step(rows, rows * 0, rows * 0, prepared, view.T_camera_world, loss, RESTING)
-    plain = PlainTraining(rows[step.visible], prepared, view.T_camera_world, loss, rasterization)
+    plain = GsplatBaseline(rows[step.visible], prepared, view.T_camera_world, loss, rasterization)
     assert plain.train(2) == pytest.approx(step.loss, rel=1e-5)
 
 

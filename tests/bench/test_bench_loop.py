@@ -10,7 +10,7 @@ from gausslite.cli.main import main
 from gausslite.errors import DatasetError
 from gausslite.mapping.stages import SkippableStage, Stage
 from gausslite.mission.frame_scheduler import FrameTiming
-from gausslite_bench.loop.bench import CostLog, FrameCost, Latency, LoopTiming
+from gausslite_bench.loop.frame_costs import CostLog, FrameCost, Latency, LoopTiming
 
 SMALL = ("--size", "96x72", "--max-gaussians", "1500", "--threads", "1")
 

@@ -11,7 +11,7 @@ from gausslite.cli.main import main
 from gausslite.domain.task import TaskGraph
 from gausslite.errors import InvalidInputError, TaskError
 from gausslite.task.rules import RuleParser
-from gausslite_bench.parser_bench import Sentence, load_sentences, score_parser
+from gausslite_bench.parser_scores import Sentence, load_sentences, score_parser
 
 ROWS = [
     {"text": "Find a mug on a table", "targets": ["mug"], "anchors": ["table"], "relations": [["on", "mug", "table"]]},

@@ -18,8 +18,8 @@ from gausslite.domain.relevance import Detection
 from gausslite.domain.task import TaskGraph
 from gausslite.errors import InvalidInputError
 from gausslite.perception.ground_truth import RegionDetector
-from gausslite_bench.perception.bench import PerceptionBench, PerceptionStage, Question
-from gausslite_bench.perception.sheet import PerceptionSheet
+from gausslite_bench.perception.contact_sheet import PerceptionSheet
+from gausslite_bench.perception.stage_scores import PerceptionBench, PerceptionStage, Question
 
 CAMERA = Camera(100.0, 100.0, 80.0, 60.0, 160, 120)
 UP = (0.0, -1.0, 0.0)

@@ -21,21 +21,21 @@ from gausslite.errors import InvalidInputError
 from gausslite.perception.vocabulary import same_kind
 from gausslite.task.rules import RuleParser
 from gausslite_bench.quality.ablation import cumulative_variants
-from gausslite_bench.quality.pairs import HOME_PAIRS, WHOLE_HOMES, TaskKind, choose_pairs
+from gausslite_bench.quality.home_tasks import HOME_TASKS, WHOLE_HOMES, TaskKind, choose_home_tasks
 from gausslite_bench.quality.scenes import HomeScenePlan, PosePolicy, RealScenePlan, UnseenRegionError, choose_kinds
-from gausslite_bench.quality.study import Archive, Finished, Study, run_study
+from gausslite_bench.quality.study import FinishedTrial, Study, TrialCache, run_study
 from gausslite_bench.quality.tables import FULL_METRICS, ROI_METRICS, Scoreboard, ablation_table, quality_table
-from gausslite_bench.quality.trials import Budget, BudgetMode, Conditions, Trial, Variant, clock_for
+from gausslite_bench.quality.trials import BudgetMode, Conditions, Trial, TrialBudget, Variant, clock_for
 from gausslite_sim.family import HOME_COUNT, HOMES
 
 
 def test_there_are_three_tasks_of_three_kinds_in_each_home() -> None:
     kinds = set(TaskKind) - {TaskKind.FULL_FRAME}
-    assert {(pair.home, pair.kind) for pair in HOME_PAIRS} == {(h, k) for h in range(1, HOME_COUNT + 1) for k in kinds}
-    assert len({pair.task for pair in HOME_PAIRS}) == len(HOME_PAIRS) == 24
+    assert {(pair.home, pair.kind) for pair in HOME_TASKS} == {(h, k) for h in range(1, HOME_COUNT + 1) for k in kinds}
+    assert len({pair.task for pair in HOME_TASKS}) == len(HOME_TASKS) == 24
 
 
-@pytest.mark.parametrize("pair", HOME_PAIRS, ids=lambda pair: pair.name)
+@pytest.mark.parametrize("pair", HOME_TASKS, ids=lambda pair: pair.name)
 def test_the_words_of_a_task_mean_its_objects(pair) -> None:
     graph = RuleParser().parse(pair.task)
     assert not graph.warnings
@@ -45,21 +45,21 @@ def test_the_words_of_a_task_mean_its_objects(pair) -> None:
 
 def test_a_task_is_about_things_that_are_there() -> None:
     names = {item.name for item in HOMES[PLAN.pair.home - 1].furnish(np.random.default_rng(0))}
-    for pair in choose_pairs([f"home-{PLAN.pair.home}"]):
+    for pair in choose_home_tasks([f"home-{PLAN.pair.home}"]):
         assert set(pair.objects) <= names
 
 
 def test_pairs_are_chosen_by_name_or_home() -> None:
-    assert choose_pairs([]) == HOME_PAIRS
-    assert [pair.name for pair in choose_pairs(["home-2", "home-5-search"])] == [
+    assert choose_home_tasks([]) == HOME_TASKS
+    assert [pair.name for pair in choose_home_tasks(["home-2", "home-5-search"])] == [
         "home-2-manipulation",
         "home-2-search",
         "home-2-navigation",
         "home-5-search",
     ]
-    assert choose_pairs(["home-7-everything"]) == (WHOLE_HOMES[6],)
+    assert choose_home_tasks(["home-7-everything"]) == (WHOLE_HOMES[6],)
     with pytest.raises(InvalidInputError, match=r"pairs: expected names such as home-3 .*, got home-9"):
-        choose_pairs(["home-1", "home-9"])
+        choose_home_tasks(["home-1", "home-9"])
 
 
 def test_a_real_sequences_kinds_are_chosen_by_name() -> None:
@@ -81,35 +81,38 @@ def test_components_come_one_by_one() -> None:
 
 
 def test_a_trials_key_changes_with_each_of_its_settings() -> None:
-    trial = Trial(PLAN, TASK, Budget(), 0, CONDITIONS)
+    trial = Trial(PLAN, TASK, TrialBudget(), 0, CONDITIONS)
     others = [
         replace(trial, seed=1),
         replace(trial, conditions=Conditions((64, 48))),
         replace(trial, variant=UNIFORM),
-        replace(trial, budget=Budget(iterations=9)),
-        replace(trial, budget=Budget(equal=BudgetMode.TIME)),
+        replace(trial, budget=TrialBudget(iterations=9)),
+        replace(trial, budget=TrialBudget(equal=BudgetMode.TIME)),
         replace(trial, plan=replace(PLAN, frames=5)),
         replace(trial, plan=replace(PLAN, trust=PosePolicy(fit_views=True))),
-        replace(trial, plan=HomeScenePlan(choose_pairs(["home-8-search"])[0], 4, 3)),
+        replace(trial, plan=HomeScenePlan(choose_home_tasks(["home-8-search"])[0], 4, 3)),
     ]
     assert len({each.key for each in (trial, *others)}) == 1 + len(others)
-    assert trial.key == Trial(PLAN, TASK, Budget(), 0, CONDITIONS).key
+    assert trial.key == Trial(PLAN, TASK, TrialBudget(), 0, CONDITIONS).key
 
 
 def test_a_map_that_knows_no_task_is_the_same_for_every_task_of_its_place() -> None:
-    search = HomeScenePlan(choose_pairs(["home-8-search"])[0], 4, 3)
-    here, there = Trial(PLAN, UNIFORM, Budget(), 0, CONDITIONS), Trial(search, UNIFORM, Budget(), 0, CONDITIONS)
+    search = HomeScenePlan(choose_home_tasks(["home-8-search"])[0], 4, 3)
+    here, there = (
+        Trial(PLAN, UNIFORM, TrialBudget(), 0, CONDITIONS),
+        Trial(search, UNIFORM, TrialBudget(), 0, CONDITIONS),
+    )
     assert (here.map_key, here.follows_task) == (there.map_key, False)
     for other in (
         replace(here, seed=1),
-        replace(here, budget=Budget(iterations=9)),
+        replace(here, budget=TrialBudget(iterations=9)),
         replace(here, plan=replace(PLAN, trust=PosePolicy(PoseExposurePrior(0.01)))),
         replace(here, plan=replace(PLAN, frames=5)),
-        replace(here, plan=HomeScenePlan(choose_pairs(["home-7-search"])[0], 4, 3)),
+        replace(here, plan=HomeScenePlan(choose_home_tasks(["home-7-search"])[0], 4, 3)),
         replace(here, variant=Variant("monogs", "monogs")),
     ):
         assert other.map_key != here.map_key
-    ours, theirs = Trial(PLAN, TASK, Budget(), 0, CONDITIONS), Trial(search, TASK, Budget(), 0, CONDITIONS)
+    ours, theirs = Trial(PLAN, TASK, TrialBudget(), 0, CONDITIONS), Trial(search, TASK, TrialBudget(), 0, CONDITIONS)
     assert ours.follows_task
     assert ours.map_key != theirs.map_key
     assert not replace(ours, variant=cumulative_variants()[0]).follows_task
@@ -117,21 +120,21 @@ def test_a_map_that_knows_no_task_is_the_same_for_every_task_of_its_place() -> N
 
 def test_homes_are_believed_and_real_cameras_are_not(tmp_path: Path) -> None:
     assert PosePolicy() == PLAN.trust
-    assert not Trial(PLAN, TASK, Budget(), 0, CONDITIONS).mission.view_prior.moves
+    assert not Trial(PLAN, TASK, TrialBudget(), 0, CONDITIONS).mission.pose_prior.has_pose_error
     real = RealScenePlan(tmp_path, tmp_path / "roi.npz", "mug", ("mug_1",))
-    mission = Trial(real, UNIFORM, Budget(), 0, CONDITIONS).mission
-    assert PoseExposurePrior.parse(str(mission.view_prior)) == PoseExposurePrior(0.01, 0.5, 0.1, 0.03)
+    mission = Trial(real, UNIFORM, TrialBudget(), 0, CONDITIONS).mission
+    assert PoseExposurePrior.parse(str(mission.pose_prior)) == PoseExposurePrior(0.01, 0.5, 0.1, 0.03)
     assert real.trust.fit_views
 
 
 def test_a_trials_key_is_the_same_in_every_process() -> None:
     program = (
         "from gausslite_bench.quality.ablation import cumulative_variants\n"
-        "from gausslite_bench.quality.pairs import HOME_PAIRS\n"
+        "from gausslite_bench.quality.home_tasks import HOME_TASKS\n"
         "from gausslite_bench.quality.scenes import HomeScenePlan\n"
-        "from gausslite_bench.quality.trials import Budget, Conditions, Trial\n"
+        "from gausslite_bench.quality.trials import TrialBudget, Conditions, Trial\n"
         "for variant in cumulative_variants():\n"
-        "    print(Trial(HomeScenePlan(HOME_PAIRS[0]), variant, Budget(), 0, Conditions((96, 72))).key)\n"
+        "    print(Trial(HomeScenePlan(HOME_TASKS[0]), variant, TrialBudget(), 0, Conditions((96, 72))).key)\n"
     )
     keys = [
         subprocess.run(
@@ -149,7 +152,7 @@ def test_a_single_thread_is_timed_by_the_processor() -> None:
 
 
 def test_the_board_knows_means_spreads_and_margins() -> None:
-    budget = Budget()
+    budget = TrialBudget()
     board = Scoreboard(
         [finished(*each, budget) for each in ((TASK, 0, 26.0), (TASK, 1, 28.0), (UNIFORM, 0, 24.5), (UNIFORM, 1, 24.5))]
     )
@@ -176,7 +179,7 @@ def test_the_board_knows_means_spreads_and_margins() -> None:
 
 
 def test_the_ablations_table_has_a_row_a_component_and_both_budgets() -> None:
-    budgets = [Budget(equal=equal) for equal in BudgetMode]
+    budgets = [TrialBudget(equal=equal) for equal in BudgetMode]
     board = Scoreboard([finished(v, 0, 20.0 + i, b) for b in budgets for i, v in enumerate(cumulative_variants())])
     table = ablation_table(board)
     one = "25.00 ± 0.00 | 20.00 ± 0.00 | 26.00 ± 0.00 | 20.00 ± 0.00"
@@ -186,21 +189,21 @@ def test_the_ablations_table_has_a_row_a_component_and_both_budgets() -> None:
 
 
 def test_without_fitted_views_the_ablation_shows_raw_ones_alone() -> None:
-    one = finished(TASK, 0, 20.0, Budget())
+    one = finished(TASK, 0, 20.0, TrialBudget())
     board = Scoreboard([replace(one, result=replace(one.result, fitted=None))])
     assert "| components | ROI PSNR, equal iterations | full PSNR, equal iterations |\n" in ablation_table(board)
 
 
 def test_the_ablation_of_several_scenes_ends_with_their_mean() -> None:
-    other = HomeScenePlan(choose_pairs(["home-8-search"])[0], frames=4, views=3)
-    board = Scoreboard([finished(TASK, 0, 20.0, Budget()), finished(TASK, 0, 23.0, Budget(), other)])
+    other = HomeScenePlan(choose_home_tasks(["home-8-search"])[0], frames=4, views=3)
+    board = Scoreboard([finished(TASK, 0, 20.0, TrialBudget()), finished(TASK, 0, 23.0, TrialBudget(), other)])
     table = ablation_table(board)
     assert "The mean over these 2\n\n| components | ROI PSNR, equal iterations |" in table
     assert table.endswith("| task | 21.50 | 20.00 | 22.50 | 20.00 |\n")
 
 
 def test_a_study_counts_its_trials() -> None:
-    study = Study([PLAN], [TASK, UNIFORM], [Budget(), Budget(equal=BudgetMode.TIME)], [0, 1, 2], CONDITIONS)
+    study = Study([PLAN], [TASK, UNIFORM], [TrialBudget(), TrialBudget(equal=BudgetMode.TIME)], [0, 1, 2], CONDITIONS)
     assert study.count == len(study.trials(PLAN)) == 12
 
 
@@ -231,14 +234,14 @@ def test_the_command_measures_keeps_and_resumes(tmp_path: Path, capsys: pytest.C
 def test_a_map_is_made_once_for_all_tasks_that_it_does_not_know(tmp_path: Path) -> None:
     pytest.importorskip("embreex", reason="the simulated homes need the extra `sim`")
     pytest.importorskip("gausslite.render._kernels", reason="the native kernels are not built")
-    plans = [HomeScenePlan(pair, frames=4, views=3) for pair in choose_pairs(["home-8"])]
+    plans = [HomeScenePlan(pair, frames=4, views=3) for pair in choose_home_tasks(["home-8"])]
     conditions = Conditions((96, 72), threads=1)
-    together = Study(plans, [TASK, UNIFORM], [Budget(max_gaussians=1500, iterations=1)], [0], conditions)
+    together = Study(plans, [TASK, UNIFORM], [TrialBudget(max_gaussians=1500, iterations=1)], [0], conditions)
     seen = Frames()
-    results = run_study(together, Archive(tmp_path / "together"), None, seen)
+    results = run_study(together, TrialCache(tmp_path / "together"), None, seen)
     assert seen.count == (3 + 1) * len(plans[0].load((96, 72)).training)
     alone = replace(together, plans=plans[2:], variants=[UNIFORM])
-    [last] = run_study(alone, Archive(tmp_path / "alone"), None, seen)
+    [last] = run_study(alone, TrialCache(tmp_path / "alone"), None, seen)
     assert results[-1].trial.key == last.trial.key
     assert results[-1].result.scores == last.result.scores
 
@@ -253,7 +256,7 @@ class Frames:
         del gaussians
         self.count += 1
 
-    def finished(self, done: Finished) -> None:
+    def finished(self, done: FinishedTrial) -> None:
         del done
 
     def left_out(self, trials: int, why: UnseenRegionError) -> None:

@@ -14,10 +14,10 @@ from gausslite.cli.main import main
 from gausslite.errors import InvalidInputError
 from gausslite.render.rasterizer import LOG_SCALE, MEAN, RGB
 from gausslite_bench.cli.main import counts, percentages, sizes
-from gausslite_bench.raster.bench import RasterBench
-from gausslite_bench.raster.cycles import BlockCost
-from gausslite_bench.raster.region import Layout, regions_of_share
-from gausslite_bench.raster.scene import held_view, seed_rows
+from gausslite_bench.raster.block_cost import BlockCost
+from gausslite_bench.raster.operation_costs import RasterBench
+from gausslite_bench.raster.procedural_room import held_view, seed_rows
+from gausslite_bench.raster.region_costs import Layout, regions_of_share
 
 pytest.importorskip("gausslite.render._kernels", reason="the native kernels are not built")
 

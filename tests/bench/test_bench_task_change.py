@@ -1,4 +1,4 @@
-"""The benchmark of a task that changes, its table and its picture; and `map --then` on a tiny home."""
+"""The benchmark of a task that changes, its table and its picture; and `map --task-at` on a tiny home."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from gausslite.errors import InvalidInputError
 from gausslite.mission.settings import MissionSettings
 from gausslite.mission.task_schedule import TaskSchedule, TaskSwitch
 from gausslite.task.rules import RuleParser
-from gausslite_bench.curves import draw_panels
+from gausslite_bench.plots import plot_panels
 from gausslite_bench.task_change import (
     ALWAYS,
     CHANGED,
@@ -94,14 +94,14 @@ def test_the_first_and_the_last_frame_are_looked_at(after: int, looks: list[floa
 
 
 def test_a_single_look_is_seen_in_the_picture() -> None:
-    once = draw_panels({"a": {"line": [(0.25, 20.0)]}}, "seconds", "dB")
+    once = plot_panels({"a": {"line": [(0.25, 20.0)]}}, "seconds", "dB")
     assert (once[60:] == (255, 208, 0)).all(axis=2).any()
 
 
 def test_curves_are_drawn_one_panel_below_the_other() -> None:
     points = recovery([3.0, 0.9, 0.4, 0.2]).points
-    one = draw_panels({"a": points}, "seconds", "dB")
-    assert len(draw_panels({"a": points, "b": points}, "seconds", "dB")) == 2 * len(one)
+    one = plot_panels({"a": points}, "seconds", "dB")
+    assert len(plot_panels({"a": points, "b": points}, "seconds", "dB")) == 2 * len(one)
     assert len(np.unique(one.reshape(-1, 3), axis=0)) > 4
 
 
@@ -115,15 +115,15 @@ def test_the_task_in_force_is_that_of_the_latest_turn() -> None:
 
 @pytest.mark.parametrize("text", ["Find the mug", "x:Find the mug", "7:", "-1:Find the mug"])
 def test_a_turn_that_is_none_is_told(text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    command = ["map", "sim:home?frames=2", "--task", "Find the mug", f"--then={text}", "--out", str(tmp_path)]
+    command = ["map", "sim:home?frames=2", "--task", "Find the mug", f"--task-at={text}", "--out", str(tmp_path)]
     assert main(command) == 2
-    assert "--then" in capsys.readouterr().err
+    assert "--task-at" in capsys.readouterr().err
 
 
 def test_a_mission_whose_task_changes_can_be_cut_in_two(tmp_path: Path) -> None:
     def map_home(name: str, *more: str) -> tuple[bytes, dict[str, object]]:
         common = ["--size", "64x48", "--max-gaussians", "500", "--iterations", "2", "--threads", "1"]
-        tasks = ["--task", "Pick up the mug on the table", "--then", "6:Find the chair"]
+        tasks = ["--task", "Pick up the mug on the table", "--task-at", "6:Find the chair"]
         out = str(tmp_path / name)
         assert main(["map", "sim:home?seed=0&trajectory=0&frames=14", *common, *tasks, "--out", out, *more]) == 0
         report = json.loads((tmp_path / name / "report.json").read_text())

@@ -12,22 +12,22 @@ from gausslite.cli.main import main
 from gausslite.errors import InvalidInputError
 from gausslite_bench.quality.equal_time import kept_rate, pacing_trials
 from gausslite_bench.quality.study import Study
-from gausslite_bench.quality.trials import Budget, BudgetMode
+from gausslite_bench.quality.trials import BudgetMode, TrialBudget
 
-TIMED = Budget(equal=BudgetMode.TIME)
+TIMED = TrialBudget(equal=BudgetMode.TIME)
 
 
-def study(*budgets: Budget) -> Study:
+def study(*budgets: TrialBudget) -> Study:
     return Study([PLAN], [TASK], budgets, [0], CONDITIONS)
 
 
 def test_only_time_that_nobody_measured_needs_a_pace() -> None:
-    told = Budget(equal=BudgetMode.TIME, rate_hz=7.0)
-    assert pacing_trials(study(Budget(), told)) == []
-    [trial] = pacing_trials(study(Budget(), TIMED))
+    told = TrialBudget(equal=BudgetMode.TIME, rate_hz=7.0)
+    assert pacing_trials(study(TrialBudget(), told)) == []
+    [trial] = pacing_trials(study(TrialBudget(), TIMED))
     assert trial.variant.policy == "uniform"
     assert trial.budget.equal is BudgetMode.ITERATIONS
-    assert [budget.rate_hz for budget in study(Budget(), told, TIMED).paced(5.0).budgets] == [None, 7.0, 5.0]
+    assert [budget.rate_hz for budget in study(TrialBudget(), told, TIMED).paced(5.0).budgets] == [None, 7.0, 5.0]
 
 
 @pytest.mark.parametrize("content", ["", "[]", "{}", '{"trial": "another", "rate_hz": 5}', '{"trial": 1}'])

@@ -14,7 +14,7 @@ from gausslite.cli.main import main
 from gausslite.errors import KernelError
 from gausslite.optimize.parameters import SplatTable
 from gausslite_bench.raster.external_rasterizer import ExternalRasterizer
-from gausslite_bench.raster.scene import held_view, seed_rows
+from gausslite_bench.raster.procedural_room import held_view, seed_rows
 
 COMPILER = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
 if COMPILER is None:

@@ -16,7 +16,7 @@ from gausslite.domain.relevance import RelevanceMap
 from gausslite.errors import DatasetError, InvalidInputError
 from gausslite.mission.settings import SceneKnowledge
 from gausslite_bench.quality.scenes import RealScenePlan, RecordedRelevanceEstimator, Scene, real_plans
-from gausslite_bench.quality.trials import Budget, Conditions, PerceptionMode, Trial, Variant, make_map
+from gausslite_bench.quality.trials import Conditions, PerceptionMode, Trial, TrialBudget, Variant, build_map
 
 
 def write_regions(path: Path, *voxels: tuple[int, int, int], name: str = "mug_1") -> Path:
@@ -27,10 +27,10 @@ def write_regions(path: Path, *voxels: tuple[int, int, int], name: str = "mug_1"
 
 def test_two_frames_from_one_place_have_masks_of_their_own() -> None:
     frames = [wall_frame(0), wall_frame(1)]
-    masks = [middle_relevance(frames[0]), RelevanceMap.nothing(*frames[1].depth_m.shape)]
+    masks = [middle_relevance(frames[0]), RelevanceMap.empty(*frames[1].depth_m.shape)]
     attention = RecordedRelevanceEstimator(Scene("Find it", frames, masks, [], SceneKnowledge()))
-    assert [attention.attend(frame) for frame in frames] == masks
-    assert attention.look_back(frames[0]) is masks[0]
+    assert [attention.estimate(frame) for frame in frames] == masks
+    assert attention.evaluate_past(frames[0]) is masks[0]
 
 
 def test_other_regions_under_the_same_names_are_another_scene(tmp_path: Path) -> None:
@@ -75,9 +75,13 @@ def test_the_words_of_a_task_find_the_regions_of_a_real_sequence(tmp_path: Path)
     wall = [(x, y, z) for x in range(-4, 4) for y in range(-4, 4) for z in (19, 20)]
     [plan] = real_plans(folder, write_regions(tmp_path / "roi.npz", *wall, name="mug_1"))
     trial = Trial(
-        plan, Variant("task", "task"), Budget(200, iterations=1), 0, Conditions((16, 16), PerceptionMode(words=True), 1)
+        plan,
+        Variant("task", "task"),
+        TrialBudget(200, iterations=1),
+        0,
+        Conditions((16, 16), PerceptionMode(words=True), 1),
     )
-    assert make_map(trial, plan.load((16, 16)), lambda _: None).gaussians.active.any()
+    assert build_map(trial, plan.load((16, 16)), lambda _: None).gaussians.active.any()
 
 
 def test_a_sequence_too_short_to_hold_a_view_out_says_what_there_was(tmp_path: Path) -> None:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from gausslite.evaluation.compare import MapScores
-from gausslite_bench.quality.pairs import choose_pairs
+from gausslite_bench.quality.home_tasks import choose_home_tasks
 from gausslite_bench.quality.scenes import HomeScenePlan
-from gausslite_bench.quality.study import Finished, Origin
-from gausslite_bench.quality.trials import Budget, Conditions, Trial, TrialResult, Variant
+from gausslite_bench.quality.study import FinishedTrial, Origin
+from gausslite_bench.quality.trials import Conditions, Trial, TrialBudget, TrialResult, Variant
 
-PLAN = HomeScenePlan(choose_pairs(["home-8-manipulation"])[0], frames=4, views=3)
+PLAN = HomeScenePlan(choose_home_tasks(["home-8-manipulation"])[0], frames=4, views=3)
 CONDITIONS = Conditions((96, 72))
 TASK, UNIFORM = Variant("task", "task"), Variant("uniform", "uniform")
 
@@ -17,7 +17,7 @@ def scores(roi_psnr: float | None, full_psnr: float = 20.0) -> MapScores:
     return MapScores(roi_psnr, 0.8, full_psnr, 0.7, 0.02, 0.938, 3, 2, 900, 0.03)
 
 
-def finished(variant: Variant, seed: int, roi_psnr: float, budget: Budget, plan: HomeScenePlan = PLAN) -> Finished:
+def finished(variant: Variant, seed: int, roi_psnr: float, budget: TrialBudget, plan: HomeScenePlan = PLAN) -> FinishedTrial:
     trial = Trial(plan, variant, budget, seed, CONDITIONS)
     result = TrialResult(scores(roi_psnr), scores(roi_psnr + 1), 0.011, 900, 8.0, 12.5)
-    return Finished(trial, result, Origin.MADE)
+    return FinishedTrial(trial, result, Origin.COMPUTED)

@@ -33,7 +33,7 @@ from gausslite.domain.voxels import VoxelGrid
 from gausslite.errors import InvalidInputError
 from gausslite.evaluation.compare import MapScores
 from gausslite.evaluation.pictures import write_png
-from gausslite.evaluation.team import TeamScores, Viewpoints, score_team
+from gausslite.evaluation.team import TeamScores, HeldOutFrames, score_team
 from gausslite.fusion.limits import MAX_REFINE_ITERATIONS
 from gausslite.mission.build import open_networks
 from gausslite.mission.results import prepare_folder, write_json
@@ -131,7 +131,7 @@ class _Stage:
     agents: tuple[AgentPlan, ...]
     size: tuple[int, int]
     hold_out: int | None
-    held_out: tuple[Viewpoints, ...]
+    held_out: tuple[HeldOutFrames, ...]
     regions: Mapping[str, Region]
     depth_registration: DepthRegistration | None = None
     pose_prior: PoseExposurePrior = field(default_factory=PoseExposurePrior)
@@ -161,7 +161,7 @@ def _simulated_stage(options: argparse.Namespace) -> _Stage:
         agents,
         size,
         None,
-        (Viewpoints(held_out, range(len(held_out)), size),),
+        (HeldOutFrames(held_out, range(len(held_out)), size),),
         _scored_regions(options, held_out.regions()),
         pose_prior=resolve_pose_prior(specs[2], held_out, options.pose_prior),
     )
@@ -180,7 +180,7 @@ def _recorded_stage(options: argparse.Namespace) -> _Stage:
         held_out.append(held)
     source, camera = register_with_warnings(options.source, recorded, options.register_depth, LOOK)
     pose_prior = resolve_pose_prior(options.source, source, options.pose_prior)
-    views = tuple(Viewpoints(source, held, size) for held in held_out)
+    views = tuple(HeldOutFrames(source, held, size) for held in held_out)
     return _Stage(tuple(agents), size, _HOLD_OUT, views, regions, camera, pose_prior)
 
 

@@ -17,7 +17,7 @@ from gausslite.datasets.registered_source import DepthRegistration
 from gausslite.datasets.selection import frame_size, select_frames
 from gausslite.errors import DatasetError
 from gausslite.evaluation.compare import MapScores, average, score_view
-from gausslite.evaluation.fitted import draw_fitted
+from gausslite.evaluation.fitted import render_fitted
 from gausslite.evaluation.pictures import comparison_sheet, write_png
 from gausslite.evaluation.views import MIN_ROI_PIXELS, HeldOutView, MapViewer
 from gausslite.mission.results import as_text, prepare_folder, read_report
@@ -67,7 +67,7 @@ def run(options: argparse.Namespace) -> int:
         view = HeldOutView.of(source.frame(position, size), chosen)
         if not view.frame.has_depth:
             continue
-        drawn = draw_fitted(viewer, view.frame) if made.fit_views else viewer.draw_frame(view.frame)
+        drawn = render_fitted(viewer, view.frame) if made.fit_views else viewer.render_frame(view.frame)
         scores.append(score_view(drawn, view))
         if options.pictures is not None and position in pictured:
             sheet = comparison_sheet(view, {options.map.stem: drawn.rgb})

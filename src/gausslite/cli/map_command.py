@@ -38,7 +38,7 @@ from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.task import TaskGraph
 from gausslite.errors import DatasetError, InvalidInputError
 from gausslite.evaluation.pictures import write_png
-from gausslite.evaluation.preview import preview
+from gausslite.evaluation.preview import render_preview
 from gausslite.evaluation.views import MapViewer
 from gausslite.mapping.policies import TASK
 from gausslite.mission.build import RelevanceEstimatorFactory, build_mapper, build_relevance_estimator
@@ -113,7 +113,7 @@ def run(options: argparse.Namespace) -> int:
     write_results(options.out, gaussians, report)
     if mapper.keyframes():
         viewer = MapViewer(gaussians, choose_rasterizer(asked.settings.backend, asked.settings.threads))
-        write_png(options.out / PREVIEW, preview(viewer, mapper.keyframes()))
+        write_png(options.out / PREVIEW, render_preview(viewer, mapper.keyframes()))
     if options.save_state is not None:
         last_index = mission.outcomes[-1].index if mission.outcomes else last_index
         save_run(options.save_state, mapper, asked.terms(options, last_index), last_index)

@@ -2,7 +2,7 @@
 
 Averages are those of the field: each view has its own PSNR, SSIM and depth error (inside the region, over the
 region's pixels of that view), and a map's score is the mean over the views. Views that show fewer than
-MIN_ROI_PIXELS of the region count for the whole image only. A view's PSNR is at most MOST_DB. SSIM is the plain one,
+MIN_ROI_PIXELS of the region count for the whole image only. A view's PSNR is at most MAX_PSNR_DB. SSIM is the plain one,
 not the multi-scale variant.
 """
 
@@ -23,7 +23,7 @@ from gausslite.evaluation.metrics import covered_share, depth_l1_m, psnr, ssim_m
 from gausslite.evaluation.views import HeldOutView, MapViewer
 from gausslite.render.rasterizer import Rasterizer, Rendering
 
-MOST_DB = 100.0
+MAX_PSNR_DB = 100.0
 """A view's PSNR where map and photograph are equal, as in a saturated region: with infinity no mean would be left."""
 _COVERED_ALPHA = 0.5
 
@@ -89,7 +89,7 @@ class MapScores:
 def evaluate(gaussians: Gaussians, views: Sequence[HeldOutView], rasterizer: Rasterizer) -> MapScores:
     """Draw the map from every held-out view and average. Raises InvalidInputError without views."""
     viewer = MapViewer(gaussians, rasterizer)
-    return average([score_view(viewer.draw_frame(view.frame), view) for view in views])
+    return average([score_view(viewer.render_frame(view.frame), view) for view in views])
 
 
 def score_view(drawn: Rendering, view: HeldOutView, perceptual: PerceptualDistance | None = None) -> ViewScore:
@@ -101,7 +101,7 @@ def score_view(drawn: Rendering, view: HeldOutView, perceptual: PerceptualDistan
     roi = None
     if view.shows_region:
         roi = RoiScore(
-            min(psnr(drawn.rgb, rgb, view.roi), MOST_DB),
+            min(psnr(drawn.rgb, rgb, view.roi), MAX_PSNR_DB),
             float(similarity[view.roi].mean()),
             depth_l1_m(depth_m, view.frame.depth_m, view.roi),
             covered_share(depth_m, view.frame.depth_m, view.roi),
@@ -109,7 +109,7 @@ def score_view(drawn: Rendering, view: HeldOutView, perceptual: PerceptualDistan
         )
     return ViewScore(
         index=view.frame.index,
-        psnr=min(psnr(drawn.rgb, rgb), MOST_DB),
+        psnr=min(psnr(drawn.rgb, rgb), MAX_PSNR_DB),
         ssim=float(similarity.mean()),
         roi_pixels=int(np.count_nonzero(view.roi)),
         roi=roi,

@@ -28,38 +28,38 @@ _DIFFERENCE_GAIN = 3.0
 def comparison_sheet(view: HeldOutView, drawings: Mapping[str, Float32[ndarray, "h w 3"]]) -> UInt8[ndarray, "H W 3"]:
     """One column for the ground truth and one for each named drawing (colours in [0, 1]), labelled.
 
-    Rows: the image with the region outlined; the region's largest and smallest pieces enlarged; the absolute
+    Rows: the image with the region outline_roi; the region's largest and smallest pieces enlarged; the absolute
     difference (three times amplified). Rows that would show nothing are left out. Raises ShapeError.
     """
     truth_rgb = view.frame.rgb
     for name, drawing in drawings.items():
         require_array(f"drawing {name}", drawing, truth_rgb.shape, np.float32)
-    columns = {"ground truth": truth_rgb} | {name: as_bytes(drawing) for name, drawing in drawings.items()}
-    rows = [[cell(outlined(image, view.roi), label) for label, image in columns.items()]]
+    columns = {"ground truth": truth_rgb} | {name: to_uint8(drawing) for name, drawing in drawings.items()}
+    rows = [[labelled_image(outline_roi(image, view.roi), label) for label, image in columns.items()]]
     rows += [
-        [cell(_crop(image, piece), f"{label}: detail") for label, image in columns.items()]
+        [labelled_image(_crop(image, piece), f"{label}: detail") for label, image in columns.items()]
         for piece in _telling_pieces(view.roi)
     ]
     if drawings:
         truth = truth_rgb / np.float32(255.0)
-        differences = [as_bytes(_DIFFERENCE_GAIN * np.abs(drawing - truth)) for drawing in drawings.values()]
-        region = cell(lit(truth_rgb, view.roi), "region of the task")
+        differences = [to_uint8(_DIFFERENCE_GAIN * np.abs(drawing - truth)) for drawing in drawings.values()]
+        region = labelled_image(dim_outside(truth_rgb, view.roi), "region of the task")
         cells = [
-            cell(outlined(difference, view.roi), f"{name}: difference x{_DIFFERENCE_GAIN:g}")
+            labelled_image(outline_roi(difference, view.roi), f"{name}: difference x{_DIFFERENCE_GAIN:g}")
             for name, difference in zip(drawings, differences, strict=True)
         ]
         rows.append([region, *cells])
-    return grid(rows)
+    return arrange_grid(rows)
 
 
-def side_by_side(
+def comparison_row(
     photograph: UInt8[ndarray, "h w 3"], drawing: Float32[ndarray, "h w 3"], roi: Bool[ndarray, "h w"], label: str
 ) -> list[UInt8[ndarray, "H W 3"]]:
-    """A row for a grid: the photograph with the region outlined, the map from there, and its largest piece in both."""
-    pair = ((photograph, label), (as_bytes(drawing), "map"))
-    row = [cell(outlined(image, roi), name) for image, name in pair]
+    """A row for a arrange_grid: the photograph with the region outline_roi, the map from there, and its largest piece in both."""
+    pair = ((photograph, label), (to_uint8(drawing), "map"))
+    row = [labelled_image(outline_roi(image, roi), name) for image, name in pair]
     for piece in _telling_pieces(roi)[:1]:
-        row += [cell(_crop(image, piece), f"{name}: detail") for image, name in pair]
+        row += [labelled_image(_crop(image, piece), f"{name}: detail") for image, name in pair]
     return row
 
 
@@ -71,13 +71,13 @@ def write_png(path: Path, image: UInt8[ndarray, "h w 3"]) -> None:
     write_whole(path, encoded.tobytes())
 
 
-def as_bytes(image: Float32[ndarray, "h w 3"]) -> UInt8[ndarray, "h w 3"]:
+def to_uint8(image: Float32[ndarray, "h w 3"]) -> UInt8[ndarray, "h w 3"]:
     """Colours in [0, 1] as 0 to 255; what lies beyond is cut off."""
     rounded: UInt8[ndarray, "h w 3"] = np.rint(np.clip(image, 0.0, 1.0) * 255.0).astype(np.uint8)
     return rounded
 
 
-def outlined(image: UInt8[ndarray, "h w 3"], roi: Bool[ndarray, "h w"]) -> UInt8[ndarray, "h w 3"]:
+def outline_roi(image: UInt8[ndarray, "h w 3"], roi: Bool[ndarray, "h w"]) -> UInt8[ndarray, "h w 3"]:
     """The image with the region's outline drawn in."""
     import cv2
 
@@ -87,7 +87,7 @@ def outlined(image: UInt8[ndarray, "h w 3"], roi: Bool[ndarray, "h w"]) -> UInt8
     return out
 
 
-def lit(image: UInt8[ndarray, "h w 3"], roi: Bool[ndarray, "h w"]) -> UInt8[ndarray, "h w 3"]:
+def dim_outside(image: UInt8[ndarray, "h w 3"], roi: Bool[ndarray, "h w"]) -> UInt8[ndarray, "h w 3"]:
     """The image with everything outside the region dimmed."""
     dimmed: UInt8[ndarray, "h w 3"] = np.where(roi[..., None], image, image // 4)
     return dimmed
@@ -125,7 +125,7 @@ def _crop(image: UInt8[ndarray, "h w 3"], piece: Bool[ndarray, "h w"]) -> UInt8[
     return enlarged
 
 
-def cell(image: UInt8[ndarray, "h w 3"], label: str) -> UInt8[ndarray, "H W 3"]:
+def labelled_image(image: UInt8[ndarray, "h w 3"], label: str) -> UInt8[ndarray, "H W 3"]:
     """The image, wide enough to be read, under a line of text that is shrunk to fit."""
     import cv2
 
@@ -142,7 +142,7 @@ def cell(image: UInt8[ndarray, "h w 3"], label: str) -> UInt8[ndarray, "H W 3"]:
     return np.concatenate([header, image])
 
 
-def grid(rows: list[list[UInt8[ndarray, "_ _ 3"]]]) -> UInt8[ndarray, "H W 3"]:
+def arrange_grid(rows: list[list[UInt8[ndarray, "_ _ 3"]]]) -> UInt8[ndarray, "H W 3"]:
     """Cells of one size in rows, with gaps between them and round them."""
     cell_height, cell_width = rows[0][0].shape[:2]
     sheet = np.full(
@@ -155,7 +155,7 @@ def grid(rows: list[list[UInt8[ndarray, "_ _ 3"]]]) -> UInt8[ndarray, "H W 3"]:
         np.uint8,
     )
     for i, row in enumerate(rows):
-        for j, cell in enumerate(row):
+        for j, labelled_image in enumerate(row):
             top, left = _GAP_PX + i * (cell_height + _GAP_PX), _GAP_PX + j * (cell_width + _GAP_PX)
-            sheet[top : top + cell_height, left : left + cell_width] = cell
+            sheet[top : top + cell_height, left : left + cell_width] = labelled_image
     return sheet

@@ -13,14 +13,14 @@ from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.region import Region
 from gausslite.errors import InvalidInputError
 from gausslite.evaluation.compare import MapScores, ViewScore, average, score_view
-from gausslite.evaluation.fitted import draw_fitted
+from gausslite.evaluation.fitted import render_fitted
 from gausslite.evaluation.pictures import comparison_sheet
-from gausslite.evaluation.views import HeldOutView, MapViewer, most_telling
+from gausslite.evaluation.views import HeldOutView, MapViewer, largest_roi_views
 from gausslite.render.rasterizer import Rasterizer
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Viewpoints:
+class HeldOutFrames:
     """Held-out frames: positions of a source at one size (width, height)."""
 
     source: Source
@@ -38,7 +38,7 @@ class TeamScores:
 
 def score_team(
     maps: Mapping[str, Gaussians],
-    viewpoints: Iterable[Viewpoints],
+    viewpoints: Iterable[HeldOutFrames],
     regions: Sequence[Region],
     rasterizer: Rasterizer,
     fit_views: bool = False,
@@ -46,7 +46,7 @@ def score_team(
 ) -> TeamScores:
     """Draw every map from every view; the sheets show the views with the most of the region, spread over the sequence.
 
-    With fit_views each drawing is in the pose and colours that fit the view (`draw_fitted`). Raises InvalidInputError
+    With fit_views each drawing is in the pose and colours that fit the view (`render_fitted`). Raises InvalidInputError
     without a single view with depth.
     """
     views = [view for point in viewpoints for view in _views(point, regions)]
@@ -54,12 +54,12 @@ def score_team(
         raise InvalidInputError("held-out views: expected at least one frame with depth, got none")
     viewers = {name: MapViewer(gaussians, rasterizer) for name, gaussians in maps.items()}
     scores: dict[str, list[ViewScore]] = {name: [] for name in maps}
-    shown = most_telling(views, sheets)
+    shown = largest_roi_views(views, sheets)
     pictures = {}
     for i, view in enumerate(views):
         drawings: dict[str, Float32[ndarray, "h w 3"]] = {}
         for name, viewer in viewers.items():
-            drawn = draw_fitted(viewer, view.frame) if fit_views else viewer.draw_frame(view.frame)
+            drawn = render_fitted(viewer, view.frame) if fit_views else viewer.render_frame(view.frame)
             scores[name].append(score_view(drawn, view))
             drawings[name] = drawn.rgb
         if i in shown:
@@ -67,7 +67,7 @@ def score_team(
     return TeamScores({name: average(listed) for name, listed in scores.items()}, pictures)
 
 
-def _views(point: Viewpoints, regions: Sequence[Region]) -> Iterable[HeldOutView]:
+def _views(point: HeldOutFrames, regions: Sequence[Region]) -> Iterable[HeldOutView]:
     for position in point.positions:
         frame = point.source.frame(position, point.size)
         if frame.has_depth:

@@ -46,12 +46,12 @@ class HeldOutView:
         return int(np.count_nonzero(self.roi)) >= MIN_ROI_PIXELS
 
 
-def most_telling(views: Sequence[HeldOutView], count: int) -> set[int]:
+def largest_roi_views(views: Sequence[HeldOutView], count: int) -> set[int]:
     """From each of `count` stretches of the sequence, the view with the largest region."""
-    return largest_of_stretches([int(np.count_nonzero(view.roi)) for view in views], count)
+    return largest_roi_per_segment([int(np.count_nonzero(view.roi)) for view in views], count)
 
 
-def largest_of_stretches(roi_pixels: Sequence[int], count: int) -> set[int]:
+def largest_roi_per_segment(roi_pixels: Sequence[int], count: int) -> set[int]:
     """The largest region's position in each of `count` stretches; passes over those too small to judge, if it can."""
     if count < 1:
         return set()
@@ -68,12 +68,12 @@ class MapViewer:
         self._rows = gaussians_to_rows(gaussians)
         self._rasterizer = rasterizer
 
-    def draw(self, camera: Camera, T_world_camera: Float64[ndarray, "4 4"]) -> Rendering:
+    def render(self, camera: Camera, T_world_camera: Float64[ndarray, "4 4"]) -> Rendering:
         """The map as this camera sees it; colours clipped to [0, 1]. Raises ShapeError."""
         drawn = self._rasterizer.forward(self._rows, camera, inverse(T_world_camera))
         # copies: a backend may reuse its images for the next rendering
         return Rendering(np.clip(drawn.rgb, 0.0, 1.0), drawn.depth_m.copy(), drawn.alpha.copy(), None)
 
-    def draw_frame(self, frame: Frame) -> Rendering:
+    def render_frame(self, frame: Frame) -> Rendering:
         """The map from where the frame was taken."""
-        return self.draw(frame.camera, frame.T_world_camera)
+        return self.render(frame.camera, frame.T_world_camera)

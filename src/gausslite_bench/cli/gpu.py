@@ -7,7 +7,7 @@ import json
 
 from gausslite.errors import KernelError
 from gausslite.render.choose import choose_rasterizer
-from gausslite_bench.raster.gpu import PAPERS_FRAME_MS, FrameCost, GpuBench, StepRate
+from gausslite_bench.raster.gpu_rates import PAPERS_FRAME_MS, FrameCost, GpuBench, StepRate
 
 
 def run_gpu(options: argparse.Namespace) -> int:

@@ -22,7 +22,7 @@ from gausslite.mission.build import build_mapper
 from gausslite.mission.results import as_text, peak_rss_mib
 from gausslite.render.choose import choose_rasterizer
 from gausslite.render.rasterizer import Rasterizer
-from gausslite_bench.loop.bench import CostLog, FrameCost, Latency, LoopBench, LoopTiming, Overhead
+from gausslite_bench.loop.frame_costs import CostLog, FrameCost, Latency, LoopBench, LoopTiming, Overhead
 from gausslite_bench.loop.memory import MemoryTrend, back_and_forth, resident_mib
 from gausslite_bench.loop.rate_gap import RateGap
 

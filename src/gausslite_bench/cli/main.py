@@ -15,11 +15,11 @@ from gausslite_bench.cli.gpu import run_gpu
 from gausslite_bench.cli.parser import configure_parser
 from gausslite_bench.cli.perception import configure_perception
 from gausslite_bench.cli.quality import configure_ablation, configure_quality
-from gausslite_bench.cli.task_change import configure_retask
-from gausslite_bench.raster.bench import GAUSSIANS, OPERATIONS, SIZES, RasterBench, RasterTiming
-from gausslite_bench.raster.cycles import BlockCost
-from gausslite_bench.raster.gpu import GPU_GAUSSIANS
-from gausslite_bench.raster.region import SHARES_PERCENT, RegionCost
+from gausslite_bench.cli.task_change import configure_task_change
+from gausslite_bench.raster.block_cost import BlockCost
+from gausslite_bench.raster.gpu_rates import GPU_GAUSSIANS
+from gausslite_bench.raster.operation_costs import GAUSSIANS, OPERATIONS, SIZES, RasterBench, RasterTiming
+from gausslite_bench.raster.region_costs import SHARES_PERCENT, RegionCost
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -40,7 +40,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     summary = "the paper's components, switched on one by one"
     configure_ablation(benches.add_parser("ablation", help=summary, description=f"Score {summary}."))
     summary = "how soon a map serves a task that came in the middle"
-    configure_retask(benches.add_parser("retask", help=summary, description=f"Measure {summary}."))
+    configure_task_change(benches.add_parser("retask", help=summary, description=f"Measure {summary}."))
 
 
 def _configure_raster(parser: argparse.ArgumentParser) -> None:

@@ -11,7 +11,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from gausslite.task.backends import add_backend, backend_of, open_parser
-from gausslite_bench.parser_bench import SENTENCES, ParserScore, load_sentences, score_parser
+from gausslite_bench.parser_scores import SENTENCES, ParserScore, load_sentences, score_parser
 
 
 def configure_parser(parser: argparse.ArgumentParser) -> None:

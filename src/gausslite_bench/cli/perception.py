@@ -19,8 +19,8 @@ from gausslite.evaluation.pictures import write_png
 from gausslite.mission.results import as_text, prepare_folder
 from gausslite.perception.vocabulary import head_of, same_kind
 from gausslite.task.rules import RuleParser
-from gausslite_bench.perception.bench import PerceptionBench, Question, QuestionScore
-from gausslite_bench.perception.sheet import PerceptionSheet
+from gausslite_bench.perception.contact_sheet import PerceptionSheet
+from gausslite_bench.perception.stage_scores import PerceptionBench, Question, QuestionScore
 
 _COLUMNS = ("IoU", "precision", "recall", "marked, %", "most, %", "frames", "right", "found", "late")
 
@@ -51,7 +51,7 @@ def run_perception(options: argparse.Namespace) -> int:
 
     if options.detector is None:
         raise InvalidInputError("--detector: expected a model file, since ground truth has nothing to be measured by")
-    source, _ = open_with_warnings(options.source, options.up, options.colour_camera)
+    source, _ = open_with_warnings(options.source, options.up, options.register_depth)
     positions, size = select_frames(source, options.frames), frame_size(options.size, source)
     regions = _regions(options, source)
     questions = [*_asked(options.task, regions), *_absent(options.absent, regions)]

@@ -19,7 +19,7 @@ from gausslite.cli.source_options import open_with_warnings
 from gausslite.codec.files import write_whole
 from gausslite.config.options import LOOK, add_colour_camera, add_view_error, names, up_axis
 from gausslite.datasets.regions import REGIONS_FILE
-from gausslite.datasets.selection import modest_size
+from gausslite.datasets.selection import downscaled_size
 from gausslite.errors import InvalidInputError
 from gausslite.mapping.policies import POLICIES
 from gausslite.mission.build import open_networks
@@ -27,7 +27,7 @@ from gausslite.mission.results import write_json
 from gausslite.mission.settings import PerceptionSettings
 from gausslite_bench.quality.ablation import cumulative_variants
 from gausslite_bench.quality.equal_time import first_scene, kept_rate, measure_rate, pacing_trials
-from gausslite_bench.quality.pairs import HomePair, choose_pairs
+from gausslite_bench.quality.home_tasks import HomeTask, choose_home_tasks
 from gausslite_bench.quality.scenes import (
     REAL_CAMERA,
     HomeScenePlan,
@@ -38,9 +38,9 @@ from gausslite_bench.quality.scenes import (
     choose_kinds,
     real_plans,
 )
-from gausslite_bench.quality.study import Archive, Finished, Origin, Study, expected_origins, run_study
+from gausslite_bench.quality.study import FinishedTrial, Origin, Study, TrialCache, expected_origins, run_study
 from gausslite_bench.quality.tables import Scoreboard, ablation_table, quality_table
-from gausslite_bench.quality.trials import Budget, BudgetMode, Conditions, PerceptionMode, Variant
+from gausslite_bench.quality.trials import BudgetMode, Conditions, PerceptionMode, TrialBudget, Variant
 
 _ABLATION_PAIR = "home-4-manipulation"
 _BOTH = "both"
@@ -110,7 +110,7 @@ def _add_common(parser: argparse.ArgumentParser, seeds: tuple[int, ...], equal: 
     add("--size", metavar="WxH", type=size, help="image size (default: 320x240, a real sequence's in its proportions)")
     add("--frames", metavar="N", type=int, help="training frames (default: 60 in a home, all of a real sequence)")
     add("--views", metavar="N", type=int, default=24, help="held-out views in a home (default: %(default)s)")
-    budget = Budget()
+    budget = TrialBudget()
     add("--max-gaussians", metavar="N", type=int, default=budget.max_gaussians, help="hard cap (default: %(default)s)")
     add(
         "--iterations",
@@ -128,7 +128,7 @@ def _add_common(parser: argparse.ArgumentParser, seeds: tuple[int, ...], equal: 
     )
     add("--threads", metavar="N", type=int, help="threads (default: all the processor allows)")
     add("--lpips-weights", metavar="PATH", type=Path, action="append", default=[], help="AlexNet's and LPIPS' weights")
-    add_view_error(parser, default=None, shown=f"homes trusted, real {REAL_CAMERA.view_prior}")
+    add_view_error(parser, default=None, shown=f"homes trusted, real {REAL_CAMERA.pose_prior}")
     add(
         "--fit-views",
         action=argparse.BooleanOptionalAction,
@@ -155,12 +155,12 @@ def _plans(
     """The homes' pairs that are asked for and the real sequence, with neither the usual pairs; and a size for them."""
     real = _real(options)
     if real is None:
-        return [*_homes(options, choose_pairs(asked or usual))], _HOME_SIZE
+        return [*_homes(options, choose_home_tasks(asked or usual))], _HOME_SIZE
     plans, own_size = real
-    return [*(_homes(options, choose_pairs(asked)) if asked else ()), *plans], own_size
+    return [*(_homes(options, choose_home_tasks(asked)) if asked else ()), *plans], own_size
 
 
-def _homes(options: argparse.Namespace, pairs: Sequence[HomePair]) -> list[HomeScenePlan]:
+def _homes(options: argparse.Namespace, pairs: Sequence[HomeTask]) -> list[HomeScenePlan]:
     frames, trust = 60 if options.frames is None else options.frames, _trust(options, PosePolicy())
     return [HomeScenePlan(pair, frames, options.views, trust=trust) for pair in pairs]
 
@@ -180,20 +180,20 @@ def _real(options: argparse.Namespace) -> tuple[list[RealScenePlan], tuple[int, 
     # what is wrong with the options is told before anything is looked for in the images
     plans = real_plans(options.real, roi, options.frames, options.up, trust=_trust(options, REAL_CAMERA))
     chosen = choose_kinds(plans, options.kinds)
-    source, camera = open_with_warnings(str(options.real), options.up, options.colour_camera, LOOK)
-    return [replace(plan, colour_camera=camera) for plan in chosen], modest_size(source.camera)
+    source, camera = open_with_warnings(str(options.real), options.up, options.register_depth, LOOK)
+    return [replace(plan, depth_registration=camera) for plan in chosen], downscaled_size(source.camera)
 
 
 def _trust(options: argparse.Namespace, usual: PosePolicy) -> PosePolicy:
     return PosePolicy(
-        usual.view_prior if options.view_error is None else options.view_error,
+        usual.pose_prior if options.pose_prior is None else options.pose_prior,
         usual.fit_views if options.fit_views is None else options.fit_views,
     )
 
 
-def _budgets(options: argparse.Namespace) -> list[Budget]:
+def _budgets(options: argparse.Namespace) -> list[TrialBudget]:
     asked = list(BudgetMode) if options.equal == _BOTH else [BudgetMode(options.equal)]
-    return [Budget(options.max_gaussians, equal, options.iterations, options.rate) for equal in asked]
+    return [TrialBudget(options.max_gaussians, equal, options.iterations, options.rate) for equal in asked]
 
 
 def _eyes(options: argparse.Namespace) -> PerceptionMode:
@@ -214,7 +214,7 @@ def _run(study: Study, options: argparse.Namespace) -> Scoreboard:
         from gausslite.evaluation.lpips import load_lpips
 
         perceptual = load_lpips(options.lpips_weights)
-    archive = Archive(options.out)
+    archive = TrialCache(options.out)
     study = _paced(study, options.out / _RATE_FILE)
     _warn_of_other_code(expected_origins(study, archive, perceptual is not None, options.reuse_other_code))
     with _StudyBar(study.count) as bar:
@@ -246,10 +246,10 @@ def _advance(bar: tqdm[Any], gaussians: int) -> None:
 
 def _warn_of_other_code(expected: Counter[Origin]) -> None:
     """Before hours of work: whoever knows that the code's change leaves the figures alone can stop and keep them."""
-    if again := expected[Origin.MADE_AGAIN]:
+    if again := expected[Origin.RECOMPUTED]:
         line = f"{again} finished trials of other code will be made again; --reuse-other-code takes them as they are"
         print(line, file=sys.stderr)
-    if reused := expected[Origin.KEPT_OF_OTHER_CODE]:
+    if reused := expected[Origin.CACHED_OTHER_CODE]:
         line = f"{reused} finished trials of other code are taken as they are: figures may not compare"
         print(line, file=sys.stderr)
 
@@ -279,12 +279,12 @@ class _StudyBar:
         self._bar.write(f"left out: {why}", file=sys.stderr)
         self._bar.update(trials)
 
-    def finished(self, done: Finished) -> None:
+    def finished(self, done: FinishedTrial) -> None:
         """Leave the trial's figures on the screen."""
         self._frames = 0
         trial, scores = done.trial, done.result.scores
         roi = "no view shows the region" if scores.roi_psnr is None else f"ROI {scores.roi_psnr:.2f} dB"
-        how = "" if done.origin is Origin.MADE else f" ({done.origin})"
+        how = "" if done.origin is Origin.COMPUTED else f" ({done.origin})"
         self._bar.write(
             f"{trial.plan.name} {trial.variant.label} equal {trial.budget.equal} seed {trial.seed}: "
             f"{roi}, full {scores.full_psnr:.2f} dB{how}",

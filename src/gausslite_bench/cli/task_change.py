@@ -14,7 +14,7 @@ from gausslite.errors import InvalidInputError
 from gausslite.evaluation.pictures import write_png
 from gausslite.mission.results import prepare_folder, write_json
 from gausslite.mission.settings import MissionSettings
-from gausslite_bench.curves import draw_panels
+from gausslite_bench.plots import plot_panels
 from gausslite_bench.task_change import Recovery, TaskChange, TaskChangeBench, recovery_table
 
 _CHANGES = (
@@ -24,7 +24,7 @@ _CHANGES = (
 )
 
 
-def configure_retask(parser: argparse.ArgumentParser) -> None:
+def configure_task_change(parser: argparse.ArgumentParser) -> None:
     """Add the options of `bench retask`."""
     add = parser.add_argument
     add("--out", metavar="DIR", type=Path, required=True, help="gets retask.md, retask.json and retask.png")
@@ -38,10 +38,10 @@ def configure_retask(parser: argparse.ArgumentParser) -> None:
     add("--timed", action="store_true", help="as many iterations as fit into a frame's time, instead of --iterations")
     add("--seed", metavar="S", type=int, default=0, help="seed of every random choice (default: 0)")
     add("--threads", metavar="N", type=int, help="threads (default: all the processor allows)")
-    parser.set_defaults(run=run_retask)
+    parser.set_defaults(run=run_task_change)
 
 
-def run_retask(options: argparse.Namespace) -> int:
+def run_task_change(options: argparse.Namespace) -> int:
     """Map each change three times; what is known is written after each, so that an interrupt loses one change alone."""
     settings = MissionSettings(
         max_gaussians=options.max_gaussians,
@@ -70,4 +70,4 @@ def _write(folder: Path, recoveries: Sequence[Recovery]) -> None:
     write_whole(folder / "retask.md", f"# bench retask\n\n`{command}`\n\n{recovery_table(recoveries)}".encode())
     write_json(folder / "retask.json", {"command": command, "changes": [each.as_json() for each in recoveries]})
     panels = {each.change.name: each.points for each in recoveries}
-    write_png(folder / "retask.png", draw_panels(panels, "seconds of mapping since the change", "ROI PSNR, dB"))
+    write_png(folder / "retask.png", plot_panels(panels, "seconds of mapping since the change", "ROI PSNR, dB"))

@@ -17,15 +17,15 @@ _NEVER_IMPORTED = {"gausslite": ("cli", "config", "fusion", "models", "v1", "wir
 
 
 @functools.cache
-def code_hash_of() -> str:
+def current_code_hash() -> str:
     """Of this package's sources and kernels as they lie on disk when it is first asked for.
 
     Other libraries are not in it, nor is the processor. Read once: a program goes on with the code it started with.
     """
-    return fingerprint(deciding_files())
+    return hash_files(trial_source_files())
 
 
-def fingerprint(files: Sequence[Path]) -> str:
+def hash_files(files: Sequence[Path]) -> str:
     """A short text that changes with every byte of these files, their names and their order."""
     digest = hashlib.sha256()
     for path in files:
@@ -34,7 +34,7 @@ def fingerprint(files: Sequence[Path]) -> str:
     return digest.hexdigest()[:16]
 
 
-def deciding_files() -> list[Path]:
+def trial_source_files() -> list[Path]:
     """All that a trial may run, in an order that is the same everywhere."""
     sources = [path for package in _PACKAGES for path in (_SOURCES / package).rglob("*.py") if _is_imported(path)]
     sources.sort(key=lambda path: path.relative_to(_SOURCES).as_posix())

@@ -15,7 +15,7 @@ from gausslite.mission.results import write_json
 from gausslite.mission.settings import require_rate
 from gausslite_bench.quality.scenes import Scene, UnseenRegionError
 from gausslite_bench.quality.study import Study
-from gausslite_bench.quality.trials import Budget, BudgetMode, Trial, Variant, make_map
+from gausslite_bench.quality.trials import BudgetMode, Trial, TrialBudget, Variant, build_map
 
 _UNIFORM = Variant("uniform", "uniform")
 _DIGITS = 3
@@ -26,7 +26,7 @@ def pacing_trials(study: Study) -> list[Trial]:
     waiting = [budget for budget in study.budgets if budget.awaits_rate]
     if not waiting:
         return []
-    budget = Budget(waiting[0].max_gaussians, BudgetMode.ITERATIONS, waiting[0].iterations)
+    budget = TrialBudget(waiting[0].max_gaussians, BudgetMode.ITERATIONS, waiting[0].iterations)
     return [Trial(plan, _UNIFORM, budget, study.seeds[0], study.conditions) for plan in study.plans]
 
 
@@ -52,7 +52,7 @@ def kept_rate(path: Path, trials: Sequence[Trial]) -> float | None:
 
 def measure_rate(path: Path, trial: Trial, scene: Scene, on_frame: Callable[[int], None]) -> float:
     """How many frames a second this trial maps, kept at the path for later runs. Raises GaussLiteError."""
-    made = make_map(trial, scene, on_frame)
+    made = build_map(trial, scene, on_frame)
     rate_hz = float(f"{1e3 / made.ms_per_frame:.{_DIGITS}g}")
     write_json(path, {"trial": trial.key, "rate_hz": rate_hz})
     return rate_hz

@@ -28,9 +28,10 @@ from gausslite.domain.state import State
 from gausslite.errors import DatasetError, InvalidInputError
 from gausslite.evaluation.views import MIN_ROI_PIXELS, HeldOutView
 from gausslite.mission.settings import SceneKnowledge
+from gausslite.perception.relevance_estimator import RelevanceEstimate
 from gausslite.perception.fixed_relevance import RegionRelevanceEstimator
 from gausslite.perception.vocabulary import head_of
-from gausslite_bench.quality.pairs import HomePair
+from gausslite_bench.quality.home_tasks import HomeTask
 
 _WALKS = (0, 1)
 _FIRST_WALK_SHARE = 2 / 3
@@ -112,7 +113,7 @@ class ScenePlan(Protocol):
 class HomeScenePlan:
     """A pair in its simulated home: both training walks with a real camera's flaws, held-out views without."""
 
-    pair: HomePair
+    pair: HomeTask
     frames: int = 60
     views: int = 24
     seed: int = 0
@@ -274,18 +275,14 @@ class RecordedRelevanceEstimator:
         """None: nothing has to be found."""
         return ()
 
-    def estimate(self, frame: Frame, rendered_depth_m: Float32[ndarray, "h w"] | None = None) -> RelevanceMap:
+    def estimate(self, frame: Frame, rendered_depth_m: Float32[ndarray, "h w"] | None = None) -> RelevanceEstimate:
         """The ground truth."""
         del rendered_depth_m
-        return self._masks[frame]
-
-    def late(self) -> None:
-        """Nothing: every frame's relevance is known at once."""
-        return
+        return RelevanceEstimate(self._masks[frame])
 
     def evaluate_past(self, frame: Frame) -> RelevanceMap:
         """The ground truth."""
-        return self.estimate(frame)
+        return self._masks[frame]
 
     def state(self) -> State:
         """Nothing: every frame's relevance is looked up."""
@@ -314,4 +311,4 @@ def _scene(
         came = f"{len(usable)} and {len(seen)}"
         raise DatasetError(f"{task!r}: expected training frames and held-out views with depth, got {came}")
     attention = RegionRelevanceEstimator(regions)
-    return Scene(task, usable, [attention.estimate(frame) for frame in usable], seen, knowledge)
+    return Scene(task, usable, [attention.estimate(frame).relevance for frame in usable], seen, knowledge)

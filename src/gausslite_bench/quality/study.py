@@ -17,42 +17,42 @@ from numpy import ndarray
 from gausslite.errors import GaussLiteError, StorageError
 from gausslite.evaluation.compare import PerceptualDistance
 from gausslite.evaluation.pictures import comparison_sheet, write_png
-from gausslite.evaluation.views import most_telling
+from gausslite.evaluation.views import largest_roi_views
 from gausslite.mission.results import prepare_folder, write_json
-from gausslite_bench.quality.code_hash import code_hash_of
+from gausslite_bench.quality.code_hash import current_code_hash
 from gausslite_bench.quality.scenes import Scene, ScenePlan, UnseenRegionError
 from gausslite_bench.quality.trials import (
     PICTURES,
-    Budget,
     Conditions,
-    MadeMap,
     Pictures,
     Trial,
+    TrialBudget,
+    TrialMap,
     TrialResult,
     Variant,
-    judge_map,
-    make_map,
+    build_map,
+    evaluate_map,
 )
 
 
 class Origin(StrEnum):
     """How a study came by a trial's result."""
 
-    MADE = "made"
-    MADE_AGAIN = "made again, as other code had made the kept one"
-    KEPT = "kept"
-    KEPT_OF_OTHER_CODE = "kept, made by other code"
+    COMPUTED = "made"
+    RECOMPUTED = "made again, as other code had made the kept one"
+    CACHED = "kept"
+    CACHED_OTHER_CODE = "kept, made by other code"
 
 
 @runtime_checkable
-class Watcher(Protocol):
+class StudyObserver(Protocol):
     """Is told how a study goes on."""
 
     def frame(self, gaussians: int) -> None:
         """A frame was mapped."""
         ...
 
-    def finished(self, done: Finished) -> None:
+    def finished(self, done: FinishedTrial) -> None:
         """A trial has its result."""
         ...
 
@@ -67,7 +67,7 @@ class Study:
 
     plans: Sequence[ScenePlan]
     variants: Sequence[Variant]
-    budgets: Sequence[Budget]
+    budgets: Sequence[TrialBudget]
     seeds: Sequence[int]
     conditions: Conditions
 
@@ -92,7 +92,7 @@ class Study:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Finished:
+class FinishedTrial:
     """A trial, what it gave, and whether that was known before."""
 
     trial: Trial
@@ -102,37 +102,37 @@ class Finished:
     @property
     def of_other_code(self) -> bool:
         """Whether its figures are of other code than this program's."""
-        return self.origin is Origin.KEPT_OF_OTHER_CODE
+        return self.origin is Origin.CACHED_OTHER_CODE
 
 
 @dataclass(frozen=True, slots=True)
-class Kept:
-    """A result from an archive, and the fingerprint of the code that gave it."""
+class CachedTrial:
+    """A result from an archive, and the hash_files of the code that gave it."""
 
     result: TrialResult
     code: str
 
 
-class Archive:
+class TrialCache:
     """A folder of finished trials: in trials/ a record each and what its map looked like, in sheets/ comparisons.
 
-    code is the fingerprint of what runs now, taken before any trial does: the files may change while one runs.
+    code is the hash_files of what runs now, taken before any trial does: the files may change while one runs.
     """
 
     def __init__(self, folder: Path) -> None:
         """Raises StorageError where the folder cannot be written."""
-        self.code = code_hash_of()
+        self.code = current_code_hash()
         self._trials, self._sheets = folder / "trials", folder / "sheets"
         for part in (self._trials, self._sheets):
             prepare_folder(part)
 
-    def recall(self, trial: Trial, with_lpips: bool) -> Kept | None:
+    def recall(self, trial: Trial, with_lpips: bool) -> CachedTrial | None:
         """The result of a finished trial, whatever code gave it; None when there is none, one whose pictures are gone,
         or one without the LPIPS that is wanted now.
         """
         try:
             record = json.loads(self._record(trial).read_text())
-            kept = Kept(TrialResult.from_json(record["result"]), str(record["code"]))
+            kept = CachedTrial(TrialResult.from_json(record["result"]), str(record["code"]))
             pictures = [self._picture(trial, position) for position in record["pictures"]]
         except (OSError, ValueError, KeyError, TypeError, GaussLiteError):
             return None
@@ -154,7 +154,7 @@ class Archive:
 
     def draw_sheets(self, trials: Sequence[Trial], scene: Scene) -> None:
         """Write ground truth and these trials' maps side by side, with crops of the region. Raises StorageError."""
-        for position in sorted(most_telling(scene.held_out, PICTURES)):
+        for position in sorted(largest_roi_views(scene.held_out, PICTURES)):
             drawings = {trial.variant.label: self._drawing(trial, position) for trial in trials}
             sheet = comparison_sheet(scene.held_out[position], drawings)
             write_png(self._sheets / f"{trials[0].plan.name}-view-{position:03d}.png", sheet)
@@ -175,23 +175,23 @@ class Archive:
         return self._trials / f"{trial.key}-view-{position:03d}.png"
 
 
-class _Shelf:
+class _MapCache:
     """Maps that know no task, kept for the other tasks in the same place: what is judged again is not made again."""
 
     def __init__(self) -> None:
         self._place: Mapping[str, object] = {}
-        self._maps: dict[str, MadeMap] = {}
+        self._maps: dict[str, TrialMap] = {}
 
     def enter(self, plan: ScenePlan) -> None:
         """Forget the maps of another place."""
         if plan.place() != self._place:
             self._place, self._maps = plan.place(), {}
 
-    def take(self, trial: Trial, scene: Scene, watcher: Watcher) -> MadeMap:
+    def take(self, trial: Trial, scene: Scene, watcher: StudyObserver) -> TrialMap:
         """The trial's map, made unless it is here. Raises GaussLiteError."""
         made = self._maps.get(trial.map_key)
         if made is None:
-            made = make_map(trial, scene, watcher.frame)
+            made = build_map(trial, scene, watcher.frame)
         if not trial.follows_task:
             self._maps[trial.map_key] = made
         return made
@@ -199,18 +199,18 @@ class _Shelf:
 
 def run_study(
     study: Study,
-    archive: Archive,
+    archive: TrialCache,
     perceptual: PerceptualDistance | None,
-    watcher: Watcher,
+    watcher: StudyObserver,
     reuse_other_code: bool = False,
-) -> list[Finished]:
+) -> list[FinishedTrial]:
     """Run what is not finished yet. A scene's frames are made only if one of its trials needs them.
 
     What other code finished is made again, unless it may be reused. A scene whose region is in no held-out view is left
     out. Raises UnseenRegionError where that leaves nothing.
     """
-    finished: list[Finished] = []
-    shelf = _Shelf()
+    finished: list[FinishedTrial] = []
+    shelf = _MapCache()
     unseen: UnseenRegionError | None = None
     for plan in study.plans:
         shelf.enter(plan)
@@ -230,9 +230,9 @@ def run_study(
             else:
                 assert scene is not None
                 made = shelf.take(trial, scene, watcher)
-                result, pictures = judge_map(made, trial, scene, perceptual)
+                result, pictures = evaluate_map(made, trial, scene, perceptual)
                 archive.keep(trial, result, pictures)
-            finished.append(Finished(trial, result, origin))
+            finished.append(FinishedTrial(trial, result, origin))
             watcher.finished(finished[-1])
         if scene is not None:
             archive.draw_sheets(trials[: len(study.variants)], scene)
@@ -241,19 +241,21 @@ def run_study(
     return finished
 
 
-def expected_origins(study: Study, archive: Archive, with_lpips: bool, reuse_other_code: bool) -> Counter[Origin]:
+def expected_origins(study: Study, archive: TrialCache, with_lpips: bool, reuse_other_code: bool) -> Counter[Origin]:
     """How many trials run_study would make and how many it would take from the archive."""
     trials = (trial for plan in study.plans for trial in study.trials(plan))
     return Counter(_look_up(trial, archive, with_lpips, reuse_other_code)[1] for trial in trials)
 
 
-def _look_up(trial: Trial, archive: Archive, with_lpips: bool, reuse_other_code: bool) -> tuple[Kept | None, Origin]:
+def _look_up(
+    trial: Trial, archive: TrialCache, with_lpips: bool, reuse_other_code: bool
+) -> tuple[CachedTrial | None, Origin]:
     kept = archive.recall(trial, with_lpips)
     if kept is None:
-        return None, Origin.MADE
+        return None, Origin.COMPUTED
     if kept.code == archive.code:
-        return kept, Origin.KEPT
-    return (kept, Origin.KEPT_OF_OTHER_CODE) if reuse_other_code else (None, Origin.MADE_AGAIN)
+        return kept, Origin.CACHED
+    return (kept, Origin.CACHED_OTHER_CODE) if reuse_other_code else (None, Origin.RECOMPUTED)
 
 
 def _summary(trial: Trial) -> Mapping[str, object]:

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from statistics import fmean, pstdev
 
-from gausslite_bench.quality.study import Finished
-from gausslite_bench.quality.trials import Budget
+from gausslite_bench.quality.study import FinishedTrial
+from gausslite_bench.quality.trials import TrialBudget
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +62,7 @@ class Figure:
 class Scoreboard:
     """Looks a study's results up by scene, variant and budget."""
 
-    def __init__(self, finished: Sequence[Finished]) -> None:
+    def __init__(self, finished: Sequence[FinishedTrial]) -> None:
         self._finished = list(finished)
         trials = [each.trial for each in finished]
         self.scenes = list(dict.fromkeys(trial.plan.name for trial in trials))
@@ -81,7 +81,7 @@ class Scoreboard:
         text = f"**{others} of these {count} trials were made by other code: their figures may not compare.**"
         return [text] if others else []
 
-    def figure(self, scene: str, variant: str, metric: Metric, budget: Budget) -> Figure | None:
+    def figure(self, scene: str, variant: str, metric: Metric, budget: TrialBudget) -> Figure | None:
         """Over the seeds; None where no trial has it."""
         results = [each.result for each in self._of(scene, variant, budget)]
         scores = [result.fitted if metric.fitted else result.scores for result in results]
@@ -89,19 +89,19 @@ class Scoreboard:
         known = [value for value in values if value is not None]
         return Figure(fmean(known), pstdev(known)) if known else None
 
-    def mean(self, scenes: Sequence[str], variant: str, metric: Metric, budget: Budget) -> float | None:
+    def mean(self, scenes: Sequence[str], variant: str, metric: Metric, budget: TrialBudget) -> float | None:
         """Over these scenes; None where one of them does not have it."""
         figures = [self.figure(scene, variant, metric, budget) for scene in scenes]
         known = [figure.mean for figure in figures if figure is not None]
         return fmean(known) if known and len(known) == len(figures) else None
 
-    def margin(self, scene: str, metric: Metric, budget: Budget) -> float | None:
+    def margin(self, scene: str, metric: Metric, budget: TrialBudget) -> float | None:
         """How far the first variant is before the best other; None with a single variant or without the figure."""
         ours, *others = (self.figure(scene, variant, metric, budget) for variant in self.variants)
         known = [other.mean for other in others if other is not None]
         return ours.mean - max(known) if ours is not None and known else None
 
-    def margins(self, metric: Metric, budget: Budget) -> list[float]:
+    def margins(self, metric: Metric, budget: TrialBudget) -> list[float]:
         """Of the scenes that have the figure."""
         return [m for scene in self.scenes if (m := self.margin(scene, metric, budget)) is not None]
 
@@ -118,7 +118,7 @@ class Scoreboard:
         """What the robot was asked to do."""
         return next(each.trial.plan.task for each in self._finished if each.trial.plan.name == scene)
 
-    def cost(self, variant: str, budget: Budget) -> tuple[float, float]:
+    def cost(self, variant: str, budget: TrialBudget) -> tuple[float, float]:
         """Mean iterations and milliseconds a frame, over all scenes and seeds."""
         results = [result for scene in self.scenes for result in (e.result for e in self._of(scene, variant, budget))]
         return fmean(r.iterations_mean for r in results), fmean(r.ms_per_frame for r in results)
@@ -131,7 +131,7 @@ class Scoreboard:
             "summary": [self._summary(budget) for budget in self.budgets],
         }
 
-    def _of(self, scene: str, variant: str, budget: Budget) -> list[Finished]:
+    def _of(self, scene: str, variant: str, budget: TrialBudget) -> list[FinishedTrial]:
         return [
             each
             for each in self._finished
@@ -157,7 +157,7 @@ class Scoreboard:
                 )
         return {"scene": scene, "task": self.task(scene), "roi_share": self.roi_share(scene), "results": results}
 
-    def _summary(self, budget: Budget) -> dict[str, object]:
+    def _summary(self, budget: TrialBudget) -> dict[str, object]:
         metrics = (*RAW_PSNR, ROI_METRICS[1], *FITTED_METRICS)
         known = {metric.name: self.margins(metric, budget) for metric in metrics}
         return {
@@ -215,7 +215,7 @@ def _by_component(board: Scoreboard, scenes: Sequence[str]) -> str:
     return _markdown(rows)
 
 
-def _by_place(board: Scoreboard, metrics: Sequence[Metric], budget: Budget) -> str:
+def _by_place(board: Scoreboard, metrics: Sequence[Metric], budget: TrialBudget) -> str:
     places: dict[str, list[str]] = {}
     for scene in board.scenes:
         places.setdefault(scene.rsplit("-", 1)[0], []).append(scene)
@@ -228,7 +228,7 @@ def _by_place(board: Scoreboard, metrics: Sequence[Metric], budget: Budget) -> s
     return _markdown(rows)
 
 
-def _by_scene(board: Scoreboard, roi_and_full: tuple[Metric, Metric], budget: Budget) -> str:
+def _by_scene(board: Scoreboard, roi_and_full: tuple[Metric, Metric], budget: TrialBudget) -> str:
     roi, _ = roi_and_full
     rows = [["pair", "task", "ROI", *board.variants, "margin", "full margin"]]
     for scene in board.scenes:
@@ -239,7 +239,7 @@ def _by_scene(board: Scoreboard, roi_and_full: tuple[Metric, Metric], budget: Bu
     return _markdown(rows)
 
 
-def _in_words(board: Scoreboard, budget: Budget) -> str:
+def _in_words(board: Scoreboard, budget: TrialBudget) -> str:
     lines = []
     for (roi, full), how in ((RAW_PSNR, ""), (FITTED_METRICS, " with views fitted")):
         margins, beside = board.margins(roi, budget), board.margins(full, budget)

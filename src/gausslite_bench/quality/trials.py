@@ -17,9 +17,9 @@ from numpy import ndarray
 from gausslite.domain.gaussians import Gaussians
 from gausslite.errors import InvalidInputError
 from gausslite.evaluation.compare import MapScores, PerceptualDistance, average, score_view
-from gausslite.evaluation.fitted import draw_fitted
-from gausslite.evaluation.pictures import as_bytes
-from gausslite.evaluation.views import MapViewer, most_telling
+from gausslite.evaluation.fitted import render_fitted
+from gausslite.evaluation.pictures import to_uint8
+from gausslite.evaluation.views import MapViewer, largest_roi_views
 from gausslite.mapping.policies import TASK
 from gausslite.mission.build import build_mapper, build_relevance_estimator
 from gausslite.mission.frame_scheduler import Clock, FrameScheduler
@@ -41,7 +41,7 @@ class BudgetMode(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Budget:
+class TrialBudget:
     """What every policy may spend: Gaussians in all, and iterations or 1 / rate_hz seconds a frame.
 
     rate_hz None: a rate is still to be measured (`pacing`), where it is time that is equal.
@@ -99,7 +99,7 @@ class Trial:
 
     plan: ScenePlan
     variant: Variant
-    budget: Budget
+    budget: TrialBudget
     seed: int
     conditions: Conditions
 
@@ -178,7 +178,7 @@ Pictures = dict[int, UInt8[ndarray, "h w 3"]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class MadeMap:
+class TrialMap:
     """A trial's map at the end of its mission. ms_per_frame counts perception and mapping."""
 
     gaussians: Gaussians
@@ -186,7 +186,7 @@ class MadeMap:
     ms_per_frame: float
 
 
-def make_map(trial: Trial, scene: Scene, on_frame: Callable[[int], None]) -> MadeMap:
+def build_map(trial: Trial, scene: Scene, on_frame: Callable[[int], None]) -> TrialMap:
     """Map the scene; on_frame hears the number of Gaussians after each frame. Raises GaussLiteError."""
     settings = trial.mission
     attention = _attention(trial, scene)
@@ -199,27 +199,27 @@ def make_map(trial: Trial, scene: Scene, on_frame: Callable[[int], None]) -> Mad
     for frame in scene.training:
         outcomes.append(loop.process(frame))
         on_frame(outcomes[-1].gaussians)
-    return MadeMap(
+    return TrialMap(
         gaussians=loop.gaussians(),
         iterations_mean=fmean(outcome.iterations for outcome in outcomes),
         ms_per_frame=1e3 * fmean(outcome.timing.seconds for outcome in outcomes),
     )
 
 
-def judge_map(
-    made: MadeMap, trial: Trial, scene: Scene, perceptual: PerceptualDistance | None
+def evaluate_map(
+    made: TrialMap, trial: Trial, scene: Scene, perceptual: PerceptualDistance | None
 ) -> tuple[TrialResult, Pictures]:
     """Score a map on the scene's held-out views, and draw those that tell most. Raises GaussLiteError."""
     viewer = MapViewer(made.gaussians, choose_rasterizer(threads=trial.conditions.threads))
-    shown = most_telling(scene.held_out, PICTURES)
+    shown = largest_roi_views(scene.held_out, PICTURES)
     scores, fitted, pictures = [], [], {}
     for i, view in enumerate(scene.held_out):
-        drawn = viewer.draw_frame(view.frame)
+        drawn = viewer.render_frame(view.frame)
         scores.append(score_view(drawn, view, perceptual))
         if trial.plan.trust.fit_views:
-            fitted.append(score_view(draw_fitted(viewer, view.frame), view, perceptual))
+            fitted.append(score_view(render_fitted(viewer, view.frame), view, perceptual))
         if i in shown:
-            pictures[i] = as_bytes(drawn.rgb)
+            pictures[i] = to_uint8(drawn.rgb)
     result = TrialResult(
         scores=average(scores),
         fitted=average(fitted) if fitted else None,

@@ -18,7 +18,7 @@ from numpy import ndarray
 from gausslite.errors import KernelError
 from gausslite.optimize.parameters import SplatTable
 from gausslite.render.rasterizer import ROW_WIDTH, TILE_PX
-from gausslite_bench.raster.scene import BenchView
+from gausslite_bench.raster.procedural_room import BenchView
 
 _FUSED_L1, _L1_AND_SSIM = 1, 2
 _PLANES = 5

@@ -13,7 +13,7 @@ from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.region import BallRegion
 from gausslite.errors import InvalidInputError
-from gausslite.evaluation.compare import MOST_DB, average, evaluate, score_view
+from gausslite.evaluation.compare import MAX_PSNR_DB, average, evaluate, score_view
 from gausslite.evaluation.metrics import psnr
 from gausslite.evaluation.views import HeldOutView, MapViewer
 
@@ -36,7 +36,7 @@ def frame_of(gaussians: Gaussians, x_m: float = 0.0) -> Frame:
     """What a perfect camera at (x, 0, 0) would record of the map."""
     T_world_camera = np.eye(4)
     T_world_camera[0, 3] = x_m
-    drawn = MapViewer(gaussians, ReferenceRasterizer()).draw(CAMERA, T_world_camera)
+    drawn = MapViewer(gaussians, ReferenceRasterizer()).render(CAMERA, T_world_camera)
     rgb = np.rint(drawn.rgb * 255).astype(np.uint8)
     return Frame(int(100 * x_m), 0, rgb, drawn.expected_depth_m(), CAMERA, T_world_camera)
 
@@ -64,7 +64,7 @@ def test_an_equal_picture_leaves_means_that_are_numbers() -> None:
     frame = frame_of(wall())
     drawn = Rendering(frame.rgb / np.float32(255.0), frame.depth_m, np.ones_like(frame.depth_m), None)
     scores = average([score_view(drawn, view_with(frame, 100)), score_view(drawn, view_with(frame, 0))])
-    assert scores.roi_psnr == scores.full_psnr == MOST_DB
+    assert scores.roi_psnr == scores.full_psnr == MAX_PSNR_DB
 
 
 def test_another_map_scores_worse() -> None:
@@ -90,7 +90,7 @@ def test_coverage_tells_the_left_half_of_a_map_from_the_whole_where_depth_was_me
     view = HeldOutView(replace(frame, depth_m=on_the_right), np.ones(frame.depth_m.shape, np.bool_))
     scores = [evaluate(gaussians, [view], ReferenceRasterizer()) for gaussians in (whole, half)]
     assert scores[0].roi_covered == pytest.approx(1.0)
-    drawn = MapViewer(half, ReferenceRasterizer()).draw_frame(frame)
+    drawn = MapViewer(half, ReferenceRasterizer()).render_frame(frame)
     assert scores[1].roi_covered == pytest.approx((drawn.alpha[:, 10:] > 0.5).mean()) == pytest.approx(0.5, abs=0.1)
     unmeasured = HeldOutView(replace(frame, depth_m=np.zeros_like(on_the_right)), view.roi)
     assert evaluate(whole, [unmeasured], ReferenceRasterizer()).roi_covered is None
@@ -100,7 +100,7 @@ def test_a_view_with_few_roi_pixels_counts_for_the_whole_image_only() -> None:
     gaussians = wall()
     frame = frame_of(gaussians)
     viewer = MapViewer(gaussians, ReferenceRasterizer())
-    drawn = viewer.draw_frame(frame)
+    drawn = viewer.render_frame(frame)
     seen, unseen = (score_view(drawn, view_with(frame, n)) for n in (64, 63))
     assert unseen.roi is None
     scores = average([seen, unseen])
@@ -113,7 +113,7 @@ def test_scores_are_means_over_views() -> None:
     gaussians = wall()
     frames = [frame_of(wall(seed=seed)) for seed in (1, 2)]
     viewer = MapViewer(gaussians, ReferenceRasterizer())
-    each = [score_view(viewer.draw_frame(frame), view_with(frame, 300)) for frame in frames]
+    each = [score_view(viewer.render_frame(frame), view_with(frame, 300)) for frame in frames]
     assert average(each).full_psnr == pytest.approx((each[0].psnr + each[1].psnr) / 2)
 
 

@@ -30,7 +30,7 @@ def mapped(kitchen: Path, out: Path, *more: str) -> Path:
 def test_the_report_beside_a_map_says_how_it_is_scored(
     kitchen: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    made = mapped(kitchen, tmp_path / "out", "--colour-camera", CAMERA, "--view-error", VIEW_ERROR)
+    made = mapped(kitchen, tmp_path / "out", "--register-depth", CAMERA, "--pose-prior", VIEW_ERROR)
 
     def score(*more: str) -> tuple[dict[str, float], str]:
         capsys.readouterr()
@@ -39,9 +39,9 @@ def test_the_report_beside_a_map_says_how_it_is_scored(
         return json.loads(said.out), said.err
 
     scores, told = score()
-    assert told == f"as the report beside map.ply says: --colour-camera {CAMERA} --fit-views\n"
-    assert scores == score("--colour-camera", CAMERA, "--fit-views")[0]
-    raw, told = score("--colour-camera", CAMERA, "--no-fit-views")
+    assert told == f"as the report beside map.ply says: --register-depth {CAMERA} --fit-views\n"
+    assert scores == score("--register-depth", CAMERA, "--fit-views")[0]
+    raw, told = score("--register-depth", CAMERA, "--no-fit-views")
     assert (scores["fitted"], raw["fitted"], told) == (True, False, "")
     (made.parent / "report.json").write_text("[]")
     assert read_report(made.parent) == {}
@@ -51,17 +51,17 @@ def test_the_report_beside_a_map_says_how_it_is_scored(
 def test_frames_that_are_held_out_are_those_that_eval_scores(
     kitchen: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    asked = ("--colour-camera", "none", "--view-error", "none", "--hold-out", "5")
+    asked = ("--register-depth", "none", "--pose-prior", "none", "--test-every", "5")
     made = mapped(kitchen, tmp_path / "out", *asked)
     report = json.loads((made.parent / "report.json").read_text())
     assert (report["frames"], report["hold_out"], report["view_error"]) == (8, 5, None)
     capsys.readouterr()
-    assert main(["eval", str(made), str(kitchen), "--threads", "1", "--json", "--hold-out", "5"]) == 0
+    assert main(["eval", str(made), str(kitchen), "--threads", "1", "--json", "--test-every", "5"]) == 0
     assert json.loads(capsys.readouterr().out)["n_views"] == 2
 
 
 def test_a_map_comes_with_a_picture_of_it_beside_photographs(kitchen: Path, tmp_path: Path) -> None:
-    made = mapped(kitchen, tmp_path / "out", "--colour-camera", "none", "--view-error", "none")
+    made = mapped(kitchen, tmp_path / "out", "--register-depth", "none", "--pose-prior", "none")
     preview = cv2.imread(str(made.parent / "preview.png"))
     # two keyframes in ten frames: a row each, of photograph, map, and the region in both
     assert preview.shape[1] > 4 * 320

@@ -19,7 +19,7 @@ from gausslite.task.backends import Backend, BackendSettings, open_parser
 from gausslite.task.language.model import Message, Role
 from gausslite.task.language.onnx import OnnxLanguageModel, phi3_chat
 from gausslite.task.language.prompt import MAX_PHRASE_CHARS, MAX_PHRASES, MAX_RELATIONS, messages_for
-from gausslite_bench.parser_bench import load_sentences
+from gausslite_bench.parser_scores import load_sentences
 
 TASKS = int(os.environ.get("GAUSSLITE_ONNX_TASKS", "5"))
 _NEEDED = ("onnxruntime_genai", "transformers", "tokenizers", "torch", "onnx_ir")

@@ -15,7 +15,7 @@ from gausslite.task.parser import task_id_of
 from gausslite.task.rules import RuleParser
 from gausslite.task.singular import singular
 from gausslite.task.validate import require_graph
-from gausslite_bench.parser_bench import SENTENCES as BENCH_SENTENCES
+from gausslite_bench.parser_scores import SENTENCES as BENCH_SENTENCES
 
 SENTENCES = json.loads(BENCH_SENTENCES.read_text(encoding="utf-8"))
 PAPER_SENTENCES = 6

@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import UInt8
 from numpy import ndarray
 
-from gausslite.evaluation.pictures import cell, grid, lit, outlined
-from gausslite_bench.perception.bench import Marks, PerceptionStage
+from gausslite.evaluation.pictures import arrange_grid, dim_outside, labelled_image, outline_roi
+from gausslite_bench.perception.stage_scores import Marks, PerceptionStage
 
 _BOX_RGB = (80, 220, 255)
 
@@ -34,13 +34,18 @@ class PerceptionSheet:
 
     def draw(self) -> UInt8[ndarray, "H W 3"]:
         """The frames taken in, one a row."""
-        return grid([row for _, (_, row) in sorted(self._rows.items())])
+        return arrange_grid([row for _, (_, row) in sorted(self._rows.items())])
 
 
 def row_of(marks: Marks) -> list[UInt8[ndarray, "H W 3"]]:
-    """The image with boxes and truth, then the image lit where each step marked it."""
-    named = cell(_boxed(outlined(marks.frame.rgb, marks.truth), marks), f"frame {marks.frame.index}: boxes, truth")
-    return [named, *(cell(lit(marks.frame.rgb, marks.masks[step]), str(step)) for step in PerceptionStage)]
+    """The image with boxes and truth, then the image dim_outside where each step marked it."""
+    named = labelled_image(
+        _boxed(outline_roi(marks.frame.rgb, marks.truth), marks), f"frame {marks.frame.index}: boxes, truth"
+    )
+    return [
+        named,
+        *(labelled_image(dim_outside(marks.frame.rgb, marks.masks[step]), str(step)) for step in PerceptionStage),
+    ]
 
 
 def _boxed(image: UInt8[ndarray, "h w 3"], marks: Marks) -> UInt8[ndarray, "h w 3"]:

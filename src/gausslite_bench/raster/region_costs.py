@@ -16,8 +16,8 @@ from gausslite.errors import InvalidInputError
 from gausslite.optimize.parameters import SplatTable
 from gausslite.render.cpu import CpuRasterizer
 from gausslite.render.rasterizer import TILE_PX, LossWeights
-from gausslite_bench.raster.scene import BenchView
-from gausslite_bench.raster.step import LOSSES, TURN, Duration, RestingStep, timed
+from gausslite_bench.raster.procedural_room import BenchView
+from gausslite_bench.raster.repeated_step import LOSSES, TURN, Duration, RestingStep, timed
 
 SHARES_PERCENT = (5.0, 10.0, 20.0, 50.0, 100.0)
 
@@ -104,7 +104,7 @@ class _Case:
 
     def turn(self, loss: LossWeights, repetitions: int) -> None:
         """Time some steps."""
-        with self._step.holding():
+        with self._step.bind_tables():
             self.seconds += timed([functools.partial(self._step, loss)], repetitions)[0]
             self.evaluations = self._rasterizer.block_evaluations()
 

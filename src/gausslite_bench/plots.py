@@ -18,7 +18,7 @@ Curves = Mapping[str, Sequence[tuple[float, float]]]
 """Points (x, y) by the name of their line; each line has one at least."""
 
 
-def draw_panels(panels: Mapping[str, Curves], x_label: str, y_label: str) -> UInt8[ndarray, "H W 3"]:
+def plot_panels(panels: Mapping[str, Curves], x_label: str, y_label: str) -> UInt8[ndarray, "H W 3"]:
     """The panels one below the other, each with its title, axes and legend."""
     return np.concatenate([_panel(title, curves, x_label, y_label) for title, curves in panels.items()])
 

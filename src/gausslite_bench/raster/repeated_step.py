@@ -14,7 +14,7 @@ from numpy import ndarray
 from gausslite.optimize.parameters import SplatTable
 from gausslite.render.cpu import CpuRasterizer
 from gausslite.render.rasterizer import FULL_FRAME, AdamSettings, LossWeights, Subset
-from gausslite_bench.raster.scene import BenchView
+from gausslite_bench.raster.procedural_room import BenchView
 
 LOSSES = {
     "fused_l1": LossWeights(colour=0.8, depth=1.0, ssim=0.0),
@@ -72,9 +72,9 @@ class RestingStep:
         self._masked = pixels is not None
         self._subset = FULL_FRAME if tiles is None else Subset(tiles=tiles)
 
-    def holding(self) -> AbstractContextManager[None]:
+    def bind_tables(self) -> AbstractContextManager[None]:
         """Lend the tables for many iterations, as the mapper does."""
-        return self._rasterizer.holding(*self._lent)
+        return self._rasterizer.bind_tables(*self._lent)
 
     def __call__(self, loss: LossWeights) -> None:
         """One iteration."""

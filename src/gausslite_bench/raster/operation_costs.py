@@ -15,11 +15,11 @@ from gausslite.optimize.parameters import SplatTable
 from gausslite.render.cpu import CpuRasterizer
 from gausslite.render.cpu_kernels import core_clock_ghz
 from gausslite.render.rasterizer import Rendering
-from gausslite_bench.raster.cycles import BlockCost
+from gausslite_bench.raster.block_cost import BlockCost
 from gausslite_bench.raster.external_rasterizer import ExternalRasterizer
-from gausslite_bench.raster.region import RegionCost, region_costs
-from gausslite_bench.raster.scene import BenchView, held_view, seed_rows
-from gausslite_bench.raster.step import LOSSES, TURN, Duration, RestingStep, timed
+from gausslite_bench.raster.procedural_room import BenchView, held_view, seed_rows
+from gausslite_bench.raster.region_costs import RegionCost, region_costs
+from gausslite_bench.raster.repeated_step import LOSSES, TURN, Duration, RestingStep, timed
 
 SIZES = ((320, 240), (640, 480))
 GAUSSIANS = (20_000, 100_000, 300_000)
@@ -134,7 +134,7 @@ class _Ours:
 
     def turn(self) -> AbstractContextManager[None]:
         """Lend the table to the rasterizer for as long as it is measured."""
-        return self._train.holding()
+        return self._train.bind_tables()
 
     def fused_l1(self) -> None:
         """One whole iteration with L1 on colour and depth."""

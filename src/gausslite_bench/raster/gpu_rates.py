@@ -23,8 +23,8 @@ from gausslite.mission.frame_scheduler import FrameScheduler
 from gausslite.optimize.density import DensitySettings
 from gausslite.optimize.parameters import SplatTable, rows_to_gaussians
 from gausslite.render.rasterizer import FULL_FRAME, Subset
-from gausslite_bench.raster.scene import BenchView, held_view, seed_rows
-from gausslite_bench.raster.step import LOSSES, RESTING, TURN, Duration
+from gausslite_bench.raster.procedural_room import BenchView, held_view, seed_rows
+from gausslite_bench.raster.repeated_step import LOSSES, RESTING, TURN, Duration
 
 if TYPE_CHECKING:
     from gausslite.render.cuda import CudaRasterizer

@@ -13,18 +13,18 @@ import pytest
 from quality_results import TASK, finished
 
 from gausslite.cli.main import main
-from gausslite_bench.quality.code_hash import code_hash_of, deciding_files, fingerprint
-from gausslite_bench.quality.study import Archive, Kept
-from gausslite_bench.quality.trials import Budget, Trial, TrialResult
+from gausslite_bench.quality.code_hash import current_code_hash, hash_files, trial_source_files
+from gausslite_bench.quality.study import CachedTrial, TrialCache
+from gausslite_bench.quality.trials import Trial, TrialBudget, TrialResult
 
 
-def recalled(archive: Archive, trial: Trial, with_lpips: bool = False) -> TrialResult | None:
+def recalled(archive: TrialCache, trial: Trial, with_lpips: bool = False) -> TrialResult | None:
     kept = archive.recall(trial, with_lpips)
     return None if kept is None else kept.result
 
 
 def test_what_is_finished_is_recalled_unless_lpips_is_wanted(tmp_path: Path) -> None:
-    archive, one = Archive(tmp_path), finished(TASK, 0, 25.0, Budget())
+    archive, one = TrialCache(tmp_path), finished(TASK, 0, 25.0, TrialBudget())
     assert recalled(archive, one.trial) is None
     archive.keep(one.trial, one.result, {})
     assert recalled(archive, one.trial) == one.result
@@ -33,7 +33,7 @@ def test_what_is_finished_is_recalled_unless_lpips_is_wanted(tmp_path: Path) -> 
 
 
 def test_a_trial_whose_picture_is_gone_is_not_kept(tmp_path: Path) -> None:
-    archive, one = Archive(tmp_path), finished(TASK, 0, 25.0, Budget())
+    archive, one = TrialCache(tmp_path), finished(TASK, 0, 25.0, TrialBudget())
     archive.keep(one.trial, one.result, {position: np.zeros((72, 96, 3), np.uint8) for position in (0, 2)})
     assert recalled(archive, one.trial) == one.result
     next((tmp_path / "trials").glob("*-view-002.png")).unlink()
@@ -42,7 +42,7 @@ def test_a_trial_whose_picture_is_gone_is_not_kept(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("record", ["{}", "[]", "1", "", '{"result": {}, "pictures": []}'])
 def test_what_is_no_record_is_not_recalled(record: str, tmp_path: Path) -> None:
-    archive, one = Archive(tmp_path), finished(TASK, 0, 25.0, Budget())
+    archive, one = TrialCache(tmp_path), finished(TASK, 0, 25.0, TrialBudget())
     archive.keep(one.trial, one.result, {})
     next((tmp_path / "trials").glob("*.json")).write_text(record)
     assert recalled(archive, one.trial) is None
@@ -56,20 +56,20 @@ def other_code(folder: Path) -> Path:
 
 
 def test_a_record_tells_which_code_made_it(tmp_path: Path) -> None:
-    archive, one = Archive(tmp_path), finished(TASK, 0, 25.0, Budget())
+    archive, one = TrialCache(tmp_path), finished(TASK, 0, 25.0, TrialBudget())
     archive.keep(one.trial, one.result, {})
-    assert archive.recall(one.trial, with_lpips=False) == Kept(one.result, code_hash_of())
+    assert archive.recall(one.trial, with_lpips=False) == CachedTrial(one.result, current_code_hash())
     other_code(tmp_path)
-    assert archive.recall(one.trial, with_lpips=False) == Kept(one.result, "of yesterday")
+    assert archive.recall(one.trial, with_lpips=False) == CachedTrial(one.result, "of yesterday")
 
 
 def test_code_that_changes_while_a_trial_runs_is_not_told_of_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    archive, one, begun = Archive(tmp_path), finished(TASK, 0, 25.0, Budget()), code_hash_of()
-    monkeypatch.setattr("gausslite_bench.quality.study.code_hash_of", lambda: "of later")
+    archive, one, begun = TrialCache(tmp_path), finished(TASK, 0, 25.0, TrialBudget()), current_code_hash()
+    monkeypatch.setattr("gausslite_bench.quality.study.current_code_hash", lambda: "of later")
     archive.keep(one.trial, one.result, {})
-    assert archive.recall(one.trial, with_lpips=False) == Kept(one.result, begun)
+    assert archive.recall(one.trial, with_lpips=False) == CachedTrial(one.result, begun)
 
 
 def test_a_fingerprint_changes_with_every_byte_and_name(tmp_path: Path) -> None:
@@ -78,11 +78,11 @@ def test_a_fingerprint_changes_with_every_byte_and_name(tmp_path: Path) -> None:
     for texts in (("", ""), ("x", ""), ("", "x"), ("x", "x")):
         for path, text in zip(files, texts, strict=True):
             path.write_text(text)
-        seen.add(fingerprint(files))
-    seen.add(fingerprint(files[::-1]))
-    seen.add(fingerprint(files[:1]))
+        seen.add(hash_files(files))
+    seen.add(hash_files(files[::-1]))
+    seen.add(hash_files(files[:1]))
     assert len(seen) == 6
-    assert fingerprint(files) in seen
+    assert hash_files(files) in seen
 
 
 def test_all_that_a_trial_runs_is_in_its_fingerprint() -> None:
@@ -90,18 +90,18 @@ def test_all_that_a_trial_runs_is_in_its_fingerprint() -> None:
     pytest.importorskip("gausslite.render._kernels", reason="the native kernels are not built")
     program = (
         "import sys\n"
-        "from gausslite_bench.quality.pairs import HOME_PAIRS\n"
+        "from gausslite_bench.quality.home_tasks import HOME_TASKS\n"
         "from gausslite_bench.quality.scenes import HomeScenePlan, PosePolicy\n"
-        "from gausslite_bench.quality.trials import Budget, Conditions, Trial, Variant, judge_map, make_map\n"
-        "plan = HomeScenePlan(HOME_PAIRS[0], frames=2, views=2, trust=PosePolicy(fit_views=True))\n"
-        "trial = Trial(plan, Variant('task', 'task'), Budget(500, iterations=2), 0, Conditions((64, 48)))\n"
+        "from gausslite_bench.quality.trials import TrialBudget, Conditions, Trial, Variant, evaluate_map, build_map\n"
+        "plan = HomeScenePlan(HOME_TASKS[0], frames=2, views=2, trust=PosePolicy(fit_views=True))\n"
+        "trial = Trial(plan, Variant('task', 'task'), TrialBudget(500, iterations=2), 0, Conditions((64, 48)))\n"
         "scene = plan.load((64, 48))\n"
-        "judge_map(make_map(trial, scene, lambda gaussians: None), trial, scene, None)\n"
+        "evaluate_map(build_map(trial, scene, lambda gaussians: None), trial, scene, None)\n"
         "print(*(m.__file__ for n, m in sys.modules.items() if n.startswith('gausslite')), sep='\\n')\n"
     )
     loaded = subprocess.run([sys.executable, "-c", program], capture_output=True, check=True, text=True).stdout.split()
     assert len(loaded) > 50
-    assert set(loaded) <= {str(path) for path in deciding_files()}
+    assert set(loaded) <= {str(path) for path in trial_source_files()}
 
 
 def test_finished_trials_of_other_code_are_made_again_unless_they_may_be_reused(
@@ -130,4 +130,4 @@ def test_finished_trials_of_other_code_are_made_again_unless_they_may_be_reused(
     assert "1 finished trials of other code will be made again; --reuse-other-code takes them" in again.err
     assert "trials: 1 made again, as other code had made the kept one, 1 kept\n" in again.err
     assert "other code" not in again.out
-    assert json.loads(record.read_text())["code"] == code_hash_of()
+    assert json.loads(record.read_text())["code"] == current_code_hash()

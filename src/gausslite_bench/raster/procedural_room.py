@@ -16,7 +16,7 @@ from numpy import ndarray
 from gausslite.domain.camera import Camera, lift
 from gausslite.domain.pose import inverse, transform_points
 from gausslite.errors import InvalidInputError
-from gausslite.render.rasterizer import LOG_SCALE, LOGIT, MEAN, QUAT, RGB, ROW_WIDTH
+from gausslite.render.rasterizer import LOG_SCALE, MEAN, OPACITY_LOGIT, QUAT, RGB, ROW_WIDTH
 
 SEED_VIEWS = 12
 _SEED_SIZE = (640, 480)
@@ -92,7 +92,7 @@ def seed_rows(count: int, opacity: float = 0.5) -> Float32[ndarray, "n 16"]:
     rows[:, MEAN] = means_m
     rows[:, LOG_SCALE] = np.log(np.clip(_SCALE_PER_SPACING * _spacing_m(means_m), *_SCALE_BOUNDS_M))[:, None]
     rows[:, QUAT.start] = 1.0
-    rows[:, LOGIT] = np.log(opacity / (1.0 - opacity))
+    rows[:, OPACITY_LOGIT] = np.log(opacity / (1.0 - opacity))
     rows[:, RGB] = np.concatenate(colours)
     return rows
 

@@ -1,0 +1,89 @@
+"""The 24 pairs of a simulated home and a task, each with the objects that the task is about, and whole homes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+
+from gausslite.errors import InvalidInputError
+
+
+class TaskKind(StrEnum):
+    """What the robot is asked to do (Sec. IV-A)."""
+
+    MANIPULATION = "manipulation"
+    SEARCH = "search"
+    NAVIGATION = "navigation"
+    FULL_FRAME = "everything"
+    """No task of the 24: a home's things all at once, to see what following a task costs where everything matters."""
+
+
+@dataclass(frozen=True, slots=True)
+class HomeTask:
+    """A task in one of the homes; objects are the ground truth of what it is about, none named means all."""
+
+    home: int
+    kind: TaskKind
+    task: str
+    objects: tuple[str, ...]
+
+    @property
+    def name(self) -> str:
+        """Such as home-3-search."""
+        return f"home-{self.home}-{self.kind}"
+
+
+_OFFICE_DESK = ("laptop", "mug_1", "keyboard_1", "mouse_1", "monitor_1", "papers_1", "pen_cup", "plant_1")
+_MEETING_CHAIRS = tuple(f"chair_{i}" for i in range(1, 9))
+_TINS = tuple(f"paint_can_{i}" for i in range(1, 6))
+
+HOME_TASKS = (
+    HomeTask(1, TaskKind.MANIPULATION, "Prepare to pick up the mug on the coffee table", ("mug_1",)),
+    HomeTask(1, TaskKind.SEARCH, "Look for the armchair", ("armchair",)),
+    HomeTask(1, TaskKind.NAVIGATION, "Navigate to the sofa", ("sofa",)),
+    HomeTask(2, TaskKind.MANIPULATION, "Pick up the mug on the nightstand", ("mug",)),
+    HomeTask(2, TaskKind.SEARCH, "Find the shoes next to the bed", ("shoe_1",)),
+    HomeTask(2, TaskKind.NAVIGATION, "Go to the dresser", ("dresser",)),
+    HomeTask(3, TaskKind.MANIPULATION, "Prepare to pick up the bottles on the counter", ("bottle_1", "bottle_2")),
+    HomeTask(3, TaskKind.SEARCH, "Find the bowl on the table", ("bowl",)),
+    HomeTask(3, TaskKind.NAVIGATION, "Avoid the chairs", ("chair_1", "chair_2", "chair_3", "chair_4")),
+    HomeTask(4, TaskKind.MANIPULATION, "Grab the headphones on the desk", ("headphones",)),
+    HomeTask(4, TaskKind.SEARCH, "Look for the plant on the shelf", ("plant_1",)),
+    HomeTask(4, TaskKind.NAVIGATION, "Navigate to the desk", ("desk",)),
+    HomeTask(5, TaskKind.MANIPULATION, "Prepare to pick up the object on the desk", _OFFICE_DESK),
+    HomeTask(5, TaskKind.SEARCH, "Locate the printer", ("printer",)),
+    HomeTask(5, TaskKind.NAVIGATION, "Avoid the office chairs", ("chair_1", "chair_2", "chair_3", "chair_4")),
+    HomeTask(6, TaskKind.MANIPULATION, "Pick up the laptop and the mug on the table", ("laptop", "mug_1", "mug_2")),
+    HomeTask(6, TaskKind.SEARCH, "Search for the screen", ("screen",)),
+    HomeTask(6, TaskKind.NAVIGATION, "Locate all chairs and find a path to the door", (*_MEETING_CHAIRS, "door")),
+    HomeTask(7, TaskKind.MANIPULATION, "Fetch the teapot from the table", ("teapot",)),
+    HomeTask(7, TaskKind.SEARCH, "Look for the plants", ("plant_1", "plant_2", "plant_3")),
+    HomeTask(7, TaskKind.NAVIGATION, "Drive to the sofas", ("sofa_1", "sofa_2")),
+    HomeTask(8, TaskKind.MANIPULATION, "Prepare to pick up the drill on the workbench", ("drill",)),
+    HomeTask(8, TaskKind.SEARCH, "Find the paint cans on the rack", _TINS),
+    HomeTask(8, TaskKind.NAVIGATION, "Navigate to the ladder", ("ladder",)),
+)
+
+WHOLE_HOMES = tuple(HomeTask(home, TaskKind.FULL_FRAME, "Inspect everything", ()) for home in range(1, 9))
+"""Each home with all its things as the region, more than half of the image; chosen by their full names alone."""
+
+
+def choose_home_tasks(asked: Sequence[str]) -> tuple[HomeTask, ...]:
+    """The pairs whose name is, or begins with, one of these ("home-3" is three of them); all when none is asked for.
+
+    Raises InvalidInputError.
+    """
+    tasks = tuple(pair for pair in HOME_TASKS if not asked or any(_fits(pair.name, name) for name in asked))
+    chosen = (*tasks, *(whole for whole in WHOLE_HOMES if whole.name in asked))
+    unknown = [name for name in asked if not any(_fits(pair.name, name) for pair in chosen)]
+    if unknown:
+        kinds = ", ".join(TaskKind)
+        raise InvalidInputError(
+            f"pairs: expected names such as home-3 or home-3-search (1 to 8; {kinds}), got {', '.join(unknown)}"
+        )
+    return chosen
+
+
+def _fits(name: str, asked: str) -> bool:
+    return name == asked or name.startswith(f"{asked}-")
