@@ -20,7 +20,7 @@ from gausslite.domain.state import State
 from gausslite.domain.task import TaskGraph
 from gausslite.mission.settings import MissionSettings
 from gausslite.perception.fixed_relevance import RegionRelevanceEstimator
-from gausslite.perception.relevance_estimator import RelevanceEstimator
+from gausslite.perception.relevance_estimator import RelevanceEstimate, RelevanceEstimator
 from gausslite.task.rules import RuleParser
 from gausslite.v1 import agent_service_pb2_grpc as pb_grpc
 from gausslite.wire.change_notifier import ChangeNotifier
@@ -50,18 +50,15 @@ class Gate:
     def notes(self) -> tuple[str, ...]:
         return self.inner.notes
 
-    def attend(self, frame: Frame, rendered_depth_m: np.ndarray | None = None) -> RelevanceMap:
+    def estimate(self, frame: Frame, rendered_depth_m: np.ndarray | None = None) -> RelevanceEstimate:
         self.reached.set()
         assert self.opened.wait(20)
         if frame.index == self.fail_at:
             raise self.failure
-        return self.inner.attend(frame, rendered_depth_m)
+        return self.inner.estimate(frame, rendered_depth_m)
 
-    def late(self) -> None:
-        return None
-
-    def look_back(self, frame: Frame) -> RelevanceMap | None:
-        return self.inner.look_back(frame)
+    def evaluate_past(self, frame: Frame) -> RelevanceMap | None:
+        return self.inner.evaluate_past(frame)
 
     def state(self) -> State:
         return {}

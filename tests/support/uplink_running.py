@@ -78,11 +78,11 @@ class ScriptedServer(pb_grpc.FusionServiceServicer):
     async def ContributeSubsets(self, request_iterator: Any, context: Any) -> Any:
         async for request in request_iterator:
             subset, _ = decode_subset(request.subset)
-            self.subsets.append(subset.words)
+            self.subsets.append(subset.batch)
             self.messages.append(request.subset)
             self.revisions.append(subset.map_revision)
             self.came.set()
-            answer = self._answer(len(self.subsets), subset.words)
+            answer = self._answer(len(self.subsets), subset.batch)
             if isinstance(answer, GaussLiteError):
                 raise answer
             answer.sequence = request.sequence

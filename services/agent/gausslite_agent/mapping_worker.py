@@ -240,7 +240,7 @@ class MappingWorker:
 
     def _rehearse(self) -> None:
         assert self._task_mapper is not None
-        if self._rehearsals_left == 0 or not self._task_mapper.rehearse():
+        if self._rehearsals_left == 0 or not self._task_mapper.idle_step():
             self._end_rest()
             return
         self._rehearsals_left -= 1

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from google.protobuf.message import DecodeError
 
-from gausslite.domain.state import State, take, take_counts, take_text, text, whole_numbers
+from gausslite.domain.state import State, encode_text, get_array, get_counts, get_text, int_array
 from gausslite.domain.task import TaskGraph
 from gausslite.errors import GaussLiteError, MapFileError
 from gausslite.mission.checkpoint import ResumeConfig, SavedRun

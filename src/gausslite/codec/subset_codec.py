@@ -81,7 +81,7 @@ def encode_subset(subset: RoiSubset, grid: VoxelGrid) -> bytes:
 
     Raises InvalidInputError when a value is not finite, out of its range or a mean lies outside its voxel.
     """
-    words, n = subset.words, len(subset.words.gaussians)
+    words, n = subset.batch, len(subset.batch.gaussians)
     _require_encodable(words.gaussians)
     agent, session = (_name_bytes(name, value) for name, value in _names(subset))
     layout = _Layout(

@@ -35,7 +35,7 @@ class RelevanceMap:
         require_array("relevance target", self.target, self.weight.shape, np.int16)
 
     @classmethod
-    def nothing(cls, height_px: int, width_px: int) -> RelevanceMap:
+    def empty(cls, height_px: int, width_px: int) -> RelevanceMap:
         """No pixel is relevant."""
         return cls(
             np.zeros((height_px, width_px), np.float32),

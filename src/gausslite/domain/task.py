@@ -46,7 +46,7 @@ class TaskGraph:
     relations: tuple[Relation, ...]
     warnings: tuple[str, ...] = ()
 
-    def asks_the_same_as(self, other: TaskGraph) -> bool:
+    def is_equivalent_to(self, other: TaskGraph) -> bool:
         """True when both look for the same things in the same relations, whatever the words were."""
         return (self.targets, self.anchors, self.relations) == (other.targets, other.anchors, other.relations)
 

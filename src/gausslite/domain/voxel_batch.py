@@ -61,7 +61,7 @@ class RoiSubset:
     session_id: str
     sequence: int
     map_revision: int
-    words: VoxelBatch
+    batch: VoxelBatch
 
     def __post_init__(self) -> None:
         if not self.agent_id:

@@ -32,9 +32,9 @@ class VoxelIndex:
     rows: Int64[ndarray, " n"]
 
     @classmethod
-    def by(cls, points_m: Float32[ndarray, "n 3"], grid: VoxelGrid) -> VoxelIndex:
+    def from_points(cls, points_m: Float32[ndarray, "n 3"], grid: VoxelGrid) -> VoxelIndex:
         """Sort points into voxels. Raises InvalidInputError for points out of the grid's reach."""
-        rows, starts = grid.grouped(points_m)
+        rows, starts = grid.sort_by_voxel(points_m)
         return cls(grid.keys(points_m[rows[starts]]), starts, np.diff(starts, append=len(rows)), rows)
 
     def sums(self, values: UInt32[ndarray, " n"] | UInt64[ndarray, " n"]) -> UInt64[ndarray, " v"]:
@@ -55,7 +55,7 @@ def group_by_voxel(gaussians: Gaussians, grid: VoxelGrid) -> VoxelBatch:
 
     Raises InvalidInputError for means out of the grid's reach.
     """
-    voxels = VoxelIndex.by(gaussians.means_m, grid)
+    voxels = VoxelIndex.from_points(gaussians.means_m, grid)
     return VoxelBatch(
         voxels.keys, voxels.sums(gaussians.kappa), voxels.counts.astype(np.uint32), gaussians.take(voxels.rows)
     )
@@ -88,7 +88,7 @@ def gather_rows(starts: NDArray[Any], counts: NDArray[Any]) -> NDArray[np.int64]
     return rows
 
 
-def take_voxels(words: VoxelBatch, keep: Bool[ndarray, " v"]) -> VoxelBatch:
+def select_voxels(words: VoxelBatch, keep: Bool[ndarray, " v"]) -> VoxelBatch:
     """The words on the voxels where `keep` is true."""
     counts = words.counts[keep]
     rows = gather_rows(words.offsets[:-1][keep], counts)
@@ -97,9 +97,9 @@ def take_voxels(words: VoxelBatch, keep: Bool[ndarray, " v"]) -> VoxelBatch:
 
 def crop_to_box(words: VoxelBatch, box: AxisAlignedBox, grid: VoxelGrid) -> VoxelBatch:
     """The words on the voxels whose centre lies in the box."""
-    return take_voxels(words, box.holds(grid.centres_m(words.keys)))
+    return select_voxels(words, box.contains(grid.centres_m(words.keys)))
 
 
-def at_keys(words: VoxelBatch, keys: Int64[ndarray, " k"]) -> VoxelBatch:
+def select_keys(words: VoxelBatch, keys: Int64[ndarray, " k"]) -> VoxelBatch:
     """The words on those of these voxels that have one; keys in any order."""
-    return take_voxels(words, np.isin(words.keys, keys))
+    return select_voxels(words, np.isin(words.keys, keys))

@@ -34,7 +34,7 @@ class VoxelGrid:
         """The key of the voxel that holds each point. Raises InvalidInputError for points out of reach."""
         return _pack(self._voxel_of(points_m))
 
-    def grouped(self, points_m: Float32[ndarray, "n 3"]) -> tuple[Int64[ndarray, " n"], Int64[ndarray, " v"]]:
+    def sort_by_voxel(self, points_m: Float32[ndarray, "n 3"]) -> tuple[Int64[ndarray, " n"], Int64[ndarray, " v"]]:
         """The points by the keys of their voxels, those of one voxel as they came, and where in that each voxel begins.
 
         Raises InvalidInputError for points out of reach.
@@ -92,7 +92,7 @@ class AxisAlignedBox:
         if not np.isfinite(corners).all() or not (corners[0] <= corners[1]).all():
             raise InvalidInputError(f"box: expected finite min <= max, got {self.min_m} and {self.max_m}")
 
-    def holds(self, points_m: Float32[ndarray, "n 3"]) -> Bool[ndarray, " n"]:
+    def contains(self, points_m: Float32[ndarray, "n 3"]) -> Bool[ndarray, " n"]:
         """True for each point in the box; its faces belong to it."""
         low, high = np.array(self.min_m), np.array(self.max_m)
         inside: Bool[ndarray, " n"] = np.logical_and(points_m >= low, points_m <= high).min(axis=1)
@@ -113,15 +113,15 @@ class VoxelVotes:
     """The outcome on one voxel: stakes sorted best first; margin is the lead in kappa_sum over the second."""
 
     key: int
-    stakes: tuple[VoxelScore, ...]
+    scores: tuple[VoxelScore, ...]
 
     @property
     def winner(self) -> str:
         """The agent whose Gaussians the fused map keeps here."""
-        return self.stakes[0].agent_id
+        return self.scores[0].agent_id
 
     @property
     def margin(self) -> int:
         """How much more trained the winner is than the runner-up; its whole sum when uncontested."""
-        second = self.stakes[1].kappa_sum if len(self.stakes) > 1 else 0
-        return self.stakes[0].kappa_sum - second
+        second = self.scores[1].kappa_sum if len(self.scores) > 1 else 0
+        return self.scores[0].kappa_sum - second

@@ -15,7 +15,7 @@ from numpy import ndarray
 
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.voxel_batch import RoiSubset, VoxelBatch
-from gausslite.domain.voxel_operations import group_by_voxel, take_voxels
+from gausslite.domain.voxel_operations import group_by_voxel, select_voxels
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.errors import InvalidInputError, MismatchError, NotPermittedError, QuotaError, SessionUnknownError
 from gausslite.fusion.change_log import ChangeLog
@@ -196,7 +196,7 @@ class FusionEngine:
         if not only_agent:
             return fused.words
         self._require_contributor(only_agent)
-        return take_voxels(fused.words, fused.won_by(only_agent))
+        return select_voxels(fused.words, fused.won_by(only_agent))
 
     def concatenated(self, only_agent: str = "") -> VoxelBatch:
         """Everyone's contributions side by side, or one agent's alone."""
@@ -272,7 +272,7 @@ class FusionEngine:
 
     def _require_room(self, subset: RoiSubset) -> AgentUsage:
         """What will be held of the agent after this message. Raises QuotaError."""
-        words = subset.words
+        words = subset.batch
         stakes = self._store.stakes(words.keys)
         mine = stakes.agent == (stakes.agents.index(subset.agent_id) if subset.agent_id in stakes.agents else -1)
         overtaken = stakes.keys[mine & (stakes.map_revisions >= subset.map_revision)]

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float32, Float64
@@ -19,7 +19,7 @@ from gausslite.domain.pose import inverse
 from gausslite.errors import InvalidInputError, QuotaError
 from gausslite.fusion.keyframes import TeamKeyframe
 from gausslite.optimize.density import DensitySettings, densify, prune
-from gausslite.optimize.parameters import SplatTable, gaussians_to_rows
+from gausslite.optimize.parameters import SplatTable
 from gausslite.optimize.rates import REFINE_RATES
 from gausslite.render.rasterizer import AdamSettings, LossWeights, Rasterizer, StepReport, TrainingView, UpdateCounter
 
@@ -83,22 +83,22 @@ def refine(
     extent_m = _extent_m(gaussians)
     rng = np.random.default_rng(settings.seed)
     with ExitStack() as loan:
-        loan.enter_context(_holding(table, rasterizer))
+        loan.enter_context(_bind_tables(table, rasterizer))
         for iteration in range(1, settings.iterations + 1):
             view, T_camera_world = views.draw(rng)
             report = _train(table, view, T_camera_world, rasterizer, settings)
             if _density_control_is_due(iteration, settings.density):
                 loan.close()
                 _control_density(table, iteration, settings, extent_m)
-                loan.enter_context(_holding(table, rasterizer))
+                loan.enter_context(_bind_tables(table, rasterizer))
             due = iteration % settings.report_every == 0 or iteration == settings.iterations
             if due and not go_on(RefineProgress(iteration, settings.iterations, report.loss, table.count)):
                 break
     return table.to_gaussians()
 
 
-def _holding(table: SplatTable, rasterizer: Rasterizer) -> AbstractContextManager[None]:
-    return rasterizer.holding(table.rows, table.first_moment, table.second_moment)
+def _bind_tables(table: SplatTable, rasterizer: Rasterizer) -> AbstractContextManager[None]:
+    return rasterizer.bind_tables(table.rows, table.first_moment, table.second_moment)
 
 
 def _fill_table(gaussians: Gaussians, settings: RefineSettings) -> SplatTable:
@@ -108,8 +108,7 @@ def _fill_table(gaussians: Gaussians, settings: RefineSettings) -> SplatTable:
     if count > settings.max_gaussians:
         raise QuotaError(f"refine: expected at most {settings.max_gaussians} Gaussians, got {count}")
     table = SplatTable(min(int(np.ceil(count * settings.headroom)), settings.max_gaussians))
-    everything_active = np.ones(count, np.bool_)
-    table.append_rows(gaussians_to_rows(gaussians), everything_active, gaussians.kappa, gaussians.target)
+    table.append(replace(gaussians, active=np.ones(count, np.bool_)))
     return table
 
 
@@ -183,7 +182,7 @@ def _train(
         settings.loss,
         settings.adam,
         masked=True,
-        tally=UpdateCounter(table.kappa),
+        update_counter=UpdateCounter(table.kappa),
     )
 
 

@@ -36,7 +36,7 @@ class MemoryStore:
     def put(self, subset: RoiSubset) -> PutOutcome:
         """Take in one message; a word that is not newer than the one held is stale. Raises InvalidInputError."""
         require_storable(subset)
-        words, offsets = subset.words, subset.words.offsets
+        words, offsets = subset.batch, subset.batch.offsets
         records = to_records(words.gaussians)
         accepted = np.zeros(len(words), np.bool_)
         with self._lock:

@@ -9,7 +9,7 @@ from jaxtyping import Int64
 from numpy import ndarray
 
 from gausslite.domain.voxel_batch import VoxelBatch
-from gausslite.domain.voxel_operations import merge_batches, take_voxels
+from gausslite.domain.voxel_operations import merge_batches, select_voxels
 from gausslite.fusion.vote import FusedMap
 
 
@@ -22,5 +22,5 @@ class RefinedMap:
 
     def overlaid(self, newer: FusedMap, changed: Int64[ndarray, " c"]) -> VoxelBatch:
         """The refined words, except on the voxels that changed since: these show the newer vote."""
-        kept = take_voxels(self.words, ~np.isin(self.words.keys, changed))
+        kept = select_voxels(self.words, ~np.isin(self.words.keys, changed))
         return merge_batches(kept, newer.words)

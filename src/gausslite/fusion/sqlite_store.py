@@ -57,7 +57,7 @@ class SqliteStore:
     def put(self, subset: RoiSubset) -> PutOutcome:
         """Take in one message in one transaction. Raises InvalidInputError, StorageError."""
         require_storable(subset)
-        words, offsets = subset.words, subset.words.offsets
+        words, offsets = subset.batch, subset.batch.offsets
         records = to_records(words.gaussians)
         with self._transaction() as db:
             query = "SELECT voxel, map_revision FROM words WHERE agent_id = ?"

@@ -121,7 +121,7 @@ class FusionStore(Protocol):
 
 def require_storable(subset: RoiSubset) -> None:
     """Raise InvalidInputError when a number of the message does not fit the register's 64-bit columns."""
-    largest = int(subset.words.kappa_sums.max(initial=0))
+    largest = int(subset.batch.kappa_sums.max(initial=0))
     limit = int(np.iinfo(np.int64).max)
     for name, value in (("map_revision", subset.map_revision), ("sequence", subset.sequence), ("kappa_sum", largest)):
         if value > limit:

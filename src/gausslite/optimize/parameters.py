@@ -2,29 +2,30 @@
 
 from __future__ import annotations
 
+import math
 import mmap
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float32, Int, Int16, UInt32
+from jaxtyping import Bool, Float32, Int, Int16, Int64, UInt32
 from numpy import ndarray
 from numpy.typing import NDArray
 
 from gausslite.domain.arrays import require_array, require_finite
 from gausslite.domain.gaussians import Gaussians
-from gausslite.domain.state import State, take
+from gausslite.domain.state import State, get_array
 from gausslite.errors import InvalidInputError, MapFileError, QuotaError
-from gausslite.render.rasterizer import GRAD_2D_SUM, LOG_SCALE, LOGIT, MEAN, QUAT, RGB, ROW_WIDTH, UPDATES
+from gausslite.render.rasterizer import GRAD_2D_SUM, LOG_SCALE, MEAN, OPACITY_LOGIT, QUAT, RGB, ROW_WIDTH, UPDATE_COUNT
 
 _COLUMNS: dict[str, tuple[int | None, type[np.generic]]] = {
     "rows": (ROW_WIDTH, np.float32),
     "first_moment": (ROW_WIDTH, np.float32),
     "second_moment": (ROW_WIDTH, np.float32),
-    "mean_rows": (ROW_WIDTH, np.float32),
+    "ema_rows": (ROW_WIDTH, np.float32),
     "active": (None, np.bool_),
     "kappa": (None, np.uint32),
     "target": (None, np.int16),
-    "votes": (None, np.int16),
+    "roi_evidence": (None, np.int16),
 }
 _MIN_SCALE_M = 1e-7
 _MAX_LOG_SCALE = 80.0
@@ -57,7 +58,7 @@ class SplatTable:
             self._active = np.zeros(capacity, np.bool_)
             self._kappa = np.zeros(capacity, np.uint32)
             self._target = np.zeros(capacity, np.int16)
-            self._votes = np.zeros(capacity, np.int16)
+            self._roi_evidence = np.zeros(capacity, np.int16)
         except (OSError, MemoryError, OverflowError, ValueError):
             raise InvalidInputError(
                 f"max_gaussians: expected as many as there is memory for, 270 bytes each, got {capacity}"
@@ -77,14 +78,14 @@ class SplatTable:
         return self._count
 
     @property
-    def room(self) -> int:
+    def free_slots(self) -> int:
         """How many Gaussians still fit."""
         return self._capacity - self._count
 
     @property
     def table_bytes(self) -> int:
         """Memory reserved for the Gaussians and what each carries."""
-        beside = (self._active, self._kappa, self._target, self._votes)
+        beside = (self._active, self._kappa, self._target, self._roi_evidence)
         return self._rows.nbytes + self._mean_rows.nbytes + sum(column.nbytes for column in beside)
 
     @property
@@ -108,7 +109,7 @@ class SplatTable:
         return self._second_moment[: self._count]
 
     @property
-    def mean_rows(self) -> Float32[ndarray, "n 16"]:
+    def ema_rows(self) -> Float32[ndarray, "n 16"]:
         """The rows' running means, as far as `average` carried them on; a newborn's is its row."""
         return self._mean_rows[: self._count]
 
@@ -128,17 +129,50 @@ class SplatTable:
         return self._target[: self._count]
 
     @property
-    def votes(self) -> Int16[ndarray, " n"]:
+    def roi_evidence(self) -> Int16[ndarray, " n"]:
         """Views that show each Gaussian inside the present task's region, less those that show it outside.
 
         A newborn has the vote of the view it was seeded from, or of its parent.
         """
-        return self._votes[: self._count]
+        return self._roi_evidence[: self._count]
+
+    @property
+    def means_m(self) -> Float32[ndarray, "n 3"]:
+        """Means in metres."""
+        return self.rows[:, MEAN]
 
     @property
     def opacities(self) -> Float32[ndarray, " n"]:
         """Opacities in (0, 1)."""
-        return _sigmoid(self.rows[:, LOGIT])
+        return _sigmoid(self.rows[:, OPACITY_LOGIT])
+
+    def has_lower_opacity(self, opacity: float) -> Bool[ndarray, " n"]:
+        """Return True for each Gaussian of lower opacity than this one in (0, 1)."""
+        return self.rows[:, OPACITY_LOGIT] < math.log(opacity) - math.log1p(-opacity)
+
+    def most_transparent(self, ids: Int64[ndarray, " m"], count: int) -> Int64[ndarray, " k"]:
+        """Return up to `count` of these ascending ids, those of lowest opacity; of equal ones the lower ids."""
+        if count >= len(ids):
+            return ids
+        if count <= 0:
+            return ids[:0]
+        # logits separate opacities that are equal in float32
+        logits = self.rows[ids, OPACITY_LOGIT]
+        limit = np.partition(logits, count - 1)[count - 1]
+        below, equal = np.flatnonzero(logits < limit), np.flatnonzero(logits == limit)
+        chosen: Int64[ndarray, " k"] = ids[np.concatenate([below, equal[: count - len(below)]])]
+        return chosen
+
+    def make_isotropic(self) -> None:
+        """Set the three scales of each Gaussian to their geometric mean."""
+        log_scales = self.rows[:, LOG_SCALE]
+        log_scales[:] = log_scales.mean(axis=1, keepdims=True)
+
+    def clip_colours(self, lowest: float, highest: float) -> None:
+        """Clip all colour channels to this range."""
+        # one channel at a time: NumPy takes twice as long for three columns at once
+        for channel in self.rows[:, RGB].T:
+            np.clip(channel, lowest, highest, out=channel)
 
     def append(self, gaussians: Gaussians) -> None:
         """Add Gaussians with fresh optimiser state. Raises QuotaError when they do not fit."""
@@ -152,8 +186,8 @@ class SplatTable:
         target: Int16[ndarray, " m"],
     ) -> None:
         """Add raw rows with fresh optimiser state. Raises QuotaError when they do not fit."""
-        if len(rows) > self.room:
-            raise QuotaError(f"table: expected at most {self.room} more Gaussians, got {len(rows)}")
+        if len(rows) > self.free_slots:
+            raise QuotaError(f"table: expected at most {self.free_slots} more Gaussians, got {len(rows)}")
         self._put(slice(self._count, self._count + len(rows)), rows, active, kappa, target)
         self._count += len(rows)
 
@@ -180,42 +214,42 @@ class SplatTable:
 
     def restore(self, state: State) -> None:
         """Take over another table's contents. Raises QuotaError when they do not fit, MapFileError, ShapeError."""
-        rows = take(state, "rows", (None, ROW_WIDTH), np.float32)
+        rows = get_array(state, "rows", (None, ROW_WIDTH), np.float32)
         if len(rows) > self._capacity:
             raise QuotaError(f"max_gaussians: expected at least the {len(rows)} saved ones, got {self._capacity}")
         columns = {
-            name: take(state, name, (len(rows),) if width is None else (len(rows), width), dtype)
+            name: get_array(state, name, (len(rows),) if width is None else (len(rows), width), dtype)
             for name, (width, dtype) in _COLUMNS.items()
         }
-        for name in ("rows", "first_moment", "second_moment", "mean_rows"):
+        for name in ("rows", "first_moment", "second_moment", "ema_rows"):
             require_finite(f"state {name}", columns[name])
-        mean_rows = columns["mean_rows"]
-        too_large = max(values[:, LOG_SCALE].max(initial=-np.inf) for values in (rows, mean_rows)) > _MAX_LOG_SCALE
-        unborn = (mean_rows[:, UPDATES] < 0).any() or (mean_rows[:, UPDATES] > rows[:, UPDATES]).any()
+        ema_rows = columns["ema_rows"]
+        too_large = max(values[:, LOG_SCALE].max(initial=-np.inf) for values in (rows, ema_rows)) > _MAX_LOG_SCALE
+        unborn = (ema_rows[:, UPDATE_COUNT] < 0).any() or (ema_rows[:, UPDATE_COUNT] > rows[:, UPDATE_COUNT]).any()
         if too_large or unborn or not _belong_together(*_moments(columns)):
             raise MapFileError("state table: expected scales, means and moments that training can reach, got others")
         for name, column in columns.items():
             getattr(self, f"_{name}")[: len(rows)] = column
         self._count = len(rows)
 
-    def average(self, horizon: float) -> None:
+    def update_ema(self, horizon: float) -> None:
         """Carry on the mean of each row over about its last `horizon` updates, and at most an eighth of all it had: a
         row that is still on its way must not be held back by where it was.
         """
-        all_moved = np.flatnonzero(self.rows[:, UPDATES] != self.mean_rows[:, UPDATES])
+        all_moved = np.flatnonzero(self.rows[:, UPDATE_COUNT] != self.ema_rows[:, UPDATE_COUNT])
         for start in range(0, len(all_moved), _ROWS_IN_CACHE):
             moved = all_moved[start : start + _ROWS_IN_CACHE]
-            rows, mean = self.rows.take(moved, axis=0), self.mean_rows.take(moved, axis=0)
-            reach = np.minimum(np.float32(horizon), rows[:, UPDATES] / _SHORTEST_LIFE)
-            share = -np.expm1((mean[:, UPDATES] - rows[:, UPDATES]) / reach)
+            rows, mean = self.rows.take(moved, axis=0), self.ema_rows.take(moved, axis=0)
+            reach = np.minimum(np.float32(horizon), rows[:, UPDATE_COUNT] / _SHORTEST_LIFE)
+            share = -np.expm1((mean[:, UPDATE_COUNT] - rows[:, UPDATE_COUNT]) / reach)
             mean += share[:, None] * (rows - mean)
-            mean[:, UPDATES] = rows[:, UPDATES]
-            self.mean_rows[moved] = mean
+            mean[:, UPDATE_COUNT] = rows[:, UPDATE_COUNT]
+            self.ema_rows[moved] = mean
 
-    def to_gaussians(self, ids: Int[ndarray, " m"] | None = None, averaged: bool = False) -> Gaussians:
+    def to_gaussians(self, ids: Int[ndarray, " m"] | None = None, use_ema: bool = False) -> Gaussians:
         """Copies of all Gaussians, or of these rows, as physical values; their running means where asked."""
         chosen = np.arange(self._count) if ids is None else ids
-        columns = self.mean_rows if averaged else self.rows, self.active, self.kappa, self.target
+        columns = self.ema_rows if use_ema else self.rows, self.active, self.kappa, self.target
         return rows_to_gaussians(*(column.take(chosen, axis=0) for column in columns))
 
     def _put(
@@ -232,7 +266,7 @@ class SplatTable:
         self._first_moment[place] = 0.0
         self._second_moment[place] = 0.0
         self._active[place], self._kappa[place], self._target[place] = active, kappa, target
-        self._votes[place] = np.where(active, 1, -1)
+        self._roi_evidence[place] = np.where(active, 1, -1)
 
 
 def _moments(columns: State) -> tuple[NDArray[Any], NDArray[Any]]:
@@ -252,7 +286,7 @@ def gaussians_to_rows(gaussians: Gaussians) -> Float32[ndarray, "n 16"]:
     rows[:, MEAN] = gaussians.means_m
     rows[:, LOG_SCALE] = np.log(np.maximum(gaussians.scales_m, _MIN_SCALE_M))
     rows[:, QUAT] = gaussians.quats_wxyz
-    rows[:, LOGIT] = np.log(opacities) - np.log1p(-opacities)
+    rows[:, OPACITY_LOGIT] = np.log(opacities) - np.log1p(-opacities)
     rows[:, RGB] = gaussians.rgb
     return rows
 
@@ -270,7 +304,7 @@ def rows_to_gaussians(
         means_m=rows[:, MEAN].copy(),
         quats_wxyz=quats / np.maximum(length, np.float32(1e-12)),
         scales_m=np.exp(rows[:, LOG_SCALE]),
-        opacities=_sigmoid(rows[:, LOGIT]),
+        opacities=_sigmoid(rows[:, OPACITY_LOGIT]),
         rgb=rows[:, RGB].copy(),
         active=active.copy(),
         kappa=kappa.copy(),

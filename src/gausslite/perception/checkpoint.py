@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from gausslite.domain.camera import Camera
 from gausslite.domain.pose import require_rigid
 from gausslite.domain.relevance import Detection
-from gausslite.domain.state import State, take, take_counts, take_measures, take_text, text, whole_numbers
+from gausslite.domain.state import State, encode_text, get_array, get_counts, get_floats, get_text, int_array
 from gausslite.errors import MapFileError
 from gausslite.perception.object_map import Landmark
 from gausslite.perception.reproject import Frustum
@@ -21,47 +21,47 @@ def frustum_state(frustum: Frustum) -> dict[str, NDArray[Any]]:
     detection, camera = frustum.detection, frustum.camera
     intrinsics = (camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px)
     return {
-        "phrase": text(detection.phrase),
+        "phrase": encode_text(detection.phrase),
         "mask": detection.mask,
         "numbers": np.array([detection.score, *detection.box_px, *intrinsics, frustum.near_m, frustum.far_m]),
         "T_world_camera": frustum.T_world_camera,
-        "passed_over": whole_numbers(frustum.passed_over),
+        "passed_over": int_array(frustum.passed_over),
     }
 
 
 def frustum_of(state: State) -> Frustum:
     """The carried detection again. Raises MapFileError, InvalidInputError."""
-    numbers = take_measures(state, "numbers", 11)
+    numbers = get_floats(state, "numbers", 11)
     score, left, top, right, bottom, fx_px, fy_px, cx_px, cy_px, near_m, far_m = numbers
-    mask = take(state, "mask", (None, None), np.bool_).copy()
-    T_world_camera = take(state, "T_world_camera", (4, 4), np.float64).copy()
+    mask = get_array(state, "mask", (None, None), np.bool_).copy()
+    T_world_camera = get_array(state, "T_world_camera", (4, 4), np.float64).copy()
     require_rigid("state T_world_camera", T_world_camera)
-    detection = Detection(take_text(state, "phrase"), score, (left, top, right, bottom), mask)
+    detection = Detection(get_text(state, "phrase"), score, (left, top, right, bottom), mask)
     camera = Camera(fx_px, fy_px, cx_px, cy_px, mask.shape[1], mask.shape[0])
-    [passed_over] = take_counts(state, "passed_over", 1)
+    [passed_over] = get_counts(state, "passed_over", 1)
     return Frustum(detection, camera, T_world_camera, near_m, far_m, passed_over)
 
 
 def remembered_state(each: Landmark) -> dict[str, NDArray[Any]]:
     """An object over all its sightings."""
     return {
-        "phrase": text(each.phrase),
+        "phrase": encode_text(each.phrase),
         "place_m": np.array([*each.centroid_m, each.radius_m]),
         "cells": each.cells,
         "counts": each.counts,
-        "seen": whole_numbers(each.seen, each.missed),
+        "seen": int_array(each.seen, each.missed),
         "best": np.array([each.best_score, each.farthest_m]),
     }
 
 
 def remembered_of(state: State) -> Landmark:
     """The object again. Raises MapFileError, InvalidInputError."""
-    x_m, y_m, z_m, radius_m = take_measures(state, "place_m", 4)
-    cells = take(state, "cells", (None,), np.int64).copy()
-    counts = take(state, "counts", cells.shape, np.int64).copy()
+    x_m, y_m, z_m, radius_m = get_floats(state, "place_m", 4)
+    cells = get_array(state, "cells", (None,), np.int64).copy()
+    counts = get_array(state, "counts", cells.shape, np.int64).copy()
     if (counts < 1).any() or (cells[1:] <= cells[:-1]).any() or len(cells) == 0:
         raise MapFileError("state object: expected ascending cells with counts, got others")
-    seen, missed = take_counts(state, "seen", 2)
-    best_score, farthest_m = take_measures(state, "best", 2)
-    place = (take_text(state, "phrase"), np.array([x_m, y_m, z_m]), radius_m, cells, counts)
+    seen, missed = get_counts(state, "seen", 2)
+    best_score, farthest_m = get_floats(state, "best", 2)
+    place = (get_text(state, "phrase"), np.array([x_m, y_m, z_m]), radius_m, cells, counts)
     return Landmark(*place, seen, missed, best_score, farthest_m)

@@ -135,7 +135,7 @@ def box_iou(boxes_a: Float32[ndarray, "n 4"], boxes_b: Float32[ndarray, "m 4"]) 
     return iou
 
 
-def box_around(mask: Bool[ndarray, "h w"]) -> tuple[float, float, float, float] | None:
+def bounding_box(mask: Bool[ndarray, "h w"]) -> tuple[float, float, float, float] | None:
     """The tight box (left, top, right, bottom) round a mask in pixels, None when it is empty."""
     columns = np.flatnonzero(mask.any(axis=0))
     rows = np.flatnonzero(mask.any(axis=1))

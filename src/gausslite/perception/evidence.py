@@ -46,19 +46,19 @@ class EvidenceSettings:
         """Every detection counts."""
         return cls(min_seen=1, sure_score=0.0, min_share=0.0)
 
-    def believes(self, each: Landmark) -> bool:
+    def is_confirmed(self, each: Landmark) -> bool:
         """True when there is enough to go by."""
         often = each.seen >= self.min_seen or each.best_score >= self.sure_score
         return often and each.seen >= self.min_share * (each.seen + each.missed)
 
-    def is_firm(self, each: Landmark) -> bool:
+    def is_reliable(self, each: Landmark) -> bool:
         """True when it is believed and could not be two mistakes: one false candidate would decide a superlative."""
         often = each.seen >= _FIRM * self.min_seen or each.best_score >= self.sure_score
-        return often and self.believes(each)
+        return often and self.is_confirmed(each)
 
-    def wants_another(self, each: Landmark) -> bool:
+    def needs_observation(self, each: Landmark) -> bool:
         """True when one more sighting could settle it."""
-        return not self.believes(each) and each.seen + 1 >= self.min_seen
+        return not self.is_confirmed(each) and each.seen + 1 >= self.min_seen
 
 
 @dataclass(frozen=True, slots=True, eq=False)

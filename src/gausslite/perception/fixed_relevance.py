@@ -13,6 +13,7 @@ from gausslite.domain.region import Region
 from gausslite.domain.relevance import NO_TARGET, RelevanceMap
 from gausslite.domain.state import State
 from gausslite.errors import InvalidInputError
+from gausslite.perception.relevance_estimator import RelevanceEstimate
 
 
 class RegionRelevanceEstimator:
@@ -28,21 +29,17 @@ class RegionRelevanceEstimator:
         """None: nothing has to be found."""
         return ()
 
-    def attend(self, frame: Frame, rendered_depth_m: Float32[ndarray, "h w"] | None = None) -> RelevanceMap:
+    def estimate(self, frame: Frame, rendered_depth_m: Float32[ndarray, "h w"] | None = None) -> RelevanceEstimate:
         """Weight 1 on every pixel that shows a region; masks are exact without the rendered depth."""
         del rendered_depth_m
         target = np.full(frame.depth_m.shape, NO_TARGET, np.int16)
         for index, region in reversed(list(enumerate(self._regions))):
             target[region.mask(frame)] = index
-        return RelevanceMap((target != NO_TARGET).astype(np.float32), target)
+        return RelevanceEstimate(RelevanceMap((target != NO_TARGET).astype(np.float32), target))
 
-    def late(self) -> None:
-        """Nothing: every frame's relevance is known at once."""
-        return
-
-    def look_back(self, frame: Frame) -> RelevanceMap:
+    def evaluate_past(self, frame: Frame) -> RelevanceMap:
         """As for any other frame."""
-        return self.attend(frame)
+        return self.estimate(frame).relevance
 
     def state(self) -> State:
         """Nothing: every frame is judged by itself."""
@@ -61,18 +58,14 @@ class NoTaskEstimator:
         """None: nothing has to be found."""
         return ()
 
-    def attend(self, frame: Frame, rendered_depth_m: Float32[ndarray, "h w"] | None = None) -> RelevanceMap:
+    def estimate(self, frame: Frame, rendered_depth_m: Float32[ndarray, "h w"] | None = None) -> RelevanceEstimate:
         """Weight 0 everywhere."""
         del rendered_depth_m
-        return RelevanceMap.nothing(*frame.depth_m.shape)
+        return RelevanceMap.empty(*frame.depth_m.shape)
 
-    def late(self) -> None:
-        """Nothing: every frame's relevance is known at once."""
-        return
-
-    def look_back(self, frame: Frame) -> RelevanceMap:
+    def evaluate_past(self, frame: Frame) -> RelevanceMap:
         """As for any other frame."""
-        return self.attend(frame)
+        return self.estimate(frame).relevance
 
     def state(self) -> State:
         """Nothing: every frame is judged by itself."""

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from gausslite.domain.frame import Frame
 from gausslite.domain.region import Region
 from gausslite.domain.relevance import Detection
-from gausslite.perception.detect import box_around
+from gausslite.perception.detect import bounding_box
 from gausslite.perception.vocabulary import same_kind
 
 
@@ -35,7 +35,7 @@ class RegionDetector:
             for name in names:
                 if name not in masks:
                     masks[name] = self._regions[name].mask(frame)
-                box = box_around(masks[name])
+                box = bounding_box(masks[name])
                 if box is not None:
                     found.append(Detection(query, 1.0, box, masks[name]))
         return found

@@ -12,7 +12,7 @@ from typing import Any, BinaryIO, Final
 
 from gausslite.errors import InvalidInputError, ModelFileError
 
-CHECKSUMS: Final = "SHA256SUMS"
+CHECKSUM_FILE: Final = "SHA256SUMS"
 """The list of checksums that may lie in a model's folder, as `sha256sum` writes it; a file in it must agree."""
 _MAX_LIST_BYTES: Final = 1 << 20
 _MAX_BYTES: Final = (1 << 31) - 1
@@ -105,7 +105,7 @@ def sha256_of(path: Path) -> str:
 
 def listed_checksum(path: Path) -> str | None:
     """What SHA256SUMS in the file's folder says about it, None where it says nothing."""
-    listing = path.parent / CHECKSUMS
+    listing = path.parent / CHECKSUM_FILE
     if not listing.is_file() or listing.stat().st_size > _MAX_LIST_BYTES:
         return None
     for line in listing.read_text(encoding="utf-8", errors="replace").splitlines():
@@ -120,7 +120,7 @@ def require_listed_checksum(path: Path) -> None:
     expected = listed_checksum(path)
     if expected is not None and (found := sha256_of(path)) != expected:
         raise ModelFileError(
-            f"model {path}: expected SHA-256 {expected[:16]}… as {CHECKSUMS} beside it says, got {found[:16]}…"
+            f"model {path}: expected SHA-256 {expected[:16]}… as {CHECKSUM_FILE} beside it says, got {found[:16]}…"
         )
 
 

@@ -15,29 +15,29 @@ VOCABULARY: Final = "vocab.txt"
 OWN, CUT = "yolo", "cut"
 
 
-class Family(StrEnum):
+class ModelFamily(StrEnum):
     """The kinds of networks that are understood."""
 
     GROUNDING_DINO = "Grounding DINO"
     YOLO_SEG = "YOLO-seg or FastSAM"
 
 
-def family_of(model: OpenModel) -> Family:
+def identify_family(model: OpenModel) -> ModelFamily:
     """The family of an open model. Raises ModelFileError for an unknown one."""
     from gausslite.perception.grounding import is_grounding
 
     inputs, outputs = model.session.get_inputs(), model.session.get_outputs()
     if is_grounding([each.name for each in inputs], [each.name for each in outputs]):
-        return Family.GROUNDING_DINO
+        return ModelFamily.GROUNDING_DINO
     image = len(inputs) == 1 and len(inputs[0].shape) == 4
     # an open size is known once the network has run
     sides = [each.shape[1] for each in outputs if len(each.shape) == 4]
     masks = any(not isinstance(side, int) or side == MASK_COEFFICIENTS for side in sides)
     if image and masks and len(outputs) == 2:
-        return Family.YOLO_SEG
+        return ModelFamily.YOLO_SEG
     came = " → ".join(", ".join(f"{each.name} {each.shape}" for each in side) for side in (inputs, outputs))
     hint = " (boxes only, no masks)" if image and len(outputs) == 1 else ""
-    raise ModelFileError(f"model {model.path}: expected {' or '.join(Family)}, got {came}{hint}")
+    raise ModelFileError(f"model {model.path}: expected {' or '.join(ModelFamily)}, got {came}{hint}")
 
 
 class ModelRegistry:
@@ -49,7 +49,7 @@ class ModelRegistry:
         None takes the detector's own masks where it has some. Raises ModelFileError, InvalidInputError, KernelError.
         """
         model = open_model(detector, threads)
-        if family_of(model) is Family.GROUNDING_DINO:
+        if identify_family(model) is ModelFamily.GROUNDING_DINO:
             self._use_grounding(model, segmenter, vocabulary, threads)
         else:
             self._use_yolo(model, segmenter, threads)
@@ -80,9 +80,9 @@ class ModelRegistry:
         self._detector: Detector = SegmentedDetector(network, _in_turn(self._segmenter))
 
     def _use_yolo(self, model: OpenModel, segmenter: str | None, threads: int | None) -> None:
-        from gausslite.perception.yolo import yolo_of
+        from gausslite.perception.yolo import load_yolo
 
-        network = yolo_of(model)
+        network = load_yolo(model)
         if segmenter in (None, OWN):
             self._segmenter, self._detector = network.segmenter(), network
         else:

@@ -37,7 +37,7 @@ class Observation:
     score: float = 1.0
 
     @classmethod
-    def of_points(
+    def from_points(
         cls,
         phrase: str,
         points_m: Float64[ndarray, "n 3"],
@@ -75,7 +75,7 @@ class Landmark:
     farthest_m: float
 
     @classmethod
-    def from_sighting(cls, sighting: Observation) -> Landmark:
+    def from_observation(cls, sighting: Observation) -> Landmark:
         """The first sighting of an object."""
         counts = np.ones(len(sighting.cells), np.int64)
         place = (sighting.phrase, sighting.centroid_m, sighting.radius_m, sighting.cells, counts)
@@ -149,7 +149,7 @@ class ObjectMap:
             self._objects.remove(min(self._objects, key=lambda each: each.seen))
 
     def _add(self, sighting: Observation) -> Landmark:
-        new = Landmark.from_sighting(sighting)
+        new = Landmark.from_observation(sighting)
         same = [each for each in self.named(sighting.phrase) if each.matches(sighting)]
         if not same:
             self._objects.append(new)

@@ -28,19 +28,23 @@ class DelayedRelevance:
     lag_frames: int
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class RelevanceEstimate:
+    """The relevance of a frame, and that of an earlier frame if its detection has finished since the last call."""
+
+    relevance: RelevanceMap
+    delayed: DelayedRelevance | None = None
+
+
 @runtime_checkable
 class RelevanceEstimator(Protocol):
     """Says for each frame which pixels the task is about."""
 
-    def attend(self, frame: Frame, rendered_depth_m: Float32[ndarray, "h w"] | None = None) -> RelevanceMap:
-        """The relevance of one frame; rendered_depth_m is drawn from the current map, 0 where it shows nothing."""
+    def estimate(self, frame: Frame, rendered_depth_m: Float32[ndarray, "h w"] | None = None) -> RelevanceEstimate:
+        """Return the relevance of one frame. rendered_depth_m is rendered from the current map, 0 where it is empty."""
         ...
 
-    def late(self) -> DelayedRelevance | None:
-        """What the latest call of `attend` has come to know of an earlier frame."""
-        ...
-
-    def look_back(self, frame: Frame) -> RelevanceMap | None:
+    def evaluate_past(self, frame: Frame) -> RelevanceMap | None:
         """The relevance of an earlier frame, attended to for another task; None where it is not known yet: ask again.
 
         Asked from the newest such frame to the oldest, one at a time.
@@ -82,24 +86,20 @@ class TaskRelevanceEstimator:
         return (*self._detector.warnings, *self._tracker.notes)
 
     @property
-    def remembered(self) -> tuple[Landmark, ...]:
+    def landmarks(self) -> tuple[Landmark, ...]:
         """The objects that the task's nouns have named so far, where they were seen."""
-        return self._tracker.remembered
+        return self._tracker.landmarks
 
-    def attend(self, frame: Frame, rendered_depth_m: Float32[ndarray, "h w"] | None = None) -> RelevanceMap:
+    def estimate(self, frame: Frame, rendered_depth_m: Float32[ndarray, "h w"] | None = None) -> RelevanceEstimate:
         """Weight 1 on the pixels of the targets that fit the task's relations."""
         if not self._tracker.wants_detection(frame):
-            return self._tracker.carry_over(frame)
+            return RelevanceEstimate(self._tracker.propagate(frame))
         found = self._detector.detect(frame, self._graph.queries)
-        return self._tracker.take(frame, best_depth_m(frame.depth_m, rendered_depth_m), found)
+        return RelevanceEstimate(self._tracker.integrate(frame, best_depth_m(frame.depth_m, rendered_depth_m), found))
 
-    def late(self) -> None:
-        """Nothing: every frame's relevance is known at once."""
-        return
-
-    def look_back(self, frame: Frame) -> RelevanceMap:
+    def evaluate_past(self, frame: Frame) -> RelevanceMap:
         """Detect on an earlier frame."""
-        return self._tracker.look_back(frame, self._detector.detect(frame, self._graph.queries))
+        return self._tracker.evaluate_past(frame, self._detector.detect(frame, self._graph.queries))
 
     def state(self) -> State:
         """The objects and targets that are followed."""
@@ -136,7 +136,6 @@ class AsyncRelevanceEstimator:
         self._warnings: tuple[str, ...] = ()
         self._running: tuple[_Keyframe, Future[list[Detection]]] | None = None
         self._waiting: _Keyframe | None = None
-        self._late: DelayedRelevance | None = None
         self._looking_back: tuple[Frame, Future[list[Detection]]] | None = None
 
     @property
@@ -153,9 +152,9 @@ class AsyncRelevanceEstimator:
         """Follow on what another attention to this task followed. Raises MapFileError, InvalidInputError."""
         self._tracker.restore(state)
 
-    def attend(self, frame: Frame, rendered_depth_m: Float32[ndarray, "h w"] | None = None) -> RelevanceMap:
+    def estimate(self, frame: Frame, rendered_depth_m: Float32[ndarray, "h w"] | None = None) -> RelevanceEstimate:
         """Weight 1 on the pixels of the targets known so far. Raises what the detector raised."""
-        self._late = self._collect()
+        delayed = self._collect()
         if self._tracker.wants_detection(frame):
             self._replaced += self._waiting is not None
             self._waiting = _Keyframe(frame, best_depth_m(frame.depth_m, rendered_depth_m), self._frames)
@@ -163,13 +162,9 @@ class AsyncRelevanceEstimator:
             found = self._executor.submit(self._detector.detect, self._waiting.frame, self._graph.queries)
             self._running, self._waiting = (self._waiting, found), None
         self._frames += 1
-        return self._tracker.carry_over(frame)
+        return RelevanceEstimate(self._tracker.propagate(frame), delayed)
 
-    def late(self) -> DelayedRelevance | None:
-        """The relevance of the keyframe whose detection the latest frame found done."""
-        return self._late
-
-    def look_back(self, frame: Frame) -> RelevanceMap | None:
+    def evaluate_past(self, frame: Frame) -> RelevanceMap | None:
         """What was found on an earlier frame; the first call has it looked at.
 
         Raises what the detector raised, once: who asks again has it looked at again.
@@ -180,14 +175,14 @@ class AsyncRelevanceEstimator:
         if not found.done():
             return None
         self._looking_back = None
-        return self._tracker.look_back(frame, found.result())
+        return self._tracker.evaluate_past(frame, found.result())
 
     def _collect(self) -> DelayedRelevance | None:
         """Take what was found, if the detector is done."""
         if self._running is None or not self._running[1].done():
             return None
         (key, found), self._running = self._running, None
-        relevance = self._tracker.take(key.frame, key.depth_m, found.result())
+        relevance = self._tracker.integrate(key.frame, key.depth_m, found.result())
         # the detector adds to its warnings while it runs; now it rests
         self._warnings = self._detector.warnings
         return DelayedRelevance(key.frame, relevance, self._frames - key.number)

@@ -44,7 +44,7 @@ def sight(detection: Detection, depth_m: Float32[ndarray, "h w"], frame: Frame) 
     points = lift(centres_px, depth_m[rows, columns].astype(np.float64), frame.camera)
     T_world_camera = frame.T_world_camera
     points_m = transform_points(T_world_camera, points)
-    return Observation.of_points(detection.phrase, points_m, T_world_camera[:3, 3], detection.score)
+    return Observation.from_points(detection.phrase, points_m, T_world_camera[:3, 3], detection.score)
 
 
 class SpatialFilter:
@@ -62,7 +62,7 @@ class SpatialFilter:
         self._memory = ObjectMap()
 
     @property
-    def remembered(self) -> tuple[Landmark, ...]:
+    def landmarks(self) -> tuple[Landmark, ...]:
         """Every object seen so far, where it was seen on average."""
         return self._memory.objects
 
@@ -76,25 +76,25 @@ class SpatialFilter:
         """Take one frame's sightings into the memory; with an outlook, also what it should have shown and did not."""
         self._memory.observe(sightings, None if outlook is None else outlook.shows_place_of)
 
-    def believes(self, sighting: Observation) -> bool:
+    def is_confirmed(self, sighting: Observation) -> bool:
         """True when what was sighted is there for all that is known of it."""
         shown = self._memory.showing(sighting)
-        return shown is not None and self._evidence.believes(shown)
+        return shown is not None and self._evidence.is_confirmed(shown)
 
-    def is_sure_of(self, sighting: Observation) -> bool:
+    def is_reliable(self, sighting: Observation) -> bool:
         """True when what was sighted could not be two mistakes."""
         shown = self._memory.showing(sighting)
-        return shown is not None and self._evidence.is_firm(shown)
+        return shown is not None and self._evidence.is_reliable(shown)
 
-    def are_one(self, sighting: Observation, other: Observation) -> bool:
+    def is_same_object(self, sighting: Observation, other: Observation) -> bool:
         """True when two sightings show one and the same object."""
         shown = self._memory.showing(sighting)
         return shown is not None and shown is self._memory.showing(other)
 
-    def wants_another(self, sighting: Observation) -> bool:
+    def needs_observation(self, sighting: Observation) -> bool:
         """True when another look could settle whether it is there."""
         shown = self._memory.showing(sighting)
-        return shown is not None and self._evidence.wants_another(shown)
+        return shown is not None and self._evidence.needs_observation(shown)
 
     def remember(self, objects: Sequence[Landmark]) -> None:
         """Start from objects of an earlier life, oldest first."""
@@ -138,9 +138,9 @@ class SpatialFilter:
     def _firm(self, phrase: str) -> list[Landmark]:
         """The objects that may decide between all that answer a phrase; the believed ones while there is none."""
         credible = self._credible(phrase)
-        return [each for each in credible if self._evidence.is_firm(each)] or credible
+        return [each for each in credible if self._evidence.is_reliable(each)] or credible
 
     def _credible(self, phrase: str) -> list[Landmark]:
         """The believed objects that answer a phrase, or all while none is."""
         named = self._memory.named(phrase)
-        return [each for each in named if self._evidence.believes(each)] or named
+        return [each for each in named if self._evidence.is_confirmed(each)] or named

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import UpAxis, require_rigid, rotation_angle_deg, translation_m, unit_up_axis
 from gausslite.domain.relevance import NO_TARGET, Detection, RelevanceMap
-from gausslite.domain.state import State, nested, part, take, take_counts, whole_numbers
+from gausslite.domain.state import State, add_prefix, get_array, get_counts, int_array, select_prefix
 from gausslite.domain.task import TaskGraph
 from gausslite.errors import InvalidInputError, MapFileError
 from gausslite.perception.checkpoint import frustum_of as frustum_of_state
@@ -76,39 +76,39 @@ class TargetTracker:
         return tuple(f"anchor {name!r} not seen yet: its targets are kept" for name in self._filter.unseen_anchors)
 
     @property
-    def remembered(self) -> tuple[Landmark, ...]:
+    def landmarks(self) -> tuple[Landmark, ...]:
         """The objects that the task's nouns have named so far, where they were seen."""
-        return self._filter.remembered
+        return self._filter.landmarks
 
     def state(self) -> State:
         """The objects seen so far, the detections that are carried on, and where they were made."""
         pose = np.zeros((0, 4, 4)) if self._T_world_keyframe is None else self._T_world_keyframe[None]
         state: dict[str, NDArray[Any]] = {
             "T_world_keyframe": pose,
-            "since": whole_numbers(self._frames_since, self._unsettled),
+            "since": int_array(self._frames_since, self._unsettled),
         }
-        state["counts"] = whole_numbers(len(self._kept), len(self.remembered))
+        state["counts"] = int_array(len(self._kept), len(self.landmarks))
         for i, frustum in enumerate(self._kept):
-            state |= nested(f"kept-{i}", frustum_state(frustum))
-        for i, each in enumerate(self.remembered):
-            state |= nested(f"object-{i}", remembered_state(each))
+            state |= add_prefix(f"kept-{i}", frustum_state(frustum))
+        for i, each in enumerate(self.landmarks):
+            state |= add_prefix(f"object-{i}", remembered_state(each))
         return state
 
     def restore(self, state: State) -> None:
         """Remember and carry on what another attention to this task did. Raises MapFileError, InvalidInputError."""
-        poses = take(state, "T_world_keyframe", (None, 4, 4), np.float64)
-        kept, objects = take_counts(state, "counts", 2)
+        poses = get_array(state, "T_world_keyframe", (None, 4, 4), np.float64)
+        kept, objects = get_counts(state, "counts", 2)
         if len(poses) > 1 or kept + objects > len(state):
             raise MapFileError(f"state attention: expected {kept} detections and {objects} objects, got fewer")
         for pose in poses:
             require_rigid("state T_world_keyframe", pose)
-        self._kept = [frustum_of_state(part(state, f"kept-{i}")) for i in range(kept)]
+        self._kept = [frustum_of_state(select_prefix(state, f"kept-{i}")) for i in range(kept)]
         strangers = {frustum.detection.phrase for frustum in self._kept} - set(self._graph.targets)
         if strangers:
             raise MapFileError(f"state attention: expected targets of the task, got {len(strangers)} other phrases")
-        self._filter.remember([remembered_of(part(state, f"object-{i}")) for i in range(objects)])
+        self._filter.remember([remembered_of(select_prefix(state, f"object-{i}")) for i in range(objects)])
         self._T_world_keyframe = poses[0].copy() if len(poses) else None
-        self._frames_since, unsettled = take_counts(state, "since", 2)
+        self._frames_since, unsettled = get_counts(state, "since", 2)
         self._unsettled = unsettled > 0
 
     def wants_detection(self, frame: Frame) -> bool:
@@ -126,7 +126,7 @@ class TargetTracker:
             self._T_world_keyframe, self._frames_since = frame.T_world_camera, 0
         return due
 
-    def take(self, frame: Frame, depth_m: Float32[ndarray, "h w"], found: Sequence[Detection]) -> RelevanceMap:
+    def integrate(self, frame: Frame, depth_m: Float32[ndarray, "h w"], found: Sequence[Detection]) -> RelevanceMap:
         """What was detected on a frame: the targets that fit the task's relations, from now on carried over."""
         sighted = self._observe(frame, depth_m, found)
         targets = [detection for detection, _ in sighted]
@@ -135,12 +135,12 @@ class TargetTracker:
         self._kept = [*(frustum for frustum in lifted if frustum is not None), *(old for old, _ in passed_over)]
         return merge([*targets, *(shown for _, shown in passed_over)], self._graph.targets, frame)
 
-    def look_back(self, frame: Frame, found: Sequence[Detection]) -> RelevanceMap:
+    def evaluate_past(self, frame: Frame, found: Sequence[Detection]) -> RelevanceMap:
         """What was detected on an earlier frame: it is remembered, but newer detections are carried on."""
         sighted = self._observe(frame, frame.depth_m, found)
         return merge([detection for detection, _ in sighted], self._graph.targets, frame)
 
-    def carry_over(self, frame: Frame) -> RelevanceMap:
+    def propagate(self, frame: Frame) -> RelevanceMap:
         """The latest targets as they are seen from another frame."""
         shown = self._shown(frame)
         if self._segmenter is not None and shown:
@@ -170,8 +170,8 @@ class TargetTracker:
             sighting = sight(shown, depth_m, frame)
             if sighting is None or frustum.passed_over >= self._settings.max_passed_over:
                 continue
-            again = any(self._filter.are_one(sighting, other) for other in found)
-            if not again and self._filter.is_sure_of(sighting) and self._filter.keep(sighting):
+            again = any(self._filter.is_same_object(sighting, other) for other in found)
+            if not again and self._filter.is_reliable(sighting) and self._filter.keep(sighting):
                 left.append((replace(frustum, passed_over=frustum.passed_over + 1), shown))
         return left
 
@@ -189,8 +189,8 @@ class TargetTracker:
             for detection, sighting in zip(detections, placed, strict=True)
             if detection.phrase in self._graph.targets and sighting is not None and self._filter.keep(sighting)
         ]
-        self._unsettled = any(self._filter.wants_another(sighting) for _, sighting in targets)
-        return [(detection, sighting) for detection, sighting in targets if self._filter.believes(sighting)]
+        self._unsettled = any(self._filter.needs_observation(sighting) for _, sighting in targets)
+        return [(detection, sighting) for detection, sighting in targets if self._filter.is_confirmed(sighting)]
 
     def _without_anchors_as_objects(self, detections: Sequence[Detection]) -> list[Detection]:
         """The object on the desk is not the desk itself, although a desk is an object."""

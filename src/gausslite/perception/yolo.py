@@ -13,7 +13,7 @@ from gausslite.errors import InvalidInputError, ModelFileError
 from gausslite.perception.class_agnostic import ClassAgnosticSegmenter
 from gausslite.perception.detect import BoxFractions, DetectedBox, concerns_many_objects
 from gausslite.perception.model_file import OpenModel
-from gausslite.perception.vectors import TextVectors, classes_for
+from gausslite.perception.text_embeddings import TextEmbeddings, classes_for
 from gausslite.perception.yolo_decode import Candidates, suppress
 from gausslite.perception.yolo_network import YoloSegNetwork
 
@@ -39,7 +39,7 @@ class YoloSegDetector:
     """A Detector, and a BoxDetector, over one YOLO-seg file whose metadata names its classes."""
 
     def __init__(
-        self, model: OpenModel, vectors: TextVectors | None = None, settings: YoloSettings | None = None
+        self, model: OpenModel, vectors: TextEmbeddings | None = None, settings: YoloSettings | None = None
     ) -> None:
         """Try the model once, so that a wrong file is refused here. Raises ModelFileError.
 
@@ -117,6 +117,6 @@ class YoloSegDetector:
         return classes
 
 
-def yolo_of(model: OpenModel) -> YoloSegDetector:
+def load_yolo(model: OpenModel) -> YoloSegDetector:
     """The detector with its defaults and the text vectors that lie beside the file. Raises ModelFileError."""
-    return YoloSegDetector(model, TextVectors.beside(model.path))
+    return YoloSegDetector(model, TextEmbeddings.from_model_folder(model.path))

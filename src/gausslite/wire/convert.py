@@ -14,7 +14,7 @@ from gausslite.domain.frame import Frame
 from gausslite.domain.pose import require_rigid
 from gausslite.domain.task import Predicate, Relation, TaskGraph
 from gausslite.domain.voxel_batch import VoxelBatch
-from gausslite.domain.voxel_operations import empty_batch, merge_batches, take_voxels
+from gausslite.domain.voxel_operations import empty_batch, merge_batches, select_voxels
 from gausslite.domain.voxels import AxisAlignedBox, VoxelGrid
 from gausslite.errors import InvalidInputError, TaskError
 from gausslite.task.validate import require_graph
@@ -47,8 +47,8 @@ class MapUpdate:
         before = empty_batch() if self.snapshot and self.first else held
         if self.words is None:
             return before
-        kept = take_voxels(before, ~np.isin(before.keys, self.words.keys))
-        return merge_batches(kept, take_voxels(self.words, self.words.counts > 0))
+        kept = select_voxels(before, ~np.isin(before.keys, self.words.keys))
+        return merge_batches(kept, select_voxels(self.words, self.words.counts > 0))
 
 
 def graph_to_message(graph: TaskGraph) -> task_pb2.TaskGraph:
@@ -175,7 +175,7 @@ def map_update_from_message(message: gaussians_pb2.MapBlock, limits: CodecLimits
     words, grid = None, None
     if message.subset:
         subset, grid = decode_subset(message.subset, limits)
-        words = subset.words
+        words = subset.batch
     names, winner = message.provenance.agent_ids, message.provenance.winner
     if len(winner) not in (0, 0 if words is None else len(words)) or any(i >= len(names) for i in winner):
         raise InvalidInputError("map block provenance: expected one known agent for each voxel")

@@ -67,12 +67,12 @@ def build(case: tuple[float, float, int, int]) -> tuple[RoiSubset, VoxelGrid]:
 def test_decoding_is_within_the_stated_bounds(case: tuple[float, float, int, int]) -> None:
     subset, grid = build(case)
     decoded, decoded_grid = decode_subset(encode_subset(subset, grid))
-    sent, got = subset.words.gaussians, decoded.words.gaussians
+    sent, got = subset.batch.gaussians, decoded.batch.gaussians
     assert decoded_grid == grid
     header = [(s.agent_id, s.session_id, s.sequence, s.map_revision) for s in (subset, decoded)]
     assert header[0] == header[1]
     for name in ("keys", "kappa_sums", "counts"):
-        np.testing.assert_array_equal(getattr(subset.words, name), getattr(decoded.words, name))
+        np.testing.assert_array_equal(getattr(subset.batch, name), getattr(decoded.batch, name))
     for name in ("active", "kappa", "target"):
         np.testing.assert_array_equal(getattr(sent, name), getattr(got, name))
     half_step_m = grid.size_m / 65535 / 2 + np.spacing(np.abs(sent.means_m))

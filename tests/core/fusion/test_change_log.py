@@ -56,7 +56,7 @@ def test_a_watcher_that_applies_the_changes_has_the_fused_map(steps) -> None:
             known = changes.revision
             votes = team.changes(0).fused.election.votes()
             assert {key: vote.winner for key, vote in held.items()} == {vote.key: vote.winner for vote in votes}
-            assert all(held[key].stakes[0] == vote.stakes[0] for key, vote in _by_key(team).items())
+            assert all(held[key].scores[0] == vote.scores[0] for key, vote in _by_key(team).items())
 
 
 def _by_key(team: FusionEngine) -> dict:

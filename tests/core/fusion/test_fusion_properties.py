@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.voxel_batch import RoiSubset, VoxelBatch
-from gausslite.domain.voxel_operations import at_keys, group_by_voxel, merge_batches, take_voxels, tombstones
+from gausslite.domain.voxel_operations import group_by_voxel, merge_batches, select_keys, select_voxels, tombstones
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.fusion.memory_store import MemoryStore
 from gausslite.fusion.offline import fuse_maps
@@ -140,7 +140,7 @@ def test_adding_agents_in_any_order_commutes(specs: dict[str, Spec], random) -> 
 def test_the_shards_united_are_the_whole(specs: dict[str, Spec], shards: int) -> None:
     table = table_from(specs)
     parts = [
-        fuse({agent: take_voxels(words, words.keys % shards == shard) for agent, words in table.items()})
+        fuse({agent: select_voxels(words, words.keys % shards == shard) for agent, words in table.items()})
         for shard in range(shards)
     ]
     united = parts[0].words
@@ -168,7 +168,7 @@ def test_the_winner_is_the_most_trained_then_the_denser_then_the_lower_id(specs:
     assert {vote.key: vote.winner for vote in fused.election.votes()} == {k: rank[2] for k, rank in expected.items()}
     for key, (_, _, agent_id) in expected.items():
         keys = np.array([key], np.int64)
-        assert_same_words(at_keys(fused.words, keys), at_keys(table[agent_id], keys))
+        assert_same_words(select_keys(fused.words, keys), select_keys(table[agent_id], keys))
 
 
 @law
@@ -180,7 +180,7 @@ def test_provenance_and_margin_agree_with_the_votes(specs: dict[str, Spec]) -> N
     assert len(fused.provenance) == len(fused.gaussians) == int(fused.words.counts.sum())
     owners = [vote.winner for vote, count in zip(votes, fused.words.counts.tolist(), strict=True) for _ in range(count)]
     assert [fused.election.agents[index] for index in fused.provenance] == owners
-    assert all(vote.margin >= 0 and vote.stakes[0].count > 0 for vote in votes)
+    assert all(vote.margin >= 0 and vote.scores[0].count > 0 for vote in votes)
     assert sum(int(fused.won_by(agent_id).sum()) for agent_id in table) == len(votes)
 
 

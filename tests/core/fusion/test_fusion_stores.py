@@ -15,7 +15,7 @@ import pytest
 
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.voxel_batch import RoiSubset, VoxelBatch
-from gausslite.domain.voxel_operations import at_keys, gather_rows
+from gausslite.domain.voxel_operations import gather_rows, select_keys
 from gausslite.errors import InvalidInputError, StorageError
 from gausslite.fusion.memory_store import MemoryStore
 from gausslite.fusion.sqlite_store import SqliteStore
@@ -59,8 +59,8 @@ def test_what_was_put_is_what_is_read(store: FusionStore) -> None:
     words = store.words("ant")
     assert words.keys.tolist() == list(KEYS)
     assert words.counts.tolist() == [2, 0, 5]
-    assert words.gaussians.means_m.tobytes() == message.words.gaussians.means_m.tobytes()
-    assert words.gaussians.active.tolist() == message.words.gaussians.active.tolist()
+    assert words.gaussians.means_m.tobytes() == message.batch.gaussians.means_m.tobytes()
+    assert words.gaussians.active.tolist() == message.batch.gaussians.active.tolist()
     assert store.agents() == ("ant",)
 
 
@@ -101,7 +101,7 @@ def test_reading_some_voxels_is_reading_all_and_choosing(store: FusionStore) -> 
     store.put(said("bee", 1, {22: 1}))
     wanted = np.array([33, 22, 99, 22], np.int64)
     for agent_id, words in store.table(wanted).items():
-        expected = at_keys(store.words(agent_id), wanted)
+        expected = select_keys(store.words(agent_id), wanted)
         assert words.keys.tolist() == expected.keys.tolist()
         assert words.gaussians.means_m.tobytes() == expected.gaussians.means_m.tobytes()
     assert store.stakes(wanted).keys.tolist() == [22, 33, 22]

@@ -18,7 +18,7 @@ from gausslite.calibration.view_fit import PoseExposurePrior
 from gausslite.codec.state_file import MAGIC, VERSION, read_state, write_state
 from gausslite.domain.frame import Frame
 from gausslite.domain.region import BallRegion
-from gausslite.domain.state import State, part
+from gausslite.domain.state import State, select_prefix
 from gausslite.domain.task import Predicate, Relation, TaskGraph
 from gausslite.domain.voxel_batch import VoxelBatch
 from gausslite.domain.voxels import VoxelGrid

@@ -18,6 +18,7 @@ from gausslite.mapping.settings import MapperSettings, SeedingSettings
 from gausslite.mapping.stages import SkippableStage, Stage
 from gausslite.mission.frame_scheduler import FrameScheduler, SchedulerSettings
 from gausslite.mission.task_mapper import TaskMapper
+from gausslite.perception.relevance_estimator import RelevanceEstimate
 from gausslite.perception.fixed_relevance import NoTaskEstimator, RegionRelevanceEstimator
 from gausslite.render.cpu import CpuRasterizer
 
@@ -102,15 +103,12 @@ class SlowAttention:
     def clock(self) -> float:
         return self.now_s
 
-    def estimate(self, frame: Frame, rendered_depth_m: np.ndarray | None = None) -> RelevanceMap:
+    def estimate(self, frame: Frame, rendered_depth_m: np.ndarray | None = None) -> RelevanceEstimate:
         self.now_s += 10.0
         return BALL.estimate(frame, rendered_depth_m)
 
-    def late(self) -> None:
-        return None
-
     def evaluate_past(self, frame: Frame) -> RelevanceMap:
-        return self.estimate(frame)
+        return self.estimate(frame).relevance
 
     def state(self) -> State:
         return {}

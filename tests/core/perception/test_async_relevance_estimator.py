@@ -45,10 +45,10 @@ def beside(executor: Executor, every: int = 3) -> AsyncRelevanceEstimator:
 def test_nothing_is_marked_until_the_first_detection_is_there() -> None:
     executor = WorkInHand()
     attention = beside(executor)
-    assert not any(attention.attend(frame_at(index)).roi.any() for index in range(3))
+    assert not any(attention.estimate(frame_at(index)).relevance.roi.any() for index in range(3))
     executor.run_next()
     frame = frame_at(3)
-    truth, carried = MUG.mask(frame), attention.attend(frame).roi
+    truth, carried = MUG.mask(frame), attention.estimate(frame).relevance.roi
     assert (truth & carried).sum() / (truth | carried).sum() > 0.8
 
 
@@ -57,29 +57,26 @@ def test_late_relevance_is_that_of_the_frame_it_was_made_on() -> None:
     attention = beside(executor)
     frames = [frame_at(index) for index in range(3)]
     for frame in frames:
-        attention.attend(frame)
-        assert attention.late() is None
+        assert attention.estimate(frame).delayed is None
     executor.run_next()
-    attention.attend(frame_at(3))
-    late = attention.late()
-    assert late is not None
-    assert late.frame is frames[0]
-    assert late.lag_frames == 3
-    at_once = TaskRelevanceEstimator(TASK, RegionDetector({"mug": MUG})).attend(frames[0])
-    np.testing.assert_array_equal(late.relevance.target, at_once.target)
-    attention.attend(frame_at(4))
-    assert attention.late() is None
+    delayed = attention.estimate(frame_at(3)).delayed
+    assert delayed is not None
+    assert delayed.frame is frames[0]
+    assert delayed.lag_frames == 3
+    at_once = TaskRelevanceEstimator(TASK, RegionDetector({"mug": MUG})).estimate(frames[0]).relevance
+    np.testing.assert_array_equal(delayed.relevance.target, at_once.target)
+    assert attention.estimate(frame_at(4)).delayed is None
 
 
 def test_one_detection_runs_at_a_time_and_the_newest_keyframe_waits() -> None:
     executor = WorkInHand()
     attention = beside(executor, every=2)
     for index in range(9):
-        attention.attend(frame_at(index))
+        attention.estimate(frame_at(index))
         assert executor.frames == [0]
     assert attention.notes == ("detector too slow: 3 keyframes were overtaken",)
     executor.run_next()
-    attention.attend(frame_at(9))
+    attention.estimate(frame_at(9))
     assert executor.frames == [8]
 
 
@@ -88,7 +85,7 @@ def test_a_detector_that_is_quick_enough_sees_the_same_keyframes_as_one_that_is_
     attention = beside(executor)
     seen = []
     for index in range(10):
-        attention.attend(frame_at(index))
+        attention.estimate(frame_at(index))
         seen += executor.frames
         while executor.jobs:
             executor.run_next()
@@ -98,10 +95,10 @@ def test_a_detector_that_is_quick_enough_sees_the_same_keyframes_as_one_that_is_
 def test_what_the_detector_raises_comes_with_a_later_frame() -> None:
     executor = WorkInHand()
     attention = AsyncRelevanceEstimator(TASK, BrokenDetector(), executor)
-    attention.attend(frame_at(0))
+    attention.estimate(frame_at(0))
     executor.run_next()
     with pytest.raises(ModelFileError, match="broken"):
-        attention.attend(frame_at(1))
+        attention.estimate(frame_at(1))
 
 
 class BrokenOnce(RegionDetector):
@@ -119,13 +116,13 @@ class BrokenOnce(RegionDetector):
 def test_what_the_detector_raises_on_an_earlier_frame_is_raised_once_and_the_frame_looked_at_again() -> None:
     executor, earlier = WorkInHand(), frame_at(0)
     attention = AsyncRelevanceEstimator(TASK, BrokenOnce({"mug": MUG}), executor)
-    assert attention.look_back(earlier) is None
+    assert attention.evaluate_past(earlier) is None
     executor.run_next()
     with pytest.raises(MemoryError, match="a moment"):
-        attention.look_back(earlier)
-    assert attention.look_back(earlier) is None
+        attention.evaluate_past(earlier)
+    assert attention.evaluate_past(earlier) is None
     executor.run_next()
-    relevance = attention.look_back(earlier)
+    relevance = attention.evaluate_past(earlier)
     assert relevance is not None
     np.testing.assert_array_equal(relevance.roi, MUG.mask(earlier))
 

@@ -35,7 +35,7 @@ def frame_at(x_m: float = 0.0, index: int = 0, wall_m: float = 2.0) -> Frame:
 def seen_from_the_origin(z_m: float = 2.0, score: float = 0.4) -> Landmark:
     grid = np.stack(np.meshgrid(np.linspace(-0.2, 0.2, 9), np.linspace(-0.2, 0.2, 9)), axis=-1).reshape(-1, 2)
     points_m = np.column_stack([grid, np.full(len(grid), z_m)])
-    return Landmark.from_sighting(Observation.of_points("mug", points_m, np.zeros(3), score))
+    return Landmark.from_observation(Observation.from_points("mug", points_m, np.zeros(3), score))
 
 
 @dataclass
@@ -59,7 +59,7 @@ def lit(scores: Sequence[float | None], frames: int, max_frames: int = 1) -> lis
     attention = TaskRelevanceEstimator(
         TaskGraph("id", "find the mug", ("mug",), (), ()), detector, TrackerSettings(max_frames=max_frames)
     )
-    return [bool(attention.attend(frame_at(index=index)).roi.any()) for index in range(frames)]
+    return [bool(attention.estimate(frame_at(index=index)).relevance.roi.any()) for index in range(frames)]
 
 
 def test_what_is_seen_through_a_chairs_slats_is_not_the_chair():
@@ -99,7 +99,7 @@ def test_after_a_first_faint_detection_the_next_frame_is_looked_at_too():
     for detector, calls in ((settled, 1), (unsettled, 2)):
         attention = TaskRelevanceEstimator(TaskGraph("id", "find the mug", ("mug",), (), ()), detector)
         for index in range(5):
-            attention.attend(frame_at(index=index))
+            attention.estimate(frame_at(index=index))
         assert detector.calls == calls
 
 
@@ -135,7 +135,7 @@ def test_nobody_is_blamed_for_not_seeing_from_farther_than_ever():
 def test_the_order_of_sightings_does_not_matter_for_what_is_known():
     rng = np.random.default_rng(0)
     sightings = [
-        Observation.of_points("mug", rng.uniform(-0.1, 0.1, (200, 3)), np.array([0.0, 0.0, -z]), score)
+        Observation.from_points("mug", rng.uniform(-0.1, 0.1, (200, 3)), np.array([0.0, 0.0, -z]), score)
         for z, score in ((1.0, 0.3), (2.0, 0.7), (1.5, 0.5))
     ]
     for order in ((0, 1, 2), (2, 0, 1)):
@@ -151,7 +151,7 @@ def test_the_order_of_sightings_does_not_matter_for_what_is_known():
 def cloud(phrase: str, score: float, *low_and_high_m: tuple[float, float]) -> Observation:
     axes = [np.arange(low, high, 0.03) for low, high in low_and_high_m]
     points_m = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 3)
-    return Observation.of_points(phrase, points_m, np.zeros(3), score)
+    return Observation.from_points(phrase, points_m, np.zeros(3), score)
 
 
 def closest_chair() -> SpatialFilter:
@@ -181,7 +181,7 @@ def test_a_faint_candidate_does_not_decide_which_is_the_closest():
     kept = closest_chair()
     for _ in range(3):
         kept.observe([table, faint, sure])
-    assert kept.believes(faint)
+    assert kept.is_confirmed(faint)
     assert kept.keep(sure)
     assert not kept.keep(faint)
 

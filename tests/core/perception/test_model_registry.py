@@ -14,7 +14,7 @@ from gausslite.domain.frame import Frame
 from gausslite.errors import InvalidInputError, KernelError, ModelFileError
 from gausslite.perception.detect import DetectedBox, SegmentedDetector
 from gausslite.perception.model_file import choose_providers, open_model
-from gausslite.perception.model_registry import Family, ModelRegistry, family_of
+from gausslite.perception.model_registry import ModelFamily, ModelRegistry, identify_family
 
 # in the network's pixels; in the image columns 32 to 64, rows 16 to 48
 CUP = (24.0, 32.0, 16.0, 16.0, 0, 0.9)
@@ -39,11 +39,11 @@ def found_pixels(networks: ModelRegistry) -> int:
 
 def test_a_family_is_told_by_inputs_and_outputs(tmp_path):
     grounding = write_tiny_grounding(tmp_path / "dino.onnx", [((0.5, 0.5, 0.2, 0.2), {})])
-    assert family_of(open_model(grounding, 1)) is Family.GROUNDING_DINO
-    assert family_of(open_model(yolo(tmp_path), 1)) is Family.YOLO_SEG
+    assert identify_family(open_model(grounding, 1)) is ModelFamily.GROUNDING_DINO
+    assert identify_family(open_model(yolo(tmp_path), 1)) is ModelFamily.YOLO_SEG
     boxes = write_boxes_only(tmp_path / "boxes.onnx")
     with pytest.raises(ModelFileError, match=r"boxes only, no masks"):
-        family_of(open_model(boxes, 1))
+        identify_family(open_model(boxes, 1))
 
 
 @pytest.mark.parametrize("name", [None, "yolo"])

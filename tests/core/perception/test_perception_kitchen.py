@@ -12,9 +12,9 @@ from gausslite.datasets.regions import load_voxel_regions
 from gausslite.datasets.source import Source
 from gausslite.perception.model_file import open_model
 from gausslite.perception.relevance_estimator import TaskRelevanceEstimator
+from gausslite.perception.text_embeddings import TextEmbeddings, classes_for
 from gausslite.perception.tracker import TrackerSettings
-from gausslite.perception.vectors import TextVectors, classes_for
-from gausslite.perception.yolo import YoloSegDetector, yolo_of
+from gausslite.perception.yolo import YoloSegDetector, load_yolo
 from gausslite.task.rules import RuleParser
 
 
@@ -25,7 +25,7 @@ def kitchen(shared_dir: Path) -> Source:
 
 @pytest.fixture(scope="module")
 def detector(shared_dir: Path) -> YoloSegDetector:
-    return yolo_of(open_model(shared_dir / "models" / "yolo11n-seg_int8.onnx"))
+    return load_yolo(open_model(shared_dir / "models" / "yolo11n-seg_int8.onnx"))
 
 
 def attention_to(text: str, kitchen: Source, detector: YoloSegDetector) -> TaskRelevanceEstimator:
@@ -42,7 +42,7 @@ def test_it_finds_chairs_table_and_cups(kitchen, detector):
 
 
 def test_text_vectors_take_nouns_to_classes_and_refuse_the_rest(shared_dir, detector):
-    vectors = TextVectors.beside(shared_dir / "models" / "yolo11n-seg_int8.onnx")
+    vectors = TextEmbeddings.from_model_folder(shared_dir / "models" / "yolo11n-seg_int8.onnx")
     assert vectors is not None
     names = detector.class_names
     expected = {"mug": "cup", "armchair": "chair", "desk": "dining table", "stool": "chair", "wheelchair": "chair"}
@@ -60,12 +60,12 @@ def test_the_chair_closest_to_the_table(kitchen, detector, shared_dir):
     shared = marked = 0
     for number in range(500, 996, 40):
         frame = kitchen.frame(kitchen.indices().index(number))
-        roi = attention.attend(frame).roi
+        roi = attention.estimate(frame).relevance.roi
         if number >= 780:
             shared += np.count_nonzero(roi & regions["chair_3"].mask(frame))
             marked += np.count_nonzero(roi)
     assert shared / marked > 0.7
-    (table,) = [each for each in attention.remembered if each.phrase == "table" and each.seen > 1]
+    (table,) = [each for each in attention.landmarks if each.phrase == "table" and each.seen > 1]
     assert np.abs(table.centroid_m - regions["table_1"].centroid_m).max() < 0.2
 
 
@@ -74,7 +74,7 @@ def test_the_closest_chair_is_known_while_an_end_of_the_table_is_all_that_was_se
     attention = attention_to("Identify the chair closest to the table", kitchen, detector)
     for number in (0, 8, 20, 44, 56, 64):
         frame = kitchen.frame(kitchen.indices().index(number), (320, 240))
-        roi = attention.attend(frame).roi
+        roi = attention.estimate(frame).relevance.roi
         assert not (roi & regions["chair_2"].mask(frame)).any()
         if number in (0, 8, 20):
             assert (roi & regions["chair_3"].mask(frame)).any()
@@ -86,8 +86,8 @@ def test_mugs_on_the_table_are_kept_and_an_absent_object_lights_nothing(kitchen,
     shares = []
     for number in range(240, 480, 40):
         frame = kitchen.frame(kitchen.indices().index(number))
-        shares.append(mugs.attend(frame).roi_share)
+        shares.append(mugs.estimate(frame).relevance.roi_share)
         if number % 80 == 0:
-            assert umbrella.attend(frame).roi_share < 0.005
+            assert umbrella.estimate(frame).relevance.roi_share < 0.005
     assert sum(share > 0.002 for share in shares) >= 5
     assert max(shares) < 0.05

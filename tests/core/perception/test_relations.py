@@ -22,7 +22,7 @@ MIRRORED = {
 
 def box(phrase: str, centre_m: tuple[float, float, float], size_m: tuple[float, float, float]) -> Observation:
     grid = np.stack(np.meshgrid(*(np.linspace(-side / 2, side / 2, 12) for side in size_m)), axis=-1).reshape(-1, 3)
-    return Observation.of_points(phrase, grid + centre_m, EYE_M)
+    return Observation.from_points(phrase, grid + centre_m, EYE_M)
 
 
 def thing(phrase: str, *centre_m: float) -> Observation:

@@ -19,8 +19,8 @@ from gausslite.perception.object_map import Observation
 from gausslite.perception.relations import SpatialSettings
 from gausslite.perception.relevance_estimator import TaskRelevanceEstimator
 from gausslite.perception.spatial import SpatialFilter, best_depth_m
+from gausslite.perception.text_embeddings import classes_for
 from gausslite.perception.tracker import TrackerSettings
-from gausslite.perception.vectors import classes_for
 
 CAMERA = Camera(100.0, 100.0, 80.0, 60.0, 160, 120)
 UP = (0.0, -1.0, 0.0)
@@ -45,7 +45,7 @@ def graph_of(*relations: Relation, targets: tuple[str, ...] = ("mug",)) -> TaskG
 
 def sighting(phrase: str, *centre_m: float, radius_m: float = 0.1) -> Observation:
     rng = np.random.default_rng(0)
-    return Observation.of_points(phrase, np.asarray(centre_m) + rng.uniform(-radius_m, radius_m, (300, 3)))
+    return Observation.from_points(phrase, np.asarray(centre_m) + rng.uniform(-radius_m, radius_m, (300, 3)))
 
 
 @dataclass
@@ -69,7 +69,7 @@ MUG = BallRegion((0.0, 0.0, 2.0), 0.2)
 
 def test_a_target_without_relations_is_marked():
     attention = TaskRelevanceEstimator(graph_of(), RegionDetector({"mug_1": MUG}))
-    relevance = attention.attend(frame_at())
+    relevance = attention.estimate(frame_at()).relevance
     assert np.array_equal(relevance.roi, MUG.mask(frame_at()))
     assert set(np.unique(relevance.target)) == {NO_TARGET, 0}
 
@@ -81,7 +81,7 @@ def test_detection_runs_on_the_first_frame_on_motion_and_after_some_frames():
     for index, (x_m, turn_deg) in enumerate(
         [(0, 0), (0.1, 0), (0.2, 0), (0.2, 16), (0.2, 16), (1.3, 16), *[(1.3, 16)] * 4]
     ):
-        attention.attend(frame_at(x_m, index, turn_deg))
+        attention.estimate(frame_at(x_m, index, turn_deg))
         calls.append(detector.calls)
     assert calls == [1, 1, 1, 2, 2, 3, 3, 3, 3, 4]
 
@@ -90,23 +90,23 @@ def test_detection_runs_on_the_first_frame_on_motion_and_after_some_frames():
 def test_between_detections_the_mask_follows_the_object(x_m, turn_deg):
     detector = CountingDetector(RegionDetector({"mug": MUG}))
     attention = TaskRelevanceEstimator(graph_of(), detector)
-    attention.attend(frame_at())
+    attention.estimate(frame_at())
     moved = frame_at(x_m, 1, turn_deg)
-    truth, carried = MUG.mask(moved), attention.attend(moved).roi
+    truth, carried = MUG.mask(moved), attention.estimate(moved).relevance.roi
     assert detector.calls == 1
     assert (truth & carried).sum() / (truth | carried).sum() > 0.85
 
 
 def test_an_object_that_leaves_the_view_is_not_carried_over():
     attention = TaskRelevanceEstimator(graph_of(), RegionDetector({"mug": MUG}), TrackerSettings(max_translation_m=9))
-    attention.attend(frame_at())
-    assert not attention.attend(frame_at(5.0, 1)).roi.any()
+    attention.estimate(frame_at())
+    assert not attention.estimate(frame_at(5.0, 1)).relevance.roi.any()
 
 
 def test_without_depth_nothing_is_marked():
     frame = frame_at()
     dark = Frame(0, 0, frame.rgb, np.zeros_like(frame.depth_m), CAMERA, frame.T_world_camera)
-    assert not TaskRelevanceEstimator(graph_of(), RegionDetector({"mug": MUG})).attend(dark).roi.any()
+    assert not TaskRelevanceEstimator(graph_of(), RegionDetector({"mug": MUG})).estimate(dark).relevance.roi.any()
 
 
 def test_the_maps_depth_comes_before_the_sensors():
@@ -118,7 +118,7 @@ def test_the_maps_depth_comes_before_the_sensors():
 def test_a_target_is_kept_while_its_anchor_was_never_seen_and_that_is_said():
     graph = graph_of(Relation(Predicate.ON, "mug", "table"))
     attention = TaskRelevanceEstimator(graph, RegionDetector({"mug": MUG}))
-    assert attention.attend(frame_at()).roi.any()
+    assert attention.estimate(frame_at()).relevance.roi.any()
     assert "anchor 'table' not seen yet: its targets are kept" in attention.notes
 
 
@@ -143,7 +143,7 @@ def test_on_means_higher_and_not_aside(centre_m, expected):
 def test_on_a_long_table_means_over_its_footprint():
     kept = SpatialFilter(graph_of(Relation(Predicate.ON, "mug", "table")), UP, SpatialSettings())
     x, z = np.meshgrid(np.linspace(-1, 1, 80), np.linspace(-0.4, 0.4, 40))
-    kept.observe([Observation.of_points("table", np.stack([x.ravel(), np.zeros(x.size), z.ravel()], axis=1))])
+    kept.observe([Observation.from_points("table", np.stack([x.ravel(), np.zeros(x.size), z.ravel()], axis=1))])
     assert kept.keep(sighting("mug", 0.9, -0.1, 0.3, radius_m=0.04))
     assert not kept.keep(sighting("mug", 1.4, -0.1, 0.3, radius_m=0.04))
 
@@ -174,8 +174,8 @@ def test_partial_views_of_one_table_grow_into_its_true_centre():
     for _ in range(3):
         for left in (-1.0, -0.6, -0.2):
             x, z = np.meshgrid(np.arange(left, left + 1.2, 0.02), np.arange(-0.4, 0.4, 0.02))
-            kept.observe([Observation.of_points("table", np.stack([x.ravel(), np.zeros(x.size), z.ravel()], axis=1))])
-    (table,) = kept.remembered
+            kept.observe([Observation.from_points("table", np.stack([x.ravel(), np.zeros(x.size), z.ravel()], axis=1))])
+    (table,) = kept.landmarks
     assert table.seen == 9
     assert np.abs(table.centroid_m - (0, 0, 0)).max() < 0.06
 
@@ -183,7 +183,7 @@ def test_partial_views_of_one_table_grow_into_its_true_centre():
 def test_the_object_on_the_desk_is_not_the_desk():
     regions = {"desk": BallRegion((0.3, 0.2, 2.0), 0.2), "book": BallRegion((0.3, -0.2, 2.0), 0.15)}
     graph = graph_of(Relation(Predicate.ON, "object", "desk"), targets=("object",))
-    relevance = TaskRelevanceEstimator(graph, RegionDetector(regions)).attend(frame_at())
+    relevance = TaskRelevanceEstimator(graph, RegionDetector(regions)).estimate(frame_at()).relevance
     assert np.array_equal(relevance.roi, regions["book"].mask(frame_at()))
 
 
@@ -198,7 +198,7 @@ def test_region_detector_answers_by_head_noun_and_says_what_it_cannot_find():
 
 def test_region_attention_numbers_its_regions():
     other = BallRegion((0.5, 0, 2.0), 0.1)
-    relevance = RegionRelevanceEstimator([MUG, other]).attend(frame_at())
+    relevance = RegionRelevanceEstimator([MUG, other]).estimate(frame_at()).relevance
     assert np.array_equal(relevance.target == 1, other.mask(frame_at()))
     with pytest.raises(InvalidInputError, match="at least one region"):
         RegionRelevanceEstimator([])

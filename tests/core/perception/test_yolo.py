@@ -13,13 +13,13 @@ from gausslite.domain.frame import Frame
 from gausslite.errors import InvalidInputError, ModelFileError
 from gausslite.perception.detect import BoxFractions
 from gausslite.perception.model_file import open_model
-from gausslite.perception.yolo import YoloSegDetector, YoloSettings, yolo_of
+from gausslite.perception.yolo import YoloSegDetector, YoloSettings, load_yolo
 
 NAMES = ("cup", "chair", "dining table")
 
 
-def load_yolo(path: Path) -> YoloSegDetector:
-    return yolo_of(open_model(path, threads=1))
+def detector_from(path: Path) -> YoloSegDetector:
+    return load_yolo(open_model(path, threads=1))
 
 
 def frame_with_red_square() -> Frame:
@@ -34,7 +34,7 @@ CUP = (24.0, 32.0, 16.0, 16.0, 0, 0.9)
 
 
 def test_letterbox_box_and_mask_come_back_to_the_image(tmp_path):
-    detector = load_yolo(write_tiny_yolo(tmp_path / "tiny.onnx", NAMES, [CUP]))
+    detector = detector_from(write_tiny_yolo(tmp_path / "tiny.onnx", NAMES, [CUP]))
     (found,) = detector.detect(frame_with_red_square(), ["mug"])
     assert found.phrase == "mug"
     assert found.score == pytest.approx(0.9)
@@ -52,7 +52,7 @@ def test_letterbox_box_and_mask_come_back_to_the_image(tmp_path):
 
 def test_a_mask_does_not_leave_its_box(tmp_path):
     narrow = (24.0, 32.0, 8.0, 16.0, 0, 0.9)
-    detector = load_yolo(write_tiny_yolo(tmp_path / "tiny.onnx", NAMES, [narrow]))
+    detector = detector_from(write_tiny_yolo(tmp_path / "tiny.onnx", NAMES, [narrow]))
     (found,) = detector.detect(frame_with_red_square(), ["cup"])
     assert not found.mask[:, :40].any()
     assert not found.mask[:, 56:].any()
@@ -61,39 +61,39 @@ def test_a_mask_does_not_leave_its_box(tmp_path):
 
 def test_overlapping_boxes_of_one_class_become_one_and_other_classes_stay(tmp_path):
     shifted, chair = (25.0, 32.0, 16.0, 16.0, 0, 0.8), (24.0, 32.0, 16.0, 16.0, 1, 0.7)
-    detector = load_yolo(write_tiny_yolo(tmp_path / "tiny.onnx", NAMES, [shifted, CUP, chair]))
+    detector = detector_from(write_tiny_yolo(tmp_path / "tiny.onnx", NAMES, [shifted, CUP, chair]))
     found = detector.detect(frame_with_red_square(), ["cup", "chair"])
     assert [(each.phrase, round(each.score, 2)) for each in found] == [("cup", 0.9), ("chair", 0.7)]
 
 
 def test_boxes_below_the_score_or_without_a_mask_are_left_out(tmp_path):
     doubtful, black = (24.0, 32.0, 16.0, 16.0, 0, 0.2), (52.0, 32.0, 16.0, 16.0, 0, 0.9)
-    detector = load_yolo(write_tiny_yolo(tmp_path / "tiny.onnx", NAMES, [doubtful, black]))
+    detector = detector_from(write_tiny_yolo(tmp_path / "tiny.onnx", NAMES, [doubtful, black]))
     assert detector.detect(frame_with_red_square(), ["cup"]) == []
 
 
 def test_boxes_that_span_too_much_are_left_out(tmp_path):
     huge = (32.0, 32.0, 64.0, 24.0, 0, 0.9)
     path = write_tiny_yolo(tmp_path / "tiny.onnx", NAMES, [huge])
-    assert load_yolo(path).detect(frame_with_red_square(), ["cup"]) == []
+    assert detector_from(path).detect(frame_with_red_square(), ["cup"]) == []
     lenient = YoloSegDetector(open_model(path), None, YoloSettings(box_fractions=BoxFractions(small=1.0)))
     assert len(lenient.detect(frame_with_red_square(), ["cup"])) == 1
 
 
 def test_a_generic_noun_finds_every_class(tmp_path):
     chair = (20.0, 30.0, 10.0, 10.0, 1, 0.7)
-    detector = load_yolo(write_tiny_yolo(tmp_path / "tiny.onnx", NAMES, [CUP, chair]))
+    detector = detector_from(write_tiny_yolo(tmp_path / "tiny.onnx", NAMES, [CUP, chair]))
     assert len(detector.detect(frame_with_red_square(), ["obstacle"])) == 2
 
 
 def test_a_noun_without_a_class_is_said_and_not_found(tmp_path):
-    detector = load_yolo(write_tiny_yolo(tmp_path / "tiny.onnx", NAMES, [CUP]))
+    detector = detector_from(write_tiny_yolo(tmp_path / "tiny.onnx", NAMES, [CUP]))
     assert detector.detect(frame_with_red_square(), ["umbrella"]) == []
     assert detector.warnings == ("no class of the detector fits 'umbrella': it will not be found",)
 
 
 def test_segment_matches_instances_of_any_class_to_boxes(tmp_path):
-    segmenter = load_yolo(write_tiny_yolo(tmp_path / "tiny.onnx", NAMES, [CUP])).segmenter()
+    segmenter = detector_from(write_tiny_yolo(tmp_path / "tiny.onnx", NAMES, [CUP])).segmenter()
     boxes = np.array([[30, 16, 64, 50], [80, 0, 120, 30]], np.float32)
     first, second = segmenter.segment(frame_with_red_square(), boxes)
     assert first is not None
@@ -141,6 +141,6 @@ def test_settings_are_checked():
 
 def _refused(path: Path, expected: str) -> None:
     with pytest.raises(ModelFileError, match=expected) as caught:
-        load_yolo(path)
+        detector_from(path)
     assert str(path) in str(caught.value)
     assert "\n" not in str(caught.value)

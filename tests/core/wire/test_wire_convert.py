@@ -181,7 +181,7 @@ def test_a_box_survives_and_knows_what_it_holds() -> None:
     box = AxisAlignedBox((-1.0, -1.0, -1.0), (1.0, 2.0, 3.0))
     assert convert.box_from_message(convert.box_to_message(box)) == box
     points = np.array([[0, 0, 0], [1, 2, 3], [1.1, 0, 0]], np.float32)
-    assert box.holds(points).tolist() == [True, True, False]
+    assert box.contains(points).tolist() == [True, True, False]
 
 
 def test_is_done() -> None:

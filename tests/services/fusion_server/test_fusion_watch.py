@@ -47,7 +47,7 @@ def watching(settings: FusionSettings, body: Callable[[AsyncIterator[MapBlock], 
 
 
 def group_by_voxel(block: MapBlock) -> VoxelBatch:
-    return decode_subset(block.subset)[0].words
+    return decode_subset(block.subset)[0].batch
 
 
 def test_many_changes_become_one_with_each_voxel_once() -> None:

@@ -25,7 +25,7 @@ _VECTORS, _NAMES, _COCO_VECTORS = "lvis_v1_clip_a+cname.npy", "lvis_v1_train_cat
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class TextVectors:
+class TextEmbeddings:
     """A vocabulary of nouns with unit text vectors, centred; coco holds the 80 COCO classes in the same space."""
 
     rows: dict[str, int]
@@ -33,7 +33,7 @@ class TextVectors:
     coco: Float32[ndarray, "c d"] | None
 
     @classmethod
-    def beside(cls, model_path: Path) -> TextVectors | None:
+    def from_model_folder(cls, model_path: Path) -> TextEmbeddings | None:
         """Read the vector files in the model's folder; None when they are not there. Raises ModelFileError."""
         vectors_path, names_path = model_path.parent / _VECTORS, model_path.parent / _NAMES
         if not (vectors_path.is_file() and names_path.is_file()):
@@ -75,7 +75,7 @@ class TextVectors:
         return table
 
 
-def classes_for(phrase: str, class_names: Sequence[str], vectors: TextVectors | None) -> tuple[int, ...]:
+def classes_for(phrase: str, class_names: Sequence[str], vectors: TextEmbeddings | None) -> tuple[int, ...]:
     """The detector's classes that a phrase means; empty when none fits.
 
     Tried in this order: the name itself, its synonym, its head, the head's synonym, the text vectors. A generic noun
