@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Find the colour camera of a sequence whose depth is not registered to colour, for the option --colour-camera.
+"""Find the colour camera of a sequence whose depth is not registered to colour, for the option --register-depth.
 
     tools/estimate_registration.py SOURCE [--frames START:STOP:STEP] [--count 40]
 
@@ -11,7 +11,7 @@ from __future__ import annotations
 import argparse
 import sys
 
-from gausslite.calibration.registration import estimate_colour_camera
+from gausslite.calibration.registration import estimate_depth_registration
 from gausslite.datasets.open import open_source
 from gausslite.datasets.selection import select_frames
 from gausslite.errors import GaussLiteError
@@ -26,7 +26,7 @@ def main() -> int:
     try:
         source = open_source(options.source)
         positions = select_frames(source, options.frames)
-        found = estimate_colour_camera(source, positions, options.count)
+        found = estimate_depth_registration(source, positions, options.count)
     except GaussLiteError as error:
         print(f"estimate_registration: {error}", file=sys.stderr)
         return 2

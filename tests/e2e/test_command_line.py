@@ -65,7 +65,7 @@ def test_a_uniform_map_needs_no_task(tmp_path: Path) -> None:
 
 def test_eval_scores_a_map_on_frames(mug_map: Path) -> None:
     done = gausslite(
-        "eval", mug_map / "map.ply", HOME, "--size", "160x120", "--hold-out", "4", "--roi-ball", "2,2,0.8,0.5", "--json"
+        "eval", mug_map / "map.ply", HOME, "--size", "160x120", "--test-every", "4", "--roi-ball", "2,2,0.8,0.5", "--json"
     )
     assert done.returncode == 0, done.stderr
     scores = json.loads(done.stdout)
@@ -106,7 +106,7 @@ def test_every_mistake_gets_one_line_and_exit_code_two(tmp_path: Path, mug_map: 
         "notes.onnx": ("map", HOME, *task, "--detector", tmp_path / "notes.onnx", *out),
         "frames": ("map", HOME, *task, "--frames", "9:3", *out),
         "size": ("map", HOME, *task, "--size", "huge", *out),
-        "colour camera": ("map", HOME, *task, "--colour-camera", "525,525", *out),
+        "colour camera": ("map", HOME, *task, "--register-depth", "525,525", *out),
         "max_gaussians": ("map", HOME, *task, "--max-gaussians", "0", *out),
         "threads: expected": ("map", HOME, *task, "--threads", "0", *out),
         "threads: expected 1": ("demo", "--threads", "0", *out),

@@ -88,7 +88,7 @@ def test_a_recordings_robots_register_and_refine_as_the_demo_was_told(tmp_path: 
     folder, out = tmp_path / "walk", tmp_path / "demo"
     _write_recording(folder)
     camera = ",".join(np.loadtxt(folder / "camera-intrinsics.txt")[[0, 1, 0, 1], [0, 1, 2, 2]].astype(str))
-    told = ("--colour-camera", camera, "--view-error", "0.01,0.5,0.1,0.03")
+    told = ("--register-depth", camera, "--pose-prior", "0.01,0.5,0.1,0.03")
     tasks = ("--source", folder, "--task-a", "Find the mug", "--task-b", "Find the mug")
     command = [sys.executable, "-m", "gausslite", "demo", *SMALL, *map(str, tasks), *told, "--out", str(out)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=280)

@@ -15,7 +15,7 @@ from gausslite.errors import InvalidInputError
 if TYPE_CHECKING:
     from gausslite.models.catalogue import ModelEntry
     from gausslite.models.download import Progress
-    from gausslite.models.fetch import Fetched
+    from gausslite.models.fetch import FetchedModel
 
 _BASE_URL = "GAUSSLITE_MODELS_URL"
 
@@ -110,10 +110,10 @@ def _inspect(options: argparse.Namespace) -> int:
     return 0
 
 
-def _assurance(fetched: Fetched) -> str:
+def _assurance(fetched: FetchedModel) -> str:
     """What is known of a file that came over the network, said as plainly as what is not."""
-    if fetched.vouched_by:
-        return f"verified: its SHA-256 is the one that {fetched.vouched_by} names"
+    if fetched.checksum_source:
+        return f"verified: its SHA-256 is the one that {fetched.checksum_source} names"
     return (
         f"not verified: nobody named its SHA-256 beforehand; it is {fetched.sha256}, compare it with its maker's "
         "(it is written down in SHA256SUMS, which holds the file to it from now on)"

@@ -6,7 +6,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from gausslite.calibration.pose_exposure_error import measure_view_error
+from gausslite.calibration.pose_exposure_error import estimate_pose_exposure_prior
 from gausslite.calibration.registration import find_registration
 from gausslite.calibration.view_fit import PoseExposurePrior
 from gausslite.config.options import AS_RECORDED, LOOK, TRUSTED, add_frames, names, numbers
@@ -44,8 +44,8 @@ def open_with_warnings(
 def open_recorded(spec: str, up_axis: UpAxis | None) -> Source:
     """Open a sequence as it was recorded and tell what is left out of it. Raises DatasetError, InvalidInputError."""
     source = open_source(spec, up_axis)
-    if source.left_out:
-        print(f"{spec}: {source.left_out}", file=sys.stderr)
+    if source.excluded_frames:
+        print(f"{spec}: {source.excluded_frames}", file=sys.stderr)
     return source
 
 
@@ -76,7 +76,7 @@ def resolve_pose_prior(spec: str, source: Source, pose_prior: PoseExposurePrior 
         return pose_prior
     if is_simulated(spec):
         return PoseExposurePrior()
-    found, why = measure_view_error(source)
+    found, why = estimate_pose_exposure_prior(source)
     print(f"--pose-prior {TRUSTED if found.is_exact else found}: {why}", file=sys.stderr)
     return found
 

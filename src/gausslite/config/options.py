@@ -34,7 +34,7 @@ _VIEW_ERROR_HELP = (
     "(default: {})"
 )
 _MEASURE_HELP = "; auto: measured on pairs of a recording's frames"
-_RELIEF_HELP = "what gives way, in order, where that time is short (default: words,seeding)"
+_RELIEF_HELP = "what gives way, in order, where that time is short (default: publishing,seeding)"
 _RUN_OVER_HELP = "by what share of its time a frame that is short of them may be late (default: %(default)s)"
 
 
@@ -67,7 +67,7 @@ def add_detector(parser: argparse.ArgumentParser) -> None:
     """Add --detector, --segmenter, --vocabulary and --resegment: what finds the task's nouns and outlines them."""
     add = parser.add_argument_group("perception").add_argument
     add("--detector", metavar="FILE.onnx", type=Path, help=_DETECTOR_HELP)
-    add("--segmenter", metavar="FILE.onnx|yolo|cut", help="a FastSAM model, the detector's masks, or depth and colour")
+    add("--segmenter", metavar="FILE.onnx|yolo|depth", help="a FastSAM model, the detector's masks, or depth and colour")
     add("--vocabulary", metavar="FILE.txt", type=Path, help="Grounding DINO's words (default: vocab.txt beside it)")
     add("--resegment", action="store_true", help="cut boxes out anew on every frame (slower)")
 
@@ -164,7 +164,7 @@ def names(text: str) -> tuple[str, ...]:
 
 
 def skip_stages(text: str) -> tuple[SkippableStage, ...]:
-    """Read "words,seeding"; argparse reports what is wrong."""
+    """Read "publishing,seeding"; argparse reports what is wrong."""
     try:
         return tuple(dict.fromkeys(SkippableStage(name) for name in names(text)))
     except ValueError:

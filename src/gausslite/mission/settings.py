@@ -11,7 +11,7 @@ from gausslite.datasets.source import Source
 from gausslite.domain.pose import UpAxis
 from gausslite.domain.region import Region
 from gausslite.errors import InvalidInputError
-from gausslite.mapping.policies import policy, without
+from gausslite.mapping.policies import disable, policy
 from gausslite.mapping.settings import MapperSettings
 from gausslite.mapping.stages import SkippableStage
 from gausslite.mission.frame_scheduler import SchedulerSettings
@@ -45,7 +45,7 @@ class SceneKnowledge:
 class PerceptionSettings:
     """What finds the task's nouns: a YOLO-seg or Grounding DINO file, or ground truth without one.
 
-    segmenter names what cuts boxes out: "yolo", "cut" or a FastSAM file; None takes the model's own masks or the cut.
+    segmenter names what outlines detected boxes: "yolo", "depth" or a FastSAM file; None takes the model's own masks or depth.
     vocabulary is Grounding DINO's; None looks for vocab.txt beside the model.
 
     resegment runs the network on frames between detections too; without it masks are cut by depth inside the
@@ -109,7 +109,7 @@ class MissionSettings:
 
     def mapper_settings(self) -> MapperSettings:
         """The named policy with this mission's cap, iterations and switches."""
-        base = without(policy(self.policy), self.without)
+        base = disable(policy(self.policy), self.without)
         optimization = base.optimization
         if self.iterations is not None:
             optimization = optimization.with_iterations(self.iterations)

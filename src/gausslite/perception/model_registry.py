@@ -12,7 +12,7 @@ from gausslite.perception.model_file import OpenModel, open_model
 from gausslite.perception.yolo_decode import MASK_COEFFICIENTS
 
 VOCABULARY: Final = "vocab.txt"
-OWN, CUT = "yolo", "cut"
+OWN_MASKS, DEPTH = "yolo", "depth"
 
 
 class ModelFamily(StrEnum):
@@ -44,7 +44,7 @@ class ModelRegistry:
     """The detector and the segmenters of one mission, each file opened once."""
 
     def __init__(self, detector: Path, segmenter: str | None, vocabulary: Path | None, threads: int | None) -> None:
-        """segmenter: "yolo" (the detector's own masks), "cut" (by depth and colour) or the path of a FastSAM file.
+        """segmenter: "yolo" (the detector's own masks), "depth" (by depth and colour) or the path of a FastSAM file.
 
         None takes the detector's own masks where it has some. Raises ModelFileError, InvalidInputError, KernelError.
         """
@@ -70,20 +70,20 @@ class ModelRegistry:
         from gausslite.perception.grounding import GroundingDino
         from gausslite.perception.grounding_text import BertTokenizer
 
-        if segmenter == OWN:
+        if segmenter == OWN_MASKS:
             raise InvalidInputError(
-                f"segmenter: {model.path} finds boxes only; expected cut or a FastSAM file, got {OWN}"
+                f"segmenter: {model.path} finds boxes only; expected depth or a FastSAM file, got {OWN_MASKS}"
             )
         tokenizer = BertTokenizer(vocabulary or model.path.parent / VOCABULARY)
         network = GroundingDino(model, tokenizer)
-        self._segmenter: Segmenter = _segmenter(segmenter or CUT, threads)
+        self._segmenter: Segmenter = _segmenter(segmenter or DEPTH, threads)
         self._detector: Detector = SegmentedDetector(network, _in_turn(self._segmenter))
 
     def _use_yolo(self, model: OpenModel, segmenter: str | None, threads: int | None) -> None:
         from gausslite.perception.yolo import load_yolo
 
         network = load_yolo(model)
-        if segmenter in (None, OWN):
+        if segmenter in (None, OWN_MASKS):
             self._segmenter, self._detector = network.segmenter(), network
         else:
             self._segmenter = _segmenter(str(segmenter), threads)
@@ -94,7 +94,7 @@ def _segmenter(name: str, threads: int | None) -> Segmenter:
     """The cut, or a file's masks of everything."""
     from gausslite.perception.depth_segmenter import DepthSegmenter
 
-    if name == CUT:
+    if name == DEPTH:
         return DepthSegmenter()
     from gausslite.perception.class_agnostic import ClassAgnosticSegmenter
     from gausslite.perception.yolo_network import YoloSegNetwork

@@ -201,14 +201,14 @@ def test_frames_without_a_pose_are_no_part_of_the_sequence(tmp_path: Path, lost:
         source = open_source(str(folder))
         assert source.indices() == numbers
         assert [source.frame(i).index for i in range(len(source))] == numbers
-        assert source.left_out == "1 of 3 colour images are left out, without a pose"
+        assert source.excluded_frames == "1 of 3 colour images are left out, without a pose"
 
 
 def test_a_tracker_that_was_lost_is_a_gap_in_the_trajectory(tmp_path: Path) -> None:
     folder = write_tum(tmp_path / "fr1", frames=30)
     whole = open_source(str(folder))
     assert len(whole) == 30
-    assert whole.left_out == ""
+    assert whole.excluded_frames == ""
     rows = (folder / "groundtruth.txt").read_text().splitlines()
     lost = [" ".join([row.split()[0], *["nan"] * 7]) if 10.3 < float(row.split()[0]) < 10.5 else row for row in rows]
     (folder / "groundtruth.txt").write_text("\n".join(lost))
@@ -216,7 +216,7 @@ def test_a_tracker_that_was_lost_is_a_gap_in_the_trajectory(tmp_path: Path) -> N
     times = [source.frame(i).capture_time_ns * 1e-9 for i in range(len(source))]
     assert len(times) == 25
     assert not any(10.31 < time < 10.49 for time in times)
-    assert source.left_out == ("5 of 30 colour images are left out, without a pose at their time or depth within 20 ms")
+    assert source.excluded_frames == ("5 of 30 colour images are left out, without a pose at their time or depth within 20 ms")
 
 
 @pytest.mark.parametrize(

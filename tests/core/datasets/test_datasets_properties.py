@@ -28,7 +28,7 @@ class Numbered:
     camera = Camera(1.0, 1.0, 1.0, 1.0, 2, 2)
     up_axis = (0.0, 0.0, 1.0)
     depth_registered = True
-    left_out = ""
+    excluded_frames = ""
 
     def __init__(self, numbers: list[int]) -> None:
         self._numbers = numbers

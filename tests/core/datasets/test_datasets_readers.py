@@ -12,7 +12,7 @@ import pytest
 from tiny_sequences import HEIGHT, WIDTH, write_depth, write_replica, write_seven_scenes, write_tum
 
 from gausslite.datasets.open import open_source
-from gausslite.datasets.selection import modest_size, select_frames
+from gausslite.datasets.selection import downscaled_size, select_frames
 from gausslite.domain.camera import Camera
 from gausslite.domain.region import BallRegion, VoxelRegion
 from gausslite.errors import DatasetError, InvalidInputError
@@ -117,7 +117,7 @@ def test_resizing_averages_colour_and_never_mixes_depth(tmp_path: Path) -> None:
     ],
 )
 def test_a_modest_size_stretches_nothing(recorded: tuple[int, int], modest: tuple[int, int]) -> None:
-    assert modest_size(Camera(500.0, 500.0, 320.0, 240.0, *recorded)) == modest
+    assert downscaled_size(Camera(500.0, 500.0, 320.0, 240.0, *recorded)) == modest
 
 
 @pytest.mark.parametrize("write", [write_tum, write_seven_scenes, write_replica])

@@ -41,7 +41,7 @@ def test_a_sequence_without_any_depth_is_refused(tmp_path: Path, capsys: pytest.
 def test_what_cannot_be_told_from_its_region_is_not_scored(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert map_uniformly(blinded(tmp_path / "one", 4), tmp_path / "out") == 0
     capsys.readouterr()
-    score = ["eval", str(tmp_path / "out" / "map.ply"), "--colour-camera", "none"]
+    score = ["eval", str(tmp_path / "out" / "map.ply"), "--register-depth", "none"]
     assert main([*score, str(tmp_path / "one"), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["n_views"] == 2
     assert main([*score, str(blinded(tmp_path / "all", 0, 4, 8)), "--json"]) == 2

@@ -146,11 +146,11 @@ def test_a_bad_text_is_refused_in_one_line(text: str) -> None:
 
 def test_the_agent_takes_the_text_for_its_source() -> None:
     text = "525,525,320,240,-0.025,0,0"
-    settings = parse_arguments(["--source", "somewhere", "--task", "Find the mug", "--colour-camera", text])
+    settings = parse_arguments(["--source", "somewhere", "--task", "Find the mug", "--register-depth", text])
     assert settings.play is not None
     assert settings.play.colour_camera == DepthRegistration.parse(text)
     with pytest.raises(InvalidInputError, match="colour camera"):
-        parse_arguments(["--source", "somewhere", "--task", "Find the mug", "--colour-camera", "525"])
+        parse_arguments(["--source", "somewhere", "--task", "Find the mug", "--register-depth", "525"])
 
 
 def test_a_focal_length_far_from_the_depth_cameras_is_refused(tmp_path: Path) -> None:

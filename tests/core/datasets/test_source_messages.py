@@ -21,7 +21,7 @@ def test_depth_that_nobody_registered_is_told(tmp_path: Path, capsys: pytest.Cap
     assert open_with_warnings(seven, None, None)[1] is None
     [line] = capsys.readouterr().err.splitlines()
     assert line.startswith(
-        f"{seven}: its layout leaves open whether depth is registered to colour; --colour-camera auto "
+        f"{seven}: its layout leaves open whether depth is registered to colour; --register-depth auto "
     )
     for spec, asked in ((seven, AS_RECORDED), (seven, CAMERA), (tum, None)):
         open_with_warnings(spec, None, asked)
@@ -36,7 +36,7 @@ def test_depth_is_registered_as_asked(tmp_path: Path, capsys: pytest.CaptureFixt
     assert source.camera == CAMERA.camera(16, 12)
     source, camera = open_with_warnings(seven, None, LOOK)
     assert (camera, source.depth_registered) == (None, False)
-    assert "--colour-camera none: alignment: expected at least 1000 depth edge points" in capsys.readouterr().err
+    assert "--register-depth none: alignment: expected at least 1000 depth edge points" in capsys.readouterr().err
 
 
 def test_a_program_that_looks_by_default_says_so_and_only_where_it_has_to(
@@ -45,8 +45,8 @@ def test_a_program_that_looks_by_default_says_so_and_only_where_it_has_to(
     seven, tum = str(write_seven_scenes(tmp_path / "seq")), str(write_tum(tmp_path / "fr1"))
     assert open_with_warnings(seven, None, None, LOOK)[1] is None
     looking, found = capsys.readouterr().err.splitlines()
-    assert looking.endswith("; looking for its colour camera now, --colour-camera none takes it as it is")
-    assert found.startswith("--colour-camera none: alignment: expected at least 1000 depth edge points")
+    assert looking.endswith("; looking for its colour camera now, --register-depth none takes it as it is")
+    assert found.startswith("--register-depth none: alignment: expected at least 1000 depth edge points")
     assert open_with_warnings(seven, None, CAMERA, LOOK)[1] == CAMERA
     for spec, asked in ((seven, AS_RECORDED), (tum, None)):
         assert open_with_warnings(spec, None, asked, LOOK)[1] is None
@@ -64,7 +64,7 @@ def test_what_is_believed_of_views_is_told_where_it_was_measured(
     assert capsys.readouterr().err == ""
     assert resolve_pose_prior(str(tum), source, LOOK).is_exact
     [line] = capsys.readouterr().err.splitlines()
-    assert line == "--view-error none: 0 pairs of its frames can be compared, too few to tell"
+    assert line == "--pose-prior none: 0 pairs of its frames can be compared, too few to tell"
 
 
 def test_images_that_are_left_out_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -48,7 +48,7 @@ def test_other_options_are_told_before_anything_is_done(tmp_path: Path, capsys: 
         (("--roi-ball", "0,0,1,0.4"), "--roi-ball '0.0,0.0,2.0,0.4' (got '0.0,0.0,2.0,0.4 0.0,0.0,1.0,0.4')"),
         (("--register-depth", "20,20,7.5,5.5"), "--register-depth '' (got '20,20,7.5,5.5,0,0,0,0,0,0')"),
         (("--up", "0,-1,0"), "--up '' (got '0.0,-1.0,0.0')"),
-        (("--resegment", "--segmenter", "cut"), "--resegment '' (got 'yes'), "),
+        (("--resegment", "--segmenter", "depth"), "--resegment '' (got 'yes'), "),
     ):
         assert main(map_command(sequence, tmp_path / "other", *options, "--resume", state)) == 2
         [line] = capsys.readouterr().err.splitlines()

@@ -54,7 +54,7 @@ def test_a_yolo_file_brings_its_own_masks(tmp_path, name):
     assert mask.sum() > 0.97 * 32 * 32
 
 
-@pytest.mark.parametrize(("segmenter", "sessions"), [(None, 1), ("cut", 1), ("everything.onnx", 2)])
+@pytest.mark.parametrize(("segmenter", "sessions"), [(None, 1), ("depth", 1), ("everything.onnx", 2)])
 def test_each_file_is_opened_once(tmp_path, monkeypatch, segmenter, sessions):
     import onnxruntime
 
@@ -72,7 +72,7 @@ def test_each_file_is_opened_once(tmp_path, monkeypatch, segmenter, sessions):
 
 
 def test_the_cut_replaces_a_networks_masks_where_it_is_asked_for(tmp_path):
-    assert found_pixels(ModelRegistry(yolo(tmp_path), "cut", None, 1)) == 24 * 24
+    assert found_pixels(ModelRegistry(yolo(tmp_path), "depth", None, 1)) == 24 * 24
 
 
 def test_another_file_masks_what_the_first_found_and_the_cut_what_neither_masks(tmp_path):

@@ -50,7 +50,7 @@ class Wall:
     name: str = "wall"
     up_axis: tuple[float, float, float] = (0.0, -1.0, 0.0)
     depth_registered: bool = True
-    left_out: str = ""
+    excluded_frames: str = ""
     camera: Camera = CAMERA
     broken_at: int | None = None
     asked: list[int] = field(default_factory=list)
@@ -133,7 +133,7 @@ def test_handover_brings_the_whole_map_and_the_keyframes(tmp_path: Path) -> None
 
 
 def test_alone_it_maps_and_sends_nothing(tmp_path: Path) -> None:
-    options = settings(tmp_path, "--hold-out", "4", "--frames", "0:6")
+    options = settings(tmp_path, "--test-every", "4", "--frames", "0:6")
     wall = Wall()
     with player(options) as (mission, _):
         mission.play(seen(wall, options))
@@ -175,7 +175,7 @@ def test_what_is_wrong_is_raised_before_or_when_it_is_met(tmp_path: Path) -> Non
         (["--source", "sim:home?trajectory=9", "--task", "Pick up the mug"], "trajectory"),
         (["--source", "sim:home", "--task", "Pick up the mug", "--frames", "500:"], "500:"),
         (["--source", "sim:home", "--task", "Pick up the mug", "--size", "big"], "size"),
-        (["--source", "sim:home", "--task", "Pick up the mug", "--hold-out", "1"], "hold-out"),
+        (["--source", "sim:home", "--task", "Pick up the mug", "--test-every", "1"], "hold-out"),
         (["--threads", "0"], "threads"),
         (["--task", "Pick up the mug"], "name an ONNX file with --detector"),
         (["--max-gaussians", "0"], "max_gaussians"),
