@@ -6,17 +6,17 @@
 
 namespace gausslite {
 
-const float* AdamCorrections::table(double beta1, double beta2, double full_rate_updates) {
-  if (beta1 != beta1_ || beta2 != beta2_ || full_rate_updates != full_rate_updates_) {
+const float* AdamCorrections::table(double beta1, double beta2, double decay_after_updates) {
+  if (beta1 != beta1_ || beta2 != beta2_ || decay_after_updates != full_rate_updates_) {
     table_.reserve(2 * size_t(kCount));
     for (int t = 1; t <= kCount; ++t) {
-      const double rate = std::sqrt(std::min(1.0, full_rate_updates / t));
+      const double rate = std::sqrt(std::min(1.0, decay_after_updates / t));
       table_[2 * size_t(t - 1)] = float(rate / (1.0 - std::pow(beta1, t)));
       table_[2 * size_t(t - 1) + 1] = float(1.0 / (1.0 - std::pow(beta2, t)));
     }
     beta1_ = beta1;
     beta2_ = beta2;
-    full_rate_updates_ = full_rate_updates;
+    full_rate_updates_ = decay_after_updates;
   }
   return table_.data();
 }

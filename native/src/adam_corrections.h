@@ -12,8 +12,8 @@ class AdamCorrections {
   static constexpr int kCount = 20'000;
 
   // rate(t) / (1 - beta1^t), 1 / (1 - beta2^t) for t = 1 ... kCount, where the rate is 1 for the first
-  // full_rate_updates and falls with the root of the updates after them; valid until the next call.
-  const float* table(double beta1, double beta2, double full_rate_updates);
+  // decay_after_updates and falls with the root of the updates after them; valid until the next call.
+  const float* table(double beta1, double beta2, double decay_after_updates);
 
  private:
   Buffer<float> table_;

@@ -191,7 +191,7 @@ struct StepTraining {
             "tables: lengths disagree");
     require(rates.size() == 16, "rates: expected 16");
     std::copy_n(rates.begin(), 16, adam.rates);
-    std::tie(adam.beta1, adam.beta2, adam.epsilon, adam.full_rate_updates) = constants;
+    std::tie(adam.beta1, adam.beta2, adam.epsilon, adam.decay_after_updates) = constants;
   }
 
   OptimizerState state() const {

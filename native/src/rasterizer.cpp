@@ -179,7 +179,7 @@ void Rasterizer::backward(const ImageGradients& input, float* d_rows, double* d_
 }
 
 Training Rasterizer::begin_training(const TrainingView& view, bool masked, const LossWeights& loss) {
-  const double weight_sum = view.weight_sum(masked), share = loss.by_share ? view.share(masked) : 1.0;
+  const double weight_sum = view.weight_sum(masked), share = loss.normalise_by_image ? view.share(masked) : 1.0;
   const double per_pixel = weight_sum > 0.0 ? share / weight_sum : 0.0;
   const size_t tiles = size_t(ws_.tiles_x) * size_t(ws_.tiles_y);
   for (ThreadScratch& scratch : ws_.scratch) {
@@ -245,7 +245,7 @@ double Rasterizer::step(const FrameInput& input, const OptimizerState& state, co
   update.adam.beta1 = float(adam.beta1);
   update.adam.beta2 = float(adam.beta2);
   update.adam.epsilon = float(adam.epsilon);
-  update.adam.corrections = corrections_.table(adam.beta1, adam.beta2, adam.full_rate_updates);
+  update.adam.corrections = corrections_.table(adam.beta1, adam.beta2, adam.decay_after_updates);
   update.adam.correction_count = AdamCorrections::kCount;
 
   team_.run([&](int thread) {
@@ -283,7 +283,7 @@ double Rasterizer::step(const FrameInput& input, const OptimizerState& state, co
 
   if (ws_.keeps_bounds) bounds_loan_ = state.loan;
   double total = with_ssim && view.weight_sum(masked) > 0.0 ? double(loss.ssim) : 0.0;
-  if (loss.by_share) total *= view.share(masked);
+  if (loss.normalise_by_image) total *= view.share(masked);
   for (int t = 0; t < ws_.tiles_x * ws_.tiles_y; ++t) total += l1_sums_[size_t(t)];
   for (int k = 0; with_ssim && k <= ws_.tiles_y; ++k) total += ssim_sums_[size_t(k)];
   const double took_ms = now_ms() - started_ms;

@@ -26,7 +26,7 @@ struct FrameInput {
 
 struct LossWeights {
   float colour, depth, ssim;
-  bool by_share;  // the loss times the view's share: a pixel of weight 1 then counts the same in every step
+  bool normalise_by_image;  // the loss times the view's share: a pixel of weight 1 then counts the same in every step
 };
 
 struct OptimizerState {
@@ -41,7 +41,7 @@ struct OptimizerState {
 
 struct AdamOptions {
   float rates[16];
-  double beta1, beta2, epsilon, full_rate_updates;
+  double beta1, beta2, epsilon, decay_after_updates;
 };
 
 // Milliseconds of the last call's stages, as its first thread saw them. With SSIM strips are drawn, compared and walked

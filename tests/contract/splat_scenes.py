@@ -10,11 +10,11 @@ import numpy as np
 import torch
 
 from gausslite.domain.camera import Camera
-from gausslite.render.rasterizer import LOG_SCALE, LOGIT, MEAN, QUAT, RGB, Rasterizer, Rendering, TrainingView
+from gausslite.render.rasterizer import LOG_SCALE, MEAN, OPACITY_LOGIT, QUAT, RGB, Rasterizer, Rendering, TrainingView
 from gausslite.render.reference.compositing import MAX_ALPHA, MIN_TRANSMITTANCE
 from gausslite.render.reference.projection import MIN_ALPHA, Ellipses, project
 
-GROUPS = {"means": MEAN, "log_scales": LOG_SCALE, "quats": QUAT, "logits": slice(LOGIT, LOGIT + 1), "rgb": RGB}
+GROUPS = {"means": MEAN, "log_scales": LOG_SCALE, "quats": QUAT, "logits": slice(OPACITY_LOGIT, OPACITY_LOGIT + 1), "rgb": RGB}
 MARGIN, STOP_MARGIN = 2e-4, 1e-2
 """How near to its thresholds, relatively, an alpha and a transmittance may come before a pixel is left out."""
 CAMERA = Camera(52.0, 50.0, 32.3, 23.6, 64, 48)
@@ -78,7 +78,7 @@ def random_rows(seed: int, n: int, size_m: float = 0.1, logit: float = 0.0) -> n
     rows[:, :3] = np.stack([rng.uniform(-1.3, 1.3, n), rng.uniform(-1, 1, n), rng.uniform(0.6, 4, n)], axis=1)
     rows[:, LOG_SCALE] = np.log(size_m * rng.uniform(0.3, 2.5, (n, 3)))
     rows[:, QUAT] = rng.normal(size=(n, 4)) * rng.uniform(0.1, 10.0, (n, 1))
-    rows[:, LOGIT] = rng.normal(logit, 1.5, n)
+    rows[:, OPACITY_LOGIT] = rng.normal(logit, 1.5, n)
     rows[:, RGB] = rng.random((n, 3))
     return rows
 
@@ -112,13 +112,13 @@ def _needles_and_sheets() -> Scene:
 
 def _transparent() -> Scene:
     rows = random_rows(8, 200)
-    rows[:150, LOGIT] = np.random.default_rng(8).uniform(-100.0, -6.0, 150)
+    rows[:150, OPACITY_LOGIT] = np.random.default_rng(8).uniform(-100.0, -6.0, 150)
     return Scene(rows, CAMERA, turned())
 
 
 def _opaque() -> Scene:
     rows = random_rows(9, 200, 0.15)
-    rows[:, LOGIT] = np.random.default_rng(9).uniform(8.0, 60.0, 200)
+    rows[:, OPACITY_LOGIT] = np.random.default_rng(9).uniform(8.0, 60.0, 200)
     return Scene(rows, CAMERA, turned())
 
 

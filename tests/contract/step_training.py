@@ -11,8 +11,8 @@ from gausslite.render.rasterizer import (
     FULL_FRAME,
     GRAD_2D_COUNT,
     GRAD_2D_SUM,
-    MOST_COUNTED_UPDATES,
-    UPDATES,
+    MAX_UPDATE_COUNT,
+    UPDATE_COUNT,
     AdamSettings,
     LossWeights,
     Rasterizer,
@@ -40,11 +40,11 @@ def tables(scene: Scene, seasoned: bool) -> tuple[np.ndarray, np.ndarray, np.nda
     rows = scene.rows.copy()
     if not seasoned:
         return rows, np.zeros_like(rows), np.zeros_like(rows)
-    rows[:, UPDATES] = rng.integers(0, 30, len(rows))
-    rows[::7, UPDATES] = 3 * MOST_COUNTED_UPDATES
+    rows[:, UPDATE_COUNT] = rng.integers(0, 30, len(rows))
+    rows[::7, UPDATE_COUNT] = 3 * MAX_UPDATE_COUNT
     first = np.zeros_like(rows)
     second = np.zeros_like(rows)
-    moved = (rows[:, UPDATES] > 0)[:, None]
+    moved = (rows[:, UPDATE_COUNT] > 0)[:, None]
     first[:, :14] = rng.normal(0, 1e-4, (len(rows), 14)) * moved
     second[:, :14] = rng.uniform(1e-9, 1e-7, (len(rows), 14)) * moved
     first[:, GRAD_2D_SUM] = rng.uniform(0, 1, len(rows))
@@ -79,5 +79,5 @@ def gradient_seen(trained: Trained) -> np.ndarray:
     """The gradient that the step fed to Adam, from the change of the first moment."""
     change = trained.first_moment.astype(np.float64) - ADAM.beta1 * trained.before[1]
     change[:, 14:] = 0.0
-    moved = trained.rows[:, UPDATES] != trained.before[0][:, UPDATES]
+    moved = trained.rows[:, UPDATE_COUNT] != trained.before[0][:, UPDATE_COUNT]
     return change * moved[:, None] / (1.0 - ADAM.beta1)

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from splat_scenes import random_rows, turned
 
 from gausslite.domain.camera import Camera
-from gausslite.render.rasterizer import LOGIT, Rasterizer, Subset
+from gausslite.render.rasterizer import OPACITY_LOGIT, Rasterizer, Subset
 
 CAMERA = Camera(30.0, 30.0, 16.0, 12.0, 33, 25)
 few = settings(max_examples=20, deadline=None)
@@ -55,7 +55,7 @@ def test_splats_without_opacity_change_nothing(
 ) -> None:
     rows = random_rows(seed, n, size_m)
     invisible = random_rows(seed ^ 1, ghosts, size_m)
-    invisible[:, LOGIT] = -20.0
+    invisible[:, OPACITY_LOGIT] = -20.0
     first = images(rasterizer, rows)
     second = images(rasterizer, np.concatenate([rows, invisible]))
     np.testing.assert_allclose(second, first, atol=1e-6)

@@ -15,8 +15,8 @@ from gausslite.render.rasterizer import (
     FULL_FRAME,
     GRAD_2D_COUNT,
     GRAD_2D_SUM,
-    MOST_COUNTED_UPDATES,
-    UPDATES,
+    MAX_UPDATE_COUNT,
+    UPDATE_COUNT,
     LossWeights,
     Rasterizer,
     Subset,
@@ -39,8 +39,8 @@ CASES = {
     "colour alone": {"loss": LossWeights(1.0, 0.0, 0.0)},
     "depth alone": {"loss": LossWeights(0.0, 1.0, 0.0)},
     "structure alone": {"loss": LossWeights(0.0, 0.0, 1.0)},
-    "masked, by share": {"loss": LossWeights(by_share=True), "masked": True},
-    "by share": {"loss": LossWeights(by_share=True)},
+    "masked, by share": {"loss": LossWeights(normalise_by_image=True), "masked": True},
+    "by share": {"loss": LossWeights(normalise_by_image=True)},
     "structure alone, masked": {"loss": LossWeights(0.0, 0.0, 1.0), "masked": True},
     "without structure, masked": {"loss": LossWeights(0.8, 1.0, 0.0), "masked": True},
     "some tiles, masked": {
@@ -121,21 +121,21 @@ def test_step_equals_the_separate_path(rasterizer: Rasterizer, oracle: Rasterize
     assert relative_error(grown, separate.mean_2d_norm) < TOLERANCE
 
 
-@pytest.mark.parametrize("full_rate_updates", [math.inf, 9.0])
-def test_rows_move_by_adams_rule(rasterizer: Rasterizer, oracle: Rasterizer, full_rate_updates: float) -> None:
+@pytest.mark.parametrize("decay_after_updates", [math.inf, 9.0])
+def test_rows_move_by_adams_rule(rasterizer: Rasterizer, oracle: Rasterizer, decay_after_updates: float) -> None:
     scene = scene_named("medium splats")
-    slowing = replace(ADAM, full_rate_updates=full_rate_updates)
+    slowing = replace(ADAM, decay_after_updates=decay_after_updates)
     done = train(rasterizer, scene, picture_for(scene, oracle), seasoned=True, adam=slowing)
     moved = done.report.visible
     before, after = done.before[0][moved, :14].astype(np.float64), done.rows[moved, :14]
     gradient = gradient_seen(done)[moved, :14]
     second = ADAM.beta2 * done.before[2][moved, :14] + (1 - ADAM.beta2) * gradient**2
     np.testing.assert_allclose(done.second_moment[moved, :14], second, rtol=2e-2, atol=1e-12)
-    updates = done.rows[moved, UPDATES].astype(np.float64)[:, None]
-    np.testing.assert_array_equal(updates[:, 0], done.before[0][moved, UPDATES] + 1)
+    updates = done.rows[moved, UPDATE_COUNT].astype(np.float64)[:, None]
+    np.testing.assert_array_equal(updates[:, 0], done.before[0][moved, UPDATE_COUNT] + 1)
     first_unbiased = done.first_moment[moved, :14] / (1 - ADAM.beta1**updates)
     second_unbiased = done.second_moment[moved, :14] / (1 - ADAM.beta2**updates)
-    slowed = np.sqrt(np.minimum(1.0, full_rate_updates / np.minimum(updates, MOST_COUNTED_UPDATES)))
+    slowed = np.sqrt(np.minimum(1.0, decay_after_updates / np.minimum(updates, MAX_UPDATE_COUNT)))
     step = slowed * ADAM.row_rates()[:14] * first_unbiased / (np.sqrt(second_unbiased) + ADAM.epsilon)
     assert relative_error(after - before, -step) < TOLERANCE
     assert not done.rows[:, 15].any()
@@ -169,7 +169,7 @@ def test_thirty_steps_reduce_the_loss(rasterizer: Rasterizer, oracle: Rasterizer
     rows, first, second = scene.rows.copy(), np.zeros_like(scene.rows), np.zeros_like(scene.rows)
     losses = [rasterizer.step(rows, first, second, view, scene.T_camera_world, LOSS, ADAM).loss for _ in range(30)]
     assert losses[-1] < 0.8 * losses[0]
-    assert rows[:, UPDATES].max() == 30
+    assert rows[:, UPDATE_COUNT].max() == 30
 
 
 def test_tables_on_loan_end_up_as_step_by_step(rasterizer: Rasterizer, oracle: Rasterizer) -> None:
@@ -177,7 +177,7 @@ def test_tables_on_loan_end_up_as_step_by_step(rasterizer: Rasterizer, oracle: R
     view = picture_for(scene, oracle).view(rasterizer, scene)
     alone, lent = tables(scene, seasoned=True), tables(scene, seasoned=True)
     reports = [rasterizer.step(*alone, view, scene.T_camera_world, LOSS, ADAM) for _ in range(3)]
-    with rasterizer.holding(*lent):
+    with rasterizer.bind_tables(*lent):
         lent_reports = [rasterizer.step(*lent, view, scene.T_camera_world, LOSS, ADAM) for _ in range(3)]
     for came, wanted in zip(lent, alone, strict=True):
         np.testing.assert_array_equal(came, wanted)
@@ -192,10 +192,10 @@ def test_an_error_ends_the_loan_with_what_was_trained(rasterizer: Rasterizer, or
     lent = tables(scene, seasoned=False)
 
     def one_step_and_a_mishap() -> None:
-        with rasterizer.holding(*lent):
+        with rasterizer.bind_tables(*lent):
             rasterizer.step(*lent, view, scene.T_camera_world, LOSS, ADAM)
             raise KeyError("a mishap")
 
     with pytest.raises(KeyError):
         one_step_and_a_mishap()
-    assert lent[0][:, UPDATES].max() == 1
+    assert lent[0][:, UPDATE_COUNT].max() == 1

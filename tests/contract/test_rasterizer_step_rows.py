@@ -11,7 +11,7 @@ from step_training import ADAM, LOSS, gradient_seen, picture_for, tables, train
 
 from gausslite.errors import InvalidInputError, ShapeError
 from gausslite.render.rasterizer import (
-    UPDATES,
+    UPDATE_COUNT,
     Rasterizer,
     UpdateCounter,
 )
@@ -49,12 +49,12 @@ def test_a_tally_counts_the_rows_that_moved_and_no_others(rasterizer: Rasterizer
     lent, rng = tables(scene, seasoned=False), np.random.default_rng(6)
     trainable, among = rng.random((2, len(scene.rows))) < 0.5
     everywhere, some = (UpdateCounter(np.full(len(scene.rows), 7, np.uint32), choice) for choice in (None, among))
-    with rasterizer.holding(*lent):
+    with rasterizer.bind_tables(*lent):
         for step in range(10):
-            rasterizer.step(*lent, view, scene.T_camera_world, LOSS, ADAM, trainable=trainable, tally=everywhere)
+            rasterizer.step(*lent, view, scene.T_camera_world, LOSS, ADAM, trainable=trainable, update_counter=everywhere)
             if step < 3:
-                rasterizer.step(*lent, view, scene.T_camera_world, LOSS, ADAM, tally=some)
-    trained = lent[0][:, UPDATES]
+                rasterizer.step(*lent, view, scene.T_camera_world, LOSS, ADAM, update_counter=some)
+    trained = lent[0][:, UPDATE_COUNT]
     np.testing.assert_array_equal(some.counts[~among], 7)
     assert set(some.counts[among]) == {7, 10}
     np.testing.assert_array_equal(everywhere.counts[~trainable], 7)
@@ -65,12 +65,12 @@ def test_tables_are_lent_one_at_a_time(rasterizer: Rasterizer) -> None:
     scene = scene_named("medium splats")
     lent, others = tables(scene, seasoned=False), tables(scene, seasoned=False)
     with (
-        rasterizer.holding(*lent),
+        rasterizer.bind_tables(*lent),
         pytest.raises(InvalidInputError, match="no other tables on loan"),
-        rasterizer.holding(*others),
+        rasterizer.bind_tables(*others),
     ):
         pass
-    with rasterizer.holding(*others):
+    with rasterizer.bind_tables(*others):
         pass
 
 
@@ -82,9 +82,9 @@ def test_a_tally_of_another_length_or_that_may_not_be_written_is_refused(
     sealed = np.zeros(len(scene.rows), np.uint32)
     sealed.flags.writeable = False
     for counts in (np.zeros(len(scene.rows) - 1, np.uint32), sealed):
-        with pytest.raises(ShapeError, match="tally counts"):
+        with pytest.raises(ShapeError, match="update_counter counts"):
             rasterizer.step(
-                *tables(scene, seasoned=False), view, scene.T_camera_world, LOSS, ADAM, tally=UpdateCounter(counts)
+                *tables(scene, seasoned=False), view, scene.T_camera_world, LOSS, ADAM, update_counter=UpdateCounter(counts)
             )
 
 

@@ -125,8 +125,8 @@ def test_the_loss_terms_are_the_sums_of_their_definition() -> None:
         wanted = 0.7 * colour / (3 * total) + 0.9 * depth / total + 0.3 * (1 - structure / (3 * total))
         came = training_loss(torch.from_numpy(images), view, LossWeights(0.7, 0.9, 0.3), masked)
         assert came.item() == pytest.approx(wanted, rel=1e-10)
-        by_share = training_loss(torch.from_numpy(images), view, LossWeights(0.7, 0.9, 0.3, by_share=True), masked)
-        assert by_share.item() == pytest.approx(wanted * total / (7 * 9), rel=1e-10)
+        normalise_by_image = training_loss(torch.from_numpy(images), view, LossWeights(0.7, 0.9, 0.3, normalise_by_image=True), masked)
+        assert normalise_by_image.item() == pytest.approx(wanted * total / (7 * 9), rel=1e-10)
 
 
 def _ssim_by_hand(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -11,7 +11,7 @@ from numpy import ndarray
 
 from gausslite.errors import InvalidInputError
 from gausslite.optimize.parameters import SplatTable
-from gausslite.render.rasterizer import GRAD_2D_COUNT, GRAD_2D_SUM, LOG_SCALE, LOGIT, MEAN, QUAT, UPDATES
+from gausslite.render.rasterizer import GRAD_2D_COUNT, GRAD_2D_SUM, LOG_SCALE, MEAN, OPACITY_LOGIT, QUAT, UPDATE_COUNT
 
 _SPLIT_SHRINK = 1.6
 """Each half of a split Gaussian is this much shorter (Kerbl et al. 2023)."""
@@ -46,14 +46,14 @@ class DensitySettings:
 
 
 @dataclass(frozen=True, slots=True)
-class Densified:
+class DensityChange:
     """How many Gaussians were cloned and how many were split; each adds one."""
 
     cloned: int
     split: int
 
 
-def densify(table: SplatTable, settings: DensitySettings, extent_m: float) -> Densified:
+def densify(table: SplatTable, settings: DensitySettings, extent_m: float) -> DensityChange:
     """Clone small and split large Gaussians whose image gradient stays high, as far as the cap and max_growth allow.
 
     Where that is short the largest gradients go first. Children together look like their parent, so that a map is
@@ -61,7 +61,7 @@ def densify(table: SplatTable, settings: DensitySettings, extent_m: float) -> De
     random (Kerbl et al. 2023) break. They inherit active, kappa and target and start with fresh optimiser state; a
     split puts its first half in the parent's row. The statistics start anew.
     """
-    most = min(table.room, math.ceil(settings.max_growth * table.count))
+    most = min(table.free_slots, math.ceil(settings.max_growth * table.count))
     chosen = _most_wanted(_mean_gradient(table), settings.min_mean_gradient, most)
     largest_scale_m = np.exp(table.rows[chosen][:, LOG_SCALE].max(axis=1, initial=-np.inf))
     small = largest_scale_m <= settings.percent_dense * extent_m
@@ -70,7 +70,7 @@ def densify(table: SplatTable, settings: DensitySettings, extent_m: float) -> De
     _clone(table, to_clone)
     for statistic in (GRAD_2D_SUM, GRAD_2D_COUNT):
         table.first_moment[:, statistic] = 0.0
-    return Densified(cloned=len(to_clone), split=len(to_split))
+    return DensityChange(cloned=len(to_clone), split=len(to_split))
 
 
 def prune(table: SplatTable, settings: DensitySettings) -> int:
@@ -97,11 +97,11 @@ def _most_wanted(gradient: Float32[ndarray, " n"], threshold: float, most: int) 
 
 def _clone(table: SplatTable, parents: Int64[ndarray, " m"]) -> None:
     """Two in the same place, each of an alpha of 1 - sqrt(1 - alpha): they hide as much as the one."""
-    for rows in (table.rows, table.mean_rows):
-        half_depth = 0.5 * np.logaddexp(0.0, rows[parents, LOGIT].astype(np.float64))  # -log(1 - alpha) / 2
-        rows[parents, LOGIT] = np.log(-np.expm1(-half_depth)) + half_depth
+    for rows in (table.rows, table.ema_rows):
+        half_depth = 0.5 * np.logaddexp(0.0, rows[parents, OPACITY_LOGIT].astype(np.float64))  # -log(1 - alpha) / 2
+        rows[parents, OPACITY_LOGIT] = np.log(-np.expm1(-half_depth)) + half_depth
     rows = table.rows[parents]
-    rows[:, UPDATES] = 0.0
+    rows[:, UPDATE_COUNT] = 0.0
     table.append_rows(rows, table.active[parents], table.kappa[parents], table.target[parents])
 
 
@@ -113,13 +113,13 @@ def _split(table: SplatTable, parents: Int64[ndarray, " m"]) -> None:
     apart_m = np.zeros((len(rows), 3), np.float32)
     apart_m[each, longest] = np.float32(_SPLIT_APART) * np.exp(log_scales[each, longest])
     log_scales[each, longest] -= np.float32(math.log(_SPLIT_SHRINK))
-    rows[:, UPDATES] = 0.0
+    rows[:, UPDATE_COUNT] = 0.0
     first, second = rows, rows.copy()
     aside_m = _rotate(rows[:, QUAT], apart_m)
     first[:, MEAN] += aside_m
     second[:, MEAN] -= aside_m
     table.rows[parents] = first
-    table.mean_rows[parents] = first
+    table.ema_rows[parents] = first
     table.first_moment[parents] = 0.0
     table.second_moment[parents] = 0.0
     table.append_rows(second, table.active[parents], table.kappa[parents], table.target[parents])

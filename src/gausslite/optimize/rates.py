@@ -13,7 +13,7 @@ colour, twice for the means. With the customary ones seeds that start small neve
 refinement of 500 iterations gains as well: +0.2 dB in the region, +1.0 dB over the whole image of the simulated home.
 """
 
-REFINE_RATES = replace(ONLINE_RATES, full_rate_updates=20)
+REFINE_RATES = replace(ONLINE_RATES, decay_after_updates=20)
 """The same for a joint refinement, which ends: what is left of its last large steps stays in the map. So Gaussians
 settle from their 20th update on, wherever the views are from. On a real kitchen whose frames two robots shared, that
 gave 0.9 dB in the region (fitted views), on simulated homes 0.2 dB.

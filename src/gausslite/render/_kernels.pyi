@@ -52,7 +52,7 @@ class StepTraining:
         counted: Bool[ndarray, " n"] | None,
         loan: int,
     ) -> None:
-        """The values of adam are beta1, beta2, epsilon, full_rate_updates. trained rises by one for each row that moved
+        """The values of adam are beta1, beta2, epsilon, decay_after_updates. trained rises by one for each row that moved
         and is counted.
 
         loan: numbers a time in which the rows change by steps of this number alone; 0 where others may change them.

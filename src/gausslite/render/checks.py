@@ -40,17 +40,17 @@ def require_scene(n: int, camera: Camera, T_camera_world: Float64[ndarray, "4 4"
         _require_ascending(subset.ids, n)
 
 
-def require_marks(n: int, trainable: Bool[ndarray, " n"] | None, tally: UpdateCounter | None) -> None:
-    """Raise ShapeError unless what is said of single rows is said of all n, and the tally can be written."""
+def require_marks(n: int, trainable: Bool[ndarray, " n"] | None, update_counter: UpdateCounter | None) -> None:
+    """Raise ShapeError unless what is said of single rows is said of all n, and the update_counter can be written."""
     if trainable is not None:
         require_array("trainable", trainable, (n,), np.bool_)
-    if tally is None:
+    if update_counter is None:
         return
-    require_array("tally counts", tally.counts, (n,), np.uint32)
-    if not (tally.counts.flags.writeable and tally.counts.flags.c_contiguous):
-        raise ShapeError("tally counts: expected a contiguous array that may be written, got another")
-    if tally.among is not None:
-        require_array("tally among", tally.among, (n,), np.bool_)
+    require_array("update_counter counts", update_counter.counts, (n,), np.uint32)
+    if not (update_counter.counts.flags.writeable and update_counter.counts.flags.c_contiguous):
+        raise ShapeError("update_counter counts: expected a contiguous array that may be written, got another")
+    if update_counter.mask is not None:
+        require_array("update_counter mask", update_counter.mask, (n,), np.bool_)
 
 
 def require_image_gradients(

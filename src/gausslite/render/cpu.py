@@ -173,21 +173,21 @@ class CpuRasterizer:
         masked: bool = False,
         subset: Subset = FULL_FRAME,
         trainable: Bool[ndarray, " n"] | None = None,
-        tally: UpdateCounter | None = None,
+        update_counter: UpdateCounter | None = None,
     ) -> StepReport:
         """One whole iteration in place. Raises ShapeError, also for a view of another backend."""
         if not isinstance(view, CpuView):
             raise ShapeError(f"view: expected one that this backend prepared, got {type(view).__name__}")
         with self._lock:
             scene = view.scene(len(rows), T_camera_world, subset, masked)
-            training = self._loans.training((rows, first_moment, second_moment), (loss, adam), masked, trainable, tally)
+            training = self._loans.training((rows, first_moment, second_moment), (loss, adam), masked, trainable, update_counter)
             self._settle_report()
             report = _Report(self._engine.step(scene, training), self._engine, self._lock)
             self._latest = ref(report)
         return report
 
     @contextmanager
-    def holding(
+    def bind_tables(
         self,
         rows: Float32[ndarray, "n 16"],
         first_moment: Float32[ndarray, "n 16"],

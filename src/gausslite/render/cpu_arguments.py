@@ -81,7 +81,7 @@ class Loans:
         """Until this ends, the tables change by steps alone. Raises ShapeError, InvalidInputError for a second loan."""
         require_tables(*tables)
         if self._held is not None:
-            raise InvalidInputError("holding: expected no other tables on loan, got a second loan")
+            raise InvalidInputError("bind_tables: expected no other tables on loan, got a second loan")
         self._number += 1
         self._held = tables
         try:
@@ -96,28 +96,28 @@ class Loans:
         rules: tuple[LossWeights, AdamSettings],
         masked: bool,
         trainable: Bool[ndarray, " n"] | None,
-        tally: UpdateCounter | None,
+        update_counter: UpdateCounter | None,
     ) -> _kernels.StepTraining:
         """What a step changes and how; kept for the next step on the same loan. Raises ShapeError."""
-        asked, known = (*tables, *rules, trainable, tally), self._trainings.get(masked)
+        asked, known = (*tables, *rules, trainable, update_counter), self._trainings.get(masked)
         if known is not None and known.is_of(asked):
             return known.native
         on_loan = self._held is not None and all(map(is_, tables, self._held))
         if not on_loan:
             require_tables(*tables)
-        require_marks(len(tables[0]), trainable, tally)
-        (loss, adam), among = rules, None if tally is None else tally.among
-        marks = contiguous(trainable), None if tally is None else tally.counts, contiguous(among)
+        require_marks(len(tables[0]), trainable, update_counter)
+        (loss, adam), mask = rules, None if update_counter is None else update_counter.mask
+        marks = contiguous(trainable), None if update_counter is None else update_counter.counts, contiguous(mask)
         native: _kernels.StepTraining = load_kernels().StepTraining(
             tables,
-            (loss.colour, loss.depth, loss.ssim, loss.by_share),
+            (loss.colour, loss.depth, loss.ssim, loss.normalise_by_image),
             _row_rates(adam),
-            (adam.beta1, adam.beta2, adam.epsilon, adam.full_rate_updates),
+            (adam.beta1, adam.beta2, adam.epsilon, adam.decay_after_updates),
             masked,
             *marks,
             self._number if on_loan else 0,
         )
-        if on_loan and marks[0] is trainable and marks[2] is among:
+        if on_loan and marks[0] is trainable and marks[2] is mask:
             self._trainings[masked] = _Carried(asked, native)
         return native
 

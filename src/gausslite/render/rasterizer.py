@@ -33,12 +33,12 @@ from gausslite.domain.camera import Camera
 from gausslite.errors import InvalidInputError
 
 ROW_WIDTH = 16
-MEAN, LOG_SCALE, QUAT, LOGIT, RGB = slice(0, 3), slice(3, 6), slice(6, 10), 10, slice(11, 14)
-UPDATES = 14
+MEAN, LOG_SCALE, QUAT, OPACITY_LOGIT, RGB = slice(0, 3), slice(3, 6), slice(6, 10), 10, slice(11, 14)
+UPDATE_COUNT = 14
 GRAD_2D_SUM, GRAD_2D_COUNT = 14, 15
 """Columns of the first-moment table, not of the rows."""
 
-MOST_COUNTED_UPDATES = 20_000
+MAX_UPDATE_COUNT = 20_000
 """Further updates of a splat count as so many: its bias corrections are 1 by then."""
 
 TILE_PX = 16
@@ -101,7 +101,7 @@ class LossWeights:
     + depth / W · Σ w |depth / alpha − measured|   where alpha > 0.5 and measured > 0
     + ssim · (1 − Σ w SSIM / (3W))   11x11 Gaussian window, sigma 1.5, zero padding, C1 = 1e-4, C2 = 9e-4
 
-    by_share multiplies all of it by W over the number of pixels, so that on images of one size a pixel of weight 1
+    normalise_by_image multiplies all of it by W over the number of pixels, so that on images of one size a pixel of weight 1
     counts the same in every step, whatever the mask. Adam divides by how large gradients were lately: without it,
     steps masked to a small region make those on the full image next to nothing to the Gaussians that both move.
     """
@@ -109,7 +109,7 @@ class LossWeights:
     colour: float = 0.8
     depth: float = 1.0
     ssim: float = 0.2
-    by_share: bool = False
+    normalise_by_image: bool = False
 
     def __post_init__(self) -> None:
         for name in ("colour", "depth", "ssim"):
@@ -122,8 +122,8 @@ class LossWeights:
 class AdamSettings:
     """Learning rates per group (FIELD defaults) and Adam's constants; bias correction counts updates per splat.
 
-    full_rate_updates: in the t-th update of a splat its rates are multiplied by √(full_rate_updates / t) where that is
-    below 1, for t up to MOST_COUNTED_UPDATES and no less after them. inf, the default, keeps them as they are.
+    decay_after_updates: in the t-th update of a splat its rates are multiplied by √(decay_after_updates / t) where that is
+    below 1, for t up to MAX_UPDATE_COUNT and no less after them. inf, the default, keeps them as they are.
     """
 
     means: float = 1e-4
@@ -134,7 +134,7 @@ class AdamSettings:
     beta1: float = 0.9
     beta2: float = 0.999
     epsilon: float = 1e-15
-    full_rate_updates: float = math.inf
+    decay_after_updates: float = math.inf
 
     def __post_init__(self) -> None:
         for name in ("means", "log_scales", "quats", "opacity_logits", "rgb"):
@@ -146,23 +146,26 @@ class AdamSettings:
                 raise InvalidInputError(f"adam {name}: expected at least 0 and less than 1, got {getattr(self, name)}")
         if not 0.0 < self.epsilon < math.inf:
             raise InvalidInputError(f"adam epsilon: expected a finite number above 0, got {self.epsilon}")
-        if not self.full_rate_updates > 0.0:
-            raise InvalidInputError(f"adam full_rate_updates: expected more than 0, got {self.full_rate_updates}")
+        if not self.decay_after_updates > 0.0:
+            raise InvalidInputError(f"adam decay_after_updates: expected more than 0, got {self.decay_after_updates}")
 
     def row_rates(self) -> Float32[ndarray, "16"]:
         """The learning rate of each column of a row; zero for the spare ones."""
         rates = np.zeros(ROW_WIDTH, np.float32)
         rates[MEAN], rates[LOG_SCALE], rates[QUAT] = self.means, self.log_scales, self.quats
-        rates[LOGIT], rates[RGB] = self.opacity_logits, self.rgb
+        rates[OPACITY_LOGIT], rates[RGB] = self.opacity_logits, self.rgb
         return rates
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class UpdateCounter:
-    """How often rows were trained: `counts` rises by one in each step that moves the row; among: of these rows only."""
+    """Count the updates of each row: a step adds 1 to `counts` for each row that it changes and `mask` selects.
+
+    mask: None selects all rows.
+    """
 
     counts: UInt32[ndarray, " n"]
-    among: Bool[ndarray, " n"] | None = None
+    mask: Bool[ndarray, " n"] | None = None
 
 
 @runtime_checkable
@@ -249,17 +252,17 @@ class Rasterizer(Protocol):
         masked: bool = False,
         subset: Subset = FULL_FRAME,
         trainable: Bool[ndarray, " n"] | None = None,
-        tally: UpdateCounter | None = None,
+        update_counter: UpdateCounter | None = None,
     ) -> StepReport:
         """One whole iteration in place: forward, loss, backward, sparse Adam on the visible (and trainable) rows.
 
         masked=True weighs every loss term by the view's weight, as LossWeights says. Only rows that are
-        visible and trainable change, with their moments: their UPDATES count rises by one, and the density
-        statistics of the first moment are added up, and so is the tally. Raises ShapeError.
+        visible and trainable change, with their moments: their UPDATE_COUNT count rises by one, and the density
+        statistics of the first moment are added up, and so is the update_counter. Raises ShapeError.
         """
         ...
 
-    def holding(
+    def bind_tables(
         self,
         rows: Float32[ndarray, "n 16"],
         first_moment: Float32[ndarray, "n 16"],

@@ -8,7 +8,7 @@ import pytest
 from gausslite.errors import InvalidInputError
 from gausslite.optimize.density import DensitySettings, densify, prune
 from gausslite.optimize.parameters import SplatTable
-from gausslite.render.rasterizer import GRAD_2D_COUNT, GRAD_2D_SUM, LOG_SCALE, LOGIT, MEAN, QUAT, UPDATES
+from gausslite.render.rasterizer import GRAD_2D_COUNT, GRAD_2D_SUM, LOG_SCALE, MEAN, OPACITY_LOGIT, QUAT, UPDATE_COUNT
 
 SETTINGS = DensitySettings(max_growth=1.0)
 EXTENT_M = 1.0
@@ -20,7 +20,7 @@ def table_of(scales_m: list[float], gradients: list[float], capacity: int) -> Sp
     rows[:, MEAN] = np.arange(count)[:, None]
     rows[:, LOG_SCALE] = np.log(np.array(scales_m, np.float32))[:, None]
     rows[:, QUAT] = (1.0, 0.0, 0.0, 0.0)
-    rows[:, UPDATES] = 9.0
+    rows[:, UPDATE_COUNT] = 9.0
     target = np.arange(count).astype(np.int16)
     table.append_rows(rows, target % 2 == 1, (10 * target).astype(np.uint32), target)
     table.first_moment[:] = 3.0
@@ -37,8 +37,8 @@ def test_small_ones_are_cloned_large_ones_are_split_and_calm_ones_are_left() -> 
     assert (outcome.cloned, outcome.split, table.count) == (1, 1, 5)
     np.testing.assert_array_equal(table.rows[2], before[2])
     parent, clone = table.rows[table.target == 0]
-    np.testing.assert_array_equal(clone[:UPDATES], parent[:UPDATES])
-    np.testing.assert_array_equal(np.delete(clone, [LOGIT, UPDATES]), np.delete(before[0], [LOGIT, UPDATES]))
+    np.testing.assert_array_equal(clone[:UPDATE_COUNT], parent[:UPDATE_COUNT])
+    np.testing.assert_array_equal(np.delete(clone, [OPACITY_LOGIT, UPDATE_COUNT]), np.delete(before[0], [OPACITY_LOGIT, UPDATE_COUNT]))
     halves = table.rows[table.target == 1]
     np.testing.assert_allclose(halves[:, LOG_SCALE], np.log([[0.1 / 1.6, 0.1, 0.1]] * 2), rtol=1e-5)
     assert not np.array_equal(halves[0], halves[1])
@@ -47,7 +47,7 @@ def test_small_ones_are_cloned_large_ones_are_split_and_calm_ones_are_left() -> 
 @pytest.mark.parametrize("logit", [-5.0, 0.0, 3.0, 12.0])
 def test_a_clone_and_its_parent_together_hide_what_the_parent_hid(logit: float) -> None:
     table = table_of([0.001], [1e-3], capacity=2)
-    table.rows[:, LOGIT] = logit
+    table.rows[:, OPACITY_LOGIT] = logit
     hidden = table.opacities[0]
     densify(table, SETTINGS, EXTENT_M)
     np.testing.assert_allclose(1.0 - np.prod(1.0 - table.opacities.astype(np.float64)), hidden, rtol=1e-4)
@@ -70,12 +70,12 @@ def test_children_inherit_and_start_with_fresh_optimiser_state_while_the_others_
     np.testing.assert_array_equal(table.kappa, 10 * table.target)
     np.testing.assert_array_equal(table.active, table.target % 2 == 1)
     kept, fresh = [0, 2], [1, 3, 4]
-    assert (table.first_moment[kept, :LOGIT] == 3.0).all()
+    assert (table.first_moment[kept, :OPACITY_LOGIT] == 3.0).all()
     assert (table.second_moment[kept] == 4.0).all()
-    assert (table.rows[kept, UPDATES] == 9.0).all()
+    assert (table.rows[kept, UPDATE_COUNT] == 9.0).all()
     assert not table.first_moment[fresh].any()
     assert not table.second_moment[fresh].any()
-    assert not table.rows[fresh, UPDATES].any()
+    assert not table.rows[fresh, UPDATE_COUNT].any()
 
 
 def test_statistics_start_anew() -> None:
@@ -116,7 +116,7 @@ def test_split_follows_the_rotation_of_an_elongated_gaussian() -> None:
 
 def test_prune_drops_the_transparent() -> None:
     table = table_of([0.1] * 3, [0.0] * 3, capacity=4)
-    table.rows[:, LOGIT] = (-6.0, 0.0, -5.0)
+    table.rows[:, OPACITY_LOGIT] = (-6.0, 0.0, -5.0)
     assert prune(table, SETTINGS) == 1
     assert sorted(table.target.tolist()) == [1, 2]
 

@@ -34,7 +34,7 @@ def test_memory_is_aligned_and_reserved_once() -> None:
     table.keep(np.arange(60) % 2 == 0)
     table.append(some_gaussians(70))
     assert table.rows.__array_interface__["data"][0] == address
-    assert (table.count, table.room) == (100, 0)
+    assert (table.count, table.free_slots) == (100, 0)
 
 
 def test_append_beyond_the_cap_is_refused_and_changes_nothing() -> None:

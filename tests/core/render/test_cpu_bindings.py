@@ -57,7 +57,7 @@ def train(rasterizer: CpuRasterizer, lending: bool, loss: LossWeights) -> list[n
     trainable = rng.random(len(rows)) < 0.5
     seen = []
     for _ in range(2):
-        with rasterizer.holding(*lent) if lending else nullcontext():
+        with rasterizer.bind_tables(*lent) if lending else nullcontext():
             for i in range(12):
                 subset = (Subset(ids=few), Subset(), Subset(scattered_tiles(i)), Subset(scattered_tiles(i), few))[i % 4]
                 report = rasterizer.step(
@@ -89,15 +89,15 @@ def test_a_step_sees_what_its_arrays_hold_now_though_they_were_seen_before(maske
         rows = random_rows(800)
         lent = rows, np.zeros_like(rows), np.zeros_like(rows)
         counts, among, trainable = np.zeros(800, np.uint32), np.ones(800, bool), np.ones(800, bool)
-        T_camera_world, tally = np.eye(4), UpdateCounter(counts, among)
+        T_camera_world, update_counter = np.eye(4), UpdateCounter(counts, among)
         subset = Subset(np.ones((6, 7), bool))
         assert subset.tiles is not None
-        with rasterizer.holding(*lent):
+        with rasterizer.bind_tables(*lent):
             for i in range(6):
                 T_camera_world[:] = pose(0.3 * i)
                 subset.tiles[:] = scattered_tiles(i)
                 trainable[:], among[:] = np.arange(800) % 3 != i % 3, np.arange(800) % 2 == i % 2
-                told = (T_camera_world, subset, trainable, tally)
+                told = (T_camera_world, subset, trainable, update_counter)
                 if fresh:
                     told = (
                         T_camera_world.copy(),
@@ -118,13 +118,13 @@ def test_what_is_wrong_is_refused_each_time_it_comes() -> None:
     view = rasterizer.prepare_view(np.zeros((*size, 3), np.uint8), np.ones(size, np.float32), CAMERA)
     lent, loss = (rows, np.zeros_like(rows), np.zeros_like(rows)), LossWeights()
     few, tiles = Subset(ids=np.array([9], np.uint32)), Subset(np.ones((2, 2), bool))
-    with rasterizer.holding(*lent):
+    with rasterizer.bind_tables(*lent):
         rasterizer.step(*lent, view, pose(0.0), loss, FAST, subset=few)
         for _ in range(2):
             with pytest.raises(ShapeError, match="subset tiles"):
                 rasterizer.step(*lent, view, pose(0.0), loss, FAST, subset=tiles)
     fewer = tuple(table[:9].copy() for table in lent)
-    for lending in (rasterizer.holding(*fewer), nullcontext()):
+    for lending in (rasterizer.bind_tables(*fewer), nullcontext()):
         with lending, pytest.raises(InvalidInputError, match="subset ids"):
             rasterizer.step(*fewer, view, pose(0.0), loss, FAST, subset=few)
 

@@ -63,7 +63,7 @@ def test_a_containers_share_of_the_cores_counts(tmp_path: Path, told: str, cores
         ({"rgb": float("nan")}, "adam rate rgb"),
         ({"beta1": 1.0}, "adam beta1: expected at least 0 and less than 1, got 1.0"),
         ({"epsilon": 0.0}, "adam epsilon"),
-        ({"full_rate_updates": -1.0}, "adam full_rate_updates: expected more than 0, got -1.0"),
+        ({"decay_after_updates": -1.0}, "adam decay_after_updates: expected more than 0, got -1.0"),
     ],
 )
 def test_rates_that_would_ruin_a_map_are_refused(wrong: dict[str, float], said: str) -> None:

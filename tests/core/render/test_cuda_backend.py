@@ -105,8 +105,8 @@ def tables(n: int = 4) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def test_one_loan_at_a_time() -> None:
     rasterizer = CudaRasterizer("cpu")
-    with rasterizer.holding(*tables()):
-        with pytest.raises(InvalidInputError, match="second loan"), rasterizer.holding(*tables()):
+    with rasterizer.bind_tables(*tables()):
+        with pytest.raises(InvalidInputError, match="second loan"), rasterizer.bind_tables(*tables()):
             pass
         frame = wall_frame(0, SIZE)
         view = rasterizer.prepare_view(frame.rgb, frame.depth_m, frame.camera)
@@ -119,7 +119,7 @@ def test_lent_arrays_change_when_the_loan_ends() -> None:
     frame = wall_frame(0, SIZE)
     view = rasterizer.prepare_view(frame.rgb, frame.depth_m, frame.camera)
     before = lent[0].copy()
-    with rasterizer.holding(*lent):
+    with rasterizer.bind_tables(*lent):
         rasterizer.step(*lent, view, np.eye(4), LossWeights(), replace(AdamSettings(), rgb=0.1))
         np.testing.assert_array_equal(lent[0], before)
     assert np.abs(lent[0] - before).max() > 0.05

@@ -14,7 +14,7 @@ from torch.nn.functional import conv2d
 
 from gausslite.domain.camera import Camera
 from gausslite.render.cuda.projection import Lens
-from gausslite.render.cuda.tables import carried
+from gausslite.render.cuda.tables import to_device
 from gausslite.render.rasterizer import TILE_PX, LossWeights
 
 MIN_DEPTH_ALPHA = 0.5
@@ -91,7 +91,7 @@ class CudaView:
 
     camera: Camera
     lens: Lens
-    plain: Target
+    unmasked: Target
     masked: Target
 
     @classmethod
@@ -104,16 +104,16 @@ class CudaView:
         device: torch.device,
     ) -> CudaView:
         """Carry the images to the device, colours in [0, 1], with the sums that no drawing changes."""
-        colours = carried(rgb, device).float() / 255.0
-        measured_m = carried(depth_m, device)
+        colours = to_device(rgb, device).float() / 255.0
+        measured_m = to_device(depth_m, device)
         planes = colours.permute(2, 0, 1)
         blurred = _blur(torch.cat([planes, planes * planes]))
         means = blurred[:3]
         similar = torch.cat([means, blurred[3:] - means * means])
-        plain = Target(Window.whole(camera), colours, measured_m, similar, None, float(depth_m.size), 1.0)
+        unmasked = Target(Window.whole(camera), colours, measured_m, similar, None, float(depth_m.size), 1.0)
         lens = Lens.of(camera, device)
         if weight is None:
-            return cls(camera, lens, plain, plain)
+            return cls(camera, lens, unmasked, unmasked)
         window = Window.around(weight, camera)
         part, weight_sum = (window.rows, window.columns), float(weight.sum(dtype=np.float64))
         masked = Target(
@@ -121,11 +121,11 @@ class CudaView:
             colours[part],
             measured_m[part],
             similar[:, window.rows, window.columns],
-            carried(weight[part], device),
+            to_device(weight[part], device),
             weight_sum,
             weight_sum / depth_m.size,
         )
-        return cls(camera, lens, plain, masked)
+        return cls(camera, lens, unmasked, masked)
 
 
 def training_loss(
@@ -145,7 +145,7 @@ def training_loss(
     if loss.ssim != 0.0:
         total = total - loss.ssim * (weight * _ssim_sum(rgb, target)).sum() / 3.0
     value = loss.ssim + total / target.weight_sum
-    return value * target.share if loss.by_share else value
+    return value * target.share if loss.normalise_by_image else value
 
 
 def _ssim_sum(rgb: Float32[Tensor, "h w 3"], target: Target) -> Float32[Tensor, "h w"]:

@@ -13,8 +13,8 @@ from torch.nn.functional import logsigmoid, normalize
 
 from gausslite.domain.camera import Camera
 from gausslite.render.cuda.kernels import Footprints, Kernels
-from gausslite.render.cuda.tables import carried
-from gausslite.render.rasterizer import LOG_SCALE, LOGIT, MEAN, NEAR_M, QUAT, RGB, TILE_PX, UPDATES
+from gausslite.render.cuda.tables import to_device
+from gausslite.render.rasterizer import LOG_SCALE, MEAN, NEAR_M, OPACITY_LOGIT, QUAT, RGB, TILE_PX, UPDATE_COUNT
 from gausslite.render.reference.projection import LOW_PASS_PX2, MIN_ALPHA
 
 
@@ -59,7 +59,7 @@ def project(
     covariance = 0.5 * (covariances_px2[:, 0, 1] + covariances_px2[:, 1, 0])
     determinant = variance_x * variance_y - covariance * covariance
     # a sigmoid whose slope keeps its digits where it is nearly 1
-    opacities = logsigmoid(rows[:, LOGIT]).exp()
+    opacities = logsigmoid(rows[:, OPACITY_LOGIT]).exp()
     # the boundary alpha = 1/255 is an ellipse at this squared Mahalanobis distance
     reach = 2.0 * torch.log(opacities.detach() / MIN_ALPHA).clamp(min=0.0)
     return Footprints(
@@ -85,7 +85,7 @@ def visible_rows(
     What cannot be drawn is projected like the rest and left out at the end: the host waits for one number only.
     """
     candidates = rows if ids is None else rows[ids]
-    drawable = torch.isfinite(candidates[:, :UPDATES]).all(dim=1) & (candidates[:, QUAT] != 0).any(dim=1)
+    drawable = torch.isfinite(candidates[:, :UPDATE_COUNT]).all(dim=1) & (candidates[:, QUAT] != 0).any(dim=1)
     drawable &= candidates[:, MEAN] @ T_camera_world[2, :3] + T_camera_world[2, 3] >= NEAR_M
     footprints = project(kernels, candidates, lens, T_camera_world)
     boxes_px = torch.cat([footprints.means_px, footprints.radius_px], dim=1)
@@ -116,7 +116,7 @@ def _touches(
     if tiles is None:
         return hit
     # how many of the tiles lie in the box, by four corners of a summed-area table
-    table = carried(np.pad(tiles.cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0))), means_px.device)
+    table = to_device(np.pad(tiles.cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0))), means_px.device)
     x0, y0 = (torch.minimum(low, last).long() // TILE_PX).unbind(dim=1)
     x1, y1 = (high.clamp(min=0.0).long() // TILE_PX + 1).unbind(dim=1)
     return hit & (table[y1, x1] - table[y0, x1] - table[y1, x0] + table[y0, x0] > 0)

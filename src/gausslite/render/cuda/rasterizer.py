@@ -25,7 +25,7 @@ from gausslite.render.checks import (
 from gausslite.render.cuda.kernels import Footprints, GsplatKernels, Kernels, TorchKernels, load_gsplat
 from gausslite.render.cuda.loss import CudaView, Window, training_loss
 from gausslite.render.cuda.projection import Lens, project, visible_rows
-from gausslite.render.cuda.tables import DeviceTables, HostTables, carried
+from gausslite.render.cuda.tables import DeviceTables, HostTables, to_device
 from gausslite.render.rasterizer import (
     FULL_FRAME,
     AdamSettings,
@@ -120,7 +120,7 @@ class CudaRasterizer:
         """Draw the splats. Raises ShapeError, InvalidInputError for ids that are not ascending rows."""
         require_table("rows", rows)
         require_scene(len(rows), camera, T_camera_world, subset)
-        on_device = carried(rows, self._kernels.device)
+        on_device = to_device(rows, self._kernels.device)
         lens = Lens.of(camera, self._kernels.device)
         drawn = self._draw(on_device, lens, T_camera_world, subset, Window.whole(camera), pose_too=True)
         channels = drawn.channels.detach().cpu().numpy()
@@ -152,7 +152,7 @@ class CudaRasterizer:
         gradients, d_means_px, d_pose = torch.autograd.grad(
             (drawn.channels, drawn.alpha),
             (drawn.rows, drawn.means_px, drawn.T_camera_world),
-            (carried(d_channels, device), carried(d_alpha, device)),
+            (to_device(d_channels, device), to_device(d_alpha, device)),
             retain_graph=True,
         )
         norms = _norms_2d(d_means_px, context.lens)
@@ -185,9 +185,9 @@ class CudaRasterizer:
         masked: bool = False,
         subset: Subset = FULL_FRAME,
         trainable: Bool[ndarray, " n"] | None = None,
-        tally: UpdateCounter | None = None,
+        update_counter: UpdateCounter | None = None,
     ) -> StepReport:
-        """One whole iteration: in place on the device during a loan, else carried there and back.
+        """One whole iteration: in place on the device during a loan, else to_device there and back.
 
         Raises ShapeError, also for a view of another backend, InvalidInputError for tables other than the lent ones.
         """
@@ -195,27 +195,27 @@ class CudaRasterizer:
             raise ShapeError(f"view: expected one that this backend prepared, got {type(view).__name__}")
         tables = HostTables(rows, first_moment, second_moment)
         if self._held is None:
-            with self.holding(rows, first_moment, second_moment):
-                return self.step(*tables.arrays, view, T_camera_world, loss, adam, masked, subset, trainable, tally)
+            with self.bind_tables(rows, first_moment, second_moment):
+                return self.step(*tables.arrays, view, T_camera_world, loss, adam, masked, subset, trainable, update_counter)
         if not self._held.host.same_memory_as(tables):
             raise InvalidInputError("step: expected the tables that are on loan, got others")
         require_scene(len(rows), view.camera, T_camera_world, subset)
-        require_marks(len(rows), trainable, tally)
-        target = view.masked if masked else view.plain
+        require_marks(len(rows), trainable, update_counter)
+        target = view.masked if masked else view.unmasked
         drawn = self._draw(self._held.rows, view.lens, T_camera_world, subset, target.window)
         value = training_loss(drawn.channels, drawn.alpha, target, loss)
         gradients, d_means_px = torch.autograd.grad(value, (drawn.rows, drawn.means_px))
         moving, norms = drawn.visible, _norms_2d(d_means_px, view.lens)
         if trainable is not None:
-            updated = torch.nonzero(carried(trainable, moving.device)[moving])[:, 0]
+            updated = torch.nonzero(to_device(trainable, moving.device)[moving])[:, 0]
             moving, gradients, norms = moving[updated], gradients[updated], norms[updated]
         self._held.update(moving, gradients, norms, adam)
-        if tally is not None:
-            self._held.count(moving, tally)
+        if update_counter is not None:
+            self._held.count(moving, update_counter)
         return _DeviceReport(value.detach(), drawn.visible)
 
     @contextmanager
-    def holding(
+    def bind_tables(
         self,
         rows: Float32[ndarray, "n 16"],
         first_moment: Float32[ndarray, "n 16"],
@@ -227,7 +227,7 @@ class CudaRasterizer:
         """
         require_tables(rows, first_moment, second_moment)
         if self._held is not None:
-            raise InvalidInputError("holding: expected no other tables on loan, got a second loan")
+            raise InvalidInputError("bind_tables: expected no other tables on loan, got a second loan")
         self._held = DeviceTables(HostTables(rows, first_moment, second_moment), self._kernels.device)
         try:
             yield
@@ -246,8 +246,8 @@ class CudaRasterizer:
     ) -> _Drawn:
         """Project the visible rows and blend them in the window; pose_too: ready for gradients by the pose."""
         device = self._kernels.device
-        pose = carried(T_camera_world.astype(np.float32), device)
-        ids = None if subset.ids is None else carried(subset.ids.astype(np.int64), device)
+        pose = to_device(T_camera_world.astype(np.float32), device)
+        ids = None if subset.ids is None else to_device(subset.ids.astype(np.int64), device)
         visible = visible_rows(self._kernels, rows, lens, pose, ids, subset.tiles)
         leaves, pose = rows[visible].requires_grad_(), pose.requires_grad_(pose_too)
         footprints = project(self._kernels, leaves, lens, pose)
@@ -265,7 +265,7 @@ class CudaRasterizer:
             return nothing.expand(height_px, width_px, 4), nothing.expand(height_px, width_px)
         shown = None
         if tiles is not None:
-            shown = carried(tiles[window.tile_rows, window.tile_columns], device)
+            shown = to_device(tiles[window.tile_rows, window.tile_columns], device)
         left, top = window.origin_px
         moved_px = torch.stack([footprints.means_px[:, 0] - left, footprints.means_px[:, 1] - top], dim=1)
         part = replace(footprints, means_px=moved_px)

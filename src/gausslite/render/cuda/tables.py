@@ -14,8 +14,8 @@ from torch import Tensor
 from gausslite.render.rasterizer import (
     GRAD_2D_COUNT,
     GRAD_2D_SUM,
-    MOST_COUNTED_UPDATES,
-    UPDATES,
+    MAX_UPDATE_COUNT,
+    UPDATE_COUNT,
     AdamSettings,
     UpdateCounter,
 )
@@ -24,7 +24,7 @@ _COUNT_EVERY = 8
 """So many tallies wait to be written together, so that the device runs on meanwhile."""
 
 
-def carried(array: NDArray[Any], device: torch.device) -> Tensor:
+def to_device(array: NDArray[Any], device: torch.device) -> Tensor:
     """The array on the device; of one that may not be written, which torch refuses to share, a copy."""
     writable = array if array.flags.writeable and array.flags.c_contiguous else array.copy(order="C")
     return torch.from_numpy(writable).to(device)
@@ -68,16 +68,16 @@ class DeviceTables:
         for array, tensor in zip(self.host.arrays, (self.rows, self.first_moment, self.second_moment), strict=True):
             torch.from_numpy(array).copy_(tensor)
 
-    def count(self, moved: Int64[Tensor, " m"], tally: UpdateCounter) -> None:
-        """These rows were trained; the tally learns of it by the end of the loan."""
-        self._uncounted.append((moved, tally))
+    def count(self, moved: Int64[Tensor, " m"], update_counter: UpdateCounter) -> None:
+        """These rows were trained; the update_counter learns of it by the end of the loan."""
+        self._uncounted.append((moved, update_counter))
         if len(self._uncounted) == _COUNT_EVERY:
             self._write_tallies()
 
     def _write_tallies(self) -> None:
-        for moved, tally in self._uncounted:
+        for moved, update_counter in self._uncounted:
             rows = moved.cpu().numpy()
-            tally.counts[rows if tally.among is None else rows[tally.among[rows]]] += 1
+            update_counter.counts[rows if update_counter.mask is None else rows[update_counter.mask[rows]]] += 1
         self._uncounted.clear()
 
     @torch.no_grad()
@@ -92,17 +92,17 @@ class DeviceTables:
         first = self.first_moment[moving]
         second = self.second_moment[moving]
         rows = self.rows[moving]
-        trained = slice(0, UPDATES)
+        trained = slice(0, UPDATE_COUNT)
         gradient = gradients[:, trained]
         first[:, trained].lerp_(gradient, 1.0 - adam.beta1)
         second[:, trained].mul_(adam.beta2).addcmul_(gradient, gradient, value=1.0 - adam.beta2)
-        updates = (rows[:, UPDATES, None] + 1.0).clamp(max=MOST_COUNTED_UPDATES)
-        slowed = (adam.full_rate_updates / updates).clamp(max=1.0).sqrt()
-        rates = carried(adam.row_rates()[trained], rows.device)
+        updates = (rows[:, UPDATE_COUNT, None] + 1.0).clamp(max=MAX_UPDATE_COUNT)
+        slowed = (adam.decay_after_updates / updates).clamp(max=1.0).sqrt()
+        rates = to_device(adam.row_rates()[trained], rows.device)
         first_unbiased = first[:, trained] / (1.0 - adam.beta1**updates)
         second_unbiased = second[:, trained] / (1.0 - adam.beta2**updates)
         rows[:, trained] -= slowed * rates * first_unbiased / (second_unbiased.sqrt() + adam.epsilon)
-        rows[:, UPDATES] += 1.0
+        rows[:, UPDATE_COUNT] += 1.0
         first[:, GRAD_2D_SUM] += mean_2d_norm
         first[:, GRAD_2D_COUNT] += 1.0
         self.rows[moving], self.first_moment[moving], self.second_moment[moving] = rows, first, second

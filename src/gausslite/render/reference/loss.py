@@ -43,7 +43,7 @@ def training_loss(
     depth = (weight[measured] * error_m).sum() / total
     similarity = (weight[..., None] * ssim_map(rgb, view.rgb)).sum() / (3.0 * total)
     value = loss.colour * colour + loss.depth * depth + loss.ssim * (1.0 - similarity)
-    return value * (total / weight.numel()) if loss.by_share else value
+    return value * (total / weight.numel()) if loss.normalise_by_image else value
 
 
 def ssim_map(a: Float64[Tensor, "h w 3"], b: Float64[Tensor, "h w 3"]) -> Float64[Tensor, "h w 3"]:

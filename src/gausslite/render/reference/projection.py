@@ -12,7 +12,7 @@ from numpy import ndarray
 from torch import Tensor
 
 from gausslite.domain.camera import Camera
-from gausslite.render.rasterizer import LOG_SCALE, LOGIT, MEAN, NEAR_M, QUAT, RGB, TILE_PX
+from gausslite.render.rasterizer import LOG_SCALE, MEAN, NEAR_M, OPACITY_LOGIT, QUAT, RGB, TILE_PX
 
 LOW_PASS_PX2 = 0.3
 MIN_ALPHA = 1.0 / 255.0
@@ -91,7 +91,7 @@ def _ellipses(
     variance_x, covariance, variance_y = _covariance_px2(kept, points, R, camera)
     determinant = variance_x * variance_y - covariance * covariance
     conics = torch.stack([variance_y, -covariance, variance_x], dim=1) / determinant[:, None]
-    opacities = torch.sigmoid(kept[:, LOGIT])
+    opacities = torch.sigmoid(kept[:, OPACITY_LOGIT])
     # the boundary alpha = 1/255 is an ellipse at this squared Mahalanobis distance
     reach = 2.0 * torch.log(opacities.detach() / MIN_ALPHA).clamp(min=0.0)
     half_box_px = torch.sqrt(reach[:, None] * torch.stack([variance_x, variance_y], dim=1).detach())

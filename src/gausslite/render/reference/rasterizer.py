@@ -26,8 +26,8 @@ from gausslite.render.rasterizer import (
     FULL_FRAME,
     GRAD_2D_COUNT,
     GRAD_2D_SUM,
-    MOST_COUNTED_UPDATES,
-    UPDATES,
+    MAX_UPDATE_COUNT,
+    UPDATE_COUNT,
     AdamSettings,
     HostReport,
     LossWeights,
@@ -127,13 +127,13 @@ class ReferenceRasterizer:
         masked: bool = False,
         subset: Subset = FULL_FRAME,
         trainable: Bool[ndarray, " n"] | None = None,
-        tally: UpdateCounter | None = None,
+        update_counter: UpdateCounter | None = None,
     ) -> StepReport:
         """One whole iteration in place. Raises ShapeError, also for a view of another backend."""
         if not isinstance(view, ReferenceView):
             raise ShapeError(f"view: expected one that this backend prepared, got {type(view).__name__}")
         require_tables(rows, first_moment, second_moment)
-        require_marks(len(rows), trainable, tally)
+        require_marks(len(rows), trainable, update_counter)
         drawn = _draw(rows, view.camera, T_camera_world, subset)
         images = drawn.images.requires_grad_()
         value = training_loss(images, view, loss, masked)
@@ -144,12 +144,12 @@ class ReferenceRasterizer:
         _adam(rows, first_moment, second_moment, d_rows, moving, adam)
         first_moment[moving, GRAD_2D_SUM] += norms[updated].astype(np.float32)
         first_moment[moving, GRAD_2D_COUNT] += 1.0
-        if tally is not None:
-            tally.counts[moving if tally.among is None else moving[tally.among[moving]]] += 1
+        if update_counter is not None:
+            update_counter.counts[moving if update_counter.mask is None else moving[update_counter.mask[moving]]] += 1
         return HostReport(value.item(), visible.astype(np.uint32))
 
     @contextmanager
-    def holding(
+    def bind_tables(
         self,
         rows: Float32[ndarray, "n 16"],
         first_moment: Float32[ndarray, "n 16"],
@@ -158,7 +158,7 @@ class ReferenceRasterizer:
         """Nothing to carry. Raises ShapeError, InvalidInputError for a second loan before the first is over."""
         require_tables(rows, first_moment, second_moment)
         if self._lent:
-            raise InvalidInputError("holding: expected no other tables on loan, got a second loan")
+            raise InvalidInputError("bind_tables: expected no other tables on loan, got a second loan")
         self._lent = True
         try:
             yield
@@ -201,16 +201,16 @@ def _adam(
     adam: AdamSettings,
 ) -> None:
     """Sparse Adam (Kingma and Ba 2015) on the moving rows; bias correction by each row's own number of updates."""
-    columns = slice(0, UPDATES)
+    columns = slice(0, UPDATE_COUNT)
     gradient = d_rows[moving, columns]
     first = adam.beta1 * first_moment[moving, columns].astype(np.float64) + (1.0 - adam.beta1) * gradient
     second = adam.beta2 * second_moment[moving, columns].astype(np.float64) + (1.0 - adam.beta2) * gradient**2
-    updates = np.minimum(rows[moving, UPDATES].astype(np.float64)[:, None] + 1.0, MOST_COUNTED_UPDATES)
-    slowed = np.sqrt(np.minimum(1.0, adam.full_rate_updates / updates))
+    updates = np.minimum(rows[moving, UPDATE_COUNT].astype(np.float64)[:, None] + 1.0, MAX_UPDATE_COUNT)
+    slowed = np.sqrt(np.minimum(1.0, adam.decay_after_updates / updates))
     first_unbiased = first / (1.0 - adam.beta1**updates)
     second_unbiased = second / (1.0 - adam.beta2**updates)
     step = slowed * adam.row_rates()[columns] * first_unbiased / (np.sqrt(second_unbiased) + adam.epsilon)
     rows[moving, columns] = (rows[moving, columns] - step).astype(np.float32)
-    rows[moving, UPDATES] += 1.0
+    rows[moving, UPDATE_COUNT] += 1.0
     first_moment[moving, columns] = first.astype(np.float32)
     second_moment[moving, columns] = second.astype(np.float32)

@@ -14,20 +14,20 @@ from torch import Tensor
 from gausslite.domain.camera import Camera
 from gausslite.render.cuda.kernels import load_gsplat
 from gausslite.render.cuda.loss import CudaView, training_loss
-from gausslite.render.cuda.tables import carried
-from gausslite.render.rasterizer import LOG_SCALE, LOGIT, MEAN, NEAR_M, QUAT, RGB, LossWeights
+from gausslite.render.cuda.tables import to_device
+from gausslite.render.rasterizer import LOG_SCALE, MEAN, NEAR_M, OPACITY_LOGIT, QUAT, RGB, LossWeights
 
 Rasterization = Callable[..., tuple[Tensor, Tensor, dict[str, Any]]]
 """gsplat.rasterization: means, quats, scales, opacities, colors, viewmats, Ks, width, height to images."""
 
 
-def gsplats_rasterization() -> Rasterization:
+def load_gsplat_rasterization() -> Rasterization:
     """The real one. Raises KernelError where its kernels cannot run."""
     found: Rasterization = load_gsplat().rasterization
     return found
 
 
-class PlainTraining:
+class GsplatBaseline:
     """Five parameter tensors, `rasterization`, this backend's loss over the whole image, one dense Adam.
 
     Learning rates are zero, as in the other benchmarks: every iteration does the same work. The loss is ours because
@@ -42,13 +42,13 @@ class PlainTraining:
         loss: LossWeights,
         rasterization: Rasterization,
     ) -> None:
-        device = view.plain.rgb.device
-        on_device = carried(rows, device)
+        device = view.unmasked.rgb.device
+        on_device = to_device(rows, device)
         self._parameters = [
-            torch.nn.Parameter(on_device[:, columns].clone()) for columns in (MEAN, QUAT, LOG_SCALE, LOGIT, RGB)
+            torch.nn.Parameter(on_device[:, columns].clone()) for columns in (MEAN, QUAT, LOG_SCALE, OPACITY_LOGIT, RGB)
         ]
         self._adam = torch.optim.Adam(self._parameters, lr=0.0, eps=1e-15)
-        self._pose = carried(T_camera_world.astype(np.float32), device)[None]
+        self._pose = to_device(T_camera_world.astype(np.float32), device)[None]
         self._intrinsics = _intrinsics(view.camera).to(device)[None]
         self._view, self._loss, self._rasterization = view, loss, rasterization
 
@@ -74,7 +74,7 @@ class PlainTraining:
             near_plane=NEAR_M,
             render_mode="RGB+D",
         )
-        value = training_loss(images[0], alphas[0, ..., 0], self._view.plain, self._loss)
+        value = training_loss(images[0], alphas[0, ..., 0], self._view.unmasked, self._loss)
         self._adam.zero_grad(set_to_none=True)
         torch.autograd.backward(value)
         self._adam.step()

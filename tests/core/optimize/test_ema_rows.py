@@ -17,7 +17,7 @@ from gausslite.mapping.settings import MapperSettings, OptimizationSettings, See
 from gausslite.optimize.density import DensitySettings, densify
 from gausslite.optimize.parameters import SplatTable
 from gausslite.render.cpu import CpuRasterizer
-from gausslite.render.rasterizer import GRAD_2D_COUNT, GRAD_2D_SUM, RGB, UPDATES
+from gausslite.render.rasterizer import GRAD_2D_COUNT, GRAD_2D_SUM, RGB, UPDATE_COUNT
 
 HORIZON = 40.0
 UPDATES_A_TURN = 8
@@ -46,15 +46,15 @@ def swing(table: SplatTable, turns: int, horizon: float = HORIZON, amplitude: fl
     rng, still = np.random.default_rng(1), table.rows[:, RGB].copy()
     for _ in range(turns):
         table.rows[:, RGB] = still + rng.normal(0, amplitude, still.shape)
-        table.rows[:, UPDATES] += UPDATES_A_TURN
-        table.average(horizon)
+        table.rows[:, UPDATE_COUNT] += UPDATES_A_TURN
+        table.update_ema(horizon)
 
 
 def test_a_newborn_is_its_own_mean_and_so_is_a_row_that_does_not_move() -> None:
     table = table_of(20)
-    assert_array_equal(table.mean_rows, table.rows)
+    assert_array_equal(table.ema_rows, table.rows)
     swing(table, turns=50, amplitude=0.0)
-    assert_allclose(table.mean_rows, table.rows, rtol=1e-6)
+    assert_allclose(table.ema_rows, table.rows, rtol=1e-6)
 
 
 def test_the_mean_of_rows_that_swing_lies_nearer_to_their_middle_the_farther_it_reaches() -> None:
@@ -62,7 +62,7 @@ def test_the_mean_of_rows_that_swing_lies_nearer_to_their_middle_the_farther_it_
     for horizon in (4.0, 16.0, 64.0):
         table = table_of(300)
         swing(table, turns=100, horizon=horizon)
-        errors.append(float(np.abs(table.mean_rows[:, RGB] - middle).mean()))
+        errors.append(float(np.abs(table.ema_rows[:, RGB] - middle).mean()))
     assert errors == sorted(errors, reverse=True)
     assert errors[-1] < 0.5 * errors[0]
 
@@ -70,46 +70,46 @@ def test_the_mean_of_rows_that_swing_lies_nearer_to_their_middle_the_farther_it_
 @pytest.mark.parametrize("turns", [[80], [8] * 10, [1] * 80])
 def test_what_counts_is_updates_and_not_how_often_one_asks(turns: list[int]) -> None:
     table = table_of(5)
-    table.rows[:, UPDATES] = table.mean_rows[:, UPDATES] = 10 * HORIZON
+    table.rows[:, UPDATE_COUNT] = table.ema_rows[:, UPDATE_COUNT] = 10 * HORIZON
     before = table.rows[:, RGB].copy()
     table.rows[:, RGB] += 1.0
     for updates in turns:
-        table.rows[:, UPDATES] += updates
-        table.average(HORIZON)
-    assert_allclose(table.mean_rows[:, RGB] - before, 1.0 - math.exp(-80 / HORIZON), rtol=1e-4)
+        table.rows[:, UPDATE_COUNT] += updates
+        table.update_ema(HORIZON)
+    assert_allclose(table.ema_rows[:, RGB] - before, 1.0 - math.exp(-80 / HORIZON), rtol=1e-4)
 
 
 def test_a_young_row_is_not_held_back_by_where_it_was_born() -> None:
     table = table_of(5)
     born = table.rows[:, RGB].copy()
     table.rows[:, RGB] += 1.0
-    table.rows[:, UPDATES] += UPDATES_A_TURN
-    table.average(1000.0)
-    assert (table.mean_rows[:, RGB] - born > 0.8).all()
+    table.rows[:, UPDATE_COUNT] += UPDATES_A_TURN
+    table.update_ema(1000.0)
+    assert (table.ema_rows[:, RGB] - born > 0.8).all()
 
 
 def test_rows_that_no_step_moved_keep_their_mean() -> None:
     table = table_of(20)
     swing(table, turns=10)
-    before = table.mean_rows.copy()
-    table.rows[5:, UPDATES] += UPDATES_A_TURN
-    table.average(HORIZON)
-    assert_array_equal(table.mean_rows[:5], before[:5])
+    before = table.ema_rows.copy()
+    table.rows[5:, UPDATE_COUNT] += UPDATES_A_TURN
+    table.update_ema(HORIZON)
+    assert_array_equal(table.ema_rows[:5], before[:5])
 
 
 def test_means_go_where_their_rows_go() -> None:
     table = table_of(20)
     swing(table, turns=10)
     table.kappa[:] = np.arange(20)
-    means = table.mean_rows.copy()
+    means = table.ema_rows.copy()
     table.keep(np.random.default_rng(2).random(20) < 0.5)
-    assert_array_equal(table.mean_rows, means[table.kappa])
+    assert_array_equal(table.ema_rows, means[table.kappa])
     newborn = table_of(3).to_gaussians()
     table.replace(np.arange(3), newborn)
-    assert_array_equal(table.mean_rows[:3], table.rows[:3])
+    assert_array_equal(table.ema_rows[:3], table.rows[:3])
     twin = SplatTable(40)
     twin.restore(table.state())
-    twin_shown, shown = twin.to_gaussians(averaged=True), table.to_gaussians(averaged=True)
+    twin_shown, shown = twin.to_gaussians(use_ema=True), table.to_gaussians(use_ema=True)
     assert_array_equal(twin_shown.rgb, shown.rgb)
 
 
@@ -120,16 +120,16 @@ def test_clones_and_halves_start_with_means_of_their_own(percent_dense: float) -
     table.first_moment[:, GRAD_2D_SUM] = table.first_moment[:, GRAD_2D_COUNT] = 1.0
     settings = DensitySettings(percent_dense=percent_dense, max_growth=1.0)
     densify(table, settings, extent_m=1.0)
-    young = table.rows[:, UPDATES] == 0
+    young = table.rows[:, UPDATE_COUNT] == 0
     assert young.sum() == (20 if percent_dense else 40)
-    assert_array_equal(table.mean_rows[young], table.rows[young])
+    assert_array_equal(table.ema_rows[young], table.rows[young])
 
 
-def map_of(averaged_updates: float) -> GaussianMapper:
+def map_of(ema_updates: float) -> GaussianMapper:
     settings = MapperSettings(
         max_gaussians=400,
         seeding=SeedingSettings(later_seeds=20_000),
-        optimization=OptimizationSettings(averaged_updates=averaged_updates),
+        optimization=OptimizationSettings(ema_updates=ema_updates),
     )
     mapper = GaussianMapper(settings, CpuRasterizer(threads=1), seed=0)
     for index in range(4):
@@ -151,5 +151,5 @@ def test_training_is_the_same_whether_its_mean_is_shown_or_not() -> None:
 
 @pytest.mark.parametrize("updates", [-1.0, math.nan, math.inf])
 def test_a_reach_that_is_none_is_refused(updates: float) -> None:
-    with pytest.raises(InvalidInputError, match="averaged_updates"):
-        replace(OptimizationSettings(), averaged_updates=updates)
+    with pytest.raises(InvalidInputError, match="ema_updates"):
+        replace(OptimizationSettings(), ema_updates=updates)
