@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from quality_results import CONDITIONS, PLAN, TASK, UNIFORM, finished
 
-from gausslite.calibration.view_fit import PoseExposurePrior
+from gausslite.calibration.pose_exposure_prior import PoseExposurePrior
 from gausslite.cli.main import main
 from gausslite.errors import InvalidInputError
 from gausslite.perception.vocabulary import same_kind
@@ -73,7 +73,7 @@ def test_a_real_sequences_kinds_are_chosen_by_name() -> None:
 def test_components_come_one_by_one() -> None:
     variants = cumulative_variants()
     labels = [variant.label for variant in variants]
-    beyond = ["+views", "+surroundings", "+scaffold", "+means", "+settling"]
+    beyond = ["+long-term-keyframes", "+roi-context", "+background-reserve", "+ema", "+lr-decay"]
     assert labels == ["none", "+SB", "+MVO", "+ROI", "+SIS", "+GFD", *beyond]
     off = [variant.without for variant in variants]
     assert all(len(a - b) == 1 and b < a for a, b in pairwise(off))

@@ -14,15 +14,10 @@ import cv2
 import numpy as np
 from numpy import ndarray
 
-from gausslite.calibration.view_fit import (
-    HANDHELD_PRIOR,
-    SAME_SURFACE,
-    PoseExposurePrior,
-    agreeing_pixels,
-    fit_exposure,
-    fit_pose,
-    twist,
-)
+from gausslite.calibration.exposure import fit_exposure
+from gausslite.calibration.pose_exposure_prior import HANDHELD_PRIOR, PoseExposurePrior
+from gausslite.calibration.pose_fit import fit_pose, twist_of
+from gausslite.calibration.view_residuals import MAX_RELATIVE_DEPTH_ERROR, comparable_pixels
 from gausslite.datasets.registered_source import register_depth
 from gausslite.datasets.selection import downscaled_size
 from gausslite.datasets.source import Source
@@ -49,7 +44,7 @@ def estimate_pose_exposure_prior(source: Source) -> tuple[PoseExposurePrior, str
     for drawn, frame in _pairs(source):
         fitted = fit_pose(drawn, inverse(frame.T_world_camera), frame, HANDHELD_PRIOR)
         colour = fit_exposure(drawn, frame, HANDHELD_PRIOR)
-        motions.append(twist(inverse(frame.T_world_camera) @ fitted))
+        motions.append(twist_of(inverse(frame.T_world_camera) @ fitted))
         gains.append(colour.gain - 1.0)
         offsets.append(colour.offset)
     if len(motions) < _FEWEST_PAIRS:
@@ -85,7 +80,7 @@ def _pairs(source: Source) -> Iterator[tuple[Rendering, Frame]]:
             except (DatasetError, PoseError):
                 break
             drawn = _carried(first, second)
-            if len(agreeing_pixels(drawn, second)) >= _FEWEST_PIXELS:
+            if len(comparable_pixels(drawn, second)) >= _FEWEST_PIXELS:
                 yield drawn, second
                 reach = gap
                 break
@@ -104,5 +99,5 @@ def _carried(frame: Frame, other: Frame) -> Rendering:
     at = columns.reshape(depth_m.shape), rows.reshape(depth_m.shape)
     rgb = cv2.remap(frame.rgb, *at, cv2.INTER_LINEAR).astype(np.float32) / np.float32(255.0)
     behind_m = np.abs(cv2.remap(frame.depth_m, *at, cv2.INTER_NEAREST) - z_m.reshape(depth_m.shape))
-    alpha = ((depth_m > 0) & (behind_m < SAME_SURFACE * depth_m)).astype(np.float32)
+    alpha = ((depth_m > 0) & (behind_m < MAX_RELATIVE_DEPTH_ERROR * depth_m)).astype(np.float32)
     return Rendering(rgb, depth_m * alpha, alpha, None)

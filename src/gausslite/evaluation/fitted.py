@@ -1,14 +1,16 @@
-"""Draw a map for a held-out view with the view's own pose and colour fitted, the same way for every map.
+"""Render a map for a held-out view after fitting the view's pose and exposure.
 
-A real camera's pose is a little off and its exposure its own: a sharp map drawn beside the true place scores below a
-blurred one. The raw score says what a robot that is_exact its odometry sees; the fitted one how good the map is.
+Poses of real cameras have errors and exposures differ between frames. Without fitting, a sharp map rendered from a
+slightly wrong pose scores below a blurred map. The raw score includes pose errors; the fitted score measures the map.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from gausslite.calibration.view_fit import HANDHELD_PRIOR, PoseExposurePrior, fit_exposure, fit_pose
+from gausslite.calibration.exposure import fit_exposure
+from gausslite.calibration.pose_exposure_prior import HANDHELD_PRIOR, PoseExposurePrior
+from gausslite.calibration.pose_fit import fit_pose
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import inverse
 from gausslite.evaluation.views import MapViewer
@@ -18,25 +20,25 @@ _ROUNDS = 4
 
 
 def render_fitted(viewer: MapViewer, frame: Frame, prior: PoseExposurePrior = HANDHELD_PRIOR) -> Rendering:
-    """The map from the pose that fits the frame, in its colours; of all rounds the one nearest to the frame.
+    """Return the rendering with the lowest squared colour error among all fitting rounds.
 
-    The first candidate is the unfitted drawing, so over the whole image the answer is never worse than that.
+    The unfitted rendering is a candidate, so the full-image error never exceeds that of `render_frame`.
     """
     T_world_camera = frame.T_world_camera
-    drawn = viewer.render(frame.camera, T_world_camera)
-    candidates = [drawn]
+    rendering = viewer.render(frame.camera, T_world_camera)
+    candidates = [rendering]
     for _ in range(_ROUNDS):
-        candidates.append(_coloured(drawn, frame, prior))
-        T_world_camera = fit_pose(drawn, inverse(T_world_camera), frame, prior)
-        drawn = viewer.render(frame.camera, T_world_camera)
-    candidates.append(_coloured(drawn, frame, prior))
+        candidates.append(_apply_fitted_exposure(rendering, frame, prior))
+        T_world_camera = fit_pose(rendering, inverse(T_world_camera), frame, prior)
+        rendering = viewer.render(frame.camera, T_world_camera)
+    candidates.append(_apply_fitted_exposure(rendering, frame, prior))
     return min(candidates, key=lambda candidate: _squared_error(candidate, frame))
 
 
-def _coloured(drawn: Rendering, frame: Frame, prior: PoseExposurePrior) -> Rendering:
-    rgb = fit_exposure(drawn, frame, prior).to_photograph(drawn.rgb)
-    return Rendering(rgb, drawn.depth_m, drawn.alpha, None)
+def _apply_fitted_exposure(rendering: Rendering, frame: Frame, prior: PoseExposurePrior) -> Rendering:
+    rgb = fit_exposure(rendering, frame, prior).to_photograph(rendering.rgb)
+    return Rendering(rgb, rendering.depth_m, rendering.alpha, None)
 
 
-def _squared_error(drawn: Rendering, frame: Frame) -> float:
-    return float(np.mean(np.square(drawn.rgb - frame.rgb / np.float32(255.0))))
+def _squared_error(rendering: Rendering, frame: Frame) -> float:
+    return float(np.mean(np.square(rendering.rgb - frame.rgb / np.float32(255.0))))

@@ -112,7 +112,7 @@ def tiles_of(region: Bool[ndarray, "h w"], margin_px: int) -> Bool[ndarray, "th 
 class KeyframeStore:
     """Every `every`th mapped frame; the latest `window` are ready to train on, at most `buffer` are remembered.
 
-    Beside them `region_views` frames are ready to train on, whenever they were mapped: those that show the task's
+    Beside them `long_term_keyframes` frames are ready to train on, whenever they were mapped: those that show the task's
     region, or any, for a policy that follows no task and would have fewer views otherwise. Once large images have come
     there is room for fewer (`KeyframeSettings.max_pixels`).
     """
@@ -222,7 +222,7 @@ class KeyframeStore:
         """Take over the keyframes of another store; view_of makes one ready to train on. Raises MapFileError."""
         settings, lists = self._settings, ("window", "region", "buffer")
         latest, region, buffer = (get_counts(state, name, len(state.get(name, ()))) for name in lists)
-        most = settings.window, settings.region_views, settings.buffer
+        most = settings.window, settings.long_term_keyframes, settings.buffer
         came = len(latest), len(region), len(buffer)
         if any(count > limit for count, limit in zip(came, most, strict=True)):
             limits, counts = ("{}, {} and {}".format(*numbers) for numbers in (most, came))
@@ -254,7 +254,7 @@ class KeyframeStore:
 
     def _keep_for_region(self, views: list[WindowView]) -> None:
         """These are the views of the region, without the one that is missed least where they are too many."""
-        while len(views) > self._room.region_views:
+        while len(views) > self._room.long_term_keyframes:
             del views[_most_crowded([view.keyframe for view in views])]
         self._region = views
 

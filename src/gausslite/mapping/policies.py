@@ -39,12 +39,12 @@ PAPER_FLAGS = ("sb", "mvo", "roi", "sis", "gfd")
 """The paper's components (Sec. III-C, III-D), in the order of its ablation."""
 
 EXTENSION_FLAGS: dict[str, Callable[[MapperSettings], MapperSettings]] = {
-    "mission-keyframes": lambda settings: replace(settings, keyframes=replace(settings.keyframes, region_views=0)),
+    "long-term-keyframes": lambda settings: replace(settings, keyframes=replace(settings.keyframes, long_term_keyframes=0)),
     "roi-context": lambda settings: replace(settings, keyframes=replace(settings.keyframes, roi_context_weight=0.0)),
     "background-reserve": lambda settings: replace(settings, seeding=replace(settings.seeding, background_share=0.0)),
     "ema": lambda settings: replace(settings, optimization=replace(settings.optimization, ema_updates=0.0)),
     "lr-decay": lambda settings: replace(
-        settings, optimization=replace(settings.optimization, lr_decay_after_updates=math.inf)
+        settings, optimization=replace(settings.optimization, decay_after_updates=math.inf)
     ),
 }
 """What came beyond the paper, in the order of our ablation, and how each is switched off."""

@@ -74,7 +74,7 @@ class Seeder:
         settings = self._settings
         if not self._components.sb:
             return Gaussians.empty()
-        coarse = undersampled(frame, relevance.roi, active_means_m, settings.roi_pixels_per_active)
+        coarse = undersampled(frame, relevance.roi, active_means_m, settings.roi_pixels_per_gaussian)
         pixels = coarse & (frame.depth_m <= settings.max_depth_m)
         budget = round(settings.roi_share * settings.first_frame_seeds * pixels.size / _REFERENCE_PIXELS)
         return self._gaussians(frame, relevance, self._roi_pool(pixels, budget), self._pixel_weight(frame))
@@ -92,14 +92,14 @@ class Seeder:
         if not self._components.sb:
             return _Pool(np.zeros_like(seedable), 0, False), self._rest_pool(open_pixels, budget, state.free_slots)
         roi_budget = int(settings.roi_share * budget)
-        coarse = undersampled(frame, relevance.roi, state.active_means_m, settings.roi_pixels_per_active)
+        coarse = undersampled(frame, relevance.roi, state.active_means_m, settings.roi_pixels_per_gaussian)
         roi_pixels = relevance.roi & (roi_open | (coarse & seedable))
         rest_pixels = open_pixels & ~relevance.roi
         return self._roi_pool(roi_pixels, roi_budget), self._rest_pool(rest_pixels, budget - roi_budget, state.free_slots)
 
     def _roi_pool(self, pixels: Bool[ndarray, "h w"], budget: int) -> _Pool:
         """No denser than the active Gaussians that the region is to have; its room is made by others."""
-        wanted = int(np.ceil(np.count_nonzero(pixels) / self._settings.roi_pixels_per_active))
+        wanted = int(np.ceil(np.count_nonzero(pixels) / self._settings.roi_pixels_per_gaussian))
         return _Pool(pixels, min(budget, wanted), False)
 
     def _rest_pool(self, pixels: Bool[ndarray, "h w"], budget: int, room: int) -> _Pool:
@@ -110,7 +110,7 @@ class Seeder:
         settings = self._settings
         densest = settings.first_frame_seeds / _REFERENCE_PIXELS
         affordable = room / (settings.reserved_views * pixels.size)
-        density = min(densest, max(affordable, settings.sparsest * densest))
+        density = min(densest, max(affordable, settings.min_density_ratio * densest))
         return _Pool(pixels, min(budget, int(np.ceil(density * np.count_nonzero(pixels)))), self._components.sis)
 
     def _budget(self, frame: Frame, state: SeedingContext) -> int:
@@ -123,7 +123,7 @@ class Seeder:
         if not self._components.gfd:
             return np.ones(frame.depth_m.shape, np.float32)
         edges = edge_magnitude(frame.rgb)
-        return edges + np.float32(self._settings.edge_floor)
+        return edges + np.float32(self._settings.edge_epsilon)
 
     def _gaussians(
         self, frame: Frame, relevance: RelevanceMap, pool: _Pool, weight: Float32[ndarray, "h w"]

@@ -27,7 +27,7 @@ class SentVoxelTracker:
         self._states = np.zeros((0, 3), np.uint64)
         self._released = np.zeros(0, np.bool_)
 
-    def changed(self, gaussians: Gaussians) -> VoxelBatch:
+    def collect_changes(self, gaussians: Gaussians) -> VoxelBatch:
         """Words on the voxels whose active Gaussians are new or changed since the last call.
 
         A voxel that held active Gaussians then and holds none now gets a tombstone (count 0), unless it is released.
@@ -44,15 +44,15 @@ class SentVoxelTracker:
         words = VoxelBatch(keys[new], kappa_sums[new], counts[new], active.take(voxels.rows_in(new)))
         return merge_batches(words, tombstones(vanished)) if len(vanished) else words
 
-    def release(self) -> None:
+    def freeze_sent(self) -> None:
         """The task is another one: what was said stays true of its time, and is neither taken back nor followed."""
         self._released = np.ones(len(self._keys), np.bool_)
 
-    def beyond_released(self, words: VoxelBatch) -> VoxelBatch:
+    def exclude_frozen(self, words: VoxelBatch) -> VoxelBatch:
         """These words without those that would replace a released one that was trained more."""
         return select_voxels(words, self._outgrow_released(words.keys, words.kappa_sums))
 
-    def forget(self) -> None:
+    def mark_all_unsent(self) -> None:
         """Treat every voxel as new at the next call (the receiver lost what it had)."""
         self._keys, self._states = np.zeros(0, np.int64), np.zeros((0, 3), np.uint64)
         self._released = np.zeros(0, np.bool_)

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
-from gausslite.calibration.view_fit import PoseExposurePrior
+from gausslite.calibration.pose_exposure_prior import PoseExposurePrior
 from gausslite.errors import InvalidInputError
 from gausslite.mapping.task_change import TaskChangeSettings
 from gausslite.optimize.density import DensitySettings
@@ -59,9 +59,9 @@ class SeedingSettings:
     roi_share: float = 0.40
     min_alpha: float = 0.6
     roi_min_alpha: float = 0.9
-    roi_pixels_per_active: float = 4.0
+    roi_pixels_per_gaussian: float = 4.0
     reserved_views: float = 4.0
-    sparsest: float = 0.1
+    min_density_ratio: float = 0.1
     background_share: float = 0.3
     depth_error_factor: float = 40.0
     max_depth_m: float = 10.0
@@ -69,23 +69,23 @@ class SeedingSettings:
     roi_scale: float = 0.5
     background_scale: float = 0.7
     init_scale: float = 1.0
-    edge_floor: float = 0.01
+    edge_epsilon: float = 0.01
 
     def __post_init__(self) -> None:
         for name in ("first_frame_seeds", "later_seeds"):
             _require(getattr(self, name) >= 1, f"seeding {name}", "at least 1", getattr(self, name))
-        for name in ("roi_share", "min_alpha", "roi_min_alpha", "sparsest", "background_share"):
+        for name in ("roi_share", "min_alpha", "roi_min_alpha", "min_density_ratio", "background_share"):
             _require(0 <= getattr(self, name) <= 1, f"seeding {name}", "0 to 1", getattr(self, name))
         _require(0 < self.opacity < 1, "seeding opacity", "more than 0 and less than 1", self.opacity)
         for name in (
-            "roi_pixels_per_active",
+            "roi_pixels_per_gaussian",
             "reserved_views",
             "depth_error_factor",
             "max_depth_m",
             "roi_scale",
             "background_scale",
             "init_scale",
-            "edge_floor",
+            "edge_epsilon",
         ):
             _require(getattr(self, name) > 0, f"seeding {name}", "more than 0", getattr(self, name))
 
@@ -94,7 +94,7 @@ class SeedingSettings:
 class KeyframeSettings:
     """Which frames are kept to train on: every `every`th, the `window` latest of them, and `buffer` of the mission.
 
-    region_views: of all frames that show the task's region (of all frames, where no component follows a task) so many
+    long_term_keyframes: of all frames that show the task's region (of all frames, where no component follows a task) so many
     more stay ready to train on, spread over the mission; 0 is the paper's window. Each takes as much memory as a frame
     of the window.
     roi_context_weight, 0 to 1: what pixels beside the region count in the active phase's loss, in the tiles that it
@@ -108,7 +108,7 @@ class KeyframeSettings:
     every: int = 5
     window: int = 24
     buffer: int = 96
-    region_views: int = 24
+    long_term_keyframes: int = 24
     roi_margin_px: int = 5
     roi_context_weight: float = 0.3
     pose_updates_per_frame: int = 2
@@ -117,19 +117,19 @@ class KeyframeSettings:
     def __post_init__(self) -> None:
         for name in ("every", "window", "buffer", "max_pixels"):
             _require(getattr(self, name) >= 1, f"keyframes {name}", "at least 1", getattr(self, name))
-        for name in ("region_views", "roi_margin_px", "pose_updates_per_frame"):
+        for name in ("long_term_keyframes", "roi_margin_px", "pose_updates_per_frame"):
             _require(getattr(self, name) >= 0, f"keyframes {name}", "at least 0", getattr(self, name))
         weight = self.roi_context_weight
         _require(0 <= weight <= 1, "keyframes roi_context_weight", "0 to 1", weight)
 
     def for_images_of(self, pixels: int) -> KeyframeSettings:
         """The same with as many images of this size as have room: one of each kind, however large they are."""
-        share = min(1.0, self.max_pixels / (pixels * (self.window + self.region_views + self.buffer)))
+        share = min(1.0, self.max_pixels / (pixels * (self.window + self.long_term_keyframes + self.buffer)))
         return replace(
             self,
             window=max(1, int(share * self.window)),
             buffer=max(1, int(share * self.buffer)),
-            region_views=min(self.region_views, max(1, int(share * self.region_views))),
+            long_term_keyframes=min(self.long_term_keyframes, max(1, int(share * self.long_term_keyframes))),
         )
 
 
@@ -142,7 +142,7 @@ class OptimizationSettings:
 
     loss: by share, so that warm-ups and the active phase, whose masks are small, do not undo each other in Adam.
     isotropic: Gaussians are made spheres again after every frame.
-    lr_decay_after_updates: where views may be wrong (`MapperSettings.pose_prior`) a Gaussian has the full rates for so many
+    decay_after_updates: where views may be wrong (`MapperSettings.pose_prior`) a Gaussian has the full rates for so many
     updates, and falling ones after them (`AdamSettings.decay_after_updates`): steps of one size would keep it moving to
     and fro between what its views say. inf never slows it.
     ema_updates: the map is shown as the mean of each Gaussian over about its last so many updates, since views
@@ -154,7 +154,7 @@ class OptimizationSettings:
     active_phase: ActivePhase = ActivePhase.EXACT
     loss: LossWeights = _ALIKE_IN_BOTH_PHASES
     adam: AdamSettings = ONLINE_RATES
-    lr_decay_after_updates: float = 150.0
+    decay_after_updates: float = 150.0
     isotropic: bool = False
     ema_updates: float = 32.0
 
@@ -163,7 +163,7 @@ class OptimizationSettings:
             _require(getattr(self, name) >= 0, f"optimization {name}", "at least 0", getattr(self, name))
         averaged = self.ema_updates
         _require(0 <= averaged < math.inf, "optimization ema_updates", "at least 0", averaged)
-        _require(self.lr_decay_after_updates > 0, "optimization lr_decay_after_updates", "more than 0", self.lr_decay_after_updates)
+        _require(self.decay_after_updates > 0, "optimization decay_after_updates", "more than 0", self.decay_after_updates)
 
     @property
     def iterations(self) -> int:
@@ -203,7 +203,7 @@ class MapperSettings:
         """The optimiser's rates, for views that are trusted or not."""
         if self.pose_prior.is_exact:
             return self.optimization.adam
-        return replace(self.optimization.adam, decay_after_updates=self.optimization.lr_decay_after_updates)
+        return replace(self.optimization.adam, decay_after_updates=self.optimization.decay_after_updates)
 
 
 def _require(holds: bool, name: str, wanted: str, came: float) -> None:

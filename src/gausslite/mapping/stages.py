@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from contextlib import AbstractContextManager, nullcontext
 from enum import StrEnum
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 
 class Stage(StrEnum):
@@ -43,6 +43,7 @@ class SkippableStage(StrEnum):
 ITERATION_STAGES = frozenset((Stage.WARM_UP, Stage.ACTIVE))
 
 
+@runtime_checkable
 class StageScheduler(Protocol):
     """Decides which stages of a frame run and for how many iterations."""
 

@@ -9,7 +9,9 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from gausslite.calibration.view_fit import PoseExposurePrior, fit_exposure, fit_pose
+from gausslite.calibration.exposure import fit_exposure
+from gausslite.calibration.pose_exposure_prior import PoseExposurePrior
+from gausslite.calibration.pose_fit import fit_pose
 from gausslite.domain.camera import Camera
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import inverse, require_rigid

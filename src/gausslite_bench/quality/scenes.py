@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float32
 from numpy import ndarray
 
-from gausslite.calibration.view_fit import PoseExposurePrior
+from gausslite.calibration.pose_exposure_prior import PoseExposurePrior
 from gausslite.datasets.held_out import HeldOutSplit
 from gausslite.datasets.intrinsics import CAMERA_FILE, INTRINSICS_FILE, find_beside_or_above
 from gausslite.datasets.open import open_source
@@ -28,8 +28,8 @@ from gausslite.domain.state import State
 from gausslite.errors import DatasetError, InvalidInputError
 from gausslite.evaluation.views import MIN_ROI_PIXELS, HeldOutView
 from gausslite.mission.settings import SceneKnowledge
-from gausslite.perception.relevance_estimator import RelevanceEstimate
 from gausslite.perception.fixed_relevance import RegionRelevanceEstimator
+from gausslite.perception.relevance_estimator import RelevanceEstimate
 from gausslite.perception.vocabulary import head_of
 from gausslite_bench.quality.home_tasks import HomeTask
 

@@ -23,7 +23,7 @@ def stored(settings: KeyframeSettings, frames: int) -> KeyframeStore:
 
 
 def test_every_fifth_frame_is_kept_and_the_window_holds_the_latest() -> None:
-    store = stored(KeyframeSettings(every=5, window=3, region_views=0), 23)
+    store = stored(KeyframeSettings(every=5, window=3, long_term_keyframes=0), 23)
     assert [view.keyframe.frame.index for view in store.window] == [10, 15, 20]
     assert [keyframe.frame.index for keyframe in store.buffer] == [0, 5, 10, 15, 20]
 
@@ -38,20 +38,20 @@ def test_the_buffer_is_bounded_and_stays_spread_over_the_mission() -> None:
 
 def test_of_large_images_fewer_are_kept() -> None:
     pixels = wall_frame(0).depth_m.size
-    settings = KeyframeSettings(every=1, window=4, buffer=8, region_views=4, max_pixels=8 * pixels)
+    settings = KeyframeSettings(every=1, window=4, buffer=8, long_term_keyframes=4, max_pixels=8 * pixels)
     store = stored(settings, 40)
     assert [keyframe.frame.index for keyframe in store.buffer][::3] == [0, 39]
     assert len(store.buffer) == 4
     assert len(store.window) <= 4
     assert store.image_bytes <= 8 * pixels * 14
     tiny = settings.for_images_of(10**9)
-    assert (tiny.window, tiny.buffer, tiny.region_views) == (1, 1, 1)
+    assert (tiny.window, tiny.buffer, tiny.long_term_keyframes) == (1, 1, 1)
     assert KeyframeSettings().for_images_of(1280 * 720) == KeyframeSettings()
-    assert KeyframeSettings(region_views=0).for_images_of(10**9).region_views == 0
+    assert KeyframeSettings(long_term_keyframes=0).for_images_of(10**9).long_term_keyframes == 0
 
 
 def test_once_larger_images_come_smaller_ones_make_room() -> None:
-    settings, rasterizer = KeyframeSettings(every=1, window=4, buffer=8, region_views=4), CpuRasterizer(threads=1)
+    settings, rasterizer = KeyframeSettings(every=1, window=4, buffer=8, long_term_keyframes=4), CpuRasterizer(threads=1)
     large = wall_frame(40)
     store = KeyframeStore(replace(settings, max_pixels=4 * large.depth_m.size))
     for index in range(20):
@@ -64,7 +64,7 @@ def test_once_larger_images_come_smaller_ones_make_room() -> None:
 
 
 def test_frames_that_show_the_region_stay_ready_to_train_on_and_spread_over_the_mission() -> None:
-    store = stored(KeyframeSettings(every=8, window=2, region_views=6), 40)
+    store = stored(KeyframeSettings(every=8, window=2, long_term_keyframes=6), 40)
     kept = [view.keyframe.frame.index for view in store.window]
     assert kept[-2:] == [24, 32]
     assert len(set(kept)) == len(kept) <= 8
@@ -73,7 +73,7 @@ def test_frames_that_show_the_region_stay_ready_to_train_on_and_spread_over_the_
 
 
 def test_a_frame_without_the_region_is_kept_at_its_turn_only() -> None:
-    settings, rasterizer = KeyframeSettings(every=4, region_views=6), CpuRasterizer(threads=1)
+    settings, rasterizer = KeyframeSettings(every=4, long_term_keyframes=6), CpuRasterizer(threads=1)
     store = KeyframeStore(settings)
     for index in range(9):
         store.offer(window_view(Keyframe(wall_frame(index), RelevanceMap.empty(48, 64)), rasterizer, settings))
@@ -81,7 +81,7 @@ def test_a_frame_without_the_region_is_kept_at_its_turn_only() -> None:
 
 
 def test_a_policy_that_follows_no_task_keeps_as_many_views_of_anything() -> None:
-    settings, rasterizer = KeyframeSettings(every=8, window=2, region_views=6), CpuRasterizer(threads=1)
+    settings, rasterizer = KeyframeSettings(every=8, window=2, long_term_keyframes=6), CpuRasterizer(threads=1)
     store = KeyframeStore(settings, follows_task=False)
     for index in range(40):
         store.offer(window_view(Keyframe(wall_frame(index), RelevanceMap.empty(48, 64)), rasterizer, settings))
@@ -94,7 +94,7 @@ def test_a_policy_that_follows_no_task_keeps_as_many_views_of_anything() -> None
 
 
 def test_a_view_of_the_region_goes_once_it_turns_out_not_to_show_it() -> None:
-    settings, rasterizer = KeyframeSettings(every=4, region_views=6), CpuRasterizer(threads=1)
+    settings, rasterizer = KeyframeSettings(every=4, long_term_keyframes=6), CpuRasterizer(threads=1)
     store = stored(settings, 3)
     wrong = store.window[0].keyframe
     assert wrong.frame.index == 1

@@ -86,7 +86,7 @@ def test_a_mission_maps_without_what_is_switched_off(name: str, iterations: int 
 def test_with_everything_off_what_is_left_knows_no_task() -> None:
     bare = disable(policy(TASK), ABLATION_FLAGS)
     assert bare.components == Components(sb=False, mvo=False, roi=False, sis=False, gfd=False)
-    assert disable(policy(TASK), EXTENSION_FLAGS).keyframes == KeyframeSettings(region_views=0, roi_context_weight=0.0)
+    assert disable(policy(TASK), EXTENSION_FLAGS).keyframes == KeyframeSettings(long_term_keyframes=0, roi_context_weight=0.0)
 
 
 def test_an_unknown_switch_is_refused() -> None:

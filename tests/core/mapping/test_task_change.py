@@ -46,7 +46,7 @@ def loop_of(max_gaussians: int = 1500, every: int = 1, buffer: int = 8, window: 
     settings = MapperSettings(
         max_gaussians=max_gaussians,
         seeding=SeedingSettings(first_frame_seeds=60_000, later_seeds=20_000),
-        keyframes=KeyframeSettings(every=every, window=window, buffer=buffer, region_views=2),
+        keyframes=KeyframeSettings(every=every, window=window, buffer=buffer, long_term_keyframes=2),
         density=DensitySettings(densify_every=7, prune_every=5),
         task_change=TaskChangeSettings(keyframes_per_frame=2),
     )
@@ -88,9 +88,9 @@ def test_no_frame_does_more_for_a_new_task_than_its_bound_and_all_keyframes_are_
     outcomes = play(loop, 8, 16)
     settings = SeedingSettings(first_frame_seeds=60_000)
     most = settings.roi_share * settings.first_frame_seeds * SIZE[0] * SIZE[1] / (640 * 480)
-    assert [outcome.reread.keyframes for outcome in outcomes] == [2, 2, 2, 2, 0, 0, 0, 0]
-    assert all(outcome.reread.seeded <= 2 * most for outcome in outcomes)
-    assert outcomes[0].reread.seeded > 0
+    assert [outcome.reevaluation.keyframes for outcome in outcomes] == [2, 2, 2, 2, 0, 0, 0, 0]
+    assert all(outcome.reevaluation.seeded <= 2 * most for outcome in outcomes)
+    assert outcomes[0].reevaluation.seeded > 0
 
 
 def test_where_time_is_short_one_keyframe_is_read_a_frame() -> None:
@@ -101,7 +101,7 @@ def test_where_time_is_short_one_keyframe_is_read_a_frame() -> None:
     )
     late.restore(loop.state())
     late.assign(B)
-    assert [outcome.reread.keyframes for outcome in play(late, 4, 9)] == [1, 1, 1, 1, 0]
+    assert [outcome.reevaluation.keyframes for outcome in play(late, 4, 9)] == [1, 1, 1, 1, 0]
 
 
 class Unreadable(RegionRelevanceEstimator):
@@ -124,7 +124,7 @@ def test_a_keyframe_that_cannot_be_judged_costs_one_frame_and_is_passed_over() -
     with pytest.raises(MemoryError, match="a moment"):
         loop.process(frame_at(4))
     outcomes = play(loop, 5, 7)
-    assert [outcome.reread.keyframes for outcome in outcomes] == [2, 0]
+    assert [outcome.reevaluation.keyframes for outcome in outcomes] == [2, 0]
     shown = {keyframe.frame.index: bool(keyframe.relevance.roi.any()) for keyframe in loop.keyframes()}
     assert [shown[index] for index in range(4)] == [True, True, False, True]
 
@@ -159,7 +159,7 @@ def test_views_that_show_the_new_region_come_back_into_a_window_that_does_not() 
         trained.append(loop.process(wall_frame(index, SIZE, shift_m=-1.1)))
         assert len(mapper._keyframes.window) <= 3 + 2
     assert mapper.next_unevaluated is None
-    assert sum(outcome.reread.seeded for outcome in trained) > 0
+    assert sum(outcome.reevaluation.seeded for outcome in trained) > 0
     assert any(view.shows_region for view in mapper._keyframes.window)
     for keyframe in mapper.keyframes():
         np.testing.assert_array_equal(keyframe.relevance.roi, RIGHT.mask(keyframe.frame))
@@ -188,8 +188,8 @@ def test_the_server_keeps_what_it_was_told_of_the_old_region() -> None:
     loop.assign(B)
     counts: dict[int, int] = {}
     for outcome in play(loop, 6, 14):
-        assert outcome.words is not None
-        counts.update(zip(outcome.words.keys.tolist(), outcome.words.counts.tolist(), strict=True))
+        assert outcome.changed_roi is not None
+        counts.update(zip(outcome.changed_roi.keys.tolist(), outcome.changed_roi.counts.tolist(), strict=True))
     new = set(GRID.keys(loop._mapper.roi_gaussians().means_m).tolist())
     assert new <= set(counts) | told
     assert not {key for key in told - new if counts.get(key) == 0}
@@ -201,7 +201,7 @@ def test_a_run_saved_in_the_middle_of_rereading_goes_on_to_the_same_bits() -> No
     whole.assign(B)
     play(whole, 8, 10)
     saved: State = {name: array.copy() for name, array in whole.state().items()}
-    words = [outcome.words for outcome in play(whole, 10, 14)]
+    words = [outcome.changed_roi for outcome in play(whole, 10, 14)]
     other = loop_of(buffer=16)
     other.assign(B)
     other.restore(saved)
@@ -241,12 +241,12 @@ def test_beside_mapping_a_look_back_is_ready_when_the_detector_is_and_takes_turn
     loop = TaskMapper(A, GaussianMapper(MapperSettings(keyframes=KeyframeSettings(every=1)), CpuRasterizer(threads=1)))
     play(loop, 0, 3)
     loop.assign(attention)
-    assert play(loop, 3, 4)[0].reread.keyframes == 0
+    assert play(loop, 3, 4)[0].reevaluation.keyframes == 0
     # the newest keyframe's detection, and a look back at the newest before it
     assert executor.frames == [3, 2]
     executor.run_next()
     executor.run_next()
-    assert play(loop, 4, 5)[0].reread.keyframes == 1
+    assert play(loop, 4, 5)[0].reevaluation.keyframes == 1
     assert executor.frames[-1] == 1
 
 

@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 from mapping_scenes import middle_relevance, wall_frame
 
-from gausslite.calibration.view_fit import AffineExposure, PoseExposurePrior, fit_exposure, fit_pose
+from gausslite.calibration.exposure import AffineExposure, fit_exposure
+from gausslite.calibration.pose_exposure_prior import PoseExposurePrior
+from gausslite.calibration.pose_fit import fit_pose
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import inverse, rotation_angle_deg, translation_m
 from gausslite.errors import InvalidInputError
@@ -74,11 +76,11 @@ def test_known_colours_are_found_again_and_undone() -> None:
     assert np.abs(found.to_map(photograph).astype(int) - frame.rgb).max() <= 4
 
 
-def mapped(prior: PoseExposurePrior, tell: float = 0.0, lr_decay_after_updates: float = 150.0) -> GaussianMapper:
+def mapped(prior: PoseExposurePrior, tell: float = 0.0, decay_after_updates: float = 150.0) -> GaussianMapper:
     settings = MapperSettings(
         max_gaussians=2000,
         keyframes=KeyframeSettings(every=1),
-        optimization=OptimizationSettings(lr_decay_after_updates=lr_decay_after_updates),
+        optimization=OptimizationSettings(decay_after_updates=decay_after_updates),
         pose_prior=prior,
     )
     mapper = GaussianMapper(settings, CpuRasterizer(threads=1), seed=0)
@@ -103,7 +105,7 @@ def test_a_prior_that_is_all_but_sure_makes_all_but_the_same_map() -> None:
 
 @pytest.mark.parametrize(("prior", "slows"), [(PoseExposurePrior(), False), (PoseExposurePrior(0.01, 0.5), True)])
 def test_gaussians_settle_where_views_may_be_wrong(prior: PoseExposurePrior, slows: bool) -> None:
-    settling, restless = (mapped(prior, lr_decay_after_updates=updates) for updates in (1.0, math.inf))
+    settling, restless = (mapped(prior, decay_after_updates=updates) for updates in (1.0, math.inf))
     before = [mapper.gaussians().rgb for mapper in (settling, restless)]
     frame = wall_frame(4, SIZE, shift_m=0.2)
     for mapper in (settling, restless):

@@ -1,0 +1,73 @@
+"""Fit the exposure of a photograph against the map: a gain and an offset for each colour channel."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Float32, Float64, UInt8
+from numpy import ndarray
+
+from gausslite.calibration.pose_exposure_prior import PoseExposurePrior
+from gausslite.calibration.view_residuals import (
+    MIN_PIXELS,
+    comparable_pixels,
+    independent_share,
+    shrinkage,
+    solve_with_prior,
+)
+from gausslite.domain.frame import Frame
+from gausslite.render.rasterizer import Rendering
+
+_BLUR_PX = 4.0
+_FIT_GAIN_STD, _FIT_OFFSET_STD = 0.05, 0.015
+"""Error of the fit itself on a map that still grows, measured where exposure is fixed."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AffineExposure:
+    """photograph = gain · map + offset in each channel, for colours in [0, 1]."""
+
+    gain: Float64[ndarray, "3"]
+    offset: Float64[ndarray, "3"]
+
+    def to_photograph(self, rendered_rgb: Float[ndarray, "h w 3"]) -> Float32[ndarray, "h w 3"]:
+        """Return rendered colours as the photograph shows them, clipped to [0, 1]."""
+        rgb: Float32[ndarray, "h w 3"] = np.clip(rendered_rgb * self.gain + self.offset, 0.0, 1.0).astype(np.float32)
+        return rgb
+
+    def to_map(self, rgb: UInt8[ndarray, "h w 3"]) -> UInt8[ndarray, "h w 3"]:
+        """Return a photograph in the map's colours, rounded to 8 bits."""
+        value = np.arange(256)[:, None] / 255.0
+        table = np.clip((value - self.offset) / self.gain, 0.0, 1.0)
+        map_rgb: UInt8[ndarray, "h w 3"] = cv2.LUT(rgb, np.rint(table * 255.0).astype(np.uint8)[:, None, :])
+        return map_rgb
+
+
+IDENTITY_EXPOSURE = AffineExposure(np.ones(3), np.zeros(3))
+
+
+def fit_exposure(rendering: Rendering, frame: Frame, prior: PoseExposurePrior) -> AffineExposure:
+    """Return the exposure that brings the rendering closest to the frame where the map covers the image.
+
+    Returns IDENTITY_EXPOSURE if the prior allows no exposure error or fewer than 200 pixels are comparable.
+    """
+    pixels = comparable_pixels(rendering, frame)
+    if not prior.has_exposure_error or len(pixels) < MIN_PIXELS:
+        return IDENTITY_EXPOSURE
+    # without the blur, detail that the map lacks would pull the gain below 1
+    model = _blurred(rendering.rgb)[pixels].astype(np.float64)
+    residual = _blurred(frame.rgb.astype(np.float32) / np.float32(255.0))[pixels] - model
+    prior_std, gain, offset = np.array([prior.gain, prior.offset]), np.ones(3), np.zeros(3)
+    for channel in range(3):
+        jacobian = np.stack([model[:, channel], np.ones(len(model))], axis=1)
+        change = solve_with_prior(jacobian, residual[:, channel], np.zeros(2), prior_std, independent_share(rendering))
+        gain[channel] += change[0] * shrinkage(prior.gain, _FIT_GAIN_STD)
+        offset[channel] += change[1] * shrinkage(prior.offset, _FIT_OFFSET_STD)
+    return AffineExposure(gain, offset)
+
+
+def _blurred(image: Float32[ndarray, "h w 3"]) -> Float32[ndarray, "n 3"]:
+    blurred: Float32[ndarray, "n 3"] = cv2.GaussianBlur(image, (0, 0), _BLUR_PX).reshape(-1, 3)
+    return blurred
