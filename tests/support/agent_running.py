@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 import grpc
 import numpy as np
-from fusion_team import GRID
+from fusion_running import GRID
 from serving import serving
 
 from gausslite.domain.frame import Frame
@@ -82,7 +82,7 @@ class Agent:
 def agent(attention: object = ball_attention, uplink: Uplink | None = None, queue_frames: int = 4) -> Iterator[Agent]:
     loops: list[asyncio.AbstractEventLoop] = []
     bells: list[ChangeNotifier] = []
-    on_change = lambda: loops[0].call_soon_threadsafe(lambda: bells[0].ring())  # noqa: E731
+    on_change = lambda: loops[0].call_soon_threadsafe(lambda: bells[0].notify())  # noqa: E731
     robot = MappingWorker(SETTINGS, GRID, attention, uplink, on_change, LoadSettings(queue_frames))  # type: ignore[arg-type]
 
     def register(server: grpc.aio.Server) -> None:

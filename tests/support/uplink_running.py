@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from fusion_team import GRID, words
+from fusion_running import GRID, words
 from serving import serving
 
 from gausslite.codec.subset_codec import decode_subset
@@ -26,7 +26,7 @@ from gausslite.wire.spool import Spool
 from gausslite.wire.uplink import Uplink
 from gausslite.wire.uplink_values import UplinkSettings
 
-EAGER = UplinkSettings(interval_s=0.0, growth_share=0.0, first_backoff_s=0.01)
+EAGER = UplinkSettings(interval_s=0.0, resend_threshold=0.0, first_backoff_s=0.01)
 WAIT_S = 20.0
 
 

@@ -33,7 +33,7 @@ class MapChangeLog:
         shown = gaussians.take(gaussians.active) if self._roi_only else gaussians
         self._words = group_by_voxel(shown, self._grid)
         # the ledger compares active Gaussians only
-        changed = self._ledger.changed(replace(shown, active=np.ones(len(shown), np.bool_)))
+        changed = self._ledger.collect_changes(replace(shown, active=np.ones(len(shown), np.bool_)))
         self._changed_at.update(dict.fromkeys(changed.keys.tolist(), revision))
         self.revision = revision
         if self._first_revision is None:

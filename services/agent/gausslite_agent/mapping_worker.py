@@ -147,7 +147,7 @@ class MappingWorker:
 
     def handover_words(self) -> Future[VoxelBatch]:
         """Words on the whole map, but for voxels of an earlier task's region that were told when trained more."""
-        return self.do(lambda mapper: self._ledger.beyond_released(group_by_voxel(mapper.gaussians(), self._grid)))
+        return self.do(lambda mapper: self._ledger.exclude_frozen(group_by_voxel(mapper.gaussians(), self._grid)))
 
     def revision(self) -> int:
         """The map's revision; it rises over restarts too."""
@@ -195,7 +195,7 @@ class MappingWorker:
             revision = self._first_revision + self._mapper.revision
             self._status = replace(self._status, gaussians=self._mapper.count, map_revision=revision)
         # the spool lets go of what it has; the rest was on its way, or told later in a life that ended unsaved
-        self._tell(self._ledger.beyond_released(group_by_voxel(self._mapper.roi_gaussians(), self._grid)))
+        self._tell(self._ledger.exclude_frozen(group_by_voxel(self._mapper.roi_gaussians(), self._grid)))
         self._on_change()
 
     def _save(self, path: Path, terms: ResumeConfig, asked: str) -> bool:
@@ -256,7 +256,7 @@ class MappingWorker:
         if not self._untold or self._task_mapper is None:
             return
         self._untold = False
-        words = self._task_mapper.words()
+        words = self._task_mapper.changed_roi()
         if words is not None:
             self._tell(words)
 
@@ -269,7 +269,7 @@ class MappingWorker:
             self._status = replace(self._status, notes=self._task_mapper.notes)
         if done.skipped is not None:
             return self._count(FrameReport(frame.index, Outcome.SKIPPED, done.skipped, gaussians=done.gaussians))
-        if done.words is not None:
+        if done.changed_roi is not None:
             self._untold = False
         report = FrameReport(
             frame.index,
@@ -291,10 +291,10 @@ class MappingWorker:
             return
         untold_because = ""
         try:
-            self.uplink.offer(words)
+            self.uplink.enqueue(words)
         except StorageError as error:
             untold_because = str(error)
-            self._ledger.forget()
+            self._ledger.mark_all_unsent()
         with self._lock:
             before = self._status.untold_because
             self._status = replace(self._status, untold_because=untold_because)
@@ -310,7 +310,7 @@ class MappingWorker:
                 without_words=status.without_words + (SkippableStage.PUBLISHING in done.timing.skipped_stages),
                 without_seeding=status.without_seeding + (SkippableStage.SEEDING in done.timing.skipped_stages),
                 max_detection_lag=max(status.max_detection_lag, done.detection_lag_frames or 0),
-                reread=status.reread + done.reread.keyframes,
+                reread=status.reread + done.reevaluation.keyframes,
             )
 
     def _count(self, report: FrameReport) -> FrameReport:

@@ -152,7 +152,7 @@ class AgentMission:
         drained = uplink.drain(link.drain_s)
         if link.handover and drained:
             try:
-                uplink.offer(self._robot.handover_words().result(), Purpose.HANDOVER)
+                uplink.enqueue(self._robot.handover_words().result(), Purpose.HANDOVER)
             except StorageError as error:
                 _log.warning("handover: %s", error)
             else:

@@ -46,7 +46,7 @@ async def _serve(settings: AgentSettings) -> None:
     with ExitStack() as stack:
         # the task of the command line may wait for a parser to start; who assigns one is told that there is none
         at_start, asked = (_parser(settings, stack, patient) for patient in (True, False))
-        uplink, client = _uplink(settings, stack, goes_on=saved is not None)
+        uplink, client = _uplink(settings, stack, has_restored_map=saved is not None)
         attentions = RelevanceEstimatorFactory(settings.perception, lambda: _scene(settings, stand_in))
         if settings.task is not None and not (settings.play and is_simulated(settings.play.source)):
             attentions.require_sight()
@@ -100,7 +100,7 @@ async def _live(
         # the player still writes what it has; nothing it uses may close before that
         player.stop()
         if uplink is not None:
-            uplink.stop_waiting()
+            uplink.cancel_drain()
         await work
         if stand_in is None:
             await asyncio.to_thread(player.conclude)
@@ -120,13 +120,13 @@ def _parser(settings: AgentSettings, stack: ExitStack, patient: bool) -> TaskPar
     return stack.enter_context(ParserClient(settings.link.parser, patient=patient, tls=settings.tls))
 
 
-def _uplink(settings: AgentSettings, stack: ExitStack, goes_on: bool) -> tuple[Uplink | None, FusionClient | None]:
+def _uplink(settings: AgentSettings, stack: ExitStack, has_restored_map: bool) -> tuple[Uplink | None, FusionClient | None]:
     link = settings.link
     if link.fusion is None:
         return None, None
     spool = Spool(link.spool, settings.agent_id, link.grid)
     client = FusionClient(link.fusion, mission_id=link.mission_id, tls=settings.tls)
-    uplink = Uplink(client, settings.agent_id, spool, link.grid, link.uplink, goes_on)
+    uplink = Uplink(client, settings.agent_id, spool, link.grid, link.uplink, has_restored_map)
     stack.callback(uplink.close)
     return uplink, client
 
@@ -139,4 +139,4 @@ def _scene(settings: AgentSettings, stand_in: ReplaySource | None) -> SceneKnowl
 
 def _ring(loop: asyncio.AbstractEventLoop, news: ChangeNotifier) -> None:
     if not loop.is_closed():
-        loop.call_soon_threadsafe(news.ring)
+        loop.call_soon_threadsafe(news.notify)

@@ -111,7 +111,7 @@ class AgentServicer(pb_grpc.AgentServiceServicer):
             return [pb.WatchMapResponse(block=block) for block in blocks]
 
         while True:
-            ticket = self._news.ticket()
+            ticket = self._news.subscribe()
             if since == 0 or since != self._robot.revision():
                 for response in await asyncio.wrap_future(self._robot.do(catch_up)):
                     yield response

@@ -48,7 +48,7 @@ class RefinementWorker:
 
         def publish(progress: RefineProgress) -> None:
             latest[:] = [progress]
-            bell.ring()
+            bell.notify()
 
         def go_on(progress: RefineProgress) -> bool:
             loop.call_soon_threadsafe(publish, progress)
@@ -64,7 +64,7 @@ class RefinementWorker:
         future.add_done_callback(lambda _: self._rest(bell))
         try:
             while not future.done():
-                ticket = bell.ticket()
+                ticket = bell.subscribe()
                 while latest:
                     yield latest.pop()
                 if not future.done():
@@ -92,4 +92,4 @@ class RefinementWorker:
 
     def _rest(self, bell: ChangeNotifier) -> None:
         self._busy = False
-        bell.ring()
+        bell.notify()

@@ -25,7 +25,7 @@ from gausslite.errors import (
     UnavailableError,
 )
 from gausslite.fusion.engine import Changes, FusionEngine
-from gausslite.fusion.keyframes import TeamKeyframe
+from gausslite.fusion.keyframes import AgentKeyframe
 from gausslite.fusion.store import MissionConfig
 from gausslite.fusion.traffic import AgentContribution, TrafficCounters
 from gausslite.v1 import fusion_service_pb2 as pb
@@ -35,7 +35,7 @@ from gausslite.wire.change_notifier import ChangeNotifier
 from gausslite.wire.convert import box_from_message, frame_from_message, grid_from_message, grid_to_message
 from gausslite.wire.server import Service
 from gausslite.wire.status import code_and_reason
-from gausslite.wire.tls import require_speaks_for
+from gausslite.wire.tls import require_agent_certificate
 from gausslite_fusion_server.change_blocks import change_blocks
 from gausslite_fusion_server.drain_gate import DrainGate
 from gausslite_fusion_server.refinement_worker import RefinementWorker, RefineRequest
@@ -74,7 +74,7 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
     def drain(self) -> None:
         """From now on every call, and every open stream, ends with UNAVAILABLE."""
         self._door.shut()
-        self._news.ring()
+        self._news.notify()
 
     def close(self) -> None:
         """Let work in threads come to its end."""
@@ -83,11 +83,11 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
 
     async def JoinSession(self, request: pb.JoinSessionRequest, context: Any) -> pb.JoinSessionResponse:
         """Enter the mission."""
-        require_speaks_for(context, request.agent_id)
+        require_agent_certificate(context, request.agent_id)
         grid = grid_from_message(request.grid)
         asked = MissionConfig(request.mission_id, request.world_frame, grid.size_m)
         joined = await self._work(self._team.join, request.agent_id, asked, request.fresh_map)
-        self._news.ring()
+        self._news.notify()
         return pb.JoinSessionResponse(
             session_id=joined.session.session_id,
             highest_map_revision=joined.highest_map_revision,
@@ -104,7 +104,7 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         acknowledged = 0
         async for request in self._door.admit(request_iterator):
             outcome = await self._work(self._take_in, request)
-            self._news.ring()
+            self._news.notify()
             acknowledged = max(acknowledged, request.sequence)
             yield pb.ContributeSubsetsResponse(acknowledged=acknowledged, outcomes=[outcome])
 
@@ -134,10 +134,10 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
             blocks = change_blocks(changes, self._team.grid, region)
             while (block := await self._work(_next_block, blocks)) is not None:
                 yield pb.WatchFusedMapResponse(block=block)
-            ticket = self._news.ticket()
+            ticket = self._news.subscribe()
             while self._team.revision == changes.revision and self._door.is_open:
                 await ticket.wait()
-                ticket = self._news.ticket()
+                ticket = self._news.subscribe()
             changes = await self._work(self._catch_up, changes.revision)
 
     async def RefineFusedMap(
@@ -190,7 +190,7 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
     async def LeaveSession(self, request: pb.LeaveSessionRequest, context: Any) -> pb.LeaveSessionResponse:
         """End a session, and forget what the agent said when it asks for that."""
         revision = await self._work(self._team.leave, request.session_id, request.forget)
-        self._news.ring()
+        self._news.notify()
         return pb.LeaveSessionResponse(fused_revision=revision)
 
     def _take_in(self, request: pb.ContributeSubsetsRequest) -> pb.SubsetOutcome:
@@ -222,7 +222,7 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
 
     def _take_view(self, request: pb.ContributeKeyframesRequest) -> None:
         agent_id = self._team.session(request.session_id).agent_id
-        self._team.add_keyframe(TeamKeyframe(agent_id, frame_from_message(request.keyframe)))
+        self._team.add_keyframe(AgentKeyframe(agent_id, frame_from_message(request.keyframe)))
 
     def _catch_up(self, revision: int) -> Changes:
         try:

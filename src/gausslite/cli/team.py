@@ -12,7 +12,7 @@ from pathlib import Path
 
 from gausslite.cli.processes import ProcessGroup, ServiceProcess
 from gausslite.cli.progress import MappingBar, progress_bar
-from gausslite.codec.files import write_whole
+from gausslite.codec.files import write_atomic
 from gausslite.errors import UnavailableError
 from gausslite.wire.clients import AgentClient, Export, FusionClient, is_done
 
@@ -162,5 +162,5 @@ def _refine(client: FusionClient, plan: TeamPlan) -> None:
 
 
 def _save(path: Path, data: bytes) -> Path:
-    write_whole(path, data)
+    write_atomic(path, data)
     return path

@@ -11,16 +11,16 @@ from pathlib import Path
 from gausslite.errors import StorageError
 
 
-def write_whole(path: Path, data: bytes) -> None:
+def write_atomic(path: Path, data: bytes) -> None:
     """Write beside `path` first, then put it in its place.
 
     Raises StorageError naming the file when the folder cannot be written or the disk is full.
     """
-    write_whole_parts(path, [data])
+    write_atomic_parts(path, [data])
 
 
-def write_whole_parts(path: Path, parts: Iterable[bytes | memoryview]) -> None:
-    """As `write_whole`, for what need not be in memory twice."""
+def write_atomic_parts(path: Path, parts: Iterable[bytes | memoryview]) -> None:
+    """As `write_atomic`, for what need not be in memory twice."""
     temporary: Path | None = None
     try:
         if path.exists() and not path.is_file():

@@ -16,7 +16,7 @@ from jaxtyping import Float32
 from numpy import ndarray
 from numpy.typing import DTypeLike, NDArray
 
-from gausslite.codec.files import write_whole
+from gausslite.codec.files import write_atomic
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.relevance import NO_TARGET
 from gausslite.errors import InvalidInputError, MapFileError
@@ -40,7 +40,7 @@ _PLY_TYPES = {
 
 def write_ply(path: Path, gaussians: Gaussians) -> None:
     """Write the map, whole or not at all. Raises StorageError when the folder is not writable or the disk is full."""
-    write_whole(path, ply_bytes(gaussians))
+    write_atomic(path, ply_bytes(gaussians))
 
 
 def read_ply(path: Path) -> Gaussians:

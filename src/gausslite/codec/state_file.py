@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gausslite.codec.files import write_whole_parts
+from gausslite.codec.files import write_atomic_parts
 from gausslite.domain.state import State
 from gausslite.errors import MapFileError
 
@@ -37,7 +37,7 @@ def write_state(path: Path, state: State) -> None:
     size = _HEAD.size + len(contents) + sum(array.nbytes for array in arrays.values()) + _CRC.size
     head = _HEAD.pack(MAGIC, VERSION, len(arrays), size)
     data = (array.reshape(-1).view(np.uint8).data for array in arrays.values())
-    write_whole_parts(path, _with_crc([head, contents, *data]))
+    write_atomic_parts(path, _with_crc([head, contents, *data]))
 
 
 def read_state(path: Path) -> dict[str, NDArray[Any]]:

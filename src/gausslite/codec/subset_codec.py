@@ -117,7 +117,7 @@ def decode_subset(data: bytes, limits: CodecLimits = DEFAULT_LIMITS) -> tuple[Ro
         raise CodecError(f"subset: {error}") from error
 
 
-def split_words(words: VoxelBatch, max_bytes: int = MAX_SUBSET_BYTES) -> list[VoxelBatch]:
+def split_batch(words: VoxelBatch, max_bytes: int = MAX_SUBSET_BYTES) -> list[VoxelBatch]:
     """Cut words on voxel boundaries into parts whose messages are at most max_bytes, however badly they compress.
 
     A voxel too full for a message of its own keeps its most opaque Gaussians; its kappa sum stays the whole total.

@@ -1,4 +1,4 @@
-"""Sheets to look at: the ground truth beside each map's rendering, the region enlarged, and where they differ."""
+"""Comparison images: ground truth next to each map's rendering, details of the region, and difference images."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 from numpy import ndarray
 
-from gausslite.codec.files import write_whole
+from gausslite.codec.files import write_atomic
 from gausslite.domain.arrays import require_array
 from gausslite.evaluation.views import HeldOutView
 
@@ -25,41 +25,41 @@ _BRIDGED_SHARE = 0.02
 _DIFFERENCE_GAIN = 3.0
 
 
-def comparison_sheet(view: HeldOutView, drawings: Mapping[str, Float32[ndarray, "h w 3"]]) -> UInt8[ndarray, "H W 3"]:
-    """One column for the ground truth and one for each named drawing (colours in [0, 1]), labelled.
+def comparison_sheet(view: HeldOutView, renderings: Mapping[str, Float32[ndarray, "h w 3"]]) -> UInt8[ndarray, "H W 3"]:
+    """Return an image with one labelled column for the ground truth and one per named rendering (colours in [0, 1]).
 
-    Rows: the image with the region outline_roi; the region's largest and smallest pieces enlarged; the absolute
-    difference (three times amplified). Rows that would show nothing are left out. Raises ShapeError.
+    Rows: the image with the region outlined; details of the region's largest and smallest components; the absolute
+    difference, amplified three times. Empty rows are skipped. Raises ShapeError.
     """
     truth_rgb = view.frame.rgb
-    for name, drawing in drawings.items():
-        require_array(f"drawing {name}", drawing, truth_rgb.shape, np.float32)
-    columns = {"ground truth": truth_rgb} | {name: to_uint8(drawing) for name, drawing in drawings.items()}
+    for name, rendering in renderings.items():
+        require_array(f"rendering {name}", rendering, truth_rgb.shape, np.float32)
+    columns = {"ground truth": truth_rgb} | {name: to_uint8(rendering) for name, rendering in renderings.items()}
     rows = [[labelled_image(outline_roi(image, view.roi), label) for label, image in columns.items()]]
     rows += [
-        [labelled_image(_crop(image, piece), f"{label}: detail") for label, image in columns.items()]
-        for piece in _telling_pieces(view.roi)
+        [labelled_image(_crop(image, component), f"{label}: detail") for label, image in columns.items()]
+        for component in _components_to_show(view.roi)
     ]
-    if drawings:
+    if renderings:
         truth = truth_rgb / np.float32(255.0)
-        differences = [to_uint8(_DIFFERENCE_GAIN * np.abs(drawing - truth)) for drawing in drawings.values()]
+        differences = [to_uint8(_DIFFERENCE_GAIN * np.abs(rendering - truth)) for rendering in renderings.values()]
         region = labelled_image(dim_outside(truth_rgb, view.roi), "region of the task")
         cells = [
             labelled_image(outline_roi(difference, view.roi), f"{name}: difference x{_DIFFERENCE_GAIN:g}")
-            for name, difference in zip(drawings, differences, strict=True)
+            for name, difference in zip(renderings, differences, strict=True)
         ]
         rows.append([region, *cells])
     return arrange_grid(rows)
 
 
 def comparison_row(
-    photograph: UInt8[ndarray, "h w 3"], drawing: Float32[ndarray, "h w 3"], roi: Bool[ndarray, "h w"], label: str
+    photograph: UInt8[ndarray, "h w 3"], rendering: Float32[ndarray, "h w 3"], roi: Bool[ndarray, "h w"], label: str
 ) -> list[UInt8[ndarray, "H W 3"]]:
-    """A row for a arrange_grid: the photograph with the region outline_roi, the map from there, and its largest piece in both."""
-    pair = ((photograph, label), (to_uint8(drawing), "map"))
+    """Return one grid row: photograph and rendering with the region outlined, then its largest component in both."""
+    pair = ((photograph, label), (to_uint8(rendering), "map"))
     row = [labelled_image(outline_roi(image, roi), name) for image, name in pair]
-    for piece in _telling_pieces(roi)[:1]:
-        row += [labelled_image(_crop(image, piece), f"{name}: detail") for image, name in pair]
+    for component in _components_to_show(roi)[:1]:
+        row += [labelled_image(_crop(image, component), f"{name}: detail") for image, name in pair]
     return row
 
 
@@ -68,17 +68,17 @@ def write_png(path: Path, image: UInt8[ndarray, "h w 3"]) -> None:
     import cv2
 
     encoded = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1]
-    write_whole(path, encoded.tobytes())
+    write_atomic(path, encoded.tobytes())
 
 
 def to_uint8(image: Float32[ndarray, "h w 3"]) -> UInt8[ndarray, "h w 3"]:
-    """Colours in [0, 1] as 0 to 255; what lies beyond is cut off."""
+    """Convert colours from [0, 1] to 0 to 255; values outside are clipped."""
     rounded: UInt8[ndarray, "h w 3"] = np.rint(np.clip(image, 0.0, 1.0) * 255.0).astype(np.uint8)
     return rounded
 
 
 def outline_roi(image: UInt8[ndarray, "h w 3"], roi: Bool[ndarray, "h w"]) -> UInt8[ndarray, "h w 3"]:
-    """The image with the region's outline drawn in."""
+    """Return the image with the region's outline drawn on it."""
     import cv2
 
     contours = cv2.findContours(roi.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0]
@@ -88,32 +88,34 @@ def outline_roi(image: UInt8[ndarray, "h w 3"], roi: Bool[ndarray, "h w"]) -> UI
 
 
 def dim_outside(image: UInt8[ndarray, "h w 3"], roi: Bool[ndarray, "h w"]) -> UInt8[ndarray, "h w 3"]:
-    """The image with everything outside the region dimmed."""
+    """Return the image with the pixels outside the region dimmed."""
     dimmed: UInt8[ndarray, "h w 3"] = np.where(roi[..., None], image, image // 4)
     return dimmed
 
 
-def _telling_pieces(roi: Bool[ndarray, "h w"]) -> list[Bool[ndarray, "h w"]]:
-    """The region's largest connected piece and its smallest: a chair hides how a mug came out.
+def _components_to_show(roi: Bool[ndarray, "h w"]) -> list[Bool[ndarray, "h w"]]:
+    """Return masks of the region's largest and smallest connected components.
 
-    Gaps that are small in the image do not divide a piece; specks are passed over unless there is nothing else.
+    Both sizes matter: quality on a large object says little about a small one. Small gaps do not split a component.
+    Specks are skipped unless the region has nothing larger.
     """
     import cv2
 
     reach = max(3, round(_BRIDGED_SHARE * roi.shape[1]))
     bridged = cv2.dilate(roi.astype(np.uint8), np.ones((reach, reach), np.uint8))
     count, labels = cv2.connectedComponents(bridged)
-    pieces = sorted((roi & (labels == label) for label in range(1, count)), key=np.count_nonzero, reverse=True)
-    worth_showing = [piece for piece in pieces if np.count_nonzero(piece) >= _SPECK_SHARE * roi.size] or pieces[:1]
-    return worth_showing[:1] + worth_showing[1:][-1:]
+    components = sorted((roi & (labels == label) for label in range(1, count)), key=np.count_nonzero, reverse=True)
+    large_enough = [each for each in components if np.count_nonzero(each) >= _SPECK_SHARE * roi.size]
+    shown = large_enough or components[:1]
+    return shown[:1] + shown[1:][-1:]
 
 
-def _crop(image: UInt8[ndarray, "h w 3"], piece: Bool[ndarray, "h w"]) -> UInt8[ndarray, "h w 3"]:
-    """The piece's box with a margin, grown to the image's proportions and enlarged to its size."""
+def _crop(image: UInt8[ndarray, "h w 3"], component: Bool[ndarray, "h w"]) -> UInt8[ndarray, "h w 3"]:
+    """Return the component's bounding box plus a margin, in the image's aspect ratio, enlarged to the image's size."""
     import cv2
 
-    height, width = piece.shape
-    ys, xs = np.nonzero(piece)
+    height, width = component.shape
+    ys, xs = np.nonzero(component)
     top, bottom, left, right = ys.min(), ys.max() + 1, xs.min(), xs.max() + 1
     share = min(1.0, (1.0 + 2.0 * _CROP_MARGIN) * max((bottom - top) / height, (right - left) / width))
     crop_height, crop_width = max(1, round(share * height)), max(1, round(share * width))
@@ -126,7 +128,7 @@ def _crop(image: UInt8[ndarray, "h w 3"], piece: Bool[ndarray, "h w"]) -> UInt8[
 
 
 def labelled_image(image: UInt8[ndarray, "h w 3"], label: str) -> UInt8[ndarray, "H W 3"]:
-    """The image, wide enough to be read, under a line of text that is shrunk to fit."""
+    """Return the image, at least 320 px wide, under one line of text; long text is scaled down."""
     import cv2
 
     height, width = image.shape[:2]
@@ -143,7 +145,7 @@ def labelled_image(image: UInt8[ndarray, "h w 3"], label: str) -> UInt8[ndarray,
 
 
 def arrange_grid(rows: list[list[UInt8[ndarray, "_ _ 3"]]]) -> UInt8[ndarray, "H W 3"]:
-    """Cells of one size in rows, with gaps between them and round them."""
+    """Return one image with the cells, all of one size, in rows with gaps."""
     cell_height, cell_width = rows[0][0].shape[:2]
     sheet = np.full(
         (
@@ -155,7 +157,7 @@ def arrange_grid(rows: list[list[UInt8[ndarray, "_ _ 3"]]]) -> UInt8[ndarray, "H
         np.uint8,
     )
     for i, row in enumerate(rows):
-        for j, labelled_image in enumerate(row):
+        for j, cell in enumerate(row):
             top, left = _GAP_PX + i * (cell_height + _GAP_PX), _GAP_PX + j * (cell_width + _GAP_PX)
-            sheet[top : top + cell_height, left : left + cell_width] = labelled_image
+            sheet[top : top + cell_height, left : left + cell_width] = cell
     return sheet

@@ -19,11 +19,11 @@ from gausslite.domain.voxel_operations import group_by_voxel, select_voxels
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.errors import InvalidInputError, MismatchError, NotPermittedError, QuotaError, SessionUnknownError
 from gausslite.fusion.change_log import ChangeLog
-from gausslite.fusion.keyframes import KeyframePool, TeamKeyframe
+from gausslite.fusion.keyframes import KeyframePool, AgentKeyframe
 from gausslite.fusion.limits import AgentUsage, FusionSettings, agree, named, require_name, shown
 from gausslite.fusion.refined_map import RefinedMap
 from gausslite.fusion.store import FusionStore, MissionConfig, PutOutcome, SessionRecord
-from gausslite.fusion.traffic import TeamStatus, TrafficCounters, contribution
+from gausslite.fusion.traffic import MissionStatus, TrafficCounters, contribution
 from gausslite.fusion.vote import FusedMap, concatenate, elect, fuse
 
 _REMEMBERED_SESSIONS = 1000
@@ -165,7 +165,7 @@ class FusionEngine:
             heard = replace(sent, last_seen_ns=time.time_ns())
             self._tallies[agent_id] = self._tallies.get(agent_id, TrafficCounters()).plus(heard)
 
-    def add_keyframe(self, keyframe: TeamKeyframe) -> None:
+    def add_keyframe(self, keyframe: AgentKeyframe) -> None:
         """Keep a view for the refinement. Raises QuotaError."""
         with self._lock:
             self._pool.add(keyframe)
@@ -205,7 +205,7 @@ class FusionEngine:
         self._require_contributor(only_agent)
         return concatenate({only_agent: self._store.words(only_agent)})
 
-    def to_refine(self) -> tuple[Gaussians, list[TeamKeyframe], int]:
+    def to_refine(self) -> tuple[Gaussians, list[AgentKeyframe], int]:
         """The fused map, the union of the keyframe buffers, and the revision they are of.
 
         Raises MismatchError when the team has not brought both yet.
@@ -239,7 +239,7 @@ class FusionEngine:
             table = self._store.table(newer)
         return refined.overlaid(fuse(table), newer)
 
-    def status(self) -> TeamStatus:
+    def status(self) -> MissionStatus:
         """Figures of the mission and of each agent's part in it."""
         with self._lock:
             stakes = self._store.stakes()
@@ -255,7 +255,7 @@ class FusionEngine:
                 for agent_id in sorted(joined | set(stakes.agents))
             )
             fused_gaussians = int(election.counts[election.offsets[:-1]].sum(dtype=np.int64))
-            return TeamStatus(
+            return MissionStatus(
                 named(self._charter),
                 self._ledger.revision,
                 fused_gaussians,

@@ -17,7 +17,7 @@ from numpy import ndarray
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.pose import inverse
 from gausslite.errors import InvalidInputError, QuotaError
-from gausslite.fusion.keyframes import TeamKeyframe
+from gausslite.fusion.keyframes import AgentKeyframe
 from gausslite.optimize.density import DensitySettings, densify, prune
 from gausslite.optimize.parameters import SplatTable
 from gausslite.optimize.rates import REFINE_RATES
@@ -69,7 +69,7 @@ GoOn = Callable[[RefineProgress], bool]
 
 def refine(
     gaussians: Gaussians,
-    keyframes: Sequence[TeamKeyframe],
+    keyframes: Sequence[AgentKeyframe],
     rasterizer: Rasterizer,
     settings: RefineSettings,
     go_on: GoOn,
@@ -116,13 +116,13 @@ def _fill_table(gaussians: Gaussians, settings: RefineSettings) -> SplatTable:
 class _RefinementView:
     """A keyframe and where it teaches."""
 
-    keyframe: TeamKeyframe
+    keyframe: AgentKeyframe
     weight: Float32[ndarray, "h w"]
     T_camera_world: Float64[ndarray, "4 4"]
 
 
 def _teaching_views(
-    table: SplatTable, keyframes: Sequence[TeamKeyframe], rasterizer: Rasterizer
+    table: SplatTable, keyframes: Sequence[AgentKeyframe], rasterizer: Rasterizer
 ) -> list[_RefinementView]:
     """The keyframes that show something of the map, with the weight of their pixels."""
     lessons = []

@@ -12,7 +12,7 @@ from gausslite.errors import InvalidInputError, QuotaError
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class TeamKeyframe:
+class AgentKeyframe:
     """A view of one agent; weight in [0, 1] says what of it matters (None = all of it)."""
 
     agent_id: str
@@ -33,12 +33,12 @@ class KeyframePool:
             )
         self._max_per_agent = max_per_agent
         self._max_pixels = max_pixels
-        self._by_agent: dict[str, dict[int, TeamKeyframe]] = {}
+        self._by_agent: dict[str, dict[int, AgentKeyframe]] = {}
 
     def __len__(self) -> int:
         return sum(len(frames) for frames in self._by_agent.values())
 
-    def add(self, keyframe: TeamKeyframe) -> None:
+    def add(self, keyframe: AgentKeyframe) -> None:
         """Keep the view, dropping the agent's oldest when full. Raises QuotaError for an image that is too large."""
         pixels = keyframe.frame.depth_m.size
         if pixels > self._max_pixels:
@@ -58,7 +58,7 @@ class KeyframePool:
         """Forget an agent's views."""
         self._by_agent.pop(agent_id, None)
 
-    def keyframes(self) -> list[TeamKeyframe]:
+    def keyframes(self) -> list[AgentKeyframe]:
         """The union of the agents' buffers, by agent id and frame index."""
         return [
             frames[index]

@@ -49,7 +49,7 @@ class AgentContribution:
 
 
 @dataclass(frozen=True, slots=True)
-class TeamStatus:
+class MissionStatus:
     """The state of the mission in figures."""
 
     mission_config: MissionConfig

@@ -9,7 +9,7 @@ import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 
-from gausslite.codec.files import write_whole
+from gausslite.codec.files import write_atomic
 from gausslite.codec.ply import write_ply
 from gausslite.domain.gaussians import Gaussians
 from gausslite.errors import StorageError
@@ -61,7 +61,7 @@ def read_report(folder: Path) -> Mapping[str, object]:
 
 def write_json(path: Path, report: Mapping[str, object]) -> None:
     """Write a report; bytes of a path that are no text become JSON's own escapes. Raises StorageError."""
-    write_whole(path, (as_text(report) + "\n").encode(errors="backslashreplace"))
+    write_atomic(path, (as_text(report) + "\n").encode(errors="backslashreplace"))
 
 
 def as_text(report: Mapping[str, object]) -> str:

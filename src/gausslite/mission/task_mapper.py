@@ -1,4 +1,4 @@
-"""One robot's loop over frames, from a posed image to the words that leave the robot, one named step a line."""
+"""Process one frame of a mission: from a posed image to the changed voxels of the task's region."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.relevance import RelevanceMap
-from gausslite.domain.state import State, nested, part
+from gausslite.domain.state import State, add_prefix, select_prefix
 from gausslite.domain.voxel_batch import VoxelBatch
 from gausslite.mapping.coverage import RenderedView
 from gausslite.mapping.keyframes import Keyframe
@@ -17,17 +17,16 @@ from gausslite.mapping.sent_voxels import SentVoxelTracker
 from gausslite.mapping.stages import SkippableStage, Stage
 from gausslite.mapping.task_change import Reevaluation
 from gausslite.mission.frame_scheduler import FrameScheduler, FrameTiming
-from gausslite.perception.relevance_estimator import RelevanceEstimator
+from gausslite.perception.relevance_estimator import DelayedRelevance, RelevanceEstimate, RelevanceEstimator
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameOutcome:
-    """What became of one frame.
+    """Result of one frame.
 
-    budget says how its time was spent, from the image to the words; skipped says why the frame was not mapped, None
-    when it was; words are what changed in the task's region, None without a ledger, when the frame was skipped, and
-    when they wait for the next one. detection_lag_frames is the age of a detection that came with this frame. reread is
-    what it did for a new task beside.
+    skipped: why the frame was not mapped, else None. changed_roi: the changed voxels of the task's region; None
+    without a tracker, for a skipped frame, and if publishing waits for the next frame. detection_lag_frames: age of
+    the detection that finished during this frame. reevaluation: the earlier keyframes evaluated for a new task.
     """
 
     index: int
@@ -36,154 +35,157 @@ class FrameOutcome:
     roi_share: float
     timing: FrameTiming
     skipped: str | None
-    words: VoxelBatch | None
+    changed_roi: VoxelBatch | None
     detection_lag_frames: int | None
-    reread: Reevaluation
+    reevaluation: Reevaluation
 
 
 class TaskMapper:
-    """Attends to a frame, maps it, and tells what of the task's region changed. Not thread-safe."""
+    """Estimate a frame's relevance, map it, and publish the changes of the task's region. Not thread-safe."""
 
     def __init__(
         self,
-        attention: RelevanceEstimator,
+        estimator: RelevanceEstimator,
         mapper: GaussianMapper,
-        ledger: SentVoxelTracker | None = None,
+        sent_voxels: SentVoxelTracker | None = None,
         scheduler: FrameScheduler | None = None,
-        tell: Callable[[VoxelBatch], None] = lambda _words: None,
+        publish: Callable[[VoxelBatch], None] = lambda _batch: None,
     ) -> None:
-        """Without a scheduler each frame gets the fixed number of iterations of the mapper's settings.
+        """Without a scheduler, each frame gets the fixed number of iterations of the mapper's settings.
 
-        `tell` is given each frame's words within its time.
+        publish gets the changed voxels of each frame; its duration counts as part of the frame.
         """
-        self._attention = attention
+        self._estimator = estimator
         self._mapper = mapper
-        self._ledger = ledger
+        self._sent_voxels = sent_voxels
         self._scheduler = scheduler or FrameScheduler()
-        self._tell = tell
+        self._publish = publish
 
-    def assign(self, attention: RelevanceEstimator) -> None:
-        """Map for another task from the next frame on.
+    def assign(self, estimator: RelevanceEstimator) -> None:
+        """Switch to another task with the next frame.
 
-        Earlier keyframes are looked at again, newest first and a few a frame; what was said of the old region stands.
+        Earlier keyframes are re-evaluated, newest first and a few per frame. Voxels that were published for the old
+        region stay published.
         """
-        self._attention = attention
-        self._mapper.begin_task()
-        if self._ledger is not None:
-            self._ledger.release()
+        self._estimator = estimator
+        self._mapper.reset_roi()
+        if self._sent_voxels is not None:
+            self._sent_voxels.freeze_sent()
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What the attention wants the operator to know."""
-        return self._attention.notes
+        """Messages of the relevance estimator for the operator, one line each."""
+        return self._estimator.notes
 
     def gaussians(self) -> Gaussians:
-        """A copy of the map."""
+        """Return a copy of the map."""
         return self._mapper.gaussians()
 
     def keyframes(self) -> list[Keyframe]:
-        """The keyframes remembered of the whole mission, oldest first."""
+        """Return the keyframes kept from the whole mission, oldest first."""
         return self._mapper.keyframes()
 
     def memory_mib(self) -> dict[str, float]:
-        """What of the map's memory is reserved or held, in MiB."""
+        """Return the memory of the map's parts in MiB."""
         return self._mapper.memory_mib()
 
     def state(self) -> State:
-        """All that the next frame depends on, save the clock; valid until then."""
-        ledger: State = {} if self._ledger is None else self._ledger.state()
+        """Return everything that the next frame depends on, except the clock. Valid until the next frame."""
+        sent_voxels: State = {} if self._sent_voxels is None else self._sent_voxels.state()
         return {
             **add_prefix("mapper", self._mapper.state()),
-            **add_prefix("attention", self._attention.state()),
-            **add_prefix("ledger", ledger),
+            **add_prefix("estimator", self._estimator.state()),
+            **add_prefix("sent_voxels", sent_voxels),
         }
 
     def restore(self, state: State) -> None:
-        """Go on from what a loop of the same settings and task handed out. Raises MapFileError, InvalidInputError."""
+        """Continue from the state of a TaskMapper with the same settings and task.
+
+        Raises MapFileError, InvalidInputError.
+        """
         self._mapper.restore(select_prefix(state, "mapper"))
-        self._attention.restore(select_prefix(state, "attention"))
-        words = select_prefix(state, "ledger")
-        if self._ledger is not None and words:
-            self._ledger.restore(words)
+        self._estimator.restore(select_prefix(state, "estimator"))
+        sent_voxels = select_prefix(state, "sent_voxels")
+        if self._sent_voxels is not None and sent_voxels:
+            self._sent_voxels.restore(sent_voxels)
 
     def process(self, frame: Frame, waited_s: float = 0.0) -> FrameOutcome:
-        """Take one frame, which has waited this long for its turn, from its pixels to the words on its region."""
+        """Process one frame and return its outcome; waited_s is its time in the queue."""
         self._scheduler.begin(waited_s)
-        sight = self._look(frame)
-        relevance = self._attend(frame, sight)
-        lag_frames = self._catch_up()
-        reread = self._reread()
-        mapped = self._mapper.map_frame(frame, relevance, self._scheduler, sight)
-        words = self._tell_changed_roi() if mapped.skipped is None else None
+        view = self._render(frame)
+        estimate = self._estimate_relevance(frame, view)
+        lag_frames = self._apply_delayed(estimate.delayed)
+        reevaluation = self._reevaluate_keyframes()
+        mapped = self._mapper.map_frame(frame, estimate.relevance, self._scheduler, view)
+        changed_roi = self._publish_changed_roi() if mapped.skipped is None else None
         return FrameOutcome(
             index=frame.index,
             iterations=mapped.iterations,
             gaussians=mapped.gaussians,
-            roi_share=relevance.roi_share,
+            roi_share=estimate.relevance.roi_share,
             timing=self._scheduler.end(),
             skipped=mapped.skipped,
-            words=words,
+            changed_roi=changed_roi,
             detection_lag_frames=lag_frames,
-            reread=reread,
+            reevaluation=reevaluation,
         )
 
-    def rehearse(self) -> bool:
-        """One more iteration while no frame waits; False when nothing has been mapped yet."""
-        return self._mapper.rehearse()
+    def idle_step(self) -> bool:
+        """Run one iteration while no frame waits. Return False if nothing has been mapped yet."""
+        return self._mapper.idle_step()
 
-    def words(self) -> VoxelBatch | None:
-        """What changed in the task's region since words were last made; None without a ledger."""
-        return None if self._ledger is None else self._ledger.changed(self._mapper.roi_gaussians())
+    def changed_roi(self) -> VoxelBatch | None:
+        """Return the voxels of the task's region that changed since the last call; None without a tracker."""
+        return None if self._sent_voxels is None else self._sent_voxels.collect_changes(self._mapper.roi_gaussians())
 
-    def _look(self, frame: Frame) -> RenderedView | None:
-        """The one drawing of a frame: attention takes its depth, seeding what it leaves open."""
+    def _render(self, frame: Frame) -> RenderedView | None:
+        """Render the map from the frame's pose, for the depth of the relevance estimate and for seeding."""
         if self._scheduler.skips(SkippableStage.SEEDING):
             return None
         with self._scheduler.timing(Stage.RENDERING):
-            return self._mapper.look(frame)
+            return self._mapper.render_view(frame)
 
-    def _attend(self, frame: Frame, sight: RenderedView | None) -> RelevanceMap:
+    def _estimate_relevance(self, frame: Frame, view: RenderedView | None) -> RelevanceEstimate:
         with self._scheduler.timing(Stage.RELEVANCE):
-            return self._attention.estimate(frame, None if sight is None else sight.depth_m)
+            return self._estimator.estimate(frame, None if view is None else view.depth_m)
 
-    def _catch_up(self) -> int | None:
-        """Give an earlier keyframe the relevance that was not known when it was mapped; its age in frames."""
-        late = self._attention.late()
-        if late is None:
+    def _apply_delayed(self, delayed: DelayedRelevance | None) -> int | None:
+        """Update an earlier keyframe with its delayed relevance, and return the delay in frames."""
+        if delayed is None:
             return None
         with self._scheduler.timing(Stage.VIEW_PREPARATION):
-            self._mapper.revise(late.frame, late.relevance)
-        return late.lag_frames
+            self._mapper.update_relevance(delayed.frame, delayed.relevance)
+        return delayed.lag_frames
 
-    def _reread(self) -> Reevaluation:
-        """Judge earlier keyframes for a new task: one a frame, more where there is time, up to a fixed number."""
+    def _reevaluate_keyframes(self) -> Reevaluation:
+        """Evaluate earlier keyframes for a new task: one per frame, more if there is time, up to a fixed number."""
         keyframes = seeded = 0
-        while (keyframe := self._mapper.next_to_judge) is not None:
-            if keyframes == self._mapper.settings.retask.keyframes_a_frame:
+        while (keyframe := self._mapper.next_unevaluated) is not None:
+            if keyframes == self._mapper.settings.task_change.keyframes_per_frame:
                 break
             if keyframes > 0 and not self._scheduler.has_time_for(Stage.REEVALUATION):
                 break
             with self._scheduler.timing(Stage.REEVALUATION):
-                relevance = self._look_back(keyframe)
+                relevance = self._evaluate_past(keyframe)
                 if relevance is None:
                     break
-                seeded += self._mapper.judge(keyframe, relevance)
+                seeded += self._mapper.evaluate_keyframe(keyframe, relevance)
                 keyframes += 1
         return Reevaluation(keyframes, seeded)
 
-    def _look_back(self, keyframe: Keyframe) -> RelevanceMap | None:
-        """The relevance of an earlier keyframe. One that cannot be judged costs this frame, and no other."""
+    def _evaluate_past(self, keyframe: Keyframe) -> RelevanceMap | None:
+        """Return the relevance of an earlier keyframe. If that fails, the keyframe is not tried again."""
         try:
-            return self._attention.evaluate_past(keyframe.as_recorded)
+            return self._estimator.evaluate_past(keyframe.as_recorded)
         except Exception:
-            self._mapper.pass_over(keyframe)
+            self._mapper.mark_unavailable(keyframe)
             raise
 
-    def _tell_changed_roi(self) -> VoxelBatch | None:
+    def _publish_changed_roi(self) -> VoxelBatch | None:
         if self._scheduler.skips(SkippableStage.PUBLISHING):
             return None
         with self._scheduler.timing(Stage.PUBLISHING):
-            words = self.words()
-            if words is not None:
-                self._tell(words)
-            return words
+            batch = self.changed_roi()
+            if batch is not None:
+                self._publish(batch)
+            return batch

@@ -6,7 +6,7 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
-from gausslite.codec.files import write_whole
+from gausslite.codec.files import write_atomic
 from gausslite.errors import ChecksumError, InvalidInputError
 from gausslite.models.catalogue import ModelEntry
 from gausslite.models.download import Progress, DownloadRequest, download
@@ -59,4 +59,4 @@ def _note_checksum(path: Path, sha256: str) -> None:
     listing = path.parent / CHECKSUM_FILE
     lines = listing.read_text(encoding="utf-8").splitlines() if listing.is_file() else []
     kept = [line for line in lines if line.partition(" ")[2].strip().removeprefix("*") != path.name]
-    write_whole(listing, "".join(f"{line}\n" for line in [*kept, f"{sha256}  {path.name}"]).encode())
+    write_atomic(listing, "".join(f"{line}\n" for line in [*kept, f"{sha256}  {path.name}"]).encode())

@@ -11,11 +11,11 @@ class ChangeNotifier:
     def __init__(self) -> None:
         self._next_ring = asyncio.Event()
 
-    def ticket(self) -> asyncio.Event:
+    def subscribe(self) -> asyncio.Event:
         """An event that the next ring sets."""
         return self._next_ring
 
-    def ring(self) -> None:
+    def notify(self) -> None:
         """Wake everyone who holds a ticket; call it on the event loop."""
         self._next_ring.set()
         self._next_ring = asyncio.Event()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 
-from gausslite.codec.subset_codec import encode_subset, split_words
+from gausslite.codec.subset_codec import encode_subset, split_batch
 from gausslite.domain.voxel_batch import RoiSubset, VoxelBatch
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.v1.gaussians_pb2 import MapBlock, Provenance
@@ -25,7 +25,7 @@ def map_blocks(
     speaker is the agent id inside the bytes; provenance tells whose Gaussians a part holds. Raises InvalidInputError
     for words that the codec refuses.
     """
-    parts = split_words(words, _BLOCK_BYTES)
+    parts = split_batch(words, _BLOCK_BYTES)
     for number, part in enumerate(parts or [words], start=1):
         yield MapBlock(
             revision=revision,

@@ -90,7 +90,7 @@ class Spool:
                 f"got {held[0]!r} and {held[1]} m; choose another file"
             )
 
-    def offer(self, words: VoxelBatch, purpose: Purpose) -> None:
+    def enqueue(self, words: VoxelBatch, purpose: Purpose) -> None:
         """Keep these words in place of older ones on their voxels; what is unchanged stays as it was."""
         records = to_records(words.gaussians)
         offsets = words.offsets.tolist()
@@ -110,16 +110,16 @@ class Spool:
                 ),
             )
 
-    def pick(self, max_bytes: int, growth_share: float) -> SpoolBatch | None:
+    def next_batch(self, max_bytes: int, resend_threshold: float) -> SpoolBatch | None:
         """Waiting words whose kappa grew most, for about max_bytes on the wire but at least one; None when none is due.
 
-        A word already sent is due once its kappa has changed by growth_share of what was sent.
+        A word already sent is due once its kappa has changed by resend_threshold of what was sent.
         """
         for purpose in Purpose:
             with self._transaction():
                 rows: list[_Row] = []
                 spent = 0
-                for row in self._database.execute(_PICK, (int(purpose), growth_share)):
+                for row in self._database.execute(_PICK, (int(purpose), resend_threshold)):
                     spent += _WIRE_BYTES_PER_VOXEL + row[3] * _WIRE_BYTES_PER_GAUSSIAN
                     if rows and spent > max_bytes:
                         break
@@ -128,7 +128,7 @@ class Spool:
                 return _picked(purpose, sorted(rows))
         return None
 
-    def settle(self, picked: SpoolBatch) -> None:
+    def mark_acked(self, picked: SpoolBatch) -> None:
         """These words need not be sent again: the server has them, or will never take them."""
         triples = zip(
             picked.versions.tolist(), picked.words.kappa_sums.tolist(), picked.words.keys.tolist(), strict=True
@@ -138,7 +138,7 @@ class Spool:
                 "UPDATE words SET waiting = (version != ?), sent_kappa = ? WHERE key = ?", triples
             )
 
-    def forget_what_was_sent(self) -> None:
+    def mark_all_unsent(self) -> None:
         """The server lost it: every word waits again."""
         with self._transaction():
             self._database.execute("UPDATE words SET waiting = 1, sent_kappa = ?", (_NEVER_SENT,))
@@ -149,7 +149,7 @@ class Spool:
         with self._transaction():
             return int(self._database.execute("SELECT count(*) FROM words WHERE waiting = 1").fetchone()[0])
 
-    def next_stamp(self, at_least: int = 0) -> int:
+    def next_update_seq(self, at_least: int = 0) -> int:
         """A number above all it gave before, in this life or an earlier one, and above at_least."""
         with self._transaction():
             stamp = max(int(self._fact("stamp") or 0), at_least) + 1

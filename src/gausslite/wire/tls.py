@@ -99,7 +99,7 @@ def service_tls(options: argparse.Namespace) -> Tls | None:
     return tls
 
 
-def require_speaks_for(context: Any, agent_id: str) -> None:
+def require_agent_certificate(context: Any, agent_id: str) -> None:
     """Raise NotPermittedError when the caller of this rpc has shown a certificate that does not name the agent."""
     shown = context.auth_context()
     if _CERTIFICATE not in shown:

@@ -13,7 +13,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import replace
 
-from gausslite.codec.subset_codec import MAX_SUBSET_BYTES, encode_subset, split_words
+from gausslite.codec.subset_codec import MAX_SUBSET_BYTES, encode_subset, split_batch
 from gausslite.domain.voxel_batch import RoiSubset, VoxelBatch
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.errors import (
@@ -49,19 +49,19 @@ class Uplink:
         spool: Spool,
         grid: VoxelGrid,
         settings: UplinkSettings | None = None,
-        goes_on: bool = False,
+        has_restored_map: bool = False,
     ) -> None:
-        """goes_on: the robot has its map from an earlier life, so that what it said then stands."""
+        """has_restored_map: the robot has its map from an earlier life, so that what it said then stands."""
         self._client, self._agent_id, self._spool, self._grid = client, agent_id, spool, grid
         self._settings = settings or UplinkSettings()
-        self._goes_on = goes_on
+        self._has_restored_map = has_restored_map
         self._counters = UplinkCounters()
         self._roi_voxels: set[int] = set()
         self._damaged: set[int] = set()
         self._session: Session | None = None
         self._sequence = 0
         self._subset_bytes = MAX_SUBSET_BYTES
-        self._allowance = TokenBucket(self._settings.kbps)
+        self._token_bucket = TokenBucket(self._settings.kbps)
         self._backoff_s = 0.0
         self._trouble = ""
         self._next_round_s = 0.0
@@ -71,10 +71,10 @@ class Uplink:
         self._thread = threading.Thread(target=self._run, name="uplink", daemon=True)
         self._thread.start()
 
-    def offer(self, words: VoxelBatch, purpose: Purpose = Purpose.ROI) -> None:
+    def enqueue(self, words: VoxelBatch, purpose: Purpose = Purpose.ROI) -> None:
         """Take these words to be sent; on each voxel they replace what was not sent yet. Raises StorageError."""
         if len(words):
-            self._spool.offer(words, purpose)
+            self._spool.enqueue(words, purpose)
             with self._changed:
                 self._changed.notify_all()
 
@@ -101,7 +101,7 @@ class Uplink:
         session = self._session
         return "" if session is None else session.session_id
 
-    def stop_waiting(self) -> None:
+    def cancel_drain(self) -> None:
         """Make `drain` return at once, now and from now on; sending goes on until `close`."""
         with self._changed:
             self._hurrying = True
@@ -142,7 +142,7 @@ class Uplink:
         with self._changed:
             while not self._closing and not self._counters.stopped_because:
                 now_s = time.monotonic()
-                wait_s = max(self._next_round_s - now_s, self._allowance.seconds_until_positive(now_s))
+                wait_s = max(self._next_round_s - now_s, self._token_bucket.seconds_until_positive(now_s))
                 if wait_s <= 0 and self._spool.waiting:
                     return True
                 self._changed.wait(wait_s if wait_s > 0 else None)
@@ -150,15 +150,15 @@ class Uplink:
 
     def _round(self) -> bool:
         """Join if needed, send one batch, settle what is acknowledged. False when no word was due."""
-        growth_share = 0.0 if self._draining else self._settings.growth_share
-        room = self._allowance.room(self._settings.round_bytes)
-        picked = self._spool.pick(room, growth_share)
+        resend_threshold = 0.0 if self._draining else self._settings.resend_threshold
+        room = self._token_bucket.room(self._settings.round_bytes)
+        picked = self._spool.next_batch(room, resend_threshold)
         if picked is None:
             return False
         session = self._joined()
         sent: dict[int, tuple[SpoolBatch, int]] = {}
         requests = list(self._requests(picked, session, sent))
-        self._allowance.spend(sum(size for _, size in sent.values()))
+        self._token_bucket.spend(sum(size for _, size in sent.values()))
         problem = self._exchange(requests, sent)
         if problem is not None:
             raise problem
@@ -186,11 +186,11 @@ class Uplink:
     def _joined(self) -> Session:
         if self._session is None:
             # a robot that begins with nothing cannot take back what it said in an earlier life
-            fresh = self._spool.is_new and not self._goes_on and self._counters.joins == 0
+            fresh = self._spool.is_new and not self._has_restored_map and self._counters.joins == 0
             self._session = self._client.join(self._agent_id, self._grid, self._settings.world_frame, fresh)
             if self._session.highest_map_revision == 0:
                 # it has nothing of what an earlier life sent
-                self._spool.forget_what_was_sent()
+                self._spool.mark_all_unsent()
             self._sequence = 0
             self._subset_bytes = min(self._subset_bytes, self._session.max_subset_bytes or MAX_SUBSET_BYTES)
             with self._changed:
@@ -201,10 +201,10 @@ class Uplink:
         self, picked: SpoolBatch, session: Session, sent: dict[int, tuple[SpoolBatch, int]]
     ) -> Iterator[pb.ContributeSubsetsRequest]:
         start = 0
-        for part in split_words(picked.words, self._subset_bytes):
+        for part in split_batch(picked.words, self._subset_bytes):
             stop = start + len(part)
             self._sequence += 1
-            stamp = self._spool.next_stamp(session.highest_map_revision)
+            stamp = self._spool.next_update_seq(session.highest_map_revision)
             words = SpoolBatch(picked.purpose, part, picked.versions[start:stop])
             start = stop
             try:
@@ -236,12 +236,12 @@ class Uplink:
         if rejected:
             self._drop(part, f"{outcome.reason} {outcome.message}")
         else:
-            self._spool.settle(part)
+            self._spool.mark_acked(part)
         return None
 
     def _drop(self, part: SpoolBatch, reason: str) -> None:
         _log.warning("uplink: words on %d voxels are dropped: %s", len(part.words), reason)
-        self._spool.settle(part)
+        self._spool.mark_acked(part)
         with self._changed:
             self._counters = replace(self._counters, subsets_rejected=self._counters.subsets_rejected + 1)
 
@@ -267,7 +267,7 @@ class Uplink:
             self._trouble = str(error)
         if isinstance(error, SessionUnknownError):
             self._session = None
-            self._spool.forget_what_was_sent()
+            self._spool.mark_all_unsent()
         if isinstance(error, (QuotaError, StorageError)):
             self._subset_bytes = max(_MIN_SUBSET_BYTES, self._subset_bytes // 2)
         with self._changed:

@@ -10,12 +10,12 @@ from gausslite.errors import InvalidInputError
 @dataclass(frozen=True, slots=True)
 class UplinkSettings:
     """kbps bounds the bandwidth (kilobits a second; None = no bound). Between rounds at least interval_s pass, so that
-    words coalesce; a voxel is sent again once its kappa grew by growth_share, or when draining.
+    words coalesce; a voxel is sent again once its kappa grew by resend_threshold, or when draining.
     """
 
     kbps: float | None = None
     interval_s: float = 1.0
-    growth_share: float = 0.25
+    resend_threshold: float = 0.25
     round_bytes: int = 4 << 20
     deadline_s: float = 30.0
     first_backoff_s: float = 0.2
@@ -24,7 +24,7 @@ class UplinkSettings:
     def __post_init__(self) -> None:
         if self.kbps is not None and not self.kbps > 0:
             raise InvalidInputError(f"uplink kbps: expected a positive number, got {self.kbps}")
-        if not (self.interval_s >= 0 and self.growth_share >= 0 and self.deadline_s > 0 and self.round_bytes > 0):
+        if not (self.interval_s >= 0 and self.resend_threshold >= 0 and self.deadline_s > 0 and self.round_bytes > 0):
             raise InvalidInputError(
                 "uplink: expected interval and growth of at least 0, and a positive deadline and size"
             )

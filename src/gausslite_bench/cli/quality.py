@@ -16,7 +16,7 @@ from tqdm import tqdm
 
 from gausslite.cli.progress import progress_bar
 from gausslite.cli.source_options import open_with_warnings
-from gausslite.codec.files import write_whole
+from gausslite.codec.files import write_atomic
 from gausslite.config.options import LOOK, add_colour_camera, add_view_error, names, up_axis
 from gausslite.datasets.regions import REGIONS_FILE
 from gausslite.datasets.selection import downscaled_size
@@ -211,7 +211,7 @@ def _run(study: Study, options: argparse.Namespace) -> Scoreboard:
     open_networks(study.conditions.eyes.detector)
     perceptual = None
     if options.lpips_weights:
-        from gausslite.evaluation.lpips import load_lpips
+        from gausslite_bench.quality.lpips import load_lpips
 
         perceptual = load_lpips(options.lpips_weights)
     archive = TrialCache(options.out)
@@ -296,7 +296,7 @@ class _StudyBar:
 def _write(folder: Path, name: str, table: str, board: Scoreboard) -> None:
     command = shlex.join(["gausslite", *sys.argv[1:]])
     text = f"# bench {name}\n\n`{command}`\n\n{table}"
-    write_whole(folder / f"{name}.md", text.encode())
+    write_atomic(folder / f"{name}.md", text.encode())
     write_json(folder / f"{name}.json", {"command": command, **board.as_json()})
     print(table)
     print(f"→ {folder / f'{name}.md'}")

@@ -8,7 +8,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from gausslite.codec.files import write_whole
+from gausslite.codec.files import write_atomic
 from gausslite.config.options import names
 from gausslite.errors import InvalidInputError
 from gausslite.evaluation.pictures import write_png
@@ -67,7 +67,7 @@ def run_task_change(options: argparse.Namespace) -> int:
 
 def _write(folder: Path, recoveries: Sequence[Recovery]) -> None:
     command = shlex.join(["gausslite", *sys.argv[1:]])
-    write_whole(folder / "retask.md", f"# bench retask\n\n`{command}`\n\n{recovery_table(recoveries)}".encode())
+    write_atomic(folder / "retask.md", f"# bench retask\n\n`{command}`\n\n{recovery_table(recoveries)}".encode())
     write_json(folder / "retask.json", {"command": command, "changes": [each.as_json() for each in recoveries]})
     panels = {each.change.name: each.points for each in recoveries}
     write_png(folder / "retask.png", plot_panels(panels, "seconds of mapping since the change", "ROI PSNR, dB"))

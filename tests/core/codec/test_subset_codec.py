@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gausslite.codec.columns import RGB_MAX, RGB_MIN, SCALE_MAX_M, SCALE_MIN_M
-from gausslite.codec.subset_codec import CodecLimits, decode_subset, encode_subset, split_words
+from gausslite.codec.subset_codec import CodecLimits, decode_subset, encode_subset, split_batch
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.voxel_batch import RoiSubset, VoxelBatch
 from gausslite.domain.voxels import VoxelGrid
@@ -185,7 +185,7 @@ def test_values_that_mean_nothing_are_not_sent(column: str, value: float) -> Non
 def test_parts_fit_and_say_the_same(seed: int, n: int, max_bytes: int) -> None:
     grid = VoxelGrid()
     words = make_words(seed, n, grid, spread_m=0.5)
-    parts = split_words(words, max_bytes)
+    parts = split_batch(words, max_bytes)
     assert all(len(encode_subset(subset_of(part), grid)) <= max_bytes for part in parts)
     for name in ("keys", "kappa_sums"):
         joined = np.concatenate([np.zeros(0, np.int64), *(getattr(part, name) for part in parts)])
@@ -197,10 +197,10 @@ def test_parts_fit_and_say_the_same(seed: int, n: int, max_bytes: int) -> None:
 def test_a_voxel_too_full_for_a_message_keeps_its_most_opaque_gaussians() -> None:
     grid = VoxelGrid(10.0)
     words = make_words(3, 300, grid, spread_m=0.5, centre_m=5.0)
-    [part] = [part for part in split_words(words, 2048) if len(part.gaussians)]
+    [part] = [part for part in split_batch(words, 2048) if len(part.gaussians)]
     kept, sent = part.gaussians, words.gaussians
     assert 0 < len(kept) < 300
     assert part.kappa_sums.tolist() == words.kappa_sums[words.counts > 0].tolist()
     assert kept.opacities.min() >= np.sort(sent.opacities)[-len(kept)]
     with pytest.raises(InvalidInputError, match="max_bytes"):
-        split_words(words, 100)
+        split_batch(words, 100)

@@ -11,7 +11,7 @@ from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.errors import InvalidInputError, QuotaError
 from gausslite.fusion.joint_refinement import RefineProgress, RefineSettings, refine
-from gausslite.fusion.keyframes import KeyframePool, TeamKeyframe
+from gausslite.fusion.keyframes import KeyframePool, AgentKeyframe
 from gausslite.optimize.density import DensitySettings
 from gausslite.optimize.rates import ONLINE_RATES
 from gausslite.render.cpu import CpuRasterizer
@@ -30,10 +30,10 @@ def patch(rgb: float) -> Gaussians:
     return plain_gaussians(means, scales_m=0.05, rgb=rgb, active=False, target=np.arange(x.size))
 
 
-def view(index: int, grey: int, depth_m: float = 1.0) -> TeamKeyframe:
+def view(index: int, grey: int, depth_m: float = 1.0) -> AgentKeyframe:
     size = (CAMERA.height_px, CAMERA.width_px)
     rgb, depth = np.full((*size, 3), grey, np.uint8), np.full(size, depth_m, np.float32)
-    return TeamKeyframe("ant", Frame(index, index, rgb, depth, CAMERA, np.eye(4)))
+    return AgentKeyframe("ant", Frame(index, index, rgb, depth, CAMERA, np.eye(4)))
 
 
 def always(_: RefineProgress) -> bool:
@@ -91,7 +91,7 @@ def test_what_stands_in_front_of_the_map_teaches_nothing() -> None:
 
 
 def test_a_keyframe_weight_of_zero_teaches_nothing() -> None:
-    weightless = TeamKeyframe("ant", view(1, 200).frame, np.zeros((18, 24), np.float32))
+    weightless = AgentKeyframe("ant", view(1, 200).frame, np.zeros((18, 24), np.float32))
     with pytest.raises(InvalidInputError, match="none does"):
         refine(patch(0.2), [weightless], ReferenceRasterizer(), QUICK, always)
 
@@ -136,7 +136,7 @@ def test_the_pool_keeps_the_newest_of_each_agent_and_replaces_a_resent_one() -> 
     pool = KeyframePool(max_per_agent=2, max_pixels=18 * 24)
     for keyframe in (view(3, 1), view(1, 1), view(2, 1), view(3, 9)):
         pool.add(keyframe)
-    pool.add(TeamKeyframe("aardvark", view(7, 1).frame))
+    pool.add(AgentKeyframe("aardvark", view(7, 1).frame))
     assert [(k.agent_id, k.frame.index) for k in pool.keyframes()] == [("aardvark", 7), ("ant", 2), ("ant", 3)]
     assert pool.keyframes()[-1].frame.rgb[0, 0, 0] == 9
     assert (len(pool), pool.count("ant"), pool.count("bee")) == (3, 2, 0)

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from certificates import SCRIPT, identity, make_certificates
-from fusion_team import GRID, team
+from fusion_running import GRID, team
 from sample_gaussians import plain_gaussians
 from serving import serving
 
@@ -90,7 +90,7 @@ def test_an_uplink_brings_its_words_over_an_encrypted_connection(certs: Path) ->
             client = FusionClient(fusion.client.address, tls=identity(certs, name))
             # the second one shows the first one's name
             uplink = Uplink(client, "husky-1", Spool(None, "husky-1", GRID), GRID, UplinkSettings(interval_s=0.0))
-            uplink.offer(words)
+            uplink.enqueue(words)
             assert uplink.drain(20.0) == (name == "husky-1")
             counters = uplink.counters()
             uplink.close()

@@ -6,7 +6,7 @@ import threading
 from pathlib import Path
 
 import pytest
-from fusion_team import GRID, team, words
+from fusion_running import GRID, team, words
 from uplink_running import WAIT_S, accepted, held, said, scripted, uplink
 
 from gausslite.domain.voxels import VoxelGrid
@@ -25,7 +25,7 @@ def test_what_was_offered_arrives_the_newest_word_of_each_voxel() -> None:
     offers = [{1: [5, 6], 2: [7], 3: [1]}, {2: [], 3: [9, 9, 9]}, {4: [2]}]
     with team(store) as fusion, uplink(fusion.client.address) as link:
         for offer in offers:
-            link.offer(words(offer))
+            link.enqueue(words(offer))
         assert link.drain(WAIT_S)
         counters = link.counters()
     assert held(store) == said(*offers)
@@ -38,10 +38,10 @@ def test_what_was_offered_arrives_the_newest_word_of_each_voxel() -> None:
 def test_handover_is_counted_apart_and_sends_only_what_differs() -> None:
     store = MemoryStore()
     with team(store) as fusion, uplink(fusion.client.address) as link:
-        link.offer(words({1: [5], 2: [7]}))
+        link.enqueue(words({1: [5], 2: [7]}))
         assert link.drain(WAIT_S)
         before = link.counters()
-        link.offer(words({1: [5], 2: [7], 3: [0, 0]}), Purpose.HANDOVER)
+        link.enqueue(words({1: [5], 2: [7], 3: [0, 0]}), Purpose.HANDOVER)
         assert link.drain(WAIT_S)
         after = link.counters()
         [agent] = fusion.client.status().agents
@@ -55,11 +55,11 @@ def test_the_spool_survives_a_restart_of_the_robot(tmp_path: Path) -> None:
     path = tmp_path / "spool.sqlite"
     nobody = "127.0.0.1:1"
     with uplink(nobody, spool=path) as link:
-        link.offer(words({1: [5], 2: [7]}))
+        link.enqueue(words({1: [5], 2: [7]}))
         assert not link.drain(0.0)
     store = MemoryStore()
     with team(store) as fusion, uplink(fusion.client.address, spool=path) as link:
-        link.offer(words({2: [8]}))
+        link.enqueue(words({2: [8]}))
         assert link.drain(WAIT_S)
     assert held(store) == said({1: [5], 2: [8]})
 
@@ -67,7 +67,7 @@ def test_the_spool_survives_a_restart_of_the_robot(tmp_path: Path) -> None:
 def test_bandwidth_goes_first_to_the_voxels_that_were_trained_most() -> None:
     slow = UplinkSettings(kbps=1.0, interval_s=0.0)
     with scripted(lambda *_: accepted()) as (server, address), uplink(address, slow) as link:
-        link.offer(words({cell: [cell] * 40 for cell in range(1, 9)}))
+        link.enqueue(words({cell: [cell] * 40 for cell in range(1, 9)}))
         assert server.came.wait(WAIT_S)
         assert not link.drain(0.0)
         first = server.subsets[0]
@@ -75,12 +75,12 @@ def test_bandwidth_goes_first_to_the_voxels_that_were_trained_most() -> None:
 
 
 def test_small_growth_waits_for_more_or_for_the_end() -> None:
-    patient = UplinkSettings(interval_s=0.0, growth_share=0.5)
+    patient = UplinkSettings(interval_s=0.0, resend_threshold=0.5)
     with scripted(lambda *_: accepted()) as (server, address), uplink(address, patient) as link:
-        link.offer(words({1: [100]}))
+        link.enqueue(words({1: [100]}))
         assert link.drain(WAIT_S)
-        link.offer(words({1: [101]}))
-        link.offer(words({2: [1]}))
+        link.enqueue(words({1: [101]}))
+        link.enqueue(words({2: [1]}))
         assert link.drain(WAIT_S)
     kappas = [subset.kappa_sums.tolist() for subset in server.subsets]
     assert kappas[0] == [100]
@@ -89,8 +89,8 @@ def test_small_growth_waits_for_more_or_for_the_end() -> None:
 
 def test_stop_waiting_ends_a_drain() -> None:
     with uplink("127.0.0.1:1") as link:
-        link.offer(words({1: [5]}))
-        timer = threading.Timer(0.05, link.stop_waiting)
+        link.enqueue(words({1: [5]}))
+        timer = threading.Timer(0.05, link.cancel_drain)
         timer.start()
         assert not link.drain(600.0)
         timer.join()

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from fusion_team import team, words
+from fusion_running import team, words
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from serving import serving
@@ -34,9 +34,9 @@ from gausslite.wire.server import Service
 def test_a_server_that_lost_its_memory_gets_everything_again() -> None:
     answers = iter([accepted(), SessionUnknownError("gone"), accepted()])
     with scripted(lambda *_: next(answers)) as (server, address), uplink(address) as link:
-        link.offer(words({1: [5], 2: [7]}))
+        link.enqueue(words({1: [5], 2: [7]}))
         assert link.drain(WAIT_S)
-        link.offer(words({3: [1]}))
+        link.enqueue(words({3: [1]}))
         assert link.drain(WAIT_S)
         assert link.counters().joins == 2
     assert server.subsets[-1].keys.tolist() == words({1: [5], 2: [7], 3: [1]}).keys.tolist()
@@ -48,7 +48,7 @@ def test_a_server_that_lost_its_memory_gets_everything_again() -> None:
 def test_a_connection_that_breaks_is_tried_again() -> None:
     answers = iter([UnavailableError("draining"), GaussLiteError("a bug"), accepted()])
     with scripted(lambda *_: next(answers)) as (server, address), uplink(address) as link:
-        link.offer(words({1: [5]}))
+        link.enqueue(words({1: [5]}))
         assert link.drain(WAIT_S)
         assert link.counters().connected
     assert len(server.subsets) == 3
@@ -59,7 +59,7 @@ def test_trouble_is_logged_once_and_so_is_its_end(caplog: pytest.LogCaptureFixtu
     caplog.set_level("INFO", logger="gausslite.wire.uplink")
     with scripted(lambda *_: next(answers)) as (_, address), uplink(address) as link:
         for voxel in (1, 2):
-            link.offer(words({voxel: [5]}))
+            link.enqueue(words({voxel: [5]}))
             assert link.drain(WAIT_S)
     again = f"uplink: fusion server {address} takes words again"
     assert [record.getMessage() for record in caplog.records] == ["uplink: draining; will go on trying", again] * 2
@@ -68,7 +68,7 @@ def test_trouble_is_logged_once_and_so_is_its_end(caplog: pytest.LogCaptureFixtu
 def test_damage_is_sent_once_more_and_then_given_up() -> None:
     answers = iter([rejected("CHECKSUM"), rejected("CHECKSUM")])
     with scripted(lambda *_: next(answers)) as (server, address), uplink(address) as link:
-        link.offer(words({1: [5]}))
+        link.enqueue(words({1: [5]}))
         assert link.drain(WAIT_S)
         assert link.counters().subsets_rejected == 1
     np.testing.assert_array_equal(server.subsets[0].gaussians.means_m, server.subsets[1].gaussians.means_m)
@@ -81,10 +81,10 @@ def test_words_that_nobody_will_ever_take_are_dropped(answer: GaussLiteError | N
     if answer is None:
         bad.gaussians.rgb[0] = np.nan
     with scripted(lambda *_: next(answers, accepted())) as (server, address), uplink(address) as link:
-        link.offer(bad)
+        link.enqueue(bad)
         assert link.drain(WAIT_S)
         assert link.counters().subsets_rejected == 1
-        link.offer(words({2: [5]}))
+        link.enqueue(words({2: [5]}))
         assert link.drain(WAIT_S)
     assert server.subsets[-1].keys.tolist() == words({2: [5]}).keys.tolist()
 
@@ -92,9 +92,9 @@ def test_words_that_nobody_will_ever_take_are_dropped(answer: GaussLiteError | N
 def test_a_rejected_subset_is_dropped_and_the_next_goes_on() -> None:
     answers = iter([rejected("INVALID_INPUT"), accepted()])
     with scripted(lambda *_: next(answers)) as (_, address), uplink(address) as link:
-        link.offer(words({1: [5]}))
+        link.enqueue(words({1: [5]}))
         assert link.drain(WAIT_S)
-        link.offer(words({2: [5]}))
+        link.enqueue(words({2: [5]}))
         assert link.drain(WAIT_S)
         counters = link.counters()
     assert (counters.subsets_rejected, counters.voxels_sent) == (1, 1)
@@ -108,7 +108,7 @@ def test_a_full_server_gets_smaller_messages_later(exhausted: pb.SubsetOutcome |
     answers = iter([exhausted])
     cells = {cell: [1] * 5000 for cell in range(8)}
     with scripted(lambda *_: next(answers, accepted())) as (server, address), uplink(address) as link:
-        link.offer(words(cells))
+        link.enqueue(words(cells))
         assert link.drain(WAIT_S)
     assert [len(subset) for subset in server.subsets] == [8, 4, 4]
     assert sorted(set(server.revisions)) == server.revisions
@@ -117,10 +117,10 @@ def test_a_full_server_gets_smaller_messages_later(exhausted: pb.SubsetOutcome |
 @pytest.mark.parametrize("final", [MismatchError("another grid"), NotPermittedError("not you")])
 def test_what_only_the_operator_can_mend_stops_the_uplink(final: GaussLiteError) -> None:
     with scripted(lambda *_: final) as (server, address), uplink(address) as link:
-        link.offer(words({1: [5]}))
+        link.enqueue(words({1: [5]}))
         assert not link.drain(WAIT_S)
         assert link.counters().stopped_because == str(final)
-        link.offer(words({2: [5]}))
+        link.enqueue(words({2: [5]}))
         assert not link.drain(WAIT_S)
         assert link.counters().voxels_waiting == 2
     assert len(server.subsets) == 1
@@ -128,9 +128,9 @@ def test_what_only_the_operator_can_mend_stops_the_uplink(final: GaussLiteError)
 
 def test_another_grid_is_told_by_the_real_server() -> None:
     with team() as fusion, uplink(fusion.client.address, grid=VoxelGrid(0.2)) as link:
-        link.offer(words({}))
+        link.enqueue(words({}))
         empty = np.zeros(1, np.uint64), np.zeros(1, np.uint32), words({}).gaussians
-        link.offer(VoxelBatch(VoxelGrid(0.2).keys(np.zeros((1, 3), np.float32)), *empty))
+        link.enqueue(VoxelBatch(VoxelGrid(0.2).keys(np.zeros((1, 3), np.float32)), *empty))
         assert not link.drain(WAIT_S)
         assert "0.2" in link.counters().stopped_because
 
@@ -181,7 +181,7 @@ def test_whatever_is_lost_on_the_way_the_server_ends_with_the_newest_words(
     )
     with serving([service]) as running, uplink(running.address) as link:
         for offer in offers:
-            link.offer(words(offer))
+            link.enqueue(words(offer))
             assert together or link.drain(WAIT_S)
         assert link.drain(WAIT_S)
     assert held(server.store) == said(*offers)

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from agent_running import SETTINGS, TASK, Gate, agent, ball_attention
-from fusion_team import CAMERA, GRID, frame, team
+from fusion_running import CAMERA, GRID, frame, team
 
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.voxel_batch import VoxelBatch
@@ -95,9 +95,9 @@ class SlowDisk(Spool):
 
     now_s = 0.0
 
-    def offer(self, words: VoxelBatch, purpose: Purpose) -> None:
+    def enqueue(self, words: VoxelBatch, purpose: Purpose) -> None:
         self.now_s += 1.0
-        super().offer(words, purpose)
+        super().enqueue(words, purpose)
 
 
 def test_what_a_frame_takes_to_tell_its_words_is_part_of_its_time() -> None:
@@ -150,7 +150,7 @@ def test_an_idle_iteration_that_fails_is_logged_and_the_next_frame_is_followed_b
     robot = MappingWorker(SETTINGS, GRID, ball_attention, load=LoadSettings(idle_iterations=3))
     robot.assign(RuleParser().parse(TASK)).result(20)
     with monkeypatch.context() as broken:
-        robot.do(lambda mapper: broken.setattr(mapper, "rehearse", fail)).result(20)
+        robot.do(lambda mapper: broken.setattr(mapper, "idle_step", fail)).result(20)
         robot.submit(frame(0)).result(20)
         robot.do(lambda _mapper: None).result(20)
     assert "a moment without memory" in caplog.text

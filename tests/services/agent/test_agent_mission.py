@@ -15,7 +15,7 @@ from pathlib import Path
 
 import grpc
 import pytest
-from fusion_team import CAMERA, GRID, frame, team
+from fusion_running import CAMERA, GRID, frame, team
 from tiny_yolo import write_tiny_yolo
 
 from gausslite.codec.ply import read_ply

@@ -9,7 +9,7 @@ import grpc
 import numpy as np
 import pytest
 from agent_running import TASK, Gate, agent, ball_attention
-from fusion_team import CAMERA, GRID, frame, team
+from fusion_running import CAMERA, GRID, frame, team
 
 from gausslite.domain.camera import Camera
 from gausslite.domain.frame import Frame

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fusion_team import CAMERA, GRID, Team, frame, team
+from fusion_running import CAMERA, GRID, Team, frame, team
 from tiny_yolo import write_tiny_yolo
 
 from gausslite.codec.ply import read_ply
@@ -55,7 +55,7 @@ def life(
     if fusion is not None:
         client = FusionClient(fusion.client.address)
         held = Spool(spool, "robot", GRID)
-        uplink = Uplink(client, "robot", held, GRID, UplinkSettings(interval_s=0.0), goes_on=saved is not None)
+        uplink = Uplink(client, "robot", held, GRID, UplinkSettings(interval_s=0.0), has_restored_map=saved is not None)
     robot = MappingWorker(options.mission, GRID, lambda _graph: RegionRelevanceEstimator([MUG]), uplink)
     try:
         if saved is not None:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import grpc
 import pytest
-from fusion_team import GRID, frame, request, said, server_process
+from fusion_running import GRID, frame, request, said, server_process
 from google.protobuf.message import DecodeError, Message
 from hypothesis import given, settings
 from hypothesis import strategies as st

@@ -8,7 +8,7 @@ import subprocess
 from pathlib import Path
 
 import pytest
-from fusion_team import COMMAND, GRID, request, said, server_process
+from fusion_running import COMMAND, GRID, request, said, server_process
 
 from gausslite.codec.ply import gaussians_from_ply
 from gausslite.errors import UnavailableError

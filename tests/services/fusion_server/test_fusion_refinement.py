@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from fusion_team import CAMERA, GRID, Team, frame, said, team
+from fusion_running import CAMERA, GRID, Team, frame, said, team
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 
 from gausslite.codec.ply import gaussians_from_ply

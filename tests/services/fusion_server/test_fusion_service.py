@@ -7,7 +7,7 @@ from pathlib import Path
 
 import grpc
 import pytest
-from fusion_team import GRID, frame, request, said, team, words
+from fusion_running import GRID, frame, request, said, team, words
 
 from gausslite.codec.ply import gaussians_from_ply
 from gausslite.domain.voxel_batch import RoiSubset

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncIterator, Callable
 
-from fusion_team import GRID, keys, said
+from fusion_running import GRID, keys, said
 
 from gausslite.codec.subset_codec import decode_subset
 from gausslite.domain.voxel_batch import VoxelBatch

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import grpc
 import numpy as np
 import pytest
-from fusion_team import GRID, keys, said, team
+from fusion_running import GRID, keys, said, team
 
 from gausslite.domain.voxel_batch import VoxelBatch
 from gausslite.domain.voxel_operations import empty_batch
