@@ -65,7 +65,7 @@ _LEFT_ALONE: Final = re.compile(
 )
 
 
-def plain_words(text: str) -> str:
+def replace_idioms(text: str) -> str:
     """One normalised sentence without the idioms of the table."""
     text = _ARROW.sub(" to ", text)
     text = _LEFT_ALONE.sub(r"do not touch \1", text)

@@ -4,20 +4,20 @@ from __future__ import annotations
 
 from typing import Final
 
-from gausslite.task.nouns import CONTAINERS, LANDMARKS, NOUNS, ROOMS
-from gausslite.task.words import words
+from gausslite.task.nouns import COMMON_ANCHORS, CONTAINERS, NOUNS, ROOMS
+from gausslite.task.word_set import word_set
 
-__all__ = ["CONTAINERS", "LANDMARKS", "NOUNS", "ROOMS"]
+__all__ = ["COMMON_ANCHORS", "CONTAINERS", "NOUNS", "ROOMS"]
 
 
-DETERMINERS: Final = words(
+DETERMINERS: Final = word_set(
     "a an the this that these those my your his her its our their any some all every each both several many few "
     "another other others more much enough whole entire one two three four five six seven eight nine ten eleven "
     "twelve zero dozen most various different multiple single either whichever first second third last next following "
     "same such"
 )
 # words that stand for any object or anyone
-STAND_INS: Final = {
+INDEFINITE_PRONOUNS: Final = {
     "something": "object", "anything": "object", "everything": "object", "someone": "person", "anyone": "person",
     "everyone": "person", "somebody": "person", "anybody": "person", "everybody": "person", "what": "object",
     "whatever": "object", "nothing": "object", "nobody": "person", "whoever": "person",
@@ -25,7 +25,7 @@ STAND_INS: Final = {
 # an ordinal that belongs to a name
 COMPOUND_OPENERS: Final = frozenset({("first", "aid"), ("second", "hand")})
 # words no graph needs; most others end in -ly
-ADVERBS: Final = words(
+ADVERBS: Final = word_set(
     "please so kindly yo pls plz thx ta cheers hey ok okay hello hi yes no-one thanks thank quickly slowly just now "
     "also too again very really so-so here there else sure still already yet always currently almost instead fast "
     "soon later today tonight tomorrow yesterday sometime sometimes whenever maybe perhaps probably certainly exactly "
@@ -34,7 +34,7 @@ ADVERBS: Final = words(
     "possible necessary ago overhead only able"
 )
 # gerunds that say what a thing is for: the charging station, a washing machine
-COMPOUND_GERUNDS: Final = words(
+COMPOUND_GERUNDS: Final = word_set(
     "charging washing loading parking dining living drying cutting swimming sleeping ironing changing sewing vending "
     "reading shopping rocking recycling cooking baking frying mixing serving waiting meeting fishing watering "
     "measuring packing gardening climbing welding milking landing docking lighting heating cooling smoking dressing "
@@ -43,12 +43,14 @@ COMPOUND_GERUNDS: Final = words(
     "steering swinging wedding wrapping writing"
 )
 # the robot itself, and how a person may be spoken to
-SELVES: Final = words("robot agent arm gripper bot dear darling sweetheart honey mate buddy sir madam pal friend")
+ADDRESSEES: Final = word_set(
+    "robot agent arm gripper bot dear darling sweetheart honey mate buddy sir madam pal friend"
+)
 
 # what a sentence may say about itself: "the goal is to", "any idea where"
-TASK_WORDS: Final = words("task mission goal objective job aim assignment duty idea clue question problem")
+TASK_NOUNS: Final = word_set("task mission goal objective job aim assignment duty idea clue question problem")
 # nouns that say where or how, not what: the object is the one after "of", or none at all
-PLACES: Final = words(
+PLACES: Final = word_set(
     "scene environment surroundings room area world space place vicinity workspace view region zone spot location "
     "site map surface home floorplan indoors outdoors way side corner middle center centre top bottom edge end front "
     "back rear left right half part rest remainder interior inside outside distance position pose state status "
@@ -59,45 +61,45 @@ PLACES: Final = words(
     "matter texture appearance structure"
 )
 # behind a preposition and without an article they say how or why: by hand, for lunch, in order
-MANNERS: Final = words(
+MANNER_NOUNS: Final = word_set(
     "hand order name care noon night lunch dinner breakfast work help fun need turn number type kind letter ease "
     "caution love sleep school total general advance bulk use case detail pair fire mistake chance hurry place focus "
     "bloom resolution quality"
 )
-TIMES: Final = words(
+TIME_NOUNS: Final = word_set(
     "date metre meter centimetre centimeter inch foot percent degree second idea problem reason question job sun rain "
     "shade dark visit trip way party step"
 )
-ROUTES: Final = words("path way route road course trajectory passage line shortcut track trail")
-MEASURES: Final = words(
+ROUTES: Final = word_set("path way route road course trajectory passage line shortcut track trail")
+MEASURES: Final = word_set(
     "picture photo photograph image video model reconstruction kind type sort piece pair set group pile stack lots "
     "number row bunch couple list total cluster collection copy amount view scan map sample none instance instances "
     "section suit bit heap batch handful slice lump chunk strip loaf record inventory close-up closeup overview "
     "weight"
 )
 # places that are solid things too, unless something is in them
-SOLID_PLACES: Final = words("home corner site front back")
-BUILDINGS: Final = words("building house apartment")
+PHYSICAL_PLACES: Final = word_set("home corner site front back")
+BUILDINGS: Final = word_set("building house apartment")
 # what an inspection looks for in the thing that it inspects
-DEFECTS: Final = words(
+DEFECTS: Final = word_set(
     "leak crack dent scratch rust stain hole corrosion damage wear tear mold mould rot chip blockage fault defect "
     "wetness gap fraying blister failure error hazard sign pest disease"
 )
-PEOPLE: Final = words(
+PEOPLE: Final = word_set(
     "person people man woman child baby kid human pedestrian worker patient visitor guest user operator nurse doctor "
     "technician someone anyone everyone somebody anybody everybody who whoever"
 )
-CLOTHING: Final = words(
+CLOTHING: Final = word_set(
     "jacket coat shirt vest hat dress suit t-shirt tshirt uniform trousers jeans skirt sweater jumper hoodie cap "
     "scarf gown apron overalls shorts boots shoes helmet blouse cardigan pullover costume kilt"
 )
-PARTS: Final = words(
+PARTS: Final = word_set(
     "handle leg lid knob button screen cable door wheel seat armrest drawer shelf cap label display spout hinge arm "
     "edge rim cover panel switch lock base"
 )
-GENERIC: Final = words("object thing item stuff obstacle obstruction clutter hazard debris target")
+GENERIC: Final = word_set("object thing item stuff obstacle obstruction clutter hazard debris target")
 
-ADJECTIVES: Final = words(
+ADJECTIVES: Final = word_set(
     "red green blue yellow orange black white grey gray brown pink purple beige silver golden dark light bright big "
     "small large little tiny huge tall short long wide narrow thick thin round square flat heavy old new broken clean "
     "dirty dusty wet dry empty full open closed wooden metal metallic plastic glass ceramic leather soft hard damaged "

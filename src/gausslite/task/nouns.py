@@ -4,21 +4,21 @@ from __future__ import annotations
 
 from typing import Final
 
-from gausslite.task.words import words
+from gausslite.task.word_set import word_set
 
-ROOMS: Final = words(
+ROOMS: Final = word_set(
     "kitchen bedroom bathroom office hallway corridor lobby garage basement attic hall lounge closet pantry laundry "
     "garden yard backyard lawn patio balcony warehouse workshop lab laboratory classroom store shop hospital street "
     "sidewalk driveway field park campus courtyard terrace porch entryway foyer study library cafeteria restroom "
     "toilet-room elevator staircase stairwell aisle"
 )
-LANDMARKS: Final = words(
+COMMON_ANCHORS: Final = word_set(
     "table desk counter countertop shelf bookshelf cabinet cupboard dresser nightstand bench sofa couch bed chair "
     "stool armchair sink stove oven fridge refrigerator dishwasher microwave wall floor ceiling door doorway window "
     "entrance exit gate fence stair stairs ladder fireplace bathtub shower toilet workbench rack sideboard wardrobe "
     "tree building car truck tv television piano pillar column whiteboard blackboard printer island"
 )
-CONTAINERS: Final = words(
+CONTAINERS: Final = word_set(
     "drawer box bin basket cabinet cupboard closet fridge refrigerator freezer dishwasher oven microwave bag backpack "
     "crate bucket bowl jar suitcase locker wardrobe container carton trunk dumpster sink bathtub pot washer dryer "
     "case pocket purse toolbox chest sack hamper safe mailbox vase envelope package pantry kitchen incubator "
@@ -28,7 +28,7 @@ CONTAINERS: Final = words(
     "folder binder hopper silo casket coffin wallet quiver holster sheath sleeve wrapper packet sachet pack bundle "
     "bathroom bedroom office garage room car truck lorry bus ambulance helicopter boat plane taxi train"
 )
-_OBJECTS: Final = words(
+_OBJECTS: Final = word_set(
     "mug cup glass bottle plate bowl fork knife spoon pan pot kettle teapot jug pitcher can jar lid tray napkin towel "
     "sponge cloth soap dish toaster blender grill apple banana orange lemon tomato potato carrot bread food fruit "
     "vegetable sandwich pizza cake cookie egg milk coffee tea juice water snack cereal book notebook magazine "
@@ -68,7 +68,7 @@ _OBJECTS: Final = words(
 NOUNS: Final = (
     _OBJECTS
     | ROOMS
-    | LANDMARKS
+    | COMMON_ANCHORS
     | CONTAINERS
     | frozenset({"object", "thing", "item", "stuff", "obstacle", "obstruction", "clutter", "hazard", "target"})
 )

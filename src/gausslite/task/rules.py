@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from gausslite.domain.task import TaskGraph
 from gausslite.errors import TaskError
-from gausslite.task.graph_builder import draft_of
-from gausslite.task.ground import grounded_graph
+from gausslite.task.chunk import Chunk, ChunkKind
+from gausslite.task.chunker import read
+from gausslite.task.graph_builder import build_draft
+from gausslite.task.graph_grounding import grounded_graph
 from gausslite.task.parser import normalise_text
-from gausslite.task.pieces import Piece, TokenKind
-from gausslite.task.reading import read
 from gausslite.task.validate import EXAMPLE, require_task_text
 
 
@@ -18,19 +18,19 @@ class RuleParser:
     def parse(self, text: str) -> TaskGraph:
         """The graph of one task. Raises TaskError."""
         require_task_text(text)
-        pieces = read(normalise_text(text))
-        _require_sense(text, pieces)
-        draft = draft_of(pieces)
+        chunks = read(normalise_text(text))
+        _require_sense(text, chunks)
+        draft = build_draft(chunks)
         if not draft.targets:
             raise TaskError(_nothing_named(text, tuple(draft.excluded)))
         return grounded_graph(text, draft.targets, draft.anchors, draft.relations, draft.warnings, draft)
 
 
-def _require_sense(text: str, pieces: list[Piece]) -> None:
+def _require_sense(text: str, chunks: list[Chunk]) -> None:
     """Unknown words alone are noise; next to a verb, an article or a preposition they may be rare objects."""
-    nouns = [piece.noun for piece in pieces if piece.noun is not None]
-    structured = any(piece.kind in (TokenKind.VERB, TokenKind.PREPOSITION) for piece in pieces)
-    if not structured and not any(noun.known or noun.determined for noun in nouns):
+    nouns = [chunk.noun for chunk in chunks if chunk.noun is not None]
+    structured = any(chunk.kind in (ChunkKind.VERB, ChunkKind.PREPOSITION) for chunk in chunks)
+    if not structured and not any(noun.is_known or noun.has_determiner for noun in nouns):
         raise TaskError(_nothing_named(text, ()))
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from gausslite.task.words import words
+from gausslite.task.word_set import word_set
 
 _IRREGULAR: Final = {
     "people": "person", "men": "man", "women": "woman", "children": "child", "feet": "foot", "teeth": "tooth",
@@ -18,7 +18,7 @@ _IRREGULAR: Final = {
     "humans": "human", "rubbish": "rubbish", "quizzes": "quiz", "policemen": "policeman", "workmen": "workman",
 }  # fmt: skip
 # plural in form, one thing in use; or singular although they end in s
-PLURAL_ONLY: Final = words(
+PLURAL_ONLY: Final = word_set(
     "scissors glasses sunglasses eyeglasses headphones earphones pants jeans trousers shorts pliers tongs tweezers "
     "binoculars goggles clothes stairs valuables electronics groceries gas bus lens news series species thermos "
     "asbestos christmas canvas atlas chaos always mass pass chess press cutlery pajamas pyjamas overalls tights "

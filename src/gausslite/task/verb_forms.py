@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Final
 
 from gausslite.task.verbs import DELIVERY_VERBS, GO_VERBS, VERBS
-from gausslite.task.words import words
+from gausslite.task.word_set import word_set
 
 # past forms and participles that do not end in -ed
 _IRREGULAR: Final = {
@@ -28,10 +28,10 @@ _IRREGULAR: Final = {
     "swung": "swing", "done": "do", "lent": "lend", "hurt": "hurt",
     "sprung": "spring", "woven": "weave", "strewn": "strew",
 }  # fmt: skip
-_PARTICLES: Final = words("up down off out over away around about back through along past at into across onto for")
-_SWITCHED_ON: Final = words("turn switch power put bring check focus concentrate spot home work plug report")
+_PARTICLES: Final = word_set("up down off out over away around about back through along past at into across onto for")
+_SWITCHED_ON: Final = word_set("turn switch power put bring check focus concentrate spot home work plug report")
 # "bring in the boxes" needs an object before any place
-_TAKES_AN_OBJECT: Final = DELIVERY_VERBS - GO_VERBS - words("rest lean pack slide place hide")
+_TAKES_AN_OBJECT: Final = DELIVERY_VERBS - GO_VERBS - word_set("rest lean pack slide place hide")
 
 
 def base_of_s(word: str) -> str | None:

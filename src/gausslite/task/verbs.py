@@ -4,58 +4,58 @@ from __future__ import annotations
 
 from typing import Final
 
-from gausslite.task.words import words
+from gausslite.task.word_set import word_set
 
-GO_VERBS: Final = words(
+GO_VERBS: Final = word_set(
     "go navigate drive move walk head proceed travel come approach reach follow cross enter exit return run roll fly "
     "advance get steer park dock explore patrol roam tour wander visit escort hurry rush climb descend crawl cruise "
     "swim sail land jog race ascend"
 )
-CARRY_VERBS: Final = words(
+CARRY_VERBS: Final = word_set(
     "bring take carry deliver fetch hand pass give transport haul transfer relocate send shift drag push pull slide "
     "connect attach plug mount fasten screw glue tape tow wheel cart ferry lug hoist ship mail forward weld solder "
     "bolt nail clamp tie hook clip pin staple join lead escort guide ride"
 )
-PLACE_VERBS: Final = words(
+PLACE_VERBS: Final = word_set(
     "put place set drop leave stack hang throw load insert pour store stow deposit unload position arrange rest dump "
     "toss lay pile plant tuck slip stick wedge shove stuff cram squeeze sprinkle spread scatter bury park fling hurl "
     "lean prop return pack file deploy install transplant tip slide hide ladle scoop spoon funnel drain discard "
     "recycle stash lodge drape embed immerse dip suspend fit pop"
 )
-TOOL_VERBS: Final = words(
+TOOL_VERBS: Final = word_set(
     "clean wipe vacuum sweep mop wash scrub dust polish rinse disinfect sanitize sanitise tidy brush dry sterilize "
     "declutter organize organise sort clear hoover rake shovel mow paint cut cover spray water repair fix hose swab "
     "scrape sand iron weed dig sponge steam sterilise wax degrease deice sharpen lubricate oil grease"
 )
-SEARCH_VERBS: Final = words(
+SEARCH_VERBS: Final = word_set(
     "look search hunt check scan inspect explore watch scout browse survey examine patrol scour comb sift probe"
 )
-INSPECTION_VERBS: Final = words("check scan inspect survey examine test monitor probe assess audit")
+INSPECTION_VERBS: Final = word_set("check scan inspect survey examine test monitor probe assess audit")
 LOOKING_VERBS: Final = (
-    SEARCH_VERBS | GO_VERBS | words("find locate identify detect spot map reconstruct photograph count track avoid")
+    SEARCH_VERBS | GO_VERBS | word_set("find locate identify detect spot map reconstruct photograph count track avoid")
 )
 # "move to the chair" goes there, "move the chair to the door" takes it there
-MOVING_VERBS: Final = words("move roll run advance return get land park dock drive fly race")
+MOVING_VERBS: Final = word_set("move roll run advance return get land park dock drive fly race")
 # "stop behind the car" means the car
-STOPPING_VERBS: Final = words("stop wait stand stay sit park halt pause")
+STOPPING_VERBS: Final = word_set("stop wait stand stay sit park halt pause")
 # "hand the nurse the towel": the first noun is who gets the second
-GIVING_VERBS: Final = words(
+GIVING_VERBS: Final = word_set(
     "hand give bring pass fetch get send offer serve show throw feed find grab lend buy read toss"
 )
 # "keep wiping tables", not "take folding chairs"
-ASPECT_VERBS: Final = words(
+ASPECT_VERBS: Final = word_set(
     "start stop begin keep continue finish mind avoid try resume go come consider need want like help"
 )
 # "load the van with boxes" moves the boxes
-FILLING_VERBS: Final = words("load reload stock restock")
+FILLING_VERBS: Final = word_set("load reload stock restock")
 # "the mugs belong in the cupboard", "the boxes go on the shelf": said of things that are to be taken there
-BELONGING_VERBS: Final = words("belong go come")
+BELONGING_VERBS: Final = word_set("belong go come")
 # "the shelf that holds the cans": what is held is near, as nothing is in "the key that opens the cabinet"
-HOLDING_VERBS: Final = words(
+HOLDING_VERBS: Final = word_set(
     "hold contain have carry wear support cover store house surround touch face hug hide show display"
 )
 DELIVERY_VERBS: Final = CARRY_VERBS | PLACE_VERBS
-_OTHER_VERBS: Final = words(
+_OTHER_VERBS: Final = word_set(
     # with the hands
     "pick grab grasp lift hold collect gather retrieve remove catch seize lower raise open close shut press push turn "
     "switch rotate touch hit bump knock break disturb move tilt flip fill empty refill squeeze assemble disassemble "

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from gausslite.domain.task import Predicate, Relation
 from gausslite.errors import InvalidInputError, LanguageModelError, TaskError
 from gausslite.task.backends import Backend, BackendSettings, open_parser
-from gausslite.task.language.answer import graph_of_answer
+from gausslite.task.language.answer import parse_answer
 from gausslite.task.language.model import Message, Role
 from gausslite.task.language.parsers import CachedParser, FallbackParser, LanguageParser
 from gausslite.task.language.prompt import MAX_PHRASES, MAX_RELATIONS, messages_for
@@ -47,7 +47,7 @@ class Told:
 
 
 def test_a_good_answer_is_the_graph_that_rules_give():
-    assert graph_of_answer(TASK, answer(["The mugs"], ["the table"], relation())) == RuleParser().parse(TASK)
+    assert parse_answer(TASK, answer(["The mugs"], ["the table"], relation())) == RuleParser().parse(TASK)
 
 
 @pytest.mark.parametrize(
@@ -64,7 +64,7 @@ def test_a_good_answer_is_the_graph_that_rules_give():
     ],
 )
 def test_a_target_that_the_sentence_excludes_is_dropped_and_named(task, answered, kept):
-    graph = graph_of_answer(task, answer(answered, []))
+    graph = parse_answer(task, answer(answered, []))
     assert graph.targets == kept
     said = [warning for warning in graph.warnings if "is to be left alone: it is dropped" in warning]
     assert len(said) == len(answered) - len(kept)
@@ -72,16 +72,16 @@ def test_a_target_that_the_sentence_excludes_is_dropped_and_named(task, answered
 
 def test_an_answer_of_excluded_objects_alone_is_refused():
     with pytest.raises(LanguageModelError, match="expected at least one object"):
-        graph_of_answer("Pick up the mug without touching the vase", answer(["vase"], []))
+        parse_answer("Pick up the mug without touching the vase", answer(["vase"], []))
 
 
 def test_an_answer_within_prose_is_found():
     said = f"Sure! Here it is:\n```json\n{answer()}\n```\nAnything else? {{}}"
-    assert graph_of_answer(TASK, said).targets == ("mug",)
+    assert parse_answer(TASK, said).targets == ("mug",)
 
 
 def test_an_invented_object_is_dropped_and_named():
-    graph = graph_of_answer(TASK, answer(["mug", "dragon"], ["table", "castle"], relation(), relation(anchor="castle")))
+    graph = parse_answer(TASK, answer(["mug", "dragon"], ["table", "castle"], relation(), relation(anchor="castle")))
     assert (graph.targets, graph.anchors) == (("mug",), ("table",))
     assert graph.relations == (Relation(Predicate.ON, "mug", "table"),)
     assert [name for name in ("dragon", "castle") if any(repr(name) in said for said in graph.warnings)] == [
@@ -103,7 +103,7 @@ def test_an_invented_object_is_dropped_and_named():
     ],
 )
 def test_what_the_sentence_entails_is_kept(task, target):
-    graph = graph_of_answer(task, answer([target], []))
+    graph = parse_answer(task, answer([target], []))
     assert len(graph.targets) == 1
     assert graph.warnings == ()
 
@@ -150,7 +150,7 @@ SHAPED = st.fixed_dictionaries({"targets": PHRASES | JSON, "anchors": PHRASES, "
 @given(st.text(max_size=300) | JSON.map(json.dumps) | SHAPED.map(json.dumps))
 def test_any_answer_gives_a_graph_of_the_sentence_or_is_refused(said):
     try:
-        graph = graph_of_answer(TASK, said)
+        graph = parse_answer(TASK, said)
     except LanguageModelError as error:
         message = str(error)
     else:
@@ -188,7 +188,7 @@ def test_the_prompts_own_examples_are_graphs_by_its_own_schema():
     shots = list(zip(messages[1:-1:2], messages[2:-1:2], strict=True))
     assert len(shots) >= 4
     for asked, answered in shots:
-        assert graph_of_answer(asked.text, answered.text).warnings == ()
+        assert parse_answer(asked.text, answered.text).warnings == ()
 
 
 @pytest.mark.parametrize(

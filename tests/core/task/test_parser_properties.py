@@ -7,19 +7,26 @@ from hypothesis import strategies as st
 
 from gausslite.errors import TaskError
 from gausslite.task import lexicon
-from gausslite.task.clauses import MODALS, WISHES
+from gausslite.task.clause_types import MODALS, WISHES
 from gausslite.task.lexicon import NOUNS
 from gausslite.task.parser import task_id_of
 from gausslite.task.prepositions import PREPOSITIONS
 from gausslite.task.rules import RuleParser
 from gausslite.task.validate import require_graph
-from gausslite.task.words import words
+from gausslite.task.word_set import word_set
 
 WORDS = st.sampled_from(
     sorted(
-        (lexicon.DETERMINERS | lexicon.ADVERBS | PREPOSITIONS.keys() | lexicon.STAND_INS.keys() | MODALS | WISHES)
+        (
+            lexicon.DETERMINERS
+            | lexicon.ADVERBS
+            | PREPOSITIONS.keys()
+            | lexicon.INDEFINITE_PRONOUNS.keys()
+            | MODALS
+            | WISHES
+        )
         | {" ".join(said) for said in lexicon.NEGATIONS}
-        | words(
+        | word_set(
             "pick up put find avoid without not ignore the a red closest nearest to from on in of for with and or , / "
             "; : . ! + it them this that these mug table chairs map go door picture path is are was don't touching who "
             "which what where when while whether because so until then before after i you we they me her one "

@@ -7,7 +7,7 @@ from typing import Any, Final, NoReturn
 
 from gausslite.domain.task import Predicate, Relation, TaskGraph
 from gausslite.errors import LanguageModelError, TaskError
-from gausslite.task.ground import grounded_graph
+from gausslite.task.graph_grounding import grounded_graph
 from gausslite.task.language.model import MAX_ANSWER_BYTES
 from gausslite.task.language.prompt import MAX_PHRASE_CHARS, MAX_PHRASES, MAX_RELATIONS
 
@@ -15,7 +15,7 @@ _KEYS: Final = frozenset({"targets", "anchors", "relations"})
 _RELATION_KEYS: Final = frozenset({"predicate", "target", "anchor"})
 
 
-def graph_of_answer(task: str, answer: str) -> TaskGraph:
+def parse_answer(task: str, answer: str) -> TaskGraph:
     """The task graph of a model's answer, JSON by ANSWER_SCHEMA, perhaps within other text.
 
     Raises LanguageModelError where the answer breaks the schema, or leaves no target that the task names.

@@ -10,7 +10,7 @@ from typing import Final
 
 from gausslite.domain.task import TaskGraph
 from gausslite.errors import LanguageModelError
-from gausslite.task.language.answer import graph_of_answer
+from gausslite.task.language.answer import parse_answer
 from gausslite.task.language.model import LanguageModel
 from gausslite.task.language.prompt import PROMPT_VERSION, messages_for
 from gausslite.task.parser import TaskParser
@@ -34,7 +34,7 @@ class LanguageParser:
     def parse(self, text: str) -> TaskGraph:
         """The graph that the model answers, without what the sentence does not say."""
         require_task_text(text)
-        return graph_of_answer(text, self._model.complete(messages_for(text)))
+        return parse_answer(text, self._model.complete(messages_for(text)))
 
 
 class CachedParser:

@@ -6,12 +6,12 @@ from collections.abc import Sequence
 from typing import Final
 
 from gausslite.task import lexicon
+from gausslite.task.part_of_speech import Tag, best_tags
 from gausslite.task.prepositions import PREPOSITIONS
 from gausslite.task.singular import PLURAL_ONLY, singular
-from gausslite.task.tags import Tag, best_tags
 from gausslite.task.verb_forms import base_of_ed, base_of_ing, base_of_s, verb_base
 from gausslite.task.verbs import GO_VERBS, SEARCH_VERBS, TOOL_VERBS, VERBS
-from gausslite.task.words import words
+from gausslite.task.word_set import word_set
 
 Options = dict[Tag, int]
 
@@ -59,9 +59,9 @@ _CLOSED_LINES: Final = (
     ("i0 d8", "what whatever"),
 )
 # "go stand", "help clean": the second is what is to be done
-_LEADING: Final = words("go come help")
-_MAINLY_VERBS: Final = GO_VERBS | TOOL_VERBS | SEARCH_VERBS | words("stop hand")
-_NEVER_NOUNS: Final = GO_VERBS | words(
+_LEADING: Final = word_set("go come help")
+_USUALLY_VERBS: Final = GO_VERBS | TOOL_VERBS | SEARCH_VERBS | word_set("stop hand")
+_NEVER_NOUNS: Final = GO_VERBS | word_set(
     "belong bring put take get find fetch make keep give hold grab need want do lie be say see hear "
     "know think eat sit seem contain include become lose forget boil"
 )
@@ -72,7 +72,7 @@ _NOUNS: Final = (
     | lexicon.ROUTES
     | lexicon.MEASURES
     | lexicon.PARTS
-    | lexicon.SELVES
+    | lexicon.ADDRESSEES
     | lexicon.COMPOUND_GERUNDS
 )
 _ADJECTIVE_ENDINGS: Final = ("ful", "ous", "able", "ible", "less", "ish", "most")
@@ -88,16 +88,16 @@ _CLOSED: Final[dict[str, Options]] = (
     {word: {Tag.PREPOSITION: 0} for word in PREPOSITIONS}
     | {" ".join(negation): {Tag.NEGATION: 0} for negation in lexicon.NEGATIONS}
     | {word: {Tag.DETERMINER: 0} for word in lexicon.DETERMINERS}
-    | {word: {Tag.STAND_IN: 0} for word in lexicon.STAND_INS}
+    | {word: {Tag.INDEFINITE: 0} for word in lexicon.INDEFINITE_PRONOUNS}
     | {word: _options(line) for line, said in _CLOSED_LINES for word in said.split()}
 )
 
 
-def tagged(units: Sequence[str]) -> list[tuple[str, Tag]]:
+def tag_words(units: Sequence[str]) -> list[tuple[str, Tag]]:
     """Words with their parts of speech; adverbs, which no graph needs, are left out."""
     kept = [unit for unit in units if not is_adverb(unit)]
     neighbours = zip(["", *kept], kept, [*kept[1:], ""], strict=False)
-    return list(zip(kept, best_tags([_candidates(*three) for three in neighbours]), strict=True))
+    return list(zip(kept, best_tags([_tag_options(*three) for three in neighbours]), strict=True))
 
 
 def is_adverb(word: str) -> bool:
@@ -108,7 +108,7 @@ def is_adverb(word: str) -> bool:
     return ending and not (word in lexicon.ADJECTIVES or singular(word) in _NOUNS or word in VERBS or word in _CLOSED)
 
 
-def _candidates(before: str, word: str, after: str) -> Options:
+def _tag_options(before: str, word: str, after: str) -> Options:
     if before in _LEADING and word in VERBS:
         return {Tag.VERB: 0}
     if (word, after) in lexicon.COMPOUND_OPENERS:
@@ -123,13 +123,13 @@ def _candidates(before: str, word: str, after: str) -> Options:
     if word.endswith(_POSSESSIVES) and len(word) > 3:
         return {Tag.ADJECTIVE: 0, Tag.DETERMINER: 0}
     is_noun = singular(word) in _NOUNS or word in _NOUNS or word in PLURAL_ONLY
-    options = _as_verb(before, word, is_noun)
+    options = _verb_options(before, word, is_noun)
     if word in lexicon.ADJECTIVES:
         options[Tag.ADJECTIVE] = 0
     if is_noun:
-        options[Tag.NOUN] = 5 if before == "to" and word in _MAINLY_VERBS else 0
+        options[Tag.NOUN] = 5 if before == "to" and word in _USUALLY_VERBS else 0
     elif options:
-        options.setdefault(Tag.NOUN, _as_rare_noun(before, word))
+        options.setdefault(Tag.NOUN, _noun_cost_of_verb(before, word))
     else:
         options = {
             Tag.NOUN: 5,
@@ -139,29 +139,29 @@ def _candidates(before: str, word: str, after: str) -> Options:
     return options
 
 
-def _as_rare_noun(before: str, word: str) -> int:
+def _noun_cost_of_verb(before: str, word: str) -> int:
     """A verb may be a noun behind another noun: a stop button, a call panel."""
     if word in lexicon.ADJECTIVES or not before or before in _CLOSED or verb_base(word) in _NEVER_NOUNS:
         return 30
     return 20 if word.endswith("s") else 12
 
 
-def _as_verb(before: str, word: str, is_noun: bool) -> Options:
+def _verb_options(before: str, word: str, is_noun: bool) -> Options:
     """What the word may be if it is a form of a verb, known or by its ending."""
     options: Options = {}
     if word in VERBS:
-        usual = not is_noun or (word in _MAINLY_VERBS and (before == "to" or (before == "and" and word in GO_VERBS)))
-        options[Tag.VERB] = 0 if usual else 5 if word in _MAINLY_VERBS else 12
+        usual = not is_noun or (word in _USUALLY_VERBS and (before == "to" or (before == "and" and word in GO_VERBS)))
+        options[Tag.VERB] = 0 if usual else 5 if word in _USUALLY_VERBS else 12
         if before in _NOUNS:  # no single thing "bring"
             options[Tag.VERB] += 8
     elif base_of_s(word) is not None:
-        options[Tag.VERB] = 2 if not is_noun else 8 if base_of_s(word) in _MAINLY_VERBS else 18
+        options[Tag.VERB] = 2 if not is_noun else 8 if base_of_s(word) in _USUALLY_VERBS else 18
     elif not is_noun and (word.endswith(_VERB_ENDINGS) or _prefixed(word)):
         options[Tag.VERB] = 5
     if base_of_ing(word) is not None:
-        options[Tag.ING] = 10 if is_noun else 0
+        options[Tag.GERUND] = 10 if is_noun else 0
     elif word.endswith("ing") and len(word) > 5 and not is_noun:
-        options |= {Tag.ING: 5, Tag.NOUN: 6}
+        options |= {Tag.GERUND: 5, Tag.NOUN: 6}
     if base_of_ed(word) is not None:
         options[Tag.PARTICIPLE] = 8 if is_noun else 0
     elif word.endswith("ed") and len(word) > 4 and not is_noun:

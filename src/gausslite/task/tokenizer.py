@@ -6,7 +6,7 @@ import re
 from typing import Final
 
 from gausslite.task import lexicon
-from gausslite.task.idioms import plain_words
+from gausslite.task.idioms import replace_idioms
 from gausslite.task.prepositions import PREPOSITIONS
 
 _TOKEN: Final = re.compile(r"[^\W\d_][\w'’-]*|\d[\w.]*|[,/&+;.!?:()]")
@@ -21,14 +21,14 @@ _COMPOUNDS: Final = {
 }
 
 
-def tokens_of(text: str) -> list[str]:
+def tokenize(text: str) -> list[str]:
     """Lower-case words, numbers and the punctuation that matters."""
-    return _TOKEN.findall(plain_words(text))
+    return _TOKEN.findall(replace_idioms(text))
 
 
-def units_of(text: str) -> list[str]:
+def lexical_units(text: str) -> list[str]:
     """The tokens of a text, with prepositions and negations of several words as one unit each."""
-    tokens = tokens_of(text)
+    tokens = tokenize(text)
     units: list[str] = []
     at = 0
     while at < len(tokens):

@@ -7,10 +7,12 @@ from dataclasses import dataclass
 
 from gausslite.task import lexicon
 from gausslite.task.singular import singular
-from gausslite.task.words import words
+from gausslite.task.word_set import word_set
 
 # "glasses" to drink from have a singular, and those to see with have none
-_DRINKS = words("wine beer water champagne drinking cocktail juice whisky whiskey shot pint milk measuring dirty empty")
+_DRINK_WORDS = word_set(
+    "wine beer water champagne drinking cocktail juice whisky whiskey shot pint milk measuring dirty empty"
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -18,7 +20,7 @@ class NounPhrase:
     """words without determiners, head singular; determined: an article stood before it; superlative: "the closest"."""
 
     words: tuple[str, ...]
-    determined: bool
+    has_determiner: bool
     superlative: bool
 
     @property
@@ -32,24 +34,24 @@ class NounPhrase:
         return " ".join(self.words)
 
     @property
-    def known(self) -> bool:
+    def is_known(self) -> bool:
         """True when the head is a noun of the lexicon."""
         return self.head in lexicon.NOUNS or self.head in lexicon.GENERIC
 
 
-def noun_phrase(words: Sequence[str], determined: bool, superlative: bool) -> NounPhrase:
+def noun_phrase(words: Sequence[str], has_determiner: bool, superlative: bool) -> NounPhrase:
     """Build the phrase from the words as they were written."""
     kept = list(words)
     last = kept[-1]
-    kept[-1] = "glass" if last == "glasses" and _DRINKS.intersection(kept) else singular(last)
-    return NounPhrase(tuple(kept), determined, superlative)
+    kept[-1] = "glass" if last == "glasses" and _DRINK_WORDS.intersection(kept) else singular(last)
+    return NounPhrase(tuple(kept), has_determiner, superlative)
 
 
-def known_phrase(text: str) -> NounPhrase:
+def phrase_from_text(text: str) -> NounPhrase:
     """The phrase of an object that was named before."""
     return NounPhrase(tuple(text.split()), True, False)
 
 
 def adjectives_only(words: Sequence[str]) -> bool:
-    """True for "red" or "big old": something is described and nothing named."""
+    """True for "red" or "big old": something is with_shared_head and nothing named."""
     return all(word in lexicon.ADJECTIVES and word not in lexicon.NOUNS for word in words)

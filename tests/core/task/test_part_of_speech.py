@@ -9,11 +9,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gausslite.task.clauses import Mood, moods_of
+from gausslite.task.clause_types import ClauseType, clause_types
 from gausslite.task.parser import normalise_text
-from gausslite.task.tagging import tagged
-from gausslite.task.tags import COST_BEHIND, Tag, best_tags
-from gausslite.task.tokens import units_of
+from gausslite.task.part_of_speech import TRANSITION_COSTS, Tag, best_tags
+from gausslite.task.tag_candidates import tag_words
+from gausslite.task.tokenizer import lexical_units
 from gausslite.task.verb_forms import base_of_ed, base_of_ing, base_of_s, verb_base
 from gausslite.task.verbs import VERBS
 
@@ -23,11 +23,11 @@ OPTIONS = st.dictionaries(TAGS, st.integers(0, 40), min_size=1, max_size=3)
 
 def path_cost(candidates: Sequence[Mapping[Tag, int]], path: Sequence[Tag]) -> int:
     own = sum(options[tag] for options, tag in zip(candidates, path, strict=True))
-    return own + sum(COST_BEHIND[before][after] for before, after in itertools.pairwise([None, *path, None]))
+    return own + sum(TRANSITION_COSTS[before][after] for before, after in itertools.pairwise([None, *path, None]))
 
 
 def tags_of(text: str) -> dict[str, Tag]:
-    return dict(tagged(units_of(normalise_text(text))))
+    return dict(tag_words(lexical_units(normalise_text(text))))
 
 
 @given(st.lists(OPTIONS, max_size=5))
@@ -54,7 +54,7 @@ def test_no_other_path_is_cheaper(candidates):
         ("Empty the trash can by the door", "can", Tag.NOUN),
         ("Can you open the door", "can", Tag.AUXILIARY),
         ("Go to the charging station", "charging", Tag.NOUN),
-        ("Find the person holding a cup", "holding", Tag.ING),
+        ("Find the person holding a cup", "holding", Tag.GERUND),
         ("Someone left a pram in the hall", "left", Tag.PARTICIPLE),
         ("Open the left drawer", "left", Tag.ADJECTIVE),
         ("Find the mug that is on the desk", "that", Tag.RELATIVE),
@@ -68,26 +68,26 @@ def test_a_word_is_read_by_its_neighbours(text, word, tag):
 
 
 @pytest.mark.parametrize(
-    ("text", "moods"),
+    ("text", "types"),
     [
-        ("Close the curtains, the sun is strong", [Mood.TASK, Mood.ASIDE]),
-        ("The bin is full, empty it", [Mood.ASIDE, Mood.TASK]),
-        ("Close the door because the dog is out", [Mood.TASK, Mood.REASON]),
-        ("Turn off the lamp so that the baby can sleep", [Mood.TASK, Mood.REASON]),
-        ("If the door is open, close it", [Mood.TASK, Mood.TASK]),
-        ("Keep the door open while I carry the sofa in", [Mood.TASK, Mood.ASIDE]),
-        ("Bring the hammer. And the nails", [Mood.TASK, Mood.TASK]),
-        ("Close the window. The baby is asleep", [Mood.TASK, Mood.ASIDE]),
-        ("Where is the mug", [Mood.TASK]),
-        ("I think the mug is on the table", [Mood.ASIDE]),
-        ("I need the mug", [Mood.TASK]),
-        ("The mugs go in the cupboard", [Mood.TASK]),
-        ("Bring the mug and the plate", [Mood.TASK]),
-        ("Bring the mug and fetch the plate", [Mood.TASK, Mood.TASK]),
+        ("Close the curtains, the sun is strong", [ClauseType.REQUEST, ClauseType.STATEMENT]),
+        ("The bin is full, empty it", [ClauseType.STATEMENT, ClauseType.REQUEST]),
+        ("Close the door because the dog is out", [ClauseType.REQUEST, ClauseType.REASON]),
+        ("Turn off the lamp so that the baby can sleep", [ClauseType.REQUEST, ClauseType.REASON]),
+        ("If the door is open, close it", [ClauseType.REQUEST, ClauseType.REQUEST]),
+        ("Keep the door open while I carry the sofa in", [ClauseType.REQUEST, ClauseType.STATEMENT]),
+        ("Bring the hammer. And the nails", [ClauseType.REQUEST, ClauseType.REQUEST]),
+        ("Close the window. The baby is asleep", [ClauseType.REQUEST, ClauseType.STATEMENT]),
+        ("Where is the mug", [ClauseType.REQUEST]),
+        ("I think the mug is on the table", [ClauseType.STATEMENT]),
+        ("I need the mug", [ClauseType.REQUEST]),
+        ("The mugs go in the cupboard", [ClauseType.REQUEST]),
+        ("Bring the mug and the plate", [ClauseType.REQUEST]),
+        ("Bring the mug and fetch the plate", [ClauseType.REQUEST, ClauseType.REQUEST]),
     ],
 )
-def test_a_clause_asks_states_or_gives_a_reason(text, moods):
-    assert list(moods_of(tagged(units_of(normalise_text(text)))).values()) == moods
+def test_a_clause_asks_states_or_gives_a_reason(text, types):
+    assert list(clause_types(tag_words(lexical_units(normalise_text(text)))).values()) == types
 
 
 def test_regular_forms_lead_back_to_a_known_verb():

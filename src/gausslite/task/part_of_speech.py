@@ -14,18 +14,18 @@ class Tag(Enum):
     ADJECTIVE = "a"
     DETERMINER = "d"
     VERB = "v"
-    ING = "g"
+    GERUND = "g"
     PARTICIPLE = "e"
     AUXILIARY = "x"
     PREPOSITION = "p"
     PARTICLE = "t"
     INFINITIVE = "u"
-    JOIN = "c"
-    BREAK = "s"
+    CONJUNCTION = "c"
+    CLAUSE_BREAK = "s"
     RELATIVE = "w"
     PRONOUN = "o"
-    STAND_IN = "i"
-    BACK_REFERENCE = "k"
+    INDEFINITE = "i"
+    ANAPHOR = "k"
     NEGATION = "q"
 
     __hash__ = object.__hash__  # members are one of a kind, and Enum's own hash is slow
@@ -63,7 +63,7 @@ def _table(text: str) -> dict[Tag | None, dict[Tag | None, int]]:
     return {None if row[0] == "^" else Tag(row[0]): dict(zip(columns, map(int, row[1:]), strict=True)) for row in rows}
 
 
-COST_BEHIND: Final = _table(_COSTS)
+TRANSITION_COSTS: Final = _table(_COSTS)
 
 
 def best_tags(candidates: Sequence[Mapping[Tag, int]]) -> list[Tag]:
@@ -75,12 +75,12 @@ def best_tags(candidates: Sequence[Mapping[Tag, int]]) -> list[Tag]:
         origins: dict[Tag, Tag | None] = {}
         for tag, own_cost in options.items():
             cost, origin = min(
-                ((so_far + COST_BEHIND[before][tag], before) for before, so_far in paths.items()), key=_first
+                ((so_far + TRANSITION_COSTS[before][tag], before) for before, so_far in paths.items()), key=_first
             )
             reached[tag], origins[tag] = cost + own_cost, origin
         paths = reached
         came_from.append(origins)
-    last = min(paths, key=lambda tag: paths[tag] + COST_BEHIND[tag][None])
+    last = min(paths, key=lambda tag: paths[tag] + TRANSITION_COSTS[tag][None])
     found: list[Tag] = []
     for origins in reversed(came_from):
         if last is not None:
