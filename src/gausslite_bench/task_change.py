@@ -92,8 +92,14 @@ class TaskChangeBench:
         for done, frame in enumerate(later, start=1):
             for name, loop in loops.items():
                 outcome = loop.process(frame)
-                reread, most_reread = reread + outcome.reread.keyframes, max(most_reread, outcome.reread.keyframes)
-                seeded, most_seeded = seeded + outcome.reread.seeded, max(most_seeded, outcome.reread.seeded)
+                reread, most_reread = (
+                    reread + outcome.reevaluation.keyframes,
+                    max(most_reread, outcome.reevaluation.keyframes),
+                )
+                seeded, most_seeded = (
+                    seeded + outcome.reevaluation.seeded,
+                    max(most_seeded, outcome.reevaluation.seeded),
+                )
                 if done in (1, len(later)) or done % self.check_every == 0:
                     points[name].append((done / self.rate_hz, self._region_psnr(loop, scene)))
         return Recovery(change, points, reread, most_reread, seeded, most_seeded)

@@ -14,7 +14,7 @@ from tiny_sequences import write_depth, write_seven_scenes
 from gausslite.cli.main import main
 from gausslite.domain.relevance import RelevanceMap
 from gausslite.errors import DatasetError, InvalidInputError
-from gausslite.mission.settings import SceneKnowledge
+from gausslite.mission.settings import SceneInfo
 from gausslite_bench.quality.scenes import RealScenePlan, RecordedRelevanceEstimator, Scene, real_plans
 from gausslite_bench.quality.trials import Conditions, PerceptionMode, Trial, TrialBudget, Variant, build_map
 
@@ -28,8 +28,8 @@ def write_regions(path: Path, *voxels: tuple[int, int, int], name: str = "mug_1"
 def test_two_frames_from_one_place_have_masks_of_their_own() -> None:
     frames = [wall_frame(0), wall_frame(1)]
     masks = [middle_relevance(frames[0]), RelevanceMap.empty(*frames[1].depth_m.shape)]
-    attention = RecordedRelevanceEstimator(Scene("Find it", frames, masks, [], SceneKnowledge()))
-    assert [attention.estimate(frame) for frame in frames] == masks
+    attention = RecordedRelevanceEstimator(Scene("Find it", frames, masks, [], SceneInfo()))
+    assert [attention.estimate(frame).relevance for frame in frames] == masks
     assert attention.evaluate_past(frames[0]) is masks[0]
 
 

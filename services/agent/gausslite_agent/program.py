@@ -11,7 +11,7 @@ from gausslite.datasets.open import is_simulated
 from gausslite.domain.pose import unit_up_axis
 from gausslite.mission.build import RelevanceEstimatorFactory
 from gausslite.mission.results import prepare_file, prepare_folder
-from gausslite.mission.settings import SceneKnowledge
+from gausslite.mission.settings import SceneInfo
 from gausslite.task.parser import TaskParser
 from gausslite.task.rules import RuleParser
 from gausslite.wire.change_notifier import ChangeNotifier
@@ -131,10 +131,10 @@ def _uplink(settings: AgentSettings, stack: ExitStack, has_restored_map: bool) -
     return uplink, client
 
 
-def _scene(settings: AgentSettings, stand_in: ReplaySource | None) -> SceneKnowledge:
+def _scene(settings: AgentSettings, stand_in: ReplaySource | None) -> SceneInfo:
     if stand_in is not None:
-        return SceneKnowledge.of(stand_in.source)
-    return SceneKnowledge() if settings.up_axis is None else SceneKnowledge(unit_up_axis(settings.up_axis))
+        return SceneInfo.of(stand_in.source)
+    return SceneInfo() if settings.up_axis is None else SceneInfo(unit_up_axis(settings.up_axis))
 
 
 def _ring(loop: asyncio.AbstractEventLoop, news: ChangeNotifier) -> None:

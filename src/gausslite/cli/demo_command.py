@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from types import FrameType
 
-from gausslite.calibration.view_fit import PoseExposurePrior
+from gausslite.calibration.pose_exposure_prior import PoseExposurePrior
 from gausslite.cli.source_options import open_recorded, register_with_warnings, resolve_pose_prior
 from gausslite.cli.team import AgentPlan, Team, TeamPlan, agent_report, collect_maps, running_team, watch_missions
 from gausslite.codec.ply import read_ply
@@ -33,7 +33,7 @@ from gausslite.domain.voxels import VoxelGrid
 from gausslite.errors import InvalidInputError
 from gausslite.evaluation.compare import MapScores
 from gausslite.evaluation.pictures import write_png
-from gausslite.evaluation.team import TeamScores, HeldOutFrames, score_team
+from gausslite.evaluation.team import HeldOutFrames, TeamScores, score_team
 from gausslite.fusion.limits import MAX_REFINE_ITERATIONS
 from gausslite.mission.build import open_networks
 from gausslite.mission.results import prepare_folder, write_json

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from gausslite.calibration.view_fit import PoseExposurePrior
+from gausslite.calibration.pose_exposure_prior import PoseExposurePrior
 from gausslite.cli.mapping_run import MappingRun, Mission
 from gausslite.cli.parse_command import as_json
 from gausslite.cli.source_options import (
@@ -41,11 +41,11 @@ from gausslite.evaluation.pictures import write_png
 from gausslite.evaluation.preview import render_preview
 from gausslite.evaluation.views import MapViewer
 from gausslite.mapping.policies import TASK
-from gausslite.mission.build import RelevanceEstimatorFactory, build_mapper, build_relevance_estimator
+from gausslite.mission.build import RelevanceEstimatorFactory, build_mapper, build_estimator
 from gausslite.mission.checkpoint import ResumeConfig, SavedRun, save_run
 from gausslite.mission.frame_scheduler import FrameScheduler
 from gausslite.mission.results import PREVIEW, peak_rss_mib, prepare_beside, prepare_folder, write_results
-from gausslite.mission.settings import MissionSettings, SceneKnowledge
+from gausslite.mission.settings import MissionSettings, SceneInfo
 from gausslite.mission.task_mapper import TaskMapper
 from gausslite.mission.task_schedule import TaskSchedule, TaskSwitch
 from gausslite.perception.fixed_relevance import NoTaskEstimator, RegionRelevanceEstimator
@@ -92,7 +92,7 @@ def run(options: argparse.Namespace) -> int:
     last_index = -1 if saved is None else saved.last_index
     graph = asked.plan.at(last_index)
     recorded = asked.source
-    attentions = RelevanceEstimatorFactory(perception_settings(options), lambda: SceneKnowledge.of(recorded))
+    attentions = RelevanceEstimatorFactory(perception_settings(options), lambda: SceneInfo.of(recorded))
     attention = _region_attention(options, recorded) if graph is None else attentions.to(graph)
     if saved is None:
         asked = asked.looked_at(options)
@@ -209,7 +209,7 @@ class _Asked:
             "task": None if first is None else {"text": first.text, **as_json(first)},
             "then": [{"frame": frame, "text": later.text, **as_json(later)} for frame, later in self.plan.turns],
             "policy": options.policy,
-            "without": sorted(self.settings.without),
+            "without": sorted(self.settings.disabled),
             "size": list(self.size),
             "seed": self.settings.seed,
             "max_gaussians": self.settings.max_gaussians,
@@ -281,7 +281,7 @@ def choose_attention(options: argparse.Namespace, source: Source) -> tuple[Relev
     graph = asked_task(options)
     if graph is None:
         return _region_attention(options, source), None
-    return build_relevance_estimator(graph, SceneKnowledge.of(source), perception_settings(options)), graph
+    return build_estimator(graph, SceneInfo.of(source), perception_settings(options)), graph
 
 
 def _region_attention(options: argparse.Namespace, source: Source) -> RelevanceEstimator:

@@ -7,8 +7,8 @@ import sys
 from pathlib import Path
 
 from gausslite.calibration.pose_exposure_error import estimate_pose_exposure_prior
+from gausslite.calibration.pose_exposure_prior import PoseExposurePrior
 from gausslite.calibration.registration import find_registration
-from gausslite.calibration.view_fit import PoseExposurePrior
 from gausslite.config.options import AS_RECORDED, LOOK, TRUSTED, add_frames, names, numbers
 from gausslite.datasets.open import is_simulated, open_source
 from gausslite.datasets.registered_source import DepthRegistration, RegisteredSource

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from gausslite.calibration.view_fit import PoseExposurePrior
+from gausslite.calibration.pose_exposure_prior import PoseExposurePrior
 from gausslite.datasets.registered_source import DepthRegistration
 from gausslite.domain.pose import UpAxis
 from gausslite.domain.voxels import VoxelGrid
@@ -134,7 +134,7 @@ def perception_settings(options: argparse.Namespace) -> PerceptionSettings:
         options.detector,
         options.resegment,
         options.threads if options.rate is None else 1,
-        beside=options.rate is not None,
+        asynchronous=options.rate is not None,
         segmenter=options.segmenter,
         vocabulary=options.vocabulary,
     )
@@ -144,7 +144,7 @@ def mission_settings(options: argparse.Namespace) -> MissionSettings:
     """What add_policy and add_budget asked for; views to be looked at are trusted so far. Raises InvalidInputError."""
     return MissionSettings(
         policy=options.policy,
-        without=frozenset(options.disable),
+        disabled=frozenset(options.disable),
         max_gaussians=options.max_gaussians,
         iterations=options.iterations,
         rate_hz=options.rate,

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from gausslite.domain.task import TaskGraph
 from gausslite.errors import InvalidInputError
 from gausslite.mapping.mapper import GaussianMapper
-from gausslite.mission.settings import MissionSettings, PerceptionSettings, SceneKnowledge
+from gausslite.mission.settings import MissionSettings, PerceptionSettings, SceneInfo
 from gausslite.perception.relevance_estimator import AsyncRelevanceEstimator, RelevanceEstimator, TaskRelevanceEstimator
 from gausslite.perception.tracker import TrackerSettings
 from gausslite.render.choose import choose_rasterizer
@@ -25,8 +25,8 @@ def build_mapper(settings: MissionSettings) -> GaussianMapper:
     return GaussianMapper(settings.mapper_settings(), rasterizer, seed=settings.seed)
 
 
-def build_relevance_estimator(
-    graph: TaskGraph, scene: SceneKnowledge, perception: PerceptionSettings
+def build_estimator(
+    graph: TaskGraph, scene: SceneInfo, perception: PerceptionSettings
 ) -> RelevanceEstimator:
     """RelevanceEstimator to one task alone; see RelevanceEstimatorFactory."""
     return RelevanceEstimatorFactory(perception, lambda: scene).to(graph)
@@ -44,7 +44,7 @@ def open_networks(perception: PerceptionSettings) -> ModelRegistry | None:
 class RelevanceEstimatorFactory:
     """Makes the attention to each task of a mission. The network is loaded once, here, and shared by all."""
 
-    def __init__(self, perception: PerceptionSettings, scene: Callable[[], SceneKnowledge]) -> None:
+    def __init__(self, perception: PerceptionSettings, scene: Callable[[], SceneInfo]) -> None:
         """Asks for the scene with the first task, as a simulated one takes seconds to build. Raises ModelFileError."""
         self._perception = perception
         self._scene = functools.cache(scene)
@@ -69,7 +69,7 @@ class RelevanceEstimatorFactory:
         if self._networks is not None:
             detector = self._networks.detector
             segmenter = self._networks.segmenter if self._perception.resegment else None
-            if self._perception.beside:
+            if self._perception.asynchronous:
                 self._executor = self._executor or ThreadPoolExecutor(1, "detector")
                 return AsyncRelevanceEstimator(graph, detector, self._executor, settings, segmenter)
             return TaskRelevanceEstimator(graph, detector, settings, segmenter)

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from gausslite.codec.state_file import read_state, write_state
-from gausslite.domain.state import State, nested, part, take, take_text, text, whole_numbers
+from gausslite.domain.state import State, add_prefix, encode_text, get_array, get_text, int_array, select_prefix
 from gausslite.errors import GaussLiteError, MapFileError, MismatchError
 from gausslite.mission.settings import MissionSettings
 from gausslite.mission.task_mapper import TaskMapper
@@ -30,7 +30,7 @@ class ResumeConfig:
         """How the robot maps, and what else the caller holds to; threads and backend are free to change."""
         options = {
             "policy": settings.policy,
-            "without": ",".join(sorted(settings.without)),
+            "without": ",".join(sorted(settings.disabled)),
             "max_gaussians": str(settings.max_gaussians),
             "iterations": _or_default(settings.iterations),
             "rate": _or_default(settings.rate_hz),

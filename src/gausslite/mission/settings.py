@@ -1,4 +1,4 @@
-"""How one robot maps: what it knows of the place, what finds its nouns, and what its map may cost."""
+"""Settings of one robot's mission: its task, its perception, its map and the frames it uses."""
 
 from __future__ import annotations
 
@@ -6,10 +6,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from gausslite.calibration.view_fit import PoseExposurePrior
+from gausslite.calibration.pose_exposure_prior import PoseExposurePrior
+from gausslite.datasets.registered_source import DepthRegistration
 from gausslite.datasets.source import Source
 from gausslite.domain.pose import UpAxis
-from gausslite.domain.region import Region
+from gausslite.domain.region import BallRegion, Region
 from gausslite.errors import InvalidInputError
 from gausslite.mapping.policies import disable, policy
 from gausslite.mapping.settings import MapperSettings
@@ -18,98 +19,134 @@ from gausslite.mission.frame_scheduler import SchedulerSettings
 from gausslite.render.cpu_kernels import MAX_THREADS
 
 DEFAULT_MAX_GAUSSIANS = 150_000
-"""What two cores keep busy at 640x480; the paper's cap of a million is for a GPU."""
-_PACE = SchedulerSettings()
+"""What two cores can train online at 640x480; the paper's cap of a million is for a GPU."""
+_MAX_ITERATIONS = 10_000
+_SCHEDULER = SchedulerSettings()
+
+MAY_CHANGE = {"may_change": True}
+"""Metadata of a settings field that may differ when a saved run is resumed."""
+FILE = {"is_file": True}
+"""Metadata of a settings field that names a file: a resumed run compares the name and not the folder."""
 
 
 def require_rate(rate_hz: float) -> None:
-    """Raise InvalidInputError for no number of frames a second."""
+    """Raise InvalidInputError if the frame rate is outside 0.01 to 1000 Hz."""
     if not 0.01 <= rate_hz <= 1000:
         raise InvalidInputError(f"rate: expected 0.01 to 1000 Hz, got {rate_hz}")
 
 
 @dataclass(frozen=True, slots=True)
-class SceneKnowledge:
-    """What is known of a place before the robot looks: which way is up and, in tests, where the objects are."""
+class SceneInfo:
+    """What a mission knows about its scene: the upward direction and, for tests, the regions of objects."""
 
     up_axis: UpAxis = (0.0, 0.0, 1.0)
     regions: Mapping[str, Region] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, source: Source) -> SceneKnowledge:
-        """What a sequence says about its place."""
+    def of(cls, source: Source) -> SceneInfo:
+        """Return the upward direction and the ground-truth regions of a sequence."""
         return cls(source.up_axis, source.regions())
 
 
 @dataclass(frozen=True, slots=True)
-class PerceptionSettings:
-    """What finds the task's nouns: a YOLO-seg or Grounding DINO file, or ground truth without one.
+class SourceSettings:
+    """A sequence and which of its frames a mission uses.
 
-    segmenter names what outlines detected boxes: "yolo", "depth" or a FastSAM file; None takes the model's own masks or depth.
-    vocabulary is Grounding DINO's; None looks for vocab.txt beside the model.
-
-    resegment runs the network on frames between detections too; without it masks are cut by depth inside the
-    re-projected boxes, which on a real kitchen is as exact at a third of the time. With beside, mapping does not wait
-    for detections: they run on a thread of their own and count from when they are there.
+    spec: a folder or a simulated home; size: "WxH", None for the original size; test_every: every N-th frame is kept
+    from mapping, for evaluation; depth_registration: the colour camera to register depth to, None if depth is
+    registered already.
     """
 
-    model: Path | None = None
+    spec: str = field(metadata=MAY_CHANGE)
+    frames: str = field(default=":", metadata=MAY_CHANGE)
+    size: str | None = None
+    up_axis: UpAxis | None = field(default=None, metadata={"flag": "--up"})
+    test_every: int | None = None
+    depth_registration: DepthRegistration | None = field(default=None, metadata={"flag": "--register-depth"})
+
+
+@dataclass(frozen=True, slots=True)
+class TaskSettings:
+    """The task in natural language, or regions of space in its place; neither for a uniform map."""
+
+    task: str | None = None
+    roi: Path | None = field(default=None, metadata=FILE)
+    objects: tuple[str, ...] = ()
+    roi_ball: tuple[BallRegion, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class PerceptionSettings:
+    """The models that find the task's nouns. Without a model file, the ground truth of the sequence is used.
+
+    model: a YOLO-seg or Grounding DINO file. segmenter: what outlines detected boxes, "yolo" (the detector's masks),
+    "depth" or a FastSAM file; None for the model's own masks, or depth if it has none. vocabulary: the vocabulary file
+    of Grounding DINO; None for vocab.txt next to the model.
+
+    resegment: also run the segmenter on frames between detections. Otherwise masks are cut by depth inside the
+    re-projected boxes, which on a real kitchen is as accurate at a third of the time. asynchronous: mapping does not
+    wait for detections; they run on their own thread and take effect when they are finished.
+    """
+
+    model: Path | None = field(default=None, metadata={"flag": "--detector", **FILE})
     resegment: bool = False
-    threads: int | None = None
-    beside: bool = False
-    segmenter: str | None = None
-    vocabulary: Path | None = None
+    threads: int | None = field(default=None, metadata=MAY_CHANGE)
+    asynchronous: bool = field(default=False, metadata=MAY_CHANGE)
+    segmenter: str | None = field(default=None, metadata=FILE)
+    vocabulary: Path | None = field(default=None, metadata=FILE)
 
 
 @dataclass(frozen=True, slots=True)
 class MissionSettings:
     """How one robot maps.
 
-    without switches parts of the policy off by name (see `gausslite.mapping.policies.without`). rate_hz, when given,
-    replaces the fixed number of iterations by what fits into 1 / rate_hz seconds a frame; where that is less than
-    min_iterations, the skip_stages give way, and a frame may be late by the share deadline_slack of its time. pose_prior: how
-    wrong poses and colours of frames may be.
+    disabled: parts of the policy to switch off (see `gausslite.mapping.policies.disable`). rate_hz: frames per second;
+    each frame then trains as many iterations as fit into its time instead of a fixed number. min_iterations,
+    skip_stages and deadline_slack apply at a rate only, see `SchedulerSettings`. pose_prior: standard deviations of
+    pose and exposure errors.
     """
 
     policy: str = "task"
-    without: frozenset[str] = frozenset()
+    disabled: frozenset[str] = field(default=frozenset(), metadata={"flag": "--disable"})
     max_gaussians: int = DEFAULT_MAX_GAUSSIANS
     iterations: int | None = None
-    rate_hz: float | None = None
-    min_iterations: int = _PACE.min_iterations
-    skip_stages: tuple[SkippableStage, ...] = _PACE.skip_stages
-    deadline_slack: float = _PACE.deadline_slack
+    rate_hz: float | None = field(default=None, metadata={"flag": "--rate"})
+    min_iterations: int = _SCHEDULER.min_iterations
+    skip_stages: tuple[SkippableStage, ...] = _SCHEDULER.skip_stages
+    deadline_slack: float = _SCHEDULER.deadline_slack
     seed: int = 0
-    threads: int | None = None
-    backend: str = "auto"
+    threads: int | None = field(default=None, metadata=MAY_CHANGE)
+    backend: str = field(default="auto", metadata=MAY_CHANGE)
     pose_prior: PoseExposurePrior = field(default_factory=PoseExposurePrior)
 
     def __post_init__(self) -> None:
         if self.rate_hz is not None:
             require_rate(self.rate_hz)
-        if not 0 <= self.min_iterations <= 10_000:
-            raise InvalidInputError(f"least iterations: expected 0 to 10000, got {self.min_iterations}")
+        if not 0 <= self.min_iterations <= _MAX_ITERATIONS:
+            raise InvalidInputError(f"min_iterations: expected 0 to {_MAX_ITERATIONS}, got {self.min_iterations}")
         if not 0 <= self.deadline_slack <= 1:
-            raise InvalidInputError(f"run over: expected a share of a frame's time, 0 to 1, got {self.deadline_slack}")
-        if self.iterations is not None and not 0 <= self.iterations <= 10_000:
-            raise InvalidInputError(f"iterations: expected 0 to 10000, got {self.iterations}")
+            raise InvalidInputError(
+                f"deadline_slack: expected a share of a frame's time, 0 to 1, got {self.deadline_slack}"
+            )
+        if self.iterations is not None and not 0 <= self.iterations <= _MAX_ITERATIONS:
+            raise InvalidInputError(f"iterations: expected 0 to {_MAX_ITERATIONS}, got {self.iterations}")
         if not 0 <= self.seed < 1 << 32:
             raise InvalidInputError(f"seed: expected 0 to {(1 << 32) - 1}, got {self.seed}")
         if self.threads is not None and not 1 <= self.threads <= MAX_THREADS:
             raise InvalidInputError(f"threads: expected 1 to {MAX_THREADS}, got {self.threads}")
-        # an unknown policy or component, or a cap of nothing
+        # raises for an unknown policy or component, and for a cap of 0
         self.mapper_settings()
 
     @property
-    def pace(self) -> SchedulerSettings | None:
-        """The time a frame may take and what it goes without when short; None where iterations are counted instead."""
+    def scheduler_settings(self) -> SchedulerSettings | None:
+        """Settings of the frame scheduler; None if iterations are counted."""
         if self.rate_hz is None:
             return None
         return SchedulerSettings(1.0 / self.rate_hz, self.min_iterations, self.skip_stages, self.deadline_slack)
 
     def mapper_settings(self) -> MapperSettings:
-        """The named policy with this mission's cap, iterations and switches."""
-        base = disable(policy(self.policy), self.without)
+        """Return the settings of the named policy, with this mission's cap, iterations and disabled parts."""
+        base = disable(policy(self.policy), self.disabled)
         optimization = base.optimization
         if self.iterations is not None:
             optimization = optimization.with_iterations(self.iterations)

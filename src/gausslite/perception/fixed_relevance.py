@@ -61,7 +61,7 @@ class NoTaskEstimator:
     def estimate(self, frame: Frame, rendered_depth_m: Float32[ndarray, "h w"] | None = None) -> RelevanceEstimate:
         """Weight 0 everywhere."""
         del rendered_depth_m
-        return RelevanceMap.empty(*frame.depth_m.shape)
+        return RelevanceEstimate(RelevanceMap.empty(*frame.depth_m.shape))
 
     def evaluate_past(self, frame: Frame) -> RelevanceMap:
         """As for any other frame."""

@@ -146,7 +146,7 @@ class _Asked:
         graph = self._question.graph
         found = [each for each in self._detector.detect(frame, graph.queries) if each.phrase in graph.targets]
         masks = {PerceptionStage.DETECTED: merge(found, graph.targets, frame).roi}
-        masks |= {step: attention.estimate(frame).roi for step, attention in self._attentions.items()}
+        masks |= {step: attention.estimate(frame).relevance.roi for step, attention in self._attentions.items()}
         known = frame.depth_m > 0
         objects = {name: truths[name] & known for name in self._question.objects}
         truth = np.zeros(known.shape, np.bool_)

@@ -27,7 +27,7 @@ from gausslite.domain.relevance import RelevanceMap
 from gausslite.domain.state import State
 from gausslite.errors import DatasetError, InvalidInputError
 from gausslite.evaluation.views import MIN_ROI_PIXELS, HeldOutView
-from gausslite.mission.settings import SceneKnowledge
+from gausslite.mission.settings import SceneInfo
 from gausslite.perception.fixed_relevance import RegionRelevanceEstimator
 from gausslite.perception.relevance_estimator import RelevanceEstimate
 from gausslite.perception.vocabulary import head_of
@@ -52,7 +52,7 @@ class Scene:
     training: Sequence[Frame]
     masks: Sequence[RelevanceMap]
     held_out: Sequence[HeldOutView]
-    knowledge: SceneKnowledge
+    knowledge: SceneInfo
 
     @property
     def roi_share(self) -> float:
@@ -153,7 +153,7 @@ class HomeScenePlan:
         beside = open_source(f"{self._held_out_spec()}&size={size[0]}x{size[1]}")
         regions = choose_regions(walks[0].regions(), self.pair.objects)
         views = [HeldOutView.of(beside.frame(i), regions) for i in range(len(beside))]
-        return _scene(self.task, training, views, regions, SceneKnowledge.of(walks[0]))
+        return _scene(self.task, training, views, regions, SceneInfo.of(walks[0]))
 
     def _training_walks(self) -> list[tuple[int, int]]:
         first = max(1, round(_FIRST_WALK_SHARE * self.frames))
@@ -227,7 +227,7 @@ class RealScenePlan:
                 f"{self.name}: expected held-out views that show at least {MIN_ROI_PIXELS} pixels of "
                 f"{', '.join(self.objects)} at {size[0]}x{size[1]}, got none of {len(views)}"
             )
-        knowledge = SceneKnowledge(source.up_axis, known)
+        knowledge = SceneInfo(source.up_axis, known)
         return _scene(self.task, [source.frame(i, size) for i in training], views, regions, knowledge)
 
     def _positions(self, source: Source) -> list[int]:
@@ -303,7 +303,7 @@ def _scene(
     training: Sequence[Frame],
     views: Sequence[HeldOutView],
     regions: Sequence[Region],
-    knowledge: SceneKnowledge,
+    knowledge: SceneInfo,
 ) -> Scene:
     usable = [frame for frame in training if frame.has_depth]
     seen = [view for view in views if view.frame.has_depth]

@@ -21,7 +21,7 @@ from gausslite.evaluation.fitted import render_fitted
 from gausslite.evaluation.pictures import to_uint8
 from gausslite.evaluation.views import MapViewer, largest_roi_views
 from gausslite.mapping.policies import TASK
-from gausslite.mission.build import build_mapper, build_relevance_estimator
+from gausslite.mission.build import build_mapper, build_estimator
 from gausslite.mission.frame_scheduler import Clock, FrameScheduler
 from gausslite.mission.settings import MissionSettings, PerceptionSettings
 from gausslite.mission.task_mapper import TaskMapper
@@ -106,13 +106,13 @@ class Trial:
     @property
     def mission(self) -> MissionSettings:
         """How the robot maps. Raises InvalidInputError for an unknown policy or component."""
-        timed = self.budget.equal is BudgetMode.TIME
+        measure_seconds = self.budget.equal is BudgetMode.TIME
         return MissionSettings(
             policy=self.variant.policy,
-            without=self.variant.without,
+            disabled=self.variant.without,
             max_gaussians=self.budget.max_gaussians,
-            iterations=None if timed else self.budget.iterations,
-            rate_hz=self.budget.rate_hz if timed else None,
+            iterations=None if measure_seconds else self.budget.iterations,
+            rate_hz=self.budget.rate_hz if measure_seconds else None,
             seed=self.seed,
             threads=self.conditions.threads,
             pose_prior=self.plan.trust.pose_prior,
@@ -138,7 +138,7 @@ class Trial:
         # the mapper's settings tell what is switched off; a set of names has another order in every process
         settings = {
             "scene": dict(scene),
-            "mission": str(replace(self.mission, without=frozenset())),
+            "mission": str(replace(self.mission, disabled=frozenset())),
             "mapper": str(self.mission.mapper_settings()),
             "conditions": str(self.conditions),
         }
@@ -244,4 +244,4 @@ def _attention(trial: Trial, scene: Scene) -> RelevanceEstimator:
         return RecordedRelevanceEstimator(scene)
     from gausslite.task.rules import RuleParser
 
-    return build_relevance_estimator(RuleParser().parse(scene.task), scene.knowledge, trial.conditions.eyes.detector)
+    return build_estimator(RuleParser().parse(scene.task), scene.knowledge, trial.conditions.eyes.detector)

@@ -14,8 +14,8 @@ from gausslite.mapping.policies import (
     PAPER_FLAGS,
     POLICIES,
     TASK,
-    policy,
     disable,
+    policy,
 )
 from gausslite.mapping.settings import Components, KeyframeSettings, MapperSettings
 from gausslite.mission.settings import MissionSettings
@@ -77,7 +77,7 @@ def test_a_switch_turns_its_own_part_off_and_no_other(name: str) -> None:
 @pytest.mark.parametrize("name", ABLATION_FLAGS)
 @pytest.mark.parametrize("iterations", [None, 4])
 def test_a_mission_maps_without_what_is_switched_off(name: str, iterations: int | None) -> None:
-    mission = MissionSettings(without=frozenset({name}), iterations=iterations)
+    mission = MissionSettings(disabled=frozenset({name}), iterations=iterations)
     settings = mission.mapper_settings()
     assert disable(settings, {name}) == settings
     assert settings.optimization.iterations == (iterations or policy(TASK).optimization.iterations)

@@ -29,7 +29,7 @@ from gausslite.mapping.task_change import TaskChangeSettings
 from gausslite.mission.frame_scheduler import FrameScheduler, SchedulerSettings
 from gausslite.mission.task_mapper import FrameOutcome, TaskMapper
 from gausslite.optimize.density import DensitySettings
-from gausslite.optimize.parameters import SplatTable
+from gausslite.optimize.splat_table import SplatTable
 from gausslite.perception.fixed_relevance import RegionRelevanceEstimator
 from gausslite.perception.ground_truth import RegionDetector
 from gausslite.perception.relevance_estimator import AsyncRelevanceEstimator, TaskRelevanceEstimator

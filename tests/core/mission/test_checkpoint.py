@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from mapping_scenes import wall_frame
 
-from gausslite.calibration.view_fit import PoseExposurePrior
+from gausslite.calibration.pose_exposure_prior import PoseExposurePrior
 from gausslite.codec.state_file import MAGIC, VERSION, read_state, write_state
 from gausslite.domain.frame import Frame
 from gausslite.domain.region import BallRegion
@@ -54,7 +54,7 @@ def loop(max_gaussians: int = 400, window: int = 2) -> TaskMapper:
     mapper_settings = MapperSettings(
         max_gaussians=max_gaussians,
         seeding=SeedingSettings(first_frame_seeds=60_000, later_seeds=20_000),
-        keyframes=KeyframeSettings(every=2, window=window, buffer=3, region_views=2),
+        keyframes=KeyframeSettings(every=2, window=window, buffer=3, long_term_keyframes=2),
         density=DensitySettings(densify_every=7, prune_every=5),
         pose_prior=PoseExposurePrior(0.01, 0.5, 0.1, 0.05),
     )

@@ -333,5 +333,5 @@ def test_settings_name_what_is_wrong() -> None:
     for wrong in wrongs:
         with pytest.raises(InvalidInputError, match=next(iter(wrong))):
             SchedulerSettings(**wrong)
-    with pytest.raises(InvalidInputError, match="each once, got words, words"):
+    with pytest.raises(InvalidInputError, match="each once, got publishing, publishing"):
         SchedulerSettings(skip_stages=(SkippableStage.PUBLISHING, SkippableStage.PUBLISHING))

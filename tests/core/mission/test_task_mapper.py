@@ -18,8 +18,8 @@ from gausslite.mapping.settings import MapperSettings, SeedingSettings
 from gausslite.mapping.stages import SkippableStage, Stage
 from gausslite.mission.frame_scheduler import FrameScheduler, SchedulerSettings
 from gausslite.mission.task_mapper import TaskMapper
-from gausslite.perception.relevance_estimator import RelevanceEstimate
 from gausslite.perception.fixed_relevance import NoTaskEstimator, RegionRelevanceEstimator
+from gausslite.perception.relevance_estimator import RelevanceEstimate
 from gausslite.render.cpu import CpuRasterizer
 
 SIZE = (32, 24)
@@ -36,8 +36,8 @@ def test_words_of_all_frames_add_up_to_the_active_part_of_the_map() -> None:
     counts: dict[int, int] = {}
     for index in range(3):
         outcome = loop.process(wall_frame(index, SIZE, shift_m=0.1 * index))
-        assert outcome.words is not None
-        counts.update(zip(outcome.words.keys.tolist(), outcome.words.counts.tolist(), strict=True))
+        assert outcome.changed_roi is not None
+        counts.update(zip(outcome.changed_roi.keys.tolist(), outcome.changed_roi.counts.tolist(), strict=True))
     gaussians = loop.gaussians()
     assert sum(counts.values()) == int(gaussians.active.sum()) > 0
     assert (outcome.index, outcome.gaussians, outcome.iterations) == (2, len(gaussians), 8)
@@ -46,7 +46,7 @@ def test_words_of_all_frames_add_up_to_the_active_part_of_the_map() -> None:
 
 
 def test_without_a_ledger_there_are_no_words() -> None:
-    assert TaskMapper(NoTaskEstimator(), small_mapper()).process(wall_frame(0, SIZE)).words is None
+    assert TaskMapper(NoTaskEstimator(), small_mapper()).process(wall_frame(0, SIZE)).changed_roi is None
 
 
 def test_a_frame_without_depth_is_passed_over() -> None:
@@ -54,7 +54,7 @@ def test_a_frame_without_depth_is_passed_over() -> None:
     frame.depth_m[:] = 0.0
     outcome = TaskMapper(BALL, small_mapper(), SentVoxelTracker(VoxelGrid())).process(frame)
     assert outcome.skipped == "no pixel has a depth reading"
-    assert outcome.words is None
+    assert outcome.changed_roi is None
     assert outcome.iterations == 0
 
 
@@ -125,9 +125,9 @@ def test_words_that_had_to_wait_come_with_the_next_frame() -> None:
     waited = []
     for index in range(5):
         outcome = loop.process(wall_frame(index, SIZE, shift_m=0.1 * index))
-        waited.append(outcome.words is None)
+        waited.append(outcome.changed_roi is None)
         assert outcome.timing.under_trained
-        if outcome.words is not None:
-            counts.update(zip(outcome.words.keys.tolist(), outcome.words.counts.tolist(), strict=True))
+        if outcome.changed_roi is not None:
+            counts.update(zip(outcome.changed_roi.keys.tolist(), outcome.changed_roi.counts.tolist(), strict=True))
     assert waited == [False, True, False, True, False]
     assert sum(counts.values()) == int(loop.gaussians().active.sum()) > 0
