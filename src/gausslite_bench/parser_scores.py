@@ -1,4 +1,4 @@
-"""Score a task parser on sentences with known graphs: how often it is right, and how long it takes."""
+"""Scores of a task parser on sentences with known task graphs: accuracy and time."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ SENTENCES = Path(__file__).with_name("parser_sentences.json")
 
 @dataclass(frozen=True, slots=True)
 class Sentence:
-    """A task and its graph; order does not matter."""
+    """A task sentence and its expected graph; order is ignored."""
 
     text: str
     targets: frozenset[str]
@@ -28,14 +28,14 @@ class Sentence:
 
     @classmethod
     def from_row(cls, row: Mapping[str, Any]) -> Sentence:
-        """From text, targets, anchors and relations as [predicate, target, anchor]."""
+        """Return the sentence of a JSON row: text, targets, anchors, relations as [predicate, target, anchor]."""
         relations = frozenset(Relation(Predicate(name), target, anchor) for name, target, anchor in row["relations"])
         return cls(row["text"], frozenset(row["targets"]), frozenset(row["anchors"]), relations)
 
 
 @dataclass(frozen=True, slots=True)
 class ParserScore:
-    """Shares of the sentences, milliseconds a sentence, and the texts whose graph is not exact."""
+    """Shares of correct sentences, milliseconds per sentence, and the texts whose graph is not exact."""
 
     backend: str
     sentences: int
@@ -49,34 +49,34 @@ class ParserScore:
 
 
 def load_sentences(path: Path = SENTENCES) -> list[Sentence]:
-    """The sentences of a JSON file. Raises InvalidInputError, OSError."""
+    """Return the sentences of a JSON file. Raises InvalidInputError, OSError."""
     try:
-        found = [Sentence.from_row(row) for row in json.loads(path.read_text(encoding="utf-8"))]
+        sentences = [Sentence.from_row(row) for row in json.loads(path.read_text(encoding="utf-8"))]
     except (ValueError, KeyError, TypeError) as error:
         expected = "a list of text, targets, anchors and relations [predicate, target, anchor]"
-        raise InvalidInputError(f"{path}: expected {expected}, got another thing") from error
-    if not found:
+        raise InvalidInputError(f"{path}: expected {expected}, got other content") from error
+    if not sentences:
         raise InvalidInputError(f"{path}: expected at least one sentence, got none")
-    return found
+    return sentences
 
 
 def score_parser(
     backend: str, parser: TaskParser, sentences: Sequence[Sentence], clock_s: Callable[[], float] = time.perf_counter
 ) -> ParserScore:
-    """Parse every sentence once; one that is refused counts as wrong."""
-    right: list[tuple[bool, bool, bool]] = []
+    """Return the scores of parsing every sentence once; a sentence that raises TaskError counts as wrong."""
+    matches: list[tuple[bool, bool, bool]] = []
     times_ms: list[float] = []
     fallbacks = 0
     for sentence in sentences:
         started_s = clock_s()
         graph = _graph_or_none(parser, sentence.text)
         times_ms.append(1e3 * (clock_s() - started_s))
-        right.append(_right(sentence, graph))
-        fallbacks += graph is not None and any(said.startswith("backend ") for said in graph.warnings)
-    targets, anchors, exact = (statistics.fmean(column) for column in zip(*right, strict=True))
-    wrong = tuple(each.text for each, (_, _, is_exact) in zip(sentences, right, strict=True) if not is_exact)
+        matches.append(_compare(sentence, graph))
+        fallbacks += graph is not None and any(warning.startswith("backend ") for warning in graph.warnings)
+    targets, anchors, exact = (statistics.fmean(column) for column in zip(*matches, strict=True))
+    wrong = tuple(each.text for each, (_, _, is_exact) in zip(sentences, matches, strict=True) if not is_exact)
     return ParserScore(
-        backend, len(right), exact, targets, anchors, statistics.median(times_ms), max(times_ms), fallbacks, wrong
+        backend, len(matches), exact, targets, anchors, statistics.median(times_ms), max(times_ms), fallbacks, wrong
     )
 
 
@@ -87,7 +87,8 @@ def _graph_or_none(parser: TaskParser, text: str) -> TaskGraph | None:
         return None
 
 
-def _right(sentence: Sentence, graph: TaskGraph | None) -> tuple[bool, bool, bool]:
+def _compare(sentence: Sentence, graph: TaskGraph | None) -> tuple[bool, bool, bool]:
+    """Return whether the targets, the anchors and the whole graph are correct."""
     if graph is None:
         return False, False, False
     targets, anchors = sentence.targets == set(graph.targets), sentence.anchors == set(graph.anchors)

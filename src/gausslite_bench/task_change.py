@@ -72,7 +72,7 @@ class TaskChangeBench:
         require_rate(self.rate_hz)
         for name in ("before", "after", "check_every"):
             if getattr(self, name) < 1:
-                raise InvalidInputError(f"retask {name}: expected at least 1, got {getattr(self, name)}")
+                raise InvalidInputError(f"task-change {name}: expected at least 1, got {getattr(self, name)}")
 
     def run(self, change: TaskChange) -> Recovery:
         """Map three times. Raises DatasetError, InvalidInputError."""

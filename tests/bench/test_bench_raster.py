@@ -13,10 +13,10 @@ import pytest
 from gausslite.cli.main import main
 from gausslite.errors import InvalidInputError
 from gausslite.render.rasterizer import LOG_SCALE, MEAN, RGB
-from gausslite_bench.cli.main import counts, percentages, sizes
+from gausslite_bench.cli.argument_types import image_sizes, percentages, positive_counts
 from gausslite_bench.raster.block_cost import BlockCost
 from gausslite_bench.raster.operation_costs import RasterBench
-from gausslite_bench.raster.procedural_room import held_view, seed_rows
+from gausslite_bench.raster.procedural_room import held_out_view, seed_rows
 from gausslite_bench.raster.region_costs import Layout, regions_of_share
 
 pytest.importorskip("gausslite.render._kernels", reason="the native kernels are not built")
@@ -38,7 +38,7 @@ KEYS = [
 
 
 def test_seeds_draw_the_room_that_the_held_view_shows() -> None:
-    view = held_view(96, 72)
+    view = held_out_view(96, 72)
     drawn = CpuRasterizer(threads=1).forward(seed_rows(30_000), view.camera, view.T_camera_world)
     seen = drawn.alpha > 0.9
     assert seen.mean() > 0.7
@@ -64,7 +64,7 @@ def test_every_case_is_measured_on_every_instruction_set() -> None:
     timings = list(bench.run())
     assert [(t.width, t.simd) for t in timings] == [(width, simd) for width in (48, 32) for simd in usable_simd()]
     for timing in timings:
-        assert timing.yardstick == {}
+        assert timing.external == {}
         assert timing.regions == ()
         assert set(timing.stages_ms) == {"fused_l1", "fused_l1_ssim"}
         assert all(0 < duration.min_ms <= duration.median_ms for duration in timing.durations.values())
@@ -159,7 +159,7 @@ def test_a_file_that_is_no_library_is_one_line(tmp_path: Path, capsys: pytest.Ca
     library = tmp_path / "other.so"
     library.write_text("not a library")
     small = ["--sizes", "32x32", "--gaussians", "20", "--threads", "1", "--reps", "1"]
-    assert main(["bench", "raster", *small, "--yardstick", str(library)]) == 2
+    assert main(["bench", "raster", *small, "--external-rasterizer", str(library)]) == 2
     said = capsys.readouterr().err
     assert "other.so: expected a shared library with gl_new" in said
     assert said.count("\n") == 1
@@ -168,10 +168,10 @@ def test_a_file_that_is_no_library_is_one_line(tmp_path: Path, capsys: pytest.Ca
 @pytest.mark.parametrize("text", ["", "32", "32x", "32x32x3", "0x5", "axb"])
 def test_sizes_that_are_none_are_told(text: str) -> None:
     with pytest.raises(argparse.ArgumentTypeError, match="expected"):
-        sizes(text)
+        image_sizes(text)
 
 
 @pytest.mark.parametrize("text", ["", "0", "-3", "1.5"])
 def test_counts_that_are_none_are_told(text: str) -> None:
     with pytest.raises(argparse.ArgumentTypeError, match="expected whole numbers"):
-        counts(text)
+        positive_counts(text)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -13,7 +15,7 @@ from gausslite.errors import InvalidInputError
 from gausslite.mission.settings import MissionSettings
 from gausslite.mission.task_schedule import TaskSchedule, TaskSwitch
 from gausslite.task.rules import RuleParser
-from gausslite_bench.plots import plot_panels
+from gausslite_bench.plots import write_curves
 from gausslite_bench.task_change import (
     ALWAYS,
     CHANGED,
@@ -63,13 +65,13 @@ def test_the_table_names_the_time_that_was_mapped() -> None:
         (["--rate", "nan"], "rate: expected 0.01 to 1000 Hz, got nan"),
         (["--rate=-4"], "rate: expected 0.01 to 1000 Hz, got -4.0"),
         (["--changes", ""], "changes: expected such as home-4-manipulation:home-4-navigation, got none"),
-        (["--before", "0"], "retask before: expected at least 1, got 0"),
+        (["--before", "0"], "task-change before: expected at least 1, got 0"),
     ],
 )
 def test_wrong_options_are_one_line(
     options: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["bench", "retask", "--out", str(tmp_path / "out"), *options]) == 2
+    assert main(["bench", "task-change", "--out", str(tmp_path / "out"), *options]) == 2
     [line] = capsys.readouterr().err.splitlines()
     assert message in line
     assert not (tmp_path / "out").exists()
@@ -93,16 +95,33 @@ def test_the_first_and_the_last_frame_are_looked_at(after: int, looks: list[floa
     assert all([when for when, _ in line] == looks for line in found.points.values())
 
 
-def test_a_single_look_is_seen_in_the_picture() -> None:
-    once = plot_panels({"a": {"line": [(0.25, 20.0)]}}, "seconds", "dB")
-    assert (once[60:] == (255, 208, 0)).all(axis=2).any()
+def plot(path: Path, panels: dict[str, dict[str, list[tuple[float, float]]]]) -> np.ndarray:
+    write_curves(path, panels, "seconds", "dB")
+    return cv2.imread(str(path))
 
 
-def test_curves_are_drawn_one_panel_below_the_other() -> None:
+def test_a_single_point_is_visible_in_the_plot(tmp_path: Path) -> None:
+    image = plot(tmp_path / "plot.png", {"a": {"line": [(0.25, 20.0)]}})
+    assert len(np.unique(image.reshape(-1, 3), axis=0)) > 4
+
+
+def test_panels_are_plotted_below_each_other_in_a_small_file(tmp_path: Path) -> None:
     points = recovery([3.0, 0.9, 0.4, 0.2]).points
-    one = plot_panels({"a": points}, "seconds", "dB")
-    assert len(plot_panels({"a": points, "b": points}, "seconds", "dB")) == 2 * len(one)
-    assert len(np.unique(one.reshape(-1, 3), axis=0)) > 4
+    one = plot(tmp_path / "one.png", {"a": points})
+    two = plot(tmp_path / "two.png", {"a": points, "b": points})
+    assert two.shape[0] == 2 * one.shape[0]
+    assert two.shape[1] == one.shape[1]
+    assert (tmp_path / "two.png").stat().st_size < 200_000
+
+
+def test_without_matplotlib_the_error_names_the_extra(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    assert main(["bench", "task-change", "--out", str(tmp_path / "out")]) == 2
+    [line] = capsys.readouterr().err.splitlines()
+    assert "pip install 'gausslite[plots]'" in line
+    assert not (tmp_path / "out").exists()
 
 
 def test_the_task_in_force_is_that_of_the_latest_turn() -> None:

@@ -12,9 +12,9 @@ import pytest
 
 from gausslite.cli.main import main
 from gausslite.errors import KernelError
-from gausslite.optimize.parameters import SplatTable
+from gausslite.optimize.splat_table import SplatTable
 from gausslite_bench.raster.external_rasterizer import ExternalRasterizer
-from gausslite_bench.raster.procedural_room import held_view, seed_rows
+from gausslite_bench.raster.procedural_room import held_out_view, seed_rows
 
 COMPILER = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
 if COMPILER is None:
@@ -67,11 +67,11 @@ def noted_number(library: Path, name: str) -> float:
 
 
 def test_the_library_gets_the_splats_the_view_and_every_operation(library: Path) -> None:
-    view = held_view(40, 24)  # not whole tiles: planes are padded to 48x32
+    view = held_out_view(40, 24)  # not whole tiles: planes are padded to 48x32
     table = SplatTable(60)
     table.append_rows(seed_rows(60), np.zeros(60, np.bool_), np.zeros(60, np.uint32), np.zeros(60, np.int16))
     other = ExternalRasterizer(library, 3, table, view)
-    with other.turn():
+    with other.active():
         other.fused_l1()
         other.fused_l1_ssim()
         other.forward()
@@ -93,7 +93,7 @@ def test_the_library_gets_the_splats_the_view_and_every_operation(library: Path)
 
 def test_the_benchmark_prints_its_times_beside_ours(library: Path, capsys: pytest.CaptureFixture[str]) -> None:
     small = ["--sizes", "32x32", "--gaussians", "20", "--threads", "1", "--reps", "2", "--shares", "0"]
-    assert main(["bench", "raster", *small, "--yardstick", str(library)]) == 0
+    assert main(["bench", "raster", *small, "--external-rasterizer", str(library)]) == 0
     assert capsys.readouterr().out.count("ratio") == 4
     assert noted(library, "opened") == noted(library, "closed")
 
@@ -103,4 +103,4 @@ def test_a_library_without_the_functions_is_told(tmp_path: Path) -> None:
     source.write_text("int gl_nothing;")
     subprocess.run([COMPILER, "-shared", "-fPIC", source, "-o", built], check=True)
     with pytest.raises(KernelError, match="expected a shared library with gl_new"):
-        ExternalRasterizer(built, 1, SplatTable(1), held_view(16, 16))
+        ExternalRasterizer(built, 1, SplatTable(1), held_out_view(16, 16))

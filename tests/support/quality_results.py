@@ -17,7 +17,9 @@ def scores(roi_psnr: float | None, full_psnr: float = 20.0) -> MapScores:
     return MapScores(roi_psnr, 0.8, full_psnr, 0.7, 0.02, 0.938, 3, 2, 900, 0.03)
 
 
-def finished(variant: Variant, seed: int, roi_psnr: float, budget: TrialBudget, plan: HomeScenePlan = PLAN) -> FinishedTrial:
+def finished(
+    variant: Variant, seed: int, roi_psnr: float, budget: TrialBudget, plan: HomeScenePlan = PLAN
+) -> FinishedTrial:
     trial = Trial(plan, variant, budget, seed, CONDITIONS)
     result = TrialResult(scores(roi_psnr), scores(roi_psnr + 1), 0.011, 900, 8.0, 12.5)
     return FinishedTrial(trial, result, Origin.COMPUTED)

@@ -1,1 +1,1 @@
-"""How good a map is: held-out views, image and depth metrics inside the task's region, and pictures to look at."""
+"""Score maps on held-out views: image and depth metrics inside the task's region, and comparison images."""

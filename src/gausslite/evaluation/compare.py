@@ -1,9 +1,8 @@
 """Score maps on held-out views, inside the task's region and over the whole image (Sec. IV-A, metrics).
 
-Averages are those of the field: each view has its own PSNR, SSIM and depth error (inside the region, over the
-region's pixels of that view), and a map's score is the mean over the views. Views that show fewer than
-MIN_ROI_PIXELS of the region count for the whole image only. A view's PSNR is at most MAX_PSNR_DB. SSIM is the plain one,
-not the multi-scale variant.
+Each view has its own PSNR, SSIM and depth error; ROI figures use the region's pixels of that view. The score of a map
+is the mean over its views. Views with fewer than MIN_ROI_PIXELS region pixels count for the whole image only. PSNR is
+capped at MAX_PSNR_DB. SSIM is the single-scale variant.
 """
 
 from __future__ import annotations
@@ -24,23 +23,25 @@ from gausslite.evaluation.views import HeldOutView, MapViewer
 from gausslite.render.rasterizer import Rasterizer, Rendering
 
 MAX_PSNR_DB = 100.0
-"""A view's PSNR where map and photograph are equal, as in a saturated region: with infinity no mean would be left."""
+"""Cap on a view's PSNR: equal images, such as a saturated region, would make the mean infinite."""
 _COVERED_ALPHA = 0.5
 
 
 @runtime_checkable
 class PerceptualDistance(Protocol):
-    """How different two images look, pixel by pixel."""
+    """Perceptual distance of two images per pixel."""
 
     def distance_map(self, a: Shaped[ndarray, "h w 3"], b: Shaped[ndarray, "h w 3"]) -> Float32[ndarray, "h w"]:
-        """0 where they look the same. Images are uint8, or floating in [0, 1]."""
+        """Return the distance per pixel, 0 for equal images. Images are uint8, or floating in [0, 1]."""
         ...
 
 
 @dataclass(frozen=True, slots=True)
 class RoiScore:
-    """One view's figures inside the region. covered: share of its pixels with measured depth that the map draws, with
-    alpha above 0.5; depth error is known there alone.
+    """Scores of one view inside the region.
+
+    covered: share of the region's pixels with measured depth where the map's alpha exceeds 0.5. The depth error uses
+    only those pixels.
     """
 
     psnr: float
@@ -52,7 +53,7 @@ class RoiScore:
 
 @dataclass(frozen=True, slots=True)
 class ViewScore:
-    """One view's figures; roi is None where the view shows too little of the region."""
+    """Scores of one view; roi is None if the view shows too little of the region."""
 
     index: int
     psnr: float
@@ -65,11 +66,10 @@ class ViewScore:
 
 @dataclass(frozen=True, slots=True)
 class MapScores:
-    """Means over the views: PSNR in dB, depth in metres, coverage a share. None where no view has such a figure, or
-    LPIPS had no weights.
+    """Means over the views: PSNR in dB, depth in metres, coverage as a share.
 
-    n_views and n_roi_views count the views behind the full and the ROI figures; roi_pixels sums the region's pixels
-    over the latter.
+    A figure is None if no view has it, or if LPIPS has no weights. n_views and n_roi_views count the views behind the
+    full-image and the ROI figures. roi_pixels sums the region's pixels over the n_roi_views views.
     """
 
     roi_psnr: float | None
@@ -87,21 +87,21 @@ class MapScores:
 
 
 def evaluate(gaussians: Gaussians, views: Sequence[HeldOutView], rasterizer: Rasterizer) -> MapScores:
-    """Draw the map from every held-out view and average. Raises InvalidInputError without views."""
+    """Return the mean scores of the map over the held-out views. Raises InvalidInputError without views."""
     viewer = MapViewer(gaussians, rasterizer)
     return average([score_view(viewer.render_frame(view.frame), view) for view in views])
 
 
-def score_view(drawn: Rendering, view: HeldOutView, perceptual: PerceptualDistance | None = None) -> ViewScore:
-    """Compare one rendering with its frame; LPIPS is left out without a network for it."""
+def score_view(rendering: Rendering, view: HeldOutView, perceptual: PerceptualDistance | None = None) -> ViewScore:
+    """Return the scores of one rendering against its frame; LPIPS needs `perceptual`."""
     rgb = view.frame.rgb
-    similarity = ssim_map(drawn.rgb, rgb)
-    depth_m = drawn.expected_depth_m(_COVERED_ALPHA)
-    distance = None if perceptual is None else perceptual.distance_map(drawn.rgb, rgb)
+    similarity = ssim_map(rendering.rgb, rgb)
+    depth_m = rendering.expected_depth_m(_COVERED_ALPHA)
+    distance = None if perceptual is None else perceptual.distance_map(rendering.rgb, rgb)
     roi = None
     if view.shows_region:
         roi = RoiScore(
-            min(psnr(drawn.rgb, rgb, view.roi), MAX_PSNR_DB),
+            min(psnr(rendering.rgb, rgb, view.roi), MAX_PSNR_DB),
             float(similarity[view.roi].mean()),
             depth_l1_m(depth_m, view.frame.depth_m, view.roi),
             covered_share(depth_m, view.frame.depth_m, view.roi),
@@ -109,7 +109,7 @@ def score_view(drawn: Rendering, view: HeldOutView, perceptual: PerceptualDistan
         )
     return ViewScore(
         index=view.frame.index,
-        psnr=min(psnr(drawn.rgb, rgb), MAX_PSNR_DB),
+        psnr=min(psnr(rendering.rgb, rgb), MAX_PSNR_DB),
         ssim=float(similarity.mean()),
         roi_pixels=int(np.count_nonzero(view.roi)),
         roi=roi,
@@ -119,7 +119,7 @@ def score_view(drawn: Rendering, view: HeldOutView, perceptual: PerceptualDistan
 
 
 def average(scores: Sequence[ViewScore]) -> MapScores:
-    """The map's scores from its views' scores. Raises InvalidInputError without views."""
+    """Return the mean of the views' scores. Raises InvalidInputError without views."""
     if not scores:
         raise InvalidInputError("held-out views: expected at least one, got none")
     rois = [score.roi for score in scores if score.roi is not None]

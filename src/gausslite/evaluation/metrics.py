@@ -1,4 +1,4 @@
-"""Compare a drawn image with the true one: PSNR, plain SSIM and depth error, over all pixels or inside a mask."""
+"""Image metrics: PSNR, single-scale SSIM and depth error, over all pixels or inside a mask."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ _C1, _C2 = 0.01**2, 0.03**2
 
 
 def psnr(a: Shaped[ndarray, "h w 3"], b: Shaped[ndarray, "h w 3"], mask: Bool[ndarray, "h w"] | None = None) -> float:
-    """Peak signal-to-noise ratio in dB over the masked pixels' three channels; infinite for equal images.
+    """Return the peak signal-to-noise ratio in dB over the masked pixels' three channels; infinite for equal images.
 
-    Images are uint8, or floating in [0, 1]. Raises ShapeError, InvalidInputError when the mask is empty.
+    Images are uint8, or floating in [0, 1]. Raises ShapeError, and InvalidInputError if the mask is empty.
     """
     first, second = _unit_images(a, b)
     squared = np.square(first - second)
@@ -28,13 +28,13 @@ def psnr(a: Shaped[ndarray, "h w 3"], b: Shaped[ndarray, "h w 3"], mask: Bool[nd
 
 
 def ssim(a: Shaped[ndarray, "h w 3"], b: Shaped[ndarray, "h w 3"], mask: Bool[ndarray, "h w"] | None = None) -> float:
-    """Mean over the masked pixels and the three channels of `ssim_map`. Takes and raises what `psnr` does."""
+    """Return the mean of `ssim_map` over the masked pixels and three channels. Arguments and errors are `psnr`'s."""
     similarity = ssim_map(a, b)
     return float(np.mean(similarity if mask is None else similarity[_checked_mask(mask, similarity)]))
 
 
 def ssim_map(a: Shaped[ndarray, "h w 3"], b: Shaped[ndarray, "h w 3"]) -> Float64[ndarray, "h w 3"]:
-    """Plain structural similarity (Wang et al. 2004) of every pixel: 11x11 Gaussian window, sigma 1.5, zero padding."""
+    """Return single-scale SSIM per pixel (Wang et al. 2004): 11x11 Gaussian window, sigma 1.5, zero padding."""
     first, second = _unit_images(a, b)
     mean_a, mean_b = _blur(first), _blur(second)
     variance_a = _blur(first * first) - mean_a * mean_a
@@ -48,9 +48,9 @@ def ssim_map(a: Shaped[ndarray, "h w 3"], b: Shaped[ndarray, "h w 3"]) -> Float6
 def depth_l1_m(
     depth_m: Float32[ndarray, "h w"], measured_m: Float32[ndarray, "h w"], mask: Bool[ndarray, "h w"] | None = None
 ) -> float | None:
-    """Mean absolute depth difference in metres where both are positive; None where there is no such pixel.
+    """Return the mean absolute depth difference in metres where both depths are positive; None without such pixels.
 
-    Holes in what is judged do not count, so that `covered_share` belongs beside it.
+    Holes in `depth_m` are ignored; `covered_share` reports them.
     """
     both = _measured(depth_m, measured_m, mask) & (depth_m > 0)
     if not both.any():
@@ -61,7 +61,7 @@ def depth_l1_m(
 def covered_share(
     depth_m: Float32[ndarray, "h w"], measured_m: Float32[ndarray, "h w"], mask: Bool[ndarray, "h w"] | None = None
 ) -> float | None:
-    """Share of the pixels with a measured depth that have a depth at all; None where nothing was measured."""
+    """Return the share of pixels with a measured depth where `depth_m` is positive; None without measurements."""
     measured = _measured(depth_m, measured_m, mask)
     return float((depth_m[measured] > 0).mean()) if measured.any() else None
 

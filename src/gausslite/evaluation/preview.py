@@ -1,4 +1,4 @@
-"""A finished map at a glance: the keyframes that show most of the task's region, and the map drawn from there."""
+"""Preview image of a finished map: keyframes with most of the task's region next to the map's renderings."""
 
 from __future__ import annotations
 
@@ -16,14 +16,15 @@ _ROWS = 3
 
 
 def render_preview(viewer: MapViewer, keyframes: Sequence[Keyframe]) -> UInt8[ndarray, "H W 3"]:
-    """One row for each third of the mission, in the poses and colours that keyframes were mapped with.
+    """Return an image with one row per third of the mission, in the keyframes' refined poses and exposures.
 
-    These are views the map was trained on: they show what it has, and say nothing of how it looks from elsewhere.
+    The map was trained on these views, so they do not show its quality from other viewpoints.
     """
-    chosen = largest_roi_per_segment([int(np.count_nonzero(each.relevance.roi)) for each in keyframes], _ROWS)
+    roi_pixels = [int(np.count_nonzero(keyframe.relevance.roi)) for keyframe in keyframes]
+    chosen = largest_roi_per_segment(roi_pixels, _ROWS)
     rows = []
     for keyframe in (keyframes[i] for i in sorted(chosen)):
-        drawn = viewer.render_frame(keyframe.frame)
+        rendering = viewer.render_frame(keyframe.frame)
         label = f"frame {keyframe.frame.index}"
-        rows.append(comparison_row(keyframe.frame.rgb, drawn.rgb, keyframe.relevance.roi, label))
+        rows.append(comparison_row(keyframe.frame.rgb, rendering.rgb, keyframe.relevance.roi, label))
     return arrange_grid(rows)

@@ -1,4 +1,4 @@
-"""Score a team's maps side by side on the same held-out views: each agent alone, and every way of fusing them."""
+"""Score several maps on the same held-out views: each agent's map and every fusion of them."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from gausslite.render.rasterizer import Rasterizer
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HeldOutFrames:
-    """Held-out frames: positions of a source at one size (width, height)."""
+    """Positions of held-out frames in a source, read at one size (width_px, height_px)."""
 
     source: Source
     positions: Sequence[int]
@@ -30,7 +30,7 @@ class HeldOutFrames:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TeamScores:
-    """Scores by map name, and a few side-by-side sheets by frame number."""
+    """Scores by map name, and a few comparison sheets by frame number."""
 
     scores: dict[str, MapScores]
     sheets: dict[str, UInt8[ndarray, "_ _ 3"]]
@@ -38,18 +38,18 @@ class TeamScores:
 
 def score_team(
     maps: Mapping[str, Gaussians],
-    viewpoints: Iterable[HeldOutFrames],
+    held_out: Iterable[HeldOutFrames],
     regions: Sequence[Region],
     rasterizer: Rasterizer,
     fit_views: bool = False,
     sheets: int = 4,
 ) -> TeamScores:
-    """Draw every map from every view; the sheets show the views with the most of the region, spread over the sequence.
+    """Return the scores of every map over all held-out views, with comparison sheets of `sheets` views.
 
-    With fit_views each drawing is in the pose and colours that fit the view (`render_fitted`). Raises InvalidInputError
-    without a single view with depth.
+    The sheets show the views with the largest region, spread over the sequence. With fit_views, each rendering uses
+    the fitted pose and exposure (`render_fitted`). Raises InvalidInputError if no view has depth.
     """
-    views = [view for point in viewpoints for view in _views(point, regions)]
+    views = [view for frames in held_out for view in _views(frames, regions)]
     if not views:
         raise InvalidInputError("held-out views: expected at least one frame with depth, got none")
     viewers = {name: MapViewer(gaussians, rasterizer) for name, gaussians in maps.items()}
@@ -57,18 +57,18 @@ def score_team(
     shown = largest_roi_views(views, sheets)
     pictures = {}
     for i, view in enumerate(views):
-        drawings: dict[str, Float32[ndarray, "h w 3"]] = {}
+        renderings: dict[str, Float32[ndarray, "h w 3"]] = {}
         for name, viewer in viewers.items():
-            drawn = render_fitted(viewer, view.frame) if fit_views else viewer.render_frame(view.frame)
-            scores[name].append(score_view(drawn, view))
-            drawings[name] = drawn.rgb
+            rendering = render_fitted(viewer, view.frame) if fit_views else viewer.render_frame(view.frame)
+            scores[name].append(score_view(rendering, view))
+            renderings[name] = rendering.rgb
         if i in shown:
-            pictures[f"{i:03d}-frame-{view.frame.index:06d}"] = comparison_sheet(view, drawings)
-    return TeamScores({name: average(listed) for name, listed in scores.items()}, pictures)
+            pictures[f"{i:03d}-frame-{view.frame.index:06d}"] = comparison_sheet(view, renderings)
+    return TeamScores({name: average(view_scores) for name, view_scores in scores.items()}, pictures)
 
 
-def _views(point: HeldOutFrames, regions: Sequence[Region]) -> Iterable[HeldOutView]:
-    for position in point.positions:
-        frame = point.source.frame(position, point.size)
+def _views(held_out: HeldOutFrames, regions: Sequence[Region]) -> Iterable[HeldOutView]:
+    for position in held_out.positions:
+        frame = held_out.source.frame(position, held_out.size)
         if frame.has_depth:
             yield HeldOutView.of(frame, regions)

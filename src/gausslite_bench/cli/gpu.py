@@ -1,4 +1,4 @@
-"""`gausslite bench gpu`: its options, and its figures as a table."""
+"""`gausslite bench gpu`: training speed of the CUDA backend."""
 
 from __future__ import annotations
 
@@ -7,11 +7,28 @@ import json
 
 from gausslite.errors import KernelError
 from gausslite.render.choose import choose_rasterizer
-from gausslite_bench.raster.gpu_rates import PAPERS_FRAME_MS, FrameCost, GpuBench, StepRate
+from gausslite_bench.cli.argument_types import positive_counts
+from gausslite_bench.raster.gpu_rates import GPU_GAUSSIANS, PAPER_FRAME_MS, FrameCost, GpuBench, StepRate
+
+
+def configure_gpu(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `bench gpu`."""
+    add = parser.add_argument
+    counts = ",".join(str(count) for count in GPU_GAUSSIANS)
+    add(
+        "--gaussians",
+        metavar="N,...",
+        type=positive_counts,
+        default=GPU_GAUSSIANS,
+        help=f"numbers of Gaussians (default: {counts})",
+    )
+    add("--reps", metavar="N", type=int, default=100, help="timed iterations of each kind (default: %(default)s)")
+    add("--json", action="store_true", help="print JSON for scripts")
+    parser.set_defaults(run=run_gpu)
 
 
 def run_gpu(options: argparse.Namespace) -> int:
-    """Measure, and print a table or one JSON object. Raises KernelError without a GPU that can be used."""
+    """Run the benchmark and print a table or one JSON object. Raises KernelError without a usable GPU."""
     rasterizer = choose_rasterizer("cuda")
     from gausslite.render.cuda import CudaRasterizer
 
@@ -29,28 +46,29 @@ def run_gpu(options: argparse.Namespace) -> int:
 
 
 def gpu_record(device: str, rates: list[StepRate], frame: FrameCost) -> dict[str, object]:
-    """Everything that was measured, for scripts."""
+    """Return all measurements as one JSON object."""
     return {"device": device, "rates": [rate.as_json() for rate in rates], "frame": frame.as_json()}
 
 
 def rate_heading(device: str, bench: GpuBench) -> str:
-    """What the lines of the table say."""
+    """Return the header of the table."""
     width, height = bench.size
-    names = "".join(f"{name:>20}" for name in ("whole image", "a fifth of it", "gsplat plainly"))
-    return f"{device}, {width}x{height}, iterations a second (best / median of turns)\n{'Gaussians':>10}{names}  ratio"
+    names = "".join(f"{name:>20}" for name in ("full image", "20 % region", "gsplat baseline"))
+    return f"{device}, {width}x{height}, iterations per second (best / median)\n{'Gaussians':>10}{names}  ratio"
 
 
 def rate_line(rate: StepRate) -> str:
-    """One size of map. The ratio is ours over gsplat's, on the whole image."""
+    """Return one table row. The ratio is this backend's rate over gsplat's, on the full image."""
     cells = (f"{rate.best[name]:.1f} / {rate.median[name]:.1f}" for name in ("whole", "region", "gsplat"))
     ratio = rate.best["whole"] / rate.best["gsplat"]
     return f"{rate.gaussians:>10}" + "".join(f"{cell:>20}" for cell in cells) + f"  {ratio:.2f}"
 
 
 def frame_lines(cost: FrameCost) -> str:
-    """The frame, and where its time went."""
-    steps = "  ".join(f"{name} {ms:.1f}" for name, ms in cost.steps_ms.items())
+    """Return the time of one mapped frame, in total and per stage."""
+    stages = "  ".join(f"{name} {ms:.1f}" for name, ms in cost.steps_ms.items())
     return (
-        f"a frame on {cost.gaussians} Gaussians, {cost.iterations} iterations: {cost.whole.min_ms:.1f} / "
-        f"{cost.whole.median_ms:.1f} ms (minimum / median; the paper allows {PAPERS_FRAME_MS:.0f})\n  {steps}"
+        f"one frame on {cost.gaussians} Gaussians, {cost.iterations} iterations: {cost.whole.min_ms:.1f} / "
+        f"{cost.whole.median_ms:.1f} ms (minimum / median; the paper's frame time is {PAPER_FRAME_MS:.0f} ms)\n"
+        f"  {stages}"
     )

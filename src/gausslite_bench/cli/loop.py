@@ -9,7 +9,8 @@ from dataclasses import asdict, dataclass
 from gausslite.cli.map_command import choose_attention
 from gausslite.cli.progress import MappingBar
 from gausslite.cli.source_options import add_regions, asked_regions, open_with_warnings
-from gausslite.config.options import add_budget, add_detector, add_frames, add_policy, mission_settings
+from gausslite.config.mapping_options import add_budget, add_detector, add_policy, mission_settings
+from gausslite.config.source_options import add_frames
 from gausslite.datasets.held_out import HeldOutSplit
 from gausslite.datasets.selection import frame_size, select_frames
 from gausslite.datasets.source import Source
@@ -31,10 +32,10 @@ _HOME_TASK = "Pick up the mug on the table"
 _MEMORY_SAMPLES = 40
 
 
-def configure(parser: argparse.ArgumentParser) -> None:
+def configure_loop(parser: argparse.ArgumentParser) -> None:
     """Add the options of `gausslite bench loop`."""
     parser.add_argument("source", metavar="SOURCE", nargs="?", default=_HOME, help="as in map (default: %(default)s)")
-    add_frames(parser, may_look=True)
+    add_frames(parser, allow_auto=True)
     parser.add_argument("--task", metavar="TEXT", help=f'as in map (on the default source "{_HOME_TASK}")')
     add_detector(parser)
     add_regions(parser)
@@ -49,10 +50,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="also map with N iterations a frame and compare ROI PSNR; every 8th frame is held out",
     )
     add("--json", action="store_true", help="print JSON for scripts")
-    parser.set_defaults(run=run)
+    parser.set_defaults(run=run_loop)
 
 
-def run(options: argparse.Namespace) -> int:
+def run_loop(options: argparse.Namespace) -> int:
     """Map the sequence with a clock between the steps and print the figures. Reading frames is not counted."""
     if options.source == _HOME and options.policy == TASK and not _says_what_matters(options):
         options.task = _HOME_TASK

@@ -10,7 +10,8 @@ from dataclasses import asdict
 from pathlib import Path
 
 from gausslite.cli.source_options import add_source, open_with_warnings
-from gausslite.config.options import add_detector, names
+from gausslite.config.mapping_options import add_detector
+from gausslite.config.values import read_names
 from gausslite.datasets.selection import frame_size, select_frames
 from gausslite.datasets.source import Source
 from gausslite.domain.region import Region
@@ -38,7 +39,7 @@ def configure_perception(parser: argparse.ArgumentParser) -> None:
         default=[],
         help="a task and the objects it is about; may be repeated (default: a search for each kind of object)",
     )
-    add("--absent", metavar="A,B", type=names, default=(), help="nouns of which nothing is there: what do they mark?")
+    add("--absent", metavar="A,B", type=read_names, default=(), help="nouns of which nothing is there: what do they mark?")
     add("--threads", metavar="N", type=int, help="the detector's threads (default: the runtime's choice)")
     add("--pictures", metavar="DIR", type=Path, help="write a sheet for each task here")
     add("--json", action="store_true", help="print JSON for scripts")
@@ -117,7 +118,7 @@ def _asked(texts: Sequence[str], regions: Mapping[str, Region]) -> list[Question
                 raise InvalidInputError(
                     f"--task: expected a task and its objects such as 'Find the mug=mug_1', got {text!r}"
                 )
-        return [Question(parser.parse(task), names(objects)) for task, _, objects in parts]
+        return [Question(parser.parse(task), read_names(objects)) for task, _, objects in parts]
     kinds: dict[str, list[str]] = {}
     for name in regions:
         kinds.setdefault(head_of(name), []).append(name)

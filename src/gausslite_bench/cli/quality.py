@@ -17,7 +17,9 @@ from tqdm import tqdm
 from gausslite.cli.progress import progress_bar
 from gausslite.cli.source_options import open_with_warnings
 from gausslite.codec.files import write_atomic
-from gausslite.config.options import LOOK, add_colour_camera, add_view_error, names, up_axis
+from gausslite.config.mapping_options import add_pose_prior
+from gausslite.config.source_options import add_register_depth
+from gausslite.config.values import AUTO, read_names, read_up_axis
 from gausslite.datasets.regions import REGIONS_FILE
 from gausslite.datasets.selection import downscaled_size
 from gausslite.errors import InvalidInputError
@@ -51,8 +53,8 @@ _HOME_SIZE = (320, 240)
 def configure_quality(parser: argparse.ArgumentParser) -> None:
     """Add the options of `bench quality`."""
     add = parser.add_argument
-    add("--pairs", metavar="A,B", type=names, default=(), help="such as home-3,home-4-search (default: all 24)")
-    add("--policies", metavar="A,B", type=names, default=tuple(POLICIES), help="ours first (default: all there are)")
+    add("--pairs", metavar="A,B", type=read_names, default=(), help="such as home-3,home-4-search (default: all 24)")
+    add("--policies", metavar="A,B", type=read_names, default=tuple(POLICIES), help="ours first (default: all there are)")
     _add_common(parser, seeds=(0,), equal=str(BudgetMode.ITERATIONS))
     add("--perception", metavar="gt|words|FILE.onnx", default="gt", help="masks given (default), or found by the task")
     parser.set_defaults(run=run_quality)
@@ -64,7 +66,7 @@ def configure_ablation(parser: argparse.ArgumentParser) -> None:
     add(
         "--pair",
         metavar="A,B",
-        type=names,
+        type=read_names,
         default=(),
         help=f"home and task (default: {_ABLATION_PAIR}, none beside a real sequence)",
     )
@@ -106,7 +108,7 @@ def _add_common(parser: argparse.ArgumentParser, seeds: tuple[int, ...], equal: 
     shown = ",".join(str(seed) for seed in seeds)
     add("--out", metavar="DIR", type=Path, required=True, help="gets tables and sheets; finished trials there are kept")
     add("--reuse-other-code", action="store_true", help="take finished trials of other code too (default: made again)")
-    add("--seeds", metavar="N,...", type=whole_numbers, default=seeds, help=f"seeds of the mapper (default: {shown})")
+    add("--seeds", metavar="N,...", type=parse_seeds, default=seeds, help=f"seeds of the mapper (default: {shown})")
     add("--size", metavar="WxH", type=size, help="image size (default: 320x240, a real sequence's in its proportions)")
     add("--frames", metavar="N", type=int, help="training frames (default: 60 in a home, all of a real sequence)")
     add("--views", metavar="N", type=int, default=24, help="held-out views in a home (default: %(default)s)")
@@ -128,7 +130,7 @@ def _add_common(parser: argparse.ArgumentParser, seeds: tuple[int, ...], equal: 
     )
     add("--threads", metavar="N", type=int, help="threads (default: all the processor allows)")
     add("--lpips-weights", metavar="PATH", type=Path, action="append", default=[], help="AlexNet's and LPIPS' weights")
-    add_view_error(parser, default=None, shown=f"homes trusted, real {REAL_CAMERA.pose_prior}")
+    add_pose_prior(parser, None, f"homes none, real {REAL_CAMERA.pose_prior}", allow_auto=False)
     add(
         "--fit-views",
         action=argparse.BooleanOptionalAction,
@@ -144,9 +146,9 @@ def _add_common(parser: argparse.ArgumentParser, seeds: tuple[int, ...], equal: 
         type=Path,
         help=f"its regions (default: FOLDER/{REGIONS_FILE}), a pair a kind of object",
     )
-    real.add_argument("--kinds", metavar="A,B", type=names, default=(), help="such as mug,chair (default: all in FILE)")
-    real.add_argument("--up", metavar="X,Y,Z", type=up_axis, help="its upward direction, if not the source's")
-    add_colour_camera(real, may_look=True, by_default=LOOK)
+    real.add_argument("--kinds", metavar="A,B", type=read_names, default=(), help="such as mug,chair (default: all in FILE)")
+    real.add_argument("--up", metavar="X,Y,Z", type=read_up_axis, help="its upward direction, if not the source's")
+    add_register_depth(real, allow_auto=True, default_text=AUTO)
 
 
 def _plans(
@@ -180,7 +182,7 @@ def _real(options: argparse.Namespace) -> tuple[list[RealScenePlan], tuple[int, 
     # what is wrong with the options is told before anything is looked for in the images
     plans = real_plans(options.real, roi, options.frames, options.up, trust=_trust(options, REAL_CAMERA))
     chosen = choose_kinds(plans, options.kinds)
-    source, camera = open_with_warnings(str(options.real), options.up, options.register_depth, LOOK)
+    source, camera = open_with_warnings(str(options.real), options.up, options.register_depth, AUTO)
     return [replace(plan, depth_registration=camera) for plan in chosen], downscaled_size(source.camera)
 
 
@@ -302,9 +304,9 @@ def _write(folder: Path, name: str, table: str, board: Scoreboard) -> None:
     print(f"→ {folder / f'{name}.md'}")
 
 
-def whole_numbers(text: str) -> tuple[int, ...]:
+def parse_seeds(text: str) -> tuple[int, ...]:
     """Read "N,N"; argparse reports what is wrong."""
-    parts = names(text)
+    parts = read_names(text)
     if not parts or not all(part.isascii() and part.isdigit() and len(part) < 10 for part in parts):
         raise argparse.ArgumentTypeError(f"expected whole numbers such as 0,1,2, got {text!r}")
     return tuple(int(part) for part in parts)

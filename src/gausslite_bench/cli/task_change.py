@@ -1,4 +1,4 @@
-"""`gausslite bench retask`: how soon a map serves a task that came in the middle of the mission."""
+"""`gausslite bench task-change`: recovery of map quality after the task changes during a mission."""
 
 from __future__ import annotations
 
@@ -9,12 +9,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from gausslite.codec.files import write_atomic
-from gausslite.config.options import names
+from gausslite.config.values import read_names
 from gausslite.errors import InvalidInputError
-from gausslite.evaluation.pictures import write_png
 from gausslite.mission.results import prepare_folder, write_json
 from gausslite.mission.settings import MissionSettings
-from gausslite_bench.plots import plot_panels
+from gausslite_bench.plots import require_matplotlib, write_curves
 from gausslite_bench.task_change import Recovery, TaskChange, TaskChangeBench, recovery_table
 
 _CHANGES = (
@@ -25,24 +24,36 @@ _CHANGES = (
 
 
 def configure_task_change(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `bench retask`."""
+    """Add the options of `bench task-change`."""
     add = parser.add_argument
-    add("--out", metavar="DIR", type=Path, required=True, help="gets retask.md, retask.json and retask.png")
-    add("--changes", metavar="A:B,...", type=names, default=_CHANGES, help=f"default: {','.join(_CHANGES)}")
+    add(
+        "--out",
+        metavar="DIR",
+        type=Path,
+        required=True,
+        help="folder for task-change.md, task-change.json and task-change.png",
+    )
+    add(
+        "--changes",
+        metavar="A:B,...",
+        type=read_names,
+        default=_CHANGES,
+        help=f"pairs of tasks in one home, first:second (default: {','.join(_CHANGES)})",
+    )
     add("--before", metavar="N", type=int, default=48, help="frames before the change (default: %(default)s)")
-    add("--after", metavar="N", type=int, default=48, help="frames after it (default: %(default)s)")
+    add("--after", metavar="N", type=int, default=48, help="frames after the change (default: %(default)s)")
     add("--views", metavar="N", type=int, default=12, help="held-out views (default: %(default)s)")
     add("--max-gaussians", metavar="N", type=int, default=60_000, help="hard cap (default: %(default)s)")
-    add("--iterations", metavar="N", type=int, default=8, help="a frame (default: %(default)s)")
-    add("--rate", metavar="HZ", type=float, default=4.0, help="frames a second (default: %(default)s)")
-    add("--timed", action="store_true", help="as many iterations as fit into a frame's time, instead of --iterations")
-    add("--seed", metavar="S", type=int, default=0, help="seed of every random choice (default: 0)")
-    add("--threads", metavar="N", type=int, help="threads (default: all the processor allows)")
+    add("--iterations", metavar="N", type=int, default=8, help="iterations per frame (default: %(default)s)")
+    add("--rate", metavar="HZ", type=float, default=4.0, help="frame rate in Hz (default: %(default)s)")
+    add("--timed", action="store_true", help="run as many iterations as fit into 1/rate seconds, not --iterations")
+    add("--seed", metavar="S", type=int, default=0, help="seed of all random numbers (default: 0)")
+    add("--threads", metavar="N", type=int, help="threads (default: all available cores)")
     parser.set_defaults(run=run_task_change)
 
 
 def run_task_change(options: argparse.Namespace) -> int:
-    """Map each change three times; what is known is written after each, so that an interrupt loses one change alone."""
+    """Run the benchmark and rewrite the files after each change, so that an interrupt loses one change at most."""
     settings = MissionSettings(
         max_gaussians=options.max_gaussians,
         iterations=None if options.timed else options.iterations,
@@ -53,6 +64,7 @@ def run_task_change(options: argparse.Namespace) -> int:
     changes = [TaskChange.parse(text) for text in options.changes]
     if not changes:
         raise InvalidInputError(f"changes: expected such as {_CHANGES[0]}, got none")
+    require_matplotlib()
     bench = TaskChangeBench(settings, options.rate, options.before, options.after, options.views)
     prepare_folder(options.out)
     recoveries: list[Recovery] = []
@@ -61,13 +73,15 @@ def run_task_change(options: argparse.Namespace) -> int:
         print(recovery_table(recoveries[-1:]).splitlines()[-1], file=sys.stderr, flush=True)
         _write(options.out, recoveries)
     print(recovery_table(recoveries))
-    print(f"→ {options.out / 'retask.md'}")
+    print(f"→ {options.out / 'task-change.md'}")
     return 0
 
 
 def _write(folder: Path, recoveries: Sequence[Recovery]) -> None:
     command = shlex.join(["gausslite", *sys.argv[1:]])
-    write_atomic(folder / "retask.md", f"# bench retask\n\n`{command}`\n\n{recovery_table(recoveries)}".encode())
-    write_json(folder / "retask.json", {"command": command, "changes": [each.as_json() for each in recoveries]})
+    write_atomic(
+        folder / "task-change.md", f"# bench task-change\n\n`{command}`\n\n{recovery_table(recoveries)}".encode()
+    )
+    write_json(folder / "task-change.json", {"command": command, "changes": [each.as_json() for each in recoveries]})
     panels = {each.change.name: each.points for each in recoveries}
-    write_png(folder / "retask.png", plot_panels(panels, "seconds of mapping since the change", "ROI PSNR, dB"))
+    write_curves(folder / "task-change.png", panels, "seconds of mapping since the change", "ROI PSNR in dB")

@@ -21,7 +21,7 @@ from gausslite.evaluation.fitted import render_fitted
 from gausslite.evaluation.pictures import to_uint8
 from gausslite.evaluation.views import MapViewer, largest_roi_views
 from gausslite.mapping.policies import TASK
-from gausslite.mission.build import build_mapper, build_estimator
+from gausslite.mission.build import build_estimator, build_mapper
 from gausslite.mission.frame_scheduler import Clock, FrameScheduler
 from gausslite.mission.settings import MissionSettings, PerceptionSettings
 from gausslite.mission.task_mapper import TaskMapper
@@ -106,13 +106,13 @@ class Trial:
     @property
     def mission(self) -> MissionSettings:
         """How the robot maps. Raises InvalidInputError for an unknown policy or component."""
-        measure_seconds = self.budget.equal is BudgetMode.TIME
+        timed = self.budget.equal is BudgetMode.TIME
         return MissionSettings(
             policy=self.variant.policy,
             disabled=self.variant.without,
             max_gaussians=self.budget.max_gaussians,
-            iterations=None if measure_seconds else self.budget.iterations,
-            rate_hz=self.budget.rate_hz if measure_seconds else None,
+            iterations=None if timed else self.budget.iterations,
+            rate_hz=self.budget.rate_hz if timed else None,
             seed=self.seed,
             threads=self.conditions.threads,
             pose_prior=self.plan.trust.pose_prior,

@@ -1,1 +1,1 @@
-"""Benchmarks of the rasterizer."""
+"""Benchmarks of the rasterizers."""

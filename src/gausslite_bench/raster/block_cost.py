@@ -1,4 +1,4 @@
-"""Say what drawing and walking back cost in cycles of the core."""
+"""Cost of compositing and its backward pass in CPU core cycles."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class BlockCost:
-    """Core cycles for each time that a splat is composited on a 4x4 block of pixels and walked back over.
+    """Core cycles per block evaluation: compositing one splat on a 4x4 pixel block, forward and backward.
 
-    evaluations: of one step. cycles: of all threads together, sorting and binning and waiting for each other included.
+    evaluations: block evaluations of one step. cycles: sum over all threads, including sorting, binning and waiting.
     """
 
     evaluations: int
@@ -19,8 +19,10 @@ class BlockCost:
 
     @classmethod
     def of(cls, evaluations: int, clock_ghz: float, threads: int, stages_ms: Mapping[str, float]) -> BlockCost:
-        """From the stages of a step with L1 alone: one pass draws, compares and walks back, and all threads end it
-        together. With SSIM the threads do each other's work, and one thread's times tell nothing of the others'.
+        """Return the cost from the stage times of a step with L1 only.
+
+        That step composites, computes the loss and runs backward in one pass that all threads end together. With SSIM
+        the threads share work, so the times of one thread do not represent the others.
         """
         busy_ms = threads * stages_ms["raster"]
         return cls(evaluations, clock_ghz, busy_ms * clock_ghz * 1e6 / max(evaluations, 1))

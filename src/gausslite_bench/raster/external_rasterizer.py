@@ -1,6 +1,6 @@
-"""Drive another rasterizer library through its C functions, to measure it beside ours on the same splats and view.
+"""Adapter that measures an external rasterizer library on the same splats and view, through its C functions.
 
-The library keeps rows of the same layout and moments of the same shape, images as planes padded to whole tiles of 16
+The library uses the same splat rows and Adam moments as GaussLite. Its images are planes padded to whole tiles of 16
 pixels. It exports gl_new, gl_free, gl_setup, gl_forward, gl_set_grad, gl_backward, gl_pbwd and gl_step.
 """
 
@@ -16,7 +16,7 @@ from jaxtyping import Float32
 from numpy import ndarray
 
 from gausslite.errors import KernelError
-from gausslite.optimize.parameters import SplatTable
+from gausslite.optimize.splat_table import SplatTable
 from gausslite.render.rasterizer import ROW_WIDTH, TILE_PX
 from gausslite_bench.raster.procedural_room import BenchView
 
@@ -40,10 +40,10 @@ _FUNCTIONS = {
 
 
 class ExternalRasterizer:
-    """One case inside the library; learning rates are zero, so its splats stay where they are."""
+    """One benchmark case in the library; learning rates are zero, so the splats do not change."""
 
     def __init__(self, library: Path, threads: int, table: SplatTable, view: BenchView) -> None:
-        """Load the library and hand it the splats and the view. Raises KernelError when it is not such a library."""
+        """Load the library and copy the view. Raises KernelError if the library lacks the functions."""
         self._lib = _load(library)
         self._table = table
         self._image = _planes(view.rgb.transpose(2, 0, 1).astype(np.float32) / np.float32(255.0))
@@ -62,8 +62,8 @@ class ExternalRasterizer:
         self._handle = ctypes.c_void_p()
 
     @contextmanager
-    def turn(self) -> Iterator[None]:
-        """Its threads and memory, for as long as it is measured: idle threads may wake now and then at our cost."""
+    def active(self) -> Iterator[None]:
+        """Create the library's threads and memory for the block only: idle threads would disturb other measurements."""
         self._handle = ctypes.c_void_p(self._lib.gl_new(self._threads))
         try:
             self._lib.gl_setup(self._handle, self._camera.ctypes.data, *self._size_px, None, 0)
@@ -72,19 +72,19 @@ class ExternalRasterizer:
             self._lib.gl_free(self._handle)
 
     def fused_l1(self) -> None:
-        """One whole iteration with L1 on colour and depth."""
+        """Run one whole iteration with L1 on colour and depth."""
         self._step(_FUSED_L1)
 
     def fused_l1_ssim(self) -> None:
-        """One whole iteration with SSIM too."""
+        """Run one whole iteration with L1 and SSIM."""
         self._step(_L1_AND_SSIM)
 
     def forward(self) -> None:
-        """Draw."""
+        """Render the image."""
         self._lib.gl_forward(self._handle, self._table.rows.ctypes.data, self._table.count, None)
 
     def backward(self) -> None:
-        """From gradients of the image to gradients of the rows; after `forward`."""
+        """Compute the gradients of the rows from those of the image; call `forward` first."""
         self._lib.gl_set_grad(self._handle, self._image_gradients.ctypes.data)
         self._lib.gl_backward(self._handle)
         self._lib.gl_pbwd(self._handle, self._table.rows.ctypes.data, self._row_gradients.ctypes.data)
@@ -110,18 +110,18 @@ class ExternalRasterizer:
 
 def _load(library: Path) -> ctypes.CDLL:
     try:
-        # a bare file name would be looked for among the system's libraries
+        # dlopen would search the system's libraries for a bare file name
         lib = ctypes.CDLL(str(library.resolve()))
-        for name, (returns, takes) in _FUNCTIONS.items():
+        for name, (result_type, argument_types) in _FUNCTIONS.items():
             function = getattr(lib, name)
-            function.restype, function.argtypes = returns, takes
+            function.restype, function.argtypes = result_type, argument_types
     except (OSError, AttributeError) as reason:
         raise KernelError(f"{library}: expected a shared library with {', '.join(_FUNCTIONS)}; {reason}") from None
     return lib
 
 
 def _planes(images: Float32[ndarray, "c h w"]) -> Float32[ndarray, "c hp wp"]:
-    """The planes padded with zeros to whole tiles."""
+    """Return the planes padded with zeros to whole tiles."""
     count, height, width = images.shape
     padded = _aligned((count, -(-height // TILE_PX) * TILE_PX, -(-width // TILE_PX) * TILE_PX))
     padded[:, :height, :width] = images
@@ -129,7 +129,7 @@ def _planes(images: Float32[ndarray, "c h w"]) -> Float32[ndarray, "c hp wp"]:
 
 
 def _aligned(shape: tuple[int, ...]) -> ndarray:
-    """Float32 zeros that start on a cache line."""
+    """Return float32 zeros aligned to a cache line."""
     size = int(np.prod(shape)) * 4
     memory = np.zeros(size + _CACHE_LINE_BYTES, np.uint8)
     start = -memory.ctypes.data % _CACHE_LINE_BYTES

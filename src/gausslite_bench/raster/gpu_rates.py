@@ -1,4 +1,4 @@
-"""Measure the cuda backend: iterations a second beside gsplat called plainly, and a whole frame on a large map."""
+"""Speed of the CUDA backend: iterations per second compared with a gsplat training loop, and one mapped frame."""
 
 from __future__ import annotations
 
@@ -16,15 +16,16 @@ from gausslite.domain.frame import Frame
 from gausslite.domain.pose import inverse
 from gausslite.domain.relevance import RelevanceMap
 from gausslite.errors import InvalidInputError
-from gausslite.mapping.keyframes import tiles_of
+from gausslite.mapping.keyframes import tiles_touching
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.settings import MapperSettings
 from gausslite.mission.frame_scheduler import FrameScheduler
 from gausslite.optimize.density import DensitySettings
-from gausslite.optimize.parameters import SplatTable, rows_to_gaussians
+from gausslite.optimize.row_encoding import rows_to_gaussians
+from gausslite.optimize.splat_table import SplatTable
 from gausslite.render.rasterizer import FULL_FRAME, Subset
-from gausslite_bench.raster.procedural_room import BenchView, held_view, seed_rows
-from gausslite_bench.raster.repeated_step import LOSSES, RESTING, TURN, Duration
+from gausslite_bench.raster.procedural_room import BenchView, held_out_view, seed_rows
+from gausslite_bench.raster.repeated_step import LOSSES, RUNS_PER_BATCH, ZERO_LEARNING_RATES, Duration
 
 if TYPE_CHECKING:
     from gausslite.render.cuda import CudaRasterizer
@@ -33,18 +34,20 @@ if TYPE_CHECKING:
 
 GPU_GAUSSIANS = (100_000, 300_000, 1_000_000, 3_000_000)
 FRAME_GAUSSIANS = 1_000_000
-PAPERS_FRAME_MS = 500.0
+PAPER_FRAME_MS = 500.0
 _LOSS = LOSSES["fused_l1_ssim"]
 _REGION_SHARE = 0.2
 _MARGIN_PX = 5
-_ROOM_TO_GROW = 1.1
+_CAPACITY_FACTOR = 1.1
 _FRAME_WARM_UP = 2
 
 
 @dataclass(frozen=True, slots=True)
 class StepRate:
-    """Iterations a second at one size of map, best and median of turns: over the whole image, in a region of a fifth
-    of it, and of gsplat called plainly over the whole image.
+    """Iterations per second at one number of Gaussians, best and median of the batches.
+
+    Keys of best and median: "whole" (full image), "region" (a fifth of the image), "gsplat" (plain gsplat training on
+    the full image).
     """
 
     gaussians: int
@@ -54,13 +57,13 @@ class StepRate:
     median: Mapping[str, float]
 
     def as_json(self) -> dict[str, object]:
-        """One record for scripts."""
+        """Return one JSON object."""
         return asdict(self)
 
 
 @dataclass(frozen=True, slots=True)
 class FrameCost:
-    """A mapped frame on a map of this many: seeding, the iterations of the settings, density control, all transfers."""
+    """Time of one mapped frame: seeding, training iterations, density control and all transfers."""
 
     gaussians: int
     iterations: int
@@ -68,13 +71,13 @@ class FrameCost:
     steps_ms: Mapping[str, float]
 
     def as_json(self) -> dict[str, object]:
-        """One record for scripts."""
+        """Return one JSON object."""
         return asdict(self)
 
 
 @dataclass(frozen=True, slots=True)
 class GpuBench:
-    """What to measure. rasterization stands in for gsplat's own where there is no GPU, which only tests do."""
+    """Settings and measurements of the benchmark. Tests without a GPU replace gsplat's `rasterization`."""
 
     rasterizer: CudaRasterizer
     gaussians: Sequence[int] = GPU_GAUSSIANS
@@ -89,13 +92,14 @@ class GpuBench:
             raise InvalidInputError(f"repetitions: expected 1 to 100000, got {self.repetitions}")
 
     def rates(self) -> Iterator[StepRate]:
-        """Iterations a second, one size of map after the other. Raises KernelError."""
-        view = held_view(*self.size)
+        """Yield the iterations per second for each number of Gaussians. Raises KernelError."""
+        view = held_out_view(*self.size)
         for count in self.gaussians:
-            with ExitStack() as at_end:
-                ours = _Ours(self.rasterizer, _table(count), view, at_end)
-                contenders = {"whole": ours.whole, "region": ours.region, "gsplat": self._plainly(count, view, ours)}
-                seconds = _take_turns(contenders, self.repetitions)
+            with ExitStack() as bindings:
+                own = _OwnSteps(self.rasterizer, _table(count), view, bindings)
+                baseline = self._gsplat_baseline(count, view, own)
+                contenders = {"whole": own.whole, "region": own.region, "gsplat": baseline}
+                seconds = _measure_interleaved(contenders, self.repetitions)
             yield StepRate(
                 count,
                 *self.size,
@@ -104,53 +108,53 @@ class GpuBench:
             )
 
     def frame(self) -> FrameCost:
-        """Map the same view again and again, with density control in every frame. Raises KernelError."""
-        view = held_view(*self.size)
+        """Map the same view repeatedly, with density control in every frame. Raises KernelError."""
+        view = held_out_view(*self.size)
         settings = MapperSettings(
-            max_gaussians=int(self.frame_gaussians * _ROOM_TO_GROW),
+            max_gaussians=int(self.frame_gaussians * _CAPACITY_FACTOR),
             density=DensitySettings(densify_every=MapperSettings().optimization.iterations, prune_every=8),
         )
         mapper = GaussianMapper(settings, self.rasterizer, known=_table(self.frame_gaussians).to_gaussians())
         scheduler, weight = FrameScheduler(), _region(self.size).astype(np.float32)
         relevance = RelevanceMap(weight, np.where(weight > 0, 0, -1).astype(np.int16))
-        budgets, iterations = [], 0
+        timings, iterations = [], 0
         for index in range(_FRAME_WARM_UP + self.frames):
             frame = Frame(index, index, view.rgb, view.depth_m, view.camera, inverse(view.T_camera_world))
             scheduler.begin()
             iterations = mapper.map_frame(frame, relevance, scheduler).iterations
-            budgets.append(scheduler.end())
-        timed = budgets[_FRAME_WARM_UP:]
-        steps = {step for budget in timed for step in budget.stages_s}
+            timings.append(scheduler.end())
+        measured = timings[_FRAME_WARM_UP:]
+        stages = sorted({stage for timing in measured for stage in timing.stages_s})
         return FrameCost(
             mapper.count,
             iterations,
-            Duration.of([budget.seconds for budget in timed]),
-            {str(step): 1e3 * float(np.median([b.stages_s.get(step, 0.0) for b in timed])) for step in sorted(steps)},
+            Duration.of([timing.seconds for timing in measured]),
+            {str(s): 1e3 * float(np.median([timing.stages_s.get(s, 0.0) for timing in measured])) for s in stages},
         )
 
-    def _plainly(self, count: int, view: BenchView, ours: _Ours) -> Callable[[int], float]:
+    def _gsplat_baseline(self, count: int, view: BenchView, own: _OwnSteps) -> Callable[[int], float]:
         from gausslite.render.cuda.gsplat_baseline import GsplatBaseline, load_gsplat_rasterization
 
-        draw = self.rasterization or load_gsplat_rasterization()
-        return GsplatBaseline(seed_rows(count), ours.view, view.T_camera_world, _LOSS, draw).train
+        rasterization = self.rasterization or load_gsplat_rasterization()
+        return GsplatBaseline(seed_rows(count), own.view, view.T_camera_world, _LOSS, rasterization).train
 
 
-class _Ours:
-    """Steps of the cuda backend on tables that stay on the device until `at_end`."""
+class _OwnSteps:
+    """Training steps of the CUDA backend; the tables stay on the device until `bindings` closes."""
 
-    def __init__(self, rasterizer: CudaRasterizer, table: SplatTable, view: BenchView, at_end: ExitStack) -> None:
+    def __init__(self, rasterizer: CudaRasterizer, table: SplatTable, view: BenchView, bindings: ExitStack) -> None:
         region = _region((view.camera.width_px, view.camera.height_px))
         self.view: CudaView = rasterizer.prepare_view(view.rgb, view.depth_m, view.camera, region.astype(np.float32))
         self._rasterizer, self._table, self._pose = rasterizer, table, view.T_camera_world
-        self._tiles = tiles_of(region, _MARGIN_PX)
-        at_end.enter_context(rasterizer.bind_tables(table.rows, table.first_moment, table.second_moment))
+        self._tiles = tiles_touching(region, _MARGIN_PX)
+        bindings.enter_context(rasterizer.bind_tables(table.rows, table.first_moment, table.second_moment))
 
     def whole(self, iterations: int) -> float:
-        """So many iterations over the whole image, waited for; the last one's loss."""
+        """Run iterations over the whole image, synchronise and return the last loss."""
         return self._train(iterations, False, FULL_FRAME)
 
     def region(self, iterations: int) -> float:
-        """So many iterations of the active phase, waited for; the last one's loss."""
+        """Run iterations of the active phase, synchronise and return the last loss."""
         return self._train(iterations, True, Subset(tiles=self._tiles))
 
     def _train(self, iterations: int, masked: bool, subset: Subset) -> float:
@@ -163,29 +167,29 @@ class _Ours:
                 self.view,
                 self._pose,
                 _LOSS,
-                RESTING,
+                ZERO_LEARNING_RATES,
                 masked,
                 subset,
             )
         return report.loss
 
 
-def _take_turns(contenders: Mapping[str, Callable[[int], float]], repetitions: int) -> dict[str, list[float]]:
-    """Seconds an iteration in each turn of each contender, once all are warm."""
-    turn = min(TURN, repetitions)
+def _measure_interleaved(contenders: Mapping[str, Callable[[int], float]], repetitions: int) -> dict[str, list[float]]:
+    """Return the seconds per iteration in each batch of each contender, after a warm-up batch."""
+    runs = min(RUNS_PER_BATCH, repetitions)
     for train in contenders.values():
-        train(turn)
+        train(runs)
     seconds: dict[str, list[float]] = {name: [] for name in contenders}
-    for _ in range(max(1, repetitions // turn)):
+    for _ in range(max(1, repetitions // runs)):
         for name, train in contenders.items():
             started_s = time.perf_counter()
-            train(turn)
-            seconds[name].append((time.perf_counter() - started_s) / turn)
+            train(runs)
+            seconds[name].append((time.perf_counter() - started_s) / runs)
     return seconds
 
 
 def _region(size: tuple[int, int]) -> Bool[ndarray, "h w"]:
-    """A fifth of the image, in its middle."""
+    """Return the mask of a fifth of the image, in its centre."""
     width, height = size
     margin = (1.0 - _REGION_SHARE**0.5) / 2.0
     region = np.zeros((height, width), np.bool_)

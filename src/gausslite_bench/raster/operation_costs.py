@@ -1,4 +1,4 @@
-"""Measure what one iteration of the CPU rasterizer costs, stage by stage, and beside another library if asked."""
+"""Times of the CPU rasterizer's operations and stages, optionally interleaved with an external rasterizer."""
 
 from __future__ import annotations
 
@@ -11,28 +11,28 @@ from pathlib import Path
 import numpy as np
 
 from gausslite.errors import InvalidInputError
-from gausslite.optimize.parameters import SplatTable
+from gausslite.optimize.splat_table import SplatTable
 from gausslite.render.cpu import CpuRasterizer
 from gausslite.render.cpu_kernels import core_clock_ghz
 from gausslite.render.rasterizer import Rendering
 from gausslite_bench.raster.block_cost import BlockCost
 from gausslite_bench.raster.external_rasterizer import ExternalRasterizer
-from gausslite_bench.raster.procedural_room import BenchView, held_view, seed_rows
+from gausslite_bench.raster.procedural_room import BenchView, held_out_view, seed_rows
 from gausslite_bench.raster.region_costs import RegionCost, region_costs
-from gausslite_bench.raster.repeated_step import LOSSES, TURN, Duration, RestingStep, timed
+from gausslite_bench.raster.repeated_step import LOSSES, RUNS_PER_BATCH, Duration, RepeatedStep, measure_seconds
 
 SIZES = ((320, 240), (640, 480))
 GAUSSIANS = (20_000, 100_000, 300_000)
 OPERATIONS = (*LOSSES, "forward", "backward")
-_SETTLE_S = 0.02
+_PAUSE_S = 0.02
 
 
 @dataclass(frozen=True, slots=True)
 class RasterTiming:
-    """What each operation took, whole calls as the mapper pays for them.
+    """Times of one case: whole calls, as the mapper makes them.
 
-    stages_ms: of each fused step, least times. blocks: of the step with L1. yardstick is the other library's and
-    regions are what shares of the image cost; both are empty when they were not asked for.
+    stages_ms: minimum time of each stage of each fused step. blocks: cost of the fused step with L1. external: times
+    of the external library, empty without one. regions: costs of steps masked to a region, empty without shares.
     """
 
     gaussians: int
@@ -43,22 +43,22 @@ class RasterTiming:
     durations: Mapping[str, Duration]
     stages_ms: Mapping[str, Mapping[str, float]]
     blocks: BlockCost
-    yardstick: Mapping[str, Duration] = field(default_factory=dict)
+    external: Mapping[str, Duration] = field(default_factory=dict)
     regions: Sequence[RegionCost] = ()
 
     def summary(self) -> dict[str, object]:
-        """One flat record for scripts: the case, and the least time of each operation."""
+        """Return the case and the minimum time of each operation as one flat JSON object."""
         minima = {f"{name}_ms_min": self.durations[name].min_ms for name in OPERATIONS}
         return {**self._case(), **minima}
 
     def details(self) -> dict[str, object]:
-        """Everything that was measured, in sections of plain values."""
+        """Return all measurements as nested JSON objects."""
         return {
             **self._case(),
             "operations": {name: asdict(duration) for name, duration in self.durations.items()},
             "stages_ms_min": {name: dict(stages) for name, stages in self.stages_ms.items()},
             "blocks": asdict(self.blocks),
-            "yardstick": {name: asdict(duration) for name, duration in self.yardstick.items()},
+            "external": {name: asdict(duration) for name, duration in self.external.items()},
             "regions": [{**asdict(cost), "ratio": cost.ratio} for cost in self.regions],
         }
 
@@ -68,10 +68,10 @@ class RasterTiming:
 
 @dataclass(frozen=True, slots=True)
 class RasterBench:
-    """What to measure: every size with every number of Gaussians and every instruction set (None: the fastest).
+    """Measures every image size with every number of Gaussians and every instruction set (None: the fastest).
 
-    repetitions counts the timed runs of each operation; threads None means one per core allowed. shares_percent: the
-    parts of the image on which the masked, exact step is measured as well.
+    repetitions: timed runs of each operation. threads: None means one per available core. shares_percent: shares of
+    the image for additional measurements of masked steps in exact mode.
     """
 
     sizes: Sequence[tuple[int, int]] = SIZES
@@ -79,7 +79,7 @@ class RasterBench:
     simd: Sequence[str | None] = (None,)
     threads: int | None = None
     repetitions: int = 60
-    yardstick: Path | None = None
+    external_library: Path | None = None
     shares_percent: Sequence[float] = ()
 
     def __post_init__(self) -> None:
@@ -87,22 +87,21 @@ class RasterBench:
             raise InvalidInputError(f"repetitions: expected 1 to 100000, got {self.repetitions}")
 
     def run(self) -> Iterator[RasterTiming]:
-        """Measure one case after the other. Raises KernelError, InvalidInputError."""
+        """Yield the times of each case. Raises KernelError, InvalidInputError."""
         for width_px, height_px in self.sizes:
-            view = held_view(width_px, height_px)
+            view = held_out_view(width_px, height_px)
             for count in self.gaussians:
                 for simd in self.simd:
                     yield self._measure(CpuRasterizer(self.threads, simd), _table(count), view)
 
     def _measure(self, rasterizer: CpuRasterizer, table: SplatTable, view: BenchView) -> RasterTiming:
-        """Ours and the other's operations take turns, so that a busy minute of the machine strikes both."""
-        ours = _Ours(rasterizer, table, view)
-        contenders: list[_Ours | ExternalRasterizer] = [ours]
-        if self.yardstick is not None:
-            contenders.append(ExternalRasterizer(self.yardstick, rasterizer.threads, _table(table.count), view))
-        seconds, clock_ghz = _take_turns(contenders, self.repetitions)
+        own = _OwnOperations(rasterizer, table, view)
+        contenders: list[_OwnOperations | ExternalRasterizer] = [own]
+        if self.external_library is not None:
+            contenders.append(ExternalRasterizer(self.external_library, rasterizer.threads, _table(table.count), view))
+        seconds, clock_ghz = _measure_interleaved(contenders, self.repetitions)
         durations = [{name: Duration.of(times) for name, times in each.items()} for each in seconds]
-        blocks = BlockCost.of(ours.evaluations, clock_ghz, rasterizer.threads, ours.stages_ms["fused_l1"])
+        blocks = BlockCost.of(own.evaluations, clock_ghz, rasterizer.threads, own.stages_ms["fused_l1"])
         return RasterTiming(
             gaussians=table.count,
             width=view.camera.width_px,
@@ -110,15 +109,15 @@ class RasterBench:
             threads=rasterizer.threads,
             simd=rasterizer.simd,
             durations=durations[0],
-            stages_ms=ours.stages_ms,
+            stages_ms=own.stages_ms,
             blocks=blocks,
-            yardstick=durations[1] if self.yardstick is not None else {},
+            external=durations[1] if self.external_library is not None else {},
             regions=region_costs(rasterizer, table, view, self.shares_percent, self.repetitions),
         )
 
 
-class _Ours:
-    """The operations of our rasterizer on one case; remembers the least time of every stage."""
+class _OwnOperations:
+    """Operations of GaussLite's CPU rasterizer on one case; stores the minimum time of every stage."""
 
     def __init__(self, rasterizer: CpuRasterizer, table: SplatTable, view: BenchView) -> None:
         self.stages_ms: dict[str, dict[str, float]] = {}
@@ -126,41 +125,41 @@ class _Ours:
         self._rasterizer = rasterizer
         self._table = table
         self._view = view
-        self._train = RestingStep(rasterizer, table, view)
-        self._drawn: Rendering = self._draw()
+        self._train = RepeatedStep(rasterizer, table, view)
+        self._rendering: Rendering = self._render()
         self._d_rgb = np.full(view.rgb.shape, 1e-5, np.float32)
         self._d_depth_m = np.full(view.depth_m.shape, 1e-5, np.float32)
         self._d_alpha = np.zeros(view.depth_m.shape, np.float32)
 
-    def turn(self) -> AbstractContextManager[None]:
-        """Lend the table to the rasterizer for as long as it is measured."""
+    def active(self) -> AbstractContextManager[None]:
+        """Bind the table to the rasterizer during the measurement."""
         return self._train.bind_tables()
 
     def fused_l1(self) -> None:
-        """One whole iteration with L1 on colour and depth."""
+        """Run one whole iteration with L1 on colour and depth."""
         self._step("fused_l1")
 
     def fused_l1_ssim(self) -> None:
-        """One whole iteration with SSIM too."""
+        """Run one whole iteration with L1 and SSIM."""
         self._step("fused_l1_ssim")
 
     def forward(self) -> None:
-        """Draw."""
-        self._drawn = self._draw()
+        """Render the image."""
+        self._rendering = self._render()
 
     def backward(self) -> None:
-        """From gradients of the image to gradients of the rows; after `forward`."""
-        self._rasterizer.backward(self._drawn, self._d_rgb, self._d_depth_m, self._d_alpha)
+        """Compute the gradients of the rows from those of the image; call `forward` first."""
+        self._rasterizer.backward(self._rendering, self._d_rgb, self._d_depth_m, self._d_alpha)
 
-    def _draw(self) -> Rendering:
+    def _render(self) -> Rendering:
         return self._rasterizer.forward(self._table.rows, self._view.camera, self._view.T_camera_world)
 
     def _step(self, name: str) -> None:
         self._train(LOSSES[name])
         self.evaluations = self._rasterizer.block_evaluations()
-        least = self.stages_ms.setdefault(name, {})
+        minima = self.stages_ms.setdefault(name, {})
         for stage, ms in self._rasterizer.stage_times_ms().items():
-            least[stage] = min(ms, least.get(stage, ms))
+            minima[stage] = min(ms, minima.get(stage, ms))
 
 
 def _table(count: int) -> SplatTable:
@@ -171,22 +170,25 @@ def _table(count: int) -> SplatTable:
     return table
 
 
-def _take_turns(
-    contenders: Sequence[_Ours | ExternalRasterizer], repetitions: int
+def _measure_interleaved(
+    contenders: Sequence[_OwnOperations | ExternalRasterizer], repetitions: int
 ) -> tuple[list[dict[str, list[float]]], float]:
-    """Seconds of `repetitions` runs of each operation of each contender, in turns; and the fastest clock in between."""
+    """Return the seconds of each run of each contender's operations, and the highest core clock in GHz.
+
+    The contenders alternate in batches, so that other load on the machine affects all of them.
+    """
     seconds: list[dict[str, list[float]]] = [{name: [] for name in OPERATIONS} for _ in contenders]
     clock_ghz = 0.0
-    for done in range(0, repetitions, TURN):
-        turn = min(TURN, repetitions - done)
+    for done in range(0, repetitions, RUNS_PER_BATCH):
+        runs = min(RUNS_PER_BATCH, repetitions - done)
         for contender, times in zip(contenders, seconds, strict=True):
-            # idle threads of the one before may still be spinning on our cores
-            time.sleep(_SETTLE_S)
-            with contender.turn():
+            # idle threads of the previous contender may still spin on the cores
+            time.sleep(_PAUSE_S)
+            with contender.active():
                 for fused in LOSSES:
-                    times[fused] += timed([getattr(contender, fused)], turn)[0]
+                    times[fused] += measure_seconds([getattr(contender, fused)], runs)[0]
                 clock_ghz = max(clock_ghz, core_clock_ghz())
-                forward, backward = timed([contender.forward, contender.backward], turn)
+                forward, backward = measure_seconds([contender.forward, contender.backward], runs)
             times["forward"] += forward
             times["backward"] += backward
     return seconds, clock_ghz

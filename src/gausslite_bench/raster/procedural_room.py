@@ -1,7 +1,7 @@
-"""A small room to measure rasterizers in: rays meet its boxes and balls by formula, so any machine can make it.
+"""Procedural room for rasterizer benchmarks, ray-traced analytically from textured boxes and balls.
 
-A box room of 4.8 x 4.2 x 2.6 m with a table, things on it and furniture round it, all textured. Twelve cameras on a
-ring look at the table and give the seeds; a thirteenth between them is the view that is timed.
+The room measures 4.8 x 4.2 x 2.6 m, with a table, objects on it and furniture. Twelve cameras on a ring look at the
+table and provide the seeds. A thirteenth camera between two of them is the view that is timed.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ _BALLS = (
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BenchView:
-    """An image of the room, and where it was taken."""
+    """An image of the room with its camera pose."""
 
     rgb: UInt8[ndarray, "h w 3"]
     depth_m: Float32[ndarray, "h w"]
@@ -58,33 +58,33 @@ class BenchView:
     T_camera_world: Float64[ndarray, "4 4"]
 
 
-def held_view(width_px: int, height_px: int) -> BenchView:
-    """The view to time, from between two of the ring's cameras."""
+def held_out_view(width_px: int, height_px: int) -> BenchView:
+    """Return the view to time, between two cameras of the ring."""
     camera = _camera(width_px, height_px)
     pixels_px = np.stack(np.meshgrid(np.arange(width_px) + 0.5, np.arange(height_px) + 0.5), axis=-1).reshape(-1, 2)
     T_world_camera = _ring_pose(2.5)
-    rgb, depth_m = _look(pixels_px, camera, T_world_camera)
+    rgb, depth_m = _trace(pixels_px, camera, T_world_camera)
     image = np.round(rgb * 255.0).astype(np.uint8).reshape(height_px, width_px, 3)
     return BenchView(image, depth_m.astype(np.float32).reshape(height_px, width_px), camera, inverse(T_world_camera))
 
 
 def seed_rows(count: int, opacity: float = 0.5) -> Float32[ndarray, "n 16"]:
-    """Rows of round splats on the surfaces that the ring sees, as large as their neighbours are far.
+    """Return rows of isotropic splats on the surfaces that the ring sees; scales follow the neighbours' distances.
 
-    Pixels are drawn at random from twelve images of 640x480, in the order of the images. Raises InvalidInputError for
-    fewer splats than views.
+    Pixels are sampled at random from twelve images of 640x480, in the order of the images. Raises InvalidInputError
+    for fewer splats than views.
     """
     if count < SEED_VIEWS:
-        raise InvalidInputError(f"gaussians: expected at least {SEED_VIEWS}, one a view, got {count}")
+        raise InvalidInputError(f"gaussians: expected at least {SEED_VIEWS}, one per view, got {count}")
     rng = np.random.default_rng(0)
     camera = _camera(*_SEED_SIZE)
     points, colours = [], []
     for view, n in enumerate(np.diff(np.linspace(0, count, SEED_VIEWS + 1).astype(int))):
-        # one pixel in each n-th part of the image, so that memory order follows the rows of the image
+        # one pixel in each of n equal parts of the image, so that memory order follows the image rows
         flat = ((np.arange(n) + rng.random(n)) * (camera.width_px * camera.height_px / n)).astype(np.int64)
         pixels_px = np.stack([flat % camera.width_px, flat // camera.width_px], axis=1) + 0.5
         T_world_camera = _ring_pose(float(view))
-        rgb, depth_m = _look(pixels_px, camera, T_world_camera)
+        rgb, depth_m = _trace(pixels_px, camera, T_world_camera)
         points.append(transform_points(T_world_camera, lift(pixels_px, depth_m, camera)))
         colours.append(rgb)
     means_m = np.concatenate(points).astype(np.float32)
@@ -98,7 +98,7 @@ def seed_rows(count: int, opacity: float = 0.5) -> Float32[ndarray, "n 16"]:
 
 
 def _spacing_m(points: Float32[ndarray, "n 3"]) -> Float32[ndarray, " n"]:
-    """Median distance from each point to its five nearest others."""
+    """Return the median distance of each point to its five nearest neighbours."""
     exact_tree = cv2.flann.Index(points, {"algorithm": 4, "leaf_max_size": 10})
     _, squared = exact_tree.knnSearch(points, min(_NEIGHBOURS + 1, len(points)), params={"checks": -1})
     spacing: Float32[ndarray, " n"] = np.sqrt(np.median(squared[:, 1:], axis=1)).astype(np.float32)
@@ -110,9 +110,9 @@ def _camera(width_px: int, height_px: int) -> Camera:
     return Camera(focal_px, focal_px, width_px / 2, height_px / 2, width_px, height_px)
 
 
-def _ring_pose(place: float) -> Float64[ndarray, "4 4"]:
-    """T_world_camera at a place from 0 to 12 on a wavy ring round the table, looking at the table."""
-    angle = 2.0 * np.pi * place / SEED_VIEWS
+def _ring_pose(position: float) -> Float64[ndarray, "4 4"]:
+    """Return T_world_camera at a position from 0 to 12 on a wavy ring round the table, looking at the table."""
+    angle = 2.0 * np.pi * position / SEED_VIEWS
     eye = np.array([1.6 * np.cos(angle), 1.3 * np.sin(angle), 1.45 + 0.2 * np.sin(3.0 * angle)])
     forward = np.array([0.2 * np.sin(2.0 * angle), 0.2 * np.cos(angle), 0.85]) - eye
     forward /= np.linalg.norm(forward)
@@ -124,11 +124,11 @@ def _ring_pose(place: float) -> Float64[ndarray, "4 4"]:
     return T_world_camera
 
 
-def _look(
+def _trace(
     pixels_px: Float64[ndarray, "n 2"], camera: Camera, T_world_camera: Float64[ndarray, "4 4"]
 ) -> tuple[Float64[ndarray, "n 3"], Float64[ndarray, " n"]]:
-    """Colour in [0, 1] and depth in metres at these image coordinates."""
-    # rays of length 1 along the optical axis, so that the distance travelled is the depth
+    """Return colours in [0, 1] and depths in metres at these image coordinates."""
+    # rays have length 1 along the optical axis, so that the ray parameter is the depth
     rays = lift(pixels_px, np.ones(len(pixels_px)), camera) @ T_world_camera[:3, :3].T
     eye = T_world_camera[:3, 3]
     depth_m, shape = _first_hit(eye, rays)
@@ -140,23 +140,23 @@ def _look(
 def _first_hit(
     eye: Float64[ndarray, "3"], rays: Float64[ndarray, "n 3"]
 ) -> tuple[Float64[ndarray, " n"], Int64[ndarray, " n"]]:
-    """How far each ray goes, and what it meets: 0 the room, then the boxes, then the balls."""
+    """Return each ray's first hit: the ray parameter and the shape (0 the room, then boxes, then balls)."""
     with np.errstate(divide="ignore"):
         inverse_rays = 1.0 / rays
     _, nearest = _through_box(eye, inverse_rays, *_ROOM)
     shape = np.zeros(len(rays), np.int64)
     for i, (low, high, _) in enumerate(_BOXES):
         enters, leaves = _through_box(eye, inverse_rays, low, high)
-        met = (enters < leaves) & (enters > 0.0) & (enters < nearest)
-        nearest[met], shape[met] = enters[met], 1 + i
+        hit = (enters < leaves) & (enters > 0.0) & (enters < nearest)
+        nearest[hit], shape[hit] = enters[hit], 1 + i
     squared = (rays * rays).sum(axis=1)
     for i, (centre, radius_m, _) in enumerate(_BALLS):
         to_eye = eye - np.array(centre)
-        half = rays @ to_eye
-        inside = half * half - squared * (to_eye @ to_eye - radius_m**2)
-        distance = (-half - np.sqrt(np.maximum(inside, 0.0))) / squared
-        met = (inside > 0.0) & (distance > 0.0) & (distance < nearest)
-        nearest[met], shape[met] = distance[met], 1 + len(_BOXES) + i
+        half_b = rays @ to_eye
+        discriminant = half_b * half_b - squared * (to_eye @ to_eye - radius_m**2)
+        distance = (-half_b - np.sqrt(np.maximum(discriminant, 0.0))) / squared
+        hit = (discriminant > 0.0) & (distance > 0.0) & (distance < nearest)
+        nearest[hit], shape[hit] = distance[hit], 1 + len(_BOXES) + i
     return nearest, shape
 
 
@@ -166,26 +166,26 @@ def _through_box(
     low: tuple[float, float, float],
     high: tuple[float, float, float],
 ) -> tuple[Float64[ndarray, " n"], Float64[ndarray, " n"]]:
-    """Where each ray enters and leaves the three pairs of planes."""
+    """Return the ray parameters where each ray enters and leaves the box (slab method)."""
     a, b = (np.array(low) - eye) * inverse_rays, (np.array(high) - eye) * inverse_rays
     return np.minimum(a, b).max(axis=1), np.maximum(a, b).min(axis=1)
 
 
 def _normals(p_world: Float64[ndarray, "n 3"], shape: Int64[ndarray, " n"]) -> Float64[ndarray, "n 3"]:
-    """Unit normals, up to sign."""
+    """Return unit normals, up to sign."""
     normals = np.zeros_like(p_world)
     for i, (low, high) in enumerate((_ROOM, *((low, high) for low, high, _ in _BOXES))):
-        of = np.flatnonzero(shape == i)
-        middle, half = (np.array(low) + high) / 2, (np.array(high) - low) / 2
-        normals[of, np.argmax(np.abs((p_world[of] - middle) / half), axis=1)] = 1.0
-    for i, (centre, radius_m, _) in enumerate(_BALLS):
-        of = np.flatnonzero(shape == 1 + len(_BOXES) + i)
-        normals[of] = (p_world[of] - centre) / radius_m
+        hits = np.flatnonzero(shape == i)
+        centre, half = (np.array(low) + high) / 2, (np.array(high) - low) / 2
+        normals[hits, np.argmax(np.abs((p_world[hits] - centre) / half), axis=1)] = 1.0
+    for i, (ball_centre, radius_m, _) in enumerate(_BALLS):
+        hits = np.flatnonzero(shape == 1 + len(_BOXES) + i)
+        normals[hits] = (p_world[hits] - ball_centre) / radius_m
     return normals
 
 
 def _texture(p_world: Float64[ndarray, "n 3"], shape: Int64[ndarray, " n"]) -> Float64[ndarray, "n 3"]:
-    """A colour for each shape, crossed by waves of 2 to 30 a metre and by coarse squares."""
+    """Return each shape's colour modulated by waves of 2 to 30 per metre and by coarse squares."""
     colours = np.array([_ROOM_COLOUR, *(c for _, _, c in _BOXES), *(c for _, _, c in _BALLS)])
     rng = np.random.default_rng(1)
     waves = np.zeros(len(p_world))
@@ -193,7 +193,7 @@ def _texture(p_world: Float64[ndarray, "n 3"], shape: Int64[ndarray, " n"]) -> F
         direction, bend = rng.normal(size=(2, 3))
         phase = 2.0 * np.pi * per_metre * (p_world @ (direction / np.linalg.norm(direction)))
         waves += strength * np.sin(phase + 2.0 * np.sin(1.3 * per_metre * (p_world @ bend)))
-    # shifted off the walls, where a floor would be decided by rounding
+    # offset from the walls, where rounding would decide the result of floor
     squares = np.floor(4.0 * p_world + 0.37).sum(axis=1) % 2.0
     textured: Float64[ndarray, "n 3"] = colours[shape] * (0.85 + waves + 0.2 * squares)[:, None]
     return textured

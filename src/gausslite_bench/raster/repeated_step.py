@@ -1,4 +1,4 @@
-"""One training step as the rasterizer's benchmark repeats it, and the clock round it."""
+"""Repeatable training step of the rasterizer benchmarks, and timing of repeated runs."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool
 from numpy import ndarray
 
-from gausslite.optimize.parameters import SplatTable
+from gausslite.optimize.splat_table import SplatTable
 from gausslite.render.cpu import CpuRasterizer
 from gausslite.render.rasterizer import FULL_FRAME, AdamSettings, LossWeights, Subset
 from gausslite_bench.raster.procedural_room import BenchView
@@ -20,40 +20,40 @@ LOSSES = {
     "fused_l1": LossWeights(colour=0.8, depth=1.0, ssim=0.0),
     "fused_l1_ssim": LossWeights(colour=0.8, depth=1.0, ssim=0.2),
 }
-"""The two kinds of iteration; with L1 alone drawing, loss and walking back are one pass."""
+"""Losses of the two kinds of iteration; with L1 only, forward, loss and backward are one pass."""
 
-TURN = 10
-"""Runs of one thing before the next has its turn, so that a busy minute of the machine strikes all of them."""
+RUNS_PER_BATCH = 10
+"""Consecutive runs of one operation before the next operation: other load on the machine then affects all alike."""
 
-RESTING = AdamSettings(means=0.0, log_scales=0.0, quats=0.0, opacity_logits=0.0, rgb=0.0)
-"""Adam does all its work and moves nothing."""
+ZERO_LEARNING_RATES = AdamSettings(means=0.0, log_scales=0.0, quats=0.0, opacity_logits=0.0, rgb=0.0)
+"""Adam runs in full but changes no parameter."""
 _WARM_UP = 3
 
 
 @dataclass(frozen=True, slots=True)
 class Duration:
-    """Milliseconds of many runs of one thing."""
+    """Minimum and median time of many runs, in milliseconds."""
 
     min_ms: float
     median_ms: float
 
     @classmethod
     def of(cls, seconds: Sequence[float]) -> Duration:
-        """Minimum and median of these times."""
+        """Return minimum and median of these times in seconds."""
         return cls(float(np.min(seconds)) * 1e3, float(np.median(seconds)) * 1e3)
 
     @classmethod
     def mean(cls, durations: Sequence[Duration]) -> Duration:
-        """Of several things: the mean of their minima, and of their medians."""
+        """Return the mean of the minima and the mean of the medians."""
         return cls(
             float(np.mean([each.min_ms for each in durations])), float(np.mean([each.median_ms for each in durations]))
         )
 
 
-class RestingStep:
-    """Whole iterations with learning rates of zero: the splats stay, so every run does the same work.
+class RepeatedStep:
+    """A whole training iteration with zero learning rates: every run does the same work.
 
-    tiles: what is drawn and trained on, and the loss is masked to; None is the whole image without a mask.
+    tiles: tiles to render and train; `pixels` masks the loss. None means the whole image without a mask.
     """
 
     def __init__(
@@ -65,7 +65,7 @@ class RestingStep:
         tiles: Bool[ndarray, "th tw"] | None = None,
     ) -> None:
         self._rasterizer = rasterizer
-        self._lent = table.rows, table.first_moment, table.second_moment
+        self._tables = table.rows, table.first_moment, table.second_moment
         self._pose = view.T_camera_world
         weight = None if pixels is None else pixels.astype(np.float32)
         self._view = rasterizer.prepare_view(view.rgb, view.depth_m, view.camera, weight)
@@ -73,24 +73,24 @@ class RestingStep:
         self._subset = FULL_FRAME if tiles is None else Subset(tiles=tiles)
 
     def bind_tables(self) -> AbstractContextManager[None]:
-        """Lend the tables for many iterations, as the mapper does."""
-        return self._rasterizer.bind_tables(*self._lent)
+        """Bind the tables for many iterations, as the mapper does."""
+        return self._rasterizer.bind_tables(*self._tables)
 
     def __call__(self, loss: LossWeights) -> None:
-        """One iteration."""
+        """Run one iteration."""
         self._rasterizer.step(
-            *self._lent,
+            *self._tables,
             self._view,
             self._pose,
             loss,
-            RESTING,
+            ZERO_LEARNING_RATES,
             self._masked,
             self._subset,
         )
 
 
-def timed(operations: Sequence[Callable[[], None]], repetitions: int) -> list[list[float]]:
-    """Seconds of each run of each of these operations, one after the other, once all are warm."""
+def measure_seconds(operations: Sequence[Callable[[], None]], repetitions: int) -> list[list[float]]:
+    """Return the seconds of each run of each operation after the warm-up; the operations alternate."""
     seconds: list[list[float]] = [[] for _ in operations]
     for i in range(_WARM_UP + repetitions):
         for operation, times in zip(operations, seconds, strict=True):

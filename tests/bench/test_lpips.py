@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from gausslite.errors import ModelFileError, ShapeError
-from gausslite.evaluation.lpips import Lpips, load_lpips
+from gausslite_bench.quality.lpips import Lpips, load_lpips
 
 torch = pytest.importorskip("torch", reason="LPIPS needs torch, which is not installed")
 

@@ -1,7 +1,7 @@
-"""LPIPS (Zhang et al. 2018, "The Unreasonable Effectiveness of Deep Features"): how different two images look.
+"""LPIPS, a perceptual image distance (Zhang et al. 2018, "The Unreasonable Effectiveness of Deep Features").
 
-The network is AlexNet up to its fifth convolution; its weights and those of the five linear heads come from the
-user's own files, under the names that torchvision and the authors give them.
+The network is AlexNet up to its fifth convolution. The user provides files with its weights and those of the five
+linear heads, under the names used by torchvision and by the LPIPS authors.
 """
 
 from __future__ import annotations
@@ -35,22 +35,22 @@ _EPSILON = 1e-10
 
 
 class Lpips:
-    """A PerceptualDistance on the processor; it holds about 10 MB of weights."""
+    """A PerceptualDistance on the CPU; its weights take about 10 MB."""
 
     def __init__(self, weights: Mapping[str, Tensor]) -> None:
         """Weights by name: features.N.weight, features.N.bias and linK.model.1.weight. Raises ModelFileError."""
-        wanted = _wanted_shapes()
-        missing = [name for name in wanted if name not in weights]
+        expected = _expected_shapes()
+        missing = [name for name in expected if name not in weights]
         if missing:
-            raise ModelFileError(f"LPIPS weights: expected {', '.join(wanted)}; missing are {', '.join(missing)}")
-        for name, shape in wanted.items():
-            came = tuple(weights[name].shape)
-            if came != shape:
-                raise ModelFileError(f"LPIPS weights: {name}: expected shape {shape}, got {came}")
-        self._weights = {name: weights[name].detach().float() for name in wanted}
+            raise ModelFileError(f"LPIPS weights: expected {', '.join(expected)}; missing are {', '.join(missing)}")
+        for name, shape in expected.items():
+            received = tuple(weights[name].shape)
+            if received != shape:
+                raise ModelFileError(f"LPIPS weights: {name}: expected shape {shape}, got {received}")
+        self._weights = {name: weights[name].detach().float() for name in expected}
 
     def distance_map(self, a: Shaped[ndarray, "h w 3"], b: Shaped[ndarray, "h w 3"]) -> Float32[ndarray, "h w"]:
-        """LPIPS of every pixel: each layer's distance, brought to the image's size; its mean is the usual figure.
+        """Return LPIPS per pixel: the sum of the layers' distances, resized to the image; its mean is the usual LPIPS.
 
         Images are uint8, or floating in [0, 1], with sides of at least 64 pixels. Raises ShapeError.
         """
@@ -71,7 +71,7 @@ class Lpips:
         return distances
 
     def _features(self, image: Shaped[ndarray, "h w 3"]) -> list[Tensor]:
-        """The five rectified layers, every pixel's channels scaled to length 1."""
+        """Return the five ReLU layers, with unit-length channels per pixel."""
         import torch
         from torch.nn import functional
 
@@ -90,9 +90,9 @@ class Lpips:
 
 
 def load_lpips(paths: Sequence[Path]) -> Lpips:
-    """From one file with all weights, or several that add up (AlexNet's, and the linear heads').
+    """Return LPIPS from one file with all weights, or from several files (AlexNet's and the linear heads').
 
-    Raises ModelFileError naming the file, and InvalidInputError where torch is not installed.
+    Raises ModelFileError naming the file, and InvalidInputError if torch is not installed.
     """
     weights: dict[str, Tensor] = {}
     for path in paths:
@@ -108,18 +108,18 @@ def _read(path: Path) -> dict[str, Tensor]:
             "--lpips-weights: needs torch; install it with: pip install 'gausslite[reference]'"
         ) from None
     if not path.is_file():
-        raise ModelFileError(f"{path}: expected a file of LPIPS weights, there is none")
+        raise ModelFileError(f"{path}: expected a file of LPIPS weights, got no file")
     try:
-        # the file may come from anywhere: tensors only, no code
+        # the file is untrusted: load tensors only, no code
         stored = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # torch raises many kinds for a file that is none of its own
+    except Exception as error:  # torch raises many types of errors for foreign files
         raise ModelFileError(f"{path}: expected tensors saved by torch, got {type(error).__name__}") from None
     if not isinstance(stored, Mapping):
         raise ModelFileError(f"{path}: expected tensors by name, got {type(stored).__name__}")
     return {str(name): value for name, value in stored.items() if isinstance(value, torch.Tensor)}
 
 
-def _wanted_shapes() -> dict[str, tuple[int, ...]]:
+def _expected_shapes() -> dict[str, tuple[int, ...]]:
     shapes: dict[str, tuple[int, ...]] = {}
     for k, (index, out, channels, kernel, _, _) in enumerate(_LAYERS):
         shapes[f"features.{index}.weight"] = (out, channels, kernel, kernel)

@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """How long the command line and the services take to start: the least and the median of several starts, warm files.
 
-    benchmarks/startup.py [--reps N]
+    tools/measure_startup.py [--reps N]
 
 A service counts as ready when it has logged where it listens and answers SERVING to a health check.
 """

@@ -1,0 +1,82 @@
+"""`gausslite bench registration`: map quality with a given registration of depth to colour."""
+
+from __future__ import annotations
+
+import argparse
+
+from gausslite.config.mapping_options import add_budget
+from gausslite.config.source_options import add_frames
+from gausslite.config.values import read_names
+from gausslite.datasets.held_out import HeldOutSplit
+from gausslite.datasets.open import open_source
+from gausslite.datasets.regions import choose_regions
+from gausslite.datasets.registered_source import DepthRegistration
+from gausslite.datasets.selection import frame_size, select_frames
+from gausslite.evaluation.compare import MapScores, average, score_view
+from gausslite.evaluation.views import HeldOutView, MapViewer
+from gausslite.mapping.policies import POLICIES, TASK
+from gausslite.mission.build import build_mapper
+from gausslite.mission.settings import MissionSettings
+from gausslite.mission.task_mapper import TaskMapper
+from gausslite.perception.fixed_relevance import NoTaskEstimator, RegionRelevanceEstimator
+from gausslite.render.choose import choose_rasterizer
+
+
+def configure_registration(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `bench registration`."""
+    parser.add_argument("source", metavar="SOURCE", help="a folder with a recorded sequence")
+    add = parser.add_argument_group("benchmark").add_argument
+    add("--objects", metavar="A,B", type=read_names, default=(), help="objects of the task's region (default: all)")
+    add("--policy", choices=sorted(POLICIES), default=TASK, help="mapping policy (default: %(default)s)")
+    add(
+        "--masks",
+        metavar="REGISTRATION",
+        type=DepthRegistration.parse,
+        help="registration for the region's masks, as in --register-depth; use one value to compare several runs on "
+        "the same pixels (default: that of --register-depth)",
+    )
+    add_frames(parser)
+    add_budget(parser)
+    parser.set_defaults(run=run_registration)
+
+
+def run_registration(options: argparse.Namespace) -> int:
+    """Map the training frames, score the held-out frames and print one line."""
+    print(registration_line(options, *map_and_score(options)))
+    return 0
+
+
+def map_and_score(options: argparse.Namespace) -> tuple[MapScores, int]:
+    """Return the scores on the held-out frames and the number of Gaussians. Raises GaussLiteError."""
+    source = open_source(options.source, options.up, options.register_depth)
+    mask_source = open_source(options.source, options.up, options.masks or options.register_depth)
+    size, regions = frame_size(options.size, source), choose_regions(source.regions(), options.objects)
+    training, held_out = HeldOutSplit().split(select_frames(source, options.frames))
+    settings = MissionSettings(
+        options.policy,
+        max_gaussians=options.max_gaussians,
+        iterations=options.iterations,
+        seed=options.seed,
+        threads=options.threads,
+    )
+    estimator = RegionRelevanceEstimator(regions) if options.policy == TASK else NoTaskEstimator()
+    mapper = TaskMapper(estimator, build_mapper(settings))
+    for position in training:
+        mapper.process(source.frame(position, size))
+    gaussians = mapper.gaussians()
+    viewer = MapViewer(gaussians, choose_rasterizer(threads=options.threads))
+    scores = []
+    for position in held_out:
+        roi = HeldOutView.of(mask_source.frame(position, size), regions).roi
+        view = HeldOutView(source.frame(position, size), roi)
+        scores.append(score_view(viewer.render_frame(view.frame), view))
+    return average(scores), len(gaussians)
+
+
+def registration_line(options: argparse.Namespace, scores: MapScores, gaussians: int) -> str:
+    """Return settings, ROI and full-image PSNR with SSIM, and the number of Gaussians."""
+    roi = "none" if scores.roi_psnr is None else f"{scores.roi_psnr:.2f} dB ({scores.roi_ssim:.3f})"
+    return (
+        f"{options.policy} {','.join(options.objects)} seed {options.seed} registration {options.register_depth}: "
+        f"ROI {roi}, full {scores.full_psnr:.2f} dB ({scores.full_ssim:.3f}), {gaussians} Gaussians"
+    )
