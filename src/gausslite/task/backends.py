@@ -1,9 +1,7 @@
-"""Choose how tasks are read: by rules, by a model on this machine, or by a server. Options for every program."""
+"""Choose how tasks are read: by rules, by a model on this machine, or by a server."""
 
 from __future__ import annotations
 
-import argparse
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
@@ -13,8 +11,7 @@ from gausslite.errors import InvalidInputError
 from gausslite.task.language.model import LanguageModel
 from gausslite.task.parser import TaskParser
 
-DEFAULT_KEY_VARIABLE: Final = "GAUSSLITE_LLM_API_KEY"
-_DIALECTS: Final = ("json_schema", "json_object", "none")
+RESPONSE_FORMATS: Final = ("json_schema", "json_object", "none")
 
 
 class Backend(StrEnum):
@@ -32,7 +29,7 @@ class BackendSettings:
     backend: Backend = Backend.RULES
     model: str | None = None
     url: str | None = None
-    response_format: str = _DIALECTS[0]
+    response_format: str = RESPONSE_FORMATS[0]
     timeout_s: float = 10.0
     api_key: str | None = field(default=None, repr=False)
 
@@ -44,35 +41,6 @@ class BackendSettings:
             raise InvalidInputError("backend http: expected --llm-url, such as http://localhost:8000/v1, got none")
         if not 0 < self.timeout_s <= 600:
             raise InvalidInputError(f"backend timeout: expected up to 600 seconds, got {self.timeout_s}")
-
-
-def add_backend(parser: argparse.ArgumentParser) -> None:
-    """Add --backend and what its backends need."""
-    group = parser.add_argument_group("how the task is read")
-    add = group.add_argument
-    add("--backend", choices=[str(each) for each in Backend], default="rules", help="default: %(default)s, no model")
-    add("--llm-model", metavar="NAME|FOLDER", help="http: the model's name; onnx: a folder with genai_config.json")
-    add("--llm-url", metavar="URL", help="http: the base of an OpenAI-compatible server, http://localhost:8000/v1")
-    add("--llm-format", choices=_DIALECTS, default=_DIALECTS[0], help="http: its response format (%(default)s)")
-    add("--llm-timeout", metavar="S", type=float, default=10.0, help="seconds, then rules read it (%(default)g)")
-    add(
-        "--llm-key-variable",
-        metavar="NAME",
-        default=DEFAULT_KEY_VARIABLE,
-        help="http: environment variable of the API key (%(default)s)",
-    )
-
-
-def backend_of(options: argparse.Namespace, environment: Mapping[str, str]) -> BackendSettings:
-    """The settings of parsed options; the API key from the environment. Raises InvalidInputError."""
-    return BackendSettings(
-        Backend(options.backend),
-        options.llm_model,
-        options.llm_url,
-        options.llm_format,
-        options.llm_timeout,
-        environment.get(options.llm_key_variable) or None,
-    )
 
 
 def open_parser(settings: BackendSettings) -> TaskParser:

@@ -1,4 +1,4 @@
-"""What a sentence is read as: a row of verbs, noun phrases, prepositions and joints."""
+"""Chunks: a sentence as a sequence of verbs, noun phrases, prepositions and conjunctions."""
 
 from __future__ import annotations
 
@@ -9,7 +9,11 @@ from gausslite.task.noun_phrase import NounPhrase
 
 
 class ChunkKind(Enum):
-    """What a chunk of a sentence is."""
+    """Kind of a chunk.
+
+    SUBJECT_VERB: a verb whose objects precede it ("the mugs belong in the cupboard"). STATEMENT: the start of a
+    clause that requests nothing. ANAPHOR: "it" or "them". DEMONSTRATIVE: "this" or "those" without a noun.
+    """
 
     VERB = "verb"
     SUBJECT_VERB = "subject verb"
@@ -25,9 +29,9 @@ class ChunkKind(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Chunk:
-    """One chunk: the verb's base form, the preposition's relation, the joint's word, or a noun phrase.
+    """One chunk; word is the verb's base form, the preposition's relation, the conjunction or the noun's head.
 
-    current_place: the place is where something is ("that is on"), and not where it is to go.
+    current_place: the preposition states where something is ("that is on"), not where to put it.
     """
 
     kind: ChunkKind

@@ -1,4 +1,4 @@
-"""What one verb of a sentence has gathered so far, and which of its nouns name an object at all."""
+"""The state of one clause while its chunks are processed, and the test whether a noun names an object."""
 
 from __future__ import annotations
 
@@ -8,7 +8,11 @@ from gausslite.task.noun_phrase import NounPhrase, adjectives_only
 
 
 class Clause:
-    """The objects a verb acts on (subjects), what "it" would mean (referents), and places that wait for an object."""
+    """The objects a verb acts on, the candidates for "it" (referents), and places still without an object.
+
+    conjoined: the latest object followed a conjunction. by_pronoun: the objects come from "it" or "them".
+    route: the clause mentions a path. skip_of_phrase: the next "of" continues a noun that names no object.
+    """
 
     def __init__(self, verb: str | None = None, referents: list[str] | None = None) -> None:
         self.verb = verb
@@ -33,14 +37,14 @@ class Clause:
 
 
 def names_object(noun: NounPhrase, pending: str | None, after: Chunk | None) -> bool:
-    """False for the robot itself, and for places, routes and measures that stand for something else."""
+    """Return False for names of the robot, and for places, routes and measures that stand for another noun."""
     if len(noun.words) == 1 and noun.head in lexicon.ADDRESSEES:
         return False
     if noun.head in lexicon.TASK_NOUNS and pending is None:
         return False
-    leads_on = after is not None and after.kind is ChunkKind.PREPOSITION and after.word == "of"
+    of_follows = after is not None and after.kind is ChunkKind.PREPOSITION and after.word == "of"
     compound = len(noun.words) > 1 and not adjectives_only(noun.words[:-1])
-    if compound and noun.head in lexicon.PLACES and not leads_on:
+    if compound and noun.head in lexicon.PLACES and not of_follows:
         return True
     unlikely = lexicon.TIME_NOUNS if noun.has_determiner else lexicon.MANNER_NOUNS | lexicon.TIME_NOUNS
     if noun.head in unlikely and adjectives_only(noun.words[:-1]) and pending not in (None, "from", "of", "to", "on"):
@@ -48,15 +52,15 @@ def names_object(noun: NounPhrase, pending: str | None, after: Chunk | None) -> 
     if noun.head in lexicon.BUILDINGS:
         return pending != "inside" or bool(noun.words[1:])
     if noun.head in lexicon.PLACES:
-        return noun.head in lexicon.PHYSICAL_PLACES and pending not in (None, "inside", "to") and not leads_on
+        return noun.head in lexicon.PHYSICAL_PLACES and pending not in (None, "inside", "to") and not of_follows
     if noun.head in lexicon.ROUTES:
         return pending not in (None, "of", "for", "to")
     if noun.head in lexicon.MEASURES and pending not in (None, "of"):
-        return not leads_on
-    return noun.head not in lexicon.MEASURES or ((noun.is_known or compound) and not leads_on)
+        return not of_follows
+    return noun.head not in lexicon.MEASURES or ((noun.is_known or compound) and not of_follows)
 
 
 def with_shared_head(adjective: NounPhrase, noun: NounPhrase) -> NounPhrase:
-    """In "red and blue mugs", red takes the head that it shares."""
+    """Return the adjective with the noun's head: in "red and blue mugs", "red" becomes "red mug"."""
     words = adjective.words[:-1] if adjective.head in ("one", "ones") else adjective.words
     return NounPhrase((*words, noun.head), adjective.has_determiner, noun.superlative)

@@ -1,4 +1,4 @@
-"""Make a graph of what a parser found, and keep nothing in it that the sentence does not say."""
+"""Build a task graph from a parser's answer, and drop everything that the sentence does not mention."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from gausslite.domain.task import Relation, TaskGraph
 from gausslite.errors import TaskError
 from gausslite.task import lexicon
-from gausslite.task.chunker import read
+from gausslite.task.chunker import chunk_sentence
 from gausslite.task.graph_builder import build_draft
 from gausslite.task.graph_draft import GraphDraft
 from gausslite.task.noun_phrase import noun_phrase
@@ -17,7 +17,7 @@ from gausslite.task.tokenizer import tokenize
 from gausslite.task.validate import EXAMPLE, LIMITS, require_graph, require_task_text
 from gausslite.task.word_set import word_set
 
-# words for any object: they, or a place, a "this" or an "everything" in the sentence, entail one another
+# a generic noun in an answer is valid if the sentence has one of these words, and the reverse
 _ANY_OBJECT = (
     lexicon.GENERIC
     | lexicon.PLACES
@@ -45,18 +45,19 @@ def grounded_graph(
     warnings: Sequence[str] = (),
     draft: GraphDraft | None = None,
 ) -> TaskGraph:
-    """The one way from any parser's answer to a task graph.
+    """Return the validated graph of any parser's answer.
 
-    Phrases lose their article and plural. A target or anchor whose head noun the sentence neither contains nor entails
-    is dropped, a target that the sentence says to leave alone, and a relation between nouns that are not listed;
-    `warnings` names them. The rules hand over their own `draft`; for other parsers it is read here. Raises TaskError
-    when the text is no task, no target is left, or the graph is out of bounds.
+    Articles and plurals are removed. Dropped, with a warning: targets and anchors whose head noun the sentence does not
+    mention, targets that the sentence excludes, and relations between unlisted nouns. The rule parser passes its own
+    `draft`; without one, the sentence is parsed by rules here. Raises TaskError if the text is not a task, if no target
+    is left, or if the graph exceeds the limits.
     """
     require_task_text(text)
-    said, notes = _sentence_words(text), list(warnings)
-    draft = draft or build_draft(read(normalise_text(text)))
-    kept_targets = _without_excluded(draft, _mentioned("target", targets, said, notes.append), notes.append)
-    kept_anchors = _mentioned("anchor", anchors, said, notes.append)
+    mentioned, all_warnings = _sentence_words(text), list(warnings)
+    draft = draft or build_draft(chunk_sentence(normalise_text(text)))
+    warn = all_warnings.append
+    kept_targets = _without_excluded(draft, _mentioned_phrases("target", targets, mentioned, warn), warn)
+    kept_anchors = _mentioned_phrases("anchor", anchors, mentioned, warn)
     if not kept_targets:
         shown = " ".join(text.split())[:60]
         raise TaskError(
@@ -67,44 +68,46 @@ def grounded_graph(
         text=text.strip(),
         targets=kept_targets,
         anchors=kept_anchors,
-        relations=_valid_relations(relations, kept_targets, kept_anchors, notes.append),
-        warnings=tuple(notes[: LIMITS.max_warnings]),
+        relations=_valid_relations(relations, kept_targets, kept_anchors, warn),
+        warnings=tuple(all_warnings[: LIMITS.max_warnings]),
     )
     require_graph(graph)
     return graph
 
 
-def _mentioned(role: str, phrases: Sequence[str], said: frozenset[str], note: Callable[[str], None]) -> tuple[str, ...]:
-    """The phrases whose head the sentence says or entails, plain and once."""
+def _mentioned_phrases(
+    role: str, phrases: Sequence[str], mentioned: frozenset[str], warn: Callable[[str], None]
+) -> tuple[str, ...]:
+    """Return the normalised phrases whose head noun the sentence mentions, without duplicates."""
     kept: dict[str, None] = {}
     for phrase in phrases:
         noun = plain_phrase(phrase)
-        if _is_mentioned(noun, said):
+        if _is_mentioned(noun, mentioned):
             kept[noun] = None
         else:
-            note(f"{role} {_abbreviate(phrase)} is not in the sentence: it is dropped")
+            warn(f"{role} {_abbreviate(phrase)} is not in the sentence: it is dropped")
     return tuple(kept)
 
 
-def _without_excluded(draft: GraphDraft, targets: tuple[str, ...], note: Callable[[str], None]) -> tuple[str, ...]:
-    """The targets without those that the rules read as to be left alone; "mug" stays where only "the blue mug" is."""
+def _without_excluded(draft: GraphDraft, targets: tuple[str, ...], warn: Callable[[str], None]) -> tuple[str, ...]:
+    """Return the targets that the rules do not exclude; "mug" stays if only "the blue mug" is excluded."""
     kept: list[str] = []
     for target in targets:
-        forbidden = any(_may_be_same_object(target, phrase) for phrase in draft.excluded)
-        if forbidden and not any(_may_be_same_object(target, wanted) for wanted in draft.targets):
-            note(f"target {_abbreviate(target)} is to be left alone: it is dropped")
+        is_excluded = any(_may_be_same_object(target, phrase) for phrase in draft.excluded)
+        if is_excluded and not any(_may_be_same_object(target, other) for other in draft.targets):
+            warn(f"target {_abbreviate(target)} is to be left alone: it is dropped")
         else:
             kept.append(target)
     return tuple(kept)
 
 
 def _may_be_same_object(one: str, other: str) -> bool:
-    """True where one phrase is the other, or the other with more words before it."""
+    """Return True if the phrases are equal, or one is the other with more words before it."""
     return f" {one}".endswith(f" {other}") or f" {other}".endswith(f" {one}")
 
 
 def plain_phrase(phrase: str) -> str:
-    """A noun phrase as a detector gets it: lower case, no article, the head in the singular, nothing after "of"."""
+    """Return a noun phrase for a detector: lower case, no article, the head in the singular, nothing after "of"."""
     tokens = normalise_text(phrase).split(" of ")[0].split()
     while len(tokens) > 1 and tokens[0] in _ARTICLES:
         tokens = tokens[1:]
@@ -112,7 +115,7 @@ def plain_phrase(phrase: str) -> str:
 
 
 def _valid_relations(
-    relations: Sequence[Relation], targets: tuple[str, ...], anchors: tuple[str, ...], note: Callable[[str], None]
+    relations: Sequence[Relation], targets: tuple[str, ...], anchors: tuple[str, ...], warn: Callable[[str], None]
 ) -> tuple[Relation, ...]:
     kept: dict[Relation, None] = {}
     for each in relations:
@@ -120,9 +123,8 @@ def _valid_relations(
         if relation.target in targets and relation.anchor in anchors:
             kept[relation] = None
         else:
-            note(
-                f"{each.predicate} joins {_abbreviate(each.target)} to {_abbreviate(each.anchor)}, not both known: it is dropped"
-            )
+            nouns = f"{_abbreviate(each.target)} to {_abbreviate(each.anchor)}"
+            warn(f"{each.predicate} joins {nouns}, not both known: it is dropped")
     return tuple(kept)
 
 
@@ -131,20 +133,20 @@ def _abbreviate(phrase: str) -> str:
 
 
 def _sentence_words(text: str) -> frozenset[str]:
-    """Every word of a sentence as it stands and in the singular, the parts of hyphenated words too."""
+    """Return every word of a sentence, also in the singular, and the parts of hyphenated words."""
     tokens = tokenize(normalise_text(text).replace("-", " ")) + normalise_text(text).split()
     bare = [token.strip(".,;:!?()\"'").removesuffix("'s") for token in tokens]
     return frozenset(bare) | frozenset(singular(token) for token in bare) | frozenset(tokens)
 
 
-def _is_mentioned(phrase: str, said: frozenset[str]) -> bool:
+def _is_mentioned(phrase: str, mentioned: frozenset[str]) -> bool:
     head = phrase.split()[-1] if phrase else ""
     if not head:
         return False
-    if head in said or head.split("-")[-1] in said:
+    if head in mentioned or head.split("-")[-1] in mentioned:
         return True
     if head in lexicon.GENERIC:
-        return bool(said & _ANY_OBJECT)
+        return bool(mentioned & _ANY_OBJECT)
     if head == "person":
-        return bool(said & lexicon.PEOPLE)
-    return any(head in group and said & group for group in _SYNONYMS)
+        return bool(mentioned & lexicon.PEOPLE)
+    return any(head in group and mentioned & group for group in _SYNONYMS)

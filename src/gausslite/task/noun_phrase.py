@@ -1,4 +1,4 @@
-"""A noun phrase: its words without determiners, the head in the singular."""
+"""Noun phrases: words without determiners, the head in the singular."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from gausslite.task import lexicon
 from gausslite.task.singular import singular
 from gausslite.task.word_set import word_set
 
-# "glasses" to drink from have a singular, and those to see with have none
+# drinking glasses have a singular, spectacles have none
 _DRINK_WORDS = word_set(
     "wine beer water champagne drinking cocktail juice whisky whiskey shot pint milk measuring dirty empty"
 )
@@ -17,7 +17,7 @@ _DRINK_WORDS = word_set(
 
 @dataclass(frozen=True, slots=True)
 class NounPhrase:
-    """words without determiners, head singular; determined: an article stood before it; superlative: "the closest"."""
+    """A noun phrase without its determiner, the head in the singular; superlative: "the closest" preceded it."""
 
     words: tuple[str, ...]
     has_determiner: bool
@@ -25,12 +25,12 @@ class NounPhrase:
 
     @property
     def head(self) -> str:
-        """The noun itself, without its adjectives."""
+        """The noun without its adjectives."""
         return self.words[-1]
 
     @property
     def text(self) -> str:
-        """The phrase as a detector gets it."""
+        """The phrase as it is passed to a detector."""
         return " ".join(self.words)
 
     @property
@@ -40,7 +40,7 @@ class NounPhrase:
 
 
 def noun_phrase(words: Sequence[str], has_determiner: bool, superlative: bool) -> NounPhrase:
-    """Build the phrase from the words as they were written."""
+    """Return the phrase of these words of a sentence."""
     kept = list(words)
     last = kept[-1]
     kept[-1] = "glass" if last == "glasses" and _DRINK_WORDS.intersection(kept) else singular(last)
@@ -48,10 +48,10 @@ def noun_phrase(words: Sequence[str], has_determiner: bool, superlative: bool) -
 
 
 def phrase_from_text(text: str) -> NounPhrase:
-    """The phrase of an object that was named before."""
+    """Return the phrase of an object that the sentence named before."""
     return NounPhrase(tuple(text.split()), True, False)
 
 
 def adjectives_only(words: Sequence[str]) -> bool:
-    """True for "red" or "big old": something is with_shared_head and nothing named."""
+    """Return True if all words are adjectives, as in "red" or "big old"."""
     return all(word in lexicon.ADJECTIVES and word not in lexicon.NOUNS for word in words)

@@ -1,4 +1,4 @@
-"""The seam between task text and task graph: every parser, rule-based, language model or remote, fits here."""
+"""The interface of task parsers (rules, language model, remote), and the normalised text and id of a task."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ _TASK_ID_HEX_DIGITS = 12
 
 @runtime_checkable
 class TaskParser(Protocol):
-    """Reads a task in plain words."""
+    """Parse a task given as an English sentence."""
 
     def parse(self, text: str) -> TaskGraph:
-        """The task graph of one task. Raises TaskError when the text is empty, too long or names nothing."""
+        """Return the graph of one task. Raises TaskError if the text is empty, too long or names no object."""
         ...
 
 
 def normalise_text(text: str) -> str:
-    """One spelling for all ways to type a task: lower case, plain quotes, single spaces, no punctuation at the end."""
+    """Return the text in lower case, with plain quotes, single spaces and no punctuation at the end."""
     plain = unicodedata.normalize("NFKC", text).translate({0x2018: "'", 0x2019: "'", 0x201C: '"', 0x201D: '"'})
     return " ".join(plain.casefold().split()).strip(" .!?;:,")
 
 
 def task_id_of(text: str) -> str:
-    """A short name of the task that is the same on every machine and for every way to type it."""
+    """Return a short hash of the normalised text: equal on every machine and for every spelling of a task."""
     return hashlib.sha256(normalise_text(text).encode()).hexdigest()[:_TASK_ID_HEX_DIGITS]

@@ -1,4 +1,4 @@
-"""Put a noun where its preposition and its verb say: target, anchor, or in a relation to what was named before."""
+"""Assign each noun a role by its verb and preposition: target, anchor, or related to an earlier noun."""
 
 from __future__ import annotations
 
@@ -26,25 +26,25 @@ from gausslite.task.verbs import (
 from gausslite.task.word_set import word_set
 
 _ORIGIN_RELATIONS: Final = {f"from_{place}": place for place in ("on", "under", "inside", "behind", "near")}
-# after "on the table" these say where something goes, and others say where the table is
+# after "on the table" these state the destination; other prepositions locate the table
 _FINAL_DESTINATIONS: Final = word_set("on inside")
 _DESTINATION_RELATIONS: Final = word_set("to on inside near under behind in_front_of above between left_of right_of")
-# what is compared or swapped with something is a target as much as that is
+# both objects of these verbs are targets
 _PAIRING_VERBS: Final = word_set("compare swap exchange")
 _PASSING_RELATIONS: Final = word_set("past beyond")
 
 
 class RoleAssigner:
-    """Fills a draft with the nouns of one clause after another."""
+    """Add the nouns of each clause to a draft."""
 
     def __init__(self, draft: GraphDraft) -> None:
         self._draft = draft
         self.clause = Clause()
 
     def end_clause(self, verb: str | None) -> None:
-        """Begin another clause. One whose only nouns are places ("look under the bed") means those places.
+        """Start another clause. The places of a clause without objects ("look under the bed") become targets.
 
-        In "in the kitchen, find the mug" the place belongs to the clause that follows.
+        In "in the kitchen, find the mug" the place belongs to the following clause.
         """
         before = self.clause
         if self._searches_for_referent():
@@ -60,7 +60,7 @@ class RoleAssigner:
         return places_only and clause.follows_statement and bool(clause.referents)
 
     def _search_there(self, clause: Clause) -> None:
-        """In "I lost my wallet, look under the bed" the wallet is sought there."""
+        """Search the places for the referents, as in "I lost my wallet, look under the bed"."""
         clause.objects = list(clause.referents)
         self._draft.confirm_targets(clause.objects)
         pending_places, clause.pending_places = clause.pending_places, []
@@ -71,33 +71,33 @@ class RoleAssigner:
         pending_places, self.clause.pending_places = self.clause.pending_places, []
         for _, noun in pending_places:
             self._draft.drop_anchor(noun.text)
-            self.target(noun, joined=True)
+            self.target(noun, conjoined=True)
 
-    def assign(self, noun: NounPhrase, pending: str | None, joined: bool, following: Sequence[Chunk]) -> None:
-        """Place one noun, knowing the preposition before it, whether it is joined, and the chunks that follow."""
+    def assign(self, noun: NounPhrase, pending: str | None, conjoined: bool, following: Sequence[Chunk]) -> None:
+        """Assign one noun, given its preposition, whether a conjunction precedes it, and the following chunks."""
         clause, after = self.clause, following[0] if following else None
         if pending == "of" and clause.skip_of_phrase:
-            pending, joined = clause.inherited_preposition, clause.inherited_conjoined
+            pending, conjoined = clause.inherited_preposition, clause.inherited_conjoined
             clause.skip_of_phrase, clause.inherited_preposition = False, None
         if pending is None:
-            if joined and clause.last_relation is not None and self._is_second_anchor(noun, after):
+            if conjoined and clause.last_relation is not None and self._is_second_anchor(noun, after):
                 self._add_anchor(clause.last_relation, noun)
             elif self._is_recipient(following):
                 self._draft.add_anchor(noun.text)
                 clause.last_relation = "to"
             else:
-                self.target(noun, joined and clause.last_relation is None)
+                self.target(noun, conjoined and clause.last_relation is None)
             return
         self.assign_by_preposition(pending, noun, following)
 
     def assign_by_preposition(self, pending: str, noun: NounPhrase, following: Sequence[Chunk] = ()) -> None:
-        """What the noun is to the clause's objects, by the preposition before it."""
+        """Assign the noun's role relative to the clause's objects, by the preposition before it."""
         clause = self.clause
         if pending == "closer":
             pending = "to" if clause.verb in DELIVERY_VERBS else "near"
-        plainly = {"to": self._destination, "for": self._search_object, "of": self._whole, "via": self._waypoint}
-        if pending in plainly:
-            plainly[pending](noun)
+        handlers = {"to": self._destination, "for": self._search_object, "of": self._whole, "via": self._waypoint}
+        if pending in handlers:
+            handlers[pending](noun)
         elif pending == "when":
             return
         elif pending == "purpose":
@@ -107,7 +107,7 @@ class RoleAssigner:
         elif pending in _PASSING_RELATIONS and clause.verb in DELIVERY_VERBS:
             self._draft.add_anchor(noun.text)
         elif self._is_route_point(pending) or (pending == "with" and clause.verb in _PAIRING_VERBS):
-            self.target(noun, joined=True)
+            self.target(noun, conjoined=True)
         elif pending == "with" and clause.verb in FILLING_VERBS and clause.objects:
             self._load(noun)
         elif pending == "with":
@@ -129,7 +129,7 @@ class RoleAssigner:
         self.clause.route = True
 
     def _purpose_goal(self, noun: NounPhrase) -> None:
-        """A path that leads to a cabin makes it a goal; a door that does, or a key that opens it, does not."""
+        """Make the end of a path a target; where a door leads or what a key opens is no target."""
         if self.clause.route:
             self.target(noun)
         else:
@@ -139,7 +139,7 @@ class RoleAssigner:
         return any(subject.split()[-1] in lexicon.PEOPLE for subject in self.clause.objects)
 
     def _is_destination(self, pending: str, following: Sequence[Chunk]) -> bool:
-        """In "take the chair and push it under the desk" and "put the mug on the desk" they are not there yet."""
+        """Return True if the preposition states where to put the objects: "put the mug on the desk"."""
         clause = self.clause
         if clause.by_pronoun and clause.verb in DELIVERY_VERBS and pending in _DESTINATION_RELATIONS:
             return True
@@ -155,7 +155,7 @@ class RoleAssigner:
             self.relate(relation, noun)
 
     def _companion(self, noun: NounPhrase) -> None:
-        """Who looks for a man with a hat is to see the hat; who wipes with a sponge is to have it."""
+        """Assign the noun after "with": the hat of "find a man with a hat" is near, a tool is an anchor."""
         if self.clause.last_relation == "to":
             self._draft.add_anchor(noun.text)
         elif self.clause.verb in LOOKING_VERBS or noun.head in lexicon.PARTS:
@@ -165,7 +165,7 @@ class RoleAssigner:
             self.clause.last_relation = "with"
 
     def _load(self, noun: NounPhrase) -> None:
-        """Who loads the van with boxes is to move the boxes."""
+        """Make the noun the target and the objects so far anchors: "load the van with boxes"."""
         places, self.clause.objects = self.clause.objects, []
         self._draft.targets = [target for target in self._draft.targets if target not in places]
         for place in places:
@@ -173,7 +173,7 @@ class RoleAssigner:
         self.target(noun)
 
     def _is_recipient(self, following: Sequence[Chunk]) -> bool:
-        """In "hand the nurse the towel" the nurse locates where the towel goes."""
+        """Return True for the first noun of "hand the nurse the towel", which states the destination."""
         clause = self.clause
         while len(following) > 1 and following[0].kind is ChunkKind.PREPOSITION and following[1].kind is ChunkKind.NOUN:
             following = following[2:]  # "bring the man in the wheelchair a drink"
@@ -181,35 +181,35 @@ class RoleAssigner:
         return follows and clause.verb in GIVING_VERBS and not clause.objects
 
     def _is_final_place(self, pending: str, following: Sequence[Chunk]) -> bool:
-        """Of "on the table into the sink" only the sink is where it goes; "on the shelf in the garage" is one place."""
+        """Return True if no later place is the destination; "on the table into the sink" goes to the sink."""
         more = [chunk.word for chunk in following[:1] if chunk.kind is ChunkKind.PREPOSITION]
         rooms = [chunk.noun for chunk in following[1:2] if chunk.noun and chunk.noun.head in lexicon.ROOMS]
         final = "to" in more or (pending == "on" and bool(_FINAL_DESTINATIONS.intersection(more)) and not rooms)
         return bool(self.clause.objects) and pending in _DESTINATION_RELATIONS and not final
 
     def _is_second_anchor(self, noun: NounPhrase, after: Chunk | None) -> bool:
-        """Near the sink and the stove: both locate. On the table and the keys: the keys are a target of their own."""
+        """Return True for the stove in "near the sink and the stove", not for a target of its own."""
         if after is not None and after.kind is ChunkKind.PREPOSITION and after.word not in ("of", "to", "for", "with"):
             return False
         if self.clause.last_relation == "between" or self.clause.between:
             return True
         return noun.head in lexicon.COMMON_ANCHORS and self.clause.last_relation not in ("on", "inside", "with")
 
-    def target(self, noun: NounPhrase, joined: bool = False) -> None:
-        """Make the noun a target: the clause is about it from here on, or about it too."""
+    def target(self, noun: NounPhrase, conjoined: bool = False) -> None:
+        """Make the noun a target and the clause's object; a conjoined noun is added to the objects."""
         clause = self.clause
         self._draft.add_target(noun.text, from_statement=clause.statement)
-        clause.objects = [*clause.objects, noun.text] if joined else [noun.text]
-        clause.conjoined, clause.by_pronoun = joined, False
+        clause.objects = [*clause.objects, noun.text] if conjoined else [noun.text]
+        clause.conjoined, clause.by_pronoun = conjoined, False
         clause.last_relation = None
-        clause.superlative = noun.superlative or (joined and clause.superlative)
+        clause.superlative = noun.superlative or (conjoined and clause.superlative)
         clause.is_part = noun.head in lexicon.PARTS
         pending_places, clause.pending_places = clause.pending_places, []
         for relation, anchor in pending_places:
             self.relate(relation, anchor)
 
     def relate(self, relation: str, noun: NounPhrase) -> None:
-        """Say where the clause's objects are; a place that is named before them waits for them."""
+        """Relate the clause's objects to the noun; a place named before any object is kept for the next object."""
         clause = self.clause
         clause.last_relation = relation
         if not clause.objects:
@@ -224,14 +224,14 @@ class RoleAssigner:
         if clause.superlative and clause.objects:
             self.relate(Predicate.CLOSEST_TO, noun)
         elif clause.route or not clause.objects or clause.verb in GO_VERBS - MOVING_VERBS:
-            self.target(noun, joined=bool(clause.objects))
+            self.target(noun, conjoined=bool(clause.objects))
             clause.route = False
         else:
             self._draft.add_anchor(noun.text)
             clause.last_relation = "to"
 
     def _search_object(self, noun: NounPhrase) -> None:
-        """Searching the desk for keys seeks the keys near the desk; inspecting it for wear seeks no object."""
+        """Make the noun the target, near the searched places; a defect to inspect for is no object."""
         clause = self.clause
         if clause.objects and clause.verb in INSPECTION_VERBS and noun.head in lexicon.DEFECTS:
             return

@@ -1,6 +1,6 @@
-"""Write word lists as running text: easier to read, sort and extend than columns of quoted strings."""
+"""Word lists as running text, which is easier to read, sort and extend than quoted strings."""
 
 
 def word_set(text: str) -> frozenset[str]:
-    """The set of the words in a text."""
+    """Return the set of the words of a text."""
     return frozenset(text.split())

@@ -137,7 +137,7 @@ def test_what_is_to_be_left_alone_is_no_target_and_said(text, excluded):
 def test_what_is_pointed_at_is_any_object_and_said(text, targets, anchors):
     graph = RuleParser().parse(text)
     assert (graph.targets, graph.anchors) == (targets, anchors)
-    assert "points at something without a name" in graph.warnings[0]
+    assert "refers to no named object" in graph.warnings[0]
 
 
 @pytest.mark.parametrize(
@@ -164,7 +164,7 @@ def test_every_predicate_can_be_said(predicate):
 def test_a_relation_without_a_predicate_becomes_near_and_is_said():
     graph = RuleParser().parse("Find the shoe opposite the couch")
     assert graph.relations == (Relation(Predicate.NEAR, "shoe", "couch"),)
-    assert graph.warnings == ("'opposite' 'couch' is no relation that is known: read as near",)
+    assert graph.warnings == ("'opposite' 'couch' is not a known relation: treated as near",)
 
 
 def test_far_from_is_not_turned_into_near():
