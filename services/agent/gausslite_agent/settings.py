@@ -7,25 +7,26 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from gausslite.config.options import (
+from gausslite.config.mapping_options import (
     add_budget,
     add_detector,
-    add_frames,
     add_policy,
     add_voxel_size,
     mission_settings,
     perception_settings,
 )
+from gausslite.config.source_options import add_frames
+from gausslite.config.tls_options import add_tls, read_server_tls
 from gausslite.datasets.registered_source import DepthRegistration
+from gausslite.domain.names import require_name
 from gausslite.domain.pose import UpAxis
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.errors import InvalidInputError
-from gausslite.fusion.limits import require_name
 from gausslite.mission.checkpoint import ResumeConfig
 from gausslite.mission.settings import MissionSettings, PerceptionSettings
 from gausslite.task.validate import require_task_text
 from gausslite.wire.address import require_callable
-from gausslite.wire.tls import Tls, add_tls, service_tls
+from gausslite.wire.tls import Tls
 from gausslite.wire.uplink_values import UplinkSettings
 from gausslite_agent.load import Drops, LoadSettings
 
@@ -116,7 +117,7 @@ def parse_arguments(arguments: Sequence[str] | None = None) -> AgentSettings:
         link,
         mission_settings(options),
         _load_settings(options),
-        service_tls(options),
+        read_server_tls(options),
         options.state,
     )
 

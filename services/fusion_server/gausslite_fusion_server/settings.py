@@ -7,12 +7,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from gausslite.config.tls_options import add_tls, read_server_tls
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.errors import InvalidInputError
 from gausslite.fusion.joint_refinement import RefineSettings
 from gausslite.fusion.limits import MAX_REFINE_ITERATIONS, FusionSettings, Quotas
 from gausslite.render.choose import BACKENDS
-from gausslite.wire.tls import Tls, add_tls, service_tls
+from gausslite.wire.tls import Tls
 
 MEMORY = "memory"
 _MAX_STORE_MB = 1 << 24
@@ -54,7 +55,7 @@ def parse_arguments(arguments: Sequence[str] | None = None) -> ServerSettings:
         FusionSettings(VoxelGrid(options.voxel_size), options.mission, options.world_frame, quotas),
         RefineSettings(iterations=options.refine_iterations),
         options.rasterizer,
-        service_tls(options),
+        read_server_tls(options),
     )
 
 

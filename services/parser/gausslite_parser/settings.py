@@ -7,8 +7,10 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from gausslite.task.backends import BackendSettings, add_backend, backend_of
-from gausslite.wire.tls import Tls, add_tls, service_tls
+from gausslite.config.task_parser_options import add_backend, backend_settings
+from gausslite.config.tls_options import add_tls, read_server_tls
+from gausslite.task.backends import BackendSettings
+from gausslite.wire.tls import Tls
 
 DEFAULT_LISTEN = "127.0.0.1:50051"
 
@@ -36,4 +38,4 @@ def parse_arguments(arguments: Sequence[str] | None = None) -> ParserSettings:
     add_backend(parser)
     add_tls(parser)
     options = parser.parse_args(arguments)
-    return ParserSettings(options.listen, backend_of(options, os.environ), service_tls(options))
+    return ParserSettings(options.listen, backend_settings(options, os.environ), read_server_tls(options))

@@ -13,16 +13,15 @@ from gausslite.calibration.pose_exposure_prior import PoseExposurePrior
 from gausslite.cli.source_options import open_recorded, register_with_warnings, resolve_pose_prior
 from gausslite.cli.team import AgentPlan, Team, TeamPlan, agent_report, collect_maps, running_team, watch_missions
 from gausslite.codec.ply import read_ply
-from gausslite.config.options import (
-    LOOK,
+from gausslite.config.mapping_options import (
     add_budget,
-    add_colour_camera,
     add_detector,
-    add_view_error,
+    add_pose_prior,
     add_voxel_size,
-    names,
     perception_settings,
 )
+from gausslite.config.source_options import add_register_depth
+from gausslite.config.values import AUTO, read_names
 from gausslite.datasets.held_out import HeldOutSplit
 from gausslite.datasets.open import open_source
 from gausslite.datasets.regions import choose_regions
@@ -58,11 +57,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--frames-a", metavar="START:STOP:STEP", help="frames of agent-a (default: the first half)")
     parser.add_argument("--frames-b", metavar="START:STOP:STEP", help="frames of agent-b (default: the second half)")
     parser.add_argument(
-        "--objects", metavar="A,B", type=names, default=(), help="score these (default: the tasks' nouns)"
+        "--objects", metavar="A,B", type=read_names, default=(), help="score these (default: the tasks' nouns)"
     )
     parser.add_argument("--size", metavar="WxH", help=f"image size (default: as it is; {_HOME_SIZE} in the home)")
-    add_colour_camera(parser, may_look=True, by_default=LOOK)
-    add_view_error(parser, LOOK, LOOK, may_look=True)
+    add_register_depth(parser, allow_auto=True, default_text=AUTO)
+    add_pose_prior(parser, AUTO, AUTO, allow_auto=True)
     add_voxel_size(parser)
     parser.add_argument("--refine-iterations", metavar="N", type=int, default=500, help="0 leaves refinement out")
     add_detector(parser)
@@ -178,7 +177,7 @@ def _recorded_stage(options: argparse.Namespace) -> _Stage:
         train, held = HeldOutSplit(_HOLD_OUT).split(select_frames(recorded, frames))
         agents.append(AgentPlan(f"agent-{letter}", task, str(options.source), frames, len(train)))
         held_out.append(held)
-    source, camera = register_with_warnings(options.source, recorded, options.register_depth, LOOK)
+    source, camera = register_with_warnings(options.source, recorded, options.register_depth, AUTO)
     pose_prior = resolve_pose_prior(options.source, source, options.pose_prior)
     views = tuple(HeldOutFrames(source, held, size) for held in held_out)
     return _Stage(tuple(agents), size, _HOLD_OUT, views, regions, camera, pose_prior)
@@ -224,7 +223,14 @@ def _plan(options: argparse.Namespace, stage: _Stage) -> TeamPlan:
     if options.vocabulary is not None:
         shared += ["--vocabulary", str(options.vocabulary.absolute())]
     if options.rate is not None:
-        shared += ["--rate", str(options.rate), "--min-iterations", str(options.min_iterations), "--skip-stages", ",".join(options.skip_stages)]
+        shared += [
+            "--rate",
+            str(options.rate),
+            "--min-iterations",
+            str(options.min_iterations),
+            "--skip-stages",
+            ",".join(options.skip_stages),
+        ]
         shared += ["--deadline-slack", str(options.deadline_slack)]
     if options.iterations is not None:
         shared += ["--iterations", str(options.iterations)]

@@ -11,7 +11,7 @@ from pathlib import Path
 from gausslite.cli.progress import progress_bar
 from gausslite.cli.source_options import add_regions, add_source, asked_regions, open_with_warnings
 from gausslite.codec.ply import read_ply
-from gausslite.config.options import AS_RECORDED, LOOK, depth_registration
+from gausslite.config.values import AUTO, NONE, read_depth_registration
 from gausslite.datasets.held_out import HeldOutSplit
 from gausslite.datasets.registered_source import DepthRegistration
 from gausslite.datasets.selection import frame_size, select_frames
@@ -24,14 +24,14 @@ from gausslite.mission.results import as_text, prepare_folder, read_report
 from gausslite.render.choose import choose_rasterizer
 
 _PICTURES = 8
-_AS_MADE = f"as the report beside MAP says, without one {LOOK}"
+_AS_MADE = f"as the report beside MAP says, without one {AUTO}"
 _FIT_AS_MADE = "where the report beside MAP says that views were refined"
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the options of `gausslite eval`."""
     parser.add_argument("map", metavar="MAP", type=Path, help="a PLY file")
-    add_source(parser, by_default=_AS_MADE)
+    add_source(parser, default_text=_AS_MADE)
     add_regions(parser)
     parser.add_argument("--test-every", metavar="N", type=int, help="score every Nth selected frame only")
     parser.add_argument(
@@ -50,7 +50,7 @@ def run(options: argparse.Namespace) -> int:
     rasterizer = choose_rasterizer(threads=options.threads)
     gaussians = read_ply(options.map)
     made = _MadeWith.of(options)
-    source, _ = open_with_warnings(options.source, options.up, made.depth_registration, LOOK)
+    source, _ = open_with_warnings(options.source, options.up, made.depth_registration, AUTO)
     positions = select_frames(source, options.frames)
     if options.test_every is not None:
         positions = HeldOutSplit(options.test_every).split(positions)[1]
@@ -94,8 +94,8 @@ class _MadeWith:
         report, told = read_report(options.map.parent), []
         camera, fit_views = options.register_depth, options.fit_views
         if camera is None and "colour_camera" in report:
-            camera = depth_registration(str(report["colour_camera"] or AS_RECORDED))
-            told += [f"--register-depth {camera}"] if camera != AS_RECORDED else []
+            camera = read_depth_registration(str(report["colour_camera"] or NONE))
+            told += [f"--register-depth {camera}"] if camera != NONE else []
         if fit_views is None:
             fit_views = report.get("view_error") is not None
             told += ["--fit-views"] if fit_views else []

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from gausslite.codec.ply import read_ply, write_ply
-from gausslite.config.options import add_voxel_size
+from gausslite.config.mapping_options import add_voxel_size
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.errors import InvalidInputError
 from gausslite.fusion.offline import fuse_maps
@@ -33,7 +33,7 @@ def run(options: argparse.Namespace) -> int:
     write_ply(options.out, fused.gaussians)
     kept = {agent_id[4:]: int(fused.won_by(agent_id).sum()) for agent_id in maps}
     if options.json:
-        print(as_text({"gaussians": len(fused.gaussians), "voxels": len(fused.words), "voxels_won": kept}))
+        print(as_text({"gaussians": len(fused.gaussians), "voxels": len(fused.batch), "voxels_won": kept}))
     else:
         wins = ", ".join(f"{name} won {count} voxels" for name, count in kept.items())
         print(f"{len(fused.gaussians)} Gaussians → {options.out} ({wins})")

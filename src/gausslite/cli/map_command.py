@@ -18,18 +18,8 @@ from gausslite.cli.source_options import (
     register_with_warnings,
     resolve_pose_prior,
 )
-from gausslite.config.options import (
-    AS_RECORDED,
-    LOOK,
-    TRUSTED,
-    add_budget,
-    add_detector,
-    add_policy,
-    depth_registration,
-    known_view_error,
-    mission_settings,
-    perception_settings,
-)
+from gausslite.config.mapping_options import add_budget, add_detector, add_policy, mission_settings, perception_settings
+from gausslite.config.values import AUTO, NONE, read_depth_registration, read_pose_prior
 from gausslite.datasets.held_out import HeldOutSplit
 from gausslite.datasets.registered_source import DepthRegistration
 from gausslite.datasets.selection import frame_size, select_frames
@@ -41,7 +31,7 @@ from gausslite.evaluation.pictures import write_png
 from gausslite.evaluation.preview import render_preview
 from gausslite.evaluation.views import MapViewer
 from gausslite.mapping.policies import TASK
-from gausslite.mission.build import RelevanceEstimatorFactory, build_mapper, build_estimator
+from gausslite.mission.build import RelevanceEstimatorFactory, build_estimator, build_mapper
 from gausslite.mission.checkpoint import ResumeConfig, SavedRun, save_run
 from gausslite.mission.frame_scheduler import FrameScheduler
 from gausslite.mission.results import PREVIEW, peak_rss_mib, prepare_beside, prepare_folder, write_results
@@ -55,7 +45,7 @@ from gausslite.render.choose import choose_rasterizer
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the options of `gausslite map`."""
-    add_source(parser, by_default=LOOK)
+    add_source(parser, default_text=AUTO)
     parser.add_argument(
         "--task", metavar="TEXT", help='what the robot is to do, such as "Pick up the mug on the table"'
     )
@@ -68,7 +58,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     add_detector(parser)
     add_regions(parser)
-    add_policy(parser, may_look=True)
+    add_policy(parser, allow_auto=True)
     add_budget(parser)
     parser.add_argument("--test-every", metavar="N", type=int, help="keep every Nth frame from mapping, for `eval`")
     parser.add_argument(
@@ -162,7 +152,7 @@ class _Asked:
     ) -> _Asked:
         """With the camera and trust that are asked for, or given here; what is neither is looked for in the frames."""
         given = options.register_depth if camera is None else camera
-        source, registered_to = register_with_warnings(options.source, self.source, given, LOOK)
+        source, registered_to = register_with_warnings(options.source, self.source, given, AUTO)
         believed = resolve_pose_prior(options.source, source, options.pose_prior if pose_prior is None else pose_prior)
         settings = replace(self.settings, pose_prior=believed)
         return replace(self, settings=settings, source=source, depth_registration=registered_to)
@@ -170,10 +160,10 @@ class _Asked:
     def as_saved(self, options: argparse.Namespace, saved: SavedRun) -> _Asked:
         """looked_at, where what was found is that of a saved run. Raises MismatchError where it had other terms."""
         camera, pose_prior = None, None
-        if options.register_depth in (None, LOOK):
-            camera = depth_registration(saved.terms.options.get("colour_camera") or AS_RECORDED)
-        if options.pose_prior == LOOK:
-            pose_prior = known_view_error(saved.terms.options.get("view_error") or TRUSTED)
+        if options.register_depth in (None, AUTO):
+            camera = read_depth_registration(saved.terms.options.get("colour_camera") or NONE)
+        if options.pose_prior == AUTO:
+            pose_prior = read_pose_prior(saved.terms.options.get("view_error") or NONE)
         asked = self.looked_at(options, camera, pose_prior)
         saved.require(asked.terms(options, saved.last_index))
         return asked

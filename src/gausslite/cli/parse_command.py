@@ -6,8 +6,9 @@ import argparse
 import json
 import os
 
+from gausslite.config.task_parser_options import add_backend, backend_settings
 from gausslite.domain.task import TaskGraph
-from gausslite.task.backends import add_backend, backend_of, open_parser
+from gausslite.task.backends import open_parser
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -20,7 +21,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Parse and print."""
-    graph = open_parser(backend_of(options, os.environ)).parse(options.text)
+    graph = open_parser(backend_settings(options, os.environ)).parse(options.text)
     print(json.dumps(as_json(graph)) if options.json else _as_text(graph))
     return 0
 

@@ -9,7 +9,8 @@ from pathlib import Path
 from gausslite.calibration.pose_exposure_error import estimate_pose_exposure_prior
 from gausslite.calibration.pose_exposure_prior import PoseExposurePrior
 from gausslite.calibration.registration import find_registration
-from gausslite.config.options import AS_RECORDED, LOOK, TRUSTED, add_frames, names, numbers
+from gausslite.config.source_options import add_frames
+from gausslite.config.values import AUTO, NONE, read_names, read_numbers
 from gausslite.datasets.open import is_simulated, open_source
 from gausslite.datasets.registered_source import DepthRegistration, RegisteredSource
 from gausslite.datasets.source import Source
@@ -17,28 +18,28 @@ from gausslite.domain.pose import UpAxis
 from gausslite.domain.region import BallRegion, Region
 
 
-def add_source(parser: argparse.ArgumentParser, by_default: str = AS_RECORDED) -> None:
-    """Add SOURCE and what of it is used; by_default as in `add_frames`."""
+def add_source(parser: argparse.ArgumentParser, default_text: str = NONE) -> None:
+    """Add SOURCE and what of it is used; default_text as in `add_frames`."""
     parser.add_argument(
         "source",
         metavar="SOURCE",
         help='a folder (TUM, 7-Scenes or Replica layout) or "sim:home?seed=0&trajectory=0", sim:home-1 to sim:home-8',
     )
-    add_frames(parser, may_look=True, by_default=by_default)
+    add_frames(parser, allow_auto=True, default_text=default_text)
 
 
 def open_with_warnings(
     spec: str,
     up_axis: UpAxis | None,
     depth_registration: DepthRegistration | str | None,
-    by_default: str = AS_RECORDED,
+    default: str = NONE,
 ) -> tuple[Source, DepthRegistration | None]:
     """Open a sequence and tell, on stderr, what a user would not expect of it; the camera that depth is registered to.
 
-    What is asked for may be LOOK, AS_RECORDED or None, for nothing; then it is by_default, one of the two. Raises
+    What is asked for may be AUTO, NONE or None, for nothing; then it is default, one of the two. Raises
     DatasetError, PoseError, InvalidInputError.
     """
-    return register_with_warnings(spec, open_recorded(spec, up_axis), depth_registration, by_default)
+    return register_with_warnings(spec, open_recorded(spec, up_axis), depth_registration, default)
 
 
 def open_recorded(spec: str, up_axis: UpAxis | None) -> Source:
@@ -50,25 +51,25 @@ def open_recorded(spec: str, up_axis: UpAxis | None) -> Source:
 
 
 def register_with_warnings(
-    spec: str, source: Source, depth_registration: DepthRegistration | str | None, by_default: str
+    spec: str, source: Source, depth_registration: DepthRegistration | str | None, default: str
 ) -> tuple[Source, DepthRegistration | None]:
     """The second half of open_with_warnings: bring depth into the colour camera; looking for that takes seconds."""
     if depth_registration is None and not source.depth_registered:
-        depth_registration = by_default
-        hint = f"--register-depth {LOOK} looks for the camera to register it to, {AS_RECORDED} takes it as it is"
-        if by_default == LOOK:
-            hint = f"looking for its colour camera now, --register-depth {AS_RECORDED} takes it as it is"
+        depth_registration = default
+        hint = f"--register-depth {AUTO} looks for the camera to register it to, {NONE} takes it as it is"
+        if default == AUTO:
+            hint = f"looking for its colour camera now, --register-depth {NONE} takes it as it is"
         print(f"{spec}: its layout leaves open whether depth is registered to colour; {hint}", file=sys.stderr)
-    if depth_registration == LOOK:
+    if depth_registration == AUTO:
         depth_registration, why = find_registration(source)
-        print(f"--register-depth {depth_registration or AS_RECORDED}: {why}", file=sys.stderr)
+        print(f"--register-depth {depth_registration or NONE}: {why}", file=sys.stderr)
     if not isinstance(depth_registration, DepthRegistration):
         return source, None
     return RegisteredSource(source, depth_registration), depth_registration
 
 
 def resolve_pose_prior(spec: str, source: Source, pose_prior: PoseExposurePrior | str) -> PoseExposurePrior:
-    """How wrong the views may be, as said or, for LOOK, as a recording itself tells; that is told on stderr.
+    """How wrong the views may be, as said or, for AUTO, as a recording itself tells; that is told on stderr.
 
     Poses of a simulated home are exact.
     """
@@ -77,7 +78,7 @@ def resolve_pose_prior(spec: str, source: Source, pose_prior: PoseExposurePrior 
     if is_simulated(spec):
         return PoseExposurePrior()
     found, why = estimate_pose_exposure_prior(source)
-    print(f"--pose-prior {TRUSTED if found.is_exact else found}: {why}", file=sys.stderr)
+    print(f"--pose-prior {NONE if found.is_exact else found}: {why}", file=sys.stderr)
     return found
 
 
@@ -85,7 +86,7 @@ def add_regions(parser: argparse.ArgumentParser) -> None:
     """Add --roi, --objects and --roi-ball: ground-truth regions of space."""
     parser.add_argument("--roi", metavar="FILE.npz", type=Path, help="voxel file of ground-truth regions")
     parser.add_argument(
-        "--objects", metavar="A,B", type=names, default=(), help="objects of --roi (default: all) or of SOURCE"
+        "--objects", metavar="A,B", type=read_names, default=(), help="objects of --roi (default: all) or of SOURCE"
     )
     parser.add_argument(
         "--roi-ball",
@@ -99,7 +100,7 @@ def add_regions(parser: argparse.ArgumentParser) -> None:
 
 def ball(text: str) -> BallRegion:
     """Read "x,y,z,r" in metres; argparse reports what is wrong."""
-    x, y, z, radius_m = numbers(text, 4)
+    x, y, z, radius_m = read_numbers(text, 4)
     if radius_m <= 0:
         raise argparse.ArgumentTypeError(f"expected a radius above 0, got {radius_m}")
     return BallRegion((x, y, z), radius_m)

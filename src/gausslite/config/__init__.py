@@ -1,1 +1,1 @@
-"""Program options shared by the command line and the services."""
+"""Program options: the ones that several programs share, and their values from files, environment and flags."""

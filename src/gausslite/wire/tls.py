@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import ssl
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -70,33 +69,6 @@ def open_channel(address: str, tls: Tls | None, options: Sequence[tuple[str, Any
     if address.startswith("unix:"):
         options = [*options, ("grpc.ssl_target_name_override", "localhost")]
     return grpc.secure_channel(address, tls.of_client(), options=options)
-
-
-def add_tls(parser: argparse.ArgumentParser) -> None:
-    """Add --tls-cert, --tls-key and --tls-ca."""
-    add = parser.add_argument_group("encryption").add_argument
-    add("--tls-cert", metavar="FILE", type=Path, help="this process's certificate, PEM (default: nothing is encrypted)")
-    add("--tls-key", metavar="FILE", type=Path, help="the certificate's private key, PEM, without a passphrase")
-    add(
-        "--tls-ca",
-        metavar="FILE",
-        type=Path,
-        help="believe only these authorities, and demand their certificates",
-    )
-
-
-def tls_of(options: argparse.Namespace) -> Tls | None:
-    """What add_tls asked for; None when nothing is to be encrypted. Raises InvalidInputError."""
-    asked = options.tls_cert, options.tls_key, options.tls_ca
-    return None if asked == (None, None, None) else Tls.read(*asked)
-
-
-def service_tls(options: argparse.Namespace) -> Tls | None:
-    """As tls_of, for a program that listens. Raises InvalidInputError also without an identity."""
-    tls = tls_of(options)
-    if tls is not None:
-        tls.of_server()
-    return tls
 
 
 def require_agent_certificate(context: Any, agent_id: str) -> None:

@@ -28,7 +28,7 @@ from gausslite.mission.build import open_networks
 from gausslite.mission.results import write_json
 from gausslite.mission.settings import PerceptionSettings
 from gausslite_bench.quality.ablation import cumulative_variants
-from gausslite_bench.quality.equal_time import first_scene, kept_rate, measure_rate, pacing_trials
+from gausslite_bench.quality.equal_time import first_visible_scene, load_rate, measure_rate, rate_trials
 from gausslite_bench.quality.home_tasks import HomeTask, choose_home_tasks
 from gausslite_bench.quality.scenes import (
     REAL_CAMERA,
@@ -41,7 +41,7 @@ from gausslite_bench.quality.scenes import (
     real_plans,
 )
 from gausslite_bench.quality.study import FinishedTrial, Origin, Study, TrialCache, expected_origins, run_study
-from gausslite_bench.quality.tables import Scoreboard, ablation_table, quality_table
+from gausslite_bench.quality.tables import StudyResults, ablation_table, quality_table
 from gausslite_bench.quality.trials import BudgetMode, Conditions, PerceptionMode, TrialBudget, Variant
 
 _ABLATION_PAIR = "home-4-manipulation"
@@ -80,7 +80,7 @@ def run_quality(options: argparse.Namespace) -> int:
     if not variants:
         raise InvalidInputError(f"policies: expected names among {', '.join(POLICIES)}, got none")
     plans, own_size = _plans(options, options.pairs, ())
-    conditions = Conditions(options.size or own_size, _eyes(options), options.threads)
+    conditions = Conditions(options.size or own_size, _perception_mode(options), options.threads)
     study = Study(plans, variants, _budgets(options), options.seeds, conditions)
     board = _run(study, options)
     _write(options.out, "quality", quality_table(board), board)
@@ -163,8 +163,8 @@ def _plans(
 
 
 def _homes(options: argparse.Namespace, pairs: Sequence[HomeTask]) -> list[HomeScenePlan]:
-    frames, trust = 60 if options.frames is None else options.frames, _trust(options, PosePolicy())
-    return [HomeScenePlan(pair, frames, options.views, trust=trust) for pair in pairs]
+    frames, pose_policy = 60 if options.frames is None else options.frames, _pose_policy(options, PosePolicy())
+    return [HomeScenePlan(pair, frames, options.views, pose_policy=pose_policy) for pair in pairs]
 
 
 def _real(options: argparse.Namespace) -> tuple[list[RealScenePlan], tuple[int, int]] | None:
@@ -180,13 +180,13 @@ def _real(options: argparse.Namespace) -> tuple[list[RealScenePlan], tuple[int, 
             f"--real: expected a folder and its regions, --real FOLDER --roi FILE.npz; got none, and no {roi}"
         )
     # what is wrong with the options is told before anything is looked for in the images
-    plans = real_plans(options.real, roi, options.frames, options.up, trust=_trust(options, REAL_CAMERA))
+    plans = real_plans(options.real, roi, options.frames, options.up, pose_policy=_pose_policy(options, REAL_CAMERA))
     chosen = choose_kinds(plans, options.kinds)
     source, camera = open_with_warnings(str(options.real), options.up, options.register_depth, AUTO)
     return [replace(plan, depth_registration=camera) for plan in chosen], downscaled_size(source.camera)
 
 
-def _trust(options: argparse.Namespace, usual: PosePolicy) -> PosePolicy:
+def _pose_policy(options: argparse.Namespace, usual: PosePolicy) -> PosePolicy:
     return PosePolicy(
         usual.pose_prior if options.pose_prior is None else options.pose_prior,
         usual.fit_views if options.fit_views is None else options.fit_views,
@@ -198,7 +198,7 @@ def _budgets(options: argparse.Namespace) -> list[TrialBudget]:
     return [TrialBudget(options.max_gaussians, equal, options.iterations, options.rate) for equal in asked]
 
 
-def _eyes(options: argparse.Namespace) -> PerceptionMode:
+def _perception_mode(options: argparse.Namespace) -> PerceptionMode:
     if options.perception == "gt":
         return PerceptionMode()
     if options.perception == "words":
@@ -206,39 +206,39 @@ def _eyes(options: argparse.Namespace) -> PerceptionMode:
     return PerceptionMode(words=True, detector=PerceptionSettings(Path(options.perception), threads=options.threads))
 
 
-def _run(study: Study, options: argparse.Namespace) -> Scoreboard:
+def _run(study: Study, options: argparse.Namespace) -> StudyResults:
     for plan in study.plans:
         for trial in study.trials(plan):
             _ = trial.mission  # a wrong name or number is told before hours of work, and so is a wrong file
-    open_networks(study.conditions.eyes.detector)
+    open_networks(study.conditions.perception.detector)
     perceptual = None
     if options.lpips_weights:
         from gausslite_bench.quality.lpips import load_lpips
 
         perceptual = load_lpips(options.lpips_weights)
-    archive = TrialCache(options.out)
-    study = _paced(study, options.out / _RATE_FILE)
-    _warn_of_other_code(expected_origins(study, archive, perceptual is not None, options.reuse_other_code))
+    cache = TrialCache(options.out)
+    study = _with_rate(study, options.out / _RATE_FILE)
+    _warn_of_other_code(expected_origins(study, cache, perceptual is not None, options.reuse_other_code))
     with _StudyBar(study.count) as bar:
-        finished = run_study(study, archive, perceptual, bar, options.reuse_other_code)
+        finished = run_study(study, cache, perceptual, bar, options.reuse_other_code)
     origins = Counter(each.origin for each in finished)
     print(f"trials: {', '.join(f'{count} {origin}' for origin, count in origins.items())}", file=sys.stderr)
-    return Scoreboard(finished)
+    return StudyResults(finished)
 
 
-def _paced(study: Study, path: Path) -> Study:
+def _with_rate(study: Study, path: Path) -> Study:
     """The study with a rate, where none was asked for."""
-    trials = pacing_trials(study)
+    trials = rate_trials(study)
     if not trials:
         return study
-    rate_hz = kept_rate(path, trials)
+    rate_hz = load_rate(path, trials)
     if rate_hz is None:
-        trial, scene = first_scene(trials)
+        trial, scene = first_visible_scene(trials)
         with progress_bar(len(scene.training), f"uniform mapping of {trial.plan.name}", "frame") as bar:
             rate_hz = measure_rate(path, trial, scene, partial(_advance, bar))
     what = f"{1e3 / rate_hz:.3g} ms a frame, as uniform mapping takes for {trials[0].budget}"
     print(f"equal time: {what} ({path})", file=sys.stderr)
-    return study.paced(rate_hz)
+    return study.with_rate(rate_hz)
 
 
 def _advance(bar: tqdm[Any], gaussians: int) -> None:
@@ -276,7 +276,7 @@ class _StudyBar:
         text = f"frame {self._frames}, {gaussians / 1e3:.1f}k Gaussians"
         self._bar.set_postfix_str(text, refresh=self._on_terminal)
 
-    def left_out(self, trials: int, why: UnseenRegionError) -> None:
+    def on_skipped(self, trials: int, why: UnseenRegionError) -> None:
         """Say which scene is not measured, and why."""
         self._bar.write(f"left out: {why}", file=sys.stderr)
         self._bar.update(trials)
@@ -295,7 +295,7 @@ class _StudyBar:
         self._bar.update()
 
 
-def _write(folder: Path, name: str, table: str, board: Scoreboard) -> None:
+def _write(folder: Path, name: str, table: str, board: StudyResults) -> None:
     command = shlex.join(["gausslite", *sys.argv[1:]])
     text = f"# bench {name}\n\n`{command}`\n\n{table}"
     write_atomic(folder / f"{name}.md", text.encode())

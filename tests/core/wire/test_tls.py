@@ -20,7 +20,7 @@ from gausslite.domain.voxel_operations import group_by_voxel
 from gausslite.errors import InvalidInputError, NotPermittedError, UnavailableError
 from gausslite.task.rules import RuleParser
 from gausslite.wire.clients import FusionClient, ParserClient
-from gausslite.wire.health import main as ask_health
+from gausslite.cli.health_check import main as ask_health
 from gausslite.wire.spool import Spool
 from gausslite.wire.tls import Tls
 from gausslite.wire.uplink import Uplink

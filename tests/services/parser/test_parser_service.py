@@ -124,7 +124,7 @@ def test_nobody_there_is_unavailable() -> None:
 
 
 def test_the_health_check_of_a_container(capsys: pytest.CaptureFixture[str]) -> None:
-    from gausslite.wire.health import main
+    from gausslite.cli.health_check import main
 
     with serving([parser_service(RuleParser())]) as server:
         assert main([server.address]) == 0

@@ -1,0 +1,32 @@
+"""Ask a service for its health, as containers do: `python -m gausslite.cli.health_check ADDRESS`."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+
+from gausslite.config.tls_options import add_tls, read_tls
+from gausslite.errors import InvalidInputError, UnavailableError
+from gausslite.wire.health import require_serving
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Return 0 if the service is SERVING, 1 with one line on stderr if not, 2 for wrong options."""
+    parser = argparse.ArgumentParser(prog="python -m gausslite.cli.health_check")
+    parser.add_argument("address", metavar="HOST:PORT|unix:PATH")
+    add_tls(parser)
+    options = parser.parse_args(arguments)
+    try:
+        require_serving(options.address, read_tls(options))
+    except InvalidInputError as error:
+        print(error, file=sys.stderr)
+        return 2
+    except UnavailableError as error:
+        print(error, file=sys.stderr)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

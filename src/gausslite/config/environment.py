@@ -1,0 +1,77 @@
+"""Read option values from environment variables: GAUSSLITE_MAX_GAUSSIANS sets --max-gaussians."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping
+from typing import Final
+
+from gausslite.config.nearest import nearest
+from gausslite.config.option_table import Layer, OptionTable, RawValue, variable_name
+from gausslite.errors import InvalidInputError
+
+PREFIX: Final = "GAUSSLITE_"
+CONFIG_VARIABLE: Final = "GAUSSLITE_CONFIG"
+KEY_VARIABLE: Final = "GAUSSLITE_LLM_API_KEY"
+MODELS_URL_VARIABLE: Final = "GAUSSLITE_MODELS_URL"
+_OTHER_VARIABLES: Final = frozenset(
+    {
+        CONFIG_VARIABLE,
+        KEY_VARIABLE,
+        MODELS_URL_VARIABLE,
+        "GAUSSLITE_SIMD",
+        # of deploy/, of the native build and of the tests
+        *("GAUSSLITE_CERTS", "GAUSSLITE_CERT_DAYS", "GAUSSLITE_FUSION_PORT", "GAUSSLITE_TASK_A", "GAUSSLITE_TASK_B"),
+        *("GAUSSLITE_SANITIZE", "GAUSSLITE_ONNX_TASKS"),
+    }
+)
+"""Variables with the prefix that are not options, or only options of one program."""
+_SWITCHES: Final = {
+    **dict.fromkeys(("1", "true", "yes", "on"), True),
+    **dict.fromkeys(("0", "false", "no", "off"), False),
+}
+
+
+def read_environment(table: OptionTable, environment: Mapping[str, str]) -> Layer:
+    """Return the option values of the environment; empty variables count as unset. Raises InvalidInputError.
+
+    A repeatable option takes one value per line.
+    """
+    values: dict[str, RawValue] = {}
+    for dest in table.actions:
+        name = variable_name(table.key(dest))
+        text = environment.get(name, "")
+        if not text:
+            continue
+        if table.is_switch(dest):
+            if text.lower() not in _SWITCHES:
+                raise InvalidInputError(f"{name}: expected true or false, got {text!r}")
+            values[dest] = _SWITCHES[text.lower()]
+        else:
+            values[dest] = text.splitlines() if table.is_repeatable(dest) else text
+    for dest in values:
+        for rival in table.exclusive_with(dest) & values.keys():
+            names = " and ".join(sorted(variable_name(table.key(each)) for each in (dest, rival)))
+            raise InvalidInputError(f"environment: expected only one of {names}, got both")
+    return Layer(values, {dest: variable_name(table.key(dest)) for dest in values})
+
+
+def warn_of_unknown_variables(
+    program: str, table: OptionTable, environment: Mapping[str, str], key_variable: str | None
+) -> None:
+    """Print a line on stderr for every variable with the prefix that nothing reads, without its value.
+
+    key_variable: the variable that the options name for the API key.
+    """
+    options = {variable_name(table.key(dest)) for dest in table.actions}
+    for name in sorted(environment):
+        if name.startswith(PREFIX) and name not in (*options, *_OTHER_VARIABLES, key_variable):
+            similar = nearest(name, options)
+            print(f"{program}: {name} is not an option; the nearest one is {similar}", file=sys.stderr)
+
+
+def without_options(environment: Mapping[str, str]) -> dict[str, str]:
+    """Return the environment without option variables, for child processes that read their own configuration file."""
+    return {
+        name: value for name, value in environment.items() if not name.startswith(PREFIX) or name in _OTHER_VARIABLES
+    }

@@ -1,0 +1,132 @@
+"""Combine the option values of a program from flags, environment, a configuration file and a preset.
+
+Flags override environment variables, those override the file, and the file overrides the preset. An option of a
+mutually exclusive group replaces the group's options of lower layers.
+"""
+
+from __future__ import annotations
+
+import argparse
+import copy
+import os
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from gausslite.config.environment import CONFIG_VARIABLE, read_environment, warn_of_unknown_variables
+from gausslite.config.file import read_file
+from gausslite.config.option_table import Layer, OptionTable, RawValue
+from gausslite.config.presets import PRESETS
+from gausslite.config.toml_text import OptionValue, to_toml
+
+
+def parse_options(
+    parser: argparse.ArgumentParser,
+    arguments: Sequence[str] | None = None,
+    environment: Mapping[str, str] | None = None,
+) -> argparse.Namespace:
+    """Return the effective options of a program; adds --config and --print-config to its parser.
+
+    Ends the process with code 0 after --print-config and with code 2 for wrong flags. Raises InvalidInputError for
+    wrong values in the file or the environment.
+    """
+    arguments = sys.argv[1:] if arguments is None else arguments
+    environment = os.environ if environment is None else environment
+    _add_configuration(parser)
+    table = OptionTable.of(parser)
+    flags = _parse_flags(parser, arguments)
+    path = flags.pop("config", None) or environment.get(CONFIG_VARIABLE)
+    print_only = bool(flags.pop("print_config", False))
+    layers = [read_environment(table, environment)]
+    if path:
+        layers.append(read_file(table, Path(str(path))))
+    values, origins = _combine(table, flags, layers)
+    values, origins = _combine(table, values, [_read_preset(table, values.get("preset"))], origins)
+    options = _parse_with_defaults(parser, arguments, table.convert(values, origins), print_only)
+    warn_of_unknown_variables(parser.prog, table, environment, getattr(options, "llm_key_variable", None))
+    if print_only:
+        print(f"# {parser.prog}: effective settings\n{to_toml(_effective(table, values))}", end="")
+        raise SystemExit(0)
+    return options
+
+
+def _add_configuration(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument_group("configuration").add_argument
+    add(
+        "--config",
+        metavar="FILE.toml",
+        type=Path,
+        help="read options from this file, named as here without dashes in front; environment variables such as "
+        "GAUSSLITE_MAX_GAUSSIANS override the file, flags override both",
+    )
+    add("--print-config", action="store_true", help="print the effective options as TOML for --config, and exit")
+
+
+def _parse_flags(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> dict[str, RawValue]:
+    """Return the unconverted values of the options that the command line sets."""
+    bare = _delegating_copy(parser)
+    for action in bare._actions:
+        action.default, action.type, action.choices = argparse.SUPPRESS, None, None
+        _make_optional(action)
+    known = {action.dest for action in bare._actions}
+    return {dest: value for dest, value in vars(bare.parse_args(arguments)).items() if dest in known}
+
+
+def _combine(
+    table: OptionTable,
+    values: Mapping[str, RawValue],
+    layers: Sequence[Layer],
+    origins: Mapping[str, str] | None = None,
+) -> tuple[dict[str, RawValue], dict[str, str]]:
+    """Return the values with those of lower layers added, and where each added value comes from."""
+    combined, sources = dict(values), dict(origins or {})
+    for layer in layers:
+        taken = {rival for dest in combined for rival in (dest, *table.exclusive_with(dest))}
+        added = {dest: value for dest, value in layer.values.items() if dest not in taken}
+        combined |= added
+        sources |= {dest: layer.origins[dest] for dest in added}
+    return combined, sources
+
+
+def _read_preset(table: OptionTable, name: RawValue | None) -> Layer:
+    """Return the preset's values of the options that the program has; argparse reports unknown presets."""
+    preset = PRESETS.get(str(name), {})
+    values = {dest: str(preset[key]) for dest in table.actions if (key := table.key(dest)) in preset}
+    return Layer(values, dict.fromkeys(values, f"preset {name}"))
+
+
+def _parse_with_defaults(
+    parser: argparse.ArgumentParser, arguments: Sequence[str], defaults: Mapping[str, object], all_optional: bool
+) -> argparse.Namespace:
+    """Parse the command line with these defaults; options that have one are no longer required."""
+    final = _delegating_copy(parser)
+    for action in final._actions:
+        if action.dest in defaults:
+            action.default = defaults[action.dest]
+        if all_optional or action.dest in defaults:
+            _make_optional(action)
+    return final.parse_args(arguments)
+
+
+def _effective(table: OptionTable, values: Mapping[str, RawValue]) -> dict[str, OptionValue]:
+    """Return the value of every option as a configuration file states it; unset options are left out."""
+    return {
+        table.key(dest): table.file_value(dest, values[dest]) if dest in values else table.default_value(dest)
+        for dest in table.actions
+    }
+
+
+def _delegating_copy(parser: argparse.ArgumentParser) -> argparse.ArgumentParser:
+    """Return a copy whose actions can be changed; help and usage are the original's."""
+    duplicate = copy.deepcopy(parser)
+    duplicate.format_help = parser.format_help  # type: ignore[method-assign]
+    duplicate.format_usage = parser.format_usage  # type: ignore[method-assign]
+    return duplicate
+
+
+def _make_optional(action: argparse.Action) -> None:
+    if action.option_strings:
+        action.required = False
+    else:
+        action.nargs = {None: "?", "+": "*"}.get(action.nargs, action.nargs)  # type: ignore[arg-type]
+        action.required = False

@@ -1,0 +1,193 @@
+"""Declare the options of perception and mapping, and convert them to settings and back."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from gausslite.calibration.pose_exposure_prior import PoseExposurePrior
+from gausslite.config.toml_text import OptionValue
+from gausslite.config.values import AUTO, NONE, read_names, read_pose_prior, read_pose_prior_or_auto, read_skip_stages
+from gausslite.domain.voxels import VoxelGrid
+from gausslite.mapping.policies import ABLATION_FLAGS, POLICIES
+from gausslite.mission.frame_scheduler import SchedulerSettings
+from gausslite.mission.settings import DEFAULT_MAX_GAUSSIANS, MissionSettings, PerceptionSettings
+from gausslite.render.choose import BACKENDS
+
+_EXACT = PoseExposurePrior()
+_POSE_PRIOR_METAVAR = "M,DEG[,GAIN,OFFSET]"
+_POSE_PRIOR_HELP = (
+    "expected error of poses (metres, degrees) and of exposure (gain and offset, 0 to 1); keyframes are refined within "
+    "it; none: poses and colours are exact{} (default: {})"
+)
+_AUTO_HELP = "; auto: estimated from pairs of frames"
+_DISABLE_HELP = (
+    "switch off parts of the policy: sb (ROI seed budgeting; ROI: the task's region of interest), mvo (multi-view "
+    "optimisation), roi (ROI optimisation), sis (stratified initial scaling), gfd (gradient-focused densification), "
+)
+_SKIP_STAGES_HELP = (
+    "at --rate, stages that a frame without enough time skips, in this order (default: publishing,seeding)"
+)
+
+
+def add_detector(parser: argparse.ArgumentParser) -> None:
+    """Add --detector, --segmenter, --vocabulary and --resegment: how the task's objects are detected and outlined."""
+    add = parser.add_argument_group("perception").add_argument
+    add(
+        "--detector",
+        metavar="FILE.onnx",
+        type=Path,
+        help="a YOLO-seg or Grounding DINO model (default: the source's ground truth)",
+    )
+    add(
+        "--segmenter",
+        metavar="FILE.onnx|yolo|depth",
+        help="a FastSAM model, the detector's own masks, or segmentation by depth and colour",
+    )
+    add(
+        "--vocabulary",
+        metavar="FILE.txt",
+        type=Path,
+        help="Grounding DINO's vocabulary (default: vocab.txt in the model's folder)",
+    )
+    add("--resegment", action="store_true", help="run the segmenter on every frame (slower)")
+
+
+def add_policy(parser: argparse.ArgumentParser, allow_auto: bool = False) -> None:
+    """Add --policy, --disable, --rasterizer and --pose-prior.
+
+    allow_auto: the pose prior may be, and by default is, estimated; for programs that read the whole sequence first.
+    """
+    add = parser.add_argument_group("mapping").add_argument
+    add("--policy", choices=sorted(POLICIES), default="task", help="what the budget is spent on (default: task)")
+    others = ", ".join(name for name in ABLATION_FLAGS if name not in ("sb", "mvo", "roi", "sis", "gfd"))
+    add("--disable", metavar="A,B", type=read_names, default=(), help=f"{_DISABLE_HELP}{others}")
+    add("--rasterizer", choices=BACKENDS, default="auto", help="backend that renders and trains (default: auto)")
+    add_pose_prior(parser, AUTO if allow_auto else _EXACT, AUTO if allow_auto else NONE, allow_auto)
+
+
+def add_pose_prior(
+    parser: argparse.ArgumentParser, default: PoseExposurePrior | str | None, default_text: str, allow_auto: bool
+) -> None:
+    """Add --pose-prior; default_text names the default in the help."""
+    parser.add_argument(
+        "--pose-prior",
+        metavar=f"{AUTO}|{NONE}|{_POSE_PRIOR_METAVAR}" if allow_auto else f"{NONE}|{_POSE_PRIOR_METAVAR}",
+        type=read_pose_prior_or_auto if allow_auto else read_pose_prior,
+        default=default,
+        help=_POSE_PRIOR_HELP.format(_AUTO_HELP if allow_auto else "", default_text),
+    )
+
+
+def add_budget(parser: argparse.ArgumentParser) -> None:
+    """Add the options that limit what a map costs: its size, iterations or frame rate, threads; and the seed."""
+    group = parser.add_argument_group("budget")
+    add = group.add_argument
+    add(
+        "--max-gaussians",
+        metavar="N",
+        type=int,
+        default=DEFAULT_MAX_GAUSSIANS,
+        help="upper limit of the map's size (default: %(default)s)",
+    )
+    per_frame = group.add_mutually_exclusive_group()
+    per_frame.add_argument("--iterations", metavar="N", type=int, help="iterations per frame (default: 8)")
+    per_frame.add_argument(
+        "--rate", metavar="HZ", type=float, help="frames per second; each frame trains as long as its time allows"
+    )
+    scheduler = SchedulerSettings()
+    add(
+        "--min-iterations",
+        metavar="N",
+        type=int,
+        default=scheduler.min_iterations,
+        help="at --rate, iterations to make time for (default: %(default)s)",
+    )
+    add(
+        "--skip-stages",
+        metavar="A,B",
+        type=read_skip_stages,
+        default=scheduler.skip_stages,
+        help=_SKIP_STAGES_HELP,
+    )
+    add(
+        "--deadline-slack",
+        metavar="SHARE",
+        type=float,
+        default=scheduler.deadline_slack,
+        help="at --rate, share of a frame's time it may overrun for its minimum iterations (default: %(default)s)",
+    )
+    add("--seed", metavar="S", type=int, default=0, help="seed of every random choice (default: 0)")
+    add("--threads", metavar="N", type=int, help="threads (default: all that the processor has)")
+
+
+def add_voxel_size(parser: argparse.ArgumentParser) -> None:
+    """Add --voxel-size, in metres."""
+    parser.add_argument(
+        "--voxel-size",
+        metavar="M",
+        type=float,
+        default=VoxelGrid().size_m,
+        help="edge of the fusion's voxels in metres (default: %(default)s)",
+    )
+
+
+def perception_settings(options: argparse.Namespace) -> PerceptionSettings:
+    """Return the settings of `add_detector` and `add_budget`; at a rate, detection is asynchronous, on one thread."""
+    return PerceptionSettings(
+        options.detector,
+        options.resegment,
+        options.threads if options.rate is None else 1,
+        asynchronous=options.rate is not None,
+        segmenter=options.segmenter,
+        vocabulary=options.vocabulary,
+    )
+
+
+def mission_settings(options: argparse.Namespace) -> MissionSettings:
+    """Return the settings of `add_policy` and `add_budget`; a pose prior of AUTO counts as exact.
+
+    Raises InvalidInputError.
+    """
+    return MissionSettings(
+        policy=options.policy,
+        disabled=frozenset(options.disable),
+        max_gaussians=options.max_gaussians,
+        iterations=options.iterations,
+        rate_hz=options.rate,
+        min_iterations=options.min_iterations,
+        skip_stages=options.skip_stages,
+        deadline_slack=options.deadline_slack,
+        seed=options.seed,
+        threads=options.threads,
+        backend=options.rasterizer,
+        pose_prior=options.pose_prior if isinstance(options.pose_prior, PoseExposurePrior) else _EXACT,
+    )
+
+
+def perception_options(settings: PerceptionSettings) -> dict[str, OptionValue]:
+    """Return the option values from which `perception_settings` makes these settings, with absolute paths."""
+    return {
+        "detector": None if settings.model is None else str(settings.model.absolute()),
+        "segmenter": settings.segmenter,
+        "vocabulary": None if settings.vocabulary is None else str(settings.vocabulary.absolute()),
+        "resegment": settings.resegment,
+    }
+
+
+def mission_options(settings: MissionSettings) -> dict[str, OptionValue]:
+    """Return the option values from which `mission_settings` makes these settings."""
+    return {
+        "policy": settings.policy,
+        "disable": ",".join(sorted(settings.disabled)),
+        "max-gaussians": settings.max_gaussians,
+        "iterations": settings.iterations,
+        "rate": settings.rate_hz,
+        "min-iterations": settings.min_iterations,
+        "skip-stages": ",".join(settings.skip_stages),
+        "deadline-slack": settings.deadline_slack,
+        "seed": settings.seed,
+        "threads": settings.threads,
+        "rasterizer": settings.backend,
+        "pose-prior": NONE if settings.pose_prior.is_exact else str(settings.pose_prior),
+    }

@@ -1,0 +1,41 @@
+"""Declare the options that select frames of a sequence and register its depth images."""
+
+from __future__ import annotations
+
+import argparse
+
+from gausslite.config.values import AUTO, NONE, read_depth_registration, read_up_axis
+from gausslite.datasets.registered_source import DepthRegistration
+
+_CAMERA_METAVAR = "FX,FY,CX,CY[,TX,TY,TZ[,RX,RY,RZ]]"
+_REGISTER_DEPTH_HELP = (
+    "register depth images to this colour camera: intrinsics in pixels, then the depth camera's position (metres) and "
+    "rotation vector (degrees) in the colour camera's frame"
+)
+_AUTO_HELP = (
+    "; none: use depth as recorded; auto: estimate the camera from image edges if the layout does not guarantee "
+    "registered depth, for example 7-Scenes (default: {})"
+)
+
+
+def add_frames(parser: argparse.ArgumentParser, allow_auto: bool = False, default_text: str = NONE) -> None:
+    """Add --frames, --size, --up and --register-depth."""
+    add = parser.add_argument_group("frames").add_argument
+    add("--frames", metavar="START:STOP:STEP", default=":", help="frame numbers to use (default: all)")
+    add("--size", metavar="WxH", help="resize images to this size (default: the recorded size)")
+    add("--up", metavar="X,Y,Z", type=read_up_axis, help="upward direction of the world (default: the source's)")
+    add_register_depth(parser, allow_auto, default_text)
+
+
+def add_register_depth(parser: argparse._ActionsContainer, allow_auto: bool = False, default_text: str = NONE) -> None:
+    """Add --register-depth; its value is None if the user does not set it.
+
+    allow_auto: also accept "auto" and "none", for programs that can analyse the whole sequence first. default_text
+    names in the help what the program does without the option.
+    """
+    parser.add_argument(
+        "--register-depth",
+        metavar=f"{AUTO}|{NONE}|{_CAMERA_METAVAR}" if allow_auto else _CAMERA_METAVAR,
+        type=read_depth_registration if allow_auto else DepthRegistration.parse,
+        help=_REGISTER_DEPTH_HELP + (_AUTO_HELP.format(default_text) if allow_auto else ""),
+    )

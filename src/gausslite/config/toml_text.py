@@ -1,0 +1,25 @@
+"""Write option values as TOML; `tomllib` reads it back."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+
+OptionValue = str | bool | int | float | Sequence[str] | None
+"""The value of one option in a configuration file; None leaves the option out."""
+
+
+def to_toml(values: Mapping[str, OptionValue]) -> str:
+    """Return one `key = value` line per value that is not None."""
+    return "".join(f"{key} = {_literal(value)}\n" for key, value in values.items() if value is not None)
+
+
+def _literal(value: str | bool | int | float | Sequence[str]) -> str:
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, int | float):
+        return repr(value)
+    if isinstance(value, str):
+        # JSON's escapes are TOML's, except that TOML refuses a bare DEL and lone surrogates
+        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+    return f"[{', '.join(_literal(each) for each in value)}]"

@@ -1,0 +1,59 @@
+"""Read option values from text."""
+
+from __future__ import annotations
+
+import argparse
+import math
+
+from gausslite.calibration.pose_exposure_prior import PoseExposurePrior
+from gausslite.datasets.registered_source import DepthRegistration
+from gausslite.domain.pose import UpAxis
+from gausslite.mapping.stages import SkippableStage
+
+AUTO, NONE = "auto", "none"
+
+
+def read_names(text: str) -> tuple[str, ...]:
+    """Return the parts of "a,b" without surrounding spaces."""
+    return tuple(part.strip() for part in text.split(",") if part.strip())
+
+
+def read_numbers(text: str, count: int) -> list[float]:
+    """Return exactly `count` finite numbers of "1,2". Raises ArgumentTypeError."""
+    try:
+        values = [float(part) for part in text.split(",")]
+    except ValueError:
+        values = []
+    if len(values) != count or not all(math.isfinite(value) for value in values):
+        raise argparse.ArgumentTypeError(f"expected {count} finite numbers separated by commas, got {text!r}")
+    return values
+
+
+def read_up_axis(text: str) -> UpAxis:
+    """Return the axis of "x,y,z". Raises ArgumentTypeError."""
+    x, y, z = read_numbers(text, 3)
+    return (x, y, z)
+
+
+def read_skip_stages(text: str) -> tuple[SkippableStage, ...]:
+    """Return the stages of "publishing,seeding", each once. Raises ArgumentTypeError."""
+    try:
+        return tuple(dict.fromkeys(SkippableStage(name) for name in read_names(text)))
+    except ValueError:
+        known = ", ".join(SkippableStage)
+        raise argparse.ArgumentTypeError(f"expected names among {known}, got {text!r}") from None
+
+
+def read_depth_registration(text: str) -> DepthRegistration | str:
+    """Return AUTO, NONE or a camera. Raises InvalidInputError."""
+    return text if text in (AUTO, NONE) else DepthRegistration.parse(text)
+
+
+def read_pose_prior(text: str) -> PoseExposurePrior:
+    """Return the prior of NONE (exact poses) or of numbers. Raises InvalidInputError."""
+    return PoseExposurePrior() if text == NONE else PoseExposurePrior.parse(text)
+
+
+def read_pose_prior_or_auto(text: str) -> PoseExposurePrior | str:
+    """Return AUTO, or the prior that `read_pose_prior` returns. Raises InvalidInputError."""
+    return text if text == AUTO else read_pose_prior(text)
