@@ -66,7 +66,7 @@ def test_tables_are_lent_one_at_a_time(rasterizer: Rasterizer) -> None:
     lent, others = tables(scene, seasoned=False), tables(scene, seasoned=False)
     with (
         rasterizer.bind_tables(*lent),
-        pytest.raises(InvalidInputError, match="no other tables on loan"),
+        pytest.raises(InvalidInputError, match="no bound tables"),
         rasterizer.bind_tables(*others),
     ):
         pass

@@ -1,7 +1,7 @@
-"""Smooth the seams between the agents' contributions: a short joint optimisation on everyone's keyframes (Sec. III-E).
+"""Refine the fused map by a short joint optimisation on all agents' keyframes (Sec. III-E).
 
-The fused map usually holds the task's voxels alone, without the room around them. A keyframe then teaches only where
-that map is what it shows: inside the footprint of the map as it was voted, and not where something stands in front.
+The fused map usually holds only the task's voxels. So a keyframe is compared only with pixels that the map explains:
+inside the footprint of the fused map, and not where the measured surface occludes it.
 """
 
 from __future__ import annotations
@@ -19,20 +19,21 @@ from gausslite.domain.pose import inverse
 from gausslite.errors import InvalidInputError, QuotaError
 from gausslite.fusion.keyframes import AgentKeyframe
 from gausslite.optimize.density import DensitySettings, densify, prune
-from gausslite.optimize.parameters import SplatTable
 from gausslite.optimize.rates import REFINE_RATES
+from gausslite.optimize.splat_table import SplatTable
 from gausslite.render.rasterizer import AdamSettings, LossWeights, Rasterizer, StepReport, TrainingView, UpdateCounter
 
 _FOOTPRINT_ALPHA = 0.5
-_IN_FRONT_M, _IN_FRONT_SHARE = 0.05, 0.05
-"""A surface measured this much (plus this share of the depth) before the map's hides it."""
+_OCCLUSION_M, _OCCLUSION_SHARE = 0.05, 0.05
+"""A measured surface occludes the map's if it is closer by this distance plus this share of the depth."""
 
 
 @dataclass(frozen=True, slots=True)
 class RefineSettings:
-    """How long and how freely to refine. The map may grow by the factor headroom, never beyond max_gaussians.
+    """Length and limits of a refinement. The map may grow by the factor `headroom`, up to max_gaussians.
 
-    loss: a mean over each view's footprint. All steps are masked, unlike the mapper's; by share gave 0.05 dB less.
+    The loss is a mean over each view's footprint. All steps are masked, unlike the mapper's. normalise_by_image gave
+    0.05 dB less.
     """
 
     iterations: int = 500
@@ -55,7 +56,7 @@ class RefineSettings:
 
 @dataclass(frozen=True, slots=True)
 class RefineProgress:
-    """Where a refinement stands after `iteration` of `iterations`."""
+    """The state of a refinement after `iteration` of `iterations`."""
 
     iteration: int
     iterations: int
@@ -63,8 +64,8 @@ class RefineProgress:
     gaussians: int
 
 
-GoOn = Callable[[RefineProgress], bool]
-"""Called every report_every iterations and at the end; answering False stops the refinement there."""
+ProgressCallback = Callable[[RefineProgress], bool]
+"""Called every report_every iterations and at the end; the refinement stops if it returns False."""
 
 
 def refine(
@@ -72,27 +73,27 @@ def refine(
     keyframes: Sequence[AgentKeyframe],
     rasterizer: Rasterizer,
     settings: RefineSettings,
-    go_on: GoOn,
+    report_progress: ProgressCallback,
 ) -> Gaussians:
-    """The map after joint optimisation with every Gaussian active; what was reached so far when stopped.
+    """Return the map after joint optimisation with every Gaussian active; the partial result if stopped.
 
-    Raises InvalidInputError when there is nothing to learn from, QuotaError when the map exceeds max_gaussians.
+    Raises InvalidInputError if no keyframe shows the map, QuotaError if the map exceeds max_gaussians.
     """
     table = _fill_table(gaussians, settings)
-    views = _Views(_teaching_views(table, keyframes, rasterizer), rasterizer, settings)
+    views = _ViewPool(_refinement_views(table, keyframes, rasterizer), rasterizer, settings)
     extent_m = _extent_m(gaussians)
     rng = np.random.default_rng(settings.seed)
-    with ExitStack() as loan:
-        loan.enter_context(_bind_tables(table, rasterizer))
+    with ExitStack() as binding:
+        binding.enter_context(_bind_tables(table, rasterizer))
         for iteration in range(1, settings.iterations + 1):
             view, T_camera_world = views.draw(rng)
             report = _train(table, view, T_camera_world, rasterizer, settings)
             if _density_control_is_due(iteration, settings.density):
-                loan.close()
+                binding.close()
                 _control_density(table, iteration, settings, extent_m)
-                loan.enter_context(_bind_tables(table, rasterizer))
+                binding.enter_context(_bind_tables(table, rasterizer))
             due = iteration % settings.report_every == 0 or iteration == settings.iterations
-            if due and not go_on(RefineProgress(iteration, settings.iterations, report.loss, table.count)):
+            if due and not report_progress(RefineProgress(iteration, settings.iterations, report.loss, table.count)):
                 break
     return table.to_gaussians()
 
@@ -114,56 +115,56 @@ def _fill_table(gaussians: Gaussians, settings: RefineSettings) -> SplatTable:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _RefinementView:
-    """A keyframe and where it teaches."""
+    """A keyframe with its pixel weights and camera pose."""
 
     keyframe: AgentKeyframe
     weight: Float32[ndarray, "h w"]
     T_camera_world: Float64[ndarray, "4 4"]
 
 
-def _teaching_views(
+def _refinement_views(
     table: SplatTable, keyframes: Sequence[AgentKeyframe], rasterizer: Rasterizer
 ) -> list[_RefinementView]:
-    """The keyframes that show something of the map, with the weight of their pixels."""
-    lessons = []
+    """Return the keyframes that show some of the map, with the weights of their pixels."""
+    views = []
     for keyframe in keyframes:
         frame = keyframe.frame
         T_camera_world = inverse(frame.T_world_camera)
         rendering = rasterizer.forward(table.rows, frame.camera, T_camera_world)
         surface_m = rendering.expected_depth_m(_FOOTPRINT_ALPHA)
-        hidden = (frame.depth_m > 0) & (frame.depth_m < surface_m * (1 - _IN_FRONT_SHARE) - _IN_FRONT_M)
-        weight = ((rendering.alpha > _FOOTPRINT_ALPHA) & ~hidden).astype(np.float32)
+        occluded = (frame.depth_m > 0) & (frame.depth_m < surface_m * (1 - _OCCLUSION_SHARE) - _OCCLUSION_M)
+        weight = ((rendering.alpha > _FOOTPRINT_ALPHA) & ~occluded).astype(np.float32)
         if keyframe.weight is not None:
             weight *= keyframe.weight
         if weight.any():
-            lessons.append(_RefinementView(keyframe, weight, T_camera_world))
-    if not lessons:
+            views.append(_RefinementView(keyframe, weight, T_camera_world))
+    if not views:
         raise InvalidInputError(
-            f"refine: expected keyframes that show the fused map, got {len(keyframes)} of which none does"
+            f"refine: expected keyframes that show the fused map, got {len(keyframes)} but none does"
         )
-    return lessons
+    return views
 
 
-class _Views:
-    """The pool to draw from. As many views as max_prepared_views stay prepared; others are prepared at each use."""
+class _ViewPool:
+    """The views to draw from. Up to max_prepared_views stay prepared; the others are prepared at each use."""
 
-    def __init__(self, lessons: list[_RefinementView], rasterizer: Rasterizer, settings: RefineSettings) -> None:
-        self._lessons = lessons
+    def __init__(self, views: list[_RefinementView], rasterizer: Rasterizer, settings: RefineSettings) -> None:
+        self._views = views
         self._rasterizer = rasterizer
         self._max_prepared = settings.max_prepared_views
         self._prepared: dict[int, TrainingView] = {}
 
     def draw(self, rng: np.random.Generator) -> tuple[TrainingView, Float64[ndarray, "4 4"]]:
-        """A view drawn uniformly from the union of the agents' buffers."""
-        index = int(rng.integers(len(self._lessons)))
-        lesson = self._lessons[index]
+        """Draw a view uniformly from all agents' keyframes; returns it with its T_camera_world."""
+        index = int(rng.integers(len(self._views)))
+        chosen = self._views[index]
         view = self._prepared.get(index)
         if view is None:
-            frame = lesson.keyframe.frame
-            view = self._rasterizer.prepare_view(frame.rgb, frame.depth_m, frame.camera, lesson.weight)
+            frame = chosen.keyframe.frame
+            view = self._rasterizer.prepare_view(frame.rgb, frame.depth_m, frame.camera, chosen.weight)
             if len(self._prepared) < self._max_prepared:
                 self._prepared[index] = view
-        return view, lesson.T_camera_world
+        return view, chosen.T_camera_world
 
 
 def _train(
@@ -191,7 +192,7 @@ def _density_control_is_due(iteration: int, density: DensitySettings) -> bool:
 
 
 def _control_density(table: SplatTable, iteration: int, settings: RefineSettings, extent_m: float) -> None:
-    """Clone, split and prune as the mapper does; a map that would vanish altogether is left alone."""
+    """Clone, split and prune as the mapper does, but never prune the whole map."""
     if iteration % settings.density.densify_every == 0 and iteration < settings.iterations:
         densify(table, settings.density, extent_m)
     if iteration % settings.density.prune_every == 0 and (table.opacities >= settings.density.min_opacity).any():
@@ -199,6 +200,6 @@ def _control_density(table: SplatTable, iteration: int, settings: RefineSettings
 
 
 def _extent_m(gaussians: Gaussians) -> float:
-    """Radius of the map round its centre, without its farthest 5 %; at least a centimetre."""
-    away_m = np.linalg.norm(gaussians.means_m - np.median(gaussians.means_m, axis=0), axis=1)
-    return max(0.01, float(np.quantile(away_m, 0.95)))
+    """Return the radius of the map about its centre without the farthest 5 %; at least 1 cm."""
+    distance_m = np.linalg.norm(gaussians.means_m - np.median(gaussians.means_m, axis=0), axis=1)
+    return max(0.01, float(np.quantile(distance_m, 0.95)))

@@ -8,7 +8,7 @@ from numpy import ndarray
 
 from gausslite.domain.gaussians import Gaussians
 from gausslite.mapping.seeding import Seeds
-from gausslite.optimize.parameters import SplatTable
+from gausslite.optimize.splat_table import SplatTable
 
 
 def insert(table: SplatTable, seeds: Seeds, newborn_opacity: float, rng: np.random.Generator, scaffold: int = 0) -> int:

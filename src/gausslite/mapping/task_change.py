@@ -15,7 +15,7 @@ from gausslite.domain.frame import Frame
 from gausslite.domain.relevance import NO_TARGET, RelevanceMap
 from gausslite.errors import InvalidInputError
 from gausslite.mapping.coverage import seen_at
-from gausslite.optimize.parameters import SplatTable
+from gausslite.optimize.splat_table import SplatTable
 
 _MOST_VOTES = 100
 

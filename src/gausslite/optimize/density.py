@@ -10,7 +10,7 @@ from jaxtyping import Float32, Int64
 from numpy import ndarray
 
 from gausslite.errors import InvalidInputError
-from gausslite.optimize.parameters import SplatTable
+from gausslite.optimize.splat_table import SplatTable
 from gausslite.render.rasterizer import GRAD_2D_COUNT, GRAD_2D_SUM, LOG_SCALE, MEAN, OPACITY_LOGIT, QUAT, UPDATE_COUNT
 
 _SPLIT_SHRINK = 1.6

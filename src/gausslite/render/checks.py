@@ -1,4 +1,4 @@
-"""What every backend asks of its input, in the seam's own words, so that all refuse the same things alike."""
+"""Input checks that all backends share, so that all raise the same errors."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from gausslite.render.rasterizer import ROW_WIDTH, TILE_PX, Rendering, Subset, U
 
 
 def require_table(name: str, table: Float32[ndarray, "n 16"], n: int | None = None) -> None:
-    """Raise ShapeError unless these are (n) rows, one after the other in memory."""
+    """Raise ShapeError unless the table is contiguous with 16 columns (and n rows, if given)."""
     require_array(name, table, (n, ROW_WIDTH), np.float32)
     if not table.flags.c_contiguous:
         raise ShapeError(f"{name}: expected contiguous rows, got strides {table.strides}")
@@ -22,7 +22,7 @@ def require_table(name: str, table: Float32[ndarray, "n 16"], n: int | None = No
 def require_tables(
     rows: Float32[ndarray, "n 16"], first_moment: Float32[ndarray, "n 16"], second_moment: Float32[ndarray, "n 16"]
 ) -> None:
-    """Raise ShapeError unless the three tables belong together and may be written to."""
+    """Raise ShapeError unless the three tables have equal shapes and are writeable."""
     for name, table in (("rows", rows), ("first_moment", first_moment), ("second_moment", second_moment)):
         require_table(name, table, len(rows))
         if not table.flags.writeable:
@@ -30,7 +30,7 @@ def require_tables(
 
 
 def require_scene(n: int, camera: Camera, T_camera_world: Float64[ndarray, "4 4"], subset: Subset) -> None:
-    """Raise ShapeError unless pose and subset fit the camera, InvalidInputError for ids that are not ascending rows."""
+    """Raise ShapeError unless pose and subset fit the camera; InvalidInputError unless ids are ascending row numbers."""
     require_array("T_camera_world", T_camera_world, (4, 4), np.float64)
     if subset.tiles is not None:
         grid = (-(-camera.height_px // TILE_PX), -(-camera.width_px // TILE_PX))
@@ -40,15 +40,15 @@ def require_scene(n: int, camera: Camera, T_camera_world: Float64[ndarray, "4 4"
         _require_ascending(subset.ids, n)
 
 
-def require_marks(n: int, trainable: Bool[ndarray, " n"] | None, update_counter: UpdateCounter | None) -> None:
-    """Raise ShapeError unless what is said of single rows is said of all n, and the update_counter can be written."""
+def require_row_masks(n: int, trainable: Bool[ndarray, " n"] | None, update_counter: UpdateCounter | None) -> None:
+    """Raise ShapeError unless masks and counters have length n and the counters are writeable."""
     if trainable is not None:
         require_array("trainable", trainable, (n,), np.bool_)
     if update_counter is None:
         return
     require_array("update_counter counts", update_counter.counts, (n,), np.uint32)
     if not (update_counter.counts.flags.writeable and update_counter.counts.flags.c_contiguous):
-        raise ShapeError("update_counter counts: expected a contiguous array that may be written, got another")
+        raise ShapeError("update_counter counts: expected a contiguous, writeable array, got another")
     if update_counter.mask is not None:
         require_array("update_counter mask", update_counter.mask, (n,), np.bool_)
 
@@ -59,7 +59,7 @@ def require_image_gradients(
     d_depth_m: Float32[ndarray, "h w"],
     d_alpha: Float32[ndarray, "h w"],
 ) -> None:
-    """Raise ShapeError unless there is one derivative for each value drawn."""
+    """Raise ShapeError unless the derivatives have the shapes of the rendered images."""
     size = rendering.alpha.shape
     require_array("d_rgb", d_rgb, (*size, 3), np.float32)
     require_array("d_depth_m", d_depth_m, size, np.float32)
@@ -72,7 +72,7 @@ def require_view(
     camera: Camera,
     weight: Float32[ndarray, "h w"] | None,
 ) -> None:
-    """Raise ShapeError unless the images are the camera's, InvalidInputError for weights outside [0, 1]."""
+    """Raise ShapeError unless the images have the camera's size; InvalidInputError if a weight is outside [0, 1]."""
     size = (camera.height_px, camera.width_px)
     require_array("view rgb", rgb, (*size, 3), np.uint8)
     require_array("view depth_m", depth_m, size, np.float32)

@@ -1,4 +1,4 @@
-"""Choose the backend once, by name."""
+"""Create a rasterizer backend by name."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from gausslite.render.rasterizer import Rasterizer
 
 BACKENDS = ("auto", "cpu", "cuda", "reference")
 _DRIVER_DEVICES = (Path("/dev/nvidia0"), Path("/dev/dxg"))
-"""What NVIDIA's driver shows on Linux, and under Windows' Linux."""
+"""Device files of the NVIDIA driver on Linux and in the Windows Subsystem for Linux."""
 
 
 def choose_rasterizer(name: str = "auto", threads: int | None = None) -> Rasterizer:
-    """The backend of this name; `auto` is cuda where it can run and cpu elsewhere. Raises KernelError.
+    """Create the backend of this name; `auto` means cuda if it can run, else cpu.
 
-    threads is for the `cpu` backend; by default one per core this process may use.
+    threads: of the `cpu` backend; by default one per core that the process may use. Raises KernelError.
     """
     if name == "auto":
         return _fastest(threads)
@@ -38,12 +38,12 @@ def choose_rasterizer(name: str = "auto", threads: int | None = None) -> Rasteri
 
 
 def _fastest(threads: int | None) -> Rasterizer:
-    """The GPU's where driver, torch and gsplat are all there; torch is not even imported where one is missing."""
+    """Create the cuda backend if driver, torch and gsplat are present, else cpu; torch is imported only if they are."""
     if any(device.exists() for device in _DRIVER_DEVICES) and _installed("torch") and _installed("gsplat"):
         try:
             return choose_rasterizer("cuda")
         except KernelError:
-            # a driver without a device for us, or a torch built for processors alone
+            # the driver has no usable device, or torch has no CUDA support
             return choose_rasterizer("cpu", threads)
     return choose_rasterizer("cpu", threads)
 

@@ -1,4 +1,4 @@
-"""The native CPU backend: checks its input, then hands whole iterations to the C++ kernels."""
+"""The CPU backend: checks its input and runs whole training iterations in the C++ kernels (native/)."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from gausslite.render.checks import (
     require_table,
     require_view,
 )
-from gausslite.render.cpu_arguments import CpuView, Loans, contiguous, intrinsics
+from gausslite.render.cpu_arguments import CpuView, TableBinding, contiguous, intrinsics
 from gausslite.render.cpu_kernels import choose_simd, choose_threads, load_kernels
 from gausslite.render.rasterizer import (
     FULL_FRAME,
@@ -40,8 +40,8 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Drawn:
-    """Which frame of which rasterizer a rendering is, and the rows it was drawn from: the way back reads them again."""
+class _ForwardContext:
+    """The rasterizer, frame number and input of a rendering; `backward` reads the rows again."""
 
     owner: CpuRasterizer
     frame: int
@@ -50,7 +50,7 @@ class _Drawn:
 
 
 class _Report:
-    """What a step did. The visible rows stay in the kernels' memory until they are read, or drawn over."""
+    """The report of a step. The visible rows are copied on first access, or before the kernels overwrite them."""
 
     __slots__ = ("__weakref__", "_engine", "_lock", "_visible", "loss")
 
@@ -70,13 +70,14 @@ class _Report:
 
 
 class CpuRasterizer:
-    """C++ kernels with a persistent team of threads; results do not depend on the number of threads.
+    """C++ kernels on a persistent thread pool. Results do not depend on the number of threads.
 
-    Calls from several Python threads are served one after the other.
+    Concurrent calls from several Python threads run one after the other. The pool's threads do not survive a fork:
+    create the rasterizer in the child process.
 
-    threads: by default one per core this process may use. simd: `avx512`, `avx2`, `neon` or `portable`; by default
-    the environment variable GAUSSLITE_SIMD, and without it the fastest this machine runs. Raises KernelError when the
-    kernels are not built or the choice is impossible. Threads do not survive a fork: build it in the child.
+    threads: by default one per core that the process may use. simd: `avx512`, `avx2`, `neon` or `portable`; by default
+    the environment variable GAUSSLITE_SIMD, else the fastest set of this machine. Raises KernelError if the kernels are
+    not built, the instruction set is not usable or the threads cannot be started.
     """
 
     def __init__(self, threads: int | None = None, simd: str | None = None) -> None:
@@ -85,10 +86,10 @@ class CpuRasterizer:
         try:
             self._engine: _kernels.Engine = load_kernels().Engine(self._simd, count)
         except RuntimeError as reason:
-            raise KernelError(f"threads: expected as many as can be started, {count} cannot ({reason})") from reason
+            raise KernelError(f"threads: expected a number that can be started, got {count} ({reason})") from reason
         self._lock = RLock()
         self._latest: ref[_Report] | None = None
-        self._loans = Loans()
+        self._binding = TableBinding()
 
     @property
     def name(self) -> str:
@@ -97,12 +98,12 @@ class CpuRasterizer:
 
     @property
     def simd(self) -> str:
-        """The instruction set in use."""
+        """Name of the instruction set in use."""
         return self._simd
 
     @property
     def threads(self) -> int:
-        """Members of the team, the caller included."""
+        """Number of threads, including the caller's."""
         return self._engine.threads
 
     def forward(
@@ -112,16 +113,16 @@ class CpuRasterizer:
         T_camera_world: Float64[ndarray, "4 4"],
         subset: Subset = FULL_FRAME,
     ) -> Rendering:
-        """Draw the splats. Raises ShapeError, InvalidInputError for ids that are not ascending rows."""
+        """Render the splats. Raises ShapeError, InvalidInputError if the ids are not ascending row numbers."""
         require_table("rows", rows)
         require_scene(len(rows), camera, T_camera_world, subset)
         T_camera_world = np.ascontiguousarray(T_camera_world)
         with self._lock:
-            self._settle_report()
+            self._fetch_visible_rows()
             rgb, depth_m, alpha, frame = self._engine.forward(
                 rows, intrinsics(camera), T_camera_world, contiguous(subset.tiles), contiguous(subset.ids)
             )
-        return Rendering(rgb, depth_m, alpha, _Drawn(self, frame, rows, T_camera_world))
+        return Rendering(rgb, depth_m, alpha, _ForwardContext(self, frame, rows, T_camera_world))
 
     def backward(
         self,
@@ -130,19 +131,19 @@ class CpuRasterizer:
         d_depth_m: Float32[ndarray, "h w"],
         d_alpha: Float32[ndarray, "h w"],
     ) -> SplatGradients:
-        """Gradients of a scalar whose derivatives by the rendering's images are given.
+        """Return the gradients of a scalar, given its derivatives by the rendered images.
 
-        The rows must not have changed since. Raises ShapeError, InvalidInputError for a rendering that is not this
+        The rows must be unchanged since `forward`. Raises ShapeError, InvalidInputError if the rendering is not this
         backend's latest.
         """
-        drawn = rendering.context
+        context = rendering.context
         with self._lock:
-            if not isinstance(drawn, _Drawn) or drawn.owner is not self or drawn.frame != self._engine.frame:
+            if not self._is_latest(context):
                 raise InvalidInputError("rendering: expected the latest forward of this rasterizer, got another one")
             require_image_gradients(rendering, d_rgb, d_depth_m, d_alpha)
             d_rows, d_twist, visible, norms = self._engine.backward(
-                drawn.frame,
-                len(drawn.rows),
+                context.frame,
+                len(context.rows),
                 np.ascontiguousarray(d_rgb),
                 np.ascontiguousarray(d_depth_m),
                 np.ascontiguousarray(d_alpha),
@@ -156,7 +157,7 @@ class CpuRasterizer:
         camera: Camera,
         weight: Float32[ndarray, "h w"] | None = None,
     ) -> TrainingView:
-        """Make an image ready to train on. Raises ShapeError, InvalidInputError for weights outside [0, 1]."""
+        """Return the image in the kernels' layout. Raises ShapeError, InvalidInputError if a weight is outside [0, 1]."""
         require_view(rgb, depth_m, camera, weight)
         native = load_kernels().View(np.ascontiguousarray(rgb), np.ascontiguousarray(depth_m), contiguous(weight))
         return CpuView(camera, intrinsics(camera), native)
@@ -175,13 +176,14 @@ class CpuRasterizer:
         trainable: Bool[ndarray, " n"] | None = None,
         update_counter: UpdateCounter | None = None,
     ) -> StepReport:
-        """One whole iteration in place. Raises ShapeError, also for a view of another backend."""
+        """Run one training iteration in place. Raises ShapeError, also for a view of another backend; InvalidInputError."""
         if not isinstance(view, CpuView):
             raise ShapeError(f"view: expected one that this backend prepared, got {type(view).__name__}")
         with self._lock:
             scene = view.scene(len(rows), T_camera_world, subset, masked)
-            training = self._loans.training((rows, first_moment, second_moment), (loss, adam), masked, trainable, update_counter)
-            self._settle_report()
+            tables = rows, first_moment, second_moment
+            training = self._binding.training(tables, (loss, adam), masked, trainable, update_counter)
+            self._fetch_visible_rows()
             report = _Report(self._engine.step(scene, training), self._engine, self._lock)
             self._latest = ref(report)
         return report
@@ -193,33 +195,36 @@ class CpuRasterizer:
         first_moment: Float32[ndarray, "n 16"],
         second_moment: Float32[ndarray, "n 16"],
     ) -> Iterator[None]:
-        """Nothing to carry: steps work on the arrays themselves, which are checked once here.
+        """Check the tables once for all steps in this context; steps work on the arrays themselves.
 
-        Raises ShapeError, InvalidInputError where tables are on loan already.
-        As nobody else changes the rows, the kernels keep where each one is from step to step.
+        Only steps change bound rows, so the kernels keep the bounds of all rows from step to step. Raises ShapeError,
+        InvalidInputError if tables are bound already.
         """
-        with self._loans.lend((rows, first_moment, second_moment)):
+        with self._binding.bind((rows, first_moment, second_moment)):
             yield
 
     def stage_times_ms(self) -> dict[str, float]:
-        """Milliseconds that the stages of the latest call took: project, raster, loss, backward, update."""
+        """Return the milliseconds of each stage of the latest call: project, raster, loss, backward, update."""
         with self._lock:
             return self._engine.stage_times_ms()
 
     def steps_s(self, masked: bool | None = None) -> float:
-        """Seconds that all steps so far spent in the kernels, or only those masked to a region, or only the others."""
+        """Return the kernels' total time in seconds of all steps, of the masked (True) or the other steps (False)."""
         with self._lock:
             all_ms, masked_ms = self._engine.steps_ms, self._engine.masked_steps_ms
-        spent_ms = all_ms if masked is None else masked_ms if masked else all_ms - masked_ms
-        return spent_ms / 1e3
+        total_ms = all_ms if masked is None else masked_ms if masked else all_ms - masked_ms
+        return total_ms / 1e3
 
     def block_evaluations(self) -> int:
-        """How often the latest forward or step composited a splat on a 4x4 block of pixels."""
+        """Return how many pairs of a splat and a 4x4 pixel block the latest forward or step composited."""
         with self._lock:
             return self._engine.block_evaluations
 
-    def _settle_report(self) -> None:
-        """A report that somebody still holds gets its rows before the kernels draw over them."""
+    def _is_latest(self, context: object) -> bool:
+        return isinstance(context, _ForwardContext) and context.owner is self and context.frame == self._engine.frame
+
+    def _fetch_visible_rows(self) -> None:
+        """Copy the visible rows of the latest report, if it is still referenced, before the kernels overwrite them."""
         report = None if self._latest is None else self._latest()
         if report is not None:
             _ = report.visible

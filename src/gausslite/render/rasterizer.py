@@ -1,21 +1,22 @@
-"""The seam between the mapper and the machines that draw: what every rasterizer backend does.
+"""Define the interface of a rasterizer: splat rows, image model, loss, Adam, and the operations of every backend.
 
-Rows. A splat is one row of 16 float32 (64 bytes, one cache line):
+Rows. One splat is a row of 16 float32 values (64 bytes, one cache line):
     0-2 mean x y z in metres | 3-5 log of the scales in metres | 6-9 quaternion w x y z (any non-zero length)
-    10 opacity logit | 11-13 red green blue | 14 number of Adam updates so far | 15 spare, zero
-Adam's two moments are tables of the same shape; columns 14 and 15 of the FIRST moment hold the density statistics
-since they were last cleared: the sum of the norms of the gradient of the mean in the image, in half image widths
-and heights (as in 3DGS), and the number of steps in which the splat was visible.
+    10 opacity logit | 11-13 red green blue | 14 number of Adam updates | 15 unused, zero
+Adam's two moments are tables of the same shape. Columns 14 and 15 of the first moment hold density statistics, summed
+since the last densification. Column 14: norms of the gradient with respect to the image mean, in half image widths and
+heights (as in 3DGS). Column 15: number of steps in which the splat was visible.
 
-Image model (EWA splatting, Kerbl et al. 2023). The 2D covariance gets 0.3 px² on its diagonal; a contribution below
-1/255 is dropped and alpha is clamped to 0.99 (no gradient through the clamp); splats nearer than 0.05 m are culled;
-the tangent that enters the Jacobian is clamped to 1.3 times the half field of view; splats are drawn in order of
-their z. Pixel centres are at +0.5. A pixel stops once its transmittance is below 1e-4, after the splat that took it
-there.
+Image model (EWA splatting; 3DGS, Kerbl et al. 2023; Sec. III-A):
+    - The diagonal of the 2D covariance gets 0.3 px².
+    - Contributions with alpha < 1/255 are dropped. Alpha is clamped to 0.99, without a gradient through the clamp.
+    - Splats nearer than 0.05 m are culled. The others are blended in ascending order of z.
+    - The tangent x/z, y/z in the Jacobian is clamped to 1.3 times half the field of view.
+    - Pixel centres are at +0.5. Blending of a pixel ends after the splat that takes its transmittance below 1e-4.
 
-A row with a value that is not finite in columns 0-13, with a quaternion of length zero, or whose ellipse is not finite
-in the backend's precision is not drawn. A row is visible when the bounding box of its ellipse alpha >= 1/255 holds
-the centre of at least one drawn pixel.
+A backend does not draw rows with a non-finite value in columns 0-13, a quaternion of length zero, or an ellipse that is
+not finite in the backend's precision. A row is visible if the bounding box of its ellipse alpha >= 1/255 contains the
+centre of at least one rendered pixel.
 """
 
 from __future__ import annotations
@@ -35,11 +36,12 @@ from gausslite.errors import InvalidInputError
 ROW_WIDTH = 16
 MEAN, LOG_SCALE, QUAT, OPACITY_LOGIT, RGB = slice(0, 3), slice(3, 6), slice(6, 10), 10, slice(11, 14)
 UPDATE_COUNT = 14
+"""Column of the rows: number of Adam updates."""
 GRAD_2D_SUM, GRAD_2D_COUNT = 14, 15
 """Columns of the first-moment table, not of the rows."""
 
 MAX_UPDATE_COUNT = 20_000
-"""Further updates of a splat count as so many: its bias corrections are 1 by then."""
+"""Adam's factors no longer change after this many updates of a row: float32 rounds both bias corrections to 1."""
 
 TILE_PX = 16
 NEAR_M = 0.05
@@ -47,10 +49,10 @@ NEAR_M = 0.05
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Subset:
-    """What takes part in a rendering; None means everything.
+    """The tiles and rows of a partial rendering; None selects all.
 
-    tiles: True for each 16x16 tile to draw, row-major from the top left; other pixels come out as zeros, alpha 0.
-    ids: the rows that exist for this rendering, ascending (active-only rendering).
+    tiles: True for each 16x16 tile to render, row-major from the top left; all other pixels are 0, with alpha 0.
+    ids: row numbers to render, ascending (active-only rendering).
     """
 
     tiles: Bool[ndarray, "th tw"] | None = None
@@ -62,9 +64,10 @@ FULL_FRAME = Subset()
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rendering:
-    """rgb and depth_m are accumulated with the weights T·alpha: divide depth_m by alpha for the expected depth.
+    """Images of a forward pass: sums of colour and depth over the splats, with weights T·alpha.
 
-    context belongs to the backend and is needed by `backward`; it is valid until the backend's next forward or step.
+    rgb is not clipped to [0, 1]. depth_m / alpha is the expected depth. context is opaque; `backward` needs it. It is
+    valid until the backend's next `forward` or `step`.
     """
 
     rgb: Float32[ndarray, "h w 3"]
@@ -73,7 +76,7 @@ class Rendering:
     context: Any = field(repr=False)
 
     def expected_depth_m(self, min_alpha: float = 0.5) -> Float32[ndarray, "h w"]:
-        """Depth of the surface drawn; 0 where alpha is below min_alpha."""
+        """Return the expected depth in metres; 0 where alpha <= min_alpha."""
         out: Float32[ndarray, "h w"] = np.zeros_like(self.depth_m)
         np.divide(self.depth_m, self.alpha, out=out, where=self.alpha > min_alpha)
         return out
@@ -81,9 +84,12 @@ class Rendering:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SplatGradients:
-    """d_rows: gradient per column (columns 14, 15 zero). d_twist: for T_camera_world ← exp(twist) T_camera_world,
-    twist = (translation 3, rotation 3) in the camera frame. visible: the visible rows, ascending. mean_2d_norm: per
-    visible row, norm of the image-mean gradient scaled by half width and half height.
+    """Gradients of a scalar function of the rendered images.
+
+    d_rows: by the parameters; columns 14 and 15 are zero. d_twist: by the camera pose, for
+    T_camera_world ← exp(twist) T_camera_world with twist = (translation 3, rotation 3) in the camera frame.
+    visible: the visible rows, ascending. mean_2d_norm: for each visible row, the norm of the gradient by the image mean
+    in half image widths and heights.
     """
 
     d_rows: Float32[ndarray, "n 16"]
@@ -94,16 +100,18 @@ class SplatGradients:
 
 @dataclass(frozen=True, slots=True)
 class LossWeights:
-    """Weights of Eq. (1), with w the view's weight (1 everywhere when not masked) and W the sum of w over all pixels
-    (every term is 0 where W is 0):
+    """Weights of the training loss, Eq. (1).
 
-      colour / (3W) · Σ w |rgb − image|   summed over the three channels
+    w is the view's weight of a pixel (1 if the step is not masked) and W the sum of w over the image. The loss is 0 if
+    W is 0, else the sum of
+
+      colour / (3W) · Σ w |rgb − image|   over pixels and the three channels
     + depth / W · Σ w |depth / alpha − measured|   where alpha > 0.5 and measured > 0
     + ssim · (1 − Σ w SSIM / (3W))   11x11 Gaussian window, sigma 1.5, zero padding, C1 = 1e-4, C2 = 9e-4
 
-    normalise_by_image multiplies all of it by W over the number of pixels, so that on images of one size a pixel of weight 1
-    counts the same in every step, whatever the mask. Adam divides by how large gradients were lately: without it,
-    steps masked to a small region make those on the full image next to nothing to the Gaussians that both move.
+    normalise_by_image multiplies the loss by W / (number of pixels). A pixel of weight 1 then has the same gradient with
+    any mask. Adam normalises by recent gradient magnitudes: without this factor, steps masked to a small region have
+    large gradients, and the steps on the full image hardly move the Gaussians that both train.
     """
 
     colour: float = 0.8
@@ -120,10 +128,10 @@ class LossWeights:
 
 @dataclass(frozen=True, slots=True)
 class AdamSettings:
-    """Learning rates per group (FIELD defaults) and Adam's constants; bias correction counts updates per splat.
+    """Learning rates per parameter group and Adam's constants (Kingma and Ba 2015).
 
-    decay_after_updates: in the t-th update of a splat its rates are multiplied by √(decay_after_updates / t) where that is
-    below 1, for t up to MAX_UPDATE_COUNT and no less after them. inf, the default, keeps them as they are.
+    Each row has its own number of updates t (column 14) for the bias correction. Its learning rates are multiplied by
+    min(1, √(decay_after_updates / t)); t stops at MAX_UPDATE_COUNT. The default inf means no decay.
     """
 
     means: float = 1e-4
@@ -150,7 +158,7 @@ class AdamSettings:
             raise InvalidInputError(f"adam decay_after_updates: expected more than 0, got {self.decay_after_updates}")
 
     def row_rates(self) -> Float32[ndarray, "16"]:
-        """The learning rate of each column of a row; zero for the spare ones."""
+        """Return the learning rate of each column of a row; 0 for columns 14 and 15."""
         rates = np.zeros(ROW_WIDTH, np.float32)
         rates[MEAN], rates[LOG_SCALE], rates[QUAT] = self.means, self.log_scales, self.quats
         rates[OPACITY_LOGIT], rates[RGB] = self.opacity_logits, self.rgb
@@ -159,7 +167,7 @@ class AdamSettings:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class UpdateCounter:
-    """Count the updates of each row: a step adds 1 to `counts` for each row that it changes and `mask` selects.
+    """Counters of row updates: a step adds 1 to `counts` for each row that it changes and that `mask` selects.
 
     mask: None selects all rows.
     """
@@ -170,7 +178,7 @@ class UpdateCounter:
 
 @runtime_checkable
 class TrainingView(Protocol):
-    """An image prepared once for many steps (padded, tiled); opaque outside its backend."""
+    """A training image in the layout of one backend, prepared once for many steps; opaque to all other code."""
 
     @property
     def camera(self) -> Camera:
@@ -180,7 +188,7 @@ class TrainingView(Protocol):
 
 @runtime_checkable
 class StepReport(Protocol):
-    """What one fused step did; a backend on a device fetches a figure when it is first read, so read it late."""
+    """Loss and visible rows of one training step. Reading a property may wait for the device."""
 
     @property
     def loss(self) -> float:
@@ -189,13 +197,13 @@ class StepReport(Protocol):
 
     @property
     def visible(self) -> UInt32[ndarray, " m"]:
-        """The visible rows, ascending (frozen ones too)."""
+        """The visible rows, ascending, trainable or not."""
         ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HostReport:
-    """The report of a backend whose figures are at hand."""
+    """The report of a backend that has loss and visible rows in host memory."""
 
     loss: float
     visible: UInt32[ndarray, " m"]
@@ -203,7 +211,7 @@ class HostReport:
 
 @runtime_checkable
 class Rasterizer(Protocol):
-    """A backend. It owns scratch memory and threads, never the splats. Calls are not re-entrant."""
+    """A rendering backend. It owns scratch memory and threads, never the splat tables. Calls are not re-entrant."""
 
     @property
     def name(self) -> str:
@@ -217,7 +225,7 @@ class Rasterizer(Protocol):
         T_camera_world: Float64[ndarray, "4 4"],
         subset: Subset = FULL_FRAME,
     ) -> Rendering:
-        """Draw the splats. Raises ShapeError."""
+        """Render the splats. Raises ShapeError, InvalidInputError if the ids are not ascending row numbers."""
         ...
 
     def backward(
@@ -227,7 +235,10 @@ class Rasterizer(Protocol):
         d_depth_m: Float32[ndarray, "h w"],
         d_alpha: Float32[ndarray, "h w"],
     ) -> SplatGradients:
-        """Gradients of a scalar whose derivatives by the rendering's images are given."""
+        """Return the gradients of a scalar, given its derivatives by the rendered images.
+
+        Raises ShapeError, InvalidInputError if the rendering is not this backend's or no longer valid.
+        """
         ...
 
     def prepare_view(
@@ -237,7 +248,11 @@ class Rasterizer(Protocol):
         camera: Camera,
         weight: Float32[ndarray, "h w"] | None = None,
     ) -> TrainingView:
-        """Make an image ready to train on. weight in [0, 1] masks the loss of steps with `masked=True`."""
+        """Return the image in the backend's layout.
+
+        depth_m: 0 means no measurement. weight in [0, 1]: weights of the loss in steps with `masked=True`, default 1.
+        Raises ShapeError, InvalidInputError if a weight is outside [0, 1].
+        """
         ...
 
     def step(
@@ -254,11 +269,11 @@ class Rasterizer(Protocol):
         trainable: Bool[ndarray, " n"] | None = None,
         update_counter: UpdateCounter | None = None,
     ) -> StepReport:
-        """One whole iteration in place: forward, loss, backward, sparse Adam on the visible (and trainable) rows.
+        """Run one training iteration in place: forward, loss, backward and sparse Adam.
 
-        masked=True weighs every loss term by the view's weight, as LossWeights says. Only rows that are
-        visible and trainable change, with their moments: their UPDATE_COUNT count rises by one, and the density
-        statistics of the first moment are added up, and so is the update_counter. Raises ShapeError.
+        Only rows that are visible and trainable (None: all) change, and their moments. Column UPDATE_COUNT, the density
+        statistics and update_counter change for the same rows. masked=True weights the loss by the view's weight.
+        Raises ShapeError, InvalidInputError.
         """
         ...
 
@@ -268,10 +283,10 @@ class Rasterizer(Protocol):
         first_moment: Float32[ndarray, "n 16"],
         second_moment: Float32[ndarray, "n 16"],
     ) -> AbstractContextManager[None]:
-        """Lend the tables to the backend for many steps: until the context ends they are its own.
+        """Bind the tables to the backend for a sequence of steps inside this context.
 
-        A device keeps them and brings them up to date on leaving, also when leaving by an error, and tallies with
-        them; inside, nobody else reads or changes the arrays, and steps name the same arrays. Without it every step
-        carries them there and back. Raises ShapeError, InvalidInputError for a second loan before the first is over.
+        Inside, pass the same arrays to `step`; no other code may read or change them. A device backend keeps copies and
+        writes the tables and update counters back on exit, also after an exception. Without a binding, each step
+        copies the tables to the device and back. Raises ShapeError, InvalidInputError if tables are bound already.
         """
         ...

@@ -8,7 +8,7 @@ from sample_gaussians import plain_gaussians
 from gausslite.domain.gaussians import Gaussians
 from gausslite.mapping.eviction import insert
 from gausslite.mapping.seeding import Seeds
-from gausslite.optimize.parameters import SplatTable
+from gausslite.optimize.splat_table import SplatTable
 
 NEWBORN = 0.5
 

@@ -7,7 +7,7 @@ import pytest
 
 from gausslite.errors import InvalidInputError
 from gausslite.optimize.density import DensitySettings, densify, prune
-from gausslite.optimize.parameters import SplatTable
+from gausslite.optimize.splat_table import SplatTable
 from gausslite.render.rasterizer import GRAD_2D_COUNT, GRAD_2D_SUM, LOG_SCALE, MEAN, OPACITY_LOGIT, QUAT, UPDATE_COUNT
 
 SETTINGS = DensitySettings(max_growth=1.0)

@@ -15,7 +15,7 @@ from gausslite.errors import InvalidInputError
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.settings import MapperSettings, OptimizationSettings, SeedingSettings
 from gausslite.optimize.density import DensitySettings, densify
-from gausslite.optimize.parameters import SplatTable
+from gausslite.optimize.splat_table import SplatTable
 from gausslite.render.cpu import CpuRasterizer
 from gausslite.render.rasterizer import GRAD_2D_COUNT, GRAD_2D_SUM, RGB, UPDATE_COUNT
 

@@ -7,7 +7,8 @@ import pytest
 from sample_gaussians import some_gaussians
 
 from gausslite.errors import InvalidInputError, QuotaError, ShapeError
-from gausslite.optimize.parameters import SplatTable, gaussians_to_rows, rows_to_gaussians
+from gausslite.optimize.row_encoding import gaussians_to_rows, rows_to_gaussians
+from gausslite.optimize.splat_table import SplatTable
 
 
 def test_physical_values_survive_the_way_through_raw_rows() -> None:
@@ -88,7 +89,7 @@ def test_to_gaussians_copies() -> None:
 
 @pytest.mark.parametrize("capacity", [10**12, 10**18, 10**30])
 def test_more_than_memory_is_refused_by_name(capacity: int) -> None:
-    with pytest.raises(InvalidInputError, match="max_gaussians: expected as many as there is memory for"):
+    with pytest.raises(InvalidInputError, match="max_gaussians: expected a table that fits in memory"):
         SplatTable(capacity)
 
 

@@ -10,7 +10,7 @@ from gausslite.domain.gaussians import Gaussians
 from gausslite.mapping.eviction import insert
 from gausslite.mapping.seeding import Seeds
 from gausslite.optimize.density import DensitySettings, densify, prune
-from gausslite.optimize.parameters import SplatTable
+from gausslite.optimize.splat_table import SplatTable
 from gausslite.render.rasterizer import GRAD_2D_COUNT, GRAD_2D_SUM
 
 CAPACITY = 40

@@ -106,11 +106,11 @@ def tables(n: int = 4) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def test_one_loan_at_a_time() -> None:
     rasterizer = CudaRasterizer("cpu")
     with rasterizer.bind_tables(*tables()):
-        with pytest.raises(InvalidInputError, match="second loan"), rasterizer.bind_tables(*tables()):
+        with pytest.raises(InvalidInputError, match="second binding"), rasterizer.bind_tables(*tables()):
             pass
         frame = wall_frame(0, SIZE)
         view = rasterizer.prepare_view(frame.rgb, frame.depth_m, frame.camera)
-        with pytest.raises(InvalidInputError, match="on loan"):
+        with pytest.raises(InvalidInputError, match="bound tables"):
             rasterizer.step(*tables(), view, np.eye(4), LossWeights(), AdamSettings())
 
 

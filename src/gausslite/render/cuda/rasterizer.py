@@ -16,7 +16,7 @@ from gausslite.domain.camera import Camera
 from gausslite.errors import InvalidInputError, KernelError, ShapeError
 from gausslite.render.checks import (
     require_image_gradients,
-    require_marks,
+    require_row_masks,
     require_scene,
     require_table,
     require_tables,
@@ -198,9 +198,9 @@ class CudaRasterizer:
             with self.bind_tables(rows, first_moment, second_moment):
                 return self.step(*tables.arrays, view, T_camera_world, loss, adam, masked, subset, trainable, update_counter)
         if not self._held.host.same_memory_as(tables):
-            raise InvalidInputError("step: expected the tables that are on loan, got others")
+            raise InvalidInputError("step: expected the bound tables, got others")
         require_scene(len(rows), view.camera, T_camera_world, subset)
-        require_marks(len(rows), trainable, update_counter)
+        require_row_masks(len(rows), trainable, update_counter)
         target = view.masked if masked else view.unmasked
         drawn = self._draw(self._held.rows, view.lens, T_camera_world, subset, target.window)
         value = training_loss(drawn.channels, drawn.alpha, target, loss)
@@ -227,7 +227,7 @@ class CudaRasterizer:
         """
         require_tables(rows, first_moment, second_moment)
         if self._held is not None:
-            raise InvalidInputError("bind_tables: expected no other tables on loan, got a second loan")
+            raise InvalidInputError("bind_tables: expected no bound tables, got a second binding")
         self._held = DeviceTables(HostTables(rows, first_moment, second_moment), self._kernels.device)
         try:
             yield

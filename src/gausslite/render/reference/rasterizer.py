@@ -16,7 +16,7 @@ from gausslite.domain.camera import Camera
 from gausslite.errors import InvalidInputError, ShapeError
 from gausslite.render.checks import (
     require_image_gradients,
-    require_marks,
+    require_row_masks,
     require_scene,
     require_table,
     require_tables,
@@ -133,7 +133,7 @@ class ReferenceRasterizer:
         if not isinstance(view, ReferenceView):
             raise ShapeError(f"view: expected one that this backend prepared, got {type(view).__name__}")
         require_tables(rows, first_moment, second_moment)
-        require_marks(len(rows), trainable, update_counter)
+        require_row_masks(len(rows), trainable, update_counter)
         drawn = _draw(rows, view.camera, T_camera_world, subset)
         images = drawn.images.requires_grad_()
         value = training_loss(images, view, loss, masked)
@@ -158,7 +158,7 @@ class ReferenceRasterizer:
         """Nothing to carry. Raises ShapeError, InvalidInputError for a second loan before the first is over."""
         require_tables(rows, first_moment, second_moment)
         if self._lent:
-            raise InvalidInputError("bind_tables: expected no other tables on loan, got a second loan")
+            raise InvalidInputError("bind_tables: expected no bound tables, got a second binding")
         self._lent = True
         try:
             yield
