@@ -30,7 +30,7 @@ def frame_state(frame: Frame) -> dict[str, NDArray[Any]]:
     }
 
 
-def frame_of(state: State) -> Frame:
+def frame_from_state(state: State) -> Frame:
     """The frame again; its arrays are copies. Raises MapFileError, InvalidInputError."""
     index, capture_time_ns = (int(value) for value in get_array(state, "stamp", (2,), np.int64))
     depth_m = get_array(state, "depth_m", (None, None), np.float32).copy()
@@ -46,7 +46,7 @@ def relevance_state(relevance: RelevanceMap) -> dict[str, NDArray[Any]]:
     return {"weight": relevance.weight, "target": relevance.target}
 
 
-def relevance_of(state: State, frame: Frame) -> RelevanceMap:
+def relevance_from_state(state: State, frame: Frame) -> RelevanceMap:
     """The relevance of this frame again. Raises MapFileError, ShapeError."""
     weight = get_array(state, "weight", frame.depth_m.shape, np.float32).copy()
     if not ((weight >= 0) & (weight <= 1)).all():
@@ -62,7 +62,7 @@ def generator_state(rng: np.random.Generator) -> UInt64[ndarray, "6"]:
     return np.array([*halves, state["has_uint32"], state["uinteger"]], np.uint64)
 
 
-def set_generator(rng: np.random.Generator, words: UInt64[ndarray, "6"]) -> None:
+def restore_generator(rng: np.random.Generator, words: UInt64[ndarray, "6"]) -> None:
     """Put a PCG64 generator where another one stood. Raises MapFileError for numbers that no generator has."""
     state_high, state_low, step_high, step_low, has_half, half = (int(word) for word in words)
     if has_half > 1 or half >> 32 or not step_low & 1:

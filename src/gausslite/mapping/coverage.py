@@ -27,12 +27,12 @@ class RenderedView:
     depth_m: Float32[ndarray, "h w"]
 
     @classmethod
-    def of(cls, rendering: Rendering) -> RenderedView:
+    def from_rendering(cls, rendering: Rendering) -> RenderedView:
         """What a rendering from the frame's pose shows."""
         return cls(rendering.alpha, rendering.expected_depth_m())
 
 
-def drawn_behind(frame: Frame, sight: RenderedView, depth_error_factor: float) -> Bool[ndarray, "h w"]:
+def rendered_behind(frame: Frame, sight: RenderedView, depth_error_factor: float) -> Bool[ndarray, "h w"]:
     """Pixels that the map draws far behind what is measured there.
 
     Far means more than depth_error_factor times the median depth error, taken over every fourth row and column.
@@ -46,7 +46,7 @@ def drawn_behind(frame: Frame, sight: RenderedView, depth_error_factor: float) -
     return far
 
 
-def undersampled(
+def undersampled_roi(
     frame: Frame, region: Bool[ndarray, "h w"], active_means_m: Float32[ndarray, "n 3"], pixels_per_active: float
 ) -> Bool[ndarray, "h w"]:
     """Pixels of the region in 8x8 cells that hold less than one active Gaussian for `pixels_per_active` pixels.
@@ -59,14 +59,14 @@ def undersampled(
     shape = (-(-height // _CELL_PX), -(-width // _CELL_PX))
     rows, columns = np.nonzero(region & (frame.depth_m > 0))
     wanted = _count(rows, columns, shape) / pixels_per_active
-    _, held_rows, held_columns = seen_at(frame, active_means_m)
+    _, held_rows, held_columns = visible_means(frame, active_means_m)
     held = _count(held_rows, held_columns, shape)
     lacking = np.repeat(np.repeat(held < wanted, _CELL_PX, axis=0), _CELL_PX, axis=1)[:height, :width]
     result: Bool[ndarray, "h w"] = lacking & region & (frame.depth_m > 0)
     return result
 
 
-def seen_at(
+def visible_means(
     frame: Frame, means_m: Float32[ndarray, "n 3"]
 ) -> tuple[Int64[ndarray, " s"], Int64[ndarray, " s"], Int64[ndarray, " s"]]:
     """Which of the means lie on the surface that the frame sees (ascending), and their pixels' rows and columns."""

@@ -11,7 +11,7 @@ from gausslite.mapping.seeding import Seeds
 from gausslite.optimize.splat_table import SplatTable
 
 
-def insert(table: SplatTable, seeds: Seeds, newborn_opacity: float, rng: np.random.Generator, scaffold: int = 0) -> int:
+def insert_seeds(table: SplatTable, seeds: Seeds, newborn_opacity: float, rng: np.random.Generator, scaffold: int = 0) -> int:
     """Add the seeds, the task's first, and return how many were added; the table never exceeds its capacity.
 
     For the task's seeds others give way: inactive before active, what an earlier task had made dense before the rest

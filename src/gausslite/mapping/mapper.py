@@ -1,4 +1,4 @@
-"""Grow one robot's map frame by frame: seed where it is missing, train where the task needs it (Sec. III-C, III-D)."""
+"""Map one robot's frames: seed Gaussians by relevance (Sec. III-C), then train them by relevance (Sec. III-D)."""
 
 from __future__ import annotations
 
@@ -15,26 +15,30 @@ from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.pose import inverse
 from gausslite.domain.relevance import RelevanceMap
 from gausslite.domain.state import State, add_prefix, get_array, get_counts, get_floats, int_array, select_prefix
-from gausslite.mapping.checkpoint import generator_state, set_generator
+from gausslite.mapping.checkpoint import generator_state, restore_generator
 from gausslite.mapping.coverage import RenderedView
-from gausslite.mapping.eviction import insert
-from gausslite.mapping.keyframes import Keyframe, KeyframeStore, WindowView, window_view
+from gausslite.mapping.eviction import insert_seeds
+from gausslite.mapping.keyframe_store import KeyframeStore
+from gausslite.mapping.keyframes import Keyframe, WindowView, window_view
 from gausslite.mapping.seeding import Seeder, SeedingContext, Seeds
 from gausslite.mapping.settings import MapperSettings
 from gausslite.mapping.stages import CountedScheduler, SkippableStage, Stage, StageScheduler
 from gausslite.mapping.task_change import clear_roi, vote_on_relevance
 from gausslite.mapping.training import Trainer
 from gausslite.mapping.view_refinement import ViewRefiner
-from gausslite.optimize.parameters import SplatTable
+from gausslite.optimize.splat_table import SplatTable
 from gausslite.render.rasterizer import Rasterizer, Rendering
 
 _EXTENT_PER_DEPTH = 1.0 / 3.0
-"""The scene's extent as a fraction of the farthest depth seen, as SplaTAM's released configuration takes it."""
+"""Scene extent as a fraction of the largest depth so far, as in SplaTAM's released configuration."""
 
 
 @dataclass(frozen=True, slots=True)
 class MappedFrame:
-    """What mapping one frame did; skipped says why nothing was done, and is None otherwise."""
+    """Result of mapping one frame: Gaussians added by seeding, iterations, and Gaussians in the map afterwards.
+
+    skipped: why the frame was not mapped, or None.
+    """
 
     index: int
     seeded: int
@@ -44,24 +48,24 @@ class MappedFrame:
 
 
 class GaussianMapper:
-    """The owner of a growing map. Not thread-safe: one worker calls it.
+    """Owner of one growing Gaussian map. Not thread-safe.
 
-    The same settings, seed and frames give the same map, as far as the rasterizer is deterministic.
+    Equal settings, seed and frames give bit-identical maps if the rasterizer is deterministic.
     """
 
     def __init__(
-        self, settings: MapperSettings, rasterizer: Rasterizer, seed: int = 0, known: Gaussians | None = None
+        self, settings: MapperSettings, rasterizer: Rasterizer, seed: int = 0, initial_map: Gaussians | None = None
     ) -> None:
-        """Reserve the memory of `settings.max_gaussians` Gaussians; seed starts all random choices.
+        """Allocate memory for `settings.max_gaussians` Gaussians; seed initialises all random choices.
 
-        known is a map to start from. Raises QuotaError when it exceeds the settings' cap.
+        Raises QuotaError if initial_map exceeds the cap.
         """
         self._settings = settings
         self._rasterizer = rasterizer
         self._rng = np.random.default_rng(seed)
         self._table = SplatTable(settings.max_gaussians)
-        if known is not None:
-            self._table.append(known)
+        if initial_map is not None:
+            self._table.append(initial_map)
         self._seeder = Seeder(settings.seeding, settings.components, self._rng)
         self._keyframes = KeyframeStore(settings.keyframes, settings.components.follow_task)
         self._refiner = ViewRefiner(settings.pose_prior, self.render, settings.keyframes.pose_updates_per_frame)
@@ -77,17 +81,17 @@ class GaussianMapper:
 
     @property
     def revision(self) -> int:
-        """Rises by one with every frame that changed the map."""
+        """Number of frames that changed the map."""
         return self._revision
 
     @property
     def skipped(self) -> int:
-        """Frames that could not be mapped."""
+        """Number of frames without a depth reading, which are not mapped."""
         return self._skipped
 
     @property
     def settings(self) -> MapperSettings:
-        """The policy in force."""
+        """Settings of the mapping policy."""
         return self._settings
 
     def map_frame(
@@ -95,12 +99,13 @@ class GaussianMapper:
         frame: Frame,
         relevance: RelevanceMap,
         scheduler: StageScheduler | None = None,
-        sight: RenderedView | None = None,
+        rendered: RenderedView | None = None,
     ) -> MappedFrame:
-        """Take one frame into the map, in the time that the scheduler gives; by default iterations are counted.
+        """Seed and train the map with one frame; the scheduler limits the time, by default iterations are counted.
 
-        sight is how the map looks from the frame, drawn here unless it is given and the frame's pose is trusted. A
-        frame without a depth reading is skipped and counted. Raises ShapeError when relevance and frame differ in size.
+        relevance: w(u, v) of Sec. III-B. rendered: the map rendered from frame.T_world_camera; if None, or if the pose
+        is refined, the mapper renders it. A frame without a depth reading is skipped. Raises ShapeError if relevance
+        and frame differ in size.
         """
         require_array("relevance weight", relevance.weight, frame.depth_m.shape, np.float32)
         scheduler = CountedScheduler() if scheduler is None else scheduler
@@ -108,87 +113,88 @@ class GaussianMapper:
             self._skipped += 1
             return MappedFrame(frame.index, 0, 0, self.count, "no pixel has a depth reading")
         with scheduler.timing(Stage.VIEW_PREPARATION):
-            view = self._observe(frame, relevance)
-        seeded = 0 if scheduler.skips(SkippableStage.SEEDING) else self._seed(view.keyframe, sight, scheduler)
+            view = self._prepare_view(frame, relevance)
+        seeded = 0 if scheduler.skips(SkippableStage.SEEDING) else self._seed(view.keyframe, rendered, scheduler)
         iterations = self._train(view, scheduler)
-        self._keyframes.offer(view)
+        self._keyframes.add(view)
         self._revision += 1
         return MappedFrame(frame.index, seeded, iterations, self.count)
 
     def idle_step(self) -> bool:
-        """One more iteration on the window's keyframes; False when there are none yet."""
+        """Run one iteration on the window's keyframes. Return False if there are none yet."""
         if not self._keyframes.window:
             return False
         self._trainer.idle_step(self._keyframes.window, self._extent_m)
         return True
 
-    def update_relevance(self, frame: Frame, relevance: RelevanceMap) -> bool:
-        """Take what came to be known of an earlier frame; False when it is no keyframe of the window (any more)."""
-        view = self._keyframes.of(frame)
+    def update_relevance(self, recorded: Frame, relevance: RelevanceMap) -> bool:
+        """Replace the relevance of an earlier frame. Return False if the frame is no longer in the window."""
+        view = self._keyframes.find(recorded)
         if view is None:
             return False
         if view.keyframe.evaluated:
-            self._keyframes.replace_view(self._view(replace(view.keyframe, relevance=relevance)))
+            self._keyframes.replace_view(self._window_view(replace(view.keyframe, relevance=relevance)))
         else:
             self.evaluate_keyframe(view.keyframe, relevance)
         return True
 
     def reset_roi(self) -> None:
-        """Map for another task from now on: nothing counts as its region until keyframes are evaluated for it.
+        """Start a new task: no Gaussian is active, and no keyframe is evaluated.
 
-        The map, kappa and the optimiser's state stay; what was the old region gives way first when room is short.
+        The map, kappa and the optimiser state stay; the old ROI is evicted first if the cap is reached.
         """
         clear_roi(self._table)
         self._keyframes.reset_roi()
 
     @property
     def next_unevaluated(self) -> Keyframe | None:
-        """The newest keyframe whose relevance to the present task is not known; None when all are evaluated."""
+        """The newest keyframe not evaluated for the present task, or None."""
         return self._keyframes.next_unevaluated
 
     def evaluate_keyframe(self, keyframe: Keyframe, relevance: RelevanceMap) -> int:
-        """Take what of an earlier keyframe is relevant to the present task; returns how many Gaussians were seeded.
+        """Apply an earlier keyframe's relevance to the present task; return the number of Gaussians seeded.
 
-        What it shows of the region becomes active, and is seeded where the map is too coarse for it, within the cap.
+        Gaussians that the keyframe shows inside the ROI become active. ROI pixels with too few of them are seeded,
+        within the cap.
         """
         require_array("relevance weight", relevance.weight, keyframe.frame.depth_m.shape, np.float32)
         frame, table = keyframe.frame, self._table
-        self._keyframes.evaluate(replace(keyframe, relevance=relevance, evaluated=True), self._view)
+        self._keyframes.set_evaluated(replace(keyframe, relevance=relevance, evaluated=True), self._window_view)
         vote_on_relevance(table, frame, relevance)
         if not relevance.roi.any():
             return 0
-        seeds = self._seeder.seed_region(frame, relevance, table.means_m[table.active])
+        seeds = self._seeder.seed_roi(frame, relevance, table.means_m[table.active])
         return self._insert(Seeds(seeds, Gaussians.empty()))
 
     def mark_unavailable(self, keyframe: Keyframe) -> None:
-        """What of an earlier keyframe is relevant to the present task will not be known: it shows no region, and casts
-        no votes either.
-        """
-        self._keyframes.evaluate(replace(keyframe, evaluated=True), self._view)
+        """Mark a keyframe as evaluated without a result: it shows no ROI and casts no votes."""
+        self._keyframes.set_evaluated(replace(keyframe, evaluated=True), self._window_view)
 
     def render_view(self, frame: Frame) -> RenderedView | None:
-        """How the map looks from a frame; None while it is empty."""
-        return RenderedView.of(self.render(frame.camera, frame.T_world_camera)) if self.count > 0 else None
+        """Return alpha and depth of the map from a frame's pose; None if the map is empty."""
+        if self.count == 0:
+            return None
+        return RenderedView.from_rendering(self.render(frame.camera, frame.T_world_camera))
 
     def render(self, camera: Camera, T_world_camera: Float64[ndarray, "4 4"]) -> Rendering:
-        """Draw the map from a pose."""
+        """Render the map from a pose."""
         return self._rasterizer.forward(self._table.rows, camera, inverse(T_world_camera))
 
     def gaussians(self) -> Gaussians:
-        """A copy of the map as physical values, as it is shown (`OptimizationSettings.ema_updates`)."""
+        """Return a copy of the map as physical values, averaged if `OptimizationSettings.ema_updates` is above 0."""
         return self._table.to_gaussians(use_ema=self._settings.optimization.ema_updates > 0)
 
     def roi_gaussians(self) -> Gaussians:
-        """A copy of the active Gaussians: the task's part of the map."""
-        averaged = self._settings.optimization.ema_updates > 0
-        return self._table.to_gaussians(np.flatnonzero(self._table.active), averaged)
+        """Return a copy of the active Gaussians."""
+        use_ema = self._settings.optimization.ema_updates > 0
+        return self._table.to_gaussians(np.flatnonzero(self._table.active), use_ema)
 
     def keyframes(self) -> list[Keyframe]:
-        """The keyframes remembered of the whole mission, oldest first (for joint refinement)."""
+        """Return the buffered keyframes of the mission, oldest first, for joint refinement (Sec. III-E)."""
         return list(self._keyframes.buffer)
 
     def memory_mib(self) -> dict[str, float]:
-        """MiB of the table and of Adam's moments, both reserved at the start, and of the keyframes' images."""
+        """Return the memory in MiB of the table, of Adam's moments and of the keyframes' images."""
         return {
             "table": self._table.table_bytes / 2**20,
             "optimizer": self._table.optimizer_bytes / 2**20,
@@ -196,7 +202,7 @@ class GaussianMapper:
         }
 
     def state(self) -> State:
-        """All that the next frame's mapping depends on, as views; valid until then."""
+        """Return everything that the next frame depends on, as views that are valid until then."""
         return {
             **add_prefix("table", self._table.state()),
             **add_prefix("keyframes", self._keyframes.state()),
@@ -208,53 +214,49 @@ class GaussianMapper:
         }
 
     def restore(self, state: State) -> None:
-        """Go on from what a mapper of the same settings handed out: the next frames give the same bits as there.
+        """Continue from the state of a mapper with the same settings; further frames give bit-identical maps.
 
-        Raises MapFileError for a state that is none, QuotaError for one beyond max_gaussians. After an error this
-        mapper must not be used.
+        Raises MapFileError if the state is not valid, QuotaError if it exceeds max_gaussians. Do not use the mapper
+        after an error.
         """
         self._table.restore(select_prefix(state, "table"))
-        self._keyframes.restore(select_prefix(state, "keyframes"), self._view)
+        self._keyframes.restore(select_prefix(state, "keyframes"), self._window_view)
         self._trainer.restore(select_prefix(state, "trainer"))
         self._refiner.restore(select_prefix(state, "refiner"))
-        set_generator(self._rng, get_array(state, "generator", (6,), np.uint64))
+        restore_generator(self._rng, get_array(state, "generator", (6,), np.uint64))
         [self._extent_m] = get_floats(state, "extent_m", 1)
         self._revision, self._skipped = get_counts(state, "frames", 2)
 
-    def _observe(self, frame: Frame, relevance: RelevanceMap) -> WindowView:
-        """Make the frame ready to train on, with its pose and colours refined where they may be wrong."""
-        # nothing is seeded farther away, and one stray reading would count for the whole mission
-        farthest_m = min(float(frame.depth_m.max()), self._settings.seeding.max_depth_m)
-        self._extent_m = max(self._extent_m, farthest_m * _EXTENT_PER_DEPTH)
-        if not self._refiner.needed or self._table.count == 0:
-            return self._view(Keyframe(frame, relevance))
-        self._refine_keyframes()
-        return self._view(Keyframe(self._refiner.settle(frame), relevance, recorded=frame))
+    def _prepare_view(self, frame: Frame, relevance: RelevanceMap) -> WindowView:
+        """Prepare the frame for training; refine its pose and exposure if the prior allows an error."""
+        # beyond max_depth_m nothing is seeded, and one outlier would enlarge the extent for the whole mission
+        largest_depth_m = min(float(frame.depth_m.max()), self._settings.seeding.max_depth_m)
+        self._extent_m = max(self._extent_m, largest_depth_m * _EXTENT_PER_DEPTH)
+        if not self._refiner.enabled or self._table.count == 0:
+            return self._window_view(Keyframe(frame, relevance))
+        for view in self._refiner.next_views(self._keyframes.window):
+            self._keyframes.replace_view(self._window_view(self._refiner.refine_keyframe(view.keyframe)))
+        return self._window_view(Keyframe(self._refiner.refine(frame), relevance, recorded=frame))
 
-    def _refine_keyframes(self) -> None:
-        """Some keyframes of the window, fitted again to the map as it has become."""
-        for view in self._refiner.next_turns(self._keyframes.window):
-            self._keyframes.replace_view(self._view(self._refiner.fit_again(view.keyframe)))
-
-    def _view(self, keyframe: Keyframe) -> WindowView:
+    def _window_view(self, keyframe: Keyframe) -> WindowView:
         return window_view(keyframe, self._rasterizer, self._settings.keyframes)
 
-    def _seed(self, keyframe: Keyframe, sight: RenderedView | None, scheduler: StageScheduler) -> int:
-        """Add Gaussians where the map does not explain the frame, within the cap."""
+    def _seed(self, keyframe: Keyframe, rendered: RenderedView | None, scheduler: StageScheduler) -> int:
+        """Add Gaussians where the map does not explain the frame (Sec. III-C); return how many."""
         frame, table = keyframe.frame, self._table
-        if sight is None or keyframe.recorded is not None:
-            sight = self.render_view(frame)
+        if rendered is None or keyframe.recorded is not None:
+            rendered = self.render_view(frame)
         with scheduler.timing(Stage.SEEDING):
-            state = SeedingContext(table.free_slots, sight, table.means_m[table.active])
-            seeds = self._seeder.seed(frame, keyframe.relevance, state)
-            return self._insert(seeds)
+            context = SeedingContext(table.free_slots, rendered, table.means_m[table.active])
+            return self._insert(self._seeder.seed(frame, keyframe.relevance, context))
 
     def _insert(self, seeds: Seeds) -> int:
-        """Add them within the cap; returns how many were added."""
+        """Add seeds within the cap; return how many."""
         seeding, table = self._settings.seeding, self._table
-        return insert(table, seeds, seeding.opacity, self._rng, int(seeding.background_share * table.capacity))
+        min_background = int(seeding.background_share * table.capacity)
+        return insert_seeds(table, seeds, seeding.opacity, self._rng, min_background)
 
     def _train(self, current: WindowView, scheduler: StageScheduler) -> int:
-        """MVO: train on views drawn from the window and the current one; without it on the current one alone."""
+        """Train on the window and the current view (MVO, Sec. III-D.2); without MVO on the current view alone."""
         views = (*self._keyframes.window, current) if self._settings.components.mvo else (current,)
         return self._trainer.train(views, self._extent_m, scheduler)

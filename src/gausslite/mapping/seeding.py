@@ -13,7 +13,7 @@ from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.pose import transform_points
 from gausslite.domain.relevance import RelevanceMap
-from gausslite.mapping.coverage import RenderedView, drawn_behind, undersampled
+from gausslite.mapping.coverage import RenderedView, rendered_behind, undersampled_roi
 from gausslite.mapping.sampling import edge_magnitude, sample_pixels, sample_stratified
 from gausslite.mapping.settings import Components, SeedingSettings
 from gausslite.mapping.spacing import initial_spacing_m, neighbour_distance_px
@@ -57,16 +57,16 @@ class Seeder:
         self._components = components
         self._rng = rng
 
-    def seed(self, frame: Frame, relevance: RelevanceMap, state: SeedingContext) -> Seeds:
+    def seed(self, frame: Frame, relevance: RelevanceMap, context: SeedingContext) -> Seeds:
         """New Gaussians for this frame."""
         weight = self._pixel_weight(frame)
-        roi_pool, rest_pool = self._pools(frame, relevance, state)
+        roi_pool, rest_pool = self._pools(frame, relevance, context)
         return Seeds(
             roi=self._gaussians(frame, relevance, roi_pool, weight),
             rest=self._gaussians(frame, relevance, rest_pool, weight),
         )
 
-    def seed_region(self, frame: Frame, relevance: RelevanceMap, active_means_m: Float32[ndarray, "n 3"]) -> Gaussians:
+    def seed_roi(self, frame: Frame, relevance: RelevanceMap, active_means_m: Float32[ndarray, "n 3"]) -> Gaussians:
         """New Gaussians where the map is too coarse for the region in an earlier frame; as many as a first frame gets.
 
         What surrounds the region was seeded when the frame was mapped.
@@ -74,28 +74,28 @@ class Seeder:
         settings = self._settings
         if not self._components.sb:
             return Gaussians.empty()
-        coarse = undersampled(frame, relevance.roi, active_means_m, settings.roi_pixels_per_gaussian)
+        coarse = undersampled_roi(frame, relevance.roi, active_means_m, settings.roi_pixels_per_gaussian)
         pixels = coarse & (frame.depth_m <= settings.max_depth_m)
         budget = round(settings.roi_share * settings.first_frame_seeds * pixels.size / _REFERENCE_PIXELS)
         return self._gaussians(frame, relevance, self._roi_pool(pixels, budget), self._pixel_weight(frame))
 
-    def _pools(self, frame: Frame, relevance: RelevanceMap, state: SeedingContext) -> tuple[_Pool, _Pool]:
+    def _pools(self, frame: Frame, relevance: RelevanceMap, context: SeedingContext) -> tuple[_Pool, _Pool]:
         """SB: the ROI share of the seeds is drawn from the region, the rest elsewhere; without SB from one pool."""
         settings = self._settings
-        budget = self._budget(frame, state)
+        budget = self._budget(frame, context)
         seedable = (frame.depth_m > 0) & (frame.depth_m <= settings.max_depth_m)
         roi_open = open_pixels = seedable
-        if state.rendered is not None:
-            behind = drawn_behind(frame, state.rendered, settings.depth_error_factor)
-            open_pixels = seedable & (behind | (state.rendered.alpha < settings.min_alpha))
-            roi_open = seedable & (behind | (state.rendered.alpha < settings.roi_min_alpha))
+        if context.rendered is not None:
+            behind = rendered_behind(frame, context.rendered, settings.depth_error_factor)
+            open_pixels = seedable & (behind | (context.rendered.alpha < settings.min_alpha))
+            roi_open = seedable & (behind | (context.rendered.alpha < settings.roi_min_alpha))
         if not self._components.sb:
-            return _Pool(np.zeros_like(seedable), 0, False), self._rest_pool(open_pixels, budget, state.free_slots)
+            return _Pool(np.zeros_like(seedable), 0, False), self._rest_pool(open_pixels, budget, context.free_slots)
         roi_budget = int(settings.roi_share * budget)
-        coarse = undersampled(frame, relevance.roi, state.active_means_m, settings.roi_pixels_per_gaussian)
+        coarse = undersampled_roi(frame, relevance.roi, context.active_means_m, settings.roi_pixels_per_gaussian)
         roi_pixels = relevance.roi & (roi_open | (coarse & seedable))
         rest_pixels = open_pixels & ~relevance.roi
-        return self._roi_pool(roi_pixels, roi_budget), self._rest_pool(rest_pixels, budget - roi_budget, state.free_slots)
+        return self._roi_pool(roi_pixels, roi_budget), self._rest_pool(rest_pixels, budget - roi_budget, context.free_slots)
 
     def _roi_pool(self, pixels: Bool[ndarray, "h w"], budget: int) -> _Pool:
         """No denser than the active Gaussians that the region is to have; its room is made by others."""
@@ -113,9 +113,9 @@ class Seeder:
         density = min(densest, max(affordable, settings.min_density_ratio * densest))
         return _Pool(pixels, min(budget, int(np.ceil(density * np.count_nonzero(pixels)))), self._components.sis)
 
-    def _budget(self, frame: Frame, state: SeedingContext) -> int:
+    def _budget(self, frame: Frame, context: SeedingContext) -> int:
         """N, for this image size."""
-        seeds = self._settings.first_frame_seeds if state.rendered is None else self._settings.later_seeds
+        seeds = self._settings.first_frame_seeds if context.rendered is None else self._settings.later_seeds
         return max(1, round(seeds * frame.depth_m.size / _REFERENCE_PIXELS))
 
     def _pixel_weight(self, frame: Frame) -> Float32[ndarray, "h w"]:

@@ -122,7 +122,7 @@ class KeyframeSettings:
         weight = self.roi_context_weight
         _require(0 <= weight <= 1, "keyframes roi_context_weight", "0 to 1", weight)
 
-    def for_images_of(self, pixels: int) -> KeyframeSettings:
+    def for_image_size(self, pixels: int) -> KeyframeSettings:
         """The same with as many images of this size as have room: one of each kind, however large they are."""
         share = min(1.0, self.max_pixels / (pixels * (self.window + self.long_term_keyframes + self.buffer)))
         return replace(

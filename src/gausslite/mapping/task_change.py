@@ -14,7 +14,7 @@ import numpy as np
 from gausslite.domain.frame import Frame
 from gausslite.domain.relevance import NO_TARGET, RelevanceMap
 from gausslite.errors import InvalidInputError
-from gausslite.mapping.coverage import seen_at
+from gausslite.mapping.coverage import visible_means
 from gausslite.optimize.splat_table import SplatTable
 
 _MOST_VOTES = 100
@@ -48,7 +48,7 @@ def clear_roi(table: SplatTable) -> None:
 
 def vote_on_relevance(table: SplatTable, frame: Frame, relevance: RelevanceMap) -> None:
     """Let one view vote on every Gaussian it sees, and mark those active that more views have inside than outside."""
-    seen, rows, columns = seen_at(frame, table.means_m)
+    seen, rows, columns = visible_means(frame, table.means_m)
     inside = relevance.roi[rows, columns]
     votes = np.clip(table.roi_evidence[seen] + np.where(inside, 1, -1), -_MOST_VOTES, _MOST_VOTES)
     table.roi_evidence[seen] = votes

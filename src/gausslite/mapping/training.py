@@ -1,4 +1,4 @@
-"""Train the map on a frame: a warm-up over the full image, then the task's region alone (Sec. III-D: ROI, MVO)."""
+"""Train the map on a frame: warm-up over full images, then the ROI alone (Sec. III-D.1, ROI; III-D.2, MVO; Eq. 1)."""
 
 from __future__ import annotations
 
@@ -15,38 +15,38 @@ from gausslite.mapping.keyframes import WindowView
 from gausslite.mapping.settings import ActivePhase, MapperSettings
 from gausslite.mapping.stages import CountedScheduler, Stage, StageScheduler
 from gausslite.optimize.density import densify, prune
-from gausslite.optimize.parameters import SplatTable
+from gausslite.optimize.splat_table import SplatTable
 from gausslite.render.rasterizer import Rasterizer, Subset, UpdateCounter
 
 _COLOUR_RANGE = (-0.25, 1.25)
-"""Somewhat beyond what can be shown, so that overlapping Gaussians still add up to black and white."""
-_DRAWS = 16
+"""Wider than [0, 1], so that blended Gaussians still reach black and white."""
+_RANDOM_BLOCK = 16
 _Rows: TypeAlias = Float32[ndarray, "n 16"]
 _Tables: TypeAlias = tuple[_Rows, _Rows, _Rows]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Loan:
-    """What the rasterizer works on until rows move: Adam's tables, and what the active phase is told of their rows."""
+class _Binding:
+    """The arrays that the rasterizer trains on until rows move: Adam's tables and the active phase's row masks."""
 
     tables: _Tables
     active_ids: UInt32[ndarray, " m"] | None
     trainable: Bool[ndarray, " n"] | None
-    update_counter: UpdateCounter
+    kappa_counter: UpdateCounter
 
     @classmethod
-    def of(cls, table: SplatTable, phase: ActivePhase) -> _Loan:
-        """All of this table, for as long as it is neither grown nor shrunk. Kappa counts active Gaussians only."""
+    def of(cls, table: SplatTable, phase: ActivePhase) -> _Binding:
+        """Return the binding of all rows, valid until the table grows or shrinks. Kappa counts active Gaussians."""
         return cls(
             tables=(table.rows, table.first_moment, table.second_moment),
             active_ids=np.flatnonzero(table.active).astype(np.uint32) if phase is ActivePhase.ACTIVE_ONLY else None,
             trainable=table.active if phase is ActivePhase.FROZEN_BACKGROUND else None,
-            update_counter=UpdateCounter(table.kappa, table.active),
+            kappa_counter=UpdateCounter(table.kappa, table.active),
         )
 
 
 class Trainer:
-    """Runs the iterations of a mapped frame and the density control that goes by their count."""
+    """Runs the training iterations of each mapped frame, and density control after a number of iterations."""
 
     def __init__(
         self, settings: MapperSettings, table: SplatTable, rasterizer: Rasterizer, rng: np.random.Generator
@@ -57,154 +57,147 @@ class Trainer:
         self._rasterizer = rasterizer
         self._rng = rng
         self._iterations = 0
-        self._since_pruned = 0
-        self._since_densified = 0
+        self._since_prune = 0
+        self._since_densify = 0
 
     @property
     def iterations(self) -> int:
-        """Iterations run since the start."""
+        """Iterations of the whole mission."""
         return self._iterations
 
     def state(self) -> State:
-        """The counts by which density control takes its turns; between two frames nothing else is kept."""
-        return {"counts": int_array(self._iterations, self._since_pruned, self._since_densified)}
+        """Return the iteration counts, which are all the state between two frames."""
+        return {"counts": int_array(self._iterations, self._since_prune, self._since_densify)}
 
     def restore(self, state: State) -> None:
-        """Go on where another trainer stood. Raises MapFileError."""
-        self._iterations, self._since_pruned, self._since_densified = get_counts(state, "counts", 3)
+        """Replace the iteration counts by another trainer's. Raises MapFileError."""
+        self._iterations, self._since_prune, self._since_densify = get_counts(state, "counts", 3)
 
     def train(self, views: Sequence[WindowView], extent_m: float, scheduler: StageScheduler) -> int:
-        """Train on these views for as long as the scheduler allows and return the number of iterations.
+        """Train on these views while the scheduler allows, and return the number of iterations.
 
-        The two phases take turns in the settings' proportion, a warm-up first. Where the time left is too short for
-        another, or for the frame's least iterations after it, active ones take its place.
+        Warm-up and active iterations alternate in the ratio of the settings, warm-up first. If the frame has no time
+        for another warm-up iteration, active iterations replace it.
         """
-        showing = self._showing_region(views)
-        done, time_is_up = 0, False
-        while not time_is_up:
-            done, time_is_up = self._until_density_control(views, showing, done, scheduler)
+        roi_views = self._roi_views(views)
+        done, frame_is_done = 0, False
+        while not frame_is_done:
+            done, frame_is_done = self._iterate_until_density_control(views, roi_views, done, scheduler)
             self._control_density(extent_m, scheduler)
         with scheduler.timing(Stage.FINALISATION):
-            self._bound_colours()
+            self._table.clip_colours(*_COLOUR_RANGE)
             if self._settings.optimization.isotropic:
-                self._make_spheres()
-            self._average()
+                self._table.make_isotropic()
+            self._update_ema()
         return done
 
     def idle_step(self, views: Sequence[WindowView], extent_m: float) -> None:
-        """One iteration on views of earlier frames, for time in which none waits; the phases take turns as ever."""
-        showing, scheduler = self._showing_region(views), CountedScheduler()
-        step = self._next_step(self._iterations, bool(showing), scheduler)
-        if step is None:
+        """Run one iteration on earlier views while no frame waits; warm-up and active iterations alternate."""
+        roi_views, scheduler = self._roi_views(views), CountedScheduler()
+        stage = self._next_stage(self._iterations, bool(roi_views), scheduler)
+        if stage is None:
             return
-        loan = _Loan.of(self._table, self._settings.optimization.active_phase)
-        with self._rasterizer.bind_tables(*loan.tables):
-            self._iterate(loan, step, views if step is Stage.WARM_UP else showing, self._rng.random())
+        binding = _Binding.of(self._table, self._settings.optimization.active_phase)
+        with self._rasterizer.bind_tables(*binding.tables):
+            self._iterate(binding, stage, views if stage is Stage.WARM_UP else roi_views, self._rng.random())
         self._control_density(extent_m, scheduler)
-        self._bound_colours()
+        self._table.clip_colours(*_COLOUR_RANGE)
         if self._iterations % self._settings.optimization.iterations == 0:
-            self._average()
+            self._update_ema()
 
-    def _showing_region(self, views: Sequence[WindowView]) -> list[WindowView]:
-        """The views of the active phase; none where the component is off, so that all iterations are warm-ups."""
+    def _roi_views(self, views: Sequence[WindowView]) -> list[WindowView]:
+        """Return the views of the active phase; none without the ROI component, so all iterations are warm-up."""
         optimization = self._settings.optimization
         if not self._settings.components.roi or optimization.active_iterations == 0:
             return []
-        return [view for view in views if view.shows_region]
+        return [view for view in views if view.shows_roi]
 
-    def _next_step(self, done: int, region_in_view: bool, scheduler: StageScheduler) -> Stage | None:
+    def _next_stage(self, done: int, roi_in_view: bool, scheduler: StageScheduler) -> Stage | None:
+        """Return the stage of the next iteration, after `done` ones; None ends the frame."""
         optimization = self._settings.optimization
-        counted = optimization.iterations
-        warming_up = not region_in_view or done % counted < optimization.warmup_iterations
-        if region_in_view and done > 0:
-            warming_up = warming_up and scheduler.has_time_for(Stage.WARM_UP)
-        if warming_up and scheduler.trains_on(Stage.WARM_UP, counted):
+        per_frame = optimization.iterations
+        warm_up = not roi_in_view or done % per_frame < optimization.warmup_iterations
+        if roi_in_view and done > 0:
+            warm_up = warm_up and scheduler.has_time_for(Stage.WARM_UP)
+        if warm_up and scheduler.trains_on(Stage.WARM_UP, per_frame):
             return Stage.WARM_UP
-        return Stage.ACTIVE if region_in_view and scheduler.trains_on(Stage.ACTIVE, counted) else None
+        return Stage.ACTIVE if roi_in_view and scheduler.trains_on(Stage.ACTIVE, per_frame) else None
 
-    def _until_density_control(
-        self, views: Sequence[WindowView], showing: Sequence[WindowView], done: int, scheduler: StageScheduler
+    def _iterate_until_density_control(
+        self, views: Sequence[WindowView], roi_views: Sequence[WindowView], done: int, scheduler: StageScheduler
     ) -> tuple[int, bool]:
-        """Iterate until density control is due or time is up, the tables on loan to the rasterizer; `done` and which
-        of both then.
+        """Iterate until density control is due or the frame ends; return `done` and whether the frame ended.
+
+        The rasterizer holds the tables meanwhile; rows move only in density control.
         """
-        loan = _Loan.of(self._table, self._settings.optimization.active_phase)
-        draws = _uniform(self._rng)
-        with self._rasterizer.bind_tables(*loan.tables):
-            while (step := self._next_step(done, bool(showing), scheduler)) is not None:
-                with scheduler.timing(step):
-                    self._iterate(loan, step, views if step is Stage.WARM_UP else showing, next(draws))
+        binding = _Binding.of(self._table, self._settings.optimization.active_phase)
+        draws = _uniform_draws(self._rng)
+        with self._rasterizer.bind_tables(*binding.tables):
+            while (stage := self._next_stage(done, bool(roi_views), scheduler)) is not None:
+                with scheduler.timing(stage):
+                    self._iterate(binding, stage, views if stage is Stage.WARM_UP else roi_views, next(draws))
                 done += 1
                 if self._prune_is_due(scheduler) or self._densify_is_due(scheduler):
                     return done, False
         return done, True
 
-    def _iterate(self, loan: _Loan, step: Stage, views: Sequence[WindowView], draw: float) -> None:
-        """One iteration on the view that `draw`, from 0 to 1, picks: its full image, or the task's region alone."""
+    def _iterate(self, binding: _Binding, stage: Stage, views: Sequence[WindowView], draw: float) -> None:
+        """Run one iteration on a uniformly drawn view (MVO); draw is in [0, 1)."""
         view = views[int(draw * len(views))]
-        if step is Stage.WARM_UP:
-            self._warm_up(loan, view)
+        if stage is Stage.WARM_UP:
+            self._train_full_image(binding, view)
         else:
-            self._active_phase(loan, view)
+            self._train_roi(binding, view)
         self._iterations += 1
-        self._since_pruned += 1
-        self._since_densified += 1
+        self._since_prune += 1
+        self._since_densify += 1
 
-    def _warm_up(self, loan: _Loan, view: WindowView) -> None:
-        optimization = self._settings.optimization
-        self._rasterizer.step(*loan.tables, view.training_view, view.T_camera_world, optimization.loss, self._adam)
+    def _train_full_image(self, binding: _Binding, view: WindowView) -> None:
+        loss = self._settings.optimization.loss
+        self._rasterizer.step(*binding.tables, view.training_view, view.T_camera_world, loss, self._adam)
 
-    def _active_phase(self, loan: _Loan, view: WindowView) -> None:
-        optimization = self._settings.optimization
+    def _train_roi(self, binding: _Binding, view: WindowView) -> None:
         self._rasterizer.step(
-            *loan.tables,
+            *binding.tables,
             view.training_view,
             view.T_camera_world,
-            optimization.loss,
+            self._settings.optimization.loss,
             self._adam,
             masked=True,
-            subset=view.region if loan.active_ids is None else Subset(view.region.tiles, loan.active_ids),
-            trainable=loan.trainable,
-            update_counter=loan.update_counter,
+            subset=view.roi if binding.active_ids is None else Subset(view.roi.tiles, binding.active_ids),
+            trainable=binding.trainable,
+            update_counter=binding.kappa_counter,
         )
 
-    def _make_spheres(self) -> None:
-        """Each Gaussian gets the geometric mean of its scales."""
-        self._table.make_isotropic()
-
-    def _bound_colours(self) -> None:
-        """Colours that no view checks for a while must not run away."""
-        self._table.clip_colours(*_COLOUR_RANGE)
-
-    def _average(self) -> None:
+    def _update_ema(self) -> None:
         if self._settings.optimization.ema_updates > 0:
             self._table.update_ema(self._settings.optimization.ema_updates)
 
     def _prune_is_due(self, scheduler: StageScheduler) -> bool:
-        return _due(self._since_pruned, self._settings.density.prune_every, Stage.PRUNING, scheduler)
+        return _is_due(self._since_prune, self._settings.density.prune_every, Stage.PRUNING, scheduler)
 
     def _densify_is_due(self, scheduler: StageScheduler) -> bool:
-        return _due(self._since_densified, self._settings.density.densify_every, Stage.DENSIFICATION, scheduler)
+        return _is_due(self._since_densify, self._settings.density.densify_every, Stage.DENSIFICATION, scheduler)
 
     def _control_density(self, extent_m: float, scheduler: StageScheduler) -> None:
-        """Clone, split and prune when their turn has come, and later where a frame has no time for it."""
+        """Clone, split and prune if due (Sec. III-D.2)."""
         density = self._settings.density
         if self._prune_is_due(scheduler):
             with scheduler.timing(Stage.PRUNING):
                 prune(self._table, density)
-            self._since_pruned = 0
+            self._since_prune = 0
         if self._densify_is_due(scheduler):
             with scheduler.timing(Stage.DENSIFICATION):
                 densify(self._table, density, extent_m)
-            self._since_densified = 0
+            self._since_densify = 0
 
 
-def _uniform(rng: np.random.Generator) -> Iterator[float]:
-    """Numbers in [0, 1), drawn some at a time: between two iterations a call of the generator is dear."""
+def _uniform_draws(rng: np.random.Generator) -> Iterator[float]:
+    """Yield numbers in [0, 1), drawn in blocks: one generator call per iteration would cost measurable time."""
     while True:
-        yield from rng.random(_DRAWS).tolist()
+        yield from rng.random(_RANDOM_BLOCK).tolist()
 
 
-def _due(since: int, every: int, step: Stage, scheduler: StageScheduler) -> bool:
-    """Density control may be late by as many iterations again as lie between two of its turns."""
-    return since >= 2 * every or (since >= every and scheduler.has_time_for(step))
+def _is_due(iterations: int, interval: int, stage: Stage, scheduler: StageScheduler) -> bool:
+    """True after `interval` iterations; a frame without time may postpone the stage to twice the interval."""
+    return iterations >= 2 * interval or (iterations >= interval and scheduler.has_time_for(stage))

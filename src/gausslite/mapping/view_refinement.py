@@ -1,4 +1,4 @@
-"""Refine the pose and colour of each frame against the map, and of the keyframes again as the map improves."""
+"""Refine the pose and exposure of each frame against the map, and those of earlier keyframes as the map improves."""
 
 from __future__ import annotations
 
@@ -19,59 +19,61 @@ from gausslite.domain.state import State, get_array, get_counts, int_array
 from gausslite.mapping.keyframes import Keyframe, WindowView
 from gausslite.render.rasterizer import Rendering
 
-Draw = Callable[[Camera, Float64[ndarray, "4 4"]], Rendering]
-"""The map as a camera sees it from T_world_camera."""
+RenderMap = Callable[[Camera, Float64[ndarray, "4 4"]], Rendering]
+"""Renders the map from T_world_camera."""
 
 
 class ViewRefiner:
-    """Knows how far the last frame's pose was corrected, and whose turn it is among the keyframes."""
+    """Refines views under the prior. Its state is the last frame's pose correction and the last refined keyframe."""
 
-    def __init__(self, prior: PoseExposurePrior, draw: Draw, pose_updates_per_frame: int) -> None:
+    def __init__(self, prior: PoseExposurePrior, render: RenderMap, keyframes_per_frame: int) -> None:
         self._prior = prior
-        self._refits = pose_updates_per_frame
-        self._draw = draw
-        self._T_said_refined = np.eye(4)
-        self._turn = 0
+        self._keyframes_per_frame = keyframes_per_frame
+        self._render = render
+        self._T_odometry_refined = np.eye(4)
+        self._position = 0
 
     @property
-    def needed(self) -> bool:
-        """False where poses and colours are trusted."""
+    def enabled(self) -> bool:
+        """False if poses and colours are used as recorded."""
         return not self._prior.is_exact
 
     def state(self) -> State:
-        """How far the last pose was corrected, and whose turn it was."""
-        return {"T_said_refined": self._T_said_refined, "turn": int_array(self._turn)}
+        """Return the last pose correction and the position of the last refined keyframe."""
+        return {"T_odometry_refined": self._T_odometry_refined, "position": int_array(self._position)}
 
     def restore(self, state: State) -> None:
-        """Go on where another refiner stood. Raises MapFileError, PoseError."""
-        T_said_refined = get_array(state, "T_said_refined", (4, 4), np.float64)
-        require_rigid("state T_said_refined", T_said_refined)
-        self._T_said_refined = T_said_refined.copy()
-        [self._turn] = get_counts(state, "turn", 1)
+        """Continue from another refiner's state. Raises MapFileError, PoseError."""
+        T_odometry_refined = get_array(state, "T_odometry_refined", (4, 4), np.float64)
+        require_rigid("state T_odometry_refined", T_odometry_refined)
+        self._T_odometry_refined = T_odometry_refined.copy()
+        [self._position] = get_counts(state, "position", 1)
 
-    def settle(self, recorded: Frame) -> Frame:
-        """A new frame with the pose and colours to map it with; an odometry's error is much like a frame ago."""
-        start = recorded.T_world_camera @ self._T_said_refined if self._prior.has_pose_error else recorded.T_world_camera
-        frame = self._fit(recorded, start)
-        self._T_said_refined = inverse(recorded.T_world_camera) @ frame.T_world_camera
+    def refine(self, recorded: Frame) -> Frame:
+        """Return a new frame with refined pose and exposure. The search starts at the last frame's pose correction."""
+        initial = recorded.T_world_camera
+        if self._prior.has_pose_error:
+            initial = initial @ self._T_odometry_refined
+        frame = self._fit(recorded, initial)
+        self._T_odometry_refined = inverse(recorded.T_world_camera) @ frame.T_world_camera
         return frame
 
-    def next_turns(self, window: Sequence[WindowView]) -> list[WindowView]:
-        """The keyframes to fit again with this frame, each in turn; none while there is none that may change."""
+    def next_views(self, window: Sequence[WindowView]) -> list[WindowView]:
+        """Return the keyframes to refine with this frame, in rotation over the window."""
         refinable = [view for view in window if view.keyframe.recorded is not None]
-        count = min(self._refits, len(refinable))
-        first = self._turn + 1
-        self._turn = (self._turn + count) % max(len(refinable), 1)
-        return [refinable[turn % len(refinable)] for turn in range(first, first + count)]
+        count = min(self._keyframes_per_frame, len(refinable))
+        first = self._position + 1
+        self._position = (self._position + count) % max(len(refinable), 1)
+        return [refinable[position % len(refinable)] for position in range(first, first + count)]
 
-    def fit_again(self, keyframe: Keyframe) -> Keyframe:
-        """The keyframe as it fits the map of now."""
+    def refine_keyframe(self, keyframe: Keyframe) -> Keyframe:
+        """Return the keyframe with its pose and exposure refined against the current map."""
         if keyframe.recorded is None:
             return keyframe
         return replace(keyframe, frame=self._fit(keyframe.recorded, keyframe.frame.T_world_camera))
 
-    def _fit(self, recorded: Frame, T_world_drawn: Float64[ndarray, "4 4"]) -> Frame:
-        drawn = self._draw(recorded.camera, T_world_drawn)
-        T_world_camera = fit_pose(drawn, inverse(T_world_drawn), recorded, self._prior)
-        colour = fit_exposure(drawn, recorded, self._prior)
-        return replace(recorded, rgb=colour.to_map(recorded.rgb), T_world_camera=T_world_camera)
+    def _fit(self, recorded: Frame, T_world_rendered: Float64[ndarray, "4 4"]) -> Frame:
+        rendering = self._render(recorded.camera, T_world_rendered)
+        T_world_camera = fit_pose(rendering, inverse(T_world_rendered), recorded, self._prior)
+        exposure = fit_exposure(rendering, recorded, self._prior)
+        return replace(recorded, rgb=exposure.to_map(recorded.rgb), T_world_camera=T_world_camera)

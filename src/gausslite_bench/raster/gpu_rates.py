@@ -114,7 +114,7 @@ class GpuBench:
             max_gaussians=int(self.frame_gaussians * _CAPACITY_FACTOR),
             density=DensitySettings(densify_every=MapperSettings().optimization.iterations, prune_every=8),
         )
-        mapper = GaussianMapper(settings, self.rasterizer, known=_table(self.frame_gaussians).to_gaussians())
+        mapper = GaussianMapper(settings, self.rasterizer, initial_map=_table(self.frame_gaussians).to_gaussians())
         scheduler, weight = FrameScheduler(), _region(self.size).astype(np.float32)
         relevance = RelevanceMap(weight, np.where(weight > 0, 0, -1).astype(np.int16))
         timings, iterations = [], 0

@@ -6,7 +6,7 @@ import numpy as np
 from sample_gaussians import plain_gaussians
 
 from gausslite.domain.gaussians import Gaussians
-from gausslite.mapping.eviction import insert
+from gausslite.mapping.eviction import insert_seeds
 from gausslite.mapping.seeding import Seeds
 from gausslite.optimize.splat_table import SplatTable
 
@@ -26,7 +26,7 @@ def full_table() -> SplatTable:
 
 def insert_into(table: SplatTable, roi: int, rest: int, scaffold: int = 0) -> int:
     seeds = Seeds(gaussians([NEWBORN] * roi, True, 7), gaussians([NEWBORN] * rest, False, 8))
-    return insert(table, seeds, NEWBORN, np.random.default_rng(0), scaffold)
+    return insert_seeds(table, seeds, NEWBORN, np.random.default_rng(0), scaffold)
 
 
 def test_with_room_nobody_gives_way() -> None:

@@ -9,7 +9,8 @@ from mapping_scenes import middle_relevance, wall_frame
 
 from gausslite.domain.relevance import RelevanceMap
 from gausslite.mapping.baselines import uniform_policy
-from gausslite.mapping.keyframes import Keyframe, KeyframeStore, tiles_of, window_view
+from gausslite.mapping.keyframe_store import KeyframeStore
+from gausslite.mapping.keyframes import Keyframe, tiles_touching, window_view
 from gausslite.mapping.settings import Components, KeyframeSettings
 from gausslite.render.cpu import CpuRasterizer
 
@@ -18,7 +19,7 @@ def stored(settings: KeyframeSettings, frames: int) -> KeyframeStore:
     store, rasterizer = KeyframeStore(settings), CpuRasterizer(threads=1)
     for index in range(frames):
         frame = wall_frame(index)
-        store.offer(window_view(Keyframe(frame, middle_relevance(frame)), rasterizer, settings))
+        store.add(window_view(Keyframe(frame, middle_relevance(frame)), rasterizer, settings))
     return store
 
 
@@ -44,10 +45,10 @@ def test_of_large_images_fewer_are_kept() -> None:
     assert len(store.buffer) == 4
     assert len(store.window) <= 4
     assert store.image_bytes <= 8 * pixels * 14
-    tiny = settings.for_images_of(10**9)
+    tiny = settings.for_image_size(10**9)
     assert (tiny.window, tiny.buffer, tiny.long_term_keyframes) == (1, 1, 1)
-    assert KeyframeSettings().for_images_of(1280 * 720) == KeyframeSettings()
-    assert KeyframeSettings(long_term_keyframes=0).for_images_of(10**9).long_term_keyframes == 0
+    assert KeyframeSettings().for_image_size(1280 * 720) == KeyframeSettings()
+    assert KeyframeSettings(long_term_keyframes=0).for_image_size(10**9).long_term_keyframes == 0
 
 
 def test_once_larger_images_come_smaller_ones_make_room() -> None:
@@ -56,9 +57,9 @@ def test_once_larger_images_come_smaller_ones_make_room() -> None:
     store = KeyframeStore(replace(settings, max_pixels=4 * large.depth_m.size))
     for index in range(20):
         frame = wall_frame(index, size=(16, 12))
-        store.offer(window_view(Keyframe(frame, middle_relevance(frame)), rasterizer, settings))
+        store.add(window_view(Keyframe(frame, middle_relevance(frame)), rasterizer, settings))
     assert len(store.buffer) == 8
-    store.offer(window_view(Keyframe(large, middle_relevance(large)), rasterizer, settings))
+    store.add(window_view(Keyframe(large, middle_relevance(large)), rasterizer, settings))
     assert (len(store.buffer), len(store.window)) == (2, 1)
     assert store.buffer[-1].frame is large
 
@@ -76,7 +77,7 @@ def test_a_frame_without_the_region_is_kept_at_its_turn_only() -> None:
     settings, rasterizer = KeyframeSettings(every=4, long_term_keyframes=6), CpuRasterizer(threads=1)
     store = KeyframeStore(settings)
     for index in range(9):
-        store.offer(window_view(Keyframe(wall_frame(index), RelevanceMap.empty(48, 64)), rasterizer, settings))
+        store.add(window_view(Keyframe(wall_frame(index), RelevanceMap.empty(48, 64)), rasterizer, settings))
     assert [view.keyframe.frame.index for view in store.window] == [0, 4, 8]
 
 
@@ -84,7 +85,7 @@ def test_a_policy_that_follows_no_task_keeps_as_many_views_of_anything() -> None
     settings, rasterizer = KeyframeSettings(every=8, window=2, long_term_keyframes=6), CpuRasterizer(threads=1)
     store = KeyframeStore(settings, follows_task=False)
     for index in range(40):
-        store.offer(window_view(Keyframe(wall_frame(index), RelevanceMap.empty(48, 64)), rasterizer, settings))
+        store.add(window_view(Keyframe(wall_frame(index), RelevanceMap.empty(48, 64)), rasterizer, settings))
     kept = [view.keyframe.frame.index for view in store.window]
     assert kept == [view.keyframe.frame.index for view in stored(settings, 40).window]
     store.replace_view(store.window[0])
@@ -107,11 +108,11 @@ def test_tiles_touch_the_region_and_its_margin() -> None:
     region[0:12, 20:28] = True
     expected = np.zeros((3, 4), np.bool_)
     expected[0:2, 0:3] = True
-    np.testing.assert_array_equal(tiles_of(region, 5), expected)
-    assert not tiles_of(np.zeros((40, 64), np.bool_), 5).any()
+    np.testing.assert_array_equal(tiles_touching(region, 5), expected)
+    assert not tiles_touching(np.zeros((40, 64), np.bool_), 5).any()
 
 
 def test_a_view_knows_whether_it_shows_the_region() -> None:
     frame, rasterizer = wall_frame(), CpuRasterizer(threads=1)
-    assert window_view(Keyframe(frame, middle_relevance(frame)), rasterizer, KeyframeSettings()).shows_region
-    assert not window_view(Keyframe(frame, RelevanceMap.empty(48, 64)), rasterizer, KeyframeSettings()).shows_region
+    assert window_view(Keyframe(frame, middle_relevance(frame)), rasterizer, KeyframeSettings()).shows_roi
+    assert not window_view(Keyframe(frame, RelevanceMap.empty(48, 64)), rasterizer, KeyframeSettings()).shows_roi

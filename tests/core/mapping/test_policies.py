@@ -90,5 +90,5 @@ def test_with_everything_off_what_is_left_knows_no_task() -> None:
 
 
 def test_an_unknown_switch_is_refused() -> None:
-    with pytest.raises(InvalidInputError, match=r"without: expected names among sb, .*, got light, sound"):
+    with pytest.raises(InvalidInputError, match=r"disable: expected names among sb, .*, got light, sound"):
         disable(policy(TASK), {"sound", "light", "sb"})

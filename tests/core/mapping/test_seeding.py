@@ -8,7 +8,7 @@ from mapping_scenes import middle_relevance, rendering_of, wall_frame
 
 from gausslite.domain.relevance import RelevanceMap
 from gausslite.errors import InvalidInputError
-from gausslite.mapping.coverage import RenderedView, drawn_behind, undersampled
+from gausslite.mapping.coverage import RenderedView, rendered_behind, undersampled_roi
 from gausslite.mapping.seeding import Seeder, SeedingContext
 from gausslite.mapping.settings import Components, SeedingSettings
 
@@ -108,7 +108,7 @@ def test_a_surface_drawn_far_behind_the_measured_one_is_found_and_one_in_front_i
     drawn_m = np.full((48, 64), 2.01, np.float32)
     drawn_m[10:14, 20:24] = 4.0
     drawn_m[30:34, 20:24] = 1.0
-    found = drawn_behind(frame, RenderedView.of(rendering_of(np.ones((48, 64)), drawn_m)), 40.0)
+    found = rendered_behind(frame, RenderedView.of(rendering_of(np.ones((48, 64)), drawn_m)), 40.0)
     expected = np.zeros((48, 64), np.bool_)
     expected[10:14, 20:24] = True
     np.testing.assert_array_equal(found, expected)
@@ -117,11 +117,11 @@ def test_a_surface_drawn_far_behind_the_measured_one_is_found_and_one_in_front_i
 def test_a_region_with_enough_active_gaussians_is_fine_and_one_without_is_too_coarse() -> None:
     frame = wall_frame()
     region = middle_relevance(frame).roi
-    np.testing.assert_array_equal(undersampled(frame, region, NO_MEANS, 4.0), region)
+    np.testing.assert_array_equal(undersampled_roi(frame, region, NO_MEANS, 4.0), region)
     dense = seeder(SeedingSettings(first_frame_seeds=300_000)).seed(frame, middle_relevance(frame), EMPTY).rest.means_m
-    assert not undersampled(frame, region, dense, 4.0).any()
+    assert not undersampled_roi(frame, region, dense, 4.0).any()
     behind = dense + np.array([0.0, 0.0, 1.0], np.float32)
-    np.testing.assert_array_equal(undersampled(frame, region, behind, 4.0), region)
+    np.testing.assert_array_equal(undersampled_roi(frame, region, behind, 4.0), region)
 
 
 def test_a_region_that_was_mapped_as_background_is_seeded_when_it_becomes_the_tasks() -> None:

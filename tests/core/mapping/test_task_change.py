@@ -19,8 +19,8 @@ from gausslite.domain.state import State
 from gausslite.domain.task import Predicate, Relation, TaskGraph
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.errors import InvalidInputError
-from gausslite.mapping.coverage import seen_at
-from gausslite.mapping.eviction import insert
+from gausslite.mapping.coverage import visible_means
+from gausslite.mapping.eviction import insert_seeds
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.seeding import Seeds
 from gausslite.mapping.sent_voxels import SentVoxelTracker
@@ -66,7 +66,7 @@ def assert_flags_agree(loop: TaskMapper, region: BallRegion, frames: Sequence[in
     gaussians = loop.gaussians()
     for index in frames:
         frame = frame_at(index)
-        seen, rows, columns = seen_at(frame, gaussians.means_m)
+        seen, rows, columns = visible_means(frame, gaussians.means_m)
         assert (gaussians.active[seen] == region.mask(frame)[rows, columns]).mean() >= share
     assert ((gaussians.target == NO_TARGET) == ~gaussians.active).all()
 
@@ -153,14 +153,14 @@ def test_views_that_show_the_new_region_come_back_into_a_window_that_does_not() 
         # the camera leaves the new region behind
         loop.process(wall_frame(index, SIZE, shift_m=-0.1 * index))
     loop.assign(B)
-    assert not any(view.shows_region for view in mapper._keyframes.window)
+    assert not any(view.shows_roi for view in mapper._keyframes.window)
     trained = []
     for index in range(12, 18):
         trained.append(loop.process(wall_frame(index, SIZE, shift_m=-1.1)))
         assert len(mapper._keyframes.window) <= 3 + 2
     assert mapper.next_unevaluated is None
     assert sum(outcome.reevaluation.seeded for outcome in trained) > 0
-    assert any(view.shows_region for view in mapper._keyframes.window)
+    assert any(view.shows_roi for view in mapper._keyframes.window)
     for keyframe in mapper.keyframes():
         np.testing.assert_array_equal(keyframe.relevance.roi, RIGHT.mask(keyframe.frame))
 
@@ -173,7 +173,7 @@ def test_room_for_the_new_region_is_made_in_the_old_one_first() -> None:
     before.target[:], seeds.target[:] = 0, 9
     table = SplatTable(60)
     table.append(before)
-    insert(table, Seeds(seeds, Gaussians.empty()), 0.5, np.random.default_rng(0))
+    insert_seeds(table, Seeds(seeds, Gaussians.empty()), 0.5, np.random.default_rng(0))
     kept = table.to_gaussians()
     # 20 of this task, 20 of an earlier one, 20 of the background
     old = kept.take(kept.target == 0)

@@ -23,7 +23,7 @@ from gausslite.domain.task import Predicate, Relation, TaskGraph
 from gausslite.domain.voxel_batch import VoxelBatch
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.errors import GaussLiteError, MapFileError, MismatchError
-from gausslite.mapping.checkpoint import generator_state, set_generator
+from gausslite.mapping.checkpoint import generator_state, restore_generator
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.sent_voxels import SentVoxelTracker
 from gausslite.mapping.settings import KeyframeSettings, MapperSettings, SeedingSettings
@@ -242,7 +242,7 @@ def test_whatever_one_array_is_made_to_be_it_is_told_or_can_be_mapped_on(state: 
 def test_a_generator_goes_on_where_another_stood_even_in_the_middle_of_a_draw() -> None:
     a, b = np.random.default_rng(5), np.random.default_rng(6)
     a.integers(0, 2**32, 3, np.uint32)  # leaves half a draw behind
-    set_generator(b, generator_state(a))
+    restore_generator(b, generator_state(a))
     np.testing.assert_array_equal(a.integers(0, 2**32, 9, np.uint32), b.integers(0, 2**32, 9, np.uint32))
     np.testing.assert_array_equal(a.standard_normal(9), b.standard_normal(9))
 
