@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from gausslite.config.layers import parse_options
 from gausslite.config.mapping_options import (
     add_budget,
     add_detector,
@@ -88,7 +89,7 @@ class AgentSettings:
 
 def parse_arguments(arguments: Sequence[str] | None = None) -> AgentSettings:
     """Settings from the command line. Raises InvalidInputError for values that make no sense."""
-    options = _parser().parse_args(arguments)
+    options = parse_options(_parser(), arguments)
     if options.source is not None and options.task is None:
         raise InvalidInputError("--task: expected a task for the source to be mapped for, got none")
     _require_sense(options)

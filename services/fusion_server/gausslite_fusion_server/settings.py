@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from gausslite.config.layers import parse_options
 from gausslite.config.tls_options import add_tls, read_server_tls
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.errors import InvalidInputError
@@ -34,7 +35,7 @@ class ServerSettings:
 
 def parse_arguments(arguments: Sequence[str] | None = None) -> ServerSettings:
     """Settings from the command line. Raises InvalidInputError for values that make no sense."""
-    options = _parser().parse_args(arguments)
+    options = parse_options(_parser(), arguments)
     if options.store_max_mb is not None and not 1 <= options.store_max_mb <= _MAX_STORE_MB:
         raise InvalidInputError(f"--store-max-mb: expected 1 to {_MAX_STORE_MB}, got {options.store_max_mb}")
     if options.refine_iterations > MAX_REFINE_ITERATIONS:

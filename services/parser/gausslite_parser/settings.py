@@ -7,6 +7,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
+from gausslite.config.layers import parse_options
 from gausslite.config.task_parser_options import add_backend, backend_settings
 from gausslite.config.tls_options import add_tls, read_server_tls
 from gausslite.task.backends import BackendSettings
@@ -37,5 +38,5 @@ def parse_arguments(arguments: Sequence[str] | None = None) -> ParserSettings:
     )
     add_backend(parser)
     add_tls(parser)
-    options = parser.parse_args(arguments)
+    options = parse_options(parser, arguments)
     return ParserSettings(options.listen, backend_settings(options, os.environ), read_server_tls(options))

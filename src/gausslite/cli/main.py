@@ -1,4 +1,4 @@
-"""Entry of `gausslite`: choose the sub-command, turn deliberate errors into one line and exit code 2."""
+"""Entry of `gausslite`: choose the sub-command; report expected errors in one line with exit code 2."""
 
 from __future__ import annotations
 
@@ -8,29 +8,31 @@ import importlib
 import io
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from gausslite import __version__
 from gausslite.errors import GaussLiteError
 from gausslite.interrupts import Terminated, started
 
 _COMMANDS = {
-    "map": "map one sequence for one task, write map.ply, report.json and preview.png",
-    "demo": "run parser, fusion server and two agents as real processes, fuse and score their maps",
-    "parse": "read a task sentence into targets, anchors and relations",
+    "map": "map a sequence for a task; write map.ply, report.json and preview.png",
+    "demo": "run a task parser, a fusion server and two agents as processes; fuse and score their maps",
+    "parse": "parse a task sentence into targets, anchors and relations",
     "eval": "score a map on frames of a sequence, inside regions and over the whole image",
-    "fuse": "vote several map files into one, voxel by voxel",
-    "models": "list, fetch, verify and inspect the model files that find and outline objects",
-    "bench": "measure the rasterizer, the whole mapping loop, the GPU, the quality of maps, or a task parser",
+    "fuse": "fuse map files into one by a vote in every voxel",
+    "models": "list, download, verify and inspect model files for detection and segmentation",
+    "bench": "measure the rasterizer, the mapping loop, the GPU, map quality or a task parser",
 }
+_CONFIGURABLE = frozenset({"map", "demo", "eval", "bench"})
+"""Commands whose options may also come from a configuration file and from the environment."""
 _MODULES = {name: f"gausslite.cli.{name}_command" for name in _COMMANDS} | {"bench": "gausslite_bench.cli.main"}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line; returns the exit code."""
+    """Run the command line and return the exit code."""
     arguments = list(sys.argv[1:] if argv is None else argv)
     if isinstance(sys.stdout, io.TextIOWrapper):
-        # a path or a language that the terminal cannot show must not end hours of work
+        # a character that the terminal cannot encode must not end hours of work
         sys.stdout.reconfigure(errors="backslashreplace")
     try:
         return _dispatch(arguments)
@@ -47,19 +49,31 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _dispatch(arguments: list[str]) -> int:
-    parser = argparse.ArgumentParser(prog="gausslite", description="Online 3D Gaussian maps that follow the task.")
+    parser = argparse.ArgumentParser(
+        prog="gausslite", description="Online 3D Gaussian maps that spend their detail on a task."
+    )
     parser.add_argument("--version", action="version", version=f"gausslite {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     chosen = next((word for word in arguments if not word.startswith("-")), None)
     for name, summary in _COMMANDS.items():
         command = commands.add_parser(name, help=summary, description=summary[0].upper() + summary[1:] + ".")
-        if name == chosen:  # the heavy imports of the others stay untouched
+        if name == chosen:  # import only the chosen command: the others need seconds
             importlib.import_module(_MODULES[name]).configure(command)
-    options = parser.parse_args(arguments)
+    options = _parse(parser, commands.choices, arguments)
     run = options.run
-    # from here on there is work to clean up after
     started()
     return int(run(options))
+
+
+def _parse(
+    parser: argparse.ArgumentParser, commands: Mapping[str, argparse.ArgumentParser], arguments: list[str]
+) -> argparse.Namespace:
+    """Return the options of the chosen command."""
+    if not arguments or arguments[0] not in _CONFIGURABLE:
+        return parser.parse_args(arguments)
+    from gausslite.config.layers import parse_options
+
+    return parse_options(commands[arguments[0]], arguments[1:])
 
 
 def _fail(message: str) -> int:

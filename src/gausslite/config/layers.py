@@ -27,11 +27,13 @@ def parse_options(
 ) -> argparse.Namespace:
     """Return the effective options of a program; adds --config and --print-config to its parser.
 
-    Ends the process with code 0 after --print-config and with code 2 for wrong flags. Raises InvalidInputError for
+    The sub-commands of a parser are parsed alike. Ends the process with code 0 after --print-config and with code 2 for wrong flags. Raises InvalidInputError for
     wrong values in the file or the environment.
     """
-    arguments = sys.argv[1:] if arguments is None else arguments
+    parser, arguments = _leaf_parser(parser, list(sys.argv[1:] if arguments is None else arguments))
     environment = os.environ if environment is None else environment
+    if _subparsers(parser) is not None:
+        return parser.parse_args(arguments)
     _add_configuration(parser)
     table = OptionTable.of(parser)
     flags = _parse_flags(parser, arguments)
@@ -48,6 +50,24 @@ def parse_options(
         print(f"# {parser.prog}: effective settings\n{to_toml(_effective(table, values))}", end="")
         raise SystemExit(0)
     return options
+
+
+def _leaf_parser(
+    parser: argparse.ArgumentParser, arguments: Sequence[str]
+) -> tuple[argparse.ArgumentParser, Sequence[str]]:
+    """Return the parser of the chosen sub-command and the arguments after the command's name."""
+    commands = _subparsers(parser)
+    if commands is None or not arguments or arguments[0] not in commands:
+        return parser, arguments
+    return _leaf_parser(commands[arguments[0]], arguments[1:])
+
+
+def _subparsers(parser: argparse.ArgumentParser) -> Mapping[str, argparse.ArgumentParser] | None:
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            choices: Mapping[str, argparse.ArgumentParser] = action.choices
+            return choices
+    return None
 
 
 def _add_configuration(parser: argparse.ArgumentParser) -> None:

@@ -6,10 +6,11 @@ import argparse
 from pathlib import Path
 
 from gausslite.calibration.pose_exposure_prior import PoseExposurePrior
+from gausslite.config.presets import PRESETS
 from gausslite.config.toml_text import OptionValue
 from gausslite.config.values import AUTO, NONE, read_names, read_pose_prior, read_pose_prior_or_auto, read_skip_stages
 from gausslite.domain.voxels import VoxelGrid
-from gausslite.mapping.policies import ABLATION_FLAGS, POLICIES
+from gausslite.mapping.policies import ABLATION_FLAGS, POLICIES, TASK
 from gausslite.mission.frame_scheduler import SchedulerSettings
 from gausslite.mission.settings import DEFAULT_MAX_GAUSSIANS, MissionSettings, PerceptionSettings
 from gausslite.render.choose import BACKENDS
@@ -54,12 +55,13 @@ def add_detector(parser: argparse.ArgumentParser) -> None:
 
 
 def add_policy(parser: argparse.ArgumentParser, allow_auto: bool = False) -> None:
-    """Add --policy, --disable, --rasterizer and --pose-prior.
+    """Add --preset, --policy, --disable, --rasterizer and --pose-prior.
 
     allow_auto: the pose prior may be, and by default is, estimated; for programs that read the whole sequence first.
     """
     add = parser.add_argument_group("mapping").add_argument
-    add("--policy", choices=sorted(POLICIES), default="task", help="what the budget is spent on (default: task)")
+    add("--preset", choices=sorted(PRESETS), help="set of defaults for other options; paper: the literal method")
+    add("--policy", choices=sorted(POLICIES), help="what the budget is spent on (default: task; map without a task: uniform)")
     others = ", ".join(name for name in ABLATION_FLAGS if name not in ("sb", "mvo", "roi", "sis", "gfd"))
     add("--disable", metavar="A,B", type=read_names, default=(), help=f"{_DISABLE_HELP}{others}")
     add("--rasterizer", choices=BACKENDS, default="auto", help="backend that renders and trains (default: auto)")
@@ -144,13 +146,13 @@ def perception_settings(options: argparse.Namespace) -> PerceptionSettings:
     )
 
 
-def mission_settings(options: argparse.Namespace) -> MissionSettings:
+def mission_settings(options: argparse.Namespace, default_policy: str = TASK) -> MissionSettings:
     """Return the settings of `add_policy` and `add_budget`; a pose prior of AUTO counts as exact.
 
     Raises InvalidInputError.
     """
     return MissionSettings(
-        policy=options.policy,
+        policy=options.policy or default_policy,
         disabled=frozenset(options.disable),
         max_gaussians=options.max_gaussians,
         iterations=options.iterations,
