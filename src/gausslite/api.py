@@ -1,0 +1,199 @@
+"""The public Python API: open a sequence, map it, store the map and render it.
+
+`import gausslite` offers these names lazily; importing `gausslite` loads neither NumPy nor torch. Errors are those of
+`gausslite.errors`; each message names the value, what was received and what was expected.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float32, Float64
+from numpy import ndarray
+
+from gausslite.calibration.pose_exposure_error import estimate_pose_exposure_prior
+from gausslite.calibration.pose_exposure_prior import PoseExposurePrior
+from gausslite.calibration.registration import find_registration
+from gausslite.codec.ply import read_ply, write_ply
+from gausslite.datasets.open import is_simulated, open_source
+from gausslite.datasets.registered_source import DepthRegistration, RegisteredSource
+from gausslite.datasets.source import Source
+from gausslite.domain.camera import Camera
+from gausslite.domain.gaussians import Gaussians
+from gausslite.domain.pose import UpAxis, require_rigid
+from gausslite.domain.region import Region
+from gausslite.errors import DatasetError, InvalidInputError
+from gausslite.evaluation.views import MapViewer
+from gausslite.mapping.policies import TASK
+from gausslite.mission.build import EstimatorFactory, build_mapper
+from gausslite.mission.frame_scheduler import FrameScheduler
+from gausslite.mission.frame_stream import CorruptFrames, FrameStream
+from gausslite.mission.runner import MissionRunner
+from gausslite.mission.settings import MissionSettings, PerceptionSettings, SceneInfo, SourceSettings
+from gausslite.mission.task_mapper import TaskMapper
+from gausslite.perception.fixed_relevance import NoTaskEstimator, RegionRelevanceEstimator
+from gausslite.perception.relevance_estimator import RelevanceEstimator
+from gausslite.render.choose import choose_rasterizer
+from gausslite.task.rules import RuleParser
+
+_UNIFORM = "uniform"
+
+
+@dataclass(frozen=True, slots=True)
+class CalibratedSequence:
+    """A sequence with registered depth, and the pose and exposure errors that mapping should correct.
+
+    notes: one line per estimate, for the operator.
+    """
+
+    source: Source
+    pose_prior: PoseExposurePrior
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MapResult:
+    """A finished map.
+
+    gaussians: the map as arrays, see `Gaussians`. report: totals of the run, with the keys of report.json such as
+    `frames`, `iterations`, `roi_share` and `hz`. notes: messages for the operator, such as skipped frames.
+    """
+
+    gaussians: Gaussians
+    report: Mapping[str, object]
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RenderedImage:
+    """A rendering of a map: rgb f32[h, w, 3] in [0, 1]; depth_m f32[h, w] in metres, 0 where alpha is at most 0.5;
+    alpha f32[h, w] in [0, 1].
+    """
+
+    rgb: Float32[ndarray, "h w 3"]
+    depth_m: Float32[ndarray, "h w"]
+    alpha: Float32[ndarray, "h w"]
+
+
+def open_sequence(
+    spec: str | Path, *, up_axis: UpAxis | None = None, depth_registration: DepthRegistration | None = None
+) -> Source:
+    """Open a folder in TUM, 7-Scenes or Replica layout, or a simulated home such as "sim:home?seed=0&trajectory=0".
+
+    up_axis: unit vector of the world frame that points up, if not the layout's. depth_registration: the colour camera,
+    for recordings with unregistered depth. Raises DatasetError, PoseError, InvalidInputError.
+    """
+    return open_source(str(spec), up_axis, depth_registration)
+
+
+def open_calibrated(spec: str | Path, *, up_axis: UpAxis | None = None) -> CalibratedSequence:
+    """Open a sequence and estimate what it does not state, as `gausslite map` does by default; takes about ten seconds.
+
+    Depth is registered if the layout does not promise it. Simulated homes are used without correction. Raises
+    DatasetError, PoseError, InvalidInputError.
+    """
+    source = open_source(str(spec), up_axis)
+    notes = []
+    if not source.depth_registered:
+        registration, note = find_registration(source)
+        notes.append(f"depth registration {registration or 'none'}: {note}")
+        if registration is not None:
+            source = RegisteredSource(source, registration)
+    if is_simulated(str(spec)):
+        return CalibratedSequence(source, PoseExposurePrior(), tuple(notes))
+    prior, note = estimate_pose_exposure_prior(source)
+    notes.append(f"pose prior {'none' if prior.is_exact else prior}: {note}")
+    return CalibratedSequence(source, prior, tuple(notes))
+
+
+def create_mapper(
+    scene: SceneInfo,
+    task: str | None = None,
+    *,
+    regions: Iterable[Region] = (),
+    settings: MissionSettings | None = None,
+    perception: PerceptionSettings | None = None,
+) -> TaskMapper:
+    """Return a mapper with an empty map, for frames of your own: call `process(frame)`, then `gaussians()`.
+
+    Give either a task or regions; without both, mapping is uniform. scene: `SceneInfo.of(source)`, or
+    `SceneInfo(up_axis)` for a live camera. perception: the detector's files; without a detector, the scene's ground
+    truth finds the task's objects. Raises TaskError, InvalidInputError, ModelFileError, KernelError.
+    """
+    settings = settings or MissionSettings()
+    perception = perception or PerceptionSettings()
+    chosen = list(regions)
+    if task is not None and chosen:
+        raise InvalidInputError("task: expected either a task or regions, got both")
+    if task is None and perception.model is not None:
+        raise InvalidInputError("perception.model: expected a task for the detector, got none")
+    if task is not None:
+        estimator: RelevanceEstimator = EstimatorFactory(perception, lambda: scene).build(RuleParser().parse(task))
+    elif chosen:
+        estimator = RegionRelevanceEstimator(chosen)
+    else:
+        estimator = NoTaskEstimator()
+        if settings.policy == TASK:
+            settings = replace(settings, policy=_UNIFORM)
+    return TaskMapper(estimator, build_mapper(settings), scheduler=FrameScheduler(settings.scheduler_settings))
+
+
+def map_sequence(
+    source: Source,
+    task: str | None = None,
+    *,
+    regions: Iterable[Region] = (),
+    frames: str = ":",
+    size: tuple[int, int] | None = None,
+    settings: MissionSettings | None = None,
+    perception: PerceptionSettings | None = None,
+) -> MapResult:
+    """Map a sequence for a task, for regions of space, or (without both) uniformly.
+
+    The map has the same bits as that of `gausslite map` with the same options. regions: for instance
+    `[source.regions()["mug"]]`. frames: "START:STOP:STEP" of the sequence's frame numbers. size: (width, height) in
+    pixels. Frames that cannot be read are skipped and named in the notes. Ctrl-C ends the call after the current frame
+    with KeyboardInterrupt. Raises DatasetError if no frame could be mapped, and the errors of `create_mapper`.
+    """
+    mapper = create_mapper(SceneInfo.of(source), task, regions=regions, settings=settings, perception=perception)
+    size_text = None if size is None else f"{size[0]}x{size[1]}"
+    stream = FrameStream.select(source, SourceSettings(source.name, frames, size_text))
+    skipped: list[str] = []
+    corrupt = CorruptFrames(skipped.append)
+    result = MissionRunner(mapper.process).run(stream.frames(corrupt))
+    result.raise_if_stopped()
+    if result.totals.frames == 0:
+        raise corrupt.first_error or DatasetError(f"{source.name}: expected frames with depth, got none")
+    return MapResult(mapper.gaussians(), result.summary(), (*skipped, *mapper.notes))
+
+
+def save_ply(path: str | Path, gaussians: Gaussians) -> None:
+    """Write a map as a 3DGS PLY file with the extra columns active, kappa and target. Raises StorageError."""
+    write_ply(Path(path), gaussians)
+
+
+def load_ply(path: str | Path) -> Gaussians:
+    """Read a map from a 3DGS PLY file; the extra columns may be missing. Raises MapFileError."""
+    return read_ply(Path(path))
+
+
+def render(
+    gaussians: Gaussians,
+    camera: Camera,
+    T_world_camera: Float64[ndarray, "4 4"],
+    *,
+    backend: str = "auto",
+    threads: int | None = None,
+) -> RenderedImage:
+    """Render a map from a camera pose (x right, y down, z forward; metres).
+
+    backend: "cpu", "cuda", "reference", or "auto" for cuda if it can run, else cpu. threads: of the cpu backend; None
+    uses all. Raises PoseError, ShapeError, KernelError.
+    """
+    pose = np.asarray(T_world_camera, np.float64)
+    require_rigid("T_world_camera", pose)
+    image = MapViewer(gaussians, choose_rasterizer(backend, threads)).render(camera, pose)
+    return RenderedImage(image.rgb, image.expected_depth_m(), image.alpha)
