@@ -1,1 +1,1 @@
-"""From words to a task graph: what the robot shall map in detail, and what locates it (Sec. III-B.1)."""
+"""Parse a task sentence into a graph of targets, anchors and relations (Sec. III-B.1)."""

@@ -1,4 +1,4 @@
-"""Choose how tasks are read: by rules, by a model on this machine, or by a server."""
+"""Select the task parser: rules, a local language model, or a server."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ RESPONSE_FORMATS: Final = ("json_schema", "json_object", "none")
 
 
 class Backend(StrEnum):
-    """Who reads a task."""
+    """Kind of task parser."""
 
     RULES = "rules"
     ONNX = "onnx"
@@ -24,7 +24,7 @@ class Backend(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class BackendSettings:
-    """model: a folder for onnx, a name for http; timeout_s: how long a model may take before rules read the task."""
+    """model: a folder for onnx, a name for http; timeout_s: longest time of a model before the rules parse the task."""
 
     backend: Backend = Backend.RULES
     model: str | None = None
@@ -44,9 +44,9 @@ class BackendSettings:
 
 
 def open_parser(settings: BackendSettings) -> TaskParser:
-    """The parser of these settings; a language model's is cached and falls back to rules.
+    """Return the parser of these settings; a language model's answers are cached, and it falls back to rules.
 
-    Loads a model where one is chosen. Raises InvalidInputError, ModelFileError.
+    Loads the model of the onnx backend. Raises InvalidInputError, ModelFileError.
     """
     from gausslite.task.rules import RuleParser
 
@@ -55,9 +55,9 @@ def open_parser(settings: BackendSettings) -> TaskParser:
         return rules
     from gausslite.task.language.parsers import CachedParser, FallbackParser, LanguageParser
 
-    asking = LanguageParser(_open_model(settings))
+    language_parser = LanguageParser(_open_model(settings))
     name = str(settings.backend)
-    return FallbackParser(CachedParser(asking, name, asking.version), name, rules)
+    return FallbackParser(CachedParser(language_parser, name, language_parser.version), name, rules)
 
 
 def _open_model(settings: BackendSettings) -> LanguageModel:
@@ -67,7 +67,7 @@ def _open_model(settings: BackendSettings) -> LanguageModel:
         return OnnxLanguageModel(Path(settings.model or ""), settings.timeout_s)
     from gausslite.task.language.http import HttpLanguageModel, HttpSettings, ResponseFormat
 
-    dialect = ResponseFormat(settings.response_format)
+    response_format = ResponseFormat(settings.response_format)
     return HttpLanguageModel(
-        HttpSettings(settings.url or "", settings.model or "", dialect, settings.timeout_s, settings.api_key)
+        HttpSettings(settings.url or "", settings.model or "", response_format, settings.timeout_s, settings.api_key)
     )

@@ -1,4 +1,4 @@
-"""Say in plain words what English says with an idiom: "get rid of the dust" is "remove the dust"."""
+"""Replace English idioms by plain phrases: "get rid of the dust" becomes "remove the dust"."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _PLAIN: Final = {
     r"lemme": "let me",
     r"be so (?:kind|good) as to|be (?:kind|good) enough to|in order to": "to",
     r"so(?: that)?(?= (?:i|you|we|he|she|they|it|the|my|our|nobody|no|people|everyone|everybody)\b)": "because",
-    # a light verb with the noun that carries the meaning
+    # light verbs, whose noun carries the meaning
     r"(?:have|take|get|give me|catch|(?:i|we) (?:would )?(?:like|want|need)) an? (?:\w+ ){0,2}"
     r"(?:look|glance|peek|view) (?:at|of|around|over|into)": "look at",
     r"(?:have|take) an? (?:\w+ )?look(?= (?:under|behind|inside|in|on|for|if|whether)\b)": "look",
@@ -54,21 +54,21 @@ _PLAIN: Final = {
     r"as well as|along with|together with|in addition to|and also|plus": "and",
     r"in between": "between",
     r"((?:every|all|any) (?:\w+ ){0,2}\w+) but(?= (?:the|a|an|my|this|that|those) )": r"\1 except",
-    # the noun carries the meaning and the verb before it none
+    # "give the table a wipe": the last noun carries the meaning
     r"give (.{2,60}?) an? (?:\w+ )?(rinse|wipe|wash|clean|scrub|polish|sweep|shake|push|pull|kick|stir)": r"\2 \1",
 }
 _IDIOMS: Final = tuple((re.compile(rf"\b(?:{idiom})(?!\w)"), plain) for idiom, plain in _PLAIN.items())
 _ARROW: Final = re.compile(r"\s*(?:->|=>|\u2192)\s*")
-_LEFT_ALONE: Final = re.compile(
+_LEAVE_ALONE: Final = re.compile(
     r"\bleav(?:e|ing) ((?:\w+ ){1,4})(?:alone|untouched|undisturbed|unchanged|in peace|as (?:it is|is|they are)"
     r"|be|for (?:now|later)|where (?:it is|they are))\b"
 )
 
 
 def replace_idioms(text: str) -> str:
-    """One normalised sentence without the idioms of the table."""
+    """Return a normalised sentence with idioms replaced."""
     text = _ARROW.sub(" to ", text)
-    text = _LEFT_ALONE.sub(r"do not touch \1", text)
+    text = _LEAVE_ALONE.sub(r"do not touch \1", text)
     for idiom, plain in _IDIOMS:
         text = idiom.sub(plain, text)
     return text

@@ -1,4 +1,4 @@
-"""The closed sets of words the rule parser knows: joining words, adverbs, adjectives, and nouns that name no object."""
+"""Word lists of the rule parser: determiners, adverbs, adjectives, negations, and nouns that name no object."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ DETERMINERS: Final = word_set(
     "twelve zero dozen most various different multiple single either whichever first second third last next following "
     "same such"
 )
-# words that stand for any object or anyone
+# indefinite pronouns, with the noun that a graph uses for them
 INDEFINITE_PRONOUNS: Final = {
     "something": "object", "anything": "object", "everything": "object", "someone": "person", "anyone": "person",
     "everyone": "person", "somebody": "person", "anybody": "person", "everybody": "person", "what": "object",
     "whatever": "object", "nothing": "object", "nobody": "person", "whoever": "person",
 }  # fmt: skip
-# an ordinal that belongs to a name
+# an ordinal that is part of a compound noun
 COMPOUND_OPENERS: Final = frozenset({("first", "aid"), ("second", "hand")})
-# words no graph needs; most others end in -ly
+# irrelevant to the graph; most other adverbs end in -ly
 ADVERBS: Final = word_set(
     "please so kindly yo pls plz thx ta cheers hey ok okay hello hi yes no-one thanks thank quickly slowly just now "
     "also too again very really so-so here there else sure still already yet always currently almost instead fast "
@@ -33,7 +33,7 @@ ADVERBS: Final = word_set(
     "afterwards finally firstly even ever quite rather pretty otherwise therefore however anyway indeed twice "
     "possible necessary ago overhead only able"
 )
-# gerunds that say what a thing is for: the charging station, a washing machine
+# gerunds that begin a compound noun: the charging station, a washing machine
 COMPOUND_GERUNDS: Final = word_set(
     "charging washing loading parking dining living drying cutting swimming sleeping ironing changing sewing vending "
     "reading shopping rocking recycling cooking baking frying mixing serving waiting meeting fishing watering "
@@ -42,14 +42,14 @@ COMPOUND_GERUNDS: Final = word_set(
     "training knitting polling printing pruning racing riding running sailing seating shaving skipping spinning "
     "steering swinging wedding wrapping writing"
 )
-# the robot itself, and how a person may be spoken to
+# names and forms of address for the robot
 ADDRESSEES: Final = word_set(
     "robot agent arm gripper bot dear darling sweetheart honey mate buddy sir madam pal friend"
 )
 
-# what a sentence may say about itself: "the goal is to", "any idea where"
+# nouns that refer to the task itself: "the goal is to", "any idea where"
 TASK_NOUNS: Final = word_set("task mission goal objective job aim assignment duty idea clue question problem")
-# nouns that say where or how, not what: the object is the one after "of", or none at all
+# nouns for places and properties: the object follows "of", or there is none
 PLACES: Final = word_set(
     "scene environment surroundings room area world space place vicinity workspace view region zone spot location "
     "site map surface home floorplan indoors outdoors way side corner middle center centre top bottom edge end front "
@@ -60,7 +60,7 @@ PLACES: Final = word_set(
     "voltage moment minute hour day week morning afternoon evening night noon bother trouble favour favor kindness "
     "matter texture appearance structure"
 )
-# behind a preposition and without an article they say how or why: by hand, for lunch, in order
+# after a preposition and without an article they express manner or purpose: by hand, for lunch, in order
 MANNER_NOUNS: Final = word_set(
     "hand order name care noon night lunch dinner breakfast work help fun need turn number type kind letter ease "
     "caution love sleep school total general advance bulk use case detail pair fire mistake chance hurry place focus "
@@ -77,10 +77,10 @@ MEASURES: Final = word_set(
     "section suit bit heap batch handful slice lump chunk strip loaf record inventory close-up closeup overview "
     "weight"
 )
-# places that are solid things too, unless something is in them
+# places that are also physical objects, unless "in" or "to" precedes them
 PHYSICAL_PLACES: Final = word_set("home corner site front back")
 BUILDINGS: Final = word_set("building house apartment")
-# what an inspection looks for in the thing that it inspects
+# defects that an inspection searches for in an object
 DEFECTS: Final = word_set(
     "leak crack dent scratch rust stain hole corrosion damage wear tear mold mould rot chip blockage fault defect "
     "wetness gap fraying blister failure error hazard sign pest disease"
@@ -114,11 +114,11 @@ ADJECTIVES: Final = word_set(
     "original correct proper exact current previous"
 )
 
-# words that only ever hide or forbid what comes after them
-_FORBIDDING: Final = (
+# words that always exclude the following noun or verb
+_EXCLUDING: Final = (
     "without|neither|nor|do not|don't|dont|never|ignore|ignoring|except for|except|excluding|exclude|"
     "but not|not to|not|other than|rather than|instead of|apart from|aside from|skip|skipping|disregard|"
     "disregarding|besides|must not|should not|leave out|leaving out|avoid touching|avoid hitting|"
     "forget about|forget|doesn't|can't|cannot|shouldn't|mustn't|omit|neglect|avoid bumping"
 )
-NEGATIONS: Final = frozenset(tuple(said.split()) for said in _FORBIDDING.split("|"))
+NEGATIONS: Final = frozenset(tuple(negation.split()) for negation in _EXCLUDING.split("|"))

@@ -1,4 +1,4 @@
-"""Everyday nouns in the singular: enough to tell a task from noise; any other word may still be an object."""
+"""Common nouns in the singular. An unknown word may still be an object."""
 
 from __future__ import annotations
 

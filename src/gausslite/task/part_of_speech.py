@@ -1,4 +1,4 @@
-"""Choose one part of speech for every word of a sentence: the cheapest path through what each word may be."""
+"""Part-of-speech tags, and the tag sequence of least cost for a sentence (Viterbi)."""
 
 from __future__ import annotations
 
@@ -8,7 +8,11 @@ from typing import Final
 
 
 class Tag(Enum):
-    """Parts of speech, as far as a task needs to tell them apart."""
+    """Parts of speech that the task parser distinguishes.
+
+    PARTICLE: the "up" of "pick up". INFINITIVE: "to". CLAUSE_BREAK: punctuation and words that start a clause.
+    INDEFINITE: "something", "who". ANAPHOR: "it", "this" without a noun.
+    """
 
     NOUN = "n"
     ADJECTIVE = "a"
@@ -28,11 +32,11 @@ class Tag(Enum):
     ANAPHOR = "k"
     NEGATION = "q"
 
-    __hash__ = object.__hash__  # members are one of a kind, and Enum's own hash is slow
+    __hash__ = object.__hash__  # members are singletons, and Enum's own hash is slow
 
 
-# What it costs to read one part of speech behind another, in tenths; "." is the end of the sentence. Chosen by hand:
-# 0 is what English does all the time, 10 what it does now and then, 90 what it does not do.
+# Cost of one tag (column) after another (row); "^" is the start and "." the end of the sentence. Chosen by hand:
+# 0 is frequent in English, 10 is occasional, 90 does not occur.
 _COSTS: Final = """
    n  a  d  v  g  e  x  p  t  u  c  s  w  o  i  k  q  .
 ^ 10 10  0  0 10 30  0 10 20 10 20 10 10  0  0 10  0  5
@@ -57,7 +61,7 @@ q  5  5  0  0  0 10 10 10 30  5 20 20 20  5  0  0 20 20
 
 
 def _table(text: str) -> dict[Tag | None, dict[Tag | None, int]]:
-    """Rows and columns by Tag; None is the start as a row and the end as a column."""
+    """Return the costs by row and column tag; None is the start as a row and the end as a column."""
     header, *rows = [line.split() for line in text.strip().splitlines()]
     columns = [None if name == "." else Tag(name) for name in header]
     return {None if row[0] == "^" else Tag(row[0]): dict(zip(columns, map(int, row[1:]), strict=True)) for row in rows}
@@ -67,27 +71,27 @@ TRANSITION_COSTS: Final = _table(_COSTS)
 
 
 def best_tags(candidates: Sequence[Mapping[Tag, int]]) -> list[Tag]:
-    """One tag a word, so that the words' own costs and the costs between neighbours are least (Viterbi)."""
+    """Return one tag per word that minimises the sum of word costs and transition costs (Viterbi)."""
     paths: dict[Tag | None, int] = {None: 0}
-    came_from: list[dict[Tag, Tag | None]] = []
+    backpointers: list[dict[Tag, Tag | None]] = []
     for options in candidates:
         reached: dict[Tag | None, int] = {}
         origins: dict[Tag, Tag | None] = {}
         for tag, own_cost in options.items():
             cost, origin = min(
-                ((so_far + TRANSITION_COSTS[before][tag], before) for before, so_far in paths.items()), key=_first
+                ((path_cost + TRANSITION_COSTS[before][tag], before) for before, path_cost in paths.items()), key=_cost
             )
             reached[tag], origins[tag] = cost + own_cost, origin
         paths = reached
-        came_from.append(origins)
+        backpointers.append(origins)
     last = min(paths, key=lambda tag: paths[tag] + TRANSITION_COSTS[tag][None])
     found: list[Tag] = []
-    for origins in reversed(came_from):
+    for origins in reversed(backpointers):
         if last is not None:
             found.append(last)
             last = origins[last]
     return found[::-1]
 
 
-def _first(pair: tuple[int, Tag | None]) -> int:
+def _cost(pair: tuple[int, Tag | None]) -> int:
     return pair[0]

@@ -1,10 +1,10 @@
-"""Which words between two nouns mean which relation."""
+"""Prepositions by the relation that they express."""
 
 from __future__ import annotations
 
 from typing import Final
 
-# a relation that is no Predicate is kept as `near`, with a warning; the names below say what the words mean
+# a relation that is not a Predicate becomes `near`, with a warning; prepositions are separated by "|"
 _BY_RELATION: Final = {
     "near": "near|next to|beside|by|close to|adjacent to|alongside|at|around|against|nearby to|touching|"
     "connected to|in the vicinity of|next|surrounding|along|close by|by the side of|"

@@ -1,4 +1,4 @@
-"""English plurals to singulars, for the heads of noun phrases."""
+"""Convert English plurals to singulars, for the heads of noun phrases."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _IRREGULAR: Final = {
     "caches": "cache", "aches": "ache", "axes": "axe", "persons": "person", "gases": "gas", "calves": "calf",
     "humans": "human", "rubbish": "rubbish", "quizzes": "quiz", "policemen": "policeman", "workmen": "workman",
 }  # fmt: skip
-# plural in form, one thing in use; or singular although they end in s
+# plural in form only, or singular with a final s
 PLURAL_ONLY: Final = word_set(
     "scissors glasses sunglasses eyeglasses headphones earphones pants jeans trousers shorts pliers tongs tweezers "
     "binoculars goggles clothes stairs valuables electronics groceries gas bus lens news series species thermos "
@@ -27,7 +27,7 @@ PLURAL_ONLY: Final = word_set(
 
 
 def singular(word: str) -> str:
-    """The singular of one lower-case English word; words that have none come back unchanged."""
+    """Return the singular of a lower-case English word, or the word itself if it has none."""
     if word in _IRREGULAR:
         return _IRREGULAR[word]
     if word in PLURAL_ONLY or len(word) <= 3 or not word.endswith("s") or word.endswith(("ss", "us", "is", "'s")):

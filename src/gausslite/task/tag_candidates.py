@@ -1,4 +1,4 @@
-"""Say what part of speech each word of a sentence may be, and at what cost; `tags` then chooses."""
+"""List the possible part-of-speech tags of each word, with costs; `part_of_speech` selects one per word."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from gausslite.task.word_set import word_set
 
 Options = dict[Tag, int]
 
-# one line for words that may be the same things; the number is the cost in the unit of `tags`
+# one line for words with the same possible tags; the digits after a tag are its cost
 _CLOSED_LINES: Final = (
     ("d0", "a an the my your his our their its every whose no"),
     ("d0 o3", "her"),
@@ -58,8 +58,8 @@ _CLOSED_LINES: Final = (
     ("n0", "ones everywhere"),
     ("i0 d8", "what whatever"),
 )
-# "go stand", "help clean": the second is what is to be done
-_LEADING: Final = word_set("go come help")
+# "go stand", "help clean": the second verb is the instruction
+_LEADING_VERBS: Final = word_set("go come help")
 _USUALLY_VERBS: Final = GO_VERBS | TOOL_VERBS | SEARCH_VERBS | word_set("stop hand")
 _NEVER_NOUNS: Final = GO_VERBS | word_set(
     "belong bring put take get find fetch make keep give hold grab need want do lie be say see hear "
@@ -89,19 +89,19 @@ _CLOSED: Final[dict[str, Options]] = (
     | {" ".join(negation): {Tag.NEGATION: 0} for negation in lexicon.NEGATIONS}
     | {word: {Tag.DETERMINER: 0} for word in lexicon.DETERMINERS}
     | {word: {Tag.INDEFINITE: 0} for word in lexicon.INDEFINITE_PRONOUNS}
-    | {word: _options(line) for line, said in _CLOSED_LINES for word in said.split()}
+    | {word: _options(line) for line, listed in _CLOSED_LINES for word in listed.split()}
 )
 
 
 def tag_words(units: Sequence[str]) -> list[tuple[str, Tag]]:
-    """Words with their parts of speech; adverbs, which no graph needs, are left out."""
+    """Return the words with their part-of-speech tags; adverbs are dropped, because no graph needs them."""
     kept = [unit for unit in units if not is_adverb(unit)]
     neighbours = zip(["", *kept], kept, [*kept[1:], ""], strict=False)
     return list(zip(kept, best_tags([_tag_options(*three) for three in neighbours]), strict=True))
 
 
 def is_adverb(word: str) -> bool:
-    """True for "carefully", "please" and "clockwise"."""
+    """Return True for "carefully", "please" and "clockwise"."""
     if word in lexicon.ADVERBS:
         return True
     ending = word.endswith(("ly", "wise", "wards"))
@@ -109,7 +109,7 @@ def is_adverb(word: str) -> bool:
 
 
 def _tag_options(before: str, word: str, after: str) -> Options:
-    if before in _LEADING and word in VERBS:
+    if before in _LEADING_VERBS and word in VERBS:
         return {Tag.VERB: 0}
     if (word, after) in lexicon.COMPOUND_OPENERS:
         return {Tag.ADJECTIVE: 0}
@@ -140,19 +140,19 @@ def _tag_options(before: str, word: str, after: str) -> Options:
 
 
 def _noun_cost_of_verb(before: str, word: str) -> int:
-    """A verb may be a noun behind another noun: a stop button, a call panel."""
+    """Return the cost of a known verb as a noun, which is low after another noun: "a stop button"."""
     if word in lexicon.ADJECTIVES or not before or before in _CLOSED or verb_base(word) in _NEVER_NOUNS:
         return 30
     return 20 if word.endswith("s") else 12
 
 
 def _verb_options(before: str, word: str, is_noun: bool) -> Options:
-    """What the word may be if it is a form of a verb, known or by its ending."""
+    """Return the tags of the word as a verb form, known or by its ending."""
     options: Options = {}
     if word in VERBS:
         usual = not is_noun or (word in _USUALLY_VERBS and (before == "to" or (before == "and" and word in GO_VERBS)))
         options[Tag.VERB] = 0 if usual else 5 if word in _USUALLY_VERBS else 12
-        if before in _NOUNS:  # no single thing "bring"
+        if before in _NOUNS:  # "the cup bring": a singular noun is not the verb's subject
             options[Tag.VERB] += 8
     elif base_of_s(word) is not None:
         options[Tag.VERB] = 2 if not is_noun else 8 if base_of_s(word) in _USUALLY_VERBS else 18

@@ -1,4 +1,4 @@
-"""Cut a sentence into words, keeping together what English reads as one: "next to", "do not"."""
+"""Split a sentence into words, with multi-word prepositions and negations as one unit: "next to", "do not"."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from gausslite.task.prepositions import PREPOSITIONS
 
 _TOKEN: Final = re.compile(r"[^\W\d_][\w'’-]*|\d[\w.]*|[,/&+;.!?:()]")
 _UNITS: Final = [
-    *(tuple(said.split()) for said in PREPOSITIONS if " " in said),
+    *(tuple(preposition.split()) for preposition in PREPOSITIONS if " " in preposition),
     *(negation for negation in lexicon.NEGATIONS if len(negation) > 1),
 ]
 # by their first word, the longest first
@@ -22,19 +22,18 @@ _COMPOUNDS: Final = {
 
 
 def tokenize(text: str) -> list[str]:
-    """Lower-case words, numbers and the punctuation that matters."""
+    """Return the lower-case words, the numbers and the relevant punctuation of a text without idioms."""
     return _TOKEN.findall(replace_idioms(text))
 
 
 def lexical_units(text: str) -> list[str]:
-    """The tokens of a text, with prepositions and negations of several words as one unit each."""
+    """Return the tokens of a text, with multi-word prepositions and negations merged."""
     tokens = tokenize(text)
     units: list[str] = []
-    at = 0
-    while at < len(tokens):
-        length = next(
-            (len(unit) for unit in _COMPOUNDS.get(tokens[at], ()) if tuple(tokens[at : at + len(unit)]) == unit), 1
-        )
-        units.append(" ".join(tokens[at : at + length]))
-        at += length
+    start = 0
+    while start < len(tokens):
+        compounds = _COMPOUNDS.get(tokens[start], ())
+        length = next((len(unit) for unit in compounds if tuple(tokens[start : start + len(unit)]) == unit), 1)
+        units.append(" ".join(tokens[start : start + length]))
+        start += length
     return units

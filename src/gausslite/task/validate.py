@@ -1,4 +1,4 @@
-"""The bounds every parser's answer keeps, whoever gave it: rules, a language model or another machine."""
+"""Size limits of tasks and task graphs, for every parser: rules, language model or remote."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ EXAMPLE = "'Pick up the mug on the table'"
 
 @dataclass(frozen=True, slots=True)
 class TaskLimits:
-    """How large a task may be."""
+    """Largest sizes of a task and its graph."""
 
     max_text_chars: int = 1000
     max_targets: int = 16
@@ -26,10 +26,10 @@ LIMITS = TaskLimits()
 
 
 def require_task_text(text: str, limits: TaskLimits = LIMITS) -> None:
-    """Raise TaskError unless the text has a letter in it and is short enough to be one task."""
+    """Raise TaskError unless the text is UTF-8, contains a letter and is short enough."""
     if len(text) > limits.max_text_chars:
         raise TaskError(f"task text: expected at most {limits.max_text_chars} characters, got {len(text)}")
-    # how Python carries bytes that are no UTF-8; no message and no file could hold them
+    # surrogates: Python's form of bytes that are not UTF-8, which neither messages nor files can store
     if any("\ud800" <= character <= "\udfff" for character in text):
         raise TaskError(f"task text: expected UTF-8, got bytes of another encoding in {text.strip()!r}")
     if not any(character.isalpha() for character in text):
@@ -37,9 +37,9 @@ def require_task_text(text: str, limits: TaskLimits = LIMITS) -> None:
 
 
 def require_graph(graph: TaskGraph, limits: TaskLimits = LIMITS) -> None:
-    """Raise TaskError unless the graph is within bounds and its relations join nouns that it lists.
+    """Raise TaskError unless the graph is within the limits and its relations join listed nouns.
 
-    A graph that was made without words has an empty text.
+    The text is empty if the graph was not parsed from a sentence.
     """
     if graph.text:
         require_task_text(graph.text, limits)
@@ -48,8 +48,8 @@ def require_graph(graph: TaskGraph, limits: TaskLimits = LIMITS) -> None:
     _require_phrases("targets", graph.targets, limits.max_targets, limits.max_phrase_chars)
     _require_phrases("anchors", graph.anchors, limits.max_anchors, limits.max_phrase_chars)
     if len(graph.relations) > limits.max_relations or len(graph.warnings) > limits.max_warnings:
-        most = f"{limits.max_relations} relations and {limits.max_warnings} warnings"
-        raise TaskError(f"task: expected at most {most}, got {len(graph.relations)} and {len(graph.warnings)}")
+        expected = f"{limits.max_relations} relations and {limits.max_warnings} warnings"
+        raise TaskError(f"task: expected at most {expected}, got {len(graph.relations)} and {len(graph.warnings)}")
     for relation in graph.relations:
         if relation.target not in graph.targets:
             raise TaskError(f"task {relation.predicate}: expected one of the targets first, got {relation.target!r}")

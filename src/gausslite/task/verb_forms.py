@@ -1,4 +1,4 @@
-"""English verb forms to base forms, and the particles that belong to verbs, for the verbs that are known."""
+"""Convert forms of known English verbs to base forms, and recognise the particles of verbs."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ _IRREGULAR: Final = {
 }  # fmt: skip
 _PARTICLES: Final = word_set("up down off out over away around about back through along past at into across onto for")
 _SWITCHED_ON: Final = word_set("turn switch power put bring check focus concentrate spot home work plug report")
-# "bring in the boxes" needs an object before any place
+# after these verbs "in" or "on" is a particle: "bring in the boxes"
 _TAKES_AN_OBJECT: Final = DELIVERY_VERBS - GO_VERBS - word_set("rest lean pack slide place hide")
 
 
 def base_of_s(word: str) -> str | None:
-    """From "holds" and "carries" to "hold" and "carry"; None for what is no such form of a known verb."""
+    """Return "hold" for "holds" and "carry" for "carries"; None if no known verb has this form."""
     if word.endswith("ies"):
         return _known(word[:-3] + "y", word[:-1])
     if word.endswith("es"):
@@ -44,14 +44,14 @@ def base_of_s(word: str) -> str | None:
 
 
 def base_of_ing(word: str) -> str | None:
-    """From "sitting" and "placing" to "sit" and "place"."""
+    """Return "sit" for "sitting" and "place" for "placing"; None if no known verb has this form."""
     if word.endswith("ying"):
         return _known(word[:-3], word[:-3] + "e", word[:-4] + "ie")
     return _stem(word[:-3]) if word.endswith("ing") else None
 
 
 def base_of_ed(word: str) -> str | None:
-    """From "stacked", "dropped", "carried" and "fallen" to their base forms."""
+    """Return the base form of "stacked", "dropped", "carried" or "fallen"; None if no known verb has this form."""
     if word in _IRREGULAR:
         return _IRREGULAR[word]
     if word.endswith("ied"):
@@ -60,21 +60,21 @@ def base_of_ed(word: str) -> str | None:
 
 
 def verb_base(word: str) -> str | None:
-    """The base form of a known verb in any of its forms, or None."""
+    """Return the base form of a known verb from any of its forms, or None."""
     if word in VERBS:
         return word
     return base_of_s(word) or base_of_ing(word) or base_of_ed(word)
 
 
 def is_particle(verb: str, word: str) -> bool:
-    """True for `on` in "turn on the lamp", and for `at` in "look at the lamp", which says no more than the verb."""
+    """Return True if the word belongs to the verb: "on" in "turn on the lamp", "at" in "look at the lamp"."""
     if word in ("on", "in"):
         return verb in _TAKES_AN_OBJECT or (word == "on" and verb in _SWITCHED_ON)
     return word in _PARTICLES
 
 
 def _stem(stem: str) -> str | None:
-    """A stem as it stands, with its silent e back, or with one of its doubled consonants."""
+    """Return the known verb of a stem: unchanged, with a silent e, or without a doubled consonant."""
     doubled = len(stem) > 2 and stem[-1] == stem[-2]
     return _known(stem, stem + "e", stem[:-1] if doubled else "")
 

@@ -1,4 +1,4 @@
-"""The verbs a task is said with, grouped by what becomes of the nouns around them."""
+"""Known verbs, grouped by the roles that they give to nouns."""
 
 from __future__ import annotations
 
@@ -34,29 +34,29 @@ INSPECTION_VERBS: Final = word_set("check scan inspect survey examine test monit
 LOOKING_VERBS: Final = (
     SEARCH_VERBS | GO_VERBS | word_set("find locate identify detect spot map reconstruct photograph count track avoid")
 )
-# "move to the chair" goes there, "move the chair to the door" takes it there
+# with and without an object: "move to the chair", "move the chair to the door"
 MOVING_VERBS: Final = word_set("move roll run advance return get land park dock drive fly race")
-# "stop behind the car" means the car
+# "stop behind the car": the car is the target
 STOPPING_VERBS: Final = word_set("stop wait stand stay sit park halt pause")
-# "hand the nurse the towel": the first noun is who gets the second
+# "hand the nurse the towel": the first noun is the recipient
 GIVING_VERBS: Final = word_set(
     "hand give bring pass fetch get send offer serve show throw feed find grab lend buy read toss"
 )
-# "keep wiping tables", not "take folding chairs"
+# verbs before a gerund that is the instruction: "keep wiping tables", unlike "take folding chairs"
 ASPECT_VERBS: Final = word_set(
     "start stop begin keep continue finish mind avoid try resume go come consider need want like help"
 )
-# "load the van with boxes" moves the boxes
+# "load the van with boxes": the boxes are the target
 FILLING_VERBS: Final = word_set("load reload stock restock")
-# "the mugs belong in the cupboard", "the boxes go on the shelf": said of things that are to be taken there
+# "the mugs belong in the cupboard", "the boxes go on the shelf": the subject is the target
 BELONGING_VERBS: Final = word_set("belong go come")
-# "the shelf that holds the cans": what is held is near, as nothing is in "the key that opens the cabinet"
+# "the shelf that holds the cans": the object is near the subject, unlike "the key that opens the cabinet"
 HOLDING_VERBS: Final = word_set(
     "hold contain have carry wear support cover store house surround touch face hug hide show display"
 )
 DELIVERY_VERBS: Final = CARRY_VERBS | PLACE_VERBS
 _OTHER_VERBS: Final = word_set(
-    # with the hands
+    # manipulation
     "pick grab grasp lift hold collect gather retrieve remove catch seize lower raise open close shut press push turn "
     "switch rotate touch hit bump knock break disturb move tilt flip fill empty refill squeeze assemble disassemble "
     "manipulate handle serve cook feed harvest prune recycle swap change replace unplug unlock lock light aim stir "
@@ -69,7 +69,7 @@ _OTHER_VERBS: Final = word_set(
     "reboot restart reset silence defrost fertilize reap glean herd milk shear saddle walk pet stroke pat steady "
     "kick punch crank pump flush pry poke tap grip clasp clench pinch yank tug seal unseal cap uncap cork uncork plow "
     "plough till sow flatten level shake strip extract excavate free release trap dismantle demolish rock"
-    # with the eyes and in words
+    # perception and communication
     " find locate identify detect recognize recognise spot seek discover determine point show tell see view observe "
     "monitor photograph capture record map reconstruct model measure count track list report describe mark label "
     "localize localise verify assess evaluate review focus attend concentrate read test document catalog catalogue "
@@ -77,7 +77,7 @@ _OTHER_VERBS: Final = word_set(
     "highlight circle tag annotate classify categorize categorise group separate distinguish estimate calculate weigh "
     "warn alert notify inform remind ask answer reply speak talk say shout call sing play hear listen smell sniff "
     "taste feel sense confirm ensure double-check recount pinpoint trace face eye peek peer glance"
-    # on the way and in general
+    # navigation and general
     " avoid dodge evade circumvent bypass pass circle stop wait stay keep mind beware prepare start begin try help "
     "make use need want know build sit stand step select choose plan compute plot route work supply charge guide lead "
     "obstruct harm damage scratch spill scare wake block interact collide contact dispose hurt crash stain drop "
@@ -86,7 +86,7 @@ _OTHER_VERBS: Final = word_set(
     "guard protect shield defend sleep think believe guess suspect wonder imagine assume expect hope wish remember "
     "recall forget learn teach let allow remain bother worry care belong contain include own steal lose die live "
     "swap switch trade share split merge combine divide bite chew eat drink sip wear dust strew infest shatter"
-    # rarer ones
+    # rare
     " discard dispose abandon absorb accompany acquire aid apply appraise assist beat boost brace bundle center centre "
     "chuck collate comfort compile compress conceal conduct consume convey cradle crop curl cycle dab decant decorate "
     "deflate dip direct discharge dish display dispatch dissolve distribute donate drape ease eject elevate eliminate "
@@ -101,7 +101,7 @@ _OTHER_VERBS: Final = word_set(
     "support house wet rid roam teach greet meet welcome invite introduce accept reject approve reserve book cater "
     "celebrate gift hail signal wink nod shrug point salute collide crack pack unwind sprawl rest recline snooze nap "
     "relax play pose queue gather crowd swarm graze nibble peck hatch roost burrow"
-    # what things do by themselves
+    # processes without an agent
     " fall lie hang lurk dwell float sink drift dangle hover perch bounce skid exist occur happen leak drip flow blink "
     "flash beep ring buzz hum smoke burn glow shine rattle wobble vibrate function fail matter depend grow bloom wilt "
     "rust rot sprout fade crack squeak stink bark meow cry laugh smile wave sway swing spring blow melt overflow "

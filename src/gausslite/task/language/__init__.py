@@ -1,1 +1,1 @@
-"""Language models as parsers: one prompt, one schema, several ways to reach a model (Sec. III-B.1)."""
+"""Language models as task parsers: one prompt, one answer schema, several backends (Sec. III-B.1)."""

@@ -1,4 +1,4 @@
-"""Read what a language model answered, trusting none of it."""
+"""Parse and validate the answer of a language model."""
 
 from __future__ import annotations
 
@@ -16,57 +16,57 @@ _RELATION_KEYS: Final = frozenset({"predicate", "target", "anchor"})
 
 
 def parse_answer(task: str, answer: str) -> TaskGraph:
-    """The task graph of a model's answer, JSON by ANSWER_SCHEMA, perhaps within other text.
+    """Return the task graph of a model's answer: JSON by ANSWER_SCHEMA, possibly inside other text.
 
-    Raises LanguageModelError where the answer breaks the schema, or leaves no target that the task names.
+    Raises LanguageModelError if the answer violates the schema or contains no target that the task names.
     """
-    found = _first_object(answer)
-    if found.keys() != _KEYS:
-        _refuse(f"expected the keys {', '.join(sorted(_KEYS))}, got {len(found)} others")
-    targets, anchors = (_phrases(role, found[role]) for role in ("targets", "anchors"))
+    fields = _first_object(answer)
+    if fields.keys() != _KEYS:
+        _refuse(f"expected the keys {', '.join(sorted(_KEYS))}, got {len(fields)} others")
+    targets, anchors = (_phrases(role, fields[role]) for role in ("targets", "anchors"))
     try:
-        return grounded_graph(task, targets, anchors, _relations(found["relations"]))
+        return grounded_graph(task, targets, anchors, _relations(fields["relations"]))
     except TaskError as error:
         raise LanguageModelError(f"language model: {error}") from error
 
 
 def _first_object(answer: str) -> dict[str, Any]:
-    """The first JSON object of a text: models like to say "Here it is" before it."""
+    """Return the first JSON object of a text; models often write an introduction before it."""
     if len(answer) > MAX_ANSWER_BYTES:
         _refuse(f"expected at most {MAX_ANSWER_BYTES} characters, got {len(answer)}")
     start = answer.find("{")
     if start < 0:
         _refuse("expected a JSON object, got none")
     try:
-        found, _ = json.JSONDecoder().raw_decode(answer[start:])
+        fields, _ = json.JSONDecoder().raw_decode(answer[start:])
     except (ValueError, RecursionError) as error:
-        raise LanguageModelError("language model answer: expected a whole JSON object, got a damaged one") from error
-    return dict(found)
+        raise LanguageModelError("language model answer: expected a complete JSON object, got invalid JSON") from error
+    return dict(fields)
 
 
 def _phrases(role: str, value: object) -> list[str]:
     if not isinstance(value, list) or len(value) > MAX_PHRASES:
-        _refuse(f"expected a list of at most {MAX_PHRASES} {role}, got another thing")
+        _refuse(f"expected a list of at most {MAX_PHRASES} {role}, got something else")
     return [_phrase(each) for each in value]
 
 
 def _phrase(value: object) -> str:
     if not isinstance(value, str) or not 0 < len(value) <= MAX_PHRASE_CHARS or not value.isprintable():
-        _refuse(f"expected printable phrases of up to {MAX_PHRASE_CHARS} characters, got another thing")
+        _refuse(f"expected printable phrases of up to {MAX_PHRASE_CHARS} characters, got something else")
     return value
 
 
 def _relations(value: object) -> list[Relation]:
     if not isinstance(value, list) or len(value) > MAX_RELATIONS:
-        _refuse(f"expected a list of at most {MAX_RELATIONS} relations, got another thing")
+        _refuse(f"expected a list of at most {MAX_RELATIONS} relations, got something else")
     return [_relation(each) for each in value]
 
 
 def _relation(value: object) -> Relation:
     if not isinstance(value, dict) or value.keys() != _RELATION_KEYS or value["predicate"] not in list(Predicate):
-        _refuse(f"expected relations of {', '.join(sorted(_RELATION_KEYS))} with a known predicate, got another thing")
+        _refuse(f"expected relations of {', '.join(sorted(_RELATION_KEYS))} with a known predicate, got something else")
     return Relation(Predicate(value["predicate"]), _phrase(value["target"]), _phrase(value["anchor"]))
 
 
-def _refuse(what: str) -> NoReturn:
-    raise LanguageModelError(f"language model answer: {what}")
+def _refuse(problem: str) -> NoReturn:
+    raise LanguageModelError(f"language model answer: {problem}")

@@ -1,4 +1,4 @@
-"""Any server that speaks OpenAI's chat completions: one POST, one deadline, one bounded answer."""
+"""A language model behind OpenAI's chat completions API: one POST, one total deadline, one bounded answer."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _MAX_ANSWER_TOKENS: Final = 1024
 
 
 class ResponseFormat(StrEnum):
-    """How a server is asked for JSON: not all of them know every dialect."""
+    """How the request asks for JSON; not every server supports all of them."""
 
     JSON_SCHEMA = "json_schema"
     JSON_OBJECT = "json_object"
@@ -32,7 +32,7 @@ class ResponseFormat(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class HttpSettings:
-    """url: the server's base, such as http://localhost:8000/v1; the key is never shown."""
+    """url: the server's base, such as http://localhost:8000/v1; the key is never logged."""
 
     url: str
     model: str
@@ -43,11 +43,11 @@ class HttpSettings:
     def __post_init__(self) -> None:
         try:
             parts = urlsplit(self.url)
-            usable = parts.scheme in ("http", "https") and bool(parts.hostname) and parts.port != 0
+            is_valid = parts.scheme in ("http", "https") and bool(parts.hostname) and parts.port != 0
         except ValueError:
-            usable = False
-        if not usable or not self.url.isascii() or any(character.isspace() for character in self.url):
-            raise InvalidInputError("backend http url: expected http://localhost:8000/v1 or alike, got another thing")
+            is_valid = False
+        if not is_valid or not self.url.isascii() or any(character.isspace() for character in self.url):
+            raise InvalidInputError("backend http url: expected a URL like http://localhost:8000/v1, got another text")
         if parts.username is not None or parts.password is not None or parts.query or parts.fragment:
             raise InvalidInputError("backend http url: expected no user, password, query or fragment, got one")
         if not self.model.strip():
@@ -59,7 +59,7 @@ class HttpSettings:
 
 
 class HttpLanguageModel:
-    """A LanguageModel behind a URL. Follows no redirect, so that the key goes nowhere else."""
+    """A LanguageModel behind a URL. Redirects are not followed, so that the key stays with this server."""
 
     def __init__(self, settings: HttpSettings) -> None:
         self._settings = settings
@@ -67,35 +67,38 @@ class HttpLanguageModel:
 
     @property
     def version(self) -> str:
-        """The server, the model's name and the dialect."""
+        """The server, the model's name and the response format."""
         return f"{self._settings.url} {self._settings.model} {self._settings.response_format}"
 
     def complete(self, messages: Sequence[Message]) -> str:
-        """The text of the first choice. Raises LanguageModelError."""
+        """Return the text of the first choice. Raises LanguageModelError."""
         connection = self._connection()
         deadline_s = time.monotonic() + self._settings.timeout_s
         try:
-            with _cut_at(deadline_s) as (cut, sockets):
+            with _close_sockets_at(deadline_s) as (expired, sockets):
                 try:
                     connection.connect()
                     sockets.append(connection.sock)
                     status, body = self._exchange(connection, messages)
                 except (OSError, http.client.HTTPException, ValueError) as error:
-                    if cut.is_set() or isinstance(error, TimeoutError):
-                        within = f"{self._settings.timeout_s:g} s"
-                        raise LanguageModelError(f"language model: no answer within {within}") from None
+                    if expired.is_set() or isinstance(error, TimeoutError):
+                        raise LanguageModelError(self._timeout_message()) from None
                     raise LanguageModelError(f"language model: the call failed with {type(error).__name__}") from None
         finally:
             connection.close()
-        if cut.is_set():
-            raise LanguageModelError(f"language model: no answer within {self._settings.timeout_s:g} s")
+        if expired.is_set():
+            raise LanguageModelError(self._timeout_message())
         if status != http.client.OK:
             raise LanguageModelError(f"language model: expected status 200, got {status}")
         return _content_of(body)
 
+    def _timeout_message(self) -> str:
+        return f"language model: no answer within {self._settings.timeout_s:g} s"
+
     def _connection(self) -> http.client.HTTPConnection:
-        kind = http.client.HTTPSConnection if self._parts.scheme == "https" else http.client.HTTPConnection
-        return kind(self._parts.hostname or "", self._parts.port, timeout=self._settings.timeout_s)
+        secure = self._parts.scheme == "https"
+        connection_type = http.client.HTTPSConnection if secure else http.client.HTTPConnection
+        return connection_type(self._parts.hostname or "", self._parts.port, timeout=self._settings.timeout_s)
 
     def _exchange(self, connection: http.client.HTTPConnection, messages: Sequence[Message]) -> tuple[int, bytes]:
         headers = {"Content-Type": "application/json", "Accept": "application/json"}
@@ -127,25 +130,25 @@ class HttpLanguageModel:
 
 
 @contextmanager
-def _cut_at(deadline_s: float) -> Iterator[tuple[threading.Event, list[socket.socket]]]:
-    """Shut the sockets at the deadline: a socket's own time-out begins anew with every byte that drips in.
+def _close_sockets_at(deadline_s: float) -> Iterator[tuple[threading.Event, list[socket.socket]]]:
+    """Shut down the listed sockets at the deadline; a socket's own timeout restarts with every received byte.
 
-    They are handed over because a connection forgets its socket once the response owns it.
+    The caller appends its socket to the list, because a connection drops its socket once the response owns it.
     """
-    cut = threading.Event()
+    expired = threading.Event()
     sockets: list[socket.socket] = []
 
-    def shut() -> None:
-        cut.set()
+    def shut_down() -> None:
+        expired.set()
         for each in sockets:
-            with suppress(OSError):  # it has ended by itself
+            with suppress(OSError):  # already closed
                 each.shutdown(socket.SHUT_RDWR)
 
-    timer = threading.Timer(max(0.0, deadline_s - time.monotonic()), shut)
+    timer = threading.Timer(max(0.0, deadline_s - time.monotonic()), shut_down)
     timer.daemon = True
     timer.start()
     try:
-        yield cut, sockets
+        yield expired, sockets
     finally:
         timer.cancel()
 
@@ -153,11 +156,11 @@ def _cut_at(deadline_s: float) -> Iterator[tuple[threading.Event, list[socket.so
 def _content_of(body: bytes) -> str:
     try:
         choice = json.loads(body)["choices"][0]
-        content, ended = choice["message"]["content"], choice.get("finish_reason")
+        content, finish_reason = choice["message"]["content"], choice.get("finish_reason")
     except (ValueError, LookupError, TypeError, AttributeError, RecursionError):
-        raise LanguageModelError("language model: expected choices[0].message.content, got another thing") from None
-    if ended == "length":
+        raise LanguageModelError("language model: expected choices[0].message.content, got something else") from None
+    if finish_reason == "length":
         raise LanguageModelError(f"language model: an answer within {_MAX_ANSWER_TOKENS} tokens was cut off")
     if not isinstance(content, str):
-        raise LanguageModelError("language model: expected text as the answer, got another thing")
+        raise LanguageModelError("language model: expected text as the answer, got something else")
     return content

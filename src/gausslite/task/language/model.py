@@ -1,4 +1,4 @@
-"""The seam to a language model: messages in, one bounded answer out."""
+"""The interface of language models: chat messages in, one bounded answer out."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ MAX_ANSWER_BYTES = 64 * 1024
 
 
 class Role(StrEnum):
-    """Who says a message of a chat."""
+    """Author of a chat message."""
 
     SYSTEM = "system"
     USER = "user"
@@ -28,13 +28,13 @@ class Message:
 
 @runtime_checkable
 class LanguageModel(Protocol):
-    """Answers a chat. May be slow; may be called from several threads."""
+    """Complete a chat. Calls may take seconds and may come from several threads."""
 
     @property
     def version(self) -> str:
-        """What distinguishes this model's answers from another's."""
+        """Identifies the model, so that cached answers of another model are not reused."""
         ...
 
     def complete(self, messages: Sequence[Message]) -> str:
-        """The answer, at most MAX_ANSWER_BYTES long. Raises LanguageModelError."""
+        """Return the answer, at most MAX_ANSWER_BYTES long. Raises LanguageModelError."""
         ...

@@ -1,4 +1,4 @@
-"""A Phi-3 style model on this machine, through onnxruntime-genai, held to the answer's schema token by token."""
+"""A local Phi-3 model through onnxruntime-genai, with decoding constrained to the answer schema."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from gausslite.task.language.prompt import ANSWER_SCHEMA
 
 _CONFIG: Final = "genai_config.json"
 _MAX_CONFIG_BYTES: Final = 1 << 20
-# whitespace that a grammar leaves free is what small models lose themselves in
+# small models otherwise generate whitespace without end
 _GUIDANCE: Final = json.dumps({**ANSWER_SCHEMA, "x-guidance": {"whitespace_flexible": False}})
 
 
 class OnnxLanguageModel:
-    """A LanguageModel from a folder with genai_config.json. Answers one chat at a time; others wait, with a limit."""
+    """A LanguageModel from a folder with genai_config.json. Answers one chat at a time; others wait up to timeout_s."""
 
     def __init__(self, folder: Path, timeout_s: float = 30.0, max_answer_tokens: int = 1024) -> None:
-        """Loads the model: seconds. Raises ModelFileError, InvalidInputError without the extra `llm`."""
+        """Load the model, which takes seconds. Raises ModelFileError, and InvalidInputError without the extra `llm`."""
         config = _config_of(folder)
         try:
             import onnxruntime_genai
@@ -36,7 +36,7 @@ class OnnxLanguageModel:
         try:
             self._model = onnxruntime_genai.Model(str(folder))
             self._tokenizer = onnxruntime_genai.Tokenizer(self._model)
-        except Exception as error:  # the binding raises bare RuntimeErrors, and others by version
+        except Exception as error:  # the exception types differ between versions of the binding
             raise ModelFileError(
                 f"{folder}: expected a model for onnxruntime-genai, got one that fails to load"
             ) from error
@@ -45,34 +45,34 @@ class OnnxLanguageModel:
         self._timeout_s = timeout_s
         self._max_answer_tokens = max_answer_tokens
         self._version = _version_of(folder, config)
-        self._turn = threading.Lock()
+        self._lock = threading.Lock()
 
     @property
     def version(self) -> str:
-        """The folder's name and a digest of its configuration and file sizes."""
+        """The folder's name and a hash of its configuration and file sizes."""
         return self._version
 
     def complete(self, messages: Sequence[Message]) -> str:
-        """The greedy answer, schema-valid. Raises LanguageModelError when it takes too long or would be cut off."""
+        """Return the greedy, schema-valid answer. Raises LanguageModelError if it is too slow or too long."""
         deadline_s = time.monotonic() + self._timeout_s
-        if not self._turn.acquire(timeout=self._timeout_s):
-            raise LanguageModelError(f"language model: no turn within {self._timeout_s:g} s")
+        if not self._lock.acquire(timeout=self._timeout_s):
+            raise LanguageModelError(f"language model: busy for more than {self._timeout_s:g} s")
         try:
             return self._answer(phi3_chat(messages), deadline_s)
         except LanguageModelError:
             raise
-        except Exception as error:  # as above
+        except Exception as error:  # as in __init__
             raise LanguageModelError(f"language model: it failed with {type(error).__name__}") from error
         finally:
-            self._turn.release()
+            self._lock.release()
 
     def _answer(self, chat: str, deadline_s: float) -> str:
         prompt = self._tokenizer.encode(chat)
-        most = min(len(prompt) + self._max_answer_tokens, self._context_tokens)
-        if most <= len(prompt):
-            raise LanguageModelError(f"language model: expected a prompt within {most} tokens, got {len(prompt)}")
+        max_tokens = min(len(prompt) + self._max_answer_tokens, self._context_tokens)
+        if max_tokens <= len(prompt):
+            raise LanguageModelError(f"language model: expected a prompt within {max_tokens} tokens, got {len(prompt)}")
         params = self._genai.GeneratorParams(self._model)
-        params.set_search_options(max_length=most, do_sample=False)
+        params.set_search_options(max_length=max_tokens, do_sample=False)
         params.set_guidance("json_schema", _GUIDANCE)
         generator = self._genai.Generator(self._model, params)
         generator.append_tokens(prompt)
@@ -81,16 +81,16 @@ class OnnxLanguageModel:
                 raise LanguageModelError(f"language model: no answer within {self._timeout_s:g} s")
             generator.generate_next_token()
         tokens = generator.get_sequence(0)
-        # at max_length the library stops without a word, in the middle of a string if need be
-        if len(tokens) >= most and int(tokens[-1]) not in self._ends:
-            raise LanguageModelError(f"language model: an answer within {most - len(prompt)} tokens was cut off")
+        # at max_length the library stops silently, even in the middle of a string
+        if len(tokens) >= max_tokens and int(tokens[-1]) not in self._ends:
+            raise LanguageModelError(f"language model: an answer within {max_tokens - len(prompt)} tokens was cut off")
         return str(self._tokenizer.decode(tokens[len(prompt) :]))
 
 
 def phi3_chat(messages: Sequence[Message]) -> str:
-    """A chat in the template of Phi-3; what a task holds of its marks is broken up."""
-    said = "".join(f"<|{each.role}|>\n{each.text.replace('<|', '< |')}<|end|>\n" for each in messages)
-    return f"{said}<|assistant|>\n"
+    """Return a chat in the template of Phi-3; template markers inside the messages are escaped."""
+    chat = "".join(f"<|{each.role}|>\n{each.text.replace('<|', '< |')}<|end|>\n" for each in messages)
+    return f"{chat}<|assistant|>\n"
 
 
 def _config_of(folder: Path) -> bytes:

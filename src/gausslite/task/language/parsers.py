@@ -1,4 +1,4 @@
-"""Task parsers around a language model: ask it, remember what it said, and go without it when it fails."""
+"""Task parsers around a language model: query it, cache its answers, and fall back to rules if it fails."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _log: Final = logging.getLogger(__name__)
 
 
 class LanguageParser:
-    """A TaskParser that asks a language model. Its `parse` raises LanguageModelError besides TaskError."""
+    """A TaskParser that queries a language model. Its `parse` also raises LanguageModelError."""
 
     def __init__(self, model: LanguageModel) -> None:
         self._model = model
@@ -32,29 +32,29 @@ class LanguageParser:
         return f"{self._model.version}, prompt {PROMPT_VERSION}"
 
     def parse(self, text: str) -> TaskGraph:
-        """The graph that the model answers, without what the sentence does not say."""
+        """Return the model's graph, without nouns that the sentence does not mention."""
         require_task_text(text)
         return parse_answer(text, self._model.complete(messages_for(text)))
 
 
 class CachedParser:
-    """A TaskParser that keeps the latest answers by task text, backend and version; failures are not kept."""
+    """A TaskParser with an LRU cache by task text, backend and version; failures are not cached."""
 
     def __init__(self, parser: TaskParser, backend: str, version: str, capacity: int = CACHED_ANSWERS) -> None:
         self._parser = parser
-        self._made_by = (backend, version)
+        self._source = (backend, version)
         self._capacity = capacity
         self._lock = threading.Lock()
         self._answers: OrderedDict[tuple[str, str, str], TaskGraph] = OrderedDict()
 
     def parse(self, text: str) -> TaskGraph:
-        """The graph of one task, from memory if it was asked for lately."""
-        key = (text, *self._made_by)
+        """Return the graph of one task, from the cache if it is there."""
+        key = (text, *self._source)
         with self._lock:
-            known = self._answers.get(key)
-            if known is not None:
+            cached = self._answers.get(key)
+            if cached is not None:
                 self._answers.move_to_end(key)
-                return known
+                return cached
         graph = self._parser.parse(text)
         with self._lock:
             self._answers[key] = graph
@@ -64,19 +64,19 @@ class CachedParser:
 
 
 class FallbackParser:
-    """A TaskParser that lets another one answer where a language model fails, and says so in the warnings."""
+    """A TaskParser that uses another parser if the language model fails, and adds a warning."""
 
-    def __init__(self, parser: TaskParser, backend: str, otherwise: TaskParser) -> None:
+    def __init__(self, parser: TaskParser, backend: str, fallback: TaskParser) -> None:
         self._parser = parser
         self._backend = backend
-        self._otherwise = otherwise
+        self._fallback = fallback
 
     def parse(self, text: str) -> TaskGraph:
-        """The graph of one task. Raises TaskError."""
+        """Return the graph of one task. Raises TaskError."""
         try:
             return self._parser.parse(text)
         except LanguageModelError as error:
-            _log.info("%s: %s; read by rules", self._backend, error)
-            said = f"backend {self._backend} failed ({error}): read by rules"
-        graph = self._otherwise.parse(text)
-        return replace(graph, warnings=(said, *graph.warnings)[: LIMITS.max_warnings])
+            _log.info("%s: %s; parsed by rules", self._backend, error)
+            warning = f"backend {self._backend} failed ({error}): parsed by rules"
+        graph = self._fallback.parse(text)
+        return replace(graph, warnings=(warning, *graph.warnings)[: LIMITS.max_warnings])

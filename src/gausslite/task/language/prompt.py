@@ -1,4 +1,4 @@
-"""What a language model is asked: the schema of its answer, and a few examples of our own."""
+"""The prompt for language models: rules, examples, and the JSON schema of the answer."""
 
 from __future__ import annotations
 
@@ -65,10 +65,10 @@ _EXAMPLES: Final = (
 
 
 def messages_for(task: str) -> tuple[Message, ...]:
-    """The chat that asks for one task: the rules, the examples, the task."""
-    shots = [
+    """Return the chat for one task: the rules, the examples, the task."""
+    examples = [
         message
-        for asked, answered in _EXAMPLES
-        for message in (Message(Role.USER, asked), Message(Role.ASSISTANT, answered))
+        for question, answer in _EXAMPLES
+        for message in (Message(Role.USER, question), Message(Role.ASSISTANT, answer))
     ]
-    return (Message(Role.SYSTEM, _RULES), *shots, Message(Role.USER, " ".join(task.split())))
+    return (Message(Role.SYSTEM, _RULES), *examples, Message(Role.USER, " ".join(task.split())))
