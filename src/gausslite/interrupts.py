@@ -1,7 +1,7 @@
-"""A known end for Ctrl-C and SIGTERM: without a traceback while a program starts, between two steps of its work later.
+"""Handle Ctrl-C and SIGTERM: end quietly during start-up, and after the current step of the work later.
 
-Programs call `end_quietly_while_starting` before they import anything else, because most of a start is imports. A
-handler of our own and not the system's, because the first process of a container ignores signals it has no handler for.
+Programs call `end_quietly_while_starting` before their other imports, because imports take most of the start-up. The
+handler is our own and not the system's default, because process 1 of a container ignores signals without a handler.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 class _QuietEnd:
-    """A signal handler that ends the process at once; nothing that would need closing has been opened yet."""
+    """A signal handler that ends the process at once; during start-up nothing is open that needs closing."""
 
     def __init__(self, program: str) -> None:
         self._program = program
@@ -26,13 +26,13 @@ class _QuietEnd:
 
 
 def end_quietly_while_starting(program: str) -> None:
-    """From now on SIGINT and SIGTERM end the process with code 130 or 143. Call it on the main thread."""
+    """End the process with code 130 or 143 on SIGINT or SIGTERM, until `started`. Call it on the main thread."""
     for number in _SIGNALS:
         signal.signal(number, _QuietEnd(program))
 
 
 def started() -> None:
-    """Give both signals back Python's own meaning, unless somebody else has taken them since."""
+    """Restore Python's own handling of both signals, unless another handler has been installed."""
     if isinstance(signal.getsignal(signal.SIGINT), _QuietEnd):
         signal.signal(signal.SIGINT, signal.default_int_handler)
     if isinstance(signal.getsignal(signal.SIGTERM), _QuietEnd):
@@ -40,35 +40,35 @@ def started() -> None:
 
 
 class Terminated(KeyboardInterrupt):
-    """SIGTERM, as what Ctrl-C is to Python."""
+    """SIGTERM, raised as Python raises KeyboardInterrupt for SIGINT."""
 
 
 class DeferredInterrupt:
-    """Within it the first Ctrl-C or SIGTERM is only noted, so that the step at hand is finished and kept.
+    """A context that records the first Ctrl-C or SIGTERM, so that the current step can be completed.
 
-    asked is then what to raise in the end; a second signal raises it at once. Away from the main thread, which alone
-    may take signals, nothing changes.
+    requested is the exception to raise afterwards; a second signal raises it at once. Only the main thread can handle
+    signals; on other threads the context changes nothing.
     """
 
     def __init__(self) -> None:
-        self.asked: KeyboardInterrupt | None = None
-        self._takes_signals = threading.current_thread() is threading.main_thread()
-        self._before = {number: signal.getsignal(number) for number in _SIGNALS}
+        self.requested: KeyboardInterrupt | None = None
+        self._on_main_thread = threading.current_thread() is threading.main_thread()
+        self._previous = {number: signal.getsignal(number) for number in _SIGNALS}
 
     def __enter__(self) -> DeferredInterrupt:
-        if self._takes_signals:
+        if self._on_main_thread:
             for number in _SIGNALS:
-                signal.signal(number, self._note)
+                signal.signal(number, self._record)
         return self
 
     def __exit__(
         self, _kind: type[BaseException] | None, _error: BaseException | None, _: TracebackType | None
     ) -> None:
-        if self._takes_signals:
-            for number, handler in self._before.items():
+        if self._on_main_thread:
+            for number, handler in self._previous.items():
                 signal.signal(number, handler)
 
-    def _note(self, number: int, _frame: FrameType | None) -> None:
-        if self.asked is not None:
-            raise self.asked
-        self.asked = Terminated() if number == signal.SIGTERM else KeyboardInterrupt()
+    def _record(self, number: int, _frame: FrameType | None) -> None:
+        if self.requested is not None:
+            raise self.requested
+        self.requested = Terminated() if number == signal.SIGTERM else KeyboardInterrupt()

@@ -36,7 +36,8 @@ def frames(count: int) -> list[Frame]:
 class FaintAndWrong:
     """Finds one of the mugs, faintly, and a vase in the first frame that is none."""
 
-    warnings: tuple[str, ...] = ()
+    def unsupported(self, queries: Sequence[str]) -> tuple[str, ...]:
+        return ()
 
     def detect(self, frame: Frame, queries: Sequence[str]) -> list[Detection]:
         mug = REGIONS["mug_1"].mask(frame)

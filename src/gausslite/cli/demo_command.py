@@ -34,7 +34,7 @@ from gausslite.evaluation.compare import MapScores
 from gausslite.evaluation.pictures import write_png
 from gausslite.evaluation.team import HeldOutFrames, TeamScores, score_team
 from gausslite.fusion.limits import MAX_REFINE_ITERATIONS
-from gausslite.mission.build import open_networks
+from gausslite.mission.build import open_models
 from gausslite.mission.results import prepare_folder, write_json
 from gausslite.mission.settings import MissionSettings
 from gausslite.perception.vocabulary import same_kind
@@ -120,7 +120,7 @@ def _require_usable(options: argparse.Namespace) -> None:
         threads=options.threads,
     )
     VoxelGrid(options.voxel_size)
-    open_networks(perception_settings(options))
+    open_models(perception_settings(options))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from gausslite.cli.progress import progress_bar
-from gausslite.cli.source_options import add_regions, add_source, asked_regions, open_with_warnings
+from gausslite.cli.source_options import add_regions, add_source, open_with_warnings, selected_regions
 from gausslite.codec.ply import read_ply
 from gausslite.config.values import AUTO, NONE, read_depth_registration
 from gausslite.datasets.held_out import HeldOutSplit
@@ -56,7 +56,7 @@ def run(options: argparse.Namespace) -> int:
         positions = HeldOutSplit(options.test_every).split(positions)[1]
         if not positions:
             raise DatasetError(f"--test-every {options.test_every}: expected at least that many frames, got fewer")
-    chosen = asked_regions(options, source)
+    chosen = selected_regions(options, source)
     size = frame_size(options.size, source)
     viewer = MapViewer(gaussians, rasterizer)
     if options.pictures is not None:

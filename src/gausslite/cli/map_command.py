@@ -1,279 +1,183 @@
-"""`gausslite map`: one sequence, one task, one map."""
+"""`gausslite map`: map one sequence, for a task, for regions or uniformly."""
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+import sys
 from pathlib import Path
 
-from gausslite.calibration.pose_exposure_prior import PoseExposurePrior
-from gausslite.cli.mapping_run import MappingRun, Mission
-from gausslite.cli.parse_command import as_json
-from gausslite.cli.source_options import (
-    add_regions,
-    add_source,
-    asked_regions,
-    open_recorded,
-    register_with_warnings,
-    resolve_pose_prior,
-)
-from gausslite.config.mapping_options import add_budget, add_detector, add_policy, mission_settings, perception_settings
-from gausslite.config.values import AUTO, NONE, read_depth_registration, read_pose_prior
-from gausslite.datasets.held_out import HeldOutSplit
-from gausslite.datasets.registered_source import DepthRegistration
-from gausslite.datasets.selection import frame_size, select_frames
-from gausslite.datasets.source import Source
+from gausslite.cli.map_inputs import MapInputs, has_regions, region_estimator
+from gausslite.cli.progress import MappingBar, print_above_bar
+from gausslite.cli.source_options import add_regions, add_source
+from gausslite.config.mapping_options import add_budget, add_detector, add_policy
+from gausslite.config.values import AUTO
 from gausslite.domain.gaussians import Gaussians
-from gausslite.domain.task import TaskGraph
-from gausslite.errors import DatasetError, InvalidInputError
+from gausslite.errors import DatasetError
 from gausslite.evaluation.pictures import write_png
 from gausslite.evaluation.preview import render_preview
 from gausslite.evaluation.views import MapViewer
-from gausslite.mapping.policies import TASK
-from gausslite.mission.build import RelevanceEstimatorFactory, build_estimator, build_mapper
-from gausslite.mission.checkpoint import ResumeConfig, SavedRun, save_run
+from gausslite.mission.build import EstimatorFactory, build_mapper
+from gausslite.mission.checkpoint import SavedRun, save_run
 from gausslite.mission.frame_scheduler import FrameScheduler
-from gausslite.mission.results import PREVIEW, peak_rss_mib, prepare_beside, prepare_folder, write_results
-from gausslite.mission.settings import MissionSettings, SceneInfo
+from gausslite.mission.frame_stream import CorruptFrames
+from gausslite.mission.results import (
+    PREVIEW,
+    peak_rss_mib,
+    prepare_file_next_to,
+    prepare_folder,
+    require_no_map,
+    write_results,
+)
+from gausslite.mission.runner import MissionResult, MissionRunner
+from gausslite.mission.settings import SceneInfo
 from gausslite.mission.task_mapper import TaskMapper
-from gausslite.mission.task_schedule import TaskSchedule, TaskSwitch
-from gausslite.perception.fixed_relevance import NoTaskEstimator, RegionRelevanceEstimator
+from gausslite.mission.task_schedule import ScheduledTaskMapper
 from gausslite.perception.relevance_estimator import RelevanceEstimator
 from gausslite.render.choose import choose_rasterizer
+
+_NOT_RESUMED = -1
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the options of `gausslite map`."""
     add_source(parser, default_text=AUTO)
-    parser.add_argument(
-        "--task", metavar="TEXT", help='what the robot is to do, such as "Pick up the mug on the table"'
-    )
+    parser.add_argument("--strict", action="store_true", help="end at a frame that cannot be read (default: skip it)")
+    parser.add_argument("--task", metavar="TEXT", help='the robot\'s task, such as "Pick up the mug on the table"')
     parser.add_argument(
         "--task-at",
         metavar="FRAME:TASK",
         action="append",
         default=[],
-        help="another task from this frame number on; may be repeated",
+        help="switch to another task at this frame number; may be repeated",
     )
     add_detector(parser)
     add_regions(parser)
     add_policy(parser, allow_auto=True)
     add_budget(parser)
-    parser.add_argument("--test-every", metavar="N", type=int, help="keep every Nth frame from mapping, for `eval`")
-    parser.add_argument(
-        "--out", metavar="DIR", type=Path, required=True, help="gets map.ply, report.json and preview.png"
-    )
-    add = parser.add_argument_group("save and resume").add_argument
-    add("--save-state", metavar="FILE", type=Path, help="save the whole run here at its end, to go on with --resume")
-    add("--resume", metavar="FILE", type=Path, help="go on from a saved run, with the frames after its last one")
+    parser.add_argument("--test-every", metavar="N", type=int, help="keep every N-th frame from mapping, for `eval`")
+    add = parser.add_argument_group("output").add_argument
+    add("--out", metavar="DIR", type=Path, required=True, help="folder for map.ply, report.json and preview.png")
+    add("--overwrite", action="store_true", help="replace a map in --out (--resume does so without this option)")
+    add("--save-state", metavar="FILE", type=Path, help="save the whole run here at its end, for --resume")
+    add("--resume", metavar="FILE", type=Path, help="continue a saved run with the frames after its last one")
     parser.set_defaults(run=run)
 
 
 def run(options: argparse.Namespace) -> int:
-    """Map the sequence and write the results; whatever can be told before the work is."""
-    asked = _Asked.of(options)
+    """Map the sequence and write the results. Errors in the options are raised before the work starts."""
+    if options.resume is None and not options.overwrite:
+        require_no_map(options.out)
+    inputs = MapInputs.of(options)
     saved = None if options.resume is None else SavedRun.read(options.resume)
     if saved is not None:
-        asked = asked.as_saved(options, saved)
+        inputs = inputs.resumed(options, saved)
     prepare_folder(options.out)
     if options.save_state is not None:
-        prepare_beside(options.save_state, options.out)
-    last_index = -1 if saved is None else saved.last_index
-    graph = asked.plan.at(last_index)
-    recorded = asked.source
-    attentions = RelevanceEstimatorFactory(perception_settings(options), lambda: SceneInfo.of(recorded))
-    attention = _region_attention(options, recorded) if graph is None else attentions.to(graph)
+        prepare_file_next_to(options.save_state, options.out)
+    resumed_after = _NOT_RESUMED if saved is None else saved.last_index
+    estimators = EstimatorFactory(inputs.perception, lambda: SceneInfo.of(inputs.stream.source))
+    estimator = _first_estimator(options, inputs, estimators, resumed_after)
     if saved is None:
-        asked = asked.looked_at(options)
-    mapper = TaskMapper(
-        attention, build_mapper(asked.settings), scheduler=FrameScheduler(asked.settings.scheduler_settings)
-    )
+        inputs = inputs.calibrated(options)
+    scheduler = FrameScheduler(inputs.mission.scheduler_settings)
+    mapper = TaskMapper(estimator, build_mapper(inputs.mission), scheduler=scheduler)
     if saved is not None:
         saved.restore(mapper)
-        saved = None  # as large as the map and its keyframes, and copied
-    mission = MappingRun(asked.source, asked.size, mapper, asked.plan, attentions).play(asked.after(last_index), graph)
-    if not mission.outcomes and mission.stopped is not None:
-        raise mission.stopped
-    gaussians = mapper.gaussians()
-    if len(gaussians) == 0 and mission.outcomes and all(each.skipped is not None for each in mission.outcomes):
-        raise DatasetError(f"{options.source}: expected frames with depth, got none in {len(mission.outcomes)}")
-    notes = (*mapper.notes, *_unseen(options, mission))
-    report = {**asked.report(options), **mission.summary(), **_held(mapper, gaussians), "notes": list(notes)}
-    write_results(options.out, gaussians, report)
-    if mapper.keyframes():
-        viewer = MapViewer(gaussians, choose_rasterizer(asked.settings.backend, asked.settings.threads))
-        write_png(options.out / PREVIEW, render_preview(viewer, mapper.keyframes()))
-    if options.save_state is not None:
-        last_index = mission.outcomes[-1].index if mission.outcomes else last_index
-        save_run(options.save_state, mapper, asked.terms(options, last_index), last_index)
-    if mission.stopped is not None:
-        # what was mapped until then is kept, and the exit code says that it is not all
-        raise mission.stopped
-    skipped = f" ({report['frames_skipped']} skipped, without depth)" if report["frames_skipped"] else ""
-    print(
-        f"{report['frames']} frames{skipped} at {report['hz']:.1f} Hz, {len(gaussians)} Gaussians "
-        f"({report['active_gaussians']} of the task) → {options.out / 'map.ply'}; look at {PREVIEW} beside it"
-    )
-    for note in notes:
-        print(f"  {note}")
+        saved = None  # its arrays, as large as the map and the keyframes, have been copied
+    mapping = _Run(options, inputs, mapper)
+    result = mapping.map_frames(estimators, resumed_after)
+    if result.processed == 0:
+        result.raise_if_stopped()
+    mapping.write_results(result)
+    # an early end keeps the map so far; the exit code reports it
+    result.raise_if_stopped()
+    mapping.print_results(result)
     return 0
 
 
-@dataclass(frozen=True, slots=True)
-class _Asked:
-    """What the command line asks for, as far as it can be known without drawing, loading or training anything.
+class _Run:
+    """One run: its frame loop and its results."""
 
-    Views are trusted and frames are as recorded until the sequence is looked at, which takes seconds.
-    """
+    def __init__(self, options: argparse.Namespace, inputs: MapInputs, mapper: TaskMapper) -> None:
+        self._options = options
+        self._inputs = inputs
+        self._mapper = mapper
+        self._corrupt = CorruptFrames(print_above_bar)
+        self._gaussians = Gaussians.empty()
+        self._report: dict[str, object] = {}
+        self._notes: tuple[str, ...] = ()
 
-    settings: MissionSettings
-    source: Source
-    positions: Sequence[int]
-    size: tuple[int, int]
-    plan: TaskSchedule
-    depth_registration: DepthRegistration | None
+    def map_frames(self, estimators: EstimatorFactory, resumed_after: int) -> MissionResult:
+        """Map the frames after an index. Raises DatasetError if frames exist and none of them can be used."""
+        inputs, options = self._inputs, self._options
+        stream, schedule = inputs.stream.after(resumed_after), inputs.schedule
+        scheduled = ScheduledTaskMapper(self._mapper, schedule, estimators, schedule.at(resumed_after))
+        frames = stream.frames(None if options.strict else self._corrupt)
+        with MappingBar(len(stream)) as bar:
+            checkpoint = None if options.save_state is None else self._save
+            result = MissionRunner(scheduled.process, bar.count, checkpoint).run(frames, resumed_after)
+        if result.processed == 0 and self._corrupt.first_error is not None:
+            raise self._corrupt.first_error
+        self._gaussians = self._mapper.gaussians()
+        if len(self._gaussians) == 0 and result.totals.frames == 0 and result.processed > 0:
+            raise DatasetError(f"{options.source}: expected frames with depth, got none in {result.processed}")
+        return result
 
-    @classmethod
-    def of(cls, options: argparse.Namespace) -> _Asked:
-        settings = mission_settings(options)
-        plan = _plan(asked_task(options), [TaskSwitch.parse(text) for text in options.task_at])
-        source = open_recorded(options.source, options.up)
-        positions, size = select_frames(source, options.frames), frame_size(options.size, source)
-        if options.test_every is not None:
-            positions, _ = HeldOutSplit(options.test_every).split(positions)
-        return cls(settings, source, positions, size, plan, None)
-
-    def looked_at(
-        self,
-        options: argparse.Namespace,
-        camera: DepthRegistration | str | None = None,
-        pose_prior: PoseExposurePrior | None = None,
-    ) -> _Asked:
-        """With the camera and trust that are asked for, or given here; what is neither is looked for in the frames."""
-        given = options.register_depth if camera is None else camera
-        source, registered_to = register_with_warnings(options.source, self.source, given, AUTO)
-        believed = resolve_pose_prior(options.source, source, options.pose_prior if pose_prior is None else pose_prior)
-        settings = replace(self.settings, pose_prior=believed)
-        return replace(self, settings=settings, source=source, depth_registration=registered_to)
-
-    def as_saved(self, options: argparse.Namespace, saved: SavedRun) -> _Asked:
-        """looked_at, where what was found is that of a saved run. Raises MismatchError where it had other terms."""
-        camera, pose_prior = None, None
-        if options.register_depth in (None, AUTO):
-            camera = read_depth_registration(saved.terms.options.get("colour_camera") or NONE)
-        if options.pose_prior == AUTO:
-            pose_prior = read_pose_prior(saved.terms.options.get("view_error") or NONE)
-        asked = self.looked_at(options, camera, pose_prior)
-        saved.require(asked.terms(options, saved.last_index))
-        return asked
-
-    def terms(self, options: argparse.Namespace, last_index: int) -> ResumeConfig:
-        """What must be the same when a run goes on after the frame of this number."""
-        graph = self.plan.at(last_index)
-        return ResumeConfig.of(
-            self.settings,
-            size=f"{self.size[0]}x{self.size[1]}",
-            task="" if graph is None else graph.text,
-            colour_camera="" if self.depth_registration is None else str(self.depth_registration),
-            up="" if options.up is None else ",".join(map(str, options.up)),
-            **{name: _file_name(getattr(options, name)) for name in ("detector", "segmenter", "vocabulary", "roi")},
-            resegment="yes" if options.resegment else "",
-            objects=",".join(options.objects),
-            hold_out="" if options.test_every is None else str(options.test_every),
-            roi_ball=" ".join(f"{','.join(map(str, ball.centre_m))},{ball.radius_m}" for ball in options.roi_ball),
-        )
-
-    def after(self, index: int) -> list[int]:
-        """The positions of the frames with greater numbers."""
-        indices = self.source.indices()
-        return [position for position in self.positions if indices[position] > index]
-
-    def report(self, options: argparse.Namespace) -> dict[str, object]:
-        """As a part of the report."""
-        first = self.plan.first
-        return {
-            "source": options.source,
-            "colour_camera": None if self.depth_registration is None else str(self.depth_registration),
-            "view_error": None if self.settings.pose_prior.is_exact else str(self.settings.pose_prior),
-            "task": None if first is None else {"text": first.text, **as_json(first)},
-            "then": [{"frame": frame, "text": later.text, **as_json(later)} for frame, later in self.plan.turns],
-            "policy": options.policy,
-            "without": sorted(self.settings.disabled),
-            "size": list(self.size),
-            "seed": self.settings.seed,
-            "max_gaussians": self.settings.max_gaussians,
-            "hold_out": options.test_every,
+    def write_results(self, result: MissionResult) -> None:
+        """Write map.ply, report.json and preview.png. Raises StorageError."""
+        options, mission = self._options, self._inputs.mission
+        self._notes = (*self._mapper.notes, *_unseen_notes(options, result))
+        self._report = {
+            **self._inputs.report(),
             "resumed_from": None if options.resume is None else str(options.resume),
+            **result.summary(),
+            "frames_corrupt": self._corrupt.count,
+            "gaussians": len(self._gaussians),
+            "active_gaussians": int(self._gaussians.active.sum()),
+            "peak_rss_mib": peak_rss_mib(),
+            "memory_mib": self._mapper.memory_mib(),
+            "notes": list(self._notes),
         }
+        write_results(options.out, self._gaussians, self._report)
+        keyframes = self._mapper.keyframes()
+        if keyframes:
+            viewer = MapViewer(self._gaussians, choose_rasterizer(mission.backend, mission.threads))
+            write_png(options.out / PREVIEW, render_preview(viewer, keyframes))
+
+    def print_results(self, result: MissionResult) -> None:
+        """Print the figures and the notes of a complete run."""
+        totals, report = result.totals, self._report
+        counts = ((totals.skipped, "without depth"), (self._corrupt.count, "corrupt"))
+        skipped = ", ".join(f"{count} {reason}" for count, reason in counts if count)
+        print(
+            f"{totals.frames} frames{f' (skipped: {skipped})' if skipped else ''} at {result.hz:.1f} Hz, "
+            f"{len(self._gaussians)} Gaussians ({report['active_gaussians']} in the task's region) → "
+            f"{self._options.out / 'map.ply'}; {PREVIEW} in the same folder shows it"
+        )
+        for note in self._notes:
+            print(f"  {note}")
+
+    def _save(self, last_index: int) -> None:
+        save_run(self._options.save_state, self._mapper, self._inputs.resume_config(last_index), last_index)
 
 
-def _file_name(path: Path | str | None) -> str:
-    """Where it lies may change between two runs."""
-    return "" if path is None else Path(path).name
+def _first_estimator(
+    options: argparse.Namespace, inputs: MapInputs, estimators: EstimatorFactory, resumed_after: int
+) -> RelevanceEstimator:
+    """Return the estimator of the first frame's task or regions, and report nouns that the detector does not know."""
+    for graph in inputs.schedule.graphs():
+        for warning in estimators.unsupported_nouns(graph):
+            print(warning, file=sys.stderr)
+    graph = inputs.schedule.at(resumed_after)
+    return region_estimator(options, inputs.stream.source) if graph is None else estimators.build(graph)
 
 
-def _unseen(options: argparse.Namespace, mission: Mission) -> tuple[str, ...]:
-    """What to tell of a task, or of regions of space, of which nothing was ever seen."""
-    if any(outcome.roi_share > 0 for outcome in mission.outcomes):
+def _unseen_notes(options: argparse.Namespace, result: MissionResult) -> tuple[str, ...]:
+    """Return a note if no frame showed the task's objects or the selected regions."""
+    if result.totals.region_seen:
         return ()
     if options.task is not None:
-        return ("nothing that the task is about was found in any of these frames",)
-    if not (options.roi or options.objects or options.roi_ball):
-        return ()
-    return ("none of these frames shows the region that was asked for; is it of another sequence, or in other units?",)
-
-
-def _held(mapper: TaskMapper, gaussians: Gaussians) -> dict[str, object]:
-    """What the map holds, and what it takes."""
-    return {
-        "gaussians": len(gaussians),
-        "active_gaussians": int(gaussians.active.sum()),
-        "peak_rss_mib": peak_rss_mib(),
-        "memory_mib": mapper.memory_mib(),
-    }
-
-
-def _plan(first: TaskGraph | None, turns: Sequence[TaskSwitch]) -> TaskSchedule:
-    """The tasks of --task and --task-at."""
-    if not turns:
-        return TaskSchedule(first)
-    if first is None:
-        raise InvalidInputError("--task-at: follows a task in words; give the first with --task TEXT")
-    from gausslite.task.rules import RuleParser
-
-    return TaskSchedule(first, tuple((turn.frame, RuleParser().parse(turn.text)) for turn in turns))
-
-
-def asked_task(options: argparse.Namespace) -> TaskGraph | None:
-    """The task in words, None where regions of space (or nothing, for a uniform map) take its place.
-
-    Raises InvalidInputError for options that contradict each other, TaskError.
-    """
-    regions = options.roi is not None or options.objects or options.roi_ball
-    if options.task is not None and regions:
-        raise InvalidInputError("--task: give either a task in words, or regions with --roi or --roi-ball, not both")
-    if options.detector is not None and options.task is None:
-        raise InvalidInputError("--detector: finds the nouns of a task; give the task with --task TEXT")
-    if options.task is None:
-        if not regions and options.policy == TASK:
-            raise InvalidInputError(
-                "--task: expected a task in words, or regions with --roi FILE.npz or --roi-ball X,Y,Z,R"
-            )
-        return None
-    from gausslite.task.rules import RuleParser
-
-    return RuleParser().parse(options.task)
-
-
-def choose_attention(options: argparse.Namespace, source: Source) -> tuple[RelevanceEstimator, TaskGraph | None]:
-    """A task in words, or regions of space, or (for a uniform map) nothing to attend to."""
-    graph = asked_task(options)
-    if graph is None:
-        return _region_attention(options, source), None
-    return build_estimator(graph, SceneInfo.of(source), perception_settings(options)), graph
-
-
-def _region_attention(options: argparse.Namespace, source: Source) -> RelevanceEstimator:
-    regions = asked_regions(options, source)
-    return RegionRelevanceEstimator(regions) if regions else NoTaskEstimator()
+        return ("none of these frames shows an object of the task",)
+    if has_regions(options):
+        return ("none of these frames shows the selected region; check that it belongs to this sequence, in metres",)
+    return ()

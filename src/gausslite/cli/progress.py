@@ -1,4 +1,4 @@
-"""Show how long work goes on: one bar with the figures a roboticist watches."""
+"""Show the progress of long work: a bar with the figures of mapping."""
 
 from __future__ import annotations
 
@@ -9,27 +9,36 @@ from typing import Any
 
 from tqdm import tqdm
 
+from gausslite.mission.task_mapper import FrameOutcome
+
+_TERMINAL_INTERVAL_S, _LOG_INTERVAL_S = 0.2, 10.0
+
 
 def progress_bar(total: int, label: str, unit: str, row: int = 0) -> tqdm[Any]:
-    """A bar on stderr, redrawn at once on a terminal; elsewhere a line every ten seconds."""
+    """Return a bar on stderr; if stderr is not a terminal, it writes one line every ten seconds."""
     on_terminal = sys.stderr.isatty()
     return tqdm(
         total=total,
         desc=label,
         unit=unit,
         position=row if on_terminal else 0,
-        mininterval=0.2 if on_terminal else 10.0,
+        mininterval=_TERMINAL_INTERVAL_S if on_terminal else _LOG_INTERVAL_S,
         dynamic_ncols=on_terminal,
         file=sys.stderr,
     )
 
 
+def print_above_bar(line: str) -> None:
+    """Write a line to stderr without breaking a progress bar."""
+    tqdm.write(line, file=sys.stderr)
+
+
 class MappingBar:
-    """A progress bar over frames, with the figures."""
+    """A progress bar over frames, with the figures of the map."""
 
     def __init__(self, total: int, label: str = "map", row: int = 0) -> None:
         self._bar = progress_bar(total, label, "frame", row)
-        self._start = time.monotonic()
+        self._start_s = time.monotonic()
 
     def __enter__(self) -> MappingBar:
         return self
@@ -40,12 +49,16 @@ class MappingBar:
         self.close()
 
     def close(self) -> None:
-        """Leave the last figures on the screen."""
+        """Stop updating; the last figures stay visible."""
         self._bar.close()
 
+    def count(self, outcome: FrameOutcome) -> None:
+        """Advance by one frame and show its figures."""
+        self.show(self._bar.n + 1, outcome.gaussians, outcome.roi_share)
+
     def show(self, done: int, gaussians: int, roi_share: float, uplink_bytes: int | None = None) -> None:
-        """Move to `done` frames and show the figures."""
-        hz = done / max(time.monotonic() - self._start, 1e-9)
+        """Set the number of frames and show the figures."""
+        hz = done / max(time.monotonic() - self._start_s, 1e-9)
         figures = f"{gaussians / 1e3:.1f}k Gaussians, ROI {roi_share:.1%}, {hz:.1f} Hz"
         if uplink_bytes is not None:
             figures += f", sent {uplink_bytes / 1e6:.2f} MB"

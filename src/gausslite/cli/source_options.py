@@ -1,4 +1,4 @@
-"""Options that several sub-commands share beside those of a mission: the sequence and ground-truth regions."""
+"""Declare SOURCE and regions of space as options, and open the sequence, with messages on stderr."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from gausslite.domain.region import BallRegion, Region
 
 
 def add_source(parser: argparse.ArgumentParser, default_text: str = NONE) -> None:
-    """Add SOURCE and what of it is used; default_text as in `add_frames`."""
+    """Add SOURCE and the options of its frames; default_text as in `add_frames`."""
     parser.add_argument(
         "source",
         metavar="SOURCE",
@@ -34,16 +34,16 @@ def open_with_warnings(
     depth_registration: DepthRegistration | str | None,
     default: str = NONE,
 ) -> tuple[Source, DepthRegistration | None]:
-    """Open a sequence and tell, on stderr, what a user would not expect of it; the camera that depth is registered to.
+    """Open a sequence and return it with the colour camera that its depth is registered to, None for no registration.
 
-    What is asked for may be AUTO, NONE or None, for nothing; then it is default, one of the two. Raises
-    DatasetError, PoseError, InvalidInputError.
+    depth_registration: a camera, AUTO, NONE, or None if the user did not set it; then default applies, AUTO or NONE.
+    Messages about the sequence go to stderr. Raises DatasetError, PoseError, InvalidInputError.
     """
     return register_with_warnings(spec, open_recorded(spec, up_axis), depth_registration, default)
 
 
 def open_recorded(spec: str, up_axis: UpAxis | None) -> Source:
-    """Open a sequence as it was recorded and tell what is left out of it. Raises DatasetError, InvalidInputError."""
+    """Open a sequence without registration, and report excluded frames. Raises DatasetError, InvalidInputError."""
     source = open_source(spec, up_axis)
     if source.excluded_frames:
         print(f"{spec}: {source.excluded_frames}", file=sys.stderr)
@@ -53,23 +53,23 @@ def open_recorded(spec: str, up_axis: UpAxis | None) -> Source:
 def register_with_warnings(
     spec: str, source: Source, depth_registration: DepthRegistration | str | None, default: str
 ) -> tuple[Source, DepthRegistration | None]:
-    """The second half of open_with_warnings: bring depth into the colour camera; looking for that takes seconds."""
+    """Register the depth of an opened sequence as in `open_with_warnings`; an estimate (AUTO) takes seconds."""
     if depth_registration is None and not source.depth_registered:
         depth_registration = default
-        hint = f"--register-depth {AUTO} looks for the camera to register it to, {NONE} takes it as it is"
+        hint = f"--register-depth {AUTO} estimates the registration, {NONE} uses depth as recorded"
         if default == AUTO:
-            hint = f"looking for its colour camera now, --register-depth {NONE} takes it as it is"
-        print(f"{spec}: its layout leaves open whether depth is registered to colour; {hint}", file=sys.stderr)
+            hint = f"the registration is estimated now, --register-depth {NONE} uses depth as recorded"
+        print(f"{spec}: this layout does not state whether depth is registered to colour; {hint}", file=sys.stderr)
     if depth_registration == AUTO:
-        depth_registration, why = find_registration(source)
-        print(f"--register-depth {depth_registration or NONE}: {why}", file=sys.stderr)
+        depth_registration, reason = find_registration(source)
+        print(f"--register-depth {depth_registration or NONE}: {reason}", file=sys.stderr)
     if not isinstance(depth_registration, DepthRegistration):
         return source, None
     return RegisteredSource(source, depth_registration), depth_registration
 
 
 def resolve_pose_prior(spec: str, source: Source, pose_prior: PoseExposurePrior | str) -> PoseExposurePrior:
-    """How wrong the views may be, as said or, for AUTO, as a recording itself tells; that is told on stderr.
+    """Return the given prior or, for AUTO, an estimate from the recording, which is printed to stderr.
 
     Poses of a simulated home are exact.
     """
@@ -77,9 +77,9 @@ def resolve_pose_prior(spec: str, source: Source, pose_prior: PoseExposurePrior 
         return pose_prior
     if is_simulated(spec):
         return PoseExposurePrior()
-    found, why = estimate_pose_exposure_prior(source)
-    print(f"--pose-prior {NONE if found.is_exact else found}: {why}", file=sys.stderr)
-    return found
+    estimate, reason = estimate_pose_exposure_prior(source)
+    print(f"--pose-prior {NONE if estimate.is_exact else estimate}: {reason}", file=sys.stderr)
+    return estimate
 
 
 def add_regions(parser: argparse.ArgumentParser) -> None:
@@ -91,32 +91,32 @@ def add_regions(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--roi-ball",
         metavar="X,Y,Z,R",
-        type=ball,
+        type=read_ball,
         action="append",
         default=[],
         help="a ball in metres; may be repeated",
     )
 
 
-def ball(text: str) -> BallRegion:
-    """Read "x,y,z,r" in metres; argparse reports what is wrong."""
+def read_ball(text: str) -> BallRegion:
+    """Return the ball of "x,y,z,r" in metres. Raises ArgumentTypeError."""
     x, y, z, radius_m = read_numbers(text, 4)
     if radius_m <= 0:
         raise argparse.ArgumentTypeError(f"expected a radius above 0, got {radius_m}")
     return BallRegion((x, y, z), radius_m)
 
 
-def asked_regions(options: argparse.Namespace, source: Source) -> list[Region]:
-    """The objects of --roi (those of --objects, or all) and every --roi-ball; --objects alone names the source's own.
+def selected_regions(options: argparse.Namespace, source: Source) -> list[Region]:
+    """Return the objects of --roi (those of --objects, or all) and every --roi-ball.
 
-    Empty when none is asked for. Raises InvalidInputError, DatasetError.
+    --objects without --roi selects regions of the source. Empty if the user selects nothing. Raises
+    InvalidInputError, DatasetError.
     """
     from gausslite.datasets.regions import balls_for_small_objects, choose_regions, load_voxel_regions
 
-    asked: list[Region] = []
+    regions: list[Region] = []
     if options.roi is not None:
-        asked += choose_regions(balls_for_small_objects(load_voxel_regions(options.roi)), options.objects)
+        regions += choose_regions(balls_for_small_objects(load_voxel_regions(options.roi)), options.objects)
     elif options.objects:
-        asked += choose_regions(source.regions(), options.objects)
-    balls: list[BallRegion] = options.roi_ball
-    return [*asked, *balls]
+        regions += choose_regions(source.regions(), options.objects)
+    return [*regions, *options.roi_ball]

@@ -1,4 +1,4 @@
-"""Build the parts of one robot's loop from its settings: what attends to frames, and what maps them."""
+"""Build the parts of a mission from its settings: the mapper and the relevance estimators."""
 
 from __future__ import annotations
 
@@ -16,24 +16,18 @@ from gausslite.perception.tracker import TrackerSettings
 from gausslite.render.choose import choose_rasterizer
 
 if TYPE_CHECKING:
+    from gausslite.perception.detect import Detector
     from gausslite.perception.model_registry import ModelRegistry
 
 
 def build_mapper(settings: MissionSettings) -> GaussianMapper:
-    """A mapper with an empty map. Raises KernelError, InvalidInputError."""
+    """Return a mapper with an empty map. Raises KernelError, InvalidInputError."""
     rasterizer = choose_rasterizer(settings.backend, settings.threads)
     return GaussianMapper(settings.mapper_settings(), rasterizer, seed=settings.seed)
 
 
-def build_estimator(
-    graph: TaskGraph, scene: SceneInfo, perception: PerceptionSettings
-) -> RelevanceEstimator:
-    """RelevanceEstimator to one task alone; see RelevanceEstimatorFactory."""
-    return RelevanceEstimatorFactory(perception, lambda: scene).to(graph)
-
-
-def open_networks(perception: PerceptionSettings) -> ModelRegistry | None:
-    """The user's model files, opened and tried; None without any. Raises ModelFileError, InvalidInputError."""
+def open_models(perception: PerceptionSettings) -> ModelRegistry | None:
+    """Open the user's model files and run each once; None without any. Raises ModelFileError, InvalidInputError."""
     if perception.model is None:
         return None
     from gausslite.perception.model_registry import ModelRegistry
@@ -41,39 +35,48 @@ def open_networks(perception: PerceptionSettings) -> ModelRegistry | None:
     return ModelRegistry(perception.model, perception.segmenter, perception.vocabulary, perception.threads)
 
 
-class RelevanceEstimatorFactory:
-    """Makes the attention to each task of a mission. The network is loaded once, here, and shared by all."""
+class EstimatorFactory:
+    """Builds the relevance estimator of each task of a mission; all of them share the detector's network."""
 
     def __init__(self, perception: PerceptionSettings, scene: Callable[[], SceneInfo]) -> None:
-        """Asks for the scene with the first task, as a simulated one takes seconds to build. Raises ModelFileError."""
+        """Open the models. The scene is requested with the first task, because a simulated one takes seconds to build.
+
+        Raises ModelFileError, InvalidInputError.
+        """
         self._perception = perception
         self._scene = functools.cache(scene)
-        self._networks = open_networks(perception)
+        self._models = open_models(perception)
         self._executor: ThreadPoolExecutor | None = None
 
-    def require_sight(self) -> None:
-        """Raise InvalidInputError when there is neither file nor ground truth to find anything with."""
-        if self._networks is None and not self._scene().regions:
+    def require_detector(self) -> None:
+        """Raise InvalidInputError if there is neither a model file nor ground truth."""
+        if self._models is None and not self._scene().regions:
             raise InvalidInputError(
                 "detector: the sequence has no ground-truth regions; name an ONNX file with --detector"
             )
 
-    def to(self, graph: TaskGraph) -> RelevanceEstimator:
-        """RelevanceEstimator to a task: by the user's model files or, without one, by the scene's own ground truth.
+    def unsupported_nouns(self, graph: TaskGraph) -> tuple[str, ...]:
+        """Return one message for each noun of the task that the detector cannot find."""
+        detector = self._ground_truth_detector() if self._models is None else self._models.detector
+        return detector.unsupported(graph.queries)
 
-        With `beside` the network runs on a thread of its own. Raises InvalidInputError when there is neither file nor
-        ground truth.
+    def build(self, graph: TaskGraph) -> RelevanceEstimator:
+        """Return the relevance estimator of a task.
+
+        It uses the user's models or, without any, the scene's ground truth. Raises InvalidInputError without both.
         """
-        scene = self._scene()
-        settings = TrackerSettings(up_axis=scene.up_axis)
-        if self._networks is not None:
-            detector = self._networks.detector
-            segmenter = self._networks.segmenter if self._perception.resegment else None
-            if self._perception.asynchronous:
-                self._executor = self._executor or ThreadPoolExecutor(1, "detector")
-                return AsyncRelevanceEstimator(graph, detector, self._executor, settings, segmenter)
+        settings = TrackerSettings(up_axis=self._scene().up_axis)
+        if self._models is None:
+            return TaskRelevanceEstimator(graph, self._ground_truth_detector(), settings)
+        detector = self._models.detector
+        segmenter = self._models.segmenter if self._perception.resegment else None
+        if not self._perception.asynchronous:
             return TaskRelevanceEstimator(graph, detector, settings, segmenter)
-        self.require_sight()
+        self._executor = self._executor or ThreadPoolExecutor(1, "detector")
+        return AsyncRelevanceEstimator(graph, detector, self._executor, settings, segmenter)
+
+    def _ground_truth_detector(self) -> Detector:
+        self.require_detector()
         from gausslite.perception.ground_truth import RegionDetector
 
-        return TaskRelevanceEstimator(graph, RegionDetector(scene.regions), settings)
+        return RegionDetector(self._scene().regions)

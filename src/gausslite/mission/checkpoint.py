@@ -1,120 +1,166 @@
-"""A mapping run between two processes: saved whole, and taken up again where it ended, on the terms it was begun on."""
+"""Save a mapping run to a file and resume it in another process with the same settings."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from gausslite.codec.state_file import read_state, write_state
 from gausslite.domain.state import State, add_prefix, encode_text, get_array, get_text, int_array, select_prefix
 from gausslite.errors import GaussLiteError, MapFileError, MismatchError
-from gausslite.mission.settings import MissionSettings
+from gausslite.mission.serialisation import field_from_plain, to_plain
 from gausslite.mission.task_mapper import TaskMapper
 
-_LONGEST_SHOWN = 200
+_MAX_SHOWN = 200
+_UNSET = "unset"
 
 
 @dataclass(frozen=True, slots=True)
 class ResumeConfig:
-    """What must be the same when a run goes on: options of the command line, as texts."""
+    """The settings that must be equal when a run is resumed: fields of each settings class as JSON values."""
 
-    options: Mapping[str, str]
+    sections: Mapping[str, Mapping[str, Any]]
 
     @classmethod
-    def of(cls, settings: MissionSettings, **beside: str) -> ResumeConfig:
-        """How the robot maps, and what else the caller holds to; threads and backend are free to change."""
-        options = {
-            "policy": settings.policy,
-            "without": ",".join(sorted(settings.disabled)),
-            "max_gaussians": str(settings.max_gaussians),
-            "iterations": _or_default(settings.iterations),
-            "rate": _or_default(settings.rate_hz),
-            "least": str(settings.min_iterations),
-            "relief": ",".join(settings.skip_stages),
-            "deadline_slack": str(settings.deadline_slack),
-            "seed": str(settings.seed),
-            "view_error": str(settings.pose_prior),
-        }
-        return cls({**options, **beside})
+    def of(cls, *settings: Any) -> ResumeConfig:
+        """Return the fields of these settings objects, except those that may change."""
+        return cls({type(each).__name__: _fixed_fields(each) for each in settings})
 
-    def differences(self, wanted: ResumeConfig) -> tuple[str, ...]:
-        """One text for each option that is not as wanted."""
-        names = sorted(self.options.keys() | wanted.options.keys())
-        pairs = ((name, self.options.get(name, ""), wanted.options.get(name, "")) for name in names)
-        return tuple(
-            f"--{name.replace('_', '-')} {right[:_LONGEST_SHOWN]!r} (got {came[:_LONGEST_SHOWN]!r})"
-            for name, came, right in pairs
-            if came != right
-        )
+    @classmethod
+    def parse(cls, stored: str) -> ResumeConfig:
+        """Return the config of a JSON text. Raises MapFileError."""
+        try:
+            sections = json.loads(stored)
+        except (ValueError, RecursionError):
+            sections = None
+        if not isinstance(sections, dict) or not all(isinstance(section, dict) for section in sections.values()):
+            raise MapFileError("state config: expected settings as JSON objects, got something else")
+        return cls(sections)
+
+    def value(self, kind: type, name: str) -> Any:
+        """Return one field of a settings class. Raises MapFileError if it is missing or has another type."""
+        section = self.sections.get(kind.__name__, {})
+        if name not in section:
+            raise MapFileError(f"state config: expected {kind.__name__}.{name}, got none")
+        try:
+            return field_from_plain(kind, name, section[name])
+        except GaussLiteError as error:
+            raise MapFileError(f"state config: {error}") from error
+
+    def differences(self, *settings: Any) -> tuple[str, ...]:
+        """Return one text for each option of these settings that differs, with its flag and both values."""
+        current = ResumeConfig.of(*settings)
+        flags = {(type(each).__name__, name): flag for each in settings for name, flag in _flags(each).items()}
+        names = {
+            (section, name)
+            for config in (self, current)
+            for section in config.sections
+            for name in config.sections[section]
+        }
+        texts = []
+        for section, name in names:
+            saved, given = (config.sections.get(section, {}).get(name) for config in (self, current))
+            if saved != given:
+                flag = flags.get((section, name), _flag_of(name))
+                texts.append(f"{flag} {_show(saved)} (got {_show(given)})")
+        return tuple(sorted(texts))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SavedRun:
-    """A run as it lies in a file; beside is what the one who saved it added."""
+    """A run read from a file. extra: the arrays that the caller of `save_run` added."""
 
     path: Path
-    terms: ResumeConfig
+    config: ResumeConfig
     last_index: int
-    beside: State
-    _loop: State = field(repr=False)
+    extra: State
+    _task_mapper: State = field(repr=False)
 
     @classmethod
     def read(cls, path: Path) -> SavedRun:
-        """Raises MapFileError for a file that is none."""
+        """Read a saved run. Raises MapFileError if the file is not one."""
         saved = read_state(path)
-        with _in_file(path):
-            about = select_prefix(saved, "about")
-            [last_index] = get_array(about, "last_index", (1,), np.int64)
-            terms = ResumeConfig(_texts(get_text(about, "terms")))
-            return cls(path, terms, int(last_index), select_prefix(saved, "beside"), select_prefix(saved, "loop"))
+        with _errors_name(path):
+            run = select_prefix(saved, "run")
+            [last_index] = get_array(run, "last_index", (1,), np.int64)
+            config = ResumeConfig.parse(get_text(run, "config"))
+            return cls(path, config, int(last_index), select_prefix(saved, "extra"), select_prefix(saved, "mapper"))
 
-    def require(self, terms: ResumeConfig) -> None:
-        """Raise MismatchError naming the options that are not those of the saved run."""
-        differences = terms.differences(self.terms)
+    def require(self, *settings: Any) -> None:
+        """Raise MismatchError that names the options that differ from the saved run's."""
+        differences = self.config.differences(*settings)
         if differences:
             raise MismatchError(f"{self.path}: expected the options of the saved run, {', '.join(differences)}")
 
-    def restore(self, loop: TaskMapper) -> None:
-        """Put a fresh loop where the saved one stood.
+    def value(self, kind: type, name: str) -> Any:
+        """Return one field of the saved settings. Raises MapFileError."""
+        with _errors_name(self.path):
+            return self.config.value(kind, name)
 
-        On the same terms the frames after the last one give the same bits as without the interruption, as far as
-        iterations are counted. Raises MapFileError; after it the loop must not be used.
+    def restore(self, mapper: TaskMapper) -> None:
+        """Bring a new TaskMapper to the saved state.
+
+        With the same settings and counted iterations, the following frames give the same bits as without the
+        interruption. Raises MapFileError; the TaskMapper must not be used after it.
         """
-        with _in_file(self.path):
-            loop.restore(self._loop)
+        with _errors_name(self.path):
+            mapper.restore(self._task_mapper)
 
 
-def save_run(path: Path, loop: TaskMapper, terms: ResumeConfig, last_index: int, beside: State | None = None) -> None:
-    """Save a run whose last frame had this number. Raises StorageError."""
-    about: State = {"terms": encode_text(json.dumps(dict(terms.options))), "last_index": int_array(last_index)}
-    write_state(
-        path, {**add_prefix("about", about), **add_prefix("loop", loop.state()), **add_prefix("beside", beside or {})}
-    )
+def save_run(path: Path, mapper: TaskMapper, config: ResumeConfig, last_index: int, extra: State | None = None) -> None:
+    """Save a run whose last frame had this index. Raises StorageError."""
+    run: State = {"config": encode_text(json.dumps(config.sections)), "last_index": int_array(last_index)}
+    state = {
+        **add_prefix("run", run),
+        **add_prefix("mapper", mapper.state()),
+        **add_prefix("extra", extra or {}),
+    }
+    write_state(path, state)
 
 
 @contextmanager
-def _in_file(path: Path) -> Iterator[None]:
-    """Whatever is wrong in there is wrong with this file."""
+def _errors_name(path: Path) -> Iterator[None]:
+    """Raise every error in this block as a MapFileError that names the file."""
     try:
         yield
     except GaussLiteError as error:
         raise MapFileError(f"{path}: {error}") from error
 
 
-def _texts(stored: str) -> dict[str, str]:
-    try:
-        texts = json.loads(stored)
-    except (ValueError, RecursionError):
-        texts = None
-    if not isinstance(texts, dict) or not all(isinstance(value, str) for value in texts.values()):
-        raise MapFileError("state terms: expected options as texts, got others")
-    return texts
+def _fixed_fields(settings: Any) -> dict[str, Any]:
+    fixed = {}
+    for each in fields(settings):
+        value = getattr(settings, each.name)
+        if each.metadata.get("may_change"):
+            continue
+        if each.metadata.get("is_file") and value is not None:
+            value = Path(value).name
+        fixed[each.name] = to_plain(value)
+    return fixed
 
 
-def _or_default(value: float | None) -> str:
-    return "default" if value is None else f"{value:g}"
+def _flags(settings: Any) -> dict[str, str]:
+    return {each.name: each.metadata.get("flag", _flag_of(each.name)) for each in fields(settings)}
+
+
+def _flag_of(name: str) -> str:
+    return f"--{name.replace('_', '-')}"
+
+
+def _show(value: Any) -> str:
+    """Return a JSON value as the user writes it on the command line."""
+    return _UNSET if value in (None, [], False) else repr(_flatten(value)[:_MAX_SHOWN])
+
+
+def _flatten(value: Any) -> str:
+    if isinstance(value, dict):
+        return ",".join(map(_flatten, value.values()))
+    if isinstance(value, list):
+        return ",".join(map(_flatten, value))
+    return f"{value:g}" if isinstance(value, float) else str(value)

@@ -1,4 +1,4 @@
-"""What a mission leaves behind: a folder with map.ply and report.json, each written whole or not at all."""
+"""Write the results of a mission to a folder: map.ply and report.json, each replaced in one step."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ PREVIEW = "preview.png"
 
 
 def prepare_folder(folder: Path) -> None:
-    """Make the folder and check that it can be written, before hours of work. Raises StorageError.
+    """Create the folder and check that files can be written there. Raises StorageError.
 
-    The file of the check has no name of ours, so that programs that start together do not take it from each other.
+    The test file has a random name, so programs that start at the same time do not interfere.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -31,17 +31,23 @@ def prepare_folder(folder: Path) -> None:
 
 
 def prepare_file(path: Path) -> None:
-    """Make the folder a file will lie in and check that it can be written there. Raises StorageError."""
+    """Create the folder of a file and check that files can be written there. Raises StorageError."""
     if path.is_dir():
         raise StorageError(f"{path}: expected the name of a file, got a folder")
     prepare_folder(path.parent)
 
 
-def prepare_beside(path: Path, folder: Path) -> None:
-    """prepare_file for one that must not take the place of this folder's results. Raises StorageError."""
+def prepare_file_next_to(path: Path, folder: Path) -> None:
+    """Do `prepare_file`, and raise StorageError if the file would replace a result in the folder."""
     if path.resolve() in {(folder / name).resolve() for name in (_MAP, _REPORT, PREVIEW)}:
-        raise StorageError(f"{path}: expected a name of its own, got that of a result of {folder}")
+        raise StorageError(f"{path}: expected a name other than that of a result in {folder}")
     prepare_file(path)
+
+
+def require_no_map(folder: Path) -> None:
+    """Raise StorageError if the folder holds a map already."""
+    if (folder / _MAP).exists():
+        raise StorageError(f"{folder / _MAP} exists already; choose another --out, or replace it with --overwrite")
 
 
 def write_results(folder: Path, gaussians: Gaussians, report: Mapping[str, object]) -> None:
@@ -51,7 +57,7 @@ def write_results(folder: Path, gaussians: Gaussians, report: Mapping[str, objec
 
 
 def read_report(folder: Path) -> Mapping[str, object]:
-    """The report that a program left here; empty where there is none, or something else by its name."""
+    """Return the content of report.json; empty if there is none or it is not a JSON object."""
     try:
         report = json.loads((folder / _REPORT).read_bytes())
     except (OSError, ValueError, RecursionError):
@@ -60,25 +66,25 @@ def read_report(folder: Path) -> Mapping[str, object]:
 
 
 def write_json(path: Path, report: Mapping[str, object]) -> None:
-    """Write a report; bytes of a path that are no text become JSON's own escapes. Raises StorageError."""
+    """Write a report as JSON; undecodable bytes of paths are escaped. Raises StorageError."""
     write_atomic(path, (as_text(report) + "\n").encode(errors="backslashreplace"))
 
 
 def as_text(report: Mapping[str, object]) -> str:
-    """Indented JSON of a report: floats to six places, null for what is not finite."""
-    return json.dumps(_finite(report), indent=2, ensure_ascii=False)
+    """Return a report as indented JSON: floats with six decimals, null for NaN and infinity."""
+    return json.dumps(_rounded(report), indent=2, ensure_ascii=False)
 
 
 def peak_rss_mib() -> float:
-    """The most memory this process ever held, in MiB."""
+    """Return the peak resident memory of this process in MiB."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
-def _finite(value: object) -> object:
+def _rounded(value: object) -> object:
     if isinstance(value, float):
         return round(value, 6) if math.isfinite(value) else None
     if isinstance(value, Mapping):
-        return {key: _finite(item) for key, item in value.items()}
+        return {key: _rounded(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_finite(item) for item in value]
+        return [_rounded(item) for item in value]
     return value

@@ -43,6 +43,11 @@ def from_plain(kind: type[Settings], values: object) -> Settings:
     return settings
 
 
+def field_from_plain(kind: type, name: str, value: object) -> Any:
+    """Return one field of a settings class from its JSON value. Raises InvalidInputError."""
+    return _convert(get_type_hints(kind)[name], value, f"{kind.__name__}.{name}")
+
+
 def _convert(kind: Any, value: Any, name: str) -> Any:
     origin = get_origin(kind)
     if origin in (Union, types.UnionType):

@@ -24,9 +24,8 @@ class Detector(Protocol):
         """All instances of each query, best first; one object may answer several queries."""
         ...
 
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """What this detector could not do with the queries so far, one line each."""
+    def unsupported(self, queries: Sequence[str]) -> tuple[str, ...]:
+        """Return one message for each query that this detector can never find."""
         ...
 
 
@@ -47,9 +46,8 @@ class BoxDetector(Protocol):
         """All instances of each query, best first."""
         ...
 
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """What this detector could not do with the queries so far, one line each."""
+    def unsupported(self, queries: Sequence[str]) -> tuple[str, ...]:
+        """Return one message for each query that this detector can never find."""
         ...
 
 
@@ -69,10 +67,9 @@ class SegmentedDetector:
         self._detector = detector
         self._segmenters = tuple(segmenters)
 
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """What the detector of boxes could not do."""
-        return self._detector.warnings
+    def unsupported(self, queries: Sequence[str]) -> tuple[str, ...]:
+        """Return one message for each query that the box detector can never find."""
+        return self._detector.unsupported(queries)
 
     def detect(self, frame: Frame, queries: Sequence[str]) -> list[Detection]:
         """The boxes that any segmenter has a mask for, in the detector's order."""

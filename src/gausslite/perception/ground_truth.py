@@ -16,26 +16,26 @@ class RegionDetector:
 
     def __init__(self, regions: Mapping[str, Region]) -> None:
         self._regions = dict(regions)
-        self._warnings: dict[str, None] = {}
 
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """The queries that no region answers."""
-        return tuple(self._warnings)
+    def unsupported(self, queries: Sequence[str]) -> tuple[str, ...]:
+        """Return one message for each query that matches no region."""
+        known = ", ".join(self._regions) or "none"
+        return tuple(
+            f"no region matches {query!r}; the regions are {known}" for query in queries if not self._names(query)
+        )
 
     def detect(self, frame: Frame, queries: Sequence[str]) -> list[Detection]:
         """The regions that are visible in the frame, score 1, with exact masks."""
         masks = {}
         found = []
         for query in queries:
-            names = [name for name in self._regions if same_kind(query, name)]
-            if not names:
-                known = ", ".join(self._regions) or "none"
-                self._warnings[f"no region answers {query!r}; the regions are {known}"] = None
-            for name in names:
+            for name in self._names(query):
                 if name not in masks:
                     masks[name] = self._regions[name].mask(frame)
                 box = bounding_box(masks[name])
                 if box is not None:
                     found.append(Detection(query, 1.0, box, masks[name]))
         return found
+
+    def _names(self, query: str) -> list[str]:
+        return [name for name in self._regions if same_kind(query, name)]

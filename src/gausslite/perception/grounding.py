@@ -67,9 +67,9 @@ class GroundingDino:
         self._phrases: dict[str, PhraseInput] = {}
         self._try_once(model)
 
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """None: any phrase can be asked for."""
+    def unsupported(self, queries: Sequence[str]) -> tuple[str, ...]:
+        """Return nothing: the network accepts any phrase."""
+        del queries
         return ()
 
     def boxes(self, frame: Frame, queries: Sequence[str]) -> list[DetectedBox]:

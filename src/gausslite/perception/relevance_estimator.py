@@ -83,7 +83,7 @@ class TaskRelevanceEstimator:
     @property
     def notes(self) -> tuple[str, ...]:
         """Nouns without a class, and anchors that have not come into view."""
-        return (*self._detector.warnings, *self._tracker.notes)
+        return (*self._detector.unsupported(self._graph.queries), *self._tracker.notes)
 
     @property
     def landmarks(self) -> tuple[Landmark, ...]:
@@ -133,7 +133,6 @@ class AsyncRelevanceEstimator:
         self._tracker = TargetTracker(graph, settings or TrackerSettings(), segmenter)
         self._frames = 0
         self._replaced = 0
-        self._warnings: tuple[str, ...] = ()
         self._running: tuple[_Keyframe, Future[list[Detection]]] | None = None
         self._waiting: _Keyframe | None = None
         self._looking_back: tuple[Frame, Future[list[Detection]]] | None = None
@@ -142,7 +141,7 @@ class AsyncRelevanceEstimator:
     def notes(self) -> tuple[str, ...]:
         """Nouns without a class, anchors that have not come into view, keyframes that were never looked at."""
         overtaken = (f"detector too slow: {self._replaced} keyframes were overtaken",) if self._replaced else ()
-        return (*self._warnings, *self._tracker.notes, *overtaken)
+        return (*self._detector.unsupported(self._graph.queries), *self._tracker.notes, *overtaken)
 
     def state(self) -> State:
         """The objects and targets that are followed; what the detector is busy with is not among them."""
@@ -183,8 +182,6 @@ class AsyncRelevanceEstimator:
             return None
         (key, found), self._running = self._running, None
         relevance = self._tracker.integrate(key.frame, key.depth_m, found.result())
-        # the detector adds to its warnings while it runs; now it rests
-        self._warnings = self._detector.warnings
         return DelayedRelevance(key.frame, relevance, self._frames - key.number)
 
 

@@ -50,17 +50,15 @@ class YoloSegDetector:
         self._network = YoloSegNetwork(model)
         if not self._network.names:
             raise ModelFileError(f"model {model.path}: expected class names in the metadata field 'names', got none")
-        self._warnings: dict[str, None] = {}
 
     @property
     def class_names(self) -> tuple[str, ...]:
         """The classes that the network knows."""
         return self._network.names
 
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """The queries that no class of the network fits."""
-        return tuple(self._warnings)
+    def unsupported(self, queries: Sequence[str]) -> tuple[str, ...]:
+        """Return one message for each query that matches no class of the network."""
+        return tuple(f"no class of the detector matches {query!r}" for query in queries if not self._classes(query))
 
     def segmenter(self) -> ClassAgnosticSegmenter:
         """A Segmenter over the same network: all it sees in an image, of whatever class."""
@@ -111,10 +109,7 @@ class YoloSegDetector:
         return suppress(found, self._settings.max_iou, self._settings.max_boxes, across_classes=False)
 
     def _classes(self, query: str) -> tuple[int, ...]:
-        classes = classes_for(query, self.class_names, self._vectors)
-        if not classes:
-            self._warnings[f"no class of the detector fits {query!r}: it will not be found"] = None
-        return classes
+        return classes_for(query, self.class_names, self._vectors)
 
 
 def load_yolo(model: OpenModel) -> YoloSegDetector:

@@ -6,9 +6,9 @@ import argparse
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 
-from gausslite.cli.map_command import choose_attention
+from gausslite.cli.map_inputs import choose_estimator
 from gausslite.cli.progress import MappingBar
-from gausslite.cli.source_options import add_regions, asked_regions, open_with_warnings
+from gausslite.cli.source_options import add_regions, selected_regions, open_with_warnings
 from gausslite.config.mapping_options import add_budget, add_detector, add_policy, mission_settings
 from gausslite.config.source_options import add_frames
 from gausslite.datasets.held_out import HeldOutSplit
@@ -136,7 +136,7 @@ def _play(
     """Run the loop over these positions; memory is sampled where the sequence is looped."""
     settings, size = mission_settings(options), frame_size(options.size, source)
     mapper = GaussianMapper(settings.mapper_settings(), rasterizer, settings.seed)
-    bench = LoopBench(choose_attention(options, source)[0], mapper, VoxelGrid(), settings.scheduler_settings)
+    bench = LoopBench(choose_estimator(options, source), mapper, VoxelGrid(), settings.scheduler_settings)
     log, samples_mib = CostLog(), []
     every = max(1, len(positions) // _MEMORY_SAMPLES)
     with MappingBar(len(positions), "bench") as bar:
@@ -157,13 +157,13 @@ def _gap(
     size = frame_size(options.size, source)
     in_time = bench.gaussians()
     patient = _patient(options)
-    loop = LoopBench(choose_attention(patient, source)[0], build_mapper(mission_settings(patient)), VoxelGrid())
+    loop = LoopBench(choose_estimator(patient, source), build_mapper(mission_settings(patient)), VoxelGrid())
     with MappingBar(len(positions), "unlimited") as bar:
         for done, position in enumerate(positions, start=1):
             cost = loop.process(source.frame(position, size))
             if cost is not None:
                 bar.show(done, cost.gaussians, cost.roi_share)
-    regions = asked_regions(options, source)
+    regions = selected_regions(options, source)
     views = [HeldOutView.of(source.frame(position, size), regions) for position in held_out]
     rasterizer = choose_rasterizer(options.rasterizer, options.threads)
     return RateGap.of(in_time, loop.gaussians(), options.unlimited, views, rasterizer)
@@ -178,7 +178,7 @@ def _check_gap(options: argparse.Namespace, source: Source, held_out: Sequence[i
     mission_settings(_patient(options))
     if not held_out:
         raise InvalidInputError("--unlimited: expected at least 8 frames, so that one is held out; got fewer")
-    regions, size = asked_regions(options, source), frame_size(options.size, source)
+    regions, size = selected_regions(options, source), frame_size(options.size, source)
     if not regions:
         raise InvalidInputError(
             "--unlimited: expected regions to score, with --roi FILE.npz, --objects A,B or --roi-ball X,Y,Z,R; got none"

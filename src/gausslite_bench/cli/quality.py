@@ -24,7 +24,7 @@ from gausslite.datasets.regions import REGIONS_FILE
 from gausslite.datasets.selection import downscaled_size
 from gausslite.errors import InvalidInputError
 from gausslite.mapping.policies import POLICIES
-from gausslite.mission.build import open_networks
+from gausslite.mission.build import open_models
 from gausslite.mission.results import write_json
 from gausslite.mission.settings import PerceptionSettings
 from gausslite_bench.quality.ablation import cumulative_variants
@@ -202,15 +202,15 @@ def _perception_mode(options: argparse.Namespace) -> PerceptionMode:
     if options.perception == "gt":
         return PerceptionMode()
     if options.perception == "words":
-        return PerceptionMode(words=True)
-    return PerceptionMode(words=True, detector=PerceptionSettings(Path(options.perception), threads=options.threads))
+        return PerceptionMode(from_text=True)
+    return PerceptionMode(from_text=True, detector=PerceptionSettings(Path(options.perception), threads=options.threads))
 
 
 def _run(study: Study, options: argparse.Namespace) -> StudyResults:
     for plan in study.plans:
         for trial in study.trials(plan):
             _ = trial.mission  # a wrong name or number is told before hours of work, and so is a wrong file
-    open_networks(study.conditions.perception.detector)
+    open_models(study.conditions.perception.detector)
     perceptual = None
     if options.lpips_weights:
         from gausslite_bench.quality.lpips import load_lpips

@@ -219,9 +219,8 @@ class _OnceAFrame:
         self._detector = detector
         self._answered: tuple[Frame, list[Detection]] | None = None
 
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        return self._detector.warnings
+    def unsupported(self, queries: Sequence[str]) -> tuple[str, ...]:
+        return self._detector.unsupported(queries)
 
     def detect(self, frame: Frame, queries: Sequence[str]) -> list[Detection]:
         if self._answered is None or self._answered[0] is not frame:

@@ -1,4 +1,4 @@
-"""One trial: one policy maps one scene from one seed within the budget, and is scored on the held-out views."""
+"""One trial: a policy maps a scene with one seed within the budget; held-out views score the map."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from gausslite.evaluation.fitted import render_fitted
 from gausslite.evaluation.pictures import to_uint8
 from gausslite.evaluation.views import MapViewer, largest_roi_views
 from gausslite.mapping.policies import TASK
-from gausslite.mission.build import build_estimator, build_mapper
+from gausslite.mission.build import EstimatorFactory, build_mapper
 from gausslite.mission.frame_scheduler import Clock, FrameScheduler
 from gausslite.mission.settings import MissionSettings, PerceptionSettings
 from gausslite.mission.task_mapper import TaskMapper
@@ -30,11 +30,11 @@ from gausslite.perception.relevance_estimator import RelevanceEstimator
 from gausslite.render.choose import choose_rasterizer
 from gausslite_bench.quality.scenes import RecordedRelevanceEstimator, Scene, ScenePlan
 
-PICTURES = 2
+SHEET_VIEWS = 2
 
 
 class BudgetMode(StrEnum):
-    """What all policies get the same of, a frame."""
+    """Quantity per frame that is equal for all policies."""
 
     ITERATIONS = "iterations"
     TIME = "time"
@@ -42,9 +42,9 @@ class BudgetMode(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class TrialBudget:
-    """What every policy may spend: Gaussians in all, and iterations or 1 / rate_hz seconds a frame.
+    """Limits for every policy: the number of Gaussians, and per frame the iterations or 1 / rate_hz seconds.
 
-    rate_hz None: a rate is still to be measured (`pacing`), where it is time that is equal.
+    rate_hz None with equal time: the rate must still be measured (`equal_time`).
     """
 
     max_gaussians: int = 60_000
@@ -53,49 +53,49 @@ class TrialBudget:
     rate_hz: float | None = None
 
     @property
-    def awaits_rate(self) -> bool:
-        """True where time is equal and nobody has said yet how much there is."""
+    def needs_rate(self) -> bool:
+        """True if time is equal and the rate is not known yet."""
         return self.equal is BudgetMode.TIME and self.rate_hz is None
 
     def __str__(self) -> str:
-        """What a frame gets of what is equal."""
+        """Return the limit per frame as text."""
         if self.equal is BudgetMode.ITERATIONS:
-            return f"{self.iterations} iterations a frame"
-        return "time" if self.rate_hz is None else f"{1e3 / self.rate_hz:.3g} ms a frame"
+            return f"{self.iterations} iterations per frame"
+        return "time" if self.rate_hz is None else f"{1e3 / self.rate_hz:.3g} ms per frame"
 
 
 @dataclass(frozen=True, slots=True)
 class Variant:
-    """A policy with components switched off; label names it in tables."""
+    """A policy with disabled components; label is its name in tables."""
 
     label: str
     policy: str
-    without: frozenset[str] = frozenset()
+    disabled: frozenset[str] = frozenset()
 
 
 @dataclass(frozen=True, slots=True)
 class PerceptionMode:
-    """How the task's region is found: by ground-truth masks, or by the task's words and a detector.
+    """Source of the task's region: ground-truth masks, or perception from the task's text.
 
-    detector None with words means the words are looked up among the scene's ground-truth objects.
+    from_text without a detector model: the text's nouns select among the scene's ground-truth objects.
     """
 
-    words: bool = False
+    from_text: bool = False
     detector: PerceptionSettings = field(default_factory=PerceptionSettings)
 
 
 @dataclass(frozen=True, slots=True)
 class Conditions:
-    """What is the same for every trial of a study."""
+    """Settings shared by all trials of a study. size: (width_px, height_px)."""
 
     size: tuple[int, int]
-    eyes: PerceptionMode = field(default_factory=PerceptionMode)
+    perception: PerceptionMode = field(default_factory=PerceptionMode)
     threads: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """Everything that decides a result."""
+    """One policy on one scene with one seed: everything that determines a result."""
 
     plan: ScenePlan
     variant: Variant
@@ -105,37 +105,37 @@ class Trial:
 
     @property
     def mission(self) -> MissionSettings:
-        """How the robot maps. Raises InvalidInputError for an unknown policy or component."""
+        """The mission's settings. Raises InvalidInputError for an unknown policy or component."""
         timed = self.budget.equal is BudgetMode.TIME
         return MissionSettings(
             policy=self.variant.policy,
-            disabled=self.variant.without,
+            disabled=self.variant.disabled,
             max_gaussians=self.budget.max_gaussians,
             iterations=None if timed else self.budget.iterations,
             rate_hz=self.budget.rate_hz if timed else None,
             seed=self.seed,
             threads=self.conditions.threads,
-            pose_prior=self.plan.trust.pose_prior,
+            pose_prior=self.plan.pose_policy.pose_prior,
         )
 
     @property
     def follows_task(self) -> bool:
-        """False where nothing in the policy asks for the task's region: its map is the same for every task."""
+        """False if the policy ignores the task's region, so that its map is the same for every task."""
         return self.variant.policy == TASK and self.mission.mapper_settings().components.follow_task
 
     @property
     def key(self) -> str:
-        """A name that changes with every setting, down to the policy's own."""
+        """File name that is unique for the trial's settings, including those of the policy."""
         digest = self._digest(self.plan.settings())
         return f"{self.plan.name}-{self.variant.label}-{self.budget.equal}-{self.seed}-{digest}".replace("+", "with-")
 
     @property
     def map_key(self) -> str:
-        """A name that changes with all that the map depends on, the task among it only where it is followed."""
-        return self._digest(self.plan.settings() if self.follows_task else self.plan.place())
+        """Digest of everything the map depends on; includes the task only if the policy follows it."""
+        return self._digest(self.plan.settings() if self.follows_task else self.plan.training_settings())
 
     def _digest(self, scene: Mapping[str, object]) -> str:
-        # the mapper's settings tell what is switched off; a set of names has another order in every process
+        # the order of a set of names differs between processes; the mapper's settings show what is disabled
         settings = {
             "scene": dict(scene),
             "mission": str(replace(self.mission, disabled=frozenset())),
@@ -147,9 +147,9 @@ class Trial:
 
 @dataclass(frozen=True, slots=True)
 class TrialResult:
-    """What a trial gave; roi_share is that of the held-out views. ms_per_frame counts perception and mapping.
+    """Result of a trial. roi_share: region's share of the held-out views. ms_per_frame: perception and mapping.
 
-    fitted are the scores with each view's pose and colours fitted, None where that was not asked for.
+    fitted: scores after fitting each view's pose and exposure; None if that was not requested.
     """
 
     scores: MapScores
@@ -160,26 +160,26 @@ class TrialResult:
     ms_per_frame: float
 
     def as_json(self) -> dict[str, object]:
-        """For the record."""
+        """Return the result as JSON values."""
         return asdict(self)
 
     @classmethod
     def from_json(cls, stored: dict[str, Any]) -> TrialResult:
-        """From as_json's. Raises InvalidInputError for anything else."""
+        """Return the result of as_json's values. Raises InvalidInputError for other content."""
         try:
             fitted = None if stored["fitted"] is None else MapScores(**stored["fitted"])
             return cls(**{**stored, "scores": MapScores(**stored["scores"]), "fitted": fitted})
         except (TypeError, KeyError) as error:
-            raise InvalidInputError(f"a kept trial: expected its figures, got {error}") from None
+            raise InvalidInputError(f"cached trial: expected the fields of a result, got {error}") from None
 
 
-Pictures = dict[int, UInt8[ndarray, "h w 3"]]
-"""What a map looks like from the most telling held-out views, by their position."""
+ViewImages = dict[int, UInt8[ndarray, "h w 3"]]
+"""Renderings of a map by the position of the held-out view."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrialMap:
-    """A trial's map at the end of its mission. ms_per_frame counts perception and mapping."""
+    """A trial's map at the end of its mission. ms_per_frame: perception and mapping."""
 
     gaussians: Gaussians
     iterations_mean: float
@@ -187,7 +187,7 @@ class TrialMap:
 
 
 def build_map(trial: Trial, scene: Scene, on_frame: Callable[[int], None]) -> TrialMap:
-    """Map the scene; on_frame hears the number of Gaussians after each frame. Raises GaussLiteError."""
+    """Return the map of the scene; on_frame gets the number of Gaussians after each frame. Raises GaussLiteError."""
     settings = trial.mission
     attention = _attention(trial, scene)
     loop = TaskMapper(
@@ -207,41 +207,41 @@ def build_map(trial: Trial, scene: Scene, on_frame: Callable[[int], None]) -> Tr
 
 
 def evaluate_map(
-    made: TrialMap, trial: Trial, scene: Scene, perceptual: PerceptualDistance | None
-) -> tuple[TrialResult, Pictures]:
-    """Score a map on the scene's held-out views, and draw those that tell most. Raises GaussLiteError."""
-    viewer = MapViewer(made.gaussians, choose_rasterizer(threads=trial.conditions.threads))
-    shown = largest_roi_views(scene.held_out, PICTURES)
-    scores, fitted, pictures = [], [], {}
+    trial_map: TrialMap, trial: Trial, scene: Scene, perceptual: PerceptualDistance | None
+) -> tuple[TrialResult, ViewImages]:
+    """Return the map's scores on the held-out views, and its renderings for the sheets. Raises GaussLiteError."""
+    viewer = MapViewer(trial_map.gaussians, choose_rasterizer(threads=trial.conditions.threads))
+    shown = largest_roi_views(scene.held_out, SHEET_VIEWS)
+    scores, fitted, images = [], [], {}
     for i, view in enumerate(scene.held_out):
-        drawn = viewer.render_frame(view.frame)
-        scores.append(score_view(drawn, view, perceptual))
-        if trial.plan.trust.fit_views:
+        rendering = viewer.render_frame(view.frame)
+        scores.append(score_view(rendering, view, perceptual))
+        if trial.plan.pose_policy.fit_views:
             fitted.append(score_view(render_fitted(viewer, view.frame), view, perceptual))
         if i in shown:
-            pictures[i] = to_uint8(drawn.rgb)
+            images[i] = to_uint8(rendering.rgb)
     result = TrialResult(
         scores=average(scores),
         fitted=average(fitted) if fitted else None,
         roi_share=scene.roi_share,
-        gaussians=len(made.gaussians),
-        iterations_mean=made.iterations_mean,
-        ms_per_frame=made.ms_per_frame,
+        gaussians=len(trial_map.gaussians),
+        iterations_mean=trial_map.iterations_mean,
+        ms_per_frame=trial_map.ms_per_frame,
     )
-    return result, pictures
+    return result, images
 
 
 def clock_for(threads: int | None) -> Clock:
-    """What measures a frame: with a single thread the processor's own time, which other programs disturb less."""
+    """Return the clock for frame times: CPU time with one thread, as other programs affect it less."""
     return time.process_time if threads == 1 else time.perf_counter
 
 
 def _attention(trial: Trial, scene: Scene) -> RelevanceEstimator:
-    """What does not follow the task is not told of it: marked Gaussians would be spared when room is short."""
+    """Return the trial's estimator; without task if the policy ignores it, as ROI flags would affect eviction."""
     if not trial.follows_task:
         return NoTaskEstimator()
-    if not trial.conditions.eyes.words:
+    if not trial.conditions.perception.from_text:
         return RecordedRelevanceEstimator(scene)
     from gausslite.task.rules import RuleParser
 
-    return build_estimator(RuleParser().parse(scene.task), scene.knowledge, trial.conditions.eyes.detector)
+    return EstimatorFactory(trial.conditions.perception.detector, lambda: scene.knowledge).build(RuleParser().parse(scene.task))

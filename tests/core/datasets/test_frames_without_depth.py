@@ -54,5 +54,5 @@ def test_what_was_not_found_is_said_at_the_end(tmp_path: Path, capsys: pytest.Ca
     small = ["--size", "64x48", "--max-gaussians", "200", "--iterations", "1"]
     assert main(["map", "sim:home?frames=1", "--task", "Find the unicorn", *small, "--out", str(tmp_path)]) == 0
     told = capsys.readouterr().out
-    assert "\n  no region answers 'unicorn'; the regions are " in told
+    assert "\n  no region matches 'unicorn'; the regions are " in told
     assert told.endswith("\n  nothing that the task is about was found in any of these frames\n")

@@ -28,7 +28,8 @@ TASK = TaskGraph("id", "a task", ("mug",), (), ())
 
 
 class BrokenDetector:
-    warnings = ()
+    def unsupported(self, queries: tuple[str, ...]) -> tuple[str, ...]:
+        return ()
 
     def detect(self, frame: Frame, queries: tuple[str, ...]) -> list[Detection]:
         raise ModelFileError("model: broken")

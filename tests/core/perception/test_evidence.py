@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -44,7 +44,9 @@ class Script:
 
     scores: Sequence[float | None]
     calls: int = 0
-    warnings: tuple[str, ...] = field(default=())
+
+    def unsupported(self, queries: Sequence[str]) -> tuple[str, ...]:
+        return ()
 
     def detect(self, frame: Frame, queries: Sequence[str]) -> list[Detection]:
         score = self.scores[min(self.calls, len(self.scores) - 1)]

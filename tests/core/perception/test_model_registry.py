@@ -84,7 +84,8 @@ def test_another_file_masks_what_the_first_found_and_the_cut_what_neither_masks(
 
 def test_boxes_without_any_mask_are_left_out():
     class TwoBoxes:
-        warnings = ("said once",)
+        def unsupported(self, queries):
+            return ("no class",)
 
         def boxes(self, frame, queries):
             return [DetectedBox(queries[0], 0.9, (32, 16, 64, 48)), DetectedBox(queries[0], 0.8, (0, 0, 9, 9))]
@@ -95,7 +96,7 @@ def test_boxes_without_any_mask_are_left_out():
 
     detector = SegmentedDetector(TwoBoxes(), [LeftHalf(), LeftHalf()])
     assert [each.score for each in detector.detect(frame(), ["cup"])] == [0.9]
-    assert detector.warnings == ("said once",)
+    assert detector.unsupported(["cup"]) == ("no class",)
 
 
 def test_grounding_dino_needs_its_words_and_cannot_mask(tmp_path):

@@ -55,9 +55,8 @@ class CountingDetector:
     inner: RegionDetector
     calls: int = 0
 
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        return self.inner.warnings
+    def unsupported(self, queries):
+        return self.inner.unsupported(queries)
 
     def detect(self, frame, queries):
         self.calls += 1
@@ -193,7 +192,7 @@ def test_region_detector_answers_by_head_noun_and_says_what_it_cannot_find():
     assert len(detector.detect(frame_at(), ["cup"])) == 2
     assert len(detector.detect(frame_at(), ["object"])) == 2
     assert detector.detect(frame_at(), ["umbrella"]) == []
-    assert detector.warnings == ("no region answers 'umbrella'; the regions are mug_1, mug_2, wall",)
+    assert detector.unsupported(["cup", "umbrella"]) == ("no region matches 'umbrella'; the regions are mug_1, mug_2, wall",)
 
 
 def test_region_attention_numbers_its_regions():

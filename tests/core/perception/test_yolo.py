@@ -89,7 +89,7 @@ def test_a_generic_noun_finds_every_class(tmp_path):
 def test_a_noun_without_a_class_is_said_and_not_found(tmp_path):
     detector = detector_from(write_tiny_yolo(tmp_path / "tiny.onnx", NAMES, [CUP]))
     assert detector.detect(frame_with_red_square(), ["umbrella"]) == []
-    assert detector.warnings == ("no class of the detector fits 'umbrella': it will not be found",)
+    assert detector.unsupported(["cup", "umbrella"]) == ("no class of the detector matches 'umbrella'",)
 
 
 def test_segment_matches_instances_of_any_class_to_boxes(tmp_path):

@@ -223,4 +223,4 @@ def test_a_spool_without_room_ends_no_mission_and_all_is_told_once_it_has_some(t
             assert uplink.drain(20.0)
             active = a.robot.do(lambda mapper: mapper.roi_gaussians()).result()
         uplink.close()
-    assert int(store.table()["robot"].counts.sum()) == len(active) > 0
+    assert int(store.batches()["robot"].counts.sum()) == len(active) > 0

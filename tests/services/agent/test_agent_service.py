@@ -52,7 +52,7 @@ def test_what_the_attention_cannot_find_is_told_to_the_operator() -> None:
         a.client.assign_task("Pick up the mug on the table")
         assert list(a.client.status().notes) == ["anchor 'table' not seen yet: its targets are kept"]
         list(a.client.ingest([frame(0)]))
-        assert any("no region answers 'table'" in note for note in a.client.status().notes)
+        assert any("no region matches 'table'" in note for note in a.client.status().notes)
 
 
 def test_a_task_without_sense_is_refused() -> None:
@@ -175,8 +175,8 @@ def follow(updates: Iterator[convert.MapUpdate], table: dict[int, int]) -> int:
     for update in updates:
         if update.snapshot:
             table.clear()
-        if update.words is not None:
-            for key, count in zip(update.words.keys.tolist(), update.words.counts.tolist(), strict=True):
+        if update.batch is not None:
+            for key, count in zip(update.batch.keys.tolist(), update.batch.counts.tolist(), strict=True):
                 table[key] = count
                 if count == 0:
                     del table[key]
@@ -257,7 +257,7 @@ def test_only_the_tasks_region_leaves_the_robot() -> None:
                 gaussians = a.robot.do(lambda mapper: mapper.gaussians()).result(20)
         finally:
             uplink.close()
-    held = store.words("robot")
+    held = store.batch("robot")
     assert held.gaussians.active.all()
     assert len(held.gaussians) == gaussians.active.sum() < len(gaussians)
     assert status.uplink.connected

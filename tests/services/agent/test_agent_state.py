@@ -97,7 +97,7 @@ def totals(words: VoxelBatch) -> dict[int, tuple[int, int]]:
 
 
 def held_by(store: MemoryStore) -> dict[int, tuple[int, int]]:
-    return totals(store.table()["robot"])
+    return totals(store.batches()["robot"])
 
 
 def test_a_mission_in_two_lives_gives_the_map_and_the_words_of_one(tmp_path: Path) -> None:

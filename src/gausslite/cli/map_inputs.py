@@ -1,0 +1,176 @@
+"""Collect and check the inputs of `gausslite map` before it maps anything."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from gausslite.calibration.pose_exposure_prior import PoseExposurePrior
+from gausslite.cli.parse_command import as_json
+from gausslite.cli.source_options import open_recorded, register_with_warnings, resolve_pose_prior, selected_regions
+from gausslite.config.mapping_options import mission_settings, perception_settings
+from gausslite.config.values import AUTO, NONE
+from gausslite.datasets.registered_source import DepthRegistration
+from gausslite.datasets.source import Source
+from gausslite.domain.task import TaskGraph
+from gausslite.errors import InvalidInputError
+from gausslite.mapping.policies import TASK, policy
+from gausslite.mission.build import EstimatorFactory
+from gausslite.mission.checkpoint import ResumeConfig, SavedRun
+from gausslite.mission.frame_stream import FrameStream
+from gausslite.mission.settings import MissionSettings, PerceptionSettings, SceneInfo, SourceSettings, TaskSettings
+from gausslite.mission.task_schedule import TaskSchedule, TaskSwitch
+from gausslite.perception.fixed_relevance import NoTaskEstimator, RegionRelevanceEstimator
+from gausslite.perception.relevance_estimator import RelevanceEstimator
+
+_UNIFORM = "uniform"
+
+
+@dataclass(frozen=True, slots=True)
+class MapInputs:
+    """The settings of one run, its frames and its tasks.
+
+    Depth registration and pose prior are not estimated yet, see `calibrated` and `resumed`.
+    """
+
+    mission: MissionSettings
+    perception: PerceptionSettings
+    source: SourceSettings
+    task: TaskSettings
+    stream: FrameStream
+    schedule: TaskSchedule
+
+    @classmethod
+    def of(cls, options: argparse.Namespace) -> MapInputs:
+        """Return the inputs of the command line. Raises InvalidInputError, DatasetError, TaskError."""
+        task = TaskSettings(options.task, options.roi, tuple(options.objects), tuple(options.roi_ball))
+        mission = mission_settings(options, _default_policy(options))
+        schedule = _schedule(parse_task(options), [TaskSwitch.parse(text) for text in options.task_at])
+        recorded = open_recorded(options.source, options.up)
+        source = SourceSettings(options.source, options.frames, options.size, options.up, options.test_every)
+        stream = FrameStream.select(recorded, source)
+        source = replace(source, size=f"{stream.size[0]}x{stream.size[1]}")
+        return cls(mission, perception_settings(options), source, task, stream, schedule)
+
+    def calibrated(
+        self,
+        options: argparse.Namespace,
+        registration: DepthRegistration | str | None = None,
+        pose_prior: PoseExposurePrior | str | None = None,
+    ) -> MapInputs:
+        """Return the inputs with depth registration and pose prior, given here or by the options, or estimated."""
+        registration = options.register_depth if registration is None else registration
+        pose_prior = options.pose_prior if pose_prior is None else pose_prior
+        frames, registered_to = register_with_warnings(self.source.spec, self.stream.source, registration, AUTO)
+        prior = resolve_pose_prior(self.source.spec, frames, pose_prior)
+        return replace(
+            self,
+            mission=replace(self.mission, pose_prior=prior),
+            source=replace(self.source, depth_registration=registered_to),
+            stream=replace(self.stream, source=frames),
+        )
+
+    def resumed(self, options: argparse.Namespace, saved: SavedRun) -> MapInputs:
+        """Return the inputs with the saved run's registration and prior where they would be estimated.
+
+        Raises MismatchError if other options differ from the saved run's.
+        """
+        registration, pose_prior = None, None
+        if options.register_depth in (None, AUTO):
+            registration = saved.value(SourceSettings, "depth_registration") or NONE
+        if options.pose_prior == AUTO:
+            pose_prior = saved.value(MissionSettings, "pose_prior")
+        inputs = self.calibrated(options, registration, pose_prior)
+        saved.require(*inputs._fixed_settings(saved.last_index))
+        return inputs
+
+    def resume_config(self, last_index: int) -> ResumeConfig:
+        """Return the settings that a run must have to continue after this frame."""
+        return ResumeConfig.of(*self._fixed_settings(last_index))
+
+    def _fixed_settings(self, last_index: int) -> tuple[Any, ...]:
+        graph = self.schedule.at(last_index)
+        task = replace(self.task, task=None if graph is None else graph.text)
+        return self.mission, self.perception, self.source, task
+
+    def report(self) -> dict[str, object]:
+        """Return the inputs as part of the report."""
+        first = self.schedule.first
+        registration, prior = self.source.depth_registration, self.mission.pose_prior
+        return {
+            "source": self.source.spec,
+            "colour_camera": None if registration is None else str(registration),
+            "view_error": None if prior.is_exact else str(prior),
+            "task": None if first is None else {"text": first.text, **as_json(first)},
+            "then": [{"frame": frame, "text": graph.text, **as_json(graph)} for frame, graph in self.schedule.switches],
+            "policy": self.mission.policy,
+            "without": sorted(self.mission.disabled),
+            "size": list(self.stream.size),
+            "seed": self.mission.seed,
+            "max_gaussians": self.mission.max_gaussians,
+            "hold_out": self.source.test_every,
+        }
+
+
+def parse_task(options: argparse.Namespace) -> TaskGraph | None:
+    """Return the task of the options; None for regions of space, and for a uniform map.
+
+    Raises InvalidInputError for options that contradict each other, TaskError.
+    """
+    regions = has_regions(options)
+    if options.task is not None and regions:
+        raise InvalidInputError("--task: give either a task, or regions with --roi or --roi-ball, not both")
+    if options.detector is not None and options.task is None:
+        raise InvalidInputError("--detector: it finds the nouns of a task; give the task with --task TEXT")
+    if options.task is None:
+        if options.policy is not None and not regions and policy(options.policy).components.follow_task:
+            raise InvalidInputError(
+                f"--policy {options.policy}: expected a task, with --task TEXT, or regions, with --roi FILE.npz or "
+                "--roi-ball X,Y,Z,R"
+            )
+        return None
+    from gausslite.task.rules import RuleParser
+
+    return RuleParser().parse(options.task)
+
+
+def has_regions(options: argparse.Namespace) -> bool:
+    """Return True if the options select regions of space."""
+    return bool(options.roi is not None or options.objects or options.roi_ball)
+
+
+def choose_estimator(options: argparse.Namespace, source: Source) -> RelevanceEstimator:
+    """Return the relevance estimator of the options: for a task, for regions, or for a uniform map."""
+    graph = parse_task(options)
+    if graph is None:
+        return region_estimator(options, source)
+    return EstimatorFactory(perception_settings(options), lambda: SceneInfo.of(source)).build(graph)
+
+
+def region_estimator(options: argparse.Namespace, source: Source) -> RelevanceEstimator:
+    """Return the estimator of the selected regions; without any, nothing is relevant."""
+    regions = selected_regions(options, source)
+    return RegionRelevanceEstimator(regions) if regions else NoTaskEstimator()
+
+
+def _default_policy(options: argparse.Namespace) -> str:
+    """Return "task" if there is a task or a region, else "uniform", with a message unless the user chose a policy."""
+    if options.task is not None or has_regions(options):
+        return TASK
+    if options.policy is None:
+        print("no --task and no region: mapping everything equally (--policy uniform)", file=sys.stderr)
+    return _UNIFORM
+
+
+def _schedule(first: TaskGraph | None, switches: Sequence[TaskSwitch]) -> TaskSchedule:
+    """Return the schedule of --task and --task-at. Raises InvalidInputError, TaskError."""
+    if not switches:
+        return TaskSchedule(first)
+    if first is None:
+        raise InvalidInputError("--task-at: expected a first task, with --task TEXT, got none")
+    from gausslite.task.rules import RuleParser
+
+    return TaskSchedule(first, tuple((switch.frame, RuleParser().parse(switch.text)) for switch in switches))
