@@ -10,10 +10,12 @@ from gausslite.datasets.regions import choose_regions
 from gausslite.errors import InvalidInputError
 from gausslite.evaluation.metrics import psnr
 from gausslite.evaluation.views import MapViewer
+from gausslite.mapping.task_change import Reevaluation
 from gausslite.mission.build import build_mapper
 from gausslite.mission.frame_scheduler import FrameScheduler
+from gausslite.mission.runner import MissionRunner
 from gausslite.mission.settings import MissionSettings, require_rate
-from gausslite.mission.task_mapper import TaskMapper
+from gausslite.mission.task_mapper import FrameOutcome, TaskMapper
 from gausslite.perception.fixed_relevance import RegionRelevanceEstimator
 from gausslite.render.choose import choose_rasterizer
 from gausslite_bench.quality.home_tasks import HOME_TASKS, HomeTask
@@ -81,28 +83,32 @@ class TaskChangeBench:
         earlier = replace(scene, masks=[old_region.estimate(frame).relevance for frame in scene.training])
         first, second = RecordedRelevanceEstimator(earlier), RecordedRelevanceEstimator(scene)
         changed, always, restarted = self._loop(first), self._loop(second), self._loop(second)
-        for frame in scene.training[: self.before]:
-            for loop in (changed, always):
-                loop.process(frame)
+        for mapper in (changed, always):
+            MissionRunner(mapper.process).run(scene.training[: self.before]).raise_if_stopped()
         changed.assign(second)
-        loops = {CHANGED: changed, RESTARTED: restarted, ALWAYS: always}
-        points: dict[str, list[tuple[float, float]]] = {name: [] for name in loops}
-        reread = seeded = most_reread = most_seeded = 0
-        later = scene.training[self.before :]
-        for done, frame in enumerate(later, start=1):
-            for name, loop in loops.items():
-                outcome = loop.process(frame)
-                reread, most_reread = (
-                    reread + outcome.reevaluation.keyframes,
-                    max(most_reread, outcome.reevaluation.keyframes),
-                )
-                seeded, most_seeded = (
-                    seeded + outcome.reevaluation.seeded,
-                    max(most_seeded, outcome.reevaluation.seeded),
-                )
-                if done in (1, len(later)) or done % self.check_every == 0:
-                    points[name].append((done / self.rate_hz, self._region_psnr(loop, scene)))
-        return Recovery(change, points, reread, most_reread, seeded, most_seeded)
+        points: dict[str, list[tuple[float, float]]] = {}
+        reevaluations: list[Reevaluation] = []
+        for name, mapper in {CHANGED: changed, RESTARTED: restarted, ALWAYS: always}.items():
+            points[name], each = self._recover(mapper, scene)
+            reevaluations += each
+        keyframes = [each.keyframes for each in reevaluations]
+        seeded = [each.seeded for each in reevaluations]
+        return Recovery(change, points, sum(keyframes), max(keyframes), sum(seeded), max(seeded))
+
+    def _recover(self, mapper: TaskMapper, scene: Scene) -> tuple[list[tuple[float, float]], list[Reevaluation]]:
+        """Map the frames after the change. Return (seconds, ROI PSNR) points and the re-evaluation of each frame."""
+        frames = scene.training[self.before :]
+        points: list[tuple[float, float]] = []
+        reevaluations: list[Reevaluation] = []
+
+        def check(outcome: FrameOutcome) -> None:
+            reevaluations.append(outcome.reevaluation)
+            done = len(reevaluations)
+            if done in (1, len(frames)) or done % self.check_every == 0:
+                points.append((done / self.rate_hz, self._region_psnr(mapper, scene)))
+
+        MissionRunner(mapper.process, check).run(frames).raise_if_stopped()
+        return points, reevaluations
 
     def _loop(self, attention: RecordedRelevanceEstimator) -> TaskMapper:
         return TaskMapper(

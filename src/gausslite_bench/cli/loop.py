@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass
 
 from gausslite.cli.map_inputs import choose_estimator
 from gausslite.cli.progress import MappingBar
-from gausslite.cli.source_options import add_regions, selected_regions, open_with_warnings
+from gausslite.cli.source_options import add_regions, open_with_warnings, selected_regions
 from gausslite.config.mapping_options import add_budget, add_detector, add_policy, mission_settings
 from gausslite.config.source_options import add_frames
 from gausslite.datasets.held_out import HeldOutSplit
@@ -20,7 +20,9 @@ from gausslite.evaluation.views import HeldOutView
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.policies import TASK
 from gausslite.mission.build import build_mapper
+from gausslite.mission.frame_stream import FrameStream
 from gausslite.mission.results import as_text, peak_rss_mib
+from gausslite.mission.task_mapper import FrameOutcome
 from gausslite.render.choose import choose_rasterizer
 from gausslite.render.rasterizer import Rasterizer
 from gausslite_bench.loop.frame_costs import CostLog, FrameCost, Latency, LoopBench, LoopTiming, Overhead
@@ -55,7 +57,7 @@ def configure_loop(parser: argparse.ArgumentParser) -> None:
 
 def run_loop(options: argparse.Namespace) -> int:
     """Map the sequence with a clock between the steps and print the figures. Reading frames is not counted."""
-    if options.source == _HOME and options.policy == TASK and not _says_what_matters(options):
+    if options.source == _HOME and options.policy in (None, TASK) and not _says_what_matters(options):
         options.task = _HOME_TASK
     if options.loop is not None and options.loop < 2:
         raise InvalidInputError(f"--loop: expected at least 2 frames, got {options.loop}")
@@ -139,14 +141,19 @@ def _play(
     bench = LoopBench(choose_estimator(options, source), mapper, VoxelGrid(), settings.scheduler_settings)
     log, samples_mib = CostLog(), []
     every = max(1, len(positions) // _MEMORY_SAMPLES)
+    done = 0
+
+    def record(outcome: FrameOutcome) -> None:
+        nonlocal done
+        done += 1
+        if outcome.skipped is None:
+            log.append(FrameCost.of(outcome))
+        bar.count(outcome)
+        if options.loop is not None and (done % every == 0 or done == 1):
+            samples_mib.append(resident_mib())
+
     with MappingBar(len(positions), "bench") as bar:
-        for done, position in enumerate(positions, start=1):
-            cost = bench.process(source.frame(position, size))
-            if cost is not None:
-                log.append(cost)
-                bar.show(done, cost.gaussians, cost.roi_share)
-            if options.loop is not None and (done % every == 0 or done == 1):
-                samples_mib.append(resident_mib())
+        bench.run(FrameStream(source, positions, size).frames(), record)
     return bench, log.costs(), MemoryTrend.of(samples_mib, every) if options.loop is not None else None
 
 
@@ -159,10 +166,7 @@ def _gap(
     patient = _patient(options)
     loop = LoopBench(choose_estimator(patient, source), build_mapper(mission_settings(patient)), VoxelGrid())
     with MappingBar(len(positions), "unlimited") as bar:
-        for done, position in enumerate(positions, start=1):
-            cost = loop.process(source.frame(position, size))
-            if cost is not None:
-                bar.show(done, cost.gaussians, cost.roi_share)
+        loop.run(FrameStream(source, positions, size).frames(), bar.count)
     regions = selected_regions(options, source)
     views = [HeldOutView.of(source.frame(position, size), regions) for position in held_out]
     rasterizer = choose_rasterizer(options.rasterizer, options.threads)

@@ -16,6 +16,8 @@ from gausslite.evaluation.compare import MapScores, average, score_view
 from gausslite.evaluation.views import HeldOutView, MapViewer
 from gausslite.mapping.policies import POLICIES, TASK
 from gausslite.mission.build import build_mapper
+from gausslite.mission.frame_stream import FrameStream
+from gausslite.mission.runner import MissionRunner
 from gausslite.mission.settings import MissionSettings
 from gausslite.mission.task_mapper import TaskMapper
 from gausslite.perception.fixed_relevance import NoTaskEstimator, RegionRelevanceEstimator
@@ -61,8 +63,7 @@ def map_and_score(options: argparse.Namespace) -> tuple[MapScores, int]:
     )
     estimator = RegionRelevanceEstimator(regions) if options.policy == TASK else NoTaskEstimator()
     mapper = TaskMapper(estimator, build_mapper(settings))
-    for position in training:
-        mapper.process(source.frame(position, size))
+    MissionRunner(mapper.process).run(FrameStream(source, training, size).frames()).raise_if_stopped()
     gaussians = mapper.gaussians()
     viewer = MapViewer(gaussians, choose_rasterizer(threads=options.threads))
     scores = []

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from array import array
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,7 +16,8 @@ from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.sent_voxels import SentVoxelTracker
 from gausslite.mapping.stages import SkippableStage, Stage
 from gausslite.mission.frame_scheduler import FrameScheduler, FrameTiming, SchedulerSettings
-from gausslite.mission.task_mapper import TaskMapper
+from gausslite.mission.runner import MissionRunner
+from gausslite.mission.task_mapper import FrameOutcome, TaskMapper
 from gausslite.perception.relevance_estimator import RelevanceEstimator
 from gausslite.render.cpu import CpuRasterizer
 from gausslite.render.rasterizer import Rasterizer
@@ -47,22 +48,27 @@ class FrameCost:
     gaussians: int
     roi_share: float
 
+    @classmethod
+    def of(cls, outcome: FrameOutcome) -> FrameCost:
+        """Return the cost of a mapped frame."""
+        return cls(outcome.timing, outcome.iterations, outcome.gaussians, outcome.roi_share)
+
     @property
     def perception_s(self) -> float:
         """Seconds of attention."""
-        return self.of(Stage.RELEVANCE)
+        return self.stage_s(Stage.RELEVANCE)
 
     @property
     def words_s(self) -> float:
         """Seconds that making the region's words took."""
-        return self.of(Stage.PUBLISHING)
+        return self.stage_s(Stage.PUBLISHING)
 
     @property
     def mapping_s(self) -> float:
         """Seconds of all else: drawing, seeding and training."""
         return self.timing.seconds - self.perception_s - self.words_s
 
-    def of(self, step: Stage) -> float:
+    def stage_s(self, step: Stage) -> float:
         """Seconds of one step; 0 where the frame went without it."""
         return self.timing.stages_s.get(step, 0.0)
 
@@ -78,7 +84,7 @@ class CostLog:
         timing = cost.timing
         self._numbers.extend((timing.seconds, timing.under_trained, cost.iterations, cost.gaussians, cost.roi_share))
         self._numbers.extend(relief in timing.skipped_stages for relief in SkippableStage)
-        self._numbers.extend(map(cost.of, Stage))
+        self._numbers.extend(map(cost.stage_s, Stage))
 
     def costs(self) -> list[FrameCost]:
         """All that were kept, in order."""
@@ -137,7 +143,7 @@ class LoopTiming:
             perception=Latency.of([cost.perception_s for cost in costs]),
             mapping=Latency.of([cost.mapping_s for cost in costs]),
             words=Latency.of([cost.words_s for cost in costs]),
-            steps={step.value: Latency.of([cost.of(step) for cost in costs]) for step in Stage},
+            steps={step.value: Latency.of([cost.stage_s(step) for cost in costs]) for step in Stage},
             frames_short=sum(cost.timing.under_trained for cost in costs),
             skipped_stages={
                 relief.value: sum(relief in cost.timing.skipped_stages for cost in costs) for relief in SkippableStage
@@ -164,12 +170,9 @@ class LoopBench:
         """A copy of the map."""
         return self._loop.gaussians()
 
-    def process(self, frame: Frame) -> FrameCost | None:
-        """What one frame cost; None when it was skipped for want of depth."""
-        outcome = self._loop.process(frame)
-        if outcome.skipped is not None:
-            return None
-        return FrameCost(outcome.timing, outcome.iterations, outcome.gaussians, outcome.roi_share)
+    def run(self, frames: Iterable[Frame], on_frame: Callable[[FrameOutcome], None]) -> None:
+        """Map all frames; on_frame gets each outcome. Raises GaussLiteError, KeyboardInterrupt."""
+        MissionRunner(self._loop.process, on_frame).run(frames).raise_if_stopped()
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,7 +186,7 @@ class Overhead:
     @classmethod
     def of(cls, costs: Sequence[FrameCost], rasterizer: Rasterizer) -> Overhead | None:
         """Of these frames, whose steps must be all that the rasterizer ever ran; None for a backend without a clock."""
-        full_s, region_s = (sum(cost.of(step) for cost in costs) for step in (Stage.WARM_UP, Stage.ACTIVE))
+        full_s, region_s = (sum(cost.stage_s(step) for cost in costs) for step in (Stage.WARM_UP, Stage.ACTIVE))
         if not isinstance(rasterizer, CpuRasterizer) or full_s + region_s == 0.0:
             return None
         return cls(

@@ -23,8 +23,9 @@ from gausslite.evaluation.views import MapViewer, largest_roi_views
 from gausslite.mapping.policies import TASK
 from gausslite.mission.build import EstimatorFactory, build_mapper
 from gausslite.mission.frame_scheduler import Clock, FrameScheduler
+from gausslite.mission.runner import MissionRunner
 from gausslite.mission.settings import MissionSettings, PerceptionSettings
-from gausslite.mission.task_mapper import TaskMapper
+from gausslite.mission.task_mapper import FrameOutcome, TaskMapper
 from gausslite.perception.fixed_relevance import NoTaskEstimator
 from gausslite.perception.relevance_estimator import RelevanceEstimator
 from gausslite.render.choose import choose_rasterizer
@@ -195,10 +196,13 @@ def build_map(trial: Trial, scene: Scene, on_frame: Callable[[int], None]) -> Tr
         build_mapper(settings),
         scheduler=FrameScheduler(settings.scheduler_settings, clock_for(settings.threads)),
     )
-    outcomes = []
-    for frame in scene.training:
-        outcomes.append(loop.process(frame))
-        on_frame(outcomes[-1].gaussians)
+    outcomes: list[FrameOutcome] = []
+
+    def record(outcome: FrameOutcome) -> None:
+        outcomes.append(outcome)
+        on_frame(outcome.gaussians)
+
+    MissionRunner(loop.process, record).run(scene.training).raise_if_stopped()
     return TrialMap(
         gaussians=loop.gaussians(),
         iterations_mean=fmean(outcome.iterations for outcome in outcomes),
@@ -244,4 +248,6 @@ def _attention(trial: Trial, scene: Scene) -> RelevanceEstimator:
         return RecordedRelevanceEstimator(scene)
     from gausslite.task.rules import RuleParser
 
-    return EstimatorFactory(trial.conditions.perception.detector, lambda: scene.knowledge).build(RuleParser().parse(scene.task))
+    return EstimatorFactory(trial.conditions.perception.detector, lambda: scene.knowledge).build(
+        RuleParser().parse(scene.task)
+    )
