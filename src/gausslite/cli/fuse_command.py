@@ -1,14 +1,16 @@
-"""`gausslite fuse`: vote map files into one, without a server."""
+"""`gausslite fuse`: fuse map files by a voxel vote, without a server."""
 
 from __future__ import annotations
 
 import argparse
+import sys
+from collections.abc import Sequence
 from pathlib import Path
 
-from gausslite.codec.ply import read_ply, write_ply
+from gausslite.codec.ply import read_ply, read_world_frame, write_ply
 from gausslite.config.mapping_options import add_voxel_size
 from gausslite.domain.voxels import VoxelGrid
-from gausslite.errors import InvalidInputError
+from gausslite.errors import InvalidInputError, MismatchError
 from gausslite.fusion.offline import fuse_maps
 from gausslite.mission.results import as_text, prepare_folder
 
@@ -16,25 +18,52 @@ from gausslite.mission.results import as_text, prepare_folder
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the options of `gausslite fuse`."""
     parser.add_argument("maps", metavar="MAP", type=Path, nargs="+", help="two or more PLY files in one world frame")
-    parser.add_argument("--out", metavar="FILE.ply", type=Path, required=True, help="the fused map")
+    parser.add_argument("--out", metavar="FILE.ply", type=Path, required=True, help="the fused map; not an input file")
     add_voxel_size(parser)
     parser.add_argument("--json", action="store_true", help="print JSON for scripts")
     parser.set_defaults(run=run)
 
 
 def run(options: argparse.Namespace) -> int:
-    """Fuse and write; on full ties the map named first wins."""
+    """Fuse and write the maps; if scores are equal, the map given first wins. Returns the exit code."""
     if len(options.maps) < 2:
         raise InvalidInputError(f"maps: expected at least two files to fuse, got {len(options.maps)}")
+    _require_separate_output(options.maps, options.out)
+    world_frame = _common_world_frame(options.maps)
     prepare_folder(options.out.absolute().parent)
-    # the vote's last tie-break is the lower id: number the files in the order given
+    # the vote's last tie-break is the lower id: number the files in the given order
     maps = {f"{i:03d} {path}": read_ply(path) for i, path in enumerate(options.maps)}
     fused = fuse_maps(maps, VoxelGrid(options.voxel_size))
-    write_ply(options.out, fused.gaussians)
-    kept = {agent_id[4:]: int(fused.won_by(agent_id).sum()) for agent_id in maps}
+    write_ply(options.out, fused.gaussians, world_frame)
+    voxels_won = {agent_id[4:]: int(fused.won_by(agent_id).sum()) for agent_id in maps}
     if options.json:
-        print(as_text({"gaussians": len(fused.gaussians), "voxels": len(fused.batch), "voxels_won": kept}))
+        report = {"gaussians": len(fused.gaussians), "voxels": len(fused.batch), "voxels_won": voxels_won}
+        print(as_text(report))
     else:
-        wins = ", ".join(f"{name} won {count} voxels" for name, count in kept.items())
+        wins = ", ".join(f"{name} won {count} voxels" for name, count in voxels_won.items())
         print(f"{len(fused.gaussians)} Gaussians → {options.out} ({wins})")
     return 0
+
+
+def _require_separate_output(maps: Sequence[Path], out: Path) -> None:
+    """Raise InvalidInputError if the output file is one of the inputs, also through a link or another path."""
+    for path in maps:
+        if path.resolve() == out.resolve() or (path.exists() and out.exists() and path.samefile(out)):
+            raise InvalidInputError(f"--out {out}: expected a file that is not an input, got the input {path}")
+
+
+def _common_world_frame(maps: Sequence[Path]) -> str:
+    """Return the world frame that the maps name, empty if none does; print a note on maps without one.
+
+    Raises MismatchError if they name different ones, MapFileError.
+    """
+    frames = {path: read_world_frame(path) for path in maps}
+    names = sorted(set(frames.values()) - {""})
+    if len(names) > 1:
+        found = ", ".join(f"{frame!r} in {path}" for path, frame in frames.items() if frame)
+        raise MismatchError(f"maps: expected one world frame, got {found}")
+    unnamed = [str(path) for path, frame in frames.items() if not frame]
+    if unnamed:
+        same = f"{names[0]!r}" if names else "one world frame"
+        print(f"no world frame named in {', '.join(unnamed)}; assumed to be in {same}", file=sys.stderr)
+    return names[0] if names else ""

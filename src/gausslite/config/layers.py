@@ -27,8 +27,8 @@ def parse_options(
 ) -> argparse.Namespace:
     """Return the effective options of a program; adds --config and --print-config to its parser.
 
-    The sub-commands of a parser are parsed alike. Ends the process with code 0 after --print-config and with code 2 for wrong flags. Raises InvalidInputError for
-    wrong values in the file or the environment.
+    A parser with sub-commands gets them in its chosen sub-command. Ends the process with code 0 after --print-config
+    and with code 2 for wrong flags. Raises InvalidInputError for wrong values in the file or the environment.
     """
     parser, arguments = _leaf_parser(parser, list(sys.argv[1:] if arguments is None else arguments))
     environment = os.environ if environment is None else environment

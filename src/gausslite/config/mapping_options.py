@@ -61,7 +61,11 @@ def add_policy(parser: argparse.ArgumentParser, allow_auto: bool = False) -> Non
     """
     add = parser.add_argument_group("mapping").add_argument
     add("--preset", choices=sorted(PRESETS), help="set of defaults for other options; paper: the literal method")
-    add("--policy", choices=sorted(POLICIES), help="what the budget is spent on (default: task; map without a task: uniform)")
+    add(
+        "--policy",
+        choices=sorted(POLICIES),
+        help="what the budget is spent on (default: task; map without a task: uniform)",
+    )
     others = ", ".join(name for name in ABLATION_FLAGS if name not in ("sb", "mvo", "roi", "sis", "gfd"))
     add("--disable", metavar="A,B", type=read_names, default=(), help=f"{_DISABLE_HELP}{others}")
     add("--rasterizer", choices=BACKENDS, default="auto", help="backend that renders and trains (default: auto)")

@@ -126,7 +126,7 @@ def test_a_wrong_file_is_one_line_that_names_file_and_key(tmp_path: Path, text: 
 
 @pytest.mark.parametrize("path", ["missing.toml", "."])
 def test_a_missing_file_is_reported(tmp_path: Path, path: str) -> None:
-    with pytest.raises(InvalidInputError, match="--config .*: expected a TOML file"):
+    with pytest.raises(InvalidInputError, match=r"--config .*: expected a TOML file"):
         parse("home", "--out=x", file=tmp_path / path)
 
 

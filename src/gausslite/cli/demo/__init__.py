@@ -1,0 +1,1 @@
+"""The parts of `gausslite demo`: its scenario, its services as processes, and its report."""

@@ -1,0 +1,59 @@
+"""The demo reports the failure of a service, and configures agents by files that restore the settings."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from gausslite.calibration.pose_exposure_prior import PoseExposurePrior
+from gausslite.cli.demo.scenario import AgentPlan
+from gausslite.cli.demo.service_processes import ServiceProcess
+from gausslite.cli.demo.services import DemoPlan, RunningService, RunningServices, watch_missions
+from gausslite.config.mapping_options import mission_options, perception_options
+from gausslite.config.toml_text import to_toml
+from gausslite.errors import UnavailableError
+from gausslite.mapping.stages import SkippableStage
+from gausslite.mission.settings import MissionSettings, PerceptionSettings
+from gausslite_agent.settings import parse_arguments
+
+
+def test_the_log_of_a_failed_agent_is_reported(tmp_path: Path) -> None:
+    log = tmp_path / "ant.log"
+    script = "import time; print('ant: the disk is full', flush=True); time.sleep(1); raise SystemExit(2)"
+    with log.open("wb") as stream:
+        process = subprocess.Popen([sys.executable, "-c", script], stdout=stream)
+    plan = DemoPlan((AgentPlan("ant", "Find the mug", "sim:home", ":", 1),), {}, 0.1, 0, 0)
+    agent = RunningService(f"unix:{tmp_path}/nobody.sock", ServiceProcess("ant", process, log))
+    with pytest.raises(UnavailableError, match=r"ant ended with code 2: ant: the disk is full"):
+        watch_missions(RunningServices(plan, "", {"ant": agent}))
+
+
+@pytest.mark.parametrize(
+    "mission",
+    [
+        MissionSettings(),
+        MissionSettings(policy="uniform", iterations=3, seed=7, threads=2, max_gaussians=99, backend="cpu"),
+        MissionSettings(
+            disabled=frozenset({"sb", "gfd"}),
+            rate_hz=4.5,
+            min_iterations=3,
+            skip_stages=(),
+            deadline_slack=0.25,
+            pose_prior=PoseExposurePrior(0.01, 0.5, 0.1, 0.03),
+        ),
+        MissionSettings(skip_stages=(SkippableStage.SEEDING,)),
+    ],
+)
+def test_an_agent_restores_the_settings_of_its_configuration_file(tmp_path: Path, mission: MissionSettings) -> None:
+    perception = PerceptionSettings(tmp_path / "a.onnx", resegment=True, segmenter="depth", vocabulary=tmp_path / "v")
+    config = tmp_path / "config.toml"
+    config.write_text(to_toml({**mission_options(mission), **perception_options(perception)}))
+    settings = parse_arguments(["--config", str(config)])
+    assert settings.mission == mission
+    at_rate = mission.rate_hz is not None
+    threads = 1 if at_rate else mission.threads
+    assert settings.perception == replace(perception, threads=threads, asynchronous=at_rate)

@@ -1,0 +1,65 @@
+"""`gausslite fuse` keeps its inputs, and fuses only maps of one world frame."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from sample_gaussians import plain_gaussians
+
+from gausslite.cli.main import main
+from gausslite.codec.ply import read_world_frame, write_ply
+
+
+@pytest.fixture
+def maps(tmp_path: Path) -> list[Path]:
+    """Return two maps without a world frame."""
+    paths = [tmp_path / "a.ply", tmp_path / "b.ply"]
+    for path in paths:
+        write_ply(path, plain_gaussians(np.linspace(0, 1, 30)))
+    return paths
+
+
+def fuse(*arguments: Path) -> int:
+    return main(["fuse", *map(str, arguments[:-1]), "--out", str(arguments[-1])])
+
+
+def test_an_output_that_is_an_input_is_refused(
+    maps: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = maps[1].read_bytes()
+    (tmp_path / "link.ply").symlink_to(maps[1])
+    (tmp_path / "hard.ply").hardlink_to(maps[1])
+    monkeypatch.chdir(tmp_path)
+    for out in (maps[1], Path("b.ply"), tmp_path / "link.ply", tmp_path / "hard.ply", tmp_path / "x" / ".." / "b.ply"):
+        assert fuse(*maps, out) == 2
+        assert "expected a file that is not an input" in capsys.readouterr().err
+    assert maps[1].read_bytes() == before
+
+
+def test_maps_of_different_world_frames_are_refused(
+    maps: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    gaussians = plain_gaussians(np.linspace(0, 1, 30))
+    write_ply(maps[0], gaussians, "map")
+    write_ply(maps[1], gaussians, "odom")
+    assert fuse(*maps, tmp_path / "fused.ply") == 2
+    [line] = capsys.readouterr().err.splitlines()
+    assert f"expected one world frame, got 'map' in {maps[0]}, 'odom' in {maps[1]}" in line
+    assert not (tmp_path / "fused.ply").exists()
+
+
+def test_the_fused_map_names_the_world_frame_of_its_maps(
+    maps: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert fuse(*maps, tmp_path / "plain.ply") == 0
+    assert f"no world frame named in {maps[0]}, {maps[1]}; assumed to be in one world" in capsys.readouterr().err
+    assert read_world_frame(tmp_path / "plain.ply") == ""
+    write_ply(maps[0], plain_gaussians(np.linspace(0, 1, 30)), "map")
+    assert fuse(*maps, tmp_path / "fused.ply") == 0
+    assert f"no world frame named in {maps[1]}; assumed to be in 'map'" in capsys.readouterr().err
+    assert read_world_frame(tmp_path / "fused.ply") == "map"
+    write_ply(maps[1], plain_gaussians(np.linspace(0, 1, 30)), "map")
+    assert fuse(*maps, tmp_path / "fused.ply") == 0
+    assert not capsys.readouterr().err
