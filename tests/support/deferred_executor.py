@@ -5,7 +5,7 @@ from __future__ import annotations
 from concurrent.futures import Executor, Future
 
 
-class WorkInHand(Executor):
+class DeferredExecutor(Executor):
     """Runs what was submitted when the test says so."""
 
     def __init__(self) -> None:

@@ -26,7 +26,7 @@ Answer = tuple[tuple[float, float, float, float], Mapping[str, float]]
 class TinyTokenizer:
     """Whole words of the vocabulary above; runs where the package `tokenizers` does not."""
 
-    def pieces(self, text: str) -> WordPieces:
+    def encode(self, text: str) -> WordPieces:
         ids, spans, at = [], [], 0
         for word in text.split():
             at = text.index(word, at)
@@ -35,7 +35,7 @@ class TinyTokenizer:
             at += len(word)
         return WordPieces(tuple(ids), tuple(spans))
 
-    def mark(self, name: str) -> int:
+    def special_token_id(self, name: str) -> int:
         return VOCABULARY.index(name)
 
 

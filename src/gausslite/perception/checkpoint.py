@@ -16,7 +16,7 @@ from gausslite.perception.object_map import Landmark
 from gausslite.perception.reproject import Frustum
 
 
-def frustum_state(frustum: Frustum) -> dict[str, NDArray[Any]]:
+def encode_frustum(frustum: Frustum) -> dict[str, NDArray[Any]]:
     """A carried detection and the camera that saw it."""
     detection, camera = frustum.detection, frustum.camera
     intrinsics = (camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px)
@@ -25,11 +25,11 @@ def frustum_state(frustum: Frustum) -> dict[str, NDArray[Any]]:
         "mask": detection.mask,
         "numbers": np.array([detection.score, *detection.box_px, *intrinsics, frustum.near_m, frustum.far_m]),
         "T_world_camera": frustum.T_world_camera,
-        "passed_over": int_array(frustum.passed_over),
+        "missed_detections": int_array(frustum.missed_detections),
     }
 
 
-def frustum_of(state: State) -> Frustum:
+def decode_frustum(state: State) -> Frustum:
     """The carried detection again. Raises MapFileError, InvalidInputError."""
     numbers = get_floats(state, "numbers", 11)
     score, left, top, right, bottom, fx_px, fy_px, cx_px, cy_px, near_m, far_m = numbers
@@ -38,23 +38,23 @@ def frustum_of(state: State) -> Frustum:
     require_rigid("state T_world_camera", T_world_camera)
     detection = Detection(get_text(state, "phrase"), score, (left, top, right, bottom), mask)
     camera = Camera(fx_px, fy_px, cx_px, cy_px, mask.shape[1], mask.shape[0])
-    [passed_over] = get_counts(state, "passed_over", 1)
-    return Frustum(detection, camera, T_world_camera, near_m, far_m, passed_over)
+    [missed_detections] = get_counts(state, "missed_detections", 1)
+    return Frustum(detection, camera, T_world_camera, near_m, far_m, missed_detections)
 
 
-def remembered_state(each: Landmark) -> dict[str, NDArray[Any]]:
-    """An object over all its sightings."""
+def encode_landmark(each: Landmark) -> dict[str, NDArray[Any]]:
+    """An object over all its observations."""
     return {
         "phrase": encode_text(each.phrase),
         "place_m": np.array([*each.centroid_m, each.radius_m]),
         "cells": each.cells,
         "counts": each.counts,
-        "seen": int_array(each.seen, each.missed),
+        "seen": int_array(each.seen_count, each.missed_count),
         "best": np.array([each.best_score, each.farthest_m]),
     }
 
 
-def remembered_of(state: State) -> Landmark:
+def decode_landmark(state: State) -> Landmark:
     """The object again. Raises MapFileError, InvalidInputError."""
     x_m, y_m, z_m, radius_m = get_floats(state, "place_m", 4)
     cells = get_array(state, "cells", (None,), np.int64).copy()

@@ -48,12 +48,12 @@ class ClassAgnosticSegmenter:
         """The mask whose own box overlaps the given one best, by min_box_iou or more; None where none does."""
         if len(boxes_px) == 0:
             return []
-        answer = self._network.answer(frame)
-        found = answer.candidates(self._settings.min_score)
+        output = self._network.run(frame)
+        found = output.candidates(self._settings.min_score)
         found = suppress(found, self._settings.max_iou, self._settings.max_masks, across_classes=True)
         if len(found.scores) == 0:
             return [None] * len(boxes_px)
         overlaps = box_iou(boxes_px, found.boxes_px)
         fits = overlaps.max(axis=1) >= self._settings.min_box_iou
-        masks = answer.masks(found.take(overlaps.argmax(axis=1)))
+        masks = output.masks(found.take(overlaps.argmax(axis=1)))
         return [mask if fit and mask.any() else None for mask, fit in zip(masks, fits, strict=True)]

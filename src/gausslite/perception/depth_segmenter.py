@@ -32,9 +32,9 @@ class DepthSegmenterSettings:
     def __post_init__(self) -> None:
         for name in ("depth_step", "colour_step"):
             if not (np.isfinite(getattr(self, name)) and getattr(self, name) > 0):
-                raise InvalidInputError(f"cut {name}: expected a positive number, got {getattr(self, name)}")
+                raise InvalidInputError(f"depth segmenter {name}: expected a positive number, got {getattr(self, name)}")
         if not 8 <= self.side_px <= 4096:
-            raise InvalidInputError(f"cut side_px: expected 8 to 4096, got {self.side_px}")
+            raise InvalidInputError(f"depth segmenter side_px: expected 8 to 4096, got {self.side_px}")
 
 
 class DepthSegmenter:
@@ -45,9 +45,9 @@ class DepthSegmenter:
 
     def segment(self, frame: Frame, boxes_px: Float32[ndarray, "n 4"]) -> list[Bool[ndarray, "h w"] | None]:
         """The largest surface in the middle of each box; None where the middle has no depth."""
-        return [self._cut(frame, box) for box in boxes_px]
+        return [self._segment_box(frame, box) for box in boxes_px]
 
-    def _cut(self, frame: Frame, box_px: Float32[ndarray, "4"]) -> Bool[ndarray, "h w"] | None:
+    def _segment_box(self, frame: Frame, box_px: Float32[ndarray, "4"]) -> Bool[ndarray, "h w"] | None:
         height, width = frame.depth_m.shape
         left, top = np.clip(np.floor(box_px[:2]).astype(int), 0, (width, height)).tolist()
         right, bottom = np.clip(np.ceil(box_px[2:]).astype(int), 0, (width, height)).tolist()
@@ -70,7 +70,7 @@ class DepthSegmenter:
         self, depth_m: Float32[ndarray, "h w"], rgb: UInt8[ndarray, "h w 3"]
     ) -> Bool[ndarray, "h w"] | None:
         """Of the surfaces that reach into the middle, the one with most pixels there."""
-        layers = _layers(depth_m, rgb)
+        layers = _similarity_image(depth_m, rgb)
         step = (self._settings.depth_step, self._settings.colour_step, self._settings.colour_step)
         height, width = depth_m.shape
         middle = np.zeros((height, width), np.bool_)
@@ -91,7 +91,7 @@ class DepthSegmenter:
         return best
 
 
-def _layers(depth_m: Float32[ndarray, "h w"], rgb: UInt8[ndarray, "h w 3"]) -> Float32[ndarray, "h w 3"]:
+def _similarity_image(depth_m: Float32[ndarray, "h w"], rgb: UInt8[ndarray, "h w 3"]) -> Float32[ndarray, "h w 3"]:
     """What must go on without a step: the logarithm of depth (so that steps are shares), lightness, and hue."""
     lab = cv2.cvtColor(cv2.GaussianBlur(rgb, (3, 3), 0).astype(np.float32) / 255, cv2.COLOR_RGB2LAB)
     log_depth = np.where(depth_m > 0, np.log(np.maximum(depth_m, 1e-3)), _NO_DEPTH)

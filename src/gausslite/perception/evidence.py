@@ -15,7 +15,7 @@ from gausslite.domain.pose import inverse, transform_points
 from gausslite.errors import InvalidInputError
 from gausslite.perception.object_map import Landmark
 
-_FIRM: Final = 3
+_RELIABLE_FACTOR: Final = 3
 _NEAR_M: Final = 0.05
 _BEHIND_M: Final = 0.10
 _BEHIND_SHARE: Final = 0.02
@@ -25,50 +25,50 @@ _FARTHER: Final = 1.1
 
 @dataclass(frozen=True, slots=True)
 class EvidenceSettings:
-    """Believed is what was seen min_seen times, or once with sure_score, in min_share of the views that show its place.
+    """Believed is what was seen min_seen times, or once with confident_score, in min_seen_fraction of the views that show its place.
 
     The least of each (1, 0 and 0) believes every detection.
     """
 
     min_seen: int = 2
-    sure_score: float = 0.6
-    min_share: float = 0.25
+    confident_score: float = 0.6
+    min_seen_fraction: float = 0.25
 
     def __post_init__(self) -> None:
         if self.min_seen < 1:
             raise InvalidInputError(f"evidence min_seen: expected at least 1, got {self.min_seen}")
-        for name in ("sure_score", "min_share"):
+        for name in ("confident_score", "min_seen_fraction"):
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise InvalidInputError(f"evidence {name}: expected 0 to 1, got {getattr(self, name)}")
 
     @classmethod
-    def none(cls) -> EvidenceSettings:
+    def accept_all(cls) -> EvidenceSettings:
         """Every detection counts."""
-        return cls(min_seen=1, sure_score=0.0, min_share=0.0)
+        return cls(min_seen=1, confident_score=0.0, min_seen_fraction=0.0)
 
     def is_confirmed(self, each: Landmark) -> bool:
         """True when there is enough to go by."""
-        often = each.seen >= self.min_seen or each.best_score >= self.sure_score
-        return often and each.seen >= self.min_share * (each.seen + each.missed)
+        often = each.seen_count >= self.min_seen or each.best_score >= self.confident_score
+        return often and each.seen_count >= self.min_seen_fraction * (each.seen_count + each.missed_count)
 
     def is_reliable(self, each: Landmark) -> bool:
         """True when it is believed and could not be two mistakes: one false candidate would decide a superlative."""
-        often = each.seen >= _FIRM * self.min_seen or each.best_score >= self.sure_score
+        often = each.seen_count >= _RELIABLE_FACTOR * self.min_seen or each.best_score >= self.confident_score
         return often and self.is_confirmed(each)
 
     def needs_observation(self, each: Landmark) -> bool:
-        """True when one more sighting could settle it."""
-        return not self.is_confirmed(each) and each.seen + 1 >= self.min_seen
+        """True when one more observation could settle it."""
+        return not self.is_confirmed(each) and each.seen_count + 1 >= self.min_seen
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Outlook:
+class VisibilityCheck:
     """What a frame could show: depth_m is that of its nearest surfaces."""
 
     frame: Frame
     depth_m: Float32[ndarray, "h w"]
 
-    def shows_place_of(self, each: Landmark) -> bool:
+    def is_visible(self, each: Landmark) -> bool:
         """True when most of the object's cells lie in view with nothing before them, no farther than it was seen from.
 
         An object that is gone still has its place: then what lies behind is seen.

@@ -21,7 +21,7 @@ class RegionRelevanceEstimator:
 
     def __init__(self, regions: Sequence[Region]) -> None:
         if not regions:
-            raise InvalidInputError("attention regions: expected at least one region, got none")
+            raise InvalidInputError("regions: expected at least one region, got none")
         self._regions = tuple(regions)
 
     @property

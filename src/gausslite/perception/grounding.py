@@ -15,18 +15,18 @@ from numpy import ndarray
 from gausslite.domain.frame import Frame
 from gausslite.errors import InvalidInputError, ModelFileError
 from gausslite.perception.detect import BoxFractions, DetectedBox, concerns_many_objects
-from gausslite.perception.grounding_text import PhraseInput, Tokenizer, phrase_input
+from gausslite.perception.grounding_text import PhraseInput, Tokenizer, encode_phrase
 from gausslite.perception.model_file import OpenModel, run_once
 
 INPUTS: Final = ("pixel_values", "input_ids", "attention_mask", "token_type_ids", "pixel_mask")
 OUTPUTS: Final = ("logits", "pred_boxes")
-_NEEDED: Final = frozenset({"pixel_values", "input_ids"})
+_REQUIRED_INPUTS: Final = frozenset({"pixel_values", "input_ids"})
 # of the images that the network was trained on, red, green and blue
 _MEAN: Final = np.array([0.485, 0.456, 0.406], np.float32)
-_DEVIATION: Final = np.array([0.229, 0.224, 0.225], np.float32)
+_STANDARD_DEVIATION: Final = np.array([0.229, 0.224, 0.225], np.float32)
 _SHORT_SIDE_PX: Final = 800
 _LONG_SIDE_PX: Final = 1333
-_TRIAL: Final = "object"
+_TEST_PHRASE: Final = "object"
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +65,7 @@ class GroundingDino:
         length = shapes["input_ids"][1]
         self._length = length if isinstance(length, int) else None
         self._phrases: dict[str, PhraseInput] = {}
-        self._try_once(model)
+        self._check_outputs(model)
 
     def unsupported(self, queries: Sequence[str]) -> tuple[str, ...]:
         """Return nothing: the network accepts any phrase."""
@@ -74,26 +74,26 @@ class GroundingDino:
 
     def boxes(self, frame: Frame, queries: Sequence[str]) -> list[DetectedBox]:
         """All instances of each query, best first; boxes that span too much are left out."""
-        pixel_values, pixel_mask = self._picture(frame.rgb)
+        pixel_values, pixel_mask = self._preprocess(frame.rgb)
         many = concerns_many_objects(queries)
         found: list[DetectedBox] = []
         for query in queries:
-            logits, centred = self._run(pixel_values, pixel_mask, self._phrase(query))
+            logits, boxes_cxcywh = self._run(pixel_values, pixel_mask, self._encoded_phrase(query))
             limit = self._settings.box_fractions.limit(query, many)
-            found += self._chosen(query, logits, centred, limit, (frame.camera.width_px, frame.camera.height_px))
+            found += self._select_boxes(query, logits, boxes_cxcywh, limit, (frame.camera.width_px, frame.camera.height_px))
         return found
 
-    def _chosen(
+    def _select_boxes(
         self,
         query: str,
         logits: Float32[ndarray, "q l"],
-        centred: Float32[ndarray, "q 4"],
+        boxes_cxcywh: Float32[ndarray, "q 4"],
         limit: float,
         size_px: tuple[int, int],
     ) -> list[DetectedBox]:
         """The boxes that are sure enough, not too large, and distinct."""
-        scores, noun_scores = phrase_scores(logits, self._phrase(query).is_noun)
-        boxes_px = corners_px(centred, size_px)
+        scores, noun_scores = phrase_scores(logits, self._encoded_phrase(query).is_noun)
+        boxes_px = corners_px(boxes_cxcywh, size_px)
         shares = (boxes_px[:, 2:] - boxes_px[:, :2]).prod(axis=1) / (size_px[0] * size_px[1])
         sure = (scores >= self._settings.box_score) & (noun_scores >= self._settings.text_score)
         rows = np.flatnonzero(sure & (shares > 0) & (shares <= limit))
@@ -109,37 +109,37 @@ class GroundingDino:
             found.append(DetectedBox(query, float(scores[row]), (left, top, right, bottom)))
         return found
 
-    def _phrase(self, query: str) -> PhraseInput:
+    def _encoded_phrase(self, query: str) -> PhraseInput:
         if query not in self._phrases:
-            self._phrases[query] = phrase_input(query, self._tokenizer, self._length)
+            self._phrases[query] = encode_phrase(query, self._tokenizer, self._length)
         return self._phrases[query]
 
-    def _picture(self, rgb: UInt8[ndarray, "h w 3"]) -> tuple[Float32[ndarray, "1 3 H W"], Int64[ndarray, "1 H W"]]:
+    def _preprocess(self, rgb: UInt8[ndarray, "h w 3"]) -> tuple[Float32[ndarray, "1 3 H W"], Int64[ndarray, "1 H W"]]:
         """The image in the network's size, its proportions kept where a mask can say what is left over."""
         height, width = self._size_px
         if height is None or width is None:
-            return picture(rgb, fitting_size_px(rgb.shape[0], rgb.shape[1]), keep_proportions=True)
-        return picture(rgb, (height, width), keep_proportions="pixel_mask" in self._types)
+            return preprocess(rgb, training_size_px(rgb.shape[0], rgb.shape[1]), keep_proportions=True)
+        return preprocess(rgb, (height, width), keep_proportions="pixel_mask" in self._types)
 
     def _run(
         self, pixel_values: Float32[ndarray, "1 3 H W"], pixel_mask: Int64[ndarray, "1 H W"], phrase: PhraseInput
     ) -> tuple[Float32[ndarray, "q l"], Float32[ndarray, "q 4"]]:
-        logits, boxes = self._session.run(list(OUTPUTS), self._feed(pixel_values, pixel_mask, phrase))
+        logits, boxes = self._session.run(list(OUTPUTS), self._inputs(pixel_values, pixel_mask, phrase))
         return logits[0].astype(np.float32), boxes[0].astype(np.float32)
 
-    def _feed(
+    def _inputs(
         self, pixel_values: Float32[ndarray, "1 3 H W"], pixel_mask: Int64[ndarray, "1 H W"], phrase: PhraseInput
     ) -> dict[str, Any]:
         given = (pixel_values, phrase.input_ids, phrase.attention_mask, phrase.token_type_ids, pixel_mask)
         named = zip(INPUTS, given, strict=True)
         return {name: array.astype(self._types[name]) for name, array in named if name in self._types}
 
-    def _try_once(self, model: OpenModel) -> None:
+    def _check_outputs(self, model: OpenModel) -> None:
         rgb = np.zeros((48, 64, 3), np.uint8)
-        outputs = run_once(model, self._feed(*self._picture(rgb), self._phrase(_TRIAL)))
+        outputs = run_once(model, self._inputs(*self._preprocess(rgb), self._encoded_phrase(_TEST_PHRASE)))
         shapes = {each.name: out.shape for each, out in zip(self._session.get_outputs(), outputs, strict=True)}
         logits, boxes = shapes["logits"], shapes["pred_boxes"]
-        tokens = self._phrase(_TRIAL).input_ids.shape[1]
+        tokens = self._encoded_phrase(_TEST_PHRASE).input_ids.shape[1]
         if not (len(logits) == 3 and logits[2] >= tokens and boxes == (1, logits[1], 4) and logits[0] == 1):
             raise ModelFileError(
                 f"model {model.path}: expected logits [1, q, {tokens} or more] and pred_boxes [1, q, 4], "
@@ -159,23 +159,23 @@ def phrase_scores(
     return likely.max(axis=1).astype(np.float32), own.astype(np.float32)
 
 
-def corners_px(centred: Float32[ndarray, "q 4"], size_px: tuple[int, int]) -> Float32[ndarray, "q 4"]:
+def corners_px(boxes_cxcywh: Float32[ndarray, "q 4"], size_px: tuple[int, int]) -> Float32[ndarray, "q 4"]:
     """Boxes (centre x, y, width, height, in shares of an image of width, height) as corners, clipped to the image."""
-    half = centred[:, 2:] / 2
-    corners = np.concatenate([centred[:, :2] - half, centred[:, :2] + half], axis=1)
+    half = boxes_cxcywh[:, 2:] / 2
+    corners = np.concatenate([boxes_cxcywh[:, :2] - half, boxes_cxcywh[:, :2] + half], axis=1)
     size = np.array([*size_px, *size_px], np.float32)
     clipped: Float32[ndarray, "q 4"] = np.clip(corners * size, 0, size).astype(np.float32)
     return clipped
 
 
-def fitting_size_px(height_px: int, width_px: int) -> tuple[int, int]:
+def training_size_px(height_px: int, width_px: int) -> tuple[int, int]:
     """The size (height, width) that the network was trained at: 800 on the short side, at most 1333 on the long."""
     short, long = sorted((height_px, width_px))
     scale = min(_SHORT_SIDE_PX / short, _LONG_SIDE_PX / long)
     return max(1, round(height_px * scale)), max(1, round(width_px * scale))
 
 
-def picture(
+def preprocess(
     rgb: UInt8[ndarray, "h w 3"], size_px: tuple[int, int], keep_proportions: bool
 ) -> tuple[Float32[ndarray, "1 3 H W"], Int64[ndarray, "1 H W"]]:
     """The image scaled into size_px (height, width) from the top left corner, standardised; the mask says where it is.
@@ -190,7 +190,7 @@ def picture(
     shrinks = inner_w < w
     scaled = cv2.resize(rgb, (inner_w, inner_h), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
     values = np.zeros((1, 3, height, width), np.float32)
-    values[0, :, :inner_h, :inner_w] = ((scaled.astype(np.float32) / 255 - _MEAN) / _DEVIATION).transpose(2, 0, 1)
+    values[0, :, :inner_h, :inner_w] = ((scaled.astype(np.float32) / 255 - _MEAN) / _STANDARD_DEVIATION).transpose(2, 0, 1)
     mask = np.zeros((1, height, width), np.int64)
     mask[:, :inner_h, :inner_w] = 1
     return values, mask
@@ -198,7 +198,7 @@ def picture(
 
 def is_grounding(names_in: Sequence[str], names_out: Sequence[str]) -> bool:
     """True for a network with the inputs and outputs of Grounding DINO."""
-    return set(names_in) >= _NEEDED and set(OUTPUTS) <= set(names_out)
+    return set(names_in) >= _REQUIRED_INPUTS and set(OUTPUTS) <= set(names_out)
 
 
 def _input_types(path: Path, session: Any) -> dict[str, type[np.generic]]:

@@ -30,11 +30,11 @@ class WordPieces:
 class Tokenizer(Protocol):
     """Cuts texts into the pieces of one vocabulary."""
 
-    def pieces(self, text: str) -> WordPieces:
+    def encode(self, text: str) -> WordPieces:
         """The pieces of a lower-case text, without marks."""
         ...
 
-    def mark(self, name: str) -> int:
+    def special_token_id(self, name: str) -> int:
         """The id of [PAD], [CLS], [SEP] or "."."""
         ...
 
@@ -49,23 +49,23 @@ class PhraseInput:
     is_noun: tuple[bool, ...]
 
 
-def phrase_input(phrase: str, tokenizer: Tokenizer, length: int | None) -> PhraseInput:
+def encode_phrase(phrase: str, tokenizer: Tokenizer, length: int | None) -> PhraseInput:
     """What the network reads for one phrase; length None: as long as the phrase needs.
 
     A phrase that is too long loses words in front, so that its noun stays. Raises ModelFileError where not even one
     piece has room.
     """
     words = " ".join(phrase.casefold().replace("_", " ").split())
-    found = tokenizer.pieces(words)
+    found = tokenizer.encode(words)
     room = len(found.ids) if length is None else length - 3
     if room < 1:
         raise ModelFileError(f"model's input_ids: expected room for 4 tokens or more, got {length}")
     ids, spans = found.ids[-room:], found.spans[-room:]
     noun_from = len(words) - len(head_of(words))
-    marked = [tokenizer.mark("[CLS]"), *ids, tokenizer.mark("."), tokenizer.mark("[SEP]")]
+    marked = [tokenizer.special_token_id("[CLS]"), *ids, tokenizer.special_token_id("."), tokenizer.special_token_id("[SEP]")]
     is_noun = [False, *(start >= noun_from for start, _ in spans), False, False]
     padding = (length or len(marked)) - len(marked)
-    input_ids = np.array([marked + [tokenizer.mark("[PAD]")] * padding], np.int64)
+    input_ids = np.array([marked + [tokenizer.special_token_id("[PAD]")] * padding], np.int64)
     attention = np.array([[1] * len(marked) + [0] * padding], np.int64)
     return PhraseInput(input_ids, attention, np.zeros_like(input_ids), (*is_noun, *([False] * padding)))
 
@@ -76,14 +76,14 @@ class BertTokenizer:
     def __init__(self, vocabulary: Path) -> None:
         """Raises ModelFileError for a wrong file and KernelError where the package `tokenizers` is missing."""
         self._ids = _read_vocabulary(vocabulary)
-        self._tokenizer = _word_piece(self._ids)
+        self._tokenizer = _wordpiece_tokenizer(self._ids)
 
-    def pieces(self, text: str) -> WordPieces:
+    def encode(self, text: str) -> WordPieces:
         """The pieces of a text, without marks."""
         encoded = self._tokenizer.encode(text, add_special_tokens=False)
         return WordPieces(tuple(encoded.ids), tuple((int(start), int(end)) for start, end in encoded.offsets))
 
-    def mark(self, name: str) -> int:
+    def special_token_id(self, name: str) -> int:
         """The id of a mark."""
         return self._ids[name]
 
@@ -104,7 +104,7 @@ def _read_vocabulary(path: Path) -> dict[str, int]:
     return ids
 
 
-def _word_piece(ids: dict[str, int]) -> Any:
+def _wordpiece_tokenizer(ids: dict[str, int]) -> Any:
     try:
         from tokenizers import Tokenizer as Pieces
         from tokenizers.models import WordPiece

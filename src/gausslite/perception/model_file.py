@@ -19,7 +19,7 @@ _MAX_BYTES: Final = (1 << 31) - 1
 # fields of an ONNX ModelProto by number, and how each is encoded: 0 a number, 2 bytes of a stated length
 _GRAPH: Final = 7
 _FIELDS: Final = {1: 0, 2: 2, 3: 2, 4: 2, 5: 0, 6: 2, _GRAPH: 2, 8: 2, 14: 2, 20: 2, 25: 2, 26: 2}
-_STRANGERS: Final = (
+_FOREIGN_FORMATS: Final = (
     (b"version https://git-lfs", "a Git LFS pointer instead of the file it points to"),
     (b"<!", "a web page"),
     (b"<html", "a web page"),
@@ -90,7 +90,7 @@ def require_onnx(path: Path) -> None:
         raise ModelFileError(f"model {path}: expected a readable ONNX model of up to 2 GiB, got {size} bytes")
     try:
         with path.open("rb") as file:
-            found = _strange_kind(file.read(64)) or _misfit(file, size)
+            found = _foreign_format(file.read(64)) or _structure_error(file, size)
     except OSError as error:
         raise ModelFileError(f"model {path}: cannot be read: {error.strerror or error}") from error
     if found:
@@ -137,14 +137,14 @@ def _providers() -> tuple[str, ...]:
     return choose_providers(_runtime().get_available_providers())
 
 
-def _strange_kind(start: bytes) -> str:
+def _foreign_format(start: bytes) -> str:
     if start[4:8] == b"ORTM":
         return "a model in ORT format: give the .onnx file it was made from"
     trimmed = start.lstrip().lower()
-    return next((kind for mark, kind in _STRANGERS if start.startswith(mark) or trimmed.startswith(mark)), "")
+    return next((kind for mark, kind in _FOREIGN_FORMATS if start.startswith(mark) or trimmed.startswith(mark)), "")
 
 
-def _misfit(file: BinaryIO, size: int) -> str:
+def _structure_error(file: BinaryIO, size: int) -> str:
     """What keeps these bytes from being a whole ModelProto; empty where nothing does."""
     file.seek(0)
     seen = set()

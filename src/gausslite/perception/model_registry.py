@@ -77,7 +77,7 @@ class ModelRegistry:
         tokenizer = BertTokenizer(vocabulary or model.path.parent / VOCABULARY)
         network = GroundingDino(model, tokenizer)
         self._segmenter: Segmenter = _segmenter(segmenter or DEPTH, threads)
-        self._detector: Detector = SegmentedDetector(network, _in_turn(self._segmenter))
+        self._detector: Detector = SegmentedDetector(network, _with_depth_fallback(self._segmenter))
 
     def _use_yolo(self, model: OpenModel, segmenter: str | None, threads: int | None) -> None:
         from gausslite.perception.yolo import load_yolo
@@ -87,7 +87,7 @@ class ModelRegistry:
             self._segmenter, self._detector = network.segmenter(), network
         else:
             self._segmenter = _segmenter(str(segmenter), threads)
-            self._detector = SegmentedDetector(network, _in_turn(self._segmenter))
+            self._detector = SegmentedDetector(network, _with_depth_fallback(self._segmenter))
 
 
 def _segmenter(name: str, threads: int | None) -> Segmenter:
@@ -102,7 +102,7 @@ def _segmenter(name: str, threads: int | None) -> Segmenter:
     return ClassAgnosticSegmenter(YoloSegNetwork(open_model(Path(name), threads)))
 
 
-def _in_turn(first: Segmenter) -> tuple[Segmenter, ...]:
+def _with_depth_fallback(first: Segmenter) -> tuple[Segmenter, ...]:
     """A network may see nothing where the detector saw something; then depth and colour still cut it out."""
     from gausslite.perception.depth_segmenter import DepthSegmenter
 

@@ -1,4 +1,4 @@
-"""The objects seen so far, in world coordinates: partial sightings of one thing grow into one entry."""
+"""The objects seen so far, in world coordinates: partial observations of one thing grow into one entry."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from numpy import ndarray
 
 from gausslite.domain.voxels import VoxelGrid
 
-_CELLS: Final = VoxelGrid(0.05)
+_CELL_GRID: Final = VoxelGrid(0.05)
 _MIN_REACH_M: Final = 0.15
 _MIN_SHARED: Final = 0.3
-_FIRM_SHARE: Final = 0.15
-_FEW_SHARE: Final = 0.25
+_MIN_COUNT_SHARE: Final = 0.15
+_MIN_RELIABLE_SHARE: Final = 0.25
 _MAX_CELLS: Final = 4000
 _MAX_OBJECTS: Final = 500
 
@@ -49,7 +49,7 @@ class Observation:
         distances = np.linalg.norm(points_m - centroid, axis=1)
         radius_m = 2.0 * float(np.median(distances))
         own = points_m[distances <= 2.0 * max(radius_m, _MIN_REACH_M)]
-        return cls(phrase, centroid, radius_m, np.unique(_CELLS.keys(own.astype(np.float32))), eye_m, score)
+        return cls(phrase, centroid, radius_m, np.unique(_CELL_GRID.keys(own.astype(np.float32))), eye_m, score)
 
     @property
     def distance_m(self) -> float:
@@ -59,7 +59,7 @@ class Observation:
 
 @dataclass(slots=True, eq=False)
 class Landmark:
-    """One object over all its sightings. Its centroid is the mean over cells, wherever the camera dwelt.
+    """One object over all its observations. Its centroid is the mean over cells, wherever the camera dwelt.
 
     missed counts the views that showed its place and not it; farthest_m is the greatest distance it was seen from.
     """
@@ -69,32 +69,32 @@ class Landmark:
     radius_m: float
     cells: Int64[ndarray, " k"]
     counts: Int64[ndarray, " k"]
-    seen: int
-    missed: int
+    seen_count: int
+    missed_count: int
     best_score: float
     farthest_m: float
 
     @classmethod
-    def from_observation(cls, sighting: Observation) -> Landmark:
-        """The first sighting of an object."""
-        counts = np.ones(len(sighting.cells), np.int64)
-        place = (sighting.phrase, sighting.centroid_m, sighting.radius_m, sighting.cells, counts)
-        return cls(*place, seen=1, missed=0, best_score=sighting.score, farthest_m=sighting.distance_m)
+    def from_observation(cls, observation: Observation) -> Landmark:
+        """The first observation of an object."""
+        counts = np.ones(len(observation.cells), np.int64)
+        place = (observation.phrase, observation.centroid_m, observation.radius_m, observation.cells, counts)
+        return cls(*place, seen_count=1, missed_count=0, best_score=observation.score, farthest_m=observation.distance_m)
 
-    def is_at(self, other: Observation) -> bool:
+    def is_colocated_with(self, other: Observation) -> bool:
         """True when the centroids are so near that both must be one object, whatever they were called."""
         reach_m = max(_MIN_REACH_M, 0.75 * min(self.radius_m, other.radius_m))
         return float(np.linalg.norm(self.centroid_m - other.centroid_m)) < reach_m
 
     def matches(self, other: Observation) -> bool:
-        """True when a sighting of the same phrase shows this object, in whole or in part."""
+        """True when a observation of the same phrase shows this object, in whole or in part."""
         shared = len(np.intersect1d(self.cells, other.cells, assume_unique=True))
-        return self.is_at(other) or shared >= _MIN_SHARED * max(1, min(len(self.cells), len(other.cells)))
+        return self.is_colocated_with(other) or shared >= _MIN_SHARED * max(1, min(len(self.cells), len(other.cells)))
 
     def add(self, other: Landmark) -> None:
-        """Take another object's sightings for this one's, and find its centre anew."""
-        self.seen += other.seen
-        self.missed += other.missed
+        """Take another object's observations for this one's, and find its centre anew."""
+        self.seen_count += other.seen_count
+        self.missed_count += other.missed_count
         self.best_score = max(self.best_score, other.best_score)
         self.farthest_m = max(self.farthest_m, other.farthest_m)
         merged, where = np.unique(np.concatenate([self.cells, other.cells]), return_inverse=True)
@@ -109,8 +109,8 @@ class Landmark:
 
     def footprint_m(self) -> Float32[ndarray, "k 3"]:
         """Centres of the cells seen more than once and not far less often than most, or of all while those are few."""
-        firm = self.cells[self.counts > max(1.0, _FIRM_SHARE * float(np.percentile(self.counts, 90)))]
-        return _CELLS.centres_m(firm if len(firm) >= _FEW_SHARE * len(self.cells) else self.cells)
+        firm = self.cells[self.counts > max(1.0, _MIN_COUNT_SHARE * float(np.percentile(self.counts, 90)))]
+        return _CELL_GRID.centres_m(firm if len(firm) >= _MIN_RELIABLE_SHARE * len(self.cells) else self.cells)
 
 
 class ObjectMap:
@@ -125,32 +125,32 @@ class ObjectMap:
         """All entries, oldest first."""
         return tuple(self._objects)
 
-    def named(self, phrase: str) -> list[Landmark]:
+    def with_phrase(self, phrase: str) -> list[Landmark]:
         """The objects that answer a phrase."""
         return [each for each in self._objects if each.phrase == phrase]
 
-    def showing(self, sighting: Observation) -> Landmark | None:
-        """The object that a sighting shows; None when it was not observed."""
-        return next((each for each in self.named(sighting.phrase) if each.matches(sighting)), None)
+    def match(self, observation: Observation) -> Landmark | None:
+        """The object that a observation shows; None when it was not observed."""
+        return next((each for each in self.with_phrase(observation.phrase) if each.matches(observation)), None)
 
     def observe(
-        self, sightings: Sequence[Observation], shows_place_of: Callable[[Landmark], bool] | None = None
+        self, observations: Sequence[Observation], is_visible: Callable[[Landmark], bool] | None = None
     ) -> None:
-        """Add one frame's sightings to the objects they show; one that joins several makes them one.
+        """Add one frame's observations to the objects they show; one that joins several makes them one.
 
-        shows_place_of tells of the other objects which the frame should have shown: these were missed.
+        is_visible tells of the other objects which the frame should have shown: these were missed.
         """
-        shown = [self._add(sighting) for sighting in sightings]
-        if shows_place_of is not None:
+        shown = [self._add(observation) for observation in observations]
+        if is_visible is not None:
             for each in self._objects:
                 if not any(each is other for other in shown):
-                    each.missed += shows_place_of(each)
+                    each.missed_count += is_visible(each)
         while len(self._objects) > _MAX_OBJECTS:
-            self._objects.remove(min(self._objects, key=lambda each: each.seen))
+            self._objects.remove(min(self._objects, key=lambda each: each.seen_count))
 
-    def _add(self, sighting: Observation) -> Landmark:
-        new = Landmark.from_observation(sighting)
-        same = [each for each in self.named(sighting.phrase) if each.matches(sighting)]
+    def _add(self, observation: Observation) -> Landmark:
+        new = Landmark.from_observation(observation)
+        same = [each for each in self.with_phrase(observation.phrase) if each.matches(observation)]
         if not same:
             self._objects.append(new)
             return new

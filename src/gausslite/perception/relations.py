@@ -34,38 +34,38 @@ class SpatialSettings:
                 raise InvalidInputError(f"spatial {name}: expected a positive length, got {getattr(self, name)}")
 
 
-class Geometry:
+class RelationGeometry:
     """Predicates between one target and one anchor, in a world whose up is known.
 
     near, on: the paper's. above is on; under mirrors it. inside: within the anchor's footprint and height. The four
-    sides are those of whoever looks, the camera that made the sighting: behind is farther away than the anchor's
-    nearest part. Sides of a sighting that nobody made are read as near.
+    sides are those of whoever looks, the camera that made the observation: behind is farther away than the anchor's
+    nearest part. Sides of a observation that nobody made are read as near.
     """
 
     def __init__(self, up: Float64[ndarray, "3"], settings: SpatialSettings) -> None:
         self._up = up
         self._settings = settings
 
-    def holds(self, predicate: Predicate, sighting: Observation, anchor: Landmark) -> bool:
+    def holds(self, predicate: Predicate, observation: Observation, anchor: Landmark) -> bool:
         """True where predicate(target, anchor) does; not for superlatives and between, which need more objects."""
         if predicate in (Predicate.ON, Predicate.ABOVE):
-            return self._is_over(sighting.centroid_m, anchor, 1.0)
+            return self._is_over(observation.centroid_m, anchor, 1.0)
         if predicate is Predicate.UNDER:
-            return self._is_over(sighting.centroid_m, anchor, -1.0)
+            return self._is_over(observation.centroid_m, anchor, -1.0)
         if predicate is Predicate.INSIDE:
-            return self._is_inside(sighting.centroid_m, anchor)
-        if predicate in _SIDES and sighting.eye_m is not None:
-            return self._is_beside(predicate, sighting.centroid_m, sighting.eye_m, anchor)
-        return distance_m(sighting.centroid_m, anchor.centroid_m) < self._settings.near_m
+            return self._is_inside(observation.centroid_m, anchor)
+        if predicate in _SIDES and observation.eye_m is not None:
+            return self._is_on_side(predicate, observation.centroid_m, observation.eye_m, anchor)
+        return distance_m(observation.centroid_m, anchor.centroid_m) < self._settings.near_m
 
-    def between(self, sighting: Observation, anchors: Sequence[Sequence[Landmark]]) -> bool | None:
+    def between(self, observation: Observation, anchors: Sequence[Sequence[Landmark]]) -> bool | None:
         """Within near_m of the line between two of the anchors, one of each group; None with fewer than two."""
         pairs = list(combinations(anchors[0], 2)) if len(anchors) == 1 else []
         for one, other in combinations(anchors, 2):
             pairs += product(one, other)
         if not pairs:
             return None
-        return any(self._is_between(sighting.centroid_m, a.centroid_m, b.centroid_m) for a, b in pairs)
+        return any(self._is_between(observation.centroid_m, a.centroid_m, b.centroid_m) for a, b in pairs)
 
     def _is_over(self, centroid_m: Float64[ndarray, "3"], anchor: Landmark, sign: float) -> bool:
         """Higher than the anchor's centroid (lower for sign -1), and less than on_m aside or over its footprint."""
@@ -91,7 +91,7 @@ class Geometry:
                 return False
         return True
 
-    def _is_beside(
+    def _is_on_side(
         self, predicate: Predicate, point_m: Float64[ndarray, "3"], eye_m: Float64[ndarray, "3"], anchor: Landmark
     ) -> bool:
         """On the asked side of the anchor's nearest cell, more so than on another, and less than side_m from it."""
@@ -145,7 +145,7 @@ def distance_m(a_m: Float64[ndarray, "3"], b_m: Float64[ndarray, "3"]) -> float:
     return float(np.linalg.norm(a_m - b_m))
 
 
-def apart_m(one: Landmark, other: Landmark) -> float:
+def surface_distance_m(one: Landmark, other: Landmark) -> float:
     """How far one object's cells lie from the nearest of another's, on average.
 
     A table of which only an end was seen yet has its centroid elsewhere, but not the edge that a chair stands at.

@@ -92,7 +92,7 @@ class TaskRelevanceEstimator:
 
     def estimate(self, frame: Frame, rendered_depth_m: Float32[ndarray, "h w"] | None = None) -> RelevanceEstimate:
         """Weight 1 on the pixels of the targets that fit the task's relations."""
-        if not self._tracker.wants_detection(frame):
+        if not self._tracker.update_keyframe(frame):
             return RelevanceEstimate(self._tracker.propagate(frame))
         found = self._detector.detect(frame, self._graph.queries)
         return RelevanceEstimate(self._tracker.integrate(frame, best_depth_m(frame.depth_m, rendered_depth_m), found))
@@ -132,15 +132,15 @@ class AsyncRelevanceEstimator:
         self._executor = executor
         self._tracker = TargetTracker(graph, settings or TrackerSettings(), segmenter)
         self._frames = 0
-        self._replaced = 0
+        self._skipped_keyframes = 0
         self._running: tuple[_Keyframe, Future[list[Detection]]] | None = None
         self._waiting: _Keyframe | None = None
-        self._looking_back: tuple[Frame, Future[list[Detection]]] | None = None
+        self._past_detection: tuple[Frame, Future[list[Detection]]] | None = None
 
     @property
     def notes(self) -> tuple[str, ...]:
         """Nouns without a class, anchors that have not come into view, keyframes that were never looked at."""
-        overtaken = (f"detector too slow: {self._replaced} keyframes were overtaken",) if self._replaced else ()
+        overtaken = (f"detector too slow: {self._skipped_keyframes} keyframes were overtaken",) if self._skipped_keyframes else ()
         return (*self._detector.unsupported(self._graph.queries), *self._tracker.notes, *overtaken)
 
     def state(self) -> State:
@@ -154,8 +154,8 @@ class AsyncRelevanceEstimator:
     def estimate(self, frame: Frame, rendered_depth_m: Float32[ndarray, "h w"] | None = None) -> RelevanceEstimate:
         """Weight 1 on the pixels of the targets known so far. Raises what the detector raised."""
         delayed = self._collect()
-        if self._tracker.wants_detection(frame):
-            self._replaced += self._waiting is not None
+        if self._tracker.update_keyframe(frame):
+            self._skipped_keyframes += self._waiting is not None
             self._waiting = _Keyframe(frame, best_depth_m(frame.depth_m, rendered_depth_m), self._frames)
         if self._running is None and self._waiting is not None:
             found = self._executor.submit(self._detector.detect, self._waiting.frame, self._graph.queries)
@@ -168,12 +168,12 @@ class AsyncRelevanceEstimator:
 
         Raises what the detector raised, once: who asks again has it looked at again.
         """
-        if self._looking_back is None or self._looking_back[0] is not frame:
-            self._looking_back = frame, self._executor.submit(self._detector.detect, frame, self._graph.queries)
-        _, found = self._looking_back
+        if self._past_detection is None or self._past_detection[0] is not frame:
+            self._past_detection = frame, self._executor.submit(self._detector.detect, frame, self._graph.queries)
+        _, found = self._past_detection
         if not found.done():
             return None
-        self._looking_back = None
+        self._past_detection = None
         return self._tracker.evaluate_past(frame, found.result())
 
     def _collect(self) -> DelayedRelevance | None:

@@ -26,7 +26,7 @@ _SLACK_SHARE: Final = 0.02
 class Frustum:
     """A detection's box between the depths its mask spans, with the camera that saw it.
 
-    passed_over counts the detections since then that did not find its object again.
+    missed_detections counts the detections since then that did not find its object again.
     """
 
     detection: Detection
@@ -34,7 +34,7 @@ class Frustum:
     T_world_camera: Float64[ndarray, "4 4"]
     near_m: float
     far_m: float
-    passed_over: int = 0
+    missed_detections: int = 0
 
     def corners_m(self) -> Float64[ndarray, "8 3"]:
         """The frustum's corners in the world: the near face first, then the far one."""
@@ -44,7 +44,7 @@ class Frustum:
         return transform_points(self.T_world_camera, lift(corners_px, depths_m, self.camera))
 
 
-def frustum_of(detection: Detection, depth_m: Float32[ndarray, "h w"], frame: Frame) -> Frustum | None:
+def lift_frustum(detection: Detection, depth_m: Float32[ndarray, "h w"], frame: Frame) -> Frustum | None:
     """Lift a detection of this frame; None when too few of its mask's pixels have depth."""
     depths = depth_m[detection.mask & (depth_m > 0)]
     if len(depths) < _MIN_PIXELS:
@@ -69,7 +69,7 @@ def reprojected_box_px(frustum: Frustum, frame: Frame) -> tuple[float, float, fl
     return left, top, right, bottom
 
 
-def cut_by_depth(frustum: Frustum, box_px: tuple[float, float, float, float], frame: Frame) -> Bool[ndarray, "h w"]:
+def mask_in_frustum(frustum: Frustum, box_px: tuple[float, float, float, float], frame: Frame) -> Bool[ndarray, "h w"]:
     """The pixels of the box whose surface lies in the frustum and, seen from the keyframe, behind its mask."""
     left, top = (int(np.floor(value)) for value in box_px[:2])
     right, bottom = (int(np.ceil(value)) for value in box_px[2:])

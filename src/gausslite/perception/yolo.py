@@ -69,9 +69,9 @@ class YoloSegDetector:
         wanted = self._wanted(queries)
         if not wanted:
             return []
-        answer = self._network.answer(frame)
-        found = self._distinct(answer.candidates(self._settings.min_score), wanted)
-        masks = answer.masks(found)
+        output = self._network.run(frame)
+        found = self._distinct(output.candidates(self._settings.min_score), wanted)
+        masks = output.masks(found)
         return [
             Detection(box.phrase, box.score, box.box_px, masks[row])
             for row, box in self._answers(found, wanted, concerns_many_objects(queries), frame.depth_m.size)
@@ -83,7 +83,7 @@ class YoloSegDetector:
         wanted = self._wanted(queries)
         if not wanted:
             return []
-        found = self._distinct(self._network.answer(frame).candidates(self._settings.min_score), wanted)
+        found = self._distinct(self._network.run(frame).candidates(self._settings.min_score), wanted)
         answers = self._answers(found, wanted, concerns_many_objects(queries), frame.depth_m.size)
         return [box for _, box in answers]
 

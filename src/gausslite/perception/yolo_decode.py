@@ -54,7 +54,7 @@ def letterbox(
 
 
 def decode(
-    output: Float32[ndarray, "rows a"], placed: Letterbox, size_px: tuple[int, int], min_score: float
+    output: Float32[ndarray, "rows a"], letterboxing: Letterbox, size_px: tuple[int, int], min_score: float
 ) -> Candidates:
     """Anchors whose best class reaches min_score, as boxes clipped to an image of size_px (height, width)."""
     class_scores = output[4:-MASK_COEFFICIENTS]
@@ -65,10 +65,10 @@ def decode(
     height_px, width_px = size_px
     boxes = np.stack(
         [
-            np.clip((centre_x - width / 2 - placed.left_px) / placed.scale_x, 0, width_px),
-            np.clip((centre_y - height / 2 - placed.top_px) / placed.scale_y, 0, height_px),
-            np.clip((centre_x + width / 2 - placed.left_px) / placed.scale_x, 0, width_px),
-            np.clip((centre_y + height / 2 - placed.top_px) / placed.scale_y, 0, height_px),
+            np.clip((centre_x - width / 2 - letterboxing.left_px) / letterboxing.scale_x, 0, width_px),
+            np.clip((centre_y - height / 2 - letterboxing.top_px) / letterboxing.scale_y, 0, height_px),
+            np.clip((centre_x + width / 2 - letterboxing.left_px) / letterboxing.scale_x, 0, width_px),
+            np.clip((centre_y + height / 2 - letterboxing.top_px) / letterboxing.scale_y, 0, height_px),
         ],
         axis=1,
     ).astype(np.float32)
@@ -97,7 +97,7 @@ def mask_of(
     coefficients: Float32[ndarray, "32"],
     prototypes: Float32[ndarray, "32 ph pw"],
     box_px: Float32[ndarray, "4"],
-    placed: Letterbox,
+    letterboxing: Letterbox,
     sizes_px: tuple[tuple[int, int], tuple[int, int]],
 ) -> Bool[ndarray, "h w"]:
     """One object's mask in the image, zero outside its box; sizes_px are (height, width) of image and network."""
@@ -110,11 +110,11 @@ def mask_of(
     if right <= left or bottom <= top:
         return mask
     # maps pixel centres of the box onto centres of the prototype grid
-    scale_x, scale_y = placed.scale_x * columns_per_px, placed.scale_y * rows_per_px
+    scale_x, scale_y = letterboxing.scale_x * columns_per_px, letterboxing.scale_y * rows_per_px
     to_grid = np.array(
         [
-            [scale_x, 0.0, (left + 0.5) * scale_x + placed.left_px * columns_per_px - 0.5],
-            [0.0, scale_y, (top + 0.5) * scale_y + placed.top_px * rows_per_px - 0.5],
+            [scale_x, 0.0, (left + 0.5) * scale_x + letterboxing.left_px * columns_per_px - 0.5],
+            [0.0, scale_y, (top + 0.5) * scale_y + letterboxing.top_px * rows_per_px - 0.5],
         ]
     )
     inside = cv2.warpAffine(

@@ -20,24 +20,24 @@ _DEFAULT_SIDE_PX: Final = 640
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Answer:
+class NetworkOutput:
     """What the network said about one image, before any threshold."""
 
     output: Float32[ndarray, "rows a"]
     prototypes: Float32[ndarray, "32 ph pw"]
-    placed: Letterbox
+    letterboxing: Letterbox
     size_px: tuple[int, int]
     network_size_px: tuple[int, int]
 
     def candidates(self, min_score: float) -> Candidates:
         """The boxes whose best class reaches min_score, in any order."""
-        return decode(self.output, self.placed, self.size_px, min_score)
+        return decode(self.output, self.letterboxing, self.size_px, min_score)
 
     def masks(self, found: Candidates) -> list[Bool[ndarray, "h w"]]:
         """One mask a candidate, zero outside its box."""
         sizes_px = (self.size_px, self.network_size_px)
         return [
-            mask_of(coefficients, self.prototypes, box, self.placed, sizes_px)
+            mask_of(coefficients, self.prototypes, box, self.letterboxing, sizes_px)
             for coefficients, box in zip(found.coefficients, found.boxes_px, strict=True)
         ]
 
@@ -54,21 +54,21 @@ class YoloSegNetwork:
         self.names = _class_names(self._session)
         self._boxes_at, self._prototypes_at = _output_order(model.path, outputs, len(self.names))
         self.classes = int(outputs[self._boxes_at].shape[1]) - 4 - MASK_COEFFICIENTS
-        self._latest: tuple[Frame, Answer] | None = None
+        self._latest: tuple[Frame, NetworkOutput] | None = None
 
-    def answer(self, frame: Frame) -> Answer:
+    def run(self, frame: Frame) -> NetworkOutput:
         """Run the network on a frame's colours; asked again about the same frame, give the same answer."""
         latest = self._latest
         if latest is None or latest[0] is not frame:
-            latest = self._latest = frame, self._run(frame)
+            latest = self._latest = frame, self._infer(frame)
         return latest[1]
 
-    def _run(self, frame: Frame) -> Answer:
-        tensor, placed = letterbox(frame.rgb, self._height_px, self._width_px)
+    def _infer(self, frame: Frame) -> NetworkOutput:
+        tensor, letterboxing = letterbox(frame.rgb, self._height_px, self._width_px)
         outputs = self._session.run(None, {self._input: tensor})
         size_px = (frame.camera.height_px, frame.camera.width_px)
         network_size_px = (self._height_px, self._width_px)
-        return Answer(outputs[self._boxes_at][0], outputs[self._prototypes_at][0], placed, size_px, network_size_px)
+        return NetworkOutput(outputs[self._boxes_at][0], outputs[self._prototypes_at][0], letterboxing, size_px, network_size_px)
 
 
 def _input_of(path: Path, session: Any) -> tuple[str, int, int]:

@@ -20,7 +20,7 @@ from gausslite.evaluation.views import MIN_ROI_PIXELS
 from gausslite.perception.detect import Detector, Segmenter
 from gausslite.perception.evidence import EvidenceSettings
 from gausslite.perception.relevance_estimator import TaskRelevanceEstimator
-from gausslite.perception.tracker import TrackerSettings, merge
+from gausslite.perception.tracker import TrackerSettings, merge_detections
 
 _FOUND_SHARE = 0.25
 
@@ -128,9 +128,9 @@ class _Asked:
     def __init__(self, question: Question, detector: Detector, up_axis: UpAxis, segmenter: Segmenter | None) -> None:
         self._question = question
         self._detector = _OnceAFrame(detector)
-        alone = TrackerSettings(up_axis=up_axis, max_frames=1, max_passed_over=0)
+        alone = TrackerSettings(up_axis=up_axis, max_frames=1, max_missed_detections=0)
         settings = {
-            PerceptionStage.RELATED: replace(alone, evidence=EvidenceSettings.none()),
+            PerceptionStage.RELATED: replace(alone, evidence=EvidenceSettings.accept_all()),
             PerceptionStage.BELIEVED: alone,
             PerceptionStage.FOLLOWED: TrackerSettings(up_axis=up_axis),
         }
@@ -145,7 +145,7 @@ class _Asked:
     def look(self, frame: Frame, truths: Mapping[str, Bool[ndarray, "h w"]]) -> Marks:
         graph = self._question.graph
         found = [each for each in self._detector.detect(frame, graph.queries) if each.phrase in graph.targets]
-        masks = {PerceptionStage.DETECTED: merge(found, graph.targets, frame).roi}
+        masks = {PerceptionStage.DETECTED: merge_detections(found, graph.targets, frame).roi}
         masks |= {step: attention.estimate(frame).relevance.roi for step, attention in self._attentions.items()}
         known = frame.depth_m > 0
         objects = {name: truths[name] & known for name in self._question.objects}

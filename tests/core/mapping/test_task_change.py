@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from deferred_executor import WorkInHand
+from deferred_executor import DeferredExecutor
 from mapping_scenes import wall_frame
 from sample_gaussians import some_gaussians
 
@@ -235,7 +235,7 @@ def test_a_task_attention_remembers_what_it_finds_in_earlier_views_but_carries_o
 
 
 def test_beside_mapping_a_look_back_is_ready_when_the_detector_is_and_takes_turns() -> None:
-    executor = WorkInHand()
+    executor = DeferredExecutor()
     task = TaskGraph("id", "a task", ("mug",), (), ())
     attention = AsyncRelevanceEstimator(task, RegionDetector({"mug": RIGHT}), executor, TrackerSettings(max_frames=2))
     loop = TaskMapper(A, GaussianMapper(MapperSettings(keyframes=KeyframeSettings(every=1)), CpuRasterizer(threads=1)))

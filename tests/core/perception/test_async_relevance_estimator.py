@@ -6,7 +6,7 @@ from concurrent.futures import Executor
 
 import numpy as np
 import pytest
-from deferred_executor import WorkInHand
+from deferred_executor import DeferredExecutor
 from mapping_scenes import wall_frame
 
 from gausslite.domain.frame import Frame
@@ -44,49 +44,49 @@ def beside(executor: Executor, every: int = 3) -> AsyncRelevanceEstimator:
 
 
 def test_nothing_is_marked_until_the_first_detection_is_there() -> None:
-    executor = WorkInHand()
-    attention = beside(executor)
-    assert not any(attention.estimate(frame_at(index)).relevance.roi.any() for index in range(3))
+    executor = DeferredExecutor()
+    estimator = beside(executor)
+    assert not any(estimator.estimate(frame_at(index)).relevance.roi.any() for index in range(3))
     executor.run_next()
     frame = frame_at(3)
-    truth, carried = MUG.mask(frame), attention.estimate(frame).relevance.roi
+    truth, carried = MUG.mask(frame), estimator.estimate(frame).relevance.roi
     assert (truth & carried).sum() / (truth | carried).sum() > 0.8
 
 
 def test_late_relevance_is_that_of_the_frame_it_was_made_on() -> None:
-    executor = WorkInHand()
-    attention = beside(executor)
+    executor = DeferredExecutor()
+    estimator = beside(executor)
     frames = [frame_at(index) for index in range(3)]
     for frame in frames:
-        assert attention.estimate(frame).delayed is None
+        assert estimator.estimate(frame).delayed is None
     executor.run_next()
-    delayed = attention.estimate(frame_at(3)).delayed
+    delayed = estimator.estimate(frame_at(3)).delayed
     assert delayed is not None
     assert delayed.frame is frames[0]
     assert delayed.lag_frames == 3
     at_once = TaskRelevanceEstimator(TASK, RegionDetector({"mug": MUG})).estimate(frames[0]).relevance
     np.testing.assert_array_equal(delayed.relevance.target, at_once.target)
-    assert attention.estimate(frame_at(4)).delayed is None
+    assert estimator.estimate(frame_at(4)).delayed is None
 
 
 def test_one_detection_runs_at_a_time_and_the_newest_keyframe_waits() -> None:
-    executor = WorkInHand()
-    attention = beside(executor, every=2)
+    executor = DeferredExecutor()
+    estimator = beside(executor, every=2)
     for index in range(9):
-        attention.estimate(frame_at(index))
+        estimator.estimate(frame_at(index))
         assert executor.frames == [0]
-    assert attention.notes == ("detector too slow: 3 keyframes were overtaken",)
+    assert estimator.notes == ("detector too slow: 3 keyframes were overtaken",)
     executor.run_next()
-    attention.estimate(frame_at(9))
+    estimator.estimate(frame_at(9))
     assert executor.frames == [8]
 
 
 def test_a_detector_that_is_quick_enough_sees_the_same_keyframes_as_one_that_is_waited_for() -> None:
-    executor = WorkInHand()
-    attention = beside(executor)
+    executor = DeferredExecutor()
+    estimator = beside(executor)
     seen = []
     for index in range(10):
-        attention.estimate(frame_at(index))
+        estimator.estimate(frame_at(index))
         seen += executor.frames
         while executor.jobs:
             executor.run_next()
@@ -94,12 +94,12 @@ def test_a_detector_that_is_quick_enough_sees_the_same_keyframes_as_one_that_is_
 
 
 def test_what_the_detector_raises_comes_with_a_later_frame() -> None:
-    executor = WorkInHand()
-    attention = AsyncRelevanceEstimator(TASK, BrokenDetector(), executor)
-    attention.estimate(frame_at(0))
+    executor = DeferredExecutor()
+    estimator = AsyncRelevanceEstimator(TASK, BrokenDetector(), executor)
+    estimator.estimate(frame_at(0))
     executor.run_next()
     with pytest.raises(ModelFileError, match="broken"):
-        attention.estimate(frame_at(1))
+        estimator.estimate(frame_at(1))
 
 
 class BrokenOnce(RegionDetector):
@@ -115,21 +115,21 @@ class BrokenOnce(RegionDetector):
 
 
 def test_what_the_detector_raises_on_an_earlier_frame_is_raised_once_and_the_frame_looked_at_again() -> None:
-    executor, earlier = WorkInHand(), frame_at(0)
-    attention = AsyncRelevanceEstimator(TASK, BrokenOnce({"mug": MUG}), executor)
-    assert attention.evaluate_past(earlier) is None
+    executor, earlier = DeferredExecutor(), frame_at(0)
+    estimator = AsyncRelevanceEstimator(TASK, BrokenOnce({"mug": MUG}), executor)
+    assert estimator.evaluate_past(earlier) is None
     executor.run_next()
     with pytest.raises(MemoryError, match="a moment"):
-        attention.evaluate_past(earlier)
-    assert attention.evaluate_past(earlier) is None
+        estimator.evaluate_past(earlier)
+    assert estimator.evaluate_past(earlier) is None
     executor.run_next()
-    relevance = attention.evaluate_past(earlier)
+    relevance = estimator.evaluate_past(earlier)
     assert relevance is not None
     np.testing.assert_array_equal(relevance.roi, MUG.mask(earlier))
 
 
 def test_a_keyframe_of_the_window_is_given_its_late_relevance() -> None:
-    executor = WorkInHand()
+    executor = DeferredExecutor()
     mapper = GaussianMapper(
         MapperSettings(max_gaussians=500, keyframes=KeyframeSettings(every=2, window=2)), CpuRasterizer(threads=1)
     )
@@ -145,7 +145,7 @@ def test_a_keyframe_of_the_window_is_given_its_late_relevance() -> None:
 
 
 def test_a_frame_that_left_the_window_is_not_revised() -> None:
-    executor = WorkInHand()
+    executor = DeferredExecutor()
     mapper = GaussianMapper(
         MapperSettings(max_gaussians=500, keyframes=KeyframeSettings(every=1, window=2)), CpuRasterizer(threads=1)
     )

@@ -46,7 +46,7 @@ def test_boxes_scores_coefficients_and_prototypes_are_torchs(tmp_path) -> None:
     assert read.classes == 1
     rgb = np.random.default_rng(1).integers(0, 256, (HEIGHT_PX, WIDTH_PX, 3), np.uint8)
     camera = Camera(60, 60, 32, 24, WIDTH_PX, HEIGHT_PX)
-    answer = read.answer(Frame(0, 0, rgb, np.ones((HEIGHT_PX, WIDTH_PX), np.float32), camera, np.eye(4)))
+    answer = read.run(Frame(0, 0, rgb, np.ones((HEIGHT_PX, WIDTH_PX), np.float32), camera, np.eye(4)))
     with torch.no_grad():
         rows, prototypes = (
             each[0].numpy() for each in network(torch.from_numpy(letterbox(rgb, HEIGHT_PX, WIDTH_PX)[0]))

@@ -1,4 +1,4 @@
-"""An object counts once there is evidence for it: a layer of depth of its own, sightings that agree, no empty looks."""
+"""An object counts once there is evidence for it: a layer of depth of its own, observations that agree, no empty looks."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from gausslite.domain.frame import Frame
 from gausslite.domain.relevance import Detection
 from gausslite.domain.task import Predicate, Relation, TaskGraph
 from gausslite.errors import InvalidInputError
-from gausslite.perception.evidence import EvidenceSettings, Outlook
+from gausslite.perception.evidence import EvidenceSettings, VisibilityCheck
 from gausslite.perception.foreground import foreground_mask
 from gausslite.perception.object_map import Landmark, ObjectMap, Observation
 from gausslite.perception.relations import SpatialSettings
@@ -58,10 +58,10 @@ class Script:
 
 def lit(scores: Sequence[float | None], frames: int, max_frames: int = 1) -> list[bool]:
     detector = Script(scores)
-    attention = TaskRelevanceEstimator(
+    estimator = TaskRelevanceEstimator(
         TaskGraph("id", "find the mug", ("mug",), (), ()), detector, TrackerSettings(max_frames=max_frames)
     )
-    return [bool(attention.estimate(frame_at(index=index)).relevance.roi.any()) for index in range(frames)]
+    return [bool(estimator.estimate(frame_at(index=index)).relevance.roi.any()) for index in range(frames)]
 
 
 def test_what_is_seen_through_a_chairs_slats_is_not_the_chair():
@@ -97,11 +97,11 @@ def test_a_faint_detection_counts_from_its_second_sighting_and_a_sure_one_at_onc
 
 def test_after_a_first_faint_detection_the_next_frame_is_looked_at_too():
     assert lit([0.4], 6, max_frames=5) == [False, True, True, True, True, True]
-    settled, unsettled = Script([None]), Script([0.4, None])
-    for detector, calls in ((settled, 1), (unsettled, 2)):
-        attention = TaskRelevanceEstimator(TaskGraph("id", "find the mug", ("mug",), (), ()), detector)
+    settled, needs_observation = Script([None]), Script([0.4, None])
+    for detector, calls in ((settled, 1), (needs_observation, 2)):
+        estimator = TaskRelevanceEstimator(TaskGraph("id", "find the mug", ("mug",), (), ()), detector)
         for index in range(5):
-            attention.estimate(frame_at(index=index))
+            estimator.estimate(frame_at(index=index))
         assert detector.calls == calls
 
 
@@ -125,28 +125,28 @@ def test_what_most_looks_at_its_place_missed_is_not_believed():
     ],
 )
 def test_a_view_misses_only_what_it_could_show(frame, shown):
-    assert Outlook(frame, frame.depth_m).shows_place_of(seen_from_the_origin()) is shown
+    assert VisibilityCheck(frame, frame.depth_m).is_visible(seen_from_the_origin()) is shown
 
 
 def test_nobody_is_blamed_for_not_seeing_from_farther_than_ever():
     away = frame_at(wall_m=9.0)
     away.T_world_camera[2, 3] = -3.0
-    assert not Outlook(away, away.depth_m).shows_place_of(seen_from_the_origin())
+    assert not VisibilityCheck(away, away.depth_m).is_visible(seen_from_the_origin())
 
 
 def test_the_order_of_sightings_does_not_matter_for_what_is_known():
     rng = np.random.default_rng(0)
-    sightings = [
+    observations = [
         Observation.from_points("mug", rng.uniform(-0.1, 0.1, (200, 3)), np.array([0.0, 0.0, -z]), score)
         for z, score in ((1.0, 0.3), (2.0, 0.7), (1.5, 0.5))
     ]
     for order in ((0, 1, 2), (2, 0, 1)):
         memory = ObjectMap()
         for number in order:
-            memory.observe([sightings[number]])
+            memory.observe([observations[number]])
         memory.observe([], lambda each: True)
         (mug,) = memory.objects
-        assert (mug.seen, mug.missed, mug.best_score) == (3, 1, 0.7)
+        assert (mug.seen_count, mug.missed_count, mug.best_score) == (3, 1, 0.7)
         assert mug.farthest_m == pytest.approx(2.0, abs=0.05)
 
 
@@ -171,8 +171,8 @@ def test_the_closest_is_told_from_a_part_of_the_table():
     for part in parts:
         kept = closest_chair()
         kept.observe([part, at_its_side, at_its_end])
-        assert kept.keep(at_its_side)
-        assert not kept.keep(at_its_end)
+        assert kept.satisfies_relations(at_its_side)
+        assert not kept.satisfies_relations(at_its_end)
 
 
 def test_a_faint_candidate_does_not_decide_which_is_the_closest():
@@ -184,11 +184,11 @@ def test_a_faint_candidate_does_not_decide_which_is_the_closest():
     for _ in range(3):
         kept.observe([table, faint, sure])
     assert kept.is_confirmed(faint)
-    assert kept.keep(sure)
-    assert not kept.keep(faint)
+    assert kept.satisfies_relations(sure)
+    assert not kept.satisfies_relations(faint)
 
 
-@pytest.mark.parametrize("settings", [{"min_seen": 0}, {"sure_score": -0.1}, {"min_share": 1.1}])
+@pytest.mark.parametrize("settings", [{"min_seen": 0}, {"confident_score": -0.1}, {"min_seen_fraction": 1.1}])
 def test_settings_are_checked(settings):
     with pytest.raises(InvalidInputError):
         EvidenceSettings(**settings)

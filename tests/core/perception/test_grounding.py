@@ -15,8 +15,8 @@ from gausslite.domain.camera import Camera
 from gausslite.domain.frame import Frame
 from gausslite.errors import InvalidInputError, ModelFileError
 from gausslite.perception.detect import DetectedBox
-from gausslite.perception.grounding import GroundingDino, GroundingSettings, corners_px, phrase_scores, picture
-from gausslite.perception.grounding_text import BertTokenizer, phrase_input
+from gausslite.perception.grounding import GroundingDino, GroundingSettings, corners_px, phrase_scores, preprocess
+from gausslite.perception.grounding_text import BertTokenizer, encode_phrase
 from gausslite.perception.model_file import open_model
 
 LEFT, RIGHT = (0.25, 0.5, 0.25, 0.5), (0.75, 0.5, 0.25, 0.5)
@@ -115,13 +115,13 @@ def test_settings_are_checked():
 
 
 def test_the_noun_stays_when_a_phrase_is_too_long():
-    read = phrase_input("red red Mug", TinyTokenizer(), 5)
+    read = encode_phrase("red red Mug", TinyTokenizer(), 5)
     assert [VOCABULARY[i] for i in read.input_ids[0]] == ["[CLS]", "red", "mug", ".", "[SEP]"]
     assert read.is_noun == (False, False, True, False, False)
 
 
 def test_a_phrase_is_padded_to_the_networks_length():
-    read = phrase_input("mug", TinyTokenizer(), 7)
+    read = encode_phrase("mug", TinyTokenizer(), 7)
     assert read.input_ids.tolist() == [[2, 6, 4, 3, 0, 0, 0]]
     assert read.attention_mask.tolist() == [[1, 1, 1, 1, 0, 0, 0]]
     assert len(read.is_noun) == 7
@@ -130,7 +130,7 @@ def test_a_phrase_is_padded_to_the_networks_length():
 @settings(max_examples=50, deadline=None)
 @given(st.integers(1, 40), st.integers(1, 40), st.integers(1, 40), st.integers(1, 40))
 def test_a_picture_keeps_its_proportions_and_fills_one_side(height, width, to_height, to_width):
-    values, mask = picture(np.full((height, width, 3), 255, np.uint8), (to_height, to_width), keep_proportions=True)
+    values, mask = preprocess(np.full((height, width, 3), 255, np.uint8), (to_height, to_width), keep_proportions=True)
     inside = mask[0] > 0
     rows, columns = inside.any(axis=1).sum(), inside.any(axis=0).sum()
     assert inside[:rows, :columns].all()
@@ -164,7 +164,7 @@ def test_word_pieces_of_a_users_vocabulary(tmp_path):
     path = tmp_path / "vocab.txt"
     path.write_text("\n".join(word for word in VOCABULARY if word != "mug") + "\n", encoding="utf-8")
     words = path.read_text().split()
-    read = phrase_input("Red Mug", BertTokenizer(path), 8)
+    read = encode_phrase("Red Mug", BertTokenizer(path), 8)
     assert [words[i] for i in read.input_ids[0]] == ["[CLS]", "red", "mu", "##g", ".", "[SEP]", "[PAD]", "[PAD]"]
     assert [i for i, noun in enumerate(read.is_noun) if noun] == [2, 3]
 

@@ -12,8 +12,8 @@ from tiny_grounding import TinyTokenizer
 from gausslite.domain.camera import Camera
 from gausslite.domain.frame import Frame
 from gausslite.perception.detect import BoxFractions
-from gausslite.perception.grounding import INPUTS, OUTPUTS, GroundingDino, GroundingSettings, picture
-from gausslite.perception.grounding_text import phrase_input
+from gausslite.perception.grounding import INPUTS, OUTPUTS, GroundingDino, GroundingSettings, preprocess
+from gausslite.perception.grounding_text import encode_phrase
 from gausslite.perception.model_file import open_model
 
 torch = pytest.importorskip("torch", reason="the reference extra brings torch, which this network is made with")
@@ -78,8 +78,8 @@ def rgb(seed: int) -> np.ndarray:
 
 
 def network_inputs(seed: int, phrase: str):
-    values, mask = picture(rgb(seed), (HEIGHT_PX, WIDTH_PX), keep_proportions=True)
-    text = phrase_input(phrase, TinyTokenizer(), TOKENS)
+    values, mask = preprocess(rgb(seed), (HEIGHT_PX, WIDTH_PX), keep_proportions=True)
+    text = encode_phrase(phrase, TinyTokenizer(), TOKENS)
     given = (values, text.input_ids, text.attention_mask, text.token_type_ids, mask)
     return tuple(torch.from_numpy(each) for each in given)
 
@@ -88,7 +88,7 @@ def network_inputs(seed: int, phrase: str):
 def test_every_box_and_score_is_torchs(network, path, phrase):
     lenient = GroundingSettings(0.001, 0.001, max_iou=0.999, box_fractions=BoxFractions(1.0, 1.0, 1.0, 1.0))
     detector = GroundingDino(open_model(path, 1), TinyTokenizer(), lenient)
-    text = phrase_input(phrase, TinyTokenizer(), TOKENS)
+    text = encode_phrase(phrase, TinyTokenizer(), TOKENS)
     for seed in SEEDS:
         frame = Frame(0, 0, rgb(seed), np.ones((48, 96), np.float32), Camera(90, 90, 48, 24, 96, 48), np.eye(4))
         found = detector.boxes(frame, [phrase])

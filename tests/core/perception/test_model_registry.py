@@ -101,7 +101,7 @@ def test_boxes_without_any_mask_are_left_out():
 
 def test_grounding_dino_needs_its_words_and_cannot_mask(tmp_path):
     path = write_tiny_grounding(tmp_path / "dino.onnx", [((0.5, 0.5, 0.2, 0.2), {})])
-    with pytest.raises(InvalidInputError, match="finds boxes only; expected cut or a FastSAM file"):
+    with pytest.raises(InvalidInputError, match="finds boxes only; expected depth or a FastSAM file"):
         ModelRegistry(path, "yolo", None, 1)
     with pytest.raises(ModelFileError, match=r"vocab\.txt"):
         ModelRegistry(path, None, None, 1)

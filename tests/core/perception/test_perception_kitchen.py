@@ -28,7 +28,7 @@ def detector(shared_dir: Path) -> YoloSegDetector:
     return load_yolo(open_model(shared_dir / "models" / "yolo11n-seg_int8.onnx"))
 
 
-def attention_to(text: str, kitchen: Source, detector: YoloSegDetector) -> TaskRelevanceEstimator:
+def estimator_for(text: str, kitchen: Source, detector: YoloSegDetector) -> TaskRelevanceEstimator:
     settings = TrackerSettings(up_axis=kitchen.up_axis, max_frames=1)
     return TaskRelevanceEstimator(RuleParser().parse(text), detector, settings)
 
@@ -56,33 +56,33 @@ def test_text_vectors_take_nouns_to_classes_and_refuse_the_rest(shared_dir, dete
 
 def test_the_chair_closest_to_the_table(kitchen, detector, shared_dir):
     regions = load_voxel_regions(shared_dir / "data" / "redkitchen" / "roi_voxels.npz")
-    attention = attention_to("Identify the chair closest to the table", kitchen, detector)
+    estimator = estimator_for("Identify the chair closest to the table", kitchen, detector)
     shared = marked = 0
     for number in range(500, 996, 40):
         frame = kitchen.frame(kitchen.indices().index(number))
-        roi = attention.estimate(frame).relevance.roi
+        roi = estimator.estimate(frame).relevance.roi
         if number >= 780:
             shared += np.count_nonzero(roi & regions["chair_3"].mask(frame))
             marked += np.count_nonzero(roi)
     assert shared / marked > 0.7
-    (table,) = [each for each in attention.landmarks if each.phrase == "table" and each.seen > 1]
+    (table,) = [each for each in estimator.landmarks if each.phrase == "table" and each.seen_count > 1]
     assert np.abs(table.centroid_m - regions["table_1"].centroid_m).max() < 0.2
 
 
 def test_the_closest_chair_is_known_while_an_end_of_the_table_is_all_that_was_seen(kitchen, detector, shared_dir):
     regions = load_voxel_regions(shared_dir / "data" / "redkitchen" / "roi_voxels.npz")
-    attention = attention_to("Identify the chair closest to the table", kitchen, detector)
+    estimator = estimator_for("Identify the chair closest to the table", kitchen, detector)
     for number in (0, 8, 20, 44, 56, 64):
         frame = kitchen.frame(kitchen.indices().index(number), (320, 240))
-        roi = attention.estimate(frame).relevance.roi
+        roi = estimator.estimate(frame).relevance.roi
         assert not (roi & regions["chair_2"].mask(frame)).any()
         if number in (0, 8, 20):
             assert (roi & regions["chair_3"].mask(frame)).any()
 
 
 def test_mugs_on_the_table_are_kept_and_an_absent_object_lights_nothing(kitchen, detector):
-    mugs = attention_to("Pick up the mug on the table", kitchen, detector)
-    umbrella = attention_to("Pick up the umbrella", kitchen, detector)
+    mugs = estimator_for("Pick up the mug on the table", kitchen, detector)
+    umbrella = estimator_for("Pick up the umbrella", kitchen, detector)
     shares = []
     for number in range(240, 480, 40):
         frame = kitchen.frame(kitchen.indices().index(number))

@@ -37,7 +37,7 @@ def keeps(predicate: Predicate, target: Observation, *others: Observation) -> bo
     relations = tuple(Relation(predicate, target.phrase, anchor) for anchor in anchors)
     spatial = SpatialFilter(TaskGraph("id", "", (target.phrase,), anchors, relations), UP, SpatialSettings())
     spatial.observe([*others, target])
-    return spatial.keep(target)
+    return spatial.satisfies_relations(target)
 
 
 @pytest.mark.parametrize(
@@ -106,5 +106,5 @@ def test_the_farthest_is_one_of_all_and_is_not_the_closest():
         relation = Relation(predicate, "chair", "door")
         spatial = SpatialFilter(TaskGraph("id", "", ("chair",), ("door",), (relation,)), UP, SpatialSettings())
         spatial.observe([thing("door", 0.0, 0.0, 0.0), near, far])
-        assert spatial.keep(chosen)
-        assert not spatial.keep(other)
+        assert spatial.satisfies_relations(chosen)
+        assert not spatial.satisfies_relations(other)

@@ -43,7 +43,7 @@ def graph_of(*relations: Relation, targets: tuple[str, ...] = ("mug",)) -> TaskG
     return TaskGraph("id", "a task", targets, anchors, relations)
 
 
-def sighting(phrase: str, *centre_m: float, radius_m: float = 0.1) -> Observation:
+def observation(phrase: str, *centre_m: float, radius_m: float = 0.1) -> Observation:
     rng = np.random.default_rng(0)
     return Observation.from_points(phrase, np.asarray(centre_m) + rng.uniform(-radius_m, radius_m, (300, 3)))
 
@@ -67,20 +67,20 @@ MUG = BallRegion((0.0, 0.0, 2.0), 0.2)
 
 
 def test_a_target_without_relations_is_marked():
-    attention = TaskRelevanceEstimator(graph_of(), RegionDetector({"mug_1": MUG}))
-    relevance = attention.estimate(frame_at()).relevance
+    estimator = TaskRelevanceEstimator(graph_of(), RegionDetector({"mug_1": MUG}))
+    relevance = estimator.estimate(frame_at()).relevance
     assert np.array_equal(relevance.roi, MUG.mask(frame_at()))
     assert set(np.unique(relevance.target)) == {NO_TARGET, 0}
 
 
 def test_detection_runs_on_the_first_frame_on_motion_and_after_some_frames():
     detector = CountingDetector(RegionDetector({"mug": MUG}))
-    attention = TaskRelevanceEstimator(graph_of(), detector, TrackerSettings(max_frames=4))
+    estimator = TaskRelevanceEstimator(graph_of(), detector, TrackerSettings(max_frames=4))
     calls = []
     for index, (x_m, turn_deg) in enumerate(
         [(0, 0), (0.1, 0), (0.2, 0), (0.2, 16), (0.2, 16), (1.3, 16), *[(1.3, 16)] * 4]
     ):
-        attention.estimate(frame_at(x_m, index, turn_deg))
+        estimator.estimate(frame_at(x_m, index, turn_deg))
         calls.append(detector.calls)
     assert calls == [1, 1, 1, 2, 2, 3, 3, 3, 3, 4]
 
@@ -88,18 +88,18 @@ def test_detection_runs_on_the_first_frame_on_motion_and_after_some_frames():
 @pytest.mark.parametrize(("x_m", "turn_deg"), [(0.2, 0.0), (-0.3, 0.0), (0.1, 8.0)])
 def test_between_detections_the_mask_follows_the_object(x_m, turn_deg):
     detector = CountingDetector(RegionDetector({"mug": MUG}))
-    attention = TaskRelevanceEstimator(graph_of(), detector)
-    attention.estimate(frame_at())
+    estimator = TaskRelevanceEstimator(graph_of(), detector)
+    estimator.estimate(frame_at())
     moved = frame_at(x_m, 1, turn_deg)
-    truth, carried = MUG.mask(moved), attention.estimate(moved).relevance.roi
+    truth, carried = MUG.mask(moved), estimator.estimate(moved).relevance.roi
     assert detector.calls == 1
     assert (truth & carried).sum() / (truth | carried).sum() > 0.85
 
 
 def test_an_object_that_leaves_the_view_is_not_carried_over():
-    attention = TaskRelevanceEstimator(graph_of(), RegionDetector({"mug": MUG}), TrackerSettings(max_translation_m=9))
-    attention.estimate(frame_at())
-    assert not attention.estimate(frame_at(5.0, 1)).relevance.roi.any()
+    estimator = TaskRelevanceEstimator(graph_of(), RegionDetector({"mug": MUG}), TrackerSettings(max_translation_m=9))
+    estimator.estimate(frame_at())
+    assert not estimator.estimate(frame_at(5.0, 1)).relevance.roi.any()
 
 
 def test_without_depth_nothing_is_marked():
@@ -116,17 +116,17 @@ def test_the_maps_depth_comes_before_the_sensors():
 
 def test_a_target_is_kept_while_its_anchor_was_never_seen_and_that_is_said():
     graph = graph_of(Relation(Predicate.ON, "mug", "table"))
-    attention = TaskRelevanceEstimator(graph, RegionDetector({"mug": MUG}))
-    assert attention.estimate(frame_at()).relevance.roi.any()
-    assert "anchor 'table' not seen yet: its targets are kept" in attention.notes
+    estimator = TaskRelevanceEstimator(graph, RegionDetector({"mug": MUG}))
+    assert estimator.estimate(frame_at()).relevance.roi.any()
+    assert "anchor 'table' not seen yet: its targets are kept" in estimator.notes
 
 
 def test_an_anchor_is_remembered_after_it_left_the_view():
     kept = SpatialFilter(graph_of(Relation(Predicate.NEAR, "mug", "sink")), UP, SpatialSettings())
-    kept.observe([sighting("sink", 0, 0, 0)])
+    kept.observe([observation("sink", 0, 0, 0)])
     kept.observe([])
-    assert kept.keep(sighting("mug", 0.9, 0, 0))
-    assert not kept.keep(sighting("mug", 1.2, 0, 0))
+    assert kept.satisfies_relations(observation("mug", 0.9, 0, 0))
+    assert not kept.satisfies_relations(observation("mug", 1.2, 0, 0))
 
 
 @pytest.mark.parametrize(
@@ -135,37 +135,37 @@ def test_an_anchor_is_remembered_after_it_left_the_view():
 )
 def test_on_means_higher_and_not_aside(centre_m, expected):
     kept = SpatialFilter(graph_of(Relation(Predicate.ON, "mug", "table")), UP, SpatialSettings())
-    kept.observe([sighting("table", 0, 0, 0)])
-    assert kept.keep(sighting("mug", *centre_m)) is expected
+    kept.observe([observation("table", 0, 0, 0)])
+    assert kept.satisfies_relations(observation("mug", *centre_m)) is expected
 
 
 def test_on_a_long_table_means_over_its_footprint():
     kept = SpatialFilter(graph_of(Relation(Predicate.ON, "mug", "table")), UP, SpatialSettings())
     x, z = np.meshgrid(np.linspace(-1, 1, 80), np.linspace(-0.4, 0.4, 40))
     kept.observe([Observation.from_points("table", np.stack([x.ravel(), np.zeros(x.size), z.ravel()], axis=1))])
-    assert kept.keep(sighting("mug", 0.9, -0.1, 0.3, radius_m=0.04))
-    assert not kept.keep(sighting("mug", 1.4, -0.1, 0.3, radius_m=0.04))
+    assert kept.satisfies_relations(observation("mug", 0.9, -0.1, 0.3, radius_m=0.04))
+    assert not kept.satisfies_relations(observation("mug", 1.4, -0.1, 0.3, radius_m=0.04))
 
 
 def test_closest_to_is_one_candidate_of_all_that_were_seen():
     kept = SpatialFilter(
         graph_of(Relation(Predicate.CLOSEST_TO, "chair", "table"), targets=("chair",)), UP, SpatialSettings()
     )
-    near, far = sighting("chair", 0.8, 0, 0), sighting("chair", 2.0, 0, 0)
-    kept.observe([sighting("table", 0, 0, 0), far])
-    assert kept.keep(far)
+    near, far = observation("chair", 0.8, 0, 0), observation("chair", 2.0, 0, 0)
+    kept.observe([observation("table", 0, 0, 0), far])
+    assert kept.satisfies_relations(far)
     kept.observe([near, far])
     kept.observe([near])
-    assert kept.keep(near)
-    assert not kept.keep(far)
+    assert kept.satisfies_relations(near)
+    assert not kept.satisfies_relations(far)
 
 
 def test_any_relation_of_several_is_enough():
     near_sink, near_stove = (Relation(Predicate.NEAR, "mug", anchor) for anchor in ("sink", "stove"))
     kept = SpatialFilter(graph_of(near_sink, near_stove), UP, SpatialSettings())
-    kept.observe([sighting("sink", 0, 0, 0), sighting("stove", 5, 0, 0)])
-    assert kept.keep(sighting("mug", 5.5, 0, 0))
-    assert not kept.keep(sighting("mug", 2.5, 0, 0))
+    kept.observe([observation("sink", 0, 0, 0), observation("stove", 5, 0, 0)])
+    assert kept.satisfies_relations(observation("mug", 5.5, 0, 0))
+    assert not kept.satisfies_relations(observation("mug", 2.5, 0, 0))
 
 
 def test_partial_views_of_one_table_grow_into_its_true_centre():
@@ -175,7 +175,7 @@ def test_partial_views_of_one_table_grow_into_its_true_centre():
             x, z = np.meshgrid(np.arange(left, left + 1.2, 0.02), np.arange(-0.4, 0.4, 0.02))
             kept.observe([Observation.from_points("table", np.stack([x.ravel(), np.zeros(x.size), z.ravel()], axis=1))])
     (table,) = kept.landmarks
-    assert table.seen == 9
+    assert table.seen_count == 9
     assert np.abs(table.centroid_m - (0, 0, 0)).max() < 0.06
 
 
