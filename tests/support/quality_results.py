@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from gausslite.evaluation.compare import MapScores
+from gausslite_bench.quality.home_scenes import HomeScenePlan
 from gausslite_bench.quality.home_tasks import choose_home_tasks
-from gausslite_bench.quality.scenes import HomeScenePlan
 from gausslite_bench.quality.study import FinishedTrial, Origin
 from gausslite_bench.quality.trials import Conditions, Trial, TrialBudget, TrialResult, Variant
 

@@ -43,7 +43,7 @@ def uplink(
 
 def held(store: MemoryStore) -> dict[int, list[int]]:
     """Per voxel the kappas the server holds of the robot."""
-    table = store.words("robot")
+    table = store.batch("robot")
     return {
         key: table.gaussians.kappa[start:end].tolist()
         for key, start, end in zip(table.keys.tolist(), table.offsets[:-1], table.offsets[1:], strict=True)

@@ -1,4 +1,4 @@
-"""Tell a watcher what changed in the fused map, and whose Gaussians it now shows where."""
+"""Encode the changes of the fused map, with the agent that wins each voxel, as messages for a watcher."""
 
 from __future__ import annotations
 
@@ -9,26 +9,26 @@ import numpy as np
 from gausslite.domain.voxel_batch import VoxelBatch
 from gausslite.domain.voxel_operations import crop_to_box, merge_batches, tombstones
 from gausslite.domain.voxels import AxisAlignedBox, VoxelGrid
-from gausslite.fusion.engine import Changes
+from gausslite.fusion.engine import FusedMapChanges
 from gausslite.fusion.vote import VoteResult
 from gausslite.v1.gaussians_pb2 import MapBlock, Provenance
 from gausslite.wire.map_blocks import map_blocks
 
-_TEAM = "team"
-"""The speaker of fused words; an agent of this name loses nothing, since provenance names agents."""
+_SENDER = "fusion-server"
+"""The agent id inside the subset bytes of fused voxels; readers use the provenance instead."""
 
 
-def change_blocks(changes: Changes, grid: VoxelGrid, region: AxisAlignedBox | None) -> Iterator[MapBlock]:
-    """The blocks of a change, or of the part of it in a region; at least one."""
-    words = merge_batches(changes.fused.words, tombstones(changes.vanished))
+def change_blocks(changes: FusedMapChanges, grid: VoxelGrid, region: AxisAlignedBox | None) -> Iterator[MapBlock]:
+    """Yield the blocks of the changes, or of their part in a region; at least one."""
+    batch = merge_batches(changes.fused.batch, tombstones(changes.removed))
     if region is not None:
-        words = crop_to_box(words, region, grid)
-    election = changes.fused.election
-    return map_blocks(words, grid, _TEAM, changes.revision, changes.snapshot, lambda part: _provenance(part, election))
+        batch = crop_to_box(batch, region, grid)
+    vote = changes.fused.vote
+    return map_blocks(batch, grid, _SENDER, changes.revision, changes.snapshot, lambda part: _provenance(part, vote))
 
 
-def _provenance(part: VoxelBatch, election: VoteResult) -> Provenance:
+def _provenance(part: VoxelBatch, vote: VoteResult) -> Provenance:
     winner = np.zeros(len(part), np.int32)
-    held = np.isin(part.keys, election.keys)
-    winner[held] = election.winner[np.searchsorted(election.keys, part.keys[held])]
-    return Provenance(agent_ids=election.agents, winner=winner.tolist())
+    has_winner = np.isin(part.keys, vote.keys)
+    winner[has_winner] = vote.winner_index[np.searchsorted(vote.keys, part.keys[has_winner])]
+    return Provenance(agent_ids=vote.agents, winner=winner.tolist())

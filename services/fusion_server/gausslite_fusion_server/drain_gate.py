@@ -1,4 +1,4 @@
-"""Let calls in while the server is up, and end the open ones when it drains."""
+"""Accept calls while the server is up, and end the open streams when it drains."""
 
 from __future__ import annotations
 
@@ -12,33 +12,33 @@ _Message = TypeVar("_Message")
 
 
 class DrainGate:
-    """Open until shut, once; used on the event loop only."""
+    """Open until `close` is called. Use it on the event loop only."""
 
     def __init__(self) -> None:
-        self._shut = asyncio.Event()
+        self._closed = asyncio.Event()
 
     @property
     def is_open(self) -> bool:
-        """False once the server drains."""
-        return not self._shut.is_set()
+        """False after `close`."""
+        return not self._closed.is_set()
 
-    def shut(self) -> None:
-        """Let nobody in any more."""
-        self._shut.set()
+    def close(self) -> None:
+        """Refuse new calls and end the streams read through `admit`."""
+        self._closed.set()
 
     def require_open(self) -> None:
-        """Raise UnavailableError when the server drains."""
-        if self._shut.is_set():
+        """Raise UnavailableError if the server drains."""
+        if self._closed.is_set():
             raise UnavailableError("fusion server: draining; try again in a moment")
 
     async def admit(self, requests: AsyncIterator[_Message]) -> AsyncIterator[_Message]:
-        """The requests of a stream for as long as the door is open; then UnavailableError, even to a silent client."""
-        shutting = asyncio.ensure_future(self._shut.wait())
+        """Yield the requests of a stream. Raises UnavailableError when the gate closes, even between two requests."""
+        closing = asyncio.ensure_future(self._closed.wait())
         try:
             while True:
                 self.require_open()
                 reading = asyncio.ensure_future(_next(requests))
-                await asyncio.wait([reading, shutting], return_when=asyncio.FIRST_COMPLETED)
+                await asyncio.wait([reading, closing], return_when=asyncio.FIRST_COMPLETED)
                 if not reading.done():
                     reading.cancel()
                     await asyncio.wait([reading])
@@ -48,7 +48,7 @@ class DrainGate:
                     return
                 yield request
         finally:
-            shutting.cancel()
+            closing.cancel()
 
 
 async def _next(requests: AsyncIterator[_Message]) -> _Message | None:

@@ -1,4 +1,4 @@
-"""Start the fusion server from the command line and end it cleanly on SIGTERM."""
+"""Start the fusion server from the command line; SIGTERM and SIGINT end it after open calls."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _PROGRAM = "gausslite-fusion-server"
 
 
 def run(arguments: Sequence[str] | None = None) -> int:
-    """Serve until stopped. Returns 0, or 2 with one line on stderr when the server cannot start or go on."""
+    """Serve until a signal arrives. Returns the exit code: 0, or 2 with one line on stderr if the server fails."""
 
     async def serve() -> None:
         settings = parse_arguments(arguments)
@@ -38,19 +38,20 @@ def _open_store(settings: ServerSettings) -> FusionStore:
 
 
 async def _serve(settings: ServerSettings, store: FusionStore) -> None:
-    def chosen_rasterizer() -> Rasterizer:
-        # imported here: a server that never refines needs no kernels
+    def create_rasterizer() -> Rasterizer:
+        # imported late, because a server without refinements needs no kernels
         from gausslite.render.choose import choose_rasterizer
 
         return choose_rasterizer(settings.rasterizer)
 
-    servicer = FusionServicer(FusionEngine(store, settings.team), RefinementWorker(settings.refine, chosen_rasterizer))
+    engine = FusionEngine(store, settings.fusion)
+    servicer = FusionServicer(engine, RefinementWorker(settings.refine, create_rasterizer))
 
     async def drain_when_stopping() -> None:
         try:
             await asyncio.Event().wait()
         finally:
-            # reached when the server begins to stop: open streams end with UNAVAILABLE instead of being cut
+            # runs when the server begins to stop, so that open streams end with UNAVAILABLE
             servicer.drain()
 
     try:

@@ -1,4 +1,4 @@
-"""Run a joint refinement in a thread of its own, and tell how far it is."""
+"""Run a joint refinement on its own thread, and report its progress."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from gausslite.wire.change_notifier import ChangeNotifier
 
 @dataclass(frozen=True, slots=True)
 class RefineRequest:
-    """What a client asked for; 0 = the server's own setting."""
+    """The values of a client's request; 0 = the server's default."""
 
     iterations: int = 0
     max_gaussians: int = 0
@@ -26,7 +26,7 @@ class RefineRequest:
 
 
 class RefinementWorker:
-    """Refines one map at a time. A rasterizer is chosen when a refinement starts, so that others need none."""
+    """Runs one refinement at a time. The rasterizer is created by the first refinement, since other calls need none."""
 
     def __init__(self, settings: RefineSettings, choose_rasterizer: Callable[[], Rasterizer]) -> None:
         self._settings = settings
@@ -34,41 +34,42 @@ class RefinementWorker:
         self._worker = ThreadPoolExecutor(1, "refine")
         self._busy = False
 
-    async def run(self, team: FusionEngine, order: RefineRequest) -> AsyncIterator[RefineProgress]:
-        """Refine, yielding the latest progress; the refined map is kept once this ends. Closing it cancels.
+    async def run(self, engine: FusionEngine, request: RefineRequest) -> AsyncIterator[RefineProgress]:
+        """Refine the engine's map, yield the latest progress, and store the result. Closing the iterator cancels.
 
-        A slow reader misses steps, never the end. Raises QuotaError when one is running, and what `refine` raises.
+        A slow reader misses some progress, but never the last one. Raises QuotaError if another refinement runs, and
+        the errors of `refine`.
         """
-        settings = self._settings_for(order)
+        settings = self._settings_for(request)
         if self._busy:
             raise QuotaError("refinement: expected one at a time, got a second while one is running")
         self._busy = True
-        loop, bell, cancelled = asyncio.get_running_loop(), ChangeNotifier(), Event()
+        loop, progress_notifier, cancelled = asyncio.get_running_loop(), ChangeNotifier(), Event()
         latest: list[RefineProgress] = []
 
         def publish(progress: RefineProgress) -> None:
             latest[:] = [progress]
-            bell.notify()
+            progress_notifier.notify()
 
-        def go_on(progress: RefineProgress) -> bool:
+        def report_progress(progress: RefineProgress) -> bool:
             loop.call_soon_threadsafe(publish, progress)
             return not cancelled.is_set()
 
         def work() -> None:
-            gaussians, keyframes, revision = team.to_refine()
-            refined = refine(gaussians, keyframes, self._choose_rasterizer(), settings, go_on)
+            gaussians, keyframes, revision = engine.refinement_input()
+            refined = refine(gaussians, keyframes, self._choose_rasterizer(), settings, report_progress)
             if not cancelled.is_set():
-                team.keep_refined(refined, revision)
+                engine.store_refined_map(refined, revision)
 
         future = loop.run_in_executor(self._worker, work)
-        future.add_done_callback(lambda _: self._rest(bell))
+        future.add_done_callback(lambda _: self._finish(progress_notifier))
         try:
             while not future.done():
-                ticket = bell.subscribe()
+                changed = progress_notifier.subscribe()
                 while latest:
                     yield latest.pop()
                 if not future.done():
-                    await ticket.wait()
+                    await changed.wait()
             future.result()
             while latest:
                 yield latest.pop()
@@ -76,20 +77,20 @@ class RefinementWorker:
             cancelled.set()
 
     def close(self) -> None:
-        """Wait for the last refinement to notice that it was cancelled."""
+        """Wait until the last refinement has ended after its cancellation."""
         self._worker.shutdown(wait=True, cancel_futures=True)
 
-    def _settings_for(self, order: RefineRequest) -> RefineSettings:
-        if order.iterations > MAX_REFINE_ITERATIONS:
-            raise QuotaError(f"refine iterations: expected at most {MAX_REFINE_ITERATIONS}, got {order.iterations}")
-        own = self._settings
+    def _settings_for(self, request: RefineRequest) -> RefineSettings:
+        if request.iterations > MAX_REFINE_ITERATIONS:
+            raise QuotaError(f"refine iterations: expected at most {MAX_REFINE_ITERATIONS}, got {request.iterations}")
+        default = self._settings
         return replace(
-            own,
-            iterations=order.iterations or own.iterations,
-            max_gaussians=min(order.max_gaussians or own.max_gaussians, own.max_gaussians),
-            seed=order.seed,
+            default,
+            iterations=request.iterations or default.iterations,
+            max_gaussians=min(request.max_gaussians or default.max_gaussians, default.max_gaussians),
+            seed=request.seed,
         )
 
-    def _rest(self, bell: ChangeNotifier) -> None:
+    def _finish(self, progress_notifier: ChangeNotifier) -> None:
         self._busy = False
-        bell.notify()
+        progress_notifier.notify()

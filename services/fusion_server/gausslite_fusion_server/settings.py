@@ -27,7 +27,7 @@ class ServerSettings:
     listen: str = "127.0.0.1:50052"
     store: Path | None = None
     store_max_bytes: int | None = None
-    team: FusionSettings = field(default_factory=FusionSettings)
+    fusion: FusionSettings = field(default_factory=FusionSettings)
     refine: RefineSettings = field(default_factory=RefineSettings)
     rasterizer: str = "auto"
     tls: Tls | None = None
@@ -71,7 +71,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--listen", default=ours.listen, metavar="HOST:PORT", help="address to serve on, or unix:PATH")
     add("--store", default=MEMORY, metavar="memory|PATH.sqlite", help="where the words are kept")
     add("--store-max-mb", type=int, metavar="MB", help="largest size of the sqlite file; no limit when absent")
-    add("--voxel-size", type=float, default=ours.team.grid.size_m, metavar="METRES", help="edge of the vote's voxels")
+    add("--voxel-size", type=float, default=ours.fusion.grid.size_m, metavar="METRES", help="edge of the vote's voxels")
     add("--mission", default="", metavar="ID", help="the only mission to serve; empty: the first agent names it")
     add("--world-frame", default="", metavar="NAME", help="frame of all maps; empty: the first agent names it")
     add("--quota-agents", type=int, default=quotas.agents, metavar="N", help="most agents in the mission")

@@ -1,15 +1,18 @@
-"""Maps as standard 3DGS PLY files, binary little-endian, with our three columns beside the usual ones.
+"""Read and write maps as standard 3DGS PLY files, binary little-endian, with three additional columns.
 
-Columns: x y z | f_dc_0..2 = (rgb - 0.5) / C0 | opacity as logit | scale_0..2 as log | rot_0..3 = w x y z | and ours:
-active, kappa, target. All are float, ours too, because common readers take a row for a run of floats; so kappa is exact
-up to 2^24. Reading goes by name: any order and type; other tools' columns (normals, f_rest) are passed over, ours may
-be missing (inactive, kappa 0, no target).
+Columns: x y z | f_dc_0..2 = (rgb - 0.5) / C0 | opacity as logit | scale_0..2 as log | rot_0..3 = w x y z | additional:
+active, kappa, target. All columns are float, because common readers read a row as a run of floats; so kappa is exact
+up to 2^24. The reader finds columns by name, in any order and type. It ignores other tools' columns (normals, f_rest);
+the additional ones may be missing (then inactive, kappa 0, no target). The header may name the map's world frame:
+`comment world_frame NAME`.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from jaxtyping import Float32
@@ -18,13 +21,15 @@ from numpy.typing import DTypeLike, NDArray
 
 from gausslite.codec.files import write_atomic
 from gausslite.domain.gaussians import Gaussians
+from gausslite.domain.names import require_name
 from gausslite.domain.relevance import NO_TARGET
 from gausslite.errors import InvalidInputError, MapFileError
 
 SH_C0 = 0.28209479177387814
 _MAX_GAUSSIANS = 100_000_000
 _MAX_HEADER_BYTES = 1 << 16
-# raw values that a float32 sigmoid and exponential can still tell apart from their limits
+_WORLD_FRAME_COMMENT = "comment world_frame "
+# the closest to 0 and 1 that a float32 sigmoid still distinguishes from them
 _OPACITY_EDGE = 1e-6
 _POSITIONS, _COLOURS = ("x", "y", "z"), ("f_dc_0", "f_dc_1", "f_dc_2")
 _SCALES, _ROTATIONS = ("scale_0", "scale_1", "scale_2"), ("rot_0", "rot_1", "rot_2", "rot_3")
@@ -38,26 +43,29 @@ _PLY_TYPES = {
 }
 
 
-def write_ply(path: Path, gaussians: Gaussians) -> None:
-    """Write the map, whole or not at all. Raises StorageError when the folder is not writable or the disk is full."""
-    write_atomic(path, ply_bytes(gaussians))
+def write_ply(path: Path, gaussians: Gaussians, world_frame: str = "") -> None:
+    """Write the map atomically; the header names the world frame unless it is empty.
+
+    Raises InvalidInputError for a name with line breaks or control characters, StorageError if writing fails.
+    """
+    write_atomic(path, ply_bytes(gaussians, world_frame))
 
 
 def read_ply(path: Path) -> Gaussians:
-    """Read a map. Raises MapFileError naming the file and what is wrong with it."""
-    path = Path(path)
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise MapFileError(f"{path}: cannot read the map: {error.strerror or error}") from error
-    try:
-        return gaussians_from_ply(data)
-    except MapFileError as error:
-        raise MapFileError(f"{path}: {error}") from error
+    """Read a map. Raises MapFileError naming the file and the cause."""
+    with _open_map(path) as file:
+        return gaussians_from_ply(file.read())
 
 
-def ply_bytes(gaussians: Gaussians) -> bytes:
-    """The whole file in memory."""
+def read_world_frame(path: Path) -> str:
+    """Read the name of the world frame from a map's header; empty if it has none. Raises MapFileError."""
+    with _open_map(path) as file:
+        return world_frame_from_ply(file.read(_MAX_HEADER_BYTES))
+
+
+def ply_bytes(gaussians: Gaussians, world_frame: str = "") -> bytes:
+    """Encode the map as the bytes of a PLY file. Raises InvalidInputError as `write_ply`."""
+    require_name("world frame", world_frame)
     rows = np.zeros(len(gaussians), _ROW)
     opacity = np.clip(gaussians.opacities.astype(np.float64), _OPACITY_EDGE, 1 - _OPACITY_EDGE)
     _fill(rows, _POSITIONS, gaussians.means_m)
@@ -67,13 +75,32 @@ def ply_bytes(gaussians: Gaussians) -> bytes:
     rows["opacity"] = np.log(opacity / (1 - opacity))
     for name in _EXTRAS:
         rows[name] = getattr(gaussians, name)
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(gaussians)}"]
+    header = ["ply", "format binary_little_endian 1.0"]
+    if world_frame:
+        header.append(_WORLD_FRAME_COMMENT + world_frame)
+    header.append(f"element vertex {len(gaussians)}")
     header += [f"property float {name}" for name in (*_STANDARD, *_EXTRAS)]
     return ("\n".join([*header, "end_header"]) + "\n").encode() + rows.tobytes()
 
 
+def world_frame_from_ply(data: bytes) -> str:
+    """Return the world frame named in the header of a PLY file; empty if it has none. Raises MapFileError."""
+    end, _ = _header_extent(data)
+    comments = {line for line in data[:end].splitlines() if line.startswith(_WORLD_FRAME_COMMENT.encode())}
+    if not comments:
+        return ""
+    if len(comments) > 1:
+        raise MapFileError(f"expected one world frame in the header, got {len(comments)}")
+    try:
+        name = comments.pop().decode().removeprefix(_WORLD_FRAME_COMMENT)
+        require_name("world frame", name)
+    except (InvalidInputError, UnicodeDecodeError) as error:
+        raise MapFileError(f"expected a world frame's name in the header: {error}") from error
+    return name
+
+
 def gaussians_from_ply(data: bytes) -> Gaussians:
-    """The map in the bytes of a PLY file. Raises MapFileError."""
+    """Decode the map in the bytes of a PLY file. Raises MapFileError."""
     count, row, start = _read_header(data)
     missing = [name for name in _STANDARD if name not in (row.names or ())]
     if missing:
@@ -82,9 +109,9 @@ def gaussians_from_ply(data: bytes) -> Gaussians:
         raise MapFileError(f"expected {count} Gaussians of {row.itemsize} bytes, got {len(data) - start} bytes of them")
     rows = np.frombuffer(data, row, count, start)
     present = [name for name in (*_STANDARD, *_EXTRAS) if name in (row.names or ())]
-    bad = [name for name in present if not np.isfinite(rows[name].astype(np.float64)).all()]
-    if bad:
-        raise MapFileError(f"column {bad[0]}: expected finite values, got NaN or infinity")
+    not_finite = [name for name in present if not np.isfinite(rows[name].astype(np.float64)).all()]
+    if not_finite:
+        raise MapFileError(f"column {not_finite[0]}: expected finite values, got NaN or infinity")
     try:
         with np.errstate(over="raise"):
             return _to_gaussians({name: rows[name] for name in present}, count)
@@ -101,30 +128,25 @@ def _to_gaussians(raw: dict[str, NDArray[Any]], count: int) -> Gaussians:
         (1 / (1 + np.exp(-logits))).astype(np.float32),
         _stack(raw, _COLOURS) * np.float32(SH_C0) + np.float32(0.5),
         raw.get("active", np.zeros(count)) != 0,
-        _whole(raw.get("kappa", np.zeros(count)), np.uint32),
-        _whole(raw.get("target", np.full(count, NO_TARGET)), np.int16),
+        _to_integers(raw.get("kappa", np.zeros(count)), np.uint32),
+        _to_integers(raw.get("target", np.full(count, NO_TARGET)), np.int16),
     )
 
 
 def _read_header(data: bytes) -> tuple[int, np.dtype[np.void], int]:
-    """How many rows there are, what a row is, and where the first one starts."""
-    end = data.find(b"end_header", 0, _MAX_HEADER_BYTES)
-    if not data.startswith(b"ply") or end < 0:
-        raise MapFileError("expected a PLY file, got something else")
-    start = data.find(b"\n", end, end + 12) + 1
-    if start == 0:
-        raise MapFileError("the header has no end")
+    """Return the number of rows, the type of a row, and the first row's offset."""
+    end, start = _header_extent(data)
     lines = [line.split() for line in data[:end].decode("ascii", "replace").splitlines()[1:]]
     lines = [line for line in lines if line and line[0] not in ("comment", "obj_info")]
-    kind = " ".join(lines[0]) if lines else "nothing"
-    if kind != "format binary_little_endian 1.0":
-        raise MapFileError(f"expected format binary_little_endian 1.0, got {kind}")
+    file_format = " ".join(lines[0]) if lines else "nothing"
+    if file_format != "format binary_little_endian 1.0":
+        raise MapFileError(f"expected format binary_little_endian 1.0, got {file_format}")
     if len(lines) < 2 or lines[1][:2] != ["element", "vertex"] or len(lines[1]) != 3:
         raise MapFileError("expected 'element vertex COUNT' as the first element")
     count = _count(lines[1][2])
     fields: dict[str, str] = {}
     for line in lines[2:]:
-        # rows of later elements lie behind the vertices and are none of ours
+        # rows of other elements follow the vertices and are not read
         if line[0] == "element":
             break
         if len(line) != 3 or line[0] != "property" or line[1] not in _PLY_TYPES or line[2] in fields:
@@ -133,16 +155,39 @@ def _read_header(data: bytes) -> tuple[int, np.dtype[np.void], int]:
     return count, np.dtype(list(fields.items())), start
 
 
+def _header_extent(data: bytes) -> tuple[int, int]:
+    """Return the offsets of the header's last line and of the first row."""
+    end = data.find(b"\nend_header", 0, _MAX_HEADER_BYTES) + 1
+    if not data.startswith(b"ply") or end == 0:
+        raise MapFileError("expected a PLY file, got something else")
+    start = data.find(b"\n", end, end + 12) + 1
+    if start == 0:
+        raise MapFileError("the header has no end")
+    return end, start
+
+
+@contextmanager
+def _open_map(path: Path) -> Iterator[BinaryIO]:
+    """Open the file; errors of its content name it."""
+    try:
+        with Path(path).open("rb") as file:
+            yield file
+    except OSError as error:
+        raise MapFileError(f"{path}: cannot read the map: {error.strerror or error}") from error
+    except MapFileError as error:
+        raise MapFileError(f"{path}: {error}") from error
+
+
 def _count(text: str) -> int:
     if not text.isascii() or not text.isdigit() or len(text) > 12 or int(text) > _MAX_GAUSSIANS:
         raise MapFileError(f"expected 0 to {_MAX_GAUSSIANS} Gaussians, got {text!r}")
     return int(text)
 
 
-def _whole(values: NDArray[Any], dtype: DTypeLike) -> NDArray[Any]:
-    """To whole numbers, kept within the type's range: a float close to its end must not wrap round."""
-    ends = np.iinfo(np.dtype(dtype))
-    return np.clip(values.astype(np.float64), ends.min, ends.max).astype(dtype)
+def _to_integers(values: NDArray[Any], dtype: DTypeLike) -> NDArray[Any]:
+    """Convert to integers, clipped to the type's range, because a float near its limit would overflow."""
+    limits = np.iinfo(np.dtype(dtype))
+    return np.clip(values.astype(np.float64), limits.min, limits.max).astype(dtype)
 
 
 def _fill(rows: NDArray[Any], names: tuple[str, ...], values: NDArray[Any]) -> None:

@@ -1,1 +1,1 @@
-"""One map from many robots: the register of their words, the vote on each voxel, and the joint refinement."""
+"""One map from many agents: the store of their voxel updates, the vote on each voxel, and the joint refinement."""

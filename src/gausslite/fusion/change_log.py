@@ -1,75 +1,52 @@
-"""Which revision of the fused map last changed each voxel, so that a watcher can be sent what is new to it."""
+"""Record at which revision of the fused map each voxel last changed, for the streams of WatchFusedMap."""
 
 from __future__ import annotations
-
-from collections import OrderedDict
 
 import numpy as np
 from jaxtyping import Int64
 from numpy import ndarray
 
-from gausslite.errors import RevisionGoneError
+from gausslite.domain.revision_log import MAX_REMOVED_VOXELS, RevisionLog
 from gausslite.fusion.vote import VoteResult
 
 
 class ChangeLog:
-    """Counts the revisions of the fused map of one life of a server.
+    """Counts the revisions of the fused map since the server started, and knows each voxel's winner.
 
-    For a voxel that holds something only its last change matters, so the ledger is bounded by the map. Of voxels that
-    became empty the most recent `max_vanished` are remembered; who has not heard of an older one must start anew.
-    first_revision tells this life's revisions from those of an earlier one: begin above all of them.
+    `first_revision` must exceed all revisions from before a restart.
     """
 
-    def __init__(self, first_revision: int = 1, max_vanished: int = 100_000) -> None:
-        self._revision = self._oldest = first_revision
-        self._max_vanished = max_vanished
-        self._holder: dict[int, str] = {}
-        self._changed: dict[int, int] = {}
-        self._vanished: OrderedDict[int, int] = OrderedDict()
+    def __init__(self, first_revision: int = 1, max_removed: int = MAX_REMOVED_VOXELS) -> None:
+        self._log = RevisionLog(first_revision, max_removed)
+        self._winner: dict[int, str] = {}
 
     @property
     def revision(self) -> int:
-        """The fused map's present revision."""
-        return self._revision
+        """The fused map's current revision."""
+        return self._log.revision
 
-    def record(self, agent_id: str, keys: Int64[ndarray, " k"], election: VoteResult) -> Int64[ndarray, " c"]:
-        """Note that this agent's words on `keys` changed and that the vote on them now stands so.
+    def record(self, agent_id: str, keys: Int64[ndarray, " k"], vote: VoteResult) -> Int64[ndarray, " c"]:
+        """Record that this agent's updates of `keys` changed; `vote` is the new result on these voxels.
 
-        Returns the voxels where the fused map changed: those the agent holds now or held before.
+        Returns the voxels where the fused map changed: those that the agent wins now or won before.
         """
-        holders = dict(zip(election.keys.tolist(), election.winner.tolist(), strict=True))
-        changed = []
+        new_winner = dict(zip(vote.keys.tolist(), vote.winner_index.tolist(), strict=True))
+        changed, removed = [], []
         for key in keys.tolist():
-            index = holders.get(key)
-            after = None if index is None else election.agents[index]
-            before = self._holder.get(key)
-            if agent_id in (after, before):
+            index = new_winner.get(key)
+            winner = None if index is None else vote.agents[index]
+            if agent_id not in (winner, self._winner.get(key)):
+                continue
+            if winner is None:
+                del self._winner[key]
+                removed.append(key)
+            else:
+                self._winner[key] = winner
                 changed.append(key)
-                self._move(key, after, self._revision + 1)
-        if changed:
-            self._revision += 1
-        return np.array(sorted(changed), np.int64)
+        if changed or removed:
+            self._log.record(changed, removed, self._log.revision + 1)
+        return np.array(sorted(changed + removed), np.int64)
 
     def changed_since(self, revision: int) -> Int64[ndarray, " c"]:
-        """The voxels whose present state someone at `revision` does not know, ascending.
-
-        Raises RevisionGoneError when the revision is of another life, or too old to know what vanished since.
-        """
-        if not self._oldest <= revision <= self._revision:
-            raise RevisionGoneError(
-                f"since_revision: expected {self._oldest} to {self._revision}, or 0 for a snapshot, got {revision}"
-            )
-        keys = [key for changes in (self._changed, self._vanished) for key, at in changes.items() if at > revision]
-        return np.array(sorted(keys), np.int64)
-
-    def _move(self, key: int, after: str | None, revision: int) -> None:
-        if after is not None:
-            self._vanished.pop(key, None)
-            self._holder[key] = after
-            self._changed[key] = revision
-            return
-        del self._holder[key], self._changed[key]
-        self._vanished[key] = revision
-        if len(self._vanished) > self._max_vanished:
-            _, forgotten = self._vanished.popitem(last=False)
-            self._oldest = max(self._oldest, forgotten)
+        """Return the voxels that changed or became empty after this revision, ascending. Raises RevisionGoneError."""
+        return self._log.changed_since(revision)

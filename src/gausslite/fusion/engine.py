@@ -1,4 +1,4 @@
-"""The team's map and everyone's part in it: who takes part, what each said last, and what follows from that."""
+"""Own the fused map of one mission: its sessions, voxel updates, keyframes, change log and refined map."""
 
 from __future__ import annotations
 
@@ -14,64 +14,67 @@ from jaxtyping import Int64
 from numpy import ndarray
 
 from gausslite.domain.gaussians import Gaussians
+from gausslite.domain.names import quote_name, require_name
 from gausslite.domain.voxel_batch import RoiSubset, VoxelBatch
 from gausslite.domain.voxel_operations import group_by_voxel, select_voxels
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.errors import InvalidInputError, MismatchError, NotPermittedError, QuotaError, SessionUnknownError
 from gausslite.fusion.change_log import ChangeLog
-from gausslite.fusion.keyframes import KeyframePool, AgentKeyframe
-from gausslite.fusion.limits import AgentUsage, FusionSettings, agree, named, require_name, shown
+from gausslite.fusion.keyframes import AgentKeyframe, KeyframePool
+from gausslite.fusion.limits import AgentUsage, FusionSettings
+from gausslite.fusion.mission_config import MissionConfig, reconcile
 from gausslite.fusion.refined_map import RefinedMap
-from gausslite.fusion.store import FusionStore, MissionConfig, PutOutcome, SessionRecord
+from gausslite.fusion.store import FusionStore, PutOutcome, SessionRecord
 from gausslite.fusion.traffic import MissionStatus, TrafficCounters, contribution
-from gausslite.fusion.vote import FusedMap, concatenate, elect, fuse
+from gausslite.fusion.vote import FusedMap, fuse, rank_voxels, union_maps
 
-_REMEMBERED_SESSIONS = 1000
+_MAX_REPLACED_SESSIONS = 1000
 
 
-class Joined(NamedTuple):
-    """The answer to an agent that joined; it must number its words above highest_map_revision."""
+class JoinResult(NamedTuple):
+    """The answer to a joining agent; the map revisions of its updates must exceed highest_map_revision."""
 
     session: SessionRecord
     highest_map_revision: int
-    revision: int
+    fused_revision: int
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Changes:
-    """What someone must be told to be at `revision`: the fused words, and the voxels where nothing is any more."""
+class FusedMapChanges:
+    """The fused voxels that changed up to `revision`, and the keys of those that became empty."""
 
     revision: int
     snapshot: bool
     fused: FusedMap
-    vanished: Int64[ndarray, " e"]
+    removed: Int64[ndarray, " e"]
 
 
 class FusionEngine:
-    """Owns the store, the sessions, the keyframes and the refined map of one mission; safe for threads.
+    """Owns the store, the sessions, the keyframes and the refined map of one mission. Thread-safe.
 
-    Words and sessions live as long as the store does; keyframes, the refined map and the tallies as long as this.
-    first_revision must lie above the revisions of earlier lives: by default it is the time in microseconds.
-    Raises MismatchError when the store was made on other terms, StorageError.
+    Updates and sessions persist with the store; keyframes, the refined map and counters end with this object.
+    first_revision must exceed the revisions from before a restart; by default it is the time in microseconds.
+    Raises MismatchError if the store belongs to another mission configuration, StorageError.
     """
 
     def __init__(self, store: FusionStore, settings: FusionSettings, first_revision: int | None = None) -> None:
         self._lock = RLock()
         self._store = store
         self._settings = settings
-        self._charter = agree(store.mission_config() or settings.offer, settings.offer)
-        begin = time.time_ns() // 1000 if first_revision is None else first_revision
-        self._ledger = ChangeLog(begin, settings.remembered_vanished)
-        self._pool = KeyframePool(settings.quotas.keyframes_per_agent, settings.quotas.keyframe_pixels)
+        own = settings.mission_config
+        self._mission_config = reconcile(store.mission_config() or own, own)
+        first_revision = time.time_ns() // 1000 if first_revision is None else first_revision
+        self._change_log = ChangeLog(first_revision, settings.max_removed_voxels)
+        self._keyframes = KeyframePool(settings.quotas.keyframes_per_agent, settings.quotas.keyframe_pixels)
         self._sessions = {session.session_id: session for session in store.sessions()}
-        self._replaced: deque[str] = deque(maxlen=_REMEMBERED_SESSIONS)
-        self._tallies: dict[str, TrafficCounters] = {}
+        self._replaced_sessions: deque[str] = deque(maxlen=_MAX_REPLACED_SESSIONS)
+        self._traffic: dict[str, TrafficCounters] = {}
         self._refined: RefinedMap | None = None
-        stakes = store.stakes()
-        self._holdings = {agent_id: AgentUsage.in_stakes(stakes, agent_id) for agent_id in stakes.agents}
-        election = elect(stakes)
-        for index, agent_id in enumerate(stakes.agents):
-            self._ledger.record(agent_id, election.keys[election.winner == index], election)
+        scores = store.scores()
+        self._usage = {agent_id: AgentUsage.from_scores(scores, agent_id) for agent_id in scores.agents}
+        vote = rank_voxels(scores)
+        for index, agent_id in enumerate(scores.agents):
+            self._change_log.record(agent_id, vote.keys[vote.winner_index == index], vote)
 
     @property
     def grid(self) -> VoxelGrid:
@@ -80,139 +83,142 @@ class FusionEngine:
 
     @property
     def settings(self) -> FusionSettings:
-        """The server's own terms."""
+        """The server's configuration."""
         return self._settings
 
     @property
     def mission_config(self) -> MissionConfig:
-        """What was agreed so far, with plain names where nobody gave one."""
+        """The mission's configuration, with default names in place of empty ones."""
         with self._lock:
-            return named(self._charter)
+            return self._mission_config.with_default_names()
 
     @property
     def revision(self) -> int:
-        """Rises whenever the fused map changes."""
+        """The fused map's revision; it increases with every change."""
         with self._lock:
-            return self._ledger.revision
+            return self._change_log.revision
 
     def require_mission(self, mission_id: str) -> None:
-        """Raise MismatchError unless this is the mission's id, or empty."""
-        if mission_id and mission_id != self.mission_config.mission_id:
-            ours = shown(self.mission_config.mission_id)
-            raise MismatchError(f"mission: expected {ours} as agreed here, got {shown(mission_id)}")
+        """Raise MismatchError unless the id is this mission's, or empty."""
+        own = self.mission_config.mission_id
+        if mission_id and mission_id != own:
+            raise MismatchError(f"mission: expected {quote_name(own)} as agreed here, got {quote_name(mission_id)}")
 
-    def join(self, agent_id: str, asked: MissionConfig, fresh_map: bool = False) -> Joined:
-        """Open a session, ending the agent's earlier one; fresh_map also forgets what the agent said before.
+    def join(self, agent_id: str, requested: MissionConfig, fresh_map: bool = False) -> JoinResult:
+        """Open a session and end the agent's earlier one; fresh_map also deletes the agent's earlier updates.
 
-        Empty names in `asked` mean the server's. Raises InvalidInputError, MismatchError, QuotaError, StorageError.
+        Empty names in `requested` accept the server's. Raises InvalidInputError, MismatchError, QuotaError,
+        StorageError.
         """
         require_name("agent_id", agent_id)
         if not agent_id:
             raise InvalidInputError("agent_id: expected a name, got an empty string")
         with self._lock:
-            mission_config = agree(self._charter, asked)
-            known = {session.agent_id for session in self._sessions.values()} | set(self._holdings)
-            most = self._settings.quotas.agents
-            if agent_id not in known and len(known) >= most:
-                raise QuotaError(f"agents: expected at most {most} in this mission, {shown(agent_id)} is one more")
-            self._store.set_mission_config(named(mission_config))
-            self._charter = named(mission_config)
+            mission_config = reconcile(self._mission_config, requested).with_default_names()
+            known_agents = {session.agent_id for session in self._sessions.values()} | set(self._usage)
+            limit = self._settings.quotas.agents
+            if agent_id not in known_agents and len(known_agents) >= limit:
+                raise QuotaError(f"agents: expected at most {limit} in this mission, {quote_name(agent_id)} exceeds it")
+            self._store.set_mission_config(mission_config)
+            self._mission_config = mission_config
             if fresh_map:
-                self._forget(agent_id)
+                self._remove_agent(agent_id)
             session = SessionRecord(secrets.token_hex(16), agent_id)
             self._store.save_session(session)
-            for ended in [key for key, old in self._sessions.items() if old.agent_id == agent_id]:
-                del self._sessions[ended]
-                self._replaced.append(ended)
+            for replaced in [key for key, old in self._sessions.items() if old.agent_id == agent_id]:
+                del self._sessions[replaced]
+                self._replaced_sessions.append(replaced)
             self._sessions[session.session_id] = session
-            return Joined(session, self._store.highest_map_revision(agent_id), self._ledger.revision)
+            return JoinResult(session, self._store.highest_map_revision(agent_id), self._change_log.revision)
 
     def session(self, session_id: str) -> SessionRecord:
-        """The session of this id. Raises SessionUnknownError, MismatchError when its agent has joined anew since.
+        """Return the session of this id. Raises SessionUnknownError, and MismatchError for a replaced session.
 
-        No agent does that while it still uses the session, so the other one is a second robot of the same name; were
-        the first to join again, both would go on throwing each other out.
+        An agent never uses a session after it has joined again, so a second robot has the same name. If the first
+        one joined again on this error, the two would end each other's sessions forever.
         """
         with self._lock:
-            session, replaced = self._sessions.get(session_id), session_id in self._replaced
-        if replaced:
+            session, is_replaced = self._sessions.get(session_id), session_id in self._replaced_sessions
+        if is_replaced:
             raise MismatchError("session: another robot has joined under this name; give each its own agent id")
         if session is None:
-            raise SessionUnknownError(f"session {shown(session_id)}: not known here; join, then send every voxel again")
+            raise SessionUnknownError(
+                f"session {quote_name(session_id)}: not known here; join, then send every voxel again"
+            )
         return session
 
     def contribute(self, session_id: str, subset: RoiSubset, grid: VoxelGrid) -> PutOutcome:
-        """Take in an agent's words; durable when this returns, if the store is.
+        """Store an agent's voxel updates; they are durable on return, if the store is.
 
         Raises SessionUnknownError, MismatchError (another grid), NotPermittedError (another agent's name),
-        InvalidInputError, QuotaError, StorageError; nothing of the message is kept then.
+        InvalidInputError, QuotaError, StorageError; in all these cases nothing of the message is stored.
         """
         with self._lock:
             agent_id = self.session(session_id).agent_id
             if subset.agent_id != agent_id:
-                raise NotPermittedError(f"subset agent_id: expected {shown(agent_id)}, got {shown(subset.agent_id)}")
+                raise NotPermittedError(
+                    f"subset agent_id: expected {quote_name(agent_id)}, got {quote_name(subset.agent_id)}"
+                )
             if grid != self.grid:
                 raise MismatchError(f"voxel size: this mission votes on {self.grid.size_m:g} m, got {grid.size_m:g} m")
-            held = self._require_room(subset)
+            usage = self._usage_after(subset)
             outcome = self._store.put(subset)
-            self._holdings[agent_id] = held
-            self._ledger.record(agent_id, outcome.accepted, elect(self._store.stakes(outcome.accepted)))
+            self._usage[agent_id] = usage
+            self._change_log.record(agent_id, outcome.accepted, rank_voxels(self._store.scores(outcome.accepted)))
             return outcome
 
-    def note(self, agent_id: str, sent: TrafficCounters) -> None:
-        """Add to what is counted of an agent, and that it was heard of now."""
+    def record_traffic(self, agent_id: str, traffic: TrafficCounters) -> None:
+        """Add to the agent's counters, and set its last_seen_ns to now."""
         with self._lock:
-            heard = replace(sent, last_seen_ns=time.time_ns())
-            self._tallies[agent_id] = self._tallies.get(agent_id, TrafficCounters()).plus(heard)
+            newer = replace(traffic, last_seen_ns=time.time_ns())
+            self._traffic[agent_id] = self._traffic.get(agent_id, TrafficCounters()).plus(newer)
 
     def add_keyframe(self, keyframe: AgentKeyframe) -> None:
-        """Keep a view for the refinement. Raises QuotaError."""
+        """Store a keyframe for the refinement. Raises QuotaError."""
         with self._lock:
-            self._pool.add(keyframe)
+            self._keyframes.add(keyframe)
 
     def leave(self, session_id: str, forget: bool = False) -> int:
-        """End a session; forget makes the map as if the agent had never been there. Returns the fused revision."""
+        """End a session and return the fused revision; with `forget` all updates of the agent are deleted."""
         with self._lock:
             agent_id = self.session(session_id).agent_id
             if forget:
-                self._forget(agent_id)
+                self._remove_agent(agent_id)
             self._store.end_session(session_id)
             del self._sessions[session_id]
-            return self._ledger.revision
+            return self._change_log.revision
 
-    def changes(self, since_revision: int = 0) -> Changes:
-        """What changed in the fused map; 0 asks for all of it. Raises RevisionGoneError."""
+    def changes(self, since_revision: int = 0) -> FusedMapChanges:
+        """Return the changes of the fused map since a revision; the whole map for 0. Raises RevisionGoneError."""
         with self._lock:
-            revision = self._ledger.revision
-            keys = None if since_revision == 0 else self._ledger.changed_since(since_revision)
-            table = self._store.table(keys)
-        fused = fuse(table)
-        vanished = np.zeros(0, np.int64) if keys is None else np.setdiff1d(keys, fused.words.keys)
-        return Changes(revision, since_revision == 0, fused, vanished)
+            revision = self._change_log.revision
+            keys = None if since_revision == 0 else self._change_log.changed_since(since_revision)
+            batches = self._store.batches(keys)
+        fused = fuse(batches)
+        removed = np.zeros(0, np.int64) if keys is None else np.setdiff1d(keys, fused.batch.keys)
+        return FusedMapChanges(revision, since_revision == 0, fused, removed)
 
-    def voted(self, only_agent: str = "") -> VoxelBatch:
-        """The fused map, or the part of it that one agent won."""
-        fused = fuse(self._store.table())
+    def voted_map(self, only_agent: str = "") -> VoxelBatch:
+        """Return the fused map, or its voxels that one agent wins."""
+        fused = fuse(self._store.batches())
         if not only_agent:
-            return fused.words
+            return fused.batch
         self._require_contributor(only_agent)
-        return select_voxels(fused.words, fused.won_by(only_agent))
+        return select_voxels(fused.batch, fused.won_by(only_agent))
 
-    def concatenated(self, only_agent: str = "") -> VoxelBatch:
-        """Everyone's contributions side by side, or one agent's alone."""
+    def union_map(self, only_agent: str = "") -> VoxelBatch:
+        """Return all agents' Gaussians, or one agent's."""
         if not only_agent:
-            return concatenate(self._store.table())
+            return union_maps(self._store.batches())
         self._require_contributor(only_agent)
-        return concatenate({only_agent: self._store.words(only_agent)})
+        return union_maps({only_agent: self._store.batch(only_agent)})
 
-    def to_refine(self) -> tuple[Gaussians, list[AgentKeyframe], int]:
-        """The fused map, the union of the keyframe buffers, and the revision they are of.
-
-        Raises MismatchError when the team has not brought both yet.
-        """
+    def refinement_input(self) -> tuple[Gaussians, list[AgentKeyframe], int]:
+        """Return the fused map, all agents' keyframes, and the map's revision. Raises MismatchError if one is empty."""
         with self._lock:
-            revision, keyframes, table = self._ledger.revision, self._pool.keyframes(), self._store.table()
-        gaussians = fuse(table).gaussians
+            revision = self._change_log.revision
+            keyframes, batches = self._keyframes.keyframes(), self._store.batches()
+        gaussians = fuse(batches).gaussians
         if not keyframes or len(gaussians) == 0:
             raise MismatchError(
                 f"refinement: expected a fused map and keyframes, got {len(gaussians)} Gaussians and "
@@ -220,79 +226,79 @@ class FusionEngine:
             )
         return gaussians, keyframes, revision
 
-    def keep_refined(self, gaussians: Gaussians, revision: int) -> None:
-        """Lay a refined map over the vote of this revision."""
+    def store_refined_map(self, gaussians: Gaussians, revision: int) -> None:
+        """Store the result of a refinement that started from the fused map of this revision."""
         refined = RefinedMap(group_by_voxel(gaussians, self.grid), revision)
         with self._lock:
             self._refined = refined
 
-    def refined(self) -> VoxelBatch:
-        """The refined map; voxels that changed since it was made show the newer vote.
+    def refined_map(self) -> VoxelBatch:
+        """Return the refined map; voxels that changed after the refinement started show the newer vote.
 
-        Raises MismatchError when there is none, RevisionGoneError when it is too old to tell: refine again.
+        Raises MismatchError before the first refinement, RevisionGoneError if the change log no longer reaches back.
         """
         with self._lock:
             refined = self._refined
             if refined is None:
                 raise MismatchError("refined map: expected a refinement first, got none yet; call RefineFusedMap")
-            newer = self._ledger.changed_since(refined.revision)
-            table = self._store.table(newer)
-        return refined.overlaid(fuse(table), newer)
+            changed = self._change_log.changed_since(refined.revision)
+            batches = self._store.batches(changed)
+        return refined.replace_changed(fuse(batches), changed)
 
     def status(self) -> MissionStatus:
-        """Figures of the mission and of each agent's part in it."""
+        """Return the figures of the mission and of each agent."""
         with self._lock:
-            stakes = self._store.stakes()
-            election = elect(stakes)
+            scores = self._store.scores()
+            vote = rank_voxels(scores)
             joined = {session.agent_id for session in self._sessions.values()}
             agents = tuple(
                 replace(
-                    contribution(agent_id, stakes, election),
+                    contribution(agent_id, scores, vote),
                     joined=agent_id in joined,
-                    keyframes=self._pool.count(agent_id),
-                    tally=self._tallies.get(agent_id, TrafficCounters()),
+                    keyframes=self._keyframes.count(agent_id),
+                    traffic=self._traffic.get(agent_id, TrafficCounters()),
                 )
-                for agent_id in sorted(joined | set(stakes.agents))
+                for agent_id in sorted(joined | set(scores.agents))
             )
-            fused_gaussians = int(election.counts[election.offsets[:-1]].sum(dtype=np.int64))
             return MissionStatus(
-                named(self._charter),
-                self._ledger.revision,
-                fused_gaussians,
-                len(election),
-                len(self._pool),
+                self._mission_config.with_default_names(),
+                self._change_log.revision,
+                int(vote.counts[vote.offsets[:-1]].sum(dtype=np.int64)),
+                len(vote),
+                len(self._keyframes),
                 self._refined is not None,
                 agents,
             )
 
     def close(self) -> None:
-        """Let go of the store."""
+        """Close the store."""
         with self._lock:
             self._store.close()
 
-    def _require_room(self, subset: RoiSubset) -> AgentUsage:
-        """What will be held of the agent after this message. Raises QuotaError."""
-        words = subset.batch
-        stakes = self._store.stakes(words.keys)
-        mine = stakes.agent == (stakes.agents.index(subset.agent_id) if subset.agent_id in stakes.agents else -1)
-        overtaken = stakes.keys[mine & (stakes.map_revisions >= subset.map_revision)]
-        news = ~np.isin(words.keys, overtaken)
-        replaced = mine & np.isin(stakes.keys, words.keys[news])
-        gone = AgentUsage(int(np.count_nonzero(replaced)), int(stakes.counts[replaced].sum(dtype=np.int64)))
-        come = AgentUsage(int(np.count_nonzero(news)), int(words.counts[news].sum(dtype=np.int64)))
-        held = self._holdings.get(subset.agent_id, AgentUsage()).exchanged(gone, come)
-        held.require_within(self._settings.quotas, subset.agent_id)
-        return held
+    def _usage_after(self, subset: RoiSubset) -> AgentUsage:
+        """Return the agent's usage after this message is stored. Raises QuotaError."""
+        batch = subset.batch
+        scores = self._store.scores(batch.keys)
+        agent_index = scores.agents.index(subset.agent_id) if subset.agent_id in scores.agents else -1
+        own = scores.agent_index == agent_index
+        newer_keys = scores.keys[own & (scores.map_revisions >= subset.map_revision)]
+        accepted = ~np.isin(batch.keys, newer_keys)
+        replaced = own & np.isin(scores.keys, batch.keys[accepted])
+        removed = AgentUsage(int(np.count_nonzero(replaced)), int(scores.counts[replaced].sum(dtype=np.int64)))
+        added = AgentUsage(int(np.count_nonzero(accepted)), int(batch.counts[accepted].sum(dtype=np.int64)))
+        usage = self._usage.get(subset.agent_id, AgentUsage()).replace_part(removed, added)
+        usage.require_within(self._settings.quotas, subset.agent_id)
+        return usage
 
     def _require_contributor(self, agent_id: str) -> None:
         agents = self._store.agents()
         if agent_id not in agents:
-            some = ", ".join(map(shown, agents[:8])) or "no agents yet"
-            raise InvalidInputError(f"agent_id: expected a contributor ({some}), got {shown(agent_id)}")
+            expected = ", ".join(map(quote_name, agents[:8])) or "no agents yet"
+            raise InvalidInputError(f"agent_id: expected a contributor ({expected}), got {quote_name(agent_id)}")
 
-    def _forget(self, agent_id: str) -> None:
+    def _remove_agent(self, agent_id: str) -> None:
         keys = self._store.remove_agent(agent_id)
-        self._ledger.record(agent_id, keys, elect(self._store.stakes(keys)))
-        self._holdings.pop(agent_id, None)
-        self._tallies.pop(agent_id, None)
-        self._pool.remove_agent(agent_id)
+        self._change_log.record(agent_id, keys, rank_voxels(self._store.scores(keys)))
+        self._usage.pop(agent_id, None)
+        self._traffic.pop(agent_id, None)
+        self._keyframes.remove_agent(agent_id)

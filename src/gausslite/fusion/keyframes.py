@@ -1,4 +1,4 @@
-"""The views that agents leave with the team for the joint refinement: a bounded buffer of each agent's newest."""
+"""Keep the keyframes that agents send for the joint refinement: for each agent its newest."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from gausslite.errors import InvalidInputError, QuotaError
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AgentKeyframe:
-    """A view of one agent; weight in [0, 1] says what of it matters (None = all of it)."""
+    """A keyframe of one agent; weight in [0, 1] weights its pixels in the loss (None = 1 everywhere)."""
 
     agent_id: str
     frame: Frame
@@ -21,9 +21,9 @@ class AgentKeyframe:
 
 
 class KeyframePool:
-    """Per agent the `max_per_agent` frames with the highest index; an index that comes again replaces the older one.
+    """Per agent the `max_per_agent` frames with the highest index; a repeated index replaces the earlier frame.
 
-    Memory is bounded by agents × max_per_agent × max_pixels × 7 bytes. Not safe for threads: the mission's lock is.
+    Memory is bounded by agents × max_per_agent × max_pixels × 7 bytes. Not thread-safe; FusionEngine holds a lock.
     """
 
     def __init__(self, max_per_agent: int, max_pixels: int) -> None:
@@ -39,7 +39,7 @@ class KeyframePool:
         return sum(len(frames) for frames in self._by_agent.values())
 
     def add(self, keyframe: AgentKeyframe) -> None:
-        """Keep the view, dropping the agent's oldest when full. Raises QuotaError for an image that is too large."""
+        """Add the keyframe; a full pool drops the agent's oldest. Raises QuotaError if the image is too large."""
         pixels = keyframe.frame.depth_m.size
         if pixels > self._max_pixels:
             raise QuotaError(
@@ -51,15 +51,15 @@ class KeyframePool:
             del frames[min(frames)]
 
     def count(self, agent_id: str) -> int:
-        """How many views of this agent are held."""
+        """Return the number of keyframes of this agent."""
         return len(self._by_agent.get(agent_id, {}))
 
     def remove_agent(self, agent_id: str) -> None:
-        """Forget an agent's views."""
+        """Delete an agent's keyframes."""
         self._by_agent.pop(agent_id, None)
 
     def keyframes(self) -> list[AgentKeyframe]:
-        """The union of the agents' buffers, by agent id and frame index."""
+        """Return all agents' keyframes, sorted by agent id and frame index."""
         return [
             frames[index]
             for agent_id in sorted(self._by_agent)

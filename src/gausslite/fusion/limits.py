@@ -1,4 +1,4 @@
-"""On what terms agents share a map: the grid, the mission and its world frame, and how much each may bring."""
+"""Limit what a mission accepts: the number of agents, and the voxels, Gaussians and keyframes of each."""
 
 from __future__ import annotations
 
@@ -6,17 +6,20 @@ from dataclasses import dataclass, field, fields
 
 import numpy as np
 
+from gausslite.domain.names import quote_name, require_name
+from gausslite.domain.revision_log import MAX_REMOVED_VOXELS
 from gausslite.domain.voxels import VoxelGrid
-from gausslite.errors import InvalidInputError, MismatchError, QuotaError
-from gausslite.fusion.store import MissionConfig, VoxelScoreTable
+from gausslite.errors import InvalidInputError, QuotaError
+from gausslite.fusion.mission_config import MissionConfig
+from gausslite.fusion.store import VoxelScoreTable
 
 MAX_REFINE_ITERATIONS = 30_000
-"""More would keep a server busy for hours on one request."""
+"""A larger number would occupy a server for hours with one request."""
 
 
 @dataclass(frozen=True, slots=True)
 class Quotas:
-    """The most the team's map takes in. Voxels count tombstones too, since those are kept."""
+    """Upper limits of one mission. voxels_per_agent includes tombstones, because the store keeps them."""
 
     agents: int = 64
     voxels_per_agent: int = 500_000
@@ -32,94 +35,53 @@ class Quotas:
 
 @dataclass(frozen=True, slots=True)
 class FusionSettings:
-    """The server's own terms. Empty mission_id and world_frame: the first agent that names them decides.
+    """The server's configuration. If mission_id or world_frame is empty, the first agent that names it fixes it.
 
-    remembered_vanished: of how many voxels that became empty a watcher can still be told; see ChangeLog.
+    max_removed_voxels: number of removed voxels that a watcher can still catch up with; see RevisionLog.
     """
 
     grid: VoxelGrid = field(default_factory=VoxelGrid)
     mission_id: str = ""
     world_frame: str = ""
     quotas: Quotas = field(default_factory=Quotas)
-    remembered_vanished: int = 100_000
+    max_removed_voxels: int = MAX_REMOVED_VOXELS
 
     def __post_init__(self) -> None:
         require_name("mission", self.mission_id)
         require_name("world frame", self.world_frame)
 
     @property
-    def offer(self) -> MissionConfig:
-        """These terms as a mission_config that may still have empty names."""
+    def mission_config(self) -> MissionConfig:
+        """The mission configuration of the server; its names may be empty."""
         return MissionConfig(self.mission_id, self.world_frame, self.grid.size_m)
-
-
-MAX_NAME_BYTES = 255
-
-
-def shown(name: str) -> str:
-    """A name from outside as it may stand in a message: quoted and short."""
-    return repr(name if len(name) <= 64 else f"{name[:64]}…")
-
-
-def require_name(what: str, name: str) -> None:
-    """Raise InvalidInputError unless the name is text of at most MAX_NAME_BYTES bytes."""
-    try:
-        size = len(name.encode())
-    except UnicodeEncodeError:
-        raise InvalidInputError(f"{what}: expected UTF-8 text, got other bytes") from None
-    if size > MAX_NAME_BYTES:
-        raise InvalidInputError(f"{what}: expected at most {MAX_NAME_BYTES} bytes, got {size}")
-
-
-def agree(own: MissionConfig, asked: MissionConfig) -> MissionConfig:
-    """The mission_config both sides can live with; an empty name leaves it to the other.
-
-    Raises InvalidInputError for names without end, MismatchError.
-    """
-    require_name("mission_id", asked.mission_id)
-    require_name("world_frame", asked.world_frame)
-    if asked.voxel_size_m != own.voxel_size_m:
-        raise MismatchError(f"voxel size: this mission votes on {own.voxel_size_m:g} m, got {asked.voxel_size_m:g} m")
-    for name, ours, theirs in (
-        ("world frame", own.world_frame, asked.world_frame),
-        ("mission", own.mission_id, asked.mission_id),
-    ):
-        if ours and theirs and ours != theirs:
-            raise MismatchError(f"{name}: expected {shown(ours)} as agreed here, got {shown(theirs)}")
-    return MissionConfig(own.mission_id or asked.mission_id, own.world_frame or asked.world_frame, own.voxel_size_m)
-
-
-def named(mission_config: MissionConfig) -> MissionConfig:
-    """The mission_config with plain names where nobody gave one."""
-    return MissionConfig(
-        mission_config.mission_id or "mission", mission_config.world_frame or "world", mission_config.voxel_size_m
-    )
 
 
 @dataclass(frozen=True, slots=True)
 class AgentUsage:
-    """How much the store keeps of one agent."""
+    """The number of voxels (with tombstones) and Gaussians that the store keeps of one agent."""
 
     voxels: int = 0
     gaussians: int = 0
 
     @classmethod
-    def in_stakes(cls, stakes: VoxelScoreTable, agent_id: str) -> AgentUsage:
-        """What these stakes hold of the agent."""
-        if agent_id not in stakes.agents:
+    def from_scores(cls, scores: VoxelScoreTable, agent_id: str) -> AgentUsage:
+        """Count the agent's rows and Gaussians in these scores."""
+        if agent_id not in scores.agents:
             return cls()
-        mine = stakes.agent == stakes.agents.index(agent_id)
-        return cls(int(np.count_nonzero(mine)), int(stakes.counts[mine].sum(dtype=np.int64)))
+        own = scores.agent_index == scores.agents.index(agent_id)
+        return cls(int(np.count_nonzero(own)), int(scores.counts[own].sum(dtype=np.int64)))
 
-    def exchanged(self, gone: AgentUsage, come: AgentUsage) -> AgentUsage:
-        """The holding after one part made room for another."""
-        return AgentUsage(self.voxels - gone.voxels + come.voxels, self.gaussians - gone.gaussians + come.gaussians)
+    def replace_part(self, removed: AgentUsage, added: AgentUsage) -> AgentUsage:
+        """Return the usage after `added` replaced `removed`."""
+        return AgentUsage(
+            self.voxels - removed.voxels + added.voxels, self.gaussians - removed.gaussians + added.gaussians
+        )
 
     def require_within(self, quotas: Quotas, agent_id: str) -> None:
-        """Raise QuotaError when this is more than one agent may bring."""
-        for name, value, most in (
+        """Raise QuotaError if the usage exceeds the quotas of one agent."""
+        for name, value, limit in (
             ("voxels", self.voxels, quotas.voxels_per_agent),
             ("Gaussians", self.gaussians, quotas.gaussians_per_agent),
         ):
-            if value > most:
-                raise QuotaError(f"agent {shown(agent_id)}: expected at most {most} {name} in all, got {value}")
+            if value > limit:
+                raise QuotaError(f"agent {quote_name(agent_id)}: expected at most {limit} {name} in all, got {value}")

@@ -1,4 +1,4 @@
-"""The register in memory: fast, for one mission at a time, gone when the process ends."""
+"""The store of voxel updates in memory: fast, for one mission, lost when the process ends."""
 
 from __future__ import annotations
 
@@ -11,12 +11,13 @@ from numpy import ndarray
 
 from gausslite.codec.records import from_bytes, to_records
 from gausslite.domain.voxel_batch import RoiSubset, VoxelBatch
-from gausslite.fusion.store import MissionConfig, PutOutcome, SessionRecord, VoxelScoreTable, require_storable
+from gausslite.fusion.mission_config import MissionConfig
+from gausslite.fusion.store import PutOutcome, SessionRecord, VoxelScoreTable, require_storable
 
 
 @dataclass(frozen=True, slots=True)
-class _Word:
-    """What one agent last said about one voxel; the records are those of codec.records."""
+class _VoxelUpdate:
+    """An agent's latest update of one voxel; the records are those of codec.records."""
 
     map_revision: int
     kappa_sum: int
@@ -25,57 +26,57 @@ class _Word:
 
 
 class MemoryStore:
-    """A FusionStore in dictionaries. 63 bytes a Gaussian and about 250 a voxel."""
+    """A FusionStore in dictionaries; 63 bytes per Gaussian and about 250 per voxel."""
 
     def __init__(self) -> None:
         self._lock = RLock()
-        self._words: dict[str, dict[int, _Word]] = {}
+        self._updates: dict[str, dict[int, _VoxelUpdate]] = {}
         self._sessions: dict[str, SessionRecord] = {}
-        self._charter: MissionConfig | None = None
+        self._mission_config: MissionConfig | None = None
 
     def put(self, subset: RoiSubset) -> PutOutcome:
-        """Take in one message; a word that is not newer than the one held is stale. Raises InvalidInputError."""
+        """Store one message; an update that is not newer than the stored one is stale. Raises InvalidInputError."""
         require_storable(subset)
-        words, offsets = subset.batch, subset.batch.offsets
-        records = to_records(words.gaussians)
-        accepted = np.zeros(len(words), np.bool_)
+        batch, offsets = subset.batch, subset.batch.offsets
+        records = to_records(batch.gaussians)
+        accepted = np.zeros(len(batch), np.bool_)
         with self._lock:
-            held = self._words.setdefault(subset.agent_id, {})
-            for i, key in enumerate(words.keys.tolist()):
-                word = held.get(key)
-                if word is not None and word.map_revision >= subset.map_revision:
+            stored = self._updates.setdefault(subset.agent_id, {})
+            for i, key in enumerate(batch.keys.tolist()):
+                update = stored.get(key)
+                if update is not None and update.map_revision >= subset.map_revision:
                     continue
-                # tobytes copies, so that a small word does not keep a whole message alive
-                row = records[offsets[i] : offsets[i + 1]].tobytes()
-                held[key] = _Word(subset.map_revision, int(words.kappa_sums[i]), int(words.counts[i]), row)
+                # tobytes copies, so that a small update does not keep the whole message in memory
+                data = records[offsets[i] : offsets[i + 1]].tobytes()
+                stored[key] = _VoxelUpdate(subset.map_revision, int(batch.kappa_sums[i]), int(batch.counts[i]), data)
                 accepted[i] = True
-            if not held:
-                del self._words[subset.agent_id]
-        return PutOutcome(words.keys[accepted], words.keys[~accepted])
+            if not stored:
+                del self._updates[subset.agent_id]
+        return PutOutcome(batch.keys[accepted], batch.keys[~accepted])
 
     def remove_agent(self, agent_id: str) -> Int64[ndarray, " v"]:
-        """Forget an agent's words; returns the voxels it had words on, ascending."""
+        """Delete an agent's updates; returns the keys of their voxels, ascending."""
         with self._lock:
-            return np.array(sorted(self._words.pop(agent_id, {})), np.int64)
+            return np.array(sorted(self._updates.pop(agent_id, {})), np.int64)
 
     def agents(self) -> tuple[str, ...]:
-        """The agents that have words here, sorted."""
+        """Return the ids of the agents with updates, sorted."""
         with self._lock:
-            return tuple(sorted(self._words))
+            return tuple(sorted(self._updates))
 
     def highest_map_revision(self, agent_id: str) -> int:
-        """The newest revision among an agent's words; 0 when it has none."""
+        """Return the highest revision among an agent's updates; 0 without any."""
         with self._lock:
-            return max((word.map_revision for word in self._words.get(agent_id, {}).values()), default=0)
+            return max((update.map_revision for update in self._updates.get(agent_id, {}).values()), default=0)
 
-    def stakes(self, keys: Int64[ndarray, " k"] | None = None) -> VoxelScoreTable:
-        """Totals of all agents, on these voxels or on all."""
+    def scores(self, keys: Int64[ndarray, " k"] | None = None) -> VoxelScoreTable:
+        """Return all agents' totals on these voxels, or on all."""
         with self._lock:
             agents = self.agents()
             rows = [
-                (index, key, word.map_revision, word.kappa_sum, word.count)
+                (index, key, update.map_revision, update.kappa_sum, update.count)
                 for index, agent_id in enumerate(agents)
-                for key, word in self._select(agent_id, keys)
+                for key, update in self._select(agent_id, keys)
             ]
         columns = list(zip(*rows, strict=True)) or [()] * 5
         return VoxelScoreTable(
@@ -87,56 +88,55 @@ class MemoryStore:
             np.array(columns[4], np.uint32),
         )
 
-    def words(self, agent_id: str, keys: Int64[ndarray, " k"] | None = None) -> VoxelBatch:
-        """An agent's latest words (tombstones too), on these voxels or on all; none for an unknown agent."""
+    def batch(self, agent_id: str, keys: Int64[ndarray, " k"] | None = None) -> VoxelBatch:
+        """Return an agent's updates (with tombstones) of these voxels, or of all; empty for an unknown agent."""
         with self._lock:
-            chosen = self._select(agent_id, keys)
+            selected = self._select(agent_id, keys)
         return VoxelBatch(
-            np.array([key for key, _ in chosen], np.int64),
-            np.array([word.kappa_sum for _, word in chosen], np.uint64),
-            np.array([word.count for _, word in chosen], np.uint32),
-            from_bytes(b"".join(word.records for _, word in chosen)),
+            np.array([key for key, _ in selected], np.int64),
+            np.array([update.kappa_sum for _, update in selected], np.uint64),
+            np.array([update.count for _, update in selected], np.uint32),
+            from_bytes(b"".join(update.records for _, update in selected)),
         )
 
-    def table(self, keys: Int64[ndarray, " k"] | None = None) -> dict[str, VoxelBatch]:
-        """Every agent's words at one instant."""
+    def batches(self, keys: Int64[ndarray, " k"] | None = None) -> dict[str, VoxelBatch]:
+        """Return the batch of every agent, all read at one instant."""
         with self._lock:
-            return {agent_id: self.words(agent_id, keys) for agent_id in self.agents()}
+            return {agent_id: self.batch(agent_id, keys) for agent_id in self.agents()}
 
     def mission_config(self) -> MissionConfig | None:
-        """What was agreed by the first to join; None before that."""
+        """Return the mission's configuration; None before an agent has joined."""
         with self._lock:
-            return self._charter
+            return self._mission_config
 
     def set_mission_config(self, mission_config: MissionConfig) -> None:
-        """Agree on this from now on."""
+        """Store the mission's configuration."""
         with self._lock:
-            self._charter = mission_config
+            self._mission_config = mission_config
 
     def sessions(self) -> tuple[SessionRecord, ...]:
-        """All sessions that were saved and not ended, by session id."""
+        """Return all open sessions, sorted by session id."""
         with self._lock:
             return tuple(sorted(self._sessions.values(), key=lambda session: session.session_id))
 
     def save_session(self, session: SessionRecord) -> None:
-        """Remember a session; it replaces any other session of the same agent."""
+        """Store a session; it replaces any other session of the same agent."""
         with self._lock:
-            others = {s.session_id for s in self._sessions.values() if s.agent_id == session.agent_id}
-            for session_id in others:
+            replaced = {s.session_id for s in self._sessions.values() if s.agent_id == session.agent_id}
+            for session_id in replaced:
                 del self._sessions[session_id]
             self._sessions[session.session_id] = session
 
     def end_session(self, session_id: str) -> None:
-        """Forget a session; unknown ones are fine. The agent's words stay."""
+        """Delete a session, if it exists. The agent's updates stay."""
         with self._lock:
             self._sessions.pop(session_id, None)
 
     def close(self) -> None:
-        """Nothing to let go of."""
+        """Do nothing; there are no files to close."""
 
-    def _select(self, agent_id: str, keys: Int64[ndarray, " k"] | None) -> list[tuple[int, _Word]]:
-        held = self._words.get(agent_id, {})
+    def _select(self, agent_id: str, keys: Int64[ndarray, " k"] | None) -> list[tuple[int, _VoxelUpdate]]:
+        stored = self._updates.get(agent_id, {})
         if keys is None:
-            return sorted(held.items())
-        wanted = sorted(set(keys.tolist()))
-        return [(key, held[key]) for key in wanted if key in held]
+            return sorted(stored.items())
+        return [(key, stored[key]) for key in sorted(set(keys.tolist())) if key in stored]

@@ -1,4 +1,4 @@
-"""Fuse whole maps from files, as the server would have fused what their robots sent."""
+"""Fuse complete maps from files, with the same vote as the fusion server."""
 
 from __future__ import annotations
 
@@ -11,5 +11,8 @@ from gausslite.fusion.vote import FusedMap, fuse
 
 
 def fuse_maps(maps: Mapping[str, Gaussians], grid: VoxelGrid) -> FusedMap:
-    """The voxel vote over complete maps by agent id (Sec. III-E). Raises InvalidInputError for means out of reach."""
+    """Return the voxel vote over complete maps by agent id (Sec. III-E).
+
+    Raises InvalidInputError if a mean is outside the grid.
+    """
     return fuse({agent_id: group_by_voxel(gaussians, grid) for agent_id, gaussians in maps.items()})

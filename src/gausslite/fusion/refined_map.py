@@ -1,4 +1,4 @@
-"""The refined map, laid over the vote it was made from: what agents say later shows through voxel by voxel."""
+"""The refined map: voxels that changed after the refinement started show the newer vote."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from gausslite.fusion.vote import FusedMap
 class RefinedMap:
     """The result of a refinement and the fused revision it started from."""
 
-    words: VoxelBatch
+    batch: VoxelBatch
     revision: int
 
-    def overlaid(self, newer: FusedMap, changed: Int64[ndarray, " c"]) -> VoxelBatch:
-        """The refined words, except on the voxels that changed since: these show the newer vote."""
-        kept = select_voxels(self.words, ~np.isin(self.words.keys, changed))
-        return merge_batches(kept, newer.words)
+    def replace_changed(self, newer: FusedMap, changed: Int64[ndarray, " c"]) -> VoxelBatch:
+        """Return the refined voxels, with the newer vote in place of the voxels in `changed`."""
+        kept = select_voxels(self.batch, ~np.isin(self.batch.keys, changed))
+        return merge_batches(kept, newer.batch)

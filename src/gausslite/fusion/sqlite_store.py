@@ -1,4 +1,4 @@
-"""The register in one SQLite file: what was acknowledged is still there after a power cut."""
+"""The store of voxel updates in one SQLite file: acknowledged updates survive a power failure."""
 
 from __future__ import annotations
 
@@ -17,13 +17,14 @@ from numpy import ndarray
 from gausslite.codec.records import from_bytes, to_records
 from gausslite.domain.voxel_batch import RoiSubset, VoxelBatch
 from gausslite.errors import StorageError
-from gausslite.fusion.store import MissionConfig, PutOutcome, SessionRecord, VoxelScoreTable, require_storable
+from gausslite.fusion.mission_config import MissionConfig
+from gausslite.fusion.store import PutOutcome, SessionRecord, VoxelScoreTable, require_storable
 
-SCHEMA_VERSION = 1
-_APPLICATION_ID = 0x47534C54  # "GSLT", so that a foreign database is recognised
+SCHEMA_VERSION = 2
+_APPLICATION_ID = 0x47534C54  # "GSLT", to recognise other programs' databases
 _PAGE_BYTES = 4096
 _SCHEMA = """
-CREATE TABLE words (
+CREATE TABLE voxel_updates (
     agent_id TEXT NOT NULL, voxel INTEGER NOT NULL, map_revision INTEGER NOT NULL,
     kappa_sum INTEGER NOT NULL, count INTEGER NOT NULL, records BLOB NOT NULL,
     PRIMARY KEY (agent_id, voxel));
@@ -32,15 +33,15 @@ CREATE TABLE mission_config (
     only INTEGER PRIMARY KEY CHECK (only = 1),
     mission_id TEXT NOT NULL, world_frame TEXT NOT NULL, voxel_size_m REAL NOT NULL);
 """
-_AT_KEYS = " AND voxel IN (SELECT value FROM json_each(?))"
-_UPSERT = "INSERT OR REPLACE INTO words VALUES (?, ?, ?, ?, ?, ?)"
+_WITH_KEYS = " AND voxel IN (SELECT value FROM json_each(?))"
+_UPSERT = "INSERT OR REPLACE INTO voxel_updates VALUES (?, ?, ?, ?, ?, ?)"
 
 
 class SqliteStore:
     """A FusionStore in a file: write-ahead log, synchronous=FULL, one transaction per message, one server at a time.
 
-    max_bytes bounds the file; a put beyond it raises StorageError and changes nothing. Raises StorageError when the
-    file cannot be opened, is in use by another server, is damaged, or is not a GaussLite store of this version.
+    max_bytes limits the file size; a put beyond it raises StorageError and changes nothing. The constructor raises
+    StorageError if the file cannot be opened, is in use by another server, is damaged, or has another schema.
     """
 
     def __init__(self, path: Path, max_bytes: int | None = None) -> None:
@@ -48,70 +49,72 @@ class SqliteStore:
         self._lock = RLock()
         self._db = _connect(path)
         try:
-            with self._speaking():
+            with self._storage_errors():
                 self._prepare(max_bytes)
         except BaseException:
             self._db.close()
             raise
 
     def put(self, subset: RoiSubset) -> PutOutcome:
-        """Take in one message in one transaction. Raises InvalidInputError, StorageError."""
+        """Store one message in one transaction. Raises InvalidInputError, StorageError."""
         require_storable(subset)
-        words, offsets = subset.batch, subset.batch.offsets
-        records = to_records(words.gaussians)
+        batch, offsets = subset.batch, subset.batch.offsets
+        records = to_records(batch.gaussians)
         with self._transaction() as db:
-            query = "SELECT voxel, map_revision FROM words WHERE agent_id = ?"
-            held = dict(db.execute(query + _AT_KEYS, (subset.agent_id, _as_json(words.keys))))
-            accepted = np.array([held.get(key, -1) < subset.map_revision for key in words.keys.tolist()], np.bool_)
+            query = "SELECT voxel, map_revision FROM voxel_updates WHERE agent_id = ?"
+            stored = dict(db.execute(query + _WITH_KEYS, (subset.agent_id, _keys_as_json(batch.keys))))
+            accepted = np.array([stored.get(key, -1) < subset.map_revision for key in batch.keys.tolist()], np.bool_)
             rows = (
                 (
                     subset.agent_id,
-                    int(words.keys[i]),
+                    int(batch.keys[i]),
                     subset.map_revision,
-                    int(words.kappa_sums[i]),
-                    int(words.counts[i]),
+                    int(batch.kappa_sums[i]),
+                    int(batch.counts[i]),
                     records[offsets[i] : offsets[i + 1]].tobytes(),
                 )
                 for i in np.flatnonzero(accepted)
             )
             db.executemany(_UPSERT, rows)
-        return PutOutcome(words.keys[accepted], words.keys[~accepted])
+        return PutOutcome(batch.keys[accepted], batch.keys[~accepted])
 
     def remove_agent(self, agent_id: str) -> Int64[ndarray, " v"]:
-        """Forget an agent's words; returns the voxels it had words on, ascending."""
+        """Delete an agent's updates; returns the keys of their voxels, ascending."""
         with self._transaction() as db:
-            rows = db.execute("SELECT voxel FROM words WHERE agent_id = ? ORDER BY voxel", (agent_id,)).fetchall()
-            db.execute("DELETE FROM words WHERE agent_id = ?", (agent_id,))
+            rows = db.execute(
+                "SELECT voxel FROM voxel_updates WHERE agent_id = ? ORDER BY voxel", (agent_id,)
+            ).fetchall()
+            db.execute("DELETE FROM voxel_updates WHERE agent_id = ?", (agent_id,))
         return np.array([voxel for (voxel,) in rows], np.int64)
 
     def agents(self) -> tuple[str, ...]:
-        """The agents that have words here, sorted."""
-        rows = self._read("SELECT DISTINCT agent_id FROM words")
-        # sorted here and not by SQL: the order must be the same in every store
+        """Return the ids of the agents with updates, sorted."""
+        rows = self._read("SELECT DISTINCT agent_id FROM voxel_updates")
+        # not sorted by SQL, because the order must be the same in every store
         return tuple(sorted(agent_id for (agent_id,) in rows))
 
     def highest_map_revision(self, agent_id: str) -> int:
-        """The newest revision among an agent's words; 0 when it has none."""
-        rows = self._read("SELECT COALESCE(MAX(map_revision), 0) FROM words WHERE agent_id = ?", (agent_id,))
+        """Return the highest revision among an agent's updates; 0 without any."""
+        rows = self._read("SELECT COALESCE(MAX(map_revision), 0) FROM voxel_updates WHERE agent_id = ?", (agent_id,))
         return int(rows[0][0])
 
-    def stakes(self, keys: Int64[ndarray, " k"] | None = None) -> VoxelScoreTable:
-        """Totals of all agents, on these voxels or on all."""
+    def scores(self, keys: Int64[ndarray, " k"] | None = None) -> VoxelScoreTable:
+        """Return all agents' totals on these voxels, or on all."""
         with self._lock:
             agents = self.agents()
-            found = [self._select("voxel, map_revision, kappa_sum, count", agent_id, keys) for agent_id in agents]
-        rows = [row for part in found for row in part]
+            parts = [self._select("voxel, map_revision, kappa_sum, count", agent_id, keys) for agent_id in agents]
+        rows = [row for part in parts for row in part]
         return VoxelScoreTable(
             agents,
-            np.repeat(np.arange(len(agents), dtype=np.int32), [len(part) for part in found]),
+            np.repeat(np.arange(len(agents), dtype=np.int32), [len(part) for part in parts]),
             np.array([row[0] for row in rows], np.int64),
             np.array([row[1] for row in rows], np.int64),
             np.array([row[2] for row in rows], np.uint64),
             np.array([row[3] for row in rows], np.uint32),
         )
 
-    def words(self, agent_id: str, keys: Int64[ndarray, " k"] | None = None) -> VoxelBatch:
-        """An agent's latest words (tombstones too), on these voxels or on all; none for an unknown agent."""
+    def batch(self, agent_id: str, keys: Int64[ndarray, " k"] | None = None) -> VoxelBatch:
+        """Return an agent's updates (with tombstones) of these voxels, or of all; empty for an unknown agent."""
         rows = self._select("voxel, kappa_sum, count, records", agent_id, keys)
         return VoxelBatch(
             np.array([row[0] for row in rows], np.int64),
@@ -120,18 +123,18 @@ class SqliteStore:
             from_bytes(b"".join(row[3] for row in rows)),
         )
 
-    def table(self, keys: Int64[ndarray, " k"] | None = None) -> dict[str, VoxelBatch]:
-        """Every agent's words at one instant."""
+    def batches(self, keys: Int64[ndarray, " k"] | None = None) -> dict[str, VoxelBatch]:
+        """Return the batch of every agent, all read at one instant."""
         with self._lock:
-            return {agent_id: self.words(agent_id, keys) for agent_id in self.agents()}
+            return {agent_id: self.batch(agent_id, keys) for agent_id in self.agents()}
 
     def mission_config(self) -> MissionConfig | None:
-        """What was agreed by the first to join; None before that."""
+        """Return the mission's configuration; None before an agent has joined."""
         rows = self._read("SELECT mission_id, world_frame, voxel_size_m FROM mission_config")
         return MissionConfig(*rows[0]) if rows else None
 
     def set_mission_config(self, mission_config: MissionConfig) -> None:
-        """Agree on this from now on."""
+        """Store the mission's configuration."""
         with self._transaction() as db:
             db.execute(
                 "INSERT OR REPLACE INTO mission_config VALUES (1, ?, ?, ?)",
@@ -139,60 +142,60 @@ class SqliteStore:
             )
 
     def sessions(self) -> tuple[SessionRecord, ...]:
-        """All sessions that were saved and not ended, by session id."""
+        """Return all open sessions, sorted by session id."""
         rows = self._read("SELECT session_id, agent_id FROM sessions")
         return tuple(sorted((SessionRecord(*row) for row in rows), key=lambda session: session.session_id))
 
     def save_session(self, session: SessionRecord) -> None:
-        """Remember a session; it replaces any other session of the same agent."""
+        """Store a session; it replaces any other session of the same agent."""
         with self._transaction() as db:
             db.execute("INSERT OR REPLACE INTO sessions VALUES (?, ?)", (session.session_id, session.agent_id))
 
     def end_session(self, session_id: str) -> None:
-        """Forget a session; unknown ones are fine. The agent's words stay."""
+        """Delete a session, if it exists. The agent's updates stay."""
         with self._transaction() as db:
             db.execute("DELETE FROM sessions WHERE session_id = ?", (session_id,))
 
     def close(self) -> None:
-        """Fold the log into the file and let go of it."""
+        """Write the log into the file and close it."""
         with self._lock:
             self._db.close()
 
     def _prepare(self, max_bytes: int | None) -> None:
         db = self._db
-        # exclusive: a second server on the same file would vote on a table it does not see change
+        # exclusive: a second server on this file would not see the changes of the first
         db.execute("PRAGMA locking_mode = EXCLUSIVE")
-        ours = db.execute("PRAGMA application_id").fetchone()[0] == _APPLICATION_ID
-        fresh = db.execute("SELECT COUNT(*) FROM sqlite_master").fetchone()[0] == 0
+        is_store = db.execute("PRAGMA application_id").fetchone()[0] == _APPLICATION_ID
+        is_new = db.execute("SELECT COUNT(*) FROM sqlite_master").fetchone()[0] == 0
         version = db.execute("PRAGMA user_version").fetchone()[0]
-        if not ours and not fresh:
+        if not is_store and not is_new:
             raise StorageError(f"store {self._path}: expected a GaussLite store, got another program's database")
-        if ours and not fresh and version != SCHEMA_VERSION:
+        if is_store and not is_new and version != SCHEMA_VERSION:
             raise StorageError(f"store {self._path}: expected schema version {SCHEMA_VERSION}, got {version}")
         db.execute("PRAGMA journal_mode = WAL")
         db.execute("PRAGMA synchronous = FULL")
-        if fresh:
-            marks = f"PRAGMA application_id = {_APPLICATION_ID}; PRAGMA user_version = {SCHEMA_VERSION};"
-            db.executescript(f"BEGIN IMMEDIATE; {marks} {_SCHEMA} COMMIT;")
-        verdict = db.execute("PRAGMA quick_check(1)").fetchone()[0]
-        if verdict != "ok":
-            raise StorageError(f"store {self._path}: expected an undamaged file, got: {verdict}".replace("\n", " "))
+        if is_new:
+            header = f"PRAGMA application_id = {_APPLICATION_ID}; PRAGMA user_version = {SCHEMA_VERSION};"
+            db.executescript(f"BEGIN IMMEDIATE; {header} {_SCHEMA} COMMIT;")
+        check = db.execute("PRAGMA quick_check(1)").fetchone()[0]
+        if check != "ok":
+            raise StorageError(f"store {self._path}: expected an undamaged file, got: {check}".replace("\n", " "))
         if max_bytes is not None:
             db.execute(f"PRAGMA max_page_count = {max(1, max_bytes // _PAGE_BYTES)}")
 
     def _select(self, columns: str, agent_id: str, keys: Int64[ndarray, " k"] | None) -> list[tuple[Any, ...]]:
-        query, values = f"SELECT {columns} FROM words WHERE agent_id = ?", [agent_id]  # noqa: S608 - our own names
+        query, values = f"SELECT {columns} FROM voxel_updates WHERE agent_id = ?", [agent_id]  # noqa: S608 - the names are constants
         if keys is not None:
-            query, values = query + _AT_KEYS, [agent_id, _as_json(keys)]
+            query, values = query + _WITH_KEYS, [agent_id, _keys_as_json(keys)]
         return self._read(f"{query} ORDER BY voxel", tuple(values))
 
     def _read(self, query: str, values: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
-        with self._lock, self._speaking():
+        with self._lock, self._storage_errors():
             return self._db.execute(query, values).fetchall()
 
     @contextmanager
     def _transaction(self) -> Iterator[sqlite3.Connection]:
-        with self._lock, self._speaking():
+        with self._lock, self._storage_errors():
             self._db.execute("BEGIN IMMEDIATE")
             try:
                 yield self._db
@@ -203,7 +206,7 @@ class SqliteStore:
                 raise
 
     @contextmanager
-    def _speaking(self) -> Iterator[None]:
+    def _storage_errors(self) -> Iterator[None]:
         try:
             yield
         except sqlite3.Error as error:
@@ -217,16 +220,16 @@ def _connect(path: Path) -> sqlite3.Connection:
         raise StorageError(f"store {path}: cannot be opened ({error}); expected a file in a writable folder") from error
 
 
-def _as_json(keys: Int64[ndarray, " k"]) -> str:
+def _keys_as_json(keys: Int64[ndarray, " k"]) -> str:
     return json.dumps(keys.tolist())
 
 
 def _explain(error: sqlite3.Error) -> str:
     text = str(error)
     if "not a database" in text or "malformed" in text:
-        return f"expected an undamaged GaussLite store, got a file that is none ({text})"
+        return f"expected an undamaged GaussLite store, got another kind of file ({text})"
     if "locked" in text:
         return "in use by another server; give each its own file"
     if "full" in text:
-        return "no room left (disk full or the store's size limit); nothing of this message was kept"
+        return "no space left (disk full or the store's size limit); nothing of this message was stored"
     return f"refused ({text})"

@@ -1,8 +1,8 @@
-"""The register of the fusion law: (agent, voxel) -> the agent's latest word, and nothing else is remembered.
+"""The store of voxel updates: (agent, voxel) → the agent's latest update of that voxel.
 
-It is no accumulator: a word replaces the agent's earlier word on that voxel when its map revision is higher, and is
-STALE otherwise. So duplicates, resends and reordering change nothing, and an agent can be taken out again as if it
-had never been there. An empty word is a tombstone and is kept, since an older word may still be on its way.
+An update replaces the agent's earlier update of the voxel if its map revision is higher; otherwise it is STALE. So
+duplicates, resends and reordering change nothing, and removing an agent leaves no trace. An update without Gaussians
+is a tombstone. It is kept, because an older update of the voxel may still arrive.
 """
 
 from __future__ import annotations
@@ -16,20 +16,12 @@ from numpy import ndarray
 
 from gausslite.domain.voxel_batch import RoiSubset, VoxelBatch
 from gausslite.errors import InvalidInputError
-
-
-@dataclass(frozen=True, slots=True)
-class MissionConfig:
-    """What all words in one store have in common; set once, by the first agent that joins."""
-
-    mission_id: str
-    world_frame: str
-    voxel_size_m: float
+from gausslite.fusion.mission_config import MissionConfig
 
 
 @dataclass(frozen=True, slots=True)
 class SessionRecord:
-    """An agent's right to contribute, from joining until leaving or joining again."""
+    """An agent's permission to contribute, from joining until it leaves or joins again."""
 
     session_id: str
     agent_id: str
@@ -37,7 +29,7 @@ class SessionRecord:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PutOutcome:
-    """Which voxels of a message became the agent's latest word, and which were duplicates or overtaken; ascending."""
+    """The voxels of a message that were stored, and those that were stale; keys in ascending order."""
 
     accepted: Int64[ndarray, " a"]
     stale: Int64[ndarray, " s"]
@@ -45,13 +37,13 @@ class PutOutcome:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class VoxelScoreTable:
-    """The totals of every word (tombstones too), without the Gaussians: all that the vote looks at.
+    """The totals of every update (tombstones included) without the Gaussians: the input of the vote.
 
-    agent indexes `agents`, which is sorted; rows are in the order of (agent, key).
+    agent_index holds indices into `agents`, which is sorted; rows are sorted by (agent, key).
     """
 
     agents: tuple[str, ...]
-    agent: Int32[ndarray, " w"]
+    agent_index: Int32[ndarray, " w"]
     keys: Int64[ndarray, " w"]
     map_revisions: Int64[ndarray, " w"]
     kappa_sums: UInt64[ndarray, " w"]
@@ -60,69 +52,70 @@ class VoxelScoreTable:
 
 @runtime_checkable
 class FusionStore(Protocol):
-    """Owns the register, the mission_config and the sessions. Every method may be called from any thread.
+    """Owns the voxel updates, the mission's configuration and the sessions. Thread-safe.
 
-    What a method has returned from is as durable as the store is: after a kill the next life of a durable store
-    has it. All raise StorageError when the storage refuses; the store stays usable for what it still can do.
+    When a method of a durable store has returned, its effect survives a crash. All methods raise StorageError if the
+    storage refuses; the store stays usable for other calls.
     """
 
     def put(self, subset: RoiSubset) -> PutOutcome:
-        """Take in one message, all of it or (on an error) nothing. Raises InvalidInputError."""
+        """Store one message completely, or nothing of it on an error. Raises InvalidInputError."""
         ...
 
     def remove_agent(self, agent_id: str) -> Int64[ndarray, " v"]:
-        """Forget an agent's words; returns the voxels it had words on, ascending."""
+        """Delete an agent's updates; returns the keys of their voxels, ascending."""
         ...
 
     def agents(self) -> tuple[str, ...]:
-        """The agents that have words here, sorted."""
+        """Return the ids of the agents with updates, sorted."""
         ...
 
     def highest_map_revision(self, agent_id: str) -> int:
-        """The newest revision among an agent's words; 0 when it has none."""
+        """Return the highest revision among an agent's updates; 0 without any."""
         ...
 
-    def stakes(self, keys: Int64[ndarray, " k"] | None = None) -> VoxelScoreTable:
-        """Totals of all agents, on these voxels or on all."""
+    def scores(self, keys: Int64[ndarray, " k"] | None = None) -> VoxelScoreTable:
+        """Return all agents' totals on these voxels, or on all."""
         ...
 
-    def words(self, agent_id: str, keys: Int64[ndarray, " k"] | None = None) -> VoxelBatch:
-        """An agent's latest words (tombstones too), on these voxels or on all; none for an unknown agent."""
+    def batch(self, agent_id: str, keys: Int64[ndarray, " k"] | None = None) -> VoxelBatch:
+        """Return an agent's updates (with tombstones) of these voxels, or of all; empty for an unknown agent."""
         ...
 
-    def table(self, keys: Int64[ndarray, " k"] | None = None) -> dict[str, VoxelBatch]:
-        """Every agent's words at one instant."""
+    def batches(self, keys: Int64[ndarray, " k"] | None = None) -> dict[str, VoxelBatch]:
+        """Return the batch of every agent, all read at one instant."""
         ...
 
     def mission_config(self) -> MissionConfig | None:
-        """What was agreed by the first to join; None before that."""
+        """Return the mission's configuration; None before an agent has joined."""
         ...
 
     def set_mission_config(self, mission_config: MissionConfig) -> None:
-        """Agree on this from now on."""
+        """Store the mission's configuration."""
         ...
 
     def sessions(self) -> tuple[SessionRecord, ...]:
-        """All sessions that were saved and not ended, by session id."""
+        """Return all open sessions, sorted by session id."""
         ...
 
     def save_session(self, session: SessionRecord) -> None:
-        """Remember a session; it replaces any other session of the same agent."""
+        """Store a session; it replaces any other session of the same agent."""
         ...
 
     def end_session(self, session_id: str) -> None:
-        """Forget a session; unknown ones are fine. The agent's words stay."""
+        """Delete a session, if it exists. The agent's updates stay."""
         ...
 
     def close(self) -> None:
-        """Let go of files; no other method may be called after."""
+        """Close the files; no other method may be called afterwards."""
         ...
 
 
 def require_storable(subset: RoiSubset) -> None:
-    """Raise InvalidInputError when a number of the message does not fit the register's 64-bit columns."""
-    largest = int(subset.batch.kappa_sums.max(initial=0))
+    """Raise InvalidInputError if a number of the message does not fit the store's signed 64-bit columns."""
+    largest_sum = int(subset.batch.kappa_sums.max(initial=0))
     limit = int(np.iinfo(np.int64).max)
-    for name, value in (("map_revision", subset.map_revision), ("sequence", subset.sequence), ("kappa_sum", largest)):
+    numbers = (("map_revision", subset.map_revision), ("sequence", subset.sequence), ("kappa_sum", largest_sum))
+    for name, value in numbers:
         if value > limit:
             raise InvalidInputError(f"subset {name}: expected at most {limit}, got {value}")

@@ -1,18 +1,19 @@
-"""Count each agent's part in the team's map, so that nobody's contribution is invisible."""
+"""Count what each agent sent, and what the fused map shows of it."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from gausslite.fusion.store import MissionConfig, VoxelScoreTable
+from gausslite.fusion.mission_config import MissionConfig
+from gausslite.fusion.store import VoxelScoreTable
 from gausslite.fusion.vote import VoteResult
 
 
 @dataclass(frozen=True, slots=True)
 class TrafficCounters:
-    """What one agent sent in this life of the server. last_seen_ns: when its latest subset came, 0 when none did."""
+    """Messages of one agent since the server started. last_seen_ns: time of its latest subset, 0 before the first."""
 
     last_seen_ns: int = 0
     roi_bytes: int = 0
@@ -21,36 +22,36 @@ class TrafficCounters:
     subsets_stale: int = 0
     subsets_rejected: int = 0
 
-    def plus(self, sent: TrafficCounters) -> TrafficCounters:
-        """Both together, last seen when `sent` was."""
+    def plus(self, newer: TrafficCounters) -> TrafficCounters:
+        """Return the sums, with last_seen_ns of the newer counters."""
         return TrafficCounters(
-            sent.last_seen_ns,
-            self.roi_bytes + sent.roi_bytes,
-            self.handover_bytes + sent.handover_bytes,
-            self.subsets_accepted + sent.subsets_accepted,
-            self.subsets_stale + sent.subsets_stale,
-            self.subsets_rejected + sent.subsets_rejected,
+            newer.last_seen_ns,
+            self.roi_bytes + newer.roi_bytes,
+            self.handover_bytes + newer.handover_bytes,
+            self.subsets_accepted + newer.subsets_accepted,
+            self.subsets_stale + newer.subsets_stale,
+            self.subsets_rejected + newer.subsets_rejected,
         )
 
 
 @dataclass(frozen=True, slots=True)
 class AgentContribution:
-    """One agent's part: what is held of it, how much of that the fused map shows, and what it sent."""
+    """What the server keeps of one agent, how many voxels it wins, and its traffic."""
 
     agent_id: str
-    joined: bool
-    voxels: int
-    gaussians: int
-    kappa_sum: int
-    won_voxels: int
-    last_map_revision: int
-    keyframes: int
-    tally: TrafficCounters
+    joined: bool = False
+    voxels: int = 0
+    gaussians: int = 0
+    kappa_sum: int = 0
+    won_voxels: int = 0
+    last_map_revision: int = 0
+    keyframes: int = 0
+    traffic: TrafficCounters = field(default_factory=TrafficCounters)
 
 
 @dataclass(frozen=True, slots=True)
 class MissionStatus:
-    """The state of the mission in figures."""
+    """The figures of a mission and of each agent."""
 
     mission_config: MissionConfig
     revision: int
@@ -61,18 +62,17 @@ class MissionStatus:
     agents: tuple[AgentContribution, ...]
 
 
-def contribution(agent_id: str, stakes: VoxelScoreTable, election: VoteResult) -> AgentContribution:
-    """The part of this agent in the words and in the vote; voxels without Gaussians do not count."""
-    none = AgentContribution(agent_id, False, 0, 0, 0, 0, 0, 0, TrafficCounters())
-    if agent_id not in stakes.agents:
-        return none
-    index = stakes.agents.index(agent_id)
-    mine = stakes.agent == index
-    return replace(
-        none,
-        voxels=int(np.count_nonzero(stakes.counts[mine])),
-        gaussians=int(stakes.counts[mine].sum(dtype=np.int64)),
-        kappa_sum=int(stakes.kappa_sums[mine].sum(dtype=np.uint64)),
-        won_voxels=int(np.count_nonzero(election.winner == index)),
-        last_map_revision=int(stakes.map_revisions[mine].max(initial=0)),
+def contribution(agent_id: str, scores: VoxelScoreTable, vote: VoteResult) -> AgentContribution:
+    """Return the agent's totals and the number of voxels it wins; tombstones do not count as voxels."""
+    if agent_id not in scores.agents:
+        return AgentContribution(agent_id)
+    index = scores.agents.index(agent_id)
+    own = scores.agent_index == index
+    return AgentContribution(
+        agent_id,
+        voxels=int(np.count_nonzero(scores.counts[own])),
+        gaussians=int(scores.counts[own].sum(dtype=np.int64)),
+        kappa_sum=int(scores.kappa_sums[own].sum(dtype=np.uint64)),
+        won_voxels=int(np.count_nonzero(vote.winner_index == index)),
+        last_map_revision=int(scores.map_revisions[own].max(initial=0)),
     )

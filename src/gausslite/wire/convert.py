@@ -1,4 +1,4 @@
-"""Messages to nouns and back; whatever comes from outside is checked here and nowhere else."""
+"""Convert between protobuf messages and domain objects; values from outside are checked here."""
 
 from __future__ import annotations
 
@@ -23,43 +23,43 @@ from gausslite.wire.images import decode_colour, decode_depth, encode_colour, en
 
 MAX_IMAGE_PX = 1 << 23
 
-_PREDICATES = {each: task_pb2.Predicate.Value(f"PREDICATE_{each.name}") for each in Predicate}
-_PREDICATES_BACK = {number: predicate for predicate, number in _PREDICATES.items()}
+_PREDICATE_NUMBERS = {each: task_pb2.Predicate.Value(f"PREDICATE_{each.name}") for each in Predicate}
+_PREDICATE_BY_NUMBER = {number: predicate for predicate, number in _PREDICATE_NUMBERS.items()}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MapUpdate:
-    """Part of a map at a revision: words to put over what is held; winners name the agent of each voxel, or nothing.
+    """Some voxel updates of a map at one revision. winners names the agent of each voxel; empty for an agent's map.
 
-    It is the first or the last part of its revision, or both; after the last one what is held is a whole map.
+    A revision arrives in one or more parts. After the last part the watcher's batch is the whole map.
     """
 
     revision: int
     snapshot: bool
     first: bool
     last: bool
-    words: VoxelBatch | None
+    batch: VoxelBatch | None
     grid: VoxelGrid | None
     winners: tuple[str, ...]
 
-    def over(self, held: VoxelBatch) -> VoxelBatch:
-        """What a watcher holds after this update: begin with `empty_batch()`, keep a map without tombstones."""
-        before = empty_batch() if self.snapshot and self.first else held
-        if self.words is None:
+    def apply_to(self, batch: VoxelBatch) -> VoxelBatch:
+        """Return the watcher's map, without tombstones, after this update. Start with `empty_batch()`."""
+        before = empty_batch() if self.snapshot and self.first else batch
+        if self.batch is None:
             return before
-        kept = select_voxels(before, ~np.isin(before.keys, self.words.keys))
-        return merge_batches(kept, select_voxels(self.words, self.words.counts > 0))
+        kept = select_voxels(before, ~np.isin(before.keys, self.batch.keys))
+        return merge_batches(kept, select_voxels(self.batch, self.batch.counts > 0))
 
 
 def graph_to_message(graph: TaskGraph) -> task_pb2.TaskGraph:
-    """A task graph as a message."""
+    """Encode a task graph."""
     return task_pb2.TaskGraph(
         task_id=graph.task_id,
         text=graph.text,
         targets=graph.targets,
         anchors=graph.anchors,
         relations=[
-            task_pb2.Relation(predicate=_PREDICATES[r.predicate], target=r.target, anchor=r.anchor)
+            task_pb2.Relation(predicate=_PREDICATE_NUMBERS[r.predicate], target=r.target, anchor=r.anchor)
             for r in graph.relations
         ],
         warnings=graph.warnings,
@@ -67,9 +67,9 @@ def graph_to_message(graph: TaskGraph) -> task_pb2.TaskGraph:
 
 
 def graph_from_message(message: task_pb2.TaskGraph) -> TaskGraph:
-    """A task graph within the bounds of `task.validate`. Raises TaskError."""
+    """Decode a task graph and check it with `task.validate`. Raises TaskError."""
     for relation in message.relations:
-        if relation.predicate not in _PREDICATES_BACK:
+        if relation.predicate not in _PREDICATE_BY_NUMBER:
             raise TaskError(
                 f"task relation: expected one of {', '.join(Predicate)}, got predicate {relation.predicate}"
             )
@@ -78,7 +78,7 @@ def graph_from_message(message: task_pb2.TaskGraph) -> TaskGraph:
         message.text,
         tuple(message.targets),
         tuple(message.anchors),
-        tuple(Relation(_PREDICATES_BACK[each.predicate], each.target, each.anchor) for each in message.relations),
+        tuple(Relation(_PREDICATE_BY_NUMBER[r.predicate], r.target, r.anchor) for r in message.relations),
         tuple(message.warnings),
     )
     require_graph(graph)
@@ -86,7 +86,7 @@ def graph_from_message(message: task_pb2.TaskGraph) -> TaskGraph:
 
 
 def camera_to_message(camera: Camera) -> geometry_pb2.Camera:
-    """A camera as a message."""
+    """Encode a camera."""
     return geometry_pb2.Camera(
         fx_px=camera.fx_px,
         fy_px=camera.fy_px,
@@ -98,7 +98,7 @@ def camera_to_message(camera: Camera) -> geometry_pb2.Camera:
 
 
 def camera_from_message(message: geometry_pb2.Camera) -> Camera:
-    """A checked camera of at most 8 megapixels. Raises InvalidInputError."""
+    """Decode a camera of at most 8 megapixels. Raises InvalidInputError."""
     if message.width_px * message.height_px > MAX_IMAGE_PX:
         raise InvalidInputError(
             f"camera: expected at most {MAX_IMAGE_PX} pixels, got {message.width_px}x{message.height_px}"
@@ -107,12 +107,12 @@ def camera_from_message(message: geometry_pb2.Camera) -> Camera:
 
 
 def transform_to_message(T: Float64[ndarray, "4 4"]) -> geometry_pb2.RigidTransform:
-    """A rigid transform as a message."""
+    """Encode a rigid transform."""
     return geometry_pb2.RigidTransform(row_major=T.reshape(-1).tolist())
 
 
 def transform_from_message(name: str, message: geometry_pb2.RigidTransform) -> Float64[ndarray, "4 4"]:
-    """A checked rigid transform. Raises PoseError, InvalidInputError."""
+    """Decode a rigid transform. Raises PoseError, InvalidInputError."""
     if len(message.row_major) != 16:
         raise InvalidInputError(f"{name}: expected 16 numbers, got {len(message.row_major)}")
     T = np.array(message.row_major, np.float64).reshape(4, 4)
@@ -121,7 +121,7 @@ def transform_from_message(name: str, message: geometry_pb2.RigidTransform) -> F
 
 
 def frame_to_message(frame: Frame, lossless: bool = False) -> geometry_pb2.EncodedFrame:
-    """A frame with JPEG colour (PNG when lossless) and millimetre depth."""
+    """Encode a frame with JPEG colour (PNG if lossless) and 16-bit PNG depth in millimetres."""
     return geometry_pb2.EncodedFrame(
         index=frame.index,
         capture_time_ns=frame.capture_time_ns,
@@ -133,7 +133,7 @@ def frame_to_message(frame: Frame, lossless: bool = False) -> geometry_pb2.Encod
 
 
 def frame_from_message(message: geometry_pb2.EncodedFrame) -> Frame:
-    """A checked frame; its images must have the camera's size. Raises InvalidInputError and its kinds."""
+    """Decode a frame whose images have the camera's size. Raises InvalidInputError and subclasses."""
     camera = camera_from_message(message.camera)
     return Frame(
         message.index,
@@ -146,38 +146,38 @@ def frame_from_message(message: geometry_pb2.EncodedFrame) -> Frame:
 
 
 def grid_to_message(grid: VoxelGrid) -> geometry_pb2.VoxelGrid:
-    """A voxel grid as a message."""
+    """Encode a voxel grid."""
     return geometry_pb2.VoxelGrid(size_m=grid.size_m)
 
 
 def grid_from_message(message: geometry_pb2.VoxelGrid) -> VoxelGrid:
-    """A checked grid. Raises InvalidInputError."""
+    """Decode a voxel grid. Raises InvalidInputError."""
     return VoxelGrid(message.size_m)
 
 
 def box_to_message(box: AxisAlignedBox) -> geometry_pb2.Box:
-    """A box as a message."""
+    """Encode a box."""
     low, high = (geometry_pb2.Point(x=p[0], y=p[1], z=p[2]) for p in (box.min_m, box.max_m))
     return geometry_pb2.Box(min_m=low, max_m=high)
 
 
 def box_from_message(message: geometry_pb2.Box) -> AxisAlignedBox:
-    """A checked box. Raises InvalidInputError."""
+    """Decode a box. Raises InvalidInputError."""
     low, high = message.min_m, message.max_m
     return AxisAlignedBox((low.x, low.y, low.z), (high.x, high.y, high.z))
 
 
 def map_update_from_message(message: gaussians_pb2.MapBlock, limits: CodecLimits, first: bool) -> MapUpdate:
-    """A checked block of a map, and whether it is the first of its revision.
+    """Decode a block of a map; `first` marks the first block of a revision.
 
     Raises CodecError, ChecksumError, InvalidInputError.
     """
-    words, grid = None, None
+    batch, grid = None, None
     if message.subset:
         subset, grid = decode_subset(message.subset, limits)
-        words = subset.batch
+        batch = subset.batch
     names, winner = message.provenance.agent_ids, message.provenance.winner
-    if len(winner) not in (0, 0 if words is None else len(words)) or any(i >= len(names) for i in winner):
+    if len(winner) not in (0, 0 if batch is None else len(batch)) or any(i >= len(names) for i in winner):
         raise InvalidInputError("map block provenance: expected one known agent for each voxel")
     winners = tuple(names[i] for i in winner)
-    return MapUpdate(message.revision, message.snapshot, first, message.last, words, grid, winners)
+    return MapUpdate(message.revision, message.snapshot, first, message.last, batch, grid, winners)

@@ -15,8 +15,8 @@ from gausslite.fusion.change_log import ChangeLog
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.limits import FusionSettings
 from gausslite.fusion.memory_store import MemoryStore
-from gausslite.fusion.store import MissionConfig
-from gausslite.fusion.vote import elect
+from gausslite.fusion.mission_config import MissionConfig
+from gausslite.fusion.vote import rank_voxels
 
 GRID = VoxelGrid(0.10)
 STEPS = st.lists(
@@ -50,22 +50,22 @@ def test_a_watcher_that_applies_the_changes_has_the_fused_map(steps) -> None:
             team.contribute(sessions[agent_id], RoiSubset(agent_id, "", revision, revision, words(counts)), GRID)
         if looks:
             changes = team.changes(known)
-            held.update(zip(changes.fused.words.keys.tolist(), changes.fused.election.votes(), strict=True))
-            for key in changes.vanished.tolist():
+            held.update(zip(changes.fused.batch.keys.tolist(), changes.fused.vote.votes(), strict=True))
+            for key in changes.removed.tolist():
                 held.pop(key, None)
             known = changes.revision
-            votes = team.changes(0).fused.election.votes()
+            votes = team.changes(0).fused.vote.votes()
             assert {key: vote.winner for key, vote in held.items()} == {vote.key: vote.winner for vote in votes}
             assert all(held[key].scores[0] == vote.scores[0] for key, vote in _by_key(team).items())
 
 
 def _by_key(team: FusionEngine) -> dict:
-    return {vote.key: vote for vote in team.changes(0).fused.election.votes()}
+    return {vote.key: vote for vote in team.changes(0).fused.vote.votes()}
 
 
 def record(ledger: ChangeLog, store: MemoryStore, subset: RoiSubset) -> list[int]:
     accepted = store.put(subset).accepted
-    return ledger.record(subset.agent_id, accepted, elect(store.stakes(accepted))).tolist()
+    return ledger.record(subset.agent_id, accepted, rank_voxels(store.scores(accepted))).tolist()
 
 
 def test_only_what_the_vote_shows_is_a_change() -> None:
@@ -89,7 +89,7 @@ def test_a_revision_of_another_life_is_gone(revision: int) -> None:
 
 
 def test_the_memory_of_vanished_voxels_is_bounded() -> None:
-    ledger, store = ChangeLog(first_revision=1, max_vanished=2), MemoryStore()
+    ledger, store = ChangeLog(first_revision=1, max_removed=2), MemoryStore()
     record(ledger, store, RoiSubset("ant", "", 1, 1, words({1: 1, 2: 1, 3: 1})))
     for revision, key in enumerate((1, 2, 3), start=2):
         record(ledger, store, RoiSubset("ant", "", revision, revision, words({key: 0})))

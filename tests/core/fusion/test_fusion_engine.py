@@ -11,9 +11,9 @@ from gausslite.domain.voxel_operations import group_by_voxel, merge_batches, tom
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.errors import GaussLiteError, InvalidInputError, MismatchError, QuotaError, SessionUnknownError
 from gausslite.fusion.engine import FusionEngine
-from gausslite.fusion.limits import FusionSettings, Quotas, agree
+from gausslite.fusion.limits import FusionSettings, Quotas
 from gausslite.fusion.memory_store import MemoryStore
-from gausslite.fusion.store import MissionConfig
+from gausslite.fusion.mission_config import MissionConfig, reconcile
 from gausslite.fusion.traffic import TrafficCounters
 
 GRID = VoxelGrid(0.10)
@@ -36,8 +36,8 @@ def test_status_says_who_holds_what() -> None:
     ant, bee = (team.join(name, ANYTHING).session.session_id for name in ("ant", "bee"))
     team.contribute(ant, said("ant", 3, [(0, 5), (1, 1), (1, 1)], buried=(4,)), GRID)
     team.contribute(bee, said("bee", 8, [(1, 9), (2, 0)]), GRID)
-    team.note("ant", TrafficCounters(roi_bytes=100, subsets_accepted=1))
-    team.note("ant", TrafficCounters(handover_bytes=7, subsets_stale=1))
+    team.record_traffic("ant", TrafficCounters(roi_bytes=100, subsets_accepted=1))
+    team.record_traffic("ant", TrafficCounters(handover_bytes=7, subsets_stale=1))
     team.leave(bee)
     status = team.status()
     assert status.mission_config == MissionConfig("rescue", "world", 0.10)
@@ -46,14 +46,14 @@ def test_status_says_who_holds_what() -> None:
     first, second = status.agents
     assert (first.agent_id, first.joined, first.voxels, first.gaussians) == ("ant", True, 2, 3)
     assert (first.kappa_sum, first.won_voxels, first.last_map_revision) == (7, 1, 3)
-    assert (first.tally.roi_bytes, first.tally.handover_bytes, first.tally.subsets_stale) == (100, 7, 1)
-    assert first.tally.last_seen_ns > 0
+    assert (first.traffic.roi_bytes, first.traffic.handover_bytes, first.traffic.subsets_stale) == (100, 7, 1)
+    assert first.traffic.last_seen_ns > 0
     assert (second.agent_id, second.joined, second.won_voxels, second.kappa_sum) == ("bee", False, 2, 9)
 
 
 def test_an_empty_team_has_an_empty_map() -> None:
     team = FusionEngine(MemoryStore(), FusionSettings(grid=GRID))
-    assert len(team.voted()) == len(team.concatenated()) == 0
+    assert len(team.voted_map()) == len(team.union_map()) == 0
     assert team.status().agents == ()
     assert len(team.changes().fused.gaussians) == 0
     team.close()
@@ -65,7 +65,7 @@ def test_the_first_to_name_the_terms_decides() -> None:
     assert team.mission_config == MissionConfig("mission", "world", 0.10)
     with pytest.raises(MismatchError, match="'world' as agreed here, got 'odom'"):
         team.join("bee", MissionConfig("", "odom", 0.10))
-    assert agree(MissionConfig("", "", 0.1), MissionConfig("a", "b", 0.1)) == MissionConfig("a", "b", 0.1)
+    assert reconcile(MissionConfig("", "", 0.1), MissionConfig("a", "b", 0.1)) == MissionConfig("a", "b", 0.1)
 
 
 def test_a_store_made_on_other_terms_is_refused() -> None:
@@ -104,8 +104,8 @@ def test_whatever_comes_the_message_is_one_short_line() -> None:
         lambda: team.join("bee", MissionConfig("", "line\nbreak", 0.10)),
         lambda: team.require_mission(LONG),
         lambda: team.session(LONG),
-        lambda: team.voted(LONG),
-        lambda: team.concatenated("line\nbreak"),
+        lambda: team.voted_map(LONG),
+        lambda: team.union_map("line\nbreak"),
         lambda: team.contribute(ant, said(LONG, 1, []), GRID),
     ]
     for attempt in attempts:

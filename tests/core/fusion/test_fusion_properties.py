@@ -19,7 +19,7 @@ from gausslite.fusion.memory_store import MemoryStore
 from gausslite.fusion.offline import fuse_maps
 from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.fusion.store import FusionStore
-from gausslite.fusion.vote import FusedMap, concatenate, elect, fuse
+from gausslite.fusion.vote import FusedMap, fuse, rank_voxels, union_maps
 
 GRID = VoxelGrid(0.10)
 AGENTS = ("ant", "bee", "cat", "dog")
@@ -95,8 +95,8 @@ def assert_same_words(a: VoxelBatch, b: VoxelBatch) -> None:
 
 def assert_same_map(a: FusedMap, b: FusedMap) -> None:
     """Bit for bit the same Gaussians, and the same account of who won where."""
-    assert_same_words(a.words, b.words)
-    assert list(a.election.votes()) == list(b.election.votes())
+    assert_same_words(a.batch, b.batch)
+    assert list(a.vote.votes()) == list(b.vote.votes())
 
 
 @law
@@ -104,8 +104,8 @@ def assert_same_map(a: FusedMap, b: FusedMap) -> None:
 def test_duplicates_and_any_order_leave_the_map_as_it_is(history: dict[str, list[Spec]], random) -> None:
     subsets = subsets_from(history)
     shuffled = random.sample(subsets + subsets, 2 * len(subsets))
-    assert_same_map(fuse(stored(shuffled).table()), fuse(stored(subsets).table()))
-    assert_same_words(concatenate(stored(shuffled).table()), concatenate(stored(subsets).table()))
+    assert_same_map(fuse(stored(shuffled).batches()), fuse(stored(subsets).batches()))
+    assert_same_words(union_maps(stored(shuffled).batches()), union_maps(stored(subsets).batches()))
 
 
 @law
@@ -115,7 +115,7 @@ def test_a_connection_that_drops_and_resumes_leaves_no_trace(
 ) -> None:
     subsets = subsets_from(history)
     resumed = subsets[:dropped] + subsets[max(0, dropped - again) :]
-    assert_same_map(fuse(stored(resumed).table()), fuse(stored(subsets).table()))
+    assert_same_map(fuse(stored(resumed).batches()), fuse(stored(subsets).batches()))
 
 
 @law
@@ -124,7 +124,7 @@ def test_removing_an_agent_equals_never_having_had_it(history: dict[str, list[Sp
     subsets = subsets_from(history)
     store = stored(subsets)
     store.remove_agent(leaver)
-    assert_same_map(fuse(store.table()), fuse(stored([s for s in subsets if s.agent_id != leaver]).table()))
+    assert_same_map(fuse(store.batches()), fuse(stored([s for s in subsets if s.agent_id != leaver]).batches()))
 
 
 @law
@@ -143,13 +143,13 @@ def test_the_shards_united_are_the_whole(specs: dict[str, Spec], shards: int) ->
         fuse({agent: select_voxels(words, words.keys % shards == shard) for agent, words in table.items()})
         for shard in range(shards)
     ]
-    united = parts[0].words
+    united = parts[0].batch
     for part in parts[1:]:
-        united = merge_batches(united, part.words)
+        united = merge_batches(united, part.batch)
     whole = fuse(table)
-    assert_same_words(united, whole.words)
-    votes = sorted((vote for part in parts for vote in part.election.votes()), key=lambda vote: vote.key)
-    assert votes == list(whole.election.votes())
+    assert_same_words(united, whole.batch)
+    votes = sorted((vote for part in parts for vote in part.vote.votes()), key=lambda vote: vote.key)
+    assert votes == list(whole.vote.votes())
 
 
 @law
@@ -165,10 +165,10 @@ def test_the_winner_is_the_most_trained_then_the_denser_then_the_lower_id(specs:
             rank = (-kappa_sum, -count, agent_id)
             if count > 0 and (key not in expected or rank < expected[key]):
                 expected[key] = rank
-    assert {vote.key: vote.winner for vote in fused.election.votes()} == {k: rank[2] for k, rank in expected.items()}
+    assert {vote.key: vote.winner for vote in fused.vote.votes()} == {k: rank[2] for k, rank in expected.items()}
     for key, (_, _, agent_id) in expected.items():
         keys = np.array([key], np.int64)
-        assert_same_words(select_keys(fused.words, keys), select_keys(table[agent_id], keys))
+        assert_same_words(select_keys(fused.batch, keys), select_keys(table[agent_id], keys))
 
 
 @law
@@ -176,10 +176,10 @@ def test_the_winner_is_the_most_trained_then_the_denser_then_the_lower_id(specs:
 def test_provenance_and_margin_agree_with_the_votes(specs: dict[str, Spec]) -> None:
     table = table_from(specs)
     fused = fuse(table)
-    votes = list(fused.election.votes())
-    assert len(fused.provenance) == len(fused.gaussians) == int(fused.words.counts.sum())
-    owners = [vote.winner for vote, count in zip(votes, fused.words.counts.tolist(), strict=True) for _ in range(count)]
-    assert [fused.election.agents[index] for index in fused.provenance] == owners
+    votes = list(fused.vote.votes())
+    assert len(fused.provenance) == len(fused.gaussians) == int(fused.batch.counts.sum())
+    owners = [vote.winner for vote, count in zip(votes, fused.batch.counts.tolist(), strict=True) for _ in range(count)]
+    assert [fused.vote.agents[index] for index in fused.provenance] == owners
     assert all(vote.margin >= 0 and vote.scores[0].count > 0 for vote in votes)
     assert sum(int(fused.won_by(agent_id).sum()) for agent_id in table) == len(votes)
 
@@ -188,7 +188,7 @@ def test_provenance_and_margin_agree_with_the_votes(specs: dict[str, Spec]) -> N
 @given(TABLES)
 def test_concatenation_keeps_everyone(specs: dict[str, Spec]) -> None:
     table = table_from(specs)
-    everything = concatenate(table)
+    everything = union_maps(table)
     assert len(everything.gaussians) == sum(len(words.gaussians) for words in table.values())
     assert int(everything.kappa_sums.sum()) == sum(int(words.kappa_sums.sum()) for words in table.values())
     assert_same_words(group_by_voxel(everything.gaussians, GRID), everything)
@@ -199,7 +199,7 @@ def test_concatenation_keeps_everyone(specs: dict[str, Spec]) -> None:
 def test_the_vote_on_stored_totals_is_the_vote_on_the_words(history: dict[str, list[Spec]]) -> None:
     subsets = subsets_from(history)
     store = stored(subsets)
-    assert list(elect(store.stakes()).votes()) == list(fuse(store.table()).election.votes())
+    assert list(rank_voxels(store.scores()).votes()) == list(fuse(store.batches()).vote.votes())
 
 
 @law
@@ -213,7 +213,7 @@ def test_every_store_gives_the_same_map(history: dict[str, list[Spec]]) -> None:
             for ours, theirs in outcomes:
                 assert ours.accepted.tolist() == theirs.accepted.tolist()
                 assert ours.stale.tolist() == theirs.stale.tolist()
-            assert_same_map(fuse(on_disk.table()), fuse(stored(subsets).table()))
+            assert_same_map(fuse(on_disk.batches()), fuse(stored(subsets).batches()))
         finally:
             on_disk.close()
 
@@ -227,9 +227,9 @@ def test_ties_go_to_more_gaussians_and_then_to_the_lower_id(
 ) -> None:
     a, b = (gaussians_in([(0, kappa) for kappa in kappas], 1) for kappas in (kappas_a, kappas_b))
     for maps in ({"ant": a, "bee": b}, {"bee": b, "ant": a}):
-        assert [vote.winner for vote in fuse_maps(maps, GRID).election.votes()] == [winner]
+        assert [vote.winner for vote in fuse_maps(maps, GRID).vote.votes()] == [winner]
 
 
 def test_no_words_fuse_to_an_empty_map() -> None:
-    assert len(fuse({}).gaussians) == len(concatenate({}).gaussians) == 0
+    assert len(fuse({}).gaussians) == len(union_maps({}).gaussians) == 0
     assert len(fuse_maps({"ant": Gaussians.empty()}, GRID).gaussians) == 0

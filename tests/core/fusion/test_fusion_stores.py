@@ -56,7 +56,7 @@ def test_what_was_put_is_what_is_read(store: FusionStore) -> None:
     outcome = store.put(message)
     assert outcome.accepted.tolist() == list(KEYS)
     assert outcome.stale.tolist() == []
-    words = store.words("ant")
+    words = store.batch("ant")
     assert words.keys.tolist() == list(KEYS)
     assert words.counts.tolist() == [2, 0, 5]
     assert words.gaussians.means_m.tobytes() == message.batch.gaussians.means_m.tobytes()
@@ -70,7 +70,7 @@ def test_the_highest_revision_wins_and_an_equal_one_is_stale(store: FusionStore)
     assert store.put(said("ant", 4, {11: 4})).stale.tolist() == [11]
     later = store.put(said("ant", 6, {11: 1, 33: 1}))
     assert later.accepted.tolist() == [11, 33]
-    assert store.words("ant").counts.tolist() == [1, 2, 1]
+    assert store.batch("ant").counts.tolist() == [1, 2, 1]
     assert store.highest_map_revision("ant") == 6
     assert store.highest_map_revision("bee") == 0
 
@@ -78,21 +78,21 @@ def test_the_highest_revision_wins_and_an_equal_one_is_stale(store: FusionStore)
 def test_a_tombstone_is_kept_so_that_an_older_word_cannot_come_back(store: FusionStore) -> None:
     store.put(said("ant", 2, {11: 0}))
     assert store.put(said("ant", 1, {11: 3})).stale.tolist() == [11]
-    assert store.words("ant").counts.tolist() == [0]
+    assert store.batch("ant").counts.tolist() == [0]
 
 
 def test_agents_do_not_touch_each_other(store: FusionStore) -> None:
     store.put(said("ant", 9, {11: 2}))
     store.put(said("bee", 1, {11: 1, 22: 1}))
-    stakes = store.stakes()
-    assert stakes.agents == ("ant", "bee")
-    assert stakes.agent.tolist() == [0, 1, 1]
-    assert stakes.keys.tolist() == [11, 11, 22]
-    assert stakes.map_revisions.tolist() == [9, 1, 1]
-    assert stakes.counts.tolist() == [2, 1, 1]
+    scores = store.scores()
+    assert scores.agents == ("ant", "bee")
+    assert scores.agent_index.tolist() == [0, 1, 1]
+    assert scores.keys.tolist() == [11, 11, 22]
+    assert scores.map_revisions.tolist() == [9, 1, 1]
+    assert scores.counts.tolist() == [2, 1, 1]
     assert store.remove_agent("ant").tolist() == [11]
     assert store.agents() == ("bee",)
-    assert len(store.words("ant")) == 0
+    assert len(store.batch("ant")) == 0
     assert store.remove_agent("nobody").tolist() == []
 
 
@@ -100,12 +100,12 @@ def test_reading_some_voxels_is_reading_all_and_choosing(store: FusionStore) -> 
     store.put(said("ant", 1, {11: 2, 22: 3, 33: 0}))
     store.put(said("bee", 1, {22: 1}))
     wanted = np.array([33, 22, 99, 22], np.int64)
-    for agent_id, words in store.table(wanted).items():
-        expected = select_keys(store.words(agent_id), wanted)
+    for agent_id, words in store.batches(wanted).items():
+        expected = select_keys(store.batch(agent_id), wanted)
         assert words.keys.tolist() == expected.keys.tolist()
         assert words.gaussians.means_m.tobytes() == expected.gaussians.means_m.tobytes()
-    assert store.stakes(wanted).keys.tolist() == [22, 33, 22]
-    assert len(store.stakes(np.zeros(0, np.int64)).keys) == 0
+    assert store.scores(wanted).keys.tolist() == [22, 33, 22]
+    assert len(store.scores(np.zeros(0, np.int64)).keys) == 0
 
 
 def test_an_empty_message_changes_nothing(store: FusionStore) -> None:
@@ -143,7 +143,7 @@ def test_threads_may_put_at_once(store: FusionStore) -> None:
         thread.start()
     for thread in threads:
         thread.join()
-    assert store.stakes().map_revisions.tolist() == [19] * 6
+    assert store.scores().map_revisions.tolist() == [19] * 6
 
 
 def test_a_sqlite_store_survives_being_closed_and_opened(tmp_path: Path) -> None:
@@ -154,7 +154,7 @@ def test_a_sqlite_store_survives_being_closed_and_opened(tmp_path: Path) -> None
     store.set_mission_config(MissionConfig("m", "w", 0.1))
     store.close()
     again = SqliteStore(path)
-    assert again.words("ant").counts.tolist() == [2]
+    assert again.batch("ant").counts.tolist() == [2]
     assert again.sessions() == (SessionRecord("one", "ant"),)
     assert again.mission_config() == MissionConfig("m", "w", 0.1)
     again.close()
@@ -189,7 +189,7 @@ def test_what_was_acknowledged_survives_a_kill(tmp_path: Path) -> None:
     child.stdout.close()
     child.wait()
     store = SqliteStore(path)
-    words = store.words("ant")
+    words = store.batch("ant")
     assert set(range(101, 101 + acknowledged)) <= set(words.keys.tolist())
     assert store.highest_map_revision("ant") in (acknowledged, acknowledged + 1)
     assert words.counts.tolist()[0] == 3
@@ -230,7 +230,7 @@ def _newer_schema(path: Path) -> None:
     db.close()
 
 
-@pytest.mark.parametrize(("spoil", "message"), [(_damaged, "undamaged"), (_newer_schema, "schema version 1, got 77")])
+@pytest.mark.parametrize(("spoil", "message"), [(_damaged, "undamaged"), (_newer_schema, "schema version 2, got 77")])
 def test_a_damaged_or_newer_store_is_one_clear_error(
     tmp_path: Path, spoil: Callable[[Path], None], message: str
 ) -> None:
@@ -258,11 +258,11 @@ def test_a_second_server_on_the_same_file_is_told_so(tmp_path: Path) -> None:
 def test_a_full_disk_refuses_the_message_and_keeps_the_rest(tmp_path: Path) -> None:
     store = SqliteStore(tmp_path / "store.sqlite", max_bytes=200_000)
     store.put(said("ant", 1, {11: 3}))
-    with pytest.raises(StorageError, match="no room left"):
+    with pytest.raises(StorageError, match="no space left"):
         store.put(said("ant", 2, {11: 1, 22: 10_000}))
-    assert store.words("ant").counts.tolist() == [3]
+    assert store.batch("ant").counts.tolist() == [3]
     store.put(said("ant", 3, {11: 2}))
-    assert store.words("ant").counts.tolist() == [2]
+    assert store.batch("ant").counts.tolist() == [2]
     store.close()
 
 

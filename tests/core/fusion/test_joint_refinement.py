@@ -11,7 +11,7 @@ from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.errors import InvalidInputError, QuotaError
 from gausslite.fusion.joint_refinement import RefineProgress, RefineSettings, refine
-from gausslite.fusion.keyframes import KeyframePool, AgentKeyframe
+from gausslite.fusion.keyframes import AgentKeyframe, KeyframePool
 from gausslite.optimize.density import DensitySettings
 from gausslite.optimize.rates import ONLINE_RATES
 from gausslite.render.cpu import CpuRasterizer
@@ -86,7 +86,7 @@ def test_gaussians_come_to_rest_between_views_that_contradict_each_other() -> No
 
 
 def test_what_stands_in_front_of_the_map_teaches_nothing() -> None:
-    with pytest.raises(InvalidInputError, match="1 of which none does"):
+    with pytest.raises(InvalidInputError, match="1 but none does"):
         refine(patch(0.2), [view(1, 250, depth_m=0.5)], ReferenceRasterizer(), QUICK, always)
 
 

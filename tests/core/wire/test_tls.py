@@ -16,11 +16,11 @@ from fusion_running import GRID, team
 from sample_gaussians import plain_gaussians
 from serving import serving
 
+from gausslite.cli.health_check import main as ask_health
 from gausslite.domain.voxel_operations import group_by_voxel
 from gausslite.errors import InvalidInputError, NotPermittedError, UnavailableError
 from gausslite.task.rules import RuleParser
 from gausslite.wire.clients import FusionClient, ParserClient
-from gausslite.cli.health_check import main as ask_health
 from gausslite.wire.spool import Spool
 from gausslite.wire.tls import Tls
 from gausslite.wire.uplink import Uplink

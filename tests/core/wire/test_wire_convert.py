@@ -167,14 +167,14 @@ def test_a_map_block_is_checked() -> None:
     update = convert.map_update_from_message(block, DEFAULT_LIMITS, first=True)
     assert update.winners == ("b", "a")
     assert update.grid == grid
-    assert update.words is not None
-    assert update.words.keys.tolist() == [5, 9]
+    assert update.batch is not None
+    assert update.batch.keys.tolist() == [5, 9]
     for winner in ([1], [1, 2]):
         block.provenance.winner[:] = winner
         with pytest.raises(InvalidInputError, match="provenance"):
             convert.map_update_from_message(block, DEFAULT_LIMITS, first=True)
     nothing = convert.map_update_from_message(gaussians_pb2.MapBlock(revision=4, last=True), DEFAULT_LIMITS, first=True)
-    assert nothing.words is None
+    assert nothing.batch is None
 
 
 def test_a_box_survives_and_knows_what_it_holds() -> None:

@@ -87,7 +87,7 @@ def test_a_refinement_without_anything_to_learn_from_is_refused() -> None:
             list(t.client.refine())
         behind = np.diag([1.0, -1.0, -1.0, 1.0])
         t.client.contribute_keyframes(session, [frame(1, CAMERA, behind)])
-        with pytest.raises(InvalidInputError, match="of which none does"):
+        with pytest.raises(InvalidInputError, match="but none does"):
             list(t.client.refine())
 
 

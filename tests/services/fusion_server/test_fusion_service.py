@@ -178,7 +178,7 @@ def test_a_full_store_ends_the_stream_and_the_server_goes_on(tmp_path: Path) -> 
         with pytest.raises(grpc.RpcError) as caught:
             list(t.stub.ContributeSubsets(iter([request(session, said("ant", 1, {c: [1] * 50 for c in range(100)}))])))
         assert caught.value.code() is grpc.StatusCode.RESOURCE_EXHAUSTED
-        assert "no room left" in caught.value.details()
+        assert "no space left" in caught.value.details()
         assert t.say(session, said("ant", 2, {0: [1]}))[0].status == ACCEPTED
     store.close()
 

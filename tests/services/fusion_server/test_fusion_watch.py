@@ -13,7 +13,7 @@ from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.joint_refinement import RefineSettings
 from gausslite.fusion.limits import FusionSettings
 from gausslite.fusion.memory_store import MemoryStore
-from gausslite.fusion.store import MissionConfig
+from gausslite.fusion.mission_config import MissionConfig
 from gausslite.render.reference import ReferenceRasterizer
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.v1.gaussians_pb2 import MapBlock
@@ -75,4 +75,4 @@ def test_a_watcher_that_missed_too_much_gets_a_snapshot() -> None:
         assert block.snapshot
         assert group_by_voxel(block).keys.tolist() == keys(3).tolist()
 
-    watching(FusionSettings(grid=GRID, remembered_vanished=1), body)
+    watching(FusionSettings(grid=GRID, max_removed_voxels=1), body)

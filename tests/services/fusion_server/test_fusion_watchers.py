@@ -27,18 +27,18 @@ def test_a_watcher_gets_the_snapshot_and_then_what_changes() -> None:
         first = next(watch)
         assert first.snapshot
         assert first.last
-        assert first.words.keys.tolist() == keys(0, 1).tolist()
+        assert first.batch.keys.tolist() == keys(0, 1).tolist()
         assert first.winners == ("ant", "ant")
         t.say(bee, said("bee", 1, {0: [1], 1: [2]}))
         second = next(watch)
         assert not second.snapshot
-        assert second.words.keys.tolist() == keys(1).tolist()
+        assert second.batch.keys.tolist() == keys(1).tolist()
         assert second.winners == ("bee",)
         t.say(ant, said("ant", 2, {0: []}))
         assert next(watch).winners == ("bee",)
         t.client.leave(bee, forget=True)
         third = next(watch)
-        assert dict(zip(third.words.keys.tolist(), third.words.counts.tolist(), strict=True)) == {
+        assert dict(zip(third.batch.keys.tolist(), third.batch.counts.tolist(), strict=True)) == {
             keys(0)[0]: 0,
             keys(1)[0]: 1,
         }
@@ -47,12 +47,12 @@ def test_a_watcher_gets_the_snapshot_and_then_what_changes() -> None:
         summed_up = next(late)
         assert not summed_up.snapshot
         assert summed_up.revision == third.revision
-        assert summed_up.words.counts.tolist() == [0, 1]
+        assert summed_up.batch.counts.tolist() == [0, 1]
         late.close()
         current = t.client.watch(third.revision)
         nothing = next(current)
         assert nothing.last
-        assert nothing.words is None
+        assert nothing.batch is None
         current.close()
 
 
@@ -61,11 +61,11 @@ def test_a_watcher_of_a_region_sees_that_region_alone() -> None:
         session = t.client.join("ant", GRID).session_id
         t.say(session, said("ant", 1, {0: [1], 5: [1]}))
         watch = t.client.watch(region=AxisAlignedBox((0.4, 0.0, 0.0), (0.6, 0.1, 2.0)))
-        assert next(watch).words.keys.tolist() == keys(5).tolist()
+        assert next(watch).batch.keys.tolist() == keys(5).tolist()
         t.say(session, said("ant", 2, {0: []}))
-        assert next(watch).words is None
+        assert next(watch).batch is None
         t.say(session, said("ant", 3, {5: []}))
-        assert next(watch).words.counts.tolist() == [0]
+        assert next(watch).batch.counts.tolist() == [0]
         watch.close()
         upside_down = pb.WatchFusedMapRequest()
         upside_down.region.min_m.x = 1.0
@@ -84,7 +84,7 @@ def test_a_revision_of_another_life_is_out_of_range() -> None:
 def follow(updates: Iterator[MapUpdate], held: VoxelBatch) -> VoxelBatch:
     """What is held after the next revision."""
     for update in updates:
-        held = update.over(held)
+        held = update.apply_to(held)
         if update.last:
             break
     return held
@@ -130,4 +130,4 @@ def test_a_large_map_comes_in_several_blocks_of_one_revision() -> None:
         assert len(blocks) > 1
         assert len({block.revision for block in blocks}) == 1
         assert [block.last for block in blocks] == [False] * (len(blocks) - 1) + [True]
-        assert np.concatenate([block.words.keys for block in blocks]).tolist() == keys(*range(3000)).tolist()
+        assert np.concatenate([block.batch.keys for block in blocks]).tolist() == keys(*range(3000)).tolist()

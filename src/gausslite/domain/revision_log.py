@@ -1,0 +1,58 @@
+"""Record at which revision of a map each voxel last changed."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Iterable
+
+import numpy as np
+from jaxtyping import Int64
+from numpy import ndarray
+
+from gausslite.errors import RevisionGoneError
+
+MAX_REMOVED_VOXELS = 100_000
+
+
+class RevisionLog:
+    """The last change of every voxel of a map; a watcher reads from it what it has missed.
+
+    The log is bounded by the map, plus the latest `max_removed` voxels that became empty. A watcher that misses an
+    older removal has to begin with a snapshot. `first_revision` must exceed all revisions from before a restart.
+    """
+
+    def __init__(self, first_revision: int, max_removed: int = MAX_REMOVED_VOXELS) -> None:
+        self._revision = self._oldest = first_revision
+        self._max_removed = max_removed
+        self._changed_at: dict[int, int] = {}
+        self._removed_at: OrderedDict[int, int] = OrderedDict()
+
+    @property
+    def revision(self) -> int:
+        """The map's current revision."""
+        return self._revision
+
+    def record(self, changed: Iterable[int], removed: Iterable[int], revision: int) -> None:
+        """Set the current revision, at which these voxels changed or became empty."""
+        self._revision = revision
+        for key in changed:
+            self._removed_at.pop(key, None)
+            self._changed_at[key] = revision
+        for key in removed:
+            del self._changed_at[key]
+            self._removed_at[key] = revision
+            if len(self._removed_at) > self._max_removed:
+                _, dropped_revision = self._removed_at.popitem(last=False)
+                self._oldest = max(self._oldest, dropped_revision)
+
+    def changed_since(self, revision: int) -> Int64[ndarray, " c"]:
+        """Return the keys of the voxels that changed or became empty after this revision, ascending.
+
+        Raises RevisionGoneError if the revision is from before a restart, or older than a removal no longer recorded.
+        """
+        if not self._oldest <= revision <= self._revision:
+            raise RevisionGoneError(
+                f"since_revision: expected {self._oldest} to {self._revision}, or 0 for a snapshot, got {revision}"
+            )
+        logs = (self._changed_at, self._removed_at)
+        return np.array(sorted(key for log in logs for key, at in log.items() if at > revision), np.int64)
