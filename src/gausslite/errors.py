@@ -1,8 +1,8 @@
-"""Every error GaussLite raises on purpose; knows neither gRPC nor exit codes."""
+"""All errors that GaussLite raises deliberately; independent of gRPC and of exit codes."""
 
 
 class GaussLiteError(Exception):
-    """Base of all deliberate errors. The message is one line: what, what came, what would be right."""
+    """Base of all deliberate errors. The message is one line: the name, what was expected, what was received."""
 
 
 class InvalidInputError(GaussLiteError):
@@ -18,7 +18,7 @@ class PoseError(InvalidInputError):
 
 
 class TaskError(InvalidInputError):
-    """The task text is empty, too long or names nothing."""
+    """The task text is empty, too long or contains no object."""
 
 
 class DatasetError(InvalidInputError):
@@ -26,7 +26,7 @@ class DatasetError(InvalidInputError):
 
 
 class ModelFileError(InvalidInputError):
-    """A model file is missing, damaged or of another kind than expected."""
+    """A model file is missing, damaged or of an unexpected kind."""
 
 
 class MapFileError(InvalidInputError):
@@ -38,40 +38,40 @@ class CodecError(InvalidInputError):
 
 
 class ChecksumError(GaussLiteError):
-    """Encoded bytes do not match their checksum: they were damaged on the way."""
+    """Bytes do not match their checksum: they were damaged in transfer or storage."""
 
 
 class SessionUnknownError(GaussLiteError):
-    """The server does not know this session (it restarted, or the agent left)."""
+    """The server has no such session: it restarted, or the agent left."""
 
 
 class MismatchError(GaussLiteError):
-    """Two parties disagree on the grid, the world frame or the mission."""
+    """Two parties use different voxel grids, world frames, missions or settings."""
 
 
 class RevisionGoneError(GaussLiteError):
-    """A revision was asked for that is no longer kept."""
+    """The requested revision is no longer stored."""
 
 
 class QuotaError(GaussLiteError):
-    """A size or count exceeds what the receiver is willing to hold."""
+    """A size or count exceeds a limit of the receiver."""
 
 
 class NotPermittedError(GaussLiteError):
-    """The caller may not act for this agent, here or at whatever stands before the server."""
+    """The caller is not authorised to act for this agent."""
 
 
 class UnavailableError(GaussLiteError):
-    """A service is starting, draining or cannot be reached."""
+    """A service is starting, draining or unreachable."""
 
 
 class LanguageModelError(GaussLiteError):
-    """A language model failed, took too long, or answered what is no task graph."""
+    """A language model failed, timed out, or did not return a task graph."""
 
 
 class StorageError(GaussLiteError):
-    """Durable storage refused a write (disk full, folder not writable)."""
+    """Durable storage refused a write, for example because the disk is full or the folder is not writable."""
 
 
 class KernelError(GaussLiteError):
-    """A rasterizer backend is not available or cannot run here."""
+    """A rasterizer backend is not available on this machine."""

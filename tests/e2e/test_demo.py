@@ -93,7 +93,7 @@ def test_a_recordings_robots_register_and_refine_as_the_demo_was_told(tmp_path: 
     command = [sys.executable, "-m", "gausslite", "demo", *SMALL, *map(str, tasks), *told, "--out", str(out)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=280)
     assert done.returncode == 0, done.stderr
-    assert "each held-out view's pose and colours fitted" in done.stdout
+    assert "pose and exposure of each held-out view were fitted" in done.stdout
     report = json.loads((out / "report.json").read_text())
     assert DepthRegistration.parse(report["colour_camera"]) == DepthRegistration.parse(camera)
     assert report["view_error"] == "0.01,0.5,0.1,0.03"

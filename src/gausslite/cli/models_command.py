@@ -1,4 +1,4 @@
-"""`gausslite models`: which model files are of use, bring them here whole, and say what a file is."""
+"""`gausslite models`: list, download, verify and inspect model files for detection and segmentation."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from gausslite.config.environment import MODELS_URL_VARIABLE
 from gausslite.errors import InvalidInputError
 
 if TYPE_CHECKING:
@@ -17,15 +18,13 @@ if TYPE_CHECKING:
     from gausslite.models.download import Progress
     from gausslite.models.fetch import FetchedModel
 
-_BASE_URL = "GAUSSLITE_MODELS_URL"
-
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add list, fetch, verify and inspect with their options."""
     actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
-    _add_list(actions.add_parser("list", help="the files that are of use, and which of them are here"))
-    _add_fetch(actions.add_parser("fetch", help="bring files over HTTPS; goes on where it was cut off"))
-    verify = actions.add_parser("verify", help="check files; exit code 2 when one is not what it should be")
+    _add_list(actions.add_parser("list", help="list the usable files, and which of them are downloaded"))
+    _add_fetch(actions.add_parser("fetch", help="download files over HTTPS; resumes interrupted downloads"))
+    verify = actions.add_parser("verify", help="check files; exit code 2 if one is damaged or another file")
     verify.add_argument("files", metavar="FILE", type=Path, nargs="+")
     _add_catalogue(verify)
     verify.set_defaults(run=_verify)
@@ -42,19 +41,23 @@ def _add_list(parser: argparse.ArgumentParser) -> None:
 
 def _add_fetch(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("names", metavar="NAME", nargs="+", help="names that `gausslite models list` prints")
-    parser.add_argument("--base-url", metavar="URL", help=f"where the files lie (default: ${_BASE_URL})")
-    parser.add_argument("--sha256", metavar="HEX", help="the file's (default: the catalogue's, else SHA256SUMS')")
+    parser.add_argument("--base-url", metavar="URL", help=f"address of the files (default: ${MODELS_URL_VARIABLE})")
+    parser.add_argument(
+        "--sha256", metavar="HEX", help="expected checksum (default: the catalogue's, else that in SHA256SUMS)"
+    )
     _add_catalogue(parser)
     _add_folder(parser)
     parser.set_defaults(run=_fetch)
 
 
 def _add_catalogue(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--catalogue", metavar="FILE.toml", type=Path, help="your own list of files")
+    parser.add_argument("--catalogue", metavar="FILE.toml", type=Path, help="another list of files")
 
 
 def _add_folder(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--folder", metavar="DIR", type=Path, default=Path("models"), help="(default: models)")
+    parser.add_argument(
+        "--folder", metavar="DIR", type=Path, default=Path("models"), help="folder of the files (default: %(default)s)"
+    )
 
 
 def _entries(options: argparse.Namespace) -> tuple[ModelEntry, ...]:
@@ -65,9 +68,9 @@ def _entries(options: argparse.Namespace) -> tuple[ModelEntry, ...]:
 
 def _list(options: argparse.Namespace) -> int:
     for entry in _entries(options):
-        here = "here" if (options.folder / entry.file_name).is_file() else "-"
+        state = "local" if (options.folder / entry.file_name).is_file() else "-"
         pinned = f"SHA-256 {entry.sha256[:12]}…" if entry.sha256 else "not pinned"
-        print(f"{entry.name:16} {here:5} {entry.purpose} ({entry.licence}, {pinned}, at most {entry.max_mib} MiB)")
+        print(f"{entry.name:16} {state:5} {entry.purpose} ({entry.licence}, {pinned}, at most {entry.max_mib} MiB)")
     return 0
 
 
@@ -75,11 +78,11 @@ def _fetch(options: argparse.Namespace) -> int:
     from gausslite.models.catalogue import entry_named
     from gausslite.models.fetch import fetch
 
-    base_url = options.base_url or os.environ.get(_BASE_URL)
+    base_url = options.base_url or os.environ.get(MODELS_URL_VARIABLE)
     if not base_url:
-        raise InvalidInputError(f"--base-url: expected the address where the files lie, or {_BASE_URL}; got neither")
+        raise InvalidInputError(f"--base-url: expected the address of the files, or {MODELS_URL_VARIABLE}; got neither")
     if options.sha256 is not None and len(options.names) > 1:
-        raise InvalidInputError(f"--sha256: expected one file to hold it against, got {len(options.names)}")
+        raise InvalidInputError(f"--sha256: expected one file for it, got {len(options.names)}")
     known = _entries(options)
     for entry in [entry_named(known, name) for name in options.names]:
         with _bar(entry.file_name) as progress:
@@ -111,24 +114,24 @@ def _inspect(options: argparse.Namespace) -> int:
 
 
 def _assurance(fetched: FetchedModel) -> str:
-    """What is known of a file that came over the network, said as plainly as what is not."""
+    """Return how the checksum of a downloaded file was verified, or that it was not."""
     if fetched.checksum_source:
-        return f"verified: its SHA-256 is the one that {fetched.checksum_source} names"
+        return f"verified: its SHA-256 is that of {fetched.checksum_source}"
     return (
-        f"not verified: nobody named its SHA-256 beforehand; it is {fetched.sha256}, compare it with its maker's "
-        "(it is written down in SHA256SUMS, which holds the file to it from now on)"
+        f"not verified: no expected SHA-256 is given; compare {fetched.sha256} with the publisher's "
+        "(SHA256SUMS now lists it, and later commands check the file against it)"
     )
 
 
 @contextmanager
 def _bar(label: str) -> Iterator[Progress]:
-    """A progress bar over bytes, on standard error."""
+    """Show a progress bar of bytes on stderr."""
     from tqdm import tqdm
 
     with tqdm(desc=label, unit="B", unit_scale=True, mininterval=0.5) as bar:
 
-        def show(have: int, total: int | None) -> None:
+        def show(done: int, total: int | None) -> None:
             bar.total = total
-            bar.update(have - bar.n)
+            bar.update(done - bar.n)
 
         yield show

@@ -1,4 +1,4 @@
-"""`gausslite parse`: show how a task sentence is understood."""
+"""`gausslite parse`: print the task graph of a sentence."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Parse and print."""
+    """Parse the sentence and print its graph. Returns the exit code."""
     graph = open_parser(backend_settings(options, os.environ)).parse(options.text)
     print(json.dumps(as_json(graph)) if options.json else _as_text(graph))
     return 0
 
 
 def as_json(graph: TaskGraph) -> dict[str, object]:
-    """The stable JSON form of a task graph."""
+    """Return the stable JSON form of a task graph."""
     return {
         "targets": list(graph.targets),
         "anchors": list(graph.anchors),

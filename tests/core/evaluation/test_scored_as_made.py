@@ -39,13 +39,13 @@ def test_the_report_beside_a_map_says_how_it_is_scored(
         return json.loads(said.out), said.err
 
     scores, told = score()
-    assert told == f"as the report beside map.ply says: --register-depth {CAMERA} --fit-views\n"
+    assert told == f"from the report next to map.ply: --register-depth {CAMERA} --fit-views\n"
     assert scores == score("--register-depth", CAMERA, "--fit-views")[0]
     raw, told = score("--register-depth", CAMERA, "--no-fit-views")
     assert (scores["fitted"], raw["fitted"], told) == (True, False, "")
     (made.parent / "report.json").write_text("[]")
     assert read_report(made.parent) == {}
-    assert "looking for its colour camera" in score()[1]
+    assert "the registration is estimated now" in score()[1]
 
 
 def test_frames_that_are_held_out_are_those_that_eval_scores(

@@ -95,10 +95,10 @@ def test_the_command_lists_fetches_verifies_and_inspects(tmp_path, capsys, monke
         monkeypatch.setenv("GAUSSLITE_MODELS_URL", base)
         command = ["models", "fetch", "tiny", "--catalogue", str(catalogue), "--folder", str(folder)]
         assert main(command) == 0
-        assert "tiny.onnx: not verified: nobody named its SHA-256 beforehand" in capsys.readouterr().err
+        assert "tiny.onnx: not verified: no expected SHA-256 is given" in capsys.readouterr().err
         assert main([*command, "--sha256", hashlib.sha256(shelf.data).hexdigest()]) == 0
         first = capsys.readouterr()
-        assert "tiny.onnx: verified: its SHA-256 is the one that --sha256 names" in first.err
+        assert "tiny.onnx: verified: its SHA-256 is that of --sha256" in first.err
         assert first.out == f"{folder / 'tiny.onnx'}\n"
     path = str(folder / "tiny.onnx")
     assert main(["models", "list", "--catalogue", str(catalogue), "--folder", str(folder)]) == 0
@@ -107,7 +107,7 @@ def test_the_command_lists_fetches_verifies_and_inspects(tmp_path, capsys, monke
     said = capsys.readouterr().out
     for expected in (
         path,
-        "here",
+        "local",
         "the checksum in SHA256SUMS and a whole YOLO-seg or FastSAM network",
         "images [1, 3, 64, 64] float",
         "CPU",
