@@ -24,7 +24,7 @@ if TYPE_CHECKING:
         map_sequence,
         open_calibrated,
         open_sequence,
-        render,
+        render_view,
         save_ply,
     )
     from gausslite.calibration.pose_exposure_prior import PoseExposurePrior
@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from gausslite.domain.frame import Frame
     from gausslite.domain.gaussians import Gaussians
     from gausslite.domain.region import BallRegion
+    from gausslite.domain.voxel_operations import empty_batch
     from gausslite.errors import GaussLiteError
     from gausslite.mission.settings import MissionSettings, PerceptionSettings, SceneInfo
     from gausslite.wire.clients import AgentClient, FusionClient
@@ -51,7 +52,7 @@ _MODULES = {
         "map_sequence",
         "open_calibrated",
         "open_sequence",
-        "render",
+        "render_view",
         "save_ply",
     ),
     "gausslite.calibration.pose_exposure_prior": ("PoseExposurePrior",),
@@ -61,6 +62,7 @@ _MODULES = {
     "gausslite.domain.frame": ("Frame",),
     "gausslite.domain.gaussians": ("Gaussians",),
     "gausslite.domain.region": ("BallRegion",),
+    "gausslite.domain.voxel_operations": ("empty_batch",),
     "gausslite.errors": ("GaussLiteError",),
     "gausslite.mission.settings": ("MissionSettings", "PerceptionSettings", "SceneInfo"),
     "gausslite.wire.clients": ("AgentClient", "FusionClient"),
@@ -87,11 +89,12 @@ __all__ = [
     "Source",
     "Tls",
     "create_mapper",
+    "empty_batch",
     "load_ply",
     "map_sequence",
     "open_calibrated",
     "open_sequence",
-    "render",
+    "render_view",
     "save_ply",
 ]
 

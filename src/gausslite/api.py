@@ -180,7 +180,7 @@ def load_ply(path: str | Path) -> Gaussians:
     return read_ply(Path(path))
 
 
-def render(
+def render_view(
     gaussians: Gaussians,
     camera: Camera,
     T_world_camera: Float64[ndarray, "4 4"],

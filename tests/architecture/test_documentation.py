@@ -1,0 +1,110 @@
+"""The documentation: links resolve, README's commands exist, and code names in backticks are in the sources."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+REQUIRED_IN_README = ("docs/glossary.md", "docs/paper.md", "docs/dependencies.md", "ARCHITECTURE.md", "CONTRIBUTING.md")
+EXTERNAL_LINK = re.compile(r"^[a-z]+:")
+PROGRAMS = {
+    "gausslite": "gausslite",
+    "gausslite-agent": "gausslite_agent",
+    "gausslite-fusion-server": "gausslite_fusion_server",
+    "gausslite-parser": "gausslite_parser",
+}
+SUB_COMMANDS = ("map", "demo", "parse", "eval", "fuse")
+BENCHMARKS = ("raster", "loop", "gpu", "parser", "perception", "quality", "ablation", "retask")
+
+
+def pages() -> list[Path]:
+    done = subprocess.run(["git", "ls-files", "*.md"], cwd=ROOT, capture_output=True, text=True)
+    if done.returncode != 0:
+        pytest.skip("not a git checkout")
+    return [ROOT / line for line in done.stdout.splitlines() if (ROOT / line).is_file()]
+
+
+def without_code(text: str) -> str:
+    """Return the text without fenced blocks and inline code."""
+    return re.sub(r"`[^`\n]*`", "", re.sub(r"^```.*?^```", "", text, flags=re.MULTILINE | re.DOTALL))
+
+
+def anchors(page: Path) -> set[str]:
+    """Return the anchors of a page's headings, as GitHub derives them."""
+    headings = re.findall(r"^#+ (.+)$", re.sub(r"^```.*?^```", "", page.read_text(), flags=re.M | re.S), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+def test_relative_links_resolve() -> None:
+    broken = []
+    for page in pages():
+        for link in re.findall(r"\]\(([^)\s]+)\)", without_code(page.read_text())):
+            target, _, anchor = link.partition("#")
+            if EXTERNAL_LINK.match(link):
+                continue
+            path = (page.parent / target).resolve() if target else page
+            if not path.exists() or (anchor and anchor not in anchors(path)):
+                broken.append(f"{page.relative_to(ROOT)}: {link}")
+    assert not broken
+
+
+def test_readme_links_the_main_pages() -> None:
+    readme = (ROOT / "README.md").read_text()
+    assert [page for page in REQUIRED_IN_README if f"({page})" not in readme] == []
+
+
+def test_every_page_of_docs_is_linked_from_readme() -> None:
+    readme = (ROOT / "README.md").read_text()
+    assert [page.name for page in sorted((ROOT / "docs").glob("*.md")) if f"(docs/{page.name})" not in readme] == []
+
+
+def test_files_named_in_pages_exist() -> None:
+    """Paths in backticks exist, in the repository, next to the page, or in the package that the page describes."""
+    missing = []
+    for page in pages():
+        bases = (
+            ROOT,
+            page.parent,
+            ROOT / "src",
+            ROOT / "src" / "gausslite",
+            page.parent / "src",
+            *page.parent.glob("gausslite_*"),
+        )
+        names = re.findall(r"`((?:[\w.-]+/)*[\w.-]+\.(?:py|proto|sh|cpp|h|pyi))`", page.read_text())
+        absent = sorted({name for name in names if not any((base / name).exists() for base in bases)})
+        missing += [f"{page.relative_to(ROOT)}: {name}" for name in absent]
+    assert not missing
+
+
+@pytest.fixture(scope="module")
+def known_flags() -> set[str]:
+    """All flags in the --help of all programs."""
+    commands = [["gausslite", name, "--help"] for name in SUB_COMMANDS]
+    commands += [["gausslite", "bench", name, "--help"] for name in BENCHMARKS]
+    commands += [["gausslite", "models", name, "--help"] for name in ("fetch", "verify", "list", "inspect")]
+    commands += [[program, "--help"] for program in PROGRAMS if program != "gausslite"]
+    flags: set[str] = set()
+    for program, *arguments in commands:
+        done = subprocess.run(
+            [sys.executable, "-m", PROGRAMS[program], *arguments], capture_output=True, text=True, timeout=60
+        )
+        assert done.returncode == 0, done.stderr
+        flags |= set(re.findall(r"--[a-z][\w-]*", done.stdout))
+    return flags
+
+
+def test_flags_named_in_pages_exist(known_flags: set[str]) -> None:
+    others = {"--check", "--editable", "--no-index", "--build", "--python", "--masks"}  # of pip, docker and our tools
+    unknown = []
+    for page in pages():
+        text = page.read_text()
+        code = re.findall(r"`([^`\n]+)`", re.sub(r"^```.*?^```", "", text, flags=re.M | re.S))
+        code += re.findall(r"^```(?:sh|toml)?\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+        flags = {flag for part in code for flag in re.findall(r"(?<![\w-])--[a-z][a-z-]*", part)}
+        unknown += [f"{page.relative_to(ROOT)}: {flag}" for flag in sorted(flags - known_flags - others)]
+    assert not unknown

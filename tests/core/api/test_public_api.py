@@ -1,0 +1,113 @@
+"""The public API: lazy imports, the same maps as the command line, and refused combinations."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import gausslite as gl
+from gausslite.cli.main import main
+from gausslite.errors import DatasetError, InvalidInputError, MapFileError, PoseError
+
+FRAMES, SIZE = "0:6", (160, 120)
+TASK = "Pick up the mug on the table"
+
+
+@pytest.fixture(scope="module")
+def home() -> gl.Source:
+    pytest.importorskip("embreex", reason="simulated homes need the extra sim")
+    return gl.open_sequence("sim:home")
+
+
+def test_importing_the_package_loads_nothing_heavy() -> None:
+    code = (
+        "import sys, gausslite; dir(gausslite); gausslite.GaussLiteError;"
+        "print(*[name for name in ('numpy', 'cv2', 'torch', 'grpc', 'gausslite.api') if name in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split() == []
+
+
+def test_every_public_name_is_importable_and_documented() -> None:
+    for name in gl.__all__:
+        assert getattr(gl, name).__doc__, name
+    assert set(gl.__all__) <= set(dir(gl))
+    with pytest.raises(AttributeError, match="no_such_name"):
+        _ = gl.no_such_name
+
+
+def test_the_package_is_typed() -> None:
+    assert (Path(gl.__file__).parent / "py.typed").is_file()
+
+
+@pytest.mark.parametrize("options", [["--task", TASK], []], ids=["task", "uniform"])
+def test_maps_have_the_same_bits_as_the_command_line(home: gl.Source, options: list[str], tmp_path: Path) -> None:
+    command = ["map", "sim:home", "--frames", FRAMES, "--size", "160x120", "--out", str(tmp_path / "cli"), *options]
+    assert main(command) == 0
+    result = gl.map_sequence(home, options[1] if options else None, frames=FRAMES, size=SIZE)
+    gl.save_ply(tmp_path / "api.ply", result.gaussians)
+    assert (tmp_path / "api.ply").read_bytes() == (tmp_path / "cli" / "map.ply").read_bytes()
+    report = json.loads((tmp_path / "cli" / "report.json").read_text())
+    assert {key: report[key] for key in ("frames", "iterations")} == {
+        key: result.report[key] for key in ("frames", "iterations")
+    }
+
+
+def test_regions_steer_the_map_like_a_task(home: gl.Source) -> None:
+    mug = home.regions()["mug"]
+    result = gl.map_sequence(home, regions=[mug], frames=FRAMES, size=SIZE)
+    assert 0 < result.gaussians.active.sum() < len(result.gaussians)
+
+
+def test_live_frames_are_mapped_one_by_one(home: gl.Source) -> None:
+    mapper = gl.create_mapper(gl.SceneInfo.of(home), TASK)
+    outcomes = [mapper.process(home.frame(i, SIZE)) for i in range(2)]
+    assert [outcome.skipped for outcome in outcomes] == [None, None]
+    assert len(mapper.gaussians()) == outcomes[-1].gaussians
+
+
+def test_a_saved_map_is_loaded_and_rendered(home: gl.Source, tmp_path: Path) -> None:
+    result = gl.map_sequence(home, frames=FRAMES, size=SIZE, settings=gl.MissionSettings(max_gaussians=5000))
+    gl.save_ply(tmp_path / "map.ply", result.gaussians)
+    loaded = gl.load_ply(tmp_path / "map.ply")
+    np.testing.assert_array_equal(loaded.means_m, result.gaussians.means_m)
+    frame = home.frame(2, SIZE)
+    image = gl.render_view(loaded, frame.camera, frame.T_world_camera, threads=1)
+    assert image.rgb.shape == (120, 160, 3)
+    assert image.depth_m.shape == image.alpha.shape == (120, 160)
+    assert np.abs(image.rgb - frame.rgb / 255.0).mean() < 0.15
+    seen = (frame.depth_m > 0) & (image.depth_m > 0)
+    assert np.median(np.abs(image.depth_m - frame.depth_m)[seen]) < 0.1
+
+
+def test_a_task_and_regions_together_are_refused(home: gl.Source) -> None:
+    with pytest.raises(InvalidInputError, match="either a task or regions"):
+        gl.map_sequence(home, TASK, regions=[gl.BallRegion((0.0, 0.0, 0.0), 1.0)])
+
+
+def test_a_detector_without_a_task_is_refused(home: gl.Source, tmp_path: Path) -> None:
+    with pytest.raises(InvalidInputError, match="a task for the detector"):
+        gl.map_sequence(home, perception=gl.PerceptionSettings(model=tmp_path / "model.onnx"))
+
+
+def test_errors_name_the_value(home: gl.Source, tmp_path: Path) -> None:
+    with pytest.raises(DatasetError, match="missing"):
+        gl.open_sequence(tmp_path / "missing")
+    with pytest.raises(MapFileError, match=r"no\.ply"):
+        gl.load_ply(tmp_path / "no.ply")
+    empty = gl.Gaussians.empty()
+    with pytest.raises(PoseError, match="T_world_camera"):
+        gl.render_view(empty, home.camera, np.zeros((4, 4)))
+
+
+def test_a_simulated_home_needs_no_calibration(home: gl.Source) -> None:
+    calibrated = gl.open_calibrated("sim:home")
+    assert calibrated.pose_prior.is_exact
+    assert calibrated.notes == ()
+    assert calibrated.source.depth_registered == home.depth_registered
