@@ -1,11 +1,11 @@
-"""The mappers others compare with, as settings of this engine: same cap, same poses, as many views.
+"""Baseline mappers as settings of this engine, with the same cap, poses and number of views. None follows a task.
 
-Each seeds, scales, weighs its loss and controls density as its released configuration does. What those leave to the
-hardware is the engine's: Adam's rates (ONLINE_RATES: the customary ones trail by decibels in so few iterations),
-seeds thinned as the cap nears, clones and halves that look like their parent, refined views where they are asked for,
-and the views to train on: the 24 latest keyframes and, where the task policy has 24 frames that show its region, 24 of
-any, spread over the mission as well. The scale of MonoGS' seeds and the number of SplaTAM's were varied
-(docs/quality.md). None of them knows a task.
+Seeding, scales, loss weights and density control follow each system's released configuration. Everything else is
+common to all policies: Adam's rates (ONLINE_RATES; in so few iterations the released rates lose several decibels), the
+density limit of seeds near the cap, clone and split that preserve appearance, pose refinement, and the views to train
+on. The task policy trains on the 24 most recent keyframes and 24 frames that show the ROI; the baselines train on the
+24 most recent keyframes and 24 others, spread over the mission. Two values were tuned in the baselines' favour
+(docs/quality.md): the initial scale of MonoGS and the number of SplaTAM's seeds.
 """
 
 from __future__ import annotations
@@ -17,26 +17,31 @@ from gausslite.optimize.density import DensitySettings
 from gausslite.render.rasterizer import LossWeights
 
 _NO_TASK = Components(sb=False, mvo=True, roi=False, sis=False, gfd=False)
-_NEVER = math.inf
+_NO_DENSIFICATION = DensitySettings(min_mean_gradient=math.inf)
 
 
 def uniform_policy() -> MapperSettings:
-    """Uniform seeds and full-image training, with this engine's own density control."""
+    """Return uniform seeding and full-image training with this engine's density control."""
     return MapperSettings(components=_NO_TASK)
 
 
 def gaussian_slam_policy() -> MapperSettings:
-    """Yugay et al. 2023: uniform seeds where alpha < 0.6, scale = neighbour distance, 7 iterations, prune alone."""
+    """Return Gaussian-SLAM (Yugay et al. 2023).
+
+    Uniform seeds where alpha < 0.6, scale = neighbour distance, 7 iterations, prune only.
+    """
     return MapperSettings(
         components=_NO_TASK,
         optimization=OptimizationSettings(warmup_iterations=7, active_iterations=0),
-        density=DensitySettings(min_mean_gradient=_NEVER),
+        density=_NO_DENSIFICATION,
     )
 
 
 def splatam_policy() -> MapperSettings:
-    """Keetha et al. 2024: spheres of a pixel's width, every fourth pixel of the first frame, then at most 2000 a frame
-    of 320x240 where alpha < 0.5 or depth errs by 50 times its median; no clone, no split.
+    """Return SplaTAM (Keetha et al. 2024).
+
+    Isotropic Gaussians of one pixel's width: every fourth pixel of the first frame, then at most 2000 per frame of
+    320x240, where alpha < 0.5 or depth errs by 50 times its median; no clone, no split.
     """
     return MapperSettings(
         components=_NO_TASK,
@@ -44,13 +49,15 @@ def splatam_policy() -> MapperSettings:
             first_frame_seeds=76_800, later_seeds=8_000, min_alpha=0.5, depth_error_factor=50.0, init_scale=0.5
         ),
         optimization=OptimizationSettings(loss=LossWeights(colour=0.4, depth=1.0, ssim=0.1), isotropic=True),
-        density=DensitySettings(min_mean_gradient=_NEVER),
+        density=_NO_DENSIFICATION,
     )
 
 
 def monogs_policy() -> MapperSettings:
-    """Matsuki et al. 2024, RGB-D: sparse small seeds everywhere (one pixel in 32, later in 64; point size 0.05 shrinks
-    the squared neighbour distance), no SSIM, clone and split where the gradient asks.
+    """Return MonoGS with RGB-D input (Matsuki et al. 2024).
+
+    Small sparse seeds everywhere (one pixel in 32, later in 64; point size 0.05 scales the squared neighbour distance),
+    no SSIM term, clone and split by gradient.
     """
     return MapperSettings(
         components=_NO_TASK,

@@ -1,4 +1,4 @@
-"""Frames and random generators as named arrays, so that a mapping run can be saved and go on elsewhere bit for bit."""
+"""Frames, relevance maps and random generators as named arrays, for checkpoints with bit-identical continuation."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from gausslite.domain.relevance import RelevanceMap
 from gausslite.domain.state import State, get_array, get_floats, int_array
 from gausslite.errors import MapFileError
 
-_LOW = (1 << 64) - 1
+_LOW_64_BITS = (1 << 64) - 1
 
 
 def frame_state(frame: Frame) -> dict[str, NDArray[Any]]:
-    """A frame, its camera and pose."""
+    """Return a frame with its camera and pose as named arrays."""
     camera = frame.camera
     return {
         "stamp": int_array(frame.index, frame.capture_time_ns),
@@ -31,7 +31,7 @@ def frame_state(frame: Frame) -> dict[str, NDArray[Any]]:
 
 
 def frame_from_state(state: State) -> Frame:
-    """The frame again; its arrays are copies. Raises MapFileError, InvalidInputError."""
+    """Return a copy of the frame that `frame_state` described. Raises MapFileError, InvalidInputError."""
     index, capture_time_ns = (int(value) for value in get_array(state, "stamp", (2,), np.int64))
     depth_m = get_array(state, "depth_m", (None, None), np.float32).copy()
     fx_px, fy_px, cx_px, cy_px = get_floats(state, "camera", 4)
@@ -42,12 +42,12 @@ def frame_from_state(state: State) -> Frame:
 
 
 def relevance_state(relevance: RelevanceMap) -> dict[str, NDArray[Any]]:
-    """What of a frame was relevant."""
+    """Return weight and target of a relevance map as named arrays."""
     return {"weight": relevance.weight, "target": relevance.target}
 
 
 def relevance_from_state(state: State, frame: Frame) -> RelevanceMap:
-    """The relevance of this frame again. Raises MapFileError, ShapeError."""
+    """Return the relevance map of this frame. Raises MapFileError, ShapeError."""
     weight = get_array(state, "weight", frame.depth_m.shape, np.float32).copy()
     if not ((weight >= 0) & (weight <= 1)).all():
         raise MapFileError("state weight: expected values in [0, 1], got others")
@@ -55,21 +55,21 @@ def relevance_from_state(state: State, frame: Frame) -> RelevanceMap:
 
 
 def generator_state(rng: np.random.Generator) -> UInt64[ndarray, "6"]:
-    """Where a PCG64 generator stands: its two numbers of 128 bits in halves, and the half draw it may have kept."""
+    """Return the state of a PCG64 generator: state and increment as 64-bit halves, flag and value of a spare draw."""
     state = rng.bit_generator.state
     numbers = state["state"]["state"], state["state"]["inc"]
-    halves = [half for number in numbers for half in (number >> 64, number & _LOW)]
+    halves = [half for number in numbers for half in (number >> 64, number & _LOW_64_BITS)]
     return np.array([*halves, state["has_uint32"], state["uinteger"]], np.uint64)
 
 
-def restore_generator(rng: np.random.Generator, words: UInt64[ndarray, "6"]) -> None:
-    """Put a PCG64 generator where another one stood. Raises MapFileError for numbers that no generator has."""
-    state_high, state_low, step_high, step_low, has_half, half = (int(word) for word in words)
-    if has_half > 1 or half >> 32 or not step_low & 1:
-        raise MapFileError("state generator: expected the numbers of a PCG64 generator, got others")
+def restore_generator(rng: np.random.Generator, values: UInt64[ndarray, "6"]) -> None:
+    """Set a PCG64 generator to a state of `generator_state`. Raises MapFileError if the values are not valid."""
+    state_high, state_low, inc_high, inc_low, has_uint32, uinteger = (int(value) for value in values)
+    if has_uint32 > 1 or uinteger >> 32 or not inc_low & 1:
+        raise MapFileError("state generator: expected the state of a PCG64 generator, got other values")
     rng.bit_generator.state = {
         "bit_generator": "PCG64",
-        "state": {"state": state_high << 64 | state_low, "inc": step_high << 64 | step_low},
-        "has_uint32": has_half,
-        "uinteger": half,
+        "state": {"state": state_high << 64 | state_low, "inc": inc_high << 64 | inc_low},
+        "has_uint32": has_uint32,
+        "uinteger": uinteger,
     }

@@ -23,7 +23,7 @@ from gausslite.mapping.keyframes import Keyframe, WindowView, window_view
 from gausslite.mapping.seeding import Seeder, SeedingContext, Seeds
 from gausslite.mapping.settings import MapperSettings
 from gausslite.mapping.stages import CountedScheduler, SkippableStage, Stage, StageScheduler
-from gausslite.mapping.task_change import clear_roi, vote_on_relevance
+from gausslite.mapping.task_change import clear_roi, update_roi_evidence
 from gausslite.mapping.training import Trainer
 from gausslite.mapping.view_refinement import ViewRefiner
 from gausslite.optimize.splat_table import SplatTable
@@ -160,7 +160,7 @@ class GaussianMapper:
         require_array("relevance weight", relevance.weight, keyframe.frame.depth_m.shape, np.float32)
         frame, table = keyframe.frame, self._table
         self._keyframes.set_evaluated(replace(keyframe, relevance=relevance, evaluated=True), self._window_view)
-        vote_on_relevance(table, frame, relevance)
+        update_roi_evidence(table, frame, relevance)
         if not relevance.roi.any():
             return 0
         seeds = self._seeder.seed_roi(frame, relevance, table.means_m[table.active])

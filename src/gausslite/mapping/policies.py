@@ -1,4 +1,4 @@
-"""Name the ways to spend a budget, for the task or evenly over everything, and what can be switched off in them."""
+"""Named mapping policies (task, paper, uniform and the baselines), and the flags that disable their parts."""
 
 from __future__ import annotations
 
@@ -8,19 +8,60 @@ from dataclasses import replace
 
 from gausslite.errors import InvalidInputError
 from gausslite.mapping.baselines import gaussian_slam_policy, monogs_policy, splatam_policy, uniform_policy
-from gausslite.mapping.settings import MapperSettings
+from gausslite.mapping.settings import (
+    ActivePhase,
+    KeyframeSettings,
+    MapperSettings,
+    OptimizationSettings,
+    SeedingSettings,
+)
+from gausslite.optimize.density import DensitySettings
+from gausslite.render.rasterizer import AdamSettings, LossWeights
 
 
 def task_policy() -> MapperSettings:
-    """All five components of the paper, and what came to stay beyond it."""
+    """Return the default policy: the paper's five components and the extensions of EXTENSION_FLAGS."""
     return MapperSettings()
 
 
+def paper_policy() -> MapperSettings:
+    """Return the method as published. Where the paper gives no value, Gaussian-SLAM's or SplaTAM's release does.
+
+    Seeding (III-C): N seeds per frame (60 000, later 10 000, at 640x480), ρ = 0.40, where rendered alpha < 0.6 or
+    depth errs by 40 times its median; no density limit for ROI or background seeds, no reserve for the background.
+    SIS (III-C.2): opacity 0.5, m = 0.5 in the ROI and 0.7 in the background. GFD (III-C.3): weights E + ε.
+    ROI (III-D.1): 2 warm-up and 6 active iterations; the active phase renders and updates active Gaussians only, with
+    a binary mask, and the loss is divided by the mask's pixels.
+    MVO (III-D.2): every 5th frame is a keyframe and the 24 most recent ones train the map; Adam with Gaussian-SLAM's
+    constant learning rates; standard clone, split and prune without a growth limit; the map is shown as trained.
+    Poses are an external input (III-C): combine this policy with an exact `MapperSettings.pose_prior`, the default.
+    """
+    return MapperSettings(
+        seeding=SeedingSettings(
+            roi_min_alpha=0.6,
+            roi_pixels_per_gaussian=1.0,
+            fill_sparse_roi=False,
+            min_density_ratio=1.0,
+            background_share=0.0,
+        ),
+        keyframes=KeyframeSettings(long_term_keyframes=0, roi_context_weight=0.0, pose_updates_per_frame=0),
+        optimization=OptimizationSettings(
+            active_phase=ActivePhase.ACTIVE_ONLY,
+            loss=LossWeights(),
+            adam=AdamSettings(),
+            decay_after_updates=math.inf,
+            ema_updates=0.0,
+        ),
+        density=DensitySettings(max_growth=1.0),
+    )
+
+
 TASK = "task"
-"""The one policy that asks what matters; the others map everything alike."""
+"""Name of the default policy."""
 
 POLICIES: dict[str, Callable[[], MapperSettings]] = {
     TASK: task_policy,
+    "paper": paper_policy,
     "uniform": uniform_policy,
     "gaussian-slam": gaussian_slam_policy,
     "splatam": splatam_policy,
@@ -29,31 +70,56 @@ POLICIES: dict[str, Callable[[], MapperSettings]] = {
 
 
 def policy(name: str) -> MapperSettings:
-    """The settings of a named policy. Raises InvalidInputError for a name that is not in POLICIES."""
+    """Return the settings of a named policy. Raises InvalidInputError if the name is not in POLICIES."""
     if name not in POLICIES:
         raise InvalidInputError(f"policy: expected one of {', '.join(POLICIES)}, got {name!r}")
     return POLICIES[name]()
 
 
+def follows_task(name: str) -> bool:
+    """True if the map of a named policy depends on the task. Raises InvalidInputError."""
+    return policy(name).components.follow_task
+
+
 PAPER_FLAGS = ("sb", "mvo", "roi", "sis", "gfd")
-"""The paper's components (Sec. III-C, III-D), in the order of its ablation."""
+"""The paper's components (Sec. III-C, III-D), in the order of its ablation (Table III)."""
+
+
+def _without_long_term_keyframes(settings: MapperSettings) -> MapperSettings:
+    return replace(settings, keyframes=replace(settings.keyframes, long_term_keyframes=0))
+
+
+def _without_roi_context(settings: MapperSettings) -> MapperSettings:
+    return replace(settings, keyframes=replace(settings.keyframes, roi_context_weight=0.0))
+
+
+def _without_background_reserve(settings: MapperSettings) -> MapperSettings:
+    return replace(settings, seeding=replace(settings.seeding, background_share=0.0))
+
+
+def _without_ema(settings: MapperSettings) -> MapperSettings:
+    return replace(settings, optimization=replace(settings.optimization, ema_updates=0.0))
+
+
+def _without_lr_decay(settings: MapperSettings) -> MapperSettings:
+    return replace(settings, optimization=replace(settings.optimization, decay_after_updates=math.inf))
+
 
 EXTENSION_FLAGS: dict[str, Callable[[MapperSettings], MapperSettings]] = {
-    "long-term-keyframes": lambda settings: replace(settings, keyframes=replace(settings.keyframes, long_term_keyframes=0)),
-    "roi-context": lambda settings: replace(settings, keyframes=replace(settings.keyframes, roi_context_weight=0.0)),
-    "background-reserve": lambda settings: replace(settings, seeding=replace(settings.seeding, background_share=0.0)),
-    "ema": lambda settings: replace(settings, optimization=replace(settings.optimization, ema_updates=0.0)),
-    "lr-decay": lambda settings: replace(
-        settings, optimization=replace(settings.optimization, decay_after_updates=math.inf)
-    ),
+    "long-term-keyframes": _without_long_term_keyframes,
+    "roi-context": _without_roi_context,
+    "background-reserve": _without_background_reserve,
+    "ema": _without_ema,
+    "lr-decay": _without_lr_decay,
 }
-"""What came beyond the paper, in the order of our ablation, and how each is switched off."""
+"""Extensions of the paper's method that can be disabled, in the order of the ablation in docs/quality.md."""
 
 ABLATION_FLAGS = (*PAPER_FLAGS, *EXTENSION_FLAGS)
+"""All names that `disable` accepts."""
 
 
 def disable(settings: MapperSettings, names: Collection[str]) -> MapperSettings:
-    """These settings with the named parts switched off. Raises InvalidInputError for a name that is none of them."""
+    """Return these settings with the named parts disabled. Raises InvalidInputError if a name is unknown."""
     unknown = sorted(set(names) - set(ABLATION_FLAGS))
     if unknown:
         raise InvalidInputError(f"disable: expected names among {', '.join(ABLATION_FLAGS)}, got {', '.join(unknown)}")

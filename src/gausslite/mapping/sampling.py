@@ -1,4 +1,4 @@
-"""Choose pixels: weighted, without repeats, freely or one in each cell of a grid (SIS and GFD, Sec. III-C)."""
+"""Sample pixels by weight without replacement, freely or one per grid cell (SIS and GFD, Sec. III-C.2 and C.3)."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ _LUMINANCE = np.array([0.299, 0.587, 0.114], np.float32) / 255.0
 
 
 def edge_magnitude(rgb: UInt8[ndarray, "h w 3"]) -> Float32[ndarray, "h w"]:
-    """E(u, v) = ‖∇I(u, v)‖: Sobel magnitude of the luminance in [0, 1], per pixel."""
+    """Return E(u, v) = ‖∇I(u, v)‖, the Sobel gradient magnitude of the luminance in [0, 1] (Sec. III-C.3)."""
     luminance = rgb @ _LUMINANCE
-    # Sobel's kernels sum to 8 times the slope
+    # the Sobel kernel returns 8 times the derivative
     dx = cv2.Sobel(luminance, cv2.CV_32F, 1, 0, ksize=3, scale=0.125)
     dy = cv2.Sobel(luminance, cv2.CV_32F, 0, 1, ksize=3, scale=0.125)
     return np.asarray(cv2.magnitude(dx, dy))
@@ -22,21 +22,21 @@ def edge_magnitude(rgb: UInt8[ndarray, "h w 3"]) -> Float32[ndarray, "h w"]:
 def sample_pixels(
     pool: Bool[ndarray, "h w"], count: int, weight: Float32[ndarray, "h w"], rng: np.random.Generator
 ) -> Int64[ndarray, " n"]:
-    """Up to `count` pixels of the pool (flat indices, ascending), drawn by weight without repeats."""
+    """Return up to `count` pixels of the pool (flat indices, ascending), drawn by weight without replacement."""
     pixels = np.flatnonzero(pool)
     if len(pixels) <= count:
         return pixels
-    arrival = _arrival(pixels, weight, rng)
+    arrival = _arrival_times(pixels, weight, rng)
     return np.sort(pixels[np.argpartition(arrival, count)[:count]]) if count > 0 else pixels[:0]
 
 
 def sample_stratified(
     pool: Bool[ndarray, "h w"], count: int, weight: Float32[ndarray, "h w"], rng: np.random.Generator
 ) -> Int64[ndarray, " n"]:
-    """Up to `count` pixels of the pool (flat indices, ascending), one in each cell of a square grid of cells.
+    """Return up to `count` pixels of the pool (flat indices, ascending), at most one per cell of a square grid.
 
-    Over a full pool the grid has √count x √count cells (Sec. III-C.2); where only part of the image is in the pool
-    the cells shrink, so that about `count` of them still meet it. Inside a cell pixels are drawn by weight.
+    If the pool is the whole image, the grid has √count x √count cells (Sec. III-C.2). For a smaller pool the cells are
+    smaller, so that about `count` of them contain pool pixels. Within a cell, the pixel is drawn by weight.
     """
     pixels = np.flatnonzero(pool)
     if len(pixels) <= count:
@@ -47,20 +47,23 @@ def sample_stratified(
     side = int(np.ceil(np.sqrt(count * pool.size / len(pixels))))
     rows, columns = np.divmod(pixels, width)
     cells = (rows * side // height) * side + columns * side // width
-    arrival = _arrival(pixels, weight, rng)
+    arrival = _arrival_times(pixels, weight, rng)
     first_in_cell = np.full(side * side, -1, np.int64)
-    # of repeated cells the last assignment stands: the earliest arrival
-    late_to_early = np.argsort(-arrival, kind="stable")
-    first_in_cell[cells[late_to_early]] = pixels[late_to_early]
+    # NumPy keeps the last assignment to a cell: the pixel of the earliest arrival
+    latest_first = np.argsort(-arrival, kind="stable")
+    first_in_cell[cells[latest_first]] = pixels[latest_first]
     chosen = first_in_cell[first_in_cell >= 0]
     if len(chosen) > count:
         chosen = rng.choice(chosen, count, replace=False)
     return np.sort(chosen)
 
 
-def _arrival(
+def _arrival_times(
     pixels: Int64[ndarray, " n"], weight: Float32[ndarray, "h w"], rng: np.random.Generator
 ) -> Float32[ndarray, " n"]:
-    """Times of independent arrivals with rates `weight`: taking the earliest draws by weight without repeats."""
+    """Return exponential arrival times with rates `weight`.
+
+    The earliest arrivals are a sample by weight without replacement.
+    """
     arrival: Float32[ndarray, " n"] = rng.standard_exponential(len(pixels), np.float32) / weight.ravel()[pixels]
     return arrival

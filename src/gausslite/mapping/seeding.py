@@ -1,4 +1,4 @@
-"""Turn pixels of a frame into new Gaussians, more and finer ones where the task is (Sec. III-C: SB, SIS, GFD)."""
+"""Seed new Gaussians from pixels of a frame, by relevance to the task (Sec. III-C: SB, SIS, GFD)."""
 
 from __future__ import annotations
 
@@ -19,12 +19,15 @@ from gausslite.mapping.settings import Components, SeedingSettings
 from gausslite.mapping.spacing import initial_spacing_m, neighbour_distance_px
 
 _REFERENCE_PIXELS = 640 * 480
+"""Image size of the seed counts in SeedingSettings."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SeedingContext:
-    """What seeding needs to know of the map: how many Gaussians still fit, how it looks from the frame (None while it
-    is empty), and where its active Gaussians are.
+    """State of the map before seeding.
+
+    free_slots: Gaussians that still fit under the cap. rendered: the map rendered from the frame's pose, None if the
+    map is empty. active_means_m: means of the active Gaussians.
     """
 
     free_slots: int
@@ -34,15 +37,15 @@ class SeedingContext:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Seeds:
-    """New Gaussians: those of the ROI budget, served first when room is short, and the rest."""
+    """New Gaussians: N_ROI seeds of the ROI, inserted first, and N_bg of the background (without SB: of any pixel)."""
 
     roi: Gaussians
-    rest: Gaussians
+    background: Gaussians
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Pool:
-    """Pixels to draw from, how many, and how."""
+    """Candidate pixels, the number to draw, and whether to draw one per grid cell (SIS)."""
 
     pixels: Bool[ndarray, "h w"]
     count: int
@@ -50,7 +53,7 @@ class _Pool:
 
 
 class Seeder:
-    """Draws each frame's seeds; its random generator is the mapper's."""
+    """Draws the seeds of each frame with the mapper's random generator."""
 
     def __init__(self, settings: SeedingSettings, components: Components, rng: np.random.Generator) -> None:
         self._settings = settings
@@ -58,88 +61,97 @@ class Seeder:
         self._rng = rng
 
     def seed(self, frame: Frame, relevance: RelevanceMap, context: SeedingContext) -> Seeds:
-        """New Gaussians for this frame."""
+        """Return new Gaussians for this frame."""
         weight = self._pixel_weight(frame)
-        roi_pool, rest_pool = self._pools(frame, relevance, context)
+        roi_pool, background_pool = self._split_budget(frame, relevance, context)
         return Seeds(
-            roi=self._gaussians(frame, relevance, roi_pool, weight),
-            rest=self._gaussians(frame, relevance, rest_pool, weight),
+            roi=self._draw(frame, relevance, roi_pool, weight),
+            background=self._draw(frame, relevance, background_pool, weight),
         )
 
     def seed_roi(self, frame: Frame, relevance: RelevanceMap, active_means_m: Float32[ndarray, "n 3"]) -> Gaussians:
-        """New Gaussians where the map is too coarse for the region in an earlier frame; as many as a first frame gets.
+        """Return new Gaussians for ROI pixels of an earlier frame that have too few active ones (after a task change).
 
-        What surrounds the region was seeded when the frame was mapped.
+        The budget is the ROI share of a first frame; without SB there are none.
         """
         settings = self._settings
         if not self._components.sb:
             return Gaussians.empty()
-        coarse = undersampled_roi(frame, relevance.roi, active_means_m, settings.roi_pixels_per_gaussian)
-        pixels = coarse & (frame.depth_m <= settings.max_depth_m)
+        sparse = undersampled_roi(frame, relevance.roi, active_means_m, settings.roi_pixels_per_gaussian)
+        pixels = sparse & (frame.depth_m <= settings.max_depth_m)
         budget = round(settings.roi_share * settings.first_frame_seeds * pixels.size / _REFERENCE_PIXELS)
-        return self._gaussians(frame, relevance, self._roi_pool(pixels, budget), self._pixel_weight(frame))
+        return self._draw(frame, relevance, self._roi_pool(pixels, budget), self._pixel_weight(frame))
 
-    def _pools(self, frame: Frame, relevance: RelevanceMap, context: SeedingContext) -> tuple[_Pool, _Pool]:
-        """SB: the ROI share of the seeds is drawn from the region, the rest elsewhere; without SB from one pool."""
+    def _split_budget(self, frame: Frame, relevance: RelevanceMap, context: SeedingContext) -> tuple[_Pool, _Pool]:
+        """SB (Sec. III-C.1): split N into floor(ρN) ROI seeds and the background's; without SB all are background.
+
+        Only pixels that the map does not explain yet are candidates.
+        """
         settings = self._settings
         budget = self._budget(frame, context)
         seedable = (frame.depth_m > 0) & (frame.depth_m <= settings.max_depth_m)
-        roi_open = open_pixels = seedable
+        roi_candidates = candidates = seedable
         if context.rendered is not None:
             behind = rendered_behind(frame, context.rendered, settings.depth_error_factor)
-            open_pixels = seedable & (behind | (context.rendered.alpha < settings.min_alpha))
-            roi_open = seedable & (behind | (context.rendered.alpha < settings.roi_min_alpha))
+            candidates = seedable & (behind | (context.rendered.alpha < settings.min_alpha))
+            roi_candidates = seedable & (behind | (context.rendered.alpha < settings.roi_min_alpha))
         if not self._components.sb:
-            return _Pool(np.zeros_like(seedable), 0, False), self._rest_pool(open_pixels, budget, context.free_slots)
+            no_roi = _Pool(np.zeros_like(seedable), 0, stratified=False)
+            return no_roi, self._background_pool(candidates, budget, context.free_slots)
         roi_budget = int(settings.roi_share * budget)
-        coarse = undersampled_roi(frame, relevance.roi, context.active_means_m, settings.roi_pixels_per_gaussian)
-        roi_pixels = relevance.roi & (roi_open | (coarse & seedable))
-        rest_pixels = open_pixels & ~relevance.roi
-        return self._roi_pool(roi_pixels, roi_budget), self._rest_pool(rest_pixels, budget - roi_budget, context.free_slots)
+        if settings.fill_sparse_roi:
+            sparse = undersampled_roi(frame, relevance.roi, context.active_means_m, settings.roi_pixels_per_gaussian)
+            roi_candidates = roi_candidates | (sparse & seedable)
+        roi_pool = self._roi_pool(relevance.roi & roi_candidates, roi_budget)
+        background_budget = budget - roi_budget
+        return roi_pool, self._background_pool(candidates & ~relevance.roi, background_budget, context.free_slots)
 
     def _roi_pool(self, pixels: Bool[ndarray, "h w"], budget: int) -> _Pool:
-        """No denser than the active Gaussians that the region is to have; its room is made by others."""
-        wanted = int(np.ceil(np.count_nonzero(pixels) / self._settings.roi_pixels_per_gaussian))
-        return _Pool(pixels, min(budget, wanted), False)
+        """Limit the ROI seeds to one per `roi_pixels_per_gaussian` pixels. Eviction frees slots for them."""
+        max_count = int(np.ceil(np.count_nonzero(pixels) / self._settings.roi_pixels_per_gaussian))
+        return _Pool(pixels, min(budget, max_count), stratified=False)
 
-    def _rest_pool(self, pixels: Bool[ndarray, "h w"], budget: int, room: int) -> _Pool:
-        """No denser than leaves room for `reserved_views` more views as open as this whole image would be.
+    def _background_pool(self, pixels: Bool[ndarray, "h w"], budget: int, free_slots: int) -> _Pool:
+        """Limit the density of seeds so that `reserved_views` more full images would fit under the cap.
 
-        So the first views do not use up the cap: as room gets short, seeds get sparser and start larger.
+        Otherwise the first views would fill the map. With fewer free slots, seeds are sparser and start larger.
         """
         settings = self._settings
-        densest = settings.first_frame_seeds / _REFERENCE_PIXELS
-        affordable = room / (settings.reserved_views * pixels.size)
-        density = min(densest, max(affordable, settings.min_density_ratio * densest))
-        return _Pool(pixels, min(budget, int(np.ceil(density * np.count_nonzero(pixels)))), self._components.sis)
+        max_density = settings.first_frame_seeds / _REFERENCE_PIXELS
+        affordable = free_slots / (settings.reserved_views * pixels.size)
+        density = min(max_density, max(affordable, settings.min_density_ratio * max_density))
+        count = min(budget, int(np.ceil(density * np.count_nonzero(pixels))))
+        return _Pool(pixels, count, stratified=self._components.sis)
 
     def _budget(self, frame: Frame, context: SeedingContext) -> int:
-        """N, for this image size."""
+        """Return N, the seed budget of the frame, for this image size."""
         seeds = self._settings.first_frame_seeds if context.rendered is None else self._settings.later_seeds
         return max(1, round(seeds * frame.depth_m.size / _REFERENCE_PIXELS))
 
     def _pixel_weight(self, frame: Frame) -> Float32[ndarray, "h w"]:
-        """GFD: P ∝ E + ε; without it uniform."""
+        """GFD (Sec. III-C.3): return E(u, v) + ε, the sampling weight of each pixel; without GFD it is uniform."""
         if not self._components.gfd:
             return np.ones(frame.depth_m.shape, np.float32)
         edges = edge_magnitude(frame.rgb)
         return edges + np.float32(self._settings.edge_epsilon)
 
-    def _gaussians(
-        self, frame: Frame, relevance: RelevanceMap, pool: _Pool, weight: Float32[ndarray, "h w"]
-    ) -> Gaussians:
+    def _draw(self, frame: Frame, relevance: RelevanceMap, pool: _Pool, weight: Float32[ndarray, "h w"]) -> Gaussians:
+        """Draw pixels from the pool and return their Gaussians."""
         sample = sample_stratified if pool.stratified else sample_pixels
         pixels = sample(pool.pixels, pool.count, weight, self._rng)
         if len(pixels) == 0:
             return Gaussians.empty()
         distance_px = neighbour_distance_px(pixels, pool.pixels, pool.stratified)
         spacing_m = initial_spacing_m(distance_px, frame.depth_m.ravel()[pixels], frame.camera.fx_px)
-        return self._born(frame, relevance, pixels, spacing_m)
+        return self._init_gaussians(frame, relevance, pixels, spacing_m)
 
-    def _born(
+    def _init_gaussians(
         self, frame: Frame, relevance: RelevanceMap, pixels: Int64[ndarray, " n"], spacing_m: Float32[ndarray, " n"]
     ) -> Gaussians:
-        """SIS: scale s0·m, identity rotation, observed colour, and the active flag of the seed's pixel."""
+        """SIS (Sec. III-C.2): scale s0·m, identity rotation, observed colour, active flag a from w at the seed's pixel.
+
+        spacing_m: s0 in metres.
+        """
         settings, count = self._settings, len(pixels)
         active = relevance.roi.ravel()[pixels]
         scale_m = spacing_m * np.float32(settings.init_scale)

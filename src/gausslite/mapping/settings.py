@@ -1,4 +1,4 @@
-"""Everything about mapping that can be chosen, in small sections, each checked once when it is made."""
+"""Settings of a mapping policy, in sections that follow Sec. III-C and III-D; each section is validated once."""
 
 from __future__ import annotations
 
@@ -16,42 +16,48 @@ from gausslite.render.rasterizer import AdamSettings, LossWeights
 
 @dataclass(frozen=True, slots=True)
 class Components:
-    """The paper's five components (Sec. III-C, III-D), each with its own switch."""
+    """The five components of the paper (Sec. III-C, III-D), each of which can be disabled."""
 
     sb: bool = True
-    """ROI seed budgeting: a share of the seeds is reserved for the task's region."""
+    """ROI seed budgeting (SB): reserve a share of the seeds for the ROI."""
     mvo: bool = True
-    """Multi-view optimisation: train on views drawn from a window of keyframes, not on the current one alone."""
+    """Multi-view optimisation (MVO): train on views drawn from a window of keyframes, not only on the current one."""
     roi: bool = True
-    """ROI optimisation: after a short warm-up, train on the task's region only."""
+    """ROI optimisation (ROI): after a short warm-up, train on the ROI only."""
     sis: bool = True
-    """Stratified initial scaling: one background seed a cell, and seeds that start small."""
+    """Stratified initial scaling (SIS): one background seed per grid cell, and small initial scales."""
     gfd: bool = True
-    """Gradient-focused densification: seeds prefer image edges."""
+    """Gradient-focused densification (GFD): draw seeds by image gradient."""
 
     @property
     def follow_task(self) -> bool:
-        """False where none of them asks for the task's region: the map is the same for every task."""
+        """False if the map does not depend on the task."""
         return self.sb or self.roi or self.sis or self.gfd
 
 
 class ActivePhase(StrEnum):
-    """What an active-phase iteration draws and moves; its loss is masked to the region in every case."""
+    """Gaussians that an active-phase iteration renders and updates; the loss is masked to the ROI in every case."""
 
     EXACT = "exact"
-    """Draw every Gaussian in the region's tiles; all of them may move."""
+    """Render and update every Gaussian in the ROI's tiles."""
     FROZEN_BACKGROUND = "frozen-background"
-    """Draw every Gaussian in the region's tiles; only active ones move."""
+    """Render every Gaussian in the ROI's tiles; update the active ones."""
     ACTIVE_ONLY = "active-only"
-    """Draw active Gaussians only: cheaper, but nothing hides the missing background at the region's borders."""
+    """Render and update active Gaussians only (Sec. III-D.1): cheaper, but no background occludes the ROI's border."""
 
 
 @dataclass(frozen=True, slots=True)
 class SeedingSettings:
-    """Where new Gaussians go and how they start (Sec. III-C). Seed counts are for 640x480 and scale with the pixels.
+    """Where new Gaussians are placed and how they are initialised (Sec. III-C).
 
-    roi_scale and background_scale are the paper's multipliers m of s0; init_scale is m without SIS.
-    background_share: what the region's seeds leave of the cap to the background, however large the region is.
+    first_frame_seeds, later_seeds: N for an image of 640x480, scaled with the number of pixels. roi_share: ρ.
+    min_alpha, roi_min_alpha: background and ROI pixels of lower rendered alpha are seeded. depth_error_factor: pixels
+    rendered behind the measured depth by this multiple of the median depth error are seeded. roi_pixels_per_gaussian:
+    ROI pixels per active Gaussian, below which the ROI is dense enough. fill_sparse_roi: seed ROI pixels with fewer
+    active Gaussians too. reserved_views: background seeds leave free slots for this many more images.
+    min_density_ratio: lowest density of background seeds relative to a first frame's. background_share: share of the
+    cap that ROI seeds leave to the background. opacity, roi_scale, background_scale: opacity and the multipliers m of
+    s0 (Sec. III-C.2); init_scale: m without SIS. edge_epsilon: ε of GFD (Sec. III-C.3).
     """
 
     first_frame_seeds: int = 60_000
@@ -60,6 +66,7 @@ class SeedingSettings:
     min_alpha: float = 0.6
     roi_min_alpha: float = 0.9
     roi_pixels_per_gaussian: float = 4.0
+    fill_sparse_roi: bool = True
     reserved_views: float = 4.0
     min_density_ratio: float = 0.1
     background_share: float = 0.3
@@ -92,17 +99,16 @@ class SeedingSettings:
 
 @dataclass(frozen=True, slots=True)
 class KeyframeSettings:
-    """Which frames are kept to train on: every `every`th, the `window` latest of them, and `buffer` of the mission.
+    """Keyframes to train on (Sec. III-D.2) and to keep for joint refinement (Sec. III-E).
 
-    long_term_keyframes: of all frames that show the task's region (of all frames, where no component follows a task) so many
-    more stay ready to train on, spread over the mission; 0 is the paper's window. Each takes as much memory as a frame
-    of the window.
-    roi_context_weight, 0 to 1: what pixels beside the region count in the active phase's loss, in the tiles that it
-    draws anyway; 0 is the paper's binary mask, which lets what stands beside the region move as it likes.
-    pose_updates_per_frame: where views may be wrong (`MapperSettings.pose_prior`) so many of those ready to train on are fitted to the
-    map again with each frame, in turns.
-    max_pixels: of larger images than 1280x720 or so fewer are kept, so that all of them have no more pixels than this;
-    a pixel takes about 13 bytes, 20 where its view may be wrong.
+    every: every `every`th mapped frame is a keyframe. window: most recent keyframes to train on. buffer: keyframes of
+    the whole mission to keep. long_term_keyframes: more frames to train on, spread over the mission, of those that show
+    the ROI (of all frames if no component follows the task); 0 is the paper's window. Each needs as much memory as a
+    keyframe of the window. roi_margin_px: margin around the ROI within which tiles are rendered in the active phase.
+    roi_context_weight: weight in the active phase's loss of pixels outside the ROI but inside its tiles, 0 to 1; 0 is
+    the paper's binary mask. pose_updates_per_frame: keyframes whose pose and exposure are refined again with each frame
+    if `MapperSettings.pose_prior` allows an error. max_pixels: cap on the pixels of all keyframes together, reached
+    with images larger than about 1280x720; a pixel needs 13 bytes, or 20 with refined poses.
     """
 
     every: int = 5
@@ -123,7 +129,7 @@ class KeyframeSettings:
         _require(0 <= weight <= 1, "keyframes roi_context_weight", "0 to 1", weight)
 
     def for_image_size(self, pixels: int) -> KeyframeSettings:
-        """The same with as many images of this size as have room: one of each kind, however large they are."""
+        """Return these settings with as many keyframes as max_pixels allows, at least one of each kind."""
         share = min(1.0, self.max_pixels / (pixels * (self.window + self.long_term_keyframes + self.buffer)))
         return replace(
             self,
@@ -133,26 +139,25 @@ class KeyframeSettings:
         )
 
 
-_ALIKE_IN_BOTH_PHASES = LossWeights(normalise_by_image=True)
+_BALANCED_LOSS = LossWeights(normalise_by_image=True)
 
 
 @dataclass(frozen=True, slots=True)
 class OptimizationSettings:
-    """How a frame trains the map (Sec. III-D): first warm-up iterations on the full image, then active ones.
+    """How a frame trains the map (Sec. III-D): warm-up iterations on full images, then active ones on the ROI.
 
-    loss: by share, so that warm-ups and the active phase, whose masks are small, do not undo each other in Adam.
-    isotropic: Gaussians are made spheres again after every frame.
-    decay_after_updates: where views may be wrong (`MapperSettings.pose_prior`) a Gaussian has the full rates for so many
-    updates, and falling ones after them (`AdamSettings.decay_after_updates`): steps of one size would keep it moving to
-    and fro between what its views say. inf never slows it.
-    ema_updates: the map is shown as the mean of each Gaussian over about its last so many updates, since views
-    that contradict each other move it to and fro; 0 shows it as training left it. Training itself knows no means.
+    loss: weights of Eq. (1), normalised by the image size by default, so that the small masks of the active phase and
+    the full images of the warm-up have comparable steps in Adam. adam: learning rates. decay_after_updates: updates of
+    a Gaussian after which its learning rates decay, if `MapperSettings.pose_prior` allows an error; inf disables the
+    decay. With constant rates, Gaussians would oscillate between views that contradict each other. isotropic: make
+    Gaussians spheres after every frame. ema_updates: time constant, in updates, of the exponential moving average (EMA)
+    of each Gaussian that is shown and saved; 0 shows the trained values. Training itself does not use the EMA.
     """
 
     warmup_iterations: int = 2
     active_iterations: int = 6
     active_phase: ActivePhase = ActivePhase.EXACT
-    loss: LossWeights = _ALIKE_IN_BOTH_PHASES
+    loss: LossWeights = _BALANCED_LOSS
     adam: AdamSettings = ONLINE_RATES
     decay_after_updates: float = 150.0
     isotropic: bool = False
@@ -161,17 +166,21 @@ class OptimizationSettings:
     def __post_init__(self) -> None:
         for name in ("warmup_iterations", "active_iterations"):
             _require(getattr(self, name) >= 0, f"optimization {name}", "at least 0", getattr(self, name))
-        averaged = self.ema_updates
-        _require(0 <= averaged < math.inf, "optimization ema_updates", "at least 0", averaged)
-        _require(self.decay_after_updates > 0, "optimization decay_after_updates", "more than 0", self.decay_after_updates)
+        updates = self.ema_updates
+        _require(0 <= updates < math.inf, "optimization ema_updates", "at least 0", updates)
+        updates = self.decay_after_updates
+        _require(updates > 0, "optimization decay_after_updates", "more than 0", updates)
 
     @property
     def iterations(self) -> int:
-        """Iterations a frame."""
+        """Iterations per frame."""
         return self.warmup_iterations + self.active_iterations
 
     def with_iterations(self, iterations: int) -> OptimizationSettings:
-        """The same proportion of the two phases in this many iterations a frame, and of two at least one a warm-up."""
+        """Return these settings with this many iterations per frame, in the same ratio of the two phases.
+
+        Of two or more iterations, at least one is a warm-up.
+        """
         _require(iterations >= 0, "optimization iterations", "at least 0", iterations)
         warmup = round(iterations * self.warmup_iterations / max(self.iterations, 1))
         if self.warmup_iterations > 0:
@@ -181,9 +190,10 @@ class OptimizationSettings:
 
 @dataclass(frozen=True, slots=True)
 class MapperSettings:
-    """A whole mapping policy. max_gaussians is a hard cap: memory for exactly that many is reserved at the start.
+    """A mapping policy.
 
-    pose_prior: how wrong poses and colours of frames may be; keyframes are refined where it is not 0.
+    max_gaussians: hard cap; memory for exactly this number is allocated at the start. pose_prior: prior of the pose and
+    exposure error of each view; keyframes are refined unless it is exact.
     """
 
     max_gaussians: int = 1_000_000
@@ -200,12 +210,12 @@ class MapperSettings:
 
     @property
     def adam(self) -> AdamSettings:
-        """The optimiser's rates, for views that are trusted or not."""
+        """Adam's settings; the learning rates decay only if the prior allows an error."""
         if self.pose_prior.is_exact:
             return self.optimization.adam
         return replace(self.optimization.adam, decay_after_updates=self.optimization.decay_after_updates)
 
 
-def _require(holds: bool, name: str, wanted: str, came: float) -> None:
-    if not holds:
-        raise InvalidInputError(f"{name}: expected {wanted}, got {came}")
+def _require(valid: bool, name: str, expected: str, value: float) -> None:
+    if not valid:
+        raise InvalidInputError(f"{name}: expected {expected}, got {value}")

@@ -1,8 +1,7 @@
-"""Make the map serve another task: forget what was the region, and learn from earlier views what is now (III-C.1).
+"""Change the task of a growing map: clear the active flags and set them again from re-evaluated keyframes.
 
-A Gaussian is active when more views show it, unoccluded, inside the new region than outside. It keeps its kappa
-whatever the task: kappa says how much training it had as a part of some region, and that stays true. So what was never
-part of one starts at 0, and a region that the robot comes back to counts on from where it stood.
+The paper leaves task changes open (Sec. V). A Gaussian becomes active if more views show it, unoccluded, inside the new
+ROI than outside. It keeps its kappa: kappa counts its active-phase iterations for any task.
 """
 
 from __future__ import annotations
@@ -17,41 +16,44 @@ from gausslite.errors import InvalidInputError
 from gausslite.mapping.coverage import visible_means
 from gausslite.optimize.splat_table import SplatTable
 
-_MOST_VOTES = 100
+_MAX_EVIDENCE = 100
 
 
 @dataclass(frozen=True, slots=True)
 class TaskChangeSettings:
-    """How fast a new task's region is read out of earlier views: keyframes_per_frame at most while a frame is mapped."""
+    """keyframes_per_frame: maximum number of earlier keyframes to re-evaluate with each frame after a task change."""
 
     keyframes_per_frame: int = 3
 
     def __post_init__(self) -> None:
         if self.keyframes_per_frame < 1:
-            raise InvalidInputError(f"retask keyframes_per_frame: expected at least 1, got {self.keyframes_per_frame}")
+            raise InvalidInputError(
+                f"task change keyframes_per_frame: expected at least 1, got {self.keyframes_per_frame}"
+            )
 
 
 @dataclass(frozen=True, slots=True)
 class Reevaluation:
-    """What a frame did for a new task beside being mapped: keyframes looked at again, and Gaussians seeded there."""
+    """Keyframes re-evaluated for a new task while one frame was mapped, and Gaussians seeded from them."""
 
     keyframes: int = 0
     seeded: int = 0
 
 
 def clear_roi(table: SplatTable) -> None:
-    """Nothing is known to be in a region any more; what was is background from now on, and gives way first."""
+    """Mark all Gaussians as background, without a target."""
     table.active[:] = False
     table.target[:] = NO_TARGET
     table.roi_evidence[:] = 0
 
 
-def vote_on_relevance(table: SplatTable, frame: Frame, relevance: RelevanceMap) -> None:
-    """Let one view vote on every Gaussian it sees, and mark those active that more views have inside than outside."""
-    seen, rows, columns = visible_means(frame, table.means_m)
+def update_roi_evidence(table: SplatTable, frame: Frame, relevance: RelevanceMap) -> None:
+    """Count one view's evidence for each visible Gaussian; active are those with more views inside than outside."""
+    visible, rows, columns = visible_means(frame, table.means_m)
     inside = relevance.roi[rows, columns]
-    votes = np.clip(table.roi_evidence[seen] + np.where(inside, 1, -1), -_MOST_VOTES, _MOST_VOTES)
-    table.roi_evidence[seen] = votes
-    table.active[seen] = votes > 0
-    named = np.where(inside, relevance.target[rows, columns], table.target[seen])
-    table.target[seen] = np.where(votes > 0, named, NO_TARGET)
+    evidence = table.roi_evidence[visible] + np.where(inside, 1, -1)
+    evidence = np.clip(evidence, -_MAX_EVIDENCE, _MAX_EVIDENCE)
+    table.roi_evidence[visible] = evidence
+    table.active[visible] = evidence > 0
+    target = np.where(inside, relevance.target[rows, columns], table.target[visible])
+    table.target[visible] = np.where(evidence > 0, target, NO_TARGET)

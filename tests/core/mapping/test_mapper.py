@@ -209,7 +209,7 @@ def test_keyframes_are_offered_for_refinement() -> None:
 def test_policies_by_name() -> None:
     assert policy("task").components == Components()
     assert policy("uniform").components == Components(sb=False, mvo=True, roi=False, sis=False, gfd=False)
-    with pytest.raises(InvalidInputError, match="task, uniform"):
+    with pytest.raises(InvalidInputError, match="task, paper, uniform"):
         policy("lavish")
 
 

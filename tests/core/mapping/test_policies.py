@@ -1,6 +1,9 @@
-"""Policies by name: the baselines map within the same cap, know no task, and say what they start from."""
+"""Named policies keep the cap; baselines follow no task; the paper's policy has the paper's settings."""
 
 from __future__ import annotations
+
+import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,13 +18,15 @@ from gausslite.mapping.policies import (
     POLICIES,
     TASK,
     disable,
+    follows_task,
     policy,
 )
-from gausslite.mapping.settings import Components, KeyframeSettings, MapperSettings
+from gausslite.mapping.settings import ActivePhase, Components, KeyframeSettings, MapperSettings
 from gausslite.mission.settings import MissionSettings
 from gausslite.render.cpu import CpuRasterizer
+from gausslite.render.rasterizer import AdamSettings, LossWeights
 
-BASELINES = sorted(POLICIES.keys() - {TASK})
+BASELINES = sorted(name for name in POLICIES if not follows_task(name))
 
 
 def mapped(settings: MapperSettings, frames: int = 3) -> GaussianMapper:
@@ -41,18 +46,54 @@ def test_every_policy_keeps_the_cap(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", BASELINES)
-def test_baselines_train_every_iteration_on_the_whole_image(name: str) -> None:
+def test_baselines_train_on_full_images_only(name: str) -> None:
     gaussians = mapped(MapperSettings(2000, policy(name).components, policy(name).seeding)).gaussians()
     assert not gaussians.kappa.any()
 
 
-def test_splatam_keeps_its_gaussians_spheres() -> None:
+def test_the_baselines_are_the_policies_without_a_task() -> None:
+    assert sorted(POLICIES.keys() - set(BASELINES)) == ["paper", TASK]
+
+
+def test_the_paper_policy_has_the_settings_of_the_paper() -> None:
+    settings = policy("paper")
+    assert settings.components == Components(sb=True, mvo=True, roi=True, sis=True, gfd=True)
+    seeding, keyframes, optimization = settings.seeding, settings.keyframes, settings.optimization
+    assert (seeding.roi_share, seeding.opacity, seeding.roi_scale, seeding.background_scale) == (0.4, 0.5, 0.5, 0.7)
+    assert (seeding.first_frame_seeds, seeding.later_seeds) == (60_000, 10_000)
+    assert (seeding.min_alpha, seeding.roi_min_alpha, seeding.depth_error_factor) == (0.6, 0.6, 40.0)
+    assert not seeding.fill_sparse_roi
+    assert seeding.background_share == 0.0
+    assert (keyframes.every, keyframes.window, keyframes.long_term_keyframes) == (5, 24, 0)
+    assert keyframes.roi_context_weight == 0.0
+    assert (optimization.warmup_iterations, optimization.active_iterations) == (2, 6)
+    assert optimization.active_phase is ActivePhase.ACTIVE_ONLY
+    assert optimization.loss == LossWeights(colour=0.8, depth=1.0, ssim=0.2, normalise_by_image=False)
+    assert (optimization.ema_updates, settings.adam) == (0.0, AdamSettings())
+    assert settings.adam.decay_after_updates == math.inf
+    assert (settings.density.densify_every, settings.density.prune_every) == (150, 100)
+    assert (settings.density.min_mean_gradient, settings.density.min_opacity) == (2e-4, 0.005)
+    assert settings.pose_prior.is_exact
+
+
+@pytest.mark.parametrize("name", EXTENSION_FLAGS)
+def test_the_paper_policy_has_no_extension(name: str) -> None:
+    assert disable(policy("paper"), {name}) == policy("paper")
+
+
+def test_the_paper_policy_moves_only_active_gaussians_in_the_active_phase() -> None:
+    paper = mapped(replace(policy("paper"), max_gaussians=2000)).gaussians()
+    assert paper.kappa[paper.active].any()
+    assert not paper.kappa[~paper.active].any()
+
+
+def test_splatam_keeps_its_gaussians_isotropic() -> None:
     settings = policy("splatam")
     gaussians = mapped(MapperSettings(2000, optimization=settings.optimization)).gaussians()
     np.testing.assert_allclose(gaussians.scales_m, gaussians.scales_m[:, :1].repeat(3, axis=1), rtol=1e-5)
 
 
-def test_surroundings_change_the_map_and_count_a_little_by_default() -> None:
+def test_roi_context_changes_the_map_and_has_a_small_weight_by_default() -> None:
     plain = mapped(MapperSettings(2000)).gaussians()
     none = mapped(MapperSettings(2000, keyframes=KeyframeSettings(roi_context_weight=0.0))).gaussians()
     some = mapped(MapperSettings(2000, keyframes=KeyframeSettings(roi_context_weight=0.3))).gaussians()
@@ -60,13 +101,13 @@ def test_surroundings_change_the_map_and_count_a_little_by_default() -> None:
     assert not np.array_equal(plain.rgb, none.rgb)
 
 
-def test_an_unknown_policy_is_refused() -> None:
+def test_an_unknown_policy_is_rejected() -> None:
     with pytest.raises(InvalidInputError, match="policy"):
         policy("best")
 
 
 @pytest.mark.parametrize("name", ABLATION_FLAGS)
-def test_a_switch_turns_its_own_part_off_and_no_other(name: str) -> None:
+def test_a_flag_disables_its_own_part_and_no_other(name: str) -> None:
     on, off = policy(TASK), disable(policy(TASK), {name})
     assert off != on
     assert disable(off, {name}) == off
@@ -76,19 +117,20 @@ def test_a_switch_turns_its_own_part_off_and_no_other(name: str) -> None:
 
 @pytest.mark.parametrize("name", ABLATION_FLAGS)
 @pytest.mark.parametrize("iterations", [None, 4])
-def test_a_mission_maps_without_what_is_switched_off(name: str, iterations: int | None) -> None:
+def test_a_mission_maps_with_the_parts_disabled(name: str, iterations: int | None) -> None:
     mission = MissionSettings(disabled=frozenset({name}), iterations=iterations)
     settings = mission.mapper_settings()
     assert disable(settings, {name}) == settings
     assert settings.optimization.iterations == (iterations or policy(TASK).optimization.iterations)
 
 
-def test_with_everything_off_what_is_left_knows_no_task() -> None:
+def test_with_all_flags_disabled_no_component_is_left() -> None:
     bare = disable(policy(TASK), ABLATION_FLAGS)
     assert bare.components == Components(sb=False, mvo=False, roi=False, sis=False, gfd=False)
-    assert disable(policy(TASK), EXTENSION_FLAGS).keyframes == KeyframeSettings(long_term_keyframes=0, roi_context_weight=0.0)
+    keyframes = KeyframeSettings(long_term_keyframes=0, roi_context_weight=0.0)
+    assert disable(policy(TASK), EXTENSION_FLAGS).keyframes == keyframes
 
 
-def test_an_unknown_switch_is_refused() -> None:
+def test_an_unknown_flag_is_rejected() -> None:
     with pytest.raises(InvalidInputError, match=r"disable: expected names among sb, .*, got light, sound"):
         disable(policy(TASK), {"sound", "light", "sb"})

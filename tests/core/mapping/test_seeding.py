@@ -26,11 +26,11 @@ def test_budgeting_splits_the_first_frames_seeds_by_rho() -> None:
     seeds = seeder(sb=True).seed(frame, middle_relevance(frame), EMPTY)
     budget = 60_000 * 64 * 48 / (640 * 480)
     assert len(seeds.roi) == min(int(0.4 * budget), np.count_nonzero(middle_relevance(frame).roi) // 4)
-    assert len(seeds.rest) == pytest.approx(0.6 * budget, rel=0.01)
+    assert len(seeds.background) == pytest.approx(0.6 * budget, rel=0.01)
     assert seeds.roi.active.all()
     assert (seeds.roi.target == 0).all()
-    assert not seeds.rest.active.any()
-    assert (seeds.rest.target == -1).all()
+    assert not seeds.background.active.any()
+    assert (seeds.background.target == -1).all()
 
 
 def test_without_budgeting_there_is_one_pool_and_flags_still_follow_the_pixels() -> None:
@@ -38,18 +38,18 @@ def test_without_budgeting_there_is_one_pool_and_flags_still_follow_the_pixels()
     relevance = middle_relevance(frame)
     seeds = seeder().seed(frame, relevance, EMPTY)
     assert len(seeds.roi) == 0
-    assert seeds.rest.active.mean() == pytest.approx(relevance.roi.mean(), abs=0.05)
+    assert seeds.background.active.mean() == pytest.approx(relevance.roi.mean(), abs=0.05)
 
 
 def test_seeds_lie_on_the_surface_and_carry_its_colour() -> None:
     frame = wall_frame(shift_m=0.5)
-    rest = seeder().seed(frame, RelevanceMap.empty(48, 64), EMPTY).rest
-    np.testing.assert_allclose(rest.means_m[:, 2], 2.0, rtol=1e-6)
-    columns = np.floor((rest.means_m[:, 0] - 0.5) / 2.0 * 64 + 32).astype(int)
-    rows = np.floor(rest.means_m[:, 1] / 2.0 * 64 + 24).astype(int)
-    np.testing.assert_allclose(rest.rgb, frame.rgb[rows, columns] / 255.0, atol=1e-6)
-    np.testing.assert_array_equal(rest.opacities, np.float32(0.5))
-    np.testing.assert_array_equal(rest.quats_wxyz, np.tile([1, 0, 0, 0], (len(rest), 1)))
+    background = seeder().seed(frame, RelevanceMap.empty(48, 64), EMPTY).background
+    np.testing.assert_allclose(background.means_m[:, 2], 2.0, rtol=1e-6)
+    columns = np.floor((background.means_m[:, 0] - 0.5) / 2.0 * 64 + 32).astype(int)
+    rows = np.floor(background.means_m[:, 1] / 2.0 * 64 + 24).astype(int)
+    np.testing.assert_allclose(background.rgb, frame.rgb[rows, columns] / 255.0, atol=1e-6)
+    np.testing.assert_array_equal(background.opacities, np.float32(0.5))
+    np.testing.assert_array_equal(background.quats_wxyz, np.tile([1, 0, 0, 0], (len(background), 1)))
 
 
 def test_initial_scaling_starts_small_and_smaller_in_the_region() -> None:
@@ -59,8 +59,8 @@ def test_initial_scaling_starts_small_and_smaller_in_the_region() -> None:
     scaled = seeder(sb=True, sis=True).seed(frame, relevance, EMPTY)
     np.testing.assert_allclose(np.median(scaled.roi.scales_m), 0.5 * np.median(plain.roi.scales_m), rtol=0.05)
     # a grid spreads its samples: 0.89 instead of 0.73 pitches apart
-    assert np.median(scaled.rest.scales_m) == pytest.approx(0.7 * np.median(plain.rest.scales_m) * 0.89 / 0.73, rel=0.1)
-    assert (scaled.rest.scales_m == scaled.rest.scales_m[:, :1]).all()
+    assert np.median(scaled.background.scales_m) == pytest.approx(0.7 * np.median(plain.background.scales_m) * 0.89 / 0.73, rel=0.1)
+    assert (scaled.background.scales_m == scaled.background.scales_m[:, :1]).all()
 
 
 def test_gradient_focus_prefers_edges() -> None:
@@ -71,7 +71,7 @@ def test_gradient_focus_prefers_edges() -> None:
     shares = []
     for gfd in (False, True):
         few = seeder(SeedingSettings(first_frame_seeds=10_000), gfd=gfd)
-        columns = np.floor(few.seed(frame, nothing, EMPTY).rest.means_m[:, 0] / 2.0 * 128 + 64)
+        columns = np.floor(few.seed(frame, nothing, EMPTY).background.means_m[:, 0] / 2.0 * 128 + 64)
         shares.append(np.mean((columns >= 59) & (columns < 69)))
     assert shares[1] > 3 * shares[0]
 
@@ -80,17 +80,17 @@ def test_later_frames_seed_only_what_the_map_does_not_explain() -> None:
     frame = wall_frame()
     alpha = np.ones((48, 64))
     alpha[:, :10] = 0.3
-    state = SeedingContext(1_000_000, RenderedView.of(rendering_of(alpha, frame.depth_m)), NO_MEANS)
-    rest = seeder().seed(frame, RelevanceMap.empty(48, 64), state).rest
-    assert 0 < len(rest) <= 10_000 * 64 * 48 / (640 * 480)
-    assert (rest.means_m[:, 0] / 2.0 * 64 + 32 < 10).all()
+    state = SeedingContext(1_000_000, RenderedView.from_rendering(rendering_of(alpha, frame.depth_m)), NO_MEANS)
+    background = seeder().seed(frame, RelevanceMap.empty(48, 64), state).background
+    assert 0 < len(background) <= 10_000 * 64 * 48 / (640 * 480)
+    assert (background.means_m[:, 0] / 2.0 * 64 + 32 < 10).all()
 
 
 def test_as_room_gets_short_seeds_get_sparser_and_larger() -> None:
     frame, nothing = wall_frame(), RelevanceMap.empty(48, 64)
-    plenty = seeder(sis=True).seed(frame, nothing, EMPTY).rest
-    short = seeder(sis=True).seed(frame, nothing, SeedingContext(1000, None, NO_MEANS)).rest
-    full = seeder(sis=True).seed(frame, nothing, SeedingContext(0, None, NO_MEANS)).rest
+    plenty = seeder(sis=True).seed(frame, nothing, EMPTY).background
+    short = seeder(sis=True).seed(frame, nothing, SeedingContext(1000, None, NO_MEANS)).background
+    full = seeder(sis=True).seed(frame, nothing, SeedingContext(0, None, NO_MEANS)).background
     assert len(plenty) > 2 * len(short) > 4 * len(full) > 0
     assert np.median(plenty.scales_m) < np.median(short.scales_m) < np.median(full.scales_m)
 
@@ -99,8 +99,8 @@ def test_pixels_without_depth_or_beyond_reach_are_not_seeded() -> None:
     frame = wall_frame()
     frame.depth_m[:, :32] = 0.0
     frame.depth_m[:, 48:] = 11.0
-    rest = seeder(sis=True).seed(frame, RelevanceMap.empty(48, 64), EMPTY).rest
-    np.testing.assert_allclose(rest.means_m[:, 2], 2.0, rtol=1e-6)
+    background = seeder(sis=True).seed(frame, RelevanceMap.empty(48, 64), EMPTY).background
+    np.testing.assert_allclose(background.means_m[:, 2], 2.0, rtol=1e-6)
 
 
 def test_a_surface_drawn_far_behind_the_measured_one_is_found_and_one_in_front_is_not() -> None:
@@ -108,7 +108,7 @@ def test_a_surface_drawn_far_behind_the_measured_one_is_found_and_one_in_front_i
     drawn_m = np.full((48, 64), 2.01, np.float32)
     drawn_m[10:14, 20:24] = 4.0
     drawn_m[30:34, 20:24] = 1.0
-    found = rendered_behind(frame, RenderedView.of(rendering_of(np.ones((48, 64)), drawn_m)), 40.0)
+    found = rendered_behind(frame, RenderedView.from_rendering(rendering_of(np.ones((48, 64)), drawn_m)), 40.0)
     expected = np.zeros((48, 64), np.bool_)
     expected[10:14, 20:24] = True
     np.testing.assert_array_equal(found, expected)
@@ -118,7 +118,7 @@ def test_a_region_with_enough_active_gaussians_is_fine_and_one_without_is_too_co
     frame = wall_frame()
     region = middle_relevance(frame).roi
     np.testing.assert_array_equal(undersampled_roi(frame, region, NO_MEANS, 4.0), region)
-    dense = seeder(SeedingSettings(first_frame_seeds=300_000)).seed(frame, middle_relevance(frame), EMPTY).rest.means_m
+    dense = seeder(SeedingSettings(first_frame_seeds=300_000)).seed(frame, middle_relevance(frame), EMPTY).background.means_m
     assert not undersampled_roi(frame, region, dense, 4.0).any()
     behind = dense + np.array([0.0, 0.0, 1.0], np.float32)
     np.testing.assert_array_equal(undersampled_roi(frame, region, behind, 4.0), region)
@@ -126,10 +126,10 @@ def test_a_region_with_enough_active_gaussians_is_fine_and_one_without_is_too_co
 
 def test_a_region_that_was_mapped_as_background_is_seeded_when_it_becomes_the_tasks() -> None:
     frame = wall_frame()
-    state = SeedingContext(1_000_000, RenderedView.of(rendering_of(np.ones((48, 64)), frame.depth_m)), NO_MEANS)
+    state = SeedingContext(1_000_000, RenderedView.from_rendering(rendering_of(np.ones((48, 64)), frame.depth_m)), NO_MEANS)
     seeds = seeder(sb=True, sis=True).seed(frame, middle_relevance(frame), state)
     assert len(seeds.roi) > 0
-    assert len(seeds.rest) == 0
+    assert len(seeds.background) == 0
 
 
 @pytest.mark.parametrize("wrong", [{"roi_share": 1.5}, {"opacity": 1.0}, {"max_depth_m": 0.0}, {"later_seeds": 0}])
