@@ -1,6 +1,7 @@
 #!/usr/bin/env bash
-# Makes an authority and a certificate for each name, to try encrypted services: deploy/make_certificates.sh FOLDER NAME...
-# A name is a host, a compose service or an agent's --agent-id. An authority that is there already is used again.
+# Create a certificate authority, and a certificate for each name, to test encrypted services:
+#   deploy/make_certificates.sh FOLDER NAME...
+# A name is a host, a compose service or an agent's --agent-id. An existing authority in FOLDER is reused.
 set -euo pipefail
 fail() { echo "make_certificates: $1" >&2; exit 1; }
 [ $# -ge 2 ] || fail "expected FOLDER NAME..."

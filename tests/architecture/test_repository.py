@@ -1,4 +1,4 @@
-"""Promises of the repository itself: README's commands, short files, no machine's secrets."""
+"""Properties of the repository: README's commands, file lengths, module docstrings, no unpickling."""
 
 from __future__ import annotations
 
@@ -24,41 +24,41 @@ def test_readme_has_exactly_the_two_commands() -> None:
     assert re.findall(r"<!-- command: (\w+) -->", readme) == ["demo", "tests"]
 
 
-def test_an_older_python_is_refused_before_pip_searches() -> None:
+def test_older_python_versions_are_refused_before_pip_searches() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())
-    wanted = project["project"]["requires-python"].removeprefix(">=")
+    minimum = project["project"]["requires-python"].removeprefix(">=")
     [refusal] = project["tool"]["scikit-build"]["overrides"]
-    assert refusal["if"] == {"python-version": f"<{wanted}"}
+    assert refusal["if"] == {"python-version": f"<{minimum}"}
     assert refusal["fail"] is True
-    assert f"needs Python {wanted} or newer" in refusal["messages"]["after-failure"]
+    assert f"needs Python {minimum} or newer" in refusal["messages"]["after-failure"]
 
 
-def test_no_source_file_grows_past_reading() -> None:
+def test_source_files_have_at_most_400_lines() -> None:
     sources = [path for path in _tracked("*.py", "*.cpp", "*.h") if "v1" not in path.parts]
     too_long = {str(p.relative_to(ROOT)): n for p in sources if (n := len(p.read_text().splitlines())) > 400}
     assert not too_long
 
 
-def test_every_package_module_says_why_it_exists() -> None:
-    silent = [
+def test_every_module_has_a_docstring() -> None:
+    undocumented = [
         str(path.relative_to(ROOT))
         for path in _tracked("src/*.py", "services/*.py")
         if "v1" not in path.parts and not path.read_text().startswith('"""')
     ]
-    assert not silent
+    assert not undocumented
 
 
-def test_services_is_a_folder_not_a_package() -> None:
+def test_services_is_a_folder_and_not_a_package() -> None:
     assert not list((ROOT / "services").glob("__init__.py"))
     assert not list((ROOT / "services").glob("*/__init__.py"))
 
 
-def test_nothing_is_ever_unpickled() -> None:
-    guilty = [
+def test_nothing_is_unpickled() -> None:
+    offending = [
         str(path.relative_to(ROOT))
         for path in _tracked("src/*.py", "services/*.py")
         if re.search(
             r"\b(pickle|marshal|shelve)\b|allow_pickle=True|torch\.load\((?!.*weights_only=True)", path.read_text()
         )
     ]
-    assert not guilty
+    assert not offending
