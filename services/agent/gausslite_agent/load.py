@@ -1,4 +1,4 @@
-"""What a robot does when frames come too fast, and when none comes."""
+"""Settings for load: what happens if frames arrive too fast, and if none arrive."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from enum import StrEnum
 from gausslite.errors import InvalidInputError
 
 
-class Drops(StrEnum):
-    """Which frame gives way when the queue is full."""
+class QueuePolicy(StrEnum):
+    """Which waiting frame a full queue drops."""
 
     OLDEST = "oldest"
     NEWEST = "newest"
@@ -17,17 +17,17 @@ class Drops(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class LoadSettings:
-    """What a robot does when frames come too fast, and when none comes.
+    """Length and policy of the frame queue, and training while it is empty.
 
-    idle_iterations is how many it may train, after each frame, while no other waits; such maps depend on the clock.
+    idle_iterations: the most iterations after each frame while no other frame waits. Maps then depend on the clock.
     """
 
     queue_frames: int = 4
-    drops: Drops = Drops.OLDEST
+    queue_policy: QueuePolicy = QueuePolicy.OLDEST
     idle_iterations: int = 0
 
     def __post_init__(self) -> None:
         if not 1 <= self.queue_frames <= 1000:
             raise InvalidInputError(f"queue: expected 1 to 1000 frames, got {self.queue_frames}")
         if not 0 <= self.idle_iterations <= 10_000:
-            raise InvalidInputError(f"idle: expected 0 to 10000 iterations, got {self.idle_iterations}")
+            raise InvalidInputError(f"idle_iterations: expected 0 to 10000, got {self.idle_iterations}")

@@ -1,20 +1,17 @@
-"""One robot's mapper on one worker thread, with a short queue of frames before it.
+"""One robot's mapper on its own thread, behind a short queue of frames.
 
-When frames come faster than they are mapped one is dropped and says so: by default the OLDEST that waits, since a live
-robot wants the newest view. While none comes the worker may train on what it has seen, one iteration at a time.
-Everything that touches the map runs on the worker, so the mapper needs no lock.
+If frames arrive faster than they are mapped, the queue drops one: by default the OLDEST, because a live robot needs
+the newest view. While no frame waits, the worker may train on earlier keyframes. Only the worker thread touches the
+map, so the mapper needs no lock.
 """
 
 from __future__ import annotations
 
 import logging
-import threading
 import time
-from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TypeVar
 
@@ -26,295 +23,247 @@ from gausslite.domain.voxels import VoxelGrid
 from gausslite.errors import InvalidInputError, MismatchError, StorageError, UnavailableError
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.sent_voxels import SentVoxelTracker
-from gausslite.mapping.stages import SkippableStage
 from gausslite.mission.build import build_mapper
 from gausslite.mission.checkpoint import ResumeConfig, save_run
 from gausslite.mission.frame_scheduler import Clock, FrameScheduler
 from gausslite.mission.settings import MissionSettings
-from gausslite.mission.task_mapper import FrameOutcome, TaskMapper
+from gausslite.mission.task_mapper import TaskMapper
 from gausslite.perception.relevance_estimator import RelevanceEstimator
 from gausslite.wire.uplink import Uplink
-from gausslite_agent.load import Drops, LoadSettings
-from gausslite_agent.mission_checkpoint import MissionCheckpoint, SavedAgentMission
-from gausslite_agent.status import FrameReport, Outcome, WorkerStatus
+from gausslite_agent.frame_queue import FrameQueue, QueuedFrame
+from gausslite_agent.idle_training import IdleTraining
+from gausslite_agent.load import LoadSettings
+from gausslite_agent.mission_checkpoint import MissionCheckpoint, SavedMission
+from gausslite_agent.status import FrameReport, Outcome, StatusHolder, WorkerStatus
 
 _log = logging.getLogger(__name__)
 _Result = TypeVar("_Result")
 
 
-def _promise() -> Future[FrameReport]:
-    """A report to come, whether or not the one who waits for it gives up."""
-    future: Future[FrameReport] = Future()
-    future.set_running_or_notify_cancel()
-    return future
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Waiting:
-    """A frame in the queue, since when it waits, and its report to come."""
-
-    frame: Frame
-    since_s: float
-    future: Future[FrameReport] = field(default_factory=_promise)
-
-
 class MappingWorker:
-    """Owns the map and the worker thread. `attention` makes what attends to a task; it runs on the worker."""
+    """Owns the map and the worker thread."""
 
     def __init__(
         self,
         settings: MissionSettings,
         grid: VoxelGrid,
-        attention: Callable[[TaskGraph], RelevanceEstimator],
+        build_estimator: Callable[[TaskGraph], RelevanceEstimator],
         uplink: Uplink | None = None,
         on_change: Callable[[], None] = lambda: None,
         load: LoadSettings | None = None,
         clock: Clock = time.monotonic,
     ) -> None:
-        """Reserve the map's memory. on_change is called on the worker after each mapped frame."""
-        self._settings, self._grid, self._make_attention = settings, grid, attention
+        """Reserve the map's memory.
+
+        build_estimator and on_change run on the worker thread, the latter after each mapped frame.
+        """
+        self._settings, self._grid, self._build_estimator = settings, grid, build_estimator
         self.uplink = uplink
         self._on_change = on_change
         self._load = load or LoadSettings()
         self._clock = clock
-        # how many iterations may still be rehearsed, and whether words are due for those that were; worker only
-        self._rehearsals_left, self._resting, self._untold = 0, False, False
         self._mapper = build_mapper(settings)
-        self._ledger = SentVoxelTracker(grid)
+        self._sent_voxels = SentVoxelTracker(grid)
         self._task_mapper: TaskMapper | None = None
         self._last_index = -1
-        # revisions of an earlier life must not be taken for ones of this
+        # the start time, so that revisions from before a restart are never repeated
         self._first_revision = time.time_ns() // 1000
-        self._status = WorkerStatus(map_revision=self._first_revision)
-        self._waiting: deque[_Waiting] = deque()
-        # guards the status and the queue
-        self._lock = threading.Lock()
+        self._status = StatusHolder(WorkerStatus(map_revision=self._first_revision))
+        self._queue = FrameQueue(self._load.queue_frames, self._load.queue_policy)
         self._worker = ThreadPoolExecutor(1, "mapper")
+        self._idle = IdleTraining(
+            self._load.idle_iterations,
+            self._idle_step,
+            self._publish_changes,
+            lambda: not self._queue.is_empty,
+            self._schedule,
+        )
 
     @property
     def grid(self) -> VoxelGrid:
-        """The voxels of the uplink."""
+        """The voxel grid of the uplink."""
         return self._grid
 
     def status(self) -> WorkerStatus:
-        """A snapshot."""
-        with self._lock:
-            return self._status
-
-    def assign(self, graph: TaskGraph) -> Future[None]:
-        """Map for this task from the next frame on; the map stays, and earlier keyframes are looked at again.
-
-        A task that asks the same as the one in force changes nothing. The future raises ModelFileError and the like.
-        """
-        return self.do(lambda _mapper: self._begin(graph))
-
-    def resume(self, saved: SavedAgentMission) -> Future[None]:
-        """Take up a mission where it was saved, before any frame is mapped. The future raises MapFileError."""
-        return self._start(lambda: self._take_up(saved))
-
-    def save(self, path: Path, terms: ResumeConfig, asked: str) -> Future[bool]:
-        """Save the mission after the frame at hand, to be resumed in another life; False when there is no task yet.
-
-        `asked` is the task of the command line. The future raises StorageError.
-        """
-        return self._start(lambda: self._save(path, terms, asked))
-
-    def submit(self, frame: Frame) -> Future[FrameReport]:
-        """Queue a frame. Raises MismatchError when there is no task yet, UnavailableError after `close`."""
-        with self._lock:
-            if self._status.graph is None:
-                raise MismatchError("frames: expected a task first, got none yet; call AssignTask")
-            come = _Waiting(frame, self._clock())
-            self._waiting.append(come)
-            dropped = self._overflow()
-        if dropped is not None:
-            reason = f"the queue of {self._load.queue_frames} frames was full; the {self._load.drops} gave way"
-            dropped.future.set_result(self._count(FrameReport(dropped.frame.index, Outcome.DROPPED, reason)))
-        self._start(self._map_next)
-        return come.future
-
-    def reject(self, index: int, reason: str) -> FrameReport:
-        """Count a frame that was none."""
-        return self._count(FrameReport(index, Outcome.REJECTED, reason))
-
-    def do(self, function: Callable[[GaussianMapper], _Result]) -> Future[_Result]:
-        """Run a function of the mapper on the worker, between two frames."""
-        return self._start(lambda: function(self._mapper))
-
-    def settle(self) -> Future[None]:
-        """Rehearse no more until the next frame, and tell what rehearsing has changed."""
-        return self._start(self._end_rest)
-
-    def handover_words(self) -> Future[VoxelBatch]:
-        """Words on the whole map, but for voxels of an earlier task's region that were told when trained more."""
-        return self.do(lambda mapper: self._ledger.exclude_frozen(group_by_voxel(mapper.gaussians(), self._grid)))
+        """Return a snapshot of the totals."""
+        return self._status.get()
 
     def revision(self) -> int:
-        """The map's revision; it rises over restarts too."""
+        """Return the map's revision. It increases, also across restarts."""
         return self.status().map_revision
 
+    def assign(self, graph: TaskGraph) -> Future[None]:
+        """Switch to this task with the next frame; the map is kept and earlier keyframes are re-evaluated.
+
+        A task that is equivalent to the current one changes nothing. The future raises ModelFileError and the like.
+        """
+        return self._submit(lambda: self._assign(graph))
+
+    def restore(self, saved: SavedMission) -> Future[None]:
+        """Continue a saved mission; call it before the first frame. The future raises MapFileError."""
+        return self._submit(lambda: self._restore(saved))
+
+    def save(self, path: Path, config: ResumeConfig, requested_task: str) -> Future[bool]:
+        """Save the mission after the current frame. The future returns False if there is no task yet.
+
+        requested_task: the task of the command line. The future raises StorageError.
+        """
+        return self._submit(lambda: self._save(path, config, requested_task))
+
+    def submit(self, frame: Frame) -> Future[FrameReport]:
+        """Queue a frame and return the future of its report.
+
+        Raises MismatchError if there is no task yet, UnavailableError after `close`.
+        """
+        if self.status().graph is None:
+            raise MismatchError("frames: expected a task first, got none yet; call AssignTask")
+        queued = QueuedFrame(frame, self._clock())
+        dropped = self._queue.put(queued)
+        if dropped is not None:
+            policy = self._load.queue_policy
+            self._report_dropped(dropped, f"the queue of {self._load.queue_frames} frames dropped its {policy}")
+        self._submit(self._map_next)
+        return queued.report
+
+    def reject(self, index: int, reason: str) -> FrameReport:
+        """Count and return the report of an invalid frame."""
+        return self._count(FrameReport(index, Outcome.REJECTED, reason))
+
+    def run(self, function: Callable[[GaussianMapper], _Result]) -> Future[_Result]:
+        """Run a function of the mapper on the worker, between two frames."""
+        return self._submit(lambda: function(self._mapper))
+
+    def end_idle_training(self) -> Future[None]:
+        """End idle training until the next frame, and publish its changes."""
+        return self._submit(self._idle.stop)
+
+    def handover_batch(self) -> Future[VoxelBatch]:
+        """Return updates of the whole map, except voxels of an earlier task that were sent with a higher Σkappa."""
+        return self.run(lambda mapper: self._sent_voxels.exclude_frozen(group_by_voxel(mapper.gaussians(), self._grid)))
+
     def close(self) -> None:
-        """End the worker after the frame it is at; frames that wait are dropped."""
+        """End the worker after its current frame; waiting frames are dropped."""
         self._worker.shutdown(wait=True, cancel_futures=True)
-        while self._waiting:
-            left = self._waiting.popleft()
-            left.future.set_result(self._count(FrameReport(left.frame.index, Outcome.DROPPED, "the agent is ending")))
+        while (queued := self._queue.get()) is not None:
+            self._report_dropped(queued, "the agent is shutting down")
 
-    def _overflow(self) -> _Waiting | None:
-        """The frame that is one too many for the queue; the lock is held."""
-        if len(self._waiting) <= self._load.queue_frames:
-            return None
-        return self._waiting.popleft() if self._load.drops is Drops.OLDEST else self._waiting.pop()
-
-    def _start(self, work: Callable[[], _Result]) -> Future[_Result]:
+    def _submit(self, work: Callable[[], _Result]) -> Future[_Result]:
         try:
             return self._worker.submit(work)
         except RuntimeError as error:
-            raise UnavailableError("agent: ending; no more work is taken") from error
+            raise UnavailableError("agent: shutting down; it accepts no more work") from error
 
-    def _begin(self, graph: TaskGraph) -> None:
-        now = self.status().graph
+    def _schedule(self, work: Callable[[], None]) -> None:
+        # the executor accepts no work while the worker is closing
+        with suppress(UnavailableError):
+            self._submit(work)
+
+    def _assign(self, graph: TaskGraph) -> None:
+        current = self.status().graph
         if self._task_mapper is None:
-            ledger = self._ledger if self.uplink is not None else None
-            attention = self._make_attention(graph)
-            scheduler = FrameScheduler(self._settings.scheduler_settings, self._clock)
-            self._task_mapper = TaskMapper(attention, self._mapper, ledger, scheduler, self._tell)
-        elif now is None or not graph.is_equivalent_to(now):
-            self._task_mapper.assign(self._make_attention(graph))
-        with self._lock:
-            self._status = replace(self._status, graph=graph, notes=self._task_mapper.notes)
+            self._task_mapper = TaskMapper(
+                self._build_estimator(graph),
+                self._mapper,
+                self._sent_voxels if self.uplink is not None else None,
+                FrameScheduler(self._settings.scheduler_settings, self._clock),
+                self._publish,
+            )
+        elif current is None or not graph.is_equivalent_to(current):
+            self._task_mapper.assign(self._build_estimator(graph))
+        self._status.update(graph=graph, notes=self._task_mapper.notes)
 
-    def _take_up(self, saved: SavedAgentMission) -> None:
-        self._begin(saved.life.graph)
+    def _restore(self, saved: SavedMission) -> None:
+        checkpoint = saved.checkpoint
+        self._assign(checkpoint.graph)
         assert self._task_mapper is not None
         saved.run.restore(self._task_mapper)
-        self._last_index = saved.life.last_index
-        # also where the clock was set back between the two lives
-        self._first_revision = max(self._first_revision, saved.life.map_revision + 1)
-        with self._lock:
-            revision = self._first_revision + self._mapper.revision
-            self._status = replace(self._status, gaussians=self._mapper.count, map_revision=revision)
-        # the spool lets go of what it has; the rest was on its way, or told later in a life that ended unsaved
-        self._tell(self._ledger.exclude_frozen(group_by_voxel(self._mapper.roi_gaussians(), self._grid)))
+        self._last_index = checkpoint.last_index
+        # the clock may have been set back since the mission was saved
+        self._first_revision = max(self._first_revision, checkpoint.map_revision + 1)
+        self._status.update(gaussians=self._mapper.count, map_revision=self._map_revision())
+        # the spool drops what it has sent; the rest was in flight, or was published after the mission was saved
+        roi = group_by_voxel(self._mapper.roi_gaussians(), self._grid)
+        self._publish(self._sent_voxels.exclude_frozen(roi))
         self._on_change()
 
-    def _save(self, path: Path, terms: ResumeConfig, asked: str) -> bool:
-        graph, loop = self.status().graph, self._task_mapper
-        if graph is None or loop is None:
+    def _save(self, path: Path, config: ResumeConfig, requested_task: str) -> bool:
+        graph, task_mapper = self.status().graph, self._task_mapper
+        if graph is None or task_mapper is None:
             return False
-        life = MissionCheckpoint(self._last_index, graph, asked, self.revision())
-        save_run(path, loop, terms, life.last_index, life.state())
+        checkpoint = MissionCheckpoint(self._last_index, graph, requested_task, self.revision())
+        save_run(path, task_mapper, config, checkpoint.last_index, checkpoint.state())
         return True
 
     def _map_next(self) -> None:
-        with self._lock:
-            if not self._waiting:
-                return
-            next_one = self._waiting.popleft()
+        queued = self._queue.get()
+        if queued is None:
+            return
         try:
-            next_one.future.set_result(self._map(next_one))
+            queued.report.set_result(self._map(queued))
         except InvalidInputError as error:
-            # the frames after it may be fine
-            next_one.future.set_result(self.reject(next_one.frame.index, str(error)))
+            # later frames may be valid
+            queued.report.set_result(self.reject(queued.frame.index, str(error)))
         except Exception as error:
-            # the one who waits for this frame is told; the worker goes on
-            next_one.future.set_exception(error)
-        self._rehearsals_left = self._load.idle_iterations
-        if not self._resting and self._rehearsals_left > 0:
-            self._rest()
+            # the caller gets the error; the worker continues with the next frame
+            queued.report.set_exception(error)
+        self._idle.start()
 
-    def _rest(self) -> None:
-        """One iteration while no frame waits, then this again, behind all work that has come meanwhile.
-
-        An error ends it until the next frame has been mapped: nobody waits for this, so it is logged.
-        """
-        with self._lock:
-            self._resting = not self._waiting
-        if not self._resting:
-            return
-        try:
-            self._rehearse()
-        except Exception:
-            _log.exception("an idle iteration failed; the next frame is followed by others")
-            self._rehearsals_left, self._resting = 0, False
-
-    def _rehearse(self) -> None:
+    def _map(self, queued: QueuedFrame) -> FrameReport:
         assert self._task_mapper is not None
-        if self._rehearsals_left == 0 or not self._task_mapper.idle_step():
-            self._end_rest()
-            return
-        self._rehearsals_left -= 1
-        self._untold = True
-        with self._lock:
-            self._status = replace(self._status, idle_iterations=self._status.idle_iterations + 1)
-        # the executor takes no more work once the robot is closing
-        with suppress(UnavailableError):
-            self._start(self._rest)
-
-    def _end_rest(self) -> None:
-        self._rehearsals_left, self._resting = 0, False
-        if not self._untold or self._task_mapper is None:
-            return
-        self._untold = False
-        words = self._task_mapper.changed_roi()
-        if words is not None:
-            self._tell(words)
-
-    def _map(self, come: _Waiting) -> FrameReport:
-        assert self._task_mapper is not None
-        frame = come.frame
-        done = self._task_mapper.process(frame, self._clock() - come.since_s)
+        frame = queued.frame
+        outcome = self._task_mapper.process(frame, self._clock() - queued.arrival_s)
         self._last_index = frame.index
-        with self._lock:
-            self._status = replace(self._status, notes=self._task_mapper.notes)
-        if done.skipped is not None:
-            return self._count(FrameReport(frame.index, Outcome.SKIPPED, done.skipped, gaussians=done.gaussians))
-        if done.changed_roi is not None:
-            self._untold = False
+        self._status.update(notes=self._task_mapper.notes)
+        if outcome.skipped is not None:
+            return self._count(FrameReport(frame.index, Outcome.SKIPPED, outcome.skipped, gaussians=outcome.gaussians))
+        if outcome.changed_roi is not None:
+            self._idle.mark_published()
         report = FrameReport(
             frame.index,
             Outcome.MAPPED,
-            iterations=done.iterations,
-            gaussians=done.gaussians,
-            roi_share=done.roi_share,
-            seconds=done.timing.seconds,
-            age_s=self._clock() - come.since_s,
+            iterations=outcome.iterations,
+            gaussians=outcome.gaussians,
+            roi_share=outcome.roi_share,
+            seconds=outcome.timing.seconds,
+            age_s=self._clock() - queued.arrival_s,
         )
-        self._note_load(done)
+        self._status.add_outcome(outcome)
         self._count(report)
         self._on_change()
         return report
 
-    def _tell(self, words: VoxelBatch) -> None:
-        """Give words to the uplink. A spool without room ends no mission: all is told again once it has some."""
+    def _idle_step(self) -> bool:
+        if self._task_mapper is None or not self._task_mapper.idle_step():
+            return False
+        self._status.add_idle_iteration()
+        return True
+
+    def _publish_changes(self) -> None:
+        batch = None if self._task_mapper is None else self._task_mapper.changed_roi()
+        if batch is not None:
+            self._publish(batch)
+
+    def _publish(self, batch: VoxelBatch) -> None:
+        """Pass updates to the uplink. If its spool is full, all voxels are published again with the next frame."""
         if self.uplink is None:
             return
-        untold_because = ""
+        publish_error = ""
         try:
-            self.uplink.enqueue(words)
+            self.uplink.enqueue(batch)
         except StorageError as error:
-            untold_because = str(error)
-            self._ledger.mark_all_unsent()
-        with self._lock:
-            before = self._status.untold_because
-            self._status = replace(self._status, untold_because=untold_because)
-        if untold_because and not before:
-            _log.warning("%s", untold_because)
+            publish_error = str(error)
+            self._sent_voxels.mark_all_unsent()
+        is_new = publish_error and not self.status().publish_error
+        self._status.update(publish_error=publish_error)
+        if is_new:
+            _log.warning("%s", publish_error)
 
-    def _note_load(self, done: FrameOutcome) -> None:
-        with self._lock:
-            status = self._status
-            self._status = replace(
-                status,
-                short=status.short + done.timing.under_trained,
-                without_words=status.without_words + (SkippableStage.PUBLISHING in done.timing.skipped_stages),
-                without_seeding=status.without_seeding + (SkippableStage.SEEDING in done.timing.skipped_stages),
-                max_detection_lag=max(status.max_detection_lag, done.detection_lag_frames or 0),
-                reread=status.reread + done.reevaluation.keyframes,
-            )
+    def _report_dropped(self, queued: QueuedFrame, reason: str) -> None:
+        queued.report.set_result(self._count(FrameReport(queued.frame.index, Outcome.DROPPED, reason)))
 
     def _count(self, report: FrameReport) -> FrameReport:
-        with self._lock:
-            revision = self._first_revision + self._mapper.revision
-            self._status = replace(self._status.plus(report), map_revision=revision)
+        self._status.add_report(report, self._map_revision())
         return report
+
+    def _map_revision(self) -> int:
+        return self._first_revision + self._mapper.revision

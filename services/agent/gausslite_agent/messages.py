@@ -1,4 +1,4 @@
-"""What an agent says, as messages."""
+"""Encode the agent's reports, status and views as messages."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from gausslite.v1 import agent_service_pb2 as pb
 from gausslite.wire.convert import graph_to_message
 from gausslite.wire.images import encode_colour, encode_depth
 from gausslite.wire.uplink_values import UplinkCounters
-from gausslite_agent.mission_runner import MissionState
+from gausslite_agent.agent_mission import MissionState
 from gausslite_agent.status import FrameReport, Outcome, WorkerStatus
 
 _STATES = {
@@ -28,7 +28,7 @@ _OUTCOMES = {
 
 
 def report_to_message(report: FrameReport) -> pb.IngestFramesResponse:
-    """The outcome of one frame."""
+    """Encode the outcome of one frame."""
     return pb.IngestFramesResponse(
         index=report.index,
         outcome=_OUTCOMES[report.outcome],
@@ -42,21 +42,21 @@ def report_to_message(report: FrameReport) -> pb.IngestFramesResponse:
 
 
 def status_to_message(
-    agent_id: str, state: MissionState, robot: WorkerStatus, uplink: UplinkCounters
+    agent_id: str, state: MissionState, status: WorkerStatus, uplink: UplinkCounters
 ) -> pb.GetAgentStatusResponse:
-    """How the agent is doing."""
+    """Encode the status of the agent and its uplink."""
     return pb.GetAgentStatusResponse(
         agent_id=agent_id,
         state=_STATES[state],
-        graph=None if robot.graph is None else graph_to_message(robot.graph),
-        map_revision=robot.map_revision,
-        gaussians=robot.gaussians,
-        frames_mapped=robot.mapped,
-        frames_skipped=robot.skipped,
-        frames_dropped=robot.dropped,
-        frames_rejected=robot.rejected,
-        hz=robot.hz,
-        roi_share=robot.roi_share,
+        graph=None if status.graph is None else graph_to_message(status.graph),
+        map_revision=status.map_revision,
+        gaussians=status.gaussians,
+        frames_mapped=status.mapped,
+        frames_skipped=status.skipped,
+        frames_dropped=status.dropped,
+        frames_rejected=status.rejected,
+        hz=status.hz,
+        roi_share=status.roi_share,
         uplink=pb.UplinkStatus(
             connected=uplink.connected,
             stopped_because=uplink.stopped_because,
@@ -66,24 +66,24 @@ def status_to_message(
             voxels_waiting=uplink.voxels_waiting,
             subsets_rejected=uplink.subsets_rejected,
         ),
-        age_p50_seconds=robot.age_s(50),
-        age_p99_seconds=robot.age_s(99),
-        notes=(*robot.notes, *robot.load_notes),
+        age_p50_seconds=status.age_s(50),
+        age_p99_seconds=status.age_s(99),
+        notes=(*status.notes, *status.load_notes),
     )
 
 
-def view_to_message(drawn: Rendering, map_revision: int) -> pb.RenderViewResponse:
-    """A rendering as two images."""
-    rgb = np.rint(np.clip(drawn.rgb, 0.0, 1.0) * 255).astype(np.uint8)
+def view_to_message(rendering: Rendering, map_revision: int) -> pb.RenderViewResponse:
+    """Encode a rendering as a colour and a depth image."""
+    rgb = np.rint(np.clip(rendering.rgb, 0.0, 1.0) * 255).astype(np.uint8)
     return pb.RenderViewResponse(
         colour_png=encode_colour(rgb, lossless=True),
-        depth_png=encode_depth(drawn.expected_depth_m()),
+        depth_png=encode_depth(rendering.expected_depth_m()),
         map_revision=map_revision,
     )
 
 
 def blank_view(camera: Camera, map_revision: int) -> pb.RenderViewResponse:
-    """What an empty map looks like."""
+    """Return the view of an empty map."""
     size = (camera.height_px, camera.width_px)
     return pb.RenderViewResponse(
         colour_png=encode_colour(np.zeros((*size, 3), np.uint8), lossless=True),

@@ -1,17 +1,20 @@
-"""One robot as a process, until its mission or the operator ends it."""
+"""The agent as a process, until its mission ends or a signal ends it."""
 
 from __future__ import annotations
 
 import asyncio
 import functools
+import logging
 from collections.abc import Sequence
 from contextlib import ExitStack
+from dataclasses import dataclass
 
-from gausslite.datasets.open import is_simulated
+from gausslite.datasets.open import is_simulated, open_source
 from gausslite.domain.pose import unit_up_axis
-from gausslite.mission.build import RelevanceEstimatorFactory
+from gausslite.mission.build import EstimatorFactory
+from gausslite.mission.frame_stream import FrameStream
 from gausslite.mission.results import prepare_file, prepare_folder
-from gausslite.mission.settings import SceneInfo
+from gausslite.mission.settings import SceneInfo, SourceSettings
 from gausslite.task.parser import TaskParser
 from gausslite.task.rules import RuleParser
 from gausslite.wire.change_notifier import ChangeNotifier
@@ -20,16 +23,18 @@ from gausslite.wire.process import run_service
 from gausslite.wire.server import serve_until_stopped
 from gausslite.wire.spool import Spool
 from gausslite.wire.uplink import Uplink
+from gausslite_agent.agent_mission import AgentMission
 from gausslite_agent.mapping_worker import MappingWorker
-from gausslite_agent.mission_checkpoint import SavedAgentMission
-from gausslite_agent.mission_runner import AgentMission
-from gausslite_agent.replay_source import ReplaySource
+from gausslite_agent.mission_checkpoint import SavedMission
+from gausslite_agent.parser_wait import WaitingParser
 from gausslite_agent.servicer import AgentServicer
 from gausslite_agent.settings import AgentSettings, parse_arguments
 
+_log = logging.getLogger(__name__)
+
 
 def run(arguments: Sequence[str] | None = None) -> int:
-    """0 after a clean end, 2 with one line on stderr when something the operator can mend is wrong."""
+    """Run the agent and return its exit code: 0, or 2 with one line on stderr for an error the operator can fix."""
 
     async def serve() -> None:
         await _serve(parse_arguments(arguments))
@@ -37,41 +42,71 @@ def run(arguments: Sequence[str] | None = None) -> int:
     return run_service("gausslite-agent", serve)
 
 
+@dataclass(frozen=True, slots=True)
+class _Mission:
+    """The mission of this process and what can end its waits."""
+
+    mission: AgentMission
+    stream: FrameStream | None
+    uplink: Uplink | None
+    first_parser: WaitingParser
+
+    def run(self) -> None:
+        """Map the source, or assign the first task and return."""
+        if self.stream is not None:
+            self.mission.run(self.stream)
+        else:
+            self.mission.assign_task()
+
+    def stop(self) -> None:
+        """End the mission after its current frame, and every wait for another service."""
+        self.mission.stop()
+        self.first_parser.stop()
+        if self.uplink is not None:
+            self.uplink.cancel_drain()
+
+
 async def _serve(settings: AgentSettings) -> None:
-    """Build the robot, serve it, play its source; close in the reverse order."""
+    """Build the agent, serve it and run its mission; close in reverse order."""
     _require_usable(settings)
-    stand_in = None if settings.play is None else ReplaySource.open(settings.play, settings.up_axis)
-    saved = _saved_mission(settings)
-    loop, news = asyncio.get_running_loop(), ChangeNotifier()
+    stream = None if settings.source is None else open_stream(settings.source)
+    saved = _read_saved(settings)
+    loop, changes = asyncio.get_running_loop(), ChangeNotifier()
     with ExitStack() as stack:
-        # the task of the command line may wait for a parser to start; who assigns one is told that there is none
-        at_start, asked = (_parser(settings, stack, patient) for patient in (True, False))
-        uplink, client = _uplink(settings, stack, has_restored_map=saved is not None)
-        attentions = RelevanceEstimatorFactory(settings.perception, lambda: _scene(settings, stand_in))
-        if settings.task is not None and not (settings.play and is_simulated(settings.play.source)):
-            attentions.require_sight()
-        robot = MappingWorker(
+        parser = _open_parser(settings, stack)
+        uplink, client = _open_uplink(settings, stack, has_restored_map=saved is not None)
+        estimators = _estimators(settings, stream)
+        worker = MappingWorker(
             settings.mission,
             settings.link.grid,
-            attentions.to,
+            estimators.build,
             uplink,
-            on_change=lambda: _ring(loop, news),
+            on_change=lambda: _notify(loop, changes),
             load=settings.load,
         )
-        stack.callback(robot.close)
-        earlier = None
+        stack.callback(worker.close)
+        resumed = None
         if saved is not None:
-            await asyncio.wrap_future(robot.resume(saved))
-            earlier, saved = saved.life, None
-        player = AgentMission(settings, robot, at_start, client, earlier)
-        servicer = AgentServicer(settings.agent_id, robot, asked, news, lambda: player.state)
+            await asyncio.wrap_future(worker.restore(saved))
+            resumed, saved = saved.checkpoint, None
+        # only the task of the command line waits for the parser to start
+        first_parser = WaitingParser(parser)
+        mission = AgentMission(settings, worker, first_parser, client, resumed)
+        servicer = AgentServicer(settings.agent_id, worker, parser, changes, lambda: mission.state)
+        run_mission = functools.partial(
+            _run_mission, _Mission(mission, stream, uplink, first_parser), settings.exit_when_done
+        )
+        await serve_until_stopped(settings.listen, [servicer.service()], run_mission, settings.tls)
 
-        mission = functools.partial(_live, settings, stand_in, player, uplink)
-        await serve_until_stopped(settings.listen, [servicer.service()], mission, settings.tls)
+
+def open_stream(settings: SourceSettings) -> FrameStream:
+    """Open the sequence that replaces the camera. Raises DatasetError, PoseError, InvalidInputError."""
+    source = open_source(settings.spec, settings.up_axis, settings.depth_registration)
+    return FrameStream.select(source, settings)
 
 
 def _require_usable(settings: AgentSettings) -> None:
-    """Raise for what would end the mission later, hours into it or with its first task."""
+    """Raise now for settings that would fail hours into the mission or with its first task."""
     if settings.up_axis is not None:
         unit_up_axis(settings.up_axis)
     if settings.out is not None:
@@ -80,47 +115,48 @@ def _require_usable(settings: AgentSettings) -> None:
         prepare_file(settings.state)
 
 
-def _saved_mission(settings: AgentSettings) -> SavedAgentMission | None:
-    """The mission of an earlier life. Raises MapFileError, MismatchError."""
+def _read_saved(settings: AgentSettings) -> SavedMission | None:
+    """Return the saved mission, None if there is none. Raises MapFileError, MismatchError."""
     if settings.state is None or not settings.state.exists():
         return None
-    return SavedAgentMission.read(settings.state, settings.terms)
+    return SavedMission.read(settings.state, *settings.fixed_settings)
 
 
-async def _live(
-    settings: AgentSettings, stand_in: ReplaySource | None, player: AgentMission, uplink: Uplink | None
-) -> None:
-    """Work through the mission, then serve on unless told otherwise; what is mapped then is written at the end."""
-    work = asyncio.ensure_future(asyncio.to_thread(_begin, stand_in, player))
+def _estimators(settings: AgentSettings, stream: FrameStream | None) -> EstimatorFactory:
+    """Return the estimator factory. Raises InvalidInputError if the task of the command line has no detector."""
+    estimators = EstimatorFactory(settings.perception, lambda: _scene(settings, stream))
+    simulated = settings.source is not None and is_simulated(settings.source.spec)
+    if settings.task is not None and not simulated:
+        estimators.require_detector()
+    if settings.task is None and settings.perception.model is None and stream is None:
+        _log.warning("no --detector: AssignTask will fail, because nothing can find the objects of a task")
+    return estimators
+
+
+async def _run_mission(mission: _Mission, exit_when_done: bool) -> None:
+    """Run the mission, then keep serving unless the agent should exit. On cancellation, write the results."""
+    work = asyncio.ensure_future(asyncio.to_thread(mission.run))
     try:
         await asyncio.shield(work)
-        if not settings.exit_when_done or stand_in is None:
+        if not exit_when_done or mission.stream is None:
             await asyncio.Event().wait()
     finally:
-        # the player still writes what it has; nothing it uses may close before that
-        player.stop()
-        if uplink is not None:
-            uplink.cancel_drain()
+        # the mission still writes its results, so nothing that it uses may be closed before it ends
+        mission.stop()
         await work
-        if stand_in is None:
-            await asyncio.to_thread(player.conclude)
+        if mission.stream is None:
+            await asyncio.to_thread(mission.mission.finish)
 
 
-def _begin(stand_in: ReplaySource | None, player: AgentMission) -> None:
-    """Play the source, or take the task and wait for frames."""
-    if stand_in is not None:
-        player.play(stand_in)
-    else:
-        player.begin()
-
-
-def _parser(settings: AgentSettings, stack: ExitStack, patient: bool) -> TaskParser:
+def _open_parser(settings: AgentSettings, stack: ExitStack) -> TaskParser:
     if settings.link.parser is None:
         return RuleParser()
-    return stack.enter_context(ParserClient(settings.link.parser, patient=patient, tls=settings.tls))
+    return stack.enter_context(ParserClient(settings.link.parser, tls=settings.tls))
 
 
-def _uplink(settings: AgentSettings, stack: ExitStack, has_restored_map: bool) -> tuple[Uplink | None, FusionClient | None]:
+def _open_uplink(
+    settings: AgentSettings, stack: ExitStack, has_restored_map: bool
+) -> tuple[Uplink | None, FusionClient | None]:
     link = settings.link
     if link.fusion is None:
         return None, None
@@ -131,12 +167,12 @@ def _uplink(settings: AgentSettings, stack: ExitStack, has_restored_map: bool) -
     return uplink, client
 
 
-def _scene(settings: AgentSettings, stand_in: ReplaySource | None) -> SceneInfo:
-    if stand_in is not None:
-        return SceneInfo.of(stand_in.source)
+def _scene(settings: AgentSettings, stream: FrameStream | None) -> SceneInfo:
+    if stream is not None:
+        return SceneInfo.of(stream.source)
     return SceneInfo() if settings.up_axis is None else SceneInfo(unit_up_axis(settings.up_axis))
 
 
-def _ring(loop: asyncio.AbstractEventLoop, news: ChangeNotifier) -> None:
+def _notify(loop: asyncio.AbstractEventLoop, changes: ChangeNotifier) -> None:
     if not loop.is_closed():
-        loop.call_soon_threadsafe(news.notify)
+        loop.call_soon_threadsafe(changes.notify)

@@ -1,4 +1,4 @@
-"""AgentService over a robot: decode, call, encode."""
+"""The AgentService: decode a request, call the mapping worker, encode the response."""
 
 from __future__ import annotations
 
@@ -25,45 +25,51 @@ from gausslite.wire.convert import (
 from gausslite.wire.map_blocks import map_blocks
 from gausslite.wire.server import Service
 from gausslite.wire.uplink_values import UplinkCounters
+from gausslite_agent.agent_mission import MissionState
 from gausslite_agent.map_changes import MapChangeLog
 from gausslite_agent.mapping_worker import MappingWorker
 from gausslite_agent.messages import blank_view, report_to_message, status_to_message, view_to_message
-from gausslite_agent.mission_runner import MissionState
 from gausslite_agent.status import FrameReport
 
 _OUTCOMES_AHEAD = 16
 
 
 class AgentServicer(pb_grpc.AgentServiceServicer):
-    """Serves one robot. `news` rings when the map changed; `state` says where the mission is."""
+    """Serves one robot. changes: notified after each change of the map; state: returns the phase of the mission."""
 
     def __init__(
         self,
         agent_id: str,
-        robot: MappingWorker,
+        worker: MappingWorker,
         parser: TaskParser,
-        news: ChangeNotifier,
+        changes: ChangeNotifier,
         state: Callable[[], MissionState],
     ) -> None:
-        self._agent_id, self._robot, self._parser, self._news, self._state = agent_id, robot, parser, news, state
-        # touched on the robot's worker only
-        self._histories = {roi_only: MapChangeLog(robot.grid, roi_only) for roi_only in (False, True)}
+        self._agent_id, self._worker, self._parser, self._changes, self._state = (
+            agent_id,
+            worker,
+            parser,
+            changes,
+            state,
+        )
+        # used on the worker thread only
+        self._change_logs = {roi_only: MapChangeLog(worker.grid, roi_only) for roi_only in (False, True)}
 
     def service(self) -> Service:
-        """Ready for a server."""
+        """Return the service to register with a server."""
         name = pb.DESCRIPTOR.services_by_name["AgentService"].full_name
         return Service(name, lambda server: pb_grpc.add_AgentServiceServicer_to_server(self, server))
 
     async def AssignTask(self, request: pb.AssignTaskRequest, _context: Any) -> pb.AssignTaskResponse:  # noqa: N802
-        """Take a task in words or as a graph."""
+        """Assign a task, given as text or as a graph."""
         graph = await self._read_task(request)
-        await asyncio.wrap_future(self._robot.assign(graph))
+        await asyncio.wrap_future(self._worker.assign(graph))
         return pb.AssignTaskResponse(graph=graph_to_message(graph))
 
     async def IngestFrames(  # noqa: N802
         self, request_iterator: AsyncIterator[pb.IngestFramesRequest], _context: Any
     ) -> AsyncIterator[pb.IngestFramesResponse]:
-        """Frames in, one outcome for each, in order."""
+        """Map a stream of frames; yield one outcome for each, in order."""
         outcomes: asyncio.Queue[asyncio.Future[FrameReport] | None] = asyncio.Queue(_OUTCOMES_AHEAD)
         reader = asyncio.ensure_future(self._read_frames(request_iterator, outcomes))
         try:
@@ -76,47 +82,47 @@ class AgentServicer(pb_grpc.AgentServiceServicer):
     async def GetAgentStatus(  # noqa: N802
         self, _request: pb.GetAgentStatusRequest, _context: Any
     ) -> pb.GetAgentStatusResponse:
-        """How the robot and its uplink are doing."""
-        uplink = self._robot.uplink
+        """Return the status of the robot and its uplink."""
+        uplink = self._worker.uplink
         counters = UplinkCounters() if uplink is None else uplink.counters()
-        return status_to_message(self._agent_id, self._state(), self._robot.status(), counters)
+        return status_to_message(self._agent_id, self._state(), self._worker.status(), counters)
 
     async def RenderView(self, request: pb.RenderViewRequest, _context: Any) -> pb.RenderViewResponse:  # noqa: N802
-        """Draw the map from a pose."""
+        """Render the map from a pose."""
         camera = camera_from_message(request.camera)
         T_world_camera = transform_from_message("t_world_camera", request.t_world_camera)
 
-        def draw(mapper: GaussianMapper) -> pb.RenderViewResponse:
-            revision = self._robot.revision()
+        def render(mapper: GaussianMapper) -> pb.RenderViewResponse:
+            revision = self._worker.revision()
             if mapper.count == 0:
                 return blank_view(camera, revision)
             return view_to_message(mapper.render(camera, T_world_camera), revision)
 
-        return await asyncio.wrap_future(self._robot.do(draw))
+        return await asyncio.wrap_future(self._worker.run(render))
 
     async def WatchMap(  # noqa: N802
         self, request: pb.WatchMapRequest, _context: Any
     ) -> AsyncIterator[pb.WatchMapResponse]:
-        """A snapshot, then what changed; a slow reader finds changes summed up, never queued."""
+        """Yield a snapshot of the map, then its changes. A slow reader gets merged changes; nothing is queued."""
         region = box_from_message(request.region) if request.HasField("region") else None
-        history = self._histories[request.roi_only]
+        change_log = self._change_logs[request.roi_only]
         since = request.since_revision
 
-        def catch_up(mapper: GaussianMapper) -> list[pb.WatchMapResponse]:
-            history.update(mapper.gaussians(), self._robot.revision())
-            words = history.since(since)
+        def changed_blocks(mapper: GaussianMapper) -> list[pb.WatchMapResponse]:
+            change_log.update(mapper.gaussians(), self._worker.revision())
+            batch = change_log.since(since)
             if region is not None:
-                words = crop_to_box(words, region, self._robot.grid)
-            blocks = map_blocks(words, self._robot.grid, self._agent_id, history.revision, snapshot=since == 0)
+                batch = crop_to_box(batch, region, self._worker.grid)
+            blocks = map_blocks(batch, self._worker.grid, self._agent_id, change_log.revision, snapshot=since == 0)
             return [pb.WatchMapResponse(block=block) for block in blocks]
 
         while True:
-            ticket = self._news.subscribe()
-            if since == 0 or since != self._robot.revision():
-                for response in await asyncio.wrap_future(self._robot.do(catch_up)):
+            notification = self._changes.subscribe()
+            if since == 0 or since != self._worker.revision():
+                for response in await asyncio.wrap_future(self._worker.run(changed_blocks)):
                     yield response
                     since = response.block.revision
-            await ticket.wait()
+            await notification.wait()
 
     async def _read_task(self, request: pb.AssignTaskRequest) -> TaskGraph:
         match request.WhichOneof("task"):
@@ -134,18 +140,18 @@ class AgentServicer(pb_grpc.AgentServiceServicer):
     ) -> None:
         try:
             async for request in requests:
-                await outcomes.put(await self._take(request))
+                await outcomes.put(await self._submit(request))
         except Exception:
-            # the outcomes so far are still told; then the stream ends with this error
+            # the outcomes so far are still sent; then the stream ends with this error
             await outcomes.put(None)
             raise
         await outcomes.put(None)
 
-    async def _take(self, request: pb.IngestFramesRequest) -> asyncio.Future[FrameReport]:
+    async def _submit(self, request: pb.IngestFramesRequest) -> asyncio.Future[FrameReport]:
         try:
             frame = await asyncio.to_thread(frame_from_message, request.frame)
         except InvalidInputError as error:
             rejected: asyncio.Future[FrameReport] = asyncio.get_running_loop().create_future()
-            rejected.set_result(self._robot.reject(request.frame.index, str(error)))
+            rejected.set_result(self._worker.reject(request.frame.index, str(error)))
             return rejected
-        return asyncio.wrap_future(self._robot.submit(frame))
+        return asyncio.wrap_future(self._worker.submit(frame))

@@ -1,4 +1,4 @@
-"""The agent's command line, read once into small sections."""
+"""Settings of the agent, read from its command line, environment and configuration file."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from gausslite.config.layers import parse_options
 from gausslite.config.mapping_options import (
@@ -18,40 +19,29 @@ from gausslite.config.mapping_options import (
 )
 from gausslite.config.source_options import add_frames
 from gausslite.config.tls_options import add_tls, read_server_tls
-from gausslite.datasets.registered_source import DepthRegistration
 from gausslite.domain.names import require_name
 from gausslite.domain.pose import UpAxis
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.errors import InvalidInputError
-from gausslite.mission.checkpoint import ResumeConfig
-from gausslite.mission.settings import MissionSettings, PerceptionSettings
+from gausslite.mission.settings import MissionSettings, PerceptionSettings, SourceSettings
 from gausslite.task.validate import require_task_text
 from gausslite.wire.address import require_callable
 from gausslite.wire.tls import Tls
 from gausslite.wire.uplink_values import UplinkSettings
-from gausslite_agent.load import Drops, LoadSettings
+from gausslite_agent.load import LoadSettings, QueuePolicy
 
 _MAX_DRAIN_S = 86400.0
 _IDLE_ITERATIONS = 64
 
 
 @dataclass(frozen=True, slots=True)
-class PlaySettings:
-    """A sequence that stands in for the robot's camera; hold_out keeps every n-th frame from mapping.
-
-    depth_registration is given when the sequence's depth is not registered to its colour.
-    """
-
-    source: str
-    frames: str = ":"
-    size: str | None = None
-    hold_out: int | None = None
-    depth_registration: DepthRegistration | None = None
-
-
-@dataclass(frozen=True, slots=True)
 class LinkSettings:
-    """How the agent reaches the others; None = alone: tasks are parsed here, nothing is sent."""
+    """Connections to the other services.
+
+    parser: its address, None to parse tasks in this process; fusion: its address, None to send nothing. spool: file of
+    the updates that wait, None to keep them in memory. handover: at the end, also send the whole map and the
+    keyframes. drain_s: the longest wait for that.
+    """
 
     parser: str | None = None
     fusion: str | None = None
@@ -64,8 +54,20 @@ class LinkSettings:
 
 
 @dataclass(frozen=True, slots=True)
+class AgentIdentity:
+    """What identifies a robot's map on the fusion server."""
+
+    agent_id: str
+    voxel_size: float
+
+
+@dataclass(frozen=True, slots=True)
 class AgentSettings:
-    """Everything about one agent."""
+    """All settings of one agent.
+
+    source: the sequence that replaces the robot's camera, None for frames by IngestFrames. strict: end the mission at a
+    frame of the source that cannot be read. state: file of the saved mission.
+    """
 
     listen: str
     agent_id: str
@@ -74,28 +76,31 @@ class AgentSettings:
     up_axis: UpAxis | None
     out: Path | None
     exit_when_done: bool
-    play: PlaySettings | None
+    source: SourceSettings | None
     link: LinkSettings
     mission: MissionSettings
     load: LoadSettings
     tls: Tls | None = None
     state: Path | None = None
+    strict: bool = False
 
     @property
-    def terms(self) -> ResumeConfig:
-        """What must be the same when a saved mission goes on."""
-        return ResumeConfig.of(self.mission, agent_id=self.agent_id, voxel_size=f"{self.link.grid.size_m:g}")
+    def fixed_settings(self) -> tuple[Any, ...]:
+        """The settings that must be equal when a saved mission is resumed."""
+        return self.mission, AgentIdentity(self.agent_id, self.link.grid.size_m)
 
 
 def parse_arguments(arguments: Sequence[str] | None = None) -> AgentSettings:
-    """Settings from the command line. Raises InvalidInputError for values that make no sense."""
+    """Return the settings of the command line. Raises InvalidInputError."""
     options = parse_options(_parser(), arguments)
     if options.source is not None and options.task is None:
-        raise InvalidInputError("--task: expected a task for the source to be mapped for, got none")
-    _require_sense(options)
-    play = None
+        raise InvalidInputError("--task: expected a task for the source, got none")
+    _require_valid(options)
+    source = None
     if options.source is not None:
-        play = PlaySettings(options.source, options.frames, options.size, options.test_every, options.register_depth)
+        source = SourceSettings(
+            options.source, options.frames, options.size, options.up, options.test_every, options.register_depth
+        )
     link = LinkSettings(
         options.parser,
         options.fusion,
@@ -114,27 +119,25 @@ def parse_arguments(arguments: Sequence[str] | None = None) -> AgentSettings:
         options.up,
         options.out,
         options.exit_when_done,
-        play,
+        source,
         link,
         mission_settings(options),
         _load_settings(options),
         read_server_tls(options),
         options.state,
+        options.strict,
     )
 
 
 def _load_settings(options: argparse.Namespace) -> LoadSettings:
-    """Counted iterations make a map that can be made again, so there idle time is left idle unless asked for."""
-    idle = (
-        options.idle_iterations
-        if options.idle_iterations is not None
-        else (0 if options.rate is None else _IDLE_ITERATIONS)
-    )
-    return LoadSettings(options.queue, Drops(options.queue_policy), idle)
+    """Return the load settings. Without a rate, the default is no idle training, so that maps are reproducible."""
+    default = 0 if options.rate is None else _IDLE_ITERATIONS
+    idle_iterations = default if options.idle_iterations is None else options.idle_iterations
+    return LoadSettings(options.queue, QueuePolicy(options.queue_policy), idle_iterations)
 
 
-def _require_sense(options: argparse.Namespace) -> None:
-    """What would show only in the middle of a mission is refused here."""
+def _require_valid(options: argparse.Namespace) -> None:
+    """Raise InvalidInputError for values that would fail only in the middle of a mission."""
     for name in ("agent_id", "mission", "world_frame"):
         require_name(f"--{name.replace('_', '-')}", getattr(options, name))
     if not options.agent_id:
@@ -152,20 +155,20 @@ def _require_sense(options: argparse.Namespace) -> None:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="gausslite-agent",
-        description="Map for a task and stream the task's part of the map to a fusion server. With --source the agent "
-        "plays a sequence as its own camera; otherwise frames come by IngestFrames.",
+        description="Map the region of interest (ROI) of a task online, and send it to a fusion server. With --source "
+        "the agent replays a sequence; otherwise it receives frames by the IngestFrames call.",
     )
     add = parser.add_argument
-    add("--listen", default="127.0.0.1:50053", metavar="ADDRESS", help="HOST:PORT or unix:PATH; default %(default)s")
-    add("--agent-id", default="agent", metavar="NAME", help="this robot's name in the team; default %(default)s")
-    add("--task", metavar="TEXT", help="what the robot is to do; otherwise it waits for AssignTask")
-    add("--out", metavar="DIR", type=Path, help="gets map.ply and report.json at the end of the mission")
-    add("--state", metavar="FILE", type=Path, help="go on from this mission if it is there; save it here at the end")
-    add("--exit-when-done", action="store_true", help="end after the mission instead of serving on")
-    _add_camera(parser)
+    add("--listen", default="127.0.0.1:50053", metavar="ADDRESS", help="HOST:PORT or unix:PATH (default: %(default)s)")
+    add("--agent-id", default="agent", metavar="NAME", help="unique name of this agent (default: %(default)s)")
+    add("--task", metavar="TEXT", help="the robot's task (default: wait for the AssignTask call)")
+    add("--out", metavar="DIR", type=Path, help="folder for map.ply and report.json at the end of the mission")
+    add("--state", metavar="FILE", type=Path, help="resume the mission saved in this file, and save it here at the end")
+    add("--exit-when-done", action="store_true", help="exit after the mission (default: continue to serve)")
+    _add_replay(parser)
     add_frames(parser)
     add_detector(parser)
-    _add_team(parser)
+    _add_connections(parser)
     add_voxel_size(parser)
     add_policy(parser)
     add_budget(parser)
@@ -174,37 +177,49 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
+def _add_replay(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument_group("replay").add_argument
+    add("--source", metavar="SPEC", help='a sequence folder or "sim:home?seed=0&trajectory=0"')
+    add("--test-every", metavar="N", type=int, help="hold out every Nth frame from mapping, for evaluation")
+
+
+def _add_connections(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument_group("connections").add_argument
+    add("--parser", metavar="ADDRESS", help="parser service (default: parse tasks in this process, by rules)")
+    add("--fusion", metavar="ADDRESS", help="fusion server (default: none; nothing is sent)")
+    add("--mission", metavar="ID", default="", help="mission to join (default: the server's only one)")
+    add("--world-frame", metavar="NAME", default="", help="name of the frame of all poses (default: the server's)")
+    add("--uplink-kbps", metavar="N", type=float, help="bandwidth limit in kilobits per second (default: none)")
+    add(
+        "--uplink-interval",
+        metavar="S",
+        type=float,
+        default=1.0,
+        help="seconds between two transmissions (default: %(default)s)",
+    )
+    add("--spool", metavar="FILE", type=Path, help="store unsent data here, across restarts (default: in memory)")
+    add("--handover", action="store_true", help="at the end also send the map outside the ROI and the keyframes")
+    add(
+        "--drain-timeout",
+        metavar="S",
+        type=float,
+        default=120.0,
+        help="longest wait for the transmission at the end, in seconds (default: %(default)s)",
+    )
+
+
 def _add_load(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument_group("load").add_argument
-    add("--queue", metavar="N", type=int, default=4, help="frames that may wait (default: %(default)s)")
+    add("--queue", metavar="N", type=int, default=4, help="length of the frame queue (default: %(default)s)")
     add(
         "--queue-policy",
-        choices=[str(each) for each in Drops],
-        default=str(Drops.OLDEST),
-        help="what a full queue drops (default: oldest)",
+        choices=[str(each) for each in QueuePolicy],
+        default=str(QueuePolicy.OLDEST),
+        help="frame that a full queue drops (default: %(default)s)",
     )
     add(
         "--idle-iterations",
         metavar="N",
         type=int,
-        help="iterations while no frame waits (default: 64 at a --rate, else 0)",
+        help=f"training iterations while the queue is empty (default: {_IDLE_ITERATIONS} at --rate, else 0)",
     )
-
-
-def _add_camera(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument_group("camera").add_argument
-    add("--source", metavar="SPEC", help='a folder or "sim:home?seed=0&trajectory=0"')
-    add("--test-every", metavar="N", type=int, help="keep every N-th frame from mapping, for scoring")
-
-
-def _add_team(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument_group("team").add_argument
-    add("--parser", metavar="ADDRESS", help="parser service (default: parse here by rules)")
-    add("--fusion", metavar="ADDRESS", help="fusion server (default: none, nothing is sent)")
-    add("--mission", metavar="ID", default="", help="the team's mission (default: the server's only one)")
-    add("--world-frame", metavar="NAME", default="", help="name of the frame all poses are in (default: the server's)")
-    add("--uplink-kbps", metavar="N", type=float, help="bandwidth to use, kilobits a second (default: no bound)")
-    add("--uplink-interval", metavar="S", type=float, default=1.0, help="seconds between rounds; default %(default)s")
-    add("--spool", metavar="FILE", type=Path, help="keep what is to be sent here, over restarts (default: in memory)")
-    add("--handover", action="store_true", help="at the end also send the rest of the map and the keyframes")
-    add("--drain-timeout", metavar="S", type=float, default=120.0, help="longest wait at the end; default %(default)s")

@@ -1,19 +1,23 @@
-"""What a robot says of a frame and of itself."""
+"""The outcome of each frame, and the totals of the mapping worker."""
 
 from __future__ import annotations
 
+import threading
 from dataclasses import dataclass, replace
 from enum import Enum
+from typing import Any
 
 import numpy as np
 
 from gausslite.domain.task import TaskGraph
+from gausslite.mapping.stages import SkippableStage
+from gausslite.mission.task_mapper import FrameOutcome
 
 _AGES_KEPT = 1000
 
 
 class Outcome(Enum):
-    """What became of a frame."""
+    """What happened to a frame."""
 
     MAPPED = "mapped"
     SKIPPED = "skipped"
@@ -23,9 +27,9 @@ class Outcome(Enum):
 
 @dataclass(frozen=True, slots=True)
 class FrameReport:
-    """The outcome of one frame; reason says why it was not mapped.
+    """The outcome of one frame; reason: why it was not mapped.
 
-    seconds is what it took, age_s how long ago it had come when it was mapped, its wait in the queue included.
+    seconds: its processing time; age_s: time from its arrival until it was mapped, including its wait in the queue.
     """
 
     index: int
@@ -40,12 +44,12 @@ class FrameReport:
 
 @dataclass(frozen=True, slots=True)
 class WorkerStatus:
-    """Totals so far; busy_s is the time spent on perception and mapping, notes what the attention has to say.
+    """Totals since the start of the agent.
 
-    short counts the frames that trained less than they should, without_* those that went without something for want
-    of time; max_detection_lag is the greatest age, in frames, at which a detection came; reread counts the keyframes
-    that were looked at again for a new task. untold_because says why the uplink could not take the newest words.
-    ages_s are those of the latest mapped frames.
+    busy_s: time of perception and mapping. under_trained, publishing_skipped, seeding_skipped: frames whose time was
+    too short for all of it. max_detection_lag: longest delay of a detection, in frames. keyframes_reevaluated:
+    keyframes evaluated for a new task. publish_error: why the uplink refused the newest changes. ages_s: ages of the
+    latest mapped frames. notes: messages of the relevance estimator.
     """
 
     graph: TaskGraph | None = None
@@ -59,26 +63,26 @@ class WorkerStatus:
     busy_s: float = 0.0
     roi_share_sum: float = 0.0
     idle_iterations: int = 0
-    short: int = 0
-    without_words: int = 0
-    without_seeding: int = 0
+    under_trained: int = 0
+    publishing_skipped: int = 0
+    seeding_skipped: int = 0
     max_detection_lag: int = 0
-    reread: int = 0
-    untold_because: str = ""
+    keyframes_reevaluated: int = 0
+    publish_error: str = ""
     ages_s: tuple[float, ...] = ()
     notes: tuple[str, ...] = ()
 
     @property
     def load_notes(self) -> tuple[str, ...]:
-        """What was left undone for want of time or of room, one line each."""
-        told = (
+        """One line for each kind of work that was dropped for want of time or space."""
+        counts = (
             (self.dropped, "frames were dropped"),
-            (self.short, "frames trained too little"),
-            (self.without_words, "frames told their words later"),
-            (self.without_seeding, "frames were not seeded"),
+            (self.under_trained, "frames trained fewer iterations than --min-iterations"),
+            (self.publishing_skipped, "frames published their changes with a later frame"),
+            (self.seeding_skipped, "frames were not seeded"),
         )
-        overload = tuple(f"overload: {count} {what}" for count, what in told if count)
-        return (*overload, f"nothing more is told: {self.untold_because}") if self.untold_because else overload
+        overload = tuple(f"overload: {count} {effect}" for count, effect in counts if count)
+        return (*overload, f"changes are not published: {self.publish_error}") if self.publish_error else overload
 
     @property
     def hz(self) -> float:
@@ -91,11 +95,11 @@ class WorkerStatus:
         return self.roi_share_sum / max(self.mapped, 1)
 
     def age_s(self, percent: float) -> float:
-        """The age that so many of the latest frames had not passed when they were mapped; 0 before the first."""
+        """Return the percentile of the latest frames' ages; 0 before the first."""
         return float(np.percentile(self.ages_s, percent)) if self.ages_s else 0.0
 
-    def plus(self, report: FrameReport) -> WorkerStatus:
-        """The totals with one more frame."""
+    def with_report(self, report: FrameReport) -> WorkerStatus:
+        """Return the totals with one more frame."""
         if report.outcome is not Outcome.MAPPED:
             return replace(self, **{report.outcome.value: getattr(self, report.outcome.value) + 1})
         return replace(
@@ -107,3 +111,48 @@ class WorkerStatus:
             roi_share_sum=self.roi_share_sum + report.roi_share,
             ages_s=(*self.ages_s[1 - _AGES_KEPT :], report.age_s),
         )
+
+    def with_outcome(self, outcome: FrameOutcome) -> WorkerStatus:
+        """Return the totals with the skipped stages, detections and keyframes of one mapped frame."""
+        skipped = outcome.timing.skipped_stages
+        return replace(
+            self,
+            under_trained=self.under_trained + outcome.timing.under_trained,
+            publishing_skipped=self.publishing_skipped + (SkippableStage.PUBLISHING in skipped),
+            seeding_skipped=self.seeding_skipped + (SkippableStage.SEEDING in skipped),
+            max_detection_lag=max(self.max_detection_lag, outcome.detection_lag_frames or 0),
+            keyframes_reevaluated=self.keyframes_reevaluated + outcome.reevaluation.keyframes,
+        )
+
+
+class StatusHolder:
+    """The current WorkerStatus, for the worker and for the readers on other threads."""
+
+    def __init__(self, status: WorkerStatus) -> None:
+        self._status = status
+        self._lock = threading.Lock()
+
+    def get(self) -> WorkerStatus:
+        """Return the current status."""
+        with self._lock:
+            return self._status
+
+    def update(self, **changes: Any) -> None:
+        """Replace these fields."""
+        with self._lock:
+            self._status = replace(self._status, **changes)
+
+    def add_report(self, report: FrameReport, map_revision: int) -> None:
+        """Count one frame."""
+        with self._lock:
+            self._status = replace(self._status.with_report(report), map_revision=map_revision)
+
+    def add_outcome(self, outcome: FrameOutcome) -> None:
+        """Count what one mapped frame skipped, detected and re-evaluated."""
+        with self._lock:
+            self._status = self._status.with_outcome(outcome)
+
+    def add_idle_iteration(self) -> None:
+        """Count one idle iteration."""
+        with self._lock:
+            self._status = replace(self._status, idle_iterations=self._status.idle_iterations + 1)

@@ -1,0 +1,44 @@
+"""Wait for the parser service to start, until the agent is stopped."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+
+from gausslite.domain.task import TaskGraph
+from gausslite.errors import UnavailableError
+from gausslite.task.parser import TaskParser
+
+_log = logging.getLogger(__name__)
+_TIMEOUT_S = 30.0
+_RETRY_S = 0.5
+
+
+class WaitingParser:
+    """A TaskParser that retries while its service is unavailable, up to 30 seconds."""
+
+    def __init__(self, parser: TaskParser, timeout_s: float = _TIMEOUT_S) -> None:
+        self._parser = parser
+        self._timeout_s = timeout_s
+        self._stopping = threading.Event()
+
+    def stop(self) -> None:
+        """End the wait: `parse` raises its last error."""
+        self._stopping.set()
+
+    def parse(self, text: str) -> TaskGraph:
+        """Return the graph of a task. Raises TaskError; UnavailableError after the timeout or `stop`."""
+        deadline_s = time.monotonic() + self._timeout_s
+        reported = False
+        while True:
+            try:
+                return self._parser.parse(text)
+            except UnavailableError as error:
+                if self._stopping.is_set() or time.monotonic() >= deadline_s:
+                    raise
+                if not reported:
+                    _log.warning("%s; retrying for %.0f s", error, self._timeout_s)
+                    reported = True
+                if self._stopping.wait(_RETRY_S):
+                    raise
