@@ -1,1 +1,1 @@
-"""From a frame and a task graph to a relevance map: which pixels the task is about (Sec. III-B.2 to III-B.4)."""
+"""Estimate the relevance map of a frame for a task graph (Sec. III-B.2 to III-B.4)."""

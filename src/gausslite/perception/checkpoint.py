@@ -1,4 +1,4 @@
-"""Landmark objects and carried detections as named arrays, so that attention can go on in another process."""
+"""Encode landmarks and propagated detections as named arrays, and decode them to resume in another process."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from gausslite.perception.reproject import Frustum
 
 
 def encode_frustum(frustum: Frustum) -> dict[str, NDArray[Any]]:
-    """A carried detection and the camera that saw it."""
+    """Encode a propagated detection and its camera."""
     detection, camera = frustum.detection, frustum.camera
     intrinsics = (camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px)
     return {
@@ -30,7 +30,7 @@ def encode_frustum(frustum: Frustum) -> dict[str, NDArray[Any]]:
 
 
 def decode_frustum(state: State) -> Frustum:
-    """The carried detection again. Raises MapFileError, InvalidInputError."""
+    """Decode a propagated detection. Raises MapFileError, InvalidInputError."""
     numbers = get_floats(state, "numbers", 11)
     score, left, top, right, bottom, fx_px, fy_px, cx_px, cy_px, near_m, far_m = numbers
     mask = get_array(state, "mask", (None, None), np.bool_).copy()
@@ -42,26 +42,26 @@ def decode_frustum(state: State) -> Frustum:
     return Frustum(detection, camera, T_world_camera, near_m, far_m, missed_detections)
 
 
-def encode_landmark(each: Landmark) -> dict[str, NDArray[Any]]:
-    """An object over all its observations."""
+def encode_landmark(landmark: Landmark) -> dict[str, NDArray[Any]]:
+    """Encode a landmark."""
     return {
-        "phrase": encode_text(each.phrase),
-        "place_m": np.array([*each.centroid_m, each.radius_m]),
-        "cells": each.cells,
-        "counts": each.counts,
-        "seen": int_array(each.seen_count, each.missed_count),
-        "best": np.array([each.best_score, each.farthest_m]),
+        "phrase": encode_text(landmark.phrase),
+        "centroid_radius_m": np.array([*landmark.centroid_m, landmark.radius_m]),
+        "cells": landmark.cells,
+        "counts": landmark.counts,
+        "seen_missed": int_array(landmark.seen_count, landmark.missed_count),
+        "best_score_farthest_m": np.array([landmark.best_score, landmark.farthest_m]),
     }
 
 
 def decode_landmark(state: State) -> Landmark:
-    """The object again. Raises MapFileError, InvalidInputError."""
-    x_m, y_m, z_m, radius_m = get_floats(state, "place_m", 4)
+    """Decode a landmark. Raises MapFileError, InvalidInputError."""
+    x_m, y_m, z_m, radius_m = get_floats(state, "centroid_radius_m", 4)
     cells = get_array(state, "cells", (None,), np.int64).copy()
     counts = get_array(state, "counts", cells.shape, np.int64).copy()
     if (counts < 1).any() or (cells[1:] <= cells[:-1]).any() or len(cells) == 0:
-        raise MapFileError("state object: expected ascending cells with counts, got others")
-    seen, missed = get_counts(state, "seen", 2)
-    best_score, farthest_m = get_floats(state, "best", 2)
-    place = (get_text(state, "phrase"), np.array([x_m, y_m, z_m]), radius_m, cells, counts)
-    return Landmark(*place, seen, missed, best_score, farthest_m)
+        raise MapFileError("state landmark: expected ascending cells with positive counts, got others")
+    seen_count, missed_count = get_counts(state, "seen_missed", 2)
+    best_score, farthest_m = get_floats(state, "best_score_farthest_m", 2)
+    extent = (get_text(state, "phrase"), np.array([x_m, y_m, z_m]), radius_m, cells, counts)
+    return Landmark(*extent, seen_count, missed_count, best_score, farthest_m)

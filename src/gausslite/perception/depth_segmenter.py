@@ -32,7 +32,9 @@ class DepthSegmenterSettings:
     def __post_init__(self) -> None:
         for name in ("depth_step", "colour_step"):
             if not (np.isfinite(getattr(self, name)) and getattr(self, name) > 0):
-                raise InvalidInputError(f"depth segmenter {name}: expected a positive number, got {getattr(self, name)}")
+                raise InvalidInputError(
+                    f"depth segmenter {name}: expected a positive number, got {getattr(self, name)}"
+                )
         if not 8 <= self.side_px <= 4096:
             raise InvalidInputError(f"depth segmenter side_px: expected 8 to 4096, got {self.side_px}")
 

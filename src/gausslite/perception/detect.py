@@ -1,4 +1,4 @@
-"""The seam between words and pixels: every detector, learned or exact, fits here, and so does every segmenter."""
+"""The interfaces of detectors and segmenters, and what all of them share: box limits and overlaps."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from gausslite.perception.vocabulary import is_furniture, is_generic, is_surface
 
 @runtime_checkable
 class Detector(Protocol):
-    """Finds the objects that noun phrases name."""
+    """Detect the objects that noun phrases name, with masks."""
 
     def detect(self, frame: Frame, queries: Sequence[str]) -> list[Detection]:
-        """All instances of each query, best first; one object may answer several queries."""
+        """Return all instances of each query, best first; one object may match several queries."""
         ...
 
     def unsupported(self, queries: Sequence[str]) -> tuple[str, ...]:
@@ -31,7 +31,7 @@ class Detector(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class DetectedBox:
-    """Where a detector of boxes saw what a phrase names; box_px is (left, top, right, bottom)."""
+    """A detection without a mask; box_px is (left, top, right, bottom)."""
 
     phrase: str
     score: float
@@ -40,10 +40,10 @@ class DetectedBox:
 
 @runtime_checkable
 class BoxDetector(Protocol):
-    """Finds the objects that noun phrases name, but not their outlines."""
+    """Detect the objects that noun phrases name, without masks."""
 
     def boxes(self, frame: Frame, queries: Sequence[str]) -> list[DetectedBox]:
-        """All instances of each query, best first."""
+        """Return all instances of each query, best first."""
         ...
 
     def unsupported(self, queries: Sequence[str]) -> tuple[str, ...]:
@@ -53,15 +53,15 @@ class BoxDetector(Protocol):
 
 @runtime_checkable
 class Segmenter(Protocol):
-    """Cuts known boxes out of an image, without asking again what they hold."""
+    """Segment the main object of given boxes, whatever its class."""
 
     def segment(self, frame: Frame, boxes_px: Float32[ndarray, "n 4"]) -> list[Bool[ndarray, "h w"] | None]:
-        """One mask a box (left, top, right, bottom); None where the box holds no clear object."""
+        """Return one mask per box (left, top, right, bottom); None if the box shows no clear object."""
         ...
 
 
 class SegmentedDetector:
-    """A Detector made of one that finds boxes and segmenters that cut them out, each asked for what the last left."""
+    """A Detector from a box detector and segmenters; each segmenter gets the boxes that the previous one left."""
 
     def __init__(self, detector: BoxDetector, segmenters: Sequence[Segmenter]) -> None:
         self._detector = detector
@@ -72,15 +72,15 @@ class SegmentedDetector:
         return self._detector.unsupported(queries)
 
     def detect(self, frame: Frame, queries: Sequence[str]) -> list[Detection]:
-        """The boxes that any segmenter has a mask for, in the detector's order."""
+        """Return the boxes with a mask, in the box detector's order."""
         boxes = self._detector.boxes(frame, queries)
         masks: list[Bool[ndarray, "h w"] | None] = [None] * len(boxes)
         for segmenter in self._segmenters:
-            open_rows = [row for row, mask in enumerate(masks) if mask is None]
-            if not open_rows:
+            rows = [row for row, mask in enumerate(masks) if mask is None]
+            if not rows:
                 break
-            table = np.array([boxes[row].box_px for row in open_rows], np.float32)
-            for row, mask in zip(open_rows, segmenter.segment(frame, table), strict=True):
+            boxes_px = np.array([boxes[row].box_px for row in rows], np.float32)
+            for row, mask in zip(rows, segmenter.segment(frame, boxes_px), strict=True):
                 masks[row] = mask
         return [
             Detection(box.phrase, box.score, box.box_px, mask)
@@ -91,9 +91,9 @@ class SegmentedDetector:
 
 @dataclass(frozen=True, slots=True)
 class BoxFractions:
-    """The largest share of the image that a box may span before it is taken for a mistake (comment in Sec. III-B.2).
+    """Largest share of the image that a box may cover; larger boxes are false detections (comment in Sec. III-B.2).
 
-    surface is ours: of the true tables of a real kitchen, seen from one to two metres, 0.40 refuses more than half.
+    `surface` is not in the paper: in a real kitchen, 0.40 would reject more than half of the true tables.
     """
 
     small: float = 0.20
@@ -107,7 +107,7 @@ class BoxFractions:
                 raise InvalidInputError(f"box fraction {name}: expected 0 to 1, got {getattr(self, name)}")
 
     def limit(self, phrase: str, many_objects: bool) -> float:
-        """The share allowed for objects of this name."""
+        """Return the largest share for objects of this name."""
         if is_surface(phrase):
             return self.surface
         if many_objects:
@@ -116,12 +116,12 @@ class BoxFractions:
 
 
 def concerns_many_objects(queries: Sequence[str]) -> bool:
-    """True for tasks about anything at all, or about more than a target and its anchor."""
+    """Return True for a generic noun, or for more queries than one target and its anchor."""
     return len(queries) > 2 or any(is_generic(query) for query in queries)
 
 
 def box_iou(boxes_a: Float32[ndarray, "n 4"], boxes_b: Float32[ndarray, "m 4"]) -> Float32[ndarray, "n m"]:
-    """Intersection over union of every pair of boxes (left, top, right, bottom)."""
+    """Return the intersection over union of every pair of boxes (left, top, right, bottom)."""
     top_left = np.maximum(boxes_a[:, None, :2], boxes_b[None, :, :2])
     bottom_right = np.minimum(boxes_a[:, None, 2:], boxes_b[None, :, 2:])
     shared = np.clip(bottom_right - top_left, 0.0, None).prod(axis=2)
@@ -133,7 +133,7 @@ def box_iou(boxes_a: Float32[ndarray, "n 4"], boxes_b: Float32[ndarray, "m 4"]) 
 
 
 def bounding_box(mask: Bool[ndarray, "h w"]) -> tuple[float, float, float, float] | None:
-    """The tight box (left, top, right, bottom) round a mask in pixels, None when it is empty."""
+    """Return the tight box (left, top, right, bottom) of a mask in pixels, None if the mask is empty."""
     columns = np.flatnonzero(mask.any(axis=0))
     rows = np.flatnonzero(mask.any(axis=1))
     if len(columns) == 0:

@@ -1,4 +1,4 @@
-"""When a remembered object is believed: seen again from another place, or once for sure, and not mostly overlooked."""
+"""Decide whether a landmark has enough evidence: repeated or confident detections, and few misses when in view."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from gausslite.perception.object_map import Landmark
 
 _RELIABLE_FACTOR: Final = 3
 _NEAR_M: Final = 0.05
-_BEHIND_M: Final = 0.10
-_BEHIND_SHARE: Final = 0.02
-_MIN_SHOWN: Final = 0.6
-_FARTHER: Final = 1.1
+_DEPTH_SLACK_M: Final = 0.10
+_DEPTH_SLACK_SHARE: Final = 0.02
+_MIN_VISIBLE_SHARE: Final = 0.6
+_MAX_DISTANCE_FACTOR: Final = 1.1
 
 
 @dataclass(frozen=True, slots=True)
 class EvidenceSettings:
-    """Believed is what was seen min_seen times, or once with confident_score, in min_seen_fraction of the views that show its place.
+    """A landmark is confirmed after min_seen detections, or one of confident_score or more.
 
-    The least of each (1, 0 and 0) believes every detection.
+    Of the frames in which it should be visible, at least min_seen_fraction must have detected it.
     """
 
     min_seen: int = 2
@@ -43,40 +43,42 @@ class EvidenceSettings:
 
     @classmethod
     def accept_all(cls) -> EvidenceSettings:
-        """Every detection counts."""
+        """Return settings that confirm every detection."""
         return cls(min_seen=1, confident_score=0.0, min_seen_fraction=0.0)
 
-    def is_confirmed(self, each: Landmark) -> bool:
-        """True when there is enough to go by."""
-        often = each.seen_count >= self.min_seen or each.best_score >= self.confident_score
-        return often and each.seen_count >= self.min_seen_fraction * (each.seen_count + each.missed_count)
+    def is_confirmed(self, landmark: Landmark) -> bool:
+        """Return True if the landmark has enough evidence to exist."""
+        seen, missed = landmark.seen_count, landmark.missed_count
+        has_evidence = seen >= self.min_seen or landmark.best_score >= self.confident_score
+        return has_evidence and seen >= self.min_seen_fraction * (seen + missed)
 
-    def is_reliable(self, each: Landmark) -> bool:
-        """True when it is believed and could not be two mistakes: one false candidate would decide a superlative."""
-        often = each.seen_count >= _RELIABLE_FACTOR * self.min_seen or each.best_score >= self.confident_score
-        return often and self.is_confirmed(each)
+    def is_reliable(self, landmark: Landmark) -> bool:
+        """Return True if two false detections cannot explain the landmark; superlatives use only such landmarks."""
+        min_seen = _RELIABLE_FACTOR * self.min_seen
+        has_evidence = landmark.seen_count >= min_seen or landmark.best_score >= self.confident_score
+        return has_evidence and self.is_confirmed(landmark)
 
-    def needs_observation(self, each: Landmark) -> bool:
-        """True when one more observation could settle it."""
-        return not self.is_confirmed(each) and each.seen_count + 1 >= self.min_seen
+    def needs_observation(self, landmark: Landmark) -> bool:
+        """Return True if one more observation could confirm the landmark."""
+        return not self.is_confirmed(landmark) and landmark.seen_count + 1 >= self.min_seen
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class VisibilityCheck:
-    """What a frame could show: depth_m is that of its nearest surfaces."""
+    """The test whether a frame should show a landmark; depth_m is the depth of the nearest surfaces."""
 
     frame: Frame
     depth_m: Float32[ndarray, "h w"]
 
-    def is_visible(self, each: Landmark) -> bool:
-        """True when most of the object's cells lie in view with nothing before them, no farther than it was seen from.
+    def is_visible(self, landmark: Landmark) -> bool:
+        """Return True if most of the landmark's cells are in view, unoccluded and near enough to be detected.
 
-        An object that is gone still has its place: then what lies behind is seen.
+        The cells of an object that was removed are also visible: the frame then shows the surface behind them.
         """
-        eye_m = self.frame.T_world_camera[:3, 3]
-        if float(np.linalg.norm(each.centroid_m - eye_m)) > _FARTHER * each.farthest_m:
+        camera_m = self.frame.T_world_camera[:3, 3]
+        if float(np.linalg.norm(landmark.centroid_m - camera_m)) > _MAX_DISTANCE_FACTOR * landmark.farthest_m:
             return False
-        cells = transform_points(inverse(self.frame.T_world_camera), each.footprint_m().astype(np.float64))
+        cells = transform_points(inverse(self.frame.T_world_camera), landmark.footprint_m().astype(np.float64))
         z_m = cells[:, 2]
         in_front = np.column_stack([cells[:, :2], np.maximum(z_m, _NEAR_M)]).astype(np.float32)
         pixels = np.floor(project(in_front, self.frame.camera)).astype(np.int64)
@@ -84,5 +86,5 @@ class VisibilityCheck:
         inside = (z_m > _NEAR_M) & (pixels >= 0).all(axis=1) & (pixels < (width, height)).all(axis=1)
         columns, rows = pixels[inside].T
         sensed_m = self.depth_m[rows, columns]
-        open_to_view = (sensed_m > 0) & (z_m[inside] <= sensed_m * (1.0 + _BEHIND_SHARE) + _BEHIND_M)
-        return bool(np.count_nonzero(open_to_view) >= _MIN_SHOWN * len(cells))
+        unoccluded = (sensed_m > 0) & (z_m[inside] <= sensed_m * (1.0 + _DEPTH_SLACK_SHARE) + _DEPTH_SLACK_M)
+        return bool(np.count_nonzero(unoccluded) >= _MIN_VISIBLE_SHARE * len(cells))

@@ -1,4 +1,4 @@
-"""RelevanceEstimator without words: the task's region is given."""
+"""Relevance estimators without a task sentence: given regions, or no region at all."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from gausslite.perception.relevance_estimator import RelevanceEstimate
 
 
 class RegionRelevanceEstimator:
-    """An RelevanceEstimator that marks the given regions; region i is target i, earlier ones win where they overlap."""
+    """A RelevanceEstimator that marks given regions; region i is target i, and the first wins in an overlap."""
 
     def __init__(self, regions: Sequence[Region]) -> None:
         if not regions:
@@ -26,11 +26,11 @@ class RegionRelevanceEstimator:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """None: nothing has to be found."""
+        """Empty: no detection can fail."""
         return ()
 
     def estimate(self, frame: Frame, rendered_depth_m: Float32[ndarray, "h w"] | None = None) -> RelevanceEstimate:
-        """Weight 1 on every pixel that shows a region; masks are exact without the rendered depth."""
+        """Return weight 1 on every pixel that shows a region; the rendered depth is not needed."""
         del rendered_depth_m
         target = np.full(frame.depth_m.shape, NO_TARGET, np.int16)
         for index, region in reversed(list(enumerate(self._regions))):
@@ -38,39 +38,39 @@ class RegionRelevanceEstimator:
         return RelevanceEstimate(RelevanceMap((target != NO_TARGET).astype(np.float32), target))
 
     def evaluate_past(self, frame: Frame) -> RelevanceMap:
-        """As for any other frame."""
+        """Return the relevance as `estimate` does."""
         return self.estimate(frame).relevance
 
     def state(self) -> State:
-        """Nothing: every frame is judged by itself."""
+        """Return nothing: each frame's relevance is independent of the others."""
         return {}
 
     def restore(self, state: State) -> None:
-        """Nothing to take over."""
+        """Do nothing: there is no state."""
         del state
 
 
 class NoTaskEstimator:
-    """An RelevanceEstimator for uniform maps: nothing is relevant."""
+    """A RelevanceEstimator for uniform maps: no pixel is relevant."""
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """None: nothing has to be found."""
+        """Empty: no detection can fail."""
         return ()
 
     def estimate(self, frame: Frame, rendered_depth_m: Float32[ndarray, "h w"] | None = None) -> RelevanceEstimate:
-        """Weight 0 everywhere."""
+        """Return weight 0 everywhere."""
         del rendered_depth_m
         return RelevanceEstimate(RelevanceMap.empty(*frame.depth_m.shape))
 
     def evaluate_past(self, frame: Frame) -> RelevanceMap:
-        """As for any other frame."""
+        """Return the relevance as `estimate` does."""
         return self.estimate(frame).relevance
 
     def state(self) -> State:
-        """Nothing: every frame is judged by itself."""
+        """Return nothing: each frame's relevance is independent of the others."""
         return {}
 
     def restore(self, state: State) -> None:
-        """Nothing to take over."""
+        """Do nothing: there is no state."""
         del state

@@ -1,4 +1,4 @@
-"""Tell an object's own pixels from those of its mask that show what is behind it, between slats, legs and leaves."""
+"""Remove background from an object's mask: pixels behind the object, between slats, legs and leaves."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ _BIN: Final = 0.02
 _GAP_BINS: Final = 2
 _SPARSE_SHARE: Final = 0.005
 _SPARSE_TO_PEAK: Final = 0.05
-_OWN_SHARE: Final = 0.15
+_MIN_LAYER_SHARE: Final = 0.15
 _MIN_PIXELS: Final = 8
 
 
 def foreground_mask(mask: Bool[ndarray, "h w"], depth_m: Float32[ndarray, "h w"]) -> Bool[ndarray, "h w"]:
-    """The nearest layer of depth that has a good part of the mask; pixels without depth stay.
+    """Return the nearest depth layer with a sufficient share of the mask; pixels without depth are kept.
 
-    Layers lie apart where two bins of 2 % of depth, side by side, hold next to none of the mask's pixels.
+    Two adjacent, almost empty bins of 2 % of depth separate layers.
     """
     known = mask & (depth_m > 0)
     log_depths = np.log(depth_m[known])
@@ -30,7 +30,7 @@ def foreground_mask(mask: Bool[ndarray, "h w"], depth_m: Float32[ndarray, "h w"]
     filled = np.flatnonzero(counts > max(_SPARSE_SHARE * len(bins), _SPARSE_TO_PEAK * float(counts.max())))
     layer = np.cumsum(np.diff(filled, prepend=filled[0]) > _GAP_BINS)
     shares = np.bincount(layer, weights=counts[filled]) / len(bins)
-    nearest = filled[layer == np.flatnonzero(shares >= min(_OWN_SHARE, shares.max()))[0]]
+    nearest = filled[layer == np.flatnonzero(shares >= min(_MIN_LAYER_SHARE, shares.max()))[0]]
     outside = (bins < nearest[0] - 1) | (bins > nearest[-1] + 1)
     front = mask.copy()
     front[known] = ~outside

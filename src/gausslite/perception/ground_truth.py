@@ -1,4 +1,4 @@
-"""Exact masks for named regions: the detector that is always right, for simulations and measurements."""
+"""An exact detector over named ground-truth regions, for simulations and evaluation."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from gausslite.perception.vocabulary import same_kind
 
 
 class RegionDetector:
-    """A Detector over known regions: "mug" finds mug_1 and mug_2, "object" finds everything that is not structure."""
+    """A Detector over named regions: "mug" finds mug_1 and mug_2, "object" finds every region except structure."""
 
     def __init__(self, regions: Mapping[str, Region]) -> None:
         self._regions = dict(regions)
@@ -25,7 +25,7 @@ class RegionDetector:
         )
 
     def detect(self, frame: Frame, queries: Sequence[str]) -> list[Detection]:
-        """The regions that are visible in the frame, score 1, with exact masks."""
+        """Return the visible regions of each query, with score 1 and exact masks."""
         masks = {}
         found = []
         for query in queries:

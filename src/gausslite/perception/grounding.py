@@ -80,7 +80,9 @@ class GroundingDino:
         for query in queries:
             logits, boxes_cxcywh = self._run(pixel_values, pixel_mask, self._encoded_phrase(query))
             limit = self._settings.box_fractions.limit(query, many)
-            found += self._select_boxes(query, logits, boxes_cxcywh, limit, (frame.camera.width_px, frame.camera.height_px))
+            found += self._select_boxes(
+                query, logits, boxes_cxcywh, limit, (frame.camera.width_px, frame.camera.height_px)
+            )
         return found
 
     def _select_boxes(
@@ -190,7 +192,9 @@ def preprocess(
     shrinks = inner_w < w
     scaled = cv2.resize(rgb, (inner_w, inner_h), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
     values = np.zeros((1, 3, height, width), np.float32)
-    values[0, :, :inner_h, :inner_w] = ((scaled.astype(np.float32) / 255 - _MEAN) / _STANDARD_DEVIATION).transpose(2, 0, 1)
+    values[0, :, :inner_h, :inner_w] = ((scaled.astype(np.float32) / 255 - _MEAN) / _STANDARD_DEVIATION).transpose(
+        2, 0, 1
+    )
     mask = np.zeros((1, height, width), np.int64)
     mask[:, :inner_h, :inner_w] = 1
     return values, mask

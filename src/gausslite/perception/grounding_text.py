@@ -62,7 +62,12 @@ def encode_phrase(phrase: str, tokenizer: Tokenizer, length: int | None) -> Phra
         raise ModelFileError(f"model's input_ids: expected room for 4 tokens or more, got {length}")
     ids, spans = found.ids[-room:], found.spans[-room:]
     noun_from = len(words) - len(head_of(words))
-    marked = [tokenizer.special_token_id("[CLS]"), *ids, tokenizer.special_token_id("."), tokenizer.special_token_id("[SEP]")]
+    marked = [
+        tokenizer.special_token_id("[CLS]"),
+        *ids,
+        tokenizer.special_token_id("."),
+        tokenizer.special_token_id("[SEP]"),
+    ]
     is_noun = [False, *(start >= noun_from for start, _ in spans), False, False]
     padding = (length or len(marked)) - len(marked)
     input_ids = np.array([marked + [tokenizer.special_token_id("[PAD]")] * padding], np.int64)

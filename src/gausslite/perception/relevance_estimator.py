@@ -1,4 +1,4 @@
-"""The task's attention (Sec. III-B): detect on keyframes, carry over between them, filter in 3D, merge to w(u, v)."""
+"""Estimate w(u, v) for a task (Sec. III-B): detect on keyframes, propagate to other frames, filter by 3D relations."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from gausslite.perception.tracker import TargetTracker, TrackerSettings
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DelayedRelevance:
-    """The relevance of a frame that was attended to lag_frames frames ago, when it was not known yet."""
+    """The relevance of an earlier frame, whose estimate was lag_frames frames ago and did not include its detection."""
 
     frame: Frame
     relevance: RelevanceMap
@@ -38,35 +38,35 @@ class RelevanceEstimate:
 
 @runtime_checkable
 class RelevanceEstimator(Protocol):
-    """Says for each frame which pixels the task is about."""
+    """Estimate which pixels of each frame are relevant to the task."""
 
     def estimate(self, frame: Frame, rendered_depth_m: Float32[ndarray, "h w"] | None = None) -> RelevanceEstimate:
         """Return the relevance of one frame. rendered_depth_m is rendered from the current map, 0 where it is empty."""
         ...
 
     def evaluate_past(self, frame: Frame) -> RelevanceMap | None:
-        """The relevance of an earlier frame, attended to for another task; None where it is not known yet: ask again.
+        """Return this task's relevance of an earlier frame; None while its detection runs, then call again.
 
-        Asked from the newest such frame to the oldest, one at a time.
+        The caller proceeds from the newest frame to the oldest, one at a time.
         """
         ...
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What the operator should know of the frames so far, one line each."""
+        """Messages for the operator about the frames so far, one line each."""
         ...
 
     def state(self) -> State:
-        """What the next frame's relevance depends on besides that frame."""
+        """Return everything that the next frame's relevance depends on, except the frame, as named arrays."""
         ...
 
     def restore(self, state: State) -> None:
-        """Go on from what an attention to the same task handed out. Raises MapFileError."""
+        """Replace the state by that of an estimator of the same task. Raises MapFileError."""
         ...
 
 
 class TaskRelevanceEstimator:
-    """An RelevanceEstimator that follows a task graph and waits for its detector. One thread at a time."""
+    """A RelevanceEstimator for a task graph that waits for its detector. Use from one thread at a time."""
 
     def __init__(
         self,
@@ -75,47 +75,48 @@ class TaskRelevanceEstimator:
         settings: TrackerSettings | None = None,
         segmenter: Segmenter | None = None,
     ) -> None:
-        """Without a segmenter, carried boxes are cut out by depth alone."""
+        """Without a segmenter, masks are propagated by depth alone."""
         self._graph = graph
         self._detector = detector
         self._tracker = TargetTracker(graph, settings or TrackerSettings(), segmenter)
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Nouns without a class, and anchors that have not come into view."""
+        """Nouns that the detector cannot find, and anchors that no frame has shown yet."""
         return (*self._detector.unsupported(self._graph.queries), *self._tracker.notes)
 
     @property
     def landmarks(self) -> tuple[Landmark, ...]:
-        """The objects that the task's nouns have named so far, where they were seen."""
+        """All objects detected so far for the task's nouns, in world coordinates."""
         return self._tracker.landmarks
 
     def estimate(self, frame: Frame, rendered_depth_m: Float32[ndarray, "h w"] | None = None) -> RelevanceEstimate:
-        """Weight 1 on the pixels of the targets that fit the task's relations."""
+        """Return weight 1 on the pixels of the targets that satisfy the task's relations."""
         if not self._tracker.update_keyframe(frame):
             return RelevanceEstimate(self._tracker.propagate(frame))
-        found = self._detector.detect(frame, self._graph.queries)
-        return RelevanceEstimate(self._tracker.integrate(frame, best_depth_m(frame.depth_m, rendered_depth_m), found))
+        detections = self._detector.detect(frame, self._graph.queries)
+        depth_m = best_depth_m(frame.depth_m, rendered_depth_m)
+        return RelevanceEstimate(self._tracker.integrate(frame, depth_m, detections))
 
     def evaluate_past(self, frame: Frame) -> RelevanceMap:
-        """Detect on an earlier frame."""
+        """Return the relevance of an earlier frame after a detection on it."""
         return self._tracker.evaluate_past(frame, self._detector.detect(frame, self._graph.queries))
 
     def state(self) -> State:
-        """The objects and targets that are followed."""
+        """Return the tracker's state as named arrays."""
         return self._tracker.state()
 
     def restore(self, state: State) -> None:
-        """Follow on what another attention to this task followed. Raises MapFileError, InvalidInputError."""
+        """Replace the tracker's state by that of the same task. Raises MapFileError, InvalidInputError."""
         self._tracker.restore(state)
 
 
 class AsyncRelevanceEstimator:
-    """Estimate relevance for a task graph without waiting: detections run on an executor of one thread.
+    """A RelevanceEstimator that does not wait: detections run on an executor of one thread.
 
-    One detection runs at a time; of the keyframes that come meanwhile the newest waits and replaces an older one. What
-    was found on a keyframe is taken when it is there and carried over to the frame at hand; the keyframe's own
-    relevance comes late. A look back at an earlier frame takes turns with them. One thread at a time calls it.
+    One detection runs at a time. Of the keyframes that arrive meanwhile, only the newest is queued. A finished
+    detection is propagated to the current frame, and the keyframe's own relevance is returned as delayed.
+    Evaluations of past frames use the same executor. Use from one thread at a time.
     """
 
     def __init__(
@@ -126,7 +127,7 @@ class AsyncRelevanceEstimator:
         settings: TrackerSettings | None = None,
         segmenter: Segmenter | None = None,
     ) -> None:
-        """Without a segmenter, carried boxes are cut out by depth alone."""
+        """Without a segmenter, masks are propagated by depth alone."""
         self._graph = graph
         self._detector = detector
         self._executor = executor
@@ -134,60 +135,62 @@ class AsyncRelevanceEstimator:
         self._frames = 0
         self._skipped_keyframes = 0
         self._running: tuple[_Keyframe, Future[list[Detection]]] | None = None
-        self._waiting: _Keyframe | None = None
+        self._queued: _Keyframe | None = None
         self._past_detection: tuple[Frame, Future[list[Detection]]] | None = None
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Nouns without a class, anchors that have not come into view, keyframes that were never looked at."""
-        overtaken = (f"detector too slow: {self._skipped_keyframes} keyframes were overtaken",) if self._skipped_keyframes else ()
-        return (*self._detector.unsupported(self._graph.queries), *self._tracker.notes, *overtaken)
+        """Nouns that the detector cannot find, anchors not seen yet, and the number of skipped keyframes."""
+        unsupported = self._detector.unsupported(self._graph.queries)
+        count = self._skipped_keyframes
+        skipped = (f"detector too slow: {count} keyframes were skipped",) if count else ()
+        return (*unsupported, *self._tracker.notes, *skipped)
 
     def state(self) -> State:
-        """The objects and targets that are followed; what the detector is busy with is not among them."""
+        """Return the tracker's state as named arrays, without running detections."""
         return self._tracker.state()
 
     def restore(self, state: State) -> None:
-        """Follow on what another attention to this task followed. Raises MapFileError, InvalidInputError."""
+        """Replace the tracker's state by that of the same task. Raises MapFileError, InvalidInputError."""
         self._tracker.restore(state)
 
     def estimate(self, frame: Frame, rendered_depth_m: Float32[ndarray, "h w"] | None = None) -> RelevanceEstimate:
-        """Weight 1 on the pixels of the targets known so far. Raises what the detector raised."""
+        """Return weight 1 on the pixels of the targets detected so far. Raises the detector's exceptions."""
         delayed = self._collect()
         if self._tracker.update_keyframe(frame):
-            self._skipped_keyframes += self._waiting is not None
-            self._waiting = _Keyframe(frame, best_depth_m(frame.depth_m, rendered_depth_m), self._frames)
-        if self._running is None and self._waiting is not None:
-            found = self._executor.submit(self._detector.detect, self._waiting.frame, self._graph.queries)
-            self._running, self._waiting = (self._waiting, found), None
+            self._skipped_keyframes += self._queued is not None
+            self._queued = _Keyframe(frame, best_depth_m(frame.depth_m, rendered_depth_m), self._frames)
+        if self._running is None and self._queued is not None:
+            future = self._executor.submit(self._detector.detect, self._queued.frame, self._graph.queries)
+            self._running, self._queued = (self._queued, future), None
         self._frames += 1
         return RelevanceEstimate(self._tracker.propagate(frame), delayed)
 
     def evaluate_past(self, frame: Frame) -> RelevanceMap | None:
-        """What was found on an earlier frame; the first call has it looked at.
+        """Return the relevance of an earlier frame once its detection has finished; the first call starts it.
 
-        Raises what the detector raised, once: who asks again has it looked at again.
+        Raises the detector's exceptions once; the next call starts the detection again.
         """
         if self._past_detection is None or self._past_detection[0] is not frame:
             self._past_detection = frame, self._executor.submit(self._detector.detect, frame, self._graph.queries)
-        _, found = self._past_detection
-        if not found.done():
+        _, future = self._past_detection
+        if not future.done():
             return None
         self._past_detection = None
-        return self._tracker.evaluate_past(frame, found.result())
+        return self._tracker.evaluate_past(frame, future.result())
 
     def _collect(self) -> DelayedRelevance | None:
-        """Take what was found, if the detector is done."""
+        """Integrate the running detection if it has finished."""
         if self._running is None or not self._running[1].done():
             return None
-        (key, found), self._running = self._running, None
-        relevance = self._tracker.integrate(key.frame, key.depth_m, found.result())
-        return DelayedRelevance(key.frame, relevance, self._frames - key.number)
+        (keyframe, future), self._running = self._running, None
+        relevance = self._tracker.integrate(keyframe.frame, keyframe.depth_m, future.result())
+        return DelayedRelevance(keyframe.frame, relevance, self._frames - keyframe.number)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Keyframe:
-    """A frame to detect on, the depth its detections are lifted by, and its number among all frames."""
+    """A frame to detect on, the depth that lifts its detections, and its number among all frames."""
 
     frame: Frame
     depth_m: Float32[ndarray, "h w"]

@@ -1,4 +1,4 @@
-"""Carry detections from a keyframe into the next frames: their 3D frustum is projected and cut out again by depth."""
+"""Propagate detections from a keyframe to later frames: project their 3D frustum and mask it by depth."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ _SLACK_SHARE: Final = 0.02
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Frustum:
-    """A detection's box between the depths its mask spans, with the camera that saw it.
+    """A detection's box between the nearest and farthest depth of its mask, with the detecting camera.
 
-    missed_detections counts the detections since then that did not find its object again.
+    missed_detections: later detections that did not find the object again.
     """
 
     detection: Detection
@@ -37,7 +37,7 @@ class Frustum:
     missed_detections: int = 0
 
     def corners_m(self) -> Float64[ndarray, "8 3"]:
-        """The frustum's corners in the world: the near face first, then the far one."""
+        """Return the frustum's corners in the world: the near face first, then the far one."""
         left, top, right, bottom = self.detection.box_px
         corners_px = np.array([(left, top), (right, top), (right, bottom), (left, bottom)] * 2, np.float64)
         depths_m = np.repeat(np.array([self.near_m, self.far_m]), 4)
@@ -45,7 +45,7 @@ class Frustum:
 
 
 def lift_frustum(detection: Detection, depth_m: Float32[ndarray, "h w"], frame: Frame) -> Frustum | None:
-    """Lift a detection of this frame; None when too few of its mask's pixels have depth."""
+    """Lift a detection of this frame; None if too few of its mask's pixels have depth."""
     depths = depth_m[detection.mask & (depth_m > 0)]
     if len(depths) < _MIN_PIXELS:
         return None
@@ -55,7 +55,7 @@ def lift_frustum(detection: Detection, depth_m: Float32[ndarray, "h w"], frame: 
 
 
 def reprojected_box_px(frustum: Frustum, frame: Frame) -> tuple[float, float, float, float] | None:
-    """The box round the frustum's corners in another frame, clipped to the image; None when it is out of view."""
+    """Return the bounding box of the frustum in another frame, clipped to the image; None if it is out of view."""
     corners = transform_points(inverse(frame.T_world_camera), frustum.corners_m())
     in_front = corners[corners[:, 2] > _MIN_Z_M].astype(np.float32)
     if len(in_front) == 0:
@@ -70,7 +70,7 @@ def reprojected_box_px(frustum: Frustum, frame: Frame) -> tuple[float, float, fl
 
 
 def mask_in_frustum(frustum: Frustum, box_px: tuple[float, float, float, float], frame: Frame) -> Bool[ndarray, "h w"]:
-    """The pixels of the box whose surface lies in the frustum and, seen from the keyframe, behind its mask."""
+    """Return the box's pixels whose surface points lie in the frustum and project into the keyframe's mask."""
     left, top = (int(np.floor(value)) for value in box_px[:2])
     right, bottom = (int(np.ceil(value)) for value in box_px[2:])
     mask = np.zeros(frame.depth_m.shape, np.bool_)
@@ -78,12 +78,12 @@ def mask_in_frustum(frustum: Frustum, box_px: tuple[float, float, float, float],
     T_key_camera = inverse(frustum.T_world_camera) @ frame.T_world_camera
     points = transform_points(T_key_camera, back_project(depth_m, frame.camera, left, top)).reshape(-1, 3)
     between = (points[:, 2] >= frustum.near_m) & (points[:, 2] <= frustum.far_m) & (depth_m.reshape(-1) > 0)
-    chosen = np.flatnonzero(between)
-    pixels = np.floor(project(points[chosen], frustum.camera)).astype(np.int64)
+    selected = np.flatnonzero(between)
+    pixels = np.floor(project(points[selected], frustum.camera)).astype(np.int64)
     size = np.asarray((frustum.camera.width_px, frustum.camera.height_px))
     visible = ((pixels >= 0) & (pixels < size)).all(axis=1)
-    chosen, pixels = chosen[visible], pixels[visible]
+    selected, pixels = selected[visible], pixels[visible]
     inside = np.zeros(depth_m.size, np.bool_)
-    inside[chosen] = frustum.detection.mask[pixels[:, 1], pixels[:, 0]]
+    inside[selected] = frustum.detection.mask[pixels[:, 1], pixels[:, 0]]
     mask[top:bottom, left:right] = inside.reshape(depth_m.shape)
     return mask

@@ -1,4 +1,4 @@
-"""Keep the detections whose place in space fits the task's relations (Sec. III-B.3)."""
+"""Filter detections by the task's spatial relations (Sec. III-B.3)."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ _MAX_PIXELS = 4000
 def best_depth_m(
     sensor_m: Float32[ndarray, "h w"], rendered_m: Float32[ndarray, "h w"] | None
 ) -> Float32[ndarray, "h w"]:
-    """The map's depth where it has drawn something, the sensor's elsewhere."""
+    """Return the rendered depth where the map is not empty, the sensor's depth elsewhere."""
     if rendered_m is None or rendered_m.shape != sensor_m.shape:
         return sensor_m
     return np.where(rendered_m > 0, rendered_m, sensor_m)
 
 
 def lift_observation(detection: Detection, depth_m: Float32[ndarray, "h w"], frame: Frame) -> Observation | None:
-    """Lift a detection's mask to its centroid in the world; None where too few of its pixels have depth.
+    """Lift a detection's mask to an observation in the world; None if too few of its pixels have depth.
 
-    Instead of the one pixel at the 2D centroid, which may lie beside the object, all its pixels are lifted.
+    The paper lifts the pixel at the 2D centroid, which may lie outside the object; this lifts all pixels.
     """
     rows, columns = np.nonzero(detection.mask & (depth_m > 0))
     if len(rows) < _MIN_PIXELS:
@@ -48,7 +48,7 @@ def lift_observation(detection: Detection, depth_m: Float32[ndarray, "h w"], fra
 
 
 class SpatialFilter:
-    """Evaluates the graph's relations against everything seen so far; anchors stay where they were last seen."""
+    """Evaluate the graph's relations against all objects seen so far, whether in view or not."""
 
     def __init__(
         self, graph: TaskGraph, up_axis: UpAxis, settings: SpatialSettings, evidence: EvidenceSettings | None = None
@@ -63,59 +63,59 @@ class SpatialFilter:
 
     @property
     def landmarks(self) -> tuple[Landmark, ...]:
-        """Every object seen so far, where it was seen on average."""
+        """Every object seen so far."""
         return self._object_map.objects
 
     @property
     def unseen_anchors(self) -> tuple[str, ...]:
-        """Anchors that some relation needs and no frame has shown yet."""
+        """Anchors of relations that no frame has shown yet."""
         needed = dict.fromkeys(each.anchor for relations in self._relations.values() for each in relations)
         return tuple(anchor for anchor in needed if not self._object_map.with_phrase(anchor))
 
-    def observe(self, observations: Sequence[Observation], outlook: VisibilityCheck | None = None) -> None:
-        """Take one frame's observations into the memory; with an outlook, also what it should have shown and did not."""
-        self._object_map.observe(observations, None if outlook is None else outlook.is_visible)
+    def observe(self, observations: Sequence[Observation], visibility: VisibilityCheck | None = None) -> None:
+        """Add one frame's observations to the object map; `visibility` also counts the landmarks that it missed."""
+        self._object_map.observe(observations, None if visibility is None else visibility.is_visible)
 
     def is_confirmed(self, observation: Observation) -> bool:
-        """True when what was sighted is there for all that is known of it."""
-        shown = self._object_map.match(observation)
-        return shown is not None and self._evidence.is_confirmed(shown)
+        """Return True if the observed object has enough evidence to exist."""
+        landmark = self._object_map.match(observation)
+        return landmark is not None and self._evidence.is_confirmed(landmark)
 
     def is_reliable(self, observation: Observation) -> bool:
-        """True when what was sighted could not be two mistakes."""
-        shown = self._object_map.match(observation)
-        return shown is not None and self._evidence.is_reliable(shown)
+        """Return True if the observed object has too much evidence to be two false detections."""
+        landmark = self._object_map.match(observation)
+        return landmark is not None and self._evidence.is_reliable(landmark)
 
     def is_same_object(self, observation: Observation, other: Observation) -> bool:
-        """True when two observations show one and the same object."""
-        shown = self._object_map.match(observation)
-        return shown is not None and shown is self._object_map.match(other)
+        """Return True if both observations show the same object."""
+        landmark = self._object_map.match(observation)
+        return landmark is not None and landmark is self._object_map.match(other)
 
     def needs_observation(self, observation: Observation) -> bool:
-        """True when another look could settle whether it is there."""
-        shown = self._object_map.match(observation)
-        return shown is not None and self._evidence.needs_observation(shown)
+        """Return True if one more observation could confirm the object."""
+        landmark = self._object_map.match(observation)
+        return landmark is not None and self._evidence.needs_observation(landmark)
 
-    def restore_landmarks(self, objects: Sequence[Landmark]) -> None:
-        """Start from objects of an earlier life, oldest first."""
-        self._object_map = ObjectMap(objects)
+    def restore_landmarks(self, landmarks: Sequence[Landmark]) -> None:
+        """Replace the object map by these landmarks, oldest first."""
+        self._object_map = ObjectMap(landmarks)
 
     def satisfies_relations(self, observation: Observation) -> bool:
-        """Any relation of the target holds (Sec. III-B.3); True without relations or without their anchors.
+        """Return True if any relation of the target holds (Sec. III-B.3), or none can be evaluated.
 
-        A target is judged by the anchors that were seen; while none of them was, it is kept, for want of evidence.
-        All the anchors of `between` make one relation.
+        Relations to anchors that were never seen are not evaluated. All the anchors of `between` form one relation.
         """
         relations = self._relations.get(observation.phrase, ())
         seen = [each for each in relations if self._object_map.with_phrase(each.anchor)]
-        held = [self._holds(each, observation) for each in seen if each.predicate is not Predicate.BETWEEN]
+        results = [self._holds(each, observation) for each in seen if each.predicate is not Predicate.BETWEEN]
         anchors = [self._anchors(each, observation) for each in relations if each.predicate is Predicate.BETWEEN]
         between = self._geometry.between(observation, anchors) if anchors else None
-        judged = held if between is None else [*held, between]
-        return not judged or any(judged)
+        if between is not None:
+            results.append(between)
+        return not results or any(results)
 
     def _anchors(self, relation: Relation, observation: Observation) -> list[Landmark]:
-        """The relation's anchors without the target itself."""
+        """Return the relation's anchors without the target itself."""
         return [each for each in self._confirmed_landmarks(relation.anchor) if not each.is_colocated_with(observation)]
 
     def _holds(self, relation: Relation, observation: Observation) -> bool:
@@ -125,22 +125,22 @@ class SpatialFilter:
         return any(self._geometry.holds(relation.predicate, observation, anchor) for anchor in anchors)
 
     def _is_extreme(self, relation: Relation, observation: Observation) -> bool:
-        """Of all firm candidates, only the one whose surface is least (most) apart from that of its nearest anchor."""
+        """Return True for the reliable candidate with the least (or largest) distance to its nearest anchor."""
         sign = 1.0 if relation.predicate is Predicate.CLOSEST_TO else -1.0
         anchors = self._confirmed_landmarks(relation.anchor)
-        best, least_m = None, np.inf
+        best, best_signed_m = None, np.inf
         for candidate in self._reliable_landmarks(relation.target):
-            to_anchors_m = [surface_distance_m(candidate, each) for each in anchors if each is not candidate]
-            if to_anchors_m and sign * min(to_anchors_m) < least_m:
-                best, least_m = candidate, sign * min(to_anchors_m)
+            distances_m = [surface_distance_m(candidate, each) for each in anchors if each is not candidate]
+            if distances_m and sign * min(distances_m) < best_signed_m:
+                best, best_signed_m = candidate, sign * min(distances_m)
         return best is not None and best.matches(observation)
 
     def _reliable_landmarks(self, phrase: str) -> list[Landmark]:
-        """The objects that may decide between all that answer a phrase; the believed ones while there is none."""
-        credible = self._confirmed_landmarks(phrase)
-        return [each for each in credible if self._evidence.is_reliable(each)] or credible
+        """Return the reliable landmarks of a phrase; if there are none, the confirmed ones."""
+        confirmed = self._confirmed_landmarks(phrase)
+        return [each for each in confirmed if self._evidence.is_reliable(each)] or confirmed
 
     def _confirmed_landmarks(self, phrase: str) -> list[Landmark]:
-        """The believed objects that answer a phrase, or all while none is."""
-        named = self._object_map.with_phrase(phrase)
-        return [each for each in named if self._evidence.is_confirmed(each)] or named
+        """Return the confirmed landmarks of a phrase; if there are none, all of them."""
+        landmarks = self._object_map.with_phrase(phrase)
+        return [each for each in landmarks if self._evidence.is_confirmed(each)] or landmarks

@@ -1,4 +1,4 @@
-"""Follow a task's targets from frame to frame: place detections in space, keep those that fit, carry them over."""
+"""Track a task's targets over frames: localise detections, filter them by relations, propagate them to new frames."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ from gausslite.perception.vocabulary import is_generic
 
 @dataclass(frozen=True, slots=True)
 class TrackerSettings:
-    """up_axis points up in the world, by default that of a level first camera; max_* say when to detect anew.
+    """Limits of the camera's motion and of the frames between two detections (a comment in Sec. III-B.2).
 
-    How far the camera may go between two detections is a comment in Sec. III-B.2. A target that was believed is carried
-    on over up to max_missed_detections detections that do not find it.
+    up_axis: up in the world frame, by default that of a level first camera. max_missed_detections: detections in a row
+    that may miss a reliable target before it is dropped.
     """
 
     up_axis: UpAxis = (0.0, -1.0, 0.0)
@@ -50,16 +50,21 @@ class TrackerSettings:
                 raise InvalidInputError(f"tracker {name}: expected a positive number, got {getattr(self, name)}")
         unit_up_axis(self.up_axis)
         if self.max_missed_detections < 0:
-            raise InvalidInputError(f"tracker max_missed_detections: expected at least 0, got {self.max_missed_detections}")
+            raise InvalidInputError(
+                f"tracker max_missed_detections: expected at least 0, got {self.max_missed_detections}"
+            )
         if self.max_frames < 1:
             raise InvalidInputError(f"tracker max_frames: expected at least 1, got {self.max_frames}")
 
 
 class TargetTracker:
-    """Owns the latest keyframe and the memory of objects, and asks no detector itself. One thread at a time."""
+    """State of the tracked targets: latest keyframe, propagated detections, landmarks. Use from one thread at a time.
+
+    The caller runs the detector.
+    """
 
     def __init__(self, graph: TaskGraph, settings: TrackerSettings, segmenter: Segmenter | None) -> None:
-        """Without a segmenter, carried boxes are cut out by depth alone."""
+        """Without a segmenter, masks are propagated by depth alone."""
         self._graph = graph
         self._settings = settings
         self._segmenter = segmenter
@@ -71,88 +76,95 @@ class TargetTracker:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Anchors that have not come into view."""
+        """Anchors that no frame has shown yet."""
         return tuple(f"anchor {name!r} not seen yet: its targets are kept" for name in self._filter.unseen_anchors)
 
     @property
     def landmarks(self) -> tuple[Landmark, ...]:
-        """The objects that the task's nouns have named so far, where they were seen."""
+        """All objects detected so far for the task's nouns, in world coordinates."""
         return self._filter.landmarks
 
     def state(self) -> State:
-        """The objects seen so far, the detections that are carried on, and where they were made."""
+        """Return landmarks, propagated detections and the keyframe's pose as named arrays."""
         pose = np.zeros((0, 4, 4)) if self._T_world_keyframe is None else self._T_world_keyframe[None]
         state: dict[str, NDArray[Any]] = {
             "T_world_keyframe": pose,
-            "since": int_array(self._frames_since, self._needs_observation),
+            "keyframe_age": int_array(self._frames_since, self._needs_observation),
         }
         state["counts"] = int_array(len(self._frustums), len(self.landmarks))
         for i, frustum in enumerate(self._frustums):
-            state |= add_prefix(f"kept-{i}", encode_frustum(frustum))
-        for i, each in enumerate(self.landmarks):
-            state |= add_prefix(f"object-{i}", encode_landmark(each))
+            state |= add_prefix(f"frustum-{i}", encode_frustum(frustum))
+        for i, landmark in enumerate(self.landmarks):
+            state |= add_prefix(f"landmark-{i}", encode_landmark(landmark))
         return state
 
     def restore(self, state: State) -> None:
-        """Remember and carry on what another attention to this task did. Raises MapFileError, InvalidInputError."""
+        """Replace the state by that of a tracker of the same task. Raises MapFileError, InvalidInputError."""
         poses = get_array(state, "T_world_keyframe", (None, 4, 4), np.float64)
-        kept, objects = get_counts(state, "counts", 2)
-        if len(poses) > 1 or kept + objects > len(state):
-            raise MapFileError(f"state tracker: expected {kept} detections and {objects} objects, got fewer")
+        frustums, landmarks = get_counts(state, "counts", 2)
+        if len(poses) > 1 or frustums + landmarks > len(state):
+            raise MapFileError(f"state tracker: expected {frustums} detections and {landmarks} landmarks, got fewer")
         for pose in poses:
             require_rigid("state T_world_keyframe", pose)
-        self._frustums = [decode_frustum(select_prefix(state, f"kept-{i}")) for i in range(kept)]
-        strangers = {frustum.detection.phrase for frustum in self._frustums} - set(self._graph.targets)
-        if strangers:
-            raise MapFileError(f"state tracker: expected targets of the task, got {len(strangers)} other phrases")
-        self._filter.restore_landmarks([decode_landmark(select_prefix(state, f"object-{i}")) for i in range(objects)])
+        self._frustums = [decode_frustum(select_prefix(state, f"frustum-{i}")) for i in range(frustums)]
+        unknown = {frustum.detection.phrase for frustum in self._frustums} - set(self._graph.targets)
+        if unknown:
+            raise MapFileError(f"state tracker: expected targets of the task, got {len(unknown)} other phrases")
+        saved_landmarks = [select_prefix(state, f"landmark-{i}") for i in range(landmarks)]
+        self._filter.restore_landmarks([decode_landmark(each) for each in saved_landmarks])
         self._T_world_keyframe = poses[0].copy() if len(poses) else None
-        self._frames_since, needs_observation = get_counts(state, "since", 2)
+        self._frames_since, needs_observation = get_counts(state, "keyframe_age", 2)
         self._needs_observation = needs_observation > 0
 
     def update_keyframe(self, frame: Frame) -> bool:
-        """True for the first frame, after some frames, and once the camera went far; such a frame is a keyframe."""
+        """Return whether this frame needs a detection, and make it the keyframe if so.
+
+        Keyframes are the first frame, every max_frames-th frame, a frame far from the keyframe, and the frame after a
+        detection whose target needs another observation.
+        """
         T_world_keyframe = self._T_world_keyframe
         self._frames_since += 1
-        due = (
+        is_keyframe = (
             T_world_keyframe is None
             or self._frames_since >= self._settings.max_frames
             or (self._needs_observation and self._frames_since == 1)
             or translation_m(T_world_keyframe, frame.T_world_camera) > self._settings.max_translation_m
             or rotation_angle_deg(T_world_keyframe, frame.T_world_camera) > self._settings.max_rotation_deg
         )
-        if due:
+        if is_keyframe:
             self._T_world_keyframe, self._frames_since = frame.T_world_camera, 0
-        return due
+        return is_keyframe
 
-    def integrate(self, frame: Frame, depth_m: Float32[ndarray, "h w"], found: Sequence[Detection]) -> RelevanceMap:
-        """What was detected on a frame: the targets that fit the task's relations, from now on carried over."""
-        sighted = self._observe(frame, depth_m, found)
-        targets = [detection for detection, _ in sighted]
-        missed_detections = self._undetected(frame, depth_m, [observation for _, observation in sighted])
+    def integrate(
+        self, frame: Frame, depth_m: Float32[ndarray, "h w"], detections: Sequence[Detection]
+    ) -> RelevanceMap:
+        """Return the relevance of a keyframe from its detections, and propagate its targets from now on."""
+        confirmed = self._observe(frame, depth_m, detections)
+        targets = [detection for detection, _ in confirmed]
+        undetected = self._undetected(frame, depth_m, [observation for _, observation in confirmed])
         lifted = [lift_frustum(detection, depth_m, frame) for detection in targets]
-        self._frustums = [*(frustum for frustum in lifted if frustum is not None), *(old for old, _ in missed_detections)]
-        return merge_detections([*targets, *(shown for _, shown in missed_detections)], self._graph.targets, frame)
+        self._frustums = [*(new for new in lifted if new is not None), *(frustum for frustum, _ in undetected)]
+        return merge_detections([*targets, *(detection for _, detection in undetected)], self._graph.targets, frame)
 
-    def evaluate_past(self, frame: Frame, found: Sequence[Detection]) -> RelevanceMap:
-        """What was detected on an earlier frame: it is remembered, but newer detections are carried on."""
-        sighted = self._observe(frame, frame.depth_m, found)
-        return merge_detections([detection for detection, _ in sighted], self._graph.targets, frame)
+    def evaluate_past(self, frame: Frame, detections: Sequence[Detection]) -> RelevanceMap:
+        """Return the relevance of an earlier frame; its detections update the landmarks but are not propagated."""
+        confirmed = self._observe(frame, frame.depth_m, detections)
+        return merge_detections([detection for detection, _ in confirmed], self._graph.targets, frame)
 
     def propagate(self, frame: Frame) -> RelevanceMap:
-        """The latest targets as they are seen from another frame."""
-        shown = self._propagated_detections(frame)
-        if self._segmenter is not None and shown:
-            table = np.asarray([detection.box_px for _, detection in shown], np.float32)
-            cut_again = self._segmenter.segment(frame, table)
-            shown = [
-                (frustum, detection if mask is None else replace(detection, mask=mask))
-                for (frustum, detection), mask in zip(shown, cut_again, strict=True)
+        """Return the relevance of a frame without a detection: the latest targets, reprojected."""
+        detections = [detection for _, detection in self._propagated_detections(frame)]
+        if self._segmenter is not None and detections:
+            boxes_px = np.asarray([detection.box_px for detection in detections], np.float32)
+            masks = self._segmenter.segment(frame, boxes_px)
+            detections = [
+                detection if mask is None else replace(detection, mask=mask)
+                for detection, mask in zip(detections, masks, strict=True)
             ]
-        return merge_detections([detection for _, detection in shown], self._graph.targets, frame)
+        return merge_detections(detections, self._graph.targets, frame)
 
     def _propagated_detections(self, frame: Frame) -> list[tuple[Frustum, Detection]]:
-        """The detections that are carried and in view of this frame, as it sees them."""
+        """Return the propagated detections in view of this frame, reprojected into it, with their frustums."""
         boxes = [(frustum, reprojected_box_px(frustum, frame)) for frustum in self._frustums]
         return [
             (frustum, replace(frustum.detection, box_px=box, mask=mask_in_frustum(frustum, box, frame)))
@@ -161,38 +173,40 @@ class TargetTracker:
         ]
 
     def _undetected(
-        self, frame: Frame, depth_m: Float32[ndarray, "h w"], found: Sequence[Observation]
+        self, frame: Frame, depth_m: Float32[ndarray, "h w"], detected: Sequence[Observation]
     ) -> list[tuple[Frustum, Detection]]:
-        """What is carried and in view, was not found again, and yet is still believed: detectors blink."""
-        left = []
-        for frustum, shown in self._propagated_detections(frame):
-            observation = lift_observation(shown, depth_m, frame)
+        """Return reliable targets in view that the detector missed this time, with their missed detections counted."""
+        undetected = []
+        for frustum, detection in self._propagated_detections(frame):
+            observation = lift_observation(detection, depth_m, frame)
             if observation is None or frustum.missed_detections >= self._settings.max_missed_detections:
                 continue
-            again = any(self._filter.is_same_object(observation, other) for other in found)
-            if not again and self._filter.is_reliable(observation) and self._filter.satisfies_relations(observation):
-                left.append((replace(frustum, missed_detections=frustum.missed_detections + 1), shown))
-        return left
+            is_detected = any(self._filter.is_same_object(observation, other) for other in detected)
+            is_target = self._filter.is_reliable(observation) and self._filter.satisfies_relations(observation)
+            if is_target and not is_detected:
+                undetected.append((replace(frustum, missed_detections=frustum.missed_detections + 1), detection))
+        return undetected
 
     def _observe(
-        self, frame: Frame, depth_m: Float32[ndarray, "h w"], found: Sequence[Detection]
+        self, frame: Frame, depth_m: Float32[ndarray, "h w"], detections: Sequence[Detection]
     ) -> list[tuple[Detection, Observation]]:
-        """Remember what was detected; the targets that are believed and fit the task's relations."""
-        detections = [
-            replace(each, mask=foreground_mask(each.mask, depth_m)) for each in self._drop_generic_anchors(found)
+        """Add the detections to the object map; return the confirmed targets that satisfy the relations."""
+        masked = [
+            replace(each, mask=foreground_mask(each.mask, depth_m)) for each in self._drop_generic_anchors(detections)
         ]
-        placed = [lift_observation(each, depth_m, frame) for each in detections]
-        self._filter.observe([observation for observation in placed if observation is not None], VisibilityCheck(frame, frame.depth_m))
+        lifted = [(each, lift_observation(each, depth_m, frame)) for each in masked]
+        localised = [(detection, observation) for detection, observation in lifted if observation is not None]
+        self._filter.observe([observation for _, observation in localised], VisibilityCheck(frame, frame.depth_m))
         targets = [
             (detection, observation)
-            for detection, observation in zip(detections, placed, strict=True)
-            if detection.phrase in self._graph.targets and observation is not None and self._filter.satisfies_relations(observation)
+            for detection, observation in localised
+            if detection.phrase in self._graph.targets and self._filter.satisfies_relations(observation)
         ]
         self._needs_observation = any(self._filter.needs_observation(observation) for _, observation in targets)
-        return [(detection, observation) for detection, observation in targets if self._filter.is_confirmed(observation)]
+        return [(detection, each) for detection, each in targets if self._filter.is_confirmed(each)]
 
     def _drop_generic_anchors(self, detections: Sequence[Detection]) -> list[Detection]:
-        """The object on the desk is not the desk itself, although a desk is an object."""
+        """Drop detections of a generic noun that are an anchor: "the object on the desk" is not the desk."""
         anchors = [each.mask for each in detections if each.phrase in self._graph.anchors]
         return [
             each
@@ -202,7 +216,7 @@ class TargetTracker:
 
 
 def merge_detections(detections: Sequence[Detection], targets: Sequence[str], frame: Frame) -> RelevanceMap:
-    """The binary w(u, v): 1 on every target's mask; where masks overlap the smaller object owns the pixel."""
+    """Return the binary w(u, v): 1 on every target's mask; in an overlap the pixel belongs to the smaller object."""
     target = np.full(frame.depth_m.shape, NO_TARGET, np.int16)
     for detection in sorted(detections, key=lambda each: int(np.count_nonzero(each.mask)), reverse=True):
         target[detection.mask] = targets.index(detection.phrase)

@@ -68,7 +68,9 @@ class YoloSegNetwork:
         outputs = self._session.run(None, {self._input: tensor})
         size_px = (frame.camera.height_px, frame.camera.width_px)
         network_size_px = (self._height_px, self._width_px)
-        return NetworkOutput(outputs[self._boxes_at][0], outputs[self._prototypes_at][0], letterboxing, size_px, network_size_px)
+        return NetworkOutput(
+            outputs[self._boxes_at][0], outputs[self._prototypes_at][0], letterboxing, size_px, network_size_px
+        )
 
 
 def _input_of(path: Path, session: Any) -> tuple[str, int, int]:

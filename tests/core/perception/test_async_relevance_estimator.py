@@ -75,7 +75,7 @@ def test_one_detection_runs_at_a_time_and_the_newest_keyframe_waits() -> None:
     for index in range(9):
         estimator.estimate(frame_at(index))
         assert executor.frames == [0]
-    assert estimator.notes == ("detector too slow: 3 keyframes were overtaken",)
+    assert estimator.notes == ("detector too slow: 3 keyframes were skipped",)
     executor.run_next()
     estimator.estimate(frame_at(9))
     assert executor.frames == [8]

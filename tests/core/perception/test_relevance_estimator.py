@@ -192,7 +192,9 @@ def test_region_detector_answers_by_head_noun_and_says_what_it_cannot_find():
     assert len(detector.detect(frame_at(), ["cup"])) == 2
     assert len(detector.detect(frame_at(), ["object"])) == 2
     assert detector.detect(frame_at(), ["umbrella"]) == []
-    assert detector.unsupported(["cup", "umbrella"]) == ("no region matches 'umbrella'; the regions are mug_1, mug_2, wall",)
+    assert detector.unsupported(["cup", "umbrella"]) == (
+        "no region matches 'umbrella'; the regions are mug_1, mug_2, wall",
+    )
 
 
 def test_region_attention_numbers_its_regions():
