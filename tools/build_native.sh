@@ -1,5 +1,5 @@
 #!/bin/sh
-# Builds the native kernels into the source tree, for work on them: tools/build_native.sh [PYTHON]. Installing the package does not need it.
+# Builds the native kernels into the source tree, for development: tools/build_native.sh [PYTHON]. Installing the package does not need it.
 set -eu
 root=$(cd "$(dirname "$0")/.." && pwd)
 python=${1:-python3}

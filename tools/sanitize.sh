@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # Runs the native kernels' tests under the compiler's sanitizers: tools/sanitize.sh address|thread [PYTHON] [PYTEST ARGUMENTS].
-# `address` brings the undefined-behaviour sanitizer along. PYTHON needs the test extra, nanobind and cmake.
+# `address` includes the undefined-behaviour sanitizer. PYTHON needs the test extra, nanobind and cmake.
 set -euo pipefail
 root=$(cd "$(dirname "$0")/.." && pwd)
 fail() { echo "sanitize: $1" >&2; exit 1; }
@@ -16,7 +16,7 @@ python=$("$python" -c 'import sys; print(sys.executable)')
 shift $(($# < 2 ? $# : 2))
 compiler=${CXX:-g++}
 
-# The runtime must be loaded before Python is, and libstdc++ with it: it intercepts what that throws.
+# The runtime must be loaded before Python, with libstdc++, whose exceptions it intercepts.
 preload=
 for library in $runtimes libstdc++.so; do
   path=$("$compiler" -print-file-name="$library" 2>/dev/null) || fail "no compiler $compiler"
@@ -24,25 +24,25 @@ for library in $runtimes libstdc++.so; do
   preload=$preload${preload:+:}$(readlink -f "$path")
 done
 
-# The thread sanitizer's shadow memory has fixed places; a kernel that shuffles addresses widely collides with them.
-calm=()
+# The thread sanitizer's shadow memory has fixed addresses, which collide with wide address space randomisation.
+no_randomisation=()
 if [ "$kind" = thread ]; then
-  calm=(setarch "$(uname -m)" -R)
-  "${calm[@]}" true 2>/dev/null || calm=()
+  no_randomisation=(setarch "$(uname -m)" -R)
+  "${no_randomisation[@]}" true 2>/dev/null || no_randomisation=()
 fi
-export ASAN_OPTIONS=detect_leaks=0  # CPython keeps much until the process ends, and all of it would be reported
+export ASAN_OPTIONS=detect_leaks=0  # CPython keeps much memory until the process ends
 export UBSAN_OPTIONS=print_stacktrace=1 TSAN_OPTIONS=halt_on_error=1 PYTHONMALLOC=malloc OMP_NUM_THREADS=1
-checked() { env LD_PRELOAD="$preload" "${calm[@]}" "$python" "$@"; }
-checked -c pass || fail "the $kind sanitizer's runtime does not start on this machine; nothing was checked"
+run_checked() { env LD_PRELOAD="$preload" "${no_randomisation[@]}" "$python" "$@"; }
+run_checked -c pass || fail "the $kind sanitizer's runtime does not start on this machine; nothing was checked"
 
-# One form beside the portable one: instrumenting all of them takes many minutes and finds nothing more in the stages.
+# One SIMD variant besides the portable one: instrumenting all takes many minutes and finds no more errors in the stages.
 build=$root/build/sanitize-$kind
 PATH=$(dirname "$python"):$PATH
-cmake -S "$root/native" -B "$build" -DGAUSSLITE_SANITIZE=$sanitizers -DGAUSSLITE_FORMS="avx2;neon" \
+cmake -S "$root/native" -B "$build" -DGAUSSLITE_SANITIZE=$sanitizers -DGAUSSLITE_VARIANTS="avx2;neon" \
   -DCMAKE_CXX_COMPILER="$compiler" -DPython_EXECUTABLE="$python" -Dnanobind_DIR="$("$python" -m nanobind --cmake_dir)" >/dev/null
 cmake --build "$build" --parallel "$(nproc)" >/dev/null
 
-# The package is copied beside its module, so that neither an installed one nor the working tree's is touched.
+# A copy of the package with this module: the installed package and the working tree stay unchanged.
 rm -rf "$build/package"
 mkdir "$build/package"
 cp -r "$root/src/." "$build/package/"
@@ -51,5 +51,5 @@ cp "$build"/_kernels*.so "$build/package/gausslite/render/"
 export PYTHONPATH=$build/package PYTHONDONTWRITEBYTECODE=1
 cd "$root"
 [ $# -gt 0 ] || set -- tests/core/render/test_cpu_kernels.py tests/core/render/test_cpu_choices.py tests/core/render/test_cpu_bindings.py
-# Uncaptured: a sanitizer writes its report and ends the process, and pytest would take the report with it.
-checked -m pytest -q --capture=no -p no:cacheprovider "$@"
+# Uncaptured: a sanitizer writes its report and ends the process; pytest would lose the report.
+run_checked -m pytest -q --capture=no -p no:cacheprovider "$@"

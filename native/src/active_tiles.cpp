@@ -5,7 +5,7 @@
 
 namespace gausslite {
 
-void ActiveTiles::look_at(const uint8_t* active, int across, int down) {
+void ActiveTiles::assign(const uint8_t* active, int across, int down) {
   across_ = size_t(across);
   box_ = {across, 0, down, 0};
   int tiles = 0;
@@ -18,7 +18,7 @@ void ActiveTiles::look_at(const uint8_t* active, int across, int down) {
   }
   fill_box_ = tiles == (box_.x1 - box_.x0) * (box_.y1 - box_.y0);
   count(active, size_t(down));
-  look_near(active, size_t(down));
+  build_near_masks(active, size_t(down));
 }
 
 void ActiveTiles::count(const uint8_t* active, size_t down) {
@@ -37,12 +37,12 @@ void ActiveTiles::count(const uint8_t* active, size_t down) {
   }
 }
 
-// First along each row of tiles, which is the lowest row of bits, then from the rows below.
-void ActiveTiles::look_near(const uint8_t* active, size_t down) {
+// First along each row of tiles (the lowest four bits), then over the rows below.
+void ActiveTiles::build_near_masks(const uint8_t* active, size_t down) {
   constexpr uint32_t kRow = (1u << kNear) - 1u, kEveryRow = 0x1111u;
   const size_t tiles = across_ * down;
   near_.reserve(tiles + 1);
-  far_place_ = uint32_t(tiles);
+  sentinel_tile_ = uint32_t(tiles);
   near_[tiles] = uint16_t(~0u);
   for (size_t t = 0; t < tiles; ++t) {
     const size_t columns = std::min<size_t>(kNear, across_ - t % across_);

@@ -7,7 +7,7 @@
 namespace gausslite {
 
 const float* AdamCorrections::table(double beta1, double beta2, double decay_after_updates) {
-  if (beta1 != beta1_ || beta2 != beta2_ || decay_after_updates != full_rate_updates_) {
+  if (beta1 != beta1_ || beta2 != beta2_ || decay_after_updates != decay_after_updates_) {
     table_.reserve(2 * size_t(kCount));
     for (int t = 1; t <= kCount; ++t) {
       const double rate = std::sqrt(std::min(1.0, decay_after_updates / t));
@@ -16,7 +16,7 @@ const float* AdamCorrections::table(double beta1, double beta2, double decay_aft
     }
     beta1_ = beta1;
     beta2_ = beta2;
-    full_rate_updates_ = decay_after_updates;
+    decay_after_updates_ = decay_after_updates;
   }
   return table_.data();
 }

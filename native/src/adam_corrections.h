@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// What Adam's step is multiplied by for a splat's number of updates, computed once per rule.
+// Factors of Adam's step by a splat's number of updates, computed once per setting.
 #pragma once
 
 #include "memory.h"
@@ -8,16 +8,16 @@ namespace gausslite {
 
 class AdamCorrections {
  public:
-  // 0.999^t is below single precision's resolution of 1 after some 17 000 updates. Rates fall no further either.
+  // 0.999^t is below the float resolution of 1 after about 17 000 updates. The rates do not decay further either.
   static constexpr int kCount = 20'000;
 
-  // rate(t) / (1 - beta1^t), 1 / (1 - beta2^t) for t = 1 ... kCount, where the rate is 1 for the first
-  // decay_after_updates and falls with the root of the updates after them; valid until the next call.
+  // Returns rate(t) / (1 - beta1^t), 1 / (1 - beta2^t) for t = 1 ... kCount, with rate(t) = min(1,
+  // sqrt(decay_after_updates / t)); valid until the next call.
   const float* table(double beta1, double beta2, double decay_after_updates);
 
  private:
   Buffer<float> table_;
-  double beta1_ = -1.0, beta2_ = -1.0, full_rate_updates_ = -1.0;
+  double beta1_ = -1.0, beta2_ = -1.0, decay_after_updates_ = -1.0;
 };
 
 }  // namespace gausslite

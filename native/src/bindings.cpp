@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
-// The extension module gausslite.render._kernels. Shapes were checked by render/cpu.py, whose messages name the
-// argument; the array types here are the second line. Work runs without the interpreter lock, and that file sees to it
-// that a rasterizer has one call at a time.
+// The extension module gausslite.render._kernels. render/cpu.py checks all shapes and names the argument in its errors;
+// the array types here are a second check. Work runs without the interpreter lock. render/cpu.py ensures that a
+// rasterizer has one call at a time.
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/optional.h>
@@ -66,7 +66,7 @@ Camera make_camera(const Intrinsics& intrinsics, const Matrix4& T_camera_world) 
   return camera;
 }
 
-// What of the scene is drawn.
+// Rows, camera, tiles and ids of a rendering.
 struct Scene {
   FrameInput input;
 
@@ -147,10 +147,10 @@ std::unique_ptr<TrainingView> make_view(ByteColours rgb, Plane depth_m, std::opt
                                         weight ? weight->data() : nullptr);
 }
 
-// What a step looks at, carried over once for as long as the arrays are the same; it keeps them alive, not their
-// values.
+// View, camera, tiles and ids of a step, converted once for repeated steps with the same arrays. It keeps the arrays
+// alive; their values may change.
 struct StepScene {
-  const TrainingView& view;  // its owner is kept alive by the binding
+  const TrainingView& view;  // the binding keeps its owner alive
   Intrinsics intrinsics;
   Matrix4 T_camera_world;
   std::optional<TileMask> tiles;
@@ -161,33 +161,33 @@ struct StepScene {
       : view(view), intrinsics(intrinsics), T_camera_world(T_camera_world), tiles(tiles), ids(ids) {}
 };
 
-// What a step changes and how.
+// Tables, settings and masks of a step.
 struct StepTraining {
   RowTable rows, first_moment, second_moment;
   LossWeights loss;
   AdamOptions adam;
   bool masked;
   std::optional<Flags> trainable;
-  std::optional<Counts> trained;
-  std::optional<Flags> counted;
-  uint64_t loan;
+  std::optional<Counts> update_counts;
+  std::optional<Flags> count_mask;
+  uint64_t binding_id;
 
   StepTraining(std::tuple<RowTable, RowTable, RowTable> tables, std::tuple<float, float, float, bool> weights,
                const std::vector<float>& rates, std::tuple<double, double, double, double> constants, bool masked,
-               std::optional<Flags> trainable, std::optional<Counts> trained, std::optional<Flags> counted,
-               uint64_t loan)
+               std::optional<Flags> trainable, std::optional<Counts> update_counts, std::optional<Flags> count_mask,
+               uint64_t binding_id)
       : rows(std::get<0>(tables)),
         first_moment(std::get<1>(tables)),
         second_moment(std::get<2>(tables)),
         loss{std::get<0>(weights), std::get<1>(weights), std::get<2>(weights), std::get<3>(weights)},
         masked(masked),
         trainable(trainable),
-        trained(trained),
-        counted(counted),
-        loan(loan) {
+        update_counts(update_counts),
+        count_mask(count_mask),
+        binding_id(binding_id) {
     const size_t n = rows.shape(0);
     require(first_moment.shape(0) == n && second_moment.shape(0) == n && (!trainable || trainable->shape(0) == n) &&
-                (!trained || trained->shape(0) == n) && (!counted || counted->shape(0) == n),
+                (!update_counts || update_counts->shape(0) == n) && (!count_mask || count_mask->shape(0) == n),
             "tables: lengths disagree");
     require(rates.size() == 16, "rates: expected 16");
     std::copy_n(rates.begin(), 16, adam.rates);
@@ -202,20 +202,20 @@ struct StepTraining {
             first_moment.data(),
             second_moment.data(),
             flags(trainable),
-            trained ? trained->data() : nullptr,
-            flags(counted),
-            loan};
+            update_counts ? update_counts->data() : nullptr,
+            flags(count_mask),
+            binding_id};
   }
 };
 
-double step(Rasterizer& self, const StepScene& seen, const StepTraining& training) {
-  const Scene scene(training.rows.data(), training.rows.shape(0), seen.intrinsics, seen.T_camera_world, seen.tiles,
-                    seen.ids);
+double step(Rasterizer& self, const StepScene& view_scene, const StepTraining& training) {
+  const Scene scene(training.rows.data(), training.rows.shape(0), view_scene.intrinsics, view_scene.T_camera_world,
+                    view_scene.tiles, view_scene.ids);
   const Camera& camera = scene.input.camera;
-  require(seen.view.width() == camera.width && seen.view.height() == camera.height, "view: wrong size");
+  require(view_scene.view.width() == camera.width && view_scene.view.height() == camera.height, "view: wrong size");
   const OptimizerState state = training.state();
   nb::gil_scoped_release unlocked;
-  return self.step(scene.input, state, seen.view, training.masked, training.loss, training.adam);
+  return self.step(scene.input, state, view_scene.view, training.masked, training.loss, training.adam);
 }
 
 nb::dict stage_times(const Rasterizer& self) {
@@ -233,43 +233,44 @@ nb::dict stage_times(const Rasterizer& self) {
 
 NB_MODULE(_kernels, m) {
   m.doc() = "Native rasterizer kernels; use gausslite.render.cpu.CpuRasterizer.";
-  m.def("usable_simd", &usable_forms, "Instruction sets this build has and this machine runs, fastest first.");
-  m.def("core_clock_ghz", &core_clock_ghz, "The clock of this core, by a chain of additions.");
+  m.def("usable_simd", &usable_variants,
+        "Return the instruction sets of this build that this machine runs, fastest first.");
+  m.def("core_clock_ghz", &core_clock_ghz, "Measure the clock of the current core in GHz.");
 
-  nb::class_<TrainingView>(m, "View", "A training image made ready: cut into tiles, and where its weights are.")
+  nb::class_<TrainingView>(m, "View", "A training image in tiles, with its weights.")
       .def(nb::new_(&make_view), nb::arg("rgb").noconvert(), nb::arg("depth_m").noconvert(),
            nb::arg("weight").noconvert().none())
       .def_prop_ro("width", &TrainingView::width)
       .def_prop_ro("height", &TrainingView::height);
 
-  nb::class_<StepScene>(m, "StepScene", "What a step looks at; it keeps the arrays, not their values.")
+  nb::class_<StepScene>(m, "StepScene", "View, camera, tiles and ids of a step; references the arrays.")
       .def(nb::init<const TrainingView&, const Intrinsics&, Matrix4, std::optional<TileMask>, std::optional<Ids>>(),
            nb::keep_alive<1, 2>(), nb::arg("view"), nb::arg("intrinsics"), nb::arg("T_camera_world").noconvert(),
            nb::arg("tiles").noconvert().none(), nb::arg("ids").noconvert().none());
 
-  nb::class_<StepTraining>(m, "StepTraining", "What a step changes and how; it keeps the arrays, not their values.")
+  nb::class_<StepTraining>(m, "StepTraining", "Tables, settings and masks of a step; references the arrays.")
       .def(nb::init<std::tuple<RowTable, RowTable, RowTable>, std::tuple<float, float, float, bool>,
                     const std::vector<float>&, std::tuple<double, double, double, double>, bool, std::optional<Flags>,
                     std::optional<Counts>, std::optional<Flags>, uint64_t>(),
            nb::arg("tables").noconvert(), nb::arg("loss"), nb::arg("rates"), nb::arg("adam"), nb::arg("masked"),
-           nb::arg("trainable").noconvert().none(), nb::arg("trained").noconvert().none(),
-           nb::arg("counted").noconvert().none(), nb::arg("loan"));
+           nb::arg("trainable").noconvert().none(), nb::arg("update_counts").noconvert().none(),
+           nb::arg("count_mask").noconvert().none(), nb::arg("binding_id"));
 
-  nb::class_<Rasterizer>(m, "Engine", "Scratch memory and a team of threads; it never keeps the splats.")
+  nb::class_<Rasterizer>(m, "Engine", "Scratch memory and a thread pool; it does not own the splats.")
       .def(nb::new_(&make_rasterizer), nb::arg("simd"), nb::arg("threads"))
       .def_prop_ro("threads", &Rasterizer::threads)
-      .def_prop_ro("frame", &Rasterizer::frame, "The number of the latest forward or step.")
+      .def_prop_ro("frame", &Rasterizer::frame, "Number of the latest forward or step.")
       .def("forward", &forward, nb::arg("rows").noconvert(), nb::arg("intrinsics"),
            nb::arg("T_camera_world").noconvert(), nb::arg("tiles").noconvert().none(),
-           nb::arg("ids").noconvert().none(), "rgb, depth_m, alpha and the frame's number.")
+           nb::arg("ids").noconvert().none(), "Return rgb, depth_m, alpha and the frame number.")
       .def("backward", &backward, nb::arg("frame"), nb::arg("row_count"), nb::arg("d_rgb").noconvert(),
            nb::arg("d_depth_m").noconvert(), nb::arg("d_alpha").noconvert(),
-           "d_rows, d_twist, visible rows, mean_2d_norm.")
-      .def("step", &step, nb::arg("scene"), nb::arg("training"), "The loss.")
-      .def("visible", &visible_ids, "The rows that the last forward or step found visible, ascending.")
-      .def_prop_ro("steps_ms", &Rasterizer::steps_ms, "Milliseconds that all steps took so far.")
-      .def_prop_ro("masked_steps_ms", &Rasterizer::masked_steps_ms, "... and those masked to a region.")
-      .def("stage_times_ms", &stage_times, "Milliseconds of the last call's stages.")
+           "Return d_rows, d_twist, visible rows and mean_2d_norm.")
+      .def("step", &step, nb::arg("scene"), nb::arg("training"), "Run one training iteration and return the loss.")
+      .def("visible", &visible_ids, "Return the visible rows of the last forward or step, ascending.")
+      .def_prop_ro("steps_ms", &Rasterizer::steps_ms, "Total milliseconds of all steps.")
+      .def_prop_ro("masked_steps_ms", &Rasterizer::masked_steps_ms, "Total milliseconds of the masked steps.")
+      .def("stage_times_ms", &stage_times, "Return the milliseconds of each stage of the last call.")
       .def_prop_ro("block_evaluations", &Rasterizer::block_evaluations,
-                   "How often the last forward or step composited a splat on a 4x4 block of pixels.");
+                   "Number of pairs of a splat and a 4x4 pixel block that the last forward or step composited.");
 }

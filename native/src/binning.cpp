@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
-// Stage 3: sorted splats to the tiles of a strip, each with a mask of the 4x4 blocks that it really touches. Culling to
-// blocks rather than to tiles is the largest gain of all: an average splat touches 4 of a tile's 16 blocks.
+// Stage 3: assign the sorted splats of a tile row to its tiles, each with a mask of the 4x4 blocks that its ellipse
+// overlaps. Culling by block, not by tile, has the largest effect on run time: an average splat touches 4 of the 16
+// blocks of a tile.
 #include <algorithm>
 #include <cstring>
 
@@ -10,23 +11,23 @@ namespace gausslite::GAUSSLITE_ISA {
 
 namespace {
 
-// A splat and the column of a tile that its bounding box meets. They are noted first and tested then, neither with a
-// branch to mispredict: which tiles a splat meets, and with which blocks, cannot be foretold.
+// A splat and a tile column of its bounding box. Touches are first collected and then tested, both without branches:
+// tiles and blocks of a splat are unpredictable.
 struct Touch {
   uint32_t slot, x;
 };
 
-constexpr int kTouches = 256;  // are tested at a time
+constexpr int kTouches = 256;  // batch size of the test
 
 alignas(64) constexpr float kBlockX[16] = {.5f, 4.5f, 8.5f, 12.5f, .5f, 4.5f, 8.5f, 12.5f,
                                            .5f, 4.5f, 8.5f, 12.5f, .5f, 4.5f, 8.5f, 12.5f};
 alignas(64) constexpr float kBlockY[16] = {.5f,  .5f,  .5f,  .5f,  4.5f,  4.5f,  4.5f,  4.5f,
                                            8.5f, 8.5f, 8.5f, 8.5f, 12.5f, 12.5f, 12.5f, 12.5f};
 
-// Which of a tile's sixteen blocks the ellipse alpha >= 1/255 meets, all at once. The quadric is convex, so its minimum
-// over the rectangle of a block's pixel centres is at the mean when that is inside, and else on one of the two sides
-// that face the mean. (dx, dy) is the rectangle's point nearest to the mean, axis by axis; on the facing vertical side
-// the minimum is at slope_y dx, clamped to the side, and likewise on the horizontal one.
+// Returns the mask of the tile's sixteen blocks that overlap the ellipse alpha >= 1/255. The quadric is convex. Its
+// minimum over the rectangle of a block's pixel centres is at the mean if that is inside, else on one of the two sides
+// that face the mean. (dx, dy) is the point of the rectangle nearest to the mean, axis by axis. On the facing vertical
+// side the minimum is at slope_y dx, clamped to the side; on the horizontal side likewise.
 GAUSSLITE_INLINE uint32_t touched_blocks(const Splat& s, float tile_x, float tile_y) {
   const Pack16 zero(0.0f);
   const Pack16 left = load(kBlockX) + (tile_x - s.mean_x), top = load(kBlockY) + (tile_y - s.mean_y);
@@ -39,17 +40,17 @@ GAUSSLITE_INLINE uint32_t touched_blocks(const Splat& s, float tile_x, float til
   return bits(min(vertical, horizontal) <= Pack16(s.log2_opacity - kLog2MinAlpha));
 }
 
-// Appends the splats to the lists of the tiles where they touch a wanted block.
-GAUSSLITE_INLINE void list_touches(const Workspace& ws, int strip, const Touch* touches, int n, const uint16_t* wanted,
-                                   TileList* tiles) {
+// Appends the splats to the lists of the tiles where they touch a needed block.
+GAUSSLITE_INLINE void list_touches(const Workspace& ws, int tile_row, const Touch* touches, int n,
+                                   const uint16_t* needed, TileList* tiles) {
   for (int x = 0; x < ws.tiles_x; ++x) {
     tiles[x].slots.reserve(tiles[x].count + kTouches + 1 + kChunk, tiles[x].count);
     tiles[x].blocks.reserve(tiles[x].count + kTouches + 1 + kChunk, tiles[x].count);
   }
   for (int i = 0; i < n; ++i) {
     const auto [slot, x] = touches[i];
-    const uint32_t blocks = wanted[x] & touched_blocks(ws.splats[slot], float(x * kTile), float(strip * kTile));
-    // Written always, kept only when a block is touched.
+    const uint32_t blocks = needed[x] & touched_blocks(ws.splats[slot], float(x * kTile), float(tile_row * kTile));
+    // Always written, counted only if a block is touched: no branch to mispredict.
     TileList& tile = tiles[x];
     tile.slots[tile.count] = slot;
     tile.blocks[tile.count] = uint16_t(blocks);
@@ -59,8 +60,8 @@ GAUSSLITE_INLINE void list_touches(const Workspace& ws, int strip, const Touch* 
 
 }  // namespace
 
-void bin_strip(const Workspace& ws, int strip, const DepthKey* keys, int count, TileList* tiles) {
-  const uint16_t* wanted = &ws.wanted_blocks[size_t(strip) * size_t(ws.tiles_x)];
+void bin_tile_row(const Workspace& ws, int tile_row, const DepthKey* keys, int count, TileList* tiles) {
+  const uint16_t* needed = &ws.needed_blocks[size_t(tile_row) * size_t(ws.tiles_x)];
   for (int x = 0; x < ws.tiles_x; ++x) tiles[x].count = 0;
   Touch touches[kTouches + 2];
   int n = 0;
@@ -68,20 +69,20 @@ void bin_strip(const Workspace& ws, int strip, const DepthKey* keys, int count, 
     prefetch(&ws.splats[keys[i + kPrefetchAhead].slot]);
     const uint32_t slot = keys[i].slot;
     const uint32_t x0 = uint32_t(ws.splats[slot].tile_x0), x1 = uint32_t(ws.splats[slot].tile_x1);
-    // Two columns at a time, because one or two are the rule.
+    // Two columns at a time: most splats touch one or two.
     for (uint32_t x = x0; x <= x1; x += 2) {
       touches[n] = {slot, x};
-      n += wanted[x] != 0;
+      n += needed[x] != 0;
       touches[n] = {slot, x + 1};
-      n += (x < x1) & (wanted[x + 1] != 0);
+      n += (x < x1) & (needed[x + 1] != 0);
       if (n >= kTouches) {
-        list_touches(ws, strip, touches, n, wanted, tiles);
+        list_touches(ws, tile_row, touches, n, needed, tiles);
         n = 0;
       }
     }
   }
-  list_touches(ws, strip, touches, n, wanted, tiles);
-  // The tile stages prefetch a chunk ahead: slot 0 is as good as any.
+  list_touches(ws, tile_row, touches, n, needed, tiles);
+  // The tile stages prefetch one chunk ahead: pad the list with slot 0.
   for (int x = 0; x < ws.tiles_x; ++x) {
     tiles[x].slots.reserve(tiles[x].count + kChunk, tiles[x].count);
     std::memset(&tiles[x].slots[tiles[x].count], 0, kChunk * sizeof(uint32_t));

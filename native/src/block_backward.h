@@ -1,10 +1,10 @@
 // SPDX-License-Identifier: Apache-2.0
-// The way back through one 4x4 block, again front to back, and the sums that its pixels leave at each splat.
+// The backward pass of one 4x4 block, in front-to-back order, and its sums per splat.
 //
 // With weights w_i = alpha_i T_i and q_i = <dL/d(rgb, depth, alpha), (rgb_i, depth_i, 1)>, the derivative by
-// ln(alpha_i) is w_i q_i - alpha_i / (1 - alpha_i) S_i, where S_i = sum over k > i of w_k q_k is what lies behind. S_i
-// is the total minus the prefix, and the total is known from the finished pixel: one running scalar a pixel, no
-// division chain for the transmittance, and no second walk from the back.
+// ln(alpha_i) is w_i q_i - alpha_i / (1 - alpha_i) S_i with the suffix sum S_i = sum over k > i of w_k q_k. S_i is the
+// total minus the prefix sum, and the finished pixel gives the total. So one running scalar per pixel suffices, without
+// a division chain for the transmittance or a back-to-front pass.
 #pragma once
 
 #include "block_forward.h"
@@ -16,13 +16,13 @@
 
 namespace gausslite::GAUSSLITE_ISA {
 
-// The gradients of sixteen pixels: r g b depth alpha; and the running transmittance and suffix.
+// Sixteen pixels: gradients by r g b depth alpha, the running transmittance and the suffix sum.
 struct BlockGradient {
   Pack16 by[5];
   Pack16 by_column[4];  // lane 4 y + c of element x: gradient of channel c (r g b depth) at pixel (x, y)
   Pack16 transmittance, behind;
 
-  // `image` holds the finished pixels: r g b depth and the transmittance left.
+  // `image`: the finished pixels, r g b depth and transmittance.
   GAUSSLITE_INLINE void start(const Pack16 (&gradient)[5], const Pack16 (&image)[5]) {
     behind = gradient[4] * (Pack16(1.0f) - image[4]);
     for (int k = 0; k < 4; ++k) behind = fma(gradient[k], image[k], behind);
@@ -33,8 +33,8 @@ struct BlockGradient {
   }
 };
 
-// Per entry of a chunk: the moments of v = dL/d ln(alpha); and the weights times the channel gradients, still one sum
-// per pixel row.
+// Per entry of a chunk: the moments of v = dL/d ln(alpha), and the weights times the channel gradients, summed per
+// pixel row.
 struct ChunkSums {
   MomentSums moments;
   Pack16 colours[kChunk];
@@ -45,7 +45,7 @@ struct ChunkSums {
   }
 };
 
-// Sixteen pixels' weights times their channel gradients, summed over the columns of the block.
+// Adds the weights of sixteen pixels times their channel gradients, summed over the columns of the block.
 GAUSSLITE_INLINE Pack16 add_colours(Pack16 weight, const Pack16 (&by_column)[4], Pack16 sums) {
   const Pack16 even =
       fma(spread_in_quads<2>(weight), by_column[2], fma(spread_in_quads<0>(weight), by_column[0], sums));
@@ -55,17 +55,18 @@ GAUSSLITE_INLINE Pack16 add_colours(Pack16 weight, const Pack16 (&by_column)[4],
 
 constexpr float kBelowMaxAlpha = 0.989995f;
 
-// Walks n entries of a block's list. With kFromAlphas the alphas of the forward pass are read back, otherwise computed
-// again.
+// Backward pass over n entries of a block's list. kFromAlphas: reads the alphas of the forward pass; otherwise computes
+// them again.
 template <bool kFromAlphas>
-GAUSSLITE_INLINE void walk_back(const Splat* records, const uint8_t* list, int n, const TilePosition& tile, int b,
-                                BlockGradient& gradient, ChunkSums& sums, MomentBatch& batch, const float*& alphas) {
+GAUSSLITE_INLINE void backward_block(const Splat* records, const uint8_t* list, int n, const TilePosition& tile, int b,
+                                     BlockGradient& gradient, ChunkSums& sums, MomentBatch& batch,
+                                     const float*& alphas) {
   const Pack16 pixel_x = tile.pixel_x(b), pixel_y = tile.pixel_y(b);
-  // A copy that nothing can point to, so that it stays in registers.
+  // A local copy without aliases stays in registers.
   BlockGradient g = gradient;
   for (int begin = 0, taken; begin < n; begin += taken) {
-    taken = n - begin < batch.room() ? n - begin : batch.room();
-    float(*values)[16] = batch.values + batch.count();
+    taken = n - begin < batch.free_slots() ? n - begin : batch.free_slots();
+    float (*values)[16] = batch.values + batch.count();
     for (int i = 0; i < taken; ++i) {
       const int entry = list[begin + i];
       const Splat& s = records[entry];
@@ -94,9 +95,9 @@ GAUSSLITE_INLINE void walk_back(const Splat* records, const uint8_t* list, int n
   gradient.behind = g.behind;
 }
 
-// Shifts moments by (x, y): about a point at that offset from the one they are about. Two fused steps: first every sum
-// less its lower neighbour times x or y, then the second-order ones once more from the results. `xy` repeats x, y;
-// lanes 6 and 7 of the moments are zero and serve the lanes that a step leaves alone.
+// Shifts moments to another reference point, at offset (x, y) from the old one, in two fused steps. The first subtracts
+// from each sum its lower neighbour times x or y; the second repeats this for the second-order sums. `xy` repeats x, y;
+// lanes 6 and 7 of the moments are zero and feed the lanes that a step does not change.
 GAUSSLITE_INLINE Pack8 shift_moments(Pack8 m, Pack8 xy) {
   m = fnma(permute<0, 0, 1, 0, 1, 1, 0, 0>(xy), permute<6, 0, 0, 1, 1, 2, 6, 6>(m), m);
   return fnma(permute<0, 0, 0, 0, 0, 1, 0, 0>(xy), permute<6, 6, 6, 1, 2, 2, 6, 6>(m), m);
@@ -110,8 +111,8 @@ GAUSSLITE_INLINE void prefetch_rows(Workspace& ws, const Splat* records, int n, 
   for (int i = 0; i < n; ++i) prefetch_to_write(gradient_row(ws, records[i], tile));
 }
 
-// Moves a chunk's moments from the tile's centre to the splats' means, in pixels, and adds them to the gradient rows of
-// this tile row.
+// Shifts a chunk's moments from the tile's centre to the splats' means, converts them to pixels, and adds them to the
+// gradient rows of this tile row.
 GAUSSLITE_INLINE void add_to_rows(Workspace& ws, const Splat* records, int n, const TilePosition& tile,
                                   const ChunkSums& sums) {
   const float centre_x = float(tile.x * kTile + kTile / 2), centre_y = float(tile.y * kTile + kTile / 2);

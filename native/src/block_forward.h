@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// Compositing one 4x4 block of pixels front to back, its whole state in registers.
+// Front-to-back compositing of one 4x4 block of pixels, with its state in registers.
 #pragma once
 
 #include "simd/pack.h"
@@ -7,7 +7,7 @@
 
 namespace gausslite::GAUSSLITE_ISA {
 
-// Sixteen pixels: accumulated colour and depth, and the transmittance that is left.
+// Sixteen pixels: accumulated colour and depth, and remaining transmittance.
 struct BlockState {
   Pack16 r{0.0f}, g{0.0f}, b{0.0f}, depth{0.0f}, transmittance{1.0f};
 
@@ -20,13 +20,13 @@ GAUSSLITE_INLINE Pack16 log2_alpha(const Splat& s, Pack16 pixel_x, Pack16 pixel_
   return fnma(x_part, dx, fnma(y_part, dy, Pack16(s.log2_opacity)));
 }
 
-// What the splat covers of sixteen pixels.
+// The splat's alpha at sixteen pixels.
 GAUSSLITE_INLINE Pack16 alpha_of(const Splat& splat, Pack16 pixel_x, Pack16 pixel_y) {
   const Pack16 exponent = log2_alpha(splat, pixel_x, pixel_y);
   return keep(exponent >= Pack16(kLog2MinAlpha), exp2_fast(min(exponent, Pack16(kLog2MaxAlpha))));
 }
 
-// A block while splats are added to it. A pixel stays as it is once it is finished.
+// A block during compositing. Finished pixels do not change.
 template <bool kKeepAlphas>
 class OpenBlock {
  public:
@@ -54,11 +54,11 @@ class OpenBlock {
     s_.b = fma(weight, Pack16(splat.b), s_.b);
     s_.depth = fma(weight, Pack16(splat.depth), s_.depth);
     if constexpr (kOneRegister) {
-      // One fused step is all that an entry waits for.
+      // The dependency chain is one fused step per entry.
       unfinished_ = fnma(alpha, unfinished_, unfinished_);
       s_.transmittance = select(open_now, unfinished_, s_.transmittance);
     } else {
-      // Registers are scarce, and there is other work while an entry waits.
+      // These variants lack registers for that, and other work hides the latency.
       unfinished_ = unfinished_ - weight;
     }
   }
@@ -67,13 +67,13 @@ class OpenBlock {
   GAUSSLITE_INLINE Mask16 open() const { return unfinished_ >= Pack16(kMinTransmittance); }
 
   BlockState s_;
-  // With kOneRegister, the transmittance that would be left if no pixel ever finished; else that which is left.
+  // With kOneRegister: the transmittance without the end of finished pixels; else the remaining transmittance.
   Pack16 unfinished_;
   float* alphas_;
 };
 
-// Composites a list until it ends or all sixteen pixels are finished; returns how many entries it took. With
-// kKeepAlphas they are appended at `alphas`, for the way back.
+// Composites a list until it ends or all sixteen pixels are finished; returns the number of composited entries.
+// kKeepAlphas: appends the alphas at `alphas`, for the backward pass.
 template <bool kKeepAlphas>
 GAUSSLITE_INLINE int composite(const Splat* records, const uint8_t* list, int n, Pack16 pixel_x, Pack16 pixel_y,
                                BlockState& state, float*& alphas) {
@@ -82,8 +82,8 @@ GAUSSLITE_INLINE int composite(const Splat* records, const uint8_t* list, int n,
   const auto splat = [&](int i) -> const Splat& { return records[list[i]]; };
   const auto alpha = [&](int i) { return alpha_of(splat(i), pixel_x, pixel_y); };
   int taken = 0;
-  // Two alphas side by side, because a core does not look far enough ahead to find the second one's work by itself;
-  // and, where there are registers for it, while the two before them are added. Beyond its end a list has slack.
+  // Two alphas at a time: a core's out-of-order window is too small to overlap them by itself. With enough registers
+  // they are computed while the previous two are added. Lists are padded behind their end.
   if constexpr (kOneRegister) {
     Pack16 first = alpha(0), second = alpha(1);
     for (; taken + 1 < n && block.any_open(); taken += 2) {

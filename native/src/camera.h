@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// The pinhole camera and the image model's constants.
+// The pinhole camera and the constants of the image model.
 #pragma once
 
 namespace gausslite {
@@ -14,10 +14,10 @@ struct Camera {
 constexpr float kNearM = 0.05f;
 constexpr float kDilationPx2 = 0.3f;                   // added to the diagonal of the 2D covariance
 constexpr float kTangentLimit = 1.3f;                  // of half the field of view
-constexpr float kMinTransmittance = 1e-4f;             // a pixel below it is finished
+constexpr float kMinTransmittance = 1e-4f;             // blending of a pixel ends below it
 constexpr float kLog2MinAlpha = -7.99435343685886f;    // log2(1/255): weaker contributions are dropped
 constexpr float kLog2MaxAlpha = -0.0144995696951151f;  // log2(0.99): alpha is clamped there, without a gradient
-constexpr float kMinSurfaceAlpha = 0.5f;               // below it a pixel has no depth to compare
+constexpr float kMinSurfaceAlpha = 0.5f;               // the depth loss ignores pixels of lower alpha
 
 constexpr int kTile = 16;    // pixels per side
 constexpr int kBlock = 4;    // pixels per side: sixteen pixels, one Pack16

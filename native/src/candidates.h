@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// Which rows may be in sight. Most rows of a map are not, and fewer still where a part of the image is drawn: finding
-// them must cost next to nothing.
+// Culling: finds the rows that may be visible. Most rows of a map are not, and fewer still in a part of the image, so
+// the test must be cheap.
 #pragma once
 
 #include <algorithm>
@@ -15,7 +15,7 @@ GAUSSLITE_INLINE Pack16 largest_log_scale(const Pack16* row) {
   return max(row[kLogScale], max(row[kLogScale + 1], row[kLogScale + 2]));
 }
 
-// Writes first + j for each bit j of `lanes`, in order, and returns how many; up to sixteen places are overwritten.
+// Writes first + j for each bit j of `lanes`, in order, and returns the number; overwrites up to sixteen elements.
 GAUSSLITE_INLINE uint32_t list_lanes(uint32_t* out, uint32_t first, uint32_t lanes) {
 #if defined(GAUSSLITE_USE_AVX512)
   const __m512i numbers = _mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
@@ -32,7 +32,7 @@ GAUSSLITE_INLINE uint32_t list_lanes(uint32_t* out, uint32_t first, uint32_t lan
 #endif
 }
 
-// The same with whole numbers in place of first + j.
+// The same with integers in tile_index of first + j.
 GAUSSLITE_INLINE void list_lanes(uint32_t* out, Pack16 numbers, uint32_t lanes) {
 #if defined(GAUSSLITE_USE_AVX512)
   _mm512_storeu_si512(out, _mm512_maskz_compress_epi32(__mmask16(lanes), _mm512_cvttps_epi32(numbers.v)));
@@ -47,12 +47,12 @@ GAUSSLITE_INLINE void list_lanes(uint32_t* out, Pack16 numbers, uint32_t lanes) 
 #endif
 }
 
-// Where in the image a splat may be, by its mean and the largest of its scales alone. With a scale s along all axes its
-// image covariance is s^2 J J^T + 0.3 I, and no direction of a real splat is longer. At most 3.33 standard deviations
-// of it are above 1/255.
-class Sight {
+// Bounds of a splat in the image, from its mean and largest scale s alone. An isotropic splat of scale s has the image
+// covariance s^2 J J^T + 0.3 I, which bounds that of the real splat in each direction. Alpha exceeds 1/255 within at
+// most 3.33 standard deviations.
+class CullingBounds {
  public:
-  explicit Sight(const Workspace& ws)
+  explicit CullingBounds(const Workspace& ws)
       : camera_(ws.camera),
         limit_u_(kTangentLimit * 0.5f * float(camera_.width) / camera_.fx),
         limit_v_(kTangentLimit * 0.5f * float(camera_.height) / camera_.fy) {
@@ -64,30 +64,31 @@ class Sight {
     bottom_ = float(y1 * kTile);
   }
 
-  // Which lanes may touch the box round the active tiles.
+  // Lanes that may touch the bounding box of the active tiles.
   GAUSSLITE_INLINE Mask16 may_touch(const Pack16* mean, Pack16 largest_log_scale) const {
-    return holds(Extent(*this, mean, largest_log_scale));
+    return overlaps(Extent(*this, mean, largest_log_scale));
   }
 
-  // Appends to `ids` the rows first ... first + 15 that may touch that box; and to `boxes`, unless it is null, the
-  // tiles that each of them reaches, as a place and a size of ActiveTiles. Returns how many.
+  // Appends to `ids` those of the rows first ... first + 15 that may touch that box. Appends to `boxes`, unless null,
+  // the tile box of each one, as tile * ActiveTiles::kSizes + size. Returns their number.
   GAUSSLITE_INLINE uint32_t list_in_box(const Workspace& ws, const Pack16* mean, Pack16 largest_log_scale,
                                         uint32_t first, uint32_t* ids, uint32_t* boxes) const {
     const Extent extent(*this, mean, largest_log_scale);
-    const uint32_t held = bits(holds(extent));
-    if (held == 0) return 0;
+    const uint32_t inside = bits(overlaps(extent));
+    if (inside == 0) return 0;
     if (boxes != nullptr) {
       const Pack16 x0 = tile(extent.x - extent.reach_x, ws.tiles_x), y0 = tile(extent.y - extent.reach_y, ws.tiles_y);
       const Pack16 across = tile(extent.x + extent.reach_x, ws.tiles_x) - x0;
       const Pack16 down = tile(extent.y + extent.reach_y, ws.tiles_y) - y0;
       const Pack16 most(float(ActiveTiles::kNear - 1)), sizes(float(ActiveTiles::kSizes));
       const Mask16 far = (across > most) | (down > most);
-      const Pack16 place = select(far, Pack16(float(ws.active.far_place())), fma(y0, Pack16(float(ws.tiles_x)), x0));
-      // Zero at the far place: a float has no room for more behind the largest images' number of tiles.
+      const Pack16 tile_index =
+          select(far, Pack16(float(ws.active.sentinel_tile())), fma(y0, Pack16(float(ws.tiles_x)), x0));
+      // Size 0 at the sentinel tile: a float cannot represent more for the largest images.
       const Pack16 size = select(far, Pack16(0.0f), fma(down, Pack16(float(ActiveTiles::kNear)), across));
-      list_lanes(boxes, fma(place, sizes, size), held);
+      list_lanes(boxes, fma(tile_index, sizes, size), inside);
     }
-    return list_lanes(ids, first, held);
+    return list_lanes(ids, first, inside);
   }
 
  private:
@@ -95,30 +96,30 @@ class Sight {
   struct Extent {
     Pack16 z, x, y, reach_x, reach_y;
 
-    GAUSSLITE_INLINE Extent(const Sight& sight, const Pack16* mean, Pack16 largest_log_scale) {
-      const Camera& c = sight.camera_;
+    GAUSSLITE_INLINE Extent(const CullingBounds& culling, const Pack16* mean, Pack16 largest_log_scale) {
+      const Camera& c = culling.camera_;
       to_camera_frame(mean, c, x, y, z);
       const Pack16 inverse_z = reciprocal(z), u = x * inverse_z, v = y * inverse_z;
       const Pack16 angle = exp(largest_log_scale) * inverse_z;
       x = fma(u, Pack16(c.fx), Pack16(c.cx));
       y = fma(v, Pack16(c.fy), Pack16(c.cy));
-      reach_x = reach(angle * c.fx, min(abs(u), Pack16(sight.limit_u_)));
-      reach_y = reach(angle * c.fy, min(abs(v), Pack16(sight.limit_v_)));
+      reach_x = reach(angle * c.fx, min(abs(u), Pack16(culling.limit_u_)));
+      reach_y = reach(angle * c.fy, min(abs(v), Pack16(culling.limit_v_)));
     }
 
-    // `size`: the scale in pixels, seen straight on. A little wider than 3.33, against rounding.
+    // `size`: the scale in pixels at the image centre. 3.35 exceeds 3.33 to allow for rounding.
     GAUSSLITE_INLINE static Pack16 reach(Pack16 size, Pack16 tangent) {
       const Pack16 square = fma(size * size, fma(tangent, tangent, Pack16(1.0f)), Pack16(kDilationPx2));
       return square * rough_inverse_sqrt(square) * 3.35f;
     }
   };
 
-  GAUSSLITE_INLINE Mask16 holds(const Extent& e) const {
+  GAUSSLITE_INLINE Mask16 overlaps(const Extent& e) const {
     return (e.z >= Pack16(kNearM)) & (e.x - e.reach_x <= Pack16(right_)) & (e.x + e.reach_x >= Pack16(left_)) &
            (e.y - e.reach_y <= Pack16(bottom_)) & (e.y + e.reach_y >= Pack16(top_));
   }
 
-  // The tile column or row that a pixel is in, or the nearest one of the image.
+  // The tile column or row of a pixel, clamped to the image.
   GAUSSLITE_INLINE static Pack16 tile(Pack16 pixel, int tiles) {
     return floor(min(max(pixel * (1.0f / kTile), Pack16(0.0f)), Pack16(float(tiles - 1))));
   }
@@ -127,14 +128,14 @@ class Sight {
   float limit_u_, limit_v_, left_, right_, top_, bottom_;
 };
 
-// Notes the bounds of a row that has changed.
-GAUSSLITE_INLINE void note_bounds(Workspace& ws, uint32_t id, const float* row) {
+// Stores the bounds of a changed row.
+GAUSSLITE_INLINE void store_row_bounds(Workspace& ws, uint32_t id, const float* row) {
   GroupBounds& group = ws.bounds[id / 16];
   for (int k = 0; k < 3; ++k) group.mean[k][id % 16] = row[kMean + k];
   group.log_scale[id % 16] = std::max(row[kLogScale], std::max(row[kLogScale + 1], row[kLogScale + 2]));
 }
 
-// Sixteen rows' bounds, from what is known of them.
+// Loads the stored bounds of sixteen rows.
 GAUSSLITE_INLINE void load_bounds(const GroupBounds& from, Pack16 (&bounds)[4]) {
   for (int k = 0; k < 3; ++k) bounds[k] = load(from.mean[k]);
   bounds[3] = load(from.log_scale);
@@ -145,8 +146,8 @@ GAUSSLITE_INLINE void store_bounds(GroupBounds& to, const Pack16 (&bounds)[4]) {
   store(to.log_scale, bounds[3]);
 }
 
-// ... and from the rows themselves.
-GAUSSLITE_INLINE void find_bounds(const float* rows, Pack16 (&bounds)[4]) {
+// Computes the bounds of sixteen rows.
+GAUSSLITE_INLINE void bounds_from_rows(const float* rows, Pack16 (&bounds)[4]) {
   Pack16 row[8];
   for (int k = 0; k < 4; ++k) {
     row[k] = load_block(rows + kRowWidth * k, 4 * kRowWidth);
@@ -158,26 +159,26 @@ GAUSSLITE_INLINE void find_bounds(const float* rows, Pack16 (&bounds)[4]) {
   bounds[3] = largest_log_scale(row);
 }
 
-// Of rows [begin, end), the ids of those that may touch an active tile. A test of its own costs less than
-// projecting a row, and the rows that are left fill their groups. The last rows, too few for a group, all count.
-GAUSSLITE_INLINE uint32_t find_candidates(Workspace& ws, const Sight& sight, uint32_t begin, uint32_t end,
+// Finds the rows of [begin, end) that may touch an active tile. This test costs less than a projection, and it fills
+// the groups of sixteen for the projection. The last rows, too few for a group, are all candidates.
+GAUSSLITE_INLINE uint32_t find_candidates(Workspace& ws, const CullingBounds& culling, uint32_t begin, uint32_t end,
                                           uint32_t* ids) {
   const bool by_tile = ws.active_tiles != nullptr && !ws.active.fill_box();
   uint32_t boxes[kSegment + 16], in_box = 0, count = 0, i = begin;
   for (; i + 16 <= end; i += 16) {
     Pack16 bounds[4];
-    if (ws.knows_bounds) {
+    if (ws.has_bounds) {
       load_bounds(ws.bounds[i / 16], bounds);
     } else {
-      find_bounds(ws.rows + size_t(kRowWidth) * i, bounds);
-      if (ws.keeps_bounds) store_bounds(ws.bounds[i / 16], bounds);
+      bounds_from_rows(ws.rows + size_t(kRowWidth) * i, bounds);
+      if (ws.stores_bounds) store_bounds(ws.bounds[i / 16], bounds);
     }
-    in_box += sight.list_in_box(ws, bounds, bounds[3], i, ids + in_box, by_tile ? boxes + in_box : nullptr);
+    in_box += culling.list_in_box(ws, bounds, bounds[3], i, ids + in_box, by_tile ? boxes + in_box : nullptr);
   }
   if (!by_tile) {
     count = in_box;
   } else {
-    // Written always, and only then counted or not: no branch to mispredict.
+    // Always written, counted only if active: no branch to mispredict.
     for (uint32_t k = 0; k < in_box; ++k) {
       ids[count] = ids[k];
       count += ws.active.any_near(boxes[k] / ActiveTiles::kSizes, boxes[k] % ActiveTiles::kSizes);

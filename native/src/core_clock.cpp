@@ -11,8 +11,7 @@ namespace {
 
 constexpr int kRuns = 8, kRounds = 30'000, kAddsPerRound = 16;
 
-// Additions that each wait for the one before take a cycle each; what is added comes from a register, because some
-// cores fold constants away.
+// Dependent additions take one cycle each. The addend comes from a register, because some cores fold constants away.
 uint64_t add_in_a_chain(uint64_t sum, uint64_t addend) {
   for (int round = 0; round < kRounds; ++round) {
     for (int i = 0; i < kAddsPerRound; ++i) {
@@ -27,14 +26,14 @@ uint64_t add_in_a_chain(uint64_t sum, uint64_t addend) {
 
 double core_clock_ghz() {
   using Clock = std::chrono::steady_clock;
-  double least_ns = 1e18;
+  double min_ns = 1e18;
   for (int run = 0; run < kRuns; ++run) {
     const auto started = Clock::now();
     volatile uint64_t kept = add_in_a_chain(uint64_t(run), 3);
     (void)kept;
-    least_ns = std::min(least_ns, std::chrono::duration<double, std::nano>(Clock::now() - started).count());
+    min_ns = std::min(min_ns, std::chrono::duration<double, std::nano>(Clock::now() - started).count());
   }
-  return double(kRounds) * kAddsPerRound / least_ns;
+  return double(kRounds) * kAddsPerRound / min_ns;
 }
 
 }  // namespace gausslite

@@ -1,10 +1,10 @@
 // SPDX-License-Identifier: Apache-2.0
-// The clock of the core, for figures in cycles: the time stamp counter runs at a rate of its own.
+// The clock of the core, to report cycles: the time stamp counter has another rate.
 #pragma once
 
 namespace gausslite {
 
-// GHz of the core that calls, busy as it is now: about a millisecond of work.
+// Measures the clock of the current core under load, in GHz; takes about a millisecond.
 double core_clock_ghz();
 
 }  // namespace gausslite

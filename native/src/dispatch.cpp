@@ -5,14 +5,14 @@ namespace gausslite {
 
 namespace {
 
-struct Form {
+struct Variant {
   const char* name;
-  bool (*runs_here)();
+  bool (*is_supported)();
   const Stages& (*stages)();
 };
 
 #if defined(GAUSSLITE_HAS_AVX2) || defined(GAUSSLITE_HAS_AVX512)
-// All that CMakeLists.txt lets the compiler use: a virtual machine may lack any of it.
+// All instruction sets that CMakeLists.txt enables: a virtual machine may lack any of them.
 bool has_avx2() {
   return __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma") && __builtin_cpu_supports("bmi") &&
          __builtin_cpu_supports("bmi2") && __builtin_cpu_supports("popcnt");
@@ -20,7 +20,7 @@ bool has_avx2() {
 #endif
 
 #if defined(GAUSSLITE_HAS_AVX512)
-// VBMI2 (Ice Lake and Zen 4 onwards) brings the byte compression that builds the block lists.
+// VBMI2 (Ice Lake, Zen 4 and later) has the byte compression that builds the block lists.
 bool has_avx512() {
   return has_avx2() && __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") &&
          __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("avx512vl") &&
@@ -28,7 +28,7 @@ bool has_avx512() {
 }
 #endif
 
-constexpr Form kForms[] = {
+constexpr Variant kVariants[] = {
 #if defined(GAUSSLITE_HAS_AVX512)
     {"avx512", has_avx512, avx512::stages},
 #endif
@@ -43,17 +43,17 @@ constexpr Form kForms[] = {
 
 }  // namespace
 
-std::vector<std::string> usable_forms() {
+std::vector<std::string> usable_variants() {
   std::vector<std::string> names;
-  for (const Form& form : kForms) {
-    if (form.runs_here()) names.emplace_back(form.name);
+  for (const Variant& variant : kVariants) {
+    if (variant.is_supported()) names.emplace_back(variant.name);
   }
   return names;
 }
 
 const Stages* find_stages(const std::string& name) {
-  for (const Form& form : kForms) {
-    if (name == form.name && form.runs_here()) return &form.stages();
+  for (const Variant& variant : kVariants) {
+    if (name == variant.name && variant.is_supported()) return &variant.stages();
   }
   return nullptr;
 }

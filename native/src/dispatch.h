@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// Which instruction sets this build has and this machine runs.
+// Selects a SIMD variant: one that this build contains and this machine runs.
 #pragma once
 
 #include <string>
@@ -9,10 +9,10 @@
 
 namespace gausslite {
 
-// Names of the usable forms, fastest first; `portable` is always the last.
-std::vector<std::string> usable_forms();
+// Names of the usable variants, fastest first; the last is `portable`.
+std::vector<std::string> usable_variants();
 
-// The stages of a form, or null when it is unknown or this machine cannot run it.
-const Stages* find_stages(const std::string& form);
+// The stages of a variant, or null if this build lacks it or this machine cannot run it.
+const Stages* find_stages(const std::string& variant);
 
 }  // namespace gausslite

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// Between the workspace, which keeps an image in planes of whole tiles, and the caller's images.
+// Copies between the workspace's planes of whole tiles and the caller's images.
 #pragma once
 
 #include "workspace.h"
@@ -18,9 +18,9 @@ struct ImageGradients {
   const float* d_alpha;
 };
 
-// Rows [begin, end) of the image that was drawn.
+// Copies rows [begin, end) of the rendered image to the output.
 void export_image(const Workspace& ws, const ImageOutput& output, int begin, int end);
-// Rows [begin, end) of the padded planes of gradients; beyond the image they are zero.
+// Fills rows [begin, end) of the padded gradient planes; beyond the image with zeros.
 void import_gradients(Workspace& ws, const ImageGradients& input, int begin, int end);
 
 }  // namespace gausslite

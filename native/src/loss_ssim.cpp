@@ -1,18 +1,18 @@
 // SPDX-License-Identifier: Apache-2.0
-// Stage 5: SSIM and its derivatives by the window means, in squares of 16x16 pixels.
+// Stage 5: SSIM (Wang et al. 2004) and its derivatives by the window means, in squares of 16x16 pixels.
 //
 // With the window mean E of the image x and the target y: S = A1 A2 / (B1 B2), A1 = 2 Ex Ey + C1, A2 = 2 (Exy - Ex Ey)
 // + C2, B1 = Ex^2 + Ey^2 + C1, B2 = E(xx + yy) - Ex^2 - Ey^2 + C2. The gradient at a pixel is the blur of dS/dEx, plus
 // 2x times that of dS/dExx, plus y times that of dS/dExy. Pixels outside the image count as zero.
 //
-// The squares lie half a tile higher than the tiles: row k of them spans image rows 16 k - 8 ... 16 k + 7, so that its
-// windows see the tile rows k - 1 and k only, and the gradient of tile row s needs rows s and s + 1 of them only. A
-// square goes through four blurs. Down the image sixteen columns are blurred at once; then the square is transposed and
-// "down" is along the image rows, so that every load is one aligned cache line. There SSIM is formed and its
-// derivatives are blurred along the rows; they are transposed back and stored; and what is left, the blur down, is done
-// where a tile needs its gradient (ssim_gradient.h). From one square to the next everything is in the first-level
-// cache. The target's mean is blurred anew each time, and its square with the image's: that costs less than fetching
-// both from memory would.
+// The squares lie half a tile higher than the tiles: row k spans image rows 16 k - 8 ... 16 k + 7. So its windows reach
+// only the tile rows k - 1 and k, and the gradient of tile row s needs only rows s and s + 1 of the squares.
+//
+// A square needs four blurs. The first, down the image, processes sixteen columns at once. Then the square is
+// transposed, so that the blur along the rows loads aligned cache lines. SSIM is computed there, and its derivatives
+// are blurred along the rows, transposed back and stored. The last blur, down the image, runs where a tile needs its
+// gradient (ssim_gradient.h). The data of successive squares stay in the first-level cache. The target's mean and
+// square are blurred again in each step: that costs less than loading stored ones from memory.
 #include <algorithm>
 
 #include "ssim_window.h"
@@ -25,11 +25,11 @@ namespace {
 
 constexpr float kC1 = 1e-4f, kC2 = 9e-4f;
 
-// What is blurred on the way forward: x, y, xx + yy, xy.
+// Blurred quantities of the forward pass: x, y, xx + yy, xy.
 constexpr int kMeans = 4;
 
-// Transposed columns of one row of squares: what was blurred down the image, and the derivatives. Sixteen columns of
-// zeros lie on either side.
+// Transposed columns of one row of squares: the quantities blurred down the image, and the derivatives. Sixteen columns
+// of zeros pad either side.
 class Columns {
  public:
   Columns(Buffer<float>& memory, int tiles_x) : map_(size_t(tiles_x + 2) * kSquare) {
@@ -50,7 +50,7 @@ class Columns {
   float* memory_;
 };
 
-// Row k of the squares: each lies on two tiles, and beyond the image there is nothing.
+// Row k of the squares: each overlaps two tiles; beyond the image all values are zero.
 class Squares {
  public:
   Squares(const Workspace& ws, const Targets& targets, const SquareRow& row)
@@ -59,32 +59,32 @@ class Squares {
         upper_(size_t(std::max(row.k - 1, 0)) * size_t(ws.tiles_x)),
         lower_(size_t(row.k) * size_t(ws.tiles_x)) {}
 
-  // The 26 rows of a channel that a square's windows reach.
+  // The 26 rows of a channel in reach of a square's windows.
   GAUSSLITE_INLINE void image_rows(int x, int channel, float* out) const {
     const size_t at = image_tile(x) + size_t(channel) * kSquare;
-    const float* upper = row_.above != nullptr ? row_.above->image.data() + at : kNoSquares;
-    const float* lower = row_.below != nullptr ? row_.below->image.data() + at : kNoSquares;
+    const float* upper = row_.above != nullptr ? row_.above->image.data() + at : kZeroSquares;
+    const float* lower = row_.below != nullptr ? row_.below->image.data() + at : kZeroSquares;
     for (int i = 0; i < kSpan; ++i) store(out + i * kTile, row_between(upper, lower, i));
   }
   GAUSSLITE_INLINE void target_rows(int x, int channel, float* out) const {
-    const TargetTile& upper = row_.above != nullptr ? targets_.tiles[upper_ + size_t(x)] : kNoTarget;
-    const TargetTile& lower = row_.below != nullptr ? targets_.tiles[lower_ + size_t(x)] : kNoTarget;
+    const TargetTile& upper = row_.above != nullptr ? targets_.tiles[upper_ + size_t(x)] : kBlackTarget;
+    const TargetTile& lower = row_.below != nullptr ? targets_.tiles[lower_ + size_t(x)] : kBlackTarget;
     for (int i = 0; i < kSpan; ++i) {
       const int at = i + kTile / 2 - kRadius;
       store(out + i * kTile, at < kTile ? colour_row(upper, channel, at) : colour_row(lower, channel, at - kTile));
     }
   }
 
-  // Whether anything is drawn in one of the two tiles.
-  GAUSSLITE_INLINE bool drawn(const Workspace& ws, int x) const {
-    return (row_.above != nullptr && ws.wanted_blocks[upper_ + size_t(x)] != 0) ||
-           (row_.below != nullptr && ws.wanted_blocks[lower_ + size_t(x)] != 0);
+  // Whether one of the two tiles has rendered blocks.
+  GAUSSLITE_INLINE bool rendered(const Workspace& ws, int x) const {
+    return (row_.above != nullptr && ws.needed_blocks[upper_ + size_t(x)] != 0) ||
+           (row_.below != nullptr && ws.needed_blocks[lower_ + size_t(x)] != 0);
   }
 
-  // The weights of a square, by columns: in `scratch`, or where they are when they are the same everywhere.
+  // The weights of a square, by columns: in `scratch`, or the shared array if they are constant.
   const float* weights(int x, float* scratch) const {
-    const float* upper = row_.above != nullptr ? targets_.tile_weights(upper_ + size_t(x)) : kNoSquares;
-    const float* lower = row_.below != nullptr ? targets_.tile_weights(lower_ + size_t(x)) : kNoSquares;
+    const float* upper = row_.above != nullptr ? targets_.tile_weights(upper_ + size_t(x)) : kZeroSquares;
+    const float* lower = row_.below != nullptr ? targets_.tile_weights(lower_ + size_t(x)) : kZeroSquares;
     if (upper == lower) return upper;
     Pack16 rows[kTile];
     for (int i = 0; i < kTile / 2; ++i) {
@@ -110,12 +110,12 @@ GAUSSLITE_INLINE void blur_and_transpose(Get get, float* out) {
   for (int i = 0; i < kTile; ++i) store(out + i * kTile, rows[i]);
 }
 
-// `drawn`: whether anything is; where nothing is, the image is zero, and what is blurred of it too.
-void blur_down(const Squares& squares, int x, int channel, bool drawn, Columns& columns) {
+// `rendered`: whether a block of the square is rendered; otherwise the image and its blurs are zero.
+void blur_down(const Squares& squares, int x, int channel, bool rendered, Columns& columns) {
   alignas(64) float image[kSpan * kTile], target[kSpan * kTile];
   squares.target_rows(x, channel, target);
   const auto Y = [&](int i) { return load(target + i * kTile); };
-  if (!drawn) {
+  if (!rendered) {
     for (const int k : {0, 3}) std::fill_n(columns.blurred(k, x), kSquare, 0.0f);
     blur_and_transpose(Y, columns.blurred(1, x));
     blur_and_transpose([&](int i) { return Y(i) * Y(i); }, columns.blurred(2, x));
@@ -129,10 +129,10 @@ void blur_down(const Squares& squares, int x, int channel, bool drawn, Columns& 
   blur_and_transpose([&](int i) { return X(i) * Y(i); }, columns.blurred(3, x));
 }
 
-// `columns` of the square itself; the window reaches into its neighbours left and right.
+// Column i of a square, or of its left or right neighbour for i outside 0 ... 15.
 GAUSSLITE_INLINE Pack16 column(const float* columns, int i) { return load(columns + (i - kRadius) * kTile); }
 
-// Forms SSIM and its derivatives in one square. Returns the sum of SSIM times the (negative) weights.
+// Computes SSIM and its derivatives in one square. Returns the sum of SSIM times the (negative) weights.
 double derive(Columns& columns, int x, const float* weights, float scale) {
   Pack16 mean[kMeans][kTile];
   for (int k = 0; k < kMeans; ++k) {
@@ -150,7 +150,7 @@ double derive(Columns& columns, int x, const float* weights, float scale) {
     const Pack16 inverse = Pack16(1.0f) / (B1 * B2), S = A1 * A2 * inverse, scaled = weight * inverse;
     const Pack16 by_A1 = A2 * scaled, by_A2 = A1 * scaled, by_B1 = -(S * B2 * scaled), by_B2 = -(S * B1 * scaled);
     const Pack16 by_Ex = fma(Ey, by_A1 - by_A2, Ex * (by_B1 - by_B2));
-    // Where there is no weight the windows may hold pixels that were never drawn.
+    // Windows of unweighted pixels may contain pixels that are not rendered.
     const Mask16 counts = given > Pack16(0.0f);
     total = total + keep(counts, S * weight);
     store(by[0] + i * kTile, keep(counts, by_Ex + by_Ex));
@@ -169,9 +169,10 @@ void derive_ssim(Workspace& ws, const Training& training, const SquareRow& row, 
   const Squares squares(ws, training.targets, row);
   Columns columns(ws.scratch[size_t(thread)].ssim, ws.tiles_x);
   for (int channel = 0; channel < 3; ++channel) {
-    // Square x is blurred down, x - 1 derived, x - 2 blurred along: each needs its right neighbour's former step.
+    // A pipeline over the squares: x is blurred down, x - 1 derived, x - 2 blurred along; each needs the previous step
+    // of its right neighbour.
     for (int x = 0; x < ws.tiles_x + 2; ++x) {
-      if (x < ws.tiles_x && reach[x] != kUnreached) blur_down(squares, x, channel, squares.drawn(ws, x), columns);
+      if (x < ws.tiles_x && reach[x] != kUnreached) blur_down(squares, x, channel, squares.rendered(ws, x), columns);
       const int middle = x - 1;
       if (middle >= 0 && middle < ws.tiles_x) {
         if (reach[middle] == kWeighted) {
@@ -182,8 +183,8 @@ void derive_ssim(Workspace& ws, const Training& training, const SquareRow& row, 
         }
       }
       const int last = x - 2;
-      // Where nothing is drawn, nothing is to be changed.
-      if (last >= 0 && reach[last] != kUnreached && squares.drawn(ws, last)) {
+      // Without rendered blocks there is no gradient.
+      if (last >= 0 && reach[last] != kUnreached && squares.rendered(ws, last)) {
         for (int m = 0; m < kSsimMaps; ++m) {
           const float* in = columns.derivative(m, last);
           blur_and_transpose([&](int i) { return column(in, i); }, row.squares + ssim_square(last, channel, m));

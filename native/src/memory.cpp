@@ -19,11 +19,11 @@ namespace {
 constexpr size_t kCacheLine = 64;
 constexpr size_t kHugePage = size_t{2} << 20;
 
-// Large blocks that were freed, kept for the next request of the same size. A robot frees one training view for every
-// one it makes; where the system takes freed pages back, touching fresh ones costs ten times what the view does.
-class Shelf {
+// Freed large blocks, kept for the next request of the same size. A mapper frees one training view for each new one. On
+// systems that take freed pages back, first access to new pages costs ten times as much as preparing the view.
+class BlockCache {
  public:
-  // A block of exactly this size, or null.
+  // Returns a block of exactly this size, or null.
   void* take(size_t bytes) {
     const std::lock_guard<std::mutex> lock(mutex_);
     for (Block& block : blocks_) {
@@ -32,13 +32,13 @@ class Shelf {
     return nullptr;
   }
 
-  // Keeps the block, in turn on one place and the other; what lies there is freed.
+  // Keeps the block in alternating slots and frees the previous block of the slot.
   void put(void* memory, size_t bytes) {
     const std::lock_guard<std::mutex> lock(mutex_);
-    Block& place = blocks_[next_];
+    Block& slot = blocks_[next_];
     next_ = (next_ + 1) % blocks_.size();
-    std::free(place.memory);
-    place = {memory, bytes};
+    std::free(slot.memory);
+    slot = {memory, bytes};
   }
 
  private:
@@ -51,9 +51,9 @@ class Shelf {
   size_t next_ = 0;
 };
 
-Shelf& shelf() {
-  static Shelf the_shelf;
-  return the_shelf;
+BlockCache& block_cache() {
+  static BlockCache cache;
+  return cache;
 }
 
 size_t alignment_of(size_t bytes) { return bytes >= kHugePage / 2 ? kHugePage : kCacheLine; }
@@ -62,14 +62,14 @@ size_t rounded(size_t bytes) { return (bytes + kCacheLine - 1) / kCacheLine * kC
 
 }  // namespace
 
-// Random 64-byte reads run about twice as fast from 2 MiB pages as from 4 KiB pages, so large arrays ask for them.
-void* grow_memory(void* old, size_t kept, size_t old_bytes, size_t bytes) {
+// Random 64-byte reads are about twice as fast from 2 MiB pages as from 4 KiB pages.
+void* reallocate(void* old, size_t kept, size_t old_bytes, size_t bytes) {
   const size_t alignment = alignment_of(bytes), size = rounded(bytes);
-  void* fresh = alignment == kHugePage ? shelf().take(size) : nullptr;
+  void* fresh = alignment == kHugePage ? block_cache().take(size) : nullptr;
   if (fresh == nullptr) {
     if (posix_memalign(&fresh, alignment, size) != 0) throw std::bad_alloc();
 #if defined(__linux__) && defined(MADV_HUGEPAGE)
-    // Whole ones only: what is left over would bring in one more of them.
+    // Whole huge pages only: a remainder would allocate one more.
     if (size >= kHugePage) madvise(fresh, size / kHugePage * kHugePage, MADV_HUGEPAGE);
 #endif
   }
@@ -81,7 +81,7 @@ void* grow_memory(void* old, size_t kept, size_t old_bytes, size_t bytes) {
 
 void free_memory(void* memory, size_t bytes) noexcept {
   if (memory != nullptr && alignment_of(bytes) == kHugePage) {
-    shelf().put(memory, rounded(bytes));
+    block_cache().put(memory, rounded(bytes));
   } else {
     std::free(memory);
   }

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// Growable scratch memory that is aligned, zeroed and backed by huge pages where it is large.
+// Growable scratch memory: aligned, zeroed, and on huge pages if large.
 #pragma once
 
 #include <cstddef>
@@ -7,14 +7,14 @@
 
 namespace gausslite {
 
-// A replacement for `old` with room for `bytes`, its first `kept` bytes copied and the rest zero; frees `old`, which
-// was asked for with `old_bytes`. Throws std::bad_alloc.
-void* grow_memory(void* old, size_t kept, size_t old_bytes, size_t bytes);
-// Frees what was asked for with `bytes`; the latest large blocks are kept for the next who asks for as much.
+// Returns memory of `bytes` with the first `kept` bytes of `old` and zeros behind them; frees `old`, which has
+// `old_bytes`. Throws std::bad_alloc.
+void* reallocate(void* old, size_t kept, size_t old_bytes, size_t bytes);
+// Frees memory of `bytes`. The latest large blocks are kept for requests of the same size.
 void free_memory(void* memory, size_t bytes) noexcept;
 
 // An array that grows and never shrinks. Its members are always inlined: the stages are compiled for several
-// instruction sets, and a shared out-of-line copy could be one that this machine cannot run.
+// instruction sets, and a shared out-of-line copy could use one that this machine lacks.
 template <class T>
 class Buffer {
  public:
@@ -24,11 +24,11 @@ class Buffer {
   Buffer& operator=(Buffer&&) = delete;
   ~Buffer() { free_memory(data_, capacity_ * sizeof(T)); }
 
-  // Makes room for `count` elements; on growth the first `kept` stay and the others are zero.
+  // Ensures a capacity of `count` elements; growth keeps the first `kept` and sets the others to zero.
   __attribute__((always_inline)) void reserve(size_t count, size_t kept = 0) {
     if (count > capacity_) grow_to(count + count / 4 + 64, kept);
   }
-  // The same without headroom, for what never grows again.
+  // The same without spare capacity, for arrays of final size.
   __attribute__((always_inline)) void reserve_exactly(size_t count) {
     if (count > capacity_) grow_to(count, 0);
   }
@@ -39,9 +39,9 @@ class Buffer {
   __attribute__((always_inline)) size_t capacity() const { return capacity_; }
 
  private:
-  __attribute__((always_inline)) void grow_to(size_t wanted, size_t kept) {
-    data_ = static_cast<T*>(grow_memory(data_, kept * sizeof(T), capacity_ * sizeof(T), wanted * sizeof(T)));
-    capacity_ = wanted;
+  __attribute__((always_inline)) void grow_to(size_t needed, size_t kept) {
+    data_ = static_cast<T*>(reallocate(data_, kept * sizeof(T), capacity_ * sizeof(T), needed * sizeof(T)));
+    capacity_ = needed;
   }
 
   T* data_ = nullptr;

@@ -1,9 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
-// The six moments that the sixteen pixels of a block leave at a splat, for sixteen (splat, block) pairs at a time.
+// Sums the six moments of v over the sixteen pixels of a block, for sixteen (splat, block) pairs at a time.
 //
-// Summing one pair with a table of 1, x, y, xx, xy, yy takes sixteen half-width multiplications, and the units that
-// multiply are what the tile pass is short of. Here sixteen pairs are transposed on the way, by the idle shuffle units,
-// until a lane is a pair; sums along x and then along y are additions but for eleven multiplications in all.
+// One pair, with a table of 1, x, y, xx, xy, yy, takes sixteen half-width multiplications, and multiplication limits
+// the tile stages. Here the otherwise idle shuffle units transpose sixteen pairs until each lane is one pair. The sums
+// along x and then y are additions, with eleven multiplications in all.
 #pragma once
 
 #include <cstring>
@@ -13,8 +13,8 @@
 
 namespace gausslite::GAUSSLITE_ISA {
 
-// By entry of a chunk: sums of v, v x, v y, v x x, v x y, v y y, with (x, y) counted in half pixels from the tile's
-// centre, where pixels have odd coordinates; two spare.
+// Per entry of a chunk: sums of v, v x, v y, v x x, v x y, v y y, with (x, y) in half pixels from the tile's centre,
+// where pixels have odd coordinates; two unused.
 struct MomentSums {
   alignas(64) float of[kChunk][8];
 
@@ -23,10 +23,10 @@ struct MomentSums {
   }
 };
 
-// From half pixels to pixels.
+// Conversion from half pixels to pixels.
 alignas(32) constexpr float kMomentUnits[8] = {1.0f, 0.5f, 0.5f, 0.25f, 0.25f, 0.25f, 0.0f, 0.0f};
 
-// Four values at -3, -1, 1, 3: their sum and first two moments.
+// Sum and first two moments of four values at -3, -1, 1, 3.
 struct LineMoments {
   Pack16 sum, first, second;
 
@@ -38,16 +38,16 @@ struct LineMoments {
   }
 };
 
-// Pairs wait here until there are sixteen. `values[i]` is for the caller to write: v at the sixteen pixels of pair i.
+// A batch of up to sixteen pairs. The caller writes `values[i]`: v at the sixteen pixels of pair i.
 class MomentBatch {
  public:
   static constexpr int kSize = 16;
   alignas(64) float values[kSize][16];
 
-  GAUSSLITE_INLINE int room() const { return kSize - count_; }
+  GAUSSLITE_INLINE int free_slots() const { return kSize - count_; }
   GAUSSLITE_INLINE int count() const { return count_; }
 
-  // Takes note of the next n pairs, n at most room(): entries list[0..n) with block b.
+  // Adds the next n pairs, n at most free_slots(): entries list[0..n) with block b.
   GAUSSLITE_INLINE void add(const uint8_t* list, int n, int b, MomentSums& sums) {
     std::memcpy(entry_ + count_, list, kSize);
     store(block_x_ + count_, Pack16(float(8 * (b & 3) - 12)));
@@ -72,7 +72,7 @@ class MomentBatch {
     const LineMoments y(one[0], one[1], one[2], one[3]), xy(x[0], x[1], x[2], x[3]);
     const Pack16 sum_xx = (xx[0] + xx[3]) + (xx[1] + xx[2]);
 
-    // From the block's centre to the tile's.
+    // Shift from the block's centre to the tile's.
     const Pack16 block_x = load(block_x_), block_y = load(block_y_);
     const Pack16 by_x = fma(block_x, y.sum, xy.sum), by_y = fma(block_y, y.sum, y.first);
     const Pack16 by_xx = fma(block_x, xy.sum + by_x, sum_xx), by_yy = fma(block_y, y.first + by_y, y.second);
@@ -94,7 +94,7 @@ class MomentBatch {
   }
 
  private:
-  // With slack for whole-register writes.
+  // Padded for whole-register writes.
   uint8_t entry_[2 * kSize];
   alignas(64) float block_x_[2 * kSize], block_y_[2 * kSize];
   int count_ = 0;

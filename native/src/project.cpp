@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// Stage 1: parameter rows to visible splats, and their depth keys to the tile rows that they touch.
+// Stage 1: project parameter rows to visible splats, and add their depth keys to the tile rows that they touch.
 #include <algorithm>
 #include <cmath>
 #include <cstring>
@@ -12,7 +12,7 @@ namespace gausslite::GAUSSLITE_ISA {
 
 namespace {
 
-// The tiles, from first to last, of the pixels whose centres are in the bounding box of alpha >= 1/255.
+// First and last tiles of the pixels with centres in the bounding box of alpha >= 1/255.
 struct Box {
   Pack16 x0, x1, y0, y1;
   Mask16 visible;
@@ -32,13 +32,13 @@ struct Box {
     y1 = floor(bottom * (1.0f / kTile));
   }
 
-  // Which lanes' boxes are larger than narrow() can tell of: few.
+  // Lanes with a box that is too large for narrow(): few.
   GAUSSLITE_INLINE uint32_t large() const {
     return bits(((x1 - x0 > Pack16(kMostAcross)) | (y1 - y0 > Pack16(1.0f))) & visible);
   }
 
-  // Of the boxes that are not large, leaves out the upper or lower row of tiles if none in it is active; returns which
-  // lanes have an active one. All are looked up, wanted or not: no branch to mispredict.
+  // Removes the upper or lower row of tiles from boxes that are not large, if no tile in it is active. Returns the
+  // lanes with an active tile. All rows are looked up: no branch to mispredict.
   GAUSSLITE_INLINE uint32_t narrow(const ActiveTiles& active, Pack16 tiles_x) {
     alignas(64) int32_t upper[16], lower[16], across[16];
     store_int(upper, keep(visible, fma(y0, tiles_x, x0)));
@@ -60,16 +60,16 @@ struct Box {
   static constexpr float kMostAcross = float(ActiveTiles::kNear - 1);
 };
 
-// Rows with a NaN or infinite parameter, and splats whose projection overflows, are not drawn at all.
-GAUSSLITE_INLINE Mask16 is_sound(const Pack16* row, const Projection& p) {
+// False for rows with a NaN or infinite parameter, and for splats with an overflow in their projection.
+GAUSSLITE_INLINE Mask16 is_valid(const Pack16* row, const Projection& p) {
   Pack16 total = row[0] * 0.0f;
-  for (int k = 1; k < kTrained; ++k) total = fma(row[k], Pack16(0.0f), total);
+  for (int k = 1; k < kTrainedColumns; ++k) total = fma(row[k], Pack16(0.0f), total);
   const Pack16 conic = p.conic_xx * 0.0f + p.conic_xy * 0.0f + p.conic_yy * 0.0f;
   const Pack16 shape = p.mean_x * 0.0f + p.mean_y * 0.0f + p.cov_xx * 0.0f + p.cov_yy * 0.0f;
   return (total + conic + shape == Pack16(0.0f)) & (p.conic_xx > Pack16(0.0f)) & (p.conic_yy > Pack16(0.0f));
 }
 
-// Sixteen splats' boxes, lane by lane; those of invisible ones are of no use, but lie in the image.
+// Sixteen splats' boxes by lane; the boxes of invisible splats have no meaning, but lie inside the image.
 struct BoxLanes {
   alignas(64) int32_t x0[16], x1[16], y0[16], y1[16];
 
@@ -80,12 +80,12 @@ struct BoxLanes {
     store_int(y1, keep(box.visible, box.y1));
   }
 
-  // Whether the box of a lane meets an active tile in one of its tile rows.
+  // Whether a lane's box has an active tile in tile row y.
   GAUSSLITE_INLINE bool active_in(const ActiveTiles& active, int lane, int y) const {
     return active.any(uint32_t(x0[lane]), uint32_t(x1[lane]), uint32_t(y), uint32_t(y));
   }
 
-  // As Box::narrow for one that is larger; returns whether it has an active tile.
+  // The same as Box::narrow for a large box; returns whether it has an active tile.
   GAUSSLITE_INLINE bool narrow(const ActiveTiles& active, int lane) {
     while (y0[lane] < y1[lane] && !active_in(active, lane, y0[lane])) ++y0[lane];
     while (y1[lane] > y0[lane] && !active_in(active, lane, y1[lane])) --y1[lane];
@@ -93,33 +93,33 @@ struct BoxLanes {
   }
 };
 
-// Gradient rows are handed out in blocks, so that the shared counter is touched rarely. Row 0 is nobody's.
-GAUSSLITE_INLINE uint32_t take_gradient_rows(Workspace& ws, ThreadScratch& mine, uint32_t rows) {
-  if (mine.last_row - mine.next_row < rows) {
+// Threads take gradient rows in blocks, so that they rarely access the shared counter. Row 0 is unused.
+GAUSSLITE_INLINE uint32_t take_gradient_rows(Workspace& ws, ThreadScratch& thread_scratch, uint32_t rows) {
+  if (thread_scratch.last_row - thread_scratch.next_row < rows) {
     const uint32_t block = std::max<uint32_t>(kSegment, rows);
-    mine.next_row = ws.gradient_rows_used.fetch_add(block, std::memory_order_relaxed);
-    mine.last_row = mine.next_row + block;
+    thread_scratch.next_row = ws.gradient_rows_used.fetch_add(block, std::memory_order_relaxed);
+    thread_scratch.last_row = thread_scratch.next_row + block;
   }
-  const uint32_t first = mine.next_row;
-  mine.next_row += rows;
+  const uint32_t first = thread_scratch.next_row;
+  thread_scratch.next_row += rows;
   return first;
 }
 
-// Where the visible splats of a segment go, and their keys.
+// Output of a segment: its visible splats and their keys.
 class Segment {
  public:
-  GAUSSLITE_INLINE Segment(Workspace& ws, ThreadScratch& mine, uint32_t first_slot)
-      : ws_(ws), mine_(mine), slot_(first_slot) {}
+  GAUSSLITE_INLINE Segment(Workspace& ws, ThreadScratch& thread_scratch, uint32_t first_slot)
+      : ws_(ws), thread_scratch_(thread_scratch), slot_(first_slot) {}
 
   GAUSSLITE_INLINE uint32_t slot() const { return slot_; }
 
-  // Adds the `visible` lanes of a group: `splats` are complete but for their gradient rows. Every lane is written, and
-  // only then counted or not: no branch to mispredict. One or two tile rows are the rule, the others are `tall`.
+  // Adds the `visible` lanes of a group; `splats` lack only their gradient rows. All lanes are written and only visible
+  // ones counted: no branch to mispredict. Most boxes span one or two tile rows; the others are `tall`.
   GAUSSLITE_INLINE void add(const Pack16 (&splats)[16], const float* depth, const uint32_t* ids, const BoxLanes& boxes,
                             uint32_t visible, uint32_t tall) {
     uint32_t rows = 0;
     for (int j = 0; j < 16; ++j) rows += (visible >> j & 1u) * uint32_t(boxes.y1[j] - boxes.y0[j] + 1);
-    uint32_t slot = slot_, gradient_row = take_gradient_rows(ws_, mine_, rows);
+    uint32_t slot = slot_, gradient_row = take_gradient_rows(ws_, thread_scratch_, rows);
     for (int j = 0; j < 16; ++j) {
       const uint32_t counts = visible >> j & 1u;
       const int first = boxes.y0[j], last = boxes.y1[j];
@@ -144,18 +144,18 @@ class Segment {
 
  private:
   GAUSSLITE_INLINE void add_key(const DepthKey& key, int tile_y, uint32_t counts) {
-    KeyList& strip = mine_.strips[size_t(tile_y)];
-    strip.keys[strip.count] = key;
-    strip.count += counts;
+    KeyList& tile_row = thread_scratch_.tile_rows[size_t(tile_y)];
+    tile_row.keys[tile_row.count] = key;
+    tile_row.count += counts;
   }
 
   Workspace& ws_;
-  ThreadScratch& mine_;
+  ThreadScratch& thread_scratch_;
   uint32_t slot_;
 };
 
-// Projects the `lanes` rows that `ids` names.
-GAUSSLITE_INLINE void project_group(const Workspace& ws, const Sight& sight, const uint32_t* ids, int lanes,
+// Projects the first `lanes` rows of `ids`.
+GAUSSLITE_INLINE void project_group(const Workspace& ws, const CullingBounds& culling, const uint32_t* ids, int lanes,
                                     Segment& segment) {
   Pack16 row[16];
   uint32_t id[16];
@@ -164,13 +164,13 @@ GAUSSLITE_INLINE void project_group(const Workspace& ws, const Sight& sight, con
     row[j] = load(ws.rows + size_t(kRowWidth) * id[j]);
   }
   transpose(row);
-  const Mask16 candidates = sight.may_touch(row, largest_log_scale(row)) & first_lanes(lanes);
+  const Mask16 candidates = culling.may_touch(row, largest_log_scale(row)) & first_lanes(lanes);
   if (!any(candidates)) return;
 
   Projection p;
   project16(row, ws.camera, p);
   Box box(p, ws.camera);
-  box.visible = box.visible & candidates & is_sound(row, p);
+  box.visible = box.visible & candidates & is_valid(row, p);
   uint32_t visible = bits(box.visible);
   if (visible == 0) return;
 
@@ -212,32 +212,32 @@ GAUSSLITE_INLINE void project_group(const Workspace& ws, const Sight& sight, con
 }  // namespace
 
 void project(Workspace& ws, int thread) {
-  ThreadScratch& mine = ws.scratch[size_t(thread)];
-  const Sight sight(ws);
-  uint32_t found[kSegment + 16];
-  mine.next_row = mine.last_row = 0;
-  // The list after the last row takes second keys that do not count.
+  ThreadScratch& thread_scratch = ws.scratch[size_t(thread)];
+  const CullingBounds culling(ws);
+  uint32_t candidate_ids[kSegment + 16];
+  thread_scratch.next_row = thread_scratch.last_row = 0;
+  // An additional list receives uncounted second keys below the last tile row.
   const int lists = ws.tiles_y + 1;
-  for (int y = 0; y < lists; ++y) mine.strips[size_t(y)].count = 0;
+  for (int y = 0; y < lists; ++y) thread_scratch.tile_rows[size_t(y)].count = 0;
   for (uint32_t s; (s = ws.take_segment(thread)) < ws.segments;) {
     const uint32_t begin = s * kSegment, end = std::min(ws.count, begin + kSegment);
     ws.segment_thread[s] = uint32_t(thread);
     KeySpan* spans = &ws.segment_keys[size_t(s) * size_t(ws.tiles_y)];
     for (int y = 0; y < lists; ++y) {
-      KeyList& strip = mine.strips[size_t(y)];
-      strip.keys.reserve(strip.count + kSegment + 1, strip.count);
-      if (y < ws.tiles_y) spans[y].begin = strip.count;
+      KeyList& tile_row = thread_scratch.tile_rows[size_t(y)];
+      tile_row.keys.reserve(tile_row.count + kSegment + 1, tile_row.count);
+      if (y < ws.tiles_y) spans[y].begin = tile_row.count;
     }
-    const uint32_t* ids = ws.ids != nullptr ? ws.ids + begin : found;
-    const uint32_t count = ws.ids != nullptr ? end - begin : find_candidates(ws, sight, begin, end, found);
-    Segment segment(ws, mine, begin);
+    const uint32_t* ids = ws.ids != nullptr ? ws.ids + begin : candidate_ids;
+    const uint32_t count = ws.ids != nullptr ? end - begin : find_candidates(ws, culling, begin, end, candidate_ids);
+    Segment segment(ws, thread_scratch, begin);
     for (uint32_t i = 0; i < count; i += 16) {
       for (uint32_t j = i + 16; j < std::min(i + 32, count); ++j) prefetch(ws.rows + size_t(kRowWidth) * ids[j]);
       for (uint32_t j = 0; j < 16; ++j) prefetch_to_write(&ws.splats[segment.slot() + j]);
-      project_group(ws, sight, ids + i, int(std::min(16u, count - i)), segment);
+      project_group(ws, culling, ids + i, int(std::min(16u, count - i)), segment);
     }
     ws.segment_visible[s] = segment.slot() - begin;
-    for (int y = 0; y < ws.tiles_y; ++y) spans[y].end = mine.strips[size_t(y)].count;
+    for (int y = 0; y < ws.tiles_y; ++y) spans[y].end = thread_scratch.tile_rows[size_t(y)].count;
   }
 }
 

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// Sixteen splats through the camera: the EWA projection of a 3D Gaussian to an image Gaussian (Kerbl et al. 2023, Sec.
-// 4). Both directions start here, the backward one with all intermediate values.
+// EWA projection of sixteen 3D Gaussians to image Gaussians (Kerbl et al. 2023, Sec. 4). The backward pass repeats it,
+// to use the intermediate values.
 #pragma once
 
 #include "camera.h"
@@ -107,7 +107,7 @@ GAUSSLITE_INLINE void project16(const Pack16* row, const Camera& camera, Project
   }
   invert_covariance(o);
 
-  // exp(-logit) / denominator keeps its digits where the opacity is close to 1 and 1 - opacity would lose them.
+  // exp(-logit) / denominator keeps its precision at opacities near 1, unlike 1 - opacity.
   const Pack16 e = exp(-row[kLogit]), denominator = Pack16(1.0f) + e;
   o.transparency = e / denominator;
   o.log2_opacity = -log2(denominator);

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// The projection's way back for sixteen splats: image gradients to gradients of the parameters, and of the camera's
-// pose.
+// Backward pass of the projection for sixteen splats: from image gradients to gradients of the parameters and of the
+// camera pose.
 #pragma once
 
 #include "projection.h"
@@ -8,23 +8,24 @@
 namespace gausslite::GAUSSLITE_ISA {
 
 // Gradients of sixteen parameter rows, transposed; the norm of the gradient by the image mean in half image widths and
-// heights; and, when asked for, what each splat adds to the gradient of the camera twist (translation, rotation).
+// heights; with kTwist, each splat's gradient by the camera twist (translation, rotation).
 struct ParameterGradients {
   Pack16 column[16];
   Pack16 mean_2d_norm;
   Pack16 twist[6];
 };
 
-// K m for column j of M, where K is the conic. K (M M^T + d I) = I and the adjugate of a sum of 2x2 matrices is the sum
-// of theirs, so that K m_j = (sum over i of n_i (n_i m_j) + d m_j) / determinant with n_i = m_i turned by 90 degrees.
-// n_j m_j is exactly zero: nothing cancels, as the entries of K times those of a needle's long axis would.
+// Computes K m for column j of M, where K is the conic. K (M M^T + d I) = I, and the adjugate of a sum of 2x2 matrices
+// is the sum of their adjugates. So K m_j = (sum over i of n_i (n_i m_j) + d m_j) / determinant, with n_i = m_i rotated
+// by 90 degrees. n_j m_j is exactly zero, which avoids the cancellation that the entries of K have for needle-shaped
+// splats.
 GAUSSLITE_INLINE void conic_times_axis(const Projection& p, int j, Pack16& x, Pack16& y) {
   const int k = (j + 1) % 3, l = (j + 2) % 3;
   x = (p.M1[k] * p.cross[l] - p.M1[l] * p.cross[k] + p.M0[j] * kDilationPx2) * p.inverse_determinant;
   y = (p.M0[l] * p.cross[k] - p.M0[k] * p.cross[l] + p.M1[j] * kDilationPx2) * p.inverse_determinant;
 }
 
-// `by_R` is the gradient by the rotation matrix of the unit quaternion; the result is by the raw one.
+// `by_R` is the gradient by the rotation matrix of the unit quaternion; the result is by the raw quaternion.
 GAUSSLITE_INLINE void quaternion_gradient(const Projection& p, const Pack16 (&by_R)[3][3], Pack16* out) {
   const Pack16 w = p.qw, x = p.qx, y = p.qy, z = p.qz;
   const Pack16 minus_x = by_R[2][1] - by_R[1][2], minus_y = by_R[0][2] - by_R[2][0], minus_z = by_R[1][0] - by_R[0][1];
@@ -55,7 +56,7 @@ GAUSSLITE_INLINE void backward16(const Pack16* row, const Pack16* image, const C
   out.mean_2d_norm = sqrt(half_x * half_x + half_y * half_y);
 
   // Covariance = M M^T + 0.3 I with M = P R S. As ln(alpha) = ... - d^T K d / 2, column m of M has the gradient K S K
-  // m, where S holds the second moments of v.
+  // m, where S is the matrix of second moments of v.
   const Pack16 *moments = image + kMoments, S_xx = moments[3], S_xy = moments[4], S_yy = moments[5];
   Pack16 by_P0[3] = {0.0f, 0.0f, 0.0f}, by_P1[3] = {0.0f, 0.0f, 0.0f}, by_R[3][3];
   for (int j = 0; j < 3; ++j) {
@@ -73,7 +74,7 @@ GAUSSLITE_INLINE void backward16(const Pack16* row, const Pack16* image, const C
   }
   quaternion_gradient(p, by_R, out.column + kQuat);
 
-  // P = J R_camera_world; where the tangent is clamped, the Jacobian does not move with it.
+  // P = J R_camera_world; the Jacobian is constant where the tangent is clamped.
   const Pack16 by_J00 = dot3(by_P0, R), by_J02 = dot3(by_P0, R + 6), by_J11 = dot3(by_P1, R + 3),
                by_J12 = dot3(by_P1, R + 6);
   const Pack16 by_u = fma(by_mean_x, Pack16(camera.fx), keep(p.u == p.u_clamped, -(p.J00 * by_J02)));
@@ -90,8 +91,8 @@ GAUSSLITE_INLINE void backward16(const Pack16* row, const Pack16* image, const C
   out.column[14] = out.column[15] = Pack16(0.0f);
 
   if constexpr (kTwist) {
-    // T <- exp(twist) T moves a camera-frame point by t + r x point and turns R_camera_world by r. With N = (dL/dR)
-    // R^T, the latter's gradient is the axis of N - N^T; dL/dR = J^T (dL/dP).
+    // T <- exp(twist) T moves a camera-frame point by t + r x point and rotates R_camera_world by r. With N = (dL/dR)
+    // R^T, the gradient of the rotation is the axis of N - N^T; dL/dR = J^T (dL/dP).
     const Pack16 a01 = dot3(by_P0, R + 3), a10 = dot3(by_P1, R);
     const Pack16 n01 = p.J00 * a01, n02 = p.J00 * by_J02, n10 = p.J11 * a10, n12 = p.J11 * by_J12;
     const Pack16 n20 = p.J02 * by_J00 + p.J12 * a10, n21 = p.J02 * a01 + p.J12 * by_J11;
@@ -102,14 +103,13 @@ GAUSSLITE_INLINE void backward16(const Pack16* row, const Pack16* image, const C
   }
 }
 
-// A gradient with a NaN or infinite entry, which only absurd splats can have, counts as zero rather than spoiling its
-// row.
-GAUSSLITE_INLINE void drop_unsound(ParameterGradients& g) {
+// Sets gradients with a NaN or infinite entry, of degenerate splats, to zero, so that they do not change their rows.
+GAUSSLITE_INLINE void zero_invalid(ParameterGradients& g) {
   Pack16 total = g.mean_2d_norm * 0.0f;
-  for (int k = 0; k < kTrained; ++k) total = fma(g.column[k], Pack16(0.0f), total);
-  const Mask16 sound = total == Pack16(0.0f);
-  for (int k = 0; k < kTrained; ++k) g.column[k] = keep(sound, g.column[k]);
-  g.mean_2d_norm = keep(sound, g.mean_2d_norm);
+  for (int k = 0; k < kTrainedColumns; ++k) total = fma(g.column[k], Pack16(0.0f), total);
+  const Mask16 valid = total == Pack16(0.0f);
+  for (int k = 0; k < kTrainedColumns; ++k) g.column[k] = keep(valid, g.column[k]);
+  g.mean_2d_norm = keep(valid, g.mean_2d_norm);
 }
 
 }  // namespace gausslite::GAUSSLITE_ISA

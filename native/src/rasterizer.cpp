@@ -15,13 +15,13 @@ double now_ms() {
   return std::chrono::duration<double, std::milli>(std::chrono::steady_clock::now().time_since_epoch()).count();
 }
 
-// Rows of the image that member `thread` works on.
+// Image rows of one thread.
 struct Band {
   int begin, end;
   Band(int height, int thread, int threads) : begin(height * thread / threads), end(height * (thread + 1) / threads) {}
 };
 
-// The blocks of a tile that are inside the image, which goes on for so many pixels from the tile's corner.
+// The blocks of a tile inside an image that extends `columns` and `rows` pixels from the corner of the tile.
 uint16_t blocks_inside(int columns, int rows) {
   const int across = std::min((columns + kBlock - 1) / kBlock, kBlocksAcross);
   const int down = std::min((rows + kBlock - 1) / kBlock, kBlocksAcross);
@@ -30,7 +30,7 @@ uint16_t blocks_inside(int columns, int rows) {
 
 }  // namespace
 
-Rasterizer::Rasterizer(const Stages& stages, int threads) : stages_(stages), team_(threads) {
+Rasterizer::Rasterizer(const Stages& stages, int threads) : stages_(stages), pool_(threads) {
   ws_.threads = threads;
   ws_.scratch = std::vector<ThreadScratch>(size_t(threads));
 }
@@ -54,121 +54,121 @@ void Rasterizer::begin_frame(const FrameInput& input) {
   ws_.segment_visible.reserve(ws_.segments + 1);
   ws_.segment_thread.reserve(ws_.segments + 1);
   ws_.segment_keys.reserve(size_t(ws_.segments + 1) * size_t(ws_.tiles_y));
-  ws_.keeps_bounds = ws_.knows_bounds = false;
+  ws_.stores_bounds = ws_.has_bounds = false;
   const size_t tiles = size_t(ws_.tiles_x) * size_t(ws_.tiles_y);
   ws_.gradient_rows_used = 0;
   ws_.ticket = 0;
-  ws_.hand_out_segments();
+  ws_.reset_segments();
   for (ThreadScratch& scratch : ws_.scratch) {
-    if (scratch.strips.size() <= size_t(ws_.tiles_y)) scratch.strips.resize(size_t(ws_.tiles_y) + 1);
+    if (scratch.tile_rows.size() <= size_t(ws_.tiles_y)) scratch.tile_rows.resize(size_t(ws_.tiles_y) + 1);
     scratch.block_evaluations = 0;
   }
-  ws_.wanted_blocks.reserve(tiles + 1);
-  if (input.active_tiles != nullptr) ws_.active.look_at(input.active_tiles, ws_.tiles_x, ws_.tiles_y);
+  ws_.needed_blocks.reserve(tiles + 1);
+  if (input.active_tiles != nullptr) ws_.active.assign(input.active_tiles, ws_.tiles_x, ws_.tiles_y);
   times_ = {};
-  last_mark_ms_ = now_ms();
+  stage_start_ms_ = now_ms();
 }
 
-// Of the active tiles, the blocks that the loss depends on; null: all inside the image.
-void Rasterizer::want_blocks(const uint16_t* blocks) {
+// Selects, in the active tiles, the blocks that the loss depends on; null: all blocks inside the image.
+void Rasterizer::select_blocks(const uint16_t* blocks) {
   for (int y = 0, t = 0; y < ws_.tiles_y; ++y) {
     for (int x = 0; x < ws_.tiles_x; ++x, ++t) {
       const bool active = ws_.active_tiles == nullptr || ws_.active_tiles[t];
       const uint16_t blocks_here =
           blocks != nullptr ? blocks[t] : blocks_inside(ws_.camera.width - x * kTile, ws_.camera.height - y * kTile);
-      ws_.wanted_blocks[size_t(t)] = active ? blocks_here : uint16_t(0);
+      ws_.needed_blocks[size_t(t)] = active ? blocks_here : uint16_t(0);
     }
   }
 }
 
-// Memory is zeroed when it grows, so 0 would read as written.
+// 0 is no tag: new memory is zero and would count as written in this pass.
 void Rasterizer::next_tag() {
   if (++ws_.tag == 0) ++ws_.tag;
 }
 
-// One more than there are: the update reads the row after a splat's only one before it knows that there is none.
+// One additional row: the update loads a second row for each splat before it checks the number of rows.
 void Rasterizer::prepare_gradient_rows() {
   ws_.gradient_rows.reserve((size_t(ws_.gradient_rows_used.load()) + 1) * kRowWidth);
 }
 
-void Rasterizer::mark(double StageTimes::*stage) {
+void Rasterizer::record_stage(double StageTimes::* stage) {
   const double now = now_ms();
-  times_.*stage = now - std::exchange(last_mark_ms_, now);
+  times_.*stage = now - std::exchange(stage_start_ms_, now);
 }
 
-// The bounds of rows that are lent are kept from the first step that looks at all of them.
-void Rasterizer::use_bounds(uint64_t loan) {
-  ws_.knows_bounds = loan != 0 && loan == bounds_loan_;
-  ws_.keeps_bounds = loan != 0 && (ws_.knows_bounds || ws_.ids == nullptr);
-  if (ws_.keeps_bounds) ws_.bounds.reserve(size_t(row_count_) / 16 + 1);
-  bounds_loan_ = 0;  // until the step is done
+// Bounds of bound rows are stored from the first step that projects all rows.
+void Rasterizer::select_bounds(uint64_t binding_id) {
+  ws_.has_bounds = binding_id != 0 && binding_id == bounds_binding_id_;
+  ws_.stores_bounds = binding_id != 0 && (ws_.has_bounds || ws_.ids == nullptr);
+  if (ws_.stores_bounds) ws_.bounds.reserve(size_t(row_count_) / 16 + 1);
+  bounds_binding_id_ = 0;  // invalid until the step ends
 }
 
-// The heaviest tile rows come first: then the threads have little to wait for at the end.
-void Rasterizer::order_strips() {
-  strip_order_.clear();
-  for (int y = 0; y < ws_.tiles_y; ++y) strip_order_.emplace_back(keys_of_strip(y), y);
-  std::sort(strip_order_.begin(), strip_order_.end(), std::greater<>());
+// Tile rows with most keys first, so that the threads end at nearly the same time.
+void Rasterizer::order_tile_rows() {
+  tile_row_order_.clear();
+  for (int y = 0; y < ws_.tiles_y; ++y) tile_row_order_.emplace_back(tile_row_keys(y), y);
+  std::sort(tile_row_order_.begin(), tile_row_order_.end(), std::greater<>());
 }
 
-uint32_t Rasterizer::keys_of_strip(int y) const {
+uint32_t Rasterizer::tile_row_keys(int y) const {
   uint32_t keys = 0;
-  for (const ThreadScratch& scratch : ws_.scratch) keys += scratch.strips[size_t(y)].count;
+  for (const ThreadScratch& scratch : ws_.scratch) keys += scratch.tile_rows[size_t(y)].count;
   return keys;
 }
 
-// With SSIM strips are begun side by side instead.
-void Rasterizer::schedule_strips() {
-  strip_weights_.clear();
-  for (int y = 0; y < ws_.tiles_y; ++y) strip_weights_.push_back(keys_of_strip(y));
-  schedule_.start(strip_weights_, team_.size(), StripSchedule::tape_places(team_.size()));
+// With SSIM each thread starts at adjacent tile rows instead.
+void Rasterizer::schedule_tile_rows() {
+  tile_row_weights_.clear();
+  for (int y = 0; y < ws_.tiles_y; ++y) tile_row_weights_.push_back(tile_row_keys(y));
+  schedule_.start(tile_row_weights_, pool_.size(), TileRowSchedule::replay_slots(pool_.size()));
 }
 
 template <class F>
-void Rasterizer::for_each_strip(F f) {
+void Rasterizer::for_each_tile_row(F f) {
   for (int i; (i = ws_.ticket.fetch_add(1, std::memory_order_relaxed)) < ws_.tiles_y;) {
-    f(strip_order_[size_t(i)].second);
+    f(tile_row_order_[size_t(i)].second);
   }
 }
 
 void Rasterizer::forward(const FrameInput& input, const ImageOutput& output) {
   begin_frame(input);
-  want_blocks(nullptr);
+  select_blocks(nullptr);
   const size_t tiles = size_t(ws_.tiles_x) * size_t(ws_.tiles_y);
   if (ws_.tiles.size() < tiles) ws_.tiles.resize(tiles);
   ws_.image.reserve(5 * size_t(ws_.plane));
   ws_.image_gradient.reserve(5 * size_t(ws_.plane));
-  team_.run([&](int thread) {
+  pool_.run([&](int thread) {
     stages_.project(ws_, thread);
-    team_.barrier([&] {
-      order_strips();
-      mark(&StageTimes::project);
+    pool_.barrier([&] {
+      order_tile_rows();
+      record_stage(&StageTimes::project);
     });
-    for_each_strip([&](int strip) { stages_.draw_strip(ws_, strip, thread); });
-    team_.barrier([&] { mark(&StageTimes::raster); });
-    const Band band(ws_.camera.height, thread, team_.size());
+    for_each_tile_row([&](int tile_row) { stages_.render_tile_row(ws_, tile_row, thread); });
+    pool_.barrier([&] { record_stage(&StageTimes::raster); });
+    const Band band(ws_.camera.height, thread, pool_.size());
     export_image(ws_, output, band.begin, band.end);
   });
 }
 
 void Rasterizer::backward(const ImageGradients& input, float* d_rows, double* d_twist, float* mean_2d_norm) {
-  last_mark_ms_ = now_ms();
+  stage_start_ms_ = now_ms();
   ws_.ticket = 0;
-  ws_.hand_out_segments();
+  ws_.reset_segments();
   next_tag();  // a second backward of the same forward must not add to the first one's rows
   prepare_gradient_rows();
   twist_sums_.reserve(6 * size_t(ws_.segments) + 6);
   std::fill_n(twist_sums_.data(), 6 * size_t(ws_.segments), 0.0);
   norms_by_slot_.reserve(size_t(ws_.count) + 1);
   const GradientOutput output{d_rows, norms_by_slot_.data(), twist_sums_.data()};
-  team_.run([&](int thread) {
-    const Band band(ws_.tiles_y * kTile, thread, team_.size());
+  pool_.run([&](int thread) {
+    const Band band(ws_.tiles_y * kTile, thread, pool_.size());
     import_gradients(ws_, input, band.begin, band.end);
-    team_.barrier();
-    for_each_strip([&](int strip) { stages_.backward_strip(ws_, strip, thread); });
-    team_.barrier([&] { mark(&StageTimes::backward); });
+    pool_.barrier();
+    for_each_tile_row([&](int tile_row) { stages_.backward_tile_row(ws_, tile_row, thread); });
+    pool_.barrier([&] { record_stage(&StageTimes::backward); });
     stages_.gradients(ws_, output, thread);
-    team_.barrier([&] { mark(&StageTimes::update); });
+    pool_.barrier([&] { record_stage(&StageTimes::update); });
   });
   std::fill_n(d_twist, 6, 0.0);
   for (uint32_t s = 0; s < ws_.segments; ++s) {
@@ -193,12 +193,12 @@ Training Rasterizer::begin_training(const TrainingView& view, bool masked, const
       l1_sums_.data(),
       ssim_sums_.data()};
   if (loss.ssim == 0.0f) {
-    want_blocks(training.targets.weighted_blocks);
+    select_blocks(training.targets.weighted_blocks);
   } else {
-    want_blocks(training.targets.reached_blocks);
-    const int tapes = StripSchedule::tape_places(team_.size());
-    const size_t rows = size_t(StripSchedule::square_places(tapes));
-    if (ws_.tapes.size() < size_t(tapes)) ws_.tapes.resize(size_t(tapes));
+    select_blocks(training.targets.reached_blocks);
+    const int replays = TileRowSchedule::replay_slots(pool_.size());
+    const size_t rows = size_t(TileRowSchedule::square_slots(replays));
+    if (ws_.replays.size() < size_t(replays)) ws_.replays.resize(size_t(replays));
     if (ws_.ssim_squares.size() < rows) ws_.ssim_squares.resize(rows);
     for (Buffer<float>& squares : ws_.ssim_squares) squares.reserve(ssim_square(ws_.tiles_x, 0, 0));
   }
@@ -206,30 +206,30 @@ Training Rasterizer::begin_training(const TrainingView& view, bool masked, const
 }
 
 void Rasterizer::train_with_ssim(const Training& training, int thread) {
-  StageTimes spent;
+  StageTimes stage_ms;
   double started_ms = now_ms();
-  for (StripTask task; (task = schedule_.next(thread)).kind != StripTask::kNone;) {
-    const auto tape = [&](int i) { return task.tapes[i] >= 0 ? &ws_.tapes[size_t(task.tapes[i])] : nullptr; };
+  for (TileRowTask task; (task = schedule_.next(thread)).kind != TileRowTask::kNone;) {
+    const auto replay = [&](int i) { return task.replays[i] >= 0 ? &ws_.replays[size_t(task.replays[i])] : nullptr; };
     const auto squares = [&](int i) { return ws_.ssim_squares[size_t(task.squares[i])].data(); };
-    double StageTimes::*stage = &StageTimes::raster;
-    if (task.kind == StripTask::kDraw) {
-      stages_.draw_on_tape(ws_, training, *tape(0), task.index, thread);
-    } else if (task.kind == StripTask::kDerive) {
-      stages_.derive_ssim(ws_, training, {task.index, tape(0), tape(1), squares(0)}, thread);
+    double StageTimes::* stage = &StageTimes::raster;
+    if (task.kind == TileRowTask::kRender) {
+      stages_.render_to_replay(ws_, training, *replay(0), task.index, thread);
+    } else if (task.kind == TileRowTask::kSsim) {
+      stages_.derive_ssim(ws_, training, {task.index, replay(0), replay(1), squares(0)}, thread);
       stage = &StageTimes::loss;
     } else {
-      stages_.walk_back_on_tape(ws_, training, {task.index, *tape(0), squares(0), squares(1)});
+      stages_.backward_from_replay(ws_, training, {task.index, *replay(0), squares(0), squares(1)});
       stage = &StageTimes::backward;
     }
     schedule_.finish(task);
     const double now = now_ms();
-    spent.*stage += now - std::exchange(started_ms, now);
+    stage_ms.*stage += now - std::exchange(started_ms, now);
   }
-  spent.backward += now_ms() - started_ms;  // the wait for the last strips, which others walk back
+  stage_ms.backward += now_ms() - started_ms;  // includes the wait for the last tile rows, which other threads process
   if (thread == 0) {
-    times_.raster = spent.raster;
-    times_.loss = spent.loss;
-    times_.backward = spent.backward;
+    times_.raster = stage_ms.raster;
+    times_.loss = stage_ms.loss;
+    times_.backward = stage_ms.backward;
   }
 }
 
@@ -237,10 +237,11 @@ double Rasterizer::step(const FrameInput& input, const OptimizerState& state, co
                         const LossWeights& loss, const AdamOptions& adam) {
   const double started_ms = now_ms();
   begin_frame(input);
-  use_bounds(state.loan);
+  select_bounds(state.binding_id);
   const Training training = begin_training(view, masked, loss);
   const bool with_ssim = loss.ssim != 0.0f;
-  Update update{state.rows, state.first_moment, state.second_moment, state.trainable, state.trained, state.counted, {}};
+  Update update{
+      state.rows, state.first_moment, state.second_moment, state.trainable, state.update_counts, state.count_mask, {}};
   std::copy_n(adam.rates, 16, update.adam.rates);
   update.adam.beta1 = float(adam.beta1);
   update.adam.beta2 = float(adam.beta2);
@@ -248,17 +249,17 @@ double Rasterizer::step(const FrameInput& input, const OptimizerState& state, co
   update.adam.corrections = corrections_.table(adam.beta1, adam.beta2, adam.decay_after_updates);
   update.adam.correction_count = AdamCorrections::kCount;
 
-  team_.run([&](int thread) {
+  pool_.run([&](int thread) {
     stages_.project(ws_, thread);
-    team_.barrier([&] {
+    pool_.barrier([&] {
       prepare_gradient_rows();
       if (with_ssim) {
-        schedule_strips();
+        schedule_tile_rows();
       } else {
-        order_strips();
+        order_tile_rows();
       }
-      ws_.hand_out_segments();
-      mark(&StageTimes::project);
+      ws_.reset_segments();
+      record_stage(&StageTimes::project);
     });
     if (with_ssim) {
       try {
@@ -268,20 +269,20 @@ double Rasterizer::step(const FrameInput& input, const OptimizerState& state, co
         throw;
       }
     } else {
-      for_each_strip([&](int strip) { stages_.train_strip(ws_, training, strip, thread); });
+      for_each_tile_row([&](int tile_row) { stages_.train_tile_row(ws_, training, tile_row, thread); });
     }
-    team_.barrier([&] {
+    pool_.barrier([&] {
       if (with_ssim) {
-        last_mark_ms_ = now_ms();
+        stage_start_ms_ = now_ms();
       } else {
-        mark(&StageTimes::raster);
+        record_stage(&StageTimes::raster);
       }
     });
     stages_.update(ws_, update, thread);
-    team_.barrier([&] { mark(&StageTimes::update); });
+    pool_.barrier([&] { record_stage(&StageTimes::update); });
   });
 
-  if (ws_.keeps_bounds) bounds_loan_ = state.loan;
+  if (ws_.stores_bounds) bounds_binding_id_ = state.binding_id;
   double total = with_ssim && view.weight_sum(masked) > 0.0 ? double(loss.ssim) : 0.0;
   if (loss.normalise_by_image) total *= view.share(masked);
   for (int t = 0; t < ws_.tiles_x * ws_.tiles_y; ++t) total += l1_sums_[size_t(t)];

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// The order of the stages: forward, backward, and the whole training step in one call.
+// Runs the stages in order: forward, backward, and a whole training step in one call.
 #pragma once
 
 #include <utility>
@@ -8,13 +8,13 @@
 #include "adam_corrections.h"
 #include "image_exchange.h"
 #include "stages.h"
-#include "strip_schedule.h"
-#include "team.h"
+#include "thread_pool.h"
+#include "tile_row_schedule.h"
 #include "training_view.h"
 
 namespace gausslite {
 
-// A frame to draw. Nothing is owned.
+// A frame to render. It owns none of its arrays.
 struct FrameInput {
   const float* rows;
   uint32_t row_count;
@@ -26,7 +26,7 @@ struct FrameInput {
 
 struct LossWeights {
   float colour, depth, ssim;
-  bool normalise_by_image;  // the loss times the view's share: a pixel of weight 1 then counts the same in every step
+  bool normalise_by_image;  // multiplies the loss by the mean weight of the view
 };
 
 struct OptimizerState {
@@ -34,9 +34,10 @@ struct OptimizerState {
   float* first_moment;
   float* second_moment;
   const uint8_t* trainable;  // null: all
-  uint32_t* trained;         // as in Update
-  const uint8_t* counted;
-  uint64_t loan;  // numbers a time in which these rows change by steps alone; 0: others may change them in between
+  uint32_t* update_counts;   // as in Update
+  const uint8_t* count_mask;
+  uint64_t
+      binding_id;  // of the table binding; only steps change bound rows. 0: not bound, other code may change the rows
 };
 
 struct AdamOptions {
@@ -44,70 +45,70 @@ struct AdamOptions {
   double beta1, beta2, epsilon, decay_after_updates;
 };
 
-// Milliseconds of the last call's stages, as its first thread saw them. With SSIM strips are drawn, compared and walked
-// back side by side: then raster, loss and backward are the times that it spent on each.
+// Milliseconds of each stage of the last call, measured on thread 0. With SSIM the raster, loss and backward tasks of
+// different tile rows alternate; their times are sums over the thread's tasks.
 struct StageTimes {
   double project = 0.0, raster = 0.0, loss = 0.0, backward = 0.0, update = 0.0;
 };
 
-// One call at a time: whoever owns it sees to that. A call that throws (memory that cannot be had) leaves it usable.
+// The owner makes one call at a time. The object stays usable after a call that throws (std::bad_alloc).
 class Rasterizer {
  public:
   Rasterizer(const Stages& stages, int threads);
 
-  int threads() const { return team_.size(); }
+  int threads() const { return pool_.size(); }
   const StageTimes& times() const { return times_; }
-  // What all steps took so far, and those masked to a region.
+  // Total time of all steps, and of the masked ones.
   double steps_ms() const { return steps_ms_; }
   double masked_steps_ms() const { return masked_steps_ms_; }
-  // How often the last frame composited a splat on a 4x4 block of pixels.
+  // Number of pairs of a splat and a 4x4 pixel block that the last frame composited.
   uint64_t block_evaluations() const;
-  // True when the last frame had this many rows and pixels.
+  // True if the last frame had this many rows and pixels.
   bool matches(size_t rows, size_t width, size_t height) const {
     return rows == row_count_ && width == size_t(ws_.camera.width) && height == size_t(ws_.camera.height);
   }
-  // Rises with every forward and step: a rendering of an earlier frame cannot be walked back.
+  // Increases with each forward and step; backward needs the latest frame.
   uint64_t frame() const { return frame_; }
 
   void forward(const FrameInput& input, const ImageOutput& output);
-  // Of the last forward. d_rows must be zero; mean_2d_norm has room for visible_count().
+  // Gradients of the last forward. d_rows must be zero; mean_2d_norm has visible_count() elements.
   void backward(const ImageGradients& input, float* d_rows, double* d_twist, float* mean_2d_norm);
   double step(const FrameInput& input, const OptimizerState& state, const TrainingView& view, bool masked,
               const LossWeights& loss, const AdamOptions& adam);
 
-  // The rows that the last call found visible, ascending.
+  // The visible rows of the last call, ascending.
   uint32_t visible_count() const;
   void copy_visible(uint32_t* ids) const;
 
  private:
   void begin_frame(const FrameInput& input);
-  void want_blocks(const uint16_t* blocks);
+  void select_blocks(const uint16_t* blocks);
   Training begin_training(const TrainingView& view, bool masked, const LossWeights& loss);
   void train_with_ssim(const Training& training, int thread);
   void next_tag();
-  void use_bounds(uint64_t loan);
-  void order_strips();
-  void schedule_strips();
-  uint32_t keys_of_strip(int y) const;
+  void select_bounds(uint64_t binding_id);
+  void order_tile_rows();
+  void schedule_tile_rows();
+  uint32_t tile_row_keys(int y) const;
   void prepare_gradient_rows();
-  void mark(double StageTimes::*stage);
+  void record_stage(double StageTimes::* stage);
   template <class F>
-  void for_each_strip(F f);
+  void for_each_tile_row(F f);
 
   const Stages& stages_;
-  Team team_;
+  ThreadPool pool_;
   Workspace ws_;
   uint64_t frame_ = 0;
   uint32_t row_count_ = 0;
-  StripSchedule schedule_;
-  std::vector<std::pair<uint32_t, int>> strip_order_;  // keys and tile row, most keys first
-  std::vector<uint32_t> strip_weights_;
-  uint64_t bounds_loan_ = 0;  // the loan in which the bounds are true
+  TileRowSchedule schedule_;
+  std::vector<std::pair<uint32_t, int>> tile_row_order_;  // keys and tile row, most keys first
+  std::vector<uint32_t> tile_row_weights_;
+  uint64_t bounds_binding_id_ = 0;  // the binding for which the bounds are valid
   Buffer<double> l1_sums_, ssim_sums_, twist_sums_;
   Buffer<float> norms_by_slot_;
   AdamCorrections corrections_;
   StageTimes times_;
-  double last_mark_ms_ = 0.0;
+  double stage_start_ms_ = 0.0;
   double steps_ms_ = 0.0, masked_steps_ms_ = 0.0;
 };
 

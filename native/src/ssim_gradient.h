@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// The last blur of the SSIM loss, down the image, for one tile: from the squares that loss_ssim.cpp left to the
-// gradient by the image's colours.
+// The last blur of the SSIM loss, down the image, for one tile: from the squares of loss_ssim.cpp to the gradient by
+// the image colours.
 #pragma once
 
 #include "ssim_window.h"
@@ -14,7 +14,7 @@ struct TileColours {
   alignas(64) float value[3][kSquare];
 };
 
-// Windows reach beyond the image's edge, where there is no image and nothing to change.
+// Sets the gradient beyond the edge of the image, which windows also reach, to zero.
 GAUSSLITE_INLINE void clear_beyond_edge(const Camera& camera, int tile_x, int tile_y, float* colours) {
   const int columns = camera.width - tile_x * kTile, rows = camera.height - tile_y * kTile;
   if (columns >= kTile && rows >= kTile) return;
@@ -23,8 +23,8 @@ GAUSSLITE_INLINE void clear_beyond_edge(const Camera& camera, int tile_x, int ti
   }
 }
 
-// The tile's part of a channel: `image` and `target` are its pixels, `upper` and `lower` the three maps of the squares
-// that it lies between.
+// The gradient of one channel of a tile: `image` and `target` are its pixels, `upper` and `lower` the three maps of the
+// squares that it overlaps.
 GAUSSLITE_INLINE void ssim_gradient(const float* image, const TargetTile& target, int channel, const float* upper,
                                     const float* lower, float* out) {
   const auto blurred = [&](int map, auto set) {
@@ -40,20 +40,20 @@ GAUSSLITE_INLINE void ssim_gradient(const float* image, const TargetTile& target
   });
 }
 
-// Returns false, and nothing in `out`, where no window around a weight reaches the tile.
-GAUSSLITE_INLINE bool ssim_gradient(const Workspace& ws, const Targets& targets, const TapedStrip& taped, int x,
+// Returns false, without output, if no window with a weight reaches the tile.
+GAUSSLITE_INLINE bool ssim_gradient(const Workspace& ws, const Targets& targets, const ReplayedTileRow& replayed, int x,
                                     TileColours& out) {
-  const size_t tile = size_t(taped.strip) * size_t(ws.tiles_x) + size_t(x);
+  const size_t tile = size_t(replayed.tile_row) * size_t(ws.tiles_x) + size_t(x);
   const bool above = targets.reach[tile] != kUnreached;
   const bool below = targets.reach[tile + size_t(ws.tiles_x)] != kUnreached;
   if (!above && !below) return false;
   for (int channel = 0; channel < 3; ++channel) {
     const size_t at = ssim_square(x, channel, 0);
-    ssim_gradient(taped.tape.image.data() + image_tile(x) + size_t(channel) * kSquare, targets.tiles[tile], channel,
-                  above ? taped.upper_squares + at : kNoSquares, below ? taped.lower_squares + at : kNoSquares,
-                  out.value[channel]);
+    ssim_gradient(replayed.replay.image.data() + image_tile(x) + size_t(channel) * kSquare, targets.tiles[tile],
+                  channel, above ? replayed.upper_squares + at : kZeroSquares,
+                  below ? replayed.lower_squares + at : kZeroSquares, out.value[channel]);
   }
-  clear_beyond_edge(ws.camera, x, taped.strip, out.value[0]);
+  clear_beyond_edge(ws.camera, x, replayed.tile_row, out.value[0]);
   return true;
 }
 

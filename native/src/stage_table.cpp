@@ -1,12 +1,13 @@
 // SPDX-License-Identifier: Apache-2.0
-// The stages of the instruction set being compiled, for the dispatcher.
+// The stage table of this instruction set, for dispatch.cpp.
 #include "stage_functions.h"
 
 namespace gausslite::GAUSSLITE_ISA {
 
 const Stages& stages() {
-  static constexpr Stages kStages{project,           draw_strip,     train_strip, draw_on_tape, derive_ssim,
-                                  walk_back_on_tape, backward_strip, update,      gradients};
+  static constexpr Stages kStages{project,           render_tile_row, train_tile_row,
+                                  render_to_replay,  derive_ssim,     backward_from_replay,
+                                  backward_tile_row, update,          gradients};
   return kStages;
 }
 

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// The stages of an iteration, as one table of functions per instruction set. Each stage is called by every thread of
-// the team with its own number; the barriers between stages are the caller's.
+// The stages of an iteration, as one table of functions per instruction set. All threads of the pool call each stage
+// with their number; the caller entries the barriers.
 #pragma once
 
 #include <cstddef>
@@ -17,30 +17,30 @@ struct AdamSettings {
   int correction_count;
 };
 
-// What the weights make of a square of the SSIM loss: without a weight in it or beside it, nothing is blurred there.
+// Whether a square of the SSIM loss has a weight, has one in reach of its windows, or neither.
 enum Reach : uint8_t { kUnreached, kReached, kWeighted };
 
-// A tile of a training image, sixteen rows of sixteen pixels of each.
+// A tile of a training image: sixteen rows of sixteen pixels per channel.
 struct alignas(64) TargetTile {
   uint8_t rgb[3][kSquare];
-  float depth_m[kSquare];  // 0: not measured
+  float depth_m[kSquare];  // 0: no measurement
 };
 
 // The targets of one training image, by tiles.
 struct Targets {
   const TargetTile* tiles;
-  const float* weights;  // [place][16][16]; 0 outside the image
-  const uint32_t* weight_places;
-  const uint16_t* weighted_blocks;  // the blocks that have a pixel with a weight
-  const uint16_t* reached_blocks;   // ... and those that have one in an SSIM window around it
-  const uint8_t* reach;             // [row][square] for rows k = 0 ... tile rows of the squares of loss_ssim.cpp
+  const float* weights;  // [weight_entries[tile]][16][16]; 0 outside the image
+  const uint32_t* weight_entries;
+  const uint16_t* weighted_blocks;  // blocks with a weighted pixel
+  const uint16_t* reached_blocks;   // blocks with a weighted pixel in reach of an SSIM window
+  const uint8_t* reach;             // Reach [k][x] of the squares of loss_ssim.cpp, k = 0 ... tile rows
 
-  // Tiles that weigh the same everywhere, all 0 or all 1, share theirs.
-  const float* tile_weights(size_t tile) const { return weights + size_t(weight_places[tile]) * kSquare; }
+  // All tiles of weight 0 share one array, as do all tiles of weight 1.
+  const float* tile_weights(size_t tile) const { return weights + size_t(weight_entries[tile]) * kSquare; }
 };
 
 struct LossSettings {
-  float colour, depth, ssim;  // per pixel and channel: already divided by the sum of the weights
+  float colour, depth, ssim;  // per pixel and channel, divided by the sum of the weights
 };
 
 struct Training {
@@ -54,9 +54,9 @@ struct Update {
   float* rows;
   float* first_moment;
   float* second_moment;
-  const uint8_t* trainable;  // null: all
-  uint32_t* trained;         // rises by one for each row that moves and is counted; null: nobody counts
-  const uint8_t* counted;    // null: all
+  const uint8_t* trainable;   // null: all
+  uint32_t* update_counts;    // incremented for each changed row that count_mask selects; null: no counts
+  const uint8_t* count_mask;  // null: all
   AdamSettings adam;
 };
 
@@ -66,42 +66,42 @@ struct GradientOutput {
   double* d_twist;      // [segments][6], zeroed by the caller
 };
 
-// What a row of SSIM squares is formed from, and where its derivatives go.
+// Input and output of the SSIM stage for one row of squares.
 struct SquareRow {
   int k;
-  const StripTape *above, *below;  // of the tile rows k - 1 and k; null beyond the image
+  const TileRowReplay *above, *below;  // of the tile rows k - 1 and k; null beyond the image
   float* squares;
 };
 
-// A strip that can be walked back: its tape, and the rows of squares that its gradient comes from.
-struct TapedStrip {
-  int strip;
-  const StripTape& tape;
+// A rendered tile row: its replay buffer, and the rows of squares of its SSIM gradient.
+struct ReplayedTileRow {
+  int tile_row;
+  const TileRowReplay& replay;
   const float *upper_squares, *lower_squares;
 };
 
 struct Stages {
-  // Projects the segments that are left to do, packs the visible splats and hands their depth keys to the tile rows
-  // that they touch.
+  // Projects the segments, packs the visible splats and adds their depth keys to the tile rows that they touch.
   void (*project)(Workspace&, int thread);
-  // Sorts, bins and draws a tile row into Workspace::image.
-  void (*draw_strip)(Workspace&, int strip, int thread);
-  // Sorts, bins, draws, compares with L1 and walks back, tile by tile while everything is in cache.
-  void (*train_strip)(Workspace&, const Training&, int strip, int thread);
-  // The same with SSIM, which looks beyond the tile, in three parts. Draws a strip and keeps its tape.
-  void (*draw_on_tape)(Workspace&, const Training&, StripTape&, int strip, int thread);
-  // SSIM in row k of the squares, once tile rows k - 1 and k are drawn.
+  // Sorts, bins and renders a tile row into Workspace::image.
+  void (*render_tile_row)(Workspace&, int tile_row, int thread);
+  // Sorts, bins, renders, compares by L1 and runs the backward pass, tile by tile, with all data in cache.
+  void (*train_tile_row)(Workspace&, const Training&, int tile_row, int thread);
+  // With SSIM, which needs the pixels around a tile, training has three parts. This one renders a tile row into its
+  // replay buffer.
+  void (*render_to_replay)(Workspace&, const Training&, TileRowReplay&, int tile_row, int thread);
+  // Computes SSIM and its derivatives in row k of the squares, from the rendered tile rows k - 1 and k.
   void (*derive_ssim)(Workspace&, const Training&, const SquareRow&, int thread);
-  // Compares a strip and walks it back, once rows `strip` and `strip` + 1 of the squares are derived.
-  void (*walk_back_on_tape)(Workspace&, const Training&, const TapedStrip&);
-  // From image_gradient to gradient rows, for the tile row that draw_strip has drawn.
-  void (*backward_strip)(Workspace&, int strip, int thread);
-  // From gradient rows to parameters, a thread's own segments first.
+  // Compares a rendered tile row and runs its backward pass; needs rows `tile_row` and `tile_row` + 1 of the squares.
+  void (*backward_from_replay)(Workspace&, const Training&, const ReplayedTileRow&);
+  // Backward pass from image_gradient to gradient rows, for a tile row that render_tile_row rendered.
+  void (*backward_tile_row)(Workspace&, int tile_row, int thread);
+  // Adam step from gradient rows, a thread's own segments first.
   void (*update)(Workspace&, const Update&, int thread);
   void (*gradients)(Workspace&, const GradientOutput&, int thread);
 };
 
-// The forms; dispatch.cpp refers to those that this build has.
+// The SIMD variants; dispatch.cpp uses those of this build.
 namespace portable {
 const Stages& stages();
 }

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// From the bytes of a training image to colours, sixteen pixels at a time.
+// Converts bytes of a training image to colours in [0, 1], sixteen pixels at a time.
 #pragma once
 
 #include "simd/pack.h"
@@ -7,9 +7,9 @@
 
 namespace gausslite::GAUSSLITE_ISA {
 
-inline constexpr TargetTile kNoTarget{};
+inline constexpr TargetTile kBlackTarget{};
 
-// A byte over 255, rounded as the division rounds it (all 256 were tried): 1 / 255 in two parts.
+// Bytes / 255, correctly rounded for all 256 values: 1 / 255 in two parts.
 GAUSSLITE_INLINE Pack16 colours_of(Pack16 bytes) {
   constexpr float kHigh = float(1.0 / 255.0), kLow = float(1.0 / 255.0 - double(kHigh));
   return fma(bytes, Pack16(kHigh), bytes * kLow);
@@ -19,7 +19,7 @@ GAUSSLITE_INLINE Pack16 colour_row(const TargetTile& tile, int channel, int row)
   return colours_of(load_bytes(tile.rgb[channel] + row * kTile));
 }
 
-// `corner`: of the 4x4 block in the tile's sixteen rows of sixteen pixels.
+// `corner`: offset of the 4x4 block in the tile's sixteen rows of sixteen pixels.
 GAUSSLITE_INLINE Pack16 colour_block(const TargetTile& tile, int channel, int corner) {
   return colours_of(load_byte_block(tile.rgb[channel] + corner, kTile));
 }

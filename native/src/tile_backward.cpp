@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// Stage 6: pixel gradients to image gradients of the splats, tile by tile along the lists of the forward pass.
+// Stage 6: backward pass from pixel gradients to image gradients of the splats, with the lists of the forward pass.
 #include <algorithm>
 
 #include "block_backward.h"
@@ -39,7 +39,7 @@ void backward_tile(Workspace& ws, const TileList& list, const TilePosition& tile
       const uint32_t entries = std::min<uint32_t>(lists.count[b], left[b]);
       const float* none = nullptr;
       if (entries > 0)
-        walk_back<false>(records, lists.entry[b], int(entries), tile, b, gradients[b], sums, batch, none);
+        backward_block<false>(records, lists.entry[b], int(entries), tile, b, gradients[b], sums, batch, none);
       left[b] -= entries;
       total_left -= entries;
     }
@@ -50,10 +50,10 @@ void backward_tile(Workspace& ws, const TileList& list, const TilePosition& tile
 
 }  // namespace
 
-void backward_strip(Workspace& ws, int strip, int) {
+void backward_tile_row(Workspace& ws, int tile_row, int) {
   for (int x = 0; x < ws.tiles_x; ++x) {
-    const size_t t = size_t(strip) * size_t(ws.tiles_x) + size_t(x);
-    if (ws.wanted_blocks[t] != 0) backward_tile(ws, ws.tiles[t], TilePosition(ws, x, strip));
+    const size_t t = size_t(tile_row) * size_t(ws.tiles_x) + size_t(x);
+    if (ws.needed_blocks[t] != 0) backward_tile(ws, ws.tiles[t], TilePosition(ws, x, tile_row));
   }
 }
 

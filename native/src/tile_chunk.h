@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// A tile's splats in chunks: their records gathered side by side, and their block masks turned into one list per block.
+// Gathers a chunk of a tile's splats, and converts their block masks to one list per block.
 #pragma once
 
 #include <algorithm>
@@ -10,10 +10,10 @@
 
 namespace gausslite::GAUSSLITE_ISA {
 
-// For each byte, which bits are set, in ascending order of the entries that they stand for: bits 0, 2, 4, 6 for entries
-// 0 to 3, the others for entries 4 to 7.
+// For each byte, the entries of its set bits in ascending order: bits 0, 2, 4, 6 are entries 0 to 3, the others entries
+// 4 to 7.
 struct SetBits {
-  uint64_t numbers[256] = {};  // bytes; on a big-endian machine they would be the other way round
+  uint64_t numbers[256] = {};  // bytes, in little-endian order
   uint8_t count[256] = {};
 
   constexpr SetBits() {
@@ -27,7 +27,7 @@ struct SetBits {
 };
 inline constexpr SetBits kSetBits;
 
-// The masks of eight entries, transposed: byte b of half 0 says which of them touch block b, of half 1 block 8 + b.
+// Transposed masks of eight entries: byte b of half 0 is the mask of entries that touch block b, of half 1 block 8 + b.
 struct BlockBytes {
   uint64_t half[2];
 
@@ -41,7 +41,7 @@ struct BlockBytes {
   }
 
  private:
-  // Eight rows of eight bits, by exchanging the off-diagonal quarters of ever larger squares.
+  // 8x8 bit transposes: exchange the off-diagonal quarters of squares of increasing size.
   GAUSSLITE_INLINE static uint64_t transposed(uint64_t rows) {
     uint64_t swap = (rows ^ rows >> 7) & 0x00AA00AA00AA00AAu;
     rows ^= swap ^ swap << 7;
@@ -52,9 +52,9 @@ struct BlockBytes {
   }
 };
 
-// Turns n masks of 16 blocks into 16 lists of entries: a bit-matrix transpose.
+// Converts n masks of 16 blocks to 16 lists of entries: a bit-matrix transpose.
 #if defined(GAUSSLITE_USE_AVX512)
-// 32 entries at a time: vptestmw picks one block's bits, vpcompressb writes the numbers of the entries that have them.
+// 32 entries at a time: vptestmw selects one block's bits, vpcompressb writes the numbers of those entries.
 GAUSSLITE_INLINE void list_blocks(const uint16_t* blocks, int n, BlockLists& lists) {
   alignas(32) static constexpr uint8_t kNumbers[32] = {0,  1,  2,  3,  4,  5,  6,  7,  8,  9,  10, 11, 12, 13, 14, 15,
                                                        16, 17, 18, 19, 20, 21, 22, 23, 24, 25, 26, 27, 28, 29, 30, 31};
@@ -74,8 +74,8 @@ GAUSSLITE_INLINE void list_blocks(const uint16_t* blocks, int n, BlockLists& lis
   lists.end(count);
 }
 #else
-// Eight entries at a time: their masks become sixteen bytes, one per block, each of which a table turns into numbers.
-// No branch: how many blocks an entry touches is as good as random.
+// Eight entries at a time: their masks become sixteen bytes, one per block, and a table converts each to entry numbers.
+// No branch: the number of blocks of an entry is unpredictable.
 GAUSSLITE_INLINE void list_blocks(const uint16_t* blocks, int n, BlockLists& lists) {
   uint32_t count[kBlocks] = {};
   const auto list = [&](const uint16_t* masks, int i) {
@@ -97,7 +97,7 @@ GAUSSLITE_INLINE void list_blocks(const uint16_t* blocks, int n, BlockLists& lis
 }
 #endif
 
-// Loads entries [first, first + n) of a tile, n at most kChunk, and asks for the next chunk's splats.
+// Loads entries [first, first + n) of a tile, n at most kChunk, and prefetches the next chunk's splats.
 GAUSSLITE_INLINE void load_chunk(const Workspace& ws, const TileList& tile, uint32_t first, int n, Splat* records,
                                  BlockLists& lists) {
   const uint32_t* slots = &tile.slots[first];

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// Stage 4: draw the tiles of a strip, keeping what the backward pass needs to walk the same lists.
+// Stage 4: render the tiles of a tile row; the lists are kept for the backward pass.
 #include <algorithm>
 
 #include "block_forward.h"
@@ -19,7 +19,7 @@ void store_pixels(Workspace& ws, const TilePosition& tile, int b, const BlockSta
   store_block(out + 4 * ws.plane, ws.padded_width, state.transmittance);
 }
 
-void draw_tile(Workspace& ws, TileList& list, const TilePosition& tile) {
+void render_tile(Workspace& ws, TileList& list, const TilePosition& tile) {
   Splat records[kChunk];
   BlockLists lists;
   BlockState state[kBlocks];
@@ -41,17 +41,17 @@ void draw_tile(Workspace& ws, TileList& list, const TilePosition& tile) {
 
 }  // namespace
 
-void draw_strip(Workspace& ws, int strip, int thread) {
+void render_tile_row(Workspace& ws, int tile_row, int thread) {
   int count = 0;
-  const DepthKey* keys = sort_strip(ws, strip, thread, count);
-  bin_strip(ws, strip, keys, count, &ws.tiles[size_t(strip) * size_t(ws.tiles_x)]);
+  const DepthKey* keys = sort_tile_row(ws, tile_row, thread, count);
+  bin_tile_row(ws, tile_row, keys, count, &ws.tiles[size_t(tile_row) * size_t(ws.tiles_x)]);
   for (int x = 0; x < ws.tiles_x; ++x) {
-    const size_t t = size_t(strip) * size_t(ws.tiles_x) + size_t(x);
-    const TilePosition tile(ws, x, strip);
-    if (ws.wanted_blocks[t] == 0) {
+    const size_t t = size_t(tile_row) * size_t(ws.tiles_x) + size_t(x);
+    const TilePosition tile(ws, x, tile_row);
+    if (ws.needed_blocks[t] == 0) {
       for (int b = 0; b < kBlocks; ++b) store_pixels(ws, tile, b, BlockState{});
     } else {
-      draw_tile(ws, ws.tiles[t], tile);
+      render_tile(ws, ws.tiles[t], tile);
       for (const uint32_t used : ws.tiles[t].used) ws.scratch[size_t(thread)].block_evaluations += used;
     }
   }

@@ -9,8 +9,8 @@ namespace gausslite {
 
 namespace {
 
-constexpr int kReachInBlocks = 2;          // an SSIM window reaches 5 px: from a block into the second one beside it
-constexpr uint32_t kZeros = 0, kOnes = 1;  // shared places
+constexpr int kReachInBlocks = 2;          // an SSIM window reaches 5 px: up to the second block next to its own
+constexpr uint32_t kZeros = 0, kOnes = 1;  // shared entries of Weights::values
 
 uint16_t block_bit(int x, int y) { return uint16_t(1u << (y % kBlocksAcross * kBlocksAcross + x % kBlocksAcross)); }
 
@@ -22,8 +22,9 @@ uint16_t blocks_with_weight(const float* tile) {
   return blocks;
 }
 
-// A tile's blocks in the middle of 8x8, and all within reach of them: bit 8 row + column.
-uint64_t surroundings(uint16_t blocks) {
+// Returns an 8x8 grid (bit 8 row + column) with the tile's blocks in its middle, dilated by the reach of the SSIM
+// window.
+uint64_t dilated(uint16_t blocks) {
   uint64_t grid = 0;
   for (int y = 0; y < kBlocksAcross; ++y) {
     grid |= uint64_t(blocks >> (kBlocksAcross * y) & 0xF) << (8 * (y + kReachInBlocks) + kReachInBlocks);
@@ -39,9 +40,9 @@ int tiles(int pixels) { return (pixels + kTile - 1) / kTile; }
 TrainingView::TrainingView(int width, int height, const uint8_t* rgb, const float* depth_m, const float* weight)
     : width_(width), height_(height), tiles_x_(tiles(width)), tiles_y_(tiles(height)), masked_(weight != nullptr) {
   tiles_.reserve_exactly(tile_count());
-  for (size_t t = 0; t < tile_count(); ++t) cut(t, rgb, depth_m);
-  weigh(inside_, nullptr);
-  if (masked_) weigh(mask_, weight);
+  for (size_t t = 0; t < tile_count(); ++t) copy_tile(t, rgb, depth_m);
+  assign_weights(inside_, nullptr);
+  if (masked_) assign_weights(mask_, weight);
 }
 
 TrainingView::Extent TrainingView::extent(size_t tile) const {
@@ -49,7 +50,7 @@ TrainingView::Extent TrainingView::extent(size_t tile) const {
   return {x, y, std::min(kTile, width_ - x), std::min(kTile, height_ - y)};
 }
 
-void TrainingView::cut(size_t tile, const uint8_t* rgb, const float* depth_m) {
+void TrainingView::copy_tile(size_t tile, const uint8_t* rgb, const float* depth_m) {
   const Extent part = extent(tile);
   TargetTile& out = tiles_[tile];
   for (int y = 0; y < part.rows; ++y) {
@@ -58,15 +59,15 @@ void TrainingView::cut(size_t tile, const uint8_t* rgb, const float* depth_m) {
       for (int x = 0; x < part.columns; ++x) out.rgb[k][y * kTile + x] = rgb[3 * (from + x) + k];
     }
     for (int x = 0; x < part.columns; ++x) {
-      // Whatever a sensor writes for "no return", a depth that is not a positive number is not compared.
+      // Depths that are not positive and finite mean "no return" and are not compared.
       const float depth = depth_m[from + x];
       out.depth_m[y * kTile + x] = std::isfinite(depth) && depth > 0.0f ? depth : 0.0f;
     }
   }
 }
 
-void TrainingView::weigh(Weights& weights, const float* weight) const {
-  weights.places.reserve_exactly(tile_count());
+void TrainingView::assign_weights(Weights& weights, const float* weight) const {
+  weights.entries.reserve_exactly(tile_count());
   weights.weighted_blocks.reserve_exactly(tile_count());
   weights.values.reserve(2 * kSquare);
   std::fill_n(&weights.values[kOnes * kSquare], kSquare, 1.0f);
@@ -87,7 +88,7 @@ void TrainingView::weigh(Weights& weights, const float* weight) const {
       zeros &= w == 0.0f;
       ones &= w == 1.0f;
     }
-    weights.places[t] = zeros ? kZeros : ones ? kOnes : used;
+    weights.entries[t] = zeros ? kZeros : ones ? kOnes : used;
     weights.weighted_blocks[t] = zeros ? uint16_t(0) : ones ? uint16_t(0xFFFF) : blocks_with_weight(own);
     weights.sum += zeros ? 0.0 : ones ? double(kSquare) : std::accumulate(own, own + kSquare, 0.0);
     if (zeros || ones) continue;
@@ -98,7 +99,7 @@ void TrainingView::weigh(Weights& weights, const float* weight) const {
   reach_squares(weights);
 }
 
-// From the blocks with a weight to those that its windows reach.
+// Marks all blocks in reach of a block with a weight.
 void TrainingView::reach_blocks(Weights& weights) const {
   weights.reached_blocks.reserve_exactly(tile_count());
   const int blocks_x = (width_ + kBlock - 1) / kBlock, blocks_y = (height_ + kBlock - 1) / kBlock;
@@ -106,7 +107,7 @@ void TrainingView::reach_blocks(Weights& weights) const {
     if (weights.weighted_blocks[t] == 0) continue;
     const Extent part = extent(t);
     const int first_x = part.x / kBlock - kReachInBlocks, first_y = part.y / kBlock - kReachInBlocks;
-    for (uint64_t left = surroundings(weights.weighted_blocks[t]); left != 0; left &= left - 1) {
+    for (uint64_t left = dilated(weights.weighted_blocks[t]); left != 0; left &= left - 1) {
       const int bit = __builtin_ctzll(left), x = first_x + bit % 8, y = first_y + bit / 8;
       if (x >= 0 && x < blocks_x && y >= 0 && y < blocks_y)
         weights.reached_blocks[tile_of(x * kBlock, y * kBlock)] |= block_bit(x, y);
@@ -114,7 +115,7 @@ void TrainingView::reach_blocks(Weights& weights) const {
   }
 }
 
-// The squares of the SSIM loss lie half a tile higher than the tiles.
+// Marks the squares of the SSIM loss, which lie half a tile higher than the tiles.
 void TrainingView::reach_squares(Weights& weights) const {
   constexpr uint16_t kUpperHalf = 0x00FF, kLowerHalf = 0xFF00;
   weights.reach.reserve_exactly(square_count());
@@ -133,7 +134,7 @@ void TrainingView::reach_squares(Weights& weights) const {
 
 Targets TrainingView::targets(bool masked) const {
   const Weights& w = weights(masked);
-  return {tiles_.data(),           w.values.data(), w.places.data(), w.weighted_blocks.data(),
+  return {tiles_.data(),           w.values.data(), w.entries.data(), w.weighted_blocks.data(),
           w.reached_blocks.data(), w.reach.data()};
 }
 

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// A training image, prepared once: cut into tiles, padded to whole ones, and where its weights are. A mapper draws one
-// of many, so that it comes from memory each time: it is kept in as few bytes as say the same.
+// A training image, prepared once: in tiles, padded to whole tiles, with weights per tile. A mapper draws one of many
+// views at random, so that it comes from memory in each step: the format is compact.
 #pragma once
 
 #include <cstdint>
@@ -19,26 +19,26 @@ class TrainingView {
   int height() const { return height_; }
   Targets targets(bool masked) const;
   double weight_sum(bool masked) const { return weights(masked).sum; }
-  // The mean weight: how much of the image counts.
+  // Mean weight of the image.
   double share(bool masked) const { return weights(masked).sum / inside_.sum; }
 
  private:
-  // One way of weighing the pixels, and where its weights are. Tiles of zeros and of ones share one place each.
+  // Weights of the pixels. All tiles of zeros share one entry, as do all tiles of ones.
   struct Weights {
     double sum = 0.0;
     Buffer<float> values;
-    Buffer<uint32_t> places;
+    Buffer<uint32_t> entries;
     Buffer<uint16_t> weighted_blocks, reached_blocks;
     Buffer<uint8_t> reach;
   };
-  // The part of a tile that lies inside the image.
+  // The part of a tile inside the image.
   struct Extent {
     int x, y, columns, rows;
   };
   Extent extent(size_t tile) const;
-  void cut(size_t tile, const uint8_t* rgb, const float* depth_m);
+  void copy_tile(size_t tile, const uint8_t* rgb, const float* depth_m);
   // weight: height x width, or null for 1 everywhere.
-  void weigh(Weights& weights, const float* weight) const;
+  void assign_weights(Weights& weights, const float* weight) const;
   void reach_blocks(Weights& weights) const;
   void reach_squares(Weights& weights) const;
   size_t tile_count() const { return size_t(tiles_y_) * size_t(tiles_x_); }

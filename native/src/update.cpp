@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// Stage 7: image gradients to parameters, for the visible splats, a segment at a time: either written out as
-// gradients, or fed to Adam on the spot, while the three rows of a splat (parameters and two moments) are in cache.
+// Stage 7: from image gradients to parameters, for the visible splats of a segment. Gradients are either written out or
+// applied by Adam at once, while the three rows of a splat (parameters and two moments) are in cache.
 #include <algorithm>
 #include <cstring>
 #include <limits>
@@ -24,7 +24,7 @@ struct Group {
       const Visible& splat = ws.visible[slot + uint32_t(std::min(j, n - 1))];
       id[j] = splat.id;
       row[j] = load(ws.rows + size_t(kRowWidth) * splat.id);
-      // One or two are the rule. Both are read always, and only then counted or not: no branch to mispredict.
+      // Most splats have one or two gradient rows. Both are always read, and masked: no branch to mispredict.
       const uint32_t rows = j < n ? splat.gradient_rows : 0;
       image[j] = gradient(ws, splat.gradient_row, rows > 0) + gradient(ws, splat.gradient_row + 1, rows > 1);
       for (uint32_t r = 2; r < rows; ++r) image[j] = image[j] + gradient(ws, splat.gradient_row + r, true);
@@ -34,7 +34,7 @@ struct Group {
   }
 
  private:
-  // A gradient row, or zeros if this pass has not written it.
+  // A gradient row, or zeros if this pass did not write it.
   GAUSSLITE_INLINE static Pack16 gradient(const Workspace& ws, uint32_t index, bool counts) {
     const float* row = ws.gradient_rows.data() + size_t(kRowWidth) * index;
     uint32_t tag;
@@ -43,21 +43,21 @@ struct Group {
   }
 };
 
-// Where a group begins, and where its segment ends.
+// First slot of a group, and end of its segment.
 struct Slots {
   uint32_t first, end;
 
-  // The one that lane j's follower is in; the last one again where there is none.
+  // Slot of lane j in the next group; the last slot if there is none.
   GAUSSLITE_INLINE uint32_t next(int j) const { return std::min(first + 16 + uint32_t(j), end - 1); }
 };
 
-// Calls f(segment, group, slots) for the visible splats of the segments that are left to do, sixteen at a time, after
-// ask_for(splat) for each of the first sixteen of a segment; f does that for those that follow it.
-template <class Ask, class F>
-GAUSSLITE_INLINE void for_each_group(Workspace& ws, int thread, Ask ask_for, F f) {
+// Calls f(segment, group, slots) for the visible splats of the segments, sixteen at a time. Calls prefetch_splat(splat)
+// for the first sixteen of a segment; f does that for the following ones.
+template <class Prefetch, class F>
+GAUSSLITE_INLINE void for_each_group(Workspace& ws, int thread, Prefetch prefetch_splat, F f) {
   for (uint32_t s; (s = ws.take_segment(thread)) < ws.segments;) {
     const uint32_t begin = s * kSegment, end = begin + ws.segment_visible[s];
-    for (uint32_t slot = begin; slot < std::min(begin + 16, end); ++slot) ask_for(ws.visible[slot]);
+    for (uint32_t slot = begin; slot < std::min(begin + 16, end); ++slot) prefetch_splat(ws.visible[slot]);
     for (uint32_t slot = begin; slot < end; slot += 16) {
       const Group group(ws, slot, int(std::min(16u, end - slot)));
       f(s, group, Slots{slot, end});
@@ -65,8 +65,8 @@ GAUSSLITE_INLINE void for_each_group(Workspace& ws, int thread, Ask ask_for, F f
   }
 }
 
-// Adam on whole rows. The statistics in columns 14 and 15 of the first moment are plain sums, which is Adam's
-// recurrence with other factors in those lanes; the update count in column 14 of the row moves by one.
+// Adam on whole rows. The statistics in columns 14 and 15 of the first moment are sums: the recurrence of Adam with
+// other factors in those lanes. Column 14 of the row, the update count, increases by one.
 class Adam {
  public:
   GAUSSLITE_INLINE explicit Adam(const Update& job)
@@ -74,11 +74,11 @@ class Adam {
     const AdamSettings& adam = job.adam;
     alignas(64) float factors[5][16];
     for (int k = 0; k < 16; ++k) {
-      const bool trained = k < kTrained;
-      factors[0][k] = trained ? adam.beta1 : 1.0f;
-      factors[1][k] = trained ? 1.0f - adam.beta1 : 1.0f;
-      factors[2][k] = trained ? adam.beta2 : 1.0f;
-      factors[3][k] = trained ? 1.0f - adam.beta2 : 0.0f;
+      const bool update_counts = k < kTrainedColumns;
+      factors[0][k] = update_counts ? adam.beta1 : 1.0f;
+      factors[1][k] = update_counts ? 1.0f - adam.beta1 : 1.0f;
+      factors[2][k] = update_counts ? adam.beta2 : 1.0f;
+      factors[3][k] = update_counts ? 1.0f - adam.beta2 : 0.0f;
       factors[4][k] = k == kUpdates ? 1.0f : 0.0f;
     }
     keep1_ = load(factors[0]);
@@ -96,14 +96,14 @@ class Adam {
     const Pack16 v_new = fma(load(v), keep2_, gradient * gradient * add2_);
     store(m, m_new);
     store(v, v_new);
-    // Fourteen bits are ample for the size of a step. The smallest float keeps 0 / 0 out of untouched columns.
+    // 14 bits suffice for the size of a step. The smallest float avoids 0 / 0 in unused columns.
     const Pack16 square = max(v_new * correction[1], Pack16(std::numeric_limits<float>::min()));
     const Pack16 size = fma(square, rough_inverse_sqrt(square), epsilon_);
     store(row, fnma(rate_ * correction[0], m_new * rough_reciprocal(size), load(row)) + count_);
   }
 
  private:
-  // The count of a row that nobody has set may hold anything.
+  // The count of an uninitialised row may be any value.
   GAUSSLITE_INLINE size_t correction_index(float updates) const {
     const float last = float(job_.adam.correction_count - 1);
     return updates > 0.0f ? size_t(std::min(updates, last)) : 0;
@@ -117,37 +117,37 @@ class Adam {
 
 void update(Workspace& ws, const Update& job, int thread) {
   const Adam adam(job);
-  const auto ask_for = [&](const Visible& splat) {
+  const auto prefetch_splat = [&](const Visible& splat) {
     const size_t at = size_t(kRowWidth) * splat.id;
     prefetch_to_write(job.rows + at);
     prefetch_to_write(job.first_moment + at);
     prefetch_to_write(job.second_moment + at);
   };
-  for_each_group(ws, thread, ask_for, [&](uint32_t, const Group& group, const Slots& slots) {
+  for_each_group(ws, thread, prefetch_splat, [&](uint32_t, const Group& group, const Slots& slots) {
     ParameterGradients g;
     backward16<false>(group.row, group.image, ws.camera, g);
-    drop_unsound(g);
+    zero_invalid(g);
     g.column[kGradSum] = g.mean_2d_norm;
     g.column[kGradCount] = Pack16(1.0f);
     transpose(g.column);
     for (int j = 0; j < group.lanes; ++j) {
       const uint32_t id = group.id[j];
-      // Between the updates, not in one burst: a core waits for some two dozen lines at a time and then for all.
-      ask_for(ws.visible[slots.next(j)]);
+      // Spread the prefetches over the updates: a core has about two dozen outstanding cache lines.
+      prefetch_splat(ws.visible[slots.next(j)]);
       if (job.trainable != nullptr && !job.trainable[id]) continue;
       adam.step(id, g.column[j]);
-      if (ws.keeps_bounds) note_bounds(ws, id, job.rows + size_t(kRowWidth) * id);
-      if (job.trained != nullptr && (job.counted == nullptr || job.counted[id])) ++job.trained[id];
+      if (ws.stores_bounds) store_row_bounds(ws, id, job.rows + size_t(kRowWidth) * id);
+      if (job.update_counts != nullptr && (job.count_mask == nullptr || job.count_mask[id])) ++job.update_counts[id];
     }
   });
 }
 
 void gradients(Workspace& ws, const GradientOutput& job, int thread) {
-  const auto ask_for = [&](const Visible& splat) { prefetch(ws.rows + size_t(kRowWidth) * splat.id); };
-  for_each_group(ws, thread, ask_for, [&](uint32_t segment, const Group& group, const Slots& slots) {
+  const auto prefetch_splat = [&](const Visible& splat) { prefetch(ws.rows + size_t(kRowWidth) * splat.id); };
+  for_each_group(ws, thread, prefetch_splat, [&](uint32_t segment, const Group& group, const Slots& slots) {
     ParameterGradients g;
     backward16<true>(group.row, group.image, ws.camera, g);
-    drop_unsound(g);
+    zero_invalid(g);
     for (int k = 0; k < 6; ++k) {
       job.d_twist[6 * size_t(segment) + size_t(k)] += double(sum(keep(is_finite(g.twist[k]), g.twist[k])));
     }
@@ -155,7 +155,7 @@ void gradients(Workspace& ws, const GradientOutput& job, int thread) {
     store(norms, g.mean_2d_norm);
     transpose(g.column);
     for (int j = 0; j < group.lanes; ++j) {
-      ask_for(ws.visible[slots.next(j)]);
+      prefetch_splat(ws.visible[slots.next(j)]);
       store(job.d_rows + size_t(kRowWidth) * group.id[j], g.column[j]);
       job.mean_2d_norm[slots.first + uint32_t(j)] = norms[j];
     }

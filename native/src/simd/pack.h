@@ -1,8 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
-// Sixteen floats at once: picks the form this translation unit is compiled for and adds the functions all forms share.
+// Sixteen floats at once: includes the SIMD variant of this translation unit and adds the functions that all variants
+// share.
 //
-// The build compiles every stage once per form and defines GAUSSLITE_ISA as the form's name, which is also the
-// namespace its code lives in, so that the forms can sit in one extension module side by side.
+// The build compiles every stage once per variant and defines GAUSSLITE_ISA as its name. This is also the namespace of
+// its code, so that one extension module can contain all variants.
 #pragma once
 
 #ifndef GAUSSLITE_ISA
@@ -26,9 +27,9 @@ namespace gausslite::GAUSSLITE_ISA {
 constexpr float kLog2E = 1.44269504088896f;
 constexpr float kLn2 = 0.69314718055994531f;
 
-// 2^e for e from -126 to 127, to a relative error of 3.6e-6 at most. The sum with a large number rounds e to a whole
-// number of steps and has that number in its lowest bits; a polynomial does what is left, of a degree to suit the
-// steps.
+// 2^e for e from -126 to 127, to a relative error of at most 3.6e-6. The sum with a large number rounds e to a multiple
+// of the step and has that multiple in its lowest bits. A polynomial, of a degree that suits the step, computes the
+// rest.
 GAUSSLITE_INLINE Pack16 exp2_fast(Pack16 e) {
   const Pack16 large(12582912.0f / kPowerSteps), shifted = e + large, f = e - (shifted - large);
   Pack16 p;
@@ -73,19 +74,19 @@ GAUSSLITE_INLINE Pack16 log2(Pack16 x) {
   return fma(p, m, exponent(x));
 }
 
-// True where a number is neither NaN nor infinite: x times 0 is 0 only then.
+// True for numbers that are neither NaN nor infinite: only these give 0 when multiplied by 0.
 GAUSSLITE_INLINE Mask16 is_finite(Pack16 x) { return x * 0.0f == Pack16(0.0f); }
 
 GAUSSLITE_INLINE Mask16 first_lanes(int n) { return mask_of((1u << n) - 1u); }
 
-// The 16x16 transpose: sixteen rows become sixteen columns.
+// 16x16 transpose of sixteen rows.
 GAUSSLITE_INLINE void transpose(Pack16 (&r)[16]) {
   for (int i = 0; i < 16; i += 4) transpose_quads(r[i], r[i + 1], r[i + 2], r[i + 3]);
   for (int i = 0; i < 4; ++i) transpose_groups(r[i], r[i + 4], r[i + 8], r[i + 12]);
 }
 
 GAUSSLITE_INLINE void prefetch(const void* p) { __builtin_prefetch(p, 0, 3); }
-// The same for what will be written: no other core keeps it then, and the store need not wait until it is given up.
+// Prefetch for writing: takes the cache line from other cores before the store.
 GAUSSLITE_INLINE void prefetch_to_write(const void* p) { __builtin_prefetch(p, 1, 3); }
 
 }  // namespace gausslite::GAUSSLITE_ISA

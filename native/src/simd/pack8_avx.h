@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// Eight floats in one AVX register, shared by the AVX2 and the AVX-512 form.
+// Eight floats in one AVX register, for the AVX2 and AVX-512 variants.
 #pragma once
 
 #include <immintrin.h>

@@ -32,7 +32,7 @@ GAUSSLITE_INLINE Mask16 mask_of(uint32_t bits) {
 struct Pack16 {
   __m256 lo, hi;
   Pack16() = default;
-  // Half by half: as a block of 64 bytes the compiler copies it through memory and through general registers.
+  // Copy each half: GCC would copy a 64-byte block through memory and general registers.
   GAUSSLITE_INLINE Pack16(const Pack16& other) : lo(other.lo), hi(other.hi) {}
   GAUSSLITE_INLINE Pack16& operator=(const Pack16& other) {
     lo = other.lo;
@@ -81,14 +81,14 @@ GAUSSLITE_INLINE Pack16 sqrt(Pack16 a) { return {_mm256_sqrt_ps(a.lo), _mm256_sq
 GAUSSLITE_INLINE Pack16 floor(Pack16 a) { return {_mm256_floor_ps(a.lo), _mm256_floor_ps(a.hi)}; }
 GAUSSLITE_INLINE Pack16 ceil(Pack16 a) { return {_mm256_ceil_ps(a.lo), _mm256_ceil_ps(a.hi)}; }
 
-// rcpps and rsqrtps have 12 bits, which one Newton step doubles.
+// rcpps and rsqrtps have 12 bits; one Newton step doubles them.
 GAUSSLITE_INLINE Pack16 reciprocal(Pack16 a) {
   const Pack16 r{_mm256_rcp_ps(a.lo), _mm256_rcp_ps(a.hi)};
   return r * fnma(a, r, Pack16(2.0f));
 }
 GAUSSLITE_INLINE Pack16 rough_reciprocal(Pack16 a) { return reciprocal(a); }
 GAUSSLITE_INLINE Pack16 rough_inverse_sqrt(Pack16 a) {
-  // Not a * 0.5f: half of the smallest float is a number that processors multiply by slowly.
+  // Not a * 0.5f: half of the smallest normal float is subnormal, which is slow to multiply.
   const Pack16 r{_mm256_rsqrt_ps(a.lo), _mm256_rsqrt_ps(a.hi)};
   return r * fnma(a * r, r * 0.5f, Pack16(1.5f));
 }
@@ -124,7 +124,7 @@ GAUSSLITE_INLINE Pack16 scale_by_power(Pack16 a, Pack16 e) {
           _mm256_castsi256_ps(_mm256_add_epi32(_mm256_castps_si256(a.hi), hi))};
 }
 
-// Bits of 2^(k / 8), less what k adds where power_of_steps moves it to the exponent.
+// Bits of 2^(k / 8), minus the part of k that power_of_steps moves to the exponent.
 alignas(32) constexpr uint32_t kPowers[8] = {0x3F800000, 0x3F7B95C2, 0x3F7837F0, 0x3F75FED7,
                                              0x3F7504F3, 0x3F75672A, 0x3F7744FD, 0x3F7AC0C7};
 constexpr int kPowerSteps = 8;

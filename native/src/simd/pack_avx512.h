@@ -1,6 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// Sixteen floats in one AVX-512 register. Every form of Pack16 offers the same functions; pack_portable.h documents
-// them.
+// Sixteen floats in one AVX-512 register. All variants have the same functions; pack_portable.h documents them.
 #pragma once
 
 #include <immintrin.h>
@@ -65,13 +64,13 @@ GAUSSLITE_INLINE Pack16 keep_if(bool yes, Pack16 a) { return _mm512_maskz_mov_ps
 GAUSSLITE_INLINE Pack16 select(Mask16 m, Pack16 yes, Pack16 no) { return _mm512_mask_mov_ps(no.v, m.v, yes.v); }
 GAUSSLITE_INLINE float sum(Pack16 a) { return _mm512_reduce_add_ps(a.v); }
 
-// vreduceps gives e - floor(e) and vscalefps multiplies by 2^floor(e): no integer detour, and no clamping is needed.
+// vreduceps returns e - floor(e), vscalefps multiplies by 2^floor(e): no integer conversion and no clamping.
 GAUSSLITE_INLINE Pack16 fraction(Pack16 e) { return _mm512_reduce_ps(e.v, 0x01); }
 GAUSSLITE_INLINE Pack16 scale_by_power(Pack16 a, Pack16 e) { return _mm512_scalef_ps(a.v, e.v); }
 GAUSSLITE_INLINE Pack16 exponent(Pack16 a) { return _mm512_getexp_ps(a.v); }
 GAUSSLITE_INLINE Pack16 mantissa(Pack16 a) { return _mm512_getmant_ps(a.v, _MM_MANT_NORM_1_2, _MM_MANT_SIGN_zero); }
 
-// Bits of 2^(k / 16), less what k adds where power_of_steps moves it to the exponent.
+// Bits of 2^(k / 16), minus the part of k that power_of_steps moves to the exponent.
 alignas(64) constexpr uint32_t kPowers[16] = {0x3F800000, 0x3F7DAAC3, 0x3F7B95C2, 0x3F79C3D3, 0x3F7837F0, 0x3F76F532,
                                               0x3F75FED7, 0x3F75583F, 0x3F7504F3, 0x3F7508A4, 0x3F75672A, 0x3F76248C,
                                               0x3F7744FD, 0x3F78CCDF, 0x3F7AC0C7, 0x3F7D257D};

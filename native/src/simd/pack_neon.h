@@ -1,6 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// Sixteen floats in four NEON registers (AArch64, where every processor has them). pack_portable.h documents the
-// functions.
+// Sixteen floats in four NEON registers (AArch64). pack_portable.h documents the functions.
 #pragma once
 
 #include <arm_neon.h>
@@ -41,7 +40,7 @@ struct Pack16 {
 GAUSSLITE_MASKWISE(operator&, vandq_u32)
 GAUSSLITE_MASKWISE(operator|, vorrq_u32)
 
-// There is no movemask: the lanes are narrowed to bytes, each keeps its own bit, and the bytes of each half are added.
+// NEON has no movemask: narrow the lanes to bytes, keep one bit of each, and add the bytes of each half.
 GAUSSLITE_INLINE uint32_t bits(Mask16 m) {
   const uint16x8_t lo = vuzp1q_u16(vreinterpretq_u16_u32(m.q[0]), vreinterpretq_u16_u32(m.q[1]));
   const uint16x8_t hi = vuzp1q_u16(vreinterpretq_u16_u32(m.q[2]), vreinterpretq_u16_u32(m.q[3]));
@@ -70,7 +69,7 @@ GAUSSLITE_INLINE void store_int(int32_t* p, Pack16 a) {
   for (int i = 0; i < 4; ++i) vst1q_s32(p + 4 * i, vcvtq_s32_f32(a.q[i]));
 }
 
-// Not vmin and vmax, which let a NaN through: here b comes out, as in the other forms, so that a clamp gives its bound.
+// Not vmin and vmax, which propagate NaN: all variants return b, so that a clamp returns its bound.
 GAUSSLITE_INLINE float32x4_t lesser(float32x4_t a, float32x4_t b) { return vbslq_f32(vcltq_f32(a, b), a, b); }
 GAUSSLITE_INLINE float32x4_t greater(float32x4_t a, float32x4_t b) { return vbslq_f32(vcgtq_f32(a, b), a, b); }
 
@@ -95,7 +94,7 @@ GAUSSLITE_INLINE Pack16 fnma(Pack16 a, Pack16 b, Pack16 c) {
           vfmsq_f32(c.q[3], a.q[3], b.q[3])};
 }
 
-// The estimates have 8 bits; one Newton step brings them to 15 and more, two to nearly all.
+// The estimates have 8 bits; one Newton step gives at least 15, two nearly all.
 GAUSSLITE_INLINE float32x4_t rough_reciprocal_of(float32x4_t a) {
   const float32x4_t r = vrecpeq_f32(a);
   return vmulq_f32(r, vrecpsq_f32(a, r));

@@ -1,7 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// Sixteen floats without any instruction set in mind: four groups of four, written with the compiler's vector types,
-// which become SSE, NEON or scalar code. It is the fallback, the oracle of the other forms, and the place where each
-// function is explained.
+// Sixteen floats for any instruction set: four groups of four in the compiler's vector types, compiled to SSE, NEON or
+// scalar code. It is the fallback, the reference of the other variants, and the documentation of each function.
 #pragma once
 
 #include <cmath>
@@ -24,14 +23,14 @@ GAUSSLITE_INLINE Quad choose(QuadInt mask, Quad yes, Quad no) {
   return (Quad)((mask & (QuadInt)yes) | (~mask & (QuadInt)no));
 }
 GAUSSLITE_INLINE Quad floor_quad(Quad a) {
-  // Beyond 2^23 a float is whole already, and the conversion to an integer would overflow.
+  // Floats beyond 2^23 are integers, and their conversion to int would overflow.
   const QuadInt small = (a < 8388608.0f) & (a > -8388608.0f);
   const QuadInt truncated = __builtin_convertvector(choose(small, a, quad(0.0f)), QuadInt);
   const Quad whole = __builtin_convertvector(truncated, Quad);
   return choose(small, whole - choose(whole > a, quad(1.0f), quad(0.0f)), a);
 }
 
-// Whether a pack is one register, so that there is room for many.
+// Whether a pack is one register; if so, many packs fit the registers.
 constexpr bool kOneRegister = false;
 
 // Sixteen truth values, one per lane.
@@ -104,7 +103,7 @@ GAUSSLITE_INLINE Pack16 operator-(Pack16 a) {
   GAUSSLITE_EACH a.q[i] = -a.q[i];
   return a;
 }
-// a b + c and c - a b, rounded once where the machine can.
+// a b + c and c - a b, with one rounding if the machine has fused operations.
 GAUSSLITE_INLINE Pack16 fma(Pack16 a, Pack16 b, Pack16 c) { return a * b + c; }
 GAUSSLITE_INLINE Pack16 fnma(Pack16 a, Pack16 b, Pack16 c) { return c - a * b; }
 GAUSSLITE_INLINE Pack16 abs(Pack16 a) {
@@ -120,10 +119,10 @@ GAUSSLITE_INLINE Pack16 floor(Pack16 a) {
   return a;
 }
 GAUSSLITE_INLINE Pack16 ceil(Pack16 a) { return -floor(-a); }
-// 1 / a to a relative error of about 2e-7, and below 6.2e-5 (14 bits).
+// 1 / a to a relative error of about 2e-7 (reciprocal) and 6.2e-5, 14 bits (rough_reciprocal).
 GAUSSLITE_INLINE Pack16 reciprocal(Pack16 a) { return Pack16(1.0f) / a; }
 GAUSSLITE_INLINE Pack16 rough_reciprocal(Pack16 a) { return Pack16(1.0f) / a; }
-// 1 / sqrt(a) of positive a, as rough.
+// 1 / sqrt(a) of positive a, to 14 bits.
 GAUSSLITE_INLINE Pack16 rough_inverse_sqrt(Pack16 a) { return Pack16(1.0f) / sqrt(a); }
 
 // Comparisons are false for NaN.
@@ -156,7 +155,7 @@ GAUSSLITE_INLINE Pack16 select(Mask16 m, Pack16 yes, Pack16 no) {
   return yes;
 }
 
-// The pieces of exp2 and log2: e - floor(e), a 2^floor(e), and a = mantissa(a) 2^exponent(a) with mantissa in [1, 2).
+// Parts of exp2 and log2: e - floor(e), a 2^floor(e), and a = mantissa(a) 2^exponent(a) with mantissa in [1, 2).
 GAUSSLITE_INLINE Pack16 fraction(Pack16 e) { return e - floor(e); }
 GAUSSLITE_INLINE Pack16 scale_by_power(Pack16 a, Pack16 e) {
   const Pack16 whole = floor(min(max(e, Pack16(-126.0f)), Pack16(127.0f)));
@@ -172,7 +171,7 @@ GAUSSLITE_INLINE Pack16 mantissa(Pack16 a) {
   return a;
 }
 
-// 2^(k / kPowerSteps), the numbers k being in the lowest bits of the mantissas.
+// 2^(k / kPowerSteps), for the numbers k in the lowest bits of the mantissas.
 constexpr int kPowerSteps = 1;
 GAUSSLITE_INLINE Pack16 power_of_steps(Pack16 shifted) {
   GAUSSLITE_EACH shifted.q[i] = (Quad)(((QuadInt)shifted.q[i] << 23) + 0x3F800000);
@@ -205,7 +204,7 @@ GAUSSLITE_INLINE void transpose_quads(Pack16& a, Pack16& b, Pack16& c, Pack16& d
   }
 }
 
-// The same among whole groups: group i of a, b, c, d in turn make up the i-th result.
+// The same for whole groups: the i-th result consists of group i of a, b, c and d.
 GAUSSLITE_INLINE void transpose_groups(Pack16& a, Pack16& b, Pack16& c, Pack16& d) {
   Pack16* rows[4] = {&a, &b, &c, &d};
   for (int i = 0; i < 4; ++i) {
@@ -223,7 +222,7 @@ GAUSSLITE_INLINE Pack16 load_block(const float* p, int64_t stride) {
   GAUSSLITE_EACH a.q[i] = load_quad(p + i * stride);
   return a;
 }
-// Sixteen bytes as numbers from 0 to 255, side by side or as a block.
+// Sixteen bytes as floats from 0 to 255, contiguous or as a block.
 GAUSSLITE_INLINE Pack16 load_byte_block(const uint8_t* p, int64_t stride) {
   Pack16 a;
   for (int i = 0; i < 16; ++i) a.q[i / 4][i % 4] = float(p[i / 4 * stride + i % 4]);
@@ -274,7 +273,7 @@ GAUSSLITE_INLINE void pair_groups(Pack16 a, Pack16 b, Pack8 (&out)[4]) {
   for (int k = 0; k < 4; ++k) out[k] = {a.q[k], b.q[k]};
 }
 
-// The first and the last eight floats; and of `lo` and `hi` those of `lo` first.
+// The first and the last eight floats, and their concatenation.
 GAUSSLITE_INLINE Pack8 lower(Pack16 a) { return {a.q[0], a.q[1]}; }
 GAUSSLITE_INLINE Pack8 upper(Pack16 a) { return {a.q[2], a.q[3]}; }
 GAUSSLITE_INLINE Pack16 join(Pack8 lo, Pack8 hi) {

@@ -1,4 +1,4 @@
-"""The native extension as Python sees it (native/src/bindings.cpp); use gausslite.render.cpu.CpuRasterizer."""
+"""Type stubs of the native extension (native/src/bindings.cpp); use gausslite.render.cpu.CpuRasterizer."""
 
 from collections.abc import Sequence
 
@@ -6,13 +6,13 @@ from jaxtyping import Bool, Float32, Float64, UInt8, UInt32
 from numpy import ndarray
 
 def usable_simd() -> list[str]:
-    """Instruction sets this build has and this machine runs, fastest first."""
+    """Return the instruction sets of this build that this machine runs, fastest first."""
 
 def core_clock_ghz() -> float:
-    """The clock of this core, by a chain of additions."""
+    """Measure the clock of the current core in GHz."""
 
 class View:
-    """A training image made ready: cut into tiles, and where its weights are."""
+    """A training image in tiles, with its weights."""
 
     def __init__(
         self,
@@ -26,7 +26,7 @@ class View:
     def height(self) -> int: ...
 
 class StepScene:
-    """What a step looks at; it keeps the arrays, not their values."""
+    """View, camera, tiles and ids of a step; references the arrays."""
 
     def __init__(
         self,
@@ -38,7 +38,7 @@ class StepScene:
     ) -> None: ...
 
 class StepTraining:
-    """What a step changes and how; it keeps the arrays, not their values."""
+    """Tables, settings and masks of a step; references the arrays."""
 
     def __init__(
         self,
@@ -48,25 +48,26 @@ class StepTraining:
         adam: tuple[float, float, float, float],
         masked: bool,
         trainable: Bool[ndarray, " n"] | None,
-        trained: UInt32[ndarray, " n"] | None,
-        counted: Bool[ndarray, " n"] | None,
-        loan: int,
+        update_counts: UInt32[ndarray, " n"] | None,
+        count_mask: Bool[ndarray, " n"] | None,
+        binding_id: int,
     ) -> None:
-        """The values of adam are beta1, beta2, epsilon, decay_after_updates. trained rises by one for each row that moved
-        and is counted.
+        """Store the arguments. loss: colour, depth, ssim, normalise_by_image. adam: beta1, beta2, epsilon,
+        decay_after_updates.
 
-        loan: numbers a time in which the rows change by steps of this number alone; 0 where others may change them.
+        update_counts increases by 1 for each changed row that count_mask selects. binding_id: number of the table
+        binding, in which only steps change the rows; 0: not bound.
         """
 
 class Engine:
-    """Scratch memory and a team of threads; it never keeps the splats."""
+    """Scratch memory and a thread pool; it does not own the splats."""
 
     def __init__(self, simd: str, threads: int) -> None: ...
     @property
     def threads(self) -> int: ...
     @property
     def frame(self) -> int:
-        """The number of the latest forward or step."""
+        """Number of the latest forward or step."""
 
     def forward(
         self,
@@ -76,7 +77,7 @@ class Engine:
         tiles: Bool[ndarray, "th tw"] | None,
         ids: UInt32[ndarray, " m"] | None,
     ) -> tuple[Float32[ndarray, "h w 3"], Float32[ndarray, "h w"], Float32[ndarray, "h w"], int]:
-        """rgb, depth_m, alpha and the frame's number; intrinsics are fx, fy, cx, cy, width, height."""
+        """Return rgb, depth_m, alpha and the frame number; intrinsics are fx, fy, cx, cy, width, height."""
 
     def backward(
         self,
@@ -86,25 +87,25 @@ class Engine:
         d_depth_m: Float32[ndarray, "h w"],
         d_alpha: Float32[ndarray, "h w"],
     ) -> tuple[Float32[ndarray, "n 16"], Float64[ndarray, "6"], UInt32[ndarray, " m"], Float32[ndarray, " m"]]:
-        """d_rows, d_twist, visible rows and mean_2d_norm."""
+        """Return d_rows, d_twist, visible rows and mean_2d_norm."""
 
     def step(self, scene: StepScene, training: StepTraining) -> float:
-        """The loss."""
+        """Run one training iteration and return the loss."""
 
     def visible(self) -> UInt32[ndarray, " m"]:
-        """The rows that the last forward or step found visible, ascending."""
+        """Return the visible rows of the last forward or step, ascending."""
 
     @property
     def steps_ms(self) -> float:
-        """Milliseconds that all steps took so far."""
+        """Total milliseconds of all steps."""
 
     @property
     def masked_steps_ms(self) -> float:
-        """... and those masked to a region."""
+        """Total milliseconds of the masked steps."""
 
     def stage_times_ms(self) -> dict[str, float]:
-        """Milliseconds of the last call's stages."""
+        """Return the milliseconds of each stage of the last call."""
 
     @property
     def block_evaluations(self) -> int:
-        """How often the last forward or step composited a splat on a 4x4 block of pixels."""
+        """Number of pairs of a splat and a 4x4 pixel block that the last forward or step composited."""

@@ -1,20 +1,20 @@
 // SPDX-License-Identifier: Apache-2.0
-#include "team.h"
+#include "thread_pool.h"
 
 namespace gausslite {
 
 namespace {
 
-// First plain loads, for some 0.1 ms: longer than the barriers of a balanced stage and than the pause between two calls
-// of a loop. A PAUSE instruction would let a hypervisor take the processor away, which costs far more than the wait
-// (0.2 ms a stage were seen), and yielding at once would hand it to another process for a whole time slice. Then the
-// scheduler may run others: with fewer free cores than members, spinning on would only delay the member that is waited
-// for. After another 0.2 ms or so the thread sleeps.
+// The wait has three phases. First about 0.1 ms of plain loads: longer than the barriers of a balanced stage and the
+// pause between two calls of a loop. A PAUSE instruction would let a hypervisor take the processor away, at a measured
+// cost of 0.2 ms per stage. An early yield would give it to another process for a time slice. Then about 0.2 ms of
+// yields: with fewer free cores than threads, spinning would delay the thread that the others wait for. Then the thread
+// sleeps.
 constexpr int kSpins = 200'000;
 constexpr int kYields = 400;
 
-// Leaves a job in which another member failed.
-struct Left {};
+// Thrown to leave a job after another thread failed.
+struct JobAborted {};
 
 }  // namespace
 
@@ -32,40 +32,40 @@ uint32_t wait_while(const std::atomic<uint32_t>& value, uint32_t old) {
   return value.load(std::memory_order_acquire);
 }
 
-Team::Team(int threads) : size_(threads) {
+ThreadPool::ThreadPool(int threads) : size_(threads) {
   try {
-    for (int member = 1; member < threads; ++member) threads_.emplace_back([this, member] { serve(member); });
+    for (int thread = 1; thread < threads; ++thread) threads_.emplace_back([this, thread] { worker_loop(thread); });
   } catch (...) {
-    dismiss();
+    join_all();
     throw;
   }
 }
 
-Team::~Team() { dismiss(); }
+ThreadPool::~ThreadPool() { join_all(); }
 
-void Team::dismiss() {
+void ThreadPool::join_all() {
   quit_ = true;
   call_.fetch_add(1, std::memory_order_release);
   call_.notify_all();
   for (std::thread& thread : threads_) thread.join();
 }
 
-void Team::serve(int member) {
-  // The first throw asks for memory of the thread's own, and a process that cannot have it is ended: so it comes now.
+void ThreadPool::worker_loop(int thread) {
+  // The first throw of a thread allocates memory, and the process ends if that fails: do it at the start.
   try {
-    throw Left{};
-  } catch (const Left&) {
+    throw JobAborted{};
+  } catch (const JobAborted&) {
   }
-  for (uint32_t seen = 0;;) {
-    // The calls are counted one by one: `run` returns only after every member has finished, so none can be missed.
-    seen = wait_while(call_, seen);
+  for (uint32_t last_call = 0;;) {
+    // `run` returns after all threads have finished, so that no thread can miss a call.
+    last_call = wait_while(call_, last_call);
     if (quit_) return;
-    attempt(member);
+    run_job(thread);
     if (running_.fetch_sub(1, std::memory_order_acq_rel) == 1) running_.notify_one();
   }
 }
 
-void Team::run(const Job& job) {
+void ThreadPool::run(const Job& job) {
   job_ = job;
   arrived_.store(0, std::memory_order_relaxed);
   failed_.store(false, std::memory_order_relaxed);
@@ -75,16 +75,16 @@ void Team::run(const Job& job) {
     call_.fetch_add(1, std::memory_order_release);
     call_.notify_all();
   }
-  attempt(0);
+  run_job(0);
   for (uint32_t left = running_.load(std::memory_order_acquire); left != 0;) left = wait_while(running_, left);
   if (error_) std::rethrow_exception(error_);
 }
 
-// A member that fails lets go of those who wait for it at a barrier.
-void Team::attempt(int member) {
+// A failed thread releases the threads that wait at a barrier.
+void ThreadPool::run_job(int thread) {
   try {
-    job_.call(job_.job, member);
-  } catch (const Left&) {
+    job_.call(job_.job, thread);
+  } catch (const JobAborted&) {
   } catch (...) {
     {
       const std::lock_guard lock(error_mutex_);
@@ -96,9 +96,9 @@ void Team::attempt(int member) {
   }
 }
 
-void Team::barrier(const std::function<void()>& last) {
+void ThreadPool::barrier(const std::function<void()>& last) {
   const uint32_t generation = generation_.load(std::memory_order_acquire);
-  if (failed_.load(std::memory_order_acquire)) throw Left{};
+  if (failed_.load(std::memory_order_acquire)) throw JobAborted{};
   if (arrived_.fetch_add(1, std::memory_order_acq_rel) + 1 == uint32_t(size_)) {
     if (last) last();
     arrived_.store(0, std::memory_order_relaxed);
@@ -106,7 +106,7 @@ void Team::barrier(const std::function<void()>& last) {
     generation_.notify_all();
   } else {
     wait_while(generation_, generation);
-    if (failed_.load(std::memory_order_acquire)) throw Left{};
+    if (failed_.load(std::memory_order_acquire)) throw JobAborted{};
   }
 }
 

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// Stage 2: the splats of one row of tiles, nearest first. A strip's keys fit the second-level cache, and its thread
-// goes on to bin and draw it while they are there; one sort of the whole image would go through memory instead.
+// Stage 2: sort the splats of each tile row by depth. The keys of a tile row fit the second-level cache, and the same
+// thread bins and renders the row next. One sort of the whole image would go through memory.
 #include <algorithm>
 #include <utility>
 
@@ -12,12 +12,12 @@ namespace {
 
 constexpr int kDigits = 3, kDigitBits = 8, kDigitValues = 1 << kDigitBits;
 
-// Calls f(key) for all keys of the strip in the order of their slots, whichever threads found them.
+// Calls f(key) for all keys of the tile row in slot order, for all threads that wrote them.
 template <class F>
-GAUSSLITE_INLINE void for_each_key(const Workspace& ws, int strip, F f) {
+GAUSSLITE_INLINE void for_each_key(const Workspace& ws, int tile_row, F f) {
   for (uint32_t segment = 0; segment < ws.segments; ++segment) {
-    const KeyList& list = ws.scratch[ws.segment_thread[segment]].strips[size_t(strip)];
-    const KeySpan& span = ws.segment_keys[size_t(segment) * size_t(ws.tiles_y) + size_t(strip)];
+    const KeyList& list = ws.scratch[ws.segment_thread[segment]].tile_rows[size_t(tile_row)];
+    const KeySpan& span = ws.segment_keys[size_t(segment) * size_t(ws.tiles_y) + size_t(tile_row)];
     for (uint32_t i = span.begin; i < span.end; ++i) f(list.keys[i]);
   }
 }
@@ -27,10 +27,10 @@ struct DepthRange {
   int count = 0;
 };
 
-DepthRange depth_range(const Workspace& ws, int strip) {
+DepthRange depth_range(const Workspace& ws, int tile_row) {
   DepthRange range;
   for (const ThreadScratch& scratch : ws.scratch) {
-    const KeyList& list = scratch.strips[size_t(strip)];
+    const KeyList& list = scratch.tile_rows[size_t(tile_row)];
     for (uint32_t i = 0; i < list.count; ++i) {
       range.nearest = std::min(range.nearest, list.keys[i].depth);
       range.farthest = std::max(range.farthest, list.keys[i].depth);
@@ -42,22 +42,22 @@ DepthRange depth_range(const Workspace& ws, int strip) {
 
 }  // namespace
 
-// A least-significant-digit radix sort over 24 bits: the bits of a positive float grow with the float, and rebased to
-// the strip's nearest splat 24 of them resolve depth to about 3e-7. It is stable, so equal depths keep the order of the
-// rows.
-const DepthKey* sort_strip(Workspace& ws, int strip, int thread, int& count) {
-  const DepthRange range = depth_range(ws, strip);
+// A least-significant-digit radix sort over 24 bits. The bits of a positive float increase with its value. Relative to
+// the nearest splat of the tile row, 24 bits resolve depth to about 3e-7. The sort is stable: equal depths keep the
+// order of the rows.
+const DepthKey* sort_tile_row(Workspace& ws, int tile_row, int thread, int& count) {
+  const DepthRange range = depth_range(ws, tile_row);
   count = range.count;
   if (count == 0) return nullptr;
-  ThreadScratch& mine = ws.scratch[size_t(thread)];
-  for (Buffer<DepthKey>& buffer : mine.sorted) buffer.reserve(size_t(count) + kPrefetchAhead);
+  ThreadScratch& thread_scratch = ws.scratch[size_t(thread)];
+  for (Buffer<DepthKey>& buffer : thread_scratch.sorted) buffer.reserve(size_t(count) + kPrefetchAhead);
   const int shift = std::max(0, 32 - kDigits * kDigitBits - __builtin_clz((range.farthest - range.nearest) | 1u));
 
   uint32_t position[kDigits][kDigitValues] = {};
-  DepthKey* from = mine.sorted[0].data();
-  DepthKey* to = mine.sorted[1].data();
+  DepthKey* from = thread_scratch.sorted[0].data();
+  DepthKey* to = thread_scratch.sorted[1].data();
   int filled = 0;
-  for_each_key(ws, strip, [&](const DepthKey& key) {
+  for_each_key(ws, tile_row, [&](const DepthKey& key) {
     const uint32_t depth = (key.depth - range.nearest) >> shift;
     from[filled++] = {depth, key.slot};
     ++position[0][depth & 255u];

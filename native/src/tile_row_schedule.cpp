@@ -1,0 +1,183 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "tile_row_schedule.h"
+
+#include <algorithm>
+#include <cstddef>
+#include <numeric>
+
+#include "thread_pool.h"
+
+namespace gausslite {
+
+namespace {
+
+int pop(std::vector<int>& stack) {
+  const int last = stack.back();
+  stack.pop_back();
+  return last;
+}
+
+// Removes and returns the latest number on the stack for which is_own holds; -1 if there is none.
+template <class F>
+int pop_own(std::vector<int>& stack, F is_own) {
+  for (size_t i = stack.size(); i-- > 0;) {
+    const int own = stack[i];
+    if (!is_own(own)) continue;
+    stack.erase(stack.begin() + std::ptrdiff_t(i));
+    return own;
+  }
+  return -1;
+}
+
+// Fills the stack with 0 ... count - 1, the lowest on top.
+void fill(std::vector<int>& stack, int count) {
+  stack.clear();
+  for (int i = count - 1; i >= 0; --i) stack.push_back(i);
+}
+
+}  // namespace
+
+void TileRowSchedule::start(const std::vector<uint32_t>& weights, int threads, int replay_slots) {
+  const int tile_rows = int(weights.size());
+  tile_rows_ = not_rendered_ = tile_rows;
+  backward_taken_ = 0;
+  first_tile_row_.assign(size_t(threads) + 1, tile_rows);
+  const uint64_t total = std::accumulate(weights.begin(), weights.end(), uint64_t{0});
+  uint64_t above = 0;
+  for (int tile_row = 0, t = 0; tile_row <= tile_rows && t < threads; ++tile_row) {
+    for (; t < threads && above * uint64_t(threads) >= total * uint64_t(t); ++t) first_tile_row_[size_t(t)] = tile_row;
+    if (tile_row < tile_rows) above += weights[size_t(tile_row)];
+  }
+  first_tile_row_[0] = 0;
+  ranges_.clear();
+  for (int t = 0; t < threads; ++t) {
+    const int first = first_tile_row_[size_t(t)], count = first_tile_row_[size_t(t) + 1] - first;
+    const bool upwards = t % 2 == 0 && t + 1 < threads;
+    ranges_.push_back({upwards ? first + count - 1 : first, count, upwards ? -1 : 1});
+  }
+  fill(free_replays_, replay_slots);
+  fill(free_squares_, square_slots(replay_slots));
+  replay_of_tile_row_.assign(size_t(tile_rows), -1);
+  rendered_by_.assign(size_t(tile_rows), -1);
+  replay_last_thread_.resize(size_t(replay_slots), -1);
+  squares_of_square_row_.assign(size_t(tile_rows) + 1, -1);
+  backward_missing_.assign(size_t(tile_rows), 2);
+  for (std::vector<int>* adjacent_tile_rows : {&ssim_missing_, &square_row_users_}) {
+    adjacent_tile_rows->assign(size_t(tile_rows) + 1, 2);
+    adjacent_tile_rows->front() = adjacent_tile_rows->back() = 1;
+  }
+  ssim_ready_.clear();
+  backward_ready_.clear();
+}
+
+TileRowTask TileRowSchedule::next(int thread) {
+  for (;;) {
+    const uint32_t old_count = change_count_.load(std::memory_order_acquire);
+    {
+      const std::lock_guard lock(mutex_);
+      TileRowTask task;
+      if (backward_taken_ == tile_rows_ || take(task, thread)) return task;
+    }
+    wait_while(change_count_, old_count);
+  }
+}
+
+// Tasks on data in the thread's own caches come first, and of these the backward tasks, which free a replay buffer. A
+// thread takes tasks on tile rows of other threads when none of its own are left.
+bool TileRowSchedule::take(TileRowTask& task, int thread) {
+  const bool can_render = not_rendered_ > 0 && !free_replays_.empty();
+  if (const int tile_row = pop_own_tile_row(thread); tile_row >= 0) {
+    task = backward(tile_row);
+  } else if (const int row = pop_own_square_row(thread); row >= 0) {
+    task = derive(row);
+  } else if (can_render && ranges_[size_t(thread)].left > 0) {
+    task = render(thread);
+  } else if (!ssim_ready_.empty()) {
+    task = derive(pop(ssim_ready_));
+  } else if (!backward_ready_.empty()) {
+    task = backward(pop(backward_ready_));
+  } else if (can_render) {
+    task = render(thread);
+  } else {
+    return false;
+  }
+  return true;
+}
+
+// Takes the next of the thread's own tile rows; if none are left, the next of the thread with most rows left.
+TileRowTask TileRowSchedule::render(int thread) {
+  ThreadRange* range = &ranges_[size_t(thread)];
+  if (range->left == 0) {
+    range = &*std::max_element(ranges_.begin(), ranges_.end(),
+                               [](const ThreadRange& a, const ThreadRange& b) { return a.left < b.left; });
+  }
+  const int tile_row = range->next;
+  range->next += range->step;
+  --range->left;
+  --not_rendered_;
+  int replay = pop_own(free_replays_, [&](int place) { return replay_last_thread_[size_t(place)] == thread; });
+  if (replay < 0) replay = pop(free_replays_);
+  replay_of_tile_row_[size_t(tile_row)] = replay;
+  rendered_by_[size_t(tile_row)] = replay_last_thread_[size_t(replay)] = thread;
+  return {TileRowTask::kRender, tile_row, {replay, -1}, {-1, -1}};
+}
+
+TileRowTask TileRowSchedule::derive(int row) {
+  const int above = row > 0 ? replay_of_tile_row_[size_t(row - 1)] : -1;
+  const int below = row < tile_rows_ ? replay_of_tile_row_[size_t(row)] : -1;
+  const int squares = squares_of_square_row_[size_t(row)] = pop(free_squares_);
+  return {TileRowTask::kSsim, row, {above, below}, {squares, -1}};
+}
+
+TileRowTask TileRowSchedule::backward(int tile_row) {
+  ++backward_taken_;
+  return {TileRowTask::kBackward,
+          tile_row,
+          {replay_of_tile_row_[size_t(tile_row)], -1},
+          {squares_of_square_row_[size_t(tile_row)], squares_of_square_row_[size_t(tile_row) + 1]}};
+}
+
+int TileRowSchedule::pop_own_tile_row(int thread) {
+  return pop_own(backward_ready_, [&](int tile_row) { return rendered_by_[size_t(tile_row)] == thread; });
+}
+
+int TileRowSchedule::pop_own_square_row(int thread) {
+  return pop_own(ssim_ready_, [&](int row) {
+    return (row > 0 && rendered_by_[size_t(row - 1)] == thread) ||
+           (row < tile_rows_ && rendered_by_[size_t(row)] == thread);
+  });
+}
+
+void TileRowSchedule::finish(const TileRowTask& task) {
+  {
+    const std::lock_guard lock(mutex_);
+    if (task.kind == TileRowTask::kRender) {
+      for (const int k : {task.index, task.index + 1}) {
+        if (--ssim_missing_[size_t(k)] == 0) ssim_ready_.push_back(k);
+      }
+    } else if (task.kind == TileRowTask::kSsim) {
+      for (const int tile_row : {task.index - 1, task.index}) {
+        if (tile_row >= 0 && tile_row < tile_rows_ && --backward_missing_[size_t(tile_row)] == 0)
+          backward_ready_.push_back(tile_row);
+      }
+    } else {
+      free_replays_.push_back(task.replays[0]);
+      for (const int k : {task.index, task.index + 1}) {
+        if (--square_row_users_[size_t(k)] == 0) free_squares_.push_back(squares_of_square_row_[size_t(k)]);
+      }
+    }
+  }
+  change_count_.fetch_add(1, std::memory_order_release);
+  change_count_.notify_all();
+}
+
+void TileRowSchedule::stop() {
+  {
+    const std::lock_guard lock(mutex_);
+    backward_taken_ = tile_rows_;
+  }
+  change_count_.fetch_add(1, std::memory_order_release);
+  change_count_.notify_all();
+}
+
+}  // namespace gausslite

@@ -1,0 +1,70 @@
+// SPDX-License-Identifier: Apache-2.0
+// Order of the tasks of a training step with SSIM. Each tile row is rendered. Row k of the SSIM squares needs the
+// rendered tile rows k - 1 and k. The backward pass of tile row s needs rows s and s + 1 of the squares. No result
+// depends on the thread or the order of the tasks.
+//
+// A rendered tile row is in its thread's caches, so each thread works on adjacent tile rows. Threads 2 i and 2 i + 1
+// start at adjacent rows and proceed upwards and downwards, with equal work. A thread reads data of other threads only
+// at these boundaries, and where it helps another thread at the end.
+#pragma once
+
+#include <atomic>
+#include <cstdint>
+#include <mutex>
+#include <vector>
+
+namespace gausslite {
+
+// One task. Replay buffers and rows of squares are few and reused; the task holds their indices.
+struct TileRowTask {
+  enum Kind { kRender, kSsim, kBackward, kNone };
+  Kind kind = kNone;
+  int index = 0;              // of the tile row, or of the row of squares
+  int replays[2] = {-1, -1};  // the tile row's; for SSIM, those of the tile rows above and below, -1 beyond the image
+  int squares[2] = {-1,
+                    -1};  // the row's; for backward, those of the rows at the upper and the lower half of the tile row
+};
+
+class TileRowSchedule {
+ public:
+  // Enough to avoid deadlock: if no SSIM or backward task is ready, at most two rendered tile rows of each thread wait,
+  // its first and its last.
+  static int replay_slots(int threads) { return 2 * threads; }
+  // At least one of the two tile rows that a row of squares overlaps still has its replay buffer.
+  static int square_slots(int replay_slots) { return 2 * replay_slots; }
+
+  // `weights`: the number of depth keys of each tile row.
+  void start(const std::vector<uint32_t>& weights, int threads, int replay_slots);
+  // Waits for a task for this thread; returns kNone if all are taken.
+  TileRowTask next(int thread);
+  void finish(const TileRowTask& task);
+  // Ends the schedule for all threads, after one of them failed.
+  void stop();
+
+ private:
+  // Tile rows of a thread that are not rendered yet: `left` rows from `next` on, upwards (step -1) or downwards (1).
+  struct ThreadRange {
+    int next, left, step;
+  };
+  bool take(TileRowTask& task, int thread);
+  TileRowTask render(int thread);
+  TileRowTask derive(int row);
+  TileRowTask backward(int tile_row);
+  // The latest ready tile row that this thread rendered, or row of squares next to such a tile row; -1 if there is
+  // none.
+  int pop_own_tile_row(int thread);
+  int pop_own_square_row(int thread);
+
+  std::mutex mutex_;
+  int tile_rows_ = 0, not_rendered_ = 0, backward_taken_ = 0;
+  std::vector<ThreadRange> ranges_;
+  std::vector<int> first_tile_row_;  // [t]: first tile row of thread t; each thread has an equal share of the keys
+  std::vector<int> free_replays_, free_squares_, replay_of_tile_row_, squares_of_square_row_;
+  std::vector<int> rendered_by_, replay_last_thread_;  // threads, by tile row and by replay buffer
+  std::vector<int> ssim_missing_, backward_missing_;   // number of unfinished inputs
+  std::vector<int> square_row_users_;                  // tile rows that still need a row of squares
+  std::vector<int> ssim_ready_, backward_ready_;
+  std::atomic<uint32_t> change_count_{0};
+};
+
+}  // namespace gausslite
