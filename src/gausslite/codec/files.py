@@ -1,42 +1,59 @@
-"""Put a file in its place whole or not at all, so that no reader ever sees half of one."""
+"""Write files atomically, so that a reader never sees a partial file."""
 
 from __future__ import annotations
 
 import contextlib
 import os
 import tempfile
-from collections.abc import Iterable
+from collections.abc import Callable
 from pathlib import Path
 
 from gausslite.errors import StorageError
 
 
 def write_atomic(path: Path, data: bytes) -> None:
-    """Write beside `path` first, then put it in its place.
+    """Write the bytes to a temporary file in the same folder, then rename it to `path`.
 
-    Raises StorageError naming the file when the folder cannot be written or the disk is full.
+    A device or pipe is written to directly. Raises StorageError if the folder is not writable or the disk is full.
     """
-    write_atomic_parts(path, [data])
+    try:
+        if path.exists() and not path.is_file():
+            path.write_bytes(data)
+            return
+    except OSError as error:
+        raise _cannot_write(path, error) from error
+    write_atomic_with(path, lambda temporary: temporary.write_bytes(data))
 
 
-def write_atomic_parts(path: Path, parts: Iterable[bytes | memoryview]) -> None:
-    """As `write_atomic`, for what need not be in memory twice."""
+def write_atomic_with(path: Path, write: Callable[[Path], object]) -> None:
+    """Let `write` fill a temporary file in the same folder, then rename it to `path`.
+
+    Raises StorageError if `path` is not a regular file, the folder is not writable or the disk is full.
+    """
     temporary: Path | None = None
     try:
         if path.exists() and not path.is_file():
-            # a device or a pipe must be written to, never replaced
-            with path.open("wb") as device:
-                device.writelines(parts)
-            return
-        with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}.", delete=False) as file:
-            temporary = Path(file.name)
-            file.writelines(parts)
-            file.flush()
-            os.fsync(file.fileno())
+            raise StorageError(f"{path}: expected a regular file or none, got something else")
+        descriptor, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+        os.close(descriptor)
+        temporary = Path(name)
+        write(temporary)
+        _flush_to_disk(temporary)
         temporary.chmod(0o644)
         temporary.replace(path)
-    except OSError as error:
+    except BaseException as error:
         if temporary is not None:
             with contextlib.suppress(OSError):
                 temporary.unlink()
-        raise StorageError(f"{path}: cannot be written: {error.strerror or error}") from error
+        if isinstance(error, OSError):
+            raise _cannot_write(path, error) from error
+        raise
+
+
+def _flush_to_disk(path: Path) -> None:
+    with path.open("rb") as file:
+        os.fsync(file.fileno())
+
+
+def _cannot_write(path: Path, error: OSError) -> StorageError:
+    return StorageError(f"{path}: cannot be written: {error.strerror or error}")

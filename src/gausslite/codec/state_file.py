@@ -1,116 +1,87 @@
-"""Named arrays in one checked file: how a mapping run lies on disk between two processes, bit for bit.
+"""Store named arrays in one checked file: a mapping run on disk between two processes, bit for bit.
 
-Little-endian. A head (magic, version, number of arrays, size of the whole file), a table of contents (name, type and
-shape of each array), the arrays one after the other, and a CRC-32 of all that. Sizes are compared with the file's own
-before anything is read. Nothing in it is ever executed.
+The file is a safetensors file. Its metadata holds the format's name, its version and a CRC-32 over the names, types,
+shapes and bytes of all arrays. safetensors compares all sizes with the file's before it allocates memory, and the
+format cannot contain code.
 """
 
 from __future__ import annotations
 
-import math
-import struct
 import zlib
-from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save_file
 
-from gausslite.codec.files import write_atomic_parts
+from gausslite.codec.files import write_atomic_with
 from gausslite.domain.state import State
-from gausslite.errors import MapFileError
+from gausslite.errors import MapFileError, StorageError
 
-MAGIC = b"GLSTATE\n"
-VERSION = 1
-_HEAD = struct.Struct("<8sIIQ")
-_ENTRY = struct.Struct("<HBB")
-_CRC = struct.Struct("<I")
-_TYPES = ("|b1", "|u1", "<i2", "<u4", "<i8", "<u8", "<f4", "<f8")
-_MAX_DIMENSIONS = 8
+FORMAT = "gausslite-state"
+VERSION = "2"
+_TYPES = {"BOOL", "U8", "I16", "U32", "I64", "U64", "F32", "F64"}
+_LENGTH_BYTES = 8
+_MAX_HEADER_BYTES = 1 << 24
 
 
 def write_state(path: Path, state: State) -> None:
-    """Write the file whole or not at all. Raises StorageError."""
+    """Write the arrays atomically. Raises StorageError."""
     arrays = {name: np.asarray(array, order="C") for name, array in state.items()}
-    contents = b"".join(_entry(name, array) for name, array in arrays.items())
-    size = _HEAD.size + len(contents) + sum(array.nbytes for array in arrays.values()) + _CRC.size
-    head = _HEAD.pack(MAGIC, VERSION, len(arrays), size)
-    data = (array.reshape(-1).view(np.uint8).data for array in arrays.values())
-    write_atomic_parts(path, _with_crc([head, contents, *data]))
+    metadata = {"format": FORMAT, "version": VERSION, "crc32": _checksum(arrays)}
+    try:
+        write_atomic_with(path, lambda temporary: save_file(arrays, temporary, metadata))
+    except SafetensorError as error:
+        raise StorageError(f"{path}: cannot be written: {error}") from error
 
 
 def read_state(path: Path) -> dict[str, NDArray[Any]]:
-    """The arrays, read-only. Raises MapFileError when the file is damaged, of another kind or cannot be read."""
+    """Read the arrays; they are read-only. Raises MapFileError if the file is damaged, unreadable or of another kind."""
     try:
-        data = _read(path)
+        _require_header(path)
+        with safe_open(path, framework="numpy") as file:
+            metadata = file.metadata() or {}
+            _require_version(path, metadata)
+            types = {name: file.get_slice(name).get_dtype() for name in file.keys()}  # noqa: SIM118 - not a dict
+            if unknown := set(types.values()) - _TYPES:
+                raise MapFileError(f"{path}: expected arrays of {', '.join(sorted(_TYPES))}, got {unknown.pop()}")
+            arrays: dict[str, NDArray[Any]] = {name: file.get_tensor(name) for name in types}
     except OSError as error:
         raise MapFileError(f"{path}: cannot be read: {error.strerror or error}") from error
-    if zlib.crc32(data[: -_CRC.size]) != _CRC.unpack_from(data, len(data) - _CRC.size)[0]:
-        raise MapFileError(f"{path}: expected an undamaged saved run, got other bytes than its checksum says")
-    try:
-        return _arrays(memoryview(data)[: -_CRC.size])
-    except (struct.error, ValueError) as error:
-        raise MapFileError(f"{path}: expected an undamaged saved run: {error}") from None
-
-
-def _read(path: Path) -> bytes:
-    """The bytes of a file whose head and length agree."""
-    if not path.is_file():
-        raise MapFileError(f"{path}: expected the file of a saved run, got none")
-    size = path.stat().st_size
-    with path.open("rb") as file:
-        head = file.read(_HEAD.size)
-        if len(head) < _HEAD.size or not head.startswith(MAGIC):
-            raise MapFileError(f"{path}: expected the file of a saved run, got another kind of file")
-        _, version, _, declared = _HEAD.unpack(head)
-        if version != VERSION:
-            raise MapFileError(f"{path}: expected a saved run of version {VERSION}, got version {version}")
-        if declared != size or size < _HEAD.size + _CRC.size:
-            raise MapFileError(f"{path}: expected {declared} bytes, got {size}: the file is not whole")
-        rest = file.read(size - _HEAD.size)
-    if len(rest) != size - _HEAD.size:
-        raise MapFileError(f"{path}: it changed while it was read")
-    return head + rest
-
-
-def _arrays(data: memoryview) -> dict[str, NDArray[Any]]:
-    """Split checked bytes. Raises struct.error, ValueError for a table of contents that does not fit them."""
-    count = _HEAD.unpack_from(data)[2]
-    at = _HEAD.size
-    entries: list[tuple[str, np.dtype[Any], tuple[int, ...]]] = []
-    for _ in range(count):
-        length, kind, dimensions = _ENTRY.unpack_from(data, at)
-        at += _ENTRY.size
-        if kind >= len(_TYPES) or dimensions > _MAX_DIMENSIONS:
-            raise ValueError(f"array {len(entries)} has an unknown type or too many dimensions")
-        name = bytes(data[at : at + length]).decode()
-        shape = struct.unpack_from(f"<{dimensions}Q", data, at + length)
-        at += length + 8 * dimensions
-        entries.append((name, np.dtype(_TYPES[kind]), shape))
-    arrays: dict[str, NDArray[Any]] = {}
-    for name, dtype, shape in entries:
-        size = math.prod(shape) * dtype.itemsize
-        if size > len(data) - at:
-            raise ValueError(f"array {name} would take {size} bytes, {len(data) - at} are left")
-        if dtype.kind == "b" and max(data[at : at + size], default=0) > 1:
-            raise ValueError(f"array {name} has other values than true and false")
-        arrays[name] = np.frombuffer(data[at : at + size], dtype).reshape(shape)
-        at += size
-    if at != len(data) or len(arrays) != count:
-        raise ValueError("its table of contents does not fit its bytes")
+    except SafetensorError as error:
+        raise MapFileError(f"{path}: expected an undamaged saved run: {error}") from error
+    if metadata.get("crc32") != _checksum(arrays):
+        raise MapFileError(f"{path}: expected an undamaged saved run, but its checksum does not match")
+    for name, array in arrays.items():
+        if array.dtype == np.bool_ and array.view(np.uint8).max(initial=0) > 1:
+            raise MapFileError(f"{path}: expected an undamaged saved run, but array {name} has invalid booleans")
+        array.flags.writeable = False
     return arrays
 
 
-def _entry(name: str, array: NDArray[Any]) -> bytes:
-    encoded = name.encode()
-    kind = _TYPES.index(array.dtype.newbyteorder("<").str)
-    return _ENTRY.pack(len(encoded), kind, array.ndim) + encoded + struct.pack(f"<{array.ndim}Q", *array.shape)
+def _require_header(path: Path) -> None:
+    """Raise MapFileError unless the file begins with the length of a header that fits into it."""
+    if not path.is_file():
+        raise MapFileError(f"{path}: expected the file of a saved run, got none")
+    with path.open("rb") as file:
+        length = int.from_bytes(file.read(_LENGTH_BYTES), "little")
+        is_json = file.read(1) == b"{"
+    if not is_json or length > min(path.stat().st_size - _LENGTH_BYTES, _MAX_HEADER_BYTES):
+        raise MapFileError(f"{path}: expected the file of a saved run, got another kind of file, or part of one")
 
 
-def _with_crc(parts: Iterable[bytes | memoryview]) -> Iterator[bytes | memoryview]:
+def _require_version(path: Path, metadata: dict[str, str]) -> None:
+    if metadata.get("format") != FORMAT:
+        raise MapFileError(f"{path}: expected the file of a saved run, got another kind of file")
+    if metadata.get("version") != VERSION:
+        raise MapFileError(f"{path}: expected a saved run of version {VERSION}, got {metadata.get('version')!r:.40}")
+
+
+def _checksum(arrays: State) -> str:
     crc = 0
-    for each in parts:
-        crc = zlib.crc32(each, crc)
-        yield each
-    yield _CRC.pack(crc)
+    for name, array in sorted(arrays.items()):
+        crc = zlib.crc32(f"{name} {array.dtype.str} {array.shape}\n".encode(), crc)
+        crc = zlib.crc32(array.reshape(-1).view(np.uint8).data, crc)
+    return f"{crc:08x}"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import struct
 import subprocess
 import sys
 import zlib
@@ -15,7 +14,7 @@ import pytest
 from mapping_scenes import wall_frame
 
 from gausslite.calibration.pose_exposure_prior import PoseExposurePrior
-from gausslite.codec.state_file import MAGIC, VERSION, read_state, write_state
+from gausslite.codec.state_file import read_state, write_state
 from gausslite.domain.frame import Frame
 from gausslite.domain.region import BallRegion
 from gausslite.domain.state import State, select_prefix
@@ -158,51 +157,6 @@ def test_terms_that_are_none_are_told(terms: str, saved: Path) -> None:
     write_state(saved, {**state, "about/terms": np.frombuffer(terms.encode(), np.uint8)})
     with pytest.raises(MapFileError, match=r"run\.state: state terms: expected options"):
         SavedRun.read(saved)
-
-
-def test_a_file_cut_anywhere_or_with_any_byte_turned_is_told(saved: Path) -> None:
-    data = saved.read_bytes()
-    damaged = saved.with_name("damaged.state")
-    places = [*range(0, 64), *np.linspace(64, len(data) - 1, 60).astype(int).tolist()]
-    for place in places:
-        damaged.write_bytes(data[:place])
-        with pytest.raises(MapFileError):
-            read_state(damaged)
-        damaged.write_bytes(data[:place] + bytes([data[place] ^ 0x40]) + data[place + 1 :])
-        with pytest.raises(MapFileError):
-            read_state(damaged)
-    damaged.write_bytes(data + b"more")
-    with pytest.raises(MapFileError, match="not whole"):
-        read_state(damaged)
-
-
-def forged(count: int, contents: bytes) -> bytes:
-    """A file whose sizes and checksum are right, whatever its table of contents says."""
-    size = 24 + len(contents) + 4
-    data = struct.pack("<8sIIQ", MAGIC, VERSION, count, size) + contents
-    return data + struct.pack("<I", zlib.crc32(data))
-
-
-@pytest.mark.parametrize(
-    ("count", "contents"),
-    [
-        (1 << 31, b""),
-        (1, struct.pack("<HBB", 1, 6, 1) + b"x" + struct.pack("<Q", 1 << 62)),
-        (1, struct.pack("<HBB", 1, 6, 2) + b"x" + struct.pack("<QQ", 1 << 63, 1 << 63)),
-        (1, struct.pack("<HBB", 1, 6, 255) + b"x"),
-        (1, struct.pack("<HBB", 1, 99, 0) + b"x"),
-        (1, struct.pack("<HBB", 65535, 6, 0) + b"x"),
-        (1, struct.pack("<HBB", 1, 1, 0) + b"\xff" + b"\0"),
-        (1, struct.pack("<HBB", 1, 0, 1) + b"x" + struct.pack("<Q", 1) + b"\7"),
-        (2, (struct.pack("<HBB", 1, 1, 0) + b"x") * 2 + b"\0\0"),
-        (0, b"left over"),
-    ],
-)
-def test_impossible_declarations_are_told_before_memory_is_taken(count: int, contents: bytes, tmp_path: Path) -> None:
-    path = tmp_path / "forged.state"
-    path.write_bytes(forged(count, contents))
-    with pytest.raises(MapFileError, match=r"forged\.state: expected an undamaged saved run"):
-        read_state(path)
 
 
 @pytest.fixture(scope="module")

@@ -4,17 +4,14 @@ from __future__ import annotations
 
 import json
 import struct
-import zlib
 from pathlib import Path
 
 import pytest
 from tiny_sequences import write_seven_scenes
 
 from gausslite.cli.main import main
-from gausslite.codec.state_file import MAGIC, VERSION
 
-HEAD = struct.pack("<8sIIQ", MAGIC, VERSION, 0, 28)
-EMPTY = HEAD + struct.pack("<I", zlib.crc32(HEAD))
+EMPTY_SAFETENSORS = struct.pack("<Q", 2) + b"{}"
 
 
 def map_command(folder: Path, out: Path, *more: str) -> list[str]:
@@ -22,7 +19,7 @@ def map_command(folder: Path, out: Path, *more: str) -> list[str]:
     return ["map", str(folder), *common, "--out", str(out), *more]
 
 
-@pytest.mark.parametrize("contents", [None, b"", b"remember the milk", MAGIC, EMPTY])
+@pytest.mark.parametrize("contents", [None, b"", b"remember the milk", EMPTY_SAFETENSORS[:8], EMPTY_SAFETENSORS])
 def test_the_command_line_says_it_in_one_line(
     contents: bytes | None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

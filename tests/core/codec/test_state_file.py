@@ -1,0 +1,105 @@
+"""State files: read back bit for bit, and refused if damaged or forged."""
+
+from __future__ import annotations
+
+import json
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gausslite.codec.state_file import FORMAT, read_state, write_state
+from gausslite.errors import MapFileError, StorageError
+
+U8 = {"dtype": "U8", "shape": [1], "data_offsets": [0, 1]}
+METADATA = {"format": FORMAT, "version": "2", "crc32": "ffffffff"}
+
+
+def forged(header: dict[str, object] | bytes, data: bytes) -> bytes:
+    text = header if isinstance(header, bytes) else json.dumps({"__metadata__": METADATA, **header}).encode()
+    return struct.pack("<Q", len(text)) + text + data
+
+
+@pytest.mark.parametrize(
+    ("header", "data"),
+    [
+        ({}, b""),
+        ({"x": U8}, b"\0"),
+        ({"x": U8}, b""),
+        ({"x": U8}, b"\0\0"),
+        ({"x": {**U8, "dtype": "F64", "shape": [1 << 62, 8]}}, b"\0"),
+        ({"x": {**U8, "dtype": "F64", "shape": [1 << 40], "data_offsets": [0, 1 << 43]}}, b"\0"),
+        ({"x": {**U8, "dtype": "F8_E4M3"}}, b"\0"),
+        ({"x": {**U8, "dtype": "OBJECT"}}, b"\0"),
+        ({"x": U8, "y": U8}, b"\0"),
+        ({"__metadata__": {**METADATA, "version": "1"}}, b""),
+        ({"__metadata__": {"format": "pt"}}, b""),
+        ({"__metadata__": {"format": 5}}, b""),
+        (b"{" * 100_000, b""),
+        (b'{"x": \xff}', b""),
+        (b"", b""),
+    ],
+)
+def test_a_forged_header_is_refused(header: dict[str, object] | bytes, data: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "forged.state"
+    path.write_bytes(forged(header, data))
+    with pytest.raises(MapFileError, match=r"forged\.state: expected"):
+        read_state(path)
+
+
+def test_a_header_longer_than_the_file_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "forged.state"
+    path.write_bytes(struct.pack("<Q", 1 << 40) + b"{}")
+    with pytest.raises(MapFileError, match="another kind of file, or part of one"):
+        read_state(path)
+
+
+def test_booleans_other_than_0_and_1_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "run.state"
+    write_state(path, {"flags": np.array([7], np.uint8).view(np.bool_)})
+    with pytest.raises(MapFileError, match=r"run\.state: expected .* array flags has invalid booleans"):
+        read_state(path)
+
+
+def test_arrays_of_every_shape_are_read_back_unchanged(tmp_path: Path) -> None:
+    state = {
+        "scalar": np.array(5, np.int64),
+        "empty": np.zeros((0, 3), np.float32),
+        "flags": np.array([True, False]),
+        "transposed": np.arange(6, dtype=np.float64).reshape(2, 3).T,
+    }
+    write_state(tmp_path / "run.state", state)
+    stored = read_state(tmp_path / "run.state")
+    assert set(stored) == set(state)
+    for name, array in state.items():
+        assert (stored[name].dtype, stored[name].shape) == (array.dtype, array.shape)
+        assert stored[name].tobytes() == array.tobytes()
+        assert not stored[name].flags.writeable
+
+
+def test_a_truncated_or_changed_file_is_refused(tmp_path: Path) -> None:
+    path, damaged = tmp_path / "run.state", tmp_path / "damaged.state"
+    write_state(path, {"a": np.arange(50, dtype=np.float32), "part/b": np.arange(9, dtype=np.int64)})
+    data = path.read_bytes()
+    for place in range(len(data)):
+        damaged.write_bytes(data[:place])
+        with pytest.raises(MapFileError):
+            read_state(damaged)
+        damaged.write_bytes(data[:place] + bytes([data[place] ^ 0x40]) + data[place + 1 :])
+        with pytest.raises(MapFileError):
+            read_state(damaged)
+    damaged.write_bytes(data + b"more")
+    with pytest.raises(MapFileError, match="undamaged saved run"):
+        read_state(damaged)
+
+
+def test_a_state_is_written_completely_or_not_at_all(tmp_path: Path) -> None:
+    with pytest.raises(StorageError, match="cannot be written"):
+        write_state(tmp_path / "missing" / "run.state", {"a": np.zeros(3)})
+    with pytest.raises(StorageError, match="expected a regular file"):
+        write_state(Path("/dev/null"), {"a": np.zeros(3)})
+    path = tmp_path / "run.state"
+    write_state(path, {"a": np.zeros(3)})
+    assert path.stat().st_mode & 0o777 == 0o644
+    assert list(tmp_path.iterdir()) == [path]
