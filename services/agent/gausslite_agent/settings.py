@@ -181,6 +181,7 @@ def _add_replay(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument_group("replay").add_argument
     add("--source", metavar="SPEC", help='a sequence folder or "sim:home?seed=0&trajectory=0"')
     add("--test-every", metavar="N", type=int, help="hold out every Nth frame from mapping, for evaluation")
+    add("--strict", action="store_true", help="end at a frame that cannot be read (default: skip it)")
 
 
 def _add_connections(parser: argparse.ArgumentParser) -> None:

@@ -1,4 +1,4 @@
-"""Read the command line of the fusion server into settings."""
+"""Settings of the fusion server, read from its options."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _MAX_STORE_MB = 1 << 24
 
 @dataclass(frozen=True, slots=True)
 class ServerSettings:
-    """Where to listen, where to keep the words (None = in memory) and on what terms agents join."""
+    """Address, storage (None: in memory) and limits of the server, and the mission that it serves."""
 
     listen: str = "127.0.0.1:50052"
     store: Path | None = None
@@ -34,7 +34,7 @@ class ServerSettings:
 
 
 def parse_arguments(arguments: Sequence[str] | None = None) -> ServerSettings:
-    """Settings from the command line. Raises InvalidInputError for values that make no sense."""
+    """Return the settings of the options. Raises InvalidInputError for values that are out of range."""
     options = parse_options(_parser(), arguments)
     if options.store_max_mb is not None and not 1 <= options.store_max_mb <= _MAX_STORE_MB:
         raise InvalidInputError(f"--store-max-mb: expected 1 to {_MAX_STORE_MB}, got {options.store_max_mb}")
@@ -63,35 +63,30 @@ def parse_arguments(arguments: Sequence[str] | None = None) -> ServerSettings:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="gausslite-fusion-server",
-        description="Keep every agent's latest word on each voxel and serve the best-trained one to the team.",
+        description="Store every agent's latest voxel updates and serve the fused map. In each voxel the agent with "
+        "the largest sum of kappa (per Gaussian, the training steps in which it was visible and active) wins.",
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
-    ours, quotas = ServerSettings(), Quotas()
+    defaults, quotas = ServerSettings(), Quotas()
     add = parser.add_argument
-    add("--listen", default=ours.listen, metavar="HOST:PORT", help="address to serve on, or unix:PATH")
-    add("--store", default=MEMORY, metavar="memory|PATH.sqlite", help="where the words are kept")
-    add("--store-max-mb", type=int, metavar="MB", help="largest size of the sqlite file; no limit when absent")
-    add("--voxel-size", type=float, default=ours.fusion.grid.size_m, metavar="METRES", help="edge of the vote's voxels")
-    add("--mission", default="", metavar="ID", help="the only mission to serve; empty: the first agent names it")
-    add("--world-frame", default="", metavar="NAME", help="frame of all maps; empty: the first agent names it")
-    add("--quota-agents", type=int, default=quotas.agents, metavar="N", help="most agents in the mission")
-    add("--quota-voxels", type=int, default=quotas.voxels_per_agent, metavar="N", help="most voxels of an agent")
-    add(
-        "--quota-gaussians",
-        type=int,
-        default=quotas.gaussians_per_agent,
-        metavar="N",
-        help="most of an agent",
-    )
-    add(
-        "--quota-keyframes",
-        type=int,
-        default=quotas.keyframes_per_agent,
-        metavar="N",
-        help="kept of an agent",
-    )
+    add("--listen", default=defaults.listen, metavar="ADDRESS", help="HOST:PORT or unix:PATH")
+    add("--store", default=MEMORY, metavar="memory|PATH.sqlite", help="storage of the voxel updates")
+    add("--store-max-mb", type=int, metavar="MB", help="largest size of the SQLite file; no limit if absent")
+    add("--voxel-size", type=float, default=defaults.fusion.grid.size_m, metavar="M", help="edge of voxels in metres")
+    add("--mission", default="", metavar="ID", help="the only mission to serve; empty: that of the first agent")
+    add("--world-frame", default="", metavar="NAME", help="frame of all maps; empty: that of the first agent")
+    add("--quota-agents", type=int, default=quotas.agents, metavar="N", help="largest number of agents")
+    add("--quota-voxels", type=int, default=quotas.voxels_per_agent, metavar="N", help="largest number per agent")
+    add("--quota-gaussians", type=int, default=quotas.gaussians_per_agent, metavar="N", help="largest number per agent")
+    add("--quota-keyframes", type=int, default=quotas.keyframes_per_agent, metavar="N", help="largest number per agent")
     add("--quota-keyframe-pixels", type=int, default=quotas.keyframe_pixels, metavar="N", help="largest keyframe image")
-    add("--refine-iterations", type=int, default=ours.refine.iterations, metavar="N", help="when a request names none")
-    add("--rasterizer", choices=BACKENDS, default=ours.rasterizer, help="backend of the refinement")
+    add(
+        "--refine-iterations",
+        type=int,
+        default=defaults.refine.iterations,
+        metavar="N",
+        help="iterations of joint refinement if a request states none",
+    )
+    add("--rasterizer", choices=BACKENDS, default=defaults.rasterizer, help="backend of the refinement")
     add_tls(parser)
     return parser

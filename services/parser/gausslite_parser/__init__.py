@@ -1,1 +1,1 @@
-"""The parser service: task text in, object-relation graph out, for every robot of a team."""
+"""The parser service: parses task texts into object-relation graphs for all robots of a team."""

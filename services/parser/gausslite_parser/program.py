@@ -1,4 +1,4 @@
-"""Serve the chosen parser until told to stop."""
+"""Serve a task parser until the process is stopped."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from gausslite_parser.settings import parse_arguments
 
 
 def run(arguments: Sequence[str] | None = None) -> int:
-    """0 after a clean end, 2 with one line on stderr when it cannot serve."""
+    """Return 0 after a clean end, 2 with one line on stderr if the service cannot start."""
     try:
         settings = parse_arguments(arguments)
         parser = open_parser(settings.backend)

@@ -14,7 +14,7 @@ SERVICE_NAME = parser_service_pb2.DESCRIPTOR.services_by_name["ParserService"].f
 
 
 class ParserServicer(parser_service_pb2_grpc.ParserServiceServicer):
-    """Holds no state; a parser may be slow, so it runs on a thread of its own."""
+    """Stateless; the parser runs on another thread, because it may be slow."""
 
     def __init__(self, parser: TaskParser) -> None:
         self._parser = parser
@@ -22,13 +22,13 @@ class ParserServicer(parser_service_pb2_grpc.ParserServiceServicer):
     async def ParseTask(  # noqa: N802 (gRPC's name)
         self, request: parser_service_pb2.ParseTaskRequest, _context: Any
     ) -> parser_service_pb2.ParseTaskResponse:
-        """The graph of one task; TaskError becomes INVALID_ARGUMENT TASK."""
+        """Return the graph of one task; a TaskError becomes INVALID_ARGUMENT TASK."""
         graph = await asyncio.to_thread(self._parser.parse, request.text)
         return parser_service_pb2.ParseTaskResponse(graph=graph_to_message(graph))
 
 
 def parser_service(parser: TaskParser) -> Service:
-    """The service ready to be served."""
+    """Return the service of this parser for a gRPC server."""
     servicer = ParserServicer(parser)
     return Service(
         SERVICE_NAME, lambda server: parser_service_pb2_grpc.add_ParserServiceServicer_to_server(servicer, server)

@@ -1,4 +1,4 @@
-"""The parser service's command line, read once."""
+"""Settings of the parser service, read from its options."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ DEFAULT_LISTEN = "127.0.0.1:50051"
 
 @dataclass(frozen=True, slots=True)
 class ParserSettings:
-    """Where to listen, HOST:PORT (port 0 = any free one) or unix:PATH, and who reads the tasks."""
+    """Address of the service, HOST:PORT (port 0: any free one) or unix:PATH, and the backend that parses tasks."""
 
     listen: str = DEFAULT_LISTEN
     backend: BackendSettings = field(default_factory=BackendSettings)
@@ -26,15 +26,15 @@ class ParserSettings:
 
 
 def parse_arguments(arguments: Sequence[str] | None = None) -> ParserSettings:
-    """Settings from the command line; ends the process with code 2 on a wrong option. Raises InvalidInputError."""
+    """Return the settings of the options. Ends the process with code 2 for wrong flags. Raises InvalidInputError."""
     parser = argparse.ArgumentParser(
-        prog="gausslite-parser", description="Serve gausslite.v1.ParserService: task text in, task graph out."
+        prog="gausslite-parser", description="Serve gausslite.v1.ParserService: parse task texts into task graphs."
     )
     parser.add_argument(
         "--listen",
         default=DEFAULT_LISTEN,
         metavar="ADDRESS",
-        help="HOST:PORT (port 0 = any free one) or unix:PATH; default %(default)s",
+        help="HOST:PORT (port 0: any free one) or unix:PATH (default: %(default)s)",
     )
     add_backend(parser)
     add_tls(parser)
