@@ -25,7 +25,7 @@ import torch
 from gausslite.render.cuda import CudaRasterizer
 from gausslite.render.cuda.gsplat_baseline import GsplatBaseline
 from gausslite.render.cuda.kernels import TorchKernels
-from gausslite.render.cuda.projection import Lens, project
+from gausslite.render.cuda.projection import DeviceCamera, project
 
 torch.set_num_threads(1)
 SIZE = (48, 32)
@@ -37,9 +37,9 @@ def rasterization(*args: Any, **options: Any) -> tuple[torch.Tensor, torch.Tenso
     quats, logits = asked["quats"], asked["opacities"].logit()[:, None]
     columns = [asked["means"], asked["scales"].log(), quats, logits, asked["colors"], torch.zeros_like(quats[:, :2])]
     kernels, size = TorchKernels(), (asked["width"], asked["height"])
-    lens = Lens.of(held_out_view(*size).camera, kernels.device)
+    camera = DeviceCamera.of(held_out_view(*size).camera, kernels.device)
     rows = torch.cat(columns, dim=1)
-    channels, alpha = kernels.composite(project(kernels, rows, lens, asked["viewmats"][0]), size, None)
+    channels, alpha = kernels.composite(project(kernels, rows, camera, asked["viewmats"][0]), size, None)
     return channels[None], alpha[None, ..., None], {}
 
 
@@ -64,7 +64,7 @@ def test_every_size_of_map_is_measured_and_a_whole_frame(bench: GpuBench) -> Non
         assert all(rate.best[name] >= rate.median[name] > 0 for name in rate.best)
         assert str(rate.gaussians) in rate_line(rate)
     assert frame.iterations == 8
-    assert {"seeding", "warm_up", "active", "pruning", "densifying"} <= set(frame.steps_ms)
+    assert {"seeding", "warm_up", "active", "pruning", "densification"} <= set(frame.stages_ms)
     record = json.loads(json.dumps(gpu_record("a device", rates, frame)))
     assert [case["gaussians"] for case in record["rates"]] == [60, 90]
     assert "the paper's frame time is 500 ms" in frame_lines(frame)

@@ -8,7 +8,7 @@ import torch
 from splat_scenes import CAMERA, GROUPS, Scene, random_image_gradients, relative_error, scene_named, turned
 
 from gausslite.render.rasterizer import LossWeights, Rasterizer
-from gausslite.render.reference.compositing import draw
+from gausslite.render.reference.compositing import render_images
 from gausslite.render.reference.loss import ReferenceView, ssim_map, training_loss
 from gausslite.render.reference.projection import project
 
@@ -18,7 +18,7 @@ STEP = 5e-8
 
 def scalar(scene: Scene, rows: np.ndarray, T_camera_world: np.ndarray, d_images: np.ndarray) -> float:
     ellipses = project(torch.from_numpy(rows), scene.camera, torch.from_numpy(T_camera_world))
-    return float((draw(ellipses, scene.camera, None).numpy() * d_images).sum())
+    return float((render_images(ellipses, scene.camera, None).numpy() * d_images).sum())
 
 
 def exp_twist(twist: np.ndarray) -> np.ndarray:
@@ -75,7 +75,7 @@ def test_the_2d_norm_is_the_gradient_of_a_shift_of_the_image(oracle: Rasterizer)
 
     def shifted(dx: float, dy: float) -> float:
         camera = type(CAMERA)(52.0, 50.0, CAMERA.cx_px + dx, CAMERA.cy_px + dy, 64, 48)
-        drawn = draw(project(torch.from_numpy(rows.astype(np.float64)), camera, torch.eye(4).double()), camera, None)
+        drawn = render_images(project(torch.from_numpy(rows.astype(np.float64)), camera, torch.eye(4).double()), camera, None)
         return float((drawn.numpy() * np.dstack([d_rgb, d_depth_m, d_alpha])).sum())
 
     by_x = (shifted(STEP, 0) - shifted(-STEP, 0)) / (2 * STEP)

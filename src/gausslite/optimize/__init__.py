@@ -1,1 +1,1 @@
-"""The trainable table of splats, its loss and its density control; shared by mapping and refinement."""
+"""The trainable splat table, its encoding, learning rates and density control, for mapping and joint refinement."""

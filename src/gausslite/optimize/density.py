@@ -1,4 +1,4 @@
-"""Adapt the number of Gaussians to what training asks for: clone, split and prune under a hard cap (Sec. III-D.3)."""
+"""Density control: clone, split and prune Gaussians under a hard cap (Sec. III-D.3; 3DGS, Kerbl et al. 2023)."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from gausslite.optimize.splat_table import SplatTable
 from gausslite.render.rasterizer import GRAD_2D_COUNT, GRAD_2D_SUM, LOG_SCALE, MEAN, OPACITY_LOGIT, QUAT, UPDATE_COUNT
 
 _SPLIT_SHRINK = 1.6
-"""Each half of a split Gaussian is this much shorter (Kerbl et al. 2023)."""
-_SPLIT_APART = math.sqrt(1.0 - 1.0 / _SPLIT_SHRINK**2)
-"""How far each half is from the middle, in standard deviations of the whole: both together then spread as it did."""
+"""Divisor of the longest scale of a split Gaussian (Kerbl et al. 2023)."""
+_SPLIT_OFFSET = math.sqrt(1.0 - 1.0 / _SPLIT_SHRINK**2)
+"""Offset of each half in standard deviations of the parent: the two together keep its mean and covariance."""
 
 
 @dataclass(frozen=True, slots=True)
 class DensitySettings:
-    """When and what to clone, split and prune; counts are mapping iterations.
+    """Settings of density control.
 
-    min_mean_gradient is in half image widths (as the rasterizer's statistics); percent_dense, a fraction of the
-    scene's extent, parts the Gaussians to clone (smaller) from those to split. max_growth bounds how much a single
-    densification may add, as a fraction of the Gaussians there are: at low resolution, where every gradient is large,
-    the threshold alone would fill the table at once and leave no room for seeds.
+    densify_every, prune_every: in mapping iterations. min_mean_gradient: in half image widths, as in the rasterizer's
+    statistics. percent_dense: Gaussians up to this fraction of the scene's extent are cloned, larger ones split.
+    max_growth: bound of one densification, as a fraction of the number of Gaussians. At low resolution, where all
+    gradients are large, the threshold alone would fill the table and leave no free slots for seeds.
     """
 
     densify_every: int = 150
@@ -47,22 +47,22 @@ class DensitySettings:
 
 @dataclass(frozen=True, slots=True)
 class DensityChange:
-    """How many Gaussians were cloned and how many were split; each adds one."""
+    """Numbers of cloned and of split Gaussians; each adds one Gaussian."""
 
     cloned: int
     split: int
 
 
 def densify(table: SplatTable, settings: DensitySettings, extent_m: float) -> DensityChange:
-    """Clone small and split large Gaussians whose image gradient stays high, as far as the cap and max_growth allow.
+    """Clone small and split large Gaussians of high image gradient, within the cap and max_growth.
 
-    Where that is short the largest gradients go first. Children together look like their parent, so that a map is
-    as good right after as before: online there is no time to mend what copies of full opacity and halves thrown at
-    random (Kerbl et al. 2023) break. They inherit active, kappa and target and start with fresh optimiser state; a
-    split puts its first half in the parent's row. The statistics start anew.
+    The Gaussians with the largest gradients have priority. The two children render nearly like their parent, because
+    online mapping has no time to repair copies of full opacity and random offsets (Kerbl et al. 2023). They inherit
+    active, kappa and target, and have no optimiser state. The first half of a split takes the parent's row. Resets the
+    density statistics.
     """
-    most = min(table.free_slots, math.ceil(settings.max_growth * table.count))
-    chosen = _most_wanted(_mean_gradient(table), settings.min_mean_gradient, most)
+    max_added = min(table.free_slots, math.ceil(settings.max_growth * table.count))
+    chosen = _largest_above(_mean_gradient(table), settings.min_mean_gradient, max_added)
     largest_scale_m = np.exp(table.rows[chosen][:, LOG_SCALE].max(axis=1, initial=-np.inf))
     small = largest_scale_m <= settings.percent_dense * extent_m
     to_clone, to_split = chosen[small], chosen[~small]
@@ -74,29 +74,30 @@ def densify(table: SplatTable, settings: DensitySettings, extent_m: float) -> De
 
 
 def prune(table: SplatTable, settings: DensitySettings) -> int:
-    """Drop the Gaussians that became all but transparent; returns how many."""
+    """Remove the Gaussians of opacity below `min_opacity`; return their number."""
     before = table.count
     table.keep(table.opacities >= settings.min_opacity)
     return before - table.count
 
 
 def _mean_gradient(table: SplatTable) -> Float32[ndarray, " n"]:
-    seen = table.first_moment[:, GRAD_2D_COUNT]
-    mean: Float32[ndarray, " n"] = table.first_moment[:, GRAD_2D_SUM] / np.maximum(seen, 1.0)
+    visible_steps = table.first_moment[:, GRAD_2D_COUNT]
+    mean: Float32[ndarray, " n"] = table.first_moment[:, GRAD_2D_SUM] / np.maximum(visible_steps, 1.0)
     return mean
 
 
-def _most_wanted(gradient: Float32[ndarray, " n"], threshold: float, most: int) -> Int64[ndarray, " m"]:
+def _largest_above(gradient: Float32[ndarray, " n"], threshold: float, max_count: int) -> Int64[ndarray, " m"]:
+    """Return the ids of gradients above the threshold, ascending; at most max_count, those of largest gradient."""
     above = np.flatnonzero(gradient > threshold)
-    if len(above) <= most:
+    if len(above) <= max_count:
         return above
-    # a stable order makes the choice among equals repeatable
+    # stable: the choice among equal gradients is repeatable
     order = np.argsort(-gradient[above], kind="stable")
-    return np.sort(above[order[:most]])
+    return np.sort(above[order[:max_count]])
 
 
 def _clone(table: SplatTable, parents: Int64[ndarray, " m"]) -> None:
-    """Two in the same place, each of an alpha of 1 - sqrt(1 - alpha): they hide as much as the one."""
+    """Replace each parent by two Gaussians of opacity 1 - sqrt(1 - opacity), with the same total transmittance."""
     for rows in (table.rows, table.ema_rows):
         half_depth = 0.5 * np.logaddexp(0.0, rows[parents, OPACITY_LOGIT].astype(np.float64))  # -log(1 - alpha) / 2
         rows[parents, OPACITY_LOGIT] = np.log(-np.expm1(-half_depth)) + half_depth
@@ -106,18 +107,18 @@ def _clone(table: SplatTable, parents: Int64[ndarray, " m"]) -> None:
 
 
 def _split(table: SplatTable, parents: Int64[ndarray, " m"]) -> None:
-    """Two shorter ones side by side on the longest axis."""
+    """Replace each parent by two shorter Gaussians, offset along its longest axis."""
     rows = table.rows[parents]
-    each, longest = np.arange(len(rows)), rows[:, LOG_SCALE].argmax(axis=1)
+    all_rows, longest = np.arange(len(rows)), rows[:, LOG_SCALE].argmax(axis=1)
     log_scales = rows[:, LOG_SCALE]
-    apart_m = np.zeros((len(rows), 3), np.float32)
-    apart_m[each, longest] = np.float32(_SPLIT_APART) * np.exp(log_scales[each, longest])
-    log_scales[each, longest] -= np.float32(math.log(_SPLIT_SHRINK))
+    offset_m = np.zeros((len(rows), 3), np.float32)
+    offset_m[all_rows, longest] = np.float32(_SPLIT_OFFSET) * np.exp(log_scales[all_rows, longest])
+    log_scales[all_rows, longest] -= np.float32(math.log(_SPLIT_SHRINK))
     rows[:, UPDATE_COUNT] = 0.0
     first, second = rows, rows.copy()
-    aside_m = _rotate(rows[:, QUAT], apart_m)
-    first[:, MEAN] += aside_m
-    second[:, MEAN] -= aside_m
+    rotated_m = _rotate(rows[:, QUAT], offset_m)
+    first[:, MEAN] += rotated_m
+    second[:, MEAN] -= rotated_m
     table.rows[parents] = first
     table.ema_rows[parents] = first
     table.first_moment[parents] = 0.0

@@ -30,7 +30,7 @@ def require_tables(
 
 
 def require_scene(n: int, camera: Camera, T_camera_world: Float64[ndarray, "4 4"], subset: Subset) -> None:
-    """Raise ShapeError unless pose and subset fit the camera; InvalidInputError unless ids are ascending row numbers."""
+    """Raise ShapeError unless pose and subset fit the camera, InvalidInputError unless ids are ascending."""
     require_array("T_camera_world", T_camera_world, (4, 4), np.float64)
     if subset.tiles is not None:
         grid = (-(-camera.height_px // TILE_PX), -(-camera.width_px // TILE_PX))

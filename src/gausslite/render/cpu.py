@@ -157,7 +157,10 @@ class CpuRasterizer:
         camera: Camera,
         weight: Float32[ndarray, "h w"] | None = None,
     ) -> TrainingView:
-        """Return the image in the kernels' layout. Raises ShapeError, InvalidInputError if a weight is outside [0, 1]."""
+        """Return the image in the kernels' layout.
+
+        Raises ShapeError, InvalidInputError if a weight is outside [0, 1].
+        """
         require_view(rgb, depth_m, camera, weight)
         native = load_kernels().View(np.ascontiguousarray(rgb), np.ascontiguousarray(depth_m), contiguous(weight))
         return CpuView(camera, intrinsics(camera), native)
@@ -176,7 +179,7 @@ class CpuRasterizer:
         trainable: Bool[ndarray, " n"] | None = None,
         update_counter: UpdateCounter | None = None,
     ) -> StepReport:
-        """Run one training iteration in place. Raises ShapeError, also for a view of another backend; InvalidInputError."""
+        """Run one training iteration in place. Raises ShapeError, also for a view of another backend."""
         if not isinstance(view, CpuView):
             raise ShapeError(f"view: expected one that this backend prepared, got {type(view).__name__}")
         with self._lock:

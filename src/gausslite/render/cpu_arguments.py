@@ -54,7 +54,7 @@ class CpuView:
     def scene(
         self, n: int, T_camera_world: Float64[ndarray, "4 4"], subset: Subset, masked: bool
     ) -> _kernels.StepScene:
-        """Return the native form of view, pose and subset for n rows. Raises ShapeError, InvalidInputError."""
+        """Return view, pose and subset in native form, for n rows. Raises ShapeError, InvalidInputError."""
         arguments, cached = (T_camera_world, subset), self.scenes.get(masked)
         if cached is not None and cached.matches(arguments):
             return cached.native

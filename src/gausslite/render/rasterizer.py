@@ -109,9 +109,9 @@ class LossWeights:
     + depth / W · Σ w |depth / alpha − measured|   where alpha > 0.5 and measured > 0
     + ssim · (1 − Σ w SSIM / (3W))   11x11 Gaussian window, sigma 1.5, zero padding, C1 = 1e-4, C2 = 9e-4
 
-    normalise_by_image multiplies the loss by W / (number of pixels). A pixel of weight 1 then has the same gradient with
-    any mask. Adam normalises by recent gradient magnitudes: without this factor, steps masked to a small region have
-    large gradients, and the steps on the full image hardly move the Gaussians that both train.
+    normalise_by_image multiplies the loss by W / (number of pixels). A pixel of weight 1 then has the same gradient
+    with any mask. Adam normalises by recent gradient magnitudes: without this factor, steps masked to a small region
+    have large gradients, and the steps on the full image hardly move the Gaussians that both train.
     """
 
     colour: float = 0.8

@@ -1,4 +1,4 @@
-"""The GPU backend: gsplat's kernels under the seam's image model, with everything kept on the device in training."""
+"""The GPU backend: gsplat's kernels behind the rasterizer interface, with all training data on the device."""
 
 from gausslite.render.cuda.rasterizer import CudaRasterizer
 

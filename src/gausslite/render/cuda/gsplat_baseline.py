@@ -1,4 +1,4 @@
-"""The library called as its manual calls it, with torch's Adam: what the cuda backend is measured against."""
+"""Training with gsplat as its manual describes, and torch's Adam: the baseline of the cuda backend's benchmark."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ from gausslite.render.cuda.tables import to_device
 from gausslite.render.rasterizer import LOG_SCALE, MEAN, NEAR_M, OPACITY_LOGIT, QUAT, RGB, LossWeights
 
 Rasterization = Callable[..., tuple[Tensor, Tensor, dict[str, Any]]]
-"""gsplat.rasterization: means, quats, scales, opacities, colors, viewmats, Ks, width, height to images."""
+"""Signature of gsplat.rasterization: means, quats, scales, opacities, colors, viewmats, Ks, width, height → images."""
 
 
 def load_gsplat_rasterization() -> Rasterization:
-    """The real one. Raises KernelError where its kernels cannot run."""
-    found: Rasterization = load_gsplat().rasterization
-    return found
+    """Return gsplat.rasterization. Raises KernelError if its kernels cannot run."""
+    rasterization: Rasterization = load_gsplat().rasterization
+    return rasterization
 
 
 class GsplatBaseline:
-    """Five parameter tensors, `rasterization`, this backend's loss over the whole image, one dense Adam.
+    """Training with five parameter tensors, `rasterization`, this backend's loss on the whole image and dense Adam.
 
-    Learning rates are zero, as in the other benchmarks: every iteration does the same work. The loss is ours because
-    it is no slower than what is usual; so the difference measured lies in drawing and updating.
+    The learning rates are zero, as in the other benchmarks, so that every iteration does the same work. The loss is
+    this backend's, which is as fast as usual implementations: the benchmark compares rendering and updates.
     """
 
     def __init__(
@@ -53,7 +53,7 @@ class GsplatBaseline:
         self._view, self._loss, self._rasterization = view, loss, rasterization
 
     def train(self, iterations: int) -> float:
-        """So many iterations, waited for; the last one's loss."""
+        """Run this many iterations, wait for them and return the loss of the last one."""
         for _ in range(iterations):
             value = self._iterate()
         return float(value)

@@ -1,8 +1,8 @@
-"""The few of gsplat's operations that this backend calls, and a stand-in in plain torch for machines without a GPU.
+"""The gsplat operations of this backend, and an emulation in torch for machines without a GPU.
 
-gsplat (Ye et al. 2025, Apache-2.0) compiles its kernels for CUDA alone. Its own torch versions of the two projection
-steps run anywhere; sorting and compositing do not, so here the oracle's compositing stands in for them, with the two
-rules in which gsplat's differs.
+gsplat (Ye et al. 2025, Apache-2.0) compiles its kernels for CUDA only. Its torch versions of the two projection steps
+run on the CPU. The emulation replaces sorting and compositing by those of the reference backend, with gsplat's two
+different rules (GSPLAT_LIMITS).
 """
 
 from __future__ import annotations
@@ -19,18 +19,18 @@ from torch import Tensor
 from gausslite.domain.camera import Camera
 from gausslite.errors import KernelError
 from gausslite.render.rasterizer import TILE_PX
-from gausslite.render.reference.compositing import Limits, draw, draw_backward
+from gausslite.render.reference.compositing import Limits, render_images, render_images_backward
 from gausslite.render.reference.projection import Ellipses
 
-GSPLAT_LIMITS = Limits(max_alpha=0.999, draws_the_last=False)
-"""gsplat clamps alpha at 0.999 and leaves out the splat that would take the transmittance to 1e-4."""
+GSPLAT_LIMITS = Limits(max_alpha=0.999, blends_last_splat=False)
+"""gsplat clamps alpha at 0.999 and skips the splat that would take the transmittance to 1e-4."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Footprints:
-    """Splats as the compositing kernels want them, in any order, in pixels of the window to draw.
+    """Input of the compositing kernels: splats in any order, in pixels of the rendered window.
 
-    channels: red, green, blue and z. radius_px: half the bounding box beyond which alpha is below 1/255.
+    channels: red, green, blue and z. radius_px: half the bounding box of alpha >= 1/255.
     """
 
     means_px: Float32[Tensor, "m 2"]
@@ -42,15 +42,15 @@ class Footprints:
 
 @runtime_checkable
 class Kernels(Protocol):
-    """The operations of gsplat, on one device, differentiable."""
+    """Differentiable operations of gsplat on one device."""
 
     @property
     def device(self) -> torch.device:
-        """Where the tensors live."""
+        """The device of the tensors."""
         ...
 
     def covariances(self, quats_wxyz: Float32[Tensor, "m 4"], scales_m: Float32[Tensor, "m 3"]) -> Tensor:
-        """Covariances [m 3 3] in the frame of the means."""
+        """Return the covariances [m 3 3] in the frame of the means."""
         ...
 
     def project(
@@ -60,20 +60,20 @@ class Kernels(Protocol):
         intrinsics: Float32[Tensor, "3 3"],
         size: tuple[int, int],
     ) -> tuple[Tensor, Tensor]:
-        """Means [m 2] and covariances [m 2 2] in the image of this width and height, from the camera's frame."""
+        """Return means [m 2] and covariances [m 2 2] in the image of this width and height, from the camera frame."""
         ...
 
     def composite(
         self, footprints: Footprints, size: tuple[int, int], tiles: Bool[Tensor, "th tw"] | None
     ) -> tuple[Tensor, Tensor]:
-        """Channels [h w 4] and alpha [h w] of a window of this width and height; zero outside the tiles."""
+        """Return channels [h w 4] and alpha [h w] of a window of this width and height; zero outside the tiles."""
         ...
 
 
 def load_gsplat() -> ModuleType:
-    """The library with its kernels; unless its wheel brought them, the first use compiles them, which takes minutes.
+    """Import gsplat and its kernels; unless the wheel contains them, the first use compiles them in some minutes.
 
-    Raises KernelError where there is nothing to compile them with, ImportError without gsplat.
+    Raises KernelError without a CUDA toolkit, ImportError without gsplat.
     """
     import gsplat
     from gsplat.cuda import _backend
@@ -84,7 +84,7 @@ def load_gsplat() -> ModuleType:
 
 
 class GsplatKernels:
-    """gsplat's functions on a CUDA device."""
+    """gsplat on a CUDA device."""
 
     def __init__(self, gsplat: Any, device: torch.device) -> None:
         self._gsplat = gsplat
@@ -96,7 +96,7 @@ class GsplatKernels:
         return self._device
 
     def covariances(self, quats_wxyz: Float32[Tensor, "m 4"], scales_m: Float32[Tensor, "m 3"]) -> Tensor:
-        """Covariances [m 3 3]."""
+        """Return the covariances [m 3 3]."""
         covariances, _ = self._gsplat.quat_scale_to_covar_preci(quats_wxyz, scales_m, compute_preci=False)
         return cast(Tensor, covariances)
 
@@ -107,14 +107,14 @@ class GsplatKernels:
         intrinsics: Float32[Tensor, "3 3"],
         size: tuple[int, int],
     ) -> tuple[Tensor, Tensor]:
-        """Means and covariances in the image."""
+        """Return means and covariances in the image."""
         means_px, covariances_px2 = self._gsplat.proj(points_m[None], covariances_m2[None], intrinsics[None], *size)
         return means_px[0], covariances_px2[0]
 
     def composite(
         self, footprints: Footprints, size: tuple[int, int], tiles: Bool[Tensor, "th tw"] | None
     ) -> tuple[Tensor, Tensor]:
-        """Sort by tile and depth, and blend front to back."""
+        """Sort the splats by tile and depth, and blend them front to back."""
         width_px, height_px = size
         tile_rows, tile_columns = -(-height_px // TILE_PX), -(-width_px // TILE_PX)
         _, crossings, owners = self._gsplat.isect_tiles(
@@ -139,13 +139,13 @@ class GsplatKernels:
         )
         if tiles is None:
             return channels[0], alpha[0, ..., 0]
-        # in tiles that it leaves out, gsplat's kernel does not write alpha at all
-        shown = tiles.repeat_interleave(TILE_PX, 0).repeat_interleave(TILE_PX, 1)[:height_px, :width_px]
-        return torch.where(shown[..., None], channels[0], 0.0), torch.where(shown, alpha[0, ..., 0], 0.0)
+        # gsplat's kernel does not write alpha in inactive tiles
+        is_active = tiles.repeat_interleave(TILE_PX, 0).repeat_interleave(TILE_PX, 1)[:height_px, :width_px]
+        return torch.where(is_active[..., None], channels[0], 0.0), torch.where(is_active, alpha[0, ..., 0], 0.0)
 
 
 class TorchKernels:
-    """The same operations on the processor, slow, for the tests of all that surrounds the kernels."""
+    """The same operations on the CPU, slow, for tests of the code around the kernels."""
 
     def __init__(self) -> None:
         from gsplat.cuda import _torch_impl
@@ -154,11 +154,11 @@ class TorchKernels:
 
     @property
     def device(self) -> torch.device:
-        """The processor."""
+        """The CPU."""
         return torch.device("cpu")
 
     def covariances(self, quats_wxyz: Float32[Tensor, "m 4"], scales_m: Float32[Tensor, "m 3"]) -> Tensor:
-        """Covariances [m 3 3]."""
+        """Return the covariances [m 3 3]."""
         covariances, _ = self._gsplat._quat_scale_to_covar_preci(quats_wxyz, scales_m, compute_preci=False)
         return cast(Tensor, covariances)
 
@@ -169,7 +169,7 @@ class TorchKernels:
         intrinsics: Float32[Tensor, "3 3"],
         size: tuple[int, int],
     ) -> tuple[Tensor, Tensor]:
-        """Means and covariances in the image."""
+        """Return means and covariances in the image."""
         means_px, covariances_px2 = self._gsplat._persp_proj(
             points_m[None], covariances_m2[None], intrinsics[None], *size
         )
@@ -178,7 +178,7 @@ class TorchKernels:
     def composite(
         self, footprints: Footprints, size: tuple[int, int], tiles: Bool[Tensor, "th tw"] | None
     ) -> tuple[Tensor, Tensor]:
-        """Blend front to back by gsplat's rules, in double precision."""
+        """Blend front to back with gsplat's limits, in double precision."""
         columns = (footprints.means_px, footprints.conics, footprints.opacities, footprints.channels)
         blend: Callable[..., Tensor] = _Composite.apply
         images = blend(*columns, footprints.radius_px, size, tiles)
@@ -186,11 +186,11 @@ class TorchKernels:
 
 
 class _Composite(torch.autograd.Function):
-    """The oracle's two passes as one differentiable operation."""
+    """Forward and backward pass of the reference compositing as one differentiable operation."""
 
     @staticmethod
     def forward(ctx: Any, *inputs: Any) -> Tensor:
-        """Images of five channels, in double precision."""
+        """Return images of five channels, in double precision."""
         means_px, conics, opacities, channels, radius_px, (width_px, height_px), tiles = inputs
         order = torch.argsort(channels[:, 3], stable=True)
         columns = (column[order].double() for column in (means_px, conics, opacities, channels, radius_px))
@@ -198,19 +198,19 @@ class _Composite(torch.autograd.Function):
         ctx.ellipses = Ellipses(
             order, means_px, conics, opacities, channels[:, :3], channels[:, 3], torch.ceil(radius_px)
         )
-        # where the pixels are is all that compositing asks of a camera
+        # compositing uses only the image size of a camera
         ctx.camera = Camera(1.0, 1.0, 0.0, 0.0, width_px, height_px)
         ctx.tiles = None if tiles is None else tiles.numpy()
-        return draw(ctx.ellipses, ctx.camera, ctx.tiles, GSPLAT_LIMITS)
+        return render_images(ctx.ellipses, ctx.camera, ctx.tiles, GSPLAT_LIMITS)
 
     @staticmethod
     def backward(ctx: Any, *d_images: Tensor) -> tuple[Tensor | None, ...]:
-        """Gradients in single precision, in the order that the splats came in."""
+        """Return the gradients in single precision, in the order of the input."""
         ellipses: Ellipses = ctx.ellipses
         with torch.enable_grad():
-            sums = draw_backward(ellipses, ctx.camera, ctx.tiles, d_images[0], GSPLAT_LIMITS)
+            sums = render_images_backward(ellipses, ctx.camera, ctx.tiles, d_images[0], GSPLAT_LIMITS)
         d_means_px, d_conics, d_opacities, d_rgb, d_z_m = sums
         d_channels = torch.cat([d_rgb, d_z_m[:, None]], dim=1)
-        back = torch.argsort(ellipses.row_ids)
+        inverse_order = torch.argsort(ellipses.row_ids)
         columns = (d_means_px, d_conics, d_opacities, d_channels)
-        return (*(column[back].float() for column in columns), None, None, None)
+        return (*(column[inverse_order].float() for column in columns), None, None, None)

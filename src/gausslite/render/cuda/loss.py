@@ -1,4 +1,4 @@
-"""The training loss on the device: views prepared once, and only the window that a view's weight reaches."""
+"""The training loss on the device, on the image window in reach of the view's weights."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.nn.functional import conv2d
 
 from gausslite.domain.camera import Camera
-from gausslite.render.cuda.projection import Lens
+from gausslite.render.cuda.projection import DeviceCamera
 from gausslite.render.cuda.tables import to_device
 from gausslite.render.rasterizer import TILE_PX, LossWeights
 
@@ -24,7 +24,7 @@ _C1, _C2 = 1e-4, 9e-4
 
 @dataclass(frozen=True, slots=True)
 class Window:
-    """A part of the image that begins and ends on the borders of tiles (or of the image), in tiles and in pixels."""
+    """A part of the image between tile borders (or image borders), in tiles and in pixels."""
 
     tile_rows: slice
     tile_columns: slice
@@ -43,16 +43,16 @@ class Window:
 
     @classmethod
     def whole(cls, camera: Camera) -> Window:
-        """All of the image."""
+        """Return the window of the whole image."""
         return cls._between((0, camera.height_px), (0, camera.width_px), camera)
 
     @classmethod
     def around(cls, weight: Float32[ndarray, "h w"], camera: Camera) -> Window:
-        """The pixels of some weight and what their similarity looks at; one tile where there are none."""
+        """Return the window of all weighted pixels and their SSIM windows; one tile if no pixel has a weight."""
         spans = []
         for axis, length in ((1, camera.height_px), (0, camera.width_px)):
-            weighed = np.flatnonzero(weight.any(axis=axis))
-            first, last = (int(weighed[0]), int(weighed[-1])) if len(weighed) else (0, 0)
+            weighted = np.flatnonzero(weight.any(axis=axis))
+            first, last = (int(weighted[0]), int(weighted[-1])) if len(weighted) else (0, 0)
             spans.append((max(first - _REACH_PX, 0), min(last + 1 + _REACH_PX, length)))
         return cls._between(spans[0], spans[1], camera)
 
@@ -70,16 +70,17 @@ class Window:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Target:
-    """What a window of a view is compared with. similar: the view's own share of the similarity, mean and variance.
+class LossTarget:
+    """LossTarget of the loss in a window of a view.
 
-    A weight of None is 1 everywhere. share: the mean weight over the whole image.
+    ssim_terms: means and variances of the target in the SSIM windows. weight None: 1 everywhere. share: mean weight of
+    the whole image.
     """
 
     window: Window
     rgb: Float32[Tensor, "h w 3"]
     depth_m: Float32[Tensor, "h w"]
-    similar: Float32[Tensor, "6 h w"]
+    ssim_terms: Float32[Tensor, "6 h w"]
     weight: Float32[Tensor, "h w"] | None
     weight_sum: float
     share: float
@@ -87,12 +88,12 @@ class Target:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CudaView:
-    """A training image on the device, as a whole and as its weight shows it."""
+    """A training image on the device: targets of unmasked and of masked steps."""
 
     camera: Camera
-    lens: Lens
-    unmasked: Target
-    masked: Target
+    device_camera: DeviceCamera
+    unmasked: LossTarget
+    masked: LossTarget
 
     @classmethod
     def of(
@@ -103,41 +104,41 @@ class CudaView:
         weight: Float32[ndarray, "h w"] | None,
         device: torch.device,
     ) -> CudaView:
-        """Carry the images to the device, colours in [0, 1], with the sums that no drawing changes."""
+        """Copy the images to the device, colours in [0, 1], and compute the constant SSIM terms."""
         colours = to_device(rgb, device).float() / 255.0
         measured_m = to_device(depth_m, device)
         planes = colours.permute(2, 0, 1)
         blurred = _blur(torch.cat([planes, planes * planes]))
         means = blurred[:3]
-        similar = torch.cat([means, blurred[3:] - means * means])
-        unmasked = Target(Window.whole(camera), colours, measured_m, similar, None, float(depth_m.size), 1.0)
-        lens = Lens.of(camera, device)
+        ssim_terms = torch.cat([means, blurred[3:] - means * means])
+        unmasked = LossTarget(Window.whole(camera), colours, measured_m, ssim_terms, None, float(depth_m.size), 1.0)
+        device_camera = DeviceCamera.of(camera, device)
         if weight is None:
-            return cls(camera, lens, unmasked, unmasked)
+            return cls(camera, device_camera, unmasked, unmasked)
         window = Window.around(weight, camera)
         part, weight_sum = (window.rows, window.columns), float(weight.sum(dtype=np.float64))
-        masked = Target(
+        masked = LossTarget(
             window,
             colours[part],
             measured_m[part],
-            similar[:, window.rows, window.columns],
+            ssim_terms[:, window.rows, window.columns],
             to_device(weight[part], device),
             weight_sum,
             weight_sum / depth_m.size,
         )
-        return cls(camera, lens, unmasked, masked)
+        return cls(camera, device_camera, unmasked, masked)
 
 
 def training_loss(
-    channels: Float32[Tensor, "h w 4"], alpha: Float32[Tensor, "h w"], target: Target, loss: LossWeights
+    channels: Float32[Tensor, "h w 4"], alpha: Float32[Tensor, "h w"], target: LossTarget, loss: LossWeights
 ) -> Float32[Tensor, ""]:
-    """Eq. (1) as LossWeights spells it out, on a drawn window. What is left out of the window has no weight."""
+    """Return the loss of Eq. (1), as defined in LossWeights, on a rendered window that contains all weighted pixels."""
     if target.weight_sum == 0.0:
         return channels.sum() * 0.0
     rgb, depth_m = channels[..., :3], channels[..., 3]
     weight = torch.ones_like(alpha) if target.weight is None else target.weight
     colour = (weight[..., None] * (rgb - target.rgb).abs()).sum() / 3.0
-    # without selecting pixels: the host would have to wait for their number
+    # no selection of pixels: the host would wait for their number
     measured = (alpha > MIN_DEPTH_ALPHA) & (target.depth_m > 0)
     error_m = (depth_m / torch.where(measured, alpha, 1.0) - target.depth_m).abs()
     depth = torch.where(measured, weight * error_m, 0.0).sum()
@@ -148,22 +149,22 @@ def training_loss(
     return value * target.share if loss.normalise_by_image else value
 
 
-def _ssim_sum(rgb: Float32[Tensor, "h w 3"], target: Target) -> Float32[Tensor, "h w"]:
-    """Structural similarity of every pixel, summed over the channels, images padded with zeros (Wang et al. 2004)."""
-    planes, wanted = rgb.permute(2, 0, 1), target.rgb.permute(2, 0, 1)
-    blurred = _blur(torch.cat([planes, planes * planes, planes * wanted]))
-    mean, wanted_mean, wanted_variance = blurred[:3], target.similar[:3], target.similar[3:]
+def _ssim_sum(rgb: Float32[Tensor, "h w 3"], target: LossTarget) -> Float32[Tensor, "h w"]:
+    """Return the SSIM of every pixel, summed over the channels, with zero padding (Wang et al. 2004)."""
+    planes, target_planes = rgb.permute(2, 0, 1), target.rgb.permute(2, 0, 1)
+    blurred = _blur(torch.cat([planes, planes * planes, planes * target_planes]))
+    mean, target_mean, target_variance = blurred[:3], target.ssim_terms[:3], target.ssim_terms[3:]
     variance = blurred[3:6] - mean * mean
-    covariance = blurred[6:] - mean * wanted_mean
-    luminance = (2.0 * mean * wanted_mean + _C1) / (mean * mean + wanted_mean * wanted_mean + _C1)
-    return (luminance * (2.0 * covariance + _C2) / (variance + wanted_variance + _C2)).sum(dim=0)
+    covariance = blurred[6:] - mean * target_mean
+    luminance = (2.0 * mean * target_mean + _C1) / (mean * mean + target_mean * target_mean + _C1)
+    return (luminance * (2.0 * covariance + _C2) / (variance + target_variance + _C2)).sum(dim=0)
 
 
 def _blur(planes: Float32[Tensor, "k h w"]) -> Float32[Tensor, "k h w"]:
-    """Every plane under an 11x11 Gaussian, as two passes of eleven.
+    """Blur each plane with an 11x11 Gaussian, as two passes of 11 taps.
 
-    Depthwise, which torch computes in full single precision; of an ordinary convolution it may round the factors to
-    ten bits on a GPU, and variances would be lost in that.
+    The convolution is depthwise, which torch computes in full single precision. An ordinary convolution on a GPU may
+    round its factors to ten bits (TF32), which is too coarse for variances.
     """
     offsets = torch.arange(-_REACH_PX, _REACH_PX + 1, dtype=torch.float64, device=planes.device)
     kernel = torch.exp(-offsets.square() / (2.0 * _SIGMA_PX**2))

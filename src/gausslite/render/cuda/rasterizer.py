@@ -1,4 +1,4 @@
-"""The cuda backend: checks its input, and keeps splats, views and gradients on the device from step to step."""
+"""The cuda backend: checks its input and keeps splats, views and gradients on the device."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from gausslite.render.checks import (
 )
 from gausslite.render.cuda.kernels import Footprints, GsplatKernels, Kernels, TorchKernels, load_gsplat
 from gausslite.render.cuda.loss import CudaView, Window, training_loss
-from gausslite.render.cuda.projection import Lens, project, visible_rows
+from gausslite.render.cuda.projection import DeviceCamera, project, visible_rows
 from gausslite.render.cuda.tables import DeviceTables, HostTables, to_device
 from gausslite.render.rasterizer import (
     FULL_FRAME,
@@ -40,8 +40,8 @@ from gausslite.render.rasterizer import (
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Drawn:
-    """A drawn window with its graph: leaves (the visible rows, the pose if asked), the means between, the images."""
+class _RenderGraph:
+    """A rendered window with its autograd graph: leaves (visible rows, pose), projected means and images."""
 
     visible: Int64[Tensor, " m"]
     rows: Float32[Tensor, "m 16"]
@@ -52,18 +52,18 @@ class _Drawn:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Context:
-    """What `backward` needs beside the images."""
+class _BackwardContext:
+    """Data for `backward`."""
 
     owner: CudaRasterizer
-    drawn: _Drawn
-    lens: Lens
+    graph: _RenderGraph
+    device_camera: DeviceCamera
     n: int
     T_camera_world: Float64[ndarray, "4 4"]
 
 
 class _DeviceReport:
-    """A report whose figures wait on the device until they are asked for."""
+    """A report with values on the device; reading them waits for the device."""
 
     def __init__(self, loss: Tensor, visible: Int64[Tensor, " m"]) -> None:
         self._loss = loss
@@ -81,23 +81,22 @@ class _DeviceReport:
 
 
 class CudaRasterizer:
-    """gsplat under the seam: one GPU, single precision.
+    """gsplat behind the rasterizer interface, on one GPU, in single precision.
 
-    The image is the seam's but for two rules of gsplat's compositing kernel, which no parameter changes. It clamps
-    alpha at 0.999 where the seam says 0.99, and it leaves out the splat that would take a pixel's transmittance to
-    1e-4 or less where the seam draws it and stops after. A pixel where alpha stays below 0.99 and the transmittance
-    above 1e-4 is the same. Elsewhere colours in [0, 1] differ by less than 0.01 as long as no alpha exceeds 0.99, and
-    by less than 0.12 where one does: a nearly opaque splat is left out behind others that let through a tenth or less.
-    Sums of gradients run in no fixed order on a GPU, so results repeat only to rounding.
+    Two rules of gsplat's compositing kernel differ from the interface. gsplat clamps alpha at 0.999, not 0.99. It skips
+    the splat that would take the transmittance of a pixel to 1e-4 or less; the interface blends that splat and then
+    ends. Pixels with all alphas below 0.99 and a transmittance above 1e-4 are equal. Other colours in [0, 1] differ by
+    less than 0.01 if no alpha exceeds 0.99, else by less than 0.12: gsplat skips a nearly opaque splat behind others of
+    transmittance 0.1 or less. A GPU adds gradients in varying order, so results repeat only to rounding.
 
-    device `cpu` runs the same code over a slow stand-in for the kernels; it is there for tests. Raises KernelError
-    where the device cannot be used. No part of a table leaves the device between the steps of a loan; gsplat itself
-    asks for the number of tile crossings, and we for the number of visible rows, once a step.
+    device `cpu` runs the same code on a slow emulation of the kernels, for tests. Bound tables stay on the device
+    between steps. Each step synchronises twice, to read counts: of tile intersections (gsplat) and of visible rows.
+    Raises KernelError if the device cannot be used.
     """
 
     def __init__(self, device: str = "cuda") -> None:
         self._kernels = _kernels_for(device)
-        self._held: DeviceTables | None = None
+        self._bound: DeviceTables | None = None
 
     @property
     def name(self) -> str:
@@ -106,9 +105,9 @@ class CudaRasterizer:
 
     @property
     def device_name(self) -> str:
-        """What the driver calls the device."""
+        """Name of the device."""
         device = self._kernels.device
-        return str(torch.cuda.get_device_name(device)) if device.type == "cuda" else "processor (stand-in)"
+        return str(torch.cuda.get_device_name(device)) if device.type == "cuda" else "CPU (emulation)"
 
     def forward(
         self,
@@ -117,18 +116,18 @@ class CudaRasterizer:
         T_camera_world: Float64[ndarray, "4 4"],
         subset: Subset = FULL_FRAME,
     ) -> Rendering:
-        """Draw the splats. Raises ShapeError, InvalidInputError for ids that are not ascending rows."""
+        """Render the splats. Raises ShapeError, InvalidInputError if the ids are not ascending row numbers."""
         require_table("rows", rows)
         require_scene(len(rows), camera, T_camera_world, subset)
         on_device = to_device(rows, self._kernels.device)
-        lens = Lens.of(camera, self._kernels.device)
-        drawn = self._draw(on_device, lens, T_camera_world, subset, Window.whole(camera), pose_too=True)
-        channels = drawn.channels.detach().cpu().numpy()
+        device_camera = DeviceCamera.of(camera, self._kernels.device)
+        graph = self._render(on_device, device_camera, T_camera_world, subset, Window.whole(camera), pose_gradient=True)
+        channels = graph.channels.detach().cpu().numpy()
         return Rendering(
             np.ascontiguousarray(channels[..., :3]),
             np.ascontiguousarray(channels[..., 3]),
-            drawn.alpha.detach().cpu().numpy(),
-            _Context(self, drawn, lens, len(rows), T_camera_world.copy()),
+            graph.alpha.detach().cpu().numpy(),
+            _BackwardContext(self, graph, device_camera, len(rows), T_camera_world.copy()),
         )
 
     def backward(
@@ -138,25 +137,25 @@ class CudaRasterizer:
         d_depth_m: Float32[ndarray, "h w"],
         d_alpha: Float32[ndarray, "h w"],
     ) -> SplatGradients:
-        """Gradients of a scalar whose derivatives by the rendering's images are given.
+        """Return the gradients of a scalar, given its derivatives by the rendered images.
 
-        Raises ShapeError, InvalidInputError for a rendering that is not this backend's.
+        Raises ShapeError, InvalidInputError if the rendering is not this backend's.
         """
         context = rendering.context
-        if not isinstance(context, _Context) or context.owner is not self:
+        if not isinstance(context, _BackwardContext) or context.owner is not self:
             raise InvalidInputError("rendering: expected one of this rasterizer, got another's")
         require_image_gradients(rendering, d_rgb, d_depth_m, d_alpha)
-        drawn = context.drawn
+        graph = context.graph
         d_channels = np.concatenate([d_rgb, d_depth_m[..., None]], axis=2)
         device = self._kernels.device
         gradients, d_means_px, d_pose = torch.autograd.grad(
-            (drawn.channels, drawn.alpha),
-            (drawn.rows, drawn.means_px, drawn.T_camera_world),
+            (graph.channels, graph.alpha),
+            (graph.rows, graph.means_px, graph.T_camera_world),
             (to_device(d_channels, device), to_device(d_alpha, device)),
             retain_graph=True,
         )
-        norms = _norms_2d(d_means_px, context.lens)
-        visible = drawn.visible.cpu().numpy()
+        norms = _norms_2d(d_means_px, context.device_camera)
+        visible = graph.visible.cpu().numpy()
         d_rows = np.zeros((context.n, gradients.shape[1]), np.float32)
         d_rows[visible] = gradients.cpu().numpy()
         d_twist = _twist_gradient(d_pose.double().cpu().numpy(), context.T_camera_world)
@@ -169,7 +168,7 @@ class CudaRasterizer:
         camera: Camera,
         weight: Float32[ndarray, "h w"] | None = None,
     ) -> CudaView:
-        """Carry an image to the device. Raises ShapeError, InvalidInputError for weights outside [0, 1]."""
+        """Copy an image to the device. Raises ShapeError, InvalidInputError if a weight is outside [0, 1]."""
         require_view(rgb, depth_m, camera, weight)
         return CudaView.of(rgb, depth_m, camera, weight, self._kernels.device)
 
@@ -187,32 +186,33 @@ class CudaRasterizer:
         trainable: Bool[ndarray, " n"] | None = None,
         update_counter: UpdateCounter | None = None,
     ) -> StepReport:
-        """One whole iteration: in place on the device during a loan, else to_device there and back.
+        """Run one training iteration on the device; unbound tables are copied there and back.
 
-        Raises ShapeError, also for a view of another backend, InvalidInputError for tables other than the lent ones.
+        Raises ShapeError, also for a view of another backend; InvalidInputError if other tables are bound.
         """
         if not isinstance(view, CudaView):
             raise ShapeError(f"view: expected one that this backend prepared, got {type(view).__name__}")
         tables = HostTables(rows, first_moment, second_moment)
-        if self._held is None:
+        if self._bound is None:
             with self.bind_tables(rows, first_moment, second_moment):
-                return self.step(*tables.arrays, view, T_camera_world, loss, adam, masked, subset, trainable, update_counter)
-        if not self._held.host.same_memory_as(tables):
+                settings = loss, adam, masked, subset, trainable, update_counter
+                return self.step(*tables.arrays, view, T_camera_world, *settings)
+        if not self._bound.host.same_memory_as(tables):
             raise InvalidInputError("step: expected the bound tables, got others")
         require_scene(len(rows), view.camera, T_camera_world, subset)
         require_row_masks(len(rows), trainable, update_counter)
         target = view.masked if masked else view.unmasked
-        drawn = self._draw(self._held.rows, view.lens, T_camera_world, subset, target.window)
-        value = training_loss(drawn.channels, drawn.alpha, target, loss)
-        gradients, d_means_px = torch.autograd.grad(value, (drawn.rows, drawn.means_px))
-        moving, norms = drawn.visible, _norms_2d(d_means_px, view.lens)
+        graph = self._render(self._bound.rows, view.device_camera, T_camera_world, subset, target.window)
+        value = training_loss(graph.channels, graph.alpha, target, loss)
+        gradients, d_means_px = torch.autograd.grad(value, (graph.rows, graph.means_px))
+        row_ids, norms = graph.visible, _norms_2d(d_means_px, view.device_camera)
         if trainable is not None:
-            updated = torch.nonzero(to_device(trainable, moving.device)[moving])[:, 0]
-            moving, gradients, norms = moving[updated], gradients[updated], norms[updated]
-        self._held.update(moving, gradients, norms, adam)
+            updated = torch.nonzero(to_device(trainable, row_ids.device)[row_ids])[:, 0]
+            row_ids, gradients, norms = row_ids[updated], gradients[updated], norms[updated]
+        self._bound.update(row_ids, gradients, norms, adam)
         if update_counter is not None:
-            self._held.count(moving, update_counter)
-        return _DeviceReport(value.detach(), drawn.visible)
+            self._bound.count(row_ids, update_counter)
+        return _DeviceReport(value.detach(), graph.visible)
 
     @contextmanager
     def bind_tables(
@@ -221,38 +221,38 @@ class CudaRasterizer:
         first_moment: Float32[ndarray, "n 16"],
         second_moment: Float32[ndarray, "n 16"],
     ) -> Iterator[None]:
-        """Keep the tables on the device until the context ends.
+        """Keep copies of the tables on the device inside this context, and write them back at its end.
 
-        Raises ShapeError, InvalidInputError while others are on loan.
+        Raises ShapeError, InvalidInputError if tables are bound already.
         """
         require_tables(rows, first_moment, second_moment)
-        if self._held is not None:
+        if self._bound is not None:
             raise InvalidInputError("bind_tables: expected no bound tables, got a second binding")
-        self._held = DeviceTables(HostTables(rows, first_moment, second_moment), self._kernels.device)
+        self._bound = DeviceTables(HostTables(rows, first_moment, second_moment), self._kernels.device)
         try:
             yield
         finally:
-            held, self._held = self._held, None
-            held.write_back()
+            tables, self._bound = self._bound, None
+            tables.write_back()
 
-    def _draw(
+    def _render(
         self,
         rows: Float32[Tensor, "n 16"],
-        lens: Lens,
+        device_camera: DeviceCamera,
         T_camera_world: Float64[ndarray, "4 4"],
         subset: Subset,
         window: Window,
-        pose_too: bool = False,
-    ) -> _Drawn:
-        """Project the visible rows and blend them in the window; pose_too: ready for gradients by the pose."""
+        pose_gradient: bool = False,
+    ) -> _RenderGraph:
+        """Project the visible rows and blend them in the window; pose_gradient: prepare gradients by the pose."""
         device = self._kernels.device
         pose = to_device(T_camera_world.astype(np.float32), device)
         ids = None if subset.ids is None else to_device(subset.ids.astype(np.int64), device)
-        visible = visible_rows(self._kernels, rows, lens, pose, ids, subset.tiles)
-        leaves, pose = rows[visible].requires_grad_(), pose.requires_grad_(pose_too)
-        footprints = project(self._kernels, leaves, lens, pose)
+        visible = visible_rows(self._kernels, rows, device_camera, pose, ids, subset.tiles)
+        leaves, pose = rows[visible].requires_grad_(), pose.requires_grad_(pose_gradient)
+        footprints = project(self._kernels, leaves, device_camera, pose)
         channels, alpha = self._composite(footprints, window, subset.tiles)
-        return _Drawn(visible, leaves, pose, footprints.means_px, channels, alpha)
+        return _RenderGraph(visible, leaves, pose, footprints.means_px, channels, alpha)
 
     def _composite(
         self, footprints: Footprints, window: Window, tiles: Bool[ndarray, "th tw"] | None
@@ -260,16 +260,16 @@ class CudaRasterizer:
         width_px, height_px = window.size
         device = self._kernels.device
         if len(footprints.opacities) == 0:
-            # an empty sum that still hangs on the leaves
-            nothing = footprints.means_px.sum() * 0.0
-            return nothing.expand(height_px, width_px, 4), nothing.expand(height_px, width_px)
-        shown = None
+            # an empty sum keeps the images connected to the leaves
+            zero = footprints.means_px.sum() * 0.0
+            return zero.expand(height_px, width_px, 4), zero.expand(height_px, width_px)
+        window_tiles = None
         if tiles is not None:
-            shown = to_device(tiles[window.tile_rows, window.tile_columns], device)
+            window_tiles = to_device(tiles[window.tile_rows, window.tile_columns], device)
         left, top = window.origin_px
-        moved_px = torch.stack([footprints.means_px[:, 0] - left, footprints.means_px[:, 1] - top], dim=1)
-        part = replace(footprints, means_px=moved_px)
-        return self._kernels.composite(part, window.size, shown)
+        window_means_px = torch.stack([footprints.means_px[:, 0] - left, footprints.means_px[:, 1] - top], dim=1)
+        part = replace(footprints, means_px=window_means_px)
+        return self._kernels.composite(part, window.size, window_tiles)
 
 
 def _kernels_for(device: str) -> Kernels:
@@ -286,13 +286,13 @@ def _kernels_for(device: str) -> Kernels:
         raise KernelError(f"cuda backend: needs gsplat; pip install gausslite[cuda] ({reason})") from reason
 
 
-def _norms_2d(d_means_px: Float32[Tensor, "m 2"], lens: Lens) -> Float32[Tensor, " m"]:
-    """Norms of the gradients by the means in the image, in half widths and half heights."""
-    norms: Tensor = (d_means_px * lens.half_size_px).norm(dim=1)
+def _norms_2d(d_means_px: Float32[Tensor, "m 2"], device_camera: DeviceCamera) -> Float32[Tensor, " m"]:
+    """Return the norms of the gradients by the image means, in half image widths and heights."""
+    norms: Tensor = (d_means_px * device_camera.half_size_px).norm(dim=1)
     return norms
 
 
 def _twist_gradient(d_pose: Float64[ndarray, "4 4"], T_camera_world: Float64[ndarray, "4 4"]) -> Float64[ndarray, "6"]:
-    """From a gradient by the entries of T_camera_world to one by the twist of exp(twist) T_camera_world at zero."""
-    turning = np.cross(T_camera_world[:3], d_pose[:3], axis=0).sum(axis=1)
-    return np.concatenate([d_pose[:3, 3], turning])
+    """Convert a gradient by the entries of T_camera_world to one by the twist of exp(twist) T_camera_world at 0."""
+    d_rotation = np.cross(T_camera_world[:3], d_pose[:3], axis=0).sum(axis=1)
+    return np.concatenate([d_pose[:3, 3], d_rotation])

@@ -1,4 +1,4 @@
-"""Keep parameters and Adam's moments on the device, and move them there by Adam's rule."""
+"""Store parameters and Adam's moments on the device, and apply Adam there."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ from gausslite.render.rasterizer import (
     UpdateCounter,
 )
 
-_COUNT_EVERY = 8
-"""So many tallies wait to be written together, so that the device runs on meanwhile."""
+_COUNTER_BATCH = 8
+"""Number of steps per update of the counters: each update waits for the device."""
 
 
 def to_device(array: NDArray[Any], device: torch.device) -> Tensor:
-    """The array on the device; of one that may not be written, which torch refuses to share, a copy."""
+    """Copy the array to the device; read-only arrays, which torch cannot share, are copied on the host first."""
     writable = array if array.flags.writeable and array.flags.c_contiguous else array.copy(order="C")
     return torch.from_numpy(writable).to(device)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HostTables:
-    """The caller's three arrays."""
+    """The three arrays of the caller."""
 
     rows: Float32[ndarray, "n 16"]
     first_moment: Float32[ndarray, "n 16"]
@@ -40,11 +40,11 @@ class HostTables:
 
     @property
     def arrays(self) -> tuple[ndarray, ndarray, ndarray]:
-        """All three."""
+        """The three arrays."""
         return self.rows, self.first_moment, self.second_moment
 
     def same_memory_as(self, other: HostTables) -> bool:
-        """True when all three are the same rows in the same place (views of a table are made anew at each call)."""
+        """Return True if all three arrays have the same addresses and shapes."""
         return all(
             a.ctypes.data == b.ctypes.data and a.shape == b.shape
             for a, b in zip(self.arrays, other.arrays, strict=True)
@@ -52,57 +52,60 @@ class HostTables:
 
 
 class DeviceTables:
-    """The three tables on a device. The copy is made at birth; `write_back` returns what became of it."""
+    """Copies of the three tables on a device; `write_back` copies them to the host arrays."""
 
     def __init__(self, host: HostTables, device: torch.device) -> None:
         self.host = host
-        # cloned, because on the processor a tensor would share the caller's memory
+        # copy=True: a tensor on the CPU would share the memory of the caller
         self.rows, self.first_moment, self.second_moment = (
             torch.from_numpy(array).to(device, copy=True) for array in host.arrays
         )
-        self._uncounted: list[tuple[Int64[Tensor, " m"], UpdateCounter]] = []
+        self._pending_counts: list[tuple[Int64[Tensor, " m"], UpdateCounter]] = []
 
     def write_back(self) -> None:
-        """Bring the caller's arrays up to date."""
-        self._write_tallies()
+        """Write counters and tables back to the host arrays."""
+        self._flush_counts()
         for array, tensor in zip(self.host.arrays, (self.rows, self.first_moment, self.second_moment), strict=True):
             torch.from_numpy(array).copy_(tensor)
 
-    def count(self, moved: Int64[Tensor, " m"], update_counter: UpdateCounter) -> None:
-        """These rows were trained; the update_counter learns of it by the end of the loan."""
-        self._uncounted.append((moved, update_counter))
-        if len(self._uncounted) == _COUNT_EVERY:
-            self._write_tallies()
+    def count(self, row_ids: Int64[Tensor, " m"], update_counter: UpdateCounter) -> None:
+        """Count an update of these rows; the counter changes at the latest in `write_back`."""
+        self._pending_counts.append((row_ids, update_counter))
+        if len(self._pending_counts) == _COUNTER_BATCH:
+            self._flush_counts()
 
-    def _write_tallies(self) -> None:
-        for moved, update_counter in self._uncounted:
-            rows = moved.cpu().numpy()
+    def _flush_counts(self) -> None:
+        for row_ids, update_counter in self._pending_counts:
+            rows = row_ids.cpu().numpy()
             update_counter.counts[rows if update_counter.mask is None else rows[update_counter.mask[rows]]] += 1
-        self._uncounted.clear()
+        self._pending_counts.clear()
 
     @torch.no_grad()
     def update(
         self,
-        moving: Int64[Tensor, " m"],
+        row_ids: Int64[Tensor, " m"],
         gradients: Float32[Tensor, "m 16"],
         mean_2d_norm: Float32[Tensor, " m"],
         adam: AdamSettings,
     ) -> None:
-        """Sparse Adam (Kingma and Ba 2015) on these rows, each with its own count of updates, and its statistics."""
-        first = self.first_moment[moving]
-        second = self.second_moment[moving]
-        rows = self.rows[moving]
-        trained = slice(0, UPDATE_COUNT)
-        gradient = gradients[:, trained]
-        first[:, trained].lerp_(gradient, 1.0 - adam.beta1)
-        second[:, trained].mul_(adam.beta2).addcmul_(gradient, gradient, value=1.0 - adam.beta2)
+        """Apply sparse Adam (Kingma and Ba 2015) to these rows and add their density statistics.
+
+        The bias correction uses each row's own number of updates.
+        """
+        first = self.first_moment[row_ids]
+        second = self.second_moment[row_ids]
+        rows = self.rows[row_ids]
+        columns = slice(0, UPDATE_COUNT)
+        gradient = gradients[:, columns]
+        first[:, columns].lerp_(gradient, 1.0 - adam.beta1)
+        second[:, columns].mul_(adam.beta2).addcmul_(gradient, gradient, value=1.0 - adam.beta2)
         updates = (rows[:, UPDATE_COUNT, None] + 1.0).clamp(max=MAX_UPDATE_COUNT)
-        slowed = (adam.decay_after_updates / updates).clamp(max=1.0).sqrt()
-        rates = to_device(adam.row_rates()[trained], rows.device)
-        first_unbiased = first[:, trained] / (1.0 - adam.beta1**updates)
-        second_unbiased = second[:, trained] / (1.0 - adam.beta2**updates)
-        rows[:, trained] -= slowed * rates * first_unbiased / (second_unbiased.sqrt() + adam.epsilon)
+        rate_decay = (adam.decay_after_updates / updates).clamp(max=1.0).sqrt()
+        rates = to_device(adam.row_rates()[columns], rows.device)
+        first_unbiased = first[:, columns] / (1.0 - adam.beta1**updates)
+        second_unbiased = second[:, columns] / (1.0 - adam.beta2**updates)
+        rows[:, columns] -= rate_decay * rates * first_unbiased / (second_unbiased.sqrt() + adam.epsilon)
         rows[:, UPDATE_COUNT] += 1.0
         first[:, GRAD_2D_SUM] += mean_2d_norm
         first[:, GRAD_2D_COUNT] += 1.0
-        self.rows[moving], self.first_moment[moving], self.second_moment[moving] = rows, first, second
+        self.rows[row_ids], self.first_moment[row_ids], self.second_moment[row_ids] = rows, first, second

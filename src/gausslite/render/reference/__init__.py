@@ -1,4 +1,4 @@
-"""The oracle: the image model written plainly in float64 torch, slow and easy to check."""
+"""The reference backend: the image model in plain float64 torch, slow and easy to check."""
 
 from gausslite.render.reference.rasterizer import ReferenceRasterizer
 

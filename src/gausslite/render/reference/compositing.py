@@ -1,4 +1,4 @@
-"""Blend ellipses front to back, one tile at a time, so that memory stays that of the busiest tile."""
+"""Blend ellipses front to back, one tile at a time, to bound the memory (3DGS, Kerbl et al. 2023)."""
 
 from __future__ import annotations
 
@@ -20,33 +20,33 @@ MIN_TRANSMITTANCE = 1e-4
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """Where alpha is clamped, and whether the splat that takes the transmittance to its minimum is still drawn."""
+    """Where alpha is clamped, and whether the splat that reaches the minimum transmittance is blended."""
 
     max_alpha: float = MAX_ALPHA
-    draws_the_last: bool = True
+    blends_last_splat: bool = True
 
 
-OUR_LIMITS = Limits()
+DEFAULT_LIMITS = Limits()
 
 
 def composite(
-    ellipses: Ellipses, pixels: Float64[Tensor, "p 2"], limits: Limits = OUR_LIMITS
+    ellipses: Ellipses, pixels: Float64[Tensor, "p 2"], limits: Limits = DEFAULT_LIMITS
 ) -> Float64[Tensor, "p 5"]:
-    """Red, green, blue, depth and alpha of these pixel centres."""
+    """Return red, green, blue, depth and alpha at these pixel centres."""
     dx, dy = (pixels[None] - ellipses.means_px[:, None]).unbind(dim=2)
     a, b, c = ellipses.conics[:, :, None].unbind(dim=1)
     alpha = ellipses.opacities[:, None] * torch.exp(-0.5 * (a * dx * dx + 2.0 * b * dx * dy + c * dy * dy))
     alpha = torch.where(alpha < MIN_ALPHA, 0.0, alpha.clamp(max=limits.max_alpha))
     transmittance = torch.cumprod(1.0 - alpha, dim=0)
     before = torch.cat([torch.ones_like(transmittance[:1]), transmittance[:-1]])
-    hidden = before < MIN_TRANSMITTANCE if limits.draws_the_last else transmittance <= MIN_TRANSMITTANCE
+    hidden = before < MIN_TRANSMITTANCE if limits.blends_last_splat else transmittance <= MIN_TRANSMITTANCE
     weights = torch.where(hidden, 0.0, alpha * before)
     channels = torch.cat([ellipses.rgb, ellipses.z_m[:, None], torch.ones_like(ellipses.z_m)[:, None]], dim=1)
     return weights.T @ channels
 
 
-def tiles_of(camera: Camera, tiles: Bool[ndarray, "th tw"] | None) -> Iterator[tuple[slice, slice]]:
-    """Image rows and columns of every drawn tile, cut at the image's border."""
+def tile_slices(camera: Camera, tiles: Bool[ndarray, "th tw"] | None) -> Iterator[tuple[slice, slice]]:
+    """Yield the image rows and columns of each rendered tile, clipped to the image."""
     tile_rows, tile_columns = tile_grid(camera)
     for row in range(tile_rows):
         for column in range(tile_columns):
@@ -58,33 +58,32 @@ def tiles_of(camera: Camera, tiles: Bool[ndarray, "th tw"] | None) -> Iterator[t
                 )
 
 
-def draw(
-    ellipses: Ellipses, camera: Camera, tiles: Bool[ndarray, "th tw"] | None, limits: Limits = OUR_LIMITS
+def render_images(
+    ellipses: Ellipses, camera: Camera, tiles: Bool[ndarray, "th tw"] | None, limits: Limits = DEFAULT_LIMITS
 ) -> Float64[Tensor, "h w 5"]:
-    """The images, differentiable if the ellipses are; pixels outside the drawn tiles are zero."""
+    """Return the images, differentiable if the ellipses are; pixels outside the tiles are zero."""
     images = torch.zeros(camera.height_px, camera.width_px, 5, dtype=torch.float64)
-    for rows, columns in tiles_of(camera, tiles):
+    for rows, columns in tile_slices(camera, tiles):
         inside = _overlapping(ellipses, rows, columns)
         tile = composite(ellipses.take(inside), _centres(rows, columns), limits)
         images[rows, columns] = tile.reshape(rows.stop - rows.start, columns.stop - columns.start, 5)
     return images
 
 
-def draw_backward(
+def render_images_backward(
     ellipses: Ellipses,
     camera: Camera,
     tiles: Bool[ndarray, "th tw"] | None,
     d_images: Float64[Tensor, "h w 5"],
-    limits: Limits = OUR_LIMITS,
+    limits: Limits = DEFAULT_LIMITS,
 ) -> tuple[Tensor, ...]:
-    """Gradients by each of `ellipses.differentiable`, drawing every tile once more with autograd."""
+    """Return the gradients by each of `ellipses.differentiable`; renders each tile again, with autograd."""
     sums = tuple(torch.zeros_like(column) for column in ellipses.differentiable)
-    for rows, columns in tiles_of(camera, tiles):
+    for rows, columns in tile_slices(camera, tiles):
         inside = _overlapping(ellipses, rows, columns)
         if len(inside) == 0:
             continue
-        part = ellipses.take(inside)
-        part = part.detached()
+        part = ellipses.take(inside).detached()
         tile = composite(part, _centres(rows, columns), limits)
         gradients = torch.autograd.grad(tile, part.differentiable, d_images[rows, columns].reshape(-1, 5))
         for total, gradient in zip(sums, gradients, strict=True):
@@ -93,7 +92,7 @@ def draw_backward(
 
 
 def _overlapping(ellipses: Ellipses, rows: slice, columns: slice) -> Tensor:
-    """Positions of the ellipses whose bounding box reaches into the tile."""
+    """Return the positions of the ellipses whose bounding box overlaps the tile."""
     low = torch.tensor([columns.start, rows.start], dtype=torch.float64)
     high = torch.tensor([columns.stop, rows.stop], dtype=torch.float64)
     means_px = ellipses.means_px.detach()

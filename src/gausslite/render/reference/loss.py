@@ -1,4 +1,4 @@
-"""The training loss of Eq. (1) on a drawn image, as LossWeights spells it out."""
+"""The training loss of Eq. (1) on a rendered image, as defined in LossWeights."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class ReferenceView:
 def training_loss(
     images: Float64[Tensor, "h w 5"], view: ReferenceView, loss: LossWeights, masked: bool
 ) -> Float64[Tensor, ""]:
-    """The weighted sum of the three terms."""
+    """Return the weighted sum of the three terms."""
     weight = view.weight if masked else torch.ones_like(view.weight)
     total = weight.sum()
     if total == 0:
@@ -47,7 +47,7 @@ def training_loss(
 
 
 def ssim_map(a: Float64[Tensor, "h w 3"], b: Float64[Tensor, "h w 3"]) -> Float64[Tensor, "h w 3"]:
-    """Structural similarity of every pixel and channel, images padded with zeros (Wang et al. 2004)."""
+    """Return the SSIM of every pixel and channel, with zero padding (Wang et al. 2004)."""
     mean_a, mean_b = _blur(a), _blur(b)
     variance_a = _blur(a * a) - mean_a * mean_a
     variance_b = _blur(b * b) - mean_b * mean_b

@@ -1,4 +1,4 @@
-"""From rows to ellipses in the image (EWA splatting), differentiable in the rows and in the camera's pose."""
+"""Project rows to ellipses in the image (EWA splatting), differentiable in the rows and the camera pose."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ TANGENT_MARGIN = 1.3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Ellipses:
-    """The visible splats in drawing order. conics hold (a, b, c) of the inverse 2D covariance [[a, b], [b, c]].
+    """The visible splats, nearest first. conics: (a, b, c) of the inverse 2D covariance [[a, b], [b, c]].
 
-    half_box_px is half the bounding box of the ellipse alpha >= 1/255; it and row_ids carry no gradient.
+    half_box_px: half the bounding box of the ellipse alpha >= 1/255, without a gradient.
     """
 
     row_ids: Int64[Tensor, " m"]
@@ -36,16 +36,16 @@ class Ellipses:
 
     @property
     def differentiable(self) -> tuple[Tensor, ...]:
-        """The columns that gradients flow through."""
+        """The columns with gradients."""
         return self.means_px, self.conics, self.opacities, self.rgb, self.z_m
 
     def detached(self) -> Ellipses:
-        """The same ellipses as leaves of a new graph."""
+        """Return the same ellipses as leaves of a new graph."""
         means_px, conics, opacities, rgb, z_m = (column.detach().requires_grad_() for column in self.differentiable)
         return Ellipses(self.row_ids, means_px, conics, opacities, rgb, z_m, self.half_box_px)
 
     def take(self, chosen: Tensor) -> Ellipses:
-        """The ellipses at these positions or where this mask is true, in the same order."""
+        """Return the ellipses at these positions, or where this mask is True, in the same order."""
         return Ellipses(
             self.row_ids[chosen],
             self.means_px[chosen],
@@ -64,17 +64,17 @@ def project(
     ids: Int64[Tensor, " k"] | None = None,
     tiles: Bool[ndarray, "th tw"] | None = None,
 ) -> Ellipses:
-    """Project the rows (only `ids`, if given) and keep those that can touch a pixel of `tiles`, nearest first."""
+    """Return the ellipses of the rows (of `ids`, if given) that can touch a pixel of `tiles`, nearest first."""
     with torch.no_grad():
-        drawable = torch.isfinite(rows[:, :14]).all(dim=1) & (rows[:, QUAT].abs().sum(dim=1) > 0)
-        row_ids = torch.nonzero(drawable)[:, 0] if ids is None else ids[drawable[ids]]
+        is_valid = torch.isfinite(rows[:, :14]).all(dim=1) & (rows[:, QUAT].abs().sum(dim=1) > 0)
+        row_ids = torch.nonzero(is_valid)[:, 0] if ids is None else ids[is_valid[ids]]
         z_m = rows[row_ids, MEAN] @ T_camera_world[2, :3] + T_camera_world[2, 3]
         ellipses = _ellipses(rows, row_ids[z_m >= NEAR_M], camera, T_camera_world)
         finite = torch.isfinite(ellipses.half_box_px).all(dim=1) & torch.isfinite(ellipses.means_px).all(dim=1)
         ellipses = ellipses.take(finite & (ellipses.opacities > MIN_ALPHA))
         ellipses = ellipses.take(_touches_tiles(ellipses, camera, tiles))
         row_ids = ellipses.row_ids[torch.argsort(ellipses.z_m, stable=True)]
-    # projected again with gradients, so that none flows through what was culled
+    # project again with gradients, only the rows that are not culled
     return _ellipses(rows, row_ids, camera, T_camera_world)
 
 
@@ -101,7 +101,7 @@ def _ellipses(
 def _covariance_px2(
     kept: Float64[Tensor, "m 16"], points: Float64[Tensor, "m 3"], R: Float64[Tensor, "3 3"], camera: Camera
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """J R Σ Rᵀ Jᵀ plus the low-pass filter as var x, cov xy, var y; the Jacobian is taken at the clamped tangent."""
+    """Return var x, cov xy, var y of J R Σ Rᵀ Jᵀ plus the low-pass filter; J is evaluated at the clamped tangent."""
     x, y, z = points.unbind(dim=1)
     limit_x = TANGENT_MARGIN * 0.5 * camera.width_px / camera.fx_px
     limit_y = TANGENT_MARGIN * 0.5 * camera.height_px / camera.fy_px
@@ -134,14 +134,14 @@ def _rotations(quats_wxyz: Float64[Tensor, "m 4"]) -> Float64[Tensor, "m 3 3"]:
 
 
 def _touches_tiles(ellipses: Ellipses, camera: Camera, tiles: Bool[ndarray, "th tw"] | None) -> Bool[Tensor, " m"]:
-    """True where the bounding box holds a pixel centre of a drawn tile (of any tile, when `tiles` is None)."""
+    """Return True where the bounding box contains a pixel centre of the tiles (None: of the image)."""
     last = torch.tensor([camera.width_px - 1, camera.height_px - 1], dtype=torch.float64)
     low = torch.ceil(ellipses.means_px - ellipses.half_box_px - 0.5).clamp(min=0.0)
     high = torch.minimum(torch.floor(ellipses.means_px + ellipses.half_box_px - 0.5), last)
     hit = (low <= high).all(dim=1)
     if tiles is None:
         return hit
-    # how many drawn tiles lie in the box, by four corners of a summed-area table
+    # number of rendered tiles in the box, from four corners of a summed-area table
     table = torch.from_numpy(np.pad(tiles.cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0))))
     x0, y0 = (torch.minimum(low, last).long() // TILE_PX).unbind(dim=1)
     x1, y1 = (high.clamp(min=0.0).long() // TILE_PX + 1).unbind(dim=1)
@@ -149,19 +149,19 @@ def _touches_tiles(ellipses: Ellipses, camera: Camera, tiles: Bool[ndarray, "th 
 
 
 def skew(v: Float64[Tensor, "3"]) -> Float64[Tensor, "3 3"]:
-    """The matrix of the cross product with v."""
+    """Return the matrix of the cross product with v."""
     zero = torch.zeros((), dtype=v.dtype)
     x, y, z = v.unbind()
     return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3)
 
 
-def moved(T_camera_world: Float64[Tensor, "4 4"], twist: Float64[Tensor, "6"]) -> Float64[Tensor, "4 4"]:
-    """exp(twist) T_camera_world to first order, which has the exact derivative at twist 0."""
+def apply_twist(T_camera_world: Float64[Tensor, "4 4"], twist: Float64[Tensor, "6"]) -> Float64[Tensor, "4 4"]:
+    """Return exp(twist) T_camera_world to first order; the derivative at twist 0 is exact."""
     top = torch.cat([skew(twist[3:]), twist[:3, None]], dim=1)
     generator = torch.cat([top, torch.zeros(1, 4, dtype=torch.float64)])
     return T_camera_world + generator @ T_camera_world
 
 
 def tile_grid(camera: Camera) -> tuple[int, int]:
-    """Rows and columns of tiles that cover the image."""
+    """Return the numbers of tile rows and columns of the image."""
     return math.ceil(camera.height_px / TILE_PX), math.ceil(camera.width_px / TILE_PX)
