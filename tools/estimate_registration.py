@@ -32,10 +32,10 @@ def main() -> int:
         return 2
     print(
         f"{found.edge_points} depth edge points; colour's gradient there is "
-        f"{found.score_before:.2f} times its surroundings as it is, {found.score:.2f} times with this camera",
+        f"{found.unregistered_score:.2f} times its surroundings as it is, {found.score:.2f} times with this camera",
         file=sys.stderr,
     )
-    print(found.camera)
+    print(found.registration)
     return 0
 
 

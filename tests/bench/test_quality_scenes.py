@@ -15,7 +15,8 @@ from gausslite.cli.main import main
 from gausslite.domain.relevance import RelevanceMap
 from gausslite.errors import DatasetError, InvalidInputError
 from gausslite.mission.settings import SceneInfo
-from gausslite_bench.quality.scenes import RealScenePlan, RecordedRelevanceEstimator, Scene, real_plans
+from gausslite_bench.quality.real_scenes import RealScenePlan, real_plans
+from gausslite_bench.quality.scenes import RecordedRelevanceEstimator, Scene
 from gausslite_bench.quality.trials import Conditions, PerceptionMode, Trial, TrialBudget, Variant, build_map
 
 
@@ -45,9 +46,9 @@ def test_other_regions_under_the_same_names_are_another_scene(tmp_path: Path) ->
 def test_another_camera_is_another_scene(tmp_path: Path) -> None:
     folder = write_seven_scenes(tmp_path / "kitchen")
     [plan] = real_plans(folder, write_regions(tmp_path / "roi.npz", (0, 0, 20)))
-    before = plan.place()
+    before = plan.training_settings()
     (folder / "camera-intrinsics.txt").write_text("21 0 7.5\n0 21 5.5\n0 0 1\n")
-    assert plan.place() != before
+    assert plan.training_settings() != before
 
 
 def test_a_sequence_is_named_by_its_folder_wherever_one_stands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -79,7 +80,7 @@ def test_the_words_of_a_task_find_the_regions_of_a_real_sequence(tmp_path: Path)
         Variant("task", "task"),
         TrialBudget(200, iterations=1),
         0,
-        Conditions((16, 16), PerceptionMode(words=True), 1),
+        Conditions((16, 16), PerceptionMode(from_text=True), 1),
     )
     assert build_map(trial, plan.load((16, 16)), lambda _: None).gaussians.active.any()
 
@@ -102,21 +103,21 @@ def write_kitchen(folder: Path, **regions: list[tuple[int, int, int]]) -> tuple[
 
 
 def bench_quality(kitchen: Path, roi: Path, out: Path) -> int:
-    asked = ["--real", str(kitchen), "--roi", str(roi), "--size", "16x16", "--policies", "task", "--iterations", "1"]
-    return main(["bench", "quality", *asked, "--max-gaussians", "150", "--threads", "1", "--out", str(out)])
+    options = ["--real", str(kitchen), "--roi", str(roi), "--size", "24x18", "--policies", "task", "--iterations", "1"]
+    return main(["bench", "quality", *options, "--max-gaussians", "150", "--threads", "1", "--out", str(out)])
 
 
-def test_a_kind_that_no_held_out_view_shows_is_left_out_and_told(
+def test_a_kind_that_no_held_out_view_shows_is_skipped_with_a_message(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     pytest.importorskip("gausslite.render._kernels", reason="the native kernels are not built")
     kitchen, roi = write_kitchen(tmp_path, mug_1=WALL, lamp_1=[(500, 500, 500)])
     assert bench_quality(kitchen, roi, tmp_path / "out") == 0
-    said = capsys.readouterr()
-    why = "kitchen-lamp: expected held-out views that show at least 64 pixels of lamp_1 at 16x16, got none of 1"
-    assert f"left out: {why}" in said.err
-    assert re.search(r"\| kitchen-mug \| Find the mug \| [\d.]+% in 1 of 1 views \|", said.out)
-    assert "kitchen-lamp" not in said.out
+    output = capsys.readouterr()
+    reason = "kitchen-lamp: expected held-out views that show at least 64 pixels of lamp_1 at 16x16, got none of 1"
+    assert f"skipped: {reason}" in output.err
+    assert re.search(r"\| kitchen-mug \| Find the mug \| [\d.]+% in 1 of 1 views \|", output.out)
+    assert "kitchen-lamp" not in output.out
 
 
 def test_a_sequence_without_depth_is_not_said_to_lack_the_region(tmp_path: Path) -> None:
@@ -136,19 +137,19 @@ def test_regions_of_another_sequence_are_refused(tmp_path: Path, capsys: pytest.
     assert not (tmp_path / "out" / "quality.md").exists()
 
 
-def test_a_map_of_regions_that_were_never_seen_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_map_of_regions_that_no_frame_shows_has_a_message(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("gausslite.render._kernels", reason="the native kernels are not built")
     kitchen, roi = write_kitchen(tmp_path, mug_1=WALL, lamp_1=[(500, 500, 500)])
-    for name, told in (("lamp_1", True), ("mug_1", False)):
-        asked = ["--roi", str(roi), "--objects", name, "--max-gaussians", "150", "--threads", "1"]
-        assert main(["map", str(kitchen), *asked, "--out", str(tmp_path / name)]) == 0
-        assert ("none of these frames shows the region" in capsys.readouterr().out) is told
+    for name, reported in (("lamp_1", True), ("mug_1", False)):
+        options = ["--roi", str(roi), "--objects", name, "--max-gaussians", "150", "--threads", "1"]
+        assert main(["map", str(kitchen), *options, "--out", str(tmp_path / name)]) == 0
+        assert ("none of these frames shows the selected region" in capsys.readouterr().out) is reported
     assert (
         main(["eval", str(tmp_path / "mug_1" / "map.ply"), str(kitchen), "--roi", str(roi), "--objects", "lamp_1"]) == 0
     )
     assert capsys.readouterr().out.startswith("no view shows 64 pixels of the region; full PSNR ")
     assert main(["eval", str(tmp_path / "mug_1" / "map.ply"), str(kitchen)]) == 0
-    assert capsys.readouterr().out.startswith("no region was asked for; full PSNR ")
+    assert capsys.readouterr().out.startswith("no region was options for; full PSNR ")
 
 
 def test_a_rates_cost_is_not_measured_where_no_view_shows_the_region(
@@ -162,12 +163,12 @@ def test_a_rates_cost_is_not_measured_where_no_view_shows_the_region(
 def test_a_real_sequences_own_regions_are_the_usual_ones(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("gausslite.render._kernels", reason="the native kernels are not built")
     kitchen, roi = write_kitchen(tmp_path, mug_1=WALL)
-    asked = ["bench", "quality", "--real", str(kitchen), "--policies", "task", "--iterations", "1", "--threads", "1"]
-    asked += ["--max-gaussians", "150", "--out", str(tmp_path / "out")]
-    assert main(asked) == 2
+    options = ["bench", "quality", "--real", str(kitchen), "--policies", "task", "--iterations", "1", "--threads", "1"]
+    options += ["--max-gaussians", "150", "--out", str(tmp_path / "out")]
+    assert main(options) == 2
     assert f"and no {kitchen / 'roi_voxels.npz'}" in capsys.readouterr().err
     roi.rename(kitchen / "roi_voxels.npz")
-    assert main(asked) == 0
+    assert main(options) == 0
     # 16x12 is its own size, which has fewer pixels than 320x240
     [record] = (tmp_path / "out" / "trials").glob("kitchen-mug-task-*.json")
     assert "size=(16, 12)" in json.loads(record.read_text())["settings"]["conditions"]
@@ -177,7 +178,7 @@ def test_wrong_kinds_are_told_before_the_colour_camera_is_looked_for(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     kitchen, roi = write_kitchen(tmp_path, mug_1=WALL)
-    asked = ["--real", str(kitchen), "--roi", str(roi), "--kinds", "mugs", "--out", str(tmp_path / "out")]
-    assert main(["bench", "quality", *asked]) == 2
+    options = ["--real", str(kitchen), "--roi", str(roi), "--kinds", "mugs", "--out", str(tmp_path / "out")]
+    assert main(["bench", "quality", *options]) == 2
     [line] = capsys.readouterr().err.splitlines()
     assert "kinds: expected names among mug, got mugs" in line

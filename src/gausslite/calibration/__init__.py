@@ -1,1 +1,1 @@
-"""Estimate what the recording does not state: depth registration, pose and exposure errors."""
+"""Estimates of what a recording does not state: depth registration, pose error and exposure error."""

@@ -1,1 +1,1 @@
-"""Sequences of posed RGB-D frames: files of known layouts and a simulated home, all behind one Source."""
+"""Sequences of posed RGB-D frames: readers of known folder layouts, behind one `Source` protocol."""

@@ -1,4 +1,4 @@
-"""Read colour and depth images, refuse damaged ones by name, and bring them to the size asked for."""
+"""Read and resize colour and depth images; reject damaged files by name."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _PNG_START = 8
 
 @dataclass(frozen=True, slots=True)
 class DepthUnits:
-    """How a 16-bit depth image counts: units per metre, and the values that mean no return."""
+    """Units per metre of a 16-bit depth image, and the values that mark missing depth."""
 
     per_metre: float
     invalid: tuple[int, ...] = (0,)
@@ -33,7 +33,7 @@ class DepthUnits:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RgbdImage:
-    """A colour and a depth image of one size, with the camera of that size."""
+    """A colour and a depth image of the same size, with the camera for this size."""
 
     rgb: UInt8[ndarray, "h w 3"]
     depth_m: Float32[ndarray, "h w"]
@@ -41,14 +41,14 @@ class RgbdImage:
 
 
 def read_colour(path: Path) -> UInt8[ndarray, "h w 3"]:
-    """An 8-bit RGB image. Raises DatasetError naming the file."""
+    """Return an 8-bit RGB image. Raises DatasetError with the file name."""
     bgr = _decode(path, cv2.IMREAD_COLOR)
     rgb: UInt8[ndarray, "h w 3"] = np.ascontiguousarray(bgr[..., ::-1])
     return rgb
 
 
 def read_depth(path: Path, units: DepthUnits) -> Float32[ndarray, "h w"]:
-    """Depth in metres, 0 where invalid. Raises DatasetError naming the file."""
+    """Return depth in metres, 0 if invalid. Raises DatasetError with the file name."""
     raw = _decode(path, cv2.IMREAD_UNCHANGED)
     if raw.dtype != np.uint16 or raw.ndim != 2:
         raise DatasetError(f"{path}: expected a 16-bit image of one channel, got {raw.dtype} of shape {raw.shape}")
@@ -60,18 +60,18 @@ def read_depth(path: Path, units: DepthUnits) -> Float32[ndarray, "h w"]:
 def load_rgbd(
     colour_path: Path, depth_path: Path, camera: Camera, units: DepthUnits, size: tuple[int, int] | None
 ) -> RgbdImage:
-    """Both images of a frame at (width, height); at the camera's own size when None. Raises DatasetError."""
+    """Return both images of a frame at (width, height), or at the camera's own size if None. Raises DatasetError."""
     rgb, depth_m = read_colour(colour_path), read_depth(depth_path, units)
     if rgb.shape[:2] != depth_m.shape:
         raise DatasetError(f"{depth_path}: expected the size of {colour_path.name}, {_size(rgb)}, got {_size(depth_m)}")
     if rgb.shape[:2] != (camera.height_px, camera.width_px):
-        wanted = f"{camera.width_px}x{camera.height_px}"
-        raise DatasetError(f"{colour_path}: expected the camera's size {wanted}, got {_size(rgb)}")
+        expected = f"{camera.width_px}x{camera.height_px}"
+        raise DatasetError(f"{colour_path}: expected the camera's size {expected}, got {_size(rgb)}")
     return resize_rgbd(RgbdImage(rgb, depth_m, camera), size)
 
 
 def resize_rgbd(image: RgbdImage, size: tuple[int, int] | None) -> RgbdImage:
-    """Bring an image to (width, height): colour by area, depth by nearest pixel centre (depth must not be mixed)."""
+    """Resize an image to (width, height): colour by area, depth by nearest pixel (averages lie on no surface)."""
     if size is None or size == (image.camera.width_px, image.camera.height_px):
         return image
     width, height = size
@@ -86,31 +86,31 @@ def _decode(path: Path, flags: int) -> NDArray[Any]:
     try:
         data = path.read_bytes()
     except FileNotFoundError:
-        raise DatasetError(f"{path}: expected an image, there is none") from None
+        raise DatasetError(f"{path}: expected an image, got none") from None
     except OSError as error:
         raise DatasetError(f"{path}: expected a readable image, got {type(error).__name__}") from None
-    # decoders fill what a truncated file lacks with grey and go on: look for the format's end mark first
+    # decoders fill a truncated file with grey without an error, so check the end marker first
     ending = _ENDINGS.get(path.suffix.lower(), b"")
     if ending not in data[-_ENDING_WINDOW_BYTES:]:
         raise DatasetError(f"{path}: expected a whole image file, got one cut short or of another format")
-    _require_sound(path, data)
+    _require_undamaged(path, data)
     image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     if image is None:
         raise DatasetError(f"{path}: expected an image, got bytes that cannot be decoded")
     return np.asarray(image)
 
 
-def _require_sound(path: Path, data: bytes) -> None:
-    """Refuse what would take all memory, and PNGs whose damage the decoder would announce in lines of its own."""
+def _require_undamaged(path: Path, data: bytes) -> None:
+    """Raise DatasetError for an image too large for memory, or a PNG with a wrong checksum, on which libpng prints."""
     width_px, height_px = image_size(data) or (0, 0)
     if not 1 <= width_px * height_px <= _MAX_IMAGE_PX:
         raise DatasetError(f"{path}: expected an image of 1 to {_MAX_IMAGE_PX} pixels, got {width_px}x{height_px}")
-    place = _PNG_START if path.suffix.lower() == ".png" else len(data)
-    while place + 12 <= len(data):
-        end = place + 8 + int.from_bytes(data[place : place + 4], "big")
-        if zlib.crc32(data[place + 4 : end]) != int.from_bytes(data[end : end + 4], "big"):
+    position = _PNG_START if path.suffix.lower() == ".png" else len(data)
+    while position + 12 <= len(data):
+        end = position + 8 + int.from_bytes(data[position : position + 4], "big")
+        if zlib.crc32(data[position + 4 : end]) != int.from_bytes(data[end : end + 4], "big"):
             raise DatasetError(f"{path}: expected an undamaged image, got one whose checksum is wrong")
-        place = end + 4
+        position = end + 4
 
 
 def _size(image: NDArray[Any]) -> str:

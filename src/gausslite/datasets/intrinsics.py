@@ -1,4 +1,4 @@
-"""Camera files of data sets; their principal points count from pixel centres at integers, ours from +0.5."""
+"""Camera files of data sets. Their pixel centres lie at integers; GaussLite's lie at +0.5."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ CAMERA_FILE = "cam_params.json"
 
 @dataclass(frozen=True, slots=True)
 class FileIntrinsics:
-    """Focal lengths and principal point in pixels, as the data set writes them (pixel centres at integers)."""
+    """Focal lengths and principal point in pixels, in the data set's convention (pixel centres at integers)."""
 
     fx: float
     fy: float
@@ -26,23 +26,24 @@ class FileIntrinsics:
     cy: float
 
     def camera(self, place: str, width_px: int, height_px: int) -> Camera:
-        """The Camera, with half a pixel added to the principal point. Raises DatasetError naming the place."""
+        """Return the Camera, with 0.5 px added to the principal point. Raises DatasetError with the place."""
         try:
             return Camera(self.fx, self.fy, self.cx + 0.5, self.cy + 0.5, width_px, height_px)
         except InvalidInputError as error:
             raise DatasetError(f"{place}: {error}") from None
 
 
-def find_beside_or_above(folder: Path, name: str) -> Path | None:
-    """The file of this name in the folder or in the one above it."""
+def find_in_or_above(folder: Path, name: str) -> Path | None:
+    """Return the file of this name in the folder or in its parent, or None."""
     return next((path for path in (folder / name, folder.parent / name) if path.is_file()), None)
 
 
 def read_folder_camera(folder: Path, width_px: int, height_px: int) -> tuple[Camera, float | None] | None:
-    """The camera of cam_params.json with the depth units of a metre, or of camera-intrinsics.txt without; None where
-    neither is in or above the folder. Raises DatasetError.
+    """Return the camera and depth units per metre of a camera file in or above the folder; None without such a file.
+
+    cam_params.json has both; camera-intrinsics.txt has the camera only. Raises DatasetError.
     """
-    camera_path, matrix_path = (find_beside_or_above(folder, name) for name in (CAMERA_FILE, INTRINSICS_FILE))
+    camera_path, matrix_path = (find_in_or_above(folder, name) for name in (CAMERA_FILE, INTRINSICS_FILE))
     if camera_path is not None:
         return read_json_camera(camera_path)
     if matrix_path is not None:
@@ -51,7 +52,7 @@ def read_folder_camera(folder: Path, width_px: int, height_px: int) -> tuple[Cam
 
 
 def read_matrix(path: Path) -> FileIntrinsics:
-    """A 3x3 matrix K in three rows. Raises DatasetError."""
+    """Return the intrinsics of a file with a 3x3 matrix K in three rows. Raises DatasetError."""
     rows = read_rows(path)
     if len(rows) != 3:
         raise DatasetError(f"{path}: expected the 3 rows of a camera matrix, got {len(rows)}")
@@ -63,13 +64,16 @@ def read_matrix(path: Path) -> FileIntrinsics:
 
 
 def read_json_camera(path: Path) -> tuple[Camera, float]:
-    """The camera and the depth scale of {"camera": {"w","h","fx","fy","cx","cy","scale"}}. Raises DatasetError."""
+    """Return camera and depth units per metre of {"camera": {"w","h","fx","fy","cx","cy","scale"}}.
+
+    Raises DatasetError.
+    """
     try:
         fields = json.loads(read_text(path))["camera"]
         numbers = {name: float(fields[name]) for name in ("w", "h", "fx", "fy", "cx", "cy", "scale")}
     except (ValueError, KeyError, TypeError) as error:
-        wanted = '{"camera": {"w", "h", "fx", "fy", "cx", "cy", "scale"}} with numbers'
-        raise DatasetError(f"{path}: expected {wanted}; {type(error).__name__}: {error}") from None
+        expected = '{"camera": {"w", "h", "fx", "fy", "cx", "cy", "scale"}} with numbers'
+        raise DatasetError(f"{path}: expected {expected}; {type(error).__name__}: {error}") from None
     if not (np.isfinite(numbers["scale"]) and numbers["scale"] > 0):
         raise DatasetError(f"{path}: expected a positive depth scale, got {numbers['scale']}")
     if not (np.isfinite(numbers["w"]) and np.isfinite(numbers["h"])):

@@ -1,4 +1,4 @@
-"""Open a sequence by looking at what is there: a folder of a known layout, or the simulated home."""
+"""Open a sequence: a folder of a known layout, or a simulated home."""
 
 from __future__ import annotations
 
@@ -23,39 +23,41 @@ _SIMULATED = "sim:"
 _SIMULATOR = "gausslite_sim.source"
 
 
-def open_source(spec: str, up_axis: UpAxis | None = None, depth_registration: DepthRegistration | None = None) -> Source:
-    """The sequence in a folder, or a simulated one ("sim:home?seed=0&trajectory=0").
+def open_source(
+    spec: str, up_axis: UpAxis | None = None, depth_registration: DepthRegistration | None = None
+) -> Source:
+    """Return the sequence in a folder, or a simulated one ("sim:home?seed=0&trajectory=0").
 
-    A folder that only holds one folder with a sequence stands for it. A colour camera given here says that colour
-    and depth are not registered: depth is then moved into it. Raises DatasetError, PoseError, InvalidInputError.
+    A folder that contains exactly one sequence folder also works. depth_registration: the colour camera to which depth
+    is registered; None if the recording is registered. Raises DatasetError, PoseError, InvalidInputError.
     """
     source = _open(spec, up_axis)
     return source if depth_registration is None else RegisteredSource(source, depth_registration)
 
 
 def is_simulated(spec: str) -> bool:
-    """True for a place whose regions are known, but take seconds to build."""
+    """True for a simulated sequence, whose scene and regions take seconds to build."""
     return spec.startswith(_SIMULATED)
 
 
 def _open(spec: str, up_axis: UpAxis | None) -> Source:
     if is_simulated(spec):
-        # the simulator is a package of its own, which the core does not import
+        # the core does not import the simulator package
         open_simulated: Callable[[str, UpAxis | None], Source] = import_module(_SIMULATOR).open_simulated
 
         return open_simulated(spec.removeprefix(_SIMULATED), up_axis)
     folder = Path(spec).expanduser()
     if not folder.is_dir():
-        came = "a file" if folder.is_file() else "nothing there"
-        raise DatasetError(f"{spec}: expected a folder with a sequence, or sim:home; got {came}")
+        found = "a file" if folder.is_file() else "nothing there"
+        raise DatasetError(f"{spec}: expected a folder with a sequence, or sim:home; got {found}")
     source = _open_folder(folder, up_axis)
     if source is not None:
         return source
     inside = [path for path in sorted(folder.iterdir()) if path.is_dir() and _recognised(path)]
     if len(inside) == 1:
-        found = _open_folder(inside[0], up_axis)
-        if found is not None:
-            return found
+        source = _open_folder(inside[0], up_axis)
+        if source is not None:
+            return source
     if inside:
         names = ", ".join(path.name for path in inside)
         raise DatasetError(f"{folder}: holds {len(inside)} sequences; expected one of them: {names}")

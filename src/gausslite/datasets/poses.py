@@ -1,4 +1,4 @@
-"""Poses as data sets write them: checked, made exactly rigid, interpolated in time."""
+"""Poses of data sets: validation, projection to rigid transforms, interpolation in time."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ _REPAIRABLE_DEVIATION = 0.05
 
 
 def is_lost(numbers: Float64[ndarray, "..."]) -> bool:
-    """True for what trackers write where they knew no pose: not one finite number, or zeros alone."""
+    """True if a tracker wrote no pose: no finite number, or only zeros."""
     return not np.isfinite(numbers).any() or not numbers.any()
 
 
 def nearest_rigid(place: str, matrix: Float64[ndarray, "4 4"]) -> Float64[ndarray, "4 4"]:
-    """Replace a rotation that is orthonormal up to rounding (|R Rᵀ - I| <= 0.05) by the nearest exact one.
+    """Return the pose with the nearest exact rotation, if its own is orthonormal up to rounding (|R Rᵀ - I| <= 0.05).
 
-    Raises PoseError, naming the place, for NaN, infinity, a wrong last row, a mirror or a larger deviation.
+    Raises PoseError with the place for NaN, infinity, a wrong last row, a reflection or a larger deviation.
     """
     if not np.isfinite(matrix).all():
         bad = float(matrix[~np.isfinite(matrix)][0])
@@ -43,7 +43,7 @@ def nearest_rigid(place: str, matrix: Float64[ndarray, "4 4"]) -> Float64[ndarra
 def pose_from_quaternion(
     place: str, translation_m: Float64[ndarray, "3"], quat_xyzw: Float64[ndarray, "4"]
 ) -> Float64[ndarray, "4 4"]:
-    """The transform of a translation and a quaternion of about unit length. Raises PoseError naming the place."""
+    """Return the transform of a translation and a quaternion of about unit length. Raises PoseError with the place."""
     if not (np.isfinite(translation_m).all() and np.isfinite(quat_xyzw).all()):
         raise PoseError(f"{place}: expected a pose of finite numbers, got NaN or infinity")
     length = float(np.linalg.norm(quat_xyzw))
@@ -61,7 +61,7 @@ def pose_from_quaternion(
 
 
 def slerp(a: Float64[ndarray, "4"], b: Float64[ndarray, "4"], share: float) -> Float64[ndarray, "4"]:
-    """The unit quaternion `share` of the short way from a to b."""
+    """Return the spherical interpolation between two quaternions along the shorter arc; share is in [0, 1]."""
     a, b = a / np.linalg.norm(a), b / np.linalg.norm(b)
     cosine = float(a @ b)
     if cosine < 0.0:
@@ -78,14 +78,14 @@ def slerp(a: Float64[ndarray, "4"], b: Float64[ndarray, "4"], share: float) -> F
 def estimate_up(
     rotations_world_camera: Float64[ndarray, "n 3 3"], fallback: tuple[float, float, float]
 ) -> tuple[float, float, float]:
-    """Where up is for a camera carried without roll: perpendicular to the image rows of all views.
+    """Return the up direction for a camera without roll: perpendicular to the image rows of all views.
 
-    The camera's x axes then lie in the ground plane, so up is the direction they span least. The fallback is
-    returned when the views turn too little for the x axes to span a plane.
+    The camera's x axes then lie in the ground plane, and up is the direction of their smallest variance. Returns the
+    fallback if the views turn too little for the x axes to span a plane.
     """
     x_axes: Float[ndarray, "n 3"] = rotations_world_camera[:, :, 0]
-    spread, directions = np.linalg.eigh(x_axes.T @ x_axes / max(len(x_axes), 1))
-    if spread[1] < 0.05 or spread[1] < 5 * spread[0]:
+    variances, directions = np.linalg.eigh(x_axes.T @ x_axes / max(len(x_axes), 1))
+    if variances[1] < 0.05 or variances[1] < 5 * variances[0]:
         return fallback
     up = directions[:, 0]
     if up @ rotations_world_camera[:, :, 1].mean(axis=0) > 0:

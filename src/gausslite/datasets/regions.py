@@ -1,4 +1,4 @@
-"""Ground-truth regions stored beside a sequence: per object, the voxels of its surface."""
+"""Ground-truth regions in a file of the sequence's folder: for each object, the voxels of its surface."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from gausslite.domain.region import BallRegion, Region, VoxelRegion
 from gausslite.errors import DatasetError, InvalidInputError
 
 REGIONS_FILE = "roi_voxels.npz"
-"""Where a sequence's own regions are, in its folder."""
+"""Name of the file in the folder of the sequence."""
 _SIZE_KEY = "voxel_size_m"
 _MAX_SIDE_VOXELS = 512
 _MAX_INDEX = 100_000
@@ -22,17 +22,18 @@ _SMALL_OBJECT_RADIUS_M = 0.10
 
 
 def load_voxel_regions(path: Path) -> dict[str, VoxelRegion]:
-    """Regions by object name from an .npz: integer arrays [n, 3] of floor(p_world / voxel_size_m), and voxel_size_m.
+    """Return regions by object name from an .npz file.
 
-    Raises DatasetError naming the file, and the array where one is wrong.
+    The file holds voxel_size_m and, for each object, an integer array [n, 3] of floor(p_world / voxel_size_m). Raises
+    DatasetError with the names of the file and of the invalid array.
     """
     try:
         _require_small(path)
-        # never unpickle: the file may come from anywhere
+        # no pickle: the file may come from an untrusted source
         with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
             arrays = {name: np.asarray(stored[name]) for name in stored.files}
     except FileNotFoundError:
-        raise DatasetError(f"{path}: expected a file of regions (.npz), there is none") from None
+        raise DatasetError(f"{path}: expected a file of regions (.npz), got none") from None
     except (OSError, ValueError, EOFError, AttributeError, TypeError, MemoryError, zipfile.BadZipFile) as error:
         raise DatasetError(f"{path}: expected a readable .npz of plain arrays, got {type(error).__name__}") from None
     size = arrays.pop(_SIZE_KEY, None)
@@ -43,7 +44,7 @@ def load_voxel_regions(path: Path) -> dict[str, VoxelRegion]:
         if voxels.ndim != 2 or voxels.shape[1] != 3 or len(voxels) == 0 or voxels.dtype.kind not in "iu":
             raise DatasetError(f"{path}: {name}: expected integers [n, 3], got {voxels.dtype} {voxels.shape}")
         if float(voxels.max()) > _MAX_INDEX or float(voxels.min()) < -_MAX_INDEX:
-            raise DatasetError(f"{path}: {name}: expected voxels within ±{_MAX_INDEX}, got one beyond")
+            raise DatasetError(f"{path}: {name}: expected voxels within ±{_MAX_INDEX}, got a larger index")
         side = int((voxels.max(axis=0).astype(np.int64) - voxels.min(axis=0).astype(np.int64)).max()) + 1
         if side > _MAX_SIDE_VOXELS:
             raise DatasetError(f"{path}: {name}: expected at most {_MAX_SIDE_VOXELS} voxels along an axis, got {side}")
@@ -53,31 +54,34 @@ def load_voxel_regions(path: Path) -> dict[str, VoxelRegion]:
     return regions
 
 
-def regions_beside(folder: Path) -> dict[str, Region]:
-    """Those of a sequence's own file, small objects as balls; none where there is no file. Raises DatasetError."""
+def regions_in_folder(folder: Path) -> dict[str, Region]:
+    """Return the regions of REGIONS_FILE in the folder, small objects as balls; empty without the file.
+
+    Raises DatasetError.
+    """
     path = folder / REGIONS_FILE
     return balls_for_small_objects(load_voxel_regions(path)) if path.is_file() else {}
 
 
 def balls_for_small_objects(regions: Mapping[str, VoxelRegion]) -> dict[str, Region]:
-    """Replace small objects by a ball of 0.10 m round their centroid.
+    """Replace small objects by a ball of radius 0.10 m around their centroid.
 
-    Voxels of 2 cm are coarse for a mug: they miss its far wall and pick up depth noise along the view. Small means
-    that 80 % of the voxels lie within 0.25 m along each axis, which leaves room for that noise.
+    Voxels of 2 cm are coarse for a mug: they miss its far side and include depth noise along the view. An object is
+    small if 80 % of its voxels lie within 0.25 m along each axis; the rest may be such noise.
     """
-    chosen: dict[str, Region] = {}
+    result: dict[str, Region] = {}
     for name, region in regions.items():
-        span = np.diff(np.percentile(region.voxels, [10, 90], axis=0), axis=0) * region.size_m
-        if float(span.max()) < _SMALL_OBJECT_M:
+        extent_m = np.diff(np.percentile(region.voxels, [10, 90], axis=0), axis=0) * region.size_m
+        if float(extent_m.max()) < _SMALL_OBJECT_M:
             x, y, z = region.centroid_m
-            chosen[name] = BallRegion((float(x), float(y), float(z)), _SMALL_OBJECT_RADIUS_M)
+            result[name] = BallRegion((float(x), float(y), float(z)), _SMALL_OBJECT_RADIUS_M)
         else:
-            chosen[name] = region
-    return chosen
+            result[name] = region
+    return result
 
 
 def choose_regions(regions: Mapping[str, Region], names: Sequence[str]) -> list[Region]:
-    """The regions with these names; all of them when no name is given. Raises InvalidInputError."""
+    """Return the regions with these names, or all if names is empty. Raises InvalidInputError."""
     if not regions:
         raise InvalidInputError("objects: expected regions to choose from, with --roi FILE.npz; the sequence has none")
     unknown = [name for name in names if name not in regions]
@@ -88,7 +92,7 @@ def choose_regions(regions: Mapping[str, Region], names: Sequence[str]) -> list[
 
 
 def _require_small(path: Path) -> None:
-    """A few bytes of zip can unpack to more than there is memory for."""
+    """Raise DatasetError if the file unpacks to more than 256 MiB."""
     with zipfile.ZipFile(path) as archive:
         unpacked = sum(member.file_size for member in archive.infolist())
     if unpacked > _MAX_UNPACKED_BYTES:

@@ -11,10 +11,10 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from gausslite.datasets.images import DepthUnits, load_rgbd
-from gausslite.datasets.intrinsics import CAMERA_FILE, find_beside_or_above, read_json_camera
+from gausslite.datasets.intrinsics import CAMERA_FILE, find_in_or_above, read_json_camera
 from gausslite.datasets.poses import is_lost, nearest_rigid
-from gausslite.datasets.regions import regions_beside
-from gausslite.datasets.source import require_frames, require_position, excluded_frames_note
+from gausslite.datasets.regions import regions_in_folder
+from gausslite.datasets.source import excluded_frames_note, require_frames, require_position
 from gausslite.datasets.text_files import parse_numbers, read_rows
 from gausslite.domain.camera import Camera
 from gausslite.domain.frame import Frame
@@ -27,20 +27,20 @@ _COLOUR_NAME = re.compile(r"frame(\d{6})\.(?:jpg|png)")
 
 
 class ReplicaSource:
-    """A folder with results/frame%06d.jpg, results/depth%06d.png and traj.txt, one 4x4 row-major pose a row.
+    """A folder with results/frame%06d.jpg, results/depth%06d.png and traj.txt, one 4x4 row-major pose per row.
 
-    cam_params.json lies in or above the folder. Frames whose pose has no finite number, or zeros alone, are no part of
-    the sequence. Times are the frame numbers at 30 Hz. Raises DatasetError, PoseError.
+    cam_params.json lies in or above the folder. Frames whose pose has no finite number, or only zeros, are excluded.
+    Times are the frame numbers at 30 Hz. Raises DatasetError, PoseError.
     """
 
     def __init__(self, folder: Path, up_axis: UpAxis | None = None) -> None:
         self._folder = folder
         results = folder / "results"
-        found = (_COLOUR_NAME.fullmatch(path.name) for path in (results.iterdir() if results.is_dir() else ()))
-        colours = {int(match.group(1)): results / match.group(0) for match in found if match}
+        matches = (_COLOUR_NAME.fullmatch(path.name) for path in (results.iterdir() if results.is_dir() else ()))
+        colours = {int(match.group(1)): results / match.group(0) for match in matches if match}
         require_frames(results, len(colours), "images named frame000000.jpg")
         self._colours = dict(sorted(colours.items()))
-        camera_path = find_beside_or_above(folder, CAMERA_FILE)
+        camera_path = find_in_or_above(folder, CAMERA_FILE)
         if camera_path is None:
             raise DatasetError(f"{folder}: the camera is unknown: expected {CAMERA_FILE} here or one folder above")
         self._camera, per_metre = read_json_camera(camera_path)
@@ -58,39 +58,39 @@ class ReplicaSource:
 
     @staticmethod
     def recognises(folder: Path) -> bool:
-        """Whether the folder looks like this layout."""
+        """True if the folder has this layout."""
         return (folder / "traj.txt").is_file() or any((folder / "results").glob("frame??????.*"))
 
     @property
     def name(self) -> str:
-        """The folder's name."""
+        """Name of the folder."""
         return self._folder.name
 
     @property
     def camera(self) -> Camera:
-        """From cam_params.json."""
+        """Camera of cam_params.json."""
         return self._camera
 
     @property
     def up_axis(self) -> UpAxis:
-        """Z unless told otherwise."""
+        """The z axis, unless the caller gives another."""
         return self._up_axis
 
     @property
     def depth_registered(self) -> bool:
-        """True: both are drawn by one camera."""
+        """True: one camera renders both images."""
         return True
 
     @property
     def excluded_frames(self) -> str:
-        """Frames without a pose."""
+        """Message on the frames without a pose."""
         return excluded_frames_note(len(self._colours) - len(self._numbers), len(self._colours), "without a pose")
 
     def __len__(self) -> int:
         return len(self._numbers)
 
     def frame(self, i: int, size: tuple[int, int] | None = None) -> Frame:
-        """The frame at position i. Raises DatasetError, PoseError."""
+        """Return the frame at position i. Raises DatasetError, PoseError."""
         require_position(self.name, i, len(self))
         number = self._numbers[i]
         T_world_camera = nearest_rigid(self._pose_rows[number][0], self._read_matrix(number))
@@ -99,18 +99,18 @@ class ReplicaSource:
         return Frame(number, number * 10**9 // _RATE_HZ, image.rgb, image.depth_m, image.camera, T_world_camera)
 
     def indices(self) -> Sequence[int]:
-        """The numbers in the file names."""
+        """Return the numbers in the file names."""
         return list(self._numbers)
 
     def regions(self) -> Mapping[str, Region]:
-        """From roi_voxels.npz when it is there; small objects as a ball of 0.10 m round their centroid."""
-        return regions_beside(self._folder)
+        """Return the regions of roi_voxels.npz in the folder, small objects as balls; empty without the file."""
+        return regions_in_folder(self._folder)
 
     def _is_lost(self, number: int) -> bool:
         try:
             return is_lost(self._read_matrix(number)[:3])
         except DatasetError:
-            return False  # a damaged row is the matter of its own frame, which may not even be wanted
+            return False  # `frame` reports a damaged row if it is used
 
     def _read_matrix(self, number: int) -> Float64[ndarray, "4 4"]:
         place, fields = self._pose_rows[number]

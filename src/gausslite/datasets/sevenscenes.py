@@ -1,4 +1,4 @@
-"""Read 7-Scenes and everything else laid out as frame-000000.color / .depth / .pose files."""
+"""Read 7-Scenes and other sequences of frame-000000.color / .depth / .pose files."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from numpy import ndarray
 from gausslite.datasets.images import DepthUnits, load_rgbd, read_colour
 from gausslite.datasets.intrinsics import CAMERA_FILE, INTRINSICS_FILE, FileIntrinsics, read_folder_camera
 from gausslite.datasets.poses import estimate_up, is_lost, nearest_rigid
-from gausslite.datasets.regions import regions_beside
-from gausslite.datasets.source import require_frames, require_position, excluded_frames_note
+from gausslite.datasets.regions import regions_in_folder
+from gausslite.datasets.source import excluded_frames_note, require_frames, require_position
 from gausslite.datasets.text_files import parse_numbers, read_rows
 from gausslite.domain.camera import Camera
 from gausslite.domain.frame import Frame
@@ -35,16 +35,15 @@ _LEVEL_FIRST_VIEW_UP = (0.0, -1.0, 0.0)
 class SevenScenesSource:
     """A folder of frame-%06d.color.{png,jpg}, .depth.png (mm; 0 and 65535 invalid) and .pose.txt (camera to world).
 
-    The camera comes from cam_params.json (which says other depth units too) or camera-intrinsics.txt in or above the
-    folder; without one, 640x480 images get the values the 7-Scenes authors state. Frames whose pose the tracker had
-    lost (no finite number in it, or zeros) are no part of the sequence. Times are the frame numbers at 30 Hz. Raises
-    DatasetError.
+    The camera comes from cam_params.json (with the depth units) or camera-intrinsics.txt in or above the folder;
+    otherwise 640x480 images get the intrinsics that the 7-Scenes authors publish. Frames whose pose has no finite
+    number, or only zeros, are excluded. Times are the frame numbers at 30 Hz. Raises DatasetError.
     """
 
     def __init__(self, folder: Path, up_axis: UpAxis | None = None) -> None:
         self._folder = folder
-        found = (_COLOUR_NAME.fullmatch(path.name) for path in folder.iterdir())
-        colours = {int(match.group(1)): folder / match.group(0) for match in found if match}
+        matches = (_COLOUR_NAME.fullmatch(path.name) for path in folder.iterdir())
+        colours = {int(match.group(1)): folder / match.group(0) for match in matches if match}
         require_frames(folder, len(colours), "images named frame-000000.color.png or .jpg")
         self._colours = dict(sorted(colours.items()))
         self._numbers = [number for number in self._colours if not self._is_lost(number)]
@@ -56,42 +55,42 @@ class SevenScenesSource:
 
     @staticmethod
     def recognises(folder: Path) -> bool:
-        """Whether the folder looks like this layout."""
+        """True if the folder has this layout."""
         return any(folder.glob("frame-??????.*"))
 
     @property
     def name(self) -> str:
-        """The folder's name."""
+        """Name of the folder."""
         return self._folder.name
 
     @property
     def camera(self) -> Camera:
-        """At the size of the first colour image."""
+        """Camera at the size of the first colour image."""
         return self._camera
 
     @property
     def up_axis(self) -> UpAxis:
-        """Estimated from the poses, unless told otherwise: the world is the first camera's, however it was tilted.
+        """Estimated from the poses, unless the caller gives another: the first camera defines the world frame.
 
-        In RedKitchen it lands 2.5 degrees from the normal of the table, which itself is 27 degrees off -y.
+        In RedKitchen it differs by 2.5 degrees from the normal of the table, which is 27 degrees off -y.
         """
         return self._up_axis
 
     @property
     def depth_registered(self) -> bool:
-        """False: colour and depth are each as their own camera saw them."""
+        """False: colour and depth come from two cameras."""
         return False
 
     @property
     def excluded_frames(self) -> str:
-        """Frames without a pose."""
+        """Message on the frames without a pose."""
         return excluded_frames_note(len(self._colours) - len(self._numbers), len(self._colours), "without a pose")
 
     def __len__(self) -> int:
         return len(self._numbers)
 
     def frame(self, i: int, size: tuple[int, int] | None = None) -> Frame:
-        """The frame at position i. Raises DatasetError, PoseError."""
+        """Return the frame at position i. Raises DatasetError, PoseError."""
         require_position(self.name, i, len(self))
         number = self._numbers[i]
         T_world_camera = _read_pose(self._pose_path(number))
@@ -100,12 +99,12 @@ class SevenScenesSource:
         return Frame(number, number * 10**9 // _RATE_HZ, image.rgb, image.depth_m, image.camera, T_world_camera)
 
     def indices(self) -> Sequence[int]:
-        """The numbers in the file names."""
+        """Return the numbers in the file names."""
         return list(self._numbers)
 
     def regions(self) -> Mapping[str, Region]:
-        """From roi_voxels.npz when it is there; small objects as a ball of 0.10 m round their centroid."""
-        return regions_beside(self._folder)
+        """Return the regions of roi_voxels.npz in the folder, small objects as balls; empty without the file."""
+        return regions_in_folder(self._folder)
 
     def _pose_path(self, number: int) -> Path:
         return self._folder / f"frame-{number:06d}.pose.txt"
@@ -114,7 +113,7 @@ class SevenScenesSource:
         try:
             return is_lost(_read_matrix(self._pose_path(number))[:3])
         except DatasetError:
-            return False  # a damaged file is the matter of its own frame, which may not even be wanted
+            return False  # `frame` reports a damaged file if it is used
 
     def _estimate_up_axis(self) -> UpAxis:
         rotations = []
@@ -122,7 +121,7 @@ class SevenScenesSource:
             try:
                 rotations.append(_read_pose(self._pose_path(number))[:3, :3])
             except (DatasetError, PoseError):
-                # a damaged pose is the matter of its own frame, which may not even be wanted
+                # `frame` reports a damaged pose if it is used
                 continue
         return estimate_up(np.array(rotations).reshape(-1, 3, 3), _LEVEL_FIRST_VIEW_UP)
 
@@ -139,10 +138,10 @@ def _read_matrix(path: Path) -> Float64[ndarray, "4 4"]:
 
 
 def _camera(folder: Path, width_px: int, height_px: int) -> tuple[Camera, float | None]:
-    """The camera and, where they are told, the depth units of a metre."""
-    told = read_folder_camera(folder, width_px, height_px)
-    if told is not None:
-        return told
+    """Return the camera and, from cam_params.json, the depth units per metre."""
+    from_file = read_folder_camera(folder, width_px, height_px)
+    if from_file is not None:
+        return from_file
     if (width_px, height_px) != _KINECT_SIZE:
         raise DatasetError(
             f"{folder}: the camera of {width_px}x{height_px} images is unknown: "

@@ -1,4 +1,4 @@
-"""What every sequence of posed RGB-D frames offers, wherever its frames come from."""
+"""The protocol of every sequence of posed RGB-D frames."""
 
 from __future__ import annotations
 
@@ -15,48 +15,48 @@ from gausslite.errors import DatasetError
 
 @runtime_checkable
 class Source(Protocol):
-    """A sequence with random access. Positions run from 0 to len - 1; `indices` gives the sequence's own numbers."""
+    """A sequence with random access. Positions run from 0 to len - 1; `indices` returns the sequence's own numbers."""
 
     @property
     def name(self) -> str:
-        """A short name for reports."""
+        """Short name for reports."""
         ...
 
     @property
     def camera(self) -> Camera:
-        """The camera at the sequence's own resolution (pixel centres at +0.5)."""
+        """Camera at the sequence's own resolution (pixel centres at +0.5)."""
         ...
 
     @property
     def up_axis(self) -> UpAxis:
-        """The unit vector of the world frame that points up."""
+        """Unit vector of the world frame that points up."""
         ...
 
     @property
     def depth_registered(self) -> bool:
-        """True when the recording brought its depth into the colour image's pixels."""
+        """True if each depth pixel belongs to the colour pixel at the same place."""
         ...
 
     @property
     def excluded_frames(self) -> str:
-        """How much of the recording is no part of the sequence, and why; empty where all of it is."""
+        """Message on the recorded frames that the sequence excludes, and why; empty if there are none."""
         ...
 
     def __len__(self) -> int: ...
 
     def frame(self, i: int, size: tuple[int, int] | None = None) -> Frame:
-        """The frame at position i, resized to (width, height): colour by area, depth by nearest.
+        """Return the frame at position i, resized to (width, height): colour by area, depth by nearest pixel.
 
-        Raises DatasetError or PoseError with a line that names the file.
+        Raises DatasetError or PoseError with the name of the file.
         """
         ...
 
     def indices(self) -> Sequence[int]:
-        """The frame number of each position, ascending."""
+        """Return the frame number of each position, ascending."""
         ...
 
     def regions(self) -> Mapping[str, Region]:
-        """Ground-truth regions by object name; empty where the sequence has none."""
+        """Return ground-truth regions by object name; empty if the sequence has none."""
         ...
 
 
@@ -66,12 +66,12 @@ def require_position(source_name: str, i: int, count: int) -> None:
         raise DatasetError(f"{source_name}: expected a position from 0 to {count - 1}, got {i}")
 
 
-def excluded_frames_note(count: int, recorded: int, why: str) -> str:
-    """The line of `Source.excluded_frames`."""
-    return f"{count} of {recorded} colour images are left out, {why}" if count else ""
+def excluded_frames_note(count: int, recorded: int, reason: str) -> str:
+    """Return the message of `Source.excluded_frames`."""
+    return f"{count} of {recorded} colour images are skipped: {reason}" if count else ""
 
 
-def require_frames(folder: Path, count: int, wanted: str) -> None:
-    """Raise DatasetError for a sequence without frames."""
+def require_frames(folder: Path, count: int, expected: str) -> None:
+    """Raise DatasetError if the sequence has no frames."""
     if count == 0:
-        raise DatasetError(f"{folder}: expected {wanted}, got none")
+        raise DatasetError(f"{folder}: expected {expected}, got none")

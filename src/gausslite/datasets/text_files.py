@@ -1,4 +1,4 @@
-"""Read the small text files of a sequence: numbers in rows, with the file and line in every complaint."""
+"""Read the small text files of a sequence: rows of numbers. Every error names the file and line."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ from gausslite.errors import DatasetError
 
 
 def read_text(path: Path) -> str:
-    """The whole file. Raises DatasetError when it is missing or not text."""
+    """Return the whole file. Raises DatasetError if it is missing or not text."""
     try:
         return path.read_text(encoding="utf-8")
     except FileNotFoundError:
-        raise DatasetError(f"{path}: expected a text file, there is none") from None
+        raise DatasetError(f"{path}: expected a text file, got none") from None
     except (OSError, UnicodeDecodeError) as error:
         raise DatasetError(f"{path}: expected a readable text file, got {type(error).__name__}") from None
 
 
 def read_rows(path: Path) -> list[tuple[str, list[str]]]:
-    """Each row's place ("FILE line 3") and its fields; blank rows and rows that start with # are left out."""
+    """Return the place ("FILE line 3") and the fields of each row, without blank rows and comments (#)."""
     rows = []
     for number, line in enumerate(read_text(path).splitlines(), start=1):
         text = line.strip()
@@ -28,7 +28,7 @@ def read_rows(path: Path) -> list[tuple[str, list[str]]]:
 
 
 def parse_numbers(place: str, fields: list[str], count: int, meaning: str) -> list[float]:
-    """Exactly `count` numbers (NaN and infinity included). Raises DatasetError naming the place."""
+    """Return exactly `count` numbers, which may be NaN or infinite. Raises DatasetError with the place."""
     if len(fields) != count:
         raise DatasetError(f"{place}: expected {count} numbers ({meaning}), got {len(fields)}")
     try:

@@ -1,4 +1,4 @@
-"""Read TUM RGB-D sequences: colour, depth and pose come with their own stamps and are brought together by time."""
+"""Read TUM RGB-D sequences: associate colour, depth and pose by their timestamps."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from numpy import ndarray
 from gausslite.datasets.images import DepthUnits, load_rgbd, read_colour
 from gausslite.datasets.intrinsics import CAMERA_FILE, INTRINSICS_FILE, FileIntrinsics, read_folder_camera
 from gausslite.datasets.poses import is_lost, pose_from_quaternion, slerp
-from gausslite.datasets.regions import regions_beside
-from gausslite.datasets.source import require_frames, require_position, excluded_frames_note
+from gausslite.datasets.regions import regions_in_folder
+from gausslite.datasets.source import excluded_frames_note, require_frames, require_position
 from gausslite.datasets.text_files import parse_numbers, read_rows
 from gausslite.domain.camera import Camera
 from gausslite.domain.frame import Frame
@@ -46,11 +46,11 @@ class _Match:
 class TumSource:
     """A folder with rgb.txt, depth.txt and groundtruth.txt.
 
-    A colour image goes with the depth image nearest in time, at most 20 ms away, and with the pose interpolated
-    (lerp and slerp) at the colour's stamp between two poses at most 0.1 s apart, or else with one at most 10 ms away;
-    colour images without either are no part of the sequence. Poses that the tracker had lost (not one finite number)
-    count as missing. Frame numbers count the rows of rgb.txt from 0. The lens distortion of fr1 and fr2 (up to a few
-    pixels in the corners) is left in. Raises DatasetError, PoseError.
+    A colour image is associated with the nearest depth image within 20 ms, and with the pose interpolated (lerp and
+    slerp) at its timestamp between two poses at most 0.1 s apart, or else with a pose within 10 ms. Colour images
+    without both are excluded. Poses without a finite number count as missing. Frame numbers are the rows of rgb.txt
+    from 0. The lens distortion of fr1 and fr2 (a few pixels in the corners) is not corrected. Raises DatasetError,
+    PoseError.
     """
 
     def __init__(self, folder: Path, up_axis: UpAxis | None = None) -> None:
@@ -63,42 +63,40 @@ class TumSource:
 
     @staticmethod
     def recognises(folder: Path) -> bool:
-        """Whether the folder looks like this layout."""
+        """True if the folder has this layout."""
         return (folder / "rgb.txt").is_file() or (folder / "groundtruth.txt").is_file()
 
     @property
     def name(self) -> str:
-        """The folder's name."""
+        """Name of the folder."""
         return self._folder.name
 
     @property
     def camera(self) -> Camera:
-        """From cam_params.json (which says other depth units too) or camera-intrinsics.txt in or above the folder;
-        without one by its name (fr1, fr2, fr3).
-        """
+        """Camera of cam_params.json or camera-intrinsics.txt, else of fr1, fr2 or fr3 by the folder's name."""
         return self._camera
 
     @property
     def up_axis(self) -> UpAxis:
-        """z, as the motion capture system was set up, unless told otherwise."""
+        """The z axis of the motion capture system, unless the caller gives another."""
         return self._up_axis
 
     @property
     def depth_registered(self) -> bool:
-        """True, by the layout."""
+        """True: the layout has registered depth."""
         return True
 
     @property
     def excluded_frames(self) -> str:
-        """Colour images without depth or pose at their time."""
-        why = "without a pose at their time or depth within 20 ms"
-        return excluded_frames_note(self._recorded - len(self), self._recorded, why)
+        """Message on the colour images without depth or pose at their time."""
+        reason = "without a pose at their time or depth within 20 ms"
+        return excluded_frames_note(self._recorded - len(self), self._recorded, reason)
 
     def __len__(self) -> int:
         return len(self._matches)
 
     def frame(self, i: int, size: tuple[int, int] | None = None) -> Frame:
-        """The frame at position i. Raises DatasetError."""
+        """Return the frame at position i. Raises DatasetError."""
         require_position(self.name, i, len(self))
         match = self._matches[i]
         image = load_rgbd(match.colour, match.depth, self._camera, self._units, size)
@@ -106,16 +104,16 @@ class TumSource:
         return Frame(match.number, time_ns, image.rgb, image.depth_m, image.camera, match.T_world_camera)
 
     def indices(self) -> Sequence[int]:
-        """Rows of rgb.txt, counted from 0."""
+        """Return the rows of rgb.txt, from 0."""
         return [match.number for match in self._matches]
 
     def regions(self) -> Mapping[str, Region]:
-        """From roi_voxels.npz when it is there; small objects as a ball of 0.10 m round their centroid."""
-        return regions_beside(self._folder)
+        """Return the regions of roi_voxels.npz in the folder, small objects as balls; empty without the file."""
+        return regions_in_folder(self._folder)
 
 
 def _associate(folder: Path) -> tuple[list[_Match], int]:
-    """The colour images that have depth and a pose, and how many there are in all."""
+    """Return the colour images with depth and a pose, and the number of all colour images."""
     colour_times, colour_names = _read_stamps(folder / "rgb.txt")
     depth_times, depth_names = _read_stamps(folder / "depth.txt")
     trajectory = _Trajectory(folder / "groundtruth.txt")
@@ -126,13 +124,13 @@ def _associate(folder: Path) -> tuple[list[_Match], int]:
         if abs(depth_times[nearest] - time_s) <= _MAX_DEPTH_LAG_S and T_world_camera is not None:
             depth = folder / depth_names[nearest]
             matches.append(_Match(number, float(time_s), folder / name, depth, T_world_camera))
-    wanted = "a colour image with depth within 20 ms (rgb.txt, depth.txt) and poses around it (groundtruth.txt)"
-    require_frames(folder, len(matches), wanted)
+    expected = "a colour image with depth within 20 ms (rgb.txt, depth.txt) and poses around it (groundtruth.txt)"
+    require_frames(folder, len(matches), expected)
     return matches, len(colour_names)
 
 
 def _read_stamps(path: Path) -> tuple[Float64[ndarray, " n"], list[str]]:
-    """Ascending times in seconds and the image's path after each."""
+    """Return ascending times in seconds and the image path of each."""
     times, names = [], []
     for place, fields in read_rows(path):
         if len(fields) != 2:
@@ -163,13 +161,13 @@ class _Trajectory:
         self._path, self._table = path, table[known]
 
     def at(self, time_s: float) -> Float64[ndarray, "4 4"] | None:
-        """The interpolated pose; None outside the recording and in its gaps, but for what is next to a pose there."""
+        """Return the interpolated pose; in gaps over 0.1 s a pose within 10 ms, else None."""
         times = self._table[:, 0]
         after = int(np.searchsorted(times, time_s))
         before, after = max(after - 1, 0), min(after, len(times) - 1)
         gap_s = float(times[after] - times[before])
         if before == after or gap_s > _MAX_POSE_GAP_S:
-            # poses of keyframes alone lie far apart, each at its image's stamp
+            # trajectories of keyframes have poses far apart, each at the timestamp of its image
             nearest = int(np.abs(times - time_s).argmin())
             if abs(float(times[nearest]) - time_s) > _MAX_POSE_LAG_S:
                 return None
@@ -180,10 +178,10 @@ class _Trajectory:
 
 
 def _camera(folder: Path, width_px: int, height_px: int) -> tuple[Camera, float | None]:
-    """The camera and, where they are told, the depth units of a metre."""
-    told = read_folder_camera(folder, width_px, height_px)
-    if told is not None:
-        return told
+    """Return the camera and, from cam_params.json, the depth units per metre."""
+    from_file = read_folder_camera(folder, width_px, height_px)
+    if from_file is not None:
+        return from_file
     group = re.search(r"(?:freiburg|fr)([123])", folder.resolve().name)
     if group is None:
         raise DatasetError(

@@ -51,7 +51,7 @@ Damage = Callable[[Path], object]
 SEVEN_POSE = "frame-000004.pose.txt"
 
 CASES: list[tuple[str, Damage, type[GaussLiteError], str]] = [
-    ("tum", lambda f: (f / "rgb/1.png").unlink(), DatasetError, "1.png: expected an image, there is none"),
+    ("tum", lambda f: (f / "rgb/1.png").unlink(), DatasetError, "1.png: expected an image, got none"),
     ("tum", lambda f: cut(f / "depth/1.png"), DatasetError, "depth/1.png: expected a whole image"),
     ("tum", lambda f: flip(f / "depth/1.png"), DatasetError, "depth/1.png: expected an undamaged image"),
     ("tum", lambda f: declare_huge(f / "rgb/1.png"), DatasetError, "rgb/1.png: .* got 30000x30000"),
@@ -201,7 +201,7 @@ def test_frames_without_a_pose_are_no_part_of_the_sequence(tmp_path: Path, lost:
         source = open_source(str(folder))
         assert source.indices() == numbers
         assert [source.frame(i).index for i in range(len(source))] == numbers
-        assert source.excluded_frames == "1 of 3 colour images are left out, without a pose"
+        assert source.excluded_frames == "1 of 3 colour images are skipped: without a pose"
 
 
 def test_a_tracker_that_was_lost_is_a_gap_in_the_trajectory(tmp_path: Path) -> None:
@@ -216,7 +216,9 @@ def test_a_tracker_that_was_lost_is_a_gap_in_the_trajectory(tmp_path: Path) -> N
     times = [source.frame(i).capture_time_ns * 1e-9 for i in range(len(source))]
     assert len(times) == 25
     assert not any(10.31 < time < 10.49 for time in times)
-    assert source.excluded_frames == ("5 of 30 colour images are left out, without a pose at their time or depth within 20 ms")
+    assert source.excluded_frames == (
+        "5 of 30 colour images are skipped: without a pose at their time or depth within 20 ms"
+    )
 
 
 @pytest.mark.parametrize(

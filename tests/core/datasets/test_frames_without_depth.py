@@ -1,4 +1,4 @@
-"""Frames without a depth reading are neither mapped nor scored, and the operator hears of that at the end."""
+"""Frames without a depth reading are neither mapped nor scored, and the summary reports them."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from gausslite.cli.main import main
 pytest.importorskip("gausslite.render._kernels", reason="the native kernels are not built")
 
 
-def blinded(folder: Path, *numbers: int) -> Path:
-    """A sequence of frames 0, 4 and 8, of which these have no depth."""
+def without_depth(folder: Path, *numbers: int) -> Path:
+    """Return a sequence of frames 0, 4 and 8 without depth in these frames."""
     write_seven_scenes(folder)
     for number in numbers:
         write_depth(folder / f"frame-{number:06d}.depth.png", value=0)
@@ -25,34 +25,34 @@ def map_uniformly(sequence: Path, out: Path) -> int:
     return main(["map", str(sequence), "--policy", "uniform", "--max-gaussians", "150", "--out", str(out)])
 
 
-def test_the_run_says_how_many_frames_it_skipped(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert map_uniformly(blinded(tmp_path / "one", 4), tmp_path / "out") == 0
-    assert capsys.readouterr().out.startswith("2 frames (1 skipped, without depth) at ")
-    assert map_uniformly(blinded(tmp_path / "none"), tmp_path / "out") == 0
+def test_the_summary_reports_skipped_frames(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert map_uniformly(without_depth(tmp_path / "one", 4), tmp_path / "out") == 0
+    assert capsys.readouterr().out.startswith("2 frames (skipped: 1 without depth) at ")
+    assert map_uniformly(without_depth(tmp_path / "none"), tmp_path / "out") == 0
     assert capsys.readouterr().out.startswith("3 frames at ")
 
 
-def test_a_sequence_without_any_depth_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert map_uniformly(blinded(tmp_path / "none", 0, 4, 8), tmp_path / "out") == 2
+def test_a_sequence_without_any_depth_is_rejected(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert map_uniformly(without_depth(tmp_path / "none", 0, 4, 8), tmp_path / "out") == 2
     assert "none: expected frames with depth, got none in 3" in capsys.readouterr().err
     assert not (tmp_path / "out" / "map.ply").exists()
 
 
-def test_what_cannot_be_told_from_its_region_is_not_scored(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert map_uniformly(blinded(tmp_path / "one", 4), tmp_path / "out") == 0
+def test_frames_without_depth_are_not_scored(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert map_uniformly(without_depth(tmp_path / "one", 4), tmp_path / "out") == 0
     capsys.readouterr()
     score = ["eval", str(tmp_path / "out" / "map.ply"), "--register-depth", "none"]
     assert main([*score, str(tmp_path / "one"), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["n_views"] == 2
-    assert main([*score, str(blinded(tmp_path / "all", 0, 4, 8)), "--json"]) == 2
+    assert main([*score, str(without_depth(tmp_path / "all", 0, 4, 8)), "--json"]) == 2
     [line] = capsys.readouterr().err.splitlines()
     assert "all: expected a frame with depth, so that its region is known; got none" in line
 
 
-def test_what_was_not_found_is_said_at_the_end(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_summary_reports_objects_not_found(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("embreex", reason="the simulated home needs the extra `sim`")
     small = ["--size", "64x48", "--max-gaussians", "200", "--iterations", "1"]
     assert main(["map", "sim:home?frames=1", "--task", "Find the unicorn", *small, "--out", str(tmp_path)]) == 0
-    told = capsys.readouterr().out
-    assert "\n  no region matches 'unicorn'; the regions are " in told
-    assert told.endswith("\n  nothing that the task is about was found in any of these frames\n")
+    output = capsys.readouterr().out
+    assert "\n  no region matches 'unicorn'; the regions are " in output
+    assert output.endswith("\n  none of these frames shows an object of the task\n")

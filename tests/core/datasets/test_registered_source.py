@@ -30,8 +30,8 @@ def box_before_a_wall(camera: Camera, T_camera_world: np.ndarray) -> np.ndarray:
     return np.where(on_box, 2.0, 4.0).astype(np.float32)
 
 
-def beside(offset_m: tuple[float, float, float]) -> np.ndarray:
-    return DepthRegistration(FileIntrinsics(1.0, 1.0, 0.0, 0.0), offset_m).depth_to_colour()
+def displaced(offset_m: tuple[float, float, float]) -> np.ndarray:
+    return DepthRegistration(FileIntrinsics(1.0, 1.0, 0.0, 0.0), offset_m).extrinsics()
 
 
 def test_the_same_camera_changes_nothing() -> None:
@@ -41,10 +41,10 @@ def test_the_same_camera_changes_nothing() -> None:
 
 
 @pytest.mark.parametrize("zoom", [0.5, 0.9, 1.0, 1.3, 2.0, 3.7])
-def test_a_scene_of_two_planes_arrives_as_the_colour_camera_sees_it(zoom: float) -> None:
+def test_register_depth_gives_the_depth_of_the_colour_camera(zoom: float) -> None:
     colour = Camera(100.0 * zoom, 100.0 * zoom, 64.0 * zoom, 48.0 * zoom, round(128 * zoom), round(96 * zoom))
-    moved = register_depth(box_before_a_wall(DEPTH, np.eye(4)), DEPTH, colour, beside(OFFSET_M))
-    truth = box_before_a_wall(colour, beside(OFFSET_M))
+    moved = register_depth(box_before_a_wall(DEPTH, np.eye(4)), DEPTH, colour, displaced(OFFSET_M))
+    truth = box_before_a_wall(colour, displaced(OFFSET_M))
     # the wall ends one disparity before the colour image does; the box hides a strip of it one disparity wide
     wall_px, box_px = (100.0 * zoom * 0.04 / depth_m for depth_m in (4.0, 2.0))
     border, shadow = np.zeros(truth.shape, np.bool_), np.zeros(truth.shape, np.bool_)
@@ -60,8 +60,8 @@ def test_a_scene_of_two_planes_arrives_as_the_colour_camera_sees_it(zoom: float)
     np.testing.assert_array_equal(moved[certain], truth[certain])
 
 
-def test_what_only_the_colour_camera_sees_stays_empty() -> None:
-    moved = register_depth(box_before_a_wall(DEPTH, np.eye(4)), DEPTH, DEPTH, beside((-0.2, 0.0, 0.0)))
+def test_pixels_that_only_the_colour_camera_sees_stay_empty() -> None:
+    moved = register_depth(box_before_a_wall(DEPTH, np.eye(4)), DEPTH, DEPTH, displaced((-0.2, 0.0, 0.0)))
     row = moved[48]
     box = np.flatnonzero(row == 2.0)
     # the wall moves by 5 px, the box by 10: five columns of the wall were behind the box
@@ -75,12 +75,12 @@ def test_what_only_the_colour_camera_sees_stays_empty() -> None:
 def test_a_slanted_wall_has_no_holes() -> None:
     u = (np.arange(128) + 0.5 - 64) / 100
     depth_m = np.broadcast_to(1.0 / (0.4 - 0.5 * u), (96, 128)).astype(np.float32)
-    moved = register_depth(np.ascontiguousarray(depth_m), DEPTH, DEPTH.resized(256, 192), beside((0.05, 0.02, 0.0)))
+    moved = register_depth(np.ascontiguousarray(depth_m), DEPTH, DEPTH.resized(256, 192), displaced((0.05, 0.02, 0.0)))
     inside = moved[8:-4, 20:-2]
     assert (inside > 0).all()
 
 
-def test_a_turned_camera_measures_depth_along_its_own_axis() -> None:
+def test_a_rotated_camera_measures_depth_along_its_own_axis() -> None:
     T_colour_depth = np.diag([-1.0, -1.0, 1.0, 1.0])
     T_colour_depth[2, 3] = -0.5
     depth_m = np.zeros((96, 128), np.float32)
@@ -94,14 +94,14 @@ def test_a_turned_camera_measures_depth_along_its_own_axis() -> None:
 
 
 def test_points_behind_the_colour_camera_and_empty_images_give_nothing() -> None:
-    T_colour_depth = beside((0.0, 0.0, -1.0))
+    T_colour_depth = displaced((0.0, 0.0, -1.0))
     assert not register_depth(np.full((96, 128), 0.5, np.float32), DEPTH, DEPTH, T_colour_depth).any()
     assert not register_depth(np.zeros((96, 128), np.float32), DEPTH, DEPTH, T_colour_depth).any()
 
 
-def test_a_registered_source_moves_depth_and_pose_and_nothing_else(tmp_path: Path) -> None:
+def test_a_registered_source_changes_depth_and_pose_only(tmp_path: Path) -> None:
     plain = open_source(str(write_seven_scenes(tmp_path / "seq")))
-    source = open_source(str(tmp_path / "seq"), colour_camera=DepthRegistration.parse("10,10,7.5,5.5,-0.4,0,0"))
+    source = open_source(str(tmp_path / "seq"), depth_registration=DepthRegistration.parse("10,10,7.5,5.5,-0.4,0,0"))
     assert isinstance(source, RegisteredSource)
     assert (source.name, source.up_axis, len(source)) == (plain.name, plain.up_axis, len(plain))
     assert (list(source.indices()), source.regions()) == (list(plain.indices()), plain.regions())
@@ -117,16 +117,16 @@ def test_a_registered_source_moves_depth_and_pose_and_nothing_else(tmp_path: Pat
     np.testing.assert_array_equal(small.depth_m, frame.depth_m[1::2, 1::2])
 
 
-def test_the_text_of_a_colour_camera_reads_back() -> None:
+def test_parse_reverses_str() -> None:
     camera = DepthRegistration.parse("525,524.5,319.5,239.5,-0.025,0,0.001,0,0.25,-0.5")
     assert DepthRegistration.parse(str(camera)) == camera
-    assert (camera.offset_m, camera.turn_deg) == ((-0.025, 0.0, 0.001), (0.0, 0.25, -0.5))
-    assert DepthRegistration.parse("525,525,320,240,-0.025,0,0").turn_deg == (0.0, 0.0, 0.0)
-    np.testing.assert_array_equal(DepthRegistration.parse("525,525,320,240").depth_to_colour(), np.eye(4))
+    assert (camera.offset_m, camera.rotation_deg) == ((-0.025, 0.0, 0.001), (0.0, 0.25, -0.5))
+    assert DepthRegistration.parse("525,525,320,240,-0.025,0,0").rotation_deg == (0.0, 0.0, 0.0)
+    np.testing.assert_array_equal(DepthRegistration.parse("525,525,320,240").extrinsics(), np.eye(4))
 
 
-def test_a_turn_about_the_view_moves_the_image_right_over_to_down() -> None:
-    T_colour_depth = DepthRegistration.parse("100,100,63.5,47.5,0,0,0,0,0,30").depth_to_colour()
+def test_a_roll_rotates_the_image_from_right_to_down() -> None:
+    T_colour_depth = DepthRegistration.parse("100,100,63.5,47.5,0,0,0,0,0,30").extrinsics()
     depth_m = np.zeros((96, 128), np.float32)
     depth_m[47:49, 103:105] = 1.0  # 40 px to the right of the centre
     rows, columns = np.nonzero(register_depth(depth_m, DEPTH, DEPTH, T_colour_depth))
@@ -139,21 +139,21 @@ def test_a_turn_about_the_view_moves_the_image_right_over_to_down() -> None:
              "525,525,inf,240", "525,525,320,240,-25,0,0", "525,525,320,240,nan,0,0",
              "525,525,320,240,0,0,0,0,0,90", "525,525,320,240,0,0,0,0,0,nan"],
 )  # fmt: skip
-def test_a_bad_text_is_refused_in_one_line(text: str) -> None:
-    with pytest.raises(InvalidInputError, match=r"^colour camera: expected [^\n]*$"):
+def test_an_invalid_text_is_rejected_in_one_line(text: str) -> None:
+    with pytest.raises(InvalidInputError, match=r"^depth registration: expected [^\n]*$"):
         DepthRegistration.parse(text)
 
 
-def test_the_agent_takes_the_text_for_its_source() -> None:
+def test_the_agent_passes_the_registration_to_its_source() -> None:
     text = "525,525,320,240,-0.025,0,0"
     settings = parse_arguments(["--source", "somewhere", "--task", "Find the mug", "--register-depth", text])
-    assert settings.play is not None
-    assert settings.play.colour_camera == DepthRegistration.parse(text)
-    with pytest.raises(InvalidInputError, match="colour camera"):
+    assert settings.source is not None
+    assert settings.source.depth_registration == DepthRegistration.parse(text)
+    with pytest.raises(InvalidInputError, match="depth registration"):
         parse_arguments(["--source", "somewhere", "--task", "Find the mug", "--register-depth", "525"])
 
 
-def test_a_focal_length_far_from_the_depth_cameras_is_refused(tmp_path: Path) -> None:
+def test_a_focal_length_far_from_the_depth_cameras_is_rejected(tmp_path: Path) -> None:
     source = open_source(str(write_seven_scenes(tmp_path / "seq")))
     with pytest.raises(InvalidInputError, match="fy_px: expected at most 4 times"):
         RegisteredSource(source, DepthRegistration.parse("20,2,7.5,5.5"))

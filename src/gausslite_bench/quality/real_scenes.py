@@ -1,0 +1,137 @@
+"""Scenes of recorded sequences."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from gausslite.calibration.pose_exposure_prior import PoseExposurePrior
+from gausslite.datasets.held_out import HeldOutSplit
+from gausslite.datasets.intrinsics import CAMERA_FILE, INTRINSICS_FILE, find_in_or_above
+from gausslite.datasets.open import open_source
+from gausslite.datasets.regions import balls_for_small_objects, choose_regions, load_voxel_regions
+from gausslite.datasets.registered_source import DepthRegistration
+from gausslite.datasets.source import Source
+from gausslite.domain.pose import UpAxis
+from gausslite.errors import InvalidInputError
+from gausslite.evaluation.views import MIN_ROI_PIXELS, HeldOutView
+from gausslite.mission.settings import SceneInfo
+from gausslite.perception.vocabulary import head_of
+from gausslite_bench.quality.scenes import PosePolicy, Scene, UnseenRegionError, make_scene, require_count
+
+REAL_CAMERA = PosePolicy(PoseExposurePrior(translation_m=0.01, rotation_deg=0.5, gain=0.1, offset=0.03), fit_views=True)
+"""A handheld camera with automatic exposure, tracked to about a centimetre."""
+_NUMBERED = re.compile(r"seq-?\d+")
+"""Folder names that need the parent's name to be distinctive."""
+
+
+@dataclass(frozen=True, slots=True)
+class RealScenePlan:
+    """A recorded sequence and its objects of one kind; every eighth frame is held out.
+
+    frames: approximate number of training frames, spread over the sequence; None uses all.
+    """
+
+    folder: Path
+    roi: Path
+    kind: str
+    objects: tuple[str, ...]
+    frames: int | None = None
+    up_axis: UpAxis | None = None
+    depth_registration: DepthRegistration | None = None
+    pose_policy: PosePolicy = REAL_CAMERA
+    split: HeldOutSplit = field(default_factory=HeldOutSplit)
+
+    def __post_init__(self) -> None:
+        if not self.kind or "/" in self.kind:
+            raise InvalidInputError(f"{self.roi}: expected objects that can name files, got {', '.join(self.objects)}")
+        if self.frames is not None:
+            require_count("frames", self.frames)
+
+    @property
+    def name(self) -> str:
+        """Such as redkitchen-chair."""
+        folder = self.folder.resolve()
+        place = f"{folder.parent.name}-{folder.name}" if _NUMBERED.fullmatch(folder.name) else folder.name
+        return f"{place}-{self.kind}"
+
+    @property
+    def task(self) -> str:
+        """A search for the kind."""
+        return f"Find the {self.kind}"
+
+    def settings(self) -> Mapping[str, object]:
+        """Return the training settings, the objects and the digest of the region file."""
+        regions = hashlib.sha256(self.roi.read_bytes()).hexdigest()
+        return {
+            **self.training_settings(),
+            "objects": list(self.objects),
+            "regions": regions,
+            "pose_policy": str(self.pose_policy),
+        }
+
+    def training_settings(self) -> Mapping[str, object]:
+        """Return the folder, the frame selection, and the digests of the camera files."""
+        cameras = [find_in_or_above(self.folder, name) for name in (CAMERA_FILE, INTRINSICS_FILE)]
+        files = {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in cameras if path is not None}
+        return {
+            "folder": str(self.folder.resolve()),
+            "frames": self.frames,
+            "up": self.up_axis,
+            "test_every": self.split.every,
+            "depth_registration": None if self.depth_registration is None else str(self.depth_registration),
+            **files,
+        }
+
+    def load(self, size: tuple[int, int]) -> Scene:
+        """Return the scene of the frames with depth. Raises UnseenRegionError, DatasetError, InvalidInputError."""
+        source = open_source(str(self.folder), self.up_axis, self.depth_registration)
+        all_regions = balls_for_small_objects(load_voxel_regions(self.roi))
+        regions = choose_regions(all_regions, self.objects)
+        training, held_out = self.split.split(self._positions(source))
+        views = [HeldOutView.of(source.frame(i, size), regions) for i in held_out]
+        views = [view for view in views if view.frame.has_depth]
+        if views and not any(view.shows_region for view in views):
+            raise UnseenRegionError(
+                f"{self.name}: expected held-out views that show at least {MIN_ROI_PIXELS} pixels of "
+                f"{', '.join(self.objects)} at {size[0]}x{size[1]}, got none of {len(views)}"
+            )
+        info = SceneInfo(source.up_axis, all_regions)
+        return make_scene(self.task, [source.frame(i, size) for i in training], views, regions, info)
+
+    def _positions(self, source: Source) -> list[int]:
+        if self.frames is None:
+            return list(range(len(source)))
+        count = min(len(source), round(self.frames * self.split.every / (self.split.every - 1)))
+        return sorted({round(i) for i in np.linspace(0, len(source) - 1, count)})
+
+
+def real_plans(
+    folder: Path,
+    roi: Path,
+    frames: int | None = None,
+    up_axis: UpAxis | None = None,
+    pose_policy: PosePolicy = REAL_CAMERA,
+) -> list[RealScenePlan]:
+    """Return one plan per kind of object in the region file: mug_1 and mug_2 are of kind mug. Raises DatasetError."""
+    kinds: dict[str, list[str]] = {}
+    for name in load_voxel_regions(roi):
+        kinds.setdefault(head_of(name), []).append(name)
+    return [
+        RealScenePlan(folder, roi, kind, tuple(objects), frames, up_axis, pose_policy=pose_policy)
+        for kind, objects in kinds.items()
+    ]
+
+
+def choose_kinds(plans: Sequence[RealScenePlan], kinds: Sequence[str]) -> list[RealScenePlan]:
+    """Return the plans of these kinds; all if kinds is empty. Raises InvalidInputError for an unknown kind."""
+    known = [plan.kind for plan in plans]
+    unknown = [kind for kind in kinds if kind not in known]
+    if unknown:
+        raise InvalidInputError(f"kinds: expected names among {', '.join(known)}, got {', '.join(unknown)}")
+    return [plan for plan in plans if not kinds or plan.kind in kinds]
