@@ -1,4 +1,4 @@
-"""How soon a map serves a task that came late: beside one restarted then, and one that had the task all along."""
+"""Recovery of map quality after a task change, compared with a restarted map and a map that always had the task."""
 
 from __future__ import annotations
 
@@ -18,17 +18,18 @@ from gausslite.mission.settings import MissionSettings, require_rate
 from gausslite.mission.task_mapper import FrameOutcome, TaskMapper
 from gausslite.perception.fixed_relevance import RegionRelevanceEstimator
 from gausslite.render.choose import choose_rasterizer
+from gausslite_bench.quality.home_scenes import HomeScenePlan
 from gausslite_bench.quality.home_tasks import HOME_TASKS, HomeTask
-from gausslite_bench.quality.scenes import HomeScenePlan, RecordedRelevanceEstimator, Scene
+from gausslite_bench.quality.scenes import RecordedRelevanceEstimator, Scene
 
 GOAL_DB, GOAL_S = 1.0, 10.0
-"""How near to the map that had the task all along, and how soon."""
-CHANGED, RESTARTED, ALWAYS = "task changed", "restarted", "always on it"
+"""Goal: the gap to the map that always had the task, and the time after the change."""
+CHANGED, RESTARTED, ALWAYS = "task changed", "restarted", "always this task"
 
 
 @dataclass(frozen=True, slots=True)
 class TaskChange:
-    """Two tasks in one home, one after the other."""
+    """Two consecutive tasks in one home."""
 
     before: HomeTask
     after: HomeTask
@@ -41,12 +42,12 @@ class TaskChange:
 
     @classmethod
     def parse(cls, text: str) -> TaskChange:
-        """Read "home-4-search:home-4-navigation". Raises InvalidInputError."""
-        pairs = {pair.name: pair for pair in HOME_TASKS}
+        """Parse "home-4-search:home-4-navigation". Raises InvalidInputError."""
+        tasks = {task.name: task for task in HOME_TASKS}
         names = text.split(":")
-        if len(names) != 2 or not all(name in pairs for name in names):
+        if len(names) != 2 or not all(name in tasks for name in names):
             raise InvalidInputError(f"task change: expected such as home-4-search:home-4-navigation, got {text!r}")
-        return cls(pairs[names[0]], pairs[names[1]])
+        return cls(tasks[names[0]], tasks[names[1]])
 
     @property
     def name(self) -> str:
@@ -56,10 +57,10 @@ class TaskChange:
 
 @dataclass(frozen=True, slots=True)
 class TaskChangeBench:
-    """What every map gets: `before` frames for the first task (the restarted one has none), then `after` more.
+    """Maps `before` frames for the first task (not for the restarted map), then `after` frames for the second.
 
-    A frame is 1 / rate_hz seconds of mapping; the maps are looked at after the first frame, the last, and every
-    check_every frames.
+    A frame counts as 1 / rate_hz seconds. The maps are scored after the first frame, the last, and every check_every
+    frames after the change. size: (width_px, height_px).
     """
 
     settings: MissionSettings
@@ -77,12 +78,12 @@ class TaskChangeBench:
                 raise InvalidInputError(f"task-change {name}: expected at least 1, got {getattr(self, name)}")
 
     def run(self, change: TaskChange) -> Recovery:
-        """Map three times. Raises DatasetError, InvalidInputError."""
+        """Build and score the three maps. Raises DatasetError, InvalidInputError."""
         scene = HomeScenePlan(change.after, self.before + self.after, self.views).load(self.size)
-        old_region = RegionRelevanceEstimator(choose_regions(scene.knowledge.regions, change.before.objects))
-        earlier = replace(scene, masks=[old_region.estimate(frame).relevance for frame in scene.training])
-        first, second = RecordedRelevanceEstimator(earlier), RecordedRelevanceEstimator(scene)
-        changed, always, restarted = self._loop(first), self._loop(second), self._loop(second)
+        first_region = RegionRelevanceEstimator(choose_regions(scene.info.regions, change.before.objects))
+        first_scene = replace(scene, masks=[first_region.estimate(frame).relevance for frame in scene.training])
+        first, second = RecordedRelevanceEstimator(first_scene), RecordedRelevanceEstimator(scene)
+        changed, always, restarted = self._mapper(first), self._mapper(second), self._mapper(second)
         for mapper in (changed, always):
             MissionRunner(mapper.process).run(scene.training[: self.before]).raise_if_stopped()
         changed.assign(second)
@@ -110,14 +111,14 @@ class TaskChangeBench:
         MissionRunner(mapper.process, check).run(frames).raise_if_stopped()
         return points, reevaluations
 
-    def _loop(self, attention: RecordedRelevanceEstimator) -> TaskMapper:
+    def _mapper(self, estimator: RecordedRelevanceEstimator) -> TaskMapper:
         return TaskMapper(
-            attention, build_mapper(self.settings), scheduler=FrameScheduler(self.settings.scheduler_settings)
+            estimator, build_mapper(self.settings), scheduler=FrameScheduler(self.settings.scheduler_settings)
         )
 
-    def _region_psnr(self, loop: TaskMapper, scene: Scene) -> float:
-        """Mean over the held-out views that show the new task's region."""
-        viewer = MapViewer(loop.gaussians(), choose_rasterizer(threads=self.settings.threads))
+    def _region_psnr(self, mapper: TaskMapper, scene: Scene) -> float:
+        """Return the mean ROI PSNR over the held-out views that show the new task's region."""
+        viewer = MapViewer(mapper.gaussians(), choose_rasterizer(threads=self.settings.threads))
         views = [view for view in scene.held_out if view.shows_region]
         if not views:
             raise InvalidInputError(f"{scene.task!r}: expected held-out views that show its region, got none")
@@ -126,59 +127,61 @@ class TaskChangeBench:
 
 @dataclass(frozen=True, slots=True)
 class Recovery:
-    """ROI PSNR in dB against seconds of mapping since the change, for the three maps; what re-reading took, in all and
-    at most in a frame.
+    """Scores of the three maps: (seconds of mapping since the change, ROI PSNR in dB) by map.
+
+    reevaluated and seeded: keyframes evaluated for the new task and Gaussians seeded from them, in total and the
+    maximum per frame.
     """
 
     change: TaskChange
     points: dict[str, list[tuple[float, float]]]
-    reread: int
-    most_reread: int
+    reevaluated: int
+    max_reevaluated: int
     seeded: int
-    most_seeded: int
+    max_seeded: int
 
     def gap_db(self, position: int) -> float:
-        """How far the changed map is behind the one that had the task all along."""
+        """Return the PSNR of the map that always had the task minus that of the changed map."""
         return self.points[ALWAYS][position][1] - self.points[CHANGED][position][1]
 
     @property
     def recovered_s(self) -> float | None:
-        """Seconds until the gap is, and stays, at most GOAL_DB; None where it never does."""
-        near = None
+        """Seconds until the gap stays at or below GOAL_DB; None if it does not."""
+        recovered = None
         for i, (seconds, _) in enumerate(self.points[CHANGED]):
-            near = (near if near is not None else seconds) if self.gap_db(i) <= GOAL_DB else None
-        return near
+            recovered = (seconds if recovered is None else recovered) if self.gap_db(i) <= GOAL_DB else None
+        return recovered
 
     def at(self, seconds: float) -> int:
-        """The latest look not after so many seconds."""
-        return max(i for i, (when, _) in enumerate(self.points[CHANGED]) if when <= seconds or i == 0)
+        """Return the position of the last score at or before this time."""
+        return max(i for i, (time_s, _) in enumerate(self.points[CHANGED]) if time_s <= seconds or i == 0)
 
     def as_json(self) -> dict[str, object]:
-        """For the record."""
+        """Return the scores as JSON values."""
         return {
             "change": self.change.name,
             "tasks": [self.change.before.task, self.change.after.task],
             "roi_psnr_by_seconds": self.points,
             "gap_db_at_goal_time": self.gap_db(self.at(GOAL_S)),
             "recovered_s": self.recovered_s,
-            "keyframes_reread": self.reread,
-            "most_keyframes_a_frame": self.most_reread,
+            "keyframes_reevaluated": self.reevaluated,
+            "max_keyframes_per_frame": self.max_reevaluated,
             "seeded": self.seeded,
-            "most_seeded_a_frame": self.most_seeded,
+            "max_seeded_per_frame": self.max_seeded,
         }
 
 
 def recovery_table(recoveries: Sequence[Recovery]) -> str:
-    """One row for each change: the three maps at the change and after GOAL_S, and when the gap had closed.
+    """Return one row per change: the scores at the change and after GOAL_S, and the recovery time.
 
-    Where mapping ended before GOAL_S, its last look stands there.
+    The last score is used if mapping ended before GOAL_S.
     """
-    looks = sorted({each.points[CHANGED][each.at(GOAL_S)][0] for each in recoveries})
+    times_s = sorted({each.points[CHANGED][each.at(GOAL_S)][0] for each in recoveries})
     lines = [
         "ROI PSNR of the new region in dB, first frame after the change → after "
-        f"{' or '.join(f'{when:g}' for when in looks)} s of further mapping.",
+        f"{' or '.join(f'{time_s:g}' for time_s in times_s)} s of further mapping.",
         "",
-        f"| change | {CHANGED} | {RESTARTED} | {ALWAYS} | gap then | within {GOAL_DB:g} dB after |",
+        f"| change | {CHANGED} | {RESTARTED} | {ALWAYS} | final gap | within {GOAL_DB:g} dB after |",
         "|---|---|---|---|---|---|",
     ]
     for each in recoveries:
@@ -186,6 +189,6 @@ def recovery_table(recoveries: Sequence[Recovery]) -> str:
         cells = [
             f"{each.points[name][0][1]:.2f} → {each.points[name][last][1]:.2f}" for name in (CHANGED, RESTARTED, ALWAYS)
         ]
-        when = "never" if each.recovered_s is None else f"{each.recovered_s:.2f} s"
-        lines.append(f"| {each.change.name} | {' | '.join(cells)} | {each.gap_db(last):.2f} | {when} |")
+        recovered = "never" if each.recovered_s is None else f"{each.recovered_s:.2f} s"
+        lines.append(f"| {each.change.name} | {' | '.join(cells)} | {each.gap_db(last):.2f} | {recovered} |")
     return "\n".join(lines) + "\n"

@@ -16,9 +16,9 @@ SMALL = ("--size", "96x72", "--max-gaussians", "1500", "--threads", "1")
 
 
 def cost(perception_s: float, iterations: int) -> FrameCost:
-    steps_s = {Stage.RELEVANCE: perception_s, Stage.SEEDING: 0.03, Stage.PUBLISHING: 0.01}
+    stages_s = {Stage.RELEVANCE: perception_s, Stage.SEEDING: 0.03, Stage.PUBLISHING: 0.01}
     budget = FrameTiming(
-        sum(steps_s.values()), steps_s, frozenset({SkippableStage.SEEDING}), under_trained=iterations < 5
+        sum(stages_s.values()), stages_s, frozenset({SkippableStage.SEEDING}), under_trained=iterations < 5
     )
     return FrameCost(budget, iterations, gaussians=100 * iterations, roi_share=0.5)
 
@@ -36,19 +36,19 @@ def test_hz_is_frames_by_the_sum_of_their_latencies() -> None:
     assert timing.mapping.max_ms == pytest.approx(30.0)
 
 
-def test_steps_reliefs_and_short_frames_are_counted() -> None:
+def test_stages_skips_and_under_trained_frames_are_counted() -> None:
     timing = LoopTiming.of([cost(0.06, 4), cost(0.26, 8)])
-    assert timing.steps["seeding"].p50_ms == pytest.approx(30.0)
-    assert timing.steps["rendering"].max_ms == 0.0
+    assert timing.stages["seeding"].p50_ms == pytest.approx(30.0)
+    assert timing.stages["rendering"].max_ms == 0.0
     assert timing.skipped_stages == {"publishing": 0, "seeding": 2}
-    assert timing.frames_short == 1
+    assert timing.frames_under_trained == 1
 
 
-def test_the_log_gives_back_what_it_was_told() -> None:
-    log, told = CostLog(), [cost(0.06, 4), cost(0.26, 8), cost(0.1, 0)]
-    for each in told:
+def test_the_log_returns_the_costs_that_were_appended() -> None:
+    log, costs = CostLog(), [cost(0.06, 4), cost(0.26, 8), cost(0.1, 0)]
+    for each in costs:
         log.append(each)
-    assert log.costs() == told
+    assert log.costs() == costs
     assert CostLog().costs() == []
 
 
@@ -70,17 +70,17 @@ def test_the_home_is_mapped_and_the_figures_are_json(
     assert 0 < report["gaussians"] <= 1500
     assert report["hz"] > 0
     assert report["peak_rss_mib"] > 0
-    for part in ("latency", "perception", "mapping", "words"):
+    for part in ("latency", "perception", "mapping", "publishing"):
         times = report[part]
         assert 0 < times["p50_ms"] <= times["p90_ms"] <= times["p99_ms"] <= times["max_ms"]
     if budget[0] == "--iterations":
         assert (report["iterations_mean"], report["iterations_min"]) == (2.0, 2)
 
 
-def test_lines_name_every_step(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_text_names_every_stage(capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("embreex", reason="the simulated home needs the extra `sim`")
     pytest.importorskip("gausslite.render._kernels", reason="the native kernels are not built")
     assert main(["bench", "loop", "--policy", "uniform", "--frames", "0:2", *SMALL, "--iterations", "1"]) == 0
     printed = capsys.readouterr().out
-    for word in ("2 frames", "Hz", "p99", "perception", "mapping", "ROI words", "peak memory"):
+    for word in ("2 frames", "Hz", "p99", "perception", "mapping", "publishing", "peak memory"):
         assert word in printed

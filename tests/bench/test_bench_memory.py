@@ -1,4 +1,4 @@
-"""Memory over a long run, and the frames such a run plays."""
+"""Memory trend of a long run, and the order of its frames."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from gausslite.errors import InvalidInputError
 from gausslite_bench.loop.memory import MemoryTrend, back_and_forth
 
 
-def test_motion_goes_on_where_the_sequence_turns() -> None:
+def test_back_and_forth_is_continuous_at_both_ends() -> None:
     assert back_and_forth(4, 10) == [0, 1, 2, 3, 2, 1, 0, 1, 2, 3]
     assert back_and_forth(1, 3) == [0, 0, 0]
     positions = back_and_forth(7, 100)
@@ -21,7 +21,7 @@ def test_motion_goes_on_where_the_sequence_turns() -> None:
 
 
 def test_the_slope_is_that_of_the_second_half() -> None:
-    trend = MemoryTrend.of([100.0, 300.0, 400.0, 410.0, 420.0, 430.0], frames_apart=50)
+    trend = MemoryTrend.of([100.0, 300.0, 400.0, 410.0, 420.0, 430.0], sample_interval_frames=50)
     assert (trend.start_mib, trend.middle_mib, trend.end_mib) == (100.0, 410.0, 430.0)
     assert trend.mib_per_1000_frames == pytest.approx(200.0)
     assert MemoryTrend.of([7.0, 7.0], 1).mib_per_1000_frames == pytest.approx(0.0, abs=1e-6)
@@ -29,7 +29,7 @@ def test_the_slope_is_that_of_the_second_half() -> None:
         MemoryTrend.of([7.0], 1)
 
 
-def test_a_looped_run_tells_its_memory_and_the_gap_to_unlimited_time(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_looped_run_reports_its_memory_and_the_gap_to_unlimited_time(capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("embreex", reason="the simulated home needs the extra `sim`")
     pytest.importorskip("gausslite.render._kernels", reason="the native kernels are not built")
     small = ("--frames", "0:16", "--size", "96x72", "--max-gaussians", "1500", "--threads", "1", "--iterations", "4")

@@ -1,4 +1,4 @@
-"""What `bench perception` counts, on a scene and detectors whose score is known."""
+"""Scores of `bench perception` on a scene and detectors with known results."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from gausslite.domain.task import TaskGraph
 from gausslite.errors import InvalidInputError
 from gausslite.perception.ground_truth import RegionDetector
 from gausslite_bench.perception.contact_sheet import PerceptionSheet
-from gausslite_bench.perception.stage_scores import PerceptionBench, PerceptionStage, Question
+from gausslite_bench.perception.stage_scores import PerceptionBench, PerceptionStage, TaskQuery
 
 CAMERA = Camera(100.0, 100.0, 80.0, 60.0, 160, 120)
 UP = (0.0, -1.0, 0.0)
 REGIONS = {"mug_1": BallRegion((-0.3, 0.0, 2.0), 0.15), "mug_2": BallRegion((0.3, 0.0, 2.0), 0.15)}
-MUGS = Question(TaskGraph("id", "Find the mug", ("mug",), (), ()), ("mug_1", "mug_2"))
-ABSENT = Question(TaskGraph("id", "Find the vase", ("vase",), (), ()), ())
+MUGS = TaskQuery(TaskGraph("id", "Find the mug", ("mug",), (), ()), ("mug_1", "mug_2"))
+ABSENT = TaskQuery(TaskGraph("id", "Find the vase", ("vase",), (), ()), ())
 
 
 def frames(count: int) -> list[Frame]:
@@ -33,8 +33,8 @@ def frames(count: int) -> list[Frame]:
     return [Frame(index, 0, rgb, depth_m, CAMERA, np.eye(4)) for index in range(count)]
 
 
-class FaintAndWrong:
-    """Finds one of the mugs, faintly, and a vase in the first frame that is none."""
+class WeakDetector:
+    """Detects one of two mugs with a low score, and a false vase in the first frame."""
 
     def unsupported(self, queries: Sequence[str]) -> tuple[str, ...]:
         return ()
@@ -49,51 +49,58 @@ class FaintAndWrong:
         ]
 
 
-def test_an_exact_detector_is_right_in_every_step():
+def test_an_exact_detector_is_right_in_every_stage():
     bench = PerceptionBench(RegionDetector(REGIONS), [MUGS], REGIONS, UP)
     for frame in frames(7):
-        bench.look(frame)
+        bench.process(frame)
     (score,) = bench.scores()
     assert (score.frames, score.shown_frames, score.shown_objects) == (7, 7, 2)
-    for figures in score.steps.values():
-        assert (figures.iou, figures.precision, figures.recall) == (1.0, 1.0, 1.0)
-        assert (figures.marked_frames, figures.right_frames, figures.objects_found, figures.late_frames) == (7, 7, 2, 0)
+    for stage_score in score.stages.values():
+        assert (stage_score.iou, stage_score.precision, stage_score.recall) == (1.0, 1.0, 1.0)
+        assert (
+            stage_score.marked_frames,
+            stage_score.right_frames,
+            stage_score.objects_found,
+            stage_score.late_frames,
+        ) == (7, 7, 2, 0)
 
 
-def test_each_figure_counts_what_it_says():
-    bench = PerceptionBench(FaintAndWrong(), [MUGS, ABSENT], REGIONS, UP)
+def test_scores_of_a_weak_detector():
+    bench = PerceptionBench(WeakDetector(), [MUGS, ABSENT], REGIONS, UP)
     for frame in frames(4):
-        bench.look(frame)
+        bench.process(frame)
     mugs, vase = bench.scores()
-    detected, believed = mugs.steps[PerceptionStage.DETECTED], mugs.steps[PerceptionStage.BELIEVED]
+    detected, confirmed = mugs.stages[PerceptionStage.DETECTED], mugs.stages[PerceptionStage.CONFIRMED]
     assert (detected.precision, detected.recall, detected.late_frames) == (1.0, 0.5, 0.0)
-    assert (believed.precision, believed.recall, believed.late_frames) == (1.0, 0.375, 1.0)
-    assert mugs.steps[PerceptionStage.FOLLOWED].objects_found == 1
-    assert vase.steps[PerceptionStage.DETECTED].marked_most == 30 * 40 / (120 * 160)
+    assert (confirmed.precision, confirmed.recall, confirmed.late_frames) == (1.0, 0.375, 1.0)
+    assert mugs.stages[PerceptionStage.TRACKED].objects_found == 1
+    assert vase.stages[PerceptionStage.DETECTED].marked_max == 30 * 40 / (120 * 160)
     assert (
-        vase.steps[PerceptionStage.DETECTED].marked_mean
-        == vase.steps[PerceptionStage.RELATED].marked_mean
+        vase.stages[PerceptionStage.DETECTED].marked_mean
+        == vase.stages[PerceptionStage.RELATED].marked_mean
         == 30 * 40 / (120 * 160) / 4
     )
-    assert vase.steps[PerceptionStage.FOLLOWED].marked_frames == vase.steps[PerceptionStage.BELIEVED].marked_frames == 0
-    assert vase.steps[PerceptionStage.DETECTED].iou is None
+    assert (
+        vase.stages[PerceptionStage.TRACKED].marked_frames == vase.stages[PerceptionStage.CONFIRMED].marked_frames == 0
+    )
+    assert vase.stages[PerceptionStage.DETECTED].iou is None
 
 
-def test_a_sheet_has_a_row_for_each_stretch_and_a_column_for_each_step():
-    bench, sheet = PerceptionBench(FaintAndWrong(), [ABSENT], REGIONS, UP), PerceptionSheet(4, rows=2)
+def test_a_sheet_has_a_row_for_each_segment_and_a_column_for_each_stage():
+    bench, sheet = PerceptionBench(WeakDetector(), [ABSENT], REGIONS, UP), PerceptionSheet(4, rows=2)
     for frame in frames(4):
-        sheet.offer(bench.look(frame)[0])
+        sheet.add(bench.process(frame)[0])
     assert sheet.draw().shape == (6 + 2 * (240 + 26 + 6), 6 + 5 * (320 + 6), 3)
 
 
 def test_objects_must_be_known():
     with pytest.raises(InvalidInputError, match="expected names among mug_1, mug_2; got mug_3"):
-        PerceptionBench(RegionDetector(REGIONS), [Question(MUGS.graph, ("mug_3",))], REGIONS, UP)
+        PerceptionBench(RegionDetector(REGIONS), [TaskQuery(MUGS.graph, ("mug_3",))], REGIONS, UP)
 
 
 @pytest.fixture
-def asked(tmp_path) -> list[str]:
-    """A folder of frames that see a wall 2 m ahead, a mug in it, and a detector of cups and dogs."""
+def arguments(tmp_path) -> list[str]:
+    """Command line for frames of a wall at 2 m with a mug, and a detector of cups and dogs."""
     np.savez(
         tmp_path / "roi.npz",
         mug=np.array([[x, y, 100] for x in range(-50, 50) for y in range(-50, 50)]),
@@ -104,30 +111,30 @@ def asked(tmp_path) -> list[str]:
     return ["bench", "perception", str(folder), "--roi", str(tmp_path / "roi.npz"), "--detector", str(model)]
 
 
-def test_the_command_prints_its_figures(asked, tmp_path, capsys):
-    asked += ["--threads", "1", "--absent", "dog"]
-    assert main([*asked, "--json", "--task", "Find the mug=mug", "--pictures", str(tmp_path / "sheets")]) == 0
+def test_the_command_prints_its_figures(arguments, tmp_path, capsys):
+    arguments += ["--threads", "1", "--absent", "dog"]
+    assert main([*arguments, "--json", "--task", "Find the mug=mug", "--pictures", str(tmp_path / "sheets")]) == 0
     printed = json.loads(capsys.readouterr().out)
     assert [task["task"] for task in printed["tasks"]] == ["Find the mug", "Find the dog"]
-    assert set(printed["tasks"][0]["steps"]) == {"detected", "related", "believed", "followed"}
+    assert set(printed["tasks"][0]["stages"]) == {"detected", "related", "confirmed", "tracked"}
     assert len(list((tmp_path / "sheets").iterdir())) == 2
-    assert main(asked) == 0
+    assert main(arguments) == 0
     assert "| Find the dog (nothing; shown in 0 of 3 frames) | detected |" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
-    ("more", "said"),
+    ("options", "message"),
     [
         (["--task", "Find the mug"], "expected a task and its objects"),
         (["--task", "Find the mug=cup"], "expected names among mug; got cup"),
-        (["--absent", "cup"], "expected nouns that name nothing there, got cup"),
+        (["--absent", "cup"], "expected nouns of absent objects, got cup"),
     ],
 )
-def test_what_cannot_be_measured_is_refused(asked, more, said, capsys):
-    assert main([*asked, *more]) == 2
-    assert said in capsys.readouterr().err
+def test_invalid_tasks_are_errors(arguments, options, message, capsys):
+    assert main([*arguments, *options]) == 2
+    assert message in capsys.readouterr().err
 
 
-def test_it_measures_a_detector(asked, capsys):
-    assert main(asked[:-2]) == 2
+def test_it_measures_a_detector(arguments, capsys):
+    assert main(arguments[:-2]) == 2
     assert "--detector: expected a model file" in capsys.readouterr().err

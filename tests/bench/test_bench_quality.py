@@ -21,35 +21,38 @@ from gausslite.errors import InvalidInputError
 from gausslite.perception.vocabulary import same_kind
 from gausslite.task.rules import RuleParser
 from gausslite_bench.quality.ablation import cumulative_variants
+from gausslite_bench.quality.home_scenes import HomeScenePlan
 from gausslite_bench.quality.home_tasks import HOME_TASKS, WHOLE_HOMES, TaskKind, choose_home_tasks
-from gausslite_bench.quality.scenes import HomeScenePlan, PosePolicy, RealScenePlan, UnseenRegionError, choose_kinds
-from gausslite_bench.quality.study import FinishedTrial, Study, TrialCache, run_study
-from gausslite_bench.quality.tables import FULL_METRICS, ROI_METRICS, Scoreboard, ablation_table, quality_table
+from gausslite_bench.quality.real_scenes import RealScenePlan, choose_kinds
+from gausslite_bench.quality.scenes import PosePolicy, UnseenRegionError
+from gausslite_bench.quality.study import FinishedTrial, Study, run_study
+from gausslite_bench.quality.tables import FULL_METRICS, ROI_METRICS, StudyResults, ablation_table, quality_table
+from gausslite_bench.quality.trial_cache import TrialCache
 from gausslite_bench.quality.trials import BudgetMode, Conditions, Trial, TrialBudget, Variant, clock_for
 from gausslite_sim.family import HOME_COUNT, HOMES
 
 
-def test_there_are_three_tasks_of_three_kinds_in_each_home() -> None:
+def test_each_home_has_one_task_of_each_kind() -> None:
     kinds = set(TaskKind) - {TaskKind.FULL_FRAME}
     assert {(pair.home, pair.kind) for pair in HOME_TASKS} == {(h, k) for h in range(1, HOME_COUNT + 1) for k in kinds}
     assert len({pair.task for pair in HOME_TASKS}) == len(HOME_TASKS) == 24
 
 
 @pytest.mark.parametrize("pair", HOME_TASKS, ids=lambda pair: pair.name)
-def test_the_words_of_a_task_mean_its_objects(pair) -> None:
+def test_the_targets_of_a_task_match_its_objects(pair) -> None:
     graph = RuleParser().parse(pair.task)
     assert not graph.warnings
     for name in pair.objects:
         assert any(same_kind(target, name) for target in graph.targets), (graph.targets, name)
 
 
-def test_a_task_is_about_things_that_are_there() -> None:
+def test_the_objects_of_a_task_exist_in_its_home() -> None:
     names = {item.name for item in HOMES[PLAN.pair.home - 1].furnish(np.random.default_rng(0))}
     for pair in choose_home_tasks([f"home-{PLAN.pair.home}"]):
         assert set(pair.objects) <= names
 
 
-def test_pairs_are_chosen_by_name_or_home() -> None:
+def test_tasks_are_selected_by_name_or_home() -> None:
     assert choose_home_tasks([]) == HOME_TASKS
     assert [pair.name for pair in choose_home_tasks(["home-2", "home-5-search"])] == [
         "home-2-manipulation",
@@ -75,7 +78,7 @@ def test_components_come_one_by_one() -> None:
     labels = [variant.label for variant in variants]
     beyond = ["+long-term-keyframes", "+roi-context", "+background-reserve", "+ema", "+lr-decay"]
     assert labels == ["none", "+SB", "+MVO", "+ROI", "+SIS", "+GFD", *beyond]
-    off = [variant.without for variant in variants]
+    off = [variant.disabled for variant in variants]
     assert all(len(a - b) == 1 and b < a for a, b in pairwise(off))
     assert not off[-1]
 
@@ -89,7 +92,7 @@ def test_a_trials_key_changes_with_each_of_its_settings() -> None:
         replace(trial, budget=TrialBudget(iterations=9)),
         replace(trial, budget=TrialBudget(equal=BudgetMode.TIME)),
         replace(trial, plan=replace(PLAN, frames=5)),
-        replace(trial, plan=replace(PLAN, trust=PosePolicy(fit_views=True))),
+        replace(trial, plan=replace(PLAN, pose_policy=PosePolicy(fit_views=True))),
         replace(trial, plan=HomeScenePlan(choose_home_tasks(["home-8-search"])[0], 4, 3)),
     ]
     assert len({each.key for each in (trial, *others)}) == 1 + len(others)
@@ -106,7 +109,7 @@ def test_a_map_that_knows_no_task_is_the_same_for_every_task_of_its_place() -> N
     for other in (
         replace(here, seed=1),
         replace(here, budget=TrialBudget(iterations=9)),
-        replace(here, plan=replace(PLAN, trust=PosePolicy(PoseExposurePrior(0.01)))),
+        replace(here, plan=replace(PLAN, pose_policy=PosePolicy(PoseExposurePrior(0.01)))),
         replace(here, plan=replace(PLAN, frames=5)),
         replace(here, plan=HomeScenePlan(choose_home_tasks(["home-7-search"])[0], 4, 3)),
         replace(here, variant=Variant("monogs", "monogs")),
@@ -119,19 +122,19 @@ def test_a_map_that_knows_no_task_is_the_same_for_every_task_of_its_place() -> N
 
 
 def test_homes_are_believed_and_real_cameras_are_not(tmp_path: Path) -> None:
-    assert PosePolicy() == PLAN.trust
+    assert PosePolicy() == PLAN.pose_policy
     assert not Trial(PLAN, TASK, TrialBudget(), 0, CONDITIONS).mission.pose_prior.has_pose_error
     real = RealScenePlan(tmp_path, tmp_path / "roi.npz", "mug", ("mug_1",))
     mission = Trial(real, UNIFORM, TrialBudget(), 0, CONDITIONS).mission
     assert PoseExposurePrior.parse(str(mission.pose_prior)) == PoseExposurePrior(0.01, 0.5, 0.1, 0.03)
-    assert real.trust.fit_views
+    assert real.pose_policy.fit_views
 
 
 def test_a_trials_key_is_the_same_in_every_process() -> None:
     program = (
         "from gausslite_bench.quality.ablation import cumulative_variants\n"
         "from gausslite_bench.quality.home_tasks import HOME_TASKS\n"
-        "from gausslite_bench.quality.scenes import HomeScenePlan\n"
+        "from gausslite_bench.quality.home_scenes import HomeScenePlan\n"
         "from gausslite_bench.quality.trials import TrialBudget, Conditions, Trial\n"
         "for variant in cumulative_variants():\n"
         "    print(Trial(HomeScenePlan(HOME_TASKS[0]), variant, TrialBudget(), 0, Conditions((96, 72))).key)\n"
@@ -151,54 +154,54 @@ def test_a_single_thread_is_timed_by_the_processor() -> None:
     assert clock_for(2) is clock_for(None) is time.perf_counter
 
 
-def test_the_board_knows_means_spreads_and_margins() -> None:
+def test_results_have_means_spreads_and_margins() -> None:
     budget = TrialBudget()
-    board = Scoreboard(
+    results = StudyResults(
         [finished(*each, budget) for each in ((TASK, 0, 26.0), (TASK, 1, 28.0), (UNIFORM, 0, 24.5), (UNIFORM, 1, 24.5))]
     )
-    figure = board.figure(PLAN.name, "task", ROI_METRICS[0], budget)
+    figure = results.figure(PLAN.name, "task", ROI_METRICS[0], budget)
     assert figure is not None
     assert (figure.mean, figure.spread) == (27.0, 1.0)
-    assert board.margin(PLAN.name, ROI_METRICS[0], budget) == pytest.approx(2.5)
-    assert board.figure(PLAN.name, "task", FULL_METRICS[2], budget) is None
-    table = quality_table(board)
+    assert results.margin(PLAN.name, ROI_METRICS[0], budget) == pytest.approx(2.5)
+    assert results.figure(PLAN.name, "task", FULL_METRICS[2], budget) is None
+    table = quality_table(results)
     assert "|  | covered [%]↑ | 93.8 | 93.8 |" in table
     for text in (
         "27.00 ± 1.00",
         "+2.50",
         "not computed",
-        "ahead of the best other in 1 of 1",
+        "exceeds the best other policy in 1 of 1",
         "| 1.1% in 2 of 3 views |",
         "| 28.00 |",
     ):
         assert text in table
     assert "by +2.50 dB inside the mask on average and by +0.00 dB over the full image with views fitted." in table
     assert "| 28.00 ± 1.00 | 25.50 ± 0.00 | +2.50 | +0.00 |" in table
-    (summary,) = board.as_json()["summary"]
+    (summary,) = results.as_json()["summary"]
     assert (summary["ahead_in"], summary["scenes"]) == (1, 1)
 
 
-def test_the_ablations_table_has_a_row_a_component_and_both_budgets() -> None:
+def test_the_ablation_table_has_one_row_per_component_and_both_budgets() -> None:
     budgets = [TrialBudget(equal=equal) for equal in BudgetMode]
-    board = Scoreboard([finished(v, 0, 20.0 + i, b) for b in budgets for i, v in enumerate(cumulative_variants())])
-    table = ablation_table(board)
+    results = StudyResults([finished(v, 0, 20.0 + i, b) for b in budgets for i, v in enumerate(cumulative_variants())])
+    table = ablation_table(results)
     one = "25.00 ± 0.00 | 20.00 ± 0.00 | 26.00 ± 0.00 | 20.00 ± 0.00"
     assert f"| +GFD | {one} | {one} |" in table
     assert "ROI PSNR, views fitted, equal time" in table
-    assert "mean over" not in table
+    assert "Mean over" not in table
 
 
-def test_without_fitted_views_the_ablation_shows_raw_ones_alone() -> None:
+def test_without_fitted_views_the_ablation_shows_raw_psnr_only() -> None:
     one = finished(TASK, 0, 20.0, TrialBudget())
-    board = Scoreboard([replace(one, result=replace(one.result, fitted=None))])
-    assert "| components | ROI PSNR, equal iterations | full PSNR, equal iterations |\n" in ablation_table(board)
+    results = StudyResults([replace(one, result=replace(one.result, fitted=None))])
+    assert "| components | ROI PSNR, equal iterations | full PSNR, equal iterations |\n" in ablation_table(results)
 
 
 def test_the_ablation_of_several_scenes_ends_with_their_mean() -> None:
     other = HomeScenePlan(choose_home_tasks(["home-8-search"])[0], frames=4, views=3)
-    board = Scoreboard([finished(TASK, 0, 20.0, TrialBudget()), finished(TASK, 0, 23.0, TrialBudget(), other)])
-    table = ablation_table(board)
-    assert "The mean over these 2\n\n| components | ROI PSNR, equal iterations |" in table
+    results = StudyResults([finished(TASK, 0, 20.0, TrialBudget()), finished(TASK, 0, 23.0, TrialBudget(), other)])
+    table = ablation_table(results)
+    assert "Mean over these 2 scenes\n\n| components | ROI PSNR, equal iterations |" in table
     assert table.endswith("| task | 21.50 | 20.00 | 22.50 | 20.00 |\n")
 
 
@@ -207,15 +210,15 @@ def test_a_study_counts_its_trials() -> None:
     assert study.count == len(study.trials(PLAN)) == 12
 
 
-def test_the_command_measures_keeps_and_resumes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_computes_caches_and_resumes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("embreex", reason="the simulated homes need the extra `sim`")
     pytest.importorskip("gausslite.render._kernels", reason="the native kernels are not built")
-    asked = ["--pairs", "home-8-manipulation", "--size", "96x72", "--frames", "4", "--views", "3"]
+    options = ["--pairs", "home-8-manipulation", "--size", "96x72", "--frames", "4", "--views", "3"]
     budget = ["--max-gaussians", "1500", "--iterations", "2", "--threads", "1", "--fit-views"]
-    command = ["bench", "quality", "--out", str(tmp_path), "--policies", "task,uniform", *asked, *budget]
+    command = ["bench", "quality", "--out", str(tmp_path), "--policies", "task,uniform", *options, *budget]
     assert main(command) == 0
     first = capsys.readouterr()
-    assert "`task` is ahead of" in first.out
+    assert "`task` exceeds" in first.out
     report = json.loads((tmp_path / "quality.json").read_text())
     (scene,) = report["scenes"]
     assert scene["task"] == "Prepare to pick up the drill on the workbench"
@@ -224,14 +227,14 @@ def test_the_command_measures_keeps_and_resumes(tmp_path: Path, capsys: pytest.C
     assert list((tmp_path / "sheets").glob("home-8-manipulation-view-*.png"))
     assert main(command) == 0
     again = capsys.readouterr()
-    assert again.err.count("(kept)") == 2
+    assert again.err.count("(cached)") == 2
     assert json.loads((tmp_path / "quality.json").read_text())["scenes"] == report["scenes"]
     next((tmp_path / "trials").glob("home-8-manipulation-task-*.png")).unlink()
     assert main([*command, "--seeds", "0,1"]) == 0
-    assert capsys.readouterr().err.count("(kept)") == 1
+    assert capsys.readouterr().err.count("(cached)") == 1
 
 
-def test_a_map_is_made_once_for_all_tasks_that_it_does_not_know(tmp_path: Path) -> None:
+def test_a_task_independent_map_is_built_once_for_all_tasks(tmp_path: Path) -> None:
     pytest.importorskip("embreex", reason="the simulated homes need the extra `sim`")
     pytest.importorskip("gausslite.render._kernels", reason="the native kernels are not built")
     plans = [HomeScenePlan(pair, frames=4, views=3) for pair in choose_home_tasks(["home-8"])]
@@ -247,28 +250,28 @@ def test_a_map_is_made_once_for_all_tasks_that_it_does_not_know(tmp_path: Path) 
 
 
 class Frames:
-    """Counts the frames that a study maps."""
+    """Counts the mapped frames of a study."""
 
     def __init__(self) -> None:
         self.count = 0
 
-    def frame(self, gaussians: int) -> None:
+    def on_frame(self, gaussians: int) -> None:
         del gaussians
         self.count += 1
 
-    def finished(self, done: FinishedTrial) -> None:
-        del done
+    def on_finished(self, trial: FinishedTrial) -> None:
+        del trial
 
-    def left_out(self, trials: int, why: UnseenRegionError) -> None:
-        del trials, why
+    def on_skipped(self, trials: int, reason: UnseenRegionError) -> None:
+        del trials, reason
 
 
-def test_the_ablation_is_run_within_the_budget_that_is_asked_for(tmp_path: Path) -> None:
+def test_the_ablation_uses_the_requested_budget(tmp_path: Path) -> None:
     pytest.importorskip("embreex", reason="the simulated homes need the extra `sim`")
     pytest.importorskip("gausslite.render._kernels", reason="the native kernels are not built")
-    asked = ["--pair", "home-8-manipulation", "--size", "96x72", "--frames", "2", "--views", "2", "--seeds", "0"]
+    options = ["--pair", "home-8-manipulation", "--size", "96x72", "--frames", "2", "--views", "2", "--seeds", "0"]
     budget = ["--equal", "time", "--rate", "200", "--max-gaussians", "500", "--threads", "1"]
-    assert main(["bench", "ablation", "--out", str(tmp_path), *asked, *budget]) == 0
+    assert main(["bench", "ablation", "--out", str(tmp_path), *options, *budget]) == 0
     report = json.loads((tmp_path / "ablation.json").read_text())
     assert [(each["equal"], each["rate_hz"]) for each in report["budgets"]] == [("time", 200.0)]
     assert len(report["scenes"][0]["results"]) == len(cumulative_variants())
@@ -280,8 +283,8 @@ def test_the_ablation_is_run_within_the_budget_that_is_asked_for(tmp_path: Path)
         (["quality", "--policies", "best"], "policy: expected one of task"),
         (["quality", "--pairs", "home-0"], "pairs: expected names such as home-3"),
         (["quality", "--real", "nowhere"], "--real: expected a folder and its regions"),
-        (["quality", "--kinds", "mug"], "--kinds: expected a real sequence it belongs to"),
-        (["quality", "--roi", "regions.npz"], "--roi: expected a real sequence it belongs to"),
+        (["quality", "--kinds", "mug"], "--kinds: expected a real sequence"),
+        (["quality", "--roi", "regions.npz"], "--roi: expected a real sequence"),
         (["quality", "--frames", "1", "--pairs", "home-1"], "frames: expected 2 to 100000, got 1"),
         (["quality", "--threads", "0"], "threads: expected 1 to 256, got 0"),
         (["quality", "--max-gaussians", "0"], "max_gaussians: expected at least 1, got 0"),

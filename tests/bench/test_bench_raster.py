@@ -13,7 +13,7 @@ import pytest
 from gausslite.cli.main import main
 from gausslite.errors import InvalidInputError
 from gausslite.render.rasterizer import LOG_SCALE, MEAN, RGB
-from gausslite_bench.cli.argument_types import image_sizes, percentages, positive_counts
+from gausslite_bench.cli.argument_types import read_counts, read_image_sizes, read_percentages
 from gausslite_bench.raster.block_cost import BlockCost
 from gausslite_bench.raster.operation_costs import RasterBench
 from gausslite_bench.raster.procedural_room import held_out_view, seed_rows
@@ -55,7 +55,7 @@ def test_seeds_lie_in_the_room_and_are_the_same_every_time() -> None:
 
 
 def test_fewer_seeds_than_views_are_refused() -> None:
-    with pytest.raises(InvalidInputError, match="at least 12, one a view, got 5"):
+    with pytest.raises(InvalidInputError, match="at least 12, one per view, got 5"):
         seed_rows(5)
 
 
@@ -147,12 +147,12 @@ def test_a_share_that_is_none_is_told(percent: float) -> None:
 @pytest.mark.parametrize("text", ["", "0,5", "5,,7", "101", "-1", "nan", "x"])
 def test_percents_that_are_none_are_told(text: str) -> None:
     with pytest.raises(argparse.ArgumentTypeError, match="expected"):
-        percentages(text)
+        read_percentages(text)
 
 
 def test_no_shares_can_be_asked_for() -> None:
-    assert percentages("0") == ()
-    assert percentages("5,20.5") == (5.0, 20.5)
+    assert read_percentages("0") == ()
+    assert read_percentages("5,20.5") == (5.0, 20.5)
 
 
 def test_a_file_that_is_no_library_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -168,10 +168,10 @@ def test_a_file_that_is_no_library_is_one_line(tmp_path: Path, capsys: pytest.Ca
 @pytest.mark.parametrize("text", ["", "32", "32x", "32x32x3", "0x5", "axb"])
 def test_sizes_that_are_none_are_told(text: str) -> None:
     with pytest.raises(argparse.ArgumentTypeError, match="expected"):
-        image_sizes(text)
+        read_image_sizes(text)
 
 
 @pytest.mark.parametrize("text", ["", "0", "-3", "1.5"])
 def test_counts_that_are_none_are_told(text: str) -> None:
     with pytest.raises(argparse.ArgumentTypeError, match="expected whole numbers"):
-        positive_counts(text)
+        read_counts(text)

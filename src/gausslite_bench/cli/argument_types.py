@@ -7,7 +7,7 @@ import argparse
 from gausslite.config.values import read_names, read_numbers
 
 
-def image_sizes(text: str) -> tuple[tuple[int, int], ...]:
+def read_image_sizes(text: str) -> tuple[tuple[int, int], ...]:
     """Parse "WxH,WxH"."""
     sizes = tuple(tuple(_positive(side) for side in part.lower().split("x")) for part in read_names(text))
     pairs = tuple((size[0], size[1]) for size in sizes if len(size) == 2)
@@ -16,7 +16,7 @@ def image_sizes(text: str) -> tuple[tuple[int, int], ...]:
     return pairs
 
 
-def image_size(text: str) -> tuple[int, int]:
+def read_image_size(text: str) -> tuple[int, int]:
     """Parse "WxH" with sides of 16 to 4096 pixels."""
     sides = text.lower().split("x")
     if len(sides) != 2 or not all(side.isascii() and side.isdigit() and 16 <= int(side[:6]) <= 4096 for side in sides):
@@ -24,7 +24,7 @@ def image_size(text: str) -> tuple[int, int]:
     return int(sides[0]), int(sides[1])
 
 
-def positive_counts(text: str) -> tuple[int, ...]:
+def read_counts(text: str) -> tuple[int, ...]:
     """Parse "N,N" with N > 0."""
     counts = tuple(_positive(part) for part in read_names(text))
     if not counts:
@@ -32,7 +32,7 @@ def positive_counts(text: str) -> tuple[int, ...]:
     return counts
 
 
-def seeds(text: str) -> tuple[int, ...]:
+def read_seeds(text: str) -> tuple[int, ...]:
     """Parse "N,N" with N >= 0."""
     parts = read_names(text)
     if not parts or not all(part.isascii() and part.isdigit() and len(part) < 10 for part in parts):
@@ -40,7 +40,7 @@ def seeds(text: str) -> tuple[int, ...]:
     return tuple(int(part) for part in parts)
 
 
-def percentages(text: str) -> tuple[float, ...]:
+def read_percentages(text: str) -> tuple[float, ...]:
     """Parse "5,20"; "0" means none."""
     if text.strip() == "0":
         return ()

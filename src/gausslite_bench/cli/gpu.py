@@ -7,7 +7,7 @@ import json
 
 from gausslite.errors import KernelError
 from gausslite.render.choose import choose_rasterizer
-from gausslite_bench.cli.argument_types import positive_counts
+from gausslite_bench.cli.argument_types import read_counts
 from gausslite_bench.raster.gpu_rates import GPU_GAUSSIANS, PAPER_FRAME_MS, FrameCost, GpuBench, StepRate
 
 
@@ -18,7 +18,7 @@ def configure_gpu(parser: argparse.ArgumentParser) -> None:
     add(
         "--gaussians",
         metavar="N,...",
-        type=positive_counts,
+        type=read_counts,
         default=GPU_GAUSSIANS,
         help=f"numbers of Gaussians (default: {counts})",
     )
@@ -66,7 +66,7 @@ def rate_line(rate: StepRate) -> str:
 
 def frame_lines(cost: FrameCost) -> str:
     """Return the time of one mapped frame, in total and per stage."""
-    stages = "  ".join(f"{name} {ms:.1f}" for name, ms in cost.steps_ms.items())
+    stages = "  ".join(f"{name} {ms:.1f}" for name, ms in cost.stages_ms.items())
     return (
         f"one frame on {cost.gaussians} Gaussians, {cost.iterations} iterations: {cost.whole.min_ms:.1f} / "
         f"{cost.whole.median_ms:.1f} ms (minimum / median; the paper's frame time is {PAPER_FRAME_MS:.0f} ms)\n"

@@ -1,4 +1,4 @@
-"""`gausslite bench loop`: one robot's whole loop on a sequence, its time, its memory, and what the rate costs."""
+"""`gausslite bench loop`: time and memory of an agent's mapping loop, and the quality lost to its frame rate."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _MEMORY_SAMPLES = 40
 
 
 def configure_loop(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `gausslite bench loop`."""
+    """Add the options of `bench loop`."""
     parser.add_argument("source", metavar="SOURCE", nargs="?", default=_HOME, help="as in map (default: %(default)s)")
     add_frames(parser, allow_auto=True)
     parser.add_argument("--task", metavar="TEXT", help=f'as in map (on the default source "{_HOME_TASK}")')
@@ -44,20 +44,20 @@ def configure_loop(parser: argparse.ArgumentParser) -> None:
     add_policy(parser)
     add_budget(parser)
     add = parser.add_argument_group("benchmark").add_argument
-    add("--loop", metavar="N", type=int, help="map N frames, the sequence back and forth, and watch the memory")
+    add("--loop", metavar="N", type=int, help="map N frames, back and forth along the sequence, and sample the memory")
     add(
         "--unlimited",
         metavar="N",
         type=int,
-        help="also map with N iterations a frame and compare ROI PSNR; every 8th frame is held out",
+        help="also map with N iterations per frame and compare ROI PSNR; every 8th frame is held out",
     )
     add("--json", action="store_true", help="print JSON for scripts")
     parser.set_defaults(run=run_loop)
 
 
 def run_loop(options: argparse.Namespace) -> int:
-    """Map the sequence with a clock between the steps and print the figures. Reading frames is not counted."""
-    if options.source == _HOME and options.policy in (None, TASK) and not _says_what_matters(options):
+    """Map the sequence and print the time of each stage. Reading frames is not counted."""
+    if options.source == _HOME and options.policy in (None, TASK) and not _has_task(options):
         options.task = _HOME_TASK
     if options.loop is not None and options.loop < 2:
         raise InvalidInputError(f"--loop: expected at least 2 frames, got {options.loop}")
@@ -70,17 +70,17 @@ def run_loop(options: argparse.Namespace) -> int:
     size = frame_size(options.size, source)
     mapped = [positions[step] for step in back_and_forth(len(positions), options.loop or len(positions))]
     rasterizer = choose_rasterizer(options.rasterizer, options.threads)
-    bench, costs, memory = _play(options, source, mapped, rasterizer)
+    bench, costs, memory = _run_mapping(options, source, mapped, rasterizer)
     timing = LoopTiming.of(costs)
     gap = None if options.unlimited is None else _gap(options, source, positions, held_out, bench)
-    findings = _Findings(timing, Overhead.of(costs, rasterizer), gap, memory, len(mapped) - len(costs))
-    print(as_text(findings.report(options, size)) if options.json else findings.lines(options.source, size))
+    report = _Report(timing, Overhead.of(costs, rasterizer), gap, memory, len(mapped) - len(costs))
+    print(as_text(report.as_json(options, size)) if options.json else report.as_lines(options.source, size))
     return 0
 
 
 @dataclass(frozen=True, slots=True)
-class _Findings:
-    """What a run showed, for scripts and for people."""
+class _Report:
+    """Results of a run as JSON or as text."""
 
     timing: LoopTiming
     overhead: Overhead | None
@@ -88,8 +88,8 @@ class _Findings:
     memory: MemoryTrend | None
     frames_skipped: int
 
-    def report(self, options: argparse.Namespace, size: tuple[int, int]) -> dict[str, object]:
-        """The figures under the names that scripts read."""
+    def as_json(self, options: argparse.Namespace, size: tuple[int, int]) -> dict[str, object]:
+        """Return the results as one JSON object."""
         overhead, gap = self.overhead, self.gap
         return {
             "source": options.source,
@@ -106,8 +106,8 @@ class _Findings:
             "peak_rss_mib": peak_rss_mib(),
         }
 
-    def lines(self, name: str, size: tuple[int, int]) -> str:
-        """The figures as one reads them."""
+    def as_lines(self, name: str, size: tuple[int, int]) -> str:
+        """Return the results as lines of text."""
         lines = [f"{name} at {size[0]}x{size[1]}", loop_lines(self.timing)]
         if self.overhead is not None:
             lines.append(overhead_line(self.overhead))
@@ -120,7 +120,7 @@ class _Findings:
 
 def _gap_line(gap: RateGap) -> str:
     return (
-        f"  ROI PSNR on {gap.views} held-out views: {gap.in_time_db:.2f} dB; with {gap.iterations} iterations a "
+        f"  ROI PSNR on {gap.views} held-out views: {gap.in_time_db:.2f} dB; with {gap.iterations} iterations per "
         f"frame {gap.unlimited_db:.2f} dB, gap {gap.gap_db:.2f} dB"
     )
 
@@ -132,15 +132,15 @@ def _memory_line(memory: MemoryTrend) -> str:
     )
 
 
-def _play(
+def _run_mapping(
     options: argparse.Namespace, source: Source, positions: Sequence[int], rasterizer: Rasterizer
 ) -> tuple[LoopBench, list[FrameCost], MemoryTrend | None]:
-    """Run the loop over these positions; memory is sampled where the sequence is looped."""
+    """Return the loop after these positions, the cost of each frame, and with --loop the memory trend."""
     settings, size = mission_settings(options), frame_size(options.size, source)
     mapper = GaussianMapper(settings.mapper_settings(), rasterizer, settings.seed)
     bench = LoopBench(choose_estimator(options, source), mapper, VoxelGrid(), settings.scheduler_settings)
     log, samples_mib = CostLog(), []
-    every = max(1, len(positions) // _MEMORY_SAMPLES)
+    sample_interval = max(1, len(positions) // _MEMORY_SAMPLES)
     done = 0
 
     def record(outcome: FrameOutcome) -> None:
@@ -149,37 +149,37 @@ def _play(
         if outcome.skipped is None:
             log.append(FrameCost.of(outcome))
         bar.count(outcome)
-        if options.loop is not None and (done % every == 0 or done == 1):
+        if options.loop is not None and (done % sample_interval == 0 or done == 1):
             samples_mib.append(resident_mib())
 
     with MappingBar(len(positions), "bench") as bar:
         bench.run(FrameStream(source, positions, size).frames(), record)
-    return bench, log.costs(), MemoryTrend.of(samples_mib, every) if options.loop is not None else None
+    trend = MemoryTrend.of(samples_mib, sample_interval) if options.loop is not None else None
+    return bench, log.costs(), trend
 
 
 def _gap(
     options: argparse.Namespace, source: Source, positions: Sequence[int], held_out: Sequence[int], bench: LoopBench
 ) -> RateGap:
-    """Map the same frames again with counted iterations and score both maps where neither was trained."""
+    """Map the same frames again with --unlimited iterations and score both maps on the held-out frames."""
     size = frame_size(options.size, source)
-    in_time = bench.gaussians()
-    patient = _patient(options)
-    loop = LoopBench(choose_estimator(patient, source), build_mapper(mission_settings(patient)), VoxelGrid())
+    unlimited = _without_rate(options)
+    loop = LoopBench(choose_estimator(unlimited, source), build_mapper(mission_settings(unlimited)), VoxelGrid())
     with MappingBar(len(positions), "unlimited") as bar:
         loop.run(FrameStream(source, positions, size).frames(), bar.count)
     regions = selected_regions(options, source)
     views = [HeldOutView.of(source.frame(position, size), regions) for position in held_out]
     rasterizer = choose_rasterizer(options.rasterizer, options.threads)
-    return RateGap.of(in_time, loop.gaussians(), options.unlimited, views, rasterizer)
+    return RateGap.of(bench.gaussians(), loop.gaussians(), options.unlimited, views, rasterizer)
 
 
-def _patient(options: argparse.Namespace) -> argparse.Namespace:
+def _without_rate(options: argparse.Namespace) -> argparse.Namespace:
     return argparse.Namespace(**{**vars(options), "rate": None, "iterations": options.unlimited})
 
 
 def _check_gap(options: argparse.Namespace, source: Source, held_out: Sequence[int]) -> None:
-    """Say before two runs what would leave nothing to compare after them. Raises InvalidInputError, DatasetError."""
-    mission_settings(_patient(options))
+    """Check before two runs that their maps can be compared. Raises InvalidInputError, DatasetError."""
+    mission_settings(_without_rate(options))
     if not held_out:
         raise InvalidInputError("--unlimited: expected at least 8 frames, so that one is held out; got fewer")
     regions, size = selected_regions(options, source), frame_size(options.size, source)
@@ -191,19 +191,19 @@ def _check_gap(options: argparse.Namespace, source: Source, held_out: Sequence[i
         raise InvalidInputError("--unlimited: expected a held-out frame that shows the region, got none")
 
 
-def _says_what_matters(options: argparse.Namespace) -> bool:
+def _has_task(options: argparse.Namespace) -> bool:
     return bool(options.task or options.roi or options.objects or options.roi_ball)
 
 
 def overhead_line(overhead: Overhead) -> str:
-    """How much of the iterations' time the kernels do not have."""
+    """Return the share of the iterations' time outside the kernels as text."""
     parts = (("full images", overhead.full_image), ("the region", overhead.region))
-    apart = ", ".join(f"on {name} {share:.1f} %" for name, share in parts if share is not None)
-    return f"  {overhead.all:.1f} % of the time of iterations is spent outside the kernels: {apart}"
+    details = ", ".join(f"{name} {percent:.1f} %" for name, percent in parts if percent is not None)
+    return f"  {overhead.all:.1f} % of the iterations' time is spent outside the kernels: {details}"
 
 
 def loop_lines(timing: LoopTiming) -> str:
-    """The figures of a run, one kind a line."""
+    """Return the statistics of a run as lines of text."""
 
     def percentiles(name: str, latency: Latency) -> str:
         values = (latency.p50_ms, latency.p90_ms, latency.p99_ms, latency.max_ms)
@@ -211,15 +211,15 @@ def loop_lines(timing: LoopTiming) -> str:
 
     return "\n".join(
         [
-            f"  {timing.frames} frames, {timing.hz:.2f} Hz, {timing.iterations_mean:.1f} iterations a frame "
-            f"(at least {timing.iterations_min}), {timing.gaussians} Gaussians, ROI {timing.roi_share:.1%}",
+            f"  {timing.frames} frames, {timing.hz:.2f} Hz, {timing.iterations_mean:.1f} iterations per frame "
+            f"(minimum {timing.iterations_min}), {timing.gaussians} Gaussians, ROI {timing.roi_share:.1%}",
             f"  {'ms':<12}" + "".join(f"{name:>9}" for name in ("p50", "p90", "p99", "max")),
             percentiles("frame", timing.latency),
             percentiles("perception", timing.perception),
             percentiles("mapping", timing.mapping),
-            percentiles("ROI words", timing.words),
-            *(percentiles(f" {name}", latency) for name, latency in timing.steps.items()),
-            f"  {timing.frames_short} frames trained too little; for want of time went without "
+            percentiles("publishing", timing.publishing),
+            *(percentiles(f" {name}", latency) for name, latency in timing.stages.items()),
+            f"  {timing.frames_under_trained} frames under-trained; frames that skipped a stage for lack of time: "
             + ", ".join(f"{name}: {count}" for name, count in timing.skipped_stages.items()),
         ]
     )

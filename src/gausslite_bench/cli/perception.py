@@ -1,4 +1,4 @@
-"""`gausslite bench perception`: what a detector's masks are worth, before and after they are placed and followed."""
+"""`gausslite bench perception`: accuracy of a detector's masks after each stage of perception."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from gausslite.mission.results import as_text, prepare_folder
 from gausslite.perception.vocabulary import head_of, same_kind
 from gausslite.task.rules import RuleParser
 from gausslite_bench.perception.contact_sheet import PerceptionSheet
-from gausslite_bench.perception.stage_scores import PerceptionBench, Question, QuestionScore
+from gausslite_bench.perception.stage_scores import PerceptionBench, TaskQuery, TaskScore
 
-_COLUMNS = ("IoU", "precision", "recall", "marked, %", "most, %", "frames", "right", "found", "late")
+_COLUMNS = ("IoU", "precision", "recall", "marked, %", "max, %", "frames", "right", "found", "late")
 
 
 def configure_perception(parser: argparse.ArgumentParser) -> None:
@@ -37,35 +37,37 @@ def configure_perception(parser: argparse.ArgumentParser) -> None:
         metavar="TEXT=A,B",
         action="append",
         default=[],
-        help="a task and the objects it is about; may be repeated (default: a search for each kind of object)",
+        help="a task and the objects of its target; repeatable (default: a search for each kind of object)",
     )
-    add("--absent", metavar="A,B", type=read_names, default=(), help="nouns of which nothing is there: what do they mark?")
+    add(
+        "--absent", metavar="A,B", type=read_names, default=(), help="also search for these nouns, which must be absent"
+    )
     add("--threads", metavar="N", type=int, help="the detector's threads (default: the runtime's choice)")
-    add("--pictures", metavar="DIR", type=Path, help="write a sheet for each task here")
+    add("--pictures", metavar="DIR", type=Path, help="write a contact sheet for each task to this folder")
     add("--json", action="store_true", help="print JSON for scripts")
     parser.set_defaults(run=run_perception)
 
 
 def run_perception(options: argparse.Namespace) -> int:
-    """Ask every task of every frame and print each step's figures."""
+    """Run every task on every frame and print the scores of each stage."""
     from gausslite.perception.model_registry import ModelRegistry
 
     if options.detector is None:
-        raise InvalidInputError("--detector: expected a model file, since ground truth has nothing to be measured by")
+        raise InvalidInputError("--detector: expected a model file to compare with ground truth, got none")
     source, _ = open_with_warnings(options.source, options.up, options.register_depth)
     positions, size = select_frames(source, options.frames), frame_size(options.size, source)
     regions = _regions(options, source)
-    questions = [*_asked(options.task, regions), *_absent(options.absent, regions)]
+    queries = [*_task_queries(options.task, regions), *_absent_queries(options.absent, regions)]
     if options.pictures is not None:
         prepare_folder(options.pictures)
-    networks = ModelRegistry(options.detector, options.segmenter, options.vocabulary, options.threads)
-    segmenter = networks.segmenter if options.resegment else None
-    bench = PerceptionBench(networks.detector, questions, regions, source.up_axis, segmenter)
-    sheets = [PerceptionSheet(len(positions)) for _ in questions] if options.pictures is not None else []
+    models = ModelRegistry(options.detector, options.segmenter, options.vocabulary, options.threads)
+    segmenter = models.segmenter if options.resegment else None
+    bench = PerceptionBench(models.detector, queries, regions, source.up_axis, segmenter)
+    sheets = [PerceptionSheet(len(positions)) for _ in queries] if options.pictures is not None else []
     for position in positions:
-        marks = bench.look(source.frame(position, size))
-        for sheet, each in zip(sheets, marks, strict=False):
-            sheet.offer(each)
+        masks = bench.process(source.frame(position, size))
+        for sheet, task_masks in zip(sheets, masks, strict=False):
+            sheet.add(task_masks)
     for number, sheet in enumerate(sheets, start=1):
         write_png(options.pictures / f"task-{number}.png", sheet.draw())
     command = shlex.join(["gausslite", *sys.argv[1:]])
@@ -76,29 +78,29 @@ def run_perception(options: argparse.Namespace) -> int:
     return 0
 
 
-def perception_table(scores: Sequence[QuestionScore]) -> str:
-    """A row for each step of each task; what can not be said is left blank."""
-    lines = [f"| task | step | {' | '.join(_COLUMNS)} |", "|---|---" + "|---:" * len(_COLUMNS) + "|"]
+def perception_table(scores: Sequence[TaskScore]) -> str:
+    """Return a Markdown table with one row per task and stage; undefined scores are blank."""
+    lines = [f"| task | stage | {' | '.join(_COLUMNS)} |", "|---|---" + "|---:" * len(_COLUMNS) + "|"]
     for score in scores:
-        asked = ", ".join(score.objects) or "nothing"
-        title = f"{score.task} ({asked}; shown in {score.shown_frames} of {score.frames} frames)"
-        for step, figures in score.steps.items():
-            there = bool(score.objects)
+        objects = ", ".join(score.objects) or "nothing"
+        title = f"{score.task} ({objects}; shown in {score.shown_frames} of {score.frames} frames)"
+        for stage, stage_score in score.stages.items():
+            has_objects = bool(score.objects)
             cells = (
-                *(_shown(value, 3) for value in (figures.iou, figures.precision, figures.recall)),
-                f"{100 * figures.marked_mean:.2f}",
-                f"{100 * figures.marked_most:.2f}",
-                f"{figures.marked_frames}",
-                f"{figures.right_frames}" if there else "",
-                f"{figures.objects_found} of {score.shown_objects}" if there else "",
-                _shown(figures.late_frames, 1),
+                *(_format(value, 3) for value in (stage_score.iou, stage_score.precision, stage_score.recall)),
+                f"{100 * stage_score.marked_mean:.2f}",
+                f"{100 * stage_score.marked_max:.2f}",
+                f"{stage_score.marked_frames}",
+                f"{stage_score.right_frames}" if has_objects else "",
+                f"{stage_score.objects_found} of {score.shown_objects}" if has_objects else "",
+                _format(stage_score.late_frames, 1),
             )
-            lines.append(f"| {title} | {step} | {' | '.join(cells)} |")
+            lines.append(f"| {title} | {stage} | {' | '.join(cells)} |")
             title = ""
     return "\n".join(lines)
 
 
-def _shown(value: float | None, digits: int) -> str:
+def _format(value: float | None, digits: int) -> str:
     return "" if value is None else f"{value:.{digits}f}"
 
 
@@ -108,8 +110,8 @@ def _regions(options: argparse.Namespace, source: Source) -> Mapping[str, Region
     return source.regions() if options.roi is None else balls_for_small_objects(load_voxel_regions(options.roi))
 
 
-def _asked(texts: Sequence[str], regions: Mapping[str, Region]) -> list[Question]:
-    """The given tasks, or a search for every kind of object: mug_1 and mug_2 are the kind mug."""
+def _task_queries(texts: Sequence[str], regions: Mapping[str, Region]) -> list[TaskQuery]:
+    """Return the given tasks, or a search for every kind of object: mug_1 and mug_2 are of kind mug."""
     parser = RuleParser()
     if texts:
         parts = [text.rpartition("=") for text in texts]
@@ -118,18 +120,18 @@ def _asked(texts: Sequence[str], regions: Mapping[str, Region]) -> list[Question
                 raise InvalidInputError(
                     f"--task: expected a task and its objects such as 'Find the mug=mug_1', got {text!r}"
                 )
-        return [Question(parser.parse(task), read_names(objects)) for task, _, objects in parts]
+        return [TaskQuery(parser.parse(task), read_names(objects)) for task, _, objects in parts]
     kinds: dict[str, list[str]] = {}
     for name in regions:
         kinds.setdefault(head_of(name), []).append(name)
-    return [Question(parser.parse(f"Find the {kind}"), tuple(objects)) for kind, objects in kinds.items()]
+    return [TaskQuery(parser.parse(f"Find the {kind}"), tuple(objects)) for kind, objects in kinds.items()]
 
 
-def _absent(nouns: Sequence[str], regions: Mapping[str, Region]) -> list[Question]:
+def _absent_queries(nouns: Sequence[str], regions: Mapping[str, Region]) -> list[TaskQuery]:
     for noun in nouns:
-        there = [name for name in regions if same_kind(noun, name)]
-        if there:
+        matches = [name for name in regions if same_kind(noun, name)]
+        if matches:
             raise InvalidInputError(
-                f"--absent: expected nouns that name nothing there, got {noun}, which is {there[0]}"
+                f"--absent: expected nouns of absent objects, got {noun}, which matches {matches[0]}"
             )
-    return [Question(RuleParser().parse(f"Find the {noun}"), ()) for noun in nouns]
+    return [TaskQuery(RuleParser().parse(f"Find the {noun}"), ()) for noun in nouns]

@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 
 from gausslite.mission.results import prepare_file, write_json
-from gausslite_bench.cli.argument_types import image_sizes, percentages, positive_counts
+from gausslite_bench.cli.argument_types import read_counts, read_image_sizes, read_percentages
 from gausslite_bench.raster.block_cost import BlockCost
 from gausslite_bench.raster.operation_costs import GAUSSIANS, OPERATIONS, SIZES, RasterBench, RasterTiming
 from gausslite_bench.raster.region_costs import SHARES_PERCENT, RegionCost
@@ -18,12 +18,18 @@ from gausslite_bench.raster.region_costs import SHARES_PERCENT, RegionCost
 def configure_raster(parser: argparse.ArgumentParser) -> None:
     """Add the options of `bench raster`."""
     add = parser.add_argument
-    add("--sizes", metavar="WxH,...", type=image_sizes, default=SIZES, help="image sizes (default: 320x240,640x480)")
+    add(
+        "--sizes",
+        metavar="WxH,...",
+        type=read_image_sizes,
+        default=SIZES,
+        help="image sizes (default: 320x240,640x480)",
+    )
     counts = ",".join(str(count) for count in GAUSSIANS)
     add(
         "--gaussians",
         metavar="N,...",
-        type=positive_counts,
+        type=read_counts,
         default=GAUSSIANS,
         help=f"numbers of Gaussians (default: {counts})",
     )
@@ -40,7 +46,7 @@ def configure_raster(parser: argparse.ArgumentParser) -> None:
     add(
         "--shares",
         metavar="P,...",
-        type=percentages,
+        type=read_percentages,
         default=SHARES_PERCENT,
         help=f"percentages of the image for steps masked to a region, or 0 for none (default: {shares})",
     )

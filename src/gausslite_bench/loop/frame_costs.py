@@ -1,4 +1,4 @@
-"""Measure one robot's whole loop over a sequence: how long each frame takes, and what it got for it."""
+"""Time and results of each frame in one agent's mapping loop."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from gausslite.render.rasterizer import Rasterizer
 
 @dataclass(frozen=True, slots=True)
 class Latency:
-    """How long something took over many frames, in milliseconds."""
+    """Percentiles of a duration over many frames, in milliseconds."""
 
     p50_ms: float
     p90_ms: float
@@ -34,14 +34,14 @@ class Latency:
 
     @classmethod
     def of(cls, seconds: Sequence[float]) -> Latency:
-        """Percentiles of these times; between two frames they are interpolated."""
+        """Return the interpolated percentiles of these times in seconds."""
         p50, p90, p99, highest = np.percentile(seconds, (50, 90, 99, 100)) * 1e3
         return cls(float(p50), float(p90), float(p99), float(highest))
 
 
 @dataclass(frozen=True, slots=True)
 class FrameCost:
-    """One mapped frame: its latency from the image in memory to the words that would leave the robot, and its steps."""
+    """Time and results of one mapped frame, from the image in memory to the voxel updates ready to send."""
 
     timing: FrameTiming
     iterations: int
@@ -55,63 +55,59 @@ class FrameCost:
 
     @property
     def perception_s(self) -> float:
-        """Seconds of attention."""
+        """Seconds of relevance estimation."""
         return self.stage_s(Stage.RELEVANCE)
 
     @property
-    def words_s(self) -> float:
-        """Seconds that making the region's words took."""
+    def publishing_s(self) -> float:
+        """Seconds of collecting the region's voxel updates."""
         return self.stage_s(Stage.PUBLISHING)
 
     @property
     def mapping_s(self) -> float:
-        """Seconds of all else: drawing, seeding and training."""
-        return self.timing.seconds - self.perception_s - self.words_s
+        """Seconds of all other stages: rendering, seeding and training."""
+        return self.timing.seconds - self.perception_s - self.publishing_s
 
-    def stage_s(self, step: Stage) -> float:
-        """Seconds of one step; 0 where the frame went without it."""
-        return self.timing.stages_s.get(step, 0.0)
+    def stage_s(self, stage: Stage) -> float:
+        """Return the seconds of one stage; 0 if the frame skipped it."""
+        return self.timing.stages_s.get(stage, 0.0)
 
 
 class CostLog:
-    """What each frame cost, as a few numbers: the memory of a long run is to be the loop's and not its record's."""
+    """Compact record of all frame costs: on a long run its memory must stay small compared with the loop's."""
 
     def __init__(self) -> None:
         self._numbers = array("d")
 
     def append(self, cost: FrameCost) -> None:
-        """Keep one more."""
+        """Add a frame."""
         timing = cost.timing
         self._numbers.extend((timing.seconds, timing.under_trained, cost.iterations, cost.gaussians, cost.roi_share))
-        self._numbers.extend(relief in timing.skipped_stages for relief in SkippableStage)
+        self._numbers.extend(stage in timing.skipped_stages for stage in SkippableStage)
         self._numbers.extend(map(cost.stage_s, Stage))
 
     def costs(self) -> list[FrameCost]:
-        """All that were kept, in order."""
-        return [
-            _cost_of(row)
-            for row in np.asarray(self._numbers).reshape(-1, 5 + len(SkippableStage) + len(Stage)).tolist()
-        ]
+        """Return all frames in order."""
+        rows = np.asarray(self._numbers).reshape(-1, 5 + len(SkippableStage) + len(Stage))
+        return [_cost_from_row(row) for row in rows.tolist()]
 
 
-def _cost_of(row: list[float]) -> FrameCost:
-    """A frame's cost from the numbers that the log keeps of it."""
-    (seconds, short, iterations, gaussians, roi_share), beside = row[:5], row[5:]
-    skipped_stages = frozenset(
-        relief for relief, went_without in zip(SkippableStage, beside, strict=False) if went_without
-    )
-    steps_s = {step: step_s for step, step_s in zip(Stage, beside[len(SkippableStage) :], strict=True) if step_s > 0.0}
-    return FrameCost(
-        FrameTiming(seconds, steps_s, skipped_stages, bool(short)), int(iterations), int(gaussians), roi_share
-    )
+def _cost_from_row(row: list[float]) -> FrameCost:
+    """Return the cost that CostLog stored as these numbers."""
+    seconds, under_trained, iterations, gaussians, roi_share = row[:5]
+    flags, times_s = row[5 : 5 + len(SkippableStage)], row[5 + len(SkippableStage) :]
+    skipped_stages = frozenset(stage for stage, skipped in zip(SkippableStage, flags, strict=True) if skipped)
+    stages_s = {stage: time_s for stage, time_s in zip(Stage, times_s, strict=True) if time_s > 0.0}
+    timing = FrameTiming(seconds, stages_s, skipped_stages, bool(under_trained))
+    return FrameCost(timing, int(iterations), int(gaussians), roi_share)
 
 
 @dataclass(frozen=True, slots=True)
 class LoopTiming:
-    """The figures of a run. hz is what the loop sustains when frames are always at hand; the last frame's Gaussians.
+    """Statistics of a run. hz: the loop's rate without waiting for frames. gaussians: after the last frame.
 
-    steps: each step's time in a frame. frames_short trained less than they should; skipped_stages counts the frames that
-    went without something for want of time.
+    stages: time of each stage per frame. frames_under_trained: frames below the minimum of iterations.
+    skipped_stages: number of frames that skipped the stage for lack of time.
     """
 
     frames: int
@@ -121,16 +117,16 @@ class LoopTiming:
     latency: Latency
     perception: Latency
     mapping: Latency
-    words: Latency
-    steps: dict[str, Latency]
-    frames_short: int
+    publishing: Latency
+    stages: dict[str, Latency]
+    frames_under_trained: int
     skipped_stages: dict[str, int]
     roi_share: float
     gaussians: int
 
     @classmethod
     def of(cls, costs: Sequence[FrameCost]) -> LoopTiming:
-        """The figures of these frames. Raises DatasetError when there are none."""
+        """Return the statistics of these frames. Raises DatasetError without frames."""
         if not costs:
             raise DatasetError("bench: expected at least one frame with depth, got none")
         iterations = [cost.iterations for cost in costs]
@@ -142,11 +138,11 @@ class LoopTiming:
             latency=Latency.of([cost.timing.seconds for cost in costs]),
             perception=Latency.of([cost.perception_s for cost in costs]),
             mapping=Latency.of([cost.mapping_s for cost in costs]),
-            words=Latency.of([cost.words_s for cost in costs]),
-            steps={step.value: Latency.of([cost.stage_s(step) for cost in costs]) for step in Stage},
-            frames_short=sum(cost.timing.under_trained for cost in costs),
+            publishing=Latency.of([cost.publishing_s for cost in costs]),
+            stages={stage.value: Latency.of([cost.stage_s(stage) for cost in costs]) for stage in Stage},
+            frames_under_trained=sum(cost.timing.under_trained for cost in costs),
             skipped_stages={
-                relief.value: sum(relief in cost.timing.skipped_stages for cost in costs) for relief in SkippableStage
+                stage.value: sum(stage in cost.timing.skipped_stages for cost in costs) for stage in SkippableStage
             },
             roi_share=float(np.mean([cost.roi_share for cost in costs])),
             gaussians=costs[-1].gaussians,
@@ -154,30 +150,30 @@ class LoopTiming:
 
 
 class LoopBench:
-    """Runs the loop that a robot runs, region words included, and keeps what each frame cost."""
+    """An agent's mapping loop, including the collection of the region's voxel updates."""
 
     def __init__(
         self,
-        attention: RelevanceEstimator,
+        estimator: RelevanceEstimator,
         mapper: GaussianMapper,
         grid: VoxelGrid,
         scheduler: SchedulerSettings | None = None,
     ) -> None:
-        """With a scheduler each frame trains until its time is up, without one for a fixed number of iterations."""
-        self._loop = TaskMapper(attention, mapper, SentVoxelTracker(grid), FrameScheduler(scheduler))
+        """Build the loop; without scheduler settings each frame runs a fixed number of iterations."""
+        self._mapper = TaskMapper(estimator, mapper, SentVoxelTracker(grid), FrameScheduler(scheduler))
 
     def gaussians(self) -> Gaussians:
-        """A copy of the map."""
-        return self._loop.gaussians()
+        """Return a copy of the map."""
+        return self._mapper.gaussians()
 
     def run(self, frames: Iterable[Frame], on_frame: Callable[[FrameOutcome], None]) -> None:
         """Map all frames; on_frame gets each outcome. Raises GaussLiteError, KeyboardInterrupt."""
-        MissionRunner(self._loop.process, on_frame).run(frames).raise_if_stopped()
+        MissionRunner(self._mapper.process, on_frame).run(frames).raise_if_stopped()
 
 
 @dataclass(frozen=True, slots=True)
 class Overhead:
-    """The percentage of iterations' time that passes outside the kernels' steps; None where there was no such step."""
+    """Percentage of the iterations' time spent outside the kernels; None if no iteration of that kind ran."""
 
     all: float
     full_image: float | None
@@ -185,8 +181,8 @@ class Overhead:
 
     @classmethod
     def of(cls, costs: Sequence[FrameCost], rasterizer: Rasterizer) -> Overhead | None:
-        """Of these frames, whose steps must be all that the rasterizer ever ran; None for a backend without a clock."""
-        full_s, region_s = (sum(cost.stage_s(step) for cost in costs) for step in (Stage.WARM_UP, Stage.ACTIVE))
+        """Return the overhead; None for backends other than cpu. The rasterizer must have run these frames only."""
+        full_s, region_s = (sum(cost.stage_s(stage) for cost in costs) for stage in (Stage.WARM_UP, Stage.ACTIVE))
         if not isinstance(rasterizer, CpuRasterizer) or full_s + region_s == 0.0:
             return None
         return cls(

@@ -1,4 +1,4 @@
-"""Tell whether a long run needs ever more memory: what the process holds, sampled along the way."""
+"""Growth of the process's memory over a long run."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ _STATM = Path("/proc/self/statm")
 
 @dataclass(frozen=True, slots=True)
 class MemoryTrend:
-    """Resident memory after the first, the middle and the last frame, and how it grows.
+    """Resident memory after the first, the middle and the last frame, and its growth.
 
-    The slope is a straight line's through the second half of the run, when keyframe buffers are full.
+    The growth is the slope of a line fitted to the second half of the run, when the keyframe buffers are full.
     """
 
     start_mib: float
@@ -27,18 +27,18 @@ class MemoryTrend:
     mib_per_1000_frames: float
 
     @classmethod
-    def of(cls, samples_mib: Sequence[float], frames_apart: int) -> MemoryTrend:
-        """From samples taken every so many frames. Raises InvalidInputError for fewer than two."""
+    def of(cls, samples_mib: Sequence[float], sample_interval_frames: int) -> MemoryTrend:
+        """Return the trend of samples at this interval. Raises InvalidInputError for fewer than two."""
         if len(samples_mib) < 2:
             raise InvalidInputError(f"memory samples: expected at least 2, got {len(samples_mib)}")
         middle = len(samples_mib) // 2
         half = np.asarray(samples_mib[-max(2, len(samples_mib) - middle) :])
-        slope = float(np.polyfit(np.arange(len(half)), half, 1)[0]) / frames_apart
+        slope = float(np.polyfit(np.arange(len(half)), half, 1)[0]) / sample_interval_frames
         return cls(samples_mib[0], samples_mib[middle], samples_mib[-1], 1000.0 * slope)
 
 
 def resident_mib() -> float:
-    """What the process holds in memory now, in MiB. Raises InvalidInputError where the system does not tell."""
+    """Return the resident memory of the process in MiB. Raises InvalidInputError on systems without /proc."""
     try:
         pages = int(_STATM.read_text().split()[1])
     except OSError as error:
@@ -46,9 +46,9 @@ def resident_mib() -> float:
     return pages * os.sysconf("SC_PAGE_SIZE") / (1 << 20)
 
 
-def back_and_forth(frames: int, wanted: int) -> list[int]:
-    """Positions of `wanted` frames of a sequence, played forward and backward in turns so that motion goes on."""
+def back_and_forth(frames: int, count: int) -> list[int]:
+    """Return `count` positions that traverse a sequence forward and backward, so that the motion is continuous."""
     if frames < 2:
-        return [0] * wanted
-    turn = 2 * (frames - 1)
-    return [min(step % turn, turn - step % turn) for step in range(wanted)]
+        return [0] * count
+    period = 2 * (frames - 1)
+    return [min(step % period, period - step % period) for step in range(count)]

@@ -1,4 +1,4 @@
-"""What mapping at a rate costs in quality: the same frames and seed, in time and with all the time there is."""
+"""Quality lost to a frame rate: the same frames and seed mapped at the rate and without a time limit."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from gausslite.render.rasterizer import Rasterizer
 
 @dataclass(frozen=True, slots=True)
 class RateGap:
-    """ROI PSNR on held-out views of the map made at the rate, and of the one with `iterations` iterations a frame."""
+    """ROI PSNR on held-out views: map built at the rate, and map built with `iterations` iterations per frame."""
 
     iterations: int
     views: int
@@ -23,7 +23,7 @@ class RateGap:
 
     @property
     def gap_db(self) -> float:
-        """What the rate costs."""
+        """Quality lost to the rate, in dB."""
         return self.unlimited_db - self.in_time_db
 
     @classmethod
@@ -35,8 +35,8 @@ class RateGap:
         views: Sequence[HeldOutView],
         rasterizer: Rasterizer,
     ) -> RateGap:
-        """Score both maps. Raises DatasetError when no view shows the region."""
-        first, second = (evaluate(gaussians, views, rasterizer) for gaussians in (in_time, unlimited))
-        if first.roi_psnr is None or second.roi_psnr is None:
+        """Return the scores of both maps. Raises DatasetError if no view shows the region."""
+        at_rate, without_limit = (evaluate(gaussians, views, rasterizer) for gaussians in (in_time, unlimited))
+        if at_rate.roi_psnr is None or without_limit.roi_psnr is None:
             raise DatasetError("bench: expected a held-out frame that shows the region, got none")
-        return cls(iterations, first.n_roi_views, first.roi_psnr, second.roi_psnr)
+        return cls(iterations, at_rate.n_roi_views, at_rate.roi_psnr, without_limit.roi_psnr)

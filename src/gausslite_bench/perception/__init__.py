@@ -1,1 +1,1 @@
-"""Benchmark of perception."""
+"""Benchmark of perception against ground-truth regions."""

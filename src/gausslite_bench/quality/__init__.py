@@ -1,1 +1,1 @@
-"""The quality benchmark: every policy maps the same walks at the same budget and is judged on views off them."""
+"""Quality study: every policy maps the same frames at the same budget; held-out views score the maps."""

@@ -1,4 +1,4 @@
-"""The paper's five components and what came beyond it, switched on one after the other (its Table "ablation")."""
+"""Variants of the ablation study: the paper's five components (its Table "ablation"), then the extensions."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from gausslite_bench.quality.trials import Variant
 
 
 def cumulative_variants() -> list[Variant]:
-    """none, +SB, +MVO, +ROI, +SIS, +GFD, then what came beyond the paper: each has all that stand before it."""
+    """Return none, +SB, +MVO, +ROI, +SIS, +GFD, then the extensions; each variant keeps all previous components."""
     labels = [*(name.upper() for name in PAPER_FLAGS), *EXTENSION_FLAGS]
     rows = [Variant("none", TASK, frozenset(ABLATION_FLAGS))]
     return rows + [Variant(f"+{label}", TASK, frozenset(ABLATION_FLAGS[i + 1 :])) for i, label in enumerate(labels)]

@@ -1,4 +1,4 @@
-"""Tell one state of the code from another: figures are compared only where the same code gave them."""
+"""Hash of the code that a trial runs: results of different code are not compared."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ import gausslite
 _SOURCES = Path(gausslite.__file__).parent.parent
 _PACKAGES = ("gausslite", "gausslite_bench", "gausslite_sim")
 _NEVER_IMPORTED = {"gausslite": ("cli", "config", "fusion", "models", "v1", "wire"), "gausslite_bench": ("cli",)}
-"""Subpackages that a trial does not import: a change there cannot change its result."""
+"""Subpackages that a trial does not import, so that their changes cannot affect its result."""
 
 
 @functools.cache
 def current_code_hash() -> str:
-    """Of this package's sources and kernels as they lie on disk when it is first asked for.
+    """Return the hash of the sources and kernels on disk at the first call.
 
-    Other libraries are not in it, nor is the processor. Read once: a program goes on with the code it started with.
+    It excludes other libraries and the processor. It is cached, since a process keeps running the code it loaded.
     """
     return hash_files(trial_source_files())
 
 
 def hash_files(files: Sequence[Path]) -> str:
-    """A short text that changes with every byte of these files, their names and their order."""
+    """Return a short SHA-256 digest of these files' contents, names and order."""
     digest = hashlib.sha256()
     for path in files:
         content = path.read_bytes()
@@ -35,10 +35,10 @@ def hash_files(files: Sequence[Path]) -> str:
 
 
 def trial_source_files() -> list[Path]:
-    """All that a trial may run, in an order that is the same everywhere."""
+    """Return all files that a trial may run, in the same order on every machine."""
     sources = [path for package in _PACKAGES for path in (_SOURCES / package).rglob("*.py") if _is_imported(path)]
     sources.sort(key=lambda path: path.relative_to(_SOURCES).as_posix())
-    # an editable install keeps the kernels elsewhere than the sources
+    # an editable installation stores the kernels apart from the sources
     kernels = find_spec("gausslite.render._kernels")
     return sources if kernels is None or kernels.origin is None else [*sources, Path(kernels.origin)]
 

@@ -1,7 +1,7 @@
-"""How much time a frame has at equal time: as much as uniform mapping takes for its iterations, on this machine.
+"""Frame rate for studies at equal time: the rate of uniform mapping with the budget's iterations on this machine.
 
-A fixed rate tells little on another machine: with twice the time every policy comes near what the training images can
-give, with half of it none does. So a study is paced once, on its first scene, and keeps that pace in its folder.
+Results at a fixed rate depend on the machine's speed. A study therefore measures the rate once, on its first scene,
+and stores it in its folder.
 """
 
 from __future__ import annotations
@@ -21,28 +21,28 @@ _UNIFORM = Variant("uniform", "uniform")
 _DIGITS = 3
 
 
-def pacing_trials(study: Study) -> list[Trial]:
-    """Uniform mapping of each scene, the first of which paces the study; none where no budget waits for a rate."""
-    waiting = [budget for budget in study.budgets if budget.awaits_rate]
-    if not waiting:
+def rate_trials(study: Study) -> list[Trial]:
+    """Return uniform mapping of each scene, candidates for measuring the rate; empty if no budget needs a rate."""
+    timed = [budget for budget in study.budgets if budget.needs_rate]
+    if not timed:
         return []
-    budget = TrialBudget(waiting[0].max_gaussians, BudgetMode.ITERATIONS, waiting[0].iterations)
+    budget = TrialBudget(timed[0].max_gaussians, BudgetMode.ITERATIONS, timed[0].iterations)
     return [Trial(plan, _UNIFORM, budget, study.seeds[0], study.conditions) for plan in study.plans]
 
 
-def first_scene(trials: Sequence[Trial]) -> tuple[Trial, Scene]:
-    """The first of these whose region some held-out view shows. Raises UnseenRegionError where there is none."""
+def first_visible_scene(trials: Sequence[Trial]) -> tuple[Trial, Scene]:
+    """Return the first trial whose region is in a held-out view, and its scene. Raises UnseenRegionError."""
     for trial in trials[:-1]:
         with contextlib.suppress(UnseenRegionError):
             return trial, trial.plan.load(trial.conditions.size)
     return trials[-1], trials[-1].plan.load(trials[-1].conditions.size)
 
 
-def kept_rate(path: Path, trials: Sequence[Trial]) -> float | None:
-    """The rate in Hz that was measured by one of these before; None where none is kept. Raises InvalidInputError."""
+def load_rate(path: Path, trials: Sequence[Trial]) -> float | None:
+    """Return the stored rate in Hz if one of these trials measured it, else None. Raises InvalidInputError."""
     try:
-        kept = json.loads(path.read_text())
-        rate_hz = float(kept["rate_hz"]) if kept["trial"] in {trial.key for trial in trials} else None
+        record = json.loads(path.read_text())
+        rate_hz = float(record["rate_hz"]) if record["trial"] in {trial.key for trial in trials} else None
     except (OSError, ValueError, KeyError, TypeError):
         return None
     if rate_hz is not None:
@@ -51,8 +51,8 @@ def kept_rate(path: Path, trials: Sequence[Trial]) -> float | None:
 
 
 def measure_rate(path: Path, trial: Trial, scene: Scene, on_frame: Callable[[int], None]) -> float:
-    """How many frames a second this trial maps, kept at the path for later runs. Raises GaussLiteError."""
-    made = build_map(trial, scene, on_frame)
-    rate_hz = float(f"{1e3 / made.ms_per_frame:.{_DIGITS}g}")
+    """Return the frames per second of this trial and store them for later runs. Raises GaussLiteError."""
+    trial_map = build_map(trial, scene, on_frame)
+    rate_hz = float(f"{1e3 / trial_map.ms_per_frame:.{_DIGITS}g}")
     write_json(path, {"trial": trial.key, "rate_hz": rate_hz})
     return rate_hz

@@ -1,4 +1,4 @@
-"""The 24 pairs of a simulated home and a task, each with the objects that the task is about, and whole homes."""
+"""The 24 tasks in simulated homes with the objects in their regions, and one whole-home task per home."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from gausslite.errors import InvalidInputError
 
 
 class TaskKind(StrEnum):
-    """What the robot is asked to do (Sec. IV-A)."""
+    """Kind of task (Sec. IV-A)."""
 
     MANIPULATION = "manipulation"
     SEARCH = "search"
     NAVIGATION = "navigation"
     FULL_FRAME = "everything"
-    """No task of the 24: a home's things all at once, to see what following a task costs where everything matters."""
+    """All objects of a home: measures the cost of following a task that covers everything. Not one of the 24 tasks."""
 
 
 @dataclass(frozen=True, slots=True)
 class HomeTask:
-    """A task in one of the homes; objects are the ground truth of what it is about, none named means all."""
+    """A task in a home. objects: names of the ground-truth objects in its region; empty means all."""
 
     home: int
     kind: TaskKind
@@ -66,17 +66,17 @@ HOME_TASKS = (
 )
 
 WHOLE_HOMES = tuple(HomeTask(home, TaskKind.FULL_FRAME, "Inspect everything", ()) for home in range(1, 9))
-"""Each home with all its things as the region, more than half of the image; chosen by their full names alone."""
+"""Each home with all objects as the region, more than half of the image; selected only by their full names."""
 
 
-def choose_home_tasks(asked: Sequence[str]) -> tuple[HomeTask, ...]:
-    """The pairs whose name is, or begins with, one of these ("home-3" is three of them); all when none is asked for.
+def choose_home_tasks(names: Sequence[str]) -> tuple[HomeTask, ...]:
+    """Return the tasks whose name equals or starts with one of these ("home-3" selects three); all without names.
 
     Raises InvalidInputError.
     """
-    tasks = tuple(pair for pair in HOME_TASKS if not asked or any(_fits(pair.name, name) for name in asked))
-    chosen = (*tasks, *(whole for whole in WHOLE_HOMES if whole.name in asked))
-    unknown = [name for name in asked if not any(_fits(pair.name, name) for pair in chosen)]
+    tasks = tuple(task for task in HOME_TASKS if not names or any(_matches(task.name, name) for name in names))
+    chosen = (*tasks, *(whole for whole in WHOLE_HOMES if whole.name in names))
+    unknown = [name for name in names if not any(_matches(task.name, name) for task in chosen)]
     if unknown:
         kinds = ", ".join(TaskKind)
         raise InvalidInputError(
@@ -85,5 +85,5 @@ def choose_home_tasks(asked: Sequence[str]) -> tuple[HomeTask, ...]:
     return chosen
 
 
-def _fits(name: str, asked: str) -> bool:
-    return name == asked or name.startswith(f"{asked}-")
+def _matches(name: str, selector: str) -> bool:
+    return name == selector or name.startswith(f"{selector}-")

@@ -248,6 +248,6 @@ def _attention(trial: Trial, scene: Scene) -> RelevanceEstimator:
         return RecordedRelevanceEstimator(scene)
     from gausslite.task.rules import RuleParser
 
-    return EstimatorFactory(trial.conditions.perception.detector, lambda: scene.knowledge).build(
+    return EstimatorFactory(trial.conditions.perception.detector, lambda: scene.info).build(
         RuleParser().parse(scene.task)
     )

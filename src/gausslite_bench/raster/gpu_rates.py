@@ -68,7 +68,7 @@ class FrameCost:
     gaussians: int
     iterations: int
     whole: Duration
-    steps_ms: Mapping[str, float]
+    stages_ms: Mapping[str, float]
 
     def as_json(self) -> dict[str, object]:
         """Return one JSON object."""

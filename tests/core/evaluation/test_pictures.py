@@ -70,8 +70,8 @@ def test_a_region_as_large_as_the_image_is_its_own_crop() -> None:
     np.testing.assert_array_equal(crop, shown.frame.rgb)
 
 
-def test_a_drawing_of_another_size_is_refused() -> None:
-    with pytest.raises(ShapeError, match="drawing vote"):
+def test_a_rendering_of_another_size_is_refused() -> None:
+    with pytest.raises(ShapeError, match="rendering vote"):
         comparison_sheet(view(), {"vote": np.zeros((4, 4, 3), np.float32)})
 
 

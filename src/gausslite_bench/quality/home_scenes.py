@@ -1,0 +1,76 @@
+"""Scenes in simulated homes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from gausslite.datasets.open import open_source
+from gausslite.datasets.regions import choose_regions
+from gausslite.evaluation.views import HeldOutView
+from gausslite.mission.settings import SceneInfo
+from gausslite_bench.quality.home_tasks import HomeTask
+from gausslite_bench.quality.scenes import PosePolicy, Scene, make_scene, require_count
+
+_TRAINING_TRAJECTORIES = (0, 1)
+_HELD_OUT_TRAJECTORY = 2
+_FIRST_TRAJECTORY_SHARE = 2 / 3
+
+
+@dataclass(frozen=True, slots=True)
+class HomeScenePlan:
+    """A task in its simulated home: two training trajectories with sensor noise, held-out views without noise."""
+
+    pair: HomeTask
+    frames: int = 60
+    views: int = 24
+    seed: int = 0
+    pose_policy: PosePolicy = field(default_factory=PosePolicy)
+
+    def __post_init__(self) -> None:
+        require_count("frames", self.frames)
+        require_count("views", self.views)
+
+    @property
+    def name(self) -> str:
+        """Such as home-3-search."""
+        return self.pair.name
+
+    @property
+    def task(self) -> str:
+        """The task's sentence."""
+        return self.pair.task
+
+    def settings(self) -> Mapping[str, object]:
+        """Return the trajectories, the task and its objects."""
+        return {
+            "specs": [*self._training_specs(), self._held_out_spec()],
+            "task": self.task,
+            "objects": list(self.pair.objects),
+            "pose_policy": str(self.pose_policy),
+        }
+
+    def training_settings(self) -> Mapping[str, object]:
+        """Return the training trajectories."""
+        return {"specs": self._training_specs()}
+
+    def load(self, size: tuple[int, int]) -> Scene:
+        """Return the scene; the training trajectories follow each other as one mission."""
+        size_option = f"&size={size[0]}x{size[1]}"
+        training_sources = [open_source(f"{spec}{size_option}") for spec in self._training_specs()]
+        training = [source.frame(i) for source in training_sources for i in range(len(source))]
+        held_out_source = open_source(f"{self._held_out_spec()}{size_option}")
+        regions = choose_regions(training_sources[0].regions(), self.pair.objects)
+        views = [HeldOutView.of(held_out_source.frame(i), regions) for i in range(len(held_out_source))]
+        return make_scene(self.task, training, views, regions, SceneInfo.of(training_sources[0]))
+
+    def _training_specs(self) -> list[str]:
+        first = max(1, round(_FIRST_TRAJECTORY_SHARE * self.frames))
+        counts = (first, self.frames - first)
+        return [self._spec(*each) for each in zip(_TRAINING_TRAJECTORIES, counts, strict=True)]
+
+    def _held_out_spec(self) -> str:
+        return f"{self._spec(_HELD_OUT_TRAJECTORY, self.views)}&noise=0&exposure=0"
+
+    def _spec(self, trajectory: int, frames: int) -> str:
+        return f"sim:home-{self.pair.home}?seed={self.seed}&trajectory={trajectory}&frames={frames}"
