@@ -1,4 +1,4 @@
-"""The command line as a user meets it: real runs on a small simulated home, and one line for every mistake."""
+"""The command line in child processes: runs on a small simulated home, and one line of message per wrong input."""
 
 from __future__ import annotations
 
@@ -65,7 +65,16 @@ def test_a_uniform_map_needs_no_task(tmp_path: Path) -> None:
 
 def test_eval_scores_a_map_on_frames(mug_map: Path) -> None:
     done = gausslite(
-        "eval", mug_map / "map.ply", HOME, "--size", "160x120", "--test-every", "4", "--roi-ball", "2,2,0.8,0.5", "--json"
+        "eval",
+        mug_map / "map.ply",
+        HOME,
+        "--size",
+        "160x120",
+        "--test-every",
+        "4",
+        "--roi-ball",
+        "2,2,0.8,0.5",
+        "--json",
     )
     assert done.returncode == 0, done.stderr
     scores = json.loads(done.stdout)
@@ -80,6 +89,35 @@ def test_fuse_joins_map_files(mug_map: Path, tmp_path: Path) -> None:
     assert json.loads(done.stdout)["gaussians"] == len(read_ply(source)) == len(read_ply(tmp_path / "fused.ply"))
 
 
+def test_map_reads_its_options_from_a_file(tmp_path: Path) -> None:
+    config = tmp_path / "map.toml"
+    out = tmp_path / "out"
+    config.write_text(
+        f'source = "{HOME}"\ntask = "Find the mug"\nout = "{out}"\nsize = "96x72"\nframes = "0:2"\n'
+        "max-gaussians = 900\niterations = 2\n"
+    )
+    shown = gausslite("map", "--config", config, "--max-gaussians", "700", "--print-config")
+    assert shown.returncode == 0, shown.stderr
+    config.write_text(shown.stdout)
+    done = gausslite("map", "--config", config)
+    assert done.returncode == 0, done.stderr
+    report = json.loads((out / "report.json").read_text())
+    assert (report["frames"], report["max_gaussians"]) == (2, 700)
+    config.write_text('tasks = "Find the mug"\n')
+    done = gausslite("map", "--config", config)
+    assert done.returncode == 2
+    assert done.stderr == f"gausslite: {config}: unknown option 'tasks'; the nearest known one is 'task'\n"
+
+
+def test_the_help_of_the_program_does_not_import_numpy() -> None:
+    code = (
+        "import sys\nfrom gausslite.cli.main import main\n"
+        "try: main(['--help'])\nexcept SystemExit: print('numpy' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert done.stdout.splitlines()[-1] == "False"
+
+
 def test_parse_prints_the_stable_json() -> None:
     done = gausslite("parse", "Pick up the mug on the table", "--json")
     assert done.returncode == 0, done.stderr
@@ -91,22 +129,25 @@ def test_parse_prints_the_stable_json() -> None:
     }
 
 
-def test_every_mistake_gets_one_line_and_exit_code_two(tmp_path: Path, mug_map: Path) -> None:
+def test_every_wrong_input_gives_one_line_and_exit_code_two(tmp_path: Path, mug_map: Path) -> None:
     (tmp_path / "notes.onnx").write_bytes(b"not a model")
     (tmp_path / "broken.ply").write_bytes((mug_map / "map.ply").read_bytes()[:-7])
     (tmp_path / "a-file").write_text("")
     task = ("--task", "Pick up the mug")
     out = ("--out", str(tmp_path / "out"))
-    mistakes: dict[str, tuple[str | Path, ...]] = {
+    wrong_inputs: dict[str, tuple[str | Path, ...]] = {
         "nowhere": ("map", tmp_path / "nowhere", *task, *out),
         "layout": ("map", tmp_path, *task, *out),
         "task": ("map", HOME, "--task", "", *out),
         "nonsense": ("map", HOME, "--task", "?!", *out),
-        "--task": ("map", HOME, *out),
+        "--task": ("map", HOME, "--policy", "task", *out),
+        "--overwrite": ("map", HOME, *task, "--out", mug_map),
+        "--out": ("fuse", mug_map / "map.ply", mug_map / "map.ply", "--out", mug_map / "map.ply"),
+        "expected TOML": ("map", HOME, *task, *out, "--config", tmp_path / "notes.onnx"),
         "notes.onnx": ("map", HOME, *task, "--detector", tmp_path / "notes.onnx", *out),
         "frames": ("map", HOME, *task, "--frames", "9:3", *out),
         "size": ("map", HOME, *task, "--size", "huge", *out),
-        "colour camera": ("map", HOME, *task, "--register-depth", "525,525", *out),
+        "depth registration": ("map", HOME, *task, "--register-depth", "525,525", *out),
         "max_gaussians": ("map", HOME, *task, "--max-gaussians", "0", *out),
         "threads: expected": ("map", HOME, *task, "--threads", "0", *out),
         "threads: expected 1": ("demo", "--threads", "0", *out),
@@ -125,14 +166,14 @@ def test_every_mistake_gets_one_line_and_exit_code_two(tmp_path: Path, mug_map: 
         "missing.ply": ("fuse", tmp_path / "missing.ply", mug_map / "map.ply", "--out", tmp_path / "f.ply"),
         "two": ("fuse", mug_map / "map.ply", "--out", tmp_path / "f.ply"),
     }
-    for named, arguments in mistakes.items():
+    for named, arguments in wrong_inputs.items():
         done = gausslite(*arguments)
-        complaint = done.stderr.strip()
-        assert done.returncode == 2, (named, complaint)
-        assert "Traceback" not in complaint
-        assert len(complaint.splitlines()) == 1, (named, complaint)
+        message = done.stderr.strip()
+        assert done.returncode == 2, (named, message)
+        assert "Traceback" not in message
+        assert len(message.splitlines()) == 1, (named, message)
         if named not in ("layout", "nonsense"):
-            assert named in complaint, (named, complaint)
+            assert named in message, (named, message)
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full here")
@@ -142,8 +183,7 @@ def test_a_full_disk_is_one_line(mug_map: Path) -> None:
     assert len(done.stderr.strip().splitlines()) == 1
 
 
-def test_a_damaged_frame_keeps_the_map_so_far(tmp_path: Path) -> None:
-    folder = tmp_path / "walk"
+def write_recording_with_a_corrupt_frame(folder: Path) -> None:
     folder.mkdir()
     home = open_source("sim:home?seed=0&trajectory=0&frames=3&size=64x48")
     k = home.camera
@@ -153,14 +193,21 @@ def test_a_damaged_frame_keeps_the_map_so_far(tmp_path: Path) -> None:
         cv2.imwrite(str(folder / f"frame-{i:06d}.color.png"), frame.rgb[..., ::-1])
         cv2.imwrite(str(folder / f"frame-{i:06d}.depth.png"), (frame.depth_m * 1000).astype(np.uint16))
         np.savetxt(folder / f"frame-{i:06d}.pose.txt", frame.T_world_camera)
-    damaged = folder / "frame-000002.color.png"
-    damaged.write_bytes(damaged.read_bytes()[:99])
+    corrupt = folder / "frame-000002.color.png"
+    corrupt.write_bytes(corrupt.read_bytes()[:99])
+
+
+@pytest.mark.parametrize("strict", [False, True])
+def test_a_corrupt_frame_is_skipped_or_ends_a_strict_run_with_the_map_so_far(tmp_path: Path, strict: bool) -> None:
+    folder = tmp_path / "recording"
+    write_recording_with_a_corrupt_frame(folder)
     ball = ("--roi-ball", "2,2,0.8,0.5", "--max-gaussians", "800", "--iterations", "1")
-    done = gausslite("map", folder, *ball, "--out", tmp_path / "out")
-    assert done.returncode == 2
+    done = gausslite("map", folder, *ball, *(("--strict",) if strict else ()), "--out", tmp_path / "out")
+    assert done.returncode == (2 if strict else 0), done.stderr
     assert "frame-000002.color.png" in done.stderr
     assert "Traceback" not in done.stderr
     report = json.loads((tmp_path / "out" / "report.json").read_text())
     assert report["frames"] == 2
-    assert "frame-000002.color.png" in report["stopped_by"]
+    assert report["frames_corrupt"] == (0 if strict else 1)
+    assert ("frame-000002.color.png" in (report["stopped_by"] or "")) == strict
     assert len(read_ply(tmp_path / "out" / "map.ply")) == report["gaussians"] > 0

@@ -171,7 +171,7 @@ class AgentMission:
                 "stopped_by": stopped_by,
                 "resumed_after_frame": None if self._resumed is None else self._resumed.last_index,
             }
-            write_results(self._settings.out, gaussians, report)
+            write_results(self._settings.out, gaussians, report, self._settings.link.uplink.world_frame)
         return len(gaussians)
 
     def _send_all(self, uplink: Uplink) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from gausslite.codec.ply import read_ply, read_world_frame, write_ply
@@ -29,12 +29,14 @@ def run(options: argparse.Namespace) -> int:
     if len(options.maps) < 2:
         raise InvalidInputError(f"maps: expected at least two files to fuse, got {len(options.maps)}")
     _require_separate_output(options.maps, options.out)
-    world_frame = _common_world_frame(options.maps)
+    frames = {path: read_world_frame(path) for path in options.maps}
+    world_frame = _common_world_frame(frames)
     prepare_folder(options.out.absolute().parent)
     # the vote's last tie-break is the lower id: number the files in the given order
     maps = {f"{i:03d} {path}": read_ply(path) for i, path in enumerate(options.maps)}
     fused = fuse_maps(maps, VoxelGrid(options.voxel_size))
     write_ply(options.out, fused.gaussians, world_frame)
+    _print_unnamed(frames, world_frame)
     voxels_won = {agent_id[4:]: int(fused.won_by(agent_id).sum()) for agent_id in maps}
     if options.json:
         report = {"gaussians": len(fused.gaussians), "voxels": len(fused.batch), "voxels_won": voxels_won}
@@ -52,18 +54,18 @@ def _require_separate_output(maps: Sequence[Path], out: Path) -> None:
             raise InvalidInputError(f"--out {out}: expected a file that is not an input, got the input {path}")
 
 
-def _common_world_frame(maps: Sequence[Path]) -> str:
-    """Return the world frame that the maps name, empty if none does; print a note on maps without one.
-
-    Raises MismatchError if they name different ones, MapFileError.
-    """
-    frames = {path: read_world_frame(path) for path in maps}
+def _common_world_frame(frames: Mapping[Path, str]) -> str:
+    """Return the world frame that the maps name, empty if none does. Raises MismatchError for different names."""
     names = sorted(set(frames.values()) - {""})
     if len(names) > 1:
         found = ", ".join(f"{frame!r} in {path}" for path, frame in frames.items() if frame)
         raise MismatchError(f"maps: expected one world frame, got {found}")
+    return names[0] if names else ""
+
+
+def _print_unnamed(frames: Mapping[Path, str], world_frame: str) -> None:
+    """Print a note on stderr about maps that do not name their world frame."""
     unnamed = [str(path) for path, frame in frames.items() if not frame]
     if unnamed:
-        same = f"{names[0]!r}" if names else "one world frame"
-        print(f"no world frame named in {', '.join(unnamed)}; assumed to be in {same}", file=sys.stderr)
-    return names[0] if names else ""
+        assumed = f"{world_frame!r}" if world_frame else "one world frame"
+        print(f"no world frame named in {', '.join(unnamed)}; assumed to be in {assumed}", file=sys.stderr)

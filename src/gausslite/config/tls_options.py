@@ -31,5 +31,5 @@ def read_server_tls(options: argparse.Namespace) -> Tls | None:
     """Return the same for a program that listens. Raises InvalidInputError if its own certificate is missing."""
     tls = read_tls(options)
     if tls is not None:
-        tls.of_server()
+        tls.server_credentials()
     return tls

@@ -50,9 +50,9 @@ def require_no_map(folder: Path) -> None:
         raise StorageError(f"{folder / _MAP} exists already; choose another --out, or replace it with --overwrite")
 
 
-def write_results(folder: Path, gaussians: Gaussians, report: Mapping[str, object]) -> None:
-    """Write map.ply and report.json. Raises StorageError."""
-    write_ply(folder / _MAP, gaussians)
+def write_results(folder: Path, gaussians: Gaussians, report: Mapping[str, object], world_frame: str = "") -> None:
+    """Write map.ply, with the name of its world frame, and report.json. Raises StorageError."""
+    write_ply(folder / _MAP, gaussians, world_frame)
     write_json(folder / _REPORT, report)
 
 
