@@ -1,4 +1,4 @@
-"""Cut boxes out with a network that masks everything it sees (FastSAM, or a YOLO-seg network standing in for it)."""
+"""Segment boxes with the class-agnostic masks of FastSAM or of a YOLO-seg network."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from gausslite.perception.yolo_network import YoloSegNetwork
 
 @dataclass(frozen=True, slots=True)
 class ClassAgnosticSettings:
-    """Which of all masks of an image count (comment in Sec. III-B.2), and how well one must fit a box to be its own."""
+    """Thresholds of an image's masks (comment in Sec. III-B.2); min_box_iou: of a mask's box with a given box."""
 
     min_score: float = 0.4
     max_iou: float = 0.9
@@ -32,28 +32,28 @@ class ClassAgnosticSettings:
 
     @classmethod
     def for_classes(cls, classes: int) -> ClassAgnosticSettings:
-        """FastSAM has one class and is sure of it; many classes share out their scores among a thing's likely names."""
+        """Return settings for a network; with many classes, each score is lower than FastSAM's with its one class."""
         return cls() if classes == 1 else cls(min_score=0.03, max_iou=0.7)
 
 
 class ClassAgnosticSegmenter:
-    """A Segmenter: a box gets the mask of the instance, of any class, that lies in it best."""
+    """A Segmenter that gives each box the mask of the instance, of any class, with the largest overlap."""
 
     def __init__(self, network: YoloSegNetwork, settings: ClassAgnosticSettings | None = None) -> None:
-        """Without settings, those for the network's number of classes."""
+        """Without settings, use the defaults for the network's number of classes."""
         self._network = network
         self._settings = settings or ClassAgnosticSettings.for_classes(network.classes)
 
     def segment(self, frame: Frame, boxes_px: Float32[ndarray, "n 4"]) -> list[Bool[ndarray, "h w"] | None]:
-        """The mask whose own box overlaps the given one best, by min_box_iou or more; None where none does."""
+        """Return per box the mask with the largest box IoU; None if no IoU reaches min_box_iou."""
         if len(boxes_px) == 0:
             return []
         output = self._network.run(frame)
-        found = output.candidates(self._settings.min_score)
-        found = suppress(found, self._settings.max_iou, self._settings.max_masks, across_classes=True)
-        if len(found.scores) == 0:
+        candidates = output.candidates(self._settings.min_score)
+        candidates = suppress(candidates, self._settings.max_iou, self._settings.max_masks, across_classes=True)
+        if len(candidates.scores) == 0:
             return [None] * len(boxes_px)
-        overlaps = box_iou(boxes_px, found.boxes_px)
-        fits = overlaps.max(axis=1) >= self._settings.min_box_iou
-        masks = output.masks(found.take(overlaps.argmax(axis=1)))
-        return [mask if fit and mask.any() else None for mask, fit in zip(masks, fits, strict=True)]
+        overlaps = box_iou(boxes_px, candidates.boxes_px)
+        is_match = overlaps.max(axis=1) >= self._settings.min_box_iou
+        masks = output.masks(candidates.take(overlaps.argmax(axis=1)))
+        return [mask if match and mask.any() else None for mask, match in zip(masks, is_match, strict=True)]

@@ -1,4 +1,4 @@
-"""Grounding DINO in an ONNX file of the user's: boxes of whatever a noun phrase names, one phrase a forward pass."""
+"""Detect boxes of any noun phrase with Grounding DINO in an ONNX file, one forward pass per phrase."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from gausslite.perception.model_file import OpenModel, run_once
 INPUTS: Final = ("pixel_values", "input_ids", "attention_mask", "token_type_ids", "pixel_mask")
 OUTPUTS: Final = ("logits", "pred_boxes")
 _REQUIRED_INPUTS: Final = frozenset({"pixel_values", "input_ids"})
-# of the images that the network was trained on, red, green and blue
+# normalisation of the network's training images: red, green, blue
 _MEAN: Final = np.array([0.485, 0.456, 0.406], np.float32)
 _STANDARD_DEVIATION: Final = np.array([0.229, 0.224, 0.225], np.float32)
 _SHORT_SIDE_PX: Final = 800
@@ -31,10 +31,10 @@ _TEST_PHRASE: Final = "object"
 
 @dataclass(frozen=True, slots=True)
 class GroundingSettings:
-    """Which boxes count (comment in Sec. III-B.2): box_score for the phrase, text_score for its noun itself.
+    """Thresholds of the boxes (comment in Sec. III-B.2): box_score of the phrase, text_score of its head noun.
 
-    With one phrase a pass, text_score keeps "red mug" from finding what is only red. max_iou is ours: the network
-    seldom repeats itself, and two boxes of one phrase over one thing would weigh it twice.
+    text_score keeps "red mug" from matching objects that are only red. max_iou is not in the paper: it removes rare
+    duplicate boxes of one object.
     """
 
     box_score: float = 0.20
@@ -52,10 +52,10 @@ class GroundingSettings:
 
 
 class GroundingDino:
-    """A BoxDetector for any phrase; what it reads of one is prepared once and kept, for a mission repeats itself."""
+    """A BoxDetector for any phrase; encoded phrases are cached."""
 
     def __init__(self, model: OpenModel, tokenizer: Tokenizer, settings: GroundingSettings | None = None) -> None:
-        """Try the model once, so that a wrong file is refused here. Raises ModelFileError."""
+        """Run the model once to check its outputs. Raises ModelFileError."""
         self._settings = settings or GroundingSettings()
         self._tokenizer = tokenizer
         self._session = model.session
@@ -73,16 +73,15 @@ class GroundingDino:
         return ()
 
     def boxes(self, frame: Frame, queries: Sequence[str]) -> list[DetectedBox]:
-        """All instances of each query, best first; boxes that span too much are left out."""
+        """Return all instances of each query, best first, without boxes that cover too much of the image."""
         pixel_values, pixel_mask = self._preprocess(frame.rgb)
-        many = concerns_many_objects(queries)
+        many_objects = concerns_many_objects(queries)
+        size_px = (frame.camera.width_px, frame.camera.height_px)
         found: list[DetectedBox] = []
         for query in queries:
             logits, boxes_cxcywh = self._run(pixel_values, pixel_mask, self._encoded_phrase(query))
-            limit = self._settings.box_fractions.limit(query, many)
-            found += self._select_boxes(
-                query, logits, boxes_cxcywh, limit, (frame.camera.width_px, frame.camera.height_px)
-            )
+            max_share = self._settings.box_fractions.limit(query, many_objects)
+            found += self._select_boxes(query, logits, boxes_cxcywh, max_share, size_px)
         return found
 
     def _select_boxes(
@@ -90,23 +89,23 @@ class GroundingDino:
         query: str,
         logits: Float32[ndarray, "q l"],
         boxes_cxcywh: Float32[ndarray, "q 4"],
-        limit: float,
+        max_share: float,
         size_px: tuple[int, int],
     ) -> list[DetectedBox]:
-        """The boxes that are sure enough, not too large, and distinct."""
+        """Return the boxes above the thresholds, not too large, after non-maximum suppression."""
         scores, noun_scores = phrase_scores(logits, self._encoded_phrase(query).is_noun)
         boxes_px = corners_px(boxes_cxcywh, size_px)
         shares = (boxes_px[:, 2:] - boxes_px[:, :2]).prod(axis=1) / (size_px[0] * size_px[1])
-        sure = (scores >= self._settings.box_score) & (noun_scores >= self._settings.text_score)
-        rows = np.flatnonzero(sure & (shares > 0) & (shares <= limit))
+        is_match = (scores >= self._settings.box_score) & (noun_scores >= self._settings.text_score)
+        rows = np.flatnonzero(is_match & (shares > 0) & (shares <= max_share))
         if len(rows) == 0:
             return []
         boxes = boxes_px[rows].astype(np.float64)
         boxes[:, 2:] -= boxes[:, :2]
         order = cv2.dnn.NMSBoxes(boxes.tolist(), scores[rows].tolist(), 0.0, self._settings.max_iou)
-        chosen = rows[np.asarray(order, np.int64).reshape(-1)[: self._settings.max_boxes]]
+        selected = rows[np.asarray(order, np.int64).reshape(-1)[: self._settings.max_boxes]]
         found = []
-        for row in chosen:
+        for row in selected:
             left, top, right, bottom = (float(edge) for edge in boxes_px[row])
             found.append(DetectedBox(query, float(scores[row]), (left, top, right, bottom)))
         return found
@@ -117,7 +116,7 @@ class GroundingDino:
         return self._phrases[query]
 
     def _preprocess(self, rgb: UInt8[ndarray, "h w 3"]) -> tuple[Float32[ndarray, "1 3 H W"], Int64[ndarray, "1 H W"]]:
-        """The image in the network's size, its proportions kept where a mask can say what is left over."""
+        """Return image and mask in the network's size; proportions are kept if the network accepts a mask."""
         height, width = self._size_px
         if height is None or width is None:
             return preprocess(rgb, training_size_px(rgb.shape[0], rgb.shape[1]), keep_proportions=True)
@@ -132,9 +131,9 @@ class GroundingDino:
     def _inputs(
         self, pixel_values: Float32[ndarray, "1 3 H W"], pixel_mask: Int64[ndarray, "1 H W"], phrase: PhraseInput
     ) -> dict[str, Any]:
-        given = (pixel_values, phrase.input_ids, phrase.attention_mask, phrase.token_type_ids, pixel_mask)
-        named = zip(INPUTS, given, strict=True)
-        return {name: array.astype(self._types[name]) for name, array in named if name in self._types}
+        arrays = (pixel_values, phrase.input_ids, phrase.attention_mask, phrase.token_type_ids, pixel_mask)
+        inputs = zip(INPUTS, arrays, strict=True)
+        return {name: array.astype(self._types[name]) for name, array in inputs if name in self._types}
 
     def _check_outputs(self, model: OpenModel) -> None:
         rgb = np.zeros((48, 64, 3), np.uint8)
@@ -152,17 +151,20 @@ class GroundingDino:
 def phrase_scores(
     logits: Float32[ndarray, "q l"], is_noun: Sequence[bool]
 ) -> tuple[Float32[ndarray, " q"], Float32[ndarray, " q"]]:
-    """How sure each box is of the phrase (the likeliest of all tokens) and of its noun (the likeliest of its own)."""
-    # -inf stands where the network has no token
-    likely = 1.0 / (1.0 + np.exp(-np.clip(logits, -80.0, 80.0)))
-    nouns = np.zeros(logits.shape[1], np.bool_)
-    nouns[: len(is_noun)] = is_noun
-    own = likely[:, nouns].max(axis=1) if nouns.any() else np.zeros(len(logits))
-    return likely.max(axis=1).astype(np.float32), own.astype(np.float32)
+    """Return per box the score of the phrase (maximum over all tokens) and of its head noun's tokens."""
+    # the logit is -inf if there is no token
+    probabilities = 1.0 / (1.0 + np.exp(-np.clip(logits, -80.0, 80.0)))
+    noun_tokens = np.zeros(logits.shape[1], np.bool_)
+    noun_tokens[: len(is_noun)] = is_noun
+    noun_scores = probabilities[:, noun_tokens].max(axis=1) if noun_tokens.any() else np.zeros(len(logits))
+    return probabilities.max(axis=1).astype(np.float32), noun_scores.astype(np.float32)
 
 
 def corners_px(boxes_cxcywh: Float32[ndarray, "q 4"], size_px: tuple[int, int]) -> Float32[ndarray, "q 4"]:
-    """Boxes (centre x, y, width, height, in shares of an image of width, height) as corners, clipped to the image."""
+    """Convert relative boxes (centre x, y, width, height) to corners in pixels of an image of size_px (width, height).
+
+    The corners are clipped to the image.
+    """
     half = boxes_cxcywh[:, 2:] / 2
     corners = np.concatenate([boxes_cxcywh[:, :2] - half, boxes_cxcywh[:, :2] + half], axis=1)
     size = np.array([*size_px, *size_px], np.float32)
@@ -171,7 +173,7 @@ def corners_px(boxes_cxcywh: Float32[ndarray, "q 4"], size_px: tuple[int, int]) 
 
 
 def training_size_px(height_px: int, width_px: int) -> tuple[int, int]:
-    """The size (height, width) that the network was trained at: 800 on the short side, at most 1333 on the long."""
+    """Return the network's training size (height, width): 800 on the short side, at most 1333 on the long side."""
     short, long = sorted((height_px, width_px))
     scale = min(_SHORT_SIDE_PX / short, _LONG_SIDE_PX / long)
     return max(1, round(height_px * scale)), max(1, round(width_px * scale))
@@ -180,9 +182,9 @@ def training_size_px(height_px: int, width_px: int) -> tuple[int, int]:
 def preprocess(
     rgb: UInt8[ndarray, "h w 3"], size_px: tuple[int, int], keep_proportions: bool
 ) -> tuple[Float32[ndarray, "1 3 H W"], Int64[ndarray, "1 H W"]]:
-    """The image scaled into size_px (height, width) from the top left corner, standardised; the mask says where it is.
+    """Return the normalised image, scaled into size_px (height, width) at the top left corner, and its mask.
 
-    The network measures boxes in shares of the masked part, so that they need no correction for the rest.
+    The network's boxes are relative to the masked part and need no correction for the padding.
     """
     (height, width), (h, w) = size_px, rgb.shape[:2]
     scale_y, scale_x = height / h, width / w
@@ -192,36 +194,35 @@ def preprocess(
     shrinks = inner_w < w
     scaled = cv2.resize(rgb, (inner_w, inner_h), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
     values = np.zeros((1, 3, height, width), np.float32)
-    values[0, :, :inner_h, :inner_w] = ((scaled.astype(np.float32) / 255 - _MEAN) / _STANDARD_DEVIATION).transpose(
-        2, 0, 1
-    )
+    normalised = (scaled.astype(np.float32) / 255 - _MEAN) / _STANDARD_DEVIATION
+    values[0, :, :inner_h, :inner_w] = normalised.transpose(2, 0, 1)
     mask = np.zeros((1, height, width), np.int64)
     mask[:, :inner_h, :inner_w] = 1
     return values, mask
 
 
 def is_grounding(names_in: Sequence[str], names_out: Sequence[str]) -> bool:
-    """True for a network with the inputs and outputs of Grounding DINO."""
+    """Return True for a network with the inputs and outputs of Grounding DINO."""
     return set(names_in) >= _REQUIRED_INPUTS and set(OUTPUTS) <= set(names_out)
 
 
 def _input_types(path: Path, session: Any) -> dict[str, type[np.generic]]:
-    """The type of each input, all of which must be known ones."""
+    """Return the type of each input. Raises ModelFileError if inputs or outputs are not those of Grounding DINO."""
     known = {"tensor(float)": np.float32, "tensor(float16)": np.float16, "tensor(int64)": np.int64,
              "tensor(int32)": np.int32, "tensor(bool)": np.bool_}  # fmt: skip
     inputs = {each.name: each for each in session.get_inputs()}
     outputs = [each.name for each in session.get_outputs()]
-    fits = (
+    is_supported = (
         is_grounding(list(inputs), outputs)
         and set(inputs) <= set(INPUTS)
         and all(each.type in known for each in inputs.values())
         and len(inputs["pixel_values"].shape) == 4
         and len(inputs["input_ids"].shape) == 2
     )
-    if not fits:
-        came = ", ".join(f"{each.name} {each.shape} {each.type}" for each in inputs.values())
+    if not is_supported:
+        received = ", ".join(f"{each.name} {each.shape} {each.type}" for each in inputs.values())
         raise ModelFileError(
             f"model {path}: expected Grounding DINO with inputs {', '.join(INPUTS)} and outputs {', '.join(OUTPUTS)}, "
-            f"got {came} and {', '.join(outputs)}"
+            f"got {received} and {', '.join(outputs)}"
         )
     return {name: known[each.type] for name, each in inputs.items()}

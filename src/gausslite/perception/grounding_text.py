@@ -1,4 +1,4 @@
-"""A noun phrase as the numbers that a BERT text encoder reads, and which of them are the noun's own."""
+"""Encode noun phrases for a BERT text encoder, with a mark on the tokens of the head noun."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _MAX_VOCABULARY_BYTES: Final = 1 << 24
 
 @dataclass(frozen=True, slots=True)
 class WordPieces:
-    """The ids of a text's word pieces between the marks of its start and end, and the span of letters of each."""
+    """Ids of a text's word pieces without special tokens, and the character span of each."""
 
     ids: tuple[int, ...]
     spans: tuple[tuple[int, int], ...]
@@ -28,20 +28,20 @@ class WordPieces:
 
 @runtime_checkable
 class Tokenizer(Protocol):
-    """Cuts texts into the pieces of one vocabulary."""
+    """Split texts into the word pieces of one vocabulary."""
 
     def encode(self, text: str) -> WordPieces:
-        """The pieces of a lower-case text, without marks."""
+        """Return the pieces of a lower-case text, without special tokens."""
         ...
 
     def special_token_id(self, name: str) -> int:
-        """The id of [PAD], [CLS], [SEP] or "."."""
+        """Return the id of [PAD], [CLS], [SEP] or "."."""
         ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PhraseInput:
-    """One phrase as `[CLS] phrase . [SEP]`, padded to the network's length; is_noun marks its head's pieces."""
+    """One phrase as `[CLS] phrase . [SEP]`, padded to the network's length; is_noun marks the head noun's pieces."""
 
     input_ids: Int64[ndarray, "1 l"]
     attention_mask: Int64[ndarray, "1 l"]
@@ -50,52 +50,48 @@ class PhraseInput:
 
 
 def encode_phrase(phrase: str, tokenizer: Tokenizer, length: int | None) -> PhraseInput:
-    """What the network reads for one phrase; length None: as long as the phrase needs.
+    """Return the network's text input for one phrase; length None: the length of the phrase.
 
-    A phrase that is too long loses words in front, so that its noun stays. Raises ModelFileError where not even one
-    piece has room.
+    A phrase that is too long loses its first words, so that the head noun stays. Raises ModelFileError if the network's
+    length is below 4.
     """
     words = " ".join(phrase.casefold().replace("_", " ").split())
-    found = tokenizer.encode(words)
-    room = len(found.ids) if length is None else length - 3
-    if room < 1:
-        raise ModelFileError(f"model's input_ids: expected room for 4 tokens or more, got {length}")
-    ids, spans = found.ids[-room:], found.spans[-room:]
-    noun_from = len(words) - len(head_of(words))
-    marked = [
-        tokenizer.special_token_id("[CLS]"),
-        *ids,
-        tokenizer.special_token_id("."),
-        tokenizer.special_token_id("[SEP]"),
-    ]
-    is_noun = [False, *(start >= noun_from for start, _ in spans), False, False]
-    padding = (length or len(marked)) - len(marked)
-    input_ids = np.array([marked + [tokenizer.special_token_id("[PAD]")] * padding], np.int64)
-    attention = np.array([[1] * len(marked) + [0] * padding], np.int64)
+    pieces = tokenizer.encode(words)
+    max_pieces = len(pieces.ids) if length is None else length - 3
+    if max_pieces < 1:
+        raise ModelFileError(f"model's input_ids: expected space for 4 tokens or more, got {length}")
+    ids, spans = pieces.ids[-max_pieces:], pieces.spans[-max_pieces:]
+    noun_start = len(words) - len(head_of(words))
+    start_id, stop_id, end_id = (tokenizer.special_token_id(name) for name in ("[CLS]", ".", "[SEP]"))
+    tokens = [start_id, *ids, stop_id, end_id]
+    is_noun = [False, *(start >= noun_start for start, _ in spans), False, False]
+    padding = (length or len(tokens)) - len(tokens)
+    input_ids = np.array([tokens + [tokenizer.special_token_id("[PAD]")] * padding], np.int64)
+    attention = np.array([[1] * len(tokens) + [0] * padding], np.int64)
     return PhraseInput(input_ids, attention, np.zeros_like(input_ids), (*is_noun, *([False] * padding)))
 
 
 class BertTokenizer:
-    """A Tokenizer over an uncased BERT vocabulary, a text file with one piece a line."""
+    """A Tokenizer over an uncased BERT vocabulary, a text file with one piece per line."""
 
     def __init__(self, vocabulary: Path) -> None:
-        """Raises ModelFileError for a wrong file and KernelError where the package `tokenizers` is missing."""
+        """Raises ModelFileError for an invalid file, KernelError if the package `tokenizers` is missing."""
         self._ids = _read_vocabulary(vocabulary)
         self._tokenizer = _wordpiece_tokenizer(self._ids)
 
     def encode(self, text: str) -> WordPieces:
-        """The pieces of a text, without marks."""
+        """Return the pieces of a text, without special tokens."""
         encoded = self._tokenizer.encode(text, add_special_tokens=False)
         return WordPieces(tuple(encoded.ids), tuple((int(start), int(end)) for start, end in encoded.offsets))
 
     def special_token_id(self, name: str) -> int:
-        """The id of a mark."""
+        """Return the id of a special token."""
         return self._ids[name]
 
 
 def _read_vocabulary(path: Path) -> dict[str, int]:
     if not path.is_file():
-        raise ModelFileError(f"vocabulary {path}: expected a text file with one BERT word piece a line, found none")
+        raise ModelFileError(f"vocabulary {path}: expected a text file with one BERT word piece per line, found none")
     try:
         if path.stat().st_size > _MAX_VOCABULARY_BYTES:
             raise ModelFileError(f"vocabulary {path}: expected at most {_MAX_VOCABULARY_BYTES >> 20} MiB")
@@ -103,7 +99,7 @@ def _read_vocabulary(path: Path) -> dict[str, int]:
     except (OSError, UnicodeDecodeError) as error:
         raise ModelFileError(f"vocabulary {path}: expected UTF-8 text, but {error}") from error
     ids = {piece.rstrip("\r"): number for number, piece in enumerate(lines)}
-    missing = [mark for mark in _REQUIRED if mark not in ids]
+    missing = [token for token in _REQUIRED if token not in ids]
     if missing:
         raise ModelFileError(f"vocabulary {path}: expected an uncased BERT vocabulary, found no {', '.join(missing)}")
     return ids

@@ -1,4 +1,4 @@
-"""Open an ONNX model that a user gave us, or say in one line what is wrong with the file, before a runtime reads it."""
+"""Open a user's ONNX model; a broken file gets a one-line message before the runtime loads it."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from typing import Any, BinaryIO, Final
 from gausslite.errors import InvalidInputError, ModelFileError
 
 CHECKSUM_FILE: Final = "SHA256SUMS"
-"""The list of checksums that may lie in a model's folder, as `sha256sum` writes it; a file in it must agree."""
+"""Optional list of checksums in a model's folder, in the format of `sha256sum`; listed files must match."""
 _MAX_LIST_BYTES: Final = 1 << 20
 _MAX_BYTES: Final = (1 << 31) - 1
-# fields of an ONNX ModelProto by number, and how each is encoded: 0 a number, 2 bytes of a stated length
+# fields of an ONNX ModelProto by number, with their protobuf wire types: 0 varint, 2 length-delimited
 _GRAPH: Final = 7
 _FIELDS: Final = {1: 0, 2: 2, 3: 2, 4: 2, 5: 0, 6: 2, _GRAPH: 2, 8: 2, 14: 2, 20: 2, 25: 2, 26: 2}
 _FOREIGN_FORMATS: Final = (
@@ -32,16 +32,16 @@ _PROVIDERS: Final = ("CUDAExecutionProvider", "TensorrtExecutionProvider", "CPUE
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OpenModel:
-    """A model file and the inference session that was made of it."""
+    """A model file and its inference session."""
 
     path: Path
     session: Any
 
 
 def open_model(path: Path, threads: int | None = None) -> OpenModel:
-    """A session on the best processor there is; threads None leaves their number to the runtime.
+    """Open a model on the fastest available provider; threads None: the runtime's default.
 
-    Raises ModelFileError for anything but a whole model, InvalidInputError.
+    Raises ModelFileError if the file is not a complete model or its checksum differs, InvalidInputError.
     """
     if threads is not None and threads < 1:
         raise InvalidInputError(f"detector threads: expected at least 1, got {threads}")
@@ -55,13 +55,13 @@ def open_model(path: Path, threads: int | None = None) -> OpenModel:
     try:
         session = runtime.InferenceSession(str(path), options, providers=list(_providers()))
     except Exception as error:
-        # the runtime has a dozen exception types without a common base, and none says more than this
+        # the runtime's exception types have no common base
         raise ModelFileError(f"model {path}: expected a readable ONNX model, but {_first_line(error)}") from error
     return OpenModel(path, session)
 
 
 def run_once(model: OpenModel, inputs: dict[str, Any]) -> list[Any]:
-    """All outputs for these inputs: shapes may be open in a file, and some damage shows only when the network runs.
+    """Return all outputs for these inputs, to check dynamic shapes and damage that loading does not detect.
 
     Raises ModelFileError.
     """
@@ -73,16 +73,16 @@ def run_once(model: OpenModel, inputs: dict[str, Any]) -> list[Any]:
 
 
 def choose_providers(available: Sequence[str]) -> tuple[str, ...]:
-    """The first of CUDA and TensorRT that this runtime was built with, and the CPU for what it cannot do.
+    """Return CUDA or TensorRT, if available, and the CPU for unsupported operators.
 
-    CUDA goes first: TensorRT compiles a network for minutes before the first image.
+    CUDA is preferred: TensorRT compiles a network for minutes before the first image.
     """
-    fast = [name for name in _PROVIDERS[:-1] if name in available][:1]
-    return (*fast, _PROVIDERS[-1])
+    gpu_providers = [name for name in _PROVIDERS[:-1] if name in available][:1]
+    return (*gpu_providers, _PROVIDERS[-1])
 
 
 def require_onnx(path: Path) -> None:
-    """Walk over the outermost fields of the file, which must end where the file ends. Raises ModelFileError."""
+    """Check the file's top-level protobuf fields, whose total size must equal the file's. Raises ModelFileError."""
     if not path.is_file():
         raise ModelFileError(f"model {path}: expected an ONNX file, found {'a folder' if path.is_dir() else 'nothing'}")
     size = path.stat().st_size
@@ -90,21 +90,21 @@ def require_onnx(path: Path) -> None:
         raise ModelFileError(f"model {path}: expected a readable ONNX model of up to 2 GiB, got {size} bytes")
     try:
         with path.open("rb") as file:
-            found = _foreign_format(file.read(64)) or _structure_error(file, size)
+            problem = _foreign_format(file.read(64)) or _structure_error(file, size)
     except OSError as error:
         raise ModelFileError(f"model {path}: cannot be read: {error.strerror or error}") from error
-    if found:
-        raise ModelFileError(f"model {path}: expected a readable ONNX model, got {found}")
+    if problem:
+        raise ModelFileError(f"model {path}: expected a readable ONNX model, got {problem}")
 
 
 def sha256_of(path: Path) -> str:
-    """The SHA-256 of a file in hexadecimal."""
+    """Return the SHA-256 of a file in hexadecimal."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def listed_checksum(path: Path) -> str | None:
-    """What SHA256SUMS in the file's folder says about it, None where it says nothing."""
+    """Return the file's checksum in its folder's SHA256SUMS; None if it is not listed."""
     listing = path.parent / CHECKSUM_FILE
     if not listing.is_file() or listing.stat().st_size > _MAX_LIST_BYTES:
         return None
@@ -116,16 +116,16 @@ def listed_checksum(path: Path) -> str | None:
 
 
 def require_listed_checksum(path: Path) -> None:
-    """Raises ModelFileError when SHA256SUMS beside the file names another checksum than it has."""
+    """Raise ModelFileError if the file's checksum differs from the one in its folder's SHA256SUMS."""
     expected = listed_checksum(path)
-    if expected is not None and (found := sha256_of(path)) != expected:
+    if expected is not None and (received := sha256_of(path)) != expected:
         raise ModelFileError(
-            f"model {path}: expected SHA-256 {expected[:16]}… as {CHECKSUM_FILE} beside it says, got {found[:16]}…"
+            f"model {path}: expected SHA-256 {expected[:16]}… of {CHECKSUM_FILE} in its folder, got {received[:16]}…"
         )
 
 
 def _runtime() -> Any:
-    # read before the import: newer runtimes report their use over the network otherwise
+    # must be set before the import: newer runtimes send telemetry by default
     os.environ["ORT_DISABLE_TELEMETRY"] = "1"
     import onnxruntime
 
@@ -139,25 +139,26 @@ def _providers() -> tuple[str, ...]:
 
 def _foreign_format(start: bytes) -> str:
     if start[4:8] == b"ORTM":
-        return "a model in ORT format: give the .onnx file it was made from"
+        return "a model in ORT format: use its original .onnx file"
     trimmed = start.lstrip().lower()
-    return next((kind for mark, kind in _FOREIGN_FORMATS if start.startswith(mark) or trimmed.startswith(mark)), "")
+    formats = (name for magic, name in _FOREIGN_FORMATS if start.startswith(magic) or trimmed.startswith(magic))
+    return next(formats, "")
 
 
 def _structure_error(file: BinaryIO, size: int) -> str:
-    """What keeps these bytes from being a whole ModelProto; empty where nothing does."""
+    """Return why these bytes are not a complete ModelProto; empty if they are."""
     file.seek(0)
     seen = set()
-    while (at := file.tell()) < size:
+    while (offset := file.tell()) < size:
         tag = _varint(file)
         if tag is None or _FIELDS.get(tag >> 3) != tag & 7:
-            return f"bytes that are none at {at} of {size}"
+            return f"invalid bytes at {offset} of {size}"
         value = _varint(file)
         if value is None:
-            return f"a file cut off at {size} bytes"
+            return f"a file truncated at {size} bytes"
         if tag & 7 == 2:
             if file.tell() + value > size:
-                return f"a file cut off at {size} bytes of {file.tell() + value} or more"
+                return f"a file truncated at {size} bytes of {file.tell() + value} or more"
             file.seek(value, os.SEEK_CUR)
         seen.add(tag >> 3)
     return "" if _GRAPH in seen else "a file without a graph"

@@ -1,4 +1,4 @@
-"""Which kind of network a model file holds, told by its inputs and outputs, and the detector and segmenter it makes."""
+"""Identify the network of a model file by its inputs and outputs, and build the detector and the segmenter."""
 
 from __future__ import annotations
 
@@ -16,37 +16,39 @@ OWN_MASKS, DEPTH = "yolo", "depth"
 
 
 class ModelFamily(StrEnum):
-    """The kinds of networks that are understood."""
+    """Supported networks."""
 
     GROUNDING_DINO = "Grounding DINO"
     YOLO_SEG = "YOLO-seg or FastSAM"
 
 
 def identify_family(model: OpenModel) -> ModelFamily:
-    """The family of an open model. Raises ModelFileError for an unknown one."""
+    """Return the family of an open model. Raises ModelFileError if it is not supported."""
     from gausslite.perception.grounding import is_grounding
 
     inputs, outputs = model.session.get_inputs(), model.session.get_outputs()
     if is_grounding([each.name for each in inputs], [each.name for each in outputs]):
         return ModelFamily.GROUNDING_DINO
-    image = len(inputs) == 1 and len(inputs[0].shape) == 4
-    # an open size is known once the network has run
-    sides = [each.shape[1] for each in outputs if len(each.shape) == 4]
-    masks = any(not isinstance(side, int) or side == MASK_COEFFICIENTS for side in sides)
-    if image and masks and len(outputs) == 2:
+    has_image_input = len(inputs) == 1 and len(inputs[0].shape) == 4
+    # a dynamic size is known only after the network has run
+    channels = [each.shape[1] for each in outputs if len(each.shape) == 4]
+    has_prototypes = any(not isinstance(count, int) or count == MASK_COEFFICIENTS for count in channels)
+    if has_image_input and has_prototypes and len(outputs) == 2:
         return ModelFamily.YOLO_SEG
-    came = " → ".join(", ".join(f"{each.name} {each.shape}" for each in side) for side in (inputs, outputs))
-    hint = " (boxes only, no masks)" if image and len(outputs) == 1 else ""
-    raise ModelFileError(f"model {model.path}: expected {' or '.join(ModelFamily)}, got {came}{hint}")
+    received = " → ".join(", ".join(f"{each.name} {each.shape}" for each in ports) for ports in (inputs, outputs))
+    hint = " (boxes only, no masks)" if has_image_input and len(outputs) == 1 else ""
+    raise ModelFileError(f"model {model.path}: expected {' or '.join(ModelFamily)}, got {received}{hint}")
 
 
 class ModelRegistry:
-    """The detector and the segmenters of one mission, each file opened once."""
+    """The detector and the segmenter of one mission; each file is opened once."""
 
     def __init__(self, detector: Path, segmenter: str | None, vocabulary: Path | None, threads: int | None) -> None:
-        """segmenter: "yolo" (the detector's own masks), "depth" (by depth and colour) or the path of a FastSAM file.
+        """Open the detector's file and build the segmenter.
 
-        None takes the detector's own masks where it has some. Raises ModelFileError, InvalidInputError, KernelError.
+        segmenter: "yolo" (the detector's own masks), "depth" (by depth and colour), or the path of a FastSAM file. None
+        selects the detector's own masks if it has them, else "depth". Raises ModelFileError, InvalidInputError,
+        KernelError.
         """
         model = open_model(detector, threads)
         if identify_family(model) is ModelFamily.GROUNDING_DINO:
@@ -56,12 +58,12 @@ class ModelRegistry:
 
     @property
     def detector(self) -> Detector:
-        """What finds the task's nouns, with masks."""
+        """The detector of the task's nouns, with masks."""
         return self._detector
 
     @property
     def segmenter(self) -> Segmenter:
-        """What cuts known boxes out of further images."""
+        """The segmenter of propagated boxes."""
         return self._segmenter
 
     def _use_grounding(
@@ -91,7 +93,7 @@ class ModelRegistry:
 
 
 def _segmenter(name: str, threads: int | None) -> Segmenter:
-    """The cut, or a file's masks of everything."""
+    """Return the depth segmenter, or a class-agnostic segmenter from a file."""
     from gausslite.perception.depth_segmenter import DepthSegmenter
 
     if name == DEPTH:
@@ -103,7 +105,7 @@ def _segmenter(name: str, threads: int | None) -> Segmenter:
 
 
 def _with_depth_fallback(first: Segmenter) -> tuple[Segmenter, ...]:
-    """A network may see nothing where the detector saw something; then depth and colour still cut it out."""
+    """Return the segmenter, followed by the depth segmenter for boxes in which the network finds nothing."""
     from gausslite.perception.depth_segmenter import DepthSegmenter
 
     return (first,) if isinstance(first, DepthSegmenter) else (first, DepthSegmenter())

@@ -1,7 +1,7 @@
-"""Which class of a fixed-vocabulary detector a task's noun means, by CLIP text vectors or by a list of synonyms.
+"""Match a task's nouns to the classes of a fixed-vocabulary detector, by CLIP text embeddings or by synonyms.
 
-Raw cosines between text vectors all lie near 0.85; with the mean of the vocabulary taken out, unrelated nouns fall
-below 0.4 and a good match stands apart from the second best. So a match needs both: likeness and a lead.
+Cosine similarities of raw embeddings are all near 0.85. After the vocabulary's mean is subtracted, unrelated nouns are
+below 0.4 and a good match is clearly above the second best. A match therefore needs a similarity and a margin.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from numpy import ndarray
 from gausslite.errors import ModelFileError
 from gausslite.perception.vocabulary import SYNONYMS, bare_name, head_of, is_generic, is_structure
 
-_MIN_LIKENESS: Final = 0.5
-_MIN_LEAD: Final = 0.10
+_MIN_SIMILARITY: Final = 0.5
+_MIN_MARGIN: Final = 0.10
 _VECTORS, _NAMES, _COCO_VECTORS = "lvis_v1_clip_a+cname.npy", "lvis_v1_train_cat_info.json", "coco_clip_a+cname.npy"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TextEmbeddings:
-    """A vocabulary of nouns with unit text vectors, centred; coco holds the 80 COCO classes in the same space."""
+    """Centred unit embeddings of a vocabulary of nouns; coco: embeddings of the 80 COCO classes."""
 
     rows: dict[str, int]
     vectors: Float32[ndarray, "n d"]
@@ -34,7 +34,7 @@ class TextEmbeddings:
 
     @classmethod
     def from_model_folder(cls, model_path: Path) -> TextEmbeddings | None:
-        """Read the vector files in the model's folder; None when they are not there. Raises ModelFileError."""
+        """Read the embedding files in the model's folder; None if there are none. Raises ModelFileError."""
         vectors_path, names_path = model_path.parent / _VECTORS, model_path.parent / _NAMES
         if not (vectors_path.is_file() and names_path.is_file()):
             return None
@@ -47,7 +47,7 @@ class TextEmbeddings:
         return cls(rows, _unit(raw - mean), coco)
 
     def vector(self, phrase: str) -> Float32[ndarray, " d"] | None:
-        """The vector of the phrase or, failing that, of its head; None for unknown nouns."""
+        """Return the embedding of the phrase, or else of its head noun; None for unknown nouns."""
         for name in (bare_name(phrase), head_of(phrase)):
             if name in self.rows:
                 found: Float32[ndarray, " d"] = self.vectors[self.rows[name]]
@@ -55,14 +55,15 @@ class TextEmbeddings:
         return None
 
     def best_class(self, phrase: str, class_names: Sequence[str]) -> int | None:
-        """The class that is like the phrase and leads the second best; None when no class fits."""
-        wanted = self.vector(phrase)
-        if wanted is None or len(class_names) < 2:
+        """Return the class most similar to the phrase; None if similarity or margin is too small."""
+        query = self.vector(phrase)
+        if query is None or len(class_names) < 2:
             return None
-        likeness = self._class_vectors(class_names) @ wanted
-        second, first = np.argsort(likeness)[-2:]
-        fits = likeness[first] >= _MIN_LIKENESS and likeness[first] - likeness[second] >= _MIN_LEAD
-        return int(first) if fits else None
+        similarity = self._class_vectors(class_names) @ query
+        second, first = np.argsort(similarity)[-2:]
+        margin = similarity[first] - similarity[second]
+        is_match = similarity[first] >= _MIN_SIMILARITY and margin >= _MIN_MARGIN
+        return int(first) if is_match else None
 
     def _class_vectors(self, class_names: Sequence[str]) -> Float32[ndarray, "c d"]:
         if self.coco is not None and len(self.coco) == len(class_names):
@@ -75,11 +76,11 @@ class TextEmbeddings:
         return table
 
 
-def classes_for(phrase: str, class_names: Sequence[str], vectors: TextEmbeddings | None) -> tuple[int, ...]:
-    """The detector's classes that a phrase means; empty when none fits.
+def classes_for(phrase: str, class_names: Sequence[str], embeddings: TextEmbeddings | None) -> tuple[int, ...]:
+    """Return the indices of the detector's classes that match a phrase; empty if none does.
 
-    Tried in this order: the name itself, its synonym, its head, the head's synonym, the text vectors. A generic noun
-    ("object", "obstacle") means every class that is no structure.
+    Order of attempts: the phrase, its synonym, its head noun, the head's synonym, the embeddings. A generic noun
+    ("object", "obstacle") matches every class except structure.
     """
     if is_generic(phrase):
         return tuple(index for index, name in enumerate(class_names) if not is_structure(name))
@@ -88,7 +89,7 @@ def classes_for(phrase: str, class_names: Sequence[str], vectors: TextEmbeddings
     for name in (bare, SYNONYMS.get(bare), head, SYNONYMS.get(head)):
         if name is not None and name in by_name:
             return (by_name[name],)
-    best = vectors.best_class(phrase, class_names) if vectors is not None else None
+    best = embeddings.best_class(phrase, class_names) if embeddings is not None else None
     return () if best is None else (best,)
 
 
@@ -101,14 +102,14 @@ def _read_vectors(path: Path) -> Float32[ndarray, "n d"]:
     try:
         table = np.load(path, allow_pickle=False)
     except (OSError, ValueError, EOFError) as error:
-        raise ModelFileError(f"{path}: expected a .npy table of text vectors, but {error}") from error
+        raise ModelFileError(f"{path}: expected a .npy table of text embeddings, but {error}") from error
     if table.ndim != 2 or table.dtype.kind != "f" or not np.isfinite(table).all():
         raise ModelFileError(f"{path}: expected a finite table of floats, got {table.dtype} of shape {table.shape}")
     return _unit(table.astype(np.float32))
 
 
 def _read_names(path: Path) -> dict[str, int]:
-    """Every name and synonym to its row; rows are ordered by id, which counts from 1."""
+    """Return the row of every name and synonym; rows are ordered by id, which starts at 1."""
     try:
         entries = json.loads(path.read_text(encoding="utf-8"))
         rows: dict[str, int] = {}

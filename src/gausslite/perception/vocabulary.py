@@ -1,4 +1,4 @@
-"""What nouns have in common: heads, synonyms, and the kinds that size limits and generic tasks depend on."""
+"""Heads, synonyms and categories of nouns; size limits and generic tasks depend on the categories."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Final
 GENERIC: Final = frozenset(
     {"object", "thing", "item", "stuff", "obstacle", "obstruction", "clutter", "hazard", "debris", "target"}
 )
-# the shell of a building or a stretch of ground: never one object among others
+# parts of a building or of the ground, which a generic noun never means
 STRUCTURE: Final = frozenset(
     {"wall", "floor", "ceiling", "ground", "roof", "room", "kitchen", "bathroom", "bedroom", "office", "hallway",
      "corridor", "road", "street", "sidewalk", "lawn", "grass", "sky", "stairs", "door", "window", "carpet", "rug"}
@@ -19,13 +19,13 @@ FURNITURE: Final = frozenset(
      "wall", "floor", "rug", "carpet", "car", "truck", "bus", "van", "boat", "train", "airplane", "tree", "person",
      "piano", "workbench", "nightstand", "ottoman", "television", "whiteboard", "curtain", "fence", "gate"}
 )  # fmt: skip
-# what a robot stands in front of: rightly fills most of an image
+# objects that may fill most of an image
 SURFACE: Final = frozenset(
     {"table", "desk", "counter", "countertop", "bed", "workbench", "wall", "floor", "ceiling", "door", "rug", "carpet",
      "lawn", "grass", "road", "whiteboard"}
 )  # fmt: skip
-# phrases that name one kind of thing; the first of each row is the word the others are read as
-_SAME: Final = (
+# synonyms; the first of each row is the canonical name
+_SYNONYM_ROWS: Final = (
     ("cup", "mug", "teacup", "coffee mug", "coffee cup", "tumbler", "paper cup"),
     ("couch", "sofa", "settee", "loveseat", "futon"),
     ("tv", "television", "monitor", "screen", "display", "computer monitor", "tv screen"),
@@ -57,11 +57,11 @@ _SAME: Final = (
     ("stop sign", "sign"),
     ("teddy bear", "teddy", "stuffed animal"),
 )  # fmt: skip
-SYNONYMS: Final = {name: row[0] for row in _SAME for name in row}
+SYNONYMS: Final = {name: row[0] for row in _SYNONYM_ROWS for name in row}
 
 
 def head_of(phrase: str) -> str:
-    """The noun itself: "lawn chair" → "chair", "mug_2" → "mug"."""
+    """Return the head noun: "lawn chair" → "chair", "mug_2" → "mug"."""
     words = phrase.casefold().replace("_", " ").replace("-", " ").split()
     while len(words) > 1 and words[-1].isdigit():
         words.pop()
@@ -69,7 +69,7 @@ def head_of(phrase: str) -> str:
 
 
 def bare_name(phrase: str) -> str:
-    """The phrase without a trailing number and with plain spaces: "dining_table_1" → "dining table"."""
+    """Return the phrase without a trailing number and with plain spaces: "dining_table_1" → "dining table"."""
     words = phrase.casefold().replace("_", " ").replace("-", " ").split()
     while len(words) > 1 and words[-1].isdigit():
         words.pop()
@@ -77,31 +77,31 @@ def bare_name(phrase: str) -> str:
 
 
 def is_generic(phrase: str) -> bool:
-    """True when the phrase stands for any object."""
+    """Return True if the phrase means any object."""
     return head_of(phrase) in GENERIC
 
 
 def is_structure(phrase: str) -> bool:
-    """True for walls, floors, rooms and the like."""
+    """Return True for walls, floors, rooms and the like."""
     return head_of(phrase) in STRUCTURE
 
 
 def is_surface(phrase: str) -> bool:
-    """True for tables, beds, walls and the like."""
+    """Return True for tables, beds, walls and the like."""
     return head_of(phrase) in SURFACE
 
 
 def is_furniture(phrase: str) -> bool:
-    """True for things that rightly fill much of an image."""
+    """Return True for furniture and other objects that may fill much of an image."""
     return head_of(phrase) in FURNITURE
 
 
 def same_kind(phrase: str, name: str) -> bool:
-    """True when a task's phrase means objects of this name: equal heads, or two words for one thing."""
+    """Return True if a task's phrase means objects of this name: equal heads, or synonyms."""
     if is_generic(phrase):
         return not is_structure(name)
-    wanted, offered = bare_name(phrase), bare_name(name)
-    if wanted == offered or head_of(wanted) == head_of(offered):
+    bare_phrase, other = bare_name(phrase), bare_name(name)
+    if bare_phrase == other or head_of(bare_phrase) == head_of(other):
         return True
-    canonical = SYNONYMS.get(wanted, SYNONYMS.get(head_of(wanted)))
-    return canonical is not None and canonical == SYNONYMS.get(offered, SYNONYMS.get(head_of(offered)))
+    canonical = SYNONYMS.get(bare_phrase, SYNONYMS.get(head_of(bare_phrase)))
+    return canonical is not None and canonical == SYNONYMS.get(other, SYNONYMS.get(head_of(other)))

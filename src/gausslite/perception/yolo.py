@@ -1,4 +1,4 @@
-"""A YOLO-seg network in an ONNX file of the user's: boxes and masks of a fixed set of classes, asked for by nouns."""
+"""Detect nouns with a YOLO-seg network in an ONNX file: boxes and masks of a fixed set of classes."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from gausslite.perception.yolo_network import YoloSegNetwork
 
 @dataclass(frozen=True, slots=True)
 class YoloSettings:
-    """How sure and how distinct a box must be."""
+    """Thresholds of score, overlap and size of the boxes."""
 
     min_score: float = 0.25
     max_iou: float = 0.7
@@ -36,24 +36,24 @@ class YoloSettings:
 
 
 class YoloSegDetector:
-    """A Detector, and a BoxDetector, over one YOLO-seg file whose metadata names its classes."""
+    """A Detector and BoxDetector for one YOLO-seg file with class names in its metadata."""
 
     def __init__(
-        self, model: OpenModel, vectors: TextEmbeddings | None = None, settings: YoloSettings | None = None
+        self, model: OpenModel, embeddings: TextEmbeddings | None = None, settings: YoloSettings | None = None
     ) -> None:
-        """Try the model once, so that a wrong file is refused here. Raises ModelFileError.
+        """Run the model once to check its outputs. Raises ModelFileError.
 
-        Without vectors, nouns find their classes by name and by a short list of synonyms alone.
+        Without embeddings, nouns match classes only by name and by a short list of synonyms.
         """
         self._settings = settings or YoloSettings()
-        self._vectors = vectors
+        self._embeddings = embeddings
         self._network = YoloSegNetwork(model)
         if not self._network.names:
             raise ModelFileError(f"model {model.path}: expected class names in the metadata field 'names', got none")
 
     @property
     def class_names(self) -> tuple[str, ...]:
-        """The classes that the network knows."""
+        """The names of the network's classes."""
         return self._network.names
 
     def unsupported(self, queries: Sequence[str]) -> tuple[str, ...]:
@@ -61,57 +61,59 @@ class YoloSegDetector:
         return tuple(f"no class of the detector matches {query!r}" for query in queries if not self._classes(query))
 
     def segmenter(self) -> ClassAgnosticSegmenter:
-        """A Segmenter over the same network: all it sees in an image, of whatever class."""
+        """Return a Segmenter over the same network, which uses masks of all classes."""
         return ClassAgnosticSegmenter(self._network)
 
     def detect(self, frame: Frame, queries: Sequence[str]) -> list[Detection]:
-        """All instances of each query with their masks, best first; boxes that span too much are left out."""
-        wanted = self._wanted(queries)
-        if not wanted:
+        """Return all instances of each query with masks, best first, without boxes that cover too much of the image."""
+        query_classes = self._query_classes(queries)
+        if not query_classes:
             return []
         output = self._network.run(frame)
-        found = self._distinct(output.candidates(self._settings.min_score), wanted)
-        masks = output.masks(found)
+        candidates = self._distinct(output.candidates(self._settings.min_score), query_classes)
+        masks = output.masks(candidates)
+        many_objects = concerns_many_objects(queries)
         return [
             Detection(box.phrase, box.score, box.box_px, masks[row])
-            for row, box in self._answers(found, wanted, concerns_many_objects(queries), frame.depth_m.size)
+            for row, box in self._matches(candidates, query_classes, many_objects, frame.depth_m.size)
             if masks[row].any()
         ]
 
     def boxes(self, frame: Frame, queries: Sequence[str]) -> list[DetectedBox]:
-        """As `detect`, for others to cut out."""
-        wanted = self._wanted(queries)
-        if not wanted:
+        """Return the boxes of `detect` without masks."""
+        query_classes = self._query_classes(queries)
+        if not query_classes:
             return []
-        found = self._distinct(self._network.run(frame).candidates(self._settings.min_score), wanted)
-        answers = self._answers(found, wanted, concerns_many_objects(queries), frame.depth_m.size)
-        return [box for _, box in answers]
+        candidates = self._distinct(self._network.run(frame).candidates(self._settings.min_score), query_classes)
+        matches = self._matches(candidates, query_classes, concerns_many_objects(queries), frame.depth_m.size)
+        return [box for _, box in matches]
 
-    def _wanted(self, queries: Sequence[str]) -> dict[str, tuple[int, ...]]:
-        """The classes of each query that has any."""
+    def _query_classes(self, queries: Sequence[str]) -> dict[str, tuple[int, ...]]:
+        """Return the class indices of each query that matches any class."""
         return {query: classes for query in queries if (classes := self._classes(query))}
 
-    def _answers(
-        self, found: Candidates, wanted: Mapping[str, tuple[int, ...]], many: bool, pixels: int
+    def _matches(
+        self, candidates: Candidates, query_classes: Mapping[str, tuple[int, ...]], many_objects: bool, pixels: int
     ) -> Iterator[tuple[int, DetectedBox]]:
-        """The candidates that answer each query, with their rows; those that span too much are left out."""
-        shares = (found.boxes_px[:, 2:] - found.boxes_px[:, :2]).prod(axis=1) / pixels
-        for query, indices in wanted.items():
-            for row in np.flatnonzero(np.isin(found.classes, indices)):
-                if shares[row] <= self._settings.box_fractions.limit(self.class_names[found.classes[row]], many):
-                    left, top, right, bottom = (float(edge) for edge in found.boxes_px[row])
-                    yield int(row), DetectedBox(query, float(found.scores[row]), (left, top, right, bottom))
+        """Yield row and box of each query's candidates, without boxes that cover too much of the image."""
+        shares = (candidates.boxes_px[:, 2:] - candidates.boxes_px[:, :2]).prod(axis=1) / pixels
+        for query, classes in query_classes.items():
+            for row in np.flatnonzero(np.isin(candidates.classes, classes)):
+                name = self.class_names[candidates.classes[row]]
+                if shares[row] <= self._settings.box_fractions.limit(name, many_objects):
+                    left, top, right, bottom = (float(edge) for edge in candidates.boxes_px[row])
+                    yield int(row), DetectedBox(query, float(candidates.scores[row]), (left, top, right, bottom))
 
-    def _distinct(self, found: Candidates, wanted: Mapping[str, tuple[int, ...]]) -> Candidates:
-        """The candidates of the wanted classes, one an object."""
-        classes = np.unique([index for indices in wanted.values() for index in indices]).astype(np.int64)
-        found = found.take(np.flatnonzero(np.isin(found.classes, classes)))
-        return suppress(found, self._settings.max_iou, self._settings.max_boxes, across_classes=False)
+    def _distinct(self, candidates: Candidates, query_classes: Mapping[str, tuple[int, ...]]) -> Candidates:
+        """Return the candidates of the queries' classes after non-maximum suppression."""
+        classes = np.unique([index for indices in query_classes.values() for index in indices]).astype(np.int64)
+        candidates = candidates.take(np.flatnonzero(np.isin(candidates.classes, classes)))
+        return suppress(candidates, self._settings.max_iou, self._settings.max_boxes, across_classes=False)
 
     def _classes(self, query: str) -> tuple[int, ...]:
-        return classes_for(query, self.class_names, self._vectors)
+        return classes_for(query, self.class_names, self._embeddings)
 
 
 def load_yolo(model: OpenModel) -> YoloSegDetector:
-    """The detector with its defaults and the text vectors that lie beside the file. Raises ModelFileError."""
+    """Return the detector with the text embeddings of the model's folder. Raises ModelFileError."""
     return YoloSegDetector(model, TextEmbeddings.from_model_folder(model.path))

@@ -1,4 +1,4 @@
-"""Arithmetic around a YOLO-seg network: the image into its square, its numbers back into boxes and masks."""
+"""Pre- and post-processing of YOLO-seg: letterboxing, box decoding, non-maximum suppression, masks."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _PAD_VALUE = 114
 
 @dataclass(frozen=True, slots=True)
 class Letterbox:
-    """How an image was scaled and padded: x_network = x_image · scale_x + left_px, and the same for y."""
+    """Scale and padding of an image: x_network = x_image · scale_x + left_px, and the same for y."""
 
     scale_x: float
     scale_y: float
@@ -33,14 +33,14 @@ class Candidates:
     coefficients: Float32[ndarray, "n 32"]
 
     def take(self, rows: Int64[ndarray, " m"]) -> Candidates:
-        """The candidates in these rows."""
+        """Return the candidates of these rows."""
         return Candidates(self.boxes_px[rows], self.scores[rows], self.classes[rows], self.coefficients[rows])
 
 
 def letterbox(
     rgb: UInt8[ndarray, "h w 3"], height_px: int, width_px: int
 ) -> tuple[Float32[ndarray, "1 3 H W"], Letterbox]:
-    """Scale to fit, centre on grey, and bring to [0, 1] with channels first."""
+    """Scale an image to fit, centre it on grey, and convert it to [0, 1] with channels first."""
     h, w = rgb.shape[:2]
     scale = min(height_px / h, width_px / w)
     inner_h, inner_w = max(1, round(h * scale)), max(1, round(w * scale))
@@ -56,7 +56,7 @@ def letterbox(
 def decode(
     output: Float32[ndarray, "rows a"], letterboxing: Letterbox, size_px: tuple[int, int], min_score: float
 ) -> Candidates:
-    """Anchors whose best class reaches min_score, as boxes clipped to an image of size_px (height, width)."""
+    """Return the anchors whose best class reaches min_score, clipped to an image of size_px (height, width)."""
     class_scores = output[4:-MASK_COEFFICIENTS]
     classes = class_scores.argmax(axis=0)
     scores = class_scores[classes, np.arange(output.shape[1])]
@@ -81,13 +81,13 @@ def decode(
 
 
 def suppress(candidates: Candidates, max_iou: float, max_boxes: int, across_classes: bool) -> Candidates:
-    """Greedy non-maximum suppression, within each class or across all; the best max_boxes survive, best first."""
+    """Return the best max_boxes after greedy non-maximum suppression, per class or across classes, best first."""
     if len(candidates.scores) == 0:
         return candidates
     boxes = candidates.boxes_px.astype(np.float64)
     boxes[:, 2:] -= boxes[:, :2]
     if not across_classes:
-        # boxes of different classes, moved apart, never overlap
+        # offset boxes by class, so that boxes of different classes never overlap
         boxes[:, :2] += (candidates.classes * (boxes.max() * 2 + 1.0))[:, None]
     order = cv2.dnn.NMSBoxes(boxes.tolist(), candidates.scores.tolist(), 0.0, max_iou)
     return candidates.take(np.asarray(order, np.int64).reshape(-1)[:max_boxes])
@@ -100,7 +100,7 @@ def mask_of(
     letterboxing: Letterbox,
     sizes_px: tuple[tuple[int, int], tuple[int, int]],
 ) -> Bool[ndarray, "h w"]:
-    """One object's mask in the image, zero outside its box; sizes_px are (height, width) of image and network."""
+    """Return one object's mask in the image, False outside its box; sizes_px: (height, width) of image and network."""
     (height_px, width_px), (network_h, network_w) = sizes_px
     logits = np.tensordot(coefficients, prototypes, axes=1).astype(np.float32)
     rows_per_px, columns_per_px = logits.shape[0] / network_h, logits.shape[1] / network_w
@@ -109,7 +109,7 @@ def mask_of(
     mask = np.zeros((height_px, width_px), np.bool_)
     if right <= left or bottom <= top:
         return mask
-    # maps pixel centres of the box onto centres of the prototype grid
+    # maps pixel centres of the box to cell centres of the prototype grid
     scale_x, scale_y = letterboxing.scale_x * columns_per_px, letterboxing.scale_y * rows_per_px
     to_grid = np.array(
         [

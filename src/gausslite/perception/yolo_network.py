@@ -1,4 +1,4 @@
-"""A YOLO-seg or FastSAM network from an ONNX file: images in, candidates and their masks out; it knows no nouns."""
+"""Run a YOLO-seg or FastSAM network: an image in, candidate boxes and masks by class index out."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _DEFAULT_SIDE_PX: Final = 640
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NetworkOutput:
-    """What the network said about one image, before any threshold."""
+    """Raw output for one image, before any threshold."""
 
     output: Float32[ndarray, "rows a"]
     prototypes: Float32[ndarray, "32 ph pw"]
@@ -30,34 +30,34 @@ class NetworkOutput:
     network_size_px: tuple[int, int]
 
     def candidates(self, min_score: float) -> Candidates:
-        """The boxes whose best class reaches min_score, in any order."""
+        """Return the boxes whose best class reaches min_score, unordered."""
         return decode(self.output, self.letterboxing, self.size_px, min_score)
 
-    def masks(self, found: Candidates) -> list[Bool[ndarray, "h w"]]:
-        """One mask a candidate, zero outside its box."""
+    def masks(self, candidates: Candidates) -> list[Bool[ndarray, "h w"]]:
+        """Return one mask per candidate, False outside its box."""
         sizes_px = (self.size_px, self.network_size_px)
         return [
             mask_of(coefficients, self.prototypes, box, self.letterboxing, sizes_px)
-            for coefficients, box in zip(found.coefficients, found.boxes_px, strict=True)
+            for coefficients, box in zip(candidates.coefficients, candidates.boxes_px, strict=True)
         ]
 
 
 class YoloSegNetwork:
-    """A session with one image in, and out of it [1, 4+c+32, A] and [1, 32, h, w] for c classes."""
+    """A network from one image to [1, 4+c+32, A] (boxes, c class scores, mask coefficients) and [1, 32, h, w]."""
 
     def __init__(self, model: OpenModel) -> None:
-        """Try the model once, so that a wrong one is refused here. Raises ModelFileError."""
+        """Run the model once to check its outputs. Raises ModelFileError."""
         self.path, self._session = model.path, model.session
         self._input, self._height_px, self._width_px = _input_of(model.path, self._session)
         blank = np.zeros((1, 3, self._height_px, self._width_px), np.float32)
         outputs = run_once(model, {self._input: blank})
         self.names = _class_names(self._session)
-        self._boxes_at, self._prototypes_at = _output_order(model.path, outputs, len(self.names))
-        self.classes = int(outputs[self._boxes_at].shape[1]) - 4 - MASK_COEFFICIENTS
+        self._boxes_index, self._prototypes_index = _output_order(model.path, outputs, len(self.names))
+        self.classes = int(outputs[self._boxes_index].shape[1]) - 4 - MASK_COEFFICIENTS
         self._latest: tuple[Frame, NetworkOutput] | None = None
 
     def run(self, frame: Frame) -> NetworkOutput:
-        """Run the network on a frame's colours; asked again about the same frame, give the same answer."""
+        """Return the network's output for a frame; the latest output is cached."""
         latest = self._latest
         if latest is None or latest[0] is not frame:
             latest = self._latest = frame, self._infer(frame)
@@ -69,7 +69,7 @@ class YoloSegNetwork:
         size_px = (frame.camera.height_px, frame.camera.width_px)
         network_size_px = (self._height_px, self._width_px)
         return NetworkOutput(
-            outputs[self._boxes_at][0], outputs[self._prototypes_at][0], letterboxing, size_px, network_size_px
+            outputs[self._boxes_index][0], outputs[self._prototypes_index][0], letterboxing, size_px, network_size_px
         )
 
 
@@ -77,14 +77,14 @@ def _input_of(path: Path, session: Any) -> tuple[str, int, int]:
     inputs = session.get_inputs()
     shape = inputs[0].shape
     if len(inputs) != 1 or len(shape) != 4 or shape[1] not in (3, None) or inputs[0].type != "tensor(float)":
-        came = ", ".join(f"{each.name} {each.shape} {each.type}" for each in inputs)
-        raise ModelFileError(f"model {path}: expected one float input [1, 3, height, width], got {came}")
+        received = ", ".join(f"{each.name} {each.shape} {each.type}" for each in inputs)
+        raise ModelFileError(f"model {path}: expected one float input [1, 3, height, width], got {received}")
     height, width = (side if isinstance(side, int) else _DEFAULT_SIDE_PX for side in shape[2:])
     return str(inputs[0].name), height, width
 
 
 def _class_names(session: Any) -> tuple[str, ...]:
-    """The classes' names in the file's metadata; none where they are missing or unreadable."""
+    """Return the class names in the file's metadata; empty if they are missing or invalid."""
     text = session.get_modelmeta().custom_metadata_map.get("names", "")
     try:
         names = ast.literal_eval(text)
@@ -94,18 +94,19 @@ def _class_names(session: Any) -> tuple[str, ...]:
 
 
 def _output_order(path: Path, outputs: list[Float32[ndarray, "..."]], classes: int) -> tuple[int, int]:
-    """Where boxes and prototypes are among the outputs; classes 0: as many as there are rows for."""
-    came = " and ".join(str(list(each.shape)) for each in outputs)
-    least = 4 + max(classes, 1) + MASK_COEFFICIENTS
-    rows = str(least) if classes else "4+c+32"
+    """Return the indices of boxes and prototypes among the outputs; classes 0 accepts any number of classes."""
+    received = " and ".join(str(list(each.shape)) for each in outputs)
+    min_rows = 4 + max(classes, 1) + MASK_COEFFICIENTS
+    rows = str(min_rows) if classes else "4+c+32"
     boxes = [
         i for i, each in enumerate(outputs)
-        if each.ndim == 3 and (each.shape[1] == least if classes else each.shape[1] >= least) and len(each) == 1
+        if each.ndim == 3 and (each.shape[1] == min_rows if classes else each.shape[1] >= min_rows) and len(each) == 1
     ]  # fmt: skip
     prototypes = [i for i, each in enumerate(outputs) if each.ndim == 4 and each.shape[:2] == (1, MASK_COEFFICIENTS)]
     if len(boxes) != 1 or len(prototypes) != 1:
         hint = " (boxes only, no masks)" if len(outputs) == 1 else ""
         raise ModelFileError(
-            f"model {path}: expected a YOLO-seg network with outputs [1, {rows}, A] and [1, 32, h, w], got {came}{hint}"
+            f"model {path}: expected a YOLO-seg network with outputs [1, {rows}, A] and [1, 32, h, w], "
+            f"got {received}{hint}"
         )
     return boxes[0], prototypes[0]

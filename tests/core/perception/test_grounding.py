@@ -100,7 +100,7 @@ def test_a_file_with_another_interface_is_refused(tmp_path):
 
 
 def test_a_network_with_room_for_no_word_is_refused(tmp_path):
-    with pytest.raises(ModelFileError, match="room for 4 tokens"):
+    with pytest.raises(ModelFileError, match="space for 4 tokens"):
         detector(tmp_path, [(LEFT, {})], length=3)
 
 

@@ -135,7 +135,7 @@ def test_the_fastest_processor_there_is_comes_first_and_the_cpu_helps_out():
         (b"PK\x03\x04rest", "a zip archive"),
         (b"\x1c\x00\x00\x00ORTM", "ORT format"),
         (b"\x08\x08", "without a graph"),
-        (b"\x08\x08\x3a\x7f1234", "cut off at 8 bytes of 131"),
+        (b"\x08\x08\x3a\x7f1234", "truncated at 8 bytes of 131"),
     ],
 )
 def test_what_is_no_model_is_told_before_a_session_is_made(tmp_path, content, expected):
@@ -148,5 +148,5 @@ def test_what_is_no_model_is_told_before_a_session_is_made(tmp_path, content, ex
 def test_a_damaged_bit_is_told_where_a_checksum_lies_beside_the_file(tmp_path):
     path = yolo(tmp_path)
     (tmp_path / "SHA256SUMS").write_text(f"{'0' * 64}  other.onnx\n{'1' * 64} *yolo.onnx\n", encoding="utf-8")
-    with pytest.raises(ModelFileError, match="as SHA256SUMS beside it says"):
+    with pytest.raises(ModelFileError, match="of SHA256SUMS in its folder"):
         ModelRegistry(path, None, None, 1)
