@@ -1,1 +1,1 @@
-"""The nouns of GaussLite: frozen values over NumPy arrays, without input or output."""
+"""Value types of GaussLite: frozen dataclasses over NumPy arrays, without input or output."""

@@ -1,4 +1,4 @@
-"""Check arrays at the border: shape, type and finiteness, with messages that name the field."""
+"""Check shape, type and finiteness of arrays from outside, with messages that name the field."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ def require_array(name: str, value: NDArray[Any], shape: tuple[int | None, ...],
     """Raise ShapeError unless `value` has this dtype and shape (None matches any length)."""
     expected = np.dtype(dtype)
     if not isinstance(value, np.ndarray) or value.dtype != expected:
-        came = getattr(value, "dtype", type(value).__name__)
-        raise ShapeError(f"{name}: expected an array of {expected}, got {came}")
+        received = getattr(value, "dtype", type(value).__name__)
+        raise ShapeError(f"{name}: expected an array of {expected}, got {received}")
     if value.shape == shape:
         return
-    fits = len(value.shape) == len(shape) and all(
-        want is None or want == have for want, have in zip(shape, value.shape, strict=True)
+    matches = len(value.shape) == len(shape) and all(
+        length is None or length == actual for length, actual in zip(shape, value.shape, strict=True)
     )
-    if not fits:
-        wanted = "(" + ", ".join("*" if want is None else str(want) for want in shape) + ")"
-        raise ShapeError(f"{name}: expected shape {wanted}, got {value.shape}")
+    if not matches:
+        pattern = "(" + ", ".join("*" if length is None else str(length) for length in shape) + ")"
+        raise ShapeError(f"{name}: expected shape {pattern}, got {value.shape}")
 
 
 def require_finite(name: str, value: NDArray[Any]) -> None:
-    """Raise InvalidInputError when any element is NaN or infinite."""
+    """Raise InvalidInputError if any element is NaN or infinite."""
     if not np.isfinite(value).all():
         bad = int(np.count_nonzero(~np.isfinite(value)))
         raise InvalidInputError(f"{name}: expected finite values, got {bad} NaN or infinite")

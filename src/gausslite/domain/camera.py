@@ -1,7 +1,7 @@
-"""The pinhole camera, and pixels lifted to points.
+"""The pinhole camera model: back-projection of pixels and projection of points.
 
-Pixel (column u, row v) has its centre at (u + 0.5, v + 0.5). Readers of data sets whose principal point counts
-from pixel centres at integers add 0.5 to cx and cy when they build a Camera.
+Pixel (column u, row v) has its centre at (u + 0.5, v + 0.5). If a dataset's principal point assumes integer pixel
+centres, its reader adds 0.5 to cx and cy.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from gausslite.errors import InvalidInputError
 
 _MAX_SIDE_PX = 16384
 _MAX_SLOPE = 100.0
-"""Of a ray against the optical axis, 89.4 degrees: what lies beyond is no pinhole, and its points lie anywhere."""
+"""Largest tangent of a ray's angle to the optical axis (89.4 degrees); steeper rays are not a pinhole camera."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +52,7 @@ class Camera:
                 )
 
     def resized(self, width_px: int, height_px: int) -> Camera:
-        """The same camera for an image scaled to this size."""
+        """Return the camera for an image scaled to this size."""
         sx, sy = width_px / self.width_px, height_px / self.height_px
         return Camera(self.fx_px * sx, self.fy_px * sy, self.cx_px * sx, self.cy_px * sy, width_px, height_px)
 
@@ -62,7 +62,7 @@ def back_project(
 ) -> Float32[ndarray, "h w 3"]:
     """Lift every pixel to a point in the camera frame (OpenCV axes); depth 0 gives the origin.
 
-    left_px and top_px say where in the camera's image `depth_m` begins, when it is a part of it.
+    left_px and top_px: offset of `depth_m` in the camera's image, if it is a crop.
     """
     height, width = depth_m.shape
     columns, rows = np.arange(left_px, left_px + width), np.arange(top_px, top_px + height)
@@ -78,7 +78,7 @@ def back_project(
 def lift(
     pixels_px: Float64[ndarray, "n 2"], depths_m: Float64[ndarray, " n"], camera: Camera
 ) -> Float64[ndarray, "n 3"]:
-    """The camera-frame points at image coordinates (column, row), centres at +0.5, at these depths along the axis."""
+    """Return camera-frame points at image coordinates (column, row) and depths; pixel centres are at +0.5."""
     principal_px, focal_px = np.array([camera.cx_px, camera.cy_px]), np.array([camera.fx_px, camera.fy_px])
     rays = (pixels_px - principal_px) / focal_px
     return np.concatenate([rays * depths_m[:, None], depths_m[:, None]], axis=1)

@@ -1,4 +1,4 @@
-"""One posed RGB-D image, checked when it is born."""
+"""One posed RGB-D image, validated on construction."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from gausslite.domain.camera import Camera
 from gausslite.domain.pose import require_rigid
 from gausslite.errors import InvalidInputError, PoseError
 
-_REACH_M = 10_000.0
-"""Farther from the world's origin float32 no longer tells a millimetre, and voxels run out of numbers."""
+_MAX_COORDINATE_M = 10_000.0
+"""Farther from the world's origin, float32 no longer resolves a millimetre, and voxel keys overflow."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -22,8 +22,8 @@ class Frame:
     """A colour and depth image with its camera and pose.
 
     depth_m is the distance along the optical axis in metres, 0 where the sensor had no return.
-    T_world_camera uses OpenCV axes (x right, y down, z forward) and stays within 10 km of the world's origin along each
-    axis. Raises ShapeError, PoseError, InvalidInputError.
+    T_world_camera uses OpenCV axes (x right, y down, z forward); its position is within 10 km of the world's origin
+    along each axis. Raises ShapeError, PoseError, InvalidInputError.
     """
 
     index: int
@@ -39,9 +39,9 @@ class Frame:
         require_array("frame depth_m", self.depth_m, size, np.float32)
         require_array("frame T_world_camera", self.T_world_camera, (4, 4), np.float64)
         require_rigid("frame T_world_camera", self.T_world_camera)
-        if np.abs(self.T_world_camera[:3, 3]).max() > _REACH_M:
+        if np.abs(self.T_world_camera[:3, 3]).max() > _MAX_COORDINATE_M:
             raise PoseError(
-                f"frame T_world_camera: expected a camera within {_REACH_M:g} m of the world's origin, "
+                f"frame T_world_camera: expected a camera within {_MAX_COORDINATE_M:g} m of the world's origin, "
                 f"got one at {self.T_world_camera[:3, 3].tolist()}; choose an origin near the robot"
             )
         if not np.isfinite(self.depth_m).all() or (self.depth_m < 0).any():
@@ -49,5 +49,5 @@ class Frame:
 
     @property
     def has_depth(self) -> bool:
-        """False when no pixel has a return; such a frame cannot be mapped."""
+        """False if no pixel has a depth; such a frame cannot be mapped."""
         return bool((self.depth_m > 0).any())

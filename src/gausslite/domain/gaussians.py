@@ -45,7 +45,7 @@ class Gaussians:
 
     @classmethod
     def empty(cls) -> Gaussians:
-        """No Gaussians."""
+        """Return a set without Gaussians."""
         return cls(
             np.zeros((0, 3), np.float32),
             np.zeros((0, 4), np.float32),
@@ -58,13 +58,13 @@ class Gaussians:
         )
 
     def take(self, rows: NDArray[Any]) -> Gaussians:
-        """The Gaussians at these indices, or where this boolean mask is true."""
-        chosen = np.flatnonzero(rows) if rows.dtype == np.bool_ else rows
-        return Gaussians(*(np.take(getattr(self, field.name), chosen, axis=0) for field in fields(self)))
+        """Return the Gaussians at these indices, or where this boolean mask is True."""
+        indices = np.flatnonzero(rows) if rows.dtype == np.bool_ else rows
+        return Gaussians(*(np.take(getattr(self, field.name), indices, axis=0) for field in fields(self)))
 
     @classmethod
     def concatenate(cls, parts: list[Gaussians]) -> Gaussians:
-        """All parts in order."""
+        """Return the Gaussians of all parts, in order."""
         if not parts:
             return cls.empty()
         return cls(*(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(cls)))

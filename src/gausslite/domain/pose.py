@@ -1,4 +1,4 @@
-"""Rigid transforms as 4x4 matrices, where `T_a_b` takes points of frame b to frame a; and which way is up."""
+"""Rigid transforms as 4x4 matrices, where `T_a_b` maps points of frame b to frame a; and the up axis of a world."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from numpy import ndarray
 from gausslite.errors import InvalidInputError, PoseError
 
 UpAxis = tuple[float, float, float]
-"""The direction of a world frame that points up."""
+"""Upward direction in a world frame."""
 
 _RIGIDITY_TOLERANCE = 1e-2
 
@@ -23,7 +23,7 @@ def require_rigid(name: str, T: Float[ndarray, "4 4"]) -> None:
     if not np.allclose(T[3], (0.0, 0.0, 0.0, 1.0), atol=1e-6):
         raise PoseError(f"{name}: expected a last row 0 0 0 1, got {T[3].tolist()}")
     R = T[:3, :3]
-    # numbers whose squares overflow give infinity or NaN, and neither is within the tolerance
+    # large numbers overflow to infinity or NaN, which are outside the tolerance
     with np.errstate(over="ignore", invalid="ignore"):
         deviation, determinant = float(np.abs(R @ R.T - np.eye(3)).max()), float(np.linalg.det(R))
     if not deviation <= _RIGIDITY_TOLERANCE or determinant < 0:
@@ -60,7 +60,7 @@ def translation_m(T_world_a: Float64[ndarray, "4 4"], T_world_b: Float64[ndarray
 
 
 def unit_up_axis(up_axis: UpAxis) -> UpAxis:
-    """Normalise an up axis. Raises InvalidInputError when it has no direction."""
+    """Return the normalised up axis. Raises InvalidInputError if it has no direction."""
     length = float(np.linalg.norm(up_axis))
     if not (np.isfinite(length) and length > 1e-6):
         raise InvalidInputError(f"up axis: expected a finite vector that is not zero, got {up_axis}")

@@ -1,4 +1,4 @@
-"""Where in the image the task is: detections and the per-pixel relevance w(u, v)."""
+"""Detections, and the per-pixel relevance w(u, v) of a frame to the task."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ NO_TARGET = -1
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Detection:
-    """One object found in one image. box_px is (left, top, right, bottom)."""
+    """One detected object in one image. box_px is (left, top, right, bottom)."""
 
     phrase: str
     score: float
@@ -25,7 +25,7 @@ class Detection:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RelevanceMap:
-    """weight is the paper's w(u, v) in [0, 1]; target is the index into TaskGraph.targets, -1 where none."""
+    """Relevance of one frame: weight is the paper's w(u, v) in [0, 1], target indexes TaskGraph.targets (-1 none)."""
 
     weight: Float32[ndarray, "h w"]
     target: Int16[ndarray, "h w"]
@@ -36,7 +36,7 @@ class RelevanceMap:
 
     @classmethod
     def empty(cls, height_px: int, width_px: int) -> RelevanceMap:
-        """No pixel is relevant."""
+        """Return a map without relevant pixels."""
         return cls(
             np.zeros((height_px, width_px), np.float32),
             np.full((height_px, width_px), NO_TARGET, np.int16),
@@ -44,10 +44,10 @@ class RelevanceMap:
 
     @property
     def roi(self) -> Bool[ndarray, "h w"]:
-        """Pixels that belong to the task's region."""
+        """True for pixels of the task's region."""
         return self.weight > 0
 
     @property
     def roi_share(self) -> float:
-        """Fraction of the pixels inside the region."""
+        """Fraction of pixels in the task's region."""
         return float(np.count_nonzero(self.weight) / self.weight.size)

@@ -1,4 +1,4 @@
-"""State as named arrays: what every owner hands out to be saved, and takes back, whatever file it lies in between."""
+"""State of a component as named arrays, for saving and restoring it independently of the file format."""
 
 from __future__ import annotations
 
@@ -12,24 +12,24 @@ from gausslite.domain.arrays import require_array
 from gausslite.errors import MapFileError
 
 State = Mapping[str, NDArray[Any]]
-"""Owners prefix the names of their parts with "part/"."""
+"""Arrays by name; a component adds its name and a slash as the prefix of its parts' names."""
 
-_LARGEST_MEASURE = 1e6
+_MAX_MAGNITUDE = 1e6
 
 
 def add_prefix(prefix: str, state: State) -> dict[str, NDArray[Any]]:
-    """The same arrays, their names one level deeper."""
+    """Return the arrays with "prefix/" before their names."""
     return {f"{prefix}/{name}": array for name, array in state.items()}
 
 
 def select_prefix(state: State, prefix: str) -> dict[str, NDArray[Any]]:
-    """What `nested` put under this prefix; empty when nothing is there."""
+    """Return the arrays whose names start with "prefix/", without it; empty if there are none."""
     start = f"{prefix}/"
     return {name.removeprefix(start): array for name, array in state.items() if name.startswith(start)}
 
 
 def get_array(state: State, name: str, shape: tuple[int | None, ...], dtype: DTypeLike) -> NDArray[Any]:
-    """One array, checked (None matches any length). Raises MapFileError when it is missing, ShapeError otherwise."""
+    """Return one array of this shape (None matches any length). Raises MapFileError if it is missing, ShapeError."""
     if name not in state:
         raise MapFileError(f"state {name}: expected it in the file, got none")
     require_array(f"state {name}", state[name], shape, dtype)
@@ -37,12 +37,12 @@ def get_array(state: State, name: str, shape: tuple[int | None, ...], dtype: DTy
 
 
 def int_array(*values: int) -> NDArray[np.int64]:
-    """Counts side by side."""
+    """Return the numbers as an array."""
     return np.array(values, np.int64)
 
 
 def get_counts(state: State, name: str, count: int) -> tuple[int, ...]:
-    """Counts of at least 0. Raises MapFileError, ShapeError."""
+    """Return integers of at least 0. Raises MapFileError, ShapeError."""
     values = tuple(int(value) for value in get_array(state, name, (count,), np.int64))
     if min(values, default=0) < 0:
         raise MapFileError(f"state {name}: expected counts of at least 0, got {min(values)}")
@@ -50,20 +50,20 @@ def get_counts(state: State, name: str, count: int) -> tuple[int, ...]:
 
 
 def get_floats(state: State, name: str, count: int) -> tuple[float, ...]:
-    """Metres, pixels and the like: numbers that float32 can still reckon with. Raises MapFileError, ShapeError."""
+    """Return floats within ±1e6, which float32 computations tolerate. Raises MapFileError, ShapeError."""
     values = get_array(state, name, (count,), np.float64)
-    if not (np.abs(values) <= _LARGEST_MEASURE).all():
-        raise MapFileError(f"state {name}: expected numbers of at most {_LARGEST_MEASURE:g}, got others")
+    if not (np.abs(values) <= _MAX_MAGNITUDE).all():
+        raise MapFileError(f"state {name}: expected numbers of at most {_MAX_MAGNITUDE:g}, got others")
     return tuple(float(value) for value in values)
 
 
 def encode_text(value: str) -> NDArray[np.uint8]:
-    """A text as its UTF-8 bytes."""
+    """Return a text as its UTF-8 bytes."""
     return np.frombuffer(value.encode(), np.uint8)
 
 
 def get_text(state: State, name: str) -> str:
-    """A text. Raises MapFileError when it is none, ShapeError."""
+    """Return a text. Raises MapFileError if it is not UTF-8, ShapeError."""
     try:
         return get_array(state, name, (None,), np.uint8).tobytes().decode()
     except UnicodeDecodeError:

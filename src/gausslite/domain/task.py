@@ -1,4 +1,4 @@
-"""What the operator asked for, as objects and the relations between them (Sec. III-B.1)."""
+"""The operator's task as a graph of objects and spatial relations (Sec. III-B.1)."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from enum import StrEnum
 
 
 class Predicate(StrEnum):
-    """Spatial predicates the relation filter can evaluate; the paper has the first two.
+    """Spatial predicates of the relation filter; the paper has the first two.
 
-    BETWEEN is said once for each of its anchors: between(t, a) and between(t, b) are one relation.
+    BETWEEN has one entry per anchor: between(t, a) and between(t, b) form one relation.
     """
 
     NEAR = "near"
@@ -37,7 +37,7 @@ class Relation:
 
 @dataclass(frozen=True, slots=True)
 class TaskGraph:
-    """Targets to map in detail, anchors that locate them, and the relations r(target, anchor)."""
+    """Targets to map in detail, anchors that locate them, and relations r(target, anchor)."""
 
     task_id: str
     text: str
@@ -47,10 +47,10 @@ class TaskGraph:
     warnings: tuple[str, ...] = ()
 
     def is_equivalent_to(self, other: TaskGraph) -> bool:
-        """True when both look for the same things in the same relations, whatever the words were."""
+        """Return True if targets, anchors and relations are equal, whatever the text."""
         return (self.targets, self.anchors, self.relations) == (other.targets, other.anchors, other.relations)
 
     @property
     def queries(self) -> tuple[str, ...]:
-        """Q = targets ∪ anchors, in order, without repeats."""
+        """Q = targets ∪ anchors, in order, without duplicates."""
         return tuple(dict.fromkeys((*self.targets, *self.anchors)))

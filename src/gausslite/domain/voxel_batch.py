@@ -1,4 +1,4 @@
-"""What leaves a robot: its latest word on some voxels."""
+"""Voxel updates of an agent: the complete current Gaussians of some voxels."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from gausslite.errors import InvalidInputError
 
 @dataclass(frozen=True, slots=True, eq=False)
 class VoxelBatch:
-    """A complete word on each listed voxel.
+    """The complete content of each listed voxel.
 
-    keys are strictly ascending; gaussians are sorted by voxel, counts[i] of them in keys[i]; a count of 0 is a
-    tombstone (nothing there any more). kappa_sums are TOTALS over the voxel, never increments, so that a word may
-    arrive twice or out of order without changing the outcome.
+    keys are strictly ascending; gaussians are sorted by voxel, counts[i] of them in keys[i]. A count of 0 is a
+    tombstone (the voxel is empty now). kappa_sums are TOTALS of the voxel, never increments, so that an update may
+    arrive twice or out of order.
     """
 
     keys: Int64[ndarray, " v"]
@@ -29,15 +29,15 @@ class VoxelBatch:
 
     def __post_init__(self) -> None:
         v = len(self.keys)
-        require_array("words keys", self.keys, (v,), np.int64)
-        require_array("words kappa_sums", self.kappa_sums, (v,), np.uint64)
-        require_array("words counts", self.counts, (v,), np.uint32)
+        require_array("voxel batch keys", self.keys, (v,), np.int64)
+        require_array("voxel batch kappa_sums", self.kappa_sums, (v,), np.uint64)
+        require_array("voxel batch counts", self.counts, (v,), np.uint32)
         if v > 1 and not (np.diff(self.keys) > 0).all():
-            raise InvalidInputError("words keys: expected strictly ascending voxel keys")
+            raise InvalidInputError("voxel batch keys: expected strictly ascending voxel keys")
         total = int(self.counts.sum(dtype=np.int64))
         if total != len(self.gaussians):
             raise InvalidInputError(
-                f"words counts: expected a sum of {len(self.gaussians)} (the Gaussians present), got {total}"
+                f"voxel batch counts: expected a sum of {len(self.gaussians)} (the Gaussians present), got {total}"
             )
 
     def __len__(self) -> int:
@@ -51,10 +51,10 @@ class VoxelBatch:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RoiSubset:
-    """One message of an agent: its words on some voxels as of `map_revision` of its map.
+    """One message of an agent: its update of some voxels at `map_revision` of its map.
 
-    Per voxel the word with the highest map_revision is the agent's latest; sequence numbers the messages of a session
-    so that the receiver can acknowledge them cumulatively.
+    Per voxel, the update with the highest map_revision is the latest. sequence numbers the messages of a session, so
+    that the receiver can acknowledge them cumulatively.
     """
 
     agent_id: str

@@ -1,4 +1,4 @@
-"""Make, cut and unite words on voxels."""
+"""Create, select and merge voxel batches."""
 
 from __future__ import annotations
 
@@ -16,14 +16,15 @@ from gausslite.domain.voxels import AxisAlignedBox, VoxelGrid
 
 
 def empty_batch() -> VoxelBatch:
-    """Nothing said about any voxel."""
+    """Return a batch without voxels."""
     return VoxelBatch(np.zeros(0, np.int64), np.zeros(0, np.uint64), np.zeros(0, np.uint32), Gaussians.empty())
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class VoxelIndex:
-    """The voxels that hold some of these points, in ascending order: rows[starts[i] : starts[i] + counts[i]] lie in
-    keys[i], in the order in which they came.
+    """Points grouped by voxel, keys ascending: points rows[starts[i] : starts[i] + counts[i]] are in keys[i].
+
+    Within a voxel, the points keep their order.
     """
 
     keys: Int64[ndarray, " v"]
@@ -33,27 +34,27 @@ class VoxelIndex:
 
     @classmethod
     def from_points(cls, points_m: Float32[ndarray, "n 3"], grid: VoxelGrid) -> VoxelIndex:
-        """Sort points into voxels. Raises InvalidInputError for points out of the grid's reach."""
+        """Group points by voxel. Raises InvalidInputError for points outside the grid's range."""
         rows, starts = grid.sort_by_voxel(points_m)
         return cls(grid.keys(points_m[rows[starts]]), starts, np.diff(starts, append=len(rows)), rows)
 
     def sums(self, values: UInt32[ndarray, " n"] | UInt64[ndarray, " n"]) -> UInt64[ndarray, " v"]:
-        """The sum over each voxel of one value a point."""
+        """Return the sum of the points' values in each voxel."""
         if len(self.starts) == 0:
             return np.zeros(0, np.uint64)
         sums: UInt64[ndarray, " v"] = np.add.reduceat(values[self.rows], self.starts, dtype=np.uint64)
         return sums
 
-    def rows_in(self, chosen: Bool[ndarray, " v"]) -> Int64[ndarray, " m"]:
-        """The points in these voxels, voxel by voxel."""
-        rows: Int64[ndarray, " m"] = self.rows[np.repeat(chosen, self.counts)]
+    def rows_in(self, selected: Bool[ndarray, " v"]) -> Int64[ndarray, " m"]:
+        """Return the indices of the points in the selected voxels, voxel by voxel."""
+        rows: Int64[ndarray, " m"] = self.rows[np.repeat(selected, self.counts)]
         return rows
 
 
 def group_by_voxel(gaussians: Gaussians, grid: VoxelGrid) -> VoxelBatch:
-    """A complete word on every voxel that holds any of these Gaussians (Sec. III-E), stable within a voxel.
+    """Return the batch of all voxels of these Gaussians (Sec. III-E); their order within a voxel is kept.
 
-    Raises InvalidInputError for means out of the grid's reach.
+    Raises InvalidInputError for means outside the grid's range.
     """
     voxels = VoxelIndex.from_points(gaussians.means_m, grid)
     return VoxelBatch(
@@ -62,12 +63,12 @@ def group_by_voxel(gaussians: Gaussians, grid: VoxelGrid) -> VoxelBatch:
 
 
 def tombstones(keys: Int64[ndarray, " k"]) -> VoxelBatch:
-    """The word "nothing is here any more" on each of these ascending voxels."""
+    """Return a batch of tombstones for these ascending voxel keys."""
     return VoxelBatch(keys, np.zeros(len(keys), np.uint64), np.zeros(len(keys), np.uint32), Gaussians.empty())
 
 
 def merge_batches(a: VoxelBatch, b: VoxelBatch) -> VoxelBatch:
-    """The words of both, which must have no voxel in common."""
+    """Return the voxels of both batches, which must be disjoint."""
     keys = np.concatenate([a.keys, b.keys])
     order = np.argsort(keys, kind="stable")
     counts = np.concatenate([a.counts, b.counts])
@@ -80,7 +81,7 @@ def merge_batches(a: VoxelBatch, b: VoxelBatch) -> VoxelBatch:
 
 
 def gather_rows(starts: NDArray[Any], counts: NDArray[Any]) -> NDArray[np.int64]:
-    """The indices start, start + 1, … of every run (start, count), run after run."""
+    """Return the indices start, start + 1, … of every run (start, count), concatenated."""
     ends = np.cumsum(counts, dtype=np.int64)
     total = int(ends[-1]) if len(ends) else 0
     shift = np.repeat(starts.astype(np.int64) - (ends - counts), counts)
@@ -88,18 +89,18 @@ def gather_rows(starts: NDArray[Any], counts: NDArray[Any]) -> NDArray[np.int64]
     return rows
 
 
-def select_voxels(words: VoxelBatch, keep: Bool[ndarray, " v"]) -> VoxelBatch:
-    """The words on the voxels where `keep` is true."""
-    counts = words.counts[keep]
-    rows = gather_rows(words.offsets[:-1][keep], counts)
-    return VoxelBatch(words.keys[keep], words.kappa_sums[keep], counts, words.gaussians.take(rows))
+def select_voxels(batch: VoxelBatch, keep: Bool[ndarray, " v"]) -> VoxelBatch:
+    """Return the voxels where `keep` is True."""
+    counts = batch.counts[keep]
+    rows = gather_rows(batch.offsets[:-1][keep], counts)
+    return VoxelBatch(batch.keys[keep], batch.kappa_sums[keep], counts, batch.gaussians.take(rows))
 
 
-def crop_to_box(words: VoxelBatch, box: AxisAlignedBox, grid: VoxelGrid) -> VoxelBatch:
-    """The words on the voxels whose centre lies in the box."""
-    return select_voxels(words, box.contains(grid.centres_m(words.keys)))
+def crop_to_box(batch: VoxelBatch, box: AxisAlignedBox, grid: VoxelGrid) -> VoxelBatch:
+    """Return the voxels whose centre is in the box."""
+    return select_voxels(batch, box.contains(grid.centres_m(batch.keys)))
 
 
-def select_keys(words: VoxelBatch, keys: Int64[ndarray, " k"]) -> VoxelBatch:
-    """The words on those of these voxels that have one; keys in any order."""
-    return select_voxels(words, np.isin(words.keys, keys))
+def select_keys(batch: VoxelBatch, keys: Int64[ndarray, " k"]) -> VoxelBatch:
+    """Return the voxels of the batch that are in `keys`, which may be unsorted."""
+    return select_voxels(batch, np.isin(batch.keys, keys))

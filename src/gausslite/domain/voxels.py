@@ -1,4 +1,4 @@
-"""World space in cubes, the unit of the fusion vote and of the uplink (Sec. III-E), and in boxes of them."""
+"""The voxel grid, unit of the fusion vote and the uplink (Sec. III-E), boxes, and the votes of a voxel."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _MASK = (1 << _BITS_PER_AXIS) - 1
 
 @dataclass(frozen=True, slots=True)
 class VoxelGrid:
-    """Cubes of size_m metres aligned to the world's origin; keys pack (i, j, k) = floor(p / size) into 63 bits."""
+    """Cubes of size_m metres, aligned to the world's origin; keys pack (i, j, k) = floor(p / size) into 63 bits."""
 
     size_m: float = 0.10
 
@@ -26,23 +26,23 @@ class VoxelGrid:
             raise InvalidInputError(f"voxel size_m: expected 0.001 to 1000, got {self.size_m}")
 
     @property
-    def reach_m(self) -> float:
-        """Coordinates must stay below this distance from the origin along each axis."""
+    def max_coordinate_m(self) -> float:
+        """Coordinates must be below this distance from the origin along each axis."""
         return _OFFSET * self.size_m
 
     def keys(self, points_m: Float32[ndarray, "n 3"]) -> Int64[ndarray, " n"]:
-        """The key of the voxel that holds each point. Raises InvalidInputError for points out of reach."""
+        """Return the key of each point's voxel. Raises InvalidInputError for points outside the grid's range."""
         return _pack(self._voxel_of(points_m))
 
     def sort_by_voxel(self, points_m: Float32[ndarray, "n 3"]) -> tuple[Int64[ndarray, " n"], Int64[ndarray, " v"]]:
-        """The points by the keys of their voxels, those of one voxel as they came, and where in that each voxel begins.
+        """Return the points' indices sorted by voxel key, and the start of each voxel in them; the sort is stable.
 
-        Raises InvalidInputError for points out of reach.
+        Raises InvalidInputError for points outside the grid's range.
         """
         axes = self._voxel_of(points_m)
         low, high = (bound(axes, axis=1, initial=0.0) for bound in (np.min, np.max))
         width_i, width_j, width_k = high - low + 1
-        # voxels of a small region have numbers of 16 bits in the order of their keys, and those sort much faster
+        # in a small region, 16-bit numbers have the order of the keys and sort much faster
         if width_i * width_j * width_k <= 1 << 16:
             axes -= low[:, None]
             numbers = (np.array([width_j * width_k, width_k, 1.0]) @ axes).astype(np.uint16)
@@ -55,22 +55,24 @@ class VoxelGrid:
         return rows, np.flatnonzero(first)
 
     def indices(self, keys: Int64[ndarray, " n"]) -> Int64[ndarray, "n 3"]:
-        """The (i, j, k) of the voxels with these keys."""
+        """Return the (i, j, k) of the voxels with these keys."""
         ijk = np.stack([(keys >> (2 * _BITS_PER_AXIS)) & _MASK, (keys >> _BITS_PER_AXIS) & _MASK, keys & _MASK], axis=1)
         return ijk - _OFFSET
 
     def centres_m(self, keys: Int64[ndarray, " n"]) -> Float32[ndarray, "n 3"]:
-        """The centres of the voxels with these keys."""
+        """Return the centres of the voxels with these keys."""
         return ((self.indices(keys) + 0.5) * self.size_m).astype(np.float32)
 
     def _voxel_of(self, points_m: Float32[ndarray, "n 3"]) -> Float64[ndarray, "3 n"]:
-        """Whole numbers i, j, k of each point's voxel, axis by axis."""
-        # float64: the key must not depend on how a float32 quotient happens to round
+        """Return the integers i, j, k of each point's voxel, axis by axis."""
+        # float64: the key must not depend on the rounding of a float32 quotient
         axes = np.ascontiguousarray(points_m.T, np.float64)
         axes /= self.size_m
         np.floor(axes, out=axes)
         if not (np.abs(axes) < _OFFSET).all():
-            raise InvalidInputError(f"points: expected coordinates within ±{self.reach_m:g} m, got one outside")
+            raise InvalidInputError(
+                f"points: expected coordinates within ±{self.max_coordinate_m:g} m, got one outside"
+            )
         return axes
 
 
@@ -82,7 +84,7 @@ def _pack(axes: Float64[ndarray, "3 n"]) -> Int64[ndarray, " n"]:
 
 @dataclass(frozen=True, slots=True)
 class AxisAlignedBox:
-    """A part of the world, in metres; a voxel belongs to it when its centre does. Raises InvalidInputError."""
+    """A box in the world, in metres; a voxel belongs to it if its centre does. Raises InvalidInputError."""
 
     min_m: tuple[float, float, float]
     max_m: tuple[float, float, float]
@@ -93,7 +95,7 @@ class AxisAlignedBox:
             raise InvalidInputError(f"box: expected finite min <= max, got {self.min_m} and {self.max_m}")
 
     def contains(self, points_m: Float32[ndarray, "n 3"]) -> Bool[ndarray, " n"]:
-        """True for each point in the box; its faces belong to it."""
+        """Return True for each point in the box or on its faces."""
         low, high = np.array(self.min_m), np.array(self.max_m)
         inside: Bool[ndarray, " n"] = np.logical_and(points_m >= low, points_m <= high).min(axis=1)
         return inside
@@ -101,7 +103,7 @@ class AxisAlignedBox:
 
 @dataclass(frozen=True, slots=True)
 class VoxelScore:
-    """One agent's total on one voxel."""
+    """One agent's kappa sum and number of Gaussians in one voxel."""
 
     agent_id: str
     kappa_sum: int
@@ -110,18 +112,18 @@ class VoxelScore:
 
 @dataclass(frozen=True, slots=True)
 class VoxelVotes:
-    """The outcome on one voxel: stakes sorted best first; margin is the lead in kappa_sum over the second."""
+    """The vote of one voxel: scores sorted best first."""
 
     key: int
     scores: tuple[VoxelScore, ...]
 
     @property
     def winner(self) -> str:
-        """The agent whose Gaussians the fused map keeps here."""
+        """The agent whose Gaussians the fused map contains in this voxel."""
         return self.scores[0].agent_id
 
     @property
     def margin(self) -> int:
-        """How much more trained the winner is than the runner-up; its whole sum when uncontested."""
+        """The winner's lead in kappa_sum over the second; its own kappa_sum without a second agent."""
         second = self.scores[1].kappa_sum if len(self.scores) > 1 else 0
         return self.scores[0].kappa_sum - second
