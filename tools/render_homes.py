@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from gausslite.datasets.open import open_source
-from gausslite_sim.family import HOME_COUNT
+from gausslite_sim.home_catalogue import HOME_COUNT
 
 SHEET = Path(__file__).resolve().parents[1] / "docs" / "homes.jpg"
 SIZE = (240, 180)

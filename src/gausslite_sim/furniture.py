@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import numpy as np
 
-from gausslite_sim.items import Part
-from gausslite_sim.mesh import box, lathe, leaf, merged, panel, ring
+from gausslite_sim.mesh import box, lathe, leaf, merge_meshes, panel, ring
+from gausslite_sim.scene_objects import Part
 
 
 def table() -> list[Part]:
     """A dining table of 1.40 x 0.90 m, 0.74 m high."""
     legs = [box((x - 0.035, y - 0.035, 0), (x + 0.035, y + 0.035, 0.70)) for x in (-0.63, 0.63) for y in (-0.38, 0.38)]
     apron = [box((-0.6, y - 0.012, 0.62), (0.6, y + 0.012, 0.70)) for y in (-0.37, 0.37)]
-    return [Part(box((-0.7, -0.45, 0.70), (0.7, 0.45, 0.74), cell_m=0.03), "oak"), Part(merged(legs + apron), "walnut")]
+    return [
+        Part(box((-0.7, -0.45, 0.70), (0.7, 0.45, 0.74), cell_m=0.03), "oak"),
+        Part(merge_meshes(legs + apron), "walnut"),
+    ]
 
 
 def chair() -> list[Part]:
@@ -23,7 +26,7 @@ def chair() -> list[Part]:
     frame += [box((-0.17, y - 0.01, 0.2), (0.17, y + 0.01, 0.23)) for y in (-0.18, 0.19)]
     top = box((-0.21, 0.172, 0.82), (0.21, 0.208, 0.94))
     return [
-        Part(merged([*frame, top]), "cherry"),
+        Part(merge_meshes([*frame, top]), "cherry"),
         Part(box((-0.22, -0.22, 0.43), (0.22, 0.17, 0.475)), "plaid"),
     ]
 
@@ -32,8 +35,8 @@ def mug() -> list[Part]:
     """A printed mug, 10 cm high, with a handle at +x."""
     outside = lathe([(0.041, 0.0), (0.043, 0.1)], fit=True)
     inside = lathe([(0.043, 0.1), (0.039, 0.1), (0.036, 0.008), (0.0005, 0.008)])
-    handle = ring(0.030, 0.0065, -np.pi / 2, np.pi / 2).moved((0.040, 0, 0.052))
-    return [Part(outside, "mug_print"), Part(merged([inside, handle]), "glaze")]
+    handle = ring(0.030, 0.0065, -np.pi / 2, np.pi / 2).translate((0.040, 0, 0.052))
+    return [Part(outside, "mug_print"), Part(merge_meshes([inside, handle]), "glaze")]
 
 
 def vase() -> list[Part]:
@@ -56,8 +59,8 @@ def books() -> list[Part]:
         boards = [box((-x, -y, z), (x, y, z + lid), fit=True) for z in (0.0, high - lid)]
         spine = box((-x, -y, 0.0), (-x + lid, y, high), fit=True)
         pages = box((-x + lid, -y + 0.005, lid), (x - 0.005, y - 0.005, high - lid))
-        for mesh, texture in ((merged([*boards, spine]), cover), (pages, "paper")):
-            parts.append(Part(mesh, texture).placed((0, 0, bottom), yaw))
+        for mesh, texture in ((merge_meshes([*boards, spine]), cover), (pages, "paper")):
+            parts.append(Part(mesh, texture).place((0, 0, bottom), yaw))
         bottom += high
     return parts
 
@@ -70,7 +73,7 @@ def bowl() -> list[Part]:
     for texture, radius, x, y in (*fruit, ("orange", 0.038, 0.0, 0.0)):
         arc = np.linspace(-np.pi / 2 + 0.02, np.pi / 2 - 0.02, 10)
         ball = lathe([(radius * float(np.cos(a)), radius * float(np.sin(a))) for a in arc], smooth=True)
-        parts.append(Part(ball.moved((x, y, 0.072 if (x, y) != (0.0, 0.0) else 0.125)), texture))
+        parts.append(Part(ball.translate((x, y, 0.072 if (x, y) != (0.0, 0.0) else 0.125)), texture))
     return parts
 
 
@@ -111,7 +114,7 @@ def cupboard(
 def kettle() -> list[Part]:
     """A steel kettle with a handle over it."""
     body = lathe([(0.085, 0), (0.095, 0.05), (0.085, 0.13), (0.05, 0.18), (0.02, 0.19), (0.0005, 0.2)], smooth=True)
-    handle = ring(0.085, 0.009, 0.15, np.pi - 0.15).moved((0, 0, 0.15))
+    handle = ring(0.085, 0.009, 0.15, np.pi - 0.15).translate((0, 0, 0.15))
     return [Part(body, "steel"), Part(handle, "rubber")]
 
 
@@ -121,10 +124,14 @@ def sofa() -> list[Part]:
     arms = [box((x - 0.1, -0.42, 0.30), (x + 0.1, 0.22, 0.58)) for x in (-0.85, 0.85)]
     seats = [box((x - 0.37, -0.44, 0.30), (x + 0.37, 0.22, 0.44)) for x in (-0.375, 0.375)]
     feet = [box((x - 0.03, y - 0.03, 0), (x + 0.03, y + 0.03, 0.08)) for x in (-0.88, 0.88) for y in (-0.36, 0.36)]
-    parts = [Part(merged(base + arms), "sofa_cloth"), Part(merged(seats), "seat_cloth"), Part(merged(feet), "walnut")]
+    parts = [
+        Part(merge_meshes(base + arms), "sofa_cloth"),
+        Part(merge_meshes(seats), "seat_cloth"),
+        Part(merge_meshes(feet), "walnut"),
+    ]
     for x, yaw, texture in ((-0.5, 14, "plaid"), (0.52, -12, "cushion")):
         cushion = box((-0.2, -0.06, 0), (0.2, 0.06, 0.38), fit=texture == "cushion")
-        parts.append(Part(cushion, texture).placed((x, 0.1, 0.44), yaw))
+        parts.append(Part(cushion, texture).place((x, 0.1, 0.44), yaw))
     return parts
 
 
@@ -132,14 +139,17 @@ def television() -> list[Part]:
     """A flat screen on a foot, seen from -y."""
     screen = panel((-0.5, -0.031, 0.68), (1.0, 0, 0), (0, 0, -0.6), fit=True)
     body = [box((-0.5, -0.03, 0.08), (0.5, 0.02, 0.68)), box((-0.2, -0.1, 0), (0.2, 0.1, 0.02))]
-    return [Part(screen, "screen"), Part(merged([*body, box((-0.04, -0.01, 0.02), (0.04, 0.01, 0.08))]), "rubber")]
+    return [
+        Part(screen, "screen"),
+        Part(merge_meshes([*body, box((-0.04, -0.01, 0.02), (0.04, 0.01, 0.08))]), "rubber"),
+    ]
 
 
 def shelf() -> list[Part]:
     """An open case with four rows of books, against a wall at y = 0."""
     sides = [box((x - 0.012, -0.28, 0), (x + 0.012, 0, 1.8)) for x in (-0.45, 0.45)]
     boards = [box((-0.44, -0.28, z), (0.44, 0, z + 0.024)) for z in (0.06, 0.48, 0.9, 1.32, 1.776)]
-    parts = [Part(merged([*sides, *boards, box((-0.44, -0.012, 0), (0.44, 0, 1.8))]), "cherry")]
+    parts = [Part(merge_meshes([*sides, *boards, box((-0.44, -0.012, 0), (0.44, 0, 1.8))]), "cherry")]
     for z, left, right in ((0.084, -0.42, 0.3), (0.504, -0.3, 0.42), (0.924, -0.42, 0.1), (1.344, -0.1, 0.42)):
         row = panel((left, -0.22, z + 0.33), (right - left, 0, 0), (0, 0, -0.33), fit=True)
         block = box((left, -0.219, z), (right, -0.02, z + 0.3))
@@ -155,9 +165,9 @@ def plant() -> list[Part]:
     for i in range(26):
         length, rise = 0.26 + 0.05 * (i % 4), 0.12 + 0.16 * ((i * 7) % 5) / 4
         blade = leaf(length, 0.11 + 0.012 * (i % 3), rise)
-        leaves.append(blade.turned(2.39996 * i).moved((0, 0, 0.28 + 0.022 * i)))
+        leaves.append(blade.rotate_z(2.39996 * i).translate((0, 0, 0.28 + 0.022 * i)))
     stem = lathe([(0.016, 0.25), (0.01, 0.86)], sectors=10)
-    return [*parts, Part(merged(leaves), "leaf"), Part(stem, "bark")]
+    return [*parts, Part(merge_meshes(leaves), "leaf"), Part(stem, "bark")]
 
 
 def lamp() -> list[Part]:
@@ -172,4 +182,4 @@ def stool() -> list[Part]:
     """A round upholstered stool on four legs."""
     cushion = lathe([(0.20, 0.33), (0.23, 0.36), (0.23, 0.42), (0.20, 0.45), (0.0005, 0.455)], smooth=True)
     legs = [box((x - 0.02, y - 0.02, 0), (x + 0.02, y + 0.02, 0.34)) for x in (-0.13, 0.13) for y in (-0.13, 0.13)]
-    return [Part(cushion, "seat_cloth"), Part(merged(legs), "cherry")]
+    return [Part(cushion, "seat_cloth"), Part(merge_meshes(legs), "cherry")]

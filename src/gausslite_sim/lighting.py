@@ -42,7 +42,7 @@ class Lighting:
 
 
 @runtime_checkable
-class Surroundings(Protocol):
+class RayCaster(Protocol):
     """What light needs to know of the things it falls on."""
 
     def occluded(
@@ -59,43 +59,45 @@ class Surroundings(Protocol):
 
 
 def vertex_light(
-    mesh: Mesh, albedo: Float64[ndarray, "m 3"], around: Surroundings, lighting: Lighting, seed: int
+    mesh: Mesh, albedo: Float64[ndarray, "m 3"], caster: RayCaster, lighting: Lighting, seed: int
 ) -> Float32[ndarray, "n 3"]:
     """Brightness of each vertex, about 1 on a table under a lamp; albedo is each triangle's mean colour, 0 to 1."""
     rng = np.random.default_rng([seed, 3])
     normals = mesh.normals
     origins = (mesh.positions_m + _LIFT_M * normals).astype(np.float32)
-    light = np.repeat(lighting.ambient * _openness(origins, normals, around, rng)[:, None], 3, axis=1)
+    light = np.repeat(lighting.ambient * _openness(origins, normals, caster, rng)[:, None], 3, axis=1)
     for lamp in lighting.lamps:
-        shade = _lamp(origins, normals, np.array(lamp.position_m), around, rng)
+        shade = _lamp(origins, normals, np.array(lamp.position_m), caster, rng)
         light += _LAMP_SHARE * lamp.strength * np.multiply.outer(shade, lamp.colour)
     if lighting.bounce > 0:
-        light += lighting.bounce * _bounced(light, albedo, mesh, _seen(origins, normals, around, rng))
+        light += lighting.bounce * _indirect_light(
+            light, albedo, mesh, _visible_triangles(origins, normals, caster, rng)
+        )
     return np.clip(light, *_BRIGHTNESS).astype(np.float32)
 
 
 def _openness(
-    origins: Float32[ndarray, "n 3"], normals: Float64[ndarray, "n 3"], around: Surroundings, rng: np.random.Generator
+    origins: Float32[ndarray, "n 3"], normals: Float64[ndarray, "n 3"], caster: RayCaster, rng: np.random.Generator
 ) -> Float64[ndarray, " n"]:
     """Share of the half space round the normal, weighted by cosine, that is free for a metre."""
     n = len(origins)
     directions = _cosine_directions(normals, rng)
-    hidden = around.occluded(np.repeat(origins, _SKY_RAYS, axis=0), directions, _SKY_REACH_M)
+    hidden = caster.occluded(np.repeat(origins, _SKY_RAYS, axis=0), directions, _SKY_REACH_M)
     return np.asarray(1.0 - hidden.reshape(n, _SKY_RAYS).mean(axis=1))
 
 
-def _seen(
-    origins: Float32[ndarray, "n 3"], normals: Float64[ndarray, "n 3"], around: Surroundings, rng: np.random.Generator
+def _visible_triangles(
+    origins: Float32[ndarray, "n 3"], normals: Float64[ndarray, "n 3"], caster: RayCaster, rng: np.random.Generator
 ) -> Int64[ndarray, "n k"]:
     """Triangles that each vertex sees in random directions, -1 for none."""
     directions = _cosine_directions(normals, rng)
-    seen: Int64[ndarray, "n k"] = around.first_triangle(np.repeat(origins, _SKY_RAYS, axis=0), directions).reshape(
+    seen: Int64[ndarray, "n k"] = caster.first_triangle(np.repeat(origins, _SKY_RAYS, axis=0), directions).reshape(
         -1, _SKY_RAYS
     )
     return seen
 
 
-def _bounced(
+def _indirect_light(
     light: Float64[ndarray, "n 3"], albedo: Float64[ndarray, "m 3"], mesh: Mesh, seen: Int64[ndarray, "n k"]
 ) -> Float64[ndarray, "n 3"]:
     """What each vertex gets from the surfaces it sees, once and then again."""
@@ -121,7 +123,7 @@ def _lamp(
     origins: Float32[ndarray, "n 3"],
     normals: Float64[ndarray, "n 3"],
     position_m: Float64[ndarray, "3"],
-    around: Surroundings,
+    caster: RayCaster,
     rng: np.random.Generator,
 ) -> Float64[ndarray, " n"]:
     """Lambert's law for a lamp of some size, so that its shadows have soft edges."""
@@ -131,5 +133,5 @@ def _lamp(
     squared = np.square(towards).sum(axis=2)
     cosine = np.clip((towards * normals[:, None, :]).sum(axis=2) / np.sqrt(squared), 0, 1)
     rays = towards.reshape(-1, 3).astype(np.float32)
-    hidden = around.occluded(np.repeat(origins, _LAMP_RAYS, axis=0), rays, 0.98).reshape(n, _LAMP_RAYS)
+    hidden = caster.occluded(np.repeat(origins, _LAMP_RAYS, axis=0), rays, 0.98).reshape(n, _LAMP_RAYS)
     return np.asarray((cosine / (1 + _FALLOFF_PER_M2 * squared) * ~hidden).mean(axis=1))

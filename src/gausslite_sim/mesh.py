@@ -25,30 +25,30 @@ class Mesh:
     normals: Float64[ndarray, "n 3"]
     faces: Int64[ndarray, "m 3"]
 
-    def moved(self, offset_m: Vector) -> Mesh:
+    def translate(self, offset_m: Vector) -> Mesh:
         """Shifted by (x, y, z)."""
         return Mesh(self.positions_m + np.asarray(offset_m, np.float64), self.uv, self.normals, self.faces)
 
-    def turned(self, yaw_rad: float) -> Mesh:
+    def rotate_z(self, yaw_rad: float) -> Mesh:
         """Turned about z."""
         c, s = np.cos(yaw_rad), np.sin(yaw_rad)
         R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
         return Mesh(self.positions_m @ R.T, self.uv, self.normals @ R.T, self.faces)
 
-    def tipped(self, pitch_rad: float) -> Mesh:
+    def rotate_x(self, pitch_rad: float) -> Mesh:
         """Turned about x: a positive angle brings the front (-y) down."""
         c, s = np.cos(pitch_rad), np.sin(pitch_rad)
         R = np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
         return Mesh(self.positions_m @ R.T, self.uv, self.normals @ R.T, self.faces)
 
-    def rolled(self, roll_rad: float) -> Mesh:
+    def rotate_y(self, roll_rad: float) -> Mesh:
         """Turned about y: a positive angle brings the right side (+x) down."""
         c, s = np.cos(roll_rad), np.sin(roll_rad)
         R = np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
         return Mesh(self.positions_m @ R.T, self.uv, self.normals @ R.T, self.faces)
 
 
-def merged(meshes: list[Mesh]) -> Mesh:
+def merge_meshes(meshes: list[Mesh]) -> Mesh:
     """All meshes in one."""
     offsets = np.cumsum([0, *(len(mesh.positions_m) for mesh in meshes[:-1])])
     return Mesh(
@@ -76,7 +76,7 @@ def box(low_m: Vector, high_m: Vector, fit: bool = False, cell_m: float = _CELL_
     x0, y0, z0 = np.asarray(low_m, np.float64)
     x1, y1, z1 = np.asarray(high_m, np.float64)
     dx, dy, dz = x1 - x0, y1 - y0, z1 - z0
-    return merged(
+    return merge_meshes(
         [
             panel((x0, y0, z1), (dx, 0, 0), (0, 0, -dz), fit, cell_m),
             panel((x1, y1, z1), (-dx, 0, 0), (0, 0, -dz), fit, cell_m),
@@ -110,7 +110,7 @@ def lathe(profile_m: list[tuple[float, float]], smooth: bool = False, fit: bool 
     for i in range(len(steps)):
         ends = (points[i + 1], points[i]), (stop[i], start[i]), (along[-1] - along[i + 1], along[-1] - along[i])
         strips.append(_strip(*ends, scale, sectors))
-    return merged(strips)
+    return merge_meshes(strips)
 
 
 def ring(major_m: float, minor_m: float, start_rad: float, stop_rad: float) -> Mesh:

@@ -6,8 +6,8 @@ from typing import Literal
 
 import numpy as np
 
-from gausslite_sim.items import Item, Part, placed
-from gausslite_sim.mesh import box, merged, panel
+from gausslite_sim.mesh import box, merge_meshes, panel
+from gausslite_sim.scene_objects import Item, Part, place_parts
 
 Wall = Literal["south", "north", "west", "east"]
 _THICK_M = 0.06
@@ -24,16 +24,18 @@ class Room:
         self._rng = rng
         self._build()
 
-    def put(self, name: str, parts: list[Part], x: float, y: float, z: float = 0.0, yaw: float = 0.0) -> None:
+    def place(self, name: str, parts: list[Part], x: float, y: float, z: float = 0.0, yaw: float = 0.0) -> None:
         """Stand it at (x, y, z), its front towards -y turned by yaw degrees."""
-        self.items.append(Item(name, placed(parts, (x, y, z), yaw)))
+        self.items.append(Item(name, place_parts(parts, (x, y, z), yaw)))
 
-    def drop(self, name: str, parts: list[Part], x: float, y: float, z: float = 0.0, yaw: float = 0.0) -> None:
+    def place_jittered(
+        self, name: str, parts: list[Part], x: float, y: float, z: float = 0.0, yaw: float = 0.0
+    ) -> None:
         """Stand it about there."""
         dx, dy = self._rng.uniform(-_SHIFT_M, _SHIFT_M, 2)
-        self.put(name, parts, x + dx, y + dy, z, yaw + self._rng.uniform(-_TURN_DEG, _TURN_DEG))
+        self.place(name, parts, x + dx, y + dy, z, yaw + self._rng.uniform(-_TURN_DEG, _TURN_DEG))
 
-    def lean(
+    def place_at_wall(
         self, name: str, parts: list[Part], wall: Wall, along_m: float, z: float = 0.0, off_m: float = 0.0
     ) -> None:
         """Put it with its back to a wall, this far along it; off_m metres before it."""
@@ -43,7 +45,7 @@ class Room:
             "west": (off_m, along_m, 90.0),
             "east": (self.length_m - off_m, along_m, -90.0),
         }[wall]
-        self.put(name, parts, x, y, z, yaw)
+        self.place(name, parts, x, y, z, yaw)
 
     def _build(self) -> None:
         x, y, z, t = self.length_m, self.width_m, self.height_m, _THICK_M
@@ -60,7 +62,7 @@ class Room:
             box((x - 0.012, 0, 0), (x, y, 0.09)),
         ]
         self.items += [
-            Item("walls", [Part(merged(walls), "wall"), Part(merged(boards), "trim")], is_room=True),
+            Item("walls", [Part(merge_meshes(walls), "wall"), Part(merge_meshes(boards), "trim")], is_room=True),
             Item("floor", [Part(box((0, 0, -t), (x, y, 0)), "floor")], is_room=True),
             Item("ceiling", [Part(box((0, 0, z), (x, y, z + t)), "ceiling")], is_room=True),
         ]

@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 
 from gausslite.errors import DatasetError
 from gausslite_sim.atlas import TextureAtlas
+from gausslite_sim.home_plan import HomePlan
 from gausslite_sim.lighting import vertex_light
-from gausslite_sim.mesh import merged
-from gausslite_sim.plan import HomePlan
+from gausslite_sim.mesh import merge_meshes
 from gausslite_sim.textures import SIDE_PX
 
-NOTHING = -1
+NO_HIT = -1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,7 +39,7 @@ class Triangles:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Hits:
-    """Where rays end: triangle (NOTHING if none), its barycentric coordinates, and the lengths along the directions."""
+    """Where rays end: triangle (NO_HIT if none), its barycentric coordinates, and the lengths along the directions."""
 
     triangle: Int64[ndarray, " r"]
     barycentric: Float32[ndarray, "r 2"]
@@ -58,7 +58,7 @@ class HomeScene:
         self.object_names = tuple(item.name for item in items if not item.is_room)
         self.atlas = TextureAtlas(list(textures.values()))
         parts = [(i, part) for i, item in enumerate(items) for part in item.parts]
-        whole = merged([part.mesh for _, part in parts])
+        whole = merge_meshes([part.mesh for _, part in parts])
         counts = [len(part.mesh.faces) for _, part in parts]
         repeats_m = np.repeat([textures[part.texture].repeat_m or 1.0 for _, part in parts], counts)
         corners_m = whole.positions_m[whole.faces]
@@ -87,7 +87,7 @@ class HomeScene:
     def first_triangle(
         self, origins_m: Float32[ndarray, "r 3"], directions: Float32[ndarray, "r 3"]
     ) -> Int64[ndarray, " r"]:
-        """The first triangle along each ray, NOTHING where there is none."""
+        """The first triangle along each ray, NO_HIT where there is none."""
         return np.asarray(self._embree.run(origins_m, directions), np.int64)
 
     def occluded(

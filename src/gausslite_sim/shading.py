@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float32, Int64
 from numpy import ndarray
 
-from gausslite_sim.scene import NOTHING, Hits, HomeScene
+from gausslite_sim.scene import NO_HIT, Hits, HomeScene
 
 _WHITE = 255.0
 _LIFT_M = 3e-3
@@ -25,14 +25,14 @@ def facing_of(scene: HomeScene, hits: Hits, directions: Float32[ndarray, "n 3"])
     return facing
 
 
-def matt_colour(scene: HomeScene, hits: Hits, pixel_m: Float32[ndarray, " n"]) -> Float32[ndarray, "n 3"]:
+def diffuse_colour(scene: HomeScene, hits: Hits, pixel_m: Float32[ndarray, " n"]) -> Float32[ndarray, "n 3"]:
     """Texture times light, 0 to 255, of pixels this wide on the surface; black where nothing is hit."""
     table, triangle = scene.triangles, hits.triangle
     weights = _corner_weights(hits)
     uv = np.einsum("nk,nkc->nc", weights, table.uv[triangle])
     light = np.einsum("nk,nkc->nc", weights, table.light[triangle])
     rgb = scene.atlas.sample(table.texture[triangle], uv, pixel_m * table.texels_per_m[triangle])
-    rgb *= light * (triangle != NOTHING)[:, None]
+    rgb *= light * (triangle != NO_HIT)[:, None]
     return rgb
 
 
@@ -46,7 +46,7 @@ def add_reflections(
 ) -> None:
     """Mix into the glossy hits' colours, in place, what they mirror of the home and its lamps."""
     triangle = hits.triangle
-    glossy = np.flatnonzero((triangle != NOTHING) & (scene.triangles.gloss[triangle] > 0))
+    glossy = np.flatnonzero((triangle != NO_HIT) & (scene.triangles.gloss[triangle] > 0))
     if len(glossy) == 0:
         return
     towards = directions[glossy] / np.linalg.norm(directions[glossy], axis=1, keepdims=True)
@@ -57,7 +57,7 @@ def add_reflections(
     strength = np.float32(mirror) * scene.triangles.gloss[triangle[glossy]]
     share = strength * (_HEAD_ON + (1 - _HEAD_ON) * (1 - np.clip(cosine, 0, 1)) ** 5)
     there = scene.cast(np.ascontiguousarray(points, np.float32), np.ascontiguousarray(mirrored, np.float32))
-    seen = matt_colour(scene, there, np.float32(_BLUR_PER_M) * np.minimum(there.distance, 10.0))
+    seen = diffuse_colour(scene, there, np.float32(_BLUR_PER_M) * np.minimum(there.distance, 10.0))
     rgb[glossy] += share[:, None] * (seen - rgb[glossy])
     rgb[glossy] += strength[:, None] * _highlights(scene, points, mirrored)
 

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from gausslite_sim.mesh import Mesh, Vector, box, lathe, merged
+from gausslite_sim.mesh import Mesh, Vector, box, lathe, merge_meshes
 
 _SQUARENESS = 0.35
 
@@ -29,7 +29,7 @@ def tube(points_m: list[Vector], radius_m: float, sides: int = 7) -> Mesh:
 
 def rods(pairs_m: list[tuple[Vector, Vector]], radius_m: float) -> Mesh:
     """Straight thin bars from point to point."""
-    return merged([tube([a, b], radius_m) for a, b in pairs_m])
+    return merge_meshes([tube([a, b], radius_m) for a, b in pairs_m])
 
 
 def sagging(start_m: Vector, end_m: Vector, sag_m: float, radius_m: float = 0.004) -> Mesh:
@@ -42,7 +42,7 @@ def sagging(start_m: Vector, end_m: Vector, sag_m: float, radius_m: float = 0.00
 
 def pillow(width_m: float, height_m: float, thickness_m: float, fit: bool = True) -> Mesh:
     """A stuffed square in the x-z plane, its lower edge at z = 0, its front towards -y."""
-    return merged([_cheek(width_m, height_m, thickness_m, fit, front) for front in (True, False)])
+    return merge_meshes([_cheek(width_m, height_m, thickness_m, fit, front) for front in (True, False)])
 
 
 def _cheek(width_m: float, height_m: float, thickness_m: float, fit: bool, front: bool) -> Mesh:
@@ -121,7 +121,7 @@ def legs(width_m: float, depth_m: float, height_m: float, thick_m: float = 0.03,
     if splay_m > 0:
         return rods(pairs, thick_m / 2)
     half = thick_m / 2
-    return merged([box((x - half, y - half, 0), (x + half, y + half, height_m)) for (x, y, _), _ in pairs])
+    return merge_meshes([box((x - half, y - half, 0), (x + half, y + half, height_m)) for (x, y, _), _ in pairs])
 
 
 def _sheet(

@@ -22,12 +22,12 @@ from gausslite.domain.pose import UpAxis, unit_up_axis
 from gausslite.domain.region import Region
 from gausslite.errors import DatasetError
 from gausslite_sim.exposure import camera_gain
-from gausslite_sim.family import HOME_COUNT, home_plan
-from gausslite_sim.plan import HomePlan
-from gausslite_sim.regions import InstanceRegion, ItemImages
+from gausslite_sim.home_catalogue import HOME_COUNT, plan_home
+from gausslite_sim.home_plan import HomePlan
+from gausslite_sim.instance_regions import InstanceImageCache, InstanceRegion
 from gausslite_sim.scene import HomeScene, require_ray_caster
 from gausslite_sim.sensor import colour_image, noisy_colour, noisy_depth
-from gausslite_sim.view import View, draw
+from gausslite_sim.view import View, render_view
 
 TRAJECTORY_COUNT = 3
 _RATE_HZ = 30
@@ -111,9 +111,9 @@ _building = threading.Lock()
 @lru_cache(maxsize=2)
 def _built(home: int, seed: int) -> _Place:
     """The home of this number and seed, shared by every source of the process; call it with `_building` held."""
-    plan = home_plan(home, seed)
+    plan = plan_home(home, seed)
     scene = HomeScene(plan)
-    images = ItemImages(scene)
+    images = InstanceImageCache(scene)
     regions = {name: InstanceRegion(name, scene.names.index(name), images) for name in scene.object_names}
     return _Place(plan, scene, regions)
 
@@ -156,7 +156,7 @@ class SimulatedHome:
         return True
 
     @property
-    def left_out(self) -> str:
+    def excluded_frames(self) -> str:
         """Nothing."""
         return ""
 
@@ -167,7 +167,7 @@ class SimulatedHome:
         """The frame at position i. Raises DatasetError."""
         require_position(self.name, i, len(self))
         settings, place, T_world_camera = self._settings, self._place, self._poses[i]
-        view = self._exposed(draw(place.scene, self._camera, T_world_camera, settings.gloss), i)
+        view = self._exposed(render_view(place.scene, self._camera, T_world_camera, settings.gloss), i)
         if settings.noise > 0:
             rng = np.random.default_rng([settings.seed, settings.trajectory, i])
             noise = place.plan.sensor.switched(settings.holes, settings.flying)
@@ -193,7 +193,7 @@ class SimulatedHome:
 
     @cached_property
     def _poses(self) -> Float64[ndarray, "n 4 4"]:
-        return self._place.plan.walks[self._settings.trajectory](self._settings.frames)
+        return self._place.plan.trajectories[self._settings.trajectory](self._settings.frames)
 
     def _exposed(self, view: View, i: int) -> View:
         """The view as a camera takes it whose exposure follows the light."""

@@ -26,7 +26,7 @@ class Texture:
     repeat_m: float | None = None
     gloss: float = 0.0
 
-    def polished(self, gloss: float) -> Texture:
+    def with_gloss(self, gloss: float) -> Texture:
         """The same picture on a surface that mirrors this share."""
         return Texture(self.rgb, self.repeat_m, gloss)
 
@@ -48,7 +48,7 @@ def grain(rng: np.random.Generator) -> Shade:
     return np.asarray(sum(weight * noise(rng, cells, cells) for cells, weight in layers))
 
 
-def tinted(shade: Shade, colour: Colour) -> UInt8[ndarray, "s s 3"]:
+def tint(shade: Shade, colour: Colour) -> UInt8[ndarray, "s s 3"]:
     """A colour (components 0 to 1), lighter and darker by the shade (1 leaves it as it is)."""
     bright = np.multiply.outer(shade * 255.0, np.asarray(colour)) + 0.5
     return np.asarray(np.minimum(bright, 255.0), np.uint8)
@@ -56,7 +56,7 @@ def tinted(shade: Shade, colour: Colour) -> UInt8[ndarray, "s s 3"]:
 
 def wood(rng: np.random.Generator, colour: Colour, repeat_m: float = 0.9) -> Texture:
     """Boards seen along the grain, which runs to the right."""
-    return Texture(tinted(_wood_shade(rng), colour), repeat_m)
+    return Texture(tint(_wood_shade(rng), colour), repeat_m)
 
 
 def planks(rng: np.random.Generator, colour: Colour) -> Texture:
@@ -70,7 +70,7 @@ def planks(rng: np.random.Generator, colour: Colour) -> Texture:
         shade[row * row_px : row * row_px + 2] *= 0.45
         for x in (joint, joint + SIDE_PX // 2):
             shade[rows, x % SIDE_PX] *= 0.45
-    return Texture(tinted(shade, colour), 1.28)
+    return Texture(tint(shade, colour), 1.28)
 
 
 def checker_tiles(rng: np.random.Generator, light: Colour, dark: Colour) -> Texture:
@@ -80,7 +80,7 @@ def checker_tiles(rng: np.random.Generator, light: Colour, dark: Colour) -> Text
     even = (row[:, None] + column[None, :]) % 2 == 0
     veins = 1.0 - 0.5 * np.exp(-(((noise(rng, 8, 8) + 0.25 * noise(rng, 32, 32) - 0.6) / 0.02) ** 2))
     shade = (0.72 + 0.5 * grain(rng)) * veins
-    rgb = np.where(even[..., None], tinted(shade, light), tinted(shade, dark))
+    rgb = np.where(even[..., None], tint(shade, light), tint(shade, dark))
     edge = np.arange(SIDE_PX) % cell < 4
     rgb[edge[:, None] | edge[None, :]] = (120, 112, 104)
     return Texture(rgb, 1.2)
@@ -88,14 +88,14 @@ def checker_tiles(rng: np.random.Generator, light: Colour, dark: Colour) -> Text
 
 def plaster(rng: np.random.Generator, colour: Colour) -> Texture:
     """Rough paint."""
-    return Texture(tinted(0.8 + 0.4 * grain(rng), colour), 1.0)
+    return Texture(tint(0.8 + 0.4 * grain(rng), colour), 1.0)
 
 
 def wallpaper(rng: np.random.Generator, ground: Colour, motif: Colour) -> Texture:
     """Offset rows of a leaf motif on fine stripes."""
     y, x = np.mgrid[0:SIDE_PX, 0:SIDE_PX]
     shade = 0.88 + 0.16 * grain(rng) + 0.05 * np.sin(2 * np.pi * x / 16)
-    rgb = tinted(shade, ground)
+    rgb = tint(shade, ground)
     mask = np.zeros((SIDE_PX, SIDE_PX), np.uint8)
     pitch = 128
     for row in range(-1, 5):
@@ -109,7 +109,7 @@ def wallpaper(rng: np.random.Generator, ground: Colour, motif: Colour) -> Textur
                 cv2.ellipse(mask, tip, (9, 26), turn, 0, 360, 255, -1, cv2.LINE_AA)
             cv2.line(mask, centre, (centre[0], centre[1] + 34), 255, 4, cv2.LINE_AA)
     alpha = (mask / 255.0)[..., None]
-    veins = tinted(shade * (0.9 + 0.2 * (y % 6 < 2)), motif)
+    veins = tint(shade * (0.9 + 0.2 * (y % 6 < 2)), motif)
     return Texture((alpha * veins + (1 - alpha) * rgb).astype(np.uint8), 0.8)
 
 
@@ -119,7 +119,7 @@ def cloth(rng: np.random.Generator, colour: Colour, repeat_m: float = 0.5) -> Te
     slant = np.where((x // 64) % 2 == 0, x + y, x - y)
     weave = 0.5 + 0.5 * np.sin(2 * np.pi * slant / 16)
     shade = 0.55 + 0.3 * weave + 0.4 * (grain(rng) - 0.2)
-    return Texture(tinted(shade, colour), repeat_m)
+    return Texture(tint(shade, colour), repeat_m)
 
 
 def plaid(rng: np.random.Generator, ground: Colour, stripe: Colour, line: Colour) -> Texture:
@@ -136,12 +136,12 @@ def plaid(rng: np.random.Generator, ground: Colour, stripe: Colour, line: Colour
 
 def brushed(rng: np.random.Generator, colour: Colour) -> Texture:
     """Metal or glazed clay with fine scratches along u."""
-    return Texture(tinted(0.78 + 0.22 * noise(rng, 512, 8) + 0.14 * noise(rng, 16, 16), colour), 0.4)
+    return Texture(tint(0.78 + 0.22 * noise(rng, 512, 8) + 0.14 * noise(rng, 16, 16), colour), 0.4)
 
 
 def mottled(rng: np.random.Generator, colour: Colour, strength: float = 0.3) -> Texture:
     """Clay, ceramic, fruit: spots of many sizes."""
-    return Texture(tinted(1.0 - 0.5 * strength + strength * grain(rng) * 1.2, colour), 0.3)
+    return Texture(tint(1.0 - 0.5 * strength + strength * grain(rng) * 1.2, colour), 0.3)
 
 
 def _wood_shade(rng: np.random.Generator) -> Shade:

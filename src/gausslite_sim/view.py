@@ -9,8 +9,8 @@ from jaxtyping import Bool, Float32, Float64, Int64
 from numpy import ndarray
 
 from gausslite.domain.camera import Camera
-from gausslite_sim.scene import NOTHING, Hits, HomeScene
-from gausslite_sim.shading import add_reflections, facing_of, matt_colour
+from gausslite_sim.scene import NO_HIT, Hits, HomeScene
+from gausslite_sim.shading import add_reflections, diffuse_colour, facing_of
 
 _SUBSAMPLES = np.array([(-0.125, -0.375), (0.375, -0.125), (0.125, 0.375), (-0.375, 0.125)], np.float32)
 """Offsets from a pixel's centre, in pixels, of the rays that smooth an edge."""
@@ -22,7 +22,7 @@ _CREASE = 0.1
 
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
-    """What a perfect camera sees. item indexes HomeScene.names (NOTHING outside); facing is |cos| of the incidence;
+    """What a perfect camera sees. item indexes HomeScene.names (NO_HIT outside); facing is |cos| of the incidence;
     gloss is the share that the surface mirrors.
     """
 
@@ -33,7 +33,7 @@ class View:
     gloss: Float32[ndarray, "h w"]
 
 
-def draw(scene: HomeScene, camera: Camera, T_world_camera: Float64[ndarray, "4 4"], mirror: float = 1.0) -> View:
+def render_view(scene: HomeScene, camera: Camera, T_world_camera: Float64[ndarray, "4 4"], mirror: float = 1.0) -> View:
     """Render one view; colours 0 to 255. Depth is that of the ray through the pixel's centre.
 
     mirror scales what glossy surfaces mirror; 0 makes all of them matt.
@@ -44,7 +44,7 @@ def draw(scene: HomeScene, camera: Camera, T_world_camera: Float64[ndarray, "4 4
     hits = _cast_from(scene, directions, T_world_camera)
     depth_m = _depth(hits)
     rgb, facing = _shade(scene, hits, directions, camera, T_world_camera, mirror)
-    item = np.where(hits.triangle == NOTHING, NOTHING, scene.triangles.item[hits.triangle])
+    item = np.where(hits.triangle == NO_HIT, NO_HIT, scene.triangles.item[hits.triangle])
     texture = scene.triangles.texture[hits.triangle]
     edge = np.flatnonzero(_edges(*(image.reshape(shape) for image in (item, texture, depth_m, facing))))
     if len(edge):
@@ -53,15 +53,17 @@ def draw(scene: HomeScene, camera: Camera, T_world_camera: Float64[ndarray, "4 4
         fine = _directions(fine_columns, fine_rows, camera, T_world_camera)
         fine_rgb, _ = _shade(scene, _cast_from(scene, fine, T_world_camera), fine, camera, T_world_camera, mirror)
         rgb[edge] = fine_rgb.reshape(-1, len(_SUBSAMPLES), 3).mean(axis=1)
-    gloss = mirror * np.where(hits.triangle == NOTHING, np.float32(0), scene.triangles.gloss[hits.triangle])
+    gloss = mirror * np.where(hits.triangle == NO_HIT, np.float32(0), scene.triangles.gloss[hits.triangle])
     return View(rgb.reshape(*shape, 3), *(image.reshape(shape) for image in (depth_m, item, facing, gloss)))
 
 
-def items_seen(scene: HomeScene, camera: Camera, T_world_camera: Float64[ndarray, "4 4"]) -> Int64[ndarray, "h w"]:
+def render_instances(
+    scene: HomeScene, camera: Camera, T_world_camera: Float64[ndarray, "4 4"]
+) -> Int64[ndarray, "h w"]:
     """The item in each pixel, exactly."""
     directions = _directions(*_pixel_centres(camera), camera, T_world_camera)
     triangle = _cast_from(scene, directions, T_world_camera).triangle
-    item: Int64[ndarray, " n"] = np.where(triangle == NOTHING, NOTHING, scene.triangles.item[triangle])
+    item: Int64[ndarray, " n"] = np.where(triangle == NO_HIT, NO_HIT, scene.triangles.item[triangle])
     return item.reshape(camera.height_px, camera.width_px)
 
 
@@ -91,7 +93,7 @@ def _cast_from(scene: HomeScene, directions: Float32[ndarray, "n 3"], T_world_ca
 
 
 def _depth(hits: Hits) -> Float32[ndarray, " n"]:
-    depth_m: Float32[ndarray, " n"] = np.where(hits.triangle == NOTHING, np.float32(0), hits.distance)
+    depth_m: Float32[ndarray, " n"] = np.where(hits.triangle == NO_HIT, np.float32(0), hits.distance)
     return depth_m
 
 
@@ -107,7 +109,7 @@ def _shade(
     facing = facing_of(scene, hits, directions)
     # between the footprint across the slope and the one along it
     pixel_m = hits.distance / np.float32(camera.fx_px) / np.sqrt(np.maximum(facing, 0.05))
-    rgb = matt_colour(scene, hits, pixel_m)
+    rgb = diffuse_colour(scene, hits, pixel_m)
     if mirror > 0:
         add_reflections(scene, rgb, hits, directions, T_world_camera[:3, 3].astype(np.float32), mirror)
     return rgb, facing

@@ -29,7 +29,7 @@ from gausslite_bench.quality.study import FinishedTrial, Study, run_study
 from gausslite_bench.quality.tables import FULL_METRICS, ROI_METRICS, StudyResults, ablation_table, quality_table
 from gausslite_bench.quality.trial_cache import TrialCache
 from gausslite_bench.quality.trials import BudgetMode, Conditions, Trial, TrialBudget, Variant, clock_for
-from gausslite_sim.family import HOME_COUNT, HOMES
+from gausslite_sim.home_catalogue import HOME_COUNT, HOMES
 
 
 def test_each_home_has_one_task_of_each_kind() -> None:
@@ -75,9 +75,9 @@ def test_a_real_sequences_kinds_are_chosen_by_name() -> None:
 
 def test_components_come_one_by_one() -> None:
     variants = cumulative_variants()
-    labels = [variant.label for variant in variants]
+    label_textures = [variant.label for variant in variants]
     beyond = ["+long-term-keyframes", "+roi-context", "+background-reserve", "+ema", "+lr-decay"]
-    assert labels == ["none", "+SB", "+MVO", "+ROI", "+SIS", "+GFD", *beyond]
+    assert label_textures == ["none", "+SB", "+MVO", "+ROI", "+SIS", "+GFD", *beyond]
     off = [variant.disabled for variant in variants]
     assert all(len(a - b) == 1 and b < a for a, b in pairwise(off))
     assert not off[-1]

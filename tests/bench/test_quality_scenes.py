@@ -114,7 +114,7 @@ def test_a_kind_that_no_held_out_view_shows_is_skipped_with_a_message(
     kitchen, roi = write_kitchen(tmp_path, mug_1=WALL, lamp_1=[(500, 500, 500)])
     assert bench_quality(kitchen, roi, tmp_path / "out") == 0
     output = capsys.readouterr()
-    reason = "kitchen-lamp: expected held-out views that show at least 64 pixels of lamp_1 at 16x16, got none of 1"
+    reason = "kitchen-lamp: expected held-out views that show at least 64 pixels of lamp_1 at 24x18, got none of 1"
     assert f"skipped: {reason}" in output.err
     assert re.search(r"\| kitchen-mug \| Find the mug \| [\d.]+% in 1 of 1 views \|", output.out)
     assert "kitchen-lamp" not in output.out
@@ -149,7 +149,7 @@ def test_a_map_of_regions_that_no_frame_shows_has_a_message(tmp_path: Path, caps
     )
     assert capsys.readouterr().out.startswith("no view shows 64 pixels of the region; full PSNR ")
     assert main(["eval", str(tmp_path / "mug_1" / "map.ply"), str(kitchen)]) == 0
-    assert capsys.readouterr().out.startswith("no region was options for; full PSNR ")
+    assert capsys.readouterr().out.startswith("no region selected; full PSNR ")
 
 
 def test_a_rates_cost_is_not_measured_where_no_view_shows_the_region(

@@ -10,10 +10,10 @@ from gausslite.datasets.source import Source
 from gausslite.domain.pose import require_rigid
 from gausslite.errors import DatasetError
 from gausslite_sim.exposure import camera_gain
-from gausslite_sim.family import HOME_COUNT, HOMES
+from gausslite_sim.home_catalogue import HOME_COUNT, HOMES
 from gausslite_sim.homes import workshop
 from gausslite_sim.materials import paint
-from gausslite_sim.walks import walk_through
+from gausslite_sim.trajectory import spline_trajectory
 
 
 @pytest.fixture(scope="module", params=range(1, HOME_COUNT + 1))
@@ -45,7 +45,7 @@ def test_everything_stands_inside_the_room(furnished: tuple) -> None:
 def test_held_out_views_lie_off_the_walks(furnished: tuple) -> None:
     home, items = furnished
     walls = next(item for item in items if item.name == "walls").parts[0].mesh.positions_m
-    *training, held_out = (walk_through(keys)(40) for keys in home.walks)
+    *training, held_out = (spline_trajectory(keys)(40) for keys in home.trajectories)
     for T in (*np.concatenate(training), *held_out):
         require_rigid("pose", T)
         assert (T[:2, 3] > 0.25).all()

@@ -15,11 +15,11 @@ from gausslite.domain.frame import Frame
 from gausslite.domain.pose import require_rigid, transform_points
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.errors import DatasetError
-from gausslite_sim.family import home_plan
-from gausslite_sim.layout import TABLE_CENTRE_M, furnish
+from gausslite_sim.home_catalogue import plan_home
 from gausslite_sim.scene import HomeScene
 from gausslite_sim.source import TRAJECTORY_COUNT
-from gausslite_sim.trajectories import WALKS
+from gausslite_sim.two_room_layout import TABLE_CENTRE_M, furnish
+from gausslite_sim.two_room_trajectories import TRAJECTORIES
 
 
 def home(trajectory: int = 0, frames: int = 12, size: str = "80x60", noise: str = "1") -> Source:
@@ -70,7 +70,7 @@ def test_the_source_says_what_it_is() -> None:
 
 @pytest.mark.parametrize("trajectory", range(TRAJECTORY_COUNT))
 def test_poses_are_rigid_level_and_inside_the_rooms(trajectory: int) -> None:
-    for T in WALKS[trajectory](60):
+    for T in TRAJECTORIES[trajectory](60):
         require_rigid("pose", T)
         assert abs(T[2, 0]) < 1e-9
         assert 0.3 < T[0, 3] < 7.8
@@ -85,7 +85,7 @@ def test_no_camera_is_inside_anything(trajectory: int) -> None:
 
 def test_walks_are_smooth_enough_to_follow() -> None:
     for trajectory in (0, 1):
-        walk = WALKS[trajectory](120)
+        walk = TRAJECTORIES[trajectory](120)
         steps = np.linalg.norm(np.diff(walk[:, :3, 3], axis=0), axis=1)
         turns = np.degrees(np.arccos(np.clip((walk[:-1, :3, 2] * walk[1:, :3, 2]).sum(axis=1), -1, 1)))
         assert steps.max() < 0.20
@@ -99,8 +99,8 @@ def test_agents_overlap_in_part() -> None:
 
 
 def test_held_out_views_lie_off_both_walks_and_see_the_same_things() -> None:
-    walked = np.concatenate([WALKS[0](120), WALKS[1](120)])[:, :3, 3]
-    held_out = WALKS[2](20)[:, :3, 3]
+    walked = np.concatenate([TRAJECTORIES[0](120), TRAJECTORIES[1](120)])[:, :3, 3]
+    held_out = TRAJECTORIES[2](20)[:, :3, 3]
     distances = np.linalg.norm(held_out[:, None] - walked[None], axis=2).min(axis=1)
     assert distances.min() > 0.25
     seen = voxels_seen(home(0, 20)) | voxels_seen(home(1, 20))
@@ -205,4 +205,4 @@ def test_a_wrong_spec_is_named(spec: str, message: str) -> None:
 def test_a_missing_ray_caster_says_how_to_install_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "embreex.mesh_construction", None)
     with pytest.raises(DatasetError, match=r"pip install 'gausslite\[sim\]'"):
-        HomeScene(home_plan(0, seed=5))
+        HomeScene(plan_home(0, seed=5))

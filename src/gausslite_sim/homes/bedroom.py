@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from gausslite_sim import fabrics, furniture, textures
-from gausslite_sim import things_devices as devices
-from gausslite_sim import things_seating as seating
-from gausslite_sim import things_small as small
-from gausslite_sim.items import Item, Part
+from gausslite_sim import device_objects as devices
+from gausslite_sim import fabric_textures, furniture, textures
+from gausslite_sim import seating_objects as seating
+from gausslite_sim import small_objects as small
 from gausslite_sim.lighting import Lamp, Lighting
-from gausslite_sim.materials import Painter, Palette, common
+from gausslite_sim.materials import Painter, Palette, common_painters
 from gausslite_sim.room import Room
+from gausslite_sim.scene_objects import Item, Part
 from gausslite_sim.shapes import draped, hanging
 
 LIGHTING = Lighting(
@@ -23,7 +23,7 @@ LIGHTING = Lighting(
     ambient=0.24,
     bounce=0.8,
 )
-WALKS = (
+TRAJECTORIES = (
     (
         ((3.3, 1.0, 1.50), (1.0, 3.3, 0.5)),
         ((3.6, 1.7, 1.45), (0.9, 3.2, 0.6)),
@@ -62,45 +62,47 @@ def furnish(rng: np.random.Generator) -> list[Item]:
     """Everything in the room, 4.6 x 4.2 m."""
     room = Room(4.6, 4.2, 2.5, rng)
     pillows = ("linen", "linen", "flowers", "accent_knit")
-    room.put("bed", seating.bed(1.5, "light_wood", "stripes", pillows, "knit"), 1.25, 3.1)
+    room.place("bed", seating.bed(1.5, "light_wood", "stripes", pillows, "knit"), 1.25, 3.1)
     for i, x in enumerate((0.25, 2.3), 1):
-        room.lean(
+        room.place_at_wall(
             f"nightstand_{i}",
             furniture.cupboard((0.42, 0.38, 0.46), "drawers", "light_wood", 1, "light_wood"),
             "north",
             x,
         )
-    room.put("lamp", devices.desk_lamp("accent_glaze"), 0.18, 4.02, 0.495, -30)
-    room.drop("alarm_clock", small.desk_clock("clock_face"), 0.34, 3.9, 0.495, 8)
-    room.drop("glasses_case", furniture.carton("leather", 0.16, 0.06, 0.04), 0.25, 3.82, 0.495, 30)
-    room.drop("books", furniture.books(), 2.26, 3.97, 0.495, 20)
-    room.drop("mug", small.cup("mug_dots"), 2.42, 3.88, 0.495, 140)
-    room.drop("phone", devices.phone("phone_screen"), 2.28, 3.82, 0.495, 70)
-    room.put("rug", furniture.lying_sheet("other_rug", 1.5, 2.0, 0.012), 2.9, 2.4)
-    room.drop("shoe_1", small.shoes("sneaker"), 2.3, 2.55, 0.012, 65)
-    room.drop("shoe_2", small.shoes("boot", "rubber"), 4.2, 0.5, 0, 30)
-    room.lean("wardrobe", furniture.cupboard((1.5, 0.6, 2.05), "doors", "light_wood", 2), "south", 2.3)
-    room.put("box_1", furniture.carton("carton", 0.5, 0.4, 0.28), 2.0, 0.32, 2.05, 5)
-    room.put("suitcase", furniture.carton("leather", 0.7, 0.45, 0.24), 2.65, 0.33, 2.05, -4)
-    room.lean("dresser", furniture.cupboard((1.1, 0.42, 0.8), "drawers", "dark_wood", 2, "dark_wood"), "east", 1.55)
-    room.lean("mirror", furniture.flat_picture("black_glass", 0.6, 0.8, 0.03), "east", 1.55, 1.0)
-    room.put("vase", small.round_vase("vase_print"), 4.38, 1.2, 0.835)
-    room.put("jewel_box", furniture.carton("weave", 0.2, 0.14, 0.1), 4.38, 1.6, 0.835, -80)
-    room.put("bottle_1", small.bottle("bottle_label", "green_glass", 0.2), 4.35, 1.85, 0.835)
-    room.put("bottle_2", small.bottle("jar_label", "brown_glass", 0.15), 4.4, 1.95, 0.835, 40)
-    room.drop("stool", furniture.stool(), 3.75, 1.55)
-    room.drop("basket", small.basket("dark_weave", "stripes", 0.24, 0.34), 4.25, 2.45)
-    room.lean("window", furniture.flat_picture("window", 1.2, 1.2, 0.05), "east", 3.2, 0.95)
+    room.place("lamp", devices.desk_lamp("accent_glaze"), 0.18, 4.02, 0.495, -30)
+    room.place_jittered("alarm_clock", small.desk_clock("clock_face"), 0.34, 3.9, 0.495, 8)
+    room.place_jittered("glasses_case", furniture.carton("leather", 0.16, 0.06, 0.04), 0.25, 3.82, 0.495, 30)
+    room.place_jittered("books", furniture.books(), 2.26, 3.97, 0.495, 20)
+    room.place_jittered("mug", small.cup("mug_dots"), 2.42, 3.88, 0.495, 140)
+    room.place_jittered("phone", devices.phone("phone_screen"), 2.28, 3.82, 0.495, 70)
+    room.place("rug", furniture.lying_sheet("other_rug", 1.5, 2.0, 0.012), 2.9, 2.4)
+    room.place_jittered("shoe_1", small.shoes("sneaker"), 2.3, 2.55, 0.012, 65)
+    room.place_jittered("shoe_2", small.shoes("boot", "rubber"), 4.2, 0.5, 0, 30)
+    room.place_at_wall("wardrobe", furniture.cupboard((1.5, 0.6, 2.05), "doors", "light_wood", 2), "south", 2.3)
+    room.place("box_1", furniture.carton("carton", 0.5, 0.4, 0.28), 2.0, 0.32, 2.05, 5)
+    room.place("suitcase", furniture.carton("leather", 0.7, 0.45, 0.24), 2.65, 0.33, 2.05, -4)
+    room.place_at_wall(
+        "dresser", furniture.cupboard((1.1, 0.42, 0.8), "drawers", "dark_wood", 2, "dark_wood"), "east", 1.55
+    )
+    room.place_at_wall("mirror", furniture.flat_picture("black_glass", 0.6, 0.8, 0.03), "east", 1.55, 1.0)
+    room.place("vase", small.round_vase("vase_print"), 4.38, 1.2, 0.835)
+    room.place("jewel_box", furniture.carton("weave", 0.2, 0.14, 0.1), 4.38, 1.6, 0.835, -80)
+    room.place("bottle_1", small.bottle("bottle_label", "green_glass", 0.2), 4.35, 1.85, 0.835)
+    room.place("bottle_2", small.bottle("jar_label", "brown_glass", 0.15), 4.4, 1.95, 0.835, 40)
+    room.place_jittered("stool", furniture.stool(), 3.75, 1.55)
+    room.place_jittered("basket", small.basket("dark_weave", "stripes", 0.24, 0.34), 4.25, 2.45)
+    room.place_at_wall("window", furniture.flat_picture("window", 1.2, 1.2, 0.05), "east", 3.2, 0.95)
     for i, y in enumerate((2.55, 3.85), 1):
-        room.lean(f"curtain_{i}", [Part(hanging(0.45, 2.2, 5), "main_cloth")], "east", y, 0.1, 0.12)
-    room.put("plant", small.fern("terracotta", "leaf", 1.6), 4.05, 3.7)
-    room.lean("picture_1", furniture.flat_picture("landscape", 1.0, 0.7), "north", 1.25, 1.3)
-    room.lean("picture_2", furniture.flat_picture("photo", 0.26, 0.32), "west", 2.9, 1.45)
-    room.lean("picture_3", furniture.flat_picture("photo", 0.26, 0.32), "west", 2.5, 1.5)
-    room.lean("door", furniture.flat_picture("door", 0.86, 2.03), "south", 0.75)
-    room.lean("poster", furniture.flat_picture("poster", 0.5, 0.7, 0.01), "south", 3.75, 1.2)
-    room.put("blanket", [Part(draped(0.4, 0.4, 0.1), "plaid")], 3.75, 1.55, 0.47, 20)
-    room.lean("laundry", small.basket("weave", "second_cloth", 0.2, 0.45), "west", 1.2, 0, 0.3)
+        room.place_at_wall(f"curtain_{i}", [Part(hanging(0.45, 2.2, 5), "main_cloth")], "east", y, 0.1, 0.12)
+    room.place("plant", small.fern("terracotta", "leaf", 1.6), 4.05, 3.7)
+    room.place_at_wall("picture_1", furniture.flat_picture("landscape", 1.0, 0.7), "north", 1.25, 1.3)
+    room.place_at_wall("picture_2", furniture.flat_picture("photo", 0.26, 0.32), "west", 2.9, 1.45)
+    room.place_at_wall("picture_3", furniture.flat_picture("photo", 0.26, 0.32), "west", 2.5, 1.5)
+    room.place_at_wall("door", furniture.flat_picture("door", 0.86, 2.03), "south", 0.75)
+    room.place_at_wall("poster", furniture.flat_picture("poster", 0.5, 0.7, 0.01), "south", 3.75, 1.2)
+    room.place("blanket", [Part(draped(0.4, 0.4, 0.1), "plaid")], 3.75, 1.55, 0.47, 20)
+    room.place_at_wall("laundry", small.basket("weave", "second_cloth", 0.2, 0.45), "west", 1.2, 0, 0.3)
     return room.items
 
 
@@ -113,7 +115,7 @@ def painters() -> dict[str, Painter]:
         accent=(0.72, 0.40, 0.40),
         other=(0.34, 0.44, 0.58),
     )
-    return common(colours) | {
+    return common_painters(colours) | {
         "wall": lambda rng: textures.wallpaper(rng, (0.80, 0.83, 0.78), (0.60, 0.68, 0.60)),
-        "floor": lambda rng: fabrics.carpet(rng, (0.70, 0.64, 0.55), (0.5, 0.44, 0.36)),
+        "floor": lambda rng: fabric_textures.carpet(rng, (0.70, 0.64, 0.55), (0.5, 0.44, 0.36)),
     }

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from gausslite_sim import fabrics, furniture, textures
-from gausslite_sim import things_devices as devices
-from gausslite_sim import things_seating as seating
-from gausslite_sim import things_small as small
-from gausslite_sim import things_tables as tables
-from gausslite_sim.items import Item, Part
+from gausslite_sim import device_objects as devices
+from gausslite_sim import fabric_textures, furniture, textures
+from gausslite_sim import seating_objects as seating
+from gausslite_sim import small_objects as small
+from gausslite_sim import table_objects as tables
 from gausslite_sim.lighting import Lamp, Lighting
-from gausslite_sim.materials import Painter, Palette, common
+from gausslite_sim.materials import Painter, Palette, common_painters
 from gausslite_sim.room import Room
+from gausslite_sim.scene_objects import Item, Part
 from gausslite_sim.shapes import draped, hanging
 
 LIGHTING = Lighting(
@@ -24,7 +24,7 @@ LIGHTING = Lighting(
     ambient=0.2,
     bounce=0.9,
 )
-WALKS = (
+TRAJECTORIES = (
     (
         ((3.6, 1.0, 1.50), (1.7, 2.6, 0.45)),
         ((3.9, 1.9, 1.45), (1.9, 2.6, 0.45)),
@@ -62,46 +62,48 @@ WALKS = (
 def furnish(rng: np.random.Generator) -> list[Item]:
     """Everything in the room, 5.2 x 4.4 m."""
     room = Room(5.2, 4.4, 2.6, rng)
-    room.put("rug", furniture.lying_sheet("rug", 2.6, 1.9, 0.01), 2.2, 2.5, 0, 4)
-    room.put("sofa_1", seating.couch(2.0, "main_cloth", ("zigzag", "accent_knit", "flowers", "stripes"), 3), 1.75, 3.88)
-    room.put("sofa_2", seating.couch(1.3, "leather", ("plaid", "knit"), 2), 0.5, 2.3, 0, 90)
-    room.drop("tea_table", tables.plain_table(1.0, 0.6, 0.42, "marble", "brass", 0.02), 1.85, 2.6, 0, 0)
-    room.drop("teapot", small.teapot("other_glaze"), 1.72, 2.62, 0.42, 150)
-    room.drop("mug_1", small.cup("mug_print"), 2.02, 2.45, 0.42, 300)
-    room.drop("mug_2", small.cup("mug_dots"), 1.55, 2.45, 0.42, 30)
-    room.drop("magazine", small.sheaf("magazine"), 2.15, 2.72, 0.42, 20)
-    room.drop("book", small.sheaf("book_cover", 0.14, 0.2, 0.03), 1.92, 2.8, 0.42, -25)
-    room.drop("candles", small.candles(), 1.45, 2.72, 0.42)
-    room.drop("armchair", seating.armchair("second_cloth", "gingham"), 3.35, 3.45, 0, -20)
-    room.put("lamp_1", devices.floor_lamp("shade_cloth"), 0.4, 3.9)
-    room.put("lamp_2", devices.pendant("dark_weave", 0.6), 1.85, 2.6, 2.6)
-    room.put("plant_1", small.little_tree("terracotta", "leaf"), 4.75, 3.85)
-    room.put("plant_2", small.snake_plant("stone_pot", "striped_leaf"), 4.25, 4.05)
-    room.put("plant_3", small.fern("accent_glaze", "leaf", 1.5), 4.55, 3.3)
-    room.put("plant_4", small.fern("other_glaze", "leaf", 1.2), 2.2, 0.22, 1.07)
-    room.lean("window", furniture.flat_picture("window", 1.9, 1.5, 0.05), "east", 2.1, 0.75)
-    room.lean("bench", seating.bench(1.7, "light_wood", "stripes"), "east", 2.1, 0, 0.25)
+    room.place("rug", furniture.lying_sheet("rug", 2.6, 1.9, 0.01), 2.2, 2.5, 0, 4)
+    room.place(
+        "sofa_1", seating.couch(2.0, "main_cloth", ("zigzag", "accent_knit", "flowers", "stripes"), 3), 1.75, 3.88
+    )
+    room.place("sofa_2", seating.couch(1.3, "leather", ("plaid", "knit"), 2), 0.5, 2.3, 0, 90)
+    room.place_jittered("tea_table", tables.plain_table(1.0, 0.6, 0.42, "marble", "brass", 0.02), 1.85, 2.6, 0, 0)
+    room.place_jittered("teapot", small.teapot("other_glaze"), 1.72, 2.62, 0.42, 150)
+    room.place_jittered("mug_1", small.cup("mug_print"), 2.02, 2.45, 0.42, 300)
+    room.place_jittered("mug_2", small.cup("mug_dots"), 1.55, 2.45, 0.42, 30)
+    room.place_jittered("magazine", small.sheaf("magazine"), 2.15, 2.72, 0.42, 20)
+    room.place_jittered("book", small.sheaf("book_cover", 0.14, 0.2, 0.03), 1.92, 2.8, 0.42, -25)
+    room.place_jittered("candles", small.candles(), 1.45, 2.72, 0.42)
+    room.place_jittered("armchair", seating.armchair("second_cloth", "gingham"), 3.35, 3.45, 0, -20)
+    room.place("lamp_1", devices.floor_lamp("shade_cloth"), 0.4, 3.9)
+    room.place("lamp_2", devices.pendant("dark_weave", 0.6), 1.85, 2.6, 2.6)
+    room.place("plant_1", small.little_tree("terracotta", "leaf"), 4.75, 3.85)
+    room.place("plant_2", small.snake_plant("stone_pot", "striped_leaf"), 4.25, 4.05)
+    room.place("plant_3", small.fern("accent_glaze", "leaf", 1.5), 4.55, 3.3)
+    room.place("plant_4", small.fern("other_glaze", "leaf", 1.2), 2.2, 0.22, 1.07)
+    room.place_at_wall("window", furniture.flat_picture("window", 1.9, 1.5, 0.05), "east", 2.1, 0.75)
+    room.place_at_wall("bench", seating.bench(1.7, "light_wood", "stripes"), "east", 2.1, 0, 0.25)
     for i, y in enumerate((0.9, 3.3), 1):
-        room.lean(f"curtain_{i}", [Part(hanging(0.45, 2.2, 5), "linen")], "east", y, 0.1, 0.1)
-    room.lean("shelf", tables.open_shelf(1.3, 1.05, "dark_wood", rng, 3, 0.34), "south", 2.4)
-    room.put("record_player", furniture.carton("dark_wood", 0.42, 0.32, 0.12), 2.75, 0.2, 1.07, 180)
-    room.put("speaker_1", devices.speaker("light_wood"), 1.55, 0.2, 0, 180)
-    room.put("speaker_2", devices.speaker("light_wood"), 3.25, 0.2, 0, 180)
-    room.put("cable", devices.cable_run((2.75, 0.05, 0.95), (3.25, 0.1, 0.2), 0.3), 0, 0)
-    room.put("clock", small.desk_clock("clock_face"), 2.45, 0.2, 1.07, 190)
-    room.lean("poster_1", furniture.flat_picture("poster", 0.6, 0.85, 0.01), "south", 2.0, 1.4)
-    room.lean("poster_2", furniture.flat_picture("painting_2", 0.7, 0.7), "south", 3.0, 1.4)
-    room.lean("picture_1", furniture.flat_picture("landscape", 1.1, 0.8), "north", 1.75, 1.25)
-    room.lean("picture_2", furniture.flat_picture("painting_3", 0.6, 0.6), "west", 2.3, 1.2)
-    room.lean("door", furniture.flat_picture("door", 0.86, 2.05), "south", 0.7)
-    room.drop("basket", small.basket("weave", "accent_knit", 0.22, 0.28), 3.9, 0.5)
-    room.put("crate", small.crate("worn_wood"), 4.5, 0.45, 0, -8)
-    room.put("vase", small.round_vase("vase_print"), 4.5, 0.45, 0.015)
-    room.drop("ottoman", seating.ottoman("accent_knit"), 2.75, 1.75)
-    room.drop("shoe", small.shoes("sneaker"), 1.15, 1.05, 0, 200)
-    room.put("guitar_case", furniture.carton("leather", 0.4, 0.14, 1.1), 0.25, 1.25, 0, 80)
-    room.put("blanket", [Part(draped(0.34, 0.6, 0.2), "plaid")], 2.75, 1.75, 0.41, 30)
-    room.put("phone", devices.phone("phone_screen"), 4.95, 1.6, 0.51, 40)
+        room.place_at_wall(f"curtain_{i}", [Part(hanging(0.45, 2.2, 5), "linen")], "east", y, 0.1, 0.1)
+    room.place_at_wall("shelf", tables.open_shelf(1.3, 1.05, "dark_wood", rng, 3, 0.34), "south", 2.4)
+    room.place("record_player", furniture.carton("dark_wood", 0.42, 0.32, 0.12), 2.75, 0.2, 1.07, 180)
+    room.place("speaker_1", devices.speaker("light_wood"), 1.55, 0.2, 0, 180)
+    room.place("speaker_2", devices.speaker("light_wood"), 3.25, 0.2, 0, 180)
+    room.place("cable", devices.cable_run((2.75, 0.05, 0.95), (3.25, 0.1, 0.2), 0.3), 0, 0)
+    room.place("clock", small.desk_clock("clock_face"), 2.45, 0.2, 1.07, 190)
+    room.place_at_wall("poster_1", furniture.flat_picture("poster", 0.6, 0.85, 0.01), "south", 2.0, 1.4)
+    room.place_at_wall("poster_2", furniture.flat_picture("painting_2", 0.7, 0.7), "south", 3.0, 1.4)
+    room.place_at_wall("picture_1", furniture.flat_picture("landscape", 1.1, 0.8), "north", 1.75, 1.25)
+    room.place_at_wall("picture_2", furniture.flat_picture("painting_3", 0.6, 0.6), "west", 2.3, 1.2)
+    room.place_at_wall("door", furniture.flat_picture("door", 0.86, 2.05), "south", 0.7)
+    room.place_jittered("basket", small.basket("weave", "accent_knit", 0.22, 0.28), 3.9, 0.5)
+    room.place("crate", small.crate("worn_wood"), 4.5, 0.45, 0, -8)
+    room.place("vase", small.round_vase("vase_print"), 4.5, 0.45, 0.015)
+    room.place_jittered("ottoman", seating.ottoman("accent_knit"), 2.75, 1.75)
+    room.place_jittered("shoe", small.shoes("sneaker"), 1.15, 1.05, 0, 200)
+    room.place("guitar_case", furniture.carton("leather", 0.4, 0.14, 1.1), 0.25, 1.25, 0, 80)
+    room.place("blanket", [Part(draped(0.34, 0.6, 0.2), "plaid")], 2.75, 1.75, 0.41, 30)
+    room.place("phone", devices.phone("phone_screen"), 4.95, 1.6, 0.51, 40)
     return room.items
 
 
@@ -110,7 +112,7 @@ def painters() -> dict[str, Painter]:
     colours = Palette(
         main=(0.52, 0.26, 0.18), second=(0.78, 0.72, 0.60), accent=(0.86, 0.56, 0.20), other=(0.10, 0.36, 0.38)
     )
-    return common(colours) | {
-        "wall": lambda rng: fabrics.brick(rng, (0.64, 0.36, 0.28)),
-        "floor": lambda rng: textures.planks(rng, (0.72, 0.55, 0.38)).polished(0.05),
+    return common_painters(colours) | {
+        "wall": lambda rng: fabric_textures.brick(rng, (0.64, 0.36, 0.28)),
+        "floor": lambda rng: textures.planks(rng, (0.72, 0.55, 0.38)).with_gloss(0.05),
     }

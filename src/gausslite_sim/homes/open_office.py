@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from gausslite_sim import fabrics, furniture, textures
-from gausslite_sim import things_devices as devices
-from gausslite_sim import things_seating as seating
-from gausslite_sim import things_small as small
-from gausslite_sim import things_tables as tables
-from gausslite_sim.items import Item, Part
+from gausslite_sim import device_objects as devices
+from gausslite_sim import fabric_textures, furniture, textures
+from gausslite_sim import seating_objects as seating
+from gausslite_sim import small_objects as small
+from gausslite_sim import table_objects as tables
 from gausslite_sim.lighting import Lamp, Lighting
-from gausslite_sim.materials import Painter, Palette, common
+from gausslite_sim.materials import Painter, Palette, common_painters
 from gausslite_sim.room import Room
+from gausslite_sim.scene_objects import Item, Part
 from gausslite_sim.shapes import draped
 
 LIGHTING = Lighting(
@@ -25,7 +25,7 @@ LIGHTING = Lighting(
     bounce=0.65,
 )
 _TOP_M = 0.73
-WALKS = (
+TRAJECTORIES = (
     (
         ((0.8, 1.0, 1.55), (1.9, 2.4, 0.75)),
         ((1.8, 0.8, 1.50), (1.9, 2.3, 0.8)),
@@ -70,7 +70,7 @@ def furnish(rng: np.random.Generator) -> list[Item]:
     screens = ("code", "slides", "code", "slides")
     for i, (x, y, yaw) in enumerate(((1.8, 2.07, 0), (1.8, 2.83, 180), (4.6, 2.07, 0), (4.6, 2.83, 180)), 1):
         side = 1 if yaw == 0 else -1
-        room.put(
+        room.place(
             f"desk_{i}",
             tables.desk(1.6, "light_wood" if i < 3 else "white_plastic", "aluminium", "drawers"),
             x,
@@ -78,10 +78,12 @@ def furnish(rng: np.random.Generator) -> list[Item]:
             0,
             yaw,
         )
-        room.drop(f"monitor_{i}", devices.monitor(screens[i - 1]), x - 0.1 * side, y + 0.2 * side, _TOP_M, yaw + 5)
-        room.drop(f"keyboard_{i}", devices.keyboard(), x - 0.12 * side, y - 0.14 * side, _TOP_M, yaw)
-        room.drop(f"mouse_{i}", devices.mouse(), x + 0.22 * side, y - 0.14 * side, _TOP_M, yaw)
-        room.drop(
+        room.place_jittered(
+            f"monitor_{i}", devices.monitor(screens[i - 1]), x - 0.1 * side, y + 0.2 * side, _TOP_M, yaw + 5
+        )
+        room.place_jittered(f"keyboard_{i}", devices.keyboard(), x - 0.12 * side, y - 0.14 * side, _TOP_M, yaw)
+        room.place_jittered(f"mouse_{i}", devices.mouse(), x + 0.22 * side, y - 0.14 * side, _TOP_M, yaw)
+        room.place_jittered(
             f"chair_{i}",
             seating.office_chair("net" if i % 2 else "main_cloth"),
             x - 0.1 * side,
@@ -89,39 +91,39 @@ def furnish(rng: np.random.Generator) -> list[Item]:
             0,
             180 + yaw + 14 * i,
         )
-    room.drop("mug_1", small.cup("mug_print"), 2.3, 1.95, _TOP_M, 30)
-    room.drop("laptop", devices.laptop("code"), 1.22, 1.98, _TOP_M, 16)
-    room.drop("papers_1", small.sheaf("page"), 2.42, 2.2, _TOP_M, -14)
-    room.put("plant_1", small.fern("terracotta", "leaf", 0.9), 1.12, 2.28, _TOP_M)
-    room.drop("pen_cup", small.pen_cup("accent_glaze"), 2.2, 2.26, _TOP_M)
-    room.drop("headphones", devices.headphones(), 1.2, 2.75, _TOP_M, 200)
-    room.drop("bottle", small.bottle("bottle_label", "green_glass", 0.24), 2.4, 2.72, _TOP_M)
-    room.drop("phone", devices.phone("phone_screen"), 5.15, 2.0, _TOP_M, 30)
-    room.drop("mug_2", small.cup("mug_dots"), 4.1, 2.85, _TOP_M, 220)
-    room.put("lamp", devices.desk_lamp("paint_red"), 5.25, 2.2, _TOP_M, -30)
-    room.drop("books", furniture.books(), 5.2, 2.8, _TOP_M, 20)
-    room.drop("magazine", small.sheaf("magazine"), 4.05, 2.1, _TOP_M, 30)
+    room.place_jittered("mug_1", small.cup("mug_print"), 2.3, 1.95, _TOP_M, 30)
+    room.place_jittered("laptop", devices.laptop("code"), 1.22, 1.98, _TOP_M, 16)
+    room.place_jittered("papers_1", small.sheaf("page"), 2.42, 2.2, _TOP_M, -14)
+    room.place("plant_1", small.fern("terracotta", "leaf", 0.9), 1.12, 2.28, _TOP_M)
+    room.place_jittered("pen_cup", small.pen_cup("accent_glaze"), 2.2, 2.26, _TOP_M)
+    room.place_jittered("headphones", devices.headphones(), 1.2, 2.75, _TOP_M, 200)
+    room.place_jittered("bottle", small.bottle("bottle_label", "green_glass", 0.24), 2.4, 2.72, _TOP_M)
+    room.place_jittered("phone", devices.phone("phone_screen"), 5.15, 2.0, _TOP_M, 30)
+    room.place_jittered("mug_2", small.cup("mug_dots"), 4.1, 2.85, _TOP_M, 220)
+    room.place("lamp", devices.desk_lamp("paint_red"), 5.25, 2.2, _TOP_M, -30)
+    room.place_jittered("books", furniture.books(), 5.2, 2.8, _TOP_M, 20)
+    room.place_jittered("magazine", small.sheaf("magazine"), 4.05, 2.1, _TOP_M, 30)
     for i, x in enumerate((1.8, 4.6), 1):
-        room.put(f"cable_{i}", devices.cable_run((x + 0.3, 2.45, 0.72), (x + 0.9, 2.45, 0.02), 0.15), 0, 0)
-    room.lean(
+        room.place(f"cable_{i}", devices.cable_run((x + 0.3, 2.45, 0.72), (x + 0.9, 2.45, 0.02), 0.15), 0, 0)
+    room.place_at_wall(
         "cabinet", furniture.cupboard((1.1, 0.5, 0.72), "wide_drawers", "aluminium", 2, "white_plastic"), "north", 5.9
     )
-    room.put("printer", devices.printer(), 6.05, 4.62, 0.755, -6)
-    room.put("papers_2", small.sheaf("page", height_m=0.05), 5.55, 4.6, 0.755, 10)
-    room.lean("shelf", tables.open_shelf(1.2, 1.8, "light_wood", rng, 5), "east", 2.4)
-    room.put("plant_2", small.little_tree("stone_pot", "leaf"), 6.2, 0.5)
-    room.put("plant_3", small.snake_plant("other_glaze", "striped_leaf"), 0.4, 4.5)
-    room.lean("whiteboard", furniture.flat_picture("whiteboard", 1.8, 1.1, 0.02), "west", 2.4, 0.95)
-    room.lean("window_1", furniture.flat_picture("window", 1.5, 1.4, 0.05), "south", 2.1, 0.9)
-    room.lean("window_2", furniture.flat_picture("window", 1.5, 1.4, 0.05), "south", 4.2, 0.9)
-    room.lean("poster", furniture.flat_picture("poster", 0.7, 1.0, 0.01), "north", 1.5, 1.0)
-    room.lean("map", furniture.flat_picture("map", 1.2, 0.9, 0.01), "north", 3.2, 1.1)
-    room.lean("clock", small.wall_clock("clock_face"), "north", 4.6, 2.0)
-    room.lean("door", furniture.flat_picture("door", 0.9, 2.1), "east", 0.9)
-    room.put("bin", small.bucket("rubber"), 3.2, 2.5)
-    room.put("box", furniture.carton("carton", 0.5, 0.4, 0.35), 0.5, 0.45, 0, 12)
-    room.put("basket", small.basket("dark_weave", "paper", 0.18, 0.32), 4.9, 4.6)
-    room.put("jacket", [Part(draped(0.06, 0.4, 0.45, 0.006), "plaid")], 1.7, 3.62, 1.02)
+    room.place("printer", devices.printer(), 6.05, 4.62, 0.755, -6)
+    room.place("papers_2", small.sheaf("page", height_m=0.05), 5.55, 4.6, 0.755, 10)
+    room.place_at_wall("shelf", tables.open_shelf(1.2, 1.8, "light_wood", rng, 5), "east", 2.4)
+    room.place("plant_2", small.little_tree("stone_pot", "leaf"), 6.2, 0.5)
+    room.place("plant_3", small.snake_plant("other_glaze", "striped_leaf"), 0.4, 4.5)
+    room.place_at_wall("whiteboard", furniture.flat_picture("whiteboard", 1.8, 1.1, 0.02), "west", 2.4, 0.95)
+    room.place_at_wall("window_1", furniture.flat_picture("window", 1.5, 1.4, 0.05), "south", 2.1, 0.9)
+    room.place_at_wall("window_2", furniture.flat_picture("window", 1.5, 1.4, 0.05), "south", 4.2, 0.9)
+    room.place_at_wall("poster", furniture.flat_picture("poster", 0.7, 1.0, 0.01), "north", 1.5, 1.0)
+    room.place_at_wall("map", furniture.flat_picture("map", 1.2, 0.9, 0.01), "north", 3.2, 1.1)
+    room.place_at_wall("clock", small.wall_clock("clock_face"), "north", 4.6, 2.0)
+    room.place_at_wall("door", furniture.flat_picture("door", 0.9, 2.1), "east", 0.9)
+    room.place("bin", small.bucket("rubber"), 3.2, 2.5)
+    room.place("box", furniture.carton("carton", 0.5, 0.4, 0.35), 0.5, 0.45, 0, 12)
+    room.place("basket", small.basket("dark_weave", "paper", 0.18, 0.32), 4.9, 4.6)
+    room.place("jacket", [Part(draped(0.06, 0.4, 0.45, 0.006), "plaid")], 1.7, 3.62, 1.02)
     return room.items
 
 
@@ -134,7 +136,7 @@ def painters() -> dict[str, Painter]:
         accent=(0.80, 0.22, 0.16),
         other=(0.10, 0.42, 0.50),
     )
-    return common(colours) | {
+    return common_painters(colours) | {
         "wall": lambda rng: textures.plaster(rng, (0.70, 0.73, 0.74)),
-        "floor": lambda rng: fabrics.carpet(rng, (0.36, 0.40, 0.44), (0.62, 0.64, 0.6)),
+        "floor": lambda rng: fabric_textures.carpet(rng, (0.36, 0.40, 0.44), (0.62, 0.64, 0.6)),
     }

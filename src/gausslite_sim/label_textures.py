@@ -1,12 +1,12 @@
-"""Printed things fitted to one face: spines, pages, labels, posters, maps. Text where text would be."""
+"""Printed things fitted to one face: spines, pages, label_textures, posters, maps. Text where text would be."""
 
 from __future__ import annotations
 
 import cv2
 import numpy as np
 
-from gausslite_sim.prints import Picture
-from gausslite_sim.textures import SIDE_PX, Colour, Texture, grain, noise, tinted
+from gausslite_sim.printed_textures import Picture
+from gausslite_sim.textures import SIDE_PX, Colour, Texture, grain, noise, tint
 
 Ink = tuple[int, int, int]
 FONT = cv2.FONT_HERSHEY_DUPLEX
@@ -18,7 +18,7 @@ DARK_INK: Ink = (28, 28, 32)
 
 def spine(rng: np.random.Generator, colour: Colour) -> Texture:
     """The back of a book: bands and a title that runs along it."""
-    picture = tinted(0.75 + 0.4 * grain(rng), colour)
+    picture = tint(0.75 + 0.4 * grain(rng), colour)
     light = ink_of(np.clip(255 * (1.1 - np.asarray(colour)), 60, 245))
     for y in (30, 60, 450, 478):
         cv2.rectangle(picture, (0, y), (SIDE_PX, y + 12), light, -1)
@@ -31,7 +31,7 @@ def spine(rng: np.random.Generator, colour: Colour) -> Texture:
 
 def page(rng: np.random.Generator) -> Texture:
     """A printed sheet: a heading, a table, paragraphs."""
-    picture = tinted(0.92 + 0.1 * grain(rng), (0.96, 0.95, 0.92))
+    picture = tint(0.92 + 0.1 * grain(rng), (0.96, 0.95, 0.92))
     cv2.putText(picture, "REPORT 27", (40, 66), FONT, 1.8, DARK_INK, 4, cv2.LINE_AA)
     paragraph(picture, rng, (40, 96, 472, 250), 17)
     for y in range(270, 371, 25):
@@ -44,7 +44,7 @@ def page(rng: np.random.Generator) -> Texture:
 
 def magazine(rng: np.random.Generator, colour: Colour) -> Texture:
     """A cover: a name, a picture, lines of what is inside."""
-    picture = tinted(0.85 + 0.25 * grain(rng), colour)
+    picture = tint(0.85 + 0.25 * grain(rng), colour)
     cv2.putText(picture, "HABITAT", (24, 110), FONT, 3.3, (248, 246, 238), 10, cv2.LINE_AA)
     shade = noise(rng, 8, 8)[150:400, 60:452]
     picture[150:400, 60:452] = np.stack([60 + 180 * shade, 90 + 110 * shade, 150 - 80 * shade], -1).astype(np.uint8)
@@ -55,7 +55,7 @@ def magazine(rng: np.random.Generator, colour: Colour) -> Texture:
 
 def poster(rng: np.random.Generator, colour: Colour) -> Texture:
     """Large letters over rings, small print below, a thin black frame."""
-    picture = tinted(0.9 + 0.15 * grain(rng), (0.93, 0.90, 0.82))
+    picture = tint(0.9 + 0.15 * grain(rng), (0.93, 0.90, 0.82))
     for radius in range(30, 170, 26):
         cv2.circle(picture, (256, 200), radius, ink_of(255 * np.asarray(colour)), 12, cv2.LINE_AA)
     cv2.putText(picture, "JAZZ", (70, 250), FONT, 6.0, (190, 50, 36), 22, cv2.LINE_AA)
@@ -82,7 +82,7 @@ def landscape(rng: np.random.Generator) -> Texture:
 def photograph(rng: np.random.Generator) -> Texture:
     """A small portrait in a white mount."""
     picture = np.full((SIDE_PX, SIDE_PX, 3), 236, np.uint8)
-    picture[70:442, 90:422] = tinted(0.5 + 0.5 * noise(rng, 8, 8), (0.5, 0.62, 0.6))[70:442, 90:422]
+    picture[70:442, 90:422] = tint(0.5 + 0.5 * noise(rng, 8, 8), (0.5, 0.62, 0.6))[70:442, 90:422]
     cv2.ellipse(picture, (256, 420), (110, 130), 0, 180, 360, (66, 52, 90), -1, cv2.LINE_AA)
     cv2.circle(picture, (256, 230), 66, (214, 170, 140), -1, cv2.LINE_AA)
     cv2.ellipse(picture, (256, 200), (72, 60), 0, 180, 360, (60, 40, 26), -1, cv2.LINE_AA)
@@ -111,7 +111,7 @@ def city_map(rng: np.random.Generator) -> Texture:
 
 def dotted_mug(rng: np.random.Generator, colour: Colour) -> Texture:
     """Dots and a word round a dark mug."""
-    picture = tinted(0.85 + 0.2 * grain(rng), colour)
+    picture = tint(0.85 + 0.2 * grain(rng), colour)
     for row in range(7):
         for k in range(12):
             at = (22 + 43 * k + 21 * (row % 2), 50 + 64 * row)
@@ -124,7 +124,7 @@ def dotted_mug(rng: np.random.Generator, colour: Colour) -> Texture:
 
 def plate(rng: np.random.Generator, colour: Colour) -> Texture:
     """Rings and petals, wound round a dish (v from rim to middle)."""
-    picture = tinted(0.92 + 0.1 * grain(rng), (0.93, 0.93, 0.9))
+    picture = tint(0.92 + 0.1 * grain(rng), (0.93, 0.93, 0.9))
     ink = ink_of(255 * np.asarray(colour))
     for y in (90, 330, 360):
         cv2.rectangle(picture, (0, y), (SIDE_PX, y + 12), ink, -1)
@@ -135,7 +135,7 @@ def plate(rng: np.random.Generator, colour: Colour) -> Texture:
 
 def bottle_label(rng: np.random.Generator, colour: Colour) -> Texture:
     """A paper label with a crest, a name and small print, twice round."""
-    picture = tinted(0.9 + 0.15 * grain(rng), (0.92, 0.88, 0.76))
+    picture = tint(0.9 + 0.15 * grain(rng), (0.92, 0.88, 0.76))
     ink = ink_of(230 * np.asarray(colour))
     for x in (128, 384):
         cv2.circle(picture, (x, 110), 62, ink, 10, cv2.LINE_AA)
@@ -149,7 +149,7 @@ def bottle_label(rng: np.random.Generator, colour: Colour) -> Texture:
 
 def jar_label(rng: np.random.Generator, colour: Colour) -> Texture:
     """Preserve behind a white label."""
-    picture = tinted(0.6 + 0.8 * grain(rng), (0.62, 0.14, 0.16))
+    picture = tint(0.6 + 0.8 * grain(rng), (0.62, 0.14, 0.16))
     for x in (30, 286):
         cv2.rectangle(picture, (x, 130), (x + 196, 390), (244, 240, 230), -1)
         cv2.rectangle(picture, (x + 10, 140), (x + 186, 380), ink_of(255 * np.asarray(colour)), 6)
@@ -160,7 +160,7 @@ def jar_label(rng: np.random.Generator, colour: Colour) -> Texture:
 
 def packet(rng: np.random.Generator, colour: Colour) -> Texture:
     """A printed box or tin: a big word on a band, stripes, a bar code."""
-    picture = tinted(0.88 + 0.2 * grain(rng), colour)
+    picture = tint(0.88 + 0.2 * grain(rng), colour)
     cv2.rectangle(picture, (0, 90), (SIDE_PX, 250), (244, 240, 226), -1)
     cv2.putText(picture, str(rng.choice(_TITLES)), (24, 208), FONT, 3.2, DARK_INK, 11, cv2.LINE_AA)
     for y in range(280, 360, 20):
@@ -174,7 +174,7 @@ def packet(rng: np.random.Generator, colour: Colour) -> Texture:
 
 def pegboard(rng: np.random.Generator) -> Texture:
     """A brown board full of holes."""
-    picture = tinted(0.8 + 0.35 * grain(rng), (0.66, 0.50, 0.34))
+    picture = tint(0.8 + 0.35 * grain(rng), (0.66, 0.50, 0.34))
     for y in range(16, SIDE_PX, 32):
         for x in range(16, SIDE_PX, 32):
             cv2.circle(picture, (x, y), 5, (50, 36, 24), -1, cv2.LINE_AA)

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from gausslite_sim.items import Item
 from gausslite_sim.lighting import Lighting
+from gausslite_sim.scene_objects import Item
 from gausslite_sim.sensor_noise import SensorNoise
 from gausslite_sim.textures import Texture
-from gausslite_sim.walks import Walk
+from gausslite_sim.trajectory import Trajectory
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -23,6 +23,6 @@ class HomePlan:
     items: Sequence[Item]
     textures: dict[str, Texture]
     lighting: Lighting
-    walks: tuple[Walk, ...]
+    trajectories: tuple[Trajectory, ...]
     exposure_drift: float = 0.0
     sensor: SensorNoise = field(default_factory=SensorNoise)

@@ -12,13 +12,13 @@ from numpy import ndarray
 from gausslite.domain.camera import Camera
 from gausslite.domain.frame import Frame
 from gausslite_sim.scene import HomeScene
-from gausslite_sim.view import items_seen
+from gausslite_sim.view import render_instances
 
 _REMEMBERED_FRAMES = 6
 
 
 @dataclass(slots=True, eq=False)
-class ItemImages:
+class InstanceImageCache:
     """The items in each pixel of the last few frames asked for; the regions of a source share one."""
 
     scene: HomeScene
@@ -29,7 +29,7 @@ class ItemImages:
         key = (frame.camera, frame.T_world_camera.tobytes())
         image = self._images.get(key)
         if image is None:
-            image = items_seen(self.scene, frame.camera, frame.T_world_camera)
+            image = render_instances(self.scene, frame.camera, frame.T_world_camera)
             self._images[key] = image
             # pop, not del: another thread may have dropped the same frame
             while len(self._images) > _REMEMBERED_FRAMES:
@@ -43,7 +43,7 @@ class InstanceRegion:
 
     name: str
     item: int
-    images: ItemImages
+    images: InstanceImageCache
 
     def mask(self, frame: Frame) -> Bool[ndarray, "h w"]:
         """True where the pixel's centre shows the object."""

@@ -1,11 +1,11 @@
-"""Things with a plug: screens, keyboards, lamps, printers; each standing on z = 0, front towards -y."""
+"""Devices: screens, keyboards, lamps, printers. Each stands on z = 0 with its front towards -y."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from gausslite_sim.items import Part
-from gausslite_sim.mesh import Vector, box, lathe, merged, panel, ring
+from gausslite_sim.mesh import Vector, box, lathe, merge_meshes, panel, ring
+from gausslite_sim.scene_objects import Part
 from gausslite_sim.shapes import pillow, rods, sagging, tube
 
 
@@ -14,24 +14,30 @@ def laptop(screen: str) -> list[Part]:
     base = box((-0.165, -0.12, 0), (0.165, 0.12, 0.016))
     keys = panel((-0.15, 0.09, 0.0165), (0.3, 0, 0), (0, -0.12, 0), fit=True)
     pad = panel((-0.05, -0.045, 0.0165), (0.1, 0, 0), (0, -0.065, 0), fit=True)
-    lid = box((-0.165, 0, 0), (0.165, 0.008, 0.225)).tipped(-0.32).moved((0, 0.12, 0.014))
-    shown = panel((-0.155, -0.0008, 0.215), (0.31, 0, 0), (0, 0, -0.2), fit=True).tipped(-0.32).moved((0, 0.12, 0.014))
-    return [Part(merged([base, lid, pad]), "aluminium"), Part(keys, "keys"), Part(shown, screen)]
+    lid = box((-0.165, 0, 0), (0.165, 0.008, 0.225)).rotate_x(-0.32).translate((0, 0.12, 0.014))
+    shown = (
+        panel((-0.155, -0.0008, 0.215), (0.31, 0, 0), (0, 0, -0.2), fit=True)
+        .rotate_x(-0.32)
+        .translate((0, 0.12, 0.014))
+    )
+    return [Part(merge_meshes([base, lid, pad]), "aluminium"), Part(keys, "keys"), Part(shown, screen)]
 
 
 def keyboard() -> list[Part]:
     """A full one, tilted towards its user, with a cable."""
-    body = box((-0.22, -0.07, 0), (0.22, 0.07, 0.018)).tipped(0.07).moved((0, 0, 0.006))
-    keys = panel((-0.212, 0.063, 0.0185), (0.424, 0, 0), (0, -0.126, 0), fit=True).tipped(0.07).moved((0, 0, 0.006))
+    body = box((-0.22, -0.07, 0), (0.22, 0.07, 0.018)).rotate_x(0.07).translate((0, 0, 0.006))
+    keys = (
+        panel((-0.212, 0.063, 0.0185), (0.424, 0, 0), (0, -0.126, 0), fit=True).rotate_x(0.07).translate((0, 0, 0.006))
+    )
     cable = tube([(0, 0.07, 0.012), (0.02, 0.14, 0.004), (-0.05, 0.24, 0.004), (0.03, 0.34, 0.004)], 0.003)
-    return [Part(merged([body, cable]), "black_plastic"), Part(keys, "keys")]
+    return [Part(merge_meshes([body, cable]), "black_plastic"), Part(keys, "keys")]
 
 
 def mouse() -> list[Part]:
     """A mouse with its cable."""
-    hump = pillow(0.062, 0.11, 0.04, fit=False).tipped(np.pi / 2).moved((0, 0.055, 0.016))
+    hump = pillow(0.062, 0.11, 0.04, fit=False).rotate_x(np.pi / 2).translate((0, 0.055, 0.016))
     cable = tube([(0, 0.05, 0.01), (-0.02, 0.12, 0.004), (0.03, 0.2, 0.004)], 0.0025)
-    return [Part(merged([hump, cable]), "black_plastic")]
+    return [Part(merge_meshes([hump, cable]), "black_plastic")]
 
 
 def monitor(screen: str, width_m: float = 0.6) -> list[Part]:
@@ -40,7 +46,7 @@ def monitor(screen: str, width_m: float = 0.6) -> list[Part]:
     body = [box((-x, -0.015, 0.12), (x, 0.015, 0.12 + high)), box((-0.03, 0.01, 0.01), (0.03, 0.03, 0.3))]
     body.append(box((-0.12, -0.09, 0), (0.12, 0.09, 0.012)))
     shown = panel((-x + 0.008, -0.0155, 0.112 + high), (width_m - 0.016, 0, 0), (0, 0, 0.03 - high), fit=True)
-    return [Part(merged(body), "black_plastic"), Part(shown, screen)]
+    return [Part(merge_meshes(body), "black_plastic"), Part(shown, screen)]
 
 
 def printer() -> list[Part]:
@@ -52,9 +58,9 @@ def printer() -> list[Part]:
     feed = panel((-0.105, 0.14, 0.42), (0.21, 0, 0), (0, -0.05, -0.19), fit=True)
     glass = panel((-0.18, 0.1, 0.2405), (0.36, 0, 0), (0, -0.24, 0), fit=True)
     return [
-        Part(merged([body, tray]), "white_plastic"),
+        Part(merge_meshes([body, tray]), "white_plastic"),
         Part(slot, "printer_front"),
-        Part(merged([sheet, feed]), "page"),
+        Part(merge_meshes([sheet, feed]), "page"),
         Part(glass, "black_glass"),
     ]
 
@@ -64,12 +70,12 @@ def desk_lamp(colour: str) -> list[Part]:
     foot = lathe([(0.0005, 0.0), (0.085, 0.0), (0.085, 0.02), (0.0005, 0.024)])
     arm = tube([(0, 0, 0.02), (0, 0.05, 0.2), (0, 0.09, 0.32)], 0.007)
     upper = tube([(0, 0.09, 0.32), (0, -0.04, 0.42), (0, -0.16, 0.46)], 0.007)
-    shade = lathe([(0.075, -0.1), (0.03, 0.0), (0.0005, 0.005)], smooth=True).tipped(0.35).moved((0, -0.2, 0.47))
-    lining = lathe([(0.0005, 0.0), (0.028, -0.004), (0.073, -0.1)]).tipped(0.35).moved((0, -0.2, 0.47))
+    shade = lathe([(0.075, -0.1), (0.03, 0.0), (0.0005, 0.005)], smooth=True).rotate_x(0.35).translate((0, -0.2, 0.47))
+    lining = lathe([(0.0005, 0.0), (0.028, -0.004), (0.073, -0.1)]).rotate_x(0.35).translate((0, -0.2, 0.47))
     cable = tube([(0, 0.08, 0.004), (0.07, 0.14, 0.004), (0.03, 0.24, 0.004)], 0.003)
     return [
-        Part(merged([foot, shade]), colour),
-        Part(merged([arm, upper, cable]), "black_plastic"),
+        Part(merge_meshes([foot, shade]), colour),
+        Part(merge_meshes([arm, upper, cable]), "black_plastic"),
         Part(lining, "glow"),
     ]
 
@@ -102,8 +108,8 @@ def speaker(wood: str) -> list[Part]:
     cones = []
     for z, radius in ((0.11, 0.075), (0.25, 0.04)):
         cone = lathe([(radius, 0.0), (0.3 * radius, -0.02), (0.0005, -0.012)], smooth=True, sectors=22)
-        cones.append(cone.tipped(np.pi / 2).moved((0, -0.112, z)))
-    return [Part(body, wood), Part(merged(cones), "rubber")]
+        cones.append(cone.rotate_x(np.pi / 2).translate((0, -0.112, z)))
+    return [Part(body, wood), Part(merge_meshes(cones), "rubber")]
 
 
 def phone(screen: str) -> list[Part]:
@@ -114,23 +120,23 @@ def phone(screen: str) -> list[Part]:
 
 def headphones() -> list[Part]:
     """Lying on the table: a bow and two cushions."""
-    bow = ring(0.085, 0.008, 0.0, np.pi).tipped(-1.35).moved((0, 0.02, 0.03))
+    bow = ring(0.085, 0.008, 0.0, np.pi).rotate_x(-1.35).translate((0, 0.02, 0.03))
     cups = [
-        lathe([(0.0005, 0), (0.04, 0.0), (0.045, 0.02), (0.0005, 0.032)], smooth=True).moved((x, 0.0, 0.004))
+        lathe([(0.0005, 0), (0.04, 0.0), (0.045, 0.02), (0.0005, 0.032)], smooth=True).translate((x, 0.0, 0.004))
         for x in (-0.085, 0.085)
     ]
-    return [Part(bow, "steel"), Part(merged(cups), "leather")]
+    return [Part(bow, "steel"), Part(merge_meshes(cups), "leather")]
 
 
 def projector() -> list[Part]:
     """A white case with a lens and a cable."""
     body = box((-0.16, -0.12, 0.02), (0.16, 0.12, 0.12))
-    lens = lathe([(0.04, 0), (0.045, 0.03), (0.03, 0.03), (0.02, 0.01), (0.0005, 0.012)]).tipped(np.pi / 2)
+    lens = lathe([(0.04, 0), (0.045, 0.03), (0.03, 0.03), (0.02, 0.01), (0.0005, 0.012)]).rotate_x(np.pi / 2)
     grille = panel((-0.15, -0.121, 0.11), (0.16, 0, 0), (0, 0, -0.08), fit=True)
     cable = tube([(0, 0.12, 0.05), (0.03, 0.25, 0.006), (-0.1, 0.4, 0.006), (0.05, 0.6, 0.006)], 0.004)
     return [
         Part(body, "white_plastic"),
-        Part(merged([lens.moved((0.08, -0.12, 0.07)), cable]), "black_plastic"),
+        Part(merge_meshes([lens.translate((0.08, -0.12, 0.07)), cable]), "black_plastic"),
         Part(grille, "printer_front"),
     ]
 
@@ -138,14 +144,14 @@ def projector() -> list[Part]:
 def fan() -> list[Part]:
     """A table fan: a wire cage before four blades."""
     stand = [lathe([(0.0005, 0), (0.12, 0), (0.12, 0.02), (0.02, 0.04), (0.018, 0.22)])]
-    cage = [ring(r, 0.003, 0, 2 * np.pi).moved((0, -0.05, 0.36)) for r in (0.16, 0.11, 0.06)]
+    cage = [ring(r, 0.003, 0, 2 * np.pi).translate((0, -0.05, 0.36)) for r in (0.16, 0.11, 0.06)]
     spokes: list[tuple[Vector, Vector]] = [
         ((0.0, -0.06, 0.36), (0.16 * float(np.cos(a)), -0.05, 0.36 + 0.16 * float(np.sin(a))))
         for a in np.linspace(0, 2 * np.pi, 17)[:-1]
     ]
-    wing = box((0.02, -0.004, -0.04), (0.14, 0.004, 0.04)).tipped(0.3)
-    wings = [wing.rolled(k * np.pi / 2).moved((0, -0.01, 0.36)) for k in range(4)]
-    return [Part(merged([*stand, *cage, rods(spokes, 0.002)]), "steel"), Part(merged(wings), "blue_paint")]
+    wing = box((0.02, -0.004, -0.04), (0.14, 0.004, 0.04)).rotate_x(0.3)
+    wings = [wing.rotate_y(k * np.pi / 2).translate((0, -0.01, 0.36)) for k in range(4)]
+    return [Part(merge_meshes([*stand, *cage, rods(spokes, 0.002)]), "steel"), Part(merge_meshes(wings), "blue_paint")]
 
 
 def cable_run(start_m: Vector, end_m: Vector, sag_m: float) -> list[Part]:

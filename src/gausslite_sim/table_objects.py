@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from gausslite_sim.items import Part
-from gausslite_sim.mesh import box, lathe, merged, panel
+from gausslite_sim.mesh import box, lathe, merge_meshes, panel
+from gausslite_sim.scene_objects import Part
 from gausslite_sim.shapes import legs, rods
 
 SPINES = ("spine_1", "spine_2", "spine_3", "spine_4")
@@ -52,7 +52,7 @@ def open_shelf(
     x, step = width_m / 2, height_m / rows
     boards = [box((-x, -depth_m, i * step), (x, 0, i * step + 0.018)) for i in range(rows + 1)]
     sides = [box((s * x - 0.009, -depth_m, 0), (s * x + 0.009, 0, height_m + 0.018)) for s in (-1, 1)]
-    parts = [Part(merged([*boards, *sides]), wood)]
+    parts = [Part(merge_meshes([*boards, *sides]), wood)]
     for i in range(rows):
         share = float(rng.uniform(0.45, 0.85))
         start = -x + 0.03 if rng.random() < 0.5 else x - 0.03 - share * (width_m - 0.06)
@@ -86,7 +86,7 @@ def metal_rack(width_m: float, height_m: float, rows: int, depth_m: float = 0.4)
         wires += [rods([((-x, s * y, z), (x, s * y, z))], 0.008) for s in (-1, 1)]
         wires += [rods([((-x, u, z), (x, u, z))], 0.004) for u in np.linspace(-y, y, 7)[1:-1].tolist()]
         wires += [rods([((s * x, -y, z), (s * x, y, z))], 0.008) for s in (-1, 0, 1)]
-    return [Part(merged([posts, *wires]), "steel")]
+    return [Part(merge_meshes([posts, *wires]), "steel")]
 
 
 def wall_board(width_m: float, wood: str, depth_m: float = 0.22) -> list[Part]:
@@ -106,7 +106,7 @@ def workbench(width_m: float) -> list[Part]:
     jaws = [box((x - 0.1, -0.44, 0.84), (x + 0.1, -0.4, 0.98)), box((x - 0.1, -0.36, 0.9), (x + 0.1, -0.3, 0.98))]
     screw = rods([((x, -0.52, 0.88), (x, -0.34, 0.88)), ((x - 0.12, -0.52, 0.88), (x + 0.12, -0.52, 0.88))], 0.011)
     return [
-        Part(merged([top, board]), "worn_wood"),
+        Part(merge_meshes([top, board]), "worn_wood"),
         Part(legs(width_m - 0.16, 0.56, 0.82, 0.09), "light_wood"),
-        Part(merged([*jaws, screw]), "blue_paint"),
+        Part(merge_meshes([*jaws, screw]), "blue_paint"),
     ]

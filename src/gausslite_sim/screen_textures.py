@@ -5,8 +5,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from gausslite_sim.labels import DARK_INK, FONT, SMALL_FONT, any_word, ink_of, paragraph
-from gausslite_sim.textures import SIDE_PX, Texture, grain, noise, tinted
+from gausslite_sim.label_textures import DARK_INK, FONT, SMALL_FONT, any_word, ink_of, paragraph
+from gausslite_sim.textures import SIDE_PX, Texture, grain, noise, tint
 
 
 def keys(rng: np.random.Generator) -> Texture:
@@ -66,7 +66,7 @@ def slide_screen(rng: np.random.Generator) -> Texture:
 
 def phone_screen(rng: np.random.Generator) -> Texture:
     """Rows of coloured icons on a dark picture."""
-    picture = tinted(0.4 + 0.6 * noise(rng, 4, 4), (0.2, 0.3, 0.5))
+    picture = tint(0.4 + 0.6 * noise(rng, 4, 4), (0.2, 0.3, 0.5))
     for row in range(6):
         for column in range(4):
             low = (34 + 118 * column, 40 + 78 * row)
@@ -76,7 +76,7 @@ def phone_screen(rng: np.random.Generator) -> Texture:
 
 def printer_front(rng: np.random.Generator) -> Texture:
     """Grey plastic with slots, lamps and a little display."""
-    picture = tinted(0.9 + 0.1 * grain(rng), (0.78, 0.79, 0.8))
+    picture = tint(0.9 + 0.1 * grain(rng), (0.78, 0.79, 0.8))
     for y in range(200, 460, 30):
         cv2.rectangle(picture, (30, y), (482, y + 12), (52, 54, 58), -1)
     cv2.rectangle(picture, (40, 40), (240, 150), (24, 40, 56), -1)
@@ -88,7 +88,7 @@ def printer_front(rng: np.random.Generator) -> Texture:
 
 def clock_face(rng: np.random.Generator) -> Texture:
     """Twelve numbers, strokes, two black hands and a red one."""
-    picture = tinted(0.95 + 0.06 * grain(rng), (0.95, 0.94, 0.9))
+    picture = tint(0.95 + 0.06 * grain(rng), (0.95, 0.94, 0.9))
     for hour in range(1, 13):
         a = np.pi * hour / 6
         at = (round(236 + 180 * np.sin(a)) - 14 * (hour > 9), round(272 - 180 * np.cos(a)))
@@ -104,7 +104,7 @@ def clock_face(rng: np.random.Generator) -> Texture:
 
 def whiteboard(rng: np.random.Generator) -> Texture:
     """Boxes, arrows, a graph and handwriting in four pens."""
-    picture = tinted(0.96 + 0.05 * noise(rng, 8, 32), (0.95, 0.95, 0.95))
+    picture = tint(0.96 + 0.05 * noise(rng, 8, 32), (0.95, 0.95, 0.95))
     pens = ((30, 60, 160), (190, 30, 30), (20, 120, 60), (30, 30, 30))
     for i in range(4):
         low = (30 + 120 * i, 60 + 26 * (i % 2))
@@ -134,7 +134,7 @@ def whiteboard(rng: np.random.Generator) -> Texture:
 
 def oven_front(rng: np.random.Generator) -> Texture:
     """Black glass with a rail, five knobs and a clock."""
-    picture = tinted(0.9 + 0.2 * noise(rng, 64, 8), (0.13, 0.13, 0.14))
+    picture = tint(0.9 + 0.2 * noise(rng, 64, 8), (0.13, 0.13, 0.14))
     for x in range(60, 480, 98):
         cv2.circle(picture, (x, 60), 26, (190, 192, 196), -1, cv2.LINE_AA)
         cv2.line(picture, (x, 60), (x + 12, 40), (20, 20, 20), 6, cv2.LINE_AA)

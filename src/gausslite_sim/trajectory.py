@@ -10,24 +10,24 @@ from numpy import ndarray
 
 from gausslite_sim.mesh import Vector
 
-Walk = Callable[[int], Float64[ndarray, "n 4 4"]]
+Trajectory = Callable[[int], Float64[ndarray, "n 4 4"]]
 """T_world_camera of this many frames, evenly spread over the walk (z up; OpenCV camera axes, no roll)."""
-Key = tuple[Vector, Vector]
+Waypoint = tuple[Vector, Vector]
 """(eye, looked at) in metres."""
 
 
-def walk_through(keys: Sequence[Key]) -> Walk:
+def spline_trajectory(keys: Sequence[Waypoint]) -> Trajectory:
     """The walk from the first of these places to the last."""
     places = np.array(keys)
 
     def poses(frames: int) -> Float64[ndarray, "n 4 4"]:
         share = np.linspace(0.0, 1.0, frames) if frames > 1 else np.array([0.5])
-        return looking(_curve(places[:, 0], share), _curve(places[:, 1], share))
+        return look_at_poses(_curve(places[:, 0], share), _curve(places[:, 1], share))
 
     return poses
 
 
-def looking(eyes_m: Float64[ndarray, "n 3"], targets_m: Float64[ndarray, "n 3"]) -> Float64[ndarray, "n 4 4"]:
+def look_at_poses(eyes_m: Float64[ndarray, "n 3"], targets_m: Float64[ndarray, "n 3"]) -> Float64[ndarray, "n 4 4"]:
     """T_world_camera of cameras at the eyes that look at the targets."""
     return np.stack([_look_at(eye, target) for eye, target in zip(eyes_m, targets_m, strict=True)])
 

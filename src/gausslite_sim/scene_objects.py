@@ -16,13 +16,13 @@ class Part:
     mesh: Mesh
     texture: str
 
-    def placed(self, position_m: Vector, yaw_deg: float) -> Part:
+    def place(self, position_m: Vector, yaw_deg: float) -> Part:
         """Turned about z, then moved."""
-        return Part(self.mesh.turned(float(np.radians(yaw_deg))).moved(position_m), self.texture)
+        return Part(self.mesh.rotate_z(float(np.radians(yaw_deg))).translate(position_m), self.texture)
 
-    def tipped(self, pitch_deg: float) -> Part:
+    def rotate_x(self, pitch_deg: float) -> Part:
         """Turned about x: a positive angle brings the front (-y) down."""
-        return Part(self.mesh.tipped(float(np.radians(pitch_deg))), self.texture)
+        return Part(self.mesh.rotate_x(float(np.radians(pitch_deg))), self.texture)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -34,6 +34,6 @@ class Item:
     is_room: bool = False
 
 
-def placed(parts: list[Part], position_m: Vector, yaw_deg: float = 0.0) -> list[Part]:
+def place_parts(parts: list[Part], position_m: Vector, yaw_deg: float = 0.0) -> list[Part]:
     """All parts turned about z, then moved."""
-    return [part.placed(position_m, yaw_deg) for part in parts]
+    return [part.place(position_m, yaw_deg) for part in parts]

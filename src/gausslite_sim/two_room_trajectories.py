@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from gausslite_sim.layout import TABLE_CENTRE_M
-from gausslite_sim.walks import Walk, looking, walk_through
+from gausslite_sim.trajectory import Trajectory, look_at_poses, spline_trajectory
+from gausslite_sim.two_room_layout import TABLE_CENTRE_M
 
 _CX, _CY = TABLE_CENTRE_M
 
@@ -48,8 +48,12 @@ def _round_the_table(frames: int) -> Float64[ndarray, "n 4 4"]:
     a = 2 * np.pi * np.arange(frames) / frames - 0.5 * np.pi
     eyes = np.stack([_CX + 1.5 * np.cos(a), _CY + 1.3 * np.sin(a), 1.42 + 0.12 * np.sin(3 * a)], axis=1)
     targets = np.stack([_CX + 0.25 * np.sin(2 * a), _CY + 0.12 * np.cos(3 * a), 0.72 + 0.08 * np.cos(2 * a)], axis=1)
-    return looking(eyes, targets)
+    return look_at_poses(eyes, targets)
 
 
-WALKS: tuple[Walk, ...] = (_round_the_table, walk_through(_KITCHEN_TO_LIVING), walk_through(_HELD_OUT))
+TRAJECTORIES: tuple[Trajectory, ...] = (
+    _round_the_table,
+    spline_trajectory(_KITCHEN_TO_LIVING),
+    spline_trajectory(_HELD_OUT),
+)
 """0: agent A round the table. 1: agent B past the chairs to the living room. 2: held-out views off both paths."""

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gausslite_sim import layout, trajectories
+from gausslite_sim import two_room_layout, two_room_trajectories
+from gausslite_sim.home_plan import HomePlan
 from gausslite_sim.homes import (
     bedroom,
     kitchen_diner,
@@ -18,12 +19,11 @@ from gausslite_sim.homes import (
     study,
     workshop,
 )
-from gausslite_sim.items import Item
 from gausslite_sim.lighting import Lighting
 from gausslite_sim.materials import Painter, paint
-from gausslite_sim.plan import HomePlan
+from gausslite_sim.scene_objects import Item
 from gausslite_sim.sensor_noise import SensorNoise
-from gausslite_sim.walks import Key, walk_through
+from gausslite_sim.trajectory import Waypoint, spline_trajectory
 
 _EXPOSURE_DRIFT = 0.12
 _SENSOR = SensorNoise(dark_loss=0.55, gloss_loss=0.5)
@@ -36,11 +36,11 @@ class Home:
     furnish: Callable[[np.random.Generator], Sequence[Item]]
     painters: Callable[[], dict[str, Painter]]
     lighting: Lighting
-    walks: Sequence[Sequence[Key]]
+    trajectories: Sequence[Sequence[Waypoint]]
 
 
 HOMES = tuple(
-    Home(module.furnish, module.painters, module.LIGHTING, module.WALKS)
+    Home(module.furnish, module.painters, module.LIGHTING, module.TRAJECTORIES)
     for module in (
         living_room,
         bedroom,
@@ -55,11 +55,13 @@ HOMES = tuple(
 HOME_COUNT = len(HOMES)
 
 
-def home_plan(number: int, seed: int) -> HomePlan:
+def plan_home(number: int, seed: int) -> HomePlan:
     """The home of this number, 0 to HOME_COUNT; the seed shifts its things and grains its materials."""
     if number == 0:
-        textures = layout.paint_textures(seed)
-        return HomePlan(seed, layout.furnish(seed), textures, layout.LIGHTING, trajectories.WALKS)
+        textures = two_room_layout.paint_textures(seed)
+        return HomePlan(
+            seed, two_room_layout.furnish(seed), textures, two_room_layout.LIGHTING, two_room_trajectories.TRAJECTORIES
+        )
     home = HOMES[number - 1]
     items = home.furnish(np.random.default_rng([seed, number, 2]))
     used = {part.texture for item in items for part in item.parts}
@@ -68,7 +70,7 @@ def home_plan(number: int, seed: int) -> HomePlan:
         items,
         paint(home.painters(), used, seed),
         home.lighting,
-        tuple(walk_through(keys) for keys in home.walks),
+        tuple(spline_trajectory(keys) for keys in home.trajectories),
         _EXPOSURE_DRIFT,
         _SENSOR,
     )

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from gausslite_sim.items import Part
-from gausslite_sim.mesh import box, lathe, merged, panel, ring
+from gausslite_sim.mesh import box, lathe, merge_meshes, panel, ring
+from gausslite_sim.scene_objects import Part
 from gausslite_sim.shapes import ball, blade, rods, shell, tube
 
 
@@ -13,8 +13,8 @@ def cup(picture: str) -> list[Part]:
     """A printed mug, 9.5 cm high, with a handle at +x."""
     outside = lathe([(0.036, 0.0), (0.04, 0.01), (0.041, 0.095)], fit=True)
     inside = lathe([(0.041, 0.095), (0.037, 0.095), (0.034, 0.01), (0.0005, 0.01)])
-    handle = ring(0.028, 0.006, -np.pi / 2, np.pi / 2).moved((0.038, 0, 0.05))
-    return [Part(outside, picture), Part(merged([inside, handle]), "glaze")]
+    handle = ring(0.028, 0.006, -np.pi / 2, np.pi / 2).translate((0.038, 0, 0.05))
+    return [Part(outside, picture), Part(merge_meshes([inside, handle]), "glaze")]
 
 
 def bottle(label: str, glass: str, height_m: float = 0.3) -> list[Part]:
@@ -42,16 +42,16 @@ def round_vase(picture: str) -> list[Part]:
         a, lean = 2.4 * i, 0.05 + 0.02 * (i % 4)
         tip = (lean * float(np.cos(a)) * 2.2, lean * float(np.sin(a)) * 2.2, 0.5 + 0.04 * (i % 3))
         twigs.append(tube([(0, 0, 0.12), (0.4 * tip[0], 0.4 * tip[1], 0.34), tip], 0.0025, 5))
-        twigs.append(ball(0.013, 1.3, 8).moved(tip))
-    return [Part(lathe(profile, smooth=True, fit=True), picture), Part(merged(twigs), "straw")]
+        twigs.append(ball(0.013, 1.3, 8).translate(tip))
+    return [Part(lathe(profile, smooth=True, fit=True), picture), Part(merge_meshes(twigs), "straw")]
 
 
 def teapot(colour: str) -> list[Part]:
     """Round, with a spout, a lid and a handle."""
     body = lathe([(0.05, 0), (0.085, 0.04), (0.09, 0.08), (0.06, 0.13), (0.02, 0.145), (0.0005, 0.146)], smooth=True)
     spout = tube([(0.075, 0, 0.05), (0.12, 0, 0.08), (0.14, 0, 0.13)], 0.013)
-    handle = ring(0.05, 0.007, np.pi / 2, 3 * np.pi / 2).moved((-0.075, 0, 0.08))
-    return [Part(merged([body, spout, handle, ball(0.014).moved((0, 0, 0.155))]), colour)]
+    handle = ring(0.05, 0.007, np.pi / 2, 3 * np.pi / 2).translate((-0.075, 0, 0.08))
+    return [Part(merge_meshes([body, spout, handle, ball(0.014).translate((0, 0, 0.155))]), colour)]
 
 
 def fruit_bowl(glaze: str, fruit: tuple[str, ...]) -> list[Part]:
@@ -61,7 +61,7 @@ def fruit_bowl(glaze: str, fruit: tuple[str, ...]) -> list[Part]:
     for i, texture in enumerate(fruit):
         a, r = 2.4 * i, 0.028 * np.sqrt(i)
         spot = (float(r * np.cos(a)), float(r * np.sin(a)), 0.075 + 0.02 * (i % 2) + (0.03 if i == 0 else 0.0))
-        parts.append(Part(ball(0.038, 0.95, 14).moved(spot), texture))
+        parts.append(Part(ball(0.038, 0.95, 14).translate(spot), texture))
     return parts
 
 
@@ -74,9 +74,9 @@ def plate(glaze: str) -> list[Part]:
 def pot(colour: str) -> list[Part]:
     """A cooking pot with a lid and two handles."""
     body = lathe([(0.0005, 0), (0.11, 0.0), (0.115, 0.14), (0.118, 0.142), (0.05, 0.16), (0.0005, 0.162)])
-    handles = [ring(0.03, 0.006, -np.pi / 2, np.pi / 2).moved((0.112, 0, 0.1))]
-    handles.append(ring(0.03, 0.006, np.pi / 2, 3 * np.pi / 2).moved((-0.112, 0, 0.1)))
-    return [Part(body, colour), Part(merged([*handles, ball(0.016).moved((0, 0, 0.175))]), "black_plastic")]
+    handles = [ring(0.03, 0.006, -np.pi / 2, np.pi / 2).translate((0.112, 0, 0.1))]
+    handles.append(ring(0.03, 0.006, np.pi / 2, 3 * np.pi / 2).translate((-0.112, 0, 0.1)))
+    return [Part(body, colour), Part(merge_meshes([*handles, ball(0.016).translate((0, 0, 0.175))]), "black_plastic")]
 
 
 def jar(label: str) -> list[Part]:
@@ -91,15 +91,15 @@ def basket(weave: str, filling: str, radius_m: float = 0.2, height_m: float = 0.
     heap = lathe(
         [(0.92 * radius_m, 0.8 * height_m), (0.6 * radius_m, 1.08 * height_m), (0.0005, 1.12 * height_m)], smooth=True
     )
-    grips = [ring(0.06, 0.012, 0, np.pi).moved((0, s * radius_m, height_m - 0.01)) for s in (-1, 1)]
-    return [Part(merged([side, *grips]), weave), Part(heap, filling)]
+    grips = [ring(0.06, 0.012, 0, np.pi).translate((0, s * radius_m, height_m - 0.01)) for s in (-1, 1)]
+    return [Part(merge_meshes([side, *grips]), weave), Part(heap, filling)]
 
 
 def shoes(upper: str, sole: str = "white_plastic") -> list[Part]:
     """A pair that somebody stepped out of."""
     parts = []
     for x, y, yaw in ((-0.065, 0.0, 4), (0.07, -0.05, -15)):
-        top = shell(0.28, 0.1, (0.09, 0.105, 0.1, 0.075, 0.055, 0.05, 0.03)).moved((0, 0, 0.022))
+        top = shell(0.28, 0.1, (0.09, 0.105, 0.1, 0.075, 0.055, 0.05, 0.03)).translate((0, 0, 0.022))
         foot = shell(0.29, 0.106, (0.03, 0.03, 0.03, 0.03, 0.03, 0.03, 0.02))
         laces = rods(
             [
@@ -108,7 +108,7 @@ def shoes(upper: str, sole: str = "white_plastic") -> list[Part]:
             ],
             0.003,
         )
-        parts += [Part(top, upper).placed((x, y, 0), yaw), Part(merged([foot, laces]), sole).placed((x, y, 0), yaw)]
+        parts += [Part(top, upper).place((x, y, 0), yaw), Part(merge_meshes([foot, laces]), sole).place((x, y, 0), yaw)]
     return parts
 
 
@@ -129,16 +129,18 @@ def pen_cup(colour: str) -> list[Part]:
 
 def desk_clock(face: str) -> list[Part]:
     """A round alarm clock on two feet."""
-    case = lathe([(0.0005, 0.0), (0.06, 0.0), (0.06, 0.05), (0.052, 0.05)]).tipped(np.pi / 2).moved((0, 0.02, 0.075))
+    case = (
+        lathe([(0.0005, 0.0), (0.06, 0.0), (0.06, 0.05), (0.052, 0.05)]).rotate_x(np.pi / 2).translate((0, 0.02, 0.075))
+    )
     dial = panel((-0.054, -0.0305, 0.129), (0.108, 0, 0), (0, 0, -0.108), fit=True)
     feet = rods([((-0.04, 0, 0.03), (-0.055, 0, 0)), ((0.04, 0, 0.03), (0.055, 0, 0))], 0.005)
-    bells = [ball(0.02, 0.7, 12).moved((x, 0, 0.14)) for x in (-0.03, 0.03)]
-    return [Part(merged([case, feet, *bells]), "brass"), Part(dial, face)]
+    bells = [ball(0.02, 0.7, 12).translate((x, 0, 0.14)) for x in (-0.03, 0.03)]
+    return [Part(merge_meshes([case, feet, *bells]), "brass"), Part(dial, face)]
 
 
 def wall_clock(face: str) -> list[Part]:
     """A round clock on a wall at y = 0, its centre at z = 0."""
-    rim = lathe([(0.0005, 0.0), (0.17, 0.0), (0.17, 0.04), (0.155, 0.04)]).tipped(np.pi / 2)
+    rim = lathe([(0.0005, 0.0), (0.17, 0.0), (0.17, 0.04), (0.155, 0.04)]).rotate_x(np.pi / 2)
     return [
         Part(rim, "black_plastic"),
         Part(panel((-0.125, -0.0385, 0.125), (0.25, 0, 0), (0, 0, -0.25), fit=True), face),
@@ -149,10 +151,10 @@ def candles() -> list[Part]:
     """Three on a tray."""
     tray = lathe([(0.0005, 0), (0.12, 0), (0.125, 0.012), (0.118, 0.008), (0.0005, 0.008)])
     sticks = [
-        lathe([(r, 0.008), (r, h), (0.0005, h + 0.004)], sectors=16).moved((x, y, 0))
+        lathe([(r, 0.008), (r, h), (0.0005, h + 0.004)], sectors=16).translate((x, y, 0))
         for x, y, r, h in ((-0.05, 0.02, 0.03, 0.14), (0.045, 0.03, 0.034, 0.09), (0.01, -0.055, 0.026, 0.19))
     ]
-    return [Part(tray, "brass"), Part(merged(sticks), "wax")]
+    return [Part(tray, "brass"), Part(merge_meshes(sticks), "wax")]
 
 
 def sheaf(picture: str, width_m: float = 0.21, length_m: float = 0.297, height_m: float = 0.012) -> list[Part]:
@@ -169,13 +171,13 @@ def crate(wood: str, width_m: float = 0.5, depth_m: float = 0.35, height_m: floa
     for z in np.linspace(0.02, height_m - 0.07, 3).tolist():
         slats += [box((-x, s * y - 0.006, z), (x, s * y + 0.006, z + 0.065)) for s in (-1, 1)]
         slats += [box((s * x - 0.006, -y, z), (s * x + 0.006, y, z + 0.065)) for s in (-1, 1)]
-    return [Part(merged(slats), wood)]
+    return [Part(merge_meshes(slats), wood)]
 
 
 def bucket(colour: str) -> list[Part]:
     """A pail with a wire handle."""
     pail = lathe([(0.1, 0), (0.14, 0.27), (0.145, 0.27), (0.135, 0.26), (0.1, 0.01), (0.0005, 0.01)])
-    return [Part(pail, colour), Part(ring(0.14, 0.004, 0.1, np.pi - 0.1).moved((0, 0, 0.26)), "steel")]
+    return [Part(pail, colour), Part(ring(0.14, 0.004, 0.1, np.pi - 0.1).translate((0, 0, 0.26)), "steel")]
 
 
 def paint_can(label: str) -> list[Part]:
@@ -189,11 +191,11 @@ def snake_plant(potting: str, leaf: str) -> list[Part]:
     pot_profile = [(0.09, 0), (0.12, 0.2), (0.125, 0.22), (0.11, 0.22), (0.105, 0.19), (0.0005, 0.19)]
     blades = [
         blade(0.45 + 0.12 * (i % 4), 0.055, 0.06 + 0.03 * (i % 3), 0.6)
-        .turned(2.4 * i)
-        .moved((0.05 * float(np.cos(2.4 * i)), 0.05 * float(np.sin(2.4 * i)), 0.18))
+        .rotate_z(2.4 * i)
+        .translate((0.05 * float(np.cos(2.4 * i)), 0.05 * float(np.sin(2.4 * i)), 0.18))
         for i in range(14)
     ]
-    return [Part(lathe(pot_profile), potting), Part(merged(blades), leaf)]
+    return [Part(lathe(pot_profile), potting), Part(merge_meshes(blades), leaf)]
 
 
 def fern(potting: str, leaf: str, size: float = 1.0) -> list[Part]:
@@ -202,9 +204,9 @@ def fern(potting: str, leaf: str, size: float = 1.0) -> list[Part]:
     for i in range(30):
         reach = size * (0.16 + 0.03 * (i % 5))
         frond = blade(size * (0.16 + 0.035 * (i % 4)), size * 0.045, reach, 0.4)
-        fronds.append(frond.turned(2.39996 * i).moved((0, 0, 0.11 * size)))
+        fronds.append(frond.rotate_z(2.39996 * i).translate((0, 0, 0.11 * size)))
     profile = [(0.06 * size, 0), (0.08 * size, 0.12 * size), (0.07 * size, 0.12 * size), (0.0005, 0.1 * size)]
-    return [Part(lathe(profile), potting), Part(merged(fronds), leaf)]
+    return [Part(lathe(profile), potting), Part(merge_meshes(fronds), leaf)]
 
 
 def little_tree(potting: str, leaf: str) -> list[Part]:
@@ -217,10 +219,14 @@ def little_tree(potting: str, leaf: str) -> list[Part]:
     tips = ((0.28, 0.1, 1.2), (-0.25, 0.18, 1.35), (0.05, -0.28, 1.4), (0.0, 0.0, 1.5), (0.1, 0.1, 1.32))
     leaves = [
         blade(0.13 + 0.03 * (i % 3), 0.07, 0.12, 0.5)
-        .turned(2.4 * i + k)
-        .moved((x + 0.07 * float(np.cos(3.1 * i)), y + 0.07 * float(np.sin(3.1 * i)), z - 0.12 + 0.02 * (i % 9)))
+        .rotate_z(2.4 * i + k)
+        .translate((x + 0.07 * float(np.cos(3.1 * i)), y + 0.07 * float(np.sin(3.1 * i)), z - 0.12 + 0.02 * (i % 9)))
         for k, (x, y, z) in enumerate(tips)
         for i in range(16)
     ]
     profile = [(0.13, 0), (0.17, 0.28), (0.18, 0.3), (0.16, 0.3), (0.15, 0.26), (0.0005, 0.26)]
-    return [Part(lathe(profile), potting), Part(merged([trunk, *branches]), "bark"), Part(merged(leaves), leaf)]
+    return [
+        Part(lathe(profile), potting),
+        Part(merge_meshes([trunk, *branches]), "bark"),
+        Part(merge_meshes(leaves), leaf),
+    ]

@@ -1,4 +1,4 @@
-"""Pictures that are fitted to one face: covers, labels, screens, doors. Drawn once, from seeded colours."""
+"""Textures fitted to one face: covers, labels, screens, doors; painted once with seeded random colours."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import UInt8
 from numpy import ndarray
 
-from gausslite_sim.textures import SIDE_PX, Colour, Texture, grain, noise, tinted, wood
+from gausslite_sim.textures import SIDE_PX, Colour, Texture, grain, noise, tint, wood
 
 Picture = UInt8[ndarray, "s s 3"]
 _Ink = tuple[int, int, int]
@@ -17,7 +17,7 @@ _WORDS = ("ATLAS", "SOUP", "RIVER", "GARDEN", "NORTH", "CLAY", "STARS", "BREAD",
 
 def mug_print(rng: np.random.Generator) -> Texture:
     """White glaze with bands, dots and a word twice round."""
-    picture = tinted(0.9 + 0.14 * grain(rng), (0.93, 0.92, 0.88))
+    picture = tint(0.9 + 0.14 * grain(rng), (0.93, 0.92, 0.88))
     cv2.rectangle(picture, (0, 60), (SIDE_PX, 130), (196, 40, 44), -1)
     cv2.rectangle(picture, (0, 400), (SIDE_PX, 452), (28, 78, 150), -1)
     for i in range(16):
@@ -30,7 +30,7 @@ def mug_print(rng: np.random.Generator) -> Texture:
 
 def vase_print(rng: np.random.Generator) -> Texture:
     """Blue bands, waves and petals on white."""
-    picture = tinted(0.9 + 0.12 * grain(rng), (0.9, 0.93, 0.96))
+    picture = tint(0.9 + 0.12 * grain(rng), (0.9, 0.93, 0.96))
     blue = (34, 62, 140)
     for y in (40, 210, 380, 470):
         cv2.rectangle(picture, (0, y), (SIDE_PX, y + 14), blue, -1)
@@ -45,7 +45,7 @@ def vase_print(rng: np.random.Generator) -> Texture:
 
 def book_cover(rng: np.random.Generator, colour: Colour) -> Texture:
     """A framed title and an emblem on cloth."""
-    picture = tinted(0.78 + 0.4 * grain(rng), colour)
+    picture = tint(0.78 + 0.4 * grain(rng), colour)
     gold = (232, 200, 110)
     cv2.rectangle(picture, (36, 36), (SIDE_PX - 36, SIDE_PX - 36), gold, 6)
     _write(picture, str(rng.choice(_WORDS)), (70, 150), 2.2, gold, 6)
@@ -95,7 +95,7 @@ def television(rng: np.random.Generator) -> Texture:
 
 def painting(rng: np.random.Generator) -> Texture:
     """Overlapping discs and bars with a wooden frame."""
-    picture = tinted(0.8 + 0.35 * grain(rng), (0.92, 0.87, 0.74))
+    picture = tint(0.8 + 0.35 * grain(rng), (0.92, 0.87, 0.74))
     for _ in range(26):
         x, y = (int(value) for value in rng.integers(40, SIDE_PX - 40, 2))
         ink, size = _ink(rng.integers(20, 240, 3)), int(rng.integers(14, 74))
@@ -112,7 +112,7 @@ def painting(rng: np.random.Generator) -> Texture:
 
 def newspaper(rng: np.random.Generator) -> Texture:
     """A headline, a photograph and columns of small print."""
-    picture = tinted(0.86 + 0.2 * grain(rng), (0.9, 0.89, 0.84))
+    picture = tint(0.86 + 0.2 * grain(rng), (0.9, 0.89, 0.84))
     _write(picture, "THE MORNING", (24, 70), 2.2, (20, 20, 20), 6)
     cv2.line(picture, (20, 90), (492, 90), (20, 20, 20), 4)
     photo = (60 + 150 * noise(rng, 32, 32)[:170, :220]).astype(np.uint8)
@@ -125,7 +125,7 @@ def newspaper(rng: np.random.Generator) -> Texture:
 
 def carton(rng: np.random.Generator, colour: Colour, word: str) -> Texture:
     """A cardboard side with tape, a label, arrows and a bar code."""
-    picture = tinted(0.72 + 0.5 * grain(rng), colour)
+    picture = tint(0.72 + 0.5 * grain(rng), colour)
     cv2.rectangle(picture, (0, 226), (SIDE_PX, 274), (206, 184, 140), -1)
     _write(picture, word, (36, 130), 2.6, (150, 26, 24), 9)
     cv2.rectangle(picture, (40, 316), (280, 470), (240, 240, 236), -1)
@@ -156,7 +156,7 @@ def panelled(rng: np.random.Generator, colour: Colour, columns: int, rows: int) 
 
 def fridge_front(rng: np.random.Generator) -> Texture:
     """Two steel doors with notes and magnets."""
-    picture = tinted(0.86 + 0.16 * noise(rng, 512, 8), (0.78, 0.8, 0.82))
+    picture = tint(0.86 + 0.16 * noise(rng, 512, 8), (0.78, 0.8, 0.82))
     cv2.rectangle(picture, (0, 168), (SIDE_PX, 178), (40, 42, 46), -1)
     for top, bottom in ((60, 150), (200, 340)):
         cv2.rectangle(picture, (446, top), (470, bottom), (70, 74, 80), -1)
@@ -213,7 +213,7 @@ def rug(rng: np.random.Generator, colour: Colour) -> Texture:
 
 def leaf_veins(rng: np.random.Generator) -> Texture:
     """A green leaf with a midrib and side veins."""
-    picture = tinted(0.6 + 0.7 * grain(rng), (0.22, 0.5, 0.2))
+    picture = tint(0.6 + 0.7 * grain(rng), (0.22, 0.5, 0.2))
     pale = (150, 196, 110)
     cv2.line(picture, (256, 0), (256, 511), pale, 16, cv2.LINE_AA)
     for y in range(40, 560, 52):

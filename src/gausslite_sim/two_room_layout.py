@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from gausslite_sim import furniture, prints, textures
-from gausslite_sim.items import Item, Part, placed
+from gausslite_sim import furniture, printed_textures, textures
 from gausslite_sim.lighting import Lamp, Lighting
-from gausslite_sim.mesh import Vector, box, merged
+from gausslite_sim.mesh import Vector, box, merge_meshes
+from gausslite_sim.scene_objects import Item, Part, place_parts
 from gausslite_sim.textures import Texture
 
 KITCHEN_END_M, LIVING_START_M, LENGTH_M = 4.2, 4.3, 8.1
@@ -57,27 +57,27 @@ def _materials(rng: np.random.Generator) -> dict[str, Texture]:
 def _pictures(rng: np.random.Generator) -> dict[str, Texture]:
     """What is fitted to a face."""
     return {
-        "mug_print": prints.mug_print(rng),
-        "vase_print": prints.vase_print(rng),
-        "cover_red": prints.book_cover(rng, (0.62, 0.16, 0.16)),
-        "cover_blue": prints.book_cover(rng, (0.14, 0.26, 0.50)),
-        "cover_green": prints.book_cover(rng, (0.14, 0.38, 0.24)),
-        "book_row": prints.book_row(rng),
-        "screen": prints.television(rng),
-        "painting_1": prints.painting(rng),
-        "painting_2": prints.painting(rng),
-        "cushion": prints.rug(rng, (0.16, 0.44, 0.42)),
-        "newspaper": prints.newspaper(rng),
-        "carton": prints.carton(rng, (0.72, 0.54, 0.34), "FRAGILE"),
-        "cereal": prints.carton(rng, (0.95, 0.74, 0.18), "CRUNCH"),
-        "doors": prints.panelled(rng, (0.84, 0.72, 0.52), 2, 1),
-        "drawers": prints.panelled(rng, (0.58, 0.38, 0.24), 2, 2),
-        "door": prints.panelled(rng, (0.88, 0.84, 0.76), 1, 2),
-        "fridge": prints.fridge_front(rng),
-        "window": prints.window_view(rng),
-        "calendar": prints.calendar(rng),
-        "rug": prints.rug(rng, (0.62, 0.16, 0.14)),
-        "leaf": prints.leaf_veins(rng),
+        "mug_print": printed_textures.mug_print(rng),
+        "vase_print": printed_textures.vase_print(rng),
+        "cover_red": printed_textures.book_cover(rng, (0.62, 0.16, 0.16)),
+        "cover_blue": printed_textures.book_cover(rng, (0.14, 0.26, 0.50)),
+        "cover_green": printed_textures.book_cover(rng, (0.14, 0.38, 0.24)),
+        "book_row": printed_textures.book_row(rng),
+        "screen": printed_textures.television(rng),
+        "painting_1": printed_textures.painting(rng),
+        "painting_2": printed_textures.painting(rng),
+        "cushion": printed_textures.rug(rng, (0.16, 0.44, 0.42)),
+        "newspaper": printed_textures.newspaper(rng),
+        "carton": printed_textures.carton(rng, (0.72, 0.54, 0.34), "FRAGILE"),
+        "cereal": printed_textures.carton(rng, (0.95, 0.74, 0.18), "CRUNCH"),
+        "doors": printed_textures.panelled(rng, (0.84, 0.72, 0.52), 2, 1),
+        "drawers": printed_textures.panelled(rng, (0.58, 0.38, 0.24), 2, 2),
+        "door": printed_textures.panelled(rng, (0.88, 0.84, 0.76), 1, 2),
+        "fridge": printed_textures.fridge_front(rng),
+        "window": printed_textures.window_view(rng),
+        "calendar": printed_textures.calendar(rng),
+        "rug": printed_textures.rug(rng, (0.62, 0.16, 0.14)),
+        "leaf": printed_textures.leaf_veins(rng),
     }
 
 
@@ -107,7 +107,7 @@ def _rooms() -> list[Item]:
             box((partition[0], low, DOORWAY_HEIGHT_M), (partition[1], high, HEIGHT_M)),
         ]
         items += [
-            Item(f"{name}_walls", [Part(merged(walls), paper)], is_room=True),
+            Item(f"{name}_walls", [Part(merge_meshes(walls), paper)], is_room=True),
             Item(f"{name}_floor", [Part(box((left, 0, -thick), (right, WIDTH_M, 0)), floor)], is_room=True),
             Item(
                 f"{name}_ceiling",
@@ -125,9 +125,9 @@ def _dining(rng: np.random.Generator) -> list[Item]:
     def on_table(name: str, parts: list[Part], dx: float, dy: float, yaw_deg: float) -> Item:
         shift = rng.uniform(-0.03, 0.03, 2)
         position = (x + dx + shift[0], y + dy + shift[1], TABLE_TOP_M)
-        return _placed(name, parts, position, yaw_deg + rng.uniform(-15, 15))
+        return _item_at(name, parts, position, yaw_deg + rng.uniform(-15, 15))
 
-    items = [_placed("table", furniture.table(), (x, y, 0), 0)]
+    items = [_item_at("table", furniture.table(), (x, y, 0), 0)]
     for name, dx, dy, yaw_deg in (
         ("chair_1", -0.32, -0.62, 180),
         ("chair_2", 0.36, 0.64, 0),
@@ -135,7 +135,7 @@ def _dining(rng: np.random.Generator) -> list[Item]:
     ):
         shift = rng.uniform(-0.03, 0.03, 2)
         turn = yaw_deg + rng.uniform(-10, 10)
-        items.append(_placed(name, furniture.chair(), (x + dx + shift[0], y + dy + shift[1], 0), turn))
+        items.append(_item_at(name, furniture.chair(), (x + dx + shift[0], y + dy + shift[1], 0), turn))
     return [
         *items,
         on_table("mug", furniture.mug(), 0.34, -0.20, -60),
@@ -149,35 +149,35 @@ def _dining(rng: np.random.Generator) -> list[Item]:
 def _kitchen() -> list[Item]:
     back = WIDTH_M
     return [
-        _placed("fridge", furniture.cupboard((0.62, 0.62, 1.75), "fridge", "steel"), (0.33, back, 0), 0),
-        _placed("counter", furniture.cupboard((2.4, 0.58, 0.85), "doors", "oak", 3, "worktop"), (1.9, back, 0), 0),
-        _placed("cupboard", furniture.cupboard((1.8, 0.34, 0.62), "doors", "oak", 2), (1.6, back, 1.5), 0),
-        _placed("kettle", furniture.kettle(), (1.2, back - 0.3, _WORKTOP_M), 30),
-        _placed("cereal", furniture.carton("cereal", 0.2, 0.07, 0.3), (1.75, back - 0.25, _WORKTOP_M), 12),
-        _placed("mug_2", furniture.mug(), (2.25, back - 0.36, _WORKTOP_M), 200),
-        _placed("window", furniture.flat_picture("window", 1.3, 1.1, 0.05), (0, 2.2, 1.0), 90),
-        _placed("door", furniture.flat_picture("door", 0.85, 2.05), (0.9, 0, 0), 180),
-        _placed("calendar", furniture.flat_picture("calendar", 0.42, 0.55, 0.008), (2.0, 0, 1.25), 180),
-        _placed("picture_1", furniture.flat_picture("painting_1", 0.7, 0.7), (3.1, 0, 1.2), 180),
+        _item_at("fridge", furniture.cupboard((0.62, 0.62, 1.75), "fridge", "steel"), (0.33, back, 0), 0),
+        _item_at("counter", furniture.cupboard((2.4, 0.58, 0.85), "doors", "oak", 3, "worktop"), (1.9, back, 0), 0),
+        _item_at("cupboard", furniture.cupboard((1.8, 0.34, 0.62), "doors", "oak", 2), (1.6, back, 1.5), 0),
+        _item_at("kettle", furniture.kettle(), (1.2, back - 0.3, _WORKTOP_M), 30),
+        _item_at("cereal", furniture.carton("cereal", 0.2, 0.07, 0.3), (1.75, back - 0.25, _WORKTOP_M), 12),
+        _item_at("mug_2", furniture.mug(), (2.25, back - 0.36, _WORKTOP_M), 200),
+        _item_at("window", furniture.flat_picture("window", 1.3, 1.1, 0.05), (0, 2.2, 1.0), 90),
+        _item_at("door", furniture.flat_picture("door", 0.85, 2.05), (0.9, 0, 0), 180),
+        _item_at("calendar", furniture.flat_picture("calendar", 0.42, 0.55, 0.008), (2.0, 0, 1.25), 180),
+        _item_at("picture_1", furniture.flat_picture("painting_1", 0.7, 0.7), (3.1, 0, 1.2), 180),
     ]
 
 
 def _living(rng: np.random.Generator) -> list[Item]:
     back = WIDTH_M
     return [
-        _placed("sofa", furniture.sofa(), (6.3, 0.46, 0), 180),
-        _placed("picture_2", furniture.flat_picture("painting_2", 0.9, 0.9), (6.3, 0, 1.15), 180),
-        _placed("rug", furniture.lying_sheet("rug", 2.0, 1.5, 0.008), (6.3, 2.0, 0), 0),
-        _placed("stool", furniture.stool(), (6.9 + rng.uniform(-0.05, 0.05), 1.6, 0.008), 20),
-        _placed("cabinet", furniture.cupboard((1.5, 0.42, 0.52), "drawers", "walnut", 2, "walnut"), (6.3, back, 0), 0),
-        _placed("tv", furniture.television(), (6.3, back - 0.2, 0.555), 0),
-        _placed("shelf", furniture.shelf(), (LENGTH_M, 2.2, 0), -90),
-        _placed("plant", furniture.plant(), (7.65, 4.05, 0), 0),
-        _placed("lamp", furniture.lamp(), (7.7, 0.42, 0), 0),
-        _placed("chair_4", furniture.chair(), (4.95, 3.75, 0), 35 + rng.uniform(-10, 10)),
-        _placed("box", furniture.carton("carton", 0.5, 0.4, 0.36), (4.75, 0.55, 0), 15),
+        _item_at("sofa", furniture.sofa(), (6.3, 0.46, 0), 180),
+        _item_at("picture_2", furniture.flat_picture("painting_2", 0.9, 0.9), (6.3, 0, 1.15), 180),
+        _item_at("rug", furniture.lying_sheet("rug", 2.0, 1.5, 0.008), (6.3, 2.0, 0), 0),
+        _item_at("stool", furniture.stool(), (6.9 + rng.uniform(-0.05, 0.05), 1.6, 0.008), 20),
+        _item_at("cabinet", furniture.cupboard((1.5, 0.42, 0.52), "drawers", "walnut", 2, "walnut"), (6.3, back, 0), 0),
+        _item_at("tv", furniture.television(), (6.3, back - 0.2, 0.555), 0),
+        _item_at("shelf", furniture.shelf(), (LENGTH_M, 2.2, 0), -90),
+        _item_at("plant", furniture.plant(), (7.65, 4.05, 0), 0),
+        _item_at("lamp", furniture.lamp(), (7.7, 0.42, 0), 0),
+        _item_at("chair_4", furniture.chair(), (4.95, 3.75, 0), 35 + rng.uniform(-10, 10)),
+        _item_at("box", furniture.carton("carton", 0.5, 0.4, 0.36), (4.75, 0.55, 0), 15),
     ]
 
 
-def _placed(name: str, parts: list[Part], position_m: Vector, yaw_deg: float) -> Item:
-    return Item(name, placed(parts, position_m, yaw_deg))
+def _item_at(name: str, parts: list[Part], position_m: Vector, yaw_deg: float) -> Item:
+    return Item(name, place_parts(parts, position_m, yaw_deg))

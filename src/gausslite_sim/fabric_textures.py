@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy import ndarray
 
-from gausslite_sim.textures import SIDE_PX, Colour, Shade, Texture, grain, noise, tinted
+from gausslite_sim.textures import SIDE_PX, Colour, Shade, Texture, grain, noise, tint
 
 _Y, _X = np.mgrid[0:SIDE_PX, 0:SIDE_PX]
 
@@ -17,7 +17,7 @@ def knit(rng: np.random.Generator, colour: Colour, repeat_m: float = 0.25) -> Te
     slant = np.where(column < 16, _Y + 0.9 * column, _Y + 0.9 * (32 - column))
     stitch = 0.5 + 0.5 * np.sin(2 * np.pi * slant / 32)
     groove = 0.6 + 0.4 * np.abs(np.sin(np.pi * _X / 16))
-    return Texture(tinted((0.45 + 0.55 * stitch) * groove + 0.25 * (grain(rng) - 0.4), colour), repeat_m)
+    return Texture(tint((0.45 + 0.55 * stitch) * groove + 0.25 * (grain(rng) - 0.4), colour), repeat_m)
 
 
 def stripes(rng: np.random.Generator, ground: Colour, lines: tuple[Colour, ...]) -> Texture:
@@ -56,7 +56,7 @@ def carpet(rng: np.random.Generator, colour: Colour, speck: Colour) -> Texture:
     ribs = np.where(((_X // 256) + (_Y // 256)) % 2 == 0, _X, _Y) % 8 < 4
     shade = 0.62 + 0.14 * ribs + 0.5 * (grain(rng) - 0.3)
     specks = (noise(rng, 256, 256) > 0.86)[..., None]
-    return Texture(np.where(specks, tinted(shade + 0.2, speck), tinted(shade, colour)), 1.0)
+    return Texture(np.where(specks, tint(shade + 0.2, speck), tint(shade, colour)), 1.0)
 
 
 def parquet(rng: np.random.Generator, colour: Colour, gloss: float = 0.05) -> Texture:
@@ -71,7 +71,7 @@ def parquet(rng: np.random.Generator, colour: Colour, gloss: float = 0.05) -> Te
     shade = tones[board % 64, (board // 64 + along_x * 3) % 64]
     streak = np.where(along_x, noise(rng, 128, 8), noise(rng, 8, 128))
     joint = np.where(along_x, _Y % half < 2, _X % half < 2)
-    return Texture(tinted((shade * (0.75 + 0.4 * streak)) * np.where(joint, 0.5, 1.0), colour), 1.2, gloss)
+    return Texture(tint((shade * (0.75 + 0.4 * streak)) * np.where(joint, 0.5, 1.0), colour), 1.2, gloss)
 
 
 def brick(rng: np.random.Generator, colour: Colour) -> Texture:
@@ -89,41 +89,41 @@ def basket_weave(rng: np.random.Generator, colour: Colour) -> Texture:
     over = ((_X // 32) + (_Y // 32)) % 2 == 0
     bulge = np.where(over, np.sin(np.pi * (_X % 32) / 32), np.sin(np.pi * (_Y % 32) / 32))
     strands = np.where(over, _Y % 8 < 2, _X % 8 < 2)
-    return Texture(tinted((0.35 + 0.75 * bulge) * np.where(strands, 0.6, 1.0) * (0.8 + 0.4 * grain(rng)), colour), 0.22)
+    return Texture(tint((0.35 + 0.75 * bulge) * np.where(strands, 0.6, 1.0) * (0.8 + 0.4 * grain(rng)), colour), 0.22)
 
 
 def net(rng: np.random.Generator, colour: Colour) -> Texture:
     """The mesh of an office chair."""
     holes = (np.hypot(_X % 16 - 8, _Y % 16 - 8) < 4.5)[..., None]
     shade = 1.0 + 0.5 * (grain(rng) - 0.3)
-    return Texture(np.where(holes, tinted(0.35 * shade, colour), tinted(1.2 * shade, colour)), 0.16)
+    return Texture(np.where(holes, tint(0.35 * shade, colour), tint(1.2 * shade, colour)), 0.16)
 
 
 def marble(rng: np.random.Generator) -> Texture:
     """White stone with grey veins, polished."""
     bend = noise(rng, 4, 4) + 0.5 * noise(rng, 16, 16) + 0.2 * noise(rng, 64, 64)
     veins = np.exp(-(((bend - 0.85) / 0.035) ** 2)) + 0.5 * np.exp(-(((bend - 0.6) / 0.02) ** 2))
-    return Texture(tinted(1.0 - 0.45 * np.clip(veins, 0, 1) + 0.06 * grain(rng), (0.88, 0.87, 0.85)), 0.9, 0.16)
+    return Texture(tint(1.0 - 0.45 * np.clip(veins, 0, 1) + 0.06 * grain(rng), (0.88, 0.87, 0.85)), 0.9, 0.16)
 
 
 def concrete(rng: np.random.Generator) -> Texture:
     """A grey floor with stains and hair cracks."""
     stains = 0.75 + 0.35 * noise(rng, 8, 8) + 0.3 * (grain(rng) - 0.4)
     crack = np.exp(-(((noise(rng, 8, 4) + 0.2 * noise(rng, 64, 64) - 0.6) / 0.006) ** 2))
-    return Texture(tinted(stains * (1 - 0.5 * crack), (0.56, 0.55, 0.53)), 2.2)
+    return Texture(tint(stains * (1 - 0.5 * crack), (0.56, 0.55, 0.53)), 2.2)
 
 
 def striped_leaf(rng: np.random.Generator) -> Texture:
     """A stiff leaf with yellow margins and dark bands."""
     bands = 0.75 + 0.35 * np.sin(_Y / 12 + 6 * noise(rng, 16, 8))
-    rgb = tinted(bands * (0.8 + 0.3 * grain(rng)), (0.18, 0.36, 0.20))
+    rgb = tint(bands * (0.8 + 0.3 * grain(rng)), (0.18, 0.36, 0.20))
     margin = np.abs(_X - SIDE_PX / 2) > 190
-    return Texture(np.where(margin[..., None], tinted(0.9 + 0.1 * bands, (0.74, 0.72, 0.36)), rgb))
+    return Texture(np.where(margin[..., None], tint(0.9 + 0.1 * bands, (0.74, 0.72, 0.36)), rgb))
 
 
 def sneaker(rng: np.random.Generator, upper: Colour, trim: Colour) -> Texture:
     """The side of a shoe: seams, a stripe, a toe cap; u from one side over to the other, v from heel to toe."""
-    picture = tinted(0.7 + 0.4 * grain(rng), upper)
+    picture = tint(0.7 + 0.4 * grain(rng), upper)
     pale = tuple(int(255 * c) for c in trim)
     for x in (110, 402):
         for shift in (0, 50, 100):
