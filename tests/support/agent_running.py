@@ -27,9 +27,9 @@ from gausslite.wire.change_notifier import ChangeNotifier
 from gausslite.wire.clients import AgentClient
 from gausslite.wire.server import Service
 from gausslite.wire.uplink import Uplink
+from gausslite_agent.agent_mission import MissionState
 from gausslite_agent.load import LoadSettings
 from gausslite_agent.mapping_worker import MappingWorker
-from gausslite_agent.mission_runner import MissionState
 from gausslite_agent.servicer import AgentServicer
 
 SETTINGS = MissionSettings(max_gaussians=2000, iterations=2, threads=1)
@@ -73,7 +73,7 @@ def ball_attention(_graph: TaskGraph) -> RelevanceEstimator:
 
 @dataclass(frozen=True)
 class Agent:
-    robot: MappingWorker
+    worker: MappingWorker
     client: AgentClient
     stub: pb_grpc.AgentServiceStub
 
@@ -81,14 +81,14 @@ class Agent:
 @contextmanager
 def agent(attention: object = ball_attention, uplink: Uplink | None = None, queue_frames: int = 4) -> Iterator[Agent]:
     loops: list[asyncio.AbstractEventLoop] = []
-    bells: list[ChangeNotifier] = []
-    on_change = lambda: loops[0].call_soon_threadsafe(lambda: bells[0].notify())  # noqa: E731
-    robot = MappingWorker(SETTINGS, GRID, attention, uplink, on_change, LoadSettings(queue_frames))  # type: ignore[arg-type]
+    notifiers: list[ChangeNotifier] = []
+    on_change = lambda: loops[0].call_soon_threadsafe(lambda: notifiers[0].notify())  # noqa: E731
+    worker = MappingWorker(SETTINGS, GRID, attention, uplink, on_change, LoadSettings(queue_frames))  # type: ignore[arg-type]
 
     def register(server: grpc.aio.Server) -> None:
         loops.append(asyncio.get_running_loop())
-        bells.append(ChangeNotifier())
-        servicer = AgentServicer("robot", robot, RuleParser(), bells[0], lambda: MissionState.MAPPING)
+        notifiers.append(ChangeNotifier())
+        servicer = AgentServicer("robot", worker, RuleParser(), notifiers[0], lambda: MissionState.MAPPING)
         servicer.service().register(server)
 
     try:
@@ -97,6 +97,6 @@ def agent(attention: object = ball_attention, uplink: Uplink | None = None, queu
             AgentClient(running.address) as client,
             grpc.insecure_channel(running.address) as channel,
         ):
-            yield Agent(robot, client, pb_grpc.AgentServiceStub(channel))
+            yield Agent(worker, client, pb_grpc.AgentServiceStub(channel))
     finally:
-        robot.close()
+        worker.close()

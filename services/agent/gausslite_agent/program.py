@@ -50,6 +50,7 @@ class _Mission:
     stream: FrameStream | None
     uplink: Uplink | None
     first_parser: WaitingParser
+    has_detector: bool
 
     def run(self) -> None:
         """Map the source, or assign the first task and return."""
@@ -93,9 +94,9 @@ async def _serve(settings: AgentSettings) -> None:
         first_parser = WaitingParser(parser)
         mission = AgentMission(settings, worker, first_parser, client, resumed)
         servicer = AgentServicer(settings.agent_id, worker, parser, changes, lambda: mission.state)
-        run_mission = functools.partial(
-            _run_mission, _Mission(mission, stream, uplink, first_parser), settings.exit_when_done
-        )
+        has_detector = stream is not None or settings.perception.model is not None
+        running = _Mission(mission, stream, uplink, first_parser, has_detector)
+        run_mission = functools.partial(_run_mission, running, settings.exit_when_done)
         await serve_until_stopped(settings.listen, [servicer.service()], run_mission, settings.tls)
 
 
@@ -128,13 +129,13 @@ def _estimators(settings: AgentSettings, stream: FrameStream | None) -> Estimato
     simulated = settings.source is not None and is_simulated(settings.source.spec)
     if settings.task is not None and not simulated:
         estimators.require_detector()
-    if settings.task is None and settings.perception.model is None and stream is None:
-        _log.warning("no --detector: AssignTask will fail, because nothing can find the objects of a task")
     return estimators
 
 
 async def _run_mission(mission: _Mission, exit_when_done: bool) -> None:
     """Run the mission, then keep serving unless the agent should exit. On cancellation, write the results."""
+    if not mission.has_detector:
+        _log.warning("no --detector: AssignTask will fail, because nothing can find the objects of a task")
     work = asyncio.ensure_future(asyncio.to_thread(mission.run))
     try:
         await asyncio.shield(work)

@@ -23,7 +23,7 @@ from gausslite.wire.clients import FusionClient
 from gausslite.wire.spool import Purpose, Spool
 from gausslite.wire.uplink import Uplink
 from gausslite.wire.uplink_values import UplinkSettings
-from gausslite_agent.load import Drops, LoadSettings
+from gausslite_agent.load import LoadSettings, QueuePolicy
 from gausslite_agent.mapping_worker import MappingWorker
 from gausslite_agent.status import Outcome
 
@@ -32,9 +32,9 @@ def test_a_full_queue_drops_the_oldest_waiting_frame_and_says_so() -> None:
     gate = Gate(ball_attention(RuleParser().parse(TASK)), threading.Event())
     with agent(lambda _graph: gate, queue_frames=2) as a:
         a.client.assign_task(TASK)
-        first = a.robot.submit(frame(0))
+        first = a.worker.submit(frame(0))
         assert gate.reached.wait(20)
-        waiting = [a.robot.submit(frame(index)) for index in range(1, 5)]
+        waiting = [a.worker.submit(frame(index)) for index in range(1, 5)]
         gate.opened.set()
         outcomes = [future.result(20).outcome for future in (first, *waiting)]
     assert outcomes == [Outcome.MAPPED, Outcome.DROPPED, Outcome.DROPPED, Outcome.MAPPED, Outcome.MAPPED]
@@ -43,49 +43,51 @@ def test_a_full_queue_drops_the_oldest_waiting_frame_and_says_so() -> None:
 
 def test_a_queue_may_drop_the_newest_frame_instead() -> None:
     gate = Gate(ball_attention(RuleParser().parse(TASK)), threading.Event())
-    robot = MappingWorker(SETTINGS, GRID, lambda _graph: gate, load=LoadSettings(queue_frames=2, drops=Drops.NEWEST))
-    robot.assign(RuleParser().parse(TASK)).result(20)
-    first = robot.submit(frame(0))
+    worker = MappingWorker(
+        SETTINGS, GRID, lambda _graph: gate, load=LoadSettings(queue_frames=2, queue_policy=QueuePolicy.NEWEST)
+    )
+    worker.assign(RuleParser().parse(TASK)).result(20)
+    first = worker.submit(frame(0))
     assert gate.reached.wait(20)
-    waiting = [robot.submit(frame(index)) for index in range(1, 5)]
+    waiting = [worker.submit(frame(index)) for index in range(1, 5)]
     gate.opened.set()
     outcomes = [future.result(20).outcome for future in (first, *waiting)]
-    robot.close()
+    worker.close()
     assert outcomes == [Outcome.MAPPED, Outcome.MAPPED, Outcome.MAPPED, Outcome.DROPPED, Outcome.DROPPED]
-    assert "overload: 2 frames were dropped" in robot.status().load_notes
+    assert "overload: 2 frames were dropped" in worker.status().load_notes
 
 
 def test_a_waiting_frame_nobody_asks_for_any_more_gives_way_like_any_other() -> None:
     gate = Gate(ball_attention(RuleParser().parse(TASK)), threading.Event())
-    robot = MappingWorker(SETTINGS, GRID, lambda _graph: gate, load=LoadSettings(queue_frames=1))
-    robot.assign(RuleParser().parse(TASK)).result(20)
-    first = robot.submit(frame(0))
+    worker = MappingWorker(SETTINGS, GRID, lambda _graph: gate, load=LoadSettings(queue_frames=1))
+    worker.assign(RuleParser().parse(TASK)).result(20)
+    first = worker.submit(frame(0))
     assert gate.reached.wait(20)
-    given_up = robot.submit(frame(1))
+    given_up = worker.submit(frame(1))
     given_up.cancel()
-    last = robot.submit(frame(2))
+    last = worker.submit(frame(2))
     gate.opened.set()
     assert (first.result(20).outcome, given_up.result(20).outcome) == (Outcome.MAPPED, Outcome.DROPPED)
     assert last.result(20).outcome == Outcome.MAPPED
-    robot.close()
+    worker.close()
 
 
 def test_a_frame_that_has_waited_has_less_time_so_that_the_queue_gets_shorter() -> None:
     now_us = itertools.count(step=10)
     settings = replace(SETTINGS, rate_hz=5.0, min_iterations=15)
-    robot = MappingWorker(settings, GRID, ball_attention, clock=lambda: (next(now_us) + stalled_us) / 1e6)
+    worker = MappingWorker(settings, GRID, ball_attention, clock=lambda: (next(now_us) + stalled_us) / 1e6)
     stalled_us = 0
-    robot.assign(RuleParser().parse(TASK)).result(20)
+    worker.assign(RuleParser().parse(TASK)).result(20)
     busy = threading.Event()
-    robot.do(lambda _mapper: busy.wait(20))
-    waited = [robot.submit(frame(index)) for index in range(3)]
+    worker.run(lambda _mapper: busy.wait(20))
+    waited = [worker.submit(frame(index)) for index in range(3)]
     stalled_us = 1_000_000
     busy.set()
     reports = [each.result(20) for each in waited]
-    status = robot.status()
-    robot.close()
+    status = worker.status()
+    worker.close()
     assert [each.iterations for each in reports] == [15, 15, 15]
-    assert status.short == 0
+    assert status.under_trained == 0
     assert all(each.age_s >= 1.0 + each.seconds for each in reports)
     assert status.ages_s == tuple(each.age_s for each in reports)
 
@@ -104,40 +106,40 @@ def test_what_a_frame_takes_to_tell_its_words_is_part_of_its_time() -> None:
     with team(MemoryStore()) as fusion:
         spool = SlowDisk(None, "robot", GRID)
         uplink = Uplink(FusionClient(fusion.client.address), "robot", spool, GRID)
-        robot = MappingWorker(SETTINGS, GRID, ball_attention, uplink, clock=lambda: spool.now_s)
-        robot.assign(RuleParser().parse(TASK)).result(20)
-        report = robot.submit(frame(0)).result(20)
-        robot.close()
+        worker = MappingWorker(SETTINGS, GRID, ball_attention, uplink, clock=lambda: spool.now_s)
+        worker.assign(RuleParser().parse(TASK)).result(20)
+        report = worker.submit(frame(0)).result(20)
+        worker.close()
         uplink.close()
     assert (report.outcome, report.seconds, report.age_s) == (Outcome.MAPPED, 1.0, 1.0)
 
 
-def after_a_frame(robot: MappingWorker) -> Gaussians:
-    robot.assign(RuleParser().parse(TASK)).result(20)
-    robot.submit(frame(0)).result(20)
-    gaussians: Gaussians = robot.do(lambda mapper: mapper.gaussians()).result(20)
-    robot.close()
+def after_a_frame(worker: MappingWorker) -> Gaussians:
+    worker.assign(RuleParser().parse(TASK)).result(20)
+    worker.submit(frame(0)).result(20)
+    gaussians: Gaussians = worker.run(lambda mapper: mapper.gaussians()).result(20)
+    worker.close()
     return gaussians
 
 
 def test_idle_time_is_trained_in_up_to_its_bound_and_work_comes_in_between() -> None:
     left = [after_a_frame(MappingWorker(SETTINGS, GRID, ball_attention)) for _ in range(2)]
     np.testing.assert_array_equal(left[0].opacities, left[1].opacities)
-    robot = MappingWorker(SETTINGS, GRID, ball_attention, load=LoadSettings(idle_iterations=5))
-    robot.assign(RuleParser().parse(TASK)).result(20)
-    robot.submit(frame(0)).result(20)
+    worker = MappingWorker(SETTINGS, GRID, ball_attention, load=LoadSettings(idle_iterations=5))
+    worker.assign(RuleParser().parse(TASK)).result(20)
+    worker.submit(frame(0)).result(20)
     # each of these waits behind one iteration at most
-    trained = [robot.do(lambda mapper: mapper.gaussians()).result(20) for _ in range(9)]
-    status = robot.status()
+    trained = [worker.run(lambda mapper: mapper.gaussians()).result(20) for _ in range(9)]
+    status = worker.status()
     assert (status.idle_iterations, status.iterations) == (5, 2)
     assert not np.array_equal(left[0].opacities, trained[-1].opacities)
     np.testing.assert_array_equal(trained[-2].opacities, trained[-1].opacities)
-    robot.submit(frame(1)).result(20)
-    robot.settle().result(20)
-    settled = robot.do(lambda mapper: mapper.gaussians()).result(20)
-    np.testing.assert_array_equal(settled.opacities, robot.do(lambda mapper: mapper.gaussians()).result(20).opacities)
-    assert robot.status().idle_iterations <= 10
-    robot.close()
+    worker.submit(frame(1)).result(20)
+    worker.end_idle_training().result(20)
+    settled = worker.run(lambda mapper: mapper.gaussians()).result(20)
+    np.testing.assert_array_equal(settled.opacities, worker.run(lambda mapper: mapper.gaussians()).result(20).opacities)
+    assert worker.status().idle_iterations <= 10
+    worker.close()
 
 
 def fail() -> None:
@@ -147,28 +149,28 @@ def fail() -> None:
 def test_an_idle_iteration_that_fails_is_logged_and_the_next_frame_is_followed_by_others(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    robot = MappingWorker(SETTINGS, GRID, ball_attention, load=LoadSettings(idle_iterations=3))
-    robot.assign(RuleParser().parse(TASK)).result(20)
+    worker = MappingWorker(SETTINGS, GRID, ball_attention, load=LoadSettings(idle_iterations=3))
+    worker.assign(RuleParser().parse(TASK)).result(20)
     with monkeypatch.context() as broken:
-        robot.do(lambda mapper: broken.setattr(mapper, "idle_step", fail)).result(20)
-        robot.submit(frame(0)).result(20)
-        robot.do(lambda _mapper: None).result(20)
+        worker.run(lambda mapper: broken.setattr(mapper, "idle_step", fail)).result(20)
+        worker.submit(frame(0)).result(20)
+        worker.run(lambda _mapper: None).result(20)
     assert "a moment without memory" in caplog.text
-    assert robot.status().idle_iterations == 0
-    robot.submit(frame(1)).result(20)
+    assert worker.status().idle_iterations == 0
+    worker.submit(frame(1)).result(20)
     for _ in range(9):
-        robot.do(lambda _mapper: None).result(20)
-    assert robot.status().idle_iterations == 3
-    robot.close()
+        worker.run(lambda _mapper: None).result(20)
+    assert worker.status().idle_iterations == 3
+    worker.close()
 
 
 def test_without_idle_iterations_the_map_stays_as_the_frame_left_it() -> None:
-    robot = MappingWorker(SETTINGS, GRID, ball_attention)
-    robot.assign(RuleParser().parse(TASK)).result(20)
-    robot.submit(frame(0)).result(20)
-    robot.settle().result(20)
-    assert robot.status().idle_iterations == 0
-    robot.close()
+    worker = MappingWorker(SETTINGS, GRID, ball_attention)
+    worker.assign(RuleParser().parse(TASK)).result(20)
+    worker.submit(frame(0)).result(20)
+    worker.end_idle_training().result(20)
+    assert worker.status().idle_iterations == 0
+    worker.close()
 
 
 @pytest.mark.parametrize("wrong", [{"queue_frames": 0}, {"idle_iterations": -1}])
@@ -179,15 +181,15 @@ def test_load_settings_name_what_is_wrong(wrong: dict[str, int]) -> None:
 
 def test_frames_that_wait_when_the_agent_ends_are_dropped() -> None:
     gate = Gate(ball_attention(RuleParser().parse(TASK)), threading.Event())
-    robot = MappingWorker(SETTINGS, GRID, lambda _graph: gate)
-    robot.assign(RuleParser().parse(TASK)).result(20)
-    futures = [robot.submit(frame(index)) for index in range(3)]
+    worker = MappingWorker(SETTINGS, GRID, lambda _graph: gate)
+    worker.assign(RuleParser().parse(TASK)).result(20)
+    futures = [worker.submit(frame(index)) for index in range(3)]
     assert gate.reached.wait(20)
     threading.Timer(0.05, gate.opened.set).start()
-    robot.close()
+    worker.close()
     assert [future.result(0).outcome for future in futures] == [Outcome.MAPPED, Outcome.DROPPED, Outcome.DROPPED]
-    with pytest.raises(UnavailableError, match="ending"):
-        robot.do(lambda mapper: mapper.count)
+    with pytest.raises(UnavailableError, match="shutting down"):
+        worker.run(lambda mapper: mapper.count)
 
 
 def test_a_frame_that_cannot_be_mapped_is_rejected_and_the_stream_goes_on() -> None:
@@ -221,6 +223,6 @@ def test_a_spool_without_room_ends_no_mission_and_all_is_told_once_it_has_some(t
             list(a.client.ingest([frame(2, CAMERA)]))
             assert not any("disk full" in note for note in a.client.status().notes)
             assert uplink.drain(20.0)
-            active = a.robot.do(lambda mapper: mapper.roi_gaussians()).result()
+            active = a.worker.run(lambda mapper: mapper.roi_gaussians()).result()
         uplink.close()
     assert int(store.batches()["robot"].counts.sum()) == len(active) > 0

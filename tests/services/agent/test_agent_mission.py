@@ -24,6 +24,8 @@ from gausslite.domain.frame import Frame
 from gausslite.domain.region import BallRegion, Region
 from gausslite.errors import DatasetError, InvalidInputError, StorageError, TaskError
 from gausslite.fusion.memory_store import MemoryStore
+from gausslite.mission.frame_stream import FrameStream
+from gausslite.mission.settings import SourceSettings
 from gausslite.perception.fixed_relevance import RegionRelevanceEstimator
 from gausslite.task.rules import RuleParser
 from gausslite.v1.agent_service_pb2 import FRAME_OUTCOME_MAPPED, AssignTaskRequest
@@ -34,10 +36,9 @@ from gausslite.wire.server import serve_until_stopped
 from gausslite.wire.spool import Spool
 from gausslite.wire.uplink import Uplink
 from gausslite.wire.uplink_values import UplinkSettings
+from gausslite_agent.agent_mission import AgentMission, MissionState
 from gausslite_agent.mapping_worker import MappingWorker
-from gausslite_agent.mission_runner import AgentMission, MissionState
-from gausslite_agent.replay_source import ReplaySource
-from gausslite_agent.settings import AgentSettings, PlaySettings, parse_arguments
+from gausslite_agent.settings import AgentSettings, parse_arguments
 
 MUG = BallRegion((0.0, 0.0, 1.2), 0.2)
 
@@ -86,26 +87,26 @@ def player(options: AgentSettings, address: str | None = None) -> Iterator[tuple
     uplink = None
     if client is not None:
         uplink = Uplink(client, "robot", Spool(None, "robot", GRID), GRID, UplinkSettings(interval_s=0.0))
-    robot = MappingWorker(options.mission, GRID, lambda _graph: RegionRelevanceEstimator([MUG]), uplink)
+    worker = MappingWorker(options.mission, GRID, lambda _graph: RegionRelevanceEstimator([MUG]), uplink)
     try:
-        yield AgentMission(options, robot, RuleParser(), client), robot
+        yield AgentMission(options, worker, RuleParser(), client), worker
     finally:
-        robot.close()
+        worker.close()
         if uplink is not None:
             uplink.close()
 
 
-def seen(wall: Wall, options: AgentSettings) -> ReplaySource:
-    assert options.play is not None
-    return ReplaySource.of(wall, options.play)
+def stream_of(wall: Wall, options: AgentSettings) -> FrameStream:
+    assert options.source is not None
+    return FrameStream.select(wall, options.source)
 
 
 def test_a_mission_leaves_a_map_a_report_and_its_region_on_the_server(tmp_path: Path) -> None:
     store, options = MemoryStore(), settings(tmp_path)
-    with team(store) as fusion, player(options, fusion.client.address) as (mission, robot):
-        mission.play(seen(Wall(), options))
+    with team(store) as fusion, player(options, fusion.client.address) as (mission, worker):
+        mission.run(stream_of(Wall(), options))
         assert mission.state == MissionState.DONE
-        count = robot.status().gaussians
+        count = worker.status().gaussians
         [agent] = fusion.client.status().agents
     written, report = read_ply(tmp_path / "map.ply"), json.loads((tmp_path / "report.json").read_text())
     assert len(written) == count == report["gaussians"]
@@ -121,10 +122,10 @@ def test_a_mission_leaves_a_map_a_report_and_its_region_on_the_server(tmp_path: 
 
 def test_handover_brings_the_whole_map_and_the_keyframes(tmp_path: Path) -> None:
     options = settings(tmp_path, "--handover")
-    with team() as fusion, player(options, fusion.client.address) as (mission, robot):
-        mission.play(seen(Wall(), options))
+    with team() as fusion, player(options, fusion.client.address) as (mission, worker):
+        mission.run(stream_of(Wall(), options))
         [agent] = fusion.client.status().agents
-        keyframes = robot.do(lambda mapper: mapper.keyframes()).result(20)
+        keyframes = worker.run(lambda mapper: mapper.keyframes()).result(20)
     report = json.loads((tmp_path / "report.json").read_text())
     assert agent.gaussians == report["gaussians"]
     assert agent.handover_bytes == report["handover_bytes"] > 0
@@ -136,7 +137,7 @@ def test_alone_it_maps_and_sends_nothing(tmp_path: Path) -> None:
     options = settings(tmp_path, "--test-every", "4", "--frames", "0:6")
     wall = Wall()
     with player(options) as (mission, _):
-        mission.play(seen(wall, options))
+        mission.run(stream_of(wall, options))
     report = json.loads((tmp_path / "report.json").read_text())
     assert wall.asked == [0, 1, 2, 4, 5]
     assert (report["frames"], report["bytes_sent"], report["map_shared_percent"]) == (5, 0, 0)
@@ -145,7 +146,7 @@ def test_alone_it_maps_and_sends_nothing(tmp_path: Path) -> None:
 def test_a_mission_that_is_stopped_writes_what_it_has(tmp_path: Path) -> None:
     options, wall = settings(tmp_path), Wall(10_000)
     with player(options) as (mission, _):
-        thread = threading.Thread(target=mission.play, args=(seen(wall, options),))
+        thread = threading.Thread(target=mission.run, args=(stream_of(wall, options),))
         thread.start()
         assert wall.reached.wait(20)
         mission.stop()
@@ -159,11 +160,11 @@ def test_a_mission_that_is_stopped_writes_what_it_has(tmp_path: Path) -> None:
 def test_what_is_wrong_is_raised_before_or_when_it_is_met(tmp_path: Path) -> None:
     options = settings(tmp_path)
     with player(replace(options, task="!")) as (mission, _), pytest.raises(TaskError):
-        mission.play(seen(Wall(), options))
+        mission.run(stream_of(Wall(), options))
     with pytest.raises(InvalidInputError, match="size"):
-        ReplaySource.of(Wall(), PlaySettings("wall", size="big"))
+        FrameStream.select(Wall(), SourceSettings("wall", size="big"))
     with player(replace(options, out=tmp_path / "gone")) as (mission, _), pytest.raises(StorageError, match="gone"):
-        mission.play(seen(Wall(), options))
+        mission.run(stream_of(Wall(), options))
 
 
 @pytest.mark.parametrize(
@@ -255,20 +256,29 @@ def test_frames_that_were_sent_leave_a_map_and_a_report_on_sigterm(tmp_path: Pat
 
 
 def test_without_a_mapped_frame_nothing_is_written_over(tmp_path: Path) -> None:
-    options = replace(settings(tmp_path), play=None)
+    options = replace(settings(tmp_path), source=None)
     (tmp_path / "map.ply").write_text("of an earlier life")
     with player(options) as (mission, _):
-        mission.begin()
+        mission.assign_task()
         mission.stop()
-        mission.conclude()
+        mission.finish()
     assert (tmp_path / "map.ply").read_text() == "of an earlier life"
 
 
-def test_a_damaged_frame_ends_the_mission_and_what_was_mapped_is_sent_and_written(tmp_path: Path) -> None:
+def test_a_corrupt_frame_is_skipped_and_counted(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     options = settings(tmp_path)
+    with player(options) as (mission, _):
+        mission.run(stream_of(Wall(broken_at=3), options))
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert (report["frames"], report["frames_corrupt"], report["stopped_by"]) == (7, 1, None)
+    assert "frame 3 skipped: wall/frame-3.png" in caplog.text
+
+
+def test_with_strict_a_corrupt_frame_ends_the_mission_after_its_map_is_sent_and_written(tmp_path: Path) -> None:
+    options = settings(tmp_path, "--strict")
     with team() as fusion, player(options, fusion.client.address) as (mission, _):
         with pytest.raises(DatasetError, match="frame-3"):
-            mission.play(seen(Wall(broken_at=3), options))
+            mission.run(stream_of(Wall(broken_at=3), options))
         [agent] = fusion.client.status().agents
     report = json.loads((tmp_path / "report.json").read_text())
     assert report["frames"] == 3
@@ -276,11 +286,11 @@ def test_a_damaged_frame_ends_the_mission_and_what_was_mapped_is_sent_and_writte
     assert agent.gaussians == read_ply(tmp_path / "map.ply").active.sum() > 0
 
 
-def test_a_first_frame_that_is_damaged_writes_nothing_over(tmp_path: Path) -> None:
-    options = settings(tmp_path)
+def test_a_corrupt_first_frame_overwrites_nothing_with_strict(tmp_path: Path) -> None:
+    options = settings(tmp_path, "--strict")
     (tmp_path / "map.ply").write_text("of an earlier life")
     with player(options) as (mission, _), pytest.raises(DatasetError, match="frame-0"):
-        mission.play(seen(Wall(broken_at=0), options))
+        mission.run(stream_of(Wall(broken_at=0), options))
     assert (tmp_path / "map.ply").read_text() == "of an earlier life"
 
 

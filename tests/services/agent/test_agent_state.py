@@ -24,18 +24,17 @@ from gausslite.domain.voxel_batch import VoxelBatch
 from gausslite.domain.voxel_operations import group_by_voxel
 from gausslite.errors import MapFileError, MismatchError
 from gausslite.fusion.memory_store import MemoryStore
-from gausslite.mission.checkpoint import ResumeConfig
 from gausslite.perception.fixed_relevance import RegionRelevanceEstimator
 from gausslite.task.rules import RuleParser
 from gausslite.wire.clients import AgentClient, FusionClient
 from gausslite.wire.spool import Spool
 from gausslite.wire.uplink import Uplink
 from gausslite.wire.uplink_values import UplinkSettings
+from gausslite_agent.agent_mission import AgentMission
 from gausslite_agent.mapping_worker import MappingWorker
-from gausslite_agent.mission_checkpoint import MissionCheckpoint, SavedAgentMission
-from gausslite_agent.mission_runner import AgentMission
+from gausslite_agent.mission_checkpoint import MissionCheckpoint, SavedMission
 from gausslite_agent.program import run
-from gausslite_agent.settings import AgentSettings, parse_arguments
+from gausslite_agent.settings import AgentIdentity, AgentSettings, parse_arguments
 
 MUG, TASK, LATER = BallRegion((0.0, 0.0, 1.2), 0.2), "Pick up the mug", "Find the chair"
 
@@ -50,21 +49,23 @@ def life(
     options: AgentSettings, fusion: Team | None = None, spool: Path | None = None
 ) -> Iterator[tuple[AgentMission, MappingWorker]]:
     """An agent as its program builds it."""
-    saved = SavedAgentMission.read(options.state, options.terms) if options.state and options.state.exists() else None
+    saved = (
+        SavedMission.read(options.state, *options.fixed_settings) if options.state and options.state.exists() else None
+    )
     uplink = None
     if fusion is not None:
         client = FusionClient(fusion.client.address)
         held = Spool(spool, "robot", GRID)
         uplink = Uplink(client, "robot", held, GRID, UplinkSettings(interval_s=0.0), has_restored_map=saved is not None)
-    robot = MappingWorker(options.mission, GRID, lambda _graph: RegionRelevanceEstimator([MUG]), uplink)
+    worker = MappingWorker(options.mission, GRID, lambda _graph: RegionRelevanceEstimator([MUG]), uplink)
     try:
         if saved is not None:
-            robot.resume(saved).result()
-        player = AgentMission(options, robot, RuleParser(), None, None if saved is None else saved.life)
-        player.begin()
-        yield player, robot
+            worker.restore(saved).result()
+        mission = AgentMission(options, worker, RuleParser(), None, None if saved is None else saved.checkpoint)
+        mission.assign_task()
+        yield mission, worker
     finally:
-        robot.close()
+        worker.close()
         if uplink is not None:
             uplink.close()
 
@@ -77,17 +78,17 @@ def red_frame(i: int) -> Frame:
     return replace(plain, rgb=rgb)
 
 
-def map_frames(robot: MappingWorker, *indices: int) -> None:
+def map_frames(worker: MappingWorker, *indices: int) -> None:
     for i in indices:
-        robot.submit(frame(i, CAMERA)).result()
+        worker.submit(frame(i, CAMERA)).result()
 
 
-def the_map(robot: MappingWorker) -> Gaussians:
-    return robot.do(lambda mapper: mapper.gaussians()).result()
+def the_map(worker: MappingWorker) -> Gaussians:
+    return worker.run(lambda mapper: mapper.gaussians()).result()
 
 
-def region_words(robot: MappingWorker) -> VoxelBatch:
-    return group_by_voxel(robot.do(lambda mapper: mapper.roi_gaussians()).result(), GRID)
+def region_words(worker: MappingWorker) -> VoxelBatch:
+    return group_by_voxel(worker.run(lambda mapper: mapper.roi_gaussians()).result(), GRID)
 
 
 def totals(words: VoxelBatch) -> dict[int, tuple[int, int]]:
@@ -102,15 +103,15 @@ def held_by(store: MemoryStore) -> dict[int, tuple[int, int]]:
 
 def test_a_mission_in_two_lives_gives_the_map_and_the_words_of_one(tmp_path: Path) -> None:
     whole, first, second = MemoryStore(), MemoryStore(), settings(tmp_path / "x.state")
-    with team(whole) as fusion, life(settings(tmp_path / "whole.state"), fusion) as (player, robot):
-        map_frames(robot, *range(8))
-        player.conclude()
-        wanted = the_map(robot)
+    with team(whole) as fusion, life(settings(tmp_path / "whole.state"), fusion) as (mission, worker):
+        map_frames(worker, *range(8))
+        mission.finish()
+        wanted = the_map(worker)
     with team(first) as fusion:
         for indices in (range(4), range(4, 8)):
-            with life(second, fusion, tmp_path / "robot.spool") as (player, robot):
-                map_frames(robot, *indices)
-                player.conclude()
+            with life(second, fusion, tmp_path / "robot.spool") as (mission, worker):
+                map_frames(worker, *indices)
+                mission.finish()
         came = the_map_of(second)
     for column in ("means_m", "opacities", "kappa", "active"):
         np.testing.assert_array_equal(getattr(came, column), getattr(wanted, column))
@@ -119,8 +120,8 @@ def test_a_mission_in_two_lives_gives_the_map_and_the_words_of_one(tmp_path: Pat
 
 
 def the_map_of(options: AgentSettings) -> Gaussians:
-    with life(options) as (_, robot):
-        return the_map(robot)
+    with life(options) as (_, worker):
+        return the_map(worker)
 
 
 @pytest.mark.parametrize("keeps_spool", [True, False])
@@ -131,87 +132,87 @@ def test_the_fused_map_follows_the_robot_through_lives_that_end_well_and_badly(
     store, options = MemoryStore(), settings(tmp_path / "robot.state")
     spool = tmp_path / "robot.spool" if keeps_spool else None
     with team(store) as fusion:
-        with life(options, fusion, spool) as (player, robot):
-            map_frames(robot, 0, 1, 2)
-            player.conclude()
-            seen = robot.revision()
-        with life(options, fusion, spool) as (player, robot):
-            assert robot.revision() > seen
-            map_frames(robot, 3, 4)
-            player.conclude()
-            assert held_by(store) == totals(region_words(robot))
-            kept = region_words(robot)
-        with life(options, fusion, spool) as (_, robot):
-            map_frames(robot, 5, 6)
-            assert robot.uplink is not None
-            assert robot.uplink.drain(20.0)
-        with life(options, fusion, spool) as (player, robot):
-            assert robot.status().graph == RuleParser().parse(TASK)
-            assert robot.uplink is not None
-            assert robot.uplink.drain(20.0)
-            words = region_words(robot)
+        with life(options, fusion, spool) as (mission, worker):
+            map_frames(worker, 0, 1, 2)
+            mission.finish()
+            seen = worker.revision()
+        with life(options, fusion, spool) as (mission, worker):
+            assert worker.revision() > seen
+            map_frames(worker, 3, 4)
+            mission.finish()
+            assert held_by(store) == totals(region_words(worker))
+            kept = region_words(worker)
+        with life(options, fusion, spool) as (_, worker):
+            map_frames(worker, 5, 6)
+            assert worker.uplink is not None
+            assert worker.uplink.drain(20.0)
+        with life(options, fusion, spool) as (mission, worker):
+            assert worker.status().graph == RuleParser().parse(TASK)
+            assert worker.uplink is not None
+            assert worker.uplink.drain(20.0)
+            words = region_words(worker)
             np.testing.assert_array_equal(words.kappa_sums, kept.kappa_sums)
             assert held_by(store).items() >= totals(words).items()
 
 
 def test_a_server_that_lost_everything_between_two_lives_gets_it_again(tmp_path: Path) -> None:
     options, store = settings(tmp_path / "robot.state"), MemoryStore()
-    with team() as fusion, life(options, fusion, tmp_path / "robot.spool") as (player, robot):
-        map_frames(robot, 0, 1)
-        player.conclude()
-    with team(store) as fusion, life(options, fusion, tmp_path / "robot.spool") as (player, robot):
-        map_frames(robot, 2)
-        player.conclude()
-        assert held_by(store) == totals(region_words(robot))
+    with team() as fusion, life(options, fusion, tmp_path / "robot.spool") as (mission, worker):
+        map_frames(worker, 0, 1)
+        mission.finish()
+    with team(store) as fusion, life(options, fusion, tmp_path / "robot.spool") as (mission, worker):
+        map_frames(worker, 2)
+        mission.finish()
+        assert held_by(store) == totals(region_words(worker))
 
 
 def test_a_task_that_came_on_the_way_stays_and_another_command_line_replaces_it(tmp_path: Path) -> None:
     options = settings(tmp_path / "robot.state")
-    with life(options) as (player, robot):
-        map_frames(robot, 0)
-        robot.assign(RuleParser().parse(LATER)).result()
-        player.conclude()
+    with life(options) as (mission, worker):
+        map_frames(worker, 0)
+        worker.assign(RuleParser().parse(LATER)).result()
+        mission.finish()
     for command_line, wanted in ((TASK, LATER), ("Find the lamp", "Find the lamp"), (None, "Find the lamp")):
-        with life(replace(options, task=command_line)) as (player, robot):
-            graph = robot.status().graph
+        with life(replace(options, task=command_line)) as (mission, worker):
+            graph = worker.status().graph
             assert graph is not None
             assert graph.text == wanted
-            player.conclude()
+            mission.finish()
 
 
 def test_watchers_never_see_a_revision_twice_even_if_the_clock_was_set_back(tmp_path: Path) -> None:
     options = settings(tmp_path / "robot.state")
-    with life(options) as (player, robot):
-        map_frames(robot, 0)
-        player.conclude()
-        seen = robot.revision()
+    with life(options) as (mission, worker):
+        map_frames(worker, 0)
+        mission.finish()
+        seen = worker.revision()
     state = read_state(tmp_path / "robot.state")
     far_off = seen + 10**15
-    write_state(tmp_path / "robot.state", {**state, "beside/map_revision": np.array([far_off])})
-    with life(options) as (_, robot):
-        assert robot.revision() > far_off
+    write_state(tmp_path / "robot.state", {**state, "extra/map_revision": np.array([far_off])})
+    with life(options) as (_, worker):
+        assert worker.revision() > far_off
 
 
 def test_what_is_no_mission_of_this_agent_is_told(tmp_path: Path) -> None:
     options = settings(tmp_path / "robot.state")
-    with life(options) as (player, robot):
-        map_frames(robot, 0)
-        player.conclude()
+    with life(options) as (mission, worker):
+        map_frames(worker, 0)
+        mission.finish()
     state = read_state(tmp_path / "robot.state")
-    other = ResumeConfig.of(options.mission, agent_id="other", voxel_size="0.2")
+    other = options.mission, AgentIdentity("other", 0.2)
     with pytest.raises(MismatchError, match=r"--agent-id 'robot' \(got 'other'\), --voxel-size '0.1' \(got '0.2'\)"):
-        SavedAgentMission.read(tmp_path / "robot.state", other)
-    for name, data in (("graph", b"\xff\xff"), ("graph", b""), ("asked", b"\xff")):
-        write_state(tmp_path / "bad.state", {**state, f"beside/{name}": np.frombuffer(data, np.uint8)})
+        SavedMission.read(tmp_path / "robot.state", *other)
+    for name, data in (("graph", b"\xff\xff"), ("graph", b""), ("requested_task", b"\xff")):
+        write_state(tmp_path / "bad.state", {**state, f"extra/{name}": np.frombuffer(data, np.uint8)})
         with pytest.raises(MapFileError, match=r"bad\.state: expected the state of an agent's mission"):
-            SavedAgentMission.read(tmp_path / "bad.state", options.terms)
+            SavedMission.read(tmp_path / "bad.state", *options.fixed_settings)
 
 
 def test_a_wrong_file_is_one_line_before_the_agent_listens(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     options = settings(tmp_path / "robot.state")
-    with life(options) as (player, robot):
-        map_frames(robot, 0)
-        player.conclude()
+    with life(options) as (mission, worker):
+        map_frames(worker, 0)
+        mission.finish()
     (tmp_path / "notes").write_text("remember the milk")
     listen = ["--listen", "127.0.0.1:0", "--agent-id", "robot", "--iterations", "2"]
     for arguments, told in (
@@ -254,10 +255,7 @@ def test_a_real_agent_ended_in_its_mission_goes_on_with_it(tmp_path: Path) -> No
     assert 0 < kappas[0] < kappas[1]
     assert revisions == sorted(set(revisions))
     assert agent.gaussians > 0
-    assert SavedAgentMission.read(tmp_path / "a.state", _terms(command)).life == MissionCheckpoint(
+    fixed_settings = parse_arguments(command[3:]).fixed_settings
+    assert SavedMission.read(tmp_path / "a.state", *fixed_settings).checkpoint == MissionCheckpoint(
         5, RuleParser().parse("Pick up the cup"), "Pick up the cup", revisions[-1]
     )
-
-
-def _terms(command: list[str]) -> ResumeConfig:
-    return parse_arguments(command[3:]).terms
