@@ -19,7 +19,7 @@ PROGRAMS = {
     "gausslite-parser": "gausslite_parser",
 }
 SUB_COMMANDS = ("map", "demo", "parse", "eval", "fuse")
-BENCHMARKS = ("raster", "loop", "gpu", "parser", "perception", "quality", "ablation", "retask")
+BENCHMARKS = ("raster", "loop", "gpu", "parser", "perception", "quality", "ablation", "task-change", "registration")
 
 
 def pages() -> list[Path]:
@@ -73,6 +73,7 @@ def test_files_named_in_pages_exist() -> None:
             ROOT / "src",
             ROOT / "src" / "gausslite",
             page.parent / "src",
+            page.parent / "src" / "simd",
             *page.parent.glob("gausslite_*"),
         )
         names = re.findall(r"`((?:[\w.-]+/)*[\w.-]+\.(?:py|proto|sh|cpp|h|pyi))`", page.read_text())
@@ -105,6 +106,6 @@ def test_flags_named_in_pages_exist(known_flags: set[str]) -> None:
         text = page.read_text()
         code = re.findall(r"`([^`\n]+)`", re.sub(r"^```.*?^```", "", text, flags=re.M | re.S))
         code += re.findall(r"^```(?:sh|toml)?\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
-        flags = {flag for part in code for flag in re.findall(r"(?<![\w-])--[a-z][a-z-]*", part)}
+        flags = {flag for part in code for flag in re.findall(r"(?<![\w-])--[a-z][a-z0-9-]*", part)}
         unknown += [f"{page.relative_to(ROOT)}: {flag}" for flag in sorted(flags - known_flags - others)]
     assert not unknown
