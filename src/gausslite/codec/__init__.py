@@ -1,1 +1,1 @@
-"""Gaussians as bytes: the subset codec for the wire and standard 3DGS PLY for files."""
+"""Encode Gaussians: the subset codec for messages, standard 3DGS PLY and state files on disk."""

@@ -1,4 +1,4 @@
-"""Quantise the columns of Gaussians: each code is stable, so that decoding and encoding again gives the same bytes.
+"""Quantise the columns of Gaussians. The codes are stable: decoding and encoding again gives the same bytes.
 
 | column    | code                                                  | largest error                                   |
 |-----------|-------------------------------------------------------|-------------------------------------------------|
@@ -8,8 +8,8 @@
 | opacities | u8, centres of 256 bins, so never 0 or 1              | 1/512                                           |
 | rgb       | 3 x u8 from -0.25 to 1.25, clamped                    | 0.003                                           |
 
-Each decoder returns the float32 nearest to its grid value among those that are allowed, and what was encoded was one
-of those: so what is decoded is never farther from the grid value than the original, and gets the same code.
+Each decoder returns the valid float32 nearest to the code's grid value. The original was valid too, so the decoded
+value is never farther from the grid value than the original, and gets the same code.
 """
 
 from __future__ import annotations
@@ -29,17 +29,17 @@ QUAT_STEPS = 511
 _LOG_MIN = float(np.log(SCALE_MIN_M))
 _LOG_STEP = (float(np.log(SCALE_MAX_M)) - _LOG_MIN) / 255
 _RGB_STEP = (RGB_MAX - RGB_MIN) / 255
-# the components that travel, for each choice of the one that does not
+# the three encoded components, for each index of the largest one
 _OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
 
 
 def encode_means(
     means_m: Float32[ndarray, "n 3"], voxel: Int64[ndarray, "n 3"], grid: VoxelGrid
 ) -> UInt16[ndarray, "n 3"]:
-    """Means as steps across their voxel, whose indices are given. Raises InvalidInputError for a mean outside it."""
+    """Encode means as steps across their voxels. Raises InvalidInputError if a mean is outside its voxel."""
     exact = means_m.astype(np.float64)
     if not np.array_equal(np.floor(exact / grid.size_m), voxel.astype(np.float64)):
-        raise InvalidInputError("words means_m: expected every mean inside its voxel, got one outside")
+        raise InvalidInputError("voxel batch means_m: expected every mean inside its voxel, got one outside")
     steps = np.rint((exact - voxel * grid.size_m) * (MEAN_STEPS / grid.size_m))
     return np.clip(steps, 0, MEAN_STEPS).astype(np.uint16)
 
@@ -47,31 +47,31 @@ def encode_means(
 def decode_means(
     steps: UInt16[ndarray, "n 3"], voxel: Int64[ndarray, "n 3"], grid: VoxelGrid
 ) -> Float32[ndarray, "n 3"]:
-    """The float32 points of the voxel nearest to these steps."""
+    """Decode means: the float32 points inside the voxels that are nearest to the steps."""
     means_m = (voxel * grid.size_m + steps.astype(np.float64) * (grid.size_m / MEAN_STEPS)).astype(np.float32)
-    # rounding to float32 can cross a face of the voxel by one float
+    # rounding to float32 can cross a voxel's face by one float
     index = np.floor(means_m.astype(np.float64) / grid.size_m)
     means_m = np.where(index < voxel, np.nextafter(means_m, np.float32(np.inf)), means_m)
     return np.where(index > voxel, np.nextafter(means_m, np.float32(-np.inf)), means_m)
 
 
 def encode_scales(scales_m: Float32[ndarray, "n 3"]) -> UInt8[ndarray, "n 3"]:
-    """Scales on a logarithmic grid."""
+    """Encode scales on a logarithmic grid."""
     logs = np.log(np.clip(scales_m.astype(np.float64), SCALE_MIN_M, SCALE_MAX_M))
     return np.rint((logs - _LOG_MIN) / _LOG_STEP).astype(np.uint8)
 
 
 def decode_scales(codes: UInt8[ndarray, "n 3"]) -> Float32[ndarray, "n 3"]:
-    """Scales in metres."""
+    """Decode scales in metres."""
     scales_m: Float32[ndarray, "n 3"] = np.exp(_LOG_MIN + codes.astype(np.float64) * _LOG_STEP).astype(np.float32)
     return scales_m
 
 
 def encode_quats(quats_wxyz: Float32[ndarray, "n 4"]) -> UInt32[ndarray, " n"]:
-    """Rotations as the index of the first largest component (2 bits) and the other three over it (10 bits each)."""
+    """Encode the index of the largest component (2 bits) and the other three divided by it (10 bits each)."""
     exact = quats_wxyz.astype(np.float64)
     steps = np.rint(exact * (QUAT_STEPS / np.abs(exact).max(axis=1, keepdims=True))).astype(np.int64)
-    # q and -q are one rotation: the largest is made positive, and a tie is settled on the quantised values
+    # q and -q are one rotation, so the largest component is made positive; ties use the quantised values
     rows = np.arange(len(steps))
     largest = np.abs(steps).argmax(axis=1)
     steps *= np.sign(steps[rows, largest])[:, None]
@@ -82,7 +82,7 @@ def encode_quats(quats_wxyz: Float32[ndarray, "n 4"]) -> UInt32[ndarray, " n"]:
 
 
 def decode_quats(codes: UInt32[ndarray, " n"]) -> Float32[ndarray, "n 4"]:
-    """Unit quaternions w x y z."""
+    """Decode unit quaternions w x y z."""
     wide = codes.astype(np.int64)
     largest = wide >> 30
     others = np.stack([(wide >> shift) & 1023 for shift in (20, 10, 0)], axis=1) - QUAT_STEPS
@@ -93,20 +93,20 @@ def decode_quats(codes: UInt32[ndarray, " n"]) -> Float32[ndarray, "n 4"]:
 
 
 def encode_opacities(opacities: Float32[ndarray, " n"]) -> UInt8[ndarray, " n"]:
-    """Opacities in 256 equal bins."""
+    """Encode opacities in 256 equal bins."""
     return np.clip(np.floor(opacities.astype(np.float64) * 256), 0, 255).astype(np.uint8)
 
 
 def decode_opacities(codes: UInt8[ndarray, " n"]) -> Float32[ndarray, " n"]:
-    """The centres of the bins."""
+    """Decode opacities as the centres of the bins."""
     return ((codes.astype(np.float64) + 0.5) / 256).astype(np.float32)
 
 
 def encode_rgb(rgb: Float32[ndarray, "n 3"]) -> UInt8[ndarray, "n 3"]:
-    """Colours with room for the overshoot that training gives them."""
+    """Encode colours; the range exceeds 0 to 1, because trained colours do."""
     return np.rint((np.clip(rgb.astype(np.float64), RGB_MIN, RGB_MAX) - RGB_MIN) / _RGB_STEP).astype(np.uint8)
 
 
 def decode_rgb(codes: UInt8[ndarray, "n 3"]) -> Float32[ndarray, "n 3"]:
-    """Colours; codes of black and white give 0 and 1 to within half a step."""
+    """Decode colours; black and white are exact to half a step."""
     return (RGB_MIN + codes.astype(np.float64) * _RGB_STEP).astype(np.float32)

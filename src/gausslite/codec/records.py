@@ -1,4 +1,4 @@
-"""Gaussians as packed rows of bytes: how the words of a voxel lie in a store or a spool, bit for bit."""
+"""Encode Gaussians as packed rows of bytes, the exact representation in stores and spools."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ RECORD = np.dtype(
         ("target", "<i2"),
     ]
 )
-"""63 bytes a Gaussian, little-endian, unpadded, exact: keeping changes no bit of what an agent said."""
+"""63 bytes per Gaussian, little-endian, without padding; storing changes no bit."""
 
 
 def to_records(gaussians: Gaussians) -> NDArray[Any]:
-    """One packed row per Gaussian, in order."""
+    """Return one packed row per Gaussian, in order."""
     records = np.empty(len(gaussians), RECORD)
     for name in RECORD.names or ():
         records[name] = getattr(gaussians, name)
@@ -35,10 +35,10 @@ def to_records(gaussians: Gaussians) -> NDArray[Any]:
 
 
 def from_bytes(data: bytes) -> Gaussians:
-    """The Gaussians whose packed rows these are. Raises StorageError when the length is not whole rows."""
+    """Decode packed rows. Raises StorageError if the length is not a multiple of a row."""
     if len(data) % RECORD.itemsize:
         raise StorageError(
-            f"stored word: expected a multiple of {RECORD.itemsize} bytes, got {len(data)}; what was stored is damaged"
+            f"stored voxel: expected a multiple of {RECORD.itemsize} bytes, got {len(data)}; the store is damaged"
         )
     records = np.frombuffer(data, RECORD)
     return Gaussians(*(np.ascontiguousarray(records[field.name]) for field in fields(Gaussians)))

@@ -38,7 +38,7 @@ def write_state(path: Path, state: State) -> None:
 
 
 def read_state(path: Path) -> dict[str, NDArray[Any]]:
-    """Read the arrays; they are read-only. Raises MapFileError if the file is damaged, unreadable or of another kind."""
+    """Read the arrays, read-only. Raises MapFileError if the file is damaged, unreadable or of another kind."""
     try:
         _require_header(path)
         with safe_open(path, framework="numpy") as file:

@@ -1,4 +1,4 @@
-"""An agent's words on some voxels as one self-contained message: little-endian columns, zstd, CRC32C.
+"""Encode an agent's voxel updates as one self-contained message: little-endian columns, zstd, CRC32C.
 
     header   "GLSB" | u16 version | u8 kappa bytes (1 2 4) | u8 target bytes (1 2) | u32 voxels | u32 Gaussians
              | u32 body bytes | f64 voxel size | u64 sequence | u64 map revision | u8 agent bytes | u8 session bytes
@@ -7,7 +7,7 @@
              scales, quats, opacities, rgb (see columns.py), kappa, target, active (bits) per Gaussian
     trailer  u32 CRC32C of everything before it
 
-The counts alone fix the size of the columns, so a message that lies about itself is refused before memory is taken.
+The counts determine the size of the columns, so a message with wrong sizes is refused before memory is allocated.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ _MAX_GAUSSIAN_BYTES = _GAUSSIAN_BYTES + 4 + 2 + 1
 
 @dataclass(frozen=True, slots=True)
 class CodecLimits:
-    """What a receiver is willing to unpack from one message."""
+    """Upper limits of one message that a receiver decodes."""
 
     max_bytes: int = MAX_SUBSET_BYTES
     max_voxels: int = 200_000
@@ -52,7 +52,7 @@ DEFAULT_LIMITS = CodecLimits()
 
 @dataclass(frozen=True, slots=True)
 class _Layout:
-    """The columns of a body in order; their sizes follow from the counts."""
+    """The columns of a body; their sizes follow from the counts."""
 
     voxels: int
     gaussians: int
@@ -60,7 +60,7 @@ class _Layout:
     target_bytes: int
 
     def columns(self) -> list[tuple[str, tuple[int, ...]]]:
-        """(little-endian type, shape) of each column."""
+        """Return the (little-endian type, shape) of each column, in order."""
         v, n = self.voxels, self.gaussians
         per_voxel: list[tuple[str, tuple[int, ...]]] = [("<i8", (v,)), ("<u8", (v,)), ("<u4", (v,))]
         return [
@@ -71,25 +71,25 @@ class _Layout:
 
     @property
     def size(self) -> int:
-        """Bytes of the unpacked body."""
+        """Bytes of the decompressed body."""
         per_gaussian = _GAUSSIAN_BYTES + self.kappa_bytes + self.target_bytes
         return self.voxels * _VOXEL_BYTES + self.gaussians * per_gaussian + (self.gaussians + 7) // 8
 
 
 def encode_subset(subset: RoiSubset, grid: VoxelGrid) -> bytes:
-    """The message of this subset; the same subset always gives the same bytes.
+    """Encode the subset; the same subset always gives the same bytes.
 
-    Raises InvalidInputError when a value is not finite, out of its range or a mean lies outside its voxel.
+    Raises InvalidInputError if a value is not finite or out of range, or a mean lies outside its voxel.
     """
-    words, n = subset.batch, len(subset.batch.gaussians)
-    _require_encodable(words.gaussians)
+    batch, n = subset.batch, len(subset.batch.gaussians)
+    _require_encodable(batch.gaussians)
     agent, session = (_name_bytes(name, value) for name, value in _names(subset))
     layout = _Layout(
-        len(words), n, _width(int(words.gaussians.kappa.max(initial=0)), 8), _target_width(words.gaussians.target)
+        len(batch), n, _width(int(batch.gaussians.kappa.max(initial=0)), 8), _target_width(batch.gaussians.target)
     )
     packed = b"".join(
         _shuffle(np.ascontiguousarray(column, dtype))
-        for column, (dtype, _) in zip(_quantise(words, grid), layout.columns(), strict=True)
+        for column, (dtype, _) in zip(_quantise(batch, grid), layout.columns(), strict=True)
     )
     body = zstandard.ZstdCompressor(level=_ZSTD_LEVEL).compress(packed)
     header = _HEADER.pack(
@@ -101,40 +101,40 @@ def encode_subset(subset: RoiSubset, grid: VoxelGrid) -> bytes:
 
 
 def decode_subset(data: bytes, limits: CodecLimits = DEFAULT_LIMITS) -> tuple[RoiSubset, VoxelGrid]:
-    """The subset in a message and the grid its voxels are of.
+    """Decode a message; returns the subset and the grid of its voxels.
 
-    Raises CodecError when the bytes are no such message or exceed the limits, ChecksumError when they were damaged.
+    Raises CodecError if the bytes are not a valid message or exceed the limits, ChecksumError if they are damaged.
     """
     layout, fields, names, body = _open_envelope(data, limits)
     size_m, sequence, map_revision = fields
     try:
         grid = VoxelGrid(size_m)
-        words = _dequantise(_unpack(body, layout), grid)
-        return RoiSubset(names[0].decode(), names[1].decode(), sequence, map_revision, words), grid
+        batch = _dequantise(_unpack(body, layout), grid)
+        return RoiSubset(names[0].decode(), names[1].decode(), sequence, map_revision, batch), grid
     except CodecError:
         raise
     except (GaussLiteError, UnicodeDecodeError) as error:
         raise CodecError(f"subset: {error}") from error
 
 
-def split_batch(words: VoxelBatch, max_bytes: int = MAX_SUBSET_BYTES) -> list[VoxelBatch]:
-    """Cut words on voxel boundaries into parts whose messages are at most max_bytes, however badly they compress.
+def split_batch(batch: VoxelBatch, max_bytes: int = MAX_SUBSET_BYTES) -> list[VoxelBatch]:
+    """Split a batch at voxel boundaries into parts whose messages have at most max_bytes, even if incompressible.
 
-    A voxel too full for a message of its own keeps its most opaque Gaussians; its kappa sum stays the whole total.
+    A voxel too large for one message keeps its most opaque Gaussians; its Σkappa stays the total of all.
     """
-    room = (max_bytes - _HEADER.size - _TRAILER.size - 2 * _MAX_NAME_BYTES - 64) * 255 // 256
-    most = (room - _VOXEL_BYTES) // _MAX_GAUSSIAN_BYTES
-    if most < 1:
-        raise InvalidInputError(f"max_bytes: expected room for a Gaussian, at least 1024, got {max_bytes}")
-    words = _thin(words, most)
-    costs = words.counts.astype(np.int64) * _MAX_GAUSSIAN_BYTES + _VOXEL_BYTES
-    parts, start, spent = [], 0, 0
+    capacity = (max_bytes - _HEADER.size - _TRAILER.size - 2 * _MAX_NAME_BYTES - 64) * 255 // 256
+    max_count = (capacity - _VOXEL_BYTES) // _MAX_GAUSSIAN_BYTES
+    if max_count < 1:
+        raise InvalidInputError(f"max_bytes: expected at least 1024, so that a Gaussian fits, got {max_bytes}")
+    batch = _limit_counts(batch, max_count)
+    costs = batch.counts.astype(np.int64) * _MAX_GAUSSIAN_BYTES + _VOXEL_BYTES
+    parts, start, size = [], 0, 0
     for i, cost in enumerate(costs.tolist()):
-        if spent + cost > room:
-            parts.append(_slice(words, start, i))
-            start, spent = i, 0
-        spent += cost
-    return [*parts, _slice(words, start, len(words))] if len(words) else []
+        if size + cost > capacity:
+            parts.append(_slice(batch, start, i))
+            start, size = i, 0
+        size += cost
+    return [*parts, _slice(batch, start, len(batch))] if len(batch) else []
 
 
 def _open_envelope(
@@ -185,11 +185,11 @@ def _unpack(body: bytes, layout: _Layout) -> list[NDArray[Any]]:
     return out
 
 
-def _quantise(words: VoxelBatch, grid: VoxelGrid) -> list[NDArray[Any]]:
-    g = words.gaussians
-    voxel = np.repeat(grid.indices(words.keys), words.counts, axis=0)
+def _quantise(batch: VoxelBatch, grid: VoxelGrid) -> list[NDArray[Any]]:
+    g = batch.gaussians
+    voxel = np.repeat(grid.indices(batch.keys), batch.counts, axis=0)
     return [
-        *(words.keys, words.kappa_sums, words.counts),
+        *(batch.keys, batch.kappa_sums, batch.counts),
         columns.encode_means(g.means_m, voxel, grid),
         columns.encode_scales(g.scales_m),
         columns.encode_quats(g.quats_wxyz),
@@ -222,13 +222,13 @@ def _dequantise(raw: list[NDArray[Any]], grid: VoxelGrid) -> VoxelBatch:
 
 def _require_encodable(gaussians: Gaussians) -> None:
     for name in ("means_m", "quats_wxyz", "scales_m", "opacities", "rgb"):
-        require_finite(f"words {name}", getattr(gaussians, name))
+        require_finite(f"voxel batch {name}", getattr(gaussians, name))
     if (gaussians.scales_m <= 0).any():
-        raise InvalidInputError("words scales_m: expected positive scales, got zero or less")
+        raise InvalidInputError("voxel batch scales_m: expected positive scales, got zero or less")
     if (gaussians.opacities < 0).any() or (gaussians.opacities > 1).any():
-        raise InvalidInputError("words opacities: expected 0 to 1, got one outside")
+        raise InvalidInputError("voxel batch opacities: expected 0 to 1, got one outside")
     if (gaussians.quats_wxyz == 0).all(axis=1).any():
-        raise InvalidInputError("words quats_wxyz: expected rotations, got a zero quaternion")
+        raise InvalidInputError("voxel batch quats_wxyz: expected rotations, got a zero quaternion")
 
 
 def _names(subset: RoiSubset) -> tuple[tuple[str, str], tuple[str, str]]:
@@ -251,7 +251,7 @@ def _target_width(target: NDArray[np.int16]) -> int:
 
 
 def _shuffle(column: NDArray[Any]) -> bytes:
-    """All first bytes, then all second bytes …: neighbours in a plane resemble each other, which zstd likes."""
+    """Return all first bytes, then all second bytes, and so on: similar neighbouring bytes compress better."""
     return column.view(np.uint8).reshape(-1, column.itemsize).T.tobytes()
 
 
@@ -260,21 +260,21 @@ def _unshuffle(raw: bytes, dtype: str, shape: tuple[int, ...]) -> NDArray[Any]:
     return np.ascontiguousarray(planes.T).reshape(-1).view(dtype).reshape(shape)
 
 
-def _slice(words: VoxelBatch, start: int, stop: int) -> VoxelBatch:
-    rows = np.arange(words.offsets[start], words.offsets[stop])
+def _slice(batch: VoxelBatch, start: int, stop: int) -> VoxelBatch:
+    rows = np.arange(batch.offsets[start], batch.offsets[stop])
     return VoxelBatch(
-        words.keys[start:stop], words.kappa_sums[start:stop], words.counts[start:stop], words.gaussians.take(rows)
+        batch.keys[start:stop], batch.kappa_sums[start:stop], batch.counts[start:stop], batch.gaussians.take(rows)
     )
 
 
-def _thin(words: VoxelBatch, most: int) -> VoxelBatch:
-    if not (words.counts > most).any():
-        return words
-    keep = np.ones(len(words.gaussians), np.bool_)
-    for i in np.flatnonzero(words.counts > most):
-        begin, end = words.offsets[i], words.offsets[i + 1]
-        faintest = np.argsort(-words.gaussians.opacities[begin:end], kind="stable")[most:]
+def _limit_counts(batch: VoxelBatch, max_count: int) -> VoxelBatch:
+    if not (batch.counts > max_count).any():
+        return batch
+    keep = np.ones(len(batch.gaussians), np.bool_)
+    for i in np.flatnonzero(batch.counts > max_count):
+        begin, end = batch.offsets[i], batch.offsets[i + 1]
+        faintest = np.argsort(-batch.gaussians.opacities[begin:end], kind="stable")[max_count:]
         keep[begin + faintest] = False
     return VoxelBatch(
-        words.keys, words.kappa_sums, np.minimum(words.counts, most).astype(np.uint32), words.gaussians.take(keep)
+        batch.keys, batch.kappa_sums, np.minimum(batch.counts, max_count).astype(np.uint32), batch.gaussians.take(keep)
     )

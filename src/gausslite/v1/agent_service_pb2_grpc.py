@@ -65,14 +65,14 @@ class AgentServiceServicer(object):
     """Missing associated documentation comment in .proto file."""
 
     def AssignTask(self, request, context):
-        """Start mapping for this task. A second task replaces the first; the map stays.
+        """Map for this task from the next frame. A second task replaces the first; the map is kept.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def IngestFrames(self, request_iterator, context):
-        """Frames in, one outcome for each in the order they came. A bad frame is REJECTED and the stream goes on.
+        """Send frames; one outcome for each, in order. An invalid frame is REJECTED and the stream continues.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
@@ -85,14 +85,14 @@ class AgentServiceServicer(object):
         raise NotImplementedError('Method not implemented!')
 
     def RenderView(self, request, context):
-        """Draw the agent's map from anywhere.
+        """Render the agent's map from a camera pose.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def WatchMap(self, request, context):
-        """The agent's map as it grows: a snapshot, then what changed. OUT_OF_RANGE when since_revision is no longer kept.
+        """A snapshot of the agent's map, then its changes. OUT_OF_RANGE if since_revision is too old.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')

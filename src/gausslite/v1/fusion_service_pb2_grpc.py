@@ -80,46 +80,47 @@ class FusionServiceServicer(object):
     """Missing associated documentation comment in .proto file."""
 
     def JoinSession(self, request, context):
-        """Enter a mission. Joining again is safe: the new session replaces the agent's old one.
-        FAILED_PRECONDITION when the grid, the world frame or the mission differ from the server's.
+        """Join a mission. Joining again is safe: the new session replaces the agent's earlier one.
+        FAILED_PRECONDITION if the grid, the world frame or the mission differ from the server's.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def ContributeSubsets(self, request_iterator, context):
-        """Words in, cumulative acknowledgements out. An acknowledged word is as durable as the server's store. One bad subset
-        is REJECTED and the stream goes on. It ends with NOT_FOUND SESSION_UNKNOWN when the session is not known (join and
-        send everything again), FAILED_PRECONDITION for another grid, RESOURCE_EXHAUSTED when the disk is full.
+        """Send voxel updates; the server answers with cumulative acknowledgements. An acknowledged update is as durable as
+        the server's store. An invalid subset is REJECTED and the stream continues. The stream ends with NOT_FOUND
+        SESSION_UNKNOWN for an unknown session (join and send everything again), FAILED_PRECONDITION for another grid,
+        RESOURCE_EXHAUSTED if the disk is full.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def ContributeKeyframes(self, request_iterator, context):
-        """Views for the joint refinement; of each agent the newest are kept. An unusable one is reported, the rest is kept.
+        """Send keyframes for the joint refinement; each agent's newest are kept. Invalid ones are reported, others are kept.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def WatchFusedMap(self, request, context):
-        """The fused map as it changes. OUT_OF_RANGE when since_revision is no longer kept: watch from 0.
+        """A snapshot of the fused map, then its changes. OUT_OF_RANGE if since_revision is too old: watch from 0.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def RefineFusedMap(self, request, context):
-        """Optimise the fused map on the union of the agents' keyframes; closing the stream cancels it and keeps nothing.
-        FAILED_PRECONDITION before there are a map and keyframes; RESOURCE_EXHAUSTED while another refinement runs.
+        """Optimise the fused map on all agents' keyframes; closing the stream cancels the refinement without a result.
+        FAILED_PRECONDITION without a map and keyframes; RESOURCE_EXHAUSTED while another refinement runs.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def ExportFusedMap(self, request, context):
-        """A map as the bytes of a standard 3DGS PLY file. FAILED_PRECONDITION for a refined map before there is one.
+        """A map as the bytes of a standard 3DGS PLY file. FAILED_PRECONDITION for a refined map before a refinement.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')

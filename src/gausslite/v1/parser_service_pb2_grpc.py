@@ -45,7 +45,7 @@ class ParserServiceServicer(object):
     """Missing associated documentation comment in .proto file."""
 
     def ParseTask(self, request, context):
-        """INVALID_ARGUMENT TASK when the text is empty, too long or names nothing.
+        """INVALID_ARGUMENT TASK if the text is empty, too long or names no object.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')

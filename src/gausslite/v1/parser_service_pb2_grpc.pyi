@@ -35,13 +35,13 @@ class ParserServiceStub:
     @_typing.overload
     def __new__(cls, channel: _aio.Channel) -> ParserServiceAsyncStub: ...
     ParseTask: _grpc.UnaryUnaryMultiCallable[_parser_service_pb2.ParseTaskRequest, _parser_service_pb2.ParseTaskResponse]
-    """INVALID_ARGUMENT TASK when the text is empty, too long or names nothing."""
+    """INVALID_ARGUMENT TASK if the text is empty, too long or names no object."""
 
 @_typing.type_check_only
 class ParserServiceAsyncStub(ParserServiceStub):
     def __init__(self, channel: _aio.Channel) -> None: ...
     ParseTask: _aio.UnaryUnaryMultiCallable[_parser_service_pb2.ParseTaskRequest, _parser_service_pb2.ParseTaskResponse]  # type: ignore[assignment]
-    """INVALID_ARGUMENT TASK when the text is empty, too long or names nothing."""
+    """INVALID_ARGUMENT TASK if the text is empty, too long or names no object."""
 
 class ParserServiceServicer(metaclass=_abc_1.ABCMeta):
     @_abc_1.abstractmethod
@@ -50,6 +50,6 @@ class ParserServiceServicer(metaclass=_abc_1.ABCMeta):
         request: _parser_service_pb2.ParseTaskRequest,
         context: _ServicerContext,
     ) -> _typing.Union[_parser_service_pb2.ParseTaskResponse, _abc.Awaitable[_parser_service_pb2.ParseTaskResponse]]:
-        """INVALID_ARGUMENT TASK when the text is empty, too long or names nothing."""
+        """INVALID_ARGUMENT TASK if the text is empty, too long or names no object."""
 
 def add_ParserServiceServicer_to_server(servicer: ParserServiceServicer, server: _typing.Union[_grpc.Server, _aio.Server]) -> None: ...

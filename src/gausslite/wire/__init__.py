@@ -1,1 +1,1 @@
-"""The only home of gRPC in the library: messages, status codes, clients, servers and the uplink."""
+"""All gRPC code of the library: messages, status codes, clients, servers and the uplink."""

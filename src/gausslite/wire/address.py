@@ -1,4 +1,4 @@
-"""Addresses as an operator writes them: HOST:PORT or unix:PATH."""
+"""Check and split addresses of the form HOST:PORT or unix:PATH."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ _LAST_PORT = 65535
 
 
 def host_and_port(name: str, address: str) -> tuple[str, int]:
-    """The two parts of HOST:PORT. Raises InvalidInputError that begins with the name."""
+    """Split HOST:PORT. Raises InvalidInputError; its message begins with the name."""
     host, _, port = address.rpartition(":")
     if not host or not (port.isascii() and port.isdigit() and len(port) <= 5) or int(port) > _LAST_PORT:
         raise InvalidInputError(f"{name}: expected HOST:PORT or unix:PATH, got {address!r}")
@@ -17,7 +17,7 @@ def host_and_port(name: str, address: str) -> tuple[str, int]:
 
 
 def require_callable(name: str, address: str) -> None:
-    """Raise InvalidInputError for what nobody can answer at: gRPC would take a missing port for 443 and try forever."""
+    """Raise InvalidInputError unless a service can listen there; gRPC would use port 443 for a missing port."""
     if address.startswith(UNIX) and address != UNIX:
         return
     _, port = host_and_port(name, address)

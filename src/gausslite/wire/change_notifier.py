@@ -1,4 +1,4 @@
-"""Wake the streams that wait for news, however much of it there was."""
+"""Wake streams that wait for a change; several changes in between count as one."""
 
 from __future__ import annotations
 
@@ -6,16 +6,16 @@ import asyncio
 
 
 class ChangeNotifier:
-    """Take a ticket, look at the state, then wait on the ticket: no ring between is missed, and many count as one."""
+    """Subscribe, read the state, then wait on the subscription: so no change is missed. Use it on the event loop."""
 
     def __init__(self) -> None:
-        self._next_ring = asyncio.Event()
+        self._next_change = asyncio.Event()
 
     def subscribe(self) -> asyncio.Event:
-        """An event that the next ring sets."""
-        return self._next_ring
+        """Return an event that the next `notify` sets."""
+        return self._next_change
 
     def notify(self) -> None:
-        """Wake everyone who holds a ticket; call it on the event loop."""
-        self._next_ring.set()
-        self._next_ring = asyncio.Event()
+        """Wake all subscribers."""
+        self._next_change.set()
+        self._next_change = asyncio.Event()

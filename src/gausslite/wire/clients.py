@@ -1,6 +1,6 @@
-"""The three services as plain Python objects: nouns in, nouns out, our errors raised, every unary call with a deadline.
+"""Clients of the three services: domain objects as arguments and results, GaussLite errors, deadlines on unary calls.
 
-A client is safe to use from many threads. Streams are iterators; closing one cancels the call.
+Clients are thread-safe. Streams are iterators; closing one cancels the call.
 """
 
 from __future__ import annotations
@@ -28,17 +28,17 @@ from gausslite.v1 import (
 )
 from gausslite.wire import convert
 from gausslite.wire.channel import DEADLINE_S, ServiceChannel
+from gausslite.wire.connection import MAX_MESSAGE_BYTES
 from gausslite.wire.images import decode_colour, decode_depth
-from gausslite.wire.server import MAX_MESSAGE_BYTES
 from gausslite.wire.tls import Tls
 
-# a snapshot's block may come from a server with a larger limit of its own
+# larger than the default, because a server may send larger blocks
 _WATCH_LIMITS = CodecLimits(max_bytes=MAX_MESSAGE_BYTES, max_voxels=2_000_000, max_gaussians=2_000_000)
 
 
 @dataclass(frozen=True, slots=True)
 class Session:
-    """A place in a mission, as the fusion server granted it."""
+    """The fusion server's answer to a joining agent."""
 
     session_id: str
     highest_map_revision: int
@@ -49,34 +49,29 @@ class Session:
 
 @dataclass(frozen=True, slots=True)
 class Export:
-    """Which map to fetch: `vote`, `concatenation` or `refined`; with an agent's name only its contribution."""
+    """The map to download: `vote`, `concatenation` or `refined`; with an agent's id only its contribution."""
 
     strategy: str = "vote"
     agent_id: str = ""
 
 
 class ParserClient(ServiceChannel):
-    """The parser service as a task.TaskParser. With `patient` a call waits, within its deadline, for it to start."""
+    """The parser service as a task.TaskParser."""
 
     kind = "parser"
 
-    def __init__(
-        self, address: str, deadline_s: float = DEADLINE_S, patient: bool = False, tls: Tls | None = None
-    ) -> None:
+    def __init__(self, address: str, deadline_s: float = DEADLINE_S, tls: Tls | None = None) -> None:
         super().__init__(address, deadline_s, tls)
-        self._patient = patient
         self._stub = parser_service_pb2_grpc.ParserServiceStub(self._channel)
 
     def parse(self, text: str) -> TaskGraph:
-        """The graph of a task. Raises TaskError, UnavailableError."""
+        """Return the graph of a task. Raises TaskError, UnavailableError."""
         request = parser_service_pb2.ParseTaskRequest(text=text)
-        with self._our_errors():
-            response = self._stub.ParseTask(request, timeout=self._deadline_s, wait_for_ready=self._patient)
-        return convert.graph_from_message(response.graph)
+        return convert.graph_from_message(self._call(self._stub.ParseTask, request).graph)
 
 
 class AgentClient(ServiceChannel):
-    """One robot's mapper."""
+    """One agent."""
 
     kind = "agent"
 
@@ -85,7 +80,7 @@ class AgentClient(ServiceChannel):
         self._stub = agent_service_pb2_grpc.AgentServiceStub(self._channel)
 
     def assign_task(self, task: str | TaskGraph) -> TaskGraph:
-        """Give the agent words or a graph; returns the graph it works on. Raises TaskError, UnavailableError."""
+        """Assign a task as text or graph; returns the graph in force. Raises TaskError, UnavailableError."""
         if isinstance(task, str):
             request = agent_service_pb2.AssignTaskRequest(text=task)
         else:
@@ -95,14 +90,14 @@ class AgentClient(ServiceChannel):
     def ingest(
         self, frames: Iterable[Frame], lossless: bool = False
     ) -> Iterator[agent_service_pb2.IngestFramesResponse]:
-        """Send frames as they come; yields one outcome for each, in order."""
+        """Send frames; yields one outcome for each, in order."""
         requests = (
             agent_service_pb2.IngestFramesRequest(frame=convert.frame_to_message(frame, lossless)) for frame in frames
         )
         return self._stream(self._stub.IngestFrames(requests))
 
     def status(self) -> agent_service_pb2.GetAgentStatusResponse:
-        """What the agent has done so far."""
+        """Return the agent's status and counters."""
         request = agent_service_pb2.GetAgentStatusRequest()
         response: agent_service_pb2.GetAgentStatusResponse = self._call(self._stub.GetAgentStatus, request)
         return response
@@ -110,7 +105,7 @@ class AgentClient(ServiceChannel):
     def render(
         self, camera: Camera, T_world_camera: Float64[ndarray, "4 4"]
     ) -> tuple[UInt8[ndarray, "h w 3"], Float32[ndarray, "h w"]]:
-        """Colour and depth of the agent's map from this pose."""
+        """Return colour and depth in metres of the agent's map, rendered from this pose."""
         request = agent_service_pb2.RenderViewRequest(
             camera=convert.camera_to_message(camera), t_world_camera=convert.transform_to_message(T_world_camera)
         )
@@ -121,7 +116,7 @@ class AgentClient(ServiceChannel):
     def watch_map(
         self, since_revision: int = 0, region: AxisAlignedBox | None = None, roi_only: bool = False
     ) -> Iterator[convert.MapUpdate]:
-        """The map as it grows, without end. Raises RevisionGoneError when since_revision is no longer kept."""
+        """Yield the map and its later changes, without end. Raises RevisionGoneError if since_revision is too old."""
         request = agent_service_pb2.WatchMapRequest(
             since_revision=since_revision,
             region=None if region is None else convert.box_to_message(region),
@@ -134,12 +129,12 @@ class AgentClient(ServiceChannel):
 
 
 def is_done(status: agent_service_pb2.GetAgentStatusResponse) -> bool:
-    """True once the agent has ended its mission and written its results."""
+    """True after the agent has ended its mission and written its results."""
     return status.state == agent_service_pb2.AGENT_STATE_DONE
 
 
 class FusionClient(ServiceChannel):
-    """The team's map."""
+    """The fusion server."""
 
     kind = "fusion server"
 
@@ -151,7 +146,7 @@ class FusionClient(ServiceChannel):
         self._stub = fusion_service_pb2_grpc.FusionServiceStub(self._channel)
 
     def join(self, agent_id: str, grid: VoxelGrid, world_frame: str = "", fresh_map: bool = False) -> Session:
-        """Enter the mission. Raises MismatchError when the grid, the world frame or the mission differ."""
+        """Join the mission. Raises MismatchError if the grid, the world frame or the mission differ."""
         request = fusion_service_pb2.JoinSessionRequest(
             agent_id=agent_id,
             mission_id=self.mission_id,
@@ -171,11 +166,11 @@ class FusionClient(ServiceChannel):
     def contribute(
         self, requests: Sequence[fusion_service_pb2.ContributeSubsetsRequest], deadline_s: float
     ) -> Iterator[fusion_service_pb2.ContributeSubsetsResponse]:
-        """Send these subsets and yield the acks until all are answered or `deadline_s` is over."""
+        """Send these subsets; yields the acknowledgements until all have arrived or `deadline_s` has passed."""
         return self._stream(self._stub.ContributeSubsets(iter(requests), timeout=deadline_s))
 
     def contribute_keyframes(self, session_id: str, keyframes: Iterable[Frame]) -> int:
-        """Hand over views for the refinement; how many were kept. Raises QuotaError, SessionUnknownError."""
+        """Send keyframes for the refinement; returns the number stored. Raises QuotaError, SessionUnknownError."""
         requests = (
             fusion_service_pb2.ContributeKeyframesRequest(
                 session_id=session_id, keyframe=convert.frame_to_message(keyframe)
@@ -185,7 +180,7 @@ class FusionClient(ServiceChannel):
         return int(self._call(self._stub.ContributeKeyframes, requests, 10 * self._deadline_s).accepted)
 
     def watch(self, since_revision: int = 0, region: AxisAlignedBox | None = None) -> Iterator[convert.MapUpdate]:
-        """The fused map as it changes, without end. Raises RevisionGoneError when since_revision is no longer kept."""
+        """Yield the fused map and its changes, without end. Raises RevisionGoneError if since_revision is gone."""
         request = fusion_service_pb2.WatchFusedMapRequest(
             mission_id=self.mission_id,
             since_revision=since_revision,
@@ -199,14 +194,14 @@ class FusionClient(ServiceChannel):
     def refine(
         self, iterations: int = 0, max_gaussians: int = 0, seed: int = 0
     ) -> Iterator[fusion_service_pb2.RefineFusedMapResponse]:
-        """Optimise the fused map on the union of the keyframes; yields progress; closing it cancels."""
+        """Refine the fused map on all agents' keyframes; yields progress; closing the iterator cancels."""
         request = fusion_service_pb2.RefineFusedMapRequest(
             mission_id=self.mission_id, iterations=iterations, max_gaussians=max_gaussians, seed=seed
         )
         return self._stream(self._stub.RefineFusedMap(request))
 
     def export(self, export: Export) -> bytes:
-        """A map as the bytes of a PLY file. Raises MismatchError before there is a refined one, ChecksumError."""
+        """Return a map as the bytes of a PLY file. Raises MismatchError before the first refinement, ChecksumError."""
         request = fusion_service_pb2.ExportFusedMapRequest(
             mission_id=self.mission_id,
             strategy=fusion_service_pb2.FusionStrategy.Value(f"FUSION_STRATEGY_{export.strategy.upper()}"),
@@ -218,18 +213,18 @@ class FusionClient(ServiceChannel):
                 raise CodecError(f"export: expected the chunk at byte {len(data)}, got the one at {last.offset}")
             data += last.data
         if last is None or last.total_bytes != len(data):
-            raise CodecError(f"export: the stream ended after {len(data)} bytes, before the map was whole")
+            raise CodecError(f"export: the stream ended after {len(data)} bytes, before the map was complete")
         if google_crc32c.value(bytes(data)) != last.crc32c:
-            raise ChecksumError("export: CRC32C does not match; the map was damaged on the way")
+            raise ChecksumError("export: CRC32C does not match; the map was damaged in transit")
         return bytes(data)
 
     def status(self) -> fusion_service_pb2.GetSessionStatusResponse:
-        """What the server holds of whom."""
+        """Return the figures of the mission and of each agent."""
         request = fusion_service_pb2.GetSessionStatusRequest(mission_id=self.mission_id)
         response: fusion_service_pb2.GetSessionStatusResponse = self._call(self._stub.GetSessionStatus, request)
         return response
 
     def leave(self, session_id: str, forget: bool = False) -> int:
-        """Leave; with `forget` the map becomes as if the agent had never been there. Returns the fused revision."""
+        """Leave the mission; with `forget` the server deletes the agent's updates. Returns the fused revision."""
         request = fusion_service_pb2.LeaveSessionRequest(session_id=session_id, forget=forget)
         return int(self._call(self._stub.LeaveSession, request).fused_revision)

@@ -1,4 +1,4 @@
-"""Images as bytes: JPEG or PNG colour, 16-bit PNG depth in millimetres, sizes known before anything is unpacked."""
+"""Encode and decode images: JPEG or PNG colour, 16-bit PNG depth in mm; sizes are checked before decoding."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _MAX_DEPTH_MM = 65535
 
 
 def encode_colour(rgb: UInt8[ndarray, "h w 3"], lossless: bool = False) -> bytes:
-    """PNG when lossless, else JPEG of quality 95."""
+    """Encode as PNG if lossless, otherwise as JPEG with quality 95."""
     import cv2
 
     kind, options = (".png", []) if lossless else (".jpg", [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
@@ -23,17 +23,17 @@ def encode_colour(rgb: UInt8[ndarray, "h w 3"], lossless: bool = False) -> bytes
 
 
 def encode_depth(depth_m: Float32[ndarray, "h w"]) -> bytes:
-    """16-bit PNG in millimetres; depth beyond 65.5 m becomes 0 (no return)."""
+    """Encode as 16-bit PNG in millimetres; depth beyond 65.5 m becomes 0 (no return)."""
     import cv2
 
     depth_mm = np.rint(depth_m.astype(np.float64) * _MM_PER_M)
     depth_mm[depth_mm > _MAX_DEPTH_MM] = 0
-    # speed over size: a level above 1 costs ten times the time for a tenth of the bytes
+    # higher compression levels take ten times longer and save a tenth of the bytes
     return bytes(cv2.imencode(".png", depth_mm.astype(np.uint16), [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes())
 
 
 def decode_colour(data: bytes, width_px: int, height_px: int) -> UInt8[ndarray, "h w 3"]:
-    """Colour of exactly this size. Raises InvalidInputError."""
+    """Decode colour of exactly this size. Raises InvalidInputError."""
     import cv2
 
     _require_size("frame colour", data, width_px, height_px)
@@ -44,7 +44,7 @@ def decode_colour(data: bytes, width_px: int, height_px: int) -> UInt8[ndarray, 
 
 
 def decode_depth(data: bytes, width_px: int, height_px: int) -> Float32[ndarray, "h w"]:
-    """Depth in metres of exactly this size. Raises InvalidInputError."""
+    """Decode depth in metres of exactly this size. Raises InvalidInputError."""
     import cv2
 
     _require_size("frame depth_png", data, width_px, height_px)

@@ -1,4 +1,4 @@
-"""Cut words of a map into messages for a watcher, each complete in itself and well under the size a client takes."""
+"""Split a batch of voxels into self-contained messages for a watcher, each far below the client's size limit."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ _BLOCK_BYTES = 1 << 19
 
 
 def map_blocks(
-    words: VoxelBatch,
+    batch: VoxelBatch,
     grid: VoxelGrid,
-    speaker: str,
+    sender: str,
     revision: int,
     snapshot: bool,
     provenance: Callable[[VoxelBatch], Provenance] | None = None,
 ) -> Iterator[MapBlock]:
-    """The blocks of one revision, at least one, encoded one by one as they are asked for.
+    """Yield the blocks of one revision, at least one; each is encoded on request.
 
-    speaker is the agent id inside the bytes; provenance tells whose Gaussians a part holds. Raises InvalidInputError
-    for words that the codec refuses.
+    sender is the agent id inside the encoded bytes; provenance returns the agent of each voxel of a part. Raises
+    InvalidInputError if the codec cannot encode the batch.
     """
-    parts = split_batch(words, _BLOCK_BYTES)
-    for number, part in enumerate(parts or [words], start=1):
+    parts = split_batch(batch, _BLOCK_BYTES)
+    for number, part in enumerate(parts or [batch], start=1):
         yield MapBlock(
             revision=revision,
             snapshot=snapshot,
             last=number >= len(parts),
-            subset=encode_subset(RoiSubset(speaker, "", number, revision, part), grid) if parts else b"",
+            subset=encode_subset(RoiSubset(sender, "", number, revision, part), grid) if parts else b"",
             provenance=None if provenance is None else provenance(part),
         )

@@ -1,4 +1,4 @@
-"""Run a service as a process: logs to stderr one line each, a known end, exit code 2 for what the operator can mend."""
+"""Run a service as a process: one-line logs on stderr, exit code 2 for errors that the operator can fix."""
 
 from __future__ import annotations
 
@@ -11,22 +11,22 @@ from gausslite.errors import GaussLiteError
 
 
 class _OneLine(logging.Formatter):
-    """A record on one line, its traceback too, so that logs can be read by line."""
+    """Formats a record, with its traceback, as one line."""
 
     def format(self, record: logging.LogRecord) -> str:
-        """Fold whatever would have been several lines."""
+        """Join the lines of the formatted record."""
         return " | ".join(super().format(record).splitlines())
 
 
 def log_to_stderr(program: str) -> None:
-    """Send every record from INFO up to stderr as `time program level message`."""
+    """Log records of level INFO and higher to stderr as `time program level message`."""
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(_OneLine(f"%(asctime)s {program} %(levelname)s %(message)s"))
     logging.basicConfig(level=logging.INFO, handlers=[handler])
 
 
 def run_service(program: str, serve: Callable[[], Awaitable[None]]) -> int:
-    """The exit code of a service: 0 after a clean end, 2 and one line on stderr for a deliberate error."""
+    """Run the service; returns 0 after a clean end, 2 with one line on stderr after a GaussLiteError."""
     log_to_stderr(program)
 
     async def body() -> None:

@@ -1,6 +1,7 @@
-"""The one table between our errors and gRPC status codes, used in both directions.
+"""Convert between GaussLite errors and gRPC status codes, by one table for both directions.
 
-The ErrorInfo's reason names the error class, so a client raises what the server raised; the code tells strangers.
+The ErrorInfo's reason names the error class, so that a client raises the class that the server raised. Other clients
+use the code.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ _TABLE: tuple[tuple[type[GaussLiteError], grpc.StatusCode, str], ...] = (
 )
 
 _BY_REASON = {reason: kind for kind, _, reason in _TABLE}
-# what a code alone means, when no ErrorInfo of ours came with it (the transport, a proxy, another server)
+# for a status without GaussLite's ErrorInfo, from the transport, a proxy or another server
 _BY_CODE: dict[grpc.StatusCode, type[GaussLiteError]] = {
     grpc.StatusCode.INVALID_ARGUMENT: errors.InvalidInputError,
     grpc.StatusCode.DATA_LOSS: errors.ChecksumError,
@@ -53,13 +54,17 @@ _BY_CODE: dict[grpc.StatusCode, type[GaussLiteError]] = {
 }
 
 
+# what the transport reports for a port or a socket file without a server
+_NOT_LISTENING = ("Connection refused", "No such file or directory")
+
+
 def code_and_reason(error: GaussLiteError) -> tuple[grpc.StatusCode, str]:
-    """The code and ErrorInfo reason of an error; a subclass not in the table gets its nearest listed base."""
+    """Return the code and ErrorInfo reason of an error; a class not in the table uses its nearest base."""
     return next((code, reason) for kind, code, reason in _TABLE if isinstance(error, kind))
 
 
 def to_status(error: GaussLiteError) -> grpc.Status:
-    """The status to abort a call with: code, the error's one line, and an ErrorInfo."""
+    """Return the status of an error: its code, its message and an ErrorInfo."""
     code, reason = code_and_reason(error)
     detail = any_pb2.Any()
     detail.Pack(error_details_pb2.ErrorInfo(reason=reason, domain=DOMAIN))
@@ -69,12 +74,12 @@ def to_status(error: GaussLiteError) -> grpc.Status:
 
 
 def error_from_reason(reason: str, message: str) -> GaussLiteError:
-    """The error that a reason names; a reason of another version becomes the base error."""
+    """Return the error of the class that a reason names; an unknown reason gives the base class."""
     return _BY_REASON.get(reason, GaussLiteError)(message)
 
 
 def from_rpc_error(error: grpc.RpcError, address: str) -> GaussLiteError:
-    """The error the server raised, as its class; what the transport says becomes the class of its code."""
+    """Return the error that the server raised; an error of the transport gets the class of its code."""
     if not isinstance(error, grpc.Call):
         return errors.UnavailableError(f"{address}: {error}")
     code, text = error.code(), error.details() or "no details"
@@ -83,6 +88,8 @@ def from_rpc_error(error: grpc.RpcError, address: str) -> GaussLiteError:
         return error_from_reason(reason, text)
     if code is grpc.StatusCode.DEADLINE_EXCEEDED:
         return errors.UnavailableError(f"{address}: no answer in time")
+    if code is grpc.StatusCode.UNAVAILABLE and any(cause in text for cause in _NOT_LISTENING):
+        return errors.UnavailableError(f"{address}: connection refused")
     first_line = text.splitlines()[0]
     return _BY_CODE.get(code, GaussLiteError)(f"{address}: {code.name}: {first_line}")
 
@@ -91,7 +98,7 @@ def _reason(error: grpc.Call) -> str | None:
     try:
         status = rpc_status.from_call(error)
     except ValueError:
-        # a status whose details contradict its code: not one of ours
+        # the details contradict the code, so another program sent this status
         return None
     for detail in status.details if status is not None else ():
         info = error_details_pb2.ErrorInfo()

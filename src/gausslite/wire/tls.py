@@ -1,4 +1,4 @@
-"""Who this process is on the network, and whom it is_exact: certificates for its connections, when it is given some."""
+"""Encrypt connections: this process's certificate, and the authorities whose certificates it accepts."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _CERTIFICATE = "x509_pem_cert"
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """A certificate, with those between it and its authority, and its private key; PEM."""
+    """A certificate with its intermediate certificates, and its private key; PEM."""
 
     certificate: bytes
     key: bytes = field(repr=False)
@@ -26,9 +26,9 @@ class Identity:
 
 @dataclass(frozen=True, slots=True)
 class Tls:
-    """Encrypted connections: what this process shows of itself, and the authorities it believes (PEM).
+    """The identity of this process and the certificate authorities that it trusts (PEM).
 
-    authorities None: those that gRPC brings along. A server that has authorities demands a certificate of each caller.
+    authorities None: gRPC's default authorities. A server with authorities requires a certificate from each client.
     """
 
     identity: Identity | None = None
@@ -36,7 +36,7 @@ class Tls:
 
     @classmethod
     def read(cls, certificate: Path | None, key: Path | None, authorities: Path | None) -> Tls:
-        """From PEM files. Raises InvalidInputError when one is missing or damaged, or key and certificate differ."""
+        """Read PEM files. Raises InvalidInputError if one is missing or damaged, or the key does not fit."""
         identity = None
         if (certificate is None) != (key is None):
             raise InvalidInputError("--tls-cert: expected a certificate and its key, --tls-cert and --tls-key; got one")
@@ -49,34 +49,34 @@ class Tls:
         _require_authorities(authorities)
         return cls(identity, trusted)
 
-    def of_server(self) -> grpc.ServerCredentials:
-        """What a server listens with. Raises InvalidInputError without an identity."""
+    def server_credentials(self) -> grpc.ServerCredentials:
+        """Return a server's credentials. Raises InvalidInputError without an identity."""
         if self.identity is None:
-            raise InvalidInputError("--tls-ca: expected --tls-cert and --tls-key beside it, for what listens here")
+            raise InvalidInputError("--tls-ca: expected --tls-cert and --tls-key too, because this program listens")
         pair = [(self.identity.key, self.identity.certificate)]
         return grpc.ssl_server_credentials(pair, self.authorities, self.authorities is not None)
 
-    def of_client(self) -> grpc.ChannelCredentials:
-        """What a client connects with."""
+    def client_credentials(self) -> grpc.ChannelCredentials:
+        """Return a client's credentials."""
         own = (None, None) if self.identity is None else (self.identity.key, self.identity.certificate)
         return grpc.ssl_channel_credentials(self.authorities, *own)
 
 
 def open_channel(address: str, tls: Tls | None, options: Sequence[tuple[str, Any]] = ()) -> grpc.Channel:
-    """A channel, encrypted with `tls`. Behind a unix socket answers this machine, so its server is localhost."""
+    """Open a channel, encrypted with `tls`. The server of a unix socket must have a certificate for localhost."""
     if tls is None:
         return grpc.insecure_channel(address, options=options)
     if address.startswith("unix:"):
         options = [*options, ("grpc.ssl_target_name_override", "localhost")]
-    return grpc.secure_channel(address, tls.of_client(), options=options)
+    return grpc.secure_channel(address, tls.client_credentials(), options=options)
 
 
 def require_agent_certificate(context: Any, agent_id: str) -> None:
-    """Raise NotPermittedError when the caller of this rpc has shown a certificate that does not name the agent."""
-    shown = context.auth_context()
-    if _CERTIFICATE not in shown:
+    """Raise NotPermittedError if the client of this call has a certificate that does not name the agent."""
+    properties = context.auth_context()
+    if _CERTIFICATE not in properties:
         return
-    names = {name.decode(errors="replace") for kind in _NAMES for name in shown.get(kind, ())}
+    names = {name.decode(errors="replace") for kind in _NAMES for name in properties.get(kind, ())}
     if agent_id not in names:
         owner = ", ".join(sorted(names))[:200]
         raise NotPermittedError(f"agent {agent_id[:80]!r}: expected a certificate that names it, got one for {owner!r}")
@@ -84,8 +84,8 @@ def require_agent_certificate(context: Any, agent_id: str) -> None:
 
 def _read(option: str, path: Path) -> bytes:
     if not path.is_file():
-        came = "a folder" if path.is_dir() else "nothing"
-        raise InvalidInputError(f"{option} {path}: expected a PEM file, got {came}")
+        received = "a folder" if path.is_dir() else "nothing"
+        raise InvalidInputError(f"{option} {path}: expected a PEM file, got {received}")
     try:
         return path.read_bytes()
     except OSError as error:
@@ -93,7 +93,7 @@ def _read(option: str, path: Path) -> bytes:
 
 
 def _require_pair(certificate: Path, key: Path) -> None:
-    """Otherwise the server would start, and refuse every connection."""
+    """Raise InvalidInputError unless the key fits: the server would start, but refuse every connection."""
 
     def refuse() -> NoReturn:
         raise InvalidInputError(f"--tls-key {key}: expected a key without a passphrase")

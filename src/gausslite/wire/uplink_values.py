@@ -1,4 +1,4 @@
-"""What an uplink is told, and what it tells: its settings and its counters."""
+"""The settings and the counters of an uplink."""
 
 from __future__ import annotations
 
@@ -9,8 +9,9 @@ from gausslite.errors import InvalidInputError
 
 @dataclass(frozen=True, slots=True)
 class UplinkSettings:
-    """kbps bounds the bandwidth (kilobits a second; None = no bound). Between rounds at least interval_s pass, so that
-    words coalesce; a voxel is sent again once its kappa grew by resend_threshold, or when draining.
+    """kbps limits the bandwidth in kilobits per second (None = no limit). Rounds are at least interval_s apart, so that
+    several changes of a voxel are sent as one. A voxel is sent again if its Σkappa has changed by the share
+    resend_threshold of the sent value, or while the uplink drains.
     """
 
     kbps: float | None = None
@@ -26,13 +27,13 @@ class UplinkSettings:
             raise InvalidInputError(f"uplink kbps: expected a positive number, got {self.kbps}")
         if not (self.interval_s >= 0 and self.resend_threshold >= 0 and self.deadline_s > 0 and self.round_bytes > 0):
             raise InvalidInputError(
-                "uplink: expected interval and growth of at least 0, and a positive deadline and size"
+                "uplink: expected an interval and resend threshold of at least 0, and a positive deadline and size"
             )
 
 
 @dataclass(frozen=True, slots=True)
 class UplinkCounters:
-    """What was sent and acknowledged so far; voxels_sent counts each voxel of the task's region once."""
+    """Totals since the start; voxels_sent counts each voxel of the task's region once."""
 
     roi_bytes: int = 0
     handover_bytes: int = 0

@@ -114,7 +114,7 @@ def test_noise_is_no_message(noise: bytes) -> None:
 
 @given(CASES, st.data())
 @settings(max_examples=200, deadline=None)
-def test_a_forged_checksum_still_ends_in_a_codec_error(
+def test_a_changed_message_with_a_valid_checksum_is_refused_or_gives_a_valid_batch(
     case: tuple[float, float, int, int], data: st.DataObject
 ) -> None:
     message = bytearray(encode_subset(*build(case))[:-4])
@@ -125,8 +125,21 @@ def test_a_forged_checksum_still_ends_in_a_codec_error(
         subset, grid = decode_subset(forged)
     except (CodecError, ChecksumError):
         return
-    # a flip in a value is another valid message, and it too says the same thing twice
-    encode_subset(subset, grid)
+    # the flip changed a value: the batch is valid, and encoding it again is stable
+    gaussians = subset.batch.gaussians
+    for name in ("means_m", "quats_wxyz", "scales_m", "opacities", "rgb"):
+        assert np.isfinite(getattr(gaussians, name)).all(), name
+    assert (gaussians.scales_m > 0).all()
+    assert ((gaussians.opacities >= 0) & (gaussians.opacities <= 1)).all()
+    np.testing.assert_array_equal(
+        grid.keys(gaussians.means_m), np.repeat(subset.batch.keys, subset.batch.counts.astype(np.int64))
+    )
+    again = encode_subset(subset, grid)
+    decoded, decoded_grid = decode_subset(again)
+    assert decoded_grid == grid
+    for name in ("keys", "kappa_sums", "counts"):
+        np.testing.assert_array_equal(getattr(decoded.batch, name), getattr(subset.batch, name))
+    assert encode_subset(decoded, decoded_grid) == again
 
 
 def forge(body: bytes, voxels: int, gaussians: int, size_m: float = 0.1) -> bytes:

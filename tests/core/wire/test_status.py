@@ -15,7 +15,8 @@ from gausslite.domain.task import TaskGraph
 from gausslite.errors import GaussLiteError, QuotaError, UnavailableError
 from gausslite.v1 import parser_service_pb2, parser_service_pb2_grpc
 from gausslite.wire.clients import ParserClient
-from gausslite.wire.server import MAX_MESSAGE_BYTES, Service
+from gausslite.wire.connection import MAX_MESSAGE_BYTES
+from gausslite.wire.server import Service
 from gausslite.wire.status import code_and_reason, error_from_reason
 
 ERRORS = [kind for _, kind in inspect.getmembers(errors, inspect.isclass) if issubclass(kind, GaussLiteError)]

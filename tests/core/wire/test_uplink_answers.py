@@ -61,8 +61,8 @@ def test_trouble_is_logged_once_and_so_is_its_end(caplog: pytest.LogCaptureFixtu
         for voxel in (1, 2):
             link.enqueue(words({voxel: [5]}))
             assert link.drain(WAIT_S)
-    again = f"uplink: fusion server {address} takes words again"
-    assert [record.getMessage() for record in caplog.records] == ["uplink: draining; will go on trying", again] * 2
+    again = f"uplink: fusion server {address} accepts updates again"
+    assert [record.getMessage() for record in caplog.records] == ["uplink: draining; retrying", again] * 2
 
 
 def test_damage_is_sent_once_more_and_then_given_up() -> None:

@@ -1,8 +1,7 @@
-"""Messages to nouns and back, and what is refused at that border."""
+"""Conversion between messages and domain objects, and the refusal of invalid messages."""
 
 from __future__ import annotations
 
-import contextlib
 import struct
 import zlib
 
@@ -18,6 +17,7 @@ from gausslite.domain.camera import Camera
 from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.image_bytes import image_size
+from gausslite.domain.pose import require_rigid
 from gausslite.domain.task import Predicate, Relation, TaskGraph
 from gausslite.domain.voxel_batch import RoiSubset, VoxelBatch
 from gausslite.domain.voxels import AxisAlignedBox, VoxelGrid
@@ -33,7 +33,7 @@ GRAPH = TaskGraph(
 )
 
 
-def some_frame() -> Frame:
+def sample_frame() -> Frame:
     rng = np.random.default_rng(0)
     smooth = cv2.resize(rng.integers(0, 256, (6, 8, 3), np.uint8), (64, 48))
     depth_m = rng.uniform(0.1, 70.0, (48, 64)).astype(np.float32)
@@ -44,8 +44,8 @@ def some_frame() -> Frame:
 
 
 @pytest.mark.parametrize("lossless", [True, False])
-def test_a_frame_survives(lossless: bool) -> None:
-    sent = some_frame()
+def test_a_frame_is_unchanged_by_a_round_trip(lossless: bool) -> None:
+    sent = sample_frame()
     got = convert.frame_from_message(convert.frame_to_message(sent, lossless))
     assert (got.index, got.capture_time_ns, got.camera) == (sent.index, sent.capture_time_ns, sent.camera)
     np.testing.assert_array_equal(got.T_world_camera, sent.T_world_camera)
@@ -56,7 +56,7 @@ def test_a_frame_survives(lossless: bool) -> None:
     assert difference.max() == 0 if lossless else difference.mean() < 3
 
 
-def test_a_task_graph_survives() -> None:
+def test_a_task_graph_is_unchanged_by_a_round_trip() -> None:
     relations = tuple(Relation(predicate, "mug", "table") for predicate in Predicate)
     for graph in (GRAPH, TaskGraph("id", "", ("mug",), ("table",), relations)):
         assert convert.graph_from_message(convert.graph_to_message(graph)) == graph
@@ -75,7 +75,7 @@ def test_a_task_graph_survives() -> None:
         {"relations": [task_pb2.Relation(predicate=99, target="mug", anchor="table")]},  # type: ignore[arg-type]
     ],
 )
-def test_a_graph_without_sense_is_refused(change: dict[str, object]) -> None:
+def test_an_invalid_graph_is_refused(change: dict[str, object]) -> None:
     message = convert.graph_to_message(GRAPH)
     for name in change:
         message.ClearField(name)  # type: ignore[arg-type]
@@ -108,7 +108,7 @@ def bomb_png(width: int, height: int) -> bytes:
     ],
 )
 def test_a_bad_frame_names_its_field(name: str, value: object, message: str) -> None:
-    encoded = convert.frame_to_message(some_frame())
+    encoded = convert.frame_to_message(sample_frame())
     encoded.ClearField(name)  # type: ignore[arg-type]
     encoded.MergeFrom(geometry_pb2.EncodedFrame(**{name: value}))  # type: ignore[arg-type]
     with pytest.raises(InvalidInputError, match=message):
@@ -117,7 +117,7 @@ def test_a_bad_frame_names_its_field(name: str, value: object, message: str) -> 
 
 @pytest.mark.parametrize("value", [float("nan"), float("-inf"), 3.0, 1e200])
 def test_a_pose_that_is_not_rigid_is_refused(value: float) -> None:
-    encoded = convert.frame_to_message(some_frame())
+    encoded = convert.frame_to_message(sample_frame())
     encoded.t_world_camera.row_major[0] = value
     with pytest.raises(PoseError, match="t_world_camera"):
         convert.frame_from_message(encoded)
@@ -125,30 +125,44 @@ def test_a_pose_that_is_not_rigid_is_refused(value: float) -> None:
 
 @pytest.mark.parametrize("value", [4_649_776.0, -1e12, 1e300])
 def test_a_pose_too_far_from_the_worlds_origin_is_refused(value: float) -> None:
-    encoded = convert.frame_to_message(some_frame())
+    encoded = convert.frame_to_message(sample_frame())
     encoded.t_world_camera.row_major[7] = value
     with pytest.raises(PoseError, match="within 10000 m of the world's origin"):
         convert.frame_from_message(encoded)
 
 
-FRAME_BYTES = convert.frame_to_message(some_frame()).SerializeToString()
+FRAME_BYTES = convert.frame_to_message(sample_frame()).SerializeToString()
 
 
 @given(st.data())
 @settings(max_examples=200, deadline=None)
-def test_any_bytes_are_a_frame_or_a_deliberate_error(data: st.DataObject) -> None:
+def test_changed_frame_bytes_give_a_valid_frame_or_a_gausslite_error(data: st.DataObject) -> None:
     noisy = bytearray(FRAME_BYTES)
     for _ in range(data.draw(st.integers(1, 4))):
         noisy[data.draw(st.integers(0, len(noisy) - 1))] = data.draw(st.integers(0, 255))
-    with contextlib.suppress(GaussLiteError, DecodeError):
-        convert.frame_from_message(geometry_pb2.EncodedFrame.FromString(bytes(noisy)))
+    try:
+        frame = convert.frame_from_message(geometry_pb2.EncodedFrame.FromString(bytes(noisy)))
+    except (GaussLiteError, DecodeError):
+        return
+    size = (frame.camera.height_px, frame.camera.width_px)
+    assert (frame.rgb.shape, frame.rgb.dtype) == ((*size, 3), np.uint8)
+    assert (frame.depth_m.shape, frame.depth_m.dtype) == (size, np.float32)
+    assert np.isfinite(frame.depth_m).all()
+    assert frame.depth_m.min() >= 0
+    require_rigid("pose", frame.T_world_camera)
+    again = convert.frame_from_message(convert.frame_to_message(frame, lossless=True))
+    assert (again.index, again.capture_time_ns, again.camera) == (frame.index, frame.capture_time_ns, frame.camera)
+    for name in ("rgb", "depth_m", "T_world_camera"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(frame, name))
 
 
 @given(st.binary(max_size=200))
 @settings(max_examples=200, deadline=None)
 def test_image_sizes_are_read_from_any_bytes(noise: bytes) -> None:
     for head in (b"", b"\xff\xd8", b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"):
-        image_size(head + noise)
+        size = image_size(head + noise)
+        assert size is None or (len(size) == 2 and min(size) >= 0)
+    assert image_size(bomb_png(640, 480) + noise) == (640, 480)
     with pytest.raises(InvalidInputError):
         decode_colour(noise, 64, 48)
 
@@ -160,8 +174,8 @@ def test_image_sizes() -> None:
 
 def test_a_map_block_is_checked() -> None:
     grid = VoxelGrid()
-    words = VoxelBatch(np.array([5, 9]), np.zeros(2, np.uint64), np.zeros(2, np.uint32), Gaussians.empty())
-    subset = encode_subset(RoiSubset("a", "", 1, 4, words), grid)
+    batch = VoxelBatch(np.array([5, 9]), np.zeros(2, np.uint64), np.zeros(2, np.uint32), Gaussians.empty())
+    subset = encode_subset(RoiSubset("a", "", 1, 4, batch), grid)
     provenance = gaussians_pb2.Provenance(agent_ids=["a", "b"], winner=[1, 0])
     block = gaussians_pb2.MapBlock(revision=4, snapshot=True, last=True, subset=subset, provenance=provenance)
     update = convert.map_update_from_message(block, DEFAULT_LIMITS, first=True)
@@ -177,7 +191,7 @@ def test_a_map_block_is_checked() -> None:
     assert nothing.batch is None
 
 
-def test_a_box_survives_and_knows_what_it_holds() -> None:
+def test_a_box_is_unchanged_by_a_round_trip_and_contains_its_faces() -> None:
     box = AxisAlignedBox((-1.0, -1.0, -1.0), (1.0, 2.0, 3.0))
     assert convert.box_from_message(convert.box_to_message(box)) == box
     points = np.array([[0, 0, 0], [1, 2, 3], [1.1, 0, 0]], np.float32)

@@ -48,7 +48,7 @@ def ends_with_one_line(*arguments: str) -> str:
 
 
 class Hasty(FusionClient):
-    silence_s = 0.5
+    keepalive_s = 0.5
 
 
 def test_a_watcher_learns_that_the_server_went_away_without_a_word() -> None:
