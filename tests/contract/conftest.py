@@ -1,4 +1,4 @@
-"""Run the contract on every backend that this machine has."""
+"""Fixtures that run the contract on every backend of this machine."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from gausslite.errors import KernelError
 from gausslite.render.rasterizer import Rasterizer
 
 torch = pytest.importorskip("torch", reason="the oracle needs torch, which is not installed")
-# the oracle's tensors are small: more threads only wait for each other
+# the tensors are small: more threads only add synchronisation
 torch.set_num_threads(1)
 
 
@@ -39,13 +39,13 @@ BACKENDS: dict[str, Callable[[], Rasterizer]] = {
     "cpu neon": lambda: _cpu("neon"),
     "cpu portable": lambda: _cpu("portable"),
     "cuda": lambda: _cuda("cuda"),
-    "cuda stand-in": lambda: _cuda("cpu"),
+    "cuda emulation": lambda: _cuda("cpu"),
 }
 
 
 @pytest.fixture(scope="session", params=BACKENDS)
 def rasterizer(request: pytest.FixtureRequest) -> Rasterizer:
-    """Each backend in turn; one that cannot run here is skipped with its own reason."""
+    """Return each backend in turn; skip those that cannot run here, with the reason."""
     try:
         return BACKENDS[request.param]()
     except (ImportError, KernelError) as reason:

@@ -1,4 +1,4 @@
-"""Every backend's gradients are the oracle's."""
+"""Contract of `backward`: gradients match the oracle."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from splat_scenes import (
     GROUPS,
     SCENES,
     Scene,
+    named_scene,
     random_image_gradients,
     random_rows,
     relative_error,
     scene_for,
-    scene_named,
 )
 
 from gausslite.render.rasterizer import FULL_FRAME, TILE_PX, Rasterizer, SplatGradients, Subset
@@ -22,18 +22,18 @@ TOLERANCE = 1e-4
 
 
 def gradients(rasterizer: Rasterizer, scene: Scene, subset: Subset = FULL_FRAME) -> SplatGradients:
-    drawn = rasterizer.forward(scene.rows, scene.camera, scene.T_camera_world, subset)
-    return rasterizer.backward(drawn, *random_image_gradients(scene))
+    rendering = rasterizer.forward(scene.rows, scene.camera, scene.T_camera_world, subset)
+    return rasterizer.backward(rendering, *random_image_gradients(scene))
 
 
-def assert_same_gradients(came: SplatGradients, wanted: SplatGradients) -> None:
-    np.testing.assert_array_equal(came.visible, wanted.visible)
+def assert_same_gradients(result: SplatGradients, expected: SplatGradients) -> None:
+    np.testing.assert_array_equal(result.visible, expected.visible)
     for group, columns in GROUPS.items():
-        error = relative_error(came.d_rows[:, columns], wanted.d_rows[:, columns])
+        error = relative_error(result.d_rows[:, columns], expected.d_rows[:, columns])
         assert error < TOLERANCE, f"{group}: relative error {error:.2e}"
-    assert relative_error(came.mean_2d_norm, wanted.mean_2d_norm) < TOLERANCE
-    assert relative_error(came.d_twist, wanted.d_twist) < TOLERANCE
-    assert not came.d_rows[:, 14:].any()
+    assert relative_error(result.mean_2d_norm, expected.mean_2d_norm) < TOLERANCE
+    assert relative_error(result.d_twist, expected.d_twist) < TOLERANCE
+    assert not result.d_rows[:, 14:].any()
 
 
 @pytest.mark.parametrize("name", SCENES)
@@ -43,36 +43,36 @@ def test_gradients_match_the_oracle(rasterizer: Rasterizer, oracle: Rasterizer, 
 
 
 @pytest.mark.parametrize("channel", range(3))
-def test_each_image_alone_gives_the_oracles_gradients(rasterizer: Rasterizer, oracle: Rasterizer, channel: int) -> None:
-    scene = scene_named("medium splats")
+def test_gradients_of_each_image_match_the_oracle(rasterizer: Rasterizer, oracle: Rasterizer, channel: int) -> None:
+    scene = named_scene("medium splats")
     d_images = [d if i == channel else np.zeros_like(d) for i, d in enumerate(random_image_gradients(scene))]
-    came, wanted = (
+    result, expected = (
         r.backward(r.forward(scene.rows, scene.camera, scene.T_camera_world), *d_images) for r in (rasterizer, oracle)
     )
-    assert_same_gradients(came, wanted)
+    assert_same_gradients(result, expected)
 
 
 @pytest.mark.parametrize("name", ["medium splats", "odd size"])
-def test_gradients_of_a_tile_subset_match(rasterizer: Rasterizer, oracle: Rasterizer, name: str) -> None:
-    scene = scene_named(name)
+def test_gradients_of_a_tile_subset_match_the_oracle(rasterizer: Rasterizer, oracle: Rasterizer, name: str) -> None:
+    scene = named_scene(name)
     grid = (-(-scene.size[0] // 16), -(-scene.size[1] // 16))
     subset = Subset(tiles=np.random.default_rng(1).random(grid) < 0.4)
-    came, wanted = gradients(rasterizer, scene, subset), gradients(oracle, scene, subset)
-    assert_same_gradients(came, wanted)
-    hidden = np.setdiff1d(np.arange(len(scene.rows)), came.visible)
-    assert not came.d_rows[hidden].any()
+    result, expected = gradients(rasterizer, scene, subset), gradients(oracle, scene, subset)
+    assert_same_gradients(result, expected)
+    hidden = np.setdiff1d(np.arange(len(scene.rows)), result.visible)
+    assert not result.d_rows[hidden].any()
 
 
-def test_gradients_of_an_id_subset_match(rasterizer: Rasterizer, oracle: Rasterizer) -> None:
-    scene = scene_named("medium splats")
+def test_gradients_of_an_id_subset_match_the_oracle(rasterizer: Rasterizer, oracle: Rasterizer) -> None:
+    scene = named_scene("medium splats")
     ids = np.flatnonzero(np.random.default_rng(4).random(len(scene.rows)) < 0.3).astype(np.uint32)
-    came, wanted = gradients(rasterizer, scene, Subset(ids=ids)), gradients(oracle, scene, Subset(ids=ids))
-    assert_same_gradients(came, wanted)
-    assert np.isin(came.visible, ids).all()
+    result, expected = gradients(rasterizer, scene, Subset(ids=ids)), gradients(oracle, scene, Subset(ids=ids))
+    assert_same_gradients(result, expected)
+    assert np.isin(result.visible, ids).all()
 
 
-def test_ids_and_tiles_together_match(rasterizer: Rasterizer, oracle: Rasterizer) -> None:
-    scene = scene_named("dense")
+def test_gradients_of_ids_and_tiles_match_the_oracle(rasterizer: Rasterizer, oracle: Rasterizer) -> None:
+    scene = named_scene("dense")
     tiles = np.zeros((3, 4), np.bool_)
     tiles[1, 1:3] = True
     subset = Subset(tiles=tiles, ids=np.arange(0, len(scene.rows), 2, dtype=np.uint32))
@@ -80,49 +80,49 @@ def test_ids_and_tiles_together_match(rasterizer: Rasterizer, oracle: Rasterizer
 
 
 @pytest.mark.parametrize("subset", [Subset(tiles=np.zeros((3, 4), np.bool_)), Subset(ids=np.zeros(0, np.uint32))])
-def test_nothing_to_draw_has_no_gradient(rasterizer: Rasterizer, subset: Subset) -> None:
-    came = gradients(rasterizer, Scene(random_rows(0, 20), CAMERA, np.eye(4)), subset)
-    assert len(came.visible) == 0
-    assert came.d_rows.shape == (20, 16)
-    assert not came.d_rows.any()
-    assert not came.d_twist.any()
+def test_empty_subset_has_no_gradient(rasterizer: Rasterizer, subset: Subset) -> None:
+    result = gradients(rasterizer, Scene(random_rows(0, 20), CAMERA, np.eye(4)), subset)
+    assert len(result.visible) == 0
+    assert result.d_rows.shape == (20, 16)
+    assert not result.d_rows.any()
+    assert not result.d_twist.any()
 
 
-def test_no_splats_have_no_gradient(rasterizer: Rasterizer) -> None:
-    came = gradients(rasterizer, Scene(np.zeros((0, 16), np.float32), CAMERA, np.eye(4)))
-    assert came.d_rows.shape == (0, 16)
-    assert len(came.visible) == len(came.mean_2d_norm) == 0
+def test_empty_map_has_no_gradient(rasterizer: Rasterizer) -> None:
+    result = gradients(rasterizer, Scene(np.zeros((0, 16), np.float32), CAMERA, np.eye(4)))
+    assert result.d_rows.shape == (0, 16)
+    assert len(result.visible) == len(result.mean_2d_norm) == 0
 
 
-def test_rows_that_cannot_be_drawn_get_no_gradient(rasterizer: Rasterizer) -> None:
-    scene = scene_named("broken rows")
-    came = gradients(rasterizer, scene)
-    assert came.visible.min() >= 42
-    assert not np.isin(np.arange(60, 80), came.visible).any()
-    assert np.isfinite(came.d_rows).all()
-    assert not came.d_rows[:42].any()
+def test_invalid_rows_have_no_gradient(rasterizer: Rasterizer) -> None:
+    scene = named_scene("broken rows")
+    result = gradients(rasterizer, scene)
+    assert result.visible.min() >= 42
+    assert not np.isin(np.arange(60, 80), result.visible).any()
+    assert np.isfinite(result.d_rows).all()
+    assert not result.d_rows[:42].any()
 
 
-def test_a_second_rendering_forgets_the_first(rasterizer: Rasterizer) -> None:
-    scene, other = scene_named("medium splats"), scene_named("odd size")
+def test_gradients_are_independent_of_earlier_renderings(rasterizer: Rasterizer) -> None:
+    scene, other = named_scene("medium splats"), named_scene("odd size")
     first = gradients(rasterizer, scene)
     gradients(rasterizer, other)
-    again = gradients(rasterizer, scene)
-    np.testing.assert_allclose(again.d_rows, first.d_rows, rtol=1e-4, atol=1e-4)
+    repeated = gradients(rasterizer, scene)
+    np.testing.assert_allclose(repeated.d_rows, first.d_rows, rtol=1e-4, atol=1e-4)
 
 
-def test_a_mask_may_be_gone_on_the_way_back(rasterizer: Rasterizer) -> None:
-    scene = scene_named(SCENES[0])
+def test_backward_does_not_read_the_tile_mask(rasterizer: Rasterizer) -> None:
+    scene = named_scene(SCENES[0])
     grid = tuple(-(-side // TILE_PX) for side in scene.size)
     half = np.arange(grid[1]) % 2 == 0
-    kept = Subset(tiles=np.broadcast_to(half, grid).copy())
-    wanted = gradients(rasterizer, scene, kept)
-    assert np.abs(wanted.d_rows).sum() > 0.0
+    subset = Subset(tiles=np.broadcast_to(half, grid).copy())
+    expected = gradients(rasterizer, scene, subset)
+    assert np.abs(expected.d_rows).sum() > 0.0
     twice_as_wide = np.broadcast_to(half, grid).repeat(2, axis=1)
     for masks in (lambda: np.broadcast_to(half, grid).copy(), lambda: twice_as_wide[:, ::2]):
-        drawn = rasterizer.forward(scene.rows, scene.camera, scene.T_camera_world, Subset(tiles=masks()))
-        # whoever asks for memory next gets what the mask lay in
-        others = [np.zeros(grid, np.bool_) for _ in range(100)]
-        came = rasterizer.backward(drawn, *random_image_gradients(scene))
-        assert_same_gradients(came, wanted)
-        del others
+        rendering = rasterizer.forward(scene.rows, scene.camera, scene.T_camera_world, Subset(tiles=masks()))
+        # the next allocations reuse the memory of the mask
+        allocations = [np.zeros(grid, np.bool_) for _ in range(100)]
+        result = rasterizer.backward(rendering, *random_image_gradients(scene))
+        assert_same_gradients(result, expected)
+        del allocations

@@ -1,32 +1,32 @@
-"""Laws of the image model that hold for any splats, drawn by any backend."""
+"""Properties of the image model, for random splats and all backends."""
 
 from __future__ import annotations
 
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from splat_scenes import random_rows, turned
+from splat_scenes import random_rows, rotated_pose
 
 from gausslite.domain.camera import Camera
 from gausslite.render.rasterizer import OPACITY_LOGIT, Rasterizer, Subset
 
 CAMERA = Camera(30.0, 30.0, 16.0, 12.0, 33, 25)
-few = settings(max_examples=20, deadline=None)
+few_examples = settings(max_examples=20, deadline=None)
 seeds = st.integers(0, 2**32 - 1)
 counts = st.integers(0, 80)
 sizes_m = st.sampled_from([1e-3, 0.03, 0.2, 1.0])
 
 
 def images(rasterizer: Rasterizer, rows: np.ndarray, subset: Subset | None = None) -> np.ndarray:
-    drawn = rasterizer.forward(rows, CAMERA, turned(), subset or Subset())
-    return np.concatenate([drawn.rgb, drawn.depth_m[..., None], drawn.alpha[..., None]], axis=2)
+    rendering = rasterizer.forward(rows, CAMERA, rotated_pose(), subset or Subset())
+    return np.concatenate([rendering.rgb, rendering.depth_m[..., None], rendering.alpha[..., None]], axis=2)
 
 
-@few
+@few_examples
 @given(seed=seeds, n=counts, size_m=sizes_m)
-def test_the_order_of_the_rows_does_not_matter(rasterizer: Rasterizer, seed: int, n: int, size_m: float) -> None:
+def test_image_is_independent_of_row_order(rasterizer: Rasterizer, seed: int, n: int, size_m: float) -> None:
     rows = random_rows(seed, n, size_m)
-    # depths a millimetre apart: the law is about order, not about ties
+    # depths 1 mm apart: ties have no defined order
     rng = np.random.default_rng(seed)
     rows[:, 0] = 0.1 * rng.normal(size=n)
     rows[:, 2] = 1.0 + 0.001 * rng.permutation(n)
@@ -37,42 +37,44 @@ def test_the_order_of_the_rows_does_not_matter(rasterizer: Rasterizer, seed: int
     np.testing.assert_allclose(second, first, atol=1e-5)
 
 
-@few
+@few_examples
 @given(seed=seeds, n=counts, size_m=sizes_m, logit=st.floats(-8.0, 12.0))
-def test_alpha_is_a_share(rasterizer: Rasterizer, seed: int, n: int, size_m: float, logit: float) -> None:
-    drawn = images(rasterizer, random_rows(seed, n, size_m, logit))
-    alpha = drawn[..., 4]
+def test_alpha_is_in_unit_range_and_bounds_colour(
+    rasterizer: Rasterizer, seed: int, n: int, size_m: float, logit: float
+) -> None:
+    rendering = images(rasterizer, random_rows(seed, n, size_m, logit))
+    alpha = rendering[..., 4]
     assert alpha.min() >= 0.0
     assert alpha.max() <= 1.0
-    # colours were drawn in [0, 1], so none outshines its alpha
-    assert (drawn[..., :3] <= alpha[..., None] + 1e-5).all()
+    # splat colours are in [0, 1], so alpha bounds the blended colour
+    assert (rendering[..., :3] <= alpha[..., None] + 1e-5).all()
 
 
-@few
-@given(seed=seeds, n=counts, ghosts=st.integers(1, 20), size_m=sizes_m)
-def test_splats_without_opacity_change_nothing(
-    rasterizer: Rasterizer, seed: int, n: int, ghosts: int, size_m: float
+@few_examples
+@given(seed=seeds, n=counts, transparent_count=st.integers(1, 20), size_m=sizes_m)
+def test_transparent_splats_change_nothing(
+    rasterizer: Rasterizer, seed: int, n: int, transparent_count: int, size_m: float
 ) -> None:
     rows = random_rows(seed, n, size_m)
-    invisible = random_rows(seed ^ 1, ghosts, size_m)
+    invisible = random_rows(seed ^ 1, transparent_count, size_m)
     invisible[:, OPACITY_LOGIT] = -20.0
     first = images(rasterizer, rows)
     second = images(rasterizer, np.concatenate([rows, invisible]))
     np.testing.assert_allclose(second, first, atol=1e-6)
 
 
-@few
+@few_examples
 @given(seed=seeds, n=counts, size_m=sizes_m)
-def test_the_length_of_a_quaternion_does_not_matter(rasterizer: Rasterizer, seed: int, n: int, size_m: float) -> None:
+def test_image_is_independent_of_quaternion_length(rasterizer: Rasterizer, seed: int, n: int, size_m: float) -> None:
     rows = random_rows(seed, n, size_m)
     longer = rows.copy()
     longer[:, 6:10] *= 4.0
     np.testing.assert_allclose(images(rasterizer, longer), images(rasterizer, rows), atol=1e-4)
 
 
-@few
+@few_examples
 @given(seed=seeds, n=counts, size_m=sizes_m, mask=st.lists(st.booleans(), min_size=6, max_size=6))
-def test_a_tiling_adds_up_to_the_whole(
+def test_complementary_tile_subsets_sum_to_the_image(
     rasterizer: Rasterizer, seed: int, n: int, size_m: float, mask: list[bool]
 ) -> None:
     rows = random_rows(seed, n, size_m)
@@ -81,14 +83,14 @@ def test_a_tiling_adds_up_to_the_whole(
     np.testing.assert_allclose(parts, images(rasterizer, rows), atol=1e-6)
 
 
-@few
+@few_examples
 @given(seed=seeds, n=st.integers(1, 80))
 def test_colour_gradients_are_linear_in_the_images(rasterizer: Rasterizer, seed: int, n: int) -> None:
     rows = random_rows(seed, n)
-    drawn = rasterizer.forward(rows, CAMERA, turned())
-    d_rgb = np.random.default_rng(seed).normal(size=drawn.rgb.shape).astype(np.float32)
-    nothing = np.zeros_like(drawn.alpha)
-    once = rasterizer.backward(drawn, d_rgb, nothing, nothing).d_rows.copy()
-    drawn = rasterizer.forward(rows, CAMERA, turned())
-    twice = rasterizer.backward(drawn, 2 * d_rgb, nothing, nothing).d_rows
+    rendering = rasterizer.forward(rows, CAMERA, rotated_pose())
+    d_rgb = np.random.default_rng(seed).normal(size=rendering.rgb.shape).astype(np.float32)
+    nothing = np.zeros_like(rendering.alpha)
+    once = rasterizer.backward(rendering, d_rgb, nothing, nothing).d_rows.copy()
+    rendering = rasterizer.forward(rows, CAMERA, rotated_pose())
+    twice = rasterizer.backward(rendering, 2 * d_rgb, nothing, nothing).d_rows
     np.testing.assert_allclose(twice, 2 * once, rtol=1e-3, atol=1e-3 * max(1.0, float(np.abs(once).max())))

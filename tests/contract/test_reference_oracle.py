@@ -1,11 +1,11 @@
-"""The oracle itself, against finite differences and against sums done by hand."""
+"""The reference backend against finite differences and against direct sums."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 import torch
-from splat_scenes import CAMERA, GROUPS, Scene, random_image_gradients, relative_error, scene_named, turned
+from splat_scenes import CAMERA, GROUPS, Scene, named_scene, random_image_gradients, relative_error, rotated_pose
 
 from gausslite.render.rasterizer import LossWeights, Rasterizer
 from gausslite.render.reference.compositing import render_images
@@ -13,10 +13,10 @@ from gausslite.render.reference.loss import ReferenceView, ssim_map, training_lo
 from gausslite.render.reference.projection import project
 
 STEP = 5e-8
-"""So small that no alpha of a compared pixel crosses a threshold, and still far above the noise of float64."""
+"""Step of finite differences: small enough that no alpha crosses a threshold, large against float64 rounding."""
 
 
-def scalar(scene: Scene, rows: np.ndarray, T_camera_world: np.ndarray, d_images: np.ndarray) -> float:
+def weighted_sum(scene: Scene, rows: np.ndarray, T_camera_world: np.ndarray, d_images: np.ndarray) -> float:
     ellipses = project(torch.from_numpy(rows), scene.camera, torch.from_numpy(T_camera_world))
     return float((render_images(ellipses, scene.camera, None).numpy() * d_images).sum())
 
@@ -31,82 +31,83 @@ def exp_twist(twist: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("name", ["medium splats", "large splats", "outside the view", "needles and sheets"])
 def test_row_gradients_match_finite_differences_along_random_directions(oracle: Rasterizer, name: str) -> None:
-    scene = scene_named(name)
+    scene = named_scene(name)
     d_rgb, d_depth_m, d_alpha = random_image_gradients(scene)
     d_images = np.concatenate([d_rgb, d_depth_m[..., None], d_alpha[..., None]], axis=2).astype(np.float64)
-    drawn = oracle.forward(scene.rows, scene.camera, scene.T_camera_world)
-    came = oracle.backward(drawn, d_rgb, d_depth_m, d_alpha)
+    rendering = oracle.forward(scene.rows, scene.camera, scene.T_camera_world)
+    result = oracle.backward(rendering, d_rgb, d_depth_m, d_alpha)
     rows = scene.rows.astype(np.float64)
     rng = np.random.default_rng(0)
     for group, columns in GROUPS.items():
         slopes, products = [], []
         for _ in range(3):
             direction = np.zeros_like(rows)
-            direction[came.visible, columns] = rng.normal(size=(len(came.visible), columns.stop - columns.start))
-            ahead = scalar(scene, rows + STEP * direction, scene.T_camera_world, d_images)
-            behind = scalar(scene, rows - STEP * direction, scene.T_camera_world, d_images)
+            direction[result.visible, columns] = rng.normal(size=(len(result.visible), columns.stop - columns.start))
+            ahead = weighted_sum(scene, rows + STEP * direction, scene.T_camera_world, d_images)
+            behind = weighted_sum(scene, rows - STEP * direction, scene.T_camera_world, d_images)
             slopes.append((ahead - behind) / (2 * STEP))
-            products.append((came.d_rows * direction).sum())
+            products.append((result.d_rows * direction).sum())
         assert relative_error(np.array(products), np.array(slopes)) < 2e-5, group
 
 
 def test_the_pose_gradient_matches_finite_differences(oracle: Rasterizer) -> None:
-    scene = scene_named("medium splats")
+    scene = named_scene("medium splats")
     d_rgb, d_depth_m, d_alpha = random_image_gradients(scene)
     d_images = np.concatenate([d_rgb, d_depth_m[..., None], d_alpha[..., None]], axis=2).astype(np.float64)
-    drawn = oracle.forward(scene.rows, scene.camera, scene.T_camera_world)
-    came = oracle.backward(drawn, d_rgb, d_depth_m, d_alpha).d_twist
+    rendering = oracle.forward(scene.rows, scene.camera, scene.T_camera_world)
+    result = oracle.backward(rendering, d_rgb, d_depth_m, d_alpha).d_twist
     rows = scene.rows.astype(np.float64)
-    wanted = [
-        scalar(scene, rows, exp_twist(STEP * axis) @ scene.T_camera_world, d_images)
-        - scalar(scene, rows, exp_twist(-STEP * axis) @ scene.T_camera_world, d_images)
+    expected = [
+        weighted_sum(scene, rows, exp_twist(STEP * axis) @ scene.T_camera_world, d_images)
+        - weighted_sum(scene, rows, exp_twist(-STEP * axis) @ scene.T_camera_world, d_images)
         for axis in np.eye(6)
     ]
-    assert relative_error(came, np.array(wanted) / (2 * STEP)) < 1e-5
+    assert relative_error(result, np.array(expected) / (2 * STEP)) < 1e-5
 
 
-def test_the_2d_norm_is_the_gradient_of_a_shift_of_the_image(oracle: Rasterizer) -> None:
-    """Moving the principal point moves every mean in the image alike, so one splat alone shows its own norm."""
-    rows = scene_named("large splats").rows[:1].copy()
+def test_mean_2d_norm_is_the_gradient_of_an_image_shift(oracle: Rasterizer) -> None:
+    """Shifting the principal point shifts the image mean of a splat, which gives the norm by finite differences."""
+    rows = named_scene("large splats").rows[:1].copy()
     rows[0, :3] = [0.1, 0.05, 1.5]
     scene = Scene(rows, CAMERA, np.eye(4))
     d_rgb, d_depth_m, d_alpha = random_image_gradients(scene)
-    came = oracle.backward(oracle.forward(rows, CAMERA, np.eye(4)), d_rgb, d_depth_m, d_alpha).mean_2d_norm
+    result = oracle.backward(oracle.forward(rows, CAMERA, np.eye(4)), d_rgb, d_depth_m, d_alpha).mean_2d_norm
 
     def shifted(dx: float, dy: float) -> float:
         camera = type(CAMERA)(52.0, 50.0, CAMERA.cx_px + dx, CAMERA.cy_px + dy, 64, 48)
-        drawn = render_images(project(torch.from_numpy(rows.astype(np.float64)), camera, torch.eye(4).double()), camera, None)
-        return float((drawn.numpy() * np.dstack([d_rgb, d_depth_m, d_alpha])).sum())
+        ellipses = project(torch.from_numpy(rows.astype(np.float64)), camera, torch.eye(4).double())
+        rendering = render_images(ellipses, camera, None)
+        return float((rendering.numpy() * np.dstack([d_rgb, d_depth_m, d_alpha])).sum())
 
     by_x = (shifted(STEP, 0) - shifted(-STEP, 0)) / (2 * STEP)
     by_y = (shifted(0, STEP) - shifted(0, -STEP)) / (2 * STEP)
-    assert came[0] == pytest.approx(np.hypot(by_x * 32, by_y * 24), rel=1e-4)
+    assert result[0] == pytest.approx(np.hypot(by_x * 32, by_y * 24), rel=1e-4)
 
 
-def test_two_splats_blend_front_over_back(oracle: Rasterizer) -> None:
+def test_two_splats_blend_front_to_back(oracle: Rasterizer) -> None:
     rows = np.zeros((2, 16), np.float32)
     rows[:, 6] = 1.0
     rows[:, 3:6] = np.log(3.0)
     rows[:, 2] = [4.0, 2.0]
     rows[0, 11:14], rows[1, 11:14] = [0, 0, 1], [1, 0, 0]
     rows[:, 10] = np.log(0.5 / 0.5)
-    drawn = oracle.forward(rows, CAMERA, np.eye(4))
-    np.testing.assert_allclose(drawn.rgb[23, 32], [0.5, 0.0, 0.25], atol=1e-3)
-    np.testing.assert_allclose(drawn.depth_m[23, 32], 0.5 * 2.0 + 0.25 * 4.0, atol=1e-2)
-    np.testing.assert_allclose(drawn.alpha[23, 32], 0.75, atol=1e-3)
+    rendering = oracle.forward(rows, CAMERA, np.eye(4))
+    np.testing.assert_allclose(rendering.rgb[23, 32], [0.5, 0.0, 0.25], atol=1e-3)
+    np.testing.assert_allclose(rendering.depth_m[23, 32], 0.5 * 2.0 + 0.25 * 4.0, atol=1e-2)
+    np.testing.assert_allclose(rendering.alpha[23, 32], 0.75, atol=1e-3)
 
 
-def test_a_pixel_stops_after_the_splat_that_leaves_less_than_a_ten_thousandth(oracle: Rasterizer) -> None:
+def test_pixel_ends_after_transmittance_below_1e_4(oracle: Rasterizer) -> None:
     rows = np.zeros((4, 16), np.float32)
     rows[:, 6] = 1.0
     rows[:, 3:6] = np.log(5.0)
     rows[:, 2] = [1.0, 2.0, 3.0, 4.0]
     rows[:, 10] = [np.log(0.5 / 0.5), 50.0, 50.0, 50.0]
-    drawn = oracle.forward(rows, CAMERA, turned(0.0))
-    assert drawn.alpha[24, 32] == pytest.approx(1.0 - 0.5 * 0.01**2, abs=1e-6)
+    rendering = oracle.forward(rows, CAMERA, rotated_pose(0.0))
+    assert rendering.alpha[24, 32] == pytest.approx(1.0 - 0.5 * 0.01**2, abs=1e-6)
 
 
-def test_the_loss_terms_are_the_sums_of_their_definition() -> None:
+def test_loss_matches_direct_sums() -> None:
     rng = np.random.default_rng(0)
     images, rgb = rng.random((7, 9, 5)), rng.random((7, 9, 3))
     depth_m = np.where(rng.random((7, 9)) < 0.7, rng.uniform(0.5, 3.0, (7, 9)), 0.0)
@@ -114,7 +115,7 @@ def test_the_loss_terms_are_the_sums_of_their_definition() -> None:
     view = ReferenceView(CAMERA, *(torch.from_numpy(a) for a in (rgb, depth_m, weight)))
     for masked, w in ((False, np.ones((7, 9))), (True, weight)):
         colour = depth = structure = 0.0
-        similarity = _ssim_by_hand(images[..., :3], rgb)
+        similarity = direct_ssim(images[..., :3], rgb)
         for y in range(7):
             for x in range(9):
                 colour += w[y, x] * np.abs(images[y, x, :3] - rgb[y, x]).sum()
@@ -122,15 +123,16 @@ def test_the_loss_terms_are_the_sums_of_their_definition() -> None:
                 if images[y, x, 4] > 0.5 and depth_m[y, x] > 0:
                     depth += w[y, x] * abs(images[y, x, 3] / images[y, x, 4] - depth_m[y, x])
         total = w.sum()
-        wanted = 0.7 * colour / (3 * total) + 0.9 * depth / total + 0.3 * (1 - structure / (3 * total))
-        came = training_loss(torch.from_numpy(images), view, LossWeights(0.7, 0.9, 0.3), masked)
-        assert came.item() == pytest.approx(wanted, rel=1e-10)
-        normalise_by_image = training_loss(torch.from_numpy(images), view, LossWeights(0.7, 0.9, 0.3, normalise_by_image=True), masked)
-        assert normalise_by_image.item() == pytest.approx(wanted * total / (7 * 9), rel=1e-10)
+        expected = 0.7 * colour / (3 * total) + 0.9 * depth / total + 0.3 * (1 - structure / (3 * total))
+        result = training_loss(torch.from_numpy(images), view, LossWeights(0.7, 0.9, 0.3), masked)
+        assert result.item() == pytest.approx(expected, rel=1e-10)
+        weights = LossWeights(0.7, 0.9, 0.3, normalise_by_image=True)
+        normalised = training_loss(torch.from_numpy(images), view, weights, masked)
+        assert normalised.item() == pytest.approx(expected * total / (7 * 9), rel=1e-10)
 
 
-def _ssim_by_hand(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """SSIM by its window sums, pixel by pixel, with zeros outside the image."""
+def direct_ssim(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return SSIM by its window sums, pixel by pixel, with zero padding."""
     offsets = np.arange(-5, 6)
     window = np.exp(-(offsets[:, None] ** 2 + offsets[None, :] ** 2) / (2 * 1.5**2))
     window = (window / window.sum())[..., None]
@@ -146,6 +148,6 @@ def _ssim_by_hand(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return out
 
 
-def test_identical_images_are_perfectly_similar() -> None:
+def test_ssim_of_identical_images_is_one() -> None:
     image = torch.rand(20, 20, 3, dtype=torch.float64)
     np.testing.assert_allclose(ssim_map(image, image).numpy(), 1.0)

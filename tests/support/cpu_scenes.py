@@ -12,7 +12,7 @@ CAMERA = Camera(75.0, 74.0, 50.3, 39.7, 101, 83)
 
 
 def random_rows(n: int = 9000, seed: int = 0) -> np.ndarray:
-    """More rows than one projection segment holds, so that threads share the work."""
+    """Return random rows; the default is more than one projection segment, so that threads share the work."""
     rng = np.random.default_rng(seed)
     rows = np.zeros((n, 16), np.float32)
     rows[:, :3] = rng.uniform((-2, -2, -0.5), (2, 2, 4), (n, 3))

@@ -1,4 +1,4 @@
-"""Clone, split and prune: who is chosen, what children inherit, and that the cap holds."""
+"""Clone, split and prune: selection, inheritance and the cap."""
 
 from __future__ import annotations
 
@@ -30,30 +30,31 @@ def table_of(scales_m: list[float], gradients: list[float], capacity: int) -> Sp
     return table
 
 
-def test_small_ones_are_cloned_large_ones_are_split_and_calm_ones_are_left() -> None:
+def test_small_are_cloned_large_are_split_low_gradients_are_unchanged() -> None:
     table = table_of([0.001, 0.1, 0.1], [1e-3, 1e-3, 1e-5], capacity=10)
     before = table.rows.copy()
-    outcome = densify(table, SETTINGS, EXTENT_M)
-    assert (outcome.cloned, outcome.split, table.count) == (1, 1, 5)
+    change = densify(table, SETTINGS, EXTENT_M)
+    assert (change.cloned, change.split, table.count) == (1, 1, 5)
     np.testing.assert_array_equal(table.rows[2], before[2])
     parent, clone = table.rows[table.target == 0]
     np.testing.assert_array_equal(clone[:UPDATE_COUNT], parent[:UPDATE_COUNT])
-    np.testing.assert_array_equal(np.delete(clone, [OPACITY_LOGIT, UPDATE_COUNT]), np.delete(before[0], [OPACITY_LOGIT, UPDATE_COUNT]))
+    changed = [OPACITY_LOGIT, UPDATE_COUNT]
+    np.testing.assert_array_equal(np.delete(clone, changed), np.delete(before[0], changed))
     halves = table.rows[table.target == 1]
     np.testing.assert_allclose(halves[:, LOG_SCALE], np.log([[0.1 / 1.6, 0.1, 0.1]] * 2), rtol=1e-5)
     assert not np.array_equal(halves[0], halves[1])
 
 
 @pytest.mark.parametrize("logit", [-5.0, 0.0, 3.0, 12.0])
-def test_a_clone_and_its_parent_together_hide_what_the_parent_hid(logit: float) -> None:
+def test_clone_and_parent_have_the_transmittance_of_the_parent(logit: float) -> None:
     table = table_of([0.001], [1e-3], capacity=2)
     table.rows[:, OPACITY_LOGIT] = logit
-    hidden = table.opacities[0]
+    opacity = table.opacities[0]
     densify(table, SETTINGS, EXTENT_M)
-    np.testing.assert_allclose(1.0 - np.prod(1.0 - table.opacities.astype(np.float64)), hidden, rtol=1e-4)
+    np.testing.assert_allclose(1.0 - np.prod(1.0 - table.opacities.astype(np.float64)), opacity, rtol=1e-4)
 
 
-def test_two_halves_together_have_the_mean_and_the_spread_of_the_whole() -> None:
+def test_split_keeps_mean_and_covariance() -> None:
     table = table_of([0.1], [1e-3], capacity=2)
     table.rows[:, LOG_SCALE] = np.log([0.02, 0.1, 0.05])
     before = table.rows[0, MEAN].copy()
@@ -64,42 +65,42 @@ def test_two_halves_together_have_the_mean_and_the_spread_of_the_whole() -> None
     np.testing.assert_allclose(np.sqrt(variance_m2), [0.02, 0.1, 0.05], rtol=1e-4)
 
 
-def test_children_inherit_and_start_with_fresh_optimiser_state_while_the_others_keep_theirs() -> None:
+def test_children_inherit_columns_and_have_no_optimiser_state() -> None:
     table = table_of([0.001, 0.1, 0.1], [1e-3, 1e-3, 1e-5], capacity=10)
     densify(table, SETTINGS, EXTENT_M)
     np.testing.assert_array_equal(table.kappa, 10 * table.target)
     np.testing.assert_array_equal(table.active, table.target % 2 == 1)
-    kept, fresh = [0, 2], [1, 3, 4]
-    assert (table.first_moment[kept, :OPACITY_LOGIT] == 3.0).all()
-    assert (table.second_moment[kept] == 4.0).all()
-    assert (table.rows[kept, UPDATE_COUNT] == 9.0).all()
-    assert not table.first_moment[fresh].any()
-    assert not table.second_moment[fresh].any()
-    assert not table.rows[fresh, UPDATE_COUNT].any()
+    unchanged, new = [0, 2], [1, 3, 4]
+    assert (table.first_moment[unchanged, :OPACITY_LOGIT] == 3.0).all()
+    assert (table.second_moment[unchanged] == 4.0).all()
+    assert (table.rows[unchanged, UPDATE_COUNT] == 9.0).all()
+    assert not table.first_moment[new].any()
+    assert not table.second_moment[new].any()
+    assert not table.rows[new, UPDATE_COUNT].any()
 
 
-def test_statistics_start_anew() -> None:
+def test_densify_resets_the_statistics() -> None:
     table = table_of([0.001] * 3, [1e-3] * 3, capacity=10)
     densify(table, SETTINGS, EXTENT_M)
     assert not table.first_moment[:, [GRAD_2D_SUM, GRAD_2D_COUNT]].any()
 
 
-def test_where_room_is_short_the_largest_gradients_go_first() -> None:
+def test_largest_gradients_have_priority() -> None:
     table = table_of([0.001] * 5, [3e-3, 5e-3, 1e-3, 4e-3, 2e-3], capacity=7)
     densify(table, SETTINGS, EXTENT_M)
     assert table.count == 7
     assert sorted(table.target[5:]) == [1, 3]
 
 
-def test_a_full_table_is_left_alone() -> None:
+def test_full_table_is_unchanged() -> None:
     table = table_of([0.1] * 4, [1.0] * 4, capacity=4)
     before = table.rows.copy()
-    outcome = densify(table, SETTINGS, EXTENT_M)
-    assert (outcome.cloned, outcome.split) == (0, 0)
+    change = densify(table, SETTINGS, EXTENT_M)
+    assert (change.cloned, change.split) == (0, 0)
     np.testing.assert_array_equal(table.rows, before)
 
 
-def test_a_gaussian_never_seen_is_not_densified() -> None:
+def test_invisible_gaussian_is_not_densified() -> None:
     table = table_of([0.1], [1.0], capacity=4)
     table.first_moment[:, [GRAD_2D_SUM, GRAD_2D_COUNT]] = 0.0
     densify(table, SETTINGS, EXTENT_M)
@@ -109,7 +110,7 @@ def test_a_gaussian_never_seen_is_not_densified() -> None:
 def test_split_follows_the_rotation_of_an_elongated_gaussian() -> None:
     table = table_of([0.1], [1e-3], capacity=2)
     table.rows[:, LOG_SCALE] = np.log([1.0, 1e-3, 1e-3])
-    table.rows[:, QUAT] = (np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5))  # a quarter turn about z: x becomes y
+    table.rows[:, QUAT] = (np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5))  # 90 degrees about z: x becomes y
     densify(table, SETTINGS, EXTENT_M)
     np.testing.assert_allclose(table.rows[:, MEAN].std(axis=0), [0.0, np.sqrt(1 - 1 / 1.6**2), 0.0], atol=1e-6)
 

@@ -1,4 +1,4 @@
-"""The table of splats: conversions, optimiser state across every change, and the cap."""
+"""Splat table: row encoding, optimiser state after each operation, and the cap."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from gausslite.optimize.row_encoding import gaussians_to_rows, rows_to_gaussians
 from gausslite.optimize.splat_table import SplatTable
 
 
-def test_physical_values_survive_the_way_through_raw_rows() -> None:
+def test_row_encoding_round_trip() -> None:
     before = some_gaussians(50)
     after = rows_to_gaussians(gaussians_to_rows(before), before.active, before.kappa, before.target)
     for name in ("means_m", "quats_wxyz", "scales_m", "opacities", "rgb"):
@@ -20,14 +20,14 @@ def test_physical_values_survive_the_way_through_raw_rows() -> None:
         np.testing.assert_array_equal(getattr(after, name), getattr(before, name))
 
 
-def test_rows_stay_finite_for_opacities_of_zero_and_one_and_scales_of_zero() -> None:
+def test_rows_are_finite_for_opacities_0_and_1_and_scale_0() -> None:
     flat = some_gaussians(2)
     flat.opacities[:] = (0.0, 1.0)
     flat.scales_m[:] = 0.0
     assert np.isfinite(gaussians_to_rows(flat)).all()
 
 
-def test_memory_is_aligned_and_reserved_once() -> None:
+def test_memory_is_aligned_and_allocated_once() -> None:
     table = SplatTable(100)
     address = table.rows.__array_interface__["data"][0]
     assert address % 64 == 0
@@ -38,7 +38,7 @@ def test_memory_is_aligned_and_reserved_once() -> None:
     assert (table.count, table.free_slots) == (100, 0)
 
 
-def test_append_beyond_the_cap_is_refused_and_changes_nothing() -> None:
+def test_append_beyond_the_cap_is_rejected_without_change() -> None:
     table = SplatTable(10)
     table.append(some_gaussians(8))
     with pytest.raises(QuotaError, match="at most 2"):
@@ -46,7 +46,7 @@ def test_append_beyond_the_cap_is_refused_and_changes_nothing() -> None:
     assert table.count == 8
 
 
-def test_keep_moves_only_the_last_rows_with_their_optimiser_state() -> None:
+def test_keep_moves_only_the_last_rows_and_their_optimiser_state() -> None:
     table = SplatTable(20)
     table.append(some_gaussians(20))
     table.first_moment[:] = np.arange(20)[:, None]
@@ -54,16 +54,16 @@ def test_keep_moves_only_the_last_rows_with_their_optimiser_state() -> None:
     rows, kappa = table.rows.copy(), table.kappa.copy()
     mask = np.random.default_rng(1).random(20) < 0.6
     table.keep(mask)
-    stood = np.arange(mask.sum())
-    stood[~mask[: len(stood)]] = len(stood) + np.flatnonzero(mask[len(stood) :])
-    assert set(stood) == set(np.flatnonzero(mask))
-    np.testing.assert_array_equal(table.rows, rows[stood])
-    np.testing.assert_array_equal(table.kappa, kappa[stood])
-    np.testing.assert_array_equal(table.first_moment[:, 0], stood)
-    np.testing.assert_array_equal(table.second_moment[:, 0], 100 + stood)
+    expected_order = np.arange(mask.sum())
+    expected_order[~mask[: len(expected_order)]] = len(expected_order) + np.flatnonzero(mask[len(expected_order) :])
+    assert set(expected_order) == set(np.flatnonzero(mask))
+    np.testing.assert_array_equal(table.rows, rows[expected_order])
+    np.testing.assert_array_equal(table.kappa, kappa[expected_order])
+    np.testing.assert_array_equal(table.first_moment[:, 0], expected_order)
+    np.testing.assert_array_equal(table.second_moment[:, 0], 100 + expected_order)
 
 
-def test_append_keeps_the_state_of_the_others_and_starts_fresh_where_rows_were_used_before() -> None:
+def test_append_resets_optimiser_state_of_reused_rows_only() -> None:
     table = SplatTable(20)
     table.append(some_gaussians(20))
     table.first_moment[:] = 7.0
@@ -88,12 +88,12 @@ def test_to_gaussians_copies() -> None:
 
 
 @pytest.mark.parametrize("capacity", [10**12, 10**18, 10**30])
-def test_more_than_memory_is_refused_by_name(capacity: int) -> None:
+def test_capacity_beyond_memory_is_rejected(capacity: int) -> None:
     with pytest.raises(InvalidInputError, match="max_gaussians: expected a table that fits in memory"):
         SplatTable(capacity)
 
 
-def test_bad_arguments_are_named() -> None:
+def test_errors_name_invalid_arguments() -> None:
     with pytest.raises(InvalidInputError, match="capacity"):
         SplatTable(0)
     with pytest.raises(ShapeError, match="keep mask"):

@@ -1,4 +1,4 @@
-"""Whatever is done to a table, in any order: the cap holds, and nobody's state gets mixed up."""
+"""Splat table under random operations: the cap holds, and columns of different Gaussians are never mixed."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gausslite.domain.gaussians import Gaussians
-from gausslite.mapping.eviction import insert
+from gausslite.mapping.eviction import insert_seeds
 from gausslite.mapping.seeding import Seeds
 from gausslite.optimize.density import DensitySettings, densify, prune
 from gausslite.optimize.splat_table import SplatTable
@@ -20,8 +20,8 @@ ACTIONS = st.lists(
 )
 
 
-def born(count: int, active: bool, rng: np.random.Generator) -> Gaussians:
-    """Gaussians whose target tells whether they are active, and whose kappa is a function of it."""
+def random_gaussians(count: int, active: bool, rng: np.random.Generator) -> Gaussians:
+    """Return Gaussians whose target and kappa depend on `active`."""
     return Gaussians(
         means_m=rng.normal(size=(count, 3)).astype(np.float32),
         quats_wxyz=rng.normal(size=(count, 4)).astype(np.float32),
@@ -34,10 +34,10 @@ def born(count: int, active: bool, rng: np.random.Generator) -> Gaussians:
     )
 
 
-def act(table: SplatTable, action: str, seed: int, amount: int) -> None:
+def apply(table: SplatTable, action: str, seed: int, amount: int) -> None:
     rng = np.random.default_rng(seed)
     if action == "insert":
-        insert(table, Seeds(born(amount // 2, True, rng), born(amount, False, rng)), 0.5, rng)
+        insert_seeds(table, Seeds(random_gaussians(amount // 2, True, rng), random_gaussians(amount, False, rng)), 0.5, rng)
     elif action == "densify":
         table.first_moment[:, GRAD_2D_SUM] = rng.random(table.count)
         table.first_moment[:, GRAD_2D_COUNT] = 1.0
@@ -53,7 +53,7 @@ def act(table: SplatTable, action: str, seed: int, amount: int) -> None:
 def test_the_cap_holds_and_active_kappa_and_target_stay_together(actions: list[tuple[str, int, int]]) -> None:
     table = SplatTable(CAPACITY)
     for action, seed, amount in actions:
-        act(table, action, seed, amount)
+        apply(table, action, seed, amount)
         assert table.count <= CAPACITY
         assert len(table.rows) == len(table.first_moment) == len(table.second_moment) == table.count
         np.testing.assert_array_equal(table.target, np.where(table.active, 2, -1))
@@ -61,51 +61,51 @@ def test_the_cap_holds_and_active_kappa_and_target_stay_together(actions: list[t
         assert np.isfinite(table.rows).all()
 
 
-class WatchedTable(SplatTable):
-    """A table that looks at itself after each change, also between the steps of one densification."""
+class CheckedTable(SplatTable):
+    """A table that checks its invariants after each change, also inside a densification."""
 
     changes = 0
 
     def append_rows(self, *columns: np.ndarray) -> None:
         super().append_rows(*columns)
-        self._look()
+        self._check()
 
     def replace(self, ids: np.ndarray, gaussians: Gaussians) -> None:
         super().replace(ids, gaussians)
-        self._look()
+        self._check()
 
     def keep(self, mask: np.ndarray) -> None:
         super().keep(mask)
-        self._look()
+        self._check()
 
-    def _look(self) -> None:
+    def _check(self) -> None:
         self.changes += 1
         assert self.count <= self.capacity == CAPACITY
-        # memory was reserved once, and every view lies inside it
+        # memory is allocated once, and every view lies inside it
         assert np.shares_memory(self.rows, self._rows) or self.count == 0
         assert self._rows.shape == self._first_moment.shape == self._second_moment.shape == (CAPACITY, 16)
 
 
 @settings(max_examples=40, deadline=None)
 @given(st.integers(CAPACITY - 12, CAPACITY), st.integers(0, 2**31))
-def test_the_cap_holds_at_every_instant_inside_seeding_and_densification(held: int, seed: int) -> None:
+def test_cap_holds_after_each_change_in_seeding_and_densification(count: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
-    table = WatchedTable(CAPACITY)
-    table.append(born(held, True, rng))
-    act(table, "densify", seed, 0)
-    act(table, "insert", seed, 60)
-    act(table, "densify", seed, 0)
+    table = CheckedTable(CAPACITY)
+    table.append(random_gaussians(count, True, rng))
+    apply(table, "densify", seed, 0)
+    apply(table, "insert", seed, 60)
+    apply(table, "densify", seed, 0)
     assert table.changes > 3
 
 
 @settings(max_examples=60, deadline=None)
 @given(st.integers(1, 40), st.integers(0, 2**31), st.integers(0, 40))
-def test_the_tasks_seeds_always_fit_and_active_gaussians_go_last(held: int, seed: int, wanted: int) -> None:
+def test_roi_seeds_always_fit_and_evict_active_gaussians_last(count: int, seed: int, seed_count: int) -> None:
     rng = np.random.default_rng(seed)
     table = SplatTable(CAPACITY)
-    table.append(born(held // 2, True, rng))
-    table.append(born(held - held // 2, False, rng))
+    table.append(random_gaussians(count // 2, True, rng))
+    table.append(random_gaussians(count - count // 2, False, rng))
     inactive_before, active_before = int((~table.active).sum()), int(table.active.sum())
-    insert(table, Seeds(born(wanted, True, rng), Gaussians.empty()), 0.5, rng)
-    lost_active = active_before + wanted - int(table.active.sum())
-    assert lost_active == max(0, held + wanted - CAPACITY - inactive_before)
+    insert_seeds(table, Seeds(random_gaussians(seed_count, True, rng), Gaussians.empty()), 0.5, rng)
+    lost_active = active_before + seed_count - int(table.active.sum())
+    assert lost_active == max(0, count + seed_count - CAPACITY - inactive_before)

@@ -1,4 +1,4 @@
-"""Backends are chosen by name; what is not there is said in one line, and costs nothing."""
+"""Backends are created by name; a missing one gives a one-line error, and torch is not imported."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ pytest.importorskip("gausslite.render._kernels", reason="the native kernels are 
 NO_GPU = not any(Path(device).exists() for device in ("/dev/nvidia0", "/dev/dxg"))
 
 
-def test_the_cpu_backend_is_chosen_by_name() -> None:
+def test_cpu_backend_is_created_by_name() -> None:
     assert choose_rasterizer("cpu", threads=1).name == "cpu"
 
 
-def test_an_unknown_name_is_refused() -> None:
+def test_unknown_name_is_rejected() -> None:
     with pytest.raises(KernelError, match="expected one of auto, cpu, cuda, reference, got gpu"):
         choose_rasterizer("gpu")
 
 
 @pytest.mark.skipif(not NO_GPU, reason="this machine has a GPU")
-def test_auto_is_the_cpu_without_a_gpu_and_does_not_load_torch() -> None:
+def test_auto_is_cpu_without_gpu_and_does_not_import_torch() -> None:
     code = (
         "import sys; from gausslite.render.choose import choose_rasterizer; "
         "print(choose_rasterizer(threads=1).name, 'torch' in sys.modules)"
@@ -36,8 +36,8 @@ def test_auto_is_the_cpu_without_a_gpu_and_does_not_load_torch() -> None:
 
 
 @pytest.mark.skipif(not NO_GPU, reason="this machine has a GPU")
-def test_cuda_without_a_gpu_says_what_is_missing() -> None:
-    wanted = "CUDA device" if find_spec("torch") and find_spec("gsplat") else r"pip install 'gausslite\[cuda\]'"
-    with pytest.raises(KernelError, match=wanted) as refused:
+def test_cuda_without_gpu_names_the_missing_part() -> None:
+    expected = "CUDA device" if find_spec("torch") and find_spec("gsplat") else r"pip install 'gausslite\[cuda\]'"
+    with pytest.raises(KernelError, match=expected) as error:
         choose_rasterizer("cuda")
-    assert "\n" not in str(refused.value)
+    assert "\n" not in str(error.value)

@@ -1,4 +1,4 @@
-"""While tables are lent the kernels remember where each row is; nothing that they draw or train may depend on it."""
+"""Bound tables: the kernels store the bounds of rows, without an effect on renderings and training."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ kernels = pytest.importorskip("gausslite.render._kernels", reason="the native ke
 
 CAMERA = Camera(75.0, 74.0, 50.3, 39.7, 101, 83)
 FAST = AdamSettings(means=5e-2, log_scales=2e-1, quats=1e-1, opacity_logits=2e-1, rgb=1e-1)
-"""Rates that throw Gaussians in and out of sight within a few steps."""
+"""Rates so high that Gaussians become visible or invisible within a subset_ids steps."""
 
 
 def random_rows(n: int = 5000) -> np.ndarray:
@@ -41,8 +41,8 @@ def scattered_tiles(seed: int) -> np.ndarray:
     return np.random.default_rng(seed).random((6, 7)) < 0.2
 
 
-def train(rasterizer: CpuRasterizer, lending: bool, loss: LossWeights) -> list[np.ndarray]:
-    """Steps of all kinds from several poses, in two rounds with a change of the rows between them."""
+def train(rasterizer: CpuRasterizer, bind: bool, loss: LossWeights) -> list[np.ndarray]:
+    """Run steps of all kinds from several poses, in two rounds with a change of the rows in between."""
     rng = np.random.default_rng(1)
     size = (CAMERA.height_px, CAMERA.width_px)
     view = rasterizer.prepare_view(
@@ -52,86 +52,91 @@ def train(rasterizer: CpuRasterizer, lending: bool, loss: LossWeights) -> list[n
         (rng.random(size) < 0.5).astype(np.float32),
     )
     rows = random_rows()
-    lent = rows, np.zeros_like(rows), np.zeros_like(rows)
-    few = np.arange(0, len(rows), 3, dtype=np.uint32)
+    bound = rows, np.zeros_like(rows), np.zeros_like(rows)
+    subset_ids = np.arange(0, len(rows), 3, dtype=np.uint32)
     trainable = rng.random(len(rows)) < 0.5
-    seen = []
+    visible = []
     for _ in range(2):
-        with rasterizer.bind_tables(*lent) if lending else nullcontext():
+        with rasterizer.bind_tables(*bound) if bind else nullcontext():
             for i in range(12):
-                subset = (Subset(ids=few), Subset(), Subset(scattered_tiles(i)), Subset(scattered_tiles(i), few))[i % 4]
+                subset = (
+                    Subset(ids=subset_ids),
+                    Subset(),
+                    Subset(scattered_tiles(i)),
+                    Subset(scattered_tiles(i), subset_ids),
+                )[i % 4]
                 report = rasterizer.step(
-                    *lent, view, pose(0.3 * i), loss, FAST, i % 2 == 1, subset, trainable if i % 5 == 0 else None
+                    *bound, view, pose(0.3 * i), loss, FAST, i % 2 == 1, subset, trainable if i % 5 == 0 else None
                 )
-                seen.append(report.visible)
+                visible.append(report.visible)
         rows[::2, :3] = rows[::2, 2::-1]
-    return [*lent, *seen]
+    return [*bound, *visible]
 
 
 @pytest.mark.parametrize("loss", [LossWeights(ssim=0.0), LossWeights()])
 @pytest.mark.parametrize("simd", kernels.usable_simd())
-def test_a_loan_changes_no_bit_however_fast_the_rows_move(simd: str, loss: LossWeights) -> None:
-    with_loan, without = (train(CpuRasterizer(2, simd), lending, loss) for lending in (True, False))
-    assert {len(ids) > 0 for ids in without[3:]} == {True}
-    for a, b in zip(with_loan, without, strict=True):
+def test_binding_changes_no_bit(simd: str, loss: LossWeights) -> None:
+    bound, unbound = (train(CpuRasterizer(2, simd), bind, loss) for bind in (True, False))
+    assert {len(ids) > 0 for ids in unbound[3:]} == {True}
+    for a, b in zip(bound, unbound, strict=True):
         np.testing.assert_array_equal(a, b)
 
 
 @pytest.mark.parametrize("masked", [False, True])
-def test_a_step_sees_what_its_arrays_hold_now_though_they_were_seen_before(masked: bool) -> None:
+def test_cached_arguments_follow_changes_of_their_arrays(masked: bool) -> None:
     rng, rasterizer = np.random.default_rng(2), CpuRasterizer(2)
     size = (CAMERA.height_px, CAMERA.width_px)
     view = rasterizer.prepare_view(
         rng.integers(0, 256, (*size, 3), np.uint8), np.full(size, 2.0, np.float32), CAMERA, np.ones(size, np.float32)
     )
-    trained: list[list[np.ndarray]] = []
+    results: list[list[np.ndarray]] = []
     for fresh in (False, True):
         rows = random_rows(800)
-        lent = rows, np.zeros_like(rows), np.zeros_like(rows)
-        counts, among, trainable = np.zeros(800, np.uint32), np.ones(800, bool), np.ones(800, bool)
-        T_camera_world, update_counter = np.eye(4), UpdateCounter(counts, among)
+        bound = rows, np.zeros_like(rows), np.zeros_like(rows)
+        counts, mask, trainable = np.zeros(800, np.uint32), np.ones(800, bool), np.ones(800, bool)
+        T_camera_world, update_counter = np.eye(4), UpdateCounter(counts, mask)
         subset = Subset(np.ones((6, 7), bool))
         assert subset.tiles is not None
-        with rasterizer.bind_tables(*lent):
+        with rasterizer.bind_tables(*bound):
             for i in range(6):
                 T_camera_world[:] = pose(0.3 * i)
                 subset.tiles[:] = scattered_tiles(i)
-                trainable[:], among[:] = np.arange(800) % 3 != i % 3, np.arange(800) % 2 == i % 2
-                told = (T_camera_world, subset, trainable, update_counter)
+                trainable[:], mask[:] = np.arange(800) % 3 != i % 3, np.arange(800) % 2 == i % 2
+                arguments = (T_camera_world, subset, trainable, update_counter)
                 if fresh:
-                    told = (
+                    arguments = (
                         T_camera_world.copy(),
                         Subset(subset.tiles.copy()),
                         trainable.copy(),
-                        UpdateCounter(counts, among.copy()),
+                        UpdateCounter(counts, mask.copy()),
                     )
-                rasterizer.step(*lent, view, told[0], LossWeights(), FAST, masked, *told[1:])
-        trained.append([*lent, counts])
-    for a, b in zip(*trained, strict=True):
+                rasterizer.step(*bound, view, arguments[0], LossWeights(), FAST, masked, *arguments[1:])
+        results.append([*bound, counts])
+    for a, b in zip(*results, strict=True):
         np.testing.assert_array_equal(a, b)
-    assert trained[0][3].any()
+    assert results[0][3].any()
 
 
-def test_what_is_wrong_is_refused_each_time_it_comes() -> None:
+def test_invalid_arguments_are_rejected_repeatedly() -> None:
     size = (CAMERA.height_px, CAMERA.width_px)
     rasterizer, rows = CpuRasterizer(1), random_rows(10)
     view = rasterizer.prepare_view(np.zeros((*size, 3), np.uint8), np.ones(size, np.float32), CAMERA)
-    lent, loss = (rows, np.zeros_like(rows), np.zeros_like(rows)), LossWeights()
-    few, tiles = Subset(ids=np.array([9], np.uint32)), Subset(np.ones((2, 2), bool))
-    with rasterizer.bind_tables(*lent):
-        rasterizer.step(*lent, view, pose(0.0), loss, FAST, subset=few)
+    bound, loss = (rows, np.zeros_like(rows), np.zeros_like(rows)), LossWeights()
+    subset_ids, tiles = Subset(ids=np.array([9], np.uint32)), Subset(np.ones((2, 2), bool))
+    with rasterizer.bind_tables(*bound):
+        rasterizer.step(*bound, view, pose(0.0), loss, FAST, subset=subset_ids)
         for _ in range(2):
             with pytest.raises(ShapeError, match="subset tiles"):
-                rasterizer.step(*lent, view, pose(0.0), loss, FAST, subset=tiles)
-    fewer = tuple(table[:9].copy() for table in lent)
-    for lending in (rasterizer.bind_tables(*fewer), nullcontext()):
-        with lending, pytest.raises(InvalidInputError, match="subset ids"):
-            rasterizer.step(*fewer, view, pose(0.0), loss, FAST, subset=few)
+                rasterizer.step(*bound, view, pose(0.0), loss, FAST, subset=tiles)
+    fewer = tuple(table[:9].copy() for table in bound)
+    for context in (rasterizer.bind_tables(*fewer), nullcontext()):
+        with context, pytest.raises(InvalidInputError, match="subset ids"):
+            rasterizer.step(*fewer, view, pose(0.0), loss, FAST, subset=subset_ids)
 
 
 @pytest.mark.parametrize("simd", kernels.usable_simd())
 @pytest.mark.parametrize("seed", range(4))
-def test_scattered_tiles_look_as_they_do_in_the_whole_image(seed: int, simd: str) -> None:
+def test_tile_subset_matches_the_whole_image(seed: int, simd: str) -> None:
     rasterizer, tiles = CpuRasterizer(2, simd), scattered_tiles(seed)
     pixels = tiles.repeat(16, 0).repeat(16, 1)[: CAMERA.height_px, : CAMERA.width_px]
     whole = rasterizer.forward(random_rows(), CAMERA, pose(0.1 * seed))

@@ -1,4 +1,4 @@
-"""How the native backend is chosen and set up, and which misuse it refuses."""
+"""Construction of the CPU backend, and the arguments that it rejects."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from gausslite.render.rasterizer import AdamSettings, LossWeights
 kernels = pytest.importorskip("gausslite.render._kernels", reason="the native kernels are not built")
 
 
-def test_a_superseded_rendering_is_refused() -> None:
+def test_outdated_rendering_is_rejected() -> None:
     rasterizer = CpuRasterizer(1)
-    drawn = rasterizer.forward(random_rows(50), CAMERA, np.eye(4))
+    rendering = rasterizer.forward(random_rows(50), CAMERA, np.eye(4))
     rasterizer.forward(random_rows(50), CAMERA, np.eye(4))
     with pytest.raises(InvalidInputError, match="latest"):
-        rasterizer.backward(drawn, drawn.rgb, drawn.depth_m, drawn.alpha)
+        rasterizer.backward(rendering, rendering.rgb, rendering.depth_m, rendering.alpha)
 
 
-def test_an_impossible_instruction_set_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unusable_instruction_set_is_rejected(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(KernelError, match=r"simd: expected one of .*portable.* got sse9"):
         CpuRasterizer(simd="sse9")
     monkeypatch.setenv(SIMD_VARIABLE, "mmx")
@@ -32,7 +32,7 @@ def test_an_impossible_instruction_set_is_refused(monkeypatch: pytest.MonkeyPatc
         CpuRasterizer()
 
 
-def test_the_environment_chooses_the_instruction_set_and_the_argument_wins(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_simd_argument_overrides_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(SIMD_VARIABLE, "portable")
     assert CpuRasterizer(threads=1).simd == "portable"
     fastest = kernels.usable_simd()[0]
@@ -40,24 +40,24 @@ def test_the_environment_chooses_the_instruction_set_and_the_argument_wins(monke
 
 
 @pytest.mark.parametrize("threads", [0, -1, 257])
-def test_an_impossible_number_of_threads_is_refused(threads: int) -> None:
+def test_invalid_thread_count_is_rejected(threads: int) -> None:
     with pytest.raises(KernelError, match="threads"):
         CpuRasterizer(threads=threads)
 
 
 @pytest.mark.parametrize(
-    ("told", "cores"),
+    ("content", "cores"),
     [("200000 100000", 2), ("150000 100000", 2), ("50000 100000", 1), ("max 100000", MAX_THREADS), ("", MAX_THREADS)],
 )
-def test_a_containers_share_of_the_cores_counts(tmp_path: Path, told: str, cores: int) -> None:
+def test_container_cpu_limit_bounds_the_threads(tmp_path: Path, content: str, cores: int) -> None:
     limit = tmp_path / "cpu.max"
     assert cores_allowed(limit) == MAX_THREADS
-    limit.write_text(told + "\n")
+    limit.write_text(content + "\n")
     assert cores_allowed(limit) == cores
 
 
 @pytest.mark.parametrize(
-    ("wrong", "said"),
+    ("settings", "message"),
     [
         ({"means": -1.0}, "adam rate means: expected a finite number of at least 0, got -1.0"),
         ({"rgb": float("nan")}, "adam rate rgb"),
@@ -66,19 +66,19 @@ def test_a_containers_share_of_the_cores_counts(tmp_path: Path, told: str, cores
         ({"decay_after_updates": -1.0}, "adam decay_after_updates: expected more than 0, got -1.0"),
     ],
 )
-def test_rates_that_would_ruin_a_map_are_refused(wrong: dict[str, float], said: str) -> None:
-    with pytest.raises(InvalidInputError, match=said):
-        AdamSettings(**wrong)
+def test_invalid_adam_settings_are_rejected(settings: dict[str, float], message: str) -> None:
+    with pytest.raises(InvalidInputError, match=message):
+        AdamSettings(**settings)
 
 
 @pytest.mark.parametrize("name", ["colour", "depth", "ssim"])
-def test_loss_weights_that_are_none_are_refused(name: str) -> None:
+def test_invalid_loss_weights_are_rejected(name: str) -> None:
     for bad in (-0.1, float("nan"), float("inf")):
         with pytest.raises(InvalidInputError, match=f"loss weight {name}"):
             LossWeights(**{name: bad})
 
 
-def test_tables_that_cannot_be_changed_in_place_are_refused() -> None:
+def test_non_contiguous_or_read_only_tables_are_rejected() -> None:
     rasterizer = CpuRasterizer(1)
     view = view_of(rasterizer)
     rows = random_rows(64)
@@ -90,7 +90,7 @@ def test_tables_that_cannot_be_changed_in_place_are_refused() -> None:
             rasterizer.step(bad, good, good.copy(), view, np.eye(4), LossWeights(), AdamSettings())
 
 
-def test_weights_outside_0_to_1_are_refused() -> None:
+def test_view_weights_outside_0_to_1_are_rejected() -> None:
     size = (CAMERA.height_px, CAMERA.width_px)
     for bad in (-0.1, 1.5, np.nan):
         with pytest.raises(InvalidInputError, match="weight"):

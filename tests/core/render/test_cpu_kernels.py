@@ -1,4 +1,4 @@
-"""What is the native backend's own: its instruction sets agree, and threads change no bit."""
+"""CPU backend: instruction sets agree, and the number of threads changes no bit."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ kernels = pytest.importorskip("gausslite.render._kernels", reason="the native ke
 
 
 L1_ONLY, WITH_SSIM = LossWeights(ssim=0.0), LossWeights()
-STILL = AdamSettings(means=0.0, log_scales=0.0, quats=0.0, opacity_logits=0.0, rgb=0.0)
+ZERO_RATES = AdamSettings(means=0.0, log_scales=0.0, quats=0.0, opacity_logits=0.0, rgb=0.0)
 
 
 def gradients(rasterizer: CpuRasterizer, rows: np.ndarray) -> SplatGradients:
-    drawn = rasterizer.forward(rows, CAMERA, np.eye(4))
+    rendering = rasterizer.forward(rows, CAMERA, np.eye(4))
     rng = np.random.default_rng(1)
     d_rgb, d_depth_m, d_alpha = (
-        rng.normal(size=a.shape).astype(np.float32) for a in (drawn.rgb, drawn.depth_m, drawn.alpha)
+        rng.normal(size=a.shape).astype(np.float32) for a in (rendering.rgb, rendering.depth_m, rendering.alpha)
     )
-    return rasterizer.backward(drawn, d_rgb, d_depth_m, d_alpha)
+    return rasterizer.backward(rendering, d_rgb, d_depth_m, d_alpha)
 
 
 def train(rasterizer: CpuRasterizer, loss: LossWeights, steps: int = 3, masked: bool = False) -> tuple[np.ndarray, ...]:
@@ -41,39 +41,38 @@ def train(rasterizer: CpuRasterizer, loss: LossWeights, steps: int = 3, masked: 
 
 
 @pytest.mark.parametrize("simd", kernels.usable_simd())
-def test_every_instruction_set_draws_what_the_portable_form_draws(simd: str) -> None:
+def test_instruction_sets_match_the_portable_variant(simd: str) -> None:
     rows = random_rows()
-    came, wanted = CpuRasterizer(2, simd), CpuRasterizer(2, "portable")
-    a, b = came.forward(rows, CAMERA, np.eye(4)), wanted.forward(rows, CAMERA, np.eye(4))
+    result, expected = CpuRasterizer(2, simd), CpuRasterizer(2, "portable")
+    a, b = result.forward(rows, CAMERA, np.eye(4)), expected.forward(rows, CAMERA, np.eye(4))
     # a contribution at the 1/255 threshold may fall on either side
     assert np.mean(np.abs(a.rgb - b.rgb) > 1e-4) < 1e-3
     assert np.abs(a.rgb - b.rgb).max() < 1e-2
-    assert gradients(came, rows).visible.tolist() == gradients(wanted, rows).visible.tolist()
+    assert gradients(result, rows).visible.tolist() == gradients(expected, rows).visible.tolist()
 
 
 @pytest.mark.parametrize("simd", kernels.usable_simd())
 @pytest.mark.parametrize("threads", [2, 3])
-def test_gradients_have_the_same_bits_for_any_number_of_threads(threads: int, simd: str) -> None:
+def test_gradients_are_independent_of_thread_count(threads: int, simd: str) -> None:
     rows = random_rows()
-    alone, team = gradients(CpuRasterizer(1, simd), rows), gradients(CpuRasterizer(threads, simd), rows)
-    np.testing.assert_array_equal(team.d_rows, alone.d_rows)
-    np.testing.assert_array_equal(team.d_twist, alone.d_twist)
-    np.testing.assert_array_equal(team.mean_2d_norm, alone.mean_2d_norm)
-    np.testing.assert_array_equal(team.visible, alone.visible)
+    single, parallel = gradients(CpuRasterizer(1, simd), rows), gradients(CpuRasterizer(threads, simd), rows)
+    np.testing.assert_array_equal(parallel.d_rows, single.d_rows)
+    np.testing.assert_array_equal(parallel.d_twist, single.d_twist)
+    np.testing.assert_array_equal(parallel.mean_2d_norm, single.mean_2d_norm)
+    np.testing.assert_array_equal(parallel.visible, single.visible)
 
 
 @pytest.mark.parametrize("simd", kernels.usable_simd())
 @pytest.mark.parametrize("masked", [False, True])
 @pytest.mark.parametrize("loss", [L1_ONLY, WITH_SSIM])
-def test_training_has_the_same_bits_for_any_number_of_threads(loss: LossWeights, masked: bool, simd: str) -> None:
-    alone = train(CpuRasterizer(1, simd), loss, masked=masked)
+def test_training_is_independent_of_thread_count(loss: LossWeights, masked: bool, simd: str) -> None:
+    single = train(CpuRasterizer(1, simd), loss, masked=masked)
     for threads in (2, 3, 8):  # also more than there are tile rows
-        for a, b in zip(train(CpuRasterizer(threads, simd), loss, masked=masked), alone, strict=True):
+        for a, b in zip(train(CpuRasterizer(threads, simd), loss, masked=masked), single, strict=True):
             np.testing.assert_array_equal(a, b)
 
 
-def test_weights_that_are_one_everywhere_train_like_no_mask() -> None:
-    """And a hair less in one corner takes the other way through the kernels, for a hair's difference."""
+def test_weights_of_one_train_like_no_mask() -> None:
     results = []
     for corner in (None, 1.0):
         rasterizer = CpuRasterizer(2)
@@ -88,7 +87,7 @@ def test_weights_that_are_one_everywhere_train_like_no_mask() -> None:
     np.testing.assert_array_equal(results[0][1], results[1][1])
 
 
-def test_a_view_without_any_weight_changes_no_gaussian_and_costs_nothing() -> None:
+def test_view_of_zero_weight_changes_nothing_and_composites_nothing() -> None:
     rasterizer = CpuRasterizer(2)
     size = (CAMERA.height_px, CAMERA.width_px)
     view = rasterizer.prepare_view(
@@ -104,17 +103,17 @@ def test_a_view_without_any_weight_changes_no_gaussian_and_costs_nothing() -> No
     np.testing.assert_array_equal(rows[:, :14], before[:, :14])
 
 
-def test_a_backward_can_be_repeated() -> None:
+def test_backward_is_repeatable() -> None:
     rasterizer = CpuRasterizer(2)
-    drawn = rasterizer.forward(random_rows(), CAMERA, np.eye(4))
-    images = [np.ones_like(a) for a in (drawn.rgb, drawn.depth_m, drawn.alpha)]
+    rendering = rasterizer.forward(random_rows(), CAMERA, np.eye(4))
+    images = [np.ones_like(a) for a in (rendering.rgb, rendering.depth_m, rendering.alpha)]
     np.testing.assert_array_equal(
-        rasterizer.backward(drawn, *images).d_rows, rasterizer.backward(drawn, *images).d_rows
+        rasterizer.backward(rendering, *images).d_rows, rasterizer.backward(rendering, *images).d_rows
     )
 
 
 @pytest.mark.parametrize("size", [(1, 1), (3, 200), (16, 16), (17, 15), (640, 3)])
-def test_any_image_size_after_any_other(size: tuple[int, int]) -> None:
+def test_image_size_can_change_between_calls(size: tuple[int, int]) -> None:
     rasterizer = CpuRasterizer(2)
     rasterizer.forward(random_rows(), CAMERA, np.eye(4))
     camera = Camera(60.0, 60.0, size[0] / 2, size[1] / 2, *size)
@@ -126,7 +125,7 @@ def test_any_image_size_after_any_other(size: tuple[int, int]) -> None:
     assert np.isfinite(rows).all()
 
 
-def test_an_exact_subset_of_tiles_trains_like_the_whole_image_under_its_mask() -> None:
+def test_tiles_that_cover_the_mask_train_like_the_whole_image() -> None:
     rasterizer = CpuRasterizer(2)
     weight = np.zeros((CAMERA.height_px, CAMERA.width_px), np.float32)
     weight[40:60, 30:70] = 1.0
@@ -151,90 +150,91 @@ def test_an_exact_subset_of_tiles_trains_like_the_whole_image_under_its_mask() -
 
 @pytest.mark.parametrize("loss", [L1_ONLY, WITH_SSIM])
 @pytest.mark.parametrize("simd", kernels.usable_simd())
-def test_hostile_rows_spoil_no_other_row_and_no_pixel(simd: str, loss: LossWeights) -> None:
-    """Numbers that are none and numbers far too large, in each column, under a mask, some tiles and some ids."""
+def test_invalid_rows_affect_no_other_row_and_no_pixel(simd: str, loss: LossWeights) -> None:
+    """Non-finite and extreme values in all columns, with a mask, with tiles and with ids."""
     rows = random_rows(1200)
     rng = np.random.default_rng(5)
-    hostile = np.arange(0, 700, 5)
+    invalid = np.arange(0, 700, 5)
     extremes = np.array([np.nan, np.inf, -np.inf, 3e38, -3e38, 1e-45, 90.0], np.float32)
-    rows[hostile, rng.integers(0, 14, len(hostile))] = rng.choice(extremes, len(hostile))
+    rows[invalid, rng.integers(0, 14, len(invalid))] = rng.choice(extremes, len(invalid))
     camera = Camera(41.0, 43.0, 20.2, 30.1, 45, 67)
     rasterizer = CpuRasterizer(3, simd)
     view = view_of(rasterizer, camera, masked=True)
     tiles = np.ones((5, 3), np.bool_)
     tiles[1, 1:] = False
-    healthy = np.setdiff1d(np.arange(len(rows)), hostile)
+    valid = np.setdiff1d(np.arange(len(rows)), invalid)
     for subset in (Subset(), Subset(tiles=tiles), Subset(ids=np.arange(3, 1200, 2, dtype=np.uint32))):
-        drawn = rasterizer.forward(rows, camera, np.eye(4), subset)
-        images = (drawn.rgb, drawn.depth_m, drawn.alpha)
+        rendering = rasterizer.forward(rows, camera, np.eye(4), subset)
+        images = (rendering.rgb, rendering.depth_m, rendering.alpha)
         assert all(np.isfinite(image).all() for image in images)
-        assert np.isfinite(rasterizer.backward(drawn, *images).d_rows[healthy]).all()
+        assert np.isfinite(rasterizer.backward(rendering, *images).d_rows[valid]).all()
         table, first, second = rows.copy(), np.zeros_like(rows), np.zeros_like(rows)
         rasterizer.step(table, first, second, view, np.eye(4), loss, AdamSettings(), True, subset)
-        assert all(np.isfinite(changed[healthy]).all() for changed in (table, first, second))
+        assert all(np.isfinite(changed[valid]).all() for changed in (table, first, second))
 
 
-def test_measurements_that_are_not_positive_numbers_are_not_compared() -> None:
+def test_depths_that_are_not_positive_and_finite_are_ignored() -> None:
     rasterizer = CpuRasterizer(1)
     size = (CAMERA.height_px, CAMERA.width_px)
     rgb = np.zeros((*size, 3), np.uint8)
     losses = []
-    for nothing in (0.0, -1.0, np.nan, np.inf):
+    for invalid_depth in (0.0, -1.0, np.nan, np.inf):
         rows = random_rows()
-        view = rasterizer.prepare_view(rgb, np.full(size, nothing, np.float32), CAMERA)
+        view = rasterizer.prepare_view(rgb, np.full(size, invalid_depth, np.float32), CAMERA)
         step = rasterizer.step(rows, rows * 0, rows * 0, view, np.eye(4), WITH_SSIM, AdamSettings())
         losses.append(step.loss)
     assert losses == [losses[0]] * 4
 
 
-def test_calls_from_several_threads_are_served_one_after_the_other() -> None:
+def test_concurrent_calls_are_serialised() -> None:
     rasterizer = CpuRasterizer(2)
     rows = random_rows()
-    wanted = rasterizer.forward(rows, CAMERA, np.eye(4)).rgb
-    came: list[np.ndarray] = []
+    expected = rasterizer.forward(rows, CAMERA, np.eye(4)).rgb
+    result: list[np.ndarray] = []
     callers = [
-        threading.Thread(target=lambda: came.append(rasterizer.forward(rows, CAMERA, np.eye(4)).rgb)) for _ in range(4)
+        threading.Thread(target=lambda: result.append(rasterizer.forward(rows, CAMERA, np.eye(4)).rgb))
+        for _ in range(4)
     ]
     for caller in callers:
         caller.start()
     for caller in callers:
         caller.join()
-    assert len(came) == 4
-    for image in came:
-        np.testing.assert_array_equal(image, wanted)
+    assert len(result) == 4
+    for image in result:
+        np.testing.assert_array_equal(image, expected)
 
 
-def test_a_report_tells_of_its_own_step_whoever_steps_beside() -> None:
+def test_reports_keep_their_visible_rows_during_concurrent_steps() -> None:
     rasterizer = CpuRasterizer(2)
     hidden = random_rows(2000)
     hidden[:, 2] = -5.0
-    wrong: list[int] = []
+    wrong_counts: list[int] = []
 
     def train_on(rows: np.ndarray, visible: int) -> None:
         moments, view = (np.zeros_like(rows), np.zeros_like(rows)), view_of(rasterizer)
         for _ in range(60):
-            report = rasterizer.step(rows, *moments, view, np.eye(4), L1_ONLY, STILL)
-            drawn = rasterizer.forward(rows, CAMERA, np.eye(4))
+            report = rasterizer.step(rows, *moments, view, np.eye(4), L1_ONLY, ZERO_RATES)
+            rendering = rasterizer.forward(rows, CAMERA, np.eye(4))
             if len(report.visible) != visible:
-                wrong.append(len(report.visible))
+                wrong_counts.append(len(report.visible))
             try:
-                rasterizer.backward(drawn, drawn.rgb, drawn.depth_m, drawn.alpha)
+                rasterizer.backward(rendering, rendering.rgb, rendering.depth_m, rendering.alpha)
             except InvalidInputError:
-                continue  # the other one drew in between, and that is told
+                continue  # the other thread rendered in between
 
-    shown = random_rows(300)
-    seen = len(gradients(rasterizer, shown).visible)
-    assert seen > 0
-    trainers = [threading.Thread(target=train_on, args=case) for case in ((shown, seen), (hidden, 0))]
+    visible_rows = random_rows(300)
+    visible_count = len(gradients(rasterizer, visible_rows).visible)
+    assert visible_count > 0
+    trainers = [threading.Thread(target=train_on, args=case) for case in ((visible_rows, visible_count), (hidden, 0))]
     for trainer in trainers:
         trainer.start()
     for trainer in trainers:
         trainer.join()
-    assert wrong == []
+    assert wrong_counts == []
 
 
 @pytest.mark.parametrize("simd", kernels.usable_simd())
-def test_drawing_and_training_composite_the_same_blocks_whatever_the_loss_and_the_threads(simd: str) -> None:
+def test_block_evaluations_are_independent_of_loss_and_threads(simd: str) -> None:
     counts = set()
     for threads in (1, 3):
         rasterizer = CpuRasterizer(threads, simd)
@@ -251,9 +251,9 @@ def test_drawing_and_training_composite_the_same_blocks_whatever_the_loss_and_th
     assert rasterizer.block_evaluations() == 0
 
 
-def test_a_speck_is_composited_on_the_blocks_that_it_touches() -> None:
+def test_small_splat_is_composited_on_its_four_blocks() -> None:
     rows = random_rows(1)
-    # at the corner that four blocks of one tile share, a third of a pixel wide
+    # at the common corner of four blocks of one tile, a third of a pixel wide
     rows[0, :3] = ((20 - CAMERA.cx_px) / CAMERA.fx_px, (20 - CAMERA.cy_px) / CAMERA.fy_px, 1.0)
     rows[0, 3:6], rows[0, 10] = np.log(0.004), 3.0
     rasterizer = CpuRasterizer(1)
@@ -261,5 +261,5 @@ def test_a_speck_is_composited_on_the_blocks_that_it_touches() -> None:
     assert rasterizer.block_evaluations() == 4
 
 
-def test_the_clock_of_the_core_is_a_clock() -> None:
+def test_core_clock_is_positive_and_finite() -> None:
     assert 0.0 < core_clock_ghz() < np.inf

@@ -1,6 +1,6 @@
-"""What the native backend does where memory or threads cannot be had: an error, and it goes on working.
+"""CPU backend without memory or threads: it raises an error and stays usable.
 
-The limits are set in processes of their own; sanitizers, which ask for terabytes of addresses, cannot run these.
+The tests set limits in subprocesses. Sanitizers, which reserve terabytes of addresses, cannot run them.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import sys
 import pytest
 
 pytest.importorskip("gausslite.render._kernels", reason="the native kernels are not built")
-resource = pytest.importorskip("resource", reason="this system has no limits for processes")
+resource = pytest.importorskip("resource", reason="this system has no resource limits")
 
 PREPARE = """
 import resource, sys
@@ -23,8 +23,8 @@ from gausslite.render.rasterizer import AdamSettings, LossWeights
 
 def limit_to(more_bytes):
     pages = int(open("/proc/self/statm").read().split()[0])
-    wanted = resource.RLIM_INFINITY if more_bytes is None else pages * resource.getpagesize() + more_bytes
-    resource.setrlimit(resource.RLIMIT_AS, (wanted, resource.RLIM_INFINITY))
+    limit = resource.RLIM_INFINITY if more_bytes is None else pages * resource.getpagesize() + more_bytes
+    resource.setrlimit(resource.RLIMIT_AS, (limit, resource.RLIM_INFINITY))
 """
 
 SHORT_OF_MEMORY = (
@@ -45,17 +45,17 @@ def step(table):
     return rasterizer.step(table, *moments, view, np.eye(4), LossWeights(ssim=ssim), AdamSettings()).loss
 
 before = step(few.copy())
-untouched, moments = rows.copy(), (np.zeros_like(rows), np.zeros_like(rows))
+original, moments = rows.copy(), (np.zeros_like(rows), np.zeros_like(rows))
 limit_to(mebibytes << 20)
 try:
     rasterizer.step(rows, *moments, view, np.eye(4), LossWeights(ssim=ssim), AdamSettings())
-    refused = False
+    failed = False
 except MemoryError:
-    refused = True
+    failed = True
 limit_to(None)
-print("refused" if refused else "done", (rows == untouched).all())
+print("failed" if failed else "done", (rows == original).all())
 assert step(few.copy()) == before
-print("works", step(rows) > 0)
+print("usable", step(rows) > 0)
 """
 )
 
@@ -81,17 +81,17 @@ def run(program: str, *arguments: object) -> list[str]:
     return done.stdout.splitlines()
 
 
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="limits of addresses are told as Linux does")
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="address space limits need Linux")
 @pytest.mark.parametrize("threads", [1, 2, 3])
 @pytest.mark.parametrize("ssim", [0.0, 0.2])
-def test_a_step_without_memory_changes_nothing_and_the_next_one_works(threads: int, ssim: float) -> None:
-    told = [run(SHORT_OF_MEMORY, threads, ssim, mebibytes) for mebibytes in (2, 8, 12, 16, 24)]
-    assert {tuple(lines) for lines in told} <= {("refused True", "works True"), ("done False", "works True")}
-    assert ["refused True", "works True"] in told
+def test_step_without_memory_changes_nothing_and_the_next_succeeds(threads: int, ssim: float) -> None:
+    outputs = [run(SHORT_OF_MEMORY, threads, ssim, mebibytes) for mebibytes in (2, 8, 12, 16, 24)]
+    assert {tuple(lines) for lines in outputs} <= {("failed True", "usable True"), ("done False", "usable True")}
+    assert ["failed True", "usable True"] in outputs
 
 
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="limits of addresses are told as Linux does")
-def test_threads_that_cannot_be_started_are_told() -> None:
-    said, works = run(SHORT_OF_THREADS)
-    assert said.startswith("threads: expected a number that can be started, got 200")
-    assert works == "2"
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="address space limits need Linux")
+def test_threads_that_cannot_start_raise_an_error() -> None:
+    message, threads = run(SHORT_OF_THREADS)
+    assert message.startswith("threads: expected a number that can be started, got 200")
+    assert threads == "2"

@@ -1,4 +1,4 @@
-"""What can be told of the GPU backend without a GPU, beyond the contract: its calls, its loans, a mapper on it."""
+"""GPU backend without a GPU, beyond the contract: calls of gsplat, table bindings, and mapping."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ import torch
 from gausslite.render.cuda import CudaRasterizer
 from gausslite.render.cuda.kernels import Footprints, GsplatKernels
 
-# small tensors: more threads only wait for each other
+# small tensors: more threads only add synchronisation
 torch.set_num_threads(1)
 SIZE = (32, 16)
 SETTINGS = MapperSettings(
@@ -43,8 +43,8 @@ def mapped(rasterizer: Rasterizer, seed: int = 0) -> GaussianMapper:
     return mapper
 
 
-def test_mappers_on_it_explain_the_wall_as_well_as_on_the_oracle() -> None:
-    """Not the same maps: Adam turns the last digit of a first gradient into a whole step, and clones follow it."""
+def test_mapping_error_matches_the_oracle() -> None:
+    """The maps differ: Adam amplifies rounding of a first gradient to a whole step, which also changes clones."""
     from gausslite.render.reference import ReferenceRasterizer
 
     frame = wall_frame(0, SIZE, shift_m=0.05)
@@ -53,16 +53,16 @@ def test_mappers_on_it_explain_the_wall_as_well_as_on_the_oracle() -> None:
     for backend, rasterizer in enumerate((CudaRasterizer("cpu"), ReferenceRasterizer())):
         for seed in range(4):
             mapper = mapped(rasterizer, seed)
-            drawn = mapper.render(frame.camera, frame.T_world_camera)
-            errors[backend, seed] = np.abs(drawn.rgb - frame.rgb / 255.0)[region].mean()
+            rendering = mapper.render(frame.camera, frame.T_world_camera)
+            errors[backend, seed] = np.abs(rendering.rgb - frame.rgb / 255.0)[region].mean()
             kappas[backend, seed] = mapper.roi_gaussians().kappa.max()
     assert errors[0].mean() < 1.2 * errors[1].mean()
     assert (kappas[0] == kappas[1]).all()
     assert kappas.min() > 0
 
 
-class _Recorded:
-    """gsplat's functions by name; a call is bound to the real signature and answered by the test."""
+class _FakeGsplat:
+    """gsplat's functions by name; checks calls against the real signatures and returns given values."""
 
     def __init__(self, answers: dict[str, Any]) -> None:
         self._answers = answers
@@ -75,7 +75,7 @@ class _Recorded:
         return call
 
 
-def test_every_call_fits_gsplats_own_signature() -> None:
+def test_calls_match_gsplats_signatures() -> None:
     answers = {
         "quat_scale_to_covar_preci": (torch.zeros(3, 3, 3), None),
         "proj": (torch.zeros(1, 3, 2), torch.zeros(1, 3, 2, 2)),
@@ -83,7 +83,7 @@ def test_every_call_fits_gsplats_own_signature() -> None:
         "isect_offset_encode": torch.zeros(1, 3, 4),
         "rasterize_to_pixels": (torch.ones(1, 40, 50, 4), torch.full((1, 40, 50, 1), torch.nan)),
     }
-    kernels = GsplatKernels(_Recorded(answers), torch.device("cpu"))
+    kernels = GsplatKernels(_FakeGsplat(answers), torch.device("cpu"))
     assert kernels.covariances(torch.ones(3, 4), torch.ones(3, 3)).shape == (3, 3, 3)
     means_px, covariances_px2 = kernels.project(torch.ones(3, 3), torch.zeros(3, 3, 3), torch.eye(3), (50, 40))
     assert means_px.shape == (3, 2)
@@ -92,7 +92,7 @@ def test_every_call_fits_gsplats_own_signature() -> None:
     tiles = torch.zeros(3, 4, dtype=torch.bool)
     tiles[1, 3] = True
     channels, alpha = kernels.composite(footprints, (50, 40), tiles)
-    # what the kernel left unwritten outside the tiles does not show
+    # unwritten values outside the tiles are masked
     assert channels.sum() == 4 * 16 * 2
     assert torch.isnan(alpha).sum() == 16 * 2
 
@@ -103,7 +103,7 @@ def tables(n: int = 4) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return rows, np.zeros_like(rows), np.zeros_like(rows)
 
 
-def test_one_loan_at_a_time() -> None:
+def test_one_binding_at_a_time() -> None:
     rasterizer = CudaRasterizer("cpu")
     with rasterizer.bind_tables(*tables()):
         with pytest.raises(InvalidInputError, match="second binding"), rasterizer.bind_tables(*tables()):
@@ -114,18 +114,18 @@ def test_one_loan_at_a_time() -> None:
             rasterizer.step(*tables(), view, np.eye(4), LossWeights(), AdamSettings())
 
 
-def test_lent_arrays_change_when_the_loan_ends() -> None:
-    rasterizer, lent = CudaRasterizer("cpu"), tables()
+def test_bound_arrays_change_at_the_end_of_the_binding() -> None:
+    rasterizer, bound = CudaRasterizer("cpu"), tables()
     frame = wall_frame(0, SIZE)
     view = rasterizer.prepare_view(frame.rgb, frame.depth_m, frame.camera)
-    before = lent[0].copy()
-    with rasterizer.bind_tables(*lent):
-        rasterizer.step(*lent, view, np.eye(4), LossWeights(), replace(AdamSettings(), rgb=0.1))
-        np.testing.assert_array_equal(lent[0], before)
-    assert np.abs(lent[0] - before).max() > 0.05
+    before = bound[0].copy()
+    with rasterizer.bind_tables(*bound):
+        rasterizer.step(*bound, view, np.eye(4), LossWeights(), replace(AdamSettings(), rgb=0.1))
+        np.testing.assert_array_equal(bound[0], before)
+    assert np.abs(bound[0] - before).max() > 0.05
 
 
-def test_a_device_that_torch_does_not_have_is_named() -> None:
+def test_missing_device_is_named() -> None:
     if not torch.cuda.is_available():
         with pytest.raises(KernelError, match="expected a CUDA device"):
             CudaRasterizer("cuda")
@@ -133,14 +133,14 @@ def test_a_device_that_torch_does_not_have_is_named() -> None:
         CudaRasterizer("meta")
 
 
-def test_what_may_not_be_written_can_be_drawn_and_trained_on() -> None:
+def test_read_only_inputs_are_accepted() -> None:
     rasterizer, frame = CudaRasterizer("cpu"), wall_frame(0, SIZE)
-    lent, rgb, trainable = tables(), frame.rgb.copy(), np.ones(4, np.bool_)
+    bound, rgb, trainable = tables(), frame.rgb.copy(), np.ones(4, np.bool_)
     tiles = np.ones((1, 2), np.bool_)
-    rows = lent[0].copy()
+    rows = bound[0].copy()
     for array in (rgb, trainable, tiles, rows):
         array.flags.writeable = False
     rasterizer.forward(rows, frame.camera, np.eye(4), Subset(tiles=tiles))
     view = rasterizer.prepare_view(rgb, frame.depth_m, frame.camera)
-    report = rasterizer.step(*lent, view, np.eye(4), LossWeights(), AdamSettings(), trainable=trainable)
+    report = rasterizer.step(*bound, view, np.eye(4), LossWeights(), AdamSettings(), trainable=trainable)
     assert len(report.visible) == 4

@@ -1,4 +1,4 @@
-"""The built extension as it is shipped: its stub tells the truth, and it needs no library that a system may lack."""
+"""The built extension: its type stubs match, and it needs only system libraries."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ import gausslite
 kernels = pytest.importorskip("gausslite.render._kernels", reason="the native kernels are not built")
 
 PACKAGE = Path(gausslite.__file__).parent
-OF_THE_SYSTEM = re.compile(r"(libstdc\+\+|libgcc_s|libm|libc|libpthread|ld-linux[\w-]*)\.so\.\d+")
+SYSTEM_LIBRARY = re.compile(r"(libstdc\+\+|libgcc_s|libm|libc|libpthread|ld-linux[\w-]*)\.so\.\d+")
 
 Interface = dict[str, tuple[str, ...] | None]
-"""By dotted name: the parameters' names of a function, None for a property."""
+"""Parameter names by dotted function name; None for a property."""
 
 
 def stub_interface() -> Interface:
@@ -41,21 +41,23 @@ def module_interface() -> Interface:
     interface: Interface = {}
     for name, value in vars(kernels).items():
         if inspect.isclass(value):
-            for member, found in vars(value).items():
+            for member, attribute in vars(value).items():
                 if not member.startswith("_"):
-                    interface[f"{name}.{member}"] = None if isinstance(found, property) else _parameters(found)[1:]
+                    interface[f"{name}.{member}"] = (
+                        None if isinstance(attribute, property) else _parameters(attribute)[1:]
+                    )
         elif not name.startswith("_"):
             interface[name] = _parameters(value)
-    # nb::new_ makes an object in __new__
-    for made in (kernels.Engine, kernels.View):
-        interface[f"{made.__name__}.__init__"] = _parameters(made.__new__)[1:]
-    for made in (kernels.StepScene, kernels.StepTraining):
-        interface[f"{made.__name__}.__init__"] = _parameters(made.__init__)[1:]
+    # nb::new_ creates objects in __new__
+    for cls in (kernels.Engine, kernels.View):
+        interface[f"{cls.__name__}.__init__"] = _parameters(cls.__new__)[1:]
+    for cls in (kernels.StepScene, kernels.StepTraining):
+        interface[f"{cls.__name__}.__init__"] = _parameters(cls.__init__)[1:]
     return interface
 
 
 def _parameters(function: Any) -> tuple[str, ...]:
-    """Names of the last overload's parameters, from what nanobind keeps of the binding."""
+    """Return the parameter names of the last overload, from nanobind's signature."""
     signature = function.__nb_signature__[-1][0]
     while "[" in signature:
         signature = re.sub(r"\[[^][]*\]", "", signature)
@@ -63,21 +65,21 @@ def _parameters(function: Any) -> tuple[str, ...]:
     return tuple(part.split(":")[0].strip() for part in inner.split(",") if part.strip())
 
 
-def test_the_stub_has_what_the_module_has() -> None:
+def test_stubs_match_the_module() -> None:
     assert stub_interface() == module_interface()
 
 
-def test_the_types_are_shipped() -> None:
+def test_type_information_is_installed() -> None:
     assert (PACKAGE / "py.typed").is_file()
     assert (PACKAGE / "render" / "_kernels.pyi").is_file()
 
 
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="ELF modules are Linux's")
-def test_the_module_needs_nothing_beyond_the_systems_libraries() -> None:
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="needs ELF")
+def test_module_needs_only_system_libraries() -> None:
     readelf = shutil.which("readelf")
     if readelf is None:
         pytest.skip("readelf is missing (binutils)")
     listing = subprocess.run([readelf, "-d", kernels.__file__], capture_output=True, text=True, check=True).stdout
     needed = re.findall(r"\(NEEDED\).*\[(.+)\]", listing)
     assert "libc.so.6" in needed
-    assert [name for name in needed if not OF_THE_SYSTEM.fullmatch(name)] == []
+    assert [name for name in needed if not SYSTEM_LIBRARY.fullmatch(name)] == []

@@ -1,4 +1,4 @@
-"""Every form of the SIMD layer offers the same functions, also those that this machine's compiler never sees."""
+"""All variants of the SIMD layer have the same functions, including those not compiled on this machine."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 SIMD = Path(__file__).resolve().parents[3] / "native" / "src" / "simd"
-FORMS = {
+VARIANTS = {
     "avx512": ("pack_avx512.h", "pack8_avx.h"),
     "avx2": ("pack_avx2.h", "pack8_avx.h"),
     "neon": ("pack_neon.h",),
@@ -23,7 +23,7 @@ MACROS = {
 
 
 def signatures(*headers: str) -> set[str]:
-    """Functions over packs as `result name(argument types)`, with the macros that define families of them expanded."""
+    """Return the functions over packs as `result name(argument types)`, with macros expanded."""
     text = "".join((SIMD / header).read_text() for header in headers)
     for macro, signature in MACROS.items():
         text = re.sub(
@@ -32,24 +32,26 @@ def signatures(*headers: str) -> set[str]:
             text,
             flags=re.MULTILINE,
         )
-    found = re.findall(r"^GAUSSLITE_INLINE (\w+) (operator\S+?|\w+)\(([^{]*)\) \{", text, re.MULTILINE)
-    found = [(result, name, _types(arguments)) for result, name, arguments in found]
-    return {f"{result} {name}({types})" for result, name, types in found if re.search(PACK, f"{result} {types}")}
+    matches = re.findall(r"^GAUSSLITE_INLINE (\w+) (operator\S+?|\w+)\(([^{]*)\) \{", text, re.MULTILINE)
+    matches = [(result, name, _types(arguments)) for result, name, arguments in matches]
+    return {f"{result} {name}({types})" for result, name, types in matches if re.search(PACK, f"{result} {types}")}
 
 
 def _types(arguments: str) -> str:
-    """Without the arguments' names: `Pack16& a, Pack16& b` is `Pack16&, Pack16&`."""
+    """Remove the argument names: `Pack16& a, Pack16& b` becomes `Pack16&, Pack16&`."""
     return ", ".join(re.sub(r"\s*\w+$", "", argument.strip()) for argument in arguments.split(","))
 
 
-def _own(signature: str) -> bool:
-    """A helper of one form shows its registers."""
+def _is_internal(signature: str) -> bool:
+    """Return True for helpers of one variant, whose types are registers."""
     return bool(re.search(r"__m\d+|\d+x\d+_t|Quad", signature))
 
 
-@pytest.mark.parametrize("form", FORMS)
-def test_a_form_offers_what_the_portable_one_does(form: str) -> None:
-    came, wanted = ({s for s in signatures(*headers) if not _own(s)} for headers in (FORMS[form], ["pack_portable.h"]))
-    assert "bool any(Mask16)" in wanted
-    assert len(wanted) > 40
-    assert came == wanted
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_variant_has_the_functions_of_the_portable_one(variant: str) -> None:
+    functions, expected = (
+        {s for s in signatures(*headers) if not _is_internal(s)} for headers in (VARIANTS[variant], ["pack_portable.h"])
+    )
+    assert "bool any(Mask16)" in expected
+    assert len(expected) > 40
+    assert functions == expected

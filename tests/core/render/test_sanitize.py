@@ -1,4 +1,4 @@
-"""The sanitizers' script says in one line what it is missing."""
+"""The sanitizer script names a missing part in one line."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ SCRIPT = Path(__file__).resolve().parents[3] / "tools" / "sanitize.sh"
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "message"),
     [
         ([], "sanitize: expected address or thread, got ''"),
         (["memory"], "sanitize: expected address or thread, got 'memory'"),
@@ -20,11 +20,11 @@ SCRIPT = Path(__file__).resolve().parents[3] / "tools" / "sanitize.sh"
         (["thread", "snake"], "sanitize: no such Python: snake"),
     ],
 )
-def test_what_is_missing_is_one_line(arguments: list[str], said: str, tmp_path: Path) -> None:
+def test_missing_part_is_named_in_one_line(arguments: list[str], message: str, tmp_path: Path) -> None:
     bash, dirname = shutil.which("bash"), shutil.which("dirname")
     assert bash is not None
     assert dirname is not None
     (tmp_path / "dirname").symlink_to(dirname)
     command = [bash, str(SCRIPT), *arguments]
-    done = subprocess.run(command, env={"PATH": str(tmp_path)}, capture_output=True, text=True, timeout=60)
-    assert (done.returncode, done.stderr) == (1, f"{said}\n")
+    result = subprocess.run(command, env={"PATH": str(tmp_path)}, capture_output=True, text=True, timeout=60)
+    assert (result.returncode, result.stderr) == (1, f"{message}\n")
