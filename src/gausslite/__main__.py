@@ -1,4 +1,4 @@
-"""`gausslite`, and `python -m gausslite`: may be interrupted from its first moment, so the imports come after that."""
+"""`gausslite` and `python -m gausslite`: handle signals first, because imports take most of the start."""
 
 import sys
 
@@ -6,7 +6,7 @@ from gausslite.interrupts import end_quietly_while_starting
 
 
 def main() -> int:
-    """Run the command line; returns the exit code."""
+    """Run the command line and return the exit code."""
     end_quietly_while_starting("gausslite")
     from gausslite.cli.main import main as run
 

@@ -1,4 +1,4 @@
-"""The demo, small: four real processes, two missions, one fused map, and nothing left running."""
+"""A small demo: four processes, two missions, one fused map, and no process left running."""
 
 from __future__ import annotations
 
@@ -35,15 +35,15 @@ def _children_named(marker: str) -> list[int]:
     for entry in Path("/proc").iterdir():
         if entry.name.isdigit():
             try:
-                words = (entry / "cmdline").read_bytes().decode(errors="replace")
+                command = (entry / "cmdline").read_bytes().decode(errors="replace")
             except OSError:
                 continue
-            if marker in words and int(entry.name) != os.getpid():
+            if marker in command and int(entry.name) != os.getpid():
                 found.append(int(entry.name))
     return found
 
 
-def test_the_demo_maps_fuses_scores_and_ends_everything(tmp_path: Path) -> None:
+def test_the_demo_maps_fuses_scores_and_ends_its_processes(tmp_path: Path) -> None:
     out = tmp_path / "demo"
     done = subprocess.run(_command(out), capture_output=True, text=True, timeout=280)
     assert done.returncode == 0, done.stderr
@@ -64,10 +64,11 @@ def test_the_demo_maps_fuses_scores_and_ends_everything(tmp_path: Path) -> None:
     assert sizes["vote"] < sizes["concatenation"] == both
     assert list((out / "pictures").glob("*.png"))
     assert not _children_named(str(out))
+    assert "max-gaussians = 5000\n" in (out / "agent-a" / "config.toml").read_text()
 
 
 def _write_recording(folder: Path) -> None:
-    """A walk through the simulated home in 7-Scenes layout, with the voxels of its mug."""
+    """Write a sequence of the simulated home in 7-Scenes layout, with the voxels of its mug."""
     home = open_source("sim:home?seed=0&trajectory=0&frames=16&size=128x96")
     mug = next(region for name, region in home.regions().items() if "mug" in name)
     folder.mkdir()
@@ -84,13 +85,13 @@ def _write_recording(folder: Path) -> None:
     np.savez(folder / "roi_voxels.npz", mug_1=voxels, voxel_size_m=0.02)
 
 
-def test_a_recordings_robots_register_and_refine_as_the_demo_was_told(tmp_path: Path) -> None:
-    folder, out = tmp_path / "walk", tmp_path / "demo"
+def test_agents_register_depth_and_refine_keyframes_as_the_demo_sets_it(tmp_path: Path) -> None:
+    folder, out = tmp_path / "recording", tmp_path / "demo"
     _write_recording(folder)
     camera = ",".join(np.loadtxt(folder / "camera-intrinsics.txt")[[0, 1, 0, 1], [0, 1, 2, 2]].astype(str))
-    told = ("--register-depth", camera, "--pose-prior", "0.01,0.5,0.1,0.03")
+    calibration = ("--register-depth", camera, "--pose-prior", "0.01,0.5,0.1,0.03")
     tasks = ("--source", folder, "--task-a", "Find the mug", "--task-b", "Find the mug")
-    command = [sys.executable, "-m", "gausslite", "demo", *SMALL, *map(str, tasks), *told, "--out", str(out)]
+    command = [sys.executable, "-m", "gausslite", "demo", *SMALL, *map(str, tasks), *calibration, "--out", str(out)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=280)
     assert done.returncode == 0, done.stderr
     assert "pose and exposure of each held-out view were fitted" in done.stdout

@@ -1,4 +1,4 @@
-"""A program that is interrupted while it starts ends with one line and a known code; its imports tell where it is."""
+"""A program interrupted during its start prints one line and returns a known code."""
 
 from __future__ import annotations
 
@@ -24,30 +24,30 @@ from gausslite.interrupts import started
         ("gausslite_parser", [], "grpc"),
     ],
 )
-def test_no_traceback_whenever_the_signal_comes(
+def test_a_signal_during_the_start_causes_no_traceback(
     module: str, arguments: Sequence[str], imported: str, number: signal.Signals
 ) -> None:
     listen = ["--listen", "127.0.0.1:0"] if not arguments else []
     command = [sys.executable, "-X", "importtime", "-m", module, *listen, *arguments]
     with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True) as process:
         assert process.stderr is not None
-        said = []
+        lines = []
         for line in process.stderr:
-            said.append(line)
+            lines.append(line)
             if line.rpartition("|")[2].strip() == imported:
                 break
         process.send_signal(number)
-        said += process.stderr.readlines()
+        lines += process.stderr.readlines()
         code = process.wait(60)
-    last_words = [line for line in said if not line.startswith("import time:")]
-    # on a busy machine the signal may find a service that runs already, or a help that is printed
-    assert code in (128 + number, 0), last_words
-    assert not any("Traceback" in line for line in last_words)
+    messages = [line for line in lines if not line.startswith("import time:")]
+    # on a busy machine the service may already run, or the help may be complete, before the signal arrives
+    assert code in (128 + number, 0), messages
+    assert not any("Traceback" in line for line in messages)
     if code:
-        assert last_words[-1] == f"{module.replace('_', '-')}: interrupted while starting\n"
+        assert messages[-1] == f"{module.replace('_', '-')}: interrupted while starting\n"
 
 
-def test_a_program_that_has_started_keeps_the_handlers_it_chose() -> None:
+def test_a_started_program_keeps_its_own_handlers() -> None:
     def chosen(_number: int, _frame: object) -> None:
         raise AssertionError("nothing is sent here")
 
@@ -59,7 +59,7 @@ def test_a_program_that_has_started_keeps_the_handlers_it_chose() -> None:
         signal.signal(signal.SIGTERM, before)
 
 
-def test_a_start_that_ended_gives_the_signals_back() -> None:
+def test_the_end_of_the_start_restores_the_default_handlers() -> None:
     code = (
         "import signal\nfrom gausslite.interrupts import end_quietly_while_starting, started\n"
         "end_quietly_while_starting('x')\nstarted()\n"

@@ -1,4 +1,4 @@
-"""`gausslite-agent`: may be interrupted from its first moment, so the imports come after that."""
+"""`gausslite-agent`: handle signals first, because imports take most of the start."""
 
 import sys
 
@@ -6,7 +6,7 @@ from gausslite.interrupts import end_quietly_while_starting
 
 
 def main() -> int:
-    """Run the program with the arguments of the command line; returns the exit code."""
+    """Run the program with the command line's arguments and return the exit code."""
     end_quietly_while_starting("gausslite-agent")
     from gausslite_agent.program import run
 

@@ -1,4 +1,4 @@
-"""`gausslite-fusion-server`: may be interrupted from its first moment, so the imports come after that."""
+"""`gausslite-fusion-server`: handle signals first, because imports take most of the start."""
 
 import sys
 
@@ -6,7 +6,7 @@ from gausslite.interrupts import end_quietly_while_starting
 
 
 def main() -> int:
-    """Run the program with the arguments of the command line; returns the exit code."""
+    """Run the program with the command line's arguments and return the exit code."""
     end_quietly_while_starting("gausslite-fusion-server")
     from gausslite_fusion_server.program import run
 

@@ -18,7 +18,7 @@ _COMMANDS = {
     "map": "map a sequence for a task; write map.ply, report.json and preview.png",
     "demo": "run a task parser, a fusion server and two agents as processes; fuse and score their maps",
     "parse": "parse a task sentence into targets, anchors and relations",
-    "eval": "score a map on frames of a sequence, inside regions and over the whole image",
+    "eval": "score a map on frames of a sequence, in the region of interest (ROI) and over whole images",
     "fuse": "fuse map files into one by a vote in every voxel",
     "models": "list, download, verify and inspect model files for detection and segmentation",
     "bench": "measure the rasterizer, the mapping loop, the GPU, map quality or a task parser",

@@ -58,7 +58,7 @@ class OptionTable:
         """Return a valid raw value with the type that a configuration file gives it."""
         action = self.actions[dest]
         if isinstance(value, str) and action.type in (int, float):
-            number: int | float = action.type(value)  # type: ignore[operator]
+            number: int | float = action.type(value)
             return number
         return value
 
