@@ -1,4 +1,4 @@
-"""An executor that runs submitted work when the test says so."""
+"""An executor that runs submitted jobs on demand."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from concurrent.futures import Executor, Future
 
 
 class DeferredExecutor(Executor):
-    """Runs what was submitted when the test says so."""
+    """Runs one submitted job per call of `run_next`."""
 
     def __init__(self) -> None:
         self.jobs: list[tuple[Future, object, tuple]] = []

@@ -1,8 +1,8 @@
-"""A network with the inputs and outputs of Grounding DINO, small enough to compute by hand.
+"""A minimal network with known results and the inputs and outputs of Grounding DINO.
 
-Every image is answered by the same boxes. A box's logit for a token is its own logit for the token's id, so that what
-a phrase finds depends on its words; tokens that the attention mask leaves out are at -inf, as in the real network. The
-blue channel's mean over the masked pixels is added to every logit, so that image and pixel mask count too.
+The boxes are constant. Each box has a logit per word, so the result depends on the words of the phrase. Tokens outside
+the attention mask are at -inf, as in the real network. The blue channel's mean over the masked pixels is added to
+every logit, so the result also depends on the image and the pixel mask.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from gausslite.perception.grounding_text import WordPieces
 VOCABULARY = ("[PAD]", "[UNK]", "[CLS]", "[SEP]", ".", "red", "mug", "table", "mu", "##g", "object")
 _UNSURE = -6.0
 
-Answer = tuple[tuple[float, float, float, float], Mapping[str, float]]
+BoxLogits = tuple[tuple[float, float, float, float], Mapping[str, float]]
 """A box (centre x, y, width, height, in shares of the image) and its logit for each word."""
 
 
 class TinyTokenizer:
-    """Whole words of the vocabulary above; runs where the package `tokenizers` does not."""
+    """A tokenizer of whole words that does not need the package `tokenizers`."""
 
     def encode(self, text: str) -> WordPieces:
         ids, spans, at = [], [], 0
@@ -41,19 +41,19 @@ class TinyTokenizer:
 
 def write_tiny_grounding(
     path: Path,
-    answers: Sequence[Answer],
+    box_logits: Sequence[BoxLogits],
     size_px: tuple[int | str, int | str] = (48, 64),
     length: int | str = 8,
     pixel_mask: bool = True,
 ) -> Path:
-    """Write a model that answers every image like this; sizes and length may be names, then they are open."""
-    logits = np.full((len(answers), len(VOCABULARY)), _UNSURE, np.float32)
-    for row, (_, words) in enumerate(answers):
+    """Write a model with these constant boxes; a size or length given as a name is dynamic."""
+    logits = np.full((len(box_logits), len(VOCABULARY)), _UNSURE, np.float32)
+    for row, (_, words) in enumerate(box_logits):
         for word, logit in words.items():
             logits[row, VOCABULARY.index(word)] = logit
     constants = {
         "table": logits,
-        "boxes": np.array([[box for box, _ in answers]], np.float32).reshape(1, -1, 4),
+        "boxes": np.array([[box for box, _ in box_logits]], np.float32).reshape(1, -1, 4),
         "never": np.array(-np.inf, np.float32),
         "blue": np.array([2], np.int64),
         "blue_end": np.array([3], np.int64),
@@ -80,8 +80,8 @@ def write_tiny_grounding(
         "tiny_grounding",
         [helper.make_tensor_value_info(*each) for each in inputs],
         [
-            helper.make_tensor_value_info("logits", TensorProto.FLOAT, [1, len(answers), length]),
-            helper.make_tensor_value_info("pred_boxes", TensorProto.FLOAT, [1, len(answers), 4]),
+            helper.make_tensor_value_info("logits", TensorProto.FLOAT, [1, len(box_logits), length]),
+            helper.make_tensor_value_info("pred_boxes", TensorProto.FLOAT, [1, len(box_logits), 4]),
         ],
         [numpy_helper.from_array(value, name) for name, value in constants.items()],
     )

@@ -1,4 +1,4 @@
-"""Build a tiny Phi-3 with random weights for onnxruntime-genai: python tests/tiny_phi3.py FOLDER makes FOLDER/onnx."""
+"""Build a tiny random Phi-3 for onnxruntime-genai: `python tests/support/tiny_phi3.py FOLDER` writes FOLDER/onnx."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ _SPECIAL = ["<unk>", "<s>", "</s>", "<|endoftext|>", "<|system|>", "<|user|>", "
 
 
 def build(folder: Path) -> None:
-    """A byte-level tokenizer, two layers of 64, and the export by the library's own builder."""
+    """Write a model with a byte-level tokenizer and two layers of 64, exported by the library's builder."""
     import torch
     from tokenizers import Tokenizer, decoders, models, pre_tokenizers, trainers
     from transformers import Phi3Config, Phi3ForCausalLM, PreTrainedTokenizerFast

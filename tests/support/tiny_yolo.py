@@ -1,4 +1,4 @@
-"""A YOLO-seg network small enough to compute by hand, with the real inputs, outputs and metadata.
+"""A minimal YOLO-seg network with known results and the real inputs, outputs and metadata.
 
 Prototype 0 is the image's red channel, averaged over 4x4 pixels; prototype 1 is one everywhere. A box with
 coefficients (20, -10) therefore has its mask where red is above one half. The boxes are constants.
@@ -23,7 +23,7 @@ def write_tiny_yolo(
     boxes: Sequence[tuple[float, float, float, float, int, float]],
     named: bool = True,
 ) -> Path:
-    """Write a model that answers every image with these boxes: centre x, y, width, height, class, score."""
+    """Write a model with these constant boxes: centre x, y, width, height, class, score."""
     output = np.zeros((1, 4 + len(names) + MASK_COEFFICIENTS, max(len(boxes), 1)), np.float32)
     for column, (x, y, width, height, index, score) in enumerate(boxes):
         output[0, :4, column] = x, y, width, height

@@ -1,4 +1,4 @@
-"""Lifting and projecting undo each other, for single pixels and for whole images alike."""
+"""Lifting and projecting are inverse, for single pixels and whole images."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ SIDE = st.integers(1, 40)
 
 
 @given(width=SIDE, height=SIDE, fx_px=st.floats(5, 500), cy_px=st.floats(-10, 50), seed=st.integers(0, 2**16))
-def test_what_is_lifted_is_projected_back(width: int, height: int, fx_px: float, cy_px: float, seed: int) -> None:
+def test_projecting_inverts_lifting(width: int, height: int, fx_px: float, cy_px: float, seed: int) -> None:
     camera = Camera(fx_px, 2 * fx_px, 3.25, cy_px, width, height)
     depth_m = np.random.default_rng(seed).uniform(0.1, 10, (height, width)).astype(np.float32)
     rows, columns = np.indices(depth_m.shape).reshape(2, -1)

@@ -1,4 +1,4 @@
-"""A region's mask marks exactly the pixels whose surface lies in it, wherever the camera stands."""
+"""A region's mask contains exactly the pixels whose surface point is in it, for any camera pose."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def surface_m(frame: Frame) -> np.ndarray:
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_a_ball_holds_what_is_within_its_radius(seed: int) -> None:
+def test_a_ball_contains_points_within_its_radius(seed: int) -> None:
     rng = np.random.default_rng(seed)
     frame, centre = random_frame(rng), rng.uniform(-1.5, 1.5, 3).astype(np.float32)
     near = np.linalg.norm(surface_m(frame) - centre, axis=-1) <= 0.6
@@ -37,7 +37,7 @@ def test_a_ball_holds_what_is_within_its_radius(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_voxels_hold_their_own_points_and_those_of_their_neighbours(seed: int) -> None:
+def test_voxels_contain_their_points_and_those_of_neighbours(seed: int) -> None:
     rng = np.random.default_rng(seed)
     frame, first = random_frame(rng), rng.integers(-12, 8, 3)
     cells = np.floor(surface_m(frame) / np.float32(0.1)).astype(np.int64)

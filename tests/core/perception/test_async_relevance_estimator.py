@@ -1,4 +1,4 @@
-"""Detection beside mapping: never waited for, one at a time, and what it found belongs to the frame it was made on."""
+"""Asynchronous detection: it never blocks, runs one at a time, and its result refers to its own keyframe."""
 
 from __future__ import annotations
 
@@ -39,23 +39,23 @@ def frame_at(index: int) -> Frame:
     return wall_frame(index, SIZE, shift_m=0.02 * index)
 
 
-def beside(executor: Executor, every: int = 3) -> AsyncRelevanceEstimator:
+def async_estimator(executor: Executor, every: int = 3) -> AsyncRelevanceEstimator:
     return AsyncRelevanceEstimator(TASK, RegionDetector({"mug": MUG}), executor, TrackerSettings(max_frames=every))
 
 
-def test_nothing_is_marked_until_the_first_detection_is_there() -> None:
+def test_relevance_is_empty_until_the_first_detection_finishes() -> None:
     executor = DeferredExecutor()
-    estimator = beside(executor)
+    estimator = async_estimator(executor)
     assert not any(estimator.estimate(frame_at(index)).relevance.roi.any() for index in range(3))
     executor.run_next()
     frame = frame_at(3)
-    truth, carried = MUG.mask(frame), estimator.estimate(frame).relevance.roi
-    assert (truth & carried).sum() / (truth | carried).sum() > 0.8
+    truth, propagated = MUG.mask(frame), estimator.estimate(frame).relevance.roi
+    assert (truth & propagated).sum() / (truth | propagated).sum() > 0.8
 
 
-def test_late_relevance_is_that_of_the_frame_it_was_made_on() -> None:
+def test_delayed_relevance_refers_to_its_keyframe() -> None:
     executor = DeferredExecutor()
-    estimator = beside(executor)
+    estimator = async_estimator(executor)
     frames = [frame_at(index) for index in range(3)]
     for frame in frames:
         assert estimator.estimate(frame).delayed is None
@@ -64,14 +64,14 @@ def test_late_relevance_is_that_of_the_frame_it_was_made_on() -> None:
     assert delayed is not None
     assert delayed.frame is frames[0]
     assert delayed.lag_frames == 3
-    at_once = TaskRelevanceEstimator(TASK, RegionDetector({"mug": MUG})).estimate(frames[0]).relevance
-    np.testing.assert_array_equal(delayed.relevance.target, at_once.target)
+    synchronous = TaskRelevanceEstimator(TASK, RegionDetector({"mug": MUG})).estimate(frames[0]).relevance
+    np.testing.assert_array_equal(delayed.relevance.target, synchronous.target)
     assert estimator.estimate(frame_at(4)).delayed is None
 
 
-def test_one_detection_runs_at_a_time_and_the_newest_keyframe_waits() -> None:
+def test_one_detection_runs_at_a_time_and_the_newest_keyframe_is_queued() -> None:
     executor = DeferredExecutor()
-    estimator = beside(executor, every=2)
+    estimator = async_estimator(executor, every=2)
     for index in range(9):
         estimator.estimate(frame_at(index))
         assert executor.frames == [0]
@@ -81,9 +81,9 @@ def test_one_detection_runs_at_a_time_and_the_newest_keyframe_waits() -> None:
     assert executor.frames == [8]
 
 
-def test_a_detector_that_is_quick_enough_sees_the_same_keyframes_as_one_that_is_waited_for() -> None:
+def test_a_fast_detector_gets_the_same_keyframes_as_a_synchronous_one() -> None:
     executor = DeferredExecutor()
-    estimator = beside(executor)
+    estimator = async_estimator(executor)
     seen = []
     for index in range(10):
         estimator.estimate(frame_at(index))
@@ -93,7 +93,7 @@ def test_a_detector_that_is_quick_enough_sees_the_same_keyframes_as_one_that_is_
     assert seen == [0, 3, 6, 9]
 
 
-def test_what_the_detector_raises_comes_with_a_later_frame() -> None:
+def test_a_detector_error_is_raised_at_a_later_frame() -> None:
     executor = DeferredExecutor()
     estimator = AsyncRelevanceEstimator(TASK, BrokenDetector(), executor)
     estimator.estimate(frame_at(0))
@@ -103,23 +103,23 @@ def test_what_the_detector_raises_comes_with_a_later_frame() -> None:
 
 
 class BrokenOnce(RegionDetector):
-    """Fails the first time."""
+    """Fails at the first call."""
 
     failed = False
 
     def detect(self, frame: Frame, queries: tuple[str, ...]) -> list[Detection]:
         if not self.failed:
             self.failed = True
-            raise MemoryError("a moment without memory")
+            raise MemoryError("temporarily out of memory")
         return super().detect(frame, queries)
 
 
-def test_what_the_detector_raises_on_an_earlier_frame_is_raised_once_and_the_frame_looked_at_again() -> None:
+def test_a_detector_error_on_a_past_frame_is_raised_once_and_retried() -> None:
     executor, earlier = DeferredExecutor(), frame_at(0)
     estimator = AsyncRelevanceEstimator(TASK, BrokenOnce({"mug": MUG}), executor)
     assert estimator.evaluate_past(earlier) is None
     executor.run_next()
-    with pytest.raises(MemoryError, match="a moment"):
+    with pytest.raises(MemoryError, match="temporarily"):
         estimator.evaluate_past(earlier)
     assert estimator.evaluate_past(earlier) is None
     executor.run_next()
@@ -128,12 +128,12 @@ def test_what_the_detector_raises_on_an_earlier_frame_is_raised_once_and_the_fra
     np.testing.assert_array_equal(relevance.roi, MUG.mask(earlier))
 
 
-def test_a_keyframe_of_the_window_is_given_its_late_relevance() -> None:
+def test_a_keyframe_in_the_window_receives_its_delayed_relevance() -> None:
     executor = DeferredExecutor()
     mapper = GaussianMapper(
         MapperSettings(max_gaussians=500, keyframes=KeyframeSettings(every=2, window=2)), CpuRasterizer(threads=1)
     )
-    loop = TaskMapper(beside(executor, every=9), mapper)
+    loop = TaskMapper(async_estimator(executor, every=9), mapper)
     first = loop.process(frame_at(0))
     assert first.detection_lag_frames is None
     assert not mapper.keyframes()[0].relevance.roi.any()
@@ -144,12 +144,12 @@ def test_a_keyframe_of_the_window_is_given_its_late_relevance() -> None:
     assert mapper.gaussians().kappa.any()
 
 
-def test_a_frame_that_left_the_window_is_not_revised() -> None:
+def test_a_frame_outside_the_window_is_not_revised() -> None:
     executor = DeferredExecutor()
     mapper = GaussianMapper(
         MapperSettings(max_gaussians=500, keyframes=KeyframeSettings(every=1, window=2)), CpuRasterizer(threads=1)
     )
-    loop = TaskMapper(beside(executor, every=9), mapper)
+    loop = TaskMapper(async_estimator(executor, every=9), mapper)
     for index in range(4):
         loop.process(frame_at(index))
     executor.run_next()

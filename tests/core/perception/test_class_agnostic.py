@@ -1,4 +1,4 @@
-"""Masks of everything, matched to boxes: the FastSAM scheme on a network computed by hand, and its thresholds."""
+"""Class-agnostic masks matched to boxes, on a network with known results, and the thresholds."""
 
 from __future__ import annotations
 
@@ -30,38 +30,38 @@ def segmenter(tmp_path, *boxes, names=("object",)):
     )
 
 
-def masks(tmp_path, *boxes, asked=(BOX,), names=("object",)):
-    return segmenter(tmp_path, *boxes, names=names).segment(frame_with_red_square(), np.asarray(asked, np.float32))
+def masks(tmp_path, *boxes, given=(BOX,), names=("object",)):
+    return segmenter(tmp_path, *boxes, names=names).segment(frame_with_red_square(), np.asarray(given, np.float32))
 
 
-def test_a_file_without_metadata_gives_the_mask_of_the_thing_in_the_box(tmp_path):
+def test_a_file_without_metadata_segments_the_object_in_the_box(tmp_path):
     (mask,) = masks(tmp_path, SURE)
     assert mask is not None
     assert mask[16:48, 32:64].mean() > 0.97
     assert mask.sum() == mask[16:48, 32:64].sum()
 
 
-def test_each_box_gets_the_thing_that_overlaps_it_best(tmp_path):
+def test_each_box_gets_the_mask_with_the_largest_overlap(tmp_path):
     larger = (26.0, 32.0, 20.0, 16.0, 0, 0.95)
-    whole, half = masks(tmp_path, SURE, larger, asked=(BOX, (32, 16, 80, 48)))
+    whole, half = masks(tmp_path, SURE, larger, given=(BOX, (32, 16, 80, 48)))
     assert whole is not None
     assert half is not None
     assert whole[16:48, 32:64].mean() > 0.97
     assert half.sum() >= whole.sum()
 
 
-def test_boxes_that_half_fit_or_hold_nothing_sure_get_no_mask(tmp_path):
+def test_boxes_without_a_confident_matching_instance_get_no_mask(tmp_path):
     beside = (48.0, 16.0, 80.0, 48.0)
-    assert masks(tmp_path, SURE, asked=(beside,)) == [None]
+    assert masks(tmp_path, SURE, given=(beside,)) == [None]
     assert masks(tmp_path, (*SURE[:5], 0.39)) == [None]
     assert masks(tmp_path) == [None]
 
 
-def test_no_boxes_ask_nothing(tmp_path):
+def test_no_boxes_give_no_masks(tmp_path):
     assert segmenter(tmp_path, SURE).segment(frame_with_red_square(), np.zeros((0, 4), np.float32)) == []
 
 
-def test_a_network_of_many_classes_may_be_unsure_of_each(tmp_path):
+def test_a_network_of_many_classes_has_a_lower_threshold(tmp_path):
     (mask,) = masks(tmp_path, (*SURE[:5], 0.04), names=("cup", "chair"))
     assert mask is not None
 

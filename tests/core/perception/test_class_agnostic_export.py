@@ -1,4 +1,4 @@
-"""A network with FastSAM's inputs and outputs, tiny and with random weights: what is read of it is what torch says."""
+"""The exported outputs of a tiny random network with FastSAM's interface equal those of torch."""
 
 from __future__ import annotations
 
@@ -46,13 +46,13 @@ def test_boxes_scores_coefficients_and_prototypes_are_torchs(tmp_path) -> None:
     assert read.classes == 1
     rgb = np.random.default_rng(1).integers(0, 256, (HEIGHT_PX, WIDTH_PX, 3), np.uint8)
     camera = Camera(60, 60, 32, 24, WIDTH_PX, HEIGHT_PX)
-    answer = read.run(Frame(0, 0, rgb, np.ones((HEIGHT_PX, WIDTH_PX), np.float32), camera, np.eye(4)))
+    output = read.run(Frame(0, 0, rgb, np.ones((HEIGHT_PX, WIDTH_PX), np.float32), camera, np.eye(4)))
     with torch.no_grad():
         rows, prototypes = (
             each[0].numpy() for each in network(torch.from_numpy(letterbox(rgb, HEIGHT_PX, WIDTH_PX)[0]))
         )
-    np.testing.assert_allclose(answer.prototypes, prototypes, atol=1e-4)
-    found = answer.candidates(0.001)
+    np.testing.assert_allclose(output.prototypes, prototypes, atol=1e-4)
+    found = output.candidates(0.001)
     corners = np.concatenate([rows[:2] - rows[2:4] / 2, rows[:2] + rows[2:4] / 2]).T
     order, expected = np.argsort(found.scores), np.argsort(rows[4])
     assert len(order) == rows.shape[1]

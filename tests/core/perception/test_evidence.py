@@ -1,4 +1,4 @@
-"""An object counts once there is evidence for it: a layer of depth of its own, observations that agree, no empty looks."""
+"""Evidence for objects: foreground masks, repeated observations, and misses of visible landmarks."""
 
 from __future__ import annotations
 
@@ -32,15 +32,15 @@ def frame_at(x_m: float = 0.0, index: int = 0, wall_m: float = 2.0) -> Frame:
     return Frame(index, 0, np.zeros((120, 160, 3), np.uint8), depth_m, CAMERA, T_world_camera)
 
 
-def seen_from_the_origin(z_m: float = 2.0, score: float = 0.4) -> Landmark:
+def landmark_at(z_m: float = 2.0, score: float = 0.4) -> Landmark:
     grid = np.stack(np.meshgrid(np.linspace(-0.2, 0.2, 9), np.linspace(-0.2, 0.2, 9)), axis=-1).reshape(-1, 2)
     points_m = np.column_stack([grid, np.full(len(grid), z_m)])
     return Landmark.from_observation(Observation.from_points("mug", points_m, np.zeros(3), score))
 
 
 @dataclass
-class Script:
-    """A detector that answers call after call with what it was given: a score, or None for nothing."""
+class ScriptedDetector:
+    """A detector with one given result per call: a score, or None for no detection."""
 
     scores: Sequence[float | None]
     calls: int = 0
@@ -56,15 +56,15 @@ class Script:
         return [] if score is None else [Detection("mug", score, (70.0, 50.0, 90.0, 70.0), mask)]
 
 
-def lit(scores: Sequence[float | None], frames: int, max_frames: int = 1) -> list[bool]:
-    detector = Script(scores)
+def target_marked(scores: Sequence[float | None], frames: int, max_frames: int = 1) -> list[bool]:
+    detector = ScriptedDetector(scores)
     estimator = TaskRelevanceEstimator(
         TaskGraph("id", "find the mug", ("mug",), (), ()), detector, TrackerSettings(max_frames=max_frames)
     )
     return [bool(estimator.estimate(frame_at(index=index)).relevance.roi.any()) for index in range(frames)]
 
 
-def test_what_is_seen_through_a_chairs_slats_is_not_the_chair():
+def test_background_between_slats_is_removed():
     depth_m = np.full((120, 160), 1.5, np.float32)
     depth_m[:, ::4] = 3.0
     depth_m[0, 1] = 0.0
@@ -72,7 +72,7 @@ def test_what_is_seen_through_a_chairs_slats_is_not_the_chair():
     assert np.array_equal(front, (depth_m == 1.5) | (depth_m == 0.0))
 
 
-def test_a_few_pixels_between_do_not_join_a_bottle_to_the_wall_behind():
+def test_a_few_pixels_in_between_do_not_join_two_layers():
     depth_m, mask = np.full((120, 160), 2.2, np.float32), np.zeros((120, 160), np.bool_)
     mask[40:70, 70:80] = True
     depth_m[40:66, 70:80] = 1.9
@@ -80,72 +80,72 @@ def test_a_few_pixels_between_do_not_join_a_bottle_to_the_wall_behind():
     assert np.array_equal(foreground_mask(mask, depth_m), mask & (depth_m < 1.97))
 
 
-def test_a_table_that_recedes_is_one_layer():
+def test_a_receding_table_is_one_layer():
     depth_m = np.broadcast_to(np.linspace(0.8, 4.0, 120, dtype=np.float32)[:, None], (120, 160))
     assert np.array_equal(foreground_mask(WHOLE, depth_m), WHOLE)
 
 
-def test_a_mask_without_depth_is_left_alone():
+def test_a_mask_without_depth_is_unchanged():
     assert np.array_equal(foreground_mask(WHOLE, np.zeros((120, 160), np.float32)), WHOLE)
 
 
-def test_a_faint_detection_counts_from_its_second_sighting_and_a_sure_one_at_once():
-    assert lit([0.4], 3) == [False, True, True]
-    assert lit([0.9], 3) == [True, True, True]
-    assert lit([0.4, None], 3) == [False, False, False]
+def test_low_scores_need_two_detections_and_high_scores_one():
+    assert target_marked([0.4], 3) == [False, True, True]
+    assert target_marked([0.9], 3) == [True, True, True]
+    assert target_marked([0.4, None], 3) == [False, False, False]
 
 
-def test_after_a_first_faint_detection_the_next_frame_is_looked_at_too():
-    assert lit([0.4], 6, max_frames=5) == [False, True, True, True, True, True]
-    settled, needs_observation = Script([None]), Script([0.4, None])
-    for detector, calls in ((settled, 1), (needs_observation, 2)):
+def test_a_first_low_score_makes_the_next_frame_a_keyframe():
+    assert target_marked([0.4], 6, max_frames=5) == [False, True, True, True, True, True]
+    no_detection, low_score = ScriptedDetector([None]), ScriptedDetector([0.4, None])
+    for detector, calls in ((no_detection, 1), (low_score, 2)):
         estimator = TaskRelevanceEstimator(TaskGraph("id", "find the mug", ("mug",), (), ()), detector)
         for index in range(5):
             estimator.estimate(frame_at(index=index))
         assert detector.calls == calls
 
 
-def test_detections_that_miss_an_object_do_not_unmake_it_at_once():
-    assert lit([0.9, None, None, None, 0.4], 5) == [True, True, True, False, True]
-    assert lit([0.9, None, None, 0.9, None, None, None], 7) == [True] * 6 + [False]
+def test_a_reliable_target_survives_a_few_missed_detections():
+    assert target_marked([0.9, None, None, None, 0.4], 5) == [True, True, True, False, True]
+    assert target_marked([0.9, None, None, 0.9, None, None, None], 7) == [True] * 6 + [False]
 
 
-def test_what_most_looks_at_its_place_missed_is_not_believed():
-    assert not any(lit([0.4, *[None] * 9, 0.4], 11))
+def test_an_object_missed_by_most_frames_is_not_confirmed():
+    assert not any(target_marked([0.4, *[None] * 9, 0.4], 11))
 
 
 @pytest.mark.parametrize(
-    ("frame", "shown"),
+    ("frame", "expected"),
     [
         (frame_at(), True),
-        (frame_at(wall_m=3.0), True),  # it is gone: its place is in view
-        (frame_at(wall_m=1.0), False),  # something stands before it
-        (frame_at(wall_m=0.0), False),  # nothing is known there
+        (frame_at(wall_m=3.0), True),  # removed object: its cells are in view
+        (frame_at(wall_m=1.0), False),  # occluded
+        (frame_at(wall_m=0.0), False),  # no depth
         (frame_at(x_m=3.0), False),  # out of view
     ],
 )
-def test_a_view_misses_only_what_it_could_show(frame, shown):
-    assert VisibilityCheck(frame, frame.depth_m).is_visible(seen_from_the_origin()) is shown
+def test_only_visible_landmarks_can_be_missed(frame, expected):
+    assert VisibilityCheck(frame, frame.depth_m).is_visible(landmark_at()) is expected
 
 
-def test_nobody_is_blamed_for_not_seeing_from_farther_than_ever():
-    away = frame_at(wall_m=9.0)
-    away.T_world_camera[2, 3] = -3.0
-    assert not VisibilityCheck(away, away.depth_m).is_visible(seen_from_the_origin())
+def test_landmarks_farther_than_any_observation_are_not_missed():
+    far_frame = frame_at(wall_m=9.0)
+    far_frame.T_world_camera[2, 3] = -3.0
+    assert not VisibilityCheck(far_frame, far_frame.depth_m).is_visible(landmark_at())
 
 
-def test_the_order_of_sightings_does_not_matter_for_what_is_known():
+def test_the_order_of_observations_does_not_matter():
     rng = np.random.default_rng(0)
     observations = [
         Observation.from_points("mug", rng.uniform(-0.1, 0.1, (200, 3)), np.array([0.0, 0.0, -z]), score)
         for z, score in ((1.0, 0.3), (2.0, 0.7), (1.5, 0.5))
     ]
     for order in ((0, 1, 2), (2, 0, 1)):
-        memory = ObjectMap()
+        object_map = ObjectMap()
         for number in order:
-            memory.observe([observations[number]])
-        memory.observe([], lambda each: True)
-        (mug,) = memory.objects
+            object_map.observe([observations[number]])
+        object_map.observe([], lambda each: True)
+        (mug,) = object_map.objects
         assert (mug.seen_count, mug.missed_count, mug.best_score) == (3, 1, 0.7)
         assert mug.farthest_m == pytest.approx(2.0, abs=0.05)
 
@@ -162,30 +162,30 @@ def closest_chair() -> SpatialFilter:
     return SpatialFilter(graph, (0.0, -1.0, 0.0), SpatialSettings())
 
 
-def test_the_closest_is_told_from_a_part_of_the_table():
-    at_its_side, at_its_end = (
+def test_the_closest_chair_is_found_from_a_part_of_the_table():
+    side_chair, end_chair = (
         cloud("chair", 0.9, (0.6, 0.9), (-0.3, 0.3), (0.45, 0.5)),
         cloud("chair", 0.9, (-0.7, -0.6), (-0.3, 0.3), (-0.2, 0.2)),
     )
     parts = [cloud("table", 0.9, (-0.4, right_m), (0.0, 0.05), (-0.4, 0.4)) for right_m in (0.9, 1.6)]
     for part in parts:
-        kept = closest_chair()
-        kept.observe([part, at_its_side, at_its_end])
-        assert kept.satisfies_relations(at_its_side)
-        assert not kept.satisfies_relations(at_its_end)
+        spatial_filter = closest_chair()
+        spatial_filter.observe([part, side_chair, end_chair])
+        assert spatial_filter.satisfies_relations(side_chair)
+        assert not spatial_filter.satisfies_relations(end_chair)
 
 
-def test_a_faint_candidate_does_not_decide_which_is_the_closest():
+def test_an_unreliable_candidate_does_not_decide_a_superlative():
     table = cloud("table", 0.9, (-0.4, 0.4), (0.0, 0.05), (-0.4, 0.4))
-    faint, sure = (
+    unreliable, reliable = (
         cloud("chair", score, (x_m, x_m + 0.3), (-0.3, 0.3), (0.0, 0.3)) for score, x_m in ((0.3, 0.5), (0.9, 1.5))
     )
-    kept = closest_chair()
+    spatial_filter = closest_chair()
     for _ in range(3):
-        kept.observe([table, faint, sure])
-    assert kept.is_confirmed(faint)
-    assert kept.satisfies_relations(sure)
-    assert not kept.satisfies_relations(faint)
+        spatial_filter.observe([table, unreliable, reliable])
+    assert spatial_filter.is_confirmed(unreliable)
+    assert spatial_filter.satisfies_relations(reliable)
+    assert not spatial_filter.satisfies_relations(unreliable)
 
 
 @pytest.mark.parametrize("settings", [{"min_seen": 0}, {"confident_score": -0.1}, {"min_seen_fraction": 1.1}])

@@ -1,4 +1,4 @@
-"""The whole way of a phrase and an image through a Grounding DINO file, with numbers known by hand, and wrong files."""
+"""Grounding DINO end to end with known results, and rejection of invalid files."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from gausslite.perception.model_file import open_model
 
 LEFT, RIGHT = (0.25, 0.5, 0.25, 0.5), (0.75, 0.5, 0.25, 0.5)
 SURE, UNSURE = 2.0, -1.2
-# blue at the mean of the images the network was trained on adds nothing to the logits
+# blue at the mean of the training images adds nothing to the logits
 NEUTRAL_BLUE = round(0.406 * 255)
 
 
@@ -46,7 +46,7 @@ LAYOUTS = (
 
 
 @pytest.mark.parametrize("layout", LAYOUTS, ids=["fitting", "padded", "open", "without pixel mask"])
-def test_a_phrase_finds_its_box_in_pixels_of_the_image_whatever_the_layout(tmp_path, layout):
+def test_a_phrase_gets_its_box_in_image_pixels_for_every_input_layout(tmp_path, layout):
     found = detector(tmp_path, [(LEFT, {"mug": SURE}), (RIGHT, {"table": SURE})], **layout).boxes(frame(), ["mug"])
     (box,) = found
     assert box.phrase == "mug"
@@ -54,13 +54,13 @@ def test_a_phrase_finds_its_box_in_pixels_of_the_image_whatever_the_layout(tmp_p
     assert box.box_px == pytest.approx((10, 15, 30, 45))
 
 
-def test_each_phrase_is_asked_by_itself_and_answers_in_the_order_of_the_queries(tmp_path):
+def test_each_phrase_has_its_own_pass_in_the_order_of_the_queries(tmp_path):
     answers = [(LEFT, {"mug": SURE}), (RIGHT, {"table": SURE, "mug": 1.0})]
     found = detector(tmp_path, answers).boxes(frame(), ["table", "mug"])
     assert [(box.phrase, box.box_px[0]) for box in found] == [("table", 50), ("mug", 10), ("mug", 50)]
 
 
-def test_a_box_that_only_fits_the_adjective_is_left_out(tmp_path):
+def test_a_box_that_matches_only_the_adjective_is_dropped(tmp_path):
     answers = [(LEFT, {"red": SURE, "mug": UNSURE}), (RIGHT, {"red": SURE, "mug": -1.0})]
     (box,) = detector(tmp_path, answers).boxes(frame(), ["red mug"])
     assert box.box_px[0] == 50
@@ -75,7 +75,7 @@ def test_thresholds_are_those_of_the_settings(tmp_path):
     assert detector(tmp_path, answers, strict).boxes(frame(), ["mug"]) == []
 
 
-def test_boxes_over_one_thing_become_one_and_boxes_that_span_too_much_are_left_out(tmp_path):
+def test_duplicate_and_too_large_boxes_are_dropped(tmp_path):
     beside, huge = (0.26, 0.5, 0.25, 0.5), (0.5, 0.5, 0.6, 0.6)
     answers = [(beside, {"mug": 1.0}), (LEFT, {"mug": SURE}), (huge, {"mug": SURE, "table": SURE})]
     grounding = detector(tmp_path, answers)
@@ -85,7 +85,7 @@ def test_boxes_over_one_thing_become_one_and_boxes_that_span_too_much_are_left_o
     assert table.box_px == pytest.approx((16, 12, 64, 48))
 
 
-def test_padding_is_masked_and_counts_for_nothing(tmp_path):
+def test_padding_is_masked_and_has_no_effect(tmp_path):
     answers = [(LEFT, {"mug": SURE})]
     layouts = ({"size_px": (48, 64)}, {"size_px": (96, 64)}, {"size_px": (48, 200)})
     scores = [detector(tmp_path, answers, **layout).boxes(frame(blue=160), ["mug"])[0].score for layout in layouts]
@@ -99,7 +99,7 @@ def test_a_file_with_another_interface_is_refused(tmp_path):
     assert "\n" not in str(caught.value)
 
 
-def test_a_network_with_room_for_no_word_is_refused(tmp_path):
+def test_a_network_too_short_for_a_word_is_refused(tmp_path):
     with pytest.raises(ModelFileError, match="space for 4 tokens"):
         detector(tmp_path, [(LEFT, {})], length=3)
 
@@ -114,7 +114,7 @@ def test_settings_are_checked():
         open_model(Path("any.onnx"), threads=0)
 
 
-def test_the_noun_stays_when_a_phrase_is_too_long():
+def test_a_long_phrase_keeps_its_noun():
     read = encode_phrase("red red Mug", TinyTokenizer(), 5)
     assert [VOCABULARY[i] for i in read.input_ids[0]] == ["[CLS]", "red", "mug", ".", "[SEP]"]
     assert read.is_noun == (False, False, True, False, False)
@@ -129,7 +129,7 @@ def test_a_phrase_is_padded_to_the_networks_length():
 
 @settings(max_examples=50, deadline=None)
 @given(st.integers(1, 40), st.integers(1, 40), st.integers(1, 40), st.integers(1, 40))
-def test_a_picture_keeps_its_proportions_and_fills_one_side(height, width, to_height, to_width):
+def test_an_image_keeps_its_proportions_and_fills_one_side(height, width, to_height, to_width):
     values, mask = preprocess(np.full((height, width, 3), 255, np.uint8), (to_height, to_width), keep_proportions=True)
     inside = mask[0] > 0
     rows, columns = inside.any(axis=1).sum(), inside.any(axis=0).sum()
@@ -140,8 +140,8 @@ def test_a_picture_keeps_its_proportions_and_fills_one_side(height, width, to_he
 
 
 @given(st.lists(st.tuples(*[st.floats(-0.5, 1.5, width=32)] * 4), min_size=1, max_size=5))
-def test_corners_lie_in_the_image_and_in_order(centred):
-    boxes = np.array(centred, np.float32)
+def test_corners_are_in_the_image_and_ordered(boxes_cxcywh):
+    boxes = np.array(boxes_cxcywh, np.float32)
     boxes[:, 2:] = np.abs(boxes[:, 2:])
     corners = corners_px(boxes, (80, 60))
     assert (corners >= 0).all()
@@ -149,17 +149,17 @@ def test_corners_lie_in_the_image_and_in_order(centred):
     assert (corners[:, 2:] >= corners[:, :2]).all()
 
 
-def test_tokens_that_the_network_has_not_are_as_unlikely_as_can_be():
+def test_missing_tokens_have_probability_zero():
     scores, noun_scores = phrase_scores(np.array([[-np.inf, 1.0, 0.0, -np.inf]], np.float32), (False, False, True))
     assert scores[0] == pytest.approx(1 / (1 + np.exp(-1)))
     assert noun_scores[0] == pytest.approx(0.5)
 
 
-def test_boxes_know_no_masks():
+def test_a_box_detector_is_not_a_detector():
     assert not hasattr(DetectedBox("mug", 0.5, (0, 0, 1, 1)), "mask")
 
 
-def test_word_pieces_of_a_users_vocabulary(tmp_path):
+def test_word_pieces_of_a_vocabulary_file(tmp_path):
     pytest.importorskip("tokenizers", reason="the word pieces of BERT come with the extra grounding")
     path = tmp_path / "vocab.txt"
     path.write_text("\n".join(word for word in VOCABULARY if word != "mug") + "\n", encoding="utf-8")
@@ -173,7 +173,7 @@ def test_word_pieces_of_a_users_vocabulary(tmp_path):
     ("content", "expected"),
     [(None, "found none"), (b"\xff\xfe", "expected UTF-8 text"), (b"cup\nmug\n", r"found no \[PAD\]")],
 )
-def test_a_wrong_vocabulary_is_refused_in_one_line(tmp_path, content, expected):
+def test_an_invalid_vocabulary_is_refused_in_one_line(tmp_path, content, expected):
     path = tmp_path / "vocab.txt"
     if content is not None:
         path.write_bytes(content)

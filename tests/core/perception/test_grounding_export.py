@@ -1,4 +1,4 @@
-"""Grounding DINO itself, tiny and with random weights: what the file says is what torch says, to 1e-4."""
+"""A tiny random Grounding DINO: the exported file equals torch to 1e-4."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ SEEDS = range(3)
 
 @pytest.fixture(scope="module")
 def network():
-    """Random weights of a size that keeps boxes and scores apart from each other."""
+    """Return a network with random weights that give distinct boxes and scores."""
     config = transformers.GroundingDinoConfig(
         backbone_config=transformers.SwinConfig(
             image_size=64, embed_dim=16, depths=[1, 1, 1, 1], num_heads=[1, 2, 2, 2], window_size=4,
@@ -38,7 +38,7 @@ def network():
         d_model=32, encoder_layers=1, encoder_ffn_dim=32, encoder_attention_heads=2, decoder_layers=2,
         decoder_ffn_dim=32, decoder_attention_heads=2, num_queries=12, max_text_len=16,
     )  # fmt: skip
-    torch.manual_seed(0)  # for what the lines below leave as it was born
+    torch.manual_seed(0)  # for the parameters not set below
     model = transformers.GroundingDinoForObjectDetection(config).eval()
     generator = torch.Generator().manual_seed(1)
     with torch.no_grad():

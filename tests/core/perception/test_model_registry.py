@@ -1,4 +1,4 @@
-"""Which family a file is of, and what detector and segmenter a mission gets for its options."""
+"""Model families of files, and the detector and segmenter built from the options."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ CUP = (24.0, 32.0, 16.0, 16.0, 0, 0.9)
 
 
 def frame() -> Frame:
-    """A red square, nearer than what is behind it, in 128x64 pixels."""
+    """Return a frame of 128x64 pixels with a red square before a wall."""
     rgb, depth_m = np.zeros((64, 128, 3), np.uint8), np.full((64, 128), 2.0, np.float32)
     rgb[16:48, 32:64, 0] = 255
     depth_m[20:44, 36:60] = 1.0
@@ -37,7 +37,7 @@ def found_pixels(networks: ModelRegistry) -> int:
     return int(found.mask.sum())
 
 
-def test_a_family_is_told_by_inputs_and_outputs(tmp_path):
+def test_a_family_is_identified_by_inputs_and_outputs(tmp_path):
     grounding = write_tiny_grounding(tmp_path / "dino.onnx", [((0.5, 0.5, 0.2, 0.2), {})])
     assert identify_family(open_model(grounding, 1)) is ModelFamily.GROUNDING_DINO
     assert identify_family(open_model(yolo(tmp_path), 1)) is ModelFamily.YOLO_SEG
@@ -47,7 +47,7 @@ def test_a_family_is_told_by_inputs_and_outputs(tmp_path):
 
 
 @pytest.mark.parametrize("name", [None, "yolo"])
-def test_a_yolo_file_brings_its_own_masks(tmp_path, name):
+def test_a_yolo_file_uses_its_own_masks(tmp_path, name):
     networks = ModelRegistry(yolo(tmp_path), name, None, 1)
     assert found_pixels(networks) > 0.97 * 32 * 32
     (mask,) = networks.segmenter.segment(frame(), np.array([[32, 16, 64, 48]], np.float32))
@@ -71,18 +71,18 @@ def test_each_file_is_opened_once(tmp_path, monkeypatch, segmenter, sessions):
     assert len(opened) == len(set(opened)) == sessions
 
 
-def test_the_cut_replaces_a_networks_masks_where_it_is_asked_for(tmp_path):
+def test_the_depth_segmenter_replaces_a_networks_masks_on_request(tmp_path):
     assert found_pixels(ModelRegistry(yolo(tmp_path), "depth", None, 1)) == 24 * 24
 
 
-def test_another_file_masks_what_the_first_found_and_the_cut_what_neither_masks(tmp_path):
+def test_a_second_file_segments_boxes_and_depth_segments_the_rest(tmp_path):
     everything = yolo(tmp_path, "everything.onnx", ("object",))
     assert found_pixels(ModelRegistry(yolo(tmp_path), str(everything), None, 1)) > 0.97 * 32 * 32
     blind = yolo(tmp_path, "blind.onnx", ("object",), ())
     assert found_pixels(ModelRegistry(yolo(tmp_path), str(blind), None, 1)) == 24 * 24
 
 
-def test_boxes_without_any_mask_are_left_out():
+def test_boxes_without_a_mask_are_dropped():
     class TwoBoxes:
         def unsupported(self, queries):
             return ("no class",)
@@ -99,7 +99,7 @@ def test_boxes_without_any_mask_are_left_out():
     assert detector.unsupported(["cup"]) == ("no class",)
 
 
-def test_grounding_dino_needs_its_words_and_cannot_mask(tmp_path):
+def test_grounding_dino_needs_a_vocabulary_and_has_no_masks(tmp_path):
     path = write_tiny_grounding(tmp_path / "dino.onnx", [((0.5, 0.5, 0.2, 0.2), {})])
     with pytest.raises(InvalidInputError, match="finds boxes only; expected depth or a FastSAM file"):
         ModelRegistry(path, "yolo", None, 1)
@@ -107,7 +107,7 @@ def test_grounding_dino_needs_its_words_and_cannot_mask(tmp_path):
         ModelRegistry(path, None, None, 1)
 
 
-def test_grounding_dino_with_words_beside_it_finds_and_cuts_out(tmp_path):
+def test_grounding_dino_with_a_vocabulary_detects_and_segments(tmp_path):
     path = write_tiny_grounding(tmp_path / "dino.onnx", [((0.375, 0.5, 0.25, 0.5), {"mug": 2.0})], (64, 128))
     (tmp_path / "vocab.txt").write_text("\n".join(VOCABULARY), encoding="utf-8")
     try:
@@ -119,7 +119,7 @@ def test_grounding_dino_with_words_beside_it_finds_and_cuts_out(tmp_path):
     assert found.mask.sum() == 24 * 24
 
 
-def test_the_fastest_processor_there_is_comes_first_and_the_cpu_helps_out():
+def test_a_gpu_provider_is_preferred_and_the_cpu_is_the_fallback():
     cpu, cuda, tensorrt = "CPUExecutionProvider", "CUDAExecutionProvider", "TensorrtExecutionProvider"
     assert choose_providers([cpu]) == (cpu,)
     assert choose_providers([tensorrt, cuda, cpu]) == (cuda, cpu)
@@ -138,14 +138,14 @@ def test_the_fastest_processor_there_is_comes_first_and_the_cpu_helps_out():
         (b"\x08\x08\x3a\x7f1234", "truncated at 8 bytes of 131"),
     ],
 )
-def test_what_is_no_model_is_told_before_a_session_is_made(tmp_path, content, expected):
+def test_invalid_files_are_rejected_before_a_session_is_made(tmp_path, content, expected):
     path = tmp_path / "model.onnx"
     path.write_bytes(content)
     with pytest.raises(ModelFileError, match=expected):
         open_model(path, 1)
 
 
-def test_a_damaged_bit_is_told_where_a_checksum_lies_beside_the_file(tmp_path):
+def test_a_damaged_bit_is_detected_by_a_listed_checksum(tmp_path):
     path = yolo(tmp_path)
     (tmp_path / "SHA256SUMS").write_text(f"{'0' * 64}  other.onnx\n{'1' * 64} *yolo.onnx\n", encoding="utf-8")
     with pytest.raises(ModelFileError, match="of SHA256SUMS in its folder"):

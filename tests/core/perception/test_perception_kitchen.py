@@ -1,4 +1,4 @@
-"""The real detector on a real kitchen: what the two missions of the demo look at."""
+"""The real detector on a real kitchen, with the two tasks of the demo."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def estimator_for(text: str, kitchen: Source, detector: YoloSegDetector) -> Task
     return TaskRelevanceEstimator(RuleParser().parse(text), detector, settings)
 
 
-def test_it_finds_chairs_table_and_cups(kitchen, detector):
+def test_chairs_table_and_cups_are_detected(kitchen, detector):
     found = detector.detect(kitchen.frame(kitchen.indices().index(532)), ["chair", "table", "mug"])
     count = {name: sum(each.phrase == name for each in found) for name in ("chair", "table", "mug")}
     assert count["chair"] >= 2
@@ -41,7 +41,7 @@ def test_it_finds_chairs_table_and_cups(kitchen, detector):
     assert count["mug"] == 2
 
 
-def test_text_vectors_take_nouns_to_classes_and_refuse_the_rest(shared_dir, detector):
+def test_text_embeddings_match_nouns_to_classes_or_to_none(shared_dir, detector):
     vectors = TextEmbeddings.from_model_folder(shared_dir / "models" / "yolo11n-seg_int8.onnx")
     assert vectors is not None
     names = detector.class_names
@@ -69,7 +69,7 @@ def test_the_chair_closest_to_the_table(kitchen, detector, shared_dir):
     assert np.abs(table.centroid_m - regions["table_1"].centroid_m).max() < 0.2
 
 
-def test_the_closest_chair_is_known_while_an_end_of_the_table_is_all_that_was_seen(kitchen, detector, shared_dir):
+def test_the_closest_chair_is_found_from_one_end_of_the_table(kitchen, detector, shared_dir):
     regions = load_voxel_regions(shared_dir / "data" / "redkitchen" / "roi_voxels.npz")
     estimator = estimator_for("Identify the chair closest to the table", kitchen, detector)
     for number in (0, 8, 20, 44, 56, 64):
@@ -80,7 +80,7 @@ def test_the_closest_chair_is_known_while_an_end_of_the_table_is_all_that_was_se
             assert (roi & regions["chair_3"].mask(frame)).any()
 
 
-def test_mugs_on_the_table_are_kept_and_an_absent_object_lights_nothing(kitchen, detector):
+def test_mugs_on_the_table_are_marked_and_absent_objects_are_not(kitchen, detector):
     mugs = estimator_for("Pick up the mug on the table", kitchen, detector)
     umbrella = estimator_for("Pick up the umbrella", kitchen, detector)
     shares = []

@@ -1,4 +1,4 @@
-"""The predicates beyond the paper's, on a table 1.2 m long that a camera looks at from 3 m before it."""
+"""The predicates beyond the paper's, on a table of 1.2 m that a camera observes from 3 m."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ def box(phrase: str, centre_m: tuple[float, float, float], size_m: tuple[float, 
     return Observation.from_points(phrase, grid + centre_m, EYE_M)
 
 
-def thing(phrase: str, *centre_m: float) -> Observation:
+def small_object(phrase: str, *centre_m: float) -> Observation:
     return box(phrase, (centre_m[0], centre_m[1], centre_m[2]), (0.08, 0.08, 0.08))
 
 
 TABLE = box("table", (0.0, 0.0, 0.0), (1.2, 0.6, 0.6))
 
 
-def keeps(predicate: Predicate, target: Observation, *others: Observation) -> bool:
+def satisfies(predicate: Predicate, target: Observation, *others: Observation) -> bool:
     anchors = tuple(dict.fromkeys(other.phrase for other in others))
     relations = tuple(Relation(predicate, target.phrase, anchor) for anchor in anchors)
     spatial = SpatialFilter(TaskGraph("id", "", (target.phrase,), anchors, relations), UP, SpatialSettings())
@@ -54,9 +54,9 @@ def keeps(predicate: Predicate, target: Observation, *others: Observation) -> bo
         (Predicate.BEHIND, (0.5, 0.0, 2.0), (0.5, 0.0, 3.0)),
     ],
 )
-def test_each_predicate_has_its_own_space(predicate, inside, outside):
-    assert keeps(predicate, thing("mug", *inside), TABLE)
-    assert not keeps(predicate, thing("mug", *outside), TABLE)
+def test_each_predicate_holds_in_its_own_region(predicate, inside, outside):
+    assert satisfies(predicate, small_object("mug", *inside), TABLE)
+    assert not satisfies(predicate, small_object("mug", *outside), TABLE)
 
 
 @given(
@@ -64,47 +64,47 @@ def test_each_predicate_has_its_own_space(predicate, inside, outside):
     st.floats(-2.5, 2.5).filter(lambda x: abs(x) > 0.1),
     st.floats(-2.5, 2.5).filter(lambda z: abs(z) > 0.1),
 )
-def test_no_place_is_on_both_opposite_sides(predicate, x_m, z_m):
-    place = thing("mug", x_m, 0.0, z_m)
-    assert not (keeps(predicate, place, TABLE) and keeps(MIRRORED[predicate], place, TABLE))
+def test_no_point_is_on_two_opposite_sides(predicate, x_m, z_m):
+    place = small_object("mug", x_m, 0.0, z_m)
+    assert not (keeps(predicate, place, TABLE) and satisfies(MIRRORED[predicate], place, TABLE))
 
 
-def test_sides_turn_with_the_one_who_looks():
-    mug = thing("mug", -1.0, 0.0, 0.1)
+def test_sides_are_relative_to_the_camera():
+    mug = small_object("mug", -1.0, 0.0, 0.1)
     from_behind = Observation(mug.phrase, mug.centroid_m, mug.radius_m, mug.cells, -EYE_M)
-    assert keeps(Predicate.LEFT_OF, mug, TABLE)
-    assert keeps(Predicate.RIGHT_OF, from_behind, TABLE)
-    assert not keeps(Predicate.LEFT_OF, from_behind, TABLE)
+    assert satisfies(Predicate.LEFT_OF, mug, TABLE)
+    assert satisfies(Predicate.RIGHT_OF, from_behind, TABLE)
+    assert not satisfies(Predicate.LEFT_OF, from_behind, TABLE)
 
 
-def test_a_side_of_what_nobody_looked_at_is_near():
-    mug = thing("mug", -0.7, 0.0, 0.1)
+def test_a_side_without_a_camera_means_near():
+    mug = small_object("mug", -0.7, 0.0, 0.1)
     unseen = Observation(mug.phrase, mug.centroid_m, mug.radius_m, mug.cells)
-    assert keeps(Predicate.RIGHT_OF, unseen, TABLE)
+    assert satisfies(Predicate.RIGHT_OF, unseen, TABLE)
 
 
 def test_between_needs_both_anchors_at_once():
-    sofa, window = thing("sofa", -2.0, 0.0, 0.0), thing("window", 2.0, 0.0, 0.0)
-    assert keeps(Predicate.BETWEEN, thing("plant", 0.5, 0.0, 0.3), sofa, window)
-    assert not keeps(Predicate.BETWEEN, thing("plant", -2.5, 0.0, 0.0), sofa, window)
-    assert not keeps(Predicate.BETWEEN, thing("plant", 0.5, 0.0, 1.5), sofa, window)
+    sofa, window = small_object("sofa", -2.0, 0.0, 0.0), small_object("window", 2.0, 0.0, 0.0)
+    assert satisfies(Predicate.BETWEEN, small_object("plant", 0.5, 0.0, 0.3), sofa, window)
+    assert not satisfies(Predicate.BETWEEN, small_object("plant", -2.5, 0.0, 0.0), sofa, window)
+    assert not satisfies(Predicate.BETWEEN, small_object("plant", 0.5, 0.0, 1.5), sofa, window)
 
 
-def test_between_things_of_one_name_means_any_two_of_them():
-    chairs = [thing("chair", x_m, 0.0, 0.0) for x_m in (-2.0, 2.0)]
-    assert keeps(Predicate.BETWEEN, thing("box", 0.0, 0.0, 0.2), *chairs)
-    assert not keeps(Predicate.BETWEEN, thing("box", 3.0, 0.0, 0.2), *chairs)
+def test_between_objects_of_one_phrase_means_any_two_of_them():
+    chairs = [small_object("chair", x_m, 0.0, 0.0) for x_m in (-2.0, 2.0)]
+    assert satisfies(Predicate.BETWEEN, small_object("box", 0.0, 0.0, 0.2), *chairs)
+    assert not satisfies(Predicate.BETWEEN, small_object("box", 3.0, 0.0, 0.2), *chairs)
 
 
-def test_between_is_not_judged_while_one_anchor_is_unseen():
-    assert keeps(Predicate.BETWEEN, thing("plant", 9.0, 0.0, 0.0), thing("sofa", -2.0, 0.0, 0.0))
+def test_between_is_not_evaluated_with_an_unseen_anchor():
+    assert satisfies(Predicate.BETWEEN, small_object("plant", 9.0, 0.0, 0.0), small_object("sofa", -2.0, 0.0, 0.0))
 
 
-def test_the_farthest_is_one_of_all_and_is_not_the_closest():
-    near, far = thing("chair", 1.0, 0.0, 0.0), thing("chair", 3.0, 0.0, 0.0)
+def test_the_farthest_is_one_candidate_and_not_the_closest():
+    near, far = small_object("chair", 1.0, 0.0, 0.0), small_object("chair", 3.0, 0.0, 0.0)
     for predicate, chosen, other in ((Predicate.FARTHEST_FROM, far, near), (Predicate.CLOSEST_TO, near, far)):
         relation = Relation(predicate, "chair", "door")
         spatial = SpatialFilter(TaskGraph("id", "", ("chair",), ("door",), (relation,)), UP, SpatialSettings())
-        spatial.observe([thing("door", 0.0, 0.0, 0.0), near, far])
+        spatial.observe([small_object("door", 0.0, 0.0, 0.0), near, far])
         assert spatial.satisfies_relations(chosen)
         assert not spatial.satisfies_relations(other)

@@ -1,4 +1,4 @@
-"""RelevanceEstimator on a made-up room: keyframes, re-projection, and the relations of Sec. III-B.3."""
+"""TaskRelevanceEstimator on a synthetic wall: keyframes, propagation, and the relations of Sec. III-B.3."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ UP = (0.0, -1.0, 0.0)
 
 
 def frame_at(x_m: float = 0.0, index: int = 0, turn_deg: float = 0.0) -> Frame:
-    """A wall 2 m ahead, seen from a camera that has moved sideways and turned about the vertical."""
+    """Return a frame of a wall 2 m ahead, from a camera moved sideways and turned about the vertical axis."""
     T_world_camera = np.eye(4)
     angle = np.radians(turn_deg)
     T_world_camera[:3, :3] = [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
@@ -50,7 +50,7 @@ def observation(phrase: str, *centre_m: float, radius_m: float = 0.1) -> Observa
 
 @dataclass
 class CountingDetector:
-    """Counts its calls; the masks come from regions."""
+    """A detector of regions that counts its calls."""
 
     inner: RegionDetector
     calls: int = 0
@@ -73,7 +73,7 @@ def test_a_target_without_relations_is_marked():
     assert set(np.unique(relevance.target)) == {NO_TARGET, 0}
 
 
-def test_detection_runs_on_the_first_frame_on_motion_and_after_some_frames():
+def test_keyframes_are_the_first_frame_motion_and_every_nth_frame():
     detector = CountingDetector(RegionDetector({"mug": MUG}))
     estimator = TaskRelevanceEstimator(graph_of(), detector, TrackerSettings(max_frames=4))
     calls = []
@@ -86,17 +86,17 @@ def test_detection_runs_on_the_first_frame_on_motion_and_after_some_frames():
 
 
 @pytest.mark.parametrize(("x_m", "turn_deg"), [(0.2, 0.0), (-0.3, 0.0), (0.1, 8.0)])
-def test_between_detections_the_mask_follows_the_object(x_m, turn_deg):
+def test_masks_are_propagated_between_detections(x_m, turn_deg):
     detector = CountingDetector(RegionDetector({"mug": MUG}))
     estimator = TaskRelevanceEstimator(graph_of(), detector)
     estimator.estimate(frame_at())
     moved = frame_at(x_m, 1, turn_deg)
-    truth, carried = MUG.mask(moved), estimator.estimate(moved).relevance.roi
+    truth, propagated = MUG.mask(moved), estimator.estimate(moved).relevance.roi
     assert detector.calls == 1
-    assert (truth & carried).sum() / (truth | carried).sum() > 0.85
+    assert (truth & propagated).sum() / (truth | propagated).sum() > 0.85
 
 
-def test_an_object_that_leaves_the_view_is_not_carried_over():
+def test_an_object_out_of_view_is_not_propagated():
     estimator = TaskRelevanceEstimator(graph_of(), RegionDetector({"mug": MUG}), TrackerSettings(max_translation_m=9))
     estimator.estimate(frame_at())
     assert not estimator.estimate(frame_at(5.0, 1)).relevance.roi.any()
@@ -104,77 +104,83 @@ def test_an_object_that_leaves_the_view_is_not_carried_over():
 
 def test_without_depth_nothing_is_marked():
     frame = frame_at()
-    dark = Frame(0, 0, frame.rgb, np.zeros_like(frame.depth_m), CAMERA, frame.T_world_camera)
-    assert not TaskRelevanceEstimator(graph_of(), RegionDetector({"mug": MUG})).estimate(dark).relevance.roi.any()
+    without_depth = Frame(0, 0, frame.rgb, np.zeros_like(frame.depth_m), CAMERA, frame.T_world_camera)
+    assert (
+        not TaskRelevanceEstimator(graph_of(), RegionDetector({"mug": MUG})).estimate(without_depth).relevance.roi.any()
+    )
 
 
-def test_the_maps_depth_comes_before_the_sensors():
+def test_rendered_depth_overrides_sensor_depth():
     sensor, rendered = np.full((2, 2), 3.0, np.float32), np.array([[1, 0], [0, 2]], np.float32)
     assert best_depth_m(sensor, rendered).tolist() == [[1, 3], [3, 2]]
     assert best_depth_m(sensor, None) is sensor
 
 
-def test_a_target_is_kept_while_its_anchor_was_never_seen_and_that_is_said():
+def test_a_target_with_an_unseen_anchor_is_kept_with_a_note():
     graph = graph_of(Relation(Predicate.ON, "mug", "table"))
     estimator = TaskRelevanceEstimator(graph, RegionDetector({"mug": MUG}))
     assert estimator.estimate(frame_at()).relevance.roi.any()
     assert "anchor 'table' not seen yet: its targets are kept" in estimator.notes
 
 
-def test_an_anchor_is_remembered_after_it_left_the_view():
-    kept = SpatialFilter(graph_of(Relation(Predicate.NEAR, "mug", "sink")), UP, SpatialSettings())
-    kept.observe([observation("sink", 0, 0, 0)])
-    kept.observe([])
-    assert kept.satisfies_relations(observation("mug", 0.9, 0, 0))
-    assert not kept.satisfies_relations(observation("mug", 1.2, 0, 0))
+def test_an_anchor_out_of_view_still_counts():
+    spatial_filter = SpatialFilter(graph_of(Relation(Predicate.NEAR, "mug", "sink")), UP, SpatialSettings())
+    spatial_filter.observe([observation("sink", 0, 0, 0)])
+    spatial_filter.observe([])
+    assert spatial_filter.satisfies_relations(observation("mug", 0.9, 0, 0))
+    assert not spatial_filter.satisfies_relations(observation("mug", 1.2, 0, 0))
 
 
 @pytest.mark.parametrize(
     ("centre_m", "expected"),
     [((0, -0.3, 0), True), ((0.4, -0.3, 0), True), ((0, 0.3, 0), False), ((0.8, -0.3, 0), False)],
 )
-def test_on_means_higher_and_not_aside(centre_m, expected):
-    kept = SpatialFilter(graph_of(Relation(Predicate.ON, "mug", "table")), UP, SpatialSettings())
-    kept.observe([observation("table", 0, 0, 0)])
-    assert kept.satisfies_relations(observation("mug", *centre_m)) is expected
+def test_on_means_above_within_a_horizontal_distance(centre_m, expected):
+    spatial_filter = SpatialFilter(graph_of(Relation(Predicate.ON, "mug", "table")), UP, SpatialSettings())
+    spatial_filter.observe([observation("table", 0, 0, 0)])
+    assert spatial_filter.satisfies_relations(observation("mug", *centre_m)) is expected
 
 
 def test_on_a_long_table_means_over_its_footprint():
-    kept = SpatialFilter(graph_of(Relation(Predicate.ON, "mug", "table")), UP, SpatialSettings())
+    spatial_filter = SpatialFilter(graph_of(Relation(Predicate.ON, "mug", "table")), UP, SpatialSettings())
     x, z = np.meshgrid(np.linspace(-1, 1, 80), np.linspace(-0.4, 0.4, 40))
-    kept.observe([Observation.from_points("table", np.stack([x.ravel(), np.zeros(x.size), z.ravel()], axis=1))])
-    assert kept.satisfies_relations(observation("mug", 0.9, -0.1, 0.3, radius_m=0.04))
-    assert not kept.satisfies_relations(observation("mug", 1.4, -0.1, 0.3, radius_m=0.04))
+    spatial_filter.observe(
+        [Observation.from_points("table", np.stack([x.ravel(), np.zeros(x.size), z.ravel()], axis=1))]
+    )
+    assert spatial_filter.satisfies_relations(observation("mug", 0.9, -0.1, 0.3, radius_m=0.04))
+    assert not spatial_filter.satisfies_relations(observation("mug", 1.4, -0.1, 0.3, radius_m=0.04))
 
 
-def test_closest_to_is_one_candidate_of_all_that_were_seen():
-    kept = SpatialFilter(
+def test_closest_to_selects_one_of_all_seen_candidates():
+    spatial_filter = SpatialFilter(
         graph_of(Relation(Predicate.CLOSEST_TO, "chair", "table"), targets=("chair",)), UP, SpatialSettings()
     )
     near, far = observation("chair", 0.8, 0, 0), observation("chair", 2.0, 0, 0)
-    kept.observe([observation("table", 0, 0, 0), far])
-    assert kept.satisfies_relations(far)
-    kept.observe([near, far])
-    kept.observe([near])
-    assert kept.satisfies_relations(near)
-    assert not kept.satisfies_relations(far)
+    spatial_filter.observe([observation("table", 0, 0, 0), far])
+    assert spatial_filter.satisfies_relations(far)
+    spatial_filter.observe([near, far])
+    spatial_filter.observe([near])
+    assert spatial_filter.satisfies_relations(near)
+    assert not spatial_filter.satisfies_relations(far)
 
 
-def test_any_relation_of_several_is_enough():
+def test_one_satisfied_relation_is_enough():
     near_sink, near_stove = (Relation(Predicate.NEAR, "mug", anchor) for anchor in ("sink", "stove"))
-    kept = SpatialFilter(graph_of(near_sink, near_stove), UP, SpatialSettings())
-    kept.observe([observation("sink", 0, 0, 0), observation("stove", 5, 0, 0)])
-    assert kept.satisfies_relations(observation("mug", 5.5, 0, 0))
-    assert not kept.satisfies_relations(observation("mug", 2.5, 0, 0))
+    spatial_filter = SpatialFilter(graph_of(near_sink, near_stove), UP, SpatialSettings())
+    spatial_filter.observe([observation("sink", 0, 0, 0), observation("stove", 5, 0, 0)])
+    assert spatial_filter.satisfies_relations(observation("mug", 5.5, 0, 0))
+    assert not spatial_filter.satisfies_relations(observation("mug", 2.5, 0, 0))
 
 
-def test_partial_views_of_one_table_grow_into_its_true_centre():
-    kept = SpatialFilter(graph_of(Relation(Predicate.NEAR, "mug", "table")), UP, SpatialSettings())
+def test_partial_views_merge_to_the_true_centroid():
+    spatial_filter = SpatialFilter(graph_of(Relation(Predicate.NEAR, "mug", "table")), UP, SpatialSettings())
     for _ in range(3):
         for left in (-1.0, -0.6, -0.2):
             x, z = np.meshgrid(np.arange(left, left + 1.2, 0.02), np.arange(-0.4, 0.4, 0.02))
-            kept.observe([Observation.from_points("table", np.stack([x.ravel(), np.zeros(x.size), z.ravel()], axis=1))])
-    (table,) = kept.landmarks
+            spatial_filter.observe(
+                [Observation.from_points("table", np.stack([x.ravel(), np.zeros(x.size), z.ravel()], axis=1))]
+            )
+    (table,) = spatial_filter.landmarks
     assert table.seen_count == 9
     assert np.abs(table.centroid_m - (0, 0, 0)).max() < 0.06
 
@@ -186,7 +192,7 @@ def test_the_object_on_the_desk_is_not_the_desk():
     assert np.array_equal(relevance.roi, regions["book"].mask(frame_at()))
 
 
-def test_region_detector_answers_by_head_noun_and_says_what_it_cannot_find():
+def test_region_detector_matches_head_nouns_and_lists_unsupported_queries():
     detector = RegionDetector({"mug_1": MUG, "mug_2": BallRegion((0.4, 0, 2), 0.1), "wall": BallRegion((0, 0, 2), 3)})
     assert len(detector.detect(frame_at(), ["red mug"])) == 2
     assert len(detector.detect(frame_at(), ["cup"])) == 2
@@ -197,7 +203,7 @@ def test_region_detector_answers_by_head_noun_and_says_what_it_cannot_find():
     )
 
 
-def test_region_attention_numbers_its_regions():
+def test_region_estimator_assigns_target_indices():
     other = BallRegion((0.5, 0, 2.0), 0.1)
     relevance = RegionRelevanceEstimator([MUG, other]).estimate(frame_at()).relevance
     assert np.array_equal(relevance.target == 1, other.mask(frame_at()))
@@ -205,7 +211,7 @@ def test_region_attention_numbers_its_regions():
         RegionRelevanceEstimator([])
 
 
-def test_nouns_find_classes_by_name_head_and_synonym():
+def test_nouns_match_classes_by_name_head_and_synonym():
     names = ("person", "chair", "cup", "dining table", "couch")
     assert classes_for("mug", names, None) == (2,)
     assert classes_for("lawn chair", names, None) == (1,)

@@ -1,4 +1,4 @@
-"""The whole way of an image through a YOLO-seg file, with numbers known by hand, and every wrong file."""
+"""YOLO-seg end to end with known results, and rejection of invalid files."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def frame_with_red_square() -> Frame:
 CUP = (24.0, 32.0, 16.0, 16.0, 0, 0.9)
 
 
-def test_letterbox_box_and_mask_come_back_to_the_image(tmp_path):
+def test_boxes_and_masks_are_mapped_back_to_the_image(tmp_path):
     detector = detector_from(write_tiny_yolo(tmp_path / "tiny.onnx", NAMES, [CUP]))
     (found,) = detector.detect(frame_with_red_square(), ["mug"])
     assert found.phrase == "mug"
@@ -50,7 +50,7 @@ def test_letterbox_box_and_mask_come_back_to_the_image(tmp_path):
     assert np.array_equal(inside, inside[:, ::-1])
 
 
-def test_a_mask_does_not_leave_its_box(tmp_path):
+def test_a_mask_stays_in_its_box(tmp_path):
     narrow = (24.0, 32.0, 8.0, 16.0, 0, 0.9)
     detector = detector_from(write_tiny_yolo(tmp_path / "tiny.onnx", NAMES, [narrow]))
     (found,) = detector.detect(frame_with_red_square(), ["cup"])
@@ -59,20 +59,20 @@ def test_a_mask_does_not_leave_its_box(tmp_path):
     assert found.mask[16:48, 40:56].all()
 
 
-def test_overlapping_boxes_of_one_class_become_one_and_other_classes_stay(tmp_path):
+def test_suppression_is_per_class(tmp_path):
     shifted, chair = (25.0, 32.0, 16.0, 16.0, 0, 0.8), (24.0, 32.0, 16.0, 16.0, 1, 0.7)
     detector = detector_from(write_tiny_yolo(tmp_path / "tiny.onnx", NAMES, [shifted, CUP, chair]))
     found = detector.detect(frame_with_red_square(), ["cup", "chair"])
     assert [(each.phrase, round(each.score, 2)) for each in found] == [("cup", 0.9), ("chair", 0.7)]
 
 
-def test_boxes_below_the_score_or_without_a_mask_are_left_out(tmp_path):
+def test_boxes_below_the_score_or_without_a_mask_are_dropped(tmp_path):
     doubtful, black = (24.0, 32.0, 16.0, 16.0, 0, 0.2), (52.0, 32.0, 16.0, 16.0, 0, 0.9)
     detector = detector_from(write_tiny_yolo(tmp_path / "tiny.onnx", NAMES, [doubtful, black]))
     assert detector.detect(frame_with_red_square(), ["cup"]) == []
 
 
-def test_boxes_that_span_too_much_are_left_out(tmp_path):
+def test_boxes_that_cover_too_much_are_dropped(tmp_path):
     huge = (32.0, 32.0, 64.0, 24.0, 0, 0.9)
     path = write_tiny_yolo(tmp_path / "tiny.onnx", NAMES, [huge])
     assert detector_from(path).detect(frame_with_red_square(), ["cup"]) == []
@@ -80,19 +80,19 @@ def test_boxes_that_span_too_much_are_left_out(tmp_path):
     assert len(lenient.detect(frame_with_red_square(), ["cup"])) == 1
 
 
-def test_a_generic_noun_finds_every_class(tmp_path):
+def test_a_generic_noun_matches_every_class(tmp_path):
     chair = (20.0, 30.0, 10.0, 10.0, 1, 0.7)
     detector = detector_from(write_tiny_yolo(tmp_path / "tiny.onnx", NAMES, [CUP, chair]))
     assert len(detector.detect(frame_with_red_square(), ["obstacle"])) == 2
 
 
-def test_a_noun_without_a_class_is_said_and_not_found(tmp_path):
+def test_a_noun_without_a_class_is_unsupported(tmp_path):
     detector = detector_from(write_tiny_yolo(tmp_path / "tiny.onnx", NAMES, [CUP]))
     assert detector.detect(frame_with_red_square(), ["umbrella"]) == []
     assert detector.unsupported(["cup", "umbrella"]) == ("no class of the detector matches 'umbrella'",)
 
 
-def test_segment_matches_instances_of_any_class_to_boxes(tmp_path):
+def test_segmenter_matches_instances_of_any_class_to_boxes(tmp_path):
     segmenter = detector_from(write_tiny_yolo(tmp_path / "tiny.onnx", NAMES, [CUP])).segmenter()
     boxes = np.array([[30, 16, 64, 50], [80, 0, 120, 30]], np.float32)
     first, second = segmenter.segment(frame_with_red_square(), boxes)

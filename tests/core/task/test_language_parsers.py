@@ -1,4 +1,4 @@
-"""What a language model answers becomes a graph only as far as the sentence says it; else rules read the task."""
+"""Answers of language models are grounded in the sentence; otherwise the rules parse the task."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def relation(predicate: str = "on", target: str = "mug", anchor: str = "table") 
 
 
 class Told:
-    """A model that says what it was told to, or fails."""
+    """A model that returns a given answer, or fails."""
 
     version = "1"
 
@@ -46,7 +46,7 @@ class Told:
         return self.answers.pop(0)
 
 
-def test_a_good_answer_is_the_graph_that_rules_give():
+def test_a_correct_answer_equals_the_graph_of_the_rules():
     assert parse_answer(TASK, answer(["The mugs"], ["the table"], relation())) == RuleParser().parse(TASK)
 
 
@@ -102,7 +102,7 @@ def test_an_invented_object_is_dropped_and_named():
         ("Wipe the coffee-table", "table"),
     ],
 )
-def test_what_the_sentence_entails_is_kept(task, target):
+def test_a_noun_that_the_sentence_implies_is_kept(task, target):
     graph = parse_answer(task, answer([target], []))
     assert len(graph.targets) == 1
     assert graph.warnings == ()
@@ -120,7 +120,7 @@ def test_what_the_sentence_entails_is_kept(task, target):
         '{"targets": ' + "9" * 10_000 + "}", "x" * 70_000,
     ],
 )  # fmt: skip
-def test_nonsense_falls_back_to_rules_and_says_so(said):
+def test_nonsense_falls_back_to_rules_with_a_warning(said):
     graph = FallbackParser(LanguageParser(Told(said)), "http", RuleParser()).parse(TASK)
     assert graph.relations == (Relation(Predicate.ON, "mug", "table"),)
     assert graph.warnings[0].startswith("backend http failed (language model")
@@ -160,14 +160,14 @@ def test_any_answer_gives_a_graph_of_the_sentence_or_is_refused(said):
     assert "\n" not in message
 
 
-def test_a_task_without_sense_is_refused_before_the_model_is_asked():
+def test_an_invalid_task_is_refused_before_the_model_is_called():
     model = Told(answer())
     with pytest.raises(TaskError, match="names an object"):
         LanguageParser(model).parse("!?")
     assert model.asked == []
 
 
-def test_answers_are_remembered_failures_are_not_and_the_memory_is_bounded():
+def test_answers_are_cached_failures_are_not_and_the_cache_is_bounded():
     model = Told(answer())
     parser = CachedParser(LanguageParser(model), "http", "1", capacity=1)
     assert parser.parse(TASK) is parser.parse(TASK)
@@ -210,5 +210,5 @@ def test_wrong_settings_are_refused(settings, expected):
     assert "secret" not in str(caught.value)
 
 
-def test_the_key_is_never_shown():
+def test_the_key_is_never_in_the_repr():
     assert "secret" not in repr(BackendSettings(api_key="secret"))

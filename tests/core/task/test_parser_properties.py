@@ -1,4 +1,4 @@
-"""Whatever is typed, the parser answers with a graph within bounds or one line."""
+"""For any text, the parser returns a graph within the limits or raises a one-line error."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ WORDS = st.sampled_from(
             | MODALS
             | WISHES
         )
-        | {" ".join(said) for said in lexicon.NEGATIONS}
+        | {" ".join(negation) for negation in lexicon.NEGATIONS}
         | word_set(
             "pick up put find avoid without not ignore the a red closest nearest to from on in of for with and or , / "
             "; : . ! + it them this that these mug table chairs map go door picture path is are was don't touching who "

@@ -1,4 +1,4 @@
-"""Words become parts of speech by what stands beside them; the cheapest path is the cheapest of all."""
+"""Part-of-speech tags depend on neighbouring words; the Viterbi path has the least cost of all paths."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def tags_of(text: str) -> dict[str, Tag]:
 
 
 @given(st.lists(OPTIONS, max_size=5))
-def test_no_other_path_is_cheaper(candidates):
+def test_the_path_has_the_least_cost(candidates):
     found = best_tags(candidates)
     assert len(found) == len(candidates)
     assert path_cost(candidates, found) == min(path_cost(candidates, path) for path in itertools.product(*candidates))
@@ -63,7 +63,7 @@ def test_no_other_path_is_cheaper(candidates):
         ("Bring the glorb", "glorb", Tag.NOUN),
     ],
 )
-def test_a_word_is_read_by_its_neighbours(text, word, tag):
+def test_a_tag_depends_on_neighbouring_words(text, word, tag):
     assert tags_of(text)[word] is tag
 
 
@@ -86,11 +86,11 @@ def test_a_word_is_read_by_its_neighbours(text, word, tag):
         ("Bring the mug and fetch the plate", [ClauseType.REQUEST, ClauseType.REQUEST]),
     ],
 )
-def test_a_clause_asks_states_or_gives_a_reason(text, types):
+def test_clause_types(text, types):
     assert list(clause_types(tag_words(lexical_units(normalise_text(text)))).values()) == types
 
 
-def test_regular_forms_lead_back_to_a_known_verb():
+def test_regular_forms_have_a_known_base():
     for verb in VERBS:
         stem = verb.removesuffix("e")
         present = (verb.removesuffix("ie") + "y" if verb.endswith("ie") else stem) + "ing"

@@ -1,4 +1,4 @@
-"""The rule parser against sentences written by hand, and against text that is no task."""
+"""The rule parser on hand-written sentences, and on text that is not a task."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def as_row(text: str) -> dict[str, object]:
 
 
 def as_sets(row: dict[str, object]) -> tuple[set[str], set[str], set[tuple[str, ...]]]:
-    """Order does not matter to a graph."""
+    """Return sets, because the order in a graph is irrelevant."""
     return set(row["targets"]), set(row["anchors"]), {tuple(relation) for relation in row["relations"]}
 
 
@@ -56,7 +56,7 @@ FRAMES = [
 
 
 @pytest.mark.parametrize("at", range(len(FRAMES)))
-def test_every_everyday_noun_is_read_as_one(at):
+def test_every_known_noun_is_parsed_as_a_noun(at):
     no_objects = lexicon.PLACES | lexicon.MEASURES | lexicon.ADDRESSEES | lexicon.ROUTES | lexicon.TASK_NOUNS
     parser, adjective = RuleParser(), "red " if "red" in FRAMES[at] else ""
     for noun in sorted(lexicon.NOUNS - no_objects - lexicon.ADJECTIVES)[at :: len(FRAMES)]:
@@ -68,7 +68,7 @@ def test_a_sentence_takes_less_than_10_ms():
     parser.parse("warm up the table")
     durations = []
     for row in SENTENCES:
-        started = time.thread_time()  # a busy machine must not count against the parser
+        started = time.thread_time()  # excludes time of other processes
         parser.parse(row["text"])
         durations.append(time.thread_time() - started)
     assert sorted(durations)[len(durations) // 2] < 0.010
@@ -78,7 +78,7 @@ def test_a_sentence_takes_less_than_10_ms():
     "text",
     ["", "   ", "asdf qwer", "pick up", "go and clean", "!?!", "12 34", "please", "Do not touch the vase", "red"],
 )
-def test_text_that_names_nothing_is_refused_in_one_line(text):
+def test_text_without_an_object_is_refused_in_one_line(text):
     with pytest.raises(TaskError, match=r"expected .* names an object, such as") as caught:
         RuleParser().parse(text)
     assert "\n" not in str(caught.value)
@@ -119,7 +119,7 @@ def test_a_phrase_that_is_too_long_is_refused():
         ("Be careful not to break the bowl and pick up the spoon", "bowl"),
     ],
 )
-def test_what_is_to_be_left_alone_is_no_target_and_said(text, excluded):
+def test_excluded_objects_are_no_targets_with_a_warning(text, excluded):
     graph = RuleParser().parse(text)
     assert excluded not in graph.queries
     assert any(repr(excluded) in warning for warning in graph.warnings)
@@ -134,7 +134,7 @@ def test_what_is_to_be_left_alone_is_no_target_and_said(text, excluded):
         ("Clean them", ("object",), ()),
     ],
 )
-def test_what_is_pointed_at_is_any_object_and_said(text, targets, anchors):
+def test_a_demonstrative_means_any_object_with_a_warning(text, targets, anchors):
     graph = RuleParser().parse(text)
     assert (graph.targets, graph.anchors) == (targets, anchors)
     assert "refers to no named object" in graph.warnings[0]
@@ -149,32 +149,32 @@ def test_what_is_pointed_at_is_any_object_and_said(text, targets, anchors):
         ("Take the vase on the desk and wipe it", (Relation(Predicate.ON, "vase", "desk"),)),
     ],
 )
-def test_it_is_what_was_named_before(text, relations):
+def test_pronouns_refer_to_named_objects(text, relations):
     graph = RuleParser().parse(text)
     assert graph.relations == relations
     assert graph.warnings == ()
 
 
 @pytest.mark.parametrize("predicate", sorted(set(Predicate) - {Predicate.BETWEEN}))
-def test_every_predicate_can_be_said(predicate):
+def test_every_predicate_has_a_preposition(predicate):
     graph = RuleParser().parse(f"Find the mug {predicate.replace('_', ' ')} the table")
     assert graph.relations == (Relation(predicate, "mug", "table"),)
 
 
-def test_a_relation_without_a_predicate_becomes_near_and_is_said():
+def test_an_unknown_relation_becomes_near_with_a_warning():
     graph = RuleParser().parse("Find the shoe opposite the couch")
     assert graph.relations == (Relation(Predicate.NEAR, "shoe", "couch"),)
     assert graph.warnings == ("'opposite' 'couch' is not a known relation: treated as near",)
 
 
-def test_far_from_is_not_turned_into_near():
+def test_far_from_does_not_become_near():
     graph = RuleParser().parse("Find the chair far from the door")
     assert graph.relations == ()
     assert graph.anchors == ("door",)
     assert len(graph.warnings) == 1
 
 
-def test_the_same_task_has_the_same_id_however_it_is_typed():
+def test_spellings_of_one_task_have_one_id():
     assert task_id_of("Pick up  the Mug.") == task_id_of("pick up the mug")
     assert task_id_of("pick up the mug") != task_id_of("pick up the cup")
     assert len(task_id_of("x")) == 12
