@@ -174,7 +174,7 @@ def _first_estimator(
 
 def _unseen_notes(options: argparse.Namespace, result: MissionResult) -> tuple[str, ...]:
     """Return a note if no frame showed the task's objects or the selected regions."""
-    if result.totals.region_seen:
+    if result.totals.region_seen or result.processed == 0:
         return ()
     if options.task is not None:
         return ("none of these frames shows an object of the task",)

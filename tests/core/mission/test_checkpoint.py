@@ -1,4 +1,4 @@
-"""A saved run goes on bit for bit in another process, and a file that is none is one line."""
+"""A saved run continues with bit-identical results in another process; other files and settings are refused."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.sent_voxels import SentVoxelTracker
 from gausslite.mapping.settings import KeyframeSettings, MapperSettings, SeedingSettings
 from gausslite.mission.checkpoint import ResumeConfig, SavedRun, save_run
-from gausslite.mission.settings import MissionSettings
+from gausslite.mission.settings import MissionSettings, TaskSettings
 from gausslite.mission.task_mapper import TaskMapper
 from gausslite.optimize.density import DensitySettings
 from gausslite.perception.ground_truth import RegionDetector
@@ -45,7 +45,8 @@ GRAPH = TaskGraph(
 )
 REGIONS = {"mug": BallRegion((0.1, -0.1, 2.0), 0.3), "table": BallRegion((0.0, 0.3, 2.0), 0.5)}
 FRAMES, CUT = 11, 5
-TERMS = ResumeConfig.of(MissionSettings(), task=GRAPH.text)
+SETTINGS = (MissionSettings(), TaskSettings(task=GRAPH.text))
+CONFIG = ResumeConfig.of(*SETTINGS)
 
 
 def loop(max_gaussians: int = 400, window: int = 2) -> TaskMapper:
@@ -67,7 +68,7 @@ def frames(first: int, end: int) -> Iterator[Frame]:
 
 
 def words_of_run(run: TaskMapper, first: int, end: int) -> list[VoxelBatch | None]:
-    return [run.process(frame).words for frame in frames(first, end)]
+    return [run.process(frame).changed_roi for frame in frames(first, end)]
 
 
 def assert_same(came: State, wanted: State) -> None:
@@ -99,7 +100,7 @@ def test_a_run_cut_in_two_gives_the_same_bits_as_one_in_one_go(tmp_path: Path) -
     words = words_of_run(whole, 0, FRAMES)
     first = loop()
     words_of_run(first, 0, CUT)
-    save_run(tmp_path / "run.state", first, TERMS, CUT - 1)
+    save_run(tmp_path / "run.state", first, CONFIG, CUT - 1)
     code = f"import sys; sys.path[:0] = {sys.path!r}; import test_checkpoint; test_checkpoint.go_on(sys.argv[1])"
     done = subprocess.run(
         [sys.executable, "-c", code, str(tmp_path / "run.state")], capture_output=True, text=True, timeout=120
@@ -110,15 +111,23 @@ def test_a_run_cut_in_two_gives_the_same_bits_as_one_in_one_go(tmp_path: Path) -
     assert len(whole.state()["mapper/keyframes/buffer"]) == 3
 
 
+def test_settings_survive_the_file(saved: Path) -> None:
+    run = SavedRun.read(saved)
+    assert run.value(MissionSettings, "pose_prior") == SETTINGS[0].pose_prior
+    assert run.value(MissionSettings, "skip_stages") == SETTINGS[0].skip_stages
+    with pytest.raises(MapFileError, match=r"MissionSettings\.threads"):
+        run.value(MissionSettings, "threads")
+
+
 def test_saving_changes_nothing_and_restoring_gives_back_what_was_saved(tmp_path: Path) -> None:
     run, same = loop(), loop()
     words_of_run(run, 0, CUT)
     before = {name: array.copy() for name, array in run.state().items()}
-    save_run(tmp_path / "run.state", run, TERMS, CUT - 1)
+    save_run(tmp_path / "run.state", run, CONFIG, CUT - 1)
     assert_same(run.state(), before)
     saved = SavedRun.read(tmp_path / "run.state")
     saved.restore(same)
-    assert (saved.last_index, saved.terms) == (CUT - 1, TERMS)
+    assert (saved.last_index, saved.config) == (CUT - 1, CONFIG)
     assert_same(same.state(), before)
 
 
@@ -126,36 +135,38 @@ def test_saving_changes_nothing_and_restoring_gives_back_what_was_saved(tmp_path
 def saved(tmp_path: Path) -> Path:
     run, path = loop(), tmp_path / "run.state"
     words_of_run(run, 0, 3)
-    save_run(path, run, TERMS, 2)
+    save_run(path, run, CONFIG, 2)
     return path
 
 
-def test_other_terms_are_told_all_at_once(saved: Path) -> None:
+def test_all_options_that_differ_are_named(saved: Path) -> None:
     run = SavedRun.read(saved)
-    run.require(TERMS)
-    other = ResumeConfig.of(MissionSettings(policy="uniform", rate_hz=4.0, max_gaussians=9), task="Find the chair")
-    with pytest.raises(MismatchError) as told:
-        run.require(other)
-    assert str(told.value) == (
+    run.require(*SETTINGS)
+    # threads and backend may change
+    run.require(MissionSettings(threads=1, backend="reference"), SETTINGS[1])
+    other = MissionSettings(policy="uniform", rate_hz=4.0, max_gaussians=9), TaskSettings("Find the chair")
+    with pytest.raises(MismatchError) as caught:
+        run.require(*other)
+    assert str(caught.value) == (
         f"{saved}: expected the options of the saved run, --max-gaussians '150000' (got '9'), --policy 'task' (got "
-        "'uniform'), --rate 'default' (got '4'), --task 'Pick up the mug on the table' (got 'Find the chair')"
+        "'uniform'), --rate unset (got '4'), --task 'Pick up the mug on the table' (got 'Find the chair')"
     )
-    # an option that only one of them knows counts as well
-    assert ResumeConfig({}).differences(ResumeConfig({"size": "1x2"})) == ("--size '1x2' (got '')",)
+    # an option that only one of them has counts as a difference
+    assert ResumeConfig({"Other": {"size": "1x2"}}).differences() == ("--size '1x2' (got unset)",)
 
 
-def test_a_loop_that_is_too_small_is_told(saved: Path) -> None:
+def test_a_mapper_that_is_too_small_is_refused(saved: Path) -> None:
     with pytest.raises(MapFileError, match="max_gaussians: expected at least"):
         SavedRun.read(saved).restore(loop(max_gaussians=10))
-    with pytest.raises(MapFileError, match="expected at most 1, 2 and 3"):
+    with pytest.raises(MapFileError, match="expected at most 1, got 2"):
         SavedRun.read(saved).restore(loop(window=1))
 
 
-@pytest.mark.parametrize("terms", ["", "[1]", '{"a": 1}', "[" * 100_000, "\0"])
-def test_terms_that_are_none_are_told(terms: str, saved: Path) -> None:
+@pytest.mark.parametrize("config", ["", "[1]", '{"a": 1}', "[" * 100_000, "\0"])
+def test_a_config_that_is_not_json_objects_is_refused(config: str, saved: Path) -> None:
     state = read_state(saved)
-    write_state(saved, {**state, "about/terms": np.frombuffer(terms.encode(), np.uint8)})
-    with pytest.raises(MapFileError, match=r"run\.state: state terms: expected options"):
+    write_state(saved, {**state, "run/config": np.frombuffer(config.encode(), np.uint8)})
+    with pytest.raises(MapFileError, match=r"run\.state: state config: expected settings"):
         SavedRun.read(saved)
 
 
@@ -163,7 +174,7 @@ def test_terms_that_are_none_are_told(terms: str, saved: Path) -> None:
 def state(tmp_path_factory: pytest.TempPathFactory) -> State:
     run, path = loop(), tmp_path_factory.mktemp("states") / "run.state"
     words_of_run(run, 0, 2)
-    save_run(path, run, TERMS, 1)
+    save_run(path, run, CONFIG, 1)
     return read_state(path)
 
 
@@ -178,7 +189,7 @@ def forgeries(array: np.ndarray) -> Iterator[np.ndarray]:
 
 
 def test_whatever_one_array_is_made_to_be_it_is_told_or_can_be_mapped_on(state: State) -> None:
-    saved = select_prefix(state, "loop")
+    saved = select_prefix(state, "mapper")
     told = 0
     for name, array in saved.items():
         for forged_array in (None, *forgeries(array)):

@@ -222,8 +222,8 @@ def test_what_a_frame_ran_over_is_given_back_by_the_next_ones() -> None:
 
 
 def after_a_stall(every_s: float, latest: int = 40) -> tuple[list[float], list[int]]:
-    """Frames that come so often to a scheduler of 100 s after 300 s in which none was begun, of those that wait the latest:
-    how long each has waited for its turn, and its iterations.
+    """Waiting times and iterations of frames that arrive after a stall of 300 s, with at most `latest` in the queue;
+    one frame arrives every `every_s`.
     """
     clock, costs = WorkClock(), {**CHEAP, Stage.WARM_UP: ITERATION_S, Stage.ACTIVE: ITERATION_S}
     scheduler = FrameScheduler(

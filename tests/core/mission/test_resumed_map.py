@@ -1,4 +1,4 @@
-"""`gausslite map --resume` goes on after the last frame, and says in one line what keeps it from that."""
+"""`gausslite map --resume` continues after the last frame, or names in one line what prevents it."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def map_command(folder: Path, out: Path, *more: str) -> list[str]:
 
 
 @pytest.mark.parametrize("contents", [None, b"", b"remember the milk", EMPTY_SAFETENSORS[:8], EMPTY_SAFETENSORS])
-def test_the_command_line_says_it_in_one_line(
+def test_a_file_that_is_not_a_saved_run_is_one_line(
     contents: bytes | None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "run.state"
@@ -32,7 +32,7 @@ def test_the_command_line_says_it_in_one_line(
     assert "run.state" in line
 
 
-def test_other_options_are_told_before_anything_is_done(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_other_options_are_named_before_the_work_starts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     sequence = write_seven_scenes(tmp_path / "kitchen")
     state = str(tmp_path / "run.state")
     assert main(map_command(sequence, tmp_path / "out", "--save-state", state)) == 0
@@ -40,12 +40,12 @@ def test_other_options_are_told_before_anything_is_done(tmp_path: Path, capsys: 
     for options, told in (
         (("--max-gaussians", "149"), "--max-gaussians '150' (got '149')"),
         (("--size", "32x24"), "--size '"),
-        (("--rate", "5"), "--rate 'default' (got '5')"),
+        (("--rate", "5"), "--rate unset (got '5')"),
         (("--policy", "uniform"), "--policy 'task' (got 'uniform')"),
-        (("--roi-ball", "0,0,1,0.4"), "--roi-ball '0.0,0.0,2.0,0.4' (got '0.0,0.0,2.0,0.4 0.0,0.0,1.0,0.4')"),
-        (("--register-depth", "20,20,7.5,5.5"), "--register-depth '' (got '20,20,7.5,5.5,0,0,0,0,0,0')"),
-        (("--up", "0,-1,0"), "--up '' (got '0.0,-1.0,0.0')"),
-        (("--resegment", "--segmenter", "depth"), "--resegment '' (got 'yes'), "),
+        (("--roi-ball", "0,0,1,0.4"), "--roi-ball '0,0,2,0.4' (got '0,0,2,0.4,0,0,1,0.4')"),
+        (("--register-depth", "20,20,7.5,5.5"), "--register-depth unset (got '20,20,7.5,5.5,0,0,0,0,0,0')"),
+        (("--up", "0,-1,0"), "--up unset (got '0,-1,0')"),
+        (("--resegment", "--segmenter", "depth"), "--resegment unset (got 'True'), "),
     ):
         assert main(map_command(sequence, tmp_path / "other", *options, "--resume", state)) == 2
         [line] = capsys.readouterr().err.splitlines()
@@ -53,10 +53,10 @@ def test_other_options_are_told_before_anything_is_done(tmp_path: Path, capsys: 
     assert not (tmp_path / "other").exists()
     more = ("--resume", state, "--task", "Find the mug")
     assert main(["map", str(sequence), "--threads", "1", "--out", str(tmp_path / "other"), *more]) == 2
-    assert "--task '' (got 'Find the mug')" in capsys.readouterr().err
+    assert "--task unset (got 'Find the mug')" in capsys.readouterr().err
 
 
-def test_the_command_line_goes_on_after_the_last_frame(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_resumed_run_continues_after_the_last_frame(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     sequence = write_seven_scenes(tmp_path / "kitchen", tuple(range(0, 24, 4)))
 
     def map_frames(name: str, *more: str) -> tuple[bytes, dict[str, object]]:
@@ -78,7 +78,9 @@ def test_the_command_line_goes_on_after_the_last_frame(tmp_path: Path, capsys: p
     capsys.readouterr()
 
 
-def test_what_was_looked_for_is_not_looked_for_again(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_registration_and_prior_of_the_saved_run_are_not_estimated_again(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     sequence = write_seven_scenes(tmp_path / "kitchen", tuple(range(0, 24, 4)))
     state = str(tmp_path / "run.state")
     found = ["--register-depth", "20,20,7.5,5.5,-0.01,0,0,0,0,0", "--pose-prior", "0.01,0.5,0.1,0.03"]
@@ -95,10 +97,8 @@ def test_what_was_looked_for_is_not_looked_for_again(tmp_path: Path, capsys: pyt
 
 
 @pytest.mark.parametrize("name", ["map.ply", "report.json", "preview.png"])
-def test_a_saved_run_does_not_take_the_place_of_a_result(
-    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_saved_run_cannot_replace_a_result(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     sequence = write_seven_scenes(tmp_path / "kitchen")
     assert main(map_command(sequence, tmp_path / "out", "--save-state", str(tmp_path / "out" / name))) == 2
     [line] = capsys.readouterr().err.splitlines()
-    assert f"{name}: expected a name of its own, got that of a result of" in line
+    assert f"{name}: expected a name other than that of a result in" in line

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from agent_running import SETTINGS, TASK, Gate, agent, ball_attention
-from fusion_running import CAMERA, GRID, frame, team
+from fusion_running import CAMERA, GRID, frame, fusion_server
 
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.voxel_batch import VoxelBatch
@@ -103,7 +103,7 @@ class SlowDisk(Spool):
 
 
 def test_what_a_frame_takes_to_tell_its_words_is_part_of_its_time() -> None:
-    with team(MemoryStore()) as fusion:
+    with fusion_server(MemoryStore()) as fusion:
         spool = SlowDisk(None, "robot", GRID)
         uplink = Uplink(FusionClient(fusion.client.address), "robot", spool, GRID)
         worker = MappingWorker(SETTINGS, GRID, ball_attention, uplink, clock=lambda: spool.now_s)
@@ -209,12 +209,14 @@ def test_a_frame_that_cannot_be_mapped_is_rejected_and_the_stream_goes_on() -> N
 
 def test_a_spool_without_room_ends_no_mission_and_all_is_told_once_it_has_some(tmp_path: Path) -> None:
     store, spool = MemoryStore(), Spool(tmp_path / "robot.spool", "robot", GRID)
-    with team(store) as fusion:
+    with fusion_server(store) as fusion:
         uplink = Uplink(FusionClient(fusion.client.address), "robot", spool, GRID, UplinkSettings(interval_s=0.0))
         with agent(uplink=uplink) as a:
             a.client.assign_task(TASK)
             limit = sqlite3.connect(tmp_path / "robot.spool")
-            limit.execute("CREATE TRIGGER full BEFORE INSERT ON words BEGIN SELECT RAISE(ABORT, 'disk full'); END")
+            limit.execute(
+                "CREATE TRIGGER full BEFORE INSERT ON voxel_updates BEGIN SELECT RAISE(ABORT, 'disk full'); END"
+            )
             outcomes = list(a.client.ingest([frame(0, CAMERA), frame(1, CAMERA)]))
             assert [each.outcome for each in outcomes] == [pb.FRAME_OUTCOME_MAPPED] * 2
             assert any("disk full" in note for note in a.client.status().notes)

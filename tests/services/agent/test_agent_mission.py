@@ -15,7 +15,7 @@ from pathlib import Path
 
 import grpc
 import pytest
-from fusion_running import CAMERA, GRID, frame, team
+from fusion_running import CAMERA, GRID, frame, fusion_server
 from tiny_yolo import write_tiny_yolo
 
 from gausslite.codec.ply import read_ply
@@ -103,7 +103,7 @@ def stream_of(wall: Wall, options: AgentSettings) -> FrameStream:
 
 def test_a_mission_leaves_a_map_a_report_and_its_region_on_the_server(tmp_path: Path) -> None:
     store, options = MemoryStore(), settings(tmp_path)
-    with team(store) as fusion, player(options, fusion.client.address) as (mission, worker):
+    with fusion_server(store) as fusion, player(options, fusion.client.address) as (mission, worker):
         mission.run(stream_of(Wall(), options))
         assert mission.state == MissionState.DONE
         count = worker.status().gaussians
@@ -122,7 +122,7 @@ def test_a_mission_leaves_a_map_a_report_and_its_region_on_the_server(tmp_path: 
 
 def test_handover_brings_the_whole_map_and_the_keyframes(tmp_path: Path) -> None:
     options = settings(tmp_path, "--handover")
-    with team() as fusion, player(options, fusion.client.address) as (mission, worker):
+    with fusion_server() as fusion, player(options, fusion.client.address) as (mission, worker):
         mission.run(stream_of(Wall(), options))
         [agent] = fusion.client.status().agents
         keyframes = worker.run(lambda mapper: mapper.keyframes()).result(20)
@@ -176,7 +176,7 @@ def test_what_is_wrong_is_raised_before_or_when_it_is_met(tmp_path: Path) -> Non
         (["--source", "sim:home?trajectory=9", "--task", "Pick up the mug"], "trajectory"),
         (["--source", "sim:home", "--task", "Pick up the mug", "--frames", "500:"], "500:"),
         (["--source", "sim:home", "--task", "Pick up the mug", "--size", "big"], "size"),
-        (["--source", "sim:home", "--task", "Pick up the mug", "--test-every", "1"], "hold-out"),
+        (["--source", "sim:home", "--task", "Pick up the mug", "--test-every", "1"], "test every"),
         (["--threads", "0"], "threads"),
         (["--task", "Pick up the mug"], "name an ONNX file with --detector"),
         (["--max-gaussians", "0"], "max_gaussians"),
@@ -276,7 +276,7 @@ def test_a_corrupt_frame_is_skipped_and_counted(tmp_path: Path, caplog: pytest.L
 
 def test_with_strict_a_corrupt_frame_ends_the_mission_after_its_map_is_sent_and_written(tmp_path: Path) -> None:
     options = settings(tmp_path, "--strict")
-    with team() as fusion, player(options, fusion.client.address) as (mission, _):
+    with fusion_server() as fusion, player(options, fusion.client.address) as (mission, _):
         with pytest.raises(DatasetError, match="frame-3"):
             mission.run(stream_of(Wall(broken_at=3), options))
         [agent] = fusion.client.status().agents

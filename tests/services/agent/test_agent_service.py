@@ -9,7 +9,7 @@ import grpc
 import numpy as np
 import pytest
 from agent_running import TASK, Gate, agent, ball_attention
-from fusion_running import CAMERA, GRID, frame, team
+from fusion_running import CAMERA, GRID, frame, fusion_server
 
 from gausslite.domain.camera import Camera
 from gausslite.domain.frame import Frame
@@ -245,7 +245,7 @@ def test_an_upside_down_region_is_refused() -> None:
 
 def test_only_the_tasks_region_leaves_the_robot() -> None:
     store = MemoryStore()
-    with team(store) as fusion:
+    with fusion_server(store) as fusion:
         client = FusionClient(fusion.client.address)
         uplink = Uplink(client, "robot", Spool(None, "robot", GRID), GRID, UplinkSettings(interval_s=0.0))
         try:

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fusion_running import CAMERA, GRID, Team, frame, team
+from fusion_running import CAMERA, GRID, RunningServer, frame, fusion_server
 from tiny_yolo import write_tiny_yolo
 
 from gausslite.codec.ply import read_ply
@@ -46,7 +46,7 @@ def settings(state: Path, *more: str) -> AgentSettings:
 
 @contextmanager
 def life(
-    options: AgentSettings, fusion: Team | None = None, spool: Path | None = None
+    options: AgentSettings, fusion: RunningServer | None = None, spool: Path | None = None
 ) -> Iterator[tuple[AgentMission, MappingWorker]]:
     """An agent as its program builds it."""
     saved = (
@@ -103,11 +103,11 @@ def held_by(store: MemoryStore) -> dict[int, tuple[int, int]]:
 
 def test_a_mission_in_two_lives_gives_the_map_and_the_words_of_one(tmp_path: Path) -> None:
     whole, first, second = MemoryStore(), MemoryStore(), settings(tmp_path / "x.state")
-    with team(whole) as fusion, life(settings(tmp_path / "whole.state"), fusion) as (mission, worker):
+    with fusion_server(whole) as fusion, life(settings(tmp_path / "whole.state"), fusion) as (mission, worker):
         map_frames(worker, *range(8))
         mission.finish()
         wanted = the_map(worker)
-    with team(first) as fusion:
+    with fusion_server(first) as fusion:
         for indices in (range(4), range(4, 8)):
             with life(second, fusion, tmp_path / "robot.spool") as (mission, worker):
                 map_frames(worker, *indices)
@@ -131,7 +131,7 @@ def test_the_fused_map_follows_the_robot_through_lives_that_end_well_and_badly(
     """The third life ends unsaved: on the voxels that the robot knows, the server is as it is."""
     store, options = MemoryStore(), settings(tmp_path / "robot.state")
     spool = tmp_path / "robot.spool" if keeps_spool else None
-    with team(store) as fusion:
+    with fusion_server(store) as fusion:
         with life(options, fusion, spool) as (mission, worker):
             map_frames(worker, 0, 1, 2)
             mission.finish()
@@ -157,10 +157,10 @@ def test_the_fused_map_follows_the_robot_through_lives_that_end_well_and_badly(
 
 def test_a_server_that_lost_everything_between_two_lives_gets_it_again(tmp_path: Path) -> None:
     options, store = settings(tmp_path / "robot.state"), MemoryStore()
-    with team() as fusion, life(options, fusion, tmp_path / "robot.spool") as (mission, worker):
+    with fusion_server() as fusion, life(options, fusion, tmp_path / "robot.spool") as (mission, worker):
         map_frames(worker, 0, 1)
         mission.finish()
-    with team(store) as fusion, life(options, fusion, tmp_path / "robot.spool") as (mission, worker):
+    with fusion_server(store) as fusion, life(options, fusion, tmp_path / "robot.spool") as (mission, worker):
         map_frames(worker, 2)
         mission.finish()
         assert held_by(store) == totals(region_words(worker))
@@ -233,7 +233,7 @@ def test_a_real_agent_ended_in_its_mission_goes_on_with_it(tmp_path: Path) -> No
     command += ["--detector", str(model), "--task", "Pick up the cup", "--max-gaussians", "2000", "--iterations", "1"]
     command += ["--state", str(tmp_path / "a.state"), "--spool", str(tmp_path / "a.spool"), "--agent-id", "robot"]
     kappas, revisions = [], []
-    with team(store) as fusion:
+    with fusion_server(store) as fusion:
         for indices in (range(3), range(3, 6)):
             with subprocess.Popen(
                 [*command, "--fusion", fusion.client.address], stderr=subprocess.PIPE, text=True

@@ -1,0 +1,94 @@
+"""`gausslite map`: existing results, corrupt frames, missing tasks and unknown nouns."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from tiny_sequences import write_seven_scenes
+
+from gausslite.cli.main import main
+
+pytest.importorskip("gausslite.render._kernels", reason="the native kernels are not built")
+FRAMES = tuple(range(0, 24, 4))
+
+
+def map_command(sequence: Path, out: Path, *more: str) -> int:
+    common = ["--threads", "1", "--max-gaussians", "150", "--register-depth", "none", "--pose-prior", "none"]
+    return main(["map", str(sequence), *common, "--out", str(out), *more])
+
+
+def report_of(out: Path) -> dict[str, object]:
+    report: dict[str, object] = json.loads((out / "report.json").read_text())
+    return report
+
+
+def corrupt(sequence: Path, position: int) -> Path:
+    path = sorted(sequence.rglob("*.color.png"))[position]
+    path.write_bytes(b"not an image")
+    return path
+
+
+def test_an_existing_map_is_replaced_only_on_request(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    sequence, out, state = write_seven_scenes(tmp_path / "kitchen", FRAMES), tmp_path / "out", tmp_path / "run.state"
+    assert map_command(sequence, out, "--frames", "0:12", "--save-state", str(state)) == 0
+    before = (out / "map.ply").read_bytes()
+    capsys.readouterr()
+    assert map_command(sequence, out) == 2
+    [line] = capsys.readouterr().err.splitlines()
+    assert line.endswith("map.ply exists already; choose another --out, or replace it with --overwrite")
+    assert (out / "map.ply").read_bytes() == before
+    assert map_command(sequence, out, "--overwrite") == 0
+    assert map_command(sequence, out, "--resume", str(state)) == 0
+    assert report_of(out)["frames"] == 3
+
+
+def test_a_corrupt_frame_is_skipped_and_counted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    sequence = write_seven_scenes(tmp_path / "kitchen", FRAMES)
+    path = corrupt(sequence, 2)
+    assert map_command(sequence, tmp_path / "out") == 0
+    told = capsys.readouterr()
+    assert path.name in told.err
+    assert "5 frames (skipped: 1 corrupt)" in told.out
+    report = report_of(tmp_path / "out")
+    assert (report["frames"], report["frames_skipped"], report["frames_corrupt"]) == (5, 0, 1)
+
+
+def test_with_strict_a_corrupt_frame_ends_the_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    sequence = write_seven_scenes(tmp_path / "kitchen", FRAMES)
+    path = corrupt(sequence, 2)
+    assert map_command(sequence, tmp_path / "out", "--strict") == 2
+    assert path.name in capsys.readouterr().err.splitlines()[-1]
+    report = report_of(tmp_path / "out")
+    assert (report["frames"], report["frames_corrupt"]) == (2, 0)
+    assert path.name in str(report["stopped_by"])
+
+
+def test_a_sequence_of_corrupt_frames_is_an_error(tmp_path: Path) -> None:
+    sequence = write_seven_scenes(tmp_path / "kitchen", FRAMES)
+    for position in range(len(FRAMES)):
+        corrupt(sequence, position)
+    assert map_command(sequence, tmp_path / "out") == 2
+    assert not (tmp_path / "out" / "map.ply").exists()
+
+
+def test_without_task_and_region_mapping_is_uniform(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    sequence = write_seven_scenes(tmp_path / "kitchen", FRAMES)
+    assert map_command(sequence, tmp_path / "out") == 0
+    assert "mapping everything equally (--policy uniform)" in capsys.readouterr().err
+    assert report_of(tmp_path / "out")["policy"] == "uniform"
+    assert map_command(sequence, tmp_path / "region", "--roi-ball", "0,0,2,0.4") == 0
+    assert report_of(tmp_path / "region")["policy"] == "task"
+    assert map_command(sequence, tmp_path / "other", "--policy", "task") == 2
+    assert "--policy task: expected a task" in capsys.readouterr().err
+
+
+def test_nouns_that_the_detector_cannot_find_are_named_before_mapping(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("embreex", reason="the simulated home needs the extra `sim`")
+    options = ["--task", "Find the umbrella", "--size", "32x24", "--frames", "0:1", "--max-gaussians", "100"]
+    assert main(["map", "sim:home", *options, "--out", str(tmp_path / "out")]) == 0
+    messages = capsys.readouterr().err
+    assert 0 <= messages.index("no region matches 'umbrella'") < messages.index("map:")
