@@ -1,9 +1,9 @@
 #!/usr/bin/env python3
-"""Find the colour camera of a sequence whose depth is not registered to colour, for the option --register-depth.
+"""Estimate the registration of unregistered depth to colour in a sequence, for the option --register-depth.
 
     tools/estimate_registration.py SOURCE [--frames START:STOP:STEP] [--count 40]
 
-Prints the option's text; how sure it is goes to stderr.
+Prints the option's value; the edge scores go to stderr.
 """
 
 from __future__ import annotations
@@ -18,24 +18,24 @@ from gausslite.errors import GaussLiteError
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description="Find the colour camera of a sequence from the edges in its images.")
+    parser = argparse.ArgumentParser(description="Estimate the registration of depth to colour from image edges.")
     parser.add_argument("source", metavar="SOURCE", help="a folder (TUM, 7-Scenes or Replica layout)")
     parser.add_argument("--frames", metavar="START:STOP:STEP", default=":", help="frame numbers to use (default: all)")
-    parser.add_argument("--count", metavar="N", type=int, default=40, help="of these, how many (default: 40)")
+    parser.add_argument("--count", metavar="N", type=int, default=40, help="number of frames to use (default: 40)")
     options = parser.parse_args()
     try:
         source = open_source(options.source)
         positions = select_frames(source, options.frames)
-        found = estimate_depth_registration(source, positions, options.count)
+        estimate = estimate_depth_registration(source, positions, options.count)
     except GaussLiteError as error:
         print(f"estimate_registration: {error}", file=sys.stderr)
         return 2
     print(
-        f"{found.edge_points} depth edge points; colour's gradient there is "
-        f"{found.unregistered_score:.2f} times its surroundings as it is, {found.score:.2f} times with this camera",
+        f"{estimate.edge_points} depth edge points; colour gradient at them relative to their surroundings: "
+        f"{estimate.unregistered_score:.2f} unregistered, {estimate.score:.2f} registered",
         file=sys.stderr,
     )
-    print(found.registration)
+    print(estimate.registration)
     return 0
 
 

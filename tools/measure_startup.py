@@ -1,9 +1,10 @@
 #!/usr/bin/env python3
-"""How long the command line and the services take to start: the least and the median of several starts, warm files.
+"""Measure the start-up time of the command line and the services: minimum and median of several starts, files cached.
 
     tools/measure_startup.py [--reps N]
 
-A service counts as ready when it has logged where it listens and answers SERVING to a health check.
+A service is ready when it has logged its address and answers SERVING to a health check.
+This is a tool and not a benchmark of `gausslite bench`, since it needs gRPC clients of the services.
 """
 
 from __future__ import annotations
@@ -56,7 +57,7 @@ def help_seconds(module: str) -> float:
 
 
 def ready_seconds(module: str, arguments: tuple[str, ...]) -> tuple[float, float]:
-    """From the start of the process to the line, and to the answer."""
+    """Return the seconds from the process start to the log line and to the health check's answer."""
     with tempfile.TemporaryDirectory() as folder:
         address = f"unix:{Path(folder) / 'service.sock'}"
         started_s = time.perf_counter()
@@ -75,13 +76,13 @@ def ready_seconds(module: str, arguments: tuple[str, ...]) -> tuple[float, float
                 process.stderr.read()
 
 
-def time_of_line(process: subprocess.Popen[str], words: str) -> float:
-    said = []
+def time_of_line(process: subprocess.Popen[str], text: str) -> float:
+    output = []
     for line in process.stderr:
-        if words in line:
+        if text in line:
             return time.perf_counter()
-        said.append(line)
-    raise SystemExit(f"startup: ended before {words!r}: {''.join(said)}")
+        output.append(line)
+    raise SystemExit(f"startup: ended before {text!r}: {''.join(output)}")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Draw docs/homes.jpg: two views of each furnished home, for looking at what quality is measured in."""
+"""Render docs/homes.jpg: two views of each benchmark home."""
 
 from __future__ import annotations
 

@@ -1,1 +1,4 @@
-"""A simulated home: textured rooms with named objects, seen by a noisy RGB-D camera whose pose is known exactly."""
+"""Simulated homes: textured rooms with named objects, a noisy RGB-D camera and exact poses.
+
+`gausslite_sim.source.open_simulated` opens a home as a Source; `gausslite` finds it for sources named sim:...
+"""

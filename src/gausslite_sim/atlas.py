@@ -1,4 +1,4 @@
-"""All textures in one image with their mip levels, so that a whole view is textured in two look-ups."""
+"""Texture atlas with mip levels: a whole view is textured with two look-ups."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ _LEVELS = 7
 _MARGIN_PX = 2
 _ROW_PX = 512
 _SHARPNESS = 0.4
-"""Levels by which the look-up is kept finer than the pixel: a camera's lens blurs less than a pixel's width."""
+"""Mip level bias towards finer levels: a camera's lens blurs less than one pixel."""
 
 
 class TextureAtlas:
-    """Squares in a grid: the finest level on the left, the coarser ones stacked to its right, margins wrapped."""
+    """Textures in a grid: the finest level on the left, coarser levels stacked to its right, with wrapped margins."""
 
     def __init__(self, textures: Sequence[Texture]) -> None:
         self._columns = int(np.ceil(np.sqrt(len(textures))))
@@ -41,7 +41,7 @@ class TextureAtlas:
         uv: Float32[ndarray, "n 2"],
         texels_per_pixel: Float32[ndarray, " n"],
     ) -> Float32[ndarray, "n 3"]:
-        """Colours 0 to 255 at texture coordinates (1 = one repeat), filtered to the pixel's footprint."""
+        """Return colours 0 to 255 at texture coordinates (1 = one repeat), filtered to the pixel's footprint."""
         level = np.clip(np.log2(np.maximum(texels_per_pixel, 1e-6)) - _SHARPNESS, 0, _LEVELS - 1.001)
         fine = level.astype(np.int64)
         share = (level - fine).astype(np.float32)[:, None]
@@ -57,7 +57,7 @@ class TextureAtlas:
         row, column = np.divmod(texture, self._columns)
         pitch, side = self._pitches[level], self._sides[level]
         offset = np.float32(_MARGIN_PX - 0.5)
-        # the interpolator takes images of limited width: lay the points out in rows
+        # cv2.remap limits the image width, so the points are arranged in rows
         grid = np.zeros((2, -(-n // _ROW_PX) * _ROW_PX), np.float32)
         grid[0, :n] = self._lefts[level] + column.astype(np.float32) * pitch + wrapped[:, 0] * side + offset
         grid[1, :n] = self._tops[level] + row.astype(np.float32) * pitch + wrapped[:, 1] * side + offset

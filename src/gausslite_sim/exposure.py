@@ -1,4 +1,4 @@
-"""A camera whose exposure and white balance follow what it sees: slow, smooth changes along a walk."""
+"""Simulated auto exposure and white balance: slow, smooth changes along a trajectory."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from numpy import ndarray
 
 
 def camera_gain(share: float, drift: float, trajectory: int) -> Float32[ndarray, "3"]:
-    """Factors of red, green and blue at this share of the walk, 1 - drift to 1 + drift."""
-    turn = 2 * np.pi * share + 1.7 * trajectory
-    brightness = 0.6 * np.sin(1.3 * turn) + 0.25 * np.sin(3.1 * turn + 0.8)
-    warmth = 0.15 * np.sin(1.9 * turn + 2.1)
+    """Return gains of red, green and blue in [1 - drift, 1 + drift] at this share of the trajectory."""
+    phase = 2 * np.pi * share + 1.7 * trajectory
+    brightness = 0.6 * np.sin(1.3 * phase) + 0.25 * np.sin(3.1 * phase + 0.8)
+    warmth = 0.15 * np.sin(1.9 * phase + 2.1)
     return np.asarray(1.0 + drift * np.array([brightness + warmth, brightness, brightness - warmth]), np.float32)

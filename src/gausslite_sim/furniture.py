@@ -1,4 +1,4 @@
-"""The things of the home, each built from parts in its own frame: standing on z = 0, front towards -y."""
+"""Objects of the two-room home, each in its own frame: standing on z = 0, front towards -y."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def flat_picture(texture: str, width_m: float, height_m: float, depth_m: float =
 
 
 def lying_sheet(texture: str, width_m: float, length_m: float, thickness_m: float) -> list[Part]:
-    """Something flat that lies on its back: newspaper, rug."""
+    """A flat object on the floor or a table: newspaper, rug."""
     x, y = width_m / 2, length_m / 2
     return [Part(box((-x, -y, 0), (x, y, thickness_m), fit=True), texture)]
 

@@ -1,4 +1,4 @@
-"""All simulated homes by number: 0 is the two rooms that the tests and the demo know, 1 to 8 are the hard ones."""
+"""All simulated homes by number: 0 is the two-room home of the tests and the demo, 1 to 8 are the benchmark homes."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _SENSOR = SensorNoise(dark_loss=0.55, gloss_loss=0.5)
 
 @dataclass(frozen=True, slots=True)
 class Home:
-    """What a module of `homes` offers."""
+    """Contents of a module of `homes`."""
 
     furnish: Callable[[np.random.Generator], Sequence[Item]]
     painters: Callable[[], dict[str, Painter]]
@@ -56,7 +56,7 @@ HOME_COUNT = len(HOMES)
 
 
 def plan_home(number: int, seed: int) -> HomePlan:
-    """The home of this number, 0 to HOME_COUNT; the seed shifts its things and grains its materials."""
+    """Return the home of this number, 0 to HOME_COUNT; the seed moves its objects and changes its textures."""
     if number == 0:
         textures = two_room_layout.paint_textures(seed)
         return HomePlan(

@@ -1,4 +1,4 @@
-"""A home before it is built: its things, what they look like, its light and the walks through it."""
+"""Description of a home before its scene is built: objects, textures, lighting, trajectories and sensor."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from gausslite_sim.trajectory import Trajectory
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HomePlan:
-    """Everything in the world frame (z up). The last walk sees the same things from places off the others.
+    """All data in the world frame (z up). The last trajectory provides held-out views of the same objects.
 
-    exposure_drift: the most by which the camera's gain strays from 1 on its way.
+    exposure_drift: maximum deviation of the camera's gain from 1 along a trajectory.
     """
 
     seed: int

@@ -1,4 +1,4 @@
-"""Printed things fitted to one face: spines, pages, label_textures, posters, maps. Text where text would be."""
+"""Printed textures fitted to one face: spines, pages, labels, posters, maps, with readable text."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def page(rng: np.random.Generator) -> Texture:
 
 
 def magazine(rng: np.random.Generator, colour: Colour) -> Texture:
-    """A cover: a name, a picture, lines of what is inside."""
+    """A cover with a title, an image and lines of text."""
     picture = tint(0.85 + 0.25 * grain(rng), colour)
     cv2.putText(picture, "HABITAT", (24, 110), FONT, 3.3, (248, 246, 238), 10, cv2.LINE_AA)
     shade = noise(rng, 8, 8)[150:400, 60:452]
@@ -110,7 +110,7 @@ def city_map(rng: np.random.Generator) -> Texture:
 
 
 def dotted_mug(rng: np.random.Generator, colour: Colour) -> Texture:
-    """Dots and a word round a dark mug."""
+    """A dark mug's dots and the text HELLO."""
     picture = tint(0.85 + 0.2 * grain(rng), colour)
     for row in range(7):
         for k in range(12):
@@ -123,7 +123,7 @@ def dotted_mug(rng: np.random.Generator, colour: Colour) -> Texture:
 
 
 def plate(rng: np.random.Generator, colour: Colour) -> Texture:
-    """Rings and petals, wound round a dish (v from rim to middle)."""
+    """Rings and petals for a dish; v runs from rim to centre."""
     picture = tint(0.92 + 0.1 * grain(rng), (0.93, 0.93, 0.9))
     ink = ink_of(255 * np.asarray(colour))
     for y in (90, 330, 360):
@@ -159,7 +159,7 @@ def jar_label(rng: np.random.Generator, colour: Colour) -> Texture:
 
 
 def packet(rng: np.random.Generator, colour: Colour) -> Texture:
-    """A printed box or tin: a big word on a band, stripes, a bar code."""
+    """A printed box or tin: a large title on a band, stripes, a bar code."""
     picture = tint(0.88 + 0.2 * grain(rng), colour)
     cv2.rectangle(picture, (0, 90), (SIDE_PX, 250), (244, 240, 226), -1)
     cv2.putText(picture, str(rng.choice(_TITLES)), (24, 208), FONT, 3.2, DARK_INK, 11, cv2.LINE_AA)
@@ -184,7 +184,7 @@ def pegboard(rng: np.random.Generator) -> Texture:
 def paragraph(
     picture: Picture, rng: np.random.Generator, box: tuple[int, int, int, int], line_px: int, ink: Ink = DARK_INK
 ) -> None:
-    """Words in rows inside (left, top, right, bottom)."""
+    """Write rows of text inside (left, top, right, bottom)."""
     left, top, right, bottom = box
     for y in range(top + line_px, bottom, line_px):
         x = left
@@ -195,11 +195,11 @@ def paragraph(
 
 
 def any_word(rng: np.random.Generator) -> str:
-    """One to three syllables that mean nothing."""
+    """Return one to three random syllables."""
     return "".join(rng.choice(_SYLLABLES, int(rng.integers(1, 4))))
 
 
 def ink_of(values: np.ndarray) -> Ink:
-    """Red, green and blue as OpenCV takes them."""
+    """Return red, green and blue as OpenCV expects them."""
     red, green, blue = (int(value) for value in values)
     return (red, green, blue)

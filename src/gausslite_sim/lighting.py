@@ -1,4 +1,4 @@
-"""The light of a home, fixed and the same from every side: lamps with soft shadows, dark corners, coloured bounce."""
+"""Static diffuse lighting per vertex: lamps with soft shadows, ambient occlusion and coloured indirect light."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _BOUNCES = 2
 
 @dataclass(frozen=True, slots=True)
 class Lamp:
-    """A lamp of some size, or a window seen as one."""
+    """An area lamp, or a window modelled as one."""
 
     position_m: Vector
     strength: float
@@ -34,7 +34,7 @@ class Lamp:
 
 @dataclass(frozen=True, slots=True)
 class Lighting:
-    """The lamps, the light that comes from everywhere, and the share of its light that a surface hands on."""
+    """Lamps, ambient light, and the share of light that surfaces reflect diffusely."""
 
     lamps: tuple[Lamp, ...]
     ambient: float = 0.62
@@ -43,25 +43,25 @@ class Lighting:
 
 @runtime_checkable
 class RayCaster(Protocol):
-    """What light needs to know of the things it falls on."""
+    """Ray queries that the lighting needs."""
 
     def occluded(
         self, origins_m: Float32[ndarray, "r 3"], directions: Float32[ndarray, "r 3"], reach: float
     ) -> Bool[ndarray, " r"]:
-        """Whether something lies within `reach` lengths of the direction."""
+        """Return whether each ray has a hit within `reach` lengths of its direction."""
         ...
 
     def first_triangle(
         self, origins_m: Float32[ndarray, "r 3"], directions: Float32[ndarray, "r 3"]
     ) -> Int64[ndarray, " r"]:
-        """The first triangle along each ray, -1 where there is none."""
+        """Return the first triangle along each ray, or -1."""
         ...
 
 
 def vertex_light(
     mesh: Mesh, albedo: Float64[ndarray, "m 3"], caster: RayCaster, lighting: Lighting, seed: int
 ) -> Float32[ndarray, "n 3"]:
-    """Brightness of each vertex, about 1 on a table under a lamp; albedo is each triangle's mean colour, 0 to 1."""
+    """Return each vertex's RGB brightness, about 1 under a lamp. albedo: mean colour per triangle, 0 to 1."""
     rng = np.random.default_rng([seed, 3])
     normals = mesh.normals
     origins = (mesh.positions_m + _LIFT_M * normals).astype(np.float32)
@@ -89,7 +89,7 @@ def _openness(
 def _visible_triangles(
     origins: Float32[ndarray, "n 3"], normals: Float64[ndarray, "n 3"], caster: RayCaster, rng: np.random.Generator
 ) -> Int64[ndarray, "n k"]:
-    """Triangles that each vertex sees in random directions, -1 for none."""
+    """Return the triangles visible from each vertex in random directions, or -1."""
     directions = _cosine_directions(normals, rng)
     seen: Int64[ndarray, "n k"] = caster.first_triangle(np.repeat(origins, _SKY_RAYS, axis=0), directions).reshape(
         -1, _SKY_RAYS
@@ -100,20 +100,20 @@ def _visible_triangles(
 def _indirect_light(
     light: Float64[ndarray, "n 3"], albedo: Float64[ndarray, "m 3"], mesh: Mesh, seen: Int64[ndarray, "n k"]
 ) -> Float64[ndarray, "n 3"]:
-    """What each vertex gets from the surfaces it sees, once and then again."""
+    """Return the indirect light of each vertex after _BOUNCES diffuse reflections."""
     gathered = np.zeros_like(light)
     for _ in range(_BOUNCES):
-        sent = albedo * (light + gathered)[mesh.faces].mean(axis=1)
-        sent = np.concatenate([sent, np.zeros((1, 3))])  # where a ray leaves the home (-1) nothing comes back
-        gathered = np.mean([sent[column] for column in seen.T], axis=0)
+        radiosity = albedo * (light + gathered)[mesh.faces].mean(axis=1)
+        radiosity = np.concatenate([radiosity, np.zeros((1, 3))])  # index -1: the ray leaves the home
+        gathered = np.mean([radiosity[column] for column in seen.T], axis=0)
     return gathered
 
 
 def _cosine_directions(normals: Float64[ndarray, "n 3"], rng: np.random.Generator) -> Float32[ndarray, "r 3"]:
-    """_SKY_RAYS unit directions a vertex, spread by the cosine to its normal."""
+    """Return _SKY_RAYS unit directions per vertex, cosine-distributed about its normal."""
     points = rng.standard_normal((len(normals), _SKY_RAYS, 3))
     points /= np.linalg.norm(points, axis=2, keepdims=True)
-    # a point on the unit sphere that touches the surface from outside is spread by the cosine
+    # points on a unit sphere tangent to the surface are cosine-distributed
     directions = (points + 1.001 * normals[:, None, :]).reshape(-1, 3)
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     return directions.astype(np.float32)
@@ -126,7 +126,7 @@ def _lamp(
     caster: RayCaster,
     rng: np.random.Generator,
 ) -> Float64[ndarray, " n"]:
-    """Lambert's law for a lamp of some size, so that its shadows have soft edges."""
+    """Return the diffuse light of an area lamp (Lambert's law), with soft shadows."""
     n = len(origins)
     spots = position_m + _LAMP_RADIUS_M * rng.uniform(-1, 1, (n, _LAMP_RAYS, 3)) * (1, 1, 0.2)
     towards = spots - origins[:, None, :]

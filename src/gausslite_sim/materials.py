@@ -1,4 +1,4 @@
-"""The stuff that the homes are made of, by name: a home gives the colours, a texture is painted where it is used."""
+"""Texture painters by material name: a home provides the palette, and only used textures are painted."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Painter = Callable[[np.random.Generator], Texture]
 
 @dataclass(frozen=True, slots=True)
 class Palette:
-    """A home's colours: woods, three cloths, two accents, and glazes."""
+    """A home's colours: woods, cloths, accents and glaze."""
 
     light_wood: Colour = (0.78, 0.60, 0.40)
     dark_wood: Colour = (0.36, 0.24, 0.17)
@@ -29,13 +29,13 @@ class Palette:
 
 
 def paint(painters: dict[str, Painter], used: Iterable[str], seed: int) -> dict[str, Texture]:
-    """The textures with these names, each from its own seed, so that none depends on which others are used."""
+    """Return the textures with these names; each has its own seed and does not depend on the others."""
     names = sorted(set(used))
     return {name: painters[name](np.random.default_rng([seed, zlib.crc32(name.encode())])) for name in names}
 
 
 def common_painters(colours: Palette) -> dict[str, Painter]:
-    """What every home has."""
+    """Return the painters that every home shares."""
     return _solids(colours) | _cloths(colours) | _pictures(colours)
 
 

@@ -1,4 +1,4 @@
-"""Triangle meshes with texture coordinates, from the few shapes furniture is made of."""
+"""Triangle meshes with texture coordinates: panels, boxes, surfaces of revolution, rings and leaves."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ Vector = tuple[float, float, float]
 
 _CELL_M = 0.12
 _BAND_M = 0.03
-"""Faces and turned bodies are cut into pieces of about this size, since light is stored at the vertices."""
+"""Edge length of the tessellation: light is stored per vertex, so that large faces need inner vertices."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Mesh:
-    """uv is in metres along the surface (u right, v down, seen from outside), or 0 to 1 where a picture is fitted."""
+    """uv: metres along the surface (u right, v down, seen from outside), or 0 to 1 for a fitted texture."""
 
     positions_m: Float64[ndarray, "n 3"]
     uv: Float64[ndarray, "n 2"]
@@ -26,30 +26,30 @@ class Mesh:
     faces: Int64[ndarray, "m 3"]
 
     def translate(self, offset_m: Vector) -> Mesh:
-        """Shifted by (x, y, z)."""
+        """Return the mesh translated by (x, y, z)."""
         return Mesh(self.positions_m + np.asarray(offset_m, np.float64), self.uv, self.normals, self.faces)
 
     def rotate_z(self, yaw_rad: float) -> Mesh:
-        """Turned about z."""
+        """Return the mesh rotated about z."""
         c, s = np.cos(yaw_rad), np.sin(yaw_rad)
         R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
         return Mesh(self.positions_m @ R.T, self.uv, self.normals @ R.T, self.faces)
 
     def rotate_x(self, pitch_rad: float) -> Mesh:
-        """Turned about x: a positive angle brings the front (-y) down."""
+        """Return the mesh rotated about x: a positive angle lowers the front (-y)."""
         c, s = np.cos(pitch_rad), np.sin(pitch_rad)
         R = np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
         return Mesh(self.positions_m @ R.T, self.uv, self.normals @ R.T, self.faces)
 
     def rotate_y(self, roll_rad: float) -> Mesh:
-        """Turned about y: a positive angle brings the right side (+x) down."""
+        """Return the mesh rotated about y: a positive angle lowers the right side (+x)."""
         c, s = np.cos(roll_rad), np.sin(roll_rad)
         R = np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
         return Mesh(self.positions_m @ R.T, self.uv, self.normals @ R.T, self.faces)
 
 
 def merge_meshes(meshes: list[Mesh]) -> Mesh:
-    """All meshes in one."""
+    """Return all meshes as one."""
     offsets = np.cumsum([0, *(len(mesh.positions_m) for mesh in meshes[:-1])])
     return Mesh(
         np.concatenate([mesh.positions_m for mesh in meshes]),
@@ -60,7 +60,10 @@ def merge_meshes(meshes: list[Mesh]) -> Mesh:
 
 
 def panel(top_left_m: Vector, right_m: Vector, down_m: Vector, fit: bool = False, cell_m: float = _CELL_M) -> Mesh:
-    """A rectangle seen from the side where `right_m` points right and `down_m` down; fit: one whole picture."""
+    """Return a rectangle, visible from the side where `right_m` points right and `down_m` down.
+
+    fit: the texture covers the rectangle once.
+    """
     origin, right, down = (np.asarray(value, np.float64) for value in (top_left_m, right_m, down_m))
     width, height = float(np.linalg.norm(right)), float(np.linalg.norm(down))
     columns, rows = max(1, round(width / cell_m)), max(1, round(height / cell_m))
@@ -72,7 +75,7 @@ def panel(top_left_m: Vector, right_m: Vector, down_m: Vector, fit: bool = False
 
 
 def box(low_m: Vector, high_m: Vector, fit: bool = False, cell_m: float = _CELL_M) -> Mesh:
-    """An axis-aligned box; with fit, each of its six sides shows the whole picture."""
+    """Return an axis-aligned box; with fit, each side shows the whole texture."""
     x0, y0, z0 = np.asarray(low_m, np.float64)
     x1, y1, z1 = np.asarray(high_m, np.float64)
     dx, dy, dz = x1 - x0, y1 - y0, z1 - z0
@@ -89,13 +92,14 @@ def box(low_m: Vector, high_m: Vector, fit: bool = False, cell_m: float = _CELL_
 
 
 def lathe(profile_m: list[tuple[float, float]], smooth: bool = False, fit: bool = False, sectors: int = 28) -> Mesh:
-    """A profile of (radius, z) turned about z; the outside lies to the right of its direction (upwards: outwards).
+    """Return the surface of revolution of a profile of (radius, z) about z.
 
-    smooth averages the normals of neighbouring segments; fit winds one whole picture round the body.
+    The outside is to the right of the profile's direction, so an upward profile faces outwards. smooth: average the
+    normals of neighbouring segments. fit: wrap the texture round the body once.
     """
     points = np.asarray(profile_m, np.float64)
     if not smooth:
-        points = _cut(points)
+        points = _subdivide(points)
     steps = np.diff(points, axis=0)
     lengths = np.linalg.norm(steps, axis=1)
     segment_normals = np.stack([steps[:, 1], -steps[:, 0]], axis=1) / lengths[:, None]
@@ -114,7 +118,7 @@ def lathe(profile_m: list[tuple[float, float]], smooth: bool = False, fit: bool 
 
 
 def ring(major_m: float, minor_m: float, start_rad: float, stop_rad: float) -> Mesh:
-    """A bent tube in the x-z plane: the handle of a mug. Angles from +x towards +z."""
+    """Return a torus segment in the x-z plane, such as the handle of a mug. Angles run from +x towards +z."""
     rows, columns = 14, 10
     t, p = _grid(np.linspace(start_rad, stop_rad, rows + 1), np.linspace(0, 2 * np.pi, columns + 1))
     normals = np.stack([np.cos(p) * np.cos(t), np.sin(p), np.cos(p) * np.sin(t)], axis=1)
@@ -124,7 +128,7 @@ def ring(major_m: float, minor_m: float, start_rad: float, stop_rad: float) -> M
 
 
 def leaf(length_m: float, width_m: float, rise_m: float) -> Mesh:
-    """A leaf that grows along +x from the origin, rises and bends over; one whole picture, stem at v = 1."""
+    """Return a bent leaf from the origin along +x with a fitted texture, stem at v = 1."""
     rows, columns = 8, 2
     t, s = _grid(np.linspace(0, 1, rows + 1), np.linspace(-1, 1, columns + 1))
     half = 0.5 * width_m * np.sin(np.pi * np.clip(0.06 + 0.94 * t, 0, 0.995)) ** 0.8
@@ -136,8 +140,8 @@ def leaf(length_m: float, width_m: float, rise_m: float) -> Mesh:
     return Mesh(positions, np.stack([(s + 1) / 2, 1 - t], axis=1), normals, _grid_faces(rows, columns))
 
 
-def _cut(points: Float64[ndarray, "k 2"]) -> Float64[ndarray, "n 2"]:
-    """The same line with no step longer than a band."""
+def _subdivide(points: Float64[ndarray, "k 2"]) -> Float64[ndarray, "n 2"]:
+    """Return the polyline subdivided into steps of at most about _BAND_M."""
     pieces = [points[:1]]
     for a, b in pairwise(points):
         count = max(1, round(float(np.linalg.norm(b - a)) / _BAND_M))
@@ -152,7 +156,7 @@ def _strip(
     scale: Float64[ndarray, "2"],
     sectors: int,
 ) -> Mesh:
-    """The band between two rings, upper one first."""
+    """Return the band between two rings, the upper one first."""
     share = np.linspace(0.0, 1.0, sectors + 1)
     cosine, sine = np.cos(2 * np.pi * share), np.sin(2 * np.pi * share)
     rings, ring_normals, uv = [], [], []
@@ -166,12 +170,12 @@ def _strip(
 def _grid(
     down: Float64[ndarray, " r"], along: Float64[ndarray, " c"]
 ) -> tuple[Float64[ndarray, " n"], Float64[ndarray, " n"]]:
-    """Both coordinates of each vertex of a grid, row by row."""
+    """Return both coordinates of each grid vertex, row by row."""
     return np.repeat(down, len(along)), np.tile(along, len(down))
 
 
 def _grid_faces(rows: int, columns: int) -> Int64[ndarray, "m 3"]:
-    """Two triangles for each cell of a grid of (rows + 1) x (columns + 1) vertices, row by row."""
+    """Return two triangles per cell of a grid of (rows + 1) x (columns + 1) vertices, row by row."""
     corner = (np.arange(rows)[:, None] * (columns + 1) + np.arange(columns)[None, :]).ravel()
     right, below, across = corner + 1, corner + columns + 1, corner + columns + 2
     faces: Int64[ndarray, "m 3"] = np.concatenate(

@@ -16,7 +16,7 @@ _WORDS = ("ATLAS", "SOUP", "RIVER", "GARDEN", "NORTH", "CLAY", "STARS", "BREAD",
 
 
 def mug_print(rng: np.random.Generator) -> Texture:
-    """White glaze with bands, dots and a word twice round."""
+    """White glaze with bands, dots and text repeated twice."""
     picture = tint(0.9 + 0.14 * grain(rng), (0.93, 0.92, 0.88))
     cv2.rectangle(picture, (0, 60), (SIDE_PX, 130), (196, 40, 44), -1)
     cv2.rectangle(picture, (0, 400), (SIDE_PX, 452), (28, 78, 150), -1)

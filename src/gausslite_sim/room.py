@@ -1,4 +1,4 @@
-"""One rectangular room that is furnished thing by thing; its corner is the origin, x and y run along its walls."""
+"""A rectangular room and the placement of objects in it; the origin is a corner, x and y run along the walls."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _TURN_DEG = 6.0
 
 
 class Room:
-    """Collects items; what a hand would move is shifted and turned a little by the generator."""
+    """Collects the objects of a room; the random generator jitters movable objects."""
 
     def __init__(self, length_m: float, width_m: float, height_m: float, rng: np.random.Generator) -> None:
         self.length_m, self.width_m, self.height_m = length_m, width_m, height_m
@@ -25,20 +25,20 @@ class Room:
         self._build()
 
     def place(self, name: str, parts: list[Part], x: float, y: float, z: float = 0.0, yaw: float = 0.0) -> None:
-        """Stand it at (x, y, z), its front towards -y turned by yaw degrees."""
+        """Place an object at (x, y, z) in metres, its front towards -y rotated by yaw degrees."""
         self.items.append(Item(name, place_parts(parts, (x, y, z), yaw)))
 
     def place_jittered(
         self, name: str, parts: list[Part], x: float, y: float, z: float = 0.0, yaw: float = 0.0
     ) -> None:
-        """Stand it about there."""
+        """Place an object near this pose, with a random shift and rotation."""
         dx, dy = self._rng.uniform(-_SHIFT_M, _SHIFT_M, 2)
         self.place(name, parts, x + dx, y + dy, z, yaw + self._rng.uniform(-_TURN_DEG, _TURN_DEG))
 
     def place_at_wall(
         self, name: str, parts: list[Part], wall: Wall, along_m: float, z: float = 0.0, off_m: float = 0.0
     ) -> None:
-        """Put it with its back to a wall, this far along it; off_m metres before it."""
+        """Place an object with its back to a wall, at along_m along the wall and off_m metres in front of it."""
         x, y, yaw = {
             "south": (along_m, off_m, 180.0),
             "north": (along_m, self.width_m - off_m, 0.0),

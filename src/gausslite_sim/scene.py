@@ -1,4 +1,4 @@
-"""A home as one triangle soup in a ray caster, with what each triangle looks like and belongs to."""
+"""A home as triangles in a ray caster, with the appearance and object of each triangle."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Triangles:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Hits:
-    """Where rays end: triangle (NO_HIT if none), its barycentric coordinates, and the lengths along the directions."""
+    """First hits of rays: triangle or NO_HIT, barycentric coordinates, distance in units of the direction."""
 
     triangle: Int64[ndarray, " r"]
     barycentric: Float32[ndarray, "r 2"]
@@ -47,7 +47,7 @@ class Hits:
 
 
 class HomeScene:
-    """Owns the ray caster and the tables of one home. Raises DatasetError without the extra `sim`."""
+    """Ray caster and triangle tables of one home. Raises DatasetError without the extra `sim`."""
 
     def __init__(self, plan: HomePlan) -> None:
         new_caster = _ray_caster()
@@ -79,7 +79,7 @@ class HomeScene:
         )
 
     def cast(self, origins_m: Float32[ndarray, "r 3"], directions: Float32[ndarray, "r 3"]) -> Hits:
-        """The first surface along each ray."""
+        """Return the first hit of each ray."""
         result = self._embree.run(origins_m, directions, output=True)
         barycentric = np.stack([result["u"], result["v"]], axis=1)
         return Hits(result["primID"].astype(np.int64), barycentric, result["tfar"])
@@ -87,25 +87,25 @@ class HomeScene:
     def first_triangle(
         self, origins_m: Float32[ndarray, "r 3"], directions: Float32[ndarray, "r 3"]
     ) -> Int64[ndarray, " r"]:
-        """The first triangle along each ray, NO_HIT where there is none."""
+        """Return the first triangle along each ray, or NO_HIT."""
         return np.asarray(self._embree.run(origins_m, directions), np.int64)
 
     def occluded(
         self, origins_m: Float32[ndarray, "r 3"], directions: Float32[ndarray, "r 3"], reach: float
     ) -> Bool[ndarray, " r"]:
-        """Whether something lies within `reach` lengths of the direction."""
+        """Return whether each ray has a hit within `reach` lengths of its direction."""
         reaches = np.full(len(origins_m), reach, np.float32)
         free = self._embree.run(origins_m, directions, dists=reaches, query="OCCLUDED")
         return np.asarray(free >= 0)
 
 
 def require_ray_caster() -> None:
-    """Raises DatasetError without the extra `sim`; asked for first, so that it is told before a home is built."""
+    """Raise DatasetError without the extra `sim`, before a home is built."""
     _ray_caster()
 
 
 def _ray_caster() -> Callable[[Float32[ndarray, "m 3 3"]], Any]:
-    """What makes a ray caster of triangles. Raises DatasetError."""
+    """Return the factory of ray casters. Raises DatasetError without the extra `sim`."""
     try:
         from embreex.mesh_construction import TriangleMesh
         from embreex.rtcore_scene import EmbreeScene
@@ -129,9 +129,9 @@ def _unit_normals(corners_m: Float64[ndarray, "m 3 3"]) -> Float32[ndarray, "m 3
 
 
 def _texels_per_m(corners_m: Float64[ndarray, "m 3 3"], uv: Float64[ndarray, "m 3 2"]) -> Float32[ndarray, " m"]:
-    """How finely a triangle is textured, from its areas on the picture and in the world."""
+    """Return each triangle's texels per metre, from its areas in texture space and in the world."""
     a, b = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
-    on_picture = np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
-    in_world = np.linalg.norm(np.cross(corners_m[:, 1] - corners_m[:, 0], corners_m[:, 2] - corners_m[:, 0]), axis=1)
-    ratio: NDArray[np.float64] = SIDE_PX * np.sqrt(on_picture / np.maximum(in_world, 1e-12))
+    texture_area = np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
+    world_area = np.linalg.norm(np.cross(corners_m[:, 1] - corners_m[:, 0], corners_m[:, 2] - corners_m[:, 0]), axis=1)
+    ratio: NDArray[np.float64] = SIDE_PX * np.sqrt(texture_area / np.maximum(world_area, 1e-12))
     return ratio.astype(np.float32)

@@ -1,4 +1,4 @@
-"""A thing of a home: meshes with the textures they show, under one name."""
+"""Named objects of a home: meshes with textures."""
 
 from __future__ import annotations
 
@@ -11,23 +11,23 @@ from gausslite_sim.mesh import Mesh, Vector
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Part:
-    """A mesh that shows one texture, by name."""
+    """A mesh with the name of its texture."""
 
     mesh: Mesh
     texture: str
 
     def place(self, position_m: Vector, yaw_deg: float) -> Part:
-        """Turned about z, then moved."""
+        """Return the part rotated about z, then translated."""
         return Part(self.mesh.rotate_z(float(np.radians(yaw_deg))).translate(position_m), self.texture)
 
     def rotate_x(self, pitch_deg: float) -> Part:
-        """Turned about x: a positive angle brings the front (-y) down."""
+        """Return the part rotated about x: a positive angle lowers the front (-y)."""
         return Part(self.mesh.rotate_x(float(np.radians(pitch_deg))), self.texture)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Item:
-    """A thing with a name; is_room marks walls, floors and ceilings, which are no objects."""
+    """A named object; is_room marks walls, floors and ceilings, which are not objects of tasks."""
 
     name: str
     parts: list[Part]
@@ -35,5 +35,5 @@ class Item:
 
 
 def place_parts(parts: list[Part], position_m: Vector, yaw_deg: float = 0.0) -> list[Part]:
-    """All parts turned about z, then moved."""
+    """Return all parts rotated about z, then translated."""
     return [part.place(position_m, yaw_deg) for part in parts]

@@ -1,4 +1,4 @@
-"""What devices and boards show: code, slides, keys, dials, handwriting; each fitted to one face."""
+"""Textures of devices and boards: code, slides, keys, dials, handwriting; each fitted to one face."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def keys(rng: np.random.Generator) -> Texture:
 
 
 def code_screen(rng: np.random.Generator) -> Texture:
-    """An editor: a tree of files at the left, coloured words in rows."""
+    """An editor: a tree of files at the left, rows of coloured text."""
     picture = np.full((SIDE_PX, SIDE_PX, 3), (22, 24, 34), np.uint8)
     cv2.rectangle(picture, (0, 0), (110, SIDE_PX), (34, 37, 50), -1)
     inks = ((120, 180, 240), (230, 150, 110), (150, 210, 130), (214, 214, 220), (200, 130, 220))

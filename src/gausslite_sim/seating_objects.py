@@ -1,4 +1,4 @@
-"""Things to sit and lie on, each in its own frame: standing on z = 0, front towards -y."""
+"""Seats and beds, each in its own frame: standing on z = 0, front towards -y."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a structured-light camera makes of a perfect view: noise that grows with distance, holes, ragged edges."""
+"""Simulated structured-light camera: noise that grows with distance, holes and ragged edges."""
 
 from __future__ import annotations
 
@@ -10,25 +10,25 @@ from gausslite_sim.sensor_noise import SensorNoise
 from gausslite_sim.view import View
 
 _DARK = 45.0
-"""Mean colour, 0 to 255, below which a surface returns too little light here and there."""
+"""Mean colour, 0 to 255, below which a surface may return too little light."""
 _MIRROR = 0.4
 
 
 def colour_image(rgb: Float32[ndarray, "h w 3"]) -> UInt8[ndarray, "h w 3"]:
-    """Round to 8 bits."""
+    """Return the colours rounded to 8 bits."""
     image: UInt8[ndarray, "h w 3"] = np.clip(rgb + np.float32(0.5), 0, 255).astype(np.uint8)
     return image
 
 
 def noisy_colour(view: View, noise: SensorNoise, strength: float, rng: np.random.Generator) -> UInt8[ndarray, "h w 3"]:
-    """Add colour noise, of deviation sqrt(read^2 + shot^2 * value)."""
+    """Return the image with colour noise of standard deviation sqrt(read^2 + shot^2 * value)."""
     deviation = np.sqrt(np.float32(noise.colour_read**2) + np.float32(noise.colour_shot**2) * view.rgb)
     grains = rng.standard_normal(view.rgb.shape, np.float32)
     return colour_image(view.rgb + np.float32(strength) * deviation * grains)
 
 
 def noisy_depth(view: View, noise: SensorNoise, strength: float, rng: np.random.Generator) -> Float32[ndarray, "h w"]:
-    """Depth as the sensor reports it, 0 where it has no return."""
+    """Return the sensor's depth in metres, 0 without a return."""
     z = view.depth_m.astype(np.float32, copy=True)
     chance = rng.random(z.shape, np.float32)
     grains = rng.standard_normal(z.shape, np.float32)
@@ -48,14 +48,14 @@ def noisy_depth(view: View, noise: SensorNoise, strength: float, rng: np.random.
 
 
 def _quantised(z: Float32[ndarray, "h w"], noise: SensorNoise, strength: float) -> Float32[ndarray, "h w"]:
-    """Round the disparity to the sensor's steps; a weaker noise has finer ones."""
+    """Return the depth with its disparity rounded to the sensor's steps; weaker noise has finer steps."""
     steps = np.float32(noise.baseline_px_m * noise.disparity_steps_per_px / strength)
     rounded: Float32[ndarray, "h w"] = steps / np.maximum(np.rint(steps / np.maximum(z, np.float32(0.05))), 1)
     return rounded.astype(np.float32)
 
 
 def _absorbed(view: View, noise: SensorNoise) -> Float32[ndarray, "h w"]:
-    """The chance that the projector's light does not come back: black swallows it, a mirror sends it elsewhere."""
+    """Return the probability of no return: dark surfaces absorb the projected light, glossy ones deflect it."""
     darkness = np.clip(1.0 - view.rgb.mean(axis=2) / _DARK, 0.0, 1.0)
     mirrored = np.minimum(view.gloss / np.float32(_MIRROR), 1.0)
     chance: Float32[ndarray, "h w"] = np.maximum(noise.dark_loss * darkness, noise.gloss_loss * mirrored)
@@ -63,7 +63,7 @@ def _absorbed(view: View, noise: SensorNoise) -> Float32[ndarray, "h w"]:
 
 
 def _edges(z: Float32[ndarray, "h w"], step_m: float) -> tuple[Bool[ndarray, "h w"], Float32[ndarray, "h w"]]:
-    """Pixels beside a jump in depth, and the depth on its other side."""
+    """Return the mask of pixels next to a depth discontinuity, and the depth on its other side."""
     edge, other = np.zeros(z.shape, np.bool_), z.copy()
     for a, b in (((slice(None), slice(1, None)), (slice(None), slice(-1))), ((slice(1, None),), (slice(-1),))):
         jump = np.abs(z[a] - z[b]) > step_m

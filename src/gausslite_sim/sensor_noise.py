@@ -1,4 +1,4 @@
-"""How strongly a structured-light camera errs, each kind of error by itself."""
+"""Parameters of the structured-light sensor model."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from dataclasses import dataclass, replace
 
 @dataclass(frozen=True, slots=True)
 class SensorNoise:
-    """Standard deviations at strength 1.
+    """Errors at strength 1.
 
-    Depth: axial noise of base_m + growth_per_m (z - 0.4 m)^2, the form Nguyen, Izadi and Lovell (2012) fitted to the
-    Kinect; disparity in steps of 1/disparity_steps_per_px with baseline_px_m = baseline times focal length, so that
-    the steps grow with z^2; no return outside [near_m, far_m] and at grazing incidence. At the edges of things a
-    pixel loses its depth, or flies: gets a depth between the two sides. dark_loss and gloss_loss are the chances of no
-    return from a black and from a mirroring surface. Colour: read-out noise and shot noise.
+    Axial depth noise: standard deviation base_m + growth_per_m (z - 0.4 m)^2 (Nguyen, Izadi and Lovell 2012, Kinect).
+    Disparity steps: 1/disparity_steps_per_px, with baseline_px_m = baseline times focal length; depth steps grow with
+    z^2. No return outside [near_m, far_m] and at grazing incidence. Edge pixels lose their depth, or get a depth
+    between both sides (flying pixels). dark_loss, gloss_loss: probability of no return from black and glossy
+    surfaces. Colour: read-out noise and shot noise.
     """
 
     base_m: float = 0.0012
@@ -32,8 +32,8 @@ class SensorNoise:
     colour_read: float = 1.6
     colour_shot: float = 0.16
 
-    def switched(self, holes: float, flying: float) -> SensorNoise:
-        """With its holes and its flying pixels made this many times as frequent; 0 turns them off."""
+    def scaled(self, holes: float, flying: float) -> SensorNoise:
+        """Return the noise with the frequency of holes and flying pixels scaled; 0 disables them."""
         return replace(
             self,
             edge_loss=holes * self.edge_loss,

@@ -1,4 +1,4 @@
-"""The colour of a surface where a ray meets it: texture times light, and what a glossy one mirrors."""
+"""Shading of ray hits: texture times light, plus reflections of glossy surfaces."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from gausslite_sim.scene import NO_HIT, Hits, HomeScene
 _WHITE = 255.0
 _LIFT_M = 3e-3
 _HEAD_ON = 0.35
-"""Of what a surface mirrors at a grazing view, the share that it mirrors head-on (Schlick 1994)."""
+"""Reflectance at normal incidence relative to grazing incidence (Schlick 1994)."""
 _BLUR_PER_M = 0.06
-"""Width of a mirrored pixel per metre of the way: polished, not silvered."""
+"""Blur width of reflections in metres per metre of reflected ray: polished surfaces, not mirrors."""
 _HIGHLIGHT_EXPONENT = 90.0
 _HIGHLIGHT = 2.5
 
 
 def facing_of(scene: HomeScene, hits: Hits, directions: Float32[ndarray, "n 3"]) -> Float32[ndarray, " n"]:
-    """|cos| of the angle between ray and surface."""
+    """Return |cos| of the angle of incidence."""
     along = np.einsum("nc,nc->n", directions, scene.triangles.normal[hits.triangle])
     facing: Float32[ndarray, " n"] = np.abs(along) / np.sqrt(np.einsum("nc,nc->n", directions, directions))
     return facing
@@ -44,51 +44,51 @@ def add_reflections(
     eye_m: Float32[ndarray, "3"],
     mirror: float,
 ) -> None:
-    """Mix into the glossy hits' colours, in place, what they mirror of the home and its lamps."""
+    """Add the reflections of the home and its lamps to the colours of glossy hits, in place."""
     triangle = hits.triangle
     glossy = np.flatnonzero((triangle != NO_HIT) & (scene.triangles.gloss[triangle] > 0))
     if len(glossy) == 0:
         return
-    towards = directions[glossy] / np.linalg.norm(directions[glossy], axis=1, keepdims=True)
-    normals = _smooth_normals(scene, hits, glossy, towards)
-    cosine = -np.einsum("nc,nc->n", towards, normals)
-    mirrored = towards + 2 * cosine[:, None] * normals
+    incoming = directions[glossy] / np.linalg.norm(directions[glossy], axis=1, keepdims=True)
+    normals = _smooth_normals(scene, hits, glossy, incoming)
+    cosine = -np.einsum("nc,nc->n", incoming, normals)
+    reflected = incoming + 2 * cosine[:, None] * normals
     points = eye_m + hits.distance[glossy, None] * directions[glossy] + np.float32(_LIFT_M) * normals
     strength = np.float32(mirror) * scene.triangles.gloss[triangle[glossy]]
     share = strength * (_HEAD_ON + (1 - _HEAD_ON) * (1 - np.clip(cosine, 0, 1)) ** 5)
-    there = scene.cast(np.ascontiguousarray(points, np.float32), np.ascontiguousarray(mirrored, np.float32))
-    seen = diffuse_colour(scene, there, np.float32(_BLUR_PER_M) * np.minimum(there.distance, 10.0))
-    rgb[glossy] += share[:, None] * (seen - rgb[glossy])
-    rgb[glossy] += strength[:, None] * _highlights(scene, points, mirrored)
+    second_hits = scene.cast(np.ascontiguousarray(points, np.float32), np.ascontiguousarray(reflected, np.float32))
+    reflection = diffuse_colour(scene, second_hits, np.float32(_BLUR_PER_M) * np.minimum(second_hits.distance, 10.0))
+    rgb[glossy] += share[:, None] * (reflection - rgb[glossy])
+    rgb[glossy] += strength[:, None] * _highlights(scene, points, reflected)
 
 
 def _highlights(
-    scene: HomeScene, points_m: Float32[ndarray, "n 3"], mirrored: Float32[ndarray, "n 3"]
+    scene: HomeScene, points_m: Float32[ndarray, "n 3"], reflected: Float32[ndarray, "n 3"]
 ) -> Float32[ndarray, "n 3"]:
-    """The lamps that the mirrored rays nearly meet and nothing hides, as soft spots (Phong 1975)."""
-    spots = np.zeros_like(points_m)
+    """Return specular highlights of the visible lamps near the reflected rays (Phong 1975)."""
+    highlights = np.zeros_like(points_m)
     for lamp in scene.lamps:
         to_lamp = np.asarray(lamp.position_m, np.float32) - points_m
-        along = np.einsum("nc,nc->n", to_lamp, mirrored) / np.linalg.norm(to_lamp, axis=1)
-        spot = np.clip(along, 0, 1) ** _HIGHLIGHT_EXPONENT
-        bright = np.flatnonzero(spot > 0.01)
+        along = np.einsum("nc,nc->n", to_lamp, reflected) / np.linalg.norm(to_lamp, axis=1)
+        intensity = np.clip(along, 0, 1) ** _HIGHLIGHT_EXPONENT
+        bright = np.flatnonzero(intensity > 0.01)
         hidden = scene.occluded(np.ascontiguousarray(points_m[bright]), np.ascontiguousarray(to_lamp[bright]), 0.95)
         bright = bright[~hidden]
         colour = _HIGHLIGHT * lamp.strength * _WHITE * np.asarray(lamp.colour, np.float32)
-        spots[bright] += spot[bright, None] * colour
-    return spots
+        highlights[bright] += intensity[bright, None] * colour
+    return highlights
 
 
 def _smooth_normals(
-    scene: HomeScene, hits: Hits, chosen: Int64[ndarray, " n"], towards: Float32[ndarray, "n 3"]
+    scene: HomeScene, hits: Hits, selected: Int64[ndarray, " n"], incoming: Float32[ndarray, "n 3"]
 ) -> Float32[ndarray, "n 3"]:
-    """The normals of the corners, mixed at the hit and turned against the ray."""
-    weights = _corner_weights(hits)[chosen]
-    normals = np.einsum("nk,nkc->nc", weights, scene.triangles.corner_normals[hits.triangle[chosen]])
+    """Return the corner normals interpolated at the hits, oriented against the rays."""
+    weights = _corner_weights(hits)[selected]
+    normals = np.einsum("nk,nkc->nc", weights, scene.triangles.corner_normals[hits.triangle[selected]])
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-6)
-    facing_away = np.einsum("nc,nc->n", normals, towards) > 0
-    turned: Float32[ndarray, "n 3"] = np.where(facing_away[:, None], -normals, normals)
-    return turned
+    facing_away = np.einsum("nc,nc->n", normals, incoming) > 0
+    oriented: Float32[ndarray, "n 3"] = np.where(facing_away[:, None], -normals, normals)
+    return oriented
 
 
 def _corner_weights(hits: Hits) -> Float32[ndarray, "n 3"]:

@@ -1,4 +1,4 @@
-"""Softer shapes than boxes and turned bodies: bent tubes, pillows, draped cloth, balls, blades of grass."""
+"""Curved meshes: tubes, pillows, draped cloth, balls, blades."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _SQUARENESS = 0.35
 
 
 def tube(points_m: list[Vector], radius_m: float, sides: int = 7) -> Mesh:
-    """A thin round bar along these points: a lamp's arm, a cable, a handle."""
+    """Return a tube along these points, such as a lamp's arm, a cable or a handle."""
     path = np.asarray(points_m, np.float64)
     along = np.gradient(path, axis=0)
     along /= np.linalg.norm(along, axis=1, keepdims=True)
@@ -28,12 +28,12 @@ def tube(points_m: list[Vector], radius_m: float, sides: int = 7) -> Mesh:
 
 
 def rods(pairs_m: list[tuple[Vector, Vector]], radius_m: float) -> Mesh:
-    """Straight thin bars from point to point."""
+    """Return straight thin bars between pairs of points."""
     return merge_meshes([tube([a, b], radius_m) for a, b in pairs_m])
 
 
 def sagging(start_m: Vector, end_m: Vector, sag_m: float, radius_m: float = 0.004) -> Mesh:
-    """A cable that hangs, or lies in a curve where both ends lie on a surface and sag_m is negative along y."""
+    """Return a sagging cable between two points."""
     t = np.linspace(0, 1, 14)[:, None]
     path = np.asarray(start_m) * (1 - t) + np.asarray(end_m) * t
     path[:, 2] -= sag_m * (4 * t * (1 - t))[:, 0]
@@ -41,7 +41,7 @@ def sagging(start_m: Vector, end_m: Vector, sag_m: float, radius_m: float = 0.00
 
 
 def pillow(width_m: float, height_m: float, thickness_m: float, fit: bool = True) -> Mesh:
-    """A stuffed square in the x-z plane, its lower edge at z = 0, its front towards -y."""
+    """Return a pillow in the x-z plane, its lower edge at z = 0, its front towards -y."""
     return merge_meshes([_cheek(width_m, height_m, thickness_m, fit, front) for front in (True, False)])
 
 
@@ -58,7 +58,7 @@ def _cheek(width_m: float, height_m: float, thickness_m: float, fit: bool, front
 
 
 def draped(width_m: float, length_m: float, drop_m: float, wave_m: float = 0.012) -> Mesh:
-    """A cloth over something flat at z = 0, hanging down by drop_m at its ends (x = ±width/2), with folds."""
+    """Return a cloth over a flat top at z = 0 that hangs down by drop_m at x = ±width/2, with folds."""
     s, y = np.meshgrid(np.linspace(-1, 1, 33), np.linspace(0.5, -0.5, 13) * length_m, indexing="xy")
     half = width_m / 2
     along = s * (half + drop_m)
@@ -71,7 +71,7 @@ def draped(width_m: float, length_m: float, drop_m: float, wave_m: float = 0.012
 
 
 def hanging(width_m: float, height_m: float, folds: int, depth_m: float = 0.05, fit: bool = False) -> Mesh:
-    """A curtain in the x-z plane from z = 0 up, with folds that widen downwards."""
+    """Return a curtain in the x-z plane above z = 0, with folds that widen downwards."""
     down, across = np.meshgrid(np.linspace(0, 1, 10), np.linspace(0, 1, 8 * folds + 1), indexing="ij")
     x = (across - 0.5) * width_m
     y = -depth_m * (0.6 + 0.4 * down) * np.sin(2 * np.pi * folds * across)
@@ -80,14 +80,14 @@ def hanging(width_m: float, height_m: float, folds: int, depth_m: float = 0.05, 
 
 
 def ball(radius_m: float, flattened: float = 1.0, sectors: int = 20) -> Mesh:
-    """A ball round the origin, its height scaled by `flattened`."""
+    """Return a ball round the origin, its height scaled by `flattened`."""
     arc = np.linspace(-np.pi / 2 + 0.02, np.pi / 2 - 0.02, 12)
     profile = [(radius_m * float(np.cos(a)), flattened * radius_m * float(np.sin(a))) for a in arc]
     return lathe(profile, smooth=True, sectors=sectors)
 
 
 def blade(length_m: float, width_m: float, lean_m: float, twist: float = 0.0) -> Mesh:
-    """A long leaf that grows up along z and leans towards +x; one whole picture."""
+    """Return a long leaf along z that leans towards +x, with a fitted texture."""
     t, s = np.meshgrid(np.linspace(1, 0, 9), np.linspace(-1, 1, 3), indexing="ij")
     half = 0.5 * width_m * np.sin(np.pi * np.clip(0.12 + 0.86 * t, 0, 1)) ** 0.7
     turn = twist * t
@@ -98,7 +98,7 @@ def blade(length_m: float, width_m: float, lean_m: float, twist: float = 0.0) ->
 
 
 def shell(length_m: float, width_m: float, heights_m: tuple[float, ...]) -> Mesh:
-    """A hull on the ground along -y, its ridge at these heights from back to front: a shoe's upper, a boat."""
+    """Return a hull on the ground along -y, its ridge at these heights from back to front, such as a shoe's upper."""
     ridge = np.interp(np.linspace(0, 1, 13), np.linspace(0, 1, len(heights_m)), heights_m)
     t, a = np.meshgrid(np.linspace(0, 1, 13), np.linspace(0, np.pi, 11), indexing="ij")
     half = 0.5 * width_m * (np.sin(np.pi * np.clip(0.06 + 0.9 * t, 0, 1)) ** 0.45)
@@ -109,7 +109,7 @@ def shell(length_m: float, width_m: float, heights_m: tuple[float, ...]) -> Mesh
 
 
 def legs(width_m: float, depth_m: float, height_m: float, thick_m: float = 0.03, splay_m: float = 0.0) -> Mesh:
-    """Four bars from the floor to the corners of a seat or top; with splay_m their feet stand further out."""
+    """Return four legs from the floor to the corners of a seat or top; splay_m moves the feet outwards."""
     pairs: list[tuple[Vector, Vector]] = [
         (
             (sx * (width_m / 2 + splay_m), sy * (depth_m / 2 + splay_m), 0.0),
@@ -127,7 +127,7 @@ def legs(width_m: float, depth_m: float, height_m: float, thick_m: float = 0.03,
 def _sheet(
     points_m: Float64[ndarray, "r c 3"], uv: Float64[ndarray, "r c 2"], normals: Float64[ndarray, "r c 3"] | None = None
 ) -> Mesh:
-    """A grid of points as a surface, seen from where rows go down and columns go right."""
+    """Return the surface of a grid of points, visible from the side where rows go down and columns go right."""
     rows, columns = points_m.shape[0] - 1, points_m.shape[1] - 1
     if normals is None:
         normals = np.cross(np.gradient(points_m, axis=0), np.gradient(points_m, axis=1))

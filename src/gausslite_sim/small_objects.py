@@ -96,7 +96,7 @@ def basket(weave: str, filling: str, radius_m: float = 0.2, height_m: float = 0.
 
 
 def shoes(upper: str, sole: str = "white_plastic") -> list[Part]:
-    """A pair that somebody stepped out of."""
+    """A pair of shoes on the floor."""
     parts = []
     for x, y, yaw in ((-0.065, 0.0, 4), (0.07, -0.05, -15)):
         top = shell(0.28, 0.1, (0.09, 0.105, 0.1, 0.075, 0.055, 0.05, 0.03)).translate((0, 0, 0.022))

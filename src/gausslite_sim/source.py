@@ -39,10 +39,10 @@ _STRENGTHS = ("noise", "holes", "flying", "exposure", "gloss")
 
 @dataclass(frozen=True, slots=True)
 class HomeSettings:
-    """One walk through one home.
+    """One trajectory through one home.
 
-    noise scales the whole sensor model, 0 turns it off: depth is then exact. holes and flying scale those of its
-    parts, exposure the drift of the camera's gain, gloss what polished surfaces mirror.
+    noise: scale of the sensor model; 0 disables it, and depth is exact. holes and flying: scales of missing depth and
+    of flying pixels. exposure: scale of the gain drift. gloss: scale of reflections.
     """
 
     home: int = 0
@@ -58,15 +58,15 @@ class HomeSettings:
 
     def __post_init__(self) -> None:
         low, high = _SIDES_PX
-        for name, value, wanted, right in (
+        for name, value, expected, valid in (
             ("seed", self.seed, "0 to 4294967295", 0 <= self.seed < 2**32),
             ("trajectory", self.trajectory, f"0 to {TRAJECTORY_COUNT - 1}", 0 <= self.trajectory < TRAJECTORY_COUNT),
             ("frames", self.frames, "1 to 100000", 1 <= self.frames <= 100_000),
             ("size", self.size_px, f"sides of {low} to {high} px", all(low <= side <= high for side in self.size_px)),
             *((name, getattr(self, name), "0 to 10", 0.0 <= getattr(self, name) <= 10.0) for name in _STRENGTHS),
         ):
-            if not right:
-                raise DatasetError(f"{self.world}: {name}: expected {wanted}, got {value}")
+            if not valid:
+                raise DatasetError(f"{self.world}: {name}: expected {expected}, got {value}")
 
     @property
     def world(self) -> str:
@@ -75,21 +75,21 @@ class HomeSettings:
 
     @classmethod
     def parse(cls, query: str, home: int = 0) -> HomeSettings:
-        """From "seed=0&trajectory=1&frames=120&size=320x240&noise=1"; what is left out keeps its default."""
-        chosen: dict[str, Any] = {}
+        """Parse "seed=0&trajectory=1&frames=120&size=320x240&noise=1"; all parts are optional. Raises DatasetError."""
+        settings: dict[str, Any] = {}
         for key, value in parse_qsl(query, keep_blank_values=True):
             if key in _NUMBERS and re.fullmatch(r"[0-9]{1,10}", value):
-                chosen[key] = int(value)
+                settings[key] = int(value)
             elif key in _STRENGTHS and re.fullmatch(r"[0-9]{1,3}(\.[0-9]{1,9})?", value):
-                chosen[key] = float(value)
+                settings[key] = float(value)
             elif key == "size" and (match := re.fullmatch(r"([0-9]{1,5})x([0-9]{1,5})", value)):
-                chosen["size_px"] = (int(match.group(1)), int(match.group(2)))
+                settings["size_px"] = (int(match.group(1)), int(match.group(2)))
             else:
-                wanted = "&".join([*(f"{name}=N" for name in _NUMBERS), "size=WxH", *(f"{n}=X" for n in _STRENGTHS)])
+                expected = "&".join([*(f"{name}=N" for name in _NUMBERS), "size=WxH", *(f"{n}=X" for n in _STRENGTHS)])
                 raise DatasetError(
-                    f"{_world(home)}: {key}={value}: expected {wanted}, each of them optional; N whole, X 0 to 10"
+                    f"{_world(home)}: {key}={value}: expected {expected}, each of them optional; N whole, X 0 to 10"
                 )
-        return cls(home, **chosen)
+        return cls(home, **settings)
 
 
 def _world(home: int) -> str:
@@ -97,33 +97,32 @@ def _world(home: int) -> str:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Place:
-    """A home that stands: what to draw, and its objects by name."""
+class _BuiltHome:
+    """A home with its scene, and its objects' regions by name."""
 
     plan: HomePlan
     scene: HomeScene
     regions: Mapping[str, Region]
 
 
-_building = threading.Lock()
+_build_lock = threading.Lock()
 
 
 @lru_cache(maxsize=2)
-def _built(home: int, seed: int) -> _Place:
-    """The home of this number and seed, shared by every source of the process; call it with `_building` held."""
+def _build_home(home: int, seed: int) -> _BuiltHome:
+    """Return the home, shared by all sources of the process; call it with `_build_lock` held."""
     plan = plan_home(home, seed)
     scene = HomeScene(plan)
     images = InstanceImageCache(scene)
     regions = {name: InstanceRegion(name, scene.names.index(name), images) for name in scene.object_names}
-    return _Place(plan, scene, regions)
+    return _BuiltHome(plan, scene, regions)
 
 
 class SimulatedHome:
-    """A walk through a home with z up. Every frame is the same whenever and wherever it is asked for.
+    """A trajectory through a home, with z up. Frames are deterministic on every machine.
 
-    Frame numbers run from 0 to frames - 1, times are those numbers at 30 Hz. The home is built, which takes seconds,
-    for the first frame or region that is asked for; what is wrong with the settings is told before. Raises
-    DatasetError where the extra `sim` is not installed.
+    Frame numbers run from 0 to frames - 1, with timestamps at 30 Hz. The first request for a frame or region builds
+    the home, which takes seconds. Raises DatasetError without the extra `sim`.
     """
 
     def __init__(self, settings: HomeSettings, up_axis: UpAxis | None = None) -> None:
@@ -136,7 +135,7 @@ class SimulatedHome:
 
     @property
     def name(self) -> str:
-        """The home and the walk."""
+        """Home, seed and trajectory."""
         settings = self._settings
         return f"{settings.world.replace(':', '-')}-{settings.seed}-{settings.trajectory}"
 
@@ -152,25 +151,25 @@ class SimulatedHome:
 
     @property
     def depth_registered(self) -> bool:
-        """True: both are drawn by one camera."""
+        """True: one camera renders both images."""
         return True
 
     @property
     def excluded_frames(self) -> str:
-        """Nothing."""
+        """Empty: every frame is used."""
         return ""
 
     def __len__(self) -> int:
         return self._settings.frames
 
     def frame(self, i: int, size: tuple[int, int] | None = None) -> Frame:
-        """The frame at position i. Raises DatasetError."""
+        """Return the frame at position i, resized to (width_px, height_px). Raises DatasetError."""
         require_position(self.name, i, len(self))
-        settings, place, T_world_camera = self._settings, self._place, self._poses[i]
-        view = self._exposed(render_view(place.scene, self._camera, T_world_camera, settings.gloss), i)
+        settings, home, T_world_camera = self._settings, self._home, self._poses[i]
+        view = self._apply_exposure(render_view(home.scene, self._camera, T_world_camera, settings.gloss), i)
         if settings.noise > 0:
             rng = np.random.default_rng([settings.seed, settings.trajectory, i])
-            noise = place.plan.sensor.switched(settings.holes, settings.flying)
+            noise = home.plan.sensor.scaled(settings.holes, settings.flying)
             rgb = noisy_colour(view, noise, settings.noise, rng)
             depth_m = noisy_depth(view, noise, settings.noise, rng)
         else:
@@ -183,28 +182,28 @@ class SimulatedHome:
         return range(len(self))
 
     def regions(self) -> Mapping[str, Region]:
-        """Every object by name: table, chair_1 ..., mug, sofa ...; walls, floors and ceilings are none."""
-        return dict(self._place.regions)
+        """Return the region of every object by name: table, chair_1, mug, ...; without walls, floors and ceilings."""
+        return dict(self._home.regions)
 
     @cached_property
-    def _place(self) -> _Place:
-        with _building:
-            return _built(self._settings.home, self._settings.seed)
+    def _home(self) -> _BuiltHome:
+        with _build_lock:
+            return _build_home(self._settings.home, self._settings.seed)
 
     @cached_property
     def _poses(self) -> Float64[ndarray, "n 4 4"]:
-        return self._place.plan.trajectories[self._settings.trajectory](self._settings.frames)
+        return self._home.plan.trajectories[self._settings.trajectory](self._settings.frames)
 
-    def _exposed(self, view: View, i: int) -> View:
-        """The view as a camera takes it whose exposure follows the light."""
-        drift = self._settings.exposure * self._place.plan.exposure_drift
+    def _apply_exposure(self, view: View, i: int) -> View:
+        """Return the view with the simulated exposure."""
+        drift = self._settings.exposure * self._home.plan.exposure_drift
         if drift == 0:
             return view
         return replace(view, rgb=view.rgb * camera_gain(i / len(self), drift, self._settings.trajectory))
 
 
 def open_simulated(spec: str, up_axis: UpAxis | None = None) -> Source:
-    """The walk of a spec without its "sim:": "home", "home-3" or "home-3?seed=0&...". Raises DatasetError."""
+    """Return the source of a spec without "sim:": "home", "home-3" or "home-3?seed=0&...". Raises DatasetError."""
     world, _, query = spec.partition("?")
     name = re.fullmatch(r"home(?:-([1-9]))?", world)
     home = int(name.group(1) or 0) if name else HOME_COUNT + 1

@@ -1,4 +1,4 @@
-"""Materials that repeat: wood, tiles, cloth, plaster. Each is a seamless square painted from seeded noise."""
+"""Repeating textures: wood, tiles, cloth, plaster. Each is a seamless square painted from seeded noise."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ Shade = Float64[ndarray, "s s"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Texture:
-    """A square picture. repeat_m: the length it covers before it repeats; None when it is fitted to a face once.
+    """A square image. repeat_m: period in metres; None for a texture fitted to one face.
 
-    gloss: share of the light that the surface mirrors, 0 for matt.
+    gloss: share of specularly reflected light, 0 for matt.
     """
 
     rgb: UInt8[ndarray, "s s 3"]
@@ -27,12 +27,12 @@ class Texture:
     gloss: float = 0.0
 
     def with_gloss(self, gloss: float) -> Texture:
-        """The same picture on a surface that mirrors this share."""
+        """Return the texture with this gloss."""
         return Texture(self.rgb, self.repeat_m, gloss)
 
 
 def noise(rng: np.random.Generator, rows: int, columns: int) -> Shade:
-    """Smooth seamless noise in [0, 1] with this many cells (powers of two up to SIDE_PX)."""
+    """Return smooth seamless noise in [0, 1] with this many cells (powers of two up to SIDE_PX)."""
     margin = 2
     lattice = np.pad(rng.random((rows, columns)).astype(np.float32), margin, mode="wrap")
     high, wide = SIDE_PX // rows, SIDE_PX // columns
@@ -43,13 +43,13 @@ def noise(rng: np.random.Generator, rows: int, columns: int) -> Shade:
 
 
 def grain(rng: np.random.Generator) -> Shade:
-    """Noise in [0, 1] with detail down to single texels."""
+    """Return noise in [0, 1] with detail down to single texels."""
     layers = ((8, 0.2), (32, 0.25), (128, 0.3), (512, 0.25))
     return np.asarray(sum(weight * noise(rng, cells, cells) for cells, weight in layers))
 
 
 def tint(shade: Shade, colour: Colour) -> UInt8[ndarray, "s s 3"]:
-    """A colour (components 0 to 1), lighter and darker by the shade (1 leaves it as it is)."""
+    """Return a colour (components 0 to 1) multiplied by the shade."""
     bright = np.multiply.outer(shade * 255.0, np.asarray(colour)) + 0.5
     return np.asarray(np.minimum(bright, 255.0), np.uint8)
 

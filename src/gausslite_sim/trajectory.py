@@ -1,4 +1,4 @@
-"""Walks through a home: smooth curves through places and what is looked at from there."""
+"""Camera trajectories: splines through waypoints of eye positions and look-at targets."""
 
 from __future__ import annotations
 
@@ -11,36 +11,36 @@ from numpy import ndarray
 from gausslite_sim.mesh import Vector
 
 Trajectory = Callable[[int], Float64[ndarray, "n 4 4"]]
-"""T_world_camera of this many frames, evenly spread over the walk (z up; OpenCV camera axes, no roll)."""
+"""Returns T_world_camera of n frames, evenly spaced along the trajectory (z up; OpenCV camera axes, no roll)."""
 Waypoint = tuple[Vector, Vector]
-"""(eye, looked at) in metres."""
+"""(eye position, look-at target) in metres."""
 
 
 def spline_trajectory(keys: Sequence[Waypoint]) -> Trajectory:
-    """The walk from the first of these places to the last."""
-    places = np.array(keys)
+    """Return the trajectory from the first waypoint to the last."""
+    waypoints = np.array(keys)
 
     def poses(frames: int) -> Float64[ndarray, "n 4 4"]:
         share = np.linspace(0.0, 1.0, frames) if frames > 1 else np.array([0.5])
-        return look_at_poses(_curve(places[:, 0], share), _curve(places[:, 1], share))
+        return look_at_poses(_spline(waypoints[:, 0], share), _spline(waypoints[:, 1], share))
 
     return poses
 
 
 def look_at_poses(eyes_m: Float64[ndarray, "n 3"], targets_m: Float64[ndarray, "n 3"]) -> Float64[ndarray, "n 4 4"]:
-    """T_world_camera of cameras at the eyes that look at the targets."""
+    """Return T_world_camera of cameras at the eyes that look at the targets."""
     return np.stack([_look_at(eye, target) for eye, target in zip(eyes_m, targets_m, strict=True)])
 
 
-def _curve(keys: Float64[ndarray, "k 3"], share: Float64[ndarray, " n"]) -> Float64[ndarray, "n 3"]:
-    """The Catmull-Rom spline through the keys at these shares of its way."""
+def _spline(keys: Float64[ndarray, "k 3"], share: Float64[ndarray, " n"]) -> Float64[ndarray, "n 3"]:
+    """Return points of the Catmull-Rom spline through the keys at these shares of its parameter range."""
     padded = np.concatenate([2 * keys[:1] - keys[1:2], keys, 2 * keys[-1:] - keys[-2:-1]])
-    place = share * (len(keys) - 1)
-    i = np.minimum(place.astype(np.int64), len(keys) - 2)
-    t = (place - i)[:, None]
+    parameter = share * (len(keys) - 1)
+    i = np.minimum(parameter.astype(np.int64), len(keys) - 2)
+    t = (parameter - i)[:, None]
     p0, p1, p2, p3 = (padded[i + k] for k in range(4))
-    bent = 2 * p1 + (p2 - p0) * t + (2 * p0 - 5 * p1 + 4 * p2 - p3) * t**2 + (3 * p1 - p0 - 3 * p2 + p3) * t**3
-    return np.asarray(0.5 * bent)
+    doubled = 2 * p1 + (p2 - p0) * t + (2 * p0 - 5 * p1 + 4 * p2 - p3) * t**2 + (3 * p1 - p0 - 3 * p2 + p3) * t**3
+    return np.asarray(0.5 * doubled)
 
 
 def _look_at(eye_m: Float64[ndarray, "3"], target_m: Float64[ndarray, "3"]) -> Float64[ndarray, "4 4"]:

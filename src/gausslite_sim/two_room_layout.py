@@ -1,4 +1,4 @@
-"""Where everything is: a kitchen (x 0 to 4.2 m) and a living room (x 4.3 to 8.1 m) joined by a wide doorway."""
+"""Layout of the two-room home: kitchen (x 0 to 4.2 m) and living room (x 4.3 to 8.1 m) with a wide doorway."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ _WORKTOP_M = 0.885
 
 
 def paint_textures(seed: int) -> dict[str, Texture]:
-    """Every texture of the home by name."""
+    """Return every texture of the home by name."""
     rng = np.random.default_rng([seed, 1])
     return _materials(rng) | _pictures(rng)
 
 
 def _materials(rng: np.random.Generator) -> dict[str, Texture]:
-    """What repeats."""
+    """Return the repeating textures."""
     return {
         "oak": textures.wood(rng, (0.80, 0.58, 0.34)),
         "walnut": textures.wood(rng, (0.46, 0.30, 0.20), 0.6),
@@ -55,7 +55,7 @@ def _materials(rng: np.random.Generator) -> dict[str, Texture]:
 
 
 def _pictures(rng: np.random.Generator) -> dict[str, Texture]:
-    """What is fitted to a face."""
+    """Return the textures fitted to one face."""
     return {
         "mug_print": printed_textures.mug_print(rng),
         "vase_print": printed_textures.vase_print(rng),
@@ -82,7 +82,7 @@ def _pictures(rng: np.random.Generator) -> dict[str, Texture]:
 
 
 def furnish(seed: int) -> list[Item]:
-    """Every item in the world frame (z up); the seed shifts and turns what a hand would move."""
+    """Return every object in the world frame (z up); the seed jitters movable objects."""
     rng = np.random.default_rng([seed, 2])
     return [*_rooms(), *_dining(rng), *_kitchen(), *_living(rng)]
 
@@ -119,7 +119,7 @@ def _rooms() -> list[Item]:
 
 
 def _dining(rng: np.random.Generator) -> list[Item]:
-    """The table, what stands on it and the chairs round it."""
+    """Return the table, the objects on it and the chairs round it."""
     x, y = TABLE_CENTRE_M
 
     def on_table(name: str, parts: list[Part], dx: float, dy: float, yaw_deg: float) -> Item:

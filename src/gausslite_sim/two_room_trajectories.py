@@ -1,4 +1,4 @@
-"""The three walks through the two-room home."""
+"""The three trajectories through the two-room home."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _KITCHEN_TO_LIVING = (
     ((4.60, 2.30, 1.45), (2.3, 2.1, 0.60)),
     ((3.95, 1.80, 1.50), (2.1, 2.2, 0.60)),
 )
-"""(eye, looked at) in metres: past the chairs, through the doorway, round the living room and back."""
+"""Waypoints: past the chairs, through the doorway, round the living room and back."""
 
 _HELD_OUT = (
     ((2.95, 1.35, 1.85), (2.0, 2.2, 0.75)),
@@ -41,7 +41,7 @@ _HELD_OUT = (
     ((6.90, 2.60, 1.25), (6.2, 4.3, 0.75)),
     ((5.90, 3.30, 1.20), (4.9, 3.7, 0.50)),
 )
-"""Above and below both walks, at the same things."""
+"""Waypoints above and below the other trajectories, looking at the same objects."""
 
 
 def _round_the_table(frames: int) -> Float64[ndarray, "n 4 4"]:
@@ -56,4 +56,4 @@ TRAJECTORIES: tuple[Trajectory, ...] = (
     spline_trajectory(_KITCHEN_TO_LIVING),
     spline_trajectory(_HELD_OUT),
 )
-"""0: agent A round the table. 1: agent B past the chairs to the living room. 2: held-out views off both paths."""
+"""0: agent A round the table. 1: agent B past the chairs to the living room. 2: held-out views."""

@@ -1,4 +1,4 @@
-"""Draw the home from a camera: exact depth, exact items, colour smoothed at the edges of things."""
+"""Render a home: exact depth, exact instances, and colour anti-aliased at edges."""
 
 from __future__ import annotations
 
@@ -13,17 +13,18 @@ from gausslite_sim.scene import NO_HIT, Hits, HomeScene
 from gausslite_sim.shading import add_reflections, diffuse_colour, facing_of
 
 _SUBSAMPLES = np.array([(-0.125, -0.375), (0.375, -0.125), (0.125, 0.375), (-0.375, 0.125)], np.float32)
-"""Offsets from a pixel's centre, in pixels, of the rays that smooth an edge."""
+"""Offsets of the anti-aliasing rays from a pixel's centre, in pixels."""
 _STEP = 0.03
-"""Neighbours whose depths differ by more than this share lie on different surfaces."""
+"""Neighbours whose relative depth difference exceeds this lie on different surfaces."""
 _CREASE = 0.1
-"""And those whose angles of incidence differ by more than this cosine, on different faces."""
+"""Neighbours whose cosines of incidence differ by more than this lie on different faces."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
-    """What a perfect camera sees. item indexes HomeScene.names (NO_HIT outside); facing is |cos| of the incidence;
-    gloss is the share that the surface mirrors.
+    """Image of an ideal camera. rgb is 0 to 255.
+
+    item: index into HomeScene.names, or NO_HIT. facing: |cos| of the angle of incidence. gloss: reflected share.
     """
 
     rgb: Float32[ndarray, "h w 3"]
@@ -34,9 +35,9 @@ class View:
 
 
 def render_view(scene: HomeScene, camera: Camera, T_world_camera: Float64[ndarray, "4 4"], mirror: float = 1.0) -> View:
-    """Render one view; colours 0 to 255. Depth is that of the ray through the pixel's centre.
+    """Return one view; depth is that of the ray through the pixel's centre.
 
-    mirror scales what glossy surfaces mirror; 0 makes all of them matt.
+    mirror: scale of reflections; 0 renders all surfaces matt.
     """
     shape = (camera.height_px, camera.width_px)
     columns, rows = _pixel_centres(camera)
@@ -60,7 +61,7 @@ def render_view(scene: HomeScene, camera: Camera, T_world_camera: Float64[ndarra
 def render_instances(
     scene: HomeScene, camera: Camera, T_world_camera: Float64[ndarray, "4 4"]
 ) -> Int64[ndarray, "h w"]:
-    """The item in each pixel, exactly."""
+    """Return the index of the object in each pixel, NO_HIT without one."""
     directions = _directions(*_pixel_centres(camera), camera, T_world_camera)
     triangle = _cast_from(scene, directions, T_world_camera).triangle
     item: Int64[ndarray, " n"] = np.where(triangle == NO_HIT, NO_HIT, scene.triangles.item[triangle])
@@ -78,11 +79,11 @@ def _directions(
     camera: Camera,
     T_world_camera: Float64[ndarray, "4 4"],
 ) -> Float32[ndarray, "n 3"]:
-    """Rays one metre long along the optical axis, so that a length along them is a depth."""
+    """Return ray directions with length 1 along the optical axis, so that the ray parameter is the depth."""
     x = (columns - np.float32(camera.cx_px)) / np.float32(camera.fx_px)
     y = (rows - np.float32(camera.cy_px)) / np.float32(camera.fy_px)
     R = T_world_camera[:3, :3].astype(np.float32)
-    # not a matrix product: its rounding may depend on the number of rays and of cores
+    # no matrix product: its rounding may depend on the number of rays and cores
     directions: Float32[ndarray, "n 3"] = np.stack([R[k, 0] * x + R[k, 1] * y + R[k, 2] for k in range(3)], axis=1)
     return directions
 
@@ -105,9 +106,9 @@ def _shade(
     T_world_camera: Float64[ndarray, "4 4"],
     mirror: float,
 ) -> tuple[Float32[ndarray, "n 3"], Float32[ndarray, " n"]]:
-    """Colour times light at each hit, and how squarely the ray meets the surface; black where nothing is hit."""
+    """Return the shaded colour of each hit, black without a hit, and |cos| of the incidence."""
     facing = facing_of(scene, hits, directions)
-    # between the footprint across the slope and the one along it
+    # geometric mean of the pixel's footprints across and along the slope
     pixel_m = hits.distance / np.float32(camera.fx_px) / np.sqrt(np.maximum(facing, 0.05))
     rgb = diffuse_colour(scene, hits, pixel_m)
     if mirror > 0:
@@ -121,7 +122,7 @@ def _edges(
     depth_m: Float32[ndarray, "h w"],
     facing: Float32[ndarray, "h w"],
 ) -> Bool[ndarray, "h w"]:
-    """Pixels next to another item, another surface or a crease."""
+    """Return the mask of pixels next to another object, another surface or a crease."""
     edge = np.zeros(item.shape, np.bool_)
     for a, b in (((slice(None), slice(1, None)), (slice(None), slice(-1))), ((slice(1, None),), (slice(-1),))):
         differs = (item[a] != item[b]) | (texture[a] != texture[b])

@@ -1,4 +1,4 @@
-"""Tools and what lies about in a workshop, each standing or lying on z = 0."""
+"""Tools and other workshop objects, each standing or lying on z = 0."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Write simulated_home.json: what the simulated home looked like when it was last looked at. Run it after a change."""
+"""Write simulated_home.json, the recorded images of test_golden_home.py. Run this after an intended change."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ COARSE = (8, 6)
 
 
 def summarise() -> dict[str, Any]:
-    """Per walk, a few frames as coarse means: colour 0 to 255, exact depth in cm, visible pixels of some objects."""
+    """Return per trajectory a few frames as coarse means: colour 0 to 255, exact depth in cm, visible pixels of some objects."""
     summary: dict[str, Any] = {}
     for trajectory in range(3):
         source = open_source(f"sim:home?seed=0&trajectory={trajectory}&frames=4&size=160x120&noise=0")

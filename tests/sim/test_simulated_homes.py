@@ -1,4 +1,4 @@
-"""The family of simulated homes: full of named things, held-out views off the walks, a switch for each hardship."""
+"""The benchmark homes: named objects, held-out views apart from the training trajectories, a setting per difficulty."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def furnished(request: pytest.FixtureRequest) -> tuple:
     return home, home.furnish(np.random.default_rng(0))
 
 
-def test_a_home_is_full_of_things_with_names_of_their_own(furnished: tuple) -> None:
+def test_a_home_has_many_objects_with_unique_names(furnished: tuple) -> None:
     home, items = furnished
     names = [item.name for item in items]
     assert len(set(names)) == len(names)
@@ -30,7 +30,7 @@ def test_a_home_is_full_of_things_with_names_of_their_own(furnished: tuple) -> N
     assert {part.texture for item in items for part in item.parts} <= home.painters().keys()
 
 
-def test_everything_stands_inside_the_room(furnished: tuple) -> None:
+def test_every_object_is_inside_the_room(furnished: tuple) -> None:
     _, items = furnished
     walls = next(item for item in items if item.name == "walls").parts[0].mesh.positions_m
     for item in items:
@@ -42,7 +42,7 @@ def test_everything_stands_inside_the_room(furnished: tuple) -> None:
             np.testing.assert_allclose(np.linalg.norm(part.mesh.normals, axis=1), 1.0, atol=0.02)
 
 
-def test_held_out_views_lie_off_the_walks(furnished: tuple) -> None:
+def test_held_out_views_are_apart_from_the_training_trajectories(furnished: tuple) -> None:
     home, items = furnished
     walls = next(item for item in items if item.name == "walls").parts[0].mesh.positions_m
     *training, held_out = (spline_trajectory(keys)(40) for keys in home.trajectories)
@@ -50,32 +50,32 @@ def test_held_out_views_lie_off_the_walks(furnished: tuple) -> None:
         require_rigid("pose", T)
         assert (T[:2, 3] > 0.25).all()
         assert (T[:2, 3] < walls.max(axis=0)[:2] - 0.2).all()
-    walked = np.concatenate(training)[:, :3, 3]
-    nearest_m = np.linalg.norm(held_out[:, None, :3, 3] - walked[None], axis=2).min(axis=1)
+    training_positions = np.concatenate(training)[:, :3, 3]
+    nearest_m = np.linalg.norm(held_out[:, None, :3, 3] - training_positions[None], axis=2).min(axis=1)
     assert np.median(nearest_m) > 0.3
 
 
-def test_gain_strays_no_further_than_it_may() -> None:
+def test_the_gain_stays_within_the_drift() -> None:
     gains = np.stack([camera_gain(share, 0.12, 1) for share in np.linspace(0, 1, 50)])
     assert np.abs(gains - 1).max() <= 0.12 + 1e-6
     assert gains.std(axis=0).min() > 0.02
     assert np.abs(np.diff(gains, axis=0)).max() < 0.03
 
 
-def test_a_texture_does_not_depend_on_its_neighbours() -> None:
+def test_a_texture_does_not_depend_on_the_other_used_textures() -> None:
     painters = workshop.painters()
-    alone, among = paint(painters, ["packet"], 0), paint(painters, ["rubber", "packet"], 0)
-    np.testing.assert_array_equal(alone["packet"].rgb, among["packet"].rgb)
+    alone, with_other = paint(painters, ["packet"], 0), paint(painters, ["rubber", "packet"], 0)
+    np.testing.assert_array_equal(alone["packet"].rgb, with_other["packet"].rgb)
     assert not np.array_equal(alone["packet"].rgb, paint(painters, ["packet"], 1)["packet"].rgb)
 
 
-def workshop_walk(options: str = "", trajectory: int = 0) -> Source:
+def workshop_source(options: str = "", trajectory: int = 0) -> Source:
     return open_source(f"sim:home-8?trajectory={trajectory}&frames=10&size=80x60{options}")
 
 
-def test_a_workshop_shows_what_it_should() -> None:
+def test_the_workshop_shows_its_main_objects() -> None:
     pytest.importorskip("embreex", reason="the simulated homes need the extra `sim`")
-    source = workshop_walk("&noise=0", trajectory=2)
+    source = workshop_source("&noise=0", trajectory=2)
     regions = source.regions()
     shares = {
         name: max(float(regions[name].mask(source.frame(i)).mean()) for i in range(len(source)))
@@ -93,16 +93,16 @@ def test_a_workshop_shows_what_it_should() -> None:
     assert min(float(source.frame(i).depth_m.min()) for i in range(len(source))) > 0.3
 
 
-def test_each_hardship_has_its_switch() -> None:
+def test_each_difficulty_has_its_setting() -> None:
     pytest.importorskip("embreex", reason="the simulated homes need the extra `sim`")
     clean = "&noise=0&exposure=0&gloss=0"
     frames = {
-        "clean": workshop_walk(clean).frame(4),
-        "exposure": workshop_walk("&noise=0&gloss=0").frame(4),
-        "gloss": workshop_walk("&noise=0&exposure=0").frame(4),
-        "noise": workshop_walk("&holes=0&flying=0").frame(4),
-        "holes": workshop_walk("&flying=0").frame(4),
-        "flying": workshop_walk("&holes=0").frame(4),
+        "clean": workshop_source(clean).frame(4),
+        "exposure": workshop_source("&noise=0&gloss=0").frame(4),
+        "gloss": workshop_source("&noise=0&exposure=0").frame(4),
+        "noise": workshop_source("&holes=0&flying=0").frame(4),
+        "holes": workshop_source("&flying=0").frame(4),
+        "flying": workshop_source("&holes=0").frame(4),
     }
     exact = frames["clean"].depth_m
     for name in ("exposure", "gloss"):
@@ -116,7 +116,7 @@ def test_each_hardship_has_its_switch() -> None:
     assert (errors["noise"] > 0.05).mean() < (errors["flying"] > 0.05).mean()
 
 
-def test_homes_are_numbered_and_the_spec_says_so() -> None:
+def test_an_invalid_home_number_is_an_error() -> None:
     for world in ("home-0", f"home-{HOME_COUNT + 1}", "home-12", "home-x"):
         with pytest.raises(DatasetError, match=rf"sim:{world}: expected sim:home, or one of sim:home-1 to"):
             open_source(f"sim:{world}")
@@ -124,7 +124,7 @@ def test_homes_are_numbered_and_the_spec_says_so() -> None:
         open_source("sim:home-2?gloss=11")
 
 
-def test_the_seed_moves_what_a_hand_would_move() -> None:
+def test_the_seed_moves_movable_objects_only() -> None:
     def middle(name: str, seed: int) -> np.ndarray:
         items = workshop.furnish(np.random.default_rng(seed))
         return next(item for item in items if item.name == name).parts[0].mesh.positions_m.mean(axis=0)

@@ -1,4 +1,4 @@
-"""The simulated home is the same every time, its poses, masks and depths are exact, and its walks overlap in part."""
+"""The two-room home is deterministic; its poses, masks and depths are exact; its trajectories overlap in part."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def voxels_seen(source: Source) -> set[int]:
     return set(np.concatenate(keys).tolist())
 
 
-def test_a_frame_is_the_same_whenever_it_is_asked_for() -> None:
+def test_a_frame_does_not_depend_on_the_order_of_requests() -> None:
     first, second = home(), home()
     later = second.frame(7)
     for i in (7, 0):
@@ -58,7 +58,7 @@ def test_two_homes_of_one_seed_are_the_same_and_another_seed_differs() -> None:
     assert not np.array_equal(mugs[0].parts[0].mesh.positions_m, mugs[1].parts[0].mesh.positions_m)
 
 
-def test_the_source_says_what_it_is() -> None:
+def test_the_source_states_its_camera_and_frames() -> None:
     source = home(frames=30)
     assert source.up_axis == (0.0, 0.0, 1.0)
     assert (source.camera.width_px, source.camera.height_px) == (80, 60)
@@ -78,16 +78,16 @@ def test_poses_are_rigid_level_and_inside_the_rooms(trajectory: int) -> None:
 
 
 @pytest.mark.parametrize("trajectory", range(TRAJECTORY_COUNT))
-def test_no_camera_is_inside_anything(trajectory: int) -> None:
+def test_no_camera_is_inside_an_object(trajectory: int) -> None:
     source = home(trajectory, frames=40, size="40x30", noise="0")
     assert min(float(source.frame(i).depth_m.min()) for i in range(len(source))) > 0.35
 
 
-def test_walks_are_smooth_enough_to_follow() -> None:
+def test_trajectories_are_smooth() -> None:
     for trajectory in (0, 1):
-        walk = TRAJECTORIES[trajectory](120)
-        steps = np.linalg.norm(np.diff(walk[:, :3, 3], axis=0), axis=1)
-        turns = np.degrees(np.arccos(np.clip((walk[:-1, :3, 2] * walk[1:, :3, 2]).sum(axis=1), -1, 1)))
+        poses = TRAJECTORIES[trajectory](120)
+        steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+        turns = np.degrees(np.arccos(np.clip((poses[:-1, :3, 2] * poses[1:, :3, 2]).sum(axis=1), -1, 1)))
         assert steps.max() < 0.20
         assert turns.max() < 15.0
 
@@ -98,17 +98,17 @@ def test_agents_overlap_in_part() -> None:
     assert len(a & b) / len(a) < 0.95
 
 
-def test_held_out_views_lie_off_both_walks_and_see_the_same_things() -> None:
-    walked = np.concatenate([TRAJECTORIES[0](120), TRAJECTORIES[1](120)])[:, :3, 3]
+def test_held_out_views_are_apart_from_both_trajectories_and_see_the_same_objects() -> None:
+    training_positions = np.concatenate([TRAJECTORIES[0](120), TRAJECTORIES[1](120)])[:, :3, 3]
     held_out = TRAJECTORIES[2](20)[:, :3, 3]
-    distances = np.linalg.norm(held_out[:, None] - walked[None], axis=2).min(axis=1)
+    distances = np.linalg.norm(held_out[:, None] - training_positions[None], axis=2).min(axis=1)
     assert distances.min() > 0.25
     seen = voxels_seen(home(0, 20)) | voxels_seen(home(1, 20))
     new = voxels_seen(home(2, 10))
     assert len(new & seen) / len(new) > 0.8
 
 
-def test_the_tasks_objects_are_in_view() -> None:
+def test_the_objects_of_the_tasks_are_visible() -> None:
     def share_of_frames(source: Source, names: tuple[str, ...], pixels: int) -> float:
         regions = source.regions()
         frames = [source.frame(i) for i in range(len(source))]
@@ -197,12 +197,12 @@ def test_textures_hold_fine_detail() -> None:
         ("sim:home?seed=9999999999", "seed: expected 0 to 4294967295"),
     ],
 )
-def test_a_wrong_spec_is_named(spec: str, message: str) -> None:
+def test_an_invalid_spec_is_an_error(spec: str, message: str) -> None:
     with pytest.raises(DatasetError, match=message.replace("?", r"\?")):
         open_source(spec)
 
 
-def test_a_missing_ray_caster_says_how_to_install_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_the_ray_caster_the_error_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "embreex.mesh_construction", None)
     with pytest.raises(DatasetError, match=r"pip install 'gausslite\[sim\]'"):
         HomeScene(plan_home(0, seed=5))

@@ -1,1 +1,1 @@
-"""Eight homes as hard as real ones, each a room that somebody lives or works in."""
+"""The eight benchmark homes: furnished rooms with the clutter of real homes and offices."""

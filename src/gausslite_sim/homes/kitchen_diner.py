@@ -1,4 +1,4 @@
-"""Home 3, a kitchen-diner: a counter full of things, a set table with country chairs, a pendant lamp, herbs."""
+"""Home 3, a kitchen-diner: a full counter, a set table with country chairs, a pendant lamp, herbs."""
 
 from __future__ import annotations
 
