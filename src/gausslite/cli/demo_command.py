@@ -71,7 +71,7 @@ def run(options: argparse.Namespace) -> int:
     scenario = simulated_scenario(options) if options.source is None else recorded_scenario(options)
     plan = DemoPlan(
         scenario.agents,
-        _agent_options(options, scenario),
+        _shared_agent_options(options, scenario),
         options.voxel_size,
         options.refine_iterations,
         options.seed,
@@ -99,7 +99,7 @@ def _require_valid(options: argparse.Namespace) -> None:
     open_models(perception_settings(options))
 
 
-def _agent_options(options: argparse.Namespace, scenario: Scenario) -> dict[str, OptionValue]:
+def _shared_agent_options(options: argparse.Namespace, scenario: Scenario) -> dict[str, OptionValue]:
     """Return the options that all agents share; two agents share the processor, so each has one thread by default."""
     settings = mission_settings(options)
     threads = 1 if settings.threads is None else settings.threads

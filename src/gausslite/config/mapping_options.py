@@ -10,7 +10,7 @@ from gausslite.config.presets import PRESETS
 from gausslite.config.toml_text import OptionValue
 from gausslite.config.values import AUTO, NONE, read_names, read_pose_prior, read_pose_prior_or_auto, read_skip_stages
 from gausslite.domain.voxels import VoxelGrid
-from gausslite.mapping.policies import ABLATION_FLAGS, POLICIES, TASK
+from gausslite.mapping.policies import EXTENSION_FLAGS, POLICIES, TASK
 from gausslite.mission.frame_scheduler import SchedulerSettings
 from gausslite.mission.settings import DEFAULT_MAX_GAUSSIANS, MissionSettings, PerceptionSettings
 from gausslite.render.choose import BACKENDS
@@ -66,8 +66,8 @@ def add_policy(parser: argparse.ArgumentParser, allow_auto: bool = False) -> Non
         choices=sorted(POLICIES),
         help="what the budget is spent on (default: task; map without a task: uniform)",
     )
-    others = ", ".join(name for name in ABLATION_FLAGS if name not in ("sb", "mvo", "roi", "sis", "gfd"))
-    add("--disable", metavar="A,B", type=read_names, default=(), help=f"{_DISABLE_HELP}{others}")
+    extensions = ", ".join(EXTENSION_FLAGS)
+    add("--disable", metavar="A,B", type=read_names, default=(), help=f"{_DISABLE_HELP}{extensions}")
     add("--rasterizer", choices=BACKENDS, default="auto", help="backend that renders and trains (default: auto)")
     add_pose_prior(parser, AUTO if allow_auto else _EXACT, AUTO if allow_auto else NONE, allow_auto)
 

@@ -102,9 +102,6 @@ class Layer:
     values: Mapping[str, RawValue]
     origins: Mapping[str, str]
 
-    def __post_init__(self) -> None:
-        assert self.values.keys() == self.origins.keys()
-
 
 def variable_name(key: str) -> str:
     """Return the environment variable of an option: GAUSSLITE_MAX_GAUSSIANS for max-gaussians."""
