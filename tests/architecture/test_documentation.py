@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -109,3 +110,13 @@ def test_flags_named_in_pages_exist(known_flags: set[str]) -> None:
         flags = {flag for part in code for flag in re.findall(r"(?<![\w-])--[a-z][a-z0-9-]*", part)}
         unknown += [f"{page.relative_to(ROOT)}: {flag}" for flag in sorted(flags - known_flags - others)]
     assert not unknown
+
+
+def test_the_configuration_file_of_readme_is_accepted(tmp_path: Path) -> None:
+    [example] = re.findall(r"^```toml\n(.*?)^```", (ROOT / "README.md").read_text(), re.MULTILINE | re.DOTALL)
+    (tmp_path / "agent.toml").write_text(example)
+    command = [sys.executable, "-m", "gausslite_agent", "--config", "agent.toml", "--print-config"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    expected, effective = tomllib.loads(example), tomllib.loads(done.stdout)
+    assert {key: effective[key] for key in expected} == expected
