@@ -165,8 +165,8 @@ def _first_estimator(
     options: argparse.Namespace, inputs: MapInputs, estimators: EstimatorFactory, resumed_after: int
 ) -> RelevanceEstimator:
     """Return the estimator of the first frame's task or regions, and report nouns that the detector does not know."""
-    for graph in inputs.schedule.graphs():
-        for warning in estimators.unsupported_nouns(graph):
+    for scheduled in inputs.schedule.graphs():
+        for warning in estimators.unsupported_nouns(scheduled):
             print(warning, file=sys.stderr)
     graph = inputs.schedule.at(resumed_after)
     return region_estimator(options, inputs.stream.source) if graph is None else estimators.build(graph)

@@ -54,7 +54,7 @@ class MappingBar:
 
     def count(self, outcome: FrameOutcome) -> None:
         """Advance by one frame and show its figures."""
-        self.show(self._bar.n + 1, outcome.gaussians, outcome.roi_share)
+        self.show(int(self._bar.n) + 1, outcome.gaussians, outcome.roi_share)
 
     def show(self, done: int, gaussians: int, roi_share: float, uplink_bytes: int | None = None) -> None:
         """Set the number of frames and show the figures."""

@@ -139,7 +139,8 @@ def _run_mapping(
     settings, size = mission_settings(options), frame_size(options.size, source)
     mapper = GaussianMapper(settings.mapper_settings(), rasterizer, settings.seed)
     bench = LoopBench(choose_estimator(options, source), mapper, VoxelGrid(), settings.scheduler_settings)
-    log, samples_mib = CostLog(), []
+    log = CostLog()
+    samples_mib: list[float] = []
     sample_interval = max(1, len(positions) // _MEMORY_SAMPLES)
     done = 0
 
