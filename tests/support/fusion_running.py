@@ -41,7 +41,7 @@ CAMERA = Camera(40.0, 40.0, 16.0, 12.0, 32, 24)
 
 
 @dataclass(frozen=True)
-class Team:
+class RunningServer:
     """A running server and ways to speak to it."""
 
     servicer: FusionServicer
@@ -54,7 +54,9 @@ class Team:
         """Begin to drain, as on SIGTERM."""
         self.loop.call_soon_threadsafe(self.servicer.drain)
 
-    def say(self, session_id: str, *subsets: RoiSubset, grid: VoxelGrid = GRID) -> list[pb.SubsetOutcome]:
+    def contribute_subsets(
+        self, session_id: str, *subsets: RoiSubset, grid: VoxelGrid = GRID
+    ) -> list[pb.SubsetOutcome]:
         """Send these messages on one stream and collect what became of each."""
         return self.send(*(request(session_id, subset, grid) for subset in subsets))
 
@@ -72,12 +74,12 @@ def request(session_id: str, subset: RoiSubset, grid: VoxelGrid = GRID) -> pb.Co
 
 
 @contextmanager
-def team(
+def fusion_server(
     store: FusionStore | None = None,
     settings: FusionSettings | None = None,
     refine: RefineSettings | None = None,
     tls: Tls | None = None,
-) -> Iterator[Team]:
+) -> Iterator[RunningServer]:
     """A fusion server on a free port with the reference rasterizer; the store stays the caller's.
 
     With tls its own client shows the server's certificate; stub and channel are of no use then.
@@ -97,7 +99,7 @@ def team(
             FusionClient(running.address, tls=tls) as client,
             grpc.insecure_channel(running.address) as channel,
         ):
-            yield Team(servicer, client, pb_grpc.FusionServiceStub(channel), channel, loops[0])
+            yield RunningServer(servicer, client, pb_grpc.FusionServiceStub(channel), channel, loops[0])
     finally:
         servicer.close()
 
@@ -119,7 +121,7 @@ def server_process(*arguments: str) -> Iterator[tuple[subprocess.Popen[bytes], F
             process.wait(20)
 
 
-def words(cells: dict[int, Sequence[int]]) -> VoxelBatch:
+def make_batch(cells: dict[int, Sequence[int]]) -> VoxelBatch:
     """For each cell along x the kappas of the Gaussians in it; none at all is a tombstone."""
     kappas = [(cell, kappa) for cell in sorted(cells) for kappa in cells[cell]]
     n = len(kappas)
@@ -137,8 +139,8 @@ def keys(*cells: int) -> np.ndarray:
     return GRID.keys(centres)
 
 
-def said(agent_id: str, revision: int, cells: dict[int, Sequence[int]]) -> RoiSubset:
-    return RoiSubset(agent_id, "", revision, revision, words(cells))
+def make_subset(agent_id: str, revision: int, cells: dict[int, Sequence[int]]) -> RoiSubset:
+    return RoiSubset(agent_id, "", revision, revision, make_batch(cells))
 
 
 def frame(index: int, camera: Camera = CAMERA, T_world_camera: np.ndarray | None = None) -> Frame:

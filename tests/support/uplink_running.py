@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from fusion_running import GRID, words
+from fusion_running import GRID, make_batch
 from serving import serving
 
 from gausslite.codec.subset_codec import decode_subset
@@ -41,7 +41,7 @@ def uplink(
         link.close()
 
 
-def held(store: MemoryStore) -> dict[int, list[int]]:
+def stored_kappas(store: MemoryStore) -> dict[int, list[int]]:
     """Per voxel the kappas the server holds of the robot."""
     table = store.batch("robot")
     return {
@@ -50,11 +50,11 @@ def held(store: MemoryStore) -> dict[int, list[int]]:
     }
 
 
-def said(*offers: dict[int, list[int]]) -> dict[int, list[int]]:
+def expected_kappas(*offers: dict[int, list[int]]) -> dict[int, list[int]]:
     """Per voxel what these offers leave behind."""
     last: dict[int, list[int]] = {}
     for offer in offers:
-        table = words(offer)
+        table = make_batch(offer)
         for key, start, end in zip(table.keys.tolist(), table.offsets[:-1], table.offsets[1:], strict=True):
             last[key] = table.gaussians.kappa[start:end].tolist()
     return last

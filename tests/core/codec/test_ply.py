@@ -25,26 +25,26 @@ def assert_same(got: Gaussians, sent: Gaussians) -> None:
 
 
 @pytest.mark.parametrize("n", [0, 1, 50])
-def test_what_was_written_is_read(tmp_path: Path, n: int) -> None:
+def test_a_written_map_is_read_back(tmp_path: Path, n: int) -> None:
     path = tmp_path / "map.ply"
     write_ply(path, random_gaussians(n))
     assert_same(read_ply(path), random_gaussians(n))
     assert [file.name for file in tmp_path.iterdir()] == ["map.ply"]
 
 
-def test_opacities_of_zero_and_one_survive() -> None:
+def test_opacities_of_zero_and_one_stay_finite() -> None:
     gaussians = random_gaussians(2)
     gaussians.opacities[:] = [0.0, 1.0]
     np.testing.assert_allclose(gaussians_from_ply(ply_bytes(gaussians)).opacities, [0, 1], atol=2e-6)
 
 
-def test_a_kappa_beyond_what_a_float_can_say_does_not_wrap() -> None:
+def test_a_kappa_beyond_float_precision_is_clipped() -> None:
     gaussians = random_gaussians(1)
     gaussians.kappa[:] = 2**32 - 1
     assert gaussians_from_ply(ply_bytes(gaussians)).kappa.tolist() == [2**32 - 1]
 
 
-def test_another_tool_reads_ours_and_we_read_its(tmp_path: Path) -> None:
+def test_files_are_exchanged_with_another_tool(tmp_path: Path) -> None:
     sent = random_gaussians(50, max_kappa=2**24)
     write_ply(tmp_path / "ours.ply", sent)
     theirs = gsply.plyread(str(tmp_path / "ours.ply"))
@@ -61,7 +61,7 @@ def test_another_tool_reads_ours_and_we_read_its(tmp_path: Path) -> None:
     assert (read.target == -1).all()
 
 
-def test_columns_go_by_name() -> None:
+def test_columns_are_found_by_name() -> None:
     """Normals, f_rest, doubles, comments, another order and a second element: all of it exists in the wild."""
     sent = random_gaussians(4)
     names = ["nx", "rot_3", "rot_2", "rot_1", "rot_0", "opacity", "f_rest_0", "scale_2", "scale_1", "scale_0"]
@@ -96,7 +96,7 @@ def test_columns_go_by_name() -> None:
         (lambda data: data[:-68] + b"\x00\x00\xc0\x7f" + data[-64:], "expected finite values"),
     ],
 )
-def test_a_damaged_map_is_one_line_that_names_the_file(tmp_path: Path, spoil: object, message: str) -> None:
+def test_the_error_of_a_damaged_map_names_the_file(tmp_path: Path, spoil: object, message: str) -> None:
     path = tmp_path / "map.ply"
     path.write_bytes(spoil(ply_bytes(random_gaussians(3))))  # type: ignore[operator]
     with pytest.raises(MapFileError, match=message) as caught:
@@ -112,7 +112,7 @@ def test_a_missing_map_is_a_map_file_error(tmp_path: Path) -> None:
 
 @given(st.data())
 @settings(max_examples=200, deadline=None)
-def test_a_flipped_byte_never_raises_anything_else(data: st.DataObject) -> None:
+def test_a_flipped_byte_raises_only_map_file_error(data: st.DataObject) -> None:
     file = bytearray(ply_bytes(random_gaussians(2)))
     for _ in range(data.draw(st.integers(1, 3))):
         file[data.draw(st.integers(0, len(file) - 1))] = data.draw(st.integers(0, 255))
@@ -125,7 +125,7 @@ def test_a_flipped_byte_never_raises_anything_else(data: st.DataObject) -> None:
     assert "\n" not in message
 
 
-def test_a_full_disk_keeps_the_old_map_and_says_so(tmp_path: Path) -> None:
+def test_a_full_disk_raises_storage_error_and_keeps_the_old_map(tmp_path: Path) -> None:
     path = tmp_path / "map.ply"
     write_ply(path, random_gaussians(3))
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)

@@ -88,14 +88,14 @@ def test_decoding_is_within_the_stated_bounds(case: tuple[float, float, int, int
 
 @given(CASES)
 @settings(max_examples=150, deadline=None)
-def test_encoding_what_was_decoded_gives_the_same_bytes(case: tuple[float, float, int, int]) -> None:
+def test_encoding_a_decoded_message_gives_the_same_bytes(case: tuple[float, float, int, int]) -> None:
     message = encode_subset(*build(case))
     assert encode_subset(*decode_subset(message)) == message
 
 
 @given(CASES, st.data())
 @settings(max_examples=150, deadline=None)
-def test_any_damage_is_noticed(case: tuple[float, float, int, int], data: st.DataObject) -> None:
+def test_any_damage_is_detected(case: tuple[float, float, int, int], data: st.DataObject) -> None:
     message = bytearray(encode_subset(*build(case)))
     place = data.draw(st.integers(0, len(message) - 1))
     message[place] ^= data.draw(st.integers(1, 255))
@@ -107,7 +107,7 @@ def test_any_damage_is_noticed(case: tuple[float, float, int, int], data: st.Dat
 
 @given(st.binary(max_size=300))
 @settings(max_examples=200, deadline=None)
-def test_noise_is_no_message(noise: bytes) -> None:
+def test_random_bytes_are_refused(noise: bytes) -> None:
     with pytest.raises((CodecError, ChecksumError)):
         decode_subset(noise)
 
@@ -148,7 +148,7 @@ def forge(body: bytes, voxels: int, gaussians: int, size_m: float = 0.1) -> byte
     return message + struct.pack("<I", google_crc32c.value(message))
 
 
-def test_a_bomb_is_refused_by_what_it_declares() -> None:
+def test_a_decompression_bomb_is_refused_by_its_declared_size() -> None:
     bomb = zstandard.ZstdCompressor(level=3).compress(bytes(1 << 28))
     with pytest.raises(CodecError, match="expected a body of 20 bytes"):
         decode_subset(forge(bomb, voxels=1, gaussians=0))
@@ -186,7 +186,7 @@ def test_counts_that_disagree_are_refused() -> None:
         ("means_m", 9.0),
     ],
 )
-def test_values_that_mean_nothing_are_not_sent(column: str, value: float) -> None:
+def test_invalid_values_are_not_encoded(column: str, value: float) -> None:
     words = make_words(0, 10, VoxelGrid())
     getattr(words.gaussians, column)[3] = value
     with pytest.raises(InvalidInputError, match=column):
@@ -195,7 +195,7 @@ def test_values_that_mean_nothing_are_not_sent(column: str, value: float) -> Non
 
 @given(st.integers(0, 1000), st.integers(0, 400), st.integers(1024, 6000))
 @settings(max_examples=60, deadline=None)
-def test_parts_fit_and_say_the_same(seed: int, n: int, max_bytes: int) -> None:
+def test_split_parts_fit_and_contain_the_whole_batch(seed: int, n: int, max_bytes: int) -> None:
     grid = VoxelGrid()
     words = make_words(seed, n, grid, spread_m=0.5)
     parts = split_batch(words, max_bytes)

@@ -1,4 +1,4 @@
-"""The ledger as a law: who applies what it names is always where the fused map is."""
+"""The change_log as a law: who applies what it names is always where the fused map is."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ STEPS = st.lists(
 """(agent, Gaussians per voxel or None = is removed, whether the watcher looks afterwards)."""
 
 
-def words(counts: dict[int, int]) -> VoxelBatch:
+def make_batch(counts: dict[int, int]) -> VoxelBatch:
     gaussians = plain_gaussians(np.zeros((sum(counts.values()), 3)), kappa=1)
     per_voxel = np.array([counts[key] for key in sorted(counts)], np.uint32)
     return VoxelBatch(np.array(sorted(counts), np.int64), per_voxel.astype(np.uint64), per_voxel, gaussians)
@@ -39,63 +39,65 @@ def words(counts: dict[int, int]) -> VoxelBatch:
 @settings(max_examples=60, deadline=None)
 @given(STEPS)
 def test_a_watcher_that_applies_the_changes_has_the_fused_map(steps) -> None:
-    team = FusionEngine(MemoryStore(), FusionSettings(grid=GRID), first_revision=1)
-    sessions = {name: team.join(name, MissionConfig("", "", 0.10)).session.session_id for name in ("ant", "bee", "cat")}
+    engine = FusionEngine(MemoryStore(), FusionSettings(grid=GRID), first_revision=1)
+    sessions = {
+        name: engine.join(name, MissionConfig("", "", 0.10)).session.session_id for name in ("ant", "bee", "cat")
+    }
     known, held = 0, {}
     for revision, (agent_id, counts, looks) in enumerate(steps, start=1):
         if counts is None:
-            team.leave(sessions[agent_id], forget=True)
-            sessions[agent_id] = team.join(agent_id, MissionConfig("", "", 0.10)).session.session_id
+            engine.leave(sessions[agent_id], forget=True)
+            sessions[agent_id] = engine.join(agent_id, MissionConfig("", "", 0.10)).session.session_id
         else:
-            team.contribute(sessions[agent_id], RoiSubset(agent_id, "", revision, revision, words(counts)), GRID)
+            engine.contribute(sessions[agent_id], RoiSubset(agent_id, "", revision, revision, make_batch(counts)), GRID)
         if looks:
-            changes = team.changes(known)
+            changes = engine.changes(known)
             held.update(zip(changes.fused.batch.keys.tolist(), changes.fused.vote.votes(), strict=True))
             for key in changes.removed.tolist():
                 held.pop(key, None)
             known = changes.revision
-            votes = team.changes(0).fused.vote.votes()
+            votes = engine.changes(0).fused.vote.votes()
             assert {key: vote.winner for key, vote in held.items()} == {vote.key: vote.winner for vote in votes}
-            assert all(held[key].scores[0] == vote.scores[0] for key, vote in _by_key(team).items())
+            assert all(held[key].scores[0] == vote.scores[0] for key, vote in _by_key(engine).items())
 
 
-def _by_key(team: FusionEngine) -> dict:
-    return {vote.key: vote for vote in team.changes(0).fused.vote.votes()}
+def _by_key(engine: FusionEngine) -> dict:
+    return {vote.key: vote for vote in engine.changes(0).fused.vote.votes()}
 
 
-def record(ledger: ChangeLog, store: MemoryStore, subset: RoiSubset) -> list[int]:
+def record(change_log: ChangeLog, store: MemoryStore, subset: RoiSubset) -> list[int]:
     accepted = store.put(subset).accepted
-    return ledger.record(subset.agent_id, accepted, rank_voxels(store.scores(accepted))).tolist()
+    return change_log.record(subset.agent_id, accepted, rank_voxels(store.scores(accepted))).tolist()
 
 
-def test_only_what_the_vote_shows_is_a_change() -> None:
-    ledger, store = ChangeLog(first_revision=100), MemoryStore()
-    assert record(ledger, store, RoiSubset("ant", "", 1, 1, words({1: 3, 2: 1}))) == [1, 2]
-    assert ledger.revision == 101
-    assert record(ledger, store, RoiSubset("bee", "", 1, 1, words({1: 2}))) == []
-    assert ledger.revision == 101
-    assert record(ledger, store, RoiSubset("bee", "", 2, 2, words({1: 5, 2: 0, 3: 0}))) == [1]
-    assert ledger.changed_since(101).tolist() == [1]
-    assert ledger.changed_since(100).tolist() == [1, 2]
-    assert ledger.changed_since(102).tolist() == []
+def test_only_a_change_of_the_fused_map_is_recorded() -> None:
+    change_log, store = ChangeLog(first_revision=100), MemoryStore()
+    assert record(change_log, store, RoiSubset("ant", "", 1, 1, make_batch({1: 3, 2: 1}))) == [1, 2]
+    assert change_log.revision == 101
+    assert record(change_log, store, RoiSubset("bee", "", 1, 1, make_batch({1: 2}))) == []
+    assert change_log.revision == 101
+    assert record(change_log, store, RoiSubset("bee", "", 2, 2, make_batch({1: 5, 2: 0, 3: 0}))) == [1]
+    assert change_log.changed_since(101).tolist() == [1]
+    assert change_log.changed_since(100).tolist() == [1, 2]
+    assert change_log.changed_since(102).tolist() == []
 
 
 @pytest.mark.parametrize("revision", [0, 99, 103, 10**18])
-def test_a_revision_of_another_life_is_gone(revision: int) -> None:
-    ledger, store = ChangeLog(first_revision=100), MemoryStore()
-    record(ledger, store, RoiSubset("ant", "", 1, 1, words({1: 3})))
+def test_a_revision_from_before_a_restart_is_gone(revision: int) -> None:
+    change_log, store = ChangeLog(first_revision=100), MemoryStore()
+    record(change_log, store, RoiSubset("ant", "", 1, 1, make_batch({1: 3})))
     with pytest.raises(RevisionGoneError, match="expected 100 to 101"):
-        ledger.changed_since(revision)
+        change_log.changed_since(revision)
 
 
-def test_the_memory_of_vanished_voxels_is_bounded() -> None:
-    ledger, store = ChangeLog(first_revision=1, max_removed=2), MemoryStore()
-    record(ledger, store, RoiSubset("ant", "", 1, 1, words({1: 1, 2: 1, 3: 1})))
+def test_the_number_of_recorded_removals_is_limited() -> None:
+    change_log, store = ChangeLog(first_revision=1, max_removed=2), MemoryStore()
+    record(change_log, store, RoiSubset("ant", "", 1, 1, make_batch({1: 1, 2: 1, 3: 1})))
     for revision, key in enumerate((1, 2, 3), start=2):
-        record(ledger, store, RoiSubset("ant", "", revision, revision, words({key: 0})))
-    assert ledger.revision == 5
+        record(change_log, store, RoiSubset("ant", "", revision, revision, make_batch({key: 0})))
+    assert change_log.revision == 5
     with pytest.raises(RevisionGoneError):
-        ledger.changed_since(2)
-    assert ledger.changed_since(3).tolist() == [2, 3]
-    record(ledger, store, RoiSubset("ant", "", 9, 9, words({3: 1})))
-    assert ledger.changed_since(3).tolist() == [2, 3]
+        change_log.changed_since(2)
+    assert change_log.changed_since(3).tolist() == [2, 3]
+    record(change_log, store, RoiSubset("ant", "", 9, 9, make_batch({3: 1})))
+    assert change_log.changed_since(3).tolist() == [2, 3]

@@ -1,4 +1,4 @@
-"""The team's map without a network: figures, terms and quotas, and messages that stay short whatever comes."""
+"""The fusion engine without a network: figures, mission configuration, quotas and short error messages."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ ANYTHING = MissionConfig("", "", 0.10)
 LONG = "x" * 1_000_000
 
 
-def said(agent_id: str, revision: int, cells: list[tuple[int, int]], buried: tuple[int, ...] = ()) -> RoiSubset:
+def make_subset(agent_id: str, revision: int, cells: list[tuple[int, int]], buried: tuple[int, ...] = ()) -> RoiSubset:
     """Words with one Gaussian for each (cell along x, kappa), and tombstones."""
     means = [(0.1 * cell + 0.05, 0.05, 0.05) for cell, _ in cells]
     gaussians = plain_gaussians(means, kappa=[kappa for _, kappa in cells])
@@ -31,15 +31,15 @@ def said(agent_id: str, revision: int, cells: list[tuple[int, int]], buried: tup
     )
 
 
-def test_status_says_who_holds_what() -> None:
-    team = FusionEngine(MemoryStore(), FusionSettings(grid=GRID, mission_id="rescue"), first_revision=10)
-    ant, bee = (team.join(name, ANYTHING).session.session_id for name in ("ant", "bee"))
-    team.contribute(ant, said("ant", 3, [(0, 5), (1, 1), (1, 1)], buried=(4,)), GRID)
-    team.contribute(bee, said("bee", 8, [(1, 9), (2, 0)]), GRID)
-    team.record_traffic("ant", TrafficCounters(roi_bytes=100, subsets_accepted=1))
-    team.record_traffic("ant", TrafficCounters(handover_bytes=7, subsets_stale=1))
-    team.leave(bee)
-    status = team.status()
+def test_status_counts_each_agents_contribution() -> None:
+    engine = FusionEngine(MemoryStore(), FusionSettings(grid=GRID, mission_id="rescue"), first_revision=10)
+    ant, bee = (engine.join(name, ANYTHING).session.session_id for name in ("ant", "bee"))
+    engine.contribute(ant, make_subset("ant", 3, [(0, 5), (1, 1), (1, 1)], buried=(4,)), GRID)
+    engine.contribute(bee, make_subset("bee", 8, [(1, 9), (2, 0)]), GRID)
+    engine.record_traffic("ant", TrafficCounters(roi_bytes=100, subsets_accepted=1))
+    engine.record_traffic("ant", TrafficCounters(handover_bytes=7, subsets_stale=1))
+    engine.leave(bee)
+    status = engine.status()
     assert status.mission_config == MissionConfig("rescue", "world", 0.10)
     assert (status.revision, status.fused_voxels, status.fused_gaussians) == (12, 3, 3)
     assert (status.keyframes, status.refined) == (0, False)
@@ -51,24 +51,24 @@ def test_status_says_who_holds_what() -> None:
     assert (second.agent_id, second.joined, second.won_voxels, second.kappa_sum) == ("bee", False, 2, 9)
 
 
-def test_an_empty_team_has_an_empty_map() -> None:
-    team = FusionEngine(MemoryStore(), FusionSettings(grid=GRID))
-    assert len(team.voted_map()) == len(team.union_map()) == 0
-    assert team.status().agents == ()
-    assert len(team.changes().fused.gaussians) == 0
-    team.close()
+def test_a_mission_without_updates_has_an_empty_map() -> None:
+    engine = FusionEngine(MemoryStore(), FusionSettings(grid=GRID))
+    assert len(engine.voted_map()) == len(engine.union_map()) == 0
+    assert engine.status().agents == ()
+    assert len(engine.changes().fused.gaussians) == 0
+    engine.close()
 
 
-def test_the_first_to_name_the_terms_decides() -> None:
-    team = FusionEngine(MemoryStore(), FusionSettings(grid=GRID))
-    team.join("ant", ANYTHING)
-    assert team.mission_config == MissionConfig("mission", "world", 0.10)
+def test_the_first_agent_that_names_the_mission_fixes_it() -> None:
+    engine = FusionEngine(MemoryStore(), FusionSettings(grid=GRID))
+    engine.join("ant", ANYTHING)
+    assert engine.mission_config == MissionConfig("mission", "world", 0.10)
     with pytest.raises(MismatchError, match="'world' as agreed here, got 'odom'"):
-        team.join("bee", MissionConfig("", "odom", 0.10))
+        engine.join("bee", MissionConfig("", "odom", 0.10))
     assert reconcile(MissionConfig("", "", 0.1), MissionConfig("a", "b", 0.1)) == MissionConfig("a", "b", 0.1)
 
 
-def test_a_store_made_on_other_terms_is_refused() -> None:
+def test_a_store_of_another_mission_is_refused() -> None:
     store = MemoryStore()
     FusionEngine(store, FusionSettings(grid=GRID)).join("ant", MissionConfig("m", "w", 0.10))
     for settings in (FusionSettings(grid=VoxelGrid(0.2)), FusionSettings(grid=GRID, mission_id="other")):
@@ -76,37 +76,37 @@ def test_a_store_made_on_other_terms_is_refused() -> None:
             FusionEngine(store, settings)
 
 
-def test_quotas_count_each_agent_and_a_resend_costs_nothing() -> None:
-    team = FusionEngine(
+def test_quotas_apply_per_agent_and_a_resend_does_not_count() -> None:
+    engine = FusionEngine(
         MemoryStore(), FusionSettings(grid=GRID, quotas=Quotas(voxels_per_agent=2, gaussians_per_agent=2))
     )
-    ant = team.join("ant", ANYTHING).session.session_id
-    team.contribute(ant, said("ant", 1, [(0, 1), (1, 1)]), GRID)
-    assert team.contribute(ant, said("ant", 1, [(0, 1), (1, 1)]), GRID).stale.size == 2
-    team.contribute(ant, said("ant", 2, [(0, 2)], buried=(1,)), GRID)
+    ant = engine.join("ant", ANYTHING).session.session_id
+    engine.contribute(ant, make_subset("ant", 1, [(0, 1), (1, 1)]), GRID)
+    assert engine.contribute(ant, make_subset("ant", 1, [(0, 1), (1, 1)]), GRID).stale.size == 2
+    engine.contribute(ant, make_subset("ant", 2, [(0, 2)], buried=(1,)), GRID)
     with pytest.raises(QuotaError, match="at most 2 Gaussians in all, got 3"):
-        team.contribute(ant, said("ant", 3, [(0, 1), (0, 1), (0, 1)]), GRID)
+        engine.contribute(ant, make_subset("ant", 3, [(0, 1), (0, 1), (0, 1)]), GRID)
     with pytest.raises(QuotaError, match="at most 2 voxels in all, got 3"):
-        team.contribute(ant, said("ant", 3, [], buried=(2,)), GRID)
-    assert team.status().agents[0].gaussians == 1
+        engine.contribute(ant, make_subset("ant", 3, [], buried=(2,)), GRID)
+    assert engine.status().agents[0].gaussians == 1
     for wrong in ({"agents": 0}, {"keyframe_pixels": -1}):
         with pytest.raises(InvalidInputError, match="quota"):
             Quotas(**wrong)
 
 
-def test_whatever_comes_the_message_is_one_short_line() -> None:
-    team = FusionEngine(MemoryStore(), FusionSettings(grid=GRID))
-    ant = team.join("ant", MissionConfig("m", "w", 0.10)).session.session_id
+def test_every_error_message_is_one_short_line() -> None:
+    engine = FusionEngine(MemoryStore(), FusionSettings(grid=GRID))
+    ant = engine.join("ant", MissionConfig("m", "w", 0.10)).session.session_id
     attempts = [
-        lambda: team.join(LONG, ANYTHING),
-        lambda: team.join("", ANYTHING),
-        lambda: team.join("bee", MissionConfig(LONG, "", 0.10)),
-        lambda: team.join("bee", MissionConfig("", "line\nbreak", 0.10)),
-        lambda: team.require_mission(LONG),
-        lambda: team.session(LONG),
-        lambda: team.voted_map(LONG),
-        lambda: team.union_map("line\nbreak"),
-        lambda: team.contribute(ant, said(LONG, 1, []), GRID),
+        lambda: engine.join(LONG, ANYTHING),
+        lambda: engine.join("", ANYTHING),
+        lambda: engine.join("bee", MissionConfig(LONG, "", 0.10)),
+        lambda: engine.join("bee", MissionConfig("", "line\nbreak", 0.10)),
+        lambda: engine.require_mission(LONG),
+        lambda: engine.session(LONG),
+        lambda: engine.voted_map(LONG),
+        lambda: engine.union_map("line\nbreak"),
+        lambda: engine.contribute(ant, make_subset(LONG, 1, []), GRID),
     ]
     for attempt in attempts:
         with pytest.raises(GaussLiteError) as caught:
@@ -114,4 +114,4 @@ def test_whatever_comes_the_message_is_one_short_line() -> None:
         assert len(str(caught.value)) < 300
         assert "\n" not in str(caught.value)
     with pytest.raises(SessionUnknownError, match="join, then send every voxel again"):
-        team.session("gone")
+        engine.session("gone")

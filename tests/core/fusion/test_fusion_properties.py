@@ -101,7 +101,7 @@ def assert_same_map(a: FusedMap, b: FusedMap) -> None:
 
 @law
 @given(HISTORIES, st.randoms(use_true_random=False))
-def test_duplicates_and_any_order_leave_the_map_as_it_is(history: dict[str, list[Spec]], random) -> None:
+def test_duplicates_and_reordering_do_not_change_the_map(history: dict[str, list[Spec]], random) -> None:
     subsets = subsets_from(history)
     shuffled = random.sample(subsets + subsets, 2 * len(subsets))
     assert_same_map(fuse(stored(shuffled).batches()), fuse(stored(subsets).batches()))
@@ -110,9 +110,7 @@ def test_duplicates_and_any_order_leave_the_map_as_it_is(history: dict[str, list
 
 @law
 @given(HISTORIES, st.integers(0, 20), st.integers(0, 20))
-def test_a_connection_that_drops_and_resumes_leaves_no_trace(
-    history: dict[str, list[Spec]], dropped: int, again: int
-) -> None:
+def test_a_resumed_connection_gives_the_same_map(history: dict[str, list[Spec]], dropped: int, again: int) -> None:
     subsets = subsets_from(history)
     resumed = subsets[:dropped] + subsets[max(0, dropped - again) :]
     assert_same_map(fuse(stored(resumed).batches()), fuse(stored(subsets).batches()))
@@ -120,7 +118,7 @@ def test_a_connection_that_drops_and_resumes_leaves_no_trace(
 
 @law
 @given(HISTORIES, st.sampled_from(AGENTS))
-def test_removing_an_agent_equals_never_having_had_it(history: dict[str, list[Spec]], leaver: str) -> None:
+def test_removing_an_agent_gives_the_map_without_it(history: dict[str, list[Spec]], leaver: str) -> None:
     subsets = subsets_from(history)
     store = stored(subsets)
     store.remove_agent(leaver)
@@ -137,7 +135,7 @@ def test_adding_agents_in_any_order_commutes(specs: dict[str, Spec], random) -> 
 
 @law
 @given(TABLES, st.integers(1, 4))
-def test_the_shards_united_are_the_whole(specs: dict[str, Spec], shards: int) -> None:
+def test_the_union_of_shards_is_the_whole_map(specs: dict[str, Spec], shards: int) -> None:
     table = table_from(specs)
     parts = [
         fuse({agent: select_voxels(words, words.keys % shards == shard) for agent, words in table.items()})
@@ -186,7 +184,7 @@ def test_provenance_and_margin_agree_with_the_votes(specs: dict[str, Spec]) -> N
 
 @law
 @given(TABLES)
-def test_concatenation_keeps_everyone(specs: dict[str, Spec]) -> None:
+def test_the_union_map_contains_all_gaussians(specs: dict[str, Spec]) -> None:
     table = table_from(specs)
     everything = union_maps(table)
     assert len(everything.gaussians) == sum(len(words.gaussians) for words in table.values())
@@ -196,7 +194,7 @@ def test_concatenation_keeps_everyone(specs: dict[str, Spec]) -> None:
 
 @law
 @given(HISTORIES)
-def test_the_vote_on_stored_totals_is_the_vote_on_the_words(history: dict[str, list[Spec]]) -> None:
+def test_the_vote_on_scores_equals_the_vote_on_batches(history: dict[str, list[Spec]]) -> None:
     subsets = subsets_from(history)
     store = stored(subsets)
     assert list(rank_voxels(store.scores()).votes()) == list(fuse(store.batches()).vote.votes())
@@ -230,6 +228,6 @@ def test_ties_go_to_more_gaussians_and_then_to_the_lower_id(
         assert [vote.winner for vote in fuse_maps(maps, GRID).vote.votes()] == [winner]
 
 
-def test_no_words_fuse_to_an_empty_map() -> None:
+def test_no_updates_fuse_to_an_empty_map() -> None:
     assert len(fuse({}).gaussians) == len(union_maps({}).gaussians) == 0
     assert len(fuse_maps({"ant": Gaussians.empty()}, GRID).gaussians) == 0

@@ -24,7 +24,7 @@ from gausslite.fusion.store import FusionStore, MissionConfig, SessionRecord
 KEYS = (11, 22, 33)
 
 
-def said(agent_id: str, revision: int, counts: dict[int, int], kappa: int = 1, seed: int = 0) -> RoiSubset:
+def make_subset(agent_id: str, revision: int, counts: dict[int, int], kappa: int = 1, seed: int = 0) -> RoiSubset:
     """A message with so many Gaussians of this kappa in each voxel."""
     n = sum(counts.values())
     numbers = np.random.default_rng(seed).random((n, 14), np.float32)
@@ -51,8 +51,8 @@ def store(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[FusionStor
     store.close()
 
 
-def test_what_was_put_is_what_is_read(store: FusionStore) -> None:
-    message = said("ant", 1, {11: 2, 22: 0, 33: 5})
+def test_stored_updates_are_read_back(store: FusionStore) -> None:
+    message = make_subset("ant", 1, {11: 2, 22: 0, 33: 5})
     outcome = store.put(message)
     assert outcome.accepted.tolist() == list(KEYS)
     assert outcome.stale.tolist() == []
@@ -65,25 +65,25 @@ def test_what_was_put_is_what_is_read(store: FusionStore) -> None:
 
 
 def test_the_highest_revision_wins_and_an_equal_one_is_stale(store: FusionStore) -> None:
-    store.put(said("ant", 5, {11: 2, 22: 2}))
-    assert store.put(said("ant", 5, {11: 4})).stale.tolist() == [11]
-    assert store.put(said("ant", 4, {11: 4})).stale.tolist() == [11]
-    later = store.put(said("ant", 6, {11: 1, 33: 1}))
+    store.put(make_subset("ant", 5, {11: 2, 22: 2}))
+    assert store.put(make_subset("ant", 5, {11: 4})).stale.tolist() == [11]
+    assert store.put(make_subset("ant", 4, {11: 4})).stale.tolist() == [11]
+    later = store.put(make_subset("ant", 6, {11: 1, 33: 1}))
     assert later.accepted.tolist() == [11, 33]
     assert store.batch("ant").counts.tolist() == [1, 2, 1]
     assert store.highest_map_revision("ant") == 6
     assert store.highest_map_revision("bee") == 0
 
 
-def test_a_tombstone_is_kept_so_that_an_older_word_cannot_come_back(store: FusionStore) -> None:
-    store.put(said("ant", 2, {11: 0}))
-    assert store.put(said("ant", 1, {11: 3})).stale.tolist() == [11]
+def test_a_tombstone_is_kept_and_makes_older_updates_stale(store: FusionStore) -> None:
+    store.put(make_subset("ant", 2, {11: 0}))
+    assert store.put(make_subset("ant", 1, {11: 3})).stale.tolist() == [11]
     assert store.batch("ant").counts.tolist() == [0]
 
 
 def test_agents_do_not_touch_each_other(store: FusionStore) -> None:
-    store.put(said("ant", 9, {11: 2}))
-    store.put(said("bee", 1, {11: 1, 22: 1}))
+    store.put(make_subset("ant", 9, {11: 2}))
+    store.put(make_subset("bee", 1, {11: 1, 22: 1}))
     scores = store.scores()
     assert scores.agents == ("ant", "bee")
     assert scores.agent_index.tolist() == [0, 1, 1]
@@ -96,9 +96,9 @@ def test_agents_do_not_touch_each_other(store: FusionStore) -> None:
     assert store.remove_agent("nobody").tolist() == []
 
 
-def test_reading_some_voxels_is_reading_all_and_choosing(store: FusionStore) -> None:
-    store.put(said("ant", 1, {11: 2, 22: 3, 33: 0}))
-    store.put(said("bee", 1, {22: 1}))
+def test_reading_some_voxels_equals_selecting_from_all(store: FusionStore) -> None:
+    store.put(make_subset("ant", 1, {11: 2, 22: 3, 33: 0}))
+    store.put(make_subset("bee", 1, {22: 1}))
     wanted = np.array([33, 22, 99, 22], np.int64)
     for agent_id, words in store.batches(wanted).items():
         expected = select_keys(store.batch(agent_id), wanted)
@@ -109,17 +109,17 @@ def test_reading_some_voxels_is_reading_all_and_choosing(store: FusionStore) -> 
 
 
 def test_an_empty_message_changes_nothing(store: FusionStore) -> None:
-    assert len(store.put(said("ant", 1, {})).accepted) == 0
+    assert len(store.put(make_subset("ant", 1, {})).accepted) == 0
     assert store.agents() == ()
 
 
-def test_a_revision_beyond_the_columns_is_refused_whole(store: FusionStore) -> None:
+def test_a_message_with_too_large_a_revision_is_refused_completely(store: FusionStore) -> None:
     with pytest.raises(InvalidInputError, match="map_revision"):
-        store.put(said("ant", 2**63, {11: 1}))
+        store.put(make_subset("ant", 2**63, {11: 1}))
     assert store.agents() == ()
 
 
-def test_an_agent_has_one_session_and_the_charter_is_remembered(store: FusionStore) -> None:
+def test_an_agent_has_one_session_and_the_mission_config_is_stored(store: FusionStore) -> None:
     assert store.mission_config() is None
     mission_config = MissionConfig("mission", "world", 0.1)
     store.set_mission_config(mission_config)
@@ -133,10 +133,10 @@ def test_an_agent_has_one_session_and_the_charter_is_remembered(store: FusionSto
     assert store.sessions() == (SessionRecord("two", "bee"),)
 
 
-def test_threads_may_put_at_once(store: FusionStore) -> None:
+def test_threads_can_put_concurrently(store: FusionStore) -> None:
     def talk(agent_id: str) -> None:
         for revision in range(20):
-            store.put(said(agent_id, revision, {11: 1, 22: revision % 3}))
+            store.put(make_subset(agent_id, revision, {11: 1, 22: revision % 3}))
 
     threads = [Thread(target=talk, args=(name,)) for name in ("ant", "bee", "cat")]
     for thread in threads:
@@ -146,10 +146,10 @@ def test_threads_may_put_at_once(store: FusionStore) -> None:
     assert store.scores().map_revisions.tolist() == [19] * 6
 
 
-def test_a_sqlite_store_survives_being_closed_and_opened(tmp_path: Path) -> None:
+def test_a_reopened_sqlite_store_has_the_same_content(tmp_path: Path) -> None:
     path = tmp_path / "store.sqlite"
     store = SqliteStore(path)
-    store.put(said("ant", 3, {11: 2}))
+    store.put(make_subset("ant", 3, {11: 2}))
     store.save_session(SessionRecord("one", "ant"))
     store.set_mission_config(MissionConfig("m", "w", 0.1))
     store.close()
@@ -168,12 +168,12 @@ from test_fusion_stores import said
 from gausslite.fusion.sqlite_store import SqliteStore
 store = SqliteStore(Path(sys.argv[1]))
 for revision in range(1, 1_000_000):
-    store.put(said("ant", revision, {11: 3, 100 + revision: 2}, seed=revision))
+    store.put(make_subset("ant", revision, {11: 3, 100 + revision: 2}, seed=revision))
     print(revision, flush=True)
 """
 
 
-def test_what_was_acknowledged_survives_a_kill(tmp_path: Path) -> None:
+def test_acknowledged_updates_survive_a_kill(tmp_path: Path) -> None:
     path = tmp_path / "store.sqlite"
     child = subprocess.Popen(
         [sys.executable, "-c", CHILD, str(path), str(Path(__file__).parent)], stdout=subprocess.PIPE, text=True
@@ -216,7 +216,7 @@ def test_a_foreign_file_is_one_clear_error(tmp_path: Path, content: bytes | None
 
 def _damaged(path: Path) -> None:
     store = SqliteStore(path)
-    store.put(said("ant", 1, dict.fromkeys(range(60), 40)))
+    store.put(make_subset("ant", 1, dict.fromkeys(range(60), 40)))
     store.close()
     data = bytearray(path.read_bytes())
     data[4096 : len(data) // 2] = bytes(len(data) // 2 - 4096)
@@ -248,24 +248,24 @@ def test_an_unwritable_place_is_one_clear_error(tmp_path: Path) -> None:
         SqliteStore(tmp_path)
 
 
-def test_a_second_server_on_the_same_file_is_told_so(tmp_path: Path) -> None:
+def test_a_second_server_on_the_same_file_is_refused(tmp_path: Path) -> None:
     first = SqliteStore(tmp_path / "store.sqlite")
     with pytest.raises(StorageError, match="in use by another server"):
         SqliteStore(tmp_path / "store.sqlite")
     first.close()
 
 
-def test_a_full_disk_refuses_the_message_and_keeps_the_rest(tmp_path: Path) -> None:
+def test_a_full_disk_refuses_the_message_and_keeps_earlier_ones(tmp_path: Path) -> None:
     store = SqliteStore(tmp_path / "store.sqlite", max_bytes=200_000)
-    store.put(said("ant", 1, {11: 3}))
+    store.put(make_subset("ant", 1, {11: 3}))
     with pytest.raises(StorageError, match="no space left"):
-        store.put(said("ant", 2, {11: 1, 22: 10_000}))
+        store.put(make_subset("ant", 2, {11: 1, 22: 10_000}))
     assert store.batch("ant").counts.tolist() == [3]
-    store.put(said("ant", 3, {11: 2}))
+    store.put(make_subset("ant", 3, {11: 2}))
     assert store.batch("ant").counts.tolist() == [2]
     store.close()
 
 
-def test_gathering_rows_runs_through_every_run() -> None:
+def test_gather_rows_returns_every_run() -> None:
     rows = gather_rows(np.array([5, 0, 9]), np.array([2, 0, 3], np.uint32))
     assert rows.tolist() == [5, 6, 9, 10, 11]

@@ -40,7 +40,7 @@ def always(_: RefineProgress) -> bool:
     return True
 
 
-def test_the_map_moves_towards_what_the_keyframes_show() -> None:
+def test_refinement_moves_the_map_towards_the_keyframes() -> None:
     before = patch(0.2)
     heard: list[RefineProgress] = []
 
@@ -65,7 +65,7 @@ def test_the_same_seed_gives_the_same_map() -> None:
     assert maps[0].means_m.tobytes() == maps[1].means_m.tobytes()
 
 
-def test_gaussians_come_to_rest_between_views_that_contradict_each_other() -> None:
+def test_gaussians_converge_between_contradicting_views() -> None:
     views = [view(1, 200), view(2, 30)]
     undisturbed = DensitySettings(densify_every=1000, prune_every=1000)
 
@@ -85,18 +85,18 @@ def test_gaussians_come_to_rest_between_views_that_contradict_each_other() -> No
     assert last_steps(RefineSettings().adam) < 0.6 * last_steps(ONLINE_RATES)
 
 
-def test_what_stands_in_front_of_the_map_teaches_nothing() -> None:
+def test_pixels_that_occlude_the_map_are_not_trained() -> None:
     with pytest.raises(InvalidInputError, match="1 but none does"):
         refine(patch(0.2), [view(1, 250, depth_m=0.5)], ReferenceRasterizer(), QUICK, always)
 
 
-def test_a_keyframe_weight_of_zero_teaches_nothing() -> None:
+def test_pixels_with_weight_zero_are_not_trained() -> None:
     weightless = AgentKeyframe("ant", view(1, 200).frame, np.zeros((18, 24), np.float32))
     with pytest.raises(InvalidInputError, match="none does"):
         refine(patch(0.2), [weightless], ReferenceRasterizer(), QUICK, always)
 
 
-def test_it_stops_when_told_to() -> None:
+def test_refinement_stops_when_the_callback_returns_false() -> None:
     heard = []
 
     def stop_at_once(progress: RefineProgress) -> bool:
@@ -107,14 +107,14 @@ def test_it_stops_when_told_to() -> None:
     assert heard == [2]
 
 
-def test_growth_stays_under_the_cap_and_views_beyond_the_cache_still_teach() -> None:
+def test_growth_stays_under_the_cap_and_uncached_views_are_trained() -> None:
     eager = DensitySettings(densify_every=1, min_mean_gradient=0.0, prune_every=2, min_opacity=0.0)
     settings = RefineSettings(iterations=6, headroom=2.0, max_gaussians=20, max_prepared_views=1, density=eager)
     after = refine(patch(0.2), [view(1, 200), view(2, 200)], ReferenceRasterizer(), settings, always)
     assert 16 < len(after) <= 20
 
 
-def test_a_map_whose_gaussians_all_fade_is_not_pruned_away() -> None:
+def test_a_map_of_faint_gaussians_is_not_pruned_completely() -> None:
     strict = DensitySettings(densify_every=100, prune_every=1, min_opacity=1.1)
     after = refine(
         patch(0.2), [view(1, 200)], ReferenceRasterizer(), RefineSettings(iterations=2, density=strict), always
@@ -122,7 +122,7 @@ def test_a_map_whose_gaussians_all_fade_is_not_pruned_away() -> None:
     assert len(after) == 16
 
 
-def test_nothing_or_too_much_to_refine_is_refused() -> None:
+def test_an_empty_or_too_large_map_is_refused() -> None:
     with pytest.raises(InvalidInputError, match="got an empty one"):
         refine(Gaussians.empty(), [view(1, 200)], ReferenceRasterizer(), QUICK, always)
     with pytest.raises(QuotaError, match="at most 3 Gaussians, got 16"):

@@ -1,4 +1,4 @@
-"""Words per voxel and the ledger of what changed."""
+"""Words per voxel and the tracker of what changed."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def active_gaussians(count: int = 60) -> Gaussians:
     return gaussians
 
 
-def test_words_hold_each_gaussian_once_in_its_voxel_with_totals() -> None:
+def test_a_batch_has_each_gaussian_once_in_its_voxel_with_totals() -> None:
     gaussians = some_gaussians(200)
     words = group_by_voxel(gaussians, GRID)
     assert int(words.counts.sum()) == 200
@@ -31,33 +31,33 @@ def test_words_hold_each_gaussian_once_in_its_voxel_with_totals() -> None:
     assert int(words.kappa_sums[0]) == int(first.sum())
 
 
-def test_no_gaussians_make_no_words() -> None:
+def test_no_gaussians_give_an_empty_batch() -> None:
     assert len(group_by_voxel(Gaussians.empty(), GRID)) == 0
     assert len(SentVoxelTracker(GRID).collect_changes(Gaussians.empty())) == 0
 
 
-def test_the_first_call_tells_all_active_ones_and_the_second_nothing() -> None:
-    ledger, gaussians = SentVoxelTracker(GRID), some_gaussians(100)
-    words = ledger.collect_changes(gaussians)
+def test_the_first_call_returns_all_active_voxels_and_the_second_none() -> None:
+    tracker, gaussians = SentVoxelTracker(GRID), some_gaussians(100)
+    words = tracker.collect_changes(gaussians)
     assert len(words.gaussians) == int(gaussians.active.sum())
     assert words.gaussians.active.all()
-    assert len(ledger.collect_changes(gaussians)) == 0
+    assert len(tracker.collect_changes(gaussians)) == 0
 
 
-def test_order_within_the_map_is_no_change() -> None:
-    ledger, gaussians = SentVoxelTracker(GRID), active_gaussians()
-    ledger.collect_changes(gaussians)
-    assert len(ledger.collect_changes(gaussians.take(np.random.default_rng(0).permutation(60)))) == 0
+def test_the_order_of_gaussians_is_not_a_change() -> None:
+    tracker, gaussians = SentVoxelTracker(GRID), active_gaussians()
+    tracker.collect_changes(gaussians)
+    assert len(tracker.collect_changes(gaussians.take(np.random.default_rng(0).permutation(60)))) == 0
 
 
-def test_growth_of_kappa_and_any_change_of_value_are_told_for_that_voxel_alone() -> None:
-    ledger, gaussians = SentVoxelTracker(GRID), active_gaussians()
-    ledger.collect_changes(gaussians)
+def test_a_change_of_any_value_returns_only_that_voxel() -> None:
+    tracker, gaussians = SentVoxelTracker(GRID), active_gaussians()
+    tracker.collect_changes(gaussians)
     key = GRID.keys(gaussians.means_m[3:4])[0]
     for column in ("kappa", "opacities", "rgb", "scales_m", "quats_wxyz", "target"):
         values = getattr(gaussians, column)
         values[3] = values[3] + values.dtype.type(1)
-        words = ledger.collect_changes(gaussians)
+        words = tracker.collect_changes(gaussians)
         assert words.keys.tolist() == [key], column
         assert int(words.counts[0]) == int((GRID.keys(gaussians.means_m) == key).sum())
 
@@ -65,56 +65,56 @@ def test_growth_of_kappa_and_any_change_of_value_are_told_for_that_voxel_alone()
 def test_values_swapped_between_two_gaussians_of_a_voxel_are_a_change() -> None:
     gaussians = active_gaussians(2)
     gaussians.means_m[:] = [[0.1, 0.1, 0.1], [0.2, 0.2, 0.2]]
-    ledger = SentVoxelTracker(GRID)
-    ledger.collect_changes(gaussians)
+    tracker = SentVoxelTracker(GRID)
+    tracker.collect_changes(gaussians)
     gaussians.rgb[:] = gaussians.rgb[::-1].copy()
-    assert len(ledger.collect_changes(gaussians)) == 1
+    assert len(tracker.collect_changes(gaussians)) == 1
 
 
 def test_a_voxel_that_lost_its_gaussians_gets_one_tombstone() -> None:
-    ledger, gaussians = SentVoxelTracker(GRID), active_gaussians()
-    ledger.collect_changes(gaussians)
+    tracker, gaussians = SentVoxelTracker(GRID), active_gaussians()
+    tracker.collect_changes(gaussians)
     keys = GRID.keys(gaussians.means_m)
     left = gaussians.take(keys != keys[5])
-    words = ledger.collect_changes(left)
+    words = tracker.collect_changes(left)
     assert words.keys.tolist() == [keys[5]]
     assert words.counts.tolist() == [0]
     assert words.kappa_sums.tolist() == [0]
-    assert len(ledger.collect_changes(left)) == 0
+    assert len(tracker.collect_changes(left)) == 0
 
 
-def test_after_forget_everything_is_told_again() -> None:
-    ledger, gaussians = SentVoxelTracker(GRID), active_gaussians()
-    before = ledger.collect_changes(gaussians)
-    ledger.mark_all_unsent()
-    np.testing.assert_array_equal(ledger.collect_changes(gaussians).keys, before.keys)
+def test_after_mark_all_unsent_every_voxel_is_returned_again() -> None:
+    tracker, gaussians = SentVoxelTracker(GRID), active_gaussians()
+    before = tracker.collect_changes(gaussians)
+    tracker.mark_all_unsent()
+    np.testing.assert_array_equal(tracker.collect_changes(gaussians).keys, before.keys)
 
 
-def test_words_on_an_earlier_tasks_region_stand_and_are_neither_taken_back_nor_followed() -> None:
-    ledger, gaussians = SentVoxelTracker(GRID), active_gaussians()
-    ledger.collect_changes(gaussians)
-    ledger.freeze_sent()
+def test_frozen_voxels_get_no_updates_and_no_tombstones() -> None:
+    tracker, gaussians = SentVoxelTracker(GRID), active_gaussians()
+    tracker.collect_changes(gaussians)
+    tracker.freeze_sent()
     gaussians.active[:] = False
     gaussians.rgb[:] = 0.0
-    assert len(ledger.collect_changes(gaussians)) == 0
-    assert len(ledger.collect_changes(gaussians.take(np.arange(0)))) == 0
+    assert len(tracker.collect_changes(gaussians)) == 0
+    assert len(tracker.collect_changes(gaussians.take(np.arange(0)))) == 0
 
 
-def test_a_released_word_gives_way_to_one_that_was_trained_as_much_and_to_no_other() -> None:
-    ledger, gaussians = SentVoxelTracker(GRID), active_gaussians()
+def test_a_frozen_voxel_is_replaced_only_at_an_equal_or_higher_kappa_sum() -> None:
+    tracker, gaussians = SentVoxelTracker(GRID), active_gaussians()
     gaussians.kappa[:] = 10
-    told = {int(key): int(total) for key, total in zip(*_sums(ledger.collect_changes(gaussians)), strict=True)}
-    ledger.freeze_sent()
+    told = {int(key): int(total) for key, total in zip(*_sums(tracker.collect_changes(gaussians)), strict=True)}
+    tracker.freeze_sent()
     less = gaussians.take(np.arange(len(gaussians)))
     less.kappa[:] = 9
-    assert len(ledger.collect_changes(less)) == 0
-    assert len(ledger.exclude_frozen(group_by_voxel(less, GRID))) == 0
+    assert len(tracker.collect_changes(less)) == 0
+    assert len(tracker.exclude_frozen(group_by_voxel(less, GRID))) == 0
     less.kappa[:] = 11
-    again = {int(key): int(total) for key, total in zip(*_sums(ledger.collect_changes(less)), strict=True)}
+    again = {int(key): int(total) for key, total in zip(*_sums(tracker.collect_changes(less)), strict=True)}
     assert set(again) == set(told)
     assert all(again[key] >= told[key] for key in told)
     # from now on these are ordinary words of the region: what vanishes is taken back
-    assert ledger.collect_changes(less.take(np.arange(0))).keys.tolist() == sorted(told)
+    assert tracker.collect_changes(less.take(np.arange(0))).keys.tolist() == sorted(told)
 
 
 def _sums(words: VoxelBatch) -> tuple[list[int], list[int]]:
@@ -122,13 +122,13 @@ def _sums(words: VoxelBatch) -> tuple[list[int], list[int]]:
 
 
 def test_applying_all_changes_in_order_rebuilds_the_whole() -> None:
-    rng, ledger = np.random.default_rng(0), SentVoxelTracker(GRID)
+    rng, tracker = np.random.default_rng(0), SentVoxelTracker(GRID)
     known: dict[int, tuple[int, int]] = {}
     gaussians = active_gaussians(80)
     for _ in range(5):
         gaussians = gaussians.take(rng.random(len(gaussians)) < 0.8)
         gaussians.kappa[rng.random(len(gaussians)) < 0.3] += 1
-        words = ledger.collect_changes(gaussians)
+        words = tracker.collect_changes(gaussians)
         for key, kappa, count in zip(words.keys, words.kappa_sums, words.counts, strict=True):
             known[int(key)] = (int(kappa), int(count))
     whole = group_by_voxel(gaussians, GRID)

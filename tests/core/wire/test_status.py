@@ -70,18 +70,18 @@ def test_the_client_raises_what_the_server_raised(kind: type[GaussLiteError]) ->
 
 
 @pytest.mark.parametrize(("kind", "code"), CODES.items(), ids=lambda value: getattr(value, "__name__", ""))
-def test_codes_are_those_of_the_design(kind: type[GaussLiteError], code: grpc.StatusCode) -> None:
+def test_each_error_has_its_documented_code(kind: type[GaussLiteError], code: grpc.StatusCode) -> None:
     assert code_and_reason(kind("x"))[0] is code
 
 
-def test_every_error_has_a_reason_of_its_own() -> None:
+def test_every_error_has_a_unique_reason() -> None:
     reasons = [code_and_reason(kind("x"))[1] for kind in ERRORS]
     assert len(set(reasons)) == len(ERRORS)
     assert [type(error_from_reason(reason, "x")) for reason in reasons] == ERRORS
     assert type(error_from_reason("OF_ANOTHER_VERSION", "x")) is GaussLiteError
 
 
-def test_what_strangers_say_becomes_the_class_of_its_code() -> None:
+def test_a_status_without_our_details_gets_the_class_of_its_code() -> None:
     with serving([service(Raising())]) as server, ParserClient(server.address) as client:
         with pytest.raises(errors.NotPermittedError, match="no certificate"):
             client.parse("UNAUTHENTICATED")
@@ -89,7 +89,7 @@ def test_what_strangers_say_becomes_the_class_of_its_code() -> None:
             client.parse("x" * (MAX_MESSAGE_BYTES + 1))
 
 
-def test_a_server_that_takes_too_long_is_unavailable() -> None:
+def test_a_missed_deadline_is_unavailable() -> None:
     class Slow(parser_service_pb2_grpc.ParserServiceServicer):
         async def ParseTask(self, request: Any, context: Any) -> TaskGraph:
             await asyncio.Event().wait()

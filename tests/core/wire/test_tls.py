@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from certificates import SCRIPT, identity, make_certificates
-from fusion_running import GRID, team
+from fusion_running import GRID, fusion_server
 from sample_gaussians import plain_gaussians
 from serving import serving
 
@@ -51,14 +51,14 @@ def test_a_client_of_the_same_authority_is_served_and_others_are_not(certs: Path
                 client.parse("Pick up the mug")
 
 
-def test_a_server_without_authorities_asks_for_no_certificate(certs: Path) -> None:
+def test_a_server_without_authorities_requires_no_client_certificate(certs: Path) -> None:
     with serving([parser_service(RuleParser())], tls=Tls(identity(certs, "server").identity)) as server:
         anyone = Tls(authorities=(certs / "ca.pem").read_bytes())
         with ParserClient(server.address, tls=anyone) as client:
             assert client.parse("Pick up the mug").targets == ("mug",)
 
 
-def test_a_server_of_another_name_is_not_believed(certs: Path, tmp_path: Path) -> None:
+def test_a_server_with_another_name_is_refused(certs: Path, tmp_path: Path) -> None:
     listen = f"unix:{tmp_path}/x.sock"
     with serving([parser_service(RuleParser())], listen, identity(certs, "server")):
         trusted = identity(certs, "husky-1")
@@ -73,9 +73,9 @@ def test_a_server_of_another_name_is_not_believed(certs: Path, tmp_path: Path) -
         client.parse("Pick up the mug")
 
 
-def test_a_robot_speaks_for_itself_alone(certs: Path) -> None:
+def test_a_robot_can_only_act_for_its_own_agent_id(certs: Path) -> None:
     with (
-        team(tls=identity(certs, "server")) as fusion,
+        fusion_server(tls=identity(certs, "server")) as fusion,
         FusionClient(fusion.client.address, tls=identity(certs, "husky-1")) as client,
     ):
         with pytest.raises(NotPermittedError, match="'husky-2': expected a certificate that names it, got one for"):
@@ -83,9 +83,9 @@ def test_a_robot_speaks_for_itself_alone(certs: Path) -> None:
         assert client.join("husky-1", GRID).session_id
 
 
-def test_an_uplink_brings_its_words_over_an_encrypted_connection(certs: Path) -> None:
+def test_an_uplink_sends_over_an_encrypted_connection(certs: Path) -> None:
     words = group_by_voxel(plain_gaussians(np.linspace(0, 1, 60)), GRID)
-    with team(tls=identity(certs, "server")) as fusion:
+    with fusion_server(tls=identity(certs, "server")) as fusion:
         for name in ("husky-1", "husky-2"):
             client = FusionClient(fusion.client.address, tls=identity(certs, name))
             # the second one shows the first one's name
@@ -99,7 +99,7 @@ def test_an_uplink_brings_its_words_over_an_encrypted_connection(certs: Path) ->
         assert agent.gaussians == 20
 
 
-def test_health_is_asked_over_tls(certs: Path) -> None:
+def test_the_health_check_works_over_tls(certs: Path) -> None:
     options = [f"--tls-{kind}={certs / name}" for kind, name in _FILES]
     with serving([parser_service(RuleParser())], tls=identity(certs, "server")) as server:
         assert ask_health([server.address, *options]) == 0
@@ -108,7 +108,7 @@ def test_health_is_asked_over_tls(certs: Path) -> None:
 
 
 @pytest.mark.parametrize("module", ["gausslite_parser", "gausslite_fusion_server", "gausslite_agent"])
-def test_each_service_listens_encrypted_and_never_says_its_key(module: str, certs: Path, tmp_path: Path) -> None:
+def test_each_service_listens_encrypted_and_never_prints_its_key(module: str, certs: Path, tmp_path: Path) -> None:
     listen = f"unix:{tmp_path}/s.sock"
     options = [f"--tls-{kind}={certs / name}" for kind, name in _FILES]
     command = [sys.executable, "-m", module, "--listen", listen, *options]
@@ -126,7 +126,7 @@ def test_each_service_listens_encrypted_and_never_says_its_key(module: str, cert
 
 
 @pytest.mark.parametrize("module", ["gausslite_parser", "gausslite_fusion_server", "gausslite_agent"])
-def test_wrong_files_are_one_line_before_anything_is_served(
+def test_wrong_files_are_one_error_line_before_serving(
     module: str, certs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = importlib.import_module(f"{module}.program").run
@@ -139,7 +139,7 @@ def test_wrong_files_are_one_line_before_anything_is_served(
     for options, told in (
         (("--tls-cert", cert), "--tls-cert: expected a certificate and its key"),
         (("--tls-key", key), "--tls-cert: expected a certificate and its key"),
-        (("--tls-ca", ca), "--tls-ca: expected --tls-cert and --tls-key beside it"),
+        (("--tls-ca", ca), "--tls-ca: expected --tls-cert and --tls-key too"),
         (("--tls-cert", cert, "--tls-key", other_key), "KEY_VALUES_MISMATCH"),
         (("--tls-cert", cert, "--tls-key", notes), f"expected a certificate and its key {notes}"),
         (("--tls-cert", cert, "--tls-key", str(locked)), "expected a key without a passphrase"),
@@ -161,7 +161,7 @@ def test_a_key_is_in_no_representation(certs: Path, caplog: pytest.LogCaptureFix
 
 
 @pytest.mark.parametrize("arguments", [[], ["folder"], ["folder", "../x"], ["folder", "a b"]])
-def test_the_script_says_what_it_expects(arguments: list[str], tmp_path: Path) -> None:
+def test_the_script_names_the_expected_arguments(arguments: list[str], tmp_path: Path) -> None:
     done = subprocess.run(
         ["bash", str(SCRIPT), *(argument.replace("folder", str(tmp_path)) for argument in arguments)],
         capture_output=True, text=True, timeout=60,

@@ -6,8 +6,8 @@ import threading
 from pathlib import Path
 
 import pytest
-from fusion_running import GRID, team, words
-from uplink_running import WAIT_S, accepted, held, said, scripted, uplink
+from fusion_running import GRID, fusion_server, make_batch
+from uplink_running import WAIT_S, accepted, expected_kappas, scripted, stored_kappas, uplink
 
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.errors import (
@@ -20,32 +20,32 @@ from gausslite.wire.spool import Purpose, Spool
 from gausslite.wire.uplink_values import UplinkSettings
 
 
-def test_what_was_offered_arrives_the_newest_word_of_each_voxel() -> None:
+def test_the_latest_update_of_each_voxel_arrives() -> None:
     store = MemoryStore()
     offers = [{1: [5, 6], 2: [7], 3: [1]}, {2: [], 3: [9, 9, 9]}, {4: [2]}]
-    with team(store) as fusion, uplink(fusion.client.address) as link:
+    with fusion_server(store) as fusion, uplink(fusion.client.address) as link:
         for offer in offers:
-            link.enqueue(words(offer))
+            link.enqueue(make_batch(offer))
         assert link.drain(WAIT_S)
         counters = link.counters()
-    assert held(store) == said(*offers)
+    assert stored_kappas(store) == expected_kappas(*offers)
     assert counters.voxels_sent == 4
     assert counters.voxels_waiting == 0
     assert counters.subsets_rejected == 0
     assert counters.bytes_sent == counters.roi_bytes > 0
 
 
-def test_handover_is_counted_apart_and_sends_only_what_differs() -> None:
+def test_handover_is_counted_separately_and_sends_only_changed_voxels() -> None:
     store = MemoryStore()
-    with team(store) as fusion, uplink(fusion.client.address) as link:
-        link.enqueue(words({1: [5], 2: [7]}))
+    with fusion_server(store) as fusion, uplink(fusion.client.address) as link:
+        link.enqueue(make_batch({1: [5], 2: [7]}))
         assert link.drain(WAIT_S)
         before = link.counters()
-        link.enqueue(words({1: [5], 2: [7], 3: [0, 0]}), Purpose.HANDOVER)
+        link.enqueue(make_batch({1: [5], 2: [7], 3: [0, 0]}), Purpose.HANDOVER)
         assert link.drain(WAIT_S)
         after = link.counters()
         [agent] = fusion.client.status().agents
-    assert held(store).keys() == said({1: [5], 2: [7], 3: [0, 0]}).keys()
+    assert stored_kappas(store).keys() == expected_kappas({1: [5], 2: [7], 3: [0, 0]}).keys()
     assert after.roi_bytes == before.roi_bytes == agent.roi_bytes
     assert after.handover_bytes == agent.handover_bytes > 0
     assert after.voxels_sent == 2
@@ -55,48 +55,48 @@ def test_the_spool_survives_a_restart_of_the_robot(tmp_path: Path) -> None:
     path = tmp_path / "spool.sqlite"
     nobody = "127.0.0.1:1"
     with uplink(nobody, spool=path) as link:
-        link.enqueue(words({1: [5], 2: [7]}))
+        link.enqueue(make_batch({1: [5], 2: [7]}))
         assert not link.drain(0.0)
     store = MemoryStore()
-    with team(store) as fusion, uplink(fusion.client.address, spool=path) as link:
-        link.enqueue(words({2: [8]}))
+    with fusion_server(store) as fusion, uplink(fusion.client.address, spool=path) as link:
+        link.enqueue(make_batch({2: [8]}))
         assert link.drain(WAIT_S)
-    assert held(store) == said({1: [5], 2: [8]})
+    assert stored_kappas(store) == expected_kappas({1: [5], 2: [8]})
 
 
-def test_bandwidth_goes_first_to_the_voxels_that_were_trained_most() -> None:
+def test_voxels_with_the_highest_kappa_sum_are_sent_first() -> None:
     slow = UplinkSettings(kbps=1.0, interval_s=0.0)
     with scripted(lambda *_: accepted()) as (server, address), uplink(address, slow) as link:
-        link.enqueue(words({cell: [cell] * 40 for cell in range(1, 9)}))
+        link.enqueue(make_batch({cell: [cell] * 40 for cell in range(1, 9)}))
         assert server.came.wait(WAIT_S)
         assert not link.drain(0.0)
         first = server.subsets[0]
-    assert first.keys.tolist() == [words({8: [1]}).keys[0]]
+    assert first.keys.tolist() == [make_batch({8: [1]}).keys[0]]
 
 
-def test_small_growth_waits_for_more_or_for_the_end() -> None:
+def test_small_changes_are_sent_only_when_draining() -> None:
     patient = UplinkSettings(interval_s=0.0, resend_threshold=0.5)
     with scripted(lambda *_: accepted()) as (server, address), uplink(address, patient) as link:
-        link.enqueue(words({1: [100]}))
+        link.enqueue(make_batch({1: [100]}))
         assert link.drain(WAIT_S)
-        link.enqueue(words({1: [101]}))
-        link.enqueue(words({2: [1]}))
+        link.enqueue(make_batch({1: [101]}))
+        link.enqueue(make_batch({2: [1]}))
         assert link.drain(WAIT_S)
     kappas = [subset.kappa_sums.tolist() for subset in server.subsets]
     assert kappas[0] == [100]
     assert sorted(total for subset in kappas[1:] for total in subset) == [1, 101]
 
 
-def test_stop_waiting_ends_a_drain() -> None:
+def test_cancel_drain_ends_a_drain() -> None:
     with uplink("127.0.0.1:1") as link:
-        link.enqueue(words({1: [5]}))
+        link.enqueue(make_batch({1: [5]}))
         timer = threading.Timer(0.05, link.cancel_drain)
         timer.start()
         assert not link.drain(600.0)
         timer.join()
 
 
-def test_a_spool_of_someone_else_is_refused(tmp_path: Path) -> None:
+def test_the_spool_of_another_agent_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "spool.sqlite"
     Spool(path, "robot", GRID).close()
     with pytest.raises(MismatchError, match="'other'"):
@@ -111,6 +111,6 @@ def test_a_spool_of_someone_else_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("wrong", [{"kbps": 0.0}, {"kbps": float("nan")}, {"interval_s": -1.0}, {"deadline_s": 0.0}])
-def test_settings_without_sense_are_refused(wrong: dict[str, float]) -> None:
+def test_invalid_settings_are_refused(wrong: dict[str, float]) -> None:
     with pytest.raises(InvalidInputError, match="uplink"):
         UplinkSettings(**wrong)  # type: ignore[arg-type]

@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from fusion_running import team, words
+from fusion_running import fusion_server, make_batch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from serving import serving
-from uplink_running import WAIT_S, ScriptedServer, accepted, held, rejected, said, scripted, uplink
+from uplink_running import WAIT_S, ScriptedServer, accepted, expected_kappas, rejected, scripted, stored_kappas, uplink
 
 from gausslite.codec.subset_codec import decode_subset
 from gausslite.domain.voxel_batch import VoxelBatch
@@ -31,70 +31,70 @@ from gausslite.v1 import fusion_service_pb2_grpc as pb_grpc
 from gausslite.wire.server import Service
 
 
-def test_a_server_that_lost_its_memory_gets_everything_again() -> None:
+def test_a_server_that_lost_its_store_gets_every_voxel_again() -> None:
     answers = iter([accepted(), SessionUnknownError("gone"), accepted()])
     with scripted(lambda *_: next(answers)) as (server, address), uplink(address) as link:
-        link.enqueue(words({1: [5], 2: [7]}))
+        link.enqueue(make_batch({1: [5], 2: [7]}))
         assert link.drain(WAIT_S)
-        link.enqueue(words({3: [1]}))
+        link.enqueue(make_batch({3: [1]}))
         assert link.drain(WAIT_S)
         assert link.counters().joins == 2
-    assert server.subsets[-1].keys.tolist() == words({1: [5], 2: [7], 3: [1]}).keys.tolist()
+    assert server.subsets[-1].keys.tolist() == make_batch({1: [5], 2: [7], 3: [1]}).keys.tolist()
     assert server.joined == [True, False]
     assert server.revisions == sorted(set(server.revisions))
     assert server.revisions[0] > 100
 
 
-def test_a_connection_that_breaks_is_tried_again() -> None:
+def test_a_broken_connection_is_retried() -> None:
     answers = iter([UnavailableError("draining"), GaussLiteError("a bug"), accepted()])
     with scripted(lambda *_: next(answers)) as (server, address), uplink(address) as link:
-        link.enqueue(words({1: [5]}))
+        link.enqueue(make_batch({1: [5]}))
         assert link.drain(WAIT_S)
         assert link.counters().connected
     assert len(server.subsets) == 3
 
 
-def test_trouble_is_logged_once_and_so_is_its_end(caplog: pytest.LogCaptureFixture) -> None:
+def test_an_error_and_its_end_are_logged_once(caplog: pytest.LogCaptureFixture) -> None:
     answers = iter([*[UnavailableError("draining")] * 3, accepted(), UnavailableError("draining"), accepted()])
     caplog.set_level("INFO", logger="gausslite.wire.uplink")
     with scripted(lambda *_: next(answers)) as (_, address), uplink(address) as link:
         for voxel in (1, 2):
-            link.enqueue(words({voxel: [5]}))
+            link.enqueue(make_batch({voxel: [5]}))
             assert link.drain(WAIT_S)
     again = f"uplink: fusion server {address} accepts updates again"
     assert [record.getMessage() for record in caplog.records] == ["uplink: draining; retrying", again] * 2
 
 
-def test_damage_is_sent_once_more_and_then_given_up() -> None:
+def test_a_damaged_subset_is_sent_once_more_and_then_dropped() -> None:
     answers = iter([rejected("CHECKSUM"), rejected("CHECKSUM")])
     with scripted(lambda *_: next(answers)) as (server, address), uplink(address) as link:
-        link.enqueue(words({1: [5]}))
+        link.enqueue(make_batch({1: [5]}))
         assert link.drain(WAIT_S)
         assert link.counters().subsets_rejected == 1
     np.testing.assert_array_equal(server.subsets[0].gaussians.means_m, server.subsets[1].gaussians.means_m)
 
 
 @pytest.mark.parametrize("answer", [InvalidInputError("no such codec"), None])
-def test_words_that_nobody_will_ever_take_are_dropped(answer: GaussLiteError | None) -> None:
+def test_updates_that_cannot_be_stored_are_dropped(answer: GaussLiteError | None) -> None:
     answers = iter([] if answer is None else [answer])
-    bad = words({1: [5]})
+    bad = make_batch({1: [5]})
     if answer is None:
         bad.gaussians.rgb[0] = np.nan
     with scripted(lambda *_: next(answers, accepted())) as (server, address), uplink(address) as link:
         link.enqueue(bad)
         assert link.drain(WAIT_S)
         assert link.counters().subsets_rejected == 1
-        link.enqueue(words({2: [5]}))
+        link.enqueue(make_batch({2: [5]}))
         assert link.drain(WAIT_S)
-    assert server.subsets[-1].keys.tolist() == words({2: [5]}).keys.tolist()
+    assert server.subsets[-1].keys.tolist() == make_batch({2: [5]}).keys.tolist()
 
 
-def test_a_rejected_subset_is_dropped_and_the_next_goes_on() -> None:
+def test_a_rejected_subset_is_dropped_and_the_next_is_sent() -> None:
     answers = iter([rejected("INVALID_INPUT"), accepted()])
     with scripted(lambda *_: next(answers)) as (_, address), uplink(address) as link:
-        link.enqueue(words({1: [5]}))
+        link.enqueue(make_batch({1: [5]}))
         assert link.drain(WAIT_S)
-        link.enqueue(words({2: [5]}))
+        link.enqueue(make_batch({2: [5]}))
         assert link.drain(WAIT_S)
         counters = link.counters()
     assert (counters.subsets_rejected, counters.voxels_sent) == (1, 1)
@@ -108,28 +108,28 @@ def test_a_full_server_gets_smaller_messages_later(exhausted: pb.SubsetOutcome |
     answers = iter([exhausted])
     cells = {cell: [1] * 5000 for cell in range(8)}
     with scripted(lambda *_: next(answers, accepted())) as (server, address), uplink(address) as link:
-        link.enqueue(words(cells))
+        link.enqueue(make_batch(cells))
         assert link.drain(WAIT_S)
     assert [len(subset) for subset in server.subsets] == [8, 4, 4]
     assert sorted(set(server.revisions)) == server.revisions
 
 
 @pytest.mark.parametrize("final", [MismatchError("another grid"), NotPermittedError("not you")])
-def test_what_only_the_operator_can_mend_stops_the_uplink(final: GaussLiteError) -> None:
+def test_an_error_that_only_the_operator_can_fix_stops_the_uplink(final: GaussLiteError) -> None:
     with scripted(lambda *_: final) as (server, address), uplink(address) as link:
-        link.enqueue(words({1: [5]}))
+        link.enqueue(make_batch({1: [5]}))
         assert not link.drain(WAIT_S)
         assert link.counters().stopped_because == str(final)
-        link.enqueue(words({2: [5]}))
+        link.enqueue(make_batch({2: [5]}))
         assert not link.drain(WAIT_S)
         assert link.counters().voxels_waiting == 2
     assert len(server.subsets) == 1
 
 
-def test_another_grid_is_told_by_the_real_server() -> None:
-    with team() as fusion, uplink(fusion.client.address, grid=VoxelGrid(0.2)) as link:
-        link.enqueue(words({}))
-        empty = np.zeros(1, np.uint64), np.zeros(1, np.uint32), words({}).gaussians
+def test_the_server_refuses_another_grid() -> None:
+    with fusion_server() as fusion, uplink(fusion.client.address, grid=VoxelGrid(0.2)) as link:
+        link.enqueue(make_batch({}))
+        empty = np.zeros(1, np.uint64), np.zeros(1, np.uint32), make_batch({}).gaussians
         link.enqueue(VoxelBatch(VoxelGrid(0.2).keys(np.zeros((1, 3), np.float32)), *empty))
         assert not link.drain(WAIT_S)
         assert "0.2" in link.counters().stopped_because
@@ -171,7 +171,7 @@ OFFERS = st.lists(
 
 @given(offers=OFFERS, faults=FAULTS, together=st.booleans())
 @settings(max_examples=25, deadline=None)
-def test_whatever_is_lost_on_the_way_the_server_ends_with_the_newest_words(
+def test_after_any_losses_the_server_has_the_latest_updates(
     offers: list[dict[int, list[int]]], faults: list[str], together: bool
 ) -> None:
     server = FlakyServer(faults)
@@ -181,7 +181,7 @@ def test_whatever_is_lost_on_the_way_the_server_ends_with_the_newest_words(
     )
     with serving([service]) as running, uplink(running.address) as link:
         for offer in offers:
-            link.enqueue(words(offer))
+            link.enqueue(make_batch(offer))
             assert together or link.drain(WAIT_S)
         assert link.drain(WAIT_S)
-    assert held(server.store) == said(*offers)
+    assert stored_kappas(server.store) == expected_kappas(*offers)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import grpc
 import pytest
-from fusion_running import GRID, frame, request, said, server_process
+from fusion_running import GRID, frame, make_subset, request, server_process
 from google.protobuf.message import DecodeError, Message
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -85,10 +85,10 @@ def test_any_bytes_as_a_subset_are_rejected(target: Target, blob: bytes) -> None
 
 @fuzz
 @given(edits=EDITS, cut=CUT)
-def test_a_mutated_subset_is_an_outcome_and_never_the_end(
+def test_a_mutated_subset_gives_an_outcome_and_the_stream_continues(
     target: Target, edits: list[tuple[int, int]], cut: int
 ) -> None:
-    good = request(target.session_id, said("ant", 1, {0: [1, 2], 3: []}))
+    good = request(target.session_id, make_subset("ant", 1, {0: [1, 2], 3: []}))
     bad = pb.ContributeSubsetsRequest(session_id=target.session_id, sequence=1, subset=mutated(good.subset, edits, cut))
     outcomes = target.send(bad, good)
     assert outcomes[-1].status != pb.SUBSET_STATUS_REJECTED
@@ -96,7 +96,7 @@ def test_a_mutated_subset_is_an_outcome_and_never_the_end(
 
 @fuzz
 @given(edits=EDITS, cut=CUT)
-def test_a_mutated_keyframe_is_reported_and_never_the_end(
+def test_a_mutated_keyframe_is_reported_and_the_stream_continues(
     target: Target, edits: list[tuple[int, int]], cut: int
 ) -> None:
     whole = frame_to_message(frame(1)).SerializeToString()
@@ -114,7 +114,7 @@ def test_a_mutated_keyframe_is_reported_and_never_the_end(
     blob=st.binary(max_size=200),
     method=st.sampled_from([method.name for method in pb.DESCRIPTOR.services_by_name["FusionService"].methods]),
 )
-def test_any_bytes_to_any_rpc_leave_the_server_alive(target: Target, blob: bytes, method: str) -> None:
+def test_the_server_answers_after_random_bytes_to_any_method(target: Target, blob: bytes, method: str) -> None:
     # INTERNAL and UNKNOWN are the transport's own words for bytes that are no message
     assert target.code(method, blob) in KNOWN | {grpc.StatusCode.INTERNAL, grpc.StatusCode.UNKNOWN}
     target.assert_alive()
@@ -140,7 +140,7 @@ NAMES = st.one_of(st.sampled_from(["", "ant", "mission"]), st.text(max_size=20))
         st.builds(pb.LeaveSessionRequest, session_id=NAMES, forget=st.booleans()),
     )
 )
-def test_wild_but_well_formed_messages_get_a_known_code(target: Target, message: Message) -> None:
+def test_random_valid_messages_get_a_documented_code(target: Target, message: Message) -> None:
     method = type(message).__name__.removesuffix("Request")
     assert target.code(method, message.SerializeToString()) in KNOWN
     target.assert_alive()

@@ -8,7 +8,7 @@ import subprocess
 from pathlib import Path
 
 import pytest
-from fusion_running import COMMAND, GRID, request, said, server_process
+from fusion_running import COMMAND, GRID, make_subset, request, server_process
 
 from gausslite.codec.ply import gaussians_from_ply
 from gausslite.errors import UnavailableError
@@ -16,11 +16,11 @@ from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.wire.clients import Export, FusionClient
 
 
-def test_after_a_kill_the_acknowledged_is_there_and_a_resend_is_stale(tmp_path: Path) -> None:
+def test_after_a_kill_acknowledged_updates_exist_and_a_resend_is_stale(tmp_path: Path) -> None:
     store = tmp_path / "team.sqlite"
     with server_process("--store", str(store)) as (_, client):
         session = client.join("ant", GRID).session_id
-        message = request(session, said("ant", 1, {0: [4], 1: [2, 2]}))
+        message = request(session, make_subset("ant", 1, {0: [4], 1: [2, 2]}))
         [answer] = client.contribute([message], 20.0)
         assert answer.acknowledged == 1
     with server_process("--store", str(store)) as (_, client):
@@ -51,7 +51,7 @@ class Hasty(FusionClient):
     keepalive_s = 0.5
 
 
-def test_a_watcher_learns_that_the_server_went_away_without_a_word() -> None:
+def test_a_watcher_detects_a_server_that_stopped_answering() -> None:
     with server_process() as (process, client), Hasty(client.address) as hasty:
         watch = hasty.watch()
         next(watch)
@@ -60,7 +60,7 @@ def test_a_watcher_learns_that_the_server_went_away_without_a_word() -> None:
             next(watch)
 
 
-def test_what_the_operator_can_mend_is_one_line_and_code_2(tmp_path: Path) -> None:
+def test_an_error_that_the_operator_can_fix_is_one_line_and_code_2(tmp_path: Path) -> None:
     nonsense = tmp_path / "notes.sqlite"
     nonsense.write_text("remember the milk, " * 300)
     assert "cannot be opened" in ends_with_one_line("--store", str(tmp_path / "no" / "folder" / "x.sqlite"))

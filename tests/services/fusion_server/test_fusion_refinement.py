@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from fusion_running import CAMERA, GRID, Team, frame, said, team
+from fusion_running import CAMERA, GRID, RunningServer, frame, fusion_server, make_subset
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 
 from gausslite.codec.ply import gaussians_from_ply
@@ -20,8 +20,10 @@ from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.wire.clients import Export
 
 
-def test_keyframes_are_kept_within_bounds_and_bad_ones_reported() -> None:
-    with team(settings=FusionSettings(grid=GRID, quotas=Quotas(keyframes_per_agent=2, keyframe_pixels=32 * 24))) as t:
+def test_keyframes_are_limited_and_invalid_ones_reported() -> None:
+    with fusion_server(
+        settings=FusionSettings(grid=GRID, quotas=Quotas(keyframes_per_agent=2, keyframe_pixels=32 * 24))
+    ) as t:
         session = t.client.join("ant", GRID).session_id
         large = Camera(40.0, 40.0, 32.0, 12.0, 64, 24)
         assert t.client.contribute_keyframes(session, [frame(1), frame(2), frame(3), frame(3), frame(4, large)]) == 4
@@ -35,15 +37,15 @@ def test_keyframes_are_kept_within_bounds_and_bad_ones_reported() -> None:
         assert answer.rejected[0].reason
 
 
-def contributed(t: Team) -> str:
+def contributed(t: RunningServer) -> str:
     session = t.client.join("ant", GRID).session_id
-    t.say(session, said("ant", 1, {cell: [3] * 4 for cell in (-1, 0, 1)}))
+    t.contribute_subsets(session, make_subset("ant", 1, {cell: [3] * 4 for cell in (-1, 0, 1)}))
     t.client.contribute_keyframes(session, [frame(1), frame(2)])
     return session
 
 
-def test_refinement_reports_ends_and_lies_over_the_vote() -> None:
-    with team() as t:
+def test_refinement_reports_progress_and_its_map_shows_newer_votes() -> None:
+    with fusion_server() as t:
         with pytest.raises(MismatchError, match="refined map"):
             t.client.export(Export("refined"))
         session = contributed(t)
@@ -53,14 +55,14 @@ def test_refinement_reports_ends_and_lies_over_the_vote() -> None:
         assert t.client.status().refined
         refined, voted = (gaussians_from_ply(t.client.export(Export(name))) for name in ("refined", "vote"))
         assert refined.rgb.tobytes() != voted.rgb.tobytes()
-        t.say(session, said("ant", 2, {0: [90]}))
+        t.contribute_subsets(session, make_subset("ant", 2, {0: [90]}))
         assert sorted(gaussians_from_ply(t.client.export(Export("refined"))).kappa.tolist())[-1] == 90
         with pytest.raises(InvalidInputError, match="expected none with REFINED"):
             t.client.export(Export("refined", "ant"))
 
 
 def test_closing_the_refinement_cancels_it_and_another_can_start() -> None:
-    with team(refine=RefineSettings(iterations=20_000, report_every=1)) as t:
+    with fusion_server(refine=RefineSettings(iterations=20_000, report_every=1)) as t:
         contributed(t)
         running = t.client.refine()
         assert next(running).iteration >= 1
@@ -77,12 +79,12 @@ def test_closing_the_refinement_cancels_it_and_another_can_start() -> None:
             list(t.client.refine(iterations=2_000_000_000))
 
 
-def test_a_refinement_without_anything_to_learn_from_is_refused() -> None:
-    with team() as t:
+def test_a_refinement_without_useful_keyframes_is_refused() -> None:
+    with fusion_server() as t:
         with pytest.raises(MismatchError, match="0 Gaussians and 0 keyframes"):
             list(t.client.refine())
         session = t.client.join("ant", GRID).session_id
-        t.say(session, said("ant", 1, {0: [1]}))
+        t.contribute_subsets(session, make_subset("ant", 1, {0: [1]}))
         with pytest.raises(MismatchError, match="1 Gaussians and 0 keyframes"):
             list(t.client.refine())
         behind = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -92,7 +94,7 @@ def test_a_refinement_without_anything_to_learn_from_is_refused() -> None:
 
 
 def test_health_answers_while_a_refinement_runs() -> None:
-    with team(refine=RefineSettings(iterations=20_000, report_every=1)) as t:
+    with fusion_server(refine=RefineSettings(iterations=20_000, report_every=1)) as t:
         contributed(t)
         running = t.client.refine()
         next(running)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import grpc
 import pytest
-from fusion_running import GRID, frame, request, said, team, words
+from fusion_running import GRID, frame, fusion_server, make_batch, make_subset, request
 
 from gausslite.codec.ply import gaussians_from_ply
 from gausslite.domain.voxel_batch import RoiSubset
@@ -29,12 +29,16 @@ from gausslite.wire.clients import Export
 ACCEPTED, STALE, REJECTED = pb.SUBSET_STATUS_ACCEPTED, pb.SUBSET_STATUS_STALE, pb.SUBSET_STATUS_REJECTED
 
 
-def test_two_agents_join_contribute_and_the_better_trained_wins() -> None:
-    with team() as t:
+def test_of_two_agents_the_one_with_the_higher_kappa_sum_wins() -> None:
+    with fusion_server() as t:
         ant, bee = t.client.join("ant", GRID), t.client.join("bee", GRID)
         assert ant.highest_map_revision == 0
-        assert [o.status for o in t.say(ant.session_id, said("ant", 1, {0: [5], 1: [1]}))] == [ACCEPTED]
-        assert [o.status for o in t.say(bee.session_id, said("bee", 1, {1: [2, 2], 2: [0]}))] == [ACCEPTED]
+        assert [o.status for o in t.contribute_subsets(ant.session_id, make_subset("ant", 1, {0: [5], 1: [1]}))] == [
+            ACCEPTED
+        ]
+        assert [o.status for o in t.contribute_subsets(bee.session_id, make_subset("bee", 1, {1: [2, 2], 2: [0]}))] == [
+            ACCEPTED
+        ]
         fused = gaussians_from_ply(t.client.export(Export("vote")))
         assert sorted(fused.kappa.tolist()) == [0, 2, 2, 5]
         assert len(gaussians_from_ply(t.client.export(Export("concatenation")))) == 5
@@ -43,10 +47,10 @@ def test_two_agents_join_contribute_and_the_better_trained_wins() -> None:
         assert t.client.join("ant", GRID).highest_map_revision == 1
 
 
-def test_the_same_again_is_stale_and_acks_are_cumulative() -> None:
-    with team() as t:
+def test_a_duplicate_is_stale_and_acks_are_cumulative() -> None:
+    with fusion_server() as t:
         session = t.client.join("ant", GRID).session_id
-        subsets = [said("ant", revision, {0: [revision]}) for revision in (1, 2, 3)]
+        subsets = [make_subset("ant", revision, {0: [revision]}) for revision in (1, 2, 3)]
         sent = [request(session, subset) for subset in (*subsets, subsets[0])]
         answers = list(t.client.contribute(sent, 20.0))
         assert [answer.acknowledged for answer in answers] == [1, 2, 3, 3]
@@ -55,20 +59,20 @@ def test_the_same_again_is_stale_and_acks_are_cumulative() -> None:
         assert gaussians_from_ply(t.client.export(Export())).kappa.tolist() == [3]
 
 
-def test_one_bad_block_does_not_end_a_good_stream() -> None:
-    with team(settings=FusionSettings(grid=GRID, quotas=Quotas(gaussians_per_agent=3))) as t:
+def test_an_invalid_subset_does_not_end_the_stream() -> None:
+    with fusion_server(settings=FusionSettings(grid=GRID, quotas=Quotas(gaussians_per_agent=3))) as t:
         session = t.client.join("ant", GRID).session_id
-        good = request(session, said("ant", 1, {0: [1]}))
+        good = request(session, make_subset("ant", 1, {0: [1]}))
         flipped = bytearray(good.subset)
         flipped[-20] ^= 1
         bad = [
             pb.ContributeSubsetsRequest(session_id=session, sequence=2, subset=bytes(flipped)),
             pb.ContributeSubsetsRequest(session_id=session, sequence=3, subset=b"no subset at all" * 9),
             pb.ContributeSubsetsRequest(session_id=session, sequence=4, subset=bytes(3 << 20)),
-            request(session, said("bee", 5, {0: [1]})),
-            request(session, said("ant", 6, {1: [1, 1, 1]})),
+            request(session, make_subset("bee", 5, {0: [1]})),
+            request(session, make_subset("ant", 6, {1: [1, 1, 1]})),
         ]
-        last = request(session, said("ant", 7, {1: [1, 1]}))
+        last = request(session, make_subset("ant", 7, {1: [1, 1]}))
         outcomes = t.send(good, *bad, last)
         assert [o.status for o in outcomes] == [ACCEPTED] + [REJECTED] * 5 + [ACCEPTED]
         assert [o.reason for o in outcomes[1:-1]] == ["CHECKSUM", "CODEC", "CODEC", "NOT_PERMITTED", "QUOTA"]
@@ -79,34 +83,34 @@ def test_one_bad_block_does_not_end_a_good_stream() -> None:
         assert ant.last_seen_ns > 0
 
 
-def test_a_quota_counts_what_is_held_and_not_what_was_sent() -> None:
-    with team(settings=FusionSettings(grid=GRID, quotas=Quotas(agents=1, voxels_per_agent=2))) as t:
+def test_a_quota_counts_stored_and_not_sent_gaussians() -> None:
+    with fusion_server(settings=FusionSettings(grid=GRID, quotas=Quotas(agents=1, voxels_per_agent=2))) as t:
         session = t.client.join("ant", GRID).session_id
         statuses = [
-            t.say(session, said("ant", revision, cells))[0].status
+            t.contribute_subsets(session, make_subset("ant", revision, cells))[0].status
             for revision, cells in [(1, {0: [1], 1: [1]}), (2, {0: [2], 1: []}), (3, {2: [1]}), (2, {0: [9], 2: [9]})]
         ]
         assert statuses == [ACCEPTED, ACCEPTED, REJECTED, REJECTED]
-        assert t.say(session, said("ant", 1, {0: [1], 1: [1]}))[0].status == STALE
+        assert t.contribute_subsets(session, make_subset("ant", 1, {0: [1], 1: [1]}))[0].status == STALE
         with pytest.raises(QuotaError, match="at most 1 in this mission"):
             t.client.join("bee", GRID)
         assert t.client.join("ant", GRID).session_id != session
 
 
-def test_a_robot_whose_name_another_one_took_is_told_to_stop() -> None:
-    with team() as t:
+def test_a_robot_whose_agent_id_another_one_uses_is_refused() -> None:
+    with fusion_server() as t:
         first, second = (t.client.join("ant", GRID).session_id for _ in range(2))
         with pytest.raises(MismatchError, match="another robot has joined under this name"):
-            t.say(first, said("ant", 1, {0: [1]}))
+            t.contribute_subsets(first, make_subset("ant", 1, {0: [1]}))
         with pytest.raises(MismatchError):
             t.client.leave(first)
-        assert t.say(second, said("ant", 1, {0: [1]}))[0].status == ACCEPTED
+        assert t.contribute_subsets(second, make_subset("ant", 1, {0: [1]}))[0].status == ACCEPTED
 
 
-def test_an_unknown_session_is_told_to_join_again() -> None:
-    with team() as t:
+def test_the_error_of_an_unknown_session_asks_to_join_again() -> None:
+    with fusion_server() as t:
         with pytest.raises(SessionUnknownError):
-            t.say("never given", said("ant", 1, {0: [1]}))
+            t.contribute_subsets("never given", make_subset("ant", 1, {0: [1]}))
         with pytest.raises(SessionUnknownError):
             t.client.contribute_keyframes("never given", [frame(0)])
         with pytest.raises(SessionUnknownError):
@@ -116,8 +120,8 @@ def test_an_unknown_session_is_told_to_join_again() -> None:
         assert caught.value.code() is grpc.StatusCode.NOT_FOUND
 
 
-def test_other_terms_are_a_mismatch_that_names_both_values() -> None:
-    with team() as t:
+def test_another_mission_config_is_a_mismatch_that_names_both_values() -> None:
+    with fusion_server() as t:
         with pytest.raises(MismatchError, match=r"0\.1 m, got 0\.2 m"):
             t.client.join("ant", VoxelGrid(0.2))
         session = t.client.join("ant", GRID, world_frame="map").session_id
@@ -130,30 +134,30 @@ def test_other_terms_are_a_mismatch_that_names_both_values() -> None:
             with pytest.raises(MismatchError, match="mission: expected 'mission' as agreed here, got 'other'"):
                 call()
         coarse = VoxelGrid(1.0)
-        subset = RoiSubset("ant", "", 1, 1, words({}))
+        subset = RoiSubset("ant", "", 1, 1, make_batch({}))
         with pytest.raises(MismatchError, match="voxel size"):
-            t.say(session, subset, grid=coarse)
+            t.contribute_subsets(session, subset, grid=coarse)
 
 
 @pytest.mark.parametrize("agent_id", ["", "x" * 256])
-def test_an_agent_needs_a_name_of_bearable_length(agent_id: str) -> None:
-    with team() as t, pytest.raises(InvalidInputError, match="agent_id"):
+def test_an_agent_id_must_be_a_name_of_limited_length(agent_id: str) -> None:
+    with fusion_server() as t, pytest.raises(InvalidInputError, match="agent_id"):
         t.client.join(agent_id, GRID)
 
 
-def test_a_grid_must_be_named() -> None:
-    with team() as t, pytest.raises(grpc.RpcError) as caught:
+def test_a_grid_is_required() -> None:
+    with fusion_server() as t, pytest.raises(grpc.RpcError) as caught:
         t.stub.JoinSession(pb.JoinSessionRequest(agent_id="ant"))
     assert caught.value.code() is grpc.StatusCode.INVALID_ARGUMENT
 
 
-def test_a_fresh_map_and_a_forgotten_agent_leave_nothing() -> None:
-    with team() as t:
-        t.say(t.client.join("ant", GRID).session_id, said("ant", 7, {0: [1]}))
+def test_a_fresh_map_and_a_forgotten_agent_leave_no_updates() -> None:
+    with fusion_server() as t:
+        t.contribute_subsets(t.client.join("ant", GRID).session_id, make_subset("ant", 7, {0: [1]}))
         session = t.client.join("ant", GRID, fresh_map=True)
         assert session.highest_map_revision == 0
         assert t.client.status().fused_voxels == 0
-        assert t.say(session.session_id, said("ant", 1, {1: [1]}))[0].status == ACCEPTED
+        assert t.contribute_subsets(session.session_id, make_subset("ant", 1, {1: [1]}))[0].status == ACCEPTED
         t.client.leave(session.session_id)
         assert t.client.status().fused_voxels == 1
         assert not t.client.status().agents[0].joined
@@ -163,63 +167,67 @@ def test_a_fresh_map_and_a_forgotten_agent_leave_nothing() -> None:
         assert len(gaussians_from_ply(t.client.export(Export()))) == 0
 
 
-def test_an_export_of_nobody_or_of_no_strategy_is_invalid() -> None:
-    with team() as t:
+def test_an_export_of_an_unknown_agent_or_strategy_is_invalid() -> None:
+    with fusion_server() as t:
         with pytest.raises(InvalidInputError, match="no agents yet"):
             t.client.export(Export("vote", "ant"))
         with pytest.raises(InvalidInputError, match="strategy"):
             t.client.export(Export("unspecified"))
 
 
-def test_a_full_store_ends_the_stream_and_the_server_goes_on(tmp_path: Path) -> None:
+def test_a_full_store_ends_the_stream_and_the_server_keeps_serving(tmp_path: Path) -> None:
     store = SqliteStore(tmp_path / "store.sqlite", max_bytes=200_000)
-    with team(store) as t:
+    with fusion_server(store) as t:
         session = t.client.join("ant", GRID).session_id
         with pytest.raises(grpc.RpcError) as caught:
-            list(t.stub.ContributeSubsets(iter([request(session, said("ant", 1, {c: [1] * 50 for c in range(100)}))])))
+            list(
+                t.stub.ContributeSubsets(
+                    iter([request(session, make_subset("ant", 1, {c: [1] * 50 for c in range(100)}))])
+                )
+            )
         assert caught.value.code() is grpc.StatusCode.RESOURCE_EXHAUSTED
         assert "no space left" in caught.value.details()
-        assert t.say(session, said("ant", 2, {0: [1]}))[0].status == ACCEPTED
+        assert t.contribute_subsets(session, make_subset("ant", 2, {0: [1]}))[0].status == ACCEPTED
     store.close()
 
 
-def test_a_restarted_server_with_a_file_goes_on_and_one_in_memory_says_so(tmp_path: Path) -> None:
+def test_a_restarted_server_keeps_its_sessions_only_with_a_file(tmp_path: Path) -> None:
     first_life, second_life = MemoryStore(), MemoryStore()
-    with team(first_life) as t:
+    with fusion_server(first_life) as t:
         session = t.client.join("ant", GRID).session_id
-        t.say(session, said("ant", 1, {0: [1]}))
-    with team(second_life) as t, pytest.raises(SessionUnknownError):
-        t.say(session, said("ant", 1, {0: [1]}))
+        t.contribute_subsets(session, make_subset("ant", 1, {0: [1]}))
+    with fusion_server(second_life) as t, pytest.raises(SessionUnknownError):
+        t.contribute_subsets(session, make_subset("ant", 1, {0: [1]}))
 
     store = SqliteStore(tmp_path / "store.sqlite")
-    with team(store) as t:
+    with fusion_server(store) as t:
         session = t.client.join("ant", GRID, world_frame="map").session_id
-        t.say(session, said("ant", 1, {0: [1], 1: [1]}))
+        t.contribute_subsets(session, make_subset("ant", 1, {0: [1], 1: [1]}))
         before, seen = t.client.export(Export()), t.client.status().fused_revision
     store.close()
     store = SqliteStore(tmp_path / "store.sqlite")
-    with team(store) as t:
-        assert t.say(session, said("ant", 1, {0: [1], 1: [1]}))[0].status == STALE
+    with fusion_server(store) as t:
+        assert t.contribute_subsets(session, make_subset("ant", 1, {0: [1], 1: [1]}))[0].status == STALE
         assert t.client.export(Export()) == before
         with pytest.raises(RevisionGoneError):
             next(t.client.watch(seen))
-        assert t.say(session, said("ant", 2, {2: [1]}))[0].status == ACCEPTED
+        assert t.contribute_subsets(session, make_subset("ant", 2, {2: [1]}))[0].status == ACCEPTED
         with pytest.raises(MismatchError, match="'map'"):
             t.client.join("bee", GRID, world_frame="odom")
-    with pytest.raises(MismatchError, match="voxel size"), team(store, FusionSettings(grid=VoxelGrid(0.2))):
+    with pytest.raises(MismatchError, match="voxel size"), fusion_server(store, FusionSettings(grid=VoxelGrid(0.2))):
         pass
     store.close()
 
 
-def test_a_draining_server_ends_open_streams_and_takes_no_more() -> None:
-    with team() as t:
+def test_a_draining_server_ends_open_streams_and_refuses_new_calls() -> None:
+    with fusion_server() as t:
         session = t.client.join("ant", GRID).session_id
         watch = t.client.watch()
         next(watch)
         silent = threading.Event()
 
         def one_and_then_silence():
-            yield request(session, said("ant", 1, {0: [1]}))
+            yield request(session, make_subset("ant", 1, {0: [1]}))
             silent.wait(20)
 
         stream = t.stub.ContributeSubsets(one_and_then_silence())

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncIterator, Callable
 
-from fusion_running import GRID, keys, said
+from fusion_running import GRID, keys, make_subset
 
 from gausslite.codec.subset_codec import decode_subset
 from gausslite.domain.voxel_batch import VoxelBatch
@@ -27,9 +27,9 @@ def watching(settings: FusionSettings, body: Callable[[AsyncIterator[MapBlock], 
     """Run `body` with the blocks of a watcher and a way to contribute while it sleeps."""
 
     async def run() -> None:
-        team = FusionEngine(MemoryStore(), settings, first_revision=1)
-        servicer = FusionServicer(team, RefinementWorker(RefineSettings(), ReferenceRasterizer))
-        session = team.join("ant", MissionConfig("", "", GRID.size_m)).session.session_id
+        engine = FusionEngine(MemoryStore(), settings, first_revision=1)
+        servicer = FusionServicer(engine, RefinementWorker(RefineSettings(), ReferenceRasterizer))
+        session = engine.join("ant", MissionConfig("", "", GRID.size_m)).session.session_id
         responses = servicer.WatchFusedMap(pb.WatchFusedMapRequest(), None)
 
         async def blocks() -> AsyncIterator[MapBlock]:
@@ -37,7 +37,7 @@ def watching(settings: FusionSettings, body: Callable[[AsyncIterator[MapBlock], 
                 yield response.block
 
         def contribute(revision: int, cells: dict[int, list[int]]) -> None:
-            team.contribute(session, said("ant", revision, cells), GRID)
+            engine.contribute(session, make_subset("ant", revision, cells), GRID)
 
         await body(blocks(), contribute)
         await responses.aclose()

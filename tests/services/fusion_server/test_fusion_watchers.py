@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import grpc
 import numpy as np
 import pytest
-from fusion_running import GRID, keys, said, team
+from fusion_running import GRID, fusion_server, keys, make_subset
 
 from gausslite.domain.voxel_batch import VoxelBatch
 from gausslite.domain.voxel_operations import empty_batch
@@ -19,22 +19,22 @@ from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.wire.convert import MapUpdate
 
 
-def test_a_watcher_gets_the_snapshot_and_then_what_changes() -> None:
-    with team() as t:
+def test_a_watcher_gets_the_snapshot_and_then_the_changes() -> None:
+    with fusion_server() as t:
         ant, bee = (t.client.join(name, GRID).session_id for name in ("ant", "bee"))
-        t.say(ant, said("ant", 1, {0: [5], 1: [1]}))
+        t.contribute_subsets(ant, make_subset("ant", 1, {0: [5], 1: [1]}))
         watch = t.client.watch()
         first = next(watch)
         assert first.snapshot
         assert first.last
         assert first.batch.keys.tolist() == keys(0, 1).tolist()
         assert first.winners == ("ant", "ant")
-        t.say(bee, said("bee", 1, {0: [1], 1: [2]}))
+        t.contribute_subsets(bee, make_subset("bee", 1, {0: [1], 1: [2]}))
         second = next(watch)
         assert not second.snapshot
         assert second.batch.keys.tolist() == keys(1).tolist()
         assert second.winners == ("bee",)
-        t.say(ant, said("ant", 2, {0: []}))
+        t.contribute_subsets(ant, make_subset("ant", 2, {0: []}))
         assert next(watch).winners == ("bee",)
         t.client.leave(bee, forget=True)
         third = next(watch)
@@ -56,15 +56,15 @@ def test_a_watcher_gets_the_snapshot_and_then_what_changes() -> None:
         current.close()
 
 
-def test_a_watcher_of_a_region_sees_that_region_alone() -> None:
-    with team() as t:
+def test_a_watcher_of_a_region_gets_only_that_region() -> None:
+    with fusion_server() as t:
         session = t.client.join("ant", GRID).session_id
-        t.say(session, said("ant", 1, {0: [1], 5: [1]}))
+        t.contribute_subsets(session, make_subset("ant", 1, {0: [1], 5: [1]}))
         watch = t.client.watch(region=AxisAlignedBox((0.4, 0.0, 0.0), (0.6, 0.1, 2.0)))
         assert next(watch).batch.keys.tolist() == keys(5).tolist()
-        t.say(session, said("ant", 2, {0: []}))
+        t.contribute_subsets(session, make_subset("ant", 2, {0: []}))
         assert next(watch).batch is None
-        t.say(session, said("ant", 3, {5: []}))
+        t.contribute_subsets(session, make_subset("ant", 3, {5: []}))
         assert next(watch).batch.counts.tolist() == [0]
         watch.close()
         upside_down = pb.WatchFusedMapRequest()
@@ -74,8 +74,8 @@ def test_a_watcher_of_a_region_sees_that_region_alone() -> None:
         assert caught.value.code() is grpc.StatusCode.INVALID_ARGUMENT
 
 
-def test_a_revision_of_another_life_is_out_of_range() -> None:
-    with team() as t:
+def test_a_revision_from_before_a_restart_is_out_of_range() -> None:
+    with fusion_server() as t:
         for revision in (1, t.client.join("ant", GRID).fused_revision + 1000):
             with pytest.raises(RevisionGoneError):
                 next(t.client.watch(revision))
@@ -90,17 +90,19 @@ def follow(updates: Iterator[MapUpdate], held: VoxelBatch) -> VoxelBatch:
     return held
 
 
-def test_update_over_update_is_the_fused_map() -> None:
-    with team() as t:
+def test_applying_all_updates_gives_the_fused_map() -> None:
+    with fusion_server() as t:
         ant, bee = (t.client.join(name, GRID).session_id for name in ("ant", "bee"))
         watch = t.client.watch()
         held = follow(watch, empty_batch())
         assert len(held) == 0
         many = {cell: [1] * 8 for cell in range(3000)}
         for change in (
-            lambda: t.say(ant, said("ant", 1, {0: [5], 1: [1]})),
-            lambda: t.say(bee, said("bee", 1, {1: [2], **{cell: many[cell] for cell in range(2, 1500)}})),
-            lambda: t.say(ant, said("ant", 2, {0: [], 1: [7, 1]})),
+            lambda: t.contribute_subsets(ant, make_subset("ant", 1, {0: [5], 1: [1]})),
+            lambda: t.contribute_subsets(
+                bee, make_subset("bee", 1, {1: [2], **{cell: many[cell] for cell in range(2, 1500)}})
+            ),
+            lambda: t.contribute_subsets(ant, make_subset("ant", 2, {0: [], 1: [7, 1]})),
             lambda: t.client.leave(bee, forget=True),
         ):
             change()
@@ -111,17 +113,22 @@ def test_update_over_update_is_the_fused_map() -> None:
             np.testing.assert_array_equal(held.gaussians.means_m, now.gaussians.means_m)
         # a second snapshot begins anew, however many parts it has
         for part in range(3):
-            t.say(ant, said("ant", 3 + part, {cell: many[cell] for cell in range(part * 1000, part * 1000 + 1000)}))
+            t.contribute_subsets(
+                ant, make_subset("ant", 3 + part, {cell: many[cell] for cell in range(part * 1000, part * 1000 + 1000)})
+            )
         again = follow(t.client.watch(), held)
         assert again.keys.tolist() == keys(*range(3000)).tolist()
         watch.close()
 
 
-def test_a_large_map_comes_in_several_blocks_of_one_revision() -> None:
-    with team() as t:
+def test_a_large_map_is_sent_in_several_blocks_of_one_revision() -> None:
+    with fusion_server() as t:
         session = t.client.join("ant", GRID).session_id
         for part in range(3):
-            t.say(session, said("ant", part + 1, {cell: [1] * 8 for cell in range(part * 1000, part * 1000 + 1000)}))
+            t.contribute_subsets(
+                session,
+                make_subset("ant", part + 1, {cell: [1] * 8 for cell in range(part * 1000, part * 1000 + 1000)}),
+            )
         blocks = []
         for block in t.client.watch():
             blocks.append(block)

@@ -28,7 +28,7 @@ class FailingParser:
         raise ZeroDivisionError("secret detail")
 
 
-def test_the_graph_comes_back_as_the_parser_made_it() -> None:
+def test_the_client_returns_the_parsers_graph() -> None:
     text = "Identify the chair closest to the table"
     with serving([parser_service(RuleParser())]) as server, ParserClient(server.address) as client:
         assert client.parse(text) == RuleParser().parse(text)
@@ -38,33 +38,33 @@ def test_unix_socket(tmp_path: Path) -> None:
     listen = f"unix:{tmp_path}/parser.sock"
     with serving([parser_service(RuleParser())], listen) as server, ParserClient(server.address) as client:
         assert client.parse("Pick up the mug on the table").targets == ("mug",)
-        with pytest.raises(UnavailableError, match="another server answers"):
+        with pytest.raises(UnavailableError, match="another server listens"):
             asyncio.run(start_server(listen, []))
 
 
 @pytest.mark.parametrize("text", ["", "   ", "x" * 100_000])
-def test_a_task_without_sense_is_a_task_error(text: str) -> None:
+def test_an_invalid_task_is_a_task_error(text: str) -> None:
     with serving([parser_service(RuleParser())]) as server, ParserClient(server.address) as client:
         with pytest.raises(TaskError):
             client.parse(text)
         assert client.parse("Pick up the mug").targets == ("mug",)
 
 
-def test_a_bug_is_internal_without_its_details_and_the_server_lives() -> None:
+def test_an_unexpected_error_is_internal_without_details_and_the_server_keeps_serving() -> None:
     with serving([parser_service(FailingParser())]) as server, ParserClient(server.address) as client:
         for _ in range(2):
-            with pytest.raises(GaussLiteError, match="unforeseen error") as caught:
+            with pytest.raises(GaussLiteError, match="unexpected error") as caught:
                 client.parse("Pick up the mug")
             assert "secret" not in str(caught.value)
 
 
-def test_what_is_no_message_is_an_invalid_argument() -> None:
+def test_invalid_message_bytes_are_an_invalid_argument() -> None:
     with serving([parser_service(RuleParser())]) as server, grpc.insecure_channel(server.address) as channel:
         call = channel.unary_unary("/gausslite.v1.ParserService/ParseTask")
         with pytest.raises(grpc.RpcError) as raised:
             call(b"\xff\xff\xff", timeout=20)
         assert raised.value.code() is grpc.StatusCode.INVALID_ARGUMENT
-        assert "3 other bytes" in raised.value.details()
+        assert "3 invalid bytes" in raised.value.details()
 
 
 def test_health_and_reflection() -> None:
@@ -93,17 +93,17 @@ def test_an_address_in_use_is_one_line_and_code_2() -> None:
 
 
 @pytest.mark.parametrize("listen", ["nowhere", "localhost:port", "localhost:70000", ":50051", "", "h:" + "9" * 5000])
-def test_what_is_no_address_is_refused(listen: str) -> None:
+def test_an_invalid_address_is_refused(listen: str) -> None:
     with pytest.raises(InvalidInputError, match="HOST:PORT"):
         asyncio.run(start_server(listen, []))
 
 
-def test_a_socket_that_cannot_be_is_one_line_and_code_2(tmp_path: Path) -> None:
+def test_an_impossible_socket_is_one_line_and_code_2(tmp_path: Path) -> None:
     (tmp_path / "notes").write_text("mine")
     sockets = {
         "1 to 107 bytes": ("", "/tmp/" + "x" * 200),
         "folder": (str(tmp_path / "nowhere" / "x.sock"),),
-        "in the way": (str(tmp_path / "notes"),),
+        "with this name exists": (str(tmp_path / "notes"),),
     }
     for reason, paths in sockets.items():
         for path in paths:
@@ -115,10 +115,11 @@ def test_a_socket_that_cannot_be_is_one_line_and_code_2(tmp_path: Path) -> None:
     assert (tmp_path / "notes").read_text() == "mine"
 
 
-def test_nobody_there_is_unavailable() -> None:
+@pytest.mark.parametrize("address", ["127.0.0.1:1", "unix:/nowhere/parser.sock"])
+def test_an_address_without_a_service_is_connection_refused(address: str) -> None:
     with (
-        ParserClient("127.0.0.1:1", deadline_s=5.0) as client,
-        pytest.raises(UnavailableError, match=r"127\.0\.0\.1:1"),
+        ParserClient(address, deadline_s=5.0) as client,
+        pytest.raises(UnavailableError, match=r"^parser .*: connection refused$"),
     ):
         client.parse("Pick up the mug")
 
