@@ -1,1 +1,1 @@
-"""Model files on a user's disk: which ones are of use, how they come there whole, and what is in them."""
+"""Model files on the user's disk: catalogue, download, verification and inspection."""

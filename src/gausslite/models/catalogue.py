@@ -1,4 +1,4 @@
-"""The model files that GaussLite can use: what each is for, its greatest size and, where it is pinned, its SHA-256."""
+"""Catalogue of the model files that GaussLite can use: purpose, licence, maximum size and optional SHA-256."""
 
 from __future__ import annotations
 
@@ -17,7 +17,10 @@ _DIGEST: Final = re.compile(r"[0-9a-f]{64}")
 
 @dataclass(frozen=True, slots=True)
 class ModelEntry:
-    """One file: `path` is where it lies below the base URL, and its last part the name it gets on disk."""
+    """One model file. path: its location below the base URL; the last part is its name on disk.
+
+    Raises InvalidInputError for invalid fields.
+    """
 
     name: str
     path: str
@@ -39,26 +42,29 @@ class ModelEntry:
 
     @property
     def file_name(self) -> str:
-        """The name of the file on disk."""
+        """Name of the file on disk."""
         return self.path.rsplit("/", 1)[-1]
 
     @property
     def max_bytes(self) -> int:
-        """More than this is not written."""
+        """Maximum size of the file in bytes."""
         return self.max_mib * _MIB
 
 
 CATALOGUE: Final = (
     ModelEntry("grounding-dino", "grounding-dino.onnx", "--detector: any noun phrase, boxes", "Apache-2.0", 1024),
-    ModelEntry("bert-vocabulary", "vocab.txt", "--vocabulary: the words of grounding-dino", "Apache-2.0", 1),
+    ModelEntry("bert-vocabulary", "vocab.txt", "--vocabulary: the vocabulary of grounding-dino", "Apache-2.0", 1),
     ModelEntry("yolo-seg", "yolo11n-seg.onnx", "--detector: 80 classes with masks", "AGPL-3.0", 256),
     ModelEntry("fastsam", "FastSAM-s.onnx", "--segmenter: masks of everything", "AGPL-3.0", 512),
 )
-"""None is pinned, for exports of one network differ from maker to maker; --sha256 or your own catalogue pins yours."""
+"""No entry has a SHA-256, because exports of one network differ. Use --sha256 or your own catalogue to fix yours."""
 
 
 def read_catalogue(path: Path) -> tuple[ModelEntry, ...]:
-    """The entries of a TOML file: one table a model, with the fields of ModelEntry. Raises InvalidInputError."""
+    """Return the entries of a TOML file: one table per model, with the fields of ModelEntry.
+
+    Raises InvalidInputError.
+    """
     try:
         tables: dict[str, Any] = tomllib.loads(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
@@ -67,7 +73,7 @@ def read_catalogue(path: Path) -> tuple[ModelEntry, ...]:
 
 
 def entry_named(entries: tuple[ModelEntry, ...], name: str) -> ModelEntry:
-    """The entry of this name. Raises InvalidInputError naming the known ones."""
+    """Return the entry with this name. Raises InvalidInputError with the known names."""
     for entry in entries:
         if entry.name == name:
             return entry

@@ -1,6 +1,6 @@
-"""Bring one file over HTTPS: goes on where it was cut off, and is in its place whole and checked, or not at all.
+"""Download one file over HTTPS: resumable, bounded in size, and moved to its path only after verification.
 
-The standard library suffices: a mission needs no network, so no HTTP client is among the dependencies.
+It uses the standard library: a mission needs no HTTP, so no HTTP client is a dependency.
 """
 
 from __future__ import annotations
@@ -31,15 +31,15 @@ from gausslite.perception.model_file import require_onnx, sha256_of
 _CHUNK_BYTES: Final = 1 << 18
 _TIMEOUT_S: Final = 30.0
 _LOCAL: Final = frozenset({"localhost", "127.0.0.1", "::1"})
-_SPARE_BYTES: Final = 1 << 24
+_RESERVED_DISK_BYTES: Final = 1 << 24
 
 Progress = Callable[[int, int | None], None]
-"""Called with the bytes there are so far and, where the server says so, those there will be."""
+"""Called with the bytes received so far and the total, None if the server does not state it."""
 
 
 @dataclass(frozen=True, slots=True)
 class DownloadRequest:
-    """A file to bring: where from, where to, the most bytes it may have and, if known, its SHA-256."""
+    """URL, target path, maximum size in bytes and, if known, SHA-256 of a file. Raises InvalidInputError."""
 
     url: str
     path: Path
@@ -51,124 +51,125 @@ class DownloadRequest:
 
 
 def require_https(url: str) -> None:
-    """Raises InvalidInputError for anything but HTTPS; plain HTTP may come from this machine itself."""
+    """Raise InvalidInputError unless the URL is HTTPS, or HTTP on this machine."""
     try:
         parts = urllib.parse.urlsplit(url)
         host = parts.hostname
     except ValueError:
         raise InvalidInputError(f"URL {url!r}: expected an https:// address") from None
     if not host or not (parts.scheme == "https" or (parts.scheme == "http" and host in _LOCAL)):
-        raise InvalidInputError(f"URL {url!r}: expected an https:// address (http:// only for this machine itself)")
+        raise InvalidInputError(f"URL {url!r}: expected an https:// address (http:// only on this machine)")
 
 
-def download(wanted: DownloadRequest, progress: Progress) -> None:
-    """Bring the file. What was cut off stays beside it as `.NAME.part` and is gone on with, if it is the same file.
+def download(request: DownloadRequest, progress: Progress) -> None:
+    """Download the file. An interrupted download stays as `.NAME.part` and is resumed if the server's file is the same.
 
-    Raises UnavailableError when the server fails, QuotaError when the file is too large, ChecksumError when it is
-    another one than expected, ModelFileError when it is
-    named .onnx and is none, StorageError when it cannot be written.
+    Raises UnavailableError if the server fails, QuotaError if the file is too large, ChecksumError if its SHA-256
+    differs, ModelFileError if a file named .onnx is not an ONNX model, StorageError if it cannot be written.
     """
-    part = wanted.path.with_name(f".{wanted.path.name}.part")
+    part = request.path.with_name(f".{request.path.name}.part")
     try:
         part.parent.mkdir(parents=True, exist_ok=True)
-        with part.open("ab") as file, _alone(file, wanted.path):
-            _fill(wanted, file, part, progress)
+        with part.open("ab") as file, _exclusive_lock(file, request.path):
+            _fill(request, file, part, progress)
             file.flush()
             os.fsync(file.fileno())
-            _require_expected(wanted, part)
-            part.replace(wanted.path)
+            _require_valid(request, part)
+            part.replace(request.path)
             _tag_file(part).unlink(missing_ok=True)
     except OSError as error:
-        raise StorageError(f"{wanted.path}: cannot be written: {error.strerror or error}") from error
+        raise StorageError(f"{request.path}: cannot be written: {error.strerror or error}") from error
 
 
-def _fill(wanted: DownloadRequest, file: BinaryIO, part: Path, progress: Progress) -> None:
-    """Add to the part what is missing of it."""
-    have = part.stat().st_size
+def _fill(request: DownloadRequest, file: BinaryIO, part: Path, progress: Progress) -> None:
+    """Download the missing bytes of the partial file."""
+    received = part.stat().st_size
     tag = _tag_of(part)
-    if have and tag is None:
-        # nobody can say whether these bytes belong to what the server has now
-        file.truncate(have := 0)
-    with _answer(wanted.url, have, tag) as answer:
-        if answer.status != http.client.PARTIAL_CONTENT:
-            file.truncate(have := 0)
-        elif not (answer.headers.get("Content-Range") or "").startswith(f"bytes {have}-"):
-            raise UnavailableError(f"{wanted.url}: expected the bytes from {have} on, got another range")
-        total = _length(answer, have)
-        _require_room(wanted, total, have)
-        _keep_tag(part, answer.headers.get("ETag"))
-        progress(have, total)
-        while chunk := _read(answer, wanted.url):
-            have += len(chunk)
-            if have > wanted.max_bytes:
-                raise _too_large(wanted, have)
+    if received and tag is None:
+        # without an ETag the bytes may belong to another version of the file
+        file.truncate(received := 0)
+    with _open_response(request.url, received, tag) as response:
+        if response.status != http.client.PARTIAL_CONTENT:
+            file.truncate(received := 0)
+        elif not (response.headers.get("Content-Range") or "").startswith(f"bytes {received}-"):
+            raise UnavailableError(f"{request.url}: expected the bytes from {received} on, got another range")
+        total = _total_bytes(response, received)
+        _require_disk_space(request, total, received)
+        _store_tag(part, response.headers.get("ETag"))
+        progress(received, total)
+        while chunk := _read(response, request.url):
+            received += len(chunk)
+            if received > request.max_bytes:
+                raise _too_large(request, received)
             file.write(chunk)
-            progress(have, total)
-    if total is not None and have != total:
-        raise UnavailableError(f"{wanted.url}: cut off after {have} of {total} bytes; run it again to go on")
+            progress(received, total)
+    if total is not None and received != total:
+        raise UnavailableError(f"{request.url}: interrupted after {received} of {total} bytes; run it again to resume")
 
 
 @contextlib.contextmanager
-def _answer(url: str, have: int, tag: str | None) -> Iterator[Any]:
-    """The server's answer, from byte `have` on if it still has the file that `tag` names."""
+def _open_response(url: str, received: int, tag: str | None) -> Iterator[Any]:
+    """Yield the server's response, from byte `received` on if the file there still has this ETag."""
     headers = {"User-Agent": "gausslite", "Accept-Encoding": "identity"}
-    if have and tag is not None:
-        headers |= {"Range": f"bytes={have}-", "If-Range": tag}
-    opener = urllib.request.build_opener(_SafeRedirects())
+    if received and tag is not None:
+        headers |= {"Range": f"bytes={received}-", "If-Range": tag}
+    opener = urllib.request.build_opener(_CheckedRedirects())
     try:
-        # require_https saw the scheme, and _SafeRedirects sees every further one
-        answer = opener.open(urllib.request.Request(url, headers=headers), timeout=_TIMEOUT_S)  # noqa: S310
+        # require_https has checked the scheme, and _CheckedRedirects checks every redirect
+        response = opener.open(urllib.request.Request(url, headers=headers), timeout=_TIMEOUT_S)  # noqa: S310
     except urllib.error.HTTPError as error:
         error.close()
-        raise UnavailableError(f"{url}: the server answers {error.code} {error.reason}") from error
+        raise UnavailableError(f"{url}: the server returned {error.code} {error.reason}") from error
     except (OSError, http.client.HTTPException) as error:
         raise UnavailableError(f"{url}: cannot be reached: {getattr(error, 'reason', error)}") from error
-    with answer:
-        yield answer
+    with response:
+        yield response
 
 
-class _SafeRedirects(urllib.request.HTTPRedirectHandler):
-    """Follows a server to another address only where that is as safe as the first had to be."""
+class _CheckedRedirects(urllib.request.HTTPRedirectHandler):
+    """Follows redirects to addresses that `require_https` accepts."""
 
     def redirect_request(self, req: Any, fp: Any, code: int, msg: str, headers: Any, newurl: str) -> Any:
         require_https(newurl)
         return super().redirect_request(req, fp, code, msg, headers, newurl)
 
 
-def _read(answer: Any, url: str) -> bytes:
+def _read(response: Any, url: str) -> bytes:
     try:
-        chunk: bytes = answer.read(_CHUNK_BYTES)
+        chunk: bytes = response.read(_CHUNK_BYTES)
     except (OSError, http.client.HTTPException) as error:
-        raise UnavailableError(f"{url}: cut off: {error}; run it again to go on") from error
+        raise UnavailableError(f"{url}: interrupted: {error}; run it again to resume") from error
     return chunk
 
 
-def _length(answer: Any, have: int) -> int | None:
-    text = answer.headers.get("Content-Length")
-    return have + int(text) if text is not None and text.isascii() and text.isdigit() else None
+def _total_bytes(response: Any, received: int) -> int | None:
+    text = response.headers.get("Content-Length")
+    return received + int(text) if text is not None and text.isascii() and text.isdigit() else None
 
 
-def _require_room(wanted: DownloadRequest, total: int | None, have: int) -> None:
+def _require_disk_space(request: DownloadRequest, total: int | None, received: int) -> None:
     if total is None:
         return
-    if total > wanted.max_bytes:
-        raise _too_large(wanted, total)
-    free = shutil.disk_usage(wanted.path.parent).free
-    if total - have + _SPARE_BYTES > free:
-        raise StorageError(f"{wanted.path}: expected {total - have >> 20} MiB of free disk, got {free >> 20}")
+    if total > request.max_bytes:
+        raise _too_large(request, total)
+    free = shutil.disk_usage(request.path.parent).free
+    if total - received + _RESERVED_DISK_BYTES > free:
+        raise StorageError(f"{request.path}: expected {total - received >> 20} MiB of free disk, got {free >> 20}")
 
 
-def _too_large(wanted: DownloadRequest, size: int) -> QuotaError:
-    return QuotaError(f"{wanted.url}: expected at most {wanted.max_bytes} bytes, got {size} or more")
+def _too_large(request: DownloadRequest, size: int) -> QuotaError:
+    return QuotaError(f"{request.url}: expected at most {request.max_bytes} bytes, got {size} or more")
 
 
-def _require_expected(wanted: DownloadRequest, part: Path) -> None:
-    """Keep nothing that is not what was asked for: going on with wrong bytes would never end well."""
+def _require_valid(request: DownloadRequest, part: Path) -> None:
+    """Check SHA-256 and format, and delete an invalid file, which could not be resumed correctly."""
     try:
-        found = sha256_of(part) if wanted.sha256 is not None else None
-        if found != wanted.sha256:
-            raise ChecksumError(f"{wanted.url}: expected SHA-256 {wanted.sha256}, got {found}; the file was not kept")
-        if wanted.path.suffix == ".onnx":
+        actual = sha256_of(part) if request.sha256 is not None else None
+        if actual != request.sha256:
+            raise ChecksumError(
+                f"{request.url}: expected SHA-256 {request.sha256}, got {actual}; the file was not kept"
+            )
+        if request.path.suffix == ".onnx":
             require_onnx(part)
     except GaussLiteError:
         part.unlink()
@@ -177,12 +178,12 @@ def _require_expected(wanted: DownloadRequest, part: Path) -> None:
 
 
 @contextlib.contextmanager
-def _alone(file: BinaryIO, path: Path) -> Iterator[None]:
-    """Two that write one file at a time would spoil it for both; the lock goes with the open file."""
+def _exclusive_lock(file: BinaryIO, path: Path) -> Iterator[None]:
+    """Lock the open file, since two writers would corrupt it. Raises InvalidInputError if it is locked."""
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
-        raise InvalidInputError(f"{path}: another process is fetching it") from None
+        raise InvalidInputError(f"{path}: another process is downloading it") from None
     yield
 
 
@@ -191,7 +192,7 @@ def _tag_file(part: Path) -> Path:
 
 
 def _tag_of(part: Path) -> str | None:
-    """What the server called the file that the part is of; weak names may stand for other bytes too."""
+    """Return the strong ETag of the partial file, or None; a weak ETag does not identify the bytes."""
     try:
         tag = _tag_file(part).read_text(encoding="ascii").strip()
     except (OSError, UnicodeDecodeError):
@@ -199,7 +200,7 @@ def _tag_of(part: Path) -> str | None:
     return tag if tag.startswith('"') else None
 
 
-def _keep_tag(part: Path, tag: str | None) -> None:
+def _store_tag(part: Path, tag: str | None) -> None:
     if tag is not None and tag.startswith('"') and tag.isascii() and len(tag) <= 200:
         _tag_file(part).write_text(tag, encoding="ascii")
     else:

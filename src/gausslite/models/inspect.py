@@ -1,4 +1,4 @@
-"""What a model file is: checked from the outside in, down to its inputs and outputs and the family they belong to."""
+"""Inspect and verify a model file: checksum, format, inputs, outputs and model family."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from gausslite.perception.model_registry import ModelFamily, identify_family
 
 @dataclass(frozen=True, slots=True)
 class ModelSheet:
-    """A file that a session could be made of; tensors as "name [shape] type"."""
+    """Description of a model file that ONNX Runtime can load; inputs and outputs as "name [shape] type"."""
 
     path: Path
     size_bytes: int
@@ -30,7 +30,7 @@ class ModelSheet:
 
 
 def inspect(path: Path) -> ModelSheet:
-    """Open a model and describe it. Raises ModelFileError when it is damaged, or of no family that GaussLite knows."""
+    """Return the description of a model. Raises ModelFileError if it is damaged or of no known family."""
     model = open_model(path, threads=1)
     session = model.session
     described = [
@@ -43,14 +43,14 @@ def inspect(path: Path) -> ModelSheet:
 
 
 def verify(path: Path, sha256: str | None) -> str:
-    """Say what was checked. Raises ModelFileError when the file is not what it should be."""
+    """Return the checks that the file passed. Raises ModelFileError if one fails."""
     if not path.is_file():
         raise ModelFileError(f"model {path}: expected a file, found {'a folder' if path.is_dir() else 'nothing'}")
     checked = []
     if sha256 is not None:
-        found = sha256_of(path)
-        if found != sha256:
-            raise ModelFileError(f"model {path}: expected SHA-256 {sha256}, got {found}")
+        actual = sha256_of(path)
+        if actual != sha256:
+            raise ModelFileError(f"model {path}: expected SHA-256 {sha256}, got {actual}")
         checked.append("SHA-256")
     require_listed_checksum(path)
     if listed_checksum(path) is not None:
