@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// A training image, prepared once: in tiles, padded to whole tiles, with weights per tile. A mapper draws one of many
+// A training image, prepared once: in tiles, padded to whole tiles, with weights per tile. A mapper picks one of many
 // views at random, so that it comes from memory in each step: the format is compact.
 #pragma once
 

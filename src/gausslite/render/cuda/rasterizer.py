@@ -195,8 +195,9 @@ class CudaRasterizer:
         tables = HostTables(rows, first_moment, second_moment)
         if self._bound is None:
             with self.bind_tables(rows, first_moment, second_moment):
-                settings = loss, adam, masked, subset, trainable, update_counter
-                return self.step(*tables.arrays, view, T_camera_world, *settings)
+                return self.step(
+                    *tables.arrays, view, T_camera_world, loss, adam, masked, subset, trainable, update_counter
+                )
         if not self._bound.host.same_memory_as(tables):
             raise InvalidInputError("step: expected the bound tables, got others")
         require_scene(len(rows), view.camera, T_camera_world, subset)
