@@ -1,4 +1,4 @@
-"""Certificates for tests, by the script that operators try encryption with."""
+"""Certificates for tests, made by the script in deploy."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ SCRIPT = Path(__file__).resolve().parents[2] / "deploy" / "make_certificates.sh"
 
 
 def make_certificates(folder: Path, *names: str) -> Path:
-    """A folder with an authority and a certificate for each name."""
+    """Make a folder with an authority and a certificate for each name."""
     if shutil.which("openssl") is None:
         pytest.skip("certificates need the program openssl")
     subprocess.run(["bash", str(SCRIPT), str(folder), *names], check=True, timeout=60)
@@ -22,5 +22,5 @@ def make_certificates(folder: Path, *names: str) -> Path:
 
 
 def identity(folder: Path, name: str) -> Tls:
-    """Who shows this name, and believes the folder's authority."""
+    """Return the identity of this name, which trusts the folder's authority."""
     return Tls.read(folder / f"{name}.pem", folder / f"{name}.key", folder / "ca.pem")

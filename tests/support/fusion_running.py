@@ -1,4 +1,4 @@
-"""Agents, words and a fusion server in process, for the tests of the service."""
+"""Agents, voxel updates and a fusion server in process, for the tests of the service."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ CAMERA = Camera(40.0, 40.0, 16.0, 12.0, 32, 24)
 
 @dataclass(frozen=True)
 class RunningServer:
-    """A running server and ways to speak to it."""
+    """A running server and its clients."""
 
     servicer: FusionServicer
     client: FusionClient
@@ -51,13 +51,13 @@ class RunningServer:
     loop: asyncio.AbstractEventLoop
 
     def drain(self) -> None:
-        """Begin to drain, as on SIGTERM."""
+        """Drain the server, as on SIGTERM."""
         self.loop.call_soon_threadsafe(self.servicer.drain)
 
     def contribute_subsets(
         self, session_id: str, *subsets: RoiSubset, grid: VoxelGrid = GRID
     ) -> list[pb.SubsetOutcome]:
-        """Send these messages on one stream and collect what became of each."""
+        """Send these subsets on one stream and return their outcomes."""
         return self.send(*(request(session_id, subset, grid) for subset in subsets))
 
     def send(self, *requests: pb.ContributeSubsetsRequest) -> list[pb.SubsetOutcome]:
@@ -80,13 +80,13 @@ def fusion_server(
     refine: RefineSettings | None = None,
     tls: Tls | None = None,
 ) -> Iterator[RunningServer]:
-    """A fusion server on a free port with the reference rasterizer; the store stays the caller's.
+    """Start a fusion server on a free port with the reference rasterizer; the caller owns the store.
 
-    With tls its own client shows the server's certificate; stub and channel are of no use then.
+    With tls the client uses the server's certificate; the stub and the channel do not work then.
     """
-    team_map = FusionEngine(store or MemoryStore(), settings or FusionSettings(grid=GRID))
+    engine = FusionEngine(store or MemoryStore(), settings or FusionSettings(grid=GRID))
     settings_of_refinement = refine or RefineSettings(iterations=3, report_every=1)
-    servicer = FusionServicer(team_map, RefinementWorker(settings_of_refinement, ReferenceRasterizer))
+    servicer = FusionServicer(engine, RefinementWorker(settings_of_refinement, ReferenceRasterizer))
     loops = []
 
     def register(server: grpc.aio.Server) -> None:
@@ -106,7 +106,7 @@ def fusion_server(
 
 @contextmanager
 def server_process(*arguments: str) -> Iterator[tuple[subprocess.Popen[bytes], FusionClient]]:
-    """A server in a process of its own that is ready to answer; killed at the end."""
+    """Start a server in another process and wait until it is ready; it is killed at the end."""
     with tempfile.TemporaryDirectory() as folder:
         address = f"unix:{folder}/fusion.sock"
         process = subprocess.Popen([*COMMAND, "--listen", address, *arguments], stderr=subprocess.DEVNULL)
@@ -122,7 +122,7 @@ def server_process(*arguments: str) -> Iterator[tuple[subprocess.Popen[bytes], F
 
 
 def make_batch(cells: dict[int, Sequence[int]]) -> VoxelBatch:
-    """For each cell along x the kappas of the Gaussians in it; none at all is a tombstone."""
+    """Make updates from the kappas of the Gaussians in each cell along x; an empty list is a tombstone."""
     kappas = [(cell, kappa) for cell in sorted(cells) for kappa in cells[cell]]
     n = len(kappas)
     numbers = np.random.default_rng(n).random((n, 3), np.float32)

@@ -1,4 +1,4 @@
-"""Gaussians to test with: plain ones at given places, or random ones in every column."""
+"""Gaussians for tests: plain ones at given positions, or random values in every column."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def plain_gaussians(means_m: Any, **columns: Any) -> Gaussians:
 
 
 def random_gaussians(n: int, seed: int = 0, max_kappa: int = 100) -> Gaussians:
-    """Anything that a map may hold, at means of about a metre from the origin."""
+    """Random Gaussians with means about a metre from the origin."""
     rng = np.random.default_rng(seed)
     quats = rng.normal(size=(n, 4))
     return plain_gaussians(

@@ -1,4 +1,4 @@
-"""Serve in process on an event loop in a thread, as another process would."""
+"""Run a server in this process, on an event loop in a thread."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from gausslite.wire.tls import Tls
 
 @contextmanager
 def serving(services: list[Service], listen: str = "127.0.0.1:0", tls: Tls | None = None) -> Iterator[RunningServer]:
-    """A running server; it is drained at the end."""
+    """Start a server; it is drained at the end."""
     loop = asyncio.new_event_loop()
     thread = threading.Thread(target=loop.run_forever)
     thread.start()

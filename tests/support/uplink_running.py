@@ -1,4 +1,4 @@
-"""An uplink beside a real fusion server, or beside one that says what a test tells it to."""
+"""An uplink to a real fusion server, or to one with scripted answers."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def uplink(
 
 
 def stored_kappas(store: MemoryStore) -> dict[int, list[int]]:
-    """Per voxel the kappas the server holds of the robot."""
+    """Return the kappas that the server stores of the robot, by voxel."""
     table = store.batch("robot")
     return {
         key: table.gaussians.kappa[start:end].tolist()
@@ -50,18 +50,18 @@ def stored_kappas(store: MemoryStore) -> dict[int, list[int]]:
     }
 
 
-def expected_kappas(*offers: dict[int, list[int]]) -> dict[int, list[int]]:
-    """Per voxel what these offers leave behind."""
+def expected_kappas(*updates: dict[int, list[int]]) -> dict[int, list[int]]:
+    """Return the kappas that remain after these updates, by voxel."""
     last: dict[int, list[int]] = {}
-    for offer in offers:
-        table = make_batch(offer)
+    for update in updates:
+        table = make_batch(update)
         for key, start, end in zip(table.keys.tolist(), table.offsets[:-1], table.offsets[1:], strict=True):
             last[key] = table.gaussians.kappa[start:end].tolist()
     return last
 
 
 class ScriptedServer(pb_grpc.FusionServiceServicer):
-    """Answers each subset as a script says, and remembers what came."""
+    """Answers each subset as scripted, and records the subsets."""
 
     def __init__(self, answer: Callable[[int, VoxelBatch], pb.SubsetOutcome | GaussLiteError]) -> None:
         self._answer = answer

@@ -1,1 +1,1 @@
-"""The fusion server: keeps the team's map, and serves it to whoever wants to see it."""
+"""The fusion server: stores the agents' voxel updates and serves the fused map."""

@@ -1,4 +1,4 @@
-"""PLY maps: what was written is read, other tools understand it, and damage is one line."""
+"""PLY maps: round trips, exchange with another tool, world frame names, and errors of damaged files."""
 
 from __future__ import annotations
 
@@ -12,9 +12,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from sample_gaussians import random_gaussians
 
-from gausslite.codec.ply import gaussians_from_ply, ply_bytes, read_ply, write_ply
+from gausslite.codec.ply import (
+    gaussians_from_ply,
+    ply_bytes,
+    read_ply,
+    read_world_frame,
+    world_frame_from_ply,
+    write_ply,
+)
 from gausslite.domain.gaussians import Gaussians
-from gausslite.errors import MapFileError, StorageError
+from gausslite.errors import InvalidInputError, MapFileError, StorageError
 
 
 def assert_same(got: Gaussians, sent: Gaussians) -> None:
@@ -139,3 +146,29 @@ def test_a_full_disk_raises_storage_error_and_keeps_the_old_map(tmp_path: Path) 
     assert [file.name for file in tmp_path.iterdir()] == ["map.ply"]
     with pytest.raises(StorageError, match="cannot be written"):
         write_ply(tmp_path / "no" / "map.ply", random_gaussians(3))
+
+
+@pytest.mark.parametrize("name", ["map", "Küche 2", "end_header", "world frame"])
+def test_the_world_frame_is_read_back_and_changes_nothing_else(name: str, tmp_path: Path) -> None:
+    gaussians = random_gaussians(5)
+    write_ply(tmp_path / "map.ply", gaussians, name)
+    assert read_world_frame(tmp_path / "map.ply") == name
+    assert ply_bytes(read_ply(tmp_path / "map.ply")) == ply_bytes(gaussians_from_ply(ply_bytes(gaussians)))
+    assert world_frame_from_ply(ply_bytes(gaussians)) == ""
+    header = f"comment world_frame {name}\n".encode()
+    assert ply_bytes(gaussians, name).replace(header, b"", 1) == ply_bytes(gaussians)
+
+
+@pytest.mark.parametrize("name", ["line\nbreak", "carriage\rreturn", "tab\t", "nul\0", "\u2028", "x" * 256, "\ud800"])
+def test_a_world_frame_with_control_characters_or_too_long_is_refused(name: str, tmp_path: Path) -> None:
+    with pytest.raises(InvalidInputError, match="world frame"):
+        write_ply(tmp_path / "map.ply", random_gaussians(1), name)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("comments", [b"a\ncomment world_frame b", b"\xff", b"a\tb"])
+def test_an_ambiguous_or_invalid_world_frame_in_a_file_is_refused(comments: bytes, tmp_path: Path) -> None:
+    data = ply_bytes(random_gaussians(1), "NAME").replace(b"NAME", comments)
+    (tmp_path / "map.ply").write_bytes(data)
+    with pytest.raises(MapFileError, match=r"map\.ply: expected (one|a) world frame"):
+        read_world_frame(tmp_path / "map.ply")

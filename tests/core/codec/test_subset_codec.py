@@ -1,4 +1,4 @@
-"""The codec's laws: bounded error, the same bytes again, and damage that is always noticed."""
+"""The subset codec: bounded errors, stable bytes, and detection of every damage."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The change_log as a law: who applies what it names is always where the fused map is."""
+"""The change log: a watcher that applies the named changes has the fused map."""
 
 from __future__ import annotations
 

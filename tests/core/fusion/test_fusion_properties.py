@@ -1,4 +1,4 @@
-"""The fusion law as laws: whatever happens on the way, the fused map is a function of the agents' latest words."""
+"""Properties of the fusion: the fused map is a function of the agents' latest voxel updates."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One suite for every store: the register's rules, sessions and the mission; then what only a durable store must do."""
+"""One suite for every store (updates, sessions, mission), then the properties of a durable store."""
 
 from __future__ import annotations
 
@@ -164,7 +164,7 @@ CHILD = """
 import sys
 from pathlib import Path
 sys.path.insert(0, sys.argv[2])
-from test_fusion_stores import said
+from test_fusion_stores import make_subset
 from gausslite.fusion.sqlite_store import SqliteStore
 store = SqliteStore(Path(sys.argv[1]))
 for revision in range(1, 1_000_000):

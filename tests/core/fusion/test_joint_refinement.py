@@ -1,4 +1,4 @@
-"""Joint refinement on a small scene: it learns where the map is seen, leaves the rest, and stops when told."""
+"""Joint refinement of a small scene: convergence, occlusion, limits and cancellation."""
 
 from __future__ import annotations
 

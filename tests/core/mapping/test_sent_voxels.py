@@ -1,4 +1,4 @@
-"""Words per voxel and the tracker of what changed."""
+"""Batches of voxels, and the tracker of sent voxels."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The one table between errors and codes: every error there, and the same class on the other side."""
+"""The table of errors and status codes: it contains every error, and clients raise the same class."""
 
 from __future__ import annotations
 

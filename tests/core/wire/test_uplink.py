@@ -1,4 +1,4 @@
-"""The uplink against real servers: everything arrives, whatever happens on the way."""
+"""The uplink with real servers: all updates arrive, in every situation."""
 
 from __future__ import annotations
 

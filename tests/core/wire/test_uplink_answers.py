@@ -1,4 +1,4 @@
-"""What the uplink does about each answer of a server, and about whatever is lost on the way."""
+"""The uplink's reaction to each answer of a server, and to every loss of messages."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whatever bytes arrive, the fusion server answers with a known code and goes on serving."""
+"""The fusion server answers random bytes with a documented code and keeps serving."""
 
 from __future__ import annotations
 

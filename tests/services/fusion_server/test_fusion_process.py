@@ -1,4 +1,4 @@
-"""The fusion server as its own process: its command line, its end on SIGTERM, and its next life after a kill."""
+"""The fusion server as a process: command line, SIGTERM, and restart after a kill."""
 
 from __future__ import annotations
 

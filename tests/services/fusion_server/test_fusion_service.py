@@ -1,4 +1,4 @@
-"""Joining, contributing and exporting on a real fusion server in process, and every error code that applies."""
+"""Joining, contributing and exporting on a real fusion server in process, and every error code."""
 
 from __future__ import annotations
 

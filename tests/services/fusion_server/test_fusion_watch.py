@@ -1,4 +1,4 @@
-"""A watcher that sleeps finds the sum of what it missed: nothing is queued for it, and nothing is lost."""
+"""A slow watcher gets the sum of the changes it missed: nothing is queued or lost."""
 
 from __future__ import annotations
 

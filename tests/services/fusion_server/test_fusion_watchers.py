@@ -1,4 +1,4 @@
-"""Watchers of the fused map, on a real server in process: a snapshot, then what changes."""
+"""Watchers of the fused map on a real server in process: a snapshot, then changes."""
 
 from __future__ import annotations
 

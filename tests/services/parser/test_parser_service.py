@@ -1,4 +1,4 @@
-"""The parser service in process: the right graph, the right status, health, reflection, and an address in use."""
+"""The parser service in process: graphs, status codes, health, reflection, and an address in use."""
 
 from __future__ import annotations
 
