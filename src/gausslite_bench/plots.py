@@ -40,5 +40,6 @@ def write_curves(path: Path, panels: Mapping[str, Curves], x_label: str, y_label
         axes.grid(alpha=0.3)
         axes.legend()
     buffer = io.BytesIO()
-    FigureCanvasAgg(figure).print_png(buffer)
+    FigureCanvasAgg(figure)
+    figure.savefig(buffer, format="png")
     write_atomic(path, buffer.getvalue())

@@ -16,7 +16,7 @@ COARSE = (8, 6)
 
 
 def summarise() -> dict[str, Any]:
-    """Return per trajectory a few frames as coarse means: colour 0 to 255, exact depth in cm, visible pixels of some objects."""
+    """Return coarse means of a few frames per trajectory: colour, exact depth in cm, and pixels of some objects."""
     summary: dict[str, Any] = {}
     for trajectory in range(3):
         source = open_source(f"sim:home?seed=0&trajectory={trajectory}&frames=4&size=160x120&noise=0")

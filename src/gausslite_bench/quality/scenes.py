@@ -110,7 +110,7 @@ class RecordedRelevanceEstimator:
         return self._masks[frame]
 
     def state(self) -> State:
-        """Return an empty state: masks are looked up."""
+        """Return an empty state."""
         return {}
 
     def restore(self, state: State) -> None:
