@@ -1,4 +1,4 @@
-"""A robot and its service in this process, and an attention that tests can hold and break."""
+"""An agent and its service in this process, and a relevance estimator that tests can block and break."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ TASK = "Pick up the mug on the table"
 
 @dataclass
 class Gate:
-    """An attention that lets a test hold the worker at a frame, and fails on demand."""
+    """A relevance estimator that blocks the worker at a frame, and fails on request."""
 
     inner: RelevanceEstimator
     opened: threading.Event
@@ -67,7 +67,7 @@ class Gate:
         del state
 
 
-def ball_attention(_graph: TaskGraph) -> RelevanceEstimator:
+def ball_estimator(_graph: TaskGraph) -> RelevanceEstimator:
     return RegionRelevanceEstimator([BallRegion((0.0, 0.0, 1.2), 0.2)])
 
 
@@ -79,11 +79,13 @@ class Agent:
 
 
 @contextmanager
-def agent(attention: object = ball_attention, uplink: Uplink | None = None, queue_frames: int = 4) -> Iterator[Agent]:
+def agent(
+    build_estimator: object = ball_estimator, uplink: Uplink | None = None, queue_frames: int = 4
+) -> Iterator[Agent]:
     loops: list[asyncio.AbstractEventLoop] = []
     notifiers: list[ChangeNotifier] = []
     on_change = lambda: loops[0].call_soon_threadsafe(lambda: notifiers[0].notify())  # noqa: E731
-    worker = MappingWorker(SETTINGS, GRID, attention, uplink, on_change, LoadSettings(queue_frames))  # type: ignore[arg-type]
+    worker = MappingWorker(SETTINGS, GRID, build_estimator, uplink, on_change, LoadSettings(queue_frames))  # type: ignore[arg-type]
 
     def register(server: grpc.aio.Server) -> None:
         loops.append(asyncio.get_running_loop())

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from gausslite.cli.map_inputs import MapInputs, has_regions, region_estimator
 from gausslite.cli.progress import MappingBar, print_above_bar
-from gausslite.cli.source_options import add_regions, add_source
+from gausslite.cli.source_options import add_regions, add_source, report_region_file
 from gausslite.config.mapping_options import add_budget, add_detector, add_policy
 from gausslite.config.values import AUTO
 from gausslite.domain.gaussians import Gaussians
@@ -164,7 +164,9 @@ class _Run:
 def _first_estimator(
     options: argparse.Namespace, inputs: MapInputs, estimators: EstimatorFactory, resumed_after: int
 ) -> RelevanceEstimator:
-    """Return the estimator of the first frame's task or regions, and report nouns that the detector does not know."""
+    """Return the estimator of the first frame's task or regions, and report nouns that the detector cannot find."""
+    if options.detector is None and inputs.schedule.graphs():
+        report_region_file(options.source)
     for scheduled in inputs.schedule.graphs():
         for warning in estimators.unsupported_nouns(scheduled):
             print(warning, file=sys.stderr)

@@ -37,7 +37,7 @@ def require_rate(rate_hz: float) -> None:
 
 @dataclass(frozen=True, slots=True)
 class SceneInfo:
-    """What a mission knows about its scene: the upward direction and, for tests, the regions of objects."""
+    """Information about the scene of a mission: the upward direction and, for tests, the regions of objects."""
 
     up_axis: UpAxis = (0.0, 0.0, 1.0)
     regions: Mapping[str, Region] = field(default_factory=dict)

@@ -58,9 +58,9 @@ def loop(max_gaussians: int = 400, window: int = 2) -> TaskMapper:
         density=DensitySettings(densify_every=7, prune_every=5),
         pose_prior=PoseExposurePrior(0.01, 0.5, 0.1, 0.05),
     )
-    attention = TaskRelevanceEstimator(GRAPH, RegionDetector(REGIONS), TrackerSettings(max_frames=3))
+    estimator = TaskRelevanceEstimator(GRAPH, RegionDetector(REGIONS), TrackerSettings(max_frames=3))
     mapper = GaussianMapper(mapper_settings, CpuRasterizer(threads=1), seed=3)
-    return TaskMapper(attention, mapper, SentVoxelTracker(VoxelGrid()))
+    return TaskMapper(estimator, mapper, SentVoxelTracker(VoxelGrid()))
 
 
 def frames(first: int, end: int) -> Iterator[Frame]:

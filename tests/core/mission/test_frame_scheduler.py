@@ -1,4 +1,4 @@
-"""How a frame's time is shared out, on a clock that only work moves."""
+"""The scheduler shares out a frame's time, on a clock that advances with work only."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from gausslite.errors import InvalidInputError
 from gausslite.mapping.stages import SkippableStage, Stage
 from gausslite.mission.frame_scheduler import FrameScheduler, FrameTiming, SchedulerSettings, choose_skipped_stages
 
-TRIED = [step for step in Stage if step not in (Stage.REEVALUATION, Stage.PRUNING, Stage.DENSIFICATION)]
+STAGES_OF_RUN_FRAME = [step for step in Stage if step not in (Stage.REEVALUATION, Stage.PRUNING, Stage.DENSIFICATION)]
 """The steps of `run_frame`."""
 CHEAP = {**dict.fromkeys(Stage, 1.0), Stage.FINALISATION: 0.0}
 
 
 class WorkClock:
-    """Stands still but for the work done."""
+    """A clock that advances with work only."""
 
     def __init__(self) -> None:
         self.now_s = 0.0
@@ -69,8 +69,8 @@ def test_without_settings_iterations_are_counted_whatever_they_cost() -> None:
     clock = WorkClock()
     scheduler = FrameScheduler(clock=clock)
     for seconds in (0.0, 1.0, 1e6):
-        budget, done = run_frame(scheduler, clock, dict.fromkeys(Stage, seconds), counted=5)
-        assert (done, budget.skipped_stages, budget.under_trained) == (5, frozenset(), False)
+        timing, done = run_frame(scheduler, clock, dict.fromkeys(Stage, seconds), counted=5)
+        assert (done, timing.skipped_stages, timing.under_trained) == (5, frozenset(), False)
         assert scheduler.has_time_for(Stage.DENSIFICATION)
 
 
@@ -82,12 +82,12 @@ def test_a_frame_ends_in_its_time_up_to_one_iteration(seed: int) -> None:
         costs = {**CHEAP, Stage.WARM_UP: rng.uniform(4, 12), Stage.ACTIVE: rng.uniform(1, 4)}
         costs[Stage.SEEDING], costs[Stage.PUBLISHING] = rng.uniform(2, 10), rng.uniform(1, 4)
         costs[Stage.FINALISATION] = rng.uniform(1, 8)
-        budget, done = run_frame(scheduler, clock, costs)
+        timing, done = run_frame(scheduler, clock, costs)
         surprise = 0.0 if frame else costs[Stage.FINALISATION] + costs[Stage.PUBLISHING]
         # the words, too, may cost more than they used to
-        assert budget.seconds <= 100.0 + costs[Stage.WARM_UP] + surprise + 4.0
+        assert timing.seconds <= 100.0 + costs[Stage.WARM_UP] + surprise + 4.0
         assert done >= 2
-        assert not budget.under_trained
+        assert not timing.under_trained
 
 
 def test_time_that_is_left_is_filled() -> None:
@@ -99,14 +99,14 @@ def test_time_that_is_left_is_filled() -> None:
     assert scheduler.end().seconds == pytest.approx(99.0)
 
 
-def test_the_steps_add_up_to_the_frame() -> None:
+def test_the_stages_add_up_to_the_frame() -> None:
     clock = WorkClock()
-    budget, done = run_frame(FrameScheduler(SchedulerSettings(50.0, 4), clock), clock, CHEAP)
-    assert sum(budget.stages_s.values()) == pytest.approx(budget.seconds)
-    assert budget.stages_s[Stage.WARM_UP] + budget.stages_s[Stage.ACTIVE] == pytest.approx(done)
+    timing, done = run_frame(FrameScheduler(SchedulerSettings(50.0, 4), clock), clock, CHEAP)
+    assert sum(timing.stages_s.values()) == pytest.approx(timing.seconds)
+    assert timing.stages_s[Stage.WARM_UP] + timing.stages_s[Stage.ACTIVE] == pytest.approx(done)
 
 
-def test_reliefs_give_way_in_their_order_and_only_as_far_as_needed() -> None:
+def test_stages_are_skipped_in_their_order_and_only_as_needed() -> None:
     # five fixed steps and four iterations cost 9, the words 1 of it and drawing with seeding 2
     four = SchedulerSettings(min_iterations=4)
     for time_s, expected in (
@@ -123,7 +123,7 @@ def test_reliefs_give_way_in_their_order_and_only_as_far_as_needed() -> None:
 
 
 @given(st.integers(0, 30), st.sampled_from([Stage.WARM_UP, Stage.ACTIVE]), st.floats(1.0, 20.0))
-def test_the_least_iterations_cost_a_warm_up_and_else_the_cheapest_kind(
+def test_min_iterations_cost_one_warm_up_and_else_the_cheapest_kind(
     least: int, cheapest: Stage, warm_up_s: float
 ) -> None:
     costs = {**CHEAP, Stage.WARM_UP: warm_up_s}
@@ -137,7 +137,7 @@ def test_the_least_iterations_cost_a_warm_up_and_else_the_cheapest_kind(
     ("done", "left_s", "expected"), [(0, 60.0, True), (5, 19.5, True), (5, 18.5, False), (13, 10.5, False)]
 )
 @pytest.mark.parametrize("step", [Stage.WARM_UP, Stage.DENSIFICATION])
-def test_there_is_time_for_a_step_while_the_least_iterations_still_fit_after_it(
+def test_there_is_time_for_a_stage_if_min_iterations_fit_after_it(
     step: Stage, done: int, left_s: float, expected: bool
 ) -> None:
     clock = WorkClock()
@@ -157,7 +157,7 @@ def test_there_is_time_for_a_step_while_the_least_iterations_still_fit_after_it(
 
 
 @pytest.mark.parametrize(("frame_s", "done", "spare_s"), [(30.0, 2.0, 9.0), (14.0, 1.0, 2.0)])
-def test_the_fixed_steps_to_come_have_their_time_set_aside_but_for_those_gone_without(
+def test_time_is_reserved_for_the_fixed_stages_to_come_except_skipped_ones(
     frame_s: float, done: float, spare_s: float
 ) -> None:
     clock = WorkClock()
@@ -177,12 +177,12 @@ def test_the_fixed_steps_to_come_have_their_time_set_aside_but_for_those_gone_wi
     assert not scheduler.has_time_for(Stage.REEVALUATION)
 
 
-FRAME_S, RUN_OVER_S, ITERATION_S = 100.0, 20.0, 4.0
-"""Fifteen iterations and four fixed steps beside the view cost 64 of a hundred."""
+FRAME_S, SLACK_S, ITERATION_S = 100.0, 20.0, 4.0
+"""Fifteen iterations and the fixed stages without the view preparation cost 64 of 100 s."""
 
 
-def surprised(views_s: list[float], deadline_slack: float = RUN_OVER_S / FRAME_S) -> list[FrameTiming]:
-    """Frames whose steps cost what they always do, but for the view: that costs what nobody could expect."""
+def timings_with_view_costs(views_s: list[float], deadline_slack: float = SLACK_S / FRAME_S) -> list[FrameTiming]:
+    """Return the timings of frames whose view preparation has unexpected costs; the other stages cost as before."""
     clock, costs = WorkClock(), {**CHEAP, Stage.WARM_UP: ITERATION_S, Stage.ACTIVE: ITERATION_S}
     scheduler = FrameScheduler(SchedulerSettings(FRAME_S, 15, skip_stages=(), deadline_slack=deadline_slack), clock)
     run_frame(scheduler, clock, costs)
@@ -191,34 +191,32 @@ def surprised(views_s: list[float], deadline_slack: float = RUN_OVER_S / FRAME_S
 
 @settings(deadline=None, max_examples=40)
 @given(st.lists(st.floats(0.0, 3 * FRAME_S), min_size=1, max_size=8), st.floats(0.0, 1.0))
-def test_frames_at_the_rate_are_late_by_the_share_that_may_be_run_over_at_most(
-    views_s: list[float], deadline_slack: float
-) -> None:
+def test_frames_overrun_by_the_deadline_slack_at_most(views_s: list[float], deadline_slack: float) -> None:
     behind_s = 0.0
-    for view_s, budget in zip(views_s, surprised(views_s, deadline_slack), strict=True):
+    for view_s, timing in zip(views_s, timings_with_view_costs(views_s, deadline_slack), strict=True):
         # a frame whose view alone takes longer trains once; what was not tried is expected to cost less than it does
         longest_s = max(FRAME_S * (1 + deadline_slack), behind_s + view_s + 4.0) + ITERATION_S
-        assert behind_s + budget.seconds <= longest_s + 1e-9
-        behind_s = min(max(0.0, behind_s + budget.seconds - FRAME_S), deadline_slack * FRAME_S)
+        assert behind_s + timing.seconds <= longest_s + 1e-9
+        behind_s = min(max(0.0, behind_s + timing.seconds - FRAME_S), deadline_slack * FRAME_S)
 
 
 @settings(deadline=None, max_examples=40)
 @given(st.data())
-def test_where_the_time_suffices_over_a_few_frames_no_frame_is_short(data: st.DataObject) -> None:
+def test_no_frame_is_under_trained_if_the_time_suffices_over_a_few_frames(data: st.DataObject) -> None:
     behind_s, views_s = 0.0, []
     for _ in range(data.draw(st.integers(1, 8))):
-        views_s.append(data.draw(st.floats(0.0, FRAME_S + RUN_OVER_S - behind_s - 64.0 - 1e-6)))
+        views_s.append(data.draw(st.floats(0.0, FRAME_S + SLACK_S - behind_s - 64.0 - 1e-6)))
         behind_s = max(0.0, behind_s + views_s[-1] + 64.0 - FRAME_S)
-    assert not any(budget.under_trained for budget in surprised(views_s))
+    assert not any(timing.under_trained for timing in timings_with_view_costs(views_s))
 
 
-def test_what_a_frame_ran_over_is_given_back_by_the_next_ones() -> None:
-    budgets = surprised([50.0, *[10.0] * 5])
-    assert budgets[0].seconds == pytest.approx(114.0)
-    assert sum(budget.seconds for budget in budgets) <= 6 * FRAME_S
-    assert not any(budget.under_trained for budget in budgets)
-    # and without that share the same frame trains too little
-    assert surprised([50.0], deadline_slack=0.0)[0].under_trained
+def test_an_overrun_is_deducted_from_the_following_frames() -> None:
+    timings = timings_with_view_costs([50.0, *[10.0] * 5])
+    assert timings[0].seconds == pytest.approx(114.0)
+    assert sum(timing.seconds for timing in timings) <= 6 * FRAME_S
+    assert not any(timing.under_trained for timing in timings)
+    # without slack the same frame is under-trained
+    assert timings_with_view_costs([50.0], deadline_slack=0.0)[0].under_trained
 
 
 def after_a_stall(every_s: float, latest: int = 40) -> tuple[list[float], list[int]]:
@@ -226,9 +224,7 @@ def after_a_stall(every_s: float, latest: int = 40) -> tuple[list[float], list[i
     one frame arrives every `every_s`.
     """
     clock, costs = WorkClock(), {**CHEAP, Stage.WARM_UP: ITERATION_S, Stage.ACTIVE: ITERATION_S}
-    scheduler = FrameScheduler(
-        SchedulerSettings(FRAME_S, 15, skip_stages=(), deadline_slack=RUN_OVER_S / FRAME_S), clock
-    )
+    scheduler = FrameScheduler(SchedulerSettings(FRAME_S, 15, skip_stages=(), deadline_slack=SLACK_S / FRAME_S), clock)
     run_frame(scheduler, clock, costs)
     came_s = deque(clock.now_s + i * every_s for i in range(60))
     clock.work(3 * FRAME_S)
@@ -238,13 +234,13 @@ def after_a_stall(every_s: float, latest: int = 40) -> tuple[list[float], list[i
             came_s.popleft()
         clock.work(max(0.0, came_s[0] - clock.now_s))
         waited_s.append(clock.now_s - came_s.popleft())
-        budget, done = run_frame(scheduler, clock, costs, waited_s=waited_s[-1])
-        assert not budget.under_trained
+        timing, done = run_frame(scheduler, clock, costs, waited_s=waited_s[-1])
+        assert not timing.under_trained
         iterations.append(done)
     return waited_s, iterations
 
 
-def test_a_frame_that_waits_trains_no_more_than_the_least_until_what_a_stall_has_left_waiting_is_made_up() -> None:
+def test_waiting_frames_train_min_iterations_until_the_queue_of_a_stall_is_empty() -> None:
     waited_s, iterations = after_a_stall(every_s=FRAME_S)
     # such a frame takes 65 of a hundred
     assert waited_s[:10] == pytest.approx([300.0, *(300.0 - 35.0 * i for i in range(1, 9)), 0.0], abs=ITERATION_S)
@@ -253,31 +249,31 @@ def test_a_frame_that_waits_trains_no_more_than_the_least_until_what_a_stall_has
     assert min(iterations[9:]) >= 22
 
 
-def test_a_queue_that_is_always_full_leaves_frames_their_time_but_for_the_share_that_may_be_run_over() -> None:
+def test_behind_a_full_queue_frames_lose_the_deadline_slack_only() -> None:
     _, iterations = after_a_stall(every_s=FRAME_S / 3, latest=4)
     assert max(iterations[:5]) == 15
     assert min(iterations[12:]) >= 17
 
 
-def test_a_frame_runs_over_for_its_least_iterations_alone() -> None:
+def test_a_frame_overruns_for_its_min_iterations_only() -> None:
     for view_s in (0.0, 20.0, 35.0):
-        assert surprised([view_s])[0].seconds <= FRAME_S
-    steps_s = surprised([45.0])[0].stages_s
+        assert timings_with_view_costs([view_s])[0].seconds <= FRAME_S
+    steps_s = timings_with_view_costs([45.0])[0].stages_s
     assert steps_s[Stage.WARM_UP] + steps_s[Stage.ACTIVE] == 15 * ITERATION_S
 
 
-def test_under_lasting_overload_nothing_is_left_out_twice_on_end_and_short_frames_are_counted() -> None:
+def test_under_overload_no_stage_is_skipped_twice_in_a_row_and_under_trained_frames_are_counted() -> None:
     clock = WorkClock()
     scheduler = FrameScheduler(SchedulerSettings(5.0, 4), clock)
-    budgets = [run_frame(scheduler, clock, {**CHEAP, Stage.SEEDING: 10.0})[0] for _ in range(20)]
-    for before, after in itertools.pairwise(budgets):
+    timings = [run_frame(scheduler, clock, {**CHEAP, Stage.SEEDING: 10.0})[0] for _ in range(20)]
+    for before, after in itertools.pairwise(timings):
         assert not before.skipped_stages & after.skipped_stages
     for relief in SkippableStage:
-        assert 8 <= sum(relief in budget.skipped_stages for budget in budgets) <= 10
-    assert sum(budget.under_trained for budget in budgets) > 0
+        assert 8 <= sum(relief in timing.skipped_stages for timing in timings) <= 10
+    assert sum(timing.under_trained for timing in timings) > 0
 
 
-def test_a_step_that_was_dear_once_is_tried_again() -> None:
+def test_a_stage_that_was_slow_once_is_tried_again() -> None:
     clock = WorkClock()
     scheduler = FrameScheduler(SchedulerSettings(20.0, 4), clock)
     with scheduler.timing(Stage.DENSIFICATION):
@@ -292,10 +288,8 @@ def test_a_step_that_was_dear_once_is_tried_again() -> None:
 
 
 @settings(deadline=None)
-@given(st.sampled_from(TRIED), st.floats(1.0, 1e6))
-def test_a_machine_that_stood_still_for_once_leaves_no_frame_after_it_without_its_iterations(
-    stalled: Stage, frames: float
-) -> None:
+@given(st.sampled_from(STAGES_OF_RUN_FRAME), st.floats(1.0, 1e6))
+def test_one_stall_of_the_machine_does_not_cost_later_frames_their_iterations(stalled: Stage, frames: float) -> None:
     clock, costs = WorkClock(), {**CHEAP, Stage.WARM_UP: ITERATION_S, Stage.ACTIVE: ITERATION_S}
     scheduler = FrameScheduler(SchedulerSettings(FRAME_S, 15, skip_stages=()), clock)
     before = [run_frame(scheduler, clock, costs)[1] for _ in range(10)][-1]
@@ -305,7 +299,7 @@ def test_a_machine_that_stood_still_for_once_leaves_no_frame_after_it_without_it
     assert min(after[10:]) >= before - 1
 
 
-def test_a_first_iteration_that_took_forever_is_not_held_against_its_kind_for_long() -> None:
+def test_a_very_slow_first_iteration_is_soon_forgotten() -> None:
     clock, costs = WorkClock(), {**CHEAP, Stage.WARM_UP: ITERATION_S, Stage.ACTIVE: ITERATION_S}
     scheduler = FrameScheduler(SchedulerSettings(FRAME_S, 15), clock)
     run_frame(scheduler, clock, costs, stall=(Stage.ACTIVE, 100 * FRAME_S))
@@ -313,13 +307,13 @@ def test_a_first_iteration_that_took_forever_is_not_held_against_its_kind_for_lo
 
 
 @pytest.mark.parametrize(("least", "expected"), [(0, 0), (1, 1), (15, 1)])
-def test_the_iteration_that_a_frame_begins_with_is_trained_whatever_time_is_left(least: int, expected: int) -> None:
+def test_the_first_iteration_of_a_frame_is_always_trained(least: int, expected: int) -> None:
     clock = WorkClock()
     scheduler = FrameScheduler(SchedulerSettings(10.0, least), clock)
     assert run_frame(scheduler, clock, {**CHEAP, Stage.VIEW_PREPARATION: 100.0})[1] == expected
 
 
-def test_what_costs_more_from_now_on_is_expected_to_soon() -> None:
+def test_forecasts_follow_a_lasting_change() -> None:
     clock, costs = WorkClock(), {**CHEAP, Stage.WARM_UP: 1.0, Stage.ACTIVE: 1.0, Stage.PUBLISHING: 1e-6}
     scheduler = FrameScheduler(SchedulerSettings(FRAME_S, 15, skip_stages=()), clock)
     for _ in range(5):
@@ -328,7 +322,7 @@ def test_what_costs_more_from_now_on_is_expected_to_soon() -> None:
     assert max(late_s[8:]) <= 1.0
 
 
-def test_settings_name_what_is_wrong() -> None:
+def test_invalid_settings_are_named() -> None:
     wrongs = {"seconds_per_frame": 0.0}, {"seconds_per_frame": np.nan}, {"min_iterations": -1}, {"deadline_slack": 1.5}
     for wrong in wrongs:
         with pytest.raises(InvalidInputError, match=next(iter(wrong))):

@@ -1,4 +1,4 @@
-"""The loop of one robot, frame in, words out."""
+"""TaskMapper: from a frame to the changed voxels of the region."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def small_mapper() -> GaussianMapper:
     return GaussianMapper(settings, CpuRasterizer(threads=1))
 
 
-def test_words_of_all_frames_add_up_to_the_active_part_of_the_map() -> None:
+def test_changes_of_all_frames_add_up_to_the_active_part_of_the_map() -> None:
     loop = TaskMapper(BALL, small_mapper(), SentVoxelTracker(VoxelGrid(0.25)))
     counts: dict[int, int] = {}
     for index in range(3):
@@ -45,11 +45,11 @@ def test_words_of_all_frames_add_up_to_the_active_part_of_the_map() -> None:
     assert outcome.timing.seconds >= sum(outcome.timing.stages_s.values()) > 0
 
 
-def test_without_a_ledger_there_are_no_words() -> None:
+def test_without_a_tracker_nothing_is_published() -> None:
     assert TaskMapper(NoTaskEstimator(), small_mapper()).process(wall_frame(0, SIZE)).changed_roi is None
 
 
-def test_a_frame_without_depth_is_passed_over() -> None:
+def test_a_frame_without_depth_is_skipped() -> None:
     frame = wall_frame(0, SIZE)
     frame.depth_m[:] = 0.0
     outcome = TaskMapper(BALL, small_mapper(), SentVoxelTracker(VoxelGrid())).process(frame)
@@ -59,7 +59,7 @@ def test_a_frame_without_depth_is_passed_over() -> None:
 
 
 def ticking_loop(seconds_per_frame: float) -> TaskMapper:
-    """A loop with a clock on which every look takes a second."""
+    """A TaskMapper whose clock advances one second per reading."""
     clock = itertools.count()
     scheduler = FrameScheduler(
         SchedulerSettings(seconds_per_frame, deadline_slack=0.0), clock=lambda: float(next(clock))
@@ -67,7 +67,7 @@ def ticking_loop(seconds_per_frame: float) -> TaskMapper:
     return TaskMapper(BALL, small_mapper(), SentVoxelTracker(VoxelGrid(0.25)), scheduler)
 
 
-def test_time_is_a_budget_for_the_whole_frame_words_included() -> None:
+def test_the_time_of_a_frame_includes_publishing() -> None:
     loop = ticking_loop(60.0)
     for index in range(4):
         budget = loop.process(wall_frame(index, SIZE, shift_m=0.1 * index)).timing
@@ -92,8 +92,8 @@ def test_the_same_clock_gives_the_same_map() -> None:
     np.testing.assert_array_equal(maps[0].kappa, maps[1].kappa)
 
 
-class SlowAttention:
-    """Takes ten seconds for every frame, on a clock that nothing else moves."""
+class SlowEstimator:
+    """An estimator that takes ten seconds per frame, on a clock that nothing else advances."""
 
     notes = ()
 
@@ -117,8 +117,8 @@ class SlowAttention:
         del state
 
 
-def test_words_that_had_to_wait_come_with_the_next_frame() -> None:
-    slow = SlowAttention()
+def test_skipped_changes_are_published_with_the_next_frame() -> None:
+    slow = SlowEstimator()
     scheduler = FrameScheduler(SchedulerSettings(5.0, skip_stages=(SkippableStage.PUBLISHING,)), slow.clock)
     loop = TaskMapper(slow, small_mapper(), SentVoxelTracker(VoxelGrid(0.25)), scheduler)
     counts: dict[int, int] = {}

@@ -1,4 +1,4 @@
-"""The robot under load: what a full queue drops, what idle time is used for, and what each is told."""
+"""The mapping worker under load: dropped frames, idle training and their reports."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from agent_running import SETTINGS, TASK, Gate, agent, ball_attention
+from agent_running import SETTINGS, TASK, Gate, agent, ball_estimator
 from fusion_running import CAMERA, GRID, frame, fusion_server
 
 from gausslite.domain.gaussians import Gaussians
@@ -28,8 +28,8 @@ from gausslite_agent.mapping_worker import MappingWorker
 from gausslite_agent.status import Outcome
 
 
-def test_a_full_queue_drops_the_oldest_waiting_frame_and_says_so() -> None:
-    gate = Gate(ball_attention(RuleParser().parse(TASK)), threading.Event())
+def test_a_full_queue_drops_and_reports_the_oldest_frame() -> None:
+    gate = Gate(ball_estimator(RuleParser().parse(TASK)), threading.Event())
     with agent(lambda _graph: gate, queue_frames=2) as a:
         a.client.assign_task(TASK)
         first = a.worker.submit(frame(0))
@@ -42,7 +42,7 @@ def test_a_full_queue_drops_the_oldest_waiting_frame_and_says_so() -> None:
 
 
 def test_a_queue_may_drop_the_newest_frame_instead() -> None:
-    gate = Gate(ball_attention(RuleParser().parse(TASK)), threading.Event())
+    gate = Gate(ball_estimator(RuleParser().parse(TASK)), threading.Event())
     worker = MappingWorker(
         SETTINGS, GRID, lambda _graph: gate, load=LoadSettings(queue_frames=2, queue_policy=QueuePolicy.NEWEST)
     )
@@ -57,8 +57,8 @@ def test_a_queue_may_drop_the_newest_frame_instead() -> None:
     assert "overload: 2 frames were dropped" in worker.status().load_notes
 
 
-def test_a_waiting_frame_nobody_asks_for_any_more_gives_way_like_any_other() -> None:
-    gate = Gate(ball_attention(RuleParser().parse(TASK)), threading.Event())
+def test_a_cancelled_report_does_not_keep_its_frame_in_the_queue() -> None:
+    gate = Gate(ball_estimator(RuleParser().parse(TASK)), threading.Event())
     worker = MappingWorker(SETTINGS, GRID, lambda _graph: gate, load=LoadSettings(queue_frames=1))
     worker.assign(RuleParser().parse(TASK)).result(20)
     first = worker.submit(frame(0))
@@ -72,10 +72,10 @@ def test_a_waiting_frame_nobody_asks_for_any_more_gives_way_like_any_other() -> 
     worker.close()
 
 
-def test_a_frame_that_has_waited_has_less_time_so_that_the_queue_gets_shorter() -> None:
+def test_a_frame_that_waited_gets_less_time() -> None:
     now_us = itertools.count(step=10)
     settings = replace(SETTINGS, rate_hz=5.0, min_iterations=15)
-    worker = MappingWorker(settings, GRID, ball_attention, clock=lambda: (next(now_us) + stalled_us) / 1e6)
+    worker = MappingWorker(settings, GRID, ball_estimator, clock=lambda: (next(now_us) + stalled_us) / 1e6)
     stalled_us = 0
     worker.assign(RuleParser().parse(TASK)).result(20)
     busy = threading.Event()
@@ -93,7 +93,7 @@ def test_a_frame_that_has_waited_has_less_time_so_that_the_queue_gets_shorter() 
 
 
 class SlowDisk(Spool):
-    """Takes a second for all that it is offered, on a clock that nothing else moves."""
+    """A spool that takes one second per update, on a clock that nothing else advances."""
 
     now_s = 0.0
 
@@ -102,11 +102,11 @@ class SlowDisk(Spool):
         super().enqueue(words, purpose)
 
 
-def test_what_a_frame_takes_to_tell_its_words_is_part_of_its_time() -> None:
+def test_publishing_is_part_of_a_frames_time() -> None:
     with fusion_server(MemoryStore()) as fusion:
         spool = SlowDisk(None, "robot", GRID)
         uplink = Uplink(FusionClient(fusion.client.address), "robot", spool, GRID)
-        worker = MappingWorker(SETTINGS, GRID, ball_attention, uplink, clock=lambda: spool.now_s)
+        worker = MappingWorker(SETTINGS, GRID, ball_estimator, uplink, clock=lambda: spool.now_s)
         worker.assign(RuleParser().parse(TASK)).result(20)
         report = worker.submit(frame(0)).result(20)
         worker.close()
@@ -122,10 +122,10 @@ def after_a_frame(worker: MappingWorker) -> Gaussians:
     return gaussians
 
 
-def test_idle_time_is_trained_in_up_to_its_bound_and_work_comes_in_between() -> None:
-    left = [after_a_frame(MappingWorker(SETTINGS, GRID, ball_attention)) for _ in range(2)]
+def test_idle_training_stops_at_its_limit_and_other_work_runs_in_between() -> None:
+    left = [after_a_frame(MappingWorker(SETTINGS, GRID, ball_estimator)) for _ in range(2)]
     np.testing.assert_array_equal(left[0].opacities, left[1].opacities)
-    worker = MappingWorker(SETTINGS, GRID, ball_attention, load=LoadSettings(idle_iterations=5))
+    worker = MappingWorker(SETTINGS, GRID, ball_estimator, load=LoadSettings(idle_iterations=5))
     worker.assign(RuleParser().parse(TASK)).result(20)
     worker.submit(frame(0)).result(20)
     # each of these waits behind one iteration at most
@@ -146,10 +146,10 @@ def fail() -> None:
     raise MemoryError("a moment without memory")
 
 
-def test_an_idle_iteration_that_fails_is_logged_and_the_next_frame_is_followed_by_others(
+def test_a_failed_idle_iteration_is_logged_and_idle_training_continues_after_the_next_frame(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    worker = MappingWorker(SETTINGS, GRID, ball_attention, load=LoadSettings(idle_iterations=3))
+    worker = MappingWorker(SETTINGS, GRID, ball_estimator, load=LoadSettings(idle_iterations=3))
     worker.assign(RuleParser().parse(TASK)).result(20)
     with monkeypatch.context() as broken:
         worker.run(lambda mapper: broken.setattr(mapper, "idle_step", fail)).result(20)
@@ -164,8 +164,8 @@ def test_an_idle_iteration_that_fails_is_logged_and_the_next_frame_is_followed_b
     worker.close()
 
 
-def test_without_idle_iterations_the_map_stays_as_the_frame_left_it() -> None:
-    worker = MappingWorker(SETTINGS, GRID, ball_attention)
+def test_without_idle_iterations_nothing_is_trained_between_frames() -> None:
+    worker = MappingWorker(SETTINGS, GRID, ball_estimator)
     worker.assign(RuleParser().parse(TASK)).result(20)
     worker.submit(frame(0)).result(20)
     worker.end_idle_training().result(20)
@@ -174,13 +174,13 @@ def test_without_idle_iterations_the_map_stays_as_the_frame_left_it() -> None:
 
 
 @pytest.mark.parametrize("wrong", [{"queue_frames": 0}, {"idle_iterations": -1}])
-def test_load_settings_name_what_is_wrong(wrong: dict[str, int]) -> None:
+def test_invalid_load_settings_are_named(wrong: dict[str, int]) -> None:
     with pytest.raises(InvalidInputError, match="expected"):
         LoadSettings(**wrong)
 
 
-def test_frames_that_wait_when_the_agent_ends_are_dropped() -> None:
-    gate = Gate(ball_attention(RuleParser().parse(TASK)), threading.Event())
+def test_waiting_frames_are_dropped_at_shutdown() -> None:
+    gate = Gate(ball_estimator(RuleParser().parse(TASK)), threading.Event())
     worker = MappingWorker(SETTINGS, GRID, lambda _graph: gate)
     worker.assign(RuleParser().parse(TASK)).result(20)
     futures = [worker.submit(frame(index)) for index in range(3)]
@@ -192,11 +192,11 @@ def test_frames_that_wait_when_the_agent_ends_are_dropped() -> None:
         worker.run(lambda mapper: mapper.count)
 
 
-def test_a_frame_that_cannot_be_mapped_is_rejected_and_the_stream_goes_on() -> None:
+def test_an_invalid_frame_is_rejected_and_the_stream_continues() -> None:
     opened = threading.Event()
     opened.set()
     fussy = Gate(
-        ball_attention(RuleParser().parse(TASK)), opened, fail_at=1, failure=InvalidInputError("points: too far")
+        ball_estimator(RuleParser().parse(TASK)), opened, fail_at=1, failure=InvalidInputError("points: too far")
     )
     with agent(lambda _graph: fussy) as a:
         a.client.assign_task(TASK)
@@ -207,7 +207,7 @@ def test_a_frame_that_cannot_be_mapped_is_rejected_and_the_stream_goes_on() -> N
     assert outcomes[1].reason == "points: too far"
 
 
-def test_a_spool_without_room_ends_no_mission_and_all_is_told_once_it_has_some(tmp_path: Path) -> None:
+def test_after_a_full_spool_all_changes_are_published_again(tmp_path: Path) -> None:
     store, spool = MemoryStore(), Spool(tmp_path / "robot.spool", "robot", GRID)
     with fusion_server(store) as fusion:
         uplink = Uplink(FusionClient(fusion.client.address), "robot", spool, GRID, UplinkSettings(interval_s=0.0))

@@ -1,4 +1,4 @@
-"""A whole mission: a played sequence ends in a map, a report and everything on the server."""
+"""A whole mission: a replayed sequence gives a map, a report and its region on the server."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ MUG = BallRegion((0.0, 0.0, 1.2), 0.2)
 
 @dataclass
 class Wall:
-    """A sequence of views of one wall."""
+    """A sequence of frames of one wall."""
 
     count: int = 8
     name: str = "wall"
@@ -82,7 +82,7 @@ def settings(out: Path | None, *more: str) -> AgentSettings:
 
 
 @contextmanager
-def player(options: AgentSettings, address: str | None = None) -> Iterator[tuple[AgentMission, MappingWorker]]:
+def agent_mission(options: AgentSettings, address: str | None = None) -> Iterator[tuple[AgentMission, MappingWorker]]:
     client = None if address is None else FusionClient(address)
     uplink = None
     if client is not None:
@@ -103,7 +103,7 @@ def stream_of(wall: Wall, options: AgentSettings) -> FrameStream:
 
 def test_a_mission_leaves_a_map_a_report_and_its_region_on_the_server(tmp_path: Path) -> None:
     store, options = MemoryStore(), settings(tmp_path)
-    with fusion_server(store) as fusion, player(options, fusion.client.address) as (mission, worker):
+    with fusion_server(store) as fusion, agent_mission(options, fusion.client.address) as (mission, worker):
         mission.run(stream_of(Wall(), options))
         assert mission.state == MissionState.DONE
         count = worker.status().gaussians
@@ -122,7 +122,7 @@ def test_a_mission_leaves_a_map_a_report_and_its_region_on_the_server(tmp_path: 
 
 def test_handover_brings_the_whole_map_and_the_keyframes(tmp_path: Path) -> None:
     options = settings(tmp_path, "--handover")
-    with fusion_server() as fusion, player(options, fusion.client.address) as (mission, worker):
+    with fusion_server() as fusion, agent_mission(options, fusion.client.address) as (mission, worker):
         mission.run(stream_of(Wall(), options))
         [agent] = fusion.client.status().agents
         keyframes = worker.run(lambda mapper: mapper.keyframes()).result(20)
@@ -133,19 +133,19 @@ def test_handover_brings_the_whole_map_and_the_keyframes(tmp_path: Path) -> None
     assert agent.keyframes == len(keyframes) > 0
 
 
-def test_alone_it_maps_and_sends_nothing(tmp_path: Path) -> None:
+def test_without_a_fusion_server_nothing_is_sent(tmp_path: Path) -> None:
     options = settings(tmp_path, "--test-every", "4", "--frames", "0:6")
     wall = Wall()
-    with player(options) as (mission, _):
+    with agent_mission(options) as (mission, _):
         mission.run(stream_of(wall, options))
     report = json.loads((tmp_path / "report.json").read_text())
     assert wall.asked == [0, 1, 2, 4, 5]
     assert (report["frames"], report["bytes_sent"], report["map_shared_percent"]) == (5, 0, 0)
 
 
-def test_a_mission_that_is_stopped_writes_what_it_has(tmp_path: Path) -> None:
+def test_a_stopped_mission_writes_its_map_so_far(tmp_path: Path) -> None:
     options, wall = settings(tmp_path), Wall(10_000)
-    with player(options) as (mission, _):
+    with agent_mission(options) as (mission, _):
         thread = threading.Thread(target=mission.run, args=(stream_of(wall, options),))
         thread.start()
         assert wall.reached.wait(20)
@@ -157,13 +157,16 @@ def test_a_mission_that_is_stopped_writes_what_it_has(tmp_path: Path) -> None:
     assert len(read_ply(tmp_path / "map.ply")) > 0
 
 
-def test_what_is_wrong_is_raised_before_or_when_it_is_met(tmp_path: Path) -> None:
+def test_errors_of_task_source_and_disk_are_raised(tmp_path: Path) -> None:
     options = settings(tmp_path)
-    with player(replace(options, task="!")) as (mission, _), pytest.raises(TaskError):
+    with agent_mission(replace(options, task="!")) as (mission, _), pytest.raises(TaskError):
         mission.run(stream_of(Wall(), options))
     with pytest.raises(InvalidInputError, match="size"):
         FrameStream.select(Wall(), SourceSettings("wall", size="big"))
-    with player(replace(options, out=tmp_path / "gone")) as (mission, _), pytest.raises(StorageError, match="gone"):
+    with (
+        agent_mission(replace(options, out=tmp_path / "gone")) as (mission, _),
+        pytest.raises(StorageError, match="gone"),
+    ):
         mission.run(stream_of(Wall(), options))
 
 
@@ -222,7 +225,7 @@ def test_a_real_process_ends_cleanly_on_sigterm(tmp_path: Path) -> None:
         assert "ended" in p.stderr.read()
 
 
-def test_who_assigns_a_task_is_told_which_parser_does_not_answer(tmp_path: Path) -> None:
+def test_assign_task_names_the_parser_that_does_not_answer(tmp_path: Path) -> None:
     address = f"unix:{tmp_path}/agent.sock"
     command = [sys.executable, "-m", "gausslite_agent", "--listen", address, "--parser", "127.0.0.1:1"]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as p:
@@ -235,7 +238,7 @@ def test_who_assigns_a_task_is_told_which_parser_does_not_answer(tmp_path: Path)
         assert p.wait(30) == 0
 
 
-def test_frames_that_were_sent_leave_a_map_and_a_report_on_sigterm(tmp_path: Path) -> None:
+def test_received_frames_give_a_map_and_a_report_on_sigterm(tmp_path: Path) -> None:
     model = write_tiny_yolo(tmp_path / "tiny.onnx", ["cup"], [(32, 32, 30, 30, 0, 0.9)])
     address, out = f"unix:{tmp_path}/agent.sock", tmp_path / "out"
     command = [sys.executable, "-m", "gausslite_agent", "--listen", address, "--out", str(out), "--threads", "1"]
@@ -255,19 +258,19 @@ def test_frames_that_were_sent_leave_a_map_and_a_report_on_sigterm(tmp_path: Pat
     assert len(read_ply(out / "map.ply")) == report["gaussians"] > 0
 
 
-def test_without_a_mapped_frame_nothing_is_written_over(tmp_path: Path) -> None:
+def test_without_a_mapped_frame_nothing_is_overwritten(tmp_path: Path) -> None:
     options = replace(settings(tmp_path), source=None)
-    (tmp_path / "map.ply").write_text("of an earlier life")
-    with player(options) as (mission, _):
+    (tmp_path / "map.ply").write_text("of an earlier mission")
+    with agent_mission(options) as (mission, _):
         mission.assign_task()
         mission.stop()
         mission.finish()
-    assert (tmp_path / "map.ply").read_text() == "of an earlier life"
+    assert (tmp_path / "map.ply").read_text() == "of an earlier mission"
 
 
 def test_a_corrupt_frame_is_skipped_and_counted(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     options = settings(tmp_path)
-    with player(options) as (mission, _):
+    with agent_mission(options) as (mission, _):
         mission.run(stream_of(Wall(broken_at=3), options))
     report = json.loads((tmp_path / "report.json").read_text())
     assert (report["frames"], report["frames_corrupt"], report["stopped_by"]) == (7, 1, None)
@@ -276,7 +279,7 @@ def test_a_corrupt_frame_is_skipped_and_counted(tmp_path: Path, caplog: pytest.L
 
 def test_with_strict_a_corrupt_frame_ends_the_mission_after_its_map_is_sent_and_written(tmp_path: Path) -> None:
     options = settings(tmp_path, "--strict")
-    with fusion_server() as fusion, player(options, fusion.client.address) as (mission, _):
+    with fusion_server() as fusion, agent_mission(options, fusion.client.address) as (mission, _):
         with pytest.raises(DatasetError, match="frame-3"):
             mission.run(stream_of(Wall(broken_at=3), options))
         [agent] = fusion.client.status().agents
@@ -288,13 +291,13 @@ def test_with_strict_a_corrupt_frame_ends_the_mission_after_its_map_is_sent_and_
 
 def test_a_corrupt_first_frame_overwrites_nothing_with_strict(tmp_path: Path) -> None:
     options = settings(tmp_path, "--strict")
-    (tmp_path / "map.ply").write_text("of an earlier life")
-    with player(options) as (mission, _), pytest.raises(DatasetError, match="frame-0"):
+    (tmp_path / "map.ply").write_text("of an earlier mission")
+    with agent_mission(options) as (mission, _), pytest.raises(DatasetError, match="frame-0"):
         mission.run(stream_of(Wall(broken_at=0), options))
-    assert (tmp_path / "map.ply").read_text() == "of an earlier life"
+    assert (tmp_path / "map.ply").read_text() == "of an earlier mission"
 
 
-def test_what_fails_at_the_very_end_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_error_during_shutdown_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     async def serve() -> None:
         async def until() -> None:
             try:

@@ -1,4 +1,4 @@
-"""The agent service in process: every rpc, every outcome of a frame, every code that applies."""
+"""The agent service in this process: every call, every frame outcome, every status code."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import grpc
 import numpy as np
 import pytest
-from agent_running import TASK, Gate, agent, ball_attention
+from agent_running import TASK, Gate, agent, ball_estimator
 from fusion_running import CAMERA, GRID, frame, fusion_server
 
 from gausslite.domain.camera import Camera
@@ -38,7 +38,7 @@ from gausslite.wire.uplink_values import UplinkSettings
 from gausslite_agent.mapping_worker import MappingWorker
 
 
-def test_a_task_comes_in_words_or_as_a_graph() -> None:
+def test_a_task_is_text_or_a_graph() -> None:
     with agent() as a:
         graph = a.client.assign_task(TASK)
         assert graph == RuleParser().parse(TASK)
@@ -46,7 +46,7 @@ def test_a_task_comes_in_words_or_as_a_graph() -> None:
         assert convert.graph_from_message(a.client.status().graph) == graph
 
 
-def test_what_the_attention_cannot_find_is_told_to_the_operator() -> None:
+def test_nouns_that_cannot_be_found_are_in_the_status_notes() -> None:
     mug = RegionDetector({"mug_1": BallRegion((0.0, 0.0, 1.2), 0.2)})
     with agent(lambda graph: TaskRelevanceEstimator(graph, mug)) as a:
         a.client.assign_task("Pick up the mug on the table")
@@ -55,7 +55,7 @@ def test_what_the_attention_cannot_find_is_told_to_the_operator() -> None:
     assert not_seen == "anchor 'table' not seen yet: its targets are kept"
 
 
-def test_a_task_without_sense_is_refused() -> None:
+def test_an_invalid_task_is_refused() -> None:
     with agent() as a:
         with pytest.raises(TaskError):
             a.client.assign_task(" ")
@@ -66,7 +66,7 @@ def test_a_task_without_sense_is_refused() -> None:
         assert caught.value.code() is grpc.StatusCode.INVALID_ARGUMENT  # type: ignore[attr-defined]
 
 
-def test_an_attention_that_cannot_be_made_is_told_to_who_assigned() -> None:
+def test_assign_task_raises_the_error_of_the_estimator() -> None:
     def broken(_graph: TaskGraph) -> RelevanceEstimator:
         raise ModelFileError("model.onnx: expected a YOLO-seg model, got a text")
 
@@ -105,15 +105,15 @@ def test_each_frame_has_its_outcome_in_order() -> None:
     assert status.hz > 0
 
 
-def test_another_task_turns_the_map_to_it_and_the_same_question_changes_nothing() -> None:
+def test_another_task_switches_the_region_and_an_equivalent_task_changes_nothing() -> None:
     asked: list[str] = []
 
-    def attention(graph: TaskGraph) -> RelevanceEstimator:
+    def build_estimator(graph: TaskGraph) -> RelevanceEstimator:
         asked.append(graph.text)
         x_m = 0.0 if "mug" in graph.targets else 0.3
         return RegionRelevanceEstimator([BallRegion((x_m, 0.0, 1.2), 0.2)])
 
-    with agent(attention) as a:
+    with agent(build_estimator) as a:
         a.client.assign_task(TASK)
         for index in range(3):
             a.worker.submit(frame(index)).result(20)
@@ -131,10 +131,10 @@ def test_another_task_turns_the_map_to_it_and_the_same_question_changes_nothing(
     assert turned.means_m[turned.active][:, 0].mean() > first.means_m[first.active][:, 0].mean() + 0.1
 
 
-def test_a_bug_in_one_frame_ends_its_stream_and_not_the_agent() -> None:
+def test_an_unexpected_error_ends_its_stream_and_not_the_agent() -> None:
     opened = threading.Event()
     opened.set()
-    gate = Gate(ball_attention(RuleParser().parse(TASK)), opened, fail_at=1)
+    gate = Gate(ball_estimator(RuleParser().parse(TASK)), opened, fail_at=1)
     with agent(lambda _graph: gate) as a:
         a.client.assign_task(TASK)
         with pytest.raises(GaussLiteError, match="unexpected error"):
@@ -143,7 +143,7 @@ def test_a_bug_in_one_frame_ends_its_stream_and_not_the_agent() -> None:
         assert answer.outcome == pb.FRAME_OUTCOME_MAPPED
 
 
-def test_a_view_shows_the_map() -> None:
+def test_render_view_shows_the_map() -> None:
     with agent() as a:
         rgb, depth_m = a.client.render(CAMERA, np.eye(4))
         assert not rgb.any()
@@ -159,7 +159,7 @@ def test_a_view_shows_the_map() -> None:
     ("camera", "T_world_camera"),
     [(Camera(1e4, 1e4, 1.0, 1.0, 16384, 16384), np.eye(4)), (CAMERA, np.full((4, 4), np.nan)), (CAMERA, np.eye(3))],
 )
-def test_a_view_from_nowhere_is_refused(camera: Camera, T_world_camera: np.ndarray) -> None:
+def test_an_invalid_camera_or_pose_is_refused(camera: Camera, T_world_camera: np.ndarray) -> None:
     request = pb.RenderViewRequest(
         camera=convert.camera_to_message(camera), t_world_camera={"row_major": T_world_camera.reshape(-1).tolist()}
     )
@@ -210,7 +210,7 @@ def test_a_watcher_follows_the_map() -> None:
         assert seen == counts_now(a.worker)
 
 
-def test_a_watcher_may_ask_for_a_region_and_for_the_task_alone() -> None:
+def test_a_watcher_may_select_a_box_or_the_tasks_region() -> None:
     with agent() as a:
         a.client.assign_task(TASK)
         list(a.client.ingest([frame(0)]))

@@ -1,4 +1,4 @@
-"""A mission saved with --state goes on in the agent's next life, for the team as well."""
+"""A mission saved with --state continues after a restart of the agent, also on the fusion server."""
 
 from __future__ import annotations
 
@@ -45,10 +45,10 @@ def settings(state: Path, *more: str) -> AgentSettings:
 
 
 @contextmanager
-def life(
+def agent_run(
     options: AgentSettings, fusion: RunningServer | None = None, spool: Path | None = None
 ) -> Iterator[tuple[AgentMission, MappingWorker]]:
-    """An agent as its program builds it."""
+    """Start an agent as its program does, restored from its state file if there is one."""
     saved = (
         SavedMission.read(options.state, *options.fixed_settings) if options.state and options.state.exists() else None
     )
@@ -83,11 +83,11 @@ def map_frames(worker: MappingWorker, *indices: int) -> None:
         worker.submit(frame(i, CAMERA)).result()
 
 
-def the_map(worker: MappingWorker) -> Gaussians:
+def map_of(worker: MappingWorker) -> Gaussians:
     return worker.run(lambda mapper: mapper.gaussians()).result()
 
 
-def region_words(worker: MappingWorker) -> VoxelBatch:
+def region_batch(worker: MappingWorker) -> VoxelBatch:
     return group_by_voxel(worker.run(lambda mapper: mapper.roi_gaussians()).result(), GRID)
 
 
@@ -97,105 +97,103 @@ def totals(words: VoxelBatch) -> dict[int, tuple[int, int]]:
     return {key: (kappa, count) for key, kappa, count in zip(*columns, strict=True) if count}
 
 
-def held_by(store: MemoryStore) -> dict[int, tuple[int, int]]:
+def totals_on(store: MemoryStore) -> dict[int, tuple[int, int]]:
     return totals(store.batches()["robot"])
 
 
-def test_a_mission_in_two_lives_gives_the_map_and_the_words_of_one(tmp_path: Path) -> None:
+def test_a_restarted_mission_gives_the_same_map_and_updates(tmp_path: Path) -> None:
     whole, first, second = MemoryStore(), MemoryStore(), settings(tmp_path / "x.state")
-    with fusion_server(whole) as fusion, life(settings(tmp_path / "whole.state"), fusion) as (mission, worker):
+    with fusion_server(whole) as fusion, agent_run(settings(tmp_path / "whole.state"), fusion) as (mission, worker):
         map_frames(worker, *range(8))
         mission.finish()
-        wanted = the_map(worker)
+        wanted = map_of(worker)
     with fusion_server(first) as fusion:
         for indices in (range(4), range(4, 8)):
-            with life(second, fusion, tmp_path / "robot.spool") as (mission, worker):
+            with agent_run(second, fusion, tmp_path / "robot.spool") as (mission, worker):
                 map_frames(worker, *indices)
                 mission.finish()
-        came = the_map_of(second)
+        came = restored_map(second)
     for column in ("means_m", "opacities", "kappa", "active"):
         np.testing.assert_array_equal(getattr(came, column), getattr(wanted, column))
-    assert held_by(first) == held_by(whole)
+    assert totals_on(first) == totals_on(whole)
     assert wanted.kappa.max() > 0
 
 
-def the_map_of(options: AgentSettings) -> Gaussians:
-    with life(options) as (_, worker):
-        return the_map(worker)
+def restored_map(options: AgentSettings) -> Gaussians:
+    with agent_run(options) as (_, worker):
+        return map_of(worker)
 
 
 @pytest.mark.parametrize("keeps_spool", [True, False])
-def test_the_fused_map_follows_the_robot_through_lives_that_end_well_and_badly(
-    keeps_spool: bool, tmp_path: Path
-) -> None:
-    """The third life ends unsaved: on the voxels that the robot knows, the server is as it is."""
+def test_the_fused_map_follows_the_agent_through_clean_and_unsaved_ends(keeps_spool: bool, tmp_path: Path) -> None:
+    """The third run ends unsaved: on the voxels of the agent's map, the server equals the agent."""
     store, options = MemoryStore(), settings(tmp_path / "robot.state")
     spool = tmp_path / "robot.spool" if keeps_spool else None
     with fusion_server(store) as fusion:
-        with life(options, fusion, spool) as (mission, worker):
+        with agent_run(options, fusion, spool) as (mission, worker):
             map_frames(worker, 0, 1, 2)
             mission.finish()
             seen = worker.revision()
-        with life(options, fusion, spool) as (mission, worker):
+        with agent_run(options, fusion, spool) as (mission, worker):
             assert worker.revision() > seen
             map_frames(worker, 3, 4)
             mission.finish()
-            assert held_by(store) == totals(region_words(worker))
-            kept = region_words(worker)
-        with life(options, fusion, spool) as (_, worker):
+            assert totals_on(store) == totals(region_batch(worker))
+            kept = region_batch(worker)
+        with agent_run(options, fusion, spool) as (_, worker):
             map_frames(worker, 5, 6)
             assert worker.uplink is not None
             assert worker.uplink.drain(20.0)
-        with life(options, fusion, spool) as (mission, worker):
+        with agent_run(options, fusion, spool) as (mission, worker):
             assert worker.status().graph == RuleParser().parse(TASK)
             assert worker.uplink is not None
             assert worker.uplink.drain(20.0)
-            words = region_words(worker)
+            words = region_batch(worker)
             np.testing.assert_array_equal(words.kappa_sums, kept.kappa_sums)
-            assert held_by(store).items() >= totals(words).items()
+            assert totals_on(store).items() >= totals(words).items()
 
 
-def test_a_server_that_lost_everything_between_two_lives_gets_it_again(tmp_path: Path) -> None:
+def test_a_server_that_lost_its_data_receives_it_again(tmp_path: Path) -> None:
     options, store = settings(tmp_path / "robot.state"), MemoryStore()
-    with fusion_server() as fusion, life(options, fusion, tmp_path / "robot.spool") as (mission, worker):
+    with fusion_server() as fusion, agent_run(options, fusion, tmp_path / "robot.spool") as (mission, worker):
         map_frames(worker, 0, 1)
         mission.finish()
-    with fusion_server(store) as fusion, life(options, fusion, tmp_path / "robot.spool") as (mission, worker):
+    with fusion_server(store) as fusion, agent_run(options, fusion, tmp_path / "robot.spool") as (mission, worker):
         map_frames(worker, 2)
         mission.finish()
-        assert held_by(store) == totals(region_words(worker))
+        assert totals_on(store) == totals(region_batch(worker))
 
 
-def test_a_task_that_came_on_the_way_stays_and_another_command_line_replaces_it(tmp_path: Path) -> None:
+def test_an_assigned_task_is_kept_and_another_command_line_task_replaces_it(tmp_path: Path) -> None:
     options = settings(tmp_path / "robot.state")
-    with life(options) as (mission, worker):
+    with agent_run(options) as (mission, worker):
         map_frames(worker, 0)
         worker.assign(RuleParser().parse(LATER)).result()
         mission.finish()
     for command_line, wanted in ((TASK, LATER), ("Find the lamp", "Find the lamp"), (None, "Find the lamp")):
-        with life(replace(options, task=command_line)) as (mission, worker):
+        with agent_run(replace(options, task=command_line)) as (mission, worker):
             graph = worker.status().graph
             assert graph is not None
             assert graph.text == wanted
             mission.finish()
 
 
-def test_watchers_never_see_a_revision_twice_even_if_the_clock_was_set_back(tmp_path: Path) -> None:
+def test_revisions_are_never_repeated_even_if_the_clock_was_set_back(tmp_path: Path) -> None:
     options = settings(tmp_path / "robot.state")
-    with life(options) as (mission, worker):
+    with agent_run(options) as (mission, worker):
         map_frames(worker, 0)
         mission.finish()
         seen = worker.revision()
     state = read_state(tmp_path / "robot.state")
     far_off = seen + 10**15
     write_state(tmp_path / "robot.state", {**state, "extra/map_revision": np.array([far_off])})
-    with life(options) as (_, worker):
+    with agent_run(options) as (_, worker):
         assert worker.revision() > far_off
 
 
-def test_what_is_no_mission_of_this_agent_is_told(tmp_path: Path) -> None:
+def test_the_state_of_another_agent_or_program_is_refused(tmp_path: Path) -> None:
     options = settings(tmp_path / "robot.state")
-    with life(options) as (mission, worker):
+    with agent_run(options) as (mission, worker):
         map_frames(worker, 0)
         mission.finish()
     state = read_state(tmp_path / "robot.state")
@@ -210,7 +208,7 @@ def test_what_is_no_mission_of_this_agent_is_told(tmp_path: Path) -> None:
 
 def test_a_wrong_file_is_one_line_before_the_agent_listens(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     options = settings(tmp_path / "robot.state")
-    with life(options) as (mission, worker):
+    with agent_run(options) as (mission, worker):
         map_frames(worker, 0)
         mission.finish()
     (tmp_path / "notes").write_text("remember the milk")
@@ -226,7 +224,7 @@ def test_a_wrong_file_is_one_line_before_the_agent_listens(tmp_path: Path, capsy
         assert told in line
 
 
-def test_a_real_agent_ended_in_its_mission_goes_on_with_it(tmp_path: Path) -> None:
+def test_a_real_agent_resumes_its_mission(tmp_path: Path) -> None:
     model = write_tiny_yolo(tmp_path / "tiny.onnx", ["cup"], [(32, 32, 20, 20, 0, 0.9)])
     address, store = f"unix:{tmp_path}/agent.sock", MemoryStore()
     command = [sys.executable, "-m", "gausslite_agent", "--listen", address, "--out", str(tmp_path), "--threads", "1"]
