@@ -118,5 +118,14 @@ def selected_regions(options: argparse.Namespace, source: Source) -> list[Region
     if options.roi is not None:
         regions += choose_regions(balls_for_small_objects(load_voxel_regions(options.roi)), options.objects)
     elif options.objects:
+        report_region_file(options.source)
         regions += choose_regions(source.regions(), options.objects)
     return [*regions, *options.roi_ball]
+
+
+def report_region_file(spec: str) -> None:
+    """Report that ground-truth regions come from a file of the sequence's folder, unless the sequence is simulated."""
+    from gausslite.datasets.regions import REGIONS_FILE
+
+    if not is_simulated(spec):
+        print(f"{spec}: the ground-truth regions of {REGIONS_FILE} in the sequence's folder are used", file=sys.stderr)

@@ -12,7 +12,7 @@ import pytest
 from tiny_sequences import HEIGHT, WIDTH, write_depth, write_replica, write_seven_scenes, write_tum
 
 from gausslite.datasets.open import open_source
-from gausslite.datasets.selection import downscaled_size, select_frames
+from gausslite.datasets.selection import downscaled_size, frame_size, select_frames
 from gausslite.domain.camera import Camera
 from gausslite.domain.region import BallRegion, VoxelRegion
 from gausslite.errors import DatasetError, InvalidInputError
@@ -116,7 +116,7 @@ def test_resizing_averages_colour_and_never_mixes_depth(tmp_path: Path) -> None:
         ((160, 120), (160, 120)),
     ],
 )
-def test_a_modest_size_stretches_nothing(recorded: tuple[int, int], modest: tuple[int, int]) -> None:
+def test_a_downscaled_size_keeps_the_aspect_ratio(recorded: tuple[int, int], modest: tuple[int, int]) -> None:
     assert downscaled_size(Camera(500.0, 500.0, 320.0, 240.0, *recorded)) == modest
 
 
@@ -182,3 +182,18 @@ def test_the_real_desk_opens(shared_dir: Path) -> None:
     source = open_source(str(shared_dir / "data" / "tum_fr1"))
     assert len(source) == 9
     assert 0.5 < np.median(source.frame(0).depth_m) < 2.0
+
+
+@pytest.mark.parametrize("text", ["16x16", "40x24", "64x32"])
+def test_a_size_that_changes_the_aspect_ratio_is_rejected_with_the_nearest_sizes(text: str, tmp_path: Path) -> None:
+    source = open_source(str(write_tum(tmp_path / "fr1")))
+    width, height = (int(side) for side in text.split("x"))
+    nearest = f"nearest sizes with it are {width}x{round(width * 0.75)} and {round(height / 0.75)}x{height}"
+    with pytest.raises(InvalidInputError, match=nearest):
+        frame_size(text, source)
+
+
+@pytest.mark.parametrize("text", ["32x24", "96x72", "101x75", "100x76"])
+def test_a_size_within_a_pixel_of_the_aspect_ratio_is_accepted(text: str, tmp_path: Path) -> None:
+    source = open_source(str(write_tum(tmp_path / "fr1")))
+    assert "x".join(map(str, frame_size(text, source))) == text

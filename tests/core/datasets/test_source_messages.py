@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import argparse
 from pathlib import Path
 
+import numpy as np
 import pytest
 from tiny_sequences import write_seven_scenes, write_tum
 
 from gausslite.calibration.pose_exposure_prior import PoseExposurePrior
-from gausslite.cli.source_options import open_with_warnings, resolve_pose_prior
+from gausslite.cli.source_options import open_with_warnings, resolve_pose_prior, selected_regions
 from gausslite.config.values import AUTO, NONE
 from gausslite.datasets.open import open_source
 from gausslite.datasets.registered_source import DepthRegistration
@@ -72,3 +74,12 @@ def test_skipped_images_are_reported(tmp_path: Path, capsys: pytest.CaptureFixtu
     open_with_warnings(str(folder), None, None)
     [line] = capsys.readouterr().err.splitlines()
     assert line == (f"{folder}: 1 of 4 colour images are skipped: without a pose at their time or depth within 20 ms")
+
+
+def test_regions_of_the_folder_are_used_with_a_message(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = write_tum(tmp_path / "fr1")
+    np.savez(folder / "roi_voxels.npz", voxel_size_m=0.02, mug_1=np.zeros((1, 3), np.int32))
+    options = argparse.Namespace(source=str(folder), roi=None, objects=("mug_1",), roi_ball=[])
+    assert len(selected_regions(options, open_source(str(folder)))) == 1
+    [line] = capsys.readouterr().err.splitlines()
+    assert line == f"{folder}: the ground-truth regions of roi_voxels.npz in the sequence's folder are used"

@@ -52,7 +52,10 @@ def test_of_large_images_fewer_are_kept() -> None:
 
 
 def test_once_larger_images_come_smaller_ones_make_room() -> None:
-    settings, rasterizer = KeyframeSettings(every=1, window=4, buffer=8, long_term_keyframes=4), CpuRasterizer(threads=1)
+    settings, rasterizer = (
+        KeyframeSettings(every=1, window=4, buffer=8, long_term_keyframes=4),
+        CpuRasterizer(threads=1),
+    )
     large = wall_frame(40)
     store = KeyframeStore(replace(settings, max_pixels=4 * large.depth_m.size))
     for index in range(20):

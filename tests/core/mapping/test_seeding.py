@@ -59,7 +59,9 @@ def test_initial_scaling_starts_small_and_smaller_in_the_region() -> None:
     scaled = seeder(sb=True, sis=True).seed(frame, relevance, EMPTY)
     np.testing.assert_allclose(np.median(scaled.roi.scales_m), 0.5 * np.median(plain.roi.scales_m), rtol=0.05)
     # a grid spreads its samples: 0.89 instead of 0.73 pitches apart
-    assert np.median(scaled.background.scales_m) == pytest.approx(0.7 * np.median(plain.background.scales_m) * 0.89 / 0.73, rel=0.1)
+    assert np.median(scaled.background.scales_m) == pytest.approx(
+        0.7 * np.median(plain.background.scales_m) * 0.89 / 0.73, rel=0.1
+    )
     assert (scaled.background.scales_m == scaled.background.scales_m[:, :1]).all()
 
 
@@ -118,7 +120,11 @@ def test_a_region_with_enough_active_gaussians_is_fine_and_one_without_is_too_co
     frame = wall_frame()
     region = middle_relevance(frame).roi
     np.testing.assert_array_equal(undersampled_roi(frame, region, NO_MEANS, 4.0), region)
-    dense = seeder(SeedingSettings(first_frame_seeds=300_000)).seed(frame, middle_relevance(frame), EMPTY).background.means_m
+    dense = (
+        seeder(SeedingSettings(first_frame_seeds=300_000))
+        .seed(frame, middle_relevance(frame), EMPTY)
+        .background.means_m
+    )
     assert not undersampled_roi(frame, region, dense, 4.0).any()
     behind = dense + np.array([0.0, 0.0, 1.0], np.float32)
     np.testing.assert_array_equal(undersampled_roi(frame, region, behind, 4.0), region)
@@ -126,7 +132,9 @@ def test_a_region_with_enough_active_gaussians_is_fine_and_one_without_is_too_co
 
 def test_a_region_that_was_mapped_as_background_is_seeded_when_it_becomes_the_tasks() -> None:
     frame = wall_frame()
-    state = SeedingContext(1_000_000, RenderedView.from_rendering(rendering_of(np.ones((48, 64)), frame.depth_m)), NO_MEANS)
+    state = SeedingContext(
+        1_000_000, RenderedView.from_rendering(rendering_of(np.ones((48, 64)), frame.depth_m)), NO_MEANS
+    )
     seeds = seeder(sb=True, sis=True).seed(frame, middle_relevance(frame), state)
     assert len(seeds.roi) > 0
     assert len(seeds.background) == 0

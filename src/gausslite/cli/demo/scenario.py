@@ -7,7 +7,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from gausslite.calibration.pose_exposure_prior import PoseExposurePrior
-from gausslite.cli.source_options import open_recorded, register_with_warnings, resolve_pose_prior
+from gausslite.cli.source_options import (
+    open_recorded,
+    register_with_warnings,
+    report_region_file,
+    resolve_pose_prior,
+)
 from gausslite.config.values import AUTO
 from gausslite.datasets.held_out import HeldOutSplit
 from gausslite.datasets.open import open_source
@@ -91,6 +96,7 @@ def recorded_scenario(options: argparse.Namespace) -> Scenario:
     middle = recorded.indices()[len(recorded) // 2]
     first, second = options.frames_a or f":{middle}", options.frames_b or f"{middle}:"
     size, regions = frame_size(options.size, recorded), _scored_regions(options, recorded.regions())
+    report_region_file(options.source)
     agents, held_out_positions = [], []
     for letter, task, frames in (("a", options.task_a, first), ("b", options.task_b, second)):
         training, held_out = HeldOutSplit(_TEST_EVERY).split(select_frames(recorded, frames))
