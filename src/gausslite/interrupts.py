@@ -1,4 +1,4 @@
-"""Handle Ctrl-C and SIGTERM: end quietly during start-up, and after the current step of the work later.
+"""Handle Ctrl-C and SIGTERM: exit at once and without a traceback during start-up, and after the current step later.
 
 Programs call `end_quietly_while_starting` before their other imports, because imports take most of the start-up. The
 handler is our own and not the system's default, because process 1 of a container ignores signals without a handler.
@@ -26,12 +26,15 @@ class _QuietEnd:
 
 
 def end_quietly_while_starting(program: str) -> None:
-    """End the process with code 130 or 143 on SIGINT or SIGTERM, until `started`. Call it on the main thread."""
+    """End the process with code 130 on SIGINT and 143 on SIGTERM, until `restore_default_handlers` is called.
+
+    Call it on the main thread.
+    """
     for number in _SIGNALS:
         signal.signal(number, _QuietEnd(program))
 
 
-def started() -> None:
+def restore_default_handlers() -> None:
     """Restore Python's own handling of both signals, unless another handler has been installed."""
     if isinstance(signal.getsignal(signal.SIGINT), _QuietEnd):
         signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -46,12 +49,13 @@ class Terminated(KeyboardInterrupt):
 class DeferredInterrupt:
     """A context that records the first Ctrl-C or SIGTERM, so that the current step can be completed.
 
-    requested is the exception to raise afterwards; a second signal raises it at once. Only the main thread can handle
-    signals; on other threads the context changes nothing.
+    pending_exception: the exception that the signal stands for, None without a signal; the caller raises it after the
+    step. A second signal raises it at once. Only the main thread can handle signals; on other threads the context
+    changes nothing.
     """
 
     def __init__(self) -> None:
-        self.requested: KeyboardInterrupt | None = None
+        self.pending_exception: KeyboardInterrupt | None = None
         self._on_main_thread = threading.current_thread() is threading.main_thread()
         self._previous = {number: signal.getsignal(number) for number in _SIGNALS}
 
@@ -69,6 +73,6 @@ class DeferredInterrupt:
                 signal.signal(number, handler)
 
     def _record(self, number: int, _frame: FrameType | None) -> None:
-        if self.requested is not None:
-            raise self.requested
-        self.requested = Terminated() if number == signal.SIGTERM else KeyboardInterrupt()
+        if self.pending_exception is not None:
+            raise self.pending_exception
+        self.pending_exception = Terminated() if number == signal.SIGTERM else KeyboardInterrupt()

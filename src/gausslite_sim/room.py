@@ -62,7 +62,7 @@ class Room:
             box((x - 0.012, 0, 0), (x, y, 0.09)),
         ]
         self.items += [
-            Item("walls", [Part(merge_meshes(walls), "wall"), Part(merge_meshes(boards), "trim")], is_room=True),
-            Item("floor", [Part(box((0, 0, -t), (x, y, 0)), "floor")], is_room=True),
-            Item("ceiling", [Part(box((0, 0, z), (x, y, z + t)), "ceiling")], is_room=True),
+            Item("walls", [Part(merge_meshes(walls), "wall"), Part(merge_meshes(boards), "trim")], is_structure=True),
+            Item("floor", [Part(box((0, 0, -t), (x, y, 0)), "floor")], is_structure=True),
+            Item("ceiling", [Part(box((0, 0, z), (x, y, z + t)), "ceiling")], is_structure=True),
         ]

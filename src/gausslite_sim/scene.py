@@ -55,7 +55,7 @@ class HomeScene:
         texture_ids = {name: i for i, name in enumerate(textures)}
         self.lamps = plan.lighting.lamps
         self.names = tuple(item.name for item in items)
-        self.object_names = tuple(item.name for item in items if not item.is_room)
+        self.object_names = tuple(item.name for item in items if not item.is_structure)
         self.atlas = TextureAtlas(list(textures.values()))
         parts = [(i, part) for i, item in enumerate(items) for part in item.parts]
         whole = merge_meshes([part.mesh for _, part in parts])

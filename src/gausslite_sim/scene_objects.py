@@ -1,4 +1,4 @@
-"""Named objects of a home: meshes with textures."""
+"""Objects of a simulated home: a name, and meshes with textures."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from gausslite_sim.mesh import Mesh, Vector
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Part:
-    """A mesh with the name of its texture."""
+    """A mesh, in metres, with the name of its texture."""
 
     mesh: Mesh
     texture: str
@@ -27,11 +27,11 @@ class Part:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Item:
-    """A named object; is_room marks walls, floors and ceilings, which are not objects of tasks."""
+    """A named object; is_structure: it is a wall, floor or ceiling, which tasks never name."""
 
     name: str
     parts: list[Part]
-    is_room: bool = False
+    is_structure: bool = False
 
 
 def place_parts(parts: list[Part], position_m: Vector, yaw_deg: float = 0.0) -> list[Part]:

@@ -107,12 +107,12 @@ def _rooms() -> list[Item]:
             box((partition[0], low, DOORWAY_HEIGHT_M), (partition[1], high, HEIGHT_M)),
         ]
         items += [
-            Item(f"{name}_walls", [Part(merge_meshes(walls), paper)], is_room=True),
-            Item(f"{name}_floor", [Part(box((left, 0, -thick), (right, WIDTH_M, 0)), floor)], is_room=True),
+            Item(f"{name}_walls", [Part(merge_meshes(walls), paper)], is_structure=True),
+            Item(f"{name}_floor", [Part(box((left, 0, -thick), (right, WIDTH_M, 0)), floor)], is_structure=True),
             Item(
                 f"{name}_ceiling",
                 [Part(box((left, 0, HEIGHT_M), (right, WIDTH_M, HEIGHT_M + thick)), "ceiling")],
-                is_room=True,
+                is_structure=True,
             ),
         ]
     return items

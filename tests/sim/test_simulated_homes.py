@@ -26,7 +26,7 @@ def test_a_home_has_many_objects_with_unique_names(furnished: tuple) -> None:
     home, items = furnished
     names = [item.name for item in items]
     assert len(set(names)) == len(names)
-    assert sum(not item.is_room for item in items) >= 25
+    assert sum(not item.is_structure for item in items) >= 25
     assert {part.texture for item in items for part in item.parts} <= home.painters().keys()
 
 
@@ -35,7 +35,7 @@ def test_every_object_is_inside_the_room(furnished: tuple) -> None:
     walls = next(item for item in items if item.name == "walls").parts[0].mesh.positions_m
     for item in items:
         points = np.concatenate([part.mesh.positions_m for part in item.parts])
-        if not item.is_room:
+        if not item.is_structure:
             assert (points > walls.min(axis=0) - 0.13).all(), item.name
             assert (points < walls.max(axis=0) + 0.13).all(), item.name
         for part in item.parts:

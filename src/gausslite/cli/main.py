@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 
 from gausslite import __version__
 from gausslite.errors import GaussLiteError
-from gausslite.interrupts import Terminated, started
+from gausslite.interrupts import Terminated, restore_default_handlers
 
 _COMMANDS = {
     "map": "map a sequence for a task; write map.ply, report.json and preview.png",
@@ -61,7 +61,7 @@ def _dispatch(arguments: list[str]) -> int:
             importlib.import_module(_MODULES[name]).configure(command)
     options = _parse(parser, commands.choices, arguments)
     run = options.run
-    started()
+    restore_default_handlers()
     return int(run(options))
 
 

@@ -23,7 +23,7 @@ from gausslite.mission.frame_stream import CorruptFrames
 from gausslite.mission.results import (
     PREVIEW,
     peak_rss_mib,
-    prepare_file_next_to,
+    prepare_additional_file,
     prepare_folder,
     require_no_map,
     write_results,
@@ -73,7 +73,7 @@ def run(options: argparse.Namespace) -> int:
         inputs = inputs.resumed(options, saved)
     prepare_folder(options.out)
     if options.save_state is not None:
-        prepare_file_next_to(options.save_state, options.out)
+        prepare_additional_file(options.save_state, options.out)
     resumed_after = _NOT_RESUMED if saved is None else saved.last_index
     estimators = EstimatorFactory(inputs.perception, lambda: SceneInfo.of(inputs.stream.source))
     estimator = _first_estimator(options, inputs, estimators, resumed_after)

@@ -24,7 +24,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
     _add_list(actions.add_parser("list", help="list the usable files, and which of them are downloaded"))
     _add_fetch(actions.add_parser("fetch", help="download files over HTTPS; resumes interrupted downloads"))
-    verify = actions.add_parser("verify", help="check files; exit code 2 if one is damaged or another file")
+    verify = actions.add_parser("verify", help="check the SHA-256 of files; exit code 2 if one differs")
     verify.add_argument("files", metavar="FILE", type=Path, nargs="+")
     _add_catalogue(verify)
     verify.set_defaults(run=_verify)
@@ -51,7 +51,7 @@ def _add_fetch(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_catalogue(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--catalogue", metavar="FILE.toml", type=Path, help="another list of files")
+    parser.add_argument("--catalogue", metavar="FILE.toml", type=Path, help="file that replaces the built-in catalogue")
 
 
 def _add_folder(parser: argparse.ArgumentParser) -> None:
@@ -82,13 +82,13 @@ def _fetch(options: argparse.Namespace) -> int:
     if not base_url:
         raise InvalidInputError(f"--base-url: expected the address of the files, or {MODELS_URL_VARIABLE}; got neither")
     if options.sha256 is not None and len(options.names) > 1:
-        raise InvalidInputError(f"--sha256: expected one file for it, got {len(options.names)}")
+        raise InvalidInputError(f"--sha256: expected only one NAME with this option, got {len(options.names)}")
     known = _entries(options)
     for entry in [entry_named(known, name) for name in options.names]:
         with _bar(entry.file_name) as progress:
             fetched = fetch(entry, base_url, options.folder, options.sha256, progress)
         print(fetched.path)
-        print(f"{fetched.path.name}: {_assurance(fetched)}", file=sys.stderr)
+        print(f"{fetched.path.name}: {_verification_text(fetched)}", file=sys.stderr)
     return 0
 
 
@@ -104,16 +104,16 @@ def _verify(options: argparse.Namespace) -> int:
 def _inspect(options: argparse.Namespace) -> int:
     from gausslite.models.inspect import inspect
 
-    sheet = inspect(options.file)
-    print(f"family    {sheet.family}\nsize      {sheet.size_bytes} bytes\nsha256    {sheet.sha256}")
-    print(f"runs on   {sheet.provider}")
-    for label, tensors in (("input", sheet.inputs), ("output", sheet.outputs)):
+    description = inspect(options.file)
+    print(f"family    {description.family}\nsize      {description.size_bytes} bytes\nsha256    {description.sha256}")
+    print(f"runs on   {description.provider}")
+    for label, tensors in (("input", description.inputs), ("output", description.outputs)):
         for tensor in tensors:
             print(f"{label:9} {tensor}")
     return 0
 
 
-def _assurance(fetched: FetchedModel) -> str:
+def _verification_text(fetched: FetchedModel) -> str:
     """Return how the checksum of a downloaded file was verified, or that it was not."""
     if fetched.checksum_source:
         return f"verified: its SHA-256 is that of {fetched.checksum_source}"

@@ -1,4 +1,4 @@
-"""Keep the keyframes that agents send for the joint refinement: for each agent its newest."""
+"""Keep each agent's newest keyframes for the joint refinement."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from gausslite.errors import InvalidInputError, QuotaError
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AgentKeyframe:
-    """A keyframe of one agent; weight in [0, 1] weights its pixels in the loss (None = 1 everywhere)."""
+    """A keyframe of one agent; weight: of each pixel in the loss, in [0, 1] (None = 1 everywhere)."""
 
     agent_id: str
     frame: Frame
@@ -23,7 +23,8 @@ class AgentKeyframe:
 class KeyframePool:
     """Per agent the `max_per_agent` frames with the highest index; a repeated index replaces the earlier frame.
 
-    Memory is bounded by agents × max_per_agent × max_pixels × 7 bytes. Not thread-safe; FusionEngine holds a lock.
+    Memory per agent is at most max_per_agent × max_pixels × 11 bytes: RGB 3, depth 4, weight 4. Not thread-safe;
+    FusionEngine holds a lock.
     """
 
     def __init__(self, max_per_agent: int, max_pixels: int) -> None:
@@ -39,7 +40,7 @@ class KeyframePool:
         return sum(len(frames) for frames in self._by_agent.values())
 
     def add(self, keyframe: AgentKeyframe) -> None:
-        """Add the keyframe; a full pool drops the agent's oldest. Raises QuotaError if the image is too large."""
+        """Add the keyframe and remove the agent's oldest above the limit. Raises QuotaError for too many pixels."""
         pixels = keyframe.frame.depth_m.size
         if pixels > self._max_pixels:
             raise QuotaError(

@@ -1,4 +1,4 @@
-"""Fuse complete maps from files, with the same vote as the fusion server."""
+"""Fuse complete maps without a server, by the same per-voxel vote."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ from gausslite.fusion.vote import FusedMap, fuse
 
 
 def fuse_maps(maps: Mapping[str, Gaussians], grid: VoxelGrid) -> FusedMap:
-    """Return the voxel vote over complete maps by agent id (Sec. III-E).
+    """Return the fused map: each voxel holds the Gaussians of the agent with the highest Σkappa there (Sec. III-E).
 
+    maps: the complete map of each agent id.
     Raises InvalidInputError if a mean is outside the grid.
     """
     return fuse({agent_id: group_by_voxel(gaussians, grid) for agent_id, gaussians in maps.items()})

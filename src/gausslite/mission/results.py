@@ -37,10 +37,10 @@ def prepare_file(path: Path) -> None:
     prepare_folder(path.parent)
 
 
-def prepare_file_next_to(path: Path, folder: Path) -> None:
-    """Do `prepare_file`, and raise StorageError if the file would replace a result in the folder."""
-    if path.resolve() in {(folder / name).resolve() for name in (_MAP, _REPORT, PREVIEW)}:
-        raise StorageError(f"{path}: expected a name other than that of a result in {folder}")
+def prepare_additional_file(path: Path, results_folder: Path) -> None:
+    """Do `prepare_file` for a file that must not replace a result in the folder. Raises StorageError."""
+    if path.resolve() in {(results_folder / name).resolve() for name in (_MAP, _REPORT, PREVIEW)}:
+        raise StorageError(f"{path}: expected a name other than that of a result in {results_folder}")
     prepare_file(path)
 
 

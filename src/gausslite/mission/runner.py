@@ -114,8 +114,8 @@ class MissionRunner:
         source = iter(frames)
         with DeferredInterrupt() as interrupt:
             while not self.should_stop():
-                if interrupt.requested is not None:
-                    stopped_by = interrupt.requested
+                if interrupt.pending_exception is not None:
+                    stopped_by = interrupt.pending_exception
                     break
                 try:
                     frame = next(source, None)

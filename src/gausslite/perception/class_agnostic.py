@@ -16,15 +16,19 @@ from gausslite.perception.yolo_network import YoloSegNetwork
 
 @dataclass(frozen=True, slots=True)
 class ClassAgnosticSettings:
-    """Thresholds of an image's masks (comment in Sec. III-B.2); min_box_iou: of a mask's box with a given box."""
+    """Which masks of an image are candidates, and which candidate a box gets.
+
+    min_score: lowest score of a candidate. nms_max_iou: IoU of two boxes above which non-maximum suppression drops the
+    lower score. max_masks: number of candidates. min_box_iou: lowest IoU of the given box with its mask's box.
+    """
 
     min_score: float = 0.4
-    max_iou: float = 0.9
+    nms_max_iou: float = 0.9
     min_box_iou: float = 0.5
     max_masks: int = 100
 
     def __post_init__(self) -> None:
-        for name in ("min_score", "max_iou", "min_box_iou"):
+        for name in ("min_score", "nms_max_iou", "min_box_iou"):
             if not 0.0 < getattr(self, name) < 1.0:
                 raise InvalidInputError(f"segmenter {name}: expected between 0 and 1, got {getattr(self, name)}")
         if not 1 <= self.max_masks <= 1000:
@@ -33,7 +37,7 @@ class ClassAgnosticSettings:
     @classmethod
     def for_classes(cls, classes: int) -> ClassAgnosticSettings:
         """Return settings for a network; with many classes, each score is lower than FastSAM's with its one class."""
-        return cls() if classes == 1 else cls(min_score=0.03, max_iou=0.7)
+        return cls() if classes == 1 else cls(min_score=0.03, nms_max_iou=0.7)
 
 
 class ClassAgnosticSegmenter:
@@ -50,7 +54,7 @@ class ClassAgnosticSegmenter:
             return []
         output = self._network.run(frame)
         candidates = output.candidates(self._settings.min_score)
-        candidates = suppress(candidates, self._settings.max_iou, self._settings.max_masks, across_classes=True)
+        candidates = suppress(candidates, self._settings.nms_max_iou, self._settings.max_masks, across_classes=True)
         if len(candidates.scores) == 0:
             return [None] * len(boxes_px)
         overlaps = box_iou(boxes_px, candidates.boxes_px)

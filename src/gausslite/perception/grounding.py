@@ -33,18 +33,18 @@ _TEST_PHRASE: Final = "object"
 class GroundingSettings:
     """Thresholds of the boxes (comment in Sec. III-B.2): box_score of the phrase, text_score of its head noun.
 
-    text_score keeps "red mug" from matching objects that are only red. max_iou is not in the paper: it removes rare
+    text_score keeps "red mug" from matching objects that are only red. nms_max_iou is not in the paper: it removes rare
     duplicate boxes of one object.
     """
 
     box_score: float = 0.20
     text_score: float = 0.25
-    max_iou: float = 0.7
+    nms_max_iou: float = 0.7
     max_boxes: int = 50
     box_fractions: BoxFractions = field(default_factory=BoxFractions)
 
     def __post_init__(self) -> None:
-        for name in ("box_score", "text_score", "max_iou"):
+        for name in ("box_score", "text_score", "nms_max_iou"):
             if not 0.0 < getattr(self, name) < 1.0:
                 raise InvalidInputError(f"detector {name}: expected between 0 and 1, got {getattr(self, name)}")
         if not 1 <= self.max_boxes <= 1000:
@@ -102,7 +102,7 @@ class GroundingDino:
             return []
         boxes = boxes_px[rows].astype(np.float64)
         boxes[:, 2:] -= boxes[:, :2]
-        order = cv2.dnn.NMSBoxes(boxes.tolist(), scores[rows].tolist(), 0.0, self._settings.max_iou)
+        order = cv2.dnn.NMSBoxes(boxes.tolist(), scores[rows].tolist(), 0.0, self._settings.nms_max_iou)
         selected = rows[np.asarray(order, np.int64).reshape(-1)[: self._settings.max_boxes]]
         found = []
         for row in selected:

@@ -79,8 +79,8 @@ class TextEmbeddings:
 def classes_for(phrase: str, class_names: Sequence[str], embeddings: TextEmbeddings | None) -> tuple[int, ...]:
     """Return the indices of the detector's classes that match a phrase; empty if none does.
 
-    Order of attempts: the phrase, its synonym, its head noun, the head's synonym, the embeddings. A generic noun
-    ("object", "obstacle") matches every class except structure.
+    The first match counts: the phrase, its synonym, its head noun, the head noun's synonym, the embeddings. A generic
+    noun ("object", "obstacle") matches every class except building structure (walls, floors, doors).
     """
     if is_generic(phrase):
         return tuple(index for index, name in enumerate(class_names) if not is_structure(name))

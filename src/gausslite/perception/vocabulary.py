@@ -7,7 +7,7 @@ from typing import Final
 GENERIC: Final = frozenset(
     {"object", "thing", "item", "stuff", "obstacle", "obstruction", "clutter", "hazard", "debris", "target"}
 )
-# parts of a building or of the ground, which a generic noun never means
+# parts of a building or of the ground: a task that names any "object" does not mean these
 STRUCTURE: Final = frozenset(
     {"wall", "floor", "ceiling", "ground", "roof", "room", "kitchen", "bathroom", "bedroom", "office", "hallway",
      "corridor", "road", "street", "sidewalk", "lawn", "grass", "sky", "stairs", "door", "window", "carpet", "rug"}
@@ -82,7 +82,7 @@ def is_generic(phrase: str) -> bool:
 
 
 def is_structure(phrase: str) -> bool:
-    """Return True for walls, floors, rooms and the like."""
+    """Return True for parts of a building or of the ground: walls, floors, doors, rooms, roads."""
     return head_of(phrase) in STRUCTURE
 
 

@@ -23,12 +23,12 @@ class YoloSettings:
     """Thresholds of score, overlap and size of the boxes."""
 
     min_score: float = 0.25
-    max_iou: float = 0.7
+    nms_max_iou: float = 0.7
     max_boxes: int = 100
     box_fractions: BoxFractions = field(default_factory=BoxFractions)
 
     def __post_init__(self) -> None:
-        for name in ("min_score", "max_iou"):
+        for name in ("min_score", "nms_max_iou"):
             if not 0.0 < getattr(self, name) < 1.0:
                 raise InvalidInputError(f"detector {name}: expected between 0 and 1, got {getattr(self, name)}")
         if not 1 <= self.max_boxes <= 1000:
@@ -108,7 +108,7 @@ class YoloSegDetector:
         """Return the candidates of the queries' classes after non-maximum suppression."""
         classes = np.unique([index for indices in query_classes.values() for index in indices]).astype(np.int64)
         candidates = candidates.take(np.flatnonzero(np.isin(candidates.classes, classes)))
-        return suppress(candidates, self._settings.max_iou, self._settings.max_boxes, across_classes=False)
+        return suppress(candidates, self._settings.nms_max_iou, self._settings.max_boxes, across_classes=False)
 
     def _classes(self, query: str) -> tuple[int, ...]:
         return classes_for(query, self.class_names, self._embeddings)

@@ -6,7 +6,7 @@ MAX_MESSAGE_BYTES = 16 << 20
 """Both ends refuse larger messages; a frame of two megapixels with PNG depth needs a fraction of it."""
 
 KEEPALIVE_S = 15.0
-"""Either end sends a ping after this time without data, and closes the connection if no answer comes as long."""
+"""Either end sends a ping after this time without data, and closes the connection if no answer comes within it."""
 
 
 def connection_options(keepalive_s: float) -> tuple[tuple[str, int], ...]:

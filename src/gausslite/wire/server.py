@@ -1,7 +1,7 @@
 """Start, drain and stop a gRPC server, for all three services.
 
 Servicers raise GaussLite errors and write streams as async generators. The interceptor converts errors to status codes,
-so that a servicer's method only decodes, calls and encodes, and no message ends the server.
+so that a servicer's method only decodes, calls and encodes. No client message can make the server exit.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _log = logging.getLogger(__name__)
 _MAX_SOCKET_PATH_BYTES = 107
 _OPTIONS = (
     *connection_options(KEEPALIVE_S),
-    # clients ping at this rate, also on streams without data for hours
+    # gRPC would close a connection whose client pings this often without sending data
     ("grpc.http2.min_ping_interval_without_data_ms", round(500 * KEEPALIVE_S)),
     # a second server must fail to bind the port instead of sharing it
     ("grpc.so_reuseport", 0),
@@ -94,13 +94,13 @@ async def start_server(listen: str, services: Sequence[Service], tls: Tls | None
 async def serve_until_stopped(
     listen: str,
     services: Sequence[Service],
-    until: Callable[[], Awaitable[None]] | None = None,
+    background_task: Callable[[], Awaitable[None]] | None = None,
     tls: Tls | None = None,
     grace_s: float = 5.0,
 ) -> None:
-    """Serve until SIGTERM or SIGINT, or until `until` returns; then drain the server. Logs the address.
+    """Serve until SIGTERM or SIGINT, or until the background task ends; then drain the server. Logs the address.
 
-    Raises the errors of `until`, also those raised during its cancellation.
+    Raises the errors of the background task, also those raised during its cancellation.
     """
     stopping = asyncio.Event()
     loop = asyncio.get_running_loop()
@@ -110,8 +110,8 @@ async def serve_until_stopped(
     service_names = ", ".join(service.name for service in services)
     _log.info("%s listening on %s%s", service_names, running.address, "" if tls is None else ", encrypted")
     waits: list[asyncio.Future[Any]] = [asyncio.ensure_future(stopping.wait())]
-    if until is not None:
-        waits.append(asyncio.ensure_future(until()))
+    if background_task is not None:
+        waits.append(asyncio.ensure_future(background_task()))
     try:
         done, _ = await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)
         for task in done:
@@ -123,26 +123,26 @@ async def serve_until_stopped(
         await running.stop(grace_s)
         _log.info("ended")
     for result in results:
-        # an error during the cancellation of `until` must reach the caller
+        # an error during the cancellation of the background task must reach the caller
         if isinstance(result, GaussLiteError):
             raise result
 
 
 class ErrorInterceptor(grpc.aio.ServerInterceptor):  # type: ignore[type-arg]
-    """Ends a call with the status of the error that its method raised; unexpected errors are INTERNAL and logged."""
+    """End a call with the status of the error that its method raised; unexpected errors are INTERNAL and logged."""
 
     async def intercept_service(
         self,
         continuation: Callable[[Any], Awaitable[Any]],
         handler_call_details: Any,
     ) -> Any:
-        """Return the called method, wrapped."""
+        """Return a handler that runs the called method and converts its errors; foreign services stay unchanged."""
         handler = await continuation(handler_call_details)
         method = handler_call_details.method
         if handler is None or not method.startswith("/gausslite."):
             return handler
         # requests are decoded inside the guard, because gRPC itself would answer UNKNOWN to an invalid message
-        serializers = {"request_deserializer": None, "response_serializer": handler.response_serializer}
+        message_codecs = {"request_deserializer": None, "response_serializer": handler.response_serializer}
         decode = _decoder(handler.request_deserializer, method, handler.request_streaming)
         if handler.response_streaming:
             inner = handler.stream_stream if handler.request_streaming else handler.unary_stream
@@ -151,12 +151,12 @@ class ErrorInterceptor(grpc.aio.ServerInterceptor):  # type: ignore[type-arg]
                 if handler.request_streaming
                 else grpc.unary_stream_rpc_method_handler
             )
-            return make(_guard_stream(inner, decode, method), **serializers)
+            return make(_guard_stream(inner, decode, method), **message_codecs)
         inner = handler.stream_unary if handler.request_streaming else handler.unary_unary
         make = (
             grpc.stream_unary_rpc_method_handler if handler.request_streaming else grpc.unary_unary_rpc_method_handler
         )
-        return make(_guard_unary(inner, decode, method), **serializers)
+        return make(_guard_unary(inner, decode, method), **message_codecs)
 
 
 def _decoder(deserialize: Callable[[bytes], Any], method: str, streaming: bool) -> Callable[[Any], Any]:
@@ -207,7 +207,8 @@ async def _abort(error: Exception, method: str, context: Any) -> NoReturn:
 def _require_free(listen: str) -> None:
     """Raise UnavailableError if the address is in use.
 
-    gRPC alone would replace the unix socket of a running server, and print about a port in use on stderr.
+    Without this check gRPC would replace the unix socket of a running server. For a port in use it would also write its
+    own messages to stderr.
     """
     if listen.startswith(UNIX):
         _require_free_socket(listen, Path(listen.removeprefix(UNIX)))

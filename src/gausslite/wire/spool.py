@@ -1,7 +1,9 @@
-"""Store the uplink's data: the latest update of every voxel, and which version the server has acknowledged.
+"""Store the uplink's data: the latest update of every voxel, and whether it is pending.
 
-Its size is bounded by the map, because a newer update replaces the older one of its voxel. With a path it is a SQLite
-file that survives a restart; otherwise it is in memory.
+An update is pending until the server has accepted or finally refused it. A pending update is due if it has never been
+sent, is a tombstone, or its Σkappa has changed enough since it was last sent. The spool's size is bounded by the map,
+because a newer update replaces the older one of its voxel. With a path it is a SQLite file that survives a restart;
+otherwise it is in memory.
 """
 
 from __future__ import annotations
@@ -30,20 +32,20 @@ _Row = tuple[int, int, int, int, bytes]
 _SCHEMA = """
 CREATE TABLE IF NOT EXISTS voxel_updates (
     key INTEGER PRIMARY KEY, version INTEGER NOT NULL, purpose INTEGER NOT NULL, kappa_sum INTEGER NOT NULL,
-    count INTEGER NOT NULL, gaussians BLOB NOT NULL, waiting INTEGER NOT NULL, sent_kappa INTEGER NOT NULL);
-CREATE INDEX IF NOT EXISTS voxel_updates_waiting ON voxel_updates (waiting) WHERE waiting = 1;
+    count INTEGER NOT NULL, gaussians BLOB NOT NULL, pending INTEGER NOT NULL, sent_kappa INTEGER NOT NULL);
+CREATE INDEX IF NOT EXISTS voxel_updates_pending ON voxel_updates (pending) WHERE pending = 1;
 CREATE TABLE IF NOT EXISTS properties (name TEXT PRIMARY KEY, value) WITHOUT ROWID;
 """
 _ENQUEUE = """
 INSERT INTO voxel_updates VALUES (?, 1, ?, ?, ?, ?, 1, -1)
 ON CONFLICT (key) DO UPDATE SET version = version + 1, purpose = excluded.purpose, kappa_sum = excluded.kappa_sum,
-    count = excluded.count, gaussians = excluded.gaussians, waiting = 1
+    count = excluded.count, gaussians = excluded.gaussians, pending = 1
 WHERE kappa_sum != excluded.kappa_sum OR gaussians != excluded.gaussians
 """
 # updates never sent and tombstones are due at once; others if Σkappa has changed by a share of the sent value
 _SELECT_DUE = """
 SELECT key, version, kappa_sum, count, gaussians FROM voxel_updates
-WHERE waiting = 1 AND purpose = ?
+WHERE pending = 1 AND purpose = ?
     AND (sent_kappa < 0 OR count = 0 OR abs(kappa_sum - sent_kappa) >= ? * max(sent_kappa, 1))
 ORDER BY abs(kappa_sum - sent_kappa) DESC, key
 """
@@ -58,7 +60,7 @@ class Purpose(IntEnum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SpoolBatch:
-    """Updates to send, with their versions; an update enqueued meanwhile has another version and stays pending."""
+    """Updates to send, with their versions; a newer update of a voxel has a higher version and stays pending."""
 
     purpose: Purpose
     batch: VoxelBatch
@@ -70,7 +72,7 @@ class Spool:
 
     def __init__(self, path: Path | None, agent_id: str, grid: VoxelGrid) -> None:
         """Open or create the spool. Raises MismatchError if the file is another agent's or of another grid."""
-        self._where = "spool" if path is None else f"spool {path}"
+        self._error_prefix = "spool" if path is None else f"spool {path}"
         self._lock = threading.Lock()
         with self._storage_errors():
             self._database = sqlite3.connect(":memory:" if path is None else path, check_same_thread=False)
@@ -86,12 +88,12 @@ class Spool:
         if stored != (agent_id, grid.size_m):
             self.close()
             raise MismatchError(
-                f"{self._where}: expected agent {agent_id!r} and voxels of {grid.size_m} m, "
+                f"{self._error_prefix}: expected agent {agent_id!r} and voxels of {grid.size_m} m, "
                 f"got {stored[0]!r} and {stored[1]} m; choose another file"
             )
 
     def enqueue(self, batch: VoxelBatch, purpose: Purpose) -> None:
-        """Replace the stored updates of these voxels; an unchanged voxel keeps its state."""
+        """Replace the stored updates of these voxels; an update equal to the stored one changes nothing."""
         records = to_records(batch.gaussians)
         offsets = batch.offsets.tolist()
         sums = np.minimum(batch.kappa_sums, np.uint64(_MAX_INTEGER)).tolist()
@@ -128,29 +130,29 @@ class Spool:
                 return _to_batch(purpose, sorted(rows))
         return None
 
-    def mark_acked(self, sent: SpoolBatch) -> None:
-        """Mark these versions as done: the server has stored them, or will never accept them."""
+    def mark_done(self, sent: SpoolBatch) -> None:
+        """Mark these versions as no longer pending, because the server has accepted or finally refused them."""
         triples = zip(sent.versions.tolist(), sent.batch.kappa_sums.tolist(), sent.batch.keys.tolist(), strict=True)
         with self._transaction():
             self._database.executemany(
-                "UPDATE voxel_updates SET waiting = (version != ?), sent_kappa = ? WHERE key = ?", triples
+                "UPDATE voxel_updates SET pending = (version != ?), sent_kappa = ? WHERE key = ?", triples
             )
 
     def mark_all_unsent(self) -> None:
-        """Mark every voxel as unsent, because the server has lost them."""
+        """Mark every voxel as pending and never sent, because the server has lost all updates."""
         with self._transaction():
-            self._database.execute("UPDATE voxel_updates SET waiting = 1, sent_kappa = ?", (_NEVER_SENT,))
+            self._database.execute("UPDATE voxel_updates SET pending = 1, sent_kappa = ?", (_NEVER_SENT,))
 
     @property
-    def waiting(self) -> int:
-        """The number of voxels whose latest update the server does not have."""
+    def pending_voxels(self) -> int:
+        """The number of voxels whose latest update is pending."""
         with self._transaction():
-            return int(self._database.execute("SELECT count(*) FROM voxel_updates WHERE waiting = 1").fetchone()[0])
+            return int(self._database.execute("SELECT count(*) FROM voxel_updates WHERE pending = 1").fetchone()[0])
 
-    def next_update_seq(self, at_least: int = 0) -> int:
-        """Return a number above all earlier ones, also those from before a restart, and above at_least."""
+    def next_update_seq(self, above: int = 0) -> int:
+        """Return a number greater than `above` and than all earlier numbers, also those from before a restart."""
         with self._transaction():
-            update_seq = max(int(self._property("update_seq") or 0), at_least) + 1
+            update_seq = max(int(self._property("update_seq") or 0), above) + 1
             self._database.execute("UPDATE properties SET value = ? WHERE name = 'update_seq'", (update_seq,))
         return update_seq
 
@@ -169,7 +171,7 @@ class Spool:
         try:
             yield
         except sqlite3.Error as error:
-            raise StorageError(f"{self._where}: {error}; free some space or choose another file") from error
+            raise StorageError(f"{self._error_prefix}: {error}; free some space or choose another file") from error
 
     def _property(self, name: str) -> str | float | None:
         row = self._database.execute("SELECT value FROM properties WHERE name = ?", (name,)).fetchone()

@@ -86,14 +86,14 @@ class Uplink:
             self._changed.notify_all()
             try:
                 self._changed.wait_for(self._is_finished, timeout_s)
-                return self._spool.waiting == 0
+                return self._spool.pending_voxels == 0
             finally:
                 self._draining = False
 
     def counters(self) -> UplinkCounters:
         """Return the current totals."""
         with self._changed:
-            return replace(self._counters, voxels_sent=len(self._roi_voxels), voxels_waiting=self._spool.waiting)
+            return replace(self._counters, voxels_sent=len(self._roi_voxels), voxels_waiting=self._spool.pending_voxels)
 
     @property
     def session_id(self) -> str:
@@ -118,9 +118,8 @@ class Uplink:
         self._spool.close()
 
     def _is_finished(self) -> bool:
-        return (
-            self._drain_cancelled or self._closing or bool(self._counters.stopped_because) or self._spool.waiting == 0
-        )
+        cannot_send = self._drain_cancelled or self._closing or bool(self._counters.stopped_because)
+        return cannot_send or self._spool.pending_voxels == 0
 
     def _run(self) -> None:
         try:
@@ -145,7 +144,7 @@ class Uplink:
             while not self._closing and not self._counters.stopped_because:
                 now_s = time.monotonic()
                 wait_s = max(self._next_round_s - now_s, self._token_bucket.seconds_until_positive(now_s))
-                if wait_s <= 0 and self._spool.waiting:
+                if wait_s <= 0 and self._spool.pending_voxels:
                     return True
                 self._changed.wait(wait_s if wait_s > 0 else None)
         return False
@@ -238,12 +237,12 @@ class Uplink:
         if rejected:
             self._drop(part, f"{outcome.reason} {outcome.message}")
         else:
-            self._spool.mark_acked(part)
+            self._spool.mark_done(part)
         return None
 
     def _drop(self, part: SpoolBatch, reason: str) -> None:
         _log.warning("uplink: updates of %d voxels are dropped: %s", len(part.batch), reason)
-        self._spool.mark_acked(part)
+        self._spool.mark_done(part)
         with self._changed:
             self._counters = replace(self._counters, subsets_rejected=self._counters.subsets_rejected + 1)
 

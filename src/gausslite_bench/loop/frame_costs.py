@@ -41,7 +41,11 @@ class Latency:
 
 @dataclass(frozen=True, slots=True)
 class FrameCost:
-    """Time and results of one mapped frame, from the image in memory to the voxel updates ready to send."""
+    """Time and results of one mapped frame, from the image in memory to the voxel updates ready to send.
+
+    iterations: training iterations. gaussians: size of the map after the frame. roi_share: share of the image's pixels
+    inside the task's region, 0 to 1.
+    """
 
     timing: FrameTiming
     iterations: int
@@ -107,7 +111,8 @@ class LoopTiming:
     """Statistics of a run. hz: the loop's rate without waiting for frames. gaussians: after the last frame.
 
     stages: time of each stage per frame. frames_under_trained: frames below the minimum of iterations.
-    skipped_stages: number of frames that skipped the stage for lack of time.
+    skipped_stages: number of frames that skipped the stage for lack of time. roi_share: mean share of the pixels that
+    the task's region covers.
     """
 
     frames: int

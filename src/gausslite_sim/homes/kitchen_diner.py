@@ -24,7 +24,8 @@ LIGHTING = Lighting(
     ambient=0.24,
     bounce=0.8,
 )
-_TOP_M = 0.935
+_COUNTERTOP_M = 0.935
+# per trajectory: waypoints (camera position, look-at target) in metres; the last trajectory is held out
 TRAJECTORIES = (
     (
         ((1.3, 2.0, 1.50), (1.4, 4.0, 1.0)),
@@ -60,7 +61,7 @@ TRAJECTORIES = (
 
 
 def furnish(rng: np.random.Generator) -> list[Item]:
-    """Everything in the room, 5.4 x 4.4 m."""
+    """Return all objects of the room, 5.4 x 4.4 m. Their positions are x, y, z in metres, then yaw in degrees."""
     room = Room(5.4, 4.4, 2.6, rng)
     room.place_at_wall("fridge", furniture.cupboard((0.66, 0.64, 1.8), "fridge_front", "white_plastic"), "north", 0.36)
     room.place_at_wall(
@@ -74,15 +75,15 @@ def furnish(rng: np.random.Generator) -> list[Item]:
     for i, (x, label) in enumerate(((2.2, "jar_label"), (2.36, "packet"), (2.5, "jar_label"), (2.66, "packet")), 1):
         room.place(f"jar_{i}", small.jar(label), x, 4.28, 1.6, 37 * i)
     room.place("herbs", small.fern("terracotta", "leaf", 0.8), 2.83, 4.28, 1.6)
-    room.place_jittered("kettle", furniture.kettle(), 0.95, 4.15, _TOP_M, 30)
-    room.place_jittered("bottle_1", small.bottle("bottle_label", "green_glass"), 1.62, 4.05, _TOP_M)
-    room.place_jittered("bottle_2", small.bottle("jar_label", "brown_glass", 0.26), 1.78, 4.12, _TOP_M, 60)
-    room.place_jittered("cereal", furniture.carton("cereal", 0.2, 0.07, 0.29), 1.3, 4.2, _TOP_M, 8)
-    room.place_jittered("bread_box", furniture.carton("worn_wood", 0.34, 0.2, 0.18), 2.1, 4.2, _TOP_M, -4)
-    room.place_jittered("mug_1", small.cup("mug_print"), 1.98, 3.98, _TOP_M, 200)
-    room.place_jittered("toaster", furniture.carton("steel", 0.28, 0.16, 0.19), 2.45, 4.15, _TOP_M, 5)
-    room.place("pot", small.pot("paint_red"), 2.85, 4.08, _TOP_M, 20)
-    room.place("pan", small.plate("black_glass"), 3.1, 4.22, _TOP_M)
+    room.place_jittered("kettle", furniture.kettle(), 0.95, 4.15, _COUNTERTOP_M, 30)
+    room.place_jittered("bottle_1", small.bottle("bottle_label", "green_glass"), 1.62, 4.05, _COUNTERTOP_M)
+    room.place_jittered("bottle_2", small.bottle("jar_label", "brown_glass", 0.26), 1.78, 4.12, _COUNTERTOP_M, 60)
+    room.place_jittered("cereal", furniture.carton("cereal", 0.2, 0.07, 0.29), 1.3, 4.2, _COUNTERTOP_M, 8)
+    room.place_jittered("bread_box", furniture.carton("worn_wood", 0.34, 0.2, 0.18), 2.1, 4.2, _COUNTERTOP_M, -4)
+    room.place_jittered("mug_1", small.cup("mug_print"), 1.98, 3.98, _COUNTERTOP_M, 200)
+    room.place_jittered("toaster", furniture.carton("steel", 0.28, 0.16, 0.19), 2.45, 4.15, _COUNTERTOP_M, 5)
+    room.place("pot", small.pot("paint_red"), 2.85, 4.08, _COUNTERTOP_M, 20)
+    room.place("pan", small.plate("black_glass"), 3.1, 4.22, _COUNTERTOP_M)
     room.place_jittered("table", tables.plain_table(1.5, 0.9, 0.75, "light_wood", "dark_wood"), 3.4, 1.5)
     for i, (x, y, yaw) in enumerate(((3.0, 0.85, 180), (3.8, 0.88, 170), (3.05, 2.2, -5), (3.85, 2.15, 12)), 1):
         room.place_jittered(
@@ -123,7 +124,7 @@ def furnish(rng: np.random.Generator) -> list[Item]:
 
 
 def painters() -> dict[str, Painter]:
-    """White and red with green chairs over stone tiles."""
+    """Return the textures' painters: blue, cream and red over checkered tiles in white and brown."""
     colours = Palette(
         main=(0.26, 0.34, 0.52), second=(0.88, 0.84, 0.74), accent=(0.74, 0.22, 0.18), other=(0.22, 0.40, 0.52)
     )

@@ -53,7 +53,7 @@ def test_a_second_ctrl_c_interrupts_at_once() -> None:
     before = signal.getsignal(signal.SIGINT)
     with DeferredInterrupt() as interrupt:
         signal.raise_signal(signal.SIGINT)
-        assert interrupt.requested
+        assert interrupt.pending_exception
         with pytest.raises(KeyboardInterrupt):
             signal.raise_signal(signal.SIGINT)
     assert signal.getsignal(signal.SIGINT) is before

@@ -67,7 +67,7 @@ def test_a_network_of_many_classes_has_a_lower_threshold(tmp_path):
 
 
 def test_settings_are_checked():
-    for name in ("min_score", "max_iou", "min_box_iou"):
+    for name in ("min_score", "nms_max_iou", "min_box_iou"):
         with pytest.raises(InvalidInputError, match=name):
             ClassAgnosticSettings(**{name: 1.0})
     with pytest.raises(InvalidInputError, match="max_masks"):

@@ -105,7 +105,7 @@ def test_a_network_too_short_for_a_word_is_refused(tmp_path):
 
 
 def test_settings_are_checked():
-    for name in ("box_score", "text_score", "max_iou"):
+    for name in ("box_score", "text_score", "nms_max_iou"):
         with pytest.raises(InvalidInputError, match=name):
             GroundingSettings(**{name: 0.0})
     with pytest.raises(InvalidInputError, match="max_boxes"):

@@ -86,7 +86,7 @@ def network_inputs(seed: int, phrase: str):
 
 @pytest.mark.parametrize("phrase", ["red mug", "table", "red table"])
 def test_every_box_and_score_is_torchs(network, path, phrase):
-    lenient = GroundingSettings(0.001, 0.001, max_iou=0.999, box_fractions=BoxFractions(1.0, 1.0, 1.0, 1.0))
+    lenient = GroundingSettings(0.001, 0.001, nms_max_iou=0.999, box_fractions=BoxFractions(1.0, 1.0, 1.0, 1.0))
     detector = GroundingDino(open_model(path, 1), TinyTokenizer(), lenient)
     text = encode_phrase(phrase, TinyTokenizer(), TOKENS)
     for seed in SEEDS:
