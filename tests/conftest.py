@@ -1,4 +1,4 @@
-"""Run every test with the shapes in the type annotations checked, and find the data that may lie beside the project."""
+"""Check the shapes in type annotations during every test, and locate optional data next to the project."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from jaxtyping import install_import_hook
 
-# an int is a float here, as it is for the type checker
+# accept an int for a float, as the type checker does
 install_import_hook(
     ("gausslite", "gausslite_sim", "gausslite_bench"),
     "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))",
@@ -16,7 +16,7 @@ install_import_hook(
 
 @pytest.fixture(scope="session")
 def shared_dir() -> Path:
-    """The folder `shared` beside the project with real sequences and models; skips where there is none."""
+    """Return the folder `shared` next to the project, with real sequences and models; skip the test without it."""
     folder = Path(__file__).resolve().parents[2] / "shared"
     if not folder.is_dir():
         pytest.skip(f"no real sequences and models here: {folder} is absent")

@@ -17,7 +17,7 @@ Curves = Mapping[str, Sequence[tuple[float, float]]]
 
 
 def require_matplotlib() -> None:
-    """Raises InvalidInputError without the extra `plots`; call it before a long benchmark."""
+    """Raise InvalidInputError without the extra `plots`; call it before a long benchmark."""
     try:
         import matplotlib  # noqa: F401
     except ImportError:

@@ -10,7 +10,7 @@ from gausslite_sim.shapes import pillow, rods, sagging, tube
 
 
 def laptop(screen: str) -> list[Part]:
-    """Open, 0.33 m wide, its lid leaning back."""
+    """An open laptop, 0.33 m wide, with its lid leaning back."""
     base = box((-0.165, -0.12, 0), (0.165, 0.12, 0.016))
     keys = panel((-0.15, 0.09, 0.0165), (0.3, 0, 0), (0, -0.12, 0), fit=True)
     pad = panel((-0.05, -0.045, 0.0165), (0.1, 0, 0), (0, -0.065, 0), fit=True)
@@ -24,7 +24,7 @@ def laptop(screen: str) -> list[Part]:
 
 
 def keyboard() -> list[Part]:
-    """A full one, tilted towards its user, with a cable."""
+    """A full-size keyboard with a cable, tilted towards its user."""
     body = box((-0.22, -0.07, 0), (0.22, 0.07, 0.018)).rotate_x(0.07).translate((0, 0, 0.006))
     keys = (
         panel((-0.212, 0.063, 0.0185), (0.424, 0, 0), (0, -0.126, 0), fit=True).rotate_x(0.07).translate((0, 0, 0.006))
@@ -66,7 +66,7 @@ def printer() -> list[Part]:
 
 
 def desk_lamp(colour: str) -> list[Part]:
-    """A thin arm with two joints and a cone of a shade, and a cable."""
+    """A desk lamp: a thin arm with two joints, a conical shade and a cable."""
     foot = lathe([(0.0005, 0.0), (0.085, 0.0), (0.085, 0.02), (0.0005, 0.024)])
     arm = tube([(0, 0, 0.02), (0, 0.05, 0.2), (0, 0.09, 0.32)], 0.007)
     upper = tube([(0, 0.09, 0.32), (0, -0.04, 0.42), (0, -0.16, 0.46)], 0.007)
@@ -81,7 +81,7 @@ def desk_lamp(colour: str) -> list[Part]:
 
 
 def floor_lamp(shade: str) -> list[Part]:
-    """A tripod of thin rods under a drum of cloth."""
+    """A floor lamp: a tripod of thin rods under a cloth drum."""
     feet: list[tuple[Vector, Vector]] = [
         (
             (0.28 * float(np.cos(a)), 0.28 * float(np.sin(a)), 0.0),
@@ -103,7 +103,7 @@ def pendant(colour: str, drop_m: float) -> list[Part]:
 
 
 def speaker(wood: str) -> list[Part]:
-    """A box with two cones."""
+    """A loudspeaker box with two cones."""
     body = box((-0.1, -0.11, 0), (0.1, 0.11, 0.32))
     cones = []
     for z, radius in ((0.11, 0.075), (0.25, 0.04)):
@@ -113,19 +113,19 @@ def speaker(wood: str) -> list[Part]:
 
 
 def phone(screen: str) -> list[Part]:
-    """Lying on its back."""
+    """A phone lying on its back."""
     shown = panel((-0.036, 0.073, 0.0092), (0.072, 0, 0), (0, -0.146, 0), fit=True)
     return [Part(box((-0.038, -0.076, 0), (0.038, 0.076, 0.009)), "black_plastic"), Part(shown, screen)]
 
 
 def headphones() -> list[Part]:
-    """Lying on the table: a bow and two cushions."""
-    bow = ring(0.085, 0.008, 0.0, np.pi).rotate_x(-1.35).translate((0, 0.02, 0.03))
+    """Headphones lying on a table: a headband and two cushions."""
+    headband = ring(0.085, 0.008, 0.0, np.pi).rotate_x(-1.35).translate((0, 0.02, 0.03))
     cups = [
         lathe([(0.0005, 0), (0.04, 0.0), (0.045, 0.02), (0.0005, 0.032)], smooth=True).translate((x, 0.0, 0.004))
         for x in (-0.085, 0.085)
     ]
-    return [Part(bow, "steel"), Part(merge_meshes(cups), "leather")]
+    return [Part(headband, "steel"), Part(merge_meshes(cups), "leather")]
 
 
 def projector() -> list[Part]:
@@ -142,7 +142,7 @@ def projector() -> list[Part]:
 
 
 def fan() -> list[Part]:
-    """A table fan: a wire cage before four blades."""
+    """A table fan: a wire cage in front of four blades."""
     stand = [lathe([(0.0005, 0), (0.12, 0), (0.12, 0.02), (0.02, 0.04), (0.018, 0.22)])]
     cage = [ring(r, 0.003, 0, 2 * np.pi).translate((0, -0.05, 0.36)) for r in (0.16, 0.11, 0.06)]
     spokes: list[tuple[Vector, Vector]] = [

@@ -65,7 +65,7 @@ def poster(rng: np.random.Generator, colour: Colour) -> Texture:
 
 
 def landscape(rng: np.random.Generator) -> Texture:
-    """Hills, a lake and trees in a pale wooden frame behind glass."""
+    """A landscape painting: hills, a lake and trees in a pale wooden frame behind glass."""
     y, x = np.mgrid[0:SIDE_PX, 0:SIDE_PX] / SIDE_PX
     rgb = np.stack([0.55 + 0.3 * y, 0.7 + 0.12 * y, 0.9 - 0.1 * y], -1)
     for base, colour in ((0.42, (0.36, 0.46, 0.56)), (0.52, (0.30, 0.44, 0.34)), (0.62, (0.20, 0.34, 0.20))):
@@ -91,7 +91,7 @@ def photograph(rng: np.random.Generator) -> Texture:
 
 
 def city_map(rng: np.random.Generator) -> Texture:
-    """Blocks, streets, a river and names."""
+    """A city map: blocks, streets, a river and names."""
     picture = np.full((SIDE_PX, SIDE_PX, 3), (232, 228, 214), np.uint8)
     for _ in range(60):
         x, y, w, h = (int(v) for v in (*rng.integers(0, 470, 2), *rng.integers(16, 60, 2)))

@@ -89,7 +89,7 @@ def spindle_chair(wood: str, pad: str | None = None) -> list[Part]:
 
 
 def bar_stool(seat: str) -> list[Part]:
-    """High, on four thin legs with a foot ring."""
+    """A high stool on four thin legs with a foot ring."""
     top = lathe([(0.0005, 0.70), (0.17, 0.70), (0.18, 0.72), (0.17, 0.75), (0.0005, 0.755)], smooth=True)
     corners = [(0.19 * float(np.cos(a)), 0.19 * float(np.sin(a)), 0.26) for a in np.linspace(0, 2 * np.pi, 25)]
     return [Part(top, seat), Part(merge_meshes([legs(0.22, 0.22, 0.7, 0.024, 0.06), tube(corners, 0.008)]), "steel")]

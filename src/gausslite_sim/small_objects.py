@@ -1,4 +1,4 @@
-"""What stands about on tables, shelves and floors, each standing on z = 0, front towards -y."""
+"""Small objects for tables, shelves and floors. Each stands on z = 0 with its front towards -y."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def round_vase(picture: str) -> list[Part]:
 
 
 def teapot(colour: str) -> list[Part]:
-    """Round, with a spout, a lid and a handle."""
+    """A round teapot with a spout, a lid and a handle."""
     body = lathe([(0.05, 0), (0.085, 0.04), (0.09, 0.08), (0.06, 0.13), (0.02, 0.145), (0.0005, 0.146)], smooth=True)
     spout = tube([(0.075, 0, 0.05), (0.12, 0, 0.08), (0.14, 0, 0.13)], 0.013)
     handle = ring(0.05, 0.007, np.pi / 2, 3 * np.pi / 2).translate((-0.075, 0, 0.08))

@@ -27,7 +27,7 @@ _KITCHEN_TO_LIVING = (
     ((4.60, 2.30, 1.45), (2.3, 2.1, 0.60)),
     ((3.95, 1.80, 1.50), (2.1, 2.2, 0.60)),
 )
-"""Waypoints: past the chairs, through the doorway, round the living room and back."""
+"""Waypoints: past the chairs, through the doorway, around the living room and back."""
 
 _HELD_OUT = (
     ((2.95, 1.35, 1.85), (2.0, 2.2, 0.75)),
@@ -44,7 +44,8 @@ _HELD_OUT = (
 """Waypoints above and below the other trajectories, looking at the same objects."""
 
 
-def _round_the_table(frames: int) -> Float64[ndarray, "n 4 4"]:
+def _around_the_table(frames: int) -> Float64[ndarray, "n 4 4"]:
+    """Return poses on an ellipse around the table, with the camera towards its centre."""
     a = 2 * np.pi * np.arange(frames) / frames - 0.5 * np.pi
     eyes = np.stack([_CX + 1.5 * np.cos(a), _CY + 1.3 * np.sin(a), 1.42 + 0.12 * np.sin(3 * a)], axis=1)
     targets = np.stack([_CX + 0.25 * np.sin(2 * a), _CY + 0.12 * np.cos(3 * a), 0.72 + 0.08 * np.cos(2 * a)], axis=1)
@@ -52,8 +53,8 @@ def _round_the_table(frames: int) -> Float64[ndarray, "n 4 4"]:
 
 
 TRAJECTORIES: tuple[Trajectory, ...] = (
-    _round_the_table,
+    _around_the_table,
     spline_trajectory(_KITCHEN_TO_LIVING),
     spline_trajectory(_HELD_OUT),
 )
-"""0: agent A round the table. 1: agent B past the chairs to the living room. 2: held-out views."""
+"""0: agent A around the table. 1: agent B past the chairs to the living room. 2: held-out views."""

@@ -1,4 +1,4 @@
-"""The GPU's benchmark on tiny cases over the stand-in: what it measures and prints, never how long it took."""
+"""Measurements and output of the GPU benchmark on tiny cases with torch kernels; times are not asserted."""
 
 from __future__ import annotations
 
@@ -32,14 +32,21 @@ SIZE = (48, 32)
 
 
 def rasterization(*args: Any, **options: Any) -> tuple[torch.Tensor, torch.Tensor, dict[str, Any]]:
-    """gsplat.rasterization by its own signature, over the stand-in's operations: one view, all splats before it."""
-    asked = inspect.signature(gsplat.rasterization).bind(*args, **options).arguments
-    quats, logits = asked["quats"], asked["opacities"].logit()[:, None]
-    columns = [asked["means"], asked["scales"].log(), quats, logits, asked["colors"], torch.zeros_like(quats[:, :2])]
-    kernels, size = TorchKernels(), (asked["width"], asked["height"])
+    """Replace gsplat.rasterization, with its signature, by torch operations: one view, all splats in front of it."""
+    given = inspect.signature(gsplat.rasterization).bind(*args, **options).arguments
+    quats, logits = given["quats"], given["opacities"].logit()[:, None]
+    columns = [
+        given["means"],
+        given["scales"].log(),
+        quats,
+        logits,
+        given["colors"],
+        torch.zeros_like(quats[:, :2]),
+    ]
+    kernels, size = TorchKernels(), (given["width"], given["height"])
     camera = DeviceCamera.of(held_out_view(*size).camera, kernels.device)
     rows = torch.cat(columns, dim=1)
-    channels, alpha = kernels.composite(project(kernels, rows, camera, asked["viewmats"][0]), size, None)
+    channels, alpha = kernels.composite(project(kernels, rows, camera, given["viewmats"][0]), size, None)
     return channels[None], alpha[None, ..., None], {}
 
 
@@ -71,7 +78,7 @@ def test_every_size_of_map_is_measured_and_a_whole_frame(bench: GpuBench) -> Non
     assert "48x32" in rate_heading("a device", bench)
 
 
-def test_gsplat_called_plainly_has_the_loss_of_our_step() -> None:
+def test_the_gsplat_baseline_has_the_loss_of_our_step() -> None:
     rasterizer, view, loss = CudaRasterizer("cpu"), held_out_view(*SIZE), LossWeights()
     prepared = rasterizer.prepare_view(view.rgb, view.depth_m, view.camera)
     rows = seed_rows(60)
@@ -86,7 +93,7 @@ def test_no_repetitions_are_refused() -> None:
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has a GPU")
-def test_without_a_gpu_the_command_says_so_in_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+def test_without_a_gpu_the_command_fails_with_one_line(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["bench", "gpu"]) == 2
     said = capsys.readouterr()
     assert said.out == ""

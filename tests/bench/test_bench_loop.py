@@ -1,4 +1,4 @@
-"""The loop's benchmark on a few small frames: what it counts and prints, never how long it took."""
+"""Counts and output of the loop benchmark on a few small frames; times are not asserted."""
 
 from __future__ import annotations
 

@@ -20,7 +20,7 @@ def test_back_and_forth_is_continuous_at_both_ends() -> None:
     assert set(positions) == set(range(7))
 
 
-def test_the_slope_is_that_of_the_second_half() -> None:
+def test_the_slope_is_fitted_to_the_second_half() -> None:
     trend = MemoryTrend.of([100.0, 300.0, 400.0, 410.0, 420.0, 430.0], sample_interval_frames=50)
     assert (trend.start_mib, trend.middle_mib, trend.end_mib) == (100.0, 410.0, 430.0)
     assert trend.mib_per_1000_frames == pytest.approx(200.0)
@@ -33,8 +33,8 @@ def test_a_looped_run_reports_its_memory_and_the_gap_to_unlimited_time(capsys: p
     pytest.importorskip("embreex", reason="the simulated home needs the extra `sim`")
     pytest.importorskip("gausslite.render._kernels", reason="the native kernels are not built")
     small = ("--frames", "0:16", "--size", "96x72", "--max-gaussians", "1500", "--threads", "1", "--iterations", "4")
-    asked = ("--objects", "table", "--loop", "18", "--unlimited", "6", "--json")
-    assert main(["bench", "loop", "sim:home?seed=0&trajectory=0", *small, *asked]) == 0
+    options = ("--objects", "table", "--loop", "18", "--unlimited", "6", "--json")
+    assert main(["bench", "loop", "sim:home?seed=0&trajectory=0", *small, *options]) == 0
     report = json.loads(capsys.readouterr().out)
     assert report["frames"] == 18
     assert report["memory"]["start_mib"] > 0
@@ -53,11 +53,11 @@ def test_a_loop_of_one_frame_is_refused(capsys: pytest.CaptureFixture[str]) -> N
 def test_a_gap_without_anything_to_score_is_refused_before_the_work(capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("embreex", reason="the simulated home needs the extra `sim`")
     loop = ("bench", "loop", "sim:home?size=64x48", "--task", "mug")
-    for more, wanted in (
+    for more, expected in (
         (("--unlimited", "9"), "--unlimited: expected regions"),
         (("--unlimited", "9", "--frames", "0:4"), "--unlimited: expected at least 8 frames"),
         (("--unlimited", "-1"), "iterations: expected 0"),
     ):
         assert main([*loop, *more]) == 2
         [line] = capsys.readouterr().err.splitlines()
-        assert wanted in line
+        assert expected in line

@@ -1,4 +1,4 @@
-"""What `bench parser` counts, on sentences and parsers whose score is known."""
+"""Scores of `bench parser` on sentences and parsers with known results."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ ROWS = [
 ]  # fmt: skip
 
 
-def test_each_figure_counts_what_it_says():
+def test_scores_of_known_answers():
     clock = itertools.count()
     score = score_parser("rules", RuleParser(), [Sentence.from_row(row) for row in ROWS], lambda: float(next(clock)))
     assert (score.sentences, score.exact, score.target_set, score.anchor_set) == (4, 0.25, 0.5, 0.5)

@@ -1,4 +1,4 @@
-"""The quality benchmark on one small home: fair trials, kept results, tables that say what was measured."""
+"""The quality benchmark on one small home: tasks, trial keys, cached results and tables."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def test_a_real_sequences_kinds_are_chosen_by_name() -> None:
         choose_kinds([mug, chair], ["mug", "cup"])
 
 
-def test_components_come_one_by_one() -> None:
+def test_components_are_enabled_one_by_one() -> None:
     variants = cumulative_variants()
     label_textures = [variant.label for variant in variants]
     beyond = ["+long-term-keyframes", "+roi-context", "+background-reserve", "+ema", "+lr-decay"]
@@ -99,29 +99,29 @@ def test_a_trials_key_changes_with_each_of_its_settings() -> None:
     assert trial.key == Trial(PLAN, TASK, TrialBudget(), 0, CONDITIONS).key
 
 
-def test_a_map_that_knows_no_task_is_the_same_for_every_task_of_its_place() -> None:
+def test_a_map_without_a_task_is_shared_by_all_tasks_of_a_home() -> None:
     search = HomeScenePlan(choose_home_tasks(["home-8-search"])[0], 4, 3)
-    here, there = (
+    trial, other_task = (
         Trial(PLAN, UNIFORM, TrialBudget(), 0, CONDITIONS),
         Trial(search, UNIFORM, TrialBudget(), 0, CONDITIONS),
     )
-    assert (here.map_key, here.follows_task) == (there.map_key, False)
+    assert (trial.map_key, trial.follows_task) == (other_task.map_key, False)
     for other in (
-        replace(here, seed=1),
-        replace(here, budget=TrialBudget(iterations=9)),
-        replace(here, plan=replace(PLAN, pose_policy=PosePolicy(PoseExposurePrior(0.01)))),
-        replace(here, plan=replace(PLAN, frames=5)),
-        replace(here, plan=HomeScenePlan(choose_home_tasks(["home-7-search"])[0], 4, 3)),
-        replace(here, variant=Variant("monogs", "monogs")),
+        replace(trial, seed=1),
+        replace(trial, budget=TrialBudget(iterations=9)),
+        replace(trial, plan=replace(PLAN, pose_policy=PosePolicy(PoseExposurePrior(0.01)))),
+        replace(trial, plan=replace(PLAN, frames=5)),
+        replace(trial, plan=HomeScenePlan(choose_home_tasks(["home-7-search"])[0], 4, 3)),
+        replace(trial, variant=Variant("monogs", "monogs")),
     ):
-        assert other.map_key != here.map_key
-    ours, theirs = Trial(PLAN, TASK, TrialBudget(), 0, CONDITIONS), Trial(search, TASK, TrialBudget(), 0, CONDITIONS)
-    assert ours.follows_task
-    assert ours.map_key != theirs.map_key
-    assert not replace(ours, variant=cumulative_variants()[0]).follows_task
+        assert other.map_key != trial.map_key
+    with_task = Trial(PLAN, TASK, TrialBudget(), 0, CONDITIONS)
+    assert with_task.follows_task
+    assert with_task.map_key != Trial(search, TASK, TrialBudget(), 0, CONDITIONS).map_key
+    assert not replace(with_task, variant=cumulative_variants()[0]).follows_task
 
 
-def test_homes_are_believed_and_real_cameras_are_not(tmp_path: Path) -> None:
+def test_homes_have_exact_poses_and_real_sequences_a_pose_prior(tmp_path: Path) -> None:
     assert PosePolicy() == PLAN.pose_policy
     assert not Trial(PLAN, TASK, TrialBudget(), 0, CONDITIONS).mission.pose_prior.has_pose_error
     real = RealScenePlan(tmp_path, tmp_path / "roi.npz", "mug", ("mug_1",))
@@ -149,7 +149,7 @@ def test_a_trials_key_is_the_same_in_every_process() -> None:
     assert len(set(keys[0])) == len(cumulative_variants())
 
 
-def test_a_single_thread_is_timed_by_the_processor() -> None:
+def test_a_single_thread_is_timed_by_cpu_time() -> None:
     assert clock_for(1) is time.process_time
     assert clock_for(2) is clock_for(None) is time.perf_counter
 

@@ -1,4 +1,4 @@
-"""The rasterizer's benchmark on tiny cases: what it measures and prints, never how long it took."""
+"""Measurements and output of the rasterizer's benchmark on tiny cases; times are not asserted."""
 
 from __future__ import annotations
 
@@ -37,16 +37,16 @@ KEYS = [
 ]
 
 
-def test_seeds_draw_the_room_that_the_held_view_shows() -> None:
+def test_seed_rows_render_the_held_out_view() -> None:
     view = held_out_view(96, 72)
-    drawn = CpuRasterizer(threads=1).forward(seed_rows(30_000), view.camera, view.T_camera_world)
-    seen = drawn.alpha > 0.9
+    rendering = CpuRasterizer(threads=1).forward(seed_rows(30_000), view.camera, view.T_camera_world)
+    seen = rendering.alpha > 0.9
     assert seen.mean() > 0.7
-    assert np.median(np.abs(drawn.expected_depth_m() - view.depth_m)[seen]) < 0.03
-    assert np.median(np.abs(drawn.rgb - view.rgb / 255.0)[seen]) < 0.08
+    assert np.median(np.abs(rendering.expected_depth_m() - view.depth_m)[seen]) < 0.03
+    assert np.median(np.abs(rendering.rgb - view.rgb / 255.0)[seen]) < 0.08
 
 
-def test_seeds_lie_in_the_room_and_are_the_same_every_time() -> None:
+def test_seed_rows_are_in_the_room_and_deterministic() -> None:
     rows = seed_rows(600)
     assert (np.abs(rows[:, MEAN]) < 2.61).all()
     assert ((rows[:, RGB] >= 0) & (rows[:, RGB] <= 1)).all()
@@ -86,7 +86,7 @@ def test_lines_name_the_case_and_every_operation(capsys: pytest.CaptureFixture[s
         assert word in printed
 
 
-def test_details_hold_every_figure_of_every_case(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_details_contain_every_number_of_every_case(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "details.json"
     small = ["--sizes", "48x32", "--gaussians", "20,40", "--threads", "1", "--reps", "1", "--shares", "10,100"]
     assert main(["bench", "raster", *small, "--details", str(file)]) == 0
@@ -103,7 +103,7 @@ def test_details_hold_every_figure_of_every_case(tmp_path: Path, capsys: pytest.
         assert whole == [1.0] * 6
 
 
-def test_cycles_are_those_of_all_threads_in_the_stage_that_evaluates_blocks() -> None:
+def test_cycles_are_summed_over_threads_in_the_stage_that_evaluates_blocks() -> None:
     stages = {"project": 5.0, "raster": 2.0, "loss": 7.0, "backward": 1.0, "update": 9.0}
     cost = BlockCost.of(evaluations=300_000, clock_ghz=3.4, threads=2, stages_ms=stages)
     assert cost.cycles == pytest.approx(2 * 2.0e-3 * 3.4e9 / 300_000)
@@ -117,7 +117,7 @@ def test_a_smaller_share_of_tiles_lies_inside_a_larger_one(layout: Layout) -> No
         assert not (smaller & ~larger).any()
 
 
-def test_a_compact_region_lies_round_the_middle() -> None:
+def test_a_compact_region_surrounds_the_middle() -> None:
     rows, columns = np.nonzero(*regions_of_share((160, 160), 36, Layout.COMPACT))
     assert {*rows, *columns} == set(range(2, 8))
 
@@ -131,7 +131,7 @@ def test_bands_cover_the_image_once(percent: float, count: int) -> None:
     assert max(int(np.ptp(np.nonzero(band)[1])) for band in bands) <= 21 // count + 1
 
 
-def test_of_many_narrow_bands_some_are_enough() -> None:
+def test_the_number_of_narrow_bands_is_limited() -> None:
     bands = regions_of_share((240, 320), 0.1, Layout.BANDS)
     assert len(bands) == 20
     assert {int(band.sum()) for band in bands} == {1}
@@ -139,23 +139,23 @@ def test_of_many_narrow_bands_some_are_enough() -> None:
 
 
 @pytest.mark.parametrize("percent", [0.0, -1.0, 100.5, float("nan")])
-def test_a_share_that_is_none_is_told(percent: float) -> None:
+def test_an_invalid_share_is_refused(percent: float) -> None:
     with pytest.raises(InvalidInputError, match="region share: expected more than 0 and at most 100"):
         regions_of_share((32, 32), percent, Layout.COMPACT)
 
 
 @pytest.mark.parametrize("text", ["", "0,5", "5,,7", "101", "-1", "nan", "x"])
-def test_percents_that_are_none_are_told(text: str) -> None:
+def test_invalid_percentages_are_refused(text: str) -> None:
     with pytest.raises(argparse.ArgumentTypeError, match="expected"):
         read_percentages(text)
 
 
-def test_no_shares_can_be_asked_for() -> None:
+def test_zero_percent_disables_shares() -> None:
     assert read_percentages("0") == ()
     assert read_percentages("5,20.5") == (5.0, 20.5)
 
 
-def test_a_file_that_is_no_library_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_file_other_than_a_library_is_refused_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     library = tmp_path / "other.so"
     library.write_text("not a library")
     small = ["--sizes", "32x32", "--gaussians", "20", "--threads", "1", "--reps", "1"]
@@ -166,12 +166,12 @@ def test_a_file_that_is_no_library_is_one_line(tmp_path: Path, capsys: pytest.Ca
 
 
 @pytest.mark.parametrize("text", ["", "32", "32x", "32x32x3", "0x5", "axb"])
-def test_sizes_that_are_none_are_told(text: str) -> None:
+def test_invalid_sizes_are_refused(text: str) -> None:
     with pytest.raises(argparse.ArgumentTypeError, match="expected"):
         read_image_sizes(text)
 
 
 @pytest.mark.parametrize("text", ["", "0", "-3", "1.5"])
-def test_counts_that_are_none_are_told(text: str) -> None:
+def test_invalid_counts_are_refused(text: str) -> None:
     with pytest.raises(argparse.ArgumentTypeError, match="expected whole numbers"):
         read_counts(text)

@@ -1,4 +1,4 @@
-"""The benchmark of a task that changes, its table and its picture; and `map --task-at` on a tiny home."""
+"""The benchmark of task changes with its table and plot, and `map --task-at` on a tiny home."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_a_change_is_between_two_tasks_of_one_home(text: str) -> None:
         TaskChange.parse(text)
 
 
-def test_the_table_names_the_time_that_was_mapped() -> None:
+def test_the_table_names_the_mapped_time() -> None:
     brief = Recovery(CHANGE, {name: [(0.25, 20.0), (1.5, 21.0)] for name in (CHANGED, RESTARTED, ALWAYS)}, 4, 2, 9, 5)
     assert "→ after 1.5 s of further mapping." in recovery_table([brief])
     assert "→ after 10 s of further mapping." in recovery_table([recovery([3.0, 0.9, 0.4, 1.5])])
@@ -124,7 +124,7 @@ def test_without_matplotlib_the_error_names_the_extra(
     assert not (tmp_path / "out").exists()
 
 
-def test_the_task_in_force_is_that_of_the_latest_turn() -> None:
+def test_the_current_task_is_that_of_the_latest_switch() -> None:
     parse = RuleParser().parse
     first, second, third = parse("Find the mug"), parse("Find the bowl"), parse("Find the chair")
     plan = TaskSchedule(first, ((20, third), (10, second)))
@@ -133,13 +133,13 @@ def test_the_task_in_force_is_that_of_the_latest_turn() -> None:
 
 
 @pytest.mark.parametrize("text", ["Find the mug", "x:Find the mug", "7:", "-1:Find the mug"])
-def test_a_turn_that_is_none_is_told(text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_invalid_task_switch_is_refused(text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     command = ["map", "sim:home?frames=2", "--task", "Find the mug", f"--task-at={text}", "--out", str(tmp_path)]
     assert main(command) == 2
     assert "--task-at" in capsys.readouterr().err
 
 
-def test_a_mission_whose_task_changes_can_be_cut_in_two(tmp_path: Path) -> None:
+def test_a_mission_with_a_task_change_resumes_bit_identically(tmp_path: Path) -> None:
     def map_home(name: str, *more: str) -> tuple[bytes, dict[str, object]]:
         common = ["--size", "64x48", "--max-gaussians", "500", "--iterations", "2", "--threads", "1"]
         tasks = ["--task", "Pick up the mug on the table", "--task-at", "6:Find the chair"]
@@ -149,8 +149,8 @@ def test_a_mission_whose_task_changes_can_be_cut_in_two(tmp_path: Path) -> None:
         return (tmp_path / name / "map.ply").read_bytes(), report
 
     state = str(tmp_path / "run.state")
-    whole, report = map_home("whole")
-    # all six frames before showed the first task's region and are remembered for that
+    uninterrupted, report = map_home("uninterrupted")
+    # all six earlier frames showed the first task's region, so they are keyframes
     assert report["keyframes_reread"] == 6
     map_home("first", "--frames", "0:7", "--save-state", state)
-    assert map_home("rest", "--resume", state)[0] == whole
+    assert map_home("rest", "--resume", state)[0] == uninterrupted

@@ -1,4 +1,4 @@
-"""The driver of other libraries, against a real one: a few lines of C that note what they are handed."""
+"""The driver of external rasterizers, with a small C library that records its arguments."""
 
 from __future__ import annotations
 
@@ -24,24 +24,24 @@ pytest.importorskip("gausslite.render._kernels", reason="the native kernels are 
 LIBRARY = r"""
 #include <stdint.h>
 #include <stdlib.h>
-long opened, closed, threads, size[2], rows[4], modes[4], loose, gradients_set;
+long opened, closed, threads, size[2], rows[4], modes[4], unexpected, gradients_set;
 float principal_point[2], first_red, last_row_padding, first_depth;
 static void *heap;
-static void check(const void *p) { loose += (uintptr_t)p % 64 != 0; }
+static void check(const void *p) { unexpected += (uintptr_t)p % 64 != 0; }
 void *gl_new(int n) { ++opened; threads = n; heap = malloc(64); return heap; }
 void gl_free(void *h) { closed += h == heap; free(h); }
 void gl_setup(void *h, const float *camera, int w, int ht, const void *mask, int raw) {
   size[0] = w; size[1] = ht; principal_point[0] = camera[14]; principal_point[1] = camera[15];
-  loose += mask != 0 || raw != 0 || h != heap;
+  unexpected += mask != 0 || raw != 0 || h != heap;
 }
-void gl_forward(void *h, const float *p, int n, const void *ids) { check(p); rows[0] = n; loose += ids != 0; }
+void gl_forward(void *h, const float *p, int n, const void *ids) { check(p); rows[0] = n; unexpected += ids != 0; }
 void gl_set_grad(void *h, const float *g) { check(g); ++gradients_set; }
 void gl_backward(void *h) { ++rows[1]; }
 void gl_pbwd(void *h, const float *p, float *d) { check(p); check(d); d[0] += 1.0f; ++rows[2]; }
 double gl_step(void *h, float *p, int n, const void *ids, const float *rgb, const float *depth, float wc, float wd,
                float *m, float *v, const float *rates, int step, int mode) {
   check(p); check(rgb); check(depth); check(m); check(v); check(rates);
-  for (int k = 0; k < 16; ++k) loose += rates[k] != 0.0f;
+  for (int k = 0; k < 16; ++k) unexpected += rates[k] != 0.0f;
   rows[3] = n; ++modes[mode & 3];
   first_red = rgb[0]; first_depth = depth[0];
   last_row_padding = rgb[32 * 48 - 1];
@@ -52,53 +52,53 @@ double gl_step(void *h, float *p, int n, const void *ids, const float *rgb, cons
 
 @pytest.fixture
 def library(tmp_path: Path) -> Path:
-    source, built = tmp_path / "noting.c", tmp_path / "libnoting.so"
+    source, built = tmp_path / "recording.c", tmp_path / "librecording.so"
     source.write_text(LIBRARY)
     subprocess.run([COMPILER, "-shared", "-fPIC", "-O1", source, "-o", built], check=True)
     return built
 
 
-def noted(library: Path, name: str, length: int = 1) -> list[int]:
+def recorded(library: Path, name: str, length: int = 1) -> list[int]:
     return list((ctypes.c_long * length).in_dll(ctypes.CDLL(str(library)), name))
 
 
-def noted_number(library: Path, name: str) -> float:
+def recorded_number(library: Path, name: str) -> float:
     return ctypes.c_float.in_dll(ctypes.CDLL(str(library)), name).value
 
 
 def test_the_library_gets_the_splats_the_view_and_every_operation(library: Path) -> None:
-    view = held_out_view(40, 24)  # not whole tiles: planes are padded to 48x32
+    view = held_out_view(40, 24)  # planes are padded to whole tiles: 48x32
     table = SplatTable(60)
     table.append_rows(seed_rows(60), np.zeros(60, np.bool_), np.zeros(60, np.uint32), np.zeros(60, np.int16))
-    other = ExternalRasterizer(library, 3, table, view)
-    with other.active():
-        other.fused_l1()
-        other.fused_l1_ssim()
-        other.forward()
-        other.backward()
+    external = ExternalRasterizer(library, 3, table, view)
+    with external.active():
+        external.fused_l1()
+        external.fused_l1_ssim()
+        external.forward()
+        external.backward()
 
-    assert noted(library, "threads") == [3]
-    assert noted(library, "size", 2) == [40, 24]
-    assert noted(library, "rows", 4) == [60, 1, 1, 60]
-    assert noted(library, "modes", 4) == [0, 1, 1, 0]
-    assert noted(library, "gradients_set") == [1]
-    assert noted(library, "opened") == noted(library, "closed")
-    assert noted(library, "loose") == [0]  # all memory on cache lines, no masks, learning rates of zero
-    assert noted_number(library, "first_red") == pytest.approx(view.rgb[0, 0, 0] / 255)
-    assert noted_number(library, "first_depth") == pytest.approx(view.depth_m[0, 0])
-    assert noted_number(library, "last_row_padding") == 0.0
+    assert recorded(library, "threads") == [3]
+    assert recorded(library, "size", 2) == [40, 24]
+    assert recorded(library, "rows", 4) == [60, 1, 1, 60]
+    assert recorded(library, "modes", 4) == [0, 1, 1, 0]
+    assert recorded(library, "gradients_set") == [1]
+    assert recorded(library, "opened") == recorded(library, "closed")
+    assert recorded(library, "unexpected") == [0]  # aligned memory, no masks, learning rates of zero
+    assert recorded_number(library, "first_red") == pytest.approx(view.rgb[0, 0, 0] / 255)
+    assert recorded_number(library, "first_depth") == pytest.approx(view.depth_m[0, 0])
+    assert recorded_number(library, "last_row_padding") == 0.0
     point = (ctypes.c_float * 2).in_dll(ctypes.CDLL(str(library)), "principal_point")
     assert list(point) == [view.camera.cx_px, view.camera.cy_px]
 
 
-def test_the_benchmark_prints_its_times_beside_ours(library: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_benchmark_prints_ratios_to_the_library(library: Path, capsys: pytest.CaptureFixture[str]) -> None:
     small = ["--sizes", "32x32", "--gaussians", "20", "--threads", "1", "--reps", "2", "--shares", "0"]
     assert main(["bench", "raster", *small, "--external-rasterizer", str(library)]) == 0
     assert capsys.readouterr().out.count("ratio") == 4
-    assert noted(library, "opened") == noted(library, "closed")
+    assert recorded(library, "opened") == recorded(library, "closed")
 
 
-def test_a_library_without_the_functions_is_told(tmp_path: Path) -> None:
+def test_a_library_without_the_functions_is_refused(tmp_path: Path) -> None:
     source, built = tmp_path / "empty.c", tmp_path / "libempty.so"
     source.write_text("int gl_nothing;")
     subprocess.run([COMPILER, "-shared", "-fPIC", source, "-o", built], check=True)

@@ -1,4 +1,4 @@
-"""LPIPS with random weights against a second computation, window by window in numpy; and files that are none."""
+"""LPIPS with random weights against a computation in numpy, and invalid weight files."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def enlarged(image: np.ndarray, height: int, width: int) -> np.ndarray:
     return np.stack([np.interp(rows, np.arange(image.shape[0]), line) for line in along.T], axis=1)
 
 
-def test_the_distance_is_that_of_a_computation_in_numpy(weights: dict) -> None:
+def test_the_distance_equals_a_computation_in_numpy(weights: dict) -> None:
     a, b = images()
     expected = np.zeros(a.shape[:2])
     for k, (one, two) in enumerate(zip(numpy_layers(a, weights), numpy_layers(b, weights), strict=True)):
@@ -76,7 +76,7 @@ def test_the_distance_is_that_of_a_computation_in_numpy(weights: dict) -> None:
     np.testing.assert_allclose(Lpips(weights).distance_map(a, b), expected, rtol=2e-3, atol=1e-4)
 
 
-def test_laws_of_a_distance(weights: dict) -> None:
+def test_the_distance_is_zero_for_equal_images_symmetric_and_monotonic(weights: dict) -> None:
     a, b = images()
     lpips = Lpips(weights)
     assert lpips.distance_map(a, a).max() == 0
@@ -88,7 +88,7 @@ def test_laws_of_a_distance(weights: dict) -> None:
     )
 
 
-def test_weights_come_from_one_file_or_two(weights: dict, tmp_path: Path) -> None:
+def test_weights_are_read_from_one_file_or_two(weights: dict, tmp_path: Path) -> None:
     trunk = {name: value for name, value in weights.items() if name.startswith("features")}
     heads = {name: value for name, value in weights.items() if name.startswith("lin")}
     for name, part in (("all.pth", weights), ("trunk.pth", trunk), ("heads.pth", heads)):

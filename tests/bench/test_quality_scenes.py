@@ -1,4 +1,4 @@
-"""What a trial is judged on: masks that belong to their frames, real sequences told apart, wrong ones named early."""
+"""Scenes of trials: masks match their frames, trial keys depend on the sequence, invalid input is refused early."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ def write_regions(path: Path, *voxels: tuple[int, int, int], name: str = "mug_1"
     return path
 
 
-def test_two_frames_from_one_place_have_masks_of_their_own() -> None:
+def test_recorded_relevance_matches_frames_by_identity() -> None:
     frames = [wall_frame(0), wall_frame(1)]
     masks = [middle_relevance(frames[0]), RelevanceMap.empty(*frames[1].depth_m.shape)]
-    attention = RecordedRelevanceEstimator(Scene("Find it", frames, masks, [], SceneInfo()))
-    assert [attention.estimate(frame).relevance for frame in frames] == masks
-    assert attention.evaluate_past(frames[0]) is masks[0]
+    estimator = RecordedRelevanceEstimator(Scene("Find it", frames, masks, [], SceneInfo()))
+    assert [estimator.estimate(frame).relevance for frame in frames] == masks
+    assert estimator.evaluate_past(frames[0]) is masks[0]
 
 
-def test_other_regions_under_the_same_names_are_another_scene(tmp_path: Path) -> None:
+def test_changed_regions_change_the_settings_of_a_scene(tmp_path: Path) -> None:
     path = write_regions(tmp_path / "roi.npz", (0, 0, 20))
     [plan] = real_plans(tmp_path, path)
     before = plan.settings()
@@ -43,7 +43,7 @@ def test_other_regions_under_the_same_names_are_another_scene(tmp_path: Path) ->
     assert plan.settings() != before
 
 
-def test_another_camera_is_another_scene(tmp_path: Path) -> None:
+def test_a_changed_camera_changes_the_settings_of_a_scene(tmp_path: Path) -> None:
     folder = write_seven_scenes(tmp_path / "kitchen")
     [plan] = real_plans(folder, write_regions(tmp_path / "roi.npz", (0, 0, 20)))
     before = plan.training_settings()
@@ -51,7 +51,7 @@ def test_another_camera_is_another_scene(tmp_path: Path) -> None:
     assert plan.training_settings() != before
 
 
-def test_a_sequence_is_named_by_its_folder_wherever_one_stands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_sequence_is_named_by_its_folder_for_any_path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "kitchen").mkdir()
     monkeypatch.chdir(tmp_path / "kitchen")
     assert RealScenePlan(Path(), Path("roi.npz"), "mug", ("mug_1",)).name == "kitchen-mug"
@@ -59,19 +59,19 @@ def test_a_sequence_is_named_by_its_folder_wherever_one_stands(tmp_path: Path, m
 
 
 @pytest.mark.parametrize("frames", [-5, 0, 1])
-def test_too_few_frames_of_a_real_sequence_are_told_at_once(frames: int, tmp_path: Path) -> None:
+def test_too_few_frames_of_a_real_sequence_are_refused_at_once(frames: int, tmp_path: Path) -> None:
     with pytest.raises(InvalidInputError, match=f"frames: expected 2 to 100000, got {frames}"):
         real_plans(tmp_path, write_regions(tmp_path / "roi.npz", (0, 0, 20)), frames)
 
 
 @pytest.mark.parametrize("name", ["left/right_1", "_"])
-def test_an_object_whose_name_cannot_name_a_file_is_told_at_once(name: str, tmp_path: Path) -> None:
+def test_an_object_whose_name_cannot_name_a_file_is_refused_at_once(name: str, tmp_path: Path) -> None:
     path = write_regions(tmp_path / "roi.npz", (0, 0, 20), name=name)
     with pytest.raises(InvalidInputError, match=r"roi\.npz: expected objects that can name files, got"):
         real_plans(tmp_path, path)
 
 
-def test_the_words_of_a_task_find_the_regions_of_a_real_sequence(tmp_path: Path) -> None:
+def test_nouns_of_a_task_match_regions_of_a_real_sequence(tmp_path: Path) -> None:
     folder = write_seven_scenes(tmp_path / "kitchen", tuple(range(0, 36, 4)))
     wall = [(x, y, z) for x in range(-4, 4) for y in range(-4, 4) for z in (19, 20)]
     [plan] = real_plans(folder, write_regions(tmp_path / "roi.npz", *wall, name="mug_1"))
@@ -85,7 +85,7 @@ def test_the_words_of_a_task_find_the_regions_of_a_real_sequence(tmp_path: Path)
     assert build_map(trial, plan.load((16, 16)), lambda _: None).gaussians.active.any()
 
 
-def test_a_sequence_too_short_to_hold_a_view_out_says_what_there_was(tmp_path: Path) -> None:
+def test_a_sequence_too_short_for_a_held_out_view_is_refused_with_its_counts(tmp_path: Path) -> None:
     folder = write_seven_scenes(tmp_path / "kitchen")
     [plan] = real_plans(folder, write_regions(tmp_path / "roi.npz", (0, 0, 20)))
     with pytest.raises(DatasetError, match="expected training frames and held-out views with depth, got 3 and 0"):
@@ -120,7 +120,7 @@ def test_a_kind_that_no_held_out_view_shows_is_skipped_with_a_message(
     assert "kitchen-lamp" not in output.out
 
 
-def test_a_sequence_without_depth_is_not_said_to_lack_the_region(tmp_path: Path) -> None:
+def test_a_sequence_without_depth_has_its_own_message(tmp_path: Path) -> None:
     kitchen, roi = write_kitchen(tmp_path, mug_1=WALL)
     for path in kitchen.glob("*.depth.png"):
         write_depth(path, value=0)
@@ -137,7 +137,7 @@ def test_regions_of_another_sequence_are_refused(tmp_path: Path, capsys: pytest.
     assert not (tmp_path / "out" / "quality.md").exists()
 
 
-def test_a_map_of_regions_that_no_frame_shows_has_a_message(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_regions_that_no_frame_shows_are_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("gausslite.render._kernels", reason="the native kernels are not built")
     kitchen, roi = write_kitchen(tmp_path, mug_1=WALL, lamp_1=[(500, 500, 500)])
     for name, reported in (("lamp_1", True), ("mug_1", False)):
@@ -152,15 +152,13 @@ def test_a_map_of_regions_that_no_frame_shows_has_a_message(tmp_path: Path, caps
     assert capsys.readouterr().out.startswith("no region selected; full PSNR ")
 
 
-def test_a_rates_cost_is_not_measured_where_no_view_shows_the_region(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_cost_of_a_rate_needs_a_view_of_the_region(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     kitchen, roi = write_kitchen(tmp_path, lamp_1=[(500, 500, 500)])
     assert main(["bench", "loop", str(kitchen), "--roi", str(roi), "--unlimited", "2"]) == 2
     assert "--unlimited: expected a held-out frame that shows the region, got none" in capsys.readouterr().err
 
 
-def test_a_real_sequences_own_regions_are_the_usual_ones(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_regions_file_of_a_sequence_is_the_default(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("gausslite.render._kernels", reason="the native kernels are not built")
     kitchen, roi = write_kitchen(tmp_path, mug_1=WALL)
     options = ["bench", "quality", "--real", str(kitchen), "--policies", "task", "--iterations", "1", "--threads", "1"]
@@ -169,14 +167,12 @@ def test_a_real_sequences_own_regions_are_the_usual_ones(tmp_path: Path, capsys:
     assert f"and no {kitchen / 'roi_voxels.npz'}" in capsys.readouterr().err
     roi.rename(kitchen / "roi_voxels.npz")
     assert main(options) == 0
-    # 16x12 is its own size, which has fewer pixels than 320x240
+    # the sequence keeps its own size of 16x12, because it has fewer pixels than 320x240
     [record] = (tmp_path / "out" / "trials").glob("kitchen-mug-task-*.json")
     assert "size=(16, 12)" in json.loads(record.read_text())["settings"]["conditions"]
 
 
-def test_wrong_kinds_are_told_before_the_colour_camera_is_looked_for(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_invalid_kinds_are_refused_before_registration(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     kitchen, roi = write_kitchen(tmp_path, mug_1=WALL)
     options = ["--real", str(kitchen), "--roi", str(roi), "--kinds", "mugs", "--out", str(tmp_path / "out")]
     assert main(["bench", "quality", *options]) == 2

@@ -198,7 +198,7 @@ def write_recording_with_a_corrupt_frame(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("strict", [False, True])
-def test_a_corrupt_frame_is_skipped_or_ends_a_strict_run_with_the_map_so_far(tmp_path: Path, strict: bool) -> None:
+def test_a_corrupt_frame_is_skipped_or_ends_a_strict_run_with_the_current_map(tmp_path: Path, strict: bool) -> None:
     folder = tmp_path / "recording"
     write_recording_with_a_corrupt_frame(folder)
     ball = ("--roi-ball", "2,2,0.8,0.5", "--max-gaussians", "800", "--iterations", "1")

@@ -69,7 +69,7 @@ class ScriptedServer(pb_grpc.FusionServiceServicer):
         self.subsets: list[VoxelBatch] = []
         self.messages: list[bytes] = []
         self.revisions: list[int] = []
-        self.came = threading.Event()
+        self.received = threading.Event()
 
     async def JoinSession(self, request: pb.JoinSessionRequest, context: Any) -> pb.JoinSessionResponse:
         self.joined.append(request.fresh_map)
@@ -81,7 +81,7 @@ class ScriptedServer(pb_grpc.FusionServiceServicer):
             self.subsets.append(subset.batch)
             self.messages.append(request.subset)
             self.revisions.append(subset.map_revision)
-            self.came.set()
+            self.received.set()
             answer = self._answer(len(self.subsets), subset.batch)
             if isinstance(answer, GaussLiteError):
                 raise answer

@@ -55,7 +55,7 @@ class LinkSettings:
 
 @dataclass(frozen=True, slots=True)
 class AgentIdentity:
-    """What identifies a robot's map on the fusion server."""
+    """The agent id and voxel size, by which the fusion server identifies a robot's map."""
 
     agent_id: str
     voxel_size: float

@@ -17,7 +17,7 @@ _AGES_KEPT = 1000
 
 
 class Outcome(Enum):
-    """What happened to a frame."""
+    """Result of a frame."""
 
     MAPPED = "mapped"
     SKIPPED = "skipped"
@@ -74,7 +74,7 @@ class WorkerStatus:
 
     @property
     def load_notes(self) -> tuple[str, ...]:
-        """One line for each kind of work that was dropped for want of time or space."""
+        """One line for each kind of work that was dropped for lack of time or space."""
         counts = (
             (self.dropped, "frames were dropped"),
             (self.under_trained, "frames trained fewer iterations than --min-iterations"),

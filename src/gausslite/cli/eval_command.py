@@ -71,7 +71,7 @@ def run(options: argparse.Namespace) -> int:
 
 @dataclass(frozen=True, slots=True)
 class _Conditions:
-    """How views are registered and fitted before they are scored."""
+    """Registration of the source, and whether views are fitted before they are scored."""
 
     depth_registration: DepthRegistration | str | None
     fit_views: bool

@@ -83,8 +83,8 @@ def _fetch(options: argparse.Namespace) -> int:
         raise InvalidInputError(f"--base-url: expected the address of the files, or {MODELS_URL_VARIABLE}; got neither")
     if options.sha256 is not None and len(options.names) > 1:
         raise InvalidInputError(f"--sha256: expected only one NAME with this option, got {len(options.names)}")
-    known = _entries(options)
-    for entry in [entry_named(known, name) for name in options.names]:
+    entries = _entries(options)
+    for entry in [entry_named(entries, name) for name in options.names]:
         with _bar(entry.file_name) as progress:
             fetched = fetch(entry, base_url, options.folder, options.sha256, progress)
         print(fetched.path)

@@ -109,6 +109,6 @@ def variable_name(key: str) -> str:
 
 
 def type_name(action: argparse.Action) -> str:
-    """Return the words for the values that an option accepts."""
+    """Return a description of the values that an option accepts, for error messages."""
     names = {int: "a whole number", float: "a number"}
     return names.get(action.type, f"text such as {action.metavar}" if action.metavar else "text")  # type: ignore[call-overload, no-any-return]

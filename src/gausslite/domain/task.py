@@ -47,7 +47,7 @@ class TaskGraph:
     warnings: tuple[str, ...] = ()
 
     def is_equivalent_to(self, other: TaskGraph) -> bool:
-        """Return True if targets, anchors and relations are equal, whatever the text."""
+        """Return True if targets, anchors and relations are equal; the text may differ."""
         return (self.targets, self.anchors, self.relations) == (other.targets, other.anchors, other.relations)
 
     @property

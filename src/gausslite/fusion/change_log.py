@@ -11,7 +11,7 @@ from gausslite.fusion.vote import VoteResult
 
 
 class ChangeLog:
-    """Counts the revisions of the fused map since the server started, and knows each voxel's winner.
+    """Count the revisions of the fused map since the server started, and store each voxel's winner.
 
     `first_revision` must exceed all revisions from before a restart.
     """

@@ -143,7 +143,7 @@ class FusionEngine:
             raise MismatchError("session: another robot has joined under this name; give each its own agent id")
         if session is None:
             raise SessionUnknownError(
-                f"session {quote_name(session_id)}: not known here; join, then send every voxel again"
+                f"session {quote_name(session_id)}: unknown to this server; join, then send every voxel again"
             )
         return session
 

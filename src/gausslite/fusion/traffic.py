@@ -36,7 +36,7 @@ class TrafficCounters:
 
 @dataclass(frozen=True, slots=True)
 class AgentContribution:
-    """What the server keeps of one agent, how many voxels it wins, and its traffic."""
+    """Stored data of one agent, the number of voxels that it wins, and its traffic."""
 
     agent_id: str
     joined: bool = False

@@ -48,7 +48,7 @@ class ActivePhase(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class SeedingSettings:
-    """Where new Gaussians are placed and how they are initialised (Sec. III-C).
+    """Placement and initialisation of new Gaussians (Sec. III-C).
 
     first_frame_seeds, later_seeds: N for an image of 640x480, scaled with the number of pixels. roi_share: ρ.
     min_alpha, roi_min_alpha: background and ROI pixels of lower rendered alpha are seeded. depth_error_factor: pixels
@@ -144,7 +144,7 @@ _BALANCED_LOSS = LossWeights(normalise_by_image=True)
 
 @dataclass(frozen=True, slots=True)
 class OptimizationSettings:
-    """How a frame trains the map (Sec. III-D): warm-up iterations on full images, then active ones on the ROI.
+    """Training of the map with one frame (Sec. III-D): warm-up iterations on full images, then active ones on the ROI.
 
     loss: weights of Eq. (1), normalised by the image size by default, so that the small masks of the active phase and
     the full images of the warm-up have comparable steps in Adam. adam: learning rates. decay_after_updates: updates of

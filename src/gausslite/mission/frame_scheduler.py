@@ -77,11 +77,11 @@ class FrameTiming:
 
 
 class FrameScheduler:
-    """The clocked StageScheduler. It measures every frame; with settings it also enforces deadlines.
+    """A StageScheduler with a clock: it measures every frame, and with settings it also enforces deadlines.
 
-    Without settings (None), iterations are counted and nothing is skipped.
+    Without settings, each frame trains a fixed number of iterations and no stage is skipped.
 
-    A frame's deadline is its begin plus seconds_per_frame, less the overrun of earlier frames. Idle time between
+    A frame's deadline is its start plus seconds_per_frame, less the overrun of earlier frames. Idle time between
     frames is not credited. An overrun beyond deadline_slack is dropped, so the rate falls. If a frame waited although
     the frame before it had used its time (less the slack), its deadline is earlier by that wait. Its min_iterations
     keep their time in any case.

@@ -43,7 +43,7 @@ class MissionTotals:
 
 @dataclass(frozen=True, slots=True)
 class MissionResult:
-    """How a mission ended.
+    """Result of a mission.
 
     totals: sums over its frames; seconds: wall time; last_index: index of the last processed frame, or the index that
     the run was resumed after; stopped_by: the error or interrupt that ended it early.
@@ -56,7 +56,7 @@ class MissionResult:
 
     @property
     def processed(self) -> int:
-        """Number of frames, including those that were skipped for want of depth."""
+        """Number of frames, including those skipped because they have no depth."""
         return self.totals.frames + self.totals.skipped
 
     @property
@@ -95,7 +95,8 @@ class MissionRunner:
 
     process: maps one frame, or queues it elsewhere and returns None. on_frame: gets each outcome, for progress.
     checkpoint: gets the index of the last frame when the run ends, unless an error came before the first frame.
-    should_stop: asked before each frame. Publishing is part of the processing step, see `TaskMapper`.
+    should_stop: called before each frame; the run ends if it returns True. Publishing is part of the processing step,
+    see `TaskMapper`.
     """
 
     process: Callable[[Frame], FrameOutcome | None]

@@ -19,7 +19,7 @@ from gausslite.mission.frame_scheduler import SchedulerSettings
 from gausslite.render.cpu_kernels import MAX_THREADS
 
 DEFAULT_MAX_GAUSSIANS = 150_000
-"""What two cores can train online at 640x480; the paper's cap of a million is for a GPU."""
+"""The number that two CPU cores can train online at 640x480; the paper's cap of a million is for a GPU."""
 _MAX_ITERATIONS = 10_000
 _SCHEDULER = SchedulerSettings()
 
@@ -98,7 +98,7 @@ class PerceptionSettings:
 
 @dataclass(frozen=True, slots=True)
 class MissionSettings:
-    """How one robot maps.
+    """Policy, budget, scheduling and hardware settings of one robot's mapping.
 
     disabled: parts of the policy to switch off (see `gausslite.mapping.policies.disable`). rate_hz: frames per second;
     each frame then trains as many iterations as fit into its time instead of a fixed number. min_iterations,

@@ -36,8 +36,8 @@ def fetch(entry: ModelEntry, base_url: str, folder: Path, sha256: str | None, pr
         download(request, progress)
     actual = sha256_of(path)
     if expected not in (None, actual):
-        wanted = f"expected SHA-256 {expected} from {checksum_source}"
-        raise ChecksumError(f"{path}: {wanted}, got {actual}; move the file away to fetch it again")
+        expectation = f"expected SHA-256 {expected} from {checksum_source}"
+        raise ChecksumError(f"{path}: {expectation}, got {actual}; move the file away to fetch it again")
     if listed_checksum(path) != actual:
         _record_checksum(path, actual)
     return FetchedModel(path, actual, checksum_source)

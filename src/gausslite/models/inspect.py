@@ -57,4 +57,4 @@ def verify(path: Path, sha256: str | None) -> str:
         checked.append(f"the checksum in {CHECKSUM_FILE}")
     if path.suffix == ".onnx":
         checked.append(f"a whole {inspect(path).family} network")
-    return " and ".join(checked) or f"{path.stat().st_size} bytes; no SHA-256 is known for it"
+    return " and ".join(checked) or f"{path.stat().st_size} bytes; no expected SHA-256 is given"

@@ -53,7 +53,7 @@ class BoxDetector(Protocol):
 
 @runtime_checkable
 class Segmenter(Protocol):
-    """Segment the main object of given boxes, whatever its class."""
+    """Segment the main object of given boxes, independent of its class."""
 
     def segment(self, frame: Frame, boxes_px: Float32[ndarray, "n 4"]) -> list[Bool[ndarray, "h w"] | None]:
         """Return one mask per box (left, top, right, bottom); None if the box shows no clear object."""

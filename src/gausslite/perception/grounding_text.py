@@ -75,7 +75,7 @@ class BertTokenizer:
     """A Tokenizer over an uncased BERT vocabulary, a text file with one piece per line."""
 
     def __init__(self, vocabulary: Path) -> None:
-        """Raises ModelFileError for an invalid file, KernelError if the package `tokenizers` is missing."""
+        """Read the vocabulary. Raises ModelFileError for an invalid file, KernelError without package `tokenizers`."""
         self._ids = _read_vocabulary(vocabulary)
         self._tokenizer = _wordpiece_tokenizer(self._ids)
 

@@ -59,7 +59,7 @@ class Observation:
 
 @dataclass(slots=True, eq=False)
 class Landmark:
-    """One object over all its observations. Its centroid is the mean of its cells, whatever their counts.
+    """One object over all its observations. Its centroid is the mean of its cells, not weighted by their counts.
 
     cells: keys of surface cells, with the number of observations of each in counts. missed_count: frames that should
     have shown the object but did not. farthest_m: the largest distance of an observation.
@@ -85,7 +85,7 @@ class Landmark:
         )
 
     def is_colocated_with(self, other: Observation) -> bool:
-        """Return True if the centroids are so close that both are one object, whatever their phrases."""
+        """Return True if the centroids are so close that both are one object; their phrases may differ."""
         max_distance_m = max(_MIN_MATCH_DISTANCE_M, 0.75 * min(self.radius_m, other.radius_m))
         return float(np.linalg.norm(self.centroid_m - other.centroid_m)) < max_distance_m
 

@@ -80,7 +80,7 @@ class AgentClient(ServiceChannel):
         self._stub = agent_service_pb2_grpc.AgentServiceStub(self._channel)
 
     def assign_task(self, task: str | TaskGraph) -> TaskGraph:
-        """Assign a task as text or graph; returns the graph in force. Raises TaskError, UnavailableError."""
+        """Assign a task as text or graph; returns the graph of the current task. Raises TaskError, UnavailableError."""
         if isinstance(task, str):
             request = agent_service_pb2.AssignTaskRequest(text=task)
         else:

@@ -11,7 +11,7 @@ from gausslite.errors import GaussLiteError
 
 
 class _OneLine(logging.Formatter):
-    """Formats a record, with its traceback, as one line."""
+    """Format a record, with its traceback, as one line."""
 
     def format(self, record: logging.LogRecord) -> str:
         """Join the lines of the formatted record."""

@@ -9,9 +9,12 @@ from gausslite.errors import InvalidInputError
 
 @dataclass(frozen=True, slots=True)
 class UplinkSettings:
-    """kbps limits the bandwidth in kilobits per second (None = no limit). Rounds are at least interval_s apart, so that
-    several changes of a voxel are sent as one. A voxel is sent again if its Σkappa has changed by the share
-    resend_threshold of the sent value, or while the uplink drains.
+    """Limits and intervals of sending.
+
+    kbps: bandwidth limit in kilobits per second, None without a limit. interval_s: minimum time between rounds, so that
+    several changes of a voxel are sent as one. resend_threshold: change of a voxel's Σkappa, as a share of the sent
+    value, from which it is sent again; 0 while the uplink drains. round_bytes: size limit of a round. deadline_s: of
+    each call. first_backoff_s: wait before the first retry.
     """
 
     kbps: float | None = None
@@ -33,7 +36,11 @@ class UplinkSettings:
 
 @dataclass(frozen=True, slots=True)
 class UplinkCounters:
-    """Totals since the start; voxels_sent counts each voxel of the task's region once."""
+    """Totals since the start.
+
+    voxels_sent counts each voxel of the task's region once; voxels_waiting: voxels in the spool with a pending update.
+    stopped_because: the error that stopped the uplink, empty while it runs.
+    """
 
     roi_bytes: int = 0
     handover_bytes: int = 0

@@ -47,7 +47,7 @@ class Scene:
 
 @dataclass(frozen=True, slots=True)
 class PosePolicy:
-    """How a study handles errors of a scene's poses and exposures.
+    """A study's handling of pose and exposure errors in a scene.
 
     pose_prior: size of the errors, for mapping. fit_views: also score held-out views with fitted pose and exposure.
     """

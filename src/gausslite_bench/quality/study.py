@@ -24,7 +24,7 @@ from gausslite_bench.quality.trials import (
 
 
 class Origin(StrEnum):
-    """Where a trial's result came from."""
+    """Origin of a trial's result: computed, or read from the cache."""
 
     COMPUTED = "computed"
     RECOMPUTED = "computed again, as the cached result is from other code"

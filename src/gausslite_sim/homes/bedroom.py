@@ -23,6 +23,7 @@ LIGHTING = Lighting(
     ambient=0.24,
     bounce=0.8,
 )
+# per trajectory: waypoints (camera position, look-at target) in metres; the last trajectory is held out
 TRAJECTORIES = (
     (
         ((3.3, 1.0, 1.50), (1.0, 3.3, 0.5)),
@@ -59,7 +60,7 @@ TRAJECTORIES = (
 
 
 def furnish(rng: np.random.Generator) -> list[Item]:
-    """Everything in the room, 4.6 x 4.2 m."""
+    """Return all objects of the room, 4.6 x 4.2 m. Their positions are x, y, z in metres, then yaw in degrees."""
     room = Room(4.6, 4.2, 2.5, rng)
     pillows = ("linen", "linen", "flowers", "accent_knit")
     room.place("bed", seating.bed(1.5, "light_wood", "stripes", pillows, "knit"), 1.25, 3.1)
@@ -107,7 +108,7 @@ def furnish(rng: np.random.Generator) -> list[Item]:
 
 
 def painters() -> dict[str, Painter]:
-    """Soft greens and rose over a carpet."""
+    """Return the textures' painters: soft greens and rose over a carpet."""
     colours = Palette(
         light_wood=(0.84, 0.74, 0.58),
         main=(0.46, 0.54, 0.44),

@@ -24,6 +24,7 @@ LIGHTING = Lighting(
     ambient=0.22,
     bounce=0.8,
 )
+# per trajectory: waypoints (camera position, look-at target) in metres; the last trajectory is held out
 TRAJECTORIES = (
     (
         ((2.2, 3.1, 1.50), (2.6, 1.2, 0.45)),
@@ -59,7 +60,7 @@ TRAJECTORIES = (
 
 
 def furnish(rng: np.random.Generator) -> list[Item]:
-    """Everything in the room, 5.2 x 4.3 m."""
+    """Return all objects of the room, 5.2 x 4.3 m. Their positions are x, y, z in metres, then yaw in degrees."""
     room = Room(5.2, 4.3, 2.6, rng)
     room.place("rug", furniture.lying_sheet("rug", 2.4, 1.7, 0.01), 2.6, 1.5)
     room.place("sofa", seating.couch(1.9, "main_cloth", ("accent_knit", "zigzag", "flowers"), 3), 2.6, 0.5, 0, 180)
@@ -99,7 +100,7 @@ def furnish(rng: np.random.Generator) -> list[Item]:
 
 
 def painters() -> dict[str, Painter]:
-    """Warm colours over herringbone parquet."""
+    """Return the textures' painters: warm colours over herringbone parquet."""
     colours = Palette(
         main=(0.24, 0.36, 0.40), second=(0.80, 0.70, 0.54), accent=(0.78, 0.34, 0.18), other=(0.12, 0.36, 0.40)
     )

@@ -24,6 +24,7 @@ LIGHTING = Lighting(
     ambient=0.2,
     bounce=0.9,
 )
+# per trajectory: waypoints (camera position, look-at target) in metres; the last trajectory is held out
 TRAJECTORIES = (
     (
         ((3.6, 1.0, 1.50), (1.7, 2.6, 0.45)),
@@ -60,7 +61,7 @@ TRAJECTORIES = (
 
 
 def furnish(rng: np.random.Generator) -> list[Item]:
-    """Everything in the room, 5.2 x 4.4 m."""
+    """Return all objects of the room, 5.2 x 4.4 m. Their positions are x, y, z in metres, then yaw in degrees."""
     room = Room(5.2, 4.4, 2.6, rng)
     room.place("rug", furniture.lying_sheet("rug", 2.6, 1.9, 0.01), 2.2, 2.5, 0, 4)
     room.place(
@@ -108,7 +109,7 @@ def furnish(rng: np.random.Generator) -> list[Item]:
 
 
 def painters() -> dict[str, Painter]:
-    """Brick, rust and teal over oak boards."""
+    """Return the textures' painters: brick, rust and teal over oak boards."""
     colours = Palette(
         main=(0.52, 0.26, 0.18), second=(0.78, 0.72, 0.60), accent=(0.86, 0.56, 0.20), other=(0.10, 0.36, 0.38)
     )

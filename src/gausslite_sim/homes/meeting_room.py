@@ -25,6 +25,7 @@ LIGHTING = Lighting(
     bounce=0.85,
 )
 _TOP_M = 0.75
+# per trajectory: waypoints (camera position, look-at target) in metres; the last trajectory is held out
 TRAJECTORIES = (
     (
         ((0.6, 0.7, 1.55), (2.6, 2.1, 0.75)),
@@ -61,7 +62,7 @@ TRAJECTORIES = (
 
 
 def furnish(rng: np.random.Generator) -> list[Item]:
-    """Everything in the room, 5.6 x 4.2 m."""
+    """Return all objects of the room, 5.6 x 4.2 m. Their positions are x, y, z in metres, then yaw in degrees."""
     room = Room(5.6, 4.2, 2.8, rng)
     room.place("table", tables.plain_table(3.0, 1.1, _TOP_M, "dark_wood", "steel"), 2.8, 2.1)
     shells = ("accent_glaze", "main_shell", "white_plastic", "main_shell")
@@ -112,7 +113,7 @@ def furnish(rng: np.random.Generator) -> list[Item]:
 
 
 def painters() -> dict[str, Painter]:
-    """Walnut and mustard over a grey carpet."""
+    """Return the textures' painters: walnut and mustard over a grey carpet."""
     colours = Palette(
         dark_wood=(0.42, 0.27, 0.18),
         main=(0.30, 0.34, 0.44),

@@ -25,6 +25,7 @@ LIGHTING = Lighting(
     bounce=0.65,
 )
 _TOP_M = 0.73
+# per trajectory: waypoints (camera position, look-at target) in metres; the last trajectory is held out
 TRAJECTORIES = (
     (
         ((0.8, 1.0, 1.55), (1.9, 2.4, 0.75)),
@@ -65,7 +66,7 @@ TRAJECTORIES = (
 
 
 def furnish(rng: np.random.Generator) -> list[Item]:
-    """Everything in the room, 6.6 x 4.9 m."""
+    """Return all objects of the room, 6.6 x 4.9 m. Their positions are x, y, z in metres, then yaw in degrees."""
     room = Room(6.6, 4.9, 2.9, rng)
     screens = ("code", "slides", "code", "slides")
     for i, (x, y, yaw) in enumerate(((1.8, 2.07, 0), (1.8, 2.83, 180), (4.6, 2.07, 0), (4.6, 2.83, 180)), 1):
@@ -128,7 +129,7 @@ def furnish(rng: np.random.Generator) -> list[Item]:
 
 
 def painters() -> dict[str, Painter]:
-    """Cool greys with one red, over carpet tiles."""
+    """Return the textures' painters: cool greys with one red, over carpet tiles."""
     colours = Palette(
         light_wood=(0.82, 0.70, 0.54),
         main=(0.24, 0.30, 0.38),

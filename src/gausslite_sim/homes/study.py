@@ -25,6 +25,7 @@ LIGHTING = Lighting(
     bounce=0.85,
 )
 _TOP_M = 0.73
+# per trajectory: waypoints (camera position, look-at target) in metres; the last trajectory is held out
 TRAJECTORIES = (
     (
         ((2.6, 1.2, 1.50), (1.5, 3.4, 0.8)),
@@ -60,7 +61,7 @@ TRAJECTORIES = (
 
 
 def furnish(rng: np.random.Generator) -> list[Item]:
-    """Everything in the room, 4.1 x 4.0 m."""
+    """Return all objects of the room, 4.1 x 4.0 m. Their positions are x, y, z in metres, then yaw in degrees."""
     room = Room(4.1, 4.0, 2.5, rng)
     room.place("desk", tables.desk(1.8, "dark_wood", "black_plastic", "drawers"), 1.6, 3.55, 0, 0)
     room.place_jittered("monitor_1", devices.monitor("code", 0.62), 1.3, 3.72, _TOP_M, -8)
@@ -106,7 +107,7 @@ def furnish(rng: np.random.Generator) -> list[Item]:
 
 
 def painters() -> dict[str, Painter]:
-    """Deep green and brass over dark planks."""
+    """Return the textures' painters: deep green and brass over dark planks."""
     colours = Palette(
         light_wood=(0.60, 0.40, 0.24),
         dark_wood=(0.30, 0.18, 0.12),

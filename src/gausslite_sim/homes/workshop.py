@@ -25,6 +25,7 @@ LIGHTING = Lighting(
     bounce=0.75,
 )
 _TOP_M = 0.9
+# per trajectory: waypoints (camera position, look-at target) in metres; the last trajectory is held out
 TRAJECTORIES = (
     (
         ((0.8, 1.6, 1.55), (1.7, 3.7, 0.95)),
@@ -61,7 +62,7 @@ TRAJECTORIES = (
 
 
 def furnish(rng: np.random.Generator) -> list[Item]:
-    """Everything in the room, 5.2 x 4.2 m."""
+    """Return all objects of the room, 5.2 x 4.2 m. Their positions are x, y, z in metres, then yaw in degrees."""
     room = Room(5.2, 4.2, 2.8, rng)
     room.place_at_wall("workbench", tables.workbench(2.4), "north", 1.7, 0, 0.38)
     room.place_at_wall("pegboard", furniture.flat_picture("pegboard", 2.2, 0.9, 0.02), "north", 1.7, 1.15)
@@ -120,7 +121,7 @@ def furnish(rng: np.random.Generator) -> list[Item]:
 
 
 def painters() -> dict[str, Painter]:
-    """Bricks and primary colours over concrete."""
+    """Return the textures' painters: bricks and primary colours over concrete."""
     colours = Palette(
         accent=(0.80, 0.30, 0.12), other=(0.16, 0.36, 0.56), main=(0.30, 0.34, 0.36), second=(0.66, 0.62, 0.54)
     )

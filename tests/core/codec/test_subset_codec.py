@@ -21,8 +21,8 @@ from gausslite.errors import ChecksumError, CodecError, InvalidInputError
 SIZES_M = [0.1, 0.05, 0.125, 0.1 / 3, 65535 * 2.0**-20, 1.0]
 
 
-def make_words(seed: int, n: int, grid: VoxelGrid, spread_m: float = 1.0, centre_m: float = 0.0) -> VoxelBatch:
-    """Random words, some of them tombstones, with values at and beyond the ends of what the codec can say."""
+def make_batch(seed: int, n: int, grid: VoxelGrid, spread_m: float = 1.0, centre_m: float = 0.0) -> VoxelBatch:
+    """Random voxel updates, some of them tombstones, with values at and beyond the limits of the codec."""
     rng = np.random.default_rng(seed)
     gaussians = Gaussians(
         (centre_m + rng.uniform(-spread_m, spread_m, (n, 3))).astype(np.float32),
@@ -45,8 +45,8 @@ def make_words(seed: int, n: int, grid: VoxelGrid, spread_m: float = 1.0, centre
     return VoxelBatch(every[by_key], sums[by_key], counts[by_key], gaussians.take(order))
 
 
-def subset_of(words: VoxelBatch) -> RoiSubset:
-    return RoiSubset("robot-ä", "s1", 7, 11, words)
+def subset_of(batch: VoxelBatch) -> RoiSubset:
+    return RoiSubset("robot-ä", "s1", 7, 11, batch)
 
 
 # drawn as numbers and built in the test: the shape checks use `random`, which a strategy must not
@@ -59,7 +59,7 @@ CASES = st.tuples(
 def build(case: tuple[float, float, int, int]) -> tuple[RoiSubset, VoxelGrid]:
     size_m, centre_m, seed, n = case
     grid = VoxelGrid(size_m)
-    return subset_of(make_words(seed, n, grid, 1.0, centre_m)), grid
+    return subset_of(make_batch(seed, n, grid, 1.0, centre_m)), grid
 
 
 @given(CASES)
@@ -187,33 +187,33 @@ def test_counts_that_disagree_are_refused() -> None:
     ],
 )
 def test_invalid_values_are_not_encoded(column: str, value: float) -> None:
-    words = make_words(0, 10, VoxelGrid())
-    getattr(words.gaussians, column)[3] = value
+    batch = make_batch(0, 10, VoxelGrid())
+    getattr(batch.gaussians, column)[3] = value
     with pytest.raises(InvalidInputError, match=column):
-        encode_subset(subset_of(words), VoxelGrid())
+        encode_subset(subset_of(batch), VoxelGrid())
 
 
 @given(st.integers(0, 1000), st.integers(0, 400), st.integers(1024, 6000))
 @settings(max_examples=60, deadline=None)
 def test_split_parts_fit_and_contain_the_whole_batch(seed: int, n: int, max_bytes: int) -> None:
     grid = VoxelGrid()
-    words = make_words(seed, n, grid, spread_m=0.5)
-    parts = split_batch(words, max_bytes)
+    batch = make_batch(seed, n, grid, spread_m=0.5)
+    parts = split_batch(batch, max_bytes)
     assert all(len(encode_subset(subset_of(part), grid)) <= max_bytes for part in parts)
     for name in ("keys", "kappa_sums"):
         joined = np.concatenate([np.zeros(0, np.int64), *(getattr(part, name) for part in parts)])
-        np.testing.assert_array_equal(joined, getattr(words, name))
-    if not len(words):
+        np.testing.assert_array_equal(joined, getattr(batch, name))
+    if not len(batch):
         assert parts == []
 
 
 def test_a_voxel_too_full_for_a_message_keeps_its_most_opaque_gaussians() -> None:
     grid = VoxelGrid(10.0)
-    words = make_words(3, 300, grid, spread_m=0.5, centre_m=5.0)
-    [part] = [part for part in split_batch(words, 2048) if len(part.gaussians)]
-    kept, sent = part.gaussians, words.gaussians
+    batch = make_batch(3, 300, grid, spread_m=0.5, centre_m=5.0)
+    [part] = [part for part in split_batch(batch, 2048) if len(part.gaussians)]
+    kept, sent = part.gaussians, batch.gaussians
     assert 0 < len(kept) < 300
-    assert part.kappa_sums.tolist() == words.kappa_sums[words.counts > 0].tolist()
+    assert part.kappa_sums.tolist() == batch.kappa_sums[batch.counts > 0].tolist()
     assert kept.opacities.min() >= np.sort(sent.opacities)[-len(kept)]
     with pytest.raises(InvalidInputError, match="max_bytes"):
-        split_batch(words, 100)
+        split_batch(batch, 100)

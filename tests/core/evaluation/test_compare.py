@@ -1,4 +1,4 @@
-"""A map is scored on what its held-out views show."""
+"""Scores of maps on held-out views."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ def wall(n: int = 300, seed: int = 0) -> Gaussians:
 
 
 def frame_of(gaussians: Gaussians, x_m: float = 0.0) -> Frame:
-    """What a perfect camera at (x, 0, 0) would record of the map."""
+    """Return the frame that a perfect camera at (x, 0, 0) would record of the map."""
     T_world_camera = np.eye(4)
     T_world_camera[0, 3] = x_m
-    drawn = MapViewer(gaussians, ReferenceRasterizer()).render(CAMERA, T_world_camera)
-    rgb = np.rint(drawn.rgb * 255).astype(np.uint8)
-    return Frame(int(100 * x_m), 0, rgb, drawn.expected_depth_m(), CAMERA, T_world_camera)
+    rendering = MapViewer(gaussians, ReferenceRasterizer()).render(CAMERA, T_world_camera)
+    rgb = np.rint(rendering.rgb * 255).astype(np.uint8)
+    return Frame(int(100 * x_m), 0, rgb, rendering.expected_depth_m(), CAMERA, T_world_camera)
 
 
 def view_with(frame: Frame, roi_pixels: int) -> HeldOutView:
@@ -47,7 +47,7 @@ def view_with(frame: Frame, roi_pixels: int) -> HeldOutView:
     return HeldOutView(frame, roi.reshape(frame.depth_m.shape))
 
 
-def test_the_map_itself_scores_as_well_as_bytes_allow() -> None:
+def test_a_perfect_map_scores_up_to_the_rounding_to_bytes() -> None:
     gaussians = wall()
     views = [view_with(frame_of(gaussians, x), 200) for x in (0.0, 0.1)]
     scores = evaluate(gaussians, views, ReferenceRasterizer())
@@ -60,10 +60,10 @@ def test_the_map_itself_scores_as_well_as_bytes_allow() -> None:
     assert (scores.n_views, scores.n_roi_views, scores.roi_pixels) == (2, 2, 400)
 
 
-def test_an_equal_picture_leaves_means_that_are_numbers() -> None:
+def test_a_perfect_image_has_a_finite_psnr() -> None:
     frame = frame_of(wall())
-    drawn = Rendering(frame.rgb / np.float32(255.0), frame.depth_m, np.ones_like(frame.depth_m), None)
-    scores = average([score_view(drawn, view_with(frame, 100)), score_view(drawn, view_with(frame, 0))])
+    rendering = Rendering(frame.rgb / np.float32(255.0), frame.depth_m, np.ones_like(frame.depth_m), None)
+    scores = average([score_view(rendering, view_with(frame, 100)), score_view(rendering, view_with(frame, 0))])
     assert scores.roi_psnr == scores.full_psnr == MAX_PSNR_DB
 
 
@@ -82,7 +82,7 @@ def test_an_empty_map_is_black_and_covers_nothing() -> None:
     assert scores.roi_depth_l1_m is None
 
 
-def test_coverage_tells_the_left_half_of_a_map_from_the_whole_where_depth_was_measured() -> None:
+def test_coverage_is_the_share_of_measured_pixels_that_the_map_covers() -> None:
     whole = wall()
     half = whole.take(whole.means_m[:, 0] < 0.0)
     frame = frame_of(whole)
@@ -90,8 +90,8 @@ def test_coverage_tells_the_left_half_of_a_map_from_the_whole_where_depth_was_me
     view = HeldOutView(replace(frame, depth_m=on_the_right), np.ones(frame.depth_m.shape, np.bool_))
     scores = [evaluate(gaussians, [view], ReferenceRasterizer()) for gaussians in (whole, half)]
     assert scores[0].roi_covered == pytest.approx(1.0)
-    drawn = MapViewer(half, ReferenceRasterizer()).render_frame(frame)
-    assert scores[1].roi_covered == pytest.approx((drawn.alpha[:, 10:] > 0.5).mean()) == pytest.approx(0.5, abs=0.1)
+    rendering = MapViewer(half, ReferenceRasterizer()).render_frame(frame)
+    assert scores[1].roi_covered == pytest.approx((rendering.alpha[:, 10:] > 0.5).mean()) == pytest.approx(0.5, abs=0.1)
     unmeasured = HeldOutView(replace(frame, depth_m=np.zeros_like(on_the_right)), view.roi)
     assert evaluate(whole, [unmeasured], ReferenceRasterizer()).roi_covered is None
 
@@ -100,8 +100,8 @@ def test_a_view_with_few_roi_pixels_counts_for_the_whole_image_only() -> None:
     gaussians = wall()
     frame = frame_of(gaussians)
     viewer = MapViewer(gaussians, ReferenceRasterizer())
-    drawn = viewer.render_frame(frame)
-    seen, unseen = (score_view(drawn, view_with(frame, n)) for n in (64, 63))
+    rendering = viewer.render_frame(frame)
+    seen, unseen = (score_view(rendering, view_with(frame, n)) for n in (64, 63))
     assert unseen.roi is None
     scores = average([seen, unseen])
     assert (scores.n_views, scores.n_roi_views, scores.roi_pixels) == (2, 1, 64)
@@ -117,7 +117,7 @@ def test_scores_are_means_over_views() -> None:
     assert average(each).full_psnr == pytest.approx((each[0].psnr + each[1].psnr) / 2)
 
 
-def test_regions_join_into_one_mask() -> None:
+def test_regions_are_merged_into_one_mask() -> None:
     frame = frame_of(wall())
     left, right = BallRegion((-0.5, 0.0, 2.0), 0.3), BallRegion((0.5, 0.0, 2.0), 0.3)
     view = HeldOutView.of(frame, [left, right])

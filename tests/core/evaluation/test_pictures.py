@@ -1,4 +1,4 @@
-"""Sheets show every map beside the truth, and end up on disk."""
+"""Comparison sheets show every map next to the ground truth; images are written as PNG."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ def view(roi: bool = True, width: int = 320, height: int = 240) -> HeldOutView:
     return HeldOutView(frame, mask)
 
 
-def drawing(of: HeldOutView, error: float = 0.0) -> np.ndarray:
+def rendering(of: HeldOutView, error: float = 0.0) -> np.ndarray:
     return np.clip(of.frame.rgb / np.float32(255) + np.float32(error), 0, 1).astype(np.float32)
 
 
-def test_a_sheet_has_a_column_for_the_truth_and_each_map_and_three_rows() -> None:
+def test_a_sheet_has_a_column_for_the_ground_truth_and_each_map_and_three_rows() -> None:
     shown = view()
-    sheet = comparison_sheet(shown, {"vote": drawing(shown), "refine": drawing(shown, 0.1)})
+    sheet = comparison_sheet(shown, {"vote": rendering(shown), "refine": rendering(shown, 0.1)})
     cell_width, cell_height = 320 + 6, 240 + 26 + 6
     assert sheet.shape == (6 + 3 * cell_height, 6 + 3 * cell_width, 3)
     # a perfect map has a black difference, apart from the outline
@@ -50,16 +50,16 @@ def test_the_largest_and_the_smallest_piece_of_a_region_are_shown_in_detail() ->
 
 def test_without_a_region_there_is_no_crop_row() -> None:
     shown = view(roi=False)
-    assert comparison_sheet(shown, {"map": drawing(shown)}).shape[0] == 6 + 2 * (240 + 26 + 6)
+    assert comparison_sheet(shown, {"map": rendering(shown)}).shape[0] == 6 + 2 * (240 + 26 + 6)
 
 
-def test_the_truth_alone_makes_a_sheet() -> None:
+def test_a_sheet_without_maps_shows_the_ground_truth() -> None:
     assert comparison_sheet(view(), {}).shape == (6 + 2 * (240 + 26 + 6), 6 + 326, 3)
 
 
 def test_small_images_are_enlarged_to_be_readable() -> None:
     shown = view(width=64, height=48)
-    assert comparison_sheet(shown, {"map": drawing(shown)}).shape[1] == 6 + 2 * 326
+    assert comparison_sheet(shown, {"map": rendering(shown)}).shape[1] == 6 + 2 * 326
 
 
 def test_a_region_as_large_as_the_image_is_its_own_crop() -> None:

@@ -27,7 +27,7 @@ STEPS = st.lists(
     ),
     max_size=12,
 )
-"""(agent, Gaussians per voxel or None = is removed, whether the watcher looks afterwards)."""
+"""(agent, Gaussians per voxel or None = is removed, whether the watcher reads changes afterwards)."""
 
 
 def make_batch(counts: dict[int, int]) -> VoxelBatch:
@@ -43,7 +43,7 @@ def test_a_watcher_that_applies_the_changes_has_the_fused_map(steps) -> None:
     sessions = {
         name: engine.join(name, MissionConfig("", "", 0.10)).session.session_id for name in ("ant", "bee", "cat")
     }
-    known, held = 0, {}
+    known, latest_votes = 0, {}
     for revision, (agent_id, counts, looks) in enumerate(steps, start=1):
         if counts is None:
             engine.leave(sessions[agent_id], forget=True)
@@ -52,13 +52,13 @@ def test_a_watcher_that_applies_the_changes_has_the_fused_map(steps) -> None:
             engine.contribute(sessions[agent_id], RoiSubset(agent_id, "", revision, revision, make_batch(counts)), GRID)
         if looks:
             changes = engine.changes(known)
-            held.update(zip(changes.fused.batch.keys.tolist(), changes.fused.vote.votes(), strict=True))
+            latest_votes.update(zip(changes.fused.batch.keys.tolist(), changes.fused.vote.votes(), strict=True))
             for key in changes.removed.tolist():
-                held.pop(key, None)
+                latest_votes.pop(key, None)
             known = changes.revision
             votes = engine.changes(0).fused.vote.votes()
-            assert {key: vote.winner for key, vote in held.items()} == {vote.key: vote.winner for vote in votes}
-            assert all(held[key].scores[0] == vote.scores[0] for key, vote in _by_key(engine).items())
+            assert {key: vote.winner for key, vote in latest_votes.items()} == {vote.key: vote.winner for vote in votes}
+            assert all(latest_votes[key].scores[0] == vote.scores[0] for key, vote in _by_key(engine).items())
 
 
 def _by_key(engine: FusionEngine) -> dict:

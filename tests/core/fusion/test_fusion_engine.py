@@ -21,20 +21,24 @@ ANYTHING = MissionConfig("", "", 0.10)
 LONG = "x" * 1_000_000
 
 
-def make_subset(agent_id: str, revision: int, cells: list[tuple[int, int]], buried: tuple[int, ...] = ()) -> RoiSubset:
-    """Words with one Gaussian for each (cell along x, kappa), and tombstones."""
+def make_subset(agent_id: str, revision: int, cells: list[tuple[int, int]], removed: tuple[int, ...] = ()) -> RoiSubset:
+    """Voxel updates with one Gaussian for each (cell along x, kappa), and tombstones of removed cells."""
     means = [(0.1 * cell + 0.05, 0.05, 0.05) for cell, _ in cells]
     gaussians = plain_gaussians(means, kappa=[kappa for _, kappa in cells])
-    graves = np.array([(0.1 * cell + 0.05, 0.05, 0.05) for cell in sorted(buried)], np.float32).reshape(-1, 3)
+    removed_m = np.array([(0.1 * cell + 0.05, 0.05, 0.05) for cell in sorted(removed)], np.float32).reshape(-1, 3)
     return RoiSubset(
-        agent_id, "", revision, revision, merge_batches(group_by_voxel(gaussians, GRID), tombstones(GRID.keys(graves)))
+        agent_id,
+        "",
+        revision,
+        revision,
+        merge_batches(group_by_voxel(gaussians, GRID), tombstones(GRID.keys(removed_m))),
     )
 
 
 def test_status_counts_each_agents_contribution() -> None:
     engine = FusionEngine(MemoryStore(), FusionSettings(grid=GRID, mission_id="rescue"), first_revision=10)
     ant, bee = (engine.join(name, ANYTHING).session.session_id for name in ("ant", "bee"))
-    engine.contribute(ant, make_subset("ant", 3, [(0, 5), (1, 1), (1, 1)], buried=(4,)), GRID)
+    engine.contribute(ant, make_subset("ant", 3, [(0, 5), (1, 1), (1, 1)], removed=(4,)), GRID)
     engine.contribute(bee, make_subset("bee", 8, [(1, 9), (2, 0)]), GRID)
     engine.record_traffic("ant", TrafficCounters(roi_bytes=100, subsets_accepted=1))
     engine.record_traffic("ant", TrafficCounters(handover_bytes=7, subsets_stale=1))
@@ -83,11 +87,11 @@ def test_quotas_apply_per_agent_and_a_resend_does_not_count() -> None:
     ant = engine.join("ant", ANYTHING).session.session_id
     engine.contribute(ant, make_subset("ant", 1, [(0, 1), (1, 1)]), GRID)
     assert engine.contribute(ant, make_subset("ant", 1, [(0, 1), (1, 1)]), GRID).stale.size == 2
-    engine.contribute(ant, make_subset("ant", 2, [(0, 2)], buried=(1,)), GRID)
+    engine.contribute(ant, make_subset("ant", 2, [(0, 2)], removed=(1,)), GRID)
     with pytest.raises(QuotaError, match="at most 2 Gaussians in all, got 3"):
         engine.contribute(ant, make_subset("ant", 3, [(0, 1), (0, 1), (0, 1)]), GRID)
     with pytest.raises(QuotaError, match="at most 2 voxels in all, got 3"):
-        engine.contribute(ant, make_subset("ant", 3, [], buried=(2,)), GRID)
+        engine.contribute(ant, make_subset("ant", 3, [], removed=(2,)), GRID)
     assert engine.status().agents[0].gaussians == 1
     for wrong in ({"agents": 0}, {"keyframe_pixels": -1}):
         with pytest.raises(InvalidInputError, match="quota"):

@@ -26,7 +26,7 @@ AGENTS = ("ant", "bee", "cat", "dog")
 
 
 def gaussians_in(cells: list[tuple[int, int]], seed: int) -> Gaussians:
-    """Gaussians with the kappa given, each somewhere in the voxel (cell, 0, 0)."""
+    """Gaussians of these (cell, kappa), each at a random position in the voxel (cell, 0, 0)."""
     rng = np.random.default_rng(seed)
     n = len(cells)
     columns = rng.random((n, 14), np.float32)
@@ -52,13 +52,13 @@ WORDS = st.tuples(
     st.lists(st.integers(0, 5), max_size=4),
     st.integers(0, 2**16),
 )
-"""(voxel, kappa) of few Gaussians on few voxels, so that ties are common; voxels that may be tombstones; a seed."""
+"""(voxel, kappa) of few Gaussians in few voxels, so that ties are common; tombstone voxels; a seed."""
 TABLES = st.dictionaries(st.sampled_from(AGENTS), WORDS, max_size=4)
 HISTORIES = st.dictionaries(st.sampled_from(AGENTS), st.lists(WORDS, max_size=4), max_size=4)
-law = settings(max_examples=40, deadline=None)
+few_examples = settings(max_examples=40, deadline=None)
 
 
-def words_from(spec: Spec) -> VoxelBatch:
+def batch_from(spec: Spec) -> VoxelBatch:
     cells, buried, seed = spec
     present = group_by_voxel(gaussians_in(cells, seed), GRID)
     centres = np.array([(0.1 * cell + 0.05, 0.05, 0.05) for cell in buried], np.float32).reshape(-1, 3)
@@ -66,13 +66,13 @@ def words_from(spec: Spec) -> VoxelBatch:
 
 
 def table_from(specs: dict[str, Spec]) -> dict[str, VoxelBatch]:
-    return {agent_id: words_from(spec) for agent_id, spec in specs.items()}
+    return {agent_id: batch_from(spec) for agent_id, spec in specs.items()}
 
 
 def subsets_from(history: dict[str, list[Spec]]) -> list[RoiSubset]:
-    """What up to four agents said, each of them with rising map revisions."""
+    """Subsets of up to four agents, each with increasing map revisions."""
     return [
-        RoiSubset(agent_id, "s", revision + 1, revision, words_from(spec))
+        RoiSubset(agent_id, "s", revision + 1, revision, batch_from(spec))
         for agent_id, specs in history.items()
         for revision, spec in enumerate(specs)
     ]
@@ -85,7 +85,7 @@ def stored(messages: list[RoiSubset], store: FusionStore | None = None) -> Fusio
     return store
 
 
-def assert_same_words(a: VoxelBatch, b: VoxelBatch) -> None:
+def assert_same_batch(a: VoxelBatch, b: VoxelBatch) -> None:
     assert a.keys.tolist() == b.keys.tolist()
     assert a.kappa_sums.tolist() == b.kappa_sums.tolist()
     assert a.counts.tolist() == b.counts.tolist()
@@ -94,21 +94,21 @@ def assert_same_words(a: VoxelBatch, b: VoxelBatch) -> None:
 
 
 def assert_same_map(a: FusedMap, b: FusedMap) -> None:
-    """Bit for bit the same Gaussians, and the same account of who won where."""
-    assert_same_words(a.batch, b.batch)
+    """Assert bit-identical Gaussians and equal votes."""
+    assert_same_batch(a.batch, b.batch)
     assert list(a.vote.votes()) == list(b.vote.votes())
 
 
-@law
+@few_examples
 @given(HISTORIES, st.randoms(use_true_random=False))
 def test_duplicates_and_reordering_do_not_change_the_map(history: dict[str, list[Spec]], random) -> None:
     subsets = subsets_from(history)
     shuffled = random.sample(subsets + subsets, 2 * len(subsets))
     assert_same_map(fuse(stored(shuffled).batches()), fuse(stored(subsets).batches()))
-    assert_same_words(union_maps(stored(shuffled).batches()), union_maps(stored(subsets).batches()))
+    assert_same_batch(union_maps(stored(shuffled).batches()), union_maps(stored(subsets).batches()))
 
 
-@law
+@few_examples
 @given(HISTORIES, st.integers(0, 20), st.integers(0, 20))
 def test_a_resumed_connection_gives_the_same_map(history: dict[str, list[Spec]], dropped: int, again: int) -> None:
     subsets = subsets_from(history)
@@ -116,7 +116,7 @@ def test_a_resumed_connection_gives_the_same_map(history: dict[str, list[Spec]],
     assert_same_map(fuse(stored(resumed).batches()), fuse(stored(subsets).batches()))
 
 
-@law
+@few_examples
 @given(HISTORIES, st.sampled_from(AGENTS))
 def test_removing_an_agent_gives_the_map_without_it(history: dict[str, list[Spec]], leaver: str) -> None:
     subsets = subsets_from(history)
@@ -125,7 +125,7 @@ def test_removing_an_agent_gives_the_map_without_it(history: dict[str, list[Spec
     assert_same_map(fuse(store.batches()), fuse(stored([s for s in subsets if s.agent_id != leaver]).batches()))
 
 
-@law
+@few_examples
 @given(TABLES, st.randoms(use_true_random=False))
 def test_adding_agents_in_any_order_commutes(specs: dict[str, Spec], random) -> None:
     table = table_from(specs)
@@ -133,32 +133,32 @@ def test_adding_agents_in_any_order_commutes(specs: dict[str, Spec], random) -> 
     assert_same_map(fuse({agent: table[agent] for agent in agents}), fuse(table))
 
 
-@law
+@few_examples
 @given(TABLES, st.integers(1, 4))
 def test_the_union_of_shards_is_the_whole_map(specs: dict[str, Spec], shards: int) -> None:
     table = table_from(specs)
     parts = [
-        fuse({agent: select_voxels(words, words.keys % shards == shard) for agent, words in table.items()})
+        fuse({agent: select_voxels(batch, batch.keys % shards == shard) for agent, batch in table.items()})
         for shard in range(shards)
     ]
-    united = parts[0].batch
+    merged = parts[0].batch
     for part in parts[1:]:
-        united = merge_batches(united, part.batch)
+        merged = merge_batches(merged, part.batch)
     whole = fuse(table)
-    assert_same_words(united, whole.batch)
+    assert_same_batch(merged, whole.batch)
     votes = sorted((vote for part in parts for vote in part.vote.votes()), key=lambda vote: vote.key)
     assert votes == list(whole.vote.votes())
 
 
-@law
+@few_examples
 @given(TABLES)
-def test_the_winner_is_the_most_trained_then_the_denser_then_the_lower_id(specs: dict[str, Spec]) -> None:
+def test_the_winner_has_the_highest_kappa_sum_then_more_gaussians_then_the_lower_id(specs: dict[str, Spec]) -> None:
     table = table_from(specs)
     fused = fuse(table)
     expected = {}
-    for agent_id, words in table.items():
+    for agent_id, batch in table.items():
         for key, kappa_sum, count in zip(
-            words.keys.tolist(), words.kappa_sums.tolist(), words.counts.tolist(), strict=True
+            batch.keys.tolist(), batch.kappa_sums.tolist(), batch.counts.tolist(), strict=True
         ):
             rank = (-kappa_sum, -count, agent_id)
             if count > 0 and (key not in expected or rank < expected[key]):
@@ -166,10 +166,10 @@ def test_the_winner_is_the_most_trained_then_the_denser_then_the_lower_id(specs:
     assert {vote.key: vote.winner for vote in fused.vote.votes()} == {k: rank[2] for k, rank in expected.items()}
     for key, (_, _, agent_id) in expected.items():
         keys = np.array([key], np.int64)
-        assert_same_words(select_keys(fused.batch, keys), select_keys(table[agent_id], keys))
+        assert_same_batch(select_keys(fused.batch, keys), select_keys(table[agent_id], keys))
 
 
-@law
+@few_examples
 @given(TABLES)
 def test_provenance_and_margin_agree_with_the_votes(specs: dict[str, Spec]) -> None:
     table = table_from(specs)
@@ -182,17 +182,17 @@ def test_provenance_and_margin_agree_with_the_votes(specs: dict[str, Spec]) -> N
     assert sum(int(fused.won_by(agent_id).sum()) for agent_id in table) == len(votes)
 
 
-@law
+@few_examples
 @given(TABLES)
 def test_the_union_map_contains_all_gaussians(specs: dict[str, Spec]) -> None:
     table = table_from(specs)
     everything = union_maps(table)
-    assert len(everything.gaussians) == sum(len(words.gaussians) for words in table.values())
-    assert int(everything.kappa_sums.sum()) == sum(int(words.kappa_sums.sum()) for words in table.values())
-    assert_same_words(group_by_voxel(everything.gaussians, GRID), everything)
+    assert len(everything.gaussians) == sum(len(batch.gaussians) for batch in table.values())
+    assert int(everything.kappa_sums.sum()) == sum(int(batch.kappa_sums.sum()) for batch in table.values())
+    assert_same_batch(group_by_voxel(everything.gaussians, GRID), everything)
 
 
-@law
+@few_examples
 @given(HISTORIES)
 def test_the_vote_on_scores_equals_the_vote_on_batches(history: dict[str, list[Spec]]) -> None:
     subsets = subsets_from(history)
@@ -200,7 +200,7 @@ def test_the_vote_on_scores_equals_the_vote_on_batches(history: dict[str, list[S
     assert list(rank_voxels(store.scores()).votes()) == list(fuse(store.batches()).vote.votes())
 
 
-@law
+@few_examples
 @given(HISTORIES)
 def test_every_store_gives_the_same_map(history: dict[str, list[Spec]]) -> None:
     subsets = subsets_from(history)

@@ -25,7 +25,7 @@ KEYS = (11, 22, 33)
 
 
 def make_subset(agent_id: str, revision: int, counts: dict[int, int], kappa: int = 1, seed: int = 0) -> RoiSubset:
-    """A message with so many Gaussians of this kappa in each voxel."""
+    """A subset with these numbers of Gaussians, all of one kappa, by voxel key."""
     n = sum(counts.values())
     numbers = np.random.default_rng(seed).random((n, 14), np.float32)
     gaussians = Gaussians(
@@ -40,8 +40,8 @@ def make_subset(agent_id: str, revision: int, counts: dict[int, int], kappa: int
     )
     keys = sorted(counts)
     per_voxel = np.array([counts[key] for key in keys], np.uint32)
-    words = VoxelBatch(np.array(keys, np.int64), per_voxel.astype(np.uint64) * np.uint64(kappa), per_voxel, gaussians)
-    return RoiSubset(agent_id, "session", revision, revision, words)
+    batch = VoxelBatch(np.array(keys, np.int64), per_voxel.astype(np.uint64) * np.uint64(kappa), per_voxel, gaussians)
+    return RoiSubset(agent_id, "session", revision, revision, batch)
 
 
 @pytest.fixture(params=["memory", "sqlite"])
@@ -56,11 +56,11 @@ def test_stored_updates_are_read_back(store: FusionStore) -> None:
     outcome = store.put(message)
     assert outcome.accepted.tolist() == list(KEYS)
     assert outcome.stale.tolist() == []
-    words = store.batch("ant")
-    assert words.keys.tolist() == list(KEYS)
-    assert words.counts.tolist() == [2, 0, 5]
-    assert words.gaussians.means_m.tobytes() == message.batch.gaussians.means_m.tobytes()
-    assert words.gaussians.active.tolist() == message.batch.gaussians.active.tolist()
+    batch = store.batch("ant")
+    assert batch.keys.tolist() == list(KEYS)
+    assert batch.counts.tolist() == [2, 0, 5]
+    assert batch.gaussians.means_m.tobytes() == message.batch.gaussians.means_m.tobytes()
+    assert batch.gaussians.active.tolist() == message.batch.gaussians.active.tolist()
     assert store.agents() == ("ant",)
 
 
@@ -81,7 +81,7 @@ def test_a_tombstone_is_kept_and_makes_older_updates_stale(store: FusionStore) -
     assert store.batch("ant").counts.tolist() == [0]
 
 
-def test_agents_do_not_touch_each_other(store: FusionStore) -> None:
+def test_agents_do_not_change_each_others_data(store: FusionStore) -> None:
     store.put(make_subset("ant", 9, {11: 2}))
     store.put(make_subset("bee", 1, {11: 1, 22: 1}))
     scores = store.scores()
@@ -99,12 +99,12 @@ def test_agents_do_not_touch_each_other(store: FusionStore) -> None:
 def test_reading_some_voxels_equals_selecting_from_all(store: FusionStore) -> None:
     store.put(make_subset("ant", 1, {11: 2, 22: 3, 33: 0}))
     store.put(make_subset("bee", 1, {22: 1}))
-    wanted = np.array([33, 22, 99, 22], np.int64)
-    for agent_id, words in store.batches(wanted).items():
-        expected = select_keys(store.batch(agent_id), wanted)
-        assert words.keys.tolist() == expected.keys.tolist()
-        assert words.gaussians.means_m.tobytes() == expected.gaussians.means_m.tobytes()
-    assert store.scores(wanted).keys.tolist() == [22, 33, 22]
+    keys = np.array([33, 22, 99, 22], np.int64)
+    for agent_id, batch in store.batches(keys).items():
+        expected = select_keys(store.batch(agent_id), keys)
+        assert batch.keys.tolist() == expected.keys.tolist()
+        assert batch.gaussians.means_m.tobytes() == expected.gaussians.means_m.tobytes()
+    assert store.scores(keys).keys.tolist() == [22, 33, 22]
     assert len(store.scores(np.zeros(0, np.int64)).keys) == 0
 
 
@@ -189,10 +189,10 @@ def test_acknowledged_updates_survive_a_kill(tmp_path: Path) -> None:
     child.stdout.close()
     child.wait()
     store = SqliteStore(path)
-    words = store.batch("ant")
-    assert set(range(101, 101 + acknowledged)) <= set(words.keys.tolist())
+    batch = store.batch("ant")
+    assert set(range(101, 101 + acknowledged)) <= set(batch.keys.tolist())
     assert store.highest_map_revision("ant") in (acknowledged, acknowledged + 1)
-    assert words.counts.tolist()[0] == 3
+    assert batch.counts.tolist()[0] == 3
     store.close()
 
 
@@ -241,7 +241,7 @@ def test_a_damaged_or_newer_store_is_one_clear_error(
     assert "\n" not in str(caught.value)
 
 
-def test_an_unwritable_place_is_one_clear_error(tmp_path: Path) -> None:
+def test_an_unwritable_folder_is_one_clear_error(tmp_path: Path) -> None:
     with pytest.raises(StorageError, match="cannot be opened"):
         SqliteStore(tmp_path / "no" / "such" / "folder" / "store.sqlite")
     with pytest.raises(StorageError):

@@ -42,10 +42,10 @@ def always(_: RefineProgress) -> bool:
 
 def test_refinement_moves_the_map_towards_the_keyframes() -> None:
     before = patch(0.2)
-    heard: list[RefineProgress] = []
+    reports: list[RefineProgress] = []
 
     def listen(progress: RefineProgress) -> bool:
-        heard.append(progress)
+        reports.append(progress)
         return True
 
     after = refine(before, [view(1, 200), view(2, 200)], ReferenceRasterizer(), QUICK, listen)
@@ -53,9 +53,9 @@ def test_refinement_moves_the_map_towards_the_keyframes() -> None:
     assert after.active.all()
     assert (after.kappa > 0).any()
     assert after.target.tolist() == before.target.tolist()
-    assert [progress.iteration for progress in heard] == [2, 4, 6]
-    assert heard[-1].loss < heard[0].loss
-    assert {progress.gaussians for progress in heard} == {16}
+    assert [progress.iteration for progress in reports] == [2, 4, 6]
+    assert reports[-1].loss < reports[0].loss
+    assert {progress.gaussians for progress in reports} == {16}
 
 
 def test_the_same_seed_gives_the_same_map() -> None:
@@ -97,14 +97,14 @@ def test_pixels_with_weight_zero_are_not_trained() -> None:
 
 
 def test_refinement_stops_when_the_callback_returns_false() -> None:
-    heard = []
+    reports = []
 
     def stop_at_once(progress: RefineProgress) -> bool:
-        heard.append(progress.iteration)
+        reports.append(progress.iteration)
         return False
 
     refine(patch(0.2), [view(1, 200)], ReferenceRasterizer(), QUICK, stop_at_once)
-    assert heard == [2]
+    assert reports == [2]
 
 
 def test_growth_stays_under_the_cap_and_uncached_views_are_trained() -> None:

@@ -1,4 +1,4 @@
-"""Laws of the mapper that hold for every combination of its components."""
+"""Properties of the mapper for every combination of its components."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Who gives way when seeds come to a full table, and that the cap holds at every instant."""
+"""Eviction order when seeds are inserted into a full table, and the cap."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from gausslite.mapping.eviction import insert_seeds
 from gausslite.mapping.seeding import Seeds
 from gausslite.optimize.splat_table import SplatTable
 
-NEWBORN = 0.5
+SEED_OPACITY = 0.5
 
 
 def gaussians(opacities: list[float], active: bool, target: int = -1) -> Gaussians:
@@ -24,19 +24,19 @@ def full_table() -> SplatTable:
     return table
 
 
-def insert_into(table: SplatTable, roi: int, rest: int, scaffold: int = 0) -> int:
-    seeds = Seeds(gaussians([NEWBORN] * roi, True, 7), gaussians([NEWBORN] * rest, False, 8))
-    return insert_seeds(table, seeds, NEWBORN, np.random.default_rng(0), scaffold)
+def insert_into(table: SplatTable, roi: int, background: int, min_background: int = 0) -> int:
+    seeds = Seeds(gaussians([SEED_OPACITY] * roi, True, 7), gaussians([SEED_OPACITY] * background, False, 8))
+    return insert_seeds(table, seeds, SEED_OPACITY, np.random.default_rng(0), min_background)
 
 
-def test_with_room_nobody_gives_way() -> None:
+def test_with_free_slots_nothing_is_evicted() -> None:
     table = SplatTable(10)
     table.append(gaussians([0.1, 0.2], active=False))
     assert insert_into(table, 3, 4) == 7
     assert table.count == 9
 
 
-def test_for_the_task_the_faintest_inactive_gives_way_first_then_the_faintest_active() -> None:
+def test_roi_seeds_evict_the_least_opaque_inactive_first_then_the_least_opaque_active() -> None:
     table = full_table()
     assert insert_into(table, 2, 0) == 2
     np.testing.assert_allclose(np.sort(table.opacities), [0.1, 0.3, 0.5, 0.5, 0.8, 0.9], rtol=1e-4)
@@ -45,13 +45,13 @@ def test_for_the_task_the_faintest_inactive_gives_way_first_then_the_faintest_ac
     np.testing.assert_allclose(np.sort(table.opacities), [0.3, 0.5, 0.5, 0.5, 0.5, 0.8], rtol=1e-4)
 
 
-def test_for_the_rest_only_inactive_ones_fainter_than_a_newborn_give_way() -> None:
+def test_background_seeds_evict_only_inactive_gaussians_less_opaque_than_a_seed() -> None:
     table = full_table()
     assert insert_into(table, 0, 5) == 1
     np.testing.assert_allclose(np.sort(table.opacities), [0.1, 0.3, 0.5, 0.7, 0.8, 0.9], rtol=1e-4)
 
 
-def test_seeds_take_the_rows_of_those_that_gave_way_with_fresh_state_and_no_other_row_moves() -> None:
+def test_seeds_reuse_evicted_rows_with_new_optimiser_state_and_other_rows_stay() -> None:
     table = full_table()
     before = table.rows.copy()
     table.first_moment[:], table.second_moment[:] = 1.0, 2.0
@@ -64,34 +64,34 @@ def test_seeds_take_the_rows_of_those_that_gave_way_with_fresh_state_and_no_othe
         assert (moment[~taken] == value).all()
 
 
-def test_of_equally_faint_ones_the_earlier_gives_way() -> None:
+def test_ties_evict_the_earlier_row() -> None:
     table = SplatTable(4)
     table.append(gaussians([0.2, 0.2, 0.1, 0.2], active=False))
     insert_into(table, 2, 0)
     assert table.target.tolist() == [7, -1, 7, -1]
 
 
-def test_the_tasks_seeds_are_served_before_the_rest() -> None:
+def test_roi_seeds_are_inserted_before_background_seeds() -> None:
     table = SplatTable(5)
     assert insert_into(table, 4, 4) == 5
     assert (table.target == 7).sum() == 4
 
 
-def test_more_seeds_of_the_task_than_the_whole_cap() -> None:
+def test_more_roi_seeds_than_the_cap() -> None:
     table = full_table()
     assert insert_into(table, 50, 50) == 6
     assert (table.target == 7).all()
 
 
-def test_the_scaffold_stays_and_of_the_region_the_faintest_give_way_instead() -> None:
+def test_a_minimum_of_background_stays_and_active_gaussians_are_evicted_instead() -> None:
     table = full_table()
-    assert insert_into(table, 3, 0, scaffold=2) == 3
+    assert insert_into(table, 3, 0, min_background=2) == 3
     np.testing.assert_allclose(np.sort(table.opacities[~table.active]), [0.7, 0.9], rtol=1e-4)
     np.testing.assert_allclose(np.sort(table.opacities[table.active]), [0.5, 0.5, 0.5, 0.8], rtol=1e-4)
 
 
-def test_without_as_many_inactive_ones_as_the_scaffold_none_of_them_gives_way() -> None:
+def test_background_below_its_minimum_is_not_evicted() -> None:
     table = full_table()
-    assert insert_into(table, 50, 0, scaffold=5) == 3
+    assert insert_into(table, 50, 0, min_background=5) == 3
     assert table.count == 6
     np.testing.assert_allclose(np.sort(table.opacities[~table.active]), [0.2, 0.7, 0.9], rtol=1e-4)

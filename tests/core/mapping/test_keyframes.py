@@ -1,4 +1,4 @@
-"""Which frames are kept, and which tiles of them belong to the task."""
+"""Keyframe selection, and the tiles of the task's region."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def test_the_buffer_is_bounded_and_stays_spread_over_the_mission() -> None:
     assert max(np.diff(kept)) <= 20
 
 
-def test_of_large_images_fewer_are_kept() -> None:
+def test_fewer_large_images_are_kept() -> None:
     pixels = wall_frame(0).depth_m.size
     settings = KeyframeSettings(every=1, window=4, buffer=8, long_term_keyframes=4, max_pixels=8 * pixels)
     store = stored(settings, 40)
@@ -51,7 +51,7 @@ def test_of_large_images_fewer_are_kept() -> None:
     assert KeyframeSettings(long_term_keyframes=0).for_image_size(10**9).long_term_keyframes == 0
 
 
-def test_once_larger_images_come_smaller_ones_make_room() -> None:
+def test_a_larger_image_evicts_several_smaller_ones() -> None:
     settings, rasterizer = (
         KeyframeSettings(every=1, window=4, buffer=8, long_term_keyframes=4),
         CpuRasterizer(threads=1),
@@ -67,7 +67,7 @@ def test_once_larger_images_come_smaller_ones_make_room() -> None:
     assert store.buffer[-1].frame is large
 
 
-def test_frames_that_show_the_region_stay_ready_to_train_on_and_spread_over_the_mission() -> None:
+def test_frames_that_show_the_region_stay_in_the_window_and_spread_over_the_mission() -> None:
     store = stored(KeyframeSettings(every=8, window=2, long_term_keyframes=6), 40)
     kept = [view.keyframe.frame.index for view in store.window]
     assert kept[-2:] == [24, 32]
@@ -76,7 +76,7 @@ def test_frames_that_show_the_region_stay_ready_to_train_on_and_spread_over_the_
     assert max(np.diff(sorted(kept))) <= 16
 
 
-def test_a_frame_without_the_region_is_kept_at_its_turn_only() -> None:
+def test_frames_without_the_region_are_kept_at_the_regular_interval_only() -> None:
     settings, rasterizer = KeyframeSettings(every=4, long_term_keyframes=6), CpuRasterizer(threads=1)
     store = KeyframeStore(settings)
     for index in range(9):
@@ -84,7 +84,7 @@ def test_a_frame_without_the_region_is_kept_at_its_turn_only() -> None:
     assert [view.keyframe.frame.index for view in store.window] == [0, 4, 8]
 
 
-def test_a_policy_that_follows_no_task_keeps_as_many_views_of_anything() -> None:
+def test_a_policy_without_a_task_keeps_as_many_views() -> None:
     settings, rasterizer = KeyframeSettings(every=8, window=2, long_term_keyframes=6), CpuRasterizer(threads=1)
     store = KeyframeStore(settings, follows_task=False)
     for index in range(40):
@@ -97,7 +97,7 @@ def test_a_policy_that_follows_no_task_keeps_as_many_views_of_anything() -> None
     assert Components(sb=False, roi=False, sis=False).follow_task
 
 
-def test_a_view_of_the_region_goes_once_it_turns_out_not_to_show_it() -> None:
+def test_a_long_term_view_is_removed_if_revised_relevance_is_empty() -> None:
     settings, rasterizer = KeyframeSettings(every=4, long_term_keyframes=6), CpuRasterizer(threads=1)
     store = stored(settings, 3)
     wrong = store.window[0].keyframe
@@ -106,7 +106,7 @@ def test_a_view_of_the_region_goes_once_it_turns_out_not_to_show_it() -> None:
     assert [view.keyframe.frame.index for view in store.window] == [2, 0]
 
 
-def test_tiles_touch_the_region_and_its_margin() -> None:
+def test_tiles_cover_the_region_and_its_margin() -> None:
     region = np.zeros((40, 64), np.bool_)
     region[0:12, 20:28] = True
     expected = np.zeros((3, 4), np.bool_)
@@ -115,7 +115,7 @@ def test_tiles_touch_the_region_and_its_margin() -> None:
     assert not tiles_touching(np.zeros((40, 64), np.bool_), 5).any()
 
 
-def test_a_view_knows_whether_it_shows_the_region() -> None:
+def test_shows_roi_is_true_only_with_relevant_pixels() -> None:
     frame, rasterizer = wall_frame(), CpuRasterizer(threads=1)
     assert window_view(Keyframe(frame, middle_relevance(frame)), rasterizer, KeyframeSettings()).shows_roi
     assert not window_view(Keyframe(frame, RelevanceMap.empty(48, 64)), rasterizer, KeyframeSettings()).shows_roi

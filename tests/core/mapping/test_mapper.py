@@ -50,11 +50,11 @@ def map_wall(mapper: GaussianMapper, frames: int) -> None:
 
 def region_error(mapper: GaussianMapper) -> float:
     frame = wall_frame(0, SIZE, shift_m=0.05)
-    drawn = mapper.render(frame.camera, frame.T_world_camera)
-    return float(np.abs(drawn.rgb - frame.rgb / 255.0)[middle_relevance(frame).roi].mean())
+    rendering = mapper.render(frame.camera, frame.T_world_camera)
+    return float(np.abs(rendering.rgb - frame.rgb / 255.0)[middle_relevance(frame).roi].mean())
 
 
-def test_a_stray_reading_does_not_widen_the_scene() -> None:
+def test_an_outlier_depth_does_not_enlarge_the_scene_extent() -> None:
     mapper = mapper_of()
     frame = wall_frame(0, SIZE)
     frame.depth_m[3, 5] = 60.0
@@ -63,12 +63,12 @@ def test_a_stray_reading_does_not_widen_the_scene() -> None:
     assert mapper.state()["extent_m"] == pytest.approx([farthest_m / 3])
 
 
-def test_the_map_comes_to_look_like_the_wall() -> None:
+def test_the_error_of_the_map_decreases() -> None:
     mapper = mapper_of()
     map_wall(mapper, 1)
-    early = region_error(mapper)
+    first_error = region_error(mapper)
     map_wall(mapper, 4)
-    assert region_error(mapper) < min(early, 0.12)
+    assert region_error(mapper) < min(first_error, 0.12)
     assert mapper.revision == 5
 
 
@@ -81,20 +81,20 @@ def test_kappa_counts_active_phase_iterations_of_active_gaussians_only() -> None
     assert (gaussians.target[gaussians.active] == 0).all()
 
 
-@pytest.mark.parametrize(("loss", "alike"), [(MapperSettings().optimization.loss, True), (LossWeights(), False)])
-def test_gradients_are_as_large_in_the_active_phase_as_in_a_warm_up(loss: LossWeights, alike: bool) -> None:
+@pytest.mark.parametrize(("loss", "similar"), [(MapperSettings().optimization.loss, True), (LossWeights(), False)])
+def test_gradients_have_similar_size_in_active_phase_and_warm_up(loss: LossWeights, similar: bool) -> None:
     sizes = []
     for warm_ups in (0, 1):
-        trained = OptimizationSettings(warmup_iterations=warm_ups, active_iterations=1 - warm_ups, loss=loss)
-        mapper = mapper_of(replace(SMALL, optimization=trained))
+        optimization = OptimizationSettings(warmup_iterations=warm_ups, active_iterations=1 - warm_ups, loss=loss)
+        mapper = mapper_of(replace(SMALL, optimization=optimization))
         map_wall(mapper, 1)
         second_moment = select_prefix(mapper.state(), "table")["second_moment"]
         sizes.append(float(np.median(second_moment[mapper.gaussians().active, RGB])))
-    # a mean over the mask, a ninth of the image, makes their squares many times as large
-    assert (0.5 < sizes[0] / sizes[1] < 2.0) is alike
+    # normalised by the mask, a ninth of the image, the squared gradients are many times as large
+    assert (0.5 < sizes[0] / sizes[1] < 2.0) is similar
 
 
-def test_where_no_view_shows_the_region_every_iteration_is_a_warm_up() -> None:
+def test_without_a_view_of_the_region_all_iterations_are_warm_up() -> None:
     mapper = mapper_of()
     frame = wall_frame(0, SIZE)
     outcome = mapper.map_frame(frame, RelevanceMap.empty(*frame.depth_m.shape))
@@ -103,7 +103,7 @@ def test_where_no_view_shows_the_region_every_iteration_is_a_warm_up() -> None:
     assert not mapper.gaussians().active.any()
 
 
-def test_the_active_phase_finds_the_keyframes_that_show_the_region() -> None:
+def test_the_active_phase_trains_on_earlier_keyframes_of_the_region() -> None:
     mapper = mapper_of()
     map_wall(mapper, 1)
     before = int(mapper.gaussians().kappa.max())
@@ -118,13 +118,13 @@ def test_each_kind_of_active_phase_trains_the_region(phase: ActivePhase) -> None
     mapper = mapper_of(replace(SMALL, optimization=optimization, density=DensitySettings()))
     frame = wall_frame(0, SIZE)
     mapper.map_frame(frame, middle_relevance(frame))
-    still = mapper.gaussians()
-    untrained = np.isclose(still.opacities, 0.5, atol=1e-6)
-    assert not untrained[still.active & (still.kappa > 0)].any()
+    gaussians = mapper.gaussians()
+    untrained = np.isclose(gaussians.opacities, 0.5, atol=1e-6)
+    assert not untrained[gaussians.active & (gaussians.kappa > 0)].any()
     if phase is not ActivePhase.EXACT:
-        assert untrained[~still.active].all()
+        assert untrained[~gaussians.active].all()
     else:
-        assert not untrained[~still.active].all()
+        assert not untrained[~gaussians.active].all()
 
 
 def test_a_frame_without_depth_is_skipped_and_counted() -> None:
@@ -152,9 +152,9 @@ def test_the_same_seed_gives_the_same_map_and_another_seed_another() -> None:
     assert len(maps[2]) != len(maps[0]) or not np.array_equal(maps[0].means_m, maps[2].means_m)
 
 
-def test_a_pace_replaces_the_number_of_iterations_and_counts_steps_by_their_names() -> None:
+def test_a_scheduler_replaces_the_number_of_iterations_and_times_each_stage() -> None:
     mapper = mapper_of()
-    # every look at this clock takes a second, and so does every step
+    # every reading of this clock advances it by a second, so every stage takes a second
     clock = itertools.count()
     scheduler = FrameScheduler(
         SchedulerSettings(seconds_per_frame=60.0, deadline_slack=0.0), clock=lambda: float(next(clock))
@@ -162,15 +162,15 @@ def test_a_pace_replaces_the_number_of_iterations_and_counts_steps_by_their_name
     frame = wall_frame(0, SIZE)
     scheduler.begin()
     outcome = mapper.map_frame(frame, middle_relevance(frame), scheduler)
-    budget = scheduler.end()
+    timing = scheduler.end()
     assert 8 < outcome.iterations < 30
-    # an iteration is one second of work and some looks at the clock
-    assert budget.seconds <= 60.0 + 8.0
-    assert budget.stages_s[Stage.WARM_UP] + budget.stages_s[Stage.ACTIVE] == outcome.iterations
-    assert budget.stages_s[Stage.SEEDING] == budget.stages_s[Stage.VIEW_PREPARATION] == 1.0
+    # an iteration takes one second plus some clock readings
+    assert timing.seconds <= 60.0 + 8.0
+    assert timing.stages_s[Stage.WARM_UP] + timing.stages_s[Stage.ACTIVE] == outcome.iterations
+    assert timing.stages_s[Stage.SEEDING] == timing.stages_s[Stage.VIEW_PREPARATION] == 1.0
 
 
-def test_density_control_waits_for_time_but_not_for_ever() -> None:
+def test_density_control_is_delayed_by_missing_time_but_not_forever() -> None:
     settings = replace(SMALL, density=DensitySettings(densify_every=10, prune_every=1000))
     frame, clock = wall_frame(0, SIZE), itertools.count()
     mapper = mapper_of(settings)
@@ -178,7 +178,7 @@ def test_density_control_waits_for_time_but_not_for_ever() -> None:
         SchedulerSettings(seconds_per_frame=100.0, min_iterations=0), clock=lambda: float(next(clock))
     )
     with scheduler.timing(Stage.DENSIFICATION):
-        # it once took very long
+        # make densification look very slow
         next(itertools.islice(clock, 200, None))
     densified = []
     for _ in range(3):
@@ -189,18 +189,18 @@ def test_density_control_waits_for_time_but_not_for_ever() -> None:
     assert densified[0][1] > 0
 
 
-def test_expected_depth_is_that_of_the_wall() -> None:
+def test_expected_depth_is_the_depth_of_the_wall() -> None:
     mapper = mapper_of(replace(SMALL, max_gaussians=1500, components=Components(sis=False)))
     map_wall(mapper, 3)
     frame = wall_frame(0, SIZE)
-    sight = mapper.render_view(frame)
-    assert sight is not None
-    depth_m = sight.depth_m
+    view = mapper.render_view(frame)
+    assert view is not None
+    depth_m = view.depth_m
     assert (depth_m > 0).mean() > 0.5
     assert np.median(depth_m[depth_m > 0]) == pytest.approx(2.0, abs=0.05)
 
 
-def test_keyframes_are_offered_for_refinement() -> None:
+def test_keyframes_returns_every_nth_frame() -> None:
     mapper = mapper_of()
     map_wall(mapper, 5)
     assert [keyframe.frame.index for keyframe in mapper.keyframes()] == [0, 2, 4]

@@ -1,4 +1,4 @@
-"""Pixels are drawn without repeats, by weight, one a cell when stratified; spacing agrees with a neighbour search."""
+"""Pixel sampling without repeats, weighted and stratified; estimated spacing against a neighbour search."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ FULL = np.ones(SHAPE, np.bool_)
 
 
 def neighbours_px(pixels: np.ndarray, width: int) -> np.ndarray:
-    """Median distance of each pixel to its three nearest others, by trying all."""
+    """Median distance of each pixel to its three nearest others, by brute force."""
     points = np.stack(np.divmod(pixels, width), axis=1).astype(np.float32)
     squared = np.square(points[:, None] - points[None]).sum(axis=-1)
     np.fill_diagonal(squared, np.inf)
@@ -32,7 +32,7 @@ def test_samples_lie_in_the_pool_and_do_not_repeat(sample) -> None:
 
 
 @pytest.mark.parametrize("sample", [sample_pixels, sample_stratified])
-def test_a_small_pool_is_taken_whole_and_nothing_asked_gives_nothing(sample) -> None:
+def test_a_small_pool_is_returned_whole_and_a_count_of_zero_gives_nothing(sample) -> None:
     rng = np.random.default_rng(0)
     pool = np.zeros(SHAPE, np.bool_)
     pool[3, 4:9] = True
@@ -54,7 +54,7 @@ def test_stratified_fills_its_count_where_the_pool_is_a_small_part_of_the_image(
     assert len(sample_stratified(pool, 100, EVEN, np.random.default_rng(0))) > 80
 
 
-def test_weights_steer_the_draw() -> None:
+def test_samples_follow_the_weights() -> None:
     weight = EVEN.copy()
     weight[:, 64:] = 9.0
     for sample in (sample_pixels, sample_stratified):
@@ -99,7 +99,7 @@ def test_spacing_follows_the_local_density(stratified: bool) -> None:
         assert np.median(estimated[side]) == pytest.approx(np.median(true[side]), rel=0.25)
 
 
-def test_spacing_in_a_narrow_gap_is_that_within_the_gap() -> None:
+def test_spacing_in_a_narrow_strip_uses_neighbours_within_it() -> None:
     gap = np.zeros(SHAPE, np.bool_)
     gap[40:48, :] = True
     pixels = sample_pixels(gap, 250, EVEN, np.random.default_rng(0))

@@ -1,4 +1,4 @@
-"""Where seeds go and how they start, with each component on and off."""
+"""Positions, flags and scales of seeds, with each component on and off."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def test_without_budgeting_there_is_one_pool_and_flags_still_follow_the_pixels()
     assert seeds.background.active.mean() == pytest.approx(relevance.roi.mean(), abs=0.05)
 
 
-def test_seeds_lie_on_the_surface_and_carry_its_colour() -> None:
+def test_seeds_lie_on_the_surface_and_have_its_colour() -> None:
     frame = wall_frame(shift_m=0.5)
     background = seeder().seed(frame, RelevanceMap.empty(48, 64), EMPTY).background
     np.testing.assert_allclose(background.means_m[:, 2], 2.0, rtol=1e-6)
@@ -58,7 +58,7 @@ def test_initial_scaling_starts_small_and_smaller_in_the_region() -> None:
     plain = seeder(sb=True).seed(frame, relevance, EMPTY)
     scaled = seeder(sb=True, sis=True).seed(frame, relevance, EMPTY)
     np.testing.assert_allclose(np.median(scaled.roi.scales_m), 0.5 * np.median(plain.roi.scales_m), rtol=0.05)
-    # a grid spreads its samples: 0.89 instead of 0.73 pitches apart
+    # stratified samples are farther apart: 0.89 instead of 0.73 times the mean pitch
     assert np.median(scaled.background.scales_m) == pytest.approx(
         0.7 * np.median(plain.background.scales_m) * 0.89 / 0.73, rel=0.1
     )
@@ -88,16 +88,16 @@ def test_later_frames_seed_only_what_the_map_does_not_explain() -> None:
     assert (background.means_m[:, 0] / 2.0 * 64 + 32 < 10).all()
 
 
-def test_as_room_gets_short_seeds_get_sparser_and_larger() -> None:
+def test_with_fewer_free_slots_seeds_get_sparser_and_larger() -> None:
     frame, nothing = wall_frame(), RelevanceMap.empty(48, 64)
     plenty = seeder(sis=True).seed(frame, nothing, EMPTY).background
-    short = seeder(sis=True).seed(frame, nothing, SeedingContext(1000, None, NO_MEANS)).background
+    scarce = seeder(sis=True).seed(frame, nothing, SeedingContext(1000, None, NO_MEANS)).background
     full = seeder(sis=True).seed(frame, nothing, SeedingContext(0, None, NO_MEANS)).background
-    assert len(plenty) > 2 * len(short) > 4 * len(full) > 0
-    assert np.median(plenty.scales_m) < np.median(short.scales_m) < np.median(full.scales_m)
+    assert len(plenty) > 2 * len(scarce) > 4 * len(full) > 0
+    assert np.median(plenty.scales_m) < np.median(scarce.scales_m) < np.median(full.scales_m)
 
 
-def test_pixels_without_depth_or_beyond_reach_are_not_seeded() -> None:
+def test_pixels_without_depth_or_beyond_the_maximum_are_not_seeded() -> None:
     frame = wall_frame()
     frame.depth_m[:, :32] = 0.0
     frame.depth_m[:, 48:] = 11.0
@@ -105,18 +105,18 @@ def test_pixels_without_depth_or_beyond_reach_are_not_seeded() -> None:
     np.testing.assert_allclose(background.means_m[:, 2], 2.0, rtol=1e-6)
 
 
-def test_a_surface_drawn_far_behind_the_measured_one_is_found_and_one_in_front_is_not() -> None:
+def test_pixels_rendered_behind_the_measured_surface_are_found_but_not_those_in_front() -> None:
     frame = wall_frame()
-    drawn_m = np.full((48, 64), 2.01, np.float32)
-    drawn_m[10:14, 20:24] = 4.0
-    drawn_m[30:34, 20:24] = 1.0
-    found = rendered_behind(frame, RenderedView.from_rendering(rendering_of(np.ones((48, 64)), drawn_m)), 40.0)
+    rendered_m = np.full((48, 64), 2.01, np.float32)
+    rendered_m[10:14, 20:24] = 4.0
+    rendered_m[30:34, 20:24] = 1.0
+    found = rendered_behind(frame, RenderedView.from_rendering(rendering_of(np.ones((48, 64)), rendered_m)), 40.0)
     expected = np.zeros((48, 64), np.bool_)
     expected[10:14, 20:24] = True
     np.testing.assert_array_equal(found, expected)
 
 
-def test_a_region_with_enough_active_gaussians_is_fine_and_one_without_is_too_coarse() -> None:
+def test_a_region_is_undersampled_without_enough_active_gaussians_on_its_surface() -> None:
     frame = wall_frame()
     region = middle_relevance(frame).roi
     np.testing.assert_array_equal(undersampled_roi(frame, region, NO_MEANS, 4.0), region)
@@ -130,7 +130,7 @@ def test_a_region_with_enough_active_gaussians_is_fine_and_one_without_is_too_co
     np.testing.assert_array_equal(undersampled_roi(frame, region, behind, 4.0), region)
 
 
-def test_a_region_that_was_mapped_as_background_is_seeded_when_it_becomes_the_tasks() -> None:
+def test_background_that_becomes_the_region_is_seeded() -> None:
     frame = wall_frame()
     state = SeedingContext(
         1_000_000, RenderedView.from_rendering(rendering_of(np.ones((48, 64)), frame.depth_m)), NO_MEANS

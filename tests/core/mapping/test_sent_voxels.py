@@ -23,12 +23,12 @@ def active_gaussians(count: int = 60) -> Gaussians:
 
 def test_a_batch_has_each_gaussian_once_in_its_voxel_with_totals() -> None:
     gaussians = some_gaussians(200)
-    words = group_by_voxel(gaussians, GRID)
-    assert int(words.counts.sum()) == 200
-    np.testing.assert_array_equal(np.repeat(words.keys, words.counts), GRID.keys(words.gaussians.means_m))
-    assert int(words.kappa_sums.sum()) == int(gaussians.kappa.sum())
-    first = words.gaussians.kappa[: words.counts[0]]
-    assert int(words.kappa_sums[0]) == int(first.sum())
+    batch = group_by_voxel(gaussians, GRID)
+    assert int(batch.counts.sum()) == 200
+    np.testing.assert_array_equal(np.repeat(batch.keys, batch.counts), GRID.keys(batch.gaussians.means_m))
+    assert int(batch.kappa_sums.sum()) == int(gaussians.kappa.sum())
+    first = batch.gaussians.kappa[: batch.counts[0]]
+    assert int(batch.kappa_sums[0]) == int(first.sum())
 
 
 def test_no_gaussians_give_an_empty_batch() -> None:
@@ -38,9 +38,9 @@ def test_no_gaussians_give_an_empty_batch() -> None:
 
 def test_the_first_call_returns_all_active_voxels_and_the_second_none() -> None:
     tracker, gaussians = SentVoxelTracker(GRID), some_gaussians(100)
-    words = tracker.collect_changes(gaussians)
-    assert len(words.gaussians) == int(gaussians.active.sum())
-    assert words.gaussians.active.all()
+    batch = tracker.collect_changes(gaussians)
+    assert len(batch.gaussians) == int(gaussians.active.sum())
+    assert batch.gaussians.active.all()
     assert len(tracker.collect_changes(gaussians)) == 0
 
 
@@ -57,9 +57,9 @@ def test_a_change_of_any_value_returns_only_that_voxel() -> None:
     for column in ("kappa", "opacities", "rgb", "scales_m", "quats_wxyz", "target"):
         values = getattr(gaussians, column)
         values[3] = values[3] + values.dtype.type(1)
-        words = tracker.collect_changes(gaussians)
-        assert words.keys.tolist() == [key], column
-        assert int(words.counts[0]) == int((GRID.keys(gaussians.means_m) == key).sum())
+        batch = tracker.collect_changes(gaussians)
+        assert batch.keys.tolist() == [key], column
+        assert int(batch.counts[0]) == int((GRID.keys(gaussians.means_m) == key).sum())
 
 
 def test_values_swapped_between_two_gaussians_of_a_voxel_are_a_change() -> None:
@@ -76,10 +76,10 @@ def test_a_voxel_that_lost_its_gaussians_gets_one_tombstone() -> None:
     tracker.collect_changes(gaussians)
     keys = GRID.keys(gaussians.means_m)
     left = gaussians.take(keys != keys[5])
-    words = tracker.collect_changes(left)
-    assert words.keys.tolist() == [keys[5]]
-    assert words.counts.tolist() == [0]
-    assert words.kappa_sums.tolist() == [0]
+    batch = tracker.collect_changes(left)
+    assert batch.keys.tolist() == [keys[5]]
+    assert batch.counts.tolist() == [0]
+    assert batch.kappa_sums.tolist() == [0]
     assert len(tracker.collect_changes(left)) == 0
 
 
@@ -103,7 +103,7 @@ def test_frozen_voxels_get_no_updates_and_no_tombstones() -> None:
 def test_a_frozen_voxel_is_replaced_only_at_an_equal_or_higher_kappa_sum() -> None:
     tracker, gaussians = SentVoxelTracker(GRID), active_gaussians()
     gaussians.kappa[:] = 10
-    told = {int(key): int(total) for key, total in zip(*_sums(tracker.collect_changes(gaussians)), strict=True)}
+    sent = {int(key): int(total) for key, total in zip(*_sums(tracker.collect_changes(gaussians)), strict=True)}
     tracker.freeze_sent()
     less = gaussians.take(np.arange(len(gaussians)))
     less.kappa[:] = 9
@@ -111,29 +111,29 @@ def test_a_frozen_voxel_is_replaced_only_at_an_equal_or_higher_kappa_sum() -> No
     assert len(tracker.exclude_frozen(group_by_voxel(less, GRID))) == 0
     less.kappa[:] = 11
     again = {int(key): int(total) for key, total in zip(*_sums(tracker.collect_changes(less)), strict=True)}
-    assert set(again) == set(told)
-    assert all(again[key] >= told[key] for key in told)
-    # from now on these are ordinary words of the region: what vanishes is taken back
-    assert tracker.collect_changes(less.take(np.arange(0))).keys.tolist() == sorted(told)
+    assert set(again) == set(sent)
+    assert all(again[key] >= sent[key] for key in sent)
+    # from now on these voxels are not frozen: removed ones get tombstones
+    assert tracker.collect_changes(less.take(np.arange(0))).keys.tolist() == sorted(sent)
 
 
-def _sums(words: VoxelBatch) -> tuple[list[int], list[int]]:
-    return words.keys.tolist(), words.kappa_sums.tolist()
+def _sums(batch: VoxelBatch) -> tuple[list[int], list[int]]:
+    return batch.keys.tolist(), batch.kappa_sums.tolist()
 
 
-def test_applying_all_changes_in_order_rebuilds_the_whole() -> None:
+def test_applying_all_changes_in_order_rebuilds_the_map() -> None:
     rng, tracker = np.random.default_rng(0), SentVoxelTracker(GRID)
-    known: dict[int, tuple[int, int]] = {}
+    latest: dict[int, tuple[int, int]] = {}
     gaussians = active_gaussians(80)
     for _ in range(5):
         gaussians = gaussians.take(rng.random(len(gaussians)) < 0.8)
         gaussians.kappa[rng.random(len(gaussians)) < 0.3] += 1
-        words = tracker.collect_changes(gaussians)
-        for key, kappa, count in zip(words.keys, words.kappa_sums, words.counts, strict=True):
-            known[int(key)] = (int(kappa), int(count))
+        batch = tracker.collect_changes(gaussians)
+        for key, kappa, count in zip(batch.keys, batch.kappa_sums, batch.counts, strict=True):
+            latest[int(key)] = (int(kappa), int(count))
     whole = group_by_voxel(gaussians, GRID)
-    alive = {key: told for key, told in known.items() if told[1] > 0}
-    assert alive == {
+    remaining = {key: sums for key, sums in latest.items() if sums[1] > 0}
+    assert remaining == {
         int(key): (int(kappa), int(count))
         for key, kappa, count in zip(whole.keys, whole.kappa_sums, whole.counts, strict=True)
     }

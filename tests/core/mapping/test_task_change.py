@@ -1,4 +1,4 @@
-"""The task changes in the middle of a mission: the laws of re-reading, of the budget and of what was told before."""
+"""A task change during a mission: re-evaluation of keyframes, the cap, and voxels that were sent before."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ A, B = RegionRelevanceEstimator([LEFT]), RegionRelevanceEstimator([RIGHT])
 GRID = VoxelGrid(0.25)
 
 
-def loop_of(max_gaussians: int = 1500, every: int = 1, buffer: int = 8, window: int = 4) -> TaskMapper:
+def make_loop(max_gaussians: int = 1500, every: int = 1, buffer: int = 8, window: int = 4) -> TaskMapper:
     settings = MapperSettings(
         max_gaussians=max_gaussians,
         seeding=SeedingSettings(first_frame_seeds=60_000, later_seeds=20_000),
@@ -57,12 +57,12 @@ def frame_at(index: int) -> Frame:
     return wall_frame(index, SIZE, shift_m=0.03 * index)
 
 
-def play(loop: TaskMapper, first: int, end: int) -> list[FrameOutcome]:
+def map_frames(loop: TaskMapper, first: int, end: int) -> list[FrameOutcome]:
     return [loop.process(frame_at(index)) for index in range(first, end)]
 
 
 def assert_flags_agree(loop: TaskMapper, region: BallRegion, frames: Sequence[int], share: float) -> None:
-    """Of what these frames see, `share` at least is active exactly where the region's mask is."""
+    """Of the Gaussians visible in these frames, at least `share` are active exactly inside the region's mask."""
     gaussians = loop.gaussians()
     for index in frames:
         frame = frame_at(index)
@@ -71,41 +71,41 @@ def assert_flags_agree(loop: TaskMapper, region: BallRegion, frames: Sequence[in
     assert ((gaussians.target == NO_TARGET) == ~gaussians.active).all()
 
 
-def test_the_cap_holds_at_every_instant() -> None:
-    loop = loop_of(max_gaussians=300)
-    for index, attention in enumerate((B, A, B)):
-        outcomes = play(loop, 4 * index, 4 * index + 4)
+def test_the_cap_holds_across_task_changes() -> None:
+    loop = make_loop(max_gaussians=300)
+    for index, estimator in enumerate((B, A, B)):
+        outcomes = map_frames(loop, 4 * index, 4 * index + 4)
         assert all(outcome.gaussians <= 300 for outcome in outcomes)
-        loop.assign(attention)
+        loop.assign(estimator)
     state = loop.state()
     assert all(len(state[f"mapper/table/{name}"]) <= 300 for name in ("rows", "active", "roi_evidence"))
 
 
-def test_no_frame_does_more_for_a_new_task_than_its_bound_and_all_keyframes_are_read_once() -> None:
-    loop = loop_of(buffer=16)
-    play(loop, 0, 8)
+def test_each_frame_reevaluates_a_bounded_number_of_keyframes_until_all_are_done() -> None:
+    loop = make_loop(buffer=16)
+    map_frames(loop, 0, 8)
     loop.assign(B)
-    outcomes = play(loop, 8, 16)
+    outcomes = map_frames(loop, 8, 16)
     settings = SeedingSettings(first_frame_seeds=60_000)
-    most = settings.roi_share * settings.first_frame_seeds * SIZE[0] * SIZE[1] / (640 * 480)
+    max_seeds = settings.roi_share * settings.first_frame_seeds * SIZE[0] * SIZE[1] / (640 * 480)
     assert [outcome.reevaluation.keyframes for outcome in outcomes] == [2, 2, 2, 2, 0, 0, 0, 0]
-    assert all(outcome.reevaluation.seeded <= 2 * most for outcome in outcomes)
+    assert all(outcome.reevaluation.seeded <= 2 * max_seeds for outcome in outcomes)
     assert outcomes[0].reevaluation.seeded > 0
 
 
-def test_where_time_is_short_one_keyframe_is_read_a_frame() -> None:
-    loop = loop_of()
-    play(loop, 0, 4)
-    late = TaskMapper(
+def test_without_spare_time_one_keyframe_is_reevaluated_per_frame() -> None:
+    loop = make_loop()
+    map_frames(loop, 0, 4)
+    overloaded = TaskMapper(
         A, GaussianMapper(MapperSettings(), CpuRasterizer(threads=1)), scheduler=FrameScheduler(SchedulerSettings(1e-6))
     )
-    late.restore(loop.state())
-    late.assign(B)
-    assert [outcome.reevaluation.keyframes for outcome in play(late, 4, 9)] == [1, 1, 1, 1, 0]
+    overloaded.restore(loop.state())
+    overloaded.assign(B)
+    assert [outcome.reevaluation.keyframes for outcome in map_frames(overloaded, 4, 9)] == [1, 1, 1, 1, 0]
 
 
-class Unreadable(RegionRelevanceEstimator):
-    """Raises for an earlier frame, whenever it is asked."""
+class FailingEstimator(RegionRelevanceEstimator):
+    """An estimator that fails on one past frame."""
 
     def __init__(self, index: int) -> None:
         super().__init__([RIGHT])
@@ -113,41 +113,41 @@ class Unreadable(RegionRelevanceEstimator):
 
     def evaluate_past(self, frame: Frame) -> RelevanceMap:
         if frame.index == self._index:
-            raise MemoryError("a moment without memory")
+            raise MemoryError("temporarily out of memory")
         return super().evaluate_past(frame)
 
 
-def test_a_keyframe_that_cannot_be_judged_costs_one_frame_and_is_passed_over() -> None:
-    loop = loop_of()
-    play(loop, 0, 4)
-    loop.assign(Unreadable(2))
-    with pytest.raises(MemoryError, match="a moment"):
+def test_a_keyframe_whose_reevaluation_fails_costs_one_frame_and_is_skipped() -> None:
+    loop = make_loop()
+    map_frames(loop, 0, 4)
+    loop.assign(FailingEstimator(2))
+    with pytest.raises(MemoryError, match="temporarily"):
         loop.process(frame_at(4))
-    outcomes = play(loop, 5, 7)
+    outcomes = map_frames(loop, 5, 7)
     assert [outcome.reevaluation.keyframes for outcome in outcomes] == [2, 0]
     shown = {keyframe.frame.index: bool(keyframe.relevance.roi.any()) for keyframe in loop.keyframes()}
     assert [shown[index] for index in range(4)] == [True, True, False, True]
 
 
-def test_what_is_seen_is_active_where_the_new_task_is_also_when_it_returns() -> None:
-    loop = loop_of()
-    play(loop, 0, 8)
+def test_active_gaussians_follow_the_task_also_when_an_earlier_task_returns() -> None:
+    loop = make_loop()
+    map_frames(loop, 0, 8)
     kappa_before = int(loop.gaussians().kappa.sum())
     assert_flags_agree(loop, LEFT, range(8), 0.9)
     loop.assign(B)
     assert not loop.gaussians().active.any()
     assert int(loop.gaussians().kappa.sum()) == kappa_before
-    play(loop, 8, 14)
+    map_frames(loop, 8, 14)
     assert_flags_agree(loop, RIGHT, range(14), 0.9)
     loop.assign(A)
-    play(loop, 14, 22)
+    map_frames(loop, 14, 22)
     assert_flags_agree(loop, LEFT, range(4, 22), 0.9)
     gaussians = loop.gaussians()
     assert gaussians.kappa[gaussians.active].max() > 8 * 6
 
 
-def test_views_that_show_the_new_region_come_back_into_a_window_that_does_not() -> None:
-    loop = loop_of(window=3, buffer=32)
+def test_keyframes_that_show_the_new_region_return_to_the_window() -> None:
+    loop = make_loop(window=3, buffer=32)
     mapper = loop._mapper
     for index in range(12):
         # the camera leaves the new region behind
@@ -165,7 +165,7 @@ def test_views_that_show_the_new_region_come_back_into_a_window_that_does_not() 
         np.testing.assert_array_equal(keyframe.relevance.roi, RIGHT.mask(keyframe.frame))
 
 
-def test_room_for_the_new_region_is_made_in_the_old_one_first() -> None:
+def test_seeds_of_the_new_region_evict_gaussians_of_the_old_region_first() -> None:
     before = some_gaussians(60)
     before.active[:] = np.arange(60) < 20
     before.kappa[:] = np.where(np.arange(60) < 40, 7, 0)
@@ -181,75 +181,75 @@ def test_room_for_the_new_region_is_made_in_the_old_one_first() -> None:
     assert int((~old.active & (old.kappa == 0)).sum()) == 20
 
 
-def test_the_server_keeps_what_it_was_told_of_the_old_region() -> None:
-    loop = loop_of()
-    play(loop, 0, 6)
-    told = set(GRID.keys(loop._mapper.roi_gaussians().means_m).tolist())
+def test_sent_voxels_of_the_old_region_get_no_tombstones() -> None:
+    loop = make_loop()
+    map_frames(loop, 0, 6)
+    sent = set(GRID.keys(loop._mapper.roi_gaussians().means_m).tolist())
     loop.assign(B)
     counts: dict[int, int] = {}
-    for outcome in play(loop, 6, 14):
+    for outcome in map_frames(loop, 6, 14):
         assert outcome.changed_roi is not None
         counts.update(zip(outcome.changed_roi.keys.tolist(), outcome.changed_roi.counts.tolist(), strict=True))
     new = set(GRID.keys(loop._mapper.roi_gaussians().means_m).tolist())
-    assert new <= set(counts) | told
-    assert not {key for key in told - new if counts.get(key) == 0}
+    assert new <= set(counts) | sent
+    assert not {key for key in sent - new if counts.get(key) == 0}
 
 
-def test_a_run_saved_in_the_middle_of_rereading_goes_on_to_the_same_bits() -> None:
-    whole = loop_of(buffer=16)
-    play(whole, 0, 8)
+def test_a_run_saved_during_reevaluation_resumes_bit_identically() -> None:
+    whole = make_loop(buffer=16)
+    map_frames(whole, 0, 8)
     whole.assign(B)
-    play(whole, 8, 10)
+    map_frames(whole, 8, 10)
     saved: State = {name: array.copy() for name, array in whole.state().items()}
-    words = [outcome.changed_roi for outcome in play(whole, 10, 14)]
-    other = loop_of(buffer=16)
+    expected_changes = [outcome.changed_roi for outcome in map_frames(whole, 10, 14)]
+    other = make_loop(buffer=16)
     other.assign(B)
     other.restore(saved)
-    for mine, theirs in zip(play(other, 10, 14), words, strict=True):
-        assert mine.changed_roi is not None
-        assert theirs is not None
-        np.testing.assert_array_equal(mine.changed_roi.keys, theirs.keys)
+    for resumed, expected in zip(map_frames(other, 10, 14), expected_changes, strict=True):
+        assert resumed.changed_roi is not None
+        assert expected is not None
+        np.testing.assert_array_equal(resumed.changed_roi.keys, expected.keys)
     for name, array in whole.state().items():
         assert other.state()[name].tobytes() == array.tobytes(), name
 
 
-def test_the_same_question_in_other_words_is_the_same_task() -> None:
+def test_rephrasing_gives_an_equivalent_task() -> None:
     on = Relation(Predicate.ON, "mug", "table")
     one = TaskGraph("1", "Pick up the mug on the table", ("mug",), ("table",), (on,))
     assert one.is_equivalent_to(replace(one, task_id="2", text="Take the mug from the table"))
     assert not one.is_equivalent_to(replace(one, relations=()))
 
 
-def test_a_task_attention_remembers_what_it_finds_in_earlier_views_but_carries_on_the_newest() -> None:
+def test_landmarks_found_in_past_views_are_used_for_the_newest_frame() -> None:
     on_the_right = Relation(Predicate.NEAR, "mug", "lamp")
     graph = TaskGraph("t", "the mug near the lamp", ("mug",), ("lamp",), (on_the_right,))
     regions = {"mug_1": LEFT, "mug_2": RIGHT, "lamp": BallRegion((0.75, 0.1, 2.0), 0.15)}
-    attention = TaskRelevanceEstimator(graph, RegionDetector(regions), TrackerSettings(max_frames=100))
+    estimator = TaskRelevanceEstimator(graph, RegionDetector(regions), TrackerSettings(max_frames=100))
     away = wall_frame(9, SIZE, shift_m=-0.6)
-    attention.estimate(away)
-    assert attention.notes
-    # an earlier view knows the lamp
-    found = attention.evaluate_past(wall_frame(0, SIZE, shift_m=0.3))
-    assert not attention.notes
+    estimator.estimate(away)
+    assert estimator.notes
+    # an earlier view shows the lamp
+    found = estimator.evaluate_past(wall_frame(0, SIZE, shift_m=0.3))
+    assert not estimator.notes
     assert (found.roi == RIGHT.mask(wall_frame(0, SIZE, shift_m=0.3))).all()
 
 
-def test_beside_mapping_a_look_back_is_ready_when_the_detector_is_and_takes_turns() -> None:
+def test_asynchronous_reevaluation_alternates_with_new_keyframes() -> None:
     executor = DeferredExecutor()
     task = TaskGraph("id", "a task", ("mug",), (), ())
-    attention = AsyncRelevanceEstimator(task, RegionDetector({"mug": RIGHT}), executor, TrackerSettings(max_frames=2))
+    estimator = AsyncRelevanceEstimator(task, RegionDetector({"mug": RIGHT}), executor, TrackerSettings(max_frames=2))
     loop = TaskMapper(A, GaussianMapper(MapperSettings(keyframes=KeyframeSettings(every=1)), CpuRasterizer(threads=1)))
-    play(loop, 0, 3)
-    loop.assign(attention)
-    assert play(loop, 3, 4)[0].reevaluation.keyframes == 0
-    # the newest keyframe's detection, and a look back at the newest before it
+    map_frames(loop, 0, 3)
+    loop.assign(estimator)
+    assert map_frames(loop, 3, 4)[0].reevaluation.keyframes == 0
+    # the detection of the newest keyframe, then the re-evaluation of the one before it
     assert executor.frames == [3, 2]
     executor.run_next()
     executor.run_next()
-    assert play(loop, 4, 5)[0].reevaluation.keyframes == 1
+    assert map_frames(loop, 4, 5)[0].reevaluation.keyframes == 1
     assert executor.frames[-1] == 1
 
 
-def test_at_least_one_keyframe_a_frame_is_asked_for() -> None:
+def test_keyframes_per_frame_must_be_positive() -> None:
     with pytest.raises(InvalidInputError, match="keyframes_per_frame"):
         TaskChangeSettings(keyframes_per_frame=0)

@@ -50,7 +50,7 @@ CONFIG = ResumeConfig.of(*SETTINGS)
 
 
 def loop(max_gaussians: int = 400, window: int = 2) -> TaskMapper:
-    """Poses refined, density control every few iterations, a window smaller than the buffer, a buffer that thins."""
+    """A mapper with refined poses, frequent density control, and a window smaller than the buffer, which is thinned."""
     mapper_settings = MapperSettings(
         max_gaussians=max_gaussians,
         seeding=SeedingSettings(first_frame_seeds=60_000, later_seeds=20_000),
@@ -67,48 +67,52 @@ def frames(first: int, end: int) -> Iterator[Frame]:
     return (wall_frame(i, (48, 32), shift_m=0.03 * i) for i in range(first, end))
 
 
-def words_of_run(run: TaskMapper, first: int, end: int) -> list[VoxelBatch | None]:
+def changes_of_run(run: TaskMapper, first: int, end: int) -> list[VoxelBatch | None]:
     return [run.process(frame).changed_roi for frame in frames(first, end)]
 
 
-def assert_same(came: State, wanted: State) -> None:
-    assert set(came) == set(wanted)
-    for name in wanted:
-        assert came[name].dtype == wanted[name].dtype, name
-        assert came[name].shape == wanted[name].shape, name
-        assert came[name].tobytes() == wanted[name].tobytes(), name
+def assert_same(actual: State, expected: State) -> None:
+    assert set(actual) == set(expected)
+    for name in expected:
+        assert actual[name].dtype == expected[name].dtype, name
+        assert actual[name].shape == expected[name].shape, name
+        assert actual[name].tobytes() == expected[name].tobytes(), name
 
 
-def fingerprint(run: TaskMapper, words: list[VoxelBatch | None]) -> dict[str, int]:
-    """What two processes can compare: a checksum of each array of the state, and of the words."""
+def checksums(run: TaskMapper, changes: list[VoxelBatch | None]) -> dict[str, int]:
+    """Return a checksum of each array of the state and of each frame's changes, to compare two processes."""
     sums = {name: zlib.crc32(array.tobytes()) for name, array in run.state().items()}
-    for i, each in enumerate(words):
-        assert each is not None
-        sums[f"words {i}"] = zlib.crc32(each.keys.tobytes() + each.gaussians.means_m.tobytes() + each.counts.tobytes())
+    for i, batch in enumerate(changes):
+        assert batch is not None
+        sums[f"changes {i}"] = zlib.crc32(_bytes_of(batch))
     return sums
 
 
-def go_on(path: str) -> None:
-    """In a process of its own: take the run up, map the rest and print the fingerprint."""
+def _bytes_of(batch: VoxelBatch) -> bytes:
+    return batch.keys.tobytes() + batch.gaussians.means_m.tobytes() + batch.counts.tobytes()
+
+
+def resume(path: str) -> None:
+    """Resume the run in another process, map the remaining frames and print the checksums."""
     run, saved = loop(), SavedRun.read(Path(path))
     saved.restore(run)
-    print(json.dumps(fingerprint(run, words_of_run(run, saved.last_index + 1, FRAMES))))
+    print(json.dumps(checksums(run, changes_of_run(run, saved.last_index + 1, FRAMES))))
 
 
-def test_a_run_cut_in_two_gives_the_same_bits_as_one_in_one_go(tmp_path: Path) -> None:
-    whole = loop()
-    words = words_of_run(whole, 0, FRAMES)
+def test_a_stopped_and_resumed_run_is_bit_identical_to_an_uninterrupted_one(tmp_path: Path) -> None:
+    uninterrupted = loop()
+    changes = changes_of_run(uninterrupted, 0, FRAMES)
     first = loop()
-    words_of_run(first, 0, CUT)
+    changes_of_run(first, 0, CUT)
     save_run(tmp_path / "run.state", first, CONFIG, CUT - 1)
-    code = f"import sys; sys.path[:0] = {sys.path!r}; import test_checkpoint; test_checkpoint.go_on(sys.argv[1])"
+    code = f"import sys; sys.path[:0] = {sys.path!r}; import test_checkpoint; test_checkpoint.resume(sys.argv[1])"
     done = subprocess.run(
         [sys.executable, "-c", code, str(tmp_path / "run.state")], capture_output=True, text=True, timeout=120
     )
     assert done.returncode == 0, done.stderr
-    assert json.loads(done.stdout) == fingerprint(whole, words[CUT:])
-    assert whole.state()["mapper/table/kappa"].max() > 0
-    assert len(whole.state()["mapper/keyframes/buffer"]) == 3
+    assert json.loads(done.stdout) == checksums(uninterrupted, changes[CUT:])
+    assert uninterrupted.state()["mapper/table/kappa"].max() > 0
+    assert len(uninterrupted.state()["mapper/keyframes/buffer"]) == 3
 
 
 def test_settings_survive_the_file(saved: Path) -> None:
@@ -119,9 +123,9 @@ def test_settings_survive_the_file(saved: Path) -> None:
         run.value(MissionSettings, "threads")
 
 
-def test_saving_changes_nothing_and_restoring_gives_back_what_was_saved(tmp_path: Path) -> None:
+def test_saving_changes_nothing_and_restoring_gives_the_saved_state(tmp_path: Path) -> None:
     run, same = loop(), loop()
-    words_of_run(run, 0, CUT)
+    changes_of_run(run, 0, CUT)
     before = {name: array.copy() for name, array in run.state().items()}
     save_run(tmp_path / "run.state", run, CONFIG, CUT - 1)
     assert_same(run.state(), before)
@@ -134,7 +138,7 @@ def test_saving_changes_nothing_and_restoring_gives_back_what_was_saved(tmp_path
 @pytest.fixture
 def saved(tmp_path: Path) -> Path:
     run, path = loop(), tmp_path / "run.state"
-    words_of_run(run, 0, 3)
+    changes_of_run(run, 0, 3)
     save_run(path, run, CONFIG, 2)
     return path
 
@@ -173,13 +177,13 @@ def test_a_config_that_is_not_json_objects_is_refused(config: str, saved: Path) 
 @pytest.fixture(scope="module")
 def state(tmp_path_factory: pytest.TempPathFactory) -> State:
     run, path = loop(), tmp_path_factory.mktemp("states") / "run.state"
-    words_of_run(run, 0, 2)
+    changes_of_run(run, 0, 2)
     save_run(path, run, CONFIG, 1)
     return read_state(path)
 
 
 def forgeries(array: np.ndarray) -> Iterator[np.ndarray]:
-    """Another length, another type, and every byte the same."""
+    """Yield arrays of another length, another type, and with all bytes equal."""
     yield np.concatenate([array.ravel(), array.ravel(), np.zeros(1, array.dtype)])
     yield array.astype(np.float64 if array.dtype != np.float64 else np.float32)
     for byte in (0, 1) if array.dtype == np.bool_ else (0, 1, 127, 128, 255):
@@ -188,9 +192,9 @@ def forgeries(array: np.ndarray) -> Iterator[np.ndarray]:
         yield same
 
 
-def test_whatever_one_array_is_made_to_be_it_is_told_or_can_be_mapped_on(state: State) -> None:
+def test_a_forged_array_is_rejected_or_mapping_continues(state: State) -> None:
     saved = select_prefix(state, "mapper")
-    told = 0
+    rejected = 0
     for name, array in saved.items():
         for forged_array in (None, *forgeries(array)):
             fresh = loop()
@@ -198,21 +202,21 @@ def test_whatever_one_array_is_made_to_be_it_is_told_or_can_be_mapped_on(state: 
             try:
                 fresh.restore(others if forged_array is None else {**others, name: forged_array})
             except GaussLiteError:
-                told += 1
+                rejected += 1
                 continue
-            words_of_run(fresh, 2, 3)
-    assert told > 3 * len(saved)
+            changes_of_run(fresh, 2, 3)
+    assert rejected > 3 * len(saved)
 
 
-def test_a_generator_goes_on_where_another_stood_even_in_the_middle_of_a_draw() -> None:
+def test_a_restored_generator_continues_the_sequence_of_the_saved_one() -> None:
     a, b = np.random.default_rng(5), np.random.default_rng(6)
-    a.integers(0, 2**32, 3, np.uint32)  # leaves half a draw behind
+    a.integers(0, 2**32, 3, np.uint32)  # leaves a buffered half of a 64-bit draw
     restore_generator(b, generator_state(a))
     np.testing.assert_array_equal(a.integers(0, 2**32, 9, np.uint32), b.integers(0, 2**32, 9, np.uint32))
     np.testing.assert_array_equal(a.standard_normal(9), b.standard_normal(9))
 
 
-def test_all_types_and_shapes_come_back(tmp_path: Path) -> None:
+def test_all_types_and_shapes_are_read_back(tmp_path: Path) -> None:
     arrays = {
         f"{dtype}-{shape}": np.arange(int(np.prod(shape)), dtype=np.int64).reshape(shape).astype(dtype)
         for dtype in ("?", "u1", "i2", "u4", "i8", "u8", "f4", "f8")

@@ -42,17 +42,17 @@ def test_the_checksum_of_a_changed_file_is_not_recorded(tmp_path):
     served.data = write_tiny_yolo(tmp_path / "source.onnx", ["cup"], []).read_bytes()
     with serving(served) as base:
         path = fetch(entry(), base, folder, None, no_progress).path
-        noted = listed_checksum(path)
+        recorded = listed_checksum(path)
         path.write_bytes(served.data + b"more")
         with pytest.raises(ChecksumError, match="from SHA256SUMS"):
             fetch(entry(), base, folder, None, no_progress)
-        # nor is what the server has now taken for what it had
+        # a changed file on the server does not match the recorded checksum either
         path.unlink()
         served.data = write_tiny_yolo(tmp_path / "other.onnx", ["bowl"], []).read_bytes()
         with pytest.raises(ChecksumError, match="the file was not kept"):
             fetch(entry(), base, folder, None, no_progress)
-        assert listed_checksum(path) == noted
-        # but for somebody who says so
+        assert listed_checksum(path) == recorded
+        # an explicit checksum overrides it
         digest = hashlib.sha256(served.data).hexdigest()
         fetched = fetch(entry(sha256="0" * 64), base, folder, digest.upper(), no_progress)
     assert (fetched.checksum_source, fetched.sha256, listed_checksum(path)) == ("--sha256", digest, digest)

@@ -30,19 +30,19 @@ def relation(predicate: str = "on", target: str = "mug", anchor: str = "table") 
     return {"predicate": predicate, "target": target, "anchor": anchor}
 
 
-class Told:
+class ScriptedModel:
     """A model that returns a given answer, or fails."""
 
     version = "1"
 
     def __init__(self, *answers: str) -> None:
         self.answers = list(answers)
-        self.asked: list[Sequence[Message]] = []
+        self.requests: list[Sequence[Message]] = []
 
     def complete(self, messages: Sequence[Message]) -> str:
-        self.asked.append(messages)
+        self.requests.append(messages)
         if not self.answers:
-            raise LanguageModelError("language model: told nothing")
+            raise LanguageModelError("language model: no answer")
         return self.answers.pop(0)
 
 
@@ -51,7 +51,7 @@ def test_a_correct_answer_equals_the_graph_of_the_rules():
 
 
 @pytest.mark.parametrize(
-    ("task", "answered", "kept"),
+    ("task", "targets", "kept"),
     [
         ("Pick up the mug without touching the vase", ["mug", "vase"], ("mug",)),
         ("Map the chairs except the stool", ["chair", "stools"], ("chair",)),
@@ -63,11 +63,11 @@ def test_a_correct_answer_equals_the_graph_of_the_rules():
         ("Avoid the trash cans", ["trash can"], ("trash can",)),
     ],
 )
-def test_a_target_that_the_sentence_excludes_is_dropped_and_named(task, answered, kept):
-    graph = parse_answer(task, answer(answered, []))
+def test_a_target_that_the_sentence_excludes_is_dropped_and_named(task, targets, kept):
+    graph = parse_answer(task, answer(targets, []))
     assert graph.targets == kept
-    said = [warning for warning in graph.warnings if "is to be left alone: it is dropped" in warning]
-    assert len(said) == len(answered) - len(kept)
+    dropped = [warning for warning in graph.warnings if "is to be left alone: it is dropped" in warning]
+    assert len(dropped) == len(targets) - len(kept)
 
 
 def test_an_answer_of_excluded_objects_alone_is_refused():
@@ -76,15 +76,15 @@ def test_an_answer_of_excluded_objects_alone_is_refused():
 
 
 def test_an_answer_within_prose_is_found():
-    said = f"Sure! Here it is:\n```json\n{answer()}\n```\nAnything else? {{}}"
-    assert parse_answer(TASK, said).targets == ("mug",)
+    text = f"Sure! Here it is:\n```json\n{answer()}\n```\nAnything else? {{}}"
+    assert parse_answer(TASK, text).targets == ("mug",)
 
 
 def test_an_invented_object_is_dropped_and_named():
     graph = parse_answer(TASK, answer(["mug", "dragon"], ["table", "castle"], relation(), relation(anchor="castle")))
     assert (graph.targets, graph.anchors) == (("mug",), ("table",))
     assert graph.relations == (Relation(Predicate.ON, "mug", "table"),)
-    assert [name for name in ("dragon", "castle") if any(repr(name) in said for said in graph.warnings)] == [
+    assert [name for name in ("dragon", "castle") if any(repr(name) in warning for warning in graph.warnings)] == [
         "dragon", "castle",
     ]  # fmt: skip
     assert len(graph.warnings) == 3
@@ -109,7 +109,7 @@ def test_a_noun_that_the_sentence_implies_is_kept(task, target):
 
 
 @pytest.mark.parametrize(
-    "said",
+    "text",
     [
         "", "no idea", "{", "{}", "[]", "null", answer(["dragon"], []), answer([], []), answer("mug", []),
         answer([3], []), answer([""], []), answer(["mug\u0000"], []), answer(["mug" * 40], []),
@@ -120,8 +120,8 @@ def test_a_noun_that_the_sentence_implies_is_kept(task, target):
         '{"targets": ' + "9" * 10_000 + "}", "x" * 70_000,
     ],
 )  # fmt: skip
-def test_nonsense_falls_back_to_rules_with_a_warning(said):
-    graph = FallbackParser(LanguageParser(Told(said)), "http", RuleParser()).parse(TASK)
+def test_nonsense_falls_back_to_rules_with_a_warning(text):
+    graph = FallbackParser(LanguageParser(ScriptedModel(text)), "http", RuleParser()).parse(TASK)
     assert graph.relations == (Relation(Predicate.ON, "mug", "table"),)
     assert graph.warnings[0].startswith("backend http failed (language model")
     assert graph.warnings[0].isprintable()
@@ -148,9 +148,9 @@ SHAPED = st.fixed_dictionaries({"targets": PHRASES | JSON, "anchors": PHRASES, "
 
 
 @given(st.text(max_size=300) | JSON.map(json.dumps) | SHAPED.map(json.dumps))
-def test_any_answer_gives_a_graph_of_the_sentence_or_is_refused(said):
+def test_any_answer_gives_a_graph_of_the_sentence_or_is_refused(text):
     try:
-        graph = parse_answer(TASK, said)
+        graph = parse_answer(TASK, text)
     except LanguageModelError as error:
         message = str(error)
     else:
@@ -161,24 +161,24 @@ def test_any_answer_gives_a_graph_of_the_sentence_or_is_refused(said):
 
 
 def test_an_invalid_task_is_refused_before_the_model_is_called():
-    model = Told(answer())
+    model = ScriptedModel(answer())
     with pytest.raises(TaskError, match="names an object"):
         LanguageParser(model).parse("!?")
-    assert model.asked == []
+    assert model.requests == []
 
 
 def test_answers_are_cached_failures_are_not_and_the_cache_is_bounded():
-    model = Told(answer())
+    model = ScriptedModel(answer())
     parser = CachedParser(LanguageParser(model), "http", "1", capacity=1)
     assert parser.parse(TASK) is parser.parse(TASK)
-    assert len(model.asked) == 1
+    assert len(model.requests) == 1
     for _ in range(2):
         with pytest.raises(LanguageModelError):
             parser.parse("Find the table")
     model.answers = [answer(["table"], []), answer(["mug"], [])]
     parser.parse("Find the table")
     parser.parse(TASK)
-    assert len(model.asked) == 5
+    assert len(model.requests) == 5
 
 
 def test_the_prompts_own_examples_are_graphs_by_its_own_schema():
@@ -187,8 +187,8 @@ def test_the_prompts_own_examples_are_graphs_by_its_own_schema():
     assert messages[-1] == Message(Role.USER, "Find the mug")
     shots = list(zip(messages[1:-1:2], messages[2:-1:2], strict=True))
     assert len(shots) >= 4
-    for asked, answered in shots:
-        assert parse_answer(asked.text, answered.text).warnings == ()
+    for request, response in shots:
+        assert parse_answer(request.text, response.text).warnings == ()
 
 
 @pytest.mark.parametrize(

@@ -35,7 +35,7 @@ CODES = {
 
 
 class Raising(parser_service_pb2_grpc.ParserServiceServicer):
-    """Raises the error whose name it is asked to parse."""
+    """A servicer that raises the error named by the request's text."""
 
     def __init__(self) -> None:
         self.calls = 0
@@ -44,7 +44,7 @@ class Raising(parser_service_pb2_grpc.ParserServiceServicer):
         self.calls += 1
         if request.text == "UNAUTHENTICATED":
             await context.abort(grpc.StatusCode.UNAUTHENTICATED, "no certificate")
-        raise getattr(errors, request.text)("one line: what, what came")
+        raise getattr(errors, request.text)("one line: expected a, got b")
 
 
 def service(servicer: Raising) -> Service:
@@ -64,8 +64,8 @@ def test_the_client_raises_what_the_server_raised(kind: type[GaussLiteError]) ->
     ):
         client.parse(kind.__name__)
     assert type(caught.value) is kind
-    assert str(caught.value) == "one line: what, what came"
-    # only what says "try again" is tried again
+    assert str(caught.value) == "one line: expected a, got b"
+    # only errors that ask for a retry are retried
     assert servicer.calls == (4 if kind is UnavailableError else 1)
 
 

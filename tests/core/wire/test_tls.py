@@ -84,13 +84,13 @@ def test_a_robot_can_only_act_for_its_own_agent_id(certs: Path) -> None:
 
 
 def test_an_uplink_sends_over_an_encrypted_connection(certs: Path) -> None:
-    words = group_by_voxel(plain_gaussians(np.linspace(0, 1, 60)), GRID)
+    batch = group_by_voxel(plain_gaussians(np.linspace(0, 1, 60)), GRID)
     with fusion_server(tls=identity(certs, "server")) as fusion:
         for name in ("husky-1", "husky-2"):
             client = FusionClient(fusion.client.address, tls=identity(certs, name))
             # the second one shows the first one's name
             uplink = Uplink(client, "husky-1", Spool(None, "husky-1", GRID), GRID, UplinkSettings(interval_s=0.0))
-            uplink.enqueue(words)
+            uplink.enqueue(batch)
             assert uplink.drain(20.0) == (name == "husky-1")
             counters = uplink.counters()
             uplink.close()
@@ -138,7 +138,7 @@ def test_wrong_files_are_one_error_line_before_serving(
     locked = tmp_path / "locked.key"
     lock = ["openssl", "pkcs8", "-topk8", "-in", key, "-out", str(locked), "-passout", "pass:secret-word"]
     subprocess.run(lock, check=True, timeout=60)
-    for options, told in (
+    for options, expected in (
         (("--tls-cert", cert), "--tls-cert: expected a certificate and its key"),
         (("--tls-key", key), "--tls-cert: expected a certificate and its key"),
         (("--tls-ca", ca), "--tls-ca: expected --tls-cert and --tls-key too"),
@@ -151,7 +151,7 @@ def test_wrong_files_are_one_error_line_before_serving(
     ):
         assert run(["--listen", "nowhere", *options]) == 2
         [line] = capsys.readouterr().err.splitlines()
-        assert told in line
+        assert expected in line
 
 
 def test_a_key_is_in_no_representation(certs: Path, caplog: pytest.LogCaptureFixture) -> None:

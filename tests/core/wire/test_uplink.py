@@ -68,7 +68,7 @@ def test_voxels_with_the_highest_kappa_sum_are_sent_first() -> None:
     slow = UplinkSettings(kbps=1.0, interval_s=0.0)
     with scripted(lambda *_: accepted()) as (server, address), uplink(address, slow) as link:
         link.enqueue(make_batch({cell: [cell] * 40 for cell in range(1, 9)}))
-        assert server.came.wait(WAIT_S)
+        assert server.received.wait(WAIT_S)
         assert not link.drain(0.0)
         first = server.subsets[0]
     assert first.keys.tolist() == [make_batch({8: [1]}).keys[0]]

@@ -97,9 +97,9 @@ class SlowDisk(Spool):
 
     now_s = 0.0
 
-    def enqueue(self, words: VoxelBatch, purpose: Purpose) -> None:
+    def enqueue(self, batch: VoxelBatch, purpose: Purpose) -> None:
         self.now_s += 1.0
-        super().enqueue(words, purpose)
+        super().enqueue(batch, purpose)
 
 
 def test_publishing_is_part_of_a_frames_time() -> None:
@@ -136,8 +136,9 @@ def test_idle_training_stops_at_its_limit_and_other_work_runs_in_between() -> No
     np.testing.assert_array_equal(trained[-2].opacities, trained[-1].opacities)
     worker.submit(frame(1)).result(20)
     worker.end_idle_training().result(20)
-    settled = worker.run(lambda mapper: mapper.gaussians()).result(20)
-    np.testing.assert_array_equal(settled.opacities, worker.run(lambda mapper: mapper.gaussians()).result(20).opacities)
+    idle_map = worker.run(lambda mapper: mapper.gaussians()).result(20)
+    later_map = worker.run(lambda mapper: mapper.gaussians()).result(20)
+    np.testing.assert_array_equal(idle_map.opacities, later_map.opacities)
     assert worker.status().idle_iterations <= 10
     worker.close()
 

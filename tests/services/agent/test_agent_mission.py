@@ -54,7 +54,7 @@ class Wall:
     excluded_frames: str = ""
     camera: Camera = CAMERA
     broken_at: int | None = None
-    asked: list[int] = field(default_factory=list)
+    read: list[int] = field(default_factory=list)
     reached: threading.Event = field(default_factory=threading.Event)
 
     def __len__(self) -> int:
@@ -63,8 +63,8 @@ class Wall:
     def frame(self, i: int, size: tuple[int, int] | None = None) -> Frame:
         if i == self.broken_at:
             raise DatasetError(f"wall/frame-{i}.png: expected an image, got noise")
-        self.asked.append(i)
-        if len(self.asked) == 2:
+        self.read.append(i)
+        if len(self.read) == 2:
             self.reached.set()
         return frame(i, CAMERA)
 
@@ -76,9 +76,9 @@ class Wall:
 
 
 def settings(out: Path | None, *more: str) -> AgentSettings:
-    asked = ["--agent-id", "robot", "--task", "Pick up the mug", "--max-gaussians", "2000", "--iterations", "2"]
-    asked += ["--source", "wall", "--threads", "1", *more]
-    return parse_arguments([*asked, "--out", str(out)] if out is not None else asked)
+    options = ["--agent-id", "robot", "--task", "Pick up the mug", "--max-gaussians", "2000", "--iterations", "2"]
+    options += ["--source", "wall", "--threads", "1", *more]
+    return parse_arguments([*options, "--out", str(out)] if out is not None else options)
 
 
 @contextmanager
@@ -139,11 +139,11 @@ def test_without_a_fusion_server_nothing_is_sent(tmp_path: Path) -> None:
     with agent_mission(options) as (mission, _):
         mission.run(stream_of(wall, options))
     report = json.loads((tmp_path / "report.json").read_text())
-    assert wall.asked == [0, 1, 2, 4, 5]
+    assert wall.read == [0, 1, 2, 4, 5]
     assert (report["frames"], report["bytes_sent"], report["map_shared_percent"]) == (5, 0, 0)
 
 
-def test_a_stopped_mission_writes_its_map_so_far(tmp_path: Path) -> None:
+def test_a_stopped_mission_writes_its_current_map(tmp_path: Path) -> None:
     options, wall = settings(tmp_path), Wall(10_000)
     with agent_mission(options) as (mission, _):
         thread = threading.Thread(target=mission.run, args=(stream_of(wall, options),))

@@ -106,10 +106,10 @@ def test_each_frame_has_its_outcome_in_order() -> None:
 
 
 def test_another_task_switches_the_region_and_an_equivalent_task_changes_nothing() -> None:
-    asked: list[str] = []
+    built: list[str] = []
 
     def build_estimator(graph: TaskGraph) -> RelevanceEstimator:
-        asked.append(graph.text)
+        built.append(graph.text)
         x_m = 0.0 if "mug" in graph.targets else 0.3
         return RegionRelevanceEstimator([BallRegion((x_m, 0.0, 1.2), 0.2)])
 
@@ -121,13 +121,13 @@ def test_another_task_switches_the_region_and_an_equivalent_task_changes_nothing
         a.client.assign_task("Take the mug on the table")
         same = a.worker.run(lambda mapper: mapper.gaussians()).result(20)
         np.testing.assert_array_equal(same.active, first.active)
-        assert asked == [TASK]
+        assert built == [TASK]
         a.client.assign_task("Find the chair")
         a.worker.submit(frame(3)).result(20)
         turned = a.worker.run(lambda mapper: mapper.gaussians()).result(20)
         # all three showed the first region, and views of the region are remembered
         assert a.worker.status().keyframes_reevaluated == 3
-    assert asked == [TASK, "Find the chair"]
+    assert built == [TASK, "Find the chair"]
     assert turned.means_m[turned.active][:, 0].mean() > first.means_m[first.active][:, 0].mean() + 0.1
 
 
@@ -257,9 +257,9 @@ def test_only_the_tasks_region_leaves_the_robot() -> None:
                 gaussians = a.worker.run(lambda mapper: mapper.gaussians()).result(20)
         finally:
             uplink.close()
-    held = store.batch("robot")
-    assert held.gaussians.active.all()
-    assert len(held.gaussians) == gaussians.active.sum() < len(gaussians)
+    stored = store.batch("robot")
+    assert stored.gaussians.active.all()
+    assert len(stored.gaussians) == gaussians.active.sum() < len(gaussians)
     assert status.uplink.connected
     assert status.uplink.bytes_sent > 0
     assert status.uplink.voxels_waiting == 0

@@ -40,8 +40,8 @@ MUG, TASK, LATER = BallRegion((0.0, 0.0, 1.2), 0.2), "Pick up the mug", "Find th
 
 
 def settings(state: Path, *more: str) -> AgentSettings:
-    asked = ["--agent-id", "robot", "--task", TASK, "--max-gaussians", "2000", "--iterations", "2"]
-    return parse_arguments([*asked, "--threads", "1", "--state", str(state), *more])
+    options = ["--agent-id", "robot", "--task", TASK, "--max-gaussians", "2000", "--iterations", "2"]
+    return parse_arguments([*options, "--threads", "1", "--state", str(state), *more])
 
 
 @contextmanager
@@ -55,8 +55,9 @@ def agent_run(
     uplink = None
     if fusion is not None:
         client = FusionClient(fusion.client.address)
-        held = Spool(spool, "robot", GRID)
-        uplink = Uplink(client, "robot", held, GRID, UplinkSettings(interval_s=0.0), has_restored_map=saved is not None)
+        opened_spool = Spool(spool, "robot", GRID)
+        uplink_settings = UplinkSettings(interval_s=0.0)
+        uplink = Uplink(client, "robot", opened_spool, GRID, uplink_settings, has_restored_map=saved is not None)
     worker = MappingWorker(options.mission, GRID, lambda _graph: RegionRelevanceEstimator([MUG]), uplink)
     try:
         if saved is not None:
@@ -91,9 +92,9 @@ def region_batch(worker: MappingWorker) -> VoxelBatch:
     return group_by_voxel(worker.run(lambda mapper: mapper.roi_gaussians()).result(), GRID)
 
 
-def totals(words: VoxelBatch) -> dict[int, tuple[int, int]]:
+def totals(batch: VoxelBatch) -> dict[int, tuple[int, int]]:
     """Sum of kappa and count of each voxel that is not empty."""
-    columns = words.keys.tolist(), words.kappa_sums.tolist(), words.counts.tolist()
+    columns = batch.keys.tolist(), batch.kappa_sums.tolist(), batch.counts.tolist()
     return {key: (kappa, count) for key, kappa, count in zip(*columns, strict=True) if count}
 
 
@@ -106,17 +107,17 @@ def test_a_restarted_mission_gives_the_same_map_and_updates(tmp_path: Path) -> N
     with fusion_server(whole) as fusion, agent_run(settings(tmp_path / "whole.state"), fusion) as (mission, worker):
         map_frames(worker, *range(8))
         mission.finish()
-        wanted = map_of(worker)
+        expected = map_of(worker)
     with fusion_server(first) as fusion:
         for indices in (range(4), range(4, 8)):
             with agent_run(second, fusion, tmp_path / "robot.spool") as (mission, worker):
                 map_frames(worker, *indices)
                 mission.finish()
-        came = restored_map(second)
+        restored = restored_map(second)
     for column in ("means_m", "opacities", "kappa", "active"):
-        np.testing.assert_array_equal(getattr(came, column), getattr(wanted, column))
+        np.testing.assert_array_equal(getattr(restored, column), getattr(expected, column))
     assert totals_on(first) == totals_on(whole)
-    assert wanted.kappa.max() > 0
+    assert expected.kappa.max() > 0
 
 
 def restored_map(options: AgentSettings) -> Gaussians:
@@ -148,9 +149,9 @@ def test_the_fused_map_follows_the_agent_through_clean_and_unsaved_ends(keeps_sp
             assert worker.status().graph == RuleParser().parse(TASK)
             assert worker.uplink is not None
             assert worker.uplink.drain(20.0)
-            words = region_batch(worker)
-            np.testing.assert_array_equal(words.kappa_sums, kept.kappa_sums)
-            assert totals_on(store).items() >= totals(words).items()
+            batch = region_batch(worker)
+            np.testing.assert_array_equal(batch.kappa_sums, kept.kappa_sums)
+            assert totals_on(store).items() >= totals(batch).items()
 
 
 def test_a_server_that_lost_its_data_receives_it_again(tmp_path: Path) -> None:
@@ -170,11 +171,11 @@ def test_an_assigned_task_is_kept_and_another_command_line_task_replaces_it(tmp_
         map_frames(worker, 0)
         worker.assign(RuleParser().parse(LATER)).result()
         mission.finish()
-    for command_line, wanted in ((TASK, LATER), ("Find the lamp", "Find the lamp"), (None, "Find the lamp")):
+    for command_line, expected in ((TASK, LATER), ("Find the lamp", "Find the lamp"), (None, "Find the lamp")):
         with agent_run(replace(options, task=command_line)) as (mission, worker):
             graph = worker.status().graph
             assert graph is not None
-            assert graph.text == wanted
+            assert graph.text == expected
             mission.finish()
 
 
@@ -213,7 +214,7 @@ def test_a_wrong_file_is_one_line_before_the_agent_listens(tmp_path: Path, capsy
         mission.finish()
     (tmp_path / "notes").write_text("remember the milk")
     listen = ["--listen", "127.0.0.1:0", "--agent-id", "robot", "--iterations", "2"]
-    for arguments, told in (
+    for arguments, expected in (
         (["--state", str(tmp_path / "robot.state")], "--max-gaussians '2000' (got '150000')"),
         (["--state", str(tmp_path / "notes")], "notes: expected the file of a saved run"),
         (["--state", str(tmp_path)], "expected the name of a file, got a folder"),
@@ -221,7 +222,7 @@ def test_a_wrong_file_is_one_line_before_the_agent_listens(tmp_path: Path, capsy
     ):
         assert run([*listen, *arguments]) == 2
         [line] = capsys.readouterr().err.splitlines()
-        assert told in line
+        assert expected in line
 
 
 def test_a_real_agent_resumes_its_mission(tmp_path: Path) -> None:

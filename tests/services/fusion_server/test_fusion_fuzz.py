@@ -31,7 +31,7 @@ fuzz = settings(max_examples=50, deadline=None)
 
 @dataclass(frozen=True)
 class Target:
-    """A server in a process of its own: its threads would otherwise draw random numbers beside hypothesis."""
+    """A server in another process, because its threads use random numbers, which hypothesis does not allow."""
 
     process: subprocess.Popen[bytes]
     client: FusionClient
@@ -42,7 +42,7 @@ class Target:
         return [outcome for answer in self.client.contribute(requests, 20.0) for outcome in answer.outcomes]
 
     def code(self, method: str, message: bytes) -> grpc.StatusCode:
-        """How the call begins to go: OK when an answer comes."""
+        """Return OK after the first answer, otherwise the status code of the call."""
         call = self.channel.stream_stream(f"/gausslite.v1.FusionService/{method}")(iter([message]), timeout=10)
         try:
             next(call, None)
@@ -115,7 +115,7 @@ def test_a_mutated_keyframe_is_reported_and_the_stream_continues(
     method=st.sampled_from([method.name for method in pb.DESCRIPTOR.services_by_name["FusionService"].methods]),
 )
 def test_the_server_answers_after_random_bytes_to_any_method(target: Target, blob: bytes, method: str) -> None:
-    # INTERNAL and UNKNOWN are the transport's own words for bytes that are no message
+    # INTERNAL and UNKNOWN are the transport's own codes for bytes that are not a message
     assert target.code(method, blob) in KNOWN | {grpc.StatusCode.INTERNAL, grpc.StatusCode.UNKNOWN}
     target.assert_alive()
 

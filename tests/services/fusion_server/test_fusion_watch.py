@@ -57,10 +57,10 @@ def test_many_changes_become_one_with_each_voxel_once() -> None:
             contribute(revision, {0: [revision], 1: [1] if revision % 2 else []})
         block = await anext(blocks)
         assert (block.snapshot, block.last) == (False, True)
-        words = group_by_voxel(block)
-        assert words.keys.tolist() == keys(0, 1).tolist()
-        assert words.kappa_sums.tolist() == [30, 0]
-        assert words.counts.tolist() == [1, 0]
+        batch = group_by_voxel(block)
+        assert batch.keys.tolist() == keys(0, 1).tolist()
+        assert batch.kappa_sums.tolist() == [30, 0]
+        assert batch.counts.tolist() == [1, 0]
 
     watching(FusionSettings(grid=GRID), body)
 

@@ -81,21 +81,21 @@ def test_a_revision_from_before_a_restart_is_out_of_range() -> None:
                 next(t.client.watch(revision))
 
 
-def follow(updates: Iterator[MapUpdate], held: VoxelBatch) -> VoxelBatch:
-    """What is held after the next revision."""
+def follow(updates: Iterator[MapUpdate], watched: VoxelBatch) -> VoxelBatch:
+    """Return the watched map after the next revision."""
     for update in updates:
-        held = update.apply_to(held)
+        watched = update.apply_to(watched)
         if update.last:
             break
-    return held
+    return watched
 
 
 def test_applying_all_updates_gives_the_fused_map() -> None:
     with fusion_server() as t:
         ant, bee = (t.client.join(name, GRID).session_id for name in ("ant", "bee"))
         watch = t.client.watch()
-        held = follow(watch, empty_batch())
-        assert len(held) == 0
+        watched = follow(watch, empty_batch())
+        assert len(watched) == 0
         many = {cell: [1] * 8 for cell in range(3000)}
         for change in (
             lambda: t.contribute_subsets(ant, make_subset("ant", 1, {0: [5], 1: [1]})),
@@ -106,17 +106,17 @@ def test_applying_all_updates_gives_the_fused_map() -> None:
             lambda: t.client.leave(bee, forget=True),
         ):
             change()
-            held = follow(watch, held)
+            watched = follow(watch, watched)
             now = follow(t.client.watch(), empty_batch())
-            assert held.keys.tolist() == now.keys.tolist()
-            assert held.kappa_sums.tolist() == now.kappa_sums.tolist()
-            np.testing.assert_array_equal(held.gaussians.means_m, now.gaussians.means_m)
-        # a second snapshot begins anew, however many parts it has
+            assert watched.keys.tolist() == now.keys.tolist()
+            assert watched.kappa_sums.tolist() == now.kappa_sums.tolist()
+            np.testing.assert_array_equal(watched.gaussians.means_m, now.gaussians.means_m)
+        # a later snapshot replaces the map, however many parts it has
         for part in range(3):
             t.contribute_subsets(
                 ant, make_subset("ant", 3 + part, {cell: many[cell] for cell in range(part * 1000, part * 1000 + 1000)})
             )
-        again = follow(t.client.watch(), held)
+        again = follow(t.client.watch(), watched)
         assert again.keys.tolist() == keys(*range(3000)).tolist()
         watch.close()
 

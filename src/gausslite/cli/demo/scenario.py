@@ -43,7 +43,7 @@ class AgentPlan:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scenario:
-    """What the agents map, and the views and regions on which their maps are scored.
+    """Sequences and tasks of the agents, and the views and regions on which their maps are scored.
 
     test_every: agents keep every n-th frame from mapping; None if the held-out views are of another sequence.
     """

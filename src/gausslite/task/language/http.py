@@ -23,7 +23,7 @@ _MAX_ANSWER_TOKENS: Final = 1024
 
 
 class ResponseFormat(StrEnum):
-    """How the request asks for JSON; not every server supports all of them."""
+    """The response_format of the request; not every server supports all of them."""
 
     JSON_SCHEMA = "json_schema"
     JSON_OBJECT = "json_object"
