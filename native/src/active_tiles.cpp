@@ -17,17 +17,17 @@ void ActiveTiles::assign(const uint8_t* active, int across, int down) {
     }
   }
   fill_box_ = tiles == (box_.x1 - box_.x0) * (box_.y1 - box_.y0);
-  count(active, size_t(down));
-  build_near_masks(active, size_t(down));
+  build_prefix_counts(active, size_t(down));
+  build_small_box_masks(active, size_t(down));
 }
 
-void ActiveTiles::count(const uint8_t* active, size_t down) {
+void ActiveTiles::build_prefix_counts(const uint8_t* active, size_t down) {
   const size_t stride = across_ + 1;
-  before_.reserve(stride * (down + 1));
-  std::fill_n(before_.data(), stride, 0u);
+  prefix_counts_.ensure_capacity(stride * (down + 1));
+  std::fill_n(prefix_counts_.data(), stride, 0u);
   for (size_t y = 0; y < down; ++y) {
-    const uint32_t* above = &before_[stride * y];
-    uint32_t* before = &before_[stride * (y + 1)];
+    const uint32_t* above = &prefix_counts_[stride * y];
+    uint32_t* before = &prefix_counts_[stride * (y + 1)];
     before[0] = 0;
     uint32_t in_row = 0;
     for (size_t x = 0; x < across_; ++x) {
@@ -37,25 +37,25 @@ void ActiveTiles::count(const uint8_t* active, size_t down) {
   }
 }
 
-// First along each row of tiles (the lowest four bits), then over the rows below.
-void ActiveTiles::build_near_masks(const uint8_t* active, size_t down) {
-  constexpr uint32_t kRow = (1u << kNear) - 1u, kEveryRow = 0x1111u;
+// First sets the bits of boxes of one row (the lowest four), then combines them with those of the rows below.
+void ActiveTiles::build_small_box_masks(const uint8_t* active, size_t down) {
+  constexpr uint32_t kRow = (1u << kSmallBox) - 1u, kEveryRow = 0x1111u;
   const size_t tiles = across_ * down;
-  near_.reserve(tiles + 1);
+  small_box_masks_.ensure_capacity(tiles + 1);
   sentinel_tile_ = uint32_t(tiles);
-  near_[tiles] = uint16_t(~0u);
+  small_box_masks_[tiles] = uint16_t(~0u);
   for (size_t t = 0; t < tiles; ++t) {
-    const size_t columns = std::min<size_t>(kNear, across_ - t % across_);
+    const size_t columns = std::min<size_t>(kSmallBox, across_ - t % across_);
     uint32_t row = 0;
     for (size_t w = 0; w < columns; ++w) row |= active[t + w] ? kRow << w : 0u;
-    near_[t] = uint16_t(row & kRow);
+    small_box_masks_[t] = uint16_t(row & kRow);
   }
   for (size_t t = 0; t < tiles; ++t) {
     uint32_t rows = 0;
-    for (size_t h = 0, below = t; h < kNear && below < tiles; ++h, below += across_) {
-      rows |= (near_[below] & kRow) * kEveryRow << (kNear * h);
+    for (size_t h = 0, below = t; h < kSmallBox && below < tiles; ++h, below += across_) {
+      rows |= (small_box_masks_[below] & kRow) * kEveryRow << (kSmallBox * h);
     }
-    near_[t] = uint16_t(rows);
+    small_box_masks_[t] = uint16_t(rows);
   }
 }
 

@@ -8,7 +8,7 @@ namespace gausslite {
 
 const float* AdamCorrections::table(double beta1, double beta2, double decay_after_updates) {
   if (beta1 != beta1_ || beta2 != beta2_ || decay_after_updates != decay_after_updates_) {
-    table_.reserve(2 * size_t(kCount));
+    table_.ensure_capacity(2 * size_t(kCount));
     for (int t = 1; t <= kCount; ++t) {
       const double rate = std::sqrt(std::min(1.0, decay_after_updates / t));
       table_[2 * size_t(t - 1)] = float(rate / (1.0 - std::pow(beta1, t)));

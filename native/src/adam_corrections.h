@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// Factors of Adam's step by a splat's number of updates, computed once per setting.
+// Table of the factors of Adam's step that depend on a splat's number of updates, computed once per setting.
 #pragma once
 
 #include "memory.h"

@@ -11,8 +11,8 @@ namespace gausslite::GAUSSLITE_ISA {
 
 namespace {
 
-// A splat and a tile column of its bounding box. Touches are first collected and then tested, both without branches:
-// tiles and blocks of a splat are unpredictable.
+// A pair of a splat and a tile column of its bounding box. The pairs are first collected and then tested, both without
+// branches: the number of tiles and blocks of a splat is unpredictable.
 struct Touch {
   uint32_t slot, x;
 };
@@ -44,13 +44,13 @@ GAUSSLITE_INLINE uint32_t touched_blocks(const Splat& s, float tile_x, float til
 GAUSSLITE_INLINE void list_touches(const Workspace& ws, int tile_row, const Touch* touches, int n,
                                    const uint16_t* needed, TileList* tiles) {
   for (int x = 0; x < ws.tiles_x; ++x) {
-    tiles[x].slots.reserve(tiles[x].count + kTouches + 1 + kChunk, tiles[x].count);
-    tiles[x].blocks.reserve(tiles[x].count + kTouches + 1 + kChunk, tiles[x].count);
+    tiles[x].slots.ensure_capacity(tiles[x].count + kTouches + 1 + kChunk, tiles[x].count);
+    tiles[x].blocks.ensure_capacity(tiles[x].count + kTouches + 1 + kChunk, tiles[x].count);
   }
   for (int i = 0; i < n; ++i) {
     const auto [slot, x] = touches[i];
     const uint32_t blocks = needed[x] & touched_blocks(ws.splats[slot], float(x * kTile), float(tile_row * kTile));
-    // Always written, counted only if a block is touched: no branch to mispredict.
+    // Each splat is written, but counted only if it touches a needed block: no branch to mispredict.
     TileList& tile = tiles[x];
     tile.slots[tile.count] = slot;
     tile.blocks[tile.count] = uint16_t(blocks);
@@ -84,7 +84,7 @@ void bin_tile_row(const Workspace& ws, int tile_row, const DepthKey* keys, int c
   list_touches(ws, tile_row, touches, n, needed, tiles);
   // The tile stages prefetch one chunk ahead: pad the list with slot 0.
   for (int x = 0; x < ws.tiles_x; ++x) {
-    tiles[x].slots.reserve(tiles[x].count + kChunk, tiles[x].count);
+    tiles[x].slots.ensure_capacity(tiles[x].count + kChunk, tiles[x].count);
     std::memset(&tiles[x].slots[tiles[x].count], 0, kChunk * sizeof(uint32_t));
   }
 }

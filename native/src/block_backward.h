@@ -1,10 +1,10 @@
 // SPDX-License-Identifier: Apache-2.0
 // The backward pass of one 4x4 block, in front-to-back order, and its sums per splat.
 //
-// With weights w_i = alpha_i T_i and q_i = <dL/d(rgb, depth, alpha), (rgb_i, depth_i, 1)>, the derivative by
-// ln(alpha_i) is w_i q_i - alpha_i / (1 - alpha_i) S_i with the suffix sum S_i = sum over k > i of w_k q_k. S_i is the
-// total minus the prefix sum, and the finished pixel gives the total. So one running scalar per pixel suffices, without
-// a division chain for the transmittance or a back-to-front pass.
+// With weights w_i = alpha_i T_i and q_i = <dL/d(rgb, depth, alpha), (rgb_i, depth_i, 1)>, the derivative
+// with respect to ln(alpha_i) is w_i q_i - alpha_i / (1 - alpha_i) S_i with the suffix sum S_i = sum over k > i of w_k
+// q_k. S_i is the total minus the prefix sum, and the finished pixel gives the total. So one running scalar per pixel
+// suffices, without a division chain for the transmittance or a back-to-front pass.
 #pragma once
 
 #include "block_forward.h"
@@ -16,19 +16,19 @@
 
 namespace gausslite::GAUSSLITE_ISA {
 
-// Sixteen pixels: gradients by r g b depth alpha, the running transmittance and the suffix sum.
+// Sixteen pixels: gradients of r g b depth alpha, the running transmittance and the suffix sum.
 struct BlockGradient {
-  Pack16 by[5];
-  Pack16 by_column[4];  // lane 4 y + c of element x: gradient of channel c (r g b depth) at pixel (x, y)
-  Pack16 transmittance, behind;
+  Pack16 d_image[5];
+  Pack16 d_columns[4];  // lane 4 y + c of element x: gradient of channel c (r g b depth) at pixel (x, y)
+  Pack16 transmittance, suffix_sum;
 
   // `image`: the finished pixels, r g b depth and transmittance.
   GAUSSLITE_INLINE void start(const Pack16 (&gradient)[5], const Pack16 (&image)[5]) {
-    behind = gradient[4] * (Pack16(1.0f) - image[4]);
-    for (int k = 0; k < 4; ++k) behind = fma(gradient[k], image[k], behind);
-    for (int k = 0; k < 5; ++k) by[k] = gradient[k];
-    for (int k = 0; k < 4; ++k) by_column[k] = gradient[k];
-    transpose_quads(by_column[0], by_column[1], by_column[2], by_column[3]);
+    suffix_sum = gradient[4] * (Pack16(1.0f) - image[4]);
+    for (int k = 0; k < 4; ++k) suffix_sum = fma(gradient[k], image[k], suffix_sum);
+    for (int k = 0; k < 5; ++k) d_image[k] = gradient[k];
+    for (int k = 0; k < 4; ++k) d_columns[k] = gradient[k];
+    transpose_within_quads(d_columns[0], d_columns[1], d_columns[2], d_columns[3]);
     transmittance = Pack16(1.0f);
   }
 };
@@ -46,13 +46,15 @@ struct ChunkSums {
 };
 
 // Adds the weights of sixteen pixels times their channel gradients, summed over the columns of the block.
-GAUSSLITE_INLINE Pack16 add_colours(Pack16 weight, const Pack16 (&by_column)[4], Pack16 sums) {
+GAUSSLITE_INLINE Pack16 add_colours(Pack16 weight, const Pack16 (&d_columns)[4], Pack16 sums) {
   const Pack16 even =
-      fma(spread_in_quads<2>(weight), by_column[2], fma(spread_in_quads<0>(weight), by_column[0], sums));
-  const Pack16 odd = fma(spread_in_quads<3>(weight), by_column[3], spread_in_quads<1>(weight) * by_column[1]);
+      fma(broadcast_within_quads<2>(weight), d_columns[2], fma(broadcast_within_quads<0>(weight), d_columns[0], sums));
+  const Pack16 odd =
+      fma(broadcast_within_quads<3>(weight), d_columns[3], broadcast_within_quads<1>(weight) * d_columns[1]);
   return even + odd;
 }
 
+// Alphas above this are taken as clamped to 0.99 (kLog2MaxAlpha), so that their gradient is 0.
 constexpr float kBelowMaxAlpha = 0.989995f;
 
 // Backward pass over n entries of a block's list. kFromAlphas: reads the alphas of the forward pass; otherwise computes
@@ -62,12 +64,12 @@ GAUSSLITE_INLINE void backward_block(const Splat* records, const uint8_t* list, 
                                      BlockGradient& gradient, ChunkSums& sums, MomentBatch& batch,
                                      const float*& alphas) {
   const Pack16 pixel_x = tile.pixel_x(b), pixel_y = tile.pixel_y(b);
-  // A local copy without aliases stays in registers.
+  // The compiler keeps a local copy without aliases in registers.
   BlockGradient g = gradient;
-  for (int begin = 0, taken; begin < n; begin += taken) {
-    taken = n - begin < batch.free_slots() ? n - begin : batch.free_slots();
+  for (int begin = 0, batch_size; begin < n; begin += batch_size) {
+    batch_size = n - begin < batch.free_slots() ? n - begin : batch.free_slots();
     float (*values)[16] = batch.values + batch.count();
-    for (int i = 0; i < taken; ++i) {
+    for (int i = 0; i < batch_size; ++i) {
       const int entry = list[begin + i];
       const Splat& s = records[entry];
       Pack16 alpha;
@@ -75,24 +77,24 @@ GAUSSLITE_INLINE void backward_block(const Splat* records, const uint8_t* list, 
         alpha = load(alphas);
         alphas += 16;
       } else {
-        alpha = keep(g.transmittance >= Pack16(kMinTransmittance), alpha_of(s, pixel_x, pixel_y));
+        alpha = zero_unless(g.transmittance >= Pack16(kMinTransmittance), alpha_of(s, pixel_x, pixel_y));
       }
       const Pack16 weight = alpha * g.transmittance;
-      Pack16 q = fma(g.by[0], Pack16(s.r), g.by[4]);
-      q = fma(g.by[1], Pack16(s.g), q);
-      q = fma(g.by[2], Pack16(s.b), q);
-      q = fma(g.by[3], Pack16(s.depth), q);
-      const Pack16 own = weight * q;
-      g.behind = g.behind - own;
+      Pack16 q = fma(g.d_image[0], Pack16(s.r), g.d_image[4]);
+      q = fma(g.d_image[1], Pack16(s.g), q);
+      q = fma(g.d_image[2], Pack16(s.b), q);
+      q = fma(g.d_image[3], Pack16(s.depth), q);
+      const Pack16 contribution = weight * q;
+      g.suffix_sum = g.suffix_sum - contribution;
       g.transmittance = fnma(alpha, g.transmittance, g.transmittance);
       const Pack16 odds = alpha * reciprocal(Pack16(1.0f) - alpha);
-      store(values[i], keep(alpha < Pack16(kBelowMaxAlpha), fnma(g.behind, odds, own)));
-      sums.colours[entry] = add_colours(weight, g.by_column, sums.colours[entry]);
+      store(values[i], zero_unless(alpha < Pack16(kBelowMaxAlpha), fnma(g.suffix_sum, odds, contribution)));
+      sums.colours[entry] = add_colours(weight, g.d_columns, sums.colours[entry]);
     }
-    batch.add(list + begin, taken, b, sums.moments);
+    batch.add(list + begin, batch_size, b, sums.moments);
   }
   gradient.transmittance = g.transmittance;
-  gradient.behind = g.behind;
+  gradient.suffix_sum = g.suffix_sum;
 }
 
 // Shifts moments to another reference point, at offset (x, y) from the old one, in two fused steps. The first subtracts
@@ -118,15 +120,16 @@ GAUSSLITE_INLINE void add_to_rows(Workspace& ws, const Splat* records, int n, co
   const float centre_x = float(tile.x * kTile + kTile / 2), centre_y = float(tile.y * kTile + kTile / 2);
   alignas(32) const float centres[8] = {centre_x, centre_y, centre_x, centre_y, centre_x, centre_y, centre_x, centre_y};
   const Pack8 centre = load8(centres), units = load8(kMomentUnits);
-  const Pack16 tagged(__builtin_bit_cast(float, ws.tag));
+  const Pack16 pass(__builtin_bit_cast(float, ws.gradient_pass));
   for (int i = 0; i < n; ++i) {
     const Pack8 offset = broadcast_pair(&records[i].mean_x) - centre;
-    const Pack8 moments = shift_moments(load8(sums.moments.of[i]), offset + offset) * units;
+    const Pack8 moments = shift_moments(load8(sums.moments.by_entry[i]), offset + offset) * units;
     float* row = gradient_row(ws, records[i], tile);
-    uint32_t tag;
-    std::memcpy(&tag, row + kRowTag, sizeof tag);
-    const Pack16 total = join(moments, sum_of_quads(sums.colours[i])) + keep_if(tag == ws.tag, load(row));
-    store(row, select(first_lanes(kRowTag), total, tagged));
+    uint32_t row_pass;
+    std::memcpy(&row_pass, row + kRowPass, sizeof row_pass);
+    const Pack16 total =
+        join(moments, sum_of_quads(sums.colours[i])) + zero_unless(row_pass == ws.gradient_pass, load(row));
+    store(row, select(first_lanes(kRowPass), total, pass));
   }
 }
 

@@ -23,52 +23,54 @@ GAUSSLITE_INLINE Pack16 log2_alpha(const Splat& s, Pack16 pixel_x, Pack16 pixel_
 // The splat's alpha at sixteen pixels.
 GAUSSLITE_INLINE Pack16 alpha_of(const Splat& splat, Pack16 pixel_x, Pack16 pixel_y) {
   const Pack16 exponent = log2_alpha(splat, pixel_x, pixel_y);
-  return keep(exponent >= Pack16(kLog2MinAlpha), exp2_fast(min(exponent, Pack16(kLog2MaxAlpha))));
+  return zero_unless(exponent >= Pack16(kLog2MinAlpha), exp2_fast(min(exponent, Pack16(kLog2MaxAlpha))));
 }
 
-// A block during compositing. Finished pixels do not change.
+// A block during compositing. A pixel is finished when its transmittance is below kMinTransmittance; it then does not
+// change.
 template <bool kKeepAlphas>
-class OpenBlock {
+class BlockCompositor {
  public:
-  GAUSSLITE_INLINE OpenBlock(const BlockState& state, float* alphas)
-      : s_(state), unfinished_(state.transmittance), alphas_(alphas) {}
+  GAUSSLITE_INLINE BlockCompositor(const BlockState& state, float* alphas)
+      : state_(state), running_transmittance_(state.transmittance), alphas_(alphas) {}
 
   GAUSSLITE_INLINE BlockState state() const {
-    BlockState out = s_;
-    if constexpr (!kOneRegister) out.transmittance = unfinished_;
+    BlockState out = state_;
+    if constexpr (!kFitsOneRegister) out.transmittance = running_transmittance_;
     return out;
   }
   GAUSSLITE_INLINE float* alphas() const { return alphas_; }
-  GAUSSLITE_INLINE bool any_open() const { return any(open()); }
+  GAUSSLITE_INLINE bool any_unfinished() const { return any(is_unfinished()); }
 
   GAUSSLITE_INLINE void add(const Splat& splat, Pack16 alpha) {
-    const Mask16 open_now = open();
-    const Pack16 open_alpha = keep(open_now, alpha);
+    const Mask16 unfinished = is_unfinished();
+    const Pack16 masked_alpha = zero_unless(unfinished, alpha);
     if (kKeepAlphas) {
-      store(alphas_, open_alpha);
+      store(alphas_, masked_alpha);
       alphas_ += 16;
     }
-    const Pack16 weight = open_alpha * unfinished_;
-    s_.r = fma(weight, Pack16(splat.r), s_.r);
-    s_.g = fma(weight, Pack16(splat.g), s_.g);
-    s_.b = fma(weight, Pack16(splat.b), s_.b);
-    s_.depth = fma(weight, Pack16(splat.depth), s_.depth);
-    if constexpr (kOneRegister) {
+    const Pack16 weight = masked_alpha * running_transmittance_;
+    state_.r = fma(weight, Pack16(splat.r), state_.r);
+    state_.g = fma(weight, Pack16(splat.g), state_.g);
+    state_.b = fma(weight, Pack16(splat.b), state_.b);
+    state_.depth = fma(weight, Pack16(splat.depth), state_.depth);
+    if constexpr (kFitsOneRegister) {
       // The dependency chain is one fused step per entry.
-      unfinished_ = fnma(alpha, unfinished_, unfinished_);
-      s_.transmittance = select(open_now, unfinished_, s_.transmittance);
+      running_transmittance_ = fnma(alpha, running_transmittance_, running_transmittance_);
+      state_.transmittance = select(unfinished, running_transmittance_, state_.transmittance);
     } else {
-      // These variants lack registers for that, and other work hides the latency.
-      unfinished_ = unfinished_ - weight;
+      // The other variants lack the registers for a second transmittance, and other work hides the latency.
+      running_transmittance_ = running_transmittance_ - weight;
     }
   }
 
  private:
-  GAUSSLITE_INLINE Mask16 open() const { return unfinished_ >= Pack16(kMinTransmittance); }
+  GAUSSLITE_INLINE Mask16 is_unfinished() const { return running_transmittance_ >= Pack16(kMinTransmittance); }
 
-  BlockState s_;
-  // With kOneRegister: the transmittance without the end of finished pixels; else the remaining transmittance.
-  Pack16 unfinished_;
+  BlockState state_;
+  // With kFitsOneRegister it continues to decrease in finished pixels, and state_.transmittance is the result.
+  // Otherwise it is the result.
+  Pack16 running_transmittance_;
   float* alphas_;
 };
 
@@ -78,36 +80,36 @@ template <bool kKeepAlphas>
 GAUSSLITE_INLINE int composite(const Splat* records, const uint8_t* list, int n, Pack16 pixel_x, Pack16 pixel_y,
                                BlockState& state, float*& alphas) {
   if (n == 0) return 0;
-  OpenBlock<kKeepAlphas> block(state, alphas);
+  BlockCompositor<kKeepAlphas> block(state, alphas);
   const auto splat = [&](int i) -> const Splat& { return records[list[i]]; };
   const auto alpha = [&](int i) { return alpha_of(splat(i), pixel_x, pixel_y); };
-  int taken = 0;
+  int composited = 0;
   // Two alphas at a time: a core's out-of-order window is too small to overlap them by itself. With enough registers
-  // they are computed while the previous two are added. Lists are padded behind their end.
-  if constexpr (kOneRegister) {
+  // the next two are computed while these are added: lists are padded, so that this may read behind their end.
+  if constexpr (kFitsOneRegister) {
     Pack16 first = alpha(0), second = alpha(1);
-    for (; taken + 1 < n && block.any_open(); taken += 2) {
-      const Pack16 third = alpha(taken + 2), fourth = alpha(taken + 3);
-      block.add(splat(taken), first);
-      block.add(splat(taken + 1), second);
+    for (; composited + 1 < n && block.any_unfinished(); composited += 2) {
+      const Pack16 third = alpha(composited + 2), fourth = alpha(composited + 3);
+      block.add(splat(composited), first);
+      block.add(splat(composited + 1), second);
       first = third;
       second = fourth;
     }
-    if (taken < n && block.any_open()) block.add(splat(taken++), first);
+    if (composited < n && block.any_unfinished()) block.add(splat(composited++), first);
   } else {
-    for (; taken + 1 < n && block.any_open(); taken += 2) {
-      const Pack16 first = alpha(taken), second = alpha(taken + 1);
-      block.add(splat(taken), first);
-      block.add(splat(taken + 1), second);
+    for (; composited + 1 < n && block.any_unfinished(); composited += 2) {
+      const Pack16 first = alpha(composited), second = alpha(composited + 1);
+      block.add(splat(composited), first);
+      block.add(splat(composited + 1), second);
     }
-    if (taken < n && block.any_open()) {
-      block.add(splat(taken), alpha(taken));
-      ++taken;
+    if (composited < n && block.any_unfinished()) {
+      block.add(splat(composited), alpha(composited));
+      ++composited;
     }
   }
   state = block.state();
   alphas = block.alphas();
-  return taken;
+  return composited;
 }
 
 }  // namespace gausslite::GAUSSLITE_ISA

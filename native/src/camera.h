@@ -11,16 +11,17 @@ struct Camera {
   int width, height;
 };
 
-constexpr float kNearM = 0.05f;
-constexpr float kDilationPx2 = 0.3f;                   // added to the diagonal of the 2D covariance
-constexpr float kTangentLimit = 1.3f;                  // of half the field of view
+constexpr float kNearM = 0.05f;       // splats with a mean at smaller depth are culled
+constexpr float kDilationPx2 = 0.3f;  // added to the diagonal of the 2D covariance
+// Tangents x/z and y/z in the Jacobian are clamped to this factor times the tangent of half the field of view.
+constexpr float kTangentLimitFactor = 1.3f;
 constexpr float kMinTransmittance = 1e-4f;             // blending of a pixel ends below it
 constexpr float kLog2MinAlpha = -7.99435343685886f;    // log2(1/255): weaker contributions are dropped
 constexpr float kLog2MaxAlpha = -0.0144995696951151f;  // log2(0.99): alpha is clamped there, without a gradient
 constexpr float kMinSurfaceAlpha = 0.5f;               // the depth loss ignores pixels of lower alpha
 
 constexpr int kTile = 16;    // pixels per side
-constexpr int kBlock = 4;    // pixels per side: sixteen pixels, one Pack16
+constexpr int kBlock = 4;    // pixels per side; the sixteen pixels of a block are one Pack16
 constexpr int kBlocks = 16;  // blocks per tile
 constexpr int kBlocksAcross = 4;
 

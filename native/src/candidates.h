@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// Culling: finds the rows that may be visible. Most rows of a map are not, and fewer still in a part of the image, so
-// the test must be cheap.
+// Culling: finds the rows that may be visible in the active tiles. Most rows of a map are not, so the test must be
+// cheap.
 #pragma once
 
 #include <algorithm>
@@ -32,7 +32,7 @@ GAUSSLITE_INLINE uint32_t list_lanes(uint32_t* out, uint32_t first, uint32_t lan
 #endif
 }
 
-// The same with integers in tile_index of first + j.
+// The same with the integers in `numbers` instead of first + j.
 GAUSSLITE_INLINE void list_lanes(uint32_t* out, Pack16 numbers, uint32_t lanes) {
 #if defined(GAUSSLITE_USE_AVX512)
   _mm512_storeu_si512(out, _mm512_maskz_compress_epi32(__mmask16(lanes), _mm512_cvttps_epi32(numbers.v)));
@@ -54,8 +54,8 @@ class CullingBounds {
  public:
   explicit CullingBounds(const Workspace& ws)
       : camera_(ws.camera),
-        limit_u_(kTangentLimit * 0.5f * float(camera_.width) / camera_.fx),
-        limit_v_(kTangentLimit * 0.5f * float(camera_.height) / camera_.fy) {
+        limit_u_(kTangentLimitFactor * 0.5f * float(camera_.width) / camera_.fx),
+        limit_v_(kTangentLimitFactor * 0.5f * float(camera_.height) / camera_.fy) {
     const bool everywhere = ws.active_tiles == nullptr;
     const auto [x0, x1, y0, y1] = everywhere ? ActiveTiles::Box{0, ws.tiles_x, 0, ws.tiles_y} : ws.active.box();
     left_ = float(x0 * kTile);
@@ -70,7 +70,7 @@ class CullingBounds {
   }
 
   // Appends to `ids` those of the rows first ... first + 15 that may touch that box. Appends to `boxes`, unless null,
-  // the tile box of each one, as tile * ActiveTiles::kSizes + size. Returns their number.
+  // the tile box of each one, as tile * ActiveTiles::kSmallBoxSizes + size. Returns their number.
   GAUSSLITE_INLINE uint32_t list_in_box(const Workspace& ws, const Pack16* mean, Pack16 largest_log_scale,
                                         uint32_t first, uint32_t* ids, uint32_t* boxes) const {
     const Extent extent(*this, mean, largest_log_scale);
@@ -80,12 +80,12 @@ class CullingBounds {
       const Pack16 x0 = tile(extent.x - extent.reach_x, ws.tiles_x), y0 = tile(extent.y - extent.reach_y, ws.tiles_y);
       const Pack16 across = tile(extent.x + extent.reach_x, ws.tiles_x) - x0;
       const Pack16 down = tile(extent.y + extent.reach_y, ws.tiles_y) - y0;
-      const Pack16 most(float(ActiveTiles::kNear - 1)), sizes(float(ActiveTiles::kSizes));
-      const Mask16 far = (across > most) | (down > most);
+      const Pack16 max_span(float(ActiveTiles::kSmallBox - 1)), sizes { float(ActiveTiles::kSmallBoxSizes) };
+      const Mask16 too_large = (across > max_span) | (down > max_span);
       const Pack16 tile_index =
-          select(far, Pack16(float(ws.active.sentinel_tile())), fma(y0, Pack16(float(ws.tiles_x)), x0));
+          select(too_large, Pack16(float(ws.active.sentinel_tile())), fma(y0, Pack16(float(ws.tiles_x)), x0));
       // Size 0 at the sentinel tile: a float cannot represent more for the largest images.
-      const Pack16 size = select(far, Pack16(0.0f), fma(down, Pack16(float(ActiveTiles::kNear)), across));
+      const Pack16 size = select(too_large, Pack16(0.0f), fma(down, Pack16(float(ActiveTiles::kSmallBox)), across));
       list_lanes(boxes, fma(tile_index, sizes, size), inside);
     }
     return list_lanes(ids, first, inside);
@@ -153,8 +153,8 @@ GAUSSLITE_INLINE void bounds_from_rows(const float* rows, Pack16 (&bounds)[4]) {
     row[k] = load_block(rows + kRowWidth * k, 4 * kRowWidth);
     row[4 + k] = load_block(rows + kRowWidth * k + 4, 4 * kRowWidth);
   }
-  transpose_quads(row[0], row[1], row[2], row[3]);
-  transpose_quads(row[4], row[5], row[6], row[7]);
+  transpose_within_quads(row[0], row[1], row[2], row[3]);
+  transpose_within_quads(row[4], row[5], row[6], row[7]);
   for (int k = 0; k < 3; ++k) bounds[k] = row[kMean + k];
   bounds[3] = largest_log_scale(row);
 }
@@ -164,7 +164,7 @@ GAUSSLITE_INLINE void bounds_from_rows(const float* rows, Pack16 (&bounds)[4]) {
 GAUSSLITE_INLINE uint32_t find_candidates(Workspace& ws, const CullingBounds& culling, uint32_t begin, uint32_t end,
                                           uint32_t* ids) {
   const bool by_tile = ws.active_tiles != nullptr && !ws.active.fill_box();
-  uint32_t boxes[kSegment + 16], in_box = 0, count = 0, i = begin;
+  uint32_t boxes[kSegmentRows + 16], in_box = 0, count = 0, i = begin;
   for (; i + 16 <= end; i += 16) {
     Pack16 bounds[4];
     if (ws.has_bounds) {
@@ -178,10 +178,11 @@ GAUSSLITE_INLINE uint32_t find_candidates(Workspace& ws, const CullingBounds& cu
   if (!by_tile) {
     count = in_box;
   } else {
-    // Always written, counted only if active: no branch to mispredict.
+    // Each id is written, but counted only if its box has an active tile: no branch to mispredict.
     for (uint32_t k = 0; k < in_box; ++k) {
       ids[count] = ids[k];
-      count += ws.active.any_near(boxes[k] / ActiveTiles::kSizes, boxes[k] % ActiveTiles::kSizes);
+      count +=
+          ws.active.any_in_small_box(boxes[k] / ActiveTiles::kSmallBoxSizes, boxes[k] % ActiveTiles::kSmallBoxSizes);
     }
   }
   for (; i < end; ++i) ids[count++] = i;

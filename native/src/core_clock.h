@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// The clock of the core, to report cycles: the time stamp counter has another rate.
+// The clock frequency of the core, to convert times to cycles. The time stamp counter has another rate.
 #pragma once
 
 namespace gausslite {

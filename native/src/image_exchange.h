@@ -20,7 +20,7 @@ struct ImageGradients {
 
 // Copies rows [begin, end) of the rendered image to the output.
 void export_image(const Workspace& ws, const ImageOutput& output, int begin, int end);
-// Fills rows [begin, end) of the padded gradient planes; beyond the image with zeros.
+// Copies rows [begin, end) of the gradients to the padded planes; sets pixels beyond the image to zero.
 void import_gradients(Workspace& ws, const ImageGradients& input, int begin, int end);
 
 }  // namespace gausslite

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// Stage 5: SSIM (Wang et al. 2004) and its derivatives by the window means, in squares of 16x16 pixels.
+// Stage 5: SSIM (Wang et al. 2004) and its derivatives with respect to the window means, in squares of 16x16 pixels.
 //
 // With the window mean E of the image x and the target y: S = A1 A2 / (B1 B2), A1 = 2 Ex Ey + C1, A2 = 2 (Exy - Ex Ey)
 // + C2, B1 = Ex^2 + Ey^2 + C1, B2 = E(xx + yy) - Ex^2 - Ey^2 + C2. The gradient at a pixel is the blur of dS/dEx, plus
@@ -25,24 +25,24 @@ namespace {
 
 constexpr float kC1 = 1e-4f, kC2 = 9e-4f;
 
-// Blurred quantities of the forward pass: x, y, xx + yy, xy.
+// Number of blurred quantities of the forward pass: x, y, xx + yy, xy.
 constexpr int kMeans = 4;
 
 // Transposed columns of one row of squares: the quantities blurred down the image, and the derivatives. Sixteen columns
 // of zeros pad either side.
 class Columns {
  public:
-  Columns(Buffer<float>& memory, int tiles_x) : map_(size_t(tiles_x + 2) * kSquare) {
-    memory.reserve((kMeans + kSsimMaps) * map_);
+  Columns(Buffer<float>& memory, int tiles_x) : map_(size_t(tiles_x + 2) * kTilePixels) {
+    memory.ensure_capacity((kMeans + kSsimMaps) * map_);
     memory_ = memory.data();
     for (size_t k = 0; k < kMeans + kSsimMaps; ++k) {
-      std::fill_n(memory_ + k * map_, kSquare, 0.0f);
-      std::fill_n(memory_ + (k + 1) * map_ - kSquare, kSquare, 0.0f);
+      std::fill_n(memory_ + k * map_, kTilePixels, 0.0f);
+      std::fill_n(memory_ + (k + 1) * map_ - kTilePixels, kTilePixels, 0.0f);
     }
   }
 
   // The sixteen columns of square x, 16 floats each.
-  float* blurred(int k, int x) { return memory_ + size_t(k) * map_ + size_t(x + 1) * kSquare; }
+  float* blurred(int k, int x) { return memory_ + size_t(k) * map_ + size_t(x + 1) * kTilePixels; }
   float* derivative(int k, int x) { return blurred(kMeans + k, x); }
 
  private:
@@ -50,18 +50,18 @@ class Columns {
   float* memory_;
 };
 
-// Row k of the squares: each overlaps two tiles; beyond the image all values are zero.
+// Row k of the SSIM squares. Each square overlaps two tiles. Beyond the image all values are zero.
 class Squares {
  public:
-  Squares(const Workspace& ws, const Targets& targets, const SquareRow& row)
+  Squares(const Workspace& ws, const Targets& targets, const SsimSquareRow& row)
       : targets_(targets),
         row_(row),
         upper_(size_t(std::max(row.k - 1, 0)) * size_t(ws.tiles_x)),
         lower_(size_t(row.k) * size_t(ws.tiles_x)) {}
 
-  // The 26 rows of a channel in reach of a square's windows.
+  // Writes the 26 rows of a channel that the windows of square x reach.
   GAUSSLITE_INLINE void image_rows(int x, int channel, float* out) const {
-    const size_t at = image_tile(x) + size_t(channel) * kSquare;
+    const size_t at = image_offset(x) + size_t(channel) * kTilePixels;
     const float* upper = row_.above != nullptr ? row_.above->image.data() + at : kZeroSquares;
     const float* lower = row_.below != nullptr ? row_.below->image.data() + at : kZeroSquares;
     for (int i = 0; i < kSpan; ++i) store(out + i * kTile, row_between(upper, lower, i));
@@ -98,7 +98,7 @@ class Squares {
 
  private:
   const Targets& targets_;
-  const SquareRow& row_;
+  const SsimSquareRow& row_;
   size_t upper_, lower_;  // first tile of the tile rows
 };
 
@@ -116,7 +116,7 @@ void blur_down(const Squares& squares, int x, int channel, bool rendered, Column
   squares.target_rows(x, channel, target);
   const auto Y = [&](int i) { return load(target + i * kTile); };
   if (!rendered) {
-    for (const int k : {0, 3}) std::fill_n(columns.blurred(k, x), kSquare, 0.0f);
+    for (const int k : {0, 3}) std::fill_n(columns.blurred(k, x), kTilePixels, 0.0f);
     blur_and_transpose(Y, columns.blurred(1, x));
     blur_and_transpose([&](int i) { return Y(i) * Y(i); }, columns.blurred(2, x));
     return;
@@ -132,62 +132,63 @@ void blur_down(const Squares& squares, int x, int channel, bool rendered, Column
 // Column i of a square, or of its left or right neighbour for i outside 0 ... 15.
 GAUSSLITE_INLINE Pack16 column(const float* columns, int i) { return load(columns + (i - kRadius) * kTile); }
 
-// Computes SSIM and its derivatives in one square. Returns the sum of SSIM times the (negative) weights.
+// Computes SSIM and its derivatives in one square. Returns its loss: the sum of SSIM times -weight.
 double derive(Columns& columns, int x, const float* weights, float scale) {
   Pack16 mean[kMeans][kTile];
   for (int k = 0; k < kMeans; ++k) {
     const float* in = columns.blurred(k, x);
     blur([&](int i) { return column(in, i); }, [&](int i, Pack16 sum) { mean[k][i] = sum; });
   }
-  float* by[kSsimMaps] = {columns.derivative(0, x), columns.derivative(1, x), columns.derivative(2, x)};
+  float* d_maps[kSsimMaps] = {columns.derivative(0, x), columns.derivative(1, x), columns.derivative(2, x)};
   Pack16 total(0.0f);
   for (int i = 0; i < kTile; ++i) {
     const Pack16 Ex = mean[0][i], Ey = mean[1][i], squares = mean[2][i], Exy = mean[3][i];
-    const Pack16 given = load(weights + i * kTile), weight = given * -scale;
+    const Pack16 pixel_weight = load(weights + i * kTile), weight = pixel_weight * -scale;
     const Pack16 cross = Ex * Ey, means = fma(Ex, Ex, Ey * Ey);
     const Pack16 A1 = fma(cross, Pack16(2.0f), Pack16(kC1)), A2 = fma(Exy - cross, Pack16(2.0f), Pack16(kC2));
     const Pack16 B1 = means + kC1, B2 = (squares - means) + kC2;
     const Pack16 inverse = Pack16(1.0f) / (B1 * B2), S = A1 * A2 * inverse, scaled = weight * inverse;
-    const Pack16 by_A1 = A2 * scaled, by_A2 = A1 * scaled, by_B1 = -(S * B2 * scaled), by_B2 = -(S * B1 * scaled);
-    const Pack16 by_Ex = fma(Ey, by_A1 - by_A2, Ex * (by_B1 - by_B2));
-    // Windows of unweighted pixels may contain pixels that are not rendered.
-    const Mask16 counts = given > Pack16(0.0f);
-    total = total + keep(counts, S * weight);
-    store(by[0] + i * kTile, keep(counts, by_Ex + by_Ex));
-    store(by[1] + i * kTile, keep(counts, by_B2));
-    store(by[2] + i * kTile, keep(counts, by_A2 + by_A2));
+    const Pack16 d_A1 = A2 * scaled, d_A2 = A1 * scaled, d_B1 = -(S * B2 * scaled), d_B2 = -(S * B1 * scaled);
+    const Pack16 d_Ex = fma(Ey, d_A1 - d_A2, Ex * (d_B1 - d_B2));
+    // Pixels without a weight have no loss. Their windows may contain pixels that are not rendered.
+    const Mask16 has_weight = pixel_weight > Pack16(0.0f);
+    total = total + zero_unless(has_weight, S * weight);
+    store(d_maps[0] + i * kTile, zero_unless(has_weight, d_Ex + d_Ex));
+    store(d_maps[1] + i * kTile, zero_unless(has_weight, d_B2));
+    store(d_maps[2] + i * kTile, zero_unless(has_weight, d_A2 + d_A2));
   }
   return double(sum(total));
 }
 
 }  // namespace
 
-void derive_ssim(Workspace& ws, const Training& training, const SquareRow& row, int thread) {
-  const uint8_t* reach = training.targets.reach + size_t(row.k) * size_t(ws.tiles_x);
+void compute_ssim(Workspace& ws, const TrainingArguments& training, const SsimSquareRow& row, int thread) {
+  const uint8_t* status = training.targets.square_status + size_t(row.k) * size_t(ws.tiles_x);
   double& loss = training.ssim_sums[row.k] = 0.0;
-  if (!std::any_of(reach, reach + ws.tiles_x, [](uint8_t r) { return r == kWeighted; })) return;
+  if (!std::any_of(status, status + ws.tiles_x, [](uint8_t r) { return r == kWeighted; })) return;
   const Squares squares(ws, training.targets, row);
   Columns columns(ws.scratch[size_t(thread)].ssim, ws.tiles_x);
   for (int channel = 0; channel < 3; ++channel) {
-    // A pipeline over the squares: x is blurred down, x - 1 derived, x - 2 blurred along; each needs the previous step
-    // of its right neighbour.
+    // A pipeline over the squares. Square x is blurred down the image. In square x - 1 SSIM and its derivatives are
+    // computed. The derivatives of square x - 2 are blurred along the rows. The last two need the step before from
+    // their right neighbour.
     for (int x = 0; x < ws.tiles_x + 2; ++x) {
-      if (x < ws.tiles_x && reach[x] != kUnreached) blur_down(squares, x, channel, squares.rendered(ws, x), columns);
+      if (x < ws.tiles_x && status[x] != kUnused) blur_down(squares, x, channel, squares.rendered(ws, x), columns);
       const int middle = x - 1;
       if (middle >= 0 && middle < ws.tiles_x) {
-        if (reach[middle] == kWeighted) {
-          alignas(64) float scratch[kSquare];
+        if (status[middle] == kWeighted) {
+          alignas(64) float scratch[kTilePixels];
           loss += derive(columns, middle, squares.weights(middle, scratch), training.loss.ssim);
         } else {
-          for (int m = 0; m < kSsimMaps; ++m) std::fill_n(columns.derivative(m, middle), kSquare, 0.0f);
+          for (int m = 0; m < kSsimMaps; ++m) std::fill_n(columns.derivative(m, middle), kTilePixels, 0.0f);
         }
       }
       const int last = x - 2;
       // Without rendered blocks there is no gradient.
-      if (last >= 0 && reach[last] != kUnreached && squares.rendered(ws, last)) {
+      if (last >= 0 && status[last] != kUnused && squares.rendered(ws, last)) {
         for (int m = 0; m < kSsimMaps; ++m) {
           const float* in = columns.derivative(m, last);
-          blur_and_transpose([&](int i) { return column(in, i); }, row.squares + ssim_square(last, channel, m));
+          blur_and_transpose([&](int i) { return column(in, i); }, row.squares + ssim_map_offset(last, channel, m));
         }
       }
     }

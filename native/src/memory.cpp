@@ -19,8 +19,9 @@ namespace {
 constexpr size_t kCacheLine = 64;
 constexpr size_t kHugePage = size_t{2} << 20;
 
-// Freed large blocks, kept for the next request of the same size. A mapper frees one training view for each new one. On
-// systems that take freed pages back, first access to new pages costs ten times as much as preparing the view.
+// Freed large blocks, for the next requests of the same size. A mapper frees an old training view for each new one.
+// Without this cache the operating system would reclaim the freed pages, and map new ones at their first access. That
+// takes ten times as long as preparing the view.
 class BlockCache {
  public:
   // Returns a block of exactly this size, or null.
@@ -32,7 +33,7 @@ class BlockCache {
     return nullptr;
   }
 
-  // Keeps the block in alternating slots and frees the previous block of the slot.
+  // Stores the block and frees the oldest one.
   void put(void* memory, size_t bytes) {
     const std::lock_guard<std::mutex> lock(mutex_);
     Block& slot = blocks_[next_];
@@ -62,19 +63,19 @@ size_t rounded(size_t bytes) { return (bytes + kCacheLine - 1) / kCacheLine * kC
 
 }  // namespace
 
-// Random 64-byte reads are about twice as fast from 2 MiB pages as from 4 KiB pages.
-void* reallocate(void* old, size_t kept, size_t old_bytes, size_t bytes) {
+// Large blocks use huge pages: random 64-byte reads are about twice as fast from 2 MiB pages as from 4 KiB pages.
+void* reallocate(void* old, size_t preserved_bytes, size_t old_bytes, size_t bytes) {
   const size_t alignment = alignment_of(bytes), size = rounded(bytes);
   void* fresh = alignment == kHugePage ? block_cache().take(size) : nullptr;
   if (fresh == nullptr) {
     if (posix_memalign(&fresh, alignment, size) != 0) throw std::bad_alloc();
 #if defined(__linux__) && defined(MADV_HUGEPAGE)
-    // Whole huge pages only: a remainder would allocate one more.
+    // Only for whole huge pages: the rest of the block would otherwise take up another 2 MiB.
     if (size >= kHugePage) madvise(fresh, size / kHugePage * kHugePage, MADV_HUGEPAGE);
 #endif
   }
-  if (kept > 0) std::memcpy(fresh, old, kept);
-  std::memset(static_cast<char*>(fresh) + kept, 0, size - kept);
+  if (preserved_bytes > 0) std::memcpy(fresh, old, preserved_bytes);
+  std::memset(static_cast<char*>(fresh) + preserved_bytes, 0, size - preserved_bytes);
   free_memory(old, old_bytes);
   return fresh;
 }

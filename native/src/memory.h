@@ -7,10 +7,10 @@
 
 namespace gausslite {
 
-// Returns memory of `bytes` with the first `kept` bytes of `old` and zeros behind them; frees `old`, which has
+// Returns `bytes` bytes of memory: a copy of the first `preserved_bytes` of `old`, then zeros. Frees `old`, which has
 // `old_bytes`. Throws std::bad_alloc.
-void* reallocate(void* old, size_t kept, size_t old_bytes, size_t bytes);
-// Frees memory of `bytes`. The latest large blocks are kept for requests of the same size.
+void* reallocate(void* old, size_t preserved_bytes, size_t old_bytes, size_t bytes);
+// Frees `memory`, which has `bytes` bytes. The two latest large blocks are cached for requests of the same size.
 void free_memory(void* memory, size_t bytes) noexcept;
 
 // An array that grows and never shrinks. Its members are always inlined: the stages are compiled for several
@@ -24,12 +24,13 @@ class Buffer {
   Buffer& operator=(Buffer&&) = delete;
   ~Buffer() { free_memory(data_, capacity_ * sizeof(T)); }
 
-  // Ensures a capacity of `count` elements; growth keeps the first `kept` and sets the others to zero.
-  __attribute__((always_inline)) void reserve(size_t count, size_t kept = 0) {
-    if (count > capacity_) grow_to(count + count / 4 + 64, kept);
+  // Ensures a capacity of `count` elements. Growth copies the first `preserved` elements, sets all others to zero and
+  // adds spare capacity.
+  __attribute__((always_inline)) void ensure_capacity(size_t count, size_t preserved = 0) {
+    if (count > capacity_) grow_to(count + count / 4 + 64, preserved);
   }
-  // The same without spare capacity, for arrays of final size.
-  __attribute__((always_inline)) void reserve_exactly(size_t count) {
+  // The same for arrays of final size: growth adds no spare capacity and sets all elements to zero.
+  __attribute__((always_inline)) void ensure_exact_capacity(size_t count) {
     if (count > capacity_) grow_to(count, 0);
   }
   __attribute__((always_inline)) T* data() { return data_; }
@@ -39,8 +40,8 @@ class Buffer {
   __attribute__((always_inline)) size_t capacity() const { return capacity_; }
 
  private:
-  __attribute__((always_inline)) void grow_to(size_t needed, size_t kept) {
-    data_ = static_cast<T*>(reallocate(data_, kept * sizeof(T), capacity_ * sizeof(T), needed * sizeof(T)));
+  __attribute__((always_inline)) void grow_to(size_t needed, size_t preserved) {
+    data_ = static_cast<T*>(reallocate(data_, preserved * sizeof(T), capacity_ * sizeof(T), needed * sizeof(T)));
     capacity_ = needed;
   }
 

@@ -32,22 +32,22 @@ struct Box {
     y1 = floor(bottom * (1.0f / kTile));
   }
 
-  // Lanes with a box that is too large for narrow(): few.
+  // Returns the few lanes with a box that is too large for narrow().
   GAUSSLITE_INLINE uint32_t large() const {
-    return bits(((x1 - x0 > Pack16(kMostAcross)) | (y1 - y0 > Pack16(1.0f))) & visible);
+    return bits(((x1 - x0 > Pack16(kMaxAcross)) | (y1 - y0 > Pack16(1.0f))) & visible);
   }
 
   // Removes the upper or lower row of tiles from boxes that are not large, if no tile in it is active. Returns the
   // lanes with an active tile. All rows are looked up: no branch to mispredict.
   GAUSSLITE_INLINE uint32_t narrow(const ActiveTiles& active, Pack16 tiles_x) {
     alignas(64) int32_t upper[16], lower[16], across[16];
-    store_int(upper, keep(visible, fma(y0, tiles_x, x0)));
-    store_int(lower, keep(visible, fma(y1, tiles_x, x0)));
-    store_int(across, keep(visible, min(x1 - x0, Pack16(kMostAcross))));
+    store_int(upper, zero_unless(visible, fma(y0, tiles_x, x0)));
+    store_int(lower, zero_unless(visible, fma(y1, tiles_x, x0)));
+    store_int(across, zero_unless(visible, min(x1 - x0, Pack16(kMaxAcross))));
     uint32_t in_upper = 0, in_lower = 0;
     for (int j = 0; j < 16; ++j) {
-      in_upper |= uint32_t(active.any_near(uint32_t(upper[j]), uint32_t(across[j]))) << j;
-      in_lower |= uint32_t(active.any_near(uint32_t(lower[j]), uint32_t(across[j]))) << j;
+      in_upper |= uint32_t(active.any_in_small_box(uint32_t(upper[j]), uint32_t(across[j]))) << j;
+      in_lower |= uint32_t(active.any_in_small_box(uint32_t(lower[j]), uint32_t(across[j]))) << j;
     }
     const uint32_t small = ~large();
     const Pack16 first = y0, last = y1;
@@ -57,10 +57,10 @@ struct Box {
   }
 
  private:
-  static constexpr float kMostAcross = float(ActiveTiles::kNear - 1);
+  static constexpr float kMaxAcross = float(ActiveTiles::kSmallBox - 1);
 };
 
-// False for rows with a NaN or infinite parameter, and for splats with an overflow in their projection.
+// Returns false for rows with a NaN or infinite parameter, and for splats with an overflow in their projection.
 GAUSSLITE_INLINE Mask16 is_valid(const Pack16* row, const Projection& p) {
   Pack16 total = row[0] * 0.0f;
   for (int k = 1; k < kTrainedColumns; ++k) total = fma(row[k], Pack16(0.0f), total);
@@ -69,15 +69,15 @@ GAUSSLITE_INLINE Mask16 is_valid(const Pack16* row, const Projection& p) {
   return (total + conic + shape == Pack16(0.0f)) & (p.conic_xx > Pack16(0.0f)) & (p.conic_yy > Pack16(0.0f));
 }
 
-// Sixteen splats' boxes by lane; the boxes of invisible splats have no meaning, but lie inside the image.
+// The boxes of sixteen splats as integers. The boxes of invisible splats have no meaning, but lie inside the image.
 struct BoxLanes {
   alignas(64) int32_t x0[16], x1[16], y0[16], y1[16];
 
   GAUSSLITE_INLINE explicit BoxLanes(const Box& box) {
-    store_int(x0, keep(box.visible, box.x0));
-    store_int(x1, keep(box.visible, box.x1));
-    store_int(y0, keep(box.visible, box.y0));
-    store_int(y1, keep(box.visible, box.y1));
+    store_int(x0, zero_unless(box.visible, box.x0));
+    store_int(x1, zero_unless(box.visible, box.x1));
+    store_int(y0, zero_unless(box.visible, box.y0));
+    store_int(y1, zero_unless(box.visible, box.y1));
   }
 
   // Whether a lane's box has an active tile in tile row y.
@@ -85,7 +85,7 @@ struct BoxLanes {
     return active.any(uint32_t(x0[lane]), uint32_t(x1[lane]), uint32_t(y), uint32_t(y));
   }
 
-  // The same as Box::narrow for a large box; returns whether it has an active tile.
+  // Removes upper and lower rows of tiles without an active tile from one large box. Returns true if a tile is active.
   GAUSSLITE_INLINE bool narrow(const ActiveTiles& active, int lane) {
     while (y0[lane] < y1[lane] && !active_in(active, lane, y0[lane])) ++y0[lane];
     while (y1[lane] > y0[lane] && !active_in(active, lane, y1[lane])) --y1[lane];
@@ -93,15 +93,16 @@ struct BoxLanes {
   }
 };
 
-// Threads take gradient rows in blocks, so that they rarely access the shared counter. Row 0 is unused.
+// Reserves gradient rows for a thread and returns the first. A thread takes them from the shared counter in large
+// blocks, so that it rarely accesses the counter.
 GAUSSLITE_INLINE uint32_t take_gradient_rows(Workspace& ws, ThreadScratch& thread_scratch, uint32_t rows) {
-  if (thread_scratch.last_row - thread_scratch.next_row < rows) {
-    const uint32_t block = std::max<uint32_t>(kSegment, rows);
-    thread_scratch.next_row = ws.gradient_rows_used.fetch_add(block, std::memory_order_relaxed);
-    thread_scratch.last_row = thread_scratch.next_row + block;
+  if (thread_scratch.end_gradient_row - thread_scratch.next_gradient_row < rows) {
+    const uint32_t block = std::max<uint32_t>(kSegmentRows, rows);
+    thread_scratch.next_gradient_row = ws.gradient_rows_used.fetch_add(block, std::memory_order_relaxed);
+    thread_scratch.end_gradient_row = thread_scratch.next_gradient_row + block;
   }
-  const uint32_t first = thread_scratch.next_row;
-  thread_scratch.next_row += rows;
+  const uint32_t first = thread_scratch.next_gradient_row;
+  thread_scratch.next_gradient_row += rows;
   return first;
 }
 
@@ -113,15 +114,15 @@ class Segment {
 
   GAUSSLITE_INLINE uint32_t slot() const { return slot_; }
 
-  // Adds the `visible` lanes of a group; `splats` lack only their gradient rows. All lanes are written and only visible
-  // ones counted: no branch to mispredict. Most boxes span one or two tile rows; the others are `tall`.
+  // Adds the `visible` lanes of a group. `splats` lacks only the gradient rows. All lanes are written, and only visible
+  // ones are counted: no branch to mispredict. Most boxes span one or two tile rows; the others are `tall`.
   GAUSSLITE_INLINE void add(const Pack16 (&splats)[16], const float* depth, const uint32_t* ids, const BoxLanes& boxes,
                             uint32_t visible, uint32_t tall) {
     uint32_t rows = 0;
     for (int j = 0; j < 16; ++j) rows += (visible >> j & 1u) * uint32_t(boxes.y1[j] - boxes.y0[j] + 1);
     uint32_t slot = slot_, gradient_row = take_gradient_rows(ws_, thread_scratch_, rows);
     for (int j = 0; j < 16; ++j) {
-      const uint32_t counts = visible >> j & 1u;
+      const uint32_t counted = visible >> j & 1u;
       const int first = boxes.y0[j], last = boxes.y1[j];
       const uint32_t height = uint32_t(last - first + 1);
       Splat& splat = ws_.splats[slot];
@@ -129,24 +130,24 @@ class Segment {
       splat.gradient_row = gradient_row - uint32_t(first);
       ws_.visible[slot] = {ids[j], gradient_row, height};
       const DepthKey key{__builtin_bit_cast(uint32_t, depth[j]), slot};
-      add_key(key, first, counts);
+      add_key(key, first, counted);
       if (visible & tall & 1u << j) [[unlikely]] {
         for (int y = first + 1; y <= last; ++y)
           add_key(key, y, ws_.active_tiles == nullptr || boxes.active_in(ws_.active, j, y));
       } else {
-        add_key(key, first + 1, counts & uint32_t(last > first));
+        add_key(key, first + 1, counted & uint32_t(last > first));
       }
-      slot += counts;
-      gradient_row += counts * height;
+      slot += counted;
+      gradient_row += counted * height;
     }
     slot_ = slot;
   }
 
  private:
-  GAUSSLITE_INLINE void add_key(const DepthKey& key, int tile_y, uint32_t counts) {
+  GAUSSLITE_INLINE void add_key(const DepthKey& key, int tile_y, uint32_t counted) {
     KeyList& tile_row = thread_scratch_.tile_rows[size_t(tile_y)];
     tile_row.keys[tile_row.count] = key;
-    tile_row.count += counts;
+    tile_row.count += counted;
   }
 
   Workspace& ws_;
@@ -214,18 +215,18 @@ GAUSSLITE_INLINE void project_group(const Workspace& ws, const CullingBounds& cu
 void project(Workspace& ws, int thread) {
   ThreadScratch& thread_scratch = ws.scratch[size_t(thread)];
   const CullingBounds culling(ws);
-  uint32_t candidate_ids[kSegment + 16];
-  thread_scratch.next_row = thread_scratch.last_row = 0;
-  // An additional list receives uncounted second keys below the last tile row.
+  uint32_t candidate_ids[kSegmentRows + 16];
+  thread_scratch.next_gradient_row = thread_scratch.end_gradient_row = 0;
+  // One more list than tile rows: add() writes a second key below the last tile row, without counting it.
   const int lists = ws.tiles_y + 1;
   for (int y = 0; y < lists; ++y) thread_scratch.tile_rows[size_t(y)].count = 0;
   for (uint32_t s; (s = ws.take_segment(thread)) < ws.segments;) {
-    const uint32_t begin = s * kSegment, end = std::min(ws.count, begin + kSegment);
+    const uint32_t begin = s * kSegmentRows, end = std::min(ws.count, begin + kSegmentRows);
     ws.segment_thread[s] = uint32_t(thread);
     KeySpan* spans = &ws.segment_keys[size_t(s) * size_t(ws.tiles_y)];
     for (int y = 0; y < lists; ++y) {
       KeyList& tile_row = thread_scratch.tile_rows[size_t(y)];
-      tile_row.keys.reserve(tile_row.count + kSegment + 1, tile_row.count);
+      tile_row.keys.ensure_capacity(tile_row.count + kSegmentRows + 1, tile_row.count);
       if (y < ws.tiles_y) spans[y].begin = tile_row.count;
     }
     const uint32_t* ids = ws.ids != nullptr ? ws.ids + begin : candidate_ids;

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// EWA projection of sixteen 3D Gaussians to image Gaussians (Kerbl et al. 2023, Sec. 4). The backward pass repeats it,
-// to use the intermediate values.
+// EWA projection of sixteen 3D Gaussians to 2D Gaussians in the image (Kerbl et al. 2023, Sec. 4). The backward pass
+// repeats it, because it needs the intermediate values.
 #pragma once
 
 #include "camera.h"
@@ -83,8 +83,8 @@ GAUSSLITE_INLINE void project16(const Pack16* row, const Camera& camera, Project
   o.inverse_z = Pack16(1.0f) / o.z;
   o.u = o.x * o.inverse_z;
   o.v = o.y * o.inverse_z;
-  const float limit_u = kTangentLimit * 0.5f * float(camera.width) / camera.fx;
-  const float limit_v = kTangentLimit * 0.5f * float(camera.height) / camera.fy;
+  const float limit_u = kTangentLimitFactor * 0.5f * float(camera.width) / camera.fx;
+  const float limit_v = kTangentLimitFactor * 0.5f * float(camera.height) / camera.fy;
   o.u_clamped = min(max(o.u, Pack16(-limit_u)), Pack16(limit_u));
   o.v_clamped = min(max(o.v, Pack16(-limit_v)), Pack16(limit_v));
   o.mean_x = fma(o.u, Pack16(camera.fx), Pack16(camera.cx));

@@ -7,11 +7,11 @@
 
 namespace gausslite::GAUSSLITE_ISA {
 
-// Gradients of sixteen parameter rows, transposed; the norm of the gradient by the image mean in half image widths and
-// heights; with kTwist, each splat's gradient by the camera twist (translation, rotation).
+// Gradients of sixteen parameter rows, transposed; the norm of the gradient of the 2D mean, in units of half the image
+// width and height; with kTwist, each splat's gradient of the camera twist (translation, rotation).
 struct ParameterGradients {
   Pack16 column[16];
-  Pack16 mean_2d_norm;
+  Pack16 mean_2d_grad_norm;
   Pack16 twist[6];
 };
 
@@ -25,16 +25,16 @@ GAUSSLITE_INLINE void conic_times_axis(const Projection& p, int j, Pack16& x, Pa
   y = (p.M0[l] * p.cross[k] - p.M0[k] * p.cross[l] + p.M1[j] * kDilationPx2) * p.inverse_determinant;
 }
 
-// `by_R` is the gradient by the rotation matrix of the unit quaternion; the result is by the raw quaternion.
-GAUSSLITE_INLINE void quaternion_gradient(const Projection& p, const Pack16 (&by_R)[3][3], Pack16* out) {
+// `d_R` is the gradient of the rotation matrix of the unit quaternion; the result is that of the raw quaternion.
+GAUSSLITE_INLINE void quaternion_gradient(const Projection& p, const Pack16 (&d_R)[3][3], Pack16* out) {
   const Pack16 w = p.qw, x = p.qx, y = p.qy, z = p.qz;
-  const Pack16 minus_x = by_R[2][1] - by_R[1][2], minus_y = by_R[0][2] - by_R[2][0], minus_z = by_R[1][0] - by_R[0][1];
-  const Pack16 plus_x = by_R[2][1] + by_R[1][2], plus_y = by_R[0][2] + by_R[2][0], plus_z = by_R[1][0] + by_R[0][1];
+  const Pack16 minus_x = d_R[2][1] - d_R[1][2], minus_y = d_R[0][2] - d_R[2][0], minus_z = d_R[1][0] - d_R[0][1];
+  const Pack16 plus_x = d_R[2][1] + d_R[1][2], plus_y = d_R[0][2] + d_R[2][0], plus_z = d_R[1][0] + d_R[0][1];
   const Pack16 two(2.0f);
   const Pack16 g[4] = {x * minus_x + y * minus_y + z * minus_z,
-                       y * plus_z + z * plus_y + w * minus_x - two * x * (by_R[1][1] + by_R[2][2]),
-                       x * plus_z + z * plus_x + w * minus_y - two * y * (by_R[0][0] + by_R[2][2]),
-                       x * plus_y + y * plus_x + w * minus_z - two * z * (by_R[0][0] + by_R[1][1])};
+                       y * plus_z + z * plus_y + w * minus_x - two * x * (d_R[1][1] + d_R[2][2]),
+                       x * plus_z + z * plus_x + w * minus_y - two * y * (d_R[0][0] + d_R[2][2]),
+                       x * plus_y + y * plus_x + w * minus_z - two * z * (d_R[0][0] + d_R[1][1])};
   const Pack16 along = w * g[0] + x * g[1] + y * g[2] + z * g[3], scale = p.inverse_norm * 2.0f;
   out[0] = (g[0] - w * along) * scale;
   out[1] = (g[1] - x * along) * scale;
@@ -50,41 +50,40 @@ GAUSSLITE_INLINE void backward16(const Pack16* row, const Pack16* image, const C
   project16(row, camera, p);
   const float* R = camera.R_camera_world;
 
-  const Pack16 by_mean_x = p.conic_xx * image[1] + p.conic_xy * image[2];
-  const Pack16 by_mean_y = p.conic_xy * image[1] + p.conic_yy * image[2];
-  const Pack16 half_x = by_mean_x * (0.5f * float(camera.width)), half_y = by_mean_y * (0.5f * float(camera.height));
-  out.mean_2d_norm = sqrt(half_x * half_x + half_y * half_y);
+  const Pack16 d_mean_x = p.conic_xx * image[1] + p.conic_xy * image[2];
+  const Pack16 d_mean_y = p.conic_xy * image[1] + p.conic_yy * image[2];
+  const Pack16 half_x = d_mean_x * (0.5f * float(camera.width)), half_y = d_mean_y * (0.5f * float(camera.height));
+  out.mean_2d_grad_norm = sqrt(half_x * half_x + half_y * half_y);
 
   // Covariance = M M^T + 0.3 I with M = P R S. As ln(alpha) = ... - d^T K d / 2, column m of M has the gradient K S K
   // m, where S is the matrix of second moments of v.
   const Pack16 *moments = image + kMoments, S_xx = moments[3], S_xy = moments[4], S_yy = moments[5];
-  Pack16 by_P0[3] = {0.0f, 0.0f, 0.0f}, by_P1[3] = {0.0f, 0.0f, 0.0f}, by_R[3][3];
+  Pack16 d_P0[3] = {0.0f, 0.0f, 0.0f}, d_P1[3] = {0.0f, 0.0f, 0.0f}, d_R[3][3];
   for (int j = 0; j < 3; ++j) {
     Pack16 x, y;
     conic_times_axis(p, j, x, y);
     const Pack16 Sx = S_xx * x + S_xy * y, Sy = S_xy * x + S_yy * y;
     out.column[kLogScale + j] = x * Sx + y * Sy;
-    const Pack16 by_M0 = p.conic_xx * Sx + p.conic_xy * Sy, by_M1 = p.conic_xy * Sx + p.conic_yy * Sy;
-    const Pack16 scaled0 = by_M0 * p.scale[j], scaled1 = by_M1 * p.scale[j];
+    const Pack16 d_M0 = p.conic_xx * Sx + p.conic_xy * Sy, d_M1 = p.conic_xy * Sx + p.conic_yy * Sy;
+    const Pack16 scaled0 = d_M0 * p.scale[j], scaled1 = d_M1 * p.scale[j];
     for (int i = 0; i < 3; ++i) {
-      by_R[i][j] = p.P0[i] * scaled0 + p.P1[i] * scaled1;
-      by_P0[i] = fma(scaled0, p.R[i][j], by_P0[i]);
-      by_P1[i] = fma(scaled1, p.R[i][j], by_P1[i]);
+      d_R[i][j] = p.P0[i] * scaled0 + p.P1[i] * scaled1;
+      d_P0[i] = fma(scaled0, p.R[i][j], d_P0[i]);
+      d_P1[i] = fma(scaled1, p.R[i][j], d_P1[i]);
     }
   }
-  quaternion_gradient(p, by_R, out.column + kQuat);
+  quaternion_gradient(p, d_R, out.column + kQuat);
 
   // P = J R_camera_world; the Jacobian is constant where the tangent is clamped.
-  const Pack16 by_J00 = dot3(by_P0, R), by_J02 = dot3(by_P0, R + 6), by_J11 = dot3(by_P1, R + 3),
-               by_J12 = dot3(by_P1, R + 6);
-  const Pack16 by_u = fma(by_mean_x, Pack16(camera.fx), keep(p.u == p.u_clamped, -(p.J00 * by_J02)));
-  const Pack16 by_v = fma(by_mean_y, Pack16(camera.fy), keep(p.v == p.v_clamped, -(p.J11 * by_J12)));
-  const Pack16 by_inverse_z = (by_J00 - p.u_clamped * by_J02) * camera.fx +
-                              (by_J11 - p.v_clamped * by_J12) * camera.fy + by_u * p.x + by_v * p.y;
-  const Pack16 by_camera[3] = {by_u * p.inverse_z, by_v * p.inverse_z,
-                               image[kColourSums + 3] - p.inverse_z * p.inverse_z * by_inverse_z};
+  const Pack16 d_J00 = dot3(d_P0, R), d_J02 = dot3(d_P0, R + 6), d_J11 = dot3(d_P1, R + 3), d_J12 = dot3(d_P1, R + 6);
+  const Pack16 d_u = fma(d_mean_x, Pack16(camera.fx), zero_unless(p.u == p.u_clamped, -(p.J00 * d_J02)));
+  const Pack16 d_v = fma(d_mean_y, Pack16(camera.fy), zero_unless(p.v == p.v_clamped, -(p.J11 * d_J12)));
+  const Pack16 d_inverse_z =
+      (d_J00 - p.u_clamped * d_J02) * camera.fx + (d_J11 - p.v_clamped * d_J12) * camera.fy + d_u * p.x + d_v * p.y;
+  const Pack16 d_camera[3] = {d_u * p.inverse_z, d_v * p.inverse_z,
+                              image[kColourSums + 3] - p.inverse_z * p.inverse_z * d_inverse_z};
   for (int j = 0; j < 3; ++j) {
-    out.column[kMean + j] = by_camera[0] * R[j] + by_camera[1] * R[3 + j] + by_camera[2] * R[6 + j];
+    out.column[kMean + j] = d_camera[0] * R[j] + d_camera[1] * R[3 + j] + d_camera[2] * R[6 + j];
   }
   out.column[kLogit] = image[0] * p.transparency;
   for (int k = 0; k < 3; ++k) out.column[kRgb + k] = image[kColourSums + k];
@@ -93,23 +92,23 @@ GAUSSLITE_INLINE void backward16(const Pack16* row, const Pack16* image, const C
   if constexpr (kTwist) {
     // T <- exp(twist) T moves a camera-frame point by t + r x point and rotates R_camera_world by r. With N = (dL/dR)
     // R^T, the gradient of the rotation is the axis of N - N^T; dL/dR = J^T (dL/dP).
-    const Pack16 a01 = dot3(by_P0, R + 3), a10 = dot3(by_P1, R);
-    const Pack16 n01 = p.J00 * a01, n02 = p.J00 * by_J02, n10 = p.J11 * a10, n12 = p.J11 * by_J12;
-    const Pack16 n20 = p.J02 * by_J00 + p.J12 * a10, n21 = p.J02 * a01 + p.J12 * by_J11;
-    for (int k = 0; k < 3; ++k) out.twist[k] = by_camera[k];
-    out.twist[3] = p.y * by_camera[2] - p.z * by_camera[1] + n21 - n12;
-    out.twist[4] = p.z * by_camera[0] - p.x * by_camera[2] + n02 - n20;
-    out.twist[5] = p.x * by_camera[1] - p.y * by_camera[0] + n10 - n01;
+    const Pack16 a01 = dot3(d_P0, R + 3), a10 = dot3(d_P1, R);
+    const Pack16 n01 = p.J00 * a01, n02 = p.J00 * d_J02, n10 = p.J11 * a10, n12 = p.J11 * d_J12;
+    const Pack16 n20 = p.J02 * d_J00 + p.J12 * a10, n21 = p.J02 * a01 + p.J12 * d_J11;
+    for (int k = 0; k < 3; ++k) out.twist[k] = d_camera[k];
+    out.twist[3] = p.y * d_camera[2] - p.z * d_camera[1] + n21 - n12;
+    out.twist[4] = p.z * d_camera[0] - p.x * d_camera[2] + n02 - n20;
+    out.twist[5] = p.x * d_camera[1] - p.y * d_camera[0] + n10 - n01;
   }
 }
 
 // Sets gradients with a NaN or infinite entry, of degenerate splats, to zero, so that they do not change their rows.
 GAUSSLITE_INLINE void zero_invalid(ParameterGradients& g) {
-  Pack16 total = g.mean_2d_norm * 0.0f;
+  Pack16 total = g.mean_2d_grad_norm * 0.0f;
   for (int k = 0; k < kTrainedColumns; ++k) total = fma(g.column[k], Pack16(0.0f), total);
   const Mask16 valid = total == Pack16(0.0f);
-  for (int k = 0; k < kTrainedColumns; ++k) g.column[k] = keep(valid, g.column[k]);
-  g.mean_2d_norm = keep(valid, g.mean_2d_norm);
+  for (int k = 0; k < kTrainedColumns; ++k) g.column[k] = zero_unless(valid, g.column[k]);
+  g.mean_2d_grad_norm = zero_unless(valid, g.mean_2d_grad_norm);
 }
 
 }  // namespace gausslite::GAUSSLITE_ISA

@@ -26,7 +26,7 @@ struct FrameInput {
 
 struct LossWeights {
   float colour, depth, ssim;
-  bool normalise_by_image;  // multiplies the loss by the mean weight of the view
+  bool normalise_by_image;  // multiplies the loss by the mean pixel weight of the view
 };
 
 struct OptimizerState {
@@ -34,10 +34,10 @@ struct OptimizerState {
   float* first_moment;
   float* second_moment;
   const uint8_t* trainable;  // null: all
-  uint32_t* update_counts;   // as in Update
+  uint32_t* update_counts;   // as in UpdateArguments
   const uint8_t* count_mask;
-  uint64_t
-      binding_id;  // of the table binding; only steps change bound rows. 0: not bound, other code may change the rows
+  // Number of the table binding: only steps change the rows of bound tables. 0: not bound, other code may change them.
+  uint64_t binding_id;
 };
 
 struct AdamOptions {
@@ -45,10 +45,11 @@ struct AdamOptions {
   double beta1, beta2, epsilon, decay_after_updates;
 };
 
-// Milliseconds of each stage of the last call, measured on thread 0. With SSIM the raster, loss and backward tasks of
-// different tile rows alternate; their times are sums over the thread's tasks.
+// Milliseconds of each stage of the last call, measured on thread 0. A step without SSIM renders, compares and runs the
+// backward pass tile by tile: `render` is the time of all three. With SSIM the render, loss and backward tasks of
+// different tile rows alternate: their times are sums over the thread's tasks.
 struct StageTimes {
-  double project = 0.0, raster = 0.0, loss = 0.0, backward = 0.0, update = 0.0;
+  double project = 0.0, render = 0.0, loss = 0.0, backward = 0.0, update = 0.0;
 };
 
 // The owner makes one call at a time. The object stays usable after a call that throws (std::bad_alloc).
@@ -67,12 +68,12 @@ class Rasterizer {
   bool matches(size_t rows, size_t width, size_t height) const {
     return rows == row_count_ && width == size_t(ws_.camera.width) && height == size_t(ws_.camera.height);
   }
-  // Increases with each forward and step; backward needs the latest frame.
+  // Number of the latest forward or step. backward needs the latest frame.
   uint64_t frame() const { return frame_; }
 
   void forward(const FrameInput& input, const ImageOutput& output);
-  // Gradients of the last forward. d_rows must be zero; mean_2d_norm has visible_count() elements.
-  void backward(const ImageGradients& input, float* d_rows, double* d_twist, float* mean_2d_norm);
+  // Gradients of the last forward. d_rows must be zero; mean_2d_grad_norm has visible_count() elements.
+  void backward(const ImageGradients& input, float* d_rows, double* d_twist, float* mean_2d_grad_norm);
   double step(const FrameInput& input, const OptimizerState& state, const TrainingView& view, bool masked,
               const LossWeights& loss, const AdamOptions& adam);
 
@@ -83,9 +84,9 @@ class Rasterizer {
  private:
   void begin_frame(const FrameInput& input);
   void select_blocks(const uint16_t* blocks);
-  Training begin_training(const TrainingView& view, bool masked, const LossWeights& loss);
-  void train_with_ssim(const Training& training, int thread);
-  void next_tag();
+  TrainingArguments begin_training(const TrainingView& view, bool masked, const LossWeights& loss);
+  void train_with_ssim(const TrainingArguments& training, int thread);
+  void start_gradient_pass();
   void select_bounds(uint64_t binding_id);
   void order_tile_rows();
   void schedule_tile_rows();
@@ -101,11 +102,11 @@ class Rasterizer {
   uint64_t frame_ = 0;
   uint32_t row_count_ = 0;
   TileRowSchedule schedule_;
-  std::vector<std::pair<uint32_t, int>> tile_row_order_;  // keys and tile row, most keys first
-  std::vector<uint32_t> tile_row_weights_;
-  uint64_t bounds_binding_id_ = 0;  // the binding for which the bounds are valid
+  std::vector<std::pair<uint32_t, int>> tile_row_order_;  // number of depth keys and tile row, most keys first
+  std::vector<uint32_t> tile_row_key_counts_;             // [tile row]: number of depth keys
+  uint64_t bounds_binding_id_ = 0;                        // the binding for which the bounds are valid
   Buffer<double> l1_sums_, ssim_sums_, twist_sums_;
-  Buffer<float> norms_by_slot_;
+  Buffer<float> mean_2d_grad_norms_;  // [slot of the visible splat]
   AdamCorrections corrections_;
   StageTimes times_;
   double stage_start_ms_ = 0.0;

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// The last blur of the SSIM loss, down the image, for one tile: from the squares of loss_ssim.cpp to the gradient by
-// the image colours.
+// The last blur of the SSIM loss, down the image, for one tile: from the derivatives in the SSIM squares
+// (loss_ssim.cpp) to the gradient of the image colours.
 #pragma once
 
 #include "ssim_window.h"
@@ -11,14 +11,14 @@ namespace gausslite::GAUSSLITE_ISA {
 
 // Sixteen rows of sixteen pixels for each channel.
 struct TileColours {
-  alignas(64) float value[3][kSquare];
+  alignas(64) float value[3][kTilePixels];
 };
 
-// Sets the gradient beyond the edge of the image, which windows also reach, to zero.
+// Sets the colours (or gradients) of a tile beyond the edge of the image, which windows also reach, to zero.
 GAUSSLITE_INLINE void clear_beyond_edge(const Camera& camera, int tile_x, int tile_y, float* colours) {
   const int columns = camera.width - tile_x * kTile, rows = camera.height - tile_y * kTile;
   if (columns >= kTile && rows >= kTile) return;
-  for (int i = 0; i < 3 * kSquare; ++i) {
+  for (int i = 0; i < 3 * kTilePixels; ++i) {
     if (i % kTile >= columns || i / kTile % kTile >= rows) colours[i] = 0.0f;
   }
 }
@@ -28,32 +28,33 @@ GAUSSLITE_INLINE void clear_beyond_edge(const Camera& camera, int tile_x, int ti
 GAUSSLITE_INLINE void ssim_gradient(const float* image, const TargetTile& target, int channel, const float* upper,
                                     const float* lower, float* out) {
   const auto blurred = [&](int map, auto set) {
-    blur([&](int i) { return row_between(upper + map * kSquare, lower + map * kSquare, i); }, set);
+    blur([&](int i) { return row_between(upper + map * kTilePixels, lower + map * kTilePixels, i); }, set);
   };
-  blurred(0, [&](int i, Pack16 by_x) { store(out + i * kTile, by_x); });
-  blurred(1, [&](int i, Pack16 by_xx) {
+  blurred(0, [&](int i, Pack16 d_x) { store(out + i * kTile, d_x); });
+  blurred(1, [&](int i, Pack16 d_xx) {
     const Pack16 x = load(image + i * kTile);
-    store(out + i * kTile, fma(x + x, by_xx, load(out + i * kTile)));
+    store(out + i * kTile, fma(x + x, d_xx, load(out + i * kTile)));
   });
-  blurred(2, [&](int i, Pack16 by_xy) {
-    store(out + i * kTile, fma(colour_row(target, channel, i), by_xy, load(out + i * kTile)));
+  blurred(2, [&](int i, Pack16 d_xy) {
+    store(out + i * kTile, fma(colour_row(target, channel, i), d_xy, load(out + i * kTile)));
   });
 }
 
-// Returns false, without output, if no window with a weight reaches the tile.
-GAUSSLITE_INLINE bool ssim_gradient(const Workspace& ws, const Targets& targets, const ReplayedTileRow& replayed, int x,
+// Computes the SSIM gradient of tile x. Returns false, without output, if no window of a weighted pixel reaches the
+// tile.
+GAUSSLITE_INLINE bool ssim_gradient(const Workspace& ws, const Targets& targets, const RenderedTileRow& tile_row, int x,
                                     TileColours& out) {
-  const size_t tile = size_t(replayed.tile_row) * size_t(ws.tiles_x) + size_t(x);
-  const bool above = targets.reach[tile] != kUnreached;
-  const bool below = targets.reach[tile + size_t(ws.tiles_x)] != kUnreached;
+  const size_t tile = size_t(tile_row.index) * size_t(ws.tiles_x) + size_t(x);
+  const bool above = targets.square_status[tile] != kUnused;
+  const bool below = targets.square_status[tile + size_t(ws.tiles_x)] != kUnused;
   if (!above && !below) return false;
   for (int channel = 0; channel < 3; ++channel) {
-    const size_t at = ssim_square(x, channel, 0);
-    ssim_gradient(replayed.replay.image.data() + image_tile(x) + size_t(channel) * kSquare, targets.tiles[tile],
-                  channel, above ? replayed.upper_squares + at : kZeroSquares,
-                  below ? replayed.lower_squares + at : kZeroSquares, out.value[channel]);
+    const size_t at = ssim_map_offset(x, channel, 0);
+    ssim_gradient(tile_row.cache.image.data() + image_offset(x) + size_t(channel) * kTilePixels, targets.tiles[tile],
+                  channel, above ? tile_row.upper_squares + at : kZeroSquares,
+                  below ? tile_row.lower_squares + at : kZeroSquares, out.value[channel]);
   }
-  clear_beyond_edge(ws.camera, x, replayed.tile_row, out.value[0]);
+  clear_beyond_edge(ws.camera, x, tile_row.index, out.value[0]);
   return true;
 }
 

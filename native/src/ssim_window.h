@@ -8,10 +8,10 @@
 namespace gausslite::GAUSSLITE_ISA {
 
 constexpr int kRadius = 5, kTaps = 2 * kRadius + 1;
-constexpr int kSpan = kTile + 2 * kRadius;  // rows or columns in reach of a square's windows
+constexpr int kSpan = kTile + 2 * kRadius;  // rows or columns that the windows of an SSIM square reach
 
-// A square's maps of zeros, for missing squares.
-alignas(64) inline constexpr float kZeroSquares[kSsimMaps * kSquare] = {};
+// The maps of an SSIM square as zeros, for squares beyond the image or without a gradient.
+alignas(64) inline constexpr float kZeroSquares[kSsimMaps * kTilePixels] = {};
 
 // Gaussian of sigma 1.5 px, normalised over its 11 taps; element k is the weight at distance k.
 constexpr float kWindow[kRadius + 1] = {0.26601171f, 0.21300553f, 0.10936070f, 0.03600077f, 0.00759876f, 0.00102838f};
@@ -34,10 +34,11 @@ GAUSSLITE_INLINE void blur_packs(Get get, Set set) {
   }
 }
 
-// The same for sixteen floats at a time; in halves if the window exceeds the registers otherwise.
+// The same for packs of sixteen floats. If a pack needs several registers, each half is blurred by itself, so that the
+// window fits the registers.
 template <class Get, class Set>
 GAUSSLITE_INLINE void blur(Get get, Set set) {
-  if constexpr (kOneRegister) {
+  if constexpr (kFitsOneRegister) {
     blur_packs<Pack16>(get, set);
   } else {
     Pack8 sums[kTile];
@@ -46,8 +47,8 @@ GAUSSLITE_INLINE void blur(Get get, Set set) {
   }
 }
 
-// The i-th of the 26 rows in reach of a square's windows. The square is the lower half of `upper` and the upper half of
-// `lower`.
+// Returns row i of the 26 rows that the windows of a square reach. The square is the lower half of `upper` and the
+// upper half of `lower`.
 GAUSSLITE_INLINE Pack16 row_between(const float* upper, const float* lower, int i) {
   constexpr int kFirst = kTile / 2 - kRadius;
   const int row = i + kFirst;

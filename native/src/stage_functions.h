@@ -13,12 +13,12 @@ const DepthKey* sort_tile_row(Workspace&, int tile_row, int thread, int& count);
 // `tiles`: the lists of the tile row's tiles, output.
 void bin_tile_row(const Workspace&, int tile_row, const DepthKey* keys, int count, TileList* tiles);
 void render_tile_row(Workspace&, int tile_row, int thread);
-void train_tile_row(Workspace&, const Training&, int tile_row, int thread);
-void render_to_replay(Workspace&, const Training&, TileRowReplay&, int tile_row, int thread);
-void derive_ssim(Workspace&, const Training&, const SquareRow&, int thread);
-void backward_from_replay(Workspace&, const Training&, const ReplayedTileRow&);
+void train_tile_row(Workspace&, const TrainingArguments&, int tile_row, int thread);
+void render_to_cache(Workspace&, const TrainingArguments&, TileRowCache&, int tile_row, int thread);
+void compute_ssim(Workspace&, const TrainingArguments&, const SsimSquareRow&, int thread);
+void backward_from_cache(Workspace&, const TrainingArguments&, const RenderedTileRow&);
 void backward_tile_row(Workspace&, int tile_row, int thread);
-void update(Workspace&, const Update&, int thread);
+void update(Workspace&, const UpdateArguments&, int thread);
 void gradients(Workspace&, const GradientOutput&, int thread);
 
 }  // namespace gausslite::GAUSSLITE_ISA

@@ -6,7 +6,7 @@ namespace gausslite::GAUSSLITE_ISA {
 
 const Stages& stages() {
   static constexpr Stages kStages{project,           render_tile_row, train_tile_row,
-                                  render_to_replay,  derive_ssim,     backward_from_replay,
+                                  render_to_cache,   compute_ssim,    backward_from_cache,
                                   backward_tile_row, update,          gradients};
   return kStages;
 }

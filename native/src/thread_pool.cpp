@@ -5,11 +5,11 @@ namespace gausslite {
 
 namespace {
 
-// The wait has three phases. First about 0.1 ms of plain loads: longer than the barriers of a balanced stage and the
-// pause between two calls of a loop. A PAUSE instruction would let a hypervisor take the processor away, at a measured
-// cost of 0.2 ms per stage. An early yield would give it to another process for a time slice. Then about 0.2 ms of
-// yields: with fewer free cores than threads, spinning would delay the thread that the others wait for. Then the thread
-// sleeps.
+// The wait has three phases: about 0.1 ms of plain loads, about 0.2 ms of yields, then sleep. The first is longer than
+// most waits at a barrier and between two calls of a loop. It has no PAUSE instruction, which would let a hypervisor
+// take the processor away, at a measured cost of 0.2 ms per stage. It has no yield either, which would give the
+// processor to another process for a time slice. The second phase serves machines with fewer free cores than threads:
+// spinning would delay the thread that the others wait for.
 constexpr int kSpins = 200'000;
 constexpr int kYields = 400;
 
@@ -51,7 +51,8 @@ void ThreadPool::join_all() {
 }
 
 void ThreadPool::worker_loop(int thread) {
-  // The first throw of a thread allocates memory, and the process ends if that fails: do it at the start.
+  // The first throw of a thread allocates memory, and the process ends if that fails. So each thread throws once at its
+  // start.
   try {
     throw JobAborted{};
   } catch (const JobAborted&) {

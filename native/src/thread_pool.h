@@ -12,12 +12,12 @@
 
 namespace gausslite {
 
-// Waits until `value` differs from `old` and returns it: first spinning, then yielding, then asleep. Code that changes
-// the value must also notify.
+// Waits until `value` differs from `old`, and returns it. The thread first spins, then yields, then sleeps: code that
+// changes the value must also notify.
 uint32_t wait_while(const std::atomic<uint32_t>& value, uint32_t old);
 
-// One owner calls `run`; the calling thread is thread 0. Between the calls of a busy loop the threads spin; in an idle
-// pool they sleep.
+// One owner calls `run`; the calling thread is thread 0. Between two calls the other threads spin for a fraction of a
+// millisecond, and then sleep.
 class ThreadPool {
  public:
   explicit ThreadPool(int threads);

@@ -12,7 +12,7 @@ namespace gausslite::GAUSSLITE_ISA {
 namespace {
 
 void load_pixels(const Workspace& ws, const float* planes, const TilePosition& tile, int b, Pack16 (&out)[5]) {
-  for (int k = 0; k < 5; ++k) out[k] = load_block(planes + k * ws.plane + tile.block(ws, b), ws.padded_width);
+  for (int k = 0; k < 5; ++k) out[k] = load_block(planes + k * ws.plane_pixels + tile.block(ws, b), ws.padded_width);
 }
 
 void backward_tile(Workspace& ws, const TileList& list, const TilePosition& tile) {
@@ -37,9 +37,9 @@ void backward_tile(Workspace& ws, const TileList& list, const TilePosition& tile
     sums.clear(n);
     for (int b = 0; b < kBlocks; ++b) {
       const uint32_t entries = std::min<uint32_t>(lists.count[b], left[b]);
-      const float* none = nullptr;
+      const float* no_alphas = nullptr;
       if (entries > 0)
-        backward_block<false>(records, lists.entry[b], int(entries), tile, b, gradients[b], sums, batch, none);
+        backward_block<false>(records, lists.entry[b], int(entries), tile, b, gradients[b], sums, batch, no_alphas);
       left[b] -= entries;
       total_left -= entries;
     }

@@ -10,8 +10,8 @@
 
 namespace gausslite::GAUSSLITE_ISA {
 
-// For each byte, the entries of its set bits in ascending order: bits 0, 2, 4, 6 are entries 0 to 3, the others entries
-// 4 to 7.
+// For each byte, the entries of its set bits in ascending order. Bits 0, 2, 4, 6 are entries 0 to 3; bits 1, 3, 5, 7
+// are entries 4 to 7.
 struct SetBits {
   uint64_t numbers[256] = {};  // bytes, in little-endian order
   uint8_t count[256] = {};
@@ -108,7 +108,7 @@ GAUSSLITE_INLINE void load_chunk(const Workspace& ws, const TileList& tile, uint
   list_blocks(&tile.blocks[first], n, lists);
 }
 
-// Pixel centres of block b of the tile whose corner is (tile_x, tile_y).
+// Pixel centres of a block, relative to its corner.
 alignas(64) constexpr float kPixelX[16] = {.5f, 1.5f, 2.5f, 3.5f, .5f, 1.5f, 2.5f, 3.5f,
                                            .5f, 1.5f, 2.5f, 3.5f, .5f, 1.5f, 2.5f, 3.5f};
 alignas(64) constexpr float kPixelY[16] = {.5f,  .5f,  .5f,  .5f,  1.5f, 1.5f, 1.5f, 1.5f,

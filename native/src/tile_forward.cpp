@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// Stage 4: render the tiles of a tile row; the lists are kept for the backward pass.
+// Stage 4: render the tiles of a tile row. The backward pass reuses their lists.
 #include <algorithm>
 
 #include "block_forward.h"
@@ -13,10 +13,10 @@ namespace {
 void store_pixels(Workspace& ws, const TilePosition& tile, int b, const BlockState& state) {
   float* out = ws.image.data() + tile.block(ws, b);
   store_block(out, ws.padded_width, state.r);
-  store_block(out + ws.plane, ws.padded_width, state.g);
-  store_block(out + 2 * ws.plane, ws.padded_width, state.b);
-  store_block(out + 3 * ws.plane, ws.padded_width, state.depth);
-  store_block(out + 4 * ws.plane, ws.padded_width, state.transmittance);
+  store_block(out + ws.plane_pixels, ws.padded_width, state.g);
+  store_block(out + 2 * ws.plane_pixels, ws.padded_width, state.b);
+  store_block(out + 3 * ws.plane_pixels, ws.padded_width, state.depth);
+  store_block(out + 4 * ws.plane_pixels, ws.padded_width, state.transmittance);
 }
 
 void render_tile(Workspace& ws, TileList& list, const TilePosition& tile) {
@@ -29,9 +29,9 @@ void render_tile(Workspace& ws, TileList& list, const TilePosition& tile) {
     load_chunk(ws, list, first, int(std::min<uint32_t>(kChunk, list.count - first)), records, lists);
     for (int b = 0; b < kBlocks; ++b) {
       if (finished >> b & 1u) continue;
-      float* none = nullptr;
-      const int taken =
-          composite<false>(records, lists.entry[b], lists.count[b], tile.pixel_x(b), tile.pixel_y(b), state[b], none);
+      float* no_alphas = nullptr;
+      const int taken = composite<false>(records, lists.entry[b], lists.count[b], tile.pixel_x(b), tile.pixel_y(b),
+                                         state[b], no_alphas);
       list.used[b] += uint32_t(taken);
       if (state[b].finished()) finished |= 1u << b;
     }

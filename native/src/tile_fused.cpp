@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
-// Stages 4 to 6 with a replay buffer: the backward pass reuses splats, lists and alphas of the forward pass. Without
+// Stages 4 to 6 fused: the backward pass reuses splats, lists and alphas of the forward pass (TileRowCache). Without
 // SSIM the loss of a pixel depends on that pixel alone. A tile then goes through all three stages at once, with its
-// data in the second-level cache, and no image is written. SSIM needs the image around a tile: the replay buffer of a
+// data in the second-level cache, and no image is written. SSIM needs the image around a tile: the forward cache of a
 // tile row waits until the adjacent tile rows are rendered.
 #include <algorithm>
 
@@ -25,7 +25,7 @@ struct TileGradient {
   uint32_t nonzero_blocks = 0;  // bit mask of the blocks with a non-zero gradient
 
   GAUSSLITE_INLINE void start(int b, const Pack16 (&gradient)[5], const Pack16 (&image)[5]) {
-    // A zero gradient by depth implies a zero gradient by alpha.
+    // A zero gradient of depth implies a zero gradient of alpha.
     const Pack16 size = (abs(gradient[0]) + abs(gradient[1])) + (abs(gradient[2]) + abs(gradient[3]));
     if (!any(size > Pack16(0.0f))) return;
     nonzero_blocks |= 1u << b;
@@ -35,25 +35,25 @@ struct TileGradient {
 
 int chunk_size(uint32_t count, uint32_t first) { return int(std::min<uint32_t>(kChunk, count - first)); }
 
-// Renders a tile and appends it to the replay buffer.
-TileReplay render(Workspace& ws, TileRowReplay& replay, const TileList& list, const TilePosition& tile,
+// Renders a tile and appends it to the forward cache.
+CachedTile render(Workspace& ws, TileRowCache& cache, const TileList& list, const TilePosition& tile,
                   BlockState (&state)[kBlocks]) {
-  TileReplay out{replay.record_count, replay.list_count, replay.alpha_count, 0};
-  replay.records.reserve(out.first_record + list.count, out.first_record);
-  replay.lists.reserve(out.first_list + (list.count + kChunk - 1) / kChunk, out.first_list);
+  CachedTile out{cache.record_count, cache.list_count, cache.alpha_count, 0};
+  cache.records.ensure_capacity(out.first_record + list.count, out.first_record);
+  cache.lists.ensure_capacity(out.first_list + (list.count + kChunk - 1) / kChunk, out.first_list);
   size_t alpha_count = out.first_alpha;
   uint32_t finished = 0;
   for (uint32_t first = 0; first < list.count && finished != 0xFFFF; first += kChunk) {
     const int n = chunk_size(list.count, first);
-    Splat* records = &replay.records[out.first_record + first];
-    BlockLists& lists = replay.lists[replay.list_count++];
+    Splat* records = &cache.records[out.first_record + first];
+    BlockLists& lists = cache.lists[cache.list_count++];
     load_chunk(ws, list, first, n, records, lists);
-    // Prefetch early: the rows are in a nearer cache when the backward pass adds to them.
+    // Prefetched this early, the rows are in a near cache when the backward pass adds to them.
     prefetch_rows(ws, records, n, tile);
     size_t entries = 0;
     for (int b = 0; b < kBlocks; ++b) entries += lists.count[b];
-    replay.alphas.reserve((alpha_count + entries) * 16, alpha_count * 16);
-    float* alphas = replay.alphas.data() + alpha_count * 16;
+    cache.alphas.ensure_capacity((alpha_count + entries) * 16, alpha_count * 16);
+    float* alphas = cache.alphas.data() + alpha_count * 16;
     for (int b = 0; b < kBlocks; ++b) {
       if (finished >> b & 1u) {
         lists.count[b] = 0;
@@ -63,26 +63,26 @@ TileReplay render(Workspace& ws, TileRowReplay& replay, const TileList& list, co
           composite<true>(records, lists.entry[b], lists.count[b], tile.pixel_x(b), tile.pixel_y(b), state[b], alphas));
       if (state[b].finished()) finished |= 1u << b;
     }
-    alpha_count = size_t(alphas - replay.alphas.data()) / 16;
+    alpha_count = size_t(alphas - cache.alphas.data()) / 16;
     out.entries = first + uint32_t(n);
   }
-  replay.record_count += out.entries;
-  replay.alpha_count = alpha_count;
+  cache.record_count += out.entries;
+  cache.alpha_count = alpha_count;
   return out;
 }
 
-void backward_replayed_tile(Workspace& ws, const TileRowReplay& replay, const TileReplay& replayed,
-                            const TilePosition& tile, TileGradient& gradient) {
+void backward_cached_tile(Workspace& ws, const TileRowCache& cache, const CachedTile& cached, const TilePosition& tile,
+                          TileGradient& gradient) {
   if (gradient.nonzero_blocks == 0) return;
   ChunkSums sums;
   MomentBatch batch;
-  const float* alphas = replay.alphas.data() + replayed.first_alpha * 16;
-  const BlockLists* lists = replay.lists.data() + replayed.first_list;
-  for (uint32_t first = 0; first < replayed.entries; first += kChunk, ++lists) {
-    const Splat* records = &replay.records[replayed.first_record + first];
-    const int n = chunk_size(replayed.entries, first);
-    if (first + kChunk < replayed.entries)
-      prefetch_rows(ws, records + kChunk, chunk_size(replayed.entries, first + kChunk), tile);
+  const float* alphas = cache.alphas.data() + cached.first_alpha * 16;
+  const BlockLists* lists = cache.lists.data() + cached.first_list;
+  for (uint32_t first = 0; first < cached.entries; first += kChunk, ++lists) {
+    const Splat* records = &cache.records[cached.first_record + first];
+    const int n = chunk_size(cached.entries, first);
+    if (first + kChunk < cached.entries)
+      prefetch_rows(ws, records + kChunk, chunk_size(cached.entries, first + kChunk), tile);
     sums.clear(n);
     for (int b = 0; b < kBlocks; ++b) {
       if (gradient.nonzero_blocks >> b & 1u) {
@@ -99,7 +99,7 @@ void backward_replayed_tile(Workspace& ws, const TileRowReplay& replay, const Ti
 }
 
 // Computes the L1 terms of one block and their gradient.
-GAUSSLITE_INLINE Pack16 compare(const Training& training, size_t t, int b, const Pack16 (&image)[5],
+GAUSSLITE_INLINE Pack16 compare(const TrainingArguments& training, size_t t, int b, const Pack16 (&image)[5],
                                 Pack16 (&gradient)[5]) {
   const TargetTile& target = training.targets.tiles[t];
   const int corner = corner_in_tile(b);
@@ -110,23 +110,23 @@ GAUSSLITE_INLINE Pack16 compare(const Training& training, size_t t, int b, const
   return l1_of_pixels(image, rgb, measured_m, weight, training.loss, gradient);
 }
 
-void train_tile(Workspace& ws, const Training& training, size_t t, const TilePosition& tile,
+void train_tile(Workspace& ws, const TrainingArguments& training, size_t t, const TilePosition& tile,
                 ThreadScratch& thread_scratch) {
   BlockState state[kBlocks];
-  thread_scratch.replay.clear();
-  const TileReplay replayed = render(ws, thread_scratch.replay, thread_scratch.tiles[size_t(tile.x)], tile, state);
-  thread_scratch.block_evaluations += thread_scratch.replay.alpha_count;
+  thread_scratch.tile_cache.clear();
+  const CachedTile cached = render(ws, thread_scratch.tile_cache, thread_scratch.tiles[size_t(tile.x)], tile, state);
+  thread_scratch.block_evaluations += thread_scratch.tile_cache.alpha_count;
   TileGradient gradient;
   Pack16 loss(0.0f);
   for (int b = 0; b < kBlocks; ++b) {
     const BlockState& s = state[b];
     const Pack16 image[5] = {s.r, s.g, s.b, s.depth, s.transmittance};
-    Pack16 by[5];
-    loss = loss + compare(training, t, b, image, by);
-    gradient.start(b, by, image);
+    Pack16 d_image[5];
+    loss = loss + compare(training, t, b, image, d_image);
+    gradient.start(b, d_image, image);
   }
   training.l1_sums[t] = double(sum(loss));
-  backward_replayed_tile(ws, thread_scratch.replay, replayed, tile, gradient);
+  backward_cached_tile(ws, thread_scratch.tile_cache, cached, tile, gradient);
 }
 
 bool any_tile(const uint16_t* blocks, int tiles_x) {
@@ -135,8 +135,8 @@ bool any_tile(const uint16_t* blocks, int tiles_x) {
 
 }  // namespace
 
-// Pixels of inactive tiles are black, and their loss counts.
-void train_tile_row(Workspace& ws, const Training& training, int tile_row, int thread) {
+// Includes the loss of inactive tiles, whose pixels are black.
+void train_tile_row(Workspace& ws, const TrainingArguments& training, int tile_row, int thread) {
   const size_t first = size_t(tile_row) * size_t(ws.tiles_x);
   std::fill_n(training.l1_sums + first, ws.tiles_x, 0.0);
   if (!any_tile(training.targets.weighted_blocks + first, ws.tiles_x)) return;
@@ -151,62 +151,63 @@ void train_tile_row(Workspace& ws, const Training& training, int tile_row, int t
   }
 }
 
-void render_to_replay(Workspace& ws, const Training& training, TileRowReplay& replay, int tile_row, int thread) {
+void render_to_cache(Workspace& ws, const TrainingArguments& training, TileRowCache& cache, int tile_row, int thread) {
   const size_t first = size_t(tile_row) * size_t(ws.tiles_x);
-  replay.clear();
+  cache.clear();
   if (!any_tile(training.targets.reached_blocks + first, ws.tiles_x)) return;
   ThreadScratch& thread_scratch = ws.scratch[size_t(thread)];
   int count = 0;
   const DepthKey* keys = sort_tile_row(ws, tile_row, thread, count);
   bin_tile_row(ws, tile_row, keys, count, thread_scratch.tiles.data());
-  replay.tiles.reserve(size_t(ws.tiles_x));
-  replay.image.reserve(image_tile(ws.tiles_x));
+  cache.tiles.ensure_capacity(size_t(ws.tiles_x));
+  cache.image.ensure_capacity(image_offset(ws.tiles_x));
   for (int x = 0; x < ws.tiles_x; ++x) {
     const size_t t = first + size_t(x);
     if (training.targets.reached_blocks[t] == 0) continue;
     if (ws.needed_blocks[t] == 0 && training.targets.weighted_blocks[t] == 0) {
       // Windows reach this tile, but it is not rendered: its pixels are black.
-      replay.tiles[size_t(x)].entries = 0;
-      std::fill_n(replay.image.data() + image_tile(x), 3 * kSquare, 0.0f);
+      cache.tiles[size_t(x)].entries = 0;
+      std::fill_n(cache.image.data() + image_offset(x), 3 * kTilePixels, 0.0f);
       continue;
     }
     const TilePosition tile(ws, x, tile_row);
     BlockState state[kBlocks];
-    replay.tiles[size_t(x)] = render(ws, replay, thread_scratch.tiles[size_t(x)], tile, state);
-    float* image = replay.image.data() + image_tile(x);
+    cache.tiles[size_t(x)] = render(ws, cache, thread_scratch.tiles[size_t(x)], tile, state);
+    float* image = cache.image.data() + image_offset(x);
     for (int b = 0; b < kBlocks; ++b) {
       const Pack16 pixels[kImagePlanes] = {state[b].r, state[b].g, state[b].b, state[b].depth, state[b].transmittance};
-      for (int k = 0; k < kImagePlanes; ++k) store_block(image + k * kSquare + corner_in_tile(b), kTile, pixels[k]);
+      for (int k = 0; k < kImagePlanes; ++k) store_block(image + k * kTilePixels + corner_in_tile(b), kTile, pixels[k]);
     }
     clear_beyond_edge(ws.camera, x, tile_row, image);
   }
-  thread_scratch.block_evaluations += replay.alpha_count;
+  thread_scratch.block_evaluations += cache.alpha_count;
 }
 
-void backward_from_replay(Workspace& ws, const Training& training, const ReplayedTileRow& replayed) {
-  const TileRowReplay& replay = replayed.replay;
+void backward_from_cache(Workspace& ws, const TrainingArguments& training, const RenderedTileRow& tile_row) {
+  const TileRowCache& cache = tile_row.cache;
   for (int x = 0; x < ws.tiles_x; ++x) {
-    const size_t t = size_t(replayed.tile_row) * size_t(ws.tiles_x) + size_t(x);
+    const size_t t = size_t(tile_row.index) * size_t(ws.tiles_x) + size_t(x);
     training.l1_sums[t] = 0.0;
     if (training.targets.reached_blocks[t] == 0) continue;
-    const TileReplay& rendered = replay.tiles[size_t(x)];
+    const CachedTile& rendered = cache.tiles[size_t(x)];
     if (rendered.entries == 0 && training.targets.weighted_blocks[t] == 0) continue;
-    const TilePosition tile(ws, x, replayed.tile_row);
-    prefetch_rows(ws, replay.records.data() + rendered.first_record, chunk_size(rendered.entries, 0), tile);
-    TileColours by_ssim;
-    const bool reached = ssim_gradient(ws, training.targets, replayed, x, by_ssim);
+    const TilePosition tile(ws, x, tile_row.index);
+    prefetch_rows(ws, cache.records.data() + rendered.first_record, chunk_size(rendered.entries, 0), tile);
+    TileColours ssim_gradients;
+    const bool reached = ssim_gradient(ws, training.targets, tile_row, x, ssim_gradients);
     TileGradient gradient;
     Pack16 loss(0.0f);
     for (int b = 0; b < kBlocks; ++b) {
-      Pack16 image[kImagePlanes], by[kImagePlanes];
+      Pack16 image[kImagePlanes], d_image[kImagePlanes];
       for (int k = 0; k < kImagePlanes; ++k)
-        image[k] = load_block(replay.image.data() + image_tile(x) + k * kSquare + corner_in_tile(b), kTile);
-      loss = loss + compare(training, t, b, image, by);
-      for (int k = 0; reached && k < 3; ++k) by[k] = by[k] + load_block(by_ssim.value[k] + corner_in_tile(b), kTile);
-      gradient.start(b, by, image);
+        image[k] = load_block(cache.image.data() + image_offset(x) + k * kTilePixels + corner_in_tile(b), kTile);
+      loss = loss + compare(training, t, b, image, d_image);
+      for (int k = 0; reached && k < 3; ++k)
+        d_image[k] = d_image[k] + load_block(ssim_gradients.value[k] + corner_in_tile(b), kTile);
+      gradient.start(b, d_image, image);
     }
     training.l1_sums[t] = double(sum(loss));
-    backward_replayed_tile(ws, replay, rendered, tile, gradient);
+    backward_cached_tile(ws, cache, rendered, tile, gradient);
   }
 }
 

@@ -37,16 +37,16 @@ void fill(std::vector<int>& stack, int count) {
 
 }  // namespace
 
-void TileRowSchedule::start(const std::vector<uint32_t>& weights, int threads, int replay_slots) {
-  const int tile_rows = int(weights.size());
+void TileRowSchedule::start(const std::vector<uint32_t>& key_counts, int threads, int cache_slots) {
+  const int tile_rows = int(key_counts.size());
   tile_rows_ = not_rendered_ = tile_rows;
   backward_taken_ = 0;
   first_tile_row_.assign(size_t(threads) + 1, tile_rows);
-  const uint64_t total = std::accumulate(weights.begin(), weights.end(), uint64_t{0});
+  const uint64_t total = std::accumulate(key_counts.begin(), key_counts.end(), uint64_t{0});
   uint64_t above = 0;
   for (int tile_row = 0, t = 0; tile_row <= tile_rows && t < threads; ++tile_row) {
     for (; t < threads && above * uint64_t(threads) >= total * uint64_t(t); ++t) first_tile_row_[size_t(t)] = tile_row;
-    if (tile_row < tile_rows) above += weights[size_t(tile_row)];
+    if (tile_row < tile_rows) above += key_counts[size_t(tile_row)];
   }
   first_tile_row_[0] = 0;
   ranges_.clear();
@@ -55,11 +55,11 @@ void TileRowSchedule::start(const std::vector<uint32_t>& weights, int threads, i
     const bool upwards = t % 2 == 0 && t + 1 < threads;
     ranges_.push_back({upwards ? first + count - 1 : first, count, upwards ? -1 : 1});
   }
-  fill(free_replays_, replay_slots);
-  fill(free_squares_, square_slots(replay_slots));
-  replay_of_tile_row_.assign(size_t(tile_rows), -1);
+  fill(free_caches_, cache_slots);
+  fill(free_squares_, square_slots(cache_slots));
+  cache_of_tile_row_.assign(size_t(tile_rows), -1);
   rendered_by_.assign(size_t(tile_rows), -1);
-  replay_last_thread_.resize(size_t(replay_slots), -1);
+  cache_last_thread_.resize(size_t(cache_slots), -1);
   squares_of_square_row_.assign(size_t(tile_rows) + 1, -1);
   backward_missing_.assign(size_t(tile_rows), 2);
   for (std::vector<int>* adjacent_tile_rows : {&ssim_missing_, &square_row_users_}) {
@@ -82,22 +82,22 @@ TileRowTask TileRowSchedule::next(int thread) {
   }
 }
 
-// Tasks on data in the thread's own caches come first, and of these the backward tasks, which free a replay buffer. A
+// Tasks on data in the thread's own caches come first, and of these the backward tasks, which free a forward cache. A
 // thread takes tasks on tile rows of other threads when none of its own are left.
 bool TileRowSchedule::take(TileRowTask& task, int thread) {
-  const bool can_render = not_rendered_ > 0 && !free_replays_.empty();
+  const bool can_render = not_rendered_ > 0 && !free_caches_.empty();
   if (const int tile_row = pop_own_tile_row(thread); tile_row >= 0) {
-    task = backward(tile_row);
+    task = backward_task(tile_row);
   } else if (const int row = pop_own_square_row(thread); row >= 0) {
-    task = derive(row);
+    task = ssim_task(row);
   } else if (can_render && ranges_[size_t(thread)].left > 0) {
-    task = render(thread);
+    task = render_task(thread);
   } else if (!ssim_ready_.empty()) {
-    task = derive(pop(ssim_ready_));
+    task = ssim_task(pop(ssim_ready_));
   } else if (!backward_ready_.empty()) {
-    task = backward(pop(backward_ready_));
+    task = backward_task(pop(backward_ready_));
   } else if (can_render) {
-    task = render(thread);
+    task = render_task(thread);
   } else {
     return false;
   }
@@ -105,7 +105,7 @@ bool TileRowSchedule::take(TileRowTask& task, int thread) {
 }
 
 // Takes the next of the thread's own tile rows; if none are left, the next of the thread with most rows left.
-TileRowTask TileRowSchedule::render(int thread) {
+TileRowTask TileRowSchedule::render_task(int thread) {
   ThreadRange* range = &ranges_[size_t(thread)];
   if (range->left == 0) {
     range = &*std::max_element(ranges_.begin(), ranges_.end(),
@@ -115,25 +115,25 @@ TileRowTask TileRowSchedule::render(int thread) {
   range->next += range->step;
   --range->left;
   --not_rendered_;
-  int replay = pop_own(free_replays_, [&](int place) { return replay_last_thread_[size_t(place)] == thread; });
-  if (replay < 0) replay = pop(free_replays_);
-  replay_of_tile_row_[size_t(tile_row)] = replay;
-  rendered_by_[size_t(tile_row)] = replay_last_thread_[size_t(replay)] = thread;
-  return {TileRowTask::kRender, tile_row, {replay, -1}, {-1, -1}};
+  int cache = pop_own(free_caches_, [&](int place) { return cache_last_thread_[size_t(place)] == thread; });
+  if (cache < 0) cache = pop(free_caches_);
+  cache_of_tile_row_[size_t(tile_row)] = cache;
+  rendered_by_[size_t(tile_row)] = cache_last_thread_[size_t(cache)] = thread;
+  return {TileRowTask::kRender, tile_row, {cache, -1}, {-1, -1}};
 }
 
-TileRowTask TileRowSchedule::derive(int row) {
-  const int above = row > 0 ? replay_of_tile_row_[size_t(row - 1)] : -1;
-  const int below = row < tile_rows_ ? replay_of_tile_row_[size_t(row)] : -1;
+TileRowTask TileRowSchedule::ssim_task(int row) {
+  const int above = row > 0 ? cache_of_tile_row_[size_t(row - 1)] : -1;
+  const int below = row < tile_rows_ ? cache_of_tile_row_[size_t(row)] : -1;
   const int squares = squares_of_square_row_[size_t(row)] = pop(free_squares_);
   return {TileRowTask::kSsim, row, {above, below}, {squares, -1}};
 }
 
-TileRowTask TileRowSchedule::backward(int tile_row) {
+TileRowTask TileRowSchedule::backward_task(int tile_row) {
   ++backward_taken_;
   return {TileRowTask::kBackward,
           tile_row,
-          {replay_of_tile_row_[size_t(tile_row)], -1},
+          {cache_of_tile_row_[size_t(tile_row)], -1},
           {squares_of_square_row_[size_t(tile_row)], squares_of_square_row_[size_t(tile_row) + 1]}};
 }
 
@@ -161,7 +161,7 @@ void TileRowSchedule::finish(const TileRowTask& task) {
           backward_ready_.push_back(tile_row);
       }
     } else {
-      free_replays_.push_back(task.replays[0]);
+      free_caches_.push_back(task.caches[0]);
       for (const int k : {task.index, task.index + 1}) {
         if (--square_row_users_[size_t(k)] == 0) free_squares_.push_back(squares_of_square_row_[size_t(k)]);
       }

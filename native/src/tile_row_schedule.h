@@ -15,28 +15,33 @@
 
 namespace gausslite {
 
-// One task. Replay buffers and rows of squares are few and reused; the task holds their indices.
+// One task. Forward caches and rows of SSIM squares are few and reused; the task holds their indices.
 struct TileRowTask {
   enum Kind { kRender, kSsim, kBackward, kNone };
   Kind kind = kNone;
-  int index = 0;              // of the tile row, or of the row of squares
-  int replays[2] = {-1, -1};  // the tile row's; for SSIM, those of the tile rows above and below, -1 beyond the image
-  int squares[2] = {-1,
-                    -1};  // the row's; for backward, those of the rows at the upper and the lower half of the tile row
+  // The tile row; for kSsim, the row of SSIM squares.
+  int index = 0;
+  // Forward cache of the tile row; for kSsim, those of the tile rows above and below, -1 beyond the image.
+  int caches[2] = {-1, -1};
+  // Memory of the row of SSIM squares; for kBackward, of the rows that overlap the upper and lower half of the tile
+  // row.
+  int squares[2] = {-1, -1};
 };
 
 class TileRowSchedule {
  public:
-  // Enough to avoid deadlock: if no SSIM or backward task is ready, at most two rendered tile rows of each thread wait,
-  // its first and its last.
-  static int replay_slots(int threads) { return 2 * threads; }
-  // At least one of the two tile rows that a row of squares overlaps still has its replay buffer.
-  static int square_slots(int replay_slots) { return 2 * replay_slots; }
+  // Number of forward caches: enough to avoid deadlock. If no SSIM or backward task is ready, at most two rendered tile
+  // rows of each thread wait for neighbours: its first and its last.
+  static int cache_slots(int threads) { return 2 * threads; }
+  // Number of rows of SSIM squares in memory: at most two for each forward cache in use. A row of squares is in use
+  // only while one of the two tile rows that it overlaps has a forward cache.
+  static int square_slots(int cache_slots) { return 2 * cache_slots; }
 
-  // `weights`: the number of depth keys of each tile row.
-  void start(const std::vector<uint32_t>& weights, int threads, int replay_slots);
+  // `key_counts`: the number of depth keys of each tile row.
+  void start(const std::vector<uint32_t>& key_counts, int threads, int cache_slots);
   // Waits for a task for this thread; returns kNone if all are taken.
   TileRowTask next(int thread);
+  // Marks a task as finished, so that tasks that need its result become ready.
   void finish(const TileRowTask& task);
   // Ends the schedule for all threads, after one of them failed.
   void stop();
@@ -47,9 +52,9 @@ class TileRowSchedule {
     int next, left, step;
   };
   bool take(TileRowTask& task, int thread);
-  TileRowTask render(int thread);
-  TileRowTask derive(int row);
-  TileRowTask backward(int tile_row);
+  TileRowTask render_task(int thread);
+  TileRowTask ssim_task(int row);
+  TileRowTask backward_task(int tile_row);
   // The latest ready tile row that this thread rendered, or row of squares next to such a tile row; -1 if there is
   // none.
   int pop_own_tile_row(int thread);
@@ -59,10 +64,10 @@ class TileRowSchedule {
   int tile_rows_ = 0, not_rendered_ = 0, backward_taken_ = 0;
   std::vector<ThreadRange> ranges_;
   std::vector<int> first_tile_row_;  // [t]: first tile row of thread t; each thread has an equal share of the keys
-  std::vector<int> free_replays_, free_squares_, replay_of_tile_row_, squares_of_square_row_;
-  std::vector<int> rendered_by_, replay_last_thread_;  // threads, by tile row and by replay buffer
-  std::vector<int> ssim_missing_, backward_missing_;   // number of unfinished inputs
-  std::vector<int> square_row_users_;                  // tile rows that still need a row of squares
+  std::vector<int> free_caches_, free_squares_, cache_of_tile_row_, squares_of_square_row_;
+  std::vector<int> rendered_by_, cache_last_thread_;  // threads, by tile row and by forward cache
+  std::vector<int> ssim_missing_, backward_missing_;  // number of unfinished inputs
+  std::vector<int> square_row_users_;                 // tile rows that still need a row of squares
   std::vector<int> ssim_ready_, backward_ready_;
   std::atomic<uint32_t> change_count_{0};
 };

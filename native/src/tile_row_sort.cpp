@@ -50,7 +50,7 @@ const DepthKey* sort_tile_row(Workspace& ws, int tile_row, int thread, int& coun
   count = range.count;
   if (count == 0) return nullptr;
   ThreadScratch& thread_scratch = ws.scratch[size_t(thread)];
-  for (Buffer<DepthKey>& buffer : thread_scratch.sorted) buffer.reserve(size_t(count) + kPrefetchAhead);
+  for (Buffer<DepthKey>& buffer : thread_scratch.sorted) buffer.ensure_capacity(size_t(count) + kPrefetchAhead);
   const int shift = std::max(0, 32 - kDigits * kDigitBits - __builtin_clz((range.farthest - range.nearest) | 1u));
 
   uint32_t position[kDigits][kDigitValues] = {};

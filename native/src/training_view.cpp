@@ -9,21 +9,22 @@ namespace gausslite {
 
 namespace {
 
-constexpr int kReachInBlocks = 2;          // an SSIM window reaches 5 px: up to the second block next to its own
-constexpr uint32_t kZeros = 0, kOnes = 1;  // shared entries of Weights::values
+// An SSIM window extends 5 px from its centre: it reaches at most the second block next to the centre's block.
+constexpr int kReachInBlocks = 2;
+// Entries of Weights::values for all tiles with weights of 0, and for all tiles with weights of 1.
+constexpr uint32_t kZerosEntry = 0, kOnesEntry = 1;
 
 uint16_t block_bit(int x, int y) { return uint16_t(1u << (y % kBlocksAcross * kBlocksAcross + x % kBlocksAcross)); }
 
 uint16_t blocks_with_weight(const float* tile) {
   uint16_t blocks = 0;
-  for (int i = 0; i < kSquare; ++i) {
+  for (int i = 0; i < kTilePixels; ++i) {
     if (tile[i] != 0.0f) blocks |= block_bit(i % kTile / kBlock, i / kTile / kBlock);
   }
   return blocks;
 }
 
-// Returns an 8x8 grid (bit 8 row + column) with the tile's blocks in its middle, dilated by the reach of the SSIM
-// window.
+// Returns an 8x8 grid of blocks (bit 8 row + column): the tile's blocks in its middle, dilated by kReachInBlocks.
 uint64_t dilated(uint16_t blocks) {
   uint64_t grid = 0;
   for (int y = 0; y < kBlocksAcross; ++y) {
@@ -39,10 +40,10 @@ int tiles(int pixels) { return (pixels + kTile - 1) / kTile; }
 
 TrainingView::TrainingView(int width, int height, const uint8_t* rgb, const float* depth_m, const float* weight)
     : width_(width), height_(height), tiles_x_(tiles(width)), tiles_y_(tiles(height)), masked_(weight != nullptr) {
-  tiles_.reserve_exactly(tile_count());
+  tiles_.ensure_exact_capacity(tile_count());
   for (size_t t = 0; t < tile_count(); ++t) copy_tile(t, rgb, depth_m);
-  assign_weights(inside_, nullptr);
-  if (masked_) assign_weights(mask_, weight);
+  assign_weights(image_weights_, nullptr);
+  if (masked_) assign_weights(mask_weights_, weight);
 }
 
 TrainingView::Extent TrainingView::extent(size_t tile) const {
@@ -67,16 +68,16 @@ void TrainingView::copy_tile(size_t tile, const uint8_t* rgb, const float* depth
 }
 
 void TrainingView::assign_weights(Weights& weights, const float* weight) const {
-  weights.entries.reserve_exactly(tile_count());
-  weights.weighted_blocks.reserve_exactly(tile_count());
-  weights.values.reserve(2 * kSquare);
-  std::fill_n(&weights.values[kOnes * kSquare], kSquare, 1.0f);
+  weights.entry_of_tile.ensure_exact_capacity(tile_count());
+  weights.weighted_blocks.ensure_exact_capacity(tile_count());
+  weights.values.ensure_capacity(2 * kTilePixels);
+  std::fill_n(&weights.values[kOnesEntry * kTilePixels], kTilePixels, 1.0f);
   uint32_t used = 2;
   for (size_t t = 0; t < tile_count(); ++t) {
     const Extent part = extent(t);
-    float own[kSquare] = {};
+    float tile[kTilePixels] = {};
     for (int y = 0; y < part.rows; ++y) {
-      float* row = own + y * kTile;
+      float* row = tile + y * kTile;
       if (weight != nullptr) {
         std::copy_n(weight + int64_t(part.y + y) * width_ + part.x, part.columns, row);
       } else {
@@ -84,58 +85,59 @@ void TrainingView::assign_weights(Weights& weights, const float* weight) const {
       }
     }
     bool zeros = true, ones = true;
-    for (const float w : own) {
+    for (const float w : tile) {
       zeros &= w == 0.0f;
       ones &= w == 1.0f;
     }
-    weights.entries[t] = zeros ? kZeros : ones ? kOnes : used;
-    weights.weighted_blocks[t] = zeros ? uint16_t(0) : ones ? uint16_t(0xFFFF) : blocks_with_weight(own);
-    weights.sum += zeros ? 0.0 : ones ? double(kSquare) : std::accumulate(own, own + kSquare, 0.0);
+    weights.entry_of_tile[t] = zeros ? kZerosEntry : ones ? kOnesEntry : used;
+    weights.weighted_blocks[t] = zeros ? uint16_t(0) : ones ? uint16_t(0xFFFF) : blocks_with_weight(tile);
+    weights.sum += zeros ? 0.0 : ones ? double(kTilePixels) : std::accumulate(tile, tile + kTilePixels, 0.0);
     if (zeros || ones) continue;
-    weights.values.reserve((size_t(used) + 1) * kSquare, size_t(used) * kSquare);
-    std::copy_n(own, kSquare, &weights.values[size_t(used++) * kSquare]);
+    weights.values.ensure_capacity((size_t(used) + 1) * kTilePixels, size_t(used) * kTilePixels);
+    std::copy_n(tile, kTilePixels, &weights.values[size_t(used++) * kTilePixels]);
   }
-  reach_blocks(weights);
-  reach_squares(weights);
+  mark_reached_blocks(weights);
+  mark_ssim_squares(weights);
 }
 
-// Marks all blocks in reach of a block with a weight.
-void TrainingView::reach_blocks(Weights& weights) const {
-  weights.reached_blocks.reserve_exactly(tile_count());
+// Marks all blocks that SSIM windows around a weighted block may reach, and these blocks themselves.
+void TrainingView::mark_reached_blocks(Weights& weights) const {
+  weights.reached_blocks.ensure_exact_capacity(tile_count());
   const int blocks_x = (width_ + kBlock - 1) / kBlock, blocks_y = (height_ + kBlock - 1) / kBlock;
   for (size_t t = 0; t < tile_count(); ++t) {
     if (weights.weighted_blocks[t] == 0) continue;
     const Extent part = extent(t);
     const int first_x = part.x / kBlock - kReachInBlocks, first_y = part.y / kBlock - kReachInBlocks;
-    for (uint64_t left = dilated(weights.weighted_blocks[t]); left != 0; left &= left - 1) {
-      const int bit = __builtin_ctzll(left), x = first_x + bit % 8, y = first_y + bit / 8;
+    for (uint64_t marked = dilated(weights.weighted_blocks[t]); marked != 0; marked &= marked - 1) {
+      const int bit = __builtin_ctzll(marked), x = first_x + bit % 8, y = first_y + bit / 8;
       if (x >= 0 && x < blocks_x && y >= 0 && y < blocks_y)
         weights.reached_blocks[tile_of(x * kBlock, y * kBlock)] |= block_bit(x, y);
     }
   }
 }
 
-// Marks the squares of the SSIM loss, which lie half a tile higher than the tiles.
-void TrainingView::reach_squares(Weights& weights) const {
+// Sets the status of the SSIM squares (workspace.h). The upper half of a tile in tile row k is in square row k, the
+// lower half in square row k + 1. Windows of a square reach only the squares next to it in its row.
+void TrainingView::mark_ssim_squares(Weights& weights) const {
   constexpr uint16_t kUpperHalf = 0x00FF, kLowerHalf = 0xFF00;
-  weights.reach.reserve_exactly(square_count());
+  weights.square_status.ensure_exact_capacity(square_count());
   const size_t across = size_t(tiles_x_);
   for (size_t t = 0; t < tile_count(); ++t) {
-    if ((weights.weighted_blocks[t] & kUpperHalf) != 0) weights.reach[t] = kWeighted;
-    if ((weights.weighted_blocks[t] & kLowerHalf) != 0) weights.reach[t + across] = kWeighted;
+    if ((weights.weighted_blocks[t] & kUpperHalf) != 0) weights.square_status[t] = kWeighted;
+    if ((weights.weighted_blocks[t] & kLowerHalf) != 0) weights.square_status[t + across] = kWeighted;
   }
   for (size_t i = 0; i < square_count(); ++i) {
-    if (weights.reach[i] != kWeighted) continue;
+    if (weights.square_status[i] != kWeighted) continue;
     const size_t x = i % across;
-    if (x > 0) weights.reach[i - 1] = std::max(weights.reach[i - 1], uint8_t(kReached));
-    if (x + 1 < across) weights.reach[i + 1] = std::max(weights.reach[i + 1], uint8_t(kReached));
+    if (x > 0) weights.square_status[i - 1] = std::max(weights.square_status[i - 1], uint8_t(kWindowInput));
+    if (x + 1 < across) weights.square_status[i + 1] = std::max(weights.square_status[i + 1], uint8_t(kWindowInput));
   }
 }
 
 Targets TrainingView::targets(bool masked) const {
   const Weights& w = weights(masked);
-  return {tiles_.data(),           w.values.data(), w.entries.data(), w.weighted_blocks.data(),
-          w.reached_blocks.data(), w.reach.data()};
+  return {tiles_.data(),           w.values.data(),       w.entry_of_tile.data(), w.weighted_blocks.data(),
+          w.reached_blocks.data(), w.square_status.data()};
 }
 
 }  // namespace gausslite

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// A training image, prepared once: in tiles, padded to whole tiles, with weights per tile. A mapper picks one of many
-// views at random, so that it comes from memory in each step: the format is compact.
+// A training image in tiles, padded to whole tiles, with pixel weights per tile. It is prepared once and used in many
+// steps. A mapper picks one of many views at random, so that each step loads it from memory: the format is compact.
 #pragma once
 
 #include <cstdint>
@@ -19,17 +19,17 @@ class TrainingView {
   int height() const { return height_; }
   Targets targets(bool masked) const;
   double weight_sum(bool masked) const { return weights(masked).sum; }
-  // Mean weight of the image.
-  double share(bool masked) const { return weights(masked).sum / inside_.sum; }
+  // Mean weight of the image's pixels.
+  double mean_weight(bool masked) const { return weights(masked).sum / image_weights_.sum; }
 
  private:
-  // Weights of the pixels. All tiles of zeros share one entry, as do all tiles of ones.
+  // Weights of the pixels, and what follows from them. All tiles of zeros share one entry, as do all tiles of ones.
   struct Weights {
     double sum = 0.0;
-    Buffer<float> values;
-    Buffer<uint32_t> entries;
+    Buffer<float> values;  // entries of 16x16 weights
+    Buffer<uint32_t> entry_of_tile;
     Buffer<uint16_t> weighted_blocks, reached_blocks;
-    Buffer<uint8_t> reach;
+    Buffer<uint8_t> square_status;
   };
   // The part of a tile inside the image.
   struct Extent {
@@ -37,19 +37,20 @@ class TrainingView {
   };
   Extent extent(size_t tile) const;
   void copy_tile(size_t tile, const uint8_t* rgb, const float* depth_m);
-  // weight: height x width, or null for 1 everywhere.
+  // weight: height x width; null: 1 everywhere in the image.
   void assign_weights(Weights& weights, const float* weight) const;
-  void reach_blocks(Weights& weights) const;
-  void reach_squares(Weights& weights) const;
+  void mark_reached_blocks(Weights& weights) const;
+  void mark_ssim_squares(Weights& weights) const;
   size_t tile_count() const { return size_t(tiles_y_) * size_t(tiles_x_); }
   size_t square_count() const { return size_t(tiles_y_ + 1) * size_t(tiles_x_); }
   size_t tile_of(int x, int y) const { return size_t(y / kTile) * size_t(tiles_x_) + size_t(x / kTile); }
-  const Weights& weights(bool masked) const { return masked && masked_ ? mask_ : inside_; }
+  const Weights& weights(bool masked) const { return masked && masked_ ? mask_weights_ : image_weights_; }
 
   int width_, height_, tiles_x_, tiles_y_;
   bool masked_;
   Buffer<TargetTile> tiles_;
-  Weights inside_, mask_;
+  Weights image_weights_;  // 1 everywhere in the image
+  Weights mask_weights_;   // the given weights
 };
 
 }  // namespace gausslite

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// Scratch memory of a frame, which passes data between stages; independent of the instruction set.
+// The data of a frame that stages pass on to each other; independent of the instruction set.
 #pragma once
 
 #include <atomic>
@@ -28,7 +28,7 @@ struct alignas(64) Splat {
 static_assert(sizeof(Splat) == 64);
 
 // Data of a visible splat for the projection's backward pass.
-struct Visible {
+struct VisibleSplat {
   uint32_t id;            // parameter row
   uint32_t gradient_row;  // first of its image gradient rows, one per tile row of its bounding box
   uint32_t gradient_rows;
@@ -49,16 +49,18 @@ struct TileList {
   Buffer<uint32_t> slots;
   Buffer<uint16_t> blocks;
   uint32_t count = 0;
-  uint32_t used[kBlocks];  // composited entries of each block's list, until all its pixels were finished
+  uint32_t used[kBlocks];  // composited entries of each block's list: all, or those before its pixels were finished
 };
 
-constexpr int kSquare = kTile * kTile;
-constexpr int kSsimMaps = 3;        // blurred maps of SSIM: x, xx, xy forward, their derivatives backward
-constexpr int kChunk = 128;         // splats of a tile per batch: their records fit the first-level cache
-constexpr int kPrefetchAhead = 64;  // in keys
-constexpr int kSegment = 2048;      // parameter rows per unit of projection and update work
+// The SSIM loss is computed in squares of the size of a tile. They lie half a tile higher than the tiles: SSIM square x
+// of row k spans image rows 16 k - 8 ... 16 k + 7 and the columns of tile column x (loss_ssim.cpp).
+constexpr int kTilePixels = kTile * kTile;  // of a tile, and of an SSIM square
+constexpr int kSsimMaps = 3;                // blurred maps of SSIM: x, xx, xy forward, their derivatives backward
+constexpr int kChunk = 128;                 // splats of a tile per batch: their records fit the first-level cache
+constexpr int kPrefetchAhead = 64;          // in keys
+constexpr int kSegmentRows = 2048;          // parameter rows per segment, the unit of projection and update work
 
-// Means of sixteen rows, and the largest log scale of each: bounds of their image position and extent.
+// Means of sixteen parameter rows, and the largest log scale of each: they bound the splats' extent in the image.
 struct alignas(64) GroupBounds {
   float mean[3][16], log_scale[16];
 };
@@ -68,7 +70,7 @@ struct KeySpan {
   uint32_t begin, end;
 };
 
-// The entries of a chunk that overlap each block, in order. Rows are padded for whole-register writes.
+// For each block, the entries of a chunk that overlap it, in order. Lists are padded for whole-register writes.
 struct BlockLists {
   alignas(64) uint8_t entry[kBlocks][kChunk + 32];
   uint16_t count[kBlocks];
@@ -82,17 +84,17 @@ struct BlockLists {
   }
 };
 
-// Position of a rendered tile in the replay buffer.
-struct TileReplay {
+// Position of a rendered tile in the forward cache of its tile row.
+struct CachedTile {
   size_t first_record, first_list, first_alpha;
   uint32_t entries;  // entries of its list that were rendered before all pixels were finished
 };
 
-// Replay buffer of a tile row between its forward and backward pass: the splats, block lists and alphas of its tiles in
-// rendering order. The alphas take 64 bytes per overlap of a splat and a block, some megabytes per tile row. Reading
-// them from the third-level cache is faster than computing them again.
-struct TileRowReplay {
-  Buffer<TileReplay> tiles;
+// The forward cache of a tile row: values of its forward pass for its backward pass. These are the splats, block lists
+// and alphas of its tiles in rendering order. The alphas take 64 bytes per overlap of a splat and a block, some
+// megabytes per tile row. Reading them from the third-level cache is faster than computing them again.
+struct TileRowCache {
+  Buffer<CachedTile> tiles;
   Buffer<Splat> records;
   Buffer<BlockLists> lists;
   Buffer<float> alphas;
@@ -102,47 +104,49 @@ struct TileRowReplay {
   void clear() { record_count = list_count = alpha_count = 0; }
 };
 
-// Offset of a tile in TileRowReplay::image.
+// Offset of tile column x in TileRowCache::image.
 constexpr int kImagePlanes = 5;
-inline size_t image_tile(int x) { return size_t(x) * kImagePlanes * kSquare; }
+inline size_t image_offset(int x) { return size_t(x) * kImagePlanes * kTilePixels; }
 
-// Offset of a map in a row of SSIM squares (loss_ssim.cpp): sixteen rows of sixteen floats.
-inline size_t ssim_square(int x, int channel, int map) { return size_t((x * 3 + channel) * kSsimMaps + map) * kSquare; }
+// Offset of a map of SSIM square x in its row of squares: sixteen rows of sixteen floats.
+inline size_t ssim_map_offset(int x, int channel, int map) {
+  return size_t((x * 3 + channel) * kSsimMaps + map) * kTilePixels;
+}
 
 struct alignas(64) ThreadScratch {
   std::vector<KeyList> tile_rows;  // by tile row: keys of this thread's segments
   Buffer<DepthKey> sorted[2];
-  std::vector<TileList> tiles;                          // of the current tile row of a training step
-  TileRowReplay replay;                                 // of one tile, for steps without SSIM
-  Buffer<float> ssim;                                   // columns of the SSIM loss
-  uint32_t next_row = 0, last_row = 0;                  // remaining block of gradient rows of this thread
-  uint64_t block_evaluations = 0;                       // composited block list entries in this frame
-  alignas(64) std::atomic<uint32_t> segments_taken{0};  // number of this thread's segments that are taken
+  std::vector<TileList> tiles;                           // of the current tile row of a training step
+  TileRowCache tile_cache;                               // forward cache of one tile, for steps without SSIM
+  Buffer<float> ssim;                                    // columns of the SSIM loss
+  uint32_t next_gradient_row = 0, end_gradient_row = 0;  // rows that this thread has reserved and not used
+  uint64_t block_evaluations = 0;                        // composited entries of block lists in this frame
+  alignas(64) std::atomic<uint32_t> segments_taken{0};   // number of this thread's segments that are taken
 };
 
 struct Workspace {
   Camera camera;
   int tiles_x = 0, tiles_y = 0, padded_width = 0;
-  int64_t plane = 0;  // floats in one padded image plane
+  int64_t plane_pixels = 0;  // pixels of the image, padded to whole tiles: floats in one plane of it
   int threads = 1;
 
   // Input of the frame. `count` entries: rows `ids[0..count)`, or rows 0..count if ids is null. The backward pass reads
-  // `rows` again: the caller keeps them.
+  // `rows` again: the caller must not free or change them before.
   const float* rows = nullptr;
   const uint32_t* ids = nullptr;
   uint32_t count = 0;
   const uint8_t* active_tiles = nullptr;  // null: all
   ActiveTiles active;                     // lookup tables of the last frame with active_tiles
 
-  // Projection. A segment's visible splats are at its front: slots segment * kSegment + 0 .. segment_visible.
+  // Projection. A segment's visible splats are at its front: slots segment * kSegmentRows + 0 .. segment_visible.
   Buffer<Splat> splats;
-  Buffer<Visible> visible;
+  Buffer<VisibleSplat> visible;
   Buffer<uint32_t> segment_visible;
   Buffer<uint32_t> segment_thread;  // thread that projected it
   Buffer<KeySpan> segment_keys;     // [segment][tile row]
   uint32_t segments = 0;
-  // Bounds of bound tables, stored from step to step: to find the candidates a step then reads 16 bytes per row,
-  // not 64. The first projection of all rows computes them; the update keeps them current.
+  // Culling bounds of the rows of bound tables, kept from step to step. A step then reads 16 bytes per row to find the
+  // candidates, not 64. The first projection of all rows computes the bounds; the update keeps them current.
   Buffer<GroupBounds> bounds;  // of rows 16 k ... 16 k + 15
   bool stores_bounds = false, has_bounds = false;
 
@@ -152,18 +156,18 @@ struct Workspace {
   std::vector<TileList> tiles;  // of the last forward, for its backward pass
   Buffer<float> image, image_gradient;
   // A training step with SSIM reuses a few of these, so that they stay in cache.
-  std::vector<TileRowReplay> replays;       // of tile rows between forward and backward pass
-  std::vector<Buffer<float>> ssim_squares;  // rows of squares: derivatives of SSIM, blurred along the image rows
+  std::vector<TileRowCache> caches;         // of tile rows between forward and backward pass
+  std::vector<Buffer<float>> ssim_squares;  // rows of SSIM squares: derivatives, blurred along the image rows
   // Each gradient row belongs to one pair of splat and tile row. So no two threads add to the same row, and the sum
-  // over a splat's rows has a fixed order: results do not depend on the number of threads. `tag` marks the rows written
-  // in this pass; others count as zero and are never cleared.
+  // over a splat's rows has a fixed order: results do not depend on the number of threads. Each row has the number of
+  // the pass that wrote it; rows of other passes than `gradient_pass` count as zero and are never cleared.
   Buffer<float> gradient_rows;
   std::atomic<uint32_t> gradient_rows_used{0};
-  uint32_t tag = 0;
+  uint32_t gradient_pass = 0;
 
   std::vector<ThreadScratch> scratch;
-  // Dynamic scheduling of tile rows and of segments; reset between stages.
-  alignas(64) std::atomic<int> ticket{0};
+  // Position in the order of tile rows: threads take the next one. Reset between stages.
+  alignas(64) std::atomic<int> next_tile_row{0};
 
   void reset_segments() {
     for (ThreadScratch& s : scratch) s.segments_taken.store(0, std::memory_order_relaxed);

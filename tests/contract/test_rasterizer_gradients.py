@@ -31,7 +31,7 @@ def assert_same_gradients(result: SplatGradients, expected: SplatGradients) -> N
     for group, columns in GROUPS.items():
         error = relative_error(result.d_rows[:, columns], expected.d_rows[:, columns])
         assert error < TOLERANCE, f"{group}: relative error {error:.2e}"
-    assert relative_error(result.mean_2d_norm, expected.mean_2d_norm) < TOLERANCE
+    assert relative_error(result.mean_2d_grad_norm, expected.mean_2d_grad_norm) < TOLERANCE
     assert relative_error(result.d_twist, expected.d_twist) < TOLERANCE
     assert not result.d_rows[:, 14:].any()
 
@@ -91,7 +91,7 @@ def test_empty_subset_has_no_gradient(rasterizer: Rasterizer, subset: Subset) ->
 def test_empty_map_has_no_gradient(rasterizer: Rasterizer) -> None:
     result = gradients(rasterizer, Scene(np.zeros((0, 16), np.float32), CAMERA, np.eye(4)))
     assert result.d_rows.shape == (0, 16)
-    assert len(result.visible) == len(result.mean_2d_norm) == 0
+    assert len(result.visible) == len(result.mean_2d_grad_norm) == 0
 
 
 def test_invalid_rows_have_no_gradient(rasterizer: Rasterizer) -> None:

@@ -110,7 +110,7 @@ def test_step_matches_separate_forward_and_backward(rasterizer: Rasterizer, orac
     np.testing.assert_array_equal(fused.report.visible, separate.visible)
     assert relative_error(applied_gradient(fused), separate.d_rows) < TOLERANCE
     added = (fused.first_moment - fused.before[1])[separate.visible, GRAD_2D_SUM]
-    assert relative_error(added, separate.mean_2d_norm) < TOLERANCE
+    assert relative_error(added, separate.mean_2d_grad_norm) < TOLERANCE
 
 
 @pytest.mark.parametrize("decay_after_updates", [math.inf, 9.0])

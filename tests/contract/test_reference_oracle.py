@@ -71,7 +71,7 @@ def test_mean_2d_norm_is_the_gradient_of_an_image_shift(oracle: Rasterizer) -> N
     rows[0, :3] = [0.1, 0.05, 1.5]
     scene = Scene(rows, CAMERA, np.eye(4))
     d_rgb, d_depth_m, d_alpha = random_image_gradients(scene)
-    result = oracle.backward(oracle.forward(rows, CAMERA, np.eye(4)), d_rgb, d_depth_m, d_alpha).mean_2d_norm
+    result = oracle.backward(oracle.forward(rows, CAMERA, np.eye(4)), d_rgb, d_depth_m, d_alpha).mean_2d_grad_norm
 
     def shifted(dx: float, dy: float) -> float:
         camera = type(CAMERA)(52.0, 50.0, CAMERA.cx_px + dx, CAMERA.cy_px + dy, 64, 48)

@@ -27,16 +27,16 @@ namespace gausslite::GAUSSLITE_ISA {
 constexpr float kLog2E = 1.44269504088896f;
 constexpr float kLn2 = 0.69314718055994531f;
 
-// 2^e for e from -126 to 127, to a relative error of at most 3.6e-6. The sum with a large number rounds e to a multiple
-// of the step and has that multiple in its lowest bits. A polynomial, of a degree that suits the step, computes the
-// rest.
+// 2^e for e from -126 to 127, to a relative error of at most 3.6e-6. With n = kExp2TableSize, 2^e = 2^(k / n) 2^f for
+// the integer k nearest to n e. The sum of e and a large bias rounds e to k / n and has k in its lowest mantissa bits.
+// A polynomial computes 2^f; its degree depends on n.
 GAUSSLITE_INLINE Pack16 exp2_fast(Pack16 e) {
-  const Pack16 large(12582912.0f / kPowerSteps), shifted = e + large, f = e - (shifted - large);
+  const Pack16 bias(12582912.0f / kExp2TableSize), biased = e + bias, f = e - (biased - bias);
   Pack16 p;
-  if constexpr (kPowerSteps == 16) {
+  if constexpr (kExp2TableSize == 16) {
     p = fma(Pack16(0.24021946f), f, Pack16(0.69318783f));
     p = fma(p, f, Pack16(1.0f));
-  } else if constexpr (kPowerSteps == 8) {
+  } else if constexpr (kExp2TableSize == 8) {
     p = fma(Pack16(0.24019833f), f, Pack16(0.69330977f));
     p = fma(p, f, Pack16(1.00000011f));
   } else {
@@ -45,10 +45,10 @@ GAUSSLITE_INLINE Pack16 exp2_fast(Pack16 e) {
     p = fma(p, f, Pack16(0.69312181f));
     p = fma(p, f, Pack16(0.99999926f));
   }
-  return p * power_of_steps(shifted);
+  return p * exp2_of_low_bits(biased);
 }
 
-// 2^e of any e, to a relative error of 7.5e-8: degree 5.
+// 2^e of any e, to a relative error of 7.5e-8, by a polynomial of degree 5.
 GAUSSLITE_INLINE Pack16 exp2_fine(Pack16 e) {
   const Pack16 f = fraction(e);
   Pack16 p = fma(Pack16(0.0018775766948238015f), f, Pack16(0.008989340625703335f));
@@ -56,7 +56,7 @@ GAUSSLITE_INLINE Pack16 exp2_fine(Pack16 e) {
   p = fma(p, f, Pack16(0.24015361070632935f));
   p = fma(p, f, Pack16(0.6931530833244324f));
   p = fma(p, f, Pack16(0.9999999403953552f));
-  return scale_by_power(p, e);
+  return multiply_by_power_of_two(p, e);
 }
 
 GAUSSLITE_INLINE Pack16 exp(Pack16 x) { return exp2_fine(x * kLog2E); }
@@ -79,10 +79,10 @@ GAUSSLITE_INLINE Mask16 is_finite(Pack16 x) { return x * 0.0f == Pack16(0.0f); }
 
 GAUSSLITE_INLINE Mask16 first_lanes(int n) { return mask_of((1u << n) - 1u); }
 
-// 16x16 transpose of sixteen rows.
+// Transposes a 16x16 matrix in place: first within quads, then whole quads.
 GAUSSLITE_INLINE void transpose(Pack16 (&r)[16]) {
-  for (int i = 0; i < 16; i += 4) transpose_quads(r[i], r[i + 1], r[i + 2], r[i + 3]);
-  for (int i = 0; i < 4; ++i) transpose_groups(r[i], r[i + 4], r[i + 8], r[i + 12]);
+  for (int i = 0; i < 16; i += 4) transpose_within_quads(r[i], r[i + 1], r[i + 2], r[i + 3]);
+  for (int i = 0; i < 4; ++i) transpose_whole_quads(r[i], r[i + 4], r[i + 8], r[i + 12]);
 }
 
 GAUSSLITE_INLINE void prefetch(const void* p) { __builtin_prefetch(p, 0, 3); }

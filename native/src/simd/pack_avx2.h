@@ -10,7 +10,7 @@
 
 namespace gausslite::GAUSSLITE_ISA {
 
-constexpr bool kOneRegister = false;
+constexpr bool kFitsOneRegister = false;
 
 struct Mask16 {
   __m256 lo, hi;
@@ -81,11 +81,12 @@ GAUSSLITE_INLINE Pack16 sqrt(Pack16 a) { return {_mm256_sqrt_ps(a.lo), _mm256_sq
 GAUSSLITE_INLINE Pack16 floor(Pack16 a) { return {_mm256_floor_ps(a.lo), _mm256_floor_ps(a.hi)}; }
 GAUSSLITE_INLINE Pack16 ceil(Pack16 a) { return {_mm256_ceil_ps(a.lo), _mm256_ceil_ps(a.hi)}; }
 
-// rcpps and rsqrtps have 12 bits; one Newton step doubles them.
+// rcpps and rsqrtps have a precision of 12 bits; one Newton step doubles it.
 GAUSSLITE_INLINE Pack16 reciprocal(Pack16 a) {
   const Pack16 r{_mm256_rcp_ps(a.lo), _mm256_rcp_ps(a.hi)};
   return r * fnma(a, r, Pack16(2.0f));
 }
+// The 12 bits without the Newton step do not suffice.
 GAUSSLITE_INLINE Pack16 rough_reciprocal(Pack16 a) { return reciprocal(a); }
 GAUSSLITE_INLINE Pack16 rough_inverse_sqrt(Pack16 a) {
   // Not a * 0.5f: half of the smallest normal float is subnormal, which is slow to multiply.
@@ -104,9 +105,11 @@ GAUSSLITE_COMPARISON(operator>=, _CMP_GE_OQ)
 GAUSSLITE_COMPARISON(operator==, _CMP_EQ_OQ)
 #undef GAUSSLITE_COMPARISON
 
-GAUSSLITE_INLINE Pack16 keep(Mask16 m, Pack16 a) { return {_mm256_and_ps(m.lo, a.lo), _mm256_and_ps(m.hi, a.hi)}; }
-GAUSSLITE_INLINE Pack16 keep_if(bool yes, Pack16 a) {
-  const __m256 mask = _mm256_castsi256_ps(_mm256_set1_epi32(-int(yes)));
+GAUSSLITE_INLINE Pack16 zero_unless(Mask16 m, Pack16 a) {
+  return {_mm256_and_ps(m.lo, a.lo), _mm256_and_ps(m.hi, a.hi)};
+}
+GAUSSLITE_INLINE Pack16 zero_unless(bool condition, Pack16 a) {
+  const __m256 mask = _mm256_castsi256_ps(_mm256_set1_epi32(-int(condition)));
   return {_mm256_and_ps(mask, a.lo), _mm256_and_ps(mask, a.hi)};
 }
 GAUSSLITE_INLINE Pack16 select(Mask16 m, Pack16 yes, Pack16 no) {
@@ -115,8 +118,8 @@ GAUSSLITE_INLINE Pack16 select(Mask16 m, Pack16 yes, Pack16 no) {
 
 GAUSSLITE_INLINE Pack16 fraction(Pack16 e) { return e - floor(e); }
 
-// Adds floor(e) to the float's exponent field; e below -126 gives about 2^-126, above 127 about 2^127.
-GAUSSLITE_INLINE Pack16 scale_by_power(Pack16 a, Pack16 e) {
+// Adds floor(e), limited to -126 ... 127, to the exponent field of a.
+GAUSSLITE_INLINE Pack16 multiply_by_power_of_two(Pack16 a, Pack16 e) {
   const Pack16 whole = floor(min(max(e, Pack16(-126.0f)), Pack16(127.0f)));
   const __m256i lo = _mm256_slli_epi32(_mm256_cvtps_epi32(whole.lo), 23);
   const __m256i hi = _mm256_slli_epi32(_mm256_cvtps_epi32(whole.hi), 23);
@@ -124,30 +127,31 @@ GAUSSLITE_INLINE Pack16 scale_by_power(Pack16 a, Pack16 e) {
           _mm256_castsi256_ps(_mm256_add_epi32(_mm256_castps_si256(a.hi), hi))};
 }
 
-// Bits of 2^(k / 8), minus the part of k that power_of_steps moves to the exponent.
-alignas(32) constexpr uint32_t kPowers[8] = {0x3F800000, 0x3F7B95C2, 0x3F7837F0, 0x3F75FED7,
-                                             0x3F7504F3, 0x3F75672A, 0x3F7744FD, 0x3F7AC0C7};
-constexpr int kPowerSteps = 8;
-GAUSSLITE_INLINE __m256 power_of_steps(__m256 shifted) {
-  const __m256i steps = _mm256_castps_si256(shifted);
-  const __m256i powers = _mm256_load_si256(reinterpret_cast<const __m256i*>(kPowers));
+// Element j: the bits of the float 2^(j / 8), minus j << 20. With j = k mod 8, adding k << 20 gives the bits of
+// 2^(k / 8): the exponent field starts at bit 23, so that it increases by 1 with each 8 of k.
+alignas(32) constexpr uint32_t kExp2Table[8] = {0x3F800000, 0x3F7B95C2, 0x3F7837F0, 0x3F75FED7,
+                                                0x3F7504F3, 0x3F75672A, 0x3F7744FD, 0x3F7AC0C7};
+constexpr int kExp2TableSize = 8;
+GAUSSLITE_INLINE __m256 exp2_of_low_bits(__m256 biased) {
+  const __m256i steps = _mm256_castps_si256(biased);
+  const __m256i powers = _mm256_load_si256(reinterpret_cast<const __m256i*>(kExp2Table));
   const __m256i power = _mm256_permutevar8x32_epi32(powers, steps);
   return _mm256_castsi256_ps(_mm256_add_epi32(_mm256_slli_epi32(steps, 20), power));
 }
-GAUSSLITE_INLINE Pack16 power_of_steps(Pack16 shifted) {
-  return {power_of_steps(shifted.lo), power_of_steps(shifted.hi)};
+GAUSSLITE_INLINE Pack16 exp2_of_low_bits(Pack16 biased) {
+  return {exp2_of_low_bits(biased.lo), exp2_of_low_bits(biased.hi)};
 }
 
-GAUSSLITE_INLINE __m256 exponent_of(__m256 a) {
+GAUSSLITE_INLINE __m256 exponent(__m256 a) {
   const __m256i biased = _mm256_srli_epi32(_mm256_castps_si256(a), 23);
   return _mm256_cvtepi32_ps(_mm256_sub_epi32(biased, _mm256_set1_epi32(127)));
 }
-GAUSSLITE_INLINE __m256 mantissa_of(__m256 a) {
+GAUSSLITE_INLINE __m256 mantissa(__m256 a) {
   const __m256i digits = _mm256_and_si256(_mm256_castps_si256(a), _mm256_set1_epi32(0x007FFFFF));
   return _mm256_castsi256_ps(_mm256_or_si256(digits, _mm256_set1_epi32(0x3F800000)));
 }
-GAUSSLITE_INLINE Pack16 exponent(Pack16 a) { return {exponent_of(a.lo), exponent_of(a.hi)}; }
-GAUSSLITE_INLINE Pack16 mantissa(Pack16 a) { return {mantissa_of(a.lo), mantissa_of(a.hi)}; }
+GAUSSLITE_INLINE Pack16 exponent(Pack16 a) { return {exponent(a.lo), exponent(a.hi)}; }
+GAUSSLITE_INLINE Pack16 mantissa(Pack16 a) { return {mantissa(a.lo), mantissa(a.hi)}; }
 
 GAUSSLITE_INLINE Pack8 sum_of_quads(Pack16 a) {
   const __m256 half = _mm256_add_ps(a.lo, a.hi);
@@ -160,11 +164,11 @@ GAUSSLITE_INLINE float sum(Pack16 a) {
 }
 
 template <int kLane>
-GAUSSLITE_INLINE Pack16 spread_in_quads(Pack16 a) {
+GAUSSLITE_INLINE Pack16 broadcast_within_quads(Pack16 a) {
   return {_mm256_permute_ps(a.lo, kLane * 0x55), _mm256_permute_ps(a.hi, kLane * 0x55)};
 }
 
-GAUSSLITE_INLINE void transpose_quads(__m256& a, __m256& b, __m256& c, __m256& d) {
+GAUSSLITE_INLINE void transpose_within_quads(__m256& a, __m256& b, __m256& c, __m256& d) {
   const __m256 ac_lo = _mm256_unpacklo_ps(a, c), ac_hi = _mm256_unpackhi_ps(a, c);
   const __m256 bd_lo = _mm256_unpacklo_ps(b, d), bd_hi = _mm256_unpackhi_ps(b, d);
   a = _mm256_unpacklo_ps(ac_lo, bd_lo);
@@ -172,12 +176,12 @@ GAUSSLITE_INLINE void transpose_quads(__m256& a, __m256& b, __m256& c, __m256& d
   c = _mm256_unpacklo_ps(ac_hi, bd_hi);
   d = _mm256_unpackhi_ps(ac_hi, bd_hi);
 }
-GAUSSLITE_INLINE void transpose_quads(Pack16& a, Pack16& b, Pack16& c, Pack16& d) {
-  transpose_quads(a.lo, b.lo, c.lo, d.lo);
-  transpose_quads(a.hi, b.hi, c.hi, d.hi);
+GAUSSLITE_INLINE void transpose_within_quads(Pack16& a, Pack16& b, Pack16& c, Pack16& d) {
+  transpose_within_quads(a.lo, b.lo, c.lo, d.lo);
+  transpose_within_quads(a.hi, b.hi, c.hi, d.hi);
 }
 
-GAUSSLITE_INLINE void transpose_groups(Pack16& a, Pack16& b, Pack16& c, Pack16& d) {
+GAUSSLITE_INLINE void transpose_whole_quads(Pack16& a, Pack16& b, Pack16& c, Pack16& d) {
   const Pack16 p = a, q = b, r = c, s = d;
   a = {_mm256_permute2f128_ps(p.lo, q.lo, 0x20), _mm256_permute2f128_ps(r.lo, s.lo, 0x20)};
   b = {_mm256_permute2f128_ps(p.lo, q.lo, 0x31), _mm256_permute2f128_ps(r.lo, s.lo, 0x31)};
@@ -185,7 +189,7 @@ GAUSSLITE_INLINE void transpose_groups(Pack16& a, Pack16& b, Pack16& c, Pack16& 
   d = {_mm256_permute2f128_ps(p.hi, q.hi, 0x31), _mm256_permute2f128_ps(r.hi, s.hi, 0x31)};
 }
 
-GAUSSLITE_INLINE void pair_groups(Pack16 a, Pack16 b, Pack8 (&out)[4]) {
+GAUSSLITE_INLINE void pair_quads(Pack16 a, Pack16 b, Pack8 (&out)[4]) {
   out[0] = _mm256_permute2f128_ps(a.lo, b.lo, 0x20);
   out[1] = _mm256_permute2f128_ps(a.lo, b.lo, 0x31);
   out[2] = _mm256_permute2f128_ps(a.hi, b.hi, 0x20);

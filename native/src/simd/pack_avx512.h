@@ -10,7 +10,7 @@
 
 namespace gausslite::GAUSSLITE_ISA {
 
-constexpr bool kOneRegister = true;
+constexpr bool kFitsOneRegister = true;
 
 struct Mask16 {
   __mmask16 v;
@@ -59,34 +59,37 @@ GAUSSLITE_INLINE Mask16 operator>(Pack16 a, Pack16 b) { return {_mm512_cmp_ps_ma
 GAUSSLITE_INLINE Mask16 operator>=(Pack16 a, Pack16 b) { return {_mm512_cmp_ps_mask(a.v, b.v, _CMP_GE_OQ)}; }
 GAUSSLITE_INLINE Mask16 operator==(Pack16 a, Pack16 b) { return {_mm512_cmp_ps_mask(a.v, b.v, _CMP_EQ_OQ)}; }
 
-GAUSSLITE_INLINE Pack16 keep(Mask16 m, Pack16 a) { return _mm512_maskz_mov_ps(m.v, a.v); }
-GAUSSLITE_INLINE Pack16 keep_if(bool yes, Pack16 a) { return _mm512_maskz_mov_ps(__mmask16(-int(yes)), a.v); }
+GAUSSLITE_INLINE Pack16 zero_unless(Mask16 m, Pack16 a) { return _mm512_maskz_mov_ps(m.v, a.v); }
+GAUSSLITE_INLINE Pack16 zero_unless(bool condition, Pack16 a) {
+  return _mm512_maskz_mov_ps(__mmask16(-int(condition)), a.v);
+}
 GAUSSLITE_INLINE Pack16 select(Mask16 m, Pack16 yes, Pack16 no) { return _mm512_mask_mov_ps(no.v, m.v, yes.v); }
 GAUSSLITE_INLINE float sum(Pack16 a) { return _mm512_reduce_add_ps(a.v); }
 
 // vreduceps returns e - floor(e), vscalefps multiplies by 2^floor(e): no integer conversion and no clamping.
 GAUSSLITE_INLINE Pack16 fraction(Pack16 e) { return _mm512_reduce_ps(e.v, 0x01); }
-GAUSSLITE_INLINE Pack16 scale_by_power(Pack16 a, Pack16 e) { return _mm512_scalef_ps(a.v, e.v); }
+GAUSSLITE_INLINE Pack16 multiply_by_power_of_two(Pack16 a, Pack16 e) { return _mm512_scalef_ps(a.v, e.v); }
 GAUSSLITE_INLINE Pack16 exponent(Pack16 a) { return _mm512_getexp_ps(a.v); }
 GAUSSLITE_INLINE Pack16 mantissa(Pack16 a) { return _mm512_getmant_ps(a.v, _MM_MANT_NORM_1_2, _MM_MANT_SIGN_zero); }
 
-// Bits of 2^(k / 16), minus the part of k that power_of_steps moves to the exponent.
-alignas(64) constexpr uint32_t kPowers[16] = {0x3F800000, 0x3F7DAAC3, 0x3F7B95C2, 0x3F79C3D3, 0x3F7837F0, 0x3F76F532,
-                                              0x3F75FED7, 0x3F75583F, 0x3F7504F3, 0x3F7508A4, 0x3F75672A, 0x3F76248C,
-                                              0x3F7744FD, 0x3F78CCDF, 0x3F7AC0C7, 0x3F7D257D};
-constexpr int kPowerSteps = 16;
-GAUSSLITE_INLINE Pack16 power_of_steps(Pack16 shifted) {
-  const __m512i steps = _mm512_castps_si512(shifted.v);
-  const __m512i power = _mm512_permutexvar_epi32(steps, _mm512_load_si512(kPowers));
+// Element j: the bits of the float 2^(j / 16), minus j << 19. With j = k mod 16, adding k << 19 gives the bits of
+// 2^(k / 16): the exponent field starts at bit 23, so that it increases by 1 with each 16 of k.
+alignas(64) constexpr uint32_t kExp2Table[16] = {0x3F800000, 0x3F7DAAC3, 0x3F7B95C2, 0x3F79C3D3, 0x3F7837F0, 0x3F76F532,
+                                                 0x3F75FED7, 0x3F75583F, 0x3F7504F3, 0x3F7508A4, 0x3F75672A, 0x3F76248C,
+                                                 0x3F7744FD, 0x3F78CCDF, 0x3F7AC0C7, 0x3F7D257D};
+constexpr int kExp2TableSize = 16;
+GAUSSLITE_INLINE Pack16 exp2_of_low_bits(Pack16 biased) {
+  const __m512i steps = _mm512_castps_si512(biased.v);
+  const __m512i power = _mm512_permutexvar_epi32(steps, _mm512_load_si512(kExp2Table));
   return _mm512_castsi512_ps(_mm512_add_epi32(_mm512_slli_epi32(steps, 19), power));
 }
 
 template <int kLane>
-GAUSSLITE_INLINE Pack16 spread_in_quads(Pack16 a) {
+GAUSSLITE_INLINE Pack16 broadcast_within_quads(Pack16 a) {
   return _mm512_permute_ps(a.v, kLane * 0x55);
 }
 
-GAUSSLITE_INLINE void transpose_quads(Pack16& a, Pack16& b, Pack16& c, Pack16& d) {
+GAUSSLITE_INLINE void transpose_within_quads(Pack16& a, Pack16& b, Pack16& c, Pack16& d) {
   const __m512 ac_lo = _mm512_unpacklo_ps(a.v, c.v), ac_hi = _mm512_unpackhi_ps(a.v, c.v);
   const __m512 bd_lo = _mm512_unpacklo_ps(b.v, d.v), bd_hi = _mm512_unpackhi_ps(b.v, d.v);
   a = _mm512_unpacklo_ps(ac_lo, bd_lo);
@@ -95,7 +98,7 @@ GAUSSLITE_INLINE void transpose_quads(Pack16& a, Pack16& b, Pack16& c, Pack16& d
   d = _mm512_unpackhi_ps(ac_hi, bd_hi);
 }
 
-GAUSSLITE_INLINE void transpose_groups(Pack16& a, Pack16& b, Pack16& c, Pack16& d) {
+GAUSSLITE_INLINE void transpose_whole_quads(Pack16& a, Pack16& b, Pack16& c, Pack16& d) {
   const __m512 ab_even = _mm512_shuffle_f32x4(a.v, b.v, 0x88), ab_odd = _mm512_shuffle_f32x4(a.v, b.v, 0xDD);
   const __m512 cd_even = _mm512_shuffle_f32x4(c.v, d.v, 0x88), cd_odd = _mm512_shuffle_f32x4(c.v, d.v, 0xDD);
   a = _mm512_shuffle_f32x4(ab_even, cd_even, 0x88);
@@ -104,7 +107,7 @@ GAUSSLITE_INLINE void transpose_groups(Pack16& a, Pack16& b, Pack16& c, Pack16& 
   d = _mm512_shuffle_f32x4(ab_odd, cd_odd, 0xDD);
 }
 
-GAUSSLITE_INLINE void pair_groups(Pack16 a, Pack16 b, Pack8 (&out)[4]) {
+GAUSSLITE_INLINE void pair_quads(Pack16 a, Pack16 b, Pack8 (&out)[4]) {
   const __m512d x = _mm512_castps_pd(a.v), y = _mm512_castps_pd(b.v);
   const __m512 low = _mm512_castpd_ps(_mm512_permutex2var_pd(x, _mm512_setr_epi64(0, 1, 8, 9, 2, 3, 10, 11), y));
   const __m512 high = _mm512_castpd_ps(_mm512_permutex2var_pd(x, _mm512_setr_epi64(4, 5, 12, 13, 6, 7, 14, 15), y));

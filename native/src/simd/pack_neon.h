@@ -9,7 +9,7 @@
 
 namespace gausslite::GAUSSLITE_ISA {
 
-constexpr bool kOneRegister = false;
+constexpr bool kFitsOneRegister = false;
 
 struct Mask16 {
   uint32x4_t q[4];
@@ -40,23 +40,25 @@ struct Pack16 {
 GAUSSLITE_MASKWISE(operator&, vandq_u32)
 GAUSSLITE_MASKWISE(operator|, vorrq_u32)
 
-// NEON has no movemask: narrow the lanes to bytes, keep one bit of each, and add the bytes of each half.
+// NEON has no movemask: narrow the lanes to bytes, mask each byte to the bit of its lane, and add the bytes of each
+// half.
 GAUSSLITE_INLINE uint32_t bits(Mask16 m) {
   const uint16x8_t lo = vuzp1q_u16(vreinterpretq_u16_u32(m.q[0]), vreinterpretq_u16_u32(m.q[1]));
   const uint16x8_t hi = vuzp1q_u16(vreinterpretq_u16_u32(m.q[2]), vreinterpretq_u16_u32(m.q[3]));
   const uint8x16_t lanes = vuzp1q_u8(vreinterpretq_u8_u16(lo), vreinterpretq_u8_u16(hi));
-  const uint8x16_t own = vandq_u8(lanes, vreinterpretq_u8_u64(vdupq_n_u64(0x8040201008040201u)));
-  return uint32_t(vaddv_u8(vget_low_u8(own))) | uint32_t(vaddv_u8(vget_high_u8(own))) << 8;
+  const uint8x16_t lane_bits = vandq_u8(lanes, vreinterpretq_u8_u64(vdupq_n_u64(0x8040201008040201u)));
+  return uint32_t(vaddv_u8(vget_low_u8(lane_bits))) | uint32_t(vaddv_u8(vget_high_u8(lane_bits))) << 8;
 }
 GAUSSLITE_INLINE bool any(Mask16 m) {
   return vmaxvq_u32(vorrq_u32(vorrq_u32(m.q[0], m.q[1]), vorrq_u32(m.q[2], m.q[3]))) != 0;
 }
-GAUSSLITE_INLINE uint32x4_t lanes_of(uint32_t bits, uint32_t first) {
-  const uint32x4_t own = {first, first << 1, first << 2, first << 3};
-  return vtstq_u32(vdupq_n_u32(bits), own);
+// Lane k is true if `bits` has the bit `first_bit` << k.
+GAUSSLITE_INLINE uint32x4_t mask_quad(uint32_t bits, uint32_t first_bit) {
+  const uint32x4_t lane_bits = {first_bit, first_bit << 1, first_bit << 2, first_bit << 3};
+  return vtstq_u32(vdupq_n_u32(bits), lane_bits);
 }
 GAUSSLITE_INLINE Mask16 mask_of(uint32_t bits) {
-  return {{lanes_of(bits, 1u), lanes_of(bits, 1u << 4), lanes_of(bits, 1u << 8), lanes_of(bits, 1u << 12)}};
+  return {{mask_quad(bits, 1u), mask_quad(bits, 1u << 4), mask_quad(bits, 1u << 8), mask_quad(bits, 1u << 12)}};
 }
 
 GAUSSLITE_INLINE Pack16 load(const float* p) {
@@ -69,16 +71,16 @@ GAUSSLITE_INLINE void store_int(int32_t* p, Pack16 a) {
   for (int i = 0; i < 4; ++i) vst1q_s32(p + 4 * i, vcvtq_s32_f32(a.q[i]));
 }
 
-// Not vmin and vmax, which propagate NaN: all variants return b, so that a clamp returns its bound.
-GAUSSLITE_INLINE float32x4_t lesser(float32x4_t a, float32x4_t b) { return vbslq_f32(vcltq_f32(a, b), a, b); }
-GAUSSLITE_INLINE float32x4_t greater(float32x4_t a, float32x4_t b) { return vbslq_f32(vcgtq_f32(a, b), a, b); }
+// vminq and vmaxq would return NaN if a is NaN. All variants return b, so that a clamp of NaN returns its bound.
+GAUSSLITE_INLINE float32x4_t min_quad(float32x4_t a, float32x4_t b) { return vbslq_f32(vcltq_f32(a, b), a, b); }
+GAUSSLITE_INLINE float32x4_t max_quad(float32x4_t a, float32x4_t b) { return vbslq_f32(vcgtq_f32(a, b), a, b); }
 
 GAUSSLITE_LANEWISE(operator+, vaddq_f32)
 GAUSSLITE_LANEWISE(operator-, vsubq_f32)
 GAUSSLITE_LANEWISE(operator*, vmulq_f32)
 GAUSSLITE_LANEWISE(operator/, vdivq_f32)
-GAUSSLITE_LANEWISE(min, lesser)
-GAUSSLITE_LANEWISE(max, greater)
+GAUSSLITE_LANEWISE(min, min_quad)
+GAUSSLITE_LANEWISE(max, max_quad)
 GAUSSLITE_UNARY(operator-, vnegq_f32)
 GAUSSLITE_UNARY(abs, vabsq_f32)
 GAUSSLITE_UNARY(sqrt, vsqrtq_f32)
@@ -94,22 +96,22 @@ GAUSSLITE_INLINE Pack16 fnma(Pack16 a, Pack16 b, Pack16 c) {
           vfmsq_f32(c.q[3], a.q[3], b.q[3])};
 }
 
-// The estimates have 8 bits; one Newton step gives at least 15, two nearly all.
-GAUSSLITE_INLINE float32x4_t rough_reciprocal_of(float32x4_t a) {
+// The hardware estimates have a precision of 8 bits. One Newton step gives at least 15 bits, two steps nearly all 24.
+GAUSSLITE_INLINE float32x4_t rough_reciprocal_quad(float32x4_t a) {
   const float32x4_t r = vrecpeq_f32(a);
   return vmulq_f32(r, vrecpsq_f32(a, r));
 }
-GAUSSLITE_INLINE float32x4_t reciprocal_of(float32x4_t a) {
-  const float32x4_t r = rough_reciprocal_of(a);
+GAUSSLITE_INLINE float32x4_t reciprocal_quad(float32x4_t a) {
+  const float32x4_t r = rough_reciprocal_quad(a);
   return vmulq_f32(r, vrecpsq_f32(a, r));
 }
-GAUSSLITE_INLINE float32x4_t inverse_sqrt_of(float32x4_t a) {
+GAUSSLITE_INLINE float32x4_t rough_inverse_sqrt_quad(float32x4_t a) {
   const float32x4_t r = vrsqrteq_f32(a);
   return vmulq_f32(r, vrsqrtsq_f32(vmulq_f32(a, r), r));
 }
-GAUSSLITE_UNARY(reciprocal, reciprocal_of)
-GAUSSLITE_UNARY(rough_reciprocal, rough_reciprocal_of)
-GAUSSLITE_UNARY(rough_inverse_sqrt, inverse_sqrt_of)
+GAUSSLITE_UNARY(reciprocal, reciprocal_quad)
+GAUSSLITE_UNARY(rough_reciprocal, rough_reciprocal_quad)
+GAUSSLITE_UNARY(rough_inverse_sqrt, rough_inverse_sqrt_quad)
 
 GAUSSLITE_COMPARISON(operator<, vcltq_f32)
 GAUSSLITE_COMPARISON(operator<=, vcleq_f32)
@@ -121,48 +123,43 @@ GAUSSLITE_INLINE Pack16 select(Mask16 m, Pack16 yes, Pack16 no) {
   return {vbslq_f32(m.q[0], yes.q[0], no.q[0]), vbslq_f32(m.q[1], yes.q[1], no.q[1]),
           vbslq_f32(m.q[2], yes.q[2], no.q[2]), vbslq_f32(m.q[3], yes.q[3], no.q[3])};
 }
-GAUSSLITE_INLINE Pack16 keep(Mask16 m, Pack16 a) { return select(m, a, Pack16(0.0f)); }
-GAUSSLITE_INLINE Pack16 keep_if(bool yes, Pack16 a) {
-  const uint32x4_t mask = vdupq_n_u32(uint32_t(-int(yes)));
+GAUSSLITE_INLINE Pack16 zero_unless(Mask16 m, Pack16 a) { return select(m, a, Pack16(0.0f)); }
+GAUSSLITE_INLINE Pack16 zero_unless(bool condition, Pack16 a) {
+  const uint32x4_t mask = vdupq_n_u32(uint32_t(-int(condition)));
   return select({mask, mask, mask, mask}, a, Pack16(0.0f));
 }
 
-// Adds floor(e) to the float's exponent field; e below -126 gives about 2^-126, above 127 about 2^127.
-GAUSSLITE_INLINE float32x4_t scaled_by_power(float32x4_t a, float32x4_t e) {
-  const float32x4_t bounded = lesser(greater(e, vdupq_n_f32(-126.0f)), vdupq_n_f32(127.0f));
-  const int32x4_t whole = vshlq_n_s32(vcvtmq_s32_f32(bounded), 23);
+// Adds floor(e), limited to -126 ... 127, to the exponent field of a.
+GAUSSLITE_INLINE float32x4_t multiply_by_power_of_two_quad(float32x4_t a, float32x4_t e) {
+  const float32x4_t limited = min_quad(max_quad(e, vdupq_n_f32(-126.0f)), vdupq_n_f32(127.0f));
+  const int32x4_t whole = vshlq_n_s32(vcvtmq_s32_f32(limited), 23);
   return vreinterpretq_f32_s32(vaddq_s32(vreinterpretq_s32_f32(a), whole));
 }
-GAUSSLITE_INLINE float32x4_t exponent_of(float32x4_t a) {
+GAUSSLITE_INLINE float32x4_t exponent_quad(float32x4_t a) {
   return vcvtq_f32_s32(vsubq_s32(vshrq_n_s32(vreinterpretq_s32_f32(a), 23), vdupq_n_s32(127)));
 }
-GAUSSLITE_INLINE float32x4_t mantissa_of(float32x4_t a) {
+GAUSSLITE_INLINE float32x4_t mantissa_quad(float32x4_t a) {
   const uint32x4_t digits = vandq_u32(vreinterpretq_u32_f32(a), vdupq_n_u32(0x007FFFFF));
   return vreinterpretq_f32_u32(vorrq_u32(digits, vdupq_n_u32(0x3F800000)));
 }
 GAUSSLITE_INLINE Pack16 fraction(Pack16 e) { return e - floor(e); }
-GAUSSLITE_LANEWISE(scale_by_power, scaled_by_power)
-constexpr int kPowerSteps = 1;
-GAUSSLITE_INLINE float32x4_t power_of_bits(float32x4_t shifted) {
-  const int32x4_t exponents = vshlq_n_s32(vreinterpretq_s32_f32(shifted), 23);
+GAUSSLITE_LANEWISE(multiply_by_power_of_two, multiply_by_power_of_two_quad)
+constexpr int kExp2TableSize = 1;
+GAUSSLITE_INLINE float32x4_t exp2_of_low_bits_quad(float32x4_t biased) {
+  const int32x4_t exponents = vshlq_n_s32(vreinterpretq_s32_f32(biased), 23);
   return vreinterpretq_f32_s32(vaddq_s32(exponents, vdupq_n_s32(0x3F800000)));
 }
-GAUSSLITE_UNARY(power_of_steps, power_of_bits)
-GAUSSLITE_UNARY(exponent, exponent_of)
-GAUSSLITE_UNARY(mantissa, mantissa_of)
+GAUSSLITE_UNARY(exp2_of_low_bits, exp2_of_low_bits_quad)
+GAUSSLITE_UNARY(exponent, exponent_quad)
+GAUSSLITE_UNARY(mantissa, mantissa_quad)
 
 #undef GAUSSLITE_UNARY
 #undef GAUSSLITE_LANEWISE
 #undef GAUSSLITE_MASKWISE
 #undef GAUSSLITE_COMPARISON
 
-GAUSSLITE_INLINE float32x4_t added_quads(Pack16 a) {
-  return vaddq_f32(vaddq_f32(a.q[0], a.q[2]), vaddq_f32(a.q[1], a.q[3]));
-}
-GAUSSLITE_INLINE float sum(Pack16 a) { return vaddvq_f32(added_quads(a)); }
-
 template <int kLane>
-GAUSSLITE_INLINE Pack16 spread_in_quads(Pack16 a) {
+GAUSSLITE_INLINE Pack16 broadcast_within_quads(Pack16 a) {
   return {vdupq_laneq_f32(a.q[0], kLane), vdupq_laneq_f32(a.q[1], kLane), vdupq_laneq_f32(a.q[2], kLane),
           vdupq_laneq_f32(a.q[3], kLane)};
 }
@@ -175,11 +172,11 @@ GAUSSLITE_INLINE void transpose_quad(float32x4_t& a, float32x4_t& b, float32x4_t
   c = vzip1q_f32(ac_hi, bd_hi);
   d = vzip2q_f32(ac_hi, bd_hi);
 }
-GAUSSLITE_INLINE void transpose_quads(Pack16& a, Pack16& b, Pack16& c, Pack16& d) {
+GAUSSLITE_INLINE void transpose_within_quads(Pack16& a, Pack16& b, Pack16& c, Pack16& d) {
   for (int i = 0; i < 4; ++i) transpose_quad(a.q[i], b.q[i], c.q[i], d.q[i]);
 }
 
-GAUSSLITE_INLINE void transpose_groups(Pack16& a, Pack16& b, Pack16& c, Pack16& d) {
+GAUSSLITE_INLINE void transpose_whole_quads(Pack16& a, Pack16& b, Pack16& c, Pack16& d) {
   const Pack16 p = a, q = b, r = c, s = d;
   a = {p.q[0], q.q[0], r.q[0], s.q[0]};
   b = {p.q[1], q.q[1], r.q[1], s.q[1]};
@@ -231,15 +228,18 @@ GAUSSLITE_INLINE Pack8 fnma(Pack8 a, Pack8 b, Pack8 c) {
   return {vfmsq_f32(c.lo, a.lo, b.lo), vfmsq_f32(c.hi, a.hi, b.hi)};
 }
 
-// Two table look-ups in the 32 bytes of x.
+// Each half compiles to one table look-up (TBL) in the 32 bytes of x.
 template <int a, int b, int c, int d, int e, int f, int g, int h>
 GAUSSLITE_INLINE Pack8 permute(Pack8 x) {
   return {__builtin_shufflevector(x.lo, x.hi, a, b, c, d), __builtin_shufflevector(x.lo, x.hi, e, f, g, h)};
 }
 
-GAUSSLITE_INLINE Pack8 sum_of_quads(Pack16 a) { return {added_quads(a), vdupq_n_f32(0.0f)}; }
+GAUSSLITE_INLINE Pack8 sum_of_quads(Pack16 a) {
+  return {vaddq_f32(vaddq_f32(a.q[0], a.q[2]), vaddq_f32(a.q[1], a.q[3])), vdupq_n_f32(0.0f)};
+}
+GAUSSLITE_INLINE float sum(Pack16 a) { return vaddvq_f32(sum_of_quads(a).lo); }
 
-GAUSSLITE_INLINE void pair_groups(Pack16 a, Pack16 b, Pack8 (&out)[4]) {
+GAUSSLITE_INLINE void pair_quads(Pack16 a, Pack16 b, Pack8 (&out)[4]) {
   for (int k = 0; k < 4; ++k) out[k] = {a.q[k], b.q[k]};
 }
 

@@ -1,6 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
-// Sixteen floats for any instruction set: four groups of four in the compiler's vector types, compiled to SSE, NEON or
-// scalar code. It is the fallback, the reference of the other variants, and the documentation of each function.
+// Sixteen floats for any instruction set, in the compiler's vector types: they compile to SSE, NEON or scalar code.
+// This variant is the fallback, the reference of the other variants, and the documentation of each function.
+//
+// A pack has sixteen lanes. Lanes 4 k ... 4 k + 3 are its quad k, for k = 0 ... 3. Loads and stores need no alignment.
 #pragma once
 
 #include <cmath>
@@ -30,8 +32,8 @@ GAUSSLITE_INLINE Quad floor_quad(Quad a) {
   return choose(small, whole - choose(whole > a, quad(1.0f), quad(0.0f)), a);
 }
 
-// Whether a pack is one register; if so, many packs fit the registers.
-constexpr bool kOneRegister = false;
+// True if one register holds a pack. A loop can then keep twice as many packs in registers as with AVX2.
+constexpr bool kFitsOneRegister = false;
 
 // Sixteen truth values, one per lane.
 struct Mask16 {
@@ -119,7 +121,8 @@ GAUSSLITE_INLINE Pack16 floor(Pack16 a) {
   return a;
 }
 GAUSSLITE_INLINE Pack16 ceil(Pack16 a) { return -floor(-a); }
-// 1 / a to a relative error of about 2e-7 (reciprocal) and 6.2e-5, 14 bits (rough_reciprocal).
+// 1 / a to a relative error of about 2e-7 (reciprocal) and of 6.2e-5, 14 bits (rough_reciprocal). A variant without a
+// faster rough function computes the more precise result: both functions are then the same.
 GAUSSLITE_INLINE Pack16 reciprocal(Pack16 a) { return Pack16(1.0f) / a; }
 GAUSSLITE_INLINE Pack16 rough_reciprocal(Pack16 a) { return Pack16(1.0f) / a; }
 // 1 / sqrt(a) of positive a, to 14 bits.
@@ -139,29 +142,34 @@ GAUSSLITE_COMPARISON(operator>=, >=)
 GAUSSLITE_COMPARISON(operator==, ==)
 #undef GAUSSLITE_COMPARISON
 
-// a where the mask is set, 0 elsewhere.
-GAUSSLITE_INLINE Pack16 keep(Mask16 m, Pack16 a) {
+// a in the lanes where the mask is set, 0 in the others.
+GAUSSLITE_INLINE Pack16 zero_unless(Mask16 m, Pack16 a) {
   GAUSSLITE_EACH a.q[i] = (Quad)(m.q[i] & (QuadInt)a.q[i]);
   return a;
 }
-GAUSSLITE_INLINE Pack16 keep_if(bool yes, Pack16 a) {
-  const int32_t mask = -int32_t(yes);
-  return keep({QuadInt{mask, mask, mask, mask}, QuadInt{mask, mask, mask, mask}, QuadInt{mask, mask, mask, mask},
-               QuadInt{mask, mask, mask, mask}},
-              a);
+// a if the condition is true, else 0 in all lanes.
+GAUSSLITE_INLINE Pack16 zero_unless(bool condition, Pack16 a) {
+  const int32_t mask = -int32_t(condition);
+  return zero_unless({QuadInt{mask, mask, mask, mask}, QuadInt{mask, mask, mask, mask}, QuadInt{mask, mask, mask, mask},
+                      QuadInt{mask, mask, mask, mask}},
+                     a);
 }
+// `yes` in the lanes where the mask is set, `no` in the others.
 GAUSSLITE_INLINE Pack16 select(Mask16 m, Pack16 yes, Pack16 no) {
   GAUSSLITE_EACH yes.q[i] = choose(m.q[i], yes.q[i], no.q[i]);
   return yes;
 }
 
-// Parts of exp2 and log2: e - floor(e), a 2^floor(e), and a = mantissa(a) 2^exponent(a) with mantissa in [1, 2).
+// e - floor(e).
 GAUSSLITE_INLINE Pack16 fraction(Pack16 e) { return e - floor(e); }
-GAUSSLITE_INLINE Pack16 scale_by_power(Pack16 a, Pack16 e) {
+// a 2^floor(e), for normal a and a normal result. All variants except AVX-512 limit floor(e) to -126 ... 127 and add it
+// to the exponent field of a.
+GAUSSLITE_INLINE Pack16 multiply_by_power_of_two(Pack16 a, Pack16 e) {
   const Pack16 whole = floor(min(max(e, Pack16(-126.0f)), Pack16(127.0f)));
   GAUSSLITE_EACH a.q[i] = (Quad)((QuadInt)a.q[i] + (__builtin_convertvector(whole.q[i], QuadInt) << 23));
   return a;
 }
+// For positive normal a: a = mantissa(a) 2^exponent(a), with the mantissa in [1, 2).
 GAUSSLITE_INLINE Pack16 exponent(Pack16 a) {
   GAUSSLITE_EACH a.q[i] = __builtin_convertvector(((QuadInt)a.q[i] >> 23) - 127, Quad);
   return a;
@@ -171,27 +179,29 @@ GAUSSLITE_INLINE Pack16 mantissa(Pack16 a) {
   return a;
 }
 
-// 2^(k / kPowerSteps), for the numbers k in the lowest bits of the mantissas.
-constexpr int kPowerSteps = 1;
-GAUSSLITE_INLINE Pack16 power_of_steps(Pack16 shifted) {
-  GAUSSLITE_EACH shifted.q[i] = (Quad)(((QuadInt)shifted.q[i] << 23) + 0x3F800000);
-  return shifted;
+// exp2_of_low_bits returns 2^(k / kExp2TableSize); `biased` has the integer k in the lowest bits of its mantissa (see
+// exp2_fast). The other variants may look up the fractional part of k / kExp2TableSize in a table of 8 or 16 floats.
+constexpr int kExp2TableSize = 1;
+GAUSSLITE_INLINE Pack16 exp2_of_low_bits(Pack16 biased) {
+  GAUSSLITE_EACH biased.q[i] = (Quad)(((QuadInt)biased.q[i] << 23) + 0x3F800000);
+  return biased;
 }
 
+// The sum of all lanes.
 GAUSSLITE_INLINE float sum(Pack16 a) {
   const Quad s = (a.q[0] + a.q[2]) + (a.q[1] + a.q[3]);
   return (s[0] + s[2]) + (s[1] + s[3]);
 }
 
-// In each group of four lanes, copy lane kLane to all four.
+// In each quad, copies lane kLane to all four lanes.
 template <int kLane>
-GAUSSLITE_INLINE Pack16 spread_in_quads(Pack16 a) {
+GAUSSLITE_INLINE Pack16 broadcast_within_quads(Pack16 a) {
   GAUSSLITE_EACH a.q[i] = __builtin_shufflevector(a.q[i], a.q[i], kLane, kLane, kLane, kLane);
   return a;
 }
 
-// In each group of four lanes, the 4x4 transpose of a, b, c, d.
-GAUSSLITE_INLINE void transpose_quads(Pack16& a, Pack16& b, Pack16& c, Pack16& d) {
+// In each quad, transposes the 4x4 matrix with rows a, b, c, d: lane j of row i becomes lane i of row j.
+GAUSSLITE_INLINE void transpose_within_quads(Pack16& a, Pack16& b, Pack16& c, Pack16& d) {
   GAUSSLITE_EACH {
     const Quad ac_lo = __builtin_shufflevector(a.q[i], c.q[i], 0, 4, 1, 5);
     const Quad ac_hi = __builtin_shufflevector(a.q[i], c.q[i], 2, 6, 3, 7);
@@ -204,8 +214,8 @@ GAUSSLITE_INLINE void transpose_quads(Pack16& a, Pack16& b, Pack16& c, Pack16& d
   }
 }
 
-// The same for whole groups: the i-th result consists of group i of a, b, c and d.
-GAUSSLITE_INLINE void transpose_groups(Pack16& a, Pack16& b, Pack16& c, Pack16& d) {
+// Transposes the 4x4 matrix of quads with rows a, b, c, d: quad j of row i becomes quad i of row j.
+GAUSSLITE_INLINE void transpose_whole_quads(Pack16& a, Pack16& b, Pack16& c, Pack16& d) {
   Pack16* rows[4] = {&a, &b, &c, &d};
   for (int i = 0; i < 4; ++i) {
     for (int j = 0; j < i; ++j) {
@@ -222,7 +232,7 @@ GAUSSLITE_INLINE Pack16 load_block(const float* p, int64_t stride) {
   GAUSSLITE_EACH a.q[i] = load_quad(p + i * stride);
   return a;
 }
-// Sixteen bytes as floats from 0 to 255, contiguous or as a block.
+// Sixteen bytes as floats from 0 to 255: a block of four rows of four (load_byte_block), or contiguous (load_bytes).
 GAUSSLITE_INLINE Pack16 load_byte_block(const uint8_t* p, int64_t stride) {
   Pack16 a;
   for (int i = 0; i < 16; ++i) a.q[i / 4][i % 4] = float(p[i / 4 * stride + i % 4]);
@@ -265,15 +275,15 @@ GAUSSLITE_INLINE Pack8 permute(Pack8 x) {
   return {__builtin_shufflevector(x.lo, x.hi, a, b, c, d), __builtin_shufflevector(x.lo, x.hi, e, f, g, h)};
 }
 
-// The sum of the four groups of four in lanes 0-3; lanes 4-7 are 0.
+// The sum of the four quads in lanes 0-3; lanes 4-7 are 0.
 GAUSSLITE_INLINE Pack8 sum_of_quads(Pack16 a) { return {(a.q[0] + a.q[2]) + (a.q[1] + a.q[3]), quad(0.0f)}; }
 
-// Group k of a followed by group k of b, for k = 0 ... 3.
-GAUSSLITE_INLINE void pair_groups(Pack16 a, Pack16 b, Pack8 (&out)[4]) {
+// out[k]: quad k of a, followed by quad k of b.
+GAUSSLITE_INLINE void pair_quads(Pack16 a, Pack16 b, Pack8 (&out)[4]) {
   for (int k = 0; k < 4; ++k) out[k] = {a.q[k], b.q[k]};
 }
 
-// The first and the last eight floats, and their concatenation.
+// The first eight floats of a pack (lower), the last eight (upper), and a pack of two such halves (join).
 GAUSSLITE_INLINE Pack8 lower(Pack16 a) { return {a.q[0], a.q[1]}; }
 GAUSSLITE_INLINE Pack8 upper(Pack16 a) { return {a.q[2], a.q[3]}; }
 GAUSSLITE_INLINE Pack16 join(Pack8 lo, Pack8 hi) {

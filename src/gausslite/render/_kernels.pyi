@@ -87,7 +87,7 @@ class Engine:
         d_depth_m: Float32[ndarray, "h w"],
         d_alpha: Float32[ndarray, "h w"],
     ) -> tuple[Float32[ndarray, "n 16"], Float64[ndarray, "6"], UInt32[ndarray, " m"], Float32[ndarray, " m"]]:
-        """Return d_rows, d_twist, visible rows and mean_2d_norm."""
+        """Return d_rows, d_twist, visible rows and mean_2d_grad_norm."""
 
     def step(self, scene: StepScene, training: StepTraining) -> float:
         """Run one training iteration and return the loss."""

@@ -131,7 +131,7 @@ class CpuRasterizer:
         d_depth_m: Float32[ndarray, "h w"],
         d_alpha: Float32[ndarray, "h w"],
     ) -> SplatGradients:
-        """Return the gradients of a scalar, given its derivatives by the rendered images.
+        """Return the gradients of a scalar, given its derivatives with respect to the rendered images.
 
         The rows must be unchanged since `forward`. Raises ShapeError, InvalidInputError if the rendering is not this
         backend's latest.

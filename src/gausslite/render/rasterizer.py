@@ -86,16 +86,16 @@ class Rendering:
 class SplatGradients:
     """Gradients of a scalar function of the rendered images.
 
-    d_rows: by the parameters; columns 14 and 15 are zero. d_twist: by the camera pose, for
+    d_rows: of the parameters; columns 14 and 15 are zero. d_twist: of the camera pose, for
     T_camera_world ← exp(twist) T_camera_world with twist = (translation 3, rotation 3) in the camera frame.
-    visible: the visible rows, ascending. mean_2d_norm: for each visible row, the norm of the gradient by the image mean
-    in half image widths and heights.
+    visible: the visible rows, ascending. mean_2d_grad_norm: for each visible row, the norm of the gradient of its
+    2D mean, in units of half the image width and height.
     """
 
     d_rows: Float32[ndarray, "n 16"]
     d_twist: Float64[ndarray, "6"]
     visible: UInt32[ndarray, " m"]
-    mean_2d_norm: Float32[ndarray, " m"]
+    mean_2d_grad_norm: Float32[ndarray, " m"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -235,7 +235,7 @@ class Rasterizer(Protocol):
         d_depth_m: Float32[ndarray, "h w"],
         d_alpha: Float32[ndarray, "h w"],
     ) -> SplatGradients:
-        """Return the gradients of a scalar, given its derivatives by the rendered images.
+        """Return the gradients of a scalar, given its derivatives with respect to the rendered images.
 
         Raises ShapeError, InvalidInputError if the rendering is not this backend's or no longer valid.
         """

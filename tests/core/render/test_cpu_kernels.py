@@ -58,7 +58,7 @@ def test_gradients_are_independent_of_thread_count(threads: int, simd: str) -> N
     single, parallel = gradients(CpuRasterizer(1, simd), rows), gradients(CpuRasterizer(threads, simd), rows)
     np.testing.assert_array_equal(parallel.d_rows, single.d_rows)
     np.testing.assert_array_equal(parallel.d_twist, single.d_twist)
-    np.testing.assert_array_equal(parallel.mean_2d_norm, single.mean_2d_norm)
+    np.testing.assert_array_equal(parallel.mean_2d_grad_norm, single.mean_2d_grad_norm)
     np.testing.assert_array_equal(parallel.visible, single.visible)
 
 

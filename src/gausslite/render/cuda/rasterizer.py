@@ -137,7 +137,7 @@ class CudaRasterizer:
         d_depth_m: Float32[ndarray, "h w"],
         d_alpha: Float32[ndarray, "h w"],
     ) -> SplatGradients:
-        """Return the gradients of a scalar, given its derivatives by the rendered images.
+        """Return the gradients of a scalar, given its derivatives with respect to the rendered images.
 
         Raises ShapeError, InvalidInputError if the rendering is not this backend's.
         """
@@ -245,7 +245,7 @@ class CudaRasterizer:
         window: Window,
         pose_gradient: bool = False,
     ) -> _RenderGraph:
-        """Project the visible rows and blend them in the window; pose_gradient: prepare gradients by the pose."""
+        """Project the visible rows and blend them in the window; pose_gradient: prepare gradients of the pose."""
         device = self._kernels.device
         pose = to_device(T_camera_world.astype(np.float32), device)
         ids = None if subset.ids is None else to_device(subset.ids.astype(np.int64), device)
@@ -288,12 +288,12 @@ def _kernels_for(device: str) -> Kernels:
 
 
 def _norms_2d(d_means_px: Float32[Tensor, "m 2"], device_camera: DeviceCamera) -> Float32[Tensor, " m"]:
-    """Return the norms of the gradients by the image means, in half image widths and heights."""
+    """Return the norms of the gradients of the 2D means, in half image widths and heights."""
     norms: Tensor = (d_means_px * device_camera.half_size_px).norm(dim=1)
     return norms
 
 
 def _twist_gradient(d_pose: Float64[ndarray, "4 4"], T_camera_world: Float64[ndarray, "4 4"]) -> Float64[ndarray, "6"]:
-    """Convert a gradient by the entries of T_camera_world to one by the twist of exp(twist) T_camera_world at 0."""
+    """Convert a gradient of the entries of T_camera_world to one of the twist of exp(twist) T_camera_world at 0."""
     d_rotation = np.cross(T_camera_world[:3], d_pose[:3], axis=0).sum(axis=1)
     return np.concatenate([d_pose[:3, 3], d_rotation])

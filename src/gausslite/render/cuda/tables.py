@@ -85,7 +85,7 @@ class DeviceTables:
         self,
         row_ids: Int64[Tensor, " m"],
         gradients: Float32[Tensor, "m 16"],
-        mean_2d_norm: Float32[Tensor, " m"],
+        mean_2d_grad_norm: Float32[Tensor, " m"],
         adam: AdamSettings,
     ) -> None:
         """Apply sparse Adam (Kingma and Ba 2015) to these rows and add their density statistics.
@@ -106,6 +106,6 @@ class DeviceTables:
         second_unbiased = second[:, columns] / (1.0 - adam.beta2**updates)
         rows[:, columns] -= rate_decay * rates * first_unbiased / (second_unbiased.sqrt() + adam.epsilon)
         rows[:, UPDATE_COUNT] += 1.0
-        first[:, GRAD_2D_SUM] += mean_2d_norm
+        first[:, GRAD_2D_SUM] += mean_2d_grad_norm
         first[:, GRAD_2D_COUNT] += 1.0
         self.rows[row_ids], self.first_moment[row_ids], self.second_moment[row_ids] = rows, first, second

@@ -77,7 +77,7 @@ def render_images_backward(
     d_images: Float64[Tensor, "h w 5"],
     limits: Limits = DEFAULT_LIMITS,
 ) -> tuple[Tensor, ...]:
-    """Return the gradients by each of `ellipses.differentiable`; renders each tile again, with autograd."""
+    """Return the gradients of each of `ellipses.differentiable`; renders each tile again, with autograd."""
     sums = tuple(torch.zeros_like(column) for column in ellipses.differentiable)
     for rows, columns in tile_slices(camera, tiles):
         inside = _overlapping(ellipses, rows, columns)

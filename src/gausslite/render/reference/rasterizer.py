@@ -90,7 +90,7 @@ class ReferenceRasterizer:
         d_depth_m: Float32[ndarray, "h w"],
         d_alpha: Float32[ndarray, "h w"],
     ) -> SplatGradients:
-        """Return the gradients of a scalar, given its derivatives by the rendered images. Raises ShapeError."""
+        """Return the gradients of a scalar, given its derivatives with respect to the images. Raises ShapeError."""
         graph: _RenderGraph = rendering.context
         require_image_gradients(rendering, d_rgb, d_depth_m, d_alpha)
         stacked = np.concatenate([d_rgb, d_depth_m[..., None], d_alpha[..., None]], axis=2)
@@ -183,7 +183,7 @@ def _render(
 
 
 def _backward(graph: _RenderGraph, d_images: Tensor) -> tuple[ndarray, ndarray, ndarray, ndarray]:
-    """Return the gradients by rows and twist, the visible rows ascending, and their image-mean gradient norms."""
+    """Return the gradients of rows and twist, the visible rows ascending, and the gradient norms of their 2D means."""
     d_ellipses = render_images_backward(graph.ellipses, graph.camera, graph.tiles, d_images)
     d_rows, d_twist = torch.autograd.grad(
         graph.ellipses.differentiable, (graph.rows, graph.twist), d_ellipses, retain_graph=True
