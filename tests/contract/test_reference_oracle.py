@@ -65,7 +65,7 @@ def test_the_pose_gradient_matches_finite_differences(oracle: Rasterizer) -> Non
     assert relative_error(result, np.array(expected) / (2 * STEP)) < 1e-5
 
 
-def test_mean_2d_norm_is_the_gradient_of_an_image_shift(oracle: Rasterizer) -> None:
+def test_mean_2d_grad_norm_is_the_gradient_of_an_image_shift(oracle: Rasterizer) -> None:
     """Shifting the principal point shifts the image mean of a splat, which gives the norm by finite differences."""
     rows = named_scene("large splats").rows[:1].copy()
     rows[0, :3] = [0.1, 0.05, 1.5]
