@@ -65,7 +65,7 @@ def test_every_page_of_docs_is_linked_from_readme() -> None:
 
 
 def test_files_named_in_pages_exist() -> None:
-    """Paths in backticks exist, in the repository, next to the page, or in the package that the page describes."""
+    """Check that paths in backticks exist: in the repository, next to the page, or in the page's package."""
     missing = []
     for page in pages():
         bases = (
@@ -85,7 +85,7 @@ def test_files_named_in_pages_exist() -> None:
 
 @pytest.fixture(scope="module")
 def known_flags() -> set[str]:
-    """All flags in the --help of all programs."""
+    """Return all flags in the --help of all programs."""
     commands = [["gausslite", name, "--help"] for name in SUB_COMMANDS]
     commands += [["gausslite", "bench", name, "--help"] for name in BENCHMARKS]
     commands += [["gausslite", "models", name, "--help"] for name in ("fetch", "verify", "list", "inspect")]

@@ -160,9 +160,9 @@ def test_a_file_other_than_a_library_is_refused_in_one_line(tmp_path: Path, caps
     library.write_text("not a library")
     small = ["--sizes", "32x32", "--gaussians", "20", "--threads", "1", "--reps", "1"]
     assert main(["bench", "raster", *small, "--external-rasterizer", str(library)]) == 2
-    said = capsys.readouterr().err
-    assert "other.so: expected a shared library with gl_new" in said
-    assert said.count("\n") == 1
+    captured = capsys.readouterr().err
+    assert "other.so: expected a shared library with gl_new" in captured
+    assert captured.count("\n") == 1
 
 
 @pytest.mark.parametrize("text", ["", "32", "32x", "32x32x3", "0x5", "axb"])

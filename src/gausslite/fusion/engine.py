@@ -78,7 +78,7 @@ class FusionEngine:
 
     @property
     def grid(self) -> VoxelGrid:
-        """The voxels of the vote."""
+        """The voxel grid of the vote."""
         return self._settings.grid
 
     @property
@@ -246,7 +246,7 @@ class FusionEngine:
         return refined.replace_changed(fuse(batches), changed)
 
     def status(self) -> MissionStatus:
-        """Return the figures of the mission and of each agent."""
+        """Return the totals of the mission and of each agent."""
         with self._lock:
             scores = self._store.scores()
             vote = rank_voxels(scores)

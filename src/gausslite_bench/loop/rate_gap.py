@@ -14,7 +14,11 @@ from gausslite.render.rasterizer import Rasterizer
 
 @dataclass(frozen=True, slots=True)
 class RateGap:
-    """ROI PSNR on held-out views: map built at the rate, and map built with `iterations` iterations per frame."""
+    """ROI PSNR of two maps on held-out views, in dB.
+
+    in_time_db: of the map built at the rate; unlimited_db: of the map built without a time limit, with `iterations`
+    iterations per frame; views: number of views that show the region.
+    """
 
     iterations: int
     views: int

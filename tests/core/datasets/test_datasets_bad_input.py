@@ -1,4 +1,4 @@
-"""Damaged sequences get one line that names the file and what would be right."""
+"""Damaged sequences raise one line that names the file and the expected content."""
 
 from __future__ import annotations
 
@@ -191,7 +191,7 @@ NOWHERE = "-inf -inf -inf -inf\n" * 3
 @pytest.mark.parametrize(
     "lost", [NOWHERE + "0 0 0 1\n", NOWHERE.replace("-inf", "nan") + "nan nan nan nan\n", "0 0 0 0\n" * 4]
 )
-def test_frames_without_a_pose_are_no_part_of_the_sequence(tmp_path: Path, lost: str) -> None:
+def test_frames_without_a_pose_are_excluded(tmp_path: Path, lost: str) -> None:
     seven = write_seven_scenes(tmp_path / "seq")
     (seven / SEVEN_POSE).write_text(lost)
     replica = write_replica(tmp_path / "office0")
@@ -204,7 +204,7 @@ def test_frames_without_a_pose_are_no_part_of_the_sequence(tmp_path: Path, lost:
         assert source.excluded_frames == "1 of 3 colour images are skipped: without a pose"
 
 
-def test_a_tracker_that_was_lost_is_a_gap_in_the_trajectory(tmp_path: Path) -> None:
+def test_lost_tracking_is_a_gap_in_the_trajectory(tmp_path: Path) -> None:
     folder = write_tum(tmp_path / "fr1", frames=30)
     whole = open_source(str(folder))
     assert len(whole) == 30
@@ -243,7 +243,7 @@ def test_a_position_outside_the_sequence_is_refused(tmp_path: Path) -> None:
         source.frame(3)
 
 
-def test_regions_come_back_by_name(tmp_path: Path) -> None:
+def test_regions_are_read_by_name(tmp_path: Path) -> None:
     path = tmp_path / "regions.npz"
     voxels = np.array([[0, 0, 50], [1, 0, 50]], np.int16)
     np.savez(path, mug_1=voxels, voxel_size_m=0.02)
@@ -281,7 +281,7 @@ def test_a_damaged_regions_file_is_named(tmp_path: Path, content: bytes) -> None
         load_voxel_regions(path)
 
 
-def test_regions_that_would_take_all_memory_are_refused(tmp_path: Path) -> None:
+def test_regions_that_need_too_much_memory_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "regions.npz"
     declared = io.BytesIO()
     np.lib.format.write_array_header_1_0(declared, {"descr": "<i8", "fortran_order": False, "shape": (10**13, 3)})

@@ -1,4 +1,4 @@
-"""Laws of reading sequences: repaired poses are rigid, interpolation stays on the sphere, selections are ranges."""
+"""Properties of reading sequences: repaired poses are rigid, interpolation is spherical, selections are ranges."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ seeds = st.integers(0, 2**32 - 1)
 
 
 class Numbered:
-    """A source of which only the frame numbers matter."""
+    """A source that has frame numbers only."""
 
     name = "numbered"
     camera = Camera(1.0, 1.0, 1.0, 1.0, 2, 2)
@@ -40,7 +40,7 @@ class Numbered:
         return self._numbers
 
     def frame(self, i: int, size: tuple[int, int] | None = None) -> Frame:
-        raise DatasetError("numbered: expected no one to look")
+        raise DatasetError("numbered: expected no frame to be read")
 
     def regions(self) -> Mapping[str, Region]:
         return {}
@@ -70,7 +70,7 @@ def test_a_rounded_rotation_becomes_the_nearest_exact_one(seed: int) -> None:
 
 
 @given(seeds, st.floats(0, 1))
-def test_interpolation_takes_its_share_of_the_angle(seed: int, share: float) -> None:
+def test_interpolation_is_linear_in_the_angle(seed: int, share: float) -> None:
     rng = np.random.default_rng(seed)
     a, b = random_quat(rng), random_quat(rng)
     whole = np.arccos(min(1.0, abs(float(a @ b))))
@@ -89,17 +89,17 @@ def test_interpolation_takes_its_share_of_the_angle(seed: int, share: float) -> 
 )
 def test_a_selection_is_a_range_of_numbers(numbers: set[int], start: int, length: int, step: int) -> None:
     source = Numbered(sorted(numbers))
-    wanted = [n for n in sorted(numbers) if n in range(start, start + length, step)]
+    expected = [n for n in sorted(numbers) if n in range(start, start + length, step)]
     spec = f"{start}:{start + length}:{step}"
-    if wanted:
-        assert [source.indices()[i] for i in select_frames(source, spec)] == wanted
+    if expected:
+        assert [source.indices()[i] for i in select_frames(source, spec)] == expected
     else:
         with pytest.raises(DatasetError, match="no frame is in"):
             select_frames(source, spec)
 
 
 @given(seeds, st.integers(1, 40), st.integers(1, 30))
-def test_resizing_invents_no_depth_and_keeps_the_rays(seed: int, width: int, height: int) -> None:
+def test_resizing_selects_existing_depths_and_keeps_the_rays(seed: int, width: int, height: int) -> None:
     rng = np.random.default_rng(seed)
     camera = Camera(18.0, 17.0, 8.3, 6.1, 16, 12)
     depth_m = rng.choice([0.0, 1.0, 2.5], (12, 16)).astype(np.float32)

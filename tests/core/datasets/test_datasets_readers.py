@@ -1,4 +1,4 @@
-"""The readers turn each layout into frames with the times, units, poses and pixel centres its authors mean."""
+"""Readers of each layout: times, units, poses and pixel centres of the frames."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from gausslite.domain.region import BallRegion, VoxelRegion
 from gausslite.errors import DatasetError, InvalidInputError
 
 
-def test_tum_takes_poses_that_lie_far_apart_at_their_own_images(tmp_path: Path) -> None:
+def test_tum_uses_sparse_poses_only_at_their_own_images(tmp_path: Path) -> None:
     folder = write_tum(tmp_path / "fr1", frames=7)
-    # keyframes' poses, 0.2 s apart: at the first image, just before the last, and at none
+    # poses 0.2 s apart: at the first image, just before the last, and at no image
     (folder / "groundtruth.txt").write_text("10.0 1 0 0 0 0 0 1\n10.194 2 0 0 0 0 0 1\n10.4 3 0 0 0 0 0 1\n")
     source = open_source(str(folder))
     assert source.indices() == [0, 6]
@@ -38,7 +38,7 @@ def test_tum_interpolates_the_pose_at_the_colours_time(tmp_path: Path) -> None:
     assert source.up_axis == (0.0, 0.0, 1.0)
 
 
-def test_tum_leaves_out_colour_without_depth_or_pose(tmp_path: Path) -> None:
+def test_tum_excludes_colour_without_depth_or_pose(tmp_path: Path) -> None:
     folder = write_tum(tmp_path / "fr1", frames=4)
     rows = (folder / "depth.txt").read_text().splitlines()
     (folder / "depth.txt").write_text("\n".join([rows[0], *rows[2:]]))
@@ -73,7 +73,7 @@ def test_seven_scenes_repairs_rounded_rotations(tmp_path: Path) -> None:
     np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
 
 
-def test_replica_reads_the_camera_from_above_and_its_depth_scale(tmp_path: Path) -> None:
+def test_replica_reads_the_camera_and_depth_scale_of_the_parent_folder(tmp_path: Path) -> None:
     source = open_source(str(write_replica(tmp_path / "office0")))
     assert (source.camera.width_px, source.camera.cx_px) == (WIDTH, 8.0)
     assert source.frame(2).depth_m[2, 2] == pytest.approx(6553 / 6553.5)
@@ -81,7 +81,7 @@ def test_replica_reads_the_camera_from_above_and_its_depth_scale(tmp_path: Path)
 
 
 @pytest.mark.parametrize(("write", "value"), [(write_tum, 5000), (write_seven_scenes, 2000)])
-def test_a_camera_file_says_other_depth_units_in_any_layout(
+def test_a_camera_file_sets_the_depth_unit_in_any_layout(
     write: Callable[[Path], Path], value: int, tmp_path: Path
 ) -> None:
     folder = write(tmp_path / "mine")
@@ -93,7 +93,7 @@ def test_a_camera_file_says_other_depth_units_in_any_layout(
     assert frame.depth_m[2, 2] == pytest.approx(value / 2500)
 
 
-def test_resizing_averages_colour_and_never_mixes_depth(tmp_path: Path) -> None:
+def test_resizing_averages_colour_and_selects_depth(tmp_path: Path) -> None:
     folder = write_seven_scenes(tmp_path / "seq", numbers=(0,))
     depth = np.full((HEIGHT, WIDTH), 1000, np.uint16)
     depth[:, WIDTH // 2 :] = 3000
@@ -121,14 +121,14 @@ def test_a_downscaled_size_keeps_the_aspect_ratio(recorded: tuple[int, int], mod
 
 
 @pytest.mark.parametrize("write", [write_tum, write_seven_scenes, write_replica])
-def test_every_layout_knows_the_regions_beside_it(write: Callable[[Path], Path], tmp_path: Path) -> None:
+def test_every_layout_reads_the_regions_of_its_folder(write: Callable[[Path], Path], tmp_path: Path) -> None:
     folder = write(tmp_path / "fr1")
     assert open_source(str(folder)).regions() == {}
     np.savez(folder / "roi_voxels.npz", voxel_size_m=0.1, mug_1=np.zeros((1, 3), np.int32))
     assert list(open_source(str(folder)).regions()) == ["mug_1"]
 
 
-def test_a_folder_that_holds_one_sequence_stands_for_it(tmp_path: Path) -> None:
+def test_a_folder_with_one_sequence_opens_that_sequence(tmp_path: Path) -> None:
     write_seven_scenes(tmp_path / "scene" / "seq-01")
     assert open_source(str(tmp_path / "scene")).name == "seq-01"
     write_seven_scenes(tmp_path / "scene" / "seq-02")
@@ -136,7 +136,7 @@ def test_a_folder_that_holds_one_sequence_stands_for_it(tmp_path: Path) -> None:
         open_source(str(tmp_path / "scene"))
 
 
-def test_the_up_axis_can_be_told(tmp_path: Path) -> None:
+def test_the_up_axis_can_be_given(tmp_path: Path) -> None:
     folder = write_seven_scenes(tmp_path / "seq")
     assert open_source(str(folder)).up_axis == (0.0, -1.0, 0.0)
     assert open_source(str(folder), up_axis=(0.0, 0.0, 2.0)).up_axis == (0.0, 0.0, 1.0)
@@ -154,13 +154,13 @@ def test_frames_are_selected_by_their_own_numbers(tmp_path: Path, selection: str
 
 
 @pytest.mark.parametrize("selection", ["", "5", "a:b", "0:10:0", "10:5", "-1:5", "0:1:2:3", "0:1.5", "0:٣"])
-def test_a_nonsense_selection_is_refused(tmp_path: Path, selection: str) -> None:
+def test_an_invalid_selection_is_refused(tmp_path: Path, selection: str) -> None:
     source = open_source(str(write_seven_scenes(tmp_path / "seq")))
     with pytest.raises(InvalidInputError, match="START:STOP"):
         select_frames(source, selection)
 
 
-def test_an_empty_selection_says_what_numbers_there_are(tmp_path: Path) -> None:
+def test_the_error_of_an_empty_selection_names_the_frame_numbers(tmp_path: Path) -> None:
     source = open_source(str(write_seven_scenes(tmp_path / "seq")))
     with pytest.raises(DatasetError, match="3 frames are numbered 0 to 8"):
         select_frames(source, "1:4")

@@ -1,4 +1,4 @@
-"""Depth brought into a colour camera beside it: exact on planes, honest about shadows, and one line for bad texts."""
+"""Depth registered to a colour camera: exact on planes, empty in occlusion shadows; invalid texts are refused."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ OFFSET_M = (-0.04, 0.0, 0.0)
 
 
 def box_before_a_wall(camera: Camera, T_camera_world: np.ndarray) -> np.ndarray:
-    """What a camera at an offset measures: a wall at 4 m, and before it a square of 1 m at 2 m."""
+    """Return the depth that a displaced camera measures: a wall at 4 m, and a 1 m square in front of it at 2 m."""
     x_m, y_m, _ = T_camera_world[:3, 3]
     u, v = np.meshgrid(np.arange(camera.width_px) + 0.5, np.arange(camera.height_px) + 0.5)
     x = (u - camera.cx_px) / camera.fx_px * 2.0 - x_m
@@ -45,14 +45,14 @@ def test_register_depth_gives_the_depth_of_the_colour_camera(zoom: float) -> Non
     colour = Camera(100.0 * zoom, 100.0 * zoom, 64.0 * zoom, 48.0 * zoom, round(128 * zoom), round(96 * zoom))
     moved = register_depth(box_before_a_wall(DEPTH, np.eye(4)), DEPTH, colour, displaced(OFFSET_M))
     truth = box_before_a_wall(colour, displaced(OFFSET_M))
-    # the wall ends one disparity before the colour image does; the box hides a strip of it one disparity wide
+    # the wall ends one disparity before the colour image does; the box occludes a strip of the wall one disparity wide
     wall_px, box_px = (100.0 * zoom * 0.04 / depth_m for depth_m in (4.0, 2.0))
     border, shadow = np.zeros(truth.shape, np.bool_), np.zeros(truth.shape, np.bool_)
     border[:, int(colour.width_px - wall_px - zoom) :] = True
     box_right = int((truth == 2.0).any(axis=0).nonzero()[0].max()) + 1
     box_rows = (truth == 2.0).any(axis=1)
     shadow[box_rows, box_right : int(box_right + box_px - wall_px + zoom) + 1] = True
-    # half a depth pixel's footprint either way
+    # half a depth pixel's footprint on both sides
     near = np.ones(2 * (2 * int(np.ceil(0.6 * zoom)) + 1,), np.uint8)
     edges = cv2.dilate(truth, near) != cv2.erode(truth, near)
     certain = ~(border | shadow | edges)

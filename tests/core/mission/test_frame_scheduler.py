@@ -65,7 +65,7 @@ def run_frame(
     return scheduler.end(), done
 
 
-def test_without_settings_iterations_are_counted_whatever_they_cost() -> None:
+def test_without_settings_the_number_of_iterations_is_fixed_at_any_cost() -> None:
     clock = WorkClock()
     scheduler = FrameScheduler(clock=clock)
     for seconds in (0.0, 1.0, 1e6):
@@ -84,17 +84,17 @@ def test_a_frame_ends_in_its_time_up_to_one_iteration(seed: int) -> None:
         costs[Stage.FINALISATION] = rng.uniform(1, 8)
         timing, done = run_frame(scheduler, clock, costs)
         surprise = 0.0 if frame else costs[Stage.FINALISATION] + costs[Stage.PUBLISHING]
-        # the words, too, may cost more than they used to
+        # publishing, too, may cost more than before
         assert timing.seconds <= 100.0 + costs[Stage.WARM_UP] + surprise + 4.0
         assert done >= 2
         assert not timing.under_trained
 
 
-def test_time_that_is_left_is_filled() -> None:
+def test_remaining_time_is_filled_with_iterations() -> None:
     clock = WorkClock()
     scheduler = FrameScheduler(SchedulerSettings(100.0, 4), clock)
     counts = [run_frame(scheduler, clock, CHEAP)[1] for _ in range(20)]
-    # four fixed steps, the words at the end, and no room left for one more
+    # four fixed stages, publishing at the end, and no time left for another iteration
     assert counts[-1] == 94
     assert scheduler.end().seconds == pytest.approx(99.0)
 
@@ -107,7 +107,7 @@ def test_the_stages_add_up_to_the_frame() -> None:
 
 
 def test_stages_are_skipped_in_their_order_and_only_as_needed() -> None:
-    # five fixed steps and four iterations cost 9, the words 1 of it and drawing with seeding 2
+    # five fixed stages and four iterations cost 9, of which publishing costs 1, and rendering with seeding 2
     four = SchedulerSettings(min_iterations=4)
     for time_s, expected in (
         (9.0, set()),
@@ -124,12 +124,12 @@ def test_stages_are_skipped_in_their_order_and_only_as_needed() -> None:
 
 @given(st.integers(0, 30), st.sampled_from([Stage.WARM_UP, Stage.ACTIVE]), st.floats(1.0, 20.0))
 def test_min_iterations_cost_one_warm_up_and_else_the_cheapest_kind(
-    least: int, cheapest: Stage, warm_up_s: float
+    min_iterations: int, cheapest: Stage, warm_up_s: float
 ) -> None:
     costs = {**CHEAP, Stage.WARM_UP: warm_up_s}
-    needed_s = 5.0 + (warm_up_s + (least - 1) * costs[cheapest] if least else 0.0)
+    needed_s = 5.0 + (warm_up_s + (min_iterations - 1) * costs[cheapest] if min_iterations else 0.0)
     for spare_s, skip_stages in ((1e-6, frozenset()), (-1e-6, frozenset({SkippableStage.PUBLISHING}))):
-        scheduler = SchedulerSettings(min_iterations=least)
+        scheduler = SchedulerSettings(min_iterations=min_iterations)
         assert choose_skipped_stages(scheduler, needed_s + spare_s, costs, frozenset(), cheapest) == skip_stages
 
 
@@ -142,7 +142,7 @@ def test_there_is_time_for_a_stage_if_min_iterations_fit_after_it(
 ) -> None:
     clock = WorkClock()
     scheduler = FrameScheduler(SchedulerSettings(60.0, 15), clock)
-    # what is no iteration itself leaves one more to do
+    # a stage that is not an iteration leaves one more iteration to do
     costs = {Stage.WARM_UP: 10.0, Stage.DENSIFICATION: 9.0, Stage.ACTIVE: 1.0}
     for each, seconds in costs.items():
         with scheduler.timing(each):
@@ -166,7 +166,7 @@ def test_time_is_reserved_for_the_fixed_stages_to_come_except_skipped_ones(
         with scheduler.timing(step):
             clock.work(seconds)
     scheduler.begin()
-    # all that must be done costs 16, 7 without drawing and seeding
+    # all required stages cost 16, or 7 without rendering and seeding
     assert scheduler.skips(SkippableStage.SEEDING) is (frame_s < 16.0)
     for step in (Stage.RENDERING, Stage.RELEVANCE)[-int(done) :]:
         with scheduler.timing(step):
@@ -194,7 +194,7 @@ def timings_with_view_costs(views_s: list[float], deadline_slack: float = SLACK_
 def test_frames_overrun_by_the_deadline_slack_at_most(views_s: list[float], deadline_slack: float) -> None:
     behind_s = 0.0
     for view_s, timing in zip(views_s, timings_with_view_costs(views_s, deadline_slack), strict=True):
-        # a frame whose view alone takes longer trains once; what was not tried is expected to cost less than it does
+        # a frame whose view preparation alone takes longer trains once; forecasts of skipped stages are too low
         longest_s = max(FRAME_S * (1 + deadline_slack), behind_s + view_s + 4.0) + ITERATION_S
         assert behind_s + timing.seconds <= longest_s + 1e-9
         behind_s = min(max(0.0, behind_s + timing.seconds - FRAME_S), deadline_slack * FRAME_S)
@@ -242,7 +242,7 @@ def after_a_stall(every_s: float, latest: int = 40) -> tuple[list[float], list[i
 
 def test_waiting_frames_train_min_iterations_until_the_queue_of_a_stall_is_empty() -> None:
     waited_s, iterations = after_a_stall(every_s=FRAME_S)
-    # such a frame takes 65 of a hundred
+    # such a frame takes 65 of 100 s
     assert waited_s[:10] == pytest.approx([300.0, *(300.0 - 35.0 * i for i in range(1, 9)), 0.0], abs=ITERATION_S)
     assert iterations[:8] == [15] * 8
     assert max(waited_s[9:]) <= ITERATION_S
@@ -268,8 +268,8 @@ def test_under_overload_no_stage_is_skipped_twice_in_a_row_and_under_trained_fra
     timings = [run_frame(scheduler, clock, {**CHEAP, Stage.SEEDING: 10.0})[0] for _ in range(20)]
     for before, after in itertools.pairwise(timings):
         assert not before.skipped_stages & after.skipped_stages
-    for relief in SkippableStage:
-        assert 8 <= sum(relief in timing.skipped_stages for timing in timings) <= 10
+    for stage in SkippableStage:
+        assert 8 <= sum(stage in timing.skipped_stages for timing in timings) <= 10
     assert sum(timing.under_trained for timing in timings) > 0
 
 
@@ -299,17 +299,17 @@ def test_one_stall_of_the_machine_does_not_cost_later_frames_their_iterations(st
     assert min(after[10:]) >= before - 1
 
 
-def test_a_very_slow_first_iteration_is_soon_forgotten() -> None:
+def test_the_forecast_recovers_from_a_very_slow_first_iteration() -> None:
     clock, costs = WorkClock(), {**CHEAP, Stage.WARM_UP: ITERATION_S, Stage.ACTIVE: ITERATION_S}
     scheduler = FrameScheduler(SchedulerSettings(FRAME_S, 15), clock)
     run_frame(scheduler, clock, costs, stall=(Stage.ACTIVE, 100 * FRAME_S))
     assert max(run_frame(scheduler, clock, costs)[1] for _ in range(10)) >= 15
 
 
-@pytest.mark.parametrize(("least", "expected"), [(0, 0), (1, 1), (15, 1)])
-def test_the_first_iteration_of_a_frame_is_always_trained(least: int, expected: int) -> None:
+@pytest.mark.parametrize(("min_iterations", "expected"), [(0, 0), (1, 1), (15, 1)])
+def test_the_first_iteration_of_a_frame_is_always_trained(min_iterations: int, expected: int) -> None:
     clock = WorkClock()
-    scheduler = FrameScheduler(SchedulerSettings(10.0, least), clock)
+    scheduler = FrameScheduler(SchedulerSettings(10.0, min_iterations), clock)
     assert run_frame(scheduler, clock, {**CHEAP, Stage.VIEW_PREPARATION: 100.0})[1] == expected
 
 

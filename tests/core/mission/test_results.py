@@ -18,7 +18,7 @@ def test_programs_that_start_together_share_a_new_folder(tmp_path: Path) -> None
     assert not list(folder.iterdir())
 
 
-def test_what_cannot_hold_results_is_refused(tmp_path: Path) -> None:
+def test_a_folder_that_cannot_be_written_is_refused(tmp_path: Path) -> None:
     (tmp_path / "file").write_bytes(b"")
     with pytest.raises(StorageError, match="file: expected a folder that can be written"):
         prepare_folder(tmp_path / "file")

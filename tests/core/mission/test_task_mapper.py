@@ -74,10 +74,10 @@ def test_the_time_of_a_frame_includes_publishing() -> None:
         assert set(Stage) - {Stage.PRUNING, Stage.DENSIFICATION, Stage.RENDERING, Stage.REEVALUATION} <= set(
             budget.stages_s
         )
-        # an iteration is one second of work and some looks at the clock
+        # an iteration takes one second plus some clock readings
         assert budget.seconds <= 60.0 + 8.0
         assert not budget.under_trained
-    # but for the iteration that every frame begins with
+    # except the first iteration, which every frame trains
     assert ticking_loop(1e-6).process(wall_frame(0, SIZE)).iterations == 1
 
 

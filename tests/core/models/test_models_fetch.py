@@ -104,7 +104,7 @@ def test_the_command_lists_fetches_verifies_and_inspects(tmp_path, capsys, monke
     assert main(["models", "list", "--catalogue", str(catalogue), "--folder", str(folder)]) == 0
     assert main(["models", "verify", path]) == 0
     assert main(["models", "inspect", path]) == 0
-    said = capsys.readouterr().out
+    captured = capsys.readouterr().out
     for expected in (
         path,
         "local",
@@ -112,7 +112,7 @@ def test_the_command_lists_fetches_verifies_and_inspects(tmp_path, capsys, monke
         "images [1, 3, 64, 64] float",
         "CPU",
     ):
-        assert expected in said
+        assert expected in captured
     (folder / "tiny.onnx").write_bytes(served.data[:-1])
     assert main(["models", "verify", path]) == 2
     assert main(["models", "fetch", "unheard-of"]) == 2

@@ -52,8 +52,8 @@ def network():
             self.model = model
 
         def forward(self, *inputs):
-            said = self.model(**dict(zip(INPUTS, inputs, strict=True)))
-            return said.logits, said.pred_boxes
+            result = self.model(**dict(zip(INPUTS, inputs, strict=True)))
+            return result.logits, result.pred_boxes
 
     return WithNamedInputs().eval()
 

@@ -34,7 +34,7 @@ CODES = {
 }
 
 
-class Raising(parser_service_pb2_grpc.ParserServiceServicer):
+class FailingParser(parser_service_pb2_grpc.ParserServiceServicer):
     """A servicer that raises the error named by the request's text."""
 
     def __init__(self) -> None:
@@ -47,7 +47,7 @@ class Raising(parser_service_pb2_grpc.ParserServiceServicer):
         raise getattr(errors, request.text)("one line: expected a, got b")
 
 
-def service(servicer: Raising) -> Service:
+def service(servicer: FailingParser) -> Service:
     return Service(
         "gausslite.v1.ParserService",
         lambda server: parser_service_pb2_grpc.add_ParserServiceServicer_to_server(servicer, server),
@@ -56,7 +56,7 @@ def service(servicer: Raising) -> Service:
 
 @pytest.mark.parametrize("kind", ERRORS, ids=lambda kind: kind.__name__)
 def test_the_client_raises_what_the_server_raised(kind: type[GaussLiteError]) -> None:
-    servicer = Raising()
+    servicer = FailingParser()
     with (
         serving([service(servicer)]) as server,
         ParserClient(server.address) as client,
@@ -82,7 +82,7 @@ def test_every_error_has_a_unique_reason() -> None:
 
 
 def test_a_status_without_our_details_gets_the_class_of_its_code() -> None:
-    with serving([service(Raising())]) as server, ParserClient(server.address) as client:
+    with serving([service(FailingParser())]) as server, ParserClient(server.address) as client:
         with pytest.raises(errors.NotPermittedError, match="no certificate"):
             client.parse("UNAUTHENTICATED")
         with pytest.raises(QuotaError):

@@ -250,8 +250,8 @@ def test_received_frames_give_a_map_and_a_report_on_sigterm(tmp_path: Path) -> N
             client.assign_task("Pick up the cup")
             outcomes = list(client.ingest([frame(i, CAMERA) for i in range(2)]))
         p.send_signal(signal.SIGTERM)
-        said = p.stderr.read()
-        assert p.wait(30) == 0, said
+        stderr_text = p.stderr.read()
+        assert p.wait(30) == 0, stderr_text
     report = json.loads((out / "report.json").read_text())
     assert [outcome.outcome for outcome in outcomes] == [FRAME_OUTCOME_MAPPED] * 2
     assert report["frames"] == 2

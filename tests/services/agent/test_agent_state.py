@@ -246,11 +246,11 @@ def test_a_real_agent_resumes_its_mission(tmp_path: Path) -> None:
                     list(client.ingest([red_frame(i) for i in indices], lossless=True))
                     revisions.append(client.status().map_revision)
                 p.send_signal(signal.SIGTERM)
-                said = p.stderr.read()
-                assert p.wait(30) == 0, said
+                stderr_text = p.stderr.read()
+                assert p.wait(30) == 0, stderr_text
             kappas.append(int(read_ply(tmp_path / "map.ply").kappa.sum()))
         [agent] = fusion.client.status().agents
-    assert "after frame 2" in said
+    assert "after frame 2" in stderr_text
     assert 0 < kappas[0] < kappas[1]
     assert revisions == sorted(set(revisions))
     assert agent.gaussians > 0
