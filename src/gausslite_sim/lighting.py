@@ -128,8 +128,8 @@ def _lamp(
 ) -> Float64[ndarray, " n"]:
     """Return the diffuse light of an area lamp (Lambert's law), with soft shadows."""
     n = len(origins)
-    spots = position_m + _LAMP_RADIUS_M * rng.uniform(-1, 1, (n, _LAMP_RAYS, 3)) * (1, 1, 0.2)
-    towards = spots - origins[:, None, :]
+    lamp_points_m = position_m + _LAMP_RADIUS_M * rng.uniform(-1, 1, (n, _LAMP_RAYS, 3)) * (1, 1, 0.2)
+    towards = lamp_points_m - origins[:, None, :]
     squared = np.square(towards).sum(axis=2)
     cosine = np.clip((towards * normals[:, None, :]).sum(axis=2) / np.sqrt(squared), 0, 1)
     rays = towards.reshape(-1, 3).astype(np.float32)

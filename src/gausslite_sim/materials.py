@@ -17,7 +17,7 @@ Painter = Callable[[np.random.Generator], Texture]
 
 @dataclass(frozen=True, slots=True)
 class Palette:
-    """A home's colours, RGB in [0, 1]: two woods, two cloths (main, second), two paints (accent, other) and a glaze."""
+    """A home's colours, RGB in [0, 1]: two woods, four colours of cloths, prints and glazes, and a pale glaze."""
 
     light_wood: Colour = (0.78, 0.60, 0.40)
     dark_wood: Colour = (0.36, 0.24, 0.17)

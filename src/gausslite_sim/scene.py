@@ -58,19 +58,19 @@ class HomeScene:
         self.object_names = tuple(item.name for item in items if not item.is_structure)
         self.atlas = TextureAtlas(list(textures.values()))
         parts = [(i, part) for i, item in enumerate(items) for part in item.parts]
-        whole = merge_meshes([part.mesh for _, part in parts])
+        merged = merge_meshes([part.mesh for _, part in parts])
         counts = [len(part.mesh.faces) for _, part in parts]
         repeats_m = np.repeat([textures[part.texture].repeat_m or 1.0 for _, part in parts], counts)
-        corners_m = whole.positions_m[whole.faces]
-        uv = whole.uv[whole.faces] / repeats_m[:, None, None]
+        corners_m = merged.positions_m[merged.faces]
+        uv = merged.uv[merged.faces] / repeats_m[:, None, None]
         texture = np.repeat([texture_ids[part.texture] for _, part in parts], counts)
         albedo = np.array([each.rgb.mean(axis=(0, 1)) / 255.0 for each in textures.values()])
         self._embree = new_caster(corners_m.astype(np.float32))
-        light = vertex_light(whole, albedo[texture], self, plan.lighting, plan.seed)
+        light = vertex_light(merged, albedo[texture], self, plan.lighting, plan.seed)
         self.triangles = Triangles(
             uv=uv.astype(np.float32),
-            light=light[whole.faces],
-            corner_normals=whole.normals[whole.faces].astype(np.float32),
+            light=light[merged.faces],
+            corner_normals=merged.normals[merged.faces].astype(np.float32),
             normal=_unit_normals(corners_m),
             texture=texture,
             item=np.repeat([i for i, _ in parts], counts),

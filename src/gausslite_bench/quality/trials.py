@@ -190,9 +190,9 @@ class TrialMap:
 def build_map(trial: Trial, scene: Scene, on_frame: Callable[[int], None]) -> TrialMap:
     """Return the map of the scene; on_frame gets the number of Gaussians after each frame. Raises GaussLiteError."""
     settings = trial.mission
-    attention = _attention(trial, scene)
+    estimator = _build_estimator(trial, scene)
     loop = TaskMapper(
-        attention,
+        estimator,
         build_mapper(settings),
         scheduler=FrameScheduler(settings.scheduler_settings, clock_for(settings.threads)),
     )
@@ -240,7 +240,7 @@ def clock_for(threads: int | None) -> Clock:
     return time.process_time if threads == 1 else time.perf_counter
 
 
-def _attention(trial: Trial, scene: Scene) -> RelevanceEstimator:
+def _build_estimator(trial: Trial, scene: Scene) -> RelevanceEstimator:
     """Return the trial's estimator; without task if the policy ignores it, as ROI flags would affect eviction."""
     if not trial.follows_task:
         return NoTaskEstimator()

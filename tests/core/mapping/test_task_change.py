@@ -196,12 +196,12 @@ def test_sent_voxels_of_the_old_region_get_no_tombstones() -> None:
 
 
 def test_a_run_saved_during_reevaluation_resumes_bit_identically() -> None:
-    whole = make_loop(buffer=16)
-    map_frames(whole, 0, 8)
-    whole.assign(B)
-    map_frames(whole, 8, 10)
-    saved: State = {name: array.copy() for name, array in whole.state().items()}
-    expected_changes = [outcome.changed_roi for outcome in map_frames(whole, 10, 14)]
+    uninterrupted = make_loop(buffer=16)
+    map_frames(uninterrupted, 0, 8)
+    uninterrupted.assign(B)
+    map_frames(uninterrupted, 8, 10)
+    saved: State = {name: array.copy() for name, array in uninterrupted.state().items()}
+    expected_changes = [outcome.changed_roi for outcome in map_frames(uninterrupted, 10, 14)]
     other = make_loop(buffer=16)
     other.assign(B)
     other.restore(saved)
@@ -209,7 +209,7 @@ def test_a_run_saved_during_reevaluation_resumes_bit_identically() -> None:
         assert resumed.changed_roi is not None
         assert expected is not None
         np.testing.assert_array_equal(resumed.changed_roi.keys, expected.keys)
-    for name, array in whole.state().items():
+    for name, array in uninterrupted.state().items():
         assert other.state()[name].tobytes() == array.tobytes(), name
 
 
