@@ -9,6 +9,7 @@ from pathlib import Path
 from gausslite.calibration.pose_exposure_prior import PoseExposurePrior
 from gausslite.datasets.registered_source import DepthRegistration
 from gausslite.datasets.source import Source
+from gausslite.domain.arguments import require_instance, require_number, require_whole
 from gausslite.domain.pose import UpAxis
 from gausslite.domain.region import BallRegion, Region
 from gausslite.errors import InvalidInputError
@@ -20,7 +21,9 @@ from gausslite.render.cpu_kernels import MAX_THREADS
 
 DEFAULT_MAX_GAUSSIANS = 150_000
 """The number that two CPU cores can train online at 640x480; the paper's cap of a million is for a GPU."""
-_MAX_ITERATIONS = 10_000
+MAX_ITERATIONS = 10_000
+MAX_SEED = (1 << 32) - 1
+MIN_RATE_HZ, MAX_RATE_HZ = 0.01, 1000.0
 _SCHEDULER = SchedulerSettings()
 
 MAY_CHANGE = {"may_change": True}
@@ -31,8 +34,8 @@ FILE = {"is_file": True}
 
 def require_rate(rate_hz: float) -> None:
     """Raise InvalidInputError if the frame rate is outside 0.01 to 1000 Hz."""
-    if not 0.01 <= rate_hz <= 1000:
-        raise InvalidInputError(f"rate: expected 0.01 to 1000 Hz, got {rate_hz}")
+    if not MIN_RATE_HZ <= rate_hz <= MAX_RATE_HZ:
+        raise InvalidInputError(f"rate: expected {MIN_RATE_HZ} to {MAX_RATE_HZ:g} Hz, got {rate_hz}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,22 +123,37 @@ class MissionSettings:
     pose_prior: PoseExposurePrior = field(default_factory=PoseExposurePrior)
 
     def __post_init__(self) -> None:
+        self._require_types()
         if self.rate_hz is not None:
             require_rate(self.rate_hz)
-        if not 0 <= self.min_iterations <= _MAX_ITERATIONS:
-            raise InvalidInputError(f"min_iterations: expected 0 to {_MAX_ITERATIONS}, got {self.min_iterations}")
+        if not 0 <= self.min_iterations <= MAX_ITERATIONS:
+            raise InvalidInputError(f"min_iterations: expected 0 to {MAX_ITERATIONS}, got {self.min_iterations}")
         if not 0 <= self.deadline_slack <= 1:
             raise InvalidInputError(
                 f"deadline_slack: expected a share of a frame's time, 0 to 1, got {self.deadline_slack}"
             )
-        if self.iterations is not None and not 0 <= self.iterations <= _MAX_ITERATIONS:
-            raise InvalidInputError(f"iterations: expected 0 to {_MAX_ITERATIONS}, got {self.iterations}")
-        if not 0 <= self.seed < 1 << 32:
-            raise InvalidInputError(f"seed: expected 0 to {(1 << 32) - 1}, got {self.seed}")
+        if self.iterations is not None and not 0 <= self.iterations <= MAX_ITERATIONS:
+            raise InvalidInputError(f"iterations: expected 0 to {MAX_ITERATIONS}, got {self.iterations}")
+        if not 0 <= self.seed <= MAX_SEED:
+            raise InvalidInputError(f"seed: expected 0 to {MAX_SEED}, got {self.seed}")
         if self.threads is not None and not 1 <= self.threads <= MAX_THREADS:
             raise InvalidInputError(f"threads: expected 1 to {MAX_THREADS}, got {self.threads}")
         # raises for an unknown policy or component, and for a cap of 0
         self.mapper_settings()
+
+    def _require_types(self) -> None:
+        """Raise InvalidInputError for values of other types than the fields'."""
+        require_instance("policy", self.policy, str, "the name of a policy as text")
+        require_instance("disabled", self.disabled, (frozenset, set), "a set of names such as frozenset({'sb'})")
+        require_instance("pose_prior", self.pose_prior, PoseExposurePrior, "a PoseExposurePrior")
+        require_instance("backend", self.backend, str, "the name of a backend as text")
+        for name in ("max_gaussians", "iterations", "min_iterations", "seed", "threads"):
+            value = getattr(self, name)
+            if value is not None or name not in ("iterations", "threads"):
+                require_whole(name, value)
+        if self.rate_hz is not None:
+            require_number("rate_hz", self.rate_hz)
+        require_number("deadline_slack", self.deadline_slack)
 
     @property
     def scheduler_settings(self) -> SchedulerSettings | None:
