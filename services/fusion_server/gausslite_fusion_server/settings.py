@@ -8,9 +8,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from gausslite.config.layers import parse_options
+from gausslite.config.mapping_options import add_voxel_size
+from gausslite.config.numbers import Number
 from gausslite.config.tls_options import add_tls, read_server_tls
 from gausslite.domain.voxels import VoxelGrid
-from gausslite.errors import InvalidInputError
 from gausslite.fusion.joint_refinement import RefineSettings
 from gausslite.fusion.limits import MAX_REFINE_ITERATIONS, FusionSettings, Quotas
 from gausslite.render.choose import BACKENDS
@@ -36,12 +37,6 @@ class ServerSettings:
 def parse_arguments(arguments: Sequence[str] | None = None) -> ServerSettings:
     """Return the settings of the options. Raises InvalidInputError for values that are out of range."""
     options = parse_options(_parser(), arguments)
-    if options.store_max_mb is not None and not 1 <= options.store_max_mb <= _MAX_STORE_MB:
-        raise InvalidInputError(f"--store-max-mb: expected 1 to {_MAX_STORE_MB}, got {options.store_max_mb}")
-    if options.refine_iterations > MAX_REFINE_ITERATIONS:
-        raise InvalidInputError(
-            f"--refine-iterations: expected 1 to {MAX_REFINE_ITERATIONS}, got {options.refine_iterations}"
-        )
     quotas = Quotas(
         options.quota_agents,
         options.quota_voxels,
@@ -65,28 +60,33 @@ def _parser() -> argparse.ArgumentParser:
         prog="gausslite-fusion-server",
         description="Store every agent's latest voxel updates and serve the fused map. In each voxel the agent with "
         "the largest sum of kappa (per Gaussian, the training steps in which it was visible and active) wins.",
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
     defaults, quotas = ServerSettings(), Quotas()
     add = parser.add_argument
-    add("--listen", default=defaults.listen, metavar="ADDRESS", help="HOST:PORT or unix:PATH")
-    add("--store", default=MEMORY, metavar="memory|PATH.sqlite", help="storage of the voxel updates")
-    add("--store-max-mb", type=int, metavar="MB", help="largest size of the SQLite file; no limit if absent")
-    add("--voxel-size", type=float, default=defaults.fusion.grid.size_m, metavar="M", help="edge of voxels in metres")
-    add("--mission", default="", metavar="ID", help="the only mission to serve; empty: that of the first agent")
-    add("--world-frame", default="", metavar="NAME", help="frame of all maps; empty: that of the first agent")
-    add("--quota-agents", type=int, default=quotas.agents, metavar="N", help="largest number of agents")
-    add("--quota-voxels", type=int, default=quotas.voxels_per_agent, metavar="N", help="largest number per agent")
-    add("--quota-gaussians", type=int, default=quotas.gaussians_per_agent, metavar="N", help="largest number per agent")
-    add("--quota-keyframes", type=int, default=quotas.keyframes_per_agent, metavar="N", help="largest number per agent")
-    add("--quota-keyframe-pixels", type=int, default=quotas.keyframe_pixels, metavar="N", help="largest keyframe image")
+    add("--listen", default=defaults.listen, metavar="ADDRESS", help="HOST:PORT or unix:PATH (default: %(default)s)")
+    add("--store", default=MEMORY, metavar="memory|PATH.sqlite", help="storage of the voxel updates (default: memory)")
+    max_mb = Number("store-max-mb", int, 1, _MAX_STORE_MB)
+    add("--store-max-mb", type=max_mb, metavar="MB", help="largest size of the SQLite file (default: no limit)")
+    add_voxel_size(parser)
+    add("--mission", default="", metavar="ID", help="the only mission to serve (default: the first agent's)")
+    add("--world-frame", default="", metavar="NAME", help="frame of all maps (default: the first agent's)")
+    for name, default, meaning in (
+        ("agents", quotas.agents, "agents"),
+        ("voxels", quotas.voxels_per_agent, "voxels per agent"),
+        ("gaussians", quotas.gaussians_per_agent, "Gaussians per agent"),
+        ("keyframes", quotas.keyframes_per_agent, "keyframes per agent"),
+        ("keyframe-pixels", quotas.keyframe_pixels, "pixels of a keyframe"),
+    ):
+        help_text = f"largest number of {meaning} (default: %(default)s)"
+        add(f"--quota-{name}", type=int, default=default, metavar="N", help=help_text)
     add(
         "--refine-iterations",
-        type=int,
+        type=Number("refine-iterations", int, 1, MAX_REFINE_ITERATIONS),
         default=defaults.refine.iterations,
         metavar="N",
-        help="iterations of joint refinement if a request states none",
+        help="iterations of joint refinement if a request states none (default: %(default)s)",
     )
-    add("--rasterizer", choices=BACKENDS, default=defaults.rasterizer, help="backend of the refinement")
+    help_text = "backend of the refinement (default: %(default)s)"
+    add("--rasterizer", choices=BACKENDS, default=defaults.rasterizer, help=help_text)
     add_tls(parser)
     return parser

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 
 from gausslite.errors import GaussLiteError
+from gausslite.messages import print_message
 from gausslite.task.backends import open_parser
 from gausslite.wire.process import run_service
 from gausslite.wire.server import serve_until_stopped
@@ -19,7 +19,7 @@ def run(arguments: Sequence[str] | None = None) -> int:
         settings = parse_arguments(arguments)
         parser = open_parser(settings.backend)
     except GaussLiteError as error:
-        print(f"gausslite-parser: {error}", file=sys.stderr)
+        print_message(f"gausslite-parser: {error}")
         return 2
     services = [parser_service(parser)]
     return run_service("gausslite-parser", lambda: serve_until_stopped(settings.listen, services, tls=settings.tls))

@@ -27,6 +27,11 @@ class ParserSettings:
 
 def parse_arguments(arguments: Sequence[str] | None = None) -> ParserSettings:
     """Return the settings of the options. Ends the process with code 2 for wrong flags. Raises InvalidInputError."""
+    options = parse_options(_parser(), arguments)
+    return ParserSettings(options.listen, backend_settings(options, os.environ), read_server_tls(options))
+
+
+def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="gausslite-parser", description="Serve gausslite.v1.ParserService: parse task texts into task graphs."
     )
@@ -38,5 +43,4 @@ def parse_arguments(arguments: Sequence[str] | None = None) -> ParserSettings:
     )
     add_backend(parser)
     add_tls(parser)
-    options = parse_options(parser, arguments)
-    return ParserSettings(options.listen, backend_settings(options, os.environ), read_server_tls(options))
+    return parser

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 
 from gausslite.config.tls_options import add_tls, read_tls
 from gausslite.errors import InvalidInputError, UnavailableError
+from gausslite.messages import print_message
 from gausslite.wire.health import require_serving
 
 
@@ -20,10 +21,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         require_serving(options.address, read_tls(options))
     except InvalidInputError as error:
-        print(error, file=sys.stderr)
+        print_message(str(error))
         return 2
     except UnavailableError as error:
-        print(error, file=sys.stderr)
+        print_message(str(error))
         return 1
     return 0
 

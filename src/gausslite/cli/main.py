@@ -13,6 +13,7 @@ from collections.abc import Mapping, Sequence
 from gausslite import __version__
 from gausslite.errors import GaussLiteError
 from gausslite.interrupts import Terminated, restore_default_handlers
+from gausslite.messages import print_message
 
 _COMMANDS = {
     "map": "map a sequence for a task; write map.ply, report.json and preview.png",
@@ -40,12 +41,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _fail(str(error))
     except OSError as error:
         return _fail(_describe(error))
-    except Terminated:
-        print("gausslite: terminated", file=sys.stderr)
-        return 143
-    except KeyboardInterrupt:
-        print("gausslite: interrupted", file=sys.stderr)
-        return 130
+    except Terminated as signal:
+        return _interrupted("terminated", signal, 143)
+    except KeyboardInterrupt as signal:
+        return _interrupted("interrupted", signal, 130)
 
 
 def _dispatch(arguments: list[str]) -> int:
@@ -77,8 +76,14 @@ def _parse(
 
 
 def _fail(message: str) -> int:
-    print(f"gausslite: {' '.join(message.split())}", file=sys.stderr)
+    print_message(f"gausslite: {message}")
     return 2
+
+
+def _interrupted(event: str, signal: KeyboardInterrupt, code: int) -> int:
+    """Report an interrupt, with the text that the command has attached to it; return the exit code."""
+    print_message(f"gausslite: {event}{f': {signal}' if str(signal) else ''}")
+    return code
 
 
 def _describe(error: OSError) -> str:

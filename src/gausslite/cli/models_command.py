@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from gausslite.config.environment import MODELS_URL_VARIABLE
 from gausslite.errors import InvalidInputError
+from gausslite.messages import print_message
 
 if TYPE_CHECKING:
     from gausslite.models.catalogue import ModelEntry
@@ -88,7 +88,7 @@ def _fetch(options: argparse.Namespace) -> int:
         with _bar(entry.file_name) as progress:
             fetched = fetch(entry, base_url, options.folder, options.sha256, progress)
         print(fetched.path)
-        print(f"{fetched.path.name}: {_verification_text(fetched)}", file=sys.stderr)
+        print_message(f"{fetched.path.name}: {_verification_text(fetched)}")
     return 0
 
 

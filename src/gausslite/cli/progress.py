@@ -9,6 +9,7 @@ from typing import Any
 
 from tqdm import tqdm
 
+from gausslite.messages import printable
 from gausslite.mission.task_mapper import FrameOutcome
 
 _TERMINAL_INTERVAL_S, _LOG_INTERVAL_S = 0.2, 10.0
@@ -30,7 +31,7 @@ def progress_bar(total: int, label: str, unit: str, row: int = 0) -> tqdm[Any]:
 
 def print_above_bar(line: str) -> None:
     """Write a line to stderr without breaking a progress bar."""
-    tqdm.write(line, file=sys.stderr)
+    tqdm.write(printable(line), file=sys.stderr)
 
 
 class MappingBar:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Mapping
 from typing import Final
 
-from gausslite.config.nearest import nearest
+from gausslite.config.known_options import KNOWN_OPTIONS
+from gausslite.config.nearest import suggestion
 from gausslite.config.option_table import Layer, OptionTable, RawValue, variable_name
 from gausslite.errors import InvalidInputError
+from gausslite.messages import print_message
 
 PREFIX: Final = "GAUSSLITE_"
 CONFIG_VARIABLE: Final = "GAUSSLITE_CONFIG"
@@ -61,13 +62,14 @@ def warn_of_unknown_variables(
 ) -> None:
     """Print a line on stderr for every variable with the prefix that nothing reads, without its value.
 
-    key_variable: the variable that the options name for the API key.
+    Options of other programs give no warning: one environment may configure several programs. key_variable: the
+    variable that the options name for the API key.
     """
     options = {variable_name(table.key(dest)) for dest in table.actions}
+    known = {*options, *map(variable_name, KNOWN_OPTIONS), *_OTHER_VARIABLES, key_variable}
     for name in sorted(environment):
-        if name.startswith(PREFIX) and name not in (*options, *_OTHER_VARIABLES, key_variable):
-            similar = nearest(name, options)
-            print(f"{program}: {name} is not an option; the nearest one is {similar}", file=sys.stderr)
+        if name.startswith(PREFIX) and name not in known:
+            print_message(f"{program}: {name} is not an option{suggestion(name, options)}")
 
 
 def without_options(environment: Mapping[str, str]) -> dict[str, str]:

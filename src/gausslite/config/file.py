@@ -6,8 +6,8 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
-from gausslite.config.nearest import nearest
-from gausslite.config.option_table import Layer, OptionTable, RawValue, type_name
+from gausslite.config.nearest import suggestion
+from gausslite.config.option_table import Layer, OptionTable, RawValue, accepts_list, number_kind, type_name
 from gausslite.errors import InvalidInputError
 
 
@@ -17,8 +17,10 @@ def read_file(table: OptionTable, path: Path) -> Layer:
     dests = {table.key(dest): dest for dest in table.actions}
     values: dict[str, RawValue] = {}
     for key, value in document.items():
+        if isinstance(value, dict):
+            raise InvalidInputError(f"{path}: [{key}]: tables are not supported; write NAME = VALUE at the top level")
         if key not in dests:
-            raise InvalidInputError(f"{path}: unknown option {key!r}; the nearest known one is {nearest(key, dests)!r}")
+            raise InvalidInputError(f"{path}: unknown option {key!r}{suggestion(key, dests)}")
         values[dests[key]] = _raw_value(table, dests[key], value, f"{path}: {key}")
     for dest in values:
         for rival in table.exclusive_with(dest) & values.keys():
@@ -29,10 +31,14 @@ def read_file(table: OptionTable, path: Path) -> Layer:
 
 def _read_toml(path: Path) -> dict[str, Any]:
     try:
-        with path.open("rb") as stream:
-            return tomllib.load(stream)
+        # some editors begin a file with a byte order mark, which TOML does not allow
+        return tomllib.loads(path.read_bytes().decode("utf-8-sig"))
     except OSError as error:
         raise InvalidInputError(f"--config {path}: expected a TOML file: {error.strerror or error}") from None
+    except UnicodeDecodeError as error:
+        raise InvalidInputError(
+            f"--config {path}: expected UTF-8 text, got another encoding (byte {error.start}); save the file as UTF-8"
+        ) from None
     except ValueError as error:
         raise InvalidInputError(f"--config {path}: expected TOML: {error}") from None
 
@@ -51,12 +57,13 @@ def _raw_value(table: OptionTable, dest: str, value: object, where: str) -> RawV
 def _text(table: OptionTable, dest: str, value: object, where: str) -> str:
     """Return the text of one value; the elements of an array are joined by commas, as in the flag."""
     action = table.actions[dest]
-    numeric = action.type in (int, float)
-    if isinstance(value, list) and not numeric:
+    kind = number_kind(action)
+    numeric = kind is not None
+    if isinstance(value, list) and accepts_list(action):
         if all(isinstance(part, str | int | float) and not isinstance(part, bool) for part in value):
             return ",".join(map(str, value))
     elif isinstance(value, str) and not numeric:
         return value
-    elif numeric and not isinstance(value, bool) and isinstance(value, (int, float) if action.type is float else int):
+    elif numeric and not isinstance(value, bool) and isinstance(value, (int, float) if kind is float else int):
         return str(value)
     raise InvalidInputError(f"{where}: expected {type_name(action)}, got {value!r}")

@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import copy
 import os
+import re
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -17,7 +18,12 @@ from gausslite.config.environment import CONFIG_VARIABLE, read_environment, warn
 from gausslite.config.file import read_file
 from gausslite.config.option_table import Layer, OptionTable, RawValue
 from gausslite.config.presets import PRESETS
-from gausslite.config.toml_text import OptionValue, to_toml
+from gausslite.config.switches import dependent_default
+from gausslite.config.toml_text import OptionValue, to_toml, without_password
+from gausslite.errors import InvalidInputError
+
+_NEGATIVE_NUMBERS = re.compile(r"-\.?\d[\d.,eE+-]*$")
+_PATHS_AS_TEXT = frozenset({"source"})
 
 
 def parse_options(
@@ -35,6 +41,8 @@ def parse_options(
     if _subparsers(parser) is not None:
         return parser.parse_args(arguments)
     _add_configuration(parser)
+    # values such as -1,0,0 are no flags
+    parser._negative_number_matcher = _NEGATIVE_NUMBERS
     table = OptionTable.of(parser)
     flags = _parse_flags(parser, arguments)
     path = flags.pop("config", None) or environment.get(CONFIG_VARIABLE)
@@ -44,10 +52,11 @@ def parse_options(
         layers.append(read_file(table, Path(str(path))))
     values, origins = _combine(table, flags, layers)
     values, origins = _combine(table, values, [_read_preset(table, values.get("preset"))], origins)
+    _require_paths(table, values)
     options = _parse_with_defaults(parser, arguments, table.convert(values, origins), print_only)
     warn_of_unknown_variables(parser.prog, table, environment, getattr(options, "llm_key_variable", None))
     if print_only:
-        print(f"# {parser.prog}: effective settings\n{to_toml(_effective(table, values))}", end="")
+        print(_configuration_text(parser.prog, table, values, options), end="")
         raise SystemExit(0)
     return options
 
@@ -128,12 +137,33 @@ def _parse_with_defaults(
     return final.parse_args(arguments)
 
 
-def _effective(table: OptionTable, values: Mapping[str, RawValue]) -> dict[str, OptionValue]:
-    """Return the value of every option as a configuration file states it; unset options are left out."""
-    return {
-        table.key(dest): table.file_value(dest, values[dest]) if dest in values else table.default_value(dest)
-        for dest in table.actions
-    }
+def _require_paths(table: OptionTable, values: Mapping[str, RawValue]) -> None:
+    """Raise InvalidInputError for an empty path, which would stand for the current folder."""
+    for dest, value in values.items():
+        action = table.actions[dest]
+        if value == "" and (action.type is Path or dest in _PATHS_AS_TEXT):
+            name = action.option_strings[0] if action.option_strings else str(action.metavar)
+            raise InvalidInputError(f"{name}: expected a path, got an empty text")
+
+
+def _configuration_text(
+    program: str, table: OptionTable, values: Mapping[str, RawValue], options: argparse.Namespace
+) -> str:
+    """Return the effective options as a configuration file.
+
+    Defaults that depend on other options are comments, so that they still depend on them when the file is read.
+    """
+    effective: dict[str, OptionValue] = {}
+    dependent: dict[str, OptionValue] = {}
+    for dest, action in table.actions.items():
+        key = table.key(dest)
+        value = table.file_value(dest, values[dest]) if dest in values else table.default_value(dest)
+        if value is None:
+            dependent[key] = dependent_default(action, options)
+        effective[key] = without_password(value) if isinstance(value, str) else value
+    comments = "".join(f"# {line}\n" for line in to_toml(dependent).splitlines())
+    heading = "# defaults that depend on other options or on the machine\n" if comments else ""
+    return f"# {program}: effective settings\n{to_toml(effective)}{heading}{comments}"
 
 
 def _delegating_copy(parser: argparse.ArgumentParser) -> argparse.ArgumentParser:

@@ -6,15 +6,27 @@ import argparse
 from pathlib import Path
 
 from gausslite.calibration.pose_exposure_prior import PoseExposurePrior
+from gausslite.config.numbers import Number
 from gausslite.config.presets import PRESETS
+from gausslite.config.switches import DependentDefault, add_switch, set_dependent_default
 from gausslite.config.toml_text import OptionValue
 from gausslite.config.values import AUTO, NONE, read_names, read_pose_prior, read_pose_prior_or_auto, read_skip_stages
 from gausslite.domain.voxels import VoxelGrid
-from gausslite.mapping.policies import EXTENSION_FLAGS, POLICIES, TASK
+from gausslite.mapping.policies import EXTENSION_FLAGS, POLICIES, TASK, policy
 from gausslite.mission.frame_scheduler import SchedulerSettings
-from gausslite.mission.settings import DEFAULT_MAX_GAUSSIANS, MissionSettings, PerceptionSettings
+from gausslite.mission.settings import (
+    DEFAULT_MAX_GAUSSIANS,
+    MAX_ITERATIONS,
+    MAX_RATE_HZ,
+    MAX_SEED,
+    MIN_RATE_HZ,
+    MissionSettings,
+    PerceptionSettings,
+)
 from gausslite.render.choose import BACKENDS
+from gausslite.render.cpu_kernels import MAX_THREADS, choose_threads
 
+HOLD_OUT_HELP = "hold out every N-th selected frame from mapping, for evaluation"
 _EXACT = PoseExposurePrior()
 _POSE_PRIOR_METAVAR = "M,DEG[,GAIN,OFFSET]"
 _POSE_PRIOR_HELP = (
@@ -33,7 +45,8 @@ _SKIP_STAGES_HELP = (
 
 def add_detector(parser: argparse.ArgumentParser) -> None:
     """Add --detector, --segmenter, --vocabulary and --resegment: how the task's objects are detected and outlined."""
-    add = parser.add_argument_group("perception").add_argument
+    group = parser.add_argument_group("perception")
+    add = group.add_argument
     add(
         "--detector",
         metavar="FILE.onnx",
@@ -51,31 +64,33 @@ def add_detector(parser: argparse.ArgumentParser) -> None:
         type=Path,
         help="Grounding DINO's vocabulary (default: vocab.txt in the model's folder)",
     )
-    add("--resegment", action="store_true", help="run the segmenter on every frame (slower)")
+    add_switch(group, "--resegment", "run the segmenter on every frame (slower)")
 
 
-def add_policy(parser: argparse.ArgumentParser, allow_auto: bool = False) -> None:
+def add_policy(
+    parser: argparse.ArgumentParser, allow_auto: bool = False, default_policy: DependentDefault = lambda _: TASK
+) -> None:
     """Add --preset, --policy, --disable, --rasterizer and --pose-prior.
 
     allow_auto: the pose prior may be, and by default is, estimated; for programs that read the whole sequence first.
+    default_policy: returns the policy that the program uses if --policy is not set.
     """
     add = parser.add_argument_group("mapping").add_argument
     add("--preset", choices=sorted(PRESETS), help="set of defaults for other options; paper: the literal method")
-    add(
+    chosen = add(
         "--policy",
         choices=sorted(POLICIES),
         help="what the budget is spent on (default: task; map without a task: uniform)",
     )
+    set_dependent_default(chosen, default_policy)
     extensions = ", ".join(EXTENSION_FLAGS)
     add("--disable", metavar="A,B", type=read_names, default=(), help=f"{_DISABLE_HELP}{extensions}")
     add("--rasterizer", choices=BACKENDS, default="auto", help="backend that renders and trains (default: auto)")
-    add_pose_prior(parser, AUTO if allow_auto else _EXACT, AUTO if allow_auto else NONE, allow_auto)
+    add_pose_prior(parser, AUTO if allow_auto else NONE, AUTO if allow_auto else NONE, allow_auto)
 
 
-def add_pose_prior(
-    parser: argparse.ArgumentParser, default: PoseExposurePrior | str | None, default_text: str, allow_auto: bool
-) -> None:
-    """Add --pose-prior; default_text names the default in the help."""
+def add_pose_prior(parser: argparse.ArgumentParser, default: str | None, default_text: str, allow_auto: bool) -> None:
+    """Add --pose-prior; default is the default's text, default_text names it in the help."""
     parser.add_argument(
         "--pose-prior",
         metavar=f"{AUTO}|{NONE}|{_POSE_PRIOR_METAVAR}" if allow_auto else f"{NONE}|{_POSE_PRIOR_METAVAR}",
@@ -92,20 +107,29 @@ def add_budget(parser: argparse.ArgumentParser) -> None:
     add(
         "--max-gaussians",
         metavar="N",
-        type=int,
+        type=Number("max-gaussians", int, 1),
         default=DEFAULT_MAX_GAUSSIANS,
         help="upper limit of the map's size (default: %(default)s)",
     )
     per_frame = group.add_mutually_exclusive_group()
-    per_frame.add_argument("--iterations", metavar="N", type=int, help="iterations per frame (default: 8)")
+    iterations = per_frame.add_argument(
+        "--iterations",
+        metavar="N",
+        type=Number("iterations", int, 0, MAX_ITERATIONS),
+        help="iterations per frame (default: 8)",
+    )
+    set_dependent_default(iterations, _default_iterations)
     per_frame.add_argument(
-        "--rate", metavar="HZ", type=float, help="frames per second; each frame trains as long as its time allows"
+        "--rate",
+        metavar="HZ",
+        type=Number("rate", float, MIN_RATE_HZ, MAX_RATE_HZ),
+        help="frames per second; each frame trains as long as its time allows",
     )
     scheduler = SchedulerSettings()
     add(
         "--min-iterations",
         metavar="N",
-        type=int,
+        type=Number("min-iterations", int, 0, MAX_ITERATIONS),
         default=scheduler.min_iterations,
         help="at --rate, iterations to make time for (default: %(default)s)",
     )
@@ -119,12 +143,32 @@ def add_budget(parser: argparse.ArgumentParser) -> None:
     add(
         "--deadline-slack",
         metavar="SHARE",
-        type=float,
+        type=Number("deadline-slack", float, 0, 1),
         default=scheduler.deadline_slack,
         help="at --rate, share of a frame's time it may overrun for its minimum iterations (default: %(default)s)",
     )
-    add("--seed", metavar="S", type=int, default=0, help="seed of every random choice (default: 0)")
-    add("--threads", metavar="N", type=int, help="threads (default: all that the processor has)")
+    seed = Number("seed", int, 0, MAX_SEED)
+    add("--seed", metavar="S", type=seed, default=0, help="seed of every random choice (default: 0)")
+    add_threads(group)
+
+
+def add_threads(parser: argparse._ActionsContainer) -> None:
+    """Add --threads."""
+    action = parser.add_argument(
+        "--threads",
+        metavar="N",
+        type=Number("threads", int, 1, MAX_THREADS),
+        help="threads (default: all that the processor has)",
+    )
+    set_dependent_default(action, lambda _: choose_threads(None))
+
+
+def _default_iterations(options: argparse.Namespace) -> int | None:
+    """Return the policy's iterations per frame; None at a rate."""
+    if options.rate is not None:
+        return None
+    settings = policy(getattr(options, "policy", None) or TASK).optimization
+    return settings.warmup_iterations + settings.active_iterations
 
 
 def add_voxel_size(parser: argparse.ArgumentParser) -> None:
@@ -132,7 +176,7 @@ def add_voxel_size(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--voxel-size",
         metavar="M",
-        type=float,
+        type=Number("voxel-size", float, 1e-3, 1e3),
         default=VoxelGrid().size_m,
         help="edge of the fusion's voxels in metres (default: %(default)s)",
     )

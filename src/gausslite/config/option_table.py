@@ -8,7 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from gausslite.config.numbers import Number
 from gausslite.config.toml_text import OptionValue
+from gausslite.config.values import read_names
 from gausslite.errors import GaussLiteError, InvalidInputError
 
 RawValue = str | bool | list[str]
@@ -56,11 +58,8 @@ class OptionTable:
 
     def file_value(self, dest: str, value: RawValue) -> OptionValue:
         """Return a valid raw value with the type that a configuration file gives it."""
-        action = self.actions[dest]
-        if isinstance(value, str) and action.type in (int, float):
-            number: int | float = action.type(value)
-            return number
-        return value
+        kind = number_kind(self.actions[dest])
+        return kind(value) if isinstance(value, str) and kind is not None else value
 
     def default_value(self, dest: str) -> OptionValue:
         """Return the option's default as a configuration file states it, None if there is none."""
@@ -87,7 +86,7 @@ class OptionTable:
         try:
             value = convert(text)
         except (argparse.ArgumentTypeError, GaussLiteError) as error:
-            raise InvalidInputError(f"{origin}: {error}") from None
+            raise InvalidInputError(f"{origin}: {str(error).removeprefix(f'--{self.key(dest)}: ')}") from None
         except (TypeError, ValueError):
             raise InvalidInputError(f"{origin}: expected {type_name(action)}, got {text!r}") from None
         if action.choices is not None and value not in action.choices:
@@ -110,5 +109,19 @@ def variable_name(key: str) -> str:
 
 def type_name(action: argparse.Action) -> str:
     """Return a description of the values that an option accepts, for error messages."""
-    names = {int: "a whole number", float: "a number"}
-    return names.get(action.type, f"text such as {action.metavar}" if action.metavar else "text")  # type: ignore[call-overload, no-any-return]
+    kind = number_kind(action)
+    if kind is not None:
+        return "a whole number" if kind is int else "a number"
+    return f"text such as {action.metavar}" if action.metavar else "text"
+
+
+def number_kind(action: argparse.Action) -> type[int] | type[float] | None:
+    """Return int or float for a numeric option, None for any other."""
+    if isinstance(action.type, Number):
+        return action.type.kind
+    return {int: int, float: float}.get(action.type)  # type: ignore[arg-type]
+
+
+def accepts_list(action: argparse.Action) -> bool:
+    """Return True if the option's text is a list with commas, which a file may also write as an array."""
+    return action.type is read_names or (isinstance(action.metavar, str) and "," in action.metavar)

@@ -3,10 +3,19 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping, Sequence
 
 OptionValue = str | bool | int | float | Sequence[str] | None
 """The value of one option in a configuration file; None leaves the option out."""
+
+
+_URL_PASSWORD = re.compile(r"(?<=://)([^/@\s:]*):[^/@\s]+(?=@)")
+
+
+def without_password(text: str) -> str:
+    """Return the text with "***" in place of a URL's password."""
+    return _URL_PASSWORD.sub(r"\1:***", text)
 
 
 def to_toml(values: Mapping[str, OptionValue]) -> str:

@@ -18,6 +18,8 @@ def host_and_port(name: str, address: str) -> tuple[str, int]:
 
 def require_callable(name: str, address: str) -> None:
     """Raise InvalidInputError unless a service can listen there; gRPC would use port 443 for a missing port."""
+    if not isinstance(address, str):
+        raise InvalidInputError(f"{name}: expected HOST:PORT or unix:PATH as text, got {type(address).__name__}")
     if address.startswith(UNIX) and address != UNIX:
         return
     _, port = host_and_port(name, address)

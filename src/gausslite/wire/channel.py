@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 
 import grpc
 
+from gausslite.wire.address import require_callable
 from gausslite.wire.connection import KEEPALIVE_S, connection_options
 from gausslite.wire.status import from_rpc_error
 from gausslite.wire.tls import Tls, open_channel
@@ -30,7 +31,10 @@ _Client = TypeVar("_Client", bound="ServiceChannel")
 
 
 class ServiceChannel:
-    """Owns one channel, encrypted with `tls`. Raises a GaussLiteError for every error of the server or the network."""
+    """Owns one channel, encrypted with `tls`. Raises InvalidInputError for a malformed address.
+
+    Calls raise a GaussLiteError for every error of the server or the network.
+    """
 
     kind = "service"
     """The service's name in error messages."""
@@ -38,6 +42,7 @@ class ServiceChannel:
     """A stream ends with UnavailableError twice this time after the last packet of a lost server."""
 
     def __init__(self, address: str, deadline_s: float = DEADLINE_S, tls: Tls | None = None) -> None:
+        require_callable(f"{type(self).__name__} address", address)
         self.address = address
         self._deadline_s = deadline_s
         methods = [

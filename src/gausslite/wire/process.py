@@ -8,6 +8,7 @@ import sys
 from collections.abc import Awaitable, Callable
 
 from gausslite.errors import GaussLiteError
+from gausslite.messages import print_message, printable
 
 
 class _OneLine(logging.Formatter):
@@ -15,7 +16,7 @@ class _OneLine(logging.Formatter):
 
     def format(self, record: logging.LogRecord) -> str:
         """Join the lines of the formatted record."""
-        return " | ".join(super().format(record).splitlines())
+        return " | ".join(printable(line) for line in super().format(record).splitlines())
 
 
 def log_to_stderr(program: str) -> None:
@@ -35,6 +36,6 @@ def run_service(program: str, serve: Callable[[], Awaitable[None]]) -> int:
     try:
         asyncio.run(body())
     except GaussLiteError as error:
-        print(f"{program}: {error}", file=sys.stderr)
+        print_message(f"{program}: {error}")
         return 2
     return 0

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 
+from gausslite.config.switches import add_switch
 from gausslite.errors import KernelError
 from gausslite.render.choose import choose_rasterizer
 from gausslite_bench.cli.argument_types import read_counts
@@ -23,7 +24,7 @@ def configure_gpu(parser: argparse.ArgumentParser) -> None:
         help=f"numbers of Gaussians (default: {counts})",
     )
     add("--reps", metavar="N", type=int, default=100, help="timed iterations of each kind (default: %(default)s)")
-    add("--json", action="store_true", help="print JSON for scripts")
+    add_switch(parser, "--json", "print JSON for scripts")
     parser.set_defaults(run=run_gpu)
 
 

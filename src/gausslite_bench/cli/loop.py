@@ -11,6 +11,7 @@ from gausslite.cli.progress import MappingBar
 from gausslite.cli.source_options import add_regions, open_with_warnings, selected_regions
 from gausslite.config.mapping_options import add_budget, add_detector, add_policy, mission_settings
 from gausslite.config.source_options import add_frames
+from gausslite.config.switches import add_switch
 from gausslite.datasets.held_out import HeldOutSplit
 from gausslite.datasets.selection import frame_size, select_frames
 from gausslite.datasets.source import Source
@@ -51,7 +52,7 @@ def configure_loop(parser: argparse.ArgumentParser) -> None:
         type=int,
         help="also map with N iterations per frame and compare ROI PSNR; every 8th frame is held out",
     )
-    add("--json", action="store_true", help="print JSON for scripts")
+    add_switch(parser, "--json", "print JSON for scripts")
     parser.set_defaults(run=run_loop)
 
 

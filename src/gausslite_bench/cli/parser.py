@@ -10,6 +10,7 @@ import sys
 from dataclasses import asdict
 from pathlib import Path
 
+from gausslite.config.switches import add_switch
 from gausslite.config.task_parser_options import add_backend, backend_settings
 from gausslite.task.backends import open_parser
 from gausslite_bench.parser_scores import SENTENCES, ParserScore, load_sentences, score_parser
@@ -25,7 +26,7 @@ def configure_parser(parser: argparse.ArgumentParser) -> None:
         default=SENTENCES,
         help="sentences with their expected graphs (default: the set in the package)",
     )
-    add("--json", action="store_true", help="print JSON for scripts")
+    add_switch(parser, "--json", "print JSON for scripts")
     add_backend(parser)
     parser.set_defaults(run=run_parser)
 

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from gausslite.cli.source_options import add_source, open_with_warnings
 from gausslite.config.mapping_options import add_detector
+from gausslite.config.switches import add_switch
 from gausslite.config.values import read_names
 from gausslite.datasets.selection import frame_size, select_frames
 from gausslite.datasets.source import Source
@@ -44,7 +45,7 @@ def configure_perception(parser: argparse.ArgumentParser) -> None:
     )
     add("--threads", metavar="N", type=int, help="the detector's threads (default: the runtime's choice)")
     add("--pictures", metavar="DIR", type=Path, help="write a contact sheet for each task to this folder")
-    add("--json", action="store_true", help="print JSON for scripts")
+    add_switch(parser, "--json", "print JSON for scripts")
     parser.set_defaults(run=run_perception)
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from gausslite.cli.source_options import open_with_warnings
 from gausslite.config.mapping_options import add_pose_prior
 from gausslite.config.source_options import add_register_depth
+from gausslite.config.switches import add_switch
 from gausslite.config.values import AUTO, read_names, read_up_axis
 from gausslite.datasets.regions import REGIONS_FILE
 from gausslite.datasets.selection import downscaled_size
@@ -100,11 +101,7 @@ def run_ablation(options: argparse.Namespace) -> int:
 def _add_study_options(parser: argparse.ArgumentParser, default_seeds: tuple[int, ...], default_equal: str) -> None:
     add = parser.add_argument
     add("--out", metavar="DIR", type=Path, required=True, help="folder for tables, sheets and cached trials")
-    add(
-        "--reuse-other-code",
-        action="store_true",
-        help="also reuse cached trials from other code (default: compute them again)",
-    )
+    add_switch(parser, "--reuse-other-code", "also reuse cached trials from other code (default: compute them again)")
     seeds = ",".join(str(seed) for seed in default_seeds)
     add("--seeds", metavar="N,...", type=read_seeds, default=default_seeds, help=f"mapping seeds (default: {seeds})")
     add(

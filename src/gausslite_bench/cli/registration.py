@@ -14,7 +14,7 @@ from gausslite.datasets.registered_source import DepthRegistration
 from gausslite.datasets.selection import frame_size, select_frames
 from gausslite.evaluation.compare import MapScores, average, score_view
 from gausslite.evaluation.views import HeldOutView, MapViewer
-from gausslite.mapping.policies import POLICIES, TASK
+from gausslite.mapping.policies import POLICIES, TASK, follows_task
 from gausslite.mission.build import build_mapper
 from gausslite.mission.frame_stream import FrameStream
 from gausslite.mission.runner import MissionRunner
@@ -61,7 +61,7 @@ def map_and_score(options: argparse.Namespace) -> tuple[MapScores, int]:
         seed=options.seed,
         threads=options.threads,
     )
-    estimator = RegionRelevanceEstimator(regions) if options.policy == TASK else NoTaskEstimator()
+    estimator = RegionRelevanceEstimator(regions) if follows_task(options.policy) else NoTaskEstimator()
     mapper = TaskMapper(estimator, build_mapper(settings))
     MissionRunner(mapper.process).run(FrameStream(source, training, size).frames()).raise_if_stopped()
     gaussians = mapper.gaussians()

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from gausslite.codec.files import write_atomic
+from gausslite.config.switches import add_switch
 from gausslite.config.values import read_names
 from gausslite.errors import InvalidInputError
 from gausslite.mission.results import prepare_folder, write_json
@@ -46,7 +47,7 @@ def configure_task_change(parser: argparse.ArgumentParser) -> None:
     add("--max-gaussians", metavar="N", type=int, default=60_000, help="hard cap (default: %(default)s)")
     add("--iterations", metavar="N", type=int, default=8, help="iterations per frame (default: %(default)s)")
     add("--rate", metavar="HZ", type=float, default=4.0, help="frame rate in Hz (default: %(default)s)")
-    add("--timed", action="store_true", help="run as many iterations as fit into 1/rate seconds, not --iterations")
+    add_switch(parser, "--timed", "run as many iterations as fit into 1/rate seconds, not --iterations")
     add("--seed", metavar="S", type=int, default=0, help="seed of all random numbers (default: 0)")
     add("--threads", metavar="N", type=int, help="threads (default: all available cores)")
     parser.set_defaults(run=run_task_change)

@@ -20,7 +20,6 @@ from gausslite.evaluation.compare import MapScores, PerceptualDistance, average,
 from gausslite.evaluation.fitted import render_fitted
 from gausslite.evaluation.pictures import to_uint8
 from gausslite.evaluation.views import MapViewer, largest_roi_views
-from gausslite.mapping.policies import TASK
 from gausslite.mission.build import EstimatorFactory, build_mapper
 from gausslite.mission.frame_scheduler import Clock, FrameScheduler
 from gausslite.mission.runner import MissionRunner
@@ -122,7 +121,7 @@ class Trial:
     @property
     def follows_task(self) -> bool:
         """False if the policy ignores the task's region, so that its map is the same for every task."""
-        return self.variant.policy == TASK and self.mission.mapper_settings().components.follow_task
+        return self.mission.mapper_settings().components.follow_task
 
     @property
     def key(self) -> str:

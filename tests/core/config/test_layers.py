@@ -98,9 +98,16 @@ def test_an_exclusive_option_replaces_its_rival_in_lower_layers(
 @pytest.mark.parametrize(
     ("text", "named"),
     [
-        ("max-gausians = 5", "unknown option 'max-gausians'; the nearest known one is 'max-gaussians'"),
-        ("max_gaussians = 5", "unknown option 'max_gaussians'; the nearest known one is 'max-gaussians'"),
-        ("config = 'x'", "unknown option 'config'"),
+        ("max-gausians = 5", "unknown option 'max-gausians'; did you mean max-gaussians\\?"),
+        ("max_gaussians = 5", "unknown option 'max_gaussians'; did you mean max-gaussians\\?"),
+        ("config = 'x'", "unknown option 'config'$"),
+        ("[mapping]\nrate = 1", r"\[mapping\]: tables are not supported; write NAME = VALUE at the top level"),
+        ("kind = ['slow', 'fast']", r"kind: expected text, got \['slow', 'fast'\]"),
+        ("rate = -1", "rate: expected 0.01 to 1000, got -1$"),
+        ("seed = 4294967296", "seed: expected 0 to 4294967295, got 4294967296"),
+        ("threads = 0", "threads: expected 1 to 256, got 0"),
+        ("max-gaussians = 0", "max-gaussians: expected at least 1, got 0"),
+        ("deadline-slack = nan", "deadline-slack: expected 0 to 1, got nan"),
         ("max-gaussians = '5'", "max-gaussians: expected a whole number, got '5'"),
         ("max-gaussians = 5.5", "max-gaussians: expected a whole number, got 5.5"),
         ("max-gaussians = true", "max-gaussians: expected a whole number, got True"),
@@ -109,10 +116,10 @@ def test_an_exclusive_option_replaces_its_rival_in_lower_layers(
         ("verbose = 1", "verbose: expected true or false, got 1"),
         ("kind = 'idle'", "kind: expected one of slow, fast, got 'idle'"),
         ("skip-stages = 'x'", "skip-stages: expected names among publishing, seeding, got 'x'"),
-        ("[source]\nx = 1", "source: expected text such as SOURCE, got {'x': 1}"),
+        ("[source]\nx = 1", "tables are not supported"),
         ("iterations = 1\nrate = 2", "expected only one of iterations and rate, got both"),
         ("= 5", "expected TOML"),
-        ("seed = '\udc80'", "expected TOML"),
+        ("seed = '\udc80'", r"expected UTF-8 text, got another encoding \(byte 8\)"),
     ],
 )
 def test_a_wrong_file_is_one_line_that_names_file_and_key(tmp_path: Path, text: str, named: str) -> None:
@@ -148,7 +155,7 @@ def test_unknown_variables_are_warnings_without_their_values(capsys: pytest.Capt
     variables = {"GAUSSLITE_MAX_GAUSIANS": "secret", "GAUSSLITE_SEED": "", **others}
     assert parse("home", "--out=x", "--llm-key-variable=GAUSSLITE_KEY", environment=variables).seed == 0
     [warning] = capsys.readouterr().err.splitlines()
-    assert warning == "mapper: GAUSSLITE_MAX_GAUSIANS is not an option; the nearest one is GAUSSLITE_MAX_GAUSSIANS"
+    assert warning == "mapper: GAUSSLITE_MAX_GAUSIANS is not an option; did you mean GAUSSLITE_MAX_GAUSSIANS?"
 
 
 def test_the_environment_can_name_the_file(tmp_path: Path) -> None:

@@ -1,0 +1,40 @@
+"""Check the types of arguments of the Python API: an error names the argument, what is right and what was received."""
+
+from __future__ import annotations
+
+import numbers
+
+from gausslite.errors import InvalidInputError
+
+
+def require_instance(name: str, value: object, kind: type | tuple[type, ...], expected: str) -> None:
+    """Raise InvalidInputError unless the value has the type; expected: what is right, for the message."""
+    if not isinstance(value, kind):
+        raise InvalidInputError(f"{name}: expected {expected}, got {describe(value)}")
+
+
+def require_whole(name: str, value: object) -> None:
+    """Raise InvalidInputError unless the value is a whole number; True and False are none."""
+    if isinstance(value, bool) or not isinstance(value, numbers.Integral):
+        raise InvalidInputError(f"{name}: expected a whole number, got {describe(value)}")
+
+
+def require_number(name: str, value: object) -> None:
+    """Raise InvalidInputError unless the value is a real number; True and False are none."""
+    if isinstance(value, bool) or not isinstance(value, numbers.Real):
+        raise InvalidInputError(f"{name}: expected a number, got {describe(value)}")
+
+
+def require_size(name: str, value: object) -> None:
+    """Raise InvalidInputError unless the value is (width, height), two whole numbers above 0."""
+    whole = isinstance(value, tuple | list) and len(value) == 2
+    if not whole or not all(isinstance(side, numbers.Integral) and side > 0 for side in value):  # type: ignore[attr-defined]
+        raise InvalidInputError(
+            f"{name}: expected (width, height) in pixels as whole numbers such as (320, 240), got {describe(value)}"
+        )
+
+
+def describe(value: object) -> str:
+    """Return a short text of a value for messages: its type and the start of its form."""
+    text = repr(value)
+    return f"{type(value).__name__} {text if len(text) <= 40 else text[:37] + '...'}"
