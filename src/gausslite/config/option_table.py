@@ -119,7 +119,9 @@ def number_kind(action: argparse.Action) -> type[int] | type[float] | None:
     """Return int or float for a numeric option, None for any other."""
     if isinstance(action.type, Number):
         return action.type.kind
-    return {int: int, float: float}.get(action.type)  # type: ignore[arg-type]
+    if action.type is int:
+        return int
+    return float if action.type is float else None
 
 
 def accepts_list(action: argparse.Action) -> bool:

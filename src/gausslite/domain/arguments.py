@@ -27,8 +27,8 @@ def require_number(name: str, value: object) -> None:
 
 def require_size(name: str, value: object) -> None:
     """Raise InvalidInputError unless the value is (width, height), two whole numbers above 0."""
-    whole = isinstance(value, tuple | list) and len(value) == 2
-    if not whole or not all(isinstance(side, numbers.Integral) and side > 0 for side in value):  # type: ignore[attr-defined]
+    sides = value if isinstance(value, tuple | list) else ()
+    if len(sides) != 2 or not all(isinstance(side, numbers.Integral) and int(side) > 0 for side in sides):
         raise InvalidInputError(
             f"{name}: expected (width, height) in pixels as whole numbers such as (320, 240), got {describe(value)}"
         )

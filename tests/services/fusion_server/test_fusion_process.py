@@ -65,7 +65,7 @@ def test_an_error_that_the_operator_can_fix_is_one_line_and_code_2(tmp_path: Pat
     nonsense.write_text("remember the milk, " * 300)
     assert "cannot be opened" in ends_with_one_line("--store", str(tmp_path / "no" / "folder" / "x.sqlite"))
     assert "undamaged GaussLite store" in ends_with_one_line("--store", str(nonsense))
-    assert "voxel size_m" in ends_with_one_line("--voxel-size", "0")
+    assert "--voxel-size: expected 0.001 to 1000" in ends_with_one_line("--voxel-size", "0")
     assert "--store-max-mb" in ends_with_one_line("--store-max-mb", "0")
     assert "--refine-iterations" in ends_with_one_line("--refine-iterations", "1000000")
     assert "mission: expected UTF-8 text" in ends_with_one_line("--mission", "husky-\udcff")
