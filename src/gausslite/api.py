@@ -21,13 +21,14 @@ from gausslite.codec.ply import read_ply, write_ply
 from gausslite.datasets.open import is_simulated, open_source
 from gausslite.datasets.registered_source import DepthRegistration, RegisteredSource
 from gausslite.datasets.source import Source
+from gausslite.domain.arguments import describe, require_instance, require_size
 from gausslite.domain.camera import Camera
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.pose import UpAxis, require_rigid
 from gausslite.domain.region import Region
 from gausslite.errors import DatasetError, InvalidInputError
 from gausslite.evaluation.views import MapViewer
-from gausslite.mapping.policies import TASK
+from gausslite.mapping.policies import TASK, follows_task
 from gausslite.mission.build import EstimatorFactory, build_mapper
 from gausslite.mission.frame_scheduler import FrameScheduler
 from gausslite.mission.frame_stream import CorruptFrames, FrameStream
@@ -123,9 +124,14 @@ def create_mapper(
     `SceneInfo(up_axis)` for a live camera. perception: the detector's files; without a detector, the scene's ground
     truth finds the task's objects. Raises TaskError, InvalidInputError, ModelFileError, KernelError.
     """
-    settings = settings or MissionSettings()
-    perception = perception or PerceptionSettings()
-    chosen = list(regions)
+    settings = MissionSettings() if settings is None else settings
+    perception = PerceptionSettings() if perception is None else perception
+    require_instance("scene", scene, SceneInfo, "gausslite.SceneInfo.of(source)")
+    require_instance("settings", settings, MissionSettings, "gausslite.MissionSettings(...)")
+    require_instance("perception", perception, PerceptionSettings, "gausslite.PerceptionSettings(...)")
+    if task is not None:
+        require_instance("task", task, str, "a sentence as text")
+    chosen = _require_regions(regions)
     if task is not None and chosen:
         raise InvalidInputError("task: expected either a task or regions, got both")
     if task is None and perception.model is not None:
@@ -136,9 +142,31 @@ def create_mapper(
         estimator = RegionRelevanceEstimator(chosen)
     else:
         estimator = NoTaskEstimator()
-        if settings.policy == TASK:
-            settings = replace(settings, policy=_UNIFORM)
+        settings = _without_task(settings)
     return TaskMapper(estimator, build_mapper(settings), scheduler=FrameScheduler(settings.scheduler_settings))
+
+
+def _require_regions(regions: object) -> list[Region]:
+    """Return the regions as a list. Raises InvalidInputError for anything else than regions."""
+    expected = "a list of regions such as [source.regions()['mug']]"
+    if isinstance(regions, str | Mapping) or not isinstance(regions, Iterable):
+        raise InvalidInputError(f"regions: expected {expected}, got {describe(regions)}")
+    chosen = list(regions)
+    for region in chosen:
+        require_instance("regions", region, Region, expected)
+    return chosen
+
+
+def _without_task(settings: MissionSettings) -> MissionSettings:
+    """Return settings for a mission without a task; the default policy becomes "uniform".
+
+    Raises InvalidInputError for other policies that follow a task.
+    """
+    if not follows_task(settings.policy):
+        return settings
+    if settings.policy != TASK:
+        raise InvalidInputError(f"settings.policy: {settings.policy!r} expects a task or regions, got neither")
+    return replace(settings, policy=_UNIFORM)
 
 
 def map_sequence(
@@ -158,6 +186,10 @@ def map_sequence(
     pixels. Frames that cannot be read are skipped and named in the notes. Ctrl-C ends the call after the current frame
     with KeyboardInterrupt. Raises DatasetError if no frame could be mapped, and the errors of `create_mapper`.
     """
+    require_instance("source", source, Source, "a sequence, pass gausslite.open_sequence(...)")
+    require_instance("frames", frames, str, 'text such as "0:100" or "0:100:2"')
+    if size is not None:
+        require_size("size", size)
     mapper = create_mapper(SceneInfo.of(source), task, regions=regions, settings=settings, perception=perception)
     size_text = None if size is None else f"{size[0]}x{size[1]}"
     stream = FrameStream.select(source, SourceSettings(source.name, frames, size_text))

@@ -16,6 +16,7 @@ from numpy import ndarray
 
 from gausslite.datasets.images import RgbdImage, resize_rgbd
 from gausslite.datasets.source import Source, require_position
+from gausslite.domain.arguments import require_size
 from gausslite.domain.camera import Camera
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import UpAxis, unit_up_axis
@@ -165,6 +166,8 @@ class SimulatedHome:
     def frame(self, i: int, size: tuple[int, int] | None = None) -> Frame:
         """Return the frame at position i, resized to (width_px, height_px). Raises DatasetError."""
         require_position(self.name, i, len(self))
+        if size is not None:
+            require_size("size", size)
         settings, home, T_world_camera = self._settings, self._home, self._poses[i]
         view = self._apply_exposure(render_view(home.scene, self._camera, T_world_camera, settings.gloss), i)
         if settings.noise > 0:

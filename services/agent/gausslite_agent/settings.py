@@ -10,6 +10,7 @@ from typing import Any
 
 from gausslite.config.layers import parse_options
 from gausslite.config.mapping_options import (
+    HOLD_OUT_HELP,
     add_budget,
     add_detector,
     add_policy,
@@ -17,7 +18,9 @@ from gausslite.config.mapping_options import (
     mission_settings,
     perception_settings,
 )
+from gausslite.config.numbers import Number
 from gausslite.config.source_options import add_frames
+from gausslite.config.switches import add_switch, set_dependent_default
 from gausslite.config.tls_options import add_tls, read_server_tls
 from gausslite.domain.names import require_name
 from gausslite.domain.pose import UpAxis
@@ -130,10 +133,16 @@ def parse_arguments(arguments: Sequence[str] | None = None) -> AgentSettings:
 
 
 def _load_settings(options: argparse.Namespace) -> LoadSettings:
-    """Return the load settings. Without a rate, the default is no idle training, so that maps are reproducible."""
-    default = 0 if options.rate is None else _IDLE_ITERATIONS
-    idle_iterations = default if options.idle_iterations is None else options.idle_iterations
+    """Return the load settings."""
+    idle_iterations = options.idle_iterations
+    if idle_iterations is None:
+        idle_iterations = _default_idle_iterations(options)
     return LoadSettings(options.queue, QueuePolicy(options.queue_policy), idle_iterations)
+
+
+def _default_idle_iterations(options: argparse.Namespace) -> int:
+    """Return 0 without a rate, so that maps are reproducible."""
+    return 0 if options.rate is None else _IDLE_ITERATIONS
 
 
 def _require_valid(options: argparse.Namespace) -> None:
@@ -142,8 +151,6 @@ def _require_valid(options: argparse.Namespace) -> None:
         require_name(f"--{name.replace('_', '-')}", getattr(options, name))
     if not options.agent_id:
         raise InvalidInputError("--agent-id: expected a name, got an empty text")
-    if not 0 <= options.drain_timeout <= _MAX_DRAIN_S:
-        raise InvalidInputError(f"--drain-timeout: expected 0 to {_MAX_DRAIN_S:g} s, got {options.drain_timeout}")
     for name in ("parser", "fusion"):
         address = getattr(options, name)
         if address is not None:
@@ -164,7 +171,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--task", metavar="TEXT", help="the robot's task (default: wait for the AssignTask call)")
     add("--out", metavar="DIR", type=Path, help="folder for map.ply and report.json at the end of the mission")
     add("--state", metavar="FILE", type=Path, help="resume the mission saved in this file, and save it here at the end")
-    add("--exit-when-done", action="store_true", help="exit after the mission (default: continue to serve)")
+    add_switch(parser, "--exit-when-done", "exit after the mission (default: continue to serve)")
     _add_replay(parser)
     add_frames(parser)
     add_detector(parser)
@@ -178,14 +185,16 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _add_replay(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument_group("replay").add_argument
+    group = parser.add_argument_group("replay")
+    add = group.add_argument
     add("--source", metavar="SPEC", help='a sequence folder or "sim:home?seed=0&trajectory=0"')
-    add("--test-every", metavar="N", type=int, help="hold out every Nth frame from mapping, for evaluation")
-    add("--strict", action="store_true", help="end at a frame that cannot be read (default: skip it)")
+    add("--test-every", metavar="N", type=int, help=HOLD_OUT_HELP)
+    add_switch(group, "--strict", "end at a frame that cannot be read (default: skip it)")
 
 
 def _add_connections(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument_group("connections").add_argument
+    group = parser.add_argument_group("connections")
+    add = group.add_argument
     add("--parser", metavar="ADDRESS", help="parser service (default: parse tasks in this process, by rules)")
     add("--fusion", metavar="ADDRESS", help="fusion server (default: none; nothing is sent)")
     add("--mission", metavar="ID", default="", help="mission to join (default: the server's only one)")
@@ -199,11 +208,11 @@ def _add_connections(parser: argparse.ArgumentParser) -> None:
         help="seconds between two transmissions (default: %(default)s)",
     )
     add("--spool", metavar="FILE", type=Path, help="store unsent data here, across restarts (default: in memory)")
-    add("--handover", action="store_true", help="at the end also send the map outside the ROI and the keyframes")
+    add_switch(group, "--handover", "at the end also send the map outside the ROI and the keyframes")
     add(
         "--drain-timeout",
         metavar="S",
-        type=float,
+        type=Number("drain-timeout", float, 0, _MAX_DRAIN_S),
         default=120.0,
         help="longest wait for the transmission at the end, in seconds (default: %(default)s)",
     )
@@ -218,9 +227,10 @@ def _add_load(parser: argparse.ArgumentParser) -> None:
         default=str(QueuePolicy.OLDEST),
         help="frame that a full queue drops (default: %(default)s)",
     )
-    add(
+    idle = add(
         "--idle-iterations",
         metavar="N",
         type=int,
         help=f"training iterations while the queue is empty (default: {_IDLE_ITERATIONS} at --rate, else 0)",
     )
+    set_dependent_default(idle, _default_idle_iterations)

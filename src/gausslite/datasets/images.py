@@ -13,6 +13,7 @@ from jaxtyping import Float32, UInt8
 from numpy import ndarray
 from numpy.typing import NDArray
 
+from gausslite.domain.arguments import require_size
 from gausslite.domain.camera import Camera
 from gausslite.domain.image_bytes import image_size
 from gausslite.errors import DatasetError
@@ -72,6 +73,8 @@ def load_rgbd(
 
 def resize_rgbd(image: RgbdImage, size: tuple[int, int] | None) -> RgbdImage:
     """Resize an image to (width, height): colour by area, depth by nearest pixel (averages lie on no surface)."""
+    if size is not None:
+        require_size("size", size)
     if size is None or size == (image.camera.width_px, image.camera.height_px):
         return image
     width, height = size
