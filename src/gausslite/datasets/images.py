@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import zlib
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -46,6 +47,19 @@ def read_colour(path: Path) -> UInt8[ndarray, "h w 3"]:
     bgr = _decode(path, cv2.IMREAD_COLOR)
     rgb: UInt8[ndarray, "h w 3"] = np.ascontiguousarray(bgr[..., ::-1])
     return rgb
+
+
+def first_readable_size(paths: Iterable[Path]) -> tuple[int, int]:
+    """Return (width, height) of the first image that can be read. Raises the first error if none can."""
+    first_error: DatasetError | None = None
+    for path in paths:
+        try:
+            height, width = read_colour(path).shape[:2]
+        except DatasetError as error:
+            first_error = first_error or error
+        else:
+            return width, height
+    raise first_error or DatasetError("expected an image, got none")
 
 
 def read_depth(path: Path, units: DepthUnits) -> Float32[ndarray, "h w"]:

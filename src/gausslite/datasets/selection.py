@@ -31,6 +31,11 @@ def select_frames(source: Source, selection: str) -> list[int]:
     return selected
 
 
+def frame_step(selection: str) -> int:
+    """Return STEP of the text "START:STOP:STEP", 1 without it. Raises InvalidInputError."""
+    return _parse(selection)[2]
+
+
 def frame_size(text: str | None, source: Source) -> tuple[int, int]:
     """Return (width, height) of "WxH", or the sequence's own size if text is None.
 

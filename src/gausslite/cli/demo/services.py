@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+from gausslite.cli.demo.results_folder import STORE
 from gausslite.cli.demo.scenario import AgentPlan
 from gausslite.cli.demo.service_processes import ProcessGroup, ServiceProcess
 from gausslite.cli.progress import MappingBar, progress_bar
@@ -67,7 +68,7 @@ def running_services(plan: DemoPlan, out: Path) -> Iterator[RunningServices]:
         for name in ("parser", "fusion-server", *(agent.agent_id for agent in plan.agents)):
             (out / name).mkdir(exist_ok=True)
         parser = start("parser", "gausslite_parser", {})
-        store: dict[str, OptionValue] = {"store": str(out / "fusion.sqlite"), "voxel-size": plan.voxel_size_m}
+        store: dict[str, OptionValue] = {"store": str(out / STORE), "voxel-size": plan.voxel_size_m}
         fusion = start("fusion-server", "gausslite_fusion_server", store)
         links: dict[str, OptionValue] = {"parser": parser.address, "fusion": fusion.address, "handover": True}
         agents = {
