@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-import sys
+import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -12,6 +12,7 @@ from gausslite.config.mapping_options import add_voxel_size
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.errors import InvalidInputError, MismatchError
 from gausslite.fusion.offline import fuse_maps
+from gausslite.messages import print_message
 from gausslite.mission.results import as_text, prepare_folder
 
 
@@ -28,6 +29,7 @@ def run(options: argparse.Namespace) -> int:
     """Fuse and write the maps; if scores are equal, the map given first wins. Returns the exit code."""
     if len(options.maps) < 2:
         raise InvalidInputError(f"maps: expected at least two files to fuse, got {len(options.maps)}")
+    _require_different_files(options.maps)
     _require_separate_output(options.maps, options.out)
     frames = {path: read_world_frame(path) for path in options.maps}
     world_frame = _common_world_frame(frames)
@@ -47,11 +49,24 @@ def run(options: argparse.Namespace) -> int:
     return 0
 
 
+def _require_different_files(maps: Sequence[Path]) -> None:
+    """Raise InvalidInputError if two inputs are the same file, also through a link or another path."""
+    for first, second in itertools.combinations(maps, 2):
+        if _is_same_file(first, second):
+            raise InvalidInputError(
+                f"maps: expected different files, got {first} and {second}, which are the same file"
+            )
+
+
 def _require_separate_output(maps: Sequence[Path], out: Path) -> None:
     """Raise InvalidInputError if the output file is one of the inputs, also through a link or another path."""
     for path in maps:
-        if path.resolve() == out.resolve() or (path.exists() and out.exists() and path.samefile(out)):
+        if _is_same_file(path, out):
             raise InvalidInputError(f"--out {out}: expected a file that is not an input, got the input {path}")
+
+
+def _is_same_file(a: Path, b: Path) -> bool:
+    return a.resolve() == b.resolve() or (a.exists() and b.exists() and a.samefile(b))
 
 
 def _common_world_frame(frames: Mapping[Path, str]) -> str:
@@ -59,7 +74,8 @@ def _common_world_frame(frames: Mapping[Path, str]) -> str:
     names = sorted(set(frames.values()) - {""})
     if len(names) > 1:
         found = ", ".join(f"{frame!r} in {path}" for path, frame in frames.items() if frame)
-        raise MismatchError(f"maps: expected one world frame, got {found}")
+        hint = "if the poses share one frame, map both with the same --world-frame NAME"
+        raise MismatchError(f"maps: expected one world frame, got {found}; {hint}")
     return names[0] if names else ""
 
 
@@ -68,4 +84,4 @@ def _print_unnamed(frames: Mapping[Path, str], world_frame: str) -> None:
     unnamed = [str(path) for path, frame in frames.items() if not frame]
     if unnamed:
         assumed = f"{world_frame!r}" if world_frame else "one world frame"
-        print(f"no world frame named in {', '.join(unnamed)}; assumed to be in {assumed}", file=sys.stderr)
+        print_message(f"no world frame named in {', '.join(unnamed)}; assumed to be in {assumed}")

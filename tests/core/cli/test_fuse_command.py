@@ -46,7 +46,8 @@ def test_maps_of_different_world_frames_are_refused(
     write_ply(maps[1], gaussians, "odom")
     assert fuse(*maps, tmp_path / "fused.ply") == 2
     [line] = capsys.readouterr().err.splitlines()
-    assert f"expected one world frame, got 'map' in {maps[0]}, 'odom' in {maps[1]}" in line
+    assert f"expected one world frame, got 'map' in {maps[0]}, 'odom' in {maps[1]}; if the poses share" in line
+    assert "map both with the same --world-frame NAME" in line
     assert not (tmp_path / "fused.ply").exists()
 
 
@@ -63,3 +64,12 @@ def test_the_fused_map_names_the_world_frame_of_its_maps(
     write_ply(maps[1], plain_gaussians(np.linspace(0, 1, 30)), "map")
     assert fuse(*maps, tmp_path / "fused.ply") == 0
     assert not capsys.readouterr().err
+
+
+def test_the_same_file_twice_is_refused(maps: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "link.ply").symlink_to(maps[0])
+    for same in (maps[0], tmp_path / "link.ply"):
+        assert fuse(maps[0], maps[1], same, tmp_path / "fused.ply") == 2
+        [line] = capsys.readouterr().err.splitlines()
+        assert f"expected different files, got {maps[0]} and {same}" in line
+    assert not (tmp_path / "fused.ply").exists()
