@@ -79,7 +79,7 @@ def _pairs(source: Source) -> Iterator[tuple[Rendering, Frame]]:
                 second = source.frame(position + direction * gap, size)
             except (DatasetError, PoseError):
                 break
-            warped = _warp(first, second)
+            warped = warp_into(first, second)
             if len(comparable_pixels(warped, second)) >= _MIN_PIXELS:
                 yield warped, second
                 last_gap = gap
@@ -87,7 +87,7 @@ def _pairs(source: Source) -> Iterator[tuple[Rendering, Frame]]:
             gap //= 2
 
 
-def _warp(frame: Frame, other: Frame) -> Rendering:
+def warp_into(frame: Frame, other: Frame) -> Rendering:
     """Return the frame as the other's camera would see it, by the recorded depth and poses."""
     T_other_frame = inverse(other.T_world_camera) @ frame.T_world_camera
     depth_m = register_depth(frame.depth_m, frame.camera, other.camera, T_other_frame)

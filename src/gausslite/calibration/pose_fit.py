@@ -69,6 +69,20 @@ def fit_pose(
     return T_world_camera
 
 
+def luminance_residual(rendering: Rendering, frame: Frame, T_world_camera: Float64[ndarray, "4 4"]) -> float:
+    """Return the robust standard deviation of the luminance residual, in [0, 1], after a fit of gain and offset.
+
+    rendering: from frame.T_world_camera; T_world_camera: the pose that the photograph is compared from.
+    """
+    pixels = comparable_pixels(rendering, frame)
+    points = back_project(rendering.expected_depth_m(OPAQUE_ALPHA), frame.camera).reshape(-1, 3)[pixels]
+    images = _LuminancePair.of(rendering, frame, pixels, _BLURS_PX[-1])
+    jacobian, residual = _linearise(images, points, inverse(T_world_camera) @ frame.T_world_camera, frame.camera)
+    exposure = jacobian[:, 6:]
+    residual = residual - exposure @ np.linalg.lstsq(exposure, residual, rcond=None)[0]
+    return 1.4826 * float(np.median(np.abs(residual)))
+
+
 def twist_of(T: Float64[ndarray, "4 4"]) -> Float64[ndarray, "6"]:
     """Return translation (m) and rotation vector (rad) of a transform."""
     return np.concatenate([T[:3, 3], cv2.Rodrigues(T[:3, :3])[0].ravel()])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,10 +11,13 @@ import numpy as np
 
 from gausslite.datasets.text_files import parse_numbers, read_rows, read_text
 from gausslite.domain.camera import Camera
+from gausslite.domain.lens import Lens, LensModel
 from gausslite.errors import DatasetError, InvalidInputError
 
 INTRINSICS_FILE = "camera-intrinsics.txt"
 CAMERA_FILE = "cam_params.json"
+CAMERA_INFO_FILES = ("camera_info.yaml", "camera_info.yml")
+COLMAP_FILE = "cameras.txt"
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,16 +42,31 @@ def find_in_or_above(folder: Path, name: str) -> Path | None:
     return next((path for path in (folder / name, folder.parent / name) if path.is_file()), None)
 
 
-def read_folder_camera(folder: Path, width_px: int, height_px: int) -> tuple[Camera, float | None] | None:
-    """Return the camera and depth units per metre of a camera file in or above the folder; None without such a file.
+@dataclass(frozen=True, slots=True)
+class FolderCamera:
+    """Camera that a folder's files state; units_per_metre: of the depth images, None if the file states none."""
 
-    cam_params.json has both; camera-intrinsics.txt has the camera only. Raises DatasetError.
+    camera: Camera
+    units_per_metre: float | None = None
+    lens: Lens | None = None
+
+
+def read_folder_camera(folder: Path, width_px: int, height_px: int) -> FolderCamera | None:
+    """Return the camera of a camera file in or above the folder; None without such a file.
+
+    Read in this order: cam_params.json (with depth units), camera_info.yaml (ROS), cameras.txt (COLMAP),
+    camera-intrinsics.txt (a matrix). Raises DatasetError.
     """
-    camera_path, matrix_path = (find_in_or_above(folder, name) for name in (CAMERA_FILE, INTRINSICS_FILE))
-    if camera_path is not None:
-        return read_json_camera(camera_path)
-    if matrix_path is not None:
-        return read_matrix(matrix_path).camera(str(matrix_path), width_px, height_px), None
+    readers: tuple[tuple[str, Callable[[Path], FolderCamera]], ...] = (
+        (CAMERA_FILE, read_json_camera),
+        *((name, read_camera_info) for name in CAMERA_INFO_FILES),
+        (COLMAP_FILE, read_colmap_camera),
+        (INTRINSICS_FILE, lambda path: FolderCamera(read_matrix(path).camera(str(path), width_px, height_px))),
+    )
+    for name, read in readers:
+        path = find_in_or_above(folder, name)
+        if path is not None:
+            return read(path)
     return None
 
 
@@ -63,15 +82,16 @@ def read_matrix(path: Path) -> FileIntrinsics:
     return FileIntrinsics(float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]))
 
 
-def read_json_camera(path: Path) -> tuple[Camera, float]:
-    """Return camera and depth units per metre of {"camera": {"w","h","fx","fy","cx","cy","scale"}}.
+def read_json_camera(path: Path) -> FolderCamera:
+    """Return the camera of {"camera": {"w","h","fx","fy","cx","cy","scale"}}, scale: depth units per metre.
 
-    Raises DatasetError.
+    "distortion_model" and "distortion" (a list) may state the lens. Raises DatasetError.
     """
     try:
         fields = json.loads(read_text(path))["camera"]
         numbers = {name: float(fields[name]) for name in ("w", "h", "fx", "fy", "cx", "cy", "scale")}
-    except (ValueError, KeyError, TypeError) as error:
+        lens = _lens(path, fields.get("distortion_model", "plumb_bob"), fields.get("distortion", ()))
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
         expected = '{"camera": {"w", "h", "fx", "fy", "cx", "cy", "scale"}} with numbers'
         raise DatasetError(f"{path}: expected {expected}; {type(error).__name__}: {error}") from None
     if not (np.isfinite(numbers["scale"]) and numbers["scale"] > 0):
@@ -79,4 +99,80 @@ def read_json_camera(path: Path) -> tuple[Camera, float]:
     if not (np.isfinite(numbers["w"]) and np.isfinite(numbers["h"])):
         raise DatasetError(f"{path}: expected a finite width and height, got {numbers['w']} and {numbers['h']}")
     intrinsics = FileIntrinsics(numbers["fx"], numbers["fy"], numbers["cx"], numbers["cy"])
-    return intrinsics.camera(str(path), int(numbers["w"]), int(numbers["h"])), numbers["scale"]
+    return FolderCamera(intrinsics.camera(str(path), int(numbers["w"]), int(numbers["h"])), numbers["scale"], lens)
+
+
+def read_camera_info(path: Path) -> FolderCamera:
+    """Return the camera of a ROS camera_info file (YAML): image_width, camera_matrix, distortion_coefficients.
+
+    Raises DatasetError.
+    """
+    import yaml
+
+    try:
+        fields = yaml.safe_load(read_text(path))
+        width, height = int(fields["image_width"]), int(fields["image_height"])
+        K = [float(value) for value in fields["camera_matrix"]["data"]]
+        lens = _lens(path, fields.get("distortion_model", "plumb_bob"), fields["distortion_coefficients"]["data"])
+        intrinsics = FileIntrinsics(K[0], K[4], K[2], K[5])
+    except (yaml.YAMLError, ValueError, KeyError, TypeError, IndexError, AttributeError) as error:
+        expected = "image_width, image_height, camera_matrix and distortion_coefficients with data"
+        reason = " ".join(str(error).split())[:120]
+        raise DatasetError(f"{path}: expected {expected}; {type(error).__name__}: {reason}") from None
+    return FolderCamera(intrinsics.camera(str(path), width, height), lens=lens)
+
+
+_COLMAP_LENSES: Mapping[str, Callable[[Sequence[float]], tuple[float, ...]]] = {
+    "SIMPLE_PINHOLE": lambda p: (p[0], p[0], p[1], p[2]),
+    "PINHOLE": lambda p: (p[0], p[1], p[2], p[3]),
+    "SIMPLE_RADIAL": lambda p: (p[0], p[0], p[1], p[2], p[3], 0.0, 0.0, 0.0),
+    "RADIAL": lambda p: (p[0], p[0], p[1], p[2], p[3], p[4], 0.0, 0.0),
+    "OPENCV": lambda p: tuple(p[:8]),
+    "FULL_OPENCV": lambda p: tuple(p[:12]),
+    "OPENCV_FISHEYE": lambda p: tuple(p[:8]),
+}
+"""Parameters of COLMAP's camera models as fx fy cx cy and OpenCV's distortion coefficients."""
+
+
+def read_colmap_camera(path: Path) -> FolderCamera:
+    """Return the first camera of COLMAP's cameras.txt, whose principal point counts from the image corner.
+
+    Raises DatasetError.
+    """
+    place, fields = next(iter(read_rows(path)), (str(path), []))
+    model = fields[1] if len(fields) > 1 else ""
+    if model not in _COLMAP_LENSES:
+        raise DatasetError(
+            f"{place}: expected ID MODEL WIDTH HEIGHT PARAMETERS with a model of "
+            f"{', '.join(_COLMAP_LENSES)}, got {model[:30]!r}"
+        )
+    numbers = parse_numbers(place, fields[2:], len(fields) - 2, "a camera's size and parameters")
+    try:
+        fx, fy, cx, cy, *distortion = _COLMAP_LENSES[model](numbers[2:])
+    except (IndexError, ValueError):
+        raise DatasetError(f"{place}: expected more parameters for {model}, got {len(numbers) - 2}") from None
+    lens = _lens(path, "equidistant" if model == "OPENCV_FISHEYE" else "plumb_bob", distortion)
+    camera = FileIntrinsics(fx, fy, cx - 0.5, cy - 0.5).camera(str(path), int(numbers[0]), int(numbers[1]))
+    return FolderCamera(camera, lens=lens)
+
+
+_LENS_MODELS = {
+    "plumb_bob": LensModel.RADTAN,
+    "rational_polynomial": LensModel.RADTAN,
+    "radtan": LensModel.RADTAN,
+    "equidistant": LensModel.FISHEYE,
+    "fisheye": LensModel.FISHEYE,
+}
+
+
+def _lens(path: Path, model: str, coefficients: Iterable[float]) -> Lens | None:
+    """Return the lens of these coefficients in OpenCV's order; None without distortion. Raises DatasetError."""
+    values = tuple(float(value) for value in coefficients)
+    if not any(values):
+        return None
+    if model not in _LENS_MODELS:
+        raise DatasetError(f"{path}: distortion_model: expected one of {', '.join(_LENS_MODELS)}, got {model!r}")
+    try:
+        return Lens(_LENS_MODELS[model], values)
+    except InvalidInputError as error:
+        raise DatasetError(f"{path}: {error}") from None

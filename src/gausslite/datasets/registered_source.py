@@ -16,8 +16,10 @@ from gausslite.datasets.intrinsics import FileIntrinsics
 from gausslite.datasets.source import Source
 from gausslite.domain.camera import Camera
 from gausslite.domain.frame import Frame
+from gausslite.domain.lens import Lens
 from gausslite.domain.pose import UpAxis, inverse
 from gausslite.domain.region import Region
+from gausslite.domain.trajectory import Trajectory
 from gausslite.errors import InvalidInputError
 
 _MAX_BASELINE_M = 1.0
@@ -130,6 +132,11 @@ class RegisteredSource:
         return self._camera
 
     @property
+    def lens(self) -> Lens | None:
+        """Lens of the wrapped source."""
+        return self._source.lens
+
+    @property
     def up_axis(self) -> UpAxis:
         """Up direction of the wrapped source."""
         return self._source.up_axis
@@ -161,6 +168,11 @@ class RegisteredSource:
     def indices(self) -> Sequence[int]:
         """Return the frame numbers of the wrapped source."""
         return self._source.indices()
+
+    def trajectory(self) -> Trajectory:
+        """Return the poses of the colour camera."""
+        recorded = self._source.trajectory()
+        return Trajectory(recorded.times_s, recorded.T_world_camera @ inverse(self._T_colour_depth))
 
     def regions(self) -> Mapping[str, Region]:
         """Return the regions of the wrapped source, which are in the world frame."""

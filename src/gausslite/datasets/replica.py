@@ -18,8 +18,10 @@ from gausslite.datasets.source import excluded_frames_note, require_frames, requ
 from gausslite.datasets.text_files import parse_numbers, read_rows
 from gausslite.domain.camera import Camera
 from gausslite.domain.frame import Frame
+from gausslite.domain.lens import Lens
 from gausslite.domain.pose import UpAxis, unit_up_axis
 from gausslite.domain.region import Region
+from gausslite.domain.trajectory import Trajectory
 from gausslite.errors import DatasetError
 
 _RATE_HZ = 30
@@ -43,8 +45,9 @@ class ReplicaSource:
         camera_path = find_in_or_above(folder, CAMERA_FILE)
         if camera_path is None:
             raise DatasetError(f"{folder}: the camera is unknown: expected {CAMERA_FILE} here or one folder above")
-        self._camera, per_metre = read_json_camera(camera_path)
-        self._units = DepthUnits(per_metre)
+        from_file = read_json_camera(camera_path)
+        self._camera, self._lens = from_file.camera, from_file.lens
+        self._units = DepthUnits(from_file.units_per_metre or 1.0)
         self._trajectory = folder / "traj.txt"
         self._pose_rows = read_rows(self._trajectory)
         last = max(self._colours)
@@ -72,6 +75,11 @@ class ReplicaSource:
         return self._camera
 
     @property
+    def lens(self) -> Lens | None:
+        """Lens of cam_params.json, else None."""
+        return self._lens
+
+    @property
     def up_axis(self) -> UpAxis:
         """The z axis, unless the caller gives another."""
         return self._up_axis
@@ -93,7 +101,7 @@ class ReplicaSource:
         """Return the frame at position i. Raises DatasetError, PoseError."""
         require_position(self.name, i, len(self))
         number = self._numbers[i]
-        T_world_camera = nearest_rigid(self._pose_rows[number][0], self._read_matrix(number))
+        T_world_camera = self._read_pose(number)
         depth = self._folder / "results" / f"depth{number:06d}.png"
         image = load_rgbd(self._colours[number], depth, self._camera, self._units, size)
         return Frame(number, number * 10**9 // _RATE_HZ, image.rgb, image.depth_m, image.camera, T_world_camera)
@@ -101,6 +109,11 @@ class ReplicaSource:
     def indices(self) -> Sequence[int]:
         """Return the numbers in the file names."""
         return list(self._numbers)
+
+    def trajectory(self) -> Trajectory:
+        """Return the poses at the frames' times."""
+        poses = [self._read_pose(number) for number in self._numbers]
+        return Trajectory(np.array(self._numbers) / _RATE_HZ, np.array(poses))
 
     def regions(self) -> Mapping[str, Region]:
         """Return the regions of roi_voxels.npz in the folder, small objects as balls; empty without the file."""
@@ -111,6 +124,9 @@ class ReplicaSource:
             return is_lost(self._read_matrix(number)[:3])
         except DatasetError:
             return False  # `frame` reports a damaged row if it is used
+
+    def _read_pose(self, number: int) -> Float64[ndarray, "4 4"]:
+        return nearest_rigid(self._pose_rows[number][0], self._read_matrix(number))
 
     def _read_matrix(self, number: int) -> Float64[ndarray, "4 4"]:
         place, fields = self._pose_rows[number]

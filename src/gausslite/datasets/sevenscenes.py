@@ -11,16 +11,18 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from gausslite.datasets.images import DepthUnits, load_rgbd, read_colour
-from gausslite.datasets.intrinsics import CAMERA_FILE, INTRINSICS_FILE, FileIntrinsics, read_folder_camera
+from gausslite.datasets.images import DepthUnits, first_readable_size, load_rgbd
+from gausslite.datasets.intrinsics import CAMERA_FILE, INTRINSICS_FILE, FileIntrinsics, FolderCamera, read_folder_camera
 from gausslite.datasets.poses import estimate_up, is_lost, nearest_rigid
 from gausslite.datasets.regions import regions_in_folder
 from gausslite.datasets.source import excluded_frames_note, require_frames, require_position
 from gausslite.datasets.text_files import parse_numbers, read_rows
 from gausslite.domain.camera import Camera
 from gausslite.domain.frame import Frame
+from gausslite.domain.lens import Lens
 from gausslite.domain.pose import UpAxis, unit_up_axis
 from gausslite.domain.region import Region
+from gausslite.domain.trajectory import Trajectory
 from gausslite.errors import DatasetError, PoseError
 
 _UNITS = DepthUnits(per_metre=1000.0, invalid=(0, 65535))
@@ -48,9 +50,9 @@ class SevenScenesSource:
         self._colours = dict(sorted(colours.items()))
         self._numbers = [number for number in self._colours if not self._is_lost(number)]
         require_frames(folder, len(self._numbers), "frames with a pose")
-        first = read_colour(self._colours[self._numbers[0]])
-        self._camera, per_metre = _camera(folder, first.shape[1], first.shape[0])
-        self._units = replace(_UNITS, per_metre=per_metre or _UNITS.per_metre)
+        from_folder = _camera(folder, *first_readable_size(self._colours[number] for number in self._numbers))
+        self._camera, self._lens = from_folder.camera, from_folder.lens
+        self._units = replace(_UNITS, per_metre=from_folder.units_per_metre or _UNITS.per_metre)
         self._up_axis = unit_up_axis(up_axis) if up_axis else self._estimate_up_axis()
 
     @staticmethod
@@ -65,8 +67,13 @@ class SevenScenesSource:
 
     @property
     def camera(self) -> Camera:
-        """Camera at the size of the first colour image."""
+        """Camera at the size of the first readable colour image."""
         return self._camera
+
+    @property
+    def lens(self) -> Lens | None:
+        """Lens of a camera file, else None."""
+        return self._lens
 
     @property
     def up_axis(self) -> UpAxis:
@@ -101,6 +108,11 @@ class SevenScenesSource:
     def indices(self) -> Sequence[int]:
         """Return the numbers in the file names."""
         return list(self._numbers)
+
+    def trajectory(self) -> Trajectory:
+        """Return the poses at the frames' times."""
+        poses = [_read_pose(self._pose_path(number)) for number in self._numbers]
+        return Trajectory(np.array(self._numbers) / _RATE_HZ, np.array(poses))
 
     def regions(self) -> Mapping[str, Region]:
         """Return the regions of roi_voxels.npz in the folder, small objects as balls; empty without the file."""
@@ -137,8 +149,8 @@ def _read_matrix(path: Path) -> Float64[ndarray, "4 4"]:
     return np.array([parse_numbers(place, fields, 4, "a row of a 4x4 pose") for place, fields in rows])
 
 
-def _camera(folder: Path, width_px: int, height_px: int) -> tuple[Camera, float | None]:
-    """Return the camera and, from cam_params.json, the depth units per metre."""
+def _camera(folder: Path, width_px: int, height_px: int) -> FolderCamera:
+    """Return the camera of a file in the folder, else the published one."""
     from_file = read_folder_camera(folder, width_px, height_px)
     if from_file is not None:
         return from_file
@@ -147,4 +159,4 @@ def _camera(folder: Path, width_px: int, height_px: int) -> tuple[Camera, float 
             f"{folder}: the camera of {width_px}x{height_px} images is unknown: "
             f"expected the file {INTRINSICS_FILE} or {CAMERA_FILE}"
         )
-    return _KINECT.camera(str(folder), width_px, height_px), None
+    return FolderCamera(_KINECT.camera(str(folder), width_px, height_px))

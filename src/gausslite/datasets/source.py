@@ -8,8 +8,10 @@ from typing import Protocol, runtime_checkable
 
 from gausslite.domain.camera import Camera
 from gausslite.domain.frame import Frame
+from gausslite.domain.lens import Lens
 from gausslite.domain.pose import UpAxis
 from gausslite.domain.region import Region
+from gausslite.domain.trajectory import Trajectory
 from gausslite.errors import DatasetError
 
 
@@ -25,6 +27,11 @@ class Source(Protocol):
     @property
     def camera(self) -> Camera:
         """Camera at the sequence's own resolution (pixel centres at +0.5)."""
+        ...
+
+    @property
+    def lens(self) -> Lens | None:
+        """Distortion of the colour images that the sequence's files state; None if they state none."""
         ...
 
     @property
@@ -53,6 +60,10 @@ class Source(Protocol):
 
     def indices(self) -> Sequence[int]:
         """Return the frame number of each position, ascending."""
+        ...
+
+    def trajectory(self) -> Trajectory:
+        """Return the pose at every position, at the frames' capture times. Raises DatasetError, PoseError."""
         ...
 
     def regions(self) -> Mapping[str, Region]:

@@ -11,16 +11,18 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from gausslite.datasets.images import DepthUnits, load_rgbd, read_colour
-from gausslite.datasets.intrinsics import CAMERA_FILE, INTRINSICS_FILE, FileIntrinsics, read_folder_camera
+from gausslite.datasets.images import DepthUnits, first_readable_size, load_rgbd
+from gausslite.datasets.intrinsics import CAMERA_FILE, INTRINSICS_FILE, FileIntrinsics, FolderCamera, read_folder_camera
 from gausslite.datasets.poses import is_lost, pose_from_quaternion, slerp
 from gausslite.datasets.regions import regions_in_folder
 from gausslite.datasets.source import excluded_frames_note, require_frames, require_position
 from gausslite.datasets.text_files import parse_numbers, read_rows
 from gausslite.domain.camera import Camera
 from gausslite.domain.frame import Frame
+from gausslite.domain.lens import Lens, LensModel
 from gausslite.domain.pose import UpAxis, unit_up_axis
 from gausslite.domain.region import Region
+from gausslite.domain.trajectory import Trajectory
 from gausslite.errors import DatasetError
 
 _UNITS = DepthUnits(per_metre=5000.0)
@@ -32,6 +34,12 @@ _INTRINSICS = {
     "2": FileIntrinsics(520.9, 521.0, 325.1, 249.7),
     "3": FileIntrinsics(535.4, 539.2, 320.1, 247.6),
 }
+
+_LENSES = {
+    "1": Lens(LensModel.RADTAN, (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
+    "2": Lens(LensModel.RADTAN, (0.2312, -0.7849, -0.0033, -0.0001, 0.9172)),
+}
+"""Published distortion of the colour cameras; the images of fr3 are undistorted."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,16 +57,15 @@ class TumSource:
     A colour image is associated with the nearest depth image within 20 ms, and with the pose interpolated (lerp and
     slerp) at its timestamp between two poses at most 0.1 s apart, or else with a pose within 10 ms. Colour images
     without both are excluded. Poses without a finite number count as missing. Frame numbers are the rows of rgb.txt
-    from 0. The lens distortion of fr1 and fr2 (a few pixels in the corners) is not corrected. Raises DatasetError,
-    PoseError.
+    from 0. Raises DatasetError, PoseError.
     """
 
     def __init__(self, folder: Path, up_axis: UpAxis | None = None) -> None:
         self._folder = folder
         self._matches, self._recorded = _associate(folder)
-        first = read_colour(self._matches[0].colour)
-        self._camera, per_metre = _camera(folder, first.shape[1], first.shape[0])
-        self._units = replace(_UNITS, per_metre=per_metre or _UNITS.per_metre)
+        from_folder = _camera(folder, *first_readable_size(match.colour for match in self._matches))
+        self._camera, self._lens = from_folder.camera, from_folder.lens
+        self._units = replace(_UNITS, per_metre=from_folder.units_per_metre or _UNITS.per_metre)
         self._up_axis = unit_up_axis(up_axis or (0.0, 0.0, 1.0))
 
     @staticmethod
@@ -75,6 +82,11 @@ class TumSource:
     def camera(self) -> Camera:
         """Camera of cam_params.json or camera-intrinsics.txt, else of fr1, fr2 or fr3 by the folder's name."""
         return self._camera
+
+    @property
+    def lens(self) -> Lens | None:
+        """Lens of a camera file, else the published one of fr1 and fr2."""
+        return self._lens
 
     @property
     def up_axis(self) -> UpAxis:
@@ -106,6 +118,11 @@ class TumSource:
     def indices(self) -> Sequence[int]:
         """Return the rows of rgb.txt, from 0."""
         return [match.number for match in self._matches]
+
+    def trajectory(self) -> Trajectory:
+        """Return the interpolated pose of every colour image."""
+        poses = np.array([match.T_world_camera for match in self._matches])
+        return Trajectory(np.array([match.time_s for match in self._matches]), poses)
 
     def regions(self) -> Mapping[str, Region]:
         """Return the regions of roi_voxels.npz in the folder, small objects as balls; empty without the file."""
@@ -177,8 +194,8 @@ class _Trajectory:
         return pose_from_quaternion(str(self._path), a[1:4] + share * (b[1:4] - a[1:4]), slerp(a[4:8], b[4:8], share))
 
 
-def _camera(folder: Path, width_px: int, height_px: int) -> tuple[Camera, float | None]:
-    """Return the camera and, from cam_params.json, the depth units per metre."""
+def _camera(folder: Path, width_px: int, height_px: int) -> FolderCamera:
+    """Return the camera of a file in the folder, else the published one of fr1, fr2 or fr3 by the folder's name."""
     from_file = read_folder_camera(folder, width_px, height_px)
     if from_file is not None:
         return from_file
@@ -188,4 +205,5 @@ def _camera(folder: Path, width_px: int, height_px: int) -> tuple[Camera, float 
             f"{folder}: the camera is unknown: expected a folder named after fr1, fr2 or fr3 (or freiburg1 ...), "
             f"or the file {INTRINSICS_FILE} or {CAMERA_FILE}"
         )
-    return _INTRINSICS[group.group(1)].camera(str(folder), width_px, height_px), None
+    camera = _INTRINSICS[group.group(1)].camera(str(folder), width_px, height_px)
+    return FolderCamera(camera, lens=_LENSES.get(group.group(1)))

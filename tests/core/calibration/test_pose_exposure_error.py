@@ -14,6 +14,7 @@ from gausslite.datasets.open import open_source
 from gausslite.datasets.source import Source
 from gausslite.domain.frame import Frame
 from gausslite.domain.region import Region
+from gausslite.domain.trajectory import Trajectory
 from gausslite.errors import DatasetError
 
 FRAMES = 40
@@ -27,6 +28,7 @@ class Recording:
         self._frames = [home.frame(i) for i in range(FRAMES)]
         self.name, self.camera, self.up_axis = "recording", home.camera, home.up_axis
         self.depth_registered, self.excluded_frames = True, ""
+        self.lens = None
         self.damaged: set[int] = set()
         rng = np.random.default_rng(0)
         self._T_true_recorded = [np.eye(4) for _ in range(FRAMES)]
@@ -49,6 +51,9 @@ class Recording:
 
     def indices(self) -> list[int]:
         return list(range(FRAMES))
+
+    def trajectory(self) -> Trajectory:
+        return Trajectory(np.arange(FRAMES) / 30, np.array([self.frame(i).T_world_camera for i in range(FRAMES)]))
 
     def regions(self) -> dict[str, Region]:
         return {}

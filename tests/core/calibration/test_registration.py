@@ -18,6 +18,7 @@ from gausslite.domain.camera import Camera
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import inverse
 from gausslite.domain.region import Region
+from gausslite.domain.trajectory import Trajectory
 from gausslite.errors import DatasetError
 
 DEPTH_CAMERA = Camera(300.0, 300.0, 162.0, 118.5, 320, 240)
@@ -76,6 +77,7 @@ class EnlargedSource:
         self.camera = k.resized(4 * k.width_px, 4 * k.height_px)
         self.name, self.up_axis, self.depth_registered = "enlarged", small.up_axis, False
         self.excluded_frames = ""
+        self.lens = None
 
     def __len__(self) -> int:
         return len(self._small)
@@ -90,6 +92,9 @@ class EnlargedSource:
 
     def indices(self) -> list[int]:
         return self._small.indices()
+
+    def trajectory(self) -> Trajectory:
+        return self._small.trajectory()
 
     def regions(self) -> dict[str, Region]:
         return {}
@@ -117,6 +122,7 @@ class UnregisteredSource:
         self.name, self.camera, self.up_axis = "unregistered", DEPTH_CAMERA, self._home.up_axis
         self.depth_registered = False
         self.excluded_frames = ""
+        self.lens = None
         self.damaged: int | None = None
 
     def __len__(self) -> int:
@@ -130,6 +136,9 @@ class UnregisteredSource:
 
     def indices(self) -> list[int]:
         return list(range(len(self)))
+
+    def trajectory(self) -> Trajectory:
+        return self._home.trajectory()
 
     def regions(self) -> dict[str, Region]:
         return {}

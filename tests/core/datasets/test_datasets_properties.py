@@ -16,6 +16,7 @@ from gausslite.domain.camera import Camera, back_project, project
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import require_rigid, rotation_angle_deg
 from gausslite.domain.region import Region
+from gausslite.domain.trajectory import Trajectory
 from gausslite.errors import DatasetError
 
 seeds = st.integers(0, 2**32 - 1)
@@ -29,6 +30,7 @@ class Numbered:
     up_axis = (0.0, 0.0, 1.0)
     depth_registered = True
     excluded_frames = ""
+    lens = None
 
     def __init__(self, numbers: list[int]) -> None:
         self._numbers = numbers
@@ -41,6 +43,9 @@ class Numbered:
 
     def frame(self, i: int, size: tuple[int, int] | None = None) -> Frame:
         raise DatasetError("numbered: expected no frame to be read")
+
+    def trajectory(self) -> Trajectory:
+        raise DatasetError("numbered: expected no pose to be read")
 
     def regions(self) -> Mapping[str, Region]:
         return {}

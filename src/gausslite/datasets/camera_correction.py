@@ -1,0 +1,178 @@
+"""Turn recorded images into those of an ideal camera: no lens distortion, all rows exposed at one time.
+
+Each output pixel looks up the recorded image once. The recorded row's exposure time depends on the row that is looked
+up, so the lookup is solved by fixed-point iteration. Colour is interpolated; depth takes the nearest pixel, since an
+interpolated depth lies on no surface.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from jaxtyping import Float32, Float64
+from numpy import ndarray
+
+from gausslite.domain.camera import Camera
+from gausslite.domain.frame import Frame
+from gausslite.domain.lens import Lens, LensModel
+from gausslite.domain.trajectory import Twist
+from gausslite.errors import InvalidInputError
+
+_MAX_READOUT_S, _MAX_TIME_OFFSET_S = 0.1, 1.0
+_FIXED_POINT_STEPS = 3
+_GRID_PX = 4
+_MIN_DEPTH_M = 0.05
+
+
+@dataclass(frozen=True, slots=True)
+class CameraCorrection:
+    """How recorded images differ from those of an ideal camera.
+
+    readout_s: time from the exposure of the first row to that of the last; negative if rows are read from the bottom.
+    time_offset_s: add it to an image's stamp to get the trajectory's time of its middle row. Raises InvalidInputError.
+    """
+
+    lens: Lens | None = None
+    readout_s: float = 0.0
+    time_offset_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name, value, limit in (
+            ("readout", self.readout_s, _MAX_READOUT_S),
+            ("time offset", self.time_offset_s, _MAX_TIME_OFFSET_S),
+        ):
+            if not abs(value) <= limit:
+                raise InvalidInputError(f"camera {name}: expected -{limit:g} to {limit:g} s, got {value}")
+
+    @classmethod
+    def parse(cls, text: str) -> CameraCorrection:
+        """Return the correction of "lens=MODEL:K1,...;readout=S;offset=S", each part optional.
+
+        Raises InvalidInputError.
+        """
+        parts: dict[str, str] = {}
+        for part in text.split(";"):
+            name, equals, value = part.strip().partition("=")
+            if not equals or name in parts or name not in ("lens", "readout", "offset"):
+                raise InvalidInputError(
+                    "camera correction: expected lens=MODEL:K1,...;readout=S;offset=S, each at most once, "
+                    f"got {text[:80]!r}"
+                )
+            parts[name] = value
+        try:
+            readout_s, time_offset_s = (float(parts.get(name, 0.0)) for name in ("readout", "offset"))
+        except ValueError:
+            raise InvalidInputError(f"camera correction: expected times in seconds, got {text[:80]!r}") from None
+        return cls(Lens.parse(parts["lens"]) if "lens" in parts else None, readout_s, time_offset_s)
+
+    def __str__(self) -> str:
+        """Return the text that `parse` reads."""
+        parts = [] if self.lens is None else [f"lens={self.lens}"]
+        parts += [f"readout={self.readout_s:g}"] if self.readout_s else []
+        parts += [f"offset={self.time_offset_s:g}"] if self.time_offset_s else []
+        return ";".join(parts) or "readout=0"
+
+    @property
+    def is_identity(self) -> bool:
+        """True if images are used as recorded."""
+        return self.readout_s == 0.0 and self.time_offset_s == 0.0 and (self.lens is None or self.lens.is_identity)
+
+
+def ideal_camera(camera: Camera, correction: CameraCorrection, angular_speed_rad_s: float) -> Camera:
+    """Return the pinhole camera of the corrected images, of the same size.
+
+    Its field of view is the largest in which every pixel has a recorded value while the camera turns at up to this
+    angular speed: lookups move by at most half a readout of motion.
+    """
+    if correction.lens is not None and not correction.lens.is_identity:
+        camera = _undistorted(camera, correction.lens)
+    swing_rad = 0.5 * abs(correction.readout_s) * angular_speed_rad_s
+    margin_px = math.ceil(swing_rad * max(camera.fx_px, camera.fy_px))
+    if margin_px == 0:
+        return camera
+    zoom_x = camera.width_px / max(camera.width_px - 2 * margin_px, 1)
+    zoom_y = camera.height_px / max(camera.height_px - 2 * margin_px, 1)
+    return replace(
+        camera,
+        fx_px=camera.fx_px * zoom_x,
+        fy_px=camera.fy_px * zoom_y,
+        cx_px=(camera.cx_px - margin_px) * zoom_x,
+        cy_px=(camera.cy_px - margin_px) * zoom_y,
+    )
+
+
+def correct_frame(frame: Frame, correction: CameraCorrection, ideal: Camera, twist: Twist) -> Frame:
+    """Return the frame as the ideal camera would have recorded it at the time of its middle row.
+
+    Pixels that the recorded image does not show repeat its border and have no depth. The twist is that of the camera
+    at the frame's stamp.
+    """
+    depth_m = np.zeros_like(frame.depth_m)
+    columns, rows = _lookup(frame.camera, correction, ideal, twist, depth_m)
+    if correction.readout_s != 0.0 and np.any(twist.linear_m_s):
+        # depth decides how far the translation moves a pixel; rotation alone is close enough to look it up
+        depth_m = cv2.remap(frame.depth_m, columns, rows, cv2.INTER_NEAREST)
+        columns, rows = _lookup(frame.camera, correction, ideal, twist, depth_m)
+    return replace(
+        frame,
+        rgb=cv2.remap(frame.rgb, columns, rows, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE),
+        depth_m=cv2.remap(frame.depth_m, columns, rows, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT),
+        camera=ideal,
+        T_world_camera=frame.T_world_camera @ twist.motion(correction.time_offset_s),
+    )
+
+
+def _undistorted(camera: Camera, lens: Lens) -> Camera:
+    """Return the pinhole camera whose whole image the distorted image covers."""
+    size = camera.width_px, camera.height_px
+    K = np.array([[camera.fx_px, 0, camera.cx_px - 0.5], [0, camera.fy_px, camera.cy_px - 0.5], [0, 0, 1]])
+    coefficients = np.array(lens.coefficients)
+    if lens.model is LensModel.FISHEYE:
+        K_ideal = cv2.fisheye.estimateNewCameraMatrixForUndistortRectify(K, coefficients, size, np.eye(3), balance=0.0)
+    else:
+        K_ideal, _ = cv2.getOptimalNewCameraMatrix(K, coefficients, size, 0.0)
+    fx_px, fy_px, cx_px, cy_px = (float(K_ideal[at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    return replace(camera, fx_px=fx_px, fy_px=fy_px, cx_px=cx_px + 0.5, cy_px=cy_px + 0.5)
+
+
+def _lookup(
+    recorded: Camera, correction: CameraCorrection, ideal: Camera, twist: Twist, depth_m: Float32[ndarray, "h w"]
+) -> tuple[Float32[ndarray, "h w"], Float32[ndarray, "h w"]]:
+    """Return column and row of the recorded image for every ideal pixel, counted from pixel centres at integers.
+
+    A point p of the camera at the middle row's time has moved to p - dt (w × p + v) after dt. The lookup is solved on
+    a grid of every _GRID_PX-th pixel and interpolated in between: it is smooth, and this takes a fraction of the time.
+    """
+    height, width = ideal.height_px, ideal.width_px
+    grid_rows, grid_columns = np.arange(0, height + _GRID_PX, _GRID_PX), np.arange(0, width + _GRID_PX, _GRID_PX)
+    x = ((grid_columns + 0.5 - ideal.cx_px) / ideal.fx_px)[None, :]
+    y = ((grid_rows + 0.5 - ideal.cy_px) / ideal.fy_px)[:, None]
+    z_m = depth_m[np.minimum(grid_rows, height - 1)[:, None], np.minimum(grid_columns, width - 1)[None, :]]
+    inverse_z = np.where(z_m > 0, 1.0 / np.maximum(z_m, _MIN_DEPTH_M), 0.0)
+    (wx, wy, wz), (vx, vy, vz) = twist.angular_rad_s, twist.linear_m_s
+    dx, dy = wy - wz * y + vx * inverse_z, wz * x - wx + vy * inverse_z
+    dz = wx * y - wy * x + vz * inverse_z
+    dt_s = np.zeros_like(inverse_z, np.float64)
+    for _ in range(_FIXED_POINT_STEPS if correction.readout_s != 0.0 else 1):
+        scale = 1.0 / (1.0 - dt_s * dz)
+        columns, rows = _pixels((x - dt_s * dx) * scale, (y - dt_s * dy) * scale, recorded, correction.lens)
+        dt_s = correction.readout_s * (np.clip((rows + 0.5) / height, 0.0, 1.0) - 0.5)
+    return _interpolated(columns, width, height), _interpolated(rows, width, height)
+
+
+def _pixels(x: ndarray, y: ndarray, camera: Camera, lens: Lens | None) -> tuple[ndarray, ndarray]:
+    if lens is not None:
+        x, y = lens.distort(x, y)
+    return camera.fx_px * x + (camera.cx_px - 0.5), camera.fy_px * y + (camera.cy_px - 0.5)
+
+
+def _interpolated(grid: Float64[ndarray, "m n"], width: int, height: int) -> Float32[ndarray, "h w"]:
+    """Return a value for every pixel, bilinear between the grid's pixels."""
+    rows = np.arange(height, dtype=np.float32) / np.float32(_GRID_PX)
+    columns = np.arange(width, dtype=np.float32) / np.float32(_GRID_PX)
+    at_columns, at_rows = np.meshgrid(columns, rows)
+    values: Float32[ndarray, "h w"] = cv2.remap(grid.astype(np.float32), at_columns, at_rows, cv2.INTER_LINEAR)
+    return values

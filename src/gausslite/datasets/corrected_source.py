@@ -1,0 +1,88 @@
+"""A sequence whose images are corrected for lens distortion, rolling shutter and time offset when they are read."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from gausslite.datasets.camera_correction import CameraCorrection, correct_frame, ideal_camera
+from gausslite.datasets.images import RgbdImage, resize_rgbd
+from gausslite.datasets.source import Source
+from gausslite.domain.camera import Camera
+from gausslite.domain.frame import Frame
+from gausslite.domain.lens import Lens
+from gausslite.domain.pose import UpAxis
+from gausslite.domain.region import Region
+from gausslite.domain.trajectory import Trajectory
+
+_SPEED_QUANTILE = 0.9
+"""Frames that turn faster than this share of all frames repeat the image's border in a few pixels."""
+
+
+class CorrectedSource:
+    """A source as an ideal camera would have recorded it: pinhole, all rows exposed at once, stamps without offset.
+
+    Colour and depth are corrected alike, so depth must be registered to colour. A source without correction returns
+    its frames unchanged. Raises InvalidInputError.
+    """
+
+    def __init__(self, source: Source, correction: CameraCorrection) -> None:
+        self._source, self._correction = source, correction
+        self._trajectory = source.trajectory()
+        speeds_rad_s = self._trajectory.angular_speeds_rad_s() if correction.readout_s != 0.0 else np.zeros(1)
+        self._camera = ideal_camera(source.camera, correction, float(np.quantile(speeds_rad_s, _SPEED_QUANTILE)))
+
+    @property
+    def name(self) -> str:
+        """The wrapped source's name."""
+        return self._source.name
+
+    @property
+    def camera(self) -> Camera:
+        """The ideal camera, of the recorded images' size."""
+        return self._camera
+
+    @property
+    def lens(self) -> Lens | None:
+        """None: frames are undistorted."""
+        return None
+
+    @property
+    def up_axis(self) -> UpAxis:
+        """The wrapped source's up axis."""
+        return self._source.up_axis
+
+    @property
+    def depth_registered(self) -> bool:
+        """Same as the wrapped source."""
+        return self._source.depth_registered
+
+    @property
+    def excluded_frames(self) -> str:
+        """The wrapped source's note."""
+        return self._source.excluded_frames
+
+    def __len__(self) -> int:
+        return len(self._source)
+
+    def frame(self, i: int, size: tuple[int, int] | None = None) -> Frame:
+        """Return the corrected frame at position i. Raises DatasetError, PoseError."""
+        # at full size: a resized image has lost the pixels that the lookup needs
+        recorded = self._source.frame(i)
+        frame = correct_frame(recorded, self._correction, self._camera, self._trajectory.twist(i))
+        image = resize_rgbd(RgbdImage(frame.rgb, frame.depth_m, frame.camera), size)
+        return replace(frame, rgb=image.rgb, depth_m=image.depth_m, camera=image.camera)
+
+    def indices(self) -> Sequence[int]:
+        """The wrapped source's frame numbers."""
+        return self._source.indices()
+
+    def trajectory(self) -> Trajectory:
+        """The wrapped source's trajectory, as recorded."""
+        return self._trajectory
+
+    def regions(self) -> Mapping[str, Region]:
+        """The wrapped source's regions; they lie in the world frame."""
+        return self._source.regions()

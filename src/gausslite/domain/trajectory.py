@@ -1,0 +1,61 @@
+"""A camera's poses over time, and its velocity at a time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Float64
+from numpy import ndarray
+
+from gausslite.domain.arrays import require_array
+from gausslite.domain.pose import inverse
+from gausslite.errors import InvalidInputError
+
+_MIN_BASELINE_S = 1e-6
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Twist:
+    """A camera's velocity in its own axes: T_world_camera(t + dt) ≈ T_world_camera(t) · exp(dt · twist)."""
+
+    linear_m_s: Float64[ndarray, "3"]
+    angular_rad_s: Float64[ndarray, "3"]
+
+    def motion(self, seconds: float) -> Float64[ndarray, "4 4"]:
+        """Return T_before_after of this motion for a time, to first order in the translation."""
+        T = np.eye(4)
+        T[:3, :3] = cv2.Rodrigues(self.angular_rad_s * seconds)[0]
+        T[:3, 3] = self.linear_m_s * seconds
+        return T
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Trajectory:
+    """Poses at ascending times. Raises ShapeError, InvalidInputError."""
+
+    times_s: Float64[ndarray, " n"]
+    T_world_camera: Float64[ndarray, "n 4 4"]
+
+    def __post_init__(self) -> None:
+        require_array("trajectory T_world_camera", self.T_world_camera, (len(self.times_s), 4, 4), np.float64)
+        if not (np.isfinite(self.times_s).all() and (np.diff(self.times_s) >= 0).all()):
+            raise InvalidInputError("trajectory times_s: expected finite, ascending times")
+
+    def twist(self, i: int) -> Twist:
+        """Return the velocity at pose i, by central difference; 0 if the trajectory has a single time."""
+        before, after = max(i - 1, 0), min(i + 1, len(self.times_s) - 1)
+        seconds = float(self.times_s[after] - self.times_s[before])
+        if seconds < _MIN_BASELINE_S:
+            return Twist(np.zeros(3), np.zeros(3))
+        T_camera_world = inverse(self.T_world_camera[i])
+        step_m = self.T_world_camera[after][:3, 3] - self.T_world_camera[before][:3, 3]
+        R_before_after = self.T_world_camera[before][:3, :3].T @ self.T_world_camera[after][:3, :3]
+        R_camera_before = T_camera_world[:3, :3] @ self.T_world_camera[before][:3, :3]
+        turn_rad = R_camera_before @ cv2.Rodrigues(R_before_after)[0].ravel()
+        return Twist(T_camera_world[:3, :3] @ step_m / seconds, turn_rad / seconds)
+
+    def angular_speeds_rad_s(self) -> Float64[ndarray, " n"]:
+        """Return the magnitude of the angular velocity at every pose."""
+        return np.array([np.linalg.norm(self.twist(i).angular_rad_s) for i in range(len(self.times_s))])

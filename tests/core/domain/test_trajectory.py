@@ -1,0 +1,32 @@
+"""The velocity of a trajectory in the camera's own axes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from gausslite.domain.trajectory import Trajectory, Twist
+from gausslite.errors import InvalidInputError
+
+
+def test_twist_of_a_constant_motion_is_found_at_every_pose() -> None:
+    truth = Twist(np.array([0.3, -0.1, 0.2]), np.array([0.4, 0.8, -0.2]))
+    poses, step = [np.eye(4)], truth.motion(0.001)
+    for _ in range(9):
+        poses.append(poses[-1] @ step)
+    trajectory = Trajectory(np.arange(10) * 0.001, np.array(poses))
+    for i in range(10):
+        np.testing.assert_allclose(trajectory.twist(i).angular_rad_s, truth.angular_rad_s, atol=1e-6)
+        np.testing.assert_allclose(trajectory.twist(i).linear_m_s, truth.linear_m_s, atol=1e-3)
+    np.testing.assert_allclose(trajectory.angular_speeds_rad_s(), np.linalg.norm(truth.angular_rad_s), atol=1e-6)
+
+
+def test_a_single_pose_has_no_velocity() -> None:
+    twist = Trajectory(np.zeros(1), np.eye(4)[None]).twist(0)
+    assert not twist.angular_rad_s.any()
+    assert not twist.linear_m_s.any()
+
+
+def test_times_that_decrease_are_rejected() -> None:
+    with pytest.raises(InvalidInputError, match="ascending"):
+        Trajectory(np.array([1.0, 0.0]), np.stack([np.eye(4)] * 2))
