@@ -14,10 +14,13 @@ import numpy as np
 from jaxtyping import Float32, Float64
 from numpy import ndarray
 
+from gausslite.calibration.camera_timing import estimate_camera_timing
 from gausslite.calibration.pose_exposure_error import estimate_pose_exposure_prior
 from gausslite.calibration.pose_exposure_prior import PoseExposurePrior
 from gausslite.calibration.registration import find_registration
 from gausslite.codec.ply import read_ply, write_ply
+from gausslite.datasets.camera_correction import CameraCorrection
+from gausslite.datasets.corrected_source import CorrectedSource
 from gausslite.datasets.open import is_simulated, open_source
 from gausslite.datasets.registered_source import DepthRegistration, RegisteredSource
 from gausslite.datasets.source import Source
@@ -105,6 +108,10 @@ def open_calibrated(spec: str | Path, *, up_axis: UpAxis | None = None) -> Calib
             source = RegisteredSource(source, registration)
     if is_simulated(str(spec)):
         return CalibratedSequence(source, PoseExposurePrior(), tuple(notes))
+    if source.depth_registered:
+        correction, note = estimate_camera_timing(source, CameraCorrection(source.lens))
+        notes.append(f"camera correction {'none' if correction.is_identity else correction}: {note}")
+        source = source if correction.is_identity else CorrectedSource(source, correction)
     prior, note = estimate_pose_exposure_prior(source)
     notes.append(f"pose prior {'none' if prior.is_exact else prior}: {note}")
     return CalibratedSequence(source, prior, tuple(notes))
@@ -202,9 +209,13 @@ def map_sequence(
     return MapResult(mapper.gaussians(), result.summary(), (*skipped, *mapper.notes))
 
 
-def save_ply(path: str | Path, gaussians: Gaussians) -> None:
-    """Write a map as a 3DGS PLY file with the extra columns active, kappa and target. Raises StorageError."""
-    write_ply(Path(path), gaussians)
+def save_ply(path: str | Path, gaussians: Gaussians, *, world_frame: str = "") -> None:
+    """Write a map as a 3DGS PLY file with the extra columns active, kappa and target.
+
+    world_frame: name of the poses' frame, stored as a comment; `gausslite fuse` refuses maps of different frames.
+    Raises StorageError, InvalidInputError.
+    """
+    write_ply(Path(path), gaussians, world_frame)
 
 
 def load_ply(path: str | Path) -> Gaussians:

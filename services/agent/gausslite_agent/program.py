@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 
+from gausslite.datasets.corrected_source import CorrectedSource
 from gausslite.datasets.open import is_simulated, open_source
 from gausslite.domain.pose import unit_up_axis
 from gausslite.mission.build import EstimatorFactory
@@ -103,6 +104,9 @@ async def _serve(settings: AgentSettings) -> None:
 def open_stream(settings: SourceSettings) -> FrameStream:
     """Open the sequence that replaces the camera. Raises DatasetError, PoseError, InvalidInputError."""
     source = open_source(settings.spec, settings.up_axis, settings.depth_registration)
+    correction = settings.camera_correction
+    if correction is not None and not correction.is_identity:
+        source = CorrectedSource(source, correction)
     return FrameStream.select(source, settings)
 
 

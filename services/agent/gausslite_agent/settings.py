@@ -19,7 +19,7 @@ from gausslite.config.mapping_options import (
     perception_settings,
 )
 from gausslite.config.numbers import Number
-from gausslite.config.source_options import add_frames
+from gausslite.config.source_options import add_camera_correction, add_frames
 from gausslite.config.switches import add_switch, set_dependent_default
 from gausslite.config.tls_options import add_tls, read_server_tls
 from gausslite.domain.names import require_name
@@ -102,7 +102,13 @@ def parse_arguments(arguments: Sequence[str] | None = None) -> AgentSettings:
     source = None
     if options.source is not None:
         source = SourceSettings(
-            options.source, options.frames, options.size, options.up, options.test_every, options.register_depth
+            options.source,
+            options.frames,
+            options.size,
+            options.up,
+            options.test_every,
+            options.register_depth,
+            options.camera_correction,
         )
     link = LinkSettings(
         options.parser,
@@ -169,11 +175,12 @@ def _parser() -> argparse.ArgumentParser:
     add("--listen", default="127.0.0.1:50053", metavar="ADDRESS", help="HOST:PORT or unix:PATH (default: %(default)s)")
     add("--agent-id", default="agent", metavar="NAME", help="unique name of this agent (default: %(default)s)")
     add("--task", metavar="TEXT", help="the robot's task (default: wait for the AssignTask call)")
-    add("--out", metavar="DIR", type=Path, help="folder for map.ply and report.json at the end of the mission")
+    add("--out", metavar="DIR", type=Path, help="folder for map.ply and report.json; replaces earlier ones at the end")
     add("--state", metavar="FILE", type=Path, help="resume the mission saved in this file, and save it here at the end")
     add_switch(parser, "--exit-when-done", "exit after the mission (default: continue to serve)")
     _add_replay(parser)
     add_frames(parser)
+    add_camera_correction(parser)
     add_detector(parser)
     _add_connections(parser)
     add_voxel_size(parser)

@@ -10,6 +10,7 @@ from pathlib import Path
 from types import FrameType
 
 from gausslite.cli.demo.report import agent_reports, demo_report, report_tables
+from gausslite.cli.demo.results_folder import remove_results, require_no_demo
 from gausslite.cli.demo.scenario import HOME_SIZE, Scenario, recorded_scenario, simulated_scenario
 from gausslite.cli.demo.services import DemoPlan, collect_maps, running_services, watch_missions
 from gausslite.codec.ply import read_ply
@@ -23,16 +24,19 @@ from gausslite.config.mapping_options import (
     perception_options,
     perception_settings,
 )
-from gausslite.config.source_options import add_register_depth
+from gausslite.config.source_options import add_camera_correction, add_register_depth
+from gausslite.config.switches import add_switch
 from gausslite.config.toml_text import OptionValue
 from gausslite.config.values import AUTO, read_names
+from gausslite.datasets.sequence_name import default_world_frame
+from gausslite.domain.names import require_name
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.errors import InvalidInputError
 from gausslite.evaluation.pictures import write_png
 from gausslite.evaluation.team import TeamScores, score_team
 from gausslite.fusion.limits import MAX_REFINE_ITERATIONS
 from gausslite.mission.build import open_models
-from gausslite.mission.results import prepare_folder, write_json
+from gausslite.mission.results import prepare_folder, require_writable, write_json
 from gausslite.render.choose import choose_rasterizer
 
 
@@ -53,12 +57,19 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     add("--size", metavar="WxH", help=f"image size (default: the recorded size; {HOME_SIZE} in the home)")
     add_register_depth(parser, allow_auto=True, default_text=AUTO)
+    add_camera_correction(parser, allow_auto=True, default_text=AUTO)
     add_voxel_size(parser)
     add("--refine-iterations", metavar="N", type=int, default=500, help="joint refinement of the fused map; 0: none")
     add_detector(parser)
     add_policy(parser, allow_auto=True)
     add_budget(parser)
     add("--out", metavar="DIR", type=Path, required=True, help="folder for report.json, maps and pictures")
+    add_switch(parser, "--overwrite", "replace the results of an earlier demo in --out")
+    add(
+        "--world-frame",
+        metavar="NAME",
+        help="name of the poses' frame in all maps (default: the sequence folder's name or the simulated home)",
+    )
     parser.set_defaults(run=run)
 
 
@@ -67,7 +78,10 @@ def run(options: argparse.Namespace) -> int:
     for number in (signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, _raise_interrupt)
     _require_valid(options)
-    prepare_folder(options.out)
+    require_name("--world-frame", options.world_frame or "")
+    if not options.overwrite:
+        require_no_demo(options.out)
+    require_writable(options.out)
     scenario = simulated_scenario(options) if options.source is None else recorded_scenario(options)
     plan = DemoPlan(
         scenario.agents,
@@ -76,6 +90,7 @@ def run(options: argparse.Namespace) -> int:
         options.refine_iterations,
         options.seed,
     )
+    remove_results(options.out)
     with running_services(plan, options.out.absolute()) as services:
         watch_missions(services)
         maps = collect_maps(services, options.out)
@@ -105,15 +120,23 @@ def _shared_agent_options(options: argparse.Namespace, scenario: Scenario) -> di
     threads = 1 if settings.threads is None else settings.threads
     settings = replace(settings, threads=threads, pose_prior=scenario.pose_prior)
     width, height = scenario.size
-    registration = scenario.depth_registration
+    registration, correction = scenario.depth_registration, scenario.camera_correction
     return {
         "size": f"{width}x{height}",
         "voxel-size": options.voxel_size,
+        "world-frame": _world_frame(options, scenario),
         "test-every": scenario.test_every,
         "register-depth": None if registration is None else str(registration),
+        "camera-correction": None if correction is None else str(correction),
         **mission_options(settings),
         **perception_options(perception_settings(options)),
     }
+
+
+def _world_frame(options: argparse.Namespace, scenario: Scenario) -> str:
+    if options.world_frame is not None:
+        return str(options.world_frame)
+    return default_world_frame(scenario.agents[0].source, scenario.held_out[0].source)
 
 
 def _score(options: argparse.Namespace, scenario: Scenario, maps: Mapping[str, Path]) -> TeamScores:

@@ -3,25 +3,37 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
-from gausslite.cli.progress import progress_bar
-from gausslite.cli.source_options import add_regions, add_source, open_with_warnings, selected_regions
+from gausslite.cli.progress import print_above_bar, progress_bar
+from gausslite.cli.source_options import (
+    add_regions,
+    add_source,
+    correct_with_warnings,
+    open_with_warnings,
+    selected_regions,
+)
 from gausslite.codec.ply import read_ply
-from gausslite.config.values import AUTO, NONE, read_depth_registration
+from gausslite.config.mapping_options import add_threads
+from gausslite.config.source_options import add_camera_correction
+from gausslite.config.switches import add_switch
+from gausslite.config.values import AUTO, NONE, read_camera_correction, read_depth_registration
+from gausslite.datasets.camera_correction import CameraCorrection
 from gausslite.datasets.held_out import HeldOutSplit
 from gausslite.datasets.registered_source import DepthRegistration
 from gausslite.datasets.selection import frame_size, select_frames
 from gausslite.datasets.source import Source
+from gausslite.domain.frame import Frame
 from gausslite.domain.region import Region
-from gausslite.errors import DatasetError
+from gausslite.errors import DatasetError, PoseError
 from gausslite.evaluation.compare import MapScores, ViewScore, average, score_view
 from gausslite.evaluation.fitted import render_fitted
 from gausslite.evaluation.pictures import comparison_sheet, write_png
 from gausslite.evaluation.views import MIN_ROI_PIXELS, HeldOutView, MapViewer
+from gausslite.messages import print_message
+from gausslite.mission.frame_stream import CorruptFrames
 from gausslite.mission.results import as_text, prepare_folder, read_report
 from gausslite.render.choose import choose_rasterizer
 
@@ -34,16 +46,23 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Add the options of `gausslite eval`."""
     parser.add_argument("map", metavar="MAP", type=Path, help="a PLY file")
     add_source(parser, default_text=_REGISTRATION_DEFAULT)
+    add_camera_correction(parser, allow_auto=True, default_text=_REGISTRATION_DEFAULT)
     add_regions(parser)
-    parser.add_argument("--test-every", metavar="N", type=int, help="score only every Nth selected frame")
+    add_switch(parser, "--strict", "end at a frame that cannot be read (default: skip it)")
+    parser.add_argument(
+        "--test-every",
+        metavar="N",
+        type=int,
+        help="score only every N-th selected frame: those that `map --test-every N` holds out",
+    )
     parser.add_argument(
         "--fit-views",
         action=argparse.BooleanOptionalAction,
         help=f"fit pose and exposure of each view before scoring, for real cameras (default: {_FIT_VIEWS_DEFAULT})",
     )
     parser.add_argument("--pictures", metavar="DIR", type=Path, help="write side-by-side pictures of a few views")
-    parser.add_argument("--threads", metavar="N", type=int, help="threads (default: all that the processor has)")
-    parser.add_argument("--json", action="store_true", help="print JSON for scripts")
+    add_threads(parser)
+    add_switch(parser, "--json", "print JSON for scripts")
     parser.set_defaults(run=run)
 
 
@@ -52,20 +71,25 @@ def run(options: argparse.Namespace) -> int:
     rasterizer = choose_rasterizer(threads=options.threads)
     gaussians = read_ply(options.map)
     conditions = _Conditions.of(options)
-    source, _ = open_with_warnings(options.source, options.up, conditions.depth_registration, AUTO)
+    registered, _ = open_with_warnings(options.source, options.up, conditions.depth_registration, AUTO)
+    source, _ = correct_with_warnings(options.source, registered, conditions.camera_correction, AUTO)
     positions = _selected_positions(options, source)
     regions = selected_regions(options, source)
     if options.pictures is not None:
         prepare_folder(options.pictures)
-    scores = _score_views(options, MapViewer(gaussians, rasterizer), source, positions, regions, conditions.fit_views)
+    frames = _SelectedFrames(source, positions, frame_size(options.size, source), options.strict, options.json)
+    scores = _score_views(options, MapViewer(gaussians, rasterizer), frames, regions, conditions.fit_views)
     if not scores:
-        raise DatasetError(f"{options.source}: expected at least one frame with depth, got none")
+        raise frames.corrupt.first_error or DatasetError(
+            f"{options.source}: expected at least one frame with depth, got none"
+        )
     result = average(scores)
     if options.json:
-        print(as_text({**asdict(result), "fitted": conditions.fit_views}))
+        print(as_text({**asdict(result), "fitted": conditions.fit_views, "frames_corrupt": frames.corrupt.count}))
     else:
         fitted = ", pose and exposure of each view fitted" if conditions.fit_views else ""
-        print(_as_line(result, bool(regions)) + fitted)
+        skipped = f" (skipped: {frames.corrupt.count} corrupt)" if frames.corrupt.count else ""
+        print(_as_line(result, bool(regions)) + fitted + skipped)
     return 0
 
 
@@ -74,22 +98,50 @@ class _Conditions:
     """Registration of the source, and whether views are fitted before they are scored."""
 
     depth_registration: DepthRegistration | str | None
+    camera_correction: CameraCorrection | str | None
     fit_views: bool
 
     @classmethod
     def of(cls, options: argparse.Namespace) -> _Conditions:
         """Return the conditions of the options; unset ones are those of the report next to the map."""
         report, from_report = read_report(options.map.parent), []
-        registration, fit_views = options.register_depth, options.fit_views
+        registration, correction = options.register_depth, options.camera_correction
+        fit_views = options.fit_views
         if registration is None and "colour_camera" in report:
             registration = read_depth_registration(str(report["colour_camera"] or NONE))
             from_report += [f"--register-depth {registration}"] if registration != NONE else []
+        if correction is None and "camera_correction" in report:
+            correction = read_camera_correction(str(report["camera_correction"] or NONE))
+            from_report += [] if correction.is_identity else [f"--camera-correction '{correction}'"]
         if fit_views is None:
             fit_views = report.get("view_error") is not None
             from_report += ["--fit-views"] if fit_views else []
         if from_report:
-            print(f"from the report next to {options.map.name}: {' '.join(from_report)}", file=sys.stderr)
-        return cls(registration, fit_views)
+            print_message(f"from the report next to {options.map.name}: {' '.join(from_report)}")
+        return cls(registration, correction, fit_views)
+
+
+@dataclass(frozen=True, slots=True)
+class _SelectedFrames:
+    """The selected frames with their positions, read on request; corrupt ones are skipped and counted unless strict."""
+
+    source: Source
+    positions: Sequence[int]
+    size: tuple[int, int]
+    strict: bool
+    quiet: bool
+    corrupt: CorruptFrames = field(default_factory=lambda: CorruptFrames(print_above_bar))
+
+    def __iter__(self) -> Iterator[tuple[int, Frame]]:
+        for position in _with_progress(self.positions, self.quiet):
+            try:
+                frame = self.source.frame(position, self.size)
+            except (DatasetError, PoseError) as error:
+                if self.strict:
+                    raise
+                self.corrupt(self.source.indices()[position], error)
+            else:
+                yield position, frame
 
 
 def _selected_positions(options: argparse.Namespace, source: Source) -> Sequence[int]:
@@ -105,17 +157,15 @@ def _selected_positions(options: argparse.Namespace, source: Source) -> Sequence
 def _score_views(
     options: argparse.Namespace,
     viewer: MapViewer,
-    source: Source,
-    positions: Sequence[int],
+    frames: _SelectedFrames,
     regions: Sequence[Region],
     fit_views: bool,
 ) -> list[ViewScore]:
     """Return the scores of all views with depth; write pictures of some of them."""
-    size = frame_size(options.size, source)
-    pictured = set(positions[:: max(1, len(positions) // _PICTURES)])
+    pictured = set(frames.positions[:: max(1, len(frames.positions) // _PICTURES)])
     scores = []
-    for position in _with_progress(positions, options.json):
-        view = HeldOutView.of(source.frame(position, size), regions)
+    for position, frame in frames:
+        view = HeldOutView.of(frame, regions)
         if not view.frame.has_depth:
             continue
         rendered = render_fitted(viewer, view.frame) if fit_views else viewer.render_frame(view.frame)

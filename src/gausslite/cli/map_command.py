@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 
-from gausslite.cli.map_inputs import MapInputs, has_regions, region_estimator
+from gausslite.cli.map_inputs import FRAMES_KEY, MapInputs, default_policy, has_regions, region_estimator
 from gausslite.cli.progress import MappingBar, print_above_bar
 from gausslite.cli.source_options import add_regions, add_source, report_region_file
-from gausslite.config.mapping_options import add_budget, add_detector, add_policy
-from gausslite.config.values import AUTO
+from gausslite.config.mapping_options import HOLD_OUT_HELP, add_budget, add_detector, add_policy
+from gausslite.config.source_options import add_camera_correction
+from gausslite.config.switches import add_switch
+from gausslite.config.values import AUTO, NONE
 from gausslite.domain.gaussians import Gaussians
+from gausslite.domain.names import require_name
+from gausslite.domain.state import State, encode_text
 from gausslite.errors import DatasetError
 from gausslite.evaluation.pictures import write_png
 from gausslite.evaluation.preview import render_preview
 from gausslite.evaluation.views import MapViewer
+from gausslite.messages import print_message
 from gausslite.mission.build import EstimatorFactory, build_mapper
 from gausslite.mission.checkpoint import SavedRun, save_run
 from gausslite.mission.frame_scheduler import FrameScheduler
@@ -23,9 +27,10 @@ from gausslite.mission.frame_stream import CorruptFrames
 from gausslite.mission.results import (
     PREVIEW,
     peak_rss_mib,
-    prepare_additional_file,
     prepare_folder,
+    require_additional_file,
     require_no_map,
+    require_writable,
     write_results,
 )
 from gausslite.mission.runner import MissionResult, MissionRunner
@@ -36,12 +41,16 @@ from gausslite.perception.relevance_estimator import RelevanceEstimator
 from gausslite.render.choose import choose_rasterizer
 
 _NOT_RESUMED = -1
+_WORLD_FRAME_HELP = (
+    "name of the poses' frame, for `fuse`, which accepts only maps of one frame (default: the sequence folder's name "
+    "or the simulated home)"
+)
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the options of `gausslite map`."""
     add_source(parser, default_text=AUTO)
-    parser.add_argument("--strict", action="store_true", help="end at a frame that cannot be read (default: skip it)")
+    add_switch(parser, "--strict", "end at a frame that cannot be read (default: skip it)")
     parser.add_argument("--task", metavar="TEXT", help='the robot\'s task, such as "Pick up the mug on the table"')
     parser.add_argument(
         "--task-at",
@@ -50,14 +59,17 @@ def configure(parser: argparse.ArgumentParser) -> None:
         default=[],
         help="switch to another task at this frame number; may be repeated",
     )
+    add_camera_correction(parser, allow_auto=True, default_text=f"{AUTO}, {NONE} for simulated homes")
     add_detector(parser)
     add_regions(parser)
-    add_policy(parser, allow_auto=True)
+    add_policy(parser, allow_auto=True, default_policy=default_policy)
     add_budget(parser)
-    parser.add_argument("--test-every", metavar="N", type=int, help="keep every N-th frame from mapping, for `eval`")
-    add = parser.add_argument_group("output").add_argument
+    parser.add_argument("--test-every", metavar="N", type=int, help=HOLD_OUT_HELP)
+    group = parser.add_argument_group("output")
+    add = group.add_argument
     add("--out", metavar="DIR", type=Path, required=True, help="folder for map.ply, report.json and preview.png")
-    add("--overwrite", action="store_true", help="replace a map in --out (--resume does so without this option)")
+    add_switch(group, "--overwrite", "replace a map in --out (--resume does so without this option)")
+    add("--world-frame", metavar="NAME", help=_WORLD_FRAME_HELP)
     add("--save-state", metavar="FILE", type=Path, help="save the whole run here at its end, for --resume")
     add("--resume", metavar="FILE", type=Path, help="continue a saved run with the frames after its last one")
     parser.set_defaults(run=run)
@@ -65,15 +77,16 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Map the sequence and write the results. Errors in the options are raised before the work starts."""
+    require_name("--world-frame", options.world_frame or "")
     if options.resume is None and not options.overwrite:
         require_no_map(options.out)
     inputs = MapInputs.of(options)
     saved = None if options.resume is None else SavedRun.read(options.resume)
     if saved is not None:
         inputs = inputs.resumed(options, saved)
-    prepare_folder(options.out)
+    require_writable(options.out)
     if options.save_state is not None:
-        prepare_additional_file(options.save_state, options.out)
+        require_additional_file(options.save_state, options.out)
     resumed_after = _NOT_RESUMED if saved is None else saved.last_index
     estimators = EstimatorFactory(inputs.perception, lambda: SceneInfo.of(inputs.stream.source))
     estimator = _first_estimator(options, inputs, estimators, resumed_after)
@@ -86,11 +99,10 @@ def run(options: argparse.Namespace) -> int:
         saved = None  # its arrays, as large as the map and the keyframes, have been copied
     mapping = _Run(options, inputs, mapper)
     result = mapping.map_frames(estimators, resumed_after)
-    if result.processed == 0:
-        result.raise_if_stopped()
-    mapping.write_results(result)
+    if result.processed > 0 or result.stopped_by is None:
+        mapping.write_results(result)
     # an early end keeps the map so far; the exit code reports it
-    result.raise_if_stopped()
+    mapping.raise_if_stopped(result)
     mapping.print_results(result)
     return 0
 
@@ -138,11 +150,18 @@ class _Run:
             "memory_mib": self._mapper.memory_mib(),
             "notes": list(self._notes),
         }
-        write_results(options.out, self._gaussians, self._report)
+        prepare_folder(options.out)
+        write_results(options.out, self._gaussians, self._report, self._inputs.world_frame(options))
         keyframes = self._mapper.keyframes()
         if keyframes:
             viewer = MapViewer(self._gaussians, choose_rasterizer(mission.backend, mission.threads))
             write_png(options.out / PREVIEW, render_preview(viewer, keyframes))
+
+    def raise_if_stopped(self, result: MissionResult) -> None:
+        """Raise the error that ended the run early, or the interrupt with a text on what is kept."""
+        if isinstance(result.stopped_by, KeyboardInterrupt):
+            raise type(result.stopped_by)(_interrupted_text(self._options, result))
+        result.raise_if_stopped()
 
     def print_results(self, result: MissionResult) -> None:
         """Print the figures and the notes of a complete run."""
@@ -154,11 +173,16 @@ class _Run:
             f"{len(self._gaussians)} Gaussians ({report['active_gaussians']} in the task's region) → "
             f"{self._options.out / 'map.ply'}; {PREVIEW} in the same folder shows it"
         )
+        if result.processed == 0:
+            print(f"  no selected frame comes after frame {result.last_index}, the last one of the resumed run")
         for note in self._notes:
             print(f"  {note}")
 
     def _save(self, last_index: int) -> None:
-        save_run(self._options.save_state, self._mapper, self._inputs.resume_config(last_index), last_index)
+        prepare_folder(self._options.save_state.parent)
+        extra: State = {FRAMES_KEY: encode_text(self._options.frames)}
+        config = self._inputs.resume_config(last_index)
+        save_run(self._options.save_state, self._mapper, config, last_index, extra)
 
 
 def _first_estimator(
@@ -166,12 +190,22 @@ def _first_estimator(
 ) -> RelevanceEstimator:
     """Return the estimator of the first frame's task or regions, and report nouns that the detector cannot find."""
     if options.detector is None and inputs.schedule.graphs():
-        report_region_file(options.source)
+        report_region_file(options.source, inputs.stream.source)
     for scheduled in inputs.schedule.graphs():
         for warning in estimators.unsupported_nouns(scheduled):
-            print(warning, file=sys.stderr)
+            print_message(warning)
     graph = inputs.schedule.at(resumed_after)
     return region_estimator(options, inputs.stream.source) if graph is None else estimators.build(graph)
+
+
+def _interrupted_text(options: argparse.Namespace, result: MissionResult) -> str:
+    """Return how many frames an interrupted run has mapped, where its files are, and how to resume it."""
+    if result.processed == 0:
+        return "no frame was mapped, and no file was written"
+    text = f"{result.totals.frames} frames are mapped; map.ply, report.json and {PREVIEW} are in {options.out}"
+    if options.save_state is None:
+        return f"{text}; only a run with --save-state can be resumed"
+    return f"{text}; continue with --resume {options.save_state}"
 
 
 def _unseen_notes(options: argparse.Namespace, result: MissionResult) -> tuple[str, ...]:

@@ -3,21 +3,31 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from gausslite.calibration.pose_exposure_prior import PoseExposurePrior
 from gausslite.cli.parse_command import as_json
-from gausslite.cli.source_options import open_recorded, register_with_warnings, resolve_pose_prior, selected_regions
+from gausslite.cli.source_options import (
+    correct_with_warnings,
+    open_recorded,
+    register_with_warnings,
+    resolve_pose_prior,
+    selected_regions,
+)
 from gausslite.config.mapping_options import mission_settings, perception_settings
 from gausslite.config.values import AUTO, NONE
+from gausslite.datasets.camera_correction import CameraCorrection
 from gausslite.datasets.registered_source import DepthRegistration
+from gausslite.datasets.selection import frame_step
+from gausslite.datasets.sequence_name import default_world_frame, sequence_name
 from gausslite.datasets.source import Source
+from gausslite.domain.state import get_text
 from gausslite.domain.task import TaskGraph
 from gausslite.errors import InvalidInputError
 from gausslite.mapping.policies import TASK, policy
+from gausslite.messages import print_message
 from gausslite.mission.build import EstimatorFactory
 from gausslite.mission.checkpoint import ResumeConfig, SavedRun
 from gausslite.mission.frame_stream import FrameStream
@@ -27,6 +37,15 @@ from gausslite.perception.fixed_relevance import NoTaskEstimator, RegionRelevanc
 from gausslite.perception.relevance_estimator import RelevanceEstimator
 
 _UNIFORM = "uniform"
+FRAMES_KEY = "frames"
+"""Name of the text of --frames among the extra arrays of a saved run."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Sequence:
+    """The sequence of a saved run: a folder may move, but it must keep its name."""
+
+    name: str = field(metadata={"flag": "SOURCE"})
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,17 +78,20 @@ class MapInputs:
         self,
         options: argparse.Namespace,
         registration: DepthRegistration | str | None = None,
+        correction: CameraCorrection | str | None = None,
         pose_prior: PoseExposurePrior | str | None = None,
     ) -> MapInputs:
-        """Return the inputs with depth registration and pose prior, given here or by the options, or estimated."""
+        """Return the inputs with registration, correction and prior, given here or by the options, or estimated."""
         registration = options.register_depth if registration is None else registration
         pose_prior = options.pose_prior if pose_prior is None else pose_prior
-        frames, registered_to = register_with_warnings(self.source.spec, self.stream.source, registration, AUTO)
+        correction = options.camera_correction if correction is None else correction
+        registered, registered_to = register_with_warnings(self.source.spec, self.stream.source, registration, AUTO)
+        frames, corrected_by = correct_with_warnings(self.source.spec, registered, correction, AUTO)
         prior = resolve_pose_prior(self.source.spec, frames, pose_prior)
         return replace(
             self,
             mission=replace(self.mission, pose_prior=prior),
-            source=replace(self.source, depth_registration=registered_to),
+            source=replace(self.source, depth_registration=registered_to, camera_correction=corrected_by),
             stream=replace(self.stream, source=frames),
         )
 
@@ -78,13 +100,16 @@ class MapInputs:
 
         Raises MismatchError if other options differ from the saved run's.
         """
-        registration, pose_prior = None, None
+        registration, correction, pose_prior = None, None, None
         if options.register_depth in (None, AUTO):
             registration = saved.value(SourceSettings, "depth_registration") or NONE
+        if options.camera_correction in (None, AUTO):
+            correction = saved.value(SourceSettings, "camera_correction") or CameraCorrection()
         if options.pose_prior == AUTO:
             pose_prior = saved.value(MissionSettings, "pose_prior")
-        inputs = self.calibrated(options, registration, pose_prior)
+        inputs = self.calibrated(options, registration, correction, pose_prior)
         saved.require(*inputs._fixed_settings(saved.last_index))
+        _report_other_step(saved, self.source.frames)
         return inputs
 
     def resume_config(self, last_index: int) -> ResumeConfig:
@@ -94,15 +119,24 @@ class MapInputs:
     def _fixed_settings(self, last_index: int) -> tuple[Any, ...]:
         graph = self.schedule.at(last_index)
         task = replace(self.task, task=None if graph is None else graph.text)
-        return self.mission, self.perception, self.source, task
+        sequence = _Sequence(sequence_name(self.source.spec, self.stream.source))
+        return self.mission, self.perception, self.source, task, sequence
+
+    def world_frame(self, options: argparse.Namespace) -> str:
+        """Return the name of the world frame: that of the options, else the sequence's."""
+        if options.world_frame is not None:
+            return str(options.world_frame)
+        return default_world_frame(self.source.spec, self.stream.source)
 
     def report(self) -> dict[str, object]:
         """Return the inputs as part of the report."""
         first = self.schedule.first
-        registration, prior = self.source.depth_registration, self.mission.pose_prior
+        registration, correction = self.source.depth_registration, self.source.camera_correction
+        prior = self.mission.pose_prior
         return {
             "source": self.source.spec,
             "colour_camera": None if registration is None else str(registration),
+            "camera_correction": None if correction is None else str(correction),
             "view_error": None if prior.is_exact else str(prior),
             "task": None if first is None else {"text": first.text, **as_json(first)},
             "then": [{"frame": frame, "text": graph.text, **as_json(graph)} for frame, graph in self.schedule.switches],
@@ -156,13 +190,26 @@ def region_estimator(options: argparse.Namespace, source: Source) -> RelevanceEs
     return RegionRelevanceEstimator(regions) if regions else NoTaskEstimator()
 
 
+def _report_other_step(saved: SavedRun, frames: str) -> None:
+    """Print a message if the saved run took frames with another step."""
+    if FRAMES_KEY not in saved.extra:
+        return
+    before, now = frame_step(get_text(saved.extra, FRAMES_KEY)), frame_step(frames)
+    if before != now:
+        print_message(f"--frames: the saved run has a step of {before} frames, this one of {now}")
+
+
+def default_policy(options: argparse.Namespace) -> str:
+    """Return "task" if there is a task or a region, else "uniform"."""
+    return TASK if options.task is not None or has_regions(options) else _UNIFORM
+
+
 def _default_policy(options: argparse.Namespace) -> str:
-    """Return "task" if there is a task or a region, else "uniform", with a message unless the user chose a policy."""
-    if options.task is not None or has_regions(options):
-        return TASK
-    if options.policy is None:
-        print("no --task and no region: mapping everything equally (--policy uniform)", file=sys.stderr)
-    return _UNIFORM
+    """Return the same, with a message if nothing selects the policy."""
+    chosen = default_policy(options)
+    if chosen == _UNIFORM and options.policy is None:
+        print_message("no --task and no region: mapping everything equally (--policy uniform)")
+    return chosen
 
 
 def _schedule(first: TaskGraph | None, switches: Sequence[TaskSwitch]) -> TaskSchedule:

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 
+from gausslite.calibration.camera_timing import estimate_camera_timing
 from gausslite.calibration.pose_exposure_error import estimate_pose_exposure_prior
 from gausslite.calibration.pose_exposure_prior import PoseExposurePrior
 from gausslite.calibration.registration import find_registration
 from gausslite.config.source_options import add_frames
 from gausslite.config.values import AUTO, NONE, read_names, read_numbers
+from gausslite.datasets.camera_correction import CameraCorrection
+from gausslite.datasets.corrected_source import CorrectedSource
 from gausslite.datasets.open import is_simulated, open_source
 from gausslite.datasets.registered_source import DepthRegistration, RegisteredSource
 from gausslite.datasets.source import Source
 from gausslite.domain.pose import UpAxis
 from gausslite.domain.region import BallRegion, Region
+from gausslite.messages import print_message
 
 
 def add_source(parser: argparse.ArgumentParser, default_text: str = NONE) -> None:
@@ -46,7 +49,7 @@ def open_recorded(spec: str, up_axis: UpAxis | None) -> Source:
     """Open a sequence without registration, and report excluded frames. Raises DatasetError, InvalidInputError."""
     source = open_source(spec, up_axis)
     if source.excluded_frames:
-        print(f"{spec}: {source.excluded_frames}", file=sys.stderr)
+        print_message(f"{spec}: {source.excluded_frames}")
     return source
 
 
@@ -59,13 +62,34 @@ def register_with_warnings(
         hint = f"--register-depth {AUTO} estimates the registration, {NONE} uses depth as recorded"
         if default == AUTO:
             hint = f"the registration is estimated now, --register-depth {NONE} uses depth as recorded"
-        print(f"{spec}: this layout does not state whether depth is registered to colour; {hint}", file=sys.stderr)
+        print_message(f"{spec}: this layout does not state whether depth is registered to colour; {hint}")
     if depth_registration == AUTO:
         depth_registration, reason = find_registration(source)
-        print(f"--register-depth {depth_registration or NONE}: {reason}", file=sys.stderr)
+        print_message(f"--register-depth {depth_registration or NONE}: {reason}")
     if not isinstance(depth_registration, DepthRegistration):
         return source, None
     return RegisteredSource(source, depth_registration), depth_registration
+
+
+def correct_with_warnings(
+    spec: str, source: Source, correction: CameraCorrection | str | None, default: str
+) -> tuple[Source, CameraCorrection | None]:
+    """Correct lens, rolling shutter and time offset of a registered source; None if images are used as recorded.
+
+    correction: a correction, AUTO, or None if the user did not set it; then default applies, AUTO or NONE. An estimate
+    (AUTO) takes seconds; a simulated home is exact unless the user asks for one. Raises DatasetError, PoseError.
+    """
+    if correction is None:
+        correction = CameraCorrection() if default == NONE or is_simulated(spec) else AUTO
+    if isinstance(correction, str) and not source.depth_registered:
+        correction, reason = CameraCorrection(), "depth is not registered to colour"
+        print_message(f"--camera-correction {NONE}: {reason}")
+    elif isinstance(correction, str):
+        correction, reason = estimate_camera_timing(source, CameraCorrection(source.lens))
+        print_message(f"--camera-correction '{NONE if correction.is_identity else correction}': {reason}")
+    if correction.is_identity:
+        return source, None
+    return CorrectedSource(source, correction), correction
 
 
 def resolve_pose_prior(spec: str, source: Source, pose_prior: PoseExposurePrior | str) -> PoseExposurePrior:
@@ -78,7 +102,7 @@ def resolve_pose_prior(spec: str, source: Source, pose_prior: PoseExposurePrior 
     if is_simulated(spec):
         return PoseExposurePrior()
     estimate, reason = estimate_pose_exposure_prior(source)
-    print(f"--pose-prior {NONE if estimate.is_exact else estimate}: {reason}", file=sys.stderr)
+    print_message(f"--pose-prior {NONE if estimate.is_exact else estimate}: {reason}")
     return estimate
 
 
@@ -118,14 +142,14 @@ def selected_regions(options: argparse.Namespace, source: Source) -> list[Region
     if options.roi is not None:
         regions += choose_regions(balls_for_small_objects(load_voxel_regions(options.roi)), options.objects)
     elif options.objects:
-        report_region_file(options.source)
+        report_region_file(options.source, source)
         regions += choose_regions(source.regions(), options.objects)
     return [*regions, *options.roi_ball]
 
 
-def report_region_file(spec: str) -> None:
-    """Report that ground-truth regions come from a file of the sequence's folder, unless the sequence is simulated."""
+def report_region_file(spec: str, source: Source) -> None:
+    """Report that ground-truth regions come from a file of the sequence's folder, if there is one."""
     from gausslite.datasets.regions import REGIONS_FILE
 
-    if not is_simulated(spec):
-        print(f"{spec}: the ground-truth regions of {REGIONS_FILE} in the sequence's folder are used", file=sys.stderr)
+    if not is_simulated(spec) and source.regions():
+        print_message(f"{spec}: the ground-truth regions of {REGIONS_FILE} in the sequence's folder are used")

@@ -4,7 +4,14 @@ from __future__ import annotations
 
 import argparse
 
-from gausslite.config.values import AUTO, NONE, read_depth_registration, read_up_axis
+from gausslite.config.values import (
+    AUTO,
+    NONE,
+    read_camera_correction,
+    read_camera_correction_or_auto,
+    read_depth_registration,
+    read_up_axis,
+)
 from gausslite.datasets.registered_source import DepthRegistration
 
 _CAMERA_METAVAR = "FX,FY,CX,CY[,TX,TY,TZ[,RX,RY,RZ]]"
@@ -15,6 +22,15 @@ _REGISTER_DEPTH_HELP = (
 _AUTO_HELP = (
     "; none: use depth as recorded; auto: estimate the camera from image edges if the layout does not guarantee "
     "registered depth, for example 7-Scenes (default: {})"
+)
+
+_CORRECTION_METAVAR = f"{NONE}|lens=MODEL:K1,...;readout=S;offset=S"
+_CORRECTION_HELP = (
+    "correct images for lens distortion (radtan or fisheye with OpenCV's coefficients), for the rolling shutter's "
+    "readout time, and for the offset between the times of images and poses (seconds); none: use images as recorded"
+)
+_CORRECTION_AUTO_HELP = (
+    "; auto: the lens that the sequence's files state, and times estimated from pairs of frames (default: {})"
 )
 
 
@@ -38,4 +54,16 @@ def add_register_depth(parser: argparse._ActionsContainer, allow_auto: bool = Fa
         metavar=f"{AUTO}|{NONE}|{_CAMERA_METAVAR}" if allow_auto else _CAMERA_METAVAR,
         type=read_depth_registration if allow_auto else DepthRegistration.parse,
         help=_REGISTER_DEPTH_HELP + (_AUTO_HELP.format(default_text) if allow_auto else ""),
+    )
+
+
+def add_camera_correction(
+    parser: argparse._ActionsContainer, allow_auto: bool = False, default_text: str = NONE
+) -> None:
+    """Add --camera-correction; its value is None if the user does not set it. allow_auto, default_text: as above."""
+    parser.add_argument(
+        "--camera-correction",
+        metavar=f"{AUTO}|{_CORRECTION_METAVAR}" if allow_auto else _CORRECTION_METAVAR,
+        type=read_camera_correction_or_auto if allow_auto else read_camera_correction,
+        help=_CORRECTION_HELP + (_CORRECTION_AUTO_HELP.format(default_text) if allow_auto else ""),
     )

@@ -6,6 +6,7 @@ import argparse
 import math
 
 from gausslite.calibration.pose_exposure_prior import PoseExposurePrior
+from gausslite.datasets.camera_correction import CameraCorrection
 from gausslite.datasets.registered_source import DepthRegistration
 from gausslite.domain.pose import UpAxis
 from gausslite.mapping.stages import SkippableStage
@@ -47,6 +48,16 @@ def read_skip_stages(text: str) -> tuple[SkippableStage, ...]:
 def read_depth_registration(text: str) -> DepthRegistration | str:
     """Return AUTO, NONE or a camera. Raises InvalidInputError."""
     return text if text in (AUTO, NONE) else DepthRegistration.parse(text)
+
+
+def read_camera_correction(text: str) -> CameraCorrection:
+    """Return the correction of NONE (images as recorded) or of its text form. Raises InvalidInputError."""
+    return CameraCorrection() if text == NONE else CameraCorrection.parse(text)
+
+
+def read_camera_correction_or_auto(text: str) -> CameraCorrection | str:
+    """Return AUTO, or the correction that `read_camera_correction` returns. Raises InvalidInputError."""
+    return text if text == AUTO else read_camera_correction(text)
 
 
 def read_pose_prior(text: str) -> PoseExposurePrior:

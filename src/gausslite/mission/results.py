@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import resource
@@ -30,6 +31,15 @@ def prepare_folder(folder: Path) -> None:
         raise StorageError(f"{folder}: expected a folder that can be written, got {error.strerror}") from error
 
 
+def require_writable(folder: Path) -> None:
+    """Check that files can be written to a folder, which is not created. Raises StorageError."""
+    missing = [each for each in (folder, *folder.parents) if not each.exists()]
+    prepare_folder(folder)
+    for each in missing:
+        with contextlib.suppress(OSError):  # another program may use it already
+            each.rmdir()
+
+
 def prepare_file(path: Path) -> None:
     """Create the folder of a file and check that files can be written there. Raises StorageError."""
     if path.is_dir():
@@ -37,17 +47,24 @@ def prepare_file(path: Path) -> None:
     prepare_folder(path.parent)
 
 
-def prepare_additional_file(path: Path, results_folder: Path) -> None:
-    """Do `prepare_file` for a file that must not replace a result in the folder. Raises StorageError."""
+def require_additional_file(path: Path, results_folder: Path) -> None:
+    """Check that a file can be written and does not replace a result in the folder. Raises StorageError."""
     if path.resolve() in {(results_folder / name).resolve() for name in (_MAP, _REPORT, PREVIEW)}:
         raise StorageError(f"{path}: expected a name other than that of a result in {results_folder}")
-    prepare_file(path)
+    if path.is_dir():
+        raise StorageError(f"{path}: expected the name of a file, got a folder")
+    require_writable(path.parent)
 
 
 def require_no_map(folder: Path) -> None:
     """Raise StorageError if the folder holds a map already."""
-    if (folder / _MAP).exists():
-        raise StorageError(f"{folder / _MAP} exists already; choose another --out, or replace it with --overwrite")
+    require_absent(folder / _MAP)
+
+
+def require_absent(path: Path) -> None:
+    """Raise StorageError if the file exists."""
+    if path.exists():
+        raise StorageError(f"{path} exists already; choose another --out, or replace it with --overwrite")
 
 
 def write_results(folder: Path, gaussians: Gaussians, report: Mapping[str, object], world_frame: str = "") -> None:

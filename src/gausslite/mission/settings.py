@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from gausslite.calibration.pose_exposure_prior import PoseExposurePrior
+from gausslite.datasets.camera_correction import CameraCorrection
 from gausslite.datasets.registered_source import DepthRegistration
 from gausslite.datasets.source import Source
 from gausslite.domain.arguments import require_instance, require_number, require_whole
@@ -57,7 +58,7 @@ class SourceSettings:
 
     spec: a folder or a simulated home; size: "WxH", None for the original size; test_every: every N-th frame is kept
     from mapping, for evaluation; depth_registration: the colour camera to register depth to, None if depth is
-    registered already.
+    registered already. camera_correction: lens, rolling shutter and time offset, None for images as recorded.
     """
 
     spec: str = field(metadata=MAY_CHANGE)
@@ -66,6 +67,7 @@ class SourceSettings:
     up_axis: UpAxis | None = field(default=None, metadata={"flag": "--up"})
     test_every: int | None = None
     depth_registration: DepthRegistration | None = field(default=None, metadata={"flag": "--register-depth"})
+    camera_correction: CameraCorrection | None = None
 
 
 @dataclass(frozen=True, slots=True)

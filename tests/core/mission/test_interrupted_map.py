@@ -28,7 +28,11 @@ def mapped(sequence: Path, out: Path, *more: str) -> int:
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_a_signal_ends_the_run_after_the_current_frame_and_it_can_be_resumed(
-    number: signal.Signals, code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    number: signal.Signals,
+    code: int,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     sequence = write_seven_scenes(tmp_path / "kitchen", tuple(range(0, 24, 4)))
     state = str(tmp_path / "run.state")
@@ -43,6 +47,9 @@ def test_a_signal_ends_the_run_after_the_current_frame_and_it_can_be_resumed(
     with monkeypatch.context() as patched:
         patched.setattr(SevenScenesSource, "frame", read_and_raise_signal)
         assert mapped(sequence, tmp_path / "first", "--save-state", state) == code
+    last_line = capsys.readouterr().err.splitlines()[-1]
+    kept = f"3 frames are mapped; map.ply, report.json and preview.png are in {tmp_path / 'first'}"
+    assert last_line.endswith(f"ed: {kept}; continue with --resume {state}")
     report = json.loads((tmp_path / "first" / "report.json").read_text())
     assert (report["frames"], report["stopped_by"]) == (3, "interrupted")
     assert mapped(sequence, tmp_path / "rest", "--resume", state) == 0
@@ -76,3 +83,14 @@ def test_a_resumed_run_without_new_frames_saves_its_state_again(tmp_path: Path) 
     before, after = read_state(first), read_state(second)
     assert before.keys() == after.keys()
     assert all(np.array_equal(before[name], after[name]) for name in before)
+
+
+def test_an_interrupt_during_the_calibration_leaves_no_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    sequence = write_seven_scenes(tmp_path / "kitchen")
+    monkeypatch.setattr(SevenScenesSource, "frame", lambda *_: signal.raise_signal(signal.SIGINT))
+    out = tmp_path / "out"
+    assert main(["map", str(sequence), "--threads", "1", "--out", str(out), "--save-state", str(out / "state")]) == 130
+    assert capsys.readouterr().err.splitlines()[-1].startswith("gausslite: interrupted")
+    assert not out.exists()

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from gausslite.errors import StorageError
-from gausslite.mission.results import prepare_folder
+from gausslite.mission.results import prepare_folder, require_writable
 
 
 def test_programs_that_start_together_share_a_new_folder(tmp_path: Path) -> None:
@@ -22,3 +22,10 @@ def test_a_folder_that_cannot_be_written_is_refused(tmp_path: Path) -> None:
     (tmp_path / "file").write_bytes(b"")
     with pytest.raises(StorageError, match="file: expected a folder that can be written"):
         prepare_folder(tmp_path / "file")
+
+
+def test_a_check_leaves_no_folder(tmp_path: Path) -> None:
+    (tmp_path / "kept").mkdir()
+    require_writable(tmp_path / "kept" / "new" / "out")
+    require_writable(tmp_path / "kept")
+    assert not list((tmp_path / "kept").iterdir())

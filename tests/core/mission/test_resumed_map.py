@@ -102,3 +102,36 @@ def test_a_saved_run_cannot_replace_a_result(name: str, tmp_path: Path, capsys: 
     assert main(map_command(sequence, tmp_path / "out", "--save-state", str(tmp_path / "out" / name))) == 2
     [line] = capsys.readouterr().err.splitlines()
     assert f"{name}: expected a name other than that of a result in" in line
+
+
+def test_a_state_of_another_sequence_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    numbers = tuple(range(0, 24, 4))
+    kitchen, office = (
+        write_seven_scenes(tmp_path / "kitchen", numbers),
+        write_seven_scenes(tmp_path / "office", numbers),
+    )
+    state = str(tmp_path / "run.state")
+    assert main(map_command(kitchen, tmp_path / "first", "--frames", "0:12", "--save-state", state)) == 0
+    capsys.readouterr()
+    assert main(map_command(office, tmp_path / "rest", "--resume", state)) == 2
+    [line] = capsys.readouterr().err.splitlines()
+    assert "SOURCE 'kitchen' (got 'office')" in line
+    assert not (tmp_path / "rest").exists()
+    moved = kitchen.rename(tmp_path / "first" / "kitchen")
+    assert main(map_command(moved, tmp_path / "rest", "--resume", state)) == 0
+
+
+def test_another_step_of_frames_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    kitchen, state = write_seven_scenes(tmp_path / "kitchen", tuple(range(0, 24, 4))), str(tmp_path / "run.state")
+    assert main(map_command(kitchen, tmp_path / "first", "--frames", "0:12:4", "--save-state", state)) == 0
+    assert main(map_command(kitchen, tmp_path / "same", "--frames", "::4", "--resume", state)) == 0
+    assert "--frames:" not in capsys.readouterr().err
+    assert main(map_command(kitchen, tmp_path / "other", "--frames", "::8", "--resume", state)) == 0
+    assert "--frames: the saved run has a step of 4 frames, this one of 8" in capsys.readouterr().err
+
+
+def test_a_resumed_run_without_new_frames_states_the_reason(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    kitchen, state = write_seven_scenes(tmp_path / "kitchen"), str(tmp_path / "run.state")
+    assert main(map_command(kitchen, tmp_path / "first", "--save-state", state)) == 0
+    assert main(map_command(kitchen, tmp_path / "rest", "--resume", state)) == 0
+    assert "no selected frame comes after frame 8, the last one of the resumed run" in capsys.readouterr().out

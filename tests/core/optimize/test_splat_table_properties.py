@@ -37,7 +37,9 @@ def random_gaussians(count: int, active: bool, rng: np.random.Generator) -> Gaus
 def apply(table: SplatTable, action: str, seed: int, amount: int) -> None:
     rng = np.random.default_rng(seed)
     if action == "insert":
-        insert_seeds(table, Seeds(random_gaussians(amount // 2, True, rng), random_gaussians(amount, False, rng)), 0.5, rng)
+        insert_seeds(
+            table, Seeds(random_gaussians(amount // 2, True, rng), random_gaussians(amount, False, rng)), 0.5, rng
+        )
     elif action == "densify":
         table.first_moment[:, GRAD_2D_SUM] = rng.random(table.count)
         table.first_moment[:, GRAD_2D_COUNT] = 1.0

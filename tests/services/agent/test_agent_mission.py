@@ -22,6 +22,7 @@ from gausslite.codec.ply import read_ply
 from gausslite.domain.camera import Camera
 from gausslite.domain.frame import Frame
 from gausslite.domain.region import BallRegion, Region
+from gausslite.domain.trajectory import Trajectory
 from gausslite.errors import DatasetError, InvalidInputError, StorageError, TaskError
 from gausslite.fusion.memory_store import MemoryStore
 from gausslite.mission.frame_stream import FrameStream
@@ -52,6 +53,7 @@ class Wall:
     up_axis: tuple[float, float, float] = (0.0, -1.0, 0.0)
     depth_registered: bool = True
     excluded_frames: str = ""
+    lens: None = None
     camera: Camera = CAMERA
     broken_at: int | None = None
     read: list[int] = field(default_factory=list)
@@ -70,6 +72,9 @@ class Wall:
 
     def indices(self) -> Sequence[int]:
         return range(self.count)
+
+    def trajectory(self) -> Trajectory:
+        raise DatasetError("wall: expected no trajectory to be read")
 
     def regions(self) -> Mapping[str, Region]:
         return {"mug": MUG}
@@ -182,7 +187,7 @@ def test_errors_of_task_source_and_disk_are_raised(tmp_path: Path) -> None:
         (["--source", "sim:home", "--task", "Pick up the mug", "--test-every", "1"], "test every"),
         (["--threads", "0"], "threads"),
         (["--task", "Pick up the mug"], "name an ONNX file with --detector"),
-        (["--max-gaussians", "0"], "max_gaussians"),
+        (["--max-gaussians", "0"], "--max-gaussians: expected at least 1"),
         (["--agent-id", ""], "--agent-id"),
         (["--agent-id", "husky-\udcff"], "--agent-id: expected UTF-8 text"),
         (["--mission", "x" * 256], "--mission: expected at most 255 bytes"),

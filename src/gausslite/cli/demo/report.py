@@ -17,10 +17,11 @@ def demo_report(
     source: str | None, seed: int, scenario: Scenario, agents: Mapping[str, object], scores: Mapping[str, MapScores]
 ) -> dict[str, object]:
     """Return report.json of the demo; source None: the simulated home of the scenario."""
-    registration, prior = scenario.depth_registration, scenario.pose_prior
+    registration, correction, prior = scenario.depth_registration, scenario.camera_correction, scenario.pose_prior
     return {
         "source": source or scenario.agents[0].source,
         "colour_camera": None if registration is None else str(registration),
+        "camera_correction": None if correction is None else str(correction),
         "view_error": None if prior.is_exact else str(prior),
         "size": list(scenario.size),
         "seed": seed,

@@ -8,12 +8,14 @@ from dataclasses import dataclass, field
 
 from gausslite.calibration.pose_exposure_prior import PoseExposurePrior
 from gausslite.cli.source_options import (
+    correct_with_warnings,
     open_recorded,
     register_with_warnings,
     report_region_file,
     resolve_pose_prior,
 )
 from gausslite.config.values import AUTO
+from gausslite.datasets.camera_correction import CameraCorrection
 from gausslite.datasets.held_out import HeldOutSplit
 from gausslite.datasets.open import open_source
 from gausslite.datasets.regions import choose_regions
@@ -54,6 +56,7 @@ class Scenario:
     held_out: tuple[HeldOutFrames, ...]
     regions: Mapping[str, Region]
     depth_registration: DepthRegistration | None = None
+    camera_correction: CameraCorrection | None = None
     pose_prior: PoseExposurePrior = field(default_factory=PoseExposurePrior)
 
     @property
@@ -66,6 +69,8 @@ def simulated_scenario(options: argparse.Namespace) -> Scenario:
     """Return two trajectories through one home; the held-out views are of a third one. Raises InvalidInputError."""
     if options.register_depth is not None:
         raise InvalidInputError("--register-depth: expected a recorded sequence, --source SOURCE; got none")
+    if options.camera_correction is not None:
+        raise InvalidInputError("--camera-correction: expected a recorded sequence, --source SOURCE; got none")
     specs = [
         _HOME.format(seed=options.seed, trajectory=number, frames=_HOME_VIEWS if number == 2 else _HOME_FRAMES)
         for number in range(3)
@@ -96,16 +101,17 @@ def recorded_scenario(options: argparse.Namespace) -> Scenario:
     middle = recorded.indices()[len(recorded) // 2]
     first, second = options.frames_a or f":{middle}", options.frames_b or f"{middle}:"
     size, regions = frame_size(options.size, recorded), _scored_regions(options, recorded.regions())
-    report_region_file(options.source)
+    report_region_file(options.source, recorded)
     agents, held_out_positions = [], []
     for letter, task, frames in (("a", options.task_a, first), ("b", options.task_b, second)):
         training, held_out = HeldOutSplit(_TEST_EVERY).split(select_frames(recorded, frames))
         agents.append(AgentPlan(f"agent-{letter}", task, str(options.source), frames, len(training)))
         held_out_positions.append(held_out)
-    source, registration = register_with_warnings(options.source, recorded, options.register_depth, AUTO)
+    registered, registration = register_with_warnings(options.source, recorded, options.register_depth, AUTO)
+    source, correction = correct_with_warnings(options.source, registered, options.camera_correction, AUTO)
     pose_prior = resolve_pose_prior(options.source, source, options.pose_prior)
     views = tuple(HeldOutFrames(source, positions, size) for positions in held_out_positions)
-    return Scenario(tuple(agents), size, _TEST_EVERY, views, regions, registration, pose_prior)
+    return Scenario(tuple(agents), size, _TEST_EVERY, views, regions, registration, correction, pose_prior)
 
 
 def _scored_regions(options: argparse.Namespace, regions: Mapping[str, Region]) -> dict[str, Region]:
