@@ -32,7 +32,7 @@ GAUSSLITE_INLINE Quad floor_quad(Quad a) {
   return choose(small, whole - choose(whole > a, quad(1.0f), quad(0.0f)), a);
 }
 
-// True if one register holds a pack. A loop can then keep twice as many packs in registers as with AVX2.
+// True if one register holds a pack, as with AVX-512. Loops then keep more packs in registers.
 constexpr bool kFitsOneRegister = false;
 
 // Sixteen truth values, one per lane.
@@ -180,7 +180,8 @@ GAUSSLITE_INLINE Pack16 mantissa(Pack16 a) {
 }
 
 // exp2_of_low_bits returns 2^(k / kExp2TableSize); `biased` has the integer k in the lowest bits of its mantissa (see
-// exp2_fast). The other variants may look up the fractional part of k / kExp2TableSize in a table of 8 or 16 floats.
+// exp2_fast). Other variants
+// may read 2^fraction(k / kExp2TableSize) from a table of 8 or 16 floats.
 constexpr int kExp2TableSize = 1;
 GAUSSLITE_INLINE Pack16 exp2_of_low_bits(Pack16 biased) {
   GAUSSLITE_EACH biased.q[i] = (Quad)(((QuadInt)biased.q[i] << 23) + 0x3F800000);

@@ -29,8 +29,8 @@ def run(options: argparse.Namespace) -> int:
     """Fuse and write the maps; if scores are equal, the map given first wins. Returns the exit code."""
     if len(options.maps) < 2:
         raise InvalidInputError(f"maps: expected at least two files to fuse, got {len(options.maps)}")
-    _require_different_files(options.maps)
     _require_separate_output(options.maps, options.out)
+    _require_different_files(options.maps)
     frames = {path: read_world_frame(path) for path in options.maps}
     world_frame = _common_world_frame(frames)
     prepare_folder(options.out.absolute().parent)
