@@ -14,7 +14,7 @@ import sys
 from gausslite.calibration.registration import estimate_depth_registration
 from gausslite.datasets.open import open_source
 from gausslite.datasets.selection import select_frames
-from gausslite.errors import GaussLiteError
+from gausslite.domain.errors import GaussLiteError
 
 
 def main() -> int:

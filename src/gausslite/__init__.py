@@ -31,11 +31,11 @@ if TYPE_CHECKING:
     from gausslite.datasets.registered_source import DepthRegistration
     from gausslite.datasets.source import Source
     from gausslite.domain.camera import Camera
+    from gausslite.domain.errors import GaussLiteError
     from gausslite.domain.frame import Frame
     from gausslite.domain.gaussians import Gaussians
     from gausslite.domain.region import BallRegion
     from gausslite.domain.voxel_operations import empty_batch
-    from gausslite.errors import GaussLiteError
     from gausslite.mission.settings import MissionSettings, PerceptionSettings, SceneInfo
     from gausslite.wire.clients import AgentClient, FusionClient
     from gausslite.wire.tls import Tls
@@ -63,7 +63,7 @@ _MODULES = {
     "gausslite.domain.gaussians": ("Gaussians",),
     "gausslite.domain.region": ("BallRegion",),
     "gausslite.domain.voxel_operations": ("empty_batch",),
-    "gausslite.errors": ("GaussLiteError",),
+    "gausslite.domain.errors": ("GaussLiteError",),
     "gausslite.mission.settings": ("MissionSettings", "PerceptionSettings", "SceneInfo"),
     "gausslite.wire.clients": ("AgentClient", "FusionClient"),
     "gausslite.wire.tls": ("Tls",),

@@ -1,7 +1,7 @@
 """The public Python API: open a sequence, map it, store the map and render it.
 
 `import gausslite` offers these names lazily; importing `gausslite` loads neither NumPy nor torch. Errors are those of
-`gausslite.errors`; each message names the value, what was received and what was expected.
+`gausslite.domain.errors`; each message names the value, what was received and what was expected.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ from gausslite.datasets.registered_source import DepthRegistration, RegisteredSo
 from gausslite.datasets.source import Source
 from gausslite.domain.arguments import describe, require_instance, require_size
 from gausslite.domain.camera import Camera
+from gausslite.domain.errors import DatasetError, InvalidInputError
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.pose import UpAxis, require_rigid
 from gausslite.domain.region import Region
-from gausslite.errors import DatasetError, InvalidInputError
 from gausslite.evaluation.views import MapViewer
 from gausslite.mapping.policies import TASK, follows_task
 from gausslite.mission.build import EstimatorFactory, build_mapper

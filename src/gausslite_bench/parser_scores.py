@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from gausslite.domain.errors import InvalidInputError, TaskError
 from gausslite.domain.task import Predicate, Relation, TaskGraph
-from gausslite.errors import InvalidInputError, TaskError
 from gausslite.task.parser import TaskParser
 
 SENTENCES = Path(__file__).with_name("parser_sentences.json")

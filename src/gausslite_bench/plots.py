@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from gausslite.codec.files import write_atomic
-from gausslite.errors import InvalidInputError
+from gausslite.domain.errors import InvalidInputError
 
 _PANEL_SIZE_IN = (6.4, 3.6)
 _DPI = 100

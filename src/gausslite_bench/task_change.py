@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from statistics import fmean
 
 from gausslite.datasets.regions import choose_regions
-from gausslite.errors import InvalidInputError
+from gausslite.domain.errors import InvalidInputError
 from gausslite.evaluation.metrics import psnr
 from gausslite.evaluation.views import MapViewer
 from gausslite.mapping.task_change import Reevaluation

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float32, Float64, Int64
 from numpy import ndarray
 from numpy.typing import NDArray
 
-from gausslite.errors import DatasetError
+from gausslite.domain.errors import DatasetError
 from gausslite_sim.atlas import TextureAtlas
 from gausslite_sim.home_plan import HomePlan
 from gausslite_sim.lighting import vertex_light

@@ -18,12 +18,12 @@ from gausslite.datasets.images import RgbdImage, resize_rgbd
 from gausslite.datasets.source import Source, require_position
 from gausslite.domain.arguments import require_size
 from gausslite.domain.camera import Camera
+from gausslite.domain.errors import DatasetError
 from gausslite.domain.frame import Frame
 from gausslite.domain.lens import Lens
 from gausslite.domain.pose import UpAxis, unit_up_axis
 from gausslite.domain.region import Region
 from gausslite.domain.trajectory import Trajectory
-from gausslite.errors import DatasetError
 from gausslite_sim.exposure import camera_gain
 from gausslite_sim.home_catalogue import HOME_COUNT, plan_home
 from gausslite_sim.home_plan import HomePlan

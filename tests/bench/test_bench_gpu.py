@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from gausslite.cli.main import main
-from gausslite.errors import InvalidInputError
+from gausslite.domain.errors import InvalidInputError
 from gausslite.render.rasterizer import LossWeights
 from gausslite_bench.cli.gpu import frame_lines, gpu_record, rate_heading, rate_line
 from gausslite_bench.raster.gpu_rates import GpuBench

@@ -7,7 +7,7 @@ import json
 import pytest
 
 from gausslite.cli.main import main
-from gausslite.errors import DatasetError
+from gausslite.domain.errors import DatasetError
 from gausslite.mapping.stages import SkippableStage, Stage
 from gausslite.mission.frame_scheduler import FrameTiming
 from gausslite_bench.loop.frame_costs import CostLog, FrameCost, Latency, LoopTiming

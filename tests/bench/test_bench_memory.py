@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from gausslite.cli.main import main
-from gausslite.errors import InvalidInputError
+from gausslite.domain.errors import InvalidInputError
 from gausslite_bench.loop.memory import MemoryTrend, back_and_forth
 
 

@@ -8,8 +8,8 @@ import json
 import pytest
 
 from gausslite.cli.main import main
+from gausslite.domain.errors import InvalidInputError, TaskError
 from gausslite.domain.task import TaskGraph
-from gausslite.errors import InvalidInputError, TaskError
 from gausslite.task.rules import RuleParser
 from gausslite_bench.parser_scores import Sentence, load_sentences, score_parser
 

@@ -12,11 +12,11 @@ from tiny_yolo import write_tiny_yolo
 
 from gausslite.cli.main import main
 from gausslite.domain.camera import Camera
+from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
 from gausslite.domain.region import BallRegion
 from gausslite.domain.relevance import Detection
 from gausslite.domain.task import TaskGraph
-from gausslite.errors import InvalidInputError
 from gausslite.perception.ground_truth import RegionDetector
 from gausslite_bench.perception.contact_sheet import PerceptionSheet
 from gausslite_bench.perception.stage_scores import PerceptionBench, PerceptionStage, TaskQuery

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from gausslite.cli.main import main
-from gausslite.errors import InvalidInputError
+from gausslite.domain.errors import InvalidInputError
 from gausslite.render.rasterizer import LOG_SCALE, MEAN, RGB
 from gausslite_bench.cli.argument_types import read_counts, read_image_sizes, read_percentages
 from gausslite_bench.raster.block_cost import BlockCost

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from gausslite.cli.main import main
-from gausslite.errors import InvalidInputError
+from gausslite.domain.errors import InvalidInputError
 from gausslite.mission.settings import MissionSettings
 from gausslite.mission.task_schedule import TaskSchedule, TaskSwitch
 from gausslite.task.rules import RuleParser

@@ -9,7 +9,7 @@ import pytest
 from quality_results import CONDITIONS, PLAN, TASK
 
 from gausslite.cli.main import main
-from gausslite.errors import InvalidInputError
+from gausslite.domain.errors import InvalidInputError
 from gausslite_bench.quality.equal_time import load_rate, rate_trials
 from gausslite_bench.quality.study import Study
 from gausslite_bench.quality.trials import BudgetMode, TrialBudget

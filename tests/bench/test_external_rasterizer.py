@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from gausslite.cli.main import main
-from gausslite.errors import KernelError
+from gausslite.domain.errors import KernelError
 from gausslite.optimize.splat_table import SplatTable
 from gausslite_bench.raster.external_rasterizer import ExternalRasterizer
 from gausslite_bench.raster.procedural_room import held_out_view, seed_rows

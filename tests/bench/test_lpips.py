@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gausslite.errors import ModelFileError, ShapeError
+from gausslite.domain.errors import ModelFileError, ShapeError
 from gausslite_bench.quality.lpips import Lpips, load_lpips
 
 torch = pytest.importorskip("torch", reason="LPIPS needs torch, which is not installed")

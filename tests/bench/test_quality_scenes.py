@@ -12,8 +12,8 @@ from mapping_scenes import middle_relevance, wall_frame
 from tiny_sequences import write_depth, write_seven_scenes
 
 from gausslite.cli.main import main
+from gausslite.domain.errors import DatasetError, InvalidInputError
 from gausslite.domain.relevance import RelevanceMap
-from gausslite.errors import DatasetError, InvalidInputError
 from gausslite.mission.settings import SceneInfo
 from gausslite_bench.quality.real_scenes import RealScenePlan, real_plans
 from gausslite_bench.quality.scenes import RecordedRelevanceEstimator, Scene

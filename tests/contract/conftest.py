@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import pytest
 
-from gausslite.errors import KernelError
+from gausslite.domain.errors import KernelError
 from gausslite.render.rasterizer import Rasterizer
 
 torch = pytest.importorskip("torch", reason="the oracle needs torch, which is not installed")

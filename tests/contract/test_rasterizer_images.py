@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from splat_scenes import CAMERA, SCENES, Scene, named_scene, random_rows, relative_error, rotated_pose, scene_for
 
-from gausslite.errors import InvalidInputError, ShapeError
+from gausslite.domain.errors import InvalidInputError, ShapeError
 from gausslite.render.rasterizer import TILE_PX, Rasterizer, Rendering, Subset
 
 ATOL = 2e-5

@@ -9,7 +9,7 @@ import pytest
 from splat_scenes import TargetImage, named_scene, relative_error
 from step_training import ADAM, LOSS, applied_gradient, tables, target_for, train
 
-from gausslite.errors import InvalidInputError, ShapeError
+from gausslite.domain.errors import InvalidInputError, ShapeError
 from gausslite.render.rasterizer import UPDATE_COUNT, Rasterizer, UpdateCounter
 
 

@@ -7,8 +7,8 @@ import pytest
 
 from gausslite.datasets.open import open_source
 from gausslite.datasets.source import Source
+from gausslite.domain.errors import DatasetError
 from gausslite.domain.pose import require_rigid
-from gausslite.errors import DatasetError
 from gausslite_sim.exposure import camera_gain
 from gausslite_sim.home_catalogue import HOME_COUNT, HOMES
 from gausslite_sim.homes import workshop

@@ -11,10 +11,10 @@ from gausslite.datasets.open import open_source
 from gausslite.datasets.selection import select_frames
 from gausslite.datasets.source import Source
 from gausslite.domain.camera import back_project
+from gausslite.domain.errors import DatasetError
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import require_rigid, transform_points
 from gausslite.domain.voxels import VoxelGrid
-from gausslite.errors import DatasetError
 from gausslite_sim.home_catalogue import plan_home
 from gausslite_sim.scene import HomeScene
 from gausslite_sim.source import TRAJECTORY_COUNT

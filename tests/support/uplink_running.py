@@ -12,11 +12,11 @@ from fusion_running import GRID, make_batch
 from serving import serving
 
 from gausslite.codec.subset_codec import decode_subset
-from gausslite.domain.voxel_batch import VoxelBatch
-from gausslite.domain.voxels import VoxelGrid
-from gausslite.errors import (
+from gausslite.domain.errors import (
     GaussLiteError,
 )
+from gausslite.domain.voxel_batch import VoxelBatch
+from gausslite.domain.voxels import VoxelGrid
 from gausslite.fusion.memory_store import MemoryStore
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.v1 import fusion_service_pb2_grpc as pb_grpc

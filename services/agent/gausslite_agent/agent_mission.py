@@ -8,8 +8,8 @@ import time
 from concurrent.futures import Future
 from enum import Enum
 
+from gausslite.domain.errors import GaussLiteError, StorageError
 from gausslite.domain.frame import Frame
-from gausslite.errors import GaussLiteError, StorageError
 from gausslite.mission.checkpoint import ResumeConfig
 from gausslite.mission.frame_stream import CorruptFrames, FrameStream
 from gausslite.mission.results import write_results

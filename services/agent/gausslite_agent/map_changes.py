@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
+from gausslite.domain.errors import RevisionGoneError
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.revision_log import RevisionLog
 from gausslite.domain.voxel_batch import VoxelBatch
 from gausslite.domain.voxel_changes import VoxelChangeTracker, VoxelSignatures
 from gausslite.domain.voxel_operations import VoxelIndex, empty_batch, merge_batches, select_keys, tombstones
 from gausslite.domain.voxels import VoxelGrid
-from gausslite.errors import RevisionGoneError
 
 
 class MapChangeLog:

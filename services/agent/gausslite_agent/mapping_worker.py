@@ -15,12 +15,12 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TypeVar
 
+from gausslite.domain.errors import InvalidInputError, MismatchError, StorageError, UnavailableError
 from gausslite.domain.frame import Frame
 from gausslite.domain.task import TaskGraph
 from gausslite.domain.voxel_batch import VoxelBatch
 from gausslite.domain.voxel_operations import group_by_voxel
 from gausslite.domain.voxels import VoxelGrid
-from gausslite.errors import InvalidInputError, MismatchError, StorageError, UnavailableError
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.sent_voxels import SentVoxelTracker
 from gausslite.mission.build import build_mapper

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from google.protobuf.message import DecodeError
 
+from gausslite.domain.errors import GaussLiteError, MapFileError
 from gausslite.domain.state import State, encode_text, get_array, get_counts, get_text, int_array
 from gausslite.domain.task import TaskGraph
-from gausslite.errors import GaussLiteError, MapFileError
 from gausslite.mission.checkpoint import SavedRun
 from gausslite.v1 import task_pb2
 from gausslite.wire.convert import graph_from_message, graph_to_message

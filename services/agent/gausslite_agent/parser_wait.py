@@ -6,8 +6,8 @@ import logging
 import threading
 import time
 
+from gausslite.domain.errors import UnavailableError
 from gausslite.domain.task import TaskGraph
-from gausslite.errors import UnavailableError
 from gausslite.task.parser import TaskParser
 
 _log = logging.getLogger(__name__)

@@ -6,9 +6,9 @@ import asyncio
 from collections.abc import AsyncIterator, Callable
 from typing import Any
 
+from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.task import TaskGraph
 from gausslite.domain.voxel_operations import crop_to_box
-from gausslite.errors import InvalidInputError
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.task.parser import TaskParser
 from gausslite.v1 import agent_service_pb2 as pb

@@ -22,10 +22,10 @@ from gausslite.config.numbers import Number
 from gausslite.config.source_options import add_camera_correction, add_frames
 from gausslite.config.switches import add_switch, set_dependent_default
 from gausslite.config.tls_options import add_tls, read_server_tls
+from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.names import require_name
 from gausslite.domain.pose import UpAxis
 from gausslite.domain.voxels import VoxelGrid
-from gausslite.errors import InvalidInputError
 from gausslite.mission.settings import MissionSettings, PerceptionSettings, SourceSettings
 from gausslite.task.validate import require_task_text
 from gausslite.wire.address import require_callable

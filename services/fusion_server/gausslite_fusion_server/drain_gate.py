@@ -6,7 +6,7 @@ import asyncio
 from collections.abc import AsyncIterator
 from typing import TypeVar
 
-from gausslite.errors import UnavailableError
+from gausslite.domain.errors import UnavailableError
 
 _Message = TypeVar("_Message")
 

@@ -8,7 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from threading import Event
 
-from gausslite.errors import QuotaError
+from gausslite.domain.errors import QuotaError
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.joint_refinement import RefineProgress, RefineSettings, refine
 from gausslite.fusion.limits import MAX_REFINE_ITERATIONS

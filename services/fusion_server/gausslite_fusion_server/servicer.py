@@ -13,8 +13,7 @@ import google_crc32c
 
 from gausslite.codec.ply import ply_bytes
 from gausslite.codec.subset_codec import MAX_SUBSET_BYTES, decode_subset
-from gausslite.domain.voxel_batch import VoxelBatch
-from gausslite.errors import (
+from gausslite.domain.errors import (
     GaussLiteError,
     InvalidInputError,
     MismatchError,
@@ -24,6 +23,7 @@ from gausslite.errors import (
     StorageError,
     UnavailableError,
 )
+from gausslite.domain.voxel_batch import VoxelBatch
 from gausslite.fusion.engine import FusedMapChanges, FusionEngine
 from gausslite.fusion.keyframes import AgentKeyframe
 from gausslite.fusion.mission_config import MissionConfig

@@ -25,10 +25,10 @@ from gausslite.datasets.camera_correction import CameraCorrection, correct_frame
 from gausslite.datasets.images import RgbdImage, resize_rgbd
 from gausslite.datasets.selection import downscaled_size
 from gausslite.datasets.source import Source
+from gausslite.domain.errors import DatasetError, PoseError
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import inverse
 from gausslite.domain.trajectory import Trajectory, Twist
-from gausslite.errors import DatasetError, PoseError
 
 _MAX_PAIRS, _MIN_PAIRS = 16, 4
 _MIN_COMPARABLE_PIXELS = 1000

@@ -22,9 +22,9 @@ from gausslite.datasets.registered_source import register_depth
 from gausslite.datasets.selection import downscaled_size
 from gausslite.datasets.source import Source
 from gausslite.domain.camera import back_project
+from gausslite.domain.errors import DatasetError, PoseError
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import inverse, transform_points
-from gausslite.errors import DatasetError, PoseError
 from gausslite.render.rasterizer import NEAR_M, Rendering
 
 _MAX_PAIRS = 24

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from gausslite.errors import InvalidInputError
+from gausslite.domain.errors import InvalidInputError
 
 _MAX_STD = 1000.0
 """Upper bound of every standard deviation; its square is still a finite float."""

@@ -21,9 +21,9 @@ from gausslite.datasets.intrinsics import FileIntrinsics
 from gausslite.datasets.registered_source import DepthRegistration
 from gausslite.datasets.source import Source
 from gausslite.domain.camera import Camera
+from gausslite.domain.errors import DatasetError, PoseError
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import transform_points
-from gausslite.errors import DatasetError, PoseError
 
 _MIN_EDGE_POINTS = 1000
 _JUMP_M, _JUMP_SHARE = 0.06, 0.05

@@ -29,9 +29,9 @@ from gausslite.config.switches import add_switch
 from gausslite.config.toml_text import OptionValue
 from gausslite.config.values import AUTO, read_names
 from gausslite.datasets.sequence_name import default_world_frame
+from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.names import require_name
 from gausslite.domain.voxels import VoxelGrid
-from gausslite.errors import InvalidInputError
 from gausslite.evaluation.pictures import write_png
 from gausslite.evaluation.team import TeamScores, score_team
 from gausslite.fusion.limits import MAX_REFINE_ITERATIONS

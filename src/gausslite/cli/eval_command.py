@@ -25,9 +25,9 @@ from gausslite.datasets.held_out import HeldOutSplit
 from gausslite.datasets.registered_source import DepthRegistration
 from gausslite.datasets.selection import frame_size, select_frames
 from gausslite.datasets.source import Source
+from gausslite.domain.errors import DatasetError, PoseError
 from gausslite.domain.frame import Frame
 from gausslite.domain.region import Region
-from gausslite.errors import DatasetError, PoseError
 from gausslite.evaluation.compare import MapScores, ViewScore, average, score_view
 from gausslite.evaluation.fitted import render_fitted
 from gausslite.evaluation.pictures import comparison_sheet, write_png

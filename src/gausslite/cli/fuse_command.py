@@ -9,8 +9,8 @@ from pathlib import Path
 
 from gausslite.codec.ply import read_ply, read_world_frame, write_ply
 from gausslite.config.mapping_options import add_voxel_size
+from gausslite.domain.errors import InvalidInputError, MismatchError
 from gausslite.domain.voxels import VoxelGrid
-from gausslite.errors import InvalidInputError, MismatchError
 from gausslite.fusion.offline import fuse_maps
 from gausslite.messages import print_message
 from gausslite.mission.results import as_text, prepare_folder

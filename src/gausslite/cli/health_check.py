@@ -7,7 +7,7 @@ import sys
 from collections.abc import Sequence
 
 from gausslite.config.tls_options import add_tls, read_tls
-from gausslite.errors import InvalidInputError, UnavailableError
+from gausslite.domain.errors import InvalidInputError, UnavailableError
 from gausslite.messages import print_message
 from gausslite.wire.health import require_serving
 

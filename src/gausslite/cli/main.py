@@ -11,7 +11,7 @@ import sys
 from collections.abc import Mapping, Sequence
 
 from gausslite import __version__
-from gausslite.errors import GaussLiteError
+from gausslite.domain.errors import GaussLiteError
 from gausslite.interrupts import Terminated, restore_default_handlers
 from gausslite.messages import print_message
 

@@ -12,10 +12,10 @@ from gausslite.config.mapping_options import HOLD_OUT_HELP, add_budget, add_dete
 from gausslite.config.source_options import add_camera_correction
 from gausslite.config.switches import add_switch
 from gausslite.config.values import AUTO, NONE
+from gausslite.domain.errors import DatasetError
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.names import require_name
 from gausslite.domain.state import State, encode_text
-from gausslite.errors import DatasetError
 from gausslite.evaluation.pictures import write_png
 from gausslite.evaluation.preview import render_preview
 from gausslite.evaluation.views import MapViewer

@@ -23,9 +23,9 @@ from gausslite.datasets.registered_source import DepthRegistration
 from gausslite.datasets.selection import frame_step
 from gausslite.datasets.sequence_name import default_world_frame, sequence_name
 from gausslite.datasets.source import Source
+from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.state import get_text
 from gausslite.domain.task import TaskGraph
-from gausslite.errors import InvalidInputError
 from gausslite.mapping.policies import TASK, policy
 from gausslite.messages import print_message
 from gausslite.mission.build import EstimatorFactory

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gausslite.config.environment import MODELS_URL_VARIABLE
-from gausslite.errors import InvalidInputError
+from gausslite.domain.errors import InvalidInputError
 from gausslite.messages import print_message
 
 if TYPE_CHECKING:

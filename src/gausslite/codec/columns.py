@@ -18,8 +18,8 @@ import numpy as np
 from jaxtyping import Float32, Int64, UInt8, UInt16, UInt32
 from numpy import ndarray
 
+from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.voxels import VoxelGrid
-from gausslite.errors import InvalidInputError
 
 MEAN_STEPS = 65535
 SCALE_MIN_M, SCALE_MAX_M = 1e-4, 20.0

@@ -8,7 +8,7 @@ import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
-from gausslite.errors import StorageError
+from gausslite.domain.errors import StorageError
 
 
 def write_atomic(path: Path, data: bytes) -> None:

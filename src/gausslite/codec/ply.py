@@ -20,10 +20,10 @@ from numpy import ndarray
 from numpy.typing import DTypeLike, NDArray
 
 from gausslite.codec.files import write_atomic
+from gausslite.domain.errors import InvalidInputError, MapFileError
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.names import require_name
 from gausslite.domain.relevance import NO_TARGET
-from gausslite.errors import InvalidInputError, MapFileError
 
 SH_C0 = 0.28209479177387814
 _MAX_GAUSSIANS = 100_000_000

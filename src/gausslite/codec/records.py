@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gausslite.domain.errors import StorageError
 from gausslite.domain.gaussians import Gaussians
-from gausslite.errors import StorageError
 
 RECORD = np.dtype(
     [

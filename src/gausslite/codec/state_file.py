@@ -17,8 +17,8 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
 from gausslite.codec.files import write_atomic_with
+from gausslite.domain.errors import MapFileError, StorageError
 from gausslite.domain.state import State
-from gausslite.errors import MapFileError, StorageError
 
 FORMAT = "gausslite-state"
 VERSION = "2"

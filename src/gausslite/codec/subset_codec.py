@@ -23,10 +23,10 @@ from numpy.typing import NDArray
 
 from gausslite.codec import columns
 from gausslite.domain.arrays import require_finite
+from gausslite.domain.errors import ChecksumError, CodecError, GaussLiteError, InvalidInputError
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.voxel_batch import RoiSubset, VoxelBatch
 from gausslite.domain.voxels import VoxelGrid
-from gausslite.errors import ChecksumError, CodecError, GaussLiteError, InvalidInputError
 
 MAX_SUBSET_BYTES = 1 << 20
 _MAGIC, _VERSION, _ZSTD_LEVEL = b"GLSB", 1, 3

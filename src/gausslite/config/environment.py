@@ -8,7 +8,7 @@ from typing import Final
 from gausslite.config.known_options import KNOWN_OPTIONS
 from gausslite.config.nearest import suggestion
 from gausslite.config.option_table import Layer, OptionTable, RawValue, variable_name
-from gausslite.errors import InvalidInputError
+from gausslite.domain.errors import InvalidInputError
 from gausslite.messages import print_message
 
 PREFIX: Final = "GAUSSLITE_"

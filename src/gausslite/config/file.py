@@ -8,7 +8,7 @@ from typing import Any
 
 from gausslite.config.nearest import suggestion
 from gausslite.config.option_table import Layer, OptionTable, RawValue, accepts_list, number_kind, type_name
-from gausslite.errors import InvalidInputError
+from gausslite.domain.errors import InvalidInputError
 
 
 def read_file(table: OptionTable, path: Path) -> Layer:

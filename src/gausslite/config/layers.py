@@ -20,7 +20,7 @@ from gausslite.config.option_table import Layer, OptionTable, RawValue
 from gausslite.config.presets import PRESETS
 from gausslite.config.switches import dependent_default
 from gausslite.config.toml_text import OptionValue, to_toml, without_password
-from gausslite.errors import InvalidInputError
+from gausslite.domain.errors import InvalidInputError
 
 _NEGATIVE_NUMBERS = re.compile(r"-\.?\d[\d.,eE+-]*$")
 _PATHS_AS_TEXT = frozenset({"source"})

@@ -6,7 +6,7 @@ import argparse
 import math
 from dataclasses import dataclass
 
-from gausslite.errors import InvalidInputError
+from gausslite.domain.errors import InvalidInputError
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,7 +11,7 @@ from typing import Any
 from gausslite.config.numbers import Number
 from gausslite.config.toml_text import OptionValue
 from gausslite.config.values import read_names
-from gausslite.errors import GaussLiteError, InvalidInputError
+from gausslite.domain.errors import GaussLiteError, InvalidInputError
 
 RawValue = str | bool | list[str]
 """An option's value before conversion: text, a switch, or the texts of a repeatable option."""

@@ -16,10 +16,10 @@ from jaxtyping import Float32, Float64
 from numpy import ndarray
 
 from gausslite.domain.camera import Camera
+from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
 from gausslite.domain.lens import Lens, LensModel
 from gausslite.domain.trajectory import Twist
-from gausslite.errors import InvalidInputError
 
 _MAX_READOUT_S, _MAX_TIME_OFFSET_S = 0.1, 1.0
 _FIXED_POINT_STEPS = 3

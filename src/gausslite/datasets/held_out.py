@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
-from gausslite.errors import InvalidInputError
+from gausslite.domain.errors import InvalidInputError
 
 Item = TypeVar("Item")
 

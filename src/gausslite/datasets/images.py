@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from gausslite.domain.arguments import require_size
 from gausslite.domain.camera import Camera
+from gausslite.domain.errors import DatasetError
 from gausslite.domain.image_bytes import image_size
-from gausslite.errors import DatasetError
 
 _ENDINGS = {".png": b"IEND\xaeB`\x82", ".jpg": b"\xff\xd9", ".jpeg": b"\xff\xd9"}
 _ENDING_WINDOW_BYTES = 64

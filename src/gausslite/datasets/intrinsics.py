@@ -11,8 +11,8 @@ import numpy as np
 
 from gausslite.datasets.text_files import parse_numbers, read_rows, read_text
 from gausslite.domain.camera import Camera
+from gausslite.domain.errors import DatasetError, InvalidInputError
 from gausslite.domain.lens import Lens, LensModel
-from gausslite.errors import DatasetError, InvalidInputError
 
 INTRINSICS_FILE = "camera-intrinsics.txt"
 CAMERA_FILE = "cam_params.json"

@@ -11,8 +11,8 @@ from gausslite.datasets.replica import ReplicaSource
 from gausslite.datasets.sevenscenes import SevenScenesSource
 from gausslite.datasets.source import Source
 from gausslite.datasets.tum import TumSource
+from gausslite.domain.errors import DatasetError
 from gausslite.domain.pose import UpAxis
-from gausslite.errors import DatasetError
 
 _READERS = (TumSource, SevenScenesSource, ReplicaSource)
 _LAYOUTS = (

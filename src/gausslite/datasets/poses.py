@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Float, Float64
 from numpy import ndarray
 
+from gausslite.domain.errors import PoseError
 from gausslite.domain.pose import require_rigid
-from gausslite.errors import PoseError
 
 _REPAIRABLE_DEVIATION = 0.05
 

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
+from gausslite.domain.errors import DatasetError, InvalidInputError
 from gausslite.domain.region import BallRegion, Region, VoxelRegion
-from gausslite.errors import DatasetError, InvalidInputError
 
 REGIONS_FILE = "roi_voxels.npz"
 """Name of the file in the folder of the sequence."""

@@ -15,12 +15,12 @@ from gausslite.datasets.images import RgbdImage, resize_rgbd
 from gausslite.datasets.intrinsics import FileIntrinsics
 from gausslite.datasets.source import Source
 from gausslite.domain.camera import Camera
+from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
 from gausslite.domain.lens import Lens
 from gausslite.domain.pose import UpAxis, inverse
 from gausslite.domain.region import Region
 from gausslite.domain.trajectory import Trajectory
-from gausslite.errors import InvalidInputError
 
 _MAX_BASELINE_M = 1.0
 _MAX_ROTATION_DEG = 45.0

@@ -6,7 +6,7 @@ import math
 
 from gausslite.datasets.source import Source
 from gausslite.domain.camera import Camera
-from gausslite.errors import DatasetError, InvalidInputError
+from gausslite.domain.errors import DatasetError, InvalidInputError
 
 _DOWNSCALED_PIXELS = 320 * 240
 

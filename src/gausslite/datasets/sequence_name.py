@@ -7,8 +7,8 @@ from urllib.parse import parse_qsl
 
 from gausslite.datasets.open import is_simulated
 from gausslite.datasets.source import Source
+from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.names import require_name
-from gausslite.errors import InvalidInputError
 
 
 def sequence_name(spec: str, source: Source) -> str:

@@ -18,12 +18,12 @@ from gausslite.datasets.regions import regions_in_folder
 from gausslite.datasets.source import excluded_frames_note, require_frames, require_position
 from gausslite.datasets.text_files import parse_numbers, read_rows
 from gausslite.domain.camera import Camera
+from gausslite.domain.errors import DatasetError, PoseError
 from gausslite.domain.frame import Frame
 from gausslite.domain.lens import Lens
 from gausslite.domain.pose import UpAxis, unit_up_axis
 from gausslite.domain.region import Region
 from gausslite.domain.trajectory import Trajectory
-from gausslite.errors import DatasetError, PoseError
 
 _UNITS = DepthUnits(per_metre=1000.0, invalid=(0, 65535))
 _RATE_HZ = 30

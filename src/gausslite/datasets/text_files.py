@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from gausslite.errors import DatasetError
+from gausslite.domain.errors import DatasetError
 
 
 def read_text(path: Path) -> str:

@@ -18,12 +18,12 @@ from gausslite.datasets.regions import regions_in_folder
 from gausslite.datasets.source import excluded_frames_note, require_frames, require_position
 from gausslite.datasets.text_files import parse_numbers, read_rows
 from gausslite.domain.camera import Camera
+from gausslite.domain.errors import DatasetError
 from gausslite.domain.frame import Frame
 from gausslite.domain.lens import Lens, LensModel
 from gausslite.domain.pose import UpAxis, unit_up_axis
 from gausslite.domain.region import Region
 from gausslite.domain.trajectory import Trajectory
-from gausslite.errors import DatasetError
 
 _UNITS = DepthUnits(per_metre=5000.0)
 _MAX_DEPTH_LAG_S = 0.020

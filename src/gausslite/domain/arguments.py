@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numbers
 
-from gausslite.errors import InvalidInputError
+from gausslite.domain.errors import InvalidInputError
 
 
 def require_instance(name: str, value: object, kind: type | tuple[type, ...], expected: str) -> None:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from gausslite.errors import InvalidInputError, ShapeError
+from gausslite.domain.errors import InvalidInputError, ShapeError
 
 
 def require_array(name: str, value: NDArray[Any], shape: tuple[int | None, ...], dtype: DTypeLike) -> None:

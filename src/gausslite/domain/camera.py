@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float32, Float64
 from numpy import ndarray
 
-from gausslite.errors import InvalidInputError
+from gausslite.domain.errors import InvalidInputError
 
 _MAX_SIDE_PX = 16384
 _MAX_SLOPE = 100.0

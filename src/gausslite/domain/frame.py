@@ -10,8 +10,8 @@ from numpy import ndarray
 
 from gausslite.domain.arrays import require_array
 from gausslite.domain.camera import Camera
+from gausslite.domain.errors import InvalidInputError, PoseError
 from gausslite.domain.pose import require_rigid
-from gausslite.errors import InvalidInputError, PoseError
 
 _MAX_COORDINATE_M = 10_000.0
 """Farther from the world's origin, float32 no longer resolves a millimetre, and voxel keys overflow."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from gausslite.errors import InvalidInputError
+from gausslite.domain.errors import InvalidInputError
 
 MAX_NAME_BYTES = 255
 _MAX_QUOTED_CHARACTERS = 64

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float, Float64
 from numpy import ndarray
 
-from gausslite.errors import InvalidInputError, PoseError
+from gausslite.domain.errors import InvalidInputError, PoseError
 
 UpAxis = tuple[float, float, float]
 """Upward direction in a world frame."""

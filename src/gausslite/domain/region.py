@@ -10,9 +10,9 @@ from jaxtyping import Bool, Float, Int64
 from numpy import ndarray
 
 from gausslite.domain.camera import back_project, project
+from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import inverse, transform_points
-from gausslite.errors import InvalidInputError
 
 _MAX_COORDINATE_M = 1e6
 _NEAR_M = 1e-3

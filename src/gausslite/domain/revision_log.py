@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Int64
 from numpy import ndarray
 
-from gausslite.errors import RevisionGoneError
+from gausslite.domain.errors import RevisionGoneError
 
 MAX_REMOVED_VOXELS = 100_000
 

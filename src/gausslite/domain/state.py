@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from gausslite.domain.arrays import require_array
-from gausslite.errors import MapFileError
+from gausslite.domain.errors import MapFileError
 
 State = Mapping[str, NDArray[Any]]
 """Arrays by name; a component adds its name and a slash as the prefix of its parts' names."""

@@ -10,8 +10,8 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from gausslite.domain.arrays import require_array
+from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.pose import inverse
-from gausslite.errors import InvalidInputError
 
 _MIN_BASELINE_S = 1e-6
 

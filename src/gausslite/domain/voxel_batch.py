@@ -9,8 +9,8 @@ from jaxtyping import Int64, UInt32, UInt64
 from numpy import ndarray
 
 from gausslite.domain.arrays import require_array
+from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.gaussians import Gaussians
-from gausslite.errors import InvalidInputError
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -8,10 +8,10 @@ import numpy as np
 from jaxtyping import Bool, Int64, UInt64
 from numpy import ndarray
 
+from gausslite.domain.errors import MapFileError
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.state import State, get_array
 from gausslite.domain.voxel_operations import VoxelIndex
-from gausslite.errors import MapFileError
 
 
 @dataclass(frozen=True, slots=True, eq=False)

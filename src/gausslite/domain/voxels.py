@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64
 from numpy import ndarray
 
-from gausslite.errors import InvalidInputError
+from gausslite.domain.errors import InvalidInputError
 
 _BITS_PER_AXIS = 21
 _OFFSET = 1 << (_BITS_PER_AXIS - 1)

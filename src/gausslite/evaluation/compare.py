@@ -16,8 +16,8 @@ import numpy as np
 from jaxtyping import Float32, Shaped
 from numpy import ndarray
 
+from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.gaussians import Gaussians
-from gausslite.errors import InvalidInputError
 from gausslite.evaluation.metrics import covered_share, depth_l1_m, psnr, ssim_map
 from gausslite.evaluation.views import HeldOutView, MapViewer
 from gausslite.render.rasterizer import Rasterizer, Rendering

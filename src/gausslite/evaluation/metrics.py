@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float32, Float64, Shaped
 from numpy import ndarray
 
 from gausslite.domain.arrays import require_array
-from gausslite.errors import InvalidInputError, ShapeError
+from gausslite.domain.errors import InvalidInputError, ShapeError
 
 SSIM_WINDOW_PX = 11
 SSIM_SIGMA_PX = 1.5

@@ -9,9 +9,9 @@ from jaxtyping import Float32, UInt8
 from numpy import ndarray
 
 from gausslite.datasets.source import Source
+from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.region import Region
-from gausslite.errors import InvalidInputError
 from gausslite.evaluation.compare import MapScores, ViewScore, average, score_view
 from gausslite.evaluation.fitted import render_fitted
 from gausslite.evaluation.pictures import comparison_sheet

@@ -13,12 +13,12 @@ import numpy as np
 from jaxtyping import Int64
 from numpy import ndarray
 
+from gausslite.domain.errors import InvalidInputError, MismatchError, NotPermittedError, QuotaError, SessionUnknownError
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.names import quote_name, require_name
 from gausslite.domain.voxel_batch import RoiSubset, VoxelBatch
 from gausslite.domain.voxel_operations import group_by_voxel, select_voxels
 from gausslite.domain.voxels import VoxelGrid
-from gausslite.errors import InvalidInputError, MismatchError, NotPermittedError, QuotaError, SessionUnknownError
 from gausslite.fusion.change_log import ChangeLog
 from gausslite.fusion.keyframes import AgentKeyframe, KeyframePool
 from gausslite.fusion.limits import AgentUsage, FusionSettings

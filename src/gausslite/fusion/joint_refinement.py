@@ -14,9 +14,9 @@ import numpy as np
 from jaxtyping import Float32, Float64
 from numpy import ndarray
 
+from gausslite.domain.errors import InvalidInputError, QuotaError
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.pose import inverse
-from gausslite.errors import InvalidInputError, QuotaError
 from gausslite.fusion.keyframes import AgentKeyframe
 from gausslite.optimize.density import DensitySettings, densify, prune
 from gausslite.optimize.rates import REFINE_RATES

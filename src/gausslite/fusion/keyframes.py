@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from jaxtyping import Float32
 from numpy import ndarray
 
+from gausslite.domain.errors import InvalidInputError, QuotaError
 from gausslite.domain.frame import Frame
-from gausslite.errors import InvalidInputError, QuotaError
 
 
 @dataclass(frozen=True, slots=True, eq=False)

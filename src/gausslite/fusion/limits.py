@@ -6,10 +6,10 @@ from dataclasses import dataclass, field, fields
 
 import numpy as np
 
+from gausslite.domain.errors import InvalidInputError, QuotaError
 from gausslite.domain.names import quote_name, require_name
 from gausslite.domain.revision_log import MAX_REMOVED_VOXELS
 from gausslite.domain.voxels import VoxelGrid
-from gausslite.errors import InvalidInputError, QuotaError
 from gausslite.fusion.mission_config import MissionConfig
 from gausslite.fusion.store import VoxelScoreTable
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from gausslite.domain.errors import MismatchError
 from gausslite.domain.names import quote_name, require_name
-from gausslite.errors import MismatchError
 
 _DEFAULT_MISSION_ID, _DEFAULT_WORLD_FRAME = "mission", "world"
 

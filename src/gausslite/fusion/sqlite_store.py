@@ -15,8 +15,8 @@ from jaxtyping import Int64
 from numpy import ndarray
 
 from gausslite.codec.records import from_bytes, to_records
+from gausslite.domain.errors import StorageError
 from gausslite.domain.voxel_batch import RoiSubset, VoxelBatch
-from gausslite.errors import StorageError
 from gausslite.fusion.mission_config import MissionConfig
 from gausslite.fusion.store import PutOutcome, SessionRecord, VoxelScoreTable, require_storable
 

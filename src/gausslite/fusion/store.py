@@ -14,8 +14,8 @@ import numpy as np
 from jaxtyping import Int32, Int64, UInt32, UInt64
 from numpy import ndarray
 
+from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.voxel_batch import RoiSubset, VoxelBatch
-from gausslite.errors import InvalidInputError
 from gausslite.fusion.mission_config import MissionConfig
 
 

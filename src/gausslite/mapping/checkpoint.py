@@ -10,10 +10,10 @@ from numpy import ndarray
 from numpy.typing import NDArray
 
 from gausslite.domain.camera import Camera
+from gausslite.domain.errors import MapFileError
 from gausslite.domain.frame import Frame
 from gausslite.domain.relevance import RelevanceMap
 from gausslite.domain.state import State, get_array, get_floats, int_array
-from gausslite.errors import MapFileError
 
 _LOW_64_BITS = (1 << 64) - 1
 

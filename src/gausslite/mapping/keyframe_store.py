@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gausslite.domain.errors import MapFileError
 from gausslite.domain.frame import Frame
 from gausslite.domain.relevance import RelevanceMap
 from gausslite.domain.state import State, add_prefix, get_counts, int_array, select_prefix
-from gausslite.errors import MapFileError
 from gausslite.mapping.keyframes import Keyframe, WindowView, is_same_frame, tiles_touching
 from gausslite.mapping.settings import KeyframeSettings
 from gausslite.render.rasterizer import Subset

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Collection
 from dataclasses import replace
 
-from gausslite.errors import InvalidInputError
+from gausslite.domain.errors import InvalidInputError
 from gausslite.mapping.baselines import gaussian_slam_policy, monogs_policy, splatam_policy, uniform_policy
 from gausslite.mapping.settings import (
     ActivePhase,

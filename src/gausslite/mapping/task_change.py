@@ -10,9 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
 from gausslite.domain.relevance import NO_TARGET, RelevanceMap
-from gausslite.errors import InvalidInputError
 from gausslite.mapping.coverage import visible_means
 from gausslite.optimize.splat_table import SplatTable
 

@@ -9,7 +9,7 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import partial
 
-from gausslite.errors import InvalidInputError
+from gausslite.domain.errors import InvalidInputError
 from gausslite.mapping.stages import ITERATION_STAGES, SkippableStage, Stage
 
 Clock = Callable[[], float]

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 from gausslite.datasets.held_out import HeldOutSplit
 from gausslite.datasets.selection import frame_size, select_frames
 from gausslite.datasets.source import Source
+from gausslite.domain.errors import DatasetError, PoseError
 from gausslite.domain.frame import Frame
-from gausslite.errors import DatasetError, PoseError
 from gausslite.mission.settings import SourceSettings
 
 OnCorrupt = Callable[[int, DatasetError | PoseError], None]

@@ -12,8 +12,8 @@ from pathlib import Path
 
 from gausslite.codec.files import write_atomic
 from gausslite.codec.ply import write_ply
+from gausslite.domain.errors import StorageError
 from gausslite.domain.gaussians import Gaussians
-from gausslite.errors import StorageError
 
 _MAP, _REPORT = "map.ply", "report.json"
 PREVIEW = "preview.png"

@@ -6,8 +6,8 @@ import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 
+from gausslite.domain.errors import GaussLiteError
 from gausslite.domain.frame import Frame
-from gausslite.errors import GaussLiteError
 from gausslite.interrupts import DeferredInterrupt
 from gausslite.mission.task_mapper import FrameOutcome
 

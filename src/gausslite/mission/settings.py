@@ -11,9 +11,9 @@ from gausslite.datasets.camera_correction import CameraCorrection
 from gausslite.datasets.registered_source import DepthRegistration
 from gausslite.datasets.source import Source
 from gausslite.domain.arguments import require_instance, require_number, require_whole
+from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.pose import UpAxis
 from gausslite.domain.region import BallRegion, Region
-from gausslite.errors import InvalidInputError
 from gausslite.mapping.policies import disable, policy
 from gausslite.mapping.settings import MapperSettings
 from gausslite.mapping.stages import SkippableStage

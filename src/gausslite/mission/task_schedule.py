@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
 from gausslite.domain.task import TaskGraph
-from gausslite.errors import InvalidInputError
 from gausslite.mission.build import EstimatorFactory
 from gausslite.mission.task_mapper import FrameOutcome, TaskMapper
 

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO, Final
 
-from gausslite.errors import (
+from gausslite.domain.errors import (
     ChecksumError,
     GaussLiteError,
     InvalidInputError,

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from gausslite.codec.files import write_atomic
-from gausslite.errors import ChecksumError, InvalidInputError
+from gausslite.domain.errors import ChecksumError, InvalidInputError
 from gausslite.models.catalogue import ModelEntry
 from gausslite.models.download import DownloadRequest, Progress, download
 from gausslite.perception.model_file import CHECKSUM_FILE, listed_checksum, sha256_of

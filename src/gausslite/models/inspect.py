@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from gausslite.errors import ModelFileError
+from gausslite.domain.errors import ModelFileError
 from gausslite.perception.model_file import (
     CHECKSUM_FILE,
     listed_checksum,

@@ -9,9 +9,9 @@ from jaxtyping import Bool, Float32, Int, Int16, Int64, UInt32
 from numpy import ndarray
 
 from gausslite.domain.arrays import require_array, require_finite
+from gausslite.domain.errors import InvalidInputError, MapFileError, QuotaError
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.state import State, get_array
-from gausslite.errors import InvalidInputError, MapFileError, QuotaError
 from gausslite.optimize.row_encoding import allocate_rows, decode_opacities, gaussians_to_rows, rows_to_gaussians
 from gausslite.render.rasterizer import GRAD_2D_SUM, LOG_SCALE, MEAN, OPACITY_LOGIT, RGB, ROW_WIDTH, UPDATE_COUNT
 

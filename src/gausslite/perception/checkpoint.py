@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gausslite.domain.camera import Camera
+from gausslite.domain.errors import MapFileError
 from gausslite.domain.pose import require_rigid
 from gausslite.domain.relevance import Detection
 from gausslite.domain.state import State, encode_text, get_array, get_counts, get_floats, get_text, int_array
-from gausslite.errors import MapFileError
 from gausslite.perception.object_map import Landmark
 from gausslite.perception.reproject import Frustum
 

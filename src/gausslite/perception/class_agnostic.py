@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from jaxtyping import Bool, Float32
 from numpy import ndarray
 
+from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
-from gausslite.errors import InvalidInputError
 from gausslite.perception.detect import box_iou
 from gausslite.perception.yolo_decode import suppress
 from gausslite.perception.yolo_network import YoloSegNetwork

@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 from numpy import ndarray
 
+from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
-from gausslite.errors import InvalidInputError
 
 _NO_DEPTH: Final = -9.0
 _CENTRE_INSET: Final = 0.25

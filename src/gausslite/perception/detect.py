@@ -10,9 +10,9 @@ import numpy as np
 from jaxtyping import Bool, Float32
 from numpy import ndarray
 
+from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
 from gausslite.domain.relevance import Detection
-from gausslite.errors import InvalidInputError
 from gausslite.perception.vocabulary import is_furniture, is_generic, is_surface
 
 

@@ -10,9 +10,9 @@ from jaxtyping import Float32
 from numpy import ndarray
 
 from gausslite.domain.camera import project
+from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import inverse, transform_points
-from gausslite.errors import InvalidInputError
 from gausslite.perception.object_map import Landmark
 
 _RELIABLE_FACTOR: Final = 3

@@ -8,11 +8,11 @@ import numpy as np
 from jaxtyping import Float32
 from numpy import ndarray
 
+from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
 from gausslite.domain.region import Region
 from gausslite.domain.relevance import NO_TARGET, RelevanceMap
 from gausslite.domain.state import State
-from gausslite.errors import InvalidInputError
 from gausslite.perception.relevance_estimator import RelevanceEstimate
 
 

@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Float32, Int64, UInt8
 from numpy import ndarray
 
+from gausslite.domain.errors import InvalidInputError, ModelFileError
 from gausslite.domain.frame import Frame
-from gausslite.errors import InvalidInputError, ModelFileError
 from gausslite.perception.detect import BoxFractions, DetectedBox, concerns_many_objects
 from gausslite.perception.grounding_text import PhraseInput, Tokenizer, encode_phrase
 from gausslite.perception.model_file import OpenModel, run_once

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Int64
 from numpy import ndarray
 
-from gausslite.errors import KernelError, ModelFileError
+from gausslite.domain.errors import KernelError, ModelFileError
 from gausslite.perception.vocabulary import head_of
 
 _UNKNOWN: Final = "[UNK]"

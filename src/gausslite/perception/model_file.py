@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO, Final
 
-from gausslite.errors import InvalidInputError, ModelFileError
+from gausslite.domain.errors import InvalidInputError, ModelFileError
 
 CHECKSUM_FILE: Final = "SHA256SUMS"
 """Optional list of checksums in a model's folder, in the format of `sha256sum`; listed files must match."""

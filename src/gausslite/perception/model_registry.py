@@ -6,7 +6,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Final
 
-from gausslite.errors import InvalidInputError, ModelFileError
+from gausslite.domain.errors import InvalidInputError, ModelFileError
 from gausslite.perception.detect import Detector, SegmentedDetector, Segmenter
 from gausslite.perception.model_file import OpenModel, open_model
 from gausslite.perception.yolo_decode import MASK_COEFFICIENTS

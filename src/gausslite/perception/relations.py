@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Float32, Float64
 from numpy import ndarray
 
+from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.task import Predicate
-from gausslite.errors import InvalidInputError
 from gausslite.perception.object_map import Landmark, Observation
 
 _FOOTPRINT_SLACK_M = 0.10

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float32
 from numpy import ndarray
 
-from gausslite.errors import ModelFileError
+from gausslite.domain.errors import ModelFileError
 from gausslite.perception.vocabulary import SYNONYMS, bare_name, head_of, is_generic, is_structure
 
 _MIN_SIMILARITY: Final = 0.5

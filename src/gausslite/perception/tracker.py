@@ -11,12 +11,12 @@ from jaxtyping import Float32, Float64
 from numpy import ndarray
 from numpy.typing import NDArray
 
+from gausslite.domain.errors import InvalidInputError, MapFileError
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import UpAxis, require_rigid, rotation_angle_deg, translation_m, unit_up_axis
 from gausslite.domain.relevance import NO_TARGET, Detection, RelevanceMap
 from gausslite.domain.state import State, add_prefix, get_array, get_counts, int_array, select_prefix
 from gausslite.domain.task import TaskGraph
-from gausslite.errors import InvalidInputError, MapFileError
 from gausslite.perception.checkpoint import decode_frustum, decode_landmark, encode_frustum, encode_landmark
 from gausslite.perception.detect import Segmenter
 from gausslite.perception.evidence import EvidenceSettings, VisibilityCheck

@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from gausslite.domain.errors import InvalidInputError, ModelFileError
 from gausslite.domain.frame import Frame
 from gausslite.domain.relevance import Detection
-from gausslite.errors import InvalidInputError, ModelFileError
 from gausslite.perception.class_agnostic import ClassAgnosticSegmenter
 from gausslite.perception.detect import BoxFractions, DetectedBox, concerns_many_objects
 from gausslite.perception.model_file import OpenModel

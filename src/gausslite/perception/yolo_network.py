@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Bool, Float32
 from numpy import ndarray
 
+from gausslite.domain.errors import ModelFileError
 from gausslite.domain.frame import Frame
-from gausslite.errors import ModelFileError
 from gausslite.perception.model_file import OpenModel, run_once
 from gausslite.perception.yolo_decode import MASK_COEFFICIENTS, Candidates, Letterbox, decode, letterbox, mask_of
 

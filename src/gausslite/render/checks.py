@@ -8,7 +8,7 @@ from numpy import ndarray
 
 from gausslite.domain.arrays import require_array
 from gausslite.domain.camera import Camera
-from gausslite.errors import InvalidInputError, ShapeError
+from gausslite.domain.errors import InvalidInputError, ShapeError
 from gausslite.render.rasterizer import ROW_WIDTH, TILE_PX, Rendering, Subset, UpdateCounter
 
 

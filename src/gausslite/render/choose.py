@@ -5,7 +5,7 @@ from __future__ import annotations
 from importlib.util import find_spec
 from pathlib import Path
 
-from gausslite.errors import KernelError
+from gausslite.domain.errors import KernelError
 from gausslite.render.rasterizer import Rasterizer
 
 BACKENDS = ("auto", "cpu", "cuda", "reference")

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float32, Float64, UInt8, UInt32
 from numpy import ndarray
 
 from gausslite.domain.camera import Camera
-from gausslite.errors import InvalidInputError, KernelError, ShapeError
+from gausslite.domain.errors import InvalidInputError, KernelError, ShapeError
 from gausslite.render.checks import (
     require_image_gradients,
     require_scene,

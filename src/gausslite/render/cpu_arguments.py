@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float32, Float64
 from numpy import ndarray
 
 from gausslite.domain.camera import Camera
-from gausslite.errors import InvalidInputError
+from gausslite.domain.errors import InvalidInputError
 from gausslite.render.checks import require_row_masks, require_scene, require_tables
 from gausslite.render.cpu_kernels import load_kernels
 from gausslite.render.rasterizer import AdamSettings, LossWeights, Subset, UpdateCounter

@@ -7,7 +7,7 @@ import os
 from pathlib import Path
 from typing import Any
 
-from gausslite.errors import KernelError
+from gausslite.domain.errors import KernelError
 
 SIMD_VARIABLE = "GAUSSLITE_SIMD"
 MAX_THREADS = 256

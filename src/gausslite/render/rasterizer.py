@@ -31,7 +31,7 @@ from jaxtyping import Bool, Float32, Float64, UInt8, UInt32
 from numpy import ndarray
 
 from gausslite.domain.camera import Camera
-from gausslite.errors import InvalidInputError
+from gausslite.domain.errors import InvalidInputError
 
 ROW_WIDTH = 16
 MEAN, LOG_SCALE, QUAT, OPACITY_LOGIT, RGB = slice(0, 3), slice(3, 6), slice(6, 10), 10, slice(11, 14)

@@ -7,7 +7,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Final
 
-from gausslite.errors import InvalidInputError
+from gausslite.domain.errors import InvalidInputError
 from gausslite.task.language.model import LanguageModel
 from gausslite.task.parser import TaskParser
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
+from gausslite.domain.errors import TaskError
 from gausslite.domain.task import Relation, TaskGraph
-from gausslite.errors import TaskError
 from gausslite.task import lexicon
 from gausslite.task.chunker import chunk_sentence
 from gausslite.task.graph_builder import build_draft

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from gausslite.domain.errors import TaskError
 from gausslite.domain.task import TaskGraph
-from gausslite.errors import TaskError
 from gausslite.task.chunk import Chunk, ChunkKind
 from gausslite.task.chunker import chunk_sentence
 from gausslite.task.graph_builder import build_draft

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from gausslite.domain.errors import TaskError
 from gausslite.domain.task import TaskGraph
-from gausslite.errors import TaskError
 
 EXAMPLE = "'Pick up the mug on the table'"
 

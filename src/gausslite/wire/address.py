@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from gausslite.errors import InvalidInputError
+from gausslite.domain.errors import InvalidInputError
 
 UNIX = "unix:"
 _LAST_PORT = 65535

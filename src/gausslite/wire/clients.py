@@ -14,10 +14,10 @@ from numpy import ndarray
 
 from gausslite.codec.subset_codec import CodecLimits
 from gausslite.domain.camera import Camera
+from gausslite.domain.errors import ChecksumError, CodecError
 from gausslite.domain.frame import Frame
 from gausslite.domain.task import TaskGraph
 from gausslite.domain.voxels import AxisAlignedBox, VoxelGrid
-from gausslite.errors import ChecksumError, CodecError
 from gausslite.v1 import (
     agent_service_pb2,
     agent_service_pb2_grpc,

@@ -10,13 +10,13 @@ from numpy import ndarray
 
 from gausslite.codec.subset_codec import CodecLimits, decode_subset
 from gausslite.domain.camera import Camera
+from gausslite.domain.errors import InvalidInputError, TaskError
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import require_rigid
 from gausslite.domain.task import Predicate, Relation, TaskGraph
 from gausslite.domain.voxel_batch import VoxelBatch
 from gausslite.domain.voxel_operations import empty_batch, merge_batches, select_voxels
 from gausslite.domain.voxels import AxisAlignedBox, VoxelGrid
-from gausslite.errors import InvalidInputError, TaskError
 from gausslite.task.validate import require_graph
 from gausslite.v1 import gaussians_pb2, geometry_pb2, task_pb2
 from gausslite.wire.images import decode_colour, decode_depth, encode_colour, encode_depth

@@ -5,7 +5,7 @@ from __future__ import annotations
 import grpc
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 
-from gausslite.errors import UnavailableError
+from gausslite.domain.errors import UnavailableError
 from gausslite.wire.status import from_rpc_error
 from gausslite.wire.tls import Tls, open_channel
 

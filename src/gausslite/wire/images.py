@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 from numpy import ndarray
 
+from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.image_bytes import image_size
-from gausslite.errors import InvalidInputError
 
 JPEG_QUALITY = 95
 _MM_PER_M = 1000.0

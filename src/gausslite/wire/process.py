@@ -7,7 +7,7 @@ import logging
 import sys
 from collections.abc import Awaitable, Callable
 
-from gausslite.errors import GaussLiteError
+from gausslite.domain.errors import GaussLiteError
 from gausslite.messages import print_message, printable
 
 

@@ -21,7 +21,7 @@ from google.protobuf.message import DecodeError
 from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection
 
-from gausslite.errors import GaussLiteError, InvalidInputError, UnavailableError
+from gausslite.domain.errors import GaussLiteError, InvalidInputError, UnavailableError
 from gausslite.wire.address import UNIX, host_and_port
 from gausslite.wire.connection import KEEPALIVE_S, connection_options
 from gausslite.wire.status import to_status

@@ -21,9 +21,9 @@ from jaxtyping import Int64
 from numpy import ndarray
 
 from gausslite.codec.records import from_bytes, to_records
+from gausslite.domain.errors import MismatchError, StorageError
 from gausslite.domain.voxel_batch import VoxelBatch
 from gausslite.domain.voxels import VoxelGrid
-from gausslite.errors import MismatchError, StorageError
 
 _WIRE_BYTES_PER_GAUSSIAN, _WIRE_BYTES_PER_VOXEL = 20, 20
 _MAX_INTEGER = (1 << 63) - 1

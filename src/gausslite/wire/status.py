@@ -11,8 +11,8 @@ from google.protobuf import any_pb2
 from google.rpc import code_pb2, error_details_pb2, status_pb2  # type: ignore[import-untyped]
 from grpc_status import rpc_status
 
-from gausslite import errors
-from gausslite.errors import GaussLiteError
+from gausslite.domain import errors
+from gausslite.domain.errors import GaussLiteError
 
 DOMAIN = "gausslite"
 

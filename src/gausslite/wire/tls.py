@@ -10,7 +10,7 @@ from typing import Any, NoReturn
 
 import grpc
 
-from gausslite.errors import InvalidInputError, NotPermittedError
+from gausslite.domain.errors import InvalidInputError, NotPermittedError
 
 _NAMES = ("x509_common_name", "x509_subject_alternative_name")
 _CERTIFICATE = "x509_pem_cert"

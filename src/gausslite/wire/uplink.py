@@ -14,9 +14,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 from gausslite.codec.subset_codec import MAX_SUBSET_BYTES, encode_subset, split_batch
-from gausslite.domain.voxel_batch import RoiSubset, VoxelBatch
-from gausslite.domain.voxels import VoxelGrid
-from gausslite.errors import (
+from gausslite.domain.errors import (
     GaussLiteError,
     InvalidInputError,
     MismatchError,
@@ -26,6 +24,8 @@ from gausslite.errors import (
     StorageError,
     UnavailableError,
 )
+from gausslite.domain.voxel_batch import RoiSubset, VoxelBatch
+from gausslite.domain.voxels import VoxelGrid
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.wire.clients import FusionClient, Session
 from gausslite.wire.spool import Purpose, Spool, SpoolBatch

@@ -6,7 +6,7 @@ import argparse
 import json
 
 from gausslite.config.switches import add_switch
-from gausslite.errors import KernelError
+from gausslite.domain.errors import KernelError
 from gausslite.render.choose import choose_rasterizer
 from gausslite_bench.cli.argument_types import read_counts
 from gausslite_bench.raster.gpu_rates import GPU_GAUSSIANS, PAPER_FRAME_MS, FrameCost, GpuBench, StepRate

@@ -15,8 +15,8 @@ from gausslite.config.switches import add_switch
 from gausslite.datasets.held_out import HeldOutSplit
 from gausslite.datasets.selection import frame_size, select_frames
 from gausslite.datasets.source import Source
+from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.voxels import VoxelGrid
-from gausslite.errors import InvalidInputError
 from gausslite.evaluation.views import HeldOutView
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.policies import TASK

@@ -15,8 +15,8 @@ from gausslite.config.switches import add_switch
 from gausslite.config.values import read_names
 from gausslite.datasets.selection import frame_size, select_frames
 from gausslite.datasets.source import Source
+from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.region import Region
-from gausslite.errors import InvalidInputError
 from gausslite.evaluation.pictures import write_png
 from gausslite.mission.results import as_text, prepare_folder
 from gausslite.perception.vocabulary import head_of, same_kind

@@ -14,7 +14,7 @@ from gausslite.config.switches import add_switch
 from gausslite.config.values import AUTO, read_names, read_up_axis
 from gausslite.datasets.regions import REGIONS_FILE
 from gausslite.datasets.selection import downscaled_size
-from gausslite.errors import InvalidInputError
+from gausslite.domain.errors import InvalidInputError
 from gausslite.mapping.policies import POLICIES
 from gausslite.mission.settings import PerceptionSettings
 from gausslite_bench.cli.argument_types import read_image_size, read_seeds

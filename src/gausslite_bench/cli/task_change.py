@@ -11,7 +11,7 @@ from pathlib import Path
 from gausslite.codec.files import write_atomic
 from gausslite.config.switches import add_switch
 from gausslite.config.values import read_names
-from gausslite.errors import InvalidInputError
+from gausslite.domain.errors import InvalidInputError
 from gausslite.mission.results import prepare_folder, write_json
 from gausslite.mission.settings import MissionSettings
 from gausslite_bench.plots import require_matplotlib, write_curves

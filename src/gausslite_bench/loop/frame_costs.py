@@ -8,10 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gausslite.domain.errors import DatasetError
 from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.voxels import VoxelGrid
-from gausslite.errors import DatasetError
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.sent_voxels import SentVoxelTracker
 from gausslite.mapping.stages import SkippableStage, Stage

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gausslite.errors import InvalidInputError
+from gausslite.domain.errors import InvalidInputError
 
 _STATM = Path("/proc/self/statm")
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from gausslite.domain.errors import DatasetError
 from gausslite.domain.gaussians import Gaussians
-from gausslite.errors import DatasetError
 from gausslite.evaluation.compare import evaluate
 from gausslite.evaluation.views import HeldOutView
 from gausslite.render.rasterizer import Rasterizer

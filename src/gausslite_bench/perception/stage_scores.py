@@ -10,12 +10,12 @@ import numpy as np
 from jaxtyping import Bool
 from numpy import ndarray
 
+from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import UpAxis
 from gausslite.domain.region import Region
 from gausslite.domain.relevance import Detection
 from gausslite.domain.task import TaskGraph
-from gausslite.errors import InvalidInputError
 from gausslite.evaluation.views import MIN_ROI_PIXELS
 from gausslite.perception.detect import Detector, Segmenter
 from gausslite.perception.evidence import EvidenceSettings

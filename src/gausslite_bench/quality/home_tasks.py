@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
-from gausslite.errors import InvalidInputError
+from gausslite.domain.errors import InvalidInputError
 
 
 class TaskKind(StrEnum):

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float32, Shaped
 from numpy import ndarray
 
-from gausslite.errors import InvalidInputError, ModelFileError, ShapeError
+from gausslite.domain.errors import InvalidInputError, ModelFileError, ShapeError
 
 if TYPE_CHECKING:
     from torch import Tensor

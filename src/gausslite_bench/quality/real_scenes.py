@@ -17,8 +17,8 @@ from gausslite.datasets.open import open_source
 from gausslite.datasets.regions import balls_for_small_objects, choose_regions, load_voxel_regions
 from gausslite.datasets.registered_source import DepthRegistration
 from gausslite.datasets.source import Source
+from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.pose import UpAxis
-from gausslite.errors import InvalidInputError
 from gausslite.evaluation.views import MIN_ROI_PIXELS, HeldOutView
 from gausslite.mission.settings import SceneInfo
 from gausslite.perception.vocabulary import head_of

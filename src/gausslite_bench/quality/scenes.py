@@ -11,11 +11,11 @@ from jaxtyping import Float32
 from numpy import ndarray
 
 from gausslite.calibration.pose_exposure_prior import PoseExposurePrior
+from gausslite.domain.errors import DatasetError, InvalidInputError
 from gausslite.domain.frame import Frame
 from gausslite.domain.region import Region
 from gausslite.domain.relevance import RelevanceMap
 from gausslite.domain.state import State
-from gausslite.errors import DatasetError, InvalidInputError
 from gausslite.evaluation.views import HeldOutView
 from gausslite.mission.settings import SceneInfo
 from gausslite.perception.fixed_relevance import RegionRelevanceEstimator

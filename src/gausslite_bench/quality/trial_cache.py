@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float32
 from numpy import ndarray
 
-from gausslite.errors import GaussLiteError, StorageError
+from gausslite.domain.errors import GaussLiteError, StorageError
 from gausslite.evaluation.pictures import comparison_sheet, write_png
 from gausslite.evaluation.views import largest_roi_views
 from gausslite.mission.results import prepare_folder, write_json

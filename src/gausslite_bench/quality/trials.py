@@ -14,8 +14,8 @@ from typing import Any
 from jaxtyping import UInt8
 from numpy import ndarray
 
+from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.gaussians import Gaussians
-from gausslite.errors import InvalidInputError
 from gausslite.evaluation.compare import MapScores, PerceptualDistance, average, score_view
 from gausslite.evaluation.fitted import render_fitted
 from gausslite.evaluation.pictures import to_uint8

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float32
 from numpy import ndarray
 
-from gausslite.errors import KernelError
+from gausslite.domain.errors import KernelError
 from gausslite.optimize.splat_table import SplatTable
 from gausslite.render.rasterizer import ROW_WIDTH, TILE_PX
 from gausslite_bench.raster.procedural_room import BenchView

@@ -12,10 +12,10 @@ import numpy as np
 from jaxtyping import Bool
 from numpy import ndarray
 
+from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import inverse
 from gausslite.domain.relevance import RelevanceMap
-from gausslite.errors import InvalidInputError
 from gausslite.mapping.keyframes import tiles_touching
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.settings import MapperSettings

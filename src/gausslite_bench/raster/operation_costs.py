@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gausslite.errors import InvalidInputError
+from gausslite.domain.errors import InvalidInputError
 from gausslite.optimize.splat_table import SplatTable
 from gausslite.render.cpu import CpuRasterizer
 from gausslite.render.cpu_kernels import core_clock_ghz

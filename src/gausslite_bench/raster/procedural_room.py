@@ -14,8 +14,8 @@ from jaxtyping import Float32, Float64, Int64, UInt8
 from numpy import ndarray
 
 from gausslite.domain.camera import Camera, lift
+from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.pose import inverse, transform_points
-from gausslite.errors import InvalidInputError
 from gausslite.render.rasterizer import LOG_SCALE, MEAN, OPACITY_LOGIT, QUAT, RGB, ROW_WIDTH
 
 SEED_VIEWS = 12

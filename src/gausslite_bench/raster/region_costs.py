@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Int
 from numpy import ndarray
 
-from gausslite.errors import InvalidInputError
+from gausslite.domain.errors import InvalidInputError
 from gausslite.optimize.splat_table import SplatTable
 from gausslite.render.cpu import CpuRasterizer
 from gausslite.render.rasterizer import TILE_PX, LossWeights

@@ -33,7 +33,7 @@ WRONG = {
 PROGRAM = """
 import json, sys
 import gausslite as gl
-from gausslite.errors import InvalidInputError
+from gausslite.domain.errors import InvalidInputError
 home = gl.open_sequence("sim:home")
 messages = {}
 for call in json.load(sys.stdin):

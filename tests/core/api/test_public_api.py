@@ -12,7 +12,7 @@ import pytest
 
 import gausslite as gl
 from gausslite.cli.main import main
-from gausslite.errors import DatasetError, InvalidInputError, MapFileError, PoseError
+from gausslite.domain.errors import DatasetError, InvalidInputError, MapFileError, PoseError
 
 FRAMES, SIZE = "0:6", (160, 120)
 TASK = "Pick up the mug on the table"

@@ -12,10 +12,10 @@ from gausslite.calibration.pose_exposure_error import estimate_pose_exposure_pri
 from gausslite.datasets.images import RgbdImage, resize_rgbd
 from gausslite.datasets.open import open_source
 from gausslite.datasets.source import Source
+from gausslite.domain.errors import DatasetError
 from gausslite.domain.frame import Frame
 from gausslite.domain.region import Region
 from gausslite.domain.trajectory import Trajectory
-from gausslite.errors import DatasetError
 
 FRAMES = 40
 pytest.importorskip("embreex", reason="the simulated home needs the extra `sim`")

@@ -15,11 +15,11 @@ from gausslite.datasets.intrinsics import FileIntrinsics
 from gausslite.datasets.open import open_source
 from gausslite.datasets.registered_source import DepthRegistration, register_depth
 from gausslite.domain.camera import Camera
+from gausslite.domain.errors import DatasetError
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import inverse
 from gausslite.domain.region import Region
 from gausslite.domain.trajectory import Trajectory
-from gausslite.errors import DatasetError
 
 DEPTH_CAMERA = Camera(300.0, 300.0, 162.0, 118.5, 320, 240)
 

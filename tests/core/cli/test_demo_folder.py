@@ -8,7 +8,7 @@ import pytest
 
 from gausslite.cli.demo.results_folder import remove_results, require_no_demo
 from gausslite.cli.main import main
-from gausslite.errors import StorageError
+from gausslite.domain.errors import StorageError
 
 
 @pytest.mark.parametrize("name", ["report.json", "fusion.sqlite", "agent-b/map.ply"])

@@ -15,7 +15,7 @@ from gausslite.cli.demo.service_processes import ServiceProcess
 from gausslite.cli.demo.services import DemoPlan, RunningService, RunningServices, watch_missions
 from gausslite.config.mapping_options import mission_options, perception_options
 from gausslite.config.toml_text import to_toml
-from gausslite.errors import UnavailableError
+from gausslite.domain.errors import UnavailableError
 from gausslite.mapping.stages import SkippableStage
 from gausslite.mission.settings import MissionSettings, PerceptionSettings
 from gausslite_agent.settings import parse_arguments

@@ -20,8 +20,8 @@ from gausslite.codec.ply import (
     world_frame_from_ply,
     write_ply,
 )
+from gausslite.domain.errors import InvalidInputError, MapFileError, StorageError
 from gausslite.domain.gaussians import Gaussians
-from gausslite.errors import InvalidInputError, MapFileError, StorageError
 
 
 def assert_same(got: Gaussians, sent: Gaussians) -> None:

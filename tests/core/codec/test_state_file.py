@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from gausslite.codec.state_file import FORMAT, read_state, write_state
-from gausslite.errors import MapFileError, StorageError
+from gausslite.domain.errors import MapFileError, StorageError
 
 U8 = {"dtype": "U8", "shape": [1], "data_offsets": [0, 1]}
 METADATA = {"format": FORMAT, "version": "2", "crc32": "ffffffff"}

@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 
 from gausslite.codec.columns import RGB_MAX, RGB_MIN, SCALE_MAX_M, SCALE_MIN_M
 from gausslite.codec.subset_codec import CodecLimits, decode_subset, encode_subset, split_batch
+from gausslite.domain.errors import ChecksumError, CodecError, InvalidInputError
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.voxel_batch import RoiSubset, VoxelBatch
 from gausslite.domain.voxels import VoxelGrid
-from gausslite.errors import ChecksumError, CodecError, InvalidInputError
 
 SIZES_M = [0.1, 0.05, 0.125, 0.1 / 3, 65535 * 2.0**-20, 1.0]
 

@@ -16,7 +16,7 @@ import gausslite_parser.settings as parser_service
 from gausslite.config.known_options import KNOWN_OPTIONS
 from gausslite.config.layers import parse_options
 from gausslite.config.option_table import OptionTable
-from gausslite.errors import InvalidInputError
+from gausslite.domain.errors import InvalidInputError
 
 SERVICES = (agent, fusion_server, parser_service)
 

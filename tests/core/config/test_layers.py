@@ -17,7 +17,7 @@ from gausslite.config.mapping_options import add_budget, add_policy
 from gausslite.config.task_parser_options import add_backend
 from gausslite.config.toml_text import to_toml
 from gausslite.config.values import read_names
-from gausslite.errors import InvalidInputError
+from gausslite.domain.errors import InvalidInputError
 
 
 def program() -> argparse.ArgumentParser:

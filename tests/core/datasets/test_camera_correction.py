@@ -13,10 +13,10 @@ from gausslite.datasets.corrected_source import CorrectedSource
 from gausslite.datasets.intrinsics import read_folder_camera
 from gausslite.datasets.open import open_source
 from gausslite.domain.camera import Camera
+from gausslite.domain.errors import DatasetError, InvalidInputError
 from gausslite.domain.frame import Frame
 from gausslite.domain.lens import Lens, LensModel
 from gausslite.domain.trajectory import Twist
-from gausslite.errors import DatasetError, InvalidInputError
 
 CAMERA = Camera(160.0, 160.0, 100.0, 75.0, 200, 150)
 STILL = Twist(np.zeros(3), np.zeros(3))

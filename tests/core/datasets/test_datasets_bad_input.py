@@ -14,7 +14,7 @@ from tiny_sequences import IDENTITY_ROWS, write_colour, write_depth, write_repli
 
 from gausslite.datasets.open import open_source
 from gausslite.datasets.regions import load_voxel_regions
-from gausslite.errors import DatasetError, GaussLiteError, PoseError
+from gausslite.domain.errors import DatasetError, GaussLiteError, PoseError
 
 WRITERS = {"tum": write_tum, "seven": write_seven_scenes, "replica": write_replica}
 FOLDERS = {"tum": "fr1", "seven": "seq", "replica": "office0"}

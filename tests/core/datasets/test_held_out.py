@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gausslite.datasets.held_out import HeldOutSplit
-from gausslite.errors import InvalidInputError
+from gausslite.domain.errors import InvalidInputError
 
 
 def test_every_eighth_position_is_a_test_frame_by_default() -> None:

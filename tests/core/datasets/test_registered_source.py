@@ -13,7 +13,7 @@ from gausslite.datasets.intrinsics import FileIntrinsics
 from gausslite.datasets.open import open_source
 from gausslite.datasets.registered_source import DepthRegistration, RegisteredSource, register_depth
 from gausslite.domain.camera import Camera
-from gausslite.errors import InvalidInputError
+from gausslite.domain.errors import InvalidInputError
 from gausslite_agent.settings import parse_arguments
 
 DEPTH = Camera(100.0, 100.0, 64.0, 48.0, 128, 96)

@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
+from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.lens import Lens
-from gausslite.errors import InvalidInputError
 
 SLOPES = np.random.default_rng(0).uniform(-0.7, 0.7, (2, 200))
 RAYS = np.stack([*SLOPES, np.ones(SLOPES.shape[1])], axis=1)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.trajectory import Trajectory, Twist
-from gausslite.errors import InvalidInputError
 
 
 def test_twist_of_a_constant_motion_is_found_at_every_pose() -> None:

@@ -9,10 +9,10 @@ import pytest
 from sample_gaussians import plain_gaussians
 
 from gausslite.domain.camera import Camera
+from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.region import BallRegion
-from gausslite.errors import InvalidInputError
 from gausslite.evaluation.compare import MAX_PSNR_DB, average, evaluate, score_view
 from gausslite.evaluation.metrics import psnr
 from gausslite.evaluation.views import HeldOutView, MapViewer

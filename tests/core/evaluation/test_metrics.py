@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gausslite.errors import InvalidInputError, ShapeError
+from gausslite.domain.errors import InvalidInputError, ShapeError
 from gausslite.evaluation.metrics import covered_share, depth_l1_m, psnr, ssim, ssim_map
 
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from gausslite.domain.camera import Camera
+from gausslite.domain.errors import ShapeError, StorageError
 from gausslite.domain.frame import Frame
-from gausslite.errors import ShapeError, StorageError
 from gausslite.evaluation.pictures import comparison_sheet, write_png
 from gausslite.evaluation.views import HeldOutView
 

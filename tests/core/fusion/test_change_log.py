@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from sample_gaussians import plain_gaussians
 
+from gausslite.domain.errors import RevisionGoneError
 from gausslite.domain.voxel_batch import RoiSubset, VoxelBatch
 from gausslite.domain.voxels import VoxelGrid
-from gausslite.errors import RevisionGoneError
 from gausslite.fusion.change_log import ChangeLog
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.limits import FusionSettings

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from sample_gaussians import plain_gaussians
 
+from gausslite.domain.errors import GaussLiteError, InvalidInputError, MismatchError, QuotaError, SessionUnknownError
 from gausslite.domain.voxel_batch import RoiSubset
 from gausslite.domain.voxel_operations import group_by_voxel, merge_batches, tombstones
 from gausslite.domain.voxels import VoxelGrid
-from gausslite.errors import GaussLiteError, InvalidInputError, MismatchError, QuotaError, SessionUnknownError
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.limits import FusionSettings, Quotas
 from gausslite.fusion.memory_store import MemoryStore

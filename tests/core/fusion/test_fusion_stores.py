@@ -13,10 +13,10 @@ from threading import Thread
 import numpy as np
 import pytest
 
+from gausslite.domain.errors import InvalidInputError, StorageError
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.voxel_batch import RoiSubset, VoxelBatch
 from gausslite.domain.voxel_operations import gather_rows, select_keys
-from gausslite.errors import InvalidInputError, StorageError
 from gausslite.fusion.memory_store import MemoryStore
 from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.fusion.store import FusionStore, MissionConfig, SessionRecord

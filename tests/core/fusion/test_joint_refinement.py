@@ -7,9 +7,9 @@ import pytest
 from sample_gaussians import plain_gaussians
 
 from gausslite.domain.camera import Camera
+from gausslite.domain.errors import InvalidInputError, QuotaError
 from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
-from gausslite.errors import InvalidInputError, QuotaError
 from gausslite.fusion.joint_refinement import RefineProgress, RefineSettings, refine
 from gausslite.fusion.keyframes import AgentKeyframe, KeyframePool
 from gausslite.optimize.density import DensitySettings

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from mapping_scenes import middle_relevance, wall_frame
 
+from gausslite.domain.errors import InvalidInputError, ShapeError
 from gausslite.domain.relevance import RelevanceMap
 from gausslite.domain.state import select_prefix
-from gausslite.errors import InvalidInputError, ShapeError
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.policies import policy
 from gausslite.mapping.settings import (

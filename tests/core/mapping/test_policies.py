@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from mapping_scenes import middle_relevance, wall_frame
 
-from gausslite.errors import InvalidInputError
+from gausslite.domain.errors import InvalidInputError
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.policies import (
     ABLATION_FLAGS,

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from mapping_scenes import middle_relevance, rendering_of, wall_frame
 
+from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.relevance import RelevanceMap
-from gausslite.errors import InvalidInputError
 from gausslite.mapping.coverage import RenderedView, rendered_behind, undersampled_roi
 from gausslite.mapping.seeding import Seeder, SeedingContext
 from gausslite.mapping.settings import Components, SeedingSettings

@@ -11,6 +11,7 @@ from deferred_executor import DeferredExecutor
 from mapping_scenes import wall_frame
 from sample_gaussians import some_gaussians
 
+from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.region import BallRegion
@@ -18,7 +19,6 @@ from gausslite.domain.relevance import NO_TARGET, RelevanceMap
 from gausslite.domain.state import State
 from gausslite.domain.task import Predicate, Relation, TaskGraph
 from gausslite.domain.voxels import VoxelGrid
-from gausslite.errors import InvalidInputError
 from gausslite.mapping.coverage import visible_means
 from gausslite.mapping.eviction import insert_seeds
 from gausslite.mapping.mapper import GaussianMapper

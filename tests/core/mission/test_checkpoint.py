@@ -15,13 +15,13 @@ from mapping_scenes import wall_frame
 
 from gausslite.calibration.pose_exposure_prior import PoseExposurePrior
 from gausslite.codec.state_file import read_state, write_state
+from gausslite.domain.errors import GaussLiteError, MapFileError, MismatchError
 from gausslite.domain.frame import Frame
 from gausslite.domain.region import BallRegion
 from gausslite.domain.state import State, select_prefix
 from gausslite.domain.task import Predicate, Relation, TaskGraph
 from gausslite.domain.voxel_batch import VoxelBatch
 from gausslite.domain.voxels import VoxelGrid
-from gausslite.errors import GaussLiteError, MapFileError, MismatchError
 from gausslite.mapping.checkpoint import generator_state, restore_generator
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.sent_voxels import SentVoxelTracker

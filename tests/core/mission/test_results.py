@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from gausslite.errors import StorageError
+from gausslite.domain.errors import StorageError
 from gausslite.mission.results import prepare_folder, require_writable
 
 

@@ -7,7 +7,7 @@ import hashlib
 import pytest
 from model_server import DATA, DIGEST, ServedModel, files_in, no_progress, serving
 
-from gausslite.errors import (
+from gausslite.domain.errors import (
     ChecksumError,
     InvalidInputError,
     QuotaError,

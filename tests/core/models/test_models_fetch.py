@@ -10,7 +10,7 @@ from model_server import DIGEST, ServedModel, files_in, no_progress, serving
 from tiny_yolo import write_tiny_yolo
 
 from gausslite.cli.main import main
-from gausslite.errors import (
+from gausslite.domain.errors import (
     ChecksumError,
     GaussLiteError,
     InvalidInputError,

@@ -10,8 +10,8 @@ import pytest
 from mapping_scenes import middle_relevance, wall_frame
 from numpy.testing import assert_allclose, assert_array_equal
 
+from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.gaussians import Gaussians
-from gausslite.errors import InvalidInputError
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.settings import MapperSettings, OptimizationSettings, SeedingSettings
 from gausslite.optimize.density import DensitySettings, densify

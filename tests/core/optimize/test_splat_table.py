@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from sample_gaussians import some_gaussians
 
-from gausslite.errors import InvalidInputError, QuotaError, ShapeError
+from gausslite.domain.errors import InvalidInputError, QuotaError, ShapeError
 from gausslite.optimize.row_encoding import gaussians_to_rows, rows_to_gaussians
 from gausslite.optimize.splat_table import SplatTable
 

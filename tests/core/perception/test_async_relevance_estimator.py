@@ -9,11 +9,11 @@ import pytest
 from deferred_executor import DeferredExecutor
 from mapping_scenes import wall_frame
 
+from gausslite.domain.errors import ModelFileError
 from gausslite.domain.frame import Frame
 from gausslite.domain.region import BallRegion
 from gausslite.domain.relevance import Detection
 from gausslite.domain.task import TaskGraph
-from gausslite.errors import ModelFileError
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.settings import KeyframeSettings, MapperSettings
 from gausslite.mission.task_mapper import TaskMapper

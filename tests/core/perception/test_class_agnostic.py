@@ -7,8 +7,8 @@ import pytest
 from tiny_yolo import write_tiny_yolo
 
 from gausslite.domain.camera import Camera
+from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
-from gausslite.errors import InvalidInputError
 from gausslite.perception.class_agnostic import ClassAgnosticSegmenter, ClassAgnosticSettings
 from gausslite.perception.model_file import open_model
 from gausslite.perception.yolo_network import YoloSegNetwork

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from gausslite.domain.camera import Camera
+from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
-from gausslite.errors import InvalidInputError
 from gausslite.perception.depth_segmenter import DepthSegmenter, DepthSegmenterSettings
 
 BOX = np.array([[30, 20, 70, 60]], np.float32)

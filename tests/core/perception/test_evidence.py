@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from gausslite.domain.camera import Camera
+from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
 from gausslite.domain.relevance import Detection
 from gausslite.domain.task import Predicate, Relation, TaskGraph
-from gausslite.errors import InvalidInputError
 from gausslite.perception.evidence import EvidenceSettings, VisibilityCheck
 from gausslite.perception.foreground import foreground_mask
 from gausslite.perception.object_map import Landmark, ObjectMap, Observation

@@ -10,8 +10,8 @@ from tiny_grounding import VOCABULARY, write_tiny_grounding
 from tiny_yolo import write_boxes_only, write_tiny_yolo
 
 from gausslite.domain.camera import Camera
+from gausslite.domain.errors import InvalidInputError, KernelError, ModelFileError
 from gausslite.domain.frame import Frame
-from gausslite.errors import InvalidInputError, KernelError, ModelFileError
 from gausslite.perception.detect import DetectedBox, SegmentedDetector
 from gausslite.perception.model_file import choose_providers, open_model
 from gausslite.perception.model_registry import ModelFamily, ModelRegistry, identify_family

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from gausslite.domain.camera import Camera
+from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
 from gausslite.domain.region import BallRegion
 from gausslite.domain.relevance import NO_TARGET
 from gausslite.domain.task import Predicate, Relation, TaskGraph
-from gausslite.errors import InvalidInputError
 from gausslite.perception.fixed_relevance import RegionRelevanceEstimator
 from gausslite.perception.ground_truth import RegionDetector
 from gausslite.perception.object_map import Observation

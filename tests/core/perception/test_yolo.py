@@ -9,8 +9,8 @@ import pytest
 from tiny_yolo import write_boxes_only, write_tiny_yolo
 
 from gausslite.domain.camera import Camera
+from gausslite.domain.errors import InvalidInputError, ModelFileError
 from gausslite.domain.frame import Frame
-from gausslite.errors import InvalidInputError, ModelFileError
 from gausslite.perception.detect import BoxFractions
 from gausslite.perception.model_file import open_model
 from gausslite.perception.yolo import YoloSegDetector, YoloSettings, load_yolo

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from gausslite.errors import KernelError
+from gausslite.domain.errors import KernelError
 from gausslite.render.choose import choose_rasterizer
 
 pytest.importorskip("gausslite.render._kernels", reason="the native kernels are not built")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from gausslite.domain.camera import Camera
-from gausslite.errors import InvalidInputError, ShapeError
+from gausslite.domain.errors import InvalidInputError, ShapeError
 from gausslite.render.cpu import CpuRasterizer
 from gausslite.render.rasterizer import AdamSettings, LossWeights, Subset, UpdateCounter
 

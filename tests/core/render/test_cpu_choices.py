@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from cpu_scenes import CAMERA, random_rows, view_of
 
-from gausslite.errors import InvalidInputError, KernelError, ShapeError
+from gausslite.domain.errors import InvalidInputError, KernelError, ShapeError
 from gausslite.render.cpu import CpuRasterizer
 from gausslite.render.cpu_kernels import MAX_THREADS, SIMD_VARIABLE, cores_allowed
 from gausslite.render.rasterizer import AdamSettings, LossWeights

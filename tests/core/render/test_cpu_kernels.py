@@ -9,7 +9,7 @@ import pytest
 from cpu_scenes import CAMERA, random_rows, view_of
 
 from gausslite.domain.camera import Camera
-from gausslite.errors import InvalidInputError
+from gausslite.domain.errors import InvalidInputError
 from gausslite.render.cpu import CpuRasterizer
 from gausslite.render.cpu_kernels import core_clock_ghz
 from gausslite.render.rasterizer import AdamSettings, LossWeights, SplatGradients, Subset

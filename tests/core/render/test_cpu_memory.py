@@ -17,7 +17,7 @@ PREPARE = """
 import resource, sys
 import numpy as np
 from gausslite.domain.camera import Camera
-from gausslite.errors import KernelError
+from gausslite.domain.errors import KernelError
 from gausslite.render.cpu import CpuRasterizer
 from gausslite.render.rasterizer import AdamSettings, LossWeights
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from mapping_scenes import middle_relevance, wall_frame
 
-from gausslite.errors import InvalidInputError, KernelError
+from gausslite.domain.errors import InvalidInputError, KernelError
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.settings import MapperSettings, SeedingSettings
 from gausslite.optimize.density import DensitySettings

@@ -10,7 +10,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import pytest
 
-from gausslite.errors import LanguageModelError
+from gausslite.domain.errors import LanguageModelError
 from gausslite.task.backends import Backend, BackendSettings, open_parser
 from gausslite.task.language.http import HttpLanguageModel, HttpSettings, ResponseFormat
 from gausslite.task.language.prompt import ANSWER_SCHEMA, messages_for

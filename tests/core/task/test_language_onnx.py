@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from gausslite.errors import LanguageModelError, ModelFileError
+from gausslite.domain.errors import LanguageModelError, ModelFileError
 from gausslite.task.backends import Backend, BackendSettings, open_parser
 from gausslite.task.language.model import Message, Role
 from gausslite.task.language.onnx import OnnxLanguageModel, phi3_chat

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from gausslite.domain.errors import InvalidInputError, LanguageModelError, TaskError
 from gausslite.domain.task import Predicate, Relation
-from gausslite.errors import InvalidInputError, LanguageModelError, TaskError
 from gausslite.task.backends import Backend, BackendSettings, open_parser
 from gausslite.task.language.answer import parse_answer
 from gausslite.task.language.model import Message, Role

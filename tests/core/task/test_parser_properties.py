@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gausslite.errors import TaskError
+from gausslite.domain.errors import TaskError
 from gausslite.task import lexicon
 from gausslite.task.clause_types import MODALS, WISHES
 from gausslite.task.lexicon import NOUNS

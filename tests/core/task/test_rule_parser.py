@@ -7,8 +7,8 @@ import time
 
 import pytest
 
+from gausslite.domain.errors import TaskError
 from gausslite.domain.task import Predicate, Relation, TaskGraph
-from gausslite.errors import TaskError
 from gausslite.task import lexicon
 from gausslite.task.nouns import COMMON_ANCHORS
 from gausslite.task.parser import task_id_of

@@ -10,9 +10,9 @@ import grpc
 import pytest
 from serving import serving
 
-from gausslite import errors
+from gausslite.domain import errors
+from gausslite.domain.errors import GaussLiteError, QuotaError, UnavailableError
 from gausslite.domain.task import TaskGraph
-from gausslite.errors import GaussLiteError, QuotaError, UnavailableError
 from gausslite.v1 import parser_service_pb2, parser_service_pb2_grpc
 from gausslite.wire.clients import ParserClient
 from gausslite.wire.connection import MAX_MESSAGE_BYTES

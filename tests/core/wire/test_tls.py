@@ -17,8 +17,8 @@ from sample_gaussians import plain_gaussians
 from serving import serving
 
 from gausslite.cli.health_check import main as ask_health
+from gausslite.domain.errors import InvalidInputError, NotPermittedError, UnavailableError
 from gausslite.domain.voxel_operations import group_by_voxel
-from gausslite.errors import InvalidInputError, NotPermittedError, UnavailableError
 from gausslite.task.rules import RuleParser
 from gausslite.wire.clients import FusionClient, ParserClient
 from gausslite.wire.spool import Spool

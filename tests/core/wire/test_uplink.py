@@ -9,12 +9,12 @@ import pytest
 from fusion_running import GRID, fusion_server, make_batch
 from uplink_running import WAIT_S, accepted, expected_kappas, scripted, stored_kappas, uplink
 
-from gausslite.domain.voxels import VoxelGrid
-from gausslite.errors import (
+from gausslite.domain.errors import (
     InvalidInputError,
     MismatchError,
     StorageError,
 )
+from gausslite.domain.voxels import VoxelGrid
 from gausslite.fusion.memory_store import MemoryStore
 from gausslite.wire.spool import Purpose, Spool
 from gausslite.wire.uplink_values import UplinkSettings

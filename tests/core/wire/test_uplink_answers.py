@@ -13,9 +13,7 @@ from serving import serving
 from uplink_running import WAIT_S, ScriptedServer, accepted, expected_kappas, rejected, scripted, stored_kappas, uplink
 
 from gausslite.codec.subset_codec import decode_subset
-from gausslite.domain.voxel_batch import VoxelBatch
-from gausslite.domain.voxels import VoxelGrid
-from gausslite.errors import (
+from gausslite.domain.errors import (
     GaussLiteError,
     InvalidInputError,
     MismatchError,
@@ -25,6 +23,8 @@ from gausslite.errors import (
     StorageError,
     UnavailableError,
 )
+from gausslite.domain.voxel_batch import VoxelBatch
+from gausslite.domain.voxels import VoxelGrid
 from gausslite.fusion.memory_store import MemoryStore
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.v1 import fusion_service_pb2_grpc as pb_grpc

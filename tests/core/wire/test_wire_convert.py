@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 from gausslite.codec.subset_codec import DEFAULT_LIMITS, encode_subset
 from gausslite.domain.camera import Camera
+from gausslite.domain.errors import GaussLiteError, InvalidInputError, PoseError, TaskError
 from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.image_bytes import image_size
@@ -21,7 +22,6 @@ from gausslite.domain.pose import require_rigid
 from gausslite.domain.task import Predicate, Relation, TaskGraph
 from gausslite.domain.voxel_batch import RoiSubset, VoxelBatch
 from gausslite.domain.voxels import AxisAlignedBox, VoxelGrid
-from gausslite.errors import GaussLiteError, InvalidInputError, PoseError, TaskError
 from gausslite.v1 import agent_service_pb2, gaussians_pb2, geometry_pb2, task_pb2
 from gausslite.wire import convert
 from gausslite.wire.clients import is_done

@@ -13,9 +13,9 @@ import pytest
 from agent_running import SETTINGS, TASK, Gate, agent, ball_estimator
 from fusion_running import CAMERA, GRID, frame, fusion_server
 
+from gausslite.domain.errors import InvalidInputError, UnavailableError
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.voxel_batch import VoxelBatch
-from gausslite.errors import InvalidInputError, UnavailableError
 from gausslite.fusion.memory_store import MemoryStore
 from gausslite.task.rules import RuleParser
 from gausslite.v1 import agent_service_pb2 as pb

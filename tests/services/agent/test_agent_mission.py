@@ -20,10 +20,10 @@ from tiny_yolo import write_tiny_yolo
 
 from gausslite.codec.ply import read_ply
 from gausslite.domain.camera import Camera
+from gausslite.domain.errors import DatasetError, InvalidInputError, StorageError, TaskError
 from gausslite.domain.frame import Frame
 from gausslite.domain.region import BallRegion, Region
 from gausslite.domain.trajectory import Trajectory
-from gausslite.errors import DatasetError, InvalidInputError, StorageError, TaskError
 from gausslite.fusion.memory_store import MemoryStore
 from gausslite.mission.frame_stream import FrameStream
 from gausslite.mission.settings import SourceSettings

@@ -12,11 +12,7 @@ from agent_running import TASK, Gate, agent, ball_estimator
 from fusion_running import CAMERA, GRID, frame, fusion_server
 
 from gausslite.domain.camera import Camera
-from gausslite.domain.frame import Frame
-from gausslite.domain.region import BallRegion
-from gausslite.domain.task import TaskGraph
-from gausslite.domain.voxels import AxisAlignedBox
-from gausslite.errors import (
+from gausslite.domain.errors import (
     GaussLiteError,
     InvalidInputError,
     MismatchError,
@@ -24,6 +20,10 @@ from gausslite.errors import (
     RevisionGoneError,
     TaskError,
 )
+from gausslite.domain.frame import Frame
+from gausslite.domain.region import BallRegion
+from gausslite.domain.task import TaskGraph
+from gausslite.domain.voxels import AxisAlignedBox
 from gausslite.fusion.memory_store import MemoryStore
 from gausslite.perception.fixed_relevance import RegionRelevanceEstimator
 from gausslite.perception.ground_truth import RegionDetector

@@ -17,12 +17,12 @@ from tiny_yolo import write_tiny_yolo
 
 from gausslite.codec.ply import read_ply
 from gausslite.codec.state_file import read_state, write_state
+from gausslite.domain.errors import MapFileError, MismatchError
 from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.region import BallRegion
 from gausslite.domain.voxel_batch import VoxelBatch
 from gausslite.domain.voxel_operations import group_by_voxel
-from gausslite.errors import MapFileError, MismatchError
 from gausslite.fusion.memory_store import MemoryStore
 from gausslite.perception.fixed_relevance import RegionRelevanceEstimator
 from gausslite.task.rules import RuleParser

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
+from gausslite.domain.errors import TaskError, UnavailableError
 from gausslite.domain.task import TaskGraph
-from gausslite.errors import TaskError, UnavailableError
 from gausslite.task.rules import RuleParser
 from gausslite_agent.parser_wait import WaitingParser
 

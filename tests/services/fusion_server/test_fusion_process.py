@@ -11,7 +11,7 @@ import pytest
 from fusion_running import COMMAND, GRID, make_subset, request, server_process
 
 from gausslite.codec.ply import gaussians_from_ply
-from gausslite.errors import UnavailableError
+from gausslite.domain.errors import UnavailableError
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.wire.clients import Export, FusionClient
 

@@ -9,7 +9,7 @@ from grpc_health.v1 import health_pb2, health_pb2_grpc
 
 from gausslite.codec.ply import gaussians_from_ply
 from gausslite.domain.camera import Camera
-from gausslite.errors import (
+from gausslite.domain.errors import (
     InvalidInputError,
     MismatchError,
     QuotaError,

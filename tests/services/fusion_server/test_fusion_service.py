@@ -10,9 +10,7 @@ import pytest
 from fusion_running import GRID, frame, fusion_server, make_batch, make_subset, request
 
 from gausslite.codec.ply import gaussians_from_ply
-from gausslite.domain.voxel_batch import RoiSubset
-from gausslite.domain.voxels import VoxelGrid
-from gausslite.errors import (
+from gausslite.domain.errors import (
     InvalidInputError,
     MismatchError,
     QuotaError,
@@ -20,6 +18,8 @@ from gausslite.errors import (
     SessionUnknownError,
     UnavailableError,
 )
+from gausslite.domain.voxel_batch import RoiSubset
+from gausslite.domain.voxels import VoxelGrid
 from gausslite.fusion.limits import FusionSettings, Quotas
 from gausslite.fusion.memory_store import MemoryStore
 from gausslite.fusion.sqlite_store import SqliteStore

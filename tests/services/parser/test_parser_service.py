@@ -13,8 +13,8 @@ from grpc_health.v1 import health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection_pb2, reflection_pb2_grpc
 from serving import serving
 
+from gausslite.domain.errors import GaussLiteError, InvalidInputError, TaskError, UnavailableError
 from gausslite.domain.task import TaskGraph
-from gausslite.errors import GaussLiteError, InvalidInputError, TaskError, UnavailableError
 from gausslite.task.rules import RuleParser
 from gausslite.wire.clients import ParserClient
 from gausslite.wire.server import start_server

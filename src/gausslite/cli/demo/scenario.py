@@ -21,8 +21,8 @@ from gausslite.datasets.open import open_source
 from gausslite.datasets.regions import choose_regions
 from gausslite.datasets.registered_source import DepthRegistration
 from gausslite.datasets.selection import frame_size, select_frames
+from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.region import Region
-from gausslite.errors import InvalidInputError
 from gausslite.evaluation.team import HeldOutFrames
 from gausslite.perception.vocabulary import same_kind
 

@@ -15,7 +15,7 @@ from pathlib import Path
 from types import TracebackType
 
 from gausslite.config.environment import without_options
-from gausslite.errors import UnavailableError
+from gausslite.domain.errors import UnavailableError
 
 _TERMINATION_TIMEOUT_S = 10.0
 _INTERRUPTS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)

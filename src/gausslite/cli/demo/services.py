@@ -16,7 +16,7 @@ from gausslite.cli.demo.service_processes import ProcessGroup, ServiceProcess
 from gausslite.cli.progress import MappingBar, progress_bar
 from gausslite.codec.files import write_atomic
 from gausslite.config.toml_text import OptionValue, to_toml
-from gausslite.errors import UnavailableError
+from gausslite.domain.errors import UnavailableError
 from gausslite.wire.clients import AgentClient, Export, FusionClient, is_done
 
 _START_TIMEOUT_S = 60.0

@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float32
 from torch import Tensor
 
 from gausslite.domain.camera import Camera
-from gausslite.errors import KernelError
+from gausslite.domain.errors import KernelError
 from gausslite.render.rasterizer import TILE_PX
 from gausslite.render.reference.compositing import Limits, render_images, render_images_backward
 from gausslite.render.reference.projection import Ellipses

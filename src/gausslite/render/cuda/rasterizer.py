@@ -13,7 +13,7 @@ from numpy import ndarray
 from torch import Tensor
 
 from gausslite.domain.camera import Camera
-from gausslite.errors import InvalidInputError, KernelError, ShapeError
+from gausslite.domain.errors import InvalidInputError, KernelError, ShapeError
 from gausslite.render.checks import (
     require_image_gradients,
     require_row_masks,

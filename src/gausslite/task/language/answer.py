@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 from typing import Any, Final, NoReturn
 
+from gausslite.domain.errors import LanguageModelError, TaskError
 from gausslite.domain.task import Predicate, Relation, TaskGraph
-from gausslite.errors import LanguageModelError, TaskError
 from gausslite.task.graph_grounding import grounded_graph
 from gausslite.task.language.model import MAX_ANSWER_BYTES
 from gausslite.task.language.prompt import MAX_PHRASE_CHARS, MAX_PHRASES, MAX_RELATIONS

@@ -15,7 +15,7 @@ from enum import StrEnum
 from typing import Any, Final
 from urllib.parse import urlsplit
 
-from gausslite.errors import InvalidInputError, LanguageModelError
+from gausslite.domain.errors import InvalidInputError, LanguageModelError
 from gausslite.task.language.model import MAX_ANSWER_BYTES, Message
 from gausslite.task.language.prompt import ANSWER_SCHEMA
 

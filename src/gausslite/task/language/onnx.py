@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from gausslite.errors import InvalidInputError, LanguageModelError, ModelFileError
+from gausslite.domain.errors import InvalidInputError, LanguageModelError, ModelFileError
 from gausslite.task.language.model import Message
 from gausslite.task.language.prompt import ANSWER_SCHEMA
 

@@ -8,8 +8,8 @@ from collections import OrderedDict
 from dataclasses import replace
 from typing import Final
 
+from gausslite.domain.errors import LanguageModelError
 from gausslite.domain.task import TaskGraph
-from gausslite.errors import LanguageModelError
 from gausslite.task.language.answer import parse_answer
 from gausslite.task.language.model import LanguageModel
 from gausslite.task.language.prompt import PROMPT_VERSION, messages_for
