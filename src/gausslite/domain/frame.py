@@ -10,6 +10,7 @@ from numpy import ndarray
 
 from gausslite.domain.arrays import require_array
 from gausslite.domain.camera import Camera
+from gausslite.domain.camera_motion import CameraMotion
 from gausslite.domain.errors import InvalidInputError, PoseError
 from gausslite.domain.pose import require_rigid
 
@@ -23,7 +24,8 @@ class Frame:
 
     depth_m is the distance along the optical axis in metres, 0 where the sensor had no return.
     T_world_camera uses OpenCV axes (x right, y down, z forward); its position is within 10 km of the world's origin
-    along each axis. Raises ShapeError, PoseError, InvalidInputError.
+    along each axis. motion: the camera's motion while the image was exposed, with T_world_camera the pose at the middle
+    row's time; None for an image of a camera at rest. Raises ShapeError, PoseError, InvalidInputError.
     """
 
     index: int
@@ -32,6 +34,7 @@ class Frame:
     depth_m: Float32[ndarray, "h w"]
     camera: Camera
     T_world_camera: Float64[ndarray, "4 4"]
+    motion: CameraMotion | None = None
 
     def __post_init__(self) -> None:
         size = (self.camera.height_px, self.camera.width_px)

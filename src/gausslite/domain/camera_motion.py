@@ -1,0 +1,50 @@
+"""The camera's motion while one image is exposed: its velocity, the readout time and the exposure time."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from gausslite.domain.arrays import require_array
+from gausslite.domain.errors import InvalidInputError
+from gausslite.domain.trajectory import Twist
+
+MAX_READOUT_S = 0.1
+MAX_EXPOSURE_S = 0.1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraMotion:
+    """How a camera moves while its rows are exposed, one after the other from the first to the last.
+
+    twist: velocity in the camera's axes at the middle row's time, which is the time of the image's pose. readout_s:
+    time from the first row's exposure to the last row's; negative if rows are read from the bottom; 0 for a global
+    shutter. exposure_s: duration of each row's exposure, centred on the row's time. Raises ShapeError,
+    InvalidInputError.
+    """
+
+    twist: Twist
+    readout_s: float = 0.0
+    exposure_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name, velocity in (("linear_m_s", self.twist.linear_m_s), ("angular_rad_s", self.twist.angular_rad_s)):
+            require_array(f"camera motion {name}", velocity, (3,), np.float64)
+            if not np.isfinite(velocity).all():
+                raise InvalidInputError(f"camera motion {name}: expected finite values, got {velocity.tolist()}")
+        if not (math.isfinite(self.readout_s) and abs(self.readout_s) <= MAX_READOUT_S):
+            raise InvalidInputError(
+                f"camera motion readout_s: expected -{MAX_READOUT_S:g} to {MAX_READOUT_S:g}, got {self.readout_s}"
+            )
+        if not 0.0 <= self.exposure_s <= MAX_EXPOSURE_S:
+            raise InvalidInputError(
+                f"camera motion exposure_s: expected 0 to {MAX_EXPOSURE_S:g}, got {self.exposure_s}"
+            )
+
+    @property
+    def is_still(self) -> bool:
+        """True if the image is that of a camera at rest: no velocity, or neither readout nor exposure time."""
+        moves = bool(self.twist.linear_m_s.any() or self.twist.angular_rad_s.any())
+        return not moves or (self.readout_s == 0.0 and self.exposure_s == 0.0)
