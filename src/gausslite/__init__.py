@@ -27,13 +27,13 @@ if TYPE_CHECKING:
         render_view,
         save_ply,
     )
-    from gausslite.calibration.pose_exposure_prior import PoseExposurePrior
     from gausslite.datasets.registered_source import DepthRegistration
     from gausslite.datasets.source import Source
     from gausslite.domain.camera import Camera
     from gausslite.domain.errors import GaussLiteError
     from gausslite.domain.frame import Frame
     from gausslite.domain.gaussians import Gaussians
+    from gausslite.domain.pose_exposure_prior import PoseExposurePrior
     from gausslite.domain.region import BallRegion
     from gausslite.domain.voxel_operations import empty_batch
     from gausslite.mission.settings import MissionSettings, PerceptionSettings, SceneInfo
@@ -55,7 +55,7 @@ _MODULES = {
         "render_view",
         "save_ply",
     ),
-    "gausslite.calibration.pose_exposure_prior": ("PoseExposurePrior",),
+    "gausslite.domain.pose_exposure_prior": ("PoseExposurePrior",),
     "gausslite.datasets.registered_source": ("DepthRegistration",),
     "gausslite.datasets.source": ("Source",),
     "gausslite.domain.camera": ("Camera",),

@@ -16,7 +16,6 @@ from numpy import ndarray
 
 from gausslite.calibration.camera_timing import estimate_camera_timing
 from gausslite.calibration.pose_exposure_error import estimate_pose_exposure_prior
-from gausslite.calibration.pose_exposure_prior import PoseExposurePrior
 from gausslite.calibration.registration import find_registration
 from gausslite.codec.ply import read_ply, write_ply
 from gausslite.datasets.camera_correction import CameraCorrection
@@ -29,6 +28,7 @@ from gausslite.domain.camera import Camera
 from gausslite.domain.errors import DatasetError, InvalidInputError
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.pose import UpAxis, require_rigid
+from gausslite.domain.pose_exposure_prior import PoseExposurePrior
 from gausslite.domain.region import Region
 from gausslite.evaluation.views import MapViewer
 from gausslite.mapping.policies import TASK, follows_task

@@ -15,9 +15,9 @@ import numpy as np
 import pytest
 from quality_results import CONDITIONS, PLAN, TASK, UNIFORM, finished
 
-from gausslite.calibration.pose_exposure_prior import PoseExposurePrior
 from gausslite.cli.main import main
 from gausslite.domain.errors import InvalidInputError
+from gausslite.domain.pose_exposure_prior import PoseExposurePrior
 from gausslite.perception.vocabulary import same_kind
 from gausslite.task.rules import RuleParser
 from gausslite_bench.quality.ablation import cumulative_variants

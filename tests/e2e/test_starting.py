@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 import pytest
 
-from gausslite.interrupts import restore_default_handlers
+from gausslite.process.interrupts import restore_default_handlers
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -61,7 +61,7 @@ def test_a_started_program_keeps_its_own_handlers() -> None:
 
 def test_the_end_of_the_start_restores_the_default_handlers() -> None:
     code = (
-        "import signal\nfrom gausslite.interrupts import end_quietly_while_starting, restore_default_handlers\n"
+        "import signal\nfrom gausslite.process.interrupts import end_quietly_while_starting, restore_default_handlers\n"
         "end_quietly_while_starting('x')\nrestore_default_handlers()\n"
         "assert signal.getsignal(signal.SIGINT) is signal.default_int_handler\n"
         "assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL\n"

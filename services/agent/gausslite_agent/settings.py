@@ -25,9 +25,9 @@ from gausslite.config.tls_options import add_tls, read_server_tls
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.names import require_name
 from gausslite.domain.pose import UpAxis
+from gausslite.domain.task_limits import require_task_text
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.mission.settings import MissionSettings, PerceptionSettings, SourceSettings
-from gausslite.task.validate import require_task_text
 from gausslite.wire.address import require_callable
 from gausslite.wire.tls import Tls
 from gausslite.wire.uplink_values import UplinkSettings

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from gausslite.domain.errors import GaussLiteError
-from gausslite.messages import print_message
+from gausslite.process.messages import print_message
 from gausslite.task.backends import open_parser
 from gausslite.wire.process import run_service
 from gausslite.wire.server import serve_until_stopped

@@ -18,7 +18,6 @@ import numpy as np
 from numpy import ndarray
 
 from gausslite.calibration.pose_exposure_error import warp_into
-from gausslite.calibration.pose_exposure_prior import HANDHELD_PRIOR
 from gausslite.calibration.pose_fit import fit_pose, luminance_residual, twist_of
 from gausslite.calibration.view_residuals import comparable_pixels
 from gausslite.datasets.camera_correction import CameraCorrection, correct_frame, ideal_camera
@@ -28,6 +27,7 @@ from gausslite.datasets.source import Source
 from gausslite.domain.errors import DatasetError, PoseError
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import inverse
+from gausslite.domain.pose_exposure_prior import HANDHELD_PRIOR
 from gausslite.domain.trajectory import Trajectory, Twist
 
 _MAX_PAIRS, _MIN_PAIRS = 16, 4

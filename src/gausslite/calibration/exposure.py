@@ -9,7 +9,6 @@ import numpy as np
 from jaxtyping import Float, Float32, Float64, UInt8
 from numpy import ndarray
 
-from gausslite.calibration.pose_exposure_prior import PoseExposurePrior
 from gausslite.calibration.view_residuals import (
     MIN_PIXELS,
     comparable_pixels,
@@ -18,6 +17,7 @@ from gausslite.calibration.view_residuals import (
     solve_with_prior,
 )
 from gausslite.domain.frame import Frame
+from gausslite.domain.pose_exposure_prior import PoseExposurePrior
 from gausslite.render.rasterizer import Rendering
 
 _BLUR_PX = 4.0

@@ -13,7 +13,6 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int64
 from numpy import ndarray
 
-from gausslite.calibration.pose_exposure_prior import PoseExposurePrior
 from gausslite.calibration.view_residuals import (
     MIN_PIXELS,
     OPAQUE_ALPHA,
@@ -25,6 +24,7 @@ from gausslite.calibration.view_residuals import (
 from gausslite.domain.camera import Camera, back_project
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import inverse
+from gausslite.domain.pose_exposure_prior import PoseExposurePrior
 from gausslite.render.rasterizer import NEAR_M, Rendering
 
 _LUMINANCE = np.array([0.299, 0.587, 0.114], np.float32)

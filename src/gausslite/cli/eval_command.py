@@ -32,9 +32,9 @@ from gausslite.evaluation.compare import MapScores, ViewScore, average, score_vi
 from gausslite.evaluation.fitted import render_fitted
 from gausslite.evaluation.pictures import comparison_sheet, write_png
 from gausslite.evaluation.views import MIN_ROI_PIXELS, HeldOutView, MapViewer
-from gausslite.messages import print_message
 from gausslite.mission.frame_stream import CorruptFrames
 from gausslite.mission.results import as_text, prepare_folder, read_report
+from gausslite.process.messages import print_message
 from gausslite.render.choose import choose_rasterizer
 
 _PICTURES = 8

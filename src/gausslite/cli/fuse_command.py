@@ -12,8 +12,8 @@ from gausslite.config.mapping_options import add_voxel_size
 from gausslite.domain.errors import InvalidInputError, MismatchError
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.fusion.offline import fuse_maps
-from gausslite.messages import print_message
 from gausslite.mission.results import as_text, prepare_folder
+from gausslite.process.messages import print_message
 
 
 def configure(parser: argparse.ArgumentParser) -> None:

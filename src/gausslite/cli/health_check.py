@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 from gausslite.config.tls_options import add_tls, read_tls
 from gausslite.domain.errors import InvalidInputError, UnavailableError
-from gausslite.messages import print_message
+from gausslite.process.messages import print_message
 from gausslite.wire.health import require_serving
 
 

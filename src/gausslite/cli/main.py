@@ -12,8 +12,8 @@ from collections.abc import Mapping, Sequence
 
 from gausslite import __version__
 from gausslite.domain.errors import GaussLiteError
-from gausslite.interrupts import Terminated, restore_default_handlers
-from gausslite.messages import print_message
+from gausslite.process.interrupts import Terminated, restore_default_handlers
+from gausslite.process.messages import print_message
 
 _COMMANDS = {
     "map": "map a sequence for a task; write map.ply, report.json and preview.png",

@@ -19,7 +19,6 @@ from gausslite.domain.state import State, encode_text
 from gausslite.evaluation.pictures import write_png
 from gausslite.evaluation.preview import render_preview
 from gausslite.evaluation.views import MapViewer
-from gausslite.messages import print_message
 from gausslite.mission.build import EstimatorFactory, build_mapper
 from gausslite.mission.checkpoint import SavedRun, save_run
 from gausslite.mission.frame_scheduler import FrameScheduler
@@ -38,6 +37,7 @@ from gausslite.mission.settings import SceneInfo
 from gausslite.mission.task_mapper import TaskMapper
 from gausslite.mission.task_schedule import ScheduledTaskMapper
 from gausslite.perception.relevance_estimator import RelevanceEstimator
+from gausslite.process.messages import print_message
 from gausslite.render.choose import choose_rasterizer
 
 _NOT_RESUMED = -1

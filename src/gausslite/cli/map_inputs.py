@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from gausslite.calibration.pose_exposure_prior import PoseExposurePrior
 from gausslite.cli.parse_command import as_json
 from gausslite.cli.source_options import (
     correct_with_warnings,
@@ -24,10 +23,10 @@ from gausslite.datasets.selection import frame_step
 from gausslite.datasets.sequence_name import default_world_frame, sequence_name
 from gausslite.datasets.source import Source
 from gausslite.domain.errors import InvalidInputError
+from gausslite.domain.pose_exposure_prior import PoseExposurePrior
 from gausslite.domain.state import get_text
 from gausslite.domain.task import TaskGraph
 from gausslite.mapping.policies import TASK, policy
-from gausslite.messages import print_message
 from gausslite.mission.build import EstimatorFactory
 from gausslite.mission.checkpoint import ResumeConfig, SavedRun
 from gausslite.mission.frame_stream import FrameStream
@@ -35,6 +34,7 @@ from gausslite.mission.settings import MissionSettings, PerceptionSettings, Scen
 from gausslite.mission.task_schedule import TaskSchedule, TaskSwitch
 from gausslite.perception.fixed_relevance import NoTaskEstimator, RegionRelevanceEstimator
 from gausslite.perception.relevance_estimator import RelevanceEstimator
+from gausslite.process.messages import print_message
 
 _UNIFORM = "uniform"
 FRAMES_KEY = "frames"

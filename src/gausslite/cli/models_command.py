@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from gausslite.config.environment import MODELS_URL_VARIABLE
 from gausslite.domain.errors import InvalidInputError
-from gausslite.messages import print_message
+from gausslite.process.messages import print_message
 
 if TYPE_CHECKING:
     from gausslite.models.catalogue import ModelEntry

@@ -9,8 +9,8 @@ from typing import Any
 
 from tqdm import tqdm
 
-from gausslite.messages import printable
 from gausslite.mission.task_mapper import FrameOutcome
+from gausslite.process.messages import printable
 
 _TERMINAL_INTERVAL_S, _LOG_INTERVAL_S = 0.2, 10.0
 

@@ -7,7 +7,6 @@ from pathlib import Path
 
 from gausslite.calibration.camera_timing import estimate_camera_timing
 from gausslite.calibration.pose_exposure_error import estimate_pose_exposure_prior
-from gausslite.calibration.pose_exposure_prior import PoseExposurePrior
 from gausslite.calibration.registration import find_registration
 from gausslite.config.source_options import add_frames
 from gausslite.config.values import AUTO, NONE, read_names, read_numbers
@@ -17,8 +16,9 @@ from gausslite.datasets.open import is_simulated, open_source
 from gausslite.datasets.registered_source import DepthRegistration, RegisteredSource
 from gausslite.datasets.source import Source
 from gausslite.domain.pose import UpAxis
+from gausslite.domain.pose_exposure_prior import PoseExposurePrior
 from gausslite.domain.region import BallRegion, Region
-from gausslite.messages import print_message
+from gausslite.process.messages import print_message
 
 
 def add_source(parser: argparse.ArgumentParser, default_text: str = NONE) -> None:

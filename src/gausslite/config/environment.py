@@ -9,7 +9,7 @@ from gausslite.config.known_options import KNOWN_OPTIONS
 from gausslite.config.nearest import suggestion
 from gausslite.config.option_table import Layer, OptionTable, RawValue, variable_name
 from gausslite.domain.errors import InvalidInputError
-from gausslite.messages import print_message
+from gausslite.process.messages import print_message
 
 PREFIX: Final = "GAUSSLITE_"
 CONFIG_VARIABLE: Final = "GAUSSLITE_CONFIG"

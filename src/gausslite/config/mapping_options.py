@@ -5,12 +5,12 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from gausslite.calibration.pose_exposure_prior import PoseExposurePrior
 from gausslite.config.numbers import Number
 from gausslite.config.presets import PRESETS
 from gausslite.config.switches import DependentDefault, add_switch, set_dependent_default
 from gausslite.config.toml_text import OptionValue
 from gausslite.config.values import AUTO, NONE, read_names, read_pose_prior, read_pose_prior_or_auto, read_skip_stages
+from gausslite.domain.pose_exposure_prior import PoseExposurePrior
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.mapping.policies import EXTENSION_FLAGS, POLICIES, TASK, policy
 from gausslite.mission.frame_scheduler import SchedulerSettings

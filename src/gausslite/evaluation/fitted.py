@@ -9,10 +9,10 @@ from __future__ import annotations
 import numpy as np
 
 from gausslite.calibration.exposure import fit_exposure
-from gausslite.calibration.pose_exposure_prior import HANDHELD_PRIOR, PoseExposurePrior
 from gausslite.calibration.pose_fit import fit_pose
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import inverse
+from gausslite.domain.pose_exposure_prior import HANDHELD_PRIOR, PoseExposurePrior
 from gausslite.evaluation.views import MapViewer
 from gausslite.render.rasterizer import Rendering
 

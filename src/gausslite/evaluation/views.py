@@ -15,8 +15,8 @@ from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.pose import inverse
 from gausslite.domain.region import Region
-from gausslite.optimize.row_encoding import gaussians_to_rows
 from gausslite.render.rasterizer import Rasterizer, Rendering
+from gausslite.render.row_encoding import gaussians_to_rows
 
 MIN_ROI_PIXELS = 64
 """Views with fewer region pixels are not scored inside the region."""

@@ -6,8 +6,8 @@ import math
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
-from gausslite.calibration.pose_exposure_prior import PoseExposurePrior
 from gausslite.domain.errors import InvalidInputError
+from gausslite.domain.pose_exposure_prior import PoseExposurePrior
 from gausslite.mapping.task_change import TaskChangeSettings
 from gausslite.optimize.density import DensitySettings
 from gausslite.optimize.rates import ONLINE_RATES

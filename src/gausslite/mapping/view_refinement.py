@@ -10,11 +10,11 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from gausslite.calibration.exposure import fit_exposure
-from gausslite.calibration.pose_exposure_prior import PoseExposurePrior
 from gausslite.calibration.pose_fit import fit_pose
 from gausslite.domain.camera import Camera
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import inverse, require_rigid
+from gausslite.domain.pose_exposure_prior import PoseExposurePrior
 from gausslite.domain.state import State, get_array, get_counts, int_array
 from gausslite.mapping.keyframes import Keyframe, WindowView
 from gausslite.render.rasterizer import Rendering

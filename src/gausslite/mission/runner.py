@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 
 from gausslite.domain.errors import GaussLiteError
 from gausslite.domain.frame import Frame
-from gausslite.interrupts import DeferredInterrupt
 from gausslite.mission.task_mapper import FrameOutcome
+from gausslite.process.interrupts import DeferredInterrupt
 
 _NO_FRAME_INDEX = -1
 

@@ -6,13 +6,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from gausslite.calibration.pose_exposure_prior import PoseExposurePrior
 from gausslite.datasets.camera_correction import CameraCorrection
 from gausslite.datasets.registered_source import DepthRegistration
 from gausslite.datasets.source import Source
 from gausslite.domain.arguments import require_instance, require_number, require_whole
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.pose import UpAxis
+from gausslite.domain.pose_exposure_prior import PoseExposurePrior
 from gausslite.domain.region import BallRegion, Region
 from gausslite.mapping.policies import disable, policy
 from gausslite.mapping.settings import MapperSettings

@@ -12,8 +12,8 @@ from gausslite.domain.arrays import require_array, require_finite
 from gausslite.domain.errors import InvalidInputError, MapFileError, QuotaError
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.state import State, get_array
-from gausslite.optimize.row_encoding import allocate_rows, decode_opacities, gaussians_to_rows, rows_to_gaussians
 from gausslite.render.rasterizer import GRAD_2D_SUM, LOG_SCALE, MEAN, OPACITY_LOGIT, RGB, ROW_WIDTH, UPDATE_COUNT
+from gausslite.render.row_encoding import allocate_rows, decode_opacities, gaussians_to_rows, rows_to_gaussians
 
 _COLUMNS: dict[str, tuple[int | None, type[np.generic]]] = {
     "rows": (ROW_WIDTH, np.float32),

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 
 from gausslite.domain.errors import TaskError
 from gausslite.domain.task import Relation, TaskGraph
+from gausslite.domain.task_limits import EXAMPLE, LIMITS, require_graph, require_task_text
 from gausslite.task import lexicon
 from gausslite.task.chunker import chunk_sentence
 from gausslite.task.graph_builder import build_draft
@@ -14,7 +15,6 @@ from gausslite.task.noun_phrase import noun_phrase
 from gausslite.task.parser import normalise_text, task_id_of
 from gausslite.task.singular import singular
 from gausslite.task.tokenizer import tokenize
-from gausslite.task.validate import EXAMPLE, LIMITS, require_graph, require_task_text
 from gausslite.task.word_set import word_set
 
 # a generic noun in an answer is valid if the sentence has one of these words, and the reverse

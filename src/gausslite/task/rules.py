@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from gausslite.domain.errors import TaskError
 from gausslite.domain.task import TaskGraph
+from gausslite.domain.task_limits import EXAMPLE, require_task_text
 from gausslite.task.chunk import Chunk, ChunkKind
 from gausslite.task.chunker import chunk_sentence
 from gausslite.task.graph_builder import build_draft
 from gausslite.task.graph_grounding import grounded_graph
 from gausslite.task.parser import normalise_text
-from gausslite.task.validate import EXAMPLE, require_task_text
 
 
 class RuleParser:

@@ -14,10 +14,10 @@ from gausslite.domain.errors import InvalidInputError, TaskError
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import require_rigid
 from gausslite.domain.task import Predicate, Relation, TaskGraph
+from gausslite.domain.task_limits import require_graph
 from gausslite.domain.voxel_batch import VoxelBatch
 from gausslite.domain.voxel_operations import empty_batch, merge_batches, select_voxels
 from gausslite.domain.voxels import AxisAlignedBox, VoxelGrid
-from gausslite.task.validate import require_graph
 from gausslite.v1 import gaussians_pb2, geometry_pb2, task_pb2
 from gausslite.wire.images import decode_colour, decode_depth, encode_colour, encode_depth
 
@@ -67,7 +67,7 @@ def graph_to_message(graph: TaskGraph) -> task_pb2.TaskGraph:
 
 
 def graph_from_message(message: task_pb2.TaskGraph) -> TaskGraph:
-    """Decode a task graph and check it with `task.validate`. Raises TaskError."""
+    """Decode a task graph and check it with `domain.task_limits`. Raises TaskError."""
     for relation in message.relations:
         if relation.predicate not in _PREDICATE_BY_NUMBER:
             raise TaskError(

@@ -8,7 +8,7 @@ import sys
 from collections.abc import Awaitable, Callable
 
 from gausslite.domain.errors import GaussLiteError
-from gausslite.messages import print_message, printable
+from gausslite.process.messages import print_message, printable
 
 
 class _OneLine(logging.Formatter):

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 
-from gausslite.calibration.pose_exposure_prior import PoseExposurePrior
 from gausslite.datasets.held_out import HeldOutSplit
 from gausslite.datasets.intrinsics import CAMERA_FILE, INTRINSICS_FILE, find_in_or_above
 from gausslite.datasets.open import open_source
@@ -19,6 +18,7 @@ from gausslite.datasets.registered_source import DepthRegistration
 from gausslite.datasets.source import Source
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.pose import UpAxis
+from gausslite.domain.pose_exposure_prior import PoseExposurePrior
 from gausslite.evaluation.views import MIN_ROI_PIXELS, HeldOutView
 from gausslite.mission.settings import SceneInfo
 from gausslite.perception.vocabulary import head_of

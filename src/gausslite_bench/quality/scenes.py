@@ -10,9 +10,9 @@ import numpy as np
 from jaxtyping import Float32
 from numpy import ndarray
 
-from gausslite.calibration.pose_exposure_prior import PoseExposurePrior
 from gausslite.domain.errors import DatasetError, InvalidInputError
 from gausslite.domain.frame import Frame
+from gausslite.domain.pose_exposure_prior import PoseExposurePrior
 from gausslite.domain.region import Region
 from gausslite.domain.relevance import RelevanceMap
 from gausslite.domain.state import State

@@ -21,9 +21,9 @@ from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.settings import MapperSettings
 from gausslite.mission.frame_scheduler import FrameScheduler
 from gausslite.optimize.density import DensitySettings
-from gausslite.optimize.row_encoding import rows_to_gaussians
 from gausslite.optimize.splat_table import SplatTable
 from gausslite.render.rasterizer import FULL_FRAME, Subset
+from gausslite.render.row_encoding import rows_to_gaussians
 from gausslite_bench.raster.procedural_room import BenchView, held_out_view, seed_rows
 from gausslite_bench.raster.repeated_step import LOSSES, RUNS_PER_BATCH, ZERO_LEARNING_RATES, Duration
 

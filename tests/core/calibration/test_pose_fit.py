@@ -11,11 +11,11 @@ import pytest
 from mapping_scenes import middle_relevance, wall_frame
 
 from gausslite.calibration.exposure import AffineExposure, fit_exposure
-from gausslite.calibration.pose_exposure_prior import PoseExposurePrior
 from gausslite.calibration.pose_fit import fit_pose
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import inverse, rotation_angle_deg, translation_m
+from gausslite.domain.pose_exposure_prior import PoseExposurePrior
 from gausslite.evaluation.fitted import render_fitted
 from gausslite.evaluation.metrics import psnr
 from gausslite.evaluation.views import MapViewer

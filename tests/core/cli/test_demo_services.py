@@ -9,13 +9,13 @@ from pathlib import Path
 
 import pytest
 
-from gausslite.calibration.pose_exposure_prior import PoseExposurePrior
 from gausslite.cli.demo.scenario import AgentPlan
 from gausslite.cli.demo.service_processes import ServiceProcess
 from gausslite.cli.demo.services import DemoPlan, RunningService, RunningServices, watch_missions
 from gausslite.config.mapping_options import mission_options, perception_options
 from gausslite.config.toml_text import to_toml
 from gausslite.domain.errors import UnavailableError
+from gausslite.domain.pose_exposure_prior import PoseExposurePrior
 from gausslite.mapping.stages import SkippableStage
 from gausslite.mission.settings import MissionSettings, PerceptionSettings
 from gausslite_agent.settings import parse_arguments

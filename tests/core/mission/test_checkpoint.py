@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 from mapping_scenes import wall_frame
 
-from gausslite.calibration.pose_exposure_prior import PoseExposurePrior
 from gausslite.codec.state_file import read_state, write_state
 from gausslite.domain.errors import GaussLiteError, MapFileError, MismatchError
 from gausslite.domain.frame import Frame
+from gausslite.domain.pose_exposure_prior import PoseExposurePrior
 from gausslite.domain.region import BallRegion
 from gausslite.domain.state import State, select_prefix
 from gausslite.domain.task import Predicate, Relation, TaskGraph

@@ -14,7 +14,7 @@ from gausslite.cli.main import main
 from gausslite.codec.state_file import read_state
 from gausslite.datasets.sevenscenes import SevenScenesSource
 from gausslite.domain.frame import Frame
-from gausslite.interrupts import DeferredInterrupt
+from gausslite.process.interrupts import DeferredInterrupt
 
 pytest.importorskip("gausslite.render._kernels", reason="the native kernels are not built")
 

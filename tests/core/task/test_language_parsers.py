@@ -11,13 +11,13 @@ from hypothesis import strategies as st
 
 from gausslite.domain.errors import InvalidInputError, LanguageModelError, TaskError
 from gausslite.domain.task import Predicate, Relation
+from gausslite.domain.task_limits import require_graph
 from gausslite.task.backends import Backend, BackendSettings, open_parser
 from gausslite.task.language.answer import parse_answer
 from gausslite.task.language.model import Message, Role
 from gausslite.task.language.parsers import CachedParser, FallbackParser, LanguageParser
 from gausslite.task.language.prompt import MAX_PHRASES, MAX_RELATIONS, messages_for
 from gausslite.task.rules import RuleParser
-from gausslite.task.validate import require_graph
 
 TASK = "Pick up the mugs on the table"
 

@@ -9,12 +9,12 @@ import pytest
 
 from gausslite.domain.errors import TaskError
 from gausslite.domain.task import Predicate, Relation, TaskGraph
+from gausslite.domain.task_limits import require_graph
 from gausslite.task import lexicon
 from gausslite.task.nouns import COMMON_ANCHORS
 from gausslite.task.parser import task_id_of
 from gausslite.task.rules import RuleParser
 from gausslite.task.singular import singular
-from gausslite.task.validate import require_graph
 from gausslite_bench.parser_scores import SENTENCES as BENCH_SENTENCES
 
 SENTENCES = json.loads(BENCH_SENTENCES.read_text(encoding="utf-8"))

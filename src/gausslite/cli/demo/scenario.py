@@ -6,7 +6,6 @@ import argparse
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from gausslite.calibration.pose_exposure_prior import PoseExposurePrior
 from gausslite.cli.source_options import (
     correct_with_warnings,
     open_recorded,
@@ -22,6 +21,7 @@ from gausslite.datasets.regions import choose_regions
 from gausslite.datasets.registered_source import DepthRegistration
 from gausslite.datasets.selection import frame_size, select_frames
 from gausslite.domain.errors import InvalidInputError
+from gausslite.domain.pose_exposure_prior import PoseExposurePrior
 from gausslite.domain.region import Region
 from gausslite.evaluation.team import HeldOutFrames
 from gausslite.perception.vocabulary import same_kind

@@ -10,11 +10,11 @@ from typing import Final
 
 from gausslite.domain.errors import LanguageModelError
 from gausslite.domain.task import TaskGraph
+from gausslite.domain.task_limits import LIMITS, require_task_text
 from gausslite.task.language.answer import parse_answer
 from gausslite.task.language.model import LanguageModel
 from gausslite.task.language.prompt import PROMPT_VERSION, messages_for
 from gausslite.task.parser import TaskParser
-from gausslite.task.validate import LIMITS, require_task_text
 
 CACHED_ANSWERS: Final = 256
 _log: Final = logging.getLogger(__name__)

@@ -7,7 +7,7 @@ import logging
 import pytest
 
 from gausslite.cli.main import main
-from gausslite.messages import printable
+from gausslite.process.messages import printable
 from gausslite.wire.process import _OneLine
 
 

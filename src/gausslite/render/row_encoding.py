@@ -1,6 +1,6 @@
 """Convert Gaussians to the trainable rows of `render.rasterizer` and back.
 
-Only `optimize` and `render` use the encoding: scales as logarithms, opacities as logits. All other modules use physical
+Only `optimize` and this package use the encoding: scales as logarithms, opacities as logits. All other modules use physical
 values.
 """
 
