@@ -75,8 +75,8 @@ struct Scene {
     require(count < (size_t{1} << 31), "rows: too many");
     input = {rows, uint32_t(count), nullptr, 0, nullptr, make_camera(intrinsics, T_camera_world)};
     if (tiles) {
-      const size_t tiles_x = size_t(input.camera.width + kTile - 1) / kTile,
-                   tiles_y = size_t(input.camera.height + kTile - 1) / kTile;
+      const size_t tiles_x = size_t(input.camera.width + kTileSide - 1) / kTileSide,
+                   tiles_y = size_t(input.camera.height + kTileSide - 1) / kTileSide;
       require(tiles->shape(0) == tiles_y && tiles->shape(1) == tiles_x, "tiles: wrong grid");
       input.active_tiles = reinterpret_cast<const uint8_t*>(tiles->data());
     }

@@ -49,7 +49,8 @@ GAUSSLITE_INLINE void list_touches(const Workspace& ws, int tile_row, const Touc
   }
   for (int i = 0; i < n; ++i) {
     const auto [slot, x] = touches[i];
-    const uint32_t blocks = needed[x] & touched_blocks(ws.splats[slot], float(x * kTile), float(tile_row * kTile));
+    const uint32_t blocks =
+        needed[x] & touched_blocks(ws.splats[slot], float(x * kTileSide), float(tile_row * kTileSide));
     // Each splat is written, but counted only if it touches a needed block: no branch to mispredict.
     TileList& tile = tiles[x];
     tile.slots[tile.count] = slot;

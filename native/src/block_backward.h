@@ -117,7 +117,8 @@ GAUSSLITE_INLINE void prefetch_rows(Workspace& ws, const Splat* records, int n, 
 // gradient rows of this tile row.
 GAUSSLITE_INLINE void add_to_rows(Workspace& ws, const Splat* records, int n, const TilePosition& tile,
                                   const ChunkSums& sums) {
-  const float centre_x = float(tile.x * kTile + kTile / 2), centre_y = float(tile.y * kTile + kTile / 2);
+  const float centre_x = float(tile.x * kTileSide + kTileSide / 2),
+              centre_y = float(tile.y * kTileSide + kTileSide / 2);
   alignas(32) const float centres[8] = {centre_x, centre_y, centre_x, centre_y, centre_x, centre_y, centre_x, centre_y};
   const Pack8 centre = load8(centres), units = load8(kMomentUnits);
   const Pack16 pass(__builtin_bit_cast(float, ws.gradient_pass));

@@ -11,7 +11,7 @@ struct Camera {
   int width, height;
 };
 
-constexpr float kNearM = 0.05f;       // splats with a mean at smaller depth are culled
+constexpr float kNearPlaneM = 0.05f;  // splats with a mean at smaller depth are culled
 constexpr float kDilationPx2 = 0.3f;  // added to the diagonal of the 2D covariance
 // Tangents x/z and y/z in the Jacobian are clamped to this factor times the tangent of half the field of view.
 constexpr float kTangentLimitFactor = 1.3f;
@@ -20,9 +20,9 @@ constexpr float kLog2MinAlpha = -7.99435343685886f;    // log2(1/255): weaker co
 constexpr float kLog2MaxAlpha = -0.0144995696951151f;  // log2(0.99): alpha is clamped there, without a gradient
 constexpr float kMinSurfaceAlpha = 0.5f;               // the depth loss ignores pixels of lower alpha
 
-constexpr int kTile = 16;    // pixels per side
-constexpr int kBlock = 4;    // pixels per side; the sixteen pixels of a block are one Pack16
-constexpr int kBlocks = 16;  // blocks per tile
-constexpr int kBlocksAcross = 4;
+constexpr int kTileSide = 16;       // pixels per side
+constexpr int kBlockSide = 4;       // pixels per side; the 16 pixels of a block are one Pack16
+constexpr int kBlocksPerTile = 16;  // 4 x 4
+constexpr int kBlocksPerSide = 4;
 
 }  // namespace gausslite

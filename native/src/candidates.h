@@ -58,10 +58,10 @@ class CullingBounds {
         limit_v_(kTangentLimitFactor * 0.5f * float(camera_.height) / camera_.fy) {
     const bool everywhere = ws.active_tiles == nullptr;
     const auto [x0, x1, y0, y1] = everywhere ? ActiveTiles::Box{0, ws.tiles_x, 0, ws.tiles_y} : ws.active.box();
-    left_ = float(x0 * kTile);
-    right_ = float(x1 * kTile);
-    top_ = float(y0 * kTile);
-    bottom_ = float(y1 * kTile);
+    left_ = float(x0 * kTileSide);
+    right_ = float(x1 * kTileSide);
+    top_ = float(y0 * kTileSide);
+    bottom_ = float(y1 * kTileSide);
   }
 
   // Lanes that may touch the bounding box of the active tiles.
@@ -115,13 +115,13 @@ class CullingBounds {
   };
 
   GAUSSLITE_INLINE Mask16 overlaps(const Extent& e) const {
-    return (e.z >= Pack16(kNearM)) & (e.x - e.reach_x <= Pack16(right_)) & (e.x + e.reach_x >= Pack16(left_)) &
+    return (e.z >= Pack16(kNearPlaneM)) & (e.x - e.reach_x <= Pack16(right_)) & (e.x + e.reach_x >= Pack16(left_)) &
            (e.y - e.reach_y <= Pack16(bottom_)) & (e.y + e.reach_y >= Pack16(top_));
   }
 
   // The tile column or row of a pixel, clamped to the image.
   GAUSSLITE_INLINE static Pack16 tile(Pack16 pixel, int tiles) {
-    return floor(min(max(pixel * (1.0f / kTile), Pack16(0.0f)), Pack16(float(tiles - 1))));
+    return floor(min(max(pixel * (1.0f / kTileSide), Pack16(0.0f)), Pack16(float(tiles - 1))));
   }
 
   const Camera& camera_;

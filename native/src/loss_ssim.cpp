@@ -64,14 +64,15 @@ class Squares {
     const size_t at = image_offset(x) + size_t(channel) * kTilePixels;
     const float* upper = row_.above != nullptr ? row_.above->image.data() + at : kZeroSquares;
     const float* lower = row_.below != nullptr ? row_.below->image.data() + at : kZeroSquares;
-    for (int i = 0; i < kSpan; ++i) store(out + i * kTile, row_between(upper, lower, i));
+    for (int i = 0; i < kSpan; ++i) store(out + i * kTileSide, row_between(upper, lower, i));
   }
   GAUSSLITE_INLINE void target_rows(int x, int channel, float* out) const {
     const TargetTile& upper = row_.above != nullptr ? targets_.tiles[upper_ + size_t(x)] : kBlackTarget;
     const TargetTile& lower = row_.below != nullptr ? targets_.tiles[lower_ + size_t(x)] : kBlackTarget;
     for (int i = 0; i < kSpan; ++i) {
-      const int at = i + kTile / 2 - kRadius;
-      store(out + i * kTile, at < kTile ? colour_row(upper, channel, at) : colour_row(lower, channel, at - kTile));
+      const int at = i + kTileSide / 2 - kRadius;
+      store(out + i * kTileSide,
+            at < kTileSide ? colour_row(upper, channel, at) : colour_row(lower, channel, at - kTileSide));
     }
   }
 
@@ -86,13 +87,13 @@ class Squares {
     const float* upper = row_.above != nullptr ? targets_.tile_weights(upper_ + size_t(x)) : kZeroSquares;
     const float* lower = row_.below != nullptr ? targets_.tile_weights(lower_ + size_t(x)) : kZeroSquares;
     if (upper == lower) return upper;
-    Pack16 rows[kTile];
-    for (int i = 0; i < kTile / 2; ++i) {
-      rows[i] = load(upper + (i + kTile / 2) * kTile);
-      rows[i + kTile / 2] = load(lower + i * kTile);
+    Pack16 rows[kTileSide];
+    for (int i = 0; i < kTileSide / 2; ++i) {
+      rows[i] = load(upper + (i + kTileSide / 2) * kTileSide);
+      rows[i + kTileSide / 2] = load(lower + i * kTileSide);
     }
     transpose(rows);
-    for (int i = 0; i < kTile; ++i) store(scratch + i * kTile, rows[i]);
+    for (int i = 0; i < kTileSide; ++i) store(scratch + i * kTileSide, rows[i]);
     return scratch;
   }
 
@@ -104,17 +105,17 @@ class Squares {
 
 template <class Get>
 GAUSSLITE_INLINE void blur_and_transpose(Get get, float* out) {
-  Pack16 rows[kTile];
+  Pack16 rows[kTileSide];
   blur(get, [&](int i, Pack16 sum) { rows[i] = sum; });
   transpose(rows);
-  for (int i = 0; i < kTile; ++i) store(out + i * kTile, rows[i]);
+  for (int i = 0; i < kTileSide; ++i) store(out + i * kTileSide, rows[i]);
 }
 
 // `rendered`: whether a block of the square is rendered; otherwise the image and its blurs are zero.
 void blur_down(const Squares& squares, int x, int channel, bool rendered, Columns& columns) {
-  alignas(64) float image[kSpan * kTile], target[kSpan * kTile];
+  alignas(64) float image[kSpan * kTileSide], target[kSpan * kTileSide];
   squares.target_rows(x, channel, target);
-  const auto Y = [&](int i) { return load(target + i * kTile); };
+  const auto Y = [&](int i) { return load(target + i * kTileSide); };
   if (!rendered) {
     for (const int k : {0, 3}) std::fill_n(columns.blurred(k, x), kTilePixels, 0.0f);
     blur_and_transpose(Y, columns.blurred(1, x));
@@ -122,7 +123,7 @@ void blur_down(const Squares& squares, int x, int channel, bool rendered, Column
     return;
   }
   squares.image_rows(x, channel, image);
-  const auto X = [&](int i) { return load(image + i * kTile); };
+  const auto X = [&](int i) { return load(image + i * kTileSide); };
   blur_and_transpose(X, columns.blurred(0, x));
   blur_and_transpose(Y, columns.blurred(1, x));
   blur_and_transpose([&](int i) { return fma(X(i), X(i), Y(i) * Y(i)); }, columns.blurred(2, x));
@@ -130,20 +131,20 @@ void blur_down(const Squares& squares, int x, int channel, bool rendered, Column
 }
 
 // Column i of a square, or of its left or right neighbour for i outside 0 ... 15.
-GAUSSLITE_INLINE Pack16 column(const float* columns, int i) { return load(columns + (i - kRadius) * kTile); }
+GAUSSLITE_INLINE Pack16 column(const float* columns, int i) { return load(columns + (i - kRadius) * kTileSide); }
 
 // Computes SSIM and its derivatives in one square. Returns its loss: the sum of SSIM times -weight.
 double derive(Columns& columns, int x, const float* weights, float scale) {
-  Pack16 mean[kMeans][kTile];
+  Pack16 mean[kMeans][kTileSide];
   for (int k = 0; k < kMeans; ++k) {
     const float* in = columns.blurred(k, x);
     blur([&](int i) { return column(in, i); }, [&](int i, Pack16 sum) { mean[k][i] = sum; });
   }
   float* d_maps[kSsimMaps] = {columns.derivative(0, x), columns.derivative(1, x), columns.derivative(2, x)};
   Pack16 total(0.0f);
-  for (int i = 0; i < kTile; ++i) {
+  for (int i = 0; i < kTileSide; ++i) {
     const Pack16 Ex = mean[0][i], Ey = mean[1][i], squares = mean[2][i], Exy = mean[3][i];
-    const Pack16 pixel_weight = load(weights + i * kTile), weight = pixel_weight * -scale;
+    const Pack16 pixel_weight = load(weights + i * kTileSide), weight = pixel_weight * -scale;
     const Pack16 cross = Ex * Ey, means = fma(Ex, Ex, Ey * Ey);
     const Pack16 A1 = fma(cross, Pack16(2.0f), Pack16(kC1)), A2 = fma(Exy - cross, Pack16(2.0f), Pack16(kC2));
     const Pack16 B1 = means + kC1, B2 = (squares - means) + kC2;
@@ -153,9 +154,9 @@ double derive(Columns& columns, int x, const float* weights, float scale) {
     // Pixels without a weight have no loss. Their windows may contain pixels that are not rendered.
     const Mask16 has_weight = pixel_weight > Pack16(0.0f);
     total = total + zero_unless(has_weight, S * weight);
-    store(d_maps[0] + i * kTile, zero_unless(has_weight, d_Ex + d_Ex));
-    store(d_maps[1] + i * kTile, zero_unless(has_weight, d_B2));
-    store(d_maps[2] + i * kTile, zero_unless(has_weight, d_A2 + d_A2));
+    store(d_maps[0] + i * kTileSide, zero_unless(has_weight, d_Ex + d_Ex));
+    store(d_maps[1] + i * kTileSide, zero_unless(has_weight, d_B2));
+    store(d_maps[2] + i * kTileSide, zero_unless(has_weight, d_A2 + d_A2));
   }
   return double(sum(total));
 }

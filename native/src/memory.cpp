@@ -19,9 +19,9 @@ namespace {
 constexpr size_t kCacheLine = 64;
 constexpr size_t kHugePage = size_t{2} << 20;
 
-// Freed large blocks, for the next requests of the same size. A mapper frees an old training view for each new one.
-// Without this cache the operating system would reclaim the freed pages, and map new ones at their first access. That
-// takes ten times as long as preparing the view.
+// Keeps freed large blocks for later requests of the same size. The mapper frees one training view for each new one.
+// Without this cache, the operating system would take back the freed pages and map new pages at their first access,
+// which takes ten times as long as preparing the view.
 class BlockCache {
  public:
   // Returns a block of exactly this size, or null.
@@ -66,18 +66,18 @@ size_t rounded(size_t bytes) { return (bytes + kCacheLine - 1) / kCacheLine * kC
 // Large blocks use huge pages: random 64-byte reads are about twice as fast from 2 MiB pages as from 4 KiB pages.
 void* reallocate(void* old, size_t preserved_bytes, size_t old_bytes, size_t bytes) {
   const size_t alignment = alignment_of(bytes), size = rounded(bytes);
-  void* fresh = alignment == kHugePage ? block_cache().take(size) : nullptr;
-  if (fresh == nullptr) {
-    if (posix_memalign(&fresh, alignment, size) != 0) throw std::bad_alloc();
+  void* new_memory = alignment == kHugePage ? block_cache().take(size) : nullptr;
+  if (new_memory == nullptr) {
+    if (posix_memalign(&new_memory, alignment, size) != 0) throw std::bad_alloc();
 #if defined(__linux__) && defined(MADV_HUGEPAGE)
-    // Only for whole huge pages: the rest of the block would otherwise take up another 2 MiB.
-    if (size >= kHugePage) madvise(fresh, size / kHugePage * kHugePage, MADV_HUGEPAGE);
+    // Only as many huge pages as the block fills: one more, for the rest of the block, would occupy 2 MiB.
+    if (size >= kHugePage) madvise(new_memory, size / kHugePage * kHugePage, MADV_HUGEPAGE);
 #endif
   }
-  if (preserved_bytes > 0) std::memcpy(fresh, old, preserved_bytes);
-  std::memset(static_cast<char*>(fresh) + preserved_bytes, 0, size - preserved_bytes);
+  if (preserved_bytes > 0) std::memcpy(new_memory, old, preserved_bytes);
+  std::memset(static_cast<char*>(new_memory) + preserved_bytes, 0, size - preserved_bytes);
   free_memory(old, old_bytes);
-  return fresh;
+  return new_memory;
 }
 
 void free_memory(void* memory, size_t bytes) noexcept {

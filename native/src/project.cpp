@@ -26,10 +26,10 @@ struct Box {
     const Pack16 right = min(floor(p.mean_x + reach_x - 0.5f), Pack16(float(camera.width - 1)));
     const Pack16 bottom = min(floor(p.mean_y + reach_y - 0.5f), Pack16(float(camera.height - 1)));
     visible = (above > zero) & (left <= right) & (top <= bottom);
-    x0 = floor(left * (1.0f / kTile));
-    x1 = floor(right * (1.0f / kTile));
-    y0 = floor(top * (1.0f / kTile));
-    y1 = floor(bottom * (1.0f / kTile));
+    x0 = floor(left * (1.0f / kTileSide));
+    x1 = floor(right * (1.0f / kTileSide));
+    y0 = floor(top * (1.0f / kTileSide));
+    y1 = floor(bottom * (1.0f / kTileSide));
   }
 
   // Returns the few lanes with a box that is too large for narrow().

@@ -24,9 +24,9 @@ struct Band {
 // Returns the mask of a tile's blocks inside an image that extends `columns` and `rows` pixels from the corner of the
 // tile.
 uint16_t blocks_inside(int columns, int rows) {
-  const int across = std::min((columns + kBlock - 1) / kBlock, kBlocksAcross);
-  const int down = std::min((rows + kBlock - 1) / kBlock, kBlocksAcross);
-  return uint16_t(((1u << across) - 1u) * 0x1111u & ((1u << kBlocksAcross * down) - 1u));
+  const int across = std::min((columns + kBlockSide - 1) / kBlockSide, kBlocksPerSide);
+  const int down = std::min((rows + kBlockSide - 1) / kBlockSide, kBlocksPerSide);
+  return uint16_t(((1u << across) - 1u) * 0x1111u & ((1u << kBlocksPerSide * down) - 1u));
 }
 
 }  // namespace
@@ -38,10 +38,10 @@ Rasterizer::Rasterizer(const Stages& stages, int threads) : stages_(stages), poo
 
 void Rasterizer::begin_frame(const FrameInput& input) {
   ws_.camera = input.camera;
-  ws_.tiles_x = (input.camera.width + kTile - 1) / kTile;
-  ws_.tiles_y = (input.camera.height + kTile - 1) / kTile;
-  ws_.padded_width = ws_.tiles_x * kTile;
-  ws_.plane_pixels = int64_t(ws_.padded_width) * ws_.tiles_y * kTile;
+  ws_.tiles_x = (input.camera.width + kTileSide - 1) / kTileSide;
+  ws_.tiles_y = (input.camera.height + kTileSide - 1) / kTileSide;
+  ws_.padded_width = ws_.tiles_x * kTileSide;
+  ws_.plane_pixels = int64_t(ws_.padded_width) * ws_.tiles_y * kTileSide;
   row_count_ = input.row_count;
   ws_.rows = input.rows;
   ws_.ids = input.ids;
@@ -76,7 +76,8 @@ void Rasterizer::select_blocks(const uint16_t* blocks) {
     for (int x = 0; x < ws_.tiles_x; ++x, ++t) {
       const bool active = ws_.active_tiles == nullptr || ws_.active_tiles[t];
       const uint16_t blocks_here =
-          blocks != nullptr ? blocks[t] : blocks_inside(ws_.camera.width - x * kTile, ws_.camera.height - y * kTile);
+          blocks != nullptr ? blocks[t]
+                            : blocks_inside(ws_.camera.width - x * kTileSide, ws_.camera.height - y * kTileSide);
       ws_.needed_blocks[size_t(t)] = active ? blocks_here : uint16_t(0);
     }
   }
@@ -165,7 +166,7 @@ void Rasterizer::backward(const ImageGradients& input, float* d_rows, double* d_
   mean_2d_grad_norms_.ensure_capacity(size_t(ws_.count) + 1);
   const GradientOutput output{d_rows, mean_2d_grad_norms_.data(), twist_sums_.data()};
   pool_.run([&](int thread) {
-    const Band band(ws_.tiles_y * kTile, thread, pool_.size());
+    const Band band(ws_.tiles_y * kTileSide, thread, pool_.size());
     import_gradients(ws_, input, band.begin, band.end);
     pool_.barrier();
     for_each_tile_row([&](int tile_row) { stages_.backward_tile_row(ws_, tile_row, thread); });

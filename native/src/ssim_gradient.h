@@ -16,10 +16,10 @@ struct TileColours {
 
 // Sets the colours (or gradients) of a tile beyond the edge of the image, which windows also reach, to zero.
 GAUSSLITE_INLINE void clear_beyond_edge(const Camera& camera, int tile_x, int tile_y, float* colours) {
-  const int columns = camera.width - tile_x * kTile, rows = camera.height - tile_y * kTile;
-  if (columns >= kTile && rows >= kTile) return;
+  const int columns = camera.width - tile_x * kTileSide, rows = camera.height - tile_y * kTileSide;
+  if (columns >= kTileSide && rows >= kTileSide) return;
   for (int i = 0; i < 3 * kTilePixels; ++i) {
-    if (i % kTile >= columns || i / kTile % kTile >= rows) colours[i] = 0.0f;
+    if (i % kTileSide >= columns || i / kTileSide % kTileSide >= rows) colours[i] = 0.0f;
   }
 }
 
@@ -30,13 +30,13 @@ GAUSSLITE_INLINE void ssim_gradient(const float* image, const TargetTile& target
   const auto blurred = [&](int map, auto set) {
     blur([&](int i) { return row_between(upper + map * kTilePixels, lower + map * kTilePixels, i); }, set);
   };
-  blurred(0, [&](int i, Pack16 d_x) { store(out + i * kTile, d_x); });
+  blurred(0, [&](int i, Pack16 d_x) { store(out + i * kTileSide, d_x); });
   blurred(1, [&](int i, Pack16 d_xx) {
-    const Pack16 x = load(image + i * kTile);
-    store(out + i * kTile, fma(x + x, d_xx, load(out + i * kTile)));
+    const Pack16 x = load(image + i * kTileSide);
+    store(out + i * kTileSide, fma(x + x, d_xx, load(out + i * kTileSide)));
   });
   blurred(2, [&](int i, Pack16 d_xy) {
-    store(out + i * kTile, fma(colour_row(target, channel, i), d_xy, load(out + i * kTile)));
+    store(out + i * kTileSide, fma(colour_row(target, channel, i), d_xy, load(out + i * kTileSide)));
   });
 }
 

@@ -8,7 +8,7 @@
 namespace gausslite::GAUSSLITE_ISA {
 
 constexpr int kRadius = 5, kTaps = 2 * kRadius + 1;
-constexpr int kSpan = kTile + 2 * kRadius;  // rows or columns that the windows of an SSIM square reach
+constexpr int kSpan = kTileSide + 2 * kRadius;  // rows or columns that the windows of an SSIM square reach
 
 // The maps of an SSIM square as zeros, for squares beyond the image or without a gradient.
 alignas(64) inline constexpr float kZeroSquares[kSsimMaps * kTilePixels] = {};
@@ -24,7 +24,7 @@ GAUSSLITE_INLINE void blur_packs(Get get, Set set) {
 #pragma GCC unroll 32
   for (int i = 0; i < kTaps - 1; ++i) window[i] = get(i);
 #pragma GCC unroll 32
-  for (int i = 0; i < kTile; ++i) {
+  for (int i = 0; i < kTileSide; ++i) {
     window[i + kTaps - 1] = get(i + kTaps - 1);
     Pack total = window[i + kRadius] * kWindow[0];
 #pragma GCC unroll 8
@@ -41,7 +41,7 @@ GAUSSLITE_INLINE void blur(Get get, Set set) {
   if constexpr (kFitsOneRegister) {
     blur_packs<Pack16>(get, set);
   } else {
-    Pack8 sums[kTile];
+    Pack8 sums[kTileSide];
     blur_packs<Pack8>([&](int i) { return lower(get(i)); }, [&](int i, Pack8 sum) { sums[i] = sum; });
     blur_packs<Pack8>([&](int i) { return upper(get(i)); }, [&](int i, Pack8 sum) { set(i, join(sums[i], sum)); });
   }
@@ -50,9 +50,9 @@ GAUSSLITE_INLINE void blur(Get get, Set set) {
 // Returns row i of the 26 rows that the windows of a square reach. The square is the lower half of `upper` and the
 // upper half of `lower`.
 GAUSSLITE_INLINE Pack16 row_between(const float* upper, const float* lower, int i) {
-  constexpr int kFirst = kTile / 2 - kRadius;
+  constexpr int kFirst = kTileSide / 2 - kRadius;
   const int row = i + kFirst;
-  return load(row < kTile ? upper + row * kTile : lower + (row - kTile) * kTile);
+  return load(row < kTileSide ? upper + row * kTileSide : lower + (row - kTileSide) * kTileSide);
 }
 
 }  // namespace gausslite::GAUSSLITE_ISA

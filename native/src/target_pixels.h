@@ -16,12 +16,12 @@ GAUSSLITE_INLINE Pack16 colours_of(Pack16 bytes) {
 }
 
 GAUSSLITE_INLINE Pack16 colour_row(const TargetTile& tile, int channel, int row) {
-  return colours_of(load_bytes(tile.rgb[channel] + row * kTile));
+  return colours_of(load_bytes(tile.rgb[channel] + row * kTileSide));
 }
 
 // `corner`: offset of the 4x4 block in the tile's sixteen rows of sixteen pixels.
 GAUSSLITE_INLINE Pack16 colour_block(const TargetTile& tile, int channel, int corner) {
-  return colours_of(load_byte_block(tile.rgb[channel] + corner, kTile));
+  return colours_of(load_byte_block(tile.rgb[channel] + corner, kTileSide));
 }
 
 }  // namespace gausslite::GAUSSLITE_ISA

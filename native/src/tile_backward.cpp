@@ -20,9 +20,9 @@ void backward_tile(Workspace& ws, const TileList& list, const TilePosition& tile
   BlockLists lists;
   ChunkSums sums;
   MomentBatch batch;
-  BlockGradient gradients[kBlocks];
-  uint32_t left[kBlocks], total_left = 0;
-  for (int b = 0; b < kBlocks; ++b) {
+  BlockGradient gradients[kBlocksPerTile];
+  uint32_t left[kBlocksPerTile], total_left = 0;
+  for (int b = 0; b < kBlocksPerTile; ++b) {
     left[b] = list.used[b];
     total_left += left[b];
     Pack16 image[5], gradient[5];
@@ -35,7 +35,7 @@ void backward_tile(Workspace& ws, const TileList& list, const TilePosition& tile
     load_chunk(ws, list, first, n, records, lists);
     prefetch_rows(ws, records, n, tile);
     sums.clear(n);
-    for (int b = 0; b < kBlocks; ++b) {
+    for (int b = 0; b < kBlocksPerTile; ++b) {
       const uint32_t entries = std::min<uint32_t>(lists.count[b], left[b]);
       const float* no_alphas = nullptr;
       if (entries > 0)

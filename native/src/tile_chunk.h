@@ -58,13 +58,13 @@ struct BlockBytes {
 GAUSSLITE_INLINE void list_blocks(const uint16_t* blocks, int n, BlockLists& lists) {
   alignas(32) static constexpr uint8_t kNumbers[32] = {0,  1,  2,  3,  4,  5,  6,  7,  8,  9,  10, 11, 12, 13, 14, 15,
                                                        16, 17, 18, 19, 20, 21, 22, 23, 24, 25, 26, 27, 28, 29, 30, 31};
-  uint32_t count[kBlocks] = {};
+  uint32_t count[kBlocksPerTile] = {};
   for (int i = 0; i < n; i += 32) {
     const __mmask32 present = n - i >= 32 ? 0xFFFFFFFFu : (1u << (n - i)) - 1u;
     const __m512i masks = _mm512_maskz_loadu_epi16(present, blocks + i);
     const __m256i numbers =
         _mm256_add_epi8(_mm256_load_si256(reinterpret_cast<const __m256i*>(kNumbers)), _mm256_set1_epi8(char(i)));
-    for (int b = 0; b < kBlocks; ++b) {
+    for (int b = 0; b < kBlocksPerTile; ++b) {
       const __mmask32 touching = _mm512_test_epi16_mask(masks, _mm512_set1_epi16(short(1u << b)));
       _mm256_storeu_si256(reinterpret_cast<__m256i*>(lists.entry[b] + count[b]),
                           _mm256_maskz_compress_epi8(touching, numbers));
@@ -77,11 +77,11 @@ GAUSSLITE_INLINE void list_blocks(const uint16_t* blocks, int n, BlockLists& lis
 // Eight entries at a time: their masks become sixteen bytes, one per block, and a table converts each to entry numbers.
 // No branch: the number of blocks of an entry is unpredictable.
 GAUSSLITE_INLINE void list_blocks(const uint16_t* blocks, int n, BlockLists& lists) {
-  uint32_t count[kBlocks] = {};
+  uint32_t count[kBlocksPerTile] = {};
   const auto list = [&](const uint16_t* masks, int i) {
     const BlockBytes bytes(masks);
     const uint64_t first = uint64_t(i) * 0x0101010101010101u;
-    for (int b = 0; b < kBlocks; ++b) {
+    for (int b = 0; b < kBlocksPerTile; ++b) {
       const uint32_t entries = uint32_t(bytes.half[b / 8] >> (8 * (b % 8))) & 0xFFu;
       const uint64_t numbers = kSetBits.numbers[entries] + first;
       std::memcpy(lists.entry[b] + count[b], &numbers, sizeof numbers);
@@ -119,12 +119,12 @@ struct TilePosition {
   int64_t corner;  // offset of its first pixel in an image plane
 
   GAUSSLITE_INLINE TilePosition(const Workspace& ws, int tile_x, int tile_y)
-      : x(tile_x), y(tile_y), corner(int64_t(tile_y) * kTile * ws.padded_width + int64_t(tile_x) * kTile) {}
+      : x(tile_x), y(tile_y), corner(int64_t(tile_y) * kTileSide * ws.padded_width + int64_t(tile_x) * kTileSide) {}
 
-  GAUSSLITE_INLINE Pack16 pixel_x(int b) const { return load(kPixelX) + float(x * kTile + (b & 3) * kBlock); }
-  GAUSSLITE_INLINE Pack16 pixel_y(int b) const { return load(kPixelY) + float(y * kTile + (b >> 2) * kBlock); }
+  GAUSSLITE_INLINE Pack16 pixel_x(int b) const { return load(kPixelX) + float(x * kTileSide + (b & 3) * kBlockSide); }
+  GAUSSLITE_INLINE Pack16 pixel_y(int b) const { return load(kPixelY) + float(y * kTileSide + (b >> 2) * kBlockSide); }
   GAUSSLITE_INLINE int64_t block(const Workspace& ws, int b) const {
-    return corner + int64_t(b >> 2) * kBlock * ws.padded_width + (b & 3) * kBlock;
+    return corner + int64_t(b >> 2) * kBlockSide * ws.padded_width + (b & 3) * kBlockSide;
   }
 };
 

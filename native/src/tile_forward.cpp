@@ -22,12 +22,12 @@ void store_pixels(Workspace& ws, const TilePosition& tile, int b, const BlockSta
 void render_tile(Workspace& ws, TileList& list, const TilePosition& tile) {
   Splat records[kChunk];
   BlockLists lists;
-  BlockState state[kBlocks];
-  std::fill_n(list.used, kBlocks, 0);
+  BlockState state[kBlocksPerTile];
+  std::fill_n(list.used, kBlocksPerTile, 0);
   uint32_t finished = 0;
   for (uint32_t first = 0; first < list.count && finished != 0xFFFF; first += kChunk) {
     load_chunk(ws, list, first, int(std::min<uint32_t>(kChunk, list.count - first)), records, lists);
-    for (int b = 0; b < kBlocks; ++b) {
+    for (int b = 0; b < kBlocksPerTile; ++b) {
       if (finished >> b & 1u) continue;
       float* no_alphas = nullptr;
       const int taken = composite<false>(records, lists.entry[b], lists.count[b], tile.pixel_x(b), tile.pixel_y(b),
@@ -36,7 +36,7 @@ void render_tile(Workspace& ws, TileList& list, const TilePosition& tile) {
       if (state[b].finished()) finished |= 1u << b;
     }
   }
-  for (int b = 0; b < kBlocks; ++b) store_pixels(ws, tile, b, state[b]);
+  for (int b = 0; b < kBlocksPerTile; ++b) store_pixels(ws, tile, b, state[b]);
 }
 
 }  // namespace
@@ -49,7 +49,7 @@ void render_tile_row(Workspace& ws, int tile_row, int thread) {
     const size_t t = size_t(tile_row) * size_t(ws.tiles_x) + size_t(x);
     const TilePosition tile(ws, x, tile_row);
     if (ws.needed_blocks[t] == 0) {
-      for (int b = 0; b < kBlocks; ++b) store_pixels(ws, tile, b, BlockState{});
+      for (int b = 0; b < kBlocksPerTile; ++b) store_pixels(ws, tile, b, BlockState{});
     } else {
       render_tile(ws, ws.tiles[t], tile);
       for (const uint32_t used : ws.tiles[t].used) ws.scratch[size_t(thread)].block_evaluations += used;

@@ -18,10 +18,10 @@ namespace gausslite::GAUSSLITE_ISA {
 namespace {
 
 // Offset of block b in sixteen rows of sixteen pixels.
-GAUSSLITE_INLINE int corner_in_tile(int b) { return (b >> 2) * kBlock * kTile + (b & 3) * kBlock; }
+GAUSSLITE_INLINE int corner_in_tile(int b) { return (b >> 2) * kBlockSide * kTileSide + (b & 3) * kBlockSide; }
 
 struct TileGradient {
-  BlockGradient block[kBlocks];
+  BlockGradient block[kBlocksPerTile];
   uint32_t nonzero_blocks = 0;  // bit mask of the blocks with a non-zero gradient
 
   GAUSSLITE_INLINE void start(int b, const Pack16 (&gradient)[5], const Pack16 (&image)[5]) {
@@ -37,7 +37,7 @@ int chunk_size(uint32_t count, uint32_t first) { return int(std::min<uint32_t>(k
 
 // Renders a tile and appends it to the forward cache.
 CachedTile render(Workspace& ws, TileRowCache& cache, const TileList& list, const TilePosition& tile,
-                  BlockState (&state)[kBlocks]) {
+                  BlockState (&state)[kBlocksPerTile]) {
   CachedTile out{cache.record_count, cache.list_count, cache.alpha_count, 0};
   cache.records.ensure_capacity(out.first_record + list.count, out.first_record);
   cache.lists.ensure_capacity(out.first_list + (list.count + kChunk - 1) / kChunk, out.first_list);
@@ -51,10 +51,10 @@ CachedTile render(Workspace& ws, TileRowCache& cache, const TileList& list, cons
     // Prefetched this early, the rows are in a near cache when the backward pass adds to them.
     prefetch_rows(ws, records, n, tile);
     size_t entries = 0;
-    for (int b = 0; b < kBlocks; ++b) entries += lists.count[b];
+    for (int b = 0; b < kBlocksPerTile; ++b) entries += lists.count[b];
     cache.alphas.ensure_capacity((alpha_count + entries) * 16, alpha_count * 16);
     float* alphas = cache.alphas.data() + alpha_count * 16;
-    for (int b = 0; b < kBlocks; ++b) {
+    for (int b = 0; b < kBlocksPerTile; ++b) {
       if (finished >> b & 1u) {
         lists.count[b] = 0;
         continue;
@@ -84,7 +84,7 @@ void backward_cached_tile(Workspace& ws, const TileRowCache& cache, const Cached
     if (first + kChunk < cached.entries)
       prefetch_rows(ws, records + kChunk, chunk_size(cached.entries, first + kChunk), tile);
     sums.clear(n);
-    for (int b = 0; b < kBlocks; ++b) {
+    for (int b = 0; b < kBlocksPerTile; ++b) {
       if (gradient.nonzero_blocks >> b & 1u) {
         if (lists->count[b] > 0)
           backward_block<true>(records, lists->entry[b], lists->count[b], tile, b, gradient.block[b], sums, batch,
@@ -105,20 +105,20 @@ GAUSSLITE_INLINE Pack16 compare(const TrainingArguments& training, size_t t, int
   const int corner = corner_in_tile(b);
   Pack16 rgb[3];
   for (int k = 0; k < 3; ++k) rgb[k] = colour_block(target, k, corner);
-  const Pack16 measured_m = load_block(target.depth_m + corner, kTile);
-  const Pack16 weight = load_block(training.targets.tile_weights(t) + corner, kTile);
+  const Pack16 measured_m = load_block(target.depth_m + corner, kTileSide);
+  const Pack16 weight = load_block(training.targets.tile_weights(t) + corner, kTileSide);
   return l1_of_pixels(image, rgb, measured_m, weight, training.loss, gradient);
 }
 
 void train_tile(Workspace& ws, const TrainingArguments& training, size_t t, const TilePosition& tile,
                 ThreadScratch& thread_scratch) {
-  BlockState state[kBlocks];
+  BlockState state[kBlocksPerTile];
   thread_scratch.tile_cache.clear();
   const CachedTile cached = render(ws, thread_scratch.tile_cache, thread_scratch.tiles[size_t(tile.x)], tile, state);
   thread_scratch.block_evaluations += thread_scratch.tile_cache.alpha_count;
   TileGradient gradient;
   Pack16 loss(0.0f);
-  for (int b = 0; b < kBlocks; ++b) {
+  for (int b = 0; b < kBlocksPerTile; ++b) {
     const BlockState& s = state[b];
     const Pack16 image[5] = {s.r, s.g, s.b, s.depth, s.transmittance};
     Pack16 d_image[5];
@@ -171,12 +171,13 @@ void render_to_cache(Workspace& ws, const TrainingArguments& training, TileRowCa
       continue;
     }
     const TilePosition tile(ws, x, tile_row);
-    BlockState state[kBlocks];
+    BlockState state[kBlocksPerTile];
     cache.tiles[size_t(x)] = render(ws, cache, thread_scratch.tiles[size_t(x)], tile, state);
     float* image = cache.image.data() + image_offset(x);
-    for (int b = 0; b < kBlocks; ++b) {
+    for (int b = 0; b < kBlocksPerTile; ++b) {
       const Pack16 pixels[kImagePlanes] = {state[b].r, state[b].g, state[b].b, state[b].depth, state[b].transmittance};
-      for (int k = 0; k < kImagePlanes; ++k) store_block(image + k * kTilePixels + corner_in_tile(b), kTile, pixels[k]);
+      for (int k = 0; k < kImagePlanes; ++k)
+        store_block(image + k * kTilePixels + corner_in_tile(b), kTileSide, pixels[k]);
     }
     clear_beyond_edge(ws.camera, x, tile_row, image);
   }
@@ -197,13 +198,13 @@ void backward_from_cache(Workspace& ws, const TrainingArguments& training, const
     const bool reached = ssim_gradient(ws, training.targets, tile_row, x, ssim_gradients);
     TileGradient gradient;
     Pack16 loss(0.0f);
-    for (int b = 0; b < kBlocks; ++b) {
+    for (int b = 0; b < kBlocksPerTile; ++b) {
       Pack16 image[kImagePlanes], d_image[kImagePlanes];
       for (int k = 0; k < kImagePlanes; ++k)
-        image[k] = load_block(cache.image.data() + image_offset(x) + k * kTilePixels + corner_in_tile(b), kTile);
+        image[k] = load_block(cache.image.data() + image_offset(x) + k * kTilePixels + corner_in_tile(b), kTileSide);
       loss = loss + compare(training, t, b, image, d_image);
       for (int k = 0; reached && k < 3; ++k)
-        d_image[k] = d_image[k] + load_block(ssim_gradients.value[k] + corner_in_tile(b), kTile);
+        d_image[k] = d_image[k] + load_block(ssim_gradients.value[k] + corner_in_tile(b), kTileSide);
       gradient.start(b, d_image, image);
     }
     training.l1_sums[t] = double(sum(loss));

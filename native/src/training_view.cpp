@@ -14,12 +14,12 @@ constexpr int kReachInBlocks = 2;
 // Entries of Weights::values for all tiles with weights of 0, and for all tiles with weights of 1.
 constexpr uint32_t kZerosEntry = 0, kOnesEntry = 1;
 
-uint16_t block_bit(int x, int y) { return uint16_t(1u << (y % kBlocksAcross * kBlocksAcross + x % kBlocksAcross)); }
+uint16_t block_bit(int x, int y) { return uint16_t(1u << (y % kBlocksPerSide * kBlocksPerSide + x % kBlocksPerSide)); }
 
 uint16_t blocks_with_weight(const float* tile) {
   uint16_t blocks = 0;
   for (int i = 0; i < kTilePixels; ++i) {
-    if (tile[i] != 0.0f) blocks |= block_bit(i % kTile / kBlock, i / kTile / kBlock);
+    if (tile[i] != 0.0f) blocks |= block_bit(i % kTileSide / kBlockSide, i / kTileSide / kBlockSide);
   }
   return blocks;
 }
@@ -27,14 +27,14 @@ uint16_t blocks_with_weight(const float* tile) {
 // Returns an 8x8 grid of blocks (bit 8 row + column): the tile's blocks in its middle, dilated by kReachInBlocks.
 uint64_t dilated(uint16_t blocks) {
   uint64_t grid = 0;
-  for (int y = 0; y < kBlocksAcross; ++y) {
-    grid |= uint64_t(blocks >> (kBlocksAcross * y) & 0xF) << (8 * (y + kReachInBlocks) + kReachInBlocks);
+  for (int y = 0; y < kBlocksPerSide; ++y) {
+    grid |= uint64_t(blocks >> (kBlocksPerSide * y) & 0xF) << (8 * (y + kReachInBlocks) + kReachInBlocks);
   }
   grid |= grid << 1 | grid << 2 | grid >> 1 | grid >> 2;
   return grid | grid << 8 | grid << 16 | grid >> 8 | grid >> 16;
 }
 
-int tiles(int pixels) { return (pixels + kTile - 1) / kTile; }
+int tiles(int pixels) { return (pixels + kTileSide - 1) / kTileSide; }
 
 }  // namespace
 
@@ -47,8 +47,8 @@ TrainingView::TrainingView(int width, int height, const uint8_t* rgb, const floa
 }
 
 TrainingView::Extent TrainingView::extent(size_t tile) const {
-  const int x = int(tile % size_t(tiles_x_)) * kTile, y = int(tile / size_t(tiles_x_)) * kTile;
-  return {x, y, std::min(kTile, width_ - x), std::min(kTile, height_ - y)};
+  const int x = int(tile % size_t(tiles_x_)) * kTileSide, y = int(tile / size_t(tiles_x_)) * kTileSide;
+  return {x, y, std::min(kTileSide, width_ - x), std::min(kTileSide, height_ - y)};
 }
 
 void TrainingView::copy_tile(size_t tile, const uint8_t* rgb, const float* depth_m) {
@@ -57,12 +57,12 @@ void TrainingView::copy_tile(size_t tile, const uint8_t* rgb, const float* depth
   for (int y = 0; y < part.rows; ++y) {
     const int64_t from = int64_t(part.y + y) * width_ + part.x;
     for (int k = 0; k < 3; ++k) {
-      for (int x = 0; x < part.columns; ++x) out.rgb[k][y * kTile + x] = rgb[3 * (from + x) + k];
+      for (int x = 0; x < part.columns; ++x) out.rgb[k][y * kTileSide + x] = rgb[3 * (from + x) + k];
     }
     for (int x = 0; x < part.columns; ++x) {
       // Depths that are not positive and finite mean "no return" and are not compared.
       const float depth = depth_m[from + x];
-      out.depth_m[y * kTile + x] = std::isfinite(depth) && depth > 0.0f ? depth : 0.0f;
+      out.depth_m[y * kTileSide + x] = std::isfinite(depth) && depth > 0.0f ? depth : 0.0f;
     }
   }
 }
@@ -77,7 +77,7 @@ void TrainingView::assign_weights(Weights& weights, const float* weight) const {
     const Extent part = extent(t);
     float tile[kTilePixels] = {};
     for (int y = 0; y < part.rows; ++y) {
-      float* row = tile + y * kTile;
+      float* row = tile + y * kTileSide;
       if (weight != nullptr) {
         std::copy_n(weight + int64_t(part.y + y) * width_ + part.x, part.columns, row);
       } else {
@@ -103,15 +103,15 @@ void TrainingView::assign_weights(Weights& weights, const float* weight) const {
 // Marks all blocks that SSIM windows around a weighted block may reach, and these blocks themselves.
 void TrainingView::mark_reached_blocks(Weights& weights) const {
   weights.reached_blocks.ensure_exact_capacity(tile_count());
-  const int blocks_x = (width_ + kBlock - 1) / kBlock, blocks_y = (height_ + kBlock - 1) / kBlock;
+  const int blocks_x = (width_ + kBlockSide - 1) / kBlockSide, blocks_y = (height_ + kBlockSide - 1) / kBlockSide;
   for (size_t t = 0; t < tile_count(); ++t) {
     if (weights.weighted_blocks[t] == 0) continue;
     const Extent part = extent(t);
-    const int first_x = part.x / kBlock - kReachInBlocks, first_y = part.y / kBlock - kReachInBlocks;
+    const int first_x = part.x / kBlockSide - kReachInBlocks, first_y = part.y / kBlockSide - kReachInBlocks;
     for (uint64_t marked = dilated(weights.weighted_blocks[t]); marked != 0; marked &= marked - 1) {
       const int bit = __builtin_ctzll(marked), x = first_x + bit % 8, y = first_y + bit / 8;
       if (x >= 0 && x < blocks_x && y >= 0 && y < blocks_y)
-        weights.reached_blocks[tile_of(x * kBlock, y * kBlock)] |= block_bit(x, y);
+        weights.reached_blocks[tile_of(x * kBlockSide, y * kBlockSide)] |= block_bit(x, y);
     }
   }
 }

@@ -43,7 +43,7 @@ class TrainingView {
   void mark_ssim_squares(Weights& weights) const;
   size_t tile_count() const { return size_t(tiles_y_) * size_t(tiles_x_); }
   size_t square_count() const { return size_t(tiles_y_ + 1) * size_t(tiles_x_); }
-  size_t tile_of(int x, int y) const { return size_t(y / kTile) * size_t(tiles_x_) + size_t(x / kTile); }
+  size_t tile_of(int x, int y) const { return size_t(y / kTileSide) * size_t(tiles_x_) + size_t(x / kTileSide); }
   const Weights& weights(bool masked) const { return masked && masked_ ? mask_weights_ : image_weights_; }
 
   int width_, height_, tiles_x_, tiles_y_;

@@ -49,16 +49,17 @@ struct TileList {
   Buffer<uint32_t> slots;
   Buffer<uint16_t> blocks;
   uint32_t count = 0;
-  uint32_t used[kBlocks];  // composited entries of each block's list: all, or those before its pixels were finished
+  uint32_t
+      used[kBlocksPerTile];  // composited entries of each block's list: all, or those before its pixels were finished
 };
 
 // The SSIM loss is computed in squares of the size of a tile. They lie half a tile higher than the tiles: SSIM square x
 // of row k spans image rows 16 k - 8 ... 16 k + 7 and the columns of tile column x (loss_ssim.cpp).
-constexpr int kTilePixels = kTile * kTile;  // of a tile, and of an SSIM square
-constexpr int kSsimMaps = 3;                // blurred maps of SSIM: x, xx, xy forward, their derivatives backward
-constexpr int kChunk = 128;                 // splats of a tile per batch: their records fit the first-level cache
-constexpr int kPrefetchAhead = 64;          // in keys
-constexpr int kSegmentRows = 2048;          // parameter rows per segment, the unit of projection and update work
+constexpr int kTilePixels = kTileSide * kTileSide;  // of a tile, and of an SSIM square
+constexpr int kSsimMaps = 3;        // blurred maps of SSIM: x, xx, xy forward, their derivatives backward
+constexpr int kChunk = 128;         // splats of a tile per batch: their records fit the first-level cache
+constexpr int kPrefetchAhead = 64;  // in keys
+constexpr int kSegmentRows = 2048;  // parameter rows per segment, the unit of projection and update work
 
 // Means of sixteen parameter rows, and the largest log scale of each: they bound the splats' extent in the image.
 struct alignas(64) GroupBounds {
@@ -72,12 +73,12 @@ struct KeySpan {
 
 // For each block, the entries of a chunk that overlap it, in order. Lists are padded for whole-register writes.
 struct BlockLists {
-  alignas(64) uint8_t entry[kBlocks][kChunk + 32];
-  uint16_t count[kBlocks];
+  alignas(64) uint8_t entry[kBlocksPerTile][kChunk + 32];
+  uint16_t count[kBlocksPerTile];
 
   // Sets the counts and pads each list with entry 0, for loops that read ahead.
-  __attribute__((always_inline)) void end(const uint32_t (&counts)[kBlocks]) {
-    for (int b = 0; b < kBlocks; ++b) {
+  __attribute__((always_inline)) void end(const uint32_t (&counts)[kBlocksPerTile]) {
+    for (int b = 0; b < kBlocksPerTile; ++b) {
       count[b] = uint16_t(counts[b]);
       std::memset(entry[b] + counts[b], 0, 4);
     }

@@ -120,9 +120,9 @@ GAUSSLITE_INLINE Pack16 fraction(Pack16 e) { return e - floor(e); }
 
 // Adds floor(e), limited to -126 ... 127, to the exponent field of a.
 GAUSSLITE_INLINE Pack16 multiply_by_power_of_two(Pack16 a, Pack16 e) {
-  const Pack16 whole = floor(min(max(e, Pack16(-126.0f)), Pack16(127.0f)));
-  const __m256i lo = _mm256_slli_epi32(_mm256_cvtps_epi32(whole.lo), 23);
-  const __m256i hi = _mm256_slli_epi32(_mm256_cvtps_epi32(whole.hi), 23);
+  const Pack16 power = floor(min(max(e, Pack16(-126.0f)), Pack16(127.0f)));
+  const __m256i lo = _mm256_slli_epi32(_mm256_cvtps_epi32(power.lo), 23);
+  const __m256i hi = _mm256_slli_epi32(_mm256_cvtps_epi32(power.hi), 23);
   return {_mm256_castsi256_ps(_mm256_add_epi32(_mm256_castps_si256(a.lo), lo)),
           _mm256_castsi256_ps(_mm256_add_epi32(_mm256_castps_si256(a.hi), hi))};
 }
@@ -132,14 +132,14 @@ GAUSSLITE_INLINE Pack16 multiply_by_power_of_two(Pack16 a, Pack16 e) {
 alignas(32) constexpr uint32_t kExp2Table[8] = {0x3F800000, 0x3F7B95C2, 0x3F7837F0, 0x3F75FED7,
                                                 0x3F7504F3, 0x3F75672A, 0x3F7744FD, 0x3F7AC0C7};
 constexpr int kExp2TableSize = 8;
-GAUSSLITE_INLINE __m256 exp2_of_low_bits(__m256 biased) {
-  const __m256i steps = _mm256_castps_si256(biased);
+GAUSSLITE_INLINE __m256 exp2_of_steps(__m256 steps_in_mantissa) {
+  const __m256i steps = _mm256_castps_si256(steps_in_mantissa);
   const __m256i powers = _mm256_load_si256(reinterpret_cast<const __m256i*>(kExp2Table));
   const __m256i power = _mm256_permutevar8x32_epi32(powers, steps);
   return _mm256_castsi256_ps(_mm256_add_epi32(_mm256_slli_epi32(steps, 20), power));
 }
-GAUSSLITE_INLINE Pack16 exp2_of_low_bits(Pack16 biased) {
-  return {exp2_of_low_bits(biased.lo), exp2_of_low_bits(biased.hi)};
+GAUSSLITE_INLINE Pack16 exp2_of_steps(Pack16 steps_in_mantissa) {
+  return {exp2_of_steps(steps_in_mantissa.lo), exp2_of_steps(steps_in_mantissa.hi)};
 }
 
 GAUSSLITE_INLINE __m256 exponent(__m256 a) {
@@ -147,8 +147,8 @@ GAUSSLITE_INLINE __m256 exponent(__m256 a) {
   return _mm256_cvtepi32_ps(_mm256_sub_epi32(biased, _mm256_set1_epi32(127)));
 }
 GAUSSLITE_INLINE __m256 mantissa(__m256 a) {
-  const __m256i digits = _mm256_and_si256(_mm256_castps_si256(a), _mm256_set1_epi32(0x007FFFFF));
-  return _mm256_castsi256_ps(_mm256_or_si256(digits, _mm256_set1_epi32(0x3F800000)));
+  const __m256i mantissa_bits = _mm256_and_si256(_mm256_castps_si256(a), _mm256_set1_epi32(0x007FFFFF));
+  return _mm256_castsi256_ps(_mm256_or_si256(mantissa_bits, _mm256_set1_epi32(0x3F800000)));
 }
 GAUSSLITE_INLINE Pack16 exponent(Pack16 a) { return {exponent(a.lo), exponent(a.hi)}; }
 GAUSSLITE_INLINE Pack16 mantissa(Pack16 a) { return {mantissa(a.lo), mantissa(a.hi)}; }

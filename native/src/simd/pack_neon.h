@@ -132,24 +132,24 @@ GAUSSLITE_INLINE Pack16 zero_unless(bool condition, Pack16 a) {
 // Adds floor(e), limited to -126 ... 127, to the exponent field of a.
 GAUSSLITE_INLINE float32x4_t multiply_by_power_of_two_quad(float32x4_t a, float32x4_t e) {
   const float32x4_t limited = min_quad(max_quad(e, vdupq_n_f32(-126.0f)), vdupq_n_f32(127.0f));
-  const int32x4_t whole = vshlq_n_s32(vcvtmq_s32_f32(limited), 23);
-  return vreinterpretq_f32_s32(vaddq_s32(vreinterpretq_s32_f32(a), whole));
+  const int32x4_t exponent_bits = vshlq_n_s32(vcvtmq_s32_f32(limited), 23);
+  return vreinterpretq_f32_s32(vaddq_s32(vreinterpretq_s32_f32(a), exponent_bits));
 }
 GAUSSLITE_INLINE float32x4_t exponent_quad(float32x4_t a) {
   return vcvtq_f32_s32(vsubq_s32(vshrq_n_s32(vreinterpretq_s32_f32(a), 23), vdupq_n_s32(127)));
 }
 GAUSSLITE_INLINE float32x4_t mantissa_quad(float32x4_t a) {
-  const uint32x4_t digits = vandq_u32(vreinterpretq_u32_f32(a), vdupq_n_u32(0x007FFFFF));
-  return vreinterpretq_f32_u32(vorrq_u32(digits, vdupq_n_u32(0x3F800000)));
+  const uint32x4_t mantissa_bits = vandq_u32(vreinterpretq_u32_f32(a), vdupq_n_u32(0x007FFFFF));
+  return vreinterpretq_f32_u32(vorrq_u32(mantissa_bits, vdupq_n_u32(0x3F800000)));
 }
 GAUSSLITE_INLINE Pack16 fraction(Pack16 e) { return e - floor(e); }
 GAUSSLITE_LANEWISE(multiply_by_power_of_two, multiply_by_power_of_two_quad)
 constexpr int kExp2TableSize = 1;
-GAUSSLITE_INLINE float32x4_t exp2_of_low_bits_quad(float32x4_t biased) {
-  const int32x4_t exponents = vshlq_n_s32(vreinterpretq_s32_f32(biased), 23);
+GAUSSLITE_INLINE float32x4_t exp2_of_steps_quad(float32x4_t steps_in_mantissa) {
+  const int32x4_t exponents = vshlq_n_s32(vreinterpretq_s32_f32(steps_in_mantissa), 23);
   return vreinterpretq_f32_s32(vaddq_s32(exponents, vdupq_n_s32(0x3F800000)));
 }
-GAUSSLITE_UNARY(exp2_of_low_bits, exp2_of_low_bits_quad)
+GAUSSLITE_UNARY(exp2_of_steps, exp2_of_steps_quad)
 GAUSSLITE_UNARY(exponent, exponent_quad)
 GAUSSLITE_UNARY(mantissa, mantissa_quad)
 

@@ -21,15 +21,15 @@ GAUSSLITE_INLINE Quad load_quad(const float* p) {
   return q;
 }
 GAUSSLITE_INLINE void store_quad(float* p, Quad q) { std::memcpy(p, &q, sizeof q); }
-GAUSSLITE_INLINE Quad choose(QuadInt mask, Quad yes, Quad no) {
+GAUSSLITE_INLINE Quad select_quad(QuadInt mask, Quad yes, Quad no) {
   return (Quad)((mask & (QuadInt)yes) | (~mask & (QuadInt)no));
 }
 GAUSSLITE_INLINE Quad floor_quad(Quad a) {
   // Floats beyond 2^23 are integers, and their conversion to int would overflow.
   const QuadInt small = (a < 8388608.0f) & (a > -8388608.0f);
-  const QuadInt truncated = __builtin_convertvector(choose(small, a, quad(0.0f)), QuadInt);
-  const Quad whole = __builtin_convertvector(truncated, Quad);
-  return choose(small, whole - choose(whole > a, quad(1.0f), quad(0.0f)), a);
+  const QuadInt truncated = __builtin_convertvector(select_quad(small, a, quad(0.0f)), QuadInt);
+  const Quad rounded = __builtin_convertvector(truncated, Quad);
+  return select_quad(small, rounded - select_quad(rounded > a, quad(1.0f), quad(0.0f)), a);
 }
 
 // True if one register holds a pack, as with AVX-512. Loops then keep more packs in registers.
@@ -40,14 +40,15 @@ struct Mask16 {
   QuadInt q[4];
 };
 
-#define GAUSSLITE_EACH for (int i = 0; i < 4; ++i)
+// Runs the next statement for each quad i of a pack.
+#define GAUSSLITE_FOR_EACH_QUAD for (int i = 0; i < 4; ++i)
 
 GAUSSLITE_INLINE Mask16 operator&(Mask16 a, Mask16 b) {
-  GAUSSLITE_EACH a.q[i] &= b.q[i];
+  GAUSSLITE_FOR_EACH_QUAD a.q[i] &= b.q[i];
   return a;
 }
 GAUSSLITE_INLINE Mask16 operator|(Mask16 a, Mask16 b) {
-  GAUSSLITE_EACH a.q[i] |= b.q[i];
+  GAUSSLITE_FOR_EACH_QUAD a.q[i] |= b.q[i];
   return a;
 }
 // The mask as an integer, lane 0 in bit 0.
@@ -75,41 +76,41 @@ struct Pack16 {
 
 GAUSSLITE_INLINE Pack16 load(const float* p) {
   Pack16 a;
-  GAUSSLITE_EACH a.q[i] = load_quad(p + 4 * i);
+  GAUSSLITE_FOR_EACH_QUAD a.q[i] = load_quad(p + 4 * i);
   return a;
 }
-GAUSSLITE_INLINE void store(float* p, Pack16 a) { GAUSSLITE_EACH store_quad(p + 4 * i, a.q[i]); }
+GAUSSLITE_INLINE void store(float* p, Pack16 a) { GAUSSLITE_FOR_EACH_QUAD store_quad(p + 4 * i, a.q[i]); }
 // Truncates towards zero; the values must fit.
 GAUSSLITE_INLINE void store_int(int32_t* p, Pack16 a) {
-  GAUSSLITE_EACH {
-    const QuadInt whole = __builtin_convertvector(a.q[i], QuadInt);
-    std::memcpy(p + 4 * i, &whole, sizeof whole);
+  GAUSSLITE_FOR_EACH_QUAD {
+    const QuadInt integers = __builtin_convertvector(a.q[i], QuadInt);
+    std::memcpy(p + 4 * i, &integers, sizeof integers);
   }
 }
 
 #define GAUSSLITE_LANEWISE(name, expression)         \
   GAUSSLITE_INLINE Pack16 name(Pack16 a, Pack16 b) { \
     Pack16 r;                                        \
-    GAUSSLITE_EACH r.q[i] = expression;              \
+    GAUSSLITE_FOR_EACH_QUAD r.q[i] = expression;     \
     return r;                                        \
   }
 GAUSSLITE_LANEWISE(operator+, a.q[i] + b.q[i])
 GAUSSLITE_LANEWISE(operator-, a.q[i] - b.q[i])
 GAUSSLITE_LANEWISE(operator*, a.q[i] * b.q[i])
 GAUSSLITE_LANEWISE(operator/, a.q[i] / b.q[i])
-GAUSSLITE_LANEWISE(min, choose(a.q[i] < b.q[i], a.q[i], b.q[i]))
-GAUSSLITE_LANEWISE(max, choose(a.q[i] > b.q[i], a.q[i], b.q[i]))
+GAUSSLITE_LANEWISE(min, select_quad(a.q[i] < b.q[i], a.q[i], b.q[i]))
+GAUSSLITE_LANEWISE(max, select_quad(a.q[i] > b.q[i], a.q[i], b.q[i]))
 #undef GAUSSLITE_LANEWISE
 
 GAUSSLITE_INLINE Pack16 operator-(Pack16 a) {
-  GAUSSLITE_EACH a.q[i] = -a.q[i];
+  GAUSSLITE_FOR_EACH_QUAD a.q[i] = -a.q[i];
   return a;
 }
 // a b + c and c - a b, with one rounding if the machine has fused operations.
 GAUSSLITE_INLINE Pack16 fma(Pack16 a, Pack16 b, Pack16 c) { return a * b + c; }
 GAUSSLITE_INLINE Pack16 fnma(Pack16 a, Pack16 b, Pack16 c) { return c - a * b; }
 GAUSSLITE_INLINE Pack16 abs(Pack16 a) {
-  GAUSSLITE_EACH a.q[i] = (Quad)((QuadInt)a.q[i] & 0x7FFFFFFF);
+  GAUSSLITE_FOR_EACH_QUAD a.q[i] = (Quad)((QuadInt)a.q[i] & 0x7FFFFFFF);
   return a;
 }
 GAUSSLITE_INLINE Pack16 sqrt(Pack16 a) {
@@ -117,7 +118,7 @@ GAUSSLITE_INLINE Pack16 sqrt(Pack16 a) {
   return a;
 }
 GAUSSLITE_INLINE Pack16 floor(Pack16 a) {
-  GAUSSLITE_EACH a.q[i] = floor_quad(a.q[i]);
+  GAUSSLITE_FOR_EACH_QUAD a.q[i] = floor_quad(a.q[i]);
   return a;
 }
 GAUSSLITE_INLINE Pack16 ceil(Pack16 a) { return -floor(-a); }
@@ -129,11 +130,11 @@ GAUSSLITE_INLINE Pack16 rough_reciprocal(Pack16 a) { return Pack16(1.0f) / a; }
 GAUSSLITE_INLINE Pack16 rough_inverse_sqrt(Pack16 a) { return Pack16(1.0f) / sqrt(a); }
 
 // Comparisons are false for NaN.
-#define GAUSSLITE_COMPARISON(name, op)               \
-  GAUSSLITE_INLINE Mask16 name(Pack16 a, Pack16 b) { \
-    Mask16 m;                                        \
-    GAUSSLITE_EACH m.q[i] = a.q[i] op b.q[i];        \
-    return m;                                        \
+#define GAUSSLITE_COMPARISON(name, op)                 \
+  GAUSSLITE_INLINE Mask16 name(Pack16 a, Pack16 b) {   \
+    Mask16 m;                                          \
+    GAUSSLITE_FOR_EACH_QUAD m.q[i] = a.q[i] op b.q[i]; \
+    return m;                                          \
   }
 GAUSSLITE_COMPARISON(operator<, <)
 GAUSSLITE_COMPARISON(operator<=, <=)
@@ -144,7 +145,7 @@ GAUSSLITE_COMPARISON(operator==, ==)
 
 // a in the lanes where the mask is set, 0 in the others.
 GAUSSLITE_INLINE Pack16 zero_unless(Mask16 m, Pack16 a) {
-  GAUSSLITE_EACH a.q[i] = (Quad)(m.q[i] & (QuadInt)a.q[i]);
+  GAUSSLITE_FOR_EACH_QUAD a.q[i] = (Quad)(m.q[i] & (QuadInt)a.q[i]);
   return a;
 }
 // a if the condition is true, else 0 in all lanes.
@@ -156,7 +157,7 @@ GAUSSLITE_INLINE Pack16 zero_unless(bool condition, Pack16 a) {
 }
 // `yes` in the lanes where the mask is set, `no` in the others.
 GAUSSLITE_INLINE Pack16 select(Mask16 m, Pack16 yes, Pack16 no) {
-  GAUSSLITE_EACH yes.q[i] = choose(m.q[i], yes.q[i], no.q[i]);
+  GAUSSLITE_FOR_EACH_QUAD yes.q[i] = select_quad(m.q[i], yes.q[i], no.q[i]);
   return yes;
 }
 
@@ -165,27 +166,27 @@ GAUSSLITE_INLINE Pack16 fraction(Pack16 e) { return e - floor(e); }
 // a 2^floor(e), for normal a and a normal result. All variants except AVX-512 limit floor(e) to -126 ... 127 and add it
 // to the exponent field of a.
 GAUSSLITE_INLINE Pack16 multiply_by_power_of_two(Pack16 a, Pack16 e) {
-  const Pack16 whole = floor(min(max(e, Pack16(-126.0f)), Pack16(127.0f)));
-  GAUSSLITE_EACH a.q[i] = (Quad)((QuadInt)a.q[i] + (__builtin_convertvector(whole.q[i], QuadInt) << 23));
+  const Pack16 power = floor(min(max(e, Pack16(-126.0f)), Pack16(127.0f)));
+  GAUSSLITE_FOR_EACH_QUAD a.q[i] = (Quad)((QuadInt)a.q[i] + (__builtin_convertvector(power.q[i], QuadInt) << 23));
   return a;
 }
 // For positive normal a: a = mantissa(a) 2^exponent(a), with the mantissa in [1, 2).
 GAUSSLITE_INLINE Pack16 exponent(Pack16 a) {
-  GAUSSLITE_EACH a.q[i] = __builtin_convertvector(((QuadInt)a.q[i] >> 23) - 127, Quad);
+  GAUSSLITE_FOR_EACH_QUAD a.q[i] = __builtin_convertvector(((QuadInt)a.q[i] >> 23) - 127, Quad);
   return a;
 }
 GAUSSLITE_INLINE Pack16 mantissa(Pack16 a) {
-  GAUSSLITE_EACH a.q[i] = (Quad)(((QuadInt)a.q[i] & 0x007FFFFF) | 0x3F800000);
+  GAUSSLITE_FOR_EACH_QUAD a.q[i] = (Quad)(((QuadInt)a.q[i] & 0x007FFFFF) | 0x3F800000);
   return a;
 }
 
-// exp2_of_low_bits returns 2^(k / kExp2TableSize); `biased` has the integer k in the lowest bits of its mantissa (see
-// exp2_fast). Other variants
-// may read 2^fraction(k / kExp2TableSize) from a table of 8 or 16 floats.
+// 2^(k / kExp2TableSize) for the integer k in the lowest mantissa bits of the argument (see exp2_fast). Other variants
+// read 2^fraction(k / kExp2TableSize) from a table of 8 or 16 floats.
 constexpr int kExp2TableSize = 1;
-GAUSSLITE_INLINE Pack16 exp2_of_low_bits(Pack16 biased) {
-  GAUSSLITE_EACH biased.q[i] = (Quad)(((QuadInt)biased.q[i] << 23) + 0x3F800000);
-  return biased;
+GAUSSLITE_INLINE Pack16 exp2_of_steps(Pack16 steps_in_mantissa) {
+  Pack16 power;
+  GAUSSLITE_FOR_EACH_QUAD power.q[i] = (Quad)(((QuadInt)steps_in_mantissa.q[i] << 23) + 0x3F800000);
+  return power;
 }
 
 // The sum of all lanes.
@@ -197,13 +198,13 @@ GAUSSLITE_INLINE float sum(Pack16 a) {
 // In each quad, copies lane kLane to all four lanes.
 template <int kLane>
 GAUSSLITE_INLINE Pack16 broadcast_within_quads(Pack16 a) {
-  GAUSSLITE_EACH a.q[i] = __builtin_shufflevector(a.q[i], a.q[i], kLane, kLane, kLane, kLane);
+  GAUSSLITE_FOR_EACH_QUAD a.q[i] = __builtin_shufflevector(a.q[i], a.q[i], kLane, kLane, kLane, kLane);
   return a;
 }
 
 // In each quad, transposes the 4x4 matrix with rows a, b, c, d: lane j of row i becomes lane i of row j.
 GAUSSLITE_INLINE void transpose_within_quads(Pack16& a, Pack16& b, Pack16& c, Pack16& d) {
-  GAUSSLITE_EACH {
+  GAUSSLITE_FOR_EACH_QUAD {
     const Quad ac_lo = __builtin_shufflevector(a.q[i], c.q[i], 0, 4, 1, 5);
     const Quad ac_hi = __builtin_shufflevector(a.q[i], c.q[i], 2, 6, 3, 7);
     const Quad bd_lo = __builtin_shufflevector(b.q[i], d.q[i], 0, 4, 1, 5);
@@ -230,7 +231,7 @@ GAUSSLITE_INLINE void transpose_whole_quads(Pack16& a, Pack16& b, Pack16& c, Pac
 // A 4x4 block of pixels: four rows of four, `stride` floats apart.
 GAUSSLITE_INLINE Pack16 load_block(const float* p, int64_t stride) {
   Pack16 a;
-  GAUSSLITE_EACH a.q[i] = load_quad(p + i * stride);
+  GAUSSLITE_FOR_EACH_QUAD a.q[i] = load_quad(p + i * stride);
   return a;
 }
 // Sixteen bytes as floats from 0 to 255: a block of four rows of four (load_byte_block), or contiguous (load_bytes).
@@ -241,10 +242,10 @@ GAUSSLITE_INLINE Pack16 load_byte_block(const uint8_t* p, int64_t stride) {
 }
 GAUSSLITE_INLINE Pack16 load_bytes(const uint8_t* p) { return load_byte_block(p, 4); }
 GAUSSLITE_INLINE void store_block(float* p, int64_t stride, Pack16 a) {
-  GAUSSLITE_EACH store_quad(p + i * stride, a.q[i]);
+  GAUSSLITE_FOR_EACH_QUAD store_quad(p + i * stride, a.q[i]);
 }
 
-#undef GAUSSLITE_EACH
+#undef GAUSSLITE_FOR_EACH_QUAD
 
 // Eight floats.
 struct Pack8 {
