@@ -30,20 +30,19 @@ from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.pose import UpAxis, require_rigid
 from gausslite.domain.pose_exposure_prior import PoseExposurePrior
 from gausslite.domain.region import Region
-from gausslite.evaluation.views import MapViewer
-from gausslite.mapping.policies import TASK, follows_task
-from gausslite.mission.build import EstimatorFactory, build_mapper
-from gausslite.mission.frame_scheduler import FrameScheduler
+from gausslite.evaluation.views import view_map
+from gausslite.mission.build import EstimatorFactory, build_task_mapper
 from gausslite.mission.frame_stream import CorruptFrames, FrameStream
 from gausslite.mission.runner import MissionRunner
-from gausslite.mission.settings import MissionSettings, PerceptionSettings, SceneInfo, SourceSettings
+from gausslite.mission.settings import (
+    MissionSettings,
+    PerceptionSettings,
+    SceneInfo,
+    SourceSettings,
+    default_policy,
+)
 from gausslite.mission.task_mapper import TaskMapper
-from gausslite.perception.fixed_relevance import NoTaskEstimator, RegionRelevanceEstimator
-from gausslite.perception.relevance_estimator import RelevanceEstimator
-from gausslite.render.choose import choose_rasterizer
 from gausslite.task.rules import RuleParser
-
-_UNIFORM = "uniform"
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,14 +142,10 @@ def create_mapper(
         raise InvalidInputError("task: expected either a task or regions, got both")
     if task is None and perception.model is not None:
         raise InvalidInputError("perception.model: expected a task for the detector, got none")
-    if task is not None:
-        estimator: RelevanceEstimator = EstimatorFactory(perception, lambda: scene).build(RuleParser().parse(task))
-    elif chosen:
-        estimator = RegionRelevanceEstimator(chosen)
-    else:
-        estimator = NoTaskEstimator()
+    if task is None and not chosen:
         settings = _without_task(settings)
-    return TaskMapper(estimator, build_mapper(settings), scheduler=FrameScheduler(settings.scheduler_settings))
+    roi = chosen if task is None else RuleParser().parse(task)
+    return build_task_mapper(settings, EstimatorFactory(perception, lambda: scene), roi)
 
 
 def _require_regions(regions: object) -> list[Region]:
@@ -169,11 +164,11 @@ def _without_task(settings: MissionSettings) -> MissionSettings:
 
     Raises InvalidInputError for other policies that follow a task.
     """
-    if not follows_task(settings.policy):
+    if not settings.follows_task:
         return settings
-    if settings.policy != TASK:
+    if settings.policy != default_policy(has_roi=True):
         raise InvalidInputError(f"settings.policy: {settings.policy!r} expects a task or regions, got neither")
-    return replace(settings, policy=_UNIFORM)
+    return replace(settings, policy=default_policy(has_roi=False))
 
 
 def map_sequence(
@@ -238,5 +233,5 @@ def render_view(
     """
     pose = np.asarray(T_world_camera, np.float64)
     require_rigid("T_world_camera", pose)
-    image = MapViewer(gaussians, choose_rasterizer(backend, threads)).render(camera, pose)
+    image = view_map(gaussians, backend, threads).render(camera, pose)
     return RenderedImage(image.rgb, image.expected_depth_m(), image.alpha)

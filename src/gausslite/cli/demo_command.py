@@ -14,6 +14,7 @@ from gausslite.cli.demo.results_folder import remove_results, require_no_demo
 from gausslite.cli.demo.scenario import HOME_SIZE, Scenario, recorded_scenario, simulated_scenario
 from gausslite.cli.demo.services import DemoPlan, collect_maps, running_services, watch_missions
 from gausslite.codec.ply import read_ply
+from gausslite.codec.png import write_png
 from gausslite.config.mapping_options import (
     add_budget,
     add_detector,
@@ -32,12 +33,13 @@ from gausslite.datasets.sequence_name import default_world_frame
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.names import require_name
 from gausslite.domain.voxels import VoxelGrid
-from gausslite.evaluation.pictures import write_png
 from gausslite.evaluation.team import TeamScores, score_team
+from gausslite.evaluation.views import HeldOutView, view_maps
 from gausslite.fusion.limits import MAX_REFINE_ITERATIONS
 from gausslite.mission.build import open_models
+from gausslite.mission.frame_stream import CorruptFrames
 from gausslite.mission.results import prepare_folder, require_writable, write_json
-from gausslite.render.choose import choose_rasterizer
+from gausslite.process.messages import print_message
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -95,8 +97,10 @@ def run(options: argparse.Namespace) -> int:
         watch_missions(services)
         maps = collect_maps(services, options.out)
         agents = agent_reports(scenario.agents, options.out)
-    result = _score(options, scenario, maps)
-    write_json(options.out / "report.json", demo_report(options.source, options.seed, scenario, agents, result.scores))
+    corrupt = CorruptFrames(print_message)
+    result = _score(options, scenario, maps, corrupt)
+    report = demo_report(options, scenario, agents, result.scores, corrupt.count)
+    write_json(options.out / "report.json", report)
     _write_pictures(options.out / "pictures", result)
     print(report_tables(agents, result.scores, scenario.fit_views))
     print(f"report, maps and pictures are in {options.out}")
@@ -139,10 +143,17 @@ def _world_frame(options: argparse.Namespace, scenario: Scenario) -> str:
     return default_world_frame(scenario.agents[0].source, scenario.held_out[0].source)
 
 
-def _score(options: argparse.Namespace, scenario: Scenario, maps: Mapping[str, Path]) -> TeamScores:
-    gaussians = {name: read_ply(path) for name, path in maps.items()}
-    rasterizer = choose_rasterizer(threads=options.threads)
-    return score_team(gaussians, scenario.held_out, list(scenario.regions.values()), rasterizer, scenario.fit_views)
+def _score(
+    options: argparse.Namespace, scenario: Scenario, maps: Mapping[str, Path], corrupt: CorruptFrames
+) -> TeamScores:
+    """Score the maps on the held-out frames that can be read."""
+    regions = list(scenario.regions.values())
+    frames = (frame for stream in scenario.held_out for frame in stream.frames(corrupt))
+    views = [HeldOutView.of(frame, regions) for frame in frames if frame.has_depth]
+    if not views and corrupt.first_error is not None:
+        raise corrupt.first_error
+    viewers = view_maps({name: read_ply(path) for name, path in maps.items()}, options.threads)
+    return score_team(viewers, views, scenario.fit_views)
 
 
 def _write_pictures(folder: Path, scores: TeamScores) -> None:

@@ -16,6 +16,7 @@ from gausslite.cli.source_options import (
     selected_regions,
 )
 from gausslite.codec.ply import read_ply
+from gausslite.codec.png import write_png
 from gausslite.config.mapping_options import add_threads
 from gausslite.config.source_options import add_camera_correction
 from gausslite.config.switches import add_switch
@@ -30,12 +31,11 @@ from gausslite.domain.frame import Frame
 from gausslite.domain.region import Region
 from gausslite.evaluation.compare import MapScores, ViewScore, average, score_view
 from gausslite.evaluation.fitted import render_fitted
-from gausslite.evaluation.pictures import comparison_sheet, write_png
-from gausslite.evaluation.views import MIN_ROI_PIXELS, HeldOutView, MapViewer
+from gausslite.evaluation.pictures import comparison_sheet
+from gausslite.evaluation.views import MIN_ROI_PIXELS, HeldOutView, MapViewer, view_map
 from gausslite.mission.frame_stream import CorruptFrames
 from gausslite.mission.results import as_text, prepare_folder, read_report
 from gausslite.process.messages import print_message
-from gausslite.render.choose import choose_rasterizer
 
 _PICTURES = 8
 _REGISTRATION_DEFAULT = f"that of the report next to MAP; {AUTO} without a report"
@@ -68,8 +68,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Render the map from every selected frame with depth, and print the mean scores. Returns the exit code."""
-    rasterizer = choose_rasterizer(threads=options.threads)
-    gaussians = read_ply(options.map)
+    viewer = view_map(read_ply(options.map), threads=options.threads)
     conditions = _Conditions.of(options)
     registered, _ = open_with_warnings(options.source, options.up, conditions.depth_registration, AUTO)
     source, _ = correct_with_warnings(options.source, registered, conditions.camera_correction, AUTO)
@@ -78,7 +77,7 @@ def run(options: argparse.Namespace) -> int:
     if options.pictures is not None:
         prepare_folder(options.pictures)
     frames = _SelectedFrames(source, positions, frame_size(options.size, source), options.strict, options.json)
-    scores = _score_views(options, MapViewer(gaussians, rasterizer), frames, regions, conditions.fit_views)
+    scores = _score_views(options, viewer, frames, regions, conditions.fit_views)
     if not scores:
         raise frames.corrupt.first_error or DatasetError(
             f"{options.source}: expected at least one frame with depth, got none"

@@ -5,9 +5,10 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from gausslite.cli.map_inputs import FRAMES_KEY, MapInputs, default_policy, has_regions, region_estimator
+from gausslite.cli.map_inputs import FRAMES_KEY, MapInputs, has_regions, policy_of
 from gausslite.cli.progress import MappingBar, print_above_bar
-from gausslite.cli.source_options import add_regions, add_source, report_region_file
+from gausslite.cli.source_options import add_regions, add_source, report_region_file, selected_regions
+from gausslite.codec.png import write_png
 from gausslite.config.mapping_options import HOLD_OUT_HELP, add_budget, add_detector, add_policy
 from gausslite.config.source_options import add_camera_correction
 from gausslite.config.switches import add_switch
@@ -15,13 +16,13 @@ from gausslite.config.values import AUTO, NONE
 from gausslite.domain.errors import DatasetError
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.names import require_name
+from gausslite.domain.region import Region
 from gausslite.domain.state import State, encode_text
-from gausslite.evaluation.pictures import write_png
+from gausslite.domain.task import TaskGraph
 from gausslite.evaluation.preview import render_preview
-from gausslite.evaluation.views import MapViewer
-from gausslite.mission.build import EstimatorFactory, build_mapper
+from gausslite.evaluation.views import view_map
+from gausslite.mission.build import EstimatorFactory, build_task_mapper
 from gausslite.mission.checkpoint import SavedRun, save_run
-from gausslite.mission.frame_scheduler import FrameScheduler
 from gausslite.mission.frame_stream import CorruptFrames
 from gausslite.mission.results import (
     PREVIEW,
@@ -36,9 +37,7 @@ from gausslite.mission.runner import MissionResult, MissionRunner
 from gausslite.mission.settings import SceneInfo
 from gausslite.mission.task_mapper import TaskMapper
 from gausslite.mission.task_schedule import ScheduledTaskMapper
-from gausslite.perception.relevance_estimator import RelevanceEstimator
 from gausslite.process.messages import print_message
-from gausslite.render.choose import choose_rasterizer
 
 _NOT_RESUMED = -1
 _WORLD_FRAME_HELP = (
@@ -62,7 +61,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_camera_correction(parser, allow_auto=True, default_text=f"{AUTO}, {NONE} for simulated homes")
     add_detector(parser)
     add_regions(parser)
-    add_policy(parser, allow_auto=True, default_policy=default_policy)
+    add_policy(parser, allow_auto=True, default_policy=policy_of)
     add_budget(parser)
     parser.add_argument("--test-every", metavar="N", type=int, help=HOLD_OUT_HELP)
     group = parser.add_argument_group("output")
@@ -89,11 +88,10 @@ def run(options: argparse.Namespace) -> int:
         require_additional_file(options.save_state, options.out)
     resumed_after = _NOT_RESUMED if saved is None else saved.last_index
     estimators = EstimatorFactory(inputs.perception, lambda: SceneInfo.of(inputs.stream.source))
-    estimator = _first_estimator(options, inputs, estimators, resumed_after)
+    roi = _first_roi(options, inputs, estimators, resumed_after)
     if saved is None:
         inputs = inputs.calibrated(options)
-    scheduler = FrameScheduler(inputs.mission.scheduler_settings)
-    mapper = TaskMapper(estimator, build_mapper(inputs.mission), scheduler=scheduler)
+    mapper = build_task_mapper(inputs.mission, estimators, roi)
     if saved is not None:
         saved.restore(mapper)
         saved = None  # its arrays, as large as the map and the keyframes, have been copied
@@ -152,9 +150,9 @@ class _Run:
         }
         prepare_folder(options.out)
         write_results(options.out, self._gaussians, self._report, self._inputs.world_frame(options))
-        keyframes = self._mapper.keyframes()
+        keyframes = [(keyframe.frame, keyframe.relevance.roi) for keyframe in self._mapper.keyframes()]
         if keyframes:
-            viewer = MapViewer(self._gaussians, choose_rasterizer(mission.backend, mission.threads))
+            viewer = view_map(self._gaussians, mission.backend, mission.threads)
             write_png(options.out / PREVIEW, render_preview(viewer, keyframes))
 
     def raise_if_stopped(self, result: MissionResult) -> None:
@@ -185,17 +183,17 @@ class _Run:
         save_run(self._options.save_state, self._mapper, config, last_index, extra)
 
 
-def _first_estimator(
+def _first_roi(
     options: argparse.Namespace, inputs: MapInputs, estimators: EstimatorFactory, resumed_after: int
-) -> RelevanceEstimator:
-    """Return the estimator of the first frame's task or regions, and report nouns that the detector cannot find."""
+) -> TaskGraph | list[Region]:
+    """Return the first frame's task or the regions, and report nouns that the detector cannot find."""
     if options.detector is None and inputs.schedule.graphs():
         report_region_file(options.source, inputs.stream.source)
     for scheduled in inputs.schedule.graphs():
         for warning in estimators.unsupported_nouns(scheduled):
             print_message(warning)
     graph = inputs.schedule.at(resumed_after)
-    return region_estimator(options, inputs.stream.source) if graph is None else estimators.build(graph)
+    return selected_regions(options, inputs.stream.source) if graph is None else graph
 
 
 def _interrupted_text(options: argparse.Namespace, result: MissionResult) -> str:

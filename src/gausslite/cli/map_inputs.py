@@ -24,19 +24,21 @@ from gausslite.datasets.sequence_name import default_world_frame, sequence_name
 from gausslite.datasets.source import Source
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.pose_exposure_prior import PoseExposurePrior
+from gausslite.domain.region import Region
 from gausslite.domain.state import get_text
 from gausslite.domain.task import TaskGraph
-from gausslite.mapping.policies import TASK, policy
-from gausslite.mission.build import EstimatorFactory
 from gausslite.mission.checkpoint import ResumeConfig, SavedRun
 from gausslite.mission.frame_stream import FrameStream
-from gausslite.mission.settings import MissionSettings, PerceptionSettings, SceneInfo, SourceSettings, TaskSettings
+from gausslite.mission.settings import (
+    MissionSettings,
+    PerceptionSettings,
+    SourceSettings,
+    TaskSettings,
+    default_policy,
+)
 from gausslite.mission.task_schedule import TaskSchedule, TaskSwitch
-from gausslite.perception.fixed_relevance import NoTaskEstimator, RegionRelevanceEstimator
-from gausslite.perception.relevance_estimator import RelevanceEstimator
 from gausslite.process.messages import print_message
 
-_UNIFORM = "uniform"
 FRAMES_KEY = "frames"
 """Name of the text of --frames among the extra arrays of a saved run."""
 
@@ -66,7 +68,8 @@ class MapInputs:
     def of(cls, options: argparse.Namespace) -> MapInputs:
         """Return the inputs of the command line. Raises InvalidInputError, DatasetError, TaskError."""
         task = TaskSettings(options.task, options.roi, tuple(options.objects), tuple(options.roi_ball))
-        mission = mission_settings(options, _default_policy(options))
+        _report_uniform_map(options)
+        mission = mission_settings(options, policy_of(options))
         schedule = _schedule(parse_task(options), [TaskSwitch.parse(text) for text in options.task_at])
         recorded = open_recorded(options.source, options.up)
         source = SourceSettings(options.source, options.frames, options.size, options.up, options.test_every)
@@ -160,7 +163,7 @@ def parse_task(options: argparse.Namespace) -> TaskGraph | None:
     if options.detector is not None and options.task is None:
         raise InvalidInputError("--detector: it finds the nouns of a task; give the task with --task TEXT")
     if options.task is None:
-        if options.policy is not None and not regions and policy(options.policy).components.follow_task:
+        if options.policy is not None and not regions and MissionSettings(policy=options.policy).follows_task:
             raise InvalidInputError(
                 f"--policy {options.policy}: expected a task, with --task TEXT, or regions, with --roi FILE.npz or "
                 "--roi-ball X,Y,Z,R"
@@ -176,18 +179,10 @@ def has_regions(options: argparse.Namespace) -> bool:
     return bool(options.roi is not None or options.objects or options.roi_ball)
 
 
-def choose_estimator(options: argparse.Namespace, source: Source) -> RelevanceEstimator:
-    """Return the relevance estimator of the options: for a task, for regions, or for a uniform map."""
+def choose_roi(options: argparse.Namespace, source: Source) -> TaskGraph | list[Region]:
+    """Return the task of the options, or the selected regions; no regions for a uniform map."""
     graph = parse_task(options)
-    if graph is None:
-        return region_estimator(options, source)
-    return EstimatorFactory(perception_settings(options), lambda: SceneInfo.of(source)).build(graph)
-
-
-def region_estimator(options: argparse.Namespace, source: Source) -> RelevanceEstimator:
-    """Return the estimator of the selected regions; without any, nothing is relevant."""
-    regions = selected_regions(options, source)
-    return RegionRelevanceEstimator(regions) if regions else NoTaskEstimator()
+    return selected_regions(options, source) if graph is None else graph
 
 
 def _report_other_step(saved: SavedRun, frames: str) -> None:
@@ -199,17 +194,15 @@ def _report_other_step(saved: SavedRun, frames: str) -> None:
         print_message(f"--frames: the saved run has a step of {before} frames, this one of {now}")
 
 
-def default_policy(options: argparse.Namespace) -> str:
-    """Return "task" if there is a task or a region, else "uniform"."""
-    return TASK if options.task is not None or has_regions(options) else _UNIFORM
+def policy_of(options: argparse.Namespace) -> str:
+    """Return the policy that is used without --policy: "task" with a task or a region, else "uniform"."""
+    return default_policy(options.task is not None or has_regions(options))
 
 
-def _default_policy(options: argparse.Namespace) -> str:
-    """Return the same, with a message if nothing selects the policy."""
-    chosen = default_policy(options)
-    if chosen == _UNIFORM and options.policy is None:
+def _report_uniform_map(options: argparse.Namespace) -> None:
+    """Print a message if neither a task nor a region nor --policy is given."""
+    if options.policy is None and options.task is None and not has_regions(options):
         print_message("no --task and no region: mapping everything equally (--policy uniform)")
-    return chosen
 
 
 def _schedule(first: TaskGraph | None, switches: Sequence[TaskSwitch]) -> TaskSchedule:

@@ -7,7 +7,7 @@ capped at MAX_PSNR_DB. SSIM is the single-scale variant.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from statistics import fmean
 from typing import Protocol, runtime_checkable
@@ -19,6 +19,7 @@ from numpy import ndarray
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.gaussians import Gaussians
 from gausslite.evaluation.metrics import covered_share, depth_l1_m, psnr, ssim_map
+from gausslite.evaluation.sharpness import gradient_deviation, laplacian_ratio
 from gausslite.evaluation.views import HeldOutView, MapViewer
 from gausslite.render.rasterizer import Rasterizer, Rendering
 
@@ -41,7 +42,7 @@ class RoiScore:
     """Scores of one view inside the region.
 
     covered: share of the region's pixels with measured depth where the map's alpha exceeds 0.5. The depth error uses
-    only those pixels.
+    only those pixels. laplacian_ratio, gradient_deviation: `sharpness`.
     """
 
     psnr: float
@@ -49,6 +50,8 @@ class RoiScore:
     depth_l1_m: float | None
     covered: float | None
     lpips: float | None = None
+    laplacian_ratio: float | None = None
+    gradient_deviation: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,12 +65,15 @@ class ViewScore:
     roi: RoiScore | None
     depth_l1_m: float | None = None
     lpips: float | None = None
+    laplacian_ratio: float | None = None
+    gradient_deviation: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class MapScores:
     """Means over the views: PSNR in dB, depth in metres, coverage as a share.
 
+    laplacian_ratio: sharpness relative to the photographs, 1 for equal; gradient_deviation: 0 for equal images.
     A figure is None if no view has it, or if LPIPS has no weights. n_views and n_roi_views count the views behind the
     full-image and the ROI figures. roi_pixels sums the region's pixels over the n_roi_views views.
     """
@@ -84,6 +90,10 @@ class MapScores:
     full_depth_l1_m: float | None = None
     roi_lpips: float | None = None
     full_lpips: float | None = None
+    roi_laplacian_ratio: float | None = None
+    full_laplacian_ratio: float | None = None
+    roi_gradient_deviation: float | None = None
+    full_gradient_deviation: float | None = None
 
 
 def evaluate(gaussians: Gaussians, views: Sequence[HeldOutView], rasterizer: Rasterizer) -> MapScores:
@@ -106,6 +116,8 @@ def score_view(rendering: Rendering, view: HeldOutView, perceptual: PerceptualDi
             depth_l1_m(depth_m, view.frame.depth_m, view.roi),
             covered_share(depth_m, view.frame.depth_m, view.roi),
             None if distance is None else float(distance[view.roi].mean()),
+            laplacian_ratio(rendering.rgb, rgb, view.roi),
+            gradient_deviation(rendering.rgb, rgb, view.roi),
         )
     return ViewScore(
         index=view.frame.index,
@@ -115,6 +127,8 @@ def score_view(rendering: Rendering, view: HeldOutView, perceptual: PerceptualDi
         roi=roi,
         depth_l1_m=depth_l1_m(depth_m, view.frame.depth_m),
         lpips=None if distance is None else float(distance.mean()),
+        laplacian_ratio=laplacian_ratio(rendering.rgb, rgb),
+        gradient_deviation=gradient_deviation(rendering.rgb, rgb),
     )
 
 
@@ -124,21 +138,26 @@ def average(scores: Sequence[ViewScore]) -> MapScores:
         raise InvalidInputError("held-out views: expected at least one, got none")
     rois = [score.roi for score in scores if score.roi is not None]
     return MapScores(
-        roi_psnr=_mean_or_none(roi.psnr for roi in rois),
-        roi_ssim=_mean_or_none(roi.ssim for roi in rois),
+        roi_psnr=_mean_or_none(rois, "psnr"),
+        roi_ssim=_mean_or_none(rois, "ssim"),
         full_psnr=fmean(score.psnr for score in scores),
         full_ssim=fmean(score.ssim for score in scores),
-        roi_depth_l1_m=_mean_or_none(roi.depth_l1_m for roi in rois if roi.depth_l1_m is not None),
-        roi_covered=_mean_or_none(roi.covered for roi in rois if roi.covered is not None),
+        roi_depth_l1_m=_mean_or_none(rois, "depth_l1_m"),
+        roi_covered=_mean_or_none(rois, "covered"),
         n_views=len(scores),
         n_roi_views=len(rois),
         roi_pixels=sum(score.roi_pixels for score in scores if score.roi is not None),
-        full_depth_l1_m=_mean_or_none(score.depth_l1_m for score in scores if score.depth_l1_m is not None),
-        roi_lpips=_mean_or_none(roi.lpips for roi in rois if roi.lpips is not None),
-        full_lpips=_mean_or_none(score.lpips for score in scores if score.lpips is not None),
+        full_depth_l1_m=_mean_or_none(scores, "depth_l1_m"),
+        roi_lpips=_mean_or_none(rois, "lpips"),
+        full_lpips=_mean_or_none(scores, "lpips"),
+        roi_laplacian_ratio=_mean_or_none(rois, "laplacian_ratio"),
+        full_laplacian_ratio=_mean_or_none(scores, "laplacian_ratio"),
+        roi_gradient_deviation=_mean_or_none(rois, "gradient_deviation"),
+        full_gradient_deviation=_mean_or_none(scores, "gradient_deviation"),
     )
 
 
-def _mean_or_none(values: Iterable[float]) -> float | None:
-    listed = list(values)
+def _mean_or_none(scores: Sequence[RoiScore | ViewScore], name: str) -> float | None:
+    """Return the mean of a field over the scores that have it."""
+    listed = [value for score in scores if (value := getattr(score, name)) is not None]
     return fmean(listed) if listed else None

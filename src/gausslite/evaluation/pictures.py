@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 from numpy import ndarray
 
-from gausslite.codec.files import write_atomic
 from gausslite.domain.arrays import require_array
 from gausslite.evaluation.views import HeldOutView
 
@@ -61,14 +59,6 @@ def comparison_row(
     for component in _components_to_show(roi)[:1]:
         row += [labelled_image(_crop(image, component), f"{name}: detail") for image, name in pair]
     return row
-
-
-def write_png(path: Path, image: UInt8[ndarray, "h w 3"]) -> None:
-    """Write an RGB image as PNG. Raises StorageError naming the file."""
-    import cv2
-
-    encoded = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1]
-    write_atomic(path, encoded.tobytes())
 
 
 def to_uint8(image: Float32[ndarray, "h w 3"]) -> UInt8[ndarray, "h w 3"]:

@@ -2,30 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from jaxtyping import Float32, UInt8
 from numpy import ndarray
 
-from gausslite.datasets.source import Source
 from gausslite.domain.errors import InvalidInputError
-from gausslite.domain.gaussians import Gaussians
-from gausslite.domain.region import Region
 from gausslite.evaluation.compare import MapScores, ViewScore, average, score_view
 from gausslite.evaluation.fitted import render_fitted
 from gausslite.evaluation.pictures import comparison_sheet
 from gausslite.evaluation.views import HeldOutView, MapViewer, largest_roi_views
-from gausslite.render.rasterizer import Rasterizer
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class HeldOutFrames:
-    """Positions of held-out frames in a source, read at one size (width_px, height_px)."""
-
-    source: Source
-    positions: Sequence[int]
-    size: tuple[int, int]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -37,23 +24,16 @@ class TeamScores:
 
 
 def score_team(
-    maps: Mapping[str, Gaussians],
-    held_out: Iterable[HeldOutFrames],
-    regions: Sequence[Region],
-    rasterizer: Rasterizer,
-    fit_views: bool = False,
-    sheets: int = 4,
+    viewers: Mapping[str, MapViewer], views: Sequence[HeldOutView], fit_views: bool = False, sheets: int = 4
 ) -> TeamScores:
     """Return the scores of every map over all held-out views, with comparison sheets of `sheets` views.
 
     The sheets show the views with the largest region, spread over the sequence. With fit_views, each rendering uses
-    the fitted pose and exposure (`render_fitted`). Raises InvalidInputError if no view has depth.
+    the fitted pose and exposure (`render_fitted`). Raises InvalidInputError if there are no views.
     """
-    views = [view for frames in held_out for view in _views(frames, regions)]
     if not views:
         raise InvalidInputError("held-out views: expected at least one frame with depth, got none")
-    viewers = {name: MapViewer(gaussians, rasterizer) for name, gaussians in maps.items()}
-    scores: dict[str, list[ViewScore]] = {name: [] for name in maps}
+    scores: dict[str, list[ViewScore]] = {name: [] for name in viewers}
     shown = largest_roi_views(views, sheets)
     pictures = {}
     for i, view in enumerate(views):
@@ -65,10 +45,3 @@ def score_team(
         if i in shown:
             pictures[f"{i:03d}-frame-{view.frame.index:06d}"] = comparison_sheet(view, renderings)
     return TeamScores({name: average(view_scores) for name, view_scores in scores.items()}, pictures)
-
-
-def _views(held_out: HeldOutFrames, regions: Sequence[Region]) -> Iterable[HeldOutView]:
-    for position in held_out.positions:
-        frame = held_out.source.frame(position, held_out.size)
-        if frame.has_depth:
-            yield HeldOutView.of(frame, regions)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +15,7 @@ from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.pose import inverse
 from gausslite.domain.region import Region
+from gausslite.render.choose import choose_rasterizer
 from gausslite.render.rasterizer import Rasterizer, Rendering
 from gausslite.render.row_encoding import gaussians_to_rows
 
@@ -80,3 +81,14 @@ class MapViewer:
     def render_frame(self, frame: Frame) -> Rendering:
         """Return the map's rendering from the frame's camera pose."""
         return self.render(frame.camera, frame.T_world_camera)
+
+
+def view_map(gaussians: Gaussians, backend: str = "auto", threads: int | None = None) -> MapViewer:
+    """Return a viewer with a rasterizer of its own, see `choose_rasterizer`. Raises KernelError."""
+    return MapViewer(gaussians, choose_rasterizer(backend, threads))
+
+
+def view_maps(maps: Mapping[str, Gaussians], threads: int | None = None) -> dict[str, MapViewer]:
+    """Return a viewer of each map; all of them share one rasterizer. Raises KernelError."""
+    rasterizer = choose_rasterizer(threads=threads)
+    return {name: MapViewer(gaussians, rasterizer) for name, gaussians in maps.items()}

@@ -58,11 +58,13 @@ def paper_policy() -> MapperSettings:
 
 TASK = "task"
 """Name of the default policy."""
+UNIFORM = "uniform"
+"""Name of the policy without a region of interest."""
 
 POLICIES: dict[str, Callable[[], MapperSettings]] = {
     TASK: task_policy,
     "paper": paper_policy,
-    "uniform": uniform_policy,
+    UNIFORM: uniform_policy,
     "gaussian-slam": gaussian_slam_policy,
     "splatam": splatam_policy,
     "monogs": monogs_policy,

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING
 
 from gausslite.domain.errors import InvalidInputError
+from gausslite.domain.region import Region
 from gausslite.domain.task import TaskGraph
 from gausslite.mapping.mapper import GaussianMapper
+from gausslite.mission.frame_scheduler import FrameScheduler
 from gausslite.mission.settings import MissionSettings, PerceptionSettings, SceneInfo
+from gausslite.mission.task_mapper import TaskMapper
+from gausslite.perception.fixed_relevance import NoTaskEstimator, RegionRelevanceEstimator
 from gausslite.perception.relevance_estimator import AsyncRelevanceEstimator, RelevanceEstimator, TaskRelevanceEstimator
 from gausslite.perception.tracker import TrackerSettings
 from gausslite.render.choose import choose_rasterizer
@@ -33,6 +37,22 @@ def open_models(perception: PerceptionSettings) -> ModelRegistry | None:
     from gausslite.perception.model_registry import ModelRegistry
 
     return ModelRegistry(perception.model, perception.segmenter, perception.vocabulary, perception.threads)
+
+
+def region_estimator(regions: Sequence[Region]) -> RelevanceEstimator:
+    """Return the relevance estimator of given regions; without any, no pixel is relevant."""
+    return RegionRelevanceEstimator(regions) if regions else NoTaskEstimator()
+
+
+def build_task_mapper(
+    settings: MissionSettings, estimators: EstimatorFactory, roi: TaskGraph | Sequence[Region]
+) -> TaskMapper:
+    """Return a mapper with an empty map. roi: a task, or regions of space; without both, mapping is uniform.
+
+    Raises KernelError, and InvalidInputError for a task without a detector.
+    """
+    estimator = estimators.build(roi) if isinstance(roi, TaskGraph) else region_estimator(roi)
+    return TaskMapper(estimator, build_mapper(settings), scheduler=FrameScheduler(settings.scheduler_settings))
 
 
 class EstimatorFactory:

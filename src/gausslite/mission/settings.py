@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -14,10 +14,11 @@ from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.pose import UpAxis
 from gausslite.domain.pose_exposure_prior import PoseExposurePrior
 from gausslite.domain.region import BallRegion, Region
-from gausslite.mapping.policies import disable, policy
+from gausslite.mapping.policies import TASK, UNIFORM, disable, follows_task, policy
 from gausslite.mapping.settings import MapperSettings
 from gausslite.mapping.stages import SkippableStage
 from gausslite.mission.frame_scheduler import SchedulerSettings
+from gausslite.perception.vocabulary import same_kind
 from gausslite.render.cpu_kernels import MAX_THREADS
 
 DEFAULT_MAX_GAUSSIANS = 150_000
@@ -39,6 +40,11 @@ def require_rate(rate_hz: float) -> None:
         raise InvalidInputError(f"rate: expected {MIN_RATE_HZ} to {MAX_RATE_HZ:g} Hz, got {rate_hz}")
 
 
+def default_policy(has_roi: bool) -> str:
+    """Return the policy of a mission with a task or regions, or of one without both."""
+    return TASK if has_roi else UNIFORM
+
+
 @dataclass(frozen=True, slots=True)
 class SceneInfo:
     """Information about the scene of a mission: the upward direction and, for tests, the regions of objects."""
@@ -50,6 +56,10 @@ class SceneInfo:
     def of(cls, source: Source) -> SceneInfo:
         """Return the upward direction and the ground-truth regions of a sequence."""
         return cls(source.up_axis, source.regions())
+
+    def regions_of(self, targets: Collection[str]) -> dict[str, Region]:
+        """Return the regions of the objects that these nouns of a task mean."""
+        return {name: roi for name, roi in self.regions.items() if any(same_kind(target, name) for target in targets)}
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,7 +121,7 @@ class MissionSettings:
     pose and exposure errors.
     """
 
-    policy: str = "task"
+    policy: str = TASK
     disabled: frozenset[str] = field(default=frozenset(), metadata={"flag": "--disable"})
     max_gaussians: int = DEFAULT_MAX_GAUSSIANS
     iterations: int | None = None
@@ -156,6 +166,11 @@ class MissionSettings:
         if self.rate_hz is not None:
             require_number("rate_hz", self.rate_hz)
         require_number("deadline_slack", self.deadline_slack)
+
+    @property
+    def follows_task(self) -> bool:
+        """True if the policy's map depends on a task or on regions."""
+        return follows_task(self.policy)
 
     @property
     def scheduler_settings(self) -> SchedulerSettings | None:

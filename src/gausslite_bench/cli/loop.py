@@ -6,24 +6,27 @@ import argparse
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 
-from gausslite.cli.map_inputs import choose_estimator
+from gausslite.cli.map_inputs import choose_roi
 from gausslite.cli.progress import MappingBar
 from gausslite.cli.source_options import add_regions, open_with_warnings, selected_regions
-from gausslite.config.mapping_options import add_budget, add_detector, add_policy, mission_settings
+from gausslite.config.mapping_options import add_budget, add_detector, add_policy, mission_settings, perception_settings
 from gausslite.config.source_options import add_frames
 from gausslite.config.switches import add_switch
 from gausslite.datasets.held_out import HeldOutSplit
 from gausslite.datasets.selection import frame_size, select_frames
 from gausslite.datasets.source import Source
 from gausslite.domain.errors import InvalidInputError
+from gausslite.domain.task import TaskGraph
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.evaluation.views import HeldOutView
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.policies import TASK
-from gausslite.mission.build import build_mapper
+from gausslite.mission.build import EstimatorFactory, build_mapper, region_estimator
 from gausslite.mission.frame_stream import FrameStream
 from gausslite.mission.results import as_text, peak_rss_mib
+from gausslite.mission.settings import SceneInfo
 from gausslite.mission.task_mapper import FrameOutcome
+from gausslite.perception.relevance_estimator import RelevanceEstimator
 from gausslite.render.choose import choose_rasterizer
 from gausslite.render.rasterizer import Rasterizer
 from gausslite_bench.loop.frame_costs import CostLog, FrameCost, Latency, LoopBench, LoopTiming, Overhead
@@ -133,13 +136,21 @@ def _memory_line(memory: MemoryTrend) -> str:
     )
 
 
+def _estimator(options: argparse.Namespace, source: Source) -> RelevanceEstimator:
+    """Return the relevance estimator of the options: for a task, for regions, or for a uniform map."""
+    roi = choose_roi(options, source)
+    if not isinstance(roi, TaskGraph):
+        return region_estimator(roi)
+    return EstimatorFactory(perception_settings(options), lambda: SceneInfo.of(source)).build(roi)
+
+
 def _run_mapping(
     options: argparse.Namespace, source: Source, positions: Sequence[int], rasterizer: Rasterizer
 ) -> tuple[LoopBench, list[FrameCost], MemoryTrend | None]:
     """Return the loop after these positions, the cost of each frame, and with --loop the memory trend."""
     settings, size = mission_settings(options), frame_size(options.size, source)
     mapper = GaussianMapper(settings.mapper_settings(), rasterizer, settings.seed)
-    bench = LoopBench(choose_estimator(options, source), mapper, VoxelGrid(), settings.scheduler_settings)
+    bench = LoopBench(_estimator(options, source), mapper, VoxelGrid(), settings.scheduler_settings)
     log = CostLog()
     samples_mib: list[float] = []
     sample_interval = max(1, len(positions) // _MEMORY_SAMPLES)
@@ -166,7 +177,7 @@ def _gap(
     """Map the same frames again with --unlimited iterations and score both maps on the held-out frames."""
     size = frame_size(options.size, source)
     unlimited = _without_rate(options)
-    loop = LoopBench(choose_estimator(unlimited, source), build_mapper(mission_settings(unlimited)), VoxelGrid())
+    loop = LoopBench(_estimator(unlimited, source), build_mapper(mission_settings(unlimited)), VoxelGrid())
     with MappingBar(len(positions), "unlimited") as bar:
         loop.run(FrameStream(source, positions, size).frames(), bar.count)
     regions = selected_regions(options, source)

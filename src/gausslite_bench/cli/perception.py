@@ -10,6 +10,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from gausslite.cli.source_options import add_source, open_with_warnings
+from gausslite.codec.png import write_png
 from gausslite.config.mapping_options import add_detector
 from gausslite.config.switches import add_switch
 from gausslite.config.values import read_names
@@ -17,7 +18,6 @@ from gausslite.datasets.selection import frame_size, select_frames
 from gausslite.datasets.source import Source
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.region import Region
-from gausslite.evaluation.pictures import write_png
 from gausslite.mission.results import as_text, prepare_folder
 from gausslite.perception.vocabulary import head_of, same_kind
 from gausslite.task.rules import RuleParser

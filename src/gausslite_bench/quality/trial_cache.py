@@ -11,8 +11,9 @@ import numpy as np
 from jaxtyping import Float32
 from numpy import ndarray
 
+from gausslite.codec.png import write_png
 from gausslite.domain.errors import GaussLiteError, StorageError
-from gausslite.evaluation.pictures import comparison_sheet, write_png
+from gausslite.evaluation.pictures import comparison_sheet
 from gausslite.evaluation.views import largest_roi_views
 from gausslite.mission.results import prepare_folder, write_json
 from gausslite_bench.quality.code_hash import current_code_hash

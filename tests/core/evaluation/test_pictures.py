@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
-import cv2
 import numpy as np
 import pytest
 
 from gausslite.domain.camera import Camera
-from gausslite.domain.errors import ShapeError, StorageError
+from gausslite.domain.errors import ShapeError
 from gausslite.domain.frame import Frame
-from gausslite.evaluation.pictures import comparison_sheet, write_png
+from gausslite.evaluation.pictures import comparison_sheet
 from gausslite.evaluation.views import HeldOutView
 
 
@@ -73,14 +70,3 @@ def test_a_region_as_large_as_the_image_is_its_own_crop() -> None:
 def test_a_rendering_of_another_size_is_refused() -> None:
     with pytest.raises(ShapeError, match="rendering vote"):
         comparison_sheet(view(), {"vote": np.zeros((4, 4, 3), np.float32)})
-
-
-def test_a_png_holds_the_same_colours(tmp_path: Path) -> None:
-    rgb = view().frame.rgb
-    write_png(tmp_path / "sheet.png", rgb)
-    np.testing.assert_array_equal(cv2.imread(str(tmp_path / "sheet.png"))[..., ::-1], rgb)
-
-
-def test_a_folder_that_is_missing_is_named(tmp_path: Path) -> None:
-    with pytest.raises(StorageError, match=r"sheet\.png"):
-        write_png(tmp_path / "missing" / "sheet.png", view().frame.rgb)

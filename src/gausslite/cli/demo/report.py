@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -14,22 +15,27 @@ _AGENT_KEYS = ("frames", "hz", "gaussians", "roi_share", "bytes_sent", "map_shar
 
 
 def demo_report(
-    source: str | None, seed: int, scenario: Scenario, agents: Mapping[str, object], scores: Mapping[str, MapScores]
+    options: argparse.Namespace,
+    scenario: Scenario,
+    agents: Mapping[str, object],
+    scores: Mapping[str, MapScores],
+    frames_corrupt: int,
 ) -> dict[str, object]:
-    """Return report.json of the demo; source None: the simulated home of the scenario."""
+    """Return report.json of the demo. frames_corrupt: number of held-out frames that cannot be read."""
     registration, correction, prior = scenario.depth_registration, scenario.camera_correction, scenario.pose_prior
     return {
-        "source": source or scenario.agents[0].source,
+        "source": options.source or scenario.agents[0].source,
         "colour_camera": None if registration is None else str(registration),
         "camera_correction": None if correction is None else str(correction),
         "view_error": None if prior.is_exact else str(prior),
         "size": list(scenario.size),
-        "seed": seed,
+        "seed": options.seed,
         "agents": dict(agents),
         "maps": {name: asdict(score) for name, score in scores.items()},
         "scored": {
             "objects": sorted(scenario.regions),
             "views": next(iter(scores.values())).n_views,
+            "frames_corrupt": frames_corrupt,
             "fitted": scenario.fit_views,
         },
     }

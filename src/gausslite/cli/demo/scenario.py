@@ -23,8 +23,8 @@ from gausslite.datasets.selection import frame_size, select_frames
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.pose_exposure_prior import PoseExposurePrior
 from gausslite.domain.region import Region
-from gausslite.evaluation.team import HeldOutFrames
-from gausslite.perception.vocabulary import same_kind
+from gausslite.mission.frame_stream import FrameStream
+from gausslite.mission.settings import SceneInfo
 
 HOME_SIZE = "320x240"
 _HOME = "sim:home?seed={seed}&trajectory={trajectory}&frames={frames}"
@@ -53,7 +53,7 @@ class Scenario:
     agents: tuple[AgentPlan, ...]
     size: tuple[int, int]
     test_every: int | None
-    held_out: tuple[HeldOutFrames, ...]
+    held_out: tuple[FrameStream, ...]
     regions: Mapping[str, Region]
     depth_registration: DepthRegistration | None = None
     camera_correction: CameraCorrection | None = None
@@ -86,7 +86,7 @@ def simulated_scenario(options: argparse.Namespace) -> Scenario:
         agents,
         size,
         None,
-        (HeldOutFrames(held_out, range(len(held_out)), size),),
+        (FrameStream(held_out, range(len(held_out)), size),),
         _scored_regions(options, held_out.regions()),
         pose_prior=resolve_pose_prior(specs[2], held_out, options.pose_prior),
     )
@@ -110,7 +110,7 @@ def recorded_scenario(options: argparse.Namespace) -> Scenario:
     registered, registration = register_with_warnings(options.source, recorded, options.register_depth, AUTO)
     source, correction = correct_with_warnings(options.source, registered, options.camera_correction, AUTO)
     pose_prior = resolve_pose_prior(options.source, source, options.pose_prior)
-    views = tuple(HeldOutFrames(source, positions, size) for positions in held_out_positions)
+    views = tuple(FrameStream(source, positions, size) for positions in held_out_positions)
     return Scenario(tuple(agents), size, _TEST_EVERY, views, regions, registration, correction, pose_prior)
 
 
@@ -121,7 +121,7 @@ def _scored_regions(options: argparse.Namespace, regions: Mapping[str, Region]) 
     from gausslite.task.rules import RuleParser
 
     targets = {t for task in (options.task_a, options.task_b) for t in RuleParser().parse(task).targets}
-    chosen = {name: region for name, region in regions.items() if any(same_kind(target, name) for target in targets)}
+    chosen = SceneInfo(regions=regions).regions_of(targets)
     if not chosen:
         raise InvalidInputError(
             f"demo: expected ground-truth regions of {', '.join(sorted(targets))} to score, "
