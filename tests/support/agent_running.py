@@ -14,6 +14,7 @@ from fusion_running import GRID
 from serving import serving
 
 from gausslite.domain.frame import Frame
+from gausslite.domain.objects import ObjectLandmark
 from gausslite.domain.region import BallRegion
 from gausslite.domain.relevance import RelevanceMap
 from gausslite.domain.state import State
@@ -59,6 +60,10 @@ class Gate:
 
     def evaluate_past(self, frame: Frame) -> RelevanceMap | None:
         return self.inner.evaluate_past(frame)
+
+    @property
+    def objects(self) -> tuple[ObjectLandmark, ...]:
+        return ()
 
     def state(self) -> State:
         return {}

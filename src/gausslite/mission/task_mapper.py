@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
+from gausslite.domain.objects import ObjectLandmark
 from gausslite.domain.relevance import RelevanceMap
 from gausslite.domain.state import State, add_prefix, select_prefix
 from gausslite.domain.voxel_batch import VoxelBatch
@@ -76,6 +77,11 @@ class TaskMapper:
     def notes(self) -> tuple[str, ...]:
         """Messages of the relevance estimator for the operator, one line each."""
         return self._estimator.notes
+
+    @property
+    def objects(self) -> tuple[ObjectLandmark, ...]:
+        """The confirmed objects of the current task."""
+        return self._estimator.objects
 
     def gaussians(self) -> Gaussians:
         """Return a copy of the map."""

@@ -50,6 +50,7 @@ def encode_landmark(landmark: Landmark) -> dict[str, NDArray[Any]]:
         "cells": landmark.cells,
         "counts": landmark.counts,
         "seen_missed": int_array(landmark.seen_count, landmark.missed_count),
+        "seen_ns_number": np.array([landmark.first_seen_ns, landmark.last_seen_ns, landmark.number], np.int64),
         "best_score_farthest_m": np.array([landmark.best_score, landmark.farthest_m]),
     }
 
@@ -64,4 +65,5 @@ def decode_landmark(state: State) -> Landmark:
     seen_count, missed_count = get_counts(state, "seen_missed", 2)
     best_score, farthest_m = get_floats(state, "best_score_farthest_m", 2)
     extent = (get_text(state, "phrase"), np.array([x_m, y_m, z_m]), radius_m, cells, counts)
-    return Landmark(*extent, seen_count, missed_count, best_score, farthest_m)
+    seen_ns_number = (int(value) for value in get_array(state, "seen_ns_number", (3,), np.int64))
+    return Landmark(*extent, seen_count, missed_count, best_score, farthest_m, *seen_ns_number)

@@ -10,6 +10,7 @@ from numpy import ndarray
 
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
+from gausslite.domain.objects import ObjectLandmark
 from gausslite.domain.region import Region
 from gausslite.domain.relevance import NO_TARGET, RelevanceMap
 from gausslite.domain.state import State
@@ -41,6 +42,11 @@ class RegionRelevanceEstimator:
         """Return the relevance as `estimate` does."""
         return self.estimate(frame).relevance
 
+    @property
+    def objects(self) -> tuple[ObjectLandmark, ...]:
+        """Empty: there is no object map."""
+        return ()
+
     def state(self) -> State:
         """Return nothing: each frame's relevance is independent of the others."""
         return {}
@@ -66,6 +72,11 @@ class NoTaskEstimator:
     def evaluate_past(self, frame: Frame) -> RelevanceMap:
         """Return the relevance as `estimate` does."""
         return self.estimate(frame).relevance
+
+    @property
+    def objects(self) -> tuple[ObjectLandmark, ...]:
+        """Empty: there is no object map."""
+        return ()
 
     def state(self) -> State:
         """Return nothing: each frame's relevance is independent of the others."""

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int64
 from numpy import ndarray
 
-from gausslite.domain.voxels import VoxelGrid
+from gausslite.domain.voxels import AxisAlignedBox, VoxelGrid
 
 _CELL_GRID: Final = VoxelGrid(0.05)
 _MIN_MATCH_DISTANCE_M: Final = 0.15
@@ -26,7 +26,8 @@ class Observation:
     """One object in one frame: centroid in the world, keys of its surface cells, radius, camera centre, score.
 
     The radius is twice the median distance of the points to the centroid: masks of chairs include background, which
-    would dominate the outermost points. camera_m is the camera's centre, None without a camera.
+    would dominate the outermost points. camera_m is the camera's centre, None without a camera. time_ns is the frame's
+    capture time.
     """
 
     phrase: str
@@ -35,6 +36,7 @@ class Observation:
     cells: Int64[ndarray, " k"]
     camera_m: Float64[ndarray, "3"] | None = None
     score: float = 1.0
+    time_ns: int = 0
 
     @classmethod
     def from_points(
@@ -43,13 +45,15 @@ class Observation:
         points_m: Float64[ndarray, "n 3"],
         camera_m: Float64[ndarray, "3"] | None = None,
         score: float = 1.0,
+        time_ns: int = 0,
     ) -> Observation:
         """Return the observation of a mask's points: their median is the centroid, outliers are dropped."""
         centroid = np.median(points_m, axis=0)
         distances = np.linalg.norm(points_m - centroid, axis=1)
         radius_m = 2.0 * float(np.median(distances))
         inliers = points_m[distances <= 2.0 * max(radius_m, _MIN_MATCH_DISTANCE_M)]
-        return cls(phrase, centroid, radius_m, np.unique(_CELL_GRID.keys(inliers.astype(np.float32))), camera_m, score)
+        cells = np.unique(_CELL_GRID.keys(inliers.astype(np.float32)))
+        return cls(phrase, centroid, radius_m, cells, camera_m, score, time_ns)
 
     @property
     def distance_m(self) -> float:
@@ -62,7 +66,8 @@ class Landmark:
     """One object over all its observations. Its centroid is the mean of its cells, not weighted by their counts.
 
     cells: keys of surface cells, with the number of observations of each in counts. missed_count: frames that should
-    have shown the object but did not. farthest_m: the largest distance of an observation.
+    have shown the object but did not. farthest_m: the largest distance of an observation. first_seen_ns, last_seen_ns:
+    capture times of its observations. number: assigned by the object map, in the order of first observations.
     """
 
     phrase: str
@@ -74,6 +79,9 @@ class Landmark:
     missed_count: int
     best_score: float
     farthest_m: float
+    first_seen_ns: int = 0
+    last_seen_ns: int = 0
+    number: int = 0
 
     @classmethod
     def from_observation(cls, observation: Observation) -> Landmark:
@@ -81,7 +89,13 @@ class Landmark:
         counts = np.ones(len(observation.cells), np.int64)
         extent = (observation.phrase, observation.centroid_m, observation.radius_m, observation.cells, counts)
         return cls(
-            *extent, seen_count=1, missed_count=0, best_score=observation.score, farthest_m=observation.distance_m
+            *extent,
+            seen_count=1,
+            missed_count=0,
+            best_score=observation.score,
+            farthest_m=observation.distance_m,
+            first_seen_ns=observation.time_ns,
+            last_seen_ns=observation.time_ns,
         )
 
     def is_colocated_with(self, other: Observation) -> bool:
@@ -100,6 +114,8 @@ class Landmark:
         self.missed_count += other.missed_count
         self.best_score = max(self.best_score, other.best_score)
         self.farthest_m = max(self.farthest_m, other.farthest_m)
+        self.first_seen_ns = min(self.first_seen_ns, other.first_seen_ns)
+        self.last_seen_ns = max(self.last_seen_ns, other.last_seen_ns)
         merged, where = np.unique(np.concatenate([self.cells, other.cells]), return_inverse=True)
         total = np.bincount(where, weights=np.concatenate([self.counts, other.counts])).astype(np.int64)
         if len(merged) > _MAX_CELLS:
@@ -109,6 +125,12 @@ class Landmark:
         centres = self.footprint_m().astype(np.float64)
         self.centroid_m = centres.mean(axis=0)
         self.radius_m = 2.0 * float(np.median(np.linalg.norm(centres - self.centroid_m, axis=1)))
+
+    def box_m(self) -> AxisAlignedBox:
+        """Return the axis-aligned box of the footprint's cells."""
+        centres, half_m = self.footprint_m().astype(np.float64), 0.5 * _CELL_GRID.size_m
+        low, high = centres.min(axis=0) - half_m, centres.max(axis=0) + half_m
+        return AxisAlignedBox((low[0], low[1], low[2]), (high[0], high[1], high[2]))
 
     def footprint_m(self) -> Float32[ndarray, "k 3"]:
         """Return the centres of the cells that are observed often, or of all cells if those are few."""
@@ -123,6 +145,7 @@ class ObjectMap:
     def __init__(self, objects: Sequence[Landmark] = ()) -> None:
         """Start with these landmarks, oldest first."""
         self._objects = list(objects)
+        self._next_number = 1 + max((each.number for each in objects), default=0)
 
     @property
     def objects(self) -> tuple[Landmark, ...]:
@@ -156,6 +179,7 @@ class ObjectMap:
         new = Landmark.from_observation(observation)
         matches = [each for each in self.with_phrase(observation.phrase) if each.matches(observation)]
         if not matches:
+            new.number, self._next_number = self._next_number, self._next_number + 1
             self._objects.append(new)
             return new
         matches[0].add(new)

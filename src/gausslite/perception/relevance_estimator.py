@@ -10,6 +10,7 @@ from jaxtyping import Float32
 from numpy import ndarray
 
 from gausslite.domain.frame import Frame
+from gausslite.domain.objects import ObjectLandmark
 from gausslite.domain.relevance import Detection, RelevanceMap
 from gausslite.domain.state import State
 from gausslite.domain.task import TaskGraph
@@ -56,6 +57,11 @@ class RelevanceEstimator(Protocol):
         """Messages for the operator about the frames so far, one line each."""
         ...
 
+    @property
+    def objects(self) -> tuple[ObjectLandmark, ...]:
+        """The confirmed objects of the task so far; empty if the estimator has no object map."""
+        ...
+
     def state(self) -> State:
         """Return everything that the next frame's relevance depends on, except the frame, as named arrays."""
         ...
@@ -89,6 +95,11 @@ class TaskRelevanceEstimator:
     def landmarks(self) -> tuple[Landmark, ...]:
         """All objects detected so far for the task's nouns, in world coordinates."""
         return self._tracker.landmarks
+
+    @property
+    def objects(self) -> tuple[ObjectLandmark, ...]:
+        """The confirmed objects of the task so far."""
+        return self._tracker.objects
 
     def estimate(self, frame: Frame, rendered_depth_m: Float32[ndarray, "h w"] | None = None) -> RelevanceEstimate:
         """Return weight 1 on the pixels of the targets that satisfy the task's relations."""
@@ -145,6 +156,11 @@ class AsyncRelevanceEstimator:
         count = self._skipped_keyframes
         skipped = (f"detector too slow: {count} keyframes were skipped",) if count else ()
         return (*unsupported, *self._tracker.notes, *skipped)
+
+    @property
+    def objects(self) -> tuple[ObjectLandmark, ...]:
+        """The confirmed objects of the task so far."""
+        return self._tracker.objects
 
     def state(self) -> State:
         """Return the tracker's state as named arrays, without running detections."""

@@ -44,7 +44,8 @@ def lift_observation(detection: Detection, depth_m: Float32[ndarray, "h w"], fra
     points = lift(centres_px, depth_m[rows, columns].astype(np.float64), frame.camera)
     T_world_camera = frame.T_world_camera
     points_m = transform_points(T_world_camera, points)
-    return Observation.from_points(detection.phrase, points_m, T_world_camera[:3, 3], detection.score)
+    camera_m, time_ns = T_world_camera[:3, 3], frame.capture_time_ns
+    return Observation.from_points(detection.phrase, points_m, camera_m, detection.score, time_ns)
 
 
 class SpatialFilter:
@@ -65,6 +66,11 @@ class SpatialFilter:
     def landmarks(self) -> tuple[Landmark, ...]:
         """Every object seen so far."""
         return self._object_map.objects
+
+    @property
+    def confirmed_landmarks(self) -> tuple[Landmark, ...]:
+        """The objects that have enough evidence to exist."""
+        return tuple(each for each in self._object_map.objects if self._evidence.is_confirmed(each))
 
     @property
     def unseen_anchors(self) -> tuple[str, ...]:

@@ -59,22 +59,31 @@ class _AgentState:
 class _AgentStateEnumTypeWrapper(_enum_type_wrapper._EnumTypeWrapper[_AgentState.ValueType], _builtins.type):
     DESCRIPTOR: _descriptor.EnumDescriptor
     AGENT_STATE_UNSPECIFIED: _AgentState.ValueType  # 0
-    AGENT_STATE_IDLE: _AgentState.ValueType  # 1
-    """No task yet."""
+    AGENT_STATE_WAITING_FOR_TASK: _AgentState.ValueType  # 1
     AGENT_STATE_MAPPING: _AgentState.ValueType  # 2
     AGENT_STATE_DRAINING: _AgentState.ValueType  # 3
-    """The source has ended; the uplink sends the pending updates."""
-    AGENT_STATE_DONE: _AgentState.ValueType  # 4
+    """The uplink sends the pending updates of the task's region and the pending keyframes."""
+    AGENT_STATE_ENDED: _AgentState.ValueType  # 4
+    AGENT_STATE_HANDING_OVER: _AgentState.ValueType  # 5
+    """The uplink sends the rest of the map."""
+    AGENT_STATE_FAILED: _AgentState.ValueType  # 6
+    """An error ended the mission; `notes` has it."""
 
-class AgentState(_AgentState, metaclass=_AgentStateEnumTypeWrapper): ...
+class AgentState(_AgentState, metaclass=_AgentStateEnumTypeWrapper):
+    """The phase of the agent's mission. MAPPING is followed by DRAINING, HANDING_OVER if the agent hands over, and ENDED; or
+    by FAILED. A task leads from ENDED and FAILED to MAPPING.
+    """
 
 AGENT_STATE_UNSPECIFIED: AgentState.ValueType  # 0
-AGENT_STATE_IDLE: AgentState.ValueType  # 1
-"""No task yet."""
+AGENT_STATE_WAITING_FOR_TASK: AgentState.ValueType  # 1
 AGENT_STATE_MAPPING: AgentState.ValueType  # 2
 AGENT_STATE_DRAINING: AgentState.ValueType  # 3
-"""The source has ended; the uplink sends the pending updates."""
-AGENT_STATE_DONE: AgentState.ValueType  # 4
+"""The uplink sends the pending updates of the task's region and the pending keyframes."""
+AGENT_STATE_ENDED: AgentState.ValueType  # 4
+AGENT_STATE_HANDING_OVER: AgentState.ValueType  # 5
+"""The uplink sends the rest of the map."""
+AGENT_STATE_FAILED: AgentState.ValueType  # 6
+"""An error ended the mission; `notes` has it."""
 Global___AgentState: _TypeAlias = AgentState  # noqa: Y015
 
 @_typing.final
@@ -187,6 +196,74 @@ class IngestFramesResponse(_message.Message):
 Global___IngestFramesResponse: _TypeAlias = IngestFramesResponse  # noqa: Y015
 
 @_typing.final
+class EndMissionRequest(_message.Message):
+    DESCRIPTOR: _descriptor.Descriptor
+
+    HANDOVER_FIELD_NUMBER: _builtins.int
+    DRAIN_SECONDS_FIELD_NUMBER: _builtins.int
+    handover: _builtins.bool
+    """Also send the map outside the task's region. Absent: as the agent's --handover."""
+    drain_seconds: _builtins.float
+    """Longest time for sending, in seconds, 0 to 86400. Absent: the agent's --drain-timeout."""
+    def __init__(
+        self,
+        *,
+        handover: _builtins.bool | None = ...,
+        drain_seconds: _builtins.float | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_drain_seconds", b"_drain_seconds", "_handover", b"_handover", "drain_seconds", b"drain_seconds", "handover", b"handover"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_drain_seconds", b"_drain_seconds", "_handover", b"_handover", "drain_seconds", b"drain_seconds", "handover", b"handover"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    _WhichOneofReturnType__drain_seconds: _TypeAlias = _typing.Literal["drain_seconds"]  # noqa: Y015
+    _WhichOneofArgType__drain_seconds: _TypeAlias = _typing.Literal["_drain_seconds", b"_drain_seconds"]  # noqa: Y015
+    _WhichOneofReturnType__handover: _TypeAlias = _typing.Literal["handover"]  # noqa: Y015
+    _WhichOneofArgType__handover: _TypeAlias = _typing.Literal["_handover", b"_handover"]  # noqa: Y015
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__drain_seconds) -> _WhichOneofReturnType__drain_seconds | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__handover) -> _WhichOneofReturnType__handover | None: ...
+
+Global___EndMissionRequest: _TypeAlias = EndMissionRequest  # noqa: Y015
+
+@_typing.final
+class EndMissionResponse(_message.Message):
+    DESCRIPTOR: _descriptor.Descriptor
+
+    STATE_FIELD_NUMBER: _builtins.int
+    SUMMARY_FIELD_NUMBER: _builtins.int
+    VOXELS_WAITING_FIELD_NUMBER: _builtins.int
+    KEYFRAMES_WAITING_FIELD_NUMBER: _builtins.int
+    FRAMES_MAPPED_FIELD_NUMBER: _builtins.int
+    GAUSSIANS_FIELD_NUMBER: _builtins.int
+    state: Global___AgentState.ValueType
+    """ENDED or FAILED."""
+    summary: _builtins.str
+    """What was sent and what was left, as one line for the operator."""
+    voxels_waiting: _builtins.int
+    """Data that the server has not acknowledged. It stays in the agent's spool."""
+    keyframes_waiting: _builtins.int
+    frames_mapped: _builtins.int
+    gaussians: _builtins.int
+    def __init__(
+        self,
+        *,
+        state: Global___AgentState.ValueType = ...,
+        summary: _builtins.str = ...,
+        voxels_waiting: _builtins.int = ...,
+        keyframes_waiting: _builtins.int = ...,
+        frames_mapped: _builtins.int = ...,
+        gaussians: _builtins.int = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["frames_mapped", b"frames_mapped", "gaussians", b"gaussians", "keyframes_waiting", b"keyframes_waiting", "state", b"state", "summary", b"summary", "voxels_waiting", b"voxels_waiting"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___EndMissionResponse: _TypeAlias = EndMissionResponse  # noqa: Y015
+
+@_typing.final
 class GetAgentStatusRequest(_message.Message):
     DESCRIPTOR: _descriptor.Descriptor
 
@@ -281,6 +358,9 @@ class UplinkStatus(_message.Message):
     VOXELS_SENT_FIELD_NUMBER: _builtins.int
     VOXELS_WAITING_FIELD_NUMBER: _builtins.int
     SUBSETS_REJECTED_FIELD_NUMBER: _builtins.int
+    KEYFRAMES_SENT_FIELD_NUMBER: _builtins.int
+    KEYFRAMES_WAITING_FIELD_NUMBER: _builtins.int
+    KEYFRAME_BYTES_FIELD_NUMBER: _builtins.int
     connected: _builtins.bool
     stopped_because: _builtins.str
     """Why the uplink stopped permanently; empty while it runs."""
@@ -292,6 +372,10 @@ class UplinkStatus(_message.Message):
     voxels_waiting: _builtins.int
     """Voxels whose latest update the server has not acknowledged."""
     subsets_rejected: _builtins.int
+    keyframes_sent: _builtins.int
+    """Keyframes that the server has acknowledged, those that wait, and their bytes, resends included."""
+    keyframes_waiting: _builtins.int
+    keyframe_bytes: _builtins.int
     def __init__(
         self,
         *,
@@ -302,10 +386,13 @@ class UplinkStatus(_message.Message):
         voxels_sent: _builtins.int = ...,
         voxels_waiting: _builtins.int = ...,
         subsets_rejected: _builtins.int = ...,
+        keyframes_sent: _builtins.int = ...,
+        keyframes_waiting: _builtins.int = ...,
+        keyframe_bytes: _builtins.int = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["bytes_sent", b"bytes_sent", "connected", b"connected", "gaussians_sent", b"gaussians_sent", "stopped_because", b"stopped_because", "subsets_rejected", b"subsets_rejected", "voxels_sent", b"voxels_sent", "voxels_waiting", b"voxels_waiting"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["bytes_sent", b"bytes_sent", "connected", b"connected", "gaussians_sent", b"gaussians_sent", "keyframe_bytes", b"keyframe_bytes", "keyframes_sent", b"keyframes_sent", "keyframes_waiting", b"keyframes_waiting", "stopped_because", b"stopped_because", "subsets_rejected", b"subsets_rejected", "voxels_sent", b"voxels_sent", "voxels_waiting", b"voxels_waiting"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

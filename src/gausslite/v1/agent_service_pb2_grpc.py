@@ -44,6 +44,11 @@ class AgentServiceStub(object):
                 request_serializer=gausslite_dot_v1_dot_agent__service__pb2.IngestFramesRequest.SerializeToString,
                 response_deserializer=gausslite_dot_v1_dot_agent__service__pb2.IngestFramesResponse.FromString,
                 _registered_method=True)
+        self.EndMission = channel.unary_unary(
+                '/gausslite.v1.AgentService/EndMission',
+                request_serializer=gausslite_dot_v1_dot_agent__service__pb2.EndMissionRequest.SerializeToString,
+                response_deserializer=gausslite_dot_v1_dot_agent__service__pb2.EndMissionResponse.FromString,
+                _registered_method=True)
         self.GetAgentStatus = channel.unary_unary(
                 '/gausslite.v1.AgentService/GetAgentStatus',
                 request_serializer=gausslite_dot_v1_dot_agent__service__pb2.GetAgentStatusRequest.SerializeToString,
@@ -65,7 +70,8 @@ class AgentServiceServicer(object):
     """Missing associated documentation comment in .proto file."""
 
     def AssignTask(self, request, context):
-        """Map for this task from the next frame. A second task replaces the first; the map is kept.
+        """Map for this task from the next frame. A second task replaces the first; the map is kept. After the end of a mission
+        a task begins the next one, with the same map. FAILED_PRECONDITION if the agent has no detector.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
@@ -73,6 +79,14 @@ class AgentServiceServicer(object):
 
     def IngestFrames(self, request_iterator, context):
         """Send frames; one outcome for each, in order. An invalid frame is REJECTED and the stream continues.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
+    def EndMission(self, request, context):
+        """End the mission: map the queued frames, save the mission, send the pending data, write the results. It returns after
+        that; a second call waits for the first and returns the same. Later frames are refused until the next task.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
@@ -110,6 +124,11 @@ def add_AgentServiceServicer_to_server(servicer, server):
                     servicer.IngestFrames,
                     request_deserializer=gausslite_dot_v1_dot_agent__service__pb2.IngestFramesRequest.FromString,
                     response_serializer=gausslite_dot_v1_dot_agent__service__pb2.IngestFramesResponse.SerializeToString,
+            ),
+            'EndMission': grpc.unary_unary_rpc_method_handler(
+                    servicer.EndMission,
+                    request_deserializer=gausslite_dot_v1_dot_agent__service__pb2.EndMissionRequest.FromString,
+                    response_serializer=gausslite_dot_v1_dot_agent__service__pb2.EndMissionResponse.SerializeToString,
             ),
             'GetAgentStatus': grpc.unary_unary_rpc_method_handler(
                     servicer.GetAgentStatus,
@@ -181,6 +200,33 @@ class AgentService(object):
             '/gausslite.v1.AgentService/IngestFrames',
             gausslite_dot_v1_dot_agent__service__pb2.IngestFramesRequest.SerializeToString,
             gausslite_dot_v1_dot_agent__service__pb2.IngestFramesResponse.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def EndMission(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/gausslite.v1.AgentService/EndMission',
+            gausslite_dot_v1_dot_agent__service__pb2.EndMissionRequest.SerializeToString,
+            gausslite_dot_v1_dot_agent__service__pb2.EndMissionResponse.FromString,
             options,
             channel_credentials,
             insecure,

@@ -35,9 +35,15 @@ class AgentServiceStub:
     @_typing.overload
     def __new__(cls, channel: _aio.Channel) -> AgentServiceAsyncStub: ...
     AssignTask: _grpc.UnaryUnaryMultiCallable[_agent_service_pb2.AssignTaskRequest, _agent_service_pb2.AssignTaskResponse]
-    """Map for this task from the next frame. A second task replaces the first; the map is kept."""
+    """Map for this task from the next frame. A second task replaces the first; the map is kept. After the end of a mission
+    a task begins the next one, with the same map. FAILED_PRECONDITION if the agent has no detector.
+    """
     IngestFrames: _grpc.StreamStreamMultiCallable[_agent_service_pb2.IngestFramesRequest, _agent_service_pb2.IngestFramesResponse]
     """Send frames; one outcome for each, in order. An invalid frame is REJECTED and the stream continues."""
+    EndMission: _grpc.UnaryUnaryMultiCallable[_agent_service_pb2.EndMissionRequest, _agent_service_pb2.EndMissionResponse]
+    """End the mission: map the queued frames, save the mission, send the pending data, write the results. It returns after
+    that; a second call waits for the first and returns the same. Later frames are refused until the next task.
+    """
     GetAgentStatus: _grpc.UnaryUnaryMultiCallable[_agent_service_pb2.GetAgentStatusRequest, _agent_service_pb2.GetAgentStatusResponse]
     RenderView: _grpc.UnaryUnaryMultiCallable[_agent_service_pb2.RenderViewRequest, _agent_service_pb2.RenderViewResponse]
     """Render the agent's map from a camera pose."""
@@ -48,9 +54,15 @@ class AgentServiceStub:
 class AgentServiceAsyncStub(AgentServiceStub):
     def __init__(self, channel: _aio.Channel) -> None: ...
     AssignTask: _aio.UnaryUnaryMultiCallable[_agent_service_pb2.AssignTaskRequest, _agent_service_pb2.AssignTaskResponse]  # type: ignore[assignment]
-    """Map for this task from the next frame. A second task replaces the first; the map is kept."""
+    """Map for this task from the next frame. A second task replaces the first; the map is kept. After the end of a mission
+    a task begins the next one, with the same map. FAILED_PRECONDITION if the agent has no detector.
+    """
     IngestFrames: _aio.StreamStreamMultiCallable[_agent_service_pb2.IngestFramesRequest, _agent_service_pb2.IngestFramesResponse]  # type: ignore[assignment]
     """Send frames; one outcome for each, in order. An invalid frame is REJECTED and the stream continues."""
+    EndMission: _aio.UnaryUnaryMultiCallable[_agent_service_pb2.EndMissionRequest, _agent_service_pb2.EndMissionResponse]  # type: ignore[assignment]
+    """End the mission: map the queued frames, save the mission, send the pending data, write the results. It returns after
+    that; a second call waits for the first and returns the same. Later frames are refused until the next task.
+    """
     GetAgentStatus: _aio.UnaryUnaryMultiCallable[_agent_service_pb2.GetAgentStatusRequest, _agent_service_pb2.GetAgentStatusResponse]  # type: ignore[assignment]
     RenderView: _aio.UnaryUnaryMultiCallable[_agent_service_pb2.RenderViewRequest, _agent_service_pb2.RenderViewResponse]  # type: ignore[assignment]
     """Render the agent's map from a camera pose."""
@@ -64,7 +76,9 @@ class AgentServiceServicer(metaclass=_abc_1.ABCMeta):
         request: _agent_service_pb2.AssignTaskRequest,
         context: _ServicerContext,
     ) -> _typing.Union[_agent_service_pb2.AssignTaskResponse, _abc.Awaitable[_agent_service_pb2.AssignTaskResponse]]:
-        """Map for this task from the next frame. A second task replaces the first; the map is kept."""
+        """Map for this task from the next frame. A second task replaces the first; the map is kept. After the end of a mission
+        a task begins the next one, with the same map. FAILED_PRECONDITION if the agent has no detector.
+        """
 
     @_abc_1.abstractmethod
     def IngestFrames(
@@ -73,6 +87,16 @@ class AgentServiceServicer(metaclass=_abc_1.ABCMeta):
         context: _ServicerContext,
     ) -> _typing.Union[_abc.Iterator[_agent_service_pb2.IngestFramesResponse], _abc.AsyncIterator[_agent_service_pb2.IngestFramesResponse]]:
         """Send frames; one outcome for each, in order. An invalid frame is REJECTED and the stream continues."""
+
+    @_abc_1.abstractmethod
+    def EndMission(
+        self,
+        request: _agent_service_pb2.EndMissionRequest,
+        context: _ServicerContext,
+    ) -> _typing.Union[_agent_service_pb2.EndMissionResponse, _abc.Awaitable[_agent_service_pb2.EndMissionResponse]]:
+        """End the mission: map the queued frames, save the mission, send the pending data, write the results. It returns after
+        that; a second call waits for the first and returns the same. Later frames are refused until the next task.
+        """
 
     @_abc_1.abstractmethod
     def GetAgentStatus(

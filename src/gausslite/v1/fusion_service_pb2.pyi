@@ -9,6 +9,8 @@ SPDX-License-Identifier: Apache-2.0
 from collections import abc as _abc
 from gausslite.v1 import gaussians_pb2 as _gaussians_pb2
 from gausslite.v1 import geometry_pb2 as _geometry_pb2
+from gausslite.v1 import objects_pb2 as _objects_pb2
+from gausslite.v1 import task_pb2 as _task_pb2
 from google.protobuf import descriptor as _descriptor
 from google.protobuf import message as _message
 from google.protobuf.internal import containers as _containers
@@ -70,6 +72,28 @@ SUBSET_STATUS_REJECTED: SubsetStatus.ValueType  # 3
 """Not stored. Sending the same bytes again helps only if the reason is CHECKSUM."""
 Global___SubsetStatus: _TypeAlias = SubsetStatus  # noqa: Y015
 
+class _MapLayer:
+    ValueType = _typing.NewType("ValueType", _builtins.int)
+    V: _TypeAlias = ValueType  # noqa: Y015
+
+class _MapLayerEnumTypeWrapper(_enum_type_wrapper._EnumTypeWrapper[_MapLayer.ValueType], _builtins.type):
+    DESCRIPTOR: _descriptor.EnumDescriptor
+    MAP_LAYER_UNSPECIFIED: _MapLayer.ValueType  # 0
+    """The same as VOTE."""
+    MAP_LAYER_VOTE: _MapLayer.ValueType  # 1
+    MAP_LAYER_REFINED: _MapLayer.ValueType  # 2
+    """The latest refinement; voxels that changed later, and all voxels before the first refinement, show the vote."""
+
+class MapLayer(_MapLayer, metaclass=_MapLayerEnumTypeWrapper):
+    """The layers of the map that watchers follow and views are rendered of."""
+
+MAP_LAYER_UNSPECIFIED: MapLayer.ValueType  # 0
+"""The same as VOTE."""
+MAP_LAYER_VOTE: MapLayer.ValueType  # 1
+MAP_LAYER_REFINED: MapLayer.ValueType  # 2
+"""The latest refinement; voxels that changed later, and all voxels before the first refinement, show the vote."""
+Global___MapLayer: _TypeAlias = MapLayer  # noqa: Y015
+
 class _FusionStrategy:
     ValueType = _typing.NewType("ValueType", _builtins.int)
     V: _TypeAlias = ValueType  # noqa: Y015
@@ -95,6 +119,37 @@ FUSION_STRATEGY_REFINED: FusionStrategy.ValueType  # 3
 """The result of the latest RefineFusedMap; FAILED_PRECONDITION before the first."""
 Global___FusionStrategy: _TypeAlias = FusionStrategy  # noqa: Y015
 
+class _AlignmentState:
+    ValueType = _typing.NewType("ValueType", _builtins.int)
+    V: _TypeAlias = ValueType  # noqa: Y015
+
+class _AlignmentStateEnumTypeWrapper(_enum_type_wrapper._EnumTypeWrapper[_AlignmentState.ValueType], _builtins.type):
+    DESCRIPTOR: _descriptor.EnumDescriptor
+    ALIGNMENT_STATE_UNSPECIFIED: _AlignmentState.ValueType  # 0
+    """Too little overlap with the map of the other agents to measure a misfit; the map is used as sent."""
+    ALIGNMENT_STATE_REFERENCE: _AlignmentState.ValueType  # 1
+    """The agent's frame defines the fused map's frame."""
+    ALIGNMENT_STATE_ALIGNED: _AlignmentState.ValueType  # 2
+    """The misfit is within the noise of the maps."""
+    ALIGNMENT_STATE_CORRECTED: _AlignmentState.ValueType  # 3
+    """The misfit is within the bound; the agent's contribution is corrected by T_fused_agent."""
+    ALIGNMENT_STATE_QUARANTINED: _AlignmentState.ValueType  # 4
+    """The misfit exceeds the bound; the agent's contribution is stored but not fused."""
+
+class AlignmentState(_AlignmentState, metaclass=_AlignmentStateEnumTypeWrapper): ...
+
+ALIGNMENT_STATE_UNSPECIFIED: AlignmentState.ValueType  # 0
+"""Too little overlap with the map of the other agents to measure a misfit; the map is used as sent."""
+ALIGNMENT_STATE_REFERENCE: AlignmentState.ValueType  # 1
+"""The agent's frame defines the fused map's frame."""
+ALIGNMENT_STATE_ALIGNED: AlignmentState.ValueType  # 2
+"""The misfit is within the noise of the maps."""
+ALIGNMENT_STATE_CORRECTED: AlignmentState.ValueType  # 3
+"""The misfit is within the bound; the agent's contribution is corrected by T_fused_agent."""
+ALIGNMENT_STATE_QUARANTINED: AlignmentState.ValueType  # 4
+"""The misfit exceeds the bound; the agent's contribution is stored but not fused."""
+Global___AlignmentState: _TypeAlias = AlignmentState  # noqa: Y015
+
 @_typing.final
 class JoinSessionRequest(_message.Message):
     DESCRIPTOR: _descriptor.Descriptor
@@ -104,6 +159,8 @@ class JoinSessionRequest(_message.Message):
     GRID_FIELD_NUMBER: _builtins.int
     WORLD_FRAME_FIELD_NUMBER: _builtins.int
     FRESH_MAP_FIELD_NUMBER: _builtins.int
+    TASK_FIELD_NUMBER: _builtins.int
+    T_FUSED_AGENT_FIELD_NUMBER: _builtins.int
     agent_id: _builtins.str
     mission_id: _builtins.str
     """Agents of one mission share a map; empty accepts the server's mission."""
@@ -113,6 +170,14 @@ class JoinSessionRequest(_message.Message):
     """The agent starts with an empty map, so the server deletes its earlier updates."""
     @_builtins.property
     def grid(self) -> _geometry_pb2.VoxelGrid: ...
+    @_builtins.property
+    def task(self) -> _task_pb2.TaskGraph:
+        """The agent's task, if it has one."""
+
+    @_builtins.property
+    def t_fused_agent(self) -> _geometry_pb2.RigidTransform:
+        """Maps points of the agent's world frame to the fused map's; absent: equal, or estimated by the server."""
+
     def __init__(
         self,
         *,
@@ -121,10 +186,12 @@ class JoinSessionRequest(_message.Message):
         grid: _geometry_pb2.VoxelGrid | None = ...,
         world_frame: _builtins.str = ...,
         fresh_map: _builtins.bool = ...,
+        task: _task_pb2.TaskGraph | None = ...,
+        t_fused_agent: _geometry_pb2.RigidTransform | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["grid", b"grid"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["grid", b"grid", "t_fused_agent", b"t_fused_agent", "task", b"task"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["agent_id", b"agent_id", "fresh_map", b"fresh_map", "grid", b"grid", "mission_id", b"mission_id", "world_frame", b"world_frame"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["agent_id", b"agent_id", "fresh_map", b"fresh_map", "grid", b"grid", "mission_id", b"mission_id", "t_fused_agent", b"t_fused_agent", "task", b"task", "world_frame", b"world_frame"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
@@ -140,6 +207,8 @@ class JoinSessionResponse(_message.Message):
     GRID_FIELD_NUMBER: _builtins.int
     MAX_SUBSET_BYTES_FIELD_NUMBER: _builtins.int
     MAX_GAUSSIANS_FIELD_NUMBER: _builtins.int
+    KEYFRAMES_FIELD_NUMBER: _builtins.int
+    MAX_KEYFRAMES_FIELD_NUMBER: _builtins.int
     session_id: _builtins.str
     highest_map_revision: _builtins.int
     """The highest map_revision stored of this agent; later updates must have a higher one."""
@@ -148,8 +217,14 @@ class JoinSessionResponse(_message.Message):
     """Size limit of a subset message."""
     max_gaussians: _builtins.int
     """Limit of stored Gaussians per agent; 0 = no limit."""
+    max_keyframes: _builtins.int
+    """Limit of stored keyframes per agent; 0 = no limit."""
     @_builtins.property
     def grid(self) -> _geometry_pb2.VoxelGrid: ...
+    @_builtins.property
+    def keyframes(self) -> _containers.RepeatedScalarFieldContainer[_builtins.int]:
+        """Indices of this agent's keyframes that the server stores; the agent sends the others of its selection."""
+
     def __init__(
         self,
         *,
@@ -159,10 +234,12 @@ class JoinSessionResponse(_message.Message):
         grid: _geometry_pb2.VoxelGrid | None = ...,
         max_subset_bytes: _builtins.int = ...,
         max_gaussians: _builtins.int = ...,
+        keyframes: _abc.Iterable[_builtins.int] | None = ...,
+        max_keyframes: _builtins.int = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["grid", b"grid"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["fused_revision", b"fused_revision", "grid", b"grid", "highest_map_revision", b"highest_map_revision", "max_gaussians", b"max_gaussians", "max_subset_bytes", b"max_subset_bytes", "session_id", b"session_id"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["fused_revision", b"fused_revision", "grid", b"grid", "highest_map_revision", b"highest_map_revision", "keyframes", b"keyframes", "max_gaussians", b"max_gaussians", "max_keyframes", b"max_keyframes", "max_subset_bytes", b"max_subset_bytes", "session_id", b"session_id"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
@@ -263,18 +340,26 @@ class ContributeKeyframesRequest(_message.Message):
 
     SESSION_ID_FIELD_NUMBER: _builtins.int
     KEYFRAME_FIELD_NUMBER: _builtins.int
+    SELECTED_FIELD_NUMBER: _builtins.int
     session_id: _builtins.str
     @_builtins.property
     def keyframe(self) -> _geometry_pb2.EncodedFrame: ...
+    @_builtins.property
+    def selected(self) -> _containers.RepeatedScalarFieldContainer[_builtins.int]:
+        """Indices of all keyframes that the agent has selected so far. If not empty, the server deletes its other keyframes of
+        this agent. A message may have no keyframe, to delete only.
+        """
+
     def __init__(
         self,
         *,
         session_id: _builtins.str = ...,
         keyframe: _geometry_pb2.EncodedFrame | None = ...,
+        selected: _abc.Iterable[_builtins.int] | None = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["keyframe", b"keyframe"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["keyframe", b"keyframe", "session_id", b"session_id"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["keyframe", b"keyframe", "selected", b"selected", "session_id", b"session_id"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
@@ -332,9 +417,14 @@ class WatchFusedMapRequest(_message.Message):
     MISSION_ID_FIELD_NUMBER: _builtins.int
     SINCE_REVISION_FIELD_NUMBER: _builtins.int
     REGION_FIELD_NUMBER: _builtins.int
+    LAYER_FIELD_NUMBER: _builtins.int
+    EXCLUDE_AGENT_ID_FIELD_NUMBER: _builtins.int
     mission_id: _builtins.str
     since_revision: _builtins.int
     """0 asks for a snapshot first."""
+    layer: Global___MapLayer.ValueType
+    exclude_agent_id: _builtins.str
+    """If not empty: voxels that this agent wins are sent as tombstones. An agent follows its teammates' voxels with it."""
     @_builtins.property
     def region(self) -> _geometry_pb2.Box: ...
     def __init__(
@@ -343,10 +433,12 @@ class WatchFusedMapRequest(_message.Message):
         mission_id: _builtins.str = ...,
         since_revision: _builtins.int = ...,
         region: _geometry_pb2.Box | None = ...,
+        layer: Global___MapLayer.ValueType = ...,
+        exclude_agent_id: _builtins.str = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["_region", b"_region", "region", b"region"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["_region", b"_region", "mission_id", b"mission_id", "region", b"region", "since_revision", b"since_revision"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_region", b"_region", "exclude_agent_id", b"exclude_agent_id", "layer", b"layer", "mission_id", b"mission_id", "region", b"region", "since_revision", b"since_revision"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     _WhichOneofReturnType__region: _TypeAlias = _typing.Literal["region"]  # noqa: Y015
     _WhichOneofArgType__region: _TypeAlias = _typing.Literal["_region", b"_region"]  # noqa: Y015
@@ -522,6 +614,7 @@ class GetSessionStatusResponse(_message.Message):
     AGENTS_FIELD_NUMBER: _builtins.int
     KEYFRAMES_FIELD_NUMBER: _builtins.int
     REFINED_FIELD_NUMBER: _builtins.int
+    VOTE_FIELD_NUMBER: _builtins.int
     mission_id: _builtins.str
     world_frame: _builtins.str
     fused_revision: _builtins.int
@@ -530,6 +623,8 @@ class GetSessionStatusResponse(_message.Message):
     keyframes: _builtins.int
     refined: _builtins.bool
     """True when a refined map can be exported."""
+    vote: _builtins.str
+    """The rule of the vote: "paper" or "free-space"."""
     @_builtins.property
     def grid(self) -> _geometry_pb2.VoxelGrid: ...
     @_builtins.property
@@ -546,10 +641,11 @@ class GetSessionStatusResponse(_message.Message):
         agents: _abc.Iterable[Global___AgentContribution] | None = ...,
         keyframes: _builtins.int = ...,
         refined: _builtins.bool = ...,
+        vote: _builtins.str = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["grid", b"grid"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["agents", b"agents", "fused_gaussians", b"fused_gaussians", "fused_revision", b"fused_revision", "fused_voxels", b"fused_voxels", "grid", b"grid", "keyframes", b"keyframes", "mission_id", b"mission_id", "refined", b"refined", "world_frame", b"world_frame"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["agents", b"agents", "fused_gaussians", b"fused_gaussians", "fused_revision", b"fused_revision", "fused_voxels", b"fused_voxels", "grid", b"grid", "keyframes", b"keyframes", "mission_id", b"mission_id", "refined", b"refined", "vote", b"vote", "world_frame", b"world_frame"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
@@ -575,6 +671,9 @@ class AgentContribution(_message.Message):
     KAPPA_SUM_FIELD_NUMBER: _builtins.int
     LAST_MAP_REVISION_FIELD_NUMBER: _builtins.int
     LAST_SEEN_NS_FIELD_NUMBER: _builtins.int
+    ALIGNMENT_FIELD_NUMBER: _builtins.int
+    FREE_VOXELS_FIELD_NUMBER: _builtins.int
+    TARGETS_FIELD_NUMBER: _builtins.int
     agent_id: _builtins.str
     joined: _builtins.bool
     """True while the agent has a session."""
@@ -595,6 +694,14 @@ class AgentContribution(_message.Message):
     """The highest map_revision of its updates; 0 without any."""
     last_seen_ns: _builtins.int
     """Time of its latest subset, by the server's clock; 0 before the first since the server started."""
+    free_voxels: _builtins.int
+    """Voxels that the agent has observed as free."""
+    @_builtins.property
+    def alignment(self) -> Global___FrameAlignment: ...
+    @_builtins.property
+    def targets(self) -> _containers.RepeatedScalarFieldContainer[_builtins.str]:
+        """Noun phrases of its task's targets, by the `target` of its Gaussians; empty before its first report."""
+
     def __init__(
         self,
         *,
@@ -612,14 +719,255 @@ class AgentContribution(_message.Message):
         kappa_sum: _builtins.int = ...,
         last_map_revision: _builtins.int = ...,
         last_seen_ns: _builtins.int = ...,
+        alignment: Global___FrameAlignment | None = ...,
+        free_voxels: _builtins.int = ...,
+        targets: _abc.Iterable[_builtins.str] | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["alignment", b"alignment"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["agent_id", b"agent_id", "gaussians", b"gaussians", "handover_bytes", b"handover_bytes", "joined", b"joined", "kappa_sum", b"kappa_sum", "keyframes", b"keyframes", "last_map_revision", b"last_map_revision", "last_seen_ns", b"last_seen_ns", "roi_bytes", b"roi_bytes", "subsets_accepted", b"subsets_accepted", "subsets_rejected", b"subsets_rejected", "subsets_stale", b"subsets_stale", "voxels", b"voxels", "won_voxels", b"won_voxels"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["agent_id", b"agent_id", "alignment", b"alignment", "free_voxels", b"free_voxels", "gaussians", b"gaussians", "handover_bytes", b"handover_bytes", "joined", b"joined", "kappa_sum", b"kappa_sum", "keyframes", b"keyframes", "last_map_revision", b"last_map_revision", "last_seen_ns", b"last_seen_ns", "roi_bytes", b"roi_bytes", "subsets_accepted", b"subsets_accepted", "subsets_rejected", b"subsets_rejected", "subsets_stale", b"subsets_stale", "targets", b"targets", "voxels", b"voxels", "won_voxels", b"won_voxels"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
 Global___AgentContribution: _TypeAlias = AgentContribution  # noqa: Y015
+
+@_typing.final
+class FrameAlignment(_message.Message):
+    """How an agent's world frame fits the fused map on their overlap."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    STATE_FIELD_NUMBER: _builtins.int
+    T_FUSED_AGENT_FIELD_NUMBER: _builtins.int
+    RESIDUAL_BEFORE_M_FIELD_NUMBER: _builtins.int
+    RESIDUAL_AFTER_M_FIELD_NUMBER: _builtins.int
+    COLOUR_BEFORE_FIELD_NUMBER: _builtins.int
+    COLOUR_AFTER_FIELD_NUMBER: _builtins.int
+    COMPARED_FIELD_NUMBER: _builtins.int
+    MESSAGE_FIELD_NUMBER: _builtins.int
+    state: Global___AlignmentState.ValueType
+    residual_before_m: _builtins.float
+    """Median distance to the other agents' surfaces and median colour difference, 0 to 1, before and after correction."""
+    residual_after_m: _builtins.float
+    colour_before: _builtins.float
+    colour_after: _builtins.float
+    compared: _builtins.int
+    """Number of Gaussians compared."""
+    message: _builtins.str
+    """Why the contribution is quarantined, or empty."""
+    @_builtins.property
+    def t_fused_agent(self) -> _geometry_pb2.RigidTransform:
+        """Correction in use for the agent's latest updates."""
+
+    def __init__(
+        self,
+        *,
+        state: Global___AlignmentState.ValueType = ...,
+        t_fused_agent: _geometry_pb2.RigidTransform | None = ...,
+        residual_before_m: _builtins.float = ...,
+        residual_after_m: _builtins.float = ...,
+        colour_before: _builtins.float = ...,
+        colour_after: _builtins.float = ...,
+        compared: _builtins.int = ...,
+        message: _builtins.str = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["t_fused_agent", b"t_fused_agent"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["colour_after", b"colour_after", "colour_before", b"colour_before", "compared", b"compared", "message", b"message", "residual_after_m", b"residual_after_m", "residual_before_m", b"residual_before_m", "state", b"state", "t_fused_agent", b"t_fused_agent"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___FrameAlignment: _TypeAlias = FrameAlignment  # noqa: Y015
+
+@_typing.final
+class ReportObjectsRequest(_message.Message):
+    DESCRIPTOR: _descriptor.Descriptor
+
+    SESSION_ID_FIELD_NUMBER: _builtins.int
+    TASK_FIELD_NUMBER: _builtins.int
+    OBJECTS_FIELD_NUMBER: _builtins.int
+    session_id: _builtins.str
+    @_builtins.property
+    def task(self) -> _task_pb2.TaskGraph: ...
+    @_builtins.property
+    def objects(self) -> _containers.RepeatedCompositeFieldContainer[_objects_pb2.ObjectLandmark]:
+        """All objects of the agent for this task; they replace those of its earlier report."""
+
+    def __init__(
+        self,
+        *,
+        session_id: _builtins.str = ...,
+        task: _task_pb2.TaskGraph | None = ...,
+        objects: _abc.Iterable[_objects_pb2.ObjectLandmark] | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["task", b"task"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["objects", b"objects", "session_id", b"session_id", "task", b"task"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___ReportObjectsRequest: _TypeAlias = ReportObjectsRequest  # noqa: Y015
+
+@_typing.final
+class ReportObjectsResponse(_message.Message):
+    DESCRIPTOR: _descriptor.Descriptor
+
+    def __init__(
+        self,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___ReportObjectsResponse: _TypeAlias = ReportObjectsResponse  # noqa: Y015
+
+@_typing.final
+class QueryObjectsRequest(_message.Message):
+    DESCRIPTOR: _descriptor.Descriptor
+
+    MISSION_ID_FIELD_NUMBER: _builtins.int
+    NOUN_FIELD_NUMBER: _builtins.int
+    mission_id: _builtins.str
+    noun: _builtins.str
+    """A noun phrase such as "mug"; empty for all objects."""
+    def __init__(
+        self,
+        *,
+        mission_id: _builtins.str = ...,
+        noun: _builtins.str = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["mission_id", b"mission_id", "noun", b"noun"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___QueryObjectsRequest: _TypeAlias = QueryObjectsRequest  # noqa: Y015
+
+@_typing.final
+class QueryObjectsResponse(_message.Message):
+    DESCRIPTOR: _descriptor.Descriptor
+
+    OBJECTS_FIELD_NUMBER: _builtins.int
+    @_builtins.property
+    def objects(self) -> _containers.RepeatedCompositeFieldContainer[_objects_pb2.ObjectLandmark]:
+        """The most confident object first."""
+
+    def __init__(
+        self,
+        *,
+        objects: _abc.Iterable[_objects_pb2.ObjectLandmark] | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["objects", b"objects"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___QueryObjectsResponse: _TypeAlias = QueryObjectsResponse  # noqa: Y015
+
+@_typing.final
+class ContributeFreeSpaceRequest(_message.Message):
+    DESCRIPTOR: _descriptor.Descriptor
+
+    SESSION_ID_FIELD_NUMBER: _builtins.int
+    FREE_SPACE_FIELD_NUMBER: _builtins.int
+    session_id: _builtins.str
+    free_space: _builtins.bytes
+    """Encoded by the free-space codec: the number of views that observed each voxel of some blocks as free."""
+    def __init__(
+        self,
+        *,
+        session_id: _builtins.str = ...,
+        free_space: _builtins.bytes = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["free_space", b"free_space", "session_id", b"session_id"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___ContributeFreeSpaceRequest: _TypeAlias = ContributeFreeSpaceRequest  # noqa: Y015
+
+@_typing.final
+class ContributeFreeSpaceResponse(_message.Message):
+    DESCRIPTOR: _descriptor.Descriptor
+
+    FREE_VOXELS_FIELD_NUMBER: _builtins.int
+    free_voxels: _builtins.int
+    """Voxels that the server now stores as observed free by this agent."""
+    def __init__(
+        self,
+        *,
+        free_voxels: _builtins.int = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["free_voxels", b"free_voxels"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___ContributeFreeSpaceResponse: _TypeAlias = ContributeFreeSpaceResponse  # noqa: Y015
+
+@_typing.final
+class RenderFusedViewRequest(_message.Message):
+    DESCRIPTOR: _descriptor.Descriptor
+
+    MISSION_ID_FIELD_NUMBER: _builtins.int
+    CAMERA_FIELD_NUMBER: _builtins.int
+    T_WORLD_CAMERA_FIELD_NUMBER: _builtins.int
+    LAYER_FIELD_NUMBER: _builtins.int
+    mission_id: _builtins.str
+    layer: Global___MapLayer.ValueType
+    @_builtins.property
+    def camera(self) -> _geometry_pb2.Camera: ...
+    @_builtins.property
+    def t_world_camera(self) -> _geometry_pb2.RigidTransform:
+        """The camera's pose in the fused map's frame."""
+
+    def __init__(
+        self,
+        *,
+        mission_id: _builtins.str = ...,
+        camera: _geometry_pb2.Camera | None = ...,
+        t_world_camera: _geometry_pb2.RigidTransform | None = ...,
+        layer: Global___MapLayer.ValueType = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["camera", b"camera", "t_world_camera", b"t_world_camera"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["camera", b"camera", "layer", b"layer", "mission_id", b"mission_id", "t_world_camera", b"t_world_camera"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___RenderFusedViewRequest: _TypeAlias = RenderFusedViewRequest  # noqa: Y015
+
+@_typing.final
+class RenderFusedViewResponse(_message.Message):
+    DESCRIPTOR: _descriptor.Descriptor
+
+    COLOUR_PNG_FIELD_NUMBER: _builtins.int
+    DEPTH_PNG_FIELD_NUMBER: _builtins.int
+    REVISION_FIELD_NUMBER: _builtins.int
+    colour_png: _builtins.bytes
+    depth_png: _builtins.bytes
+    """16-bit millimetres, 0 where nothing was rendered."""
+    revision: _builtins.int
+    def __init__(
+        self,
+        *,
+        colour_png: _builtins.bytes = ...,
+        depth_png: _builtins.bytes = ...,
+        revision: _builtins.int = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["colour_png", b"colour_png", "depth_png", b"depth_png", "revision", b"revision"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___RenderFusedViewResponse: _TypeAlias = RenderFusedViewResponse  # noqa: Y015
 
 @_typing.final
 class LeaveSessionRequest(_message.Message):

@@ -64,6 +64,26 @@ class FusionServiceStub(object):
                 request_serializer=gausslite_dot_v1_dot_fusion__service__pb2.ExportFusedMapRequest.SerializeToString,
                 response_deserializer=gausslite_dot_v1_dot_fusion__service__pb2.ExportFusedMapResponse.FromString,
                 _registered_method=True)
+        self.ReportObjects = channel.unary_unary(
+                '/gausslite.v1.FusionService/ReportObjects',
+                request_serializer=gausslite_dot_v1_dot_fusion__service__pb2.ReportObjectsRequest.SerializeToString,
+                response_deserializer=gausslite_dot_v1_dot_fusion__service__pb2.ReportObjectsResponse.FromString,
+                _registered_method=True)
+        self.QueryObjects = channel.unary_unary(
+                '/gausslite.v1.FusionService/QueryObjects',
+                request_serializer=gausslite_dot_v1_dot_fusion__service__pb2.QueryObjectsRequest.SerializeToString,
+                response_deserializer=gausslite_dot_v1_dot_fusion__service__pb2.QueryObjectsResponse.FromString,
+                _registered_method=True)
+        self.ContributeFreeSpace = channel.unary_unary(
+                '/gausslite.v1.FusionService/ContributeFreeSpace',
+                request_serializer=gausslite_dot_v1_dot_fusion__service__pb2.ContributeFreeSpaceRequest.SerializeToString,
+                response_deserializer=gausslite_dot_v1_dot_fusion__service__pb2.ContributeFreeSpaceResponse.FromString,
+                _registered_method=True)
+        self.RenderView = channel.unary_unary(
+                '/gausslite.v1.FusionService/RenderView',
+                request_serializer=gausslite_dot_v1_dot_fusion__service__pb2.RenderFusedViewRequest.SerializeToString,
+                response_deserializer=gausslite_dot_v1_dot_fusion__service__pb2.RenderFusedViewResponse.FromString,
+                _registered_method=True)
         self.GetSessionStatus = channel.unary_unary(
                 '/gausslite.v1.FusionService/GetSessionStatus',
                 request_serializer=gausslite_dot_v1_dot_fusion__service__pb2.GetSessionStatusRequest.SerializeToString,
@@ -126,6 +146,34 @@ class FusionServiceServicer(object):
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
+    def ReportObjects(self, request, context):
+        """Replace the agent's task graph and object landmarks; both are as durable as the server's store.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
+    def QueryObjects(self, request, context):
+        """The team's objects, each merged over the agents that observed it, or those that a noun names.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
+    def ContributeFreeSpace(self, request, context):
+        """Replace what the agent has observed as free in some blocks of voxels; used by the free-space vote.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
+    def RenderView(self, request, context):
+        """Render a layer of the map from a camera pose. RESOURCE_EXHAUSTED for more pixels than the server renders.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
     def GetSessionStatus(self, request, context):
         """Missing associated documentation comment in .proto file."""
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
@@ -170,6 +218,26 @@ def add_FusionServiceServicer_to_server(servicer, server):
                     servicer.ExportFusedMap,
                     request_deserializer=gausslite_dot_v1_dot_fusion__service__pb2.ExportFusedMapRequest.FromString,
                     response_serializer=gausslite_dot_v1_dot_fusion__service__pb2.ExportFusedMapResponse.SerializeToString,
+            ),
+            'ReportObjects': grpc.unary_unary_rpc_method_handler(
+                    servicer.ReportObjects,
+                    request_deserializer=gausslite_dot_v1_dot_fusion__service__pb2.ReportObjectsRequest.FromString,
+                    response_serializer=gausslite_dot_v1_dot_fusion__service__pb2.ReportObjectsResponse.SerializeToString,
+            ),
+            'QueryObjects': grpc.unary_unary_rpc_method_handler(
+                    servicer.QueryObjects,
+                    request_deserializer=gausslite_dot_v1_dot_fusion__service__pb2.QueryObjectsRequest.FromString,
+                    response_serializer=gausslite_dot_v1_dot_fusion__service__pb2.QueryObjectsResponse.SerializeToString,
+            ),
+            'ContributeFreeSpace': grpc.unary_unary_rpc_method_handler(
+                    servicer.ContributeFreeSpace,
+                    request_deserializer=gausslite_dot_v1_dot_fusion__service__pb2.ContributeFreeSpaceRequest.FromString,
+                    response_serializer=gausslite_dot_v1_dot_fusion__service__pb2.ContributeFreeSpaceResponse.SerializeToString,
+            ),
+            'RenderView': grpc.unary_unary_rpc_method_handler(
+                    servicer.RenderView,
+                    request_deserializer=gausslite_dot_v1_dot_fusion__service__pb2.RenderFusedViewRequest.FromString,
+                    response_serializer=gausslite_dot_v1_dot_fusion__service__pb2.RenderFusedViewResponse.SerializeToString,
             ),
             'GetSessionStatus': grpc.unary_unary_rpc_method_handler(
                     servicer.GetSessionStatus,
@@ -344,6 +412,114 @@ class FusionService(object):
             '/gausslite.v1.FusionService/ExportFusedMap',
             gausslite_dot_v1_dot_fusion__service__pb2.ExportFusedMapRequest.SerializeToString,
             gausslite_dot_v1_dot_fusion__service__pb2.ExportFusedMapResponse.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def ReportObjects(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/gausslite.v1.FusionService/ReportObjects',
+            gausslite_dot_v1_dot_fusion__service__pb2.ReportObjectsRequest.SerializeToString,
+            gausslite_dot_v1_dot_fusion__service__pb2.ReportObjectsResponse.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def QueryObjects(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/gausslite.v1.FusionService/QueryObjects',
+            gausslite_dot_v1_dot_fusion__service__pb2.QueryObjectsRequest.SerializeToString,
+            gausslite_dot_v1_dot_fusion__service__pb2.QueryObjectsResponse.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def ContributeFreeSpace(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/gausslite.v1.FusionService/ContributeFreeSpace',
+            gausslite_dot_v1_dot_fusion__service__pb2.ContributeFreeSpaceRequest.SerializeToString,
+            gausslite_dot_v1_dot_fusion__service__pb2.ContributeFreeSpaceResponse.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def RenderView(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/gausslite.v1.FusionService/RenderView',
+            gausslite_dot_v1_dot_fusion__service__pb2.RenderFusedViewRequest.SerializeToString,
+            gausslite_dot_v1_dot_fusion__service__pb2.RenderFusedViewResponse.FromString,
             options,
             channel_credentials,
             insecure,

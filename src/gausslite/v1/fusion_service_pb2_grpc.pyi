@@ -54,6 +54,14 @@ class FusionServiceStub:
     """
     ExportFusedMap: _grpc.UnaryStreamMultiCallable[_fusion_service_pb2.ExportFusedMapRequest, _fusion_service_pb2.ExportFusedMapResponse]
     """A map as the bytes of a standard 3DGS PLY file. FAILED_PRECONDITION for a refined map before a refinement."""
+    ReportObjects: _grpc.UnaryUnaryMultiCallable[_fusion_service_pb2.ReportObjectsRequest, _fusion_service_pb2.ReportObjectsResponse]
+    """Replace the agent's task graph and object landmarks; both are as durable as the server's store."""
+    QueryObjects: _grpc.UnaryUnaryMultiCallable[_fusion_service_pb2.QueryObjectsRequest, _fusion_service_pb2.QueryObjectsResponse]
+    """The team's objects, each merged over the agents that observed it, or those that a noun names."""
+    ContributeFreeSpace: _grpc.UnaryUnaryMultiCallable[_fusion_service_pb2.ContributeFreeSpaceRequest, _fusion_service_pb2.ContributeFreeSpaceResponse]
+    """Replace what the agent has observed as free in some blocks of voxels; used by the free-space vote."""
+    RenderView: _grpc.UnaryUnaryMultiCallable[_fusion_service_pb2.RenderFusedViewRequest, _fusion_service_pb2.RenderFusedViewResponse]
+    """Render a layer of the map from a camera pose. RESOURCE_EXHAUSTED for more pixels than the server renders."""
     GetSessionStatus: _grpc.UnaryUnaryMultiCallable[_fusion_service_pb2.GetSessionStatusRequest, _fusion_service_pb2.GetSessionStatusResponse]
     LeaveSession: _grpc.UnaryUnaryMultiCallable[_fusion_service_pb2.LeaveSessionRequest, _fusion_service_pb2.LeaveSessionResponse]
 
@@ -80,6 +88,14 @@ class FusionServiceAsyncStub(FusionServiceStub):
     """
     ExportFusedMap: _aio.UnaryStreamMultiCallable[_fusion_service_pb2.ExportFusedMapRequest, _fusion_service_pb2.ExportFusedMapResponse]  # type: ignore[assignment]
     """A map as the bytes of a standard 3DGS PLY file. FAILED_PRECONDITION for a refined map before a refinement."""
+    ReportObjects: _aio.UnaryUnaryMultiCallable[_fusion_service_pb2.ReportObjectsRequest, _fusion_service_pb2.ReportObjectsResponse]  # type: ignore[assignment]
+    """Replace the agent's task graph and object landmarks; both are as durable as the server's store."""
+    QueryObjects: _aio.UnaryUnaryMultiCallable[_fusion_service_pb2.QueryObjectsRequest, _fusion_service_pb2.QueryObjectsResponse]  # type: ignore[assignment]
+    """The team's objects, each merged over the agents that observed it, or those that a noun names."""
+    ContributeFreeSpace: _aio.UnaryUnaryMultiCallable[_fusion_service_pb2.ContributeFreeSpaceRequest, _fusion_service_pb2.ContributeFreeSpaceResponse]  # type: ignore[assignment]
+    """Replace what the agent has observed as free in some blocks of voxels; used by the free-space vote."""
+    RenderView: _aio.UnaryUnaryMultiCallable[_fusion_service_pb2.RenderFusedViewRequest, _fusion_service_pb2.RenderFusedViewResponse]  # type: ignore[assignment]
+    """Render a layer of the map from a camera pose. RESOURCE_EXHAUSTED for more pixels than the server renders."""
     GetSessionStatus: _aio.UnaryUnaryMultiCallable[_fusion_service_pb2.GetSessionStatusRequest, _fusion_service_pb2.GetSessionStatusResponse]  # type: ignore[assignment]
     LeaveSession: _aio.UnaryUnaryMultiCallable[_fusion_service_pb2.LeaveSessionRequest, _fusion_service_pb2.LeaveSessionResponse]  # type: ignore[assignment]
 
@@ -139,6 +155,38 @@ class FusionServiceServicer(metaclass=_abc_1.ABCMeta):
         context: _ServicerContext,
     ) -> _typing.Union[_abc.Iterator[_fusion_service_pb2.ExportFusedMapResponse], _abc.AsyncIterator[_fusion_service_pb2.ExportFusedMapResponse]]:
         """A map as the bytes of a standard 3DGS PLY file. FAILED_PRECONDITION for a refined map before a refinement."""
+
+    @_abc_1.abstractmethod
+    def ReportObjects(
+        self,
+        request: _fusion_service_pb2.ReportObjectsRequest,
+        context: _ServicerContext,
+    ) -> _typing.Union[_fusion_service_pb2.ReportObjectsResponse, _abc.Awaitable[_fusion_service_pb2.ReportObjectsResponse]]:
+        """Replace the agent's task graph and object landmarks; both are as durable as the server's store."""
+
+    @_abc_1.abstractmethod
+    def QueryObjects(
+        self,
+        request: _fusion_service_pb2.QueryObjectsRequest,
+        context: _ServicerContext,
+    ) -> _typing.Union[_fusion_service_pb2.QueryObjectsResponse, _abc.Awaitable[_fusion_service_pb2.QueryObjectsResponse]]:
+        """The team's objects, each merged over the agents that observed it, or those that a noun names."""
+
+    @_abc_1.abstractmethod
+    def ContributeFreeSpace(
+        self,
+        request: _fusion_service_pb2.ContributeFreeSpaceRequest,
+        context: _ServicerContext,
+    ) -> _typing.Union[_fusion_service_pb2.ContributeFreeSpaceResponse, _abc.Awaitable[_fusion_service_pb2.ContributeFreeSpaceResponse]]:
+        """Replace what the agent has observed as free in some blocks of voxels; used by the free-space vote."""
+
+    @_abc_1.abstractmethod
+    def RenderView(
+        self,
+        request: _fusion_service_pb2.RenderFusedViewRequest,
+        context: _ServicerContext,
+    ) -> _typing.Union[_fusion_service_pb2.RenderFusedViewResponse, _abc.Awaitable[_fusion_service_pb2.RenderFusedViewResponse]]:
+        """Render a layer of the map from a camera pose. RESOURCE_EXHAUSTED for more pixels than the server renders."""
 
     @_abc_1.abstractmethod
     def GetSessionStatus(

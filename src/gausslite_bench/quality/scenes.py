@@ -13,6 +13,7 @@ from numpy import ndarray
 from gausslite.domain.errors import DatasetError, InvalidInputError
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose_exposure_prior import PoseExposurePrior
+from gausslite.domain.objects import ObjectLandmark
 from gausslite.domain.region import Region
 from gausslite.domain.relevance import RelevanceMap
 from gausslite.domain.state import State
@@ -108,6 +109,11 @@ class RecordedRelevanceEstimator:
     def evaluate_past(self, frame: Frame) -> RelevanceMap:
         """Return the ground-truth mask."""
         return self._masks[frame]
+
+    @property
+    def objects(self) -> tuple[ObjectLandmark, ...]:
+        """Empty: there is no object map."""
+        return ()
 
     def state(self) -> State:
         """Return an empty state."""

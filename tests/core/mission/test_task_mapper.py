@@ -8,6 +8,7 @@ import numpy as np
 from mapping_scenes import wall_frame
 
 from gausslite.domain.frame import Frame
+from gausslite.domain.objects import ObjectLandmark
 from gausslite.domain.region import BallRegion
 from gausslite.domain.relevance import RelevanceMap
 from gausslite.domain.state import State
@@ -109,6 +110,10 @@ class SlowEstimator:
 
     def evaluate_past(self, frame: Frame) -> RelevanceMap:
         return self.estimate(frame).relevance
+
+    @property
+    def objects(self) -> tuple[ObjectLandmark, ...]:
+        return ()
 
     def state(self) -> State:
         return {}
