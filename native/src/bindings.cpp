@@ -138,13 +138,13 @@ nb::tuple backward(Rasterizer& self, uint64_t frame, size_t row_count, Colours d
   return nb::make_tuple(d_rows, d_twist, visible, norms);
 }
 
-std::unique_ptr<TrainingView> make_view(ByteColours rgb, Plane depth_m, std::optional<Plane> weight) {
+std::unique_ptr<TrainingView> make_view(ByteColours rgb, Plane depth_m, std::optional<Plane> pixel_weights) {
   const size_t height = rgb.shape(0), width = rgb.shape(1);
   const auto fits = [&](const Plane& plane) { return plane.shape(0) == height && plane.shape(1) == width; };
-  require(fits(depth_m) && (!weight || fits(*weight)), "view: sizes disagree");
+  require(fits(depth_m) && (!pixel_weights || fits(*pixel_weights)), "view: sizes disagree");
   nb::gil_scoped_release unlocked;
   return std::make_unique<TrainingView>(int(width), int(height), rgb.data(), depth_m.data(),
-                                        weight ? weight->data() : nullptr);
+                                        pixel_weights ? pixel_weights->data() : nullptr);
 }
 
 // View, camera, tiles and ids of a step, converted once for repeated steps with the same arrays. It keeps the arrays
@@ -239,7 +239,7 @@ NB_MODULE(_kernels, m) {
 
   nb::class_<TrainingView>(m, "View", "A training image in tiles, with its weights.")
       .def(nb::new_(&make_view), nb::arg("rgb").noconvert(), nb::arg("depth_m").noconvert(),
-           nb::arg("weight").noconvert().none())
+           nb::arg("pixel_weights").noconvert().none())
       .def_prop_ro("width", &TrainingView::width)
       .def_prop_ro("height", &TrainingView::height);
 

@@ -38,12 +38,16 @@ int tiles(int pixels) { return (pixels + kTileSide - 1) / kTileSide; }
 
 }  // namespace
 
-TrainingView::TrainingView(int width, int height, const uint8_t* rgb, const float* depth_m, const float* weight)
-    : width_(width), height_(height), tiles_x_(tiles(width)), tiles_y_(tiles(height)), masked_(weight != nullptr) {
+TrainingView::TrainingView(int width, int height, const uint8_t* rgb, const float* depth_m, const float* pixel_weights)
+    : width_(width),
+      height_(height),
+      tiles_x_(tiles(width)),
+      tiles_y_(tiles(height)),
+      masked_(pixel_weights != nullptr) {
   tiles_.ensure_exact_capacity(tile_count());
   for (size_t t = 0; t < tile_count(); ++t) copy_tile(t, rgb, depth_m);
   assign_weights(image_weights_, nullptr);
-  if (masked_) assign_weights(mask_weights_, weight);
+  if (masked_) assign_weights(mask_weights_, pixel_weights);
 }
 
 TrainingView::Extent TrainingView::extent(size_t tile) const {
@@ -67,7 +71,7 @@ void TrainingView::copy_tile(size_t tile, const uint8_t* rgb, const float* depth
   }
 }
 
-void TrainingView::assign_weights(Weights& weights, const float* weight) const {
+void TrainingView::assign_weights(Weights& weights, const float* pixel_weights) const {
   weights.entry_of_tile.ensure_exact_capacity(tile_count());
   weights.weighted_blocks.ensure_exact_capacity(tile_count());
   weights.values.ensure_capacity(2 * kTilePixels);
@@ -78,8 +82,8 @@ void TrainingView::assign_weights(Weights& weights, const float* weight) const {
     float tile[kTilePixels] = {};
     for (int y = 0; y < part.rows; ++y) {
       float* row = tile + y * kTileSide;
-      if (weight != nullptr) {
-        std::copy_n(weight + int64_t(part.y + y) * width_ + part.x, part.columns, row);
+      if (pixel_weights != nullptr) {
+        std::copy_n(pixel_weights + int64_t(part.y + y) * width_ + part.x, part.columns, row);
       } else {
         std::fill_n(row, part.columns, 1.0f);
       }

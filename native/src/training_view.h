@@ -12,8 +12,8 @@ namespace gausslite {
 
 class TrainingView {
  public:
-  // rgb: height x width x 3 bytes; depth_m, weight: height x width; weight may be null (1 everywhere).
-  TrainingView(int width, int height, const uint8_t* rgb, const float* depth_m, const float* weight);
+  // rgb: height x width x 3 bytes; depth_m, pixel_weights: height x width; pixel_weights may be null (1 everywhere).
+  TrainingView(int width, int height, const uint8_t* rgb, const float* depth_m, const float* pixel_weights);
 
   int width() const { return width_; }
   int height() const { return height_; }
@@ -37,8 +37,8 @@ class TrainingView {
   };
   Extent extent(size_t tile) const;
   void copy_tile(size_t tile, const uint8_t* rgb, const float* depth_m);
-  // weight: height x width; null: 1 everywhere in the image.
-  void assign_weights(Weights& weights, const float* weight) const;
+  // pixel_weights: height x width; null: 1 everywhere in the image.
+  void assign_weights(Weights& weights, const float* pixel_weights) const;
   void mark_reached_blocks(Weights& weights) const;
   void mark_ssim_squares(Weights& weights) const;
   size_t tile_count() const { return size_t(tiles_y_) * size_t(tiles_x_); }

@@ -213,10 +213,10 @@ class TargetImage:
 
     rgb: np.ndarray
     depth_m: np.ndarray
-    weight: np.ndarray
+    pixel_weights: np.ndarray
 
     def view(self, rasterizer: Rasterizer, scene: Scene) -> TrainingView:
-        return rasterizer.prepare_view(self.rgb, self.depth_m, scene.camera, self.weight)
+        return rasterizer.prepare_view(self.rgb, self.depth_m, scene.camera, self.pixel_weights)
 
 
 def target_near(rendering: Rendering, seed: int = 0) -> TargetImage:
@@ -228,7 +228,7 @@ def target_near(rendering: Rendering, seed: int = 0) -> TargetImage:
     depth_m = np.maximum(rendering.expected_depth_m(0.4) + offset_m, 0.0)
     near_half = np.abs(rendering.alpha - 0.5) < 1e-2
     depth_m = np.where(near_half | (rng.random(rendering.alpha.shape) < 0.2), 0.0, depth_m).astype(np.float32)
-    weight = np.where(rng.random(rendering.alpha.shape) < 0.4, rng.random(rendering.alpha.shape), 0.0).astype(
+    pixel_weights = np.where(rng.random(rendering.alpha.shape) < 0.4, rng.random(rendering.alpha.shape), 0.0).astype(
         np.float32
     )
-    return TargetImage(rgb, depth_m, weight)
+    return TargetImage(rgb, depth_m, pixel_weights)

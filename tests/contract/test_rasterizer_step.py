@@ -85,7 +85,7 @@ def test_small_region_step_matches_oracle(rasterizer: Rasterizer, oracle: Raster
     for row, column in np.ndindex(tiles.shape):
         tiles[row, column] = near[16 * row : 16 * row + 26, 16 * column : 16 * column + 26].any()
     subset = Subset(tiles=tiles)
-    target = replace(target_for(scene, oracle, subset), weight=region)
+    target = replace(target_for(scene, oracle, subset), pixel_weights=region)
     result, expected = (train(backend, scene, target, masked=True, subset=subset) for backend in (rasterizer, oracle))
     assert result.report.loss == pytest.approx(expected.report.loss, rel=1e-4)
     np.testing.assert_array_equal(result.report.visible, expected.report.visible)

@@ -89,11 +89,11 @@ def test_masked_step_ignores_pixels_of_weight_zero(rasterizer: Rasterizer, oracl
     scene = named_scene("medium splats")
     target = target_for(scene, oracle)
     other_rgb, other_depth_m = 255 - target.rgb, target.depth_m + np.float32(0.5)
-    unweighted = target.weight == 0
+    unweighted = target.pixel_weights == 0
     changed = TargetImage(
         np.where(unweighted[..., None], other_rgb, target.rgb),
         np.where(unweighted, other_depth_m, target.depth_m),
-        target.weight,
+        target.pixel_weights,
     )
     loss = replace(LOSS, ssim=0.0)
     first = train(rasterizer, scene, target, loss=loss, masked=True)
@@ -104,7 +104,7 @@ def test_masked_step_ignores_pixels_of_weight_zero(rasterizer: Rasterizer, oracl
 
 def test_empty_mask_gives_zero_loss_and_gradient(rasterizer: Rasterizer, oracle: Rasterizer) -> None:
     scene = named_scene("medium splats")
-    target = replace(target_for(scene, oracle), weight=np.zeros(scene.size, np.float32))
+    target = replace(target_for(scene, oracle), pixel_weights=np.zeros(scene.size, np.float32))
     result = train(rasterizer, scene, target, masked=True)
     assert result.report.loss == 0.0
     assert np.abs(applied_gradient(result)).max() < 1e-9

@@ -111,9 +111,9 @@ def test_loss_matches_direct_sums() -> None:
     rng = np.random.default_rng(0)
     images, rgb = rng.random((7, 9, 5)), rng.random((7, 9, 3))
     depth_m = np.where(rng.random((7, 9)) < 0.7, rng.uniform(0.5, 3.0, (7, 9)), 0.0)
-    weight = np.where(rng.random((7, 9)) < 0.5, rng.random((7, 9)), 0.0)
-    view = ReferenceView(CAMERA, *(torch.from_numpy(a) for a in (rgb, depth_m, weight)))
-    for masked, w in ((False, np.ones((7, 9))), (True, weight)):
+    pixel_weights = np.where(rng.random((7, 9)) < 0.5, rng.random((7, 9)), 0.0)
+    view = ReferenceView(CAMERA, *(torch.from_numpy(a) for a in (rgb, depth_m, pixel_weights)))
+    for masked, w in ((False, np.ones((7, 9))), (True, pixel_weights)):
         colour = depth = structure = 0.0
         similarity = direct_ssim(images[..., :3], rgb)
         for y in range(7):

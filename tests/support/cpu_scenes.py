@@ -26,7 +26,9 @@ def random_rows(n: int = 9000, seed: int = 0) -> np.ndarray:
 def view_of(rasterizer: CpuRasterizer, camera: Camera = CAMERA, masked: bool = False) -> TrainingView:
     rng = np.random.default_rng(7)
     size = (camera.height_px, camera.width_px)
-    weight = np.zeros(size, np.float32)
-    weight[size[0] // 3 :, : size[1] // 2] = 1.0
+    pixel_weights = np.zeros(size, np.float32)
+    pixel_weights[size[0] // 3 :, : size[1] // 2] = 1.0
     rgb = rng.integers(0, 256, (*size, 3), np.uint8)
-    return rasterizer.prepare_view(rgb, rng.uniform(0, 4, size).astype(np.float32), camera, weight if masked else None)
+    return rasterizer.prepare_view(
+        rgb, rng.uniform(0, 4, size).astype(np.float32), camera, pixel_weights if masked else None
+    )

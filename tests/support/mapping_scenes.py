@@ -26,9 +26,9 @@ def wall_frame(index: int = 0, size: tuple[int, int] = (64, 48), depth_m: float 
 def middle_relevance(frame: Frame) -> RelevanceMap:
     """The middle third of the image belongs to target 0."""
     height, width = frame.depth_m.shape
-    weight = np.zeros((height, width), np.float32)
-    weight[height // 3 : 2 * height // 3, width // 3 : 2 * width // 3] = 1.0
-    return RelevanceMap(weight, np.where(weight > 0, 0, -1).astype(np.int16))
+    pixel_weights = np.zeros((height, width), np.float32)
+    pixel_weights[height // 3 : 2 * height // 3, width // 3 : 2 * width // 3] = 1.0
+    return RelevanceMap(pixel_weights, np.where(pixel_weights > 0, 0, -1).astype(np.int16))
 
 
 def rendering_of(alpha: np.ndarray, depth_m: np.ndarray) -> Rendering:

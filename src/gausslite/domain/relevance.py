@@ -25,14 +25,18 @@ class Detection:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RelevanceMap:
-    """Relevance of one frame: weight is the paper's w(u, v) in [0, 1], target indexes TaskGraph.targets (-1 none)."""
+    """Relevance of one frame.
 
-    weight: Float32[ndarray, "h w"]
+    pixel_weights: the paper's w(u, v), in [0, 1]. target: for each pixel, the index of its target in TaskGraph.targets,
+    -1 for none.
+    """
+
+    pixel_weights: Float32[ndarray, "h w"]
     target: Int16[ndarray, "h w"]
 
     def __post_init__(self) -> None:
-        require_array("relevance weight", self.weight, (None, None), np.float32)
-        require_array("relevance target", self.target, self.weight.shape, np.int16)
+        require_array("relevance pixel_weights", self.pixel_weights, (None, None), np.float32)
+        require_array("relevance target", self.target, self.pixel_weights.shape, np.int16)
 
     @classmethod
     def empty(cls, height_px: int, width_px: int) -> RelevanceMap:
@@ -45,9 +49,9 @@ class RelevanceMap:
     @property
     def roi(self) -> Bool[ndarray, "h w"]:
         """True for pixels of the task's region."""
-        return self.weight > 0
+        return self.pixel_weights > 0
 
     @property
     def roi_share(self) -> float:
         """Fraction of pixels in the task's region."""
-        return float(np.count_nonzero(self.weight) / self.weight.size)
+        return float(np.count_nonzero(self.pixel_weights) / self.pixel_weights.size)

@@ -118,7 +118,7 @@ class _RefinementView:
     """A keyframe with its pixel weights and camera pose."""
 
     keyframe: AgentKeyframe
-    weight: Float32[ndarray, "h w"]
+    pixel_weights: Float32[ndarray, "h w"]
     T_camera_world: Float64[ndarray, "4 4"]
 
 
@@ -133,11 +133,11 @@ def _refinement_views(
         rendering = rasterizer.forward(table.rows, frame.camera, T_camera_world)
         surface_m = rendering.expected_depth_m(_FOOTPRINT_ALPHA)
         occluded = (frame.depth_m > 0) & (frame.depth_m < surface_m * (1 - _OCCLUSION_SHARE) - _OCCLUSION_M)
-        weight = ((rendering.alpha > _FOOTPRINT_ALPHA) & ~occluded).astype(np.float32)
-        if keyframe.weight is not None:
-            weight *= keyframe.weight
-        if weight.any():
-            views.append(_RefinementView(keyframe, weight, T_camera_world))
+        pixel_weights = ((rendering.alpha > _FOOTPRINT_ALPHA) & ~occluded).astype(np.float32)
+        if keyframe.pixel_weights is not None:
+            pixel_weights *= keyframe.pixel_weights
+        if pixel_weights.any():
+            views.append(_RefinementView(keyframe, pixel_weights, T_camera_world))
     if not views:
         raise InvalidInputError(
             f"refine: expected keyframes that show the fused map, got {len(keyframes)} but none does"
@@ -161,7 +161,7 @@ class _ViewPool:
         view = self._prepared.get(index)
         if view is None:
             frame = chosen.keyframe.frame
-            view = self._rasterizer.prepare_view(frame.rgb, frame.depth_m, frame.camera, chosen.weight)
+            view = self._rasterizer.prepare_view(frame.rgb, frame.depth_m, frame.camera, chosen.pixel_weights)
             if len(self._prepared) < self._max_prepared:
                 self._prepared[index] = view
         return view, chosen.T_camera_world

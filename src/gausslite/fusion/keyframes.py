@@ -13,17 +13,17 @@ from gausslite.domain.frame import Frame
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AgentKeyframe:
-    """A keyframe of one agent; weight: of each pixel in the loss, in [0, 1] (None = 1 everywhere)."""
+    """A keyframe of one agent. pixel_weights: the weight of each pixel in the loss, 0 to 1; None means 1 everywhere."""
 
     agent_id: str
     frame: Frame
-    weight: Float32[ndarray, "h w"] | None = None
+    pixel_weights: Float32[ndarray, "h w"] | None = None
 
 
 class KeyframePool:
-    """Per agent the `max_per_agent` frames with the highest index; a repeated index replaces the earlier frame.
+    """Keeps the `max_per_agent` frames of each agent with the highest index; a repeated index replaces the earlier one.
 
-    Memory per agent is at most max_per_agent × max_pixels × 11 bytes: RGB 3, depth 4, weight 4. Not thread-safe;
+    Memory per agent is at most max_per_agent × max_pixels × 11 bytes: RGB 3, depth 4, pixel weight 4. Not thread-safe;
     FusionEngine holds a lock.
     """
 

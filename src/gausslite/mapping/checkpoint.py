@@ -42,16 +42,16 @@ def frame_from_state(state: State) -> Frame:
 
 
 def relevance_state(relevance: RelevanceMap) -> dict[str, NDArray[Any]]:
-    """Return weight and target of a relevance map as named arrays."""
-    return {"weight": relevance.weight, "target": relevance.target}
+    """Return the pixel weights and targets of a relevance map as named arrays."""
+    return {"pixel_weights": relevance.pixel_weights, "target": relevance.target}
 
 
 def relevance_from_state(state: State, frame: Frame) -> RelevanceMap:
     """Return the relevance map of this frame. Raises MapFileError, ShapeError."""
-    weight = get_array(state, "weight", frame.depth_m.shape, np.float32).copy()
-    if not ((weight >= 0) & (weight <= 1)).all():
-        raise MapFileError("state weight: expected values in [0, 1], got others")
-    return RelevanceMap(weight, get_array(state, "target", frame.depth_m.shape, np.int16).copy())
+    pixel_weights = get_array(state, "pixel_weights", frame.depth_m.shape, np.float32).copy()
+    if not ((pixel_weights >= 0) & (pixel_weights <= 1)).all():
+        raise MapFileError("state pixel_weights: expected values in [0, 1], got others")
+    return RelevanceMap(pixel_weights, get_array(state, "target", frame.depth_m.shape, np.int16).copy())
 
 
 def generator_state(rng: np.random.Generator) -> UInt64[ndarray, "6"]:

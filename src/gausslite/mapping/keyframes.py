@@ -81,13 +81,13 @@ class WindowView:
 def window_view(keyframe: Keyframe, rasterizer: Rasterizer, settings: KeyframeSettings) -> WindowView:
     """Prepare a keyframe for training. The margin gives the SSIM window its neighbours at the ROI's border."""
     frame, relevance = keyframe.frame, keyframe.relevance
-    tiles, weight = tiles_touching(relevance.roi, settings.roi_margin_px), relevance.weight
+    tiles, pixel_weights = tiles_touching(relevance.roi, settings.roi_margin_px), relevance.pixel_weights
     if settings.roi_context_weight > 0:
-        context = np.float32(settings.roi_context_weight) * _pixels_inside(tiles, weight.shape)
-        weight = np.maximum(weight, context)
+        context = np.float32(settings.roi_context_weight) * _pixels_inside(tiles, pixel_weights.shape)
+        pixel_weights = np.maximum(pixel_weights, context)
     return WindowView(
         keyframe=keyframe,
-        training_view=rasterizer.prepare_view(frame.rgb, frame.depth_m, frame.camera, weight),
+        training_view=rasterizer.prepare_view(frame.rgb, frame.depth_m, frame.camera, pixel_weights),
         T_camera_world=inverse(frame.T_world_camera),
         roi=Subset(tiles),
     )

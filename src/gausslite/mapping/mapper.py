@@ -107,7 +107,7 @@ class GaussianMapper:
         is refined, the mapper renders it. A frame without a depth reading is skipped. Raises ShapeError if relevance
         and frame differ in size.
         """
-        require_array("relevance weight", relevance.weight, frame.depth_m.shape, np.float32)
+        require_array("relevance pixel_weights", relevance.pixel_weights, frame.depth_m.shape, np.float32)
         scheduler = CountedScheduler() if scheduler is None else scheduler
         if not frame.has_depth:
             self._skipped += 1
@@ -157,7 +157,7 @@ class GaussianMapper:
         Gaussians that the keyframe shows inside the ROI become active. ROI pixels with too few of them are seeded,
         within the cap.
         """
-        require_array("relevance weight", relevance.weight, keyframe.frame.depth_m.shape, np.float32)
+        require_array("relevance pixel_weights", relevance.pixel_weights, keyframe.frame.depth_m.shape, np.float32)
         frame, table = keyframe.frame, self._table
         self._keyframes.set_evaluated(replace(keyframe, relevance=relevance, evaluated=True), self._window_view)
         update_roi_evidence(table, frame, relevance)

@@ -20,18 +20,18 @@ def edge_magnitude(rgb: UInt8[ndarray, "h w 3"]) -> Float32[ndarray, "h w"]:
 
 
 def sample_pixels(
-    pool: Bool[ndarray, "h w"], count: int, weight: Float32[ndarray, "h w"], rng: np.random.Generator
+    pool: Bool[ndarray, "h w"], count: int, pixel_weights: Float32[ndarray, "h w"], rng: np.random.Generator
 ) -> Int64[ndarray, " n"]:
     """Return up to `count` pixels of the pool (flat indices, ascending), drawn by weight without replacement."""
     pixels = np.flatnonzero(pool)
     if len(pixels) <= count:
         return pixels
-    arrival = _arrival_times(pixels, weight, rng)
+    arrival = _arrival_times(pixels, pixel_weights, rng)
     return np.sort(pixels[np.argpartition(arrival, count)[:count]]) if count > 0 else pixels[:0]
 
 
 def sample_stratified(
-    pool: Bool[ndarray, "h w"], count: int, weight: Float32[ndarray, "h w"], rng: np.random.Generator
+    pool: Bool[ndarray, "h w"], count: int, pixel_weights: Float32[ndarray, "h w"], rng: np.random.Generator
 ) -> Int64[ndarray, " n"]:
     """Return up to `count` pixels of the pool (flat indices, ascending), at most one per cell of a square grid.
 
@@ -47,7 +47,7 @@ def sample_stratified(
     side = int(np.ceil(np.sqrt(count * pool.size / len(pixels))))
     rows, columns = np.divmod(pixels, width)
     cells = (rows * side // height) * side + columns * side // width
-    arrival = _arrival_times(pixels, weight, rng)
+    arrival = _arrival_times(pixels, pixel_weights, rng)
     first_in_cell = np.full(side * side, -1, np.int64)
     # NumPy keeps the last assignment to a cell: the pixel of the earliest arrival
     latest_first = np.argsort(-arrival, kind="stable")
@@ -59,11 +59,11 @@ def sample_stratified(
 
 
 def _arrival_times(
-    pixels: Int64[ndarray, " n"], weight: Float32[ndarray, "h w"], rng: np.random.Generator
+    pixels: Int64[ndarray, " n"], pixel_weights: Float32[ndarray, "h w"], rng: np.random.Generator
 ) -> Float32[ndarray, " n"]:
-    """Return exponential arrival times with rates `weight`.
+    """Return exponential arrival times with the rates `pixel_weights`.
 
     The earliest arrivals are a sample by weight without replacement.
     """
-    arrival: Float32[ndarray, " n"] = rng.standard_exponential(len(pixels), np.float32) / weight.ravel()[pixels]
+    arrival: Float32[ndarray, " n"] = rng.standard_exponential(len(pixels), np.float32) / pixel_weights.ravel()[pixels]
     return arrival

@@ -62,11 +62,11 @@ class Seeder:
 
     def seed(self, frame: Frame, relevance: RelevanceMap, context: SeedingContext) -> Seeds:
         """Return new Gaussians for this frame."""
-        weight = self._pixel_weight(frame)
+        pixel_weights = self._pixel_weights(frame)
         roi_pool, background_pool = self._split_budget(frame, relevance, context)
         return Seeds(
-            roi=self._draw(frame, relevance, roi_pool, weight),
-            background=self._draw(frame, relevance, background_pool, weight),
+            roi=self._draw(frame, relevance, roi_pool, pixel_weights),
+            background=self._draw(frame, relevance, background_pool, pixel_weights),
         )
 
     def seed_roi(self, frame: Frame, relevance: RelevanceMap, active_means_m: Float32[ndarray, "n 3"]) -> Gaussians:
@@ -80,7 +80,7 @@ class Seeder:
         sparse = undersampled_roi(frame, relevance.roi, active_means_m, settings.roi_pixels_per_gaussian)
         pixels = sparse & (frame.depth_m <= settings.max_depth_m)
         budget = round(settings.roi_share * settings.first_frame_seeds * pixels.size / _REFERENCE_PIXELS)
-        return self._draw(frame, relevance, self._roi_pool(pixels, budget), self._pixel_weight(frame))
+        return self._draw(frame, relevance, self._roi_pool(pixels, budget), self._pixel_weights(frame))
 
     def _split_budget(self, frame: Frame, relevance: RelevanceMap, context: SeedingContext) -> tuple[_Pool, _Pool]:
         """SB (Sec. III-C.1): split N into floor(ρN) ROI seeds and the background's; without SB all are background.
@@ -128,17 +128,19 @@ class Seeder:
         seeds = self._settings.first_frame_seeds if context.rendered is None else self._settings.later_seeds
         return max(1, round(seeds * frame.depth_m.size / _REFERENCE_PIXELS))
 
-    def _pixel_weight(self, frame: Frame) -> Float32[ndarray, "h w"]:
+    def _pixel_weights(self, frame: Frame) -> Float32[ndarray, "h w"]:
         """GFD (Sec. III-C.3): return E(u, v) + ε, the sampling weight of each pixel; without GFD it is uniform."""
         if not self._components.gfd:
             return np.ones(frame.depth_m.shape, np.float32)
         edges = edge_magnitude(frame.rgb)
         return edges + np.float32(self._settings.edge_epsilon)
 
-    def _draw(self, frame: Frame, relevance: RelevanceMap, pool: _Pool, weight: Float32[ndarray, "h w"]) -> Gaussians:
+    def _draw(
+        self, frame: Frame, relevance: RelevanceMap, pool: _Pool, pixel_weights: Float32[ndarray, "h w"]
+    ) -> Gaussians:
         """Draw pixels from the pool and return their Gaussians."""
         sample = sample_stratified if pool.stratified else sample_pixels
-        pixels = sample(pool.pixels, pool.count, weight, self._rng)
+        pixels = sample(pool.pixels, pool.count, pixel_weights, self._rng)
         if len(pixels) == 0:
             return Gaussians.empty()
         distance_px = neighbour_distance_px(pixels, pool.pixels, pool.stratified)

@@ -18,7 +18,7 @@ class View:
         self,
         rgb: UInt8[ndarray, "h w 3"],
         depth_m: Float32[ndarray, "h w"],
-        weight: Float32[ndarray, "h w"] | None,
+        pixel_weights: Float32[ndarray, "h w"] | None,
     ) -> None: ...
     @property
     def width(self) -> int: ...

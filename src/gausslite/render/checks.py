@@ -70,16 +70,18 @@ def require_view(
     rgb: UInt8[ndarray, "h w 3"],
     depth_m: Float32[ndarray, "h w"],
     camera: Camera,
-    weight: Float32[ndarray, "h w"] | None,
+    pixel_weights: Float32[ndarray, "h w"] | None,
 ) -> None:
     """Raise ShapeError unless the images have the camera's size; InvalidInputError if a weight is outside [0, 1]."""
     size = (camera.height_px, camera.width_px)
     require_array("view rgb", rgb, (*size, 3), np.uint8)
     require_array("view depth_m", depth_m, size, np.float32)
-    if weight is not None:
-        require_array("view weight", weight, size, np.float32)
-        if not ((weight >= 0.0) & (weight <= 1.0)).all():
-            raise InvalidInputError(f"view weight: expected values in [0, 1], got {weight.min()} to {weight.max()}")
+    if pixel_weights is not None:
+        require_array("view pixel_weights", pixel_weights, size, np.float32)
+        if not ((pixel_weights >= 0.0) & (pixel_weights <= 1.0)).all():
+            raise InvalidInputError(
+                f"view pixel_weights: expected values in [0, 1], got {pixel_weights.min()} to {pixel_weights.max()}"
+            )
 
 
 def _require_ascending(ids: UInt32[ndarray, " m"], n: int) -> None:

@@ -155,14 +155,16 @@ class CpuRasterizer:
         rgb: UInt8[ndarray, "h w 3"],
         depth_m: Float32[ndarray, "h w"],
         camera: Camera,
-        weight: Float32[ndarray, "h w"] | None = None,
+        pixel_weights: Float32[ndarray, "h w"] | None = None,
     ) -> TrainingView:
         """Return the image in the kernels' layout.
 
         Raises ShapeError, InvalidInputError if a weight is outside [0, 1].
         """
-        require_view(rgb, depth_m, camera, weight)
-        native = load_kernels().View(np.ascontiguousarray(rgb), np.ascontiguousarray(depth_m), contiguous(weight))
+        require_view(rgb, depth_m, camera, pixel_weights)
+        native = load_kernels().View(
+            np.ascontiguousarray(rgb), np.ascontiguousarray(depth_m), contiguous(pixel_weights)
+        )
         return CpuView(camera, intrinsics(camera), native)
 
     def step(

@@ -246,11 +246,12 @@ class Rasterizer(Protocol):
         rgb: UInt8[ndarray, "h w 3"],
         depth_m: Float32[ndarray, "h w"],
         camera: Camera,
-        weight: Float32[ndarray, "h w"] | None = None,
+        pixel_weights: Float32[ndarray, "h w"] | None = None,
     ) -> TrainingView:
         """Return the image in the backend's layout.
 
-        depth_m: 0 means no measurement. weight in [0, 1]: weights of the loss in steps with `masked=True`, default 1.
+        depth_m: 0 means no measurement. pixel_weights: the weight of each pixel in the loss of steps with `masked=True`,
+        in [0, 1]; default 1.
         Raises ShapeError, InvalidInputError if a weight is outside [0, 1].
         """
         ...

@@ -115,8 +115,8 @@ class GpuBench:
             density=DensitySettings(densify_every=MapperSettings().optimization.iterations, prune_every=8),
         )
         mapper = GaussianMapper(settings, self.rasterizer, initial_map=_table(self.frame_gaussians).to_gaussians())
-        scheduler, weight = FrameScheduler(), _region(self.size).astype(np.float32)
-        relevance = RelevanceMap(weight, np.where(weight > 0, 0, -1).astype(np.int16))
+        scheduler, pixel_weights = FrameScheduler(), _region(self.size).astype(np.float32)
+        relevance = RelevanceMap(pixel_weights, np.where(pixel_weights > 0, 0, -1).astype(np.int16))
         timings, iterations = [], 0
         for index in range(_FRAME_WARM_UP + self.frames):
             frame = Frame(index, index, view.rgb, view.depth_m, view.camera, inverse(view.T_camera_world))

@@ -67,8 +67,8 @@ class RepeatedStep:
         self._rasterizer = rasterizer
         self._tables = table.rows, table.first_moment, table.second_moment
         self._pose = view.T_camera_world
-        weight = None if pixels is None else pixels.astype(np.float32)
-        self._view = rasterizer.prepare_view(view.rgb, view.depth_m, view.camera, weight)
+        pixel_weights = None if pixels is None else pixels.astype(np.float32)
+        self._view = rasterizer.prepare_view(view.rgb, view.depth_m, view.camera, pixel_weights)
         self._masked = pixels is not None
         self._subset = FULL_FRAME if tiles is None else Subset(tiles=tiles)
 

@@ -137,7 +137,7 @@ def test_a_frame_without_depth_is_skipped_and_counted() -> None:
 
 
 def test_a_relevance_map_of_another_size_is_refused() -> None:
-    with pytest.raises(ShapeError, match="relevance weight"):
+    with pytest.raises(ShapeError, match="relevance pixel_weights"):
         mapper_of().map_frame(wall_frame(0, SIZE), RelevanceMap.empty(8, 8))
 
 

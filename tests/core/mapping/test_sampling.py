@@ -55,18 +55,18 @@ def test_stratified_fills_its_count_where_the_pool_is_a_small_part_of_the_image(
 
 
 def test_samples_follow_the_weights() -> None:
-    weight = EVEN.copy()
-    weight[:, 64:] = 9.0
+    pixel_weights = EVEN.copy()
+    pixel_weights[:, 64:] = 9.0
     for sample in (sample_pixels, sample_stratified):
-        pixels = sample(FULL, 300, weight, np.random.default_rng(0))
+        pixels = sample(FULL, 300, pixel_weights, np.random.default_rng(0))
         share = np.mean(pixels % SHAPE[1] >= 64)
         assert share > (0.85 if sample is sample_pixels else 0.49)
 
 
 def test_stratified_weights_act_within_cells() -> None:
-    weight = EVEN.copy()
-    weight[:, ::2] = 19.0
-    pixels = sample_stratified(FULL, 400, weight, np.random.default_rng(0))
+    pixel_weights = EVEN.copy()
+    pixel_weights[:, ::2] = 19.0
+    pixels = sample_stratified(FULL, 400, pixel_weights, np.random.default_rng(0))
     assert np.mean(pixels % 2 == 0) > 0.85
 
 

@@ -76,9 +76,9 @@ def test_weights_of_one_train_like_no_mask() -> None:
     results = []
     for corner in (None, 1.0):
         rasterizer = CpuRasterizer(2)
-        weight = None if corner is None else np.full((CAMERA.height_px, CAMERA.width_px), corner, np.float32)
+        pixel_weights = None if corner is None else np.full((CAMERA.height_px, CAMERA.width_px), corner, np.float32)
         rgb = np.random.default_rng(3).integers(0, 256, (CAMERA.height_px, CAMERA.width_px, 3), np.uint8)
-        view = rasterizer.prepare_view(rgb, np.full(rgb.shape[:2], 2.0, np.float32), CAMERA, weight)
+        view = rasterizer.prepare_view(rgb, np.full(rgb.shape[:2], 2.0, np.float32), CAMERA, pixel_weights)
         rows = random_rows()
         moments = np.zeros_like(rows), np.zeros_like(rows)
         report = rasterizer.step(rows, *moments, view, np.eye(4), WITH_SSIM, AdamSettings(), masked=corner is not None)
@@ -127,10 +127,10 @@ def test_image_size_can_change_between_calls(size: tuple[int, int]) -> None:
 
 def test_tiles_that_cover_the_mask_train_like_the_whole_image() -> None:
     rasterizer = CpuRasterizer(2)
-    weight = np.zeros((CAMERA.height_px, CAMERA.width_px), np.float32)
-    weight[40:60, 30:70] = 1.0
-    rgb = np.random.default_rng(3).integers(0, 256, (*weight.shape, 3), np.uint8)
-    view = rasterizer.prepare_view(rgb, np.full_like(weight, 2.0), CAMERA, weight)
+    pixel_weights = np.zeros((CAMERA.height_px, CAMERA.width_px), np.float32)
+    pixel_weights[40:60, 30:70] = 1.0
+    rgb = np.random.default_rng(3).integers(0, 256, (*pixel_weights.shape, 3), np.uint8)
+    view = rasterizer.prepare_view(rgb, np.full_like(pixel_weights, 2.0), CAMERA, pixel_weights)
     tiles = np.zeros((6, 7), np.bool_)
     tiles[2:5, 1:5] = True  # covers the mask and 5 px around it
     results = []

@@ -47,11 +47,11 @@ class Window:
         return cls._between((0, camera.height_px), (0, camera.width_px), camera)
 
     @classmethod
-    def around(cls, weight: Float32[ndarray, "h w"], camera: Camera) -> Window:
+    def around(cls, pixel_weights: Float32[ndarray, "h w"], camera: Camera) -> Window:
         """Return the window of all weighted pixels and their SSIM windows; one tile if no pixel has a weight."""
         spans = []
         for axis, length in ((1, camera.height_px), (0, camera.width_px)):
-            weighted = np.flatnonzero(weight.any(axis=axis))
+            weighted = np.flatnonzero(pixel_weights.any(axis=axis))
             first, last = (int(weighted[0]), int(weighted[-1])) if len(weighted) else (0, 0)
             spans.append((max(first - _REACH_PX, 0), min(last + 1 + _REACH_PX, length)))
         return cls._between(spans[0], spans[1], camera)
@@ -73,15 +73,15 @@ class Window:
 class LossTarget:
     """LossTarget of the loss in a window of a view.
 
-    ssim_terms: means and variances of the target in the SSIM windows. weight None: 1 everywhere. share: mean weight of
-    the whole image.
+    ssim_terms: means and variances of the target in the SSIM windows. pixel_weights: None means 1 everywhere. share: the
+    mean weight of the whole image.
     """
 
     window: Window
     rgb: Float32[Tensor, "h w 3"]
     depth_m: Float32[Tensor, "h w"]
     ssim_terms: Float32[Tensor, "6 h w"]
-    weight: Float32[Tensor, "h w"] | None
+    pixel_weights: Float32[Tensor, "h w"] | None
     weight_sum: float
     share: float
 
@@ -101,7 +101,7 @@ class CudaView:
         rgb: UInt8[ndarray, "h w 3"],
         depth_m: Float32[ndarray, "h w"],
         camera: Camera,
-        weight: Float32[ndarray, "h w"] | None,
+        pixel_weights: Float32[ndarray, "h w"] | None,
         device: torch.device,
     ) -> CudaView:
         """Copy the images to the device, colours in [0, 1], and compute the constant SSIM terms."""
@@ -113,16 +113,16 @@ class CudaView:
         ssim_terms = torch.cat([means, blurred[3:] - means * means])
         unmasked = LossTarget(Window.whole(camera), colours, measured_m, ssim_terms, None, float(depth_m.size), 1.0)
         device_camera = DeviceCamera.of(camera, device)
-        if weight is None:
+        if pixel_weights is None:
             return cls(camera, device_camera, unmasked, unmasked)
-        window = Window.around(weight, camera)
-        part, weight_sum = (window.rows, window.columns), float(weight.sum(dtype=np.float64))
+        window = Window.around(pixel_weights, camera)
+        part, weight_sum = (window.rows, window.columns), float(pixel_weights.sum(dtype=np.float64))
         masked = LossTarget(
             window,
             colours[part],
             measured_m[part],
             ssim_terms[:, window.rows, window.columns],
-            to_device(weight[part], device),
+            to_device(pixel_weights[part], device),
             weight_sum,
             weight_sum / depth_m.size,
         )
@@ -136,15 +136,15 @@ def training_loss(
     if target.weight_sum == 0.0:
         return channels.sum() * 0.0
     rgb, depth_m = channels[..., :3], channels[..., 3]
-    weight = torch.ones_like(alpha) if target.weight is None else target.weight
-    colour = (weight[..., None] * (rgb - target.rgb).abs()).sum() / 3.0
+    pixel_weights = torch.ones_like(alpha) if target.pixel_weights is None else target.pixel_weights
+    colour = (pixel_weights[..., None] * (rgb - target.rgb).abs()).sum() / 3.0
     # no selection of pixels: the host would wait for their number
     measured = (alpha > MIN_DEPTH_ALPHA) & (target.depth_m > 0)
     error_m = (depth_m / torch.where(measured, alpha, 1.0) - target.depth_m).abs()
-    depth = torch.where(measured, weight * error_m, 0.0).sum()
+    depth = torch.where(measured, pixel_weights * error_m, 0.0).sum()
     total = loss.colour * colour + loss.depth * depth
     if loss.ssim != 0.0:
-        total = total - loss.ssim * (weight * _ssim_sum(rgb, target)).sum() / 3.0
+        total = total - loss.ssim * (pixel_weights * _ssim_sum(rgb, target)).sum() / 3.0
     value = loss.ssim + total / target.weight_sum
     return value * target.share if loss.normalise_by_image else value
 

@@ -166,11 +166,11 @@ class CudaRasterizer:
         rgb: UInt8[ndarray, "h w 3"],
         depth_m: Float32[ndarray, "h w"],
         camera: Camera,
-        weight: Float32[ndarray, "h w"] | None = None,
+        pixel_weights: Float32[ndarray, "h w"] | None = None,
     ) -> CudaView:
         """Copy an image to the device. Raises ShapeError, InvalidInputError if a weight is outside [0, 1]."""
-        require_view(rgb, depth_m, camera, weight)
-        return CudaView.of(rgb, depth_m, camera, weight, self._kernels.device)
+        require_view(rgb, depth_m, camera, pixel_weights)
+        return CudaView.of(rgb, depth_m, camera, pixel_weights, self._kernels.device)
 
     def step(
         self,

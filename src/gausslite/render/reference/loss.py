@@ -25,25 +25,25 @@ class ReferenceView:
     camera: Camera
     rgb: Float64[Tensor, "h w 3"]
     depth_m: Float64[Tensor, "h w"]
-    weight: Float64[Tensor, "h w"]
+    pixel_weights: Float64[Tensor, "h w"]
 
 
 def training_loss(
     images: Float64[Tensor, "h w 5"], view: ReferenceView, loss: LossWeights, masked: bool
 ) -> Float64[Tensor, ""]:
     """Return the weighted sum of the three terms."""
-    weight = view.weight if masked else torch.ones_like(view.weight)
-    total = weight.sum()
+    pixel_weights = view.pixel_weights if masked else torch.ones_like(view.pixel_weights)
+    total = pixel_weights.sum()
     if total == 0:
         return images.sum() * 0.0
     rgb, depth_m, alpha = images[..., :3], images[..., 3], images[..., 4]
-    colour = (weight[..., None] * (rgb - view.rgb).abs()).sum() / (3.0 * total)
+    colour = (pixel_weights[..., None] * (rgb - view.rgb).abs()).sum() / (3.0 * total)
     measured = (alpha > MIN_DEPTH_ALPHA) & (view.depth_m > 0)
     error_m = (depth_m[measured] / alpha[measured] - view.depth_m[measured]).abs()
-    depth = (weight[measured] * error_m).sum() / total
-    similarity = (weight[..., None] * ssim_map(rgb, view.rgb)).sum() / (3.0 * total)
+    depth = (pixel_weights[measured] * error_m).sum() / total
+    similarity = (pixel_weights[..., None] * ssim_map(rgb, view.rgb)).sum() / (3.0 * total)
     value = loss.colour * colour + loss.depth * depth + loss.ssim * (1.0 - similarity)
-    return value * (total / weight.numel()) if loss.normalise_by_image else value
+    return value * (total / pixel_weights.numel()) if loss.normalise_by_image else value
 
 
 def ssim_map(a: Float64[Tensor, "h w 3"], b: Float64[Tensor, "h w 3"]) -> Float64[Tensor, "h w 3"]:

@@ -102,17 +102,17 @@ class ReferenceRasterizer:
         rgb: UInt8[ndarray, "h w 3"],
         depth_m: Float32[ndarray, "h w"],
         camera: Camera,
-        weight: Float32[ndarray, "h w"] | None = None,
+        pixel_weights: Float32[ndarray, "h w"] | None = None,
     ) -> TrainingView:
         """Return the image as float64 tensors. Raises ShapeError, InvalidInputError if a weight is outside [0, 1]."""
-        require_view(rgb, depth_m, camera, weight)
-        if weight is None:
-            weight = np.ones(depth_m.shape, np.float32)
+        require_view(rgb, depth_m, camera, pixel_weights)
+        if pixel_weights is None:
+            pixel_weights = np.ones(depth_m.shape, np.float32)
         return ReferenceView(
             camera,
             torch.from_numpy(rgb / 255.0),
             torch.from_numpy(depth_m.astype(np.float64)),
-            torch.from_numpy(weight.astype(np.float64)),
+            torch.from_numpy(pixel_weights.astype(np.float64)),
         )
 
     def step(
