@@ -16,10 +16,25 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from gausslite.api import (
+        AgentClient,
+        BallRegion,
         CalibratedSequence,
+        Camera,
+        DepthRegistration,
+        Frame,
+        FusionClient,
+        Gaussians,
+        GaussLiteError,
         MapResult,
+        MissionSettings,
+        PerceptionSettings,
+        PoseExposurePrior,
         RenderedImage,
+        SceneInfo,
+        Source,
+        Tls,
         create_mapper,
+        empty_batch,
         load_ply,
         map_sequence,
         open_calibrated,
@@ -27,48 +42,8 @@ if TYPE_CHECKING:
         render_view,
         save_ply,
     )
-    from gausslite.datasets.registered_source import DepthRegistration
-    from gausslite.datasets.source import Source
-    from gausslite.domain.camera import Camera
-    from gausslite.domain.errors import GaussLiteError
-    from gausslite.domain.frame import Frame
-    from gausslite.domain.gaussians import Gaussians
-    from gausslite.domain.pose_exposure_prior import PoseExposurePrior
-    from gausslite.domain.region import BallRegion
-    from gausslite.domain.voxel_operations import empty_batch
-    from gausslite.mission.settings import MissionSettings, PerceptionSettings, SceneInfo
-    from gausslite.wire.clients import AgentClient, FusionClient
-    from gausslite.wire.tls import Tls
 
 __version__ = "0.1.0"
-
-_MODULES = {
-    "gausslite.api": (
-        "CalibratedSequence",
-        "MapResult",
-        "RenderedImage",
-        "create_mapper",
-        "load_ply",
-        "map_sequence",
-        "open_calibrated",
-        "open_sequence",
-        "render_view",
-        "save_ply",
-    ),
-    "gausslite.domain.pose_exposure_prior": ("PoseExposurePrior",),
-    "gausslite.datasets.registered_source": ("DepthRegistration",),
-    "gausslite.datasets.source": ("Source",),
-    "gausslite.domain.camera": ("Camera",),
-    "gausslite.domain.frame": ("Frame",),
-    "gausslite.domain.gaussians": ("Gaussians",),
-    "gausslite.domain.region": ("BallRegion",),
-    "gausslite.domain.voxel_operations": ("empty_batch",),
-    "gausslite.domain.errors": ("GaussLiteError",),
-    "gausslite.mission.settings": ("MissionSettings", "PerceptionSettings", "SceneInfo"),
-    "gausslite.wire.clients": ("AgentClient", "FusionClient"),
-    "gausslite.wire.tls": ("Tls",),
-}
-_MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
 
 __all__ = [
     "AgentClient",
@@ -101,9 +76,9 @@ __all__ = [
 
 def __getattr__(name: str) -> Any:
     """Import a public name on first use. Raises AttributeError for other names."""
-    if name not in _MODULE_OF:
+    if name not in __all__:
         raise AttributeError(f"module 'gausslite' has no attribute {name!r}")
-    value = getattr(import_module(_MODULE_OF[name]), name)
+    value = getattr(import_module("gausslite.api"), name)
     globals()[name] = value
     return value
 

@@ -25,11 +25,13 @@ from gausslite.datasets.registered_source import DepthRegistration, RegisteredSo
 from gausslite.datasets.source import Source
 from gausslite.domain.arguments import describe, require_instance, require_size
 from gausslite.domain.camera import Camera
-from gausslite.domain.errors import DatasetError, InvalidInputError
+from gausslite.domain.errors import DatasetError, GaussLiteError, InvalidInputError
+from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.pose import UpAxis, require_rigid
 from gausslite.domain.pose_exposure_prior import PoseExposurePrior
-from gausslite.domain.region import Region
+from gausslite.domain.region import BallRegion, Region
+from gausslite.domain.voxel_operations import empty_batch
 from gausslite.evaluation.views import view_map
 from gausslite.mission.build import EstimatorFactory, build_task_mapper
 from gausslite.mission.frame_stream import CorruptFrames, FrameStream
@@ -43,6 +45,36 @@ from gausslite.mission.settings import (
 )
 from gausslite.mission.task_mapper import TaskMapper
 from gausslite.task.rules import RuleParser
+from gausslite.wire.clients import AgentClient, FusionClient
+from gausslite.wire.tls import Tls
+
+__all__ = [
+    "AgentClient",
+    "BallRegion",
+    "CalibratedSequence",
+    "Camera",
+    "DepthRegistration",
+    "Frame",
+    "FusionClient",
+    "GaussLiteError",
+    "Gaussians",
+    "MapResult",
+    "MissionSettings",
+    "PerceptionSettings",
+    "PoseExposurePrior",
+    "RenderedImage",
+    "SceneInfo",
+    "Source",
+    "Tls",
+    "create_mapper",
+    "empty_batch",
+    "load_ply",
+    "map_sequence",
+    "open_calibrated",
+    "open_sequence",
+    "render_view",
+    "save_ply",
+]
 
 
 @dataclass(frozen=True, slots=True)

@@ -23,12 +23,11 @@ from gausslite.domain.voxel_operations import group_by_voxel
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.sent_voxels import SentVoxelTracker
-from gausslite.mission.build import build_mapper
+from gausslite.mission.build import EstimatorBuilder, build_mapper
 from gausslite.mission.checkpoint import ResumeConfig, save_run
 from gausslite.mission.frame_scheduler import Clock, FrameScheduler
 from gausslite.mission.settings import MissionSettings
 from gausslite.mission.task_mapper import TaskMapper
-from gausslite.perception.relevance_estimator import RelevanceEstimator
 from gausslite.wire.uplink import Uplink
 from gausslite_agent.frame_queue import FrameQueue, QueuedFrame
 from gausslite_agent.idle_training import IdleTraining
@@ -47,7 +46,7 @@ class MappingWorker:
         self,
         settings: MissionSettings,
         grid: VoxelGrid,
-        build_estimator: Callable[[TaskGraph], RelevanceEstimator],
+        build_estimator: EstimatorBuilder,
         uplink: Uplink | None = None,
         on_change: Callable[[], None] = lambda: None,
         load: LoadSettings | None = None,

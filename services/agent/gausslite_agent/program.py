@@ -9,13 +9,11 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 
-from gausslite.datasets.corrected_source import CorrectedSource
-from gausslite.datasets.open import is_simulated, open_source
 from gausslite.domain.pose import unit_up_axis
 from gausslite.mission.build import EstimatorFactory
-from gausslite.mission.frame_stream import FrameStream
+from gausslite.mission.frame_stream import FrameStream, region_file_note
 from gausslite.mission.results import prepare_file, prepare_folder
-from gausslite.mission.settings import SceneInfo, SourceSettings
+from gausslite.mission.settings import SceneInfo
 from gausslite.task.parser import TaskParser
 from gausslite.task.rules import RuleParser
 from gausslite.wire.change_notifier import ChangeNotifier
@@ -71,7 +69,7 @@ class _Mission:
 async def _serve(settings: AgentSettings) -> None:
     """Build the agent, serve it and run its mission; close in reverse order."""
     _require_usable(settings)
-    stream = None if settings.source is None else open_stream(settings.source)
+    stream = None if settings.source is None else FrameStream.open(settings.source)
     saved = _read_saved(settings)
     loop, changes = asyncio.get_running_loop(), ChangeNotifier()
     with ExitStack() as stack:
@@ -101,15 +99,6 @@ async def _serve(settings: AgentSettings) -> None:
         await serve_until_stopped(settings.listen, [servicer.service()], run_mission, settings.tls)
 
 
-def open_stream(settings: SourceSettings) -> FrameStream:
-    """Open the sequence that replaces the camera. Raises DatasetError, PoseError, InvalidInputError."""
-    source = open_source(settings.spec, settings.up_axis, settings.depth_registration)
-    correction = settings.camera_correction
-    if correction is not None and not correction.is_identity:
-        source = CorrectedSource(source, correction)
-    return FrameStream.select(source, settings)
-
-
 def _require_usable(settings: AgentSettings) -> None:
     """Raise now for settings that would fail hours into the mission or with its first task."""
     if settings.up_axis is not None:
@@ -130,9 +119,13 @@ def _read_saved(settings: AgentSettings) -> SavedMission | None:
 def _estimators(settings: AgentSettings, stream: FrameStream | None) -> EstimatorFactory:
     """Return the estimator factory. Raises InvalidInputError if the task of the command line has no detector."""
     estimators = EstimatorFactory(settings.perception, lambda: _scene(settings, stream))
-    simulated = settings.source is not None and is_simulated(settings.source.spec)
+    simulated = settings.source is not None and settings.source.is_simulated
     if settings.task is not None and not simulated:
         estimators.require_detector()
+    if settings.source is not None and stream is not None and settings.perception.model is None:
+        note = region_file_note(settings.source.spec, stream.source)
+        if note is not None:
+            _log.info(note)
     return estimators
 
 

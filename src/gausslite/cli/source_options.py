@@ -18,6 +18,7 @@ from gausslite.datasets.source import Source
 from gausslite.domain.pose import UpAxis
 from gausslite.domain.pose_exposure_prior import PoseExposurePrior
 from gausslite.domain.region import BallRegion, Region
+from gausslite.mission.frame_stream import region_file_note
 from gausslite.process.messages import print_message
 
 
@@ -149,7 +150,6 @@ def selected_regions(options: argparse.Namespace, source: Source) -> list[Region
 
 def report_region_file(spec: str, source: Source) -> None:
     """Report that ground-truth regions come from a file of the sequence's folder, if there is one."""
-    from gausslite.datasets.regions import REGIONS_FILE
-
-    if not is_simulated(spec) and source.regions():
-        print_message(f"{spec}: the ground-truth regions of {REGIONS_FILE} in the sequence's folder are used")
+    note = region_file_note(spec, source)
+    if note is not None:
+        print_message(note)

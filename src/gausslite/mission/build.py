@@ -24,6 +24,10 @@ if TYPE_CHECKING:
     from gausslite.perception.model_registry import ModelRegistry
 
 
+EstimatorBuilder = Callable[[TaskGraph], RelevanceEstimator]
+"""Returns the relevance estimator of a task."""
+
+
 def build_mapper(settings: MissionSettings) -> GaussianMapper:
     """Return a mapper with an empty map. Raises KernelError, InvalidInputError."""
     rasterizer = choose_rasterizer(settings.backend, settings.threads)

@@ -5,7 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
+from gausslite.datasets.corrected_source import CorrectedSource
 from gausslite.datasets.held_out import HeldOutSplit
+from gausslite.datasets.open import is_simulated, open_source
+from gausslite.datasets.regions import REGIONS_FILE
 from gausslite.datasets.selection import frame_size, select_frames
 from gausslite.datasets.source import Source
 from gausslite.domain.errors import DatasetError, PoseError
@@ -16,6 +19,13 @@ OnCorrupt = Callable[[int, DatasetError | PoseError], None]
 """Gets the index and the error of each frame that cannot be read."""
 
 
+def region_file_note(spec: str, source: Source) -> str | None:
+    """Return a message if the ground-truth regions come from a file of the sequence's folder, else None."""
+    if is_simulated(spec) or not source.regions():
+        return None
+    return f"{spec}: the ground-truth regions of {REGIONS_FILE} in the sequence's folder are used"
+
+
 @dataclass(frozen=True, slots=True)
 class FrameStream:
     """The selected positions of a sequence and the size of their images."""
@@ -23,6 +33,18 @@ class FrameStream:
     source: Source
     positions: Sequence[int]
     size: tuple[int, int]
+
+    @classmethod
+    def open(cls, settings: SourceSettings) -> FrameStream:
+        """Open the sequence of the settings, registered and corrected, and select its frames.
+
+        Raises DatasetError, PoseError, InvalidInputError.
+        """
+        source = open_source(settings.spec, settings.up_axis, settings.depth_registration)
+        correction = settings.camera_correction
+        if correction is not None and not correction.is_identity:
+            source = CorrectedSource(source, correction)
+        return cls.select(source, settings)
 
     @classmethod
     def select(cls, source: Source, settings: SourceSettings) -> FrameStream:

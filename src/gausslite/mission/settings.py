@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from gausslite.datasets.camera_correction import CameraCorrection
+from gausslite.datasets.open import is_simulated
 from gausslite.datasets.registered_source import DepthRegistration
 from gausslite.datasets.source import Source
 from gausslite.domain.arguments import require_instance, require_number, require_whole
@@ -78,6 +79,11 @@ class SourceSettings:
     test_every: int | None = None
     depth_registration: DepthRegistration | None = field(default=None, metadata={"flag": "--register-depth"})
     camera_correction: CameraCorrection | None = None
+
+    @property
+    def is_simulated(self) -> bool:
+        """True for a simulated home, whose scene and regions take seconds to build."""
+        return is_simulated(self.spec)
 
 
 @dataclass(frozen=True, slots=True)
