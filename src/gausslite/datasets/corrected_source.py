@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -10,18 +9,17 @@ import numpy as np
 from gausslite.datasets.camera_correction import CameraCorrection, correct_frame, ideal_camera
 from gausslite.datasets.images import RgbdImage, resize_rgbd
 from gausslite.datasets.source import Source
+from gausslite.datasets.wrapped_source import WrappedSource
 from gausslite.domain.camera import Camera
 from gausslite.domain.frame import Frame
 from gausslite.domain.lens import Lens
-from gausslite.domain.pose import UpAxis
-from gausslite.domain.region import Region
 from gausslite.domain.trajectory import Trajectory
 
 _SPEED_QUANTILE = 0.9
 """Frames that turn faster than this share of all frames repeat the image's border in a few pixels."""
 
 
-class CorrectedSource:
+class CorrectedSource(WrappedSource):
     """A source as an ideal camera would have recorded it: pinhole, all rows exposed at once, stamps without offset.
 
     Colour and depth are corrected alike, so depth must be registered to colour. A source without correction returns
@@ -29,15 +27,11 @@ class CorrectedSource:
     """
 
     def __init__(self, source: Source, correction: CameraCorrection) -> None:
-        self._source, self._correction = source, correction
+        super().__init__(source)
+        self._correction = correction
         self._trajectory = source.trajectory()
         speeds_rad_s = self._trajectory.angular_speeds_rad_s() if correction.readout_s != 0.0 else np.zeros(1)
         self._camera = ideal_camera(source.camera, correction, float(np.quantile(speeds_rad_s, _SPEED_QUANTILE)))
-
-    @property
-    def name(self) -> str:
-        """The wrapped source's name."""
-        return self._source.name
 
     @property
     def camera(self) -> Camera:
@@ -49,24 +43,6 @@ class CorrectedSource:
         """None: frames are undistorted."""
         return None
 
-    @property
-    def up_axis(self) -> UpAxis:
-        """The wrapped source's up axis."""
-        return self._source.up_axis
-
-    @property
-    def depth_registered(self) -> bool:
-        """Same as the wrapped source."""
-        return self._source.depth_registered
-
-    @property
-    def excluded_frames(self) -> str:
-        """The wrapped source's note."""
-        return self._source.excluded_frames
-
-    def __len__(self) -> int:
-        return len(self._source)
-
     def frame(self, i: int, size: tuple[int, int] | None = None) -> Frame:
         """Return the corrected frame at position i. Raises DatasetError, PoseError."""
         # at full size: a resized image has lost the pixels that the lookup needs
@@ -75,14 +51,6 @@ class CorrectedSource:
         image = resize_rgbd(RgbdImage(frame.rgb, frame.depth_m, frame.camera), size)
         return replace(frame, rgb=image.rgb, depth_m=image.depth_m, camera=image.camera)
 
-    def indices(self) -> Sequence[int]:
-        """The wrapped source's frame numbers."""
-        return self._source.indices()
-
     def trajectory(self) -> Trajectory:
         """The wrapped source's trajectory, as recorded."""
         return self._trajectory
-
-    def regions(self) -> Mapping[str, Region]:
-        """The wrapped source's regions; they lie in the world frame."""
-        return self._source.regions()

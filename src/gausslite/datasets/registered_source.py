@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -14,12 +13,11 @@ from numpy import ndarray
 from gausslite.datasets.images import RgbdImage, resize_rgbd
 from gausslite.datasets.intrinsics import FileIntrinsics
 from gausslite.datasets.source import Source
+from gausslite.datasets.wrapped_source import WrappedSource
 from gausslite.domain.camera import Camera
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
-from gausslite.domain.lens import Lens
-from gausslite.domain.pose import UpAxis, inverse
-from gausslite.domain.region import Region
+from gausslite.domain.pose import inverse
 from gausslite.domain.trajectory import Trajectory
 
 _MAX_BASELINE_M = 1.0
@@ -101,7 +99,7 @@ class DepthRegistration:
         return self.intrinsics.camera("depth registration", width_px, height_px)
 
 
-class RegisteredSource:
+class RegisteredSource(WrappedSource):
     """A source with its depth registered to the colour camera; poses become the colour camera's.
 
     The wrapped source's camera and poses are those of the depth camera. Raises InvalidInputError if the focal lengths
@@ -109,7 +107,7 @@ class RegisteredSource:
     """
 
     def __init__(self, source: Source, registration: DepthRegistration) -> None:
-        self._source = source
+        super().__init__(source)
         depth_camera = source.camera
         self._camera = registration.camera(depth_camera.width_px, depth_camera.height_px)
         for axis in ("fx_px", "fy_px"):
@@ -122,37 +120,14 @@ class RegisteredSource:
         self._T_colour_depth = registration.extrinsics()
 
     @property
-    def name(self) -> str:
-        """Name of the wrapped source."""
-        return self._source.name
-
-    @property
     def camera(self) -> Camera:
         """Colour camera."""
         return self._camera
 
     @property
-    def lens(self) -> Lens | None:
-        """Lens of the wrapped source."""
-        return self._source.lens
-
-    @property
-    def up_axis(self) -> UpAxis:
-        """Up direction of the wrapped source."""
-        return self._source.up_axis
-
-    @property
     def depth_registered(self) -> bool:
         """True."""
         return True
-
-    @property
-    def excluded_frames(self) -> str:
-        """Message of the wrapped source."""
-        return self._source.excluded_frames
-
-    def __len__(self) -> int:
-        return len(self._source)
 
     def frame(self, i: int, size: tuple[int, int] | None = None) -> Frame:
         """Return the frame at position i in the colour camera. Raises DatasetError, PoseError."""
@@ -165,18 +140,10 @@ class RegisteredSource:
             recorded, rgb=image.rgb, depth_m=image.depth_m, camera=image.camera, T_world_camera=T_world_colour
         )
 
-    def indices(self) -> Sequence[int]:
-        """Return the frame numbers of the wrapped source."""
-        return self._source.indices()
-
     def trajectory(self) -> Trajectory:
         """Return the poses of the colour camera."""
         recorded = self._source.trajectory()
         return Trajectory(recorded.times_s, recorded.T_world_camera @ inverse(self._T_colour_depth))
-
-    def regions(self) -> Mapping[str, Region]:
-        """Return the regions of the wrapped source, which are in the world frame."""
-        return self._source.regions()
 
 
 def register_depth(

@@ -3,26 +3,24 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
+from gausslite.datasets.folder_source import FolderSource
 from gausslite.datasets.images import DepthUnits, first_readable_size, load_rgbd
 from gausslite.datasets.intrinsics import CAMERA_FILE, INTRINSICS_FILE, FileIntrinsics, FolderCamera, read_folder_camera
 from gausslite.datasets.poses import is_lost, pose_from_quaternion, slerp
-from gausslite.datasets.regions import regions_in_folder
 from gausslite.datasets.source import excluded_frames_note, require_frames, require_position
 from gausslite.datasets.text_files import parse_numbers, read_rows
-from gausslite.domain.camera import Camera
 from gausslite.domain.errors import DatasetError
 from gausslite.domain.frame import Frame
 from gausslite.domain.lens import Lens, LensModel
 from gausslite.domain.pose import UpAxis, unit_up_axis
-from gausslite.domain.region import Region
 from gausslite.domain.trajectory import Trajectory
 
 _UNITS = DepthUnits(per_metre=5000.0)
@@ -51,7 +49,7 @@ class _Match:
     T_world_camera: Float64[ndarray, "4 4"]
 
 
-class TumSource:
+class TumSource(FolderSource):
     """A folder with rgb.txt, depth.txt and groundtruth.txt.
 
     A colour image is associated with the nearest depth image within 20 ms, and with the pose interpolated (lerp and
@@ -61,37 +59,16 @@ class TumSource:
     """
 
     def __init__(self, folder: Path, up_axis: UpAxis | None = None) -> None:
-        self._folder = folder
+        super().__init__(folder)
         self._matches, self._recorded = _associate(folder)
-        from_folder = _camera(folder, *first_readable_size(match.colour for match in self._matches))
-        self._camera, self._lens = from_folder.camera, from_folder.lens
-        self._units = replace(_UNITS, per_metre=from_folder.units_per_metre or _UNITS.per_metre)
+        size_px = first_readable_size(match.colour for match in self._matches)
+        self._set_camera(_camera(folder, *size_px), _UNITS)
         self._up_axis = unit_up_axis(up_axis or (0.0, 0.0, 1.0))
 
     @staticmethod
     def recognises(folder: Path) -> bool:
         """True if the folder has this layout."""
         return (folder / "rgb.txt").is_file() or (folder / "groundtruth.txt").is_file()
-
-    @property
-    def name(self) -> str:
-        """Name of the folder."""
-        return self._folder.name
-
-    @property
-    def camera(self) -> Camera:
-        """Camera of cam_params.json or camera-intrinsics.txt, else of fr1, fr2 or fr3 by the folder's name."""
-        return self._camera
-
-    @property
-    def lens(self) -> Lens | None:
-        """Lens of a camera file, else the published one of fr1 and fr2."""
-        return self._lens
-
-    @property
-    def up_axis(self) -> UpAxis:
-        """The z axis of the motion capture system, unless the caller gives another."""
-        return self._up_axis
 
     @property
     def depth_registered(self) -> bool:
@@ -123,10 +100,6 @@ class TumSource:
         """Return the interpolated pose of every colour image."""
         poses = np.array([match.T_world_camera for match in self._matches])
         return Trajectory(np.array([match.time_s for match in self._matches]), poses)
-
-    def regions(self) -> Mapping[str, Region]:
-        """Return the regions of roi_voxels.npz in the folder, small objects as balls; empty without the file."""
-        return regions_in_folder(self._folder)
 
 
 def _associate(folder: Path) -> tuple[list[_Match], int]:
