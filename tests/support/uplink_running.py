@@ -73,14 +73,14 @@ class ScriptedServer(pb_grpc.FusionServiceServicer):
 
     async def JoinSession(self, request: pb.JoinSessionRequest, context: Any) -> pb.JoinSessionResponse:
         self.joined.append(request.fresh_map)
-        return pb.JoinSessionResponse(session_id=f"s{len(self.joined)}", highest_map_revision=100)
+        return pb.JoinSessionResponse(session_id=f"s{len(self.joined)}", highest_update_seq=100)
 
     async def ContributeSubsets(self, request_iterator: Any, context: Any) -> Any:
         async for request in request_iterator:
             subset, _ = decode_subset(request.subset)
             self.subsets.append(subset.batch)
             self.messages.append(request.subset)
-            self.revisions.append(subset.map_revision)
+            self.revisions.append(subset.update_seq)
             self.received.set()
             answer = self._answer(len(self.subsets), subset.batch)
             if isinstance(answer, GaussLiteError):

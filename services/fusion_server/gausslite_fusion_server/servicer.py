@@ -90,7 +90,7 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         self._map_changes.notify()
         return pb.JoinSessionResponse(
             session_id=joined.session.session_id,
-            highest_map_revision=joined.highest_map_revision,
+            highest_update_seq=joined.highest_update_seq,
             fused_revision=joined.fused_revision,
             grid=grid_to_message(self._engine.grid),
             max_subset_bytes=MAX_SUBSET_BYTES,
@@ -269,6 +269,6 @@ def _contribution_to_message(agent: AgentContribution) -> pb.AgentContribution:
         subsets_rejected=agent.traffic.subsets_rejected,
         keyframes=agent.keyframes,
         kappa_sum=agent.kappa_sum,
-        last_map_revision=agent.last_map_revision,
+        last_update_seq=agent.last_update_seq,
         last_seen_ns=agent.traffic.last_seen_ns,
     )

@@ -26,7 +26,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     _add_fetch(actions.add_parser("fetch", help="download files over HTTPS; resumes interrupted downloads"))
     verify = actions.add_parser("verify", help="check the SHA-256 of files; exit code 2 if one differs")
     verify.add_argument("files", metavar="FILE", type=Path, nargs="+")
-    _add_catalogue(verify)
+    _add_catalogue_option(verify)
     verify.set_defaults(run=_verify)
     inspect = actions.add_parser("inspect", help="print a model's family, inputs and outputs")
     inspect.add_argument("file", metavar="FILE.onnx", type=Path)
@@ -34,8 +34,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_list(parser: argparse.ArgumentParser) -> None:
-    _add_catalogue(parser)
-    _add_folder(parser)
+    _add_catalogue_option(parser)
+    _add_folder_option(parser)
     parser.set_defaults(run=_list)
 
 
@@ -45,16 +45,16 @@ def _add_fetch(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--sha256", metavar="HEX", help="expected checksum (default: the catalogue's, else that in SHA256SUMS)"
     )
-    _add_catalogue(parser)
-    _add_folder(parser)
+    _add_catalogue_option(parser)
+    _add_folder_option(parser)
     parser.set_defaults(run=_fetch)
 
 
-def _add_catalogue(parser: argparse.ArgumentParser) -> None:
+def _add_catalogue_option(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--catalogue", metavar="FILE.toml", type=Path, help="file that replaces the built-in catalogue")
 
 
-def _add_folder(parser: argparse.ArgumentParser) -> None:
+def _add_folder_option(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--folder", metavar="DIR", type=Path, default=Path("models"), help="folder of the files (default: %(default)s)"
     )
@@ -85,7 +85,7 @@ def _fetch(options: argparse.Namespace) -> int:
         raise InvalidInputError(f"--sha256: expected only one NAME with this option, got {len(options.names)}")
     entries = _entries(options)
     for entry in [entry_named(entries, name) for name in options.names]:
-        with _bar(entry.file_name) as progress:
+        with _byte_progress_bar(entry.file_name) as progress:
             fetched = fetch(entry, base_url, options.folder, options.sha256, progress)
         print(fetched.path)
         print_message(f"{fetched.path.name}: {_verification_text(fetched)}")
@@ -124,7 +124,7 @@ def _verification_text(fetched: FetchedModel) -> str:
 
 
 @contextmanager
-def _bar(label: str) -> Iterator[Progress]:
+def _byte_progress_bar(label: str) -> Iterator[Progress]:
     """Show a progress bar of bytes on stderr."""
     from tqdm import tqdm
 

@@ -1,7 +1,7 @@
 """Encode an agent's voxel updates as one self-contained message: little-endian columns, zstd, CRC32C.
 
     header   "GLSB" | u16 version | u8 kappa bytes (1 2 4) | u8 target bytes (1 2) | u32 voxels | u32 Gaussians
-             | u32 body bytes | f64 voxel size | u64 sequence | u64 map revision | u8 agent bytes | u8 session bytes
+             | u32 body bytes | f64 voxel size | u64 message_seq | u64 update_seq | u8 agent bytes | u8 session bytes
     names    agent id, session id (UTF-8)
     body     one zstd frame over byte-shuffled columns: keys i64, kappa sums u64, counts u32 per voxel; then means,
              scales, quats, opacities, rgb (see columns.py), kappa, target, active (bits) per Gaussian
@@ -94,7 +94,7 @@ def encode_subset(subset: RoiSubset, grid: VoxelGrid) -> bytes:
     body = zstandard.ZstdCompressor(level=_ZSTD_LEVEL).compress(packed)
     header = _HEADER.pack(
         *(_MAGIC, _VERSION, layout.kappa_bytes, layout.target_bytes, layout.voxels, layout.gaussians, len(body)),
-        *(grid.size_m, subset.sequence, subset.map_revision, len(agent), len(session)),
+        *(grid.size_m, subset.message_seq, subset.update_seq, len(agent), len(session)),
     )
     message = header + agent + session + body
     return message + _TRAILER.pack(google_crc32c.value(message))
@@ -106,11 +106,11 @@ def decode_subset(data: bytes, limits: CodecLimits = DEFAULT_LIMITS) -> tuple[Ro
     Raises CodecError if the bytes are not a valid message or exceed the limits, ChecksumError if they are damaged.
     """
     layout, fields, names, body = _open_envelope(data, limits)
-    size_m, sequence, map_revision = fields
+    size_m, message_seq, update_seq = fields
     try:
         grid = VoxelGrid(size_m)
         batch = _dequantise(_unpack(body, layout), grid)
-        return RoiSubset(names[0].decode(), names[1].decode(), sequence, map_revision, batch), grid
+        return RoiSubset(names[0].decode(), names[1].decode(), message_seq, update_seq, batch), grid
     except CodecError:
         raise
     except (GaussLiteError, UnicodeDecodeError) as error:

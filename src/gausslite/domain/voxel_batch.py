@@ -1,4 +1,4 @@
-"""Voxel updates of an agent: the complete current Gaussians of some voxels."""
+"""Voxel updates: the complete current Gaussians of some voxels, and the message that carries those of one agent."""
 
 from __future__ import annotations
 
@@ -51,22 +51,22 @@ class VoxelBatch:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RoiSubset:
-    """One message of an agent: its update of some voxels at `map_revision` of its map.
+    """One message of an agent: its updates of some voxels.
 
-    Per voxel, the update with the highest map_revision is the latest. sequence numbers the messages of a session, so
-    that the receiver can acknowledge them cumulatively.
+    update_seq: sequence number of these updates; in each voxel, the update with the highest one is the latest.
+    message_seq: number of the message in its session, for cumulative acknowledgements.
     """
 
     agent_id: str
     session_id: str
-    sequence: int
-    map_revision: int
+    message_seq: int
+    update_seq: int
     batch: VoxelBatch
 
     def __post_init__(self) -> None:
         if not self.agent_id:
             raise InvalidInputError("subset agent_id: expected a name, got an empty string")
-        if self.sequence < 0 or self.map_revision < 0:
+        if self.message_seq < 0 or self.update_seq < 0:
             raise InvalidInputError(
-                f"subset sequence and map_revision: expected at least 0, got {self.sequence} and {self.map_revision}"
+                f"subset message_seq and update_seq: expected at least 0, got {self.message_seq} and {self.update_seq}"
             )

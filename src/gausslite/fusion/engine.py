@@ -32,10 +32,10 @@ _MAX_REPLACED_SESSIONS = 1000
 
 
 class JoinResult(NamedTuple):
-    """The answer to a joining agent; the map revisions of its updates must exceed highest_map_revision."""
+    """The answer to a joining agent; the sequence numbers of its updates must exceed highest_update_seq."""
 
     session: SessionRecord
-    highest_map_revision: int
+    highest_update_seq: int
     fused_revision: int
 
 
@@ -129,7 +129,7 @@ class FusionEngine:
                 del self._sessions[replaced]
                 self._replaced_sessions.append(replaced)
             self._sessions[session.session_id] = session
-            return JoinResult(session, self._store.highest_map_revision(agent_id), self._change_log.revision)
+            return JoinResult(session, self._store.highest_update_seq(agent_id), self._change_log.revision)
 
     def session(self, session_id: str) -> SessionRecord:
         """Return the session of this id. Raises SessionUnknownError, and MismatchError for a replaced session.
@@ -281,7 +281,7 @@ class FusionEngine:
         scores = self._store.scores(batch.keys)
         agent_index = scores.agents.index(subset.agent_id) if subset.agent_id in scores.agents else -1
         own = scores.agent_index == agent_index
-        newer_keys = scores.keys[own & (scores.map_revisions >= subset.map_revision)]
+        newer_keys = scores.keys[own & (scores.update_seqs >= subset.update_seq)]
         accepted = ~np.isin(batch.keys, newer_keys)
         replaced = own & np.isin(scores.keys, batch.keys[accepted])
         removed = AgentUsage(int(np.count_nonzero(replaced)), int(scores.counts[replaced].sum(dtype=np.int64)))

@@ -19,7 +19,7 @@ from gausslite.fusion.store import PutOutcome, SessionRecord, VoxelScoreTable, r
 class _VoxelUpdate:
     """An agent's latest update of one voxel; the records are those of codec.records."""
 
-    map_revision: int
+    update_seq: int
     kappa_sum: int
     count: int
     records: bytes
@@ -44,11 +44,11 @@ class MemoryStore:
             stored = self._updates.setdefault(subset.agent_id, {})
             for i, key in enumerate(batch.keys.tolist()):
                 update = stored.get(key)
-                if update is not None and update.map_revision >= subset.map_revision:
+                if update is not None and update.update_seq >= subset.update_seq:
                     continue
                 # tobytes copies, so that a small update does not keep the whole message in memory
                 data = records[offsets[i] : offsets[i + 1]].tobytes()
-                stored[key] = _VoxelUpdate(subset.map_revision, int(batch.kappa_sums[i]), int(batch.counts[i]), data)
+                stored[key] = _VoxelUpdate(subset.update_seq, int(batch.kappa_sums[i]), int(batch.counts[i]), data)
                 accepted[i] = True
             if not stored:
                 del self._updates[subset.agent_id]
@@ -64,17 +64,17 @@ class MemoryStore:
         with self._lock:
             return tuple(sorted(self._updates))
 
-    def highest_map_revision(self, agent_id: str) -> int:
-        """Return the highest revision among an agent's updates; 0 without any."""
+    def highest_update_seq(self, agent_id: str) -> int:
+        """Return the highest sequence number among an agent's updates; 0 without any."""
         with self._lock:
-            return max((update.map_revision for update in self._updates.get(agent_id, {}).values()), default=0)
+            return max((update.update_seq for update in self._updates.get(agent_id, {}).values()), default=0)
 
     def scores(self, keys: Int64[ndarray, " k"] | None = None) -> VoxelScoreTable:
         """Return all agents' totals on these voxels, or on all."""
         with self._lock:
             agents = self.agents()
             rows = [
-                (index, key, update.map_revision, update.kappa_sum, update.count)
+                (index, key, update.update_seq, update.kappa_sum, update.count)
                 for index, agent_id in enumerate(agents)
                 for key, update in self._select(agent_id, keys)
             ]

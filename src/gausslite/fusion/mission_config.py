@@ -25,7 +25,7 @@ class MissionConfig:
 
     @property
     def given_world_frame(self) -> str:
-        """The world frame's name; empty if it is the default, which every robot's own map has too."""
+        """The world frame's name; empty if it is the default, because maps of different frames share that name."""
         return "" if self.world_frame == _DEFAULT_WORLD_FRAME else self.world_frame
 
 

@@ -1,4 +1,4 @@
-"""The refined map: voxels that changed after the refinement started show the newer vote."""
+"""The refined map, in which voxels that changed after the start of the refinement have the newer vote's Gaussians."""
 
 from __future__ import annotations
 

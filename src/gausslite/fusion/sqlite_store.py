@@ -20,12 +20,12 @@ from gausslite.domain.voxel_batch import RoiSubset, VoxelBatch
 from gausslite.fusion.mission_config import MissionConfig
 from gausslite.fusion.store import PutOutcome, SessionRecord, VoxelScoreTable, require_storable
 
-SCHEMA_VERSION = 2
+SCHEMA_VERSION = 3
 _APPLICATION_ID = 0x47534C54  # "GSLT", to recognise other programs' databases
 _PAGE_BYTES = 4096
 _SCHEMA = """
 CREATE TABLE voxel_updates (
-    agent_id TEXT NOT NULL, voxel INTEGER NOT NULL, map_revision INTEGER NOT NULL,
+    agent_id TEXT NOT NULL, voxel INTEGER NOT NULL, update_seq INTEGER NOT NULL,
     kappa_sum INTEGER NOT NULL, count INTEGER NOT NULL, records BLOB NOT NULL,
     PRIMARY KEY (agent_id, voxel));
 CREATE TABLE sessions (session_id TEXT PRIMARY KEY, agent_id TEXT NOT NULL UNIQUE);
@@ -61,14 +61,14 @@ class SqliteStore:
         batch, offsets = subset.batch, subset.batch.offsets
         records = to_records(batch.gaussians)
         with self._transaction() as db:
-            query = "SELECT voxel, map_revision FROM voxel_updates WHERE agent_id = ?"
+            query = "SELECT voxel, update_seq FROM voxel_updates WHERE agent_id = ?"
             stored = dict(db.execute(query + _WITH_KEYS, (subset.agent_id, _keys_as_json(batch.keys))))
-            accepted = np.array([stored.get(key, -1) < subset.map_revision for key in batch.keys.tolist()], np.bool_)
+            accepted = np.array([stored.get(key, -1) < subset.update_seq for key in batch.keys.tolist()], np.bool_)
             rows = (
                 (
                     subset.agent_id,
                     int(batch.keys[i]),
-                    subset.map_revision,
+                    subset.update_seq,
                     int(batch.kappa_sums[i]),
                     int(batch.counts[i]),
                     records[offsets[i] : offsets[i + 1]].tobytes(),
@@ -93,16 +93,16 @@ class SqliteStore:
         # not sorted by SQL, because the order must be the same in every store
         return tuple(sorted(agent_id for (agent_id,) in rows))
 
-    def highest_map_revision(self, agent_id: str) -> int:
-        """Return the highest revision among an agent's updates; 0 without any."""
-        rows = self._read("SELECT COALESCE(MAX(map_revision), 0) FROM voxel_updates WHERE agent_id = ?", (agent_id,))
+    def highest_update_seq(self, agent_id: str) -> int:
+        """Return the highest sequence number among an agent's updates; 0 without any."""
+        rows = self._read("SELECT COALESCE(MAX(update_seq), 0) FROM voxel_updates WHERE agent_id = ?", (agent_id,))
         return int(rows[0][0])
 
     def scores(self, keys: Int64[ndarray, " k"] | None = None) -> VoxelScoreTable:
         """Return all agents' totals on these voxels, or on all."""
         with self._lock:
             agents = self.agents()
-            parts = [self._select("voxel, map_revision, kappa_sum, count", agent_id, keys) for agent_id in agents]
+            parts = [self._select("voxel, update_seq, kappa_sum, count", agent_id, keys) for agent_id in agents]
         rows = [row for part in parts for row in part]
         return VoxelScoreTable(
             agents,

@@ -1,6 +1,6 @@
 """The store of voxel updates: (agent, voxel) → the agent's latest update of that voxel.
 
-An update replaces the agent's earlier update of the voxel if its map revision is higher; otherwise it is STALE. So
+An update replaces the agent's earlier update of the voxel if its sequence number is higher; otherwise it is STALE. So
 duplicates, resends and reordering change nothing, and removing an agent leaves no trace. An update without Gaussians
 is a tombstone. It is kept, because an older update of the voxel may still arrive.
 """
@@ -45,7 +45,7 @@ class VoxelScoreTable:
     agents: tuple[str, ...]
     agent_index: Int32[ndarray, " w"]
     keys: Int64[ndarray, " w"]
-    map_revisions: Int64[ndarray, " w"]
+    update_seqs: Int64[ndarray, " w"]
     kappa_sums: UInt64[ndarray, " w"]
     counts: UInt32[ndarray, " w"]
 
@@ -70,8 +70,8 @@ class FusionStore(Protocol):
         """Return the ids of the agents with updates, sorted."""
         ...
 
-    def highest_map_revision(self, agent_id: str) -> int:
-        """Return the highest revision among an agent's updates; 0 without any."""
+    def highest_update_seq(self, agent_id: str) -> int:
+        """Return the highest sequence number among an agent's updates; 0 without any."""
         ...
 
     def scores(self, keys: Int64[ndarray, " k"] | None = None) -> VoxelScoreTable:
@@ -115,7 +115,7 @@ def require_storable(subset: RoiSubset) -> None:
     """Raise InvalidInputError if a number of the message does not fit the store's signed 64-bit columns."""
     largest_sum = int(subset.batch.kappa_sums.max(initial=0))
     limit = int(np.iinfo(np.int64).max)
-    numbers = (("map_revision", subset.map_revision), ("sequence", subset.sequence), ("kappa_sum", largest_sum))
+    numbers = (("update_seq", subset.update_seq), ("message_seq", subset.message_seq), ("kappa_sum", largest_sum))
     for name, value in numbers:
         if value > limit:
             raise InvalidInputError(f"subset {name}: expected at most {limit}, got {value}")

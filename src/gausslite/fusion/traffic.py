@@ -1,4 +1,4 @@
-"""Count what each agent sent, and what the fused map shows of it."""
+"""Count the messages of each agent, its stored data, and the voxels that it wins."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class AgentContribution:
     gaussians: int = 0
     kappa_sum: int = 0
     won_voxels: int = 0
-    last_map_revision: int = 0
+    last_update_seq: int = 0
     keyframes: int = 0
     traffic: TrafficCounters = field(default_factory=TrafficCounters)
 
@@ -74,5 +74,5 @@ def contribution(agent_id: str, scores: VoxelScoreTable, vote: VoteResult) -> Ag
         gaussians=int(scores.counts[own].sum(dtype=np.int64)),
         kappa_sum=int(scores.kappa_sums[own].sum(dtype=np.uint64)),
         won_voxels=int(np.count_nonzero(vote.winner_index == index)),
-        last_map_revision=int(scores.map_revisions[own].max(initial=0)),
+        last_update_seq=int(scores.update_seqs[own].max(initial=0)),
     )

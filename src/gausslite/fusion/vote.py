@@ -145,7 +145,7 @@ def _stack(batch_by_agent: Mapping[str, VoxelBatch]) -> tuple[VoxelScoreTable, G
         agents,
         np.repeat(np.arange(len(agents), dtype=np.int32), [len(batch) for batch in batches]),
         np.concatenate([np.zeros(0, np.int64), *(batch.keys for batch in batches)]),
-        np.zeros(len(counts), np.int64),  # the vote does not use revisions
+        np.zeros(len(counts), np.int64),  # the vote does not use sequence numbers
         np.concatenate([np.zeros(0, np.uint64), *(batch.kappa_sums for batch in batches)]),
         counts,
     )

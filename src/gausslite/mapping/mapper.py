@@ -167,7 +167,7 @@ class GaussianMapper:
         return self._insert(Seeds(seeds, Gaussians.empty()))
 
     def mark_unavailable(self, keyframe: Keyframe) -> None:
-        """Mark a keyframe as evaluated without a result: it shows no ROI and casts no votes."""
+        """Mark a keyframe as evaluated without a result: it shows no ROI and adds no evidence."""
         self._keyframes.set_evaluated(replace(keyframe, evaluated=True), self._window_view)
 
     def render_view(self, frame: Frame) -> RenderedView | None:

@@ -36,12 +36,12 @@ class Components:
 
 
 class ActivePhase(StrEnum):
-    """Gaussians that an active-phase iteration renders and updates; the loss is masked to the ROI in every case."""
+    """Which Gaussians the iterations of the active phase render and update; their loss is always masked to the ROI."""
 
-    EXACT = "exact"
-    """Render and update every Gaussian in the ROI's tiles."""
+    ALL_GAUSSIANS = "all-gaussians"
+    """Render and update all Gaussians in the ROI's tiles, active or not."""
     FROZEN_BACKGROUND = "frozen-background"
-    """Render every Gaussian in the ROI's tiles; update the active ones."""
+    """Render all Gaussians in the ROI's tiles, but update only the active ones."""
     ACTIVE_ONLY = "active-only"
     """Render and update active Gaussians only (Sec. III-D.1): cheaper, but no background occludes the ROI's border."""
 
@@ -156,7 +156,7 @@ class OptimizationSettings:
 
     warmup_iterations: int = 2
     active_iterations: int = 6
-    active_phase: ActivePhase = ActivePhase.EXACT
+    active_phase: ActivePhase = ActivePhase.ALL_GAUSSIANS
     loss: LossWeights = _BALANCED_LOSS
     adam: AdamSettings = ONLINE_RATES
     decay_after_updates: float = 150.0

@@ -1,4 +1,4 @@
-"""Name the stages of mapping a frame, and what decides how much of each a frame has time for."""
+"""The stages of mapping a frame, and the interface of the scheduler that decides which of them run."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Stage(StrEnum):
     PRUNING = "pruning"
     DENSIFICATION = "densification"
     FINALISATION = "finalisation"
-    """Clamp colours and update the averaged parameters after the iterations."""
+    """Clamp colours and update the EMA after the iterations."""
     PUBLISHING = "publishing"
     """Find the changed voxels of the region and pass them to the uplink."""
 

@@ -19,7 +19,7 @@ from gausslite.optimize.splat_table import SplatTable
 from gausslite.render.rasterizer import Rasterizer, Subset, UpdateCounter
 
 _COLOUR_RANGE = (-0.25, 1.25)
-"""Wider than [0, 1], so that blended Gaussians still reach black and white."""
+"""Wider than [0, 1], so that blended colours still reach black and white."""
 _RANDOM_BLOCK = 16
 _Rows: TypeAlias = Float32[ndarray, "n 16"]
 _Tables: TypeAlias = tuple[_Rows, _Rows, _Rows]

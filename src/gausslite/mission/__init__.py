@@ -1,1 +1,1 @@
-"""One robot's mission: its settings and options, the loop they build, and what it leaves on disk."""
+"""One robot's mission: its settings, the loop over its frames, checkpoints and results."""

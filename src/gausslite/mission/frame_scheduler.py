@@ -1,4 +1,4 @@
-"""Share out the time of each frame: forecast the cost of every stage, and fill the rest with iterations."""
+"""Divide the time of each frame: forecast the duration of every stage, and train for the rest of the time."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ _EMA_WEIGHT = 0.2
 _FADE_PER_FRAME = 0.95
 _ITERATION_FADE_PER_FRAME = 0.5
 _OUTLIER_FACTOR = 4.0
-"""A measured duration counts for at most this multiple of its cautious forecast, if it is longer than ..."""
+"""Measured durations are clipped to this multiple of their cautious forecast."""
 _OUTLIER_SHARE = 0.1
-"""... this share of a frame's time."""
+"""Durations below this share of a frame's time are never clipped."""
 
 _STAGES_SKIPPED = {
     SkippableStage.PUBLISHING: (Stage.PUBLISHING,),
@@ -62,7 +62,7 @@ class SchedulerSettings:
 
     @property
     def deadline_slack_s(self) -> float:
-        """The longest overrun of a frame, and the most that a frame is shortened by earlier overruns."""
+        """The longest overrun of a frame, and the largest reduction of a frame's time by earlier overruns."""
         return self.deadline_slack * self.seconds_per_frame
 
 
@@ -82,9 +82,8 @@ class FrameScheduler:
     Without settings, each frame trains a fixed number of iterations and no stage is skipped.
 
     A frame's deadline is its start plus seconds_per_frame, less the overrun of earlier frames. Idle time between
-    frames is not credited. An overrun beyond deadline_slack is dropped, so the rate falls. If a frame waited although
-    the frame before it had used its time (less the slack), its deadline is earlier by that wait. Its min_iterations
-    keep their time in any case.
+    frames does not extend it. An overrun beyond deadline_slack is not recovered, so the rate falls. A frame that waited
+    in the queue gets an earlier deadline, see `begin`. The time of its min_iterations is never reduced.
     """
 
     def __init__(self, settings: SchedulerSettings | None = None, clock: Clock = time.perf_counter) -> None:
@@ -110,7 +109,7 @@ class FrameScheduler:
         """
         for stage in Stage:
             if stage not in self._stages_s:
-                # a stage that is never tried would keep its forecast, and might never be tried again
+                # without this, a stage with a long forecast would never run again
                 fade = _ITERATION_FADE_PER_FRAME if stage in ITERATION_STAGES else _FADE_PER_FRAME
                 self._forecasts[stage].fade(fade)
         self._cheapest_iteration = Stage.ACTIVE if Stage.ACTIVE in self._stages_s else Stage.WARM_UP
@@ -260,6 +259,6 @@ class _Forecast:
         self._deviation_s += _EMA_WEIGHT * (abs(error_s) - self._deviation_s)
 
     def fade(self, share: float) -> None:
-        """Lower the forecast of a stage that did not run, so that one slow run does not exclude it for ever."""
+        """Lower the forecast of a stage that did not run, so that it runs again some time after a slow run."""
         self._mean_s = None if self._mean_s is None else share * self._mean_s
         self._deviation_s *= share

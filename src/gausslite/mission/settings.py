@@ -100,7 +100,7 @@ class TaskSettings:
 class PerceptionSettings:
     """The models that find the task's nouns. Without a model file, the ground truth of the sequence is used.
 
-    model: a YOLO-seg or Grounding DINO file. segmenter: what outlines detected boxes, "yolo" (the detector's masks),
+    model: a YOLO-seg or Grounding DINO file. segmenter: how detected boxes become masks, "yolo" (the detector's masks),
     "depth" or a FastSAM file; None for the model's own masks, or depth if it has none. vocabulary: the vocabulary file
     of Grounding DINO; None for vocab.txt next to the model.
 

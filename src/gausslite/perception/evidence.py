@@ -53,7 +53,10 @@ class EvidenceSettings:
         return has_evidence and seen >= self.min_seen_fraction * (seen + missed)
 
     def is_reliable(self, landmark: Landmark) -> bool:
-        """Return True if two false detections cannot explain the landmark; superlatives use only such landmarks."""
+        """Return True if a confident detection, or three times min_seen detections, confirm the landmark.
+
+        Superlatives ("closest to") use only such landmarks.
+        """
         min_seen = _RELIABLE_FACTOR * self.min_seen
         has_evidence = landmark.seen_count >= min_seen or landmark.best_score >= self.confident_score
         return has_evidence and self.is_confirmed(landmark)
@@ -65,7 +68,7 @@ class EvidenceSettings:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class VisibilityCheck:
-    """The test whether a frame should show a landmark; depth_m is the depth of the nearest surfaces."""
+    """Decides whether a frame should show a landmark. depth_m: the depth of the nearest surface in each pixel."""
 
     frame: Frame
     depth_m: Float32[ndarray, "h w"]

@@ -16,7 +16,7 @@ from gausslite.perception.object_map import Landmark, Observation
 
 _FOOTPRINT_SLACK_M = 0.10
 _MAX_SAMPLE = 400
-# diagonally behind counts as behind, next to does not
+# an object diagonally behind counts as behind, an object beside does not
 _MIN_SLOPE = 0.5
 
 
@@ -47,7 +47,7 @@ class RelationGeometry:
         self._settings = settings
 
     def holds(self, predicate: Predicate, observation: Observation, anchor: Landmark) -> bool:
-        """Return whether predicate(target, anchor) holds; not for superlatives and between, which need more anchors."""
+        """Return whether predicate(target, anchor) holds. Superlatives and `between` are evaluated elsewhere."""
         if predicate in (Predicate.ON, Predicate.ABOVE):
             return self._is_over(observation.centroid_m, anchor, 1.0)
         if predicate is Predicate.UNDER:

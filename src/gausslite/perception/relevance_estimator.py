@@ -22,7 +22,7 @@ from gausslite.perception.tracker import TargetTracker, TrackerSettings
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DelayedRelevance:
-    """The relevance of an earlier frame, whose estimate was lag_frames frames ago and did not include its detection."""
+    """The relevance of an earlier frame, from a detection that finished lag_frames frames after that frame."""
 
     frame: Frame
     relevance: RelevanceMap

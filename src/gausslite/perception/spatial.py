@@ -88,7 +88,7 @@ class SpatialFilter:
         return landmark is not None and self._evidence.is_confirmed(landmark)
 
     def is_reliable(self, observation: Observation) -> bool:
-        """Return True if the observed object has too much evidence to be two false detections."""
+        """Return True if the observed object is a reliable landmark."""
         landmark = self._object_map.match(observation)
         return landmark is not None and self._evidence.is_reliable(landmark)
 

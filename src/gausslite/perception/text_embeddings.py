@@ -1,7 +1,8 @@
-"""Match a task's nouns to the classes of a fixed-vocabulary detector, by CLIP text embeddings or by synonyms.
+"""Match a task's nouns to the classes of a fixed-vocabulary detector, by synonyms or by CLIP text embeddings.
 
-Cosine similarities of raw embeddings are all near 0.85. After the vocabulary's mean is subtracted, unrelated nouns are
-below 0.4 and a good match is clearly above the second best. A match therefore needs a similarity and a margin.
+Raw embeddings of any two nouns have a cosine similarity near 0.85. After subtraction of the vocabulary's mean,
+unrelated nouns are below 0.4, and the right class is clearly above the second best. So a match needs a minimum
+similarity and a minimum margin to the second best class.
 """
 
 from __future__ import annotations
@@ -17,40 +18,49 @@ from jaxtyping import Float32
 from numpy import ndarray
 
 from gausslite.domain.errors import ModelFileError
-from gausslite.perception.vocabulary import SYNONYMS, bare_name, head_of, is_generic, is_structure
+from gausslite.perception.vocabulary import SYNONYMS, head_of, is_generic, is_structure, normalised_noun
 
 _MIN_SIMILARITY: Final = 0.5
 _MIN_MARGIN: Final = 0.10
-_VECTORS, _NAMES, _COCO_VECTORS = "lvis_v1_clip_a+cname.npy", "lvis_v1_train_cat_info.json", "coco_clip_a+cname.npy"
+_NOUN_VECTORS_FILE, _NOUN_NAMES_FILE, _COCO_VECTORS_FILE = (
+    "lvis_v1_clip_a+cname.npy",
+    "lvis_v1_train_cat_info.json",
+    "coco_clip_a+cname.npy",
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TextEmbeddings:
-    """Centred unit embeddings of a vocabulary of nouns; coco: embeddings of the 80 COCO classes."""
+    """Centred unit embeddings of a vocabulary of nouns.
 
-    rows: dict[str, int]
+    noun_index: the index in `vectors` of each noun. coco_vectors: embeddings of the 80 COCO classes, None without them.
+    """
+
+    noun_index: dict[str, int]
     vectors: Float32[ndarray, "n d"]
-    coco: Float32[ndarray, "c d"] | None
+    coco_vectors: Float32[ndarray, "c d"] | None
 
     @classmethod
     def from_model_folder(cls, model_path: Path) -> TextEmbeddings | None:
         """Read the embedding files in the model's folder; None if there are none. Raises ModelFileError."""
-        vectors_path, names_path = model_path.parent / _VECTORS, model_path.parent / _NAMES
+        vectors_path, names_path = model_path.parent / _NOUN_VECTORS_FILE, model_path.parent / _NOUN_NAMES_FILE
         if not (vectors_path.is_file() and names_path.is_file()):
             return None
-        raw, rows = _read_vectors(vectors_path), _read_names(names_path)
-        if max(rows.values(), default=-1) >= len(raw):
-            raise ModelFileError(f"{names_path}: expected at most {len(raw)} names, as many as {_VECTORS} has rows")
+        raw, noun_index = _read_vectors(vectors_path), _read_names(names_path)
+        if max(noun_index.values(), default=-1) >= len(raw):
+            raise ModelFileError(
+                f"{names_path}: expected at most {len(raw)} names, as many as {_NOUN_VECTORS_FILE} has rows"
+            )
         mean = raw.mean(axis=0)
-        coco_path = model_path.parent / _COCO_VECTORS
-        coco = _unit(_read_vectors(coco_path) - mean) if coco_path.is_file() else None
-        return cls(rows, _unit(raw - mean), coco)
+        coco_vectors_path = model_path.parent / _COCO_VECTORS_FILE
+        coco_vectors = _unit(_read_vectors(coco_vectors_path) - mean) if coco_vectors_path.is_file() else None
+        return cls(noun_index, _unit(raw - mean), coco_vectors)
 
     def vector(self, phrase: str) -> Float32[ndarray, " d"] | None:
         """Return the embedding of the phrase, or else of its head noun; None for unknown nouns."""
-        for name in (bare_name(phrase), head_of(phrase)):
-            if name in self.rows:
-                found: Float32[ndarray, " d"] = self.vectors[self.rows[name]]
+        for name in (normalised_noun(phrase), head_of(phrase)):
+            if name in self.noun_index:
+                found: Float32[ndarray, " d"] = self.vectors[self.noun_index[name]]
                 return found
         return None
 
@@ -66,8 +76,8 @@ class TextEmbeddings:
         return int(first) if is_match else None
 
     def _class_vectors(self, class_names: Sequence[str]) -> Float32[ndarray, "c d"]:
-        if self.coco is not None and len(self.coco) == len(class_names):
-            return self.coco
+        if self.coco_vectors is not None and len(self.coco_vectors) == len(class_names):
+            return self.coco_vectors
         table = np.zeros((len(class_names), self.vectors.shape[1]), np.float32)
         for index, name in enumerate(class_names):
             found = self.vector(name)
@@ -84,9 +94,9 @@ def classes_for(phrase: str, class_names: Sequence[str], embeddings: TextEmbeddi
     """
     if is_generic(phrase):
         return tuple(index for index, name in enumerate(class_names) if not is_structure(name))
-    by_name = {bare_name(name): index for index, name in reversed(list(enumerate(class_names)))}
-    bare, head = bare_name(phrase), head_of(phrase)
-    for name in (bare, SYNONYMS.get(bare), head, SYNONYMS.get(head)):
+    by_name = {normalised_noun(name): index for index, name in reversed(list(enumerate(class_names)))}
+    noun, head = normalised_noun(phrase), head_of(phrase)
+    for name in (noun, SYNONYMS.get(noun), head, SYNONYMS.get(head)):
         if name is not None and name in by_name:
             return (by_name[name],)
     best = embeddings.best_class(phrase, class_names) if embeddings is not None else None
@@ -109,13 +119,13 @@ def _read_vectors(path: Path) -> Float32[ndarray, "n d"]:
 
 
 def _read_names(path: Path) -> dict[str, int]:
-    """Return the row of every name and synonym; rows are ordered by id, which starts at 1."""
+    """Return the row of every name and synonym in the table of vectors: the id minus 1, because ids start at 1."""
     try:
         entries = json.loads(path.read_text(encoding="utf-8"))
-        rows: dict[str, int] = {}
+        noun_index: dict[str, int] = {}
         for entry in sorted(entries, key=lambda entry: int(entry["id"])):
             for name in (entry["name"], *entry["synonyms"]):
-                rows.setdefault(bare_name(name.split("_(")[0]), int(entry["id"]) - 1)
+                noun_index.setdefault(normalised_noun(name.split("_(")[0]), int(entry["id"]) - 1)
     except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
         raise ModelFileError(f"{path}: expected a list of classes with id, name and synonyms, but {error!r}") from error
-    return rows
+    return noun_index

@@ -68,7 +68,7 @@ def head_of(phrase: str) -> str:
     return words[-1] if words else ""
 
 
-def bare_name(phrase: str) -> str:
+def normalised_noun(phrase: str) -> str:
     """Return the phrase without a trailing number and with plain spaces: "dining_table_1" → "dining table"."""
     words = phrase.casefold().replace("_", " ").replace("-", " ").split()
     while len(words) > 1 and words[-1].isdigit():
@@ -100,8 +100,8 @@ def same_kind(phrase: str, name: str) -> bool:
     """Return True if a task's phrase means objects of this name: equal heads, or synonyms."""
     if is_generic(phrase):
         return not is_structure(name)
-    bare_phrase, other = bare_name(phrase), bare_name(name)
-    if bare_phrase == other or head_of(bare_phrase) == head_of(other):
+    normalised_phrase, other = normalised_noun(phrase), normalised_noun(name)
+    if normalised_phrase == other or head_of(normalised_phrase) == head_of(other):
         return True
-    canonical = SYNONYMS.get(bare_phrase, SYNONYMS.get(head_of(bare_phrase)))
+    canonical = SYNONYMS.get(normalised_phrase, SYNONYMS.get(head_of(normalised_phrase)))
     return canonical is not None and canonical == SYNONYMS.get(other, SYNONYMS.get(head_of(other)))

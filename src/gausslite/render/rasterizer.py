@@ -250,8 +250,8 @@ class Rasterizer(Protocol):
     ) -> TrainingView:
         """Return the image in the backend's layout.
 
-        depth_m: 0 means no measurement. pixel_weights: the weight of each pixel in the loss of steps with `masked=True`,
-        in [0, 1]; default 1.
+        depth_m: 0 means no measurement. pixel_weights: the weight of each pixel, in [0, 1], in the loss of steps with
+        `masked=True`; default 1.
         Raises ShapeError, InvalidInputError if a weight is outside [0, 1].
         """
         ...

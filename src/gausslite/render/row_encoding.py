@@ -1,7 +1,7 @@
 """Convert Gaussians to the trainable rows of `render.rasterizer` and back.
 
-Only `optimize` and this package use the encoding: scales as logarithms, opacities as logits. All other modules use physical
-values.
+Only `optimize` and this package use the encoding: scales as logarithms, opacities as logits. All other modules use
+physical values.
 """
 
 from __future__ import annotations

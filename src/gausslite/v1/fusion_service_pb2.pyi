@@ -202,7 +202,7 @@ class JoinSessionResponse(_message.Message):
     DESCRIPTOR: _descriptor.Descriptor
 
     SESSION_ID_FIELD_NUMBER: _builtins.int
-    HIGHEST_MAP_REVISION_FIELD_NUMBER: _builtins.int
+    HIGHEST_UPDATE_SEQ_FIELD_NUMBER: _builtins.int
     FUSED_REVISION_FIELD_NUMBER: _builtins.int
     GRID_FIELD_NUMBER: _builtins.int
     MAX_SUBSET_BYTES_FIELD_NUMBER: _builtins.int
@@ -210,8 +210,8 @@ class JoinSessionResponse(_message.Message):
     KEYFRAMES_FIELD_NUMBER: _builtins.int
     MAX_KEYFRAMES_FIELD_NUMBER: _builtins.int
     session_id: _builtins.str
-    highest_map_revision: _builtins.int
-    """The highest map_revision stored of this agent; later updates must have a higher one."""
+    highest_update_seq: _builtins.int
+    """The highest sequence number of the updates stored of this agent; later updates must have a higher one."""
     fused_revision: _builtins.int
     max_subset_bytes: _builtins.int
     """Size limit of a subset message."""
@@ -229,7 +229,7 @@ class JoinSessionResponse(_message.Message):
         self,
         *,
         session_id: _builtins.str = ...,
-        highest_map_revision: _builtins.int = ...,
+        highest_update_seq: _builtins.int = ...,
         fused_revision: _builtins.int = ...,
         grid: _geometry_pb2.VoxelGrid | None = ...,
         max_subset_bytes: _builtins.int = ...,
@@ -239,7 +239,7 @@ class JoinSessionResponse(_message.Message):
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["grid", b"grid"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["fused_revision", b"fused_revision", "grid", b"grid", "highest_map_revision", b"highest_map_revision", "keyframes", b"keyframes", "max_gaussians", b"max_gaussians", "max_keyframes", b"max_keyframes", "max_subset_bytes", b"max_subset_bytes", "session_id", b"session_id"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["fused_revision", b"fused_revision", "grid", b"grid", "highest_update_seq", b"highest_update_seq", "keyframes", b"keyframes", "max_gaussians", b"max_gaussians", "max_keyframes", b"max_keyframes", "max_subset_bytes", b"max_subset_bytes", "session_id", b"session_id"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
@@ -669,7 +669,7 @@ class AgentContribution(_message.Message):
     SUBSETS_REJECTED_FIELD_NUMBER: _builtins.int
     KEYFRAMES_FIELD_NUMBER: _builtins.int
     KAPPA_SUM_FIELD_NUMBER: _builtins.int
-    LAST_MAP_REVISION_FIELD_NUMBER: _builtins.int
+    LAST_UPDATE_SEQ_FIELD_NUMBER: _builtins.int
     LAST_SEEN_NS_FIELD_NUMBER: _builtins.int
     ALIGNMENT_FIELD_NUMBER: _builtins.int
     FREE_VOXELS_FIELD_NUMBER: _builtins.int
@@ -690,8 +690,8 @@ class AgentContribution(_message.Message):
     keyframes: _builtins.int
     kappa_sum: _builtins.int
     """Sum of kappa over all its voxels; the vote compares these sums voxel by voxel."""
-    last_map_revision: _builtins.int
-    """The highest map_revision of its updates; 0 without any."""
+    last_update_seq: _builtins.int
+    """The highest sequence number of its updates; 0 without any."""
     last_seen_ns: _builtins.int
     """Time of its latest subset, by the server's clock; 0 before the first since the server started."""
     free_voxels: _builtins.int
@@ -717,7 +717,7 @@ class AgentContribution(_message.Message):
         subsets_rejected: _builtins.int = ...,
         keyframes: _builtins.int = ...,
         kappa_sum: _builtins.int = ...,
-        last_map_revision: _builtins.int = ...,
+        last_update_seq: _builtins.int = ...,
         last_seen_ns: _builtins.int = ...,
         alignment: Global___FrameAlignment | None = ...,
         free_voxels: _builtins.int = ...,
@@ -725,7 +725,7 @@ class AgentContribution(_message.Message):
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["alignment", b"alignment"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["agent_id", b"agent_id", "alignment", b"alignment", "free_voxels", b"free_voxels", "gaussians", b"gaussians", "handover_bytes", b"handover_bytes", "joined", b"joined", "kappa_sum", b"kappa_sum", "keyframes", b"keyframes", "last_map_revision", b"last_map_revision", "last_seen_ns", b"last_seen_ns", "roi_bytes", b"roi_bytes", "subsets_accepted", b"subsets_accepted", "subsets_rejected", b"subsets_rejected", "subsets_stale", b"subsets_stale", "targets", b"targets", "voxels", b"voxels", "won_voxels", b"won_voxels"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["agent_id", b"agent_id", "alignment", b"alignment", "free_voxels", b"free_voxels", "gaussians", b"gaussians", "handover_bytes", b"handover_bytes", "joined", b"joined", "kappa_sum", b"kappa_sum", "keyframes", b"keyframes", "last_seen_ns", b"last_seen_ns", "last_update_seq", b"last_update_seq", "roi_bytes", b"roi_bytes", "subsets_accepted", b"subsets_accepted", "subsets_rejected", b"subsets_rejected", "subsets_stale", b"subsets_stale", "targets", b"targets", "voxels", b"voxels", "won_voxels", b"won_voxels"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

@@ -23,6 +23,7 @@ from gausslite.v1 import (
     agent_service_pb2_grpc,
     fusion_service_pb2,
     fusion_service_pb2_grpc,
+    geometry_pb2,
     parser_service_pb2,
     parser_service_pb2_grpc,
 )
@@ -32,19 +33,22 @@ from gausslite.wire.connection import MAX_MESSAGE_BYTES
 from gausslite.wire.images import decode_colour, decode_depth
 from gausslite.wire.tls import Tls
 
+MAX_END_S = 90_000.0
+"""Longer than any agent takes to end a mission: its --drain-timeout is at most a day."""
 # larger than the default, because a server may send larger blocks
 _WATCH_LIMITS = CodecLimits(max_bytes=MAX_MESSAGE_BYTES, max_voxels=2_000_000, max_gaussians=2_000_000)
 
 
 @dataclass(frozen=True, slots=True)
 class Session:
-    """The fusion server's answer to a joining agent."""
+    """The fusion server's answer to a joining agent; keyframes: indices of those that it stores of the agent."""
 
     session_id: str
-    highest_map_revision: int
+    highest_update_seq: int
     fused_revision: int
     max_subset_bytes: int
     max_gaussians: int
+    keyframes: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,6 +100,19 @@ class AgentClient(ServiceChannel):
         )
         return self._stream(self._stub.IngestFrames(requests))
 
+    def end_mission(
+        self, handover: bool | None = None, drain_s: float | None = None
+    ) -> agent_service_pb2.EndMissionResponse:
+        """End the mission and return what was sent and left; None: as the agent's options.
+
+        Raises MismatchError before the first task, UnavailableError.
+        """
+        request = agent_service_pb2.EndMissionRequest(handover=handover, drain_seconds=drain_s)
+        # after sending, the agent also writes its results
+        deadline_s = MAX_END_S if drain_s is None else drain_s + 10 * self._deadline_s
+        response: agent_service_pb2.EndMissionResponse = self._call(self._stub.EndMission, request, deadline_s)
+        return response
+
     def status(self) -> agent_service_pb2.GetAgentStatusResponse:
         """Return the agent's status and counters."""
         request = agent_service_pb2.GetAgentStatusRequest()
@@ -130,7 +147,7 @@ class AgentClient(ServiceChannel):
 
 def is_done(status: agent_service_pb2.GetAgentStatusResponse) -> bool:
     """True after the agent has ended its mission and written its results."""
-    return status.state == agent_service_pb2.AGENT_STATE_DONE
+    return status.state == agent_service_pb2.AGENT_STATE_ENDED
 
 
 class FusionClient(ServiceChannel):
@@ -157,10 +174,11 @@ class FusionClient(ServiceChannel):
         response = self._call(self._stub.JoinSession, request)
         return Session(
             response.session_id,
-            response.highest_map_revision,
+            response.highest_update_seq,
             response.fused_revision,
             response.max_subset_bytes,
             response.max_gaussians,
+            tuple(response.keyframes),
         )
 
     def contribute(
@@ -171,13 +189,27 @@ class FusionClient(ServiceChannel):
 
     def contribute_keyframes(self, session_id: str, keyframes: Iterable[Frame]) -> int:
         """Send keyframes for the refinement; returns the number stored. Raises QuotaError, SessionUnknownError."""
+        return int(self.contribute_encoded_keyframes(session_id, map(convert.frame_to_message, keyframes)).accepted)
+
+    def contribute_encoded_keyframes(
+        self,
+        session_id: str,
+        keyframes: Iterable[geometry_pb2.EncodedFrame],
+        selected: Sequence[int] = (),
+        deadline_s: float | None = None,
+    ) -> fusion_service_pb2.ContributeKeyframesResponse:
+        """Send encoded keyframes; the server deletes this agent's others that are not `selected`, if it is not empty.
+
+        Raises QuotaError, SessionUnknownError.
+        """
         requests = (
-            fusion_service_pb2.ContributeKeyframesRequest(
-                session_id=session_id, keyframe=convert.frame_to_message(keyframe)
-            )
+            fusion_service_pb2.ContributeKeyframesRequest(session_id=session_id, keyframe=keyframe, selected=selected)
             for keyframe in keyframes
         )
-        return int(self._call(self._stub.ContributeKeyframes, requests, 10 * self._deadline_s).accepted)
+        response: fusion_service_pb2.ContributeKeyframesResponse = self._call(
+            self._stub.ContributeKeyframes, requests, deadline_s or 10 * self._deadline_s
+        )
+        return response
 
     def watch(self, since_revision: int = 0, region: AxisAlignedBox | None = None) -> Iterator[convert.MapUpdate]:
         """Yield the fused map and its changes, without end. Raises RevisionGoneError if since_revision is gone."""

@@ -1,4 +1,4 @@
-"""Start, drain and stop a gRPC server, for all three services.
+"""Start, drain and stop the gRPC server of a service.
 
 Servicers raise GaussLite errors and write streams as async generators. The interceptor converts errors to status codes,
 so that a servicer's method only decodes, calls and encodes. No client message can make the server exit.
@@ -66,7 +66,7 @@ async def start_server(listen: str, services: Sequence[Service], tls: Tls | None
 
     Raises UnavailableError if the address is in use, InvalidInputError if it is not an address.
     """
-    _require_free(listen)
+    _require_free_address(listen)
     server = grpc.aio.server(interceptors=[ErrorInterceptor()], options=_OPTIONS)
     health_servicer = health.aio.HealthServicer()  # type: ignore[attr-defined]
     health_pb2_grpc.add_HealthServicer_to_server(health_servicer, server)
@@ -204,7 +204,7 @@ async def _abort(error: Exception, method: str, context: Any) -> NoReturn:
     raise error
 
 
-def _require_free(listen: str) -> None:
+def _require_free_address(listen: str) -> None:
     """Raise UnavailableError if the address is in use.
 
     Without this check gRPC would replace the unix socket of a running server. For a port in use it would also write its

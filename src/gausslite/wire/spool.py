@@ -1,20 +1,25 @@
-"""Store the uplink's data: the latest update of every voxel, and whether it is pending.
+"""Store the latest update of every voxel and the selected keyframes for the uplink, and whether they are pending.
 
-An update is pending until the server has accepted or finally refused it. A pending update is due if it has never been
-sent, is a tombstone, or its Σkappa has changed enough since it was last sent. The spool's size is bounded by the map,
-because a newer update replaces the older one of its voxel. With a path it is a SQLite file that survives a restart;
-otherwise it is in memory.
+An update is pending until the server has accepted it or permanently rejected it. A pending update is due if the voxel
+was never sent, if the update is a tombstone, or if Σkappa has changed enough since the voxel was last sent. A newer
+update replaces the older one of its voxel, so the size of the spool is bounded by the map. With a path, the spool is
+a SQLite file that survives a restart; otherwise it is in memory.
+
+Updates and keyframes share one bandwidth: the highest value per byte is sent first. The value of an update is the change
+of Σkappa, that is the number of optimiser updates that the server lacks. The value of a keyframe has the same unit.
 """
 
 from __future__ import annotations
 
+import heapq
 import sqlite3
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import IntEnum
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Int64
@@ -24,31 +29,35 @@ from gausslite.codec.records import from_bytes, to_records
 from gausslite.domain.errors import MismatchError, StorageError
 from gausslite.domain.voxel_batch import VoxelBatch
 from gausslite.domain.voxels import VoxelGrid
+from gausslite.wire.spooled_keyframes import SCHEMA as KEYFRAME_SCHEMA
+from gausslite.wire.spooled_keyframes import KeyframeTable, SpooledKeyframe
 
 _WIRE_BYTES_PER_GAUSSIAN, _WIRE_BYTES_PER_VOXEL = 20, 20
 _MAX_INTEGER = (1 << 63) - 1
 _NEVER_SENT = -1
-_Row = tuple[int, int, int, int, bytes]
+_Row = tuple[int, int, int, int, bytes, float]
 _SCHEMA = """
 CREATE TABLE IF NOT EXISTS voxel_updates (
-    key INTEGER PRIMARY KEY, version INTEGER NOT NULL, purpose INTEGER NOT NULL, kappa_sum INTEGER NOT NULL,
+    key INTEGER PRIMARY KEY, enqueue_count INTEGER NOT NULL, purpose INTEGER NOT NULL, kappa_sum INTEGER NOT NULL,
     count INTEGER NOT NULL, gaussians BLOB NOT NULL, pending INTEGER NOT NULL, sent_kappa INTEGER NOT NULL);
 CREATE INDEX IF NOT EXISTS voxel_updates_pending ON voxel_updates (pending) WHERE pending = 1;
 CREATE TABLE IF NOT EXISTS properties (name TEXT PRIMARY KEY, value) WITHOUT ROWID;
 """
 _ENQUEUE = """
 INSERT INTO voxel_updates VALUES (?, 1, ?, ?, ?, ?, 1, -1)
-ON CONFLICT (key) DO UPDATE SET version = version + 1, purpose = excluded.purpose, kappa_sum = excluded.kappa_sum,
-    count = excluded.count, gaussians = excluded.gaussians, pending = 1
+ON CONFLICT (key) DO UPDATE SET enqueue_count = enqueue_count + 1, purpose = excluded.purpose,
+    kappa_sum = excluded.kappa_sum, count = excluded.count, gaussians = excluded.gaussians, pending = 1
 WHERE kappa_sum != excluded.kappa_sum OR gaussians != excluded.gaussians
 """
 # updates never sent and tombstones are due at once; others if Σkappa has changed by a share of the sent value
-_SELECT_DUE = """
-SELECT key, version, kappa_sum, count, gaussians FROM voxel_updates
+_SELECT_DUE = f"""
+SELECT key, enqueue_count, kappa_sum, count, gaussians,
+    abs(kappa_sum - sent_kappa) / ({_WIRE_BYTES_PER_VOXEL}.0 + {_WIRE_BYTES_PER_GAUSSIAN}.0 * count) AS value_per_byte
+FROM voxel_updates
 WHERE pending = 1 AND purpose = ?
     AND (sent_kappa < 0 OR count = 0 OR abs(kappa_sum - sent_kappa) >= ? * max(sent_kappa, 1))
-ORDER BY abs(kappa_sum - sent_kappa) DESC, key
-"""
+ORDER BY value_per_byte DESC, key
+"""  # noqa: S608 - two constants of this file
 
 
 class Purpose(IntEnum):
@@ -60,11 +69,23 @@ class Purpose(IntEnum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SpoolBatch:
-    """Updates to send, with their versions; a newer update of a voxel has a higher version and stays pending."""
+    """Updates to send.
+
+    enqueue_counts: how often each voxel had been enqueued. If the stored count is higher when the answer arrives, a
+    newer update of the voxel is pending.
+    """
 
     purpose: Purpose
     batch: VoxelBatch
-    versions: Int64[ndarray, " v"]
+    enqueue_counts: Int64[ndarray, " v"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SpoolRound:
+    """What is sent in one round."""
+
+    voxels: SpoolBatch | None
+    keyframes: tuple[SpooledKeyframe, ...]
 
 
 class Spool:
@@ -78,7 +99,8 @@ class Spool:
             self._database = sqlite3.connect(":memory:" if path is None else path, check_same_thread=False)
             self._database.execute("PRAGMA journal_mode = WAL")
             self._database.execute("PRAGMA synchronous = NORMAL")
-            self._database.executescript(_SCHEMA)
+            self._database.executescript(_SCHEMA + KEYFRAME_SCHEMA)
+            self._keyframes = KeyframeTable(self._database)
             self.is_new = self._property("agent_id") is None
             if self.is_new:
                 properties = [("agent_id", agent_id), ("voxel_size_m", grid.size_m), ("update_seq", 0)]
@@ -112,30 +134,65 @@ class Spool:
                 ),
             )
 
-    def next_batch(self, max_bytes: int, resend_threshold: float) -> SpoolBatch | None:
-        """Return the due voxels with the largest change of Σkappa, about max_bytes, at least one; None if none is due.
+    def next_round(self, max_bytes: int, resend_threshold: float) -> SpoolRound | None:
+        """Return what is due with the highest value per byte, about max_bytes, at least one; None if nothing is due.
 
-        A voxel sent before is due if its Σkappa has changed by the share resend_threshold of the sent value.
+        A voxel sent before is due if its Σkappa has changed by the share resend_threshold of the sent value. Voxels of
+        the handover follow when nothing else is due.
         """
-        for purpose in Purpose:
-            with self._transaction():
-                rows: list[_Row] = []
-                spent = 0
-                for row in self._database.execute(_SELECT_DUE, (int(purpose), resend_threshold)):
-                    spent += _WIRE_BYTES_PER_VOXEL + row[3] * _WIRE_BYTES_PER_GAUSSIAN
-                    if rows and spent > max_bytes:
-                        break
-                    rows.append(row)
-            if rows:
-                return _to_batch(purpose, sorted(rows))
+        with self._transaction():
+            updates = self._due(Purpose.ROI, resend_threshold)
+            due = heapq.merge(updates, self._keyframes.pending(), key=_value_per_byte, reverse=True)
+            if chosen := _take(due, max_bytes):
+                return SpoolRound(
+                    _to_batch(Purpose.ROI, [each for each in chosen if isinstance(each, tuple)]),
+                    tuple(each for each in chosen if isinstance(each, SpooledKeyframe)),
+                )
+            if rows := _take(self._due(Purpose.HANDOVER, resend_threshold), max_bytes):
+                return SpoolRound(_to_batch(Purpose.HANDOVER, rows), ())
         return None
 
+    def enqueue_keyframe(self, keyframe: SpooledKeyframe, replaced: int | None = None) -> None:
+        """Store a selected keyframe as pending, and delete the one that it replaces in the selection."""
+        with self._transaction():
+            if replaced is not None:
+                self._keyframes.remove(replaced)
+            self._keyframes.enqueue(keyframe)
+
+    def mark_keyframes_done(self, keyframes: Iterable[SpooledKeyframe]) -> None:
+        """Mark these keyframes as not pending, because the server has accepted or permanently rejected them."""
+        with self._transaction():
+            self._keyframes.mark_done(keyframes)
+
+    def mark_keyframes_missing(self, stored: Iterable[int]) -> None:
+        """Mark all keyframes as pending except those with these indices, which the server stores."""
+        with self._transaction():
+            self._keyframes.mark_missing(stored)
+
+    def keyframes(self) -> list[SpooledKeyframe]:
+        """Return all keyframes, in the order of their indices."""
+        with self._transaction():
+            return self._keyframes.stored()
+
+    def keyframe_indices(self) -> tuple[int, ...]:
+        """Return the indices of all keyframes, ascending."""
+        with self._transaction():
+            return self._keyframes.indices()
+
+    @property
+    def pending_keyframes(self) -> int:
+        """The number of pending keyframes."""
+        with self._transaction():
+            return self._keyframes.count_pending()
+
     def mark_done(self, sent: SpoolBatch) -> None:
-        """Mark these versions as no longer pending, because the server has accepted or finally refused them."""
-        triples = zip(sent.versions.tolist(), sent.batch.kappa_sums.tolist(), sent.batch.keys.tolist(), strict=True)
+        """Mark these updates as not pending, because the server has accepted or permanently rejected them."""
+        triples = zip(
+            sent.enqueue_counts.tolist(), sent.batch.kappa_sums.tolist(), sent.batch.keys.tolist(), strict=True
+        )
         with self._transaction():
             self._database.executemany(
-                "UPDATE voxel_updates SET pending = (version != ?), sent_kappa = ? WHERE key = ?", triples
+                "UPDATE voxel_updates SET pending = (enqueue_count != ?), sent_kappa = ? WHERE key = ?", triples
             )
 
     def mark_all_unsent(self) -> None:
@@ -161,6 +218,9 @@ class Spool:
         with self._lock:
             self._database.close()
 
+    def _due(self, purpose: Purpose, resend_threshold: float) -> Iterator[_Row]:
+        return iter(self._database.execute(_SELECT_DUE, (int(purpose), resend_threshold)))
+
     @contextmanager
     def _transaction(self) -> Iterator[None]:
         with self._lock, self._storage_errors(), self._database:
@@ -178,12 +238,39 @@ class Spool:
         return None if row is None else row[0]
 
 
-def _to_batch(purpose: Purpose, rows: list[_Row]) -> SpoolBatch:
-    keys, versions, sums, counts, blobs = zip(*rows, strict=True)
+_Due = TypeVar("_Due", bound="_Row | SpooledKeyframe")
+
+
+def _value_per_byte(due: _Row | SpooledKeyframe) -> float:
+    return due.value_per_byte if isinstance(due, SpooledKeyframe) else due[5]
+
+
+def _size(due: _Row | SpooledKeyframe) -> int:
+    if isinstance(due, SpooledKeyframe):
+        return len(due.data)
+    return _WIRE_BYTES_PER_VOXEL + due[3] * _WIRE_BYTES_PER_GAUSSIAN
+
+
+def _take(due: Iterable[_Due], max_bytes: int) -> list[_Due]:
+    """Return the first items of about max_bytes together, at least one."""
+    chosen: list[_Due] = []
+    spent = 0
+    for each in due:
+        spent += _size(each)
+        if chosen and spent > max_bytes:
+            break
+        chosen.append(each)
+    return chosen
+
+
+def _to_batch(purpose: Purpose, rows: list[_Row]) -> SpoolBatch | None:
+    if not rows:
+        return None
+    keys, enqueue_counts, sums, counts, blobs, _ = zip(*sorted(rows), strict=True)
     batch = VoxelBatch(
         np.array(keys, np.int64),
         np.array(sums, np.uint64),
         np.array(counts, np.uint32),
         from_bytes(b"".join(blobs)),
     )
-    return SpoolBatch(purpose, batch, np.array(versions, np.int64))
+    return SpoolBatch(purpose, batch, np.array(enqueue_counts, np.int64))

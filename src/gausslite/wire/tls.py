@@ -12,7 +12,7 @@ import grpc
 
 from gausslite.domain.errors import InvalidInputError, NotPermittedError
 
-_NAMES = ("x509_common_name", "x509_subject_alternative_name")
+_CERTIFICATE_NAME_PROPERTIES = ("x509_common_name", "x509_subject_alternative_name")
 _CERTIFICATE = "x509_pem_cert"
 
 
@@ -76,7 +76,9 @@ def require_agent_certificate(context: Any, agent_id: str) -> None:
     properties = context.auth_context()
     if _CERTIFICATE not in properties:
         return
-    names = {name.decode(errors="replace") for kind in _NAMES for name in properties.get(kind, ())}
+    names = {
+        name.decode(errors="replace") for kind in _CERTIFICATE_NAME_PROPERTIES for name in properties.get(kind, ())
+    }
     if agent_id not in names:
         owner = ", ".join(sorted(names))[:200]
         raise NotPermittedError(f"agent {agent_id[:80]!r}: expected a certificate that names it, got one for {owner!r}")

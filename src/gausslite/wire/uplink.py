@@ -1,16 +1,17 @@
-"""Send a robot's voxel updates to the fusion server: asynchronously, within a bandwidth, until each is acknowledged.
+"""Send an agent's voxel updates and keyframes to the fusion server, asynchronously and within one bandwidth.
 
-The uplink sends in rounds. A round takes the voxels with the largest change of Σkappa from the spool, sends them as
-subsets on one stream and marks the acknowledged ones; the others stay in the spool for a later round. So a lost
-connection, a restart of either side and a duplicate need no special case.
+The uplink sends in rounds. A round takes the updates and keyframes with the highest value per byte from the spool, sends
+them and marks the acknowledged ones; the others stay in the spool for a later round. So a lost connection, a restart of
+either side and a duplicate need no special case.
 """
 
 from __future__ import annotations
 
 import logging
+import math
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 from gausslite.codec.subset_codec import MAX_SUBSET_BYTES, encode_subset, split_batch
@@ -27,8 +28,10 @@ from gausslite.domain.errors import (
 from gausslite.domain.voxel_batch import RoiSubset, VoxelBatch
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.v1 import fusion_service_pb2 as pb
+from gausslite.v1 import geometry_pb2
 from gausslite.wire.clients import FusionClient, Session
 from gausslite.wire.spool import Purpose, Spool, SpoolBatch
+from gausslite.wire.spooled_keyframes import SpooledKeyframe
 from gausslite.wire.token_bucket import TokenBucket
 from gausslite.wire.uplink_values import UplinkCounters, UplinkSettings
 
@@ -59,13 +62,15 @@ class Uplink:
         self._roi_voxels: set[int] = set()
         self._resent_damaged: set[int] = set()
         self._session: Session | None = None
-        self._sequence = 0
+        self._message_seq = 0
         self._subset_bytes = MAX_SUBSET_BYTES
         self._token_bucket = TokenBucket(self._settings.kbps)
         self._backoff_s = 0.0
         self._last_error = ""
         self._next_round_s = 0.0
-        self._draining = self._closing = self._drain_cancelled = False
+        self._draining = self._closing = False
+        self._drain_limit_s = math.inf
+        self._sent_keyframes: set[int] = set()
         # guards the counters and flags; waited on by the thread and by drain
         self._changed = threading.Condition()
         self._thread = threading.Thread(target=self._run, name="uplink", daemon=True)
@@ -78,33 +83,49 @@ class Uplink:
             with self._changed:
                 self._changed.notify_all()
 
-    def drain(self, timeout_s: float) -> bool:
-        """Send all pending updates, also small changes. True if the server has them all, False after the timeout."""
+    def enqueue_keyframe(self, keyframe: SpooledKeyframe, replaced: int | None = None) -> None:
+        """Queue a selected keyframe; replaced: index of the one that it replaces. Raises StorageError."""
+        self._spool.enqueue_keyframe(keyframe, replaced)
         with self._changed:
+            self._changed.notify_all()
+
+    def selected_keyframes(self) -> list[SpooledKeyframe]:
+        """Return all selected keyframes, also those from before a restart."""
+        return self._spool.keyframes()
+
+    def drain(self, timeout_s: float) -> bool:
+        """Send everything pending, also small changes. True if the server has it all, False after the timeout."""
+        with self._changed:
+            deadline_s = time.monotonic() + timeout_s
             self._draining = True
             self._next_round_s = 0.0
             self._changed.notify_all()
             try:
-                self._changed.wait_for(self._is_finished, timeout_s)
-                return self._spool.pending_voxels == 0
+                # the limit may change during the wait
+                while not self._is_finished():
+                    remaining_s = min(deadline_s, self._drain_limit_s) - time.monotonic()
+                    if remaining_s <= 0:
+                        break
+                    self._changed.wait(min(remaining_s, threading.TIMEOUT_MAX))
+                return not self._has_pending()
             finally:
                 self._draining = False
 
     def counters(self) -> UplinkCounters:
         """Return the current totals."""
         with self._changed:
-            return replace(self._counters, voxels_sent=len(self._roi_voxels), voxels_waiting=self._spool.pending_voxels)
+            return replace(
+                self._counters,
+                voxels_sent=len(self._roi_voxels),
+                voxels_waiting=self._spool.pending_voxels,
+                keyframes_sent=len(self._sent_keyframes),
+                keyframes_waiting=self._spool.pending_keyframes,
+            )
 
-    @property
-    def session_id(self) -> str:
-        """The id of the current session; empty without one."""
-        session = self._session
-        return "" if session is None else session.session_id
-
-    def cancel_drain(self) -> None:
-        """Make the current and all later calls of `drain` return at once; sending continues until `close`."""
+    def limit_drain(self, timeout_s: float) -> None:
+        """Make the current and all later calls of `drain` return by then; sending continues until `close`."""
         with self._changed:
-            self._drain_cancelled = True
+            self._drain_limit_s = time.monotonic() + timeout_s
             self._changed.notify_all()
 
     def close(self) -> None:
@@ -118,8 +139,10 @@ class Uplink:
         self._spool.close()
 
     def _is_finished(self) -> bool:
-        cannot_send = self._drain_cancelled or self._closing or bool(self._counters.stopped_because)
-        return cannot_send or self._spool.pending_voxels == 0
+        return self._closing or bool(self._counters.stopped_because) or not self._has_pending()
+
+    def _has_pending(self) -> bool:
+        return self._spool.pending_voxels + self._spool.pending_keyframes > 0
 
     def _run(self) -> None:
         try:
@@ -144,19 +167,26 @@ class Uplink:
             while not self._closing and not self._counters.stopped_because:
                 now_s = time.monotonic()
                 wait_s = max(self._next_round_s - now_s, self._token_bucket.seconds_until_positive(now_s))
-                if wait_s <= 0 and self._spool.pending_voxels:
+                if wait_s <= 0 and self._has_pending():
                     return True
                 self._changed.wait(wait_s if wait_s > 0 else None)
         return False
 
     def _send_round(self) -> bool:
-        """Join if needed, send one batch and mark the acknowledged updates. False if no voxel was due."""
+        """Join if needed, send what is due and mark what is acknowledged. False if nothing was due."""
         resend_threshold = 0.0 if self._draining else self._settings.resend_threshold
         max_bytes = self._token_bucket.available_bytes(self._settings.round_bytes)
-        due = self._spool.next_batch(max_bytes, resend_threshold)
+        due = self._spool.next_round(max_bytes, resend_threshold)
         if due is None:
             return False
         session = self._join_if_needed()
+        if due.voxels is not None:
+            self._send_voxels(due.voxels, session)
+        if due.keyframes:
+            self._send_keyframes(due.keyframes, session)
+        return True
+
+    def _send_voxels(self, due: SpoolBatch, session: Session) -> None:
         sent: dict[int, tuple[SpoolBatch, int]] = {}
         requests = list(self._requests(due, session, sent))
         self._token_bucket.spend(sum(size for _, size in sent.values()))
@@ -165,7 +195,22 @@ class Uplink:
             raise error
         if sent:
             raise UnavailableError(f"{self._client}: the stream ended before {len(sent)} subsets were answered")
-        return True
+
+    def _send_keyframes(self, due: Sequence[SpooledKeyframe], session: Session) -> None:
+        """Send keyframes on one stream. A rejected keyframe is dropped, because it would be rejected again."""
+        byte_count = sum(len(each.data) for each in due)
+        self._token_bucket.spend(byte_count)
+        messages = [geometry_pb2.EncodedFrame.FromString(each.data) for each in due]
+        selected = self._spool.keyframe_indices()
+        deadline_s = self._settings.deadline_s
+        response = self._client.contribute_encoded_keyframes(session.session_id, messages, selected, deadline_s)
+        self._spool.mark_keyframes_done(due)
+        for each in response.rejected:
+            _log.warning("uplink: keyframe %d is dropped: %s", each.index, each.reason)
+        rejected = {each.index for each in response.rejected}
+        with self._changed:
+            self._sent_keyframes |= {each.frame_index for each in due} - rejected
+            self._counters = replace(self._counters, keyframe_bytes=self._counters.keyframe_bytes + byte_count)
 
     def _exchange(
         self, requests: list[pb.ContributeSubsetsRequest], sent: dict[int, tuple[SpoolBatch, int]]
@@ -189,10 +234,11 @@ class Uplink:
             # a robot with a new map cannot send tombstones for the updates of its earlier map
             fresh = self._spool.is_new and not self._has_restored_map and self._counters.joins == 0
             self._session = self._client.join(self._agent_id, self._grid, self._settings.world_frame, fresh)
-            if self._session.highest_map_revision == 0:
+            if self._session.highest_update_seq == 0:
                 # the server has no updates of this agent
                 self._spool.mark_all_unsent()
-            self._sequence = 0
+            self._spool.mark_keyframes_missing(self._session.keyframes)
+            self._message_seq = 0
             self._subset_bytes = min(self._subset_bytes, self._session.max_subset_bytes or MAX_SUBSET_BYTES)
             with self._changed:
                 self._counters = replace(self._counters, connected=True, joins=self._counters.joins + 1)
@@ -204,21 +250,21 @@ class Uplink:
         start = 0
         for part in split_batch(due.batch, self._subset_bytes):
             stop = start + len(part)
-            self._sequence += 1
-            map_revision = self._spool.next_update_seq(session.highest_map_revision)
-            spooled = SpoolBatch(due.purpose, part, due.versions[start:stop])
+            self._message_seq += 1
+            update_seq = self._spool.next_update_seq(session.highest_update_seq)
+            spooled = SpoolBatch(due.purpose, part, due.enqueue_counts[start:stop])
             start = stop
             try:
                 data = encode_subset(
-                    RoiSubset(self._agent_id, session.session_id, self._sequence, map_revision, part), self._grid
+                    RoiSubset(self._agent_id, session.session_id, self._message_seq, update_seq, part), self._grid
                 )
             except InvalidInputError as error:
                 self._drop(spooled, str(error))
                 continue
-            sent[self._sequence] = spooled, len(data)
+            sent[self._message_seq] = spooled, len(data)
             yield pb.ContributeSubsetsRequest(
                 session_id=session.session_id,
-                sequence=self._sequence,
+                sequence=self._message_seq,
                 purpose=_PURPOSES[due.purpose],
                 subset=data,
             )

@@ -69,7 +69,7 @@ def test_decoding_is_within_the_stated_bounds(case: tuple[float, float, int, int
     decoded, decoded_grid = decode_subset(encode_subset(subset, grid))
     sent, got = subset.batch.gaussians, decoded.batch.gaussians
     assert decoded_grid == grid
-    header = [(s.agent_id, s.session_id, s.sequence, s.map_revision) for s in (subset, decoded)]
+    header = [(s.agent_id, s.session_id, s.message_seq, s.update_seq) for s in (subset, decoded)]
     assert header[0] == header[1]
     for name in ("keys", "kappa_sums", "counts"):
         np.testing.assert_array_equal(getattr(subset.batch, name), getattr(decoded.batch, name))

@@ -49,7 +49,7 @@ def test_status_counts_each_agents_contribution() -> None:
     assert (status.keyframes, status.refined) == (0, False)
     first, second = status.agents
     assert (first.agent_id, first.joined, first.voxels, first.gaussians) == ("ant", True, 2, 3)
-    assert (first.kappa_sum, first.won_voxels, first.last_map_revision) == (7, 1, 3)
+    assert (first.kappa_sum, first.won_voxels, first.last_update_seq) == (7, 1, 3)
     assert (first.traffic.roi_bytes, first.traffic.handover_bytes, first.traffic.subsets_stale) == (100, 7, 1)
     assert first.traffic.last_seen_ns > 0
     assert (second.agent_id, second.joined, second.won_voxels, second.kappa_sum) == ("bee", False, 2, 9)

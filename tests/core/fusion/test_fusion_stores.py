@@ -71,8 +71,8 @@ def test_the_highest_revision_wins_and_an_equal_one_is_stale(store: FusionStore)
     later = store.put(make_subset("ant", 6, {11: 1, 33: 1}))
     assert later.accepted.tolist() == [11, 33]
     assert store.batch("ant").counts.tolist() == [1, 2, 1]
-    assert store.highest_map_revision("ant") == 6
-    assert store.highest_map_revision("bee") == 0
+    assert store.highest_update_seq("ant") == 6
+    assert store.highest_update_seq("bee") == 0
 
 
 def test_a_tombstone_is_kept_and_makes_older_updates_stale(store: FusionStore) -> None:
@@ -88,7 +88,7 @@ def test_agents_do_not_change_each_others_data(store: FusionStore) -> None:
     assert scores.agents == ("ant", "bee")
     assert scores.agent_index.tolist() == [0, 1, 1]
     assert scores.keys.tolist() == [11, 11, 22]
-    assert scores.map_revisions.tolist() == [9, 1, 1]
+    assert scores.update_seqs.tolist() == [9, 1, 1]
     assert scores.counts.tolist() == [2, 1, 1]
     assert store.remove_agent("ant").tolist() == [11]
     assert store.agents() == ("bee",)
@@ -114,7 +114,7 @@ def test_an_empty_message_changes_nothing(store: FusionStore) -> None:
 
 
 def test_a_message_with_too_large_a_revision_is_refused_completely(store: FusionStore) -> None:
-    with pytest.raises(InvalidInputError, match="map_revision"):
+    with pytest.raises(InvalidInputError, match="update_seq"):
         store.put(make_subset("ant", 2**63, {11: 1}))
     assert store.agents() == ()
 
@@ -143,7 +143,7 @@ def test_threads_can_put_concurrently(store: FusionStore) -> None:
         thread.start()
     for thread in threads:
         thread.join()
-    assert store.scores().map_revisions.tolist() == [19] * 6
+    assert store.scores().update_seqs.tolist() == [19] * 6
 
 
 def test_a_reopened_sqlite_store_has_the_same_content(tmp_path: Path) -> None:
@@ -191,7 +191,7 @@ def test_acknowledged_updates_survive_a_kill(tmp_path: Path) -> None:
     store = SqliteStore(path)
     batch = store.batch("ant")
     assert set(range(101, 101 + acknowledged)) <= set(batch.keys.tolist())
-    assert store.highest_map_revision("ant") in (acknowledged, acknowledged + 1)
+    assert store.highest_update_seq("ant") in (acknowledged, acknowledged + 1)
     assert batch.counts.tolist()[0] == 3
     store.close()
 
@@ -230,7 +230,7 @@ def _newer_schema(path: Path) -> None:
     db.close()
 
 
-@pytest.mark.parametrize(("spoil", "message"), [(_damaged, "undamaged"), (_newer_schema, "schema version 2, got 77")])
+@pytest.mark.parametrize(("spoil", "message"), [(_damaged, "undamaged"), (_newer_schema, "schema version 3, got 77")])
 def test_a_damaged_or_newer_store_is_one_clear_error(
     tmp_path: Path, spoil: Callable[[Path], None], message: str
 ) -> None:

@@ -32,7 +32,7 @@ ACCEPTED, STALE, REJECTED = pb.SUBSET_STATUS_ACCEPTED, pb.SUBSET_STATUS_STALE, p
 def test_of_two_agents_the_one_with_the_higher_kappa_sum_wins() -> None:
     with fusion_server() as t:
         ant, bee = t.client.join("ant", GRID), t.client.join("bee", GRID)
-        assert ant.highest_map_revision == 0
+        assert ant.highest_update_seq == 0
         assert [o.status for o in t.contribute_subsets(ant.session_id, make_subset("ant", 1, {0: [5], 1: [1]}))] == [
             ACCEPTED
         ]
@@ -44,7 +44,7 @@ def test_of_two_agents_the_one_with_the_higher_kappa_sum_wins() -> None:
         assert len(gaussians_from_ply(t.client.export(Export("concatenation")))) == 5
         assert gaussians_from_ply(t.client.export(Export("vote", "ant"))).kappa.tolist() == [5]
         assert sorted(gaussians_from_ply(t.client.export(Export("concatenation", "ant"))).kappa.tolist()) == [1, 5]
-        assert t.client.join("ant", GRID).highest_map_revision == 1
+        assert t.client.join("ant", GRID).highest_update_seq == 1
 
 
 def test_a_duplicate_is_stale_and_acks_are_cumulative() -> None:
@@ -79,7 +79,7 @@ def test_an_invalid_subset_does_not_end_the_stream() -> None:
         assert all(o.message and "\n" not in o.message for o in outcomes[1:-1])
         [ant] = t.client.status().agents
         assert (ant.subsets_accepted, ant.subsets_rejected, ant.gaussians, ant.voxels) == (2, 5, 3, 2)
-        assert (ant.kappa_sum, ant.last_map_revision) == (3, 7)
+        assert (ant.kappa_sum, ant.last_update_seq) == (3, 7)
         assert ant.last_seen_ns > 0
 
 
@@ -155,7 +155,7 @@ def test_a_fresh_map_and_a_forgotten_agent_leave_no_updates() -> None:
     with fusion_server() as t:
         t.contribute_subsets(t.client.join("ant", GRID).session_id, make_subset("ant", 7, {0: [1]}))
         session = t.client.join("ant", GRID, fresh_map=True)
-        assert session.highest_map_revision == 0
+        assert session.highest_update_seq == 0
         assert t.client.status().fused_voxels == 0
         assert t.contribute_subsets(session.session_id, make_subset("ant", 1, {1: [1]}))[0].status == ACCEPTED
         t.client.leave(session.session_id)

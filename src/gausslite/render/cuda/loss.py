@@ -73,8 +73,8 @@ class Window:
 class LossTarget:
     """LossTarget of the loss in a window of a view.
 
-    ssim_terms: means and variances of the target in the SSIM windows. pixel_weights: None means 1 everywhere. share: the
-    mean weight of the whole image.
+    ssim_terms: means and variances of the target in the SSIM windows. pixel_weights: None means 1 everywhere. share:
+    the mean weight of the whole image.
     """
 
     window: Window

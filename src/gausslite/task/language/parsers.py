@@ -16,7 +16,7 @@ from gausslite.task.language.model import LanguageModel
 from gausslite.task.language.prompt import PROMPT_VERSION, messages_for
 from gausslite.task.parser import TaskParser
 
-CACHED_ANSWERS: Final = 256
+DEFAULT_CACHE_CAPACITY: Final = 256
 _log: Final = logging.getLogger(__name__)
 
 
@@ -40,7 +40,7 @@ class LanguageParser:
 class CachedParser:
     """A TaskParser with an LRU cache by task text, backend and version; failures are not cached."""
 
-    def __init__(self, parser: TaskParser, backend: str, version: str, capacity: int = CACHED_ANSWERS) -> None:
+    def __init__(self, parser: TaskParser, backend: str, version: str, capacity: int = DEFAULT_CACHE_CAPACITY) -> None:
         self._parser = parser
         self._source = (backend, version)
         self._capacity = capacity
