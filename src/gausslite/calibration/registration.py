@@ -14,9 +14,10 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, UInt8
+from jaxtyping import Float32, Float64
 from numpy import ndarray
 
+from gausslite.calibration.image_edges import ColourGradients, DepthEdges, depth_edges, relative_gradients
 from gausslite.datasets.intrinsics import FileIntrinsics
 from gausslite.datasets.registered_source import DepthRegistration
 from gausslite.datasets.source import Source
@@ -26,10 +27,6 @@ from gausslite.domain.frame import Frame
 from gausslite.domain.pose import transform_points
 
 _MIN_EDGE_POINTS = 1000
-_JUMP_M, _JUMP_SHARE = 0.06, 0.05
-_MAX_GAP_PX = 16
-_LOCAL_MEAN_PX = 12.0
-_GRADIENT_FLOOR, _MAX_RELATIVE_GRADIENT = 2.0, 4.0
 _BLURS_PX = (4.0, 2.0, 1.0)
 _HALVINGS = 5
 _STEP_FACTOR = 0.25
@@ -71,26 +68,6 @@ class RegistrationEstimate:
     def is_reliable(self) -> bool:
         """True if the score is high, and clearly higher than that of the images as recorded."""
         return self.score > max(_MIN_SCORE, _MIN_RATIO_TO_UNREGISTERED * self.unregistered_score)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Edges:
-    """Points in the depth camera's frame, on the near side of depth jumps along rows and along columns of one image."""
-
-    along_rows: Float64[ndarray, "n 3"]
-    along_columns: Float64[ndarray, "m 3"]
-
-    def thinned(self, every: int) -> _Edges:
-        """Return every `every`th point."""
-        return _Edges(self.along_rows[::every], self.along_columns[::every])
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Gradients:
-    """Gradient of one colour image along rows and along columns, relative to its local mean."""
-
-    along_rows: Float32[ndarray, "h w"]
-    along_columns: Float32[ndarray, "h w"]
 
 
 def estimate_depth_registration(source: Source, positions: Sequence[int], count: int = 40) -> RegistrationEstimate:
@@ -141,7 +118,7 @@ def estimate_from_frames(frames: Sequence[Frame]) -> RegistrationEstimate:
     40 frames of a furnished room are enough. The other three pose parameters stay 0: a tilt of a degree is equivalent
     to a shifted principal point, and an offset along the view to a zoom. Raises TooFewEdgesError.
     """
-    edges = [_depth_edges(frame) for frame in frames]
+    edges = [depth_edges(frame) for frame in frames]
     points = [points for edge in edges for points in (edge.along_rows, edge.along_columns)]
     depths_m = np.concatenate([np.empty((0, 3)), *points])[:, 2]
     if len(depths_m) < _MIN_EDGE_POINTS:
@@ -149,14 +126,14 @@ def estimate_from_frames(frames: Sequence[Frame]) -> RegistrationEstimate:
             f"registration: expected at least {_MIN_EDGE_POINTS} depth edge points, got {len(depths_m)}"
         )
     depth_camera, reference_m = frames[0].camera, float(np.median(depths_m))
-    gradients: list[_Gradients] = []
+    gradients: list[ColourGradients] = []
 
-    def score(candidate: Float64[ndarray, "6"], edges: Sequence[_Edges] = edges) -> float:
+    def score(candidate: Float64[ndarray, "6"], edges: Sequence[DepthEdges] = edges) -> float:
         return _score(_registration_of(candidate, depth_camera, reference_m), edges, gradients)
 
     best = _START
     for level, blur_px in enumerate(_BLURS_PX):
-        gradients[:] = [_relative_gradients(frame.rgb, blur_px) for frame in frames]
+        gradients[:] = [relative_gradients(frame.rgb, blur_px) for frame in frames]
         steps = _FIRST_STEPS * _STEP_FACTOR**level
         if level == 0:
             subset = [edge.thinned(max(1, len(depths_m) // _GRID_POINTS)) for edge in edges]
@@ -218,7 +195,7 @@ def _jump(score: Callable[[Float64[ndarray, "6"]], float], start: Float64[ndarra
     return best
 
 
-def _score(registration: DepthRegistration, edges: Sequence[_Edges], gradients: Sequence[_Gradients]) -> float:
+def _score(registration: DepthRegistration, edges: Sequence[DepthEdges], gradients: Sequence[ColourGradients]) -> float:
     """Return the mean relative colour gradient at the projected depth edges inside the image."""
     sampled = []
     for edge, gradient in zip(edges, gradients, strict=True):
@@ -251,53 +228,3 @@ def _bilinear(
         return columns
     sampled: Float32[ndarray, " k"] = cv2.remap(image, maps[0], maps[1], cv2.INTER_LINEAR).reshape(-1)[:count]
     return sampled
-
-
-def _relative_gradients(rgb: UInt8[ndarray, "h w 3"], blur_px: float) -> _Gradients:
-    grey = cv2.GaussianBlur(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32), (0, 0), blur_px)
-    return _Gradients(_relative_gradient(grey, 1, 0), _relative_gradient(grey, 0, 1))
-
-
-def _relative_gradient(grey: Float32[ndarray, "h w"], dx: int, dy: int) -> Float32[ndarray, "h w"]:
-    """Return the gradient relative to its local mean, so that one high-contrast object does not dominate."""
-    gradient = np.abs(cv2.Sobel(grey, cv2.CV_32F, dx, dy, ksize=3))
-    local_mean = cv2.GaussianBlur(gradient, (0, 0), _LOCAL_MEAN_PX)
-    relative: Float32[ndarray, "h w"] = np.minimum(
-        gradient / (local_mean + np.float32(_GRADIENT_FLOOR)), np.float32(_MAX_RELATIVE_GRADIENT)
-    )
-    return relative
-
-
-def _depth_edges(frame: Frame) -> _Edges:
-    """Return points on pixel borders where depth jumps, at the smaller of both depths."""
-    rows, columns, z_m = _jumps(frame.depth_m)
-    along_rows = _lift(columns + 1.0, rows + 0.5, z_m, frame.camera)
-    columns, rows, z_m = _jumps(np.ascontiguousarray(frame.depth_m.T))
-    return _Edges(along_rows, _lift(columns + 0.5, rows + 1.0, z_m, frame.camera))
-
-
-def _jumps(depth_m: Float32[ndarray, "h w"]) -> tuple[ndarray, ndarray, Float64[ndarray, " n"]]:
-    """Return row and column of each pixel before a jump along its row, and the smaller depth."""
-    filled = _fill_occlusions(depth_m)
-    nearer = np.minimum(filled[:, :-1], filled[:, 1:])
-    jump_m = np.abs(filled[:, 1:] - filled[:, :-1])
-    rows, columns = np.nonzero((nearer > 0) & (jump_m > np.maximum(_JUMP_M, _JUMP_SHARE * nearer)))
-    return rows, columns, nearer[rows, columns].astype(np.float64)
-
-
-def _fill_occlusions(depth_m: Float32[ndarray, "h w"]) -> Float32[ndarray, "h w"]:
-    """Fill short gaps in a row with the larger depth at their ends: sensors have none next to occluding edges."""
-    width = depth_m.shape[1]
-    valid: Bool[ndarray, "h w"] = depth_m > 0
-    columns = np.arange(width)
-    before = np.maximum.accumulate(np.where(valid, columns, -width), axis=1)
-    after = np.minimum.accumulate(np.where(valid, columns, 2 * width)[:, ::-1], axis=1)[:, ::-1]
-    ends = [np.take_along_axis(depth_m, np.clip(end, 0, width - 1), axis=1) for end in (before, after)]
-    return np.where(~valid & (after - before <= _MAX_GAP_PX), np.maximum(*ends), depth_m)
-
-
-def _lift(
-    u_px: Float64[ndarray, " n"], v_px: Float64[ndarray, " n"], z_m: Float64[ndarray, " n"], camera: Camera
-) -> Float64[ndarray, "n 3"]:
-    x_m, y_m = (u_px - camera.cx_px) / camera.fx_px * z_m, (v_px - camera.cy_px) / camera.fy_px * z_m
-    return np.stack([x_m, y_m, z_m], axis=1)
