@@ -7,8 +7,6 @@ import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from typing import Any
-from urllib.parse import parse_qsl
 
 import numpy as np
 from jaxtyping import Float64
@@ -27,93 +25,16 @@ from gausslite.domain.trajectory import Trajectory
 from gausslite_sim.exposure import camera_gain
 from gausslite_sim.home_catalogue import HOME_COUNT, plan_home
 from gausslite_sim.home_plan import HomePlan
+from gausslite_sim.home_settings import HomeSettings
 from gausslite_sim.instance_regions import InstanceImageCache, InstanceRegion
-from gausslite_sim.rolling_shutter import render_rolling_view
+from gausslite_sim.ray_camera import RayCamera
+from gausslite_sim.recorded_view import RecordingCamera, render_recorded_view
 from gausslite_sim.scene import HomeScene, require_ray_caster
 from gausslite_sim.sensor import colour_image, noisy_colour, noisy_depth
 from gausslite_sim.view import View, render_view
 
-TRAJECTORY_COUNT = 3
 _RATE_HZ = 30
-_SUBSTEPS = 8
 _FOCAL_PER_WIDTH = 0.85
-_SIDES_PX = (16, 4096)
-_NUMBERS = ("seed", "trajectory", "frames")
-_STRENGTHS = ("noise", "holes", "flying", "exposure", "gloss")
-
-
-@dataclass(frozen=True, slots=True)
-class HomeSettings:
-    """One trajectory through one home.
-
-    noise: scale of the sensor model; 0 disables it, and depth is exact. holes and flying: scales of missing depth and
-    of flying pixels. exposure: scale of the gain drift. gloss: scale of reflections. shutter_ms: readout time of a
-    rolling shutter. speed_deg_s: mean angular speed, which sets the frame rate; 0 for 30 Hz.
-    """
-
-    home: int = 0
-    seed: int = 0
-    trajectory: int = 0
-    frames: int = 120
-    size_px: tuple[int, int] = (320, 240)
-    noise: float = 1.0
-    holes: float = 1.0
-    flying: float = 1.0
-    exposure: float = 1.0
-    gloss: float = 1.0
-    shutter_ms: float = 0.0
-    speed_deg_s: float = 0.0
-
-    def __post_init__(self) -> None:
-        low, high = _SIDES_PX
-        for name, value, expected, valid in (
-            ("seed", self.seed, "0 to 4294967295", 0 <= self.seed < 2**32),
-            ("trajectory", self.trajectory, f"0 to {TRAJECTORY_COUNT - 1}", 0 <= self.trajectory < TRAJECTORY_COUNT),
-            ("frames", self.frames, "1 to 100000", 1 <= self.frames <= 100_000),
-            ("size", self.size_px, f"sides of {low} to {high} px", all(low <= side <= high for side in self.size_px)),
-            ("shutter", self.shutter_ms, "0ms to 100ms", 0.0 <= self.shutter_ms <= 100.0),
-            ("speed", self.speed_deg_s, "0 to 1000 degrees per second", 0.0 <= self.speed_deg_s <= 1000.0),
-            *((name, getattr(self, name), "0 to 10", 0.0 <= getattr(self, name) <= 10.0) for name in _STRENGTHS),
-        ):
-            if not valid:
-                raise DatasetError(f"{self.world}: {name}: expected {expected}, got {value}")
-
-    @property
-    def world(self) -> str:
-        """The home's name in a spec."""
-        return _world(self.home)
-
-    @classmethod
-    def parse(cls, query: str, home: int = 0) -> HomeSettings:
-        """Parse "seed=0&trajectory=1&frames=120&size=320x240&noise=1"; all parts are optional. Raises DatasetError."""
-        settings: dict[str, Any] = {}
-        for key, value in parse_qsl(query, keep_blank_values=True):
-            if key in _NUMBERS and re.fullmatch(r"[0-9]{1,10}", value):
-                settings[key] = int(value)
-            elif key in _STRENGTHS and re.fullmatch(r"[0-9]{1,3}(\.[0-9]{1,9})?", value):
-                settings[key] = float(value)
-            elif key == "size" and (match := re.fullmatch(r"([0-9]{1,5})x([0-9]{1,5})", value)):
-                settings["size_px"] = (int(match.group(1)), int(match.group(2)))
-            elif key == "shutter" and (match := re.fullmatch(r"([0-9]{1,3}(?:\.[0-9]{1,3})?)ms", value)):
-                settings["shutter_ms"] = float(match.group(1))
-            elif key == "speed" and re.fullmatch(r"[0-9]{1,4}", value):
-                settings["speed_deg_s"] = float(value)
-            else:
-                expected = "&".join(
-                    [
-                        *(f"{name}=N" for name in _NUMBERS),
-                        *("size=WxH", "shutter=Xms", "speed=N"),
-                        *(f"{name}=X" for name in _STRENGTHS),
-                    ]
-                )
-                raise DatasetError(
-                    f"{_world(home)}: {key}={value}: expected {expected}, each of them optional; N whole, X 0 to 10"
-                )
-        return cls(home, **settings)
-
-
-def _world(home: int) -> str:
-    return f"sim:home-{home}" if home else "sim:home"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -166,7 +87,7 @@ class SimulatedHome:
 
     @property
     def lens(self) -> Lens | None:
-        """None: the camera is a pinhole."""
+        """None: as in a recording without a camera file, a lens of the settings is not stated."""
         return None
 
     @property
@@ -234,27 +155,29 @@ class SimulatedHome:
 
     @cached_property
     def _times_s(self) -> Float64[ndarray, " n"]:
-        """Capture times: at 30 Hz, or at the rate that gives the mean angular speed of the settings."""
-        numbers, speed_deg_s = np.arange(len(self), dtype=np.float64), self._settings.speed_deg_s
-        if speed_deg_s == 0:
-            return numbers / _RATE_HZ
-        turn_per_frame_deg = np.degrees(Trajectory(numbers, self._poses).angular_speeds_rad_s().mean())
-        return numbers * (max(float(turn_per_frame_deg), 1e-6) / speed_deg_s)
+        return np.arange(len(self), dtype=np.float64) * self._interval_s
 
     @cached_property
-    def _fine_trajectory(self) -> Trajectory:
-        """The trajectory with _SUBSTEPS poses per frame, for the velocity at a frame."""
-        count = _SUBSTEPS * (len(self) - 1) + 1
-        times_s = np.interp(np.arange(count) / _SUBSTEPS, np.arange(len(self)), self._times_s)
-        return Trajectory(times_s, self._home.plan.trajectories[self._settings.trajectory](count))
+    def _interval_s(self) -> float:
+        """Time between two frames: that of 30 Hz, or the one that gives the mean angular speed of the settings."""
+        speed_deg_s = self._settings.speed_deg_s
+        if speed_deg_s == 0:
+            return 1.0 / _RATE_HZ
+        numbers = np.arange(len(self), dtype=np.float64)
+        turn_per_frame_deg = np.degrees(Trajectory(numbers, self._poses).angular_speeds_rad_s().mean())
+        return max(float(turn_per_frame_deg), 1e-6) / speed_deg_s
 
     def _render(self, i: int) -> View:
-        settings, scene, T_world_camera = self._settings, self._home.scene, self._poses[i]
-        if settings.shutter_ms == 0:
-            return render_view(scene, self._camera, T_world_camera, settings.gloss)
-        twist = self._fine_trajectory.twist(_SUBSTEPS * i)
-        readout_s = settings.shutter_ms / 1e3
-        return render_rolling_view(scene, self._camera, T_world_camera, twist, readout_s, settings.gloss)
+        settings, scene = self._settings, self._home.scene
+        if settings.shutter_ms == 0 and settings.blur_ms == 0:
+            return render_view(scene, RayCamera(self._camera, self._poses[i], settings.lens), settings.gloss)
+        camera = RecordingCamera(self._camera, settings.lens, settings.shutter_ms / 1e3, settings.blur_ms / 1e3)
+        path = self._home.plan.trajectories[settings.trajectory]
+
+        def poses_at(seconds: Float64[ndarray, " n"]) -> Float64[ndarray, "n 4 4"]:
+            return path(settings.frames, i + seconds / self._interval_s)
+
+        return render_recorded_view(scene, camera, poses_at, settings.gloss)
 
     def _apply_exposure(self, view: View, i: int) -> View:
         """Return the view with the simulated exposure."""

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float64
@@ -10,8 +11,20 @@ from numpy import ndarray
 
 from gausslite_sim.mesh import Vector
 
-Trajectory = Callable[[int], Float64[ndarray, "n 4 4"]]
-"""Returns T_world_camera of n frames, evenly spaced along the trajectory (z up; OpenCV camera axes, no roll)."""
+
+@runtime_checkable
+@runtime_checkable
+class Trajectory(Protocol):
+    """T_world_camera along a path (z up; OpenCV camera axes, no roll)."""
+
+    def __call__(self, frames: int, numbers: Float64[ndarray, " n"] | None = None) -> Float64[ndarray, "n 4 4"]:
+        """Return the poses of `frames` frames, evenly spaced along the path.
+
+        numbers: return the poses at these frame numbers instead, which may be fractions.
+        """
+        ...
+
+
 Waypoint = tuple[Vector, Vector]
 """(eye position, look-at target) in metres."""
 
@@ -20,8 +33,11 @@ def spline_trajectory(keys: Sequence[Waypoint]) -> Trajectory:
     """Return the trajectory from the first waypoint to the last."""
     waypoints = np.array(keys)
 
-    def poses(frames: int) -> Float64[ndarray, "n 4 4"]:
-        share = np.linspace(0.0, 1.0, frames) if frames > 1 else np.array([0.5])
+    def poses(frames: int, numbers: Float64[ndarray, " n"] | None = None) -> Float64[ndarray, "n 4 4"]:
+        if frames == 1:
+            share = np.full(1 if numbers is None else len(numbers), 0.5)
+        else:
+            share = np.linspace(0.0, 1.0, frames) if numbers is None else numbers / (frames - 1)
         return look_at_poses(_spline(waypoints[:, 0], share), _spline(waypoints[:, 1], share))
 
     return poses

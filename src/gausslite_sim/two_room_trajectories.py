@@ -44,9 +44,9 @@ _HELD_OUT = (
 """Waypoints above and below the other trajectories, looking at the same objects."""
 
 
-def _around_the_table(frames: int) -> Float64[ndarray, "n 4 4"]:
+def _around_the_table(frames: int, numbers: Float64[ndarray, " n"] | None = None) -> Float64[ndarray, "n 4 4"]:
     """Return poses on an ellipse around the table, with the camera towards its centre."""
-    a = 2 * np.pi * np.arange(frames) / frames - 0.5 * np.pi
+    a = 2 * np.pi * (np.arange(frames) if numbers is None else numbers) / frames - 0.5 * np.pi
     eyes = np.stack([_CX + 1.5 * np.cos(a), _CY + 1.3 * np.sin(a), 1.42 + 0.12 * np.sin(3 * a)], axis=1)
     targets = np.stack([_CX + 0.25 * np.sin(2 * a), _CY + 0.12 * np.cos(3 * a), 0.72 + 0.08 * np.cos(2 * a)], axis=1)
     return look_at_poses(eyes, targets)

@@ -16,8 +16,8 @@ from gausslite.domain.frame import Frame
 from gausslite.domain.pose import require_rigid, transform_points
 from gausslite.domain.voxels import VoxelGrid
 from gausslite_sim.home_catalogue import plan_home
+from gausslite_sim.home_settings import TRAJECTORY_COUNT
 from gausslite_sim.scene import HomeScene
-from gausslite_sim.source import TRAJECTORY_COUNT
 from gausslite_sim.two_room_layout import TABLE_CENTRE_M, furnish
 from gausslite_sim.two_room_trajectories import TRAJECTORIES
 

@@ -1,0 +1,105 @@
+"""Settings of a simulated home's sequence, as written in its spec."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import Any
+from urllib.parse import parse_qsl
+
+from gausslite.domain.errors import DatasetError, InvalidInputError
+from gausslite.domain.lens import Lens
+
+TRAJECTORY_COUNT = 3
+_SIDES_PX = (16, 4096)
+_NUMBERS = ("seed", "trajectory", "frames")
+_STRENGTHS = ("noise", "holes", "flying", "exposure", "gloss")
+_TIMES = ("shutter", "blur")
+
+
+@dataclass(frozen=True, slots=True)
+class HomeSettings:
+    """One trajectory through one home.
+
+    noise: scale of the sensor model; 0 disables it, and depth is exact. holes and flying: scales of missing depth and
+    of flying pixels. exposure: scale of the gain drift. gloss: scale of reflections. shutter_ms: readout time of a
+    rolling shutter. blur_ms: exposure time of a row. lens: distortion of both images. speed_deg_s: mean angular speed,
+    which sets the frame rate; 0 for 30 Hz.
+    """
+
+    home: int = 0
+    seed: int = 0
+    trajectory: int = 0
+    frames: int = 120
+    size_px: tuple[int, int] = (320, 240)
+    noise: float = 1.0
+    holes: float = 1.0
+    flying: float = 1.0
+    exposure: float = 1.0
+    gloss: float = 1.0
+    shutter_ms: float = 0.0
+    blur_ms: float = 0.0
+    lens: Lens | None = None
+    speed_deg_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        low, high = _SIDES_PX
+        for name, value, expected, valid in (
+            ("seed", self.seed, "0 to 4294967295", 0 <= self.seed < 2**32),
+            ("trajectory", self.trajectory, f"0 to {TRAJECTORY_COUNT - 1}", 0 <= self.trajectory < TRAJECTORY_COUNT),
+            ("frames", self.frames, "1 to 100000", 1 <= self.frames <= 100_000),
+            ("size", self.size_px, f"sides of {low} to {high} px", all(low <= side <= high for side in self.size_px)),
+            ("shutter", self.shutter_ms, "0ms to 100ms", 0.0 <= self.shutter_ms <= 100.0),
+            ("blur", self.blur_ms, "0ms to 100ms", 0.0 <= self.blur_ms <= 100.0),
+            ("speed", self.speed_deg_s, "0 to 1000 degrees per second", 0.0 <= self.speed_deg_s <= 1000.0),
+            *((name, getattr(self, name), "0 to 10", 0.0 <= getattr(self, name) <= 10.0) for name in _STRENGTHS),
+        ):
+            if not valid:
+                raise DatasetError(f"{self.world}: {name}: expected {expected}, got {value}")
+
+    @property
+    def world(self) -> str:
+        """The home's name in a spec."""
+        return world_name(self.home)
+
+    @classmethod
+    def parse(cls, query: str, home: int = 0) -> HomeSettings:
+        """Parse "seed=0&trajectory=1&frames=120&size=320x240&noise=1"; all parts are optional. Raises DatasetError."""
+        settings: dict[str, Any] = {}
+        for key, value in parse_qsl(query, keep_blank_values=True):
+            if key in _NUMBERS and re.fullmatch(r"[0-9]{1,10}", value):
+                settings[key] = int(value)
+            elif key in _STRENGTHS and re.fullmatch(r"[0-9]{1,3}(\.[0-9]{1,9})?", value):
+                settings[key] = float(value)
+            elif key == "size" and (match := re.fullmatch(r"([0-9]{1,5})x([0-9]{1,5})", value)):
+                settings["size_px"] = (int(match.group(1)), int(match.group(2)))
+            elif key in _TIMES and (match := re.fullmatch(r"([0-9]{1,3}(?:\.[0-9]{1,3})?)ms", value)):
+                settings[f"{key}_ms"] = float(match.group(1))
+            elif key == "lens":
+                settings["lens"] = _read_lens(value, home)
+            elif key == "speed" and re.fullmatch(r"[0-9]{1,4}", value):
+                settings["speed_deg_s"] = float(value)
+            else:
+                expected = "&".join(
+                    [
+                        *(f"{name}=N" for name in _NUMBERS),
+                        *("size=WxH", "shutter=Xms", "blur=Xms", "lens=MODEL:K1,...", "speed=N"),
+                        *(f"{name}=X" for name in _STRENGTHS),
+                    ]
+                )
+                raise DatasetError(
+                    f"{world_name(home)}: {key}={value}: expected {expected}, each of them optional; N whole, X 0 to 10"
+                )
+        return cls(home, **settings)
+
+
+def _read_lens(text: str, home: int) -> Lens:
+    try:
+        return Lens.parse(text)
+    except InvalidInputError as error:
+        raise DatasetError(f"{world_name(home)}: {error}") from None
+
+
+def world_name(home: int) -> str:
+    """Return the home's name in a spec."""
+    return f"sim:home-{home}" if home else "sim:home"
