@@ -24,7 +24,6 @@ if TYPE_CHECKING:
         Frame,
         FusionClient,
         Gaussians,
-        GaussLiteError,
         MapResult,
         MissionSettings,
         PerceptionSettings,
@@ -42,6 +41,7 @@ if TYPE_CHECKING:
         render_view,
         save_ply,
     )
+    from gausslite.domain.errors import GaussLiteError
 
 __version__ = "0.1.0"
 
@@ -78,7 +78,9 @@ def __getattr__(name: str) -> Any:
     """Import a public name on first use. Raises AttributeError for other names."""
     if name not in __all__:
         raise AttributeError(f"module 'gausslite' has no attribute {name!r}")
-    value = getattr(import_module("gausslite.api"), name)
+    # a program that only catches errors does not load the library
+    module = "gausslite.domain.errors" if name == "GaussLiteError" else "gausslite.api"
+    value = getattr(import_module(module), name)
     globals()[name] = value
     return value
 

@@ -18,14 +18,15 @@ from gausslite.calibration.camera_timing import estimate_camera_timing
 from gausslite.calibration.pose_exposure_error import estimate_pose_exposure_prior
 from gausslite.calibration.registration import find_registration
 from gausslite.codec.ply import read_ply, write_ply
-from gausslite.datasets.camera_correction import CameraCorrection
 from gausslite.datasets.corrected_source import CorrectedSource
 from gausslite.datasets.open import is_simulated, open_source
-from gausslite.datasets.registered_source import DepthRegistration, RegisteredSource
+from gausslite.datasets.registered_source import RegisteredSource
 from gausslite.datasets.source import Source
 from gausslite.domain.arguments import describe, require_instance, require_size
 from gausslite.domain.camera import Camera
-from gausslite.domain.errors import DatasetError, GaussLiteError, InvalidInputError
+from gausslite.domain.camera_correction import CameraCorrection
+from gausslite.domain.depth_registration import DepthRegistration
+from gausslite.domain.errors import DatasetError, InvalidInputError
 from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.pose import UpAxis, require_rigid
@@ -56,7 +57,6 @@ __all__ = [
     "DepthRegistration",
     "Frame",
     "FusionClient",
-    "GaussLiteError",
     "Gaussians",
     "MapResult",
     "MissionSettings",

@@ -16,8 +16,8 @@ import pytest
 
 from gausslite.codec.ply import read_ply
 from gausslite.datasets.open import open_source
-from gausslite.datasets.registered_source import DepthRegistration
 from gausslite.domain.camera import back_project
+from gausslite.domain.depth_registration import DepthRegistration
 from gausslite.domain.pose import transform_points
 
 pytest.importorskip("embreex", reason="the simulated home needs the extra `sim`")

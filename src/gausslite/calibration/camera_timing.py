@@ -1,9 +1,9 @@
 """Estimate readout time and time offset of a camera from pairs of frames on moving stretches.
 
 A frame is warped into a later one by depth and both poses, and the later frame's pose is fitted to the result. Wrong
-times leave a photometric residual, and a rotation that the fit needs. The readout time first minimises the residual;
-then the offset, and the readout time again in finer steps, minimise the rotation. Both are used only if they remove a
-clear share of it.
+times leave a photometric residual, and a rotation that the fit needs. The search minimises the residual by the readout
+time, then the rotation by the time offset, then the rotation by the readout time in finer steps. The result is used
+only if it clearly reduces both.
 """
 
 from __future__ import annotations
@@ -18,15 +18,16 @@ import numpy as np
 from numpy import ndarray
 
 from gausslite.calibration.pose_exposure_error import warp_into
-from gausslite.calibration.pose_fit import fit_pose, luminance_residual, twist_of
+from gausslite.calibration.pose_fit import fit_pose, luminance_residual
 from gausslite.calibration.view_residuals import comparable_pixels
-from gausslite.datasets.camera_correction import CameraCorrection, correct_frame, ideal_camera
+from gausslite.datasets.camera_correction import correct_frame, ideal_camera
 from gausslite.datasets.images import RgbdImage, resize_rgbd
 from gausslite.datasets.selection import downscaled_size
 from gausslite.datasets.source import Source
+from gausslite.domain.camera_correction import CameraCorrection
 from gausslite.domain.errors import DatasetError, PoseError
 from gausslite.domain.frame import Frame
-from gausslite.domain.pose import inverse
+from gausslite.domain.pose import inverse, twist_of
 from gausslite.domain.pose_exposure_prior import HANDHELD_PRIOR
 from gausslite.domain.trajectory import Trajectory, Twist
 

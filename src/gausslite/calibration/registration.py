@@ -18,10 +18,9 @@ from jaxtyping import Float32, Float64
 from numpy import ndarray
 
 from gausslite.calibration.image_edges import ColourGradients, DepthEdges, depth_edges, relative_gradients
-from gausslite.datasets.intrinsics import FileIntrinsics
-from gausslite.datasets.registered_source import DepthRegistration
 from gausslite.datasets.source import Source
 from gausslite.domain.camera import Camera
+from gausslite.domain.depth_registration import DepthRegistration, FileIntrinsics
 from gausslite.domain.errors import DatasetError, PoseError
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import transform_points
@@ -43,8 +42,8 @@ _FIRST_STEPS = np.array([0.03, 8.0, 8.0, 0.016, 0.016, 0.5])
 _GRID_ZOOMS, _GRID_SHIFTS_PX = np.linspace(0.85, 1.15, 7), np.linspace(-24.0, 24.0, 5)
 _GRID_POINTS = 8000
 _SHIFTS_AND_OFFSETS = ((1, 3), (2, 4))
-_JUMPS_M, _JUMPS_PX = np.linspace(-0.12, 0.12, 25), np.linspace(-6.0, 6.0, 7)
-_JUMP_LEVEL = 1  # with more blur the maxima are too similar, with less they are too narrow
+_OFFSET_SEARCH_M, _SHIFT_SEARCH_PX = np.linspace(-0.12, 0.12, 25), np.linspace(-6.0, 6.0, 7)
+_OFFSET_SEARCH_BLUR = 1  # with more blur the maxima are too similar, with less they are too narrow
 _REMAP_COLUMNS = 256
 
 
@@ -139,8 +138,8 @@ def estimate_from_frames(frames: Sequence[Frame]) -> RegistrationEstimate:
             subset = [edge.thinned(max(1, len(depths_m) // _GRID_POINTS)) for edge in edges]
             best = max(_grid(), key=lambda candidate: score(candidate, subset))
         best = _pattern_search(score, best, steps)
-        if level == _JUMP_LEVEL:
-            best = _pattern_search(score, _jump(score, best), steps)
+        if level == _OFFSET_SEARCH_BLUR:
+            best = _pattern_search(score, _search_along_offsets(score, best), steps)
     return RegistrationEstimate(
         _registration_of(best, depth_camera, reference_m), score(best), score(_START), len(depths_m)
     )
@@ -185,13 +184,22 @@ def _pattern_search(
     return best
 
 
-def _jump(score: Callable[[Float64[ndarray, "6"]], float], start: Float64[ndarray, "6"]) -> Float64[ndarray, "6"]:
-    """Return the best candidate along each offset and its shift: edges at two depths can be confused."""
+def _search_along_offsets(
+    score: Callable[[Float64[ndarray, "6"]], float], start: Float64[ndarray, "6"]
+) -> Float64[ndarray, "6"]:
+    """Return the best candidate on a wide grid of each offset and its shift.
+
+    A pattern search alone may end where edges at one depth match those at another.
+    """
     best = start
     for shift, offset in _SHIFTS_AND_OFFSETS:
         to_shift, to_offset = np.eye(len(start))[[shift, offset]]
-        jumps = [best + jump_m * to_offset + jump_px * to_shift for jump_m in _JUMPS_M for jump_px in _JUMPS_PX]
-        best = max([best, *jumps], key=score)
+        candidates = [
+            best + offset_m * to_offset + shift_px * to_shift
+            for offset_m in _OFFSET_SEARCH_M
+            for shift_px in _SHIFT_SEARCH_PX
+        ]
+        best = max([best, *candidates], key=score)
     return best
 
 

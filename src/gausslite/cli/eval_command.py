@@ -21,11 +21,11 @@ from gausslite.config.mapping_options import add_threads
 from gausslite.config.source_options import add_camera_correction
 from gausslite.config.switches import add_switch
 from gausslite.config.values import AUTO, NONE, read_camera_correction, read_depth_registration
-from gausslite.datasets.camera_correction import CameraCorrection
 from gausslite.datasets.held_out import HeldOutSplit
-from gausslite.datasets.registered_source import DepthRegistration
 from gausslite.datasets.selection import frame_size, select_frames
 from gausslite.datasets.source import Source
+from gausslite.domain.camera_correction import CameraCorrection
+from gausslite.domain.depth_registration import DepthRegistration
 from gausslite.domain.errors import DatasetError, PoseError
 from gausslite.domain.frame import Frame
 from gausslite.domain.region import Region

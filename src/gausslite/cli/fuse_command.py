@@ -9,6 +9,7 @@ from pathlib import Path
 
 from gausslite.codec.ply import read_ply, read_world_frame, write_ply
 from gausslite.config.mapping_options import add_voxel_size
+from gausslite.config.paths import read_path
 from gausslite.domain.errors import InvalidInputError, MismatchError
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.fusion.offline import fuse_maps
@@ -18,8 +19,12 @@ from gausslite.process.messages import print_message
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the options of `gausslite fuse`."""
-    parser.add_argument("maps", metavar="MAP", type=Path, nargs="+", help="two or more PLY files in one world frame")
-    parser.add_argument("--out", metavar="FILE.ply", type=Path, required=True, help="the fused map; not an input file")
+    parser.add_argument(
+        "maps", metavar="MAP", type=read_path, nargs="+", help="two or more PLY files in one world frame"
+    )
+    parser.add_argument(
+        "--out", metavar="FILE.ply", type=read_path, required=True, help="the fused map; not an input file"
+    )
     add_voxel_size(parser)
     parser.add_argument("--json", action="store_true", help="print JSON for scripts")
     parser.set_defaults(run=run)

@@ -21,6 +21,7 @@ _COMMANDS = {
     "parse": "parse a task sentence into targets, anchors and relations",
     "eval": "score a map on frames of a sequence, in the region of interest (ROI) and over whole images",
     "fuse": "fuse map files into one by a vote in every voxel",
+    "export": "write a map for other tools: splat viewers, point clouds, planners, meshes",
     "models": "list, download, verify and inspect model files for detection and segmentation",
     "bench": "measure the rasterizer, the mapping loop, the GPU, map quality or a task parser",
 }

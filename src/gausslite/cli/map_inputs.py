@@ -17,11 +17,11 @@ from gausslite.cli.source_options import (
 )
 from gausslite.config.mapping_options import mission_settings, perception_settings
 from gausslite.config.values import AUTO, NONE
-from gausslite.datasets.camera_correction import CameraCorrection
-from gausslite.datasets.registered_source import DepthRegistration
 from gausslite.datasets.selection import frame_step
 from gausslite.datasets.sequence_name import default_world_frame, sequence_name
 from gausslite.datasets.source import Source
+from gausslite.domain.camera_correction import CameraCorrection
+from gausslite.domain.depth_registration import DepthRegistration
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.pose_exposure_prior import PoseExposurePrior
 from gausslite.domain.region import Region

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gausslite.config.environment import MODELS_URL_VARIABLE
+from gausslite.config.paths import read_path
 from gausslite.domain.errors import InvalidInputError
 from gausslite.process.messages import print_message
 
@@ -25,11 +26,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
     _add_list(actions.add_parser("list", help="list the usable files, and which of them are downloaded"))
     _add_fetch(actions.add_parser("fetch", help="download files over HTTPS; resumes interrupted downloads"))
     verify = actions.add_parser("verify", help="check the SHA-256 of files; exit code 2 if one differs")
-    verify.add_argument("files", metavar="FILE", type=Path, nargs="+")
+    verify.add_argument("files", metavar="FILE", type=read_path, nargs="+")
     _add_catalogue_option(verify)
     verify.set_defaults(run=_verify)
     inspect = actions.add_parser("inspect", help="print a model's family, inputs and outputs")
-    inspect.add_argument("file", metavar="FILE.onnx", type=Path)
+    inspect.add_argument("file", metavar="FILE.onnx", type=read_path)
     inspect.set_defaults(run=_inspect)
 
 
@@ -51,12 +52,18 @@ def _add_fetch(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_catalogue_option(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--catalogue", metavar="FILE.toml", type=Path, help="file that replaces the built-in catalogue")
+    parser.add_argument(
+        "--catalogue", metavar="FILE.toml", type=read_path, help="file that replaces the built-in catalogue"
+    )
 
 
 def _add_folder_option(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "--folder", metavar="DIR", type=Path, default=Path("models"), help="folder of the files (default: %(default)s)"
+        "--folder",
+        metavar="DIR",
+        type=read_path,
+        default=Path("models"),
+        help="folder of the files (default: %(default)s)",
     )
 
 

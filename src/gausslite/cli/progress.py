@@ -20,7 +20,7 @@ def progress_bar(total: int, label: str, unit: str, row: int = 0) -> tqdm[Any]:
     on_terminal = sys.stderr.isatty()
     return tqdm(
         total=total,
-        desc=label,
+        desc=printable(label),
         unit=unit,
         position=row if on_terminal else 0,
         mininterval=_TERMINAL_INTERVAL_S if on_terminal else _LOG_INTERVAL_S,

@@ -10,11 +10,12 @@ from gausslite.calibration.pose_exposure_error import estimate_pose_exposure_pri
 from gausslite.calibration.registration import find_registration
 from gausslite.config.source_options import add_frames
 from gausslite.config.values import AUTO, NONE, read_names, read_numbers
-from gausslite.datasets.camera_correction import CameraCorrection
 from gausslite.datasets.corrected_source import CorrectedSource
 from gausslite.datasets.open import is_simulated, open_source
-from gausslite.datasets.registered_source import DepthRegistration, RegisteredSource
+from gausslite.datasets.registered_source import RegisteredSource
 from gausslite.datasets.source import Source
+from gausslite.domain.camera_correction import CameraCorrection
+from gausslite.domain.depth_registration import DepthRegistration
 from gausslite.domain.pose import UpAxis
 from gausslite.domain.pose_exposure_prior import PoseExposurePrior
 from gausslite.domain.region import BallRegion, Region

@@ -12,12 +12,12 @@ from gausslite.config.values import (
     read_depth_registration,
     read_up_axis,
 )
-from gausslite.datasets.registered_source import DepthRegistration
+from gausslite.domain.depth_registration import DepthRegistration
 
 _CAMERA_METAVAR = "FX,FY,CX,CY[,TX,TY,TZ[,RX,RY,RZ]]"
 _REGISTER_DEPTH_HELP = (
-    "register depth images to this colour camera: intrinsics in pixels, then the depth camera's position (metres) and "
-    "rotation vector (degrees) in the colour camera's frame"
+    "shift each depth image onto the colour image (registration), for sensors with two cameras: the colour camera's "
+    "intrinsics in pixels, then the depth camera's position (metres) and rotation vector (degrees) in its frame"
 )
 _AUTO_HELP = (
     "; none: use depth as recorded; auto: estimate the camera from image edges if the layout does not guarantee "

@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 import math
 
-from gausslite.datasets.camera_correction import CameraCorrection
-from gausslite.datasets.registered_source import DepthRegistration
+from gausslite.domain.camera_correction import CameraCorrection
+from gausslite.domain.depth_registration import DepthRegistration
 from gausslite.domain.pose import UpAxis
 from gausslite.domain.pose_exposure_prior import PoseExposurePrior
 from gausslite.mapping.stages import SkippableStage

@@ -6,11 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from gausslite.datasets.camera_correction import CameraCorrection, correct_frame, ideal_camera
+from gausslite.datasets.camera_correction import correct_frame, ideal_camera
 from gausslite.datasets.images import RgbdImage, resize_rgbd
 from gausslite.datasets.source import Source
 from gausslite.datasets.wrapped_source import WrappedSource
 from gausslite.domain.camera import Camera
+from gausslite.domain.camera_correction import CameraCorrection
 from gausslite.domain.frame import Frame
 from gausslite.domain.lens import Lens
 from gausslite.domain.trajectory import Trajectory

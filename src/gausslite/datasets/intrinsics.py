@@ -11,6 +11,7 @@ import numpy as np
 
 from gausslite.datasets.text_files import parse_numbers, read_rows, read_text
 from gausslite.domain.camera import Camera
+from gausslite.domain.depth_registration import FileIntrinsics
 from gausslite.domain.errors import DatasetError, InvalidInputError
 from gausslite.domain.lens import Lens, LensModel
 
@@ -18,23 +19,6 @@ INTRINSICS_FILE = "camera-intrinsics.txt"
 CAMERA_FILE = "cam_params.json"
 CAMERA_INFO_FILES = ("camera_info.yaml", "camera_info.yml")
 COLMAP_FILE = "cameras.txt"
-
-
-@dataclass(frozen=True, slots=True)
-class FileIntrinsics:
-    """Focal lengths and principal point in pixels, in the data set's convention (pixel centres at integers)."""
-
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-
-    def camera(self, place: str, width_px: int, height_px: int) -> Camera:
-        """Return the Camera, with 0.5 px added to the principal point. Raises DatasetError with the place."""
-        try:
-            return Camera(self.fx, self.fy, self.cx + 0.5, self.cy + 0.5, width_px, height_px)
-        except InvalidInputError as error:
-            raise DatasetError(f"{place}: {error}") from None
 
 
 def find_in_or_above(folder: Path, name: str) -> Path | None:

@@ -6,11 +6,12 @@ from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
 
-from gausslite.datasets.registered_source import DepthRegistration, RegisteredSource
+from gausslite.datasets.registered_source import RegisteredSource
 from gausslite.datasets.replica import ReplicaSource
 from gausslite.datasets.sevenscenes import SevenScenesSource
 from gausslite.datasets.source import Source
 from gausslite.datasets.tum import TumSource
+from gausslite.domain.depth_registration import DepthRegistration
 from gausslite.domain.errors import DatasetError
 from gausslite.domain.pose import UpAxis
 

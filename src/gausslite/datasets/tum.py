@@ -13,10 +13,11 @@ from numpy import ndarray
 
 from gausslite.datasets.folder_source import FolderSource
 from gausslite.datasets.images import DepthUnits, first_readable_size, load_rgbd
-from gausslite.datasets.intrinsics import CAMERA_FILE, INTRINSICS_FILE, FileIntrinsics, FolderCamera, read_folder_camera
+from gausslite.datasets.intrinsics import CAMERA_FILE, INTRINSICS_FILE, FolderCamera, read_folder_camera
 from gausslite.datasets.poses import is_lost, pose_from_quaternion, slerp
 from gausslite.datasets.source import excluded_frames_note, require_frames, require_position
 from gausslite.datasets.text_files import parse_numbers, read_rows
+from gausslite.domain.depth_registration import FileIntrinsics
 from gausslite.domain.errors import DatasetError
 from gausslite.domain.frame import Frame
 from gausslite.domain.lens import Lens, LensModel

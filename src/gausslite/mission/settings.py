@@ -6,11 +6,11 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from gausslite.datasets.camera_correction import CameraCorrection
 from gausslite.datasets.open import is_simulated
-from gausslite.datasets.registered_source import DepthRegistration
 from gausslite.datasets.source import Source
 from gausslite.domain.arguments import require_instance, require_number, require_whole
+from gausslite.domain.camera_correction import CameraCorrection
+from gausslite.domain.depth_registration import DepthRegistration
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.pose import UpAxis
 from gausslite.domain.pose_exposure_prior import PoseExposurePrior

@@ -10,8 +10,8 @@ from gausslite.config.values import read_names
 from gausslite.datasets.held_out import HeldOutSplit
 from gausslite.datasets.open import open_source
 from gausslite.datasets.regions import choose_regions
-from gausslite.datasets.registered_source import DepthRegistration
 from gausslite.datasets.selection import frame_size, select_frames
+from gausslite.domain.depth_registration import DepthRegistration
 from gausslite.evaluation.compare import MapScores, average, score_view
 from gausslite.evaluation.views import HeldOutView, MapViewer
 from gausslite.mapping.policies import POLICIES, TASK, follows_task

@@ -11,7 +11,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-from gausslite.cli.progress import progress_bar
+from gausslite.cli.progress import print_above_bar, progress_bar
 from gausslite.codec.files import write_atomic
 from gausslite.mission.build import open_models
 from gausslite.mission.results import write_json
@@ -44,7 +44,7 @@ def run_with_progress(
     with _StudyBar(study.count) as bar:
         finished = run_study(study, cache, perceptual, bar, reuse_other_code)
     origins = Counter(each.origin for each in finished)
-    print(f"trials: {', '.join(f'{count} {origin}' for origin, count in origins.items())}", file=sys.stderr)
+    print_above_bar(f"trials: {', '.join(f'{count} {origin}' for origin, count in origins.items())}")
     return StudyResults(finished)
 
 
@@ -69,7 +69,7 @@ def _with_measured_rate(study: Study, path: Path) -> Study:
         with progress_bar(len(scene.training), f"uniform mapping of {trial.plan.name}", "frame") as bar:
             rate_hz = measure_rate(path, trial, scene, partial(_advance, bar))
     budget = f"{1e3 / rate_hz:.3g} ms per frame, the time of uniform mapping with {trials[0].budget}"
-    print(f"equal time: {budget} ({path})", file=sys.stderr)
+    print_above_bar(f"equal time: {budget} ({path})")
     return study.with_rate(rate_hz)
 
 
@@ -82,9 +82,9 @@ def _warn_about_other_code(expected: Counter[Origin]) -> None:
     """Warn before the study starts: the user may stop and reuse results that a code change does not affect."""
     if recomputed := expected[Origin.RECOMPUTED]:
         line = f"{recomputed} cached trials from other code will be computed again; --reuse-other-code keeps them"
-        print(line, file=sys.stderr)
+        print_above_bar(line)
     if reused := expected[Origin.CACHED_OTHER_CODE]:
-        print(f"{reused} cached trials from other code are reused: scores may not be comparable", file=sys.stderr)
+        print_above_bar(f"{reused} cached trials from other code are reused: scores may not be comparable")
 
 
 class _StudyBar:
@@ -109,7 +109,7 @@ class _StudyBar:
 
     def on_skipped(self, trials: int, reason: UnseenRegionError) -> None:
         """Print the skipped scene and the reason."""
-        self._bar.write(f"skipped: {reason}", file=sys.stderr)
+        print_above_bar(f"skipped: {reason}")
         self._bar.update(trials)
 
     def on_finished(self, trial: FinishedTrial) -> None:
@@ -118,9 +118,8 @@ class _StudyBar:
         settings, scores = trial.trial, trial.result.scores
         roi = "no view shows the region" if scores.roi_psnr is None else f"ROI {scores.roi_psnr:.2f} dB"
         origin = "" if trial.origin is Origin.COMPUTED else f" ({trial.origin})"
-        self._bar.write(
+        print_above_bar(
             f"{settings.plan.name} {settings.variant.label} equal {settings.budget.equal} seed {settings.seed}: "
-            f"{roi}, full {scores.full_psnr:.2f} dB{origin}",
-            file=sys.stderr,
+            f"{roi}, full {scores.full_psnr:.2f} dB{origin}"
         )
         self._bar.update()

@@ -8,6 +8,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from gausslite.cli.progress import print_above_bar
 from gausslite.codec.files import write_atomic
 from gausslite.config.switches import add_switch
 from gausslite.config.values import read_names
@@ -71,7 +72,7 @@ def run_task_change(options: argparse.Namespace) -> int:
     recoveries: list[Recovery] = []
     for change in changes:
         recoveries.append(bench.run(change))
-        print(recovery_table(recoveries[-1:]).splitlines()[-1], file=sys.stderr, flush=True)
+        print_above_bar(recovery_table(recoveries[-1:]).splitlines()[-1])
         _write(options.out, recoveries)
     print(recovery_table(recoveries))
     print(f"→ {options.out / 'task-change.md'}")

@@ -14,8 +14,8 @@ from gausslite.datasets.held_out import HeldOutSplit
 from gausslite.datasets.intrinsics import CAMERA_FILE, INTRINSICS_FILE, find_in_or_above
 from gausslite.datasets.open import open_source
 from gausslite.datasets.regions import balls_for_small_objects, choose_regions, load_voxel_regions
-from gausslite.datasets.registered_source import DepthRegistration
 from gausslite.datasets.source import Source
+from gausslite.domain.depth_registration import DepthRegistration
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.pose import UpAxis
 from gausslite.domain.pose_exposure_prior import PoseExposurePrior

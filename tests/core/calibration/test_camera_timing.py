@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from gausslite.calibration.camera_timing import estimate_camera_timing
-from gausslite.datasets.camera_correction import CameraCorrection
 from gausslite.datasets.open import open_source
+from gausslite.domain.camera_correction import CameraCorrection
 
 pytest.importorskip("embreex", reason="the simulated home needs the extra `sim`")
 

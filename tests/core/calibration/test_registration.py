@@ -11,10 +11,10 @@ from tiny_sequences import write_replica, write_seven_scenes, write_tum
 
 from gausslite.calibration.registration import RegistrationEstimate, estimate_from_frames, find_registration
 from gausslite.datasets.images import RgbdImage, resize_rgbd
-from gausslite.datasets.intrinsics import FileIntrinsics
 from gausslite.datasets.open import open_source
-from gausslite.datasets.registered_source import DepthRegistration, register_depth
+from gausslite.datasets.registered_source import register_depth
 from gausslite.domain.camera import Camera
+from gausslite.domain.depth_registration import DepthRegistration, FileIntrinsics
 from gausslite.domain.errors import DatasetError
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import inverse

@@ -8,11 +8,12 @@ import cv2
 import numpy as np
 import pytest
 
-from gausslite.datasets.camera_correction import CameraCorrection, correct_frame, ideal_camera
+from gausslite.datasets.camera_correction import correct_frame, ideal_camera
 from gausslite.datasets.corrected_source import CorrectedSource
 from gausslite.datasets.intrinsics import read_folder_camera
 from gausslite.datasets.open import open_source
 from gausslite.domain.camera import Camera
+from gausslite.domain.camera_correction import CameraCorrection
 from gausslite.domain.errors import DatasetError, InvalidInputError
 from gausslite.domain.frame import Frame
 from gausslite.domain.lens import Lens, LensModel

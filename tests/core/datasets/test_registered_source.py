@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from tiny_sequences import write_seven_scenes
 
-from gausslite.datasets.intrinsics import FileIntrinsics
 from gausslite.datasets.open import open_source
-from gausslite.datasets.registered_source import DepthRegistration, RegisteredSource, register_depth
+from gausslite.datasets.registered_source import RegisteredSource, register_depth
 from gausslite.domain.camera import Camera
+from gausslite.domain.depth_registration import DepthRegistration, FileIntrinsics
 from gausslite.domain.errors import InvalidInputError
 from gausslite_agent.settings import parse_arguments
 

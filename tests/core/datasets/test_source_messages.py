@@ -12,7 +12,7 @@ from tiny_sequences import write_seven_scenes, write_tum
 from gausslite.cli.source_options import open_with_warnings, resolve_pose_prior, selected_regions
 from gausslite.config.values import AUTO, NONE
 from gausslite.datasets.open import open_source
-from gausslite.datasets.registered_source import DepthRegistration
+from gausslite.domain.depth_registration import DepthRegistration
 from gausslite.domain.pose_exposure_prior import PoseExposurePrior
 
 CAMERA = DepthRegistration.parse("20,20,7.5,5.5,-0.01,0,0")

@@ -14,12 +14,12 @@ from gausslite.cli.source_options import (
     resolve_pose_prior,
 )
 from gausslite.config.values import AUTO
-from gausslite.datasets.camera_correction import CameraCorrection
 from gausslite.datasets.held_out import HeldOutSplit
 from gausslite.datasets.open import open_source
 from gausslite.datasets.regions import choose_regions
-from gausslite.datasets.registered_source import DepthRegistration
 from gausslite.datasets.selection import frame_size, select_frames
+from gausslite.domain.camera_correction import CameraCorrection
+from gausslite.domain.depth_registration import DepthRegistration
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.pose_exposure_prior import PoseExposurePrior
 from gausslite.domain.region import Region
