@@ -24,6 +24,7 @@ from gausslite.evaluation.views import view_map
 from gausslite.mission.build import EstimatorFactory, build_task_mapper
 from gausslite.mission.checkpoint import SavedRun, save_run
 from gausslite.mission.frame_stream import CorruptFrames
+from gausslite.mission.keyframe_views import write_keyframe_views
 from gausslite.mission.results import (
     PREVIEW,
     peak_rss_mib,
@@ -66,7 +67,13 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--test-every", metavar="N", type=int, help=HOLD_OUT_HELP)
     group = parser.add_argument_group("output")
     add = group.add_argument
-    add("--out", metavar="DIR", type=Path, required=True, help="folder for map.ply, report.json and preview.png")
+    add(
+        "--out",
+        metavar="DIR",
+        type=Path,
+        required=True,
+        help="folder for map.ply, report.json, keyframes.json and preview.png",
+    )
     add_switch(group, "--overwrite", "replace a map in --out (--resume does so without this option)")
     add("--world-frame", metavar="NAME", help=_WORLD_FRAME_HELP)
     add("--save-state", metavar="FILE", type=Path, help="save the whole run here at its end, for --resume")
@@ -134,7 +141,7 @@ class _Run:
         return result
 
     def write_results(self, result: MissionResult) -> None:
-        """Write map.ply, report.json and preview.png. Raises StorageError."""
+        """Write map.ply, report.json, keyframes.json and preview.png. Raises StorageError."""
         options, mission = self._options, self._inputs.mission
         self._notes = (*self._mapper.notes, *_unseen_notes(options, result))
         self._report = {
@@ -150,6 +157,7 @@ class _Run:
         }
         prepare_folder(options.out)
         write_results(options.out, self._gaussians, self._report, self._inputs.world_frame(options))
+        write_keyframe_views(options.out, self._mapper.keyframes())
         keyframes = [(keyframe.frame, keyframe.relevance.roi) for keyframe in self._mapper.keyframes()]
         if keyframes:
             viewer = view_map(self._gaussians, mission.backend, mission.threads)

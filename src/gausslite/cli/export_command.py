@@ -1,0 +1,86 @@
+"""`gausslite export`: write a map in the formats of other tools."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+from gausslite.cli.progress import progress_bar
+from gausslite.config.numbers import Number
+from gausslite.domain.errors import InvalidInputError
+from gausslite.export.formats import FORMATS, ExportSettings, read_map
+from gausslite.export.occupancy import OccupancySettings
+from gausslite.mission.keyframe_views import KeyframeView
+from gausslite.mission.results import as_text, prepare_folder, require_absent
+
+_MESH_VOXEL_M, _OCCUPANCY_VOXEL_M = 0.01, 0.05
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `gausslite export`."""
+    add = parser.add_argument
+    formats = "; ".join(f"{name}: {each.summary} ({each.suffix})" for name, each in FORMATS.items())
+    add("map", metavar="RUN", type=Path, help="a results folder of `gausslite map`, or a PLY file")
+    add("--to", metavar="FORMAT", choices=tuple(FORMATS), required=True, help=formats)
+    add("--out", metavar="FILE", type=Path, help="the file to write (default: RUN/map with the format's suffix)")
+    add("--region", choices=("roi", "all"), help="only the task's region, or all (default: depends on the format)")
+    add(
+        "--voxel",
+        metavar="M",
+        type=Number("voxel", float, 0.001, 10),
+        help="voxel size in metres (default: 0.05; mesh: 0.01)",
+    )
+    add(
+        "--min-opacity",
+        metavar="A",
+        type=Number("min-opacity", float, 0, 1),
+        default=0.3,
+        help="for octomap and nav2 (default: 0.3)",
+    )
+    add("--overwrite", action="store_true", help="replace an existing file")
+    add("--json", action="store_true", help="print JSON for scripts")
+    parser.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Read the map and write the file. Returns the exit code."""
+    chosen = FORMATS[options.to]
+    region = options.region or ("roi" if chosen.region_only else "all")
+    content = read_map(options.map, region)
+    out = options.out or _default_file(options.map, chosen.suffix)
+    _require_separate(out, options.map)
+    if not options.overwrite:
+        require_absent(out)
+    prepare_folder(out.absolute().parent)
+    voxel_m = options.voxel or (_MESH_VOXEL_M if options.to == "mesh" else _OCCUPANCY_VOXEL_M)
+    occupancy = OccupancySettings(voxel_m=voxel_m, min_opacity=options.min_opacity)
+    chosen.write(out, content, ExportSettings(occupancy, _with_progress))
+    size = out.stat().st_size
+    if options.json:
+        print(as_text({"file": str(out), "format": options.to, "gaussians": len(content.chosen), "bytes": size}))
+    else:
+        part = "of the task's region" if region == "roi" else "of the map"
+        print(f"{len(content.chosen)} Gaussians {part} → {out} ({chosen.summary}, {size / 1e6:.2f} MB)")
+    return 0
+
+
+def _default_file(source: Path, suffix: str) -> Path:
+    """Return the output's default path, next to the map; an exported PLY never replaces the map itself."""
+    base = source / "map" if source.is_dir() else source.with_suffix("")
+    return base.with_name(base.name + (".export.ply" if suffix == ".ply" else suffix))
+
+
+def _require_separate(out: Path, source: Path) -> None:
+    """Raise InvalidInputError if the output is the map that is read, also through a link."""
+    file = source / "map.ply" if source.is_dir() else source
+    if out.resolve() == file.resolve() or (out.exists() and out.samefile(file)):
+        raise InvalidInputError(f"--out {out}: expected a file that is not the input")
+
+
+def _with_progress(views: Iterable[KeyframeView]) -> Iterator[KeyframeView]:
+    listed = list(views)
+    with progress_bar(len(listed), "fusing depth", "view") as bar:
+        for view in listed:
+            yield view
+            bar.update()

@@ -1,0 +1,117 @@
+"""The table of export formats, and the content of a map that they write."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import MappingProxyType
+
+import numpy as np
+
+from gausslite.codec.ply import read_ply, read_world_frame, write_ply
+from gausslite.domain.errors import InvalidInputError, MapFileError
+from gausslite.domain.gaussians import Gaussians
+from gausslite.evaluation.views import view_map
+from gausslite.export.mesh import write_mesh
+from gausslite.export.occupancy import OccupancySettings, write_nav2, write_octomap
+from gausslite.export.point_formats import write_las, write_pcd
+from gausslite.export.splat_formats import write_gltf, write_splat, write_spz
+from gausslite.mission.keyframe_views import KeyframeView, read_keyframe_views
+from gausslite.mission.results import read_report, write_json
+
+Progress = Callable[[Iterable[KeyframeView]], Iterable[KeyframeView]]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MapContent:
+    """A map with what a results folder holds beside it; `views` and `report` are empty for a single PLY file.
+
+    gaussians: the whole map. chosen: the Gaussians to write.
+    """
+
+    gaussians: Gaussians
+    chosen: Gaussians
+    world_frame: str = ""
+    views: Sequence[KeyframeView] = ()
+    report: Mapping[str, object] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class ExportSettings:
+    """occupancy: for octomap and nav2; its voxel size is also the mesh's. progress: wraps the rendered views."""
+
+    occupancy: OccupancySettings = field(default_factory=OccupancySettings)
+    progress: Progress = iter
+
+
+@dataclass(frozen=True, slots=True)
+class Format:
+    """suffix: of the written file. summary: one line for people. region_only: by default only the task's region."""
+
+    suffix: str
+    summary: str
+    write: Callable[[Path, MapContent, ExportSettings], None]
+    region_only: bool = False
+
+
+def read_map(path: Path, region: str) -> MapContent:
+    """Read a results folder or a PLY file. region: `roi` chooses the Gaussians of the task's region, `all` all.
+
+    Raises MapFileError; InvalidInputError if the region is asked for and the map has none.
+    """
+    folder, file = (path, path / "map.ply") if path.is_dir() else (None, path)
+    if not file.is_file():
+        raise MapFileError(f"{path}: expected a results folder with map.ply, or a PLY file, got neither")
+    gaussians = read_ply(file)
+    chosen = gaussians if region == "all" else gaussians.take(gaussians.active)
+    if not len(chosen) and len(gaussians):
+        raise InvalidInputError(f"{path}: the map has no region of a task; export all of it with --region all")
+    views = [] if folder is None else read_keyframe_views(folder)
+    return MapContent(gaussians, chosen, read_world_frame(file), views, {} if folder is None else read_report(folder))
+
+
+def _objects(path: Path, content: MapContent, _settings: ExportSettings) -> None:
+    """Write the objects that the mission confirmed, and the extent of the chosen Gaussians, as JSON."""
+    means_m = content.chosen.means_m
+    bounds = [] if not len(means_m) else np.stack([means_m.min(axis=0), means_m.max(axis=0)]).tolist()
+    write_json(
+        path,
+        {
+            "world_frame": content.world_frame,
+            "task": content.report.get("task"),
+            "objects": content.report.get("objects", []),
+            "gaussians": len(content.chosen),
+            "bounds_m": bounds,
+        },
+    )
+
+
+def _mesh(path: Path, content: MapContent, settings: ExportSettings) -> None:
+    viewer, voxel_m = view_map(content.gaussians), settings.occupancy.voxel_m
+    write_mesh(path, content.chosen, content.views, viewer, voxel_m, settings.progress)
+
+
+FORMATS: Mapping[str, Format] = MappingProxyType(
+    {
+        "ply": Format(
+            ".ply", "3D Gaussian splatting PLY", lambda path, map_, _: write_ply(path, map_.chosen, map_.world_frame)
+        ),
+        "spz": Format(".spz", "compressed splats (SPZ)", lambda path, map_, _: write_spz(path, map_.chosen)),
+        "splat": Format(".splat", "splats of 32 bytes", lambda path, map_, _: write_splat(path, map_.chosen)),
+        "gltf": Format(".glb", "KHR_gaussian_splatting", lambda path, map_, _: write_gltf(path, map_.chosen)),
+        "pcd": Format(".pcd", "coloured points", lambda path, map_, _: write_pcd(path, map_.chosen)),
+        "las": Format(".las", "coloured points (LAS 1.4)", lambda path, map_, _: write_las(path, map_.chosen)),
+        "octomap": Format(
+            ".bt",
+            "occupied voxels of the region",
+            lambda path, map_, settings: write_octomap(path, map_.chosen, settings.occupancy),
+            region_only=True,
+        ),
+        "nav2": Format(
+            ".yaml", "2D grid", lambda path, map_, settings: write_nav2(path, map_.chosen, settings.occupancy)
+        ),
+        "mesh": Format(".mesh.ply", "triangles of the region, from rendered depth", _mesh, region_only=True),
+        "json": Format(".json", "objects of the mission", _objects, region_only=True),
+    }
+)

@@ -1,0 +1,140 @@
+"""Reconstruct a triangle mesh: fuse rendered depth images to a truncated signed distance function (TSDF)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float32, Float64, Int32
+from numpy import ndarray
+
+from gausslite.codec.files import write_atomic
+from gausslite.domain.errors import InvalidInputError
+from gausslite.domain.gaussians import Gaussians
+from gausslite.domain.pose import inverse, transform_points
+from gausslite.evaluation.views import MapViewer
+from gausslite.export.packages import import_extra
+from gausslite.mission.keyframe_views import KeyframeView
+
+_TRUNCATION_VOXELS = 4.0
+_MIN_ALPHA = 0.5
+_MAX_VOXELS = 1 << 24
+_MIN_WEIGHT = 1.0
+_BOUNDS_PERCENTILES = (0.5, 99.5)
+_VERTEX = np.dtype([("position_m", "<f4", 3), ("rgb", "u1", 3)])
+_FACE = np.dtype([("count", "u1"), ("vertices", "<i4", 3)])
+
+
+@dataclass(eq=False)
+class TsdfVolume:
+    """A grid of signed distances to the surface, in units of the truncation distance, with weights and colours.
+
+    Follows Curless and Levoy (1996): each view adds its distance along the viewing ray, with weight 1.
+    """
+
+    origin_m: Float64[ndarray, "3"]
+    voxel_m: float
+    shape: tuple[int, int, int]
+    distances: Float32[ndarray, "n"] = field(init=False)
+    weights: Float32[ndarray, "n"] = field(init=False)
+    colours: Float32[ndarray, "n 3"] = field(init=False)
+
+    def __post_init__(self) -> None:
+        count = int(np.prod(self.shape))
+        if count > _MAX_VOXELS:
+            raise InvalidInputError(f"mesh: expected at most {_MAX_VOXELS} voxels, got {count}; use a larger --voxel")
+        self.distances = np.ones(count, np.float32)
+        self.weights = np.zeros(count, np.float32)
+        self.colours = np.zeros((count, 3), np.float32)
+        indices = np.stack(np.meshgrid(*(np.arange(n) for n in self.shape), indexing="ij"), axis=-1).reshape(-1, 3)
+        self._centres_m = (self.origin_m + (indices + 0.5) * self.voxel_m).astype(np.float32)
+
+    def integrate(self, view: KeyframeView, rendering_depth_m: ndarray, alpha: ndarray, rgb: ndarray) -> None:
+        """Add one rendered view. rendering_depth_m: distance along the optical axis; alpha: opacity of the pixel."""
+        rows, pixels, depth_m = self._visible(view)
+        surface_m = rendering_depth_m[pixels]
+        signed = (surface_m - depth_m) / (_TRUNCATION_VOXELS * self.voxel_m)
+        kept = (alpha[pixels] > _MIN_ALPHA) & (surface_m > 0) & (signed > -1)
+        rows, signed = rows[kept], np.minimum(signed[kept], 1)
+        new_weights = self.weights[rows] + 1
+        self.distances[rows] += (signed - self.distances[rows]) / new_weights
+        self.colours[rows] += (rgb[tuple(axis[kept] for axis in pixels)] - self.colours[rows]) / new_weights[:, None]
+        self.weights[rows] = new_weights
+
+    def _visible(self, view: KeyframeView) -> tuple[ndarray, tuple[ndarray, ndarray], ndarray]:
+        """Return the voxels inside the image, their pixels (row, column) and their depths in metres."""
+        camera = view.camera
+        points = transform_points(inverse(view.T_world_camera), self._centres_m)
+        depth_m = points[:, 2]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            columns = camera.fx_px * points[:, 0] / depth_m + camera.cx_px
+            image_rows = camera.fy_px * points[:, 1] / depth_m + camera.cy_px
+        inside = (depth_m > self.voxel_m) & (columns >= 0) & (columns < camera.width_px)
+        inside &= (image_rows >= 0) & (image_rows < camera.height_px)
+        rows = np.flatnonzero(inside)
+        return rows, (image_rows[rows].astype(np.intp), columns[rows].astype(np.intp)), depth_m[rows]
+
+    def observed(self) -> Bool[ndarray, "x y z"]:
+        """Return the mask of voxels that some view has seen."""
+        return (self.weights >= _MIN_WEIGHT).reshape(self.shape)
+
+
+def write_mesh(
+    path: Path,
+    gaussians: Gaussians,
+    views: Sequence[KeyframeView],
+    viewer: MapViewer,
+    voxel_m: float,
+    progress: Callable[[Iterable[KeyframeView]], Iterable[KeyframeView]] = iter,
+) -> None:
+    """Write a coloured triangle mesh of the space around the Gaussians as a binary PLY file.
+
+    views: where to render the map from; the mission's keyframes show each surface from its free side. viewer: renders
+    the whole map, because other surfaces hide parts of the region. Raises InvalidInputError without views, without a
+    surface or without the scikit-image package, StorageError.
+    """
+    measure = import_extra("skimage.measure", "export", "meshes")
+    if not views or not len(gaussians):
+        raise InvalidInputError("mesh: expected a results folder with keyframes.json and a map that is not empty")
+    volume = _volume_around(gaussians, voxel_m)
+    for view in progress(views):
+        rendering = viewer.render(view.camera, view.T_world_camera)
+        volume.integrate(view, rendering.expected_depth_m(), rendering.alpha, rendering.rgb)
+    distances, observed = volume.distances.reshape(volume.shape), volume.observed()
+    if not (observed.any() and distances[observed].min() < 0 < distances[observed].max()):
+        raise InvalidInputError("mesh: expected a surface that the keyframes show, found none in the chosen Gaussians")
+    vertices, faces, _, _ = measure.marching_cubes(distances, 0.0, mask=observed)
+    colours = volume.colours.reshape(*volume.shape, 3)[tuple(np.round(vertices).astype(np.intp).T)]
+    positions_m = volume.origin_m + (vertices + 0.5) * voxel_m
+    write_atomic(path, _ply_mesh(positions_m.astype(np.float32), colours, faces.astype(np.int32)))
+
+
+def _volume_around(gaussians: Gaussians, voxel_m: float) -> TsdfVolume:
+    """Return an empty volume around the Gaussians without the farthest 0.5 % along each axis."""
+    low, high = np.percentile(gaussians.means_m.astype(np.float64), _BOUNDS_PERCENTILES, axis=0)
+    margin_m = (_TRUNCATION_VOXELS + 1) * voxel_m
+    origin_m = low - margin_m
+    shape = np.ceil((high + margin_m - origin_m) / voxel_m).astype(int)
+    return TsdfVolume(origin_m, voxel_m, (int(shape[0]), int(shape[1]), int(shape[2])))
+
+
+def _ply_mesh(
+    positions_m: Float32[ndarray, "v 3"], colours: Float32[ndarray, "v 3"], faces: Int32[ndarray, "f 3"]
+) -> bytes:
+    vertices = np.zeros(len(positions_m), _VERTEX)
+    vertices["position_m"], vertices["rgb"] = positions_m, np.clip(np.round(colours * 255), 0, 255)
+    triangles = np.zeros(len(faces), _FACE)
+    triangles["count"], triangles["vertices"] = 3, faces
+    header = [
+        "ply",
+        "format binary_little_endian 1.0",
+        f"element vertex {len(vertices)}",
+        *(f"property float {axis}" for axis in "xyz"),
+        *(f"property uchar {channel}" for channel in ("red", "green", "blue")),
+        f"element face {len(triangles)}",
+        "property list uchar int vertex_indices",
+        "end_header",
+    ]
+    return ("\n".join(header) + "\n").encode() + vertices.tobytes() + triangles.tobytes()

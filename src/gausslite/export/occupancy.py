@@ -1,0 +1,140 @@
+"""Find the voxels that the Gaussians occupy and write them for planners: OctoMap trees and nav2 grids.
+
+A map of Gaussians holds surfaces and no observation of free space. A voxel without a surface is therefore unknown in
+an OctoMap file, and a grid cell is free only where the map has a floor.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import yaml
+from jaxtyping import Float32, Float64, Int64, UInt8
+from numpy import ndarray
+
+from gausslite.codec.files import write_atomic, write_atomic_with
+from gausslite.domain.errors import InvalidInputError
+from gausslite.domain.gaussians import Gaussians
+from gausslite.export.packages import import_extra
+
+_EXTENT_SIGMAS = 1.5
+_MAX_SAMPLES_PER_AXIS = 33
+_MAX_GRID_CELLS = 1 << 26
+_OCCUPIED, _FREE, _UNKNOWN = 0, 254, 205
+"""Grey values of nav2's trinary map images."""
+_FLOOR_PERCENTILE = 2.0
+
+
+@dataclass(frozen=True, slots=True)
+class OccupancySettings:
+    """How Gaussians become occupied space.
+
+    voxel_m: side of a voxel or cell. min_opacity: Gaussians below it occupy nothing. height_m: the lowest and highest
+    obstacle above the floor that a robot can hit (nav2).
+    """
+
+    voxel_m: float = 0.05
+    min_opacity: float = 0.3
+    height_m: tuple[float, float] = (0.1, 1.8)
+
+
+def occupied_voxels(gaussians: Gaussians, settings: OccupancySettings) -> Int64[ndarray, "v 3"]:
+    """Return the indices floor(p / voxel_m) of all voxels that an ellipsoid of 1.5 standard deviations touches.
+
+    Each ellipsoid is sampled in steps of half a voxel, at most 33 per axis. The result is sorted and unique.
+    """
+    chosen = gaussians.take(gaussians.opacities >= settings.min_opacity)
+    if not len(chosen):
+        return np.zeros((0, 3), np.int64)
+    axes = _rotation_matrices(chosen.quats_wxyz) * (_EXTENT_SIGMAS * chosen.scales_m[:, None, :])
+    steps = np.ceil(2 * _EXTENT_SIGMAS * chosen.scales_m / (settings.voxel_m / 2)).astype(np.int64)
+    counts = np.clip(steps + 1 - steps % 2, 1, _MAX_SAMPLES_PER_AXIS)  # odd, so that the centre is a sample
+    found = []
+    for count in np.unique(counts, axis=0):  # all Gaussians with the same numbers of samples at once
+        rows = np.flatnonzero((counts == count).all(axis=1))
+        offsets = _ellipsoid_samples(count)
+        for part in np.array_split(rows, max(1, len(rows) * len(offsets) // 2_000_000)):
+            points = chosen.means_m[part, None, :] + np.einsum("nij,kj->nki", axes[part], offsets)
+            found.append(np.unique(np.floor(points.reshape(-1, 3) / settings.voxel_m).astype(np.int64), axis=0))
+    return np.unique(np.concatenate(found), axis=0)
+
+
+def write_octomap(path: Path, gaussians: Gaussians, settings: OccupancySettings) -> None:
+    """Write an OctoMap binary tree (.bt) of the occupied voxels; all other space is unknown.
+
+    Raises InvalidInputError without the pyoctomap package, StorageError.
+    """
+    octomap = import_extra("pyoctomap", "export", "OctoMap files")
+    tree = octomap.OcTree(settings.voxel_m)
+    for centre_m in (occupied_voxels(gaussians, settings) + 0.5) * settings.voxel_m:
+        tree.updateNode(centre_m, True, True)
+    tree.updateInnerOccupancy()
+    write_atomic_with(path, lambda partial: tree.writeBinary(str(partial)))
+
+
+def write_nav2(path: Path, gaussians: Gaussians, settings: OccupancySettings) -> None:
+    """Write a nav2 map: `path` is the YAML file, the image next to it has the suffix .pgm.
+
+    The grid lies in x and y, so the map's z axis must point up. The floor is at the 2nd percentile of the occupied
+    heights. Raises InvalidInputError if the grid is too large, StorageError.
+    """
+    image, origin_m = _grid(occupied_voxels(gaussians, settings), settings)
+    encoded, data = cv2.imencode(".pgm", image)
+    if not encoded:
+        raise InvalidInputError(f"nav2: expected an image that OpenCV can encode, got {image.shape}")
+    image_path = path.with_suffix(".pgm")
+    write_atomic(image_path, data.tobytes())
+    description = {
+        "image": image_path.name,
+        "mode": "trinary",
+        "resolution": settings.voxel_m,
+        "origin": [float(origin_m[0]), float(origin_m[1]), 0.0],
+        "negate": 0,
+        "occupied_thresh": 0.65,
+        "free_thresh": 0.25,
+    }
+    write_atomic(path, yaml.safe_dump(description, sort_keys=False).encode())
+
+
+def _grid(
+    voxels: Int64[ndarray, "v 3"], settings: OccupancySettings
+) -> tuple[UInt8[ndarray, "h w"], Float64[ndarray, "2"]]:
+    """Return the grid image, its first row at the largest y, and the position of its lower left corner in metres."""
+    if not len(voxels):
+        return np.full((1, 1), _UNKNOWN, np.uint8), np.zeros(2)
+    first, last = voxels.min(axis=0), voxels.max(axis=0)
+    width, height = (int(n) for n in (last - first + 1)[:2])
+    if width * height > _MAX_GRID_CELLS:
+        raise InvalidInputError(
+            f"nav2: expected at most {_MAX_GRID_CELLS} cells, got {width} x {height}; use a larger --voxel"
+        )
+    floor = np.percentile(voxels[:, 2], _FLOOR_PERCENTILE)
+    above_m = (voxels[:, 2] - floor) * settings.voxel_m
+    image = np.full((height, width), _UNKNOWN, np.uint8)
+    for values, mask in (
+        (_FREE, above_m < settings.height_m[0]),
+        (_OCCUPIED, (above_m >= settings.height_m[0]) & (above_m <= settings.height_m[1])),
+    ):
+        cells = voxels[mask, :2] - first[:2]
+        image[height - 1 - cells[:, 1], cells[:, 0]] = values
+    return image, first[:2] * settings.voxel_m
+
+
+def _ellipsoid_samples(count: Int64[ndarray, "3"]) -> Float32[ndarray, "k 3"]:
+    """Return a regular grid of points in the unit ball with this many points per axis."""
+    axes = [np.linspace(-1, 1, int(n)) if n > 1 else np.zeros(1) for n in count]
+    points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3).astype(np.float32)
+    return points[(points**2).sum(axis=1) <= 1 + 1e-6]
+
+
+def _rotation_matrices(quats_wxyz: Float32[ndarray, "n 4"]) -> Float32[ndarray, "n 3 3"]:
+    w, x, y, z = (quats_wxyz / np.maximum(np.linalg.norm(quats_wxyz, axis=1, keepdims=True), 1e-12)).T
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)

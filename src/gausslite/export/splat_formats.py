@@ -1,0 +1,143 @@
+"""Encode all Gaussians for splat viewers: .splat, SPZ and glTF with KHR_gaussian_splatting.
+
+These formats have no columns for kappa, the active flag and the target; a map's own PLY file keeps them.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float32
+from numpy import ndarray
+
+from gausslite.codec.files import write_atomic, write_atomic_with
+from gausslite.codec.ply import SH_C0
+from gausslite.domain.gaussians import Gaussians
+from gausslite.export.packages import import_extra
+
+_SPLAT_ROW = np.dtype([("mean_m", "<f4", 3), ("scale_m", "<f4", 3), ("rgba", "u1", 4), ("quat_wxyz", "u1", 4)])
+_OPACITY_EDGE = 1e-6
+_GLB_MAGIC, _GLB_VERSION, _GLB_JSON, _GLB_BINARY = 0x46546C67, 2, 0x4E4F534A, 0x004E4942
+_FLOAT, _POINTS = 5126, 0
+_Z_UP_TO_Y_UP_XYZW = (-np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5))
+"""The rotation that a glTF node applies to a map whose z axis points up; glTF's y axis points up."""
+
+
+def write_splat(path: Path, gaussians: Gaussians) -> None:
+    """Write a .splat file: 32 bytes a Gaussian, colours and rotations in 8 bits; the most visible Gaussians first.
+
+    Viewers show such files while they load; therefore the rows are sorted by opacity times volume. Raises StorageError.
+    """
+    order = np.argsort(-gaussians.opacities * np.prod(gaussians.scales_m, axis=1), kind="stable")
+    ordered = gaussians.take(order)
+    rows = np.zeros(len(ordered), _SPLAT_ROW)
+    rows["mean_m"], rows["scale_m"] = ordered.means_m, ordered.scales_m
+    rows["rgba"][:, :3] = _as_bytes(ordered.rgb)
+    rows["rgba"][:, 3] = _as_bytes(ordered.opacities)
+    rows["quat_wxyz"] = np.clip(np.round(_unit_quaternions(ordered) * 128 + 128), 0, 255)
+    write_atomic(path, rows.tobytes())
+
+
+def write_spz(path: Path, gaussians: Gaussians) -> None:
+    """Write an SPZ file with the gsply library. Raises InvalidInputError without it, StorageError."""
+    gsply = import_extra("gsply", "export", "SPZ files")
+    opacity = np.clip(gaussians.opacities.astype(np.float64), _OPACITY_EDGE, 1 - _OPACITY_EDGE)
+    data = gsply.GSData(
+        means=gaussians.means_m,
+        scales=np.log(np.maximum(gaussians.scales_m, np.finfo(np.float32).tiny)),
+        quats=_unit_quaternions(gaussians),
+        opacities=np.log(opacity / (1 - opacity)).astype(np.float32),
+        sh0=_harmonics(gaussians),
+        shN=np.zeros((len(gaussians), 0, 3), np.float32),
+    )
+    write_atomic_with(path, lambda partial: gsply.write_spz(str(partial), data))
+
+
+def write_gltf(path: Path, gaussians: Gaussians) -> None:
+    """Write a binary glTF file (.glb): points with the extension KHR_gaussian_splatting.
+
+    Scales are metres and opacities linear. COLOR_0 lets viewers without the extension show coloured points. Raises
+    StorageError.
+    """
+    colours = np.concatenate([np.clip(gaussians.rgb, 0, 1), gaussians.opacities[:, None]], axis=1)
+    columns = {
+        "POSITION": gaussians.means_m,
+        "COLOR_0": colours,
+        "KHR_gaussian_splatting:ROTATION": _unit_quaternions(gaussians)[:, [1, 2, 3, 0]],
+        "KHR_gaussian_splatting:SCALE": gaussians.scales_m,
+        "KHR_gaussian_splatting:OPACITY": gaussians.opacities,
+        "KHR_gaussian_splatting:SH_DEGREE_0_COEF_0": _harmonics(gaussians),
+    }
+    write_atomic(path, _glb(columns, len(gaussians)))
+
+
+def _glb(columns: dict[str, Float32[ndarray, "n *k"]], count: int) -> bytes:
+    """Return a GLB container: header, JSON chunk, binary chunk with one buffer view per column."""
+    if not count:
+        scene = {"asset": _asset(), "scene": 0, "scenes": [{"nodes": []}]}
+        text = _padded(json.dumps(scene).encode(), b" ")
+        return struct.pack("<IIIII", _GLB_MAGIC, _GLB_VERSION, 20 + len(text), len(text), _GLB_JSON) + text
+    views, accessors, chunks, offset = [], [], [], 0
+    for name, values in columns.items():
+        data = np.ascontiguousarray(values, "<f4").tobytes()
+        views.append({"buffer": 0, "byteOffset": offset, "byteLength": len(data)})
+        kind = "SCALAR" if values.ndim == 1 else f"VEC{values.shape[1]}"
+        accessor = {"bufferView": len(views) - 1, "componentType": _FLOAT, "count": count, "type": kind}
+        if name == "POSITION":  # glTF requires the bounds of positions
+            accessor |= {"min": values.min(axis=0).tolist(), "max": values.max(axis=0).tolist()}
+        accessors.append(accessor)
+        chunks.append(data)
+        offset += len(data)
+    scene = _gltf_scene({name: i for i, name in enumerate(columns)}) | {
+        "buffers": [{"byteLength": offset}],
+        "bufferViews": views,
+        "accessors": accessors,
+    }
+    text, binary = _padded(json.dumps(scene).encode(), b" "), b"".join(chunks)
+    total = 12 + 8 + len(text) + 8 + len(binary)
+    return (
+        struct.pack("<III", _GLB_MAGIC, _GLB_VERSION, total)
+        + struct.pack("<II", len(text), _GLB_JSON)
+        + text
+        + struct.pack("<II", len(binary), _GLB_BINARY)
+        + binary
+    )
+
+
+def _gltf_scene(attributes: dict[str, int]) -> dict[str, object]:
+    extension = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
+    primitive = {"mode": _POINTS, "attributes": attributes, "extensions": {"KHR_gaussian_splatting": extension}}
+    return {
+        "asset": _asset(),
+        "extensionsUsed": ["KHR_gaussian_splatting"],
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0, "rotation": [float(value) for value in _Z_UP_TO_Y_UP_XYZW]}],
+        "meshes": [{"primitives": [primitive]}],
+    }
+
+
+def _asset() -> dict[str, str]:
+    return {"version": "2.0", "generator": "GaussLite"}
+
+
+def _padded(data: bytes, fill: bytes) -> bytes:
+    return data + fill * (-len(data) % 4)
+
+
+def _as_bytes(values: Float32[ndarray, "n *k"]) -> ndarray:
+    return np.clip(np.round(values * 255), 0, 255).astype(np.uint8)
+
+
+def _harmonics(gaussians: Gaussians) -> Float32[ndarray, "n 3"]:
+    """Return the colours as coefficients of the spherical harmonic of degree 0."""
+    return ((gaussians.rgb - 0.5) / SH_C0).astype(np.float32)
+
+
+def _unit_quaternions(gaussians: Gaussians) -> Float32[ndarray, "n 4"]:
+    lengths = np.linalg.norm(gaussians.quats_wxyz, axis=1, keepdims=True)
+    identity = np.array([1, 0, 0, 0], np.float32)
+    return np.where(lengths > 0, gaussians.quats_wxyz / np.maximum(lengths, 1e-12), identity).astype(np.float32)

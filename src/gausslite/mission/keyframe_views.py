@@ -1,0 +1,71 @@
+"""Write and read the camera views of a mission's keyframes: keyframes.json in the results folder."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64
+from numpy import ndarray
+
+from gausslite.domain.camera import Camera
+from gausslite.domain.errors import GaussLiteError, MapFileError
+from gausslite.domain.pose import require_rigid
+from gausslite.mapping.keyframes import Keyframe
+from gausslite.mission.results import write_json
+
+_FILE = "keyframes.json"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class KeyframeView:
+    """One keyframe's camera in its refined pose, without the images.
+
+    index: the frame's index in its sequence. roi_pixels: number of pixels in the task's region.
+    """
+
+    index: int
+    capture_time_ns: int
+    camera: Camera
+    T_world_camera: Float64[ndarray, "4 4"]
+    roi_pixels: int
+
+
+def write_keyframe_views(folder: Path, keyframes: Sequence[Keyframe]) -> None:
+    """Write keyframes.json. Raises StorageError."""
+    views = [
+        {
+            "index": keyframe.frame.index,
+            "capture_time_ns": keyframe.frame.capture_time_ns,
+            "camera": asdict(keyframe.frame.camera),
+            "T_world_camera": keyframe.frame.T_world_camera.tolist(),
+            "roi_pixels": int(np.count_nonzero(keyframe.relevance.roi)),
+        }
+        for keyframe in keyframes
+    ]
+    write_json(folder / _FILE, {"keyframes": views})
+
+
+def read_keyframe_views(folder: Path) -> list[KeyframeView]:
+    """Read keyframes.json, oldest keyframe first; an empty list if the folder has none.
+
+    Raises MapFileError if the file is not one that `write_keyframe_views` writes.
+    """
+    path = folder / _FILE
+    if not path.exists():
+        return []
+    try:
+        return [_view(record) for record in json.loads(path.read_bytes())["keyframes"]]
+    except (OSError, ValueError, KeyError, TypeError, RecursionError, GaussLiteError) as error:
+        raise MapFileError(f"{path}: expected the keyframes of a mission, got an unreadable file: {error}") from error
+
+
+def _view(record: Mapping[str, object]) -> KeyframeView:
+    pose = np.array(record["T_world_camera"], np.float64)
+    require_rigid("T_world_camera", pose)
+    camera = Camera(**record["camera"])  # type: ignore[arg-type]
+    index, time_ns, roi_pixels = (int(str(record[name])) for name in ("index", "capture_time_ns", "roi_pixels"))
+    return KeyframeView(index, time_ns, camera, pose, roi_pixels)
