@@ -12,6 +12,7 @@ from gausslite.domain.arguments import require_instance, require_number, require
 from gausslite.domain.camera_correction import CameraCorrection
 from gausslite.domain.depth_registration import DepthRegistration
 from gausslite.domain.errors import InvalidInputError
+from gausslite.domain.object_names import same_kind
 from gausslite.domain.pose import UpAxis
 from gausslite.domain.pose_exposure_prior import PoseExposurePrior
 from gausslite.domain.region import BallRegion, Region
@@ -19,7 +20,6 @@ from gausslite.mapping.policies import TASK, UNIFORM, disable, follows_task, pol
 from gausslite.mapping.settings import MapperSettings
 from gausslite.mapping.stages import SkippableStage
 from gausslite.mission.frame_scheduler import SchedulerSettings
-from gausslite.perception.vocabulary import same_kind
 from gausslite.render.cpu_kernels import MAX_THREADS
 
 DEFAULT_MAX_GAUSSIANS = 150_000

@@ -12,8 +12,8 @@ from numpy import ndarray
 
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
+from gausslite.domain.object_names import is_furniture, is_generic, is_surface
 from gausslite.domain.relevance import Detection
-from gausslite.perception.vocabulary import is_furniture, is_generic, is_surface
 
 
 @runtime_checkable

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from gausslite.domain.frame import Frame
+from gausslite.domain.object_names import same_kind
 from gausslite.domain.region import Region
 from gausslite.domain.relevance import Detection
 from gausslite.perception.detect import bounding_box
-from gausslite.perception.vocabulary import same_kind
 
 
 class RegionDetector:

@@ -11,7 +11,7 @@ from jaxtyping import Int64
 from numpy import ndarray
 
 from gausslite.domain.errors import KernelError, ModelFileError
-from gausslite.perception.vocabulary import head_of
+from gausslite.domain.object_names import head_of
 
 _UNKNOWN: Final = "[UNK]"
 _REQUIRED: Final = ("[PAD]", _UNKNOWN, "[CLS]", "[SEP]", ".")

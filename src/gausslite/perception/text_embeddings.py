@@ -18,7 +18,7 @@ from jaxtyping import Float32
 from numpy import ndarray
 
 from gausslite.domain.errors import ModelFileError
-from gausslite.perception.vocabulary import SYNONYMS, head_of, is_generic, is_structure, normalised_noun
+from gausslite.domain.object_names import SYNONYMS, head_of, is_generic, is_structure, normalised_noun
 
 _MIN_SIMILARITY: Final = 0.5
 _MIN_MARGIN: Final = 0.10

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from gausslite.domain.errors import InvalidInputError, MapFileError
 from gausslite.domain.frame import Frame
+from gausslite.domain.object_names import is_generic
 from gausslite.domain.objects import ObjectLandmark
 from gausslite.domain.pose import UpAxis, require_rigid, rotation_angle_deg, translation_m, unit_up_axis
 from gausslite.domain.relevance import NO_TARGET, Detection, RelevanceMap
@@ -23,11 +24,10 @@ from gausslite.perception.detect import Segmenter
 from gausslite.perception.evidence import EvidenceSettings, VisibilityCheck
 from gausslite.perception.foreground import foreground_mask
 from gausslite.perception.object_map import Landmark, Observation
-from gausslite.perception.object_report import describe_landmark
+from gausslite.perception.object_report import describe_landmarks
 from gausslite.perception.relations import SpatialSettings
 from gausslite.perception.reproject import Frustum, lift_frustum, mask_in_frustum, reprojected_box_px
 from gausslite.perception.spatial import SpatialFilter, lift_observation
-from gausslite.perception.vocabulary import is_generic
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,8 +88,8 @@ class TargetTracker:
 
     @property
     def objects(self) -> tuple[ObjectLandmark, ...]:
-        """The confirmed objects of the task."""
-        return tuple(describe_landmark(each, self._graph) for each in self._filter.confirmed_landmarks)
+        """The confirmed objects of the task, in the order of their first detection."""
+        return describe_landmarks(self._filter.confirmed_landmarks, self._graph)
 
     def state(self) -> State:
         """Return landmarks, propagated detections and the keyframe's pose as named arrays."""

@@ -17,9 +17,9 @@ from gausslite.config.values import read_names
 from gausslite.datasets.selection import frame_size, select_frames
 from gausslite.datasets.source import Source
 from gausslite.domain.errors import InvalidInputError
+from gausslite.domain.object_names import head_of, same_kind
 from gausslite.domain.region import Region
 from gausslite.mission.results import as_text, prepare_folder
-from gausslite.perception.vocabulary import head_of, same_kind
 from gausslite.task.rules import RuleParser
 from gausslite_bench.perception.contact_sheet import PerceptionSheet
 from gausslite_bench.perception.stage_scores import PerceptionBench, TaskQuery, TaskScore

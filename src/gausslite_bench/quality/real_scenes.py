@@ -17,11 +17,11 @@ from gausslite.datasets.regions import balls_for_small_objects, choose_regions, 
 from gausslite.datasets.source import Source
 from gausslite.domain.depth_registration import DepthRegistration
 from gausslite.domain.errors import InvalidInputError
+from gausslite.domain.object_names import head_of
 from gausslite.domain.pose import UpAxis
 from gausslite.domain.pose_exposure_prior import PoseExposurePrior
 from gausslite.evaluation.views import MIN_ROI_PIXELS, HeldOutView
 from gausslite.mission.settings import SceneInfo
-from gausslite.perception.vocabulary import head_of
 from gausslite_bench.quality.scenes import PosePolicy, Scene, UnseenRegionError, make_scene, require_count
 
 REAL_CAMERA = PosePolicy(PoseExposurePrior(translation_m=0.01, rotation_deg=0.5, gain=0.1, offset=0.03), fit_views=True)
