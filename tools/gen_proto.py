@@ -4,7 +4,7 @@
     tools/gen_proto.py            write the code
     tools/gen_proto.py --check    generate to a temporary folder and compare; exit 1 where the committed code is stale
 
-The compiler lives in its own environment because generated code refuses a runtime older than its compiler.
+The compiler has an environment of its own, because generated code refuses a runtime older than its compiler.
 """
 
 from __future__ import annotations

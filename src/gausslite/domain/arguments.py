@@ -1,4 +1,4 @@
-"""Check the types of arguments of the Python API: an error names the argument, what is right and what was received."""
+"""Check the types of arguments of the Python API: errors name the argument, what was expected and what was received."""
 
 from __future__ import annotations
 
@@ -8,19 +8,19 @@ from gausslite.domain.errors import InvalidInputError
 
 
 def require_instance(name: str, value: object, kind: type | tuple[type, ...], expected: str) -> None:
-    """Raise InvalidInputError unless the value has the type; expected: what is right, for the message."""
+    """Raise InvalidInputError unless the value has the type; expected: a description of the type, for the message."""
     if not isinstance(value, kind):
         raise InvalidInputError(f"{name}: expected {expected}, got {describe(value)}")
 
 
 def require_whole(name: str, value: object) -> None:
-    """Raise InvalidInputError unless the value is a whole number; True and False are none."""
+    """Raise InvalidInputError unless the value is a whole number; True and False are not numbers."""
     if isinstance(value, bool) or not isinstance(value, numbers.Integral):
         raise InvalidInputError(f"{name}: expected a whole number, got {describe(value)}")
 
 
 def require_number(name: str, value: object) -> None:
-    """Raise InvalidInputError unless the value is a real number; True and False are none."""
+    """Raise InvalidInputError unless the value is a real number; True and False are not numbers."""
     if isinstance(value, bool) or not isinstance(value, numbers.Real):
         raise InvalidInputError(f"{name}: expected a number, got {describe(value)}")
 
@@ -35,6 +35,6 @@ def require_size(name: str, value: object) -> None:
 
 
 def describe(value: object) -> str:
-    """Return a short text of a value for messages: its type and the start of its form."""
+    """Return a short text of a value for messages: its type and the start of its text."""
     text = repr(value)
     return f"{type(value).__name__} {text if len(text) <= 40 else text[:37] + '...'}"

@@ -15,10 +15,11 @@ MAX_REMOVED_VOXELS = 100_000
 
 
 class RevisionLog:
-    """The last change of every voxel of a map; a watcher reads from it what it has missed.
+    """Records the last change of every voxel of a map, so that a watcher can get the changes that it has missed.
 
-    The log is bounded by the map, plus the latest `max_removed` voxels that became empty. A watcher that misses an
-    older removal has to begin with a snapshot. `first_revision` must exceed all revisions from before a restart.
+    The log has one entry for each voxel of the map, plus the latest `max_removed` voxels that became empty. A watcher
+    that misses an older removal has to begin with a snapshot. `first_revision` must exceed all revisions from before a
+    restart.
     """
 
     def __init__(self, first_revision: int, max_removed: int = MAX_REMOVED_VOXELS) -> None:

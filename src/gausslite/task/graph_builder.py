@@ -61,9 +61,9 @@ class GraphBuilder:
             self._new_clause(None)
             self._negated, self._clause.statement = False, chunk.kind is ChunkKind.STATEMENT
         elif chunk.kind is ChunkKind.ANAPHOR:
-            self._back_reference(chunk.word, before)
+            self._resolve_back_reference(chunk.word, before)
         elif chunk.kind is ChunkKind.DEMONSTRATIVE:
-            self._pointing(chunk.word, before, after)
+            self._handle_demonstrative(chunk.word, before, after)
 
     def finish(self) -> GraphDraft:
         """Return the draft after the last clause, without excluded objects."""
@@ -118,11 +118,11 @@ class GraphBuilder:
     def _clause(self) -> Clause:
         return self._assigner.clause
 
-    def _back_reference(self, word: str, before: Chunk | None) -> None:
+    def _resolve_back_reference(self, word: str, before: Chunk | None) -> None:
         """Resolve "it" or "them": the clause's objects, or after a preposition the objects named before these."""
         clause = self._clause
         if not clause.referents and not clause.objects and before is not None and before.kind is ChunkKind.VERB:
-            self._pointing(word, before, None)
+            self._handle_demonstrative(word, before, None)
             return
         pending, self._pending = self._pending, None
         if self._negated:
@@ -141,7 +141,7 @@ class GraphBuilder:
             for each in named:
                 self._assigner.assign_by_preposition(pending, phrase_from_text(each))
 
-    def _pointing(self, word: str, before: Chunk | None, after: Chunk | None) -> None:
+    def _handle_demonstrative(self, word: str, before: Chunk | None, after: Chunk | None) -> None:
         """Handle a "this" without a noun."""
         if self._negated or (self._clause.verb is None and self._pending is None):
             return

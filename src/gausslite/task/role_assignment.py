@@ -48,7 +48,7 @@ class RoleAssigner:
         """
         before = self.clause
         if self._searches_for_referent():
-            self._search_there(before)
+            self._search_places_for_referents(before)
         elif not before.statement:
             self._make_places_targets()
         self.clause = Clause(verb=verb, referents=before.objects or before.referents)
@@ -59,7 +59,7 @@ class RoleAssigner:
         places_only = clause.verb in SEARCH_VERBS and bool(clause.pending_places) and not clause.objects
         return places_only and clause.follows_statement and bool(clause.referents)
 
-    def _search_there(self, clause: Clause) -> None:
+    def _search_places_for_referents(self, clause: Clause) -> None:
         """Search the places for the referents, as in "I lost my wallet, look under the bed"."""
         clause.objects = list(clause.referents)
         self._draft.confirm_targets(clause.objects)
@@ -95,13 +95,18 @@ class RoleAssigner:
         clause = self.clause
         if pending == "closer":
             pending = "to" if clause.verb in DELIVERY_VERBS else "near"
-        handlers = {"to": self._destination, "for": self._search_object, "of": self._whole, "via": self._waypoint}
+        handlers = {
+            "to": self._destination,
+            "for": self._assign_searched_object,
+            "of": self._assign_after_of,
+            "via": self._assign_waypoint,
+        }
         if pending in handlers:
             handlers[pending](noun)
         elif pending == "when":
             return
         elif pending == "purpose":
-            self._purpose_goal(noun)
+            self._assign_path_end(noun)
         elif pending == "inside" and noun.head in lexicon.CLOTHING and self._acts_on_people():
             self.relate("near", noun)
         elif pending in _PASSING_RELATIONS and clause.verb in DELIVERY_VERBS:
@@ -109,12 +114,12 @@ class RoleAssigner:
         elif self._is_route_point(pending) or (pending == "with" and clause.verb in _PAIRING_VERBS):
             self.target(noun, conjoined=True)
         elif pending == "with" and clause.verb in FILLING_VERBS and clause.objects:
-            self._load(noun)
+            self._assign_loaded(noun)
         elif pending == "with":
             if noun.is_known and (clause.objects or clause.verb is None):
-                self._companion(noun)
+                self._assign_after_with(noun)
         elif pending == "from" or pending in _ORIGIN_RELATIONS:
-            self._origin(pending, noun)
+            self._assign_origin(pending, noun)
         elif clause.last_relation in ("to", "with") or self._is_destination(pending, following):
             self._draft.add_anchor(noun.text)
             clause.last_relation = clause.last_relation if clause.last_relation == "with" else "to"
@@ -124,11 +129,11 @@ class RoleAssigner:
                 self._make_places_targets()  # "stop behind the car near the tree"
             self.relate(pending, noun)
 
-    def _waypoint(self, noun: NounPhrase) -> None:
+    def _assign_waypoint(self, noun: NounPhrase) -> None:
         self.target(noun)
         self.clause.route = True
 
-    def _purpose_goal(self, noun: NounPhrase) -> None:
+    def _assign_path_end(self, noun: NounPhrase) -> None:
         """Make the end of a path a target; where a door leads or what a key opens is no target."""
         if self.clause.route:
             self.target(noun)
@@ -154,7 +159,7 @@ class RoleAssigner:
         else:
             self.relate(relation, noun)
 
-    def _companion(self, noun: NounPhrase) -> None:
+    def _assign_after_with(self, noun: NounPhrase) -> None:
         """Assign the noun after "with": the hat of "find a man with a hat" is near, a tool is an anchor."""
         if self.clause.last_relation == "to":
             self._draft.add_anchor(noun.text)
@@ -164,7 +169,7 @@ class RoleAssigner:
             self._draft.add_anchor(noun.text)
             self.clause.last_relation = "with"
 
-    def _load(self, noun: NounPhrase) -> None:
+    def _assign_loaded(self, noun: NounPhrase) -> None:
         """Make the noun the target and the objects so far anchors: "load the van with boxes"."""
         places, self.clause.objects = self.clause.objects, []
         self._draft.targets = [target for target in self._draft.targets if target not in places]
@@ -230,7 +235,7 @@ class RoleAssigner:
             self._draft.add_anchor(noun.text)
             clause.last_relation = "to"
 
-    def _search_object(self, noun: NounPhrase) -> None:
+    def _assign_searched_object(self, noun: NounPhrase) -> None:
         """Make the noun the target, near the searched places; a defect to inspect for is no object."""
         clause = self.clause
         if clause.objects and clause.verb in INSPECTION_VERBS and noun.head in lexicon.DEFECTS:
@@ -244,7 +249,7 @@ class RoleAssigner:
         elif not clause.objects:
             self.target(noun)
 
-    def _whole(self, noun: NounPhrase) -> None:
+    def _assign_after_of(self, noun: NounPhrase) -> None:
         clause = self.clause
         if clause.pending_places:
             return
@@ -253,7 +258,7 @@ class RoleAssigner:
         elif (clause.is_part or noun.has_determiner) and clause.last_relation is None:
             self.relate("near", noun)
 
-    def _origin(self, pending: str, noun: NounPhrase) -> None:
+    def _assign_origin(self, pending: str, noun: NounPhrase) -> None:
         going = self.clause.verb in GO_VERBS - MOVING_VERBS and self.clause.objects
         if going or self.clause.last_relation == "with":
             self._draft.add_anchor(noun.text)

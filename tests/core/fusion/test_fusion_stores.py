@@ -64,7 +64,7 @@ def test_stored_updates_are_read_back(store: FusionStore) -> None:
     assert store.agents() == ("ant",)
 
 
-def test_the_highest_revision_wins_and_an_equal_one_is_stale(store: FusionStore) -> None:
+def test_the_highest_update_seq_wins_and_an_equal_one_is_stale(store: FusionStore) -> None:
     store.put(make_subset("ant", 5, {11: 2, 22: 2}))
     assert store.put(make_subset("ant", 5, {11: 4})).stale.tolist() == [11]
     assert store.put(make_subset("ant", 4, {11: 4})).stale.tolist() == [11]
@@ -113,7 +113,7 @@ def test_an_empty_message_changes_nothing(store: FusionStore) -> None:
     assert store.agents() == ()
 
 
-def test_a_message_with_too_large_a_revision_is_refused_completely(store: FusionStore) -> None:
+def test_a_message_with_too_large_an_update_seq_is_refused_completely(store: FusionStore) -> None:
     with pytest.raises(InvalidInputError, match="update_seq"):
         store.put(make_subset("ant", 2**63, {11: 1}))
     assert store.agents() == ()

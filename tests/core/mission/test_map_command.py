@@ -48,9 +48,9 @@ def test_a_corrupt_frame_is_skipped_and_counted(tmp_path: Path, capsys: pytest.C
     sequence = write_seven_scenes(tmp_path / "kitchen", FRAMES)
     path = corrupt(sequence, 2)
     assert map_command(sequence, tmp_path / "out") == 0
-    told = capsys.readouterr()
-    assert path.name in told.err
-    assert "5 frames (skipped: 1 corrupt)" in told.out
+    printed = capsys.readouterr()
+    assert path.name in printed.err
+    assert "5 frames (skipped: 1 corrupt)" in printed.out
     report = report_of(tmp_path / "out")
     assert (report["frames"], report["frames_skipped"], report["frames_corrupt"]) == (5, 0, 1)
 

@@ -37,7 +37,7 @@ def test_other_options_are_named_before_the_work_starts(tmp_path: Path, capsys: 
     state = str(tmp_path / "run.state")
     assert main(map_command(sequence, tmp_path / "out", "--save-state", state)) == 0
     capsys.readouterr()
-    for options, told in (
+    for options, difference in (
         (("--max-gaussians", "149"), "--max-gaussians '150' (got '149')"),
         (("--size", "32x24"), "--size '"),
         (("--rate", "5"), "--rate unset (got '5')"),
@@ -49,7 +49,7 @@ def test_other_options_are_named_before_the_work_starts(tmp_path: Path, capsys: 
     ):
         assert main(map_command(sequence, tmp_path / "other", *options, "--resume", state)) == 2
         [line] = capsys.readouterr().err.splitlines()
-        assert told in line
+        assert difference in line
     assert not (tmp_path / "other").exists()
     more = ("--resume", state, "--task", "Find the mug")
     assert main(["map", str(sequence), "--threads", "1", "--out", str(tmp_path / "other"), *more]) == 2

@@ -22,13 +22,13 @@ from gausslite.wire.uplink_values import UplinkSettings
 
 def test_the_latest_update_of_each_voxel_arrives() -> None:
     store = MemoryStore()
-    offers = [{1: [5, 6], 2: [7], 3: [1]}, {2: [], 3: [9, 9, 9]}, {4: [2]}]
+    enqueued = [{1: [5, 6], 2: [7], 3: [1]}, {2: [], 3: [9, 9, 9]}, {4: [2]}]
     with fusion_server(store) as fusion, uplink(fusion.client.address) as link:
-        for offer in offers:
-            link.enqueue(make_batch(offer))
+        for voxels in enqueued:
+            link.enqueue(make_batch(voxels))
         assert link.drain(WAIT_S)
         counters = link.counters()
-    assert stored_kappas(store) == expected_kappas(*offers)
+    assert stored_kappas(store) == expected_kappas(*enqueued)
     assert counters.voxels_sent == 4
     assert counters.voxels_waiting == 0
     assert counters.subsets_rejected == 0

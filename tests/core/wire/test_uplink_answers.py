@@ -164,15 +164,15 @@ class FlakyServer(ScriptedServer):
 
 
 FAULTS = st.lists(st.sampled_from(["none", "message lost", "ack lost", "memory lost"]), max_size=4)
-OFFERS = st.lists(
+ENQUEUED_BATCHES = st.lists(
     st.dictionaries(st.integers(0, 5), st.lists(st.integers(0, 9), max_size=3), max_size=4), min_size=1, max_size=4
 )
 
 
-@given(offers=OFFERS, faults=FAULTS, together=st.booleans())
+@given(enqueued=ENQUEUED_BATCHES, faults=FAULTS, together=st.booleans())
 @settings(max_examples=25, deadline=None)
 def test_after_any_losses_the_server_has_the_latest_updates(
-    offers: list[dict[int, list[int]]], faults: list[str], together: bool
+    enqueued: list[dict[int, list[int]]], faults: list[str], together: bool
 ) -> None:
     server = FlakyServer(faults)
     service = Service(
@@ -180,8 +180,8 @@ def test_after_any_losses_the_server_has_the_latest_updates(
         lambda running: pb_grpc.add_FusionServiceServicer_to_server(server, running),
     )
     with serving([service]) as running, uplink(running.address) as link:
-        for offer in offers:
-            link.enqueue(make_batch(offer))
+        for voxels in enqueued:
+            link.enqueue(make_batch(voxels))
             assert together or link.drain(WAIT_S)
         assert link.drain(WAIT_S)
-    assert stored_kappas(server.store) == expected_kappas(*offers)
+    assert stored_kappas(server.store) == expected_kappas(*enqueued)

@@ -71,7 +71,7 @@ class Window:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LossTarget:
-    """LossTarget of the loss in a window of a view.
+    """Target of the loss in a window of a view.
 
     ssim_terms: means and variances of the target in the SSIM windows. pixel_weights: None means 1 everywhere. share:
     the mean weight of the whole image.
