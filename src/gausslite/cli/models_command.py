@@ -15,9 +15,9 @@ from gausslite.domain.errors import InvalidInputError
 from gausslite.process.messages import print_message
 
 if TYPE_CHECKING:
-    from gausslite.models.catalogue import ModelEntry
-    from gausslite.models.download import Progress
-    from gausslite.models.fetch import FetchedModel
+    from gausslite.perception.models.catalogue import ModelEntry
+    from gausslite.perception.models.download import Progress
+    from gausslite.perception.models.fetch import FetchedModel
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -68,7 +68,7 @@ def _add_folder_option(parser: argparse.ArgumentParser) -> None:
 
 
 def _entries(options: argparse.Namespace) -> tuple[ModelEntry, ...]:
-    from gausslite.models.catalogue import CATALOGUE, read_catalogue
+    from gausslite.perception.models.catalogue import CATALOGUE, read_catalogue
 
     return CATALOGUE if options.catalogue is None else read_catalogue(options.catalogue)
 
@@ -82,8 +82,8 @@ def _list(options: argparse.Namespace) -> int:
 
 
 def _fetch(options: argparse.Namespace) -> int:
-    from gausslite.models.catalogue import entry_named
-    from gausslite.models.fetch import fetch
+    from gausslite.perception.models.catalogue import entry_named
+    from gausslite.perception.models.fetch import fetch
 
     base_url = options.base_url or os.environ.get(MODELS_URL_VARIABLE)
     if not base_url:
@@ -100,7 +100,7 @@ def _fetch(options: argparse.Namespace) -> int:
 
 
 def _verify(options: argparse.Namespace) -> int:
-    from gausslite.models.inspect import verify
+    from gausslite.perception.models.inspect import verify
 
     pinned = {entry.file_name: entry.sha256 for entry in _entries(options)}
     for path in options.files:
@@ -109,7 +109,7 @@ def _verify(options: argparse.Namespace) -> int:
 
 
 def _inspect(options: argparse.Namespace) -> int:
-    from gausslite.models.inspect import inspect
+    from gausslite.perception.models.inspect import inspect
 
     description = inspect(options.file)
     print(f"family    {description.family}\nsize      {description.size_bytes} bytes\nsha256    {description.sha256}")

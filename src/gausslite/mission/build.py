@@ -21,7 +21,7 @@ from gausslite.render.choose import choose_rasterizer
 
 if TYPE_CHECKING:
     from gausslite.perception.detect import Detector
-    from gausslite.perception.model_registry import ModelRegistry
+    from gausslite.perception.models.model_registry import ModelRegistry
 
 
 EstimatorBuilder = Callable[[TaskGraph], RelevanceEstimator]
@@ -38,7 +38,7 @@ def open_models(perception: PerceptionSettings) -> ModelRegistry | None:
     """Open the user's model files and run each once; None without any. Raises ModelFileError, InvalidInputError."""
     if perception.model is None:
         return None
-    from gausslite.perception.model_registry import ModelRegistry
+    from gausslite.perception.models.model_registry import ModelRegistry
 
     return ModelRegistry(perception.model, perception.segmenter, perception.vocabulary, perception.threads)
 

@@ -16,7 +16,7 @@ from gausslite.domain.errors import InvalidInputError, ModelFileError
 from gausslite.domain.frame import Frame
 from gausslite.perception.detect import BoxFractions, DetectedBox, concerns_many_objects
 from gausslite.perception.grounding_text import PhraseInput, Tokenizer, encode_phrase
-from gausslite.perception.model_file import OpenModel, run_once
+from gausslite.perception.models.model_file import OpenModel, run_once
 
 INPUTS: Final = ("pixel_values", "input_ids", "attention_mask", "token_type_ids", "pixel_mask")
 OUTPUTS: Final = ("logits", "pred_boxes")

@@ -12,7 +12,7 @@ from gausslite.domain.frame import Frame
 from gausslite.domain.relevance import Detection
 from gausslite.perception.class_agnostic import ClassAgnosticSegmenter
 from gausslite.perception.detect import BoxFractions, DetectedBox, concerns_many_objects
-from gausslite.perception.model_file import OpenModel
+from gausslite.perception.models.model_file import OpenModel
 from gausslite.perception.text_embeddings import TextEmbeddings, classes_for
 from gausslite.perception.yolo_decode import Candidates, suppress
 from gausslite.perception.yolo_network import YoloSegNetwork

@@ -13,7 +13,7 @@ from numpy import ndarray
 
 from gausslite.domain.errors import ModelFileError
 from gausslite.domain.frame import Frame
-from gausslite.perception.model_file import OpenModel, run_once
+from gausslite.perception.models.model_file import OpenModel, run_once
 from gausslite.perception.yolo_decode import MASK_COEFFICIENTS, Candidates, Letterbox, decode, letterbox, mask_of
 
 _DEFAULT_SIDE_PX: Final = 640

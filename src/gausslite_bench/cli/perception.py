@@ -51,7 +51,7 @@ def configure_perception(parser: argparse.ArgumentParser) -> None:
 
 def run_perception(options: argparse.Namespace) -> int:
     """Run every task on every frame and print the scores of each stage."""
-    from gausslite.perception.model_registry import ModelRegistry
+    from gausslite.perception.models.model_registry import ModelRegistry
 
     if options.detector is None:
         raise InvalidInputError("--detector: expected a model file to compare with ground truth, got none")

@@ -10,7 +10,7 @@ from gausslite.domain.camera import Camera
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
 from gausslite.perception.class_agnostic import ClassAgnosticSegmenter, ClassAgnosticSettings
-from gausslite.perception.model_file import open_model
+from gausslite.perception.models.model_file import open_model
 from gausslite.perception.yolo_network import YoloSegNetwork
 
 SURE = (24.0, 32.0, 16.0, 16.0, 0, 0.9)

@@ -17,7 +17,7 @@ from gausslite.domain.frame import Frame
 from gausslite.perception.detect import DetectedBox
 from gausslite.perception.grounding import GroundingDino, GroundingSettings, corners_px, phrase_scores, preprocess
 from gausslite.perception.grounding_text import BertTokenizer, encode_phrase
-from gausslite.perception.model_file import open_model
+from gausslite.perception.models.model_file import open_model
 
 LEFT, RIGHT = (0.25, 0.5, 0.25, 0.5), (0.75, 0.5, 0.25, 0.5)
 SURE, UNSURE = 2.0, -1.2

@@ -14,7 +14,7 @@ from gausslite.domain.frame import Frame
 from gausslite.perception.detect import BoxFractions
 from gausslite.perception.grounding import INPUTS, OUTPUTS, GroundingDino, GroundingSettings, preprocess
 from gausslite.perception.grounding_text import encode_phrase
-from gausslite.perception.model_file import open_model
+from gausslite.perception.models.model_file import open_model
 
 torch = pytest.importorskip("torch", reason="the reference extra brings torch, which this network is made with")
 transformers = pytest.importorskip("transformers", reason="transformers, which has Grounding DINO, is not installed")

@@ -10,7 +10,7 @@ import pytest
 from gausslite.datasets.open import open_source
 from gausslite.datasets.regions import load_voxel_regions
 from gausslite.datasets.source import Source
-from gausslite.perception.model_file import open_model
+from gausslite.perception.models.model_file import open_model
 from gausslite.perception.relevance_estimator import TaskRelevanceEstimator
 from gausslite.perception.text_embeddings import TextEmbeddings, classes_for
 from gausslite.perception.tracker import TrackerSettings

@@ -12,7 +12,7 @@ from gausslite.domain.camera import Camera
 from gausslite.domain.errors import InvalidInputError, ModelFileError
 from gausslite.domain.frame import Frame
 from gausslite.perception.detect import BoxFractions
-from gausslite.perception.model_file import open_model
+from gausslite.perception.models.model_file import open_model
 from gausslite.perception.yolo import YoloSegDetector, YoloSettings, load_yolo
 
 NAMES = ("cup", "chair", "dining table")

@@ -8,7 +8,7 @@ from typing import Final
 
 from gausslite.domain.errors import InvalidInputError, ModelFileError
 from gausslite.perception.detect import Detector, SegmentedDetector, Segmenter
-from gausslite.perception.model_file import OpenModel, open_model
+from gausslite.perception.models.model_file import OpenModel, open_model
 from gausslite.perception.yolo_decode import MASK_COEFFICIENTS
 
 VOCABULARY: Final = "vocab.txt"

@@ -13,7 +13,7 @@ from gausslite.domain.errors import (
     QuotaError,
     UnavailableError,
 )
-from gausslite.models.download import DownloadRequest, download, require_https
+from gausslite.perception.models.download import DownloadRequest, download, require_https
 
 
 def request(base: str, folder, sha256: str | None = DIGEST, max_bytes: int = 1 << 20) -> DownloadRequest:

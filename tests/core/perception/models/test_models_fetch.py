@@ -16,9 +16,9 @@ from gausslite.domain.errors import (
     InvalidInputError,
     ModelFileError,
 )
-from gausslite.models.catalogue import CATALOGUE, ModelEntry, entry_named, read_catalogue
-from gausslite.models.fetch import fetch
-from gausslite.perception.model_file import listed_checksum
+from gausslite.perception.models.catalogue import CATALOGUE, ModelEntry, entry_named, read_catalogue
+from gausslite.perception.models.fetch import fetch
+from gausslite.perception.models.model_file import listed_checksum
 
 
 def entry(max_mib: int = 1, sha256: str | None = None) -> ModelEntry:

@@ -6,14 +6,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from gausslite.domain.errors import ModelFileError
-from gausslite.perception.model_file import (
+from gausslite.perception.models.model_file import (
     CHECKSUM_FILE,
     listed_checksum,
     open_model,
     require_listed_checksum,
     sha256_of,
 )
-from gausslite.perception.model_registry import ModelFamily, identify_family
+from gausslite.perception.models.model_registry import ModelFamily, identify_family
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,9 +8,9 @@ from pathlib import Path
 
 from gausslite.codec.files import write_atomic
 from gausslite.domain.errors import ChecksumError, InvalidInputError
-from gausslite.models.catalogue import ModelEntry
-from gausslite.models.download import DownloadRequest, Progress, download
-from gausslite.perception.model_file import CHECKSUM_FILE, listed_checksum, sha256_of
+from gausslite.perception.models.catalogue import ModelEntry
+from gausslite.perception.models.download import DownloadRequest, Progress, download
+from gausslite.perception.models.model_file import CHECKSUM_FILE, listed_checksum, sha256_of
 
 
 @dataclass(frozen=True, slots=True)

@@ -26,7 +26,7 @@ from gausslite.domain.errors import (
     StorageError,
     UnavailableError,
 )
-from gausslite.perception.model_file import require_onnx, sha256_of
+from gausslite.perception.models.model_file import require_onnx, sha256_of
 
 _CHUNK_BYTES: Final = 1 << 18
 _TIMEOUT_S: Final = 30.0

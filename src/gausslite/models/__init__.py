@@ -1,1 +1,0 @@
-"""Model files on the user's disk: catalogue, download, verification and inspection."""

@@ -1,0 +1,1 @@
+"""Model files: catalogue, download, checks, inspection, and the networks that they hold."""
