@@ -15,7 +15,7 @@ import numpy as np
 from numpy import ndarray
 
 from gausslite.calibration.exposure import fit_exposure
-from gausslite.calibration.pose_fit import fit_pose, twist_of
+from gausslite.calibration.pose_fit import fit_pose
 from gausslite.calibration.view_residuals import MAX_RELATIVE_DEPTH_ERROR, comparable_pixels
 from gausslite.datasets.registered_source import register_depth
 from gausslite.datasets.selection import downscaled_size
@@ -23,7 +23,7 @@ from gausslite.datasets.source import Source
 from gausslite.domain.camera import back_project
 from gausslite.domain.errors import DatasetError, PoseError
 from gausslite.domain.frame import Frame
-from gausslite.domain.pose import inverse, transform_points
+from gausslite.domain.pose import inverse, transform_points, twist_of
 from gausslite.domain.pose_exposure_prior import HANDHELD_PRIOR, PoseExposurePrior
 from gausslite.render.rasterizer import NEAR_M, Rendering
 

@@ -23,7 +23,7 @@ from gausslite.calibration.view_residuals import (
 )
 from gausslite.domain.camera import Camera, back_project
 from gausslite.domain.frame import Frame
-from gausslite.domain.pose import inverse
+from gausslite.domain.pose import inverse, transform_of, twist_of
 from gausslite.domain.pose_exposure_prior import PoseExposurePrior
 from gausslite.render.rasterizer import NEAR_M, Rendering
 
@@ -61,11 +61,11 @@ def fit_pose(
             jacobian, residual = _linearise(images, points, T_camera_rendered, frame.camera)
             deviation = np.append(twist_of(T_camera_rendered @ T_rendered_odometry), (0.0, 0.0))
             update = solve_with_prior(-jacobian, residual, deviation, prior_std, independent_share(rendering))
-            T_camera_rendered = _transform_of(update[:6]) @ T_camera_rendered
+            T_camera_rendered = transform_of(update[:6]) @ T_camera_rendered
     deviation = twist_of(T_camera_rendered @ T_rendered_odometry)
     deviation[:3] *= shrinkage(prior.translation_m, _FIT_TRANSLATION_STD_M)
     deviation[3:] *= shrinkage(prior.rotation_deg, _FIT_ROTATION_STD_DEG)
-    T_world_camera: Float64[ndarray, "4 4"] = frame.T_world_camera @ inverse(_transform_of(deviation))
+    T_world_camera: Float64[ndarray, "4 4"] = frame.T_world_camera @ inverse(transform_of(deviation))
     return T_world_camera
 
 
@@ -81,18 +81,6 @@ def luminance_residual(rendering: Rendering, frame: Frame, T_world_camera: Float
     exposure = jacobian[:, 6:]
     residual = residual - exposure @ np.linalg.lstsq(exposure, residual, rcond=None)[0]
     return 1.4826 * float(np.median(np.abs(residual)))
-
-
-def twist_of(T: Float64[ndarray, "4 4"]) -> Float64[ndarray, "6"]:
-    """Return translation (m) and rotation vector (rad) of a transform."""
-    return np.concatenate([T[:3, 3], cv2.Rodrigues(T[:3, :3])[0].ravel()])
-
-
-def _transform_of(twist: Float64[ndarray, "6"]) -> Float64[ndarray, "4 4"]:
-    """Return the transform of a translation (m) and a rotation vector (rad): the inverse of `twist_of`."""
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = cv2.Rodrigues(twist[3:])[0], twist[:3]
-    return T
 
 
 @dataclass(frozen=True, slots=True, eq=False)

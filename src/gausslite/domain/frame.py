@@ -14,7 +14,7 @@ from gausslite.domain.camera_motion import CameraMotion
 from gausslite.domain.errors import InvalidInputError, PoseError
 from gausslite.domain.pose import require_rigid
 
-_MAX_COORDINATE_M = 10_000.0
+MAX_COORDINATE_M = 10_000.0
 """Farther from the world's origin, float32 no longer resolves a millimetre, and voxel keys overflow."""
 
 
@@ -42,9 +42,9 @@ class Frame:
         require_array("frame depth_m", self.depth_m, size, np.float32)
         require_array("frame T_world_camera", self.T_world_camera, (4, 4), np.float64)
         require_rigid("frame T_world_camera", self.T_world_camera)
-        if np.abs(self.T_world_camera[:3, 3]).max() > _MAX_COORDINATE_M:
+        if np.abs(self.T_world_camera[:3, 3]).max() > MAX_COORDINATE_M:
             raise PoseError(
-                f"frame T_world_camera: expected a camera within {_MAX_COORDINATE_M:g} m of the world's origin, "
+                f"frame T_world_camera: expected a camera within {MAX_COORDINATE_M:g} m of the world's origin, "
                 f"got one at {self.T_world_camera[:3, 3].tolist()}; choose an origin near the robot"
             )
         if not np.isfinite(self.depth_m).all() or (self.depth_m < 0).any():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 from jaxtyping import Float, Float64
 from numpy import ndarray
@@ -39,6 +40,36 @@ def inverse(T: Float64[ndarray, "4 4"]) -> Float64[ndarray, "4 4"]:
     out[:3, :3] = T[:3, :3].T
     out[:3, 3] = -T[:3, :3].T @ T[:3, 3]
     return out
+
+
+def orthonormal(T: Float64[ndarray, "4 4"]) -> Float64[ndarray, "4 4"]:
+    """Return the rigid transform with the nearest rotation. It removes rounding errors of a long product."""
+    U, _, Vt = np.linalg.svd(T[:3, :3])
+    out = T.copy()
+    out[:3, :3] = U @ Vt
+    return out
+
+
+def twist_of(T: Float64[ndarray, "4 4"]) -> Float64[ndarray, "6"]:
+    """Return translation (m) and rotation vector (rad) of a transform."""
+    return np.concatenate([T[:3, 3], cv2.Rodrigues(T[:3, :3])[0].ravel()])
+
+
+def transform_of(twist: Float64[ndarray, "6"]) -> Float64[ndarray, "4 4"]:
+    """Return the transform of a translation (m) and a rotation vector (rad): the inverse of `twist_of`."""
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = cv2.Rodrigues(twist[3:])[0], twist[:3]
+    return T
+
+
+def interpolate_poses(
+    T_world_a: Float64[ndarray, "4 4"], T_world_b: Float64[ndarray, "4 4"], share: float
+) -> Float64[ndarray, "4 4"]:
+    """Return the pose at this share of the way from a to b: linear in position, and in angle about one axis."""
+    T = np.eye(4)
+    T[:3, :3] = T_world_a[:3, :3] @ cv2.Rodrigues(share * cv2.Rodrigues(T_world_a[:3, :3].T @ T_world_b[:3, :3])[0])[0]
+    T[:3, 3] = T_world_a[:3, 3] + share * (T_world_b[:3, 3] - T_world_a[:3, 3])
+    return T
 
 
 def transform_points(T: Float64[ndarray, "4 4"], points: Float[ndarray, "*n 3"]) -> Float[ndarray, "*n 3"]:

@@ -20,12 +20,13 @@ from gausslite.mapping.coverage import RenderedView
 from gausslite.mapping.eviction import insert_seeds
 from gausslite.mapping.keyframe_store import KeyframeStore
 from gausslite.mapping.keyframes import Keyframe, WindowView, window_view
+from gausslite.mapping.pose_history import PoseHistory
 from gausslite.mapping.seeding import Seeder, SeedingContext, Seeds
 from gausslite.mapping.settings import MapperSettings
 from gausslite.mapping.stages import CountedScheduler, SkippableStage, Stage, StageScheduler
 from gausslite.mapping.task_change import clear_roi, update_roi_evidence
 from gausslite.mapping.training import Trainer
-from gausslite.mapping.view_refinement import ViewRefiner
+from gausslite.mapping.view_refinement import RefinementSettings, ViewRefiner
 from gausslite.optimize.splat_table import SplatTable
 from gausslite.render.rasterizer import Rasterizer, Rendering
 
@@ -37,7 +38,7 @@ _EXTENT_PER_DEPTH = 1.0 / 3.0
 class MappedFrame:
     """Result of mapping one frame: Gaussians added by seeding, iterations, and Gaussians in the map afterwards.
 
-    skipped: why the frame was not mapped, or None.
+    skipped: why the frame was not mapped, or None. T_world_camera: the pose that it was mapped with; None if skipped.
     """
 
     index: int
@@ -45,6 +46,7 @@ class MappedFrame:
     iterations: int
     gaussians: int
     skipped: str | None = None
+    T_world_camera: Float64[ndarray, "4 4"] | None = None
 
 
 class GaussianMapper:
@@ -68,7 +70,10 @@ class GaussianMapper:
             self._table.append(initial_map)
         self._seeder = Seeder(settings.seeding, settings.components, self._rng)
         self._keyframes = KeyframeStore(settings.keyframes, settings.components.follow_task)
-        self._refiner = ViewRefiner(settings.pose_prior, self.render, settings.keyframes.pose_updates_per_frame)
+        refinement = RefinementSettings(
+            settings.pose_prior, settings.keyframes.pose_updates_per_frame, settings.pose_anchor_share
+        )
+        self._refiner = ViewRefiner(refinement, self.render)
         self._trainer = Trainer(settings, self._table, rasterizer, self._rng)
         self._extent_m = 0.0
         self._revision = 0
@@ -100,12 +105,13 @@ class GaussianMapper:
         relevance: RelevanceMap,
         scheduler: StageScheduler | None = None,
         rendered: RenderedView | None = None,
+        odometry: Frame | None = None,
     ) -> MappedFrame:
         """Seed and train the map with one frame; the scheduler limits the time, by default iterations are counted.
 
         relevance: w(u, v) of Sec. III-B. rendered: the map rendered from frame.T_world_camera; if None, or if the pose
-        is refined, the mapper renders it. A frame without a depth reading is skipped. Raises ShapeError if relevance
-        and frame differ in size.
+        is refined, the mapper renders it. odometry: the frame with the odometry's pose, if frame has another. A frame
+        without a depth reading is skipped. Raises ShapeError if relevance and frame differ in size.
         """
         require_array("relevance pixel_weights", relevance.pixel_weights, frame.depth_m.shape, np.float32)
         scheduler = CountedScheduler() if scheduler is None else scheduler
@@ -114,11 +120,13 @@ class GaussianMapper:
             return MappedFrame(frame.index, 0, 0, self.count, "no pixel has a depth reading")
         with scheduler.timing(Stage.VIEW_PREPARATION):
             view = self._prepare_view(frame, relevance)
+        T_world_camera = view.keyframe.frame.T_world_camera
+        self._refiner.history.record(odometry or frame, T_world_camera)
         seeded = 0 if scheduler.skips(SkippableStage.SEEDING) else self._seed(view.keyframe, rendered, scheduler)
         iterations = self._train(view, scheduler)
         self._keyframes.add(view)
         self._revision += 1
-        return MappedFrame(frame.index, seeded, iterations, self.count)
+        return MappedFrame(frame.index, seeded, iterations, self.count, T_world_camera=T_world_camera)
 
     def idle_step(self) -> bool:
         """Run one iteration on the window's keyframes. Return False if there are none yet."""
@@ -179,6 +187,11 @@ class GaussianMapper:
     def render(self, camera: Camera, T_world_camera: Float64[ndarray, "4 4"]) -> Rendering:
         """Render the map from a pose."""
         return self._rasterizer.forward(self._table.rows, camera, inverse(T_world_camera))
+
+    @property
+    def poses(self) -> PoseHistory:
+        """The poses of all mapped frames: the odometry's, and their latest estimate in the map."""
+        return self._refiner.history
 
     def gaussians(self) -> Gaussians:
         """Return a copy of the map as physical values, averaged if `OptimizationSettings.ema_updates` is above 0."""

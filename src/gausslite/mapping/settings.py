@@ -193,7 +193,8 @@ class MapperSettings:
     """A mapping policy.
 
     max_gaussians: hard cap; memory for exactly this number is allocated at the start. pose_prior: prior of the pose and
-    exposure error of each view; keyframes are refined unless it is exact.
+    exposure error of each view; keyframes are refined unless it is exact. pose_anchor_share: share of the mission's
+    mean pose correction by which each refined pose moves back towards the odometry; 0 for poses without odometry.
     """
 
     max_gaussians: int = 1_000_000
@@ -204,9 +205,12 @@ class MapperSettings:
     density: DensitySettings = field(default_factory=DensitySettings)
     task_change: TaskChangeSettings = field(default_factory=TaskChangeSettings)
     pose_prior: PoseExposurePrior = field(default_factory=PoseExposurePrior)
+    pose_anchor_share: float = 0.1
 
     def __post_init__(self) -> None:
         _require(self.max_gaussians >= 1, "max_gaussians", "at least 1", self.max_gaussians)
+        share = self.pose_anchor_share
+        _require(0 <= share <= 1, "pose_anchor_share", "0 to 1", share)
 
     @property
     def adam(self) -> AdamSettings:

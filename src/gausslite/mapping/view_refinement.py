@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float64
@@ -13,23 +13,43 @@ from gausslite.calibration.exposure import fit_exposure
 from gausslite.calibration.pose_fit import fit_pose
 from gausslite.domain.camera import Camera
 from gausslite.domain.frame import Frame
-from gausslite.domain.pose import inverse, require_rigid
+from gausslite.domain.pose import inverse, require_rigid, transform_of
 from gausslite.domain.pose_exposure_prior import PoseExposurePrior
-from gausslite.domain.state import State, get_array, get_counts, int_array
+from gausslite.domain.state import State, add_prefix, get_array, get_counts, int_array, select_prefix
 from gausslite.mapping.keyframes import Keyframe, WindowView
+from gausslite.mapping.pose_history import PoseHistory
 from gausslite.render.rasterizer import Rendering
 
 RenderMap = Callable[[Camera, Float64[ndarray, "4 4"]], Rendering]
 """Renders the map from T_world_camera."""
 
 
-class ViewRefiner:
-    """Refines views under the prior. Its state is the last frame's pose correction and the last refined keyframe."""
+@dataclass(frozen=True, slots=True)
+class RefinementSettings:
+    """How views are refined.
 
-    def __init__(self, prior: PoseExposurePrior, render: RenderMap, keyframes_per_frame: int) -> None:
-        self._prior = prior
-        self._keyframes_per_frame = keyframes_per_frame
+    prior: standard deviations of pose and exposure errors. keyframes_per_frame: keyframes refined with each frame.
+    anchor_share: share of the mission's mean correction by which each fit moves back; 0 if the poses do not come from
+    an odometry.
+    """
+
+    prior: PoseExposurePrior
+    keyframes_per_frame: int
+    anchor_share: float
+
+
+class ViewRefiner:
+    """Refines views under the prior. It owns the pose history, the last pose correction and its place in the window.
+
+    Each frame is aligned to the map, and the map is trained on the aligned frames, so both could drift from the
+    odometry together. After each fit, the refined pose moves back by a share of the mission's mean correction.
+    """
+
+    def __init__(self, settings: RefinementSettings, render: RenderMap) -> None:
+        self._prior = settings.prior
+        self._settings = settings
         self._render = render
+        self._history = PoseHistory()
         self._T_odometry_refined = np.eye(4)
         self._position = 0
 
@@ -38,9 +58,18 @@ class ViewRefiner:
         """False if poses and colours are used as recorded."""
         return not self._prior.is_exact
 
+    @property
+    def history(self) -> PoseHistory:
+        """The poses of all mapped frames."""
+        return self._history
+
     def state(self) -> State:
-        """Return the last pose correction and the position of the last refined keyframe."""
-        return {"T_odometry_refined": self._T_odometry_refined, "position": int_array(self._position)}
+        """Return the pose history, the last pose correction and the position of the last refined keyframe."""
+        return {
+            "T_odometry_refined": self._T_odometry_refined,
+            "position": int_array(self._position),
+            **add_prefix("history", self._history.state()),
+        }
 
     def restore(self, state: State) -> None:
         """Continue from another refiner's state. Raises MapFileError, PoseError."""
@@ -48,6 +77,7 @@ class ViewRefiner:
         require_rigid("state T_odometry_refined", T_odometry_refined)
         self._T_odometry_refined = T_odometry_refined.copy()
         [self._position] = get_counts(state, "position", 1)
+        self._history.restore(select_prefix(state, "history"))
 
     def refine(self, recorded: Frame) -> Frame:
         """Return a new frame with refined pose and exposure. The search starts at the last frame's pose correction."""
@@ -61,7 +91,7 @@ class ViewRefiner:
     def next_views(self, window: Sequence[WindowView]) -> list[WindowView]:
         """Return the keyframes to refine with this frame, in rotation over the window."""
         refinable = [view for view in window if view.keyframe.recorded is not None]
-        count = min(self._keyframes_per_frame, len(refinable))
+        count = min(self._settings.keyframes_per_frame, len(refinable))
         first = self._position + 1
         self._position = (self._position + count) % max(len(refinable), 1)
         return [refinable[position % len(refinable)] for position in range(first, first + count)]
@@ -75,5 +105,17 @@ class ViewRefiner:
     def _fit(self, recorded: Frame, T_world_rendered: Float64[ndarray, "4 4"]) -> Frame:
         rendering = self._render(recorded.camera, T_world_rendered)
         T_world_camera = fit_pose(rendering, inverse(T_world_rendered), recorded, self._prior)
+        if self._prior.has_pose_error:
+            T_world_camera = self._anchored(recorded, T_world_camera)
         exposure = fit_exposure(rendering, recorded, self._prior)
         return replace(recorded, rgb=exposure.to_map(recorded.rgb), T_world_camera=T_world_camera)
+
+    def _anchored(self, recorded: Frame, T_world_camera: Float64[ndarray, "4 4"]) -> Float64[ndarray, "4 4"]:
+        """Return the pose moved back by a share of the mean correction, and store it in the history."""
+        self._history.record(recorded, T_world_camera)
+        back = -self._settings.anchor_share * self._history.mean_correction
+        anchored = T_world_camera.copy()
+        anchored[:3, :3] = transform_of(back)[:3, :3] @ T_world_camera[:3, :3]
+        anchored[:3, 3] += back[:3]
+        self._history.record(recorded, anchored)
+        return anchored

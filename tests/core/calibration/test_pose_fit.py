@@ -22,7 +22,7 @@ from gausslite.evaluation.views import MapViewer
 from gausslite.mapping.keyframes import Keyframe, window_view
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.settings import KeyframeSettings, MapperSettings, OptimizationSettings
-from gausslite.mapping.view_refinement import ViewRefiner
+from gausslite.mapping.view_refinement import RefinementSettings, ViewRefiner
 from gausslite.render.cpu import CpuRasterizer
 from gausslite.render.rasterizer import Rendering
 
@@ -136,7 +136,8 @@ def test_keyframes_are_refined_equally_often(pose_updates_per_frame: int) -> Non
     frames = [wall_frame(index, SIZE) for index in range(5)]
     keyframes = [Keyframe(frame, middle_relevance(frame), recorded=frame if frame.index else None) for frame in frames]
     window = [window_view(keyframe, rasterizer, settings) for keyframe in keyframes]
-    refiner = ViewRefiner(LOOSE, lambda camera, T_world_camera: rendering_like(frames[0]), pose_updates_per_frame)
+    refinement = RefinementSettings(LOOSE, pose_updates_per_frame, anchor_share=0.1)
+    refiner = ViewRefiner(refinement, lambda camera, T_world_camera: rendering_like(frames[0]))
     rounds = [refiner.next_views(window) for _ in range(4)]
     assert [len(turn) for turn in rounds] == [min(pose_updates_per_frame, 4)] * 4
     fitted = Counter(view.keyframe.frame.index for turn in rounds for view in turn)
