@@ -43,8 +43,6 @@ if TYPE_CHECKING:
     )
     from gausslite.domain.errors import GaussLiteError
 
-__version__ = "0.1.0"
-
 __all__ = [
     "AgentClient",
     "BallRegion",

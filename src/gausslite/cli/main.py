@@ -10,7 +10,6 @@ import os
 import sys
 from collections.abc import Mapping, Sequence
 
-from gausslite import __version__
 from gausslite.domain.errors import GaussLiteError
 from gausslite.process.interrupts import Terminated, restore_default_handlers
 from gausslite.process.messages import print_message
@@ -28,6 +27,19 @@ _COMMANDS = {
 _CONFIGURABLE = frozenset({"map", "demo", "eval", "bench"})
 """Commands whose options may also come from a configuration file and from the environment."""
 _MODULES = {name: f"gausslite.cli.{name}_command" for name in _COMMANDS} | {"bench": "gausslite_bench.cli.main"}
+
+
+class _PrintVersion(argparse.Action):
+    """Print the version of the installed distribution, which is looked up only on request."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
+        from importlib.metadata import PackageNotFoundError, version
+
+        try:
+            print(f"gausslite {version('gausslite')}")
+        except PackageNotFoundError:
+            print("gausslite from a source tree that is not installed")
+        parser.exit()
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -52,7 +64,7 @@ def _dispatch(arguments: list[str]) -> int:
     parser = argparse.ArgumentParser(
         prog="gausslite", description="Online 3D Gaussian maps that spend their detail on a task."
     )
-    parser.add_argument("--version", action="version", version=f"gausslite {__version__}")
+    parser.add_argument("--version", action=_PrintVersion, nargs=0, help="print the version and exit")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     chosen = next((word for word in arguments if not word.startswith("-")), None)
     for name, summary in _COMMANDS.items():
