@@ -6,17 +6,25 @@ slightly wrong pose scores below a blurred map. The raw score includes pose erro
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import cv2
 import numpy as np
+from jaxtyping import Bool, Float64
+from numpy import ndarray
 
 from gausslite.calibration.exposure import fit_exposure
 from gausslite.calibration.pose_fit import fit_pose
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import inverse
 from gausslite.domain.pose_exposure_prior import HANDHELD_PRIOR, PoseExposurePrior
-from gausslite.evaluation.views import MapViewer
+from gausslite.evaluation.views import HeldOutView, MapViewer
 from gausslite.render.rasterizer import Rendering
 
 _ROUNDS = 4
+_REGION_MARGIN_PX = 8
+"""A fit at the region uses the region's pixels and this margin: the outline also fixes the pose."""
 
 
 def render_fitted(viewer: MapViewer, frame: Frame, prior: PoseExposurePrior = HANDHELD_PRIOR) -> Rendering:
@@ -24,21 +32,55 @@ def render_fitted(viewer: MapViewer, frame: Frame, prior: PoseExposurePrior = HA
 
     The unfitted rendering is a candidate, so the full-image error never exceeds that of `render_frame`.
     """
-    T_world_camera = frame.T_world_camera
+    return _fit_to_image(viewer, frame, prior).rendering
+
+
+def render_fitted_at_region(
+    viewer: MapViewer, view: HeldOutView, prior: PoseExposurePrior = HANDHELD_PRIOR
+) -> Rendering:
+    """Return the rendering with the lowest squared colour error in the region, fitted at the region alone.
+
+    The fit starts at the pose of `render_fitted`, whose rendering is a candidate. It measures the region's sharpness
+    without the pose error that the rest of the map causes.
+    """
+    frame, best = view.frame, _fit_to_image(viewer, view.frame, prior)
+    near = cv2.dilate(view.roi.astype(np.uint8), np.ones((2 * _REGION_MARGIN_PX + 1,) * 2, np.uint8)) > 0
+    # the fits compare pixels with a measured depth
+    near_frame = replace(frame, depth_m=np.where(near, frame.depth_m, np.float32(0.0)))
+    candidates = [best, *_fit(viewer, near_frame, best.T_world_camera, prior)]
+    return min(candidates, key=lambda candidate: candidate.squared_error(frame, view.roi)).rendering
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Candidate:
+    """A rendering and the pose it was rendered from."""
+
+    T_world_camera: Float64[ndarray, "4 4"]
+    rendering: Rendering
+
+    def squared_error(self, frame: Frame, mask: Bool[ndarray, "h w"] | None = None) -> float:
+        """Return the mean squared colour error, inside the mask or over the whole image."""
+        squared = np.square(self.rendering.rgb - frame.rgb / np.float32(255.0))
+        return float(np.mean(squared if mask is None else squared[mask]))
+
+
+def _fit_to_image(viewer: MapViewer, frame: Frame, prior: PoseExposurePrior) -> _Candidate:
+    return min(_fit(viewer, frame, frame.T_world_camera, prior), key=lambda candidate: candidate.squared_error(frame))
+
+
+def _fit(
+    viewer: MapViewer, frame: Frame, T_world_camera: Float64[ndarray, "4 4"], prior: PoseExposurePrior
+) -> Iterator[_Candidate]:
+    """Yield the rendering from the initial pose, and one with fitted exposure for each round's pose."""
     rendering = viewer.render(frame.camera, T_world_camera)
-    candidates = [rendering]
+    yield _Candidate(T_world_camera, rendering)
     for _ in range(_ROUNDS):
-        candidates.append(_apply_fitted_exposure(rendering, frame, prior))
+        yield _Candidate(T_world_camera, _apply_fitted_exposure(rendering, frame, prior))
         T_world_camera = fit_pose(rendering, inverse(T_world_camera), frame, prior)
         rendering = viewer.render(frame.camera, T_world_camera)
-    candidates.append(_apply_fitted_exposure(rendering, frame, prior))
-    return min(candidates, key=lambda candidate: _squared_error(candidate, frame))
+    yield _Candidate(T_world_camera, _apply_fitted_exposure(rendering, frame, prior))
 
 
 def _apply_fitted_exposure(rendering: Rendering, frame: Frame, prior: PoseExposurePrior) -> Rendering:
     rgb = fit_exposure(rendering, frame, prior).to_photograph(rendering.rgb)
     return Rendering(rgb, rendering.depth_m, rendering.alpha, None)
-
-
-def _squared_error(rendering: Rendering, frame: Frame) -> float:
-    return float(np.mean(np.square(rendering.rgb - frame.rgb / np.float32(255.0))))

@@ -4,26 +4,35 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from enum import StrEnum
 from statistics import fmean, pstdev
 
 from gausslite_bench.quality.study import FinishedTrial
 from gausslite_bench.quality.trials import TrialBudget
 
 
+class ViewFit(StrEnum):
+    """What was fitted before a view was scored, as the field of TrialResult that holds the scores."""
+
+    RAW = "scores"
+    FITTED = "fitted"
+    REGION_FITTED = "region_fitted"
+
+
 @dataclass(frozen=True, slots=True)
 class Metric:
-    """A field of MapScores, raw or fitted; factor converts it to the table's unit."""
+    """A field of MapScores at one kind of view fit; factor converts it to the table's unit."""
 
     title: str
     field: str
     digits: int
     factor: float = 1.0
-    fitted: bool = False
+    fit: ViewFit = ViewFit.RAW
 
     @property
     def name(self) -> str:
         """Key in JSON."""
-        return f"fitted_{self.field}" if self.fitted else self.field
+        return self.field if self.fit is ViewFit.RAW else f"{self.fit}_{self.field}"
 
 
 ROI_METRICS = (
@@ -32,16 +41,25 @@ ROI_METRICS = (
     Metric("LPIPS↓", "roi_lpips", 3),
     Metric("depth L1 [cm]↓", "roi_depth_l1_m", 2, 100.0),
     Metric("covered [%]↑", "roi_covered", 1, 100.0),
+    Metric("Laplacian ratio↑", "roi_laplacian_ratio", 2),
+    Metric("GMSD↓", "roi_gradient_deviation", 3),
 )
 FULL_METRICS = (
     Metric("PSNR↑", "full_psnr", 2),
     Metric("SSIM↑", "full_ssim", 3),
     Metric("LPIPS↓", "full_lpips", 3),
     Metric("depth L1 [cm]↓", "full_depth_l1_m", 2, 100.0),
+    Metric("Laplacian ratio↑", "full_laplacian_ratio", 2),
+    Metric("GMSD↓", "full_gradient_deviation", 3),
 )
 FITTED_METRICS = (
-    Metric("PSNR, views fitted↑", "roi_psnr", 2, fitted=True),
-    Metric("PSNR, views fitted↑", "full_psnr", 2, fitted=True),
+    Metric("PSNR, views fitted↑", "roi_psnr", 2, fit=ViewFit.FITTED),
+    Metric("PSNR, views fitted↑", "full_psnr", 2, fit=ViewFit.FITTED),
+)
+REGION_FITTED_METRICS = (
+    Metric("PSNR, fitted at the region↑", "roi_psnr", 2, fit=ViewFit.REGION_FITTED),
+    Metric("Laplacian ratio, fitted at the region↑", "roi_laplacian_ratio", 2, fit=ViewFit.REGION_FITTED),
+    Metric("GMSD, fitted at the region↓", "roi_gradient_deviation", 3, fit=ViewFit.REGION_FITTED),
 )
 RAW_PSNR = (ROI_METRICS[0], FULL_METRICS[0])
 _NOT_COMPUTED = "not computed"
@@ -84,7 +102,7 @@ class StudyResults:
     def figure(self, scene: str, variant: str, metric: Metric, budget: TrialBudget) -> MeanStd | None:
         """Return mean and spread over the seeds; None if no trial has the metric."""
         results = [each.result for each in self._of(scene, variant, budget)]
-        scores = [result.fitted if metric.fitted else result.scores for result in results]
+        scores = [getattr(result, metric.fit) for result in results]
         values = [getattr(each, metric.field) for each in scores if each is not None]
         known = [value for value in values if value is not None]
         return MeanStd(fmean(known), pstdev(known)) if known else None
@@ -139,7 +157,7 @@ class StudyResults:
         ]
 
     def _scene_as_json(self, scene: str) -> dict[str, object]:
-        metrics = (*ROI_METRICS, *FULL_METRICS, *FITTED_METRICS)
+        metrics = (*ROI_METRICS, *FULL_METRICS, *FITTED_METRICS, *REGION_FITTED_METRICS)
         results = []
         for budget in self.budgets:
             for variant in self.variants:
@@ -172,11 +190,12 @@ def quality_table(results: StudyResults) -> str:
     """Return the comparison of policies: per place as in the paper's Replica table, per pair, and a summary."""
     blocks = results.notes
     fitted = FITTED_METRICS if results.has_fitted else ()
+    at_region = REGION_FITTED_METRICS if results.has_fitted else ()
     for budget in results.budgets:
         blocks += [
             f"## Equal {budget.equal} ({budget}), at most {budget.max_gaussians} Gaussians",
             "Inside the task's ground-truth mask (mean over a place's tasks):",
-            _by_place(results, (*ROI_METRICS, *fitted[:1]), budget),
+            _by_place(results, (*ROI_METRICS, *fitted[:1], *at_region), budget),
             "Over the full image:",
             _by_place(results, (*FULL_METRICS, *fitted[1:]), budget),
             "Per pair, ROI PSNR in dB (mean ± standard deviation over the seeds):",

@@ -17,7 +17,7 @@ from numpy import ndarray
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.gaussians import Gaussians
 from gausslite.evaluation.compare import MapScores, PerceptualDistance, average, score_view
-from gausslite.evaluation.fitted import render_fitted
+from gausslite.evaluation.fitted import render_fitted, render_fitted_at_region
 from gausslite.evaluation.pictures import to_uint8
 from gausslite.evaluation.views import MapViewer, largest_roi_views
 from gausslite.mission.build import EstimatorFactory, build_mapper
@@ -149,7 +149,8 @@ class Trial:
 class TrialResult:
     """Result of a trial. roi_share: region's share of the held-out views. ms_per_frame: perception and mapping.
 
-    fitted: scores after fitting each view's pose and exposure; None if that was not requested.
+    fitted: scores after fitting each view's pose and exposure; region_fitted: fitted at the region alone, over the views
+    that show it. None if that was not requested, or if no view shows the region.
     """
 
     scores: MapScores
@@ -158,6 +159,7 @@ class TrialResult:
     gaussians: int
     iterations_mean: float
     ms_per_frame: float
+    region_fitted: MapScores | None = None
 
     def as_json(self) -> dict[str, object]:
         """Return the result as JSON values."""
@@ -167,10 +169,14 @@ class TrialResult:
     def from_json(cls, stored: dict[str, Any]) -> TrialResult:
         """Return the result of as_json's values. Raises InvalidInputError for other content."""
         try:
-            fitted = None if stored["fitted"] is None else MapScores(**stored["fitted"])
-            return cls(**{**stored, "scores": MapScores(**stored["scores"]), "fitted": fitted})
+            scores = {name: _stored_scores(stored[name]) for name in ("scores", "fitted", "region_fitted")}
+            return cls(**{**stored, **scores})
         except (TypeError, KeyError) as error:
             raise InvalidInputError(f"cached trial: expected the fields of a result, got {error}") from None
+
+
+def _stored_scores(stored: dict[str, Any] | None) -> MapScores | None:
+    return None if stored is None else MapScores(**stored)
 
 
 ViewImages = dict[int, UInt8[ndarray, "h w 3"]]
@@ -215,12 +221,14 @@ def evaluate_map(
     """Return the map's scores on the held-out views, and its renderings for the sheets. Raises GaussLiteError."""
     viewer = MapViewer(trial_map.gaussians, choose_rasterizer(threads=trial.conditions.threads))
     shown = largest_roi_views(scene.held_out, SHEET_VIEWS)
-    scores, fitted, images = [], [], {}
+    scores, fitted, region_fitted, images = [], [], [], {}
     for i, view in enumerate(scene.held_out):
         rendering = viewer.render_frame(view.frame)
         scores.append(score_view(rendering, view, perceptual))
         if trial.plan.pose_policy.fit_views:
             fitted.append(score_view(render_fitted(viewer, view.frame), view, perceptual))
+            if view.shows_region:
+                region_fitted.append(score_view(render_fitted_at_region(viewer, view), view, perceptual))
         if i in shown:
             images[i] = to_uint8(rendering.rgb)
     result = TrialResult(
@@ -230,6 +238,7 @@ def evaluate_map(
         gaussians=len(trial_map.gaussians),
         iterations_mean=trial_map.iterations_mean,
         ms_per_frame=trial_map.ms_per_frame,
+        region_fitted=average(region_fitted) if region_fitted else None,
     )
     return result, images
 
