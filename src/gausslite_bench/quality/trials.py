@@ -149,8 +149,8 @@ class Trial:
 class TrialResult:
     """Result of a trial. roi_share: region's share of the held-out views. ms_per_frame: perception and mapping.
 
-    fitted: scores after fitting each view's pose and exposure; region_fitted: fitted at the region alone, over the views
-    that show it. None if that was not requested, or if no view shows the region.
+    fitted: scores after fitting each view's pose and exposure; region_fitted: fitted at the region alone, on the
+    views that show it. None if that was not requested, or if no view shows the region.
     """
 
     scores: MapScores
