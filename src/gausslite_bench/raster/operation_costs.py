@@ -71,7 +71,7 @@ class RasterBench:
     """Measures every image size with every number of Gaussians and every instruction set (None: the fastest).
 
     repetitions: timed runs of each operation. threads: None means one per available core. shares_percent: shares of
-    the image for additional measurements of masked steps in exact mode.
+    the image for additional measurements of masked steps.
     """
 
     sizes: Sequence[tuple[int, int]] = SIZES

@@ -1,4 +1,4 @@
-"""Cost of the active phase in exact mode as a function of the region's share of the image (Sec. III-D)."""
+"""Cost of the active phase with all Gaussians as a function of the region's share of the image (Sec. III-D)."""
 
 from __future__ import annotations
 

@@ -21,7 +21,9 @@ ANYTHING = MissionConfig("", "", 0.10)
 LONG = "x" * 1_000_000
 
 
-def make_subset(agent_id: str, revision: int, cells: list[tuple[int, int]], removed: tuple[int, ...] = ()) -> RoiSubset:
+def make_subset(
+    agent_id: str, update_seq: int, cells: list[tuple[int, int]], removed: tuple[int, ...] = ()
+) -> RoiSubset:
     """Voxel updates with one Gaussian for each (cell along x, kappa), and tombstones of removed cells."""
     means = [(0.1 * cell + 0.05, 0.05, 0.05) for cell, _ in cells]
     gaussians = plain_gaussians(means, kappa=[kappa for _, kappa in cells])
@@ -29,8 +31,8 @@ def make_subset(agent_id: str, revision: int, cells: list[tuple[int, int]], remo
     return RoiSubset(
         agent_id,
         "",
-        revision,
-        revision,
+        update_seq,
+        update_seq,
         merge_batches(group_by_voxel(gaussians, GRID), tombstones(GRID.keys(removed_m))),
     )
 
@@ -57,9 +59,9 @@ def test_status_counts_each_agents_contribution() -> None:
 
 def test_a_mission_without_updates_has_an_empty_map() -> None:
     engine = FusionEngine(MemoryStore(), FusionSettings(grid=GRID))
-    assert len(engine.voted_map()) == len(engine.union_map()) == 0
+    assert len(engine.maps.voted_map()) == len(engine.maps.union_map()) == 0
     assert engine.status().agents == ()
-    assert len(engine.changes().fused.gaussians) == 0
+    assert len(engine.maps.changes().fused.gaussians) == 0
     engine.close()
 
 
@@ -108,8 +110,8 @@ def test_every_error_message_is_one_short_line() -> None:
         lambda: engine.join("bee", MissionConfig("", "line\nbreak", 0.10)),
         lambda: engine.require_mission(LONG),
         lambda: engine.session(LONG),
-        lambda: engine.voted_map(LONG),
-        lambda: engine.union_map("line\nbreak"),
+        lambda: engine.maps.voted_map(LONG),
+        lambda: engine.maps.union_map("line\nbreak"),
         lambda: engine.contribute(ant, make_subset(LONG, 1, []), GRID),
     ]
     for attempt in attempts:

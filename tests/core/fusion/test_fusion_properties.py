@@ -70,11 +70,11 @@ def table_from(specs: dict[str, Spec]) -> dict[str, VoxelBatch]:
 
 
 def subsets_from(history: dict[str, list[Spec]]) -> list[RoiSubset]:
-    """Subsets of up to four agents, each with increasing map revisions."""
+    """Subsets of up to four agents, each with increasing sequence numbers."""
     return [
-        RoiSubset(agent_id, "s", revision + 1, revision, batch_from(spec))
+        RoiSubset(agent_id, "s", update_seq + 1, update_seq, batch_from(spec))
         for agent_id, specs in history.items()
-        for revision, spec in enumerate(specs)
+        for update_seq, spec in enumerate(specs)
     ]
 
 

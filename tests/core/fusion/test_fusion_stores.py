@@ -24,7 +24,7 @@ from gausslite.fusion.store import FusionStore, MissionConfig, SessionRecord
 KEYS = (11, 22, 33)
 
 
-def make_subset(agent_id: str, revision: int, counts: dict[int, int], kappa: int = 1, seed: int = 0) -> RoiSubset:
+def make_subset(agent_id: str, update_seq: int, counts: dict[int, int], kappa: int = 1, seed: int = 0) -> RoiSubset:
     """A subset with these numbers of Gaussians, all of one kappa, by voxel key."""
     n = sum(counts.values())
     numbers = np.random.default_rng(seed).random((n, 14), np.float32)
@@ -41,7 +41,7 @@ def make_subset(agent_id: str, revision: int, counts: dict[int, int], kappa: int
     keys = sorted(counts)
     per_voxel = np.array([counts[key] for key in keys], np.uint32)
     batch = VoxelBatch(np.array(keys, np.int64), per_voxel.astype(np.uint64) * np.uint64(kappa), per_voxel, gaussians)
-    return RoiSubset(agent_id, "session", revision, revision, batch)
+    return RoiSubset(agent_id, "session", update_seq, update_seq, batch)
 
 
 @pytest.fixture(params=["memory", "sqlite"])
@@ -134,11 +134,11 @@ def test_an_agent_has_one_session_and_the_mission_config_is_stored(store: Fusion
 
 
 def test_threads_can_put_concurrently(store: FusionStore) -> None:
-    def talk(agent_id: str) -> None:
-        for revision in range(20):
-            store.put(make_subset(agent_id, revision, {11: 1, 22: revision % 3}))
+    def put_updates(agent_id: str) -> None:
+        for update_seq in range(20):
+            store.put(make_subset(agent_id, update_seq, {11: 1, 22: update_seq % 3}))
 
-    threads = [Thread(target=talk, args=(name,)) for name in ("ant", "bee", "cat")]
+    threads = [Thread(target=put_updates, args=(name,)) for name in ("ant", "bee", "cat")]
     for thread in threads:
         thread.start()
     for thread in threads:

@@ -42,7 +42,7 @@ A, B = RegionRelevanceEstimator([LEFT]), RegionRelevanceEstimator([RIGHT])
 GRID = VoxelGrid(0.25)
 
 
-def make_loop(max_gaussians: int = 1500, every: int = 1, buffer: int = 8, window: int = 4) -> TaskMapper:
+def make_task_mapper(max_gaussians: int = 1500, every: int = 1, buffer: int = 8, window: int = 4) -> TaskMapper:
     settings = MapperSettings(
         max_gaussians=max_gaussians,
         seeding=SeedingSettings(first_frame_seeds=60_000, later_seeds=20_000),
@@ -57,13 +57,13 @@ def frame_at(index: int) -> Frame:
     return wall_frame(index, SIZE, shift_m=0.03 * index)
 
 
-def map_frames(loop: TaskMapper, first: int, end: int) -> list[FrameOutcome]:
-    return [loop.process(frame_at(index)) for index in range(first, end)]
+def map_frames(task_mapper: TaskMapper, first: int, end: int) -> list[FrameOutcome]:
+    return [task_mapper.process(frame_at(index)) for index in range(first, end)]
 
 
-def assert_flags_agree(loop: TaskMapper, region: BallRegion, frames: Sequence[int], share: float) -> None:
+def assert_flags_agree(task_mapper: TaskMapper, region: BallRegion, frames: Sequence[int], share: float) -> None:
     """Of the Gaussians visible in these frames, at least `share` are active exactly inside the region's mask."""
-    gaussians = loop.gaussians()
+    gaussians = task_mapper.gaussians()
     for index in frames:
         frame = frame_at(index)
         seen, rows, columns = visible_means(frame, gaussians.means_m)
@@ -72,20 +72,20 @@ def assert_flags_agree(loop: TaskMapper, region: BallRegion, frames: Sequence[in
 
 
 def test_the_cap_holds_across_task_changes() -> None:
-    loop = make_loop(max_gaussians=300)
+    task_mapper = make_task_mapper(max_gaussians=300)
     for index, estimator in enumerate((B, A, B)):
-        outcomes = map_frames(loop, 4 * index, 4 * index + 4)
+        outcomes = map_frames(task_mapper, 4 * index, 4 * index + 4)
         assert all(outcome.gaussians <= 300 for outcome in outcomes)
-        loop.assign(estimator)
-    state = loop.state()
+        task_mapper.assign(estimator)
+    state = task_mapper.state()
     assert all(len(state[f"mapper/table/{name}"]) <= 300 for name in ("rows", "active", "roi_evidence"))
 
 
 def test_each_frame_reevaluates_a_bounded_number_of_keyframes_until_all_are_done() -> None:
-    loop = make_loop(buffer=16)
-    map_frames(loop, 0, 8)
-    loop.assign(B)
-    outcomes = map_frames(loop, 8, 16)
+    task_mapper = make_task_mapper(buffer=16)
+    map_frames(task_mapper, 0, 8)
+    task_mapper.assign(B)
+    outcomes = map_frames(task_mapper, 8, 16)
     settings = SeedingSettings(first_frame_seeds=60_000)
     max_seeds = settings.roi_share * settings.first_frame_seeds * SIZE[0] * SIZE[1] / (640 * 480)
     assert [outcome.reevaluation.keyframes for outcome in outcomes] == [2, 2, 2, 2, 0, 0, 0, 0]
@@ -94,12 +94,12 @@ def test_each_frame_reevaluates_a_bounded_number_of_keyframes_until_all_are_done
 
 
 def test_without_spare_time_one_keyframe_is_reevaluated_per_frame() -> None:
-    loop = make_loop()
-    map_frames(loop, 0, 4)
+    task_mapper = make_task_mapper()
+    map_frames(task_mapper, 0, 4)
     overloaded = TaskMapper(
         A, GaussianMapper(MapperSettings(), CpuRasterizer(threads=1)), scheduler=FrameScheduler(SchedulerSettings(1e-6))
     )
-    overloaded.restore(loop.state())
+    overloaded.restore(task_mapper.state())
     overloaded.assign(B)
     assert [outcome.reevaluation.keyframes for outcome in map_frames(overloaded, 4, 9)] == [1, 1, 1, 1, 0]
 
@@ -118,45 +118,45 @@ class FailingEstimator(RegionRelevanceEstimator):
 
 
 def test_a_keyframe_whose_reevaluation_fails_costs_one_frame_and_is_skipped() -> None:
-    loop = make_loop()
-    map_frames(loop, 0, 4)
-    loop.assign(FailingEstimator(2))
+    task_mapper = make_task_mapper()
+    map_frames(task_mapper, 0, 4)
+    task_mapper.assign(FailingEstimator(2))
     with pytest.raises(MemoryError, match="temporarily"):
-        loop.process(frame_at(4))
-    outcomes = map_frames(loop, 5, 7)
+        task_mapper.process(frame_at(4))
+    outcomes = map_frames(task_mapper, 5, 7)
     assert [outcome.reevaluation.keyframes for outcome in outcomes] == [2, 0]
-    shown = {keyframe.frame.index: bool(keyframe.relevance.roi.any()) for keyframe in loop.keyframes()}
+    shown = {keyframe.frame.index: bool(keyframe.relevance.roi.any()) for keyframe in task_mapper.keyframes()}
     assert [shown[index] for index in range(4)] == [True, True, False, True]
 
 
 def test_active_gaussians_follow_the_task_also_when_an_earlier_task_returns() -> None:
-    loop = make_loop()
-    map_frames(loop, 0, 8)
-    kappa_before = int(loop.gaussians().kappa.sum())
-    assert_flags_agree(loop, LEFT, range(8), 0.9)
-    loop.assign(B)
-    assert not loop.gaussians().active.any()
-    assert int(loop.gaussians().kappa.sum()) == kappa_before
-    map_frames(loop, 8, 14)
-    assert_flags_agree(loop, RIGHT, range(14), 0.9)
-    loop.assign(A)
-    map_frames(loop, 14, 22)
-    assert_flags_agree(loop, LEFT, range(4, 22), 0.9)
-    gaussians = loop.gaussians()
+    task_mapper = make_task_mapper()
+    map_frames(task_mapper, 0, 8)
+    kappa_before = int(task_mapper.gaussians().kappa.sum())
+    assert_flags_agree(task_mapper, LEFT, range(8), 0.9)
+    task_mapper.assign(B)
+    assert not task_mapper.gaussians().active.any()
+    assert int(task_mapper.gaussians().kappa.sum()) == kappa_before
+    map_frames(task_mapper, 8, 14)
+    assert_flags_agree(task_mapper, RIGHT, range(14), 0.9)
+    task_mapper.assign(A)
+    map_frames(task_mapper, 14, 22)
+    assert_flags_agree(task_mapper, LEFT, range(4, 22), 0.9)
+    gaussians = task_mapper.gaussians()
     assert gaussians.kappa[gaussians.active].max() > 8 * 6
 
 
 def test_keyframes_that_show_the_new_region_return_to_the_window() -> None:
-    loop = make_loop(window=3, buffer=32)
-    mapper = loop._mapper
+    task_mapper = make_task_mapper(window=3, buffer=32)
+    mapper = task_mapper._mapper
     for index in range(12):
         # the camera leaves the new region behind
-        loop.process(wall_frame(index, SIZE, shift_m=-0.1 * index))
-    loop.assign(B)
+        task_mapper.process(wall_frame(index, SIZE, shift_m=-0.1 * index))
+    task_mapper.assign(B)
     assert not any(view.shows_roi for view in mapper._keyframes.window)
     trained = []
     for index in range(12, 18):
-        trained.append(loop.process(wall_frame(index, SIZE, shift_m=-1.1)))
+        trained.append(task_mapper.process(wall_frame(index, SIZE, shift_m=-1.1)))
         assert len(mapper._keyframes.window) <= 3 + 2
     assert mapper.next_unevaluated is None
     assert sum(outcome.reevaluation.seeded for outcome in trained) > 0
@@ -182,27 +182,27 @@ def test_seeds_of_the_new_region_evict_gaussians_of_the_old_region_first() -> No
 
 
 def test_sent_voxels_of_the_old_region_get_no_tombstones() -> None:
-    loop = make_loop()
-    map_frames(loop, 0, 6)
-    sent = set(GRID.keys(loop._mapper.roi_gaussians().means_m).tolist())
-    loop.assign(B)
+    task_mapper = make_task_mapper()
+    map_frames(task_mapper, 0, 6)
+    sent = set(GRID.keys(task_mapper._mapper.roi_gaussians().means_m).tolist())
+    task_mapper.assign(B)
     counts: dict[int, int] = {}
-    for outcome in map_frames(loop, 6, 14):
+    for outcome in map_frames(task_mapper, 6, 14):
         assert outcome.changed_roi is not None
         counts.update(zip(outcome.changed_roi.keys.tolist(), outcome.changed_roi.counts.tolist(), strict=True))
-    new = set(GRID.keys(loop._mapper.roi_gaussians().means_m).tolist())
+    new = set(GRID.keys(task_mapper._mapper.roi_gaussians().means_m).tolist())
     assert new <= set(counts) | sent
     assert not {key for key in sent - new if counts.get(key) == 0}
 
 
 def test_a_run_saved_during_reevaluation_resumes_bit_identically() -> None:
-    uninterrupted = make_loop(buffer=16)
+    uninterrupted = make_task_mapper(buffer=16)
     map_frames(uninterrupted, 0, 8)
     uninterrupted.assign(B)
     map_frames(uninterrupted, 8, 10)
     saved: State = {name: array.copy() for name, array in uninterrupted.state().items()}
     expected_changes = [outcome.changed_roi for outcome in map_frames(uninterrupted, 10, 14)]
-    other = make_loop(buffer=16)
+    other = make_task_mapper(buffer=16)
     other.assign(B)
     other.restore(saved)
     for resumed, expected in zip(map_frames(other, 10, 14), expected_changes, strict=True):
@@ -238,15 +238,17 @@ def test_asynchronous_reevaluation_alternates_with_new_keyframes() -> None:
     executor = DeferredExecutor()
     task = TaskGraph("id", "a task", ("mug",), (), ())
     estimator = AsyncRelevanceEstimator(task, RegionDetector({"mug": RIGHT}), executor, TrackerSettings(max_frames=2))
-    loop = TaskMapper(A, GaussianMapper(MapperSettings(keyframes=KeyframeSettings(every=1)), CpuRasterizer(threads=1)))
-    map_frames(loop, 0, 3)
-    loop.assign(estimator)
-    assert map_frames(loop, 3, 4)[0].reevaluation.keyframes == 0
+    task_mapper = TaskMapper(
+        A, GaussianMapper(MapperSettings(keyframes=KeyframeSettings(every=1)), CpuRasterizer(threads=1))
+    )
+    map_frames(task_mapper, 0, 3)
+    task_mapper.assign(estimator)
+    assert map_frames(task_mapper, 3, 4)[0].reevaluation.keyframes == 0
     # the detection of the newest keyframe, then the re-evaluation of the one before it
     assert executor.frames == [3, 2]
     executor.run_next()
     executor.run_next()
-    assert map_frames(loop, 4, 5)[0].reevaluation.keyframes == 1
+    assert map_frames(task_mapper, 4, 5)[0].reevaluation.keyframes == 1
     assert executor.frames[-1] == 1
 
 

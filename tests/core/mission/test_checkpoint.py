@@ -49,7 +49,7 @@ SETTINGS = (MissionSettings(), TaskSettings(task=GRAPH.text))
 CONFIG = ResumeConfig.of(*SETTINGS)
 
 
-def loop(max_gaussians: int = 400, window: int = 2) -> TaskMapper:
+def make_task_mapper(max_gaussians: int = 400, window: int = 2) -> TaskMapper:
     """A mapper with refined poses, frequent density control, and a window smaller than the buffer, which is thinned."""
     mapper_settings = MapperSettings(
         max_gaussians=max_gaussians,
@@ -94,15 +94,15 @@ def _bytes_of(batch: VoxelBatch) -> bytes:
 
 def resume(path: str) -> None:
     """Resume the run in another process, map the remaining frames and print the checksums."""
-    run, saved = loop(), SavedRun.read(Path(path))
+    run, saved = make_task_mapper(), SavedRun.read(Path(path))
     saved.restore(run)
     print(json.dumps(checksums(run, changes_of_run(run, saved.last_index + 1, FRAMES))))
 
 
 def test_a_stopped_and_resumed_run_is_bit_identical_to_an_uninterrupted_one(tmp_path: Path) -> None:
-    uninterrupted = loop()
+    uninterrupted = make_task_mapper()
     changes = changes_of_run(uninterrupted, 0, FRAMES)
-    first = loop()
+    first = make_task_mapper()
     changes_of_run(first, 0, CUT)
     save_run(tmp_path / "run.state", first, CONFIG, CUT - 1)
     code = f"import sys; sys.path[:0] = {sys.path!r}; import test_checkpoint; test_checkpoint.resume(sys.argv[1])"
@@ -124,7 +124,7 @@ def test_settings_survive_the_file(saved: Path) -> None:
 
 
 def test_saving_changes_nothing_and_restoring_gives_the_saved_state(tmp_path: Path) -> None:
-    run, same = loop(), loop()
+    run, same = make_task_mapper(), make_task_mapper()
     changes_of_run(run, 0, CUT)
     before = {name: array.copy() for name, array in run.state().items()}
     save_run(tmp_path / "run.state", run, CONFIG, CUT - 1)
@@ -137,7 +137,7 @@ def test_saving_changes_nothing_and_restoring_gives_the_saved_state(tmp_path: Pa
 
 @pytest.fixture
 def saved(tmp_path: Path) -> Path:
-    run, path = loop(), tmp_path / "run.state"
+    run, path = make_task_mapper(), tmp_path / "run.state"
     changes_of_run(run, 0, 3)
     save_run(path, run, CONFIG, 2)
     return path
@@ -161,9 +161,9 @@ def test_all_options_that_differ_are_named(saved: Path) -> None:
 
 def test_a_mapper_that_is_too_small_is_refused(saved: Path) -> None:
     with pytest.raises(MapFileError, match="max_gaussians: expected at least"):
-        SavedRun.read(saved).restore(loop(max_gaussians=10))
+        SavedRun.read(saved).restore(make_task_mapper(max_gaussians=10))
     with pytest.raises(MapFileError, match="expected at most 1, got 2"):
-        SavedRun.read(saved).restore(loop(window=1))
+        SavedRun.read(saved).restore(make_task_mapper(window=1))
 
 
 @pytest.mark.parametrize("config", ["", "[1]", '{"a": 1}', "[" * 100_000, "\0"])
@@ -176,7 +176,7 @@ def test_a_config_that_is_not_json_objects_is_refused(config: str, saved: Path) 
 
 @pytest.fixture(scope="module")
 def state(tmp_path_factory: pytest.TempPathFactory) -> State:
-    run, path = loop(), tmp_path_factory.mktemp("states") / "run.state"
+    run, path = make_task_mapper(), tmp_path_factory.mktemp("states") / "run.state"
     changes_of_run(run, 0, 2)
     save_run(path, run, CONFIG, 1)
     return read_state(path)
@@ -197,7 +197,7 @@ def test_a_forged_array_is_rejected_or_mapping_continues(state: State) -> None:
     rejected = 0
     for name, array in saved.items():
         for forged_array in (None, *forgeries(array)):
-            fresh = loop()
+            fresh = make_task_mapper()
             others = {other: each for other, each in saved.items() if other != name}
             try:
                 fresh.restore(others if forged_array is None else {**others, name: forged_array})

@@ -33,13 +33,13 @@ def small_mapper() -> GaussianMapper:
 
 
 def test_changes_of_all_frames_add_up_to_the_active_part_of_the_map() -> None:
-    loop = TaskMapper(BALL, small_mapper(), SentVoxelTracker(VoxelGrid(0.25)))
+    task_mapper = TaskMapper(BALL, small_mapper(), SentVoxelTracker(VoxelGrid(0.25)))
     counts: dict[int, int] = {}
     for index in range(3):
-        outcome = loop.process(wall_frame(index, SIZE, shift_m=0.1 * index))
+        outcome = task_mapper.process(wall_frame(index, SIZE, shift_m=0.1 * index))
         assert outcome.changed_roi is not None
         counts.update(zip(outcome.changed_roi.keys.tolist(), outcome.changed_roi.counts.tolist(), strict=True))
-    gaussians = loop.gaussians()
+    gaussians = task_mapper.gaussians()
     assert sum(counts.values()) == int(gaussians.active.sum()) > 0
     assert (outcome.index, outcome.gaussians, outcome.iterations) == (2, len(gaussians), 8)
     assert 0 < outcome.roi_share < 1
@@ -59,7 +59,7 @@ def test_a_frame_without_depth_is_skipped() -> None:
     assert outcome.iterations == 0
 
 
-def ticking_loop(seconds_per_frame: float) -> TaskMapper:
+def ticking_mapper(seconds_per_frame: float) -> TaskMapper:
     """A TaskMapper whose clock advances one second per reading."""
     clock = itertools.count()
     scheduler = FrameScheduler(
@@ -69,9 +69,9 @@ def ticking_loop(seconds_per_frame: float) -> TaskMapper:
 
 
 def test_the_time_of_a_frame_includes_publishing() -> None:
-    loop = ticking_loop(60.0)
+    task_mapper = ticking_mapper(60.0)
     for index in range(4):
-        budget = loop.process(wall_frame(index, SIZE, shift_m=0.1 * index)).timing
+        budget = task_mapper.process(wall_frame(index, SIZE, shift_m=0.1 * index)).timing
         assert set(Stage) - {Stage.PRUNING, Stage.DENSIFICATION, Stage.RENDERING, Stage.REEVALUATION} <= set(
             budget.stages_s
         )
@@ -79,16 +79,16 @@ def test_the_time_of_a_frame_includes_publishing() -> None:
         assert budget.seconds <= 60.0 + 8.0
         assert not budget.under_trained
     # except the first iteration, which every frame trains
-    assert ticking_loop(1e-6).process(wall_frame(0, SIZE)).iterations == 1
+    assert ticking_mapper(1e-6).process(wall_frame(0, SIZE)).iterations == 1
 
 
 def test_the_same_clock_gives_the_same_map() -> None:
     maps = []
     for _ in range(2):
-        loop = ticking_loop(60.0)
+        task_mapper = ticking_mapper(60.0)
         for index in range(3):
-            loop.process(wall_frame(index, SIZE, shift_m=0.1 * index))
-        maps.append(loop.gaussians())
+            task_mapper.process(wall_frame(index, SIZE, shift_m=0.1 * index))
+        maps.append(task_mapper.gaussians())
     np.testing.assert_array_equal(maps[0].means_m, maps[1].means_m)
     np.testing.assert_array_equal(maps[0].kappa, maps[1].kappa)
 
@@ -125,14 +125,14 @@ class SlowEstimator:
 def test_skipped_changes_are_published_with_the_next_frame() -> None:
     slow = SlowEstimator()
     scheduler = FrameScheduler(SchedulerSettings(5.0, skip_stages=(SkippableStage.PUBLISHING,)), slow.clock)
-    loop = TaskMapper(slow, small_mapper(), SentVoxelTracker(VoxelGrid(0.25)), scheduler)
+    task_mapper = TaskMapper(slow, small_mapper(), SentVoxelTracker(VoxelGrid(0.25)), scheduler)
     counts: dict[int, int] = {}
     waited = []
     for index in range(5):
-        outcome = loop.process(wall_frame(index, SIZE, shift_m=0.1 * index))
+        outcome = task_mapper.process(wall_frame(index, SIZE, shift_m=0.1 * index))
         waited.append(outcome.changed_roi is None)
         assert outcome.timing.under_trained
         if outcome.changed_roi is not None:
             counts.update(zip(outcome.changed_roi.keys.tolist(), outcome.changed_roi.counts.tolist(), strict=True))
     assert waited == [False, True, False, True, False]
-    assert sum(counts.values()) == int(loop.gaussians().active.sum()) > 0
+    assert sum(counts.values()) == int(task_mapper.gaussians().active.sum()) > 0
