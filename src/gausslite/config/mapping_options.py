@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
 from pathlib import Path
 
 from gausslite.config.numbers import Number
@@ -30,8 +31,8 @@ HOLD_OUT_HELP = "hold out every N-th selected frame from mapping, for evaluation
 _EXACT = PoseExposurePrior()
 _POSE_PRIOR_METAVAR = "M,DEG[,GAIN,OFFSET]"
 _POSE_PRIOR_HELP = (
-    "expected error of poses (metres, degrees) and of exposure (gain and offset, 0 to 1); keyframes are refined within "
-    "it; none: poses and colours are exact{} (default: {})"
+    "standard deviations of the errors of poses (metres, degrees) and of exposure (gain and offset, 0 to 1), within "
+    "which views are corrected; none: poses and colours are exact{} (default: {})"
 )
 _AUTO_HELP = "; auto: estimated from pairs of frames"
 _DISABLE_HELP = (
@@ -76,17 +77,23 @@ def add_policy(
     default_policy: returns the policy that the program uses if --policy is not set.
     """
     add = parser.add_argument_group("mapping").add_argument
-    add("--preset", choices=sorted(PRESETS), help="set of defaults for other options; paper: the literal method")
+    preset_help = "set of defaults for other options; paper: the paper's method without additions"
+    add("--preset", choices=sorted(PRESETS), help=preset_help)
     chosen = add(
         "--policy",
         choices=sorted(POLICIES),
-        help="what the budget is spent on (default: task; map without a task: uniform)",
+        help="how the map is seeded and trained (default: task; map without a task: uniform)",
     )
     set_dependent_default(chosen, default_policy)
     extensions = ", ".join(EXTENSION_FLAGS)
     add("--disable", metavar="A,B", type=read_names, default=(), help=f"{_DISABLE_HELP}{extensions}")
-    add("--rasterizer", choices=BACKENDS, default="auto", help="backend that renders and trains (default: auto)")
+    add_rasterizer(add, "backend that renders and trains")
     add_pose_prior(parser, AUTO if allow_auto else NONE, AUTO if allow_auto else NONE, allow_auto)
+
+
+def add_rasterizer(add: Callable[..., argparse.Action], meaning: str) -> None:
+    """Add --rasterizer with the `add_argument` of a parser or group."""
+    add("--rasterizer", choices=BACKENDS, default="auto", help=f"{meaning} (default: %(default)s)")
 
 
 def add_pose_prior(parser: argparse.ArgumentParser, default: str | None, default_text: str, allow_auto: bool) -> None:
@@ -131,7 +138,7 @@ def add_budget(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         type=Number("min-iterations", int, 0, MAX_ITERATIONS),
         default=scheduler.min_iterations,
-        help="at --rate, iterations to make time for (default: %(default)s)",
+        help="at --rate, iterations that every frame should get (default: %(default)s)",
     )
     add(
         "--skip-stages",

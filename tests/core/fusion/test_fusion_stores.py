@@ -18,7 +18,7 @@ from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.voxel_batch import RoiSubset, VoxelBatch
 from gausslite.domain.voxel_operations import gather_rows, select_keys
 from gausslite.fusion.memory_store import MemoryStore
-from gausslite.fusion.sqlite_store import SqliteStore
+from gausslite.fusion.sqlite_store import SCHEMA_VERSION, SqliteStore
 from gausslite.fusion.store import FusionStore, MissionConfig, SessionRecord
 
 KEYS = (11, 22, 33)
@@ -230,7 +230,7 @@ def _newer_schema(path: Path) -> None:
     db.close()
 
 
-@pytest.mark.parametrize(("spoil", "message"), [(_damaged, "undamaged"), (_newer_schema, "schema version 3, got 77")])
+@pytest.mark.parametrize(("spoil", "message"), [(_damaged, "undamaged"), (_newer_schema, f"schema version {SCHEMA_VERSION}, got 77")])
 def test_a_damaged_or_newer_store_is_one_clear_error(
     tmp_path: Path, spoil: Callable[[Path], None], message: str
 ) -> None:
