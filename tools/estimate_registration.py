@@ -11,10 +11,8 @@ from __future__ import annotations
 import argparse
 import sys
 
+import gausslite as gl
 from gausslite.calibration.registration import estimate_depth_registration
-from gausslite.datasets.open import open_source
-from gausslite.datasets.selection import select_frames
-from gausslite.domain.errors import GaussLiteError
 
 
 def main() -> int:
@@ -24,10 +22,8 @@ def main() -> int:
     parser.add_argument("--count", metavar="N", type=int, default=40, help="number of frames to use (default: 40)")
     options = parser.parse_args()
     try:
-        source = open_source(options.source)
-        positions = select_frames(source, options.frames)
-        estimate = estimate_depth_registration(source, positions, options.count)
-    except GaussLiteError as error:
+        estimate = estimate_depth_registration(gl.open_sequence(options.source), options.frames, options.count)
+    except gl.GaussLiteError as error:
         print(f"estimate_registration: {error}", file=sys.stderr)
         return 2
     print(

@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from gausslite.datasets.open import open_source
+import gausslite as gl
 from gausslite_sim.home_catalogue import HOME_COUNT
 
 SHEET = Path(__file__).resolve().parents[1] / "docs" / "homes.jpg"
@@ -29,7 +29,7 @@ def main() -> None:
     cells = []
     for home in range(1, HOME_COUNT + 1):
         for trajectory, frame in VIEWS[2 * home - 2 : 2 * home]:
-            source = open_source(f"sim:home-{home}?trajectory={trajectory}&frames=10&size=480x360&noise=0")
+            source = gl.open_sequence(f"sim:home-{home}?trajectory={trajectory}&frames=10&size=480x360&noise=0")
             cells.append(cv2.resize(source.frame(frame).rgb, SIZE, interpolation=cv2.INTER_AREA))
     rows = [np.concatenate(cells[i : i + 4], axis=1) for i in range(0, len(cells), 4)]
     sheet = cv2.cvtColor(np.concatenate(rows), cv2.COLOR_RGB2BGR)

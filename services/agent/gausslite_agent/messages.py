@@ -3,21 +3,26 @@
 from __future__ import annotations
 
 import numpy as np
+from jaxtyping import Float32
+from numpy import ndarray
 
 from gausslite.domain.camera import Camera
-from gausslite.render.rasterizer import Rendering
 from gausslite.v1 import agent_service_pb2 as pb
 from gausslite.wire.convert import graph_to_message
 from gausslite.wire.images import encode_colour, encode_depth
 from gausslite.wire.uplink_values import UplinkCounters
-from gausslite_agent.agent_mission import MissionState
+from gausslite_agent.agent_mission import AgentMission
+from gausslite_agent.mission_end import MissionSummary
+from gausslite_agent.mission_state import MissionState
 from gausslite_agent.status import FrameReport, Outcome, WorkerStatus
 
 _STATES = {
-    MissionState.IDLE: pb.AGENT_STATE_IDLE,
+    MissionState.WAITING_FOR_TASK: pb.AGENT_STATE_WAITING_FOR_TASK,
     MissionState.MAPPING: pb.AGENT_STATE_MAPPING,
     MissionState.DRAINING: pb.AGENT_STATE_DRAINING,
-    MissionState.DONE: pb.AGENT_STATE_DONE,
+    MissionState.HANDING_OVER: pb.AGENT_STATE_HANDING_OVER,
+    MissionState.ENDED: pb.AGENT_STATE_ENDED,
+    MissionState.FAILED: pb.AGENT_STATE_FAILED,
 }
 _OUTCOMES = {
     Outcome.MAPPED: pb.FRAME_OUTCOME_MAPPED,
@@ -41,13 +46,26 @@ def report_to_message(report: FrameReport) -> pb.IngestFramesResponse:
     )
 
 
+def summary_to_message(state: MissionState, summary: MissionSummary) -> pb.EndMissionResponse:
+    """Encode what an ended mission has sent and left."""
+    uplink = summary.uplink or UplinkCounters()
+    return pb.EndMissionResponse(
+        state=_STATES[state],
+        summary=summary.line(),
+        voxels_waiting=uplink.voxels_waiting,
+        keyframes_waiting=uplink.keyframes_waiting,
+        frames_mapped=summary.frames,
+        gaussians=summary.gaussians,
+    )
+
+
 def status_to_message(
-    agent_id: str, state: MissionState, status: WorkerStatus, uplink: UplinkCounters
+    agent_id: str, mission: AgentMission, status: WorkerStatus, uplink: UplinkCounters
 ) -> pb.GetAgentStatusResponse:
-    """Encode the status of the agent and its uplink."""
+    """Encode the status of the agent, its mission and its uplink."""
     return pb.GetAgentStatusResponse(
         agent_id=agent_id,
-        state=_STATES[state],
+        state=_STATES[mission.state],
         graph=None if status.graph is None else graph_to_message(status.graph),
         map_revision=status.map_revision,
         gaussians=status.gaussians,
@@ -65,19 +83,23 @@ def status_to_message(
             voxels_sent=uplink.voxels_sent,
             voxels_waiting=uplink.voxels_waiting,
             subsets_rejected=uplink.subsets_rejected,
+            keyframes_sent=uplink.keyframes_sent,
+            keyframes_waiting=uplink.keyframes_waiting,
+            keyframe_bytes=uplink.keyframe_bytes,
         ),
         age_p50_seconds=status.age_s(50),
         age_p99_seconds=status.age_s(99),
-        notes=(*status.notes, *status.load_notes),
+        notes=(*mission.notes, *status.notes, *status.task_notes, *status.load_notes),
     )
 
 
-def view_to_message(rendering: Rendering, map_revision: int) -> pb.RenderViewResponse:
-    """Encode a rendering as a colour and a depth image."""
-    rgb = np.rint(np.clip(rendering.rgb, 0.0, 1.0) * 255).astype(np.uint8)
+def view_to_message(
+    rgb: Float32[ndarray, "h w 3"], depth_m: Float32[ndarray, "h w"], map_revision: int
+) -> pb.RenderViewResponse:
+    """Encode a rendering as a colour and a depth image: colours in [0, 1], depth in metres."""
     return pb.RenderViewResponse(
-        colour_png=encode_colour(rgb, lossless=True),
-        depth_png=encode_depth(rendering.expected_depth_m()),
+        colour_png=encode_colour(np.rint(np.clip(rgb, 0.0, 1.0) * 255).astype(np.uint8), lossless=True),
+        depth_png=encode_depth(depth_m),
         map_revision=map_revision,
     )
 
@@ -85,8 +107,4 @@ def view_to_message(rendering: Rendering, map_revision: int) -> pb.RenderViewRes
 def blank_view(camera: Camera, map_revision: int) -> pb.RenderViewResponse:
     """Return the view of an empty map."""
     size = (camera.height_px, camera.width_px)
-    return pb.RenderViewResponse(
-        colour_png=encode_colour(np.zeros((*size, 3), np.uint8), lossless=True),
-        depth_png=encode_depth(np.zeros(size, np.float32)),
-        map_revision=map_revision,
-    )
+    return view_to_message(np.zeros((*size, 3), np.float32), np.zeros(size, np.float32), map_revision)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
+from collections.abc import Callable
 
 from gausslite.domain.errors import UnavailableError
 from gausslite.domain.task import TaskGraph
@@ -18,14 +19,19 @@ _RETRY_S = 0.5
 class WaitingParser:
     """A TaskParser that retries while its service is unavailable, up to 30 seconds."""
 
-    def __init__(self, parser: TaskParser, timeout_s: float = _TIMEOUT_S) -> None:
+    def __init__(
+        self, parser: TaskParser, timeout_s: float = _TIMEOUT_S, cancel: Callable[[], None] = lambda: None
+    ) -> None:
+        """cancel: ends the parser's open calls with UnavailableError; a service may accept a call and not answer."""
         self._parser = parser
         self._timeout_s = timeout_s
+        self._cancel = cancel
         self._stopping = threading.Event()
 
     def stop(self) -> None:
-        """End the wait: `parse` raises its last error."""
+        """End the wait: an open call is cancelled, and `parse` raises its last error."""
         self._stopping.set()
+        self._cancel()
 
     def parse(self, text: str) -> TaskGraph:
         """Return the graph of a task. Raises TaskError; UnavailableError after the timeout or `stop`."""

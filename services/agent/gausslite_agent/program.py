@@ -22,12 +22,14 @@ from gausslite.wire.process import run_service
 from gausslite.wire.server import serve_until_stopped
 from gausslite.wire.spool import Spool
 from gausslite.wire.uplink import Uplink
-from gausslite_agent.agent_mission import AgentMission
+from gausslite_agent.agent_mission import NO_DETECTOR, AgentMission
+from gausslite_agent.keyframe_upload import KeyframeUpload
 from gausslite_agent.mapping_worker import MappingWorker
 from gausslite_agent.mission_checkpoint import SavedMission
 from gausslite_agent.parser_wait import WaitingParser
+from gausslite_agent.periodic_save import PeriodicSave
 from gausslite_agent.servicer import AgentServicer
-from gausslite_agent.settings import AgentSettings, parse_arguments
+from gausslite_agent.settings import AgentSettings, LinkSettings, parse_arguments
 
 _log = logging.getLogger(__name__)
 
@@ -47,9 +49,7 @@ class _Mission:
 
     mission: AgentMission
     stream: FrameStream | None
-    uplink: Uplink | None
     first_parser: WaitingParser
-    has_detector: bool
 
     def run(self) -> None:
         """Map the source, or assign the first task and return."""
@@ -58,12 +58,10 @@ class _Mission:
         else:
             self.mission.assign_task()
 
-    def stop(self) -> None:
-        """End the mission after its current frame, and every wait for another service."""
-        self.mission.stop()
+    def stop(self, grace_s: float) -> None:
+        """End the mission after its current frame, and waits for other services after `grace_s` seconds."""
+        self.mission.stop(grace_s)
         self.first_parser.stop()
-        if self.uplink is not None:
-            self.uplink.cancel_drain()
 
 
 async def _serve(settings: AgentSettings) -> None:
@@ -74,7 +72,7 @@ async def _serve(settings: AgentSettings) -> None:
     loop, changes = asyncio.get_running_loop(), ChangeNotifier()
     with ExitStack() as stack:
         parser = _open_parser(settings, stack)
-        uplink, client = _open_uplink(settings, stack, has_restored_map=saved is not None)
+        uplink = _open_uplink(settings, stack, has_restored_map=saved is not None)
         estimators = _estimators(settings, stream)
         worker = MappingWorker(
             settings.mission,
@@ -83,6 +81,7 @@ async def _serve(settings: AgentSettings) -> None:
             uplink,
             on_change=lambda: _notify(loop, changes),
             load=settings.load,
+            keyframe_upload=_keyframe_upload(settings.link, uplink),
         )
         stack.callback(worker.close)
         resumed = None
@@ -90,12 +89,12 @@ async def _serve(settings: AgentSettings) -> None:
             await asyncio.wrap_future(worker.restore(saved))
             resumed, saved = saved.checkpoint, None
         # only the task of the command line waits for the parser to start
-        first_parser = WaitingParser(parser)
-        mission = AgentMission(settings, worker, first_parser, client, resumed)
-        servicer = AgentServicer(settings.agent_id, worker, parser, changes, lambda: mission.state)
-        has_detector = stream is not None or settings.perception.model is not None
-        running = _Mission(mission, stream, uplink, first_parser, has_detector)
-        run_mission = functools.partial(_run_mission, running, settings.exit_when_done)
+        cancel = parser.close if isinstance(parser, ParserClient) else _do_nothing
+        first_parser = WaitingParser(parser, cancel=cancel)
+        can_detect = stream is not None or settings.perception.model is not None
+        mission = AgentMission(settings, worker, first_parser, resumed, can_detect)
+        servicer = AgentServicer(settings.agent_id, worker, mission, parser, changes)
+        run_mission = functools.partial(_run_mission, _Mission(mission, stream, first_parser), settings)
         await serve_until_stopped(settings.listen, [servicer.service()], run_mission, settings.tls)
 
 
@@ -129,21 +128,25 @@ def _estimators(settings: AgentSettings, stream: FrameStream | None) -> Estimato
     return estimators
 
 
-async def _run_mission(mission: _Mission, exit_when_done: bool) -> None:
-    """Run the mission, then keep serving unless the agent should exit. On cancellation, write the results."""
-    if not mission.has_detector:
-        _log.warning("no --detector: AssignTask will fail, because nothing can find the objects of a task")
+async def _run_mission(mission: _Mission, settings: AgentSettings) -> None:
+    """Run the mission, then keep serving unless the agent should exit. On cancellation, end the mission."""
+    if not mission.mission.can_detect:
+        _log.warning("every AssignTask will fail: %s", NO_DETECTOR)
     work = asyncio.ensure_future(asyncio.to_thread(mission.run))
     try:
-        await asyncio.shield(work)
-        if not exit_when_done or mission.stream is None:
-            await asyncio.Event().wait()
+        with PeriodicSave(mission.mission.save_if_mapping, settings.save_interval_s):
+            await asyncio.shield(work)
+            if not settings.exit_when_done or mission.stream is None:
+                await asyncio.Event().wait()
     finally:
-        # the mission still writes its results, so nothing that it uses may be closed before it ends
-        mission.stop()
+        # the mission still sends and writes its results, so nothing that it uses may be closed before it ends
+        mission.stop(settings.link.grace_s)
         await work
-        if mission.stream is None:
-            await asyncio.to_thread(mission.mission.finish)
+        await asyncio.to_thread(mission.mission.finish)
+
+
+def _do_nothing() -> None:
+    """Cancel nothing: a parser of this process answers at once."""
 
 
 def _open_parser(settings: AgentSettings, stack: ExitStack) -> TaskParser:
@@ -152,17 +155,21 @@ def _open_parser(settings: AgentSettings, stack: ExitStack) -> TaskParser:
     return stack.enter_context(ParserClient(settings.link.parser, tls=settings.tls))
 
 
-def _open_uplink(
-    settings: AgentSettings, stack: ExitStack, has_restored_map: bool
-) -> tuple[Uplink | None, FusionClient | None]:
+def _open_uplink(settings: AgentSettings, stack: ExitStack, has_restored_map: bool) -> Uplink | None:
     link = settings.link
     if link.fusion is None:
-        return None, None
+        return None
     spool = Spool(link.spool, settings.agent_id, link.grid)
     client = FusionClient(link.fusion, mission_id=link.mission_id, tls=settings.tls)
     uplink = Uplink(client, settings.agent_id, spool, link.grid, link.uplink, has_restored_map)
     stack.callback(uplink.close)
-    return uplink, client
+    return uplink
+
+
+def _keyframe_upload(link: LinkSettings, uplink: Uplink | None) -> KeyframeUpload | None:
+    if uplink is None or link.keyframes == 0:
+        return None
+    return KeyframeUpload(uplink, link.grid, link.keyframes, link.keyframes_during_mission)
 
 
 def _scene(settings: AgentSettings, stream: FrameStream | None) -> SceneInfo:

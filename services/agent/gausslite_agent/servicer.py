@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
+from dataclasses import replace
 from typing import Any
 
 from gausslite.domain.errors import InvalidInputError
@@ -25,33 +26,34 @@ from gausslite.wire.convert import (
 from gausslite.wire.map_blocks import map_blocks
 from gausslite.wire.server import Service
 from gausslite.wire.uplink_values import UplinkCounters
-from gausslite_agent.agent_mission import MissionState
+from gausslite_agent.agent_mission import AgentMission
 from gausslite_agent.map_changes import MapChangeLog
 from gausslite_agent.mapping_worker import MappingWorker
-from gausslite_agent.messages import blank_view, report_to_message, status_to_message, view_to_message
+from gausslite_agent.messages import (
+    blank_view,
+    report_to_message,
+    status_to_message,
+    summary_to_message,
+    view_to_message,
+)
 from gausslite_agent.status import FrameReport
 
 _OUTCOMES_AHEAD = 16
 
 
 class AgentServicer(pb_grpc.AgentServiceServicer):
-    """Serves one robot. changes: notified after each change of the map; state: returns the phase of the mission."""
+    """Serves one robot. changes: notified after each change of the map."""
 
     def __init__(
         self,
         agent_id: str,
         worker: MappingWorker,
+        mission: AgentMission,
         parser: TaskParser,
         changes: ChangeNotifier,
-        state: Callable[[], MissionState],
     ) -> None:
-        self._agent_id, self._worker, self._parser, self._changes, self._state = (
-            agent_id,
-            worker,
-            parser,
-            changes,
-            state,
-        )
+        self._agent_id, self._worker, self._mission = agent_id, worker, mission
+        self._parser, self._changes = parser, changes
         # used on the worker thread only
         self._change_logs = {roi_only: MapChangeLog(worker.grid, roi_only) for roi_only in (False, True)}
 
@@ -63,7 +65,7 @@ class AgentServicer(pb_grpc.AgentServiceServicer):
     async def AssignTask(self, request: pb.AssignTaskRequest, _context: Any) -> pb.AssignTaskResponse:  # noqa: N802
         """Assign a task, given as text or as a graph."""
         graph = await self._read_task(request)
-        await asyncio.wrap_future(self._worker.assign(graph))
+        await asyncio.to_thread(self._mission.assign, graph)
         return pb.AssignTaskResponse(graph=graph_to_message(graph))
 
     async def IngestFrames(  # noqa: N802
@@ -79,13 +81,25 @@ class AgentServicer(pb_grpc.AgentServiceServicer):
         finally:
             reader.cancel()
 
+    async def EndMission(  # noqa: N802
+        self, request: pb.EndMissionRequest, _context: Any
+    ) -> pb.EndMissionResponse:
+        """End the mission; return what was sent and left."""
+        end = self._mission.end_by_options
+        if request.HasField("handover"):
+            end = replace(end, handover=request.handover)
+        if request.HasField("drain_seconds"):
+            end = replace(end, drain_s=request.drain_seconds)
+        summary = await asyncio.to_thread(self._mission.end, end)
+        return summary_to_message(self._mission.state, summary)
+
     async def GetAgentStatus(  # noqa: N802
         self, _request: pb.GetAgentStatusRequest, _context: Any
     ) -> pb.GetAgentStatusResponse:
         """Return the status of the robot and its uplink."""
         uplink = self._worker.uplink
         counters = UplinkCounters() if uplink is None else uplink.counters()
-        return status_to_message(self._agent_id, self._state(), self._worker.status(), counters)
+        return status_to_message(self._agent_id, self._mission, self._worker.status(), counters)
 
     async def RenderView(self, request: pb.RenderViewRequest, _context: Any) -> pb.RenderViewResponse:  # noqa: N802
         """Render the map from a pose."""
@@ -96,7 +110,8 @@ class AgentServicer(pb_grpc.AgentServiceServicer):
             revision = self._worker.revision()
             if mapper.count == 0:
                 return blank_view(camera, revision)
-            return view_to_message(mapper.render(camera, T_world_camera), revision)
+            rendering = mapper.render(camera, T_world_camera)
+            return view_to_message(rendering.rgb, rendering.expected_depth_m(), revision)
 
         return await asyncio.wrap_future(self._worker.run(render))
 
@@ -154,4 +169,4 @@ class AgentServicer(pb_grpc.AgentServiceServicer):
             rejected: asyncio.Future[FrameReport] = asyncio.get_running_loop().create_future()
             rejected.set_result(self._worker.reject(request.frame.index, str(error)))
             return rejected
-        return asyncio.wrap_future(self._worker.submit(frame))
+        return asyncio.wrap_future(self._mission.submit(frame))

@@ -7,10 +7,11 @@ import contextlib
 from collections.abc import Sequence
 
 from gausslite.fusion.engine import FusionEngine
+from gausslite.fusion.joint_refinement import rasterizer_of_backend
 from gausslite.fusion.memory_store import MemoryStore
 from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.fusion.store import FusionStore
-from gausslite.render.rasterizer import Rasterizer
+from gausslite.wire.convert import decode_frame
 from gausslite.wire.process import run_service
 from gausslite.wire.server import serve_until_stopped
 from gausslite_fusion_server.refinement_worker import RefinementWorker
@@ -38,14 +39,8 @@ def _open_store(settings: ServerSettings) -> FusionStore:
 
 
 async def _serve(settings: ServerSettings, store: FusionStore) -> None:
-    def create_rasterizer() -> Rasterizer:
-        # imported late, because a server without refinements needs no kernels
-        from gausslite.render.choose import choose_rasterizer
-
-        return choose_rasterizer(settings.rasterizer)
-
-    engine = FusionEngine(store, settings.fusion)
-    servicer = FusionServicer(engine, RefinementWorker(settings.refine, create_rasterizer))
+    engine = FusionEngine(store, settings.fusion, decode_keyframe=decode_frame)
+    servicer = FusionServicer(engine, RefinementWorker(settings.refine, rasterizer_of_backend(settings.rasterizer)))
 
     async def drain_when_stopping() -> None:
         try:

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from threading import Event
 
 from gausslite.domain.errors import QuotaError
 from gausslite.fusion.engine import FusionEngine
-from gausslite.fusion.joint_refinement import RefineProgress, RefineSettings, refine
+from gausslite.fusion.joint_refinement import CreateRasterizer, RefineProgress, RefineSettings, refine
 from gausslite.fusion.limits import MAX_REFINE_ITERATIONS
-from gausslite.render.rasterizer import Rasterizer
 from gausslite.wire.change_notifier import ChangeNotifier
 
 
@@ -28,9 +27,9 @@ class RefineRequest:
 class RefinementWorker:
     """Runs one refinement at a time. The rasterizer is created by the first refinement, since other calls need none."""
 
-    def __init__(self, settings: RefineSettings, choose_rasterizer: Callable[[], Rasterizer]) -> None:
+    def __init__(self, settings: RefineSettings, create_rasterizer: CreateRasterizer) -> None:
         self._settings = settings
-        self._choose_rasterizer = choose_rasterizer
+        self._create_rasterizer = create_rasterizer
         self._worker = ThreadPoolExecutor(1, "refine")
         self._busy = False
 
@@ -57,9 +56,9 @@ class RefinementWorker:
 
         def work() -> None:
             gaussians, keyframes, revision = engine.refinement_input()
-            refined = refine(gaussians, keyframes, self._choose_rasterizer(), settings, report_progress)
+            refined = refine(gaussians, keyframes, self._create_rasterizer(), settings, report_progress)
             if not cancelled.is_set():
-                engine.store_refined_map(refined, revision)
+                engine.maps.store_refined(refined, revision)
 
         future = loop.run_in_executor(self._worker, work)
         future.add_done_callback(lambda _: self._finish(progress_notifier))

@@ -8,13 +8,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from gausslite.config.layers import parse_options
-from gausslite.config.mapping_options import add_voxel_size
+from gausslite.config.mapping_options import add_rasterizer, add_voxel_size
 from gausslite.config.numbers import Number
 from gausslite.config.tls_options import add_tls, read_server_tls
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.fusion.joint_refinement import RefineSettings
 from gausslite.fusion.limits import MAX_REFINE_ITERATIONS, FusionSettings, Quotas
-from gausslite.render.choose import BACKENDS
 from gausslite.wire.tls import Tls
 
 MEMORY = "memory"
@@ -86,7 +85,6 @@ def _parser() -> argparse.ArgumentParser:
         metavar="N",
         help="iterations of joint refinement if a request states none (default: %(default)s)",
     )
-    help_text = "backend of the refinement (default: %(default)s)"
-    add("--rasterizer", choices=BACKENDS, default=defaults.rasterizer, help=help_text)
+    add_rasterizer(add, "backend of the refinement")
     add_tls(parser)
     return parser

@@ -18,6 +18,7 @@ from jaxtyping import Float32, Float64
 from numpy import ndarray
 
 from gausslite.calibration.image_edges import ColourGradients, DepthEdges, depth_edges, relative_gradients
+from gausslite.datasets.selection import select_frames
 from gausslite.datasets.source import Source
 from gausslite.domain.camera import Camera
 from gausslite.domain.depth_registration import DepthRegistration, FileIntrinsics
@@ -69,11 +70,12 @@ class RegistrationEstimate:
         return self.score > max(_MIN_SCORE, _MIN_RATIO_TO_UNREGISTERED * self.unregistered_score)
 
 
-def estimate_depth_registration(source: Source, positions: Sequence[int], count: int = 40) -> RegistrationEstimate:
-    """Return the registration estimated from about `count` of these frames, spread evenly. Raises TooFewEdgesError.
+def estimate_depth_registration(source: Source, frames: str = ":", count: int = 40) -> RegistrationEstimate:
+    """Return the registration estimated from about `count` of the frames START:STOP:STEP, spread evenly.
 
-    Unreadable frames are ignored here; mapping reports them.
+    Unreadable frames are ignored here; mapping reports them. Raises TooFewEdgesError, DatasetError.
     """
+    positions = select_frames(source, frames)
     selected = positions[:: max(1, len(positions) // max(1, count))]
     full = source.camera
     shrink = _MAX_SIDE_PX / max(full.width_px, full.height_px)
@@ -101,7 +103,7 @@ def find_registration(source: Source) -> tuple[DepthRegistration | None, str]:
     if source.depth_registered:
         return None, "depth is registered to colour in this layout"
     try:
-        estimate = estimate_depth_registration(source, range(len(source)))
+        estimate = estimate_depth_registration(source)
     except TooFewEdgesError as error:
         return None, str(error)
     reason = (

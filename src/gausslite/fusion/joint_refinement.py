@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 from jaxtyping import Float32, Float64
@@ -21,6 +22,7 @@ from gausslite.fusion.keyframes import AgentKeyframe
 from gausslite.optimize.density import DensitySettings, densify, prune
 from gausslite.optimize.rates import REFINE_RATES
 from gausslite.optimize.splat_table import SplatTable
+from gausslite.render.choose import choose_rasterizer
 from gausslite.render.rasterizer import AdamSettings, LossWeights, Rasterizer, StepReport, TrainingView, UpdateCounter
 
 _FOOTPRINT_ALPHA = 0.5
@@ -62,6 +64,15 @@ class RefineProgress:
     iterations: int
     loss: float
     gaussians: int
+
+
+CreateRasterizer = Callable[[], Rasterizer]
+"""Creates the rasterizer of a refinement when it starts: a server without refinements needs no kernels."""
+
+
+def rasterizer_of_backend(name: str) -> CreateRasterizer:
+    """Return a function that creates the backend of this name, see `choose_rasterizer`."""
+    return partial(choose_rasterizer, name)
 
 
 ProgressCallback = Callable[[RefineProgress], bool]

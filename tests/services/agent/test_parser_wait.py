@@ -10,11 +10,14 @@ import time
 from pathlib import Path
 
 import pytest
+from serving import serving
 
 from gausslite.domain.errors import TaskError, UnavailableError
 from gausslite.domain.task import TaskGraph
 from gausslite.task.rules import RuleParser
+from gausslite.wire.clients import ParserClient
 from gausslite_agent.parser_wait import WaitingParser
+from gausslite_parser.servicer import parser_service
 
 TASK = "Pick up the mug"
 
@@ -48,6 +51,30 @@ def test_stop_ends_the_wait() -> None:
     threading.Timer(0.1, parser.stop).start()
     with pytest.raises(UnavailableError, match="refused"):
         parser.parse(TASK)
+
+
+class SilentParser:
+    """A parser that accepts a task and does not answer until the end of the test."""
+
+    def __init__(self) -> None:
+        self.called, self.end = threading.Event(), threading.Event()
+
+    def parse(self, text: str) -> TaskGraph:
+        self.called.set()
+        self.end.wait()
+        return RuleParser().parse(text)
+
+
+def test_stop_cancels_a_call_that_the_service_does_not_answer() -> None:
+    silent = SilentParser()
+    with serving([parser_service(silent)]) as server, ParserClient(server.address, deadline_s=3600.0) as client:
+        waiting = WaitingParser(client, cancel=client.close)
+        threading.Thread(target=lambda: silent.called.wait() and waiting.stop()).start()
+        try:
+            with pytest.raises(UnavailableError):
+                waiting.parse(TASK)
+        finally:
+            silent.end.set()
 
 
 def test_a_real_agent_that_waits_for_its_parser_ends_on_sigterm(tmp_path: Path) -> None:
