@@ -30,11 +30,12 @@ from gausslite.domain.errors import DatasetError, PoseError
 from gausslite.domain.frame import Frame
 from gausslite.domain.region import Region
 from gausslite.evaluation.compare import MapScores, ViewScore, average, score_view
+from gausslite.evaluation.corrected import CorrectedScores
 from gausslite.evaluation.fitted import render_fitted
 from gausslite.evaluation.pictures import comparison_sheet
 from gausslite.evaluation.views import MIN_ROI_PIXELS, HeldOutView, MapViewer, view_map
 from gausslite.mission.frame_stream import CorruptFrames
-from gausslite.mission.results import as_text, prepare_folder, read_report
+from gausslite.mission.results import MAP_TO_ODOM, as_text, prepare_folder, read_corrections, read_report
 from gausslite.process.messages import print_message
 
 _PICTURES = 8
@@ -77,18 +78,29 @@ def run(options: argparse.Namespace) -> int:
     if options.pictures is not None:
         prepare_folder(options.pictures)
     frames = _SelectedFrames(source, positions, frame_size(options.size, source), options.strict, options.json)
-    scores = _score_views(options, viewer, frames, regions, conditions.fit_views)
+    corrections = read_corrections(options.map.parent)
+    corrected = None if corrections is None or corrections.is_identity else CorrectedScores(corrections)
+    scores = _score_views(options, viewer, frames, regions, conditions.fit_views, corrected)
     if not scores:
         raise frames.corrupt.first_error or DatasetError(
             f"{options.source}: expected at least one frame with depth, got none"
         )
     result = average(scores)
     if options.json:
-        print(as_text({**asdict(result), "fitted": conditions.fit_views, "frames_corrupt": frames.corrupt.count}))
+        extra = {} if corrected is None else corrected.summary()
+        figures = {**asdict(result), "fitted": conditions.fit_views, "frames_corrupt": frames.corrupt.count}
+        print(as_text({**figures, **extra}))
     else:
         fitted = ", pose and exposure of each view fitted" if conditions.fit_views else ""
         skipped = f" (skipped: {frames.corrupt.count} corrupt)" if frames.corrupt.count else ""
         print(_as_line(result, bool(regions)) + fitted + skipped)
+        if corrected is not None:
+            for scored, meaning in (
+                (corrected.raw, "given poses"),
+                (corrected.interpolated, f"given poses with {MAP_TO_ODOM}, interpolated"),
+                (corrected.before, f"given poses with {MAP_TO_ODOM} of the frame before"),
+            ):
+                print(f"  {meaning}: {_as_line(average(scored), bool(regions))}")
     return 0
 
 
@@ -159,8 +171,9 @@ def _score_views(
     frames: _SelectedFrames,
     regions: Sequence[Region],
     fit_views: bool,
+    corrected: CorrectedScores | None,
 ) -> list[ViewScore]:
-    """Return the scores of all views with depth; write pictures of some of them."""
+    """Return the scores of all views with depth, and add those of corrected poses; write pictures of some views."""
     pictured = set(frames.positions[:: max(1, len(frames.positions) // _PICTURES)])
     scores = []
     for position, frame in frames:
@@ -169,6 +182,8 @@ def _score_views(
             continue
         rendered = render_fitted(viewer, view.frame) if fit_views else viewer.render_frame(view.frame)
         scores.append(score_view(rendered, view))
+        if corrected is not None:
+            corrected.add(viewer, view)
         if options.pictures is not None and position in pictured:
             sheet = comparison_sheet(view, {options.map.stem: rendered.rgb})
             write_png(options.pictures / f"view-{view.frame.index:06d}.png", sheet)

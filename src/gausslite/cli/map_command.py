@@ -32,6 +32,7 @@ from gausslite.mission.results import (
     require_additional_file,
     require_no_map,
     require_writable,
+    write_poses,
     write_results,
 )
 from gausslite.mission.runner import MissionResult, MissionRunner
@@ -141,7 +142,7 @@ class _Run:
         return result
 
     def write_results(self, result: MissionResult) -> None:
-        """Write map.ply, report.json, keyframes.json and preview.png. Raises StorageError."""
+        """Write map.ply, report.json, keyframes.json, poses and preview.png. Raises StorageError."""
         options, mission = self._options, self._inputs.mission
         self._notes = (*self._mapper.notes, *_unseen_notes(options, result))
         self._report = {
@@ -158,6 +159,7 @@ class _Run:
         prepare_folder(options.out)
         write_results(options.out, self._gaussians, self._report, self._inputs.world_frame(options))
         write_keyframe_views(options.out, self._mapper.keyframes())
+        write_poses(options.out, self._mapper.poses)
         keyframes = [(keyframe.frame, keyframe.relevance.roi) for keyframe in self._mapper.keyframes()]
         if keyframes:
             viewer = view_map(self._gaussians, mission.backend, mission.threads)

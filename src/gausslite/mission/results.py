@@ -1,4 +1,4 @@
-"""Write the results of a mission to a folder: map.ply and report.json, each replaced in one step."""
+"""Write the results of a mission to a folder: map.ply, report.json and poses, each replaced in one step."""
 
 from __future__ import annotations
 
@@ -12,11 +12,15 @@ from pathlib import Path
 
 from gausslite.codec.files import write_atomic
 from gausslite.codec.ply import write_ply
+from gausslite.datasets.pose_file import format_pose_rows, read_pose_rows
 from gausslite.domain.errors import StorageError
 from gausslite.domain.gaussians import Gaussians
+from gausslite.domain.pose_correction import CorrectionTrack
+from gausslite.mapping.pose_history import PoseHistory
 
 _MAP, _REPORT = "map.ply", "report.json"
 PREVIEW = "preview.png"
+MAP_TO_ODOM, TRAJECTORY = "map_to_odom.txt", "trajectory.txt"
 
 
 def prepare_folder(folder: Path) -> None:
@@ -49,7 +53,9 @@ def prepare_file(path: Path) -> None:
 
 def require_additional_file(path: Path, results_folder: Path) -> None:
     """Check that a file can be written and does not replace a result in the folder. Raises StorageError."""
-    if path.resolve() in {(results_folder / name).resolve() for name in (_MAP, _REPORT, PREVIEW)}:
+    if path.resolve() in {
+        (results_folder / name).resolve() for name in (_MAP, _REPORT, PREVIEW, MAP_TO_ODOM, TRAJECTORY)
+    }:
         raise StorageError(f"{path}: expected a name other than that of a result in {results_folder}")
     if path.is_dir():
         raise StorageError(f"{path}: expected the name of a file, got a folder")
@@ -71,6 +77,24 @@ def write_results(folder: Path, gaussians: Gaussians, report: Mapping[str, objec
     """Write map.ply, with the name of its world frame, and report.json. Raises StorageError."""
     write_ply(folder / _MAP, gaussians, world_frame)
     write_json(folder / _REPORT, report)
+
+
+def write_poses(folder: Path, poses: PoseHistory) -> None:
+    """Write map_to_odom.txt and trajectory.txt, in TUM's format, if any frame was mapped. Raises StorageError."""
+    corrections = poses.corrections()
+    if corrections is None:
+        return
+    for name, title, T in (
+        (MAP_TO_ODOM, "T_map_odometry at each mapped frame", corrections.T_map_odometry),
+        (TRAJECTORY, "T_map_camera of each mapped frame", poses.trajectory().T_world_camera),
+    ):
+        write_atomic(folder / name, format_pose_rows(title, corrections.times_ns, T).encode())
+
+
+def read_corrections(folder: Path) -> CorrectionTrack | None:
+    """Return the corrections of map_to_odom.txt; None without the file. Raises DatasetError, PoseError."""
+    path = folder / MAP_TO_ODOM
+    return CorrectionTrack(*read_pose_rows(path)) if path.is_file() else None
 
 
 def read_report(folder: Path) -> Mapping[str, object]:

@@ -14,6 +14,7 @@ from gausslite.domain.voxel_batch import VoxelBatch
 from gausslite.mapping.coverage import RenderedView
 from gausslite.mapping.keyframes import Keyframe
 from gausslite.mapping.mapper import GaussianMapper
+from gausslite.mapping.pose_history import PoseHistory
 from gausslite.mapping.sent_voxels import SentVoxelTracker
 from gausslite.mapping.stages import SkippableStage, Stage
 from gausslite.mapping.task_change import Reevaluation
@@ -86,6 +87,11 @@ class TaskMapper:
     def gaussians(self) -> Gaussians:
         """Return a copy of the map."""
         return self._mapper.gaussians()
+
+    @property
+    def poses(self) -> PoseHistory:
+        """The poses of all mapped frames."""
+        return self._mapper.poses
 
     def keyframes(self) -> list[Keyframe]:
         """Return the keyframes kept from the whole mission, oldest first."""
