@@ -25,7 +25,7 @@ Progress = Callable[[Iterable[KeyframeView]], Iterable[KeyframeView]]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MapContent:
-    """A map with what a results folder holds beside it; `views` and `report` are empty for a single PLY file.
+    """A map and the other content of its results folder; `views` and `report` are empty for a single PLY file.
 
     gaussians: the whole map. chosen: the Gaussians to write.
     """
@@ -39,7 +39,11 @@ class MapContent:
 
 @dataclass(frozen=True, slots=True)
 class ExportSettings:
-    """occupancy: for octomap and nav2; its voxel size is also the mesh's. progress: wraps the rendered views."""
+    """Settings of an export.
+
+    occupancy: settings of OctoMap and nav2 files; its voxel size is also that of the mesh. progress: wraps the
+    iteration over rendered views, to show a progress bar.
+    """
 
     occupancy: OccupancySettings = field(default_factory=OccupancySettings)
     progress: Progress = iter
@@ -47,7 +51,11 @@ class ExportSettings:
 
 @dataclass(frozen=True, slots=True)
 class Format:
-    """suffix: of the written file. summary: one line for people. region_only: by default only the task's region."""
+    """A file format.
+
+    suffix: of the written file. summary: one line of the help. region_only: if the user selects nothing, write only the
+    Gaussians of the task's region.
+    """
 
     suffix: str
     summary: str

@@ -70,7 +70,7 @@ class _AgentStateEnumTypeWrapper(_enum_type_wrapper._EnumTypeWrapper[_AgentState
     """An error ended the mission; `notes` has it."""
 
 class AgentState(_AgentState, metaclass=_AgentStateEnumTypeWrapper):
-    """The phase of the agent's mission. MAPPING is followed by DRAINING, HANDING_OVER if the agent hands over, and ENDED; or
+    """The state of the agent's mission. MAPPING is followed by DRAINING, HANDING_OVER if the agent hands over, and ENDED; or
     by FAILED. A task leads from ENDED and FAILED to MAPPING.
     """
 
