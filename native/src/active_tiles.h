@@ -12,7 +12,7 @@ namespace gausslite {
 // The functions that the stages call are always inlined, like Buffer's members.
 class ActiveTiles {
  public:
-  // Builds the tables. `active`: down rows of across flags.
+  // Builds the tables. `active`: one flag per tile, in `down` rows of `across` flags.
   void assign(const uint8_t* active, int across, int down);
 
   // Bounding box of the active tiles: columns x0 ... x1 - 1, rows y0 ... y1 - 1. Without active tiles x1 < x0.
