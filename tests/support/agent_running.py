@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
@@ -28,10 +28,11 @@ from gausslite.wire.change_notifier import ChangeNotifier
 from gausslite.wire.clients import AgentClient
 from gausslite.wire.server import Service
 from gausslite.wire.uplink import Uplink
-from gausslite_agent.agent_mission import MissionState
+from gausslite_agent.agent_mission import AgentMission
 from gausslite_agent.load import LoadSettings
 from gausslite_agent.mapping_worker import MappingWorker
 from gausslite_agent.servicer import AgentServicer
+from gausslite_agent.settings import parse_arguments
 
 SETTINGS = MissionSettings(max_gaussians=2000, iterations=2, threads=1)
 TASK = "Pick up the mug on the table"
@@ -85,17 +86,22 @@ class Agent:
 
 @contextmanager
 def agent(
-    build_estimator: object = ball_estimator, uplink: Uplink | None = None, queue_frames: int = 4
+    build_estimator: object = ball_estimator,
+    uplink: Uplink | None = None,
+    queue_frames: int = 4,
+    options: Sequence[str] = (),
 ) -> Iterator[Agent]:
     loops: list[asyncio.AbstractEventLoop] = []
     notifiers: list[ChangeNotifier] = []
     on_change = lambda: loops[0].call_soon_threadsafe(lambda: notifiers[0].notify())  # noqa: E731
     worker = MappingWorker(SETTINGS, GRID, build_estimator, uplink, on_change, LoadSettings(queue_frames))  # type: ignore[arg-type]
 
+    mission = AgentMission(parse_arguments(["--agent-id", "robot", *options]), worker, RuleParser())
+
     def register(server: grpc.aio.Server) -> None:
         loops.append(asyncio.get_running_loop())
         notifiers.append(ChangeNotifier())
-        servicer = AgentServicer("robot", worker, RuleParser(), notifiers[0], lambda: MissionState.MAPPING)
+        servicer = AgentServicer("robot", worker, mission, RuleParser(), notifiers[0])
         servicer.service().register(server)
 
     try:

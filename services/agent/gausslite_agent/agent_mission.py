@@ -1,4 +1,4 @@
-"""Run one mission of the agent: map its source, send the rest to the fusion server, write the results."""
+"""Run one mission of the agent: map its frames, send the rest to the fusion server, write the results."""
 
 from __future__ import annotations
 
@@ -6,67 +6,99 @@ import logging
 import threading
 import time
 from concurrent.futures import Future
-from enum import Enum
+from pathlib import Path
 
-from gausslite.domain.errors import GaussLiteError, StorageError
+from gausslite.domain.errors import GaussLiteError, MismatchError, StorageError
 from gausslite.domain.frame import Frame
+from gausslite.domain.gaussians import Gaussians
+from gausslite.domain.task import TaskGraph
 from gausslite.mission.checkpoint import ResumeConfig
 from gausslite.mission.frame_stream import CorruptFrames, FrameStream
 from gausslite.mission.results import write_results
 from gausslite.mission.runner import MissionRunner
 from gausslite.task.parser import TaskParser
-from gausslite.wire.clients import FusionClient
 from gausslite.wire.spool import Purpose
 from gausslite.wire.uplink import Uplink
 from gausslite.wire.uplink_values import UplinkCounters
 from gausslite_agent.mapping_worker import MappingWorker
 from gausslite_agent.mission_checkpoint import MissionCheckpoint
+from gausslite_agent.mission_end import EndRequest, MissionSummary
+from gausslite_agent.mission_state import MissionState, MissionStateMachine
 from gausslite_agent.report import mission_report
 from gausslite_agent.settings import AgentSettings
 from gausslite_agent.status import FrameReport
 
 _log = logging.getLogger(__name__)
-
-
-class MissionState(Enum):
-    """Phase of a mission."""
-
-    IDLE = "idle"
-    MAPPING = "mapping"
-    DRAINING = "draining"
-    DONE = "done"
+_INTERRUPTED = "interrupted"
+NO_DETECTOR = (
+    "this agent cannot find the objects of a task, because it has no detector; start it with --detector FILE.onnx"
+)
 
 
 class AgentMission:
-    """One mission. Its methods block: call them on a thread. `stop` may be called on any thread."""
+    """One mission after another, with one map. Its methods block and are thread-safe: call them on a thread."""
 
     def __init__(
         self,
         settings: AgentSettings,
         worker: MappingWorker,
         parser: TaskParser,
-        client: FusionClient | None,
         resumed: MissionCheckpoint | None = None,
+        can_detect: bool = True,
     ) -> None:
-        """Resumed: the checkpoint that the worker was restored from."""
-        self._settings, self._worker, self._parser, self._client = settings, worker, parser, client
-        self._resumed = resumed
-        self._stopping = threading.Event()
-        self._state = MissionState.IDLE
+        """Resumed: the checkpoint that the worker was restored from. can_detect: False if any task would fail."""
+        self.can_detect = can_detect
+        self._settings, self._worker, self._parser, self._resumed = settings, worker, parser, resumed
+        self._state_machine = MissionStateMachine()
         self._start_s = time.monotonic()
         self._corrupt = CorruptFrames(_log.warning)
         self._pending: Future[FrameReport] | None = None
+        # set while no source is replayed
+        self._replay_ended = threading.Event()
+        self._replay_ended.set()
+        self._stopping = threading.Event()
+        self._stop_deadline_s: float | None = None
+        self._ending = threading.Lock()
+        self._summary: MissionSummary | None = None
 
     @property
     def state(self) -> MissionState:
-        """The phase of the mission; an agent without a source is mapping as soon as it has a task."""
-        if self._state is MissionState.IDLE and self._worker.status().graph is not None:
-            return MissionState.MAPPING
-        return self._state
+        """The state of the mission."""
+        return self._state_machine.state
 
-    def stop(self) -> None:
-        """End the mission after the current frame. The results are written, but nothing more is sent."""
+    @property
+    def failure(self) -> str:
+        """The error that ended the mission; empty unless it failed."""
+        return self._state_machine.failure
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Messages for the operator about the mission itself."""
+        failed = (f"the mission failed: {self.failure}",) if self.failure else ()
+        return failed if self.can_detect else (*failed, NO_DETECTOR)
+
+    @property
+    def end_by_options(self) -> EndRequest:
+        """How the mission ends without a request: by the options of the command line."""
+        return EndRequest(self._settings.link.handover, self._settings.link.drain_s)
+
+    def stop(self, grace_s: float = 0.0) -> None:
+        """End the mission after the current frame; sending ends after `grace_s` seconds, also if it has begun."""
+        self._stop_deadline_s = time.monotonic() + grace_s
         self._stopping.set()
+        if self._worker.uplink is not None:
+            self._worker.uplink.limit_drain(grace_s)
+
+    def assign(self, graph: TaskGraph) -> None:
+        """Assign a task; it begins the next mission if the last one has ended.
+
+        Raises MismatchError while a mission ends, ModelFileError and the like.
+        """
+        self._state_machine.require_accepting("task")
+        if not self.can_detect:
+            raise MismatchError(f"task: {NO_DETECTOR}")
+        self._worker.assign(graph).result()
+        self._begin()
 
     def assign_task(self) -> None:
         """Assign the task of the command line.
@@ -77,44 +109,82 @@ class AgentMission:
         resumed, task = self._resumed, self._settings.task
         if resumed is not None:
             _log.info("resuming %r after frame %d", resumed.graph.text, resumed.last_index)
+            self._begin()
         if task is not None and (resumed is None or task != resumed.requested_task):
-            self._worker.assign(self._parser.parse(task)).result()
+            self.assign(self._parser.parse(task))
+
+    def submit(self, frame: Frame) -> Future[FrameReport]:
+        """Queue a frame and return the future of its report. Raises MismatchError unless the mission is mapping."""
+        self._state_machine.require_mapping()
+        return self._worker.submit(frame)
 
     def run(self, stream: FrameStream) -> None:
-        """Assign the task, map every frame and finish. Raises the errors of the source, the disk and the task.
+        """Assign the task, map every frame and end the mission. Raises the errors of the source, the disk and the task.
 
         An error after the first mapped frame ends the mission early: the map so far is sent and written first.
         """
         self._start_s = time.monotonic()
-        self.assign_task()
-        self._state = MissionState.MAPPING
-        failure = self._map_all(stream)
+        try:
+            self.assign_task()
+            failure = self._replay(stream)
+        except GaussLiteError as error:
+            self._state_machine.enter(MissionState.FAILED, str(error))
+            raise
         if failure is None and self._worker.status().mapped == 0:
             failure = self._corrupt.first_error
-        if failure is None:
-            self._finish()
-            return
-        if self._worker.status().mapped > 0:
-            self._finish(str(failure))
-        raise failure
+        if failure is None or self._worker.status().mapped > 0:
+            self._end(self.end_by_options, None if failure is None else str(failure))
+        if failure is not None:
+            raise failure
+
+    def end(self, request: EndRequest) -> MissionSummary:
+        """End the mission and return what was sent and left. A later call waits and returns the same.
+
+        Raises MismatchError before the first task, StorageError if the results cannot be written; the mission is FAILED
+        then and can be ended again.
+        """
+        if self._state_machine.state is MissionState.WAITING_FOR_TASK:
+            raise MismatchError("mission: expected a task first, got none yet; call AssignTask")
+        self._stopping.set()
+        self._replay_ended.wait()
+        return self._end(request, None)
 
     def finish(self) -> None:
-        """End a mission whose frames came by IngestFrames: write the map if there is one. Raises StorageError."""
-        if self._worker.status().mapped > 0:
-            self._finish()
-        elif self._resumed is not None:
-            # the task may have changed
-            self._save()
+        """End the mission because the process ends; one without a task has nothing to send or write."""
+        self._stopping.set()
+        self._replay_ended.wait()
+        if self._state_machine.state is not MissionState.WAITING_FOR_TASK:
+            self._end(self.end_by_options, None)
 
-    def _map_all(self, stream: FrameStream) -> GaussLiteError | None:
+    def save(self) -> None:
+        """Save the mission after the current frame if there is a file for it. Raises StorageError."""
+        settings = self._settings
+        if settings.state is not None:
+            config = ResumeConfig.of(*settings.fixed_settings)
+            self._worker.save(settings.state, config, settings.task or "").result()
+
+    def save_if_mapping(self) -> None:
+        """Save the mission, unless it is not mapping now. Raises StorageError."""
+        if self._state_machine.state is MissionState.MAPPING:
+            self.save()
+
+    def _begin(self) -> None:
+        if self._state_machine.state is not MissionState.MAPPING:
+            self._summary = None
+            self._state_machine.enter(MissionState.MAPPING)
+
+    def _replay(self, stream: FrameStream) -> GaussLiteError | None:
         """Map the frames of the stream, and return the error that ended it early."""
-        last_index = -1 if self._resumed is None else self._resumed.last_index
-        frames = stream.after(last_index).frames(None if self._settings.strict else self._corrupt)
-        result = MissionRunner(self._submit, should_stop=self._stopping.is_set).run(frames, last_index)
+        self._replay_ended.clear()
         try:
+            last_index = -1 if self._resumed is None else self._resumed.last_index
+            frames = stream.after(last_index).frames(None if self._settings.strict else self._corrupt)
+            result = MissionRunner(self._submit, should_stop=self._stopping.is_set).run(frames, last_index)
             self._wait_for_pending()
         except GaussLiteError as error:
             return error
+        finally:
+            self._replay_ended.set()
         return result.stopped_by if isinstance(result.stopped_by, GaussLiteError) else None
 
     def _submit(self, frame: Frame) -> None:
@@ -131,76 +201,66 @@ class AgentMission:
         if report.reason:
             _log.info("frame %d %s: %s", report.index, report.outcome.value, report.reason)
 
-    def _finish(self, ended_by: str | None = None) -> None:
-        """Save the mission, send what waits and write the results; ended_by: the error that ended it early."""
-        self._state = MissionState.DRAINING
+    def _end(self, request: EndRequest, ended_by: str | None) -> MissionSummary:
+        """End the mission once; ended_by: the error that ended it early."""
+        with self._ending:
+            if self._summary is not None:
+                return self._summary
+            # from here on frames are refused; those in the queue are still mapped
+            self._state_machine.enter(MissionState.DRAINING)
+            try:
+                summary = self._send_and_write(request, ended_by)
+            except GaussLiteError as error:
+                self._state_machine.enter(MissionState.FAILED, str(error))
+                raise
+            _log.log(logging.INFO if summary.is_complete else logging.WARNING, "%s", summary.line())
+            self._stopping.clear()
+            self._summary = summary
+            self._state_machine.enter(MissionState.ENDED)
+            return summary
+
+    def _send_and_write(self, request: EndRequest, ended_by: str | None) -> MissionSummary:
         self._worker.end_idle_training().result()
         # first, because sending and writing can take minutes that a robot may not have
-        self._save()
-        uplink, counters = self._worker.uplink, UplinkCounters()
-        if uplink is not None:
-            if not self._stopping.is_set():
-                self._send_all(uplink)
-            counters = uplink.counters()
-        stopped_by = "interrupted" if self._stopping.is_set() else ended_by
-        gaussians = self._write_results(counters, stopped_by)
-        status = self._worker.status()
-        _log.info(
-            "mission %s: %d frames at %.2f Hz, %d Gaussians, %d bytes of the task's region sent",
-            "interrupted" if self._stopping.is_set() else "ended early" if ended_by else "done",
-            *(status.mapped, status.hz, gaussians, counters.roi_bytes),
-        )
-        if not self._stopping.is_set():
-            self._state = MissionState.DONE
-
-    def _save(self) -> None:
-        settings = self._settings
-        if settings.state is not None:
-            config = ResumeConfig.of(*settings.fixed_settings)
-            self._worker.save(settings.state, config, settings.task or "").result()
-
-    def _write_results(self, counters: UplinkCounters, stopped_by: str | None) -> int:
-        """Write the map and the report if there is a folder for them, and return the number of Gaussians."""
+        self.save()
+        if self._worker.uplink is not None:
+            self._send_all(self._worker.uplink, request)
+        if ended_by is None and (self._settings.source is not None or self._stop_deadline_s is not None):
+            ended_by = _INTERRUPTED if self._stopping.is_set() else None
         gaussians = self._worker.run(lambda mapper: mapper.gaussians()).result()
-        if self._settings.out is not None:
-            seconds = time.monotonic() - self._start_s
-            report = {
-                **mission_report(self._settings.agent_id, self._worker.status(), gaussians, counters, seconds),
-                "frames_corrupt": self._corrupt.count,
-                "memory_mib": self._worker.run(lambda mapper: mapper.memory_mib()).result(),
-                "stopped_by": stopped_by,
-                "resumed_after_frame": None if self._resumed is None else self._resumed.last_index,
-            }
-            write_results(self._settings.out, gaussians, report, self._settings.link.uplink.world_frame)
-        return len(gaussians)
+        status, uplink = self._worker.status(), self._worker.uplink
+        for note in status.task_notes:
+            _log.warning("%s", note)
+        counters = None if uplink is None else uplink.counters()
+        if self._settings.out is not None and status.mapped > 0:
+            self._write_results(self._settings.out, gaussians, counters or UplinkCounters(), ended_by)
+        spool = self._settings.link.spool
+        return MissionSummary(status.mapped, status.hz, len(gaussians), ended_by, counters, spool)
 
-    def _send_all(self, uplink: Uplink) -> None:
-        """Send the rest of the region and, with --handover, the rest of the map and the keyframes."""
-        link = self._settings.link
-        drained = uplink.drain(link.drain_s)
-        if link.handover and drained:
-            try:
-                uplink.enqueue(self._worker.handover_batch().result(), Purpose.HANDOVER)
-            except StorageError as error:
-                _log.warning("handover: %s", error)
-            else:
-                drained = uplink.drain(link.drain_s)
-                self._send_keyframes(uplink)
-        if not drained:
-            consequence = (
-                "they are lost when this process ends"
-                if link.spool is None
-                else f"they stay in {link.spool} until the agent is started again"
-            )
-            _log.warning("uplink: %d voxels are not sent; %s", uplink.counters().voxels_waiting, consequence)
+    def _write_results(
+        self, folder: Path, gaussians: Gaussians, counters: UplinkCounters, ended_by: str | None
+    ) -> None:
+        seconds = time.monotonic() - self._start_s
+        report = {
+            **mission_report(self._settings.agent_id, self._worker.status(), gaussians, counters, seconds),
+            "frames_corrupt": self._corrupt.count,
+            "memory_mib": self._worker.run(lambda mapper: mapper.memory_mib()).result(),
+            "stopped_by": ended_by,
+            "resumed_after_frame": None if self._resumed is None else self._resumed.last_index,
+        }
+        write_results(folder, gaussians, report, self._settings.link.uplink.world_frame)
 
-    def _send_keyframes(self, uplink: Uplink) -> None:
-        assert self._client is not None
-        keyframes = self._worker.run(lambda mapper: mapper.keyframes()).result()
+    def _send_all(self, uplink: Uplink, request: EndRequest) -> None:
+        """Send the rest of the region and the keyframes and, for a handover, the rest of the map, within one time."""
+        deadline_s = time.monotonic() + request.drain_s
+        drained = uplink.drain(request.drain_s)
+        # without a file, more data would only delay the region's, and would be lost
+        if not request.handover or not (drained or self._settings.link.spool):
+            return
+        self._state_machine.enter(MissionState.HANDING_OVER)
         try:
-            accepted = self._client.contribute_keyframes(uplink.session_id, [each.frame for each in keyframes])
-        except GaussLiteError as error:
-            # the map is complete without them; they only improve its refinement
-            _log.warning("keyframes: %s", error)
-        else:
-            _log.info("handed over %d of %d keyframes", accepted, len(keyframes))
+            self._worker.select_keyframes().result()
+            uplink.enqueue(self._worker.handover_batch().result(), Purpose.HANDOVER)
+        except StorageError as error:
+            _log.warning("handover: %s", error)
+        uplink.drain(deadline_s - time.monotonic())

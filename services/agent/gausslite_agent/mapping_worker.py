@@ -31,6 +31,7 @@ from gausslite.mission.task_mapper import TaskMapper
 from gausslite.wire.uplink import Uplink
 from gausslite_agent.frame_queue import FrameQueue, QueuedFrame
 from gausslite_agent.idle_training import IdleTraining
+from gausslite_agent.keyframe_upload import KeyframeUpload
 from gausslite_agent.load import LoadSettings
 from gausslite_agent.mission_checkpoint import MissionCheckpoint, SavedMission
 from gausslite_agent.status import FrameReport, Outcome, StatusHolder, WorkerStatus
@@ -51,11 +52,13 @@ class MappingWorker:
         on_change: Callable[[], None] = lambda: None,
         load: LoadSettings | None = None,
         clock: Clock = time.monotonic,
+        keyframe_upload: KeyframeUpload | None = None,
     ) -> None:
         """Reserve the map's memory.
 
         build_estimator and on_change run on the worker thread, the latter after each mapped frame.
         """
+        self._keyframe_upload = keyframe_upload
         self._settings, self._grid, self._build_estimator = settings, grid, build_estimator
         self.uplink = uplink
         self._on_change = on_change
@@ -140,6 +143,10 @@ class MappingWorker:
         """Return updates of the whole map, except voxels of an earlier task that were sent with a higher Σkappa."""
         return self.run(lambda mapper: self._sent_voxels.exclude_frozen(group_by_voxel(mapper.gaussians(), self._grid)))
 
+    def select_keyframes(self) -> Future[None]:
+        """Select the keyframes to hand over from all that the mapper keeps, and pass them to the uplink."""
+        return self.run(self._offer_all_keyframes)
+
     def close(self) -> None:
         """End the worker after its current frame; waiting frames are dropped."""
         self._worker.shutdown(wait=True, cancel_futures=True)
@@ -169,7 +176,8 @@ class MappingWorker:
             )
         elif current is None or not graph.is_equivalent_to(current):
             self._task_mapper.assign(self._build_estimator(graph))
-        self._status.update(graph=graph, notes=self._task_mapper.notes)
+        self._status.update(graph=graph)
+        self._update_notes(self._task_mapper.notes)
 
     def _restore(self, saved: SavedMission) -> None:
         checkpoint = saved.checkpoint
@@ -212,7 +220,7 @@ class MappingWorker:
         frame = queued.frame
         outcome = self._task_mapper.process(frame, self._clock() - queued.arrival_s)
         self._last_index = frame.index
-        self._status.update(notes=self._task_mapper.notes)
+        self._update_notes(self._task_mapper.notes)
         if outcome.skipped is not None:
             return self._count(FrameReport(frame.index, Outcome.SKIPPED, outcome.skipped, gaussians=outcome.gaussians))
         if outcome.changed_roi is not None:
@@ -226,10 +234,22 @@ class MappingWorker:
             seconds=outcome.timing.seconds,
             age_s=self._clock() - queued.arrival_s,
         )
+        if self._keyframe_upload is not None:
+            self._keyframe_upload.offer_newest(self._mapper.keyframes())
         self._status.add_outcome(outcome)
         self._count(report)
         self._on_change()
         return report
+
+    def _update_notes(self, notes: tuple[str, ...]) -> None:
+        """Store the messages of the relevance estimator, and log each new one."""
+        for note in set(notes) - set(self.status().notes):
+            _log.warning("%s", note)
+        self._status.update(notes=notes)
+
+    def _offer_all_keyframes(self, mapper: GaussianMapper) -> None:
+        if self._keyframe_upload is not None:
+            self._keyframe_upload.offer_all(mapper.keyframes())
 
     def _idle_step(self) -> bool:
         if self._task_mapper is None or not self._task_mapper.idle_step():

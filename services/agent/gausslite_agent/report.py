@@ -38,6 +38,9 @@ def mission_report(
         "roi_share": status.roi_share,
         "bytes_sent": uplink.roi_bytes,
         "handover_bytes": uplink.handover_bytes,
+        "keyframe_bytes": uplink.keyframe_bytes,
+        "keyframes_sent": uplink.keyframes_sent,
+        "keyframes_waiting": uplink.keyframes_waiting,
         "gaussians_sent": uplink.gaussians_sent,
         "voxels_sent": uplink.voxels_sent,
         "subsets_sent": uplink.subsets_sent,
@@ -46,5 +49,5 @@ def mission_report(
         "uplink_stopped_because": uplink.stopped_because,
         "map_shared_percent": 100.0 * active / max(len(gaussians), 1) if is_sent else 0.0,
         "peak_rss_mib": peak_rss_mib(),
-        "notes": [*status.notes, *status.load_notes],
+        "notes": [*status.notes, *status.task_notes, *status.load_notes],
     }

@@ -32,8 +32,10 @@ from gausslite.wire.address import require_callable
 from gausslite.wire.tls import Tls
 from gausslite.wire.uplink_values import UplinkSettings
 from gausslite_agent.load import LoadSettings, QueuePolicy
+from gausslite_agent.mission_end import MAX_DRAIN_S
 
-_MAX_DRAIN_S = 86400.0
+_KEYFRAMES = 64
+_MAX_KEYFRAMES = 10_000
 _IDLE_ITERATIONS = 64
 
 
@@ -42,8 +44,9 @@ class LinkSettings:
     """Connections to the other services.
 
     parser: its address, None to parse tasks in this process; fusion: its address, None to send nothing. spool: file of
-    the updates that wait, None to keep them in memory. handover: at the end, also send the whole map and the
-    keyframes. drain_s: the longest wait for that.
+    the data that waits, None to keep it in memory. handover: at the end, also send the whole map. drain_s: the longest
+    time for sending at the end of a mission; grace_s: the same after SIGTERM. keyframes: the most keyframes that the
+    server has at a time; with keyframes_during_mission they are sent while mapping, not only with a handover.
     """
 
     parser: str | None = None
@@ -54,6 +57,9 @@ class LinkSettings:
     spool: Path | None = None
     handover: bool = False
     drain_s: float = 120.0
+    grace_s: float = 5.0
+    keyframes: int = _KEYFRAMES
+    keyframes_during_mission: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +75,8 @@ class AgentSettings:
     """All settings of one agent.
 
     source: the sequence that replaces the robot's camera, None for frames by IngestFrames. strict: end the mission at a
-    frame of the source that cannot be read. state: file of the saved mission.
+    frame of the source that cannot be read. state: file of the saved mission; it is saved every save_interval_s seconds
+    (0: only at the end).
     """
 
     listen: str
@@ -86,6 +93,7 @@ class AgentSettings:
     tls: Tls | None = None
     state: Path | None = None
     strict: bool = False
+    save_interval_s: float = 0.0
 
     @property
     def fixed_settings(self) -> tuple[Any, ...]:
@@ -119,6 +127,9 @@ def parse_arguments(arguments: Sequence[str] | None = None) -> AgentSettings:
         options.spool,
         options.handover,
         options.drain_timeout,
+        options.grace_period,
+        _KEYFRAMES if options.keyframes is None else options.keyframes,
+        options.handover if options.keyframes is None else options.keyframes > 0,
     )
     return AgentSettings(
         options.listen,
@@ -135,6 +146,7 @@ def parse_arguments(arguments: Sequence[str] | None = None) -> AgentSettings:
         read_server_tls(options),
         options.state,
         options.strict,
+        options.save_interval,
     )
 
 
@@ -149,6 +161,11 @@ def _load_settings(options: argparse.Namespace) -> LoadSettings:
 def _default_idle_iterations(options: argparse.Namespace) -> int:
     """Return 0 without a rate, so that maps are reproducible."""
     return 0 if options.rate is None else _IDLE_ITERATIONS
+
+
+def _default_keyframes(options: argparse.Namespace) -> int:
+    """Return 0 without a handover: then only the task's region leaves the robot."""
+    return _KEYFRAMES if options.handover else 0
 
 
 def _require_valid(options: argparse.Namespace) -> None:
@@ -177,6 +194,13 @@ def _parser() -> argparse.ArgumentParser:
     add("--task", metavar="TEXT", help="the robot's task (default: wait for the AssignTask call)")
     add("--out", metavar="DIR", type=Path, help="folder for map.ply and report.json; replaces earlier ones at the end")
     add("--state", metavar="FILE", type=Path, help="resume the mission saved in this file, and save it here at the end")
+    add(
+        "--save-interval",
+        metavar="S",
+        type=Number("save-interval", float, 0, MAX_DRAIN_S),
+        default=60.0,
+        help="seconds between two saves of --state during the mission; 0: only at the end (default: %(default)s)",
+    )
     add_switch(parser, "--exit-when-done", "exit after the mission (default: continue to serve)")
     _add_replay(parser)
     add_frames(parser)
@@ -215,13 +239,27 @@ def _add_connections(parser: argparse.ArgumentParser) -> None:
         help="seconds between two transmissions (default: %(default)s)",
     )
     add("--spool", metavar="FILE", type=Path, help="store unsent data here, across restarts (default: in memory)")
-    add_switch(group, "--handover", "at the end also send the map outside the ROI and the keyframes")
+    add_switch(group, "--handover", "at the end also send the map outside the ROI")
+    keyframes = add(
+        "--keyframes",
+        metavar="N",
+        type=Number("keyframes", int, 0, _MAX_KEYFRAMES),
+        help=f"send up to N keyframes for the refinement while mapping (default: {_KEYFRAMES} with --handover, else 0)",
+    )
+    set_dependent_default(keyframes, _default_keyframes)
     add(
         "--drain-timeout",
         metavar="S",
-        type=Number("drain-timeout", float, 0, _MAX_DRAIN_S),
+        type=Number("drain-timeout", float, 0, MAX_DRAIN_S),
         default=120.0,
-        help="longest wait for the transmission at the end, in seconds (default: %(default)s)",
+        help="longest wait for the transmission at the end of a mission, in seconds (default: %(default)s)",
+    )
+    add(
+        "--grace-period",
+        metavar="S",
+        type=Number("grace-period", float, 0, MAX_DRAIN_S),
+        default=5.0,
+        help="longest wait for the transmission after SIGTERM, in seconds (default: %(default)s)",
     )
 
 

@@ -73,6 +73,13 @@ class WorkerStatus:
     notes: tuple[str, ...] = ()
 
     @property
+    def task_notes(self) -> tuple[str, ...]:
+        """One line if no frame has shown the task's region."""
+        if self.mapped == 0 or self.graph is None or self.roi_share_sum > 0:
+            return ()
+        return (f"the task's targets were not found in {self.mapped} frames: {', '.join(self.graph.targets)}",)
+
+    @property
     def load_notes(self) -> tuple[str, ...]:
         """One line for each kind of work that was dropped for lack of time or space."""
         counts = (

@@ -17,8 +17,8 @@ from gausslite.wire.tls import Tls, open_channel
 DEADLINE_S = 30.0
 _RETRIED_METHODS = {
     "gausslite.v1.ParserService": ("ParseTask",),
-    "gausslite.v1.AgentService": ("AssignTask", "GetAgentStatus", "RenderView"),
-    "gausslite.v1.FusionService": ("JoinSession", "GetSessionStatus", "LeaveSession"),
+    "gausslite.v1.AgentService": ("AssignTask", "EndMission", "GetAgentStatus", "RenderView"),
+    "gausslite.v1.FusionService": ("JoinSession", "GetSessionStatus", "QueryObjects", "ReportObjects", "LeaveSession"),
 }
 _RETRY_POLICY = {
     "maxAttempts": 4,

@@ -16,6 +16,7 @@ from gausslite.codec.subset_codec import CodecLimits
 from gausslite.domain.camera import Camera
 from gausslite.domain.errors import ChecksumError, CodecError
 from gausslite.domain.frame import Frame
+from gausslite.domain.objects import ObjectReport, TeamObject
 from gausslite.domain.task import TaskGraph
 from gausslite.domain.voxels import AxisAlignedBox, VoxelGrid
 from gausslite.v1 import (
@@ -30,6 +31,7 @@ from gausslite.v1 import (
 from gausslite.wire import convert
 from gausslite.wire.channel import DEADLINE_S, ServiceChannel
 from gausslite.wire.connection import MAX_MESSAGE_BYTES
+from gausslite.wire.convert_objects import report_to_message, team_object_from_message
 from gausslite.wire.images import decode_colour, decode_depth
 from gausslite.wire.tls import Tls
 
@@ -162,7 +164,14 @@ class FusionClient(ServiceChannel):
         self.mission_id = mission_id
         self._stub = fusion_service_pb2_grpc.FusionServiceStub(self._channel)
 
-    def join(self, agent_id: str, grid: VoxelGrid, world_frame: str = "", fresh_map: bool = False) -> Session:
+    def join(
+        self,
+        agent_id: str,
+        grid: VoxelGrid,
+        world_frame: str = "",
+        fresh_map: bool = False,
+        task: TaskGraph | None = None,
+    ) -> Session:
         """Join the mission. Raises MismatchError if the grid, the world frame or the mission differ."""
         request = fusion_service_pb2.JoinSessionRequest(
             agent_id=agent_id,
@@ -170,6 +179,7 @@ class FusionClient(ServiceChannel):
             grid=convert.grid_to_message(grid),
             world_frame=world_frame,
             fresh_map=fresh_map,
+            task=None if task is None else convert.graph_to_message(task),
         )
         response = self._call(self._stub.JoinSession, request)
         return Session(
@@ -249,6 +259,15 @@ class FusionClient(ServiceChannel):
         if google_crc32c.value(bytes(data)) != last.crc32c:
             raise ChecksumError("export: CRC32C does not match; the map was damaged in transit")
         return bytes(data)
+
+    def report_objects(self, session_id: str, report: ObjectReport) -> None:
+        """Replace the agent's task graph and objects. Raises SessionUnknownError, InvalidInputError."""
+        self._call(self._stub.ReportObjects, report_to_message(session_id, report))
+
+    def query_objects(self, noun: str = "") -> tuple[TeamObject, ...]:
+        """Return the team's objects that a noun names, or all, the most confident first."""
+        request = fusion_service_pb2.QueryObjectsRequest(mission_id=self.mission_id, noun=noun)
+        return tuple(team_object_from_message(each) for each in self._call(self._stub.QueryObjects, request).objects)
 
     def status(self) -> fusion_service_pb2.GetSessionStatusResponse:
         """Return the figures of the mission and of each agent."""

@@ -5,8 +5,8 @@ was never sent, if the update is a tombstone, or if Σkappa has changed enough s
 update replaces the older one of its voxel, so the size of the spool is bounded by the map. With a path, the spool is
 a SQLite file that survives a restart; otherwise it is in memory.
 
-Updates and keyframes share one bandwidth: the highest value per byte is sent first. The value of an update is the change
-of Σkappa, that is the number of optimiser updates that the server lacks. The value of a keyframe has the same unit.
+Updates and keyframes share one bandwidth: the highest value per byte is sent first. The value of an update is the
+change of Σkappa, the number of optimiser updates that the server lacks. The value of a keyframe has the same unit.
 """
 
 from __future__ import annotations

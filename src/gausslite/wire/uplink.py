@@ -1,8 +1,8 @@
 """Send an agent's voxel updates and keyframes to the fusion server, asynchronously and within one bandwidth.
 
-The uplink sends in rounds. A round takes the updates and keyframes with the highest value per byte from the spool, sends
-them and marks the acknowledged ones; the others stay in the spool for a later round. So a lost connection, a restart of
-either side and a duplicate need no special case.
+The uplink sends in rounds. A round takes the updates and keyframes with the highest value per byte from the spool,
+sends them and marks the acknowledged ones; the others stay in the spool for a later round. So a lost connection, a
+restart of either side and a duplicate need no special case.
 """
 
 from __future__ import annotations

@@ -39,6 +39,7 @@ class UplinkCounters:
     """Totals since the start.
 
     voxels_sent counts each voxel of the task's region once; voxels_waiting: voxels in the spool with a pending update.
+    keyframes_sent counts each acknowledged keyframe once; keyframe_bytes has their bytes, resends included.
     stopped_because: the error that stopped the uplink, empty while it runs.
     """
 
@@ -47,6 +48,9 @@ class UplinkCounters:
     gaussians_sent: int = 0
     voxels_sent: int = 0
     voxels_waiting: int = 0
+    keyframes_sent: int = 0
+    keyframes_waiting: int = 0
+    keyframe_bytes: int = 0
     subsets_sent: int = 0
     subsets_rejected: int = 0
     joins: int = 0

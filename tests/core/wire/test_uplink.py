@@ -87,10 +87,10 @@ def test_small_changes_are_sent_only_when_draining() -> None:
     assert sorted(total for subset in kappas[1:] for total in subset) == [1, 101]
 
 
-def test_cancel_drain_ends_a_drain() -> None:
+def test_limit_drain_ends_a_drain_that_has_begun() -> None:
     with uplink("127.0.0.1:1") as link:
         link.enqueue(make_batch({1: [5]}))
-        timer = threading.Timer(0.05, link.cancel_drain)
+        timer = threading.Timer(0.05, link.limit_drain, [0.0])
         timer.start()
         assert not link.drain(600.0)
         timer.join()

@@ -200,5 +200,5 @@ def test_a_box_is_unchanged_by_a_round_trip_and_contains_its_faces() -> None:
 
 def test_is_done() -> None:
     status = agent_service_pb2.GetAgentStatusResponse
-    assert is_done(status(state=agent_service_pb2.AGENT_STATE_DONE))
+    assert is_done(status(state=agent_service_pb2.AGENT_STATE_ENDED))
     assert not is_done(status(state=agent_service_pb2.AGENT_STATE_DRAINING))

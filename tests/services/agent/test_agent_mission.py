@@ -37,8 +37,10 @@ from gausslite.wire.server import serve_until_stopped
 from gausslite.wire.spool import Spool
 from gausslite.wire.uplink import Uplink
 from gausslite.wire.uplink_values import UplinkSettings
-from gausslite_agent.agent_mission import AgentMission, MissionState
+from gausslite_agent.agent_mission import AgentMission
+from gausslite_agent.keyframe_upload import KeyframeUpload
 from gausslite_agent.mapping_worker import MappingWorker
+from gausslite_agent.mission_state import MissionState
 from gausslite_agent.settings import AgentSettings, parse_arguments
 
 MUG = BallRegion((0.0, 0.0, 1.2), 0.2)
@@ -92,9 +94,15 @@ def agent_mission(options: AgentSettings, address: str | None = None) -> Iterato
     uplink = None
     if client is not None:
         uplink = Uplink(client, "robot", Spool(None, "robot", GRID), GRID, UplinkSettings(interval_s=0.0))
-    worker = MappingWorker(options.mission, GRID, lambda _graph: RegionRelevanceEstimator([MUG]), uplink)
+    link = options.link
+    keyframes = None
+    if uplink is not None:
+        keyframes = KeyframeUpload(uplink, GRID, link.keyframes, link.keyframes_during_mission)
+    worker = MappingWorker(
+        options.mission, GRID, lambda _graph: RegionRelevanceEstimator([MUG]), uplink, keyframe_upload=keyframes
+    )
     try:
-        yield AgentMission(options, worker, RuleParser(), client), worker
+        yield AgentMission(options, worker, RuleParser()), worker
     finally:
         worker.close()
         if uplink is not None:
@@ -110,7 +118,7 @@ def test_a_mission_leaves_a_map_a_report_and_its_region_on_the_server(tmp_path: 
     store, options = MemoryStore(), settings(tmp_path)
     with fusion_server(store) as fusion, agent_mission(options, fusion.client.address) as (mission, worker):
         mission.run(stream_of(Wall(), options))
-        assert mission.state == MissionState.DONE
+        assert mission.state == MissionState.ENDED
         count = worker.status().gaussians
         [agent] = fusion.client.status().agents
     written, report = read_ply(tmp_path / "map.ply"), json.loads((tmp_path / "report.json").read_text())
@@ -157,7 +165,7 @@ def test_a_stopped_mission_writes_its_current_map(tmp_path: Path) -> None:
         mission.stop()
         thread.join(20)
         assert not thread.is_alive()
-        assert mission.state == MissionState.DRAINING
+        assert mission.state == MissionState.ENDED
     assert json.loads((tmp_path / "report.json").read_text())["frames"] < 10_000
     assert len(read_ply(tmp_path / "map.ply")) > 0
 

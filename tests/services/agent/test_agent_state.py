@@ -62,7 +62,7 @@ def agent_run(
     try:
         if saved is not None:
             worker.restore(saved).result()
-        mission = AgentMission(options, worker, RuleParser(), None, None if saved is None else saved.checkpoint)
+        mission = AgentMission(options, worker, RuleParser(), None if saved is None else saved.checkpoint)
         mission.assign_task()
         yield mission, worker
     finally:
