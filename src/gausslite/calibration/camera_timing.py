@@ -1,9 +1,9 @@
 """Estimate readout time and time offset of a camera from pairs of frames on moving stretches.
 
 A frame is warped into a later one by depth and both poses, and the later frame's pose is fitted to the result. Wrong
-times leave a photometric residual, and a rotation that the fit needs. The search minimises the residual by the readout
-time, then the rotation by the time offset, then the rotation by the readout time in finer steps. The result is used
-only if it clearly reduces both.
+times leave a photometric residual, and a rotation that the fit needs. The search minimises the residual over the
+readout time. Then it minimises the rotation over the time offset, and over the readout time in finer steps. The result
+is used only if it clearly reduces both.
 """
 
 from __future__ import annotations

@@ -53,9 +53,9 @@ class _Match:
 class TumSource(FolderSource):
     """A folder with rgb.txt, depth.txt and groundtruth.txt.
 
-    A colour image is associated with the nearest depth image within 20 ms, and with the pose interpolated (lerp and
-    slerp) at its timestamp between two poses at most 0.1 s apart, or else with a pose within 10 ms. Colour images
-    without both are excluded. Poses without a finite number count as missing. Frame numbers are the rows of rgb.txt
+    A colour image is associated with the nearest depth image within 20 ms. Its pose is interpolated (lerp and slerp)
+    between two poses at most 0.1 s apart; if there are none, a pose within 10 ms is used. Colour images without depth
+    or pose are excluded. Poses without a finite number count as missing. Frame numbers are the rows of rgb.txt
     from 0. Raises DatasetError, PoseError.
     """
 

@@ -1,10 +1,10 @@
 """Baseline mappers as settings of this engine, with the same cap, poses and number of views. None follows a task.
 
-Seeding, scales, loss weights and density control follow each system's released configuration. Everything else is
-common to all policies: Adam's rates (ONLINE_RATES; in so few iterations the released rates lose several decibels), the
-density limit of seeds near the cap, clone and split that preserve appearance, pose refinement, and the views to train
-on. The task policy trains on the 24 most recent keyframes and 24 frames that show the ROI; the baselines train on the
-24 most recent keyframes and 24 others, spread over the mission. Two values were tuned in the baselines' favour
+Seeding, scales, loss weights and density control follow each system's released configuration. Everything else is common
+to all policies: Adam's rates (ONLINE_RATES), the density limit of seeds near the cap, clone and split that preserve
+appearance, pose refinement, and the views to train on. With so few iterations, the released rates would lose several
+decibels. The task policy trains on the 24 most recent keyframes and 24 frames that show the ROI; the baselines train on
+the 24 most recent keyframes and 24 others, spread over the mission. Two values were tuned in the baselines' favour
 (docs/quality.md): the initial scale of MonoGS and the number of SplaTAM's seeds.
 """
 

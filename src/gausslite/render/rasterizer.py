@@ -14,9 +14,9 @@ Image model (EWA splatting; 3DGS, Kerbl et al. 2023; Sec. III-A):
     - The tangent x/z, y/z in the Jacobian is clamped to 1.3 times half the field of view.
     - Pixel centres are at +0.5. Blending of a pixel ends after the splat that takes its transmittance below 1e-4.
 
-A backend does not render rows with a non-finite value in columns 0-13, a quaternion of length zero, or an ellipse that
-is not finite in the backend's precision. A row is visible if the bounding box of its ellipse alpha >= 1/255 contains
-the centre of at least one rendered pixel.
+A backend does not render invalid rows: those with a non-finite value in columns 0-13, a quaternion of length zero, or
+an ellipse that is not finite in the backend's precision. A row is visible if the bounding box of its ellipse alpha >=
+1/255 contains the centre of at least one rendered pixel.
 """
 
 from __future__ import annotations

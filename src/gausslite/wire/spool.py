@@ -1,7 +1,7 @@
 """Store the latest update of every voxel and the selected keyframes for the uplink, and whether they are pending.
 
-An update is pending until the server has accepted it or permanently rejected it. A pending update is due if the voxel
-was never sent, if the update is a tombstone, or if Σkappa has changed enough since the voxel was last sent. A newer
+An update is pending until the server has accepted it or permanently rejected it. A pending update is due if its voxel
+was never sent, if it is a tombstone, or if its Σkappa has changed enough since then. A newer
 update replaces the older one of its voxel, so the size of the spool is bounded by the map. With a path, the spool is
 a SQLite file that survives a restart; otherwise it is in memory.
 
