@@ -36,6 +36,8 @@ using Flags = nb::ndarray<const bool, nb::numpy, nb::ndim<1>, nb::c_contig, nb::
 using Counts = nb::ndarray<uint32_t, nb::numpy, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 using Ids = nb::ndarray<const uint32_t, nb::numpy, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 using Intrinsics = std::tuple<double, double, double, double, int, int>;  // fx fy cx cy, width, height
+// Linear velocity, angular velocity, readout and exposure time; of length 8.
+using Motion = std::optional<std::vector<float>>;
 
 void require(bool holds, const char* message) {
   if (!holds) throw nb::value_error(message);
@@ -50,7 +52,7 @@ auto new_array(Sizes... sizes) {
   return nb::ndarray<nb::numpy, T>(data, {size_t(sizes)...}, owner);
 }
 
-Camera make_camera(const Intrinsics& intrinsics, const Matrix4& T_camera_world) {
+Camera make_camera(const Intrinsics& intrinsics, const Matrix4& T_camera_world, const Motion& motion) {
   Camera camera;
   for (size_t i = 0; i < 3; ++i) {
     for (size_t j = 0; j < 3; ++j) camera.R_camera_world[3 * i + j] = float(T_camera_world(i, j));
@@ -63,6 +65,15 @@ Camera make_camera(const Intrinsics& intrinsics, const Matrix4& T_camera_world) 
   camera.width = std::get<4>(intrinsics);
   camera.height = std::get<5>(intrinsics);
   require(camera.width > 0 && camera.height > 0 && camera.width <= 16384 && camera.height <= 16384, "image size");
+  if (motion) {
+    require(motion->size() == 8, "motion: expected 8 values");
+    const float* values = motion->data();
+    camera.moves = true;
+    std::copy_n(values, 3, camera.motion.linear_m_s);
+    std::copy_n(values + 3, 3, camera.motion.angular_rad_s);
+    camera.motion.readout_s = values[6];
+    camera.motion.exposure_s = values[7];
+  }
   return camera;
 }
 
@@ -71,9 +82,9 @@ struct Scene {
   FrameInput input;
 
   Scene(const float* rows, size_t count, const Intrinsics& intrinsics, const Matrix4& T_camera_world,
-        const std::optional<TileMask>& tiles, const std::optional<Ids>& ids) {
+        const std::optional<TileMask>& tiles, const std::optional<Ids>& ids, const Motion& motion) {
     require(count < (size_t{1} << 31), "rows: too many");
-    input = {rows, uint32_t(count), nullptr, 0, nullptr, make_camera(intrinsics, T_camera_world)};
+    input = {rows, uint32_t(count), nullptr, 0, nullptr, make_camera(intrinsics, T_camera_world, motion)};
     if (tiles) {
       const size_t tiles_x = size_t(input.camera.width + kTileSide - 1) / kTileSide,
                    tiles_y = size_t(input.camera.height + kTileSide - 1) / kTileSide;
@@ -106,8 +117,8 @@ auto visible_ids(const Rasterizer& rasterizer) {
 }
 
 nb::tuple forward(Rasterizer& self, ConstRowTable rows, const Intrinsics& intrinsics, Matrix4 T_camera_world,
-                  std::optional<TileMask> tiles, std::optional<Ids> ids) {
-  const Scene scene(rows.data(), rows.shape(0), intrinsics, T_camera_world, tiles, ids);
+                  std::optional<TileMask> tiles, std::optional<Ids> ids, const Motion& motion) {
+  const Scene scene(rows.data(), rows.shape(0), intrinsics, T_camera_world, tiles, ids, motion);
   const size_t height = size_t(scene.input.camera.height), width = size_t(scene.input.camera.width);
   auto rgb = new_array<float>(height, width, 3);
   auto depth_m = new_array<float>(height, width);
@@ -155,10 +166,11 @@ struct StepScene {
   Matrix4 T_camera_world;
   std::optional<TileMask> tiles;
   std::optional<Ids> ids;
+  Motion motion;
 
   StepScene(const TrainingView& view, const Intrinsics& intrinsics, Matrix4 T_camera_world,
-            std::optional<TileMask> tiles, std::optional<Ids> ids)
-      : view(view), intrinsics(intrinsics), T_camera_world(T_camera_world), tiles(tiles), ids(ids) {}
+            std::optional<TileMask> tiles, std::optional<Ids> ids, const Motion& motion)
+      : view(view), intrinsics(intrinsics), T_camera_world(T_camera_world), tiles(tiles), ids(ids), motion(motion) {}
 };
 
 // Tables, settings and masks of a step.
@@ -210,7 +222,7 @@ struct StepTraining {
 
 double step(Rasterizer& self, const StepScene& view_scene, const StepTraining& training) {
   const Scene scene(training.rows.data(), training.rows.shape(0), view_scene.intrinsics, view_scene.T_camera_world,
-                    view_scene.tiles, view_scene.ids);
+                    view_scene.tiles, view_scene.ids, view_scene.motion);
   const Camera& camera = scene.input.camera;
   require(view_scene.view.width() == camera.width && view_scene.view.height() == camera.height, "view: wrong size");
   const OptimizerState state = training.state();
@@ -244,9 +256,10 @@ NB_MODULE(_kernels, m) {
       .def_prop_ro("height", &TrainingView::height);
 
   nb::class_<StepScene>(m, "StepScene", "View, camera, tiles and ids of a step; references the arrays.")
-      .def(nb::init<const TrainingView&, const Intrinsics&, Matrix4, std::optional<TileMask>, std::optional<Ids>>(),
+      .def(nb::init<const TrainingView&, const Intrinsics&, Matrix4, std::optional<TileMask>, std::optional<Ids>,
+                    const Motion&>(),
            nb::keep_alive<1, 2>(), nb::arg("view"), nb::arg("intrinsics"), nb::arg("T_camera_world").noconvert(),
-           nb::arg("tiles").noconvert().none(), nb::arg("ids").noconvert().none());
+           nb::arg("tiles").noconvert().none(), nb::arg("ids").noconvert().none(), nb::arg("motion").none());
 
   nb::class_<StepTraining>(m, "StepTraining", "Tables, settings and masks of a step; references the arrays.")
       .def(nb::init<std::tuple<RowTable, RowTable, RowTable>, std::tuple<float, float, float, bool>,
@@ -262,7 +275,8 @@ NB_MODULE(_kernels, m) {
       .def_prop_ro("frame", &Rasterizer::frame, "Number of the latest forward or step.")
       .def("forward", &forward, nb::arg("rows").noconvert(), nb::arg("intrinsics"),
            nb::arg("T_camera_world").noconvert(), nb::arg("tiles").noconvert().none(),
-           nb::arg("ids").noconvert().none(), "Return rgb, depth_m, alpha and the frame number.")
+           nb::arg("ids").noconvert().none(), nb::arg("motion").none(),
+           "Return rgb, depth_m, alpha and the frame number.")
       .def("backward", &backward, nb::arg("frame"), nb::arg("row_count"), nb::arg("d_rgb").noconvert(),
            nb::arg("d_depth_m").noconvert(), nb::arg("d_alpha").noconvert(),
            "Return d_rows, d_twist, visible rows and mean_2d_grad_norm.")

@@ -49,7 +49,8 @@ GAUSSLITE_INLINE void list_lanes(uint32_t* out, Pack16 numbers, uint32_t lanes) 
 
 // Bounds of a splat in the image, from its mean and largest scale s alone. An isotropic splat of scale s has the image
 // covariance s^2 J J^T + 0.3 I, which bounds that of the real splat in each direction. Alpha exceeds 1/255 within at
-// most 3.33 standard deviations.
+// most 3.33 standard deviations. kMotion: whether the camera moves.
+template <bool kMotion>
 class CullingBounds {
  public:
   explicit CullingBounds(const Workspace& ws)
@@ -92,13 +93,17 @@ class CullingBounds {
   }
 
  private:
-  // Sixteen splats: depth, mean and reach in pixels.
+  // Sixteen splats: smallest depth, mean and reach in pixels.
   struct Extent {
     Pack16 z, x, y, reach_x, reach_y;
 
     GAUSSLITE_INLINE Extent(const CullingBounds& culling, const Pack16* mean, Pack16 largest_log_scale) {
       const Camera& c = culling.camera_;
       to_camera_frame(mean, c, x, y, z);
+      if constexpr (kMotion) {
+        set_moving(culling, largest_log_scale);
+        return;
+      }
       const Pack16 inverse_z = reciprocal(z), u = x * inverse_z, v = y * inverse_z;
       const Pack16 angle = exp(largest_log_scale) * inverse_z;
       x = fma(u, Pack16(c.fx), Pack16(c.cx));
@@ -107,11 +112,43 @@ class CullingBounds {
       reach_y = reach(angle * c.fy, min(abs(v), Pack16(culling.limit_v_)));
     }
 
+    // The same at the times of exposure, with shear and blur (projection.h).
+    GAUSSLITE_INLINE void set_moving(const CullingBounds& culling, Pack16 largest_log_scale) {
+      const Camera& c = culling.camera_;
+      const Pack16 depth = z;
+      const RowExposure exposure(c, x, y, z, reciprocal(z));
+      exposure.move(x, y, z);
+      Pack16 velocity[3];
+      point_velocity(c.motion, x, y, z, velocity);
+      const Pack16 inverse_z = reciprocal(z), u = x * inverse_z, v = y * inverse_z;
+      const Pack16 limit_u(culling.limit_u_), limit_v(culling.limit_v_);
+      const Pack16 u_clamped = min(max(u, -limit_u), limit_u), v_clamped = min(max(v, -limit_v), limit_v);
+      const Pack16 speed_x = abs(fnma(u_clamped, velocity[2], velocity[0]) * inverse_z * c.fx);
+      const Pack16 speed_y = fnma(v_clamped, velocity[2], velocity[1]) * inverse_z * c.fy;
+      const Pack16 angle = exp(largest_log_scale) * inverse_z;
+      const Pack16 sharp_x = deviation(angle * c.fx, u_clamped), sharp_y = deviation(angle * c.fy, v_clamped);
+      const Pack16 sheared_x = fma(abs(exposure.time_per_row) * speed_x, sharp_y, sharp_x);
+      const Pack16 sheared_y = abs(fma(exposure.time_per_row, speed_y, Pack16(1.0f))) * sharp_y;
+      const float blur_s = exposure_deviation_s(c.motion);
+      reach_x = reach_of(sheared_x * sheared_x + speed_x * speed_x * (blur_s * blur_s) + kDilationPx2);
+      reach_y = reach_of(sheared_y * sheared_y + speed_y * speed_y * (blur_s * blur_s) + kDilationPx2);
+      x = fma(u, Pack16(c.fx), Pack16(c.cx));
+      y = fma(v, Pack16(c.fy), Pack16(c.cy));
+      z = min(z, depth);
+    }
+
+    // Standard deviation without dilation; `size` is the scale in pixels at the image centre.
+    GAUSSLITE_INLINE static Pack16 deviation(Pack16 size, Pack16 tangent) {
+      const Pack16 square = max(size * size * fma(tangent, tangent, Pack16(1.0f)), Pack16(1e-30f));
+      return square * rough_inverse_sqrt(square);
+    }
+
     // `size`: the scale in pixels at the image centre. 3.35 exceeds 3.33 to allow for rounding.
     GAUSSLITE_INLINE static Pack16 reach(Pack16 size, Pack16 tangent) {
-      const Pack16 square = fma(size * size, fma(tangent, tangent, Pack16(1.0f)), Pack16(kDilationPx2));
-      return square * rough_inverse_sqrt(square) * 3.35f;
+      return reach_of(fma(size * size, fma(tangent, tangent, Pack16(1.0f)), Pack16(kDilationPx2)));
     }
+
+    GAUSSLITE_INLINE static Pack16 reach_of(Pack16 variance) { return variance * rough_inverse_sqrt(variance) * 3.35f; }
   };
 
   GAUSSLITE_INLINE Mask16 overlaps(const Extent& e) const {
@@ -161,8 +198,9 @@ GAUSSLITE_INLINE void bounds_from_rows(const float* rows, Pack16 (&bounds)[4]) {
 
 // Finds the rows of [begin, end) that may touch an active tile. This test costs less than a projection, and it fills
 // the groups of sixteen for the projection. The last rows, too few for a group, are all candidates.
-GAUSSLITE_INLINE uint32_t find_candidates(Workspace& ws, const CullingBounds& culling, uint32_t begin, uint32_t end,
-                                          uint32_t* ids) {
+template <bool kMotion>
+GAUSSLITE_INLINE uint32_t find_candidates(Workspace& ws, const CullingBounds<kMotion>& culling, uint32_t begin,
+                                          uint32_t end, uint32_t* ids) {
   const bool by_tile = ws.active_tiles != nullptr && !ws.active.fill_box();
   uint32_t boxes[kSegmentRows + 16], in_box = 0, count = 0, i = begin;
   for (; i + 16 <= end; i += 16) {

@@ -156,8 +156,9 @@ class Segment {
 };
 
 // Projects the first `lanes` rows of `ids`.
-GAUSSLITE_INLINE void project_group(const Workspace& ws, const CullingBounds& culling, const uint32_t* ids, int lanes,
-                                    Segment& segment) {
+template <bool kMotion>
+GAUSSLITE_INLINE void project_group(const Workspace& ws, const CullingBounds<kMotion>& culling, const uint32_t* ids,
+                                    int lanes, Segment& segment) {
   Pack16 row[16];
   uint32_t id[16];
   for (int j = 0; j < 16; ++j) {
@@ -169,7 +170,7 @@ GAUSSLITE_INLINE void project_group(const Workspace& ws, const CullingBounds& cu
   if (!any(candidates)) return;
 
   Projection p;
-  project16(row, ws.camera, p);
+  project16<kMotion>(row, ws.camera, p);
   Box box(p, ws.camera);
   box.visible = box.visible & candidates & is_valid(row, p);
   uint32_t visible = bits(box.visible);
@@ -210,11 +211,10 @@ GAUSSLITE_INLINE void project_group(const Workspace& ws, const CullingBounds& cu
   segment.add(out, depth, id, boxes, visible, tall);
 }
 
-}  // namespace
-
-void project(Workspace& ws, int thread) {
+template <bool kMotion>
+void project_segments(Workspace& ws, int thread) {
   ThreadScratch& thread_scratch = ws.scratch[size_t(thread)];
-  const CullingBounds culling(ws);
+  const CullingBounds<kMotion> culling(ws);
   uint32_t candidate_ids[kSegmentRows + 16];
   thread_scratch.next_gradient_row = thread_scratch.end_gradient_row = 0;
   // One more list than tile rows: add() writes a second key below the last tile row, without counting it.
@@ -240,6 +240,12 @@ void project(Workspace& ws, int thread) {
     ws.segment_visible[s] = segment.slot() - begin;
     for (int y = 0; y < ws.tiles_y; ++y) spans[y].end = thread_scratch.tile_rows[size_t(y)].count;
   }
+}
+
+}  // namespace
+
+void project(Workspace& ws, int thread) {
+  ws.camera.moves ? project_segments<true>(ws, thread) : project_segments<false>(ws, thread);
 }
 
 }  // namespace gausslite::GAUSSLITE_ISA

@@ -113,9 +113,8 @@ class Adam {
   Pack16 rate_, epsilon_, first_decay_, first_gain_, second_decay_, second_gain_, count_;
 };
 
-}  // namespace
-
-void update(Workspace& ws, const UpdateArguments& args, int thread) {
+template <bool kMotion>
+void update_splats(Workspace& ws, const UpdateArguments& args, int thread) {
   const Adam adam(args);
   const auto prefetch_splat = [&](const VisibleSplat& splat) {
     const size_t at = size_t(kRowWidth) * splat.id;
@@ -125,7 +124,7 @@ void update(Workspace& ws, const UpdateArguments& args, int thread) {
   };
   for_each_group(ws, thread, prefetch_splat, [&](uint32_t, const Group& group, const Slots& slots) {
     ParameterGradients g;
-    backward16<false>(group.row, group.image, ws.camera, g);
+    backward16<false, kMotion>(group.row, group.image, ws.camera, g);
     zero_invalid(g);
     g.column[kGradSum] = g.mean_2d_grad_norm;
     g.column[kGradCount] = Pack16(1.0f);
@@ -143,11 +142,12 @@ void update(Workspace& ws, const UpdateArguments& args, int thread) {
   });
 }
 
-void gradients(Workspace& ws, const GradientOutput& args, int thread) {
+template <bool kMotion>
+void write_gradients(Workspace& ws, const GradientOutput& args, int thread) {
   const auto prefetch_splat = [&](const VisibleSplat& splat) { prefetch(ws.rows + size_t(kRowWidth) * splat.id); };
   for_each_group(ws, thread, prefetch_splat, [&](uint32_t segment, const Group& group, const Slots& slots) {
     ParameterGradients g;
-    backward16<true>(group.row, group.image, ws.camera, g);
+    backward16<true, kMotion>(group.row, group.image, ws.camera, g);
     zero_invalid(g);
     for (int k = 0; k < 6; ++k) {
       args.d_twist[6 * size_t(segment) + size_t(k)] += double(sum(zero_unless(is_finite(g.twist[k]), g.twist[k])));
@@ -161,6 +161,16 @@ void gradients(Workspace& ws, const GradientOutput& args, int thread) {
       args.mean_2d_grad_norm[slots.first + uint32_t(j)] = norms[j];
     }
   });
+}
+
+}  // namespace
+
+void update(Workspace& ws, const UpdateArguments& args, int thread) {
+  ws.camera.moves ? update_splats<true>(ws, args, thread) : update_splats<false>(ws, args, thread);
+}
+
+void gradients(Workspace& ws, const GradientOutput& args, int thread) {
+  ws.camera.moves ? write_gradients<true>(ws, args, thread) : write_gradients<false>(ws, args, thread);
 }
 
 }  // namespace gausslite::GAUSSLITE_ISA

@@ -10,8 +10,10 @@ import numpy as np
 import torch
 
 from gausslite.domain.camera import Camera
+from gausslite.domain.camera_motion import CameraMotion
 from gausslite.render.rasterizer import LOG_SCALE, MEAN, OPACITY_LOGIT, QUAT, RGB, Rasterizer, Rendering, TrainingView
 from gausslite.render.reference.compositing import MAX_ALPHA, MIN_TRANSMITTANCE
+from gausslite.render.reference.motion import ImageMotion
 from gausslite.render.reference.projection import MIN_ALPHA, Ellipses, project
 
 GROUPS = {
@@ -28,12 +30,13 @@ CAMERA = Camera(52.0, 50.0, 32.3, 23.6, 64, 48)
 
 @dataclass(frozen=True)
 class Scene:
-    """Rows, camera and pose. saturated: also compare pixels with clamped alpha or early termination."""
+    """Rows, camera, its pose and motion. saturated: also compare pixels with clamped alpha or early termination."""
 
     rows: np.ndarray
     camera: Camera
     T_camera_world: np.ndarray
     saturated: bool = True
+    motion: CameraMotion | None = None
 
     @property
     def size(self) -> tuple[int, int]:
@@ -43,7 +46,8 @@ class Scene:
     def comparable(self) -> np.ndarray:
         """True for pixels to compare: float32 cannot move any of their alphas across a threshold."""
         rows = torch.from_numpy(self.rows.astype(np.float64))
-        ellipses = project(rows, self.camera, torch.from_numpy(self.T_camera_world))
+        motion = ImageMotion.of(self.camera, self.motion, torch.float64)
+        ellipses = project(rows, self.camera, torch.from_numpy(self.T_camera_world), motion=motion)
         comparable = np.ones(self.size, np.bool_)
         transmittance = torch.ones(self.size, dtype=torch.float64)
         for start in range(0, len(ellipses.row_ids), 64):

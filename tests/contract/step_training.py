@@ -72,7 +72,7 @@ def train(
 
 
 def target_for(scene: Scene, oracle: Rasterizer, subset: Subset = FULL_FRAME) -> TargetImage:
-    return target_near(oracle.forward(scene.rows, scene.camera, scene.T_camera_world, subset))
+    return target_near(oracle.forward(scene.rows, scene.camera, scene.T_camera_world, subset, scene.motion))
 
 
 def applied_gradient(result: StepResult) -> np.ndarray:

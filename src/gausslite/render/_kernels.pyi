@@ -35,6 +35,7 @@ class StepScene:
         T_camera_world: Float64[ndarray, "4 4"],
         tiles: Bool[ndarray, "th tw"] | None,
         ids: UInt32[ndarray, " m"] | None,
+        motion: list[float] | None,
     ) -> None: ...
 
 class StepTraining:
@@ -76,8 +77,12 @@ class Engine:
         T_camera_world: Float64[ndarray, "4 4"],
         tiles: Bool[ndarray, "th tw"] | None,
         ids: UInt32[ndarray, " m"] | None,
+        motion: list[float] | None,
     ) -> tuple[Float32[ndarray, "h w 3"], Float32[ndarray, "h w"], Float32[ndarray, "h w"], int]:
-        """Return rgb, depth_m, alpha and the frame number; intrinsics are fx, fy, cx, cy, width, height."""
+        """Return rgb, depth_m, alpha and the frame number.
+
+        intrinsics: fx, fy, cx, cy, width, height. motion: linear and angular velocity, readout and exposure time.
+        """
 
     def backward(
         self,

@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float32, Float64, UInt8, UInt32
 from numpy import ndarray
 
 from gausslite.domain.camera import Camera
+from gausslite.domain.camera_motion import CameraMotion
 from gausslite.domain.errors import InvalidInputError, KernelError, ShapeError
 from gausslite.render.checks import (
     require_image_gradients,
@@ -21,7 +22,7 @@ from gausslite.render.checks import (
     require_table,
     require_view,
 )
-from gausslite.render.cpu_arguments import CpuView, TableBinding, contiguous, intrinsics
+from gausslite.render.cpu_arguments import CpuView, TableBinding, contiguous, intrinsics, native_motion
 from gausslite.render.cpu_kernels import choose_simd, choose_threads, load_kernels
 from gausslite.render.rasterizer import (
     FULL_FRAME,
@@ -112,6 +113,7 @@ class CpuRasterizer:
         camera: Camera,
         T_camera_world: Float64[ndarray, "4 4"],
         subset: Subset = FULL_FRAME,
+        motion: CameraMotion | None = None,
     ) -> Rendering:
         """Render the splats. Raises ShapeError, InvalidInputError if the ids are not ascending row numbers."""
         require_table("rows", rows)
@@ -120,7 +122,12 @@ class CpuRasterizer:
         with self._lock:
             self._fetch_visible_rows()
             rgb, depth_m, alpha, frame = self._engine.forward(
-                rows, intrinsics(camera), T_camera_world, contiguous(subset.tiles), contiguous(subset.ids)
+                rows,
+                intrinsics(camera),
+                T_camera_world,
+                contiguous(subset.tiles),
+                contiguous(subset.ids),
+                native_motion(motion),
             )
         return Rendering(rgb, depth_m, alpha, _ForwardContext(self, frame, rows, T_camera_world))
 
@@ -156,6 +163,7 @@ class CpuRasterizer:
         depth_m: Float32[ndarray, "h w"],
         camera: Camera,
         pixel_weights: Float32[ndarray, "h w"] | None = None,
+        motion: CameraMotion | None = None,
     ) -> TrainingView:
         """Return the image in the kernels' layout.
 
@@ -165,7 +173,7 @@ class CpuRasterizer:
         native = load_kernels().View(
             np.ascontiguousarray(rgb), np.ascontiguousarray(depth_m), contiguous(pixel_weights)
         )
-        return CpuView(camera, intrinsics(camera), native)
+        return CpuView(camera, intrinsics(camera), native_motion(motion), native)
 
     def step(
         self,

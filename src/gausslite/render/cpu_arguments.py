@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float32, Float64
 from numpy import ndarray
 
 from gausslite.domain.camera import Camera
+from gausslite.domain.camera_motion import CameraMotion
 from gausslite.domain.errors import InvalidInputError
 from gausslite.render.checks import require_row_masks, require_scene, require_tables
 from gausslite.render.cpu_kernels import load_kernels
@@ -48,6 +49,7 @@ class CpuView:
 
     camera: Camera
     intrinsics: tuple[float, float, float, float, int, int]
+    motion: list[float] | None
     native: _kernels.View
     scenes: dict[bool, _CachedArguments[_kernels.StepScene]] = field(default_factory=dict, repr=False)
 
@@ -61,7 +63,7 @@ class CpuView:
         require_scene(n, self.camera, T_camera_world, subset)
         arrays = T_camera_world, subset.tiles, subset.ids
         passed = contiguous(T_camera_world), contiguous(subset.tiles), contiguous(subset.ids)
-        native: _kernels.StepScene = load_kernels().StepScene(self.native, self.intrinsics, *passed)
+        native: _kernels.StepScene = load_kernels().StepScene(self.native, self.intrinsics, *passed, self.motion)
         # a copy would not follow later changes of its array; the check of ids depends on n
         if subset.ids is None and all(map(is_, arrays, passed)):
             self.scenes[masked] = _CachedArguments(arguments, native)
@@ -132,6 +134,14 @@ def _row_rates(adam: AdamSettings) -> tuple[float, ...]:
 def intrinsics(camera: Camera) -> tuple[float, float, float, float, int, int]:
     """Return fx, fy, cx, cy, width and height in pixels."""
     return camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px, camera.width_px, camera.height_px
+
+
+def native_motion(motion: CameraMotion | None) -> list[float] | None:
+    """Return linear and angular velocity, readout and exposure time; None for a camera at rest."""
+    if motion is None or motion.is_still:
+        return None
+    velocities = motion.twist.linear_m_s.tolist() + motion.twist.angular_rad_s.tolist()
+    return [*velocities, motion.readout_s, motion.exposure_s]
 
 
 def contiguous(array: ndarray | None) -> ndarray | None:

@@ -14,6 +14,16 @@ Image model (EWA splatting; 3DGS, Kerbl et al. 2023; Sec. III-A):
     - The tangent x/z, y/z in the Jacobian is clamped to 1.3 times half the field of view.
     - Pixel centres are at +0.5. Blending of a pixel ends after the splat that takes its transmittance below 1e-4.
 
+Moving camera (CameraMotion: twist v, w; readout; exposure), to first order in time. A point p of the camera frame has
+the velocity -(v + w x p). Its image crosses rows at s px/s, and is recorded when the row that it reaches is exposed.
+    - The splat is projected at p - t (v + w x p), where t is the time of that row's exposure. With
+      d = 1 - s · readout / height, at least 0.5, t = readout (y0 / height - 1/2) / d, at most 0.65 readouts before or
+      after the middle. The splat is also culled if the depth at this time is less than 0.05 m.
+    - The readout shears the ellipse: its covariance is A C Aᵀ with A = I + V (0, 1) readout / (height · d). V is the
+      velocity of the image in px/s: the Jacobian times that of the point.
+    - The exposure stretches it: V Vᵀ exposure² / 12 is added to the covariance after its 0.3 px². The opacity is
+      multiplied by the root of the ratio of the determinants before and after, which keeps the splat's integral.
+
 A backend does not render invalid rows: those with a non-finite value in columns 0-13, a quaternion of length zero, or
 an ellipse that is not finite in the backend's precision. A row is visible if the bounding box of its ellipse alpha >=
 1/255 contains the centre of at least one rendered pixel.
@@ -31,6 +41,7 @@ from jaxtyping import Bool, Float32, Float64, UInt8, UInt32
 from numpy import ndarray
 
 from gausslite.domain.camera import Camera
+from gausslite.domain.camera_motion import CameraMotion
 from gausslite.domain.errors import InvalidInputError
 
 ROW_WIDTH = 16
@@ -45,6 +56,10 @@ MAX_UPDATE_COUNT = 20_000
 
 TILE_PX = 16
 NEAR_M = 0.05
+TANGENT_MARGIN = 1.3
+"""Limit of the tangents in the Jacobian, as a factor of half the field of view."""
+MAX_READOUT_SHARE, MIN_ROW_RATE = 0.65, 0.5
+"""Limits of a moving camera's exposure time, in readouts, and of 1 - s readout / height."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -224,8 +239,12 @@ class Rasterizer(Protocol):
         camera: Camera,
         T_camera_world: Float64[ndarray, "4 4"],
         subset: Subset = FULL_FRAME,
+        motion: CameraMotion | None = None,
     ) -> Rendering:
-        """Render the splats. Raises ShapeError, InvalidInputError if the ids are not ascending row numbers."""
+        """Render the splats, with a moving camera if motion is given.
+
+        Raises ShapeError, InvalidInputError if the ids are not ascending row numbers.
+        """
         ...
 
     def backward(
@@ -247,8 +266,9 @@ class Rasterizer(Protocol):
         depth_m: Float32[ndarray, "h w"],
         camera: Camera,
         pixel_weights: Float32[ndarray, "h w"] | None = None,
+        motion: CameraMotion | None = None,
     ) -> TrainingView:
-        """Return the image in the backend's layout.
+        """Return the image in the backend's layout. Steps render it with a moving camera if motion is given.
 
         depth_m: 0 means no measurement. pixel_weights: the weight of each pixel, in [0, 1], in the loss of steps with
         `masked=True`; default 1.

@@ -13,6 +13,7 @@ from torch import Tensor
 from torch.nn.functional import conv2d
 
 from gausslite.domain.camera import Camera
+from gausslite.domain.camera_motion import CameraMotion
 from gausslite.render.cuda.projection import DeviceCamera
 from gausslite.render.cuda.tables import to_device
 from gausslite.render.rasterizer import TILE_PX, LossWeights
@@ -103,6 +104,7 @@ class CudaView:
         camera: Camera,
         pixel_weights: Float32[ndarray, "h w"] | None,
         device: torch.device,
+        motion: CameraMotion | None = None,
     ) -> CudaView:
         """Copy the images to the device, colours in [0, 1], and compute the constant SSIM terms."""
         colours = to_device(rgb, device).float() / 255.0
@@ -112,7 +114,7 @@ class CudaView:
         means = blurred[:3]
         ssim_terms = torch.cat([means, blurred[3:] - means * means])
         unmasked = LossTarget(Window.whole(camera), colours, measured_m, ssim_terms, None, float(depth_m.size), 1.0)
-        device_camera = DeviceCamera.of(camera, device)
+        device_camera = DeviceCamera.of(camera, device, motion)
         if pixel_weights is None:
             return cls(camera, device_camera, unmasked, unmasked)
         window = Window.around(pixel_weights, camera)

@@ -12,9 +12,11 @@ from torch import Tensor
 from torch.nn.functional import logsigmoid, normalize
 
 from gausslite.domain.camera import Camera
+from gausslite.domain.camera_motion import CameraMotion
 from gausslite.render.cuda.kernels import Footprints, Kernels
 from gausslite.render.cuda.tables import to_device
 from gausslite.render.rasterizer import LOG_SCALE, MEAN, NEAR_M, OPACITY_LOGIT, QUAT, RGB, TILE_PX, UPDATE_COUNT
+from gausslite.render.reference.motion import ImageMotion, determinants
 from gausslite.render.reference.projection import LOW_PASS_PX2, MIN_ALPHA
 
 
@@ -30,10 +32,11 @@ class DeviceCamera:
     intrinsics: Float32[Tensor, "3 3"]
     shift_px: Float32[Tensor, "2"]
     half_size_px: Float32[Tensor, "2"]
+    motion: ImageMotion | None
 
     @classmethod
-    def of(cls, camera: Camera, device: torch.device) -> DeviceCamera:
-        """Return the device form of this camera."""
+    def of(cls, camera: Camera, device: torch.device, motion: CameraMotion | None = None) -> DeviceCamera:
+        """Return the device form of this camera and its motion."""
         middle_px = np.array([camera.width_px, camera.height_px]) / 2.0
         intrinsics = [[camera.fx_px, 0.0, middle_px[0]], [0.0, camera.fy_px, middle_px[1]], [0.0, 0.0, 1.0]]
         shift_px = np.array([camera.cx_px, camera.cy_px]) - middle_px
@@ -42,6 +45,7 @@ class DeviceCamera:
             torch.tensor(intrinsics, dtype=torch.float32, device=device),
             torch.tensor(shift_px, dtype=torch.float32, device=device),
             torch.tensor(middle_px, dtype=torch.float32, device=device),
+            ImageMotion.of(camera, motion, torch.float32, device),
         )
 
 
@@ -50,16 +54,26 @@ def project(
 ) -> Footprints:
     """Return the footprints of these rows in the whole image, in the same order."""
     R, t = T_camera_world[:3, :3], T_camera_world[:3, 3]
-    points_m = rows[:, MEAN] @ R.T + t
+    points_m, motion = rows[:, MEAN] @ R.T + t, device_camera.motion
+    if motion is not None:
+        points_m, s_per_row = motion.expose(points_m)
     covariances_m2 = kernels.covariances(_unit(rows[:, QUAT]), rows[:, LOG_SCALE].exp())
     # R Σ Rᵀ by two products with one matrix each: much faster than a batch of small products
     rotated_m2 = (covariances_m2 @ R.T).transpose(1, 2) @ R.T
     means_px, covariances_px2 = kernels.project(points_m, rotated_m2, device_camera.intrinsics, device_camera.size)
-    variance_x, variance_y = covariances_px2[:, 0, 0] + LOW_PASS_PX2, covariances_px2[:, 1, 1] + LOW_PASS_PX2
+    variance_x, variance_y = covariances_px2[:, 0, 0], covariances_px2[:, 1, 1]
     covariance = 0.5 * (covariances_px2[:, 0, 1] + covariances_px2[:, 1, 0])
-    determinant = variance_x * variance_y - covariance * covariance
     # a sigmoid whose derivative is precise near 1
     opacities = logsigmoid(rows[:, OPACITY_LOGIT]).exp()
+    if motion is None:
+        variance_x, variance_y = variance_x + LOW_PASS_PX2, variance_y + LOW_PASS_PX2
+    else:
+        velocity = motion.image_velocity(points_m)
+        variance_x, covariance, variance_y = motion.shear((variance_x, covariance, variance_y), velocity, s_per_row)
+        sharp = variance_x + LOW_PASS_PX2, covariance, variance_y + LOW_PASS_PX2
+        (variance_x, covariance, variance_y), peak = motion.blur(sharp, velocity)
+        opacities = opacities * peak
+    determinant = determinants((variance_x, covariance, variance_y))
     # the boundary alpha = 1/255 is an ellipse at this squared Mahalanobis distance
     reach = 2.0 * torch.log(opacities.detach() / MIN_ALPHA).clamp(min=0.0)
     return Footprints(
@@ -90,7 +104,7 @@ def visible_rows(
     footprints = project(kernels, candidates, device_camera, T_camera_world)
     boxes_px = torch.cat([footprints.means_px, footprints.radius_px], dim=1)
     is_valid &= torch.isfinite(footprints.conics).all(dim=1) & torch.isfinite(boxes_px).all(dim=1)
-    is_valid &= footprints.opacities > MIN_ALPHA
+    is_valid &= (footprints.opacities > MIN_ALPHA) & (footprints.channels[:, 3] >= NEAR_M)
     boxes_px = torch.where(is_valid[:, None], boxes_px, 0.0)
     chosen = torch.nonzero(is_valid & _touches(boxes_px[:, :2], boxes_px[:, 2:], device_camera, tiles))[:, 0]
     return chosen if ids is None else ids[chosen]

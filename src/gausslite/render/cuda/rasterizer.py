@@ -13,6 +13,7 @@ from numpy import ndarray
 from torch import Tensor
 
 from gausslite.domain.camera import Camera
+from gausslite.domain.camera_motion import CameraMotion
 from gausslite.domain.errors import InvalidInputError, KernelError, ShapeError
 from gausslite.render.checks import (
     require_image_gradients,
@@ -115,12 +116,13 @@ class CudaRasterizer:
         camera: Camera,
         T_camera_world: Float64[ndarray, "4 4"],
         subset: Subset = FULL_FRAME,
+        motion: CameraMotion | None = None,
     ) -> Rendering:
         """Render the splats. Raises ShapeError, InvalidInputError if the ids are not ascending row numbers."""
         require_table("rows", rows)
         require_scene(len(rows), camera, T_camera_world, subset)
         on_device = to_device(rows, self._kernels.device)
-        device_camera = DeviceCamera.of(camera, self._kernels.device)
+        device_camera = DeviceCamera.of(camera, self._kernels.device, motion)
         graph = self._render(on_device, device_camera, T_camera_world, subset, Window.whole(camera), pose_gradient=True)
         channels = graph.channels.detach().cpu().numpy()
         return Rendering(
@@ -167,10 +169,11 @@ class CudaRasterizer:
         depth_m: Float32[ndarray, "h w"],
         camera: Camera,
         pixel_weights: Float32[ndarray, "h w"] | None = None,
+        motion: CameraMotion | None = None,
     ) -> CudaView:
         """Copy an image to the device. Raises ShapeError, InvalidInputError if a weight is outside [0, 1]."""
         require_view(rgb, depth_m, camera, pixel_weights)
-        return CudaView.of(rgb, depth_m, camera, pixel_weights, self._kernels.device)
+        return CudaView.of(rgb, depth_m, camera, pixel_weights, self._kernels.device, motion)
 
     def step(
         self,

@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.nn.functional import conv2d
 
 from gausslite.domain.camera import Camera
+from gausslite.domain.camera_motion import CameraMotion
 from gausslite.render.rasterizer import LossWeights
 
 MIN_DEPTH_ALPHA = 0.5
@@ -26,6 +27,7 @@ class ReferenceView:
     rgb: Float64[Tensor, "h w 3"]
     depth_m: Float64[Tensor, "h w"]
     pixel_weights: Float64[Tensor, "h w"]
+    motion: CameraMotion | None = None
 
 
 def training_loss(

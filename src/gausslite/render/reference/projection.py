@@ -12,11 +12,11 @@ from numpy import ndarray
 from torch import Tensor
 
 from gausslite.domain.camera import Camera
-from gausslite.render.rasterizer import LOG_SCALE, MEAN, NEAR_M, OPACITY_LOGIT, QUAT, RGB, TILE_PX
+from gausslite.render.rasterizer import LOG_SCALE, MEAN, NEAR_M, OPACITY_LOGIT, QUAT, RGB, TANGENT_MARGIN, TILE_PX
+from gausslite.render.reference.motion import Covariances, ImageMotion, determinants
 
 LOW_PASS_PX2 = 0.3
 MIN_ALPHA = 1.0 / 255.0
-TANGENT_MARGIN = 1.3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -63,45 +63,63 @@ def project(
     T_camera_world: Float64[Tensor, "4 4"],
     ids: Int64[Tensor, " k"] | None = None,
     tiles: Bool[ndarray, "th tw"] | None = None,
+    motion: ImageMotion | None = None,
 ) -> Ellipses:
     """Return the ellipses of the rows (of `ids`, if given) that can touch a pixel of `tiles`, nearest first."""
     with torch.no_grad():
         is_valid = torch.isfinite(rows[:, :14]).all(dim=1) & (rows[:, QUAT].abs().sum(dim=1) > 0)
         row_ids = torch.nonzero(is_valid)[:, 0] if ids is None else ids[is_valid[ids]]
         z_m = rows[row_ids, MEAN] @ T_camera_world[2, :3] + T_camera_world[2, 3]
-        ellipses = _ellipses(rows, row_ids[z_m >= NEAR_M], camera, T_camera_world)
+        ellipses = _ellipses(rows, row_ids[z_m >= NEAR_M], camera, T_camera_world, motion)
+        ellipses = ellipses.take(ellipses.z_m >= NEAR_M)
         finite = torch.isfinite(ellipses.half_box_px).all(dim=1) & torch.isfinite(ellipses.means_px).all(dim=1)
         ellipses = ellipses.take(finite & (ellipses.opacities > MIN_ALPHA))
         ellipses = ellipses.take(_touches_tiles(ellipses, camera, tiles))
         row_ids = ellipses.row_ids[torch.argsort(ellipses.z_m, stable=True)]
     # project again with gradients, only the rows that are not culled
-    return _ellipses(rows, row_ids, camera, T_camera_world)
+    return _ellipses(rows, row_ids, camera, T_camera_world, motion)
 
 
 def _ellipses(
-    rows: Float64[Tensor, "n 16"], row_ids: Int64[Tensor, " m"], camera: Camera, T_camera_world: Float64[Tensor, "4 4"]
+    rows: Float64[Tensor, "n 16"],
+    row_ids: Int64[Tensor, " m"],
+    camera: Camera,
+    T_camera_world: Float64[Tensor, "4 4"],
+    motion: ImageMotion | None,
 ) -> Ellipses:
     kept = rows[row_ids]
     R, t = T_camera_world[:3, :3], T_camera_world[:3, 3]
     points = kept[:, MEAN] @ R.T + t
+    opacities = torch.sigmoid(kept[:, OPACITY_LOGIT])
+    if motion is None:
+        variance_x, covariance, variance_y = _low_passed(_covariances_px2(kept, points, R, camera))
+    else:
+        points, s_per_row = motion.expose(points)
+        velocity = motion.image_velocity(points)
+        covariances = motion.shear(_covariances_px2(kept, points, R, camera), velocity, s_per_row)
+        (variance_x, covariance, variance_y), peak = motion.blur(_low_passed(covariances), velocity)
+        opacities = opacities * peak
     z = points[:, 2]
     means_px = torch.stack(
         [camera.fx_px * points[:, 0] / z + camera.cx_px, camera.fy_px * points[:, 1] / z + camera.cy_px], dim=1
     )
-    variance_x, covariance, variance_y = _covariance_px2(kept, points, R, camera)
-    determinant = variance_x * variance_y - covariance * covariance
+    determinant = determinants((variance_x, covariance, variance_y))
     conics = torch.stack([variance_y, -covariance, variance_x], dim=1) / determinant[:, None]
-    opacities = torch.sigmoid(kept[:, OPACITY_LOGIT])
     # the boundary alpha = 1/255 is an ellipse at this squared Mahalanobis distance
     reach = 2.0 * torch.log(opacities.detach() / MIN_ALPHA).clamp(min=0.0)
     half_box_px = torch.sqrt(reach[:, None] * torch.stack([variance_x, variance_y], dim=1).detach())
     return Ellipses(row_ids, means_px, conics, opacities, kept[:, RGB], z, half_box_px)
 
 
-def _covariance_px2(
+def _low_passed(covariances: Covariances) -> Covariances:
+    variance_x, covariance, variance_y = covariances
+    return variance_x + LOW_PASS_PX2, covariance, variance_y + LOW_PASS_PX2
+
+
+def _covariances_px2(
     kept: Float64[Tensor, "m 16"], points: Float64[Tensor, "m 3"], R: Float64[Tensor, "3 3"], camera: Camera
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Return var x, cov xy, var y of J R Σ Rᵀ Jᵀ plus the low-pass filter; J is evaluated at the clamped tangent."""
+) -> Covariances:
+    """Return var x, cov xy, var y of J R Σ Rᵀ Jᵀ; J is evaluated at the clamped tangent."""
     x, y, z = points.unbind(dim=1)
     limit_x = TANGENT_MARGIN * 0.5 * camera.width_px / camera.fx_px
     limit_y = TANGENT_MARGIN * 0.5 * camera.height_px / camera.fy_px
@@ -112,9 +130,7 @@ def _covariance_px2(
     spread = R @ _rotations(kept[:, QUAT]) * torch.exp(kept[:, LOG_SCALE])[:, None, :]
     spread_x = torch.einsum("mi,mij->mj", jacobian_x, spread)
     spread_y = torch.einsum("mi,mij->mj", jacobian_y, spread)
-    variance_x = (spread_x * spread_x).sum(dim=1) + LOW_PASS_PX2
-    variance_y = (spread_y * spread_y).sum(dim=1) + LOW_PASS_PX2
-    return variance_x, (spread_x * spread_y).sum(dim=1), variance_y
+    return (spread_x * spread_x).sum(dim=1), (spread_x * spread_y).sum(dim=1), (spread_y * spread_y).sum(dim=1)
 
 
 def _rotations(quats_wxyz: Float64[Tensor, "m 4"]) -> Float64[Tensor, "m 3 3"]:

@@ -13,6 +13,7 @@ from numpy import ndarray
 from torch import Tensor
 
 from gausslite.domain.camera import Camera
+from gausslite.domain.camera_motion import CameraMotion
 from gausslite.domain.errors import InvalidInputError, ShapeError
 from gausslite.render.checks import (
     require_image_gradients,
@@ -40,6 +41,7 @@ from gausslite.render.rasterizer import (
 )
 from gausslite.render.reference.compositing import render_images, render_images_backward
 from gausslite.render.reference.loss import ReferenceView, training_loss
+from gausslite.render.reference.motion import ImageMotion
 from gausslite.render.reference.projection import Ellipses, apply_twist, project
 
 
@@ -72,9 +74,10 @@ class ReferenceRasterizer:
         camera: Camera,
         T_camera_world: Float64[ndarray, "4 4"],
         subset: Subset = FULL_FRAME,
+        motion: CameraMotion | None = None,
     ) -> Rendering:
         """Render the splats. Raises ShapeError, InvalidInputError if the ids are not ascending row numbers."""
-        graph = _render(rows, camera, T_camera_world, subset)
+        graph = _render(rows, camera, T_camera_world, subset, motion)
         images = graph.images.numpy().astype(np.float32)
         return Rendering(
             np.ascontiguousarray(images[..., :3]),
@@ -103,6 +106,7 @@ class ReferenceRasterizer:
         depth_m: Float32[ndarray, "h w"],
         camera: Camera,
         pixel_weights: Float32[ndarray, "h w"] | None = None,
+        motion: CameraMotion | None = None,
     ) -> TrainingView:
         """Return the image as float64 tensors. Raises ShapeError, InvalidInputError if a weight is outside [0, 1]."""
         require_view(rgb, depth_m, camera, pixel_weights)
@@ -113,6 +117,7 @@ class ReferenceRasterizer:
             torch.from_numpy(rgb / 255.0),
             torch.from_numpy(depth_m.astype(np.float64)),
             torch.from_numpy(pixel_weights.astype(np.float64)),
+            motion,
         )
 
     def step(
@@ -134,7 +139,7 @@ class ReferenceRasterizer:
             raise ShapeError(f"view: expected one that this backend prepared, got {type(view).__name__}")
         require_tables(rows, first_moment, second_moment)
         require_row_masks(len(rows), trainable, update_counter)
-        graph = _render(rows, view.camera, T_camera_world, subset)
+        graph = _render(rows, view.camera, T_camera_world, subset, view.motion)
         images = graph.images.requires_grad_()
         value = training_loss(images, view, loss, masked)
         (d_images,) = torch.autograd.grad(value, images)
@@ -169,14 +174,19 @@ class ReferenceRasterizer:
 
 
 def _render(
-    rows: Float32[ndarray, "n 16"], camera: Camera, T_camera_world: Float64[ndarray, "4 4"], subset: Subset
+    rows: Float32[ndarray, "n 16"],
+    camera: Camera,
+    T_camera_world: Float64[ndarray, "4 4"],
+    subset: Subset,
+    motion: CameraMotion | None,
 ) -> _RenderGraph:
     require_table("rows", rows)
     require_scene(len(rows), camera, T_camera_world, subset)
     ids = None if subset.ids is None else torch.from_numpy(subset.ids.astype(np.int64))
     leaves = torch.from_numpy(rows.astype(np.float64)).requires_grad_()
     twist = torch.zeros(6, dtype=torch.float64, requires_grad=True)
-    ellipses = project(leaves, camera, apply_twist(torch.from_numpy(T_camera_world), twist), ids, subset.tiles)
+    pose = apply_twist(torch.from_numpy(T_camera_world), twist)
+    ellipses = project(leaves, camera, pose, ids, subset.tiles, ImageMotion.of(camera, motion, torch.float64))
     with torch.no_grad():
         images = render_images(ellipses, camera, subset.tiles)
     return _RenderGraph(leaves, twist, camera, subset.tiles, ellipses, images)
