@@ -30,6 +30,7 @@ from gausslite.render.reference import ReferenceRasterizer
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.v1 import fusion_service_pb2_grpc as pb_grpc
 from gausslite.wire.clients import FusionClient
+from gausslite.wire.convert import decode_frame
 from gausslite.wire.server import Service
 from gausslite.wire.tls import Tls
 from gausslite_fusion_server.refinement_worker import RefinementWorker
@@ -84,7 +85,7 @@ def fusion_server(
 
     With tls the client uses the server's certificate; the stub and the channel do not work then.
     """
-    engine = FusionEngine(store or MemoryStore(), settings or FusionSettings(grid=GRID))
+    engine = FusionEngine(store or MemoryStore(), settings or FusionSettings(grid=GRID), decode_keyframe=decode_frame)
     settings_of_refinement = refine or RefineSettings(iterations=3, report_every=1)
     servicer = FusionServicer(engine, RefinementWorker(settings_of_refinement, ReferenceRasterizer))
     loops = []

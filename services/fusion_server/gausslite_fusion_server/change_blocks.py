@@ -9,7 +9,7 @@ import numpy as np
 from gausslite.domain.voxel_batch import VoxelBatch
 from gausslite.domain.voxel_operations import crop_to_box, merge_batches, tombstones
 from gausslite.domain.voxels import AxisAlignedBox, VoxelGrid
-from gausslite.fusion.engine import FusedMapChanges
+from gausslite.fusion.fused_map import FusedMapChanges
 from gausslite.fusion.vote import VoteResult
 from gausslite.v1.gaussians_pb2 import MapBlock, Provenance
 from gausslite.wire.map_blocks import map_blocks

@@ -12,46 +12,41 @@ from typing import Any, TypeVar
 import google_crc32c
 
 from gausslite.codec.ply import ply_bytes
-from gausslite.codec.subset_codec import MAX_SUBSET_BYTES, decode_subset
+from gausslite.codec.subset_codec import MAX_SUBSET_BYTES
 from gausslite.domain.errors import (
-    GaussLiteError,
     InvalidInputError,
-    MismatchError,
     QuotaError,
     RevisionGoneError,
-    SessionUnknownError,
-    StorageError,
-    UnavailableError,
 )
+from gausslite.domain.objects import ObjectReport
 from gausslite.domain.voxel_batch import VoxelBatch
-from gausslite.fusion.engine import FusedMapChanges, FusionEngine
-from gausslite.fusion.keyframes import AgentKeyframe
+from gausslite.fusion.engine import FusionEngine
+from gausslite.fusion.fused_map import FusedMapChanges
 from gausslite.fusion.mission_config import MissionConfig
-from gausslite.fusion.traffic import AgentContribution, TrafficCounters
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.v1 import fusion_service_pb2_grpc as pb_grpc
 from gausslite.v1.gaussians_pb2 import MapBlock
 from gausslite.wire.change_notifier import ChangeNotifier
-from gausslite.wire.convert import box_from_message, frame_from_message, grid_from_message, grid_to_message
+from gausslite.wire.convert import (
+    box_from_message,
+    graph_from_message,
+    grid_from_message,
+    grid_to_message,
+)
+from gausslite.wire.convert_objects import object_to_message, report_from_message
 from gausslite.wire.server import Service
-from gausslite.wire.status import code_and_reason
 from gausslite.wire.tls import require_agent_certificate
 from gausslite_fusion_server.change_blocks import change_blocks
+from gausslite_fusion_server.contributions import store_keyframe, store_subset
 from gausslite_fusion_server.drain_gate import DrainGate
+from gausslite_fusion_server.messages import contribution_to_message
 from gausslite_fusion_server.refinement_worker import RefinementWorker, RefineRequest
 
 _CHUNK_BYTES = 1 << 20
 _MAX_REPORTED_REJECTIONS = 1000
 _WORKERS = 4
-_STREAM_ERRORS = (SessionUnknownError, MismatchError, StorageError, UnavailableError)
-"""Errors that every later message would raise too, so they end the stream; other errors reject one message."""
 
 _Result = TypeVar("_Result")
-_ACCEPTED, _STALE, _REJECTED = (
-    pb.SUBSET_STATUS_ACCEPTED,
-    pb.SUBSET_STATUS_STALE,
-    pb.SUBSET_STATUS_REJECTED,
-)
 
 
 class FusionServicer(pb_grpc.FusionServiceServicer):
@@ -86,7 +81,11 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         require_agent_certificate(context, request.agent_id)
         grid = grid_from_message(request.grid)
         requested = MissionConfig(request.mission_id, request.world_frame, grid.size_m)
+        task = graph_from_message(request.task) if request.HasField("task") else None
         joined = await self._work(self._engine.join, request.agent_id, requested, request.fresh_map)
+        if task is not None:
+            report = ObjectReport(task, self._engine.reported_objects(request.agent_id, task))
+            await self._work(self._engine.report_objects, joined.session.session_id, report)
         self._map_changes.notify()
         return pb.JoinSessionResponse(
             session_id=joined.session.session_id,
@@ -95,6 +94,8 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
             grid=grid_to_message(self._engine.grid),
             max_subset_bytes=MAX_SUBSET_BYTES,
             max_gaussians=self._engine.settings.quotas.gaussians_per_agent,
+            keyframes=joined.keyframes,
+            max_keyframes=self._engine.settings.quotas.keyframes_per_agent,
         )
 
     async def ContributeSubsets(
@@ -103,7 +104,7 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         """Store voxel updates; one acknowledgement for each message."""
         acknowledged = 0
         async for request in self._gate.admit(request_iterator):
-            outcome = await self._work(self._store_subset, request)
+            outcome = await self._work(store_subset, self._engine, request)
             self._map_changes.notify()
             acknowledged = max(acknowledged, request.sequence)
             yield pb.ContributeSubsetsResponse(acknowledged=acknowledged, outcomes=[outcome])
@@ -115,7 +116,7 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         response = pb.ContributeKeyframesResponse()
         async for request in self._gate.admit(request_iterator):
             try:
-                await self._work(self._store_keyframe, request)
+                await self._work(store_keyframe, self._engine, request)
                 response.accepted += 1
             except (InvalidInputError, QuotaError) as error:
                 if len(response.rejected) >= _MAX_REPORTED_REJECTIONS:
@@ -129,7 +130,7 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         """Send the map, then its changes. A slow watcher gets several changes as one; nothing is queued."""
         self._engine.require_mission(request.mission_id)
         region = box_from_message(request.region) if request.HasField("region") else None
-        changes = await self._work(self._engine.changes, request.since_revision)
+        changes = await self._work(self._engine.maps.changes, request.since_revision)
         while True:
             blocks = change_blocks(changes, self._engine.grid, region)
             while (block := await self._work(_next_block, blocks)) is not None:
@@ -171,6 +172,18 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
             chunk = data[offset : offset + _CHUNK_BYTES]
             yield pb.ExportFusedMapResponse(offset=offset, total_bytes=len(data), data=chunk, crc32c=crc32c)
 
+    async def ReportObjects(self, request: pb.ReportObjectsRequest, context: Any) -> pb.ReportObjectsResponse:
+        """Replace the agent's task graph and objects."""
+        self._engine.session(request.session_id)
+        await self._work(self._engine.report_objects, request.session_id, report_from_message(request))
+        return pb.ReportObjectsResponse()
+
+    async def QueryObjects(self, request: pb.QueryObjectsRequest, context: Any) -> pb.QueryObjectsResponse:
+        """Return the team's objects that a noun names, or all."""
+        self._engine.require_mission(request.mission_id)
+        objects = await self._work(self._engine.query_objects, request.noun)
+        return pb.QueryObjectsResponse(objects=[object_to_message(each.landmark, each.observers) for each in objects])
+
     async def GetSessionStatus(self, request: pb.GetSessionStatusRequest, context: Any) -> pb.GetSessionStatusResponse:
         """Return the figures of the mission and of each agent."""
         self._engine.require_mission(request.mission_id)
@@ -182,7 +195,7 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
             fused_revision=status.revision,
             fused_gaussians=status.fused_gaussians,
             fused_voxels=status.fused_voxels,
-            agents=[_contribution_to_message(agent) for agent in status.agents],
+            agents=[contribution_to_message(agent) for agent in status.agents],
             keyframes=status.keyframes,
             refined=status.refined,
         )
@@ -193,39 +206,12 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         self._map_changes.notify()
         return pb.LeaveSessionResponse(fused_revision=revision)
 
-    def _store_subset(self, request: pb.ContributeSubsetsRequest) -> pb.SubsetOutcome:
-        """Store one message. An invalid one gives a REJECTED outcome; errors of the whole stream are raised."""
-        agent_id = self._engine.session(request.session_id).agent_id
-        size = len(request.subset)
-        is_handover = request.purpose == pb.PURPOSE_HANDOVER
-        traffic = TrafficCounters(handover_bytes=size) if is_handover else TrafficCounters(roi_bytes=size)
-        outcome = pb.SubsetOutcome(sequence=request.sequence)
-        try:
-            subset, grid = decode_subset(request.subset)
-            put = self._engine.contribute(request.session_id, subset, grid)
-        except _STREAM_ERRORS:
-            raise
-        except GaussLiteError as error:
-            outcome.status, outcome.reason, outcome.message = _REJECTED, code_and_reason(error)[1], str(error)
-            self._engine.record_traffic(agent_id, traffic.plus(TrafficCounters(subsets_rejected=1)))
-            return outcome
-        accepted = len(put.accepted) > 0 or len(put.stale) == 0
-        outcome.status = _ACCEPTED if accepted else _STALE
-        outcome.accepted_voxels, outcome.stale_voxels = len(put.accepted), len(put.stale)
-        stored = TrafficCounters(subsets_accepted=int(accepted), subsets_stale=int(not accepted))
-        self._engine.record_traffic(agent_id, traffic.plus(stored))
-        return outcome
-
-    def _store_keyframe(self, request: pb.ContributeKeyframesRequest) -> None:
-        agent_id = self._engine.session(request.session_id).agent_id
-        self._engine.add_keyframe(AgentKeyframe(agent_id, frame_from_message(request.keyframe)))
-
     def _changes_or_snapshot(self, revision: int) -> FusedMapChanges:
         try:
-            return self._engine.changes(revision)
+            return self._engine.maps.changes(revision)
         except RevisionGoneError:
             # the watcher missed more removals than are recorded, so it gets a snapshot
-            return self._engine.changes()
+            return self._engine.maps.changes()
 
     def _export(self, request: pb.ExportFusedMapRequest) -> tuple[bytes, int]:
         batch = self._select_map(request)
@@ -235,11 +221,11 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
     def _select_map(self, request: pb.ExportFusedMapRequest) -> VoxelBatch:
         match request.strategy:
             case pb.FUSION_STRATEGY_VOTE:
-                return self._engine.voted_map(request.agent_id)
+                return self._engine.maps.voted_map(request.agent_id)
             case pb.FUSION_STRATEGY_CONCATENATION:
-                return self._engine.union_map(request.agent_id)
+                return self._engine.maps.union_map(request.agent_id)
             case pb.FUSION_STRATEGY_REFINED if not request.agent_id:
-                return self._engine.refined_map()
+                return self._engine.maps.refined_map()
             case pb.FUSION_STRATEGY_REFINED:
                 raise InvalidInputError("agent_id: expected none with REFINED, whose Gaussians belong to everyone")
             case other:
@@ -253,22 +239,3 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
 
 def _next_block(blocks: Iterator[MapBlock]) -> MapBlock | None:
     return next(blocks, None)
-
-
-def _contribution_to_message(agent: AgentContribution) -> pb.AgentContribution:
-    return pb.AgentContribution(
-        agent_id=agent.agent_id,
-        joined=agent.joined,
-        gaussians=agent.gaussians,
-        voxels=agent.voxels,
-        won_voxels=agent.won_voxels,
-        roi_bytes=agent.traffic.roi_bytes,
-        handover_bytes=agent.traffic.handover_bytes,
-        subsets_accepted=agent.traffic.subsets_accepted,
-        subsets_stale=agent.traffic.subsets_stale,
-        subsets_rejected=agent.traffic.subsets_rejected,
-        keyframes=agent.keyframes,
-        kappa_sum=agent.kappa_sum,
-        last_update_seq=agent.last_update_seq,
-        last_seen_ns=agent.traffic.last_seen_ns,
-    )

@@ -12,7 +12,7 @@ from gausslite.domain.names import quote_name, require_name
 from gausslite.domain.task import TaskGraph
 from gausslite.domain.voxels import AxisAlignedBox
 
-MAX_OBJECTS_PER_AGENT = 500
+MAX_OBJECTS_PER_AGENT = 200
 NO_TARGET_INDEX = -1
 _MAX_COORDINATE_M = 1e6
 _MAX_TIME_NS = 1 << 62

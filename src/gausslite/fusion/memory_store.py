@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from threading import RLock
 
@@ -33,6 +34,8 @@ class MemoryStore:
         self._updates: dict[str, dict[int, _VoxelUpdate]] = {}
         self._sessions: dict[str, SessionRecord] = {}
         self._mission_config: MissionConfig | None = None
+        self._keyframes: dict[str, dict[int, bytes]] = {}
+        self._records: dict[str, dict[str, bytes]] = {}
 
     def put(self, subset: RoiSubset) -> PutOutcome:
         """Store one message; an update that is not newer than the stored one is stale. Raises InvalidInputError."""
@@ -55,8 +58,11 @@ class MemoryStore:
         return PutOutcome(batch.keys[accepted], batch.keys[~accepted])
 
     def remove_agent(self, agent_id: str) -> Int64[ndarray, " v"]:
-        """Delete an agent's updates; returns the keys of their voxels, ascending."""
+        """Delete an agent's updates, keyframes and records; returns the keys of the updates' voxels, ascending."""
         with self._lock:
+            self._keyframes.pop(agent_id, None)
+            for records in self._records.values():
+                records.pop(agent_id, None)
             return np.array(sorted(self._updates.pop(agent_id, {})), np.int64)
 
     def agents(self) -> tuple[str, ...]:
@@ -131,6 +137,37 @@ class MemoryStore:
         """Delete a session, if it exists. The agent's updates stay."""
         with self._lock:
             self._sessions.pop(session_id, None)
+
+    def save_keyframe(self, agent_id: str, index: int, data: bytes) -> None:
+        """Store an encoded keyframe; it replaces the agent's one of this frame index."""
+        with self._lock:
+            self._keyframes.setdefault(agent_id, {})[index] = data
+
+    def remove_keyframes(self, agent_id: str, indices: Iterable[int]) -> None:
+        """Delete these keyframes of an agent, if they exist."""
+        with self._lock:
+            for index in indices:
+                self._keyframes.get(agent_id, {}).pop(index, None)
+
+    def keyframe_indices(self) -> dict[str, tuple[int, ...]]:
+        """Return the frame indices of each agent's keyframes, ascending."""
+        with self._lock:
+            return {agent_id: tuple(sorted(frames)) for agent_id, frames in self._keyframes.items() if frames}
+
+    def keyframe(self, agent_id: str, index: int) -> bytes:
+        """Return an encoded keyframe; empty if it does not exist."""
+        with self._lock:
+            return self._keyframes.get(agent_id, {}).get(index, b"")
+
+    def save_record(self, agent_id: str, name: str, data: bytes) -> None:
+        """Store a named record of an agent; it replaces the earlier one."""
+        with self._lock:
+            self._records.setdefault(name, {})[agent_id] = data
+
+    def records(self, name: str) -> dict[str, bytes]:
+        """Return the record of this name of every agent that has one."""
+        with self._lock:
+            return dict(self._records.get(name, {}))
 
     def close(self) -> None:
         """Do nothing; there are no files to close."""

@@ -9,6 +9,8 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from gausslite.domain.names import MAX_NAME_BYTES
 from gausslite.domain.objects import ObjectLandmark, ObjectObserver, ObjectReport, ObjectRole, TeamObject
 from gausslite.domain.voxels import AxisAlignedBox
@@ -42,50 +44,44 @@ def merge_objects(reports: Mapping[str, ObjectReport]) -> tuple[TeamObject, ...]
         ),
         key=lambda each: each.order,
     )
+    position = {id(each): i for i, each in enumerate(observed)}
     clusters = [[each] for each in observed]
-    pairs = [
-        (distance, i, j)
-        for i, a in enumerate(observed)
-        for j, b in enumerate(observed[:i])
-        if a.agent_id != b.agent_id and (distance := _match_distance_m(a.landmark, b.landmark)) is not None
-    ]
-    for _, i, j in sorted(pairs):
+    # pairs at the smallest distance are merged first; a cluster has at most one landmark of each agent
+    for _, i, j in _matching_pairs([each.landmark for each in observed]):
         first, second = clusters[i], clusters[j]
         if first is second or {each.agent_id for each in first} & {each.agent_id for each in second}:
             continue
         first += second
-        for k, cluster in enumerate(clusters):
-            if cluster is second:
-                clusters[k] = first
+        for member in second:
+            clusters[position[id(member)]] = first
     merged = [_merge(cluster) for cluster in {id(cluster): cluster for cluster in clusters}.values()]
     return tuple(sorted(merged, key=lambda each: (-each.landmark.confidence, each.landmark.object_id)))
 
 
 def team_object_id(agent_id: str, object_id: str) -> str:
-    """Return the id of an object in the team: its earliest observer and the id there, shortened to the limit of names."""
+    """Return the id of a team object: its earliest observer and the id there, shortened to the limit of names."""
     return f"{agent_id}/{object_id}".encode()[:MAX_NAME_BYTES].decode(errors="ignore")
 
 
-def _match_distance_m(a: ObjectLandmark, b: ObjectLandmark) -> float | None:
-    """Return the distance of the centroids if both landmarks can be one object, else None."""
-    if a.noun != b.noun:
-        return None
-    distance_m = math.dist(a.centroid_m, b.centroid_m)
-    smaller_m = min(math.hypot(*a.size_m), math.hypot(*b.size_m))
-    is_near = distance_m < max(_MIN_MATCH_DISTANCE_M, _MATCH_DISTANCE_SHARE * smaller_m)
-    return distance_m if is_near or _overlap(a, b) >= _MIN_OVERLAP else None
-
-
-def _overlap(a: ObjectLandmark, b: ObjectLandmark) -> float:
-    """Return the volume of the common box as a share of the smaller box."""
-    common = math.prod(
-        max(0.0, min(a_high, b_high) - max(a_low, b_low))
-        for a_low, a_high, b_low, b_high in zip(
-            a.extent_m.min_m, a.extent_m.max_m, b.extent_m.min_m, b.extent_m.max_m, strict=True
-        )
-    )
-    smaller = min(math.prod(a.size_m), math.prod(b.size_m))
-    return common / smaller if smaller > 0 else 0.0
+def _matching_pairs(landmarks: Sequence[ObjectLandmark]) -> list[tuple[float, int, int]]:
+    """Return (distance of the centroids, i, j) of the landmarks that can be one object, the nearest first."""
+    groups: dict[str, list[int]] = {}
+    for i, each in enumerate(landmarks):
+        groups.setdefault(each.noun, []).append(i)
+    pairs: list[tuple[float, int, int]] = []
+    for group in groups.values():
+        centroids = np.array([landmarks[i].centroid_m for i in group])
+        low = np.array([landmarks[i].extent_m.min_m for i in group])
+        high = np.array([landmarks[i].extent_m.max_m for i in group])
+        diagonal, volume = np.linalg.norm(high - low, axis=1), np.prod(high - low, axis=1)
+        for k in range(1, len(group)):
+            distance = np.linalg.norm(centroids[:k] - centroids[k], axis=1)
+            reach = np.maximum(_MIN_MATCH_DISTANCE_M, _MATCH_DISTANCE_SHARE * np.minimum(diagonal[:k], diagonal[k]))
+            sides = np.maximum(np.minimum(high[:k], high[k]) - np.maximum(low[:k], low[k]), 0.0)
+            smaller = np.minimum(volume[:k], volume[k])
+            overlaps = (smaller > 0) & (np.prod(sides, axis=1) >= _MIN_OVERLAP * smaller)
+            pairs += [(float(distance[j]), group[k], group[j]) for j in np.flatnonzero((distance < reach) | overlaps)]
+    return sorted(pairs)
 
 
 def _merge(cluster: Sequence[_Observed]) -> TeamObject:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import sqlite3
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from threading import RLock
@@ -20,7 +20,7 @@ from gausslite.domain.voxel_batch import RoiSubset, VoxelBatch
 from gausslite.fusion.mission_config import MissionConfig
 from gausslite.fusion.store import PutOutcome, SessionRecord, VoxelScoreTable, require_storable
 
-SCHEMA_VERSION = 3
+SCHEMA_VERSION = 4
 _APPLICATION_ID = 0x47534C54  # "GSLT", to recognise other programs' databases
 _PAGE_BYTES = 4096
 _SCHEMA = """
@@ -29,6 +29,9 @@ CREATE TABLE voxel_updates (
     kappa_sum INTEGER NOT NULL, count INTEGER NOT NULL, records BLOB NOT NULL,
     PRIMARY KEY (agent_id, voxel));
 CREATE TABLE sessions (session_id TEXT PRIMARY KEY, agent_id TEXT NOT NULL UNIQUE);
+CREATE TABLE keyframes (
+    agent_id TEXT NOT NULL, frame_index INTEGER NOT NULL, data BLOB NOT NULL, PRIMARY KEY (agent_id, frame_index));
+CREATE TABLE records (name TEXT NOT NULL, agent_id TEXT NOT NULL, data BLOB NOT NULL, PRIMARY KEY (name, agent_id));
 CREATE TABLE mission_config (
     only INTEGER PRIMARY KEY CHECK (only = 1),
     mission_id TEXT NOT NULL, world_frame TEXT NOT NULL, voxel_size_m REAL NOT NULL);
@@ -79,12 +82,13 @@ class SqliteStore:
         return PutOutcome(batch.keys[accepted], batch.keys[~accepted])
 
     def remove_agent(self, agent_id: str) -> Int64[ndarray, " v"]:
-        """Delete an agent's updates; returns the keys of their voxels, ascending."""
+        """Delete an agent's updates, keyframes and records; returns the keys of the updates' voxels, ascending."""
         with self._transaction() as db:
             rows = db.execute(
                 "SELECT voxel FROM voxel_updates WHERE agent_id = ? ORDER BY voxel", (agent_id,)
             ).fetchall()
-            db.execute("DELETE FROM voxel_updates WHERE agent_id = ?", (agent_id,))
+            for table in ("voxel_updates", "keyframes", "records"):
+                db.execute(f"DELETE FROM {table} WHERE agent_id = ?", (agent_id,))  # noqa: S608 - the names are constants
         return np.array([voxel for (voxel,) in rows], np.int64)
 
     def agents(self) -> tuple[str, ...]:
@@ -155,6 +159,39 @@ class SqliteStore:
         """Delete a session, if it exists. The agent's updates stay."""
         with self._transaction() as db:
             db.execute("DELETE FROM sessions WHERE session_id = ?", (session_id,))
+
+    def save_keyframe(self, agent_id: str, index: int, data: bytes) -> None:
+        """Store an encoded keyframe; it replaces the agent's one of this frame index."""
+        with self._transaction() as db:
+            db.execute("INSERT OR REPLACE INTO keyframes VALUES (?, ?, ?)", (agent_id, index, data))
+
+    def remove_keyframes(self, agent_id: str, indices: Iterable[int]) -> None:
+        """Delete these keyframes of an agent, if they exist."""
+        with self._transaction() as db:
+            rows = ((agent_id, index) for index in indices)
+            db.executemany("DELETE FROM keyframes WHERE agent_id = ? AND frame_index = ?", rows)
+
+    def keyframe_indices(self) -> dict[str, tuple[int, ...]]:
+        """Return the frame indices of each agent's keyframes, ascending."""
+        indices: dict[str, tuple[int, ...]] = {}
+        for agent_id, index in self._read("SELECT agent_id, frame_index FROM keyframes ORDER BY frame_index"):
+            indices[agent_id] = (*indices.get(agent_id, ()), index)
+        return indices
+
+    def keyframe(self, agent_id: str, index: int) -> bytes:
+        """Return an encoded keyframe; empty if it does not exist."""
+        query = "SELECT data FROM keyframes WHERE agent_id = ? AND frame_index = ?"
+        rows = self._read(query, (agent_id, index))
+        return bytes(rows[0][0]) if rows else b""
+
+    def save_record(self, agent_id: str, name: str, data: bytes) -> None:
+        """Store a named record of an agent; it replaces the earlier one."""
+        with self._transaction() as db:
+            db.execute("INSERT OR REPLACE INTO records VALUES (?, ?, ?)", (name, agent_id, data))
+
+    def records(self, name: str) -> dict[str, bytes]:
+        """Return the record of this name of every agent that has one."""
+        return dict(self._read("SELECT agent_id, data FROM records WHERE name = ?", (name,)))
 
     def close(self) -> None:
         """Write the log into the file and close it."""

@@ -7,6 +7,7 @@ is a tombstone. It is kept, because an older update of the voxel may still arriv
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -63,7 +64,7 @@ class FusionStore(Protocol):
         ...
 
     def remove_agent(self, agent_id: str) -> Int64[ndarray, " v"]:
-        """Delete an agent's updates; returns the keys of their voxels, ascending."""
+        """Delete an agent's updates, keyframes and records; returns the keys of the updates' voxels, ascending."""
         ...
 
     def agents(self) -> tuple[str, ...]:
@@ -104,6 +105,30 @@ class FusionStore(Protocol):
 
     def end_session(self, session_id: str) -> None:
         """Delete a session, if it exists. The agent's updates stay."""
+        ...
+
+    def save_keyframe(self, agent_id: str, index: int, data: bytes) -> None:
+        """Store an encoded keyframe; it replaces the agent's one of this frame index."""
+        ...
+
+    def remove_keyframes(self, agent_id: str, indices: Iterable[int]) -> None:
+        """Delete these keyframes of an agent, if they exist."""
+        ...
+
+    def keyframe_indices(self) -> dict[str, tuple[int, ...]]:
+        """Return the frame indices of each agent's keyframes, ascending."""
+        ...
+
+    def keyframe(self, agent_id: str, index: int) -> bytes:
+        """Return an encoded keyframe; empty if it does not exist."""
+        ...
+
+    def save_record(self, agent_id: str, name: str, data: bytes) -> None:
+        """Store a named record of an agent, such as its objects; it replaces the earlier one."""
+        ...
+
+    def records(self, name: str) -> dict[str, bytes]:
+        """Return the record of this name of every agent that has one."""
         ...
 
     def close(self) -> None:

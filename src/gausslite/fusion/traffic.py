@@ -36,7 +36,7 @@ class TrafficCounters:
 
 @dataclass(frozen=True, slots=True)
 class AgentContribution:
-    """Stored data of one agent, the number of voxels that it wins, and its traffic."""
+    """Stored data of one agent, the number of voxels that it wins, its task's targets, and its traffic."""
 
     agent_id: str
     joined: bool = False
@@ -46,6 +46,7 @@ class AgentContribution:
     won_voxels: int = 0
     last_update_seq: int = 0
     keyframes: int = 0
+    targets: tuple[str, ...] = ()
     traffic: TrafficCounters = field(default_factory=TrafficCounters)
 
 

@@ -2,9 +2,19 @@
 
 from __future__ import annotations
 
-from gausslite.domain.objects import ObjectLandmark, ObjectRole
+from collections.abc import Sequence
+
+from gausslite.domain.objects import MAX_OBJECTS_PER_AGENT, ObjectLandmark, ObjectRole
 from gausslite.domain.task import TaskGraph
 from gausslite.perception.object_map import Landmark
+
+
+def describe_landmarks(landmarks: Sequence[Landmark], graph: TaskGraph) -> tuple[ObjectLandmark, ...]:
+    """Return the landmarks as values, in their order; of too many for a report, the most confident ones."""
+    described = [describe_landmark(each, graph) for each in landmarks]
+    chosen = sorted(described, key=lambda each: -each.confidence)[:MAX_OBJECTS_PER_AGENT]
+    ids = {each.object_id for each in chosen}
+    return tuple(each for each in described if each.object_id in ids)
 
 
 def describe_landmark(landmark: Landmark, graph: TaskGraph) -> ObjectLandmark:

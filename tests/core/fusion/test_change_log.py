@@ -51,18 +51,18 @@ def test_a_watcher_that_applies_the_changes_has_the_fused_map(steps) -> None:
         else:
             engine.contribute(sessions[agent_id], RoiSubset(agent_id, "", revision, revision, make_batch(counts)), GRID)
         if looks:
-            changes = engine.changes(known)
+            changes = engine.maps.changes(known)
             latest_votes.update(zip(changes.fused.batch.keys.tolist(), changes.fused.vote.votes(), strict=True))
             for key in changes.removed.tolist():
                 latest_votes.pop(key, None)
             known = changes.revision
-            votes = engine.changes(0).fused.vote.votes()
+            votes = engine.maps.changes(0).fused.vote.votes()
             assert {key: vote.winner for key, vote in latest_votes.items()} == {vote.key: vote.winner for vote in votes}
             assert all(latest_votes[key].scores[0] == vote.scores[0] for key, vote in _by_key(engine).items())
 
 
 def _by_key(engine: FusionEngine) -> dict:
-    return {vote.key: vote for vote in engine.changes(0).fused.vote.votes()}
+    return {vote.key: vote for vote in engine.maps.changes(0).fused.vote.votes()}
 
 
 def record(change_log: ChangeLog, store: MemoryStore, subset: RoiSubset) -> list[int]:

@@ -7,16 +7,18 @@ import pytest
 from sample_gaussians import plain_gaussians
 
 from gausslite.domain.camera import Camera
-from gausslite.domain.errors import InvalidInputError, QuotaError
+from gausslite.domain.errors import CodecError, InvalidInputError, QuotaError
 from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.fusion.joint_refinement import RefineProgress, RefineSettings, refine
-from gausslite.fusion.keyframes import AgentKeyframe, KeyframePool
+from gausslite.fusion.keyframes import AgentKeyframe, EncodedKeyframe, KeyframePool
+from gausslite.fusion.memory_store import MemoryStore
 from gausslite.optimize.density import DensitySettings
 from gausslite.optimize.rates import ONLINE_RATES
 from gausslite.render.cpu import CpuRasterizer
 from gausslite.render.rasterizer import AdamSettings
 from gausslite.render.reference import ReferenceRasterizer
+from gausslite.wire.convert import decode_frame
 
 CAMERA = Camera(30.0, 30.0, 12.0, 9.0, 24, 18)
 QUICK = RefineSettings(iterations=6, report_every=2, density=DensitySettings(densify_every=100, prune_every=100))
@@ -132,17 +134,39 @@ def test_an_empty_or_too_large_map_is_refused() -> None:
             RefineSettings(**wrong)
 
 
+def encoded(agent_id: str, index: int, data: bytes = b"") -> EncodedKeyframe:
+    return EncodedKeyframe(agent_id, index, 18 * 24, data)
+
+
 def test_the_pool_keeps_the_newest_of_each_agent_and_replaces_a_resent_one() -> None:
-    pool = KeyframePool(max_per_agent=2, max_pixels=18 * 24)
-    for keyframe in (view(3, 1), view(1, 1), view(2, 1), view(3, 9)):
-        pool.add(keyframe)
-    pool.add(AgentKeyframe("aardvark", view(7, 1).frame))
-    assert [(k.agent_id, k.frame.index) for k in pool.keyframes()] == [("aardvark", 7), ("ant", 2), ("ant", 3)]
-    assert pool.keyframes()[-1].frame.rgb[0, 0, 0] == 9
-    assert (len(pool), pool.count("ant"), pool.count("bee")) == (3, 2, 0)
+    store = MemoryStore()
+    pool = KeyframePool(store, max_per_agent=2, max_pixels=18 * 24)
+    for index, data in ((3, b"first"), (1, b""), (2, b""), (3, b"again")):
+        pool.add(encoded("ant", index, data))
+    pool.add(encoded("aardvark", 7))
+    assert pool.encoded() == [("aardvark", b""), ("ant", b""), ("ant", b"again")]
+    assert (len(pool), pool.count("ant"), pool.indices("ant"), pool.count("bee")) == (3, 2, (2, 3), 0)
+    # the store keeps them for the next process
+    assert KeyframePool(store, 2, 18 * 24).indices("ant") == (2, 3)
     pool.remove_agent("ant")
     assert len(pool) == 1
+    assert store.keyframe_indices() == {"aardvark": (7,)}
     with pytest.raises(QuotaError, match="at most 1 pixels"):
-        KeyframePool(2, max_pixels=1).add(view(1, 1))
+        KeyframePool(store, 2, max_pixels=1).add(encoded("ant", 1))
     with pytest.raises(InvalidInputError, match="limits of at least 1"):
-        KeyframePool(max_per_agent=0, max_pixels=1)
+        KeyframePool(store, max_per_agent=0, max_pixels=1)
+
+
+def test_keyframes_that_are_not_selected_are_deleted() -> None:
+    pool = KeyframePool(MemoryStore(), max_per_agent=4, max_pixels=18 * 24)
+    for index in (1, 2, 3):
+        pool.add(encoded("ant", index))
+    pool.add(encoded("ant", 9), selected=(2, 5))
+    assert pool.indices("ant") == (2, 9)
+
+
+def test_a_damaged_keyframe_is_named() -> None:
+    pool = KeyframePool(MemoryStore(), 4, 18 * 24, decode_frame)
+    pool.add(encoded("ant", 1, b"\xff\xff"))
+    with pytest.raises(CodecError, match="expected an EncodedFrame"):
+        pool.decode(pool.encoded())

@@ -1,0 +1,61 @@
+"""Store what agents contribute: voxel updates with an outcome for each message, and keyframes."""
+
+from __future__ import annotations
+
+from gausslite.codec.subset_codec import decode_subset
+from gausslite.domain.errors import (
+    GaussLiteError,
+    MismatchError,
+    SessionUnknownError,
+    StorageError,
+    UnavailableError,
+)
+from gausslite.fusion.engine import FusionEngine
+from gausslite.fusion.keyframes import EncodedKeyframe
+from gausslite.fusion.traffic import TrafficCounters
+from gausslite.v1 import fusion_service_pb2 as pb
+from gausslite.wire.convert import frame_from_message
+from gausslite.wire.status import code_and_reason
+
+_MAX_SELECTED_KEYFRAMES = 10_000
+_STREAM_ERRORS = (SessionUnknownError, MismatchError, StorageError, UnavailableError)
+"""Errors that every later message would raise too, so they end the stream; other errors reject one message."""
+_ACCEPTED, _STALE, _REJECTED = (
+    pb.SUBSET_STATUS_ACCEPTED,
+    pb.SUBSET_STATUS_STALE,
+    pb.SUBSET_STATUS_REJECTED,
+)
+
+
+def store_subset(engine: FusionEngine, request: pb.ContributeSubsetsRequest) -> pb.SubsetOutcome:
+    """Store one message. An invalid one gives a REJECTED outcome; errors of the whole stream are raised."""
+    agent_id = engine.session(request.session_id).agent_id
+    size = len(request.subset)
+    is_handover = request.purpose == pb.PURPOSE_HANDOVER
+    traffic = TrafficCounters(handover_bytes=size) if is_handover else TrafficCounters(roi_bytes=size)
+    outcome = pb.SubsetOutcome(sequence=request.sequence)
+    try:
+        subset, grid = decode_subset(request.subset)
+        put = engine.contribute(request.session_id, subset, grid)
+    except _STREAM_ERRORS:
+        raise
+    except GaussLiteError as error:
+        outcome.status, outcome.reason, outcome.message = _REJECTED, code_and_reason(error)[1], str(error)
+        engine.record_traffic(agent_id, traffic.plus(TrafficCounters(subsets_rejected=1)))
+        return outcome
+    accepted = len(put.accepted) > 0 or len(put.stale) == 0
+    outcome.status = _ACCEPTED if accepted else _STALE
+    outcome.accepted_voxels, outcome.stale_voxels = len(put.accepted), len(put.stale)
+    stored = TrafficCounters(subsets_accepted=int(accepted), subsets_stale=int(not accepted))
+    engine.record_traffic(agent_id, traffic.plus(stored))
+    return outcome
+
+
+def store_keyframe(engine: FusionEngine, request: pb.ContributeKeyframesRequest) -> None:
+    """Store a keyframe as it was received. Raises InvalidInputError, QuotaError, SessionUnknownError."""
+    agent_id = engine.session(request.session_id).agent_id
+    # decoded here to refuse invalid images; stored as received, which needs less space
+    frame = frame_from_message(request.keyframe)
+    data = request.keyframe.SerializeToString()
+    keyframe = EncodedKeyframe(agent_id, frame.index, frame.depth_m.size, data)
+    engine.add_keyframe(keyframe, request.selected[:_MAX_SELECTED_KEYFRAMES])

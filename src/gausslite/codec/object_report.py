@@ -1,0 +1,78 @@
+"""Encode an agent's task graph and objects as JSON, for the fusion server's store and for reports."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from typing import Any
+
+from gausslite.domain.errors import CodecError, GaussLiteError
+from gausslite.domain.objects import ObjectLandmark, ObjectReport, ObjectRole
+from gausslite.domain.task import Predicate, Relation, TaskGraph
+from gausslite.domain.voxels import AxisAlignedBox
+
+
+def encode_object_report(report: ObjectReport) -> bytes:
+    """Return the report as JSON."""
+    graph = report.graph
+    value = {
+        "task_id": graph.task_id,
+        "text": graph.text,
+        "targets": graph.targets,
+        "anchors": graph.anchors,
+        "relations": [[str(each.predicate), each.target, each.anchor] for each in graph.relations],
+        "warnings": graph.warnings,
+        "objects": [object_as_json(each) for each in report.objects],
+    }
+    return json.dumps(value, ensure_ascii=False).encode()
+
+
+def decode_object_report(data: bytes) -> ObjectReport:
+    """Return the report of `encode_object_report`. Raises CodecError."""
+    try:
+        value = json.loads(data)
+        graph = TaskGraph(
+            value["task_id"],
+            value["text"],
+            tuple(value["targets"]),
+            tuple(value["anchors"]),
+            tuple(Relation(Predicate(predicate), target, anchor) for predicate, target, anchor in value["relations"]),
+            tuple(value["warnings"]),
+        )
+        return ObjectReport(graph, tuple(object_from_json(each) for each in value["objects"]))
+    except (KeyError, TypeError, ValueError, RecursionError, GaussLiteError) as error:
+        raise CodecError(f"object report: expected the JSON of a report, got other bytes ({error})") from error
+
+
+def object_as_json(landmark: ObjectLandmark) -> dict[str, Any]:
+    """Return a landmark as JSON values, as in report.json."""
+    return {
+        "id": landmark.object_id,
+        "noun": landmark.noun,
+        "role": str(landmark.role),
+        "centroid_m": list(landmark.centroid_m),
+        "min_m": list(landmark.extent_m.min_m),
+        "max_m": list(landmark.extent_m.max_m),
+        "confidence": landmark.confidence,
+        "first_seen_ns": landmark.first_seen_ns,
+        "last_seen_ns": landmark.last_seen_ns,
+    }
+
+
+def object_from_json(value: Mapping[str, Any]) -> ObjectLandmark:
+    """Return the landmark of `object_as_json`. Raises CodecError."""
+    try:
+        x, y, z = (float(each) for each in value["centroid_m"])
+        low, high = ([float(each) for each in value[name]] for name in ("min_m", "max_m"))
+        return ObjectLandmark(
+            str(value["id"]),
+            str(value["noun"]),
+            ObjectRole(value["role"]),
+            (x, y, z),
+            AxisAlignedBox((low[0], low[1], low[2]), (high[0], high[1], high[2])),
+            float(value["confidence"]),
+            int(value["first_seen_ns"]),
+            int(value["last_seen_ns"]),
+        )
+    except (KeyError, TypeError, ValueError, IndexError, GaussLiteError) as error:
+        raise CodecError(f"object: expected the JSON of a landmark, got other values ({error})") from error

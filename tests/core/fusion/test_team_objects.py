@@ -1,0 +1,159 @@
+"""Objects of a team: merging landmarks across agents, noun queries, and their persistence."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gausslite.codec.object_report import decode_object_report, encode_object_report
+from gausslite.domain.errors import CodecError, InvalidInputError
+from gausslite.domain.objects import ObjectLandmark, ObjectReport, ObjectRole, object_of_gaussian
+from gausslite.domain.task import Predicate, Relation, TaskGraph
+from gausslite.domain.voxels import AxisAlignedBox
+from gausslite.fusion.engine import FusionEngine
+from gausslite.fusion.limits import FusionSettings
+from gausslite.fusion.mission_config import MissionConfig
+from gausslite.fusion.object_merge import merge_objects
+from gausslite.fusion.sqlite_store import SqliteStore
+from gausslite.fusion.team_objects import find_objects
+
+GRAPH = TaskGraph("t", "Pick up the mug on the table", ("mug",), ("table",), (Relation(Predicate.ON, "mug", "table"),))
+ANYTHING = MissionConfig("", "", 0.10)
+
+
+def landmark(
+    noun: str, centre: tuple[float, float, float], number: int = 1, half_m: float = 0.05, confidence: float = 0.5
+) -> ObjectLandmark:
+    low, high = (tuple(c + side * half_m for c in centre) for side in (-1, 1))
+    role = ObjectRole.TARGET if noun in GRAPH.targets else ObjectRole.ANCHOR
+    box = AxisAlignedBox((low[0], low[1], low[2]), (high[0], high[1], high[2]))
+    return ObjectLandmark(f"{noun}-{number}", noun, role, centre, box, confidence, 10 * number, 10 * number + 5)
+
+
+def report(*landmarks: ObjectLandmark) -> ObjectReport:
+    return ObjectReport(GRAPH, landmarks)
+
+
+def test_two_observations_of_one_object_are_merged_with_both_observers() -> None:
+    near = landmark("mug", (1.06, 0, 0), number=3, confidence=0.8)
+    reports = {
+        "ant": report(landmark("mug", (1, 0, 0))),
+        "bee": report(near, landmark("table", (1, 0.5, 0), half_m=0.4)),
+    }
+    mug, table = sorted(merge_objects(reports), key=lambda each: each.landmark.noun)
+    assert mug.landmark.object_id == "ant/mug-1"
+    assert mug.landmark.confidence == pytest.approx(1 - 0.5 * 0.2)
+    assert mug.landmark.centroid_m[0] == pytest.approx((0.5 * 1 + 0.8 * 1.06) / 1.3)
+    assert mug.landmark.extent_m.min_m[0] == pytest.approx(0.95)
+    assert mug.landmark.extent_m.max_m[0] == pytest.approx(1.11)
+    assert (mug.landmark.first_seen_ns, mug.landmark.last_seen_ns) == (10, 35)
+    assert [(o.agent_id, o.object_id, o.target) for o in mug.observers] == [("ant", "mug-1", 0), ("bee", "mug-3", 0)]
+    assert [(o.agent_id, o.target) for o in table.observers] == [("bee", -1)]
+
+
+def test_other_nouns_far_objects_and_objects_of_one_agent_stay_apart() -> None:
+    reports = {
+        "ant": report(landmark("mug", (0, 0, 0), 1), landmark("mug", (0.08, 0, 0), 2)),
+        "bee": report(landmark("mug", (2, 0, 0)), landmark("table", (0, 0, 0))),
+    }
+    assert len(merge_objects(reports)) == 4
+
+
+def test_each_object_merges_with_the_nearest_one() -> None:
+    reports = {
+        "ant": report(landmark("mug", (0, 0, 0), 1), landmark("mug", (0.12, 0, 0), 2)),
+        "bee": report(landmark("mug", (0.10, 0, 0))),
+    }
+    merged = {each.landmark.object_id: len(each.observers) for each in merge_objects(reports)}
+    assert merged == {"ant/mug-1": 1, "bee/mug-1": 2} or merged == {"ant/mug-1": 1, "ant/mug-2": 2}
+
+
+def test_the_result_does_not_depend_on_the_order_of_the_agents() -> None:
+    rng = np.random.default_rng(3)
+    reports = {
+        name: report(*(landmark("mug", tuple(rng.uniform(0, 0.6, 3).tolist()), i) for i in range(8))) for name in "abc"
+    }
+    expected = merge_objects(reports)
+    for order in itertools.permutations(reports):
+        assert merge_objects({name: reports[name] for name in order}) == expected
+
+
+def test_a_query_finds_synonyms_and_plurals_and_moves_landmarks_to_the_fused_frame() -> None:
+    reports = {"ant": report(landmark("mug", (1, 0, 0)), landmark("table", (0, 0, 0)))}
+    assert [each.landmark.noun for each in find_objects(reports, {}, "mug")] == ["mug"]
+    assert [each.landmark.noun for each in find_objects(reports, {}, " Cup ")] == ["mug"]
+    assert find_objects(reports, {}, "bicycle") == ()
+    assert len(find_objects(reports, {})) == 2
+    T = np.eye(4)
+    T[:3, :3] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
+    T[:3, 3] = (0, 0, 2)
+    [moved] = find_objects(reports, {"ant": T}, "mug")
+    assert moved.landmark.centroid_m == pytest.approx((0, 1, 2))
+    assert moved.landmark.extent_m.min_m == pytest.approx((-0.05, 0.95, 1.95))
+    for noun in ("\n", "x" * 1000, "  "):
+        with pytest.raises(InvalidInputError, match="noun"):
+            find_objects(reports, {}, noun)
+
+
+def test_a_gaussian_leads_to_the_object_of_its_target() -> None:
+    reports = {
+        "ant": report(landmark("mug", (0, 0, 0), 1), landmark("mug", (1, 0, 0), 2), landmark("table", (1, 0, 0)))
+    }
+    objects = merge_objects(reports)
+    found = object_of_gaussian(objects, "ant", 0, (0.9, 0, 0))
+    assert found is not None
+    assert found.landmark.object_id == "ant/mug-2"
+    assert object_of_gaussian(objects, "ant", -1, (0.9, 0, 0)) is None
+    assert object_of_gaussian(objects, "bee", 0, (0.9, 0, 0)) is None
+
+
+def test_reports_survive_in_the_store_and_end_with_the_agent(tmp_path: Path) -> None:
+    path = tmp_path / "store.sqlite"
+    store = SqliteStore(path)
+    engine = FusionEngine(store, FusionSettings())
+    session = engine.join("ant", ANYTHING).session.session_id
+    engine.report_objects(session, report(landmark("mug", (1, 2, 3))))
+    store.close()
+    store = SqliteStore(path)
+    engine = FusionEngine(store, FusionSettings())
+    [mug] = engine.query_objects("mug")
+    assert mug.landmark.centroid_m == (1.0, 2.0, 3.0)
+    # a join with the same task keeps the objects of the report; another task has none yet
+    assert len(engine.reported_objects("ant", GRAPH)) == 1
+    assert engine.reported_objects("ant", replace(GRAPH, targets=("cup",))) == ()
+    engine.leave(session, forget=True)
+    assert engine.query_objects() == ()
+    assert store.records("objects") == {}
+    store.close()
+
+
+def test_a_report_is_encoded_completely_and_damage_is_one_error() -> None:
+    original = report(landmark("mug", (1, 2, 3)))
+    assert decode_object_report(encode_object_report(original)) == original
+    for damaged in (b"", b"[]", b'{"task_id": 1}', encode_object_report(original).replace(b"target", b"ground")):
+        with pytest.raises(CodecError, match="object report"):
+            decode_object_report(damaged)
+
+
+def test_values_out_of_range_are_refused() -> None:
+    good = landmark("mug", (0, 0, 0))
+    for wrong in (
+        {"noun": ""},
+        {"noun": "a\nb"},
+        {"object_id": "x" * 300},
+        {"centroid_m": (float("nan"), 0, 0)},
+        {"centroid_m": (1e9, 0, 0)},
+        {"confidence": 1.5},
+        {"confidence": float("nan")},
+        {"first_seen_ns": 100},
+    ):
+        with pytest.raises(InvalidInputError, match="object"):
+            replace(good, **wrong)
+    with pytest.raises(InvalidInputError, match="repeated"):
+        report(good, good)
+    with pytest.raises(InvalidInputError, match="at most 200"):
+        report(*(landmark("mug", (0, 0, 0), i) for i in range(201)))
