@@ -23,9 +23,11 @@ from gausslite.mission.settings import (
     MIN_RATE_HZ,
     MissionSettings,
     PerceptionSettings,
+    PoseMode,
 )
 from gausslite.render.choose import BACKENDS
 from gausslite.render.cpu_kernels import MAX_THREADS, choose_threads
+from gausslite.tracking.tracker import MotionModel
 
 HOLD_OUT_HELP = "hold out every N-th selected frame from mapping, for evaluation"
 _EXACT = PoseExposurePrior()
@@ -33,6 +35,14 @@ _POSE_PRIOR_METAVAR = "M,DEG[,GAIN,OFFSET]"
 _POSE_PRIOR_HELP = (
     "standard deviations of the errors of poses (metres, degrees) and of exposure (gain and offset, 0 to 1), within "
     "which views are corrected; none: poses and colours are exact{} (default: {})"
+)
+_POSES_HELP = (
+    "given: map with the given poses; refine: refine them within --pose-prior; track: find poses by tracking the "
+    "camera against the map, from the first given pose on (default: %(default)s)"
+)
+_TRACK_MOTION_HELP = (
+    "with --poses track, what predicts the motion between two frames without enough common features: the last velocity "
+    "or the given odometry (default: %(default)s)"
 )
 _AUTO_HELP = "; auto: estimated from pairs of frames"
 _DISABLE_HELP = (
@@ -89,6 +99,9 @@ def add_policy(
     add("--disable", metavar="A,B", type=read_names, default=(), help=f"{_DISABLE_HELP}{extensions}")
     add_rasterizer(add, "backend that renders and trains")
     add_pose_prior(parser, AUTO if allow_auto else NONE, AUTO if allow_auto else NONE, allow_auto)
+    add("--poses", choices=[str(mode) for mode in PoseMode], default=str(PoseMode.REFINE), help=_POSES_HELP)
+    motions = [str(motion) for motion in MotionModel]
+    add("--track-motion", choices=motions, default=str(MotionModel.VELOCITY), help=_TRACK_MOTION_HELP)
 
 
 def add_rasterizer(add: Callable[..., argparse.Action], meaning: str) -> None:
@@ -219,6 +232,8 @@ def mission_settings(options: argparse.Namespace, default_policy: str = TASK) ->
         threads=options.threads,
         backend=options.rasterizer,
         pose_prior=options.pose_prior if isinstance(options.pose_prior, PoseExposurePrior) else _EXACT,
+        poses=PoseMode(options.poses),
+        motion=MotionModel(options.track_motion),
     )
 
 
@@ -247,4 +262,6 @@ def mission_options(settings: MissionSettings) -> dict[str, OptionValue]:
         "threads": settings.threads,
         "rasterizer": settings.backend,
         "pose-prior": NONE if settings.pose_prior.is_exact else str(settings.pose_prior),
+        "poses": str(settings.poses),
+        "track-motion": str(settings.motion),
     }

@@ -59,5 +59,7 @@ class PoseExposurePrior:
         return self.gain > 0 or self.offset > 0
 
 
+TRACKED_PRIOR = PoseExposurePrior(translation_m=0.01, rotation_deg=0.5, gain=0.1, offset=0.03)
+"""Prior for poses that were tracked against a map that still grows."""
 HANDHELD_PRIOR = PoseExposurePrior(translation_m=0.03, rotation_deg=1.0, gain=0.2, offset=0.06)
 """Prior for a hand-held camera whose poses come from another sensor; also the upper bound of every fit."""

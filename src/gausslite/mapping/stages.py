@@ -10,6 +10,8 @@ from typing import Protocol, runtime_checkable
 class Stage(StrEnum):
     """One measured part of processing a frame, in the order of the loop."""
 
+    TRACKING = "tracking"
+    """Find the camera's pose by aligning the frame to the map."""
     RENDERING = "rendering"
     """Render the map from the frame's pose."""
     RELEVANCE = "relevance"

@@ -12,12 +12,13 @@ from gausslite.domain.region import Region
 from gausslite.domain.task import TaskGraph
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mission.frame_scheduler import FrameScheduler
-from gausslite.mission.settings import MissionSettings, PerceptionSettings, SceneInfo
+from gausslite.mission.settings import MissionSettings, PerceptionSettings, PoseMode, SceneInfo
 from gausslite.mission.task_mapper import TaskMapper
 from gausslite.perception.fixed_relevance import NoTaskEstimator, RegionRelevanceEstimator
 from gausslite.perception.relevance_estimator import AsyncRelevanceEstimator, RelevanceEstimator, TaskRelevanceEstimator
 from gausslite.perception.tracker import TrackerSettings
 from gausslite.render.choose import choose_rasterizer
+from gausslite.tracking.tracker import CameraTracker
 
 if TYPE_CHECKING:
     from gausslite.perception.detect import Detector
@@ -32,6 +33,11 @@ def build_mapper(settings: MissionSettings) -> GaussianMapper:
     """Return a mapper with an empty map. Raises KernelError, InvalidInputError."""
     rasterizer = choose_rasterizer(settings.backend, settings.threads)
     return GaussianMapper(settings.mapper_settings(), rasterizer, seed=settings.seed)
+
+
+def build_tracker(settings: MissionSettings, mapper: GaussianMapper) -> CameraTracker | None:
+    """Return a tracker against the mapper's map; None if frames are mapped with their own poses."""
+    return CameraTracker(mapper.render, settings.motion) if settings.poses is PoseMode.TRACK else None
 
 
 def open_models(perception: PerceptionSettings) -> ModelRegistry | None:
@@ -56,7 +62,9 @@ def build_task_mapper(
     Raises KernelError, and InvalidInputError for a task without a detector.
     """
     estimator = estimators.build(roi) if isinstance(roi, TaskGraph) else region_estimator(roi)
-    return TaskMapper(estimator, build_mapper(settings), scheduler=FrameScheduler(settings.scheduler_settings))
+    mapper = build_mapper(settings)
+    scheduler = FrameScheduler(settings.scheduler_settings)
+    return TaskMapper(estimator, mapper, scheduler=scheduler, tracker=build_tracker(settings, mapper))
 
 
 class EstimatorFactory:

@@ -28,7 +28,10 @@ _STAGES_SKIPPED = {
     SkippableStage.SEEDING: (Stage.RENDERING, Stage.SEEDING),
 }
 _FIXED_STAGES = frozenset(
-    (Stage.RENDERING, Stage.RELEVANCE, Stage.VIEW_PREPARATION, Stage.SEEDING, Stage.FINALISATION, Stage.PUBLISHING)
+    (
+        *(Stage.TRACKING, Stage.RENDERING, Stage.RELEVANCE, Stage.VIEW_PREPARATION),
+        *(Stage.SEEDING, Stage.FINALISATION, Stage.PUBLISHING),
+    )
 )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
+from enum import StrEnum
 from pathlib import Path
 
 from gausslite.datasets.open import is_simulated
@@ -14,13 +15,14 @@ from gausslite.domain.depth_registration import DepthRegistration
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.object_names import same_kind
 from gausslite.domain.pose import UpAxis
-from gausslite.domain.pose_exposure_prior import PoseExposurePrior
+from gausslite.domain.pose_exposure_prior import TRACKED_PRIOR, PoseExposurePrior
 from gausslite.domain.region import BallRegion, Region
 from gausslite.mapping.policies import TASK, UNIFORM, disable, follows_task, policy
 from gausslite.mapping.settings import MapperSettings
 from gausslite.mapping.stages import SkippableStage
 from gausslite.mission.frame_scheduler import SchedulerSettings
 from gausslite.render.cpu_kernels import MAX_THREADS
+from gausslite.tracking.tracker import MotionModel
 
 DEFAULT_MAX_GAUSSIANS = 150_000
 """The number that two CPU cores can train online at 640x480; the paper's cap of a million is for a GPU."""
@@ -44,6 +46,17 @@ def require_rate(rate_hz: float) -> None:
 def default_policy(has_roi: bool) -> str:
     """Return the policy of a mission with a task or regions, or of one without both."""
     return TASK if has_roi else UNIFORM
+
+
+class PoseMode(StrEnum):
+    """Where the poses of frames come from."""
+
+    GIVEN = "given"
+    """The odometry's poses, without refinement."""
+    REFINE = "refine"
+    """The odometry's poses, refined within the pose prior."""
+    TRACK = "track"
+    """Tracking against the map; of the given poses, only the first one is used, as the start."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,7 +137,8 @@ class MissionSettings:
     disabled: parts of the policy to switch off (see `gausslite.mapping.policies.disable`). rate_hz: frames per second;
     each frame then trains as many iterations as fit into its time instead of a fixed number. min_iterations,
     skip_stages and deadline_slack apply at a rate only, see `SchedulerSettings`. pose_prior: standard deviations of
-    pose and exposure errors.
+    pose and exposure errors; tracked poses have TRACKED_PRIOR if it allows no pose error. motion: what predicts tracked
+    poses.
     """
 
     policy: str = TASK
@@ -139,6 +153,8 @@ class MissionSettings:
     threads: int | None = field(default=None, metadata=MAY_CHANGE)
     backend: str = field(default="auto", metadata=MAY_CHANGE)
     pose_prior: PoseExposurePrior = field(default_factory=PoseExposurePrior)
+    poses: PoseMode = PoseMode.REFINE
+    motion: MotionModel = field(default=MotionModel.VELOCITY, metadata={"flag": "--track-motion"})
 
     def __post_init__(self) -> None:
         self._require_types()
@@ -164,6 +180,8 @@ class MissionSettings:
         require_instance("policy", self.policy, str, "the name of a policy as text")
         require_instance("disabled", self.disabled, (frozenset, set), "a set of names such as frozenset({'sb'})")
         require_instance("pose_prior", self.pose_prior, PoseExposurePrior, "a PoseExposurePrior")
+        require_instance("poses", self.poses, PoseMode, "a PoseMode")
+        require_instance("motion", self.motion, MotionModel, "a MotionModel")
         require_instance("backend", self.backend, str, "the name of a backend as text")
         for name in ("max_gaussians", "iterations", "min_iterations", "seed", "threads"):
             value = getattr(self, name)
@@ -191,4 +209,19 @@ class MissionSettings:
         optimization = base.optimization
         if self.iterations is not None:
             optimization = optimization.with_iterations(self.iterations)
-        return replace(base, max_gaussians=self.max_gaussians, optimization=optimization, pose_prior=self.pose_prior)
+        return replace(
+            base,
+            max_gaussians=self.max_gaussians,
+            optimization=optimization,
+            pose_prior=self.refinement_prior,
+            pose_anchor_share=0.0 if self.poses is PoseMode.TRACK else base.pose_anchor_share,
+        )
+
+    @property
+    def refinement_prior(self) -> PoseExposurePrior:
+        """The prior within which views are refined in this pose mode."""
+        if self.poses is PoseMode.GIVEN:
+            return replace(self.pose_prior, translation_m=0.0, rotation_deg=0.0)
+        if self.poses is PoseMode.TRACK and not self.pose_prior.has_pose_error:
+            return TRACKED_PRIOR
+        return self.pose_prior

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 
 from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
@@ -20,6 +20,7 @@ from gausslite.mapping.stages import SkippableStage, Stage
 from gausslite.mapping.task_change import Reevaluation
 from gausslite.mission.frame_scheduler import FrameScheduler, FrameTiming
 from gausslite.perception.relevance_estimator import DelayedRelevance, RelevanceEstimate, RelevanceEstimator
+from gausslite.tracking.tracker import CameraTracker
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,16 +53,19 @@ class TaskMapper:
         sent_voxels: SentVoxelTracker | None = None,
         scheduler: FrameScheduler | None = None,
         publish: Callable[[VoxelBatch], None] = lambda _batch: None,
+        tracker: CameraTracker | None = None,
     ) -> None:
         """Without a scheduler, each frame gets the fixed number of iterations of the mapper's settings.
 
-        publish gets the changed voxels of each frame; its duration counts as part of the frame.
+        publish gets the changed voxels of each frame; its duration counts as part of the frame. Without a tracker,
+        frames are mapped with their own poses.
         """
         self._estimator = estimator
         self._mapper = mapper
         self._sent_voxels = sent_voxels
         self._scheduler = scheduler or FrameScheduler()
         self._publish = publish
+        self._tracker = tracker
 
     def assign(self, estimator: RelevanceEstimator) -> None:
         """Switch to another task with the next frame.
@@ -108,6 +112,7 @@ class TaskMapper:
             **add_prefix("mapper", self._mapper.state()),
             **add_prefix("estimator", self._estimator.state()),
             **add_prefix("sent_voxels", sent_voxels),
+            **add_prefix("tracker", {} if self._tracker is None else self._tracker.state()),
         }
 
     def restore(self, state: State) -> None:
@@ -120,15 +125,26 @@ class TaskMapper:
         sent_voxels = select_prefix(state, "sent_voxels")
         if self._sent_voxels is not None and sent_voxels:
             self._sent_voxels.restore(sent_voxels)
+        if self._tracker is not None:
+            self._tracker.restore(select_prefix(state, "tracker"))
 
     def process(self, frame: Frame, waited_s: float = 0.0) -> FrameOutcome:
-        """Process one frame and return its outcome; waited_s is its time in the queue."""
+        """Process one frame and return its outcome; waited_s is its time in the queue.
+
+        A frame whose pose is not found by tracking is skipped.
+        """
         self._scheduler.begin(waited_s)
+        odometry, tracked = frame, self._track(frame)
+        if tracked is None:
+            return self._lost(frame)
+        frame = tracked
         view = self._render(frame)
         estimate = self._estimate_relevance(frame, view)
         lag_frames = self._apply_delayed(estimate.delayed)
         reevaluation = self._reevaluate_keyframes()
-        mapped = self._mapper.map_frame(frame, estimate.relevance, self._scheduler, view)
+        mapped = self._mapper.map_frame(frame, estimate.relevance, self._scheduler, view, odometry)
+        if self._tracker is not None and mapped.T_world_camera is not None:
+            self._tracker.confirm(mapped.T_world_camera)
         changed_roi = self._publish_changed_roi() if mapped.skipped is None else None
         return FrameOutcome(
             index=frame.index,
@@ -149,6 +165,33 @@ class TaskMapper:
     def changed_roi(self) -> VoxelBatch | None:
         """Return the voxels of the task's region that changed since the last call; None without a tracker."""
         return None if self._sent_voxels is None else self._sent_voxels.collect_changes(self._mapper.roi_gaussians())
+
+    @property
+    def tracking_counts(self) -> Mapping[str, int]:
+        """Number of frames by how their pose was found; empty without tracking."""
+        return {} if self._tracker is None else self._tracker.counts
+
+    def _track(self, frame: Frame) -> Frame | None:
+        """Return the frame with its tracked pose, the frame itself without tracking, or None if the camera is lost."""
+        if self._tracker is None or not frame.has_depth:
+            return frame
+        with self._scheduler.timing(Stage.TRACKING):
+            T_world_camera = self._tracker.track(frame)
+        return None if T_world_camera is None else replace(frame, T_world_camera=T_world_camera)
+
+    def _lost(self, frame: Frame) -> FrameOutcome:
+        """Return the outcome of a frame without a pose."""
+        return FrameOutcome(
+            index=frame.index,
+            iterations=0,
+            gaussians=self._mapper.count,
+            roi_share=0.0,
+            timing=self._scheduler.end(),
+            skipped="tracking is lost: the frame agrees with no part of the map",
+            changed_roi=None,
+            detection_lag_frames=None,
+            reevaluation=Reevaluation(0, 0),
+        )
 
     def _render(self, frame: Frame) -> RenderedView | None:
         """Render the map from the frame's pose, for the depth of the relevance estimate and for seeding."""

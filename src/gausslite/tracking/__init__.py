@@ -1,0 +1,1 @@
+"""Track the camera against the map, for recordings and robots without a good odometry."""

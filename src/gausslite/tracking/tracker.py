@@ -1,0 +1,197 @@
+"""Track the camera from frame to frame: predict its pose, align it to the map, detect a loss and recover from it."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+from jaxtyping import Float64
+from numpy import ndarray
+
+from gausslite.domain.camera import Camera
+from gausslite.domain.frame import Frame
+from gausslite.domain.pose import inverse, orthonormal, require_rigid, transform_of, twist_of
+from gausslite.domain.state import State, add_prefix, get_array, get_counts, int_array, select_prefix
+from gausslite.render.rasterizer import Rendering
+from gausslite.tracking.alignment import COARSE_TO_FINE, FINE, Alignment, align
+from gausslite.tracking.features import FeatureView, detect_features, relative_pose
+from gausslite.tracking.relocalisation import KeyframeIndex
+
+_MIN_OVERLAP = 0.5
+_MAX_RESIDUAL = 0.15
+"""An alignment with less overlap, or a larger luminance residual, counts as a loss. Tracked frames of the kitchen of
+7-Scenes and of simulated homes have at least 0.7 and at most 0.06."""
+_MIN_FEATURE_INLIERS = 20
+"""Feature matches with the last frame predict the pose if they are this many; otherwise the motion model does."""
+_RELIABLE_FEATURE_INLIERS = 40
+"""With this many, the pose counts as tracked where the map covers too little of the view for an alignment."""
+_RENDER_AGAIN_M, _RENDER_AGAIN_RAD = 0.01, np.radians(0.5)
+_PRIOR_STD = np.array([0.1] * 3 + [np.radians(5.0)] * 3)
+"""Error of a predicted pose: translation (m) and rotation (rad)."""
+
+
+class MotionModel(StrEnum):
+    """What predicts the motion since the last frame where features do not."""
+
+    VELOCITY = "velocity"
+    """The velocity between the last two frames."""
+    ODOMETRY = "odometry"
+    """The motion between the poses of the frames."""
+
+
+class TrackedBy(StrEnum):
+    """How a frame's pose was found."""
+
+    START = "start"
+    """The first frame keeps its pose."""
+    MAP = "map"
+    FEATURES = "features"
+    """Feature matches with the last frame alone: the map covers too little of the view."""
+    RELOCALISATION = "relocalisation"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _LastFrame:
+    time_ns: int
+    T_world_odometry: Float64[ndarray, "4 4"]
+    T_world_camera: Float64[ndarray, "4 4"]
+    features: FeatureView
+
+
+class CameraTracker:
+    """Tracks one camera. Call `track` with each frame, map it, then call `confirm` with the pose it was mapped with.
+
+    The first frame's own pose is the start, so the map lies in its world frame; of later frames, only
+    MotionModel.ODOMETRY uses the pose. Not thread-safe.
+    """
+
+    def __init__(
+        self, render: Callable[[Camera, Float64[ndarray, "4 4"]], Rendering], motion: MotionModel = MotionModel.VELOCITY
+    ) -> None:
+        """Render: renders the map from T_world_camera."""
+        self._render = render
+        self._motion = motion
+        self._keyframes = KeyframeIndex()
+        self._last: _LastFrame | None = None
+        self._velocity = np.zeros(6)
+        self._lost_frames = 0
+        self._counts: Counter[str] = Counter()
+        self._pending: _LastFrame | None = None
+
+    @property
+    def counts(self) -> Mapping[str, int]:
+        """Number of frames by `TrackedBy`, and of lost frames ("lost")."""
+        return {name: self._counts[name] for name in (*TrackedBy, "lost")}
+
+    def track(self, frame: Frame) -> Float64[ndarray, "4 4"] | None:
+        """Return the frame's T_world_camera; None if the camera is lost."""
+        features = detect_features(frame)
+        found = self._find(frame, features)
+        if found is None:
+            self._lost_frames += 1
+            self._counts["lost"] += 1
+            self._pending = None
+            return None
+        T_world_camera, tracked_by = found
+        if self._lost_frames > 0:
+            self._velocity = np.zeros(6)
+            self._lost_frames = 0
+            self._keyframes.restart()
+        self._counts[tracked_by] += 1
+        T_world_camera = orthonormal(T_world_camera)
+        self._pending = _LastFrame(frame.capture_time_ns, frame.T_world_camera, T_world_camera, features)
+        return T_world_camera
+
+    def confirm(self, T_world_camera: Float64[ndarray, "4 4"]) -> None:
+        """Set the pose that the last tracked frame was mapped with."""
+        pending, last = self._pending, self._last
+        if pending is None:
+            return
+        current = _LastFrame(pending.time_ns, pending.T_world_odometry, orthonormal(T_world_camera), pending.features)
+        if last is not None and current.time_ns > last.time_ns:
+            step = twist_of(inverse(last.T_world_camera) @ current.T_world_camera)
+            self._velocity = step / (1e-9 * (current.time_ns - last.time_ns))
+        self._keyframes.add(current.features, current.T_world_camera)
+        self._last, self._pending = current, None
+
+    def _find(self, frame: Frame, features: FeatureView) -> tuple[Float64[ndarray, "4 4"], TrackedBy] | None:
+        last = self._last
+        if last is None:
+            return frame.T_world_camera, TrackedBy.START
+        if self._lost_frames > 0:
+            return self._relocalise(frame, features)
+        by_features = relative_pose(last.features, features, frame.camera)
+        predictions = [self._predict(frame, last)]
+        if by_features is not None and by_features.inliers >= _MIN_FEATURE_INLIERS:
+            predictions.insert(0, last.T_world_camera @ inverse(by_features.T_current_reference))
+        for T_world_predicted in predictions:
+            alignment = self._align(frame, T_world_predicted)
+            if alignment is not None:
+                return alignment.T_world_camera, TrackedBy.MAP
+        if by_features is not None and by_features.inliers >= _RELIABLE_FEATURE_INLIERS:
+            return predictions[0], TrackedBy.FEATURES
+        return self._relocalise(frame, features)
+
+    def _predict(self, frame: Frame, last: _LastFrame) -> Float64[ndarray, "4 4"]:
+        if self._motion is MotionModel.ODOMETRY:
+            return last.T_world_camera @ inverse(last.T_world_odometry) @ frame.T_world_camera
+        return last.T_world_camera @ transform_of(self._velocity * 1e-9 * (frame.capture_time_ns - last.time_ns))
+
+    def _relocalise(self, frame: Frame, features: FeatureView) -> tuple[Float64[ndarray, "4 4"], TrackedBy] | None:
+        for T_world_camera in self._keyframes.candidates(features, frame.camera):
+            alignment = self._align(frame, T_world_camera)
+            if alignment is not None:
+                return alignment.T_world_camera, TrackedBy.RELOCALISATION
+        return None
+
+    def _align(self, frame: Frame, T_world_predicted: Float64[ndarray, "4 4"]) -> Alignment | None:
+        """Return the pose aligned to the map near a prediction; None if map and frame do not agree there."""
+        rendering = self._render(frame.camera, T_world_predicted)
+        alignment = align(rendering, T_world_predicted, frame, _PRIOR_STD, COARSE_TO_FINE)
+        if alignment is None:
+            return None
+        step = np.abs(twist_of(inverse(T_world_predicted) @ alignment.T_world_camera))
+        if step[:3].max() > _RENDER_AGAIN_M or step[3:].max() > _RENDER_AGAIN_RAD:
+            rendering = self._render(frame.camera, alignment.T_world_camera)
+            alignment = align(rendering, alignment.T_world_camera, frame, _PRIOR_STD, FINE)
+        if alignment is None or alignment.overlap < _MIN_OVERLAP or alignment.residual > _MAX_RESIDUAL:
+            return None
+        return alignment
+
+    def state(self) -> State:
+        """Return everything that the next frame depends on."""
+        last = self._last
+        stored: State = {}
+        if last is not None:
+            stored = {
+                "time_ns": int_array(last.time_ns),
+                "T_world_odometry": last.T_world_odometry,
+                "T_world_camera": last.T_world_camera,
+                **add_prefix("features", last.features.state()),
+            }
+        return {
+            **add_prefix("last", stored),
+            **add_prefix("keyframes", self._keyframes.state()),
+            "velocity": self._velocity,
+            "counts": int_array(self._lost_frames, *self.counts.values()),
+        }
+
+    def restore(self, state: State) -> None:
+        """Continue from another tracker's state. Raises MapFileError, PoseError."""
+        self._keyframes.restore(select_prefix(state, "keyframes"))
+        self._velocity = get_array(state, "velocity", (6,), np.float64).copy()
+        names = (*TrackedBy, "lost")
+        self._lost_frames, *counts = get_counts(state, "counts", 1 + len(names))
+        self._counts = Counter(dict(zip(map(str, names), counts, strict=True)))
+        last = select_prefix(state, "last")
+        if not last:
+            return
+        poses = [get_array(last, name, (4, 4), np.float64) for name in ("T_world_odometry", "T_world_camera")]
+        for T in poses:
+            require_rigid("state tracked pose", T)
+        [time_ns] = get_array(last, "time_ns", (1,), np.int64)
+        features = FeatureView.from_state(select_prefix(last, "features"))
+        self._last = _LastFrame(int(time_ns), poses[0].copy(), poses[1].copy(), features)
