@@ -21,6 +21,10 @@ _COMMANDS = {
     "eval": "score a map on frames of a sequence, in the region of interest (ROI) and over whole images",
     "fuse": "fuse map files into one by a vote in every voxel",
     "export": "write a map for other tools: splat viewers, point clouds, planners, meshes",
+    "status": "print the state of a running agent or fusion server",
+    "end": "end the mission of a running agent: send what waits, hand over, save",
+    "refine": "refine the fused map of a running team",
+    "fetch": "download the fused map of a running team",
     "models": "list, download, verify and inspect model files for detection and segmentation",
     "bench": "measure the rasterizer, the mapping loop, the GPU, map quality or a task parser",
 }
