@@ -20,8 +20,7 @@ from gausslite.mission.keyframe_views import KeyframeView
 
 _TRUNCATION_VOXELS = 4.0
 _MIN_ALPHA = 0.5
-_MAX_VOXELS = 1 << 24
-_MIN_WEIGHT = 1.0
+_MAX_VOXELS = 1 << 23
 _BOUNDS_PERCENTILES = (0.5, 99.5)
 _VERTEX = np.dtype([("position_m", "<f4", 3), ("rgb", "u1", 3)])
 _FACE = np.dtype([("count", "u1"), ("vertices", "<i4", 3)])
@@ -76,9 +75,18 @@ class TsdfVolume:
         rows = np.flatnonzero(inside)
         return rows, (image_rows[rows].astype(np.intp), columns[rows].astype(np.intp)), depth_m[rows]
 
-    def observed(self) -> Bool[ndarray, "x y z"]:
-        """Return the mask of voxels that some view has seen."""
-        return (self.weights >= _MIN_WEIGHT).reshape(self.shape)
+    def inner(self) -> Bool[ndarray, "x y z"]:
+        """Return the mask of voxels that views have seen together with all 26 neighbours.
+
+        Elsewhere the distance is unknown, and the end of the known space would look like a surface.
+        """
+        mask = (self.weights > 0).reshape(self.shape)
+        for axis in range(3):
+            seen = np.moveaxis(mask, axis, 0)
+            kept = np.zeros_like(seen)
+            kept[1:-1] = seen[:-2] & seen[1:-1] & seen[2:]
+            mask = np.moveaxis(kept, 0, axis)
+        return mask
 
 
 def write_mesh(
@@ -102,10 +110,10 @@ def write_mesh(
     for view in progress(views):
         rendering = viewer.render(view.camera, view.T_world_camera)
         volume.integrate(view, rendering.expected_depth_m(), rendering.alpha, rendering.rgb)
-    distances, observed = volume.distances.reshape(volume.shape), volume.observed()
-    if not (observed.any() and distances[observed].min() < 0 < distances[observed].max()):
+    distances, inner = volume.distances.reshape(volume.shape), volume.inner()
+    if not (inner.any() and distances[inner].min() < 0 < distances[inner].max()):
         raise InvalidInputError("mesh: expected a surface that the keyframes show, found none in the chosen Gaussians")
-    vertices, faces, _, _ = measure.marching_cubes(distances, 0.0, mask=observed)
+    vertices, faces, _, _ = measure.marching_cubes(distances, 0.0, mask=inner)
     colours = volume.colours.reshape(*volume.shape, 3)[tuple(np.round(vertices).astype(np.intp).T)]
     positions_m = volume.origin_m + (vertices + 0.5) * voxel_m
     write_atomic(path, _ply_mesh(positions_m.astype(np.float32), colours, faces.astype(np.int32)))

@@ -127,7 +127,8 @@ def _ellipsoid_samples(count: Int64[ndarray, "3"]) -> Float32[ndarray, "k 3"]:
     """Return a regular grid of points in the unit ball with this many points per axis."""
     axes = [np.linspace(-1, 1, int(n)) if n > 1 else np.zeros(1) for n in count]
     points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3).astype(np.float32)
-    return points[(points**2).sum(axis=1) <= 1 + 1e-6]
+    inside: Float32[ndarray, "k 3"] = points[(points**2).sum(axis=1) <= 1 + 1e-6]
+    return inside
 
 
 def _rotation_matrices(quats_wxyz: Float32[ndarray, "n 4"]) -> Float32[ndarray, "n 3 3"]:

@@ -20,6 +20,8 @@ from gausslite.export.packages import import_extra
 
 _SPLAT_ROW = np.dtype([("mean_m", "<f4", 3), ("scale_m", "<f4", 3), ("rgba", "u1", 4), ("quat_wxyz", "u1", 4)])
 _OPACITY_EDGE = 1e-6
+_TURN_ABOUT_X = np.array([1, -1, -1], np.float32)
+"""Signs of x, y, z after a turn by 180 degrees about x; also of a quaternion's x, y, z when the axes turn so."""
 _GLB_MAGIC, _GLB_VERSION, _GLB_JSON, _GLB_BINARY = 0x46546C67, 2, 0x4E4F534A, 0x004E4942
 _FLOAT, _POINTS = 5126, 0
 _Z_UP_TO_Y_UP_XYZW = (-np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5))
@@ -42,13 +44,17 @@ def write_splat(path: Path, gaussians: Gaussians) -> None:
 
 
 def write_spz(path: Path, gaussians: Gaussians) -> None:
-    """Write an SPZ file with the gsply library. Raises InvalidInputError without it, StorageError."""
+    """Write an SPZ file with the gsply library. Raises InvalidInputError without it, StorageError.
+
+    SPZ's axes are right, up, back, and viewers take PLY's as right, down, forward; therefore y and z change sign here,
+    and viewers show both files alike.
+    """
     gsply = import_extra("gsply", "export", "SPZ files")
     opacity = np.clip(gaussians.opacities.astype(np.float64), _OPACITY_EDGE, 1 - _OPACITY_EDGE)
     data = gsply.GSData(
-        means=gaussians.means_m,
+        means=gaussians.means_m * _TURN_ABOUT_X,
         scales=np.log(np.maximum(gaussians.scales_m, np.finfo(np.float32).tiny)),
-        quats=_unit_quaternions(gaussians),
+        quats=_unit_quaternions(gaussians) * np.concatenate([[np.float32(1)], _TURN_ABOUT_X]),
         opacities=np.log(opacity / (1 - opacity)).astype(np.float32),
         sh0=_harmonics(gaussians),
         shN=np.zeros((len(gaussians), 0, 3), np.float32),

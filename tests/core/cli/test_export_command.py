@@ -1,0 +1,45 @@
+"""`gausslite export` over a results folder that `gausslite map` wrote."""
+
+import json
+
+import pytest
+
+from gausslite.cli.main import main
+from gausslite.mission.keyframe_views import read_keyframe_views
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("export") / "run"
+    arguments = ["map", "sim:home", "--task", "Pick up the mug on the table", "--size", "160x120", "--frames", "0:12"]
+    assert main([*arguments, "--iterations", "2", "--out", str(folder)]) == 0
+    return folder
+
+
+def test_map_writes_the_cameras_of_its_keyframes(results):
+    views = read_keyframe_views(results)
+    assert views
+    assert [view.index for view in views] == sorted(view.index for view in views)
+    assert (views[0].camera.width_px, views[0].camera.height_px) == (160, 120)
+
+
+@pytest.mark.parametrize("name", ["ply", "spz", "splat", "gltf", "pcd", "las", "octomap", "nav2", "mesh", "json"])
+def test_every_format_writes_its_default_file(results, name, capsys):
+    assert main(["export", str(results), "--to", name, "--region", "all", "--voxel", "0.1", "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert (report["format"], report["gaussians"] > 0, report["bytes"] > 0) == (name, True, True)
+    assert main(["export", str(results), "--to", name, "--region", "all", "--voxel", "0.1"]) == 2
+    assert "--overwrite" in capsys.readouterr().err
+
+
+def test_the_map_itself_is_never_the_output(results, capsys):
+    before = (results / "map.ply").read_bytes()
+    out = str(results / "map.ply")
+    assert main(["export", str(results), "--to", "ply", "--out", out, "--overwrite"]) == 2
+    assert "not the input" in capsys.readouterr().err
+    assert (results / "map.ply").read_bytes() == before
+
+
+def test_a_missing_run_is_one_line(tmp_path, capsys):
+    assert main(["export", str(tmp_path / "nothing"), "--to", "spz"]) == 2
+    assert "map.ply" in capsys.readouterr().err
