@@ -18,9 +18,9 @@ from gausslite.wire.change_notifier import ChangeNotifier
 from gausslite.wire.convert import (
     box_from_message,
     camera_from_message,
-    frame_from_message,
     graph_from_message,
     graph_to_message,
+    live_frame_from_message,
     transform_from_message,
 )
 from gausslite.wire.map_blocks import map_blocks
@@ -164,7 +164,7 @@ class AgentServicer(pb_grpc.AgentServiceServicer):
 
     async def _submit(self, request: pb.IngestFramesRequest) -> asyncio.Future[FrameReport]:
         try:
-            frame = await asyncio.to_thread(frame_from_message, request.frame)
+            frame = await asyncio.to_thread(live_frame_from_message, request.frame)
         except InvalidInputError as error:
             rejected: asyncio.Future[FrameReport] = asyncio.get_running_loop().create_future()
             rejected.set_result(self._worker.reject(request.frame.index, str(error)))

@@ -17,6 +17,8 @@ from numpy import ndarray
 
 from gausslite.domain.camera import Camera
 from gausslite.domain.camera_correction import CameraCorrection
+from gausslite.domain.camera_motion import CameraMotion
+from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
 from gausslite.domain.lens import Lens, LensModel
 from gausslite.domain.trajectory import Twist
@@ -53,7 +55,7 @@ def correct_frame(frame: Frame, correction: CameraCorrection, ideal: Camera, twi
     """Return the frame as the ideal camera would have recorded it at the time of its middle row.
 
     Pixels that the recorded image does not show repeat its border and have no depth. The twist is that of the camera
-    at the frame's stamp.
+    at the frame's stamp. Motion blur stays; the frame's motion states it.
     """
     depth_m = np.zeros_like(frame.depth_m)
     columns, rows = _lookup(frame.camera, correction, ideal, twist, depth_m)
@@ -67,18 +69,36 @@ def correct_frame(frame: Frame, correction: CameraCorrection, ideal: Camera, twi
         depth_m=cv2.remap(frame.depth_m, columns, rows, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT),
         camera=ideal,
         T_world_camera=frame.T_world_camera @ twist.motion(correction.time_offset_s),
+        motion=CameraMotion(twist, exposure_s=correction.exposure_s) if correction.exposure_s else None,
     )
 
 
+def correct_by_own_motion(frame: Frame, lens: Lens | None) -> Frame:
+    """Return a frame without lens distortion and rolling shutter, by the motion that the frame itself states.
+
+    For frames of a live camera, whose other poses are not known. Raises InvalidInputError for a lens without a usable
+    pinhole camera.
+    """
+    motion = frame.motion or CameraMotion(Twist(np.zeros(3), np.zeros(3)))
+    correction = CameraCorrection(lens, motion.readout_s, exposure_s=motion.exposure_s)
+    if correction.is_identity:
+        return frame
+    speed_rad_s = float(np.linalg.norm(motion.twist.angular_rad_s))
+    return correct_frame(frame, correction, ideal_camera(frame.camera, correction, speed_rad_s), motion.twist)
+
+
 def _undistorted(camera: Camera, lens: Lens) -> Camera:
-    """Return the pinhole camera whose whole image the distorted image covers."""
+    """Return the pinhole camera whose whole image the distorted image covers. Raises InvalidInputError."""
     size = camera.width_px, camera.height_px
     K = np.array([[camera.fx_px, 0, camera.cx_px - 0.5], [0, camera.fy_px, camera.cy_px - 0.5], [0, 0, 1]])
-    coefficients = np.array(lens.coefficients)
-    if lens.model is LensModel.FISHEYE:
-        K_ideal = cv2.fisheye.estimateNewCameraMatrixForUndistortRectify(K, coefficients, size, np.eye(3), balance=0.0)
-    else:
-        K_ideal, _ = cv2.getOptimalNewCameraMatrix(K, coefficients, size, 0.0)
+    D = np.array(lens.coefficients)
+    try:
+        if lens.model is LensModel.FISHEYE:
+            K_ideal = cv2.fisheye.estimateNewCameraMatrixForUndistortRectify(K, D, size, np.eye(3), balance=0.0)
+        else:
+            K_ideal, _ = cv2.getOptimalNewCameraMatrix(K, D, size, 0.0)
+    except cv2.error as error:
+        raise InvalidInputError(f"lens {lens}: expected one that can be inverted over the image") from error
     fx_px, fy_px, cx_px, cy_px = (float(K_ideal[at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2)))
     return replace(camera, fx_px=fx_px, fy_px=fy_px, cx_px=cx_px + 0.5, cy_px=cy_px + 0.5)
 

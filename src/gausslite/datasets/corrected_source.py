@@ -1,4 +1,4 @@
-"""A sequence whose images are corrected for lens distortion, rolling shutter and time offset when they are read."""
+"""A sequence whose images are corrected for lens, rolling shutter and time offset when read, and state their blur."""
 
 from __future__ import annotations
 
@@ -22,6 +22,8 @@ _SPEED_QUANTILE = 0.9
 
 class CorrectedSource(WrappedSource):
     """A source as an ideal camera would have recorded it: pinhole, all rows exposed at once, stamps without offset.
+
+    Motion blur is not removed: with an exposure time, each frame's motion states it.
 
     Colour and depth are corrected alike, so depth must be registered to colour. A source without correction returns
     its frames unchanged. Raises InvalidInputError.

@@ -55,7 +55,12 @@ def frame_size(text: str | None, source: Source) -> tuple[int, int]:
 
 def downscaled_size(camera: Camera) -> tuple[int, int]:
     """Return a size with the camera's aspect ratio and about as many pixels as 320x240, or its own size if smaller."""
-    scale = min(1.0, math.sqrt(_DOWNSCALED_PIXELS / (camera.width_px * camera.height_px)))
+    return capped_size(camera, _DOWNSCALED_PIXELS)
+
+
+def capped_size(camera: Camera, max_pixels: int) -> tuple[int, int]:
+    """Return a size with the camera's aspect ratio and about this many pixels, or its own size if smaller."""
+    scale = min(1.0, math.sqrt(max_pixels / (camera.width_px * camera.height_px)))
     return round(scale * camera.width_px), round(scale * camera.height_px)
 
 

@@ -10,6 +10,7 @@ from collections import abc as _abc
 from google.protobuf import descriptor as _descriptor
 from google.protobuf import message as _message
 from google.protobuf.internal import containers as _containers
+from google.protobuf.internal import enum_type_wrapper as _enum_type_wrapper
 import builtins as _builtins
 import sys
 import typing as _typing
@@ -20,6 +21,23 @@ else:
     from typing_extensions import TypeAlias as _TypeAlias, Never as _Never
 
 DESCRIPTOR: _descriptor.FileDescriptor
+
+class _LensModel:
+    ValueType = _typing.NewType("ValueType", _builtins.int)
+    V: _TypeAlias = ValueType  # noqa: Y015
+
+class _LensModelEnumTypeWrapper(_enum_type_wrapper._EnumTypeWrapper[_LensModel.ValueType], _builtins.type):
+    DESCRIPTOR: _descriptor.EnumDescriptor
+    LENS_MODEL_UNSPECIFIED: _LensModel.ValueType  # 0
+    LENS_MODEL_RADTAN: _LensModel.ValueType  # 1
+    LENS_MODEL_FISHEYE: _LensModel.ValueType  # 2
+
+class LensModel(_LensModel, metaclass=_LensModelEnumTypeWrapper): ...
+
+LENS_MODEL_UNSPECIFIED: LensModel.ValueType  # 0
+LENS_MODEL_RADTAN: LensModel.ValueType  # 1
+LENS_MODEL_FISHEYE: LensModel.ValueType  # 2
+Global___LensModel: _TypeAlias = LensModel  # noqa: Y015
 
 @_typing.final
 class Camera(_message.Message):
@@ -165,6 +183,10 @@ class EncodedFrame(_message.Message):
     DEPTH_PNG_FIELD_NUMBER: _builtins.int
     CAMERA_FIELD_NUMBER: _builtins.int
     T_WORLD_CAMERA_FIELD_NUMBER: _builtins.int
+    LENS_FIELD_NUMBER: _builtins.int
+    READOUT_SECONDS_FIELD_NUMBER: _builtins.int
+    EXPOSURE_SECONDS_FIELD_NUMBER: _builtins.int
+    TWIST_FIELD_NUMBER: _builtins.int
     index: _builtins.int
     capture_time_ns: _builtins.int
     """By the robot's clock, increasing from frame to frame; it spreads the kept keyframes over the mission."""
@@ -172,10 +194,26 @@ class EncodedFrame(_message.Message):
     """JPEG or PNG, 8 bits a channel."""
     depth_png: _builtins.bytes
     """16-bit PNG in millimetres, 0 = no return, the same size as the colour."""
+    readout_seconds: _builtins.float
+    """From the first row's exposure to the last row's, -0.1 to 0.1; negative if rows are read from the bottom. 0 for a
+    global shutter. An agent corrects a rolling shutter on receipt; it needs the twist.
+    """
+    exposure_seconds: _builtins.float
+    """Exposure time of a row, 0 to 0.1; with the twist it states the motion blur."""
     @_builtins.property
     def camera(self) -> Global___Camera: ...
     @_builtins.property
-    def t_world_camera(self) -> Global___RigidTransform: ...
+    def t_world_camera(self) -> Global___RigidTransform:
+        """At the middle of the middle row's exposure."""
+
+    @_builtins.property
+    def lens(self) -> Global___Lens:
+        """Distortion of both images; none for a pinhole. An agent corrects it on receipt."""
+
+    @_builtins.property
+    def twist(self) -> Global___Twist:
+        """The camera's velocity in its own axes, at the time of the pose."""
+
     def __init__(
         self,
         *,
@@ -185,11 +223,75 @@ class EncodedFrame(_message.Message):
         depth_png: _builtins.bytes = ...,
         camera: Global___Camera | None = ...,
         t_world_camera: Global___RigidTransform | None = ...,
+        lens: Global___Lens | None = ...,
+        readout_seconds: _builtins.float = ...,
+        exposure_seconds: _builtins.float = ...,
+        twist: Global___Twist | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["camera", b"camera", "t_world_camera", b"t_world_camera"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_lens", b"_lens", "_twist", b"_twist", "camera", b"camera", "lens", b"lens", "t_world_camera", b"t_world_camera", "twist", b"twist"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["camera", b"camera", "capture_time_ns", b"capture_time_ns", "colour", b"colour", "depth_png", b"depth_png", "index", b"index", "t_world_camera", b"t_world_camera"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_lens", b"_lens", "_twist", b"_twist", "camera", b"camera", "capture_time_ns", b"capture_time_ns", "colour", b"colour", "depth_png", b"depth_png", "exposure_seconds", b"exposure_seconds", "index", b"index", "lens", b"lens", "readout_seconds", b"readout_seconds", "t_world_camera", b"t_world_camera", "twist", b"twist"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    _WhichOneofReturnType__lens: _TypeAlias = _typing.Literal["lens"]  # noqa: Y015
+    _WhichOneofArgType__lens: _TypeAlias = _typing.Literal["_lens", b"_lens"]  # noqa: Y015
+    _WhichOneofReturnType__twist: _TypeAlias = _typing.Literal["twist"]  # noqa: Y015
+    _WhichOneofArgType__twist: _TypeAlias = _typing.Literal["_twist", b"_twist"]  # noqa: Y015
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__lens) -> _WhichOneofReturnType__lens | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__twist) -> _WhichOneofReturnType__twist | None: ...
+
+Global___EncodedFrame: _TypeAlias = EncodedFrame  # noqa: Y015
+
+@_typing.final
+class Lens(_message.Message):
+    """OpenCV's distortion coefficients. RADTAN: k1 k2 p1 p2, then k3, then k4 k5 k6 (4, 5 or 8 numbers). FISHEYE: k1 to k4
+    of the equidistant model.
+    """
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    MODEL_FIELD_NUMBER: _builtins.int
+    COEFFICIENTS_FIELD_NUMBER: _builtins.int
+    model: Global___LensModel.ValueType
+    @_builtins.property
+    def coefficients(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]: ...
+    def __init__(
+        self,
+        *,
+        model: Global___LensModel.ValueType = ...,
+        coefficients: _abc.Iterable[_builtins.float] | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["coefficients", b"coefficients", "model", b"model"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
-Global___EncodedFrame: _TypeAlias = EncodedFrame  # noqa: Y015
+Global___Lens: _TypeAlias = Lens  # noqa: Y015
+
+@_typing.final
+class Twist(_message.Message):
+    """At most 100 m/s and 100 rad/s along each axis."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    LINEAR_M_S_FIELD_NUMBER: _builtins.int
+    ANGULAR_RAD_S_FIELD_NUMBER: _builtins.int
+    @_builtins.property
+    def linear_m_s(self) -> Global___Point: ...
+    @_builtins.property
+    def angular_rad_s(self) -> Global___Point: ...
+    def __init__(
+        self,
+        *,
+        linear_m_s: Global___Point | None = ...,
+        angular_rad_s: Global___Point | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["angular_rad_s", b"angular_rad_s", "linear_m_s", b"linear_m_s"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["angular_rad_s", b"angular_rad_s", "linear_m_s", b"linear_m_s"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___Twist: _TypeAlias = Twist  # noqa: Y015

@@ -16,6 +16,7 @@ from gausslite.codec.subset_codec import CodecLimits
 from gausslite.domain.camera import Camera
 from gausslite.domain.errors import ChecksumError, CodecError
 from gausslite.domain.frame import Frame
+from gausslite.domain.lens import Lens
 from gausslite.domain.objects import ObjectReport, TeamObject
 from gausslite.domain.task import TaskGraph
 from gausslite.domain.voxels import AxisAlignedBox, VoxelGrid
@@ -94,11 +95,16 @@ class AgentClient(ServiceChannel):
         return convert.graph_from_message(self._call(self._stub.AssignTask, request).graph)
 
     def ingest(
-        self, frames: Iterable[Frame], lossless: bool = False
+        self, frames: Iterable[Frame], lossless: bool = False, lens: Lens | None = None
     ) -> Iterator[agent_service_pb2.IngestFramesResponse]:
-        """Send frames; yields one outcome for each, in order."""
+        """Send frames; yields one outcome for each, in order.
+
+        lens: distortion of the frames' images, which the agent corrects together with the rolling shutter that
+        `Frame.motion` states.
+        """
         requests = (
-            agent_service_pb2.IngestFramesRequest(frame=convert.frame_to_message(frame, lossless)) for frame in frames
+            agent_service_pb2.IngestFramesRequest(frame=convert.live_frame_to_message(frame, lens, lossless))
+            for frame in frames
         )
         return self._stream(self._stub.IngestFrames(requests))
 
@@ -260,9 +266,11 @@ class FusionClient(ServiceChannel):
             raise ChecksumError("export: CRC32C does not match; the map was damaged in transit")
         return bytes(data)
 
-    def report_objects(self, session_id: str, report: ObjectReport) -> None:
-        """Replace the agent's task graph and objects. Raises SessionUnknownError, InvalidInputError."""
-        self._call(self._stub.ReportObjects, report_to_message(session_id, report))
+    def report_objects(self, session_id: str, report: ObjectReport) -> int:
+        """Replace the agent's task graph and objects; returns the bytes sent. Raises SessionUnknownError."""
+        request = report_to_message(session_id, report)
+        self._call(self._stub.ReportObjects, request)
+        return request.ByteSize()
 
     def query_objects(self, noun: str = "") -> tuple[TeamObject, ...]:
         """Return the team's objects that a noun names, or all, the most confident first."""

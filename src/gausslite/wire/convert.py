@@ -10,9 +10,11 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from gausslite.codec.subset_codec import CodecLimits, decode_subset
+from gausslite.datasets.camera_correction import correct_by_own_motion
 from gausslite.domain.camera import Camera
 from gausslite.domain.errors import CodecError, InvalidInputError, TaskError
 from gausslite.domain.frame import Frame
+from gausslite.domain.lens import Lens
 from gausslite.domain.pose import require_rigid
 from gausslite.domain.task import Predicate, Relation, TaskGraph
 from gausslite.domain.task_limits import require_graph
@@ -20,6 +22,12 @@ from gausslite.domain.voxel_batch import VoxelBatch
 from gausslite.domain.voxel_operations import empty_batch, merge_batches, select_voxels
 from gausslite.domain.voxels import AxisAlignedBox, VoxelGrid
 from gausslite.v1 import gaussians_pb2, geometry_pb2, task_pb2
+from gausslite.wire.camera_messages import (
+    lens_from_message,
+    lens_to_message,
+    motion_from_message,
+    twist_to_message,
+)
 from gausslite.wire.images import (
     JPEG_QUALITY,
     KEYFRAME_JPEG_QUALITY,
@@ -131,10 +139,11 @@ def transform_from_message(name: str, message: geometry_pb2.RigidTransform) -> F
 
 
 def frame_to_message(frame: Frame, lossless: bool = False, compact: bool = False) -> geometry_pb2.EncodedFrame:
-    """Encode a frame with JPEG colour (PNG if lossless) and 16-bit PNG depth in millimetres.
+    """Encode a frame, and its motion if it states one, with JPEG colour (PNG if lossless) and depth in millimetres.
 
     compact: a third smaller, but encoding takes three times longer; for keyframes, which share a robot's bandwidth.
     """
+    motion = frame.motion
     return geometry_pb2.EncodedFrame(
         index=frame.index,
         capture_time_ns=frame.capture_time_ns,
@@ -142,12 +151,42 @@ def frame_to_message(frame: Frame, lossless: bool = False, compact: bool = False
         depth_png=encode_depth(frame.depth_m, KEYFRAME_PNG_COMPRESSION if compact else PNG_COMPRESSION),
         camera=camera_to_message(frame.camera),
         t_world_camera=transform_to_message(frame.T_world_camera),
+        readout_seconds=0.0 if motion is None else motion.readout_s,
+        exposure_seconds=0.0 if motion is None else motion.exposure_s,
+        twist=None if motion is None else twist_to_message(motion.twist),
     )
 
 
 def frame_from_message(message: geometry_pb2.EncodedFrame) -> Frame:
-    """Decode a frame whose images have the camera's size. Raises InvalidInputError and subclasses."""
+    """Decode a frame whose images have the camera's size and no lens distortion.
+
+    Raises InvalidInputError and subclasses.
+    """
+    if message.HasField("lens"):
+        raise InvalidInputError("frame lens: expected an undistorted image; only an agent's IngestFrames takes a lens")
+    return _decode_images(message)
+
+
+def live_frame_to_message(frame: Frame, lens: Lens | None, lossless: bool = False) -> geometry_pb2.EncodedFrame:
+    """Encode a frame of a live camera with its lens; None for a pinhole."""
+    message = frame_to_message(frame, lossless)
+    if lens is not None:
+        message.lens.CopyFrom(lens_to_message(lens))
+    return message
+
+
+def live_frame_from_message(message: geometry_pb2.EncodedFrame) -> Frame:
+    """Decode a frame of a live camera, without its lens distortion and rolling shutter.
+
+    Raises InvalidInputError and subclasses.
+    """
+    lens = lens_from_message(message)
+    return correct_by_own_motion(_decode_images(message), lens)
+
+
+def _decode_images(message: geometry_pb2.EncodedFrame) -> Frame:
     camera = camera_from_message(message.camera)
+    motion = motion_from_message(message)
     return Frame(
         message.index,
         message.capture_time_ns,
@@ -155,6 +194,7 @@ def frame_from_message(message: geometry_pb2.EncodedFrame) -> Frame:
         decode_depth(message.depth_png, camera.width_px, camera.height_px),
         camera,
         transform_from_message("frame t_world_camera", message.t_world_camera),
+        motion,
     )
 
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import struct
 import zlib
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -13,13 +15,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gausslite.codec.subset_codec import DEFAULT_LIMITS, encode_subset
+from gausslite.datasets.camera_correction import correct_frame, ideal_camera
 from gausslite.domain.camera import Camera
+from gausslite.domain.camera_correction import CameraCorrection
+from gausslite.domain.camera_motion import CameraMotion
 from gausslite.domain.errors import GaussLiteError, InvalidInputError, PoseError, TaskError
 from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.image_bytes import image_size
+from gausslite.domain.lens import Lens, LensModel
 from gausslite.domain.pose import require_rigid
 from gausslite.domain.task import Predicate, Relation, TaskGraph
+from gausslite.domain.trajectory import Twist
 from gausslite.domain.voxel_batch import RoiSubset, VoxelBatch
 from gausslite.domain.voxels import AxisAlignedBox, VoxelGrid
 from gausslite.v1 import agent_service_pb2, gaussians_pb2, geometry_pb2, task_pb2
@@ -131,7 +138,79 @@ def test_a_pose_too_far_from_the_worlds_origin_is_refused(value: float) -> None:
         convert.frame_from_message(encoded)
 
 
-FRAME_BYTES = convert.frame_to_message(sample_frame()).SerializeToString()
+MOTION = CameraMotion(Twist(np.array([0.3, -0.1, 0.2]), np.array([0.5, 1.5, -0.4])), readout_s=0.03, exposure_s=0.01)
+LENS = Lens(LensModel.RADTAN, (-0.2, 0.03, 0.001, -0.002, 0.01))
+
+
+def test_a_frames_motion_is_unchanged_by_a_round_trip() -> None:
+    got = convert.frame_from_message(convert.frame_to_message(replace(sample_frame(), motion=MOTION))).motion
+    assert got is not None
+    assert (got.readout_s, got.exposure_s) == (MOTION.readout_s, MOTION.exposure_s)
+    np.testing.assert_array_equal(got.twist.linear_m_s, MOTION.twist.linear_m_s)
+    np.testing.assert_array_equal(got.twist.angular_rad_s, MOTION.twist.angular_rad_s)
+    assert convert.frame_from_message(convert.frame_to_message(sample_frame())).motion is None
+
+
+def test_a_live_frame_is_corrected_as_a_recorded_one() -> None:
+    sent = replace(sample_frame(), motion=MOTION)
+    got = convert.live_frame_from_message(convert.live_frame_to_message(sent, LENS, lossless=True))
+    correction = CameraCorrection(LENS, MOTION.readout_s, exposure_s=MOTION.exposure_s)
+    ideal = ideal_camera(CAMERA, correction, float(np.linalg.norm(MOTION.twist.angular_rad_s)))
+    plain = convert.frame_from_message(convert.frame_to_message(sample_frame(), lossless=True))
+    expected = correct_frame(plain, correction, ideal, MOTION.twist)
+    assert got.camera == ideal != CAMERA
+    np.testing.assert_array_equal(got.rgb, expected.rgb)
+    np.testing.assert_array_equal(got.depth_m, expected.depth_m)
+    assert got.motion is not None
+    assert (got.motion.readout_s, got.motion.exposure_s) == (0.0, MOTION.exposure_s)
+
+
+def test_a_live_frame_without_lens_and_motion_is_used_as_sent() -> None:
+    sent = sample_frame()
+    got = convert.live_frame_from_message(convert.live_frame_to_message(sent, None, lossless=True))
+    assert got.camera == sent.camera
+    np.testing.assert_array_equal(got.rgb, sent.rgb)
+    assert got.motion is None
+
+
+def test_a_frame_with_a_lens_is_refused_where_nothing_corrects_it() -> None:
+    with pytest.raises(InvalidInputError, match="frame lens"):
+        convert.frame_from_message(convert.live_frame_to_message(sample_frame(), LENS))
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        ({"readout_seconds": 0.03}, "frame twist: expected one"),
+        ({"exposure_seconds": 0.01}, "frame twist: expected one"),
+        ({"twist": geometry_pb2.Twist(angular_rad_s=geometry_pb2.Point(x=1e3))}, "twist angular_rad_s"),
+        ({"twist": geometry_pb2.Twist(linear_m_s=geometry_pb2.Point(z=float("nan")))}, "twist linear_m_s"),
+        ({"twist": geometry_pb2.Twist(), "readout_seconds": 0.2}, "readout_s"),
+        ({"twist": geometry_pb2.Twist(), "readout_seconds": float("inf")}, "readout_s"),
+        ({"twist": geometry_pb2.Twist(), "exposure_seconds": -0.01}, "exposure_s"),
+        ({"lens": geometry_pb2.Lens(coefficients=[0.1, 0, 0, 0])}, "frame lens: expected the model"),
+        ({"lens": geometry_pb2.Lens(model=geometry_pb2.LENS_MODEL_FISHEYE, coefficients=[0.1] * 5)}, "got 5"),
+        ({"lens": geometry_pb2.Lens(model=geometry_pb2.LENS_MODEL_RADTAN, coefficients=[float("nan")] * 4)}, "finite"),
+        ({"lens": geometry_pb2.Lens(model=geometry_pb2.LENS_MODEL_RADTAN, coefficients=[1.0] * 10_000)}, "got 10000"),
+    ],
+)
+def test_a_wrong_lens_or_motion_is_refused_by_name(change: dict[str, object], expected: str) -> None:
+    encoded = convert.frame_to_message(sample_frame())
+    encoded.MergeFrom(geometry_pb2.EncodedFrame(**change))  # type: ignore[arg-type]
+    with pytest.raises(InvalidInputError, match=expected):
+        convert.live_frame_from_message(encoded)
+
+
+@given(st.lists(st.floats(-1e3, 1e3), min_size=8, max_size=8), st.sampled_from(["radtan", "fisheye"]))
+@settings(max_examples=100, deadline=None)
+def test_any_lens_gives_a_frame_or_an_error_about_it(coefficients: list[float], model: str) -> None:
+    lens = Lens(LensModel(model), tuple(coefficients[: 8 if model == "radtan" else 4]))
+    with contextlib.suppress(InvalidInputError):
+        frame = convert.live_frame_from_message(convert.live_frame_to_message(sample_frame(), lens))
+        assert np.isfinite(frame.depth_m).all()
+
+
+FRAME_BYTES = convert.live_frame_to_message(replace(sample_frame(), motion=MOTION), LENS).SerializeToString()
 
 
 @given(st.data())
@@ -141,7 +220,7 @@ def test_changed_frame_bytes_give_a_valid_frame_or_a_gausslite_error(data: st.Da
     for _ in range(data.draw(st.integers(1, 4))):
         noisy[data.draw(st.integers(0, len(noisy) - 1))] = data.draw(st.integers(0, 255))
     try:
-        frame = convert.frame_from_message(geometry_pb2.EncodedFrame.FromString(bytes(noisy)))
+        frame = convert.live_frame_from_message(geometry_pb2.EncodedFrame.FromString(bytes(noisy)))
     except (GaussLiteError, DecodeError):
         return
     size = (frame.camera.height_px, frame.camera.width_px)

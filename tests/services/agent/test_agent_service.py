@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterator
+from dataclasses import replace
 
 import grpc
 import numpy as np
@@ -12,6 +13,7 @@ from agent_running import TASK, Gate, agent, ball_estimator
 from fusion_running import CAMERA, GRID, frame, fusion_server
 
 from gausslite.domain.camera import Camera
+from gausslite.domain.camera_motion import CameraMotion
 from gausslite.domain.errors import (
     GaussLiteError,
     InvalidInputError,
@@ -21,8 +23,10 @@ from gausslite.domain.errors import (
     TaskError,
 )
 from gausslite.domain.frame import Frame
+from gausslite.domain.lens import Lens, LensModel
 from gausslite.domain.region import BallRegion
 from gausslite.domain.task import TaskGraph
+from gausslite.domain.trajectory import Twist
 from gausslite.domain.voxels import AxisAlignedBox
 from gausslite.fusion.memory_store import MemoryStore
 from gausslite.perception.fixed_relevance import RegionRelevanceEstimator
@@ -103,6 +107,17 @@ def test_each_frame_has_its_outcome_in_order() -> None:
     assert counts == (2, 1, 0, 1)
     assert status.gaussians == answers[3].gaussians > 0
     assert status.hz > 0
+
+
+def test_frames_of_a_distorted_moving_camera_are_corrected_and_mapped() -> None:
+    motion = CameraMotion(Twist(np.array([0.1, 0.0, 0.0]), np.array([0.0, 0.5, 0.0])), readout_s=0.03, exposure_s=0.01)
+    frames = [replace(frame(index), motion=motion) for index in range(2)]
+    with agent() as a:
+        a.client.assign_task(TASK)
+        answers = list(a.client.ingest(frames, lens=Lens(LensModel.RADTAN, (-0.2, 0.0, 0.0, 0.0))))
+        keyframe = a.worker.run(lambda mapper: mapper.render(CAMERA, np.eye(4)).depth_m).result(20)
+    assert [answer.outcome for answer in answers] == [pb.FRAME_OUTCOME_MAPPED] * 2, [a.reason for a in answers]
+    assert (keyframe > 0).any()
 
 
 def test_another_task_switches_the_region_and_an_equivalent_task_changes_nothing() -> None:
