@@ -24,7 +24,8 @@ class HomeSettings:
     noise: scale of the sensor model; 0 disables it, and depth is exact. holes and flying: scales of missing depth and
     of flying pixels. exposure: scale of the gain drift. gloss: scale of reflections. shutter_ms: readout time of a
     rolling shutter. blur_ms: exposure time of a row. lens: distortion of both images. speed_deg_s: mean angular speed,
-    which sets the frame rate; 0 for 30 Hz.
+    which sets the frame rate; 0 for 30 Hz. drift_percent: error of the odometry whose poses the frames have, in percent
+    of the distance moved and of the angle turned; 0 for exact poses.
     """
 
     home: int = 0
@@ -41,6 +42,7 @@ class HomeSettings:
     blur_ms: float = 0.0
     lens: Lens | None = None
     speed_deg_s: float = 0.0
+    drift_percent: float = 0.0
 
     def __post_init__(self) -> None:
         low, high = _SIDES_PX
@@ -51,6 +53,7 @@ class HomeSettings:
             ("size", self.size_px, f"sides of {low} to {high} px", all(low <= side <= high for side in self.size_px)),
             ("shutter", self.shutter_ms, "0ms to 100ms", 0.0 <= self.shutter_ms <= 100.0),
             ("blur", self.blur_ms, "0ms to 100ms", 0.0 <= self.blur_ms <= 100.0),
+            ("drift", self.drift_percent, "0% to 20%", 0.0 <= self.drift_percent <= 20.0),
             ("speed", self.speed_deg_s, "0 to 1000 degrees per second", 0.0 <= self.speed_deg_s <= 1000.0),
             *((name, getattr(self, name), "0 to 10", 0.0 <= getattr(self, name) <= 10.0) for name in _STRENGTHS),
         ):
@@ -79,11 +82,13 @@ class HomeSettings:
                 settings["lens"] = _read_lens(value, home)
             elif key == "speed" and re.fullmatch(r"[0-9]{1,4}", value):
                 settings["speed_deg_s"] = float(value)
+            elif key == "drift" and (match := re.fullmatch(r"([0-9]{1,2}(?:\.[0-9]{1,3})?)%", value)):
+                settings["drift_percent"] = float(match.group(1))
             else:
                 expected = "&".join(
                     [
                         *(f"{name}=N" for name in _NUMBERS),
-                        *("size=WxH", "shutter=Xms", "blur=Xms", "lens=MODEL:K1,...", "speed=N"),
+                        *("size=WxH", "shutter=Xms", "blur=Xms", "lens=MODEL:K1,...", "speed=N", "drift=X%"),
                         *(f"{name}=X" for name in _STRENGTHS),
                     ]
                 )

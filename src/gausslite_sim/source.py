@@ -27,6 +27,7 @@ from gausslite_sim.home_catalogue import HOME_COUNT, plan_home
 from gausslite_sim.home_plan import HomePlan
 from gausslite_sim.home_settings import HomeSettings
 from gausslite_sim.instance_regions import InstanceImageCache, InstanceRegion
+from gausslite_sim.odometry_drift import drifting_poses
 from gausslite_sim.ray_camera import RayCamera
 from gausslite_sim.recorded_view import RecordingCamera, render_recorded_view
 from gausslite_sim.scene import HomeScene, require_ray_caster
@@ -113,7 +114,7 @@ class SimulatedHome:
         require_position(self.name, i, len(self))
         if size is not None:
             require_size("size", size)
-        settings, home, T_world_camera = self._settings, self._home, self._poses[i]
+        settings, home = self._settings, self._home
         view = self._apply_exposure(self._render(i), i)
         if settings.noise > 0:
             rng = np.random.default_rng([settings.seed, settings.trajectory, i])
@@ -129,7 +130,7 @@ class SimulatedHome:
             image.rgb,
             image.depth_m,
             image.camera,
-            T_world_camera.copy(),
+            self._odometry_poses[i].copy(),
         )
 
     def indices(self) -> Sequence[int]:
@@ -137,8 +138,8 @@ class SimulatedHome:
         return range(len(self))
 
     def trajectory(self) -> Trajectory:
-        """Return the exact poses at the frames' times."""
-        return Trajectory(self._times_s, self._poses)
+        """Return the frames' poses: exact, or those of an odometry that drifts."""
+        return Trajectory(self._times_s, self._odometry_poses)
 
     def regions(self) -> Mapping[str, Region]:
         """Return the region of every object by name: table, chair_1, mug, ...; without walls, floors and ceilings."""
@@ -152,6 +153,14 @@ class SimulatedHome:
     @cached_property
     def _poses(self) -> Float64[ndarray, "n 4 4"]:
         return self._home.plan.trajectories[self._settings.trajectory](self._settings.frames)
+
+    @cached_property
+    def _odometry_poses(self) -> Float64[ndarray, "n 4 4"]:
+        settings = self._settings
+        if settings.drift_percent == 0:
+            return self._poses
+        rng = np.random.default_rng([settings.seed, settings.trajectory])
+        return drifting_poses(self._poses, settings.drift_percent / 100, rng)
 
     @cached_property
     def _times_s(self) -> Float64[ndarray, " n"]:

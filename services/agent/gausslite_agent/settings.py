@@ -27,7 +27,7 @@ from gausslite.domain.names import require_name
 from gausslite.domain.pose import UpAxis
 from gausslite.domain.task_limits import require_task_text
 from gausslite.domain.voxels import VoxelGrid
-from gausslite.mission.settings import MissionSettings, PerceptionSettings, SourceSettings
+from gausslite.mission.settings import MissionSettings, PerceptionSettings, PoseMode, SourceSettings
 from gausslite.wire.address import require_callable
 from gausslite.wire.tls import Tls
 from gausslite.wire.uplink_values import UplinkSettings
@@ -117,6 +117,7 @@ def parse_arguments(arguments: Sequence[str] | None = None) -> AgentSettings:
             options.test_every,
             options.register_depth,
             options.camera_correction,
+            require_poses=options.poses != PoseMode.TRACK,
         )
     link = LinkSettings(
         options.parser,

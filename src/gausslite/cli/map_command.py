@@ -5,15 +5,23 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+import numpy as np
+from jaxtyping import Bool
+from numpy import ndarray
+
 from gausslite.cli.map_inputs import FRAMES_KEY, MapInputs, has_regions, policy_of
 from gausslite.cli.progress import MappingBar, print_above_bar
 from gausslite.cli.source_options import add_regions, add_source, report_region_file, selected_regions
+from gausslite.cli.trajectory_report import tracking_text, trajectory_report
+from gausslite.codec.keyframe_views import KeyframeView, write_keyframe_views
+from gausslite.codec.object_report import object_as_json
 from gausslite.codec.png import write_png
 from gausslite.config.mapping_options import HOLD_OUT_HELP, add_budget, add_detector, add_policy
 from gausslite.config.source_options import add_camera_correction
 from gausslite.config.switches import add_switch
 from gausslite.config.values import AUTO, NONE
 from gausslite.domain.errors import DatasetError
+from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.names import require_name
 from gausslite.domain.region import Region
@@ -24,7 +32,6 @@ from gausslite.evaluation.views import view_map
 from gausslite.mission.build import EstimatorFactory, build_task_mapper
 from gausslite.mission.checkpoint import SavedRun, save_run
 from gausslite.mission.frame_stream import CorruptFrames
-from gausslite.mission.keyframe_views import write_keyframe_views
 from gausslite.mission.results import (
     PREVIEW,
     peak_rss_mib,
@@ -36,7 +43,7 @@ from gausslite.mission.results import (
     write_results,
 )
 from gausslite.mission.runner import MissionResult, MissionRunner
-from gausslite.mission.settings import SceneInfo
+from gausslite.mission.settings import PoseMode, SceneInfo
 from gausslite.mission.task_mapper import TaskMapper
 from gausslite.mission.task_schedule import ScheduledTaskMapper
 from gausslite.process.messages import print_message
@@ -149,18 +156,20 @@ class _Run:
             **self._inputs.report(),
             "resumed_from": None if options.resume is None else str(options.resume),
             **result.summary(),
+            **trajectory_report(self._inputs.source, self._inputs.stream.source, self._mapper),
             "frames_corrupt": self._corrupt.count,
             "gaussians": len(self._gaussians),
             "active_gaussians": int(self._gaussians.active.sum()),
             "peak_rss_mib": peak_rss_mib(),
             "memory_mib": self._mapper.memory_mib(),
+            "objects": [object_as_json(each) for each in self._mapper.objects],
             "notes": list(self._notes),
         }
         prepare_folder(options.out)
         write_results(options.out, self._gaussians, self._report, self._inputs.world_frame(options))
-        write_keyframe_views(options.out, self._mapper.keyframes())
         write_poses(options.out, self._mapper.poses)
         keyframes = [(keyframe.frame, keyframe.relevance.roi) for keyframe in self._mapper.keyframes()]
+        write_keyframe_views(options.out, [_view(frame, roi) for frame, roi in keyframes])
         if keyframes:
             viewer = view_map(self._gaussians, mission.backend, mission.threads)
             write_png(options.out / PREVIEW, render_preview(viewer, keyframes))
@@ -181,6 +190,8 @@ class _Run:
             f"{len(self._gaussians)} Gaussians ({report['active_gaussians']} in the task's region) → "
             f"{self._options.out / 'map.ply'}; {PREVIEW} in the same folder shows it"
         )
+        if self._inputs.mission.poses is PoseMode.TRACK:
+            print(f"  {tracking_text(report)}")
         if result.processed == 0:
             print(f"  no selected frame comes after frame {result.last_index}, the last one of the resumed run")
         for note in self._notes:
@@ -204,6 +215,11 @@ def _first_roi(
             print_message(warning)
     graph = inputs.schedule.at(resumed_after)
     return selected_regions(options, inputs.stream.source) if graph is None else graph
+
+
+def _view(frame: Frame, roi: Bool[ndarray, "h w"]) -> KeyframeView:
+    pixels = int(np.count_nonzero(roi))
+    return KeyframeView(frame.index, frame.capture_time_ns, frame.camera, frame.T_world_camera, pixels)
 
 
 def _interrupted_text(options: argparse.Namespace, result: MissionResult) -> str:

@@ -32,6 +32,7 @@ from gausslite.mission.frame_stream import FrameStream
 from gausslite.mission.settings import (
     MissionSettings,
     PerceptionSettings,
+    PoseMode,
     SourceSettings,
     TaskSettings,
     default_policy,
@@ -71,8 +72,16 @@ class MapInputs:
         _report_uniform_map(options)
         mission = mission_settings(options, policy_of(options))
         schedule = _schedule(parse_task(options), [TaskSwitch.parse(text) for text in options.task_at])
-        recorded = open_recorded(options.source, options.up)
-        source = SourceSettings(options.source, options.frames, options.size, options.up, options.test_every)
+        require_poses = mission.poses is not PoseMode.TRACK
+        recorded = open_recorded(options.source, options.up, require_poses)
+        source = SourceSettings(
+            options.source,
+            options.frames,
+            options.size,
+            options.up,
+            options.test_every,
+            require_poses=require_poses,
+        )
         stream = FrameStream.select(recorded, source)
         source = replace(source, size=f"{stream.size[0]}x{stream.size[1]}")
         return cls(mission, perception_settings(options), source, task, stream, schedule)
@@ -89,11 +98,16 @@ class MapInputs:
         pose_prior = options.pose_prior if pose_prior is None else pose_prior
         correction = options.camera_correction if correction is None else correction
         registered, registered_to = register_with_warnings(self.source.spec, self.stream.source, registration, AUTO)
+        if self.mission.poses is PoseMode.TRACK and not isinstance(correction, CameraCorrection):
+            # readout time and offset are estimated from given poses
+            correction = CameraCorrection(registered.lens if registered.depth_registered else None)
         frames, corrected_by = correct_with_warnings(self.source.spec, registered, correction, AUTO)
-        prior = resolve_pose_prior(self.source.spec, frames, pose_prior)
+        if self.mission.poses is not PoseMode.REFINE and pose_prior == AUTO:
+            pose_prior = PoseExposurePrior()
+        mission = replace(self.mission, pose_prior=resolve_pose_prior(self.source.spec, frames, pose_prior))
         return replace(
             self,
-            mission=replace(self.mission, pose_prior=prior),
+            mission=replace(mission, pose_prior=mission.refinement_prior),
             source=replace(self.source, depth_registration=registered_to, camera_correction=corrected_by),
             stream=replace(self.stream, source=frames),
         )
@@ -143,6 +157,7 @@ class MapInputs:
             "view_error": None if prior.is_exact else str(prior),
             "task": None if first is None else {"text": first.text, **as_json(first)},
             "then": [{"frame": frame, "text": graph.text, **as_json(graph)} for frame, graph in self.schedule.switches],
+            "poses": str(self.mission.poses),
             "policy": self.mission.policy,
             "without": sorted(self.mission.disabled),
             "size": list(self.stream.size),

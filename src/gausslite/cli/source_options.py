@@ -11,7 +11,7 @@ from gausslite.calibration.registration import find_registration
 from gausslite.config.source_options import add_frames
 from gausslite.config.values import AUTO, NONE, read_names, read_numbers
 from gausslite.datasets.corrected_source import CorrectedSource
-from gausslite.datasets.open import is_simulated, open_source
+from gausslite.datasets.open import has_exact_poses, is_simulated, open_source
 from gausslite.datasets.registered_source import RegisteredSource
 from gausslite.datasets.source import Source
 from gausslite.domain.camera_correction import CameraCorrection
@@ -47,9 +47,9 @@ def open_with_warnings(
     return register_with_warnings(spec, open_recorded(spec, up_axis), depth_registration, default)
 
 
-def open_recorded(spec: str, up_axis: UpAxis | None) -> Source:
+def open_recorded(spec: str, up_axis: UpAxis | None, require_poses: bool = True) -> Source:
     """Open a sequence without registration, and report excluded frames. Raises DatasetError, InvalidInputError."""
-    source = open_source(spec, up_axis)
+    source = open_source(spec, up_axis, require_poses=require_poses)
     if source.excluded_frames:
         print_message(f"{spec}: {source.excluded_frames}")
     return source
@@ -97,11 +97,11 @@ def correct_with_warnings(
 def resolve_pose_prior(spec: str, source: Source, pose_prior: PoseExposurePrior | str) -> PoseExposurePrior:
     """Return the given prior or, for AUTO, an estimate from the recording, which is printed to stderr.
 
-    Poses of a simulated home are exact.
+    Poses of a simulated home without drift are exact.
     """
     if isinstance(pose_prior, PoseExposurePrior):
         return pose_prior
-    if is_simulated(spec):
+    if has_exact_poses(spec):
         return PoseExposurePrior()
     estimate, reason = estimate_pose_exposure_prior(source)
     print_message(f"--pose-prior {NONE if estimate.is_exact else estimate}: {reason}")

@@ -71,10 +71,14 @@ class FolderSource:
 
 
 class NumberedFolderSource(FolderSource, ABC):
-    """A folder whose image files are numbered, with times at 30 Hz. Frames without a pose are excluded."""
+    """A folder whose image files are numbered, with times at 30 Hz.
+
+    Frames without a pose are excluded if poses are required; otherwise they have the identity.
+    """
 
     _colours: dict[int, Path]
     _numbers: list[int]
+    _require_poses: bool
 
     def _find_colours(self, folder: Path, paths: Iterable[Path], pattern: re.Pattern[str], expected: str) -> None:
         """Find the colour images by their names. Raises DatasetError if there are none."""
@@ -83,9 +87,10 @@ class NumberedFolderSource(FolderSource, ABC):
         require_frames(folder, len(colours), f"images named {expected}")
         self._colours = dict(sorted(colours.items()))
 
-    def _select_frames_with_pose(self) -> None:
-        """Exclude the frames without a pose. Raises DatasetError if none is left."""
-        self._numbers = [number for number in self._colours if not self._is_lost(number)]
+    def _select_frames(self, require_poses: bool) -> None:
+        """Exclude the frames without a pose if poses are required. Raises DatasetError if none is left."""
+        self._require_poses = require_poses
+        self._numbers = [number for number in self._colours if not require_poses or not self._is_lost(number)]
         require_frames(self._folder, len(self._numbers), "frames with a pose")
 
     @abstractmethod
@@ -132,4 +137,12 @@ class NumberedFolderSource(FolderSource, ABC):
             return False  # `frame` reports a damaged pose if it is used
 
     def _read_pose(self, number: int) -> Float64[ndarray, "4 4"]:
+        if not self._require_poses and not self._has_pose(number):
+            return np.eye(4)
         return nearest_rigid(self._place_of_pose(number), self._read_matrix(number))
+
+    def _has_pose(self, number: int) -> bool:
+        try:
+            return not is_lost(self._read_matrix(number)[:3])
+        except DatasetError:
+            return False

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
@@ -12,7 +13,7 @@ from gausslite.datasets.sevenscenes import SevenScenesSource
 from gausslite.datasets.source import Source
 from gausslite.datasets.tum import TumSource
 from gausslite.domain.depth_registration import DepthRegistration
-from gausslite.domain.errors import DatasetError
+from gausslite.domain.errors import DatasetError, PoseError
 from gausslite.domain.pose import UpAxis
 
 _READERS = (TumSource, SevenScenesSource, ReplicaSource)
@@ -25,14 +26,18 @@ _SIMULATOR = "gausslite_sim.source"
 
 
 def open_source(
-    spec: str, up_axis: UpAxis | None = None, depth_registration: DepthRegistration | None = None
+    spec: str,
+    up_axis: UpAxis | None = None,
+    depth_registration: DepthRegistration | None = None,
+    require_poses: bool = True,
 ) -> Source:
     """Return the sequence in a folder, or a simulated one ("sim:home?seed=0&trajectory=0").
 
     A folder that contains exactly one sequence folder also works. depth_registration: the colour camera to which depth
-    is registered; None if the recording is registered. Raises DatasetError, PoseError, InvalidInputError.
+    is registered; None if the recording is registered. require_poses: False also accepts frames and sequences without
+    poses, for tracking; these frames get the identity. Raises DatasetError, PoseError, InvalidInputError.
     """
-    source = _open(spec, up_axis)
+    source = _open(spec, up_axis, require_poses)
     return source if depth_registration is None else RegisteredSource(source, depth_registration)
 
 
@@ -41,7 +46,23 @@ def is_simulated(spec: str) -> bool:
     return spec.startswith(_SIMULATED)
 
 
-def _open(spec: str, up_axis: UpAxis | None) -> Source:
+def open_reference(spec: str, depth_registration: DepthRegistration | None = None) -> Source | None:
+    """Return the sequence with its true poses, for scoring a trajectory; None if it has no poses.
+
+    The poses of a recording count as true. A simulated home's are exact, whatever its drift= is.
+    """
+    try:
+        return open_source(re.sub(r"[?&]drift=[^&]*$|drift=[^&]*&", "", spec), None, depth_registration)
+    except (DatasetError, PoseError):
+        return None
+
+
+def has_exact_poses(spec: str) -> bool:
+    """True for a simulated home without odometry drift."""
+    return is_simulated(spec) and "drift=" not in spec
+
+
+def _open(spec: str, up_axis: UpAxis | None, require_poses: bool) -> Source:
     if is_simulated(spec):
         # the core does not import the simulator package
         open_simulated: Callable[[str, UpAxis | None], Source] = import_module(_SIMULATOR).open_simulated
@@ -51,12 +72,12 @@ def _open(spec: str, up_axis: UpAxis | None) -> Source:
     if not folder.is_dir():
         found = "a file" if folder.is_file() else "nothing there"
         raise DatasetError(f"{spec}: expected a folder with a sequence, or sim:home; got {found}")
-    source = _open_folder(folder, up_axis)
+    source = _open_folder(folder, up_axis, require_poses)
     if source is not None:
         return source
     inside = [path for path in sorted(folder.iterdir()) if path.is_dir() and _recognised(path)]
     if len(inside) == 1:
-        source = _open_folder(inside[0], up_axis)
+        source = _open_folder(inside[0], up_axis, require_poses)
         if source is not None:
             return source
     if inside:
@@ -71,5 +92,5 @@ def _recognised(folder: Path) -> bool:
     return any(reader.recognises(folder) for reader in _READERS)
 
 
-def _open_folder(folder: Path, up_axis: UpAxis | None) -> Source | None:
-    return next((reader(folder, up_axis) for reader in _READERS if reader.recognises(folder)), None)
+def _open_folder(folder: Path, up_axis: UpAxis | None, require_poses: bool) -> Source | None:
+    return next((reader(folder, up_axis, require_poses) for reader in _READERS if reader.recognises(folder)), None)

@@ -10,6 +10,8 @@ from gausslite.domain.errors import PoseError
 from gausslite.domain.pose import require_rigid
 
 _REPAIRABLE_DEVIATION = 0.05
+FIRST_VIEW_UP = (0.0, -1.0, 0.0)
+"""Upward direction of a world that a level first view defines."""
 
 
 def is_lost(numbers: Float64[ndarray, "..."]) -> bool:

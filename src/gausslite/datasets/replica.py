@@ -12,6 +12,7 @@ from numpy import ndarray
 from gausslite.datasets.folder_source import NumberedFolderSource
 from gausslite.datasets.images import DepthUnits
 from gausslite.datasets.intrinsics import CAMERA_FILE, find_in_or_above, read_json_camera
+from gausslite.datasets.poses import FIRST_VIEW_UP
 from gausslite.datasets.text_files import parse_numbers, read_rows
 from gausslite.domain.errors import DatasetError
 from gausslite.domain.pose import UpAxis, unit_up_axis
@@ -26,7 +27,7 @@ class ReplicaSource(NumberedFolderSource):
     Times are the frame numbers at 30 Hz. Raises DatasetError, PoseError.
     """
 
-    def __init__(self, folder: Path, up_axis: UpAxis | None = None) -> None:
+    def __init__(self, folder: Path, up_axis: UpAxis | None = None, require_poses: bool = True) -> None:
         super().__init__(folder)
         self._results = folder / "results"
         paths = self._results.iterdir() if self._results.is_dir() else ()
@@ -36,14 +37,14 @@ class ReplicaSource(NumberedFolderSource):
             raise DatasetError(f"{folder}: the camera is unknown: expected {CAMERA_FILE} here or one folder above")
         self._set_camera(read_json_camera(camera_path), DepthUnits(1.0))
         trajectory = folder / "traj.txt"
-        self._pose_rows = read_rows(trajectory)
+        self._pose_rows = read_rows(trajectory) if require_poses or trajectory.is_file() else []
         last = max(self._colours)
-        if len(self._pose_rows) <= last:
+        if require_poses and len(self._pose_rows) <= last:
             raise DatasetError(
                 f"{trajectory}: expected a pose for each of frames 0 to {last}, got {len(self._pose_rows)} rows"
             )
-        self._select_frames_with_pose()
-        self._up_axis = unit_up_axis(up_axis or (0.0, 0.0, 1.0))
+        self._select_frames(require_poses)
+        self._up_axis = unit_up_axis(up_axis or ((0.0, 0.0, 1.0) if self._pose_rows else FIRST_VIEW_UP))
 
     @staticmethod
     def recognises(folder: Path) -> bool:
@@ -62,5 +63,7 @@ class ReplicaSource(NumberedFolderSource):
         return self._pose_rows[number][0]
 
     def _read_matrix(self, number: int) -> Float64[ndarray, "4 4"]:
+        if number >= len(self._pose_rows):
+            raise DatasetError(f"{self._folder}: expected a pose of frame {number} in traj.txt, got none")
         place, fields = self._pose_rows[number]
         return np.array(parse_numbers(place, fields, 16, "a 4x4 pose, row by row")).reshape(4, 4)

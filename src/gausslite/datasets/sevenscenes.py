@@ -12,7 +12,7 @@ from numpy import ndarray
 from gausslite.datasets.folder_source import NumberedFolderSource
 from gausslite.datasets.images import DepthUnits, first_readable_size
 from gausslite.datasets.intrinsics import CAMERA_FILE, INTRINSICS_FILE, FolderCamera, read_folder_camera
-from gausslite.datasets.poses import estimate_up
+from gausslite.datasets.poses import FIRST_VIEW_UP, estimate_up
 from gausslite.datasets.text_files import parse_numbers, read_rows
 from gausslite.domain.depth_registration import FileIntrinsics
 from gausslite.domain.errors import DatasetError, PoseError
@@ -23,7 +23,6 @@ _COLOUR_NAME = re.compile(r"frame-(\d{6})\.color\.(?:png|jpg)")
 _KINECT = FileIntrinsics(585.0, 585.0, 320.0, 240.0)
 _KINECT_SIZE = (640, 480)
 _UP_POSES = 64
-_LEVEL_FIRST_VIEW_UP = (0.0, -1.0, 0.0)
 
 
 class SevenScenesSource(NumberedFolderSource):
@@ -34,10 +33,10 @@ class SevenScenesSource(NumberedFolderSource):
     number, or only zeros, are excluded. Times are the frame numbers at 30 Hz. Raises DatasetError.
     """
 
-    def __init__(self, folder: Path, up_axis: UpAxis | None = None) -> None:
+    def __init__(self, folder: Path, up_axis: UpAxis | None = None, require_poses: bool = True) -> None:
         super().__init__(folder)
         self._find_colours(folder, folder.iterdir(), _COLOUR_NAME, "frame-000000.color.png or .jpg")
-        self._select_frames_with_pose()
+        self._select_frames(require_poses)
         size_px = first_readable_size(self._colours[number] for number in self._numbers)
         self._set_camera(_camera(folder, *size_px), _UNITS)
         self._up_axis = unit_up_axis(up_axis) if up_axis else self._estimate_up_axis()
@@ -81,7 +80,7 @@ class SevenScenesSource(NumberedFolderSource):
             except (DatasetError, PoseError):
                 # `frame` reports a damaged pose if it is used
                 continue
-        return estimate_up(np.array(rotations).reshape(-1, 3, 3), _LEVEL_FIRST_VIEW_UP)
+        return estimate_up(np.array(rotations).reshape(-1, 3, 3), FIRST_VIEW_UP)
 
 
 def _camera(folder: Path, width_px: int, height_px: int) -> FolderCamera:

@@ -14,7 +14,7 @@ from numpy import ndarray
 from gausslite.datasets.folder_source import FolderSource
 from gausslite.datasets.images import DepthUnits, first_readable_size, load_rgbd
 from gausslite.datasets.intrinsics import CAMERA_FILE, INTRINSICS_FILE, FolderCamera, read_folder_camera
-from gausslite.datasets.poses import is_lost, pose_from_quaternion, slerp
+from gausslite.datasets.poses import FIRST_VIEW_UP, is_lost, pose_from_quaternion, slerp
 from gausslite.datasets.source import excluded_frames_note, require_frames, require_position
 from gausslite.datasets.text_files import parse_numbers, read_rows
 from gausslite.domain.depth_registration import FileIntrinsics
@@ -25,6 +25,7 @@ from gausslite.domain.pose import UpAxis, unit_up_axis
 from gausslite.domain.trajectory import Trajectory
 
 _UNITS = DepthUnits(per_metre=5000.0)
+_POSES = "groundtruth.txt"
 _MAX_DEPTH_LAG_S = 0.020
 _MAX_POSE_GAP_S = 0.100
 _MAX_POSE_LAG_S = 0.010
@@ -59,12 +60,13 @@ class TumSource(FolderSource):
     from 0. Raises DatasetError, PoseError.
     """
 
-    def __init__(self, folder: Path, up_axis: UpAxis | None = None) -> None:
+    def __init__(self, folder: Path, up_axis: UpAxis | None = None, require_poses: bool = True) -> None:
         super().__init__(folder)
-        self._matches, self._recorded = _associate(folder)
+        self._matches, self._recorded = _associate(folder, require_poses)
         size_px = first_readable_size(match.colour for match in self._matches)
         self._set_camera(_camera(folder, *size_px), _UNITS)
-        self._up_axis = unit_up_axis(up_axis or (0.0, 0.0, 1.0))
+        has_poses = require_poses or (folder / _POSES).is_file()
+        self._up_axis = unit_up_axis(up_axis or ((0.0, 0.0, 1.0) if has_poses else FIRST_VIEW_UP))
 
     @staticmethod
     def recognises(folder: Path) -> bool:
@@ -103,15 +105,21 @@ class TumSource(FolderSource):
         return Trajectory(np.array([match.time_s for match in self._matches]), poses)
 
 
-def _associate(folder: Path) -> tuple[list[_Match], int]:
-    """Return the colour images with depth and a pose, and the number of all colour images."""
+def _associate(folder: Path, require_poses: bool) -> tuple[list[_Match], int]:
+    """Return the colour images with depth and a pose, and the number of all colour images.
+
+    Images without a pose get the identity if poses are not required.
+    """
     colour_times, colour_names = _read_stamps(folder / "rgb.txt")
     depth_times, depth_names = _read_stamps(folder / "depth.txt")
-    trajectory = _Trajectory(folder / "groundtruth.txt")
+    poses = folder / _POSES
+    trajectory = _Trajectory(poses) if require_poses or poses.is_file() else None
     matches = []
     for number, (time_s, name) in enumerate(zip(colour_times, colour_names, strict=True)):
         nearest = int(np.abs(depth_times - time_s).argmin())
-        T_world_camera = trajectory.at(float(time_s))
+        T_world_camera = None if trajectory is None else trajectory.at(float(time_s))
+        if T_world_camera is None and not require_poses:
+            T_world_camera = np.eye(4)
         if abs(depth_times[nearest] - time_s) <= _MAX_DEPTH_LAG_S and T_world_camera is not None:
             depth = folder / depth_names[nearest]
             matches.append(_Match(number, float(time_s), folder / name, depth, T_world_camera))

@@ -40,7 +40,7 @@ class FrameStream:
 
         Raises DatasetError, PoseError, InvalidInputError.
         """
-        source = open_source(settings.spec, settings.up_axis, settings.depth_registration)
+        source = open_source(settings.spec, settings.up_axis, settings.depth_registration, settings.require_poses)
         correction = settings.camera_correction
         if correction is not None and not correction.is_identity:
             source = CorrectedSource(source, correction)

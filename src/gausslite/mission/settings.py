@@ -83,6 +83,7 @@ class SourceSettings:
     spec: a folder or a simulated home; size: "WxH", None for the original size; test_every: every N-th frame is kept
     from mapping, for evaluation; depth_registration: the colour camera to register depth to, None if depth is
     registered already. camera_correction: lens, rolling shutter and time offset, None for images as recorded.
+    require_poses: False also uses frames without a pose, for tracking.
     """
 
     spec: str = field(metadata=MAY_CHANGE)
@@ -92,6 +93,7 @@ class SourceSettings:
     test_every: int | None = None
     depth_registration: DepthRegistration | None = field(default=None, metadata={"flag": "--register-depth"})
     camera_correction: CameraCorrection | None = None
+    require_poses: bool = True
 
     @property
     def is_simulated(self) -> bool:
