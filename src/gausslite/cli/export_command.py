@@ -7,12 +7,13 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from gausslite.cli.progress import progress_bar
+from gausslite.codec.keyframe_views import KeyframeView
 from gausslite.config.numbers import Number
 from gausslite.domain.errors import InvalidInputError
+from gausslite.evaluation.views import view_map
 from gausslite.export.formats import FORMATS, ExportSettings, read_map
 from gausslite.export.occupancy import OccupancySettings
-from gausslite.mission.keyframe_views import KeyframeView
-from gausslite.mission.results import as_text, prepare_folder, require_absent
+from gausslite.mission.results import as_text, prepare_folder, read_report, require_absent
 
 _MESH_VOXEL_M, _OCCUPANCY_VOXEL_M = 0.01, 0.05
 
@@ -47,7 +48,7 @@ def run(options: argparse.Namespace) -> int:
     """Read the map and write the file. Returns the exit code."""
     chosen = FORMATS[options.to]
     region = options.region or ("roi" if chosen.region_only else "all")
-    content = read_map(options.map, region)
+    content = read_map(options.map, region, read_report(options.map))
     out = options.out or _default_file(options.map, chosen.suffix)
     _require_separate(out, options.map)
     if not options.overwrite:
@@ -55,7 +56,7 @@ def run(options: argparse.Namespace) -> int:
     prepare_folder(out.absolute().parent)
     voxel_m = options.voxel or (_MESH_VOXEL_M if options.to == "mesh" else _OCCUPANCY_VOXEL_M)
     occupancy = OccupancySettings(voxel_m=voxel_m, min_opacity=options.min_opacity)
-    chosen.write(out, content, ExportSettings(occupancy, _with_progress))
+    chosen.write(out, content, ExportSettings(lambda gaussians: view_map(gaussians).render, occupancy, _with_progress))
     size = out.stat().st_size
     if options.json:
         print(as_text({"file": str(out), "format": options.to, "gaussians": len(content.chosen), "bytes": size}))

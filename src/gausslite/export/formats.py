@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -9,16 +10,15 @@ from types import MappingProxyType
 
 import numpy as np
 
+from gausslite.codec.files import write_atomic
+from gausslite.codec.keyframe_views import KeyframeView, read_keyframe_views
 from gausslite.codec.ply import read_ply, read_world_frame, write_ply
 from gausslite.domain.errors import InvalidInputError, MapFileError
 from gausslite.domain.gaussians import Gaussians
-from gausslite.evaluation.views import view_map
 from gausslite.export.mesh import write_mesh
 from gausslite.export.occupancy import OccupancySettings, write_nav2, write_octomap
 from gausslite.export.point_formats import write_las, write_pcd
 from gausslite.export.splat_formats import write_gltf, write_splat, write_spz
-from gausslite.mission.keyframe_views import KeyframeView, read_keyframe_views
-from gausslite.mission.results import read_report, write_json
 
 Progress = Callable[[Iterable[KeyframeView]], Iterable[KeyframeView]]
 
@@ -39,12 +39,13 @@ class MapContent:
 
 @dataclass(frozen=True, slots=True)
 class ExportSettings:
-    """Settings of an export.
+    """How to write a map.
 
-    occupancy: settings of OctoMap and nav2 files; its voxel size is also that of the mesh. progress: wraps the
-    iteration over rendered views, to show a progress bar.
+    renderer: returns a function that renders a map; only meshes need it. occupancy: for octomap and nav2; its voxel
+    size is also the mesh's. progress: wraps the rendered views.
     """
 
+    renderer: Callable[[Gaussians], Render]
     occupancy: OccupancySettings = field(default_factory=OccupancySettings)
     progress: Progress = iter
 
@@ -63,10 +64,11 @@ class Format:
     region_only: bool = False
 
 
-def read_map(path: Path, region: str) -> MapContent:
-    """Read a results folder or a PLY file. region: `roi` chooses the Gaussians of the task's region, `all` all.
+def read_map(path: Path, region: str, report: Mapping[str, object] = MappingProxyType({})) -> MapContent:
+    """Read a results folder or a PLY file.
 
-    Raises MapFileError; InvalidInputError if the region is asked for and the map has none.
+    region: `roi` chooses the Gaussians of the task's region, `all` all. report: the content of the results folder's
+    report.json. Raises MapFileError; InvalidInputError if the region is asked for and the map has none.
     """
     folder, file = (path, path / "map.ply") if path.is_dir() else (None, path)
     if not file.is_file():
@@ -76,28 +78,26 @@ def read_map(path: Path, region: str) -> MapContent:
     if not len(chosen) and len(gaussians):
         raise InvalidInputError(f"{path}: the map has no region of a task; export all of it with --region all")
     views = [] if folder is None else read_keyframe_views(folder)
-    return MapContent(gaussians, chosen, read_world_frame(file), views, {} if folder is None else read_report(folder))
+    return MapContent(gaussians, chosen, read_world_frame(file), views, report)
 
 
 def _objects(path: Path, content: MapContent, _settings: ExportSettings) -> None:
     """Write the objects that the mission confirmed, and the extent of the chosen Gaussians, as JSON."""
     means_m = content.chosen.means_m
     bounds = [] if not len(means_m) else np.stack([means_m.min(axis=0), means_m.max(axis=0)]).tolist()
-    write_json(
-        path,
-        {
-            "world_frame": content.world_frame,
-            "task": content.report.get("task"),
-            "objects": content.report.get("objects", []),
-            "gaussians": len(content.chosen),
-            "bounds_m": bounds,
-        },
-    )
+    content_of_map = {
+        "world_frame": content.world_frame,
+        "task": content.report.get("task"),
+        "objects": content.report.get("objects", []),
+        "gaussians": len(content.chosen),
+        "bounds_m": bounds,
+    }
+    write_atomic(path, (json.dumps(content_of_map, indent=2, ensure_ascii=False) + "\n").encode())
 
 
 def _mesh(path: Path, content: MapContent, settings: ExportSettings) -> None:
-    viewer, voxel_m = view_map(content.gaussians), settings.occupancy.voxel_m
-    write_mesh(path, content.chosen, content.views, viewer, voxel_m, settings.progress)
+    render, voxel_m = settings.renderer(content.gaussians), settings.occupancy.voxel_m
+    write_mesh(path, content.chosen, content.views, render, voxel_m, settings.progress)
 
 
 FORMATS: Mapping[str, Format] = MappingProxyType(

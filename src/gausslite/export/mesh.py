@@ -5,18 +5,19 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32
 from numpy import ndarray
 
 from gausslite.codec.files import write_atomic
+from gausslite.codec.keyframe_views import KeyframeView
+from gausslite.domain.camera import Camera
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.pose import inverse, transform_points
-from gausslite.evaluation.views import MapViewer
 from gausslite.export.packages import import_extra
-from gausslite.mission.keyframe_views import KeyframeView
 
 _TRUNCATION_VOXELS = 4.0
 _MIN_ALPHA = 0.5
@@ -24,6 +25,29 @@ _MAX_VOXELS = 1 << 23
 _BOUNDS_PERCENTILES = (0.5, 99.5)
 _VERTEX = np.dtype([("position_m", "<f4", 3), ("rgb", "u1", 3)])
 _FACE = np.dtype([("count", "u1"), ("vertices", "<i4", 3)])
+
+
+@runtime_checkable
+class RenderedView(Protocol):
+    """A rendering of the map: colours in [0, 1], opacity in [0, 1], expected depth in metres (0 where unknown)."""
+
+    @property
+    def rgb(self) -> Float32[ndarray, "h w 3"]:
+        """The colours."""
+        ...
+
+    @property
+    def alpha(self) -> Float32[ndarray, "h w"]:
+        """The opacities."""
+        ...
+
+    def expected_depth_m(self) -> Float32[ndarray, "h w"]:
+        """Return the distances along the optical axis."""
+        ...
+
+
+Render = Callable[[Camera, Float64[ndarray, "4 4"]], RenderedView]
+"""Renders the whole map from a camera pose (camera, T_world_camera)."""
 
 
 @dataclass(eq=False)
@@ -50,16 +74,18 @@ class TsdfVolume:
         indices = np.stack(np.meshgrid(*(np.arange(n) for n in self.shape), indexing="ij"), axis=-1).reshape(-1, 3)
         self._centres_m = (self.origin_m + (indices + 0.5) * self.voxel_m).astype(np.float32)
 
-    def integrate(self, view: KeyframeView, rendering_depth_m: ndarray, alpha: ndarray, rgb: ndarray) -> None:
-        """Add one rendered view. rendering_depth_m: distance along the optical axis; alpha: opacity of the pixel."""
+    def integrate(self, view: KeyframeView, rendering: RenderedView) -> None:
+        """Add one rendered view."""
         rows, pixels, depth_m = self._visible(view)
-        surface_m = rendering_depth_m[pixels]
+        surface_m = rendering.expected_depth_m()[pixels]
         signed = (surface_m - depth_m) / (_TRUNCATION_VOXELS * self.voxel_m)
-        kept = (alpha[pixels] > _MIN_ALPHA) & (surface_m > 0) & (signed > -1)
+        kept = (rendering.alpha[pixels] > _MIN_ALPHA) & (surface_m > 0) & (signed > -1)
         rows, signed = rows[kept], np.minimum(signed[kept], 1)
         new_weights = self.weights[rows] + 1
         self.distances[rows] += (signed - self.distances[rows]) / new_weights
-        self.colours[rows] += (rgb[tuple(axis[kept] for axis in pixels)] - self.colours[rows]) / new_weights[:, None]
+        self.colours[rows] += (rendering.rgb[tuple(axis[kept] for axis in pixels)] - self.colours[rows]) / new_weights[
+            :, None
+        ]
         self.weights[rows] = new_weights
 
     def _visible(self, view: KeyframeView) -> tuple[ndarray, tuple[ndarray, ndarray], ndarray]:
@@ -93,13 +119,13 @@ def write_mesh(
     path: Path,
     gaussians: Gaussians,
     views: Sequence[KeyframeView],
-    viewer: MapViewer,
+    render: Render,
     voxel_m: float,
     progress: Callable[[Iterable[KeyframeView]], Iterable[KeyframeView]] = iter,
 ) -> None:
     """Write a coloured triangle mesh of the space around the Gaussians as a binary PLY file.
 
-    views: where to render the map from; the mission's keyframes show each surface from its free side. viewer: renders
+    views: where to render the map from; the mission's keyframes show each surface from its free side. render: renders
     the whole map, because other surfaces hide parts of the region. Raises InvalidInputError without views, without a
     surface or without the scikit-image package, StorageError.
     """
@@ -108,8 +134,7 @@ def write_mesh(
         raise InvalidInputError("mesh: expected a results folder with keyframes.json and a map that is not empty")
     volume = _volume_around(gaussians, voxel_m)
     for view in progress(views):
-        rendering = viewer.render(view.camera, view.T_world_camera)
-        volume.integrate(view, rendering.expected_depth_m(), rendering.alpha, rendering.rgb)
+        volume.integrate(view, render(view.camera, view.T_world_camera))
     distances, inner = volume.distances.reshape(volume.shape), volume.inner()
     if not (inner.any() and distances[inner].min() < 0 < distances[inner].max()):
         raise InvalidInputError("mesh: expected a surface that the keyframes show, found none in the chosen Gaussians")

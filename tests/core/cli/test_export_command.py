@@ -5,7 +5,7 @@ import json
 import pytest
 
 from gausslite.cli.main import main
-from gausslite.mission.keyframe_views import read_keyframe_views
+from gausslite.codec.keyframe_views import read_keyframe_views
 
 
 @pytest.fixture(scope="module")

@@ -13,12 +13,12 @@ import pyoctomap
 import pytest
 import yaml
 
+from gausslite.codec.keyframe_views import read_keyframe_views
 from gausslite.codec.ply import SH_C0, read_ply, write_ply
 from gausslite.domain.errors import InvalidInputError, MapFileError
 from gausslite.domain.gaussians import Gaussians
 from gausslite.export.formats import FORMATS, ExportSettings, read_map
 from gausslite.export.occupancy import OccupancySettings, occupied_voxels
-from gausslite.mission.keyframe_views import read_keyframe_views
 
 COUNT = 50
 
@@ -38,11 +38,15 @@ def random_map(seed: int = 0) -> Gaussians:
     )
 
 
+def no_rendering(gaussians):
+    raise AssertionError("only meshes are rendered")
+
+
 def export(tmp_path: Path, name: str, gaussians: Gaussians, region: str = "all", voxel_m: float = 0.05) -> Path:
     source = tmp_path / "map.ply"
     write_ply(source, gaussians)
     out = tmp_path / f"out{FORMATS[name].suffix}"
-    FORMATS[name].write(out, read_map(source, region), ExportSettings(OccupancySettings(voxel_m=voxel_m)))
+    FORMATS[name].write(out, read_map(source, region), ExportSettings(no_rendering, OccupancySettings(voxel_m=voxel_m)))
     return out
 
 

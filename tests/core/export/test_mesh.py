@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
+from gausslite.codec.keyframe_views import KeyframeView
 from gausslite.domain.camera import Camera
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.gaussians import Gaussians
 from gausslite.evaluation.views import view_map
 from gausslite.export.mesh import write_mesh
-from gausslite.mission.keyframe_views import KeyframeView
 
 VOXEL_M = 0.02
 
@@ -56,7 +56,7 @@ def read_vertices(path) -> tuple[np.ndarray, int]:
 
 def test_mesh_of_a_plane(tmp_path):
     gaussians = plane()
-    write_mesh(tmp_path / "mesh.ply", gaussians, views_from_above(), view_map(gaussians), VOXEL_M)
+    write_mesh(tmp_path / "mesh.ply", gaussians, views_from_above(), view_map(gaussians).render, VOXEL_M)
     vertices, faces = read_vertices(tmp_path / "mesh.ply")
     assert faces > 500
     on_top = np.abs(vertices["position_m"][:, 2]) < VOXEL_M
@@ -70,7 +70,7 @@ def test_mesh_of_a_plane(tmp_path):
 def test_mesh_needs_views_and_a_bounded_grid(tmp_path):
     gaussians = plane()
     with pytest.raises(InvalidInputError, match=r"keyframes\.json"):
-        write_mesh(tmp_path / "m.ply", gaussians, [], view_map(gaussians), VOXEL_M)
+        write_mesh(tmp_path / "m.ply", gaussians, [], view_map(gaussians).render, VOXEL_M)
     with pytest.raises(InvalidInputError, match="--voxel"):
-        write_mesh(tmp_path / "m.ply", gaussians, views_from_above(), view_map(gaussians), 0.0004)
+        write_mesh(tmp_path / "m.ply", gaussians, views_from_above(), view_map(gaussians).render, 0.0004)
     assert not list(tmp_path.iterdir())

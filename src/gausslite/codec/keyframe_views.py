@@ -11,11 +11,10 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
+from gausslite.codec.files import write_atomic
 from gausslite.domain.camera import Camera
 from gausslite.domain.errors import GaussLiteError, MapFileError
 from gausslite.domain.pose import require_rigid
-from gausslite.mapping.keyframes import Keyframe
-from gausslite.mission.results import write_json
 
 _FILE = "keyframes.json"
 
@@ -34,19 +33,19 @@ class KeyframeView:
     roi_pixels: int
 
 
-def write_keyframe_views(folder: Path, keyframes: Sequence[Keyframe]) -> None:
+def write_keyframe_views(folder: Path, views: Sequence[KeyframeView]) -> None:
     """Write keyframes.json. Raises StorageError."""
-    views = [
+    records = [
         {
-            "index": keyframe.frame.index,
-            "capture_time_ns": keyframe.frame.capture_time_ns,
-            "camera": asdict(keyframe.frame.camera),
-            "T_world_camera": keyframe.frame.T_world_camera.tolist(),
-            "roi_pixels": int(np.count_nonzero(keyframe.relevance.roi)),
+            "index": view.index,
+            "capture_time_ns": view.capture_time_ns,
+            "camera": asdict(view.camera),
+            "T_world_camera": view.T_world_camera.tolist(),
+            "roi_pixels": view.roi_pixels,
         }
-        for keyframe in keyframes
+        for view in views
     ]
-    write_json(folder / _FILE, {"keyframes": views})
+    write_atomic(folder / _FILE, (json.dumps({"keyframes": records}, indent=1) + "\n").encode())
 
 
 def read_keyframe_views(folder: Path) -> list[KeyframeView]:
