@@ -2,6 +2,7 @@
 # Create a certificate authority, and a certificate for each name, to test encrypted services:
 #   deploy/make_certificates.sh FOLDER NAME...
 # A name is a host, a compose service or an agent's --agent-id. An existing authority in FOLDER is reused.
+# FOLDER/NAME gets ca.pem, cert.pem and key.pem: all that this service may read. Only FOLDER has the authority's key.
 set -euo pipefail
 fail() { echo "make_certificates: $1" >&2; exit 1; }
 [ $# -ge 2 ] || fail "expected FOLDER NAME..."
@@ -17,9 +18,11 @@ new_key=(-newkey ec -pkeyopt ec_paramgen_curve:prime256v1 -nodes)
 
 for name in "$@"; do
   [[ $name =~ ^[A-Za-z0-9][A-Za-z0-9._-]*$ ]] || fail "expected names of letters, digits and ._-, got '$name'"
-  openssl req "${new_key[@]}" -keyout "$folder/$name.key" -out "$folder/$name.csr" -subj "/CN=$name" 2>/dev/null
-  openssl x509 -req -in "$folder/$name.csr" -CA "$folder/ca.pem" -CAkey "$folder/ca.key" -CAcreateserial -days "$days" \
-    -extfile <(echo "subjectAltName=DNS:$name,DNS:localhost,IP:127.0.0.1") -out "$folder/$name.pem" 2>/dev/null
-  rm "$folder/$name.csr"
+  own=$folder/$name
+  mkdir -p "$own"
+  openssl req "${new_key[@]}" -keyout "$own/key.pem" -out "$own/request" -subj "/CN=$name" 2>/dev/null
+  openssl x509 -req -in "$own/request" -CA "$folder/ca.pem" -CAkey "$folder/ca.key" -CAcreateserial -days "$days" \
+    -extfile <(echo "subjectAltName=DNS:$name,DNS:localhost,IP:127.0.0.1") -out "$own/cert.pem" 2>/dev/null
+  rm "$own/request"
+  cp "$folder/ca.pem" "$own/ca.pem"
 done
-chmod 644 "$folder"/*.pem

@@ -29,6 +29,7 @@ from gausslite.wire.clients import AgentClient
 from gausslite.wire.server import Service
 from gausslite.wire.uplink import Uplink
 from gausslite_agent.agent_mission import AgentMission
+from gausslite_agent.keyframe_upload import KeyframeUpload
 from gausslite_agent.load import LoadSettings
 from gausslite_agent.mapping_worker import MappingWorker
 from gausslite_agent.servicer import AgentServicer
@@ -94,7 +95,16 @@ def agent(
     loops: list[asyncio.AbstractEventLoop] = []
     notifiers: list[ChangeNotifier] = []
     on_change = lambda: loops[0].call_soon_threadsafe(lambda: notifiers[0].notify())  # noqa: E731
-    worker = MappingWorker(SETTINGS, GRID, build_estimator, uplink, on_change, LoadSettings(queue_frames))  # type: ignore[arg-type]
+    keyframes = None if uplink is None else KeyframeUpload(uplink, GRID, 64, during_mission=False)
+    worker = MappingWorker(
+        SETTINGS,
+        GRID,
+        build_estimator,  # type: ignore[arg-type]
+        uplink,
+        on_change,
+        LoadSettings(queue_frames),
+        keyframe_upload=keyframes,
+    )
 
     mission = AgentMission(parse_arguments(["--agent-id", "robot", *options]), worker, RuleParser())
 

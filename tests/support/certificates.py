@@ -23,4 +23,4 @@ def make_certificates(folder: Path, *names: str) -> Path:
 
 def identity(folder: Path, name: str) -> Tls:
     """Return the identity of this name, which trusts the folder's authority."""
-    return Tls.read(folder / f"{name}.pem", folder / f"{name}.key", folder / "ca.pem")
+    return Tls.read(folder / name / "cert.pem", folder / name / "key.pem", folder / name / "ca.pem")

@@ -8,7 +8,7 @@ import sys
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import grpc
 import numpy as np
@@ -155,3 +155,11 @@ def frame(index: int, camera: Camera = CAMERA, T_world_camera: np.ndarray | None
         camera,
         np.eye(4) if T_world_camera is None else T_world_camera,
     )
+
+
+def red_frame(index: int) -> Frame:
+    """A view whose middle the tiny detector takes for a cup."""
+    plain = frame(index)
+    rgb = np.zeros_like(plain.rgb)
+    rgb[6:18, 8:24, 0] = 255
+    return replace(plain, rgb=rgb)

@@ -119,7 +119,7 @@ class KeyframeSelection:
             return None
         if len(self._selected) >= self._max_keyframes:
             replaced = min(self._selected, key=lambda each: self._loss(self._selected[each].coverage))
-            if gain < _EXCHANGE_FACTOR * self._loss(self._selected[replaced].coverage):
+            if gain <= _EXCHANGE_FACTOR * self._loss(self._selected[replaced].coverage):
                 return None
             self._remove(replaced)
         self._add(index, KnownKeyframe(coverage, keyframe.frame.T_world_camera))

@@ -27,7 +27,7 @@ from gausslite.wire.uplink import Uplink
 from gausslite.wire.uplink_values import UplinkSettings
 from gausslite_parser.servicer import parser_service
 
-_FILES = (("cert", "server.pem"), ("key", "server.key"), ("ca", "ca.pem"))
+_FILES = (("cert", "server/cert.pem"), ("key", "server/key.pem"), ("ca", "server/ca.pem"))
 
 
 @pytest.fixture(scope="module")
@@ -123,7 +123,7 @@ def test_each_service_listens_encrypted_and_never_prints_its_key(module: str, ce
         log = started + process.stderr.read()
         assert process.wait(30) == 0, log
     assert f"listening on {listen}, encrypted" in started
-    for line in (certs / "server.key").read_text().splitlines():
+    for line in (certs / "server/key.pem").read_text().splitlines():
         assert line not in log
 
 
@@ -134,7 +134,7 @@ def test_wrong_files_are_one_error_line_before_serving(
     run = importlib.import_module(f"{module}.program").run
     cert, key, ca = (str(certs / name) for _, name in _FILES)
     (tmp_path / "notes").write_text("remember the milk")
-    notes, other_key = str(tmp_path / "notes"), str(certs / "husky-1.key")
+    notes, other_key = str(tmp_path / "notes"), str(certs / "husky-1/key.pem")
     locked = tmp_path / "locked.key"
     lock = ["openssl", "pkcs8", "-topk8", "-in", key, "-out", str(locked), "-passout", "pass:secret-word"]
     subprocess.run(lock, check=True, timeout=60)
@@ -157,7 +157,7 @@ def test_wrong_files_are_one_error_line_before_serving(
 def test_a_key_is_in_no_representation(certs: Path, caplog: pytest.LogCaptureFixture) -> None:
     tls = identity(certs, "server")
     logging.getLogger("test").error("%s %r", tls, [tls])
-    secret = (certs / "server.key").read_text().splitlines()[1]
+    secret = (certs / "server/key.pem").read_text().splitlines()[1]
     assert secret not in caplog.text
     assert "BEGIN PRIVATE KEY" not in caplog.text
 

@@ -12,13 +12,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fusion_running import CAMERA, GRID, RunningServer, frame, fusion_server
+from fusion_running import CAMERA, GRID, RunningServer, frame, fusion_server, red_frame
 from tiny_yolo import write_tiny_yolo
 
 from gausslite.codec.ply import read_ply
 from gausslite.codec.state_file import read_state, write_state
 from gausslite.domain.errors import MapFileError, MismatchError
-from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.region import BallRegion
 from gausslite.domain.voxel_batch import VoxelBatch
@@ -69,14 +68,6 @@ def agent_run(
         worker.close()
         if uplink is not None:
             uplink.close()
-
-
-def red_frame(i: int) -> Frame:
-    """A view whose middle the tiny detector takes for a cup."""
-    plain = frame(i, CAMERA)
-    rgb = np.zeros_like(plain.rgb)
-    rgb[6:18, 8:24, 0] = 255
-    return replace(plain, rgb=rgb)
 
 
 def map_frames(worker: MappingWorker, *indices: int) -> None:

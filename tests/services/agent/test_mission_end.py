@@ -1,0 +1,209 @@
+"""A mission of streamed frames ends by EndMission or SIGTERM: drained, handed over, saved, and the next one begins."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from agent_running import TASK, agent
+from fusion_running import GRID, frame, fusion_server, red_frame
+from tiny_yolo import write_tiny_yolo
+
+from gausslite.codec.ply import read_ply
+from gausslite.domain.errors import InvalidInputError, MismatchError
+from gausslite.v1 import agent_service_pb2 as pb
+from gausslite.wire.clients import AgentClient, FusionClient
+from gausslite.wire.spool import Spool
+from gausslite.wire.uplink import Uplink
+from gausslite.wire.uplink_values import UplinkSettings
+from gausslite_agent.mission_end import EndRequest
+from gausslite_agent.mission_state import MissionState, MissionStateMachine
+
+
+@contextmanager
+def linked(address: str) -> Iterator[Uplink]:
+    link = Uplink(FusionClient(address), "robot", Spool(None, "robot", GRID), GRID, UplinkSettings(interval_s=0.0))
+    try:
+        yield link
+    finally:
+        link.close()
+
+
+def state_name(client: AgentClient) -> str:
+    return pb.AgentState.Name(client.status().state).removeprefix("AGENT_STATE_")
+
+
+def test_end_mission_drains_and_a_task_begins_the_next_mission() -> None:
+    with fusion_server() as fusion, linked(fusion.client.address) as link, agent(uplink=link, queue_frames=100) as a:
+        assert state_name(a.client) == "WAITING_FOR_TASK"
+        with pytest.raises(MismatchError, match="call AssignTask"):
+            a.client.end_mission()
+        a.client.assign_task(TASK)
+        assert state_name(a.client) == "MAPPING"
+        list(a.client.ingest([frame(index) for index in range(6)]))
+        ended = a.client.end_mission()
+        assert ended == a.client.end_mission()
+        assert ended.state == pb.AGENT_STATE_ENDED
+        assert (ended.frames_mapped, ended.voxels_waiting, ended.keyframes_waiting) == (6, 0, 0)
+        assert ended.summary.startswith("mission ended: 6 frames")
+        assert ended.summary.endswith("nothing was left")
+        with pytest.raises(MismatchError, match="expected a mission that is mapping, got one that is ended"):
+            list(a.client.ingest([frame(6)]))
+        a.client.assign_task("Find the chair")
+        [answer] = a.client.ingest([frame(7)])
+        assert answer.outcome == pb.FRAME_OUTCOME_MAPPED
+        assert state_name(a.client) == "MAPPING"
+        again = a.client.end_mission()
+    assert again.frames_mapped == 7
+
+
+def test_a_handover_on_request_brings_the_whole_map_and_the_keyframes() -> None:
+    with fusion_server() as fusion, linked(fusion.client.address) as link, agent(uplink=link, queue_frames=100) as a:
+        a.client.assign_task(TASK)
+        list(a.client.ingest([frame(index) for index in range(6)]))
+        response = a.client.end_mission(handover=True)
+        [stored] = fusion.client.status().agents
+        kept = a.worker.run(lambda mapper: mapper.keyframes()).result(20)
+    assert stored.gaussians == response.gaussians
+    assert stored.handover_bytes > 0
+    assert stored.keyframes == len(kept) > 0
+
+
+def test_an_unreachable_server_leaves_data_and_the_summary_says_how_much() -> None:
+    with linked("127.0.0.1:1") as link, agent(uplink=link, queue_frames=100) as a:
+        a.client.assign_task(TASK)
+        list(a.client.ingest([frame(0)]))
+        response = a.client.end_mission(handover=True, drain_s=0.1)
+    assert response.state == pb.AGENT_STATE_ENDED
+    assert response.voxels_waiting > 0
+    assert f"left {response.voxels_waiting} voxels and 0 keyframes, lost when the agent ends" in response.summary
+
+
+@pytest.mark.parametrize("drain_s", [-1.0, float("nan"), 1e9])
+def test_an_impossible_drain_time_is_refused(drain_s: float) -> None:
+    with pytest.raises(InvalidInputError, match="drain_seconds"):
+        EndRequest(False, drain_s)
+
+
+def test_two_callers_get_the_result_of_one_end() -> None:
+    answers: list[pb.EndMissionResponse] = []
+    with fusion_server() as fusion, linked(fusion.client.address) as link, agent(uplink=link, queue_frames=100) as a:
+        a.client.assign_task(TASK)
+        list(a.client.ingest([frame(0)]))
+        threads = [threading.Thread(target=lambda: answers.append(a.client.end_mission())) for _ in range(2)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join(30)
+    assert len(answers) == 2
+    assert answers[0] == answers[1]
+
+
+def test_a_phase_that_cannot_follow_is_refused() -> None:
+    phases = MissionStateMachine()
+    with pytest.raises(MismatchError, match="waiting for task, got ended"):
+        phases.enter(MissionState.ENDED)
+    phases.enter(MissionState.MAPPING)
+    phases.enter(MissionState.FAILED, "the disk is full")
+    assert phases.failure == "the disk is full"
+    phases.enter(MissionState.MAPPING)
+    assert phases.failure == ""
+
+
+@contextmanager
+def agent_process(folder: Path, fusion: str, *more: str) -> Iterator[tuple[subprocess.Popen[str], AgentClient]]:
+    """Start an agent whose detector finds a cup in every frame."""
+    model = write_tiny_yolo(folder / "tiny.onnx", ["cup"], [(32, 32, 20, 20, 0, 0.9)])
+    address = f"unix:{folder}/agent.sock"
+    command = [sys.executable, "-m", "gausslite_agent", "--listen", address, "--threads", "1", "--agent-id", "robot"]
+    command += ["--detector", str(model), "--max-gaussians", "2000", "--iterations", "1", "--queue", "100"]
+    command += ["--fusion", fusion, *more]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stderr is not None
+        try:
+            assert "listening on" in process.stderr.readline()
+            with AgentClient(address) as client:
+                yield process, client
+        finally:
+            process.kill()
+
+
+def test_sigterm_hands_over_within_the_grace_period(tmp_path: Path) -> None:
+    options = ("--handover", "--grace-period", "60", "--uplink-interval", "0", "--out", str(tmp_path))
+    with fusion_server() as fusion:
+        with agent_process(tmp_path, fusion.client.address, *options) as (process, client):
+            client.assign_task("Pick up the cup")
+            list(client.ingest([red_frame(index) for index in range(12)]))
+            process.send_signal(signal.SIGTERM)
+            assert process.stderr is not None
+            log = process.stderr.read()
+            assert process.wait(60) == 0
+        [stored] = fusion.client.status().agents
+    assert "mission ended early (interrupted): 12 frames" in log
+    assert "nothing was left" in log
+    assert stored.gaussians == len(read_ply(tmp_path / "map.ply")) > 0
+    assert stored.handover_bytes > 0
+    assert stored.keyframes == 3
+
+
+def test_what_sigterm_leaves_is_sent_after_the_next_start(tmp_path: Path) -> None:
+    options = ("--spool", str(tmp_path / "x.spool"), "--state", str(tmp_path / "x.state"), "--handover")
+    with agent_process(tmp_path, "127.0.0.1:1", *options, "--grace-period", "0.1") as (process, client):
+        client.assign_task("Pick up the cup")
+        list(client.ingest([red_frame(index) for index in range(6)]))
+        process.send_signal(signal.SIGTERM)
+        assert process.stderr is not None
+        log = process.stderr.read()
+        assert process.wait(60) == 0
+    assert "and 2 keyframes, in " in log
+    assert "until the agent runs again" in log
+    with fusion_server() as fusion:
+        with agent_process(tmp_path, fusion.client.address, *options) as (_, client):
+            ended = client.end_mission()
+        [stored] = fusion.client.status().agents
+    assert (ended.voxels_waiting, ended.keyframes_waiting) == (0, 0)
+    assert stored.keyframes == 2
+    assert stored.gaussians == ended.gaussians
+
+
+def test_a_killed_agent_continues_from_its_last_save(tmp_path: Path) -> None:
+    state = tmp_path / "x.state"
+    options = ("--spool", str(tmp_path / "x.spool"), "--state", str(state), "--save-interval", "0.05")
+    with fusion_server() as fusion:
+        with agent_process(tmp_path, fusion.client.address, *options) as (process, client):
+            client.assign_task("Pick up the cup")
+            for index in range(1000):
+                list(client.ingest([red_frame(index)]))
+                if state.exists():
+                    break
+            mapped = client.status().map_revision
+            process.kill()
+        with agent_process(tmp_path, fusion.client.address, *options) as (_, client):
+            status = client.status()
+            assert status.graph.text == "Pick up the cup"
+            assert state_name(client) == "MAPPING"
+            assert status.gaussians > 0
+            assert status.map_revision > mapped
+            [answer] = client.ingest([red_frame(2000)])
+    assert answer.outcome == pb.FRAME_OUTCOME_MAPPED
+
+
+def test_an_agent_without_a_detector_says_so_at_the_start_and_to_assign_task(tmp_path: Path) -> None:
+    address = f"unix:{tmp_path}/agent.sock"
+    command = [sys.executable, "-m", "gausslite_agent", "--listen", address, "--threads", "1"]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stderr is not None
+        lines = [process.stderr.readline() for _ in range(2)]
+        with AgentClient(address) as client:
+            with pytest.raises(MismatchError, match="--detector"):
+                client.assign_task(TASK)
+            assert any("--detector" in note for note in client.status().notes)
+        process.terminate()
+        assert process.wait(30) == 0
+    assert any("every AssignTask will fail" in line and "--detector" in line for line in lines)
