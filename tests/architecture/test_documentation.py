@@ -20,7 +20,18 @@ PROGRAMS = {
     "gausslite-parser": "gausslite_parser",
 }
 SUB_COMMANDS = ("map", "demo", "parse", "eval", "fuse")
-BENCHMARKS = ("raster", "loop", "gpu", "parser", "perception", "quality", "ablation", "task-change", "registration")
+BENCHMARKS = (
+    "raster",
+    "loop",
+    "gpu",
+    "parser",
+    "perception",
+    "quality",
+    "ablation",
+    "budget",
+    "task-change",
+    "registration",
+)
 
 
 def pages() -> list[Path]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable
 
+from gausslite_bench.cli.budget import configure_budget
 from gausslite_bench.cli.gpu import configure_gpu
 from gausslite_bench.cli.loop import configure_loop
 from gausslite_bench.cli.parser import configure_parser
@@ -54,6 +55,12 @@ _BENCHMARKS: dict[str, tuple[Callable[[argparse.ArgumentParser], None], str, str
         "map quality with the paper's components enabled one by one",
         "Map scenes while enabling the components of the method one after the other, and score the maps on held-out "
         "views.",
+    ),
+    "budget": (
+        configure_budget,
+        "gain of the task policy against Gaussians, image size and iterations",
+        "Map scenes with the task policy and with uniform mapping at several budgets. The table, and with the extra "
+        "plots a figure, show the gain in the region and over the full image.",
     ),
     "task-change": (
         configure_task_change,

@@ -10,11 +10,13 @@ from pathlib import Path
 
 import numpy as np
 
+from gausslite.datasets.corrected_source import CorrectedSource
 from gausslite.datasets.held_out import HeldOutSplit
 from gausslite.datasets.intrinsics import CAMERA_FILE, INTRINSICS_FILE, find_in_or_above
 from gausslite.datasets.open import open_source
 from gausslite.datasets.regions import balls_for_small_objects, choose_regions, load_voxel_regions
 from gausslite.datasets.source import Source
+from gausslite.domain.camera_correction import CameraCorrection
 from gausslite.domain.depth_registration import DepthRegistration
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.object_names import head_of
@@ -44,6 +46,7 @@ class RealScenePlan:
     frames: int | None = None
     up_axis: UpAxis | None = None
     depth_registration: DepthRegistration | None = None
+    camera_correction: CameraCorrection | None = None
     pose_policy: PosePolicy = REAL_CAMERA
     split: HeldOutSplit = field(default_factory=HeldOutSplit)
 
@@ -85,12 +88,15 @@ class RealScenePlan:
             "up": self.up_axis,
             "test_every": self.split.every,
             "depth_registration": None if self.depth_registration is None else str(self.depth_registration),
+            **({} if self.camera_correction is None else {"camera_correction": str(self.camera_correction)}),
             **files,
         }
 
     def load(self, size: tuple[int, int]) -> Scene:
         """Return the scene of the frames with depth. Raises UnseenRegionError, DatasetError, InvalidInputError."""
         source = open_source(str(self.folder), self.up_axis, self.depth_registration)
+        if self.camera_correction is not None:
+            source = CorrectedSource(source, self.camera_correction)
         all_regions = balls_for_small_objects(load_voxel_regions(self.roi))
         regions = choose_regions(all_regions, self.objects)
         training, held_out = self.split.split(self._positions(source))

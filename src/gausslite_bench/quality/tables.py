@@ -88,6 +88,11 @@ class StudyResults:
         self.budgets = list(dict.fromkeys(trial.budget for trial in trials))
 
     @property
+    def finished(self) -> list[FinishedTrial]:
+        """All trials of the study."""
+        return list(self._finished)
+
+    @property
     def has_fitted(self) -> bool:
         """True if a trial has scores with fitted views."""
         return any(each.result.fitted is not None for each in self._finished)

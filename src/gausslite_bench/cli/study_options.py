@@ -1,0 +1,123 @@
+"""Options of the quality studies, and the scenes that they select."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from gausslite.cli.source_options import correct_with_warnings, open_with_warnings
+from gausslite.config.mapping_options import add_pose_prior
+from gausslite.config.source_options import add_camera_correction, add_register_depth
+from gausslite.config.switches import add_switch
+from gausslite.config.values import AUTO, NONE, read_names, read_up_axis
+from gausslite.datasets.regions import REGIONS_FILE
+from gausslite.datasets.selection import downscaled_size
+from gausslite.domain.errors import InvalidInputError
+from gausslite_bench.cli.argument_types import read_seeds
+from gausslite_bench.quality.home_scenes import HomeScenePlan
+from gausslite_bench.quality.home_tasks import HomeTask, choose_home_tasks
+from gausslite_bench.quality.real_scenes import REAL_CAMERA, RealScenePlan, choose_kinds, real_plans
+from gausslite_bench.quality.scenes import PosePolicy, ScenePlan
+
+_HOME_FRAMES = 60
+_HOME_SIZE = (320, 240)
+
+
+def add_study_options(parser: argparse.ArgumentParser, default_seeds: tuple[int, ...]) -> None:
+    """Add the output folder, the seeds, the frames and their poses, and the options of a real sequence."""
+    add = parser.add_argument
+    add("--out", metavar="DIR", type=Path, required=True, help="folder for tables, sheets and cached trials")
+    add_switch(parser, "--reuse-other-code", "also reuse cached trials from other code (default: compute them again)")
+    seeds = ",".join(str(seed) for seed in default_seeds)
+    add("--seeds", metavar="N,...", type=read_seeds, default=default_seeds, help=f"mapping seeds (default: {seeds})")
+    add(
+        "--frames",
+        metavar="N",
+        type=int,
+        help=f"training frames (default: {_HOME_FRAMES} per home, all of a real sequence)",
+    )
+    add("--views", metavar="N", type=int, default=24, help="held-out views per home (default: %(default)s)")
+    add("--threads", metavar="N", type=int, help="threads (default: all available cores)")
+    add(
+        "--lpips-weights",
+        metavar="PATH",
+        type=Path,
+        action="append",
+        default=[],
+        help="weights of AlexNet and LPIPS; repeatable (default: LPIPS is not computed)",
+    )
+    add_pose_prior(parser, None, f"homes none, real {REAL_CAMERA.pose_prior}", allow_auto=False)
+    add(
+        "--fit-views",
+        action=argparse.BooleanOptionalAction,
+        help="also score with each view's pose and exposure fitted (default: real sequences only)",
+    )
+    _add_real_sequence_options(parser)
+
+
+def _add_real_sequence_options(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group("real sequence")
+    add = group.add_argument
+    add("--real", metavar="FOLDER", type=Path, help="measure on this sequence; on homes too if they are named")
+    add(
+        "--roi",
+        metavar="FILE.npz",
+        type=Path,
+        help=f"its regions; one task per kind of object (default: FOLDER/{REGIONS_FILE})",
+    )
+    add("--kinds", metavar="A,B", type=read_names, default=(), help="kinds of objects such as mug,chair (default: all)")
+    add("--up", metavar="X,Y,Z", type=read_up_axis, help="the world's upward direction (default: the source's)")
+    add_register_depth(group, allow_auto=True, default_text=AUTO)
+    add_camera_correction(group, allow_auto=True, default_text=NONE)
+
+
+def scene_plans(
+    options: argparse.Namespace, task_names: Sequence[str], default_names: Sequence[str]
+) -> tuple[list[ScenePlan], tuple[int, int]]:
+    """Return the scenes and a default image size: home tasks, a real sequence, or both.
+
+    task_names: homes or home-task pairs; default_names replaces an empty list if there is no real sequence. Raises
+    InvalidInputError, DatasetError.
+    """
+    real = _real_plans(options)
+    if real is None:
+        return [*_home_plans(options, choose_home_tasks(task_names or default_names))], _HOME_SIZE
+    plans, size = real
+    return [*(_home_plans(options, choose_home_tasks(task_names)) if task_names else ()), *plans], size
+
+
+def _home_plans(options: argparse.Namespace, tasks: Sequence[HomeTask]) -> list[HomeScenePlan]:
+    frames = _HOME_FRAMES if options.frames is None else options.frames
+    pose_policy = _pose_policy(options, PosePolicy())
+    return [HomeScenePlan(task, frames, options.views, pose_policy=pose_policy) for task in tasks]
+
+
+def _real_plans(options: argparse.Namespace) -> tuple[list[RealScenePlan], tuple[int, int]] | None:
+    """Return the plans of the real sequence and an image size with its aspect ratio; None without --real."""
+    if options.real is None:
+        for name in ("roi", "kinds"):
+            if getattr(options, name):
+                raise InvalidInputError(f"--{name}: expected a real sequence, --real FOLDER; got none")
+        return None
+    roi = options.roi or options.real / REGIONS_FILE
+    if options.roi is None and not roi.is_file():
+        raise InvalidInputError(
+            f"--real: expected a folder and its regions, --real FOLDER --roi FILE.npz; got none, and no {roi}"
+        )
+    # check the options before the registration is estimated from the images
+    plans = real_plans(options.real, roi, options.frames, options.up, pose_policy=_pose_policy(options, REAL_CAMERA))
+    chosen = choose_kinds(plans, options.kinds)
+    spec = str(options.real)
+    registered, registration = open_with_warnings(spec, options.up, options.register_depth, AUTO)
+    source, correction = correct_with_warnings(spec, registered, options.camera_correction, NONE)
+    plans = [replace(plan, depth_registration=registration, camera_correction=correction) for plan in chosen]
+    return plans, downscaled_size(source.camera)
+
+
+def _pose_policy(options: argparse.Namespace, default: PosePolicy) -> PosePolicy:
+    return PosePolicy(
+        default.pose_prior if options.pose_prior is None else options.pose_prior,
+        default.fit_views if options.fit_views is None else options.fit_views,
+    )
