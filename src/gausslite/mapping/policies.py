@@ -8,6 +8,7 @@ from dataclasses import replace
 
 from gausslite.domain.errors import InvalidInputError
 from gausslite.mapping.baselines import gaussian_slam_policy, monogs_policy, splatam_policy, uniform_policy
+from gausslite.mapping.saturation import SaturationSettings
 from gausslite.mapping.settings import (
     ActivePhase,
     KeyframeSettings,
@@ -52,6 +53,7 @@ def paper_policy() -> MapperSettings:
             decay_after_updates=math.inf,
             ema_updates=0.0,
         ),
+        saturation=SaturationSettings(max_released=0.0),
         density=DensitySettings(max_growth=1.0),
     )
 
@@ -107,12 +109,17 @@ def _without_lr_decay(settings: MapperSettings) -> MapperSettings:
     return replace(settings, optimization=replace(settings.optimization, decay_after_updates=math.inf))
 
 
+def _without_saturation(settings: MapperSettings) -> MapperSettings:
+    return replace(settings, saturation=replace(settings.saturation, max_released=0.0))
+
+
 EXTENSION_FLAGS: dict[str, Callable[[MapperSettings], MapperSettings]] = {
     "long-term-keyframes": _without_long_term_keyframes,
     "roi-context": _without_roi_context,
     "background-reserve": _without_background_reserve,
     "ema": _without_ema,
     "lr-decay": _without_lr_decay,
+    "saturation": _without_saturation,
 }
 """Extensions of the paper's method that can be disabled, in the order of the ablation in docs/quality.md."""
 

@@ -10,8 +10,9 @@ import numpy as np
 from jaxtyping import Bool, Float32, UInt32
 from numpy import ndarray
 
-from gausslite.domain.state import State, get_counts, int_array
+from gausslite.domain.state import State, add_prefix, get_counts, int_array, select_prefix
 from gausslite.mapping.keyframes import WindowView
+from gausslite.mapping.saturation import RegionSaturation
 from gausslite.mapping.settings import ActivePhase, MapperSettings
 from gausslite.mapping.stages import CountedScheduler, Stage, StageScheduler
 from gausslite.optimize.density import densify, prune
@@ -56,6 +57,7 @@ class Trainer:
         self._table = table
         self._rasterizer = rasterizer
         self._rng = rng
+        self._saturation = RegionSaturation(settings.saturation)
         self._iterations = 0
         self._since_prune = 0
         self._since_densify = 0
@@ -66,18 +68,25 @@ class Trainer:
         return self._iterations
 
     def state(self) -> State:
-        """Return the iteration counts, which are all the state between two frames."""
-        return {"counts": int_array(self._iterations, self._since_prune, self._since_densify)}
+        """Return the iteration counts and the measured saturation, which are all the state between two frames."""
+        counts = int_array(self._iterations, self._since_prune, self._since_densify)
+        return {"counts": counts, **add_prefix("saturation", self._saturation.state())}
 
     def restore(self, state: State) -> None:
-        """Replace the iteration counts by another trainer's. Raises MapFileError."""
+        """Continue from another trainer's state. Raises MapFileError."""
         self._iterations, self._since_prune, self._since_densify = get_counts(state, "counts", 3)
+        self._saturation.restore(select_prefix(state, "saturation"))
+
+    def reset_roi(self) -> None:
+        """Forget how far the region has been trained: a new task has another region."""
+        self._saturation.reset()
 
     def train(self, views: Sequence[WindowView], extent_m: float, scheduler: StageScheduler) -> int:
         """Train on these views while the scheduler allows, and return the number of iterations.
 
-        Warm-up and active iterations alternate in the ratio of the settings, warm-up first. If the frame has no time
-        for another warm-up iteration, active iterations replace it.
+        Warm-up and active iterations alternate in the ratio of the settings, warm-up first. Warm-up iterations replace
+        the active ones that a saturated region releases. If the frame has no time for another warm-up iteration, active
+        iterations replace it.
         """
         roi_views = self._roi_views(views)
         done, frame_is_done = 0, False
@@ -117,6 +126,7 @@ class Trainer:
         optimization = self._settings.optimization
         per_frame = optimization.iterations
         warm_up = not roi_in_view or done % per_frame < optimization.warmup_iterations
+        warm_up = warm_up or self._saturation.releases_next()
         if roi_in_view and done > 0:
             warm_up = warm_up and scheduler.has_time_for(Stage.WARM_UP)
         if warm_up and scheduler.trains_on(Stage.WARM_UP, per_frame):
@@ -157,7 +167,7 @@ class Trainer:
         self._rasterizer.step(*binding.tables, view.training_view, view.T_camera_world, loss, self._adam)
 
     def _train_roi(self, binding: _Binding, view: WindowView) -> None:
-        self._rasterizer.step(
+        report = self._rasterizer.step(
             *binding.tables,
             view.training_view,
             view.T_camera_world,
@@ -168,6 +178,8 @@ class Trainer:
             trainable=binding.trainable,
             update_counter=binding.kappa_counter,
         )
+        if self._saturation.enabled:
+            self._saturation.observe(view.keyframe.as_recorded, report.loss)
 
     def _update_ema(self) -> None:
         if self._settings.optimization.ema_updates > 0:
