@@ -8,6 +8,7 @@ from enum import StrEnum
 
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.pose_exposure_prior import PoseExposurePrior
+from gausslite.mapping.saturation import SaturationSettings
 from gausslite.mapping.task_change import TaskChangeSettings
 from gausslite.optimize.density import DensitySettings
 from gausslite.optimize.rates import ONLINE_RATES
@@ -202,6 +203,7 @@ class MapperSettings:
     seeding: SeedingSettings = field(default_factory=SeedingSettings)
     keyframes: KeyframeSettings = field(default_factory=KeyframeSettings)
     optimization: OptimizationSettings = field(default_factory=OptimizationSettings)
+    saturation: SaturationSettings = field(default_factory=SaturationSettings)
     density: DensitySettings = field(default_factory=DensitySettings)
     task_change: TaskChangeSettings = field(default_factory=TaskChangeSettings)
     pose_prior: PoseExposurePrior = field(default_factory=PoseExposurePrior)
