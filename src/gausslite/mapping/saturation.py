@@ -35,7 +35,7 @@ class SaturationSettings:
     iteration is released, and at and below which max_released is. Between them the share changes linearly.
     """
 
-    max_released: float = 0.0
+    max_released: float = 0.75
     improving: float = 0.12
     saturated: float = 0.04
 

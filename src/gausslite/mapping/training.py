@@ -53,7 +53,7 @@ class Trainer:
         self, settings: MapperSettings, table: SplatTable, rasterizer: Rasterizer, rng: np.random.Generator
     ) -> None:
         self._settings = settings
-        self._adam = settings.adam
+        self._adam, self._loss = settings.adam, settings.loss
         self._table = table
         self._rasterizer = rasterizer
         self._rng = rng
@@ -163,15 +163,14 @@ class Trainer:
         self._since_densify += 1
 
     def _train_full_image(self, binding: _Binding, view: WindowView) -> None:
-        loss = self._settings.optimization.loss
-        self._rasterizer.step(*binding.tables, view.training_view, view.T_camera_world, loss, self._adam)
+        self._rasterizer.step(*binding.tables, view.training_view, view.T_camera_world, self._loss, self._adam)
 
     def _train_roi(self, binding: _Binding, view: WindowView) -> None:
         report = self._rasterizer.step(
             *binding.tables,
             view.training_view,
             view.T_camera_world,
-            self._settings.optimization.loss,
+            self._loss,
             self._adam,
             masked=True,
             subset=view.roi if binding.active_ids is None else Subset(view.roi.tiles, binding.active_ids),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from contextlib import AbstractContextManager
 
 import numpy as np
 import pytest
@@ -100,7 +101,7 @@ class CountingScheduler(CountedScheduler):
         super().__init__()
         self._counts = counts
 
-    def timing(self, stage: Stage):  # noqa: ANN201
+    def timing(self, stage: Stage) -> AbstractContextManager[None]:
         self._counts[stage] = self._counts.get(stage, 0) + 1
         return super().timing(stage)
 
