@@ -22,7 +22,7 @@ _NO_DENSIFICATION = DensitySettings(min_mean_gradient=math.inf)
 
 def uniform_policy() -> MapperSettings:
     """Return uniform seeding and full-image training with this engine's density control."""
-    return MapperSettings(components=_NO_TASK)
+    return MapperSettings(components=_NO_TASK, optimization=OptimizationSettings(real_depth_share=1.0))
 
 
 def gaussian_slam_policy() -> MapperSettings:

@@ -108,7 +108,7 @@ def test_the_depth_term_is_lighter_where_poses_may_be_wrong() -> None:
     assert exact.loss == exact.optimization.loss
     assert real.loss == replace(exact.loss, depth=0.1 * exact.loss.depth)
     assert disable(real, ["light-depth"]).loss == exact.loss
-    for name in ("gaussian-slam", "splatam", "monogs"):  # their released weights
+    for name in BASELINES:
         released = replace(policy(name), pose_prior=real.pose_prior)
         assert released.loss == released.optimization.loss
 
