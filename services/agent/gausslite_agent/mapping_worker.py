@@ -17,13 +17,14 @@ from typing import TypeVar
 
 from gausslite.domain.errors import InvalidInputError, MismatchError, StorageError, UnavailableError
 from gausslite.domain.frame import Frame
+from gausslite.domain.objects import ObjectLandmark, ObjectReport
 from gausslite.domain.task import TaskGraph
 from gausslite.domain.voxel_batch import VoxelBatch
 from gausslite.domain.voxel_operations import group_by_voxel
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.sent_voxels import SentVoxelTracker
-from gausslite.mission.build import EstimatorBuilder, build_mapper
+from gausslite.mission.build import EstimatorBuilder, build_mapper, build_tracker
 from gausslite.mission.checkpoint import ResumeConfig, save_run
 from gausslite.mission.frame_scheduler import Clock, FrameScheduler
 from gausslite.mission.settings import MissionSettings
@@ -173,11 +174,13 @@ class MappingWorker:
                 self._sent_voxels if self.uplink is not None else None,
                 FrameScheduler(self._settings.scheduler_settings, self._clock),
                 self._publish,
+                build_tracker(self._settings, self._mapper),
             )
         elif current is None or not graph.is_equivalent_to(current):
             self._task_mapper.assign(self._build_estimator(graph))
         self._status.update(graph=graph)
         self._update_notes(self._task_mapper.notes)
+        self._update_objects(self._task_mapper.objects)
 
     def _restore(self, saved: SavedMission) -> None:
         checkpoint = saved.checkpoint
@@ -221,6 +224,7 @@ class MappingWorker:
         outcome = self._task_mapper.process(frame, self._clock() - queued.arrival_s)
         self._last_index = frame.index
         self._update_notes(self._task_mapper.notes)
+        self._update_objects(self._task_mapper.objects)
         if outcome.skipped is not None:
             return self._count(FrameReport(frame.index, Outcome.SKIPPED, outcome.skipped, gaussians=outcome.gaussians))
         if outcome.changed_roi is not None:
@@ -237,6 +241,7 @@ class MappingWorker:
         if self._keyframe_upload is not None:
             self._keyframe_upload.offer_newest(self._mapper.keyframes())
         self._status.add_outcome(outcome)
+        self._status.update(correction=self._mapper.poses.latest(), corrected_at_s=time.monotonic())
         self._count(report)
         self._on_change()
         return report
@@ -246,6 +251,13 @@ class MappingWorker:
         for note in set(notes) - set(self.status().notes):
             _log.warning("%s", note)
         self._status.update(notes=notes)
+
+    def _update_objects(self, objects: tuple[ObjectLandmark, ...]) -> None:
+        """Store the confirmed objects, and report them with the task to the fusion server."""
+        self._status.update(objects=objects)
+        graph = self.status().graph
+        if self.uplink is not None and graph is not None:
+            self.uplink.report_objects(ObjectReport(graph, objects))
 
     def _offer_all_keyframes(self, mapper: GaussianMapper) -> None:
         if self._keyframe_upload is not None:

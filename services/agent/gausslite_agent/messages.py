@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import time
+
 import numpy as np
 from jaxtyping import Float32
 from numpy import ndarray
 
 from gausslite.domain.camera import Camera
 from gausslite.v1 import agent_service_pb2 as pb
-from gausslite.wire.convert import graph_to_message
+from gausslite.wire.convert import transform_to_message
+from gausslite.wire.convert_objects import object_to_message
+from gausslite.wire.convert_task import graph_to_message
 from gausslite.wire.images import encode_colour, encode_depth
 from gausslite.wire.uplink_values import UplinkCounters
 from gausslite_agent.agent_mission import AgentMission
@@ -89,7 +93,22 @@ def status_to_message(
         ),
         age_p50_seconds=status.age_s(50),
         age_p99_seconds=status.age_s(99),
+        map_to_odom=_correction_to_message(status),
+        objects=[object_to_message(each) for each in status.objects],
         notes=(*mission.notes, *status.notes, *status.task_notes, *status.load_notes),
+    )
+
+
+def _correction_to_message(status: WorkerStatus) -> pb.MapToOdometry | None:
+    correction = status.correction
+    if correction is None:
+        return None
+    return pb.MapToOdometry(
+        t_map_odometry=transform_to_message(correction.T_map_odometry),
+        capture_time_ns=correction.capture_time_ns,
+        age_seconds=time.monotonic() - status.corrected_at_s,
+        translation_std_m=correction.translation_std_m,
+        rotation_std_deg=correction.rotation_std_deg,
     )
 
 

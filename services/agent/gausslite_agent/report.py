@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from gausslite.codec.object_report import object_as_json
 from gausslite.domain.gaussians import Gaussians
 from gausslite.mission.results import peak_rss_mib
 from gausslite.wire.uplink_values import UplinkCounters
@@ -49,5 +50,6 @@ def mission_report(
         "uplink_stopped_because": uplink.stopped_because,
         "map_shared_percent": 100.0 * active / max(len(gaussians), 1) if is_sent else 0.0,
         "peak_rss_mib": peak_rss_mib(),
+        "objects": [object_as_json(each) for each in status.objects],
         "notes": [*status.notes, *status.task_notes, *status.load_notes],
     }

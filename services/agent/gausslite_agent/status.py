@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from gausslite.domain.objects import ObjectLandmark
+from gausslite.domain.pose_correction import PoseCorrection
 from gausslite.domain.task import TaskGraph
 from gausslite.mapping.stages import SkippableStage
 from gausslite.mission.task_mapper import FrameOutcome
@@ -49,7 +51,9 @@ class WorkerStatus:
     busy_s: time of perception and mapping. under_trained, publishing_skipped, seeding_skipped: frames whose time was
     too short for all of it. max_detection_lag: longest delay of a detection, in frames. keyframes_reevaluated:
     keyframes evaluated for a new task. publish_error: why the uplink refused the newest changes. ages_s: ages of the
-    latest mapped frames. notes: messages of the relevance estimator.
+    latest mapped frames. correction: the odometry's latest correction, mapped at corrected_at_s of the monotonic clock.
+    notes: messages of the relevance estimator. objects: the confirmed
+    objects of the task.
     """
 
     graph: TaskGraph | None = None
@@ -71,6 +75,9 @@ class WorkerStatus:
     publish_error: str = ""
     ages_s: tuple[float, ...] = ()
     notes: tuple[str, ...] = ()
+    correction: PoseCorrection | None = None
+    corrected_at_s: float = 0.0
+    objects: tuple[ObjectLandmark, ...] = ()
 
     @property
     def task_notes(self) -> tuple[str, ...]:

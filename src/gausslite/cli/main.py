@@ -19,12 +19,14 @@ _COMMANDS = {
     "demo": "run a task parser, a fusion server and two agents as processes; fuse and score their maps",
     "parse": "parse a task sentence into targets, anchors and relations",
     "eval": "score a map on frames of a sequence, in the region of interest (ROI) and over whole images",
+    "calibrate": "estimate the camera of a recording: depth registration, lens, rolling shutter, times, pose errors",
     "fuse": "fuse map files into one by a vote in every voxel",
     "export": "write a map for other tools: splat viewers, point clouds, planners, meshes",
     "status": "print the state of a running agent or fusion server",
     "end": "end the mission of a running agent: send what waits, hand over, save",
     "refine": "refine the fused map of a running team",
     "fetch": "download the fused map of a running team",
+    "objects": "print where the objects of a task are, from a fusion server or from the report of a run",
     "models": "list, download, verify and inspect model files for detection and segmentation",
     "bench": "measure the rasterizer, the mapping loop, the GPU, map quality or a task parser",
 }
@@ -89,7 +91,7 @@ def _parse(
         return parser.parse_args(arguments)
     from gausslite.config.layers import parse_options
 
-    return parse_options(commands[arguments[0]], arguments[1:])
+    return parse_options(commands[arguments[0]], arguments[1:], warn=print_message)
 
 
 def _fail(message: str) -> int:

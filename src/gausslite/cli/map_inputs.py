@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from gausslite.cli.parse_command import as_json
 from gausslite.cli.source_options import (
     correct_with_warnings,
     open_recorded,
@@ -15,6 +14,7 @@ from gausslite.cli.source_options import (
     resolve_pose_prior,
     selected_regions,
 )
+from gausslite.codec.task_json import graph_as_json
 from gausslite.config.mapping_options import mission_settings, perception_settings
 from gausslite.config.values import AUTO, NONE
 from gausslite.datasets.selection import frame_step
@@ -155,8 +155,10 @@ class MapInputs:
             "colour_camera": None if registration is None else str(registration),
             "camera_correction": None if correction is None else str(correction),
             "view_error": None if prior.is_exact else str(prior),
-            "task": None if first is None else {"text": first.text, **as_json(first)},
-            "then": [{"frame": frame, "text": graph.text, **as_json(graph)} for frame, graph in self.schedule.switches],
+            "task": None if first is None else {"text": first.text, **graph_as_json(first)},
+            "then": [
+                {"frame": frame, "text": graph.text, **graph_as_json(graph)} for frame, graph in self.schedule.switches
+            ],
             "poses": str(self.mission.poses),
             "policy": self.mission.policy,
             "without": sorted(self.mission.disabled),

@@ -6,8 +6,9 @@ import argparse
 import json
 import os
 
+from gausslite.codec.task_json import graph_as_json
 from gausslite.config.task_parser_options import add_backend, backend_settings
-from gausslite.domain.task import TaskGraph
+from gausslite.domain.task import TargetRole, TaskGraph
 from gausslite.task.backends import open_parser
 
 
@@ -22,25 +23,19 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Parse the sentence and print its graph. Returns the exit code."""
     graph = open_parser(backend_settings(options, os.environ)).parse(options.text)
-    print(json.dumps(as_json(graph)) if options.json else _as_text(graph))
+    print(json.dumps(graph_as_json(graph)) if options.json else _as_text(graph))
     return 0
 
 
-def as_json(graph: TaskGraph) -> dict[str, object]:
-    """Return the stable JSON form of a task graph."""
-    return {
-        "targets": list(graph.targets),
-        "anchors": list(graph.anchors),
-        "relations": [
-            {"predicate": str(relation.predicate), "target": relation.target, "anchor": relation.anchor}
-            for relation in graph.relations
-        ],
-        "warnings": list(graph.warnings),
-    }
-
-
 def _as_text(graph: TaskGraph) -> str:
-    lines = [f"targets   {', '.join(graph.targets) or '-'}", f"anchors   {', '.join(graph.anchors) or '-'}"]
-    lines += [f"relation  {r.predicate}({r.target}, {r.anchor})" for r in graph.relations]
+    roles = zip(graph.targets, graph.roles, strict=True)
+    targets = ", ".join(name if role is TargetRole.OBJECT else f"{name} ({role})" for name, role in roles)
+    lines = [f"targets   {targets}", f"anchors   {', '.join(graph.anchors) or '-'}"]
+    lines += [f"relation  {relation}" for relation in graph.relations]
+    for each in graph.attributes:
+        values = [value for value in (each.colour, each.superlative) if value is not None]
+        lines.append(f"attribute {each.name}: {', '.join(values)}")
+    lines += [f"excluded  {name}" for name in graph.excluded]
+    lines += [f"context   {place}" for place in graph.context]
     lines += [f"warning   {warning}" for warning in graph.warnings]
     return "\n".join(lines)

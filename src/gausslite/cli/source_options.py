@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from gausslite.calibration.camera_timing import estimate_camera_timing
+from gausslite.calibration.camera_estimate import estimate_camera
 from gausslite.calibration.pose_exposure_error import estimate_pose_exposure_prior
 from gausslite.calibration.registration import find_registration
 from gausslite.config.source_options import add_frames
@@ -76,7 +76,7 @@ def register_with_warnings(
 def correct_with_warnings(
     spec: str, source: Source, correction: CameraCorrection | str | None, default: str
 ) -> tuple[Source, CameraCorrection | None]:
-    """Correct lens, rolling shutter and time offset of a registered source; None if images are used as recorded.
+    """Correct a registered source's lens, rolling shutter, time offset and blur; None if images are used as recorded.
 
     correction: a correction, AUTO, or None if the user did not set it; then default applies, AUTO or NONE. An estimate
     (AUTO) takes seconds; a simulated home is exact unless the user asks for one. Raises DatasetError, PoseError.
@@ -87,7 +87,9 @@ def correct_with_warnings(
         correction, reason = CameraCorrection(), "depth is not registered to colour"
         print_message(f"--camera-correction {NONE}: {reason}")
     elif isinstance(correction, str):
-        correction, reason = estimate_camera_timing(source, CameraCorrection(source.lens))
+        estimate = estimate_camera(source, CameraCorrection(source.lens))
+        correction = estimate.correction
+        reason = "; ".join(estimate.evidence)
         print_message(f"--camera-correction '{NONE if correction.is_identity else correction}': {reason}")
     if correction.is_identity:
         return source, None

@@ -24,46 +24,49 @@ _sym_db = _symbol_database.Default()
 
 from gausslite.v1 import gaussians_pb2 as gausslite_dot_v1_dot_gaussians__pb2
 from gausslite.v1 import geometry_pb2 as gausslite_dot_v1_dot_geometry__pb2
+from gausslite.v1 import objects_pb2 as gausslite_dot_v1_dot_objects__pb2
 from gausslite.v1 import task_pb2 as gausslite_dot_v1_dot_task__pb2
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n gausslite/v1/agent_service.proto\x12\x0cgausslite.v1\x1a\x1cgausslite/v1/gaussians.proto\x1a\x1bgausslite/v1/geometry.proto\x1a\x17gausslite/v1/task.proto\"U\n\x11\x41ssignTaskRequest\x12\x0e\n\x04text\x18\x01 \x01(\tH\x00\x12(\n\x05graph\x18\x02 \x01(\x0b\x32\x17.gausslite.v1.TaskGraphH\x00\x42\x06\n\x04task\"<\n\x12\x41ssignTaskResponse\x12&\n\x05graph\x18\x01 \x01(\x0b\x32\x17.gausslite.v1.TaskGraph\"@\n\x13IngestFramesRequest\x12)\n\x05\x66rame\x18\x01 \x01(\x0b\x32\x1a.gausslite.v1.EncodedFrame\"\xc2\x01\n\x14IngestFramesResponse\x12\r\n\x05index\x18\x01 \x01(\x03\x12+\n\x07outcome\x18\x02 \x01(\x0e\x32\x1a.gausslite.v1.FrameOutcome\x12\x0e\n\x06reason\x18\x03 \x01(\t\x12\x12\n\niterations\x18\x04 \x01(\r\x12\x11\n\tgaussians\x18\x05 \x01(\x04\x12\x11\n\troi_share\x18\x06 \x01(\x01\x12\x0f\n\x07seconds\x18\x07 \x01(\x01\x12\x13\n\x0b\x61ge_seconds\x18\x08 \x01(\x01\"e\n\x11\x45ndMissionRequest\x12\x15\n\x08handover\x18\x01 \x01(\x08H\x00\x88\x01\x01\x12\x1a\n\rdrain_seconds\x18\x02 \x01(\x01H\x01\x88\x01\x01\x42\x0b\n\t_handoverB\x10\n\x0e_drain_seconds\"\xab\x01\n\x12\x45ndMissionResponse\x12\'\n\x05state\x18\x01 \x01(\x0e\x32\x18.gausslite.v1.AgentState\x12\x0f\n\x07summary\x18\x02 \x01(\t\x12\x16\n\x0evoxels_waiting\x18\x03 \x01(\x04\x12\x19\n\x11keyframes_waiting\x18\x04 \x01(\x04\x12\x15\n\rframes_mapped\x18\x05 \x01(\x04\x12\x11\n\tgaussians\x18\x06 \x01(\x04\"\x17\n\x15GetAgentStatusRequest\"\x90\x03\n\x16GetAgentStatusResponse\x12\x10\n\x08\x61gent_id\x18\x01 \x01(\t\x12\'\n\x05state\x18\x02 \x01(\x0e\x32\x18.gausslite.v1.AgentState\x12&\n\x05graph\x18\x03 \x01(\x0b\x32\x17.gausslite.v1.TaskGraph\x12\x14\n\x0cmap_revision\x18\x04 \x01(\x04\x12\x11\n\tgaussians\x18\x05 \x01(\x04\x12\x15\n\rframes_mapped\x18\x06 \x01(\x04\x12\x16\n\x0e\x66rames_skipped\x18\x07 \x01(\x04\x12\x16\n\x0e\x66rames_dropped\x18\x08 \x01(\x04\x12\x17\n\x0f\x66rames_rejected\x18\t \x01(\x04\x12\n\n\x02hz\x18\n \x01(\x01\x12\x11\n\troi_share\x18\x0b \x01(\x01\x12*\n\x06uplink\x18\x0c \x01(\x0b\x32\x1a.gausslite.v1.UplinkStatus\x12\r\n\x05notes\x18\r \x03(\t\x12\x17\n\x0f\x61ge_p50_seconds\x18\x0e \x01(\x01\x12\x17\n\x0f\x61ge_p99_seconds\x18\x0f \x01(\x01\"\xf8\x01\n\x0cUplinkStatus\x12\x11\n\tconnected\x18\x01 \x01(\x08\x12\x17\n\x0fstopped_because\x18\x02 \x01(\t\x12\x12\n\nbytes_sent\x18\x03 \x01(\x04\x12\x16\n\x0egaussians_sent\x18\x04 \x01(\x04\x12\x13\n\x0bvoxels_sent\x18\x05 \x01(\x04\x12\x16\n\x0evoxels_waiting\x18\x06 \x01(\x04\x12\x18\n\x10subsets_rejected\x18\x07 \x01(\x04\x12\x16\n\x0ekeyframes_sent\x18\x08 \x01(\x04\x12\x19\n\x11keyframes_waiting\x18\t \x01(\x04\x12\x16\n\x0ekeyframe_bytes\x18\n \x01(\x04\"o\n\x11RenderViewRequest\x12$\n\x06\x63\x61mera\x18\x01 \x01(\x0b\x32\x14.gausslite.v1.Camera\x12\x34\n\x0et_world_camera\x18\x02 \x01(\x0b\x32\x1c.gausslite.v1.RigidTransform\"Q\n\x12RenderViewResponse\x12\x12\n\ncolour_png\x18\x01 \x01(\x0c\x12\x11\n\tdepth_png\x18\x02 \x01(\x0c\x12\x14\n\x0cmap_revision\x18\x03 \x01(\x04\"n\n\x0fWatchMapRequest\x12\x16\n\x0esince_revision\x18\x01 \x01(\x04\x12&\n\x06region\x18\x02 \x01(\x0b\x32\x11.gausslite.v1.BoxH\x00\x88\x01\x01\x12\x10\n\x08roi_only\x18\x03 \x01(\x08\x42\t\n\x07_region\"9\n\x10WatchMapResponse\x12%\n\x05\x62lock\x18\x01 \x01(\x0b\x32\x16.gausslite.v1.MapBlock*\x99\x01\n\x0c\x46rameOutcome\x12\x1d\n\x19\x46RAME_OUTCOME_UNSPECIFIED\x10\x00\x12\x18\n\x14\x46RAME_OUTCOME_MAPPED\x10\x01\x12\x19\n\x15\x46RAME_OUTCOME_SKIPPED\x10\x02\x12\x19\n\x15\x46RAME_OUTCOME_DROPPED\x10\x03\x12\x1a\n\x16\x46RAME_OUTCOME_REJECTED\x10\x04*\xcb\x01\n\nAgentState\x12\x1b\n\x17\x41GENT_STATE_UNSPECIFIED\x10\x00\x12 \n\x1c\x41GENT_STATE_WAITING_FOR_TASK\x10\x01\x12\x17\n\x13\x41GENT_STATE_MAPPING\x10\x02\x12\x18\n\x14\x41GENT_STATE_DRAINING\x10\x03\x12\x15\n\x11\x41GENT_STATE_ENDED\x10\x04\x12\x1c\n\x18\x41GENT_STATE_HANDING_OVER\x10\x05\x12\x16\n\x12\x41GENT_STATE_FAILED\x10\x06\x32\x86\x04\n\x0c\x41gentService\x12O\n\nAssignTask\x12\x1f.gausslite.v1.AssignTaskRequest\x1a .gausslite.v1.AssignTaskResponse\x12Y\n\x0cIngestFrames\x12!.gausslite.v1.IngestFramesRequest\x1a\".gausslite.v1.IngestFramesResponse(\x01\x30\x01\x12O\n\nEndMission\x12\x1f.gausslite.v1.EndMissionRequest\x1a .gausslite.v1.EndMissionResponse\x12[\n\x0eGetAgentStatus\x12#.gausslite.v1.GetAgentStatusRequest\x1a$.gausslite.v1.GetAgentStatusResponse\x12O\n\nRenderView\x12\x1f.gausslite.v1.RenderViewRequest\x1a .gausslite.v1.RenderViewResponse\x12K\n\x08WatchMap\x12\x1d.gausslite.v1.WatchMapRequest\x1a\x1e.gausslite.v1.WatchMapResponse0\x01\x62\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n gausslite/v1/agent_service.proto\x12\x0cgausslite.v1\x1a\x1cgausslite/v1/gaussians.proto\x1a\x1bgausslite/v1/geometry.proto\x1a\x1agausslite/v1/objects.proto\x1a\x17gausslite/v1/task.proto\"U\n\x11\x41ssignTaskRequest\x12\x0e\n\x04text\x18\x01 \x01(\tH\x00\x12(\n\x05graph\x18\x02 \x01(\x0b\x32\x17.gausslite.v1.TaskGraphH\x00\x42\x06\n\x04task\"<\n\x12\x41ssignTaskResponse\x12&\n\x05graph\x18\x01 \x01(\x0b\x32\x17.gausslite.v1.TaskGraph\"@\n\x13IngestFramesRequest\x12)\n\x05\x66rame\x18\x01 \x01(\x0b\x32\x1a.gausslite.v1.EncodedFrame\"\xc2\x01\n\x14IngestFramesResponse\x12\r\n\x05index\x18\x01 \x01(\x03\x12+\n\x07outcome\x18\x02 \x01(\x0e\x32\x1a.gausslite.v1.FrameOutcome\x12\x0e\n\x06reason\x18\x03 \x01(\t\x12\x12\n\niterations\x18\x04 \x01(\r\x12\x11\n\tgaussians\x18\x05 \x01(\x04\x12\x11\n\troi_share\x18\x06 \x01(\x01\x12\x0f\n\x07seconds\x18\x07 \x01(\x01\x12\x13\n\x0b\x61ge_seconds\x18\x08 \x01(\x01\"e\n\x11\x45ndMissionRequest\x12\x15\n\x08handover\x18\x01 \x01(\x08H\x00\x88\x01\x01\x12\x1a\n\rdrain_seconds\x18\x02 \x01(\x01H\x01\x88\x01\x01\x42\x0b\n\t_handoverB\x10\n\x0e_drain_seconds\"\xab\x01\n\x12\x45ndMissionResponse\x12\'\n\x05state\x18\x01 \x01(\x0e\x32\x18.gausslite.v1.AgentState\x12\x0f\n\x07summary\x18\x02 \x01(\t\x12\x16\n\x0evoxels_waiting\x18\x03 \x01(\x04\x12\x19\n\x11keyframes_waiting\x18\x04 \x01(\x04\x12\x15\n\rframes_mapped\x18\x05 \x01(\x04\x12\x11\n\tgaussians\x18\x06 \x01(\x04\"\x17\n\x15GetAgentStatusRequest\"\xf1\x03\n\x16GetAgentStatusResponse\x12\x10\n\x08\x61gent_id\x18\x01 \x01(\t\x12\'\n\x05state\x18\x02 \x01(\x0e\x32\x18.gausslite.v1.AgentState\x12&\n\x05graph\x18\x03 \x01(\x0b\x32\x17.gausslite.v1.TaskGraph\x12\x14\n\x0cmap_revision\x18\x04 \x01(\x04\x12\x11\n\tgaussians\x18\x05 \x01(\x04\x12\x15\n\rframes_mapped\x18\x06 \x01(\x04\x12\x16\n\x0e\x66rames_skipped\x18\x07 \x01(\x04\x12\x16\n\x0e\x66rames_dropped\x18\x08 \x01(\x04\x12\x17\n\x0f\x66rames_rejected\x18\t \x01(\x04\x12\n\n\x02hz\x18\n \x01(\x01\x12\x11\n\troi_share\x18\x0b \x01(\x01\x12*\n\x06uplink\x18\x0c \x01(\x0b\x32\x1a.gausslite.v1.UplinkStatus\x12\r\n\x05notes\x18\r \x03(\t\x12\x17\n\x0f\x61ge_p50_seconds\x18\x0e \x01(\x01\x12\x17\n\x0f\x61ge_p99_seconds\x18\x0f \x01(\x01\x12\x30\n\x0bmap_to_odom\x18\x10 \x01(\x0b\x32\x1b.gausslite.v1.MapToOdometry\x12-\n\x07objects\x18\x12 \x03(\x0b\x32\x1c.gausslite.v1.ObjectLandmark\"\xa8\x01\n\rMapToOdometry\x12\x34\n\x0et_map_odometry\x18\x01 \x01(\x0b\x32\x1c.gausslite.v1.RigidTransform\x12\x17\n\x0f\x63\x61pture_time_ns\x18\x02 \x01(\x03\x12\x13\n\x0b\x61ge_seconds\x18\x03 \x01(\x01\x12\x19\n\x11translation_std_m\x18\x04 \x01(\x01\x12\x18\n\x10rotation_std_deg\x18\x05 \x01(\x01\"\xf8\x01\n\x0cUplinkStatus\x12\x11\n\tconnected\x18\x01 \x01(\x08\x12\x17\n\x0fstopped_because\x18\x02 \x01(\t\x12\x12\n\nbytes_sent\x18\x03 \x01(\x04\x12\x16\n\x0egaussians_sent\x18\x04 \x01(\x04\x12\x13\n\x0bvoxels_sent\x18\x05 \x01(\x04\x12\x16\n\x0evoxels_waiting\x18\x06 \x01(\x04\x12\x18\n\x10subsets_rejected\x18\x07 \x01(\x04\x12\x16\n\x0ekeyframes_sent\x18\x08 \x01(\x04\x12\x19\n\x11keyframes_waiting\x18\t \x01(\x04\x12\x16\n\x0ekeyframe_bytes\x18\n \x01(\x04\"o\n\x11RenderViewRequest\x12$\n\x06\x63\x61mera\x18\x01 \x01(\x0b\x32\x14.gausslite.v1.Camera\x12\x34\n\x0et_world_camera\x18\x02 \x01(\x0b\x32\x1c.gausslite.v1.RigidTransform\"Q\n\x12RenderViewResponse\x12\x12\n\ncolour_png\x18\x01 \x01(\x0c\x12\x11\n\tdepth_png\x18\x02 \x01(\x0c\x12\x14\n\x0cmap_revision\x18\x03 \x01(\x04\"n\n\x0fWatchMapRequest\x12\x16\n\x0esince_revision\x18\x01 \x01(\x04\x12&\n\x06region\x18\x02 \x01(\x0b\x32\x11.gausslite.v1.BoxH\x00\x88\x01\x01\x12\x10\n\x08roi_only\x18\x03 \x01(\x08\x42\t\n\x07_region\"9\n\x10WatchMapResponse\x12%\n\x05\x62lock\x18\x01 \x01(\x0b\x32\x16.gausslite.v1.MapBlock*\x99\x01\n\x0c\x46rameOutcome\x12\x1d\n\x19\x46RAME_OUTCOME_UNSPECIFIED\x10\x00\x12\x18\n\x14\x46RAME_OUTCOME_MAPPED\x10\x01\x12\x19\n\x15\x46RAME_OUTCOME_SKIPPED\x10\x02\x12\x19\n\x15\x46RAME_OUTCOME_DROPPED\x10\x03\x12\x1a\n\x16\x46RAME_OUTCOME_REJECTED\x10\x04*\xcb\x01\n\nAgentState\x12\x1b\n\x17\x41GENT_STATE_UNSPECIFIED\x10\x00\x12 \n\x1c\x41GENT_STATE_WAITING_FOR_TASK\x10\x01\x12\x17\n\x13\x41GENT_STATE_MAPPING\x10\x02\x12\x18\n\x14\x41GENT_STATE_DRAINING\x10\x03\x12\x15\n\x11\x41GENT_STATE_ENDED\x10\x04\x12\x1c\n\x18\x41GENT_STATE_HANDING_OVER\x10\x05\x12\x16\n\x12\x41GENT_STATE_FAILED\x10\x06\x32\x86\x04\n\x0c\x41gentService\x12O\n\nAssignTask\x12\x1f.gausslite.v1.AssignTaskRequest\x1a .gausslite.v1.AssignTaskResponse\x12Y\n\x0cIngestFrames\x12!.gausslite.v1.IngestFramesRequest\x1a\".gausslite.v1.IngestFramesResponse(\x01\x30\x01\x12O\n\nEndMission\x12\x1f.gausslite.v1.EndMissionRequest\x1a .gausslite.v1.EndMissionResponse\x12[\n\x0eGetAgentStatus\x12#.gausslite.v1.GetAgentStatusRequest\x1a$.gausslite.v1.GetAgentStatusResponse\x12O\n\nRenderView\x12\x1f.gausslite.v1.RenderViewRequest\x1a .gausslite.v1.RenderViewResponse\x12K\n\x08WatchMap\x12\x1d.gausslite.v1.WatchMapRequest\x1a\x1e.gausslite.v1.WatchMapResponse0\x01\x62\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
 _builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'gausslite.v1.agent_service_pb2', _globals)
 if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
-  _globals['_FRAMEOUTCOME']._serialized_start=1870
-  _globals['_FRAMEOUTCOME']._serialized_end=2023
-  _globals['_AGENTSTATE']._serialized_start=2026
-  _globals['_AGENTSTATE']._serialized_end=2229
-  _globals['_ASSIGNTASKREQUEST']._serialized_start=134
-  _globals['_ASSIGNTASKREQUEST']._serialized_end=219
-  _globals['_ASSIGNTASKRESPONSE']._serialized_start=221
-  _globals['_ASSIGNTASKRESPONSE']._serialized_end=281
-  _globals['_INGESTFRAMESREQUEST']._serialized_start=283
-  _globals['_INGESTFRAMESREQUEST']._serialized_end=347
-  _globals['_INGESTFRAMESRESPONSE']._serialized_start=350
-  _globals['_INGESTFRAMESRESPONSE']._serialized_end=544
-  _globals['_ENDMISSIONREQUEST']._serialized_start=546
-  _globals['_ENDMISSIONREQUEST']._serialized_end=647
-  _globals['_ENDMISSIONRESPONSE']._serialized_start=650
-  _globals['_ENDMISSIONRESPONSE']._serialized_end=821
-  _globals['_GETAGENTSTATUSREQUEST']._serialized_start=823
-  _globals['_GETAGENTSTATUSREQUEST']._serialized_end=846
-  _globals['_GETAGENTSTATUSRESPONSE']._serialized_start=849
-  _globals['_GETAGENTSTATUSRESPONSE']._serialized_end=1249
-  _globals['_UPLINKSTATUS']._serialized_start=1252
-  _globals['_UPLINKSTATUS']._serialized_end=1500
-  _globals['_RENDERVIEWREQUEST']._serialized_start=1502
-  _globals['_RENDERVIEWREQUEST']._serialized_end=1613
-  _globals['_RENDERVIEWRESPONSE']._serialized_start=1615
-  _globals['_RENDERVIEWRESPONSE']._serialized_end=1696
-  _globals['_WATCHMAPREQUEST']._serialized_start=1698
-  _globals['_WATCHMAPREQUEST']._serialized_end=1808
-  _globals['_WATCHMAPRESPONSE']._serialized_start=1810
-  _globals['_WATCHMAPRESPONSE']._serialized_end=1867
-  _globals['_AGENTSERVICE']._serialized_start=2232
-  _globals['_AGENTSERVICE']._serialized_end=2750
+  _globals['_FRAMEOUTCOME']._serialized_start=2166
+  _globals['_FRAMEOUTCOME']._serialized_end=2319
+  _globals['_AGENTSTATE']._serialized_start=2322
+  _globals['_AGENTSTATE']._serialized_end=2525
+  _globals['_ASSIGNTASKREQUEST']._serialized_start=162
+  _globals['_ASSIGNTASKREQUEST']._serialized_end=247
+  _globals['_ASSIGNTASKRESPONSE']._serialized_start=249
+  _globals['_ASSIGNTASKRESPONSE']._serialized_end=309
+  _globals['_INGESTFRAMESREQUEST']._serialized_start=311
+  _globals['_INGESTFRAMESREQUEST']._serialized_end=375
+  _globals['_INGESTFRAMESRESPONSE']._serialized_start=378
+  _globals['_INGESTFRAMESRESPONSE']._serialized_end=572
+  _globals['_ENDMISSIONREQUEST']._serialized_start=574
+  _globals['_ENDMISSIONREQUEST']._serialized_end=675
+  _globals['_ENDMISSIONRESPONSE']._serialized_start=678
+  _globals['_ENDMISSIONRESPONSE']._serialized_end=849
+  _globals['_GETAGENTSTATUSREQUEST']._serialized_start=851
+  _globals['_GETAGENTSTATUSREQUEST']._serialized_end=874
+  _globals['_GETAGENTSTATUSRESPONSE']._serialized_start=877
+  _globals['_GETAGENTSTATUSRESPONSE']._serialized_end=1374
+  _globals['_MAPTOODOMETRY']._serialized_start=1377
+  _globals['_MAPTOODOMETRY']._serialized_end=1545
+  _globals['_UPLINKSTATUS']._serialized_start=1548
+  _globals['_UPLINKSTATUS']._serialized_end=1796
+  _globals['_RENDERVIEWREQUEST']._serialized_start=1798
+  _globals['_RENDERVIEWREQUEST']._serialized_end=1909
+  _globals['_RENDERVIEWRESPONSE']._serialized_start=1911
+  _globals['_RENDERVIEWRESPONSE']._serialized_end=1992
+  _globals['_WATCHMAPREQUEST']._serialized_start=1994
+  _globals['_WATCHMAPREQUEST']._serialized_end=2104
+  _globals['_WATCHMAPRESPONSE']._serialized_start=2106
+  _globals['_WATCHMAPRESPONSE']._serialized_end=2163
+  _globals['_AGENTSERVICE']._serialized_start=2528
+  _globals['_AGENTSERVICE']._serialized_end=3046
 # @@protoc_insertion_point(module_scope)

@@ -9,6 +9,7 @@ SPDX-License-Identifier: Apache-2.0
 from collections import abc as _abc
 from gausslite.v1 import gaussians_pb2 as _gaussians_pb2
 from gausslite.v1 import geometry_pb2 as _geometry_pb2
+from gausslite.v1 import objects_pb2 as _objects_pb2
 from gausslite.v1 import task_pb2 as _task_pb2
 from google.protobuf import descriptor as _descriptor
 from google.protobuf import message as _message
@@ -297,6 +298,8 @@ class GetAgentStatusResponse(_message.Message):
     NOTES_FIELD_NUMBER: _builtins.int
     AGE_P50_SECONDS_FIELD_NUMBER: _builtins.int
     AGE_P99_SECONDS_FIELD_NUMBER: _builtins.int
+    MAP_TO_ODOM_FIELD_NUMBER: _builtins.int
+    OBJECTS_FIELD_NUMBER: _builtins.int
     agent_id: _builtins.str
     state: Global___AgentState.ValueType
     map_revision: _builtins.int
@@ -320,6 +323,14 @@ class GetAgentStatusResponse(_message.Message):
     def notes(self) -> _containers.RepeatedScalarFieldContainer[_builtins.str]:
         """Messages for the operator, such as nouns without a detector class and anchors not observed yet."""
 
+    @_builtins.property
+    def map_to_odom(self) -> Global___MapToOdometry:
+        """Absent before the first mapped frame."""
+
+    @_builtins.property
+    def objects(self) -> _containers.RepeatedCompositeFieldContainer[_objects_pb2.ObjectLandmark]:
+        """The objects of the task that the agent has confirmed so far."""
+
     def __init__(
         self,
         *,
@@ -338,14 +349,58 @@ class GetAgentStatusResponse(_message.Message):
         notes: _abc.Iterable[_builtins.str] | None = ...,
         age_p50_seconds: _builtins.float = ...,
         age_p99_seconds: _builtins.float = ...,
+        map_to_odom: Global___MapToOdometry | None = ...,
+        objects: _abc.Iterable[_objects_pb2.ObjectLandmark] | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["graph", b"graph", "uplink", b"uplink"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["graph", b"graph", "map_to_odom", b"map_to_odom", "uplink", b"uplink"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["age_p50_seconds", b"age_p50_seconds", "age_p99_seconds", b"age_p99_seconds", "agent_id", b"agent_id", "frames_dropped", b"frames_dropped", "frames_mapped", b"frames_mapped", "frames_rejected", b"frames_rejected", "frames_skipped", b"frames_skipped", "gaussians", b"gaussians", "graph", b"graph", "hz", b"hz", "map_revision", b"map_revision", "notes", b"notes", "roi_share", b"roi_share", "state", b"state", "uplink", b"uplink"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["age_p50_seconds", b"age_p50_seconds", "age_p99_seconds", b"age_p99_seconds", "agent_id", b"agent_id", "frames_dropped", b"frames_dropped", "frames_mapped", b"frames_mapped", "frames_rejected", b"frames_rejected", "frames_skipped", b"frames_skipped", "gaussians", b"gaussians", "graph", b"graph", "hz", b"hz", "map_revision", b"map_revision", "map_to_odom", b"map_to_odom", "notes", b"notes", "objects", b"objects", "roi_share", b"roi_share", "state", b"state", "uplink", b"uplink"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
 Global___GetAgentStatusResponse: _TypeAlias = GetAgentStatusResponse  # noqa: Y015
+
+@_typing.final
+class MapToOdometry(_message.Message):
+    """The latest correction of the odometry: T_map_camera = t_map_odometry * T_odometry_camera. A robot uses it to look up
+    places of its odometry in the map. With exact poses it is the identity; with tracked poses it is the offset between the
+    tracked pose and the frame's own.
+    """
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    T_MAP_ODOMETRY_FIELD_NUMBER: _builtins.int
+    CAPTURE_TIME_NS_FIELD_NUMBER: _builtins.int
+    AGE_SECONDS_FIELD_NUMBER: _builtins.int
+    TRANSLATION_STD_M_FIELD_NUMBER: _builtins.int
+    ROTATION_STD_DEG_FIELD_NUMBER: _builtins.int
+    capture_time_ns: _builtins.int
+    """Of the frame that it was estimated from, by the robot's clock."""
+    age_seconds: _builtins.float
+    """Time since that frame was mapped."""
+    translation_std_m: _builtins.float
+    """By how much the corrections of successive frames differ, along and about each axis (root mean square of the latest
+    32): the error of using it for the next frame.
+    """
+    rotation_std_deg: _builtins.float
+    @_builtins.property
+    def t_map_odometry(self) -> _geometry_pb2.RigidTransform: ...
+    def __init__(
+        self,
+        *,
+        t_map_odometry: _geometry_pb2.RigidTransform | None = ...,
+        capture_time_ns: _builtins.int = ...,
+        age_seconds: _builtins.float = ...,
+        translation_std_m: _builtins.float = ...,
+        rotation_std_deg: _builtins.float = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["t_map_odometry", b"t_map_odometry"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["age_seconds", b"age_seconds", "capture_time_ns", b"capture_time_ns", "rotation_std_deg", b"rotation_std_deg", "t_map_odometry", b"t_map_odometry", "translation_std_m", b"translation_std_m"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___MapToOdometry: _TypeAlias = MapToOdometry  # noqa: Y015
 
 @_typing.final
 class UplinkStatus(_message.Message):

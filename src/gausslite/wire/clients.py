@@ -29,7 +29,7 @@ from gausslite.v1 import (
     parser_service_pb2,
     parser_service_pb2_grpc,
 )
-from gausslite.wire import convert
+from gausslite.wire import convert, convert_task
 from gausslite.wire.channel import DEADLINE_S, ServiceChannel
 from gausslite.wire.connection import MAX_MESSAGE_BYTES
 from gausslite.wire.convert_objects import report_to_message, team_object_from_message
@@ -74,7 +74,7 @@ class ParserClient(ServiceChannel):
     def parse(self, text: str) -> TaskGraph:
         """Return the graph of a task. Raises TaskError, UnavailableError."""
         request = parser_service_pb2.ParseTaskRequest(text=text)
-        return convert.graph_from_message(self._call(self._stub.ParseTask, request).graph)
+        return convert_task.graph_from_message(self._call(self._stub.ParseTask, request).graph)
 
 
 class AgentClient(ServiceChannel):
@@ -91,8 +91,8 @@ class AgentClient(ServiceChannel):
         if isinstance(task, str):
             request = agent_service_pb2.AssignTaskRequest(text=task)
         else:
-            request = agent_service_pb2.AssignTaskRequest(graph=convert.graph_to_message(task))
-        return convert.graph_from_message(self._call(self._stub.AssignTask, request).graph)
+            request = agent_service_pb2.AssignTaskRequest(graph=convert_task.graph_to_message(task))
+        return convert_task.graph_from_message(self._call(self._stub.AssignTask, request).graph)
 
     def ingest(
         self, frames: Iterable[Frame], lossless: bool = False, lens: Lens | None = None
@@ -185,7 +185,7 @@ class FusionClient(ServiceChannel):
             grid=convert.grid_to_message(grid),
             world_frame=world_frame,
             fresh_map=fresh_map,
-            task=None if task is None else convert.graph_to_message(task),
+            task=None if task is None else convert_task.graph_to_message(task),
         )
         response = self._call(self._stub.JoinSession, request)
         return Session(

@@ -25,11 +25,13 @@ from gausslite.domain.errors import (
     StorageError,
     UnavailableError,
 )
+from gausslite.domain.objects import ObjectReport
 from gausslite.domain.voxel_batch import RoiSubset, VoxelBatch
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.v1 import geometry_pb2
 from gausslite.wire.clients import FusionClient, Session
+from gausslite.wire.object_outbox import ObjectOutbox
 from gausslite.wire.spool import Purpose, Spool, SpoolBatch
 from gausslite.wire.spooled_keyframes import SpooledKeyframe
 from gausslite.wire.token_bucket import TokenBucket
@@ -71,6 +73,7 @@ class Uplink:
         self._draining = self._closing = False
         self._drain_limit_s = math.inf
         self._sent_keyframes: set[int] = set()
+        self._objects = ObjectOutbox()
         # guards the counters and flags; waited on by the thread and by drain
         self._changed = threading.Condition()
         self._thread = threading.Thread(target=self._run, name="uplink", daemon=True)
@@ -80,6 +83,12 @@ class Uplink:
         """Queue voxel updates; each replaces a pending update of its voxel. Raises StorageError."""
         if len(batch):
             self._spool.enqueue(batch, purpose)
+            with self._changed:
+                self._changed.notify_all()
+
+    def report_objects(self, report: ObjectReport) -> None:
+        """Send the agent's task and objects with the next round; a newer report replaces one that waits."""
+        if self._objects.put(report):
             with self._changed:
                 self._changed.notify_all()
 
@@ -142,7 +151,8 @@ class Uplink:
         return self._closing or bool(self._counters.stopped_because) or not self._has_pending()
 
     def _has_pending(self) -> bool:
-        return self._spool.pending_voxels + self._spool.pending_keyframes > 0
+        has_report = self._objects.pending is not None
+        return has_report or self._spool.pending_voxels + self._spool.pending_keyframes > 0
 
     def _run(self) -> None:
         try:
@@ -177,14 +187,28 @@ class Uplink:
         resend_threshold = 0.0 if self._draining else self._settings.resend_threshold
         max_bytes = self._token_bucket.available_bytes(self._settings.round_bytes)
         due = self._spool.next_round(max_bytes, resend_threshold)
-        if due is None:
+        if due is None and self._objects.pending is None:
             return False
         session = self._join_if_needed()
+        self._send_objects(session)
+        if due is None:
+            return True
         if due.voxels is not None:
             self._send_voxels(due.voxels, session)
         if due.keyframes:
             self._send_keyframes(due.keyframes, session)
         return True
+
+    def _send_objects(self, session: Session) -> None:
+        """Send the agent's report if it has changed. A rejected one is dropped: the map does not depend on it."""
+        report = self._objects.pending
+        if report is None:
+            return
+        try:
+            self._token_bucket.spend(self._client.report_objects(session.session_id, report))
+        except InvalidInputError as error:
+            _log.warning("uplink: the report of objects is dropped: %s", error)
+        self._objects.mark_done(report)
 
     def _send_voxels(self, due: SpoolBatch, session: Session) -> None:
         sent: dict[int, tuple[SpoolBatch, int]] = {}
@@ -233,7 +257,9 @@ class Uplink:
         if self._session is None:
             # a robot with a new map cannot send tombstones for the updates of its earlier map
             fresh = self._spool.is_new and not self._has_restored_map and self._counters.joins == 0
-            self._session = self._client.join(self._agent_id, self._grid, self._settings.world_frame, fresh)
+            report, frame = self._objects.latest, self._settings.world_frame
+            task = None if report is None else report.graph
+            self._session = self._client.join(self._agent_id, self._grid, frame, fresh, task)
             if self._session.highest_update_seq == 0:
                 # the server has no updates of this agent
                 self._spool.mark_all_unsent()
@@ -315,6 +341,7 @@ class Uplink:
         if isinstance(error, SessionUnknownError):
             self._session = None
             self._spool.mark_all_unsent()
+            self._objects.mark_unsent()
         if isinstance(error, (QuotaError, StorageError)):
             self._subset_bytes = max(_MIN_SUBSET_BYTES, self._subset_bytes // 2)
         with self._changed:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -14,6 +15,8 @@ from gausslite.domain.errors import (
     MismatchError,
     StorageError,
 )
+from gausslite.domain.objects import ObjectReport
+from gausslite.domain.task import TaskGraph
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.fusion.memory_store import MemoryStore
 from gausslite.wire.spool import Purpose, Spool
@@ -114,3 +117,18 @@ def test_the_spool_of_another_agent_is_refused(tmp_path: Path) -> None:
 def test_invalid_settings_are_refused(wrong: dict[str, float]) -> None:
     with pytest.raises(InvalidInputError, match="uplink"):
         UplinkSettings(**wrong)  # type: ignore[arg-type]
+
+
+def test_the_latest_report_of_objects_is_sent_also_without_voxels() -> None:
+    graph = TaskGraph("t", "Find the mug", ("mug",), (), ())
+    with fusion_server() as server, uplink(server.client.address) as link:
+        link.report_objects(ObjectReport(graph))
+        assert link.drain(20)
+        [agent] = server.client.status().agents
+        assert list(agent.targets) == ["mug"]
+        changed = replace(graph, targets=("cup",))
+        link.report_objects(ObjectReport(changed))
+        link.report_objects(ObjectReport(graph))
+        link.report_objects(ObjectReport(changed))
+        assert link.drain(20)
+        assert list(server.client.status().agents[0].targets) == ["cup"]
