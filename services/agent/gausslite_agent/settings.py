@@ -28,6 +28,7 @@ from gausslite.domain.pose import UpAxis
 from gausslite.domain.task_limits import require_task_text
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.mission.settings import MissionSettings, PerceptionSettings, PoseMode, SourceSettings
+from gausslite.process.messages import print_message
 from gausslite.wire.address import require_callable
 from gausslite.wire.tls import Tls
 from gausslite.wire.uplink_values import UplinkSettings
@@ -103,7 +104,7 @@ class AgentSettings:
 
 def parse_arguments(arguments: Sequence[str] | None = None) -> AgentSettings:
     """Return the settings of the command line. Raises InvalidInputError."""
-    options = parse_options(_parser(), arguments)
+    options = parse_options(_parser(), arguments, warn=print_message)
     if options.source is not None and options.task is None:
         raise InvalidInputError("--task: expected a task for the source, got none")
     _require_valid(options)

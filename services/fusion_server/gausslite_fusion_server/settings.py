@@ -14,6 +14,7 @@ from gausslite.config.tls_options import add_tls, read_server_tls
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.fusion.joint_refinement import RefineSettings
 from gausslite.fusion.limits import MAX_REFINE_ITERATIONS, FusionSettings, Quotas
+from gausslite.process.messages import print_message
 from gausslite.wire.tls import Tls
 
 MEMORY = "memory"
@@ -35,7 +36,7 @@ class ServerSettings:
 
 def parse_arguments(arguments: Sequence[str] | None = None) -> ServerSettings:
     """Return the settings of the options. Raises InvalidInputError for values that are out of range."""
-    options = parse_options(_parser(), arguments)
+    options = parse_options(_parser(), arguments, warn=print_message)
     quotas = Quotas(
         options.quota_agents,
         options.quota_voxels,

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from gausslite.config.layers import parse_options
 from gausslite.config.task_parser_options import add_backend, backend_settings
 from gausslite.config.tls_options import add_tls, read_server_tls
+from gausslite.process.messages import print_message
 from gausslite.task.backends import BackendSettings
 from gausslite.wire.tls import Tls
 
@@ -27,7 +28,7 @@ class ParserSettings:
 
 def parse_arguments(arguments: Sequence[str] | None = None) -> ParserSettings:
     """Return the settings of the options. Ends the process with code 2 for wrong flags. Raises InvalidInputError."""
-    options = parse_options(_parser(), arguments)
+    options = parse_options(_parser(), arguments, warn=print_message)
     return ParserSettings(options.listen, backend_settings(options, os.environ), read_server_tls(options))
 
 

@@ -9,7 +9,6 @@ from gausslite.config.known_options import KNOWN_OPTIONS
 from gausslite.config.nearest import suggestion
 from gausslite.config.option_table import Layer, OptionTable, RawValue, variable_name
 from gausslite.domain.errors import InvalidInputError
-from gausslite.process.messages import print_message
 
 PREFIX: Final = "GAUSSLITE_"
 CONFIG_VARIABLE: Final = "GAUSSLITE_CONFIG"
@@ -57,19 +56,18 @@ def read_environment(table: OptionTable, environment: Mapping[str, str]) -> Laye
     return Layer(values, {dest: variable_name(table.key(dest)) for dest in values})
 
 
-def warn_of_unknown_variables(
-    program: str, table: OptionTable, environment: Mapping[str, str], key_variable: str | None
-) -> None:
-    """Print a line on stderr for every variable with the prefix that nothing reads, without its value.
+def describe_unknown_variables(
+    table: OptionTable, environment: Mapping[str, str], key_variable: str | None
+) -> list[str]:
+    """Return a message for every variable with the prefix that nothing reads, without its value.
 
     Options of other programs give no warning: one environment may configure several programs. key_variable: the
     variable that the options name for the API key.
     """
     options = {variable_name(table.key(dest)) for dest in table.actions}
     known = {*options, *map(variable_name, KNOWN_OPTIONS), *_OTHER_VARIABLES, key_variable}
-    for name in sorted(environment):
-        if name.startswith(PREFIX) and name not in known:
-            print_message(f"{program}: {name} is not an option{suggestion(name, options)}")
+    unknown = sorted(name for name in environment if name.startswith(PREFIX) and name not in known)
+    return [f"{name} is not an option{suggestion(name, options)}" for name in unknown]
 
 
 def without_options(environment: Mapping[str, str]) -> dict[str, str]:

@@ -11,10 +11,10 @@ import copy
 import os
 import re
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
-from gausslite.config.environment import CONFIG_VARIABLE, read_environment, warn_of_unknown_variables
+from gausslite.config.environment import CONFIG_VARIABLE, describe_unknown_variables, read_environment
 from gausslite.config.file import read_file
 from gausslite.config.option_table import Layer, OptionTable, RawValue
 from gausslite.config.presets import PRESETS
@@ -30,8 +30,12 @@ def parse_options(
     parser: argparse.ArgumentParser,
     arguments: Sequence[str] | None = None,
     environment: Mapping[str, str] | None = None,
+    *,
+    warn: Callable[[str], None],
 ) -> argparse.Namespace:
     """Return the effective options of a program; adds --config and --print-config to its parser.
+
+    warn: called with one line for every environment variable that looks like an option but is none.
 
     A parser with sub-commands gets them in its chosen sub-command. Ends the process with code 0 after --print-config
     and with code 2 for wrong flags. Raises InvalidInputError for wrong values in the file or the environment.
@@ -54,7 +58,8 @@ def parse_options(
     values, origins = _combine(table, values, [_read_preset(table, values.get("preset"))], origins)
     _require_paths(table, values)
     options = _parse_with_defaults(parser, arguments, table.convert(values, origins), print_only)
-    warn_of_unknown_variables(parser.prog, table, environment, getattr(options, "llm_key_variable", None))
+    for message in describe_unknown_variables(table, environment, getattr(options, "llm_key_variable", None)):
+        warn(f"{parser.prog}: {message}")
     if print_only:
         print(_configuration_text(parser.prog, table, values, options), end="")
         raise SystemExit(0)

@@ -17,6 +17,7 @@ from gausslite.config.known_options import KNOWN_OPTIONS
 from gausslite.config.layers import parse_options
 from gausslite.config.option_table import OptionTable
 from gausslite.domain.errors import InvalidInputError
+from gausslite.process.messages import print_message
 
 SERVICES = (agent, fusion_server, parser_service)
 
@@ -39,7 +40,7 @@ def parsers() -> Iterator[argparse.ArgumentParser]:
 
 def printed(parser: argparse.ArgumentParser, capsys: pytest.CaptureFixture[str], *flags: str) -> str:
     with pytest.raises(SystemExit) as ended:
-        parse_options(parser, [*flags, "--print-config"], {})
+        parse_options(parser, [*flags, "--print-config"], {}, warn=print_message)
     assert ended.value.code == 0
     return capsys.readouterr().out
 
@@ -56,9 +57,14 @@ def test_the_list_of_known_options_is_complete() -> None:
 
 
 def test_options_of_another_program_give_no_warning(capsys: pytest.CaptureFixture[str]) -> None:
-    parse_options(parser_service._parser(), [], {"GAUSSLITE_MAX_GAUSSIANS": "5", "GAUSSLITE_LISTEN": "[::1]:1"})
+    parse_options(
+        parser_service._parser(),
+        [],
+        {"GAUSSLITE_MAX_GAUSSIANS": "5", "GAUSSLITE_LISTEN": "[::1]:1"},
+        warn=print_message,
+    )
     assert capsys.readouterr().err == ""
-    parse_options(parser_service._parser(), [], {"GAUSSLITE_ZZZ\x1b": "5"})
+    parse_options(parser_service._parser(), [], {"GAUSSLITE_ZZZ\x1b": "5"}, warn=print_message)
     assert capsys.readouterr().err == "gausslite-parser: GAUSSLITE_ZZZ\\x1b is not an option\n"
 
 
@@ -66,9 +72,9 @@ def test_every_boolean_option_can_be_switched_off(tmp_path: Path) -> None:
     file = tmp_path / "agent.toml"
     file.write_text("\ufeffstrict = true\nhandover = true\n", encoding="utf-8")
     config = ["--config", str(file)]
-    assert parse_options(agent._parser(), config, {}).strict
-    assert not parse_options(agent._parser(), [*config, "--no-strict"], {}).strict
-    assert not parse_options(agent._parser(), config, {"GAUSSLITE_STRICT": "false"}).strict
+    assert parse_options(agent._parser(), config, {}, warn=print_message).strict
+    assert not parse_options(agent._parser(), [*config, "--no-strict"], {}, warn=print_message).strict
+    assert not parse_options(agent._parser(), config, {"GAUSSLITE_STRICT": "false"}, warn=print_message).strict
     for parser in parsers():
         plain = [each.dest for each in parser._actions if isinstance(each, argparse._StoreTrueAction)]
         assert set(plain) <= {"print_config"}, parser.prog
@@ -114,4 +120,4 @@ def test_a_printed_configuration_hides_the_password_of_a_url(capsys: pytest.Capt
 )
 def test_a_flag_outside_its_bounds_is_named(flags: list[str], named: str) -> None:
     with pytest.raises(InvalidInputError, match=named):
-        parse_options(agent._parser(), flags, {})
+        parse_options(agent._parser(), flags, {}, warn=print_message)

@@ -18,6 +18,7 @@ from gausslite.config.task_parser_options import add_backend
 from gausslite.config.toml_text import to_toml
 from gausslite.config.values import read_names
 from gausslite.domain.errors import InvalidInputError
+from gausslite.process.messages import print_message
 
 
 def program() -> argparse.ArgumentParser:
@@ -38,7 +39,7 @@ def program() -> argparse.ArgumentParser:
 
 def parse(*flags: str, file: Path | None = None, environment: Mapping[str, str] | None = None) -> argparse.Namespace:
     config = () if file is None else ("--config", str(file))
-    return parse_options(program(), [*flags, *config], environment or {})
+    return parse_options(program(), [*flags, *config], environment or {}, warn=print_message)
 
 
 def written(folder: Path, text: str) -> Path:
@@ -239,9 +240,9 @@ def test_sub_commands_are_configured_alike() -> None:
     parser = argparse.ArgumentParser(prog="bench")
     commands = parser.add_subparsers(required=True)
     commands.add_parser("loop").add_argument("--seed", type=int, default=0)
-    assert parse_options(parser, ["loop"], {"GAUSSLITE_SEED": "3"}).seed == 3
+    assert parse_options(parser, ["loop"], {"GAUSSLITE_SEED": "3"}, warn=print_message).seed == 3
     with pytest.raises(SystemExit):
-        parse_options(parser, [], {})
+        parse_options(parser, [], {}, warn=print_message)
 
 
 def test_a_child_process_inherits_no_option_variables() -> None:
