@@ -38,6 +38,12 @@ def serving(served: ServedModel) -> Iterator[str]:
                 self.send_error(404)
                 return
             start = int(requested[6:-1]) if requested and self.headers.get("If-Range") == served.tag else 0
+            if start >= len(served.data):
+                self.send_response(416)
+                self.send_header("Content-Range", f"bytes */{len(served.data)}")
+                self.send_header("Content-Length", "0")
+                self.end_headers()
+                return
             self.send_response(206 if start else 200)
             if start:
                 self.send_header("Content-Range", f"bytes {start}-{len(served.data) - 1}/{len(served.data)}")

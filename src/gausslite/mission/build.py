@@ -16,7 +16,7 @@ from gausslite.mission.settings import MissionSettings, PerceptionSettings, Pose
 from gausslite.mission.task_mapper import TaskMapper
 from gausslite.perception.fixed_relevance import NoTaskEstimator, RegionRelevanceEstimator
 from gausslite.perception.relevance_estimator import AsyncRelevanceEstimator, RelevanceEstimator, TaskRelevanceEstimator
-from gausslite.perception.tracker import TrackerSettings
+from gausslite.perception.relevance_tracker import RelevanceTrackerSettings
 from gausslite.render.choose import choose_rasterizer
 from gausslite.tracking.tracker import CameraTracker
 
@@ -97,7 +97,7 @@ class EstimatorFactory:
 
         It uses the user's models or, without any, the scene's ground truth. Raises InvalidInputError without both.
         """
-        settings = TrackerSettings(up_axis=self._scene().up_axis)
+        settings = RelevanceTrackerSettings(up_axis=self._scene().up_axis)
         if self._models is None:
             return TaskRelevanceEstimator(graph, self._ground_truth_detector(), settings)
         detector = self._models.detector

@@ -17,7 +17,7 @@ from gausslite.domain.task import TaskGraph
 from gausslite.perception.detect import Detector, Segmenter
 from gausslite.perception.object_map import Landmark
 from gausslite.perception.spatial import best_depth_m
-from gausslite.perception.tracker import TargetTracker, TrackerSettings
+from gausslite.perception.relevance_tracker import RelevanceTracker, RelevanceTrackerSettings
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,13 +78,13 @@ class TaskRelevanceEstimator:
         self,
         graph: TaskGraph,
         detector: Detector,
-        settings: TrackerSettings | None = None,
+        settings: RelevanceTrackerSettings | None = None,
         segmenter: Segmenter | None = None,
     ) -> None:
         """Without a segmenter, masks are propagated by depth alone."""
         self._graph = graph
         self._detector = detector
-        self._tracker = TargetTracker(graph, settings or TrackerSettings(), segmenter)
+        self._tracker = RelevanceTracker(graph, settings or RelevanceTrackerSettings(), segmenter)
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -135,14 +135,14 @@ class AsyncRelevanceEstimator:
         graph: TaskGraph,
         detector: Detector,
         executor: Executor,
-        settings: TrackerSettings | None = None,
+        settings: RelevanceTrackerSettings | None = None,
         segmenter: Segmenter | None = None,
     ) -> None:
         """Without a segmenter, masks are propagated by depth alone."""
         self._graph = graph
         self._detector = detector
         self._executor = executor
-        self._tracker = TargetTracker(graph, settings or TrackerSettings(), segmenter)
+        self._tracker = RelevanceTracker(graph, settings or RelevanceTrackerSettings(), segmenter)
         self._frames = 0
         self._skipped_keyframes = 0
         self._running: tuple[_Keyframe, Future[list[Detection]]] | None = None

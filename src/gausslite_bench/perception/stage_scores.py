@@ -20,7 +20,7 @@ from gausslite.evaluation.views import MIN_ROI_PIXELS
 from gausslite.perception.detect import Detector, Segmenter
 from gausslite.perception.evidence import EvidenceSettings
 from gausslite.perception.relevance_estimator import TaskRelevanceEstimator
-from gausslite.perception.tracker import TrackerSettings, merge_detections
+from gausslite.perception.relevance_tracker import RelevanceTrackerSettings, merge_detections
 
 _MIN_FOUND_SHARE = 0.25
 
@@ -129,11 +129,11 @@ class _TaskEvaluation:
     def __init__(self, query: TaskQuery, detector: Detector, up_axis: UpAxis, segmenter: Segmenter | None) -> None:
         self._query = query
         self._detector = _CachedDetector(detector)
-        every_frame = TrackerSettings(up_axis=up_axis, max_frames=1, max_missed_detections=0)
+        every_frame = RelevanceTrackerSettings(up_axis=up_axis, max_frames=1, max_missed_detections=0)
         settings = {
             PerceptionStage.RELATED: replace(every_frame, evidence=EvidenceSettings.accept_all()),
             PerceptionStage.CONFIRMED: every_frame,
-            PerceptionStage.TRACKED: TrackerSettings(up_axis=up_axis),
+            PerceptionStage.TRACKED: RelevanceTrackerSettings(up_axis=up_axis),
         }
         self._estimators = {
             stage: TaskRelevanceEstimator(query.graph, self._detector, tracker_settings, segmenter)

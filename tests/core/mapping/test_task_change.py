@@ -33,7 +33,7 @@ from gausslite.optimize.splat_table import SplatTable
 from gausslite.perception.fixed_relevance import RegionRelevanceEstimator
 from gausslite.perception.ground_truth import RegionDetector
 from gausslite.perception.relevance_estimator import AsyncRelevanceEstimator, TaskRelevanceEstimator
-from gausslite.perception.tracker import TrackerSettings
+from gausslite.perception.relevance_tracker import RelevanceTrackerSettings
 from gausslite.render.cpu import CpuRasterizer
 
 SIZE = (64, 48)
@@ -224,7 +224,7 @@ def test_landmarks_found_in_past_views_are_used_for_the_newest_frame() -> None:
     on_the_right = Relation(Predicate.NEAR, "mug", "lamp")
     graph = TaskGraph("t", "the mug near the lamp", ("mug",), ("lamp",), (on_the_right,))
     regions = {"mug_1": LEFT, "mug_2": RIGHT, "lamp": BallRegion((0.75, 0.1, 2.0), 0.15)}
-    estimator = TaskRelevanceEstimator(graph, RegionDetector(regions), TrackerSettings(max_frames=100))
+    estimator = TaskRelevanceEstimator(graph, RegionDetector(regions), RelevanceTrackerSettings(max_frames=100))
     away = wall_frame(9, SIZE, shift_m=-0.6)
     estimator.estimate(away)
     assert estimator.notes
@@ -237,7 +237,9 @@ def test_landmarks_found_in_past_views_are_used_for_the_newest_frame() -> None:
 def test_asynchronous_reevaluation_alternates_with_new_keyframes() -> None:
     executor = DeferredExecutor()
     task = TaskGraph("id", "a task", ("mug",), (), ())
-    estimator = AsyncRelevanceEstimator(task, RegionDetector({"mug": RIGHT}), executor, TrackerSettings(max_frames=2))
+    estimator = AsyncRelevanceEstimator(
+        task, RegionDetector({"mug": RIGHT}), executor, RelevanceTrackerSettings(max_frames=2)
+    )
     task_mapper = TaskMapper(
         A, GaussianMapper(MapperSettings(keyframes=KeyframeSettings(every=1)), CpuRasterizer(threads=1))
     )

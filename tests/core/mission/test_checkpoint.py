@@ -32,7 +32,7 @@ from gausslite.mission.task_mapper import TaskMapper
 from gausslite.optimize.density import DensitySettings
 from gausslite.perception.ground_truth import RegionDetector
 from gausslite.perception.relevance_estimator import TaskRelevanceEstimator
-from gausslite.perception.tracker import TrackerSettings
+from gausslite.perception.relevance_tracker import RelevanceTrackerSettings
 from gausslite.render.cpu import CpuRasterizer
 
 GRAPH = TaskGraph(
@@ -58,7 +58,7 @@ def make_task_mapper(max_gaussians: int = 400, window: int = 2) -> TaskMapper:
         density=DensitySettings(densify_every=7, prune_every=5),
         pose_prior=PoseExposurePrior(0.01, 0.5, 0.1, 0.05),
     )
-    estimator = TaskRelevanceEstimator(GRAPH, RegionDetector(REGIONS), TrackerSettings(max_frames=3))
+    estimator = TaskRelevanceEstimator(GRAPH, RegionDetector(REGIONS), RelevanceTrackerSettings(max_frames=3))
     mapper = GaussianMapper(mapper_settings, CpuRasterizer(threads=1), seed=3)
     return TaskMapper(estimator, mapper, SentVoxelTracker(VoxelGrid()))
 

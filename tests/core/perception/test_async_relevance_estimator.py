@@ -19,7 +19,7 @@ from gausslite.mapping.settings import KeyframeSettings, MapperSettings
 from gausslite.mission.task_mapper import TaskMapper
 from gausslite.perception.ground_truth import RegionDetector
 from gausslite.perception.relevance_estimator import AsyncRelevanceEstimator, TaskRelevanceEstimator
-from gausslite.perception.tracker import TrackerSettings
+from gausslite.perception.relevance_tracker import RelevanceTrackerSettings
 from gausslite.render.cpu import CpuRasterizer
 
 SIZE = (64, 48)
@@ -40,7 +40,9 @@ def frame_at(index: int) -> Frame:
 
 
 def async_estimator(executor: Executor, every: int = 3) -> AsyncRelevanceEstimator:
-    return AsyncRelevanceEstimator(TASK, RegionDetector({"mug": MUG}), executor, TrackerSettings(max_frames=every))
+    return AsyncRelevanceEstimator(
+        TASK, RegionDetector({"mug": MUG}), executor, RelevanceTrackerSettings(max_frames=every)
+    )
 
 
 def test_relevance_is_empty_until_the_first_detection_finishes() -> None:

@@ -19,7 +19,7 @@ from gausslite.perception.object_map import Landmark, ObjectMap, Observation
 from gausslite.perception.relations import SpatialSettings
 from gausslite.perception.relevance_estimator import TaskRelevanceEstimator
 from gausslite.perception.spatial import SpatialFilter
-from gausslite.perception.tracker import TrackerSettings
+from gausslite.perception.relevance_tracker import RelevanceTrackerSettings
 
 CAMERA = Camera(100.0, 100.0, 80.0, 60.0, 160, 120)
 WHOLE = np.ones((120, 160), np.bool_)
@@ -59,7 +59,7 @@ class ScriptedDetector:
 def target_marked(scores: Sequence[float | None], frames: int, max_frames: int = 1) -> list[bool]:
     detector = ScriptedDetector(scores)
     estimator = TaskRelevanceEstimator(
-        TaskGraph("id", "find the mug", ("mug",), (), ()), detector, TrackerSettings(max_frames=max_frames)
+        TaskGraph("id", "find the mug", ("mug",), (), ()), detector, RelevanceTrackerSettings(max_frames=max_frames)
     )
     return [bool(estimator.estimate(frame_at(index=index)).relevance.roi.any()) for index in range(frames)]
 

@@ -13,7 +13,7 @@ from gausslite.datasets.source import Source
 from gausslite.perception.models.model_file import open_model
 from gausslite.perception.relevance_estimator import TaskRelevanceEstimator
 from gausslite.perception.text_embeddings import TextEmbeddings, classes_for
-from gausslite.perception.tracker import TrackerSettings
+from gausslite.perception.relevance_tracker import RelevanceTrackerSettings
 from gausslite.perception.yolo import YoloSegDetector, load_yolo
 from gausslite.task.rules import RuleParser
 
@@ -29,7 +29,7 @@ def detector(shared_dir: Path) -> YoloSegDetector:
 
 
 def estimator_for(text: str, kitchen: Source, detector: YoloSegDetector) -> TaskRelevanceEstimator:
-    settings = TrackerSettings(up_axis=kitchen.up_axis, max_frames=1)
+    settings = RelevanceTrackerSettings(up_axis=kitchen.up_axis, max_frames=1)
     return TaskRelevanceEstimator(RuleParser().parse(text), detector, settings)
 
 

@@ -20,7 +20,7 @@ from gausslite.perception.relations import SpatialSettings
 from gausslite.perception.relevance_estimator import TaskRelevanceEstimator
 from gausslite.perception.spatial import SpatialFilter, best_depth_m
 from gausslite.perception.text_embeddings import classes_for
-from gausslite.perception.tracker import TrackerSettings
+from gausslite.perception.relevance_tracker import RelevanceTrackerSettings
 
 CAMERA = Camera(100.0, 100.0, 80.0, 60.0, 160, 120)
 UP = (0.0, -1.0, 0.0)
@@ -75,7 +75,7 @@ def test_a_target_without_relations_is_marked():
 
 def test_keyframes_are_the_first_frame_motion_and_every_nth_frame():
     detector = CountingDetector(RegionDetector({"mug": MUG}))
-    estimator = TaskRelevanceEstimator(graph_of(), detector, TrackerSettings(max_frames=4))
+    estimator = TaskRelevanceEstimator(graph_of(), detector, RelevanceTrackerSettings(max_frames=4))
     calls = []
     for index, (x_m, turn_deg) in enumerate(
         [(0, 0), (0.1, 0), (0.2, 0), (0.2, 16), (0.2, 16), (1.3, 16), *[(1.3, 16)] * 4]
@@ -97,7 +97,9 @@ def test_masks_are_propagated_between_detections(x_m, turn_deg):
 
 
 def test_an_object_out_of_view_is_not_propagated():
-    estimator = TaskRelevanceEstimator(graph_of(), RegionDetector({"mug": MUG}), TrackerSettings(max_translation_m=9))
+    estimator = TaskRelevanceEstimator(
+        graph_of(), RegionDetector({"mug": MUG}), RelevanceTrackerSettings(max_translation_m=9)
+    )
     estimator.estimate(frame_at())
     assert not estimator.estimate(frame_at(5.0, 1)).relevance.roi.any()
 
@@ -224,4 +226,4 @@ def test_nouns_match_classes_by_name_head_and_synonym():
 @pytest.mark.parametrize("settings", [{"up_axis": (0.0, 0.0, 0.0)}, {"max_frames": 0}, {"max_rotation_deg": -1.0}])
 def test_settings_are_checked(settings):
     with pytest.raises(InvalidInputError):
-        TrackerSettings(**settings)
+        RelevanceTrackerSettings(**settings)

@@ -17,7 +17,7 @@ _DIGEST: Final = re.compile(r"[0-9a-f]{64}")
 
 @dataclass(frozen=True, slots=True)
 class ModelEntry:
-    """One model file. path: its location below the base URL; the last part is its name on disk.
+    """One model file. path: its location below the address of --base-url; the last part is its name on disk.
 
     Raises InvalidInputError for invalid fields.
     """
@@ -57,7 +57,7 @@ CATALOGUE: Final = (
     ModelEntry("yolo-seg", "yolo11n-seg.onnx", "--detector: 80 classes with masks", "AGPL-3.0", 256),
     ModelEntry("fastsam", "FastSAM-s.onnx", "--segmenter: masks of everything", "AGPL-3.0", 512),
 )
-"""No entry has a SHA-256, because exports of one network differ. Use --sha256 or your own catalogue to fix yours."""
+"""No entry has a SHA-256, because exports of one network differ. Pin that of your file by --sha256 or a catalogue."""
 
 
 def read_catalogue(path: Path) -> tuple[ModelEntry, ...]:

@@ -1,6 +1,6 @@
 """Download one file over HTTPS: resumable, bounded in size, and moved to its path only after verification.
 
-It uses the standard library: a mission needs no HTTP, so no HTTP client is a dependency.
+It uses the standard library, because nothing else in GaussLite needs an HTTP client as a dependency.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ def download(request: DownloadRequest, progress: Progress) -> None:
             os.fsync(file.fileno())
             _require_valid(request, part)
             part.replace(request.path)
-            _tag_file(part).unlink(missing_ok=True)
+            _etag_file(part).unlink(missing_ok=True)
     except OSError as error:
         raise StorageError(f"{request.path}: cannot be written: {error.strerror or error}") from error
 
@@ -84,18 +84,25 @@ def download(request: DownloadRequest, progress: Progress) -> None:
 def _fill(request: DownloadRequest, file: BinaryIO, part: Path, progress: Progress) -> None:
     """Download the missing bytes of the partial file."""
     received = part.stat().st_size
-    tag = _tag_of(part)
-    if received and tag is None:
+    etag = _read_etag(part)
+    if received and etag is None:
         # without an ETag the bytes may belong to another version of the file
         file.truncate(received := 0)
-    with _open_response(request.url, received, tag) as response:
+    with _open_response(request.url, received, etag) as response:
+        if response.status == http.client.REQUESTED_RANGE_NOT_SATISFIABLE:
+            if response.headers.get("Content-Range") == f"bytes */{received}":
+                # an earlier process ended after the last byte, before it moved the file
+                progress(received, received)
+                return
+            file.truncate(0)
+            raise UnavailableError(f"{request.url}: got no bytes from {received} on; run it again to restart")
         if response.status != http.client.PARTIAL_CONTENT:
             file.truncate(received := 0)
         elif not (response.headers.get("Content-Range") or "").startswith(f"bytes {received}-"):
             raise UnavailableError(f"{request.url}: expected the bytes from {received} on, got another range")
         total = _total_bytes(response, received)
         _require_disk_space(request, total, received)
-        _store_tag(part, response.headers.get("ETag"))
+        _store_etag(part, response.headers.get("ETag"))
         progress(received, total)
         while chunk := _read(response, request.url):
             received += len(chunk)
@@ -108,18 +115,23 @@ def _fill(request: DownloadRequest, file: BinaryIO, part: Path, progress: Progre
 
 
 @contextlib.contextmanager
-def _open_response(url: str, received: int, tag: str | None) -> Iterator[Any]:
-    """Yield the server's response, from byte `received` on if the file there still has this ETag."""
+def _open_response(url: str, received: int, etag: str | None) -> Iterator[Any]:
+    """Yield the server's response, from byte `received` on if the file there still has this ETag.
+
+    Its status is 416 if the server's file ends before that byte. Raises UnavailableError for all other failures.
+    """
     headers = {"User-Agent": "gausslite", "Accept-Encoding": "identity"}
-    if received and tag is not None:
-        headers |= {"Range": f"bytes={received}-", "If-Range": tag}
+    if received and etag is not None:
+        headers |= {"Range": f"bytes={received}-", "If-Range": etag}
     opener = urllib.request.build_opener(_CheckedRedirects())
     try:
         # require_https has checked the scheme, and _CheckedRedirects checks every redirect
         response = opener.open(urllib.request.Request(url, headers=headers), timeout=_TIMEOUT_S)  # noqa: S310
     except urllib.error.HTTPError as error:
-        error.close()
-        raise UnavailableError(f"{url}: the server returned {error.code} {error.reason}") from error
+        if error.code != http.client.REQUESTED_RANGE_NOT_SATISFIABLE or not received:
+            error.close()
+            raise UnavailableError(f"{url}: the server returned {error.code} {error.reason}") from error
+        response = error
     except (OSError, http.client.HTTPException) as error:
         raise UnavailableError(f"{url}: cannot be reached: {getattr(error, 'reason', error)}") from error
     with response:
@@ -153,8 +165,9 @@ def _require_disk_space(request: DownloadRequest, total: int | None, received: i
     if total > request.max_bytes:
         raise _too_large(request, total)
     free = shutil.disk_usage(request.path.parent).free
-    if total - received + _RESERVED_DISK_BYTES > free:
-        raise StorageError(f"{request.path}: expected {total - received >> 20} MiB of free disk, got {free >> 20}")
+    needed = total - received + _RESERVED_DISK_BYTES
+    if needed > free:
+        raise StorageError(f"{request.path}: expected {needed >> 20} MiB of free disk, got {free >> 20}")
 
 
 def _too_large(request: DownloadRequest, size: int) -> QuotaError:
@@ -162,7 +175,7 @@ def _too_large(request: DownloadRequest, size: int) -> QuotaError:
 
 
 def _require_valid(request: DownloadRequest, part: Path) -> None:
-    """Check SHA-256 and format, and delete an invalid file, which could not be resumed correctly."""
+    """Check SHA-256 and format. Delete an invalid file: the next download must not continue from its wrong bytes."""
     try:
         actual = sha256_of(part) if request.sha256 is not None else None
         if actual != request.sha256:
@@ -173,7 +186,7 @@ def _require_valid(request: DownloadRequest, part: Path) -> None:
             require_onnx(part)
     except GaussLiteError:
         part.unlink()
-        _tag_file(part).unlink(missing_ok=True)
+        _etag_file(part).unlink(missing_ok=True)
         raise
 
 
@@ -187,21 +200,21 @@ def _exclusive_lock(file: BinaryIO, path: Path) -> Iterator[None]:
     yield
 
 
-def _tag_file(part: Path) -> Path:
+def _etag_file(part: Path) -> Path:
     return part.with_name(f"{part.name}.etag")
 
 
-def _tag_of(part: Path) -> str | None:
+def _read_etag(part: Path) -> str | None:
     """Return the strong ETag of the partial file, or None; a weak ETag does not identify the bytes."""
     try:
-        tag = _tag_file(part).read_text(encoding="ascii").strip()
+        etag = _etag_file(part).read_text(encoding="ascii").strip()
     except (OSError, UnicodeDecodeError):
         return None
-    return tag if tag.startswith('"') else None
+    return etag if etag.startswith('"') else None
 
 
-def _store_tag(part: Path, tag: str | None) -> None:
-    if tag is not None and tag.startswith('"') and tag.isascii() and len(tag) <= 200:
-        _tag_file(part).write_text(tag, encoding="ascii")
+def _store_etag(part: Path, etag: str | None) -> None:
+    if etag is not None and etag.startswith('"') and etag.isascii() and len(etag) <= 200:
+        _etag_file(part).write_text(etag, encoding="ascii")
     else:
-        _tag_file(part).unlink(missing_ok=True)
+        _etag_file(part).unlink(missing_ok=True)

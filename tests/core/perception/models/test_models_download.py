@@ -44,6 +44,29 @@ def test_an_interrupted_download_resumes(tmp_path):
     assert files_in(tmp_path) == ["thing.bin"]
 
 
+def test_a_complete_partial_file_is_moved_without_another_download(tmp_path):
+    """A process may end after the last byte and before it moves the file."""
+    served = ServedModel()
+    (tmp_path / ".thing.bin.part").write_bytes(DATA)
+    (tmp_path / ".thing.bin.part.etag").write_text(served.tag)
+    with serving(served) as base:
+        download(request(base, tmp_path), no_progress)
+    assert served.requested_ranges == [f"bytes={len(DATA)}-"]
+    assert (tmp_path / "thing.bin").read_bytes() == DATA
+    assert files_in(tmp_path) == ["thing.bin"]
+
+
+def test_a_partial_file_longer_than_the_servers_file_restarts_the_download(tmp_path):
+    served = ServedModel()
+    (tmp_path / ".thing.bin.part").write_bytes(DATA + b"more")
+    (tmp_path / ".thing.bin.part.etag").write_text(served.tag)
+    with serving(served) as base:
+        with pytest.raises(UnavailableError, match="run it again to restart"):
+            download(request(base, tmp_path), no_progress)
+        download(request(base, tmp_path), no_progress)
+    assert (tmp_path / "thing.bin").read_bytes() == DATA
+
+
 @pytest.mark.parametrize("tag", ['"v2"', 'W/"v1"'])
 def test_a_changed_file_on_the_server_restarts_the_download(tmp_path, tag):
     served = ServedModel()

@@ -1,4 +1,7 @@
-"""Track a task's targets over frames: localise detections, filter them by relations, propagate them to new frames."""
+"""Decide the relevance of each frame: which pixels show the task's targets.
+
+Detections are localised in 3D, filtered by the task's relations, and propagated to the following frames.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +34,7 @@ from gausslite.perception.spatial import SpatialFilter, lift_observation
 
 
 @dataclass(frozen=True, slots=True)
-class TrackerSettings:
+class RelevanceTrackerSettings:
     """Limits of the camera's motion and of the frames between two detections (a comment in Sec. III-B.2).
 
     up_axis: up in the world frame, by default that of a level first camera. max_missed_detections: detections in a row
@@ -59,13 +62,13 @@ class TrackerSettings:
             raise InvalidInputError(f"tracker max_frames: expected at least 1, got {self.max_frames}")
 
 
-class TargetTracker:
+class RelevanceTracker:
     """State of the tracked targets: latest keyframe, propagated detections, landmarks. Use from one thread at a time.
 
     The caller runs the detector.
     """
 
-    def __init__(self, graph: TaskGraph, settings: TrackerSettings, segmenter: Segmenter | None) -> None:
+    def __init__(self, graph: TaskGraph, settings: RelevanceTrackerSettings, segmenter: Segmenter | None) -> None:
         """Without a segmenter, masks are propagated by depth alone."""
         self._graph = graph
         self._settings = settings
