@@ -207,7 +207,7 @@ GAUSSLITE_INLINE void project_group(const Workspace& ws, const CullingBounds<kMo
                     Pack16(0.0f)};
   transpose(out);
   alignas(64) float depth[16];
-  store(depth, p.z);
+  store(depth, kMotion ? p.motion.z : p.z);  // blending keeps the order at the middle of the readout
   segment.add(out, depth, id, boxes, visible, tall);
 }
 

@@ -15,9 +15,11 @@ from gausslite.domain.errors import InvalidInputError
 from gausslite.render.rasterizer import LOG_SCALE, MEAN, RGB
 from gausslite_bench.cli.argument_types import read_counts, read_image_sizes, read_percentages
 from gausslite_bench.raster.block_cost import BlockCost
+from gausslite_bench.raster.motion_costs import MOTIONS
 from gausslite_bench.raster.operation_costs import RasterBench
 from gausslite_bench.raster.procedural_room import held_out_view, seed_rows
 from gausslite_bench.raster.region_costs import Layout, regions_of_share
+from gausslite_bench.raster.repeated_step import LOSSES
 
 pytest.importorskip("gausslite.render._kernels", reason="the native kernels are not built")
 
@@ -66,6 +68,8 @@ def test_every_case_is_measured_on_every_instruction_set() -> None:
     for timing in timings:
         assert timing.external == {}
         assert timing.regions == ()
+        assert {(cost.motion, cost.loss) for cost in timing.motions} == set(itertools.product(MOTIONS, LOSSES))
+        assert all(cost.moving.min_ms > 0 and cost.still.min_ms > 0 for cost in timing.motions)
         assert set(timing.stages_ms) == {"fused_l1", "fused_l1_ssim"}
         assert all(0 < duration.min_ms <= duration.median_ms for duration in timing.durations.values())
 
@@ -82,7 +86,7 @@ def test_json_is_a_list_of_flat_records(capsys: pytest.CaptureFixture[str]) -> N
 def test_lines_name_the_case_and_every_operation(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["bench", "raster", "--sizes", "32x32", "--gaussians", "20", "--threads", "1", "--reps", "1"]) == 0
     printed = capsys.readouterr().out
-    for word in ("20 Gaussians, 32x32", "fused_l1 ", "fused_l1_ssim", "forward", "backward", "raster"):
+    for word in ("20 Gaussians, 32x32", "fused_l1 ", "fused_l1_ssim", "forward", "backward", "raster", "shutter+blur"):
         assert word in printed
 
 
@@ -96,6 +100,9 @@ def test_details_contain_every_number_of_every_case(tmp_path: Path, capsys: pyte
     for case in cases:
         assert set(case["operations"]) == {"fused_l1", "fused_l1_ssim", "forward", "backward"}
         assert case["blocks"]["evaluations"] > 0
+        assert [(each["motion"], each["loss"]) for each in case["motions"]] == [
+            (motion, loss) for loss in LOSSES for motion in MOTIONS
+        ]
         regions = [(each["share_percent"], each["layout"], each["loss"]) for each in case["regions"]]
         assert len(set(regions)) == 2 * 3 * 2
         assert all(each["ratio"] > 0 for each in case["regions"])

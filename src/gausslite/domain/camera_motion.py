@@ -6,6 +6,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Float64
+from numpy import ndarray
 
 from gausslite.domain.arrays import require_array
 from gausslite.domain.errors import InvalidInputError
@@ -42,6 +44,21 @@ class CameraMotion:
             raise InvalidInputError(
                 f"camera motion exposure_s: expected 0 to {MAX_EXPOSURE_S:g}, got {self.exposure_s}"
             )
+
+    def to_middle_row(
+        self, points_m: Float64[ndarray, "n 3"], row_shares: Float64[ndarray, " n"]
+    ) -> Float64[ndarray, "n 3"]:
+        """Return points seen by a row of the image, in the frame of the camera at the middle row's time.
+
+        points_m: in the camera frame at the time of their row. row_shares: their rows, from 0 (top) to 1 (bottom).
+        """
+        time_s = (self.readout_s * (row_shares - 0.5))[:, None]
+        turned_m = np.cross(self.twist.angular_rad_s, points_m)
+        second_order_m = np.cross(self.twist.angular_rad_s, turned_m)
+        result: Float64[ndarray, "n 3"] = (
+            points_m + time_s * (self.twist.linear_m_s + turned_m) + 0.5 * time_s**2 * second_order_m
+        )
+        return result
 
     @property
     def is_still(self) -> bool:

@@ -72,12 +72,12 @@ def _fit(
     viewer: MapViewer, frame: Frame, T_world_camera: Float64[ndarray, "4 4"], prior: PoseExposurePrior
 ) -> Iterator[_Candidate]:
     """Yield the rendering from the initial pose, and one with fitted exposure for each round's pose."""
-    rendering = viewer.render(frame.camera, T_world_camera)
+    rendering = viewer.render(frame.camera, T_world_camera, frame.motion)
     yield _Candidate(T_world_camera, rendering)
     for _ in range(_ROUNDS):
         yield _Candidate(T_world_camera, _apply_fitted_exposure(rendering, frame, prior))
         T_world_camera = fit_pose(rendering, inverse(T_world_camera), frame, prior)
-        rendering = viewer.render(frame.camera, T_world_camera)
+        rendering = viewer.render(frame.camera, T_world_camera, frame.motion)
     yield _Candidate(T_world_camera, _apply_fitted_exposure(rendering, frame, prior))
 
 

@@ -11,6 +11,7 @@ from numpy import ndarray
 
 from gausslite.domain.arrays import require_array
 from gausslite.domain.camera import Camera
+from gausslite.domain.camera_motion import CameraMotion
 from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.pose import inverse
@@ -72,15 +73,17 @@ class MapViewer:
         self._rows = gaussians_to_rows(gaussians)
         self._rasterizer = rasterizer
 
-    def render(self, camera: Camera, T_world_camera: Float64[ndarray, "4 4"]) -> Rendering:
+    def render(
+        self, camera: Camera, T_world_camera: Float64[ndarray, "4 4"], motion: CameraMotion | None = None
+    ) -> Rendering:
         """Return the map's rendering from this camera pose; colours are clipped to [0, 1]. Raises ShapeError."""
-        rendering = self._rasterizer.forward(self._rows, camera, inverse(T_world_camera))
+        rendering = self._rasterizer.forward(self._rows, camera, inverse(T_world_camera), motion=motion)
         # copies: a backend may reuse its images for the next rendering
         return Rendering(np.clip(rendering.rgb, 0.0, 1.0), rendering.depth_m.copy(), rendering.alpha.copy(), None)
 
     def render_frame(self, frame: Frame) -> Rendering:
-        """Return the map's rendering from the frame's camera pose."""
-        return self.render(frame.camera, frame.T_world_camera)
+        """Return the map's rendering from the frame's camera pose, with the frame's motion."""
+        return self.render(frame.camera, frame.T_world_camera, frame.motion)
 
 
 def view_map(gaussians: Gaussians, backend: str = "auto", threads: int | None = None) -> MapViewer:

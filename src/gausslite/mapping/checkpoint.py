@@ -10,10 +10,12 @@ from numpy import ndarray
 from numpy.typing import NDArray
 
 from gausslite.domain.camera import Camera
+from gausslite.domain.camera_motion import CameraMotion
 from gausslite.domain.errors import MapFileError
 from gausslite.domain.frame import Frame
 from gausslite.domain.relevance import RelevanceMap
-from gausslite.domain.state import State, get_array, get_floats, int_array
+from gausslite.domain.state import State, add_prefix, get_array, get_floats, int_array, select_prefix
+from gausslite.domain.trajectory import Twist
 
 _LOW_64_BITS = (1 << 64) - 1
 
@@ -27,6 +29,7 @@ def frame_state(frame: Frame) -> dict[str, NDArray[Any]]:
         "depth_m": frame.depth_m,
         "camera": np.array([camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px]),
         "T_world_camera": frame.T_world_camera,
+        **add_prefix("motion", _motion_state(frame.motion)),
     }
 
 
@@ -38,7 +41,25 @@ def frame_from_state(state: State) -> Frame:
     camera = Camera(fx_px, fy_px, cx_px, cy_px, depth_m.shape[1], depth_m.shape[0])
     rgb = get_array(state, "rgb", (*depth_m.shape, 3), np.uint8).copy()
     T_world_camera = get_array(state, "T_world_camera", (4, 4), np.float64).copy()
-    return Frame(index, capture_time_ns, rgb, depth_m, camera, T_world_camera)
+    motion = _motion_from_state(select_prefix(state, "motion"))
+    return Frame(index, capture_time_ns, rgb, depth_m, camera, T_world_camera, motion)
+
+
+def _motion_state(motion: CameraMotion | None) -> dict[str, NDArray[Any]]:
+    if motion is None:
+        return {}
+    return {
+        "linear_m_s": motion.twist.linear_m_s,
+        "angular_rad_s": motion.twist.angular_rad_s,
+        "times_s": np.array([motion.readout_s, motion.exposure_s]),
+    }
+
+
+def _motion_from_state(state: State) -> CameraMotion | None:
+    if not state:
+        return None
+    linear_m_s, angular_rad_s = (np.array(get_floats(state, name, 3)) for name in ("linear_m_s", "angular_rad_s"))
+    return CameraMotion(Twist(linear_m_s, angular_rad_s), *get_floats(state, "times_s", 2))
 
 
 def relevance_state(relevance: RelevanceMap) -> dict[str, NDArray[Any]]:

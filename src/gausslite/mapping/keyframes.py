@@ -87,7 +87,7 @@ def window_view(keyframe: Keyframe, rasterizer: Rasterizer, settings: KeyframeSe
         pixel_weights = np.maximum(pixel_weights, context)
     return WindowView(
         keyframe=keyframe,
-        training_view=rasterizer.prepare_view(frame.rgb, frame.depth_m, frame.camera, pixel_weights),
+        training_view=rasterizer.prepare_view(frame.rgb, frame.depth_m, frame.camera, pixel_weights, frame.motion),
         T_camera_world=inverse(frame.T_world_camera),
         roi=Subset(tiles),
     )

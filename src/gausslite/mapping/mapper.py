@@ -10,6 +10,7 @@ from numpy import ndarray
 
 from gausslite.domain.arrays import require_array
 from gausslite.domain.camera import Camera
+from gausslite.domain.camera_motion import CameraMotion
 from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.pose import inverse
@@ -153,6 +154,7 @@ class GaussianMapper:
         """
         clear_roi(self._table)
         self._keyframes.reset_roi()
+        self._trainer.reset_roi()
 
     @property
     def next_unevaluated(self) -> Keyframe | None:
@@ -182,11 +184,13 @@ class GaussianMapper:
         """Return alpha and depth of the map from a frame's pose; None if the map is empty."""
         if self.count == 0:
             return None
-        return RenderedView.from_rendering(self.render(frame.camera, frame.T_world_camera))
+        return RenderedView.from_rendering(self.render(frame.camera, frame.T_world_camera, frame.motion))
 
-    def render(self, camera: Camera, T_world_camera: Float64[ndarray, "4 4"]) -> Rendering:
-        """Render the map from a pose."""
-        return self._rasterizer.forward(self._table.rows, camera, inverse(T_world_camera))
+    def render(
+        self, camera: Camera, T_world_camera: Float64[ndarray, "4 4"], motion: CameraMotion | None = None
+    ) -> Rendering:
+        """Render the map from a pose, with a moving camera if motion is given."""
+        return self._rasterizer.forward(self._table.rows, camera, inverse(T_world_camera), motion=motion)
 
     @property
     def poses(self) -> PoseHistory:

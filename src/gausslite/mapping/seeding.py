@@ -162,6 +162,8 @@ class Seeder:
         rows, columns = np.divmod(pixels, frame.camera.width_px)
         depths_m = frame.depth_m[rows, columns].astype(np.float64)
         points = lift(np.stack([columns, rows], axis=1) + 0.5, depths_m, frame.camera)
+        if frame.motion is not None:
+            points = frame.motion.to_middle_row(points, (rows + 0.5) / frame.camera.height_px)
         return Gaussians(
             means_m=transform_points(frame.T_world_camera, points).astype(np.float32),
             quats_wxyz=np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1)),

@@ -12,6 +12,7 @@ from numpy import ndarray
 from gausslite.calibration.exposure import fit_exposure
 from gausslite.calibration.pose_fit import fit_pose
 from gausslite.domain.camera import Camera
+from gausslite.domain.camera_motion import CameraMotion
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import inverse, require_rigid, transform_of
 from gausslite.domain.pose_exposure_prior import PoseExposurePrior
@@ -20,8 +21,8 @@ from gausslite.mapping.keyframes import Keyframe, WindowView
 from gausslite.mapping.pose_history import PoseHistory
 from gausslite.render.rasterizer import Rendering
 
-RenderMap = Callable[[Camera, Float64[ndarray, "4 4"]], Rendering]
-"""Renders the map from T_world_camera."""
+RenderMap = Callable[[Camera, Float64[ndarray, "4 4"], CameraMotion | None], Rendering]
+"""Renders the map from T_world_camera, with the camera's motion."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,7 +104,7 @@ class ViewRefiner:
         return replace(keyframe, frame=self._fit(keyframe.recorded, keyframe.frame.T_world_camera))
 
     def _fit(self, recorded: Frame, T_world_rendered: Float64[ndarray, "4 4"]) -> Frame:
-        rendering = self._render(recorded.camera, T_world_rendered)
+        rendering = self._render(recorded.camera, T_world_rendered, recorded.motion)
         T_world_camera = fit_pose(rendering, inverse(T_world_rendered), recorded, self._prior)
         if self._prior.has_pose_error:
             T_world_camera = self._anchored(recorded, T_world_camera)

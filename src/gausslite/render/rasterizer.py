@@ -18,7 +18,8 @@ Moving camera (CameraMotion: twist v, w; readout; exposure), to first order in t
 the velocity -(v + w x p). Its image crosses rows at s px/s, and is recorded when the row that it reaches is exposed.
     - The splat is projected at p - t (v + w x p), where t is the time of that row's exposure. With
       d = 1 - s · readout / height, at least 0.5, t = readout (y0 / height - 1/2) / d, at most 0.65 readouts before or
-      after the middle. The splat is also culled if the depth at this time is less than 0.05 m.
+      after the middle. The splat is also culled if the depth at this time is less than 0.05 m. Blending keeps the order
+      at the middle of the readout.
     - The readout shears the ellipse: its covariance is A C Aᵀ with A = I + V (0, 1) readout / (height · d). V is the
       velocity of the image in px/s: the Jacobian times that of the point.
     - The exposure stretches it: V Vᵀ exposure² / 12 is added to the covariance after its 0.3 px². The opacity is

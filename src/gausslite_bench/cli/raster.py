@@ -12,6 +12,7 @@ from gausslite.config.switches import add_switch
 from gausslite.mission.results import prepare_file, write_json
 from gausslite_bench.cli.argument_types import read_counts, read_image_sizes, read_percentages
 from gausslite_bench.raster.block_cost import BlockCost
+from gausslite_bench.raster.motion_costs import MotionCost
 from gausslite_bench.raster.operation_costs import GAUSSIANS, OPERATIONS, SIZES, RasterBench, RasterTiming
 from gausslite_bench.raster.region_costs import SHARES_PERCENT, RegionCost
 
@@ -101,6 +102,7 @@ def raster_lines(timing: RasterTiming) -> str:
         if stages := timing.stages_ms.get(name):
             lines.append("    " + "  ".join(f"{stage} {ms:.2f}" for stage, ms in stages.items()))
     lines.append(f"  {_block_line(timing.blocks)}")
+    lines += [_motion_line(cost) for cost in timing.motions]
     lines += [_region_line(cost) for cost in timing.regions]
     return "\n".join(lines)
 
@@ -108,6 +110,13 @@ def raster_lines(timing: RasterTiming) -> str:
 def _block_line(cost: BlockCost) -> str:
     return (
         f"{cost.evaluations} block evaluations at {cost.clock_ghz:.2f} GHz: {cost.cycles:.1f} cycles each in fused_l1"
+    )
+
+
+def _motion_line(cost: MotionCost) -> str:
+    return (
+        f"  {cost.motion:<12} {cost.loss:<13} {cost.moving.min_ms:8.2f} / {cost.moving.median_ms:8.2f}   "
+        f"at rest {cost.still.min_ms:8.2f} / {cost.still.median_ms:8.2f}   time ratio {cost.ratio:.3f}"
     )
 
 

@@ -17,6 +17,7 @@ from gausslite.render.cpu_kernels import core_clock_ghz
 from gausslite.render.rasterizer import Rendering
 from gausslite_bench.raster.block_cost import BlockCost
 from gausslite_bench.raster.external_rasterizer import ExternalRasterizer
+from gausslite_bench.raster.motion_costs import MotionCost, motion_costs
 from gausslite_bench.raster.procedural_room import BenchView, held_out_view, seed_rows
 from gausslite_bench.raster.region_costs import RegionCost, region_costs
 from gausslite_bench.raster.repeated_step import LOSSES, RUNS_PER_BATCH, Duration, RepeatedStep, measure_seconds
@@ -32,7 +33,8 @@ class RasterTiming:
     """Times of one case: whole calls, as the mapper makes them.
 
     stages_ms: minimum time of each stage of each fused step. blocks: cost of the fused step with L1. external: times
-    of the external library, empty without one. regions: costs of steps masked to a region, empty without shares.
+    of the external library, empty without one. motions: costs of steps with a moving camera. regions: costs of steps
+    masked to a region, empty without shares.
     """
 
     gaussians: int
@@ -43,6 +45,7 @@ class RasterTiming:
     durations: Mapping[str, Duration]
     stages_ms: Mapping[str, Mapping[str, float]]
     blocks: BlockCost
+    motions: Sequence[MotionCost]
     external: Mapping[str, Duration] = field(default_factory=dict)
     regions: Sequence[RegionCost] = ()
 
@@ -59,6 +62,7 @@ class RasterTiming:
             "stages_ms_min": {name: dict(stages) for name, stages in self.stages_ms.items()},
             "blocks": asdict(self.blocks),
             "external": {name: asdict(duration) for name, duration in self.external.items()},
+            "motions": [{**asdict(cost), "ratio": cost.ratio} for cost in self.motions],
             "regions": [{**asdict(cost), "ratio": cost.ratio} for cost in self.regions],
         }
 
@@ -111,6 +115,7 @@ class RasterBench:
             durations=durations[0],
             stages_ms=own.stages_ms,
             blocks=blocks,
+            motions=motion_costs(rasterizer, table, view, self.repetitions),
             external=durations[1] if self.external_library is not None else {},
             regions=region_costs(rasterizer, table, view, self.shares_percent, self.repetitions),
         )

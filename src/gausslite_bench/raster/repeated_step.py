@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Bool
 from numpy import ndarray
 
+from gausslite.domain.camera_motion import CameraMotion
 from gausslite.optimize.splat_table import SplatTable
 from gausslite.render.cpu import CpuRasterizer
 from gausslite.render.rasterizer import FULL_FRAME, AdamSettings, LossWeights, Subset
@@ -53,7 +54,8 @@ class Duration:
 class RepeatedStep:
     """A whole training iteration with zero learning rates: every run does the same work.
 
-    tiles: tiles to render and train; `pixels` masks the loss. None means the whole image without a mask.
+    tiles: tiles to render and train; `pixels` masks the loss. None means the whole image without a mask. motion: that
+    of the camera, None for a camera at rest.
     """
 
     def __init__(
@@ -63,12 +65,14 @@ class RepeatedStep:
         view: BenchView,
         pixels: Bool[ndarray, "h w"] | None = None,
         tiles: Bool[ndarray, "th tw"] | None = None,
+        *,
+        motion: CameraMotion | None = None,
     ) -> None:
         self._rasterizer = rasterizer
         self._tables = table.rows, table.first_moment, table.second_moment
         self._pose = view.T_camera_world
         pixel_weights = None if pixels is None else pixels.astype(np.float32)
-        self._view = rasterizer.prepare_view(view.rgb, view.depth_m, view.camera, pixel_weights)
+        self._view = rasterizer.prepare_view(view.rgb, view.depth_m, view.camera, pixel_weights, motion)
         self._masked = pixels is not None
         self._subset = FULL_FRAME if tiles is None else Subset(tiles=tiles)
 

@@ -137,7 +137,7 @@ def test_keyframes_are_refined_equally_often(pose_updates_per_frame: int) -> Non
     keyframes = [Keyframe(frame, middle_relevance(frame), recorded=frame if frame.index else None) for frame in frames]
     window = [window_view(keyframe, rasterizer, settings) for keyframe in keyframes]
     refinement = RefinementSettings(LOOSE, pose_updates_per_frame, anchor_share=0.1)
-    refiner = ViewRefiner(refinement, lambda camera, T_world_camera: rendering_like(frames[0]))
+    refiner = ViewRefiner(refinement, lambda camera, T_world_camera, motion: rendering_like(frames[0]))
     rounds = [refiner.next_views(window) for _ in range(4)]
     assert [len(turn) for turn in rounds] == [min(pose_updates_per_frame, 4)] * 4
     fitted = Counter(view.keyframe.frame.index for turn in rounds for view in turn)

@@ -88,7 +88,9 @@ def test_calls_match_gsplats_signatures() -> None:
     means_px, covariances_px2 = kernels.project(torch.ones(3, 3), torch.zeros(3, 3, 3), torch.eye(3), (50, 40))
     assert means_px.shape == (3, 2)
     assert covariances_px2.shape == (3, 2, 2)
-    footprints = Footprints(torch.ones(3, 2), torch.ones(3, 3), torch.ones(3), torch.ones(3, 4), torch.ones(3, 2))
+    footprints = Footprints(
+        torch.ones(3, 2), torch.ones(3, 3), torch.ones(3), torch.ones(3, 4), torch.ones(3), torch.ones(3, 2)
+    )
     tiles = torch.zeros(3, 4, dtype=torch.bool)
     tiles[1, 3] = True
     channels, alpha = kernels.composite(footprints, (50, 40), tiles)

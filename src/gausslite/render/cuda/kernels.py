@@ -30,13 +30,15 @@ GSPLAT_LIMITS = Limits(max_alpha=0.999, blends_last_splat=False)
 class Footprints:
     """Input of the compositing kernels: splats in any order, in pixels of the rendered window.
 
-    channels: red, green, blue and z. radius_px: half the bounding box of alpha >= 1/255.
+    channels: red, green, blue and z. order_m: splats are blended in ascending order of it. radius_px: half the bounding
+    box of alpha >= 1/255.
     """
 
     means_px: Float32[Tensor, "m 2"]
     conics: Float32[Tensor, "m 3"]
     opacities: Float32[Tensor, " m"]
     channels: Float32[Tensor, "m 4"]
+    order_m: Float32[Tensor, " m"]
     radius_px: Float32[Tensor, "m 2"]
 
 
@@ -120,7 +122,7 @@ class GsplatKernels:
         _, crossings, owners = self._gsplat.isect_tiles(
             footprints.means_px.detach()[None],
             footprints.radius_px.ceil().to(torch.int32)[None],
-            footprints.channels[:, 3].detach()[None],
+            footprints.order_m[None],
             TILE_PX,
             tile_columns,
             tile_rows,
@@ -181,7 +183,7 @@ class TorchKernels:
         """Blend front to back with gsplat's limits, in double precision."""
         columns = (footprints.means_px, footprints.conics, footprints.opacities, footprints.channels)
         blend: Callable[..., Tensor] = _Composite.apply
-        images = blend(*columns, footprints.radius_px, size, tiles)
+        images = blend(*columns, footprints.order_m, footprints.radius_px, size, tiles)
         return images[..., :4].float(), images[..., 4].float()
 
 
@@ -191,8 +193,8 @@ class _Composite(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, *inputs: Any) -> Tensor:
         """Return images of five channels, in double precision."""
-        means_px, conics, opacities, channels, radius_px, (width_px, height_px), tiles = inputs
-        order = torch.argsort(channels[:, 3], stable=True)
+        means_px, conics, opacities, channels, order_m, radius_px, (width_px, height_px), tiles = inputs
+        order = torch.argsort(order_m, stable=True)
         columns = (column[order].double() for column in (means_px, conics, opacities, channels, radius_px))
         means_px, conics, opacities, channels, radius_px = columns
         ctx.ellipses = Ellipses(
@@ -213,4 +215,4 @@ class _Composite(torch.autograd.Function):
         d_channels = torch.cat([d_rgb, d_z_m[:, None]], dim=1)
         inverse_order = torch.argsort(ellipses.row_ids)
         columns = (d_means_px, d_conics, d_opacities, d_channels)
-        return (*(column[inverse_order].float() for column in columns), None, None, None)
+        return (*(column[inverse_order].float() for column in columns), None, None, None, None)

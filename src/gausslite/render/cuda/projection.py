@@ -55,6 +55,7 @@ def project(
     """Return the footprints of these rows in the whole image, in the same order."""
     R, t = T_camera_world[:3, :3], T_camera_world[:3, 3]
     points_m, motion = rows[:, MEAN] @ R.T + t, device_camera.motion
+    order_m = points_m[:, 2].detach()
     if motion is not None:
         points_m, s_per_row = motion.expose(points_m)
     covariances_m2 = kernels.covariances(_unit(rows[:, QUAT]), rows[:, LOG_SCALE].exp())
@@ -81,6 +82,7 @@ def project(
         conics=torch.stack([variance_y, -covariance, variance_x], dim=1) / determinant[:, None],
         opacities=opacities,
         channels=torch.cat([rows[:, RGB], points_m[:, 2:]], dim=1),
+        order_m=order_m,
         radius_px=torch.sqrt(reach[:, None] * torch.stack([variance_x, variance_y], dim=1).detach()),
     )
 

@@ -21,8 +21,9 @@ MIN_ALPHA = 1.0 / 255.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Ellipses:
-    """The visible splats, nearest first. conics: (a, b, c) of the inverse 2D covariance [[a, b], [b, c]].
+    """The visible splats, nearest first (with a moving camera, at the middle of the readout).
 
+    conics: (a, b, c) of the inverse 2D covariance [[a, b], [b, c]].
     half_box_px: half the bounding box of the ellipse alpha >= 1/255, without a gradient.
     """
 
@@ -75,7 +76,9 @@ def project(
         finite = torch.isfinite(ellipses.half_box_px).all(dim=1) & torch.isfinite(ellipses.means_px).all(dim=1)
         ellipses = ellipses.take(finite & (ellipses.opacities > MIN_ALPHA))
         ellipses = ellipses.take(_touches_tiles(ellipses, camera, tiles))
-        row_ids = ellipses.row_ids[torch.argsort(ellipses.z_m, stable=True)]
+        # with a moving camera too, the order is that of the middle of the readout
+        middle_z_m = rows[ellipses.row_ids, MEAN] @ T_camera_world[2, :3] + T_camera_world[2, 3]
+        row_ids = ellipses.row_ids[torch.argsort(middle_z_m, stable=True)]
     # project again with gradients, only the rows that are not culled
     return _ellipses(rows, row_ids, camera, T_camera_world, motion)
 
