@@ -14,7 +14,7 @@ from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.task import TaskGraph
 from gausslite.mission.checkpoint import ResumeConfig
 from gausslite.mission.frame_stream import CorruptFrames, FrameStream
-from gausslite.mission.results import write_results
+from gausslite.mission.results import write_poses, write_results
 from gausslite.mission.runner import MissionRunner
 from gausslite.task.parser import TaskParser
 from gausslite.wire.spool import Purpose
@@ -249,6 +249,7 @@ class AgentMission:
             "resumed_after_frame": None if self._resumed is None else self._resumed.last_index,
         }
         write_results(folder, gaussians, report, self._settings.link.uplink.world_frame)
+        self._worker.run(lambda mapper: write_poses(folder, mapper.poses)).result()
 
     def _send_all(self, uplink: Uplink, request: EndRequest) -> None:
         """Send the rest of the region and the keyframes and, for a handover, the rest of the map, within one time."""

@@ -12,6 +12,8 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from gausslite.domain.camera import Camera
+from gausslite.domain.camera_motion import CameraMotion
+from gausslite.domain.errors import MapFileError
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import inverse, orthonormal, require_rigid, transform_of, twist_of
 from gausslite.domain.state import State, add_prefix, get_array, get_counts, int_array, select_prefix
@@ -69,9 +71,11 @@ class CameraTracker:
     """
 
     def __init__(
-        self, render: Callable[[Camera, Float64[ndarray, "4 4"]], Rendering], motion: MotionModel = MotionModel.VELOCITY
+        self,
+        render: Callable[[Camera, Float64[ndarray, "4 4"], CameraMotion | None], Rendering],
+        motion: MotionModel = MotionModel.VELOCITY,
     ) -> None:
-        """Render: renders the map from T_world_camera."""
+        """Render: renders the map from T_world_camera, for the camera's motion while a frame was exposed."""
         self._render = render
         self._motion = motion
         self._keyframes = KeyframeIndex()
@@ -149,13 +153,13 @@ class CameraTracker:
 
     def _align(self, frame: Frame, T_world_predicted: Float64[ndarray, "4 4"]) -> Alignment | None:
         """Return the pose aligned to the map near a prediction; None if map and frame do not agree there."""
-        rendering = self._render(frame.camera, T_world_predicted)
+        rendering = self._render(frame.camera, T_world_predicted, frame.motion)
         alignment = align(rendering, T_world_predicted, frame, _PRIOR_STD, COARSE_TO_FINE)
         if alignment is None:
             return None
         step = np.abs(twist_of(inverse(T_world_predicted) @ alignment.T_world_camera))
         if step[:3].max() > _RENDER_AGAIN_M or step[3:].max() > _RENDER_AGAIN_RAD:
-            rendering = self._render(frame.camera, alignment.T_world_camera)
+            rendering = self._render(frame.camera, alignment.T_world_camera, frame.motion)
             alignment = align(rendering, alignment.T_world_camera, frame, _PRIOR_STD, FINE)
         if alignment is None or alignment.overlap < _MIN_OVERLAP or alignment.residual > _MAX_RESIDUAL:
             return None
@@ -183,6 +187,8 @@ class CameraTracker:
         """Continue from another tracker's state. Raises MapFileError, PoseError."""
         self._keyframes.restore(select_prefix(state, "keyframes"))
         self._velocity = get_array(state, "velocity", (6,), np.float64).copy()
+        if not np.isfinite(self._velocity).all():
+            raise MapFileError("state velocity: expected finite numbers, got NaN or infinity")
         names = (*TrackedBy, "lost")
         self._lost_frames, *counts = get_counts(state, "counts", 1 + len(names))
         self._counts = Counter(dict(zip(map(str, names), counts, strict=True)))

@@ -14,9 +14,10 @@ from gausslite.domain.errors import InvalidInputError
 from gausslite.mapping.stages import SkippableStage, Stage
 from gausslite.mission.frame_scheduler import FrameScheduler, FrameTiming, SchedulerSettings, choose_skipped_stages
 
-STAGES_OF_RUN_FRAME = [step for step in Stage if step not in (Stage.REEVALUATION, Stage.PRUNING, Stage.DENSIFICATION)]
+_NOT_RUN = (Stage.TRACKING, Stage.REEVALUATION, Stage.PRUNING, Stage.DENSIFICATION)
+STAGES_OF_RUN_FRAME = [step for step in Stage if step not in _NOT_RUN]
 """The steps of `run_frame`."""
-CHEAP = {**dict.fromkeys(Stage, 1.0), Stage.FINALISATION: 0.0}
+CHEAP = {**dict.fromkeys(Stage, 1.0), Stage.FINALISATION: 0.0, Stage.TRACKING: 0.0}
 
 
 class WorkClock:

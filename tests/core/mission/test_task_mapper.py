@@ -72,9 +72,8 @@ def test_the_time_of_a_frame_includes_publishing() -> None:
     task_mapper = ticking_mapper(60.0)
     for index in range(4):
         budget = task_mapper.process(wall_frame(index, SIZE, shift_m=0.1 * index)).timing
-        assert set(Stage) - {Stage.PRUNING, Stage.DENSIFICATION, Stage.RENDERING, Stage.REEVALUATION} <= set(
-            budget.stages_s
-        )
+        optional = {Stage.TRACKING, Stage.PRUNING, Stage.DENSIFICATION, Stage.RENDERING, Stage.REEVALUATION}
+        assert set(Stage) - optional <= set(budget.stages_s)
         # an iteration takes one second plus some clock readings
         assert budget.seconds <= 60.0 + 8.0
         assert not budget.under_trained

@@ -34,7 +34,7 @@ from gausslite.perception.ground_truth import RegionDetector
 from gausslite.perception.relevance_estimator import RelevanceEstimator, TaskRelevanceEstimator
 from gausslite.task.rules import RuleParser
 from gausslite.v1 import agent_service_pb2 as pb
-from gausslite.wire import convert
+from gausslite.wire import convert, convert_task
 from gausslite.wire.clients import FusionClient
 from gausslite.wire.spool import Spool
 from gausslite.wire.uplink import Uplink
@@ -47,7 +47,7 @@ def test_a_task_is_text_or_a_graph() -> None:
         graph = a.client.assign_task(TASK)
         assert graph == RuleParser().parse(TASK)
         assert a.client.assign_task(graph) == graph
-        assert convert.graph_from_message(a.client.status().graph) == graph
+        assert convert_task.graph_from_message(a.client.status().graph) == graph
 
 
 def test_nouns_that_cannot_be_found_are_in_the_status_notes() -> None:
@@ -107,6 +107,19 @@ def test_each_frame_has_its_outcome_in_order() -> None:
     assert counts == (2, 1, 0, 1)
     assert status.gaussians == answers[3].gaussians > 0
     assert status.hz > 0
+
+
+def test_the_status_has_the_odometrys_correction() -> None:
+    with agent() as a:
+        a.client.assign_task(TASK)
+        assert not a.client.status().HasField("map_to_odom")
+        list(a.client.ingest(frame(index) for index in range(2)))
+        correction = a.client.status().map_to_odom
+    # poses are exact by default
+    np.testing.assert_allclose(convert.transform_from_message("t", correction.t_map_odometry), np.eye(4), atol=1e-12)
+    assert correction.capture_time_ns == frame(1).capture_time_ns
+    assert correction.age_seconds >= 0
+    assert correction.translation_std_m == 0
 
 
 def test_frames_of_a_distorted_moving_camera_are_corrected_and_mapped() -> None:

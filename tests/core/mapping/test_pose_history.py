@@ -1,0 +1,155 @@
+"""The pose history: corrections by time, their mean, a bounded size; anchored poses stay near the odometry's frame."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from mapping_scenes import middle_relevance, wall_frame
+
+from gausslite.domain.errors import GaussLiteError
+from gausslite.domain.frame import Frame
+from gausslite.domain.pose import inverse, transform_of, translation_m, twist_of
+from gausslite.domain.pose_correction import CorrectionTrack
+from gausslite.domain.pose_exposure_prior import PoseExposurePrior
+from gausslite.mapping import pose_history
+from gausslite.mapping.pose_history import PoseHistory
+from gausslite.mapping.view_refinement import RefinementSettings, ViewRefiner
+from gausslite.render.rasterizer import Rendering
+
+SMALL = wall_frame(size=(4, 3))
+
+
+def odometry(index: int, x_m: float = 0.0) -> Frame:
+    """Return a tiny frame at 10 Hz."""
+    return replace(SMALL, index=index, capture_time_ns=index * 100_000_000, T_world_camera=shift(x_m))
+
+
+def shift(x_m: float) -> np.ndarray:
+    return transform_of(np.array([x_m, 0.0, 0.0, 0.0, 0.0, 0.0]))
+
+
+def test_a_frame_refined_again_replaces_its_pose_and_counts_once() -> None:
+    history = PoseHistory()
+    for x_m in (0.1, 0.3):
+        history.record(odometry(0), shift(x_m))
+    history.record(odometry(1), shift(0.1))
+    assert len(history) == 2
+    np.testing.assert_allclose(history.mean_correction, [0.2, 0, 0, 0, 0, 0], atol=1e-12)
+    corrections = history.corrections()
+    assert corrections is not None
+    np.testing.assert_allclose(corrections.T_map_odometry[:, 0, 3], [0.3, 0.1])
+
+
+def test_the_correction_maps_the_odometrys_pose_to_the_maps() -> None:
+    rng = np.random.default_rng(0)
+    history, pairs = PoseHistory(), []
+    for index in range(5):
+        T_odometry, T_map = (transform_of(rng.normal(0, 1, 6)) for _ in range(2))
+        history.record(replace(odometry(index), T_world_camera=T_odometry), T_map)
+        pairs.append((T_odometry, T_map))
+    corrections, latest = history.corrections(), history.latest()
+    assert corrections is not None
+    assert latest is not None
+    for T_map_odometry, (T_odometry, T_map) in zip(corrections.T_map_odometry, pairs, strict=True):
+        np.testing.assert_allclose(T_map_odometry @ T_odometry, T_map, atol=1e-12)
+    np.testing.assert_array_equal(latest.T_map_odometry, corrections.T_map_odometry[-1])
+    assert latest.capture_time_ns == 400_000_000
+
+
+def test_the_uncertainty_is_the_change_between_successive_frames() -> None:
+    history = PoseHistory()
+    for index in range(10):
+        history.record(odometry(index), shift(0.03 * (index % 2)))
+    latest = history.latest()
+    assert latest is not None
+    assert latest.translation_std_m == pytest.approx(0.03 / np.sqrt(3))  # the change is along one of three axes
+    assert latest.rotation_std_deg == pytest.approx(0.0, abs=1e-9)
+
+
+def test_a_long_mission_keeps_the_newest_poses_and_thins_older_ones(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pose_history, "_MAX_POSES", 20)
+    history = PoseHistory()
+    for index in range(100):
+        history.record(odometry(index), shift(0.01))
+        assert len(history) <= 20
+    corrections = history.corrections()
+    assert corrections is not None
+    times = (corrections.times_ns // 100_000_000).tolist()
+    assert times[0] == 0
+    assert times[-5:] == [95, 96, 97, 98, 99]
+    np.testing.assert_allclose(history.mean_correction[0], 0.01)
+
+
+def test_a_restored_history_continues_with_the_same_bits() -> None:
+    rng = np.random.default_rng(1)
+    first, second = PoseHistory(), PoseHistory()
+    poses = [transform_of(rng.normal(0, 0.1, 6)) for _ in range(30)]
+    for index, T in enumerate(poses[:20]):
+        first.record(odometry(index % 13), T)
+    second.restore(first.state())
+    for index, T in enumerate(poses[20:]):
+        first.record(odometry(index), T)
+        second.record(odometry(index), T)
+    assert first.mean_correction.tobytes() == second.mean_correction.tobytes()
+
+
+@pytest.mark.parametrize("name", ["correction_sum", "T_world_map", "T_world_odometry"])
+@pytest.mark.parametrize("value", [np.nan, 1e30])
+def test_a_forged_state_is_refused(name: str, value: float) -> None:
+    history = PoseHistory()
+    history.record(odometry(0), shift(0.1))
+    state = {key: array.copy() for key, array in history.state().items()}
+    state[name].flat[3] = value
+    with pytest.raises(GaussLiteError, match="state"):
+        PoseHistory().restore(state)
+
+
+def test_corrections_between_frames_are_interpolated_and_live_ones_are_the_last() -> None:
+    track = CorrectionTrack(np.array([0, 100], np.int64), np.stack([shift(0.0), shift(1.0)]))
+    for time_ns, between, before in ((-5, 0.0, 0.0), (0, 0.0, 0.0), (25, 0.25, 0.0), (100, 1.0, 0.0), (300, 1.0, 1.0)):
+        assert track.interpolated(time_ns)[0, 3] == pytest.approx(between)
+        assert track.before(time_ns)[0, 3] == pytest.approx(before)
+    turned = CorrectionTrack(
+        np.array([0, 10], np.int64), np.stack([np.eye(4), transform_of(np.array([0, 0, 0, 0, 0, 1.0]))])
+    )
+    np.testing.assert_allclose(twist_of(turned.interpolated(5))[5], 0.5)
+
+
+def mean_drift_m(anchor_share: float) -> float:
+    """Return the mean correction after 40 frames, on a map that lies 2 mm beside the last refined pose."""
+    drift_m = 0.0
+
+    def render(_camera: object, T_world_camera: np.ndarray, _motion: object) -> Rendering:
+        shown = wall_frame(size=(96, 72), shift_m=float(T_world_camera[0, 3]) - drift_m)
+        return Rendering(shown.rgb / np.float32(255.0), shown.depth_m, np.ones_like(shown.depth_m), None)
+
+    refiner = ViewRefiner(RefinementSettings(PoseExposurePrior(1.0, 0.01), 0, anchor_share), render)
+    for index in range(40):
+        frame = replace(wall_frame(index, (96, 72)), T_world_camera=np.eye(4))
+        drift_m = float(refiner.refine(frame).T_world_camera[0, 3]) + 0.002
+    return float(refiner.history.mean_correction[0])
+
+
+def test_an_anchored_map_stays_near_the_odometry() -> None:
+    # without an anchor the drift grows by 2 mm a frame; a share of 0.1 ends it at ten times that
+    assert mean_drift_m(0.0) > 0.035
+    assert mean_drift_m(0.1) < 0.021
+
+
+def test_frames_with_exact_poses_have_no_correction() -> None:
+    from gausslite.mapping.mapper import GaussianMapper
+    from gausslite.mapping.settings import MapperSettings
+    from gausslite.render.cpu import CpuRasterizer
+
+    mapper = GaussianMapper(MapperSettings(max_gaussians=500), CpuRasterizer(threads=1))
+    for index in range(3):
+        frame = wall_frame(index, shift_m=0.05 * index)
+        mapped = mapper.map_frame(frame, middle_relevance(frame))
+        assert mapped.T_world_camera is not None
+        assert translation_m(mapped.T_world_camera, frame.T_world_camera) == 0
+    corrections = mapper.poses.corrections()
+    assert corrections is not None
+    assert corrections.is_identity
+    np.testing.assert_allclose(inverse(corrections.T_map_odometry[-1]), np.eye(4), atol=1e-12)
