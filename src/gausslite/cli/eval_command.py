@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
+
+from jaxtyping import Float64
+from numpy import ndarray
 
 from gausslite.cli.progress import print_above_bar, progress_bar
 from gausslite.cli.source_options import (
     add_regions,
     add_source,
     correct_with_warnings,
-    open_with_warnings,
+    open_recorded,
+    register_with_warnings,
     selected_regions,
 )
 from gausslite.codec.ply import read_ply
@@ -28,6 +32,7 @@ from gausslite.domain.camera_correction import CameraCorrection
 from gausslite.domain.depth_registration import DepthRegistration
 from gausslite.domain.errors import DatasetError, PoseError
 from gausslite.domain.frame import Frame
+from gausslite.domain.pose_correction import CorrectionTrack
 from gausslite.domain.region import Region
 from gausslite.evaluation.compare import MapScores, ViewScore, average, score_view
 from gausslite.evaluation.corrected import CorrectedScores
@@ -35,12 +40,22 @@ from gausslite.evaluation.fitted import render_fitted
 from gausslite.evaluation.pictures import comparison_sheet
 from gausslite.evaluation.views import MIN_ROI_PIXELS, HeldOutView, MapViewer, view_map
 from gausslite.mission.frame_stream import CorruptFrames
-from gausslite.mission.results import MAP_TO_ODOM, as_text, prepare_folder, read_corrections, read_report
+from gausslite.mission.results import (
+    MAP_TO_ODOM,
+    TRAJECTORY,
+    as_text,
+    prepare_folder,
+    read_corrections,
+    read_report,
+    read_trajectory,
+)
+from gausslite.mission.settings import PoseMode
 from gausslite.process.messages import print_message
 
 _PICTURES = 8
 _REGISTRATION_DEFAULT = f"that of the report next to MAP; {AUTO} without a report"
-_FIT_VIEWS_DEFAULT = "on if the report next to MAP states refined views"
+_FIT_VIEWS_DEFAULT = "as --poses"
+_POSES_DEFAULT = "as the report next to MAP states that the map was made, else given"
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -61,6 +76,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
         action=argparse.BooleanOptionalAction,
         help=f"fit pose and exposure of each view before scoring, for real cameras (default: {_FIT_VIEWS_DEFAULT})",
     )
+    parser.add_argument(
+        "--poses",
+        choices=[str(mode) for mode in PoseMode],
+        help="given: score views from the given poses; refine: fit each view first; track: also start from "
+        f"{TRAJECTORY} next to MAP, for tracked maps (default: {_POSES_DEFAULT})",
+    )
     parser.add_argument("--pictures", metavar="DIR", type=Path, help="write side-by-side pictures of a few views")
     add_threads(parser)
     add_switch(parser, "--json", "print JSON for scripts")
@@ -71,16 +92,16 @@ def run(options: argparse.Namespace) -> int:
     """Render the map from every selected frame with depth, and print the mean scores. Returns the exit code."""
     viewer = view_map(read_ply(options.map), threads=options.threads)
     conditions = _Conditions.of(options)
-    registered, _ = open_with_warnings(options.source, options.up, conditions.depth_registration, AUTO)
+    recorded = open_recorded(options.source, options.up, require_poses=conditions.trajectory is None)
+    registered, _ = register_with_warnings(options.source, recorded, conditions.depth_registration, AUTO)
     source, _ = correct_with_warnings(options.source, registered, conditions.camera_correction, AUTO)
     positions = _selected_positions(options, source)
     regions = selected_regions(options, source)
     if options.pictures is not None:
         prepare_folder(options.pictures)
     frames = _SelectedFrames(source, positions, frame_size(options.size, source), options.strict, options.json)
-    corrections = read_corrections(options.map.parent)
-    corrected = None if corrections is None or corrections.is_identity else CorrectedScores(corrections)
-    scores = _score_views(options, viewer, frames, regions, conditions.fit_views, corrected)
+    corrected = None if conditions.corrections is None else CorrectedScores(conditions.corrections)
+    scores = _score_views(options, viewer, frames, regions, conditions, corrected)
     if not scores:
         raise frames.corrupt.first_error or DatasetError(
             f"{options.source}: expected at least one frame with depth, got none"
@@ -106,11 +127,17 @@ def run(options: argparse.Namespace) -> int:
 
 @dataclass(frozen=True, slots=True)
 class _Conditions:
-    """Registration of the source, and whether views are fitted before they are scored."""
+    """Registration of the source, and how views are scored.
+
+    fit_views: their pose and exposure are fitted first. trajectory: returns the tracked pose at a time in nanoseconds;
+    None to start from the given poses. corrections: those published with the map; None if there are none to score.
+    """
 
     depth_registration: DepthRegistration | str | None
     camera_correction: CameraCorrection | str | None
     fit_views: bool
+    trajectory: Callable[[int], Float64[ndarray, "4 4"]] | None
+    corrections: CorrectionTrack | None
 
     @classmethod
     def of(cls, options: argparse.Namespace) -> _Conditions:
@@ -124,12 +151,18 @@ class _Conditions:
         if correction is None and "camera_correction" in report:
             correction = read_camera_correction(str(report["camera_correction"] or NONE))
             from_report += [] if correction.is_identity else [f"--camera-correction '{correction}'"]
-        if fit_views is None:
-            fit_views = report.get("view_error") is not None
-            from_report += ["--fit-views"] if fit_views else []
+        poses = options.poses
+        if poses is None and report.get("view_error") is not None:
+            poses = PoseMode.TRACK if report.get("poses") == PoseMode.TRACK else PoseMode.REFINE
+            from_report += [f"--poses {poses}"]
+        fit_views = poses in (PoseMode.REFINE, PoseMode.TRACK) if fit_views is None else fit_views
         if from_report:
             print_message(f"from the report next to {options.map.name}: {' '.join(from_report)}")
-        return cls(registration, correction, fit_views)
+        if poses == PoseMode.TRACK:
+            return cls(registration, correction, fit_views, read_trajectory(options.map.parent), None)
+        corrections = read_corrections(options.map.parent)
+        corrections = None if corrections is None or corrections.is_identity else corrections
+        return cls(registration, correction, fit_views, None, corrections)
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,17 +203,19 @@ def _score_views(
     viewer: MapViewer,
     frames: _SelectedFrames,
     regions: Sequence[Region],
-    fit_views: bool,
+    conditions: _Conditions,
     corrected: CorrectedScores | None,
 ) -> list[ViewScore]:
     """Return the scores of all views with depth, and add those of corrected poses; write pictures of some views."""
     pictured = set(frames.positions[:: max(1, len(frames.positions) // _PICTURES)])
     scores = []
     for position, frame in frames:
+        if conditions.trajectory is not None:
+            frame = replace(frame, T_world_camera=conditions.trajectory(frame.capture_time_ns))
         view = HeldOutView.of(frame, regions)
         if not view.frame.has_depth:
             continue
-        rendered = render_fitted(viewer, view.frame) if fit_views else viewer.render_frame(view.frame)
+        rendered = render_fitted(viewer, view.frame) if conditions.fit_views else viewer.render_frame(view.frame)
         scores.append(score_view(rendered, view))
         if corrected is not None:
             corrected.add(viewer, view)

@@ -51,14 +51,19 @@ class CorrectionTrack:
 
         It uses the frame after this time, so it is known only once that frame is mapped.
         """
-        after = int(np.searchsorted(self.times_ns, time_ns))
-        before, after = max(after - 1, 0), min(after, len(self.times_ns) - 1)
-        gap_ns = int(self.times_ns[after] - self.times_ns[before])
-        if gap_ns == 0:
-            return self.T_map_odometry[after]
-        share = min(max((time_ns - int(self.times_ns[before])) / gap_ns, 0.0), 1.0)
-        return interpolate_poses(self.T_map_odometry[before], self.T_map_odometry[after], share)
+        return pose_at(self.times_ns, self.T_map_odometry, time_ns)
 
     def before(self, time_ns: int) -> Float64[ndarray, "4 4"]:
         """Return T_map_odometry of the last frame before a time, or of the first frame: what a live robot can use."""
         return self.T_map_odometry[max(int(np.searchsorted(self.times_ns, time_ns)) - 1, 0)]
+
+
+def pose_at(times_ns: Int64[ndarray, " n"], T: Float64[ndarray, "n 4 4"], time_ns: int) -> Float64[ndarray, "4 4"]:
+    """Return the pose at a time: linear in position and angle between two ascending times, constant beyond the ends."""
+    after = int(np.searchsorted(times_ns, time_ns))
+    before, after = max(after - 1, 0), min(after, len(times_ns) - 1)
+    gap_ns = int(times_ns[after] - times_ns[before])
+    if gap_ns == 0:
+        return T[after]
+    share = min(max((time_ns - int(times_ns[before])) / gap_ns, 0.0), 1.0)
+    return interpolate_poses(T[before], T[after], share)

@@ -7,15 +7,19 @@ import json
 import math
 import resource
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
+
+from jaxtyping import Float64
+from numpy import ndarray
 
 from gausslite.codec.files import write_atomic
 from gausslite.codec.ply import write_ply
 from gausslite.datasets.pose_file import format_pose_rows, read_pose_rows
 from gausslite.domain.errors import StorageError
 from gausslite.domain.gaussians import Gaussians
-from gausslite.domain.pose_correction import CorrectionTrack
+from gausslite.domain.pose_correction import CorrectionTrack, pose_at
 from gausslite.mapping.pose_history import PoseHistory
 
 _MAP, _REPORT = "map.ply", "report.json"
@@ -95,6 +99,12 @@ def read_corrections(folder: Path) -> CorrectionTrack | None:
     """Return the corrections of map_to_odom.txt; None without the file. Raises DatasetError, PoseError."""
     path = folder / MAP_TO_ODOM
     return CorrectionTrack(*read_pose_rows(path)) if path.is_file() else None
+
+
+def read_trajectory(folder: Path) -> Callable[[int], Float64[ndarray, "4 4"]]:
+    """Return a function from a time in nanoseconds to T_map_camera, interpolated. Raises DatasetError, PoseError."""
+    times_ns, T_map_camera = read_pose_rows(folder / TRAJECTORY)
+    return partial(pose_at, times_ns, T_map_camera)
 
 
 def read_report(folder: Path) -> Mapping[str, object]:
