@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float32, Float64
 from numpy import ndarray
 
-from gausslite.calibration.camera_timing import estimate_camera_timing
+from gausslite.calibration.camera_estimate import estimate_camera
 from gausslite.calibration.pose_exposure_error import estimate_pose_exposure_prior
 from gausslite.calibration.registration import find_registration
 from gausslite.codec.ply import read_ply, write_ply
@@ -140,8 +140,10 @@ def open_calibrated(spec: str | Path, *, up_axis: UpAxis | None = None) -> Calib
     if is_simulated(str(spec)):
         return CalibratedSequence(source, PoseExposurePrior(), tuple(notes))
     if source.depth_registered:
-        correction, note = estimate_camera_timing(source, CameraCorrection(source.lens))
-        notes.append(f"camera correction {'none' if correction.is_identity else correction}: {note}")
+        estimate = estimate_camera(source, CameraCorrection(source.lens))
+        correction = estimate.correction
+        evidence = "; ".join(estimate.evidence)
+        notes.append(f"camera correction {'none' if correction.is_identity else correction}: {evidence}")
         source = source if correction.is_identity else CorrectedSource(source, correction)
     prior, note = estimate_pose_exposure_prior(source)
     notes.append(f"pose prior {'none' if prior.is_exact else prior}: {note}")

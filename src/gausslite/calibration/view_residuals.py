@@ -15,7 +15,7 @@ MAX_RELATIVE_DEPTH_ERROR = 0.05
 """Rendered and measured depth within this fraction belong to the same surface."""
 OPAQUE_ALPHA = 0.8
 """Pixels of a higher alpha count as covered by the map."""
-_MAX_PIXELS = 12_000
+MAX_PIXELS = 12_000
 _CORRELATED_PX = 64.0
 """Residuals of neighbouring pixels are correlated: one pixel in a cell of 8x8 counts as independent."""
 _OUTLIER_STDS, _MIN_RESIDUAL_STD = 2.0, 0.005
@@ -70,4 +70,4 @@ def shrinkage(prior_std: float, fit_std: float) -> float:
 
 def _grid_stride(rendering: Rendering) -> int:
     height, width = rendering.alpha.shape
-    return int(np.ceil(np.sqrt(height * width / _MAX_PIXELS)))
+    return int(np.ceil(np.sqrt(height * width / MAX_PIXELS)))

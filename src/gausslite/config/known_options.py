@@ -7,9 +7,9 @@ from typing import Final
 
 KNOWN_OPTIONS: Final = frozenset(
     {
-        *("absent", "after", "agent-id", "backend", "before", "camera-correction", "changes"),
+        *("absent", "after", "agent-id", "backend", "before", "blur", "camera-correction", "changes"),
         *("deadline-slack", "details", "detector", "disable", "drain-timeout", "equal", "exit-when-done"),
-        *("external-rasterizer", "fit-views", "frames", "frames-a", "frames-b", "fusion", "gaussians"),
+        *("external-rasterizer", "fit-views", "frame-alignment", "frames", "frames-a", "frames-b", "fusion", "gaussians"),
         *(
             "grace-period",
             "handover",
@@ -21,6 +21,7 @@ KNOWN_OPTIONS: Final = frozenset(
             "listen",
             "llm-format",
         ),
+        *("lens", "shutter", "speeds"),
         *("llm-key-variable", "llm-model", "llm-timeout", "llm-url", "loop", "lpips-weights", "map", "masks"),
         *("max-gaussians", "min-iterations", "mission", "objects", "out", "overwrite", "pair", "pairs"),
         *("parser", "perception", "pictures", "policies", "policy", "pose-prior", "poses", "preset", "queue"),

@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, Float64
+from jaxtyping import Float32, Float64, UInt8
 from numpy import ndarray
 
 from gausslite.domain.camera import Camera
@@ -73,18 +73,15 @@ def correct_frame(frame: Frame, correction: CameraCorrection, ideal: Camera, twi
     )
 
 
-def correct_by_own_motion(frame: Frame, lens: Lens | None) -> Frame:
-    """Return a frame without lens distortion and rolling shutter, by the motion that the frame itself states.
-
-    For frames of a live camera, whose other poses are not known. Raises InvalidInputError for a lens without a usable
-    pinhole camera.
-    """
-    motion = frame.motion or CameraMotion(Twist(np.zeros(3), np.zeros(3)))
-    correction = CameraCorrection(lens, motion.readout_s, exposure_s=motion.exposure_s)
-    if correction.is_identity:
-        return frame
-    speed_rad_s = float(np.linalg.norm(motion.twist.angular_rad_s))
-    return correct_frame(frame, correction, ideal_camera(frame.camera, correction, speed_rad_s), motion.twist)
+def undistort_colour(rgb: UInt8[ndarray, "h w 3"], camera: Camera, lens: Lens) -> UInt8[ndarray, "h w 3"]:
+    """Return the image as a pinhole camera with these intrinsics would have recorded it; borders are repeated."""
+    still = Twist(np.zeros(3), np.zeros(3))
+    no_depth = np.zeros(rgb.shape[:2], np.float32)
+    columns, rows = _lookup(camera, CameraCorrection(lens), camera, still, no_depth)
+    undistorted: UInt8[ndarray, "h w 3"] = cv2.remap(
+        rgb, columns, rows, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE
+    )
+    return undistorted
 
 
 def _undistorted(camera: Camera, lens: Lens) -> Camera:

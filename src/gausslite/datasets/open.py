@@ -12,6 +12,7 @@ from gausslite.datasets.replica import ReplicaSource
 from gausslite.datasets.sevenscenes import SevenScenesSource
 from gausslite.datasets.source import Source
 from gausslite.datasets.tum import TumSource
+from gausslite.datasets.undistorted_colour import UndistortedColourSource
 from gausslite.domain.depth_registration import DepthRegistration
 from gausslite.domain.errors import DatasetError, PoseError
 from gausslite.domain.pose import UpAxis
@@ -34,10 +35,13 @@ def open_source(
     """Return the sequence in a folder, or a simulated one ("sim:home?seed=0&trajectory=0").
 
     A folder that contains exactly one sequence folder also works. depth_registration: the colour camera to which depth
-    is registered; None if the recording is registered. require_poses: False also accepts frames and sequences without
+    is registered; None if the recording is registered. A lens that is stated for unregistered depth is the colour
+    camera's alone; colour images are undistorted. require_poses: False also accepts frames and sequences without
     poses, for tracking; these frames get the identity. Raises DatasetError, PoseError, InvalidInputError.
     """
     source = _open(spec, up_axis, require_poses)
+    if source.lens is not None and not source.depth_registered:
+        source = UndistortedColourSource(source)
     return source if depth_registration is None else RegisteredSource(source, depth_registration)
 
 

@@ -6,6 +6,7 @@ import argparse
 from collections.abc import Callable
 
 from gausslite_bench.cli.budget import configure_budget
+from gausslite_bench.cli.camera import configure_camera
 from gausslite_bench.cli.gpu import configure_gpu
 from gausslite_bench.cli.loop import configure_loop
 from gausslite_bench.cli.parser import configure_parser
@@ -61,6 +62,12 @@ _BENCHMARKS: dict[str, tuple[Callable[[argparse.ArgumentParser], None], str, str
         "gain of the task policy against Gaussians, image size and iterations",
         "Map scenes with the task policy and with uniform mapping at several budgets. The table, and with the extra "
         "plots a figure, show the gain in the region and over the full image.",
+    ),
+    "camera": (
+        configure_camera,
+        "map quality with rolling shutter, motion blur and lens distortion",
+        "Map one walk with an ideal camera and with a real one at several angular speeds: uncorrected, corrected with "
+        "the true values, and corrected with estimates.",
     ),
     "task-change": (
         configure_task_change,

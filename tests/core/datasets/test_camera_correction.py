@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from tiny_sequences import write_replica, write_seven_scenes, write_tum
 
 from gausslite.datasets.camera_correction import correct_frame, ideal_camera
 from gausslite.datasets.corrected_source import CorrectedSource
@@ -80,7 +83,8 @@ def test_the_identity_is_recognised_and_text_round_trips() -> None:
 
 
 @pytest.mark.parametrize(
-    "text", ["", "readout", "readout=x", "readout=0.5", "offset=2", "speed=1", "readout=0;readout=0"]
+    "text",
+    ["", "readout", "readout=x", "readout=0.5", "offset=2", "speed=1", "readout=0;readout=0", "exposure=-1"],
 )
 def test_a_wrong_correction_is_rejected(text: str) -> None:
     with pytest.raises(InvalidInputError, match=r"camera|lens"):
@@ -129,3 +133,102 @@ def test_the_published_lens_of_fr1_is_used(shared_dir: Path) -> None:
     frame = corrected.frame(4, (320, 240))
     assert frame.camera == corrected.camera.resized(320, 240)
     assert (frame.depth_m > 0).mean() > 0.7
+
+
+def test_a_lens_stated_for_unregistered_depth_corrects_colour_alone(tmp_path: Path) -> None:
+    folder = write_seven_scenes(tmp_path / "seq")
+    plain = open_source(str(folder)).frame(1)
+    (folder / "camera-intrinsics.txt").unlink()
+    camera = {"w": 16, "h": 12, "fx": 20, "fy": 20, "cx": 7.5, "cy": 5.5, "scale": 1000, "distortion": [-0.3, 0, 0, 0]}
+    (folder / "cam_params.json").write_text(json.dumps({"camera": camera}))
+    source = open_source(str(folder))
+    frame = source.frame(1)
+    assert source.lens is None
+    assert frame.camera == plain.camera
+    np.testing.assert_array_equal(frame.depth_m, plain.depth_m)
+    K, D = np.array([[20.0, 0, 7.5], [0, 20.0, 5.5], [0, 0, 1]]), np.array([-0.3, 0, 0, 0])
+    maps = cv2.initUndistortRectifyMap(K, D, np.eye(3), K, (16, 12), cv2.CV_32FC1)
+    expected = cv2.remap(plain.rgb, *maps, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    # the lookup is interpolated between every fourth pixel, and these images are noise
+    assert np.abs(frame.rgb.astype(int) - expected).mean() < 8 < np.abs(plain.rgb.astype(int) - expected).mean()
+
+
+LENSES = {
+    "radtan5": ("plumb_bob", (0.1, -0.2, 0.001, 0.002, 0.05)),
+    "radtan8": ("rational_polynomial", (0.1, -0.2, 0.001, 0.002, 0.05, 0.3, 0.02, 0.01)),
+    "fisheye": ("equidistant", (0.05, 0.01, -0.002, 0.0005)),
+}
+
+
+@pytest.mark.parametrize("layout", [write_tum, write_seven_scenes, write_replica])
+@pytest.mark.parametrize("name", LENSES)
+def test_every_layout_reads_the_lens_of_a_json_camera(
+    tmp_path: Path, layout: Callable[[Path], Path], name: str
+) -> None:
+    model, coefficients = LENSES[name]
+    folder = layout(tmp_path / "seq")
+    camera = {"w": 16, "h": 12, "fx": 20.0, "fy": 20.0, "cx": 7.5, "cy": 5.5, "scale": 1000.0}
+    lens = {"distortion_model": model, "distortion": coefficients}
+    (folder / "cam_params.json").write_text(json.dumps({"camera": {**camera, **lens}}))
+    found = read_folder_camera(folder, 16, 12)
+    assert found is not None
+    expected = LensModel.FISHEYE if name == "fisheye" else LensModel.RADTAN
+    assert found.lens == Lens(expected, coefficients)
+    source = open_source(str(folder))
+    assert source.lens == (found.lens if source.depth_registered else None)
+
+
+@pytest.mark.parametrize("name", LENSES)
+def test_camera_info_states_every_lens_model(tmp_path: Path, name: str) -> None:
+    model, coefficients = LENSES[name]
+    (tmp_path / "camera_info.yaml").write_text(
+        f"image_width: 16\nimage_height: 12\ndistortion_model: {model}\n"
+        "camera_matrix: {data: [20, 0, 7.5, 0, 20, 5.5, 0, 0, 1]}\n"
+        f"distortion_coefficients: {{data: {list(coefficients)}}}\n"
+    )
+    found = read_folder_camera(tmp_path, 16, 12)
+    assert found is not None
+    assert found.lens == Lens(LensModel.FISHEYE if name == "fisheye" else LensModel.RADTAN, coefficients)
+
+
+@pytest.mark.parametrize(
+    ("line", "coefficients"),
+    [
+        ("1 SIMPLE_PINHOLE 16 12 20 8 6", None),
+        ("1 PINHOLE 16 12 20 20 8 6", None),
+        ("1 SIMPLE_RADIAL 16 12 20 8 6 0.1", (0.1, 0.0, 0.0, 0.0)),
+        ("1 RADIAL 16 12 20 8 6 0.1 -0.2", (0.1, -0.2, 0.0, 0.0)),
+        ("1 OPENCV 16 12 20 20 8 6 0.1 -0.2 0.01 0.02", (0.1, -0.2, 0.01, 0.02)),
+        (
+            "1 FULL_OPENCV 16 12 20 20 8 6 0.1 -0.2 0.01 0.02 0.3 0.4 0.5 0.6",
+            (0.1, -0.2, 0.01, 0.02, 0.3, 0.4, 0.5, 0.6),
+        ),
+    ],
+)
+def test_colmap_models_become_opencv_coefficients(
+    tmp_path: Path, line: str, coefficients: tuple[float, ...] | None
+) -> None:
+    (tmp_path / "cameras.txt").write_text(f"# Camera list\n{line}\n")
+    found = read_folder_camera(tmp_path, 16, 12)
+    assert found is not None
+    assert found.camera == Camera(20.0, 20.0, 8.0, 6.0, 16, 12)
+    assert found.lens == (None if coefficients is None else Lens(LensModel.RADTAN, coefficients))
+
+
+@pytest.mark.parametrize(
+    ("name", "k1"), [("rgbd_dataset_freiburg1_desk", 0.2624), ("fr2_desk", 0.2312), ("freiburg3_office", None)]
+)
+def test_the_published_lens_follows_the_folders_name(tmp_path: Path, name: str, k1: float | None) -> None:
+    lens = open_source(str(write_tum(tmp_path / name))).lens
+    assert (None if lens is None else lens.coefficients[0]) == k1
+
+
+def test_exposure_time_becomes_the_frames_motion() -> None:
+    frame = frame_of(texture(*slopes(CAMERA)))
+    twist = Twist(np.array([0.1, 0.0, 0.0]), np.array([0.0, 0.5, 0.0]))
+    correction = CameraCorrection(readout_s=0.02, exposure_s=0.01)
+    motion = correct_frame(frame, correction, CAMERA, twist).motion
+    assert motion is not None
+    assert (motion.readout_s, motion.exposure_s, motion.twist) == (0.0, 0.01, twist)
+    assert correct_frame(frame, CameraCorrection(readout_s=0.02), CAMERA, twist).motion is None
+    assert CameraCorrection.parse(str(correction)) == correction

@@ -1,0 +1,127 @@
+"""Pairs of frames on moving stretches, and how far they disagree under a camera correction.
+
+A frame is warped into a later one by depth and both poses, and the later frame's pose is fitted to the result. A wrong
+lens or wrong times leave a photometric residual, and a rotation that the fit needs.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from gausslite.calibration.pose_exposure_error import warp_into
+from gausslite.calibration.pose_fit import fit_pose, luminance_residual
+from gausslite.calibration.view_residuals import MAX_PIXELS, comparable_pixels
+from gausslite.datasets.camera_correction import correct_frame
+from gausslite.datasets.images import RgbdImage, resize_rgbd
+from gausslite.datasets.source import Source
+from gausslite.domain.camera_correction import CameraCorrection
+from gausslite.domain.errors import DatasetError, PoseError
+from gausslite.domain.frame import Frame
+from gausslite.domain.pose import inverse, twist_of
+from gausslite.domain.pose_exposure_prior import HANDHELD_PRIOR
+from gausslite.domain.trajectory import Trajectory
+
+_MAX_PAIRS = 16
+_MIN_COMPARABLE_SHARE = 0.08
+"""Share of the pixels of the grid of `comparable_pixels`; less overlap makes the pose fit unreliable."""
+_MIN_SPEED_RAD_S = math.radians(8.0)
+"""Slower cameras move rows by less than a pixel in a readout of 30 ms."""
+_PAIR_TURN_RAD = math.radians(8.0)
+
+
+@dataclass(frozen=True, slots=True)
+class PairError:
+    """Disagreement of frame pairs: robust residual of the luminance (0 to 255), and rotation of the pose fit."""
+
+    residual: float
+    rotation_deg: float
+    pairs: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MovingPairs:
+    """Pairs of positions with their recorded frames, and the poses of the whole source."""
+
+    trajectory: Trajectory
+    pairs: Sequence[tuple[int, int]]
+    frames: Mapping[int, Frame]
+
+    @classmethod
+    def read(cls, source: Source, size: tuple[int, int]) -> MovingPairs:
+        """Read the pairs of a source at this size; frames that cannot be read are absent."""
+        trajectory = source.trajectory()
+        pairs = fastest_pairs(trajectory)
+        return cls(trajectory, pairs, read_frames(source, sorted({i for pair in pairs for i in pair}), size))
+
+    def halved(self) -> MovingPairs:
+        """Return the pairs with frames of half the width and height, for a coarse search in a quarter of the time."""
+        frames = {}
+        for i, frame in self.frames.items():
+            size = max(frame.camera.width_px // 2, 16), max(frame.camera.height_px // 2, 16)
+            image = resize_rgbd(RgbdImage(frame.rgb, frame.depth_m, frame.camera), size)
+            frames[i] = replace(frame, rgb=image.rgb, depth_m=image.depth_m, camera=image.camera)
+        return MovingPairs(self.trajectory, self.pairs, frames)
+
+    def error(self, correction: CameraCorrection) -> PairError:
+        """Return how far the pairs disagree once corrected, each after a fit of pose and exposure.
+
+        The camera of the corrected images does not depend on the correction, so that residuals can be compared.
+        """
+        corrected = {
+            i: correct_frame(frame, correction, frame.camera, self.trajectory.twist(i))
+            for i, frame in self.frames.items()
+        }
+        residuals, rotations_deg = [], []
+        for i, j in self.pairs:
+            first, second = corrected.get(i), corrected.get(j)
+            if first is None or second is None:
+                continue
+            warped = warp_into(first, second)
+            if len(comparable_pixels(warped, second)) < _MIN_COMPARABLE_SHARE * min(warped.alpha.size, MAX_PIXELS):
+                continue
+            T_world_fitted = fit_pose(warped, inverse(second.T_world_camera), second, HANDHELD_PRIOR)
+            residuals.append(255.0 * luminance_residual(warped, second, T_world_fitted))
+            change = twist_of(inverse(second.T_world_camera) @ T_world_fitted)
+            rotations_deg.append(math.degrees(float(np.linalg.norm(change[3:]))))
+        if not residuals:
+            return PairError(math.inf, math.inf, 0)
+        return PairError(float(np.mean(residuals)), float(np.median(rotations_deg)), len(residuals))
+
+
+def fastest_pairs(trajectory: Trajectory) -> list[tuple[int, int]]:
+    """Return positions of frame pairs on the fastest stretches; the second is turned by about 8 degrees."""
+    speeds = trajectory.angular_speeds_rad_s()
+    separation = max(1, len(speeds) // (2 * _MAX_PAIRS))
+    pairs: list[tuple[int, int]] = []
+    for i in np.argsort(-speeds).tolist():
+        if len(pairs) == _MAX_PAIRS or speeds[i] < _MIN_SPEED_RAD_S:
+            break
+        if all(abs(i - first) >= separation for first, _ in pairs):
+            second = _first_turned(trajectory, i)
+            if second is not None:
+                pairs.append((i, second))
+    return pairs
+
+
+def read_frames(source: Source, positions: Sequence[int], size: tuple[int, int]) -> dict[int, Frame]:
+    """Return the frames that can be read, by position."""
+    frames = {}
+    for position in positions:
+        with contextlib.suppress(DatasetError, PoseError):
+            frames[position] = source.frame(position, size)
+    return frames
+
+
+def _first_turned(trajectory: Trajectory, i: int) -> int | None:
+    R_world_first = trajectory.T_world_camera[i][:3, :3]
+    for j in range(i + 1, len(trajectory.times_s)):
+        turn = cv2.Rodrigues(R_world_first.T @ trajectory.T_world_camera[j][:3, :3])[0]
+        if np.linalg.norm(turn) >= _PAIR_TURN_RAD:
+            return j
+    return len(trajectory.times_s) - 1 if i + 1 < len(trajectory.times_s) else None

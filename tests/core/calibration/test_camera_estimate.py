@@ -1,0 +1,55 @@
+"""Lens, readout time, time offset and exposure time of simulated cameras with a known truth."""
+
+from __future__ import annotations
+
+import pytest
+
+from gausslite.calibration.camera_estimate import estimate_camera
+from gausslite.calibration.exposure_time import estimate_exposure_time
+from gausslite.datasets.open import open_source
+from gausslite.domain.camera_correction import CameraCorrection
+from gausslite.domain.lens import Lens, LensModel
+
+pytest.importorskip("embreex", reason="the simulated home needs the extra `sim`")
+
+HOME = "sim:home-1?frames=90&size=160x120&noise=0&exposure=0"
+PINHOLE = Lens(LensModel.RADTAN, (0.0, 0.0, 0.0, 0.0))
+
+
+def test_lens_and_readout_of_a_turning_camera_are_estimated() -> None:
+    source = open_source(f"{HOME}&speed=60&shutter=30ms&lens=radtan:-0.2,0,0,0")
+    estimate = estimate_camera(source, CameraCorrection())
+    found = estimate.correction
+    assert found.readout_s == pytest.approx(0.03, abs=0.003)
+    assert abs(found.time_offset_s) <= 0.003
+    assert found.lens is not None
+    k1, k2 = found.lens.coefficients[:2]
+    # distortion at a typical distance from the centre, half of the image's width
+    assert k1 + 0.35 * k2 == pytest.approx(-0.2, abs=0.02)
+    assert [line.partition(":")[0] for line in estimate.evidence] == ["lens", "readout and offset", "exposure"]
+
+
+def test_a_known_lens_is_kept() -> None:
+    estimate = estimate_camera(open_source(f"{HOME}&speed=60&shutter=30ms"), CameraCorrection(PINHOLE))
+    assert estimate.correction.lens == PINHOLE
+    assert estimate.correction.readout_s == pytest.approx(0.03, abs=0.003)
+    assert len(estimate.evidence) == 2
+
+
+def test_the_exposure_time_is_estimated_from_blur() -> None:
+    spec = "sim:home-1?frames=90&size=320x240&exposure=0&speed=60&blur=10ms"
+    exposure_s, evidence = estimate_exposure_time(open_source(spec), CameraCorrection())
+    assert exposure_s == pytest.approx(0.01, abs=0.001)
+    assert "pairs of a fast and a slower frame" in evidence
+
+
+def test_an_ideal_camera_is_left_alone() -> None:
+    estimate = estimate_camera(open_source(f"{HOME}&speed=60"), CameraCorrection())
+    assert estimate.correction.is_identity
+    assert all("not used" in line or "expected at least" in line for line in estimate.evidence), estimate.evidence
+
+
+def test_a_slow_camera_gives_no_estimate() -> None:
+    estimate = estimate_camera(open_source(f"{HOME}&speed=2&shutter=30ms"), CameraCorrection())
+    assert estimate.correction.is_identity
+    assert "turn fast enough" in estimate.evidence[0]
