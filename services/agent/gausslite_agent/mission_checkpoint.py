@@ -14,7 +14,7 @@ from gausslite.domain.state import State, encode_text, get_array, get_counts, ge
 from gausslite.domain.task import TaskGraph
 from gausslite.mission.checkpoint import SavedRun
 from gausslite.v1 import task_pb2
-from gausslite.wire.convert import graph_from_message, graph_to_message
+from gausslite.wire.convert_task import graph_from_message, graph_to_message
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,9 +8,11 @@ from dataclasses import replace
 from typing import Any
 
 from gausslite.domain.errors import InvalidInputError
+from gausslite.domain.frame import Frame
 from gausslite.domain.task import TaskGraph
 from gausslite.domain.voxel_operations import crop_to_box
 from gausslite.mapping.mapper import GaussianMapper
+from gausslite.mission.live_frame import correct_live_frame
 from gausslite.task.parser import TaskParser
 from gausslite.v1 import agent_service_pb2 as pb
 from gausslite.v1 import agent_service_pb2_grpc as pb_grpc
@@ -18,11 +20,10 @@ from gausslite.wire.change_notifier import ChangeNotifier
 from gausslite.wire.convert import (
     box_from_message,
     camera_from_message,
-    graph_from_message,
-    graph_to_message,
     live_frame_from_message,
     transform_from_message,
 )
+from gausslite.wire.convert_task import graph_from_message, graph_to_message
 from gausslite.wire.map_blocks import map_blocks
 from gausslite.wire.server import Service
 from gausslite.wire.uplink_values import UplinkCounters
@@ -164,9 +165,14 @@ class AgentServicer(pb_grpc.AgentServiceServicer):
 
     async def _submit(self, request: pb.IngestFramesRequest) -> asyncio.Future[FrameReport]:
         try:
-            frame = await asyncio.to_thread(live_frame_from_message, request.frame)
+            frame = await asyncio.to_thread(_decode_frame, request)
         except InvalidInputError as error:
             rejected: asyncio.Future[FrameReport] = asyncio.get_running_loop().create_future()
             rejected.set_result(self._worker.reject(request.frame.index, str(error)))
             return rejected
         return asyncio.wrap_future(self._mission.submit(frame))
+
+
+def _decode_frame(request: pb.IngestFramesRequest) -> Frame:
+    """Return the frame without lens distortion and rolling shutter. Raises InvalidInputError and subclasses."""
+    return correct_live_frame(*live_frame_from_message(request.frame))

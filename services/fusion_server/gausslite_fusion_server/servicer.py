@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import asyncio
 import functools
+import logging
 from collections.abc import AsyncIterator, Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, TypeVar
@@ -18,10 +19,11 @@ from gausslite.domain.errors import (
     QuotaError,
     RevisionGoneError,
 )
+from gausslite.domain.names import require_name
 from gausslite.domain.objects import ObjectReport
 from gausslite.domain.voxel_batch import VoxelBatch
 from gausslite.fusion.engine import FusionEngine
-from gausslite.fusion.fused_map import FusedMapChanges
+from gausslite.fusion.fused_map import FusedMapChanges, MapLayer
 from gausslite.fusion.mission_config import MissionConfig
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.v1 import fusion_service_pb2_grpc as pb_grpc
@@ -29,19 +31,23 @@ from gausslite.v1.gaussians_pb2 import MapBlock
 from gausslite.wire.change_notifier import ChangeNotifier
 from gausslite.wire.convert import (
     box_from_message,
-    graph_from_message,
+    camera_from_message,
     grid_from_message,
     grid_to_message,
+    transform_from_message,
 )
 from gausslite.wire.convert_objects import object_to_message, report_from_message
+from gausslite.wire.convert_task import graph_from_message
 from gausslite.wire.server import Service
 from gausslite.wire.tls import require_agent_certificate
 from gausslite_fusion_server.change_blocks import change_blocks
 from gausslite_fusion_server.contributions import store_keyframe, store_subset
 from gausslite_fusion_server.drain_gate import DrainGate
-from gausslite_fusion_server.messages import contribution_to_message
+from gausslite_fusion_server.map_renderer import MapRenderer
+from gausslite_fusion_server.messages import contribution_to_message, layer_from_message
 from gausslite_fusion_server.refinement_worker import RefinementWorker, RefineRequest
 
+_log = logging.getLogger(__name__)
 _CHUNK_BYTES = 1 << 20
 _MAX_REPORTED_REJECTIONS = 1000
 _WORKERS = 4
@@ -56,6 +62,10 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         self._engine = engine
         self._refinement_worker = refinement_worker
         self._workers = ThreadPoolExecutor(_WORKERS, "fusion")
+        # one thread: an estimate of frames or a rendering must not delay the acknowledgements
+        self._background = ThreadPoolExecutor(1, "background")
+        self._aligning = False
+        self._renderer = MapRenderer(engine, refinement_worker.create_rasterizer)
         self._map_changes = ChangeNotifier()
         self._gate = DrainGate()
 
@@ -73,6 +83,7 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
 
     def close(self) -> None:
         """Wait until the work in threads has ended."""
+        self._background.shutdown(wait=True, cancel_futures=True)
         self._workers.shutdown(wait=True)
         self._refinement_worker.close()
 
@@ -83,6 +94,9 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         requested = MissionConfig(request.mission_id, request.world_frame, grid.size_m)
         task = graph_from_message(request.task) if request.HasField("task") else None
         joined = await self._work(self._engine.join, request.agent_id, requested, request.fresh_map)
+        if request.HasField("t_fused_agent"):
+            T_fused_agent = transform_from_message("t_fused_agent", request.t_fused_agent)
+            await self._work(self._engine.declare_frame, request.agent_id, T_fused_agent)
         if task is not None:
             report = ObjectReport(task, self._engine.reported_objects(request.agent_id, task))
             await self._work(self._engine.report_objects, joined.session.session_id, report)
@@ -106,6 +120,7 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         async for request in self._gate.admit(request_iterator):
             outcome = await self._work(store_subset, self._engine, request)
             self._map_changes.notify()
+            self._align_in_background()
             acknowledged = max(acknowledged, request.sequence)
             yield pb.ContributeSubsetsResponse(acknowledged=acknowledged, outcomes=[outcome])
 
@@ -130,16 +145,18 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         """Send the map, then its changes. A slow watcher gets several changes as one; nothing is queued."""
         self._engine.require_mission(request.mission_id)
         region = box_from_message(request.region) if request.HasField("region") else None
-        changes = await self._work(self._engine.maps.changes, request.since_revision)
+        layer, excluded = layer_from_message(request.layer), request.exclude_agent_id
+        require_name("exclude_agent_id", excluded)
+        changes = await self._work(self._engine.maps.changes, request.since_revision, layer, excluded)
         while True:
             blocks = change_blocks(changes, self._engine.grid, region)
             while (block := await self._work(_next_block, blocks)) is not None:
                 yield pb.WatchFusedMapResponse(block=block)
             changed = self._map_changes.subscribe()
-            while self._engine.revision == changes.revision and self._gate.is_open:
+            while self._engine.maps.revision(layer) == changes.revision and self._gate.is_open:
                 await changed.wait()
                 changed = self._map_changes.subscribe()
-            changes = await self._work(self._changes_or_snapshot, changes.revision)
+            changes = await self._work(self._changes_or_snapshot, changes.revision, layer, excluded)
 
     async def RefineFusedMap(
         self, request: pb.RefineFusedMapRequest, context: Any
@@ -158,6 +175,7 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
                 gaussians=progress.gaussians,
             )
             yield response
+        self._map_changes.notify()
         response.done = True
         yield response
 
@@ -184,6 +202,16 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         objects = await self._work(self._engine.query_objects, request.noun)
         return pb.QueryObjectsResponse(objects=[object_to_message(each.landmark, each.observers) for each in objects])
 
+    async def RenderView(self, request: pb.RenderFusedViewRequest, context: Any) -> pb.RenderFusedViewResponse:
+        """Render a layer of the map from a camera pose."""
+        self._gate.require_open()
+        self._engine.require_mission(request.mission_id)
+        camera = camera_from_message(request.camera)
+        T_world_camera = transform_from_message("t_world_camera", request.t_world_camera)
+        layer = layer_from_message(request.layer)
+        render = functools.partial(self._renderer.render, camera, T_world_camera, layer)
+        return await asyncio.get_running_loop().run_in_executor(self._background, render)
+
     async def GetSessionStatus(self, request: pb.GetSessionStatusRequest, context: Any) -> pb.GetSessionStatusResponse:
         """Return the figures of the mission and of each agent."""
         self._engine.require_mission(request.mission_id)
@@ -206,12 +234,12 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         self._map_changes.notify()
         return pb.LeaveSessionResponse(fused_revision=revision)
 
-    def _changes_or_snapshot(self, revision: int) -> FusedMapChanges:
+    def _changes_or_snapshot(self, revision: int, layer: MapLayer, excluded: str) -> FusedMapChanges:
         try:
-            return self._engine.maps.changes(revision)
+            return self._engine.maps.changes(revision, layer, excluded)
         except RevisionGoneError:
             # the watcher missed more removals than are recorded, so it gets a snapshot
-            return self._engine.maps.changes()
+            return self._engine.maps.changes(0, layer, excluded)
 
     def _export(self, request: pb.ExportFusedMapRequest) -> tuple[bytes, int]:
         batch = self._select_map(request)
@@ -230,6 +258,23 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
                 raise InvalidInputError("agent_id: expected none with REFINED, whose Gaussians belong to everyone")
             case other:
                 raise InvalidInputError(f"strategy: expected VOTE, CONCATENATION or REFINED, got {other}")
+
+    def _align_in_background(self) -> None:
+        """Start an estimate of the agents' frames, unless one is running. Use on the event loop."""
+        if self._aligning or not self._gate.is_open:
+            return
+        self._aligning = True
+        future = asyncio.get_running_loop().run_in_executor(self._background, self._engine.align_due)
+        future.add_done_callback(self._after_aligning)
+
+    def _after_aligning(self, future: asyncio.Future[bool]) -> None:
+        self._aligning = False
+        if future.cancelled():
+            return
+        if future.exception() is not None:
+            _log.error("frames are not estimated: %s", future.exception())
+        elif future.result():
+            self._map_changes.notify()
 
     async def _work(self, function: Callable[..., _Result], *arguments: Any) -> _Result:
         """Run the function in a worker thread. Raises UnavailableError if the server drains."""

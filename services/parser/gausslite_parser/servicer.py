@@ -7,7 +7,7 @@ from typing import Any
 
 from gausslite.task.parser import TaskParser
 from gausslite.v1 import parser_service_pb2, parser_service_pb2_grpc
-from gausslite.wire.convert import graph_to_message
+from gausslite.wire.convert_task import graph_to_message
 from gausslite.wire.server import Service
 
 SERVICE_NAME = parser_service_pb2.DESCRIPTOR.services_by_name["ParserService"].full_name

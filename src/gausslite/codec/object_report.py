@@ -6,9 +6,9 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
+from gausslite.codec.task_json import graph_as_json, graph_from_json
 from gausslite.domain.errors import CodecError, GaussLiteError
 from gausslite.domain.objects import ObjectLandmark, ObjectReport, ObjectRole
-from gausslite.domain.task import Predicate, Relation, TaskGraph
 from gausslite.domain.voxels import AxisAlignedBox
 
 
@@ -18,10 +18,7 @@ def encode_object_report(report: ObjectReport) -> bytes:
     value = {
         "task_id": graph.task_id,
         "text": graph.text,
-        "targets": graph.targets,
-        "anchors": graph.anchors,
-        "relations": [[str(each.predicate), each.target, each.anchor] for each in graph.relations],
-        "warnings": graph.warnings,
+        **graph_as_json(graph),
         "objects": [object_as_json(each) for each in report.objects],
     }
     return json.dumps(value, ensure_ascii=False).encode()
@@ -31,16 +28,8 @@ def decode_object_report(data: bytes) -> ObjectReport:
     """Return the report of `encode_object_report`. Raises CodecError."""
     try:
         value = json.loads(data)
-        graph = TaskGraph(
-            value["task_id"],
-            value["text"],
-            tuple(value["targets"]),
-            tuple(value["anchors"]),
-            tuple(Relation(Predicate(predicate), target, anchor) for predicate, target, anchor in value["relations"]),
-            tuple(value["warnings"]),
-        )
-        return ObjectReport(graph, tuple(object_from_json(each) for each in value["objects"]))
-    except (KeyError, TypeError, ValueError, RecursionError, GaussLiteError) as error:
+        return ObjectReport(graph_from_json(value), tuple(object_from_json(each) for each in value["objects"]))
+    except (KeyError, TypeError, ValueError, AttributeError, RecursionError, GaussLiteError) as error:
         raise CodecError(f"object report: expected the JSON of a report, got other bytes ({error})") from error
 
 

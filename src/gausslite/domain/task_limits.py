@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from gausslite.domain.errors import TaskError
-from gausslite.domain.task import TaskGraph
+from gausslite.domain.task import Relation, TaskGraph
 
 EXAMPLE = "'Pick up the mug on the table'"
 
@@ -20,6 +20,7 @@ class TaskLimits:
     max_phrase_chars: int = 64
     max_relations: int = 64
     max_warnings: int = 64
+    max_distance_m: float = 1000.0
 
 
 LIMITS = TaskLimits()
@@ -45,16 +46,43 @@ def require_graph(graph: TaskGraph, limits: TaskLimits = LIMITS) -> None:
         require_task_text(graph.text, limits)
     if not graph.targets:
         raise TaskError(f"task targets: expected at least one object, such as in {EXAMPLE}, got none")
-    _require_phrases("targets", graph.targets, limits.max_targets, limits.max_phrase_chars)
-    _require_phrases("anchors", graph.anchors, limits.max_anchors, limits.max_phrase_chars)
+    if len(graph.roles) != len(graph.targets):
+        raise TaskError(f"task roles: expected one for each of {len(graph.targets)} targets, got {len(graph.roles)}")
+    for role, names, max_count in (
+        ("targets", graph.targets, limits.max_targets),
+        ("anchors", graph.anchors, limits.max_anchors),
+        ("excluded", graph.excluded, limits.max_targets),
+        ("context", graph.context, limits.max_anchors),
+    ):
+        _require_phrases(role, names, max_count, limits.max_phrase_chars)
     if len(graph.relations) > limits.max_relations or len(graph.warnings) > limits.max_warnings:
         expected = f"{limits.max_relations} relations and {limits.max_warnings} warnings"
         raise TaskError(f"task: expected at most {expected}, got {len(graph.relations)} and {len(graph.warnings)}")
     for relation in graph.relations:
-        if relation.target not in graph.targets:
-            raise TaskError(f"task {relation.predicate}: expected one of the targets first, got {relation.target!r}")
-        if relation.anchor not in graph.anchors:
-            raise TaskError(f"task {relation.predicate}: expected one of the anchors last, got {relation.anchor!r}")
+        _require_relation(relation, graph, limits)
+    _require_attributes(graph, limits)
+
+
+def _require_relation(relation: Relation, graph: TaskGraph, limits: TaskLimits) -> None:
+    if relation.target not in graph.targets:
+        raise TaskError(f"task {relation.predicate}: expected one of the targets first, got {relation.target!r}")
+    if relation.anchor not in graph.anchors:
+        raise TaskError(f"task {relation.predicate}: expected one of the anchors last, got {relation.anchor!r}")
+    low_m, high_m = relation.min_m or 0.0, limits.max_distance_m if relation.max_m is None else relation.max_m
+    if not 0.0 <= low_m <= high_m <= limits.max_distance_m:
+        expected = f"0 <= min_m <= max_m <= {limits.max_distance_m:g}"
+        raise TaskError(f"task {relation.predicate}: expected {expected}, got {relation.min_m} and {relation.max_m}")
+
+
+def _require_attributes(graph: TaskGraph, limits: TaskLimits) -> None:
+    known = {*graph.targets, *graph.anchors, *graph.excluded}
+    names = tuple(each.name for each in graph.attributes)
+    if len(set(names)) != len(names) or not known.issuperset(names):
+        raise TaskError(f"task attributes: expected each object of the graph at most once, got {', '.join(names)}")
+    _require_phrases(
+        "colours", tuple(dict.fromkeys(each.colour for each in graph.attributes if each.colour is not None)),
+        len(names), limits.max_phrase_chars,
+    )  # fmt: skip
 
 
 def _require_phrases(role: str, phrases: tuple[str, ...], max_count: int, max_chars: int) -> None:

@@ -24,17 +24,23 @@ _sym_db = _symbol_database.Default()
 
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x17gausslite/v1/task.proto\x12\x0cgausslite.v1\"V\n\x08Relation\x12*\n\tpredicate\x18\x01 \x01(\x0e\x32\x17.gausslite.v1.Predicate\x12\x0e\n\x06target\x18\x02 \x01(\t\x12\x0e\n\x06\x61nchor\x18\x03 \x01(\t\"\x89\x01\n\tTaskGraph\x12\x0f\n\x07task_id\x18\x01 \x01(\t\x12\x0c\n\x04text\x18\x02 \x01(\t\x12\x0f\n\x07targets\x18\x03 \x03(\t\x12\x0f\n\x07\x61nchors\x18\x04 \x03(\t\x12)\n\trelations\x18\x05 \x03(\x0b\x32\x16.gausslite.v1.Relation\x12\x10\n\x08warnings\x18\x06 \x03(\t*\xba\x02\n\tPredicate\x12\x19\n\x15PREDICATE_UNSPECIFIED\x10\x00\x12\x12\n\x0ePREDICATE_NEAR\x10\x01\x12\x10\n\x0cPREDICATE_ON\x10\x02\x12\x18\n\x14PREDICATE_CLOSEST_TO\x10\x03\x12\x1b\n\x17PREDICATE_FARTHEST_FROM\x10\x04\x12\x13\n\x0fPREDICATE_UNDER\x10\x05\x12\x14\n\x10PREDICATE_INSIDE\x10\x06\x12\x13\n\x0fPREDICATE_ABOVE\x10\x07\x12\x14\n\x10PREDICATE_BEHIND\x10\x08\x12\x19\n\x15PREDICATE_IN_FRONT_OF\x10\t\x12\x15\n\x11PREDICATE_LEFT_OF\x10\n\x12\x16\n\x12PREDICATE_RIGHT_OF\x10\x0b\x12\x15\n\x11PREDICATE_BETWEEN\x10\x0c\x62\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x17gausslite/v1/task.proto\x12\x0cgausslite.v1\"\xa3\x01\n\x08Relation\x12*\n\tpredicate\x18\x01 \x01(\x0e\x32\x17.gausslite.v1.Predicate\x12\x0e\n\x06target\x18\x02 \x01(\t\x12\x0e\n\x06\x61nchor\x18\x03 \x01(\t\x12\x0f\n\x07negated\x18\x04 \x01(\x08\x12\x12\n\x05min_m\x18\x05 \x01(\x01H\x00\x88\x01\x01\x12\x12\n\x05max_m\x18\x06 \x01(\x01H\x01\x88\x01\x01\x42\x08\n\x06_min_mB\x08\n\x06_max_m\"`\n\x10ObjectAttributes\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\x0e\n\x06\x63olour\x18\x02 \x01(\t\x12.\n\x0bsuperlative\x18\x03 \x01(\x0e\x32\x19.gausslite.v1.Superlative\"\x89\x02\n\tTaskGraph\x12\x0f\n\x07task_id\x18\x01 \x01(\t\x12\x0c\n\x04text\x18\x02 \x01(\t\x12\x0f\n\x07targets\x18\x03 \x03(\t\x12\x0f\n\x07\x61nchors\x18\x04 \x03(\t\x12)\n\trelations\x18\x05 \x03(\x0b\x32\x16.gausslite.v1.Relation\x12\x10\n\x08warnings\x18\x06 \x03(\t\x12\'\n\x05roles\x18\x07 \x03(\x0e\x32\x18.gausslite.v1.TargetRole\x12\x32\n\nattributes\x18\x08 \x03(\x0b\x32\x1e.gausslite.v1.ObjectAttributes\x12\x10\n\x08\x65xcluded\x18\t \x03(\t\x12\x0f\n\x07\x63ontext\x18\n \x03(\t*\xba\x02\n\tPredicate\x12\x19\n\x15PREDICATE_UNSPECIFIED\x10\x00\x12\x12\n\x0ePREDICATE_NEAR\x10\x01\x12\x10\n\x0cPREDICATE_ON\x10\x02\x12\x18\n\x14PREDICATE_CLOSEST_TO\x10\x03\x12\x1b\n\x17PREDICATE_FARTHEST_FROM\x10\x04\x12\x13\n\x0fPREDICATE_UNDER\x10\x05\x12\x14\n\x10PREDICATE_INSIDE\x10\x06\x12\x13\n\x0fPREDICATE_ABOVE\x10\x07\x12\x14\n\x10PREDICATE_BEHIND\x10\x08\x12\x19\n\x15PREDICATE_IN_FRONT_OF\x10\t\x12\x15\n\x11PREDICATE_LEFT_OF\x10\n\x12\x16\n\x12PREDICATE_RIGHT_OF\x10\x0b\x12\x15\n\x11PREDICATE_BETWEEN\x10\x0c*\x8e\x01\n\nTargetRole\x12\x1b\n\x17TARGET_ROLE_UNSPECIFIED\x10\x00\x12\x16\n\x12TARGET_ROLE_OBJECT\x10\x01\x12\x1b\n\x17TARGET_ROLE_DESTINATION\x10\x02\x12\x14\n\x10TARGET_ROLE_TOOL\x10\x03\x12\x18\n\x14TARGET_ROLE_OBSTACLE\x10\x04*\xa9\x03\n\x0bSuperlative\x12\x1b\n\x17SUPERLATIVE_UNSPECIFIED\x10\x00\x12\x17\n\x13SUPERLATIVE_LARGEST\x10\x01\x12\x18\n\x14SUPERLATIVE_SMALLEST\x10\x02\x12\x17\n\x13SUPERLATIVE_TALLEST\x10\x03\x12\x18\n\x14SUPERLATIVE_SHORTEST\x10\x04\x12\x17\n\x13SUPERLATIVE_LONGEST\x10\x05\x12\x16\n\x12SUPERLATIVE_WIDEST\x10\x06\x12\x19\n\x15SUPERLATIVE_NARROWEST\x10\x07\x12\x18\n\x14SUPERLATIVE_THICKEST\x10\x08\x12\x18\n\x14SUPERLATIVE_THINNEST\x10\t\x12\x17\n\x13SUPERLATIVE_HIGHEST\x10\n\x12\x16\n\x12SUPERLATIVE_LOWEST\x10\x0b\x12\x18\n\x14SUPERLATIVE_LEFTMOST\x10\x0c\x12\x19\n\x15SUPERLATIVE_RIGHTMOST\x10\r\x12\x17\n\x13SUPERLATIVE_NEAREST\x10\x0e\x12\x18\n\x14SUPERLATIVE_FARTHEST\x10\x0f\x62\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
 _builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'gausslite.v1.task_pb2', _globals)
 if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
-  _globals['_PREDICATE']._serialized_start=270
-  _globals['_PREDICATE']._serialized_end=584
-  _globals['_RELATION']._serialized_start=41
-  _globals['_RELATION']._serialized_end=127
-  _globals['_TASKGRAPH']._serialized_start=130
-  _globals['_TASKGRAPH']._serialized_end=267
+  _globals['_PREDICATE']._serialized_start=574
+  _globals['_PREDICATE']._serialized_end=888
+  _globals['_TARGETROLE']._serialized_start=891
+  _globals['_TARGETROLE']._serialized_end=1033
+  _globals['_SUPERLATIVE']._serialized_start=1036
+  _globals['_SUPERLATIVE']._serialized_end=1461
+  _globals['_RELATION']._serialized_start=42
+  _globals['_RELATION']._serialized_end=205
+  _globals['_OBJECTATTRIBUTES']._serialized_start=207
+  _globals['_OBJECTATTRIBUTES']._serialized_end=303
+  _globals['_TASKGRAPH']._serialized_start=306
+  _globals['_TASKGRAPH']._serialized_end=571
 # @@protoc_insertion_point(module_scope)

@@ -63,32 +63,156 @@ PREDICATE_BETWEEN: Predicate.ValueType  # 12
 """One Relation for each anchor: between(t, a) and between(t, b) together are one relation."""
 Global___Predicate: _TypeAlias = Predicate  # noqa: Y015
 
+class _TargetRole:
+    ValueType = _typing.NewType("ValueType", _builtins.int)
+    V: _TypeAlias = ValueType  # noqa: Y015
+
+class _TargetRoleEnumTypeWrapper(_enum_type_wrapper._EnumTypeWrapper[_TargetRole.ValueType], _builtins.type):
+    DESCRIPTOR: _descriptor.EnumDescriptor
+    TARGET_ROLE_UNSPECIFIED: _TargetRole.ValueType  # 0
+    """Read as OBJECT: graphs of older parsers have no roles."""
+    TARGET_ROLE_OBJECT: _TargetRole.ValueType  # 1
+    """Sought, looked at or handled."""
+    TARGET_ROLE_DESTINATION: _TargetRole.ValueType  # 2
+    """Something is put or delivered there, or the robot goes there."""
+    TARGET_ROLE_TOOL: _TargetRole.ValueType  # 3
+    """The robot uses it."""
+    TARGET_ROLE_OBSTACLE: _TargetRole.ValueType  # 4
+    """Not to be hit, touched or harmed."""
+
+class TargetRole(_TargetRole, metaclass=_TargetRoleEnumTypeWrapper):
+    """What the robot does with a target. docs/tasks.md defines the whole graph."""
+
+TARGET_ROLE_UNSPECIFIED: TargetRole.ValueType  # 0
+"""Read as OBJECT: graphs of older parsers have no roles."""
+TARGET_ROLE_OBJECT: TargetRole.ValueType  # 1
+"""Sought, looked at or handled."""
+TARGET_ROLE_DESTINATION: TargetRole.ValueType  # 2
+"""Something is put or delivered there, or the robot goes there."""
+TARGET_ROLE_TOOL: TargetRole.ValueType  # 3
+"""The robot uses it."""
+TARGET_ROLE_OBSTACLE: TargetRole.ValueType  # 4
+"""Not to be hit, touched or harmed."""
+Global___TargetRole: _TypeAlias = TargetRole  # noqa: Y015
+
+class _Superlative:
+    ValueType = _typing.NewType("ValueType", _builtins.int)
+    V: _TypeAlias = ValueType  # noqa: Y015
+
+class _SuperlativeEnumTypeWrapper(_enum_type_wrapper._EnumTypeWrapper[_Superlative.ValueType], _builtins.type):
+    DESCRIPTOR: _descriptor.EnumDescriptor
+    SUPERLATIVE_UNSPECIFIED: _Superlative.ValueType  # 0
+    SUPERLATIVE_LARGEST: _Superlative.ValueType  # 1
+    SUPERLATIVE_SMALLEST: _Superlative.ValueType  # 2
+    SUPERLATIVE_TALLEST: _Superlative.ValueType  # 3
+    SUPERLATIVE_SHORTEST: _Superlative.ValueType  # 4
+    SUPERLATIVE_LONGEST: _Superlative.ValueType  # 5
+    SUPERLATIVE_WIDEST: _Superlative.ValueType  # 6
+    SUPERLATIVE_NARROWEST: _Superlative.ValueType  # 7
+    SUPERLATIVE_THICKEST: _Superlative.ValueType  # 8
+    SUPERLATIVE_THINNEST: _Superlative.ValueType  # 9
+    SUPERLATIVE_HIGHEST: _Superlative.ValueType  # 10
+    SUPERLATIVE_LOWEST: _Superlative.ValueType  # 11
+    SUPERLATIVE_LEFTMOST: _Superlative.ValueType  # 12
+    SUPERLATIVE_RIGHTMOST: _Superlative.ValueType  # 13
+    SUPERLATIVE_NEAREST: _Superlative.ValueType  # 14
+    """Relative to the camera."""
+    SUPERLATIVE_FARTHEST: _Superlative.ValueType  # 15
+
+class Superlative(_Superlative, metaclass=_SuperlativeEnumTypeWrapper):
+    """An attribute that compares all objects of a noun."""
+
+SUPERLATIVE_UNSPECIFIED: Superlative.ValueType  # 0
+SUPERLATIVE_LARGEST: Superlative.ValueType  # 1
+SUPERLATIVE_SMALLEST: Superlative.ValueType  # 2
+SUPERLATIVE_TALLEST: Superlative.ValueType  # 3
+SUPERLATIVE_SHORTEST: Superlative.ValueType  # 4
+SUPERLATIVE_LONGEST: Superlative.ValueType  # 5
+SUPERLATIVE_WIDEST: Superlative.ValueType  # 6
+SUPERLATIVE_NARROWEST: Superlative.ValueType  # 7
+SUPERLATIVE_THICKEST: Superlative.ValueType  # 8
+SUPERLATIVE_THINNEST: Superlative.ValueType  # 9
+SUPERLATIVE_HIGHEST: Superlative.ValueType  # 10
+SUPERLATIVE_LOWEST: Superlative.ValueType  # 11
+SUPERLATIVE_LEFTMOST: Superlative.ValueType  # 12
+SUPERLATIVE_RIGHTMOST: Superlative.ValueType  # 13
+SUPERLATIVE_NEAREST: Superlative.ValueType  # 14
+"""Relative to the camera."""
+SUPERLATIVE_FARTHEST: Superlative.ValueType  # 15
+Global___Superlative: _TypeAlias = Superlative  # noqa: Y015
+
 @_typing.final
 class Relation(_message.Message):
-    """predicate(target, anchor); both are noun phrases of the graph."""
+    """predicate(target, anchor); both are names of the graph."""
 
     DESCRIPTOR: _descriptor.Descriptor
 
     PREDICATE_FIELD_NUMBER: _builtins.int
     TARGET_FIELD_NUMBER: _builtins.int
     ANCHOR_FIELD_NUMBER: _builtins.int
+    NEGATED_FIELD_NUMBER: _builtins.int
+    MIN_M_FIELD_NUMBER: _builtins.int
+    MAX_M_FIELD_NUMBER: _builtins.int
     predicate: Global___Predicate.ValueType
     target: _builtins.str
     anchor: _builtins.str
+    negated: _builtins.bool
+    """The relation does not hold."""
+    min_m: _builtins.float
+    """Bounds of the distance to the anchor; equal bounds mean "about"."""
+    max_m: _builtins.float
     def __init__(
         self,
         *,
         predicate: Global___Predicate.ValueType = ...,
         target: _builtins.str = ...,
         anchor: _builtins.str = ...,
+        negated: _builtins.bool = ...,
+        min_m: _builtins.float | None = ...,
+        max_m: _builtins.float | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_max_m", b"_max_m", "_min_m", b"_min_m", "max_m", b"max_m", "min_m", b"min_m"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_max_m", b"_max_m", "_min_m", b"_min_m", "anchor", b"anchor", "max_m", b"max_m", "min_m", b"min_m", "negated", b"negated", "predicate", b"predicate", "target", b"target"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    _WhichOneofReturnType__max_m: _TypeAlias = _typing.Literal["max_m"]  # noqa: Y015
+    _WhichOneofArgType__max_m: _TypeAlias = _typing.Literal["_max_m", b"_max_m"]  # noqa: Y015
+    _WhichOneofReturnType__min_m: _TypeAlias = _typing.Literal["min_m"]  # noqa: Y015
+    _WhichOneofArgType__min_m: _TypeAlias = _typing.Literal["_min_m", b"_min_m"]  # noqa: Y015
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__max_m) -> _WhichOneofReturnType__max_m | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__min_m) -> _WhichOneofReturnType__min_m | None: ...
+
+Global___Relation: _TypeAlias = Relation  # noqa: Y015
+
+@_typing.final
+class ObjectAttributes(_message.Message):
+    """Colour and superlative of one target, anchor or excluded object."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    NAME_FIELD_NUMBER: _builtins.int
+    COLOUR_FIELD_NUMBER: _builtins.int
+    SUPERLATIVE_FIELD_NUMBER: _builtins.int
+    name: _builtins.str
+    colour: _builtins.str
+    """As in the sentence; empty without a colour."""
+    superlative: Global___Superlative.ValueType
+    def __init__(
+        self,
+        *,
+        name: _builtins.str = ...,
+        colour: _builtins.str = ...,
+        superlative: Global___Superlative.ValueType = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["anchor", b"anchor", "predicate", b"predicate", "target", b"target"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["colour", b"colour", "name", b"name", "superlative", b"superlative"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
-Global___Relation: _TypeAlias = Relation  # noqa: Y015
+Global___ObjectAttributes: _TypeAlias = ObjectAttributes  # noqa: Y015
 
 @_typing.final
 class TaskGraph(_message.Message):
@@ -100,10 +224,16 @@ class TaskGraph(_message.Message):
     ANCHORS_FIELD_NUMBER: _builtins.int
     RELATIONS_FIELD_NUMBER: _builtins.int
     WARNINGS_FIELD_NUMBER: _builtins.int
+    ROLES_FIELD_NUMBER: _builtins.int
+    ATTRIBUTES_FIELD_NUMBER: _builtins.int
+    EXCLUDED_FIELD_NUMBER: _builtins.int
+    CONTEXT_FIELD_NUMBER: _builtins.int
     task_id: _builtins.str
     text: _builtins.str
     @_builtins.property
-    def targets(self) -> _containers.RepeatedScalarFieldContainer[_builtins.str]: ...
+    def targets(self) -> _containers.RepeatedScalarFieldContainer[_builtins.str]:
+        """Names: a noun, with the suffix _2, _3, ... for a further object of that noun with other attributes."""
+
     @_builtins.property
     def anchors(self) -> _containers.RepeatedScalarFieldContainer[_builtins.str]: ...
     @_builtins.property
@@ -111,6 +241,20 @@ class TaskGraph(_message.Message):
     @_builtins.property
     def warnings(self) -> _containers.RepeatedScalarFieldContainer[_builtins.str]:
         """Parts of the text that the parser could not interpret, for the operator."""
+
+    @_builtins.property
+    def roles(self) -> _containers.RepeatedScalarFieldContainer[Global___TargetRole.ValueType]:
+        """One for each target, in the same order; none if every target is an OBJECT."""
+
+    @_builtins.property
+    def attributes(self) -> _containers.RepeatedCompositeFieldContainer[Global___ObjectAttributes]: ...
+    @_builtins.property
+    def excluded(self) -> _containers.RepeatedScalarFieldContainer[_builtins.str]:
+        """Objects to leave out."""
+
+    @_builtins.property
+    def context(self) -> _containers.RepeatedScalarFieldContainer[_builtins.str]:
+        """Rooms and places of the sentence; they locate nothing."""
 
     def __init__(
         self,
@@ -121,10 +265,14 @@ class TaskGraph(_message.Message):
         anchors: _abc.Iterable[_builtins.str] | None = ...,
         relations: _abc.Iterable[Global___Relation] | None = ...,
         warnings: _abc.Iterable[_builtins.str] | None = ...,
+        roles: _abc.Iterable[Global___TargetRole.ValueType] | None = ...,
+        attributes: _abc.Iterable[Global___ObjectAttributes] | None = ...,
+        excluded: _abc.Iterable[_builtins.str] | None = ...,
+        context: _abc.Iterable[_builtins.str] | None = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["anchors", b"anchors", "relations", b"relations", "targets", b"targets", "task_id", b"task_id", "text", b"text", "warnings", b"warnings"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["anchors", b"anchors", "attributes", b"attributes", "context", b"context", "excluded", b"excluded", "relations", b"relations", "roles", b"roles", "targets", b"targets", "task_id", b"task_id", "text", b"text", "warnings", b"warnings"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

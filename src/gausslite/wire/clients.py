@@ -227,12 +227,23 @@ class FusionClient(ServiceChannel):
         )
         return response
 
-    def watch(self, since_revision: int = 0, region: AxisAlignedBox | None = None) -> Iterator[convert.MapUpdate]:
-        """Yield the fused map and its changes, without end. Raises RevisionGoneError if since_revision is gone."""
+    def watch(
+        self,
+        since_revision: int = 0,
+        region: AxisAlignedBox | None = None,
+        layer: str = "vote",
+        exclude_agent: str = "",
+    ) -> Iterator[convert.MapUpdate]:
+        """Yield a layer of the map (vote, refined) and its changes, without end; exclude_agent: without its voxels.
+
+        Raises RevisionGoneError if since_revision is gone.
+        """
         request = fusion_service_pb2.WatchFusedMapRequest(
             mission_id=self.mission_id,
             since_revision=since_revision,
             region=None if region is None else convert.box_to_message(region),
+            layer=fusion_service_pb2.MapLayer.Value(f"MAP_LAYER_{layer.upper()}"),
+            exclude_agent_id=exclude_agent,
         )
         first = True
         for response in self._stream(self._stub.WatchFusedMap(request)):
@@ -265,6 +276,20 @@ class FusionClient(ServiceChannel):
         if google_crc32c.value(bytes(data)) != last.crc32c:
             raise ChecksumError("export: CRC32C does not match; the map was damaged in transit")
         return bytes(data)
+
+    def render(
+        self, camera: Camera, T_world_camera: Float64[ndarray, "4 4"], layer: str = "vote"
+    ) -> tuple[UInt8[ndarray, "h w 3"], Float32[ndarray, "h w"]]:
+        """Return colour and depth in metres of a layer of the map (vote, refined), rendered from this pose."""
+        request = fusion_service_pb2.RenderFusedViewRequest(
+            mission_id=self.mission_id,
+            camera=convert.camera_to_message(camera),
+            t_world_camera=convert.transform_to_message(T_world_camera),
+            layer=fusion_service_pb2.MapLayer.Value(f"MAP_LAYER_{layer.upper()}"),
+        )
+        response = self._call(self._stub.RenderView, request)
+        size = camera.width_px, camera.height_px
+        return decode_colour(response.colour_png, *size), decode_depth(response.depth_png, *size)
 
     def report_objects(self, session_id: str, report: ObjectReport) -> int:
         """Replace the agent's task graph and objects; returns the bytes sent. Raises SessionUnknownError."""

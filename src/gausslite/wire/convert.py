@@ -10,18 +10,15 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from gausslite.codec.subset_codec import CodecLimits, decode_subset
-from gausslite.datasets.camera_correction import correct_by_own_motion
 from gausslite.domain.camera import Camera
-from gausslite.domain.errors import CodecError, InvalidInputError, TaskError
+from gausslite.domain.errors import CodecError, InvalidInputError
 from gausslite.domain.frame import Frame
 from gausslite.domain.lens import Lens
 from gausslite.domain.pose import require_rigid
-from gausslite.domain.task import Predicate, Relation, TaskGraph
-from gausslite.domain.task_limits import require_graph
 from gausslite.domain.voxel_batch import VoxelBatch
 from gausslite.domain.voxel_operations import empty_batch, merge_batches, select_voxels
 from gausslite.domain.voxels import AxisAlignedBox, VoxelGrid
-from gausslite.v1 import gaussians_pb2, geometry_pb2, task_pb2
+from gausslite.v1 import gaussians_pb2, geometry_pb2
 from gausslite.wire.camera_messages import (
     lens_from_message,
     lens_to_message,
@@ -40,9 +37,6 @@ from gausslite.wire.images import (
 )
 
 MAX_IMAGE_PX = 1 << 23
-
-_PREDICATE_NUMBERS = {each: task_pb2.Predicate.Value(f"PREDICATE_{each.name}") for each in Predicate}
-_PREDICATE_BY_NUMBER = {number: predicate for predicate, number in _PREDICATE_NUMBERS.items()}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -67,40 +61,6 @@ class MapUpdate:
             return before
         kept = select_voxels(before, ~np.isin(before.keys, self.batch.keys))
         return merge_batches(kept, select_voxels(self.batch, self.batch.counts > 0))
-
-
-def graph_to_message(graph: TaskGraph) -> task_pb2.TaskGraph:
-    """Encode a task graph."""
-    return task_pb2.TaskGraph(
-        task_id=graph.task_id,
-        text=graph.text,
-        targets=graph.targets,
-        anchors=graph.anchors,
-        relations=[
-            task_pb2.Relation(predicate=_PREDICATE_NUMBERS[r.predicate], target=r.target, anchor=r.anchor)
-            for r in graph.relations
-        ],
-        warnings=graph.warnings,
-    )
-
-
-def graph_from_message(message: task_pb2.TaskGraph) -> TaskGraph:
-    """Decode a task graph and check it with `domain.task_limits`. Raises TaskError."""
-    for relation in message.relations:
-        if relation.predicate not in _PREDICATE_BY_NUMBER:
-            raise TaskError(
-                f"task relation: expected one of {', '.join(Predicate)}, got predicate {relation.predicate}"
-            )
-    graph = TaskGraph(
-        message.task_id,
-        message.text,
-        tuple(message.targets),
-        tuple(message.anchors),
-        tuple(Relation(_PREDICATE_BY_NUMBER[r.predicate], r.target, r.anchor) for r in message.relations),
-        tuple(message.warnings),
-    )
-    require_graph(graph)
-    return graph
 
 
 def camera_to_message(camera: Camera) -> geometry_pb2.Camera:
@@ -175,13 +135,10 @@ def live_frame_to_message(frame: Frame, lens: Lens | None, lossless: bool = Fals
     return message
 
 
-def live_frame_from_message(message: geometry_pb2.EncodedFrame) -> Frame:
-    """Decode a frame of a live camera, without its lens distortion and rolling shutter.
-
-    Raises InvalidInputError and subclasses.
-    """
+def live_frame_from_message(message: geometry_pb2.EncodedFrame) -> tuple[Frame, Lens | None]:
+    """Decode a frame of a live camera as recorded, and its lens. Raises InvalidInputError and subclasses."""
     lens = lens_from_message(message)
-    return correct_by_own_motion(_decode_images(message), lens)
+    return _decode_images(message), lens
 
 
 def _decode_images(message: geometry_pb2.EncodedFrame) -> Frame:

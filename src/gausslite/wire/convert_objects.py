@@ -14,7 +14,8 @@ from gausslite.domain.objects import (
     TeamObject,
 )
 from gausslite.v1 import fusion_service_pb2, geometry_pb2, objects_pb2
-from gausslite.wire.convert import box_from_message, box_to_message, graph_from_message, graph_to_message
+from gausslite.wire.convert import box_from_message, box_to_message
+from gausslite.wire.convert_task import graph_from_message, graph_to_message
 
 _ROLES = {ObjectRole.TARGET: objects_pb2.OBJECT_ROLE_TARGET, ObjectRole.ANCHOR: objects_pb2.OBJECT_ROLE_ANCHOR}
 _ROLE_BY_NUMBER = {number: role for role, number in _ROLES.items()}

@@ -15,9 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gausslite.codec.subset_codec import DEFAULT_LIMITS, encode_subset
-from gausslite.datasets.camera_correction import correct_frame, ideal_camera
 from gausslite.domain.camera import Camera
-from gausslite.domain.camera_correction import CameraCorrection
 from gausslite.domain.camera_motion import CameraMotion
 from gausslite.domain.errors import GaussLiteError, InvalidInputError, PoseError, TaskError
 from gausslite.domain.frame import Frame
@@ -29,8 +27,9 @@ from gausslite.domain.task import Predicate, Relation, TaskGraph
 from gausslite.domain.trajectory import Twist
 from gausslite.domain.voxel_batch import RoiSubset, VoxelBatch
 from gausslite.domain.voxels import AxisAlignedBox, VoxelGrid
+from gausslite.mission.live_frame import correct_live_frame
 from gausslite.v1 import agent_service_pb2, gaussians_pb2, geometry_pb2, task_pb2
-from gausslite.wire import convert
+from gausslite.wire import convert, convert_task
 from gausslite.wire.clients import is_done
 from gausslite.wire.images import decode_colour, encode_colour, encode_depth
 
@@ -66,7 +65,7 @@ def test_a_frame_is_unchanged_by_a_round_trip(lossless: bool) -> None:
 def test_a_task_graph_is_unchanged_by_a_round_trip() -> None:
     relations = tuple(Relation(predicate, "mug", "table") for predicate in Predicate)
     for graph in (GRAPH, TaskGraph("id", "", ("mug",), ("table",), relations)):
-        assert convert.graph_from_message(convert.graph_to_message(graph)) == graph
+        assert convert_task.graph_from_message(convert_task.graph_to_message(graph)) == graph
 
 
 @pytest.mark.parametrize(
@@ -83,12 +82,12 @@ def test_a_task_graph_is_unchanged_by_a_round_trip() -> None:
     ],
 )
 def test_an_invalid_graph_is_refused(change: dict[str, object]) -> None:
-    message = convert.graph_to_message(GRAPH)
+    message = convert_task.graph_to_message(GRAPH)
     for name in change:
         message.ClearField(name)  # type: ignore[arg-type]
     message.MergeFrom(task_pb2.TaskGraph(**change))  # type: ignore[arg-type]
     with pytest.raises(TaskError, match=r"^task "):
-        convert.graph_from_message(message)
+        convert_task.graph_from_message(message)
 
 
 def bomb_png(width: int, height: int) -> bytes:
@@ -151,26 +150,13 @@ def test_a_frames_motion_is_unchanged_by_a_round_trip() -> None:
     assert convert.frame_from_message(convert.frame_to_message(sample_frame())).motion is None
 
 
-def test_a_live_frame_is_corrected_as_a_recorded_one() -> None:
+def test_a_live_frame_is_unchanged_by_a_round_trip() -> None:
     sent = replace(sample_frame(), motion=MOTION)
-    got = convert.live_frame_from_message(convert.live_frame_to_message(sent, LENS, lossless=True))
-    correction = CameraCorrection(LENS, MOTION.readout_s, exposure_s=MOTION.exposure_s)
-    ideal = ideal_camera(CAMERA, correction, float(np.linalg.norm(MOTION.twist.angular_rad_s)))
-    plain = convert.frame_from_message(convert.frame_to_message(sample_frame(), lossless=True))
-    expected = correct_frame(plain, correction, ideal, MOTION.twist)
-    assert got.camera == ideal != CAMERA
-    np.testing.assert_array_equal(got.rgb, expected.rgb)
-    np.testing.assert_array_equal(got.depth_m, expected.depth_m)
-    assert got.motion is not None
-    assert (got.motion.readout_s, got.motion.exposure_s) == (0.0, MOTION.exposure_s)
-
-
-def test_a_live_frame_without_lens_and_motion_is_used_as_sent() -> None:
-    sent = sample_frame()
-    got = convert.live_frame_from_message(convert.live_frame_to_message(sent, None, lossless=True))
-    assert got.camera == sent.camera
+    got, lens = convert.live_frame_from_message(convert.live_frame_to_message(sent, LENS, lossless=True))
+    assert (got.camera, lens) == (sent.camera, LENS)
     np.testing.assert_array_equal(got.rgb, sent.rgb)
-    assert got.motion is None
+    assert got.motion is not None
+    assert (got.motion.readout_s, got.motion.exposure_s) == (MOTION.readout_s, MOTION.exposure_s)
 
 
 def test_a_frame_with_a_lens_is_refused_where_nothing_corrects_it() -> None:
@@ -206,7 +192,8 @@ def test_a_wrong_lens_or_motion_is_refused_by_name(change: dict[str, object], ex
 def test_any_lens_gives_a_frame_or_an_error_about_it(coefficients: list[float], model: str) -> None:
     lens = Lens(LensModel(model), tuple(coefficients[: 8 if model == "radtan" else 4]))
     with contextlib.suppress(InvalidInputError):
-        frame = convert.live_frame_from_message(convert.live_frame_to_message(sample_frame(), lens))
+        live_frame = convert.live_frame_from_message(convert.live_frame_to_message(sample_frame(), lens))
+        frame = correct_live_frame(*live_frame)
         assert np.isfinite(frame.depth_m).all()
 
 
@@ -220,7 +207,8 @@ def test_changed_frame_bytes_give_a_valid_frame_or_a_gausslite_error(data: st.Da
     for _ in range(data.draw(st.integers(1, 4))):
         noisy[data.draw(st.integers(0, len(noisy) - 1))] = data.draw(st.integers(0, 255))
     try:
-        frame = convert.live_frame_from_message(geometry_pb2.EncodedFrame.FromString(bytes(noisy)))
+        live_frame = convert.live_frame_from_message(geometry_pb2.EncodedFrame.FromString(bytes(noisy)))
+        frame = correct_live_frame(*live_frame)
     except (GaussLiteError, DecodeError):
         return
     size = (frame.camera.height_px, frame.camera.width_px)

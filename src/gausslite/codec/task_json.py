@@ -1,0 +1,97 @@
+"""Encode task graphs as JSON values, in the form of `gausslite parse --json` (docs/tasks.md)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from gausslite.domain.task import ObjectAttributes, Predicate, Relation, Superlative, TargetRole, TaskGraph
+
+
+def graph_as_json(graph: TaskGraph) -> dict[str, Any]:
+    """Return everything but the graph's id and text as JSON values."""
+    return {
+        "targets": list(graph.targets),
+        "roles": {target: str(role) for target, role in zip(graph.targets, graph.roles, strict=True)},
+        "anchors": list(graph.anchors),
+        "relations": [_relation_as_json(each) for each in graph.relations],
+        "attributes": {each.name: _attributes_as_json(each) for each in graph.attributes},
+        "excluded": list(graph.excluded),
+        "context": list(graph.context),
+        "warnings": list(graph.warnings),
+    }
+
+
+def graph_from_json(value: Mapping[str, Any]) -> TaskGraph:
+    """Return the graph of `graph_as_json`, with "text" and "task_id" where given; only targets are required.
+
+    A relation may also be a list of predicate, target and anchor. A target without a role is an object. Raises
+    KeyError, TypeError, ValueError, AttributeError for other values.
+    """
+    targets, roles = _names(value["targets"]), dict(value.get("roles", {}))
+    unknown = roles.keys() - set(targets)
+    if unknown:
+        raise ValueError(f"roles: expected targets, got {', '.join(sorted(map(str, unknown)))}")
+    return TaskGraph(
+        str(value.get("task_id", "")),
+        str(value.get("text", "")),
+        targets,
+        _names(value.get("anchors", ())),
+        tuple(_relation_from_json(each) for each in value.get("relations", ())),
+        _names(value.get("warnings", ())),
+        tuple(TargetRole(roles.get(target, TargetRole.OBJECT)) for target in targets),
+        tuple(_attributes_from_json(name, each) for name, each in value.get("attributes", {}).items()),
+        _names(value.get("excluded", ())),
+        _names(value.get("context", ())),
+    )
+
+
+def _relation_as_json(relation: Relation) -> dict[str, Any]:
+    value: dict[str, Any] = {
+        "predicate": str(relation.predicate),
+        "target": relation.target,
+        "anchor": relation.anchor,
+    }
+    if relation.negated:
+        value["negated"] = True
+    bounds_m = {"min_m": relation.min_m, "max_m": relation.max_m}
+    return value | {name: bound_m for name, bound_m in bounds_m.items() if bound_m is not None}
+
+
+def _relation_from_json(value: Mapping[str, Any] | list[str]) -> Relation:
+    if isinstance(value, list):
+        predicate, target, anchor = value
+        return Relation(Predicate(predicate), target, anchor)
+    unknown = value.keys() - {"predicate", "target", "anchor", "negated", "min_m", "max_m"}
+    if unknown:
+        raise ValueError(f"relation: expected predicate, target, anchor, negated, min_m and max_m, got {unknown}")
+    min_m, max_m = (None if value.get(name) is None else float(value[name]) for name in ("min_m", "max_m"))
+    return Relation(
+        Predicate(value["predicate"]),
+        str(value["target"]),
+        str(value["anchor"]),
+        bool(value.get("negated", False)),
+        min_m,
+        max_m,
+    )
+
+
+def _attributes_as_json(attributes: ObjectAttributes) -> dict[str, str]:
+    values = {"colour": attributes.colour, "superlative": attributes.superlative}
+    return {name: str(value) for name, value in values.items() if value is not None}
+
+
+def _attributes_from_json(name: str, value: Mapping[str, Any]) -> ObjectAttributes:
+    if not value or value.keys() - {"colour", "superlative"}:
+        raise ValueError(f"attributes of {name!r}: expected colour, superlative or both, got {sorted(value)}")
+    superlative = value.get("superlative")
+    colour = value.get("colour")
+    return ObjectAttributes(
+        str(name), None if colour is None else str(colour), None if superlative is None else Superlative(superlative)
+    )
+
+
+def _names(values: Any) -> tuple[str, ...]:
+    if not isinstance(values, list | tuple) or not all(isinstance(each, str) for each in values):
+        raise TypeError(f"expected a list of names, got {type(values).__name__}")
+    return tuple(values)
