@@ -12,6 +12,7 @@ change of Σkappa, the number of optimiser updates that the server lacks. The va
 from __future__ import annotations
 
 import heapq
+import os
 import sqlite3
 import threading
 from collections.abc import Iterable, Iterator
@@ -93,6 +94,7 @@ class Spool:
 
     def __init__(self, path: Path | None, agent_id: str, grid: VoxelGrid) -> None:
         """Open or create the spool. Raises MismatchError if the file is another agent's or of another grid."""
+        self._path = path
         self._error_prefix = "spool" if path is None else f"spool {path}"
         self._lock = threading.Lock()
         with self._storage_errors():
@@ -231,7 +233,10 @@ class Spool:
         try:
             yield
         except sqlite3.Error as error:
-            raise StorageError(f"{self._error_prefix}: {error}; free some space or choose another file") from error
+            advice = "free some space or choose another file"
+            if self._path is not None and not os.access(self._path.absolute().parent, os.W_OK):
+                advice = f"expected a file in a folder that user {os.geteuid()} can write"
+            raise StorageError(f"{self._error_prefix}: {error}; {advice}") from error
 
     def _property(self, name: str) -> str | float | None:
         row = self._database.execute("SELECT value FROM properties WHERE name = ?", (name,)).fetchone()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import ssl
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -85,11 +86,17 @@ def require_agent_certificate(context: Any, agent_id: str) -> None:
 
 
 def _read(option: str, path: Path) -> bytes:
-    if not path.is_file():
-        received = "a folder" if path.is_dir() else "nothing"
-        raise InvalidInputError(f"{option} {path}: expected a PEM file, got {received}")
     try:
         return path.read_bytes()
+    except FileNotFoundError:
+        raise InvalidInputError(f"{option} {path}: expected a PEM file, got nothing") from None
+    except IsADirectoryError:
+        raise InvalidInputError(f"{option} {path}: expected a PEM file, got a folder") from None
+    except PermissionError:
+        user = os.geteuid()
+        raise InvalidInputError(
+            f"{option} {path}: expected a file that user {user} can read; run chown -R {user} on its folder"
+        ) from None
     except OSError as error:
         raise InvalidInputError(f"{option} {path}: cannot be read: {error.strerror or error}") from error
 

@@ -154,6 +154,27 @@ def test_wrong_files_are_one_error_line_before_serving(
         assert expected in line
 
 
+def test_a_folder_of_another_user_is_one_line_with_the_command_that_helps(certs: Path) -> None:
+    code = (
+        "import pathlib, sys\n"
+        "from gausslite.wire.tls import Tls, InvalidInputError\n"
+        "try: Tls.read(*map(pathlib.Path, sys.argv[1:]))\n"
+        "except InvalidInputError as error: print(error)"
+    )
+    paths = [str(certs / name) for _, name in _FILES]
+    (certs / "server").chmod(0)
+    try:
+        # root reads everything, so the child gives up its rights after its imports
+        drop = "import os; os.geteuid() or os.setuid(65534)\n"
+        command = [sys.executable, "-c", code.replace("try:", drop + "try:"), *paths]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    finally:
+        (certs / "server").chmod(0o700)
+    assert done.stderr == ""
+    assert f"--tls-cert {paths[0]}: expected a file that user" in done.stdout
+    assert "chown -R" in done.stdout
+
+
 def test_a_key_is_in_no_representation(certs: Path, caplog: pytest.LogCaptureFixture) -> None:
     tls = identity(certs, "server")
     logging.getLogger("test").error("%s %r", tls, [tls])
