@@ -53,8 +53,9 @@ class MissionSummary:
         if uplink is None:
             return mapped
         sent = (
-            f"{uplink.voxels_sent} voxels of the task's region, {uplink.keyframes_sent} keyframes; "
-            f"{uplink.bytes_sent} bytes ({uplink.handover_bytes} of the handover)"
+            f"{uplink.voxels_sent} voxels of the task's region in {uplink.roi_bytes} bytes, "
+            f"{uplink.keyframes_sent} keyframes in {uplink.keyframe_bytes} bytes, "
+            f"a handover of {uplink.handover_bytes} bytes"
         )
         return f"{mapped}; sent {sent}; {self._left(uplink)}"
 
