@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float32, Float64
 from numpy import ndarray
 
 from gausslite.domain.camera import Camera
@@ -60,7 +60,7 @@ def render_recorded_view(scene: HomeScene, camera: RecordingCamera, poses_at: Po
         )
         for share in shares
     ]
-    rgb = np.mean([view.rgb for view in views], axis=0, dtype=np.float32)
+    rgb: Float32[ndarray, "h w 3"] = np.stack([view.rgb for view in views]).mean(axis=0, dtype=np.float32)
     return replace(views[samples // 2], rgb=rgb)
 
 

@@ -1,21 +1,22 @@
 """Estimate how a camera's images differ from an ideal camera's: lens, readout time, time offset and exposure time.
 
 Lens, readout and offset are those under which pairs of frames on moving stretches agree best (`MovingPairs`). The
-radial lens and the readout time first minimise the photometric residual. Then readout and offset minimise the rotation
-that the pose fit needs. The exposure time comes from blur (`estimate_exposure_time`). Each part is used only if it
-explains a clear share of the disagreement.
+radial lens and the readout time first minimise the photometric residual. Then the offset minimises the rotation that
+the pose fit needs, and the readout both. The exposure time comes from blur (`estimate_exposure_time`). Each part is
+used only if it explains a clear share of the disagreement.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy import ndarray
 
 from gausslite.calibration.exposure_time import estimate_exposure_time
-from gausslite.calibration.moving_pairs import MovingPairs
+from gausslite.calibration.moving_pairs import MovingPairs, PairError
 from gausslite.datasets.selection import downscaled_size
 from gausslite.datasets.source import Source
 from gausslite.domain.camera_correction import CameraCorrection
@@ -28,6 +29,9 @@ _FINE_STEP_S = 0.0075
 _RADIAL = (-0.3, -0.15, 0.0, 0.15, 0.3)
 _FINE_RADIAL_STEP = 0.05
 _SECOND_RADIAL = (-0.15, 0.0, 0.15)
+_MIN_ROTATION_DEG = 0.01
+_EXCHANGE = 0.4
+"""Squared slope at which the two radial terms exchange: half way to the corner of an image 60 degrees wide."""
 _MIN_TIMING_RESIDUAL_GAIN, _MIN_MOTION_GAIN = 0.005, 0.3
 _MIN_COARSE_LENS_GAIN, _MIN_LENS_RESIDUAL_GAIN, _MIN_SECOND_RADIAL_GAIN = 0.01, 0.03, 0.01
 
@@ -79,7 +83,7 @@ def _with_lens(moving: MovingPairs, coarse: MovingPairs, known: CameraCorrection
     # a readout time left in the images would bias the lens
     readout_s = minimum(_READOUTS_S, lambda value: residual(coarse, k1, 0.0, value))
     k1 = minimum(_around(k1, _FINE_RADIAL_STEP), lambda value: residual(moving, value, 0.0, readout_s))
-    two = _second_coefficient(k1, lambda *slopes: residual(coarse, *slopes, readout_s))
+    two = _second_coefficient(k1, lambda first, second: residual(coarse, first, second, readout_s))
     pinhole, lens, wider = (
         moving.error(replace(known, lens=_radial(*slopes), readout_s=readout_s))
         for slopes in ((0.0, 0.0), (k1, 0.0), two)
@@ -97,11 +101,15 @@ def _with_lens(moving: MovingPairs, coarse: MovingPairs, known: CameraCorrection
 def _second_coefficient(k1: float, residual: Callable[[float, float], float]) -> tuple[float, float]:
     """Return both coefficients at the minimum over k2, with k1 at its own minimum for each k2."""
     best_k1 = {
-        k2: minimum(_around(k1 - 0.4 * k2, _FINE_RADIAL_STEP), lambda value, k2=k2: residual(value, k2))
+        k2: minimum(_around(k1 - _EXCHANGE * k2, _FINE_RADIAL_STEP), partial(_swapped, residual, k2))
         for k2 in _SECOND_RADIAL
     }
     k2 = minimum(_SECOND_RADIAL, lambda value: residual(best_k1[value], value))
     return float(np.interp(k2, _SECOND_RADIAL, [best_k1[value] for value in _SECOND_RADIAL])), k2
+
+
+def _swapped(residual: Callable[[float, float], float], k2: float, k1: float) -> float:
+    return residual(k1, k2)
 
 
 def _with_times(moving: MovingPairs, coarse: MovingPairs, known: CameraCorrection) -> tuple[CameraCorrection, str]:
@@ -110,10 +118,10 @@ def _with_times(moving: MovingPairs, coarse: MovingPairs, known: CameraCorrectio
     readout_s = minimum(_READOUTS_S, lambda value: coarse.error(replace(known, readout_s=value)).residual)
     found = replace(known, readout_s=readout_s)
     offset_s = minimum(_OFFSETS_S, lambda value: moving.error(replace(found, time_offset_s=value)).rotation_deg)
-    found = replace(found, time_offset_s=round(offset_s, 3))
+    found = replace(found, time_offset_s=round(offset_s, 3) + 0.0)
     around_s = _around(readout_s, _FINE_STEP_S)
-    readout_s = minimum(around_s, lambda value: moving.error(replace(found, readout_s=value)).rotation_deg)
-    found = replace(found, readout_s=round(readout_s, 3))
+    readout_s = minimum(around_s, lambda value: _relative(moving.error(replace(found, readout_s=value)), before))
+    found = replace(found, readout_s=round(readout_s, 3) + 0.0)
     after = moving.error(found)
     evidence = (
         f"{1e3 * found.readout_s:.0f} ms and {1e3 * found.time_offset_s:.0f} ms, {after.pairs} pairs of moving "
@@ -125,6 +133,11 @@ def _with_times(moving: MovingPairs, coarse: MovingPairs, known: CameraCorrectio
         and after.rotation_deg <= (1.0 - _MIN_MOTION_GAIN) * before.rotation_deg
     )
     return (found, evidence) if is_clear else (known, f"{evidence}; no clear gain, not used")
+
+
+def _relative(error: PairError, before: PairError) -> float:
+    """Return residual and rotation relative to those before, added: on few pairs, either alone has a flat minimum."""
+    return error.residual / before.residual + error.rotation_deg / max(before.rotation_deg, _MIN_ROTATION_DEG)
 
 
 def _radial(k1: float, k2: float) -> Lens:
