@@ -1,0 +1,44 @@
+"""Frames of a live camera are corrected by their own motion and lens, as recorded frames are by the trajectory."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from gausslite.datasets.camera_correction import correct_frame, ideal_camera
+from gausslite.domain.camera import Camera
+from gausslite.domain.camera_correction import CameraCorrection
+from gausslite.domain.camera_motion import CameraMotion
+from gausslite.domain.frame import Frame
+from gausslite.domain.lens import Lens, LensModel
+from gausslite.domain.trajectory import Twist
+from gausslite.mission.live_frame import correct_live_frame
+
+CAMERA = Camera(500.0, 501.0, 32.5, 24.5, 64, 48)
+MOTION = CameraMotion(Twist(np.array([0.3, -0.1, 0.2]), np.array([0.5, 1.5, -0.4])), readout_s=0.03, exposure_s=0.01)
+LENS = Lens(LensModel.RADTAN, (-0.2, 0.03, 0.001, -0.002, 0.01))
+
+
+def sample_frame() -> Frame:
+    rng = np.random.default_rng(0)
+    rgb = rng.integers(0, 256, (48, 64, 3), np.uint8)
+    return Frame(7, 123, rgb, rng.uniform(0.5, 4.0, (48, 64)).astype(np.float32), CAMERA, np.eye(4))
+
+
+def test_a_live_frame_is_corrected_as_a_recorded_one() -> None:
+    plain = sample_frame()
+    got = correct_live_frame(replace(plain, motion=MOTION), LENS)
+    correction = CameraCorrection(LENS, MOTION.readout_s, exposure_s=MOTION.exposure_s)
+    ideal = ideal_camera(CAMERA, correction, float(np.linalg.norm(MOTION.twist.angular_rad_s)))
+    expected = correct_frame(plain, correction, ideal, MOTION.twist)
+    assert got.camera == ideal != CAMERA
+    np.testing.assert_array_equal(got.rgb, expected.rgb)
+    np.testing.assert_array_equal(got.depth_m, expected.depth_m)
+    assert got.motion is not None
+    assert (got.motion.readout_s, got.motion.exposure_s) == (0.0, MOTION.exposure_s)
+
+
+def test_a_live_frame_without_lens_and_motion_is_used_as_sent() -> None:
+    frame = sample_frame()
+    assert correct_live_frame(frame, None) is frame
