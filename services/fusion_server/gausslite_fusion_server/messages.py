@@ -2,8 +2,49 @@
 
 from __future__ import annotations
 
+from gausslite.domain.errors import InvalidInputError
+from gausslite.fusion.frame_alignment import AlignmentState, FrameAlignment
+from gausslite.fusion.fused_map import MapLayer
 from gausslite.fusion.traffic import AgentContribution
 from gausslite.v1 import fusion_service_pb2 as pb
+from gausslite.wire.convert import transform_to_message
+
+_STATES = {
+    AlignmentState.UNKNOWN: pb.ALIGNMENT_STATE_UNSPECIFIED,
+    AlignmentState.REFERENCE: pb.ALIGNMENT_STATE_REFERENCE,
+    AlignmentState.ALIGNED: pb.ALIGNMENT_STATE_ALIGNED,
+    AlignmentState.CORRECTED: pb.ALIGNMENT_STATE_CORRECTED,
+    AlignmentState.QUARANTINED: pb.ALIGNMENT_STATE_QUARANTINED,
+}
+
+
+_LAYERS = {
+    pb.MAP_LAYER_UNSPECIFIED: MapLayer.VOTE,
+    pb.MAP_LAYER_VOTE: MapLayer.VOTE,
+    pb.MAP_LAYER_REFINED: MapLayer.REFINED,
+}
+
+
+def layer_from_message(number: int) -> MapLayer:
+    """Decode a layer of the map. Raises InvalidInputError."""
+    if number not in _LAYERS:
+        raise InvalidInputError(f"layer: expected VOTE or REFINED, got {number}")
+    return _LAYERS[number]
+
+
+def alignment_to_message(alignment: FrameAlignment) -> pb.FrameAlignment:
+    """Encode how an agent's frame fits the fused map."""
+    message = pb.FrameAlignment(
+        state=_STATES[alignment.state],
+        t_fused_agent=transform_to_message(alignment.T_fused_agent),
+        message=alignment.message,
+    )
+    fit = alignment.fit
+    if fit is not None:
+        message.residual_before_m, message.residual_after_m = fit.before.distance_m, fit.after.distance_m
+        message.colour_before, message.colour_after = fit.before.colour, fit.after.colour
+        message.compared = fit.compared
+    return message
 
 
 def contribution_to_message(agent: AgentContribution) -> pb.AgentContribution:
@@ -24,4 +65,5 @@ def contribution_to_message(agent: AgentContribution) -> pb.AgentContribution:
         last_update_seq=agent.last_update_seq,
         last_seen_ns=agent.traffic.last_seen_ns,
         targets=agent.targets,
+        alignment=alignment_to_message(agent.alignment),
     )

@@ -33,6 +33,10 @@ class RefinementWorker:
         self._worker = ThreadPoolExecutor(1, "refine")
         self._busy = False
 
+    def create_rasterizer(self) -> Rasterizer:
+        """Return a rasterizer of the refinement's backend. Raises KernelError."""
+        return self._create_rasterizer()
+
     async def run(self, engine: FusionEngine, request: RefineRequest) -> AsyncIterator[RefineProgress]:
         """Refine the engine's map, yield the latest progress, and store the result. Closing the iterator cancels.
 

@@ -12,12 +12,14 @@ from gausslite.config.mapping_options import add_rasterizer, add_voxel_size
 from gausslite.config.numbers import Number
 from gausslite.config.tls_options import add_tls, read_server_tls
 from gausslite.domain.voxels import VoxelGrid
+from gausslite.fusion.frame_alignment import AlignmentSettings
 from gausslite.fusion.joint_refinement import RefineSettings
 from gausslite.fusion.limits import MAX_REFINE_ITERATIONS, FusionSettings, Quotas
 from gausslite.process.messages import print_message
 from gausslite.wire.tls import Tls
 
 MEMORY = "memory"
+_CORRECT, _TRUST = "correct", "trust"
 _MAX_STORE_MB = 1 << 24
 
 
@@ -48,7 +50,13 @@ def parse_arguments(arguments: Sequence[str] | None = None) -> ServerSettings:
         options.listen,
         None if options.store == MEMORY else Path(options.store),
         None if options.store_max_mb is None else options.store_max_mb << 20,
-        FusionSettings(VoxelGrid(options.voxel_size), options.mission, options.world_frame, quotas),
+        FusionSettings(
+            VoxelGrid(options.voxel_size),
+            options.mission,
+            options.world_frame,
+            quotas,
+            alignment=None if options.frame_alignment == _TRUST else AlignmentSettings(),
+        ),
         RefineSettings(iterations=options.refine_iterations),
         options.rasterizer,
         read_server_tls(options),
@@ -70,6 +78,12 @@ def _parser() -> argparse.ArgumentParser:
     add_voxel_size(parser)
     add("--mission", default="", metavar="ID", help="the only mission to serve (default: the first agent's)")
     add("--world-frame", default="", metavar="NAME", help="frame of all maps (default: the first agent's)")
+    add(
+        "--frame-alignment",
+        choices=[_CORRECT, _TRUST],
+        default=_CORRECT,
+        help="correct the misfit of agents' frames and quarantine gross ones, or trust them (default: %(default)s)",
+    )
     for name, default, meaning in (
         ("agents", quotas.agents, "agents"),
         ("voxels", quotas.voxels_per_agent, "voxels per agent"),

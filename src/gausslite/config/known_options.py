@@ -9,7 +9,8 @@ KNOWN_OPTIONS: Final = frozenset(
     {
         *("absent", "after", "agent-id", "backend", "before", "blur", "camera-correction", "changes"),
         *("deadline-slack", "details", "detector", "disable", "drain-timeout", "equal", "exit-when-done"),
-        *("external-rasterizer", "fit-views", "frame-alignment", "frames", "frames-a", "frames-b", "fusion", "gaussians"),
+        *("frame-alignment", "frame-error", "homes", "team-sizes"),
+        *("external-rasterizer", "fit-views", "frames", "frames-a", "frames-b", "fusion", "gaussians"),
         *(
             "grace-period",
             "handover",

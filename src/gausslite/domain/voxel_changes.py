@@ -65,6 +65,10 @@ class VoxelChangeTracker:
         self._store(current, previous.select(kept))
         return changed, previous.keys[absent & ~kept]
 
+    def insert(self, added: VoxelSignatures) -> None:
+        """Store these signatures; they replace those of the same voxels."""
+        self._store(added, self.signatures.select(~np.isin(self.signatures.keys, added.keys)))
+
     def reset(self) -> None:
         """Clear all signatures, so that every voxel counts as new at the next update."""
         self.signatures = VoxelSignatures.empty()

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Collection
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from threading import RLock
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float64
+from numpy import ndarray
 
 from gausslite.domain.errors import InvalidInputError, MismatchError, NotPermittedError, QuotaError
 from gausslite.domain.gaussians import Gaussians
@@ -17,6 +19,8 @@ from gausslite.domain.objects import ObjectLandmark, ObjectReport, TeamObject
 from gausslite.domain.task import TaskGraph
 from gausslite.domain.voxel_batch import RoiSubset
 from gausslite.domain.voxels import VoxelGrid
+from gausslite.fusion.frame_aligner import FrameAligner
+from gausslite.fusion.frame_alignment import FrameAlignments
 from gausslite.fusion.fused_map import FusedMapLayers
 from gausslite.fusion.keyframes import AgentKeyframe, EncodedKeyframe, FrameDecoder, KeyframePool, no_decoder
 from gausslite.fusion.limits import FusionSettings
@@ -71,8 +75,10 @@ class FusionEngine:
         self._traffic: dict[str, TrafficCounters] = {}
         scores = store.scores()
         self._usage = UsageLedger(scores, quotas)
-        votes = VoteInput(store)
-        self._maps = FusedMapLayers(votes, self._lock, settings.grid, first_revision, settings.max_removed_voxels)
+        self._alignments = FrameAlignments(store)
+        self._votes = VoteInput(store, self._alignments, settings.grid)
+        self._aligner = FrameAligner(store, self._alignments, self._votes, self._lock, settings.alignment)
+        self._maps = FusedMapLayers(self._votes, self._lock, settings.grid, first_revision, settings.max_removed_voxels)
 
     @property
     def grid(self) -> VoxelGrid:
@@ -155,8 +161,28 @@ class FusionEngine:
             usage = self._usage.after(subset, self._store)
             outcome = self._store.put(subset)
             self._usage.set(agent_id, usage)
-            self._maps.record(agent_id, outcome.accepted)
+            self._aligner.record(agent_id, outcome.accepted)
+            self._maps.record(agent_id, self._votes.changed_keys(agent_id, outcome.accepted))
             return outcome
+
+    def align_due(self) -> bool:
+        """Estimate the frames of the agents with enough new updates; returns whether the fused map changed.
+
+        It takes up to seconds, mostly without the lock. Call it from one thread at a time. Raises StorageError.
+        """
+        changed = False
+        for agent_id in self._aligner.due():
+            keys = self._aligner.estimate(agent_id)
+            if len(keys):
+                self._maps.record(agent_id, keys)
+                changed = True
+        return changed
+
+    def declare_frame(self, agent_id: str, T_fused_agent: Float64[ndarray, "4 4"]) -> None:
+        """Set the motion from the agent's frame to the fused map's that the agent declares. Raises StorageError."""
+        with self._lock:
+            self._alignments.declare(agent_id, T_fused_agent)
+            self._maps.record(agent_id, self._votes.refresh(agent_id))
 
     def record_traffic(self, agent_id: str, traffic: TrafficCounters) -> None:
         """Add to the agent's counters, and set its last_seen_ns to now."""
@@ -185,8 +211,8 @@ class FusionEngine:
     def query_objects(self, noun: str = "") -> tuple[TeamObject, ...]:
         """Return the team's objects that a noun names, or all, the most confident first. Raises InvalidInputError."""
         with self._lock:
-            reports = self._objects.reports()
-        return find_objects(reports, {}, noun)
+            reports, frames = self._objects.reports(), self._alignments.transforms()
+        return find_objects(reports, frames, noun)
 
     def leave(self, session_id: str, forget: bool = False) -> int:
         """End a session and return the fused revision; with `forget` all updates of the agent are deleted."""
@@ -207,13 +233,18 @@ class FusionEngine:
                 f"refinement: expected a fused map and keyframes, got {len(gaussians)} Gaussians and "
                 f"{len(encoded)} keyframes; agents send keyframes with --handover"
             )
-        return gaussians, self._keyframes.decode(encoded), revision
+        return gaussians, self.in_fused_frame(self._keyframes.decode(encoded)), revision
+
+    def in_fused_frame(self, keyframes: Sequence[AgentKeyframe]) -> list[AgentKeyframe]:
+        """Return the keyframes with camera poses in the fused map's frame."""
+        with self._lock:
+            frames = self._alignments.transforms()
+        return [_in_fused_frame(each, frames) for each in keyframes]
 
     def status(self) -> MissionStatus:
         """Return the totals of the mission and of each agent."""
         with self._lock:
-            scores = self._store.scores()
-            vote = rank_voxels(scores)
+            scores, vote = self._store.scores(), rank_voxels(self._votes.scores())
             joined = self._sessions.agents
             agents = tuple(
                 replace(
@@ -221,6 +252,7 @@ class FusionEngine:
                     joined=agent_id in joined,
                     keyframes=self._keyframes.count(agent_id),
                     targets=self._objects.targets(agent_id),
+                    alignment=self._alignments.get(agent_id),
                     traffic=self._traffic.get(agent_id, TrafficCounters()),
                 )
                 for agent_id in sorted(joined | set(scores.agents))
@@ -241,9 +273,20 @@ class FusionEngine:
             self._store.close()
 
     def _remove_agent(self, agent_id: str) -> None:
-        keys = self._store.remove_agent(agent_id)
+        keys = np.union1d(self._store.remove_agent(agent_id), self._votes.remove_agent(agent_id))
         self._maps.record(agent_id, keys)
+        self._alignments.remove_agent(agent_id)
+        self._aligner.remove_agent(agent_id)
         self._usage.remove_agent(agent_id)
         self._traffic.pop(agent_id, None)
         self._keyframes.remove_agent(agent_id)
         self._objects.remove_agent(agent_id)
+
+
+def _in_fused_frame(keyframe: AgentKeyframe, frames: Mapping[str, Float64[ndarray, "4 4"]]) -> AgentKeyframe:
+    """Return the keyframe with its camera pose in the fused map's frame."""
+    T_fused_agent = frames.get(keyframe.agent_id)
+    if T_fused_agent is None:
+        return keyframe
+    pose = T_fused_agent @ keyframe.frame.T_world_camera
+    return replace(keyframe, frame=replace(keyframe.frame, T_world_camera=pose))

@@ -10,6 +10,7 @@ from gausslite.domain.errors import InvalidInputError, QuotaError
 from gausslite.domain.names import quote_name, require_name
 from gausslite.domain.revision_log import MAX_REMOVED_VOXELS
 from gausslite.domain.voxels import VoxelGrid
+from gausslite.fusion.frame_alignment import AlignmentSettings
 from gausslite.fusion.mission_config import MissionConfig
 from gausslite.fusion.store import VoxelScoreTable
 
@@ -38,6 +39,7 @@ class FusionSettings:
     """The server's configuration. If mission_id or world_frame is empty, the first agent that names it fixes it.
 
     max_removed_voxels: number of removed voxels that a watcher can still catch up with; see RevisionLog.
+    alignment: how agents' frames are estimated; None uses them as declared.
     """
 
     grid: VoxelGrid = field(default_factory=VoxelGrid)
@@ -45,6 +47,7 @@ class FusionSettings:
     world_frame: str = ""
     quotas: Quotas = field(default_factory=Quotas)
     max_removed_voxels: int = MAX_REMOVED_VOXELS
+    alignment: AlignmentSettings | None = None
 
     def __post_init__(self) -> None:
         require_name("mission", self.mission_id)

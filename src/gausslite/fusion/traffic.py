@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from gausslite.fusion.frame_alignment import FrameAlignment
 from gausslite.fusion.mission_config import MissionConfig
 from gausslite.fusion.store import VoxelScoreTable
 from gausslite.fusion.vote import VoteResult
@@ -36,7 +37,7 @@ class TrafficCounters:
 
 @dataclass(frozen=True, slots=True)
 class AgentContribution:
-    """Stored data of one agent, the number of voxels that it wins, its task's targets, and its traffic."""
+    """Stored data of one agent, the number of voxels that it wins, its task's targets, its frame and its traffic."""
 
     agent_id: str
     joined: bool = False
@@ -47,6 +48,7 @@ class AgentContribution:
     last_update_seq: int = 0
     keyframes: int = 0
     targets: tuple[str, ...] = ()
+    alignment: FrameAlignment = field(default_factory=lambda: FrameAlignment(0))
     traffic: TrafficCounters = field(default_factory=TrafficCounters)
 
 

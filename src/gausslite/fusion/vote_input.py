@@ -1,19 +1,38 @@
-"""The voxel updates as the vote reads them."""
+"""The voxel updates as the vote reads them: in the fused map's frame, without quarantined agents."""
 
 from __future__ import annotations
 
-from jaxtyping import Int64
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float64, Int64
 from numpy import ndarray
 
+from gausslite.domain.errors import InvalidInputError
+from gausslite.domain.gaussians import Gaussians
+from gausslite.domain.pose import transform_points
 from gausslite.domain.voxel_batch import VoxelBatch
+from gausslite.domain.voxel_changes import VoxelChangeTracker, VoxelSignatures
+from gausslite.domain.voxel_operations import VoxelIndex, empty_batch, group_by_voxel, select_keys, select_voxels
+from gausslite.domain.voxels import VoxelGrid
+from gausslite.fusion.frame_alignment import AlignmentState, FrameAlignment, FrameAlignments
 from gausslite.fusion.store import FusionStore, VoxelScoreTable
 
 
 class VoteInput:
-    """Reads the updates from the store. Not thread-safe; FusionEngine holds a lock."""
+    """Reads the updates from the store; the moved maps of agents in other frames are cached.
 
-    def __init__(self, store: FusionStore) -> None:
-        self._store = store
+    Not thread-safe; FusionEngine holds a lock.
+    """
+
+    def __init__(self, store: FusionStore, alignments: FrameAlignments, grid: VoxelGrid) -> None:
+        self._store, self._alignments, self._grid = store, alignments, grid
+        self._moved: dict[str, VoxelBatch] = {}
+        self._trackers: dict[str, VoxelChangeTracker] = {}
+        for agent_id in store.agents():
+            if not self._is_as_sent(agent_id):
+                self.refresh(agent_id)
 
     def agents(self) -> tuple[str, ...]:
         """Return the ids of the agents with updates, sorted."""
@@ -21,8 +40,137 @@ class VoteInput:
 
     def scores(self, keys: Int64[ndarray, " k"] | None = None) -> VoxelScoreTable:
         """Return all agents' totals on these voxels, or on all."""
-        return self._store.scores(keys)
+        table = self._store.scores(keys)
+        if not self._moved:
+            return table
+        kept = ~np.isin(table.agent_index, [i for i, name in enumerate(table.agents) if name in self._moved])
+        moved = {i: _select(self._moved[name], keys) for i, name in enumerate(table.agents) if name in self._moved}
+        return _merge_scores(table, kept, moved)
 
     def batches(self, keys: Int64[ndarray, " k"] | None = None) -> dict[str, VoxelBatch]:
         """Return the updates of every agent on these voxels, or on all."""
-        return self._store.batches(keys)
+        batches = self._store.batches(keys)
+        return {
+            name: _select(self._moved[name], keys) if name in self._moved else batch for name, batch in batches.items()
+        }
+
+    def refresh(self, agent_id: str) -> Int64[ndarray, " k"]:
+        """Recompute the agent's moved map after its updates or its alignment changed; returns the voxels to compare.
+
+        These are the voxels of the fused grid where the vote may read other data than before.
+        """
+        before = self._moved.pop(agent_id, None)
+        sent = self._store.batch(agent_id)
+        if self._is_as_sent(agent_id):
+            self._trackers.pop(agent_id, None)
+            return sent.keys if before is None else np.union1d(before.keys, sent.keys)
+        tracker = self._trackers.get(agent_id)
+        is_first = tracker is None
+        if tracker is None:
+            tracker = self._trackers[agent_id] = VoxelChangeTracker()
+        moved = self._move(agent_id, sent)
+        voxels = VoxelIndex.from_points(moved.gaussians.means_m, self._grid)
+        signatures = VoxelSignatures.from_gaussians(moved.gaussians, voxels)
+        changed, removed = tracker.update(signatures)
+        self._moved[agent_id] = moved
+        keys = np.union1d(signatures.keys[changed], removed)
+        return np.union1d(keys, sent.keys) if is_first else keys
+
+    def changed_keys(self, agent_id: str, accepted: Int64[ndarray, " a"]) -> Int64[ndarray, " k"]:
+        """Return the voxels of the fused grid that these accepted updates of the agent may change."""
+        return accepted if self._is_as_sent(agent_id) else self.refresh(agent_id)
+
+    def remove_agent(self, agent_id: str) -> Int64[ndarray, " k"]:
+        """Forget the agent's moved map; returns its voxels."""
+        self._trackers.pop(agent_id, None)
+        moved = self._moved.pop(agent_id, None)
+        return np.zeros(0, np.int64) if moved is None else moved.keys
+
+    def _is_as_sent(self, agent_id: str) -> bool:
+        alignment = self._alignments.get(agent_id)
+        return alignment.is_identity and alignment.state is not AlignmentState.QUARANTINED
+
+    def _move(self, agent_id: str, sent: VoxelBatch) -> VoxelBatch:
+        alignment = self._alignments.get(agent_id)
+        if alignment.state is AlignmentState.QUARANTINED:
+            return empty_batch()
+        return move_batch(sent, self._update_seqs(agent_id, sent), alignment, self._grid)
+
+    def _update_seqs(self, agent_id: str, batch: VoxelBatch) -> Int64[ndarray, " v"]:
+        scores = self._store.scores(batch.keys)
+        own = scores.agent_index == scores.agents.index(agent_id) if agent_id in scores.agents else slice(0)
+        return scores.update_seqs[own]
+
+
+def move_batch(
+    batch: VoxelBatch, update_seqs: Int64[ndarray, " v"], alignment: FrameAlignment, grid: VoxelGrid
+) -> VoxelBatch:
+    """Return the Gaussians of an agent's updates in the fused frame, grouped by the fused map's voxels.
+
+    Gaussians that leave the range of the grid are dropped.
+    """
+    segments = alignment.segment_of(update_seqs)
+    parts = [
+        move_gaussians(select_voxels(batch, segments == each).gaussians, alignment.transform(int(each)))
+        for each in np.unique(segments)
+    ]
+    gaussians = Gaussians.concatenate(parts)
+    try:
+        return group_by_voxel(gaussians, grid)
+    except InvalidInputError:
+        inside = (np.abs(gaussians.means_m) < 0.99 * grid.max_coordinate_m).all(axis=1)
+        return group_by_voxel(gaussians.take(inside), grid)
+
+
+def move_gaussians(gaussians: Gaussians, T: Float64[ndarray, "4 4"]) -> Gaussians:
+    """Return the Gaussians moved by a rigid motion."""
+    if np.array_equal(T, np.eye(4)) or len(gaussians) == 0:
+        return gaussians
+    means = transform_points(T, gaussians.means_m.astype(np.float64)).astype(np.float32)
+    quats = _multiply(_quaternion(T[:3, :3]), gaussians.quats_wxyz.astype(np.float64)).astype(np.float32)
+    return replace(gaussians, means_m=means, quats_wxyz=quats)
+
+
+def _quaternion(R: Float64[ndarray, "3 3"]) -> Float64[ndarray, "4"]:
+    """Return the unit quaternion (w, x, y, z) of a rotation: the main eigenvector of Bar-Itzhack's matrix."""
+    (a, b, c), (d, e, f), (g, h, i) = R
+    K = np.array(
+        [
+            [a + e + i, h - f, c - g, d - b],
+            [h - f, a - e - i, b + d, c + g],
+            [c - g, b + d, e - a - i, f + h],
+            [d - b, c + g, f + h, i - a - e],
+        ]
+    )
+    _, vectors = np.linalg.eigh(K)
+    quaternion: Float64[ndarray, "4"] = vectors[:, -1]
+    return quaternion
+
+
+def _multiply(left: Float64[ndarray, "4"], right: Float64[ndarray, "n 4"]) -> Float64[ndarray, "n 4"]:
+    """Return the Hamilton products of one quaternion (w, x, y, z) with many."""
+    w, x, y, z = left
+    matrix = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
+    return right @ matrix.T
+
+
+def _select(batch: VoxelBatch, keys: Int64[ndarray, " k"] | None) -> VoxelBatch:
+    return batch if keys is None else select_keys(batch, keys)
+
+
+def _merge_scores(table: VoxelScoreTable, kept: ndarray, moved: Mapping[int, VoxelBatch]) -> VoxelScoreTable:
+    """Return the kept rows and those of the moved batches, sorted by agent and key."""
+    index = np.concatenate(
+        [table.agent_index[kept], *(np.full(len(batch), i, np.int32) for i, batch in moved.items())]
+    ).astype(np.int32)
+    keys = np.concatenate([table.keys[kept], *(batch.keys for batch in moved.values())])
+    order = np.lexsort((keys, index))
+    zeros = [np.zeros(len(batch), np.int64) for batch in moved.values()]
+    return VoxelScoreTable(
+        table.agents,
+        index[order],
+        keys[order],
+        np.concatenate([table.update_seqs[kept], *zeros])[order],
+        np.concatenate([table.kappa_sums[kept], *(batch.kappa_sums for batch in moved.values())])[order],
+        np.concatenate([table.counts[kept], *(batch.counts for batch in moved.values())])[order],
+    )

@@ -16,6 +16,8 @@ from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.pose import inverse
 from gausslite.domain.relevance import RelevanceMap
 from gausslite.domain.state import State, add_prefix, get_array, get_counts, get_floats, int_array, select_prefix
+from gausslite.domain.voxel_batch import VoxelBatch
+from gausslite.domain.voxels import VoxelGrid
 from gausslite.mapping.checkpoint import generator_state, restore_generator
 from gausslite.mapping.coverage import RenderedView
 from gausslite.mapping.eviction import insert_seeds
@@ -26,6 +28,7 @@ from gausslite.mapping.seeding import Seeder, SeedingContext, Seeds
 from gausslite.mapping.settings import MapperSettings
 from gausslite.mapping.stages import CountedScheduler, SkippableStage, Stage, StageScheduler
 from gausslite.mapping.task_change import clear_roi, update_roi_evidence
+from gausslite.mapping.team_voxels import InsertedVoxels, insert_team_voxels
 from gausslite.mapping.training import Trainer
 from gausslite.mapping.view_refinement import RefinementSettings, ViewRefiner
 from gausslite.optimize.splat_table import SplatTable
@@ -175,6 +178,12 @@ class GaussianMapper:
             return 0
         seeds = self._seeder.seed_roi(frame, relevance, table.means_m[table.active])
         return self._insert(Seeds(seeds, Gaussians.empty()))
+
+    def insert_team_voxels(self, received: VoxelBatch, grid: VoxelGrid) -> InsertedVoxels:
+        """Insert a teammate's voxels whose Σkappa exceeds the local one; they replace the local Gaussians there."""
+        inserted = insert_team_voxels(self._table, received, grid)
+        self._revision += inserted.gaussians > 0
+        return inserted
 
     def mark_unavailable(self, keyframe: Keyframe) -> None:
         """Mark a keyframe as evaluated without a result: it shows no ROI and adds no evidence."""

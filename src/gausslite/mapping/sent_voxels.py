@@ -48,6 +48,16 @@ class SentVoxelTracker:
         """Freeze all voxels sent so far; call it when the task changes."""
         self._frozen = self._tracker.signatures.keys
 
+    def mark_received(self, received: VoxelBatch) -> None:
+        """Note voxels that were inserted from the fused map: the server has them from the agent that trained them.
+
+        A voxel is sent only after this agent's training has raised its Σkappa by a quarter.
+        """
+        values = np.zeros((len(received), 3), np.uint64)
+        values[:, 0] = received.kappa_sums + received.kappa_sums // np.uint64(4) + np.uint64(1)
+        self._tracker.insert(VoxelSignatures(received.keys, values))
+        self._frozen = np.union1d(self._frozen, received.keys)
+
     def exclude_frozen(self, batch: VoxelBatch) -> VoxelBatch:
         """Return the batch without the voxels that are frozen with a higher Σkappa."""
         values = np.zeros((len(batch), 3), np.uint64)

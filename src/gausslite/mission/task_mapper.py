@@ -11,6 +11,7 @@ from gausslite.domain.objects import ObjectLandmark
 from gausslite.domain.relevance import RelevanceMap
 from gausslite.domain.state import State, add_prefix, select_prefix
 from gausslite.domain.voxel_batch import VoxelBatch
+from gausslite.domain.voxels import VoxelGrid
 from gausslite.mapping.coverage import RenderedView
 from gausslite.mapping.keyframes import Keyframe
 from gausslite.mapping.mapper import GaussianMapper
@@ -18,6 +19,7 @@ from gausslite.mapping.pose_history import PoseHistory
 from gausslite.mapping.sent_voxels import SentVoxelTracker
 from gausslite.mapping.stages import SkippableStage, Stage
 from gausslite.mapping.task_change import Reevaluation
+from gausslite.mapping.team_voxels import InsertedVoxels
 from gausslite.mission.frame_scheduler import FrameScheduler, FrameTiming
 from gausslite.perception.relevance_estimator import DelayedRelevance, RelevanceEstimate, RelevanceEstimator
 from gausslite.tracking.tracker import CameraTracker
@@ -87,6 +89,16 @@ class TaskMapper:
     def objects(self) -> tuple[ObjectLandmark, ...]:
         """The confirmed objects of the current task."""
         return self._estimator.objects
+
+    def insert_team_voxels(self, received: VoxelBatch, grid: VoxelGrid) -> InsertedVoxels:
+        """Insert voxels that a teammate trained more than this agent, for the current task's region.
+
+        They are not sent back before this agent has trained them further.
+        """
+        inserted = self._mapper.insert_team_voxels(received, grid)
+        if self._sent_voxels is not None:
+            self._sent_voxels.mark_received(inserted.batch)
+        return inserted
 
     def gaussians(self) -> Gaussians:
         """Return a copy of the map."""

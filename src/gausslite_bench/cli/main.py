@@ -15,6 +15,7 @@ from gausslite_bench.cli.quality import configure_ablation, configure_quality
 from gausslite_bench.cli.raster import configure_raster
 from gausslite_bench.cli.registration import configure_registration
 from gausslite_bench.cli.task_change import configure_task_change
+from gausslite_bench.cli.team import configure_team
 
 _BENCHMARKS: dict[str, tuple[Callable[[argparse.ArgumentParser], None], str, str]] = {
     "raster": (
@@ -68,6 +69,12 @@ _BENCHMARKS: dict[str, tuple[Callable[[argparse.ArgumentParser], None], str, str
         "map quality with rolling shutter, motion blur and lens distortion",
         "Map one walk with an ideal camera and with a real one at several angular speeds: uncorrected, corrected with "
         "the true values, and corrected with estimates.",
+    ),
+    "team": (
+        configure_team,
+        "quality of the fused map of several agents, by strategy and policy",
+        "Map one home with several agents and tasks. Fuse their maps by concatenation, by the vote and with a joint "
+        "refinement, and score the fused maps on held-out views.",
     ),
     "task-change": (
         configure_task_change,

@@ -1,0 +1,205 @@
+"""Measure how an agent's frame fits the map of the other agents, by coloured point-to-plane ICP on their Gaussians."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64, Int64
+from numpy import ndarray
+
+from gausslite.domain.gaussians import Gaussians
+from gausslite.domain.pose import transform_of, transform_points
+
+_MAX_SOURCE, _MAX_REFERENCE = 2000, 6000
+_NEIGHBOURS = 12
+_MIN_OPACITY = 0.3
+_REACH_M = (0.30, 0.30, 0.20, 0.20, 0.15, 0.15, 0.10, 0.10, 0.08, 0.08, 0.08, 0.08)
+"""Longest distance of a match in each iteration."""
+_MIN_COMPARED = 50
+_INDEPENDENT_SAMPLES = 150
+_OVERLAP_M = 0.10
+_COLOUR_WEIGHT_M = 0.1
+"""Geometric residual that weighs as much as a luminance difference of 1."""
+_PRIOR_TRANSLATION_M, _PRIOR_ROTATION_RAD = 0.3, 0.15
+_LUMINANCE = np.array([0.299, 0.587, 0.114])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Misfit:
+    """How samples of one map fit another: median point-to-plane distance and luminance difference of the matches.
+
+    overlap: share of the samples within 10 cm of the other map's samples.
+    """
+
+    distance_m: float
+    colour: float
+    overlap: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FrameFit:
+    """The rigid correction that fits an agent's map to the others', and the misfit before and after it.
+
+    shift_m, rotation_deg: the correction's motion of the overlap's centre and its angle. compared: number of samples.
+    """
+
+    T_fused_agent: Float64[ndarray, "4 4"]
+    before: Misfit
+    after: Misfit
+    shift_m: float
+    rotation_deg: float
+    compared: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SurfaceSamples:
+    """Points of a surface with normals, luminance and its gradient along the surface (per metre)."""
+
+    points_m: Float64[ndarray, "n 3"]
+    normals: Float64[ndarray, "n 3"]
+    luminance: Float64[ndarray, " n"]
+    gradients: Float64[ndarray, "n 3"]
+
+    @classmethod
+    def of(cls, gaussians: Gaussians, seed: int = 0) -> SurfaceSamples:
+        """Draw samples from the means of opaque Gaussians; the local plane and gradient come from their neighbours."""
+        points, luminance = _sample(gaussians, _MAX_REFERENCE, seed)
+        if len(points) <= _NEIGHBOURS:
+            return cls(points, np.zeros_like(points), luminance, np.zeros_like(points))
+        near = _nearest(points, points, _NEIGHBOURS)
+        offsets = points[near] - points[near].mean(axis=1, keepdims=True)
+        covariance = np.einsum("nki,nkj->nij", offsets, offsets)
+        _, axes = np.linalg.eigh(covariance)
+        normals = axes[:, :, 0]
+        differences = luminance[near] - luminance[near].mean(axis=1, keepdims=True)
+        slope = np.einsum("nki,nk->ni", offsets, differences)
+        # the ridge is relative to the neighbourhood's size, so that noise across the plane gives no gradient
+        ridge = 0.1 * np.trace(covariance, axis1=1, axis2=2)[:, None, None] * np.eye(3) + 1e-12 * np.eye(3)
+        gradients = np.linalg.solve(covariance + ridge, slope[:, :, None])[:, :, 0]
+        gradients -= np.einsum("ni,ni->n", gradients, normals)[:, None] * normals
+        return cls(points, normals, luminance, gradients)
+
+
+def fit_frame(source: Gaussians, reference: SurfaceSamples, start: Float64[ndarray, "4 4"]) -> FrameFit | None:
+    """Fit the source map to the reference from an initial T_fused_agent; None if fewer than 50 samples overlap.
+
+    The fit is a robust Gauss-Newton with a weak prior at the start, so directions that the overlap does not constrain
+    keep the initial value.
+    """
+    points, luminance = _sample(source, _MAX_SOURCE, seed=1)
+    T = start.copy()
+    if len(points) < _MIN_COMPARED or len(reference.points_m) < _MIN_COMPARED:
+        return None
+    before = _misfit(points, luminance, reference, T)
+    for reach_m in _REACH_M:
+        update = _step(transform_points(T, points), luminance, reference, reach_m)
+        if update is None:
+            return None
+        T = update @ T
+    matches = _match(transform_points(T, points), reference, _OVERLAP_M)
+    if len(matches[0]) < _MIN_COMPARED:
+        return None
+    after = _misfit(points, luminance, reference, T)
+    centre = points[matches[0]].mean(axis=0)[None]
+    shift = transform_points(T, centre) - transform_points(start, centre)
+    turn = T[:3, :3] @ start[:3, :3].T
+    rotation_deg = float(np.degrees(np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1))))
+    return FrameFit(T, before, after, float(np.linalg.norm(shift)), rotation_deg, len(matches[0]))
+
+
+def _step(
+    moved: Float64[ndarray, "n 3"], luminance: Float64[ndarray, " n"], reference: SurfaceSamples, reach_m: float
+) -> Float64[ndarray, "4 4"] | None:
+    """Return one Gauss-Newton update in the fused frame; None with too few matches."""
+    rows, near = _match(moved, reference, reach_m)
+    if len(rows) < _MIN_COMPARED:
+        return None
+    offset, normals, gradients = (
+        moved[rows] - reference.points_m[near],
+        reference.normals[near],
+        reference.gradients[near],
+    )
+    distance = np.einsum("ni,ni->n", offset, normals)
+    colour = luminance[rows] - reference.luminance[near] - np.einsum("ni,ni->n", gradients, offset)
+    # agents' exposures may differ
+    colour -= np.median(colour)
+    # rotations about the centre of the matches, so that they are independent of the translation
+    centre = moved[rows].mean(axis=0)
+    arms = moved[rows] - centre
+    jacobian = np.vstack([_rows_of(normals, arms), -_COLOUR_WEIGHT_M * _rows_of(gradients, arms)])
+    residual = np.concatenate([distance, _COLOUR_WEIGHT_M * colour])
+    weight = np.concatenate([_tukey(distance), _tukey(_COLOUR_WEIGHT_M * colour)])
+    scale = np.concatenate(
+        [np.full(len(rows), _spread(distance)), np.full(len(rows), _spread(_COLOUR_WEIGHT_M * colour))]
+    )
+    # neighbouring samples err together, so many count as few: else noise would turn the map about a poor overlap
+    weight /= np.square(scale) * max(1.0, len(rows) / _INDEPENDENT_SAMPLES)
+    prior = np.diag([_PRIOR_TRANSLATION_M**-2.0] * 3 + [_PRIOR_ROTATION_RAD**-2.0] * 3)
+    hessian = (jacobian * weight[:, None]).T @ jacobian + prior
+    twist = -np.linalg.solve(hessian, (jacobian * weight[:, None]).T @ residual)
+    to_centre, back = np.eye(4), np.eye(4)
+    to_centre[:3, 3], back[:3, 3] = -centre, centre
+    update: Float64[ndarray, "4 4"] = back @ transform_of(twist) @ to_centre
+    return update
+
+
+def _rows_of(directions: Float64[ndarray, "n 3"], arms: Float64[ndarray, "n 3"]) -> Float64[ndarray, "n 6"]:
+    return np.hstack([directions, np.cross(arms, directions)])
+
+
+def _spread(residual: Float64[ndarray, " n"]) -> float:
+    """Return a robust standard deviation; at least a millimetre."""
+    return max(1e-3, 1.4826 * float(np.median(np.abs(residual))))
+
+
+def _tukey(residual: Float64[ndarray, " n"]) -> Float64[ndarray, " n"]:
+    share = np.clip(np.abs(residual) / (4.685 * _spread(residual)), 0.0, 1.0)
+    weight: Float64[ndarray, " n"] = np.square(1.0 - np.square(share))
+    return weight
+
+
+def _misfit(
+    points: Float64[ndarray, "n 3"], luminance: Float64[ndarray, " n"], reference: SurfaceSamples, T: ndarray
+) -> Misfit:
+    moved = transform_points(T, points)
+    rows, near = _match(moved, reference, _REACH_M[0])
+    if len(rows) == 0:
+        return Misfit(float("inf"), 1.0, 0.0)
+    offset = moved[rows] - reference.points_m[near]
+    distance = np.abs(np.einsum("ni,ni->n", offset, reference.normals[near]))
+    colour = np.abs(luminance[rows] - reference.luminance[near])
+    overlap = float(np.mean(np.linalg.norm(offset, axis=1) <= _OVERLAP_M) * len(rows) / len(points))
+    return Misfit(float(np.median(distance)), float(np.median(colour)), overlap)
+
+
+def _match(
+    moved: Float64[ndarray, "n 3"], reference: SurfaceSamples, reach_m: float
+) -> tuple[Int64[ndarray, " m"], Int64[ndarray, " m"]]:
+    """Return the samples whose nearest reference is within reach, and the indices of these references."""
+    near = _nearest(moved, reference.points_m, 1)[:, 0]
+    rows = np.flatnonzero(np.linalg.norm(moved - reference.points_m[near], axis=1) <= reach_m)
+    return rows, near[rows]
+
+
+def _nearest(points: Float64[ndarray, "n 3"], reference: Float64[ndarray, "m 3"], count: int) -> Int64[ndarray, "n k"]:
+    """Return the indices of the `count` nearest references of each point, unordered; memory is bounded by blocks."""
+    origin = reference.mean(axis=0)
+    a, b = (points - origin).astype(np.float32), (reference - origin).astype(np.float32)
+    squares = np.square(b).sum(axis=1)
+    found = []
+    for start in range(0, len(a), 1000):
+        distance = squares - 2.0 * (a[start : start + 1000] @ b.T)
+        if count == 1:
+            found.append(distance.argmin(axis=1)[:, None])
+        else:
+            found.append(np.argpartition(distance, count, axis=1)[:, :count])
+    return np.concatenate(found).astype(np.int64)
+
+
+def _sample(gaussians: Gaussians, limit: int, seed: int) -> tuple[Float64[ndarray, "n 3"], Float64[ndarray, " n"]]:
+    """Return the means and luminances of at most `limit` opaque Gaussians, drawn at random."""
+    rows = np.flatnonzero(gaussians.opacities >= _MIN_OPACITY)
+    if len(rows) > limit:
+        rows = np.sort(np.random.default_rng(seed).choice(rows, limit, replace=False))
+    return gaussians.means_m[rows].astype(np.float64), gaussians.rgb[rows].astype(np.float64) @ _LUMINANCE

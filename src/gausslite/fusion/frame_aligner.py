@@ -1,0 +1,116 @@
+"""Estimate the agents' frames from their updates, outside the engine's lock."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+from threading import RLock
+
+import numpy as np
+from jaxtyping import Int64
+from numpy import ndarray
+
+from gausslite.domain.gaussians import Gaussians
+from gausslite.domain.names import quote_name
+from gausslite.domain.voxel_operations import select_voxels
+from gausslite.fusion.alignment import SurfaceSamples, fit_frame
+from gausslite.fusion.frame_alignment import AlignmentSettings, AlignmentState, FrameAlignment, FrameAlignments
+from gausslite.fusion.store import FusionStore
+from gausslite.fusion.vote_input import VoteInput
+
+_log = logging.getLogger(__name__)
+_MIN_GAUSSIANS = 50
+
+
+class FrameAligner:
+    """Finds the agents whose frame has to be estimated, and estimates it. Thread-safe, with the engine's lock."""
+
+    def __init__(
+        self,
+        store: FusionStore,
+        alignments: FrameAlignments,
+        votes: VoteInput,
+        lock: RLock,
+        settings: AlignmentSettings | None,
+    ) -> None:
+        """Without settings, frames are used as declared and nothing is estimated."""
+        self._store, self._alignments, self._votes, self._lock = store, alignments, votes, lock
+        self._settings = settings
+        self._changed: dict[str, set[int]] = {}
+        self._next_seq: dict[str, int] = {}
+
+    def record(self, agent_id: str, accepted: Int64[ndarray, " a"]) -> None:
+        """Note that these voxels of an agent changed. The first agent that contributes is the reference."""
+        self._changed.setdefault(agent_id, set()).update(accepted.tolist())
+        alignment = self._alignments.get(agent_id)
+        if alignment.state is AlignmentState.UNKNOWN and not self._alignments.earlier(agent_id):
+            self._alignments.set(agent_id, replace(alignment, state=AlignmentState.REFERENCE))
+        elif alignment.fit is None and agent_id not in self._next_seq:
+            # fixes the order of the agents
+            self._alignments.set(agent_id, alignment)
+            self._next_seq[agent_id] = 0
+
+    def due(self) -> tuple[str, ...]:
+        """Return the agents with enough changed voxels for a new estimate."""
+        if self._settings is None:
+            return ()
+        with self._lock:
+            return tuple(name for name, changed in self._changed.items() if self._is_due(name, len(changed)))
+
+    def estimate(self, agent_id: str) -> Int64[ndarray, " k"]:
+        """Fit the agent's recent updates to the maps before it; returns the fused voxels that may have changed."""
+        assert self._settings is not None
+        with self._lock:
+            self._changed[agent_id] = set()
+            alignment = self._alignments.get(agent_id)
+            first_seq = self._next_seq.get(agent_id, 0)
+            source = self._recent(agent_id, first_seq)
+            reference = self._reference(agent_id)
+            highest_seq = self._store.highest_update_seq(agent_id)
+        # QUARANTINED agents are fitted from their declared frame, so that they can return
+        start = alignment.declared if alignment.state is AlignmentState.QUARANTINED else alignment.T_fused_agent
+        fit = fit_frame(source, SurfaceSamples.of(reference), start) if len(reference) >= _MIN_GAUSSIANS else None
+        with self._lock:
+            if fit is None or self._alignments.get(agent_id) is not alignment:
+                return np.zeros(0, np.int64)
+            aligned = alignment.after_fit(fit, first_seq, self._settings)
+            self._next_seq[agent_id] = highest_seq + 1
+            return self._apply(agent_id, alignment, aligned)
+
+    def remove_agent(self, agent_id: str) -> None:
+        """Forget the agent."""
+        self._changed.pop(agent_id, None)
+        self._next_seq.pop(agent_id, None)
+
+    def _apply(self, agent_id: str, before: FrameAlignment, after: FrameAlignment) -> Int64[ndarray, " k"]:
+        self._alignments.set(agent_id, after)
+        if after.state is not before.state:
+            level = logging.WARNING if after.state is AlignmentState.QUARANTINED else logging.INFO
+            _log.log(
+                level, "agent %s is %s%s", quote_name(agent_id), after.state, f": {after.message}" * bool(after.message)
+            )
+        was_used, is_used = (each.state is not AlignmentState.QUARANTINED for each in (before, after))
+        if was_used == is_used and after.segments == before.segments:
+            return np.zeros(0, np.int64)
+        return self._votes.refresh(agent_id)
+
+    def _is_due(self, agent_id: str, changed: int) -> bool:
+        assert self._settings is not None
+        if changed == 0 or not self._alignments.earlier(agent_id):
+            return False
+        scores = self._store.scores()
+        own = scores.agent_index == scores.agents.index(agent_id) if agent_id in scores.agents else slice(0)
+        has_enough = int(scores.counts[own].sum(dtype=np.int64)) >= _MIN_GAUSSIANS
+        return has_enough and changed >= self._settings.refit_share * len(scores.keys[own])
+
+    def _recent(self, agent_id: str, first_seq: int) -> Gaussians:
+        """Return the Gaussians of the updates from first_seq on, or all if these are few."""
+        batch = self._store.batch(agent_id)
+        scores = self._store.scores(batch.keys)
+        seqs = scores.update_seqs[scores.agent_index == scores.agents.index(agent_id)]
+        recent = select_voxels(batch, seqs >= first_seq).gaussians
+        return recent if len(recent) >= 4 * _MIN_GAUSSIANS else batch.gaussians
+
+    def _reference(self, agent_id: str) -> Gaussians:
+        earlier = self._alignments.earlier(agent_id)
+        return Gaussians.concatenate([b.gaussians for name, b in self._votes.batches().items() if name in earlier])

@@ -1,0 +1,192 @@
+"""The rigid motion from each agent's frame to the fused map's frame: declared, estimated, or quarantined.
+
+The agent that contributes first defines the fused frame, unless it declares another one. Each later agent is compared
+with the agents before it. Odometry drifts, so the motion is a sequence of segments: an estimate from the agent's
+updates since the last one applies to these updates and to later ones.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field, replace
+from enum import StrEnum
+
+import numpy as np
+from jaxtyping import Float64, Int64
+from numpy import ndarray
+
+from gausslite.domain.errors import CodecError, GaussLiteError
+from gausslite.domain.pose import require_rigid
+from gausslite.fusion.alignment import FrameFit, Misfit
+from gausslite.fusion.store import FusionStore
+
+_RECORD = "alignment"
+_MAX_SEGMENTS = 200
+
+
+class AlignmentState(StrEnum):
+    """How an agent's contribution is used."""
+
+    UNKNOWN = "unknown"
+    """Too little overlap with the agents before it: used as sent, or as declared."""
+    REFERENCE = "reference"
+    ALIGNED = "aligned"
+    CORRECTED = "corrected"
+    QUARANTINED = "quarantined"
+
+
+@dataclass(frozen=True, slots=True)
+class AlignmentSettings:
+    """When a misfit is corrected and when it is quarantined.
+
+    min_shift_m, min_rotation_deg: smaller misfits are noise of the maps and are not corrected. min_improvement: the
+    factor by which a correction has to reduce the median point-to-plane distance. max_distance_m: a larger distance is
+    quarantined unless a correction within max_shift_m and max_rotation_deg reduces it below. refit_share: an estimate
+    is due when this share of the agent's voxels has changed since the last one.
+    """
+
+    min_shift_m: float = 0.01
+    min_rotation_deg: float = 1.0
+    max_shift_m: float = 0.25
+    max_rotation_deg: float = 8.0
+    max_distance_m: float = 0.03
+    min_improvement: float = 1.4
+    refit_share: float = 0.25
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FrameAlignment:
+    """The state of one agent.
+
+    segments: (lowest update_seq, T_fused_agent), ascending. order: rank of its first update among the agents.
+    """
+
+    order: int
+    state: AlignmentState = AlignmentState.UNKNOWN
+    segments: tuple[tuple[int, Float64[ndarray, "4 4"]], ...] = ()
+    fit: FrameFit | None = None
+    message: str = ""
+    declared: Float64[ndarray, "4 4"] = field(default_factory=lambda: np.eye(4))
+
+    @property
+    def T_fused_agent(self) -> Float64[ndarray, "4 4"]:  # noqa: N802 - a transform names both frames
+        """The motion of the latest updates."""
+        return self.segments[-1][1] if self.segments else self.declared
+
+    @property
+    def is_identity(self) -> bool:
+        """Return whether all updates are used as sent."""
+        return all(np.array_equal(T, np.eye(4)) for T in (self.declared, *(T for _, T in self.segments)))
+
+    def segment_of(self, update_seqs: Int64[ndarray, " n"]) -> Int64[ndarray, " n"]:
+        """Return the index of each update's segment; -1 for updates before the first, which use the declared motion."""
+        firsts = np.array([first for first, _ in self.segments], np.int64)
+        return np.searchsorted(firsts, update_seqs, side="right") - 1
+
+    def transform(self, segment: int) -> Float64[ndarray, "4 4"]:
+        """Return T_fused_agent of a segment."""
+        return self.declared if segment < 0 else self.segments[segment][1]
+
+    def after_fit(self, fit: FrameFit | None, first_seq: int, settings: AlignmentSettings) -> FrameAlignment:
+        """Return the alignment after a fit of the updates from first_seq on, which started at T_fused_agent."""
+        if fit is None:
+            return self
+        too_far = fit.shift_m > settings.max_shift_m or fit.rotation_deg > settings.max_rotation_deg
+        is_bad = fit.before.distance_m > settings.max_distance_m
+        if is_bad and (too_far or fit.after.distance_m > settings.max_distance_m):
+            message = (
+                f"frame: expected a misfit of at most {settings.max_shift_m:g} m and {settings.max_rotation_deg:g} "
+                f"deg, with {1e3 * settings.max_distance_m:g} mm left after its correction, got {fit.shift_m:.2f} m, "
+                f"{fit.rotation_deg:.1f} deg and {1e3 * fit.after.distance_m:.0f} mm; check the agent's localisation"
+            )
+            return replace(self, state=AlignmentState.QUARANTINED, fit=fit, message=message)
+        is_small = fit.shift_m < settings.min_shift_m and fit.rotation_deg < settings.min_rotation_deg
+        improves = fit.before.distance_m > settings.min_improvement * fit.after.distance_m
+        if is_small or too_far or not improves:
+            state = AlignmentState.ALIGNED if self.is_identity else AlignmentState.CORRECTED
+            return replace(self, state=state, fit=fit, message="")
+        # the first estimate also holds for all updates before it
+        first_seq = first_seq if self.segments else 0
+        segments = (*self.segments[1 - _MAX_SEGMENTS :], (first_seq, fit.T_fused_agent))
+        return replace(self, state=AlignmentState.CORRECTED, segments=segments, fit=fit, message="")
+
+
+class FrameAlignments:
+    """The alignments of all agents; they persist with the store. Not thread-safe; FusionEngine holds a lock."""
+
+    def __init__(self, store: FusionStore) -> None:
+        self._store = store
+        self._by_agent = {agent_id: _decode(data) for agent_id, data in store.records(_RECORD).items()}
+
+    def get(self, agent_id: str) -> FrameAlignment:
+        """Return the agent's alignment."""
+        return self._by_agent.get(agent_id) or FrameAlignment(order=len(self._by_agent))
+
+    def set(self, agent_id: str, alignment: FrameAlignment) -> None:
+        """Replace the agent's alignment. Raises StorageError."""
+        self._store.save_record(agent_id, _RECORD, _encode(alignment))
+        self._by_agent[agent_id] = alignment
+
+    def declare(self, agent_id: str, T_fused_agent: Float64[ndarray, "4 4"]) -> None:
+        """Set the motion that the agent declares; estimates from before are dropped if it changed."""
+        current = self.get(agent_id)
+        if not np.array_equal(current.declared, T_fused_agent):
+            self.set(agent_id, FrameAlignment(current.order, declared=T_fused_agent))
+
+    def remove_agent(self, agent_id: str) -> None:
+        """Forget the agent; the store deletes its record with its updates."""
+        self._by_agent.pop(agent_id, None)
+
+    def transforms(self) -> dict[str, Float64[ndarray, "4 4"]]:
+        """Return the latest T_fused_agent of the agents whose frame differs from the fused map's."""
+        return {name: each.T_fused_agent for name, each in self._by_agent.items() if not each.is_identity}
+
+    def earlier(self, agent_id: str) -> set[str]:
+        """Return the agents that contributed before this one and are not quarantined."""
+        order = self.get(agent_id).order
+        usable = {name: each for name, each in self._by_agent.items() if each.state is not AlignmentState.QUARANTINED}
+        return {name for name, each in usable.items() if each.order < order}
+
+
+def _encode(alignment: FrameAlignment) -> bytes:
+    fit = alignment.fit
+    value = {
+        "order": alignment.order,
+        "state": str(alignment.state),
+        "segments": [[first, T.reshape(-1).tolist()] for first, T in alignment.segments],
+        "declared": alignment.declared.reshape(-1).tolist(),
+        "message": alignment.message,
+        "fit": None
+        if fit is None
+        else {
+            "T": fit.T_fused_agent.reshape(-1).tolist(),
+            "before": [fit.before.distance_m, fit.before.colour, fit.before.overlap],
+            "after": [fit.after.distance_m, fit.after.colour, fit.after.overlap],
+            "rest": [fit.shift_m, fit.rotation_deg, fit.compared],
+        },
+    }
+    return json.dumps(value).encode()
+
+
+def _decode(data: bytes) -> FrameAlignment:
+    """Decode a stored alignment. Raises CodecError."""
+    try:
+        value = json.loads(data)
+        stored = value["fit"]
+        fit = None
+        if stored is not None:
+            misfits = (Misfit(*(float(each) for each in stored[name])) for name in ("before", "after"))
+            shift_m, rotation_deg, compared = stored["rest"]
+            fit = FrameFit(_matrix(stored["T"]), *misfits, float(shift_m), float(rotation_deg), int(compared))
+        segments = tuple((int(first), _matrix(T)) for first, T in value["segments"])
+        state = AlignmentState(value["state"])
+        declared = _matrix(value["declared"])
+        return FrameAlignment(int(value["order"]), state, segments, fit, str(value["message"]), declared)
+    except (KeyError, TypeError, ValueError, RecursionError, GaussLiteError) as error:
+        raise CodecError(f"alignment: expected the JSON of an alignment, got other bytes ({error})") from error
+
+
+def _matrix(values: object) -> Float64[ndarray, "4 4"]:
+    T = np.array(values, np.float64).reshape(4, 4)
+    require_rigid("stored T_fused_agent", T)
+    return T

@@ -1,0 +1,1 @@
+"""Benchmark of a team: the fused maps of several agents by strategy and policy."""

@@ -1,0 +1,139 @@
+"""Fuse the agents' maps by every strategy, and score the fused maps in the union of the agents' regions."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+from gausslite.domain.gaussians import Gaussians
+from gausslite.domain.voxel_batch import RoiSubset
+from gausslite.domain.voxel_operations import group_by_voxel
+from gausslite.domain.voxels import VoxelGrid
+from gausslite.evaluation.compare import MapScores
+from gausslite.evaluation.team import score_team
+from gausslite.evaluation.views import MapViewer
+from gausslite.fusion.engine import FusionEngine
+from gausslite.fusion.frame_alignment import AlignmentSettings
+from gausslite.fusion.joint_refinement import RefineSettings, refine
+from gausslite.fusion.keyframes import AgentKeyframe
+from gausslite.fusion.limits import FusionSettings, Quotas
+from gausslite.fusion.memory_store import MemoryStore
+from gausslite.fusion.mission_config import MissionConfig
+from gausslite.mission.settings import MissionSettings
+from gausslite.mission.task_mapper import FrameOutcome
+from gausslite.render.choose import choose_rasterizer
+from gausslite_bench.team.frame_errors import FrameError
+from gausslite_bench.team.missions import AgentMap, map_agent
+from gausslite_bench.team.scenes import TeamPlan, TeamScene
+
+CONCATENATION, VOTE, REFINED, SHARED_VOTE = "concatenation", "vote", "refine", "vote of shared regions"
+UNALIGNED = "vote, frames trusted"
+
+
+@dataclass(frozen=True, slots=True)
+class TeamTrial:
+    """One policy in one home with one seed. frame_error: of every agent except the first."""
+
+    plan: TeamPlan
+    policy: str
+    seed: int
+    settings: MissionSettings
+    size: tuple[int, int] = (320, 240)
+    refine_iterations: int = 300
+    frame_error: FrameError = field(default_factory=FrameError)
+    grid: VoxelGrid = field(default_factory=VoxelGrid)
+
+
+@dataclass(frozen=True, slots=True)
+class TeamResult:
+    """Scores by strategy; share of all maps' Gaussians in the final sent regions, and totals sent with resends.
+    bytes_whole: size of all whole maps in messages.
+    alignment: the state of each agent's frame after the vote.
+    """
+
+    trial: TeamTrial
+    scores: Mapping[str, MapScores]
+    share_percent: float
+    bytes_sent: int
+    gaussians_sent: int
+    gaussians: int
+    bytes_whole: int
+    alignment: Mapping[str, str]
+
+    def as_json(self) -> dict[str, object]:
+        """Return the result as JSON values."""
+        trial = self.trial
+        return {
+            "scene": trial.plan.name,
+            "policy": trial.policy,
+            "seed": trial.seed,
+            "frame_error": [trial.frame_error.shift_m, trial.frame_error.rotation_deg, trial.frame_error.drift],
+            "roi_psnr": {name: each.roi_psnr for name, each in self.scores.items()},
+            "roi_ssim": {name: each.roi_ssim for name, each in self.scores.items()},
+            "full_psnr": {name: each.full_psnr for name, each in self.scores.items()},
+            "share_percent": self.share_percent,
+            "bytes_sent": self.bytes_sent,
+            "gaussians_sent": self.gaussians_sent,
+            "gaussians": self.gaussians,
+            "bytes_whole": self.bytes_whole,
+            "alignment": dict(self.alignment),
+        }
+
+
+def run_trial(trial: TeamTrial, scene: TeamScene, on_frame: Callable[[FrameOutcome], None]) -> TeamResult:
+    """Map, fuse and score. Raises GaussLiteError."""
+    maps = []
+    for i, agent in enumerate(scene.agents):
+        wrong = agent if i == 0 else replace(agent, frames=trial.frame_error.apply(agent.frames))
+        maps.append(map_agent(wrong, replace(trial.settings, seed=trial.seed + i), trial.grid, on_frame))
+    engine = fuse_messages({each.agent_id: whole_map(each, trial.grid) for each in maps}, trial.grid, align=True)
+    fused = {CONCATENATION: engine.maps.union_map().gaussians, VOTE: engine.maps.voted_map().gaussians}
+    if not trial.frame_error.is_zero:
+        trusted = fuse_messages({each.agent_id: whole_map(each, trial.grid) for each in maps}, trial.grid, align=False)
+        fused[UNALIGNED] = trusted.maps.voted_map().gaussians
+    first, *others = maps
+    shared = {first.agent_id: whole_map(first, trial.grid), **{each.agent_id: each.messages for each in others}}
+    fused[SHARED_VOTE] = fuse_messages(shared, trial.grid, align=True).maps.voted_map().gaussians
+    if trial.refine_iterations > 0:
+        fused[REFINED] = _refine(
+            trial, fused[VOTE], engine.in_fused_frame([k for each in maps for k in each.keyframes])
+        )
+    rasterizer = choose_rasterizer(threads=trial.settings.threads)
+    viewers = {name: MapViewer(gaussians, rasterizer) for name, gaussians in fused.items() if len(gaussians)}
+    total, active = (
+        sum(values) for values in zip(*((len(m.gaussians), m.gaussians.active.sum()) for m in maps), strict=True)
+    )
+    return TeamResult(
+        trial,
+        score_team(viewers, scene.views, sheets=0).scores,
+        100.0 * float(active) / max(total, 1),
+        sum(each.bytes_sent for each in maps),
+        sum(each.gaussians_sent for each in maps),
+        total,
+        sum(each.bytes_whole for each in maps),
+        {each.agent_id: str(each.alignment.state) for each in engine.status().agents},
+    )
+
+
+def whole_map(agent_map: AgentMap, grid: VoxelGrid) -> tuple[RoiSubset, ...]:
+    """Return the agent's complete map as one message, numbered after those that it sent."""
+    number = len(agent_map.messages) + 1
+    return (RoiSubset(agent_map.agent_id, "", number, number, group_by_voxel(agent_map.gaussians, grid)),)
+
+
+def fuse_messages(messages: Mapping[str, Sequence[RoiSubset]], grid: VoxelGrid, align: bool) -> FusionEngine:
+    """Return a fusion engine that has received these messages, agent by agent."""
+    quotas = Quotas(voxels_per_agent=10_000_000, gaussians_per_agent=100_000_000)
+    settings = FusionSettings(grid, quotas=quotas, alignment=AlignmentSettings() if align else None)
+    engine = FusionEngine(MemoryStore(), settings)
+    for agent_id, subsets in messages.items():
+        session_id = engine.join(agent_id, MissionConfig("", "", grid.size_m)).session.session_id
+        for subset in subsets:
+            engine.contribute(session_id, subset, grid)
+            engine.align_due()
+    return engine
+
+
+def _refine(trial: TeamTrial, gaussians: Gaussians, keyframes: Sequence[AgentKeyframe]) -> Gaussians:
+    settings = RefineSettings(iterations=trial.refine_iterations, seed=trial.seed)
+    return refine(gaussians, keyframes, choose_rasterizer(threads=trial.settings.threads), settings, lambda _: True)

@@ -1,0 +1,104 @@
+"""Map each agent's frames, and count what its uplink would send."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from gausslite.codec.subset_codec import encode_subset, split_batch
+from gausslite.domain.gaussians import Gaussians
+from gausslite.domain.voxel_batch import RoiSubset, VoxelBatch
+from gausslite.domain.voxel_operations import group_by_voxel
+from gausslite.domain.voxels import VoxelGrid
+from gausslite.fusion.keyframes import AgentKeyframe
+from gausslite.mapping.sent_voxels import SentVoxelTracker
+from gausslite.mission.build import build_mapper
+from gausslite.mission.frame_scheduler import FrameScheduler
+from gausslite.mission.runner import MissionRunner
+from gausslite.mission.settings import MissionSettings, SceneInfo
+from gausslite.mission.task_mapper import FrameOutcome, TaskMapper
+from gausslite.perception.fixed_relevance import NoTaskEstimator
+from gausslite.wire.spool import Purpose, Spool
+from gausslite_bench.quality.scenes import RecordedRelevanceEstimator, Scene
+from gausslite_bench.team.scenes import AgentScene
+
+_RESEND_THRESHOLD = 0.25
+_ROUND_FRAMES = 4
+_SUBSET_BYTES = 1 << 20
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AgentMap:
+    """One agent's map, its keyframes, and what it sent: bytes of all messages and Gaussians, resends included.
+    bytes_whole: size of its whole map as messages.
+
+    messages: the subsets in the order of sending, as the fusion server would receive them.
+    """
+
+    agent_id: str
+    gaussians: Gaussians
+    keyframes: tuple[AgentKeyframe, ...]
+    messages: tuple[RoiSubset, ...]
+    bytes_sent: int
+    gaussians_sent: int
+    bytes_whole: int
+
+
+class _SentMessages:
+    """A spool that is read every few frames by the uplink's rule: changed by a quarter, the largest change first."""
+
+    def __init__(self, agent_id: str, grid: VoxelGrid) -> None:
+        self._agent_id, self._grid = agent_id, grid
+        self._spool = Spool(None, agent_id, grid)
+        self.messages: list[RoiSubset] = []
+        self.byte_count = 0
+
+    def publish(self, batch: VoxelBatch) -> None:
+        """Queue the changed voxels of a frame."""
+        self._spool.enqueue(batch, Purpose.ROI)
+
+    def send(self, resend_threshold: float = _RESEND_THRESHOLD) -> None:
+        """Send all that is due."""
+        while (due := self._spool.next_round(_SUBSET_BYTES, resend_threshold)) is not None and due.voxels is not None:
+            for part in split_batch(due.voxels.batch, _SUBSET_BYTES):
+                number = len(self.messages) + 1
+                message = RoiSubset(self._agent_id, "", number, number, part)
+                self.byte_count += len(encode_subset(message, self._grid))
+                self.messages.append(message)
+            self._spool.mark_done(due.voxels)
+
+
+def map_agent(
+    agent: AgentScene, settings: MissionSettings, grid: VoxelGrid, on_frame: Callable[[FrameOutcome], None]
+) -> AgentMap:
+    """Return the agent's map after all its frames. A policy without a task sends its whole map once, at the end."""
+    follows_task = settings.mapper_settings().components.follow_task
+    scene = Scene(agent.task.task, agent.frames, agent.masks, (), SceneInfo())
+    estimator = RecordedRelevanceEstimator(scene) if follows_task else NoTaskEstimator()
+    sent = _SentMessages(agent.agent_id, grid)
+    mapper = TaskMapper(
+        estimator,
+        build_mapper(settings),
+        SentVoxelTracker(grid),
+        FrameScheduler(settings.scheduler_settings),
+        sent.publish,
+    )
+    count = 0
+
+    def after_frame(outcome: FrameOutcome) -> None:
+        nonlocal count
+        count += 1
+        if count % _ROUND_FRAMES == 0:
+            sent.send()
+        on_frame(outcome)
+
+    MissionRunner(mapper.process, after_frame).run(agent.frames).raise_if_stopped()
+    sent.send(0.0)
+    keyframes = tuple(AgentKeyframe(agent.agent_id, each.frame) for each in mapper.keyframes())
+    gaussians_sent = sum(len(message.batch.gaussians) for message in sent.messages)
+    gaussians = mapper.gaussians()
+    whole = split_batch(group_by_voxel(gaussians, grid), _SUBSET_BYTES)
+    bytes_whole = sum(len(encode_subset(RoiSubset(agent.agent_id, "", 1, 1, part), grid)) for part in whole)
+    return AgentMap(
+        agent.agent_id, gaussians, keyframes, tuple(sent.messages), sent.byte_count, gaussians_sent, bytes_whole
+    )

@@ -1,0 +1,51 @@
+"""The table of `bench team`: one row per scene, policy and strategy, means over the seeds."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from statistics import fmean
+
+from gausslite.evaluation.compare import MapScores
+from gausslite_bench.team.bench import CONCATENATION, TeamResult
+
+_STRATEGY_COLUMNS = ("ROI PSNR", "gain", "ROI SSIM", "full PSNR")
+
+
+def team_table(results: Sequence[TeamResult]) -> str:
+    """Return the table; gain: ROI PSNR over the concatenation of the same policy; share and bytes: per team."""
+    lines = [
+        "PSNR in dB on held-out views, in the union of the agents' regions (ROI) and over whole images. share: "
+        "Gaussians of the regions; sent: Gaussians and bytes of all messages of the regions, resends included, and the "
+        "bytes as a share of the whole maps' bytes.",
+        "",
+        f"| scene | policy | strategy | {' | '.join(_STRATEGY_COLUMNS)} | share | sent | seeds |",
+        "|---|---|---|---|---|---|---|---|---|---|",
+    ]
+    groups: dict[tuple[str, str], list[TeamResult]] = {}
+    for each in results:
+        groups.setdefault((each.trial.plan.name, each.trial.policy), []).append(each)
+    for (scene, policy), group in groups.items():
+        lines += [
+            f"| {scene} | {policy} | {strategy} | {_scores(group, strategy)} | {_sent(group)} | {len(group)} |"
+            for strategy in group[0].scores
+        ]
+    return "\n".join(lines) + "\n"
+
+
+def _scores(group: Sequence[TeamResult], strategy: str) -> str:
+    scores = [each.scores[strategy] for each in group]
+    base = _roi_psnr([each.scores[CONCATENATION] for each in group])
+    roi_psnr = _roi_psnr(scores)
+    roi_ssim = fmean(each.roi_ssim or 0.0 for each in scores)
+    return f"{roi_psnr:.2f} | {roi_psnr - base:+.2f} | {roi_ssim:.3f} | {fmean(each.full_psnr for each in scores):.2f}"
+
+
+def _roi_psnr(scores: Sequence[MapScores]) -> float:
+    return fmean(each.roi_psnr or 0.0 for each in scores)
+
+
+def _sent(group: Sequence[TeamResult]) -> str:
+    share = fmean(each.share_percent for each in group)
+    gaussians, megabytes = fmean(each.gaussians_sent for each in group), fmean(each.bytes_sent for each in group) / 1e6
+    percent = fmean(100 * each.bytes_sent / max(each.bytes_whole, 1) for each in group)
+    return f"{share:.1f} % | {gaussians:.0f}, {megabytes:.2f} MB ({percent:.1f} %)"

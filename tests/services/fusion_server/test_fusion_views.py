@@ -1,0 +1,109 @@
+"""RenderView, the refined layer and the declared frame over gRPC: the contract, and hostile input."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import grpc
+import numpy as np
+import pytest
+from fusion_running import CAMERA, GRID, frame, fusion_server, make_subset
+
+from gausslite.domain.camera import Camera
+from gausslite.domain.errors import InvalidInputError, PoseError, QuotaError
+from gausslite.domain.pose import transform_of
+from gausslite.domain.voxel_operations import empty_batch
+from gausslite.v1 import fusion_service_pb2 as pb
+from gausslite.wire.convert import camera_to_message, grid_to_message, transform_to_message
+
+CELLS = {0: [5, 6], 1: [7], 2: [1, 1]}
+
+
+def test_views_of_the_map_are_rendered() -> None:
+    with fusion_server() as server:
+        rgb, depth_m = server.client.render(CAMERA, np.eye(4))
+        assert not rgb.any()
+        assert not depth_m.any()
+        session = server.client.join("ant", GRID).session_id
+        server.contribute_subsets(session, make_subset("ant", 1, CELLS))
+        rgb, depth_m = server.client.render(CAMERA, np.eye(4), "refined")
+        assert rgb.shape == (24, 32, 3)
+        assert rgb.any()
+        assert depth_m.max() == pytest.approx(1.05, abs=0.15)
+
+
+def test_hostile_views_are_refused() -> None:
+    with fusion_server() as server:
+        large = replace(CAMERA, width_px=3000, height_px=2000)
+        with pytest.raises(QuotaError, match="at most 2073600 pixels, got 6000000"):
+            server.client.render(large, np.eye(4))
+        with pytest.raises(PoseError):
+            server.client.render(CAMERA, 2 * np.eye(4))
+        good = {"camera": camera_to_message(CAMERA), "t_world_camera": transform_to_message(np.eye(4))}
+        for wrong in (
+            {"layer": 77},
+            {"camera": camera_to_message(CAMERA).__class__(width_px=1 << 31, height_px=1 << 31)},
+            {"t_world_camera": transform_to_message(np.eye(4)).__class__(row_major=[1.0] * 15)},
+        ):
+            with pytest.raises(grpc.RpcError) as refused:
+                server.stub.RenderView(pb.RenderFusedViewRequest(**{**good, **wrong}))
+            assert refused.value.code() is grpc.StatusCode.INVALID_ARGUMENT
+        with pytest.raises(grpc.RpcError) as refused:
+            server.stub.RenderView(pb.RenderFusedViewRequest(mission_id="another", **good))
+        assert refused.value.code() is grpc.StatusCode.FAILED_PRECONDITION
+        assert isinstance(CAMERA, Camera)
+
+
+def test_watchers_follow_the_refined_layer() -> None:
+    with fusion_server() as server:
+        session = server.client.join("ant", GRID).session_id
+        server.contribute_subsets(session, make_subset("ant", 1, CELLS))
+        server.client.contribute_keyframes(session, [frame(0), frame(1)])
+        watched = empty_batch()
+        updates = server.client.watch(layer="refined")
+        watched = next(updates).apply_to(watched)
+        before = watched.gaussians.rgb.copy()
+        assert list(server.client.refine(iterations=3))[-1].done
+        watched = next(updates).apply_to(watched)
+        assert watched.gaussians.rgb.shape != before.shape or not np.array_equal(watched.gaussians.rgb, before)
+        # the vote is unchanged
+        vote = next(server.client.watch()).apply_to(empty_batch())
+        assert vote.gaussians.rgb == pytest.approx(before, abs=0.01)
+        updates.close()
+
+
+def test_an_agent_follows_its_teammates_voxels() -> None:
+    with fusion_server() as server:
+        ant, bee = (server.client.join(name, GRID).session_id for name in ("ant", "bee"))
+        server.contribute_subsets(ant, make_subset("ant", 1, {0: [5], 1: [9]}))
+        server.contribute_subsets(bee, make_subset("bee", 1, {1: [1], 2: [3]}))
+        updates = server.client.watch(exclude_agent="bee")
+        batch = next(updates).apply_to(empty_batch())
+        assert batch.kappa_sums.tolist() == [5, 9]
+        # bee trains voxel 1 more and wins it: it is empty for bee
+        server.contribute_subsets(bee, make_subset("bee", 2, {1: [20]}))
+        batch = next(updates).apply_to(batch)
+        assert batch.kappa_sums.tolist() == [5]
+        updates.close()
+        with pytest.raises(InvalidInputError, match="exclude_agent_id"):
+            next(server.client.watch(layer="refined", exclude_agent="bee"))
+        with pytest.raises(InvalidInputError, match="exclude_agent_id"):
+            next(server.client.watch(exclude_agent="x" * 1000))
+
+
+def test_a_declared_frame_moves_the_agents_map() -> None:
+    with fusion_server() as server:
+        T = transform_of(np.array([0.0, 0.0, 2.0, 0.0, 0.0, 0.0]))
+        request = pb.JoinSessionRequest(
+            agent_id="ant", grid=grid_to_message(GRID), t_fused_agent=transform_to_message(T)
+        )
+        session = server.stub.JoinSession(request).session_id
+        server.contribute_subsets(session, make_subset("ant", 1, CELLS))
+        batch = next(server.client.watch()).apply_to(empty_batch())
+        assert (batch.gaussians.means_m[:, 2] > 2.9).all()
+        [agent] = server.client.status().agents
+        assert list(agent.alignment.t_fused_agent.row_major) == T.reshape(-1).tolist()
+        request.t_fused_agent.row_major[0] = 5.0
+        with pytest.raises(grpc.RpcError) as refused:
+            server.stub.JoinSession(request)
+        assert refused.value.code() is grpc.StatusCode.INVALID_ARGUMENT
