@@ -21,7 +21,7 @@ def require_serving(address: str, tls: Tls | None) -> None:
 
 def serves(address: str, service: str, tls: Tls | None) -> bool:
     """Return whether the service of this full name serves at the address. Raises UnavailableError without an answer."""
-    return _status(address, service, tls) == _SERVING
+    return _status(address, service, tls) == int(_SERVING)
 
 
 def _status(address: str, service: str, tls: Tls | None) -> int:

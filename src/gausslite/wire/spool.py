@@ -143,8 +143,7 @@ class Spool:
         the handover follow when nothing else is due.
         """
         with self._transaction():
-            updates = self._due(Purpose.ROI, resend_threshold)
-            due = heapq.merge(updates, self._keyframes.pending(), key=_value_per_byte, reverse=True)
+            due = _by_value(self._due(Purpose.ROI, resend_threshold), self._keyframes.pending())
             if chosen := _take(due, max_bytes):
                 return SpoolRound(
                     _to_batch(Purpose.ROI, [each for each in chosen if isinstance(each, tuple)]),
@@ -244,6 +243,11 @@ class Spool:
 
 
 _Due = TypeVar("_Due", bound="_Row | SpooledKeyframe")
+
+
+def _by_value(*sources: Iterable[_Row | SpooledKeyframe]) -> Iterator[_Row | SpooledKeyframe]:
+    """Merge sources that are sorted by value per byte, the highest first."""
+    return heapq.merge(*sources, key=_value_per_byte, reverse=True)
 
 
 def _value_per_byte(due: _Row | SpooledKeyframe) -> float:
