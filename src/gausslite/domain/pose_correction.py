@@ -55,7 +55,8 @@ class CorrectionTrack:
 
     def before(self, time_ns: int) -> Float64[ndarray, "4 4"]:
         """Return T_map_odometry of the last frame before a time, or of the first frame: what a live robot can use."""
-        return self.T_map_odometry[max(int(np.searchsorted(self.times_ns, time_ns)) - 1, 0)]
+        T: Float64[ndarray, "4 4"] = self.T_map_odometry[max(int(np.searchsorted(self.times_ns, time_ns)) - 1, 0)]
+        return T
 
 
 def pose_at(times_ns: Int64[ndarray, " n"], T: Float64[ndarray, "n 4 4"], time_ns: int) -> Float64[ndarray, "4 4"]:
@@ -63,7 +64,5 @@ def pose_at(times_ns: Int64[ndarray, " n"], T: Float64[ndarray, "n 4 4"], time_n
     after = int(np.searchsorted(times_ns, time_ns))
     before, after = max(after - 1, 0), min(after, len(times_ns) - 1)
     gap_ns = int(times_ns[after] - times_ns[before])
-    if gap_ns == 0:
-        return T[after]
-    share = min(max((time_ns - int(times_ns[before])) / gap_ns, 0.0), 1.0)
+    share = min(max((time_ns - int(times_ns[before])) / gap_ns, 0.0), 1.0) if gap_ns > 0 else 0.0
     return interpolate_poses(T[before], T[after], share)

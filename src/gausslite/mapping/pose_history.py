@@ -129,4 +129,6 @@ class PoseHistory:
         self._correction_sum = self._sum_corrections()
 
     def _sum_corrections(self) -> Float64[ndarray, "6"]:
-        return np.sum([pose.correction for pose in self._poses.values()] or [np.zeros(6)], axis=0)
+        corrections = [pose.correction for pose in self._poses.values()]
+        total: Float64[ndarray, "6"] = np.sum(corrections or [np.zeros(6)], axis=0)
+        return total

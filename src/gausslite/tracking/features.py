@@ -69,11 +69,11 @@ class RelativePose:
 def detect_features(frame: Frame) -> FeatureView:
     """Return the frame's ORB features."""
     camera = frame.camera
-    orb = cv2.ORB_create(nfeatures=_MAX_FEATURES, nlevels=6, fastThreshold=_FAST_THRESHOLD)
+    orb = cv2.ORB.create(nfeatures=_MAX_FEATURES, nlevels=6, fastThreshold=_FAST_THRESHOLD)
     keypoints, descriptors = orb.detectAndCompute(cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY), None)
     if not keypoints:
         return FeatureView(np.zeros((0, 2), np.float32), np.zeros((0, 3), np.float32), np.zeros((0, 32), np.uint8))
-    pixels = cv2.KeyPoint_convert(keypoints).astype(np.float32).reshape(-1, 2)
+    pixels = np.array(cv2.KeyPoint.convert(keypoints)).astype(np.float32).reshape(-1, 2)
     columns = np.clip(np.rint(pixels[:, 0]).astype(np.int64), 0, camera.width_px - 1)
     rows = np.clip(np.rint(pixels[:, 1]).astype(np.int64), 0, camera.height_px - 1)
     z_m = frame.depth_m[rows, columns]

@@ -18,7 +18,7 @@ from gausslite.domain.frame import Frame
 from gausslite.domain.pose import inverse, orthonormal, require_rigid, transform_of, twist_of
 from gausslite.domain.state import State, add_prefix, get_array, get_counts, int_array, select_prefix
 from gausslite.render.rasterizer import Rendering
-from gausslite.tracking.alignment import COARSE_TO_FINE, FINE, Alignment, align
+from gausslite.tracking.alignment import COARSE_TO_FINE, FINE, Alignment, Level, align
 from gausslite.tracking.features import FeatureView, detect_features, relative_pose
 from gausslite.tracking.relocalisation import KeyframeIndex
 
@@ -128,33 +128,39 @@ class CameraTracker:
         if self._lost_frames > 0:
             return self._relocalise(frame, features)
         by_features = relative_pose(last.features, features, frame.camera)
-        predictions = [self._predict(frame, last)]
+        predictions: list[tuple[Float64[ndarray, "4 4"], tuple[Level, ...]]]
+        predictions = [(self._predict(frame, last), COARSE_TO_FINE)]
         if by_features is not None and by_features.inliers >= _MIN_FEATURE_INLIERS:
-            predictions.insert(0, last.T_world_camera @ inverse(by_features.T_current_reference))
-        for T_world_predicted in predictions:
-            alignment = self._align(frame, T_world_predicted)
+            predictions.insert(0, (last.T_world_camera @ inverse(by_features.T_current_reference), FINE))
+        for T_world_predicted, levels in predictions:
+            alignment = self._align(frame, T_world_predicted, levels)
             if alignment is not None:
                 return alignment.T_world_camera, TrackedBy.MAP
         if by_features is not None and by_features.inliers >= _RELIABLE_FEATURE_INLIERS:
-            return predictions[0], TrackedBy.FEATURES
+            return predictions[0][0], TrackedBy.FEATURES
         return self._relocalise(frame, features)
 
     def _predict(self, frame: Frame, last: _LastFrame) -> Float64[ndarray, "4 4"]:
         if self._motion is MotionModel.ODOMETRY:
-            return last.T_world_camera @ inverse(last.T_world_odometry) @ frame.T_world_camera
-        return last.T_world_camera @ transform_of(self._velocity * 1e-9 * (frame.capture_time_ns - last.time_ns))
+            T_last_frame = inverse(last.T_world_odometry) @ frame.T_world_camera
+        else:
+            T_last_frame = transform_of(self._velocity * 1e-9 * (frame.capture_time_ns - last.time_ns))
+        T_world_camera: Float64[ndarray, "4 4"] = last.T_world_camera @ T_last_frame
+        return T_world_camera
 
     def _relocalise(self, frame: Frame, features: FeatureView) -> tuple[Float64[ndarray, "4 4"], TrackedBy] | None:
         for T_world_camera in self._keyframes.candidates(features, frame.camera):
-            alignment = self._align(frame, T_world_camera)
+            alignment = self._align(frame, T_world_camera, COARSE_TO_FINE)
             if alignment is not None:
                 return alignment.T_world_camera, TrackedBy.RELOCALISATION
         return None
 
-    def _align(self, frame: Frame, T_world_predicted: Float64[ndarray, "4 4"]) -> Alignment | None:
+    def _align(
+        self, frame: Frame, T_world_predicted: Float64[ndarray, "4 4"], levels: tuple[Level, ...]
+    ) -> Alignment | None:
         """Return the pose aligned to the map near a prediction; None if map and frame do not agree there."""
         rendering = self._render(frame.camera, T_world_predicted, frame.motion)
-        alignment = align(rendering, T_world_predicted, frame, _PRIOR_STD, COARSE_TO_FINE)
+        alignment = align(rendering, T_world_predicted, frame, _PRIOR_STD, levels)
         if alignment is None:
             return None
         step = np.abs(twist_of(inverse(T_world_predicted) @ alignment.T_world_camera))
