@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// Lookup tables of the active tiles. They test a box of tiles in a few instructions: culling does this for each row of
-// a map.
+// Lookup tables of the active tiles, the tiles that a step renders. They test a box of tiles in a few instructions:
+// culling does this for each parameter row of a map.
 #pragma once
 
 #include <cstdint>

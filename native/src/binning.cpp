@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
-// Stage 3: assign the sorted splats of a tile row to its tiles, each with a mask of the 4x4 blocks that its ellipse
-// overlaps. Culling by block, not by tile, has the largest effect on run time: an average splat touches 4 of the 16
-// blocks of a tile.
+// Assigns the sorted splats of a tile row to its tiles, each with a mask of the 4x4 blocks that its ellipse overlaps.
+// Culling by block, not by tile, has the largest effect on run time: an average splat touches 4 of the 16 blocks of a
+// tile.
 #include <algorithm>
 #include <cstring>
 
@@ -40,7 +40,7 @@ GAUSSLITE_INLINE uint32_t touched_blocks(const Splat& s, float tile_x, float til
   return bits(min(vertical, horizontal) <= Pack16(s.log2_opacity - kLog2MinAlpha));
 }
 
-// Appends the splats to the lists of the tiles where they touch a needed block.
+// Appends the splats to the lists of the tiles where they touch a needed block (Workspace::needed_blocks).
 GAUSSLITE_INLINE void list_touches(const Workspace& ws, int tile_row, const Touch* touches, int n,
                                    const uint16_t* needed, TileList* tiles) {
   for (int x = 0; x < ws.tiles_x; ++x) {

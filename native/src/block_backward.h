@@ -1,5 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// The backward pass of one 4x4 block, in front-to-back order, and its sums per splat.
+// The backward pass of one 4x4 block, in front-to-back order, and its sums per entry: the index of a splat in the
+// tile's current chunk (Workspace's kChunk). T_i is the transmittance in front of splat i; <a, b> is the dot product.
 //
 // With weights w_i = alpha_i T_i and q_i = <dL/d(rgb, depth, alpha), (rgb_i, depth_i, 1)>, the derivative
 // with respect to ln(alpha_i) is w_i q_i - alpha_i / (1 - alpha_i) S_i with the suffix sum S_i = sum over k > i of w_k
@@ -127,10 +128,10 @@ GAUSSLITE_INLINE void add_to_rows(Workspace& ws, const Splat* records, int n, co
     const Pack8 moments = shift_moments(load8(sums.moments.by_entry[i]), offset + offset) * units;
     float* row = gradient_row(ws, records[i], tile);
     uint32_t row_pass;
-    std::memcpy(&row_pass, row + kRowPass, sizeof row_pass);
+    std::memcpy(&row_pass, row + kPassNumber, sizeof row_pass);
     const Pack16 total =
         join(moments, sum_of_quads(sums.colours[i])) + zero_unless(row_pass == ws.gradient_pass, load(row));
-    store(row, select(first_lanes(kRowPass), total, pass));
+    store(row, select(first_lanes(kPassNumber), total, pass));
   }
 }
 

@@ -1,5 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// Front-to-back compositing of one 4x4 block of pixels, with its state in registers.
+// Front-to-back compositing of one 4x4 block of pixels, with its state in registers. An entry is the index of a splat
+// in the tile's current chunk (Workspace's kChunk).
 #pragma once
 
 #include "simd/pack.h"

@@ -25,8 +25,8 @@ constexpr float kDilationPx2 = 0.3f;  // added to the diagonal of the 2D covaria
 constexpr float kTangentLimitFactor = 1.3f;
 // The exposure time of a mean outside the image is limited to this share of the readout, before and after its middle.
 constexpr float kMaxReadoutShare = 0.65f;
-// Smallest derivative of a recorded row by its row without motion: rows that recede as fast as the readout have none.
-constexpr float kMinRowRate = 0.5f;
+// Smallest readout factor (motion.h). The factor is 0 for a mean that moves down the image as fast as the readout.
+constexpr float kMinReadoutFactor = 0.5f;
 constexpr float kMinTransmittance = 1e-4f;             // blending of a pixel ends below it
 constexpr float kLog2MinAlpha = -7.99435343685886f;    // log2(1/255): weaker contributions are dropped
 constexpr float kLog2MaxAlpha = -0.0144995696951151f;  // log2(0.99): alpha is clamped there, without a gradient

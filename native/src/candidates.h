@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// Culling: finds the rows that may be visible in the active tiles. Most rows of a map are not, so the test must be
-// cheap.
+// Culling: finds the parameter rows whose splats may be visible in the active tiles, called candidates. Most rows of a
+// map are not, so the test must be cheap.
 #pragma once
 
 #include <algorithm>

@@ -12,7 +12,7 @@ struct Variant {
 };
 
 #if defined(GAUSSLITE_HAS_AVX2) || defined(GAUSSLITE_HAS_AVX512)
-// All instruction sets that CMakeLists.txt enables: a virtual machine may lack any of them.
+// Tests every instruction set that CMakeLists.txt enables for the variant: a virtual machine may hide any of them.
 bool has_avx2() {
   return __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma") && __builtin_cpu_supports("bmi") &&
          __builtin_cpu_supports("bmi2") && __builtin_cpu_supports("popcnt");
@@ -20,7 +20,8 @@ bool has_avx2() {
 #endif
 
 #if defined(GAUSSLITE_HAS_AVX512)
-// VBMI2 (Ice Lake, Zen 4 and later) has the byte compression that builds the block lists.
+// tile_chunk.h uses vpcompressb, which moves the selected bytes of a register to its front. It is part of VBMI2 (Ice
+// Lake, Zen 4 and later).
 bool has_avx512() {
   return has_avx2() && __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") &&
          __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("avx512vl") &&

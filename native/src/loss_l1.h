@@ -15,12 +15,12 @@ GAUSSLITE_INLINE Pack16 sign_times(Pack16 x, Pack16 size) {
 }
 
 // image: r g b depth transmittance; gradient: by r g b depth alpha. Returns the loss of each pixel.
-GAUSSLITE_INLINE Pack16 l1_of_pixels(const Pack16 (&image)[5], const Pack16 (&target_rgb)[3], Pack16 measured_m,
+GAUSSLITE_INLINE Pack16 l1_of_pixels(const Pack16 (&image)[5], const Pack16 (&training_rgb)[3], Pack16 measured_m,
                                      Pack16 weight, const LossSettings& settings, Pack16 (&gradient)[5]) {
   const Pack16 colour = weight * settings.colour;
   Pack16 loss(0.0f);
   for (int k = 0; k < 3; ++k) {
-    const Pack16 difference = image[k] - target_rgb[k];
+    const Pack16 difference = image[k] - training_rgb[k];
     loss = fma(abs(difference), colour, loss);
     gradient[k] = sign_times(difference, colour);
   }

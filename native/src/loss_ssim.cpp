@@ -1,7 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
-// Stage 5: SSIM (Wang et al. 2004) and its derivatives with respect to the window means, in squares of 16x16 pixels.
+// SSIM (Wang et al. 2004) and its derivatives with respect to the window means, in squares of 16x16 pixels.
 //
-// With the window mean E of the image x and the target y: S = A1 A2 / (B1 B2), A1 = 2 Ex Ey + C1, A2 = 2 (Exy - Ex Ey)
+// With the window mean E of the rendered image x and the training image y: S = A1 A2 / (B1 B2), A1 = 2 Ex Ey + C1, A2 =
+// 2 (Exy - Ex Ey)
 // + C2, B1 = Ex^2 + Ey^2 + C1, B2 = E(xx + yy) - Ex^2 - Ey^2 + C2. The gradient at a pixel is the blur of dS/dEx, plus
 // 2x times that of dS/dExx, plus y times that of dS/dExy. Pixels outside the image count as zero.
 //
@@ -11,13 +12,13 @@
 // A square needs four blurs. The first, down the image, processes sixteen columns at once. Then the square is
 // transposed, so that the blur along the rows loads aligned cache lines. SSIM is computed there, and its derivatives
 // are blurred along the rows, transposed back and stored. The last blur, down the image, runs where a tile needs its
-// gradient (ssim_gradient.h). The data of successive squares stay in the first-level cache. The target's mean and
-// square are blurred again in each step: that costs less than loading stored ones from memory.
+// gradient (ssim_gradient.h). The data of successive squares stay in the first-level cache. The blurs of y
+// and y² are computed again in each step: that costs less than loading stored ones from memory.
 #include <algorithm>
 
+#include "image_tile.h"
 #include "ssim_window.h"
 #include "stage_functions.h"
-#include "target_pixels.h"
 
 namespace gausslite::GAUSSLITE_ISA {
 
@@ -53,22 +54,22 @@ class Columns {
 // Row k of the SSIM squares. Each square overlaps two tiles. Beyond the image all values are zero.
 class Squares {
  public:
-  Squares(const Workspace& ws, const Targets& targets, const SsimSquareRow& row)
-      : targets_(targets),
+  Squares(const Workspace& ws, const TrainingImage& training_image, const SsimSquareRow& row)
+      : training_image_(training_image),
         row_(row),
         upper_(size_t(std::max(row.k - 1, 0)) * size_t(ws.tiles_x)),
         lower_(size_t(row.k) * size_t(ws.tiles_x)) {}
 
   // Writes the 26 rows of a channel that the windows of square x reach.
-  GAUSSLITE_INLINE void image_rows(int x, int channel, float* out) const {
+  GAUSSLITE_INLINE void rendered_rows(int x, int channel, float* out) const {
     const size_t at = image_offset(x) + size_t(channel) * kTilePixels;
     const float* upper = row_.above != nullptr ? row_.above->image.data() + at : kZeroSquares;
     const float* lower = row_.below != nullptr ? row_.below->image.data() + at : kZeroSquares;
     for (int i = 0; i < kSpan; ++i) store(out + i * kTileSide, row_between(upper, lower, i));
   }
-  GAUSSLITE_INLINE void target_rows(int x, int channel, float* out) const {
-    const TargetTile& upper = row_.above != nullptr ? targets_.tiles[upper_ + size_t(x)] : kBlackTarget;
-    const TargetTile& lower = row_.below != nullptr ? targets_.tiles[lower_ + size_t(x)] : kBlackTarget;
+  GAUSSLITE_INLINE void training_rows(int x, int channel, float* out) const {
+    const ImageTile& upper = row_.above != nullptr ? training_image_.tiles[upper_ + size_t(x)] : kBlackTile;
+    const ImageTile& lower = row_.below != nullptr ? training_image_.tiles[lower_ + size_t(x)] : kBlackTile;
     for (int i = 0; i < kSpan; ++i) {
       const int at = i + kTileSide / 2 - kRadius;
       store(out + i * kTileSide,
@@ -84,8 +85,8 @@ class Squares {
 
   // The weights of a square, by columns: in `scratch`, or the shared array if they are constant.
   const float* weights(int x, float* scratch) const {
-    const float* upper = row_.above != nullptr ? targets_.tile_weights(upper_ + size_t(x)) : kZeroSquares;
-    const float* lower = row_.below != nullptr ? targets_.tile_weights(lower_ + size_t(x)) : kZeroSquares;
+    const float* upper = row_.above != nullptr ? training_image_.tile_weights(upper_ + size_t(x)) : kZeroSquares;
+    const float* lower = row_.below != nullptr ? training_image_.tile_weights(lower_ + size_t(x)) : kZeroSquares;
     if (upper == lower) return upper;
     Pack16 rows[kTileSide];
     for (int i = 0; i < kTileSide / 2; ++i) {
@@ -98,7 +99,7 @@ class Squares {
   }
 
  private:
-  const Targets& targets_;
+  const TrainingImage& training_image_;
   const SsimSquareRow& row_;
   size_t upper_, lower_;  // first tile of the tile rows
 };
@@ -111,10 +112,11 @@ GAUSSLITE_INLINE void blur_and_transpose(Get get, float* out) {
   for (int i = 0; i < kTileSide; ++i) store(out + i * kTileSide, rows[i]);
 }
 
-// `rendered`: whether a block of the square is rendered; otherwise the image and its blurs are zero.
+// First of the four blurs. `rendered`: whether a block of the square is rendered; if not, the image and its blurs are
+// zero.
 void blur_down(const Squares& squares, int x, int channel, bool rendered, Columns& columns) {
   alignas(64) float image[kSpan * kTileSide], target[kSpan * kTileSide];
-  squares.target_rows(x, channel, target);
+  squares.training_rows(x, channel, target);
   const auto Y = [&](int i) { return load(target + i * kTileSide); };
   if (!rendered) {
     for (const int k : {0, 3}) std::fill_n(columns.blurred(k, x), kTilePixels, 0.0f);
@@ -122,7 +124,7 @@ void blur_down(const Squares& squares, int x, int channel, bool rendered, Column
     blur_and_transpose([&](int i) { return Y(i) * Y(i); }, columns.blurred(2, x));
     return;
   }
-  squares.image_rows(x, channel, image);
+  squares.rendered_rows(x, channel, image);
   const auto X = [&](int i) { return load(image + i * kTileSide); };
   blur_and_transpose(X, columns.blurred(0, x));
   blur_and_transpose(Y, columns.blurred(1, x));
@@ -164,10 +166,10 @@ double derive(Columns& columns, int x, const float* weights, float scale) {
 }  // namespace
 
 void compute_ssim(Workspace& ws, const TrainingArguments& training, const SsimSquareRow& row, int thread) {
-  const uint8_t* status = training.targets.square_status + size_t(row.k) * size_t(ws.tiles_x);
+  const uint8_t* status = training.image.square_status + size_t(row.k) * size_t(ws.tiles_x);
   double& loss = training.ssim_sums[row.k] = 0.0;
   if (!std::any_of(status, status + ws.tiles_x, [](uint8_t r) { return r == kWeighted; })) return;
-  const Squares squares(ws, training.targets, row);
+  const Squares squares(ws, training.image, row);
   Columns columns(ws.scratch[size_t(thread)].ssim, ws.tiles_x);
   for (int channel = 0; channel < 3; ++channel) {
     // A pipeline over the squares. Square x is blurred down the image. In square x - 1 SSIM and its derivatives are

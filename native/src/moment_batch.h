@@ -1,5 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// Sums the six moments of v over the sixteen pixels of a block, for sixteen (splat, block) pairs at a time.
+// Sums the six moments of v = dL/d ln(alpha) (row_layout.h) over the sixteen pixels of a block, for sixteen (splat,
+// block) pairs at a time.
 //
 // Multiplication limits the speed of the tile stages. A single pair, with a table of 1, x, y, xx, xy, yy, would take
 // sixteen half-width multiplications. Here the otherwise idle shuffle units transpose sixteen pairs until each lane is
@@ -13,7 +14,7 @@
 
 namespace gausslite::GAUSSLITE_ISA {
 
-// Per entry of a chunk: sums of v, v x, v y, v x x, v x y, v y y, with (x, y) in half pixels from the tile's centre,
+// Per entry of a chunk: sums of v, v·x, v·y, v·x², v·x·y, v·y², with (x, y) in half pixels from the tile's centre,
 // where pixels have odd coordinates; two unused.
 struct MomentSums {
   alignas(64) float by_entry[kChunk][8];

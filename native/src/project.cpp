@@ -1,5 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// Stage 1: project parameter rows to visible splats, and add their depth keys to the tile rows that they touch.
+// Projects parameter rows to visible splats, and adds their depth keys to the tile rows that they touch:
+// Stages::project. stages.h defines the terms.
 #include <algorithm>
 #include <cmath>
 #include <cstring>
@@ -32,7 +33,7 @@ struct Box {
     y1 = floor(bottom * (1.0f / kTileSide));
   }
 
-  // Returns the few lanes with a box that is too large for narrow().
+  // Returns the few lanes with a box that is too large for narrow(): over kSmallBox tiles across or two down.
   GAUSSLITE_INLINE uint32_t large() const {
     return bits(((x1 - x0 > Pack16(kMaxAcross)) | (y1 - y0 > Pack16(1.0f))) & visible);
   }
@@ -93,8 +94,8 @@ struct BoxLanes {
   }
 };
 
-// Reserves gradient rows for a thread and returns the first. A thread takes them from the shared counter in large
-// blocks, so that it rarely accesses the counter.
+// Reserves rows of image gradients (row_layout.h) for a thread and returns the first. A thread takes them from the
+// shared counter in large blocks, so that it rarely accesses the counter.
 GAUSSLITE_INLINE uint32_t take_gradient_rows(Workspace& ws, ThreadScratch& thread_scratch, uint32_t rows) {
   if (thread_scratch.end_gradient_row - thread_scratch.next_gradient_row < rows) {
     const uint32_t block = std::max<uint32_t>(kSegmentRows, rows);

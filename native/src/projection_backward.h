@@ -31,8 +31,9 @@ GAUSSLITE_INLINE void conic_times_axis(const Projection& p, int j, Pack16& x, Pa
   y = y * p.inverse_determinant;
 }
 
-// The same with blur, a fourth axis b with n_b m_j = -minor[j]. fainter: the gradient of ln sqrt(sharp determinant /
-// determinant), by which blur scales alpha: the axis times the conic without blur, less the axis times the conic.
+// The same with blur, a fourth axis b with n_b m_j = -minor[j]. Blur scales alpha by sqrt(sharp determinant /
+// determinant). `fainter` is the gradient of the logarithm of this factor with respect to m_j: the conic without blur
+// times m_j, minus the conic times m_j.
 GAUSSLITE_INLINE void conic_times_blurred_axis(const Projection& p, int j, Pack16& x, Pack16& y, Pack16& fainter_x,
                                                Pack16& fainter_y) {
   const ProjectionMotion& m = p.motion;
@@ -53,7 +54,7 @@ struct MotionGradients {
   GAUSSLITE_INLINE void from_covariance(const Projection& p, const Camera& camera, const Pack16* image,
                                         Pack16 (&d_P0)[3], Pack16 (&d_P1)[3]) {
     const ProjectionMotion& m = p.motion;
-    const Pack16 *moments = image + kMoments, S_xx = moments[3], S_xy = moments[4], S_yy = moments[5];
+    const Pack16 *moments = image + kGradientMoments, S_xx = moments[3], S_xy = moments[4], S_yy = moments[5];
     // The conic times b, as in scaled_conic_times_axis.
     const Pack16 x = fma(m.blur_x, Pack16(kDilationPx2), dot3(p.M1, m.minor)) * p.inverse_determinant;
     const Pack16 y = (m.blur_y * kDilationPx2 - dot3(p.M0, m.minor)) * p.inverse_determinant;
@@ -86,13 +87,13 @@ struct MotionGradients {
     const Pack16 d_velocity[3] = {p.J00 * d_image_x, p.J11 * d_image_y, fma(p.J02, d_image_x, p.J12 * d_image_y)};
     add_velocity_gradient(camera.motion, d_velocity, d);
 
-    // t, with a gradient unless it is limited, and its derivative by the row
+    // Backward through t, which has no gradient where it is clamped, and through time_per_row.
     const float per_row = camera.motion.readout_s / float(camera.height);
     const Pack16 inverse_z = Pack16(1.0f) / m.z, fy(camera.fy);
-    const Pack16 d_time = zero_unless(e.time == e.unlimited_time, dot3(d, e.velocity));
-    const Pack16 d_rate =
-        zero_unless(e.row_rate > Pack16(kMinRowRate), (d_time * e.time + d_time_per_row * e.time_per_row) / e.row_rate);
-    const Pack16 d_rows_per_s = d_rate * per_row * fy;  // the rate falls with the speed, and t with the rate
+    const Pack16 d_time = zero_unless(e.time == e.unclamped_time, dot3(d, e.velocity));
+    const Pack16 d_factor = zero_unless(e.readout_factor > Pack16(kMinReadoutFactor),
+                                        (d_time * e.time + d_time_per_row * e.time_per_row) / e.readout_factor);
+    const Pack16 d_rows_per_s = d_factor * per_row * fy;  // signs cancel: f falls with s, and t falls with f
     const Pack16 d_moving[3] = {e.time * d[0], fma(e.time, d[1], d_rows_per_s * inverse_z),
                                 fnma(d_rows_per_s * inverse_z, e.tangent_y, e.time * d[2])};
     const Pack16 d_tangent = fy * d_time * e.time_per_row - d_rows_per_s * inverse_z * e.velocity[2];
@@ -145,7 +146,7 @@ GAUSSLITE_INLINE void backward16(const Pack16* row, const Pack16* image, const C
 
   // Covariance = M M^T + 0.3 I with M = P R S. As ln(alpha) = ... - d^T K d / 2, column m of M has the gradient K S K
   // m, where S is the matrix of second moments of v.
-  const Pack16 *moments = image + kMoments, S_xx = moments[3], S_xy = moments[4], S_yy = moments[5];
+  const Pack16 *moments = image + kGradientMoments, S_xx = moments[3], S_xy = moments[4], S_yy = moments[5];
   Pack16 d_P0[3] = {0.0f, 0.0f, 0.0f}, d_P1[3] = {0.0f, 0.0f, 0.0f}, d_R[3][3];
   for (int j = 0; j < 3; ++j) {
     Pack16 x, y, fainter_x, fainter_y;

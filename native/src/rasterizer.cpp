@@ -192,14 +192,14 @@ TrainingArguments Rasterizer::begin_training(const TrainingView& view, bool mask
   l1_sums_.ensure_capacity(tiles);
   ssim_sums_.ensure_capacity(size_t(ws_.tiles_y) + 1);
   const TrainingArguments training{
-      view.targets(masked),
+      view.image(masked),
       {float(loss.colour * per_pixel / 3.0), float(loss.depth * per_pixel), float(loss.ssim * per_pixel / 3.0)},
       l1_sums_.data(),
       ssim_sums_.data()};
   if (loss.ssim == 0.0f) {
-    select_blocks(training.targets.weighted_blocks);
+    select_blocks(training.image.weighted_blocks);
   } else {
-    select_blocks(training.targets.reached_blocks);
+    select_blocks(training.image.reached_blocks);
     const int caches = TileRowSchedule::cache_slots(pool_.size());
     const size_t rows = size_t(TileRowSchedule::square_slots(caches));
     if (ws_.caches.size() < size_t(caches)) ws_.caches.resize(size_t(caches));
@@ -250,8 +250,8 @@ double Rasterizer::step(const FrameInput& input, const OptimizerState& state, co
   update.adam.beta1 = float(adam.beta1);
   update.adam.beta2 = float(adam.beta2);
   update.adam.epsilon = float(adam.epsilon);
-  update.adam.corrections = corrections_.table(adam.beta1, adam.beta2, adam.decay_after_updates);
-  update.adam.correction_count = AdamCorrections::kCount;
+  update.adam.step_factors = corrections_.table(adam.beta1, adam.beta2, adam.decay_after_updates);
+  update.adam.step_factor_count = AdamCorrections::kCount;
 
   pool_.run([&](int thread) {
     stages_.project(ws_, thread);

@@ -3,9 +3,9 @@
 // (loss_ssim.cpp) to the gradient of the image colours.
 #pragma once
 
+#include "image_tile.h"
 #include "ssim_window.h"
 #include "stages.h"
-#include "target_pixels.h"
 
 namespace gausslite::GAUSSLITE_ISA {
 
@@ -25,7 +25,7 @@ GAUSSLITE_INLINE void clear_beyond_edge(const Camera& camera, int tile_x, int ti
 
 // The gradient of one channel of a tile: `image` and `target` are its pixels, `upper` and `lower` the three maps of the
 // squares that it overlaps.
-GAUSSLITE_INLINE void ssim_gradient(const float* image, const TargetTile& target, int channel, const float* upper,
+GAUSSLITE_INLINE void ssim_gradient(const float* image, const ImageTile& target, int channel, const float* upper,
                                     const float* lower, float* out) {
   const auto blurred = [&](int map, auto set) {
     blur([&](int i) { return row_between(upper + map * kTilePixels, lower + map * kTilePixels, i); }, set);
@@ -42,16 +42,16 @@ GAUSSLITE_INLINE void ssim_gradient(const float* image, const TargetTile& target
 
 // Computes the SSIM gradient of tile x. Returns false, without output, if no window of a weighted pixel reaches the
 // tile.
-GAUSSLITE_INLINE bool ssim_gradient(const Workspace& ws, const Targets& targets, const RenderedTileRow& tile_row, int x,
-                                    TileColours& out) {
+GAUSSLITE_INLINE bool ssim_gradient(const Workspace& ws, const TrainingImage& training_image,
+                                    const RenderedTileRow& tile_row, int x, TileColours& out) {
   const size_t tile = size_t(tile_row.index) * size_t(ws.tiles_x) + size_t(x);
-  const bool above = targets.square_status[tile] != kUnused;
-  const bool below = targets.square_status[tile + size_t(ws.tiles_x)] != kUnused;
+  const bool above = training_image.square_status[tile] != kUnused;
+  const bool below = training_image.square_status[tile + size_t(ws.tiles_x)] != kUnused;
   if (!above && !below) return false;
   for (int channel = 0; channel < 3; ++channel) {
     const size_t at = ssim_map_offset(x, channel, 0);
-    ssim_gradient(tile_row.cache.image.data() + image_offset(x) + size_t(channel) * kTilePixels, targets.tiles[tile],
-                  channel, above ? tile_row.upper_squares + at : kZeroSquares,
+    ssim_gradient(tile_row.cache.image.data() + image_offset(x) + size_t(channel) * kTilePixels,
+                  training_image.tiles[tile], channel, above ? tile_row.upper_squares + at : kZeroSquares,
                   below ? tile_row.lower_squares + at : kZeroSquares, out.value[channel]);
   }
   clear_beyond_edge(ws.camera, x, tile_row.index, out.value[0]);

@@ -1,6 +1,19 @@
 // SPDX-License-Identifier: Apache-2.0
-// The stages of an iteration, as one table of functions per instruction set. All threads of the pool call each stage
-// with their index. The caller synchronises them with barriers between the stages.
+// The stages of an iteration, as one table of functions per instruction set.
+//
+// Terms of the kernels:
+// - tile: 16x16 pixels. tile row: the tiles at one height of the image.
+// - block: 4x4 pixels, 16 per tile. A block mask has the bit 4 row + column for each block of a tile.
+// - SSIM square: 16x16 pixels, half a tile higher than a tile (workspace.h). There is one row of squares more than tile
+//   rows.
+// - segment: kSegmentRows (workspace.h) successive parameter rows, processed by one thread. Its own segments are those
+//   that a thread takes first, the same ones in each stage.
+// - slot: index of a visible splat in Workspace::splats. The slots of segment s start at s * kSegmentRows.
+// - forward cache: what the backward pass reuses of the forward pass of a tile row (TileRowCache).
+//
+// The caller is Rasterizer. In `project`, `update` and `gradients`, all threads of the pool take segments, with
+// barriers between these stages. The stages that process one tile row are tasks: threads take tile rows in any order,
+// and steps with SSIM in the order of TileRowSchedule.
 #pragma once
 
 #include <cstddef>
@@ -10,45 +23,46 @@
 
 namespace gausslite {
 
+// Settings of Adam. step_factors holds the two factors of a step by the number of updates (AdamCorrections::table).
 struct AdamSettings {
   float rates[16];
   float beta1, beta2, epsilon;
-  const float* corrections;  // AdamCorrections::table
-  int correction_count;
+  const float* step_factors;
+  int step_factor_count;
 };
 
-// Use of an SSIM square (workspace.h) by the loss. kWeighted: it has pixels with a weight, for which SSIM is computed.
+// Use of an SSIM square by the loss. kWeighted: it has pixels with a weight, for which SSIM is computed.
 // kWindowInput: it has none, but windows of an adjacent kWeighted square reach into it. kUnused: neither.
 enum SquareStatus : uint8_t { kUnused, kWindowInput, kWeighted };
 
-// A tile of a training image: sixteen rows of sixteen pixels per channel.
-struct alignas(64) TargetTile {
+// A tile of the image that a view is compared with: sixteen rows of sixteen pixels per channel.
+struct alignas(64) ImageTile {
   uint8_t rgb[3][kTilePixels];
   float depth_m[kTilePixels];  // 0: no measurement
 };
 
-// The targets of one training image, by tiles.
-struct Targets {
-  const TargetTile* tiles;
-  const float* weights;                  // arrays of 16x16 pixels, 0 outside the image
-  const uint32_t* weight_entry_of_tile;  // [tile]: index of its array in `weights`
+// The image that a view is compared with, and the weights of its pixels in the loss. The arrays belong to TrainingView.
+struct TrainingImage {
+  const ImageTile* tiles;
+  const float* weights;                  // arrays of 16x16 pixel weights, 0 outside the image
+  const uint32_t* weight_array_of_tile;  // [tile]: number of its array in `weights`
   const uint16_t* weighted_blocks;       // [tile]: mask of the blocks with a weighted pixel
   const uint16_t* reached_blocks;        // [tile]: mask of the blocks in the SSIM window of a weighted pixel
   const uint8_t* square_status;          // [k][x]: SquareStatus of SSIM square x in row k, k = 0 ... tile rows
 
   // All tiles of weight 0 share one array, as do all tiles of weight 1.
-  const float* tile_weights(size_t tile) const { return weights + size_t(weight_entry_of_tile[tile]) * kTilePixels; }
+  const float* tile_weights(size_t tile) const { return weights + size_t(weight_array_of_tile[tile]) * kTilePixels; }
 };
 
-// Factors of a pixel's loss terms: the loss weights, divided by the sum of the pixel weights, and by 3 for the channels
-// of colour and SSIM.
+// Factors of a pixel's loss terms: the loss weights divided by the sum of the pixel weights, or by the number of pixels
+// with LossWeights::normalise_by_image; and divided by 3 for the channels of colour and SSIM.
 struct LossSettings {
   float colour, depth, ssim;
 };
 
 // Input and output of the loss stages.
 struct TrainingArguments {
-  Targets targets;
+  TrainingImage image;
   LossSettings loss;
   double* l1_sums;    // one per tile
   double* ssim_sums;  // one per row of SSIM squares
@@ -68,7 +82,7 @@ struct UpdateArguments {
 // Output of the gradient stage.
 struct GradientOutput {
   float* d_rows;             // zeroed by the caller
-  float* mean_2d_grad_norm;  // [slot of the visible splat]: norm of the gradient of its 2D mean
+  float* mean_2d_grad_norm;  // [slot]: norm of the gradient of its 2D mean
   double* d_twist;           // [segment][6]: gradient of the camera twist, zeroed by the caller
 };
 

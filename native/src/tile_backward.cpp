@@ -1,5 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// Stage 6: backward pass from pixel gradients to image gradients of the splats, with the lists of the forward pass.
+// Backward pass of rendered tiles, for Rasterizer::backward: from the gradients of pixels to the image gradients of
+// splats (row_layout.h), with the lists of the forward pass.
 #include <algorithm>
 
 #include "block_backward.h"

@@ -1,5 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// Gathers a chunk of a tile's splats, and converts their block masks to one list per block.
+// Gathers a chunk of a tile's splats (kChunk in workspace.h), and converts their block masks to one list per block. An
+// entry is the index of a splat in its chunk.
 #pragma once
 
 #include <algorithm>

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// Stage 4: render the tiles of a tile row. The backward pass reuses their lists.
+// Renders the tiles of a tile row into Workspace::image, for Rasterizer::forward. The backward pass reuses their lists.
 #include <algorithm>
 
 #include "block_forward.h"
@@ -30,9 +30,9 @@ void render_tile(Workspace& ws, TileList& list, const TilePosition& tile) {
     for (int b = 0; b < kBlocksPerTile; ++b) {
       if (finished >> b & 1u) continue;
       float* no_alphas = nullptr;
-      const int taken = composite<false>(records, lists.entry[b], lists.count[b], tile.pixel_x(b), tile.pixel_y(b),
-                                         state[b], no_alphas);
-      list.used[b] += uint32_t(taken);
+      const int composited = composite<false>(records, lists.entry[b], lists.count[b], tile.pixel_x(b), tile.pixel_y(b),
+                                              state[b], no_alphas);
+      list.used[b] += uint32_t(composited);
       if (state[b].finished()) finished |= 1u << b;
     }
   }

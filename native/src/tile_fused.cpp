@@ -1,16 +1,16 @@
 // SPDX-License-Identifier: Apache-2.0
-// Stages 4 to 6 fused: the backward pass reuses splats, lists and alphas of the forward pass (TileRowCache). Without
-// SSIM the loss of a pixel depends on that pixel alone. A tile then goes through all three stages at once, with its
-// data in the second-level cache, and no image is written. SSIM needs the image around a tile: the forward cache of a
-// tile row waits until the adjacent tile rows are rendered.
+// Tiles of a training step: render, loss and backward pass. The backward pass reuses splats, lists and alphas of the
+// forward pass (TileRowCache). Without SSIM the loss of a pixel depends on that pixel alone. A tile then goes through
+// all three steps at once, with its data in the second-level cache, and no image is written. SSIM needs the image
+// around a tile: the forward cache of a tile row waits until the adjacent tile rows are rendered.
 #include <algorithm>
 
 #include "block_backward.h"
 #include "block_forward.h"
+#include "image_tile.h"
 #include "loss_l1.h"
 #include "ssim_gradient.h"
 #include "stage_functions.h"
-#include "target_pixels.h"
 #include "tile_chunk.h"
 
 namespace gausslite::GAUSSLITE_ISA {
@@ -101,12 +101,12 @@ void backward_cached_tile(Workspace& ws, const TileRowCache& cache, const Cached
 // Computes the L1 terms of one block and their gradient.
 GAUSSLITE_INLINE Pack16 compare(const TrainingArguments& training, size_t t, int b, const Pack16 (&image)[5],
                                 Pack16 (&gradient)[5]) {
-  const TargetTile& target = training.targets.tiles[t];
+  const ImageTile& target = training.image.tiles[t];
   const int corner = corner_in_tile(b);
   Pack16 rgb[3];
   for (int k = 0; k < 3; ++k) rgb[k] = colour_block(target, k, corner);
   const Pack16 measured_m = load_block(target.depth_m + corner, kTileSide);
-  const Pack16 weight = load_block(training.targets.tile_weights(t) + corner, kTileSide);
+  const Pack16 weight = load_block(training.image.tile_weights(t) + corner, kTileSide);
   return l1_of_pixels(image, rgb, measured_m, weight, training.loss, gradient);
 }
 
@@ -139,14 +139,14 @@ bool any_tile(const uint16_t* blocks, int tiles_x) {
 void train_tile_row(Workspace& ws, const TrainingArguments& training, int tile_row, int thread) {
   const size_t first = size_t(tile_row) * size_t(ws.tiles_x);
   std::fill_n(training.l1_sums + first, ws.tiles_x, 0.0);
-  if (!any_tile(training.targets.weighted_blocks + first, ws.tiles_x)) return;
+  if (!any_tile(training.image.weighted_blocks + first, ws.tiles_x)) return;
   ThreadScratch& thread_scratch = ws.scratch[size_t(thread)];
   int count = 0;
   const DepthKey* keys = sort_tile_row(ws, tile_row, thread, count);
   bin_tile_row(ws, tile_row, keys, count, thread_scratch.tiles.data());
   for (int x = 0; x < ws.tiles_x; ++x) {
     const size_t t = first + size_t(x);
-    if (training.targets.weighted_blocks[t] != 0)
+    if (training.image.weighted_blocks[t] != 0)
       train_tile(ws, training, t, TilePosition(ws, x, tile_row), thread_scratch);
   }
 }
@@ -154,7 +154,7 @@ void train_tile_row(Workspace& ws, const TrainingArguments& training, int tile_r
 void render_to_cache(Workspace& ws, const TrainingArguments& training, TileRowCache& cache, int tile_row, int thread) {
   const size_t first = size_t(tile_row) * size_t(ws.tiles_x);
   cache.clear();
-  if (!any_tile(training.targets.reached_blocks + first, ws.tiles_x)) return;
+  if (!any_tile(training.image.reached_blocks + first, ws.tiles_x)) return;
   ThreadScratch& thread_scratch = ws.scratch[size_t(thread)];
   int count = 0;
   const DepthKey* keys = sort_tile_row(ws, tile_row, thread, count);
@@ -163,8 +163,8 @@ void render_to_cache(Workspace& ws, const TrainingArguments& training, TileRowCa
   cache.image.ensure_capacity(image_offset(ws.tiles_x));
   for (int x = 0; x < ws.tiles_x; ++x) {
     const size_t t = first + size_t(x);
-    if (training.targets.reached_blocks[t] == 0) continue;
-    if (ws.needed_blocks[t] == 0 && training.targets.weighted_blocks[t] == 0) {
+    if (training.image.reached_blocks[t] == 0) continue;
+    if (ws.needed_blocks[t] == 0 && training.image.weighted_blocks[t] == 0) {
       // Windows reach this tile, but it is not rendered: its pixels are black.
       cache.tiles[size_t(x)].entries = 0;
       std::fill_n(cache.image.data() + image_offset(x), 3 * kTilePixels, 0.0f);
@@ -189,13 +189,13 @@ void backward_from_cache(Workspace& ws, const TrainingArguments& training, const
   for (int x = 0; x < ws.tiles_x; ++x) {
     const size_t t = size_t(tile_row.index) * size_t(ws.tiles_x) + size_t(x);
     training.l1_sums[t] = 0.0;
-    if (training.targets.reached_blocks[t] == 0) continue;
+    if (training.image.reached_blocks[t] == 0) continue;
     const CachedTile& rendered = cache.tiles[size_t(x)];
-    if (rendered.entries == 0 && training.targets.weighted_blocks[t] == 0) continue;
+    if (rendered.entries == 0 && training.image.weighted_blocks[t] == 0) continue;
     const TilePosition tile(ws, x, tile_row.index);
     prefetch_rows(ws, cache.records.data() + rendered.first_record, chunk_size(rendered.entries, 0), tile);
     TileColours ssim_gradients;
-    const bool reached = ssim_gradient(ws, training.targets, tile_row, x, ssim_gradients);
+    const bool reached = ssim_gradient(ws, training.image, tile_row, x, ssim_gradients);
     TileGradient gradient;
     Pack16 loss(0.0f);
     for (int b = 0; b < kBlocksPerTile; ++b) {

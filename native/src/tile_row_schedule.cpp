@@ -43,26 +43,31 @@ void TileRowSchedule::start(const std::vector<uint32_t>& key_counts, int threads
   backward_taken_ = 0;
   first_tile_row_.assign(size_t(threads) + 1, tile_rows);
   const uint64_t total = std::accumulate(key_counts.begin(), key_counts.end(), uint64_t{0});
-  uint64_t above = 0;
+  // Thread t starts at the first tile row with at least its share t / threads of all keys above it.
+  uint64_t keys_above = 0;
   for (int tile_row = 0, t = 0; tile_row <= tile_rows && t < threads; ++tile_row) {
-    for (; t < threads && above * uint64_t(threads) >= total * uint64_t(t); ++t) first_tile_row_[size_t(t)] = tile_row;
-    if (tile_row < tile_rows) above += key_counts[size_t(tile_row)];
+    for (; t < threads && keys_above * uint64_t(threads) >= total * uint64_t(t); ++t)
+      first_tile_row_[size_t(t)] = tile_row;
+    if (tile_row < tile_rows) keys_above += key_counts[size_t(tile_row)];
   }
   first_tile_row_[0] = 0;
   ranges_.clear();
   for (int t = 0; t < threads; ++t) {
     const int first = first_tile_row_[size_t(t)], count = first_tile_row_[size_t(t) + 1] - first;
-    const bool upwards = t % 2 == 0 && t + 1 < threads;
-    ranges_.push_back({upwards ? first + count - 1 : first, count, upwards ? -1 : 1});
+    // Threads 2 i and 2 i + 1 start at their common boundary, so that the rows that wait for each other there are
+    // rendered first. A last thread without a partner goes to the bottom.
+    const bool towards_top = t % 2 == 0 && t + 1 < threads;
+    ranges_.push_back({towards_top ? first + count - 1 : first, count, towards_top ? -1 : 1});
   }
   fill(free_caches_, cache_slots);
   fill(free_squares_, square_slots(cache_slots));
   cache_of_tile_row_.assign(size_t(tile_rows), -1);
   rendered_by_.assign(size_t(tile_rows), -1);
-  cache_last_thread_.resize(size_t(cache_slots), -1);
+  last_thread_of_cache_.resize(size_t(cache_slots), -1);
   squares_of_square_row_.assign(size_t(tile_rows) + 1, -1);
-  backward_missing_.assign(size_t(tile_rows), 2);
-  for (std::vector<int>* adjacent_tile_rows : {&ssim_missing_, &square_row_users_}) {
+  missing_square_rows_.assign(size_t(tile_rows), 2);
+  // A row of squares needs two tile rows, and two need it; only one at the top and bottom of the image.
+  for (std::vector<int>* adjacent_tile_rows : {&missing_tile_rows_, &square_row_users_}) {
     adjacent_tile_rows->assign(size_t(tile_rows) + 1, 2);
     adjacent_tile_rows->front() = adjacent_tile_rows->back() = 1;
   }
@@ -84,6 +89,12 @@ TileRowTask TileRowSchedule::next(int thread) {
 
 // Tasks on data in the thread's own caches come first, and of these the backward tasks, which free a forward cache. A
 // thread takes tasks on tile rows of other threads when none of its own are left.
+//
+// Returns false if nothing can be taken now. There is no deadlock, because then a task of another thread is running,
+// and its end makes others ready. Suppose that no task is ready or running. Then each forward cache in use holds a
+// rendered tile row next to one that is not rendered. The rendered rows of a thread are contiguous, and those of
+// threads 2 i and 2 i + 1 touch each other or the image's edge. So at most threads + 1 caches are in use, or one by a
+// single thread, which starts at the top. These are fewer than cache_slots, so that a row can be rendered.
 bool TileRowSchedule::take(TileRowTask& task, int thread) {
   const bool can_render = not_rendered_ > 0 && !free_caches_.empty();
   if (const int tile_row = pop_own_tile_row(thread); tile_row >= 0) {
@@ -115,10 +126,10 @@ TileRowTask TileRowSchedule::render_task(int thread) {
   range->next += range->step;
   --range->left;
   --not_rendered_;
-  int cache = pop_own(free_caches_, [&](int place) { return cache_last_thread_[size_t(place)] == thread; });
+  int cache = pop_own(free_caches_, [&](int place) { return last_thread_of_cache_[size_t(place)] == thread; });
   if (cache < 0) cache = pop(free_caches_);
   cache_of_tile_row_[size_t(tile_row)] = cache;
-  rendered_by_[size_t(tile_row)] = cache_last_thread_[size_t(cache)] = thread;
+  rendered_by_[size_t(tile_row)] = last_thread_of_cache_[size_t(cache)] = thread;
   return {TileRowTask::kRender, tile_row, {cache, -1}, {-1, -1}};
 }
 
@@ -153,11 +164,11 @@ void TileRowSchedule::finish(const TileRowTask& task) {
     const std::lock_guard lock(mutex_);
     if (task.kind == TileRowTask::kRender) {
       for (const int k : {task.index, task.index + 1}) {
-        if (--ssim_missing_[size_t(k)] == 0) ssim_ready_.push_back(k);
+        if (--missing_tile_rows_[size_t(k)] == 0) ssim_ready_.push_back(k);
       }
     } else if (task.kind == TileRowTask::kSsim) {
       for (const int tile_row : {task.index - 1, task.index}) {
-        if (tile_row >= 0 && tile_row < tile_rows_ && --backward_missing_[size_t(tile_row)] == 0)
+        if (tile_row >= 0 && tile_row < tile_rows_ && --missing_square_rows_[size_t(tile_row)] == 0)
           backward_ready_.push_back(tile_row);
       }
     } else {

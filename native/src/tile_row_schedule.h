@@ -30,8 +30,7 @@ struct TileRowTask {
 
 class TileRowSchedule {
  public:
-  // Number of forward caches: enough to avoid deadlock. If no SSIM or backward task is ready, at most two rendered tile
-  // rows of each thread wait for neighbours: its first and its last.
+  // Number of forward caches: two per thread avoid deadlock (see `take`).
   static int cache_slots(int threads) { return 2 * threads; }
   // Number of rows of SSIM squares in memory: at most two for each forward cache in use. A row of squares is in use
   // only while one of the two tile rows that it overlaps has a forward cache.
@@ -47,7 +46,8 @@ class TileRowSchedule {
   void stop();
 
  private:
-  // Tile rows of a thread that are not rendered yet: `left` rows from `next` on, upwards (step -1) or downwards (1).
+  // Tile rows of a thread that are not rendered yet: `left` rows from `next` on, towards the top of the image (step -1)
+  // or the bottom (1).
   struct ThreadRange {
     int next, left, step;
   };
@@ -65,9 +65,10 @@ class TileRowSchedule {
   std::vector<ThreadRange> ranges_;
   std::vector<int> first_tile_row_;  // [t]: first tile row of thread t; each thread has an equal share of the keys
   std::vector<int> free_caches_, free_squares_, cache_of_tile_row_, squares_of_square_row_;
-  std::vector<int> rendered_by_, cache_last_thread_;  // threads, by tile row and by forward cache
-  std::vector<int> ssim_missing_, backward_missing_;  // number of unfinished inputs
-  std::vector<int> square_row_users_;                 // tile rows that still need a row of squares
+  std::vector<int> rendered_by_, last_thread_of_cache_;  // threads, by tile row and by forward cache
+  std::vector<int> missing_tile_rows_;                   // [row of squares]: adjacent tile rows not rendered yet
+  std::vector<int> missing_square_rows_;                 // [tile row]: overlapping rows of squares without SSIM yet
+  std::vector<int> square_row_users_;                    // tile rows that still need a row of squares
   std::vector<int> ssim_ready_, backward_ready_;
   std::atomic<uint32_t> change_count_{0};
 };

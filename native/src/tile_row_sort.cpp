@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// Stage 2: sort the splats of each tile row by depth. The keys of a tile row fit the second-level cache, and the same
-// thread bins and renders the row next. One sort of the whole image would go through memory.
+// Sorts the splats of each tile row by depth, after `project`. The keys of a tile row fit the second-level cache, and
+// the same thread bins and renders the row next. One sort of the whole image would go through memory.
 #include <algorithm>
 #include <utility>
 
@@ -42,9 +42,10 @@ DepthRange depth_range(const Workspace& ws, int tile_row) {
 
 }  // namespace
 
-// A least-significant-digit radix sort over 24 bits. The bits of a positive float increase with its value. Relative to
-// the nearest splat of the tile row, 24 bits resolve depth to about 3e-7. The sort is stable: equal depths keep the
-// order of the rows.
+// A least-significant-digit radix sort over the 24 highest bits of the depths' range. The bits of a positive float
+// increase with its value. The order is exact if the farthest splat of the tile row is less than 4 times as far as the
+// nearest. Below 16 times, it ignores the lowest mantissa bit; below 256 times, the lowest two (3.6e-7 of the depth).
+// The sort is stable: equal keys keep the order of the rows.
 const DepthKey* sort_tile_row(Workspace& ws, int tile_row, int thread, int& count) {
   const DepthRange range = depth_range(ws, tile_row);
   count = range.count;
@@ -70,6 +71,7 @@ const DepthKey* sort_tile_row(Workspace& ws, int tile_row, int thread, int& coun
     for (int i = 0; i < count; ++i) to[position[digit][from[i].depth >> (kDigitBits * digit) & 255u]++] = from[i];
     std::swap(from, to);
   }
+  // bin_tile_row prefetches this far ahead: behind the last key, it prefetches the last splat again.
   for (int i = 0; i < kPrefetchAhead; ++i) from[count + i] = from[count - 1];
   return from;
 }

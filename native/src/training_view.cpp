@@ -12,7 +12,7 @@ namespace {
 // An SSIM window extends 5 px from its centre: it reaches at most the second block next to the centre's block.
 constexpr int kReachInBlocks = 2;
 // Entries of Weights::values for all tiles with weights of 0, and for all tiles with weights of 1.
-constexpr uint32_t kZerosEntry = 0, kOnesEntry = 1;
+constexpr uint32_t kZerosArray = 0, kOnesArray = 1;
 
 uint16_t block_bit(int x, int y) { return uint16_t(1u << (y % kBlocksPerSide * kBlocksPerSide + x % kBlocksPerSide)); }
 
@@ -57,7 +57,7 @@ TrainingView::Extent TrainingView::extent(size_t tile) const {
 
 void TrainingView::copy_tile(size_t tile, const uint8_t* rgb, const float* depth_m) {
   const Extent part = extent(tile);
-  TargetTile& out = tiles_[tile];
+  ImageTile& out = tiles_[tile];
   for (int y = 0; y < part.rows; ++y) {
     const int64_t from = int64_t(part.y + y) * width_ + part.x;
     for (int k = 0; k < 3; ++k) {
@@ -72,10 +72,10 @@ void TrainingView::copy_tile(size_t tile, const uint8_t* rgb, const float* depth
 }
 
 void TrainingView::assign_weights(Weights& weights, const float* pixel_weights) const {
-  weights.entry_of_tile.ensure_exact_capacity(tile_count());
+  weights.array_of_tile.ensure_exact_capacity(tile_count());
   weights.weighted_blocks.ensure_exact_capacity(tile_count());
   weights.values.ensure_capacity(2 * kTilePixels);
-  std::fill_n(&weights.values[kOnesEntry * kTilePixels], kTilePixels, 1.0f);
+  std::fill_n(&weights.values[kOnesArray * kTilePixels], kTilePixels, 1.0f);
   uint32_t used = 2;
   for (size_t t = 0; t < tile_count(); ++t) {
     const Extent part = extent(t);
@@ -93,7 +93,7 @@ void TrainingView::assign_weights(Weights& weights, const float* pixel_weights) 
       zeros &= w == 0.0f;
       ones &= w == 1.0f;
     }
-    weights.entry_of_tile[t] = zeros ? kZerosEntry : ones ? kOnesEntry : used;
+    weights.array_of_tile[t] = zeros ? kZerosArray : ones ? kOnesArray : used;
     weights.weighted_blocks[t] = zeros ? uint16_t(0) : ones ? uint16_t(0xFFFF) : blocks_with_weight(tile);
     weights.sum += zeros ? 0.0 : ones ? double(kTilePixels) : std::accumulate(tile, tile + kTilePixels, 0.0);
     if (zeros || ones) continue;
@@ -138,9 +138,9 @@ void TrainingView::mark_ssim_squares(Weights& weights) const {
   }
 }
 
-Targets TrainingView::targets(bool masked) const {
+TrainingImage TrainingView::image(bool masked) const {
   const Weights& w = weights(masked);
-  return {tiles_.data(),           w.values.data(),       w.entry_of_tile.data(), w.weighted_blocks.data(),
+  return {tiles_.data(),           w.values.data(),       w.array_of_tile.data(), w.weighted_blocks.data(),
           w.reached_blocks.data(), w.square_status.data()};
 }
 

@@ -18,7 +18,7 @@ class TrainingView {
 
   int width() const { return width_; }
   int height() const { return height_; }
-  Targets targets(bool masked) const;
+  TrainingImage image(bool masked) const;
   double weight_sum(bool masked) const { return weights(masked).sum; }
   // Mean weight of the image's pixels.
   double mean_weight(bool masked) const { return weights(masked).sum / image_weights_.sum; }
@@ -28,7 +28,7 @@ class TrainingView {
   struct Weights {
     double sum = 0.0;
     Buffer<float> values;  // entries of 16x16 weights
-    Buffer<uint32_t> entry_of_tile;
+    Buffer<uint32_t> array_of_tile;
     Buffer<uint16_t> weighted_blocks, reached_blocks;
     Buffer<uint8_t> square_status;
   };
@@ -49,7 +49,7 @@ class TrainingView {
 
   int width_, height_, tiles_x_, tiles_y_;
   bool masked_;
-  Buffer<TargetTile> tiles_;
+  Buffer<ImageTile> tiles_;
   Weights image_weights_;  // 1 everywhere in the image
   Weights mask_weights_;   // the given weights
 };

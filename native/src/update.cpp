@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
-// Stage 7: from image gradients to parameters, for the visible splats of a segment. Gradients are either written out or
-// applied by Adam at once, while the three rows of a splat (parameters and two moments) are in cache.
+// From image gradients (row_layout.h) to parameters, for the visible splats of a segment: Stages::update and
+// Stages::gradients. Gradients are either written out or applied by Adam at once, while the three rows of a splat
+// (parameters and two moments) are in cache.
 #include <algorithm>
 #include <cstring>
 #include <limits>
@@ -38,7 +39,7 @@ struct Group {
   GAUSSLITE_INLINE static Pack16 gradient(const Workspace& ws, uint32_t index, bool is_used) {
     const float* row = ws.gradient_rows.data() + size_t(kRowWidth) * index;
     uint32_t row_pass;
-    std::memcpy(&row_pass, row + kRowPass, sizeof row_pass);
+    std::memcpy(&row_pass, row + kPassNumber, sizeof row_pass);
     return zero_unless(is_used & (row_pass == ws.gradient_pass), load(row));
   }
 };
@@ -65,8 +66,8 @@ GAUSSLITE_INLINE void for_each_group(Workspace& ws, int thread, Prefetch prefetc
   }
 }
 
-// Adam on whole rows. Columns 14 and 15 of the first moment are sums over the steps: the recurrence of Adam with
-// factors of 1 in those lanes. Column 14 of the row, the number of updates, increases by one.
+// Adam on whole rows. Columns kGradSum and kGradCount of the first moment are sums over the steps: the recurrence of
+// Adam with factors of 1 in those lanes. Column kUpdates of the row increases by one.
 class Adam {
  public:
   GAUSSLITE_INLINE explicit Adam(const UpdateArguments& args)
@@ -91,21 +92,21 @@ class Adam {
   GAUSSLITE_INLINE void step(uint32_t id, Pack16 gradient) const {
     const size_t at = size_t(kRowWidth) * id;
     float *row = args_.rows + at, *m = args_.first_moment + at, *v = args_.second_moment + at;
-    const float* correction = args_.adam.corrections + 2 * correction_index(row[kUpdates]);
+    const float* factors = args_.adam.step_factors + 2 * step_factor_index(row[kUpdates]);
     const Pack16 m_new = fma(load(m), first_decay_, gradient * first_gain_);
     const Pack16 v_new = fma(load(v), second_decay_, gradient * gradient * second_gain_);
     store(m, m_new);
     store(v, v_new);
     // 14 bits suffice for the size of a step. The smallest float avoids 0 / 0 in unused columns.
-    const Pack16 square = max(v_new * correction[1], Pack16(std::numeric_limits<float>::min()));
+    const Pack16 square = max(v_new * factors[1], Pack16(std::numeric_limits<float>::min()));
     const Pack16 size = fma(square, rough_inverse_sqrt(square), epsilon_);
-    store(row, fnma(rate_ * correction[0], m_new * rough_reciprocal(size), load(row)) + count_);
+    store(row, fnma(rate_ * factors[0], m_new * rough_reciprocal(size), load(row)) + count_);
   }
 
  private:
   // Limits the index to the table: the number of updates of an uninitialised row may be any value.
-  GAUSSLITE_INLINE size_t correction_index(float updates) const {
-    const float last = float(args_.adam.correction_count - 1);
+  GAUSSLITE_INLINE size_t step_factor_index(float updates) const {
+    const float last = float(args_.adam.step_factor_count - 1);
     return updates > 0.0f ? size_t(std::min(updates, last)) : 0;
   }
 

@@ -1,5 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// The data of a frame that stages pass on to each other; independent of the instruction set.
+// The data of a frame that stages pass on to each other; independent of the instruction set. stages.h defines the
+// terms.
 #pragma once
 
 #include <atomic>
@@ -13,8 +14,8 @@
 
 namespace gausslite {
 
-// A projected splat in one cache line. log2(alpha) at a pixel d = pixel - mean is
-// log2_opacity - (quad_xx dx dx + quad_xy dx dy + quad_yy dy dy).
+// A projected splat in one cache line. With (dx, dy) = pixel - mean, log2(alpha) at a pixel is
+// log2_opacity - (quad_xx·dx² + quad_xy·dx·dy + quad_yy·dy²).
 struct alignas(64) Splat {
   float mean_x, mean_y;
   float quad_xx, quad_xy, quad_yy;
@@ -58,7 +59,7 @@ struct TileList {
 constexpr int kTilePixels = kTileSide * kTileSide;  // of a tile, and of an SSIM square
 constexpr int kSsimMaps = 3;        // blurred maps of SSIM: x, xx, xy forward, their derivatives backward
 constexpr int kChunk = 128;         // splats of a tile per batch: their records fit the first-level cache
-constexpr int kPrefetchAhead = 64;  // in keys
+constexpr int kPrefetchAhead = 64;  // number of depth keys between a prefetch and the use of its splat
 constexpr int kSegmentRows = 2048;  // parameter rows per segment, the unit of projection and update work
 
 // Means of sixteen parameter rows, and the largest log scale of each: they bound the splats' extent in the image.

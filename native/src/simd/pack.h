@@ -31,7 +31,7 @@ constexpr float kLn2 = 0.69314718055994531f;
 // the integer k nearest to n e: k steps of 1 / n, and a remainder f. Adding a large bias to e rounds e to k / n and
 // puts k into the lowest mantissa bits. A polynomial computes 2^f; its degree depends on n.
 GAUSSLITE_INLINE Pack16 exp2_fast(Pack16 e) {
-  const Pack16 bias(12582912.0f / kExp2TableSize), steps_in_mantissa = e + bias, f = e - (steps_in_mantissa - bias);
+  const Pack16 bias(12582912.0f / kExp2TableSize), biased_steps = e + bias, f = e - (biased_steps - bias);
   Pack16 p;
   if constexpr (kExp2TableSize == 16) {
     p = fma(Pack16(0.24021946f), f, Pack16(0.69318783f));
@@ -45,7 +45,7 @@ GAUSSLITE_INLINE Pack16 exp2_fast(Pack16 e) {
     p = fma(p, f, Pack16(0.69312181f));
     p = fma(p, f, Pack16(0.99999926f));
   }
-  return p * exp2_of_steps(steps_in_mantissa);
+  return p * exp2_of_steps(biased_steps);
 }
 
 // 2^e of any e, to a relative error of 7.5e-8, by a polynomial of degree 5.

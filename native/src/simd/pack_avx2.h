@@ -131,15 +131,16 @@ GAUSSLITE_INLINE Pack16 multiply_by_power_of_two(Pack16 a, Pack16 e) {
 // 2^(k / 8): the exponent field starts at bit 23, so that it increases by 1 with each 8 of k.
 alignas(32) constexpr uint32_t kExp2Table[8] = {0x3F800000, 0x3F7B95C2, 0x3F7837F0, 0x3F75FED7,
                                                 0x3F7504F3, 0x3F75672A, 0x3F7744FD, 0x3F7AC0C7};
+// exp2_fast (pack.h) splits 2^e into 2^(k / n) 2^f, n = kExp2TableSize. exp2_of_steps returns 2^(k / n).
 constexpr int kExp2TableSize = 8;
-GAUSSLITE_INLINE __m256 exp2_of_steps(__m256 steps_in_mantissa) {
-  const __m256i steps = _mm256_castps_si256(steps_in_mantissa);
+GAUSSLITE_INLINE __m256 exp2_of_steps(__m256 biased_steps) {
+  const __m256i steps = _mm256_castps_si256(biased_steps);
   const __m256i powers = _mm256_load_si256(reinterpret_cast<const __m256i*>(kExp2Table));
   const __m256i power = _mm256_permutevar8x32_epi32(powers, steps);
   return _mm256_castsi256_ps(_mm256_add_epi32(_mm256_slli_epi32(steps, 20), power));
 }
-GAUSSLITE_INLINE Pack16 exp2_of_steps(Pack16 steps_in_mantissa) {
-  return {exp2_of_steps(steps_in_mantissa.lo), exp2_of_steps(steps_in_mantissa.hi)};
+GAUSSLITE_INLINE Pack16 exp2_of_steps(Pack16 biased_steps) {
+  return {exp2_of_steps(biased_steps.lo), exp2_of_steps(biased_steps.hi)};
 }
 
 GAUSSLITE_INLINE __m256 exponent(__m256 a) {

@@ -77,9 +77,10 @@ GAUSSLITE_INLINE Pack16 mantissa(Pack16 a) { return _mm512_getmant_ps(a.v, _MM_M
 alignas(64) constexpr uint32_t kExp2Table[16] = {0x3F800000, 0x3F7DAAC3, 0x3F7B95C2, 0x3F79C3D3, 0x3F7837F0, 0x3F76F532,
                                                  0x3F75FED7, 0x3F75583F, 0x3F7504F3, 0x3F7508A4, 0x3F75672A, 0x3F76248C,
                                                  0x3F7744FD, 0x3F78CCDF, 0x3F7AC0C7, 0x3F7D257D};
+// exp2_fast (pack.h) splits 2^e into 2^(k / n) 2^f, n = kExp2TableSize. exp2_of_steps returns 2^(k / n).
 constexpr int kExp2TableSize = 16;
-GAUSSLITE_INLINE Pack16 exp2_of_steps(Pack16 steps_in_mantissa) {
-  const __m512i steps = _mm512_castps_si512(steps_in_mantissa.v);
+GAUSSLITE_INLINE Pack16 exp2_of_steps(Pack16 biased_steps) {
+  const __m512i steps = _mm512_castps_si512(biased_steps.v);
   const __m512i power = _mm512_permutexvar_epi32(steps, _mm512_load_si512(kExp2Table));
   return _mm512_castsi512_ps(_mm512_add_epi32(_mm512_slli_epi32(steps, 19), power));
 }

@@ -144,9 +144,10 @@ GAUSSLITE_INLINE float32x4_t mantissa_quad(float32x4_t a) {
 }
 GAUSSLITE_INLINE Pack16 fraction(Pack16 e) { return e - floor(e); }
 GAUSSLITE_LANEWISE(multiply_by_power_of_two, multiply_by_power_of_two_quad)
+// exp2_fast (pack.h) splits 2^e into 2^(k / n) 2^f. This returns 2^(k / n), for n = 1 without a table.
 constexpr int kExp2TableSize = 1;
-GAUSSLITE_INLINE float32x4_t exp2_of_steps_quad(float32x4_t steps_in_mantissa) {
-  const int32x4_t exponents = vshlq_n_s32(vreinterpretq_s32_f32(steps_in_mantissa), 23);
+GAUSSLITE_INLINE float32x4_t exp2_of_steps_quad(float32x4_t biased_steps) {
+  const int32x4_t exponents = vshlq_n_s32(vreinterpretq_s32_f32(biased_steps), 23);
   return vreinterpretq_f32_s32(vaddq_s32(exponents, vdupq_n_s32(0x3F800000)));
 }
 GAUSSLITE_UNARY(exp2_of_steps, exp2_of_steps_quad)
@@ -172,10 +173,12 @@ GAUSSLITE_INLINE void transpose_quad(float32x4_t& a, float32x4_t& b, float32x4_t
   c = vzip1q_f32(ac_hi, bd_hi);
   d = vzip2q_f32(ac_hi, bd_hi);
 }
+// Four 4x4 matrices of floats: matrix i has the rows a.q[i], b.q[i], c.q[i], d.q[i].
 GAUSSLITE_INLINE void transpose_within_quads(Pack16& a, Pack16& b, Pack16& c, Pack16& d) {
   for (int i = 0; i < 4; ++i) transpose_quad(a.q[i], b.q[i], c.q[i], d.q[i]);
 }
 
+// One 4x4 matrix of quads, with the rows a, b, c, d; the lanes of a quad keep their order.
 GAUSSLITE_INLINE void transpose_whole_quads(Pack16& a, Pack16& b, Pack16& c, Pack16& d) {
   const Pack16 p = a, q = b, r = c, s = d;
   a = {p.q[0], q.q[0], r.q[0], s.q[0]};
@@ -234,6 +237,7 @@ GAUSSLITE_INLINE Pack8 permute(Pack8 x) {
   return {__builtin_shufflevector(x.lo, x.hi, a, b, c, d), __builtin_shufflevector(x.lo, x.hi, e, f, g, h)};
 }
 
+// Lanes 0-3: the sum of the four quads, lane by lane; lanes 4-7: 0.
 GAUSSLITE_INLINE Pack8 sum_of_quads(Pack16 a) {
   return {vaddq_f32(vaddq_f32(a.q[0], a.q[2]), vaddq_f32(a.q[1], a.q[3])), vdupq_n_f32(0.0f)};
 }

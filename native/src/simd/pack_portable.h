@@ -180,12 +180,12 @@ GAUSSLITE_INLINE Pack16 mantissa(Pack16 a) {
   return a;
 }
 
-// 2^(k / kExp2TableSize) for the integer k in the lowest mantissa bits of the argument (see exp2_fast). Other variants
-// read 2^fraction(k / kExp2TableSize) from a table of 8 or 16 floats.
+// 2^(k / kExp2TableSize) for a number of steps k, in the lowest mantissa bits of the argument (see exp2_fast in
+// pack.h). AVX2 and AVX-512 read 2^fraction(k / kExp2TableSize) from a table of 8 or 16 floats.
 constexpr int kExp2TableSize = 1;
-GAUSSLITE_INLINE Pack16 exp2_of_steps(Pack16 steps_in_mantissa) {
+GAUSSLITE_INLINE Pack16 exp2_of_steps(Pack16 biased_steps) {
   Pack16 power;
-  GAUSSLITE_FOR_EACH_QUAD power.q[i] = (Quad)(((QuadInt)steps_in_mantissa.q[i] << 23) + 0x3F800000);
+  GAUSSLITE_FOR_EACH_QUAD power.q[i] = (Quad)(((QuadInt)biased_steps.q[i] << 23) + 0x3F800000);
   return power;
 }
 
@@ -277,7 +277,7 @@ GAUSSLITE_INLINE Pack8 permute(Pack8 x) {
   return {__builtin_shufflevector(x.lo, x.hi, a, b, c, d), __builtin_shufflevector(x.lo, x.hi, e, f, g, h)};
 }
 
-// The sum of the four quads in lanes 0-3; lanes 4-7 are 0.
+// Lanes 0-3: the sum of the four quads, lane by lane; lanes 4-7: 0.
 GAUSSLITE_INLINE Pack8 sum_of_quads(Pack16 a) { return {(a.q[0] + a.q[2]) + (a.q[1] + a.q[3]), quad(0.0f)}; }
 
 // out[k]: quad k of a, followed by quad k of b.

@@ -7,7 +7,7 @@
 
 namespace gausslite::GAUSSLITE_ISA {
 
-inline constexpr TargetTile kBlackTarget{};
+inline constexpr ImageTile kBlackTile{};
 
 // Bytes / 255, correctly rounded for all 256 values: 1 / 255 in two parts.
 GAUSSLITE_INLINE Pack16 colours_of(Pack16 bytes) {
@@ -15,12 +15,12 @@ GAUSSLITE_INLINE Pack16 colours_of(Pack16 bytes) {
   return fma(bytes, Pack16(kHigh), bytes * kLow);
 }
 
-GAUSSLITE_INLINE Pack16 colour_row(const TargetTile& tile, int channel, int row) {
+GAUSSLITE_INLINE Pack16 colour_row(const ImageTile& tile, int channel, int row) {
   return colours_of(load_bytes(tile.rgb[channel] + row * kTileSide));
 }
 
 // `corner`: offset of the 4x4 block in the tile's sixteen rows of sixteen pixels.
-GAUSSLITE_INLINE Pack16 colour_block(const TargetTile& tile, int channel, int corner) {
+GAUSSLITE_INLINE Pack16 colour_block(const ImageTile& tile, int channel, int corner) {
   return colours_of(load_byte_block(tile.rgb[channel] + corner, kTileSide));
 }
 
