@@ -20,10 +20,11 @@ from gausslite.domain.frame import Frame
 from gausslite.domain.objects import ObjectLandmark, ObjectReport
 from gausslite.domain.task import TaskGraph
 from gausslite.domain.voxel_batch import VoxelBatch
-from gausslite.domain.voxel_operations import group_by_voxel
+from gausslite.domain.voxel_operations import empty_batch, group_by_voxel
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.sent_voxels import SentVoxelTracker
+from gausslite.mapping.team_voxels import InsertedVoxels
 from gausslite.mission.build import EstimatorBuilder, build_mapper, build_tracker
 from gausslite.mission.checkpoint import ResumeConfig, save_run
 from gausslite.mission.frame_scheduler import Clock, FrameScheduler
@@ -139,6 +140,10 @@ class MappingWorker:
     def end_idle_training(self) -> Future[None]:
         """End idle training until the next frame, and publish its changes."""
         return self._submit(self._idle.stop)
+
+    def insert_team_voxels(self, received: VoxelBatch) -> Future[InsertedVoxels]:
+        """Insert voxels that a teammate trained more than this agent; between two frames."""
+        return self._submit(lambda: self._insert_team_voxels(received))
 
     def handover_batch(self) -> Future[VoxelBatch]:
         """Return updates of the whole map, except voxels of an earlier task that were sent with a higher Σkappa."""
@@ -258,6 +263,16 @@ class MappingWorker:
         graph = self.status().graph
         if self.uplink is not None and graph is not None:
             self.uplink.report_objects(ObjectReport(graph, objects))
+
+    def _insert_team_voxels(self, received: VoxelBatch) -> InsertedVoxels:
+        if self._task_mapper is None:
+            return InsertedVoxels(empty_batch(), 0)
+        inserted = self._task_mapper.insert_team_voxels(received, self._grid)
+        if inserted.gaussians:
+            count = self.status().team_gaussians + inserted.gaussians
+            self._status.update(team_gaussians=count, gaussians=self._mapper.count, map_revision=self._map_revision())
+            self._on_change()
+        return inserted
 
     def _offer_all_keyframes(self, mapper: GaussianMapper) -> None:
         if self._keyframe_upload is not None:

@@ -29,7 +29,8 @@ from gausslite_agent.mission_checkpoint import SavedMission
 from gausslite_agent.parser_wait import WaitingParser
 from gausslite_agent.periodic_save import PeriodicSave
 from gausslite_agent.servicer import AgentServicer
-from gausslite_agent.settings import AgentSettings, LinkSettings, parse_arguments
+from gausslite_agent.settings import NO_TEAM_MAP, AgentSettings, LinkSettings, parse_arguments
+from gausslite_agent.team_map import TeamMapFollower
 
 _log = logging.getLogger(__name__)
 
@@ -84,6 +85,7 @@ async def _serve(settings: AgentSettings) -> None:
             keyframe_upload=_keyframe_upload(settings.link, uplink),
         )
         stack.callback(worker.close)
+        _follow_team_map(settings, worker, stack)
         resumed = None
         if saved is not None:
             await asyncio.wrap_future(worker.restore(saved))
@@ -164,6 +166,22 @@ def _open_uplink(settings: AgentSettings, stack: ExitStack, has_restored_map: bo
     uplink = Uplink(client, settings.agent_id, spool, link.grid, link.uplink, has_restored_map)
     stack.callback(uplink.close)
     return uplink
+
+
+def _follow_team_map(settings: AgentSettings, worker: MappingWorker, stack: ExitStack) -> None:
+    """Insert teammates' voxels of the task's region into the map, if the options ask for it."""
+    link = settings.link
+    if link.fusion is None or link.team_map == NO_TEAM_MAP:
+        return
+    follower = TeamMapFollower(
+        FusionClient(link.fusion, mission_id=link.mission_id, tls=settings.tls),
+        settings.agent_id,
+        link.grid,
+        link.team_map,
+        lambda: worker.status().graph,
+        lambda batch: worker.insert_team_voxels(batch).result(),
+    )
+    stack.callback(follower.close)
 
 
 def _keyframe_upload(link: LinkSettings, uplink: Uplink | None) -> KeyframeUpload | None:

@@ -50,6 +50,7 @@ def mission_report(
         "uplink_stopped_because": uplink.stopped_because,
         "map_shared_percent": 100.0 * active / max(len(gaussians), 1) if is_sent else 0.0,
         "peak_rss_mib": peak_rss_mib(),
+        "team_gaussians_inserted": status.team_gaussians,
         "objects": [object_as_json(each) for each in status.objects],
         "notes": [*status.notes, *status.task_notes, *status.load_notes],
     }

@@ -35,6 +35,7 @@ from gausslite.wire.uplink_values import UplinkSettings
 from gausslite_agent.load import LoadSettings, QueuePolicy
 from gausslite_agent.mission_end import MAX_DRAIN_S
 
+NO_TEAM_MAP = "none"
 _KEYFRAMES = 64
 _MAX_KEYFRAMES = 10_000
 _IDLE_ITERATIONS = 64
@@ -48,6 +49,7 @@ class LinkSettings:
     the data that waits, None to keep it in memory. handover: at the end, also send the whole map. drain_s: the longest
     time for sending at the end of a mission; grace_s: the same after SIGTERM. keyframes: the most keyframes that the
     server has at a time; with keyframes_during_mission they are sent while mapping, not only with a handover.
+    team_map: layer of the fused map that is inserted in the task's region: vote, refined or none.
     """
 
     parser: str | None = None
@@ -61,6 +63,7 @@ class LinkSettings:
     grace_s: float = 5.0
     keyframes: int = _KEYFRAMES
     keyframes_during_mission: bool = False
+    team_map: str = NO_TEAM_MAP
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,6 +135,7 @@ def parse_arguments(arguments: Sequence[str] | None = None) -> AgentSettings:
         options.grace_period,
         _KEYFRAMES if options.keyframes is None else options.keyframes,
         options.handover if options.keyframes is None else options.keyframes > 0,
+        options.team_map,
     )
     return AgentSettings(
         options.listen,
@@ -241,6 +245,12 @@ def _add_connections(parser: argparse.ArgumentParser) -> None:
         help="seconds between two transmissions (default: %(default)s)",
     )
     add("--spool", metavar="FILE", type=Path, help="store unsent data here, across restarts (default: in memory)")
+    add(
+        "--team-map",
+        choices=[NO_TEAM_MAP, "vote", "refined"],
+        default=NO_TEAM_MAP,
+        help="insert teammates' voxels of the task's region, voted or refined (default: %(default)s)",
+    )
     add_switch(group, "--handover", "at the end also send the map outside the ROI")
     keyframes = add(
         "--keyframes",

@@ -53,7 +53,7 @@ class WorkerStatus:
     keyframes evaluated for a new task. publish_error: why the uplink refused the newest changes. ages_s: ages of the
     latest mapped frames. correction: the odometry's latest correction, mapped at corrected_at_s of the monotonic clock.
     notes: messages of the relevance estimator. objects: the confirmed
-    objects of the task.
+    objects of the task. team_gaussians: Gaussians inserted from the fused map.
     """
 
     graph: TaskGraph | None = None
@@ -78,6 +78,7 @@ class WorkerStatus:
     correction: PoseCorrection | None = None
     corrected_at_s: float = 0.0
     objects: tuple[ObjectLandmark, ...] = ()
+    team_gaussians: int = 0
 
     @property
     def task_notes(self) -> tuple[str, ...]:

@@ -10,6 +10,7 @@ import pytest
 from sample_gaussians import plain_gaussians
 
 from gausslite.domain.gaussians import Gaussians
+from gausslite.domain.moved_gaussians import move_gaussians
 from gausslite.domain.pose import inverse, rotation_angle_deg, transform_of, transform_points
 from gausslite.domain.voxel_batch import RoiSubset
 from gausslite.domain.voxel_operations import group_by_voxel
@@ -22,7 +23,6 @@ from gausslite.fusion.memory_store import MemoryStore
 from gausslite.fusion.mission_config import MissionConfig
 from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.fusion.store import FusionStore
-from gausslite.fusion.vote_input import move_gaussians
 
 GRID = VoxelGrid(0.10)
 ANYTHING = MissionConfig("", "", 0.10)

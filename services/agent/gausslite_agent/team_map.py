@@ -1,0 +1,131 @@
+"""Follow the fused map in the region of the agent's task, and insert what teammates trained more."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections import Counter
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float64
+from numpy import ndarray
+
+from gausslite.domain.errors import GaussLiteError, RevisionGoneError
+from gausslite.domain.moved_gaussians import move_gaussians
+from gausslite.domain.pose import inverse
+from gausslite.domain.task import TaskGraph
+from gausslite.domain.voxel_batch import VoxelBatch
+from gausslite.domain.voxel_operations import empty_batch, group_by_voxel, select_voxels
+from gausslite.domain.voxels import VoxelGrid
+from gausslite.mapping.team_voxels import InsertedVoxels
+from gausslite.mission.team_region import TeamRegion
+from gausslite.wire.clients import FusionClient
+from gausslite.wire.convert import MapUpdate, transform_from_message
+
+_log = logging.getLogger(__name__)
+_INTERVAL_S = 2.0
+InsertVoxels = Callable[[VoxelBatch], InsertedVoxels]
+
+
+@dataclass(slots=True)
+class TeamMapCounters:
+    """Inserted Gaussians by the teammate that trained them, and the received Gaussians of the region."""
+
+    inserted: Counter[str] = field(default_factory=Counter)
+    received: int = 0
+
+
+class TeamMapFollower:
+    """Owns a thread and a client that read the changes of the fused map every two seconds.
+
+    layer: "vote" for the teammates' voxels as they trained them, "refined" also for the refinement of own voxels.
+    """
+
+    def __init__(
+        self,
+        client: FusionClient,
+        agent_id: str,
+        grid: VoxelGrid,
+        layer: str,
+        task: Callable[[], TaskGraph | None],
+        insert: InsertVoxels,
+    ) -> None:
+        """task: returns the agent's current task; insert: inserts voxels and waits for the result."""
+        self._client, self._agent_id, self._grid, self._layer = client, agent_id, grid, layer
+        self._task, self._insert = task, insert
+        self.counters = TeamMapCounters()
+        self._region = TeamRegion()
+        self._revision = 0
+        self._last_error = ""
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="team-map", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """End the thread and the connection."""
+        self._closing.set()
+        self._client.close()
+        self._thread.join()
+
+    def follow_once(self) -> None:
+        """Read the changes since the last call and insert those of the task's region. Raises GaussLiteError."""
+        graph = self._task()
+        if graph is None:
+            return
+        region = TeamRegion.of(graph, self._client.query_objects())
+        if region != self._region:
+            # voxels of a new region may have changed before
+            self._region, self._revision = region, 0
+        if region.bounds is None:
+            return
+        try:
+            self._read(region)
+        except RevisionGoneError:
+            self._revision = 0
+
+    def _run(self) -> None:
+        while not self._closing.wait(_INTERVAL_S):
+            try:
+                self.follow_once()
+                self._last_error = ""
+            except GaussLiteError as error:
+                if not self._closing.is_set() and str(error) != self._last_error:
+                    _log.warning("team map: %s; retrying", error)
+                    self._last_error = str(error)
+
+    def _read(self, region: TeamRegion) -> None:
+        T_agent_fused = inverse(self._own_frame())
+        exclude = "" if self._layer == "refined" else self._agent_id
+        updates = self._client.watch(self._revision, region.bounds, self._layer, exclude)
+        for update in _until_complete(updates):
+            if update.batch is not None:
+                self._insert_region(update, region, T_agent_fused)
+            self._revision = update.revision
+
+    def _insert_region(self, update: MapUpdate, region: TeamRegion, T_agent_fused: Float64[ndarray, "4 4"]) -> None:
+        assert update.batch is not None
+        winners = np.array([*update.winners, *[""] * (len(update.batch) - len(update.winners))])
+        for agent_id in sorted(set(winners.tolist())):
+            batch = region.select(select_voxels(update.batch, winners == agent_id), self._grid)
+            self.counters.received += len(batch.gaussians)
+            moved = group_by_voxel(move_gaussians(batch.gaussians, T_agent_fused), self._grid)
+            inserted = self._insert(moved) if len(moved) else InsertedVoxels(empty_batch(), 0)
+            if inserted.gaussians:
+                self.counters.inserted[agent_id] += inserted.gaussians
+
+    def _own_frame(self) -> Float64[ndarray, "4 4"]:
+        """Return T_fused_agent of this agent, as the server estimates it."""
+        for each in self._client.status().agents:
+            if each.agent_id == self._agent_id and len(each.alignment.t_fused_agent.row_major) == 16:
+                return transform_from_message("t_fused_agent", each.alignment.t_fused_agent)
+        return np.eye(4)
+
+
+def _until_complete(updates: Iterable[MapUpdate]) -> Iterable[MapUpdate]:
+    """Yield the parts of one revision, then close the stream."""
+    for update in updates:
+        yield update
+        if update.last:
+            break
