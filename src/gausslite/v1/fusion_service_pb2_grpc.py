@@ -118,7 +118,8 @@ class FusionServiceServicer(object):
         raise NotImplementedError('Method not implemented!')
 
     def ContributeKeyframes(self, request_iterator, context):
-        """Send keyframes for the joint refinement; each agent's newest are kept. Invalid ones are reported, others are kept.
+        """Send keyframes for the joint refinement. They are as durable as the server's store. The server keeps the agent's
+        selection, at most its quota: then the newest. Invalid ones are reported, others are kept.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')

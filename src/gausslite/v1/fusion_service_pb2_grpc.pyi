@@ -45,7 +45,9 @@ class FusionServiceStub:
     RESOURCE_EXHAUSTED if the disk is full.
     """
     ContributeKeyframes: _grpc.StreamUnaryMultiCallable[_fusion_service_pb2.ContributeKeyframesRequest, _fusion_service_pb2.ContributeKeyframesResponse]
-    """Send keyframes for the joint refinement; each agent's newest are kept. Invalid ones are reported, others are kept."""
+    """Send keyframes for the joint refinement. They are as durable as the server's store. The server keeps the agent's
+    selection, at most its quota: then the newest. Invalid ones are reported, others are kept.
+    """
     WatchFusedMap: _grpc.UnaryStreamMultiCallable[_fusion_service_pb2.WatchFusedMapRequest, _fusion_service_pb2.WatchFusedMapResponse]
     """A snapshot of the fused map, then its changes. OUT_OF_RANGE if since_revision is too old: watch from 0."""
     RefineFusedMap: _grpc.UnaryStreamMultiCallable[_fusion_service_pb2.RefineFusedMapRequest, _fusion_service_pb2.RefineFusedMapResponse]
@@ -79,7 +81,9 @@ class FusionServiceAsyncStub(FusionServiceStub):
     RESOURCE_EXHAUSTED if the disk is full.
     """
     ContributeKeyframes: _aio.StreamUnaryMultiCallable[_fusion_service_pb2.ContributeKeyframesRequest, _fusion_service_pb2.ContributeKeyframesResponse]  # type: ignore[assignment]
-    """Send keyframes for the joint refinement; each agent's newest are kept. Invalid ones are reported, others are kept."""
+    """Send keyframes for the joint refinement. They are as durable as the server's store. The server keeps the agent's
+    selection, at most its quota: then the newest. Invalid ones are reported, others are kept.
+    """
     WatchFusedMap: _aio.UnaryStreamMultiCallable[_fusion_service_pb2.WatchFusedMapRequest, _fusion_service_pb2.WatchFusedMapResponse]  # type: ignore[assignment]
     """A snapshot of the fused map, then its changes. OUT_OF_RANGE if since_revision is too old: watch from 0."""
     RefineFusedMap: _aio.UnaryStreamMultiCallable[_fusion_service_pb2.RefineFusedMapRequest, _fusion_service_pb2.RefineFusedMapResponse]  # type: ignore[assignment]
@@ -128,7 +132,9 @@ class FusionServiceServicer(metaclass=_abc_1.ABCMeta):
         request_iterator: _MaybeAsyncIterator[_fusion_service_pb2.ContributeKeyframesRequest],
         context: _ServicerContext,
     ) -> _typing.Union[_fusion_service_pb2.ContributeKeyframesResponse, _abc.Awaitable[_fusion_service_pb2.ContributeKeyframesResponse]]:
-        """Send keyframes for the joint refinement; each agent's newest are kept. Invalid ones are reported, others are kept."""
+        """Send keyframes for the joint refinement. They are as durable as the server's store. The server keeps the agent's
+        selection, at most its quota: then the newest. Invalid ones are reported, others are kept.
+        """
 
     @_abc_1.abstractmethod
     def WatchFusedMap(
