@@ -13,19 +13,20 @@ from gausslite.domain.lens import Lens
 TRAJECTORY_COUNT = 3
 _SIDES_PX = (16, 4096)
 _NUMBERS = ("seed", "trajectory", "frames")
-_STRENGTHS = ("noise", "holes", "flying", "exposure", "gloss")
-_TIMES = ("shutter", "blur")
+_STRENGTHS = {"noise": "noise", "holes": "holes", "flying": "flying_pixels", "exposure": "exposure", "gloss": "gloss"}
+"""Fields of HomeSettings by the names in a spec."""
+_TIMES = {"shutter": "readout_ms", "blur": "exposure_ms"}
 
 
 @dataclass(frozen=True, slots=True)
 class HomeSettings:
     """One trajectory through one home.
 
-    noise: scale of the sensor model; 0 disables it, and depth is exact. holes and flying: scales of missing depth and
-    of flying pixels. exposure: scale of the gain drift. gloss: scale of reflections. shutter_ms: readout time of a
-    rolling shutter. blur_ms: exposure time of a row. lens: distortion of both images. speed_deg_s: mean angular speed,
-    which sets the frame rate; 0 for 30 Hz. drift_percent: error of the odometry whose poses the frames have, in percent
-    of the distance moved and of the angle turned; 0 for exact poses.
+    noise: scale of the sensor model; 0 disables it, and depth is exact. holes and flying_pixels: scales of missing
+    depth and of flying pixels. exposure: scale of the gain drift. gloss: scale of reflections. readout_ms: readout time
+    of a rolling shutter. exposure_ms: exposure time of a row. lens: distortion of both images. speed_deg_s: mean
+    angular speed, which sets the frame rate; 0 for 30 Hz. drift_percent: error of the odometry whose poses the frames
+    have, in percent of the distance moved and of the angle turned; 0 for exact poses.
     """
 
     home: int = 0
@@ -35,11 +36,11 @@ class HomeSettings:
     size_px: tuple[int, int] = (320, 240)
     noise: float = 1.0
     holes: float = 1.0
-    flying: float = 1.0
+    flying_pixels: float = 1.0
     exposure: float = 1.0
     gloss: float = 1.0
-    shutter_ms: float = 0.0
-    blur_ms: float = 0.0
+    readout_ms: float = 0.0
+    exposure_ms: float = 0.0
     lens: Lens | None = None
     speed_deg_s: float = 0.0
     drift_percent: float = 0.0
@@ -51,19 +52,22 @@ class HomeSettings:
             ("trajectory", self.trajectory, f"0 to {TRAJECTORY_COUNT - 1}", 0 <= self.trajectory < TRAJECTORY_COUNT),
             ("frames", self.frames, "1 to 100000", 1 <= self.frames <= 100_000),
             ("size", self.size_px, f"sides of {low} to {high} px", all(low <= side <= high for side in self.size_px)),
-            ("shutter", self.shutter_ms, "0ms to 100ms", 0.0 <= self.shutter_ms <= 100.0),
-            ("blur", self.blur_ms, "0ms to 100ms", 0.0 <= self.blur_ms <= 100.0),
+            ("shutter", self.readout_ms, "0ms to 100ms", 0.0 <= self.readout_ms <= 100.0),
+            ("blur", self.exposure_ms, "0ms to 100ms", 0.0 <= self.exposure_ms <= 100.0),
             ("drift", self.drift_percent, "0% to 20%", 0.0 <= self.drift_percent <= 20.0),
             ("speed", self.speed_deg_s, "0 to 1000 degrees per second", 0.0 <= self.speed_deg_s <= 1000.0),
-            *((name, getattr(self, name), "0 to 10", 0.0 <= getattr(self, name) <= 10.0) for name in _STRENGTHS),
+            *(
+                (key, getattr(self, name), "0 to 10", 0.0 <= getattr(self, name) <= 10.0)
+                for key, name in _STRENGTHS.items()
+            ),
         ):
             if not valid:
-                raise DatasetError(f"{self.world}: {name}: expected {expected}, got {value}")
+                raise DatasetError(f"{self.home_name}: {name}: expected {expected}, got {value}")
 
     @property
-    def world(self) -> str:
-        """The home's name in a spec."""
-        return world_name(self.home)
+    def home_name(self) -> str:
+        """The home's name in a spec: "sim:home-3"."""
+        return name_of_home(self.home)
 
     @classmethod
     def parse(cls, query: str, home: int = 0) -> HomeSettings:
@@ -73,11 +77,11 @@ class HomeSettings:
             if key in _NUMBERS and re.fullmatch(r"[0-9]{1,10}", value):
                 settings[key] = int(value)
             elif key in _STRENGTHS and re.fullmatch(r"[0-9]{1,3}(\.[0-9]{1,9})?", value):
-                settings[key] = float(value)
+                settings[_STRENGTHS[key]] = float(value)
             elif key == "size" and (match := re.fullmatch(r"([0-9]{1,5})x([0-9]{1,5})", value)):
                 settings["size_px"] = (int(match.group(1)), int(match.group(2)))
             elif key in _TIMES and (match := re.fullmatch(r"([0-9]{1,3}(?:\.[0-9]{1,3})?)ms", value)):
-                settings[f"{key}_ms"] = float(match.group(1))
+                settings[_TIMES[key]] = float(match.group(1))
             elif key == "lens":
                 settings["lens"] = _read_lens(value, home)
             elif key == "speed" and re.fullmatch(r"[0-9]{1,4}", value):
@@ -93,7 +97,7 @@ class HomeSettings:
                     ]
                 )
                 raise DatasetError(
-                    f"{world_name(home)}: {key}={value}: expected {expected}, each of them optional; N whole, X 0 to 10"
+                    f"{name_of_home(home)}: {key}={value}: expected {expected}, each optional; N whole, X 0 to 10"
                 )
         return cls(home, **settings)
 
@@ -102,9 +106,9 @@ def _read_lens(text: str, home: int) -> Lens:
     try:
         return Lens.parse(text)
     except InvalidInputError as error:
-        raise DatasetError(f"{world_name(home)}: {error}") from None
+        raise DatasetError(f"{name_of_home(home)}: {error}") from None
 
 
-def world_name(home: int) -> str:
+def name_of_home(home: int) -> str:
     """Return the home's name in a spec."""
     return f"sim:home-{home}" if home else "sim:home"

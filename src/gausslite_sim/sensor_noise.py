@@ -32,7 +32,7 @@ class SensorNoise:
     colour_read: float = 1.6
     colour_shot: float = 0.16
 
-    def scaled(self, holes: float, flying: float) -> SensorNoise:
+    def scaled(self, holes: float, flying_pixels: float) -> SensorNoise:
         """Return the noise with the frequency of holes and flying pixels scaled; 0 disables them."""
         return replace(
             self,
@@ -41,5 +41,5 @@ class SensorNoise:
             dark_loss=holes * self.dark_loss,
             gloss_loss=holes * self.gloss_loss,
             grazing_cosine=self.grazing_cosine if holes > 0 else 0.0,
-            edge_flight=flying * self.edge_flight,
+            edge_flight=flying_pixels * self.edge_flight,
         )

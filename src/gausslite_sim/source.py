@@ -79,7 +79,7 @@ class SimulatedHome:
     def name(self) -> str:
         """Home, seed and trajectory."""
         settings = self._settings
-        return f"{settings.world.replace(':', '-')}-{settings.seed}-{settings.trajectory}"
+        return f"{settings.home_name.replace(':', '-')}-{settings.seed}-{settings.trajectory}"
 
     @property
     def camera(self) -> Camera:
@@ -88,12 +88,12 @@ class SimulatedHome:
 
     @property
     def lens(self) -> Lens | None:
-        """None: as in a recording without a camera file, a lens of the settings is not stated."""
+        """None, also if the settings have a lens: a recording without a camera file does not state its lens."""
         return None
 
     @property
     def up_axis(self) -> UpAxis:
-        """Z."""
+        """Up in the world frame; by default the z axis."""
         return self._up_axis
 
     @property
@@ -118,9 +118,9 @@ class SimulatedHome:
         view = self._apply_exposure(self._render(i), i)
         if settings.noise > 0:
             rng = np.random.default_rng([settings.seed, settings.trajectory, i])
-            noise = home.plan.sensor.scaled(settings.holes, settings.flying)
-            rgb = noisy_colour(view, noise, settings.noise, rng)
-            depth_m = noisy_depth(view, noise, settings.noise, rng)
+            sensor_noise = home.plan.sensor.scaled(settings.holes, settings.flying_pixels)
+            rgb = noisy_colour(view, sensor_noise, settings.noise, rng)
+            depth_m = noisy_depth(view, sensor_noise, settings.noise, rng)
         else:
             rgb, depth_m = colour_image(view.rgb), view.depth_m
         image = resize_rgbd(RgbdImage(rgb, depth_m, self._camera), size)
@@ -178,9 +178,9 @@ class SimulatedHome:
 
     def _render(self, i: int) -> View:
         settings, scene = self._settings, self._home.scene
-        if settings.shutter_ms == 0 and settings.blur_ms == 0:
+        if settings.readout_ms == 0 and settings.exposure_ms == 0:
             return render_view(scene, RayCamera(self._camera, self._poses[i], settings.lens), settings.gloss)
-        camera = RecordingCamera(self._camera, settings.lens, settings.shutter_ms / 1e3, settings.blur_ms / 1e3)
+        camera = RecordingCamera(self._camera, settings.lens, settings.readout_ms / 1e3, settings.exposure_ms / 1e3)
         path = self._home.plan.trajectories[settings.trajectory]
 
         def poses_at(seconds: Float64[ndarray, " n"]) -> Float64[ndarray, "n 4 4"]:
@@ -190,10 +190,10 @@ class SimulatedHome:
 
     def _apply_exposure(self, view: View, i: int) -> View:
         """Return the view with the simulated exposure."""
-        drift = self._settings.exposure * self._home.plan.exposure_drift
-        if drift == 0:
+        amplitude = self._settings.exposure * self._home.plan.exposure_drift
+        if amplitude == 0:
             return view
-        return replace(view, rgb=view.rgb * camera_gain(i / len(self), drift, self._settings.trajectory))
+        return replace(view, rgb=view.rgb * camera_gain(i / len(self), amplitude, self._settings.trajectory))
 
 
 def open_simulated(spec: str, up_axis: UpAxis | None = None) -> Source:
