@@ -31,8 +31,8 @@ class SaturationSettings:
     """Release of active iterations to whole images.
 
     max_released: largest share of the active iterations that is released; 0 disables the release. The rest keeps
-    measuring the region. improving, saturated: mean decrease of the log loss per visit of a view, at and above which no
-    iteration is released, and at and below which max_released is. Between them the share changes linearly.
+    measuring the region. improving, saturated: mean decreases of the log loss per visit of a view. No iteration is
+    released from `improving` upwards, and max_released from `saturated` downwards. Between them the share is linear.
     """
 
     max_released: float = 0.75

@@ -147,14 +147,14 @@ _BALANCED_LOSS = LossWeights(normalise_by_image=True)
 class OptimizationSettings:
     """Training of the map with one frame (Sec. III-D): warm-up iterations on full images, then active ones on the ROI.
 
-    loss: weights of Eq. (1). By default they are normalised by the image size: steps of Adam with the small masks of
-    the active phase are then comparable to those with full images. adam: learning rates. decay_after_updates: updates
-    of a Gaussian after which its learning rates decay, if `MapperSettings.pose_prior` allows an error; inf disables the
+    loss: weights of Eq. (1). By default they are normalised by the image size. Adam's steps with the small masks of the
+    active phase are then comparable to those with full images. adam: learning rates. decay_after_updates: updates of a
+    Gaussian after which its learning rates decay, if `MapperSettings.pose_prior` allows an error; inf disables the
     decay. With constant rates, Gaussians would oscillate between views that contradict each other. real_depth_share:
-    factor of the depth weight if that prior allows an error: depth of such a camera has errors at every outline, and a
-    strong depth term moves Gaussians there against the colours. isotropic: make
-    Gaussians spheres after every frame. ema_updates: time constant, in updates, of the exponential moving average (EMA)
-    of each Gaussian that is shown and saved; 0 shows the trained values. Training itself does not use the EMA.
+    factor of the depth weight if that prior allows an error. The depth of such a camera has errors at every outline. A
+    strong depth term would move Gaussians there against the colours. isotropic: make Gaussians spheres after every
+    frame. ema_updates: time constant, in updates, of the exponential moving average (EMA) of each Gaussian. The EMA is
+    shown and saved, but not trained; 0 shows the trained values.
     """
 
     warmup_iterations: int = 2

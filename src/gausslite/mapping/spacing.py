@@ -1,10 +1,10 @@
 """Estimate the spacing s0 of seeds (Sec. III-C.2) from their density in the image, without a search tree.
 
-s0 is the median distance of a seed to its three nearest neighbours, which is the distance to the second nearest. At a
-density of λ seeds per pixel it is 0.73 / sqrt(λ) pixels for a Poisson process (π λ r² = 1.678), and 0.89 / sqrt(λ),
-measured, for one seed per grid cell. λ is counted over 48x48 pixels around a seed. Only pixels of the pool count, so
-that seeds in a narrow gap do not appear sparse. A pixel covers depth / focal length metres of a fronto-parallel
-surface. On slanted surfaces the true spacing is larger, so seeds start slightly smaller there.
+s0 is the median distance of a seed to its three nearest neighbours, which is the distance to the second nearest. With
+λ seeds per pixel it is 0.73 / sqrt(λ) pixels for a Poisson process (π λ r² = 1.678). For one seed per grid cell it is
+0.89 / sqrt(λ), by measurement. λ is counted over 48x48 pixels around a seed. Only pixels from which seeds are drawn
+count, so that seeds in a narrow gap do not appear sparse. A pixel covers depth / focal length metres of a
+fronto-parallel surface. On slanted surfaces the true spacing is larger, so seeds start slightly smaller there.
 """
 
 from __future__ import annotations

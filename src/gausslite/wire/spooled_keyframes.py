@@ -1,7 +1,7 @@
 """The keyframes of a spool: encoded images that wait for the fusion server, and those that it has.
 
-All keyframes that the agent has selected stay in the spool, also after they were sent: a server may lose its data, and
-an agent that starts again must know what it has selected. The agent limits their number.
+All keyframes that the agent has selected stay in the spool, also after they were sent. A server may lose its data, and
+a restarted agent needs the list of its selected keyframes. The agent limits their number.
 """
 
 from __future__ import annotations
