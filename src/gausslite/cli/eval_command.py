@@ -154,7 +154,7 @@ class _Conditions:
         poses = options.poses
         if poses is None and report.get("view_error") is not None:
             poses = PoseMode.TRACK if report.get("poses") == PoseMode.TRACK else PoseMode.REFINE
-            from_report += [f"--poses {poses}"]
+            from_report += [f"--poses {poses}"] if fit_views is None or poses == PoseMode.TRACK else []
         fit_views = poses in (PoseMode.REFINE, PoseMode.TRACK) if fit_views is None else fit_views
         if from_report:
             print_message(f"from the report next to {options.map.name}: {' '.join(from_report)}")

@@ -39,7 +39,7 @@ def test_the_report_next_to_a_map_sets_the_registration_and_fitting(
         return json.loads(captured.out), captured.err
 
     scores, message = score()
-    assert message == f"from the report next to map.ply: --register-depth {CAMERA} --fit-views\n"
+    assert message == f"from the report next to map.ply: --register-depth {CAMERA} --poses refine\n"
     assert scores == score("--register-depth", CAMERA, "--fit-views")[0]
     raw, message = score("--register-depth", CAMERA, "--no-fit-views")
     assert (scores["fitted"], raw["fitted"], message) == (True, False, "")
