@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # Run the team of compose.yaml on this machine's container engine, and check that it survives:
-#   deploy/smoke_test.sh [AGENTS]
+#   deploy/smoke_test.sh [AGENTS] [--no-build]
 # It builds the images, starts the team, kills each kind of service once, refines the fused map from outside, waits for the
 # end of all missions, and deletes the team with its volumes. The host needs docker compose and an installed gausslite.
 set -euo pipefail
@@ -46,7 +46,7 @@ all_ended() {
   for index in $(seq "$agents"); do [ "$(agent_status "$index")" = ended ] || return 1; done
 }
 
-docker compose build --quiet
+[ "${2:-}" = --no-build ] || docker compose build --quiet
 docker compose up --detach --wait || fail "the team did not start"
 wait_until 600 "two keyframes are on the server" has_keyframes
 gausslite refine "$fusion" --iterations 20 --out "$out/during.ply" || fail "refining during the mission"

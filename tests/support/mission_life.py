@@ -32,7 +32,7 @@ class Life:
     """What the mission left.
 
     keyframes_before_end: selected while mapping. objects: those that the noun names. rendered_share: of the pixels of a
-    view of the agent's map.
+    view of the fused map.
     """
 
     mapped: int
@@ -141,7 +141,7 @@ def _end(
     status = fusion.call("GetSessionStatus")
     chunks = list(fusion.read("ExportFusedMap", strategy=3))
     objects = fusion.call("QueryObjects", noun=noun).objects
-    view = agent.call("RenderView", camera=_camera(frames[-1]["camera"]), t_world_camera=frames[-1]["t_world_camera"])
+    view = fusion.call("RenderView", camera=_camera(frames[-1]["camera"]), t_world_camera=frames[-1]["t_world_camera"])
     depth = cv2.imdecode(np.frombuffer(view.depth_png, np.uint8), cv2.IMREAD_UNCHANGED)
     return Life(
         mapped=mapped,

@@ -14,6 +14,7 @@ from google.protobuf.descriptor_pool import DescriptorPool
 from google.protobuf.message_factory import GetMessageClass
 from grpc_reflection.v1alpha.proto_reflection_descriptor_database import ProtoReflectionDescriptorDatabase
 
+_START_TIMEOUT_S = 60.0
 _OPTIONS = [("grpc.max_receive_message_length", 64 << 20), ("grpc.initial_reconnect_backoff_ms", 200)]
 
 
@@ -22,7 +23,7 @@ class ProtoClient:
 
     def __init__(self, address: str, service: str, timeout_s: float = 60.0) -> None:
         self._channel = grpc.insecure_channel(address, _OPTIONS)
-        grpc.channel_ready_future(self._channel).result(timeout_s)
+        grpc.channel_ready_future(self._channel).result(_START_TIMEOUT_S)
         pool = DescriptorPool(ProtoReflectionDescriptorDatabase(self._channel))
         self._service = pool.FindServiceByName(f"gausslite.v1.{service}")
         self._timeout_s = timeout_s
