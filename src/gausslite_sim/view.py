@@ -61,9 +61,12 @@ def render_view(scene: HomeScene, camera: RayCamera, mirror: float = 1.0) -> Vie
 
 
 def render_instances(
-    scene: HomeScene, camera: Camera, T_world_camera: Float64[ndarray, "4 4"]
+    scene: HomeScene, camera: Camera, T_world_camera: Float64[ndarray, "4 4"] | Float64[ndarray, "h 4 4"]
 ) -> Int64[ndarray, "h w"]:
-    """Return the index of the object in each pixel of a pinhole camera, NO_HIT without one."""
+    """Return the index of the object in each pixel of a pinhole camera, NO_HIT without one.
+
+    T_world_camera: one pose, or one for each row.
+    """
     ray_camera = RayCamera(camera, T_world_camera)
     pixels = ray_camera.pixels()
     rays = ray_camera.rays(pixels, *ray_camera.centres(pixels))

@@ -17,6 +17,7 @@ from numpy import ndarray
 from gausslite.calibration.exposure import fit_exposure
 from gausslite.calibration.pose_fit import fit_pose
 from gausslite.calibration.view_residuals import MAX_RELATIVE_DEPTH_ERROR, comparable_pixels
+from gausslite.datasets.corrected_source import CorrectedSource
 from gausslite.datasets.registered_source import register_depth
 from gausslite.datasets.selection import downscaled_size
 from gausslite.datasets.source import Source
@@ -41,7 +42,9 @@ def estimate_pose_exposure_prior(source: Source) -> tuple[PoseExposurePrior, str
     Unreadable frames are ignored here; mapping reports them.
     """
     twists, gains, offsets = [], [], []
-    for warped, frame in _pairs(source):
+    # frames are compared with each other, so a rolling shutter is removed from their images
+    images = source.rectified() if isinstance(source, CorrectedSource) else source
+    for warped, frame in _pairs(images):
         T_world_fitted = fit_pose(warped, inverse(frame.T_world_camera), frame, HANDHELD_PRIOR)
         exposure = fit_exposure(warped, frame, HANDHELD_PRIOR)
         twists.append(twist_of(inverse(frame.T_world_camera) @ T_world_fitted))

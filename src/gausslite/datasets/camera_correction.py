@@ -17,7 +17,7 @@ from numpy import ndarray
 
 from gausslite.domain.camera import Camera
 from gausslite.domain.camera_correction import CameraCorrection
-from gausslite.domain.camera_motion import CameraMotion
+from gausslite.domain.camera_motion import MAX_READOUT_S, CameraMotion
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
 from gausslite.domain.lens import Lens, LensModel
@@ -71,6 +71,36 @@ def correct_frame(frame: Frame, correction: CameraCorrection, ideal: Camera, twi
         T_world_camera=frame.T_world_camera @ twist.motion(correction.time_offset_s),
         motion=CameraMotion(twist, exposure_s=correction.exposure_s) if correction.exposure_s else None,
     )
+
+
+def undistort_frame(frame: Frame, correction: CameraCorrection, ideal: Camera, twist: Twist) -> Frame:
+    """Return the frame without lens distortion and time offset, at the pose of its middle row.
+
+    Rolling shutter and motion blur stay in the image: the frame's motion states them. ideal: `ideal_camera` of the
+    correction without its readout time. The twist is that of the camera at the frame's stamp.
+    """
+    has_lens = correction.lens is not None and not correction.lens.is_identity
+    undistorted = correct_frame(frame, CameraCorrection(correction.lens), ideal, twist) if has_lens else frame
+    first, last = _recorded_row_shares(frame.camera, correction.lens, ideal)
+    readout_s = min(max(correction.readout_s * (last - first), -MAX_READOUT_S), MAX_READOUT_S)
+    middle_s = correction.time_offset_s + correction.readout_s * (0.5 * (first + last) - 0.5)
+    motion = CameraMotion(twist, readout_s, correction.exposure_s)
+    return replace(
+        undistorted,
+        T_world_camera=frame.T_world_camera @ twist.motion(middle_s),
+        motion=None if motion.is_still else motion,
+    )
+
+
+def _recorded_row_shares(recorded: Camera, lens: Lens | None, ideal: Camera) -> tuple[float, float]:
+    """Return the recorded rows at the upper and lower border of an undistorted image, 0 to 1, in its middle column.
+
+    Rows in between are nearly linear: distortion bends them by a few pixels, which the readout passes in microseconds.
+    """
+    x = np.full(2, (0.5 * ideal.width_px - ideal.cx_px) / ideal.fx_px)
+    y = (np.array([0.0, ideal.height_px]) - ideal.cy_px) / ideal.fy_px
+    first, last = (_pixels(x, y, recorded, lens)[1] + 0.5) / recorded.height_px
+    return float(first), float(last)
 
 
 def undistort_colour(rgb: UInt8[ndarray, "h w 3"], camera: Camera, lens: Lens) -> UInt8[ndarray, "h w 3"]:

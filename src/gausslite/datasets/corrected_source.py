@@ -1,4 +1,4 @@
-"""A sequence whose images are corrected for lens, rolling shutter and time offset when read, and state their blur."""
+"""A sequence whose frames are undistorted, and corrected for or annotated with the camera's motion, when read."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from gausslite.datasets.camera_correction import correct_frame, ideal_camera
+from gausslite.datasets.camera_correction import correct_frame, ideal_camera, undistort_frame
 from gausslite.datasets.images import RgbdImage, resize_rgbd
 from gausslite.datasets.source import Source
 from gausslite.datasets.wrapped_source import WrappedSource
@@ -21,20 +21,27 @@ _SPEED_QUANTILE = 0.9
 
 
 class CorrectedSource(WrappedSource):
-    """A source as an ideal camera would have recorded it: pinhole, all rows exposed at once, stamps without offset.
+    """A source without lens distortion and time offset; each frame's motion states rolling shutter and motion blur.
 
-    Motion blur is not removed: with an exposure time, each frame's motion states it.
-
-    Colour and depth are corrected alike, so depth must be registered to colour. A source without correction returns
+    rectified: also remove the rolling shutter, as if all rows were exposed at once. Comparisons of frames with each
+    other need this. The rasterizer models the shutter itself, which is sharper and keeps the field of view.
+    Colour and depth are undistorted alike, so depth must be registered to colour. A source without correction returns
     its frames unchanged. Raises InvalidInputError.
     """
 
-    def __init__(self, source: Source, correction: CameraCorrection) -> None:
+    def __init__(self, source: Source, correction: CameraCorrection, rectified: bool = False) -> None:
         super().__init__(source)
-        self._correction = correction
+        self._correction, self._rectified = correction, rectified
         self._trajectory = source.trajectory()
+        if not rectified:
+            self._camera = ideal_camera(source.camera, replace(correction, readout_s=0.0), 0.0)
+            return
         speeds_rad_s = self._trajectory.angular_speeds_rad_s() if correction.readout_s != 0.0 else np.zeros(1)
         self._camera = ideal_camera(source.camera, correction, float(np.quantile(speeds_rad_s, _SPEED_QUANTILE)))
+
+    def rectified(self) -> CorrectedSource:
+        """Return the same source with its rolling shutter removed."""
+        return CorrectedSource(self._source, self._correction, rectified=True)
 
     @property
     def camera(self) -> Camera:
@@ -50,7 +57,8 @@ class CorrectedSource(WrappedSource):
         """Return the corrected frame at position i. Raises DatasetError, PoseError."""
         # at full size: a resized image has lost the pixels that the lookup needs
         recorded = self._source.frame(i)
-        frame = correct_frame(recorded, self._correction, self._camera, self._trajectory.twist(i))
+        correct = correct_frame if self._rectified else undistort_frame
+        frame = correct(recorded, self._correction, self._camera, self._trajectory.twist(i))
         image = resize_rgbd(RgbdImage(frame.rgb, frame.depth_m, frame.camera), size)
         return replace(frame, rgb=image.rgb, depth_m=image.depth_m, camera=image.camera)
 

@@ -10,11 +10,14 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from gausslite.domain.arrays import require_array
+from gausslite.domain.camera import Camera
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.trajectory import Twist
 
 MAX_READOUT_S = 0.1
 MAX_EXPOSURE_S = 0.1
+_MAX_READOUT_SHARE, _MIN_READOUT_FACTOR = 0.65, 0.5
+"""Limits as in the rasterizer."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,6 +61,20 @@ class CameraMotion:
         result: Float64[ndarray, "n 3"] = (
             points_m + time_s * (self.twist.linear_m_s + turned_m) + 0.5 * time_s**2 * second_order_m
         )
+        return result
+
+    def at_exposure(self, points_m: Float64[ndarray, "n 3"], camera: Camera) -> Float64[ndarray, "n 3"]:
+        """Return points of the camera frame at the middle row's time at the times when their rows are exposed.
+
+        points_m: in front of the camera. The same first-order model as in the rasterizer (render/rasterizer.py).
+        """
+        velocity = -(self.twist.linear_m_s + np.cross(self.twist.angular_rad_s, points_m))
+        tangent = points_m[:, 1] / points_m[:, 2]
+        rows_per_s = camera.fy_px * (velocity[:, 1] - tangent * velocity[:, 2]) / points_m[:, 2]
+        row_shares = (camera.fy_px * tangent + camera.cy_px) / camera.height_px
+        readout_factor = np.maximum(1.0 - rows_per_s * self.readout_s / camera.height_px, _MIN_READOUT_FACTOR)
+        shares = np.clip((row_shares - 0.5) / readout_factor, -_MAX_READOUT_SHARE, _MAX_READOUT_SHARE)
+        result: Float64[ndarray, "n 3"] = points_m + (self.readout_s * shares)[:, None] * velocity
         return result
 
     @property

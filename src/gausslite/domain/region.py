@@ -90,7 +90,7 @@ def _image_window(frame: Frame, low_m: Float[ndarray, "3"], high_m: Float[ndarra
     bounds_m = np.stack([low_m, high_m]).astype(np.float64)
     p_world = np.stack(np.meshgrid(*bounds_m.T, indexing="ij"), axis=-1).reshape(-1, 3)
     p_camera = transform_points(inverse(frame.T_world_camera), p_world)
-    if (p_camera[:, 2] < _NEAR_M).any():
+    if (p_camera[:, 2] < _NEAR_M).any() or (frame.motion is not None and frame.motion.readout_s != 0.0):
         return slice(0, height), slice(0, width)
     pixels = project(p_camera.astype(np.float32), frame.camera)
     # one more pixel on every side, for rounding
@@ -102,4 +102,9 @@ def _image_window(frame: Frame, low_m: Float[ndarray, "3"], high_m: Float[ndarra
 def _world_points(frame: Frame, window: tuple[slice, slice]) -> Float[ndarray, "h w 3"]:
     rows, columns = window
     points = back_project(frame.depth_m[window], frame.camera, columns.start, rows.start)
+    if frame.motion is not None:
+        row_shares = (np.arange(rows.start, rows.stop) + 0.5) / frame.camera.height_px
+        pixel_shares = np.repeat(row_shares, points.shape[1])
+        moved = frame.motion.to_middle_row(points.reshape(-1, 3).astype(np.float64), pixel_shares)
+        points = moved.astype(np.float32).reshape(points.shape)
     return transform_points(frame.T_world_camera, points)

@@ -141,7 +141,7 @@ def _refinement_views(
     for keyframe in keyframes:
         frame = keyframe.frame
         T_camera_world = inverse(frame.T_world_camera)
-        rendering = rasterizer.forward(table.rows, frame.camera, T_camera_world)
+        rendering = rasterizer.forward(table.rows, frame.camera, T_camera_world, motion=frame.motion)
         surface_m = rendering.expected_depth_m(_FOOTPRINT_ALPHA)
         occluded = (frame.depth_m > 0) & (frame.depth_m < surface_m * (1 - _OCCLUSION_SHARE) - _OCCLUSION_M)
         pixel_weights = ((rendering.alpha > _FOOTPRINT_ALPHA) & ~occluded).astype(np.float32)
@@ -172,7 +172,9 @@ class _ViewPool:
         view = self._prepared.get(index)
         if view is None:
             frame = chosen.keyframe.frame
-            view = self._rasterizer.prepare_view(frame.rgb, frame.depth_m, frame.camera, chosen.pixel_weights)
+            view = self._rasterizer.prepare_view(
+                frame.rgb, frame.depth_m, frame.camera, chosen.pixel_weights, frame.motion
+            )
             if len(self._prepared) < self._max_prepared:
                 self._prepared[index] = view
         return view, chosen.T_camera_world

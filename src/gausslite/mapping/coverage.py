@@ -73,6 +73,8 @@ def visible_means(
     points = transform_points(inverse(frame.T_world_camera), means_m)
     ids = np.flatnonzero(points[:, 2] > NEAR_M)
     points = points.take(ids, axis=0)
+    if frame.motion is not None:
+        points = frame.motion.at_exposure(points.astype(np.float64), frame.camera).astype(np.float32)
     x_px, y_px = np.ascontiguousarray(project(points, frame.camera).T)
     height, width = frame.depth_m.shape
     inside = np.flatnonzero((y_px >= 0) & (y_px < height) & (x_px >= 0) & (x_px < width))

@@ -42,6 +42,8 @@ def lift_observation(detection: Detection, depth_m: Float32[ndarray, "h w"], fra
     rows, columns = rows[::step], columns[::step]
     centres_px = np.stack([columns, rows], axis=1) + 0.5
     points = lift(centres_px, depth_m[rows, columns].astype(np.float64), frame.camera)
+    if frame.motion is not None:
+        points = frame.motion.to_middle_row(points, (rows + 0.5) / frame.camera.height_px)
     T_world_camera = frame.T_world_camera
     points_m = transform_points(T_world_camera, points)
     camera_m, time_ns = T_world_camera[:3, 3], frame.capture_time_ns
