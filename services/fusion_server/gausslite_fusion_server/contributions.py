@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from gausslite.codec.free_space import decode_free_space
 from gausslite.codec.subset_codec import decode_subset
 from gausslite.domain.errors import (
     GaussLiteError,
@@ -49,6 +50,13 @@ def store_subset(engine: FusionEngine, request: pb.ContributeSubsetsRequest) -> 
     stored = TrafficCounters(subsets_accepted=int(accepted), subsets_stale=int(not accepted))
     engine.record_traffic(agent_id, traffic.plus(stored))
     return outcome
+
+
+def store_free_space(engine: FusionEngine, request: pb.ContributeFreeSpaceRequest) -> int:
+    """Store free space; returns the agent's number of free voxels. Raises CodecError, QuotaError and the like."""
+    engine.session(request.session_id)
+    blocks, grid = decode_free_space(request.free_space)
+    return engine.contribute_free_space(request.session_id, blocks, grid)
 
 
 def store_keyframe(engine: FusionEngine, request: pb.ContributeKeyframesRequest) -> None:

@@ -65,5 +65,6 @@ def contribution_to_message(agent: AgentContribution) -> pb.AgentContribution:
         last_update_seq=agent.last_update_seq,
         last_seen_ns=agent.traffic.last_seen_ns,
         targets=agent.targets,
+        free_voxels=agent.free_voxels,
         alignment=alignment_to_message(agent.alignment),
     )

@@ -41,7 +41,7 @@ from gausslite.wire.convert_task import graph_from_message
 from gausslite.wire.server import Service
 from gausslite.wire.tls import require_agent_certificate
 from gausslite_fusion_server.change_blocks import change_blocks
-from gausslite_fusion_server.contributions import store_keyframe, store_subset
+from gausslite_fusion_server.contributions import store_free_space, store_keyframe, store_subset
 from gausslite_fusion_server.drain_gate import DrainGate
 from gausslite_fusion_server.map_renderer import MapRenderer
 from gausslite_fusion_server.messages import contribution_to_message, layer_from_message
@@ -202,6 +202,14 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         objects = await self._work(self._engine.query_objects, request.noun)
         return pb.QueryObjectsResponse(objects=[object_to_message(each.landmark, each.observers) for each in objects])
 
+    async def ContributeFreeSpace(
+        self, request: pb.ContributeFreeSpaceRequest, context: Any
+    ) -> pb.ContributeFreeSpaceResponse:
+        """Replace what an agent observed as free in some blocks of voxels."""
+        free_voxels = await self._work(store_free_space, self._engine, request)
+        self._map_changes.notify()
+        return pb.ContributeFreeSpaceResponse(free_voxels=free_voxels)
+
     async def RenderView(self, request: pb.RenderFusedViewRequest, context: Any) -> pb.RenderFusedViewResponse:
         """Render a layer of the map from a camera pose."""
         self._gate.require_open()
@@ -226,6 +234,7 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
             agents=[contribution_to_message(agent) for agent in status.agents],
             keyframes=status.keyframes,
             refined=status.refined,
+            vote=str(self._engine.settings.vote),
         )
 
     async def LeaveSession(self, request: pb.LeaveSessionRequest, context: Any) -> pb.LeaveSessionResponse:

@@ -14,7 +14,7 @@ from gausslite.config.tls_options import add_tls, read_server_tls
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.fusion.frame_alignment import AlignmentSettings
 from gausslite.fusion.joint_refinement import RefineSettings
-from gausslite.fusion.limits import MAX_REFINE_ITERATIONS, FusionSettings, Quotas
+from gausslite.fusion.limits import MAX_REFINE_ITERATIONS, FusionSettings, Quotas, VoteRule
 from gausslite.process.messages import print_message
 from gausslite.wire.tls import Tls
 
@@ -55,6 +55,7 @@ def parse_arguments(arguments: Sequence[str] | None = None) -> ServerSettings:
             options.mission,
             options.world_frame,
             quotas,
+            vote=VoteRule(options.vote),
             alignment=None if options.frame_alignment == _TRUST else AlignmentSettings(),
         ),
         RefineSettings(iterations=options.refine_iterations),
@@ -78,6 +79,12 @@ def _parser() -> argparse.ArgumentParser:
     add_voxel_size(parser)
     add("--mission", default="", metavar="ID", help="the only mission to serve (default: the first agent's)")
     add("--world-frame", default="", metavar="NAME", help="frame of all maps (default: the first agent's)")
+    add(
+        "--vote",
+        choices=[str(each) for each in VoteRule],
+        default=str(VoteRule.PAPER),
+        help="rule of the vote; free-space leaves out voxels that an agent observed as free (default: %(default)s)",
+    )
     add(
         "--frame-alignment",
         choices=[_CORRECT, _TRUST],

@@ -13,6 +13,7 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from gausslite.domain.errors import InvalidInputError, MismatchError, NotPermittedError, QuotaError
+from gausslite.domain.free_space import FreeSpace
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.names import quote_name, require_name
 from gausslite.domain.objects import ObjectLandmark, ObjectReport, TeamObject
@@ -21,9 +22,10 @@ from gausslite.domain.voxel_batch import RoiSubset
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.fusion.frame_aligner import FrameAligner
 from gausslite.fusion.frame_alignment import FrameAlignments
+from gausslite.fusion.free_space import FreeSpaceRecords
 from gausslite.fusion.fused_map import FusedMapLayers
 from gausslite.fusion.keyframes import AgentKeyframe, EncodedKeyframe, FrameDecoder, KeyframePool, no_decoder
-from gausslite.fusion.limits import FusionSettings
+from gausslite.fusion.limits import FusionSettings, VoteRule
 from gausslite.fusion.mission_config import MissionConfig, reconcile
 from gausslite.fusion.sessions import SessionRegistry
 from gausslite.fusion.store import FusionStore, PutOutcome, SessionRecord
@@ -76,7 +78,10 @@ class FusionEngine:
         scores = store.scores()
         self._usage = UsageLedger(scores, quotas)
         self._alignments = FrameAlignments(store)
-        self._votes = VoteInput(store, self._alignments, settings.grid)
+        self._free_space = FreeSpaceRecords(store, settings.grid)
+        uses_free_space = settings.vote is VoteRule.FREE_SPACE
+        free_space = self._free_space if uses_free_space else None
+        self._votes = VoteInput(store, self._alignments, settings.grid, free_space)
         self._aligner = FrameAligner(store, self._alignments, self._votes, self._lock, settings.alignment)
         self._maps = FusedMapLayers(self._votes, self._lock, settings.grid, first_revision, settings.max_removed_voxels)
 
@@ -184,6 +189,21 @@ class FusionEngine:
             self._alignments.declare(agent_id, T_fused_agent)
             self._maps.record(agent_id, self._votes.refresh(agent_id))
 
+    def contribute_free_space(self, session_id: str, blocks: FreeSpace, grid: VoxelGrid) -> int:
+        """Replace what an agent observed as free in these blocks; returns its number of free voxels.
+
+        Raises SessionUnknownError, MismatchError (another grid), QuotaError, StorageError.
+        """
+        with self._lock:
+            agent_id = self._sessions.get(session_id).agent_id
+            if grid != self.grid:
+                raise MismatchError(f"voxel size: this mission votes on {self.grid.size_m:g} m, got {grid.size_m:g} m")
+            keys = self._free_space.contribute(agent_id, blocks)
+            if self._settings.vote is VoteRule.FREE_SPACE:
+                for name in self._votes.agents():
+                    self._maps.record(name, keys)
+            return self._free_space.free_voxels(agent_id)
+
     def record_traffic(self, agent_id: str, traffic: TrafficCounters) -> None:
         """Add to the agent's counters, and set its last_seen_ns to now."""
         with self._lock:
@@ -252,6 +272,7 @@ class FusionEngine:
                     joined=agent_id in joined,
                     keyframes=self._keyframes.count(agent_id),
                     targets=self._objects.targets(agent_id),
+                    free_voxels=self._free_space.free_voxels(agent_id),
                     alignment=self._alignments.get(agent_id),
                     traffic=self._traffic.get(agent_id, TrafficCounters()),
                 )
@@ -277,6 +298,7 @@ class FusionEngine:
         self._maps.record(agent_id, keys)
         self._alignments.remove_agent(agent_id)
         self._aligner.remove_agent(agent_id)
+        self._free_space.remove_agent(agent_id)
         self._usage.remove_agent(agent_id)
         self._traffic.pop(agent_id, None)
         self._keyframes.remove_agent(agent_id)

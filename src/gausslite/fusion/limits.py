@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
+from enum import StrEnum
 
 import numpy as np
 
@@ -16,6 +17,13 @@ from gausslite.fusion.store import VoxelScoreTable
 
 MAX_REFINE_ITERATIONS = 30_000
 """A larger number would occupy a server for hours with one request."""
+
+
+class VoteRule(StrEnum):
+    """FREE_SPACE leaves out updates of voxels that an agent has observed as free in two views."""
+
+    PAPER = "paper"
+    FREE_SPACE = "free-space"
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +47,7 @@ class FusionSettings:
     """The server's configuration. If mission_id or world_frame is empty, the first agent that names it fixes it.
 
     max_removed_voxels: number of removed voxels that a watcher can still catch up with; see RevisionLog.
-    alignment: how agents' frames are estimated; None uses them as declared.
+    alignment: how agents' frames are estimated; None uses them as declared. vote: the rule of the vote.
     """
 
     grid: VoxelGrid = field(default_factory=VoxelGrid)
@@ -48,6 +56,7 @@ class FusionSettings:
     quotas: Quotas = field(default_factory=Quotas)
     max_removed_voxels: int = MAX_REMOVED_VOXELS
     alignment: AlignmentSettings | None = None
+    vote: VoteRule = VoteRule.PAPER
 
     def __post_init__(self) -> None:
         require_name("mission", self.mission_id)

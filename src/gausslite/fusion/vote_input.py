@@ -1,4 +1,7 @@
-"""The voxel updates as the vote reads them: in the fused map's frame, without quarantined agents."""
+"""The voxel updates as the vote reads them: in the fused map's frame, without quarantined agents.
+
+The free-space vote also leaves out updates that the agents' views contradict.
+"""
 
 from __future__ import annotations
 
@@ -16,6 +19,7 @@ from gausslite.domain.voxel_changes import VoxelChangeTracker, VoxelSignatures
 from gausslite.domain.voxel_operations import VoxelIndex, empty_batch, group_by_voxel, select_keys, select_voxels
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.fusion.frame_alignment import AlignmentState, FrameAlignment, FrameAlignments
+from gausslite.fusion.free_space import FreeSpaceRecords
 from gausslite.fusion.store import FusionStore, VoxelScoreTable
 
 
@@ -25,8 +29,15 @@ class VoteInput:
     Not thread-safe; FusionEngine holds a lock.
     """
 
-    def __init__(self, store: FusionStore, alignments: FrameAlignments, grid: VoxelGrid) -> None:
-        self._store, self._alignments, self._grid = store, alignments, grid
+    def __init__(
+        self,
+        store: FusionStore,
+        alignments: FrameAlignments,
+        grid: VoxelGrid,
+        free_space: FreeSpaceRecords | None = None,
+    ) -> None:
+        """With free space, updates of voxels that an agent has observed as free are not read."""
+        self._store, self._alignments, self._grid, self._free_space = store, alignments, grid, free_space
         self._moved: dict[str, VoxelBatch] = {}
         self._trackers: dict[str, VoxelChangeTracker] = {}
         for agent_id in store.agents():
@@ -39,6 +50,13 @@ class VoteInput:
 
     def scores(self, keys: Int64[ndarray, " k"] | None = None) -> VoxelScoreTable:
         """Return all agents' totals on these voxels, or on all."""
+        table = self._fused_scores(keys)
+        if self._free_space is None:
+            return table
+        kept = ~self._free_space.contradicts(table.keys, set(self._alignments.transforms()))
+        return _merge_scores(table, kept, {})
+
+    def _fused_scores(self, keys: Int64[ndarray, " k"] | None) -> VoxelScoreTable:
         table = self._store.scores(keys)
         if not self._moved:
             return table
@@ -49,9 +67,14 @@ class VoteInput:
     def batches(self, keys: Int64[ndarray, " k"] | None = None) -> dict[str, VoxelBatch]:
         """Return the updates of every agent on these voxels, or on all."""
         batches = self._store.batches(keys)
-        return {
+        fused = {
             name: _select(self._moved[name], keys) if name in self._moved else batch for name, batch in batches.items()
         }
+        if self._free_space is None:
+            return fused
+        differ = set(self._alignments.transforms())
+        free = self._free_space
+        return {name: select_voxels(each, ~free.contradicts(each.keys, differ)) for name, each in fused.items()}
 
     def refresh(self, agent_id: str) -> Int64[ndarray, " k"]:
         """Recompute the agent's moved map after its updates or its alignment changed; returns the voxels to compare.

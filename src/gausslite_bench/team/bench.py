@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
+from gausslite.domain.free_space import FreeSpace
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.voxel_batch import RoiSubset
 from gausslite.domain.voxel_operations import group_by_voxel
@@ -16,7 +17,7 @@ from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.frame_alignment import AlignmentSettings
 from gausslite.fusion.joint_refinement import RefineSettings, refine
 from gausslite.fusion.keyframes import AgentKeyframe
-from gausslite.fusion.limits import FusionSettings, Quotas
+from gausslite.fusion.limits import FusionSettings, Quotas, VoteRule
 from gausslite.fusion.memory_store import MemoryStore
 from gausslite.fusion.mission_config import MissionConfig
 from gausslite.mission.settings import MissionSettings
@@ -28,6 +29,7 @@ from gausslite_bench.team.scenes import TeamPlan, TeamScene
 
 CONCATENATION, VOTE, REFINED, SHARED_VOTE = "concatenation", "vote", "refine", "vote of shared regions"
 UNALIGNED = "vote, frames trusted"
+FREE_SPACE_VOTE = "free-space vote"
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,6 +93,9 @@ def run_trial(trial: TeamTrial, scene: TeamScene, on_frame: Callable[[FrameOutco
     if not trial.frame_error.is_zero:
         trusted = fuse_messages({each.agent_id: whole_map(each, trial.grid) for each in maps}, trial.grid, align=False)
         fused[UNALIGNED] = trusted.maps.voted_map().gaussians
+    whole = {each.agent_id: whole_map(each, trial.grid) for each in maps}
+    free = {each.agent_id: each.free_space for each in maps}
+    fused[FREE_SPACE_VOTE] = fuse_messages(whole, trial.grid, align=True, free_space=free).maps.voted_map().gaussians
     first, *others = maps
     shared = {first.agent_id: whole_map(first, trial.grid), **{each.agent_id: each.messages for each in others}}
     fused[SHARED_VOTE] = fuse_messages(shared, trial.grid, align=True).maps.voted_map().gaussians
@@ -121,16 +126,24 @@ def whole_map(agent_map: AgentMap, grid: VoxelGrid) -> tuple[RoiSubset, ...]:
     return (RoiSubset(agent_map.agent_id, "", number, number, group_by_voxel(agent_map.gaussians, grid)),)
 
 
-def fuse_messages(messages: Mapping[str, Sequence[RoiSubset]], grid: VoxelGrid, align: bool) -> FusionEngine:
-    """Return a fusion engine that has received these messages, agent by agent."""
+def fuse_messages(
+    messages: Mapping[str, Sequence[RoiSubset]],
+    grid: VoxelGrid,
+    align: bool,
+    free_space: Mapping[str, FreeSpace] | None = None,
+) -> FusionEngine:
+    """Return a fusion engine that has received these messages, agent by agent; with free space it is in the vote."""
     quotas = Quotas(voxels_per_agent=10_000_000, gaussians_per_agent=100_000_000)
     settings = FusionSettings(grid, quotas=quotas, alignment=AlignmentSettings() if align else None)
+    settings = replace(settings, vote=VoteRule.PAPER if free_space is None else VoteRule.FREE_SPACE)
     engine = FusionEngine(MemoryStore(), settings)
     for agent_id, subsets in messages.items():
         session_id = engine.join(agent_id, MissionConfig("", "", grid.size_m)).session.session_id
         for subset in subsets:
             engine.contribute(session_id, subset, grid)
             engine.align_due()
+        if free_space is not None:
+            engine.contribute_free_space(session_id, free_space[agent_id], grid)
     return engine
 
 

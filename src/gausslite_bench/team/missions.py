@@ -6,11 +6,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from gausslite.codec.subset_codec import encode_subset, split_batch
+from gausslite.domain.free_space import FreeSpace
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.voxel_batch import RoiSubset, VoxelBatch
 from gausslite.domain.voxel_operations import group_by_voxel
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.fusion.keyframes import AgentKeyframe
+from gausslite.mapping.free_space import FreeSpaceMap
 from gausslite.mapping.sent_voxels import SentVoxelTracker
 from gausslite.mission.build import build_mapper
 from gausslite.mission.frame_scheduler import FrameScheduler
@@ -24,6 +26,7 @@ from gausslite_bench.team.scenes import AgentScene
 
 _RESEND_THRESHOLD = 0.25
 _ROUND_FRAMES = 4
+_FREE_SPACE_FRAMES = 5
 _SUBSET_BYTES = 1 << 20
 
 
@@ -31,6 +34,7 @@ _SUBSET_BYTES = 1 << 20
 class AgentMap:
     """One agent's map, its keyframes, and what it sent: bytes of all messages and Gaussians, resends included.
     bytes_whole: size of its whole map as messages.
+    free_space: what every fifth frame observed as free.
 
     messages: the subsets in the order of sending, as the fusion server would receive them.
     """
@@ -42,6 +46,7 @@ class AgentMap:
     bytes_sent: int
     gaussians_sent: int
     bytes_whole: int
+    free_space: FreeSpace
 
 
 class _SentMessages:
@@ -100,5 +105,19 @@ def map_agent(
     whole = split_batch(group_by_voxel(gaussians, grid), _SUBSET_BYTES)
     bytes_whole = sum(len(encode_subset(RoiSubset(agent.agent_id, "", 1, 1, part), grid)) for part in whole)
     return AgentMap(
-        agent.agent_id, gaussians, keyframes, tuple(sent.messages), sent.byte_count, gaussians_sent, bytes_whole
+        agent.agent_id,
+        gaussians,
+        keyframes,
+        tuple(sent.messages),
+        sent.byte_count,
+        gaussians_sent,
+        bytes_whole,
+        _observe_free_space(agent, grid),
     )
+
+
+def _observe_free_space(agent: AgentScene, grid: VoxelGrid) -> FreeSpace:
+    free = FreeSpaceMap(grid)
+    for frame in agent.frames[::_FREE_SPACE_FRAMES]:
+        free.observe(frame)
+    return free.free_space

@@ -9,10 +9,13 @@ import numpy as np
 import pytest
 from fusion_running import CAMERA, GRID, frame, fusion_server, make_subset
 
+from gausslite.codec.free_space import encode_free_space
 from gausslite.domain.camera import Camera
-from gausslite.domain.errors import InvalidInputError, PoseError, QuotaError
+from gausslite.domain.errors import InvalidInputError, MismatchError, PoseError, QuotaError
+from gausslite.domain.free_space import FreeSpace
 from gausslite.domain.pose import transform_of
 from gausslite.domain.voxel_operations import empty_batch
+from gausslite.domain.voxels import VoxelGrid
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.wire.convert import camera_to_message, grid_to_message, transform_to_message
 
@@ -107,3 +110,19 @@ def test_a_declared_frame_moves_the_agents_map() -> None:
         with pytest.raises(grpc.RpcError) as refused:
             server.stub.JoinSession(request)
         assert refused.value.code() is grpc.StatusCode.INVALID_ARGUMENT
+
+
+def test_free_space_is_stored_and_hostile_bytes_are_refused() -> None:
+    free = FreeSpace(np.array([5, 9], np.int64), np.full((2, 512), 2, np.uint8))
+    with fusion_server() as server:
+        session = server.client.join("ant", GRID).session_id
+        assert server.client.contribute_free_space(session, free, GRID) < 300
+        [agent] = server.client.status().agents
+        assert agent.free_voxels == 1024
+        for session_id, data in (("nobody", encode_free_space(free, GRID)), (session, b"\xff" * 1000)):
+            with pytest.raises(grpc.RpcError) as refused:
+                server.stub.ContributeFreeSpace(pb.ContributeFreeSpaceRequest(session_id=session_id, free_space=data))
+            assert refused.value.code() in (grpc.StatusCode.NOT_FOUND, grpc.StatusCode.INVALID_ARGUMENT)
+        with pytest.raises(MismatchError):
+            server.client.contribute_free_space(session, free, VoxelGrid(0.2))
+        assert server.client.status().agents[0].free_voxels == 1024

@@ -1,0 +1,57 @@
+"""What the agents observed as free, and the updates that these observations contradict."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Bool, Int64
+from numpy import ndarray
+
+from gausslite.codec.free_space import MAX_BLOCKS, decode_free_space, encode_free_space
+from gausslite.domain.errors import QuotaError
+from gausslite.domain.free_space import FreeSpace
+from gausslite.domain.voxels import VoxelGrid
+from gausslite.fusion.store import FusionStore
+
+_RECORD = "free_space"
+_STORED_BYTES = 1 << 23
+MIN_VIEWS = 2
+"""Views of one agent that have to agree: one view may have a wrong depth or pose."""
+
+
+class FreeSpaceRecords:
+    """Each agent's free space, in the store. Not thread-safe; FusionEngine holds a lock."""
+
+    def __init__(self, store: FusionStore, grid: VoxelGrid) -> None:
+        self._store, self._grid = store, grid
+        stored = store.records(_RECORD).items()
+        self._by_agent = {agent_id: decode_free_space(data, _STORED_BYTES)[0] for agent_id, data in stored}
+
+    def contribute(self, agent_id: str, blocks: FreeSpace) -> Int64[ndarray, " k"]:
+        """Replace these blocks of an agent; returns the voxels where its view may have changed. Raises QuotaError."""
+        before = self._by_agent.get(agent_id, FreeSpace.empty())
+        after = before.replace_blocks(blocks)
+        if len(after.keys) > MAX_BLOCKS:
+            raise QuotaError(f"free space: expected at most {MAX_BLOCKS} blocks of an agent, got {len(after.keys)}")
+        self._store.save_record(agent_id, _RECORD, encode_free_space(after, self._grid))
+        self._by_agent[agent_id] = after
+        earlier, now = (each.voxel_keys(self._grid, MIN_VIEWS) for each in (before, after))
+        return np.setxor1d(earlier, now)
+
+    def free_voxels(self, agent_id: str) -> int:
+        """Return the number of voxels that the agent has observed as free."""
+        return self._by_agent.get(agent_id, FreeSpace.empty()).free_voxels
+
+    def contradicts(self, keys: Int64[ndarray, " k"], frames_differ: set[str]) -> Bool[ndarray, " k"]:
+        """Return True for the voxels that an agent has observed as free in two views.
+
+        Agents in `frames_differ` do not count, because their voxels are not those of the fused map.
+        """
+        contradicted = np.zeros(len(keys), np.bool_)
+        for agent_id, free in self._by_agent.items():
+            if agent_id not in frames_differ:
+                contradicted |= free.views(keys, self._grid) >= MIN_VIEWS
+        return contradicted
+
+    def remove_agent(self, agent_id: str) -> None:
+        """Forget the agent; the store deletes its record with its updates."""
+        self._by_agent.pop(agent_id, None)

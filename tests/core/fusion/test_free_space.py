@@ -1,0 +1,149 @@
+"""Free space: observed from depth, encoded at a few bits a voxel, and used by the free-space vote."""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import replace
+from pathlib import Path
+
+import google_crc32c
+import numpy as np
+import pytest
+from sample_gaussians import plain_gaussians
+
+from gausslite.codec.free_space import decode_free_space, encode_free_space
+from gausslite.domain.camera import Camera
+from gausslite.domain.errors import GaussLiteError, MismatchError
+from gausslite.domain.frame import Frame
+from gausslite.domain.free_space import FreeSpace
+from gausslite.domain.voxel_batch import RoiSubset
+from gausslite.domain.voxel_operations import group_by_voxel
+from gausslite.domain.voxels import VoxelGrid
+from gausslite.fusion.engine import FusionEngine
+from gausslite.fusion.limits import FusionSettings, VoteRule
+from gausslite.fusion.mission_config import MissionConfig
+from gausslite.fusion.sqlite_store import SqliteStore
+from gausslite.mapping.free_space import FreeSpaceMap
+
+GRID = VoxelGrid(0.10)
+CAMERA = Camera(60.0, 60.0, 32.0, 24.0, 64, 48)
+
+
+def wall(depth_m: float, index: int = 0) -> Frame:
+    """A view from the origin along z of a wall."""
+    depth = np.full((48, 64), depth_m, np.float32)
+    return Frame(index, index, np.full((48, 64, 3), 90, np.uint8), depth, CAMERA, np.eye(4))
+
+
+def observed(views: int, depth_m: float = 2.0) -> FreeSpace:
+    free = FreeSpaceMap(GRID)
+    for index in range(views):
+        free.observe(wall(depth_m, index))
+    return free.free_space
+
+
+def key_at(x: float, y: float, z: float) -> np.ndarray:
+    return GRID.keys(np.array([[x, y, z]], np.float32))
+
+
+def test_voxels_between_the_camera_and_the_wall_are_free() -> None:
+    free = observed(2)
+    assert free.views(key_at(0.05, 0.05, 1.05), GRID).tolist() == [2]
+    for x, z in ((0.05, 1.95), (0.05, 2.55), (1.5, 1.05), (0.05, -1.0)):
+        assert free.views(key_at(x, 0.05, z), GRID).tolist() == [0]
+    keys = free.voxel_keys(GRID, 2)
+    assert (free.views(keys, GRID) == 2).all()
+    assert len(keys) == free.free_voxels > 50
+
+
+def test_counts_saturate_and_pixels_without_depth_show_nothing() -> None:
+    assert observed(9).counts.max() == 3
+    free = FreeSpaceMap(GRID)
+    holes = wall(2.0)
+    holes.depth_m[20:28, 28:36] = 0.0
+    free.observe(holes)
+    assert free.free_space.views(key_at(0.05, 0.05, 1.05), GRID).tolist() == [0]
+
+
+def test_only_changed_blocks_are_collected() -> None:
+    free = FreeSpaceMap(GRID)
+    free.observe(wall(2.0))
+    assert len(free.collect_changes().keys) == len(free.free_space.keys) > 0
+    assert len(free.collect_changes().keys) == 0
+
+
+def test_the_codec_needs_a_few_bits_a_voxel_and_loses_nothing() -> None:
+    free = observed(2)
+    data = encode_free_space(free, GRID)
+    decoded, grid = decode_free_space(data)
+    assert grid == GRID
+    assert np.array_equal(decoded.keys, free.keys)
+    assert np.array_equal(decoded.counts, free.counts)
+    assert 8 * len(data) / free.free_voxels < 8
+
+
+def test_hostile_messages_are_one_error() -> None:
+    data = encode_free_space(observed(2), GRID)
+
+    def resealed(message: bytes) -> bytes:
+        return message[:-4] + struct.pack("<I", google_crc32c.value(message[:-4]))
+
+    rng = np.random.default_rng(0)
+    hostile = [b"", data[:10], data[:-1], b"XXXX" + data[4:], data + b"\0" * (1 << 21)]
+    hostile += [resealed(data[:6] + struct.pack("<I", count) + data[10:]) for count in (0, 1, 2**32 - 1)]
+    for _ in range(200):
+        changed = bytearray(data)
+        changed[int(rng.integers(len(data)))] ^= int(rng.integers(1, 256))
+        hostile += [bytes(changed)]
+    for message in hostile:
+        with pytest.raises(GaussLiteError):
+            decode_free_space(message)
+    changed = bytearray(data)
+    changed[-20] ^= 255
+    with pytest.raises(GaussLiteError):
+        decode_free_space(resealed(bytes(changed)))
+
+
+def team(store: SqliteStore, rule: VoteRule) -> tuple[FusionEngine, str]:
+    """An engine with a stray Gaussian of ant in front of the wall and its surface; returns bee's session."""
+    engine = FusionEngine(store, FusionSettings(grid=GRID, vote=rule))
+    ant, bee = (engine.join(name, MissionConfig("", "", 0.10)).session.session_id for name in ("ant", "bee"))
+    gaussians = plain_gaussians([(0.05, 0.05, 1.05), (0.05, 0.05, 2.05)], kappa=9)
+    engine.contribute(ant, RoiSubset("ant", "", 1, 1, group_by_voxel(gaussians, GRID)), GRID)
+    return engine, bee
+
+
+def test_a_stray_gaussian_in_space_that_another_robot_saw_free_is_left_out(tmp_path: Path) -> None:
+    store = SqliteStore(tmp_path / "a.sqlite")
+    engine, bee = team(store, VoteRule.FREE_SPACE)
+    revision = engine.revision
+    assert len(engine.maps.voted_map()) == 2
+    engine.contribute_free_space(bee, observed(1), GRID)
+    assert len(engine.maps.voted_map()) == 2  # one view may be wrong
+    assert engine.contribute_free_space(bee, observed(2), GRID) > 0
+    assert engine.maps.voted_map().gaussians.means_m[:, 2].tolist() == pytest.approx([2.05])
+    assert engine.maps.changes(revision).removed.tolist() == key_at(0.05, 0.05, 1.05).tolist()
+    store.close()
+    store = SqliteStore(tmp_path / "a.sqlite")
+    assert len(FusionEngine(store, FusionSettings(grid=GRID, vote=VoteRule.FREE_SPACE)).maps.voted_map()) == 1
+    store.close()
+
+
+def test_the_published_vote_ignores_free_space(tmp_path: Path) -> None:
+    store = SqliteStore(tmp_path / "a.sqlite")
+    engine, bee = team(store, VoteRule.PAPER)
+    engine.contribute_free_space(bee, observed(2), GRID)
+    assert len(engine.maps.voted_map()) == 2
+    assert engine.status().agents[1].free_voxels > 0
+    with pytest.raises(MismatchError, match="voxel size"):
+        engine.contribute_free_space(bee, observed(2), VoxelGrid(0.05))
+    engine.leave(bee, forget=True)
+    assert store.records("free_space") == {}
+    store.close()
+
+
+def test_free_space_of_wrong_shape_is_refused() -> None:
+    free = observed(1)
+    for wrong in ({"keys": free.keys[::-1].copy()}, {"counts": free.counts + np.uint8(3)}):
+        with pytest.raises(GaussLiteError, match="free space"):
+            replace(free, **wrong)
