@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gausslite.datasets.camera_correction import correct_frame, ideal_camera
+from gausslite.datasets.camera_correction import ideal_camera, undistort_frame
 from gausslite.domain.camera_correction import CameraCorrection
 from gausslite.domain.camera_motion import CameraMotion
 from gausslite.domain.frame import Frame
@@ -13,7 +13,7 @@ from gausslite.domain.trajectory import Twist
 
 
 def correct_live_frame(frame: Frame, lens: Lens | None) -> Frame:
-    """Return the frame without lens distortion and rolling shutter.
+    """Return the frame without lens distortion; its motion states rolling shutter and blur of the returned image.
 
     lens: that of the recorded image, None for a pinhole. Raises InvalidInputError for a lens without a usable pinhole
     camera.
@@ -22,5 +22,5 @@ def correct_live_frame(frame: Frame, lens: Lens | None) -> Frame:
     correction = CameraCorrection(lens, motion.readout_s, exposure_s=motion.exposure_s)
     if correction.is_identity:
         return frame
-    speed_rad_s = float(np.linalg.norm(motion.twist.angular_rad_s))
-    return correct_frame(frame, correction, ideal_camera(frame.camera, correction, speed_rad_s), motion.twist)
+    ideal = ideal_camera(frame.camera, CameraCorrection(lens), 0.0)
+    return undistort_frame(frame, correction, ideal, motion.twist)

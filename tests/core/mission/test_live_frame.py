@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from gausslite.datasets.camera_correction import correct_frame, ideal_camera
+from gausslite.datasets.camera_correction import ideal_camera, undistort_frame
 from gausslite.domain.camera import Camera
 from gausslite.domain.camera_correction import CameraCorrection
 from gausslite.domain.camera_motion import CameraMotion
@@ -30,13 +30,17 @@ def test_a_live_frame_is_corrected_as_a_recorded_one() -> None:
     plain = sample_frame()
     got = correct_live_frame(replace(plain, motion=MOTION), LENS)
     correction = CameraCorrection(LENS, MOTION.readout_s, exposure_s=MOTION.exposure_s)
-    ideal = ideal_camera(CAMERA, correction, float(np.linalg.norm(MOTION.twist.angular_rad_s)))
-    expected = correct_frame(plain, correction, ideal, MOTION.twist)
+    ideal = ideal_camera(CAMERA, CameraCorrection(LENS), 0.0)
+    expected = undistort_frame(plain, correction, ideal, MOTION.twist)
     assert got.camera == ideal != CAMERA
     np.testing.assert_array_equal(got.rgb, expected.rgb)
     np.testing.assert_array_equal(got.depth_m, expected.depth_m)
     assert got.motion is not None
-    assert (got.motion.readout_s, got.motion.exposure_s) == (0.0, MOTION.exposure_s)
+    assert expected.motion is not None
+    assert got.motion.readout_s == expected.motion.readout_s
+    assert 0.8 * MOTION.readout_s < got.motion.readout_s < MOTION.readout_s
+    assert got.motion.exposure_s == MOTION.exposure_s
+    np.testing.assert_array_equal(got.T_world_camera, expected.T_world_camera)
 
 
 def test_a_live_frame_without_lens_and_motion_is_used_as_sent() -> None:
