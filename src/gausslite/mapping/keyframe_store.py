@@ -13,7 +13,7 @@ from gausslite.domain.errors import MapFileError
 from gausslite.domain.frame import Frame
 from gausslite.domain.relevance import RelevanceMap
 from gausslite.domain.state import State, add_prefix, get_counts, int_array, select_prefix
-from gausslite.mapping.keyframes import Keyframe, WindowView, is_same_frame, tiles_touching
+from gausslite.mapping.keyframes import Keyframe, WindowView, is_same_frame, motion_blur_px, tiles_touching
 from gausslite.mapping.settings import KeyframeSettings
 from gausslite.render.rasterizer import Subset
 
@@ -25,7 +25,8 @@ class KeyframeStore:
     """Every `every`th mapped frame is a keyframe: the `window` most recent train the map, `buffer` are kept.
 
     `long_term_keyframes` more frames train the map, spread over the mission: those that show the ROI, or any frames if
-    the policy follows no task. Large images reduce all three numbers (`KeyframeSettings.max_pixels`).
+    the policy follows no task. Of frames equally close in time, sharp ones stay. Large images reduce all three numbers
+    (`KeyframeSettings.max_pixels`).
     """
 
     def __init__(self, settings: KeyframeSettings, follows_task: bool = True) -> None:
@@ -179,7 +180,11 @@ def _capture_time_ns(view: WindowView) -> int:
 
 
 def _most_redundant(keyframes: Sequence[Keyframe]) -> int:
-    """Return the index of the keyframe closest in time to its neighbours, never the first or the last one."""
+    """Return the index of the keyframe closest in time to its neighbours, never the first or the last one.
+
+    Motion blur counts as if the neighbours were closer.
+    """
     times = np.array([keyframe.frame.capture_time_ns for keyframe in keyframes])
     gaps = np.abs(times[2:] - times[:-2])  # the clock of a second recording may restart
-    return 1 + int(np.argmin(gaps)) if len(gaps) else 0
+    blur_px = np.array([motion_blur_px(keyframe.frame) for keyframe in keyframes[1:-1]])
+    return 1 + int(np.argmin(gaps / (1.0 + blur_px**2))) if len(gaps) else 0

@@ -18,6 +18,7 @@ from gausslite.mapping.settings import KeyframeSettings
 from gausslite.render.rasterizer import TILE_PX, Rasterizer, Subset, TrainingView
 
 _SSIM_WINDOW_PX = 11
+_DEPTH_STEP_PX = 8
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,6 +62,17 @@ class Keyframe:
 def is_same_frame(a: Keyframe, b: Keyframe) -> bool:
     """True if both keyframes come from the same recorded frame."""
     return a.as_recorded is b.as_recorded
+
+
+def motion_blur_px(frame: Frame) -> float:
+    """Return the standard deviation of a point's image during the exposure, at the frame's median depth; 0 at rest."""
+    motion = frame.motion
+    if motion is None or motion.exposure_s == 0.0:
+        return 0.0
+    depths_m = frame.depth_m[::_DEPTH_STEP_PX, ::_DEPTH_STEP_PX]
+    distance_m = float(np.median(depths_m[depths_m > 0])) if (depths_m > 0).any() else np.inf
+    turn_rad_s, speed_m_s = (float(np.linalg.norm(v)) for v in (motion.twist.angular_rad_s, motion.twist.linear_m_s))
+    return frame.camera.fx_px * (turn_rad_s + speed_m_s / distance_m) * motion.exposure_s / 12**0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)

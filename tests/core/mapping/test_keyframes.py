@@ -7,10 +7,12 @@ from dataclasses import replace
 import numpy as np
 from mapping_scenes import middle_relevance, wall_frame
 
+from gausslite.domain.camera_motion import CameraMotion
 from gausslite.domain.relevance import RelevanceMap
+from gausslite.domain.trajectory import Twist
 from gausslite.mapping.baselines import uniform_policy
 from gausslite.mapping.keyframe_store import KeyframeStore
-from gausslite.mapping.keyframes import Keyframe, tiles_touching, window_view
+from gausslite.mapping.keyframes import Keyframe, motion_blur_px, tiles_touching, window_view
 from gausslite.mapping.settings import Components, KeyframeSettings
 from gausslite.render.cpu import CpuRasterizer
 
@@ -35,6 +37,26 @@ def test_the_buffer_is_bounded_and_stays_spread_over_the_mission() -> None:
     assert len(kept) == 8
     assert (kept[0], kept[-1]) == (0, 63)
     assert max(np.diff(kept)) <= 20
+
+
+def test_sharp_frames_are_kept_instead_of_blurred_neighbours() -> None:
+    """Every second frame is blurred by several pixels."""
+    settings, rasterizer = (
+        KeyframeSettings(every=1, window=2, buffer=8, long_term_keyframes=8),
+        CpuRasterizer(threads=1),
+    )
+    store = KeyframeStore(settings)
+    turn = Twist(np.zeros(3), np.array([0.0, 2.0, 0.0]))
+    for index in range(32):
+        motion = CameraMotion(turn, exposure_s=0.05 if index % 2 else 0.001)
+        frame = replace(wall_frame(index), motion=motion)
+        assert (motion_blur_px(frame) > 1.5) == bool(index % 2)
+        store.add(window_view(Keyframe(frame, middle_relevance(frame)), rasterizer, settings))
+    kept = [keyframe.frame.index for keyframe in store.buffer]
+    long_term = [view.keyframe.frame.index for view in store.window[:-2]]
+    for indices in (kept[1:-1], long_term[1:]):
+        assert sum(index % 2 for index in indices) <= 1
+    assert motion_blur_px(wall_frame(0)) == 0.0
 
 
 def test_fewer_large_images_are_kept() -> None:
