@@ -196,7 +196,7 @@ class EncodedFrame(_message.Message):
     """16-bit PNG in millimetres, 0 = no return, the same size as the colour."""
     readout_seconds: _builtins.float
     """From the first row's exposure to the last row's, -0.1 to 0.1; negative if rows are read from the bottom. 0 for a
-    global shutter. An agent corrects a rolling shutter on receipt; it needs the twist.
+    global shutter. With the twist it states the rolling shutter, which mapping models.
     """
     exposure_seconds: _builtins.float
     """Exposure time of a row, 0 to 0.1; with the twist it states the motion blur."""
