@@ -1,9 +1,9 @@
 """Estimate how a camera's images differ from an ideal camera's: lens, readout time, time offset and exposure time.
 
 Lens, readout and offset are those under which pairs of frames on moving stretches agree best (`MovingPairs`). The
-radial lens and the readout time first minimise the photometric residual. Then the offset minimises the rotation that
-the pose fit needs, and the readout both. The exposure time comes from blur (`estimate_exposure_time`). Each part is
-used only if it explains a clear share of the disagreement.
+radial lens minimises the photometric residual. The readout time minimises the residual and the rotation that the pose
+fit needs, and the offset the rotation. The exposure time comes from blur (`estimate_exposure_time`). Each part is used
+only if it explains a clear share of the disagreement.
 """
 
 from __future__ import annotations
@@ -114,8 +114,10 @@ def _swapped(residual: Callable[[float, float], float], k2: float, k1: float) ->
 
 def _with_times(moving: MovingPairs, coarse: MovingPairs, known: CameraCorrection) -> tuple[CameraCorrection, str]:
     """Return `known` with readout time and time offset, if they lower residual and rotation clearly."""
-    before = moving.error(known)
-    readout_s = minimum(_READOUTS_S, lambda value: coarse.error(replace(known, readout_s=value)).residual)
+    before, coarse_before = moving.error(known), coarse.error(known)
+    readout_s = minimum(
+        _READOUTS_S, lambda value: _relative(coarse.error(replace(known, readout_s=value)), coarse_before)
+    )
     found = replace(known, readout_s=readout_s)
     offset_s = minimum(_OFFSETS_S, lambda value: moving.error(replace(found, time_offset_s=value)).rotation_deg)
     found = replace(found, time_offset_s=round(offset_s, 3) + 0.0)

@@ -29,7 +29,6 @@ from gausslite.domain.pose import inverse
 from gausslite.domain.trajectory import Trajectory, Twist
 
 _MAX_PAIRS, _MIN_PAIRS = 16, 4
-_TYPICAL_DISTANCE_M = 2.0
 _MAX_TURN_RAD, _MAX_DISTANCE_M = math.radians(25.0), 0.8
 _MAX_SPEED_SHARE = 0.7
 """Speed of the slower frame relative to the fast one."""
@@ -91,13 +90,13 @@ def _speed_pairs(trajectory: Trajectory) -> list[tuple[int, int]]:
     """Return positions (slow, fast) of frames that show the same surfaces at different speeds, fastest first."""
     poses = trajectory.T_world_camera
     twists = [trajectory.twist(i) for i in range(len(poses))]
-    speeds = np.array([_typical_speed(twist) for twist in twists])
+    speeds = np.array([twist.typical_image_speed for twist in twists])
     separation = max(1, len(speeds) // (4 * _MAX_PAIRS))
     pairs: list[tuple[int, int]] = []
     for fast in np.argsort(-speeds).tolist():
         if len(pairs) == _MAX_PAIRS:
             break
-        if any(abs(fast - other) < separation for _, other in pairs):
+        if any(abs(fast - other) < separation for _, other in pairs) or not trajectory.is_steady(fast):
             continue
         cosine = 0.5 * (np.einsum("nij,ij->n", poses[:, :3, :3], poses[fast, :3, :3]) - 1.0)
         is_near = np.linalg.norm(poses[:, :3, 3] - poses[fast, :3, 3], axis=1) < _MAX_DISTANCE_M
@@ -107,12 +106,6 @@ def _speed_pairs(trajectory: Trajectory) -> list[tuple[int, int]]:
         if len(usable):
             pairs.append((int(usable[np.argmin(speeds[usable])]), fast))
     return pairs
-
-
-def _typical_speed(twist: Twist) -> float:
-    """Return the image motion in focal lengths per second, of a point at a typical distance."""
-    translation = float(np.linalg.norm(twist.linear_m_s)) / _TYPICAL_DISTANCE_M
-    return float(np.linalg.norm(twist.angular_rad_s)) + translation
 
 
 def _pair_time(slow: Frame, fast: Frame, slow_twist: Twist, fast_twist: Twist) -> Iterator[_PairTime]:

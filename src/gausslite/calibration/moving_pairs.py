@@ -32,6 +32,7 @@ _MIN_COMPARABLE_SHARE = 0.08
 """Share of the pixels of the grid of `comparable_pixels`; less overlap makes the pose fit unreliable."""
 _MIN_SPEED_RAD_S = math.radians(8.0)
 """Slower cameras move rows by less than a pixel in a readout of 30 ms."""
+_MIN_HALVED_PIXELS = 160 * 120
 _PAIR_TURN_RAD = math.radians(8.0)
 
 
@@ -60,7 +61,12 @@ class MovingPairs:
         return cls(trajectory, pairs, read_frames(source, sorted({i for pair in pairs for i in pair}), size))
 
     def halved(self) -> MovingPairs:
-        """Return the pairs with frames of half the width and height, for a coarse search in a quarter of the time."""
+        """Return the pairs with frames of half the width and height, for a coarse search in a third of the time.
+
+        Small frames are kept: below about 160x120 the residual no longer shows the readout time.
+        """
+        if any(frame.depth_m.size < 4 * _MIN_HALVED_PIXELS for frame in self.frames.values()):
+            return self
         frames = {}
         for i, frame in self.frames.items():
             size = max(frame.camera.width_px // 2, 16), max(frame.camera.height_px // 2, 16)

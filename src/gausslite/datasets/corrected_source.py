@@ -59,6 +59,9 @@ class CorrectedSource(WrappedSource):
         recorded = self._source.frame(i)
         correct = correct_frame if self._rectified else undistort_frame
         frame = correct(recorded, self._correction, self._camera, self._trajectory.twist(i))
+        if frame.motion is not None and not self._trajectory.is_steady(i):
+            # a blur along a wrong velocity does more harm than none
+            frame = replace(frame, motion=replace(frame.motion, exposure_s=0.0))
         image = resize_rgbd(RgbdImage(frame.rgb, frame.depth_m, frame.camera), size)
         return replace(frame, rgb=image.rgb, depth_m=image.depth_m, camera=image.camera)
 

@@ -11,9 +11,11 @@ from numpy import ndarray
 
 from gausslite.domain.arrays import require_array
 from gausslite.domain.errors import InvalidInputError
-from gausslite.domain.pose import inverse
+from gausslite.domain.pose import inverse, twist_of
 
 _MIN_BASELINE_S = 1e-6
+_TYPICAL_DISTANCE_M = 2.0
+_MAX_VELOCITY_CHANGE = 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -22,6 +24,11 @@ class Twist:
 
     linear_m_s: Float64[ndarray, "3"]
     angular_rad_s: Float64[ndarray, "3"]
+
+    @property
+    def typical_image_speed(self) -> float:
+        """Image motion in focal lengths per second, of a point at a distance of 2 m."""
+        return float(np.linalg.norm(self.angular_rad_s) + np.linalg.norm(self.linear_m_s) / _TYPICAL_DISTANCE_M)
 
     def motion(self, seconds: float) -> Float64[ndarray, "4 4"]:
         """Return T_before_after of this motion for a time, to first order in the translation."""
@@ -55,6 +62,23 @@ class Trajectory:
         R_camera_before = T_camera_world[:3, :3] @ self.T_world_camera[before][:3, :3]
         turn_rad = R_camera_before @ cv2.Rodrigues(R_before_after)[0].ravel()
         return Twist(T_camera_world[:3, :3] @ step_m / seconds, turn_rad / seconds)
+
+    def is_steady(self, i: int) -> bool:
+        """True if the velocities before and after pose i are similar: only then do the poses state the velocity there.
+
+        False for the first and the last pose.
+        """
+        if not 0 < i < len(self.times_s) - 1:
+            return False
+        before, after = (self._mean_velocity(first) for first in (i - 1, i))
+        change, mean = after - before, 0.5 * (before + after)
+        limit = _MAX_VELOCITY_CHANGE * Twist(mean[:3], mean[3:]).typical_image_speed
+        return Twist(change[:3], change[3:]).typical_image_speed <= limit
+
+    def _mean_velocity(self, i: int) -> Float64[ndarray, "6"]:
+        """Return translation and rotation per second from pose i to the next."""
+        seconds = max(float(self.times_s[i + 1] - self.times_s[i]), _MIN_BASELINE_S)
+        return twist_of(inverse(self.T_world_camera[i]) @ self.T_world_camera[i + 1]) / seconds
 
     def angular_speeds_rad_s(self) -> Float64[ndarray, " n"]:
         """Return the magnitude of the angular velocity at every pose."""

@@ -30,3 +30,11 @@ def test_a_single_pose_has_no_velocity() -> None:
 def test_times_that_decrease_are_rejected() -> None:
     with pytest.raises(InvalidInputError, match="ascending"):
         Trajectory(np.array([1.0, 0.0]), np.stack([np.eye(4)] * 2))
+
+
+def test_a_velocity_is_steady_if_it_is_similar_before_and_after() -> None:
+    times_s = np.arange(5) / 10
+    poses = np.repeat(np.eye(4)[None], 5, axis=0)
+    poses[:, 0, 3] = [0.0, 0.1, 0.2, 0.3, 0.31]
+    trajectory = Trajectory(times_s, poses)
+    assert [trajectory.is_steady(i) for i in range(5)] == [False, True, True, False, False]
