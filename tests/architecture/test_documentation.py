@@ -30,6 +30,7 @@ BENCHMARKS = (
     "ablation",
     "budget",
     "task-change",
+    "team",
     "registration",
 )
 

@@ -20,11 +20,13 @@ class LoadSettings:
     """Length and policy of the frame queue, and training while it is empty.
 
     idle_iterations: the most iterations after each frame while no other frame waits. Maps then depend on the clock.
+    free_space: observe the free space of every fifth frame, for the fusion server.
     """
 
     queue_frames: int = 4
     queue_policy: QueuePolicy = QueuePolicy.OLDEST
     idle_iterations: int = 0
+    free_space: bool = False
 
     def __post_init__(self) -> None:
         if not 1 <= self.queue_frames <= 1000:

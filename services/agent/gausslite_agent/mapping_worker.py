@@ -22,6 +22,7 @@ from gausslite.domain.task import TaskGraph
 from gausslite.domain.voxel_batch import VoxelBatch
 from gausslite.domain.voxel_operations import empty_batch, group_by_voxel
 from gausslite.domain.voxels import VoxelGrid
+from gausslite.mapping.free_space import FreeSpaceMap
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.sent_voxels import SentVoxelTracker
 from gausslite.mapping.team_voxels import InsertedVoxels
@@ -40,6 +41,7 @@ from gausslite_agent.status import FrameReport, Outcome, StatusHolder, WorkerSta
 
 _log = logging.getLogger(__name__)
 _Result = TypeVar("_Result")
+_FREE_SPACE_FRAMES = 5
 
 
 class MappingWorker:
@@ -65,6 +67,7 @@ class MappingWorker:
         self.uplink = uplink
         self._on_change = on_change
         self._load = load or LoadSettings()
+        self._free_space = FreeSpaceMap(grid) if self._load.free_space else None
         self._clock = clock
         self._mapper = build_mapper(settings)
         self._sent_voxels = SentVoxelTracker(grid)
@@ -245,6 +248,7 @@ class MappingWorker:
         )
         if self._keyframe_upload is not None:
             self._keyframe_upload.offer_newest(self._mapper.keyframes())
+        self._observe_free_space(frame)
         self._status.add_outcome(outcome)
         self._status.update(correction=self._mapper.poses.latest(), corrected_at_s=time.monotonic())
         self._count(report)
@@ -273,6 +277,13 @@ class MappingWorker:
             self._status.update(team_gaussians=count, gaussians=self._mapper.count, map_revision=self._map_revision())
             self._on_change()
         return inserted
+
+    def _observe_free_space(self, frame: Frame) -> None:
+        """Observe every fifth mapped frame's free space, and send the changes."""
+        if self._free_space is None or self.uplink is None or self._mapper.revision % _FREE_SPACE_FRAMES != 1:
+            return
+        self._free_space.observe(frame)
+        self.uplink.enqueue_free_space(self._free_space.collect_changes())
 
     def _offer_all_keyframes(self, mapper: GaussianMapper) -> None:
         if self._keyframe_upload is not None:

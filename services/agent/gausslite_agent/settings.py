@@ -161,7 +161,7 @@ def _load_settings(options: argparse.Namespace) -> LoadSettings:
     idle_iterations = options.idle_iterations
     if idle_iterations is None:
         idle_iterations = _default_idle_iterations(options)
-    return LoadSettings(options.queue, QueuePolicy(options.queue_policy), idle_iterations)
+    return LoadSettings(options.queue, QueuePolicy(options.queue_policy), idle_iterations, options.free_space)
 
 
 def _default_idle_iterations(options: argparse.Namespace) -> int:
@@ -251,6 +251,7 @@ def _add_connections(parser: argparse.ArgumentParser) -> None:
         default=NO_TEAM_MAP,
         help="insert teammates' voxels of the task's region, voted or refined (default: %(default)s)",
     )
+    add_switch(group, "--free-space", "send what the camera has observed as free, for the free-space vote")
     add_switch(group, "--handover", "at the end also send the map outside the ROI")
     keyframes = add(
         "--keyframes",

@@ -27,14 +27,17 @@ class FreeSpaceRecords:
         self._by_agent = {agent_id: decode_free_space(data, _STORED_BYTES)[0] for agent_id, data in stored}
 
     def contribute(self, agent_id: str, blocks: FreeSpace) -> Int64[ndarray, " k"]:
-        """Replace these blocks of an agent; returns the voxels where its view may have changed. Raises QuotaError."""
+        """Replace these blocks of an agent; returns the voxels where its view may have changed. Raises QuotaError,
+        InvalidInputError for blocks outside the grid's range.
+        """
         before = self._by_agent.get(agent_id, FreeSpace.empty())
         after = before.replace_blocks(blocks)
         if len(after.keys) > MAX_BLOCKS:
             raise QuotaError(f"free space: expected at most {MAX_BLOCKS} blocks of an agent, got {len(after.keys)}")
+        # before it is stored, because blocks outside the grid's range raise here
+        earlier, now = (each.voxel_keys(self._grid, MIN_VIEWS) for each in (before, after))
         self._store.save_record(agent_id, _RECORD, encode_free_space(after, self._grid))
         self._by_agent[agent_id] = after
-        earlier, now = (each.voxel_keys(self._grid, MIN_VIEWS) for each in (before, after))
         return np.setxor1d(earlier, now)
 
     def free_voxels(self, agent_id: str) -> int:

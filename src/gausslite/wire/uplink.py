@@ -25,12 +25,14 @@ from gausslite.domain.errors import (
     StorageError,
     UnavailableError,
 )
+from gausslite.domain.free_space import FreeSpace
 from gausslite.domain.objects import ObjectReport
 from gausslite.domain.voxel_batch import RoiSubset, VoxelBatch
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.v1 import geometry_pb2
 from gausslite.wire.clients import FusionClient, Session
+from gausslite.wire.free_space_outbox import FreeSpaceOutbox
 from gausslite.wire.object_outbox import ObjectOutbox
 from gausslite.wire.spool import Purpose, Spool, SpoolBatch
 from gausslite.wire.spooled_keyframes import SpooledKeyframe
@@ -74,6 +76,7 @@ class Uplink:
         self._drain_limit_s = math.inf
         self._sent_keyframes: set[int] = set()
         self._objects = ObjectOutbox()
+        self._free_space = FreeSpaceOutbox()
         # guards the counters and flags; waited on by the thread and by drain
         self._changed = threading.Condition()
         self._thread = threading.Thread(target=self._run, name="uplink", daemon=True)
@@ -89,6 +92,13 @@ class Uplink:
     def report_objects(self, report: ObjectReport) -> None:
         """Send the agent's task and objects with the next round; a newer report replaces one that waits."""
         if self._objects.put(report):
+            with self._changed:
+                self._changed.notify_all()
+
+    def enqueue_free_space(self, blocks: FreeSpace) -> None:
+        """Send these blocks of free space with the next round; newer ones replace those that wait."""
+        if len(blocks.keys):
+            self._free_space.put(blocks)
             with self._changed:
                 self._changed.notify_all()
 
@@ -151,8 +161,8 @@ class Uplink:
         return self._closing or bool(self._counters.stopped_because) or not self._has_pending()
 
     def _has_pending(self) -> bool:
-        has_report = self._objects.pending is not None
-        return has_report or self._spool.pending_voxels + self._spool.pending_keyframes > 0
+        has_others = self._objects.pending is not None or self._free_space.has_pending
+        return has_others or self._spool.pending_voxels + self._spool.pending_keyframes > 0
 
     def _run(self) -> None:
         try:
@@ -187,10 +197,11 @@ class Uplink:
         resend_threshold = 0.0 if self._draining else self._settings.resend_threshold
         max_bytes = self._token_bucket.available_bytes(self._settings.round_bytes)
         due = self._spool.next_round(max_bytes, resend_threshold)
-        if due is None and self._objects.pending is None:
+        if due is None and self._objects.pending is None and not self._free_space.has_pending:
             return False
         session = self._join_if_needed()
         self._send_objects(session)
+        self._send_free_space(session)
         if due is None:
             return True
         if due.voxels is not None:
@@ -209,6 +220,19 @@ class Uplink:
         except InvalidInputError as error:
             _log.warning("uplink: the report of objects is dropped: %s", error)
         self._objects.mark_done(report)
+
+    def _send_free_space(self, session: Session) -> None:
+        """Send the blocks that wait. Rejected ones are dropped: the map does not depend on them."""
+        if not self._free_space.has_pending:
+            return
+        blocks = self._free_space.take()
+        try:
+            self._token_bucket.spend(self._client.contribute_free_space(session.session_id, blocks, self._grid))
+        except (InvalidInputError, QuotaError) as error:
+            _log.warning("uplink: free space is dropped: %s", error)
+        except GaussLiteError:
+            self._free_space.put_back(blocks)
+            raise
 
     def _send_voxels(self, due: SpoolBatch, session: Session) -> None:
         sent: dict[int, tuple[SpoolBatch, int]] = {}
@@ -342,6 +366,7 @@ class Uplink:
             self._session = None
             self._spool.mark_all_unsent()
             self._objects.mark_unsent()
+            self._free_space.mark_unsent()
         if isinstance(error, (QuotaError, StorageError)):
             self._subset_bytes = max(_MIN_SUBSET_BYTES, self._subset_bytes // 2)
         with self._changed:

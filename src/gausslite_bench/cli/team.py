@@ -10,6 +10,7 @@ from pathlib import Path
 
 from gausslite.cli.progress import print_above_bar, progress_bar
 from gausslite.codec.files import write_atomic
+from gausslite.config.switches import add_switch
 from gausslite.config.values import read_names
 from gausslite.domain.errors import InvalidInputError
 from gausslite.mapping.policies import POLICIES
@@ -58,7 +59,7 @@ def configure_team(parser: argparse.ArgumentParser) -> None:
         help="shift, turn and drift (share of the way) of all agents' frames except the first's (default: none)",
     )
     add("--threads", metavar="N", type=int, help="threads (default: all available cores)")
-    add("--json", action="store_true", help="print JSON for scripts")
+    add_switch(parser, "--json", "print JSON for scripts")
     parser.set_defaults(run=run_team)
 
 

@@ -12,7 +12,7 @@ from fusion_running import CAMERA, GRID, frame, fusion_server, make_subset
 from gausslite.codec.free_space import encode_free_space
 from gausslite.domain.camera import Camera
 from gausslite.domain.errors import InvalidInputError, MismatchError, PoseError, QuotaError
-from gausslite.domain.free_space import FreeSpace
+from gausslite.domain.free_space import FreeSpace, block_grid
 from gausslite.domain.pose import transform_of
 from gausslite.domain.voxel_operations import empty_batch
 from gausslite.domain.voxels import VoxelGrid
@@ -113,7 +113,9 @@ def test_a_declared_frame_moves_the_agents_map() -> None:
 
 
 def test_free_space_is_stored_and_hostile_bytes_are_refused() -> None:
-    free = FreeSpace(np.array([5, 9], np.int64), np.full((2, 512), 2, np.uint8))
+    keys = block_grid(GRID).keys(np.array([[0.1, 0.1, 0.1], [0.1, 0.1, 1.0]], np.float32))
+    free = FreeSpace(keys, np.full((2, 512), 2, np.uint8))
+    outside = FreeSpace(np.array([5, 9], np.int64), free.counts)
     with fusion_server() as server:
         session = server.client.join("ant", GRID).session_id
         assert server.client.contribute_free_space(session, free, GRID) < 300
@@ -123,6 +125,8 @@ def test_free_space_is_stored_and_hostile_bytes_are_refused() -> None:
             with pytest.raises(grpc.RpcError) as refused:
                 server.stub.ContributeFreeSpace(pb.ContributeFreeSpaceRequest(session_id=session_id, free_space=data))
             assert refused.value.code() in (grpc.StatusCode.NOT_FOUND, grpc.StatusCode.INVALID_ARGUMENT)
+        with pytest.raises(InvalidInputError, match="coordinates within"):
+            server.client.contribute_free_space(session, outside, GRID)
         with pytest.raises(MismatchError):
             server.client.contribute_free_space(session, free, VoxelGrid(0.2))
         assert server.client.status().agents[0].free_voxels == 1024

@@ -1,0 +1,65 @@
+"""The team benchmark: a small home with two agents, wrong frames, and refused options."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from mapping_scenes import wall_frame
+
+from gausslite.cli.main import main
+from gausslite.domain.errors import InvalidInputError
+from gausslite.domain.pose import rotation_angle_deg, translation_m
+from gausslite_bench.team.frame_errors import FrameError
+from gausslite_bench.team.scenes import TeamPlan
+
+
+def test_a_team_is_mapped_fused_and_scored(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    size = ("--size", "80x60", "--frames", "4", "--views", "2", "--max-gaussians", "3000", "--iterations", "2")
+    arguments = ("bench", "team", "--homes", "4", "--policies", "task,uniform", "--refine-iterations", "3")
+    assert main([*arguments, *size, "--threads", "1", "--json", "--out", str(tmp_path)]) == 0
+    task, uniform = json.loads(capsys.readouterr().out)["trials"]
+    assert set(task["roi_psnr"]) == {
+        "concatenation",
+        "vote",
+        "free-space vote",
+        "vote of shared regions",
+        "refine",
+    }
+    assert all(5 < value < 60 for value in task["full_psnr"].values())
+    assert task["alignment"]["agent-0"] == "reference"
+    assert 0 < task["share_percent"] < 100
+    assert task["bytes_sent"] > 0
+    # a policy without a task has no region to send
+    assert uniform["share_percent"] == 0
+    assert (tmp_path / "team.md").read_text().count("| home-4 x 2 |") == 10
+
+
+def test_wrong_options_fail_before_any_mapping(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    for wrong, expected in (
+        (("--homes", "9"), "homes"),
+        (("--homes", "x"), "homes"),
+        (("--team-sizes", "7"), "agents"),
+        (("--policies", "best"), "policies"),
+    ):
+        assert main(["bench", "team", "--out", str(tmp_path), *wrong]) == 2
+        assert expected in capsys.readouterr().err
+    with pytest.raises(InvalidInputError, match="agents"):
+        TeamPlan(1, 5)
+
+
+def test_a_frame_error_shifts_turns_and_drifts() -> None:
+    frames = [wall_frame(i, shift_m=2.0 * i) for i in range(3)]
+    assert FrameError().apply(frames) == frames
+    shifted = FrameError(shift_m=0.05).apply(frames)
+    turned = FrameError(rotation_deg=2.0).apply(frames)
+    drifting = FrameError(drift=0.01).apply(frames)
+    for i, frame in enumerate(frames):
+        pose = frame.T_world_camera
+        assert translation_m(pose, shifted[i].T_world_camera) == pytest.approx(0.05)
+        assert rotation_angle_deg(pose, turned[i].T_world_camera) == pytest.approx(2.0)
+        assert translation_m(pose, drifting[i].T_world_camera) == pytest.approx(0.02 * i)
+    assert translation_m(frames[0].T_world_camera, turned[0].T_world_camera) == pytest.approx(0.0)
+    with pytest.raises(InvalidInputError, match="frame error"):
+        FrameError(shift_m=-1.0)
