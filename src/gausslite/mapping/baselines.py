@@ -22,7 +22,7 @@ _NO_DENSIFICATION = DensitySettings(min_mean_gradient=math.inf)
 
 def uniform_policy() -> MapperSettings:
     """Return uniform seeding and full-image training with this engine's density control."""
-    return MapperSettings(components=_NO_TASK, optimization=OptimizationSettings(real_depth_share=1.0))
+    return MapperSettings(components=_NO_TASK)
 
 
 def gaussian_slam_policy() -> MapperSettings:
@@ -32,7 +32,7 @@ def gaussian_slam_policy() -> MapperSettings:
     """
     return MapperSettings(
         components=_NO_TASK,
-        optimization=OptimizationSettings(warmup_iterations=7, active_iterations=0, real_depth_share=1.0),
+        optimization=OptimizationSettings(warmup_iterations=7, active_iterations=0),
         density=_NO_DENSIFICATION,
     )
 
@@ -48,9 +48,7 @@ def splatam_policy() -> MapperSettings:
         seeding=SeedingSettings(
             first_frame_seeds=76_800, later_seeds=8_000, min_alpha=0.5, depth_error_factor=50.0, init_scale=0.5
         ),
-        optimization=OptimizationSettings(
-            loss=LossWeights(colour=0.4, depth=1.0, ssim=0.1), isotropic=True, real_depth_share=1.0
-        ),
+        optimization=OptimizationSettings(loss=LossWeights(colour=0.4, depth=1.0, ssim=0.1), isotropic=True),
         density=_NO_DENSIFICATION,
     )
 
@@ -64,5 +62,5 @@ def monogs_policy() -> MapperSettings:
     return MapperSettings(
         components=_NO_TASK,
         seeding=SeedingSettings(first_frame_seeds=9_600, later_seeds=4_800, min_alpha=1.0, init_scale=math.sqrt(0.05)),
-        optimization=OptimizationSettings(loss=LossWeights(colour=0.95, depth=0.05, ssim=0.0), real_depth_share=1.0),
+        optimization=OptimizationSettings(loss=LossWeights(colour=0.95, depth=0.05, ssim=0.0)),
     )

@@ -51,7 +51,6 @@ def paper_policy() -> MapperSettings:
             loss=LossWeights(),
             adam=AdamSettings(),
             decay_after_updates=math.inf,
-            real_depth_share=1.0,
             ema_updates=0.0,
         ),
         saturation=SaturationSettings(max_released=0.0),
@@ -110,10 +109,6 @@ def _without_lr_decay(settings: MapperSettings) -> MapperSettings:
     return replace(settings, optimization=replace(settings.optimization, decay_after_updates=math.inf))
 
 
-def _without_light_depth(settings: MapperSettings) -> MapperSettings:
-    return replace(settings, optimization=replace(settings.optimization, real_depth_share=1.0))
-
-
 def _without_saturation(settings: MapperSettings) -> MapperSettings:
     return replace(settings, saturation=replace(settings.saturation, max_released=0.0))
 
@@ -124,7 +119,6 @@ EXTENSION_FLAGS: dict[str, Callable[[MapperSettings], MapperSettings]] = {
     "background-reserve": _without_background_reserve,
     "ema": _without_ema,
     "lr-decay": _without_lr_decay,
-    "light-depth": _without_light_depth,
     "saturation": _without_saturation,
 }
 """Extensions of the paper's method that can be disabled, in the order of the ablation in docs/quality.md."""

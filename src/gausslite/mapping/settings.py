@@ -150,11 +150,9 @@ class OptimizationSettings:
     loss: weights of Eq. (1). By default they are normalised by the image size. Adam's steps with the small masks of the
     active phase are then comparable to those with full images. adam: learning rates. decay_after_updates: updates of a
     Gaussian after which its learning rates decay, if `MapperSettings.pose_prior` allows an error; inf disables the
-    decay. With constant rates, Gaussians would oscillate between views that contradict each other. real_depth_share:
-    factor of the depth weight if that prior allows an error. The depth of such a camera has errors at every outline. A
-    strong depth term would move Gaussians there against the colours. isotropic: make Gaussians spheres after every
-    frame. ema_updates: time constant, in updates, of the exponential moving average (EMA) of each Gaussian. The EMA is
-    shown and saved, but not trained; 0 shows the trained values.
+    decay. With constant rates, Gaussians would oscillate between views that contradict each other. isotropic: make
+    Gaussians spheres after every frame. ema_updates: time constant, in updates, of the exponential moving average (EMA)
+    of each Gaussian. The EMA is shown and saved, but not trained; 0 shows the trained values.
     """
 
     warmup_iterations: int = 2
@@ -163,7 +161,6 @@ class OptimizationSettings:
     loss: LossWeights = _BALANCED_LOSS
     adam: AdamSettings = ONLINE_RATES
     decay_after_updates: float = 150.0
-    real_depth_share: float = 0.1
     isotropic: bool = False
     ema_updates: float = 32.0
 
@@ -174,8 +171,6 @@ class OptimizationSettings:
         _require(0 <= updates < math.inf, "optimization ema_updates", "at least 0", updates)
         updates = self.decay_after_updates
         _require(updates > 0, "optimization decay_after_updates", "more than 0", updates)
-        share = self.real_depth_share
-        _require(0 <= share <= 1, "optimization real_depth_share", "0 to 1", share)
 
     @property
     def iterations(self) -> int:
@@ -225,14 +220,6 @@ class MapperSettings:
         if self.pose_prior.is_exact:
             return self.optimization.adam
         return replace(self.optimization.adam, decay_after_updates=self.optimization.decay_after_updates)
-
-    @property
-    def loss(self) -> LossWeights:
-        """Weights of Eq. (1); the depth term is lighter if the prior allows an error."""
-        loss = self.optimization.loss
-        if self.pose_prior.is_exact:
-            return loss
-        return replace(loss, depth=loss.depth * self.optimization.real_depth_share)
 
 
 def _require(valid: bool, name: str, expected: str, value: float) -> None:

@@ -55,7 +55,7 @@ class Trainer:
         self, settings: MapperSettings, table: SplatTable, rasterizer: Rasterizer, rng: np.random.Generator
     ) -> None:
         self._settings = settings
-        self._adam, self._loss = settings.adam, settings.loss
+        self._adam, self._loss = settings.adam, settings.optimization.loss
         self._table = table
         self._rasterizer = rasterizer
         self._rng = rng

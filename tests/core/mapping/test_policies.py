@@ -10,7 +10,6 @@ import pytest
 from mapping_scenes import middle_relevance, wall_frame
 
 from gausslite.domain.errors import InvalidInputError
-from gausslite.domain.pose_exposure_prior import PoseExposurePrior
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.policies import (
     ABLATION_FLAGS,
@@ -100,17 +99,6 @@ def test_roi_context_changes_the_map_and_has_a_small_weight_by_default() -> None
     some = mapped(MapperSettings(2000, keyframes=KeyframeSettings(roi_context_weight=0.3))).gaussians()
     np.testing.assert_array_equal(plain.rgb, some.rgb)
     assert not np.array_equal(plain.rgb, none.rgb)
-
-
-def test_the_depth_term_is_lighter_where_poses_may_be_wrong() -> None:
-    exact = policy(TASK)
-    real = replace(exact, pose_prior=PoseExposurePrior(0.01, 0.5))
-    assert exact.loss == exact.optimization.loss
-    assert real.loss == replace(exact.loss, depth=0.1 * exact.loss.depth)
-    assert disable(real, ["light-depth"]).loss == exact.loss
-    for name in BASELINES:
-        released = replace(policy(name), pose_prior=real.pose_prior)
-        assert released.loss == released.optimization.loss
 
 
 def test_an_unknown_policy_is_rejected() -> None:
