@@ -40,6 +40,7 @@ from gausslite.mission.runner import MissionRunner
 from gausslite.mission.settings import (
     MissionSettings,
     PerceptionSettings,
+    PoseMode,
     SceneInfo,
     SourceSettings,
     default_policy,
@@ -62,6 +63,7 @@ __all__ = [
     "MissionSettings",
     "PerceptionSettings",
     "PoseExposurePrior",
+    "PoseMode",
     "RenderedImage",
     "SceneInfo",
     "Source",
