@@ -24,8 +24,6 @@ _COLOUR_RANGE = (-0.25, 1.25)
 _RANDOM_BLOCK = 16
 _Rows: TypeAlias = Float32[ndarray, "n 16"]
 _Tables: TypeAlias = tuple[_Rows, _Rows, _Rows]
-_Views: TypeAlias = Sequence[WindowView]
-_Iteration: TypeAlias = tuple[Stage, _Views]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -105,12 +103,12 @@ class Trainer:
     def idle_step(self, views: Sequence[WindowView], extent_m: float) -> None:
         """Run one iteration on earlier views while no frame waits; warm-up and active iterations alternate."""
         roi_views, scheduler = self._roi_views(views), CountedScheduler()
-        iteration = self._next_iteration(self._iterations, views, roi_views, scheduler)
-        if iteration is None:
+        stage = self._next_stage(self._iterations, bool(roi_views), scheduler)
+        if stage is None:
             return
         binding = _Binding.of(self._table, self._settings.optimization.active_phase)
         with self._rasterizer.bind_tables(*binding.tables):
-            self._iterate(binding, iteration, self._rng.random())
+            self._iterate(binding, stage, views if stage is Stage.WARM_UP else roi_views, self._rng.random())
         self._control_density(extent_m, scheduler)
         self._table.clip_colours(*_COLOUR_RANGE)
         if self._iterations % self._settings.optimization.iterations == 0:
@@ -123,24 +121,17 @@ class Trainer:
             return []
         return [view for view in views if view.shows_roi]
 
-    def _next_iteration(
-        self, done: int, views: _Views, roi_views: _Views, scheduler: StageScheduler
-    ) -> _Iteration | None:
-        """Return stage and views of the next iteration, after `done` ones; None ends the frame.
-
-        An iteration that a saturated region releases trains a whole image that shows the region: its pose holds on to
-        the rest of that image.
-        """
+    def _next_stage(self, done: int, roi_in_view: bool, scheduler: StageScheduler) -> Stage | None:
+        """Return the stage of the next iteration, after `done` ones; None ends the frame."""
         optimization = self._settings.optimization
         per_frame = optimization.iterations
-        warm_up = not roi_views or done % per_frame < optimization.warmup_iterations
-        released = not warm_up and self._saturation.releases_next()
-        whole_image = warm_up or released
-        if roi_views and done > 0:
-            whole_image = whole_image and scheduler.has_time_for(Stage.WARM_UP)
-        if whole_image and scheduler.trains_on(Stage.WARM_UP, per_frame):
-            return Stage.WARM_UP, roi_views if released else views
-        return (Stage.ACTIVE, roi_views) if roi_views and scheduler.trains_on(Stage.ACTIVE, per_frame) else None
+        warm_up = not roi_in_view or done % per_frame < optimization.warmup_iterations
+        warm_up = warm_up or self._saturation.releases_next()
+        if roi_in_view and done > 0:
+            warm_up = warm_up and scheduler.has_time_for(Stage.WARM_UP)
+        if warm_up and scheduler.trains_on(Stage.WARM_UP, per_frame):
+            return Stage.WARM_UP
+        return Stage.ACTIVE if roi_in_view and scheduler.trains_on(Stage.ACTIVE, per_frame) else None
 
     def _iterate_until_density_control(
         self, views: Sequence[WindowView], roi_views: Sequence[WindowView], done: int, scheduler: StageScheduler
@@ -152,17 +143,16 @@ class Trainer:
         binding = _Binding.of(self._table, self._settings.optimization.active_phase)
         draws = _uniform_draws(self._rng)
         with self._rasterizer.bind_tables(*binding.tables):
-            while (iteration := self._next_iteration(done, views, roi_views, scheduler)) is not None:
-                with scheduler.timing(iteration[0]):
-                    self._iterate(binding, iteration, next(draws))
+            while (stage := self._next_stage(done, bool(roi_views), scheduler)) is not None:
+                with scheduler.timing(stage):
+                    self._iterate(binding, stage, views if stage is Stage.WARM_UP else roi_views, next(draws))
                 done += 1
                 if self._prune_is_due(scheduler) or self._densify_is_due(scheduler):
                     return done, False
         return done, True
 
-    def _iterate(self, binding: _Binding, iteration: _Iteration, draw: float) -> None:
+    def _iterate(self, binding: _Binding, stage: Stage, views: Sequence[WindowView], draw: float) -> None:
         """Run one iteration on a uniformly drawn view (MVO); draw is in [0, 1)."""
-        stage, views = iteration
         view = views[int(draw * len(views))]
         if stage is Stage.WARM_UP:
             self._train_full_image(binding, view)
