@@ -5,78 +5,103 @@ from __future__ import annotations
 import json
 import statistics
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
+from gausslite.codec.task_json import graph_from_json
 from gausslite.domain.errors import InvalidInputError, TaskError
-from gausslite.domain.task import Predicate, Relation, TaskGraph
+from gausslite.domain.task import TaskGraph
 from gausslite.task.parser import TaskParser
 
 SENTENCES = Path(__file__).with_name("parser_sentences.json")
 
 
 @dataclass(frozen=True, slots=True)
-class Sentence:
-    """A task sentence and its expected graph; order is ignored."""
-
-    text: str
-    targets: frozenset[str]
-    anchors: frozenset[str]
-    relations: frozenset[Relation]
-
-    @classmethod
-    def from_row(cls, row: Mapping[str, Any]) -> Sentence:
-        """Return the sentence of a JSON row: text, targets, anchors, relations as [predicate, target, anchor]."""
-        relations = frozenset(Relation(Predicate(name), target, anchor) for name, target, anchor in row["relations"])
-        return cls(row["text"], frozenset(row["targets"]), frozenset(row["anchors"]), relations)
-
-
-@dataclass(frozen=True, slots=True)
 class ParserScore:
-    """Shares of correct sentences, milliseconds per sentence, and the texts whose graph is not exact."""
+    """Shares of correct sentences, milliseconds per sentence, and the texts whose graph is not exact.
+
+    A share per part of the graph: the set of its targets, their roles, the anchors, the relations with negation and
+    distances, the attributes, and the excluded objects. exact: all of them. reversed_relations: sentences with a
+    relation whose negation is wrong, and no warning.
+    """
 
     backend: str
     sentences: int
     exact: float
     target_set: float
+    role_set: float
     anchor_set: float
+    relation_set: float
+    attribute_set: float
+    excluded_set: float
+    reversed_relations: int
     median_ms: float
     slowest_ms: float
     by_fallback: int
     wrong: tuple[str, ...]
 
 
-def load_sentences(path: Path = SENTENCES) -> list[Sentence]:
-    """Return the sentences of a JSON file. Raises InvalidInputError, OSError."""
+def load_sentences(path: Path = SENTENCES) -> list[TaskGraph]:
+    """Return the expected graphs, with their sentence as text, of a JSON file. Raises InvalidInputError, OSError.
+
+    The file is a list of graphs in the form of `gausslite parse --json`, with the sentence as "text" (docs/tasks.md).
+    """
     try:
-        sentences = [Sentence.from_row(row) for row in json.loads(path.read_text(encoding="utf-8"))]
-    except (ValueError, KeyError, TypeError) as error:
-        expected = "a list of text, targets, anchors and relations [predicate, target, anchor]"
-        raise InvalidInputError(f"{path}: expected {expected}, got other content") from error
-    if not sentences:
+        rows = json.loads(path.read_text(encoding="utf-8"))
+        graphs = [graph_from_json({**row, "text": row["text"]}) for row in rows]
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        expected = "a list of text, targets, roles, anchors and relations as in docs/tasks.md"
+        raise InvalidInputError(f"{path}: expected {expected}, got other content ({error})") from error
+    if not graphs:
         raise InvalidInputError(f"{path}: expected at least one sentence, got none")
-    return sentences
+    return graphs
 
 
 def score_parser(
-    backend: str, parser: TaskParser, sentences: Sequence[Sentence], clock_s: Callable[[], float] = time.perf_counter
+    backend: str, parser: TaskParser, expected: Sequence[TaskGraph], clock_s: Callable[[], float] = time.perf_counter
 ) -> ParserScore:
     """Return the scores of parsing every sentence once; a sentence that raises TaskError counts as wrong."""
-    matches: list[tuple[bool, bool, bool]] = []
+    matches: list[tuple[bool, ...]] = []
     times_ms: list[float] = []
-    fallbacks = 0
-    for sentence in sentences:
+    fallbacks = reversed_relations = 0
+    for graph in expected:
         started_s = clock_s()
-        graph = _graph_or_none(parser, sentence.text)
+        parsed = _graph_or_none(parser, graph.text)
         times_ms.append(1e3 * (clock_s() - started_s))
-        matches.append(_compare(sentence, graph))
-        fallbacks += graph is not None and any(warning.startswith("backend ") for warning in graph.warnings)
-    targets, anchors, exact = (statistics.fmean(column) for column in zip(*matches, strict=True))
-    wrong = tuple(each.text for each, (_, _, is_exact) in zip(sentences, matches, strict=True) if not is_exact)
+        matches.append(matching_parts(graph, parsed))
+        if parsed is not None:
+            fallbacks += any(warning.startswith("backend ") for warning in parsed.warnings)
+            reversed_relations += _is_reversed(graph, parsed)
+    shares = [statistics.fmean(column) for column in zip(*matches, strict=True)]
+    exact = [all(parts) for parts in matches]
+    wrong = tuple(graph.text for graph, is_exact in zip(expected, exact, strict=True) if not is_exact)
+    median_ms, slowest_ms = statistics.median(times_ms), max(times_ms)
     return ParserScore(
-        backend, len(matches), exact, targets, anchors, statistics.median(times_ms), max(times_ms), fallbacks, wrong
+        backend, len(matches), statistics.fmean(exact), *shares, reversed_relations, median_ms, slowest_ms, fallbacks,
+        wrong,
+    )  # fmt: skip
+
+
+def matching_parts(expected: TaskGraph, parsed: TaskGraph | None) -> tuple[bool, ...]:
+    """Return whether targets, roles, anchors, relations, attributes and excluded objects are equal as sets."""
+    if parsed is None:
+        return (False,) * 6
+    return tuple(one == other for one, other in zip(_parts(expected), _parts(parsed), strict=True))
+
+
+def _parts(graph: TaskGraph) -> tuple[frozenset[object], ...]:
+    roles = zip(graph.targets, graph.roles, strict=True)
+    parts = (graph.targets, roles, graph.anchors, graph.relations, graph.attributes, graph.excluded)
+    return tuple(frozenset(part) for part in parts)
+
+
+def _is_reversed(expected: TaskGraph, parsed: TaskGraph) -> bool:
+    """Return True if a relation stands with the wrong negation and nothing warns of it."""
+    wanted = {(each.predicate, each.target, each.anchor): each.negated for each in expected.relations}
+    return not parsed.warnings and any(
+        wanted.get((each.predicate, each.target, each.anchor), each.negated) != each.negated
+        for each in parsed.relations
     )
 
 
@@ -85,11 +110,3 @@ def _graph_or_none(parser: TaskParser, text: str) -> TaskGraph | None:
         return parser.parse(text)
     except TaskError:
         return None
-
-
-def _compare(sentence: Sentence, graph: TaskGraph | None) -> tuple[bool, bool, bool]:
-    """Return whether the targets, the anchors and the whole graph are correct."""
-    if graph is None:
-        return False, False, False
-    targets, anchors = sentence.targets == set(graph.targets), sentence.anchors == set(graph.anchors)
-    return targets, anchors, targets and anchors and sentence.relations == set(graph.relations)

@@ -8,10 +8,11 @@ import json
 import pytest
 
 from gausslite.cli.main import main
+from gausslite.codec.task_json import graph_from_json
 from gausslite.domain.errors import InvalidInputError, TaskError
 from gausslite.domain.task import TaskGraph
 from gausslite.task.rules import RuleParser
-from gausslite_bench.parser_scores import Sentence, load_sentences, score_parser
+from gausslite_bench.parser_scores import load_sentences, score_parser
 
 ROWS = [
     {"text": "Find a mug on a table", "targets": ["mug"], "anchors": ["table"], "relations": [["on", "mug", "table"]]},
@@ -21,9 +22,12 @@ ROWS = [
 ]  # fmt: skip
 
 
+GRAPHS = [graph_from_json(row) for row in ROWS]
+
+
 def test_scores_of_known_answers():
     clock = itertools.count()
-    score = score_parser("rules", RuleParser(), [Sentence.from_row(row) for row in ROWS], lambda: float(next(clock)))
+    score = score_parser("rules", RuleParser(), GRAPHS, lambda: float(next(clock)))
     assert (score.sentences, score.exact, score.target_set, score.anchor_set) == (4, 0.25, 0.5, 0.5)
     assert (score.median_ms, score.slowest_ms, score.by_fallback) == (1000.0, 1000.0, 0)
     assert score.wrong == tuple(row["text"] for row in ROWS[1:])
@@ -36,7 +40,7 @@ def test_answers_by_fallback_are_counted():
                 raise TaskError("names nothing")
             return TaskGraph("id", text, ("mug",), (), (), ("backend http failed (late): read by rules",))
 
-    score = score_parser("http", Failing(), [Sentence.from_row(row) for row in ROWS])
+    score = score_parser("http", Failing(), GRAPHS)
     assert score.by_fallback == 3
 
 

@@ -9,7 +9,7 @@ from enum import StrEnum
 
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.names import quote_name, require_name
-from gausslite.domain.task import TaskGraph
+from gausslite.domain.task import TaskGraph, noun_of
 from gausslite.domain.voxels import AxisAlignedBox
 
 MAX_OBJECTS_PER_AGENT = 200
@@ -86,7 +86,8 @@ class ObjectReport:
 
     def target_index(self, noun: str) -> int:
         """Return the index of a noun among the task's targets, as in a Gaussian's `target`; -1 for other nouns."""
-        return self.graph.targets.index(noun) if noun in self.graph.targets else NO_TARGET_INDEX
+        nouns = [noun_of(target) for target in self.graph.targets]
+        return nouns.index(noun) if noun in nouns else NO_TARGET_INDEX
 
 
 @dataclass(frozen=True, slots=True)

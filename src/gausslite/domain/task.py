@@ -124,8 +124,15 @@ class TaskGraph:
 
     @property
     def queries(self) -> tuple[str, ...]:
-        """The nouns of the targets and anchors, in order, without duplicates: Q of Sec. III-B.1."""
-        return tuple(dict.fromkeys(noun_of(name) for name in (*self.targets, *self.anchors)))
+        """The nouns to detect, in order, without duplicates: Q of Sec. III-B.1, and the excluded nouns."""
+        nouns = dict.fromkeys(noun_of(name) for name in (*self.targets, *self.anchors))
+        return tuple(dict.fromkeys((*nouns, *self.excluded_nouns)))
+
+    @property
+    def excluded_nouns(self) -> tuple[str, ...]:
+        """The nouns of excluded objects that no target has: their pixels belong to no target."""
+        targets = {noun_of(name) for name in self.targets}
+        return tuple(dict.fromkeys(noun for noun in map(noun_of, self.excluded) if noun not in targets))
 
     def role_of(self, target: str) -> TargetRole:
         """Return the role of a target. Raises ValueError for other names."""

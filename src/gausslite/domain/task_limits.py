@@ -20,7 +20,7 @@ class TaskLimits:
     max_phrase_chars: int = 64
     max_relations: int = 64
     max_warnings: int = 64
-    max_distance_m: float = 1000.0
+    max_distance_m: float = 10_000.0
 
 
 LIMITS = TaskLimits()

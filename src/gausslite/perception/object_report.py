@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from gausslite.domain.objects import MAX_OBJECTS_PER_AGENT, ObjectLandmark, ObjectRole
-from gausslite.domain.task import TaskGraph
+from gausslite.domain.task import TaskGraph, noun_of
 from gausslite.perception.object_map import Landmark
 
 
@@ -24,7 +24,7 @@ def describe_landmark(landmark: Landmark, graph: TaskGraph) -> ObjectLandmark:
     return ObjectLandmark(
         f"{landmark.phrase}-{landmark.number}",
         landmark.phrase,
-        ObjectRole.TARGET if landmark.phrase in graph.targets else ObjectRole.ANCHOR,
+        ObjectRole.TARGET if landmark.phrase in map(noun_of, graph.targets) else ObjectRole.ANCHOR,
         (x, y, z),
         landmark.box_m(),
         min(max(landmark.best_score, 0.0), 1.0) * seen_share,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations, product
 
 import numpy as np
@@ -11,13 +11,15 @@ from jaxtyping import Float32, Float64
 from numpy import ndarray
 
 from gausslite.domain.errors import InvalidInputError
-from gausslite.domain.task import Predicate
+from gausslite.domain.task import Predicate, Relation
 from gausslite.perception.object_map import Landmark, Observation
 
 _FOOTPRINT_SLACK_M = 0.10
 _MAX_SAMPLE = 400
 # an object diagonally behind counts as behind, an object beside does not
 _MIN_SLOPE = 0.5
+# tolerated share of a distance that is stated as about so many metres
+_ABOUT = 0.25
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,6 +59,27 @@ class RelationGeometry:
         if predicate in _SIDES and observation.camera_m is not None:
             return self._is_on_side(predicate, observation.centroid_m, observation.camera_m, anchor)
         return distance_m(observation.centroid_m, anchor.centroid_m) < self._settings.near_m
+
+    def is_at_distance(self, relation: Relation, observation: Observation, anchors: Sequence[Landmark]) -> bool:
+        """Return True if the distance to the nearest anchor is within the relation's bounds; True without bounds.
+
+        Equal bounds mean "about": a quarter less and a quarter more are accepted.
+        """
+        low_m, high_m = relation.min_m or 0.0, np.inf if relation.max_m is None else relation.max_m
+        if low_m == high_m:
+            low_m, high_m = (1.0 - _ABOUT) * low_m, (1.0 + _ABOUT) * high_m
+        if not anchors or (low_m == 0.0 and np.isinf(high_m)):
+            return bool(anchors)
+        nearest_m = min(
+            float(np.linalg.norm(each.footprint_m().astype(np.float64) - observation.centroid_m, axis=1).min())
+            for each in anchors
+        )
+        return bool(low_m <= nearest_m <= high_m)
+
+    def with_reach(self, max_m: float | None) -> RelationGeometry:
+        """Return these predicates, with sides that reach as far as a stated distance."""
+        side_m = max(self._settings.side_m, (1.0 + _ABOUT) * (max_m or 0.0))
+        return RelationGeometry(self._up, replace(self._settings, side_m=side_m))
 
     def between(self, observation: Observation, anchors: Sequence[Sequence[Landmark]]) -> bool | None:
         """Return True within near_m of the line between two anchors of different groups; None with fewer than two."""

@@ -21,7 +21,7 @@ from gausslite.domain.objects import ObjectLandmark
 from gausslite.domain.pose import UpAxis, require_rigid, rotation_angle_deg, translation_m, unit_up_axis
 from gausslite.domain.relevance import NO_TARGET, Detection, RelevanceMap
 from gausslite.domain.state import State, add_prefix, get_array, get_counts, int_array, select_prefix
-from gausslite.domain.task import TaskGraph
+from gausslite.domain.task import TaskGraph, noun_of
 from gausslite.perception.checkpoint import decode_frustum, decode_landmark, encode_frustum, encode_landmark
 from gausslite.perception.detect import Segmenter
 from gausslite.perception.evidence import EvidenceSettings, VisibilityCheck
@@ -31,6 +31,9 @@ from gausslite.perception.object_report import describe_landmarks
 from gausslite.perception.relations import SpatialSettings
 from gausslite.perception.reproject import Frustum, lift_frustum, mask_in_frustum, reprojected_box_px
 from gausslite.perception.spatial import SpatialFilter, lift_observation
+
+# a detection with a smaller share of its pixels outside excluded objects shows one of them
+_MIN_SHARE_LEFT = 0.3
 
 
 @dataclass(frozen=True, slots=True)
@@ -188,7 +191,7 @@ class RelevanceTracker:
         """Return reliable targets in view that the detector missed this time, with their missed detections counted."""
         undetected = []
         for frustum, detection in self._propagated_detections(frame):
-            observation = lift_observation(detection, depth_m, frame)
+            observation = lift_observation(replace(detection, phrase=noun_of(detection.phrase)), depth_m, frame)
             if observation is None or frustum.missed_detections >= self._settings.max_missed_detections:
                 continue
             is_detected = any(self._filter.is_same_object(observation, other) for other in detected)
@@ -201,27 +204,42 @@ class RelevanceTracker:
         self, frame: Frame, depth_m: Float32[ndarray, "h w"], detections: Sequence[Detection]
     ) -> list[tuple[Detection, Observation]]:
         """Add the detections to the object map; return the confirmed targets that satisfy the relations."""
-        masked = [
-            replace(each, mask=foreground_mask(each.mask, depth_m)) for each in self._drop_generic_anchors(detections)
-        ]
+        kept = self._drop_excluded(self._drop_generic_anchors(detections))
+        masked = [replace(each, mask=foreground_mask(each.mask, depth_m)) for each in kept]
         lifted = [(each, lift_observation(each, depth_m, frame)) for each in masked]
         localised = [(detection, observation) for detection, observation in lifted if observation is not None]
         self._filter.observe([observation for _, observation in localised], VisibilityCheck(frame, frame.depth_m))
         targets = [
-            (detection, observation)
+            (replace(detection, phrase=name), observation)
             for detection, observation in localised
-            if detection.phrase in self._graph.targets and self._filter.satisfies_relations(observation)
+            if (name := self._filter.target_of(observation)) is not None
         ]
         self._needs_observation = any(self._filter.needs_observation(observation) for _, observation in targets)
         return [(detection, each) for detection, each in targets if self._filter.is_confirmed(each)]
 
     def _drop_generic_anchors(self, detections: Sequence[Detection]) -> list[Detection]:
         """Drop detections of a generic noun that are an anchor: "the object on the desk" is not the desk."""
-        anchors = [each.mask for each in detections if each.phrase in self._graph.anchors]
+        nouns = {noun_of(anchor) for anchor in self._graph.anchors}
+        anchors = [each.mask for each in detections if each.phrase in nouns]
         return [
             each
             for each in detections
             if not (is_generic(each.phrase) and any(each.mask is anchor for anchor in anchors))
+        ]
+
+    def _drop_excluded(self, detections: Sequence[Detection]) -> list[Detection]:
+        """Remove the pixels of excluded objects from all others; drop detections that mostly show an excluded one."""
+        nouns = self._graph.excluded_nouns
+        excluded = [each.mask for each in detections if each.phrase in nouns]
+        if not excluded:
+            return list(detections)
+        left_out = np.logical_or.reduce(excluded)
+        others = [replace(each, mask=each.mask & ~left_out) for each in detections if each.phrase not in nouns]
+        full = [each.mask for each in detections if each.phrase not in nouns]
+        return [
+            each
+            for each, mask in zip(others, full, strict=True)
+            if np.count_nonzero(each.mask) >= _MIN_SHARE_LEFT * np.count_nonzero(mask)
         ]
 
 

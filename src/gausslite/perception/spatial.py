@@ -12,7 +12,7 @@ from gausslite.domain.camera import lift
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import UpAxis, transform_points, unit_up_axis
 from gausslite.domain.relevance import Detection
-from gausslite.domain.task import Predicate, Relation, TaskGraph
+from gausslite.domain.task import Predicate, Relation, TaskGraph, noun_of
 from gausslite.perception.evidence import EvidenceSettings, VisibilityCheck
 from gausslite.perception.object_map import Landmark, ObjectMap, Observation
 from gausslite.perception.relations import RelationGeometry, SpatialSettings, surface_distance_m
@@ -60,6 +60,8 @@ class SpatialFilter:
             target: tuple(relation for relation in graph.relations if relation.target == target)
             for target in graph.targets
         }
+        nouns = dict.fromkeys(noun_of(target) for target in graph.targets)
+        self._names = {noun: tuple(each for each in graph.targets if noun_of(each) == noun) for noun in nouns}
         self._geometry = RelationGeometry(np.array(unit_up_axis(up_axis)), settings)
         self._evidence = evidence or EvidenceSettings()
         self._object_map = ObjectMap()
@@ -77,7 +79,7 @@ class SpatialFilter:
     @property
     def unseen_anchors(self) -> tuple[str, ...]:
         """Anchors of relations that no frame has shown yet."""
-        needed = dict.fromkeys(each.anchor for relations in self._relations.values() for each in relations)
+        needed = dict.fromkeys(noun_of(each.anchor) for relations in self._relations.values() for each in relations)
         return tuple(anchor for anchor in needed if not self._object_map.with_phrase(anchor))
 
     def observe(self, observations: Sequence[Observation], visibility: VisibilityCheck | None = None) -> None:
@@ -108,36 +110,62 @@ class SpatialFilter:
         """Replace the object map by these landmarks, oldest first."""
         self._object_map = ObjectMap(landmarks)
 
+    def target_of(self, observation: Observation) -> str | None:
+        """Return the first target of the observation's noun whose relations it satisfies; None if there is none."""
+        names = self._names.get(observation.phrase, ())
+        return next((name for name in names if self._satisfies(self._relations[name], observation)), None)
+
     def satisfies_relations(self, observation: Observation) -> bool:
-        """Return True if any relation of the target holds (Sec. III-B.3), or none can be evaluated.
+        """Return True if the object satisfies the relations of a target of its noun; True for other nouns."""
+        return observation.phrase not in self._names or self.target_of(observation) is not None
+
+    def _satisfies(self, relations: Sequence[Relation], observation: Observation) -> bool:
+        """Return True if no negated relation holds, and any other does (Sec. III-B.3) or none can be evaluated.
 
         Relations to anchors that were never seen are not evaluated. All the anchors of `between` form one relation.
         """
-        relations = self._relations.get(observation.phrase, ())
-        seen = [each for each in relations if self._object_map.with_phrase(each.anchor)]
-        results = [self._holds(each, observation) for each in seen if each.predicate is not Predicate.BETWEEN]
-        anchors = [self._anchors(each, observation) for each in relations if each.predicate is Predicate.BETWEEN]
-        between = self._geometry.between(observation, anchors) if anchors else None
-        if between is not None:
-            results.append(between)
+        seen = [each for each in relations if self._object_map.with_phrase(noun_of(each.anchor))]
+        simple = [each for each in seen if each.predicate is not Predicate.BETWEEN]
+        if any(each.negated and self._holds(each, observation) for each in simple):
+            return False
+        results = [self._holds(each, observation) for each in simple if not each.negated]
+        for negated in (False, True):
+            anchors = [
+                self._anchors(each, observation)
+                for each in relations
+                if each.predicate is Predicate.BETWEEN and each.negated == negated
+            ]
+            between = self._geometry.between(observation, anchors) if anchors else None
+            if between is not None and negated and between:
+                return False
+            if between is not None and not negated:
+                results.append(between)
         return not results or any(results)
 
     def _anchors(self, relation: Relation, observation: Observation) -> list[Landmark]:
         """Return the relation's anchors without the target itself."""
-        return [each for each in self._confirmed_landmarks(relation.anchor) if not each.is_colocated_with(observation)]
+        landmarks = self._confirmed_landmarks(noun_of(relation.anchor))
+        return [each for each in landmarks if not each.is_colocated_with(observation)]
 
     def _holds(self, relation: Relation, observation: Observation) -> bool:
+        """Return whether the relation holds, regardless of its negation."""
         if relation.predicate in (Predicate.CLOSEST_TO, Predicate.FARTHEST_FROM):
             return self._is_extreme(relation, observation)
         anchors = self._anchors(relation, observation)
-        return any(self._geometry.holds(relation.predicate, observation, anchor) for anchor in anchors)
+        has_bounds = relation.min_m is not None or relation.max_m is not None
+        if has_bounds and not self._geometry.is_at_distance(relation, observation, anchors):
+            return False
+        if has_bounds and relation.predicate is Predicate.NEAR:
+            return True
+        geometry = self._geometry.with_reach(relation.max_m) if has_bounds else self._geometry
+        return any(geometry.holds(relation.predicate, observation, anchor) for anchor in anchors)
 
     def _is_extreme(self, relation: Relation, observation: Observation) -> bool:
         """Return True for the reliable candidate with the least (or largest) distance to its nearest anchor."""
         sign = 1.0 if relation.predicate is Predicate.CLOSEST_TO else -1.0
-        anchors = self._confirmed_landmarks(relation.anchor)
+        anchors = self._confirmed_landmarks(noun_of(relation.anchor))
         best, best_signed_m = None, np.inf
-        for candidate in self._reliable_landmarks(relation.target):
+        for candidate in self._reliable_landmarks(noun_of(relation.target)):
             distances_m = [surface_distance_m(candidate, each) for each in anchors if each is not candidate]
             if distances_m and sign * min(distances_m) < best_signed_m:
                 best, best_signed_m = candidate, sign * min(distances_m)

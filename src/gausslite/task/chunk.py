@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import Enum
 
+from gausslite.task.distances import Bounds
 from gausslite.task.noun_phrase import NounPhrase
 
 
@@ -13,6 +14,7 @@ class ChunkKind(Enum):
 
     SUBJECT_VERB: a verb whose objects precede it ("the mugs belong in the cupboard"). STATEMENT: the start of a
     clause that requests nothing. ANAPHOR: "it" or "them". DEMONSTRATIVE: "this" or "those" without a noun.
+    ATTRIBUTE: a colour or superlative of the noun before it ("the mug that is red").
     """
 
     VERB = "verb"
@@ -25,13 +27,15 @@ class ChunkKind(Enum):
     NEGATION = "negation"
     ANAPHOR = "anaphor"
     DEMONSTRATIVE = "demonstrative"
+    ATTRIBUTE = "attribute"
 
 
 @dataclass(frozen=True, slots=True)
 class Chunk:
     """One chunk; word is the verb's base form, the preposition's relation, the conjunction or the noun's head.
 
-    current_place: the preposition states where something is ("that is on"), not where to put it.
+    current_place: the preposition states where something is ("that is on"), not where to put it. negated: the
+    preposition or attribute does not hold. text: the preposition itself. bounds: the distance of a preposition.
     """
 
     kind: ChunkKind
@@ -39,3 +43,6 @@ class Chunk:
     noun: NounPhrase | None = None
     gerund: bool = False
     current_place: bool = False
+    negated: bool = False
+    text: str = ""
+    bounds: Bounds | None = None

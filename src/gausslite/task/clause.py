@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from gausslite.task import lexicon
 from gausslite.task.chunk import Chunk, ChunkKind
+from gausslite.task.graph_draft import RelationTerms
 from gausslite.task.noun_phrase import NounPhrase, adjectives_only
 
 
 class Clause:
     """The objects a verb acts on, the candidates for "it" (referents), and places still without an object.
 
-    conjoined: the latest object followed a conjunction. by_pronoun: the objects come from "it" or "them".
+    places: the destinations or tools named last, which further places describe. terms: of the latest preposition.
+    superlative: "nearest" or "farthest" before the latest object. conjoined: the latest object followed
+    a conjunction. by_pronoun: the objects come from "it" or "them". adds_place: the preposition follows a conjunction.
     route: the clause mentions a path. skip_of_phrase: the next "of" continues a noun that names no object.
     """
 
@@ -18,13 +21,18 @@ class Clause:
         self.verb = verb
         self.referents = referents or []
         self.objects: list[str] = []
-        self.pending_places: list[tuple[str, NounPhrase]] = []
+        self.pending_places: list[tuple[RelationTerms, NounPhrase]] = []
         self.last_relation: str | None = None
-        self.superlative = False
+        self.terms = RelationTerms("near")
+        self.places: list[str] = []
+        self.superlative: str | None = None
         self.statement = False
         self.conjoined = False
         self.is_part = False
         self.between = False
+        self.in_space = False
+        self.preposition = ""
+        self.adds_place = False
         self.current_place = False
         self.by_pronoun = False
         self.follows_statement = False
@@ -53,7 +61,7 @@ def names_object(noun: NounPhrase, pending: str | None, after: Chunk | None) -> 
         return pending != "inside" or bool(noun.words[1:])
     if noun.head in lexicon.PLACES:
         return noun.head in lexicon.PHYSICAL_PLACES and pending not in (None, "inside", "to") and not of_follows
-    if noun.head in lexicon.ROUTES:
+    if noun.head in lexicon.ROUTES and not compound:
         return pending not in (None, "of", "for", "to")
     if noun.head in lexicon.MEASURES and pending not in (None, "of"):
         return not of_follows
@@ -63,4 +71,4 @@ def names_object(noun: NounPhrase, pending: str | None, after: Chunk | None) -> 
 def with_shared_head(adjective: NounPhrase, noun: NounPhrase) -> NounPhrase:
     """Return the adjective with the noun's head: in "red and blue mugs", "red" becomes "red mug"."""
     words = adjective.words[:-1] if adjective.head in ("one", "ones") else adjective.words
-    return NounPhrase((*words, noun.head), adjective.has_determiner, noun.superlative)
+    return NounPhrase((*words, noun.head), adjective.has_determiner)

@@ -19,6 +19,7 @@ SEMI_MODALS: Final = word_set("has have had need needs")
 WISHES: Final = word_set("need want like love require prefer seek")
 SUBJECT_TAGS: Final = frozenset({Tag.NOUN, Tag.INDEFINITE, Tag.PRONOUN, Tag.RELATIVE, Tag.ANAPHOR})
 _LOST_STATES: Final = word_set("missing lost gone")
+_UNKNOWN_PEOPLE: Final = word_set("somebody someone nobody everybody everyone")
 _OTHER_PEOPLE: Final = word_set("i he she they")
 _REASONS: Final = word_set("because since as although though")
 _CONDITIONS: Final = word_set("if whether when once until unless before after while")
@@ -81,10 +82,12 @@ def _begins_clause(tagged: TaggedWords, index: int) -> bool:
 def _opens_clause(tagged: TaggedWords, conjunction_at: int) -> bool:
     """Return True if a verb, or a subject with its verb, follows the conjunction."""
     tags = [tag for _, tag in tagged[conjunction_at + 1 : conjunction_at + 3]] + [None, None]
+    if tags[0] is Tag.NEGATION and tags[1] is Tag.PREPOSITION:
+        return False  # "on the table, not on the shelf"
     if tags[0] in (Tag.VERB, Tag.NEGATION, Tag.AUXILIARY):
         return True
     if tags[0] in (Tag.PRONOUN, Tag.ANAPHOR):
-        return tags[1] in _PREDICATES
+        return tags[1] in _PREDICATES or tags[1] is Tag.NEGATION
     return tagged[conjunction_at][0] in _STRONG_CONJUNCTIONS and _is_statement(tagged, conjunction_at + 1)
 
 
@@ -115,7 +118,8 @@ def _clause_type(tagged: TaggedWords, start: int, end: int, before: ClauseType) 
         return ClauseType.STATEMENT  # "while I hold the door"
     if not clause or (opener[1] is Tag.CLAUSE_BREAK and opener[0] in _CONDITIONS):
         return ClauseType.REQUEST
-    is_question = clause[0][1] in _QUESTION_OPENERS or clause[0][0] == "which"
+    is_statement = clause[0][0] in _UNKNOWN_PEOPLE and len(clause) > 1 and clause[1][1] in _PREDICATES
+    is_question = (clause[0][1] in _QUESTION_OPENERS or clause[0][0] == "which") and not is_statement
     if is_question or any(_is_request(tagged, index) for index in range(first, end)):
         return ClauseType.REQUEST
     # "bring the hammer. And the nails."

@@ -1,19 +1,25 @@
-"""Build the graph of a chunked sentence: each noun becomes a target, an anchor or is ignored."""
+"""Build the graph of a chunked sentence: each noun gets a role, locates another noun, is excluded or ignored."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
+from gausslite.domain.task import TargetRole
 from gausslite.task import lexicon
+from gausslite.task.attributes import SUPERLATIVES, is_attribute
 from gausslite.task.chunk import Chunk, ChunkKind
 from gausslite.task.clause import Clause, names_object, with_shared_head
-from gausslite.task.graph_draft import GraphDraft
+from gausslite.task.distances import UNBOUNDED
+from gausslite.task.graph_draft import GraphDraft, RelationTerms
 from gausslite.task.noun_phrase import NounPhrase, adjectives_only, phrase_from_text
 from gausslite.task.role_assignment import RoleAssigner
-from gausslite.task.verbs import BELONGING_VERBS
+from gausslite.task.verbs import BELONGING_VERBS, CONTACT_VERBS, GO_VERBS
 
 # "drone, fly to the roof" addresses the drone, "find the drone" does not
+# with these, a room or place states where something is
+_SPACE_PREPOSITIONS = frozenset(
+    {"at", "around", "throughout", "across", "on", "near the middle of", "along", "through"}
+)
 _ADDRESSED_ROBOTS = (("drone",), ("rover",))
 
 
@@ -34,7 +40,11 @@ class GraphBuilder:
         self._pending: str | None = None
         self._alternative: str | None = None  # "under" in "under or behind the couch"
         self._negated = False
+        self._avoids = False  # the negation itself means contact: "avoid touching"
         self._corrects = False
+        self._negated_objects: list[str] = []
+        self._partitive: tuple[NounPhrase, str | None] | None = None  # "the largest" of "the largest of the boxes"
+        self._described: str | None = None  # the latest object, which an attribute may describe
         self._adjectives: list[NounPhrase] = []
         self._following: Sequence[Chunk] = ()
 
@@ -54,7 +64,7 @@ class GraphBuilder:
                 before is None or before.kind is not ChunkKind.CONJUNCTION or before.word == "or"
             )
             self._alternative = self._pending if before is not None and before.kind is ChunkKind.CONJUNCTION else None
-            self._pending, self._clause.current_place = chunk.word, chunk.current_place
+            self._preposition(before, chunk)
         elif chunk.kind is ChunkKind.NEGATION:
             self._negation(chunk.word)
         elif chunk.kind in (ChunkKind.CLAUSE_BREAK, ChunkKind.STATEMENT):
@@ -64,12 +74,31 @@ class GraphBuilder:
             self._resolve_back_reference(chunk.word, before)
         elif chunk.kind is ChunkKind.DEMONSTRATIVE:
             self._handle_demonstrative(chunk.word, before, after)
+        elif chunk.kind is ChunkKind.ATTRIBUTE:
+            self._describe(chunk.word, chunk.negated)
 
     def finish(self) -> GraphDraft:
         """Return the draft after the last clause, without excluded objects."""
         self._new_clause(None)
         self._draft.finalise()
         return self._draft
+
+    def _preposition(self, before: Chunk | None, chunk: Chunk) -> None:
+        clause = self._clause
+        clause.adds_place = before is not None and before.kind is ChunkKind.CONJUNCTION
+        self._pending, clause.preposition, clause.current_place = chunk.word, chunk.text, chunk.current_place
+        clause.terms = RelationTerms(chunk.word, chunk.negated, chunk.bounds or UNBOUNDED)
+
+    def _describe(self, word: str, negated: bool) -> None:
+        """Add an attribute to the latest object; a negated one excludes others: "the mug that is not red"."""
+        if self._described is None:
+            return
+        described = f"{word} {self._described}"
+        if negated:
+            self._draft.exclude(described)
+        else:
+            self._assigner.rename(self._described, described)
+            self._described = described
 
     def _negation(self, word: str) -> None:
         """Start an exclusion; a second negation cancels it: "ignore everything except the signs"."""
@@ -79,9 +108,10 @@ class GraphBuilder:
             return
         self._corrects = word == "not" and not self._draft.targets
         self._negate()
+        self._avoids = word.startswith("avoid ")
 
     def _negate(self) -> None:
-        self._pending, self._negated = None, True
+        self._pending, self._negated, self._avoids, self._negated_objects = None, True, False, []
         self._clause.nouns_since_negation = 0
         self._clause.verb_since_negation = False
 
@@ -92,7 +122,8 @@ class GraphBuilder:
         return named and (not rest or rest[0] in (ChunkKind.CLAUSE_BREAK, ChunkKind.VERB))
 
     def _verb(self, before: Chunk | None, chunk: Chunk) -> None:
-        if chunk.word == "leave" and self._draft.targets and self._leave_excludes():
+        is_leave = chunk.word == "leave" and not self._clause.statement
+        if is_leave and self._draft.targets and self._leave_excludes():
             self._negate()
             return
         same_negation = self._negated and (
@@ -126,6 +157,8 @@ class GraphBuilder:
             return
         pending, self._pending = self._pending, None
         if self._negated:
+            for each in (clause.objects or clause.referents)[-1:] if pending is not None else ():
+                self._place_negated(phrase_from_text(each), pending)
             return
         if pending is None:
             clause.objects = clause.objects or list(clause.referents)
@@ -138,12 +171,18 @@ class GraphBuilder:
         )  # fmt: skip
         if named and subjects:
             clause.objects = subjects
+            if pending == "with":
+                self._assigner.make_tools(named)
+                return
             for each in named:
                 self._assigner.assign_by_preposition(pending, phrase_from_text(each))
 
     def _handle_demonstrative(self, word: str, before: Chunk | None, after: Chunk | None) -> None:
         """Handle a "this" without a noun."""
-        if self._negated or (self._clause.verb is None and self._pending is None):
+        if self._negated:
+            self._negate_latest()
+            return
+        if self._clause.verb is None and self._pending is None:
             return
         self._draft.unnamed = self._draft.unnamed or word
         if self._pending is None:
@@ -158,17 +197,27 @@ class GraphBuilder:
             self._negated = False  # "not the wooden spoon, the metal one"
         if noun.head in ("one", "ones"):
             if self._negated and len(noun.words) == 1:
-                return  # "this mug, not that one"
+                self._negate_latest()  # "this mug, not that one"
+                return
             noun = self._resolve_one(noun)
         pending, self._pending = self._pending, None
+        if self._partitive is not None and pending in (None, "of"):
+            (superlative, pending), self._partitive = self._partitive, None
+            noun = NounPhrase((*superlative.words, *noun.words), True)
         of_follows = after is not None and after.kind is ChunkKind.PREPOSITION and after.word == "of"
         if adjectives_only(noun.words) and not (of_follows and noun.head in lexicon.PLACES):
             if after is not None and after.kind is ChunkKind.CONJUNCTION:
                 self._adjectives.append(noun)
+            elif any(word in SUPERLATIVES for word in noun.words) and self._described is not None:
+                self._describe(" ".join(word for word in noun.words if is_attribute(word)), negated=False)
+            elif is_attribute(noun.head) and (of_follows or (after is not None and after.kind is ChunkKind.NOUN)):
+                self._partitive = noun, pending
             return
         if not names_object(noun, pending, after):
             self._skip_noun(noun, pending, conjoined, after)
             return
+        if pending is not None and lexicon.is_space(noun.words) and self._clause.preposition in _SPACE_PREPOSITIONS:
+            pending = "inside"
         nouns = [*(with_shared_head(adjective, noun) for adjective in self._adjectives), noun]
         self._adjectives = []
         for each in nouns:
@@ -176,6 +225,7 @@ class GraphBuilder:
                 self._exclude(each, pending)
             else:
                 self._assigner.assign(each, pending, conjoined, self._following)
+                self._described = each.text
                 if self._alternative is not None:
                     self._assigner.assign_by_preposition(self._alternative, each)
         self._alternative = None
@@ -185,8 +235,14 @@ class GraphBuilder:
         named = (
             self._clause.objects or self._clause.referents or self._draft.targets or self._draft.excluded or ["object"]
         )
-        same = phrase_from_text(named[-1])
-        return with_shared_head(one, same) if len(one.words) > 1 else replace(same, superlative=one.superlative)
+        nouns = [word for word in named[-1].split() if not is_attribute(word)] or ["object"]
+        same = phrase_from_text(" ".join(nouns))
+        if len(one.words) == 1:
+            return phrase_from_text(named[-1])
+        described = NounPhrase((*one.words[:-1], *same.words), one.has_determiner)
+        if self._draft.is_from_statement(named[-1]):  # "there are two mugs on the table, take the red one"
+            self._assigner.rename(named[-1], described.text)
+        return described
 
     def _skip_noun(self, noun: NounPhrase, pending: str | None, conjoined: bool, after: Chunk | None) -> None:
         """Skip a noun that names no object; in "on the edge of the table" the table inherits the "on"."""
@@ -198,11 +254,33 @@ class GraphBuilder:
         self._clause.inherited_preposition = pending if of_follows else None
         self._clause.skip_of_phrase, self._clause.inherited_conjoined = of_follows, conjoined
 
+    def _negate_latest(self) -> None:
+        """Remember the objects of "except those on the shelf", whose place follows."""
+        if not self._negated_objects and self._pending is None:
+            self._negated_objects = list(self._clause.objects or self._draft.targets[-1:])
+
     def _exclude(self, noun: NounPhrase, pending: str | None) -> None:
+        """Exclude the noun, or make it an obstacle if the negated verb means contact or harm."""
         clause = self._clause
         direct = pending is None or (clause.nouns_since_negation == 0 and clause.verb_since_negation)
-        if not direct and clause.nouns_since_negation == 0:
-            self._draft.warnings.append(f"an exception by place ({noun.text!r}) is not supported: it is dropped")
         clause.nouns_since_negation += 1
-        if direct and noun.text not in self._draft.excluded:
-            self._draft.excluded.append(noun.text)
+        if not direct:
+            self._place_negated(noun, pending or "near")
+        elif self._avoids or (clause.verb_since_negation and clause.verb in CONTACT_VERBS | GO_VERBS):
+            self._draft.add_target(noun.text, TargetRole.OBSTACLE)
+            self._negated_objects.append(noun.text)
+        else:
+            self._draft.exclude(noun.text)
+            self._negated_objects.append(noun.text)
+
+    def _place_negated(self, noun: NounPhrase, relation: str) -> None:
+        """Relate an obstacle to its place; "the mugs except the one on the shelf" negates the relation."""
+        terms = self._clause.terms
+        objects = self._negated_objects
+        if objects and all(self._draft.roles.get(each) is TargetRole.OBSTACLE for each in objects):
+            self._draft.add_relation(RelationTerms(relation, terms.negated, terms.bounds), objects, noun.text)
+        elif objects and all(each in self._draft.targets for each in objects) and not lexicon.is_space(noun.words):
+            self._draft.excluded = [each for each in self._draft.excluded if each not in objects]
+            self._draft.add_relation(RelationTerms(relation, not terms.negated, terms.bounds), objects, noun.text)
+        else:
+            self._draft.warnings.append(f"an exception by place ({noun.text!r}) is not supported: it is dropped")

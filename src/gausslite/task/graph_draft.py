@@ -1,91 +1,153 @@
-"""The graph of a sentence under construction: targets, anchors, relations and warnings for the operator."""
+"""The graph of a sentence under construction: objects with roles, relations, and warnings for the operator."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Final
 
-from gausslite.domain.task import Predicate, Relation
+from gausslite.domain.task import Predicate, Relation, TargetRole
+from gausslite.task import lexicon
+from gausslite.task.distances import UNBOUNDED, Bounds
 
 _PREDICATES: Final = frozenset(predicate.value for predicate in Predicate)
-# treating "far from" as near would reverse its meaning
-_NOT_NEAR: Final = frozenset({"far_from"})
+
+
+@dataclass(frozen=True, slots=True)
+class RelationTerms:
+    """How a preposition relates: its relation, whether it is negated, and its distance."""
+
+    relation: str
+    negated: bool = False
+    bounds: Bounds = UNBOUNDED
 
 
 class GraphDraft:
-    """A mutable task graph; `finalise` removes excluded objects and resolves targets without a name.
+    """A mutable task graph of noun phrases; `finalise` removes excluded objects and resolves targets without a name.
 
-    excluded: objects that the sentence says to leave alone. whole_place: a place named instead of an object.
-    unnamed: a demonstrative ("this") without a noun.
+    excluded: objects that the sentence says to leave out. context: rooms and places. whole_place: a place named instead
+    of an object. unnamed: a demonstrative ("this") without a noun. mentions: all phrases in their order.
     """
 
     def __init__(self) -> None:
         self.targets: list[str] = []
+        self.roles: dict[str, TargetRole] = {}
         self.anchors: list[str] = []
         self.relations: list[Relation] = []
         self.warnings: list[str] = []
         self.excluded: list[str] = []
+        self.context: list[str] = []
+        self.mentions: list[str] = []
         self.whole_place: str | None = None
         self.unnamed: str | None = None
         self._statement_nouns: set[str] = set()
 
-    def add_target(self, phrase: str, from_statement: bool = False) -> None:
-        """Add an object of the task. One from a statement counts only if no request names a target."""
+    def add_target(self, phrase: str, role: TargetRole = TargetRole.OBJECT, from_statement: bool = False) -> None:
+        """Add an object of the task; its first role stands.
+
+        An object of a statement counts only if no request names a target.
+        """
+        self.mentions.append(phrase)
         if phrase not in self.targets:
             self.targets.append(phrase)
+            self.roles[phrase] = role
             if from_statement:
                 self._statement_nouns.add(phrase)
         if not from_statement:
+            if phrase in self._statement_nouns:
+                self.roles[phrase] = role
             self._statement_nouns.discard(phrase)
+
+    def remove_targets(self, phrases: Sequence[str]) -> None:
+        """Remove objects that turn out to be places."""
+        self.targets = [target for target in self.targets if target not in phrases]
+
+    def exclude(self, phrase: str) -> None:
+        """Add an excluded object, once."""
+        self.mentions.append(phrase)
+        if phrase not in self.excluded:
+            self.excluded.append(phrase)
+
+    def add_context(self, place: str) -> None:
+        """Add a room or place, once."""
+        if place not in self.context:
+            self.context.append(place)
+
+    def rename(self, phrase: str, new: str) -> None:
+        """Replace a phrase everywhere, because its description has changed."""
+        for phrases in (self.targets, self.anchors, self.mentions):
+            phrases[:] = dict.fromkeys(new if each == phrase else each for each in phrases)
+        if phrase in self.roles:
+            self.roles.setdefault(new, self.roles.pop(phrase))
+        if phrase in self._statement_nouns:
+            self._statement_nouns.discard(phrase)
+            self._statement_nouns.add(new)
+        self.relations = [
+            replace(
+                each,
+                target=new if each.target == phrase else each.target,
+                anchor=new if each.anchor == phrase else each.anchor,
+            )
+            for each in self.relations
+        ]
+
+    def is_from_statement(self, phrase: str) -> bool:
+        """Return True if only a statement has named this object so far."""
+        return phrase in self._statement_nouns
 
     def confirm_targets(self, phrases: Sequence[str]) -> None:
         """Make objects of a statement full targets, because a later "it" refers to them."""
+        self.roles.update(dict.fromkeys(self._statement_nouns.intersection(phrases), TargetRole.OBJECT))
         self._statement_nouns.difference_update(phrases)
 
-    def add_anchor(self, phrase: str) -> None:
-        """Add an anchor, once."""
-        if phrase not in self.anchors:
-            self.anchors.append(phrase)
-
-    def drop_anchor(self, phrase: str) -> None:
-        """Remove an anchor that no relation uses."""
-        if phrase in self.anchors and not any(relation.anchor == phrase for relation in self.relations):
-            self.anchors.remove(phrase)
-
-    def add_relation(self, relation: str, targets: Sequence[str], anchor: str) -> None:
-        """Relate every target to the anchor; a relation without a predicate becomes near, or is dropped."""
-        self.add_anchor(anchor)
-        unknown = f"'{relation.replace('_', ' ')}' {anchor!r} is not a known relation"
-        if relation in _NOT_NEAR:
-            self.warnings.append(f"{unknown}: it is dropped")
+    def add_relation(self, terms: RelationTerms, targets: Sequence[str], anchor: str) -> None:
+        """Relate every target to the anchor; a relation without a predicate becomes near, with a warning."""
+        self.mentions.append(anchor)
+        known = self._as_predicate(terms, anchor)
+        if known is None:
             return
-        if relation not in _PREDICATES:
-            self.warnings.append(f"{unknown}: treated as near")
-        predicate = Predicate(relation) if relation in _PREDICATES else Predicate.NEAR
+        if anchor not in self.anchors:
+            self.anchors.append(anchor)
+        predicate, negated = known
         for target in targets:
-            new = Relation(predicate, target, anchor)
+            new = Relation(predicate, target, anchor, negated, terms.bounds.min_m, terms.bounds.max_m)
             if new not in self.relations:
                 self.relations.append(new)
 
+    def _as_predicate(self, terms: RelationTerms, anchor: str) -> tuple[Predicate, bool] | None:
+        """Return the predicate, and whether it is negated; None if the preposition states no relation."""
+        shown = f"'{terms.relation.replace('_', ' ')}' {anchor!r}"
+        if terms.relation == "far_from":
+            return Predicate.NEAR, not terms.negated
+        if terms.relation == "outside" and anchor.split()[-1] in lexicon.CONTAINERS:
+            return Predicate.INSIDE, not terms.negated
+        if terms.relation == "at_distance":
+            self.warnings.append(f"the distance from {anchor!r} is not a number: it is dropped")
+            return None
+        if terms.relation in _PREDICATES:
+            return Predicate(terms.relation), terms.negated
+        if terms.negated:
+            self.warnings.append(f"not {shown} is not a known relation: it is dropped")
+            return None
+        self.warnings.append(f"{shown} is not a known relation: treated as near")
+        return Predicate.NEAR, False
+
     def finalise(self) -> None:
-        """Remove excluded objects; without a named target, a place or a "this" stands for every object."""
+        """Remove excluded objects and unused anchors; without a target, a place or a "this" means every object."""
         if not self.targets and self.whole_place is not None:
-            self.targets.append("object")
+            self.add_target("object")
             self.warnings.append(f"{self.whole_place!r} is a place, not an object: every object in it is a target")
         if not self.targets and self.unnamed is not None:
-            self.targets.append("object")
+            self.add_target("object")
         if self.unnamed is not None and "object" in self.targets:
             self.warnings.append(f"{self.unnamed!r} refers to no named object: every object is a target")
         self._drop_statement_nouns()
         self.targets = [target for target in self.targets if target not in self.excluded]
         self.relations = [relation for relation in self.relations if relation.target in self.targets]
-        self.warnings += [f"{phrase!r} is to be left alone and is not a target" for phrase in self.excluded]
+        used = {relation.anchor for relation in self.relations}
+        self.anchors = [anchor for anchor in self.anchors if anchor in used]
 
     def _drop_statement_nouns(self) -> None:
         """Remove nouns of statements: the baby in "the baby sleeps, close the curtains"."""
         if not self._statement_nouns.issuperset(self.targets):
             self.targets = [target for target in self.targets if target not in self._statement_nouns]
-            unused = {relation.anchor for relation in self.relations if relation.target in self._statement_nouns}
-            self.relations = [relation for relation in self.relations if relation.target in self.targets]
-            unused -= {relation.anchor for relation in self.relations}
-            self.anchors = [anchor for anchor in self.anchors if anchor not in unused]

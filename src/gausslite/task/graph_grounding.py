@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 from gausslite.domain.errors import TaskError
-from gausslite.domain.task import Relation, TaskGraph
+from gausslite.domain.task import Relation, TargetRole, TaskGraph
 from gausslite.domain.task_limits import EXAMPLE, LIMITS, require_graph, require_task_text
 from gausslite.task import lexicon
 from gausslite.task.chunker import chunk_sentence
 from gausslite.task.graph_builder import build_draft
 from gausslite.task.graph_draft import GraphDraft
+from gausslite.task.naming import name_objects
 from gausslite.task.noun_phrase import noun_phrase
 from gausslite.task.parser import normalise_text, task_id_of
 from gausslite.task.singular import singular
@@ -37,42 +39,88 @@ _SYNONYMS = tuple(
 _ARTICLES = word_set("a an the this that these those my your his her its our their some any all every each")
 
 
-def grounded_graph(
-    text: str,
-    targets: Sequence[str],
-    anchors: Sequence[str],
-    relations: Sequence[Relation],
-    warnings: Sequence[str] = (),
-    draft: GraphDraft | None = None,
-) -> TaskGraph:
+@dataclass(frozen=True, slots=True)
+class ParsedPhrases:
+    """A parser's answer as noun phrases of the sentence, with their colours and superlatives."""
+
+    targets: Mapping[str, TargetRole]
+    anchors: Sequence[str] = ()
+    relations: Sequence[Relation] = ()
+    excluded: Sequence[str] = ()
+    context: Sequence[str] = ()
+    warnings: Sequence[str] = ()
+    mentions: Sequence[str] = ()
+
+
+def grounded_graph(text: str, parsed: ParsedPhrases, draft: GraphDraft | None = None) -> TaskGraph:
     """Return the validated graph of any parser's answer.
 
-    Articles and plurals are removed. Dropped, with a warning: targets and anchors whose head noun the sentence does not
-    mention, targets that the sentence excludes, and relations between unlisted nouns. The rule parser passes its own
-    `draft`; without one, the sentence is parsed by rules here. Raises TaskError if the text is not a task, if no target
-    is left, or if the graph exceeds the limits.
+    Articles and plurals are removed, attributes are separated from the names. Dropped, with a warning: phrases whose
+    head noun the sentence does not mention, targets that the sentence excludes, and relations between unlisted nouns.
+    The rule parser passes its own `draft`; without one, the sentence is parsed by rules here. Raises TaskError if the
+    text is not a task, if no target is left, or if the graph exceeds the limits.
     """
     require_task_text(text)
-    mentioned, all_warnings = _sentence_words(text), list(warnings)
-    draft = draft or build_draft(chunk_sentence(normalise_text(text)))
+    mentioned, all_warnings = _sentence_words(text), list(parsed.warnings)
+    if draft is None:
+        draft = build_draft(chunk_sentence(normalise_text(text)))
+        parsed = _with_rule_negations(parsed, draft, all_warnings.append)
     warn = all_warnings.append
-    kept_targets = _without_excluded(draft, _mentioned_phrases("target", targets, mentioned, warn), warn)
-    kept_anchors = _mentioned_phrases("anchor", anchors, mentioned, warn)
-    if not kept_targets:
+    targets = _without_excluded(draft, _mentioned_phrases("target", tuple(parsed.targets), mentioned, warn), warn)
+    anchors = _mentioned_phrases("anchor", parsed.anchors, mentioned, warn)
+    excluded = _mentioned_phrases("excluded object", parsed.excluded, mentioned, warn)
+    if not targets:
         shown = " ".join(text.split())[:60]
         raise TaskError(
             f"task targets: expected at least one object of the sentence, such as in {EXAMPLE}, got {shown!r}"
         )
+    roles = {plain_phrase(phrase): role for phrase, role in parsed.targets.items()}
+    relations = _valid_relations(parsed.relations, targets, anchors, warn)
+    order = [plain_phrase(each) for each in parsed.mentions]
+    kept = (*targets, *anchors, *excluded)
+    named = name_objects([*(each for each in order if each in kept), *kept], excluded)
+    names = named.names
+    target_roles: dict[str, TargetRole] = {}
+    for target in targets:
+        target_roles.setdefault(names[target], roles[target])
     graph = TaskGraph(
         task_id=task_id_of(text),
         text=text.strip(),
-        targets=kept_targets,
-        anchors=kept_anchors,
-        relations=_valid_relations(relations, kept_targets, kept_anchors, warn),
-        warnings=tuple(all_warnings[: LIMITS.max_warnings]),
+        targets=tuple(target_roles),
+        anchors=_renamed(anchors, names),
+        relations=tuple(
+            dict.fromkeys(replace(each, target=names[each.target], anchor=names[each.anchor]) for each in relations)
+        ),
+        warnings=tuple((*all_warnings, *named.warnings)[: LIMITS.max_warnings]),
+        roles=tuple(target_roles.values()),
+        attributes=named.attributes,
+        excluded=_renamed(excluded, names),
+        context=tuple(dict.fromkeys(filter(None, map(plain_phrase, parsed.context)))),
     )
     require_graph(graph)
     return graph
+
+
+def _with_rule_negations(parsed: ParsedPhrases, draft: GraphDraft, warn: Callable[[str], None]) -> ParsedPhrases:
+    """Return a model's answer with the obstacles and the negations that the rules find in the same sentence."""
+    negations = {(each.predicate, each.target, each.anchor): each.negated for each in draft.relations}
+    relations = []
+    for each in parsed.relations:
+        key = each.predicate, plain_phrase(each.target), plain_phrase(each.anchor)
+        corrected = replace(each, negated=negations.get(key, each.negated))
+        if corrected != each:
+            warn(f"{each} contradicts the sentence: read as {corrected}")
+        relations.append(corrected)
+    obstacles = {phrase for phrase, role in draft.roles.items() if role is TargetRole.OBSTACLE}
+    targets = {
+        phrase: TargetRole.OBSTACLE if plain_phrase(phrase) in obstacles else role
+        for phrase, role in parsed.targets.items()
+    }
+    return replace(parsed, targets=targets, relations=relations)
+
+
+def _renamed(phrases: Sequence[str], names: Mapping[str, str]) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(names[phrase] for phrase in phrases))
 
 
 def _mentioned_phrases(
@@ -111,7 +159,7 @@ def plain_phrase(phrase: str) -> str:
     tokens = normalise_text(phrase).split(" of ")[0].split()
     while len(tokens) > 1 and tokens[0] in _ARTICLES:
         tokens = tokens[1:]
-    return noun_phrase(tokens, False, False).text if tokens else ""
+    return noun_phrase(tokens, False).text if tokens else ""
 
 
 def _valid_relations(
@@ -119,7 +167,7 @@ def _valid_relations(
 ) -> tuple[Relation, ...]:
     kept: dict[Relation, None] = {}
     for each in relations:
-        relation = Relation(each.predicate, plain_phrase(each.target), plain_phrase(each.anchor))
+        relation = replace(each, target=plain_phrase(each.target), anchor=plain_phrase(each.anchor))
         if relation.target in targets and relation.anchor in anchors:
             kept[relation] = None
         else:
@@ -146,7 +194,7 @@ def _is_mentioned(phrase: str, mentioned: frozenset[str]) -> bool:
     if head in mentioned or head.split("-")[-1] in mentioned:
         return True
     if head in lexicon.GENERIC:
-        return bool(mentioned & _ANY_OBJECT)
+        return bool(mentioned & _ANY_OBJECT) or any(lexicon.is_space((word,)) for word in mentioned)
     if head == "person":
         return bool(mentioned & lexicon.PEOPLE)
     return any(head in group and mentioned & group for group in _SYNONYMS)

@@ -5,6 +5,9 @@ from __future__ import annotations
 import re
 from typing import Final
 
+from gausslite.task.attributes import COLOURS
+from gausslite.task.distances import mark_distances
+
 _NUMBER: Final = r"(?:a few|a couple of|several|some|at least|about|one|two|three|four|five|half an?|a|\d+)"
 _LENGTH: Final = r"(?:met(?:er|re)s?|feet|foot|steps?|cm|m|inch(?:es)?|paces?|yards?|centimet(?:er|re)s?)"
 _DISTANCE: Final = rf"{_NUMBER}(?: (?:one|two|three|a|\d+))? {_LENGTH}"
@@ -14,6 +17,11 @@ _PLAIN: Final = {
     r"(i|you|we|they|it)'(?:ve|d|ll|m|re)": r"\1",
     r"(is|are|was|were|does|did|has|have|would|could|should|must)n't": r"\1 not",
     r"let's": "let us",
+    r"there (?:is|are|was|were|should be|must be|might be)(?! (?:not?|any)\b)": "i see",
+    r"back(?= where\b)": "",
+    r"(?:so|as|very|quite|too) well": "",
+    r"reach(?:ing)? for": "grab",
+    r"(?:head|make|leave|set off|set out) for(?= (?:the|a|an|my|that|this)\b)": "go to",
     r"(there|where|what|who)s": r"\1 is",
     r"(where|how|what|who)'d": r"\1 did",
     r"u": "you",
@@ -39,9 +47,13 @@ _PLAIN: Final = {
     r"(?:watch out|look out|be careful|beware) (?:for|of|with)": "avoid",
     r"(?:stay|keep|steer|remain|stand) (?:well )?(?:clear|away|off) (?:of|from)": "avoid",
     r"keep (?:your|a safe|some|a) distance (?:from|to)": "avoid",
-    rf"(?:keep|stay|remain) {_DISTANCE} (?:away )?from": "avoid",
-    rf"{_DISTANCE} (?:away )?from|not (?:\w+ )?far (?:away )?from": "near",
-    rf"{_DISTANCE}(?= (?:behind|in front|left|right|above|below|under|to the|inside|next)\b)": "",
+    rf"(?:keep|stay|remain) (?:at least )?{_DISTANCE} (?:away |clear )?(?:from|of)": "avoid",
+    r"not (?:\w+ )?far (?:away )?from": "near",
+    r"(?:farthest|furthest|most distant) away(?! from)|most distant(?! from)": "farthest",
+    r"with no(?= \w)": "without",
+    r"(?:ground|first|second|third|fourth|top|upper|lower|next|\d+(?:st|nd|rd|th)) floor\b"
+    r"(?! (?:tile|lamp|mat|plan|board))": "storey",
+    r"(\w+)-colou?red": r"\1",
     r"across the (?:street|road|hall|hallway|room|corridor|aisle) from": "opposite",
     r"right(?= (?:next|beside|behind|under|above|in front|by|inside|at|below|between|on top)\b)": "",
     r"in (?:a|one) (?:\w+ )?(?:row|line|pile|stack|heap|circle)": "",
@@ -58,6 +70,11 @@ _PLAIN: Final = {
     r"give (.{2,60}?) an? (?:\w+ )?(rinse|wipe|wash|clean|scrub|polish|sweep|shake|push|pull|kick|stir)": r"\2 \1",
 }
 _IDIOMS: Final = tuple((re.compile(rf"\b(?:{idiom})(?!\w)"), plain) for idiom, plain in _PLAIN.items())
+_COLOUR: Final = "|".join(sorted(COLOURS))
+# one object with two colours: "a black and white cat", but not "the red and blue mugs"
+_TWO_COLOURS: Final = re.compile(
+    rf"\b(?:(?<=\ba )|(?<=\bthe )|(?<=\bthat ))({_COLOUR}) and ({_COLOUR})(?= \w*[^s\W]\b)"
+)
 _ARROW: Final = re.compile(r"\s*(?:->|=>|\u2192)\s*")
 _LEAVE_ALONE: Final = re.compile(
     r"\bleav(?:e|ing) ((?:\w+ ){1,4})(?:alone|untouched|undisturbed|unchanged|in peace|as (?:it is|is|they are)"
@@ -71,4 +88,4 @@ def replace_idioms(text: str) -> str:
     text = _LEAVE_ALONE.sub(r"do not touch \1", text)
     for idiom, plain in _IDIOMS:
         text = idiom.sub(plain, text)
-    return text
+    return mark_distances(_TWO_COLOURS.sub(r"\1-and-\2", text))

@@ -68,7 +68,7 @@ MANNER_NOUNS: Final = word_set(
 )
 TIME_NOUNS: Final = word_set(
     "date metre meter centimetre centimeter inch foot percent degree second idea problem reason question job sun rain "
-    "shade dark visit trip way party step"
+    "shade dark visit trip way party step age"
 )
 ROUTES: Final = word_set("path way route road course trajectory passage line shortcut track trail")
 MEASURES: Final = word_set(
@@ -80,6 +80,22 @@ MEASURES: Final = word_set(
 # places that are also physical objects, unless "in" or "to" precedes them
 PHYSICAL_PLACES: Final = word_set("home corner site front back")
 BUILDINGS: Final = word_set("building house apartment")
+# spaces around the robot, which state a context and no anchor; other rooms of the lexicon are objects
+_SPACES: Final = (ROOMS - word_set("closet elevator staircase street sidewalk lawn driveway laundry")) | word_set(
+    "building house apartment school hotel supermarket restaurant cafe gym church museum airport station terminal mall "
+    "theatre theater cinema factory hangar farm clinic ward showroom storeroom stockroom mailroom washroom cloakroom "
+    "ballroom courtroom playroom storey depot vestibule atrium mezzanine veranda conservatory greenhouse barn cellar "
+    "loft nursery playground meadow forest woods beach orchard vineyard plaza town city village canteen cleanroom "
+    "darkroom sunroom dormitory gallery auditorium gymnasium studio home villa pharmacy bakery mudroom zoo stadium"
+)
+_SPACE_HEADS: Final = word_set("room area lot hall park site zone storey wing department section suite court space")
+
+
+def is_space(words: tuple[str, ...]) -> bool:
+    """Return True if a noun phrase is a room or a place: "kitchen", "parking lot", "living room"."""
+    return words[-1] in _SPACES or (len(words) > 1 and words[-1] in _SPACE_HEADS)
+
+
 # defects that an inspection searches for in an object
 DEFECTS: Final = word_set(
     "leak crack dent scratch rust stain hole corrosion damage wear tear mold mould rot chip blockage fault defect "
@@ -96,6 +112,11 @@ CLOTHING: Final = word_set(
 PARTS: Final = word_set(
     "handle leg lid knob button screen cable door wheel seat armrest drawer shelf cap label display spout hinge arm "
     "edge rim cover panel switch lock base"
+)
+# tools to take something with
+HELD_TOOLS: Final = word_set(
+    "tongs gripper tweezers cart trolley tray glove gloves pliers forklift magnet shovel spoon fork net scoop hook "
+    "hand wheelbarrow ladder pallet-jack claw arm suction dolly towel cloth oven-mitt mitt crane rope winch"
 )
 GENERIC: Final = word_set("object thing item stuff obstacle obstruction clutter hazard debris target")
 

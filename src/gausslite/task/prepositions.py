@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Final
 
+from gausslite.task.distances import VAGUE_MARKER
+
 # a relation that is not a Predicate becomes `near`, with a warning; prepositions are separated by "|"
 _BY_RELATION: Final = {
     "near": "near|next to|beside|by|close to|adjacent to|alongside|at|around|against|nearby to|touching|"
@@ -13,7 +15,8 @@ _BY_RELATION: Final = {
     "within easy reach of|tied to|chained to|hooked to|leashed to|plugged into|propped against|"
     "resting against",
     "closer": "closer to",
-    "on": "on|on top of|upon|atop|resting on|on the top of|at the top of|on the surface of|mounted on|on to|"
+    "on": "on|all over|scattered over|spread over|"
+    "on top of|upon|atop|resting on|on the top of|at the top of|on the surface of|mounted on|on to|"
     "on the side of|attached to|stuck to|stuck on|taped to|glued to|pinned to|nailed to|screwed to|"
     "bolted to|fixed to|fastened to|clipped to|hung on|hanging on|hanging from|hung from|mounted to|"
     "hung up on|hanging off",
@@ -21,6 +24,7 @@ _BY_RELATION: Final = {
     "farthest_from": "farthest from|furthest from|farthest to|farthest away from|furthest away from|most distant from|"
     "furthest to",
     "far_from": "far from|away from|far away from|clear of|far off",
+    "at_distance": VAGUE_MARKER,
     "inside": "in|inside|inside of|within|in the middle of|in the center of|in the centre of|in the corner of",
     "under": "under|underneath|beneath|below|underneath of",
     "above": "above|over",

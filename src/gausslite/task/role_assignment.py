@@ -1,18 +1,23 @@
-"""Assign each noun a role by its verb and preposition: target, anchor, or related to an earlier noun."""
+"""Assign each noun a role by its verb and preposition, or relate it to an earlier noun."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from typing import Final
 
-from gausslite.domain.task import Predicate
+from gausslite.domain.task import Predicate, Superlative, TargetRole
 from gausslite.task import lexicon
+from gausslite.task.attributes import SUPERLATIVES
 from gausslite.task.chunk import Chunk, ChunkKind
 from gausslite.task.clause import Clause
-from gausslite.task.graph_draft import GraphDraft
+from gausslite.task.graph_draft import GraphDraft, RelationTerms
 from gausslite.task.noun_phrase import NounPhrase, phrase_from_text
 from gausslite.task.verbs import (
+    ATTACHING_VERBS,
+    AVOIDING_VERBS,
+    COVERING_VERBS,
     DELIVERY_VERBS,
+    FETCHING_VERBS,
     FILLING_VERBS,
     GIVING_VERBS,
     GO_VERBS,
@@ -20,6 +25,8 @@ from gausslite.task.verbs import (
     LOOKING_VERBS,
     MOVING_VERBS,
     PLACE_VERBS,
+    PUSHING_VERBS,
+    REACHING_VERBS,
     SEARCH_VERBS,
     STOPPING_VERBS,
 )
@@ -64,14 +71,14 @@ class RoleAssigner:
         clause.objects = list(clause.referents)
         self._draft.confirm_targets(clause.objects)
         pending_places, clause.pending_places = clause.pending_places, []
-        for relation, noun in pending_places:
-            self.relate(relation, noun)
+        for terms, noun in pending_places:
+            self._relate(terms, noun)
 
     def _make_places_targets(self) -> None:
         pending_places, self.clause.pending_places = self.clause.pending_places, []
+        going = self.clause.verb in GO_VERBS | STOPPING_VERBS
         for _, noun in pending_places:
-            self._draft.drop_anchor(noun.text)
-            self.target(noun, conjoined=True)
+            self.target(noun, TargetRole.DESTINATION if going else TargetRole.OBJECT, conjoined=True)
 
     def assign(self, noun: NounPhrase, pending: str | None, conjoined: bool, following: Sequence[Chunk]) -> None:
         """Assign one noun, given its preposition, whether a conjunction precedes it, and the following chunks."""
@@ -83,16 +90,18 @@ class RoleAssigner:
             if conjoined and clause.last_relation is not None and self._is_second_anchor(noun, after):
                 self._add_anchor(clause.last_relation, noun)
             elif self._is_recipient(following):
-                self._draft.add_anchor(noun.text)
-                clause.last_relation = "to"
+                self._add_destination(noun)
             else:
-                self.target(noun, conjoined and clause.last_relation is None)
+                self.target(noun, self._role_of_object(), conjoined and clause.last_relation is None)
             return
         self.assign_by_preposition(pending, noun, following)
 
     def assign_by_preposition(self, pending: str, noun: NounPhrase, following: Sequence[Chunk] = ()) -> None:
         """Assign the noun's role relative to the clause's objects, by the preposition before it."""
         clause = self.clause
+        if self._is_extreme(pending):
+            self._relate_extreme(noun)
+            return
         if pending == "closer":
             pending = "to" if clause.verb in DELIVERY_VERBS else "near"
         handlers = {
@@ -110,33 +119,38 @@ class RoleAssigner:
         elif pending == "inside" and noun.head in lexicon.CLOTHING and self._acts_on_people():
             self.relate("near", noun)
         elif pending in _PASSING_RELATIONS and clause.verb in DELIVERY_VERBS:
-            self._draft.add_anchor(noun.text)
+            self._draft.add_target(noun.text)
         elif self._is_route_point(pending) or (pending == "with" and clause.verb in _PAIRING_VERBS):
-            self.target(noun, conjoined=True)
+            self.target(noun, TargetRole.OBJECT, conjoined=True)
         elif pending == "with" and clause.verb in FILLING_VERBS and clause.objects:
             self._assign_loaded(noun)
         elif pending == "with":
-            if noun.is_known and (clause.objects or clause.verb is None):
+            if (noun.is_known or noun.has_determiner) and (clause.objects or clause.verb is None):
                 self._assign_after_with(noun)
         elif pending == "from" or pending in _ORIGIN_RELATIONS:
             self._assign_origin(pending, noun)
-        elif clause.last_relation in ("to", "with") or self._is_destination(pending, following):
-            self._draft.add_anchor(noun.text)
-            clause.last_relation = clause.last_relation if clause.last_relation == "with" else "to"
+        elif clause.last_relation == "to" and clause.terms.negated and clause.adds_place:
+            self._draft.exclude(noun.text)  # "put it on the table, not on the shelf"
+        elif clause.last_relation in ("to", "with") and clause.places:
+            self._relate_places(RelationTerms(pending, clause.terms.negated, clause.terms.bounds), noun)
+        elif self._is_destination(pending, following):
+            self._add_destination(noun)
             clause.between = pending == "between"
+        elif pending == "far_from" and clause.verb in PUSHING_VERBS | DELIVERY_VERBS and not clause.current_place:
+            self.relate("near", noun)  # "pull the chair away from the wall": it is there now
         else:
             if clause.pending_places and clause.verb in GO_VERBS | STOPPING_VERBS:
                 self._make_places_targets()  # "stop behind the car near the tree"
             self.relate(pending, noun)
 
     def _assign_waypoint(self, noun: NounPhrase) -> None:
-        self.target(noun)
+        self.target(noun, TargetRole.OBJECT)
         self.clause.route = True
 
     def _assign_path_end(self, noun: NounPhrase) -> None:
         """Make the end of a path a target; where a door leads or what a key opens is no target."""
         if self.clause.route:
-            self.target(noun)
+            self.target(noun, TargetRole.DESTINATION)
         else:
             self.clause.last_relation = "with"
 
@@ -148,34 +162,60 @@ class RoleAssigner:
         clause = self.clause
         if clause.by_pronoun and clause.verb in DELIVERY_VERBS and pending in _DESTINATION_RELATIONS:
             return True
+        if clause.verb in PUSHING_VERBS and clause.objects and clause.preposition.startswith(("to the ", "on to")):
+            return True  # "move the mug to the left of the plate"
+        if clause.verb in ATTACHING_VERBS and not clause.current_place:
+            return self._is_final_place(pending, following)
         return clause.verb in PLACE_VERBS and not clause.current_place and self._is_final_place(pending, following)
 
     def _is_route_point(self, pending: str) -> bool:
         return pending == "past" and self.clause.verb in GO_VERBS and bool(self.clause.objects)
 
     def _add_anchor(self, relation: str, noun: NounPhrase) -> None:
-        if relation in ("to", "with"):
-            self._draft.add_anchor(noun.text)
+        if relation == "to":
+            self._add_destination(noun, conjoined=True)
+        elif relation == "with":
+            self._add_tool(noun, conjoined=True)
         else:
             self.relate(relation, noun)
 
+    def _add_destination(self, noun: NounPhrase, conjoined: bool = False) -> None:
+        self._add_place(noun, TargetRole.DESTINATION, conjoined)
+        self.clause.last_relation = "to"
+
+    def _add_tool(self, noun: NounPhrase, conjoined: bool = False) -> None:
+        self._add_place(noun, TargetRole.TOOL, conjoined)
+        self.clause.last_relation = "with"
+
+    def _add_place(self, noun: NounPhrase, role: TargetRole, conjoined: bool) -> None:
+        self._draft.add_target(noun.text, role)
+        self.clause.places = [*self.clause.places, noun.text] if conjoined else [noun.text]
+
+    def make_tools(self, phrases: Sequence[str]) -> None:
+        """Make earlier objects tools: "take the sponge and wipe the table with it"."""
+        self._draft.roles.update(dict.fromkeys(phrases, TargetRole.TOOL))
+
     def _assign_after_with(self, noun: NounPhrase) -> None:
-        """Assign the noun after "with": the hat of "find a man with a hat" is near, a tool is an anchor."""
-        if self.clause.last_relation == "to":
-            self._draft.add_anchor(noun.text)
-        elif self.clause.verb in LOOKING_VERBS or noun.head in lexicon.PARTS:
+        """Assign the noun after "with": the hat of "find a man with a hat" is near him, a sponge is a tool."""
+        clause = self.clause
+        is_part = noun.head in lexicon.PARTS or noun.head in lexicon.CLOTHING
+        if clause.last_relation == "to" and clause.places and (is_part or self._are_people(clause.places)):
+            self._relate_places(RelationTerms("near"), noun)
+        elif (
+            clause.verb in LOOKING_VERBS
+            or is_part
+            or self._are_people(clause.objects)
+            or (clause.verb in FETCHING_VERBS and noun.head not in lexicon.HELD_TOOLS)
+        ):
             self.relate("near", noun)
         else:
-            self._draft.add_anchor(noun.text)
-            self.clause.last_relation = "with"
+            self._add_tool(noun)
 
     def _assign_loaded(self, noun: NounPhrase) -> None:
-        """Make the noun the target and the objects so far anchors: "load the van with boxes"."""
+        """Make the noun the object and the objects so far destinations: "load the van with boxes"."""
         places, self.clause.objects = self.clause.objects, []
-        self._draft.targets = [target for target in self._draft.targets if target not in places]
-        for place in places:
-            self._draft.add_anchor(place)
-        self.target(noun)
+        self._draft.roles.update(dict.fromkeys(places, TargetRole.DESTINATION))
+        self.target(noun, TargetRole.OBJECT)
 
     def _is_recipient(self, following: Sequence[Chunk]) -> bool:
         """Return True for the first noun of "hand the nurse the towel", which states the destination."""
@@ -198,42 +238,97 @@ class RoleAssigner:
             return False
         if self.clause.last_relation == "between" or self.clause.between:
             return True
+        if lexicon.is_space(noun.words) and self.clause.in_space:
+            return True
         return noun.head in lexicon.COMMON_ANCHORS and self.clause.last_relation not in ("on", "inside", "with")
 
-    def target(self, noun: NounPhrase, conjoined: bool = False) -> None:
+    def _role_of_object(self) -> TargetRole:
+        """Return the role of a verb's direct object."""
+        if self.clause.verb in AVOIDING_VERBS:
+            return TargetRole.OBSTACLE
+        if self.clause.verb in REACHING_VERBS | STOPPING_VERBS:
+            return TargetRole.DESTINATION
+        return TargetRole.TOOL if self.clause.verb == "use" else TargetRole.OBJECT
+
+    def target(self, noun: NounPhrase, role: TargetRole, conjoined: bool = False) -> None:
         """Make the noun a target and the clause's object; a conjoined noun is added to the objects."""
-        clause = self.clause
-        self._draft.add_target(noun.text, from_statement=clause.statement)
-        clause.objects = [*clause.objects, noun.text] if conjoined else [noun.text]
+        clause, phrase = self.clause, noun.text
+        if lexicon.is_space(noun.words) and role is TargetRole.OBJECT and clause.verb in COVERING_VERBS:
+            self._draft.add_context(phrase)  # "clean the kitchen": every object in it
+            phrase = "object"
+        self._draft.add_target(phrase, role, from_statement=clause.statement)
+        clause.objects = [*clause.objects, phrase] if conjoined else [phrase]
         clause.conjoined, clause.by_pronoun = conjoined, False
-        clause.last_relation = None
-        clause.superlative = noun.superlative or (conjoined and clause.superlative)
+        clause.last_relation, clause.places = None, []
+        clause.superlative = noun.distance_superlative or (clause.superlative if conjoined else None)
         clause.is_part = noun.head in lexicon.PARTS
         pending_places, clause.pending_places = clause.pending_places, []
-        for relation, anchor in pending_places:
-            self.relate(relation, anchor)
+        for terms, anchor in pending_places:
+            self._relate(terms, anchor)
 
     def relate(self, relation: str, noun: NounPhrase) -> None:
         """Relate the clause's objects to the noun; a place named before any object is kept for the next object."""
+        self._relate(RelationTerms(relation, self.clause.terms.negated, self.clause.terms.bounds), noun)
+
+    def _relate(self, terms: RelationTerms, noun: NounPhrase) -> None:
         clause = self.clause
-        clause.last_relation = relation
+        clause.last_relation = terms.relation
+        clause.in_space = self._is_context(terms, noun)
         if not clause.objects:
-            clause.pending_places.append((relation, noun))
-            return
-        self._draft.add_relation(relation, clause.objects, noun.text)
+            clause.pending_places.append((terms, noun))
+        elif clause.in_space:
+            self._draft.add_context(noun.text)
+        else:
+            self._draft.add_relation(terms, clause.objects, noun.text)
+
+    def _relate_places(self, terms: RelationTerms, noun: NounPhrase) -> None:
+        """Relate the destinations or tools named last: "put it on the table by the window"."""
+        if self._is_context(terms, noun):
+            self._draft.add_context(noun.text)
+        else:
+            self._draft.add_relation(terms, self.clause.places, noun.text)
+
+    def _is_context(self, terms: RelationTerms, noun: NounPhrase) -> bool:
+        is_context = terms.relation == "inside" and lexicon.is_space(noun.words)
+        if is_context and terms.negated:
+            self._draft.warnings.append(f"not in {noun.text!r}: a place is not evaluated, the exception is dropped")
+        return is_context
+
+    def _are_people(self, phrases: Sequence[str]) -> bool:
+        return any(phrase.split()[-1] in lexicon.PEOPLE for phrase in phrases)
+
+    def _is_extreme(self, pending: str) -> bool:
+        """Return True for "the nearest chair to", "the farthest cone from"."""
+        superlative = SUPERLATIVES.get(self.clause.superlative or "")
+        is_farthest = superlative is Superlative.FARTHEST and pending == "from"
+        return bool(self.clause.objects) and (is_farthest or (superlative is not None and pending == "to"))
+
+    def _relate_extreme(self, noun: NounPhrase) -> None:
+        clause = self.clause
+        word = clause.superlative or ""
+        for phrase in list(clause.objects):
+            self.rename(phrase, " ".join(each for each in phrase.split() if each != word))
+        farthest = SUPERLATIVES[word] is Superlative.FARTHEST
+        clause.superlative = None
+        self.relate(Predicate.FARTHEST_FROM if farthest else Predicate.CLOSEST_TO, noun)
+
+    def rename(self, phrase: str, new: str) -> None:
+        """Change the description of an object that the sentence has named."""
+        self._draft.rename(phrase, new)
+        for phrases in (self.clause.objects, self.clause.referents, self.clause.places):
+            phrases[:] = [new if each == phrase else each for each in phrases]
 
     def _destination(self, noun: NounPhrase) -> None:
         clause = self.clause
         if clause.verb in GO_VERBS | STOPPING_VERBS:
             self._make_places_targets()  # "between the shelves to the exit"
-        if clause.superlative and clause.objects:
-            self.relate(Predicate.CLOSEST_TO, noun)
-        elif clause.route or not clause.objects or clause.verb in GO_VERBS - MOVING_VERBS:
-            self.target(noun, conjoined=bool(clause.objects))
+        if clause.route or not clause.objects or clause.verb in GO_VERBS - MOVING_VERBS:
+            going = clause.route or clause.verb is None or clause.verb in GO_VERBS | STOPPING_VERBS | DELIVERY_VERBS
+            role = TargetRole.DESTINATION if going else TargetRole.OBJECT
+            self.target(noun, role, conjoined=bool(clause.objects))
             clause.route = False
         else:
-            self._draft.add_anchor(noun.text)
-            clause.last_relation = "to"
+            self._add_destination(noun)
 
     def _assign_searched_object(self, noun: NounPhrase) -> None:
         """Make the noun the target, near the searched places; a defect to inspect for is no object."""
@@ -242,27 +337,33 @@ class RoleAssigner:
             return
         if clause.objects and clause.verb in SEARCH_VERBS:
             places, clause.objects = clause.objects, []
-            self._draft.targets = [target for target in self._draft.targets if target not in places]
-            self.target(noun)
+            self._draft.remove_targets(places)
+            self.target(noun, TargetRole.OBJECT)
             for place in map(phrase_from_text, places):
-                self.relate("inside" if place.head in lexicon.CONTAINERS | lexicon.ROOMS else "near", place)
+                if place.text != "object":  # a room is context
+                    self.relate("inside" if place.head in lexicon.CONTAINERS else "near", place)
         elif not clause.objects:
-            self.target(noun)
+            self.target(noun, TargetRole.OBJECT)
 
     def _assign_after_of(self, noun: NounPhrase) -> None:
         clause = self.clause
         if clause.pending_places:
             return
         if not clause.objects:
-            self.target(noun)
+            self.target(noun, self._role_of_object())
+        elif lexicon.is_space(noun.words):
+            self._draft.add_context(noun.text)
         elif (clause.is_part or noun.has_determiner) and clause.last_relation is None:
             self.relate("near", noun)
 
     def _assign_origin(self, pending: str, noun: NounPhrase) -> None:
         going = self.clause.verb in GO_VERBS - MOVING_VERBS and self.clause.objects
         if going or self.clause.last_relation == "with":
-            self._draft.add_anchor(noun.text)
-        elif pending in _ORIGIN_RELATIONS:
+            return
+        if pending in _ORIGIN_RELATIONS:
             self.relate(_ORIGIN_RELATIONS[pending], noun)
+        elif noun.head in lexicon.PEOPLE:
+            self.relate("near", noun)
         else:
-            self.relate("inside" if noun.head in lexicon.CONTAINERS | lexicon.ROOMS else "on", noun)
+            encloses = noun.head in lexicon.CONTAINERS or lexicon.is_space(noun.words)
+            self.relate("inside" if encloses else "on", noun)

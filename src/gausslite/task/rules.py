@@ -8,7 +8,7 @@ from gausslite.domain.task_limits import EXAMPLE, require_task_text
 from gausslite.task.chunk import Chunk, ChunkKind
 from gausslite.task.chunker import chunk_sentence
 from gausslite.task.graph_builder import build_draft
-from gausslite.task.graph_grounding import grounded_graph
+from gausslite.task.graph_grounding import ParsedPhrases, grounded_graph
 from gausslite.task.parser import normalise_text
 
 
@@ -23,7 +23,16 @@ class RuleParser:
         draft = build_draft(chunks)
         if not draft.targets:
             raise TaskError(_no_object_message(text, tuple(draft.excluded)))
-        return grounded_graph(text, draft.targets, draft.anchors, draft.relations, draft.warnings, draft)
+        parsed = ParsedPhrases(
+            {target: draft.roles[target] for target in draft.targets},
+            draft.anchors,
+            draft.relations,
+            draft.excluded,
+            draft.context,
+            draft.warnings,
+            draft.mentions,
+        )
+        return grounded_graph(text, parsed, draft)
 
 
 def _require_structure(text: str, chunks: list[Chunk]) -> None:

@@ -6,9 +6,11 @@ from collections.abc import Sequence
 from typing import Final
 
 from gausslite.task import lexicon
+from gausslite.task.attributes import is_attribute
 from gausslite.task.part_of_speech import Tag, best_tags
 from gausslite.task.prepositions import PREPOSITIONS
 from gausslite.task.singular import PLURAL_ONLY, singular
+from gausslite.task.tokenizer import split_bounds
 from gausslite.task.verb_forms import base_of_ed, base_of_ing, base_of_s, verb_base
 from gausslite.task.verbs import GO_VERBS, SEARCH_VERBS, TOOL_VERBS, VERBS
 from gausslite.task.word_set import word_set
@@ -60,6 +62,8 @@ _CLOSED_LINES: Final = (
 )
 # "go stand", "help clean": the second verb is the instruction
 _LEADING_VERBS: Final = word_set("go come help")
+_NEGATED_COMMANDS: Final = frozenset({"do not", "don't", "dont", "never", "not to"})
+_MODALS_AFTER_ONE: Final = word_set("can can't cannot could should must may might would has needs")
 _USUALLY_VERBS: Final = GO_VERBS | TOOL_VERBS | SEARCH_VERBS | word_set("stop hand")
 _NEVER_NOUNS: Final = GO_VERBS | word_set(
     "belong bring put take get find fetch make keep give hold grab need want do lie be say see hear "
@@ -109,13 +113,17 @@ def is_adverb(word: str) -> bool:
 
 
 def _tag_options(before: str, word: str, after: str) -> Options:
-    if before in _LEADING_VERBS and word in VERBS:
+    if before in _LEADING_VERBS | _NEGATED_COMMANDS and word in VERBS:
         return {Tag.VERB: 0}
     if (word, after) in lexicon.COMPOUND_OPENERS:
         return {Tag.ADJECTIVE: 0}
+    if before == "without" and base_of_ing(word) is not None:
+        return {Tag.GERUND: 0}
+    if word == "one" and after in _MODALS_AFTER_ONE:
+        return {Tag.PRONOUN: 0}
     if after == "of" and word in ("one", "half"):
         return {Tag.DETERMINER: 0} if word == "one" else {Tag.NOUN: 0}
-    closed = _CLOSED.get(word)
+    closed = _CLOSED.get(split_bounds(word)[0])
     if closed is not None:
         return closed
     if word[0].isdigit():
@@ -124,7 +132,7 @@ def _tag_options(before: str, word: str, after: str) -> Options:
         return {Tag.ADJECTIVE: 0, Tag.DETERMINER: 0}
     is_noun = singular(word) in _NOUNS or word in _NOUNS or word in PLURAL_ONLY
     options = _verb_options(before, word, is_noun)
-    if word in lexicon.ADJECTIVES:
+    if word in lexicon.ADJECTIVES or is_attribute(word):
         options[Tag.ADJECTIVE] = 0
     if is_noun:
         options[Tag.NOUN] = 5 if before == "to" and word in _USUALLY_VERBS else 0

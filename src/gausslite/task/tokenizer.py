@@ -6,10 +6,12 @@ import re
 from typing import Final
 
 from gausslite.task import lexicon
+from gausslite.task.distances import Bounds, bounds_of
 from gausslite.task.idioms import replace_idioms
 from gausslite.task.prepositions import PREPOSITIONS
 
 _TOKEN: Final = re.compile(r"[^\W\d_][\w'’-]*|\d[\w.]*|[,/&+;.!?:()]")
+_BOUNDS_SIGN: Final = "@"  # no token contains it
 _UNITS: Final = [
     *(tuple(preposition.split()) for preposition in PREPOSITIONS if " " in preposition),
     *(negation for negation in lexicon.NEGATIONS if len(negation) > 1),
@@ -31,9 +33,36 @@ def lexical_units(text: str) -> list[str]:
     tokens = tokenize(text)
     units: list[str] = []
     start = 0
+    bounds = ""
     while start < len(tokens):
+        marked = bounds_of(tokens[start])
+        if marked is not None:
+            bounds = f"{_BOUNDS_SIGN}{tokens[start]}"
+            if marked.stands_alone:
+                units.append(f"near{bounds}")
+                bounds = ""
+            start += 1
+            continue
         compounds = _COMPOUNDS.get(tokens[start], ())
         length = next((len(unit) for unit in compounds if tuple(tokens[start : start + len(unit)]) == unit), 1)
-        units.append(" ".join(tokens[start : start + length]))
+        if length > 1 and tokens[start + length - 1] == "to" and _begins_preposition(tokens, start + length - 1):
+            length -= 1  # "not to the left of"
+        unit = " ".join(tokens[start : start + length])
+        units.append(unit + bounds if unit in PREPOSITIONS else unit)
+        bounds = ""
         start += length
     return units
+
+
+def split_bounds(unit: str) -> tuple[str, Bounds | None]:
+    """Return a preposition without its distance, and the distance."""
+    text, _, marker = unit.partition(_BOUNDS_SIGN)
+    return text, bounds_of(marker)
+
+
+def _begins_preposition(tokens: list[str], start: int) -> bool:
+    """Return True if a preposition of several words begins here."""
+    compounds = _COMPOUNDS.get(tokens[start], ())
+    return any(
+        " ".join(unit) in PREPOSITIONS and tuple(tokens[start : start + len(unit)]) == unit for unit in compounds
+    )

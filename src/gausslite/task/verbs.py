@@ -47,14 +47,43 @@ ASPECT_VERBS: Final = word_set(
     "start stop begin keep continue finish mind avoid try resume go come consider need want like help"
 )
 # "load the van with boxes": the boxes are the target
-FILLING_VERBS: Final = word_set("load reload stock restock")
+FILLING_VERBS: Final = word_set("load reload stock restock fill refill")
 # "the mugs belong in the cupboard", "the boxes go on the shelf": the subject is the target
 BELONGING_VERBS: Final = word_set("belong go come")
 # "the shelf that holds the cans": the object is near the subject, unlike "the key that opens the cabinet"
 HOLDING_VERBS: Final = word_set(
     "hold contain have carry wear support cover store house surround touch face hug hide show display"
 )
+# "tape the note on the door", "move the mug to the left of the plate": the place is the destination
+ATTACHING_VERBS: Final = word_set(
+    "connect attach mount fasten screw glue tape weld solder bolt nail clamp tie hook clip pin staple deliver"
+)
+PUSHING_VERBS: Final = word_set("move shift push slide drag pull roll nudge place put")
+# "bring the box with the label": what the object has, not a tool
+FETCHING_VERBS: Final = word_set(
+    "bring take get fetch pick grab give hand pass choose select want need carry show deliver collect retrieve lift"
+)
+# "the mug that does not stand on the table"
+POSTURE_VERBS: Final = word_set("hang stand sit lie rest lean belong locate live stick place mount park")
+# negated, these mean contact or harm: the object is an obstacle
+CONTACT_VERBS: Final = word_set(
+    "touch hit bump knock collide mess tamper fiddle meddle interfere stamp "
+    "break damage scratch crush spill step disturb wake scare move erase strike ram graze "
+    "trample squash harm hurt shatter smash crash kick nudge tip topple tread stain rattle interact contact "
+    "brush scrape dent smudge burn tear rip injure stumble trip startle frighten endanger tilt overturn upset crack"
+)
+# the direct object is where the robot goes
+REACHING_VERBS: Final = word_set("approach reach enter visit board ascend climb")
+# the robot keeps away from the direct object
+AVOIDING_VERBS: Final = word_set("avoid dodge evade circumvent bypass mind beware")
 DELIVERY_VERBS: Final = CARRY_VERBS | PLACE_VERBS
+# "clean the kitchen": everything in it
+COVERING_VERBS: Final = (
+    SEARCH_VERBS
+    | INSPECTION_VERBS
+    | TOOL_VERBS
+    | word_set("map reconstruct photograph capture record film model digitize monitor declutter tour roam watch empty")
+)
 _OTHER_VERBS: Final = word_set(
     # manipulation
     "pick grab grasp lift hold collect gather retrieve remove catch seize lower raise open close shut press push turn "
@@ -108,4 +137,4 @@ _OTHER_VERBS: Final = word_set(
     "collapse tumble topple trip slump arrive forgive excuse pardon thank appreciate trouble bother surprise show "
     "appear seem look become weave bind sting deal meet swell"
 )
-VERBS: Final = GO_VERBS | DELIVERY_VERBS | TOOL_VERBS | SEARCH_VERBS | INSPECTION_VERBS | _OTHER_VERBS
+VERBS: Final = GO_VERBS | DELIVERY_VERBS | CONTACT_VERBS | TOOL_VERBS | SEARCH_VERBS | INSPECTION_VERBS | _OTHER_VERBS

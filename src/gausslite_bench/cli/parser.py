@@ -47,6 +47,8 @@ def score_lines(score: ParserScore) -> str:
     lines = [
         f"{score.backend}: {score.sentences} sentences, exact graphs {score.exact:.1%}, "
         f"targets {score.target_set:.1%}, anchors {score.anchor_set:.1%}",
+        f"  roles {score.role_set:.1%}, relations {score.relation_set:.1%}, attributes {score.attribute_set:.1%}, "
+        f"excluded objects {score.excluded_set:.1%}; {score.reversed_relations} relations negated wrongly",
         f"  {score.median_ms:.2f} ms per sentence (median), {score.slowest_ms:.2f} ms maximum",
     ]
     if score.by_fallback:

@@ -15,7 +15,7 @@ from gausslite.domain.frame import Frame
 from gausslite.domain.pose import UpAxis
 from gausslite.domain.region import Region
 from gausslite.domain.relevance import Detection
-from gausslite.domain.task import TaskGraph
+from gausslite.domain.task import TaskGraph, noun_of
 from gausslite.evaluation.views import MIN_ROI_PIXELS
 from gausslite.perception.detect import Detector, Segmenter
 from gausslite.perception.evidence import EvidenceSettings
@@ -145,8 +145,11 @@ class _TaskEvaluation:
 
     def process(self, frame: Frame, truths: Mapping[str, Bool[ndarray, "h w"]]) -> FrameMasks:
         graph = self._query.graph
-        detections = [each for each in self._detector.detect(frame, graph.queries) if each.phrase in graph.targets]
-        masks = {PerceptionStage.DETECTED: merge_detections(detections, graph.targets, frame).roi}
+        detections = [
+            each for each in self._detector.detect(frame, graph.queries) if each.phrase in map(noun_of, graph.targets)
+        ]
+        nouns = [noun_of(target) for target in graph.targets]
+        masks = {PerceptionStage.DETECTED: merge_detections(detections, nouns, frame).roi}
         masks |= {stage: estimator.estimate(frame).relevance.roi for stage, estimator in self._estimators.items()}
         has_depth = frame.depth_m > 0
         objects = {name: truths[name] & has_depth for name in self._query.objects}

@@ -194,6 +194,21 @@ def test_the_object_on_the_desk_is_not_the_desk():
     assert np.array_equal(relevance.roi, regions["book"].mask(frame_at()))
 
 
+def test_pixels_of_excluded_objects_do_not_count():
+    regions = {"book": BallRegion((-0.3, 0.0, 2.0), 0.15), "laptop": BallRegion((0.3, 0.0, 2.0), 0.2)}
+    graph = TaskGraph("id", "everything except the laptop", ("object",), (), (), excluded=("laptop",))
+    relevance = TaskRelevanceEstimator(graph, RegionDetector(regions)).estimate(frame_at()).relevance
+    assert np.array_equal(relevance.roi, regions["book"].mask(frame_at()))
+
+
+def test_an_excluded_object_in_front_of_a_target_is_cut_out():
+    regions = {"desk": BallRegion((0.0, 0.0, 2.0), 0.4), "laptop": BallRegion((0.0, 0.0, 2.0), 0.1)}
+    graph = TaskGraph("id", "the desk except the laptop", ("desk",), (), (), excluded=("laptop",))
+    relevance = TaskRelevanceEstimator(graph, RegionDetector(regions)).estimate(frame_at()).relevance
+    frame = frame_at()
+    assert np.array_equal(relevance.roi, regions["desk"].mask(frame) & ~regions["laptop"].mask(frame))
+
+
 def test_region_detector_matches_head_nouns_and_lists_unsupported_queries():
     detector = RegionDetector({"mug_1": MUG, "mug_2": BallRegion((0.4, 0, 2), 0.1), "wall": BallRegion((0, 0, 2), 3)})
     assert len(detector.detect(frame_at(), ["red mug"])) == 2

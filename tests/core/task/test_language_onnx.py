@@ -18,7 +18,7 @@ from gausslite.domain.errors import LanguageModelError, ModelFileError
 from gausslite.task.backends import Backend, BackendSettings, open_parser
 from gausslite.task.language.model import Message, Role
 from gausslite.task.language.onnx import OnnxLanguageModel, phi3_chat
-from gausslite.task.language.prompt import MAX_PHRASE_CHARS, MAX_PHRASES, MAX_RELATIONS, messages_for
+from gausslite.task.language.prompt import MAX_PHRASE_CHARS, MAX_PHRASES, MAX_RELATIONS, PHRASE_KEYS, messages_for
 from gausslite_bench.parser_scores import load_sentences
 
 TASKS = int(os.environ.get("GAUSSLITE_ONNX_TASKS", "5"))
@@ -39,20 +39,19 @@ def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def require_schema(answer: str) -> None:
     found = json.loads(answer)
-    assert list(found) == ["targets", "anchors", "relations"]
-    assert 1 <= len(found["targets"]) <= MAX_PHRASES
-    assert len(found["anchors"]) <= MAX_PHRASES
+    assert list(found) == [*PHRASE_KEYS, "relations"]
+    assert all(len(found[key]) <= MAX_PHRASES for key in PHRASE_KEYS)
     assert len(found["relations"]) <= MAX_RELATIONS
-    phrases = [*found["targets"], *found["anchors"]]
+    phrases = [phrase for key in PHRASE_KEYS for phrase in found[key]]
     for relation in found["relations"]:
-        assert set(relation) == {"predicate", "target", "anchor"}
+        assert set(relation) == {"predicate", "target", "anchor", "negated", "min_m", "max_m"}
         phrases += [relation["target"], relation["anchor"]]
     assert all(1 <= len(phrase) <= MAX_PHRASE_CHARS for phrase in phrases)
 
 
 @needs_genai
 def test_every_answer_is_valid_by_the_schema(tiny: Path) -> None:
-    model = OnnxLanguageModel(tiny, timeout_s=60.0, max_answer_tokens=2400)
+    model = OnnxLanguageModel(tiny, timeout_s=60.0, max_answer_tokens=8000)
     answers = [model.complete(messages_for(each.text)) for each in load_sentences()[:TASKS]]
     for answer in answers:
         require_schema(answer)

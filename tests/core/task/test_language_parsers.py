@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gausslite.domain.errors import InvalidInputError, LanguageModelError, TaskError
-from gausslite.domain.task import Predicate, Relation
+from gausslite.domain.task import Predicate, Relation, TargetRole
 from gausslite.domain.task_limits import require_graph
 from gausslite.task.backends import Backend, BackendSettings, open_parser
 from gausslite.task.language.answer import parse_answer
@@ -53,12 +53,12 @@ def test_a_correct_answer_equals_the_graph_of_the_rules():
 @pytest.mark.parametrize(
     ("task", "targets", "kept"),
     [
-        ("Pick up the mug without touching the vase", ["mug", "vase"], ("mug",)),
+        ("Pick up the mug and ignore the vase", ["mug", "vase"], ("mug",)),
         ("Map the chairs except the stool", ["chair", "stools"], ("chair",)),
-        ("Clean the desk but leave the old laptop alone", ["desk", "laptop"], ("desk",)),
+        ("Clean the desk but skip the old laptop", ["desk", "laptop"], ("desk",)),
         ("Ignore the glass, bring the plastic cup", ["plastic cup", "glass"], ("plastic cup",)),
         ("Take the red mug, not the blue mug", ["mug"], ("mug",)),
-        ("Take the red mug, not the blue mug", ["red mug", "blue mug"], ("red mug",)),
+        ("Take the red mug, not the blue mug", ["red mug", "blue mug"], ("mug",)),
         ("Take everything off the table except the tray", ["object", "tray"], ("object",)),
         ("Avoid the trash cans", ["trash can"], ("trash can",)),
     ],
@@ -72,7 +72,25 @@ def test_a_target_that_the_sentence_excludes_is_dropped_and_named(task, targets,
 
 def test_an_answer_of_excluded_objects_alone_is_refused():
     with pytest.raises(LanguageModelError, match="expected at least one object"):
-        parse_answer("Pick up the mug without touching the vase", answer(["vase"], []))
+        parse_answer("Pick up the mug, not the vase", answer(["vase"], []))
+
+
+def test_roles_negations_and_distances_of_an_answer_are_kept():
+    task = "Put the mug that is within 2 m of the door and not on the table into the red box, ignore the cat"
+    near = {**relation("near", anchor="door"), "max_m": 2, "min_m": None, "negated": False}
+    not_on = {**relation(), "negated": True}
+    value = {"targets": ["mug"], "destinations": ["red box"], "anchors": ["door", "table"], "excluded": ["cat"]}
+    graph = parse_answer(task, json.dumps({**value, "relations": [near, not_on]}))
+    assert graph.is_equivalent_to(RuleParser().parse(task))
+    assert graph.warnings == ()
+
+
+def test_the_rules_correct_an_answer_that_reverses_the_sentence():
+    graph = parse_answer("Find the mug that is not on the table", answer(["mug"], ["table"], relation()))
+    assert graph.relations == (Relation(Predicate.ON, "mug", "table", negated=True),)
+    assert "contradicts the sentence" in graph.warnings[0]
+    graph = parse_answer("Take the mug without touching the vase", answer(["mug", "vase"], []))
+    assert graph.role_of("vase") is TargetRole.OBSTACLE
 
 
 def test_an_answer_within_prose_is_found():

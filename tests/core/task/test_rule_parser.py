@@ -2,47 +2,46 @@
 
 from __future__ import annotations
 
-import json
 import time
+from pathlib import Path
 
 import pytest
 
+from gausslite.codec.task_json import graph_as_json
 from gausslite.domain.errors import TaskError
-from gausslite.domain.task import Predicate, Relation, TaskGraph
+from gausslite.domain.task import Predicate, Relation, TargetRole, TaskGraph
 from gausslite.domain.task_limits import require_graph
 from gausslite.task import lexicon
+from gausslite.task.attributes import COLOURS
 from gausslite.task.nouns import COMMON_ANCHORS
 from gausslite.task.parser import task_id_of
 from gausslite.task.rules import RuleParser
 from gausslite.task.singular import singular
-from gausslite_bench.parser_scores import SENTENCES as BENCH_SENTENCES
+from gausslite_bench.parser_scores import load_sentences, matching_parts, score_parser
 
-SENTENCES = json.loads(BENCH_SENTENCES.read_text(encoding="utf-8"))
+SENTENCES = load_sentences()
 PAPER_SENTENCES = 6
+DAILY_TASKS = Path(__file__).with_name("daily_tasks.json")
 
 
-def as_row(text: str) -> dict[str, object]:
-    graph = RuleParser().parse(text)
-    relations = [[str(each.predicate), each.target, each.anchor] for each in graph.relations]
-    return {"text": text, "targets": list(graph.targets), "anchors": list(graph.anchors), "relations": relations}
-
-
-def as_sets(row: dict[str, object]) -> tuple[set[str], set[str], set[tuple[str, ...]]]:
-    """Return sets, because the order in a graph is irrelevant."""
-    return set(row["targets"]), set(row["anchors"]), {tuple(relation) for relation in row["relations"]}
-
-
-@pytest.mark.parametrize("row", SENTENCES[:PAPER_SENTENCES], ids=lambda row: row["text"])
-def test_the_papers_tasks(row):
-    assert as_row(row["text"]) == row
+@pytest.mark.parametrize("expected", SENTENCES[:PAPER_SENTENCES], ids=lambda graph: graph.text)
+def test_the_papers_tasks(expected):
+    assert RuleParser().parse(expected.text).is_equivalent_to(expected)
 
 
 def test_graphs_of_ordinary_sentences_are_exact():
-    wrong = [row["text"] for row in SENTENCES if as_sets(as_row(row["text"])) != as_sets(row)]
-    share = 1 - len(wrong) / len(SENTENCES)
-    print(f"exact graphs: {share:.1%} of {len(SENTENCES)}; wrong: {wrong}")
-    assert len(SENTENCES) >= 600
-    assert share >= 0.95, wrong
+    score = score_parser("rules", RuleParser(), SENTENCES)
+    print(f"exact graphs: {score.exact:.1%} of {score.sentences}; wrong: {score.wrong}")
+    assert score.sentences >= 600
+    assert score.exact >= 0.95, score.wrong
+    assert score.reversed_relations == 0
+
+
+@pytest.mark.parametrize("expected", load_sentences(DAILY_TASKS), ids=lambda graph: graph.text)
+def test_daily_tasks(expected):
+    parsed = RuleParser().parse(expected.text)
+    assert all(matching_parts(expected, parsed)), graph_as_json(parsed)
+    assert set(parsed.context) >= set(expected.context)
 
 
 FRAMES = [
@@ -59,24 +58,26 @@ FRAMES = [
 def test_every_known_noun_is_parsed_as_a_noun(at):
     no_objects = lexicon.PLACES | lexicon.MEASURES | lexicon.ADDRESSEES | lexicon.ROUTES | lexicon.TASK_NOUNS
     parser, adjective = RuleParser(), "red " if "red" in FRAMES[at] else ""
-    for noun in sorted(lexicon.NOUNS - no_objects - lexicon.ADJECTIVES)[at :: len(FRAMES)]:
-        assert adjective + singular(noun) in parser.parse(FRAMES[at].format(noun)).targets
+    for noun in sorted(lexicon.NOUNS - no_objects - lexicon.ADJECTIVES - COLOURS)[at :: len(FRAMES)]:
+        graph = parser.parse(FRAMES[at].format(noun))
+        assert singular(noun) in (*graph.targets, *graph.context)
+        assert not adjective or any(each.colour == "red" for each in graph.attributes)
 
 
 def test_a_sentence_takes_less_than_10_ms():
     parser = RuleParser()
     parser.parse("warm up the table")
     durations = []
-    for row in SENTENCES:
+    for each in SENTENCES:
         started = time.thread_time()  # excludes time of other processes
-        parser.parse(row["text"])
+        parser.parse(each.text)
         durations.append(time.thread_time() - started)
     assert sorted(durations)[len(durations) // 2] < 0.010
 
 
 @pytest.mark.parametrize(
     "text",
-    ["", "   ", "asdf qwer", "pick up", "go and clean", "!?!", "12 34", "please", "Do not touch the vase", "red"],
+    ["", "   ", "asdf qwer", "pick up", "go and clean", "!?!", "12 34", "please", "Ignore the vase", "red"],
 )
 def test_text_without_an_object_is_refused_in_one_line(text):
     with pytest.raises(TaskError, match=r"expected .* names an object, such as") as caught:
@@ -110,27 +111,41 @@ def test_a_phrase_that_is_too_long_is_refused():
 @pytest.mark.parametrize(
     ("text", "excluded"),
     [
-        ("Pick up the mug without touching the vase", "vase"),
         ("Ignore people and map the chairs", "person"),
-        ("Go to the door without bumping into the table", "table"),
         ("Map the chairs except the stool", "stool"),
+        ("Clean the desk but skip the laptop", "laptop"),
+        ("Harvest the tomatoes but leave the cucumbers", "cucumber"),
+    ],
+)
+def test_excluded_objects_are_no_targets(text, excluded):
+    graph = RuleParser().parse(text)
+    assert excluded not in (*graph.targets, *graph.anchors)
+    assert graph.excluded == (excluded,)
+
+
+@pytest.mark.parametrize(
+    ("text", "obstacle"),
+    [
+        ("Pick up the mug without touching the vase", "vase"),
+        ("Go to the door without bumping into the table", "table"),
         ("Don't touch the lamp, pick up the book", "lamp"),
         ("Clean the desk but leave the laptop alone", "laptop"),
         ("Be careful not to break the bowl and pick up the spoon", "bowl"),
+        ("Do not touch the vase", "vase"),
     ],
 )
-def test_excluded_objects_are_no_targets_with_a_warning(text, excluded):
+def test_objects_not_to_be_touched_are_obstacles(text, obstacle):
     graph = RuleParser().parse(text)
-    assert excluded not in graph.queries
-    assert any(repr(excluded) in warning for warning in graph.warnings)
+    assert graph.role_of(obstacle) is TargetRole.OBSTACLE
+    assert graph.excluded == ()
 
 
 @pytest.mark.parametrize(
     ("text", "targets", "anchors"),
     [
         ("Pick this up", ("object",), ()),
-        ("Put that on the tray", ("object",), ("tray",)),
-        ("Leave it on the porch", ("object",), ("porch",)),
+        ("Put that on the tray", ("object", "tray"), ()),
+        ("Leave it on the porch", ("object", "porch"), ()),
         ("Clean them", ("object",), ()),
     ],
 )
@@ -167,11 +182,53 @@ def test_an_unknown_relation_becomes_near_with_a_warning():
     assert graph.warnings == ("'opposite' 'couch' is not a known relation: treated as near",)
 
 
-def test_far_from_does_not_become_near():
-    graph = RuleParser().parse("Find the chair far from the door")
-    assert graph.relations == ()
-    assert graph.anchors == ("door",)
-    assert len(graph.warnings) == 1
+@pytest.mark.parametrize(
+    ("text", "relation"),
+    [
+        ("Find the chair far from the door", Relation(Predicate.NEAR, "chair", "door", negated=True)),
+        ("Find the cup that is not on the table", Relation(Predicate.ON, "cup", "table", negated=True)),
+        ("Find the cup that isn't on the table", Relation(Predicate.ON, "cup", "table", negated=True)),
+        ("Find the cup not to the left of the table", Relation(Predicate.LEFT_OF, "cup", "table", negated=True)),
+        ("Find the box outside the crate", Relation(Predicate.INSIDE, "box", "crate", negated=True)),
+        ("Find the worker without a helmet", Relation(Predicate.NEAR, "worker", "helmet", negated=True)),
+        ("Find the worker who isn't wearing a helmet", Relation(Predicate.NEAR, "worker", "helmet", negated=True)),
+    ],
+)
+def test_a_negated_relation_is_never_read_as_its_opposite(text, relation):
+    assert RuleParser().parse(text).relations == (relation,)
+
+
+@pytest.mark.parametrize(
+    ("phrase", "predicate", "min_m", "max_m"),
+    [
+        ("1.5 m from", Predicate.NEAR, 1.5, 1.5),
+        ("no further than a metre from", Predicate.NEAR, None, 1.0),
+        ("within 2m of", Predicate.NEAR, None, 2.0),
+        ("at least two feet away from", Predicate.NEAR, 0.61, None),
+        ("no closer than 30 cm to", Predicate.NEAR, 0.3, None),
+        ("between 1 and 2 metres from", Predicate.NEAR, 1.0, 2.0),
+        ("half a metre behind", Predicate.BEHIND, 0.5, 0.5),
+        ("less than 3 steps to the left of", Predicate.LEFT_OF, None, 2.25),
+    ],
+)
+def test_distances_bound_a_relation(phrase, predicate, min_m, max_m):
+    graph = RuleParser().parse(f"Find the mug {phrase} the door")
+    assert graph.relations == (Relation(predicate, "mug", "door", False, min_m, max_m),)
+
+
+@pytest.mark.parametrize(
+    ("text", "word"),
+    [
+        ("Open the second drawer", "second"),
+        ("Take the oldest box", "oldest"),
+        ("Find the mug a few metres from the door", "door"),
+        ("Pick up all mugs except the red one near the sink", "sink"),
+    ],
+)
+def test_what_is_not_understood_is_a_warning(text, word):
+    graph = RuleParser().parse(text)
+    assert any(word in warning for warning in graph.warnings)
+    assert all(word not in name for name in (*graph.queries, *graph.excluded))
 
 
 def test_spellings_of_one_task_have_one_id():

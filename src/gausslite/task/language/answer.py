@@ -6,13 +6,23 @@ import json
 from typing import Any, Final, NoReturn
 
 from gausslite.domain.errors import LanguageModelError, TaskError
-from gausslite.domain.task import Predicate, Relation, TaskGraph
-from gausslite.task.graph_grounding import grounded_graph
+from gausslite.domain.task import Predicate, Relation, TargetRole, TaskGraph
+from gausslite.task.graph_grounding import ParsedPhrases, grounded_graph
 from gausslite.task.language.model import MAX_ANSWER_BYTES
-from gausslite.task.language.prompt import MAX_PHRASE_CHARS, MAX_PHRASES, MAX_RELATIONS
+from gausslite.task.language.prompt import (
+    MAX_DISTANCE_M,
+    MAX_PHRASE_CHARS,
+    MAX_PHRASES,
+    MAX_RELATIONS,
+    PHRASE_KEYS,
+    ROLE_KEYS,
+)
 
-_KEYS: Final = frozenset({"targets", "anchors", "relations"})
-_RELATION_KEYS: Final = frozenset({"predicate", "target", "anchor"})
+# other keys of the schema may be missing in answers of servers that do not enforce it
+_REQUIRED_KEYS: Final = frozenset({"targets", "anchors", "relations"})
+_KEYS: Final = frozenset({*PHRASE_KEYS, "relations"})
+_REQUIRED_RELATION_KEYS: Final = frozenset({"predicate", "target", "anchor"})
+_RELATION_KEYS: Final = _REQUIRED_RELATION_KEYS | {"negated", "min_m", "max_m"}
 
 
 def parse_answer(task: str, answer: str) -> TaskGraph:
@@ -21,11 +31,22 @@ def parse_answer(task: str, answer: str) -> TaskGraph:
     Raises LanguageModelError if the answer violates the schema or contains no target that the task names.
     """
     fields = _first_object(answer)
-    if fields.keys() != _KEYS:
+    if not _REQUIRED_KEYS <= fields.keys() <= _KEYS:
         _refuse(f"expected the keys {', '.join(sorted(_KEYS))}, got {len(fields)} others")
-    targets, anchors = (_phrases(role, fields[role]) for role in ("targets", "anchors"))
+    phrases = {key: _phrases(key, fields.get(key, [])) for key in PHRASE_KEYS}
+    roles: dict[str, TargetRole] = {}
+    for key, role in ROLE_KEYS.items():
+        for phrase in phrases[key]:
+            roles.setdefault(phrase, role)
+    parsed = ParsedPhrases(
+        targets=roles,
+        anchors=phrases["anchors"],
+        relations=_relations(fields["relations"]),
+        excluded=phrases["excluded"],
+        context=phrases["context"],
+    )
     try:
-        return grounded_graph(task, targets, anchors, _relations(fields["relations"]))
+        return grounded_graph(task, parsed)
     except TaskError as error:
         raise LanguageModelError(f"language model: {error}") from error
 
@@ -63,9 +84,29 @@ def _relations(value: object) -> list[Relation]:
 
 
 def _relation(value: object) -> Relation:
-    if not isinstance(value, dict) or value.keys() != _RELATION_KEYS or value["predicate"] not in list(Predicate):
+    if (
+        not isinstance(value, dict)
+        or not _REQUIRED_RELATION_KEYS <= value.keys() <= _RELATION_KEYS
+        or value["predicate"] not in list(Predicate)
+        or not isinstance(value.get("negated", False), bool)
+    ):
         _refuse(f"expected relations of {', '.join(sorted(_RELATION_KEYS))} with a known predicate, got something else")
-    return Relation(Predicate(value["predicate"]), _phrase(value["target"]), _phrase(value["anchor"]))
+    return Relation(
+        Predicate(value["predicate"]),
+        _phrase(value["target"]),
+        _phrase(value["anchor"]),
+        value.get("negated", False),
+        _distance_m(value.get("min_m")),
+        _distance_m(value.get("max_m")),
+    )
+
+
+def _distance_m(value: object) -> float | None:
+    if value is None:
+        return None
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value <= MAX_DISTANCE_M:
+        _refuse(f"expected distances of 0 to {MAX_DISTANCE_M:g} m, got something else")
+    return round(float(value), 2)
 
 
 def _refuse(problem: str) -> NoReturn:
