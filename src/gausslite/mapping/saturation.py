@@ -2,8 +2,8 @@
 
 The loss of an active iteration is compared with that of the previous one on the same view, so that easy and hard views
 do not mix. The improvement per visit starts above 0.1 in a new region and falls where views contradict each other. On
-real cameras the released iterations cost the region nothing; the rest of the image gains 1 to 6 dB (docs/quality-experiments.md),
-and poses are fitted to all of it.
+real cameras, released iterations cost the region nothing. The rest of the image gains 1 to 6 dB, and poses are fitted
+to all of it (docs/quality-experiments.md).
 """
 
 from __future__ import annotations
