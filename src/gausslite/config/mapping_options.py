@@ -11,6 +11,7 @@ from gausslite.config.presets import PRESETS
 from gausslite.config.switches import DependentDefault, add_switch, set_dependent_default
 from gausslite.config.toml_text import OptionValue
 from gausslite.config.values import AUTO, NONE, read_names, read_pose_prior, read_pose_prior_or_auto, read_skip_stages
+from gausslite.domain.motion_model import MotionModel
 from gausslite.domain.pose_exposure_prior import PoseExposurePrior
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.mapping.policies import EXTENSION_FLAGS, POLICIES, TASK, policy
@@ -27,7 +28,6 @@ from gausslite.mission.settings import (
 )
 from gausslite.render.choose import BACKENDS
 from gausslite.render.cpu_kernels import MAX_THREADS, choose_threads
-from gausslite.tracking.tracker import MotionModel
 
 HOLD_OUT_HELP = "hold out every N-th selected frame from mapping, for evaluation"
 _EXACT = PoseExposurePrior()

@@ -13,6 +13,7 @@ from gausslite.domain.arguments import require_instance, require_number, require
 from gausslite.domain.camera_correction import CameraCorrection
 from gausslite.domain.depth_registration import DepthRegistration
 from gausslite.domain.errors import InvalidInputError
+from gausslite.domain.motion_model import MotionModel
 from gausslite.domain.object_names import same_kind
 from gausslite.domain.pose import UpAxis
 from gausslite.domain.pose_exposure_prior import TRACKED_PRIOR, PoseExposurePrior
@@ -22,7 +23,6 @@ from gausslite.mapping.settings import MapperSettings
 from gausslite.mapping.stages import SkippableStage
 from gausslite.mission.frame_scheduler import SchedulerSettings
 from gausslite.render.cpu_kernels import MAX_THREADS
-from gausslite.tracking.tracker import MotionModel
 
 DEFAULT_MAX_GAUSSIANS = 150_000
 """The number that two CPU cores can train online at 640x480; the paper's cap of a million is for a GPU."""

@@ -15,6 +15,7 @@ from gausslite.domain.camera import Camera
 from gausslite.domain.camera_motion import CameraMotion
 from gausslite.domain.errors import MapFileError
 from gausslite.domain.frame import Frame
+from gausslite.domain.motion_model import MotionModel
 from gausslite.domain.pose import inverse, orthonormal, require_rigid, transform_of, twist_of
 from gausslite.domain.state import State, add_prefix, get_array, get_counts, int_array, select_prefix
 from gausslite.render.rasterizer import Rendering
@@ -33,15 +34,6 @@ _RELIABLE_FEATURE_INLIERS = 40
 _RENDER_AGAIN_M, _RENDER_AGAIN_RAD = 0.01, np.radians(0.5)
 _PRIOR_STD = np.array([0.1] * 3 + [np.radians(5.0)] * 3)
 """Error of a predicted pose: translation (m) and rotation (rad)."""
-
-
-class MotionModel(StrEnum):
-    """What predicts the motion since the last frame where features do not."""
-
-    VELOCITY = "velocity"
-    """The velocity between the last two frames."""
-    ODOMETRY = "odometry"
-    """The motion between the poses of the frames."""
 
 
 class TrackedBy(StrEnum):

@@ -8,12 +8,11 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from gausslite.cli.progress import progress_bar
+from gausslite.cli.progress import print_above_bar, progress_bar
 from gausslite.codec.files import write_atomic
 from gausslite.domain.errors import InvalidInputError
 from gausslite.mission.results import prepare_folder, write_json
 from gausslite.mission.settings import MissionSettings
-from gausslite.process.messages import printable
 from gausslite_bench.camera_study import CameraScore, CameraStudy, Handling, camera_table, read_truth
 from gausslite_bench.cli.argument_types import read_counts, read_image_size
 from gausslite_bench.quality.home_tasks import choose_home_tasks
@@ -73,7 +72,7 @@ def run_camera(options: argparse.Namespace) -> int:
         def show(score: CameraScore) -> None:
             roi = "no view shows the region" if score.roi_psnr is None else f"ROI {score.roi_psnr:.2f} dB"
             line = f"{score.speed_deg_s} deg/s {score.handling}: {roi}, full {score.full_psnr:.2f} dB"
-            bar.write("; ".join(map(printable, (line, *score.evidence))), file=sys.stderr)
+            print_above_bar("; ".join((line, *score.evidence)))
             bar.update()
 
         for speed in options.speeds:

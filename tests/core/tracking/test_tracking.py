@@ -12,6 +12,7 @@ import pytest
 from gausslite.datasets.open import open_source
 from gausslite.domain.errors import GaussLiteError
 from gausslite.domain.frame import Frame
+from gausslite.domain.motion_model import MotionModel
 from gausslite.domain.pose import inverse, rotation_angle_deg, transform_of, translation_m
 from gausslite.domain.trajectory import Trajectory
 from gausslite.evaluation.trajectory_error import trajectory_error
@@ -22,7 +23,7 @@ from gausslite.perception.fixed_relevance import NoTaskEstimator
 from gausslite.render.rasterizer import Rendering
 from gausslite.tracking.alignment import align
 from gausslite.tracking.features import detect_features, relative_pose
-from gausslite.tracking.tracker import CameraTracker, MotionModel
+from gausslite.tracking.tracker import CameraTracker
 
 PRIOR_STD = np.array([0.1] * 3 + [0.1] * 3)
 SETTINGS = MissionSettings(policy="uniform", max_gaussians=20_000, threads=1, poses=PoseMode.TRACK)
