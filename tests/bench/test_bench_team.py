@@ -36,6 +36,18 @@ def test_a_team_is_mapped_fused_and_scored(tmp_path: Path, capsys: pytest.Captur
     assert (tmp_path / "team.md").read_text().count("| home-4 x 2 |") == 10
 
 
+def test_a_late_robot_is_measured_alone_and_with_the_teams_map(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    size = ("--size", "160x120", "--frames", "8", "--views", "4", "--max-gaussians", "6000", "--iterations", "2")
+    arguments = ("bench", "team", "--late-joiner", "--homes", "4", "--policies", "task", "--json")
+    assert main([*arguments, *size, "--threads", "1", "--out", str(tmp_path)]) == 0
+    [scene] = json.loads(capsys.readouterr().out)["scenes"]
+    assert [count for count, _ in scene["alone"]] == [1, 2, 4, 8]
+    assert scene["with_team"][0][1] > scene["alone"][0][1]
+    assert 0 < scene["team_bytes"] < 100_000
+
+
 def test_wrong_options_fail_before_any_mapping(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     for wrong, expected in (
         (("--homes", "9"), "homes"),

@@ -9,9 +9,10 @@ from jaxtyping import Float64, Int64
 from numpy import ndarray
 
 from gausslite.domain.gaussians import Gaussians
-from gausslite.domain.pose import transform_of, transform_points
+from gausslite.domain.pose import inverse, transform_of, transform_points, twist_of
+from gausslite.domain.voxels import VoxelGrid
 
-_MAX_SOURCE, _MAX_REFERENCE = 2000, 6000
+_MAX_SOURCE, _MAX_REFERENCE = 2500, 8000
 _NEIGHBOURS = 12
 _MIN_OPACITY = 0.3
 _REACH_M = (0.30, 0.30, 0.20, 0.20, 0.15, 0.15, 0.10, 0.10, 0.08, 0.08, 0.08, 0.08)
@@ -21,7 +22,8 @@ _INDEPENDENT_SAMPLES = 150
 _OVERLAP_M = 0.10
 _COLOUR_WEIGHT_M = 0.1
 """Geometric residual that weighs as much as a luminance difference of 1."""
-_PRIOR_TRANSLATION_M, _PRIOR_ROTATION_RAD = 0.3, 0.15
+_PRIOR_TRANSLATION_M, _PRIOR_ROTATION_RAD = 0.15, 0.05
+_OVERLAP_GRID = VoxelGrid(0.5)
 _LUMINANCE = np.array([0.299, 0.587, 0.114])
 
 
@@ -81,6 +83,19 @@ class SurfaceSamples:
         return cls(points, normals, luminance, gradients)
 
 
+def crop_to_overlap(
+    source: Gaussians, reference: Gaussians, T_fused_agent: Float64[ndarray, "4 4"]
+) -> tuple[Gaussians, Gaussians]:
+    """Return the Gaussians of both maps in the cubes of 50 cm that both occupy, so that the samples are dense there.
+
+    Raises InvalidInputError for means outside the range of the grid.
+    """
+    moved = transform_points(T_fused_agent, source.means_m.astype(np.float64)).astype(np.float32)
+    source_keys, reference_keys = _OVERLAP_GRID.keys(moved), _OVERLAP_GRID.keys(reference.means_m)
+    common = np.intersect1d(source_keys, reference_keys)
+    return source.take(np.isin(source_keys, common)), reference.take(np.isin(reference_keys, common))
+
+
 def fit_frame(source: Gaussians, reference: SurfaceSamples, start: Float64[ndarray, "4 4"]) -> FrameFit | None:
     """Fit the source map to the reference from an initial T_fused_agent; None if fewer than 50 samples overlap.
 
@@ -93,7 +108,7 @@ def fit_frame(source: Gaussians, reference: SurfaceSamples, start: Float64[ndarr
         return None
     before = _misfit(points, luminance, reference, T)
     for reach_m in _REACH_M:
-        update = _step(transform_points(T, points), luminance, reference, reach_m)
+        update = _step(transform_points(T, points), luminance, reference, reach_m, T @ inverse(start))
         if update is None:
             return None
         T = update @ T
@@ -109,9 +124,13 @@ def fit_frame(source: Gaussians, reference: SurfaceSamples, start: Float64[ndarr
 
 
 def _step(
-    moved: Float64[ndarray, "n 3"], luminance: Float64[ndarray, " n"], reference: SurfaceSamples, reach_m: float
+    moved: Float64[ndarray, "n 3"],
+    luminance: Float64[ndarray, " n"],
+    reference: SurfaceSamples,
+    reach_m: float,
+    correction: Float64[ndarray, "4 4"],
 ) -> Float64[ndarray, "4 4"] | None:
-    """Return one Gauss-Newton update in the fused frame; None with too few matches."""
+    """Return one Gauss-Newton update in the fused frame; None with too few matches. correction: all updates so far."""
     rows, near = _match(moved, reference, reach_m)
     if len(rows) < _MIN_COMPARED:
         return None
@@ -137,9 +156,10 @@ def _step(
     weight /= np.square(scale) * max(1.0, len(rows) / _INDEPENDENT_SAMPLES)
     prior = np.diag([_PRIOR_TRANSLATION_M**-2.0] * 3 + [_PRIOR_ROTATION_RAD**-2.0] * 3)
     hessian = (jacobian * weight[:, None]).T @ jacobian + prior
-    twist = -np.linalg.solve(hessian, (jacobian * weight[:, None]).T @ residual)
     to_centre, back = np.eye(4), np.eye(4)
     to_centre[:3, 3], back[:3, 3] = -centre, centre
+    so_far = twist_of(to_centre @ correction @ back)
+    twist = -np.linalg.solve(hessian, (jacobian * weight[:, None]).T @ residual + prior @ so_far)
     update: Float64[ndarray, "4 4"] = back @ transform_of(twist) @ to_centre
     return update
 

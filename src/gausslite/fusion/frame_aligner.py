@@ -13,7 +13,7 @@ from numpy import ndarray
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.names import quote_name
 from gausslite.domain.voxel_operations import select_voxels
-from gausslite.fusion.alignment import SurfaceSamples, fit_frame
+from gausslite.fusion.alignment import SurfaceSamples, crop_to_overlap, fit_frame
 from gausslite.fusion.frame_alignment import AlignmentSettings, AlignmentState, FrameAlignment, FrameAlignments
 from gausslite.fusion.store import FusionStore
 from gausslite.fusion.vote_input import VoteInput
@@ -69,6 +69,7 @@ class FrameAligner:
             highest_seq = self._store.highest_update_seq(agent_id)
         # QUARANTINED agents are fitted from their declared frame, so that they can return
         start = alignment.declared if alignment.state is AlignmentState.QUARANTINED else alignment.T_fused_agent
+        source, reference = crop_to_overlap(source, reference, start)
         fit = fit_frame(source, SurfaceSamples.of(reference), start) if len(reference) >= _MIN_GAUSSIANS else None
         with self._lock:
             if fit is None or self._alignments.get(agent_id) is not alignment:

@@ -6,6 +6,7 @@ import argparse
 import shlex
 import sys
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 
 from gausslite.cli.progress import print_above_bar, progress_bar
@@ -19,6 +20,7 @@ from gausslite.mission.settings import MissionSettings
 from gausslite_bench.cli.argument_types import read_image_size, read_seeds
 from gausslite_bench.team.bench import TeamResult, TeamTrial, run_trial
 from gausslite_bench.team.frame_errors import FrameError
+from gausslite_bench.team.late_joiner import late_joiner_table, run_late_joiner
 from gausslite_bench.team.scenes import TeamPlan
 from gausslite_bench.team.tables import team_table
 
@@ -59,6 +61,7 @@ def configure_team(parser: argparse.ArgumentParser) -> None:
         help="shift, turn and drift (share of the way) of all agents' frames except the first's (default: none)",
     )
     add("--threads", metavar="N", type=int, help="threads (default: all available cores)")
+    add_switch(parser, "--late-joiner", "only measure a robot that joins late, alone and with the team's map")
     add_switch(parser, "--json", "print JSON for scripts")
     parser.set_defaults(run=run_team)
 
@@ -67,6 +70,8 @@ def run_team(options: argparse.Namespace) -> int:
     """Run the trials; the files are rewritten after each, so that an interrupt loses one trial at most."""
     trials = _trials(options)
     prepare_folder(options.out)
+    if options.late_joiner:
+        return _run_late_joiner(options, trials)
     results: list[TeamResult] = []
     frames = sum(trial.plan.agents * trial.plan.frames for trial in trials)
     with progress_bar(frames, "team", "frame") as bar:
@@ -75,6 +80,20 @@ def run_team(options: argparse.Namespace) -> int:
             _write(options.out, results)
             print_above_bar(team_table(results[-1:]).splitlines()[-1])
     print(as_text({"trials": [each.as_json() for each in results]}) if options.json else team_table(results))
+    return 0
+
+
+def _run_late_joiner(options: argparse.Namespace, trials: Sequence[TeamTrial]) -> int:
+    """Measure each scene, policy and seed; write late-joiner.md and .json."""
+    results = []
+    for trial in trials:
+        results.append(run_late_joiner(trial.plan, trial.settings, trial.size, trial.grid))
+        print_above_bar(results[-1].row)
+    command, table = shlex.join(["gausslite", *sys.argv[1:]]), late_joiner_table(results)
+    write_atomic(options.out / "late-joiner.md", f"# bench team\n\n`{command}`\n\n{table}".encode())
+    report = {"command": command, "scenes": [asdict(each) for each in results]}
+    write_json(options.out / "late-joiner.json", report)
+    print(as_text(report) if options.json else table)
     return 0
 
 

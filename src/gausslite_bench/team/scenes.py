@@ -9,6 +9,7 @@ from gausslite.datasets.open import open_source
 from gausslite.datasets.regions import choose_regions
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
+from gausslite.domain.region import Region
 from gausslite.domain.relevance import RelevanceMap
 from gausslite.evaluation.views import HeldOutView
 from gausslite.perception.fixed_relevance import RegionRelevanceEstimator
@@ -68,6 +69,11 @@ class TeamPlan:
         regions = choose_regions(held_out.regions(), names)
         views = [HeldOutView.of(held_out.frame(i), regions) for i in range(len(held_out))]
         return TeamScene(self.name, agents, [view for view in views if view.frame.has_depth])
+
+    def regions_of_first_task(self, size: tuple[int, int]) -> list[Region]:
+        """Return the regions of the first agent's task."""
+        task = next(task for task in HOME_TASKS if task.home == self.home)
+        return list(choose_regions(open_source(self._spec(0, self.frames, size)).regions(), task.objects))
 
     def _agent_scene(self, agent_id: str, task: HomeTask, trajectory: int, size: tuple[int, int]) -> AgentScene:
         source = open_source(self._spec(trajectory, self.frames, size))
