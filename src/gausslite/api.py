@@ -127,7 +127,7 @@ def open_sequence(
 
 
 def open_calibrated(spec: str | Path, *, up_axis: UpAxis | None = None) -> CalibratedSequence:
-    """Open a sequence and estimate what it does not state, as `gausslite map` does by default; takes ten to thirty seconds.
+    """Open a sequence and estimate what it does not state, as `gausslite map` does; takes ten to thirty seconds.
 
     Depth is registered if the layout does not promise it. Simulated homes are used without correction. Raises
     DatasetError, PoseError, InvalidInputError.
