@@ -19,7 +19,10 @@ PROGRAMS = {
     "gausslite-fusion-server": "gausslite_fusion_server",
     "gausslite-parser": "gausslite_parser",
 }
-SUB_COMMANDS = ("map", "demo", "parse", "eval", "fuse")
+SUB_COMMANDS = (
+    *("map", "demo", "parse", "eval", "calibrate", "fuse", "export"),
+    *("status", "end", "refine", "fetch", "objects"),
+)
 BENCHMARKS = (
     "raster",
     "loop",
