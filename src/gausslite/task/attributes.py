@@ -71,13 +71,18 @@ _WORDS_OF_SUPERLATIVE: Final = {
     Superlative.FARTHEST: "farthest furthest farther further remotest",
 }
 SUPERLATIVES: Final = {word: each for each, words in _WORDS_OF_SUPERLATIVE.items() for word in words.split()}
+COMPARATIVES: Final = frozenset(
+    word
+    for word, each in SUPERLATIVES.items()
+    if word.endswith("er") and each not in (Superlative.NEAREST, Superlative.FARTHEST)
+) | word_set("heavier lighter older newer thicker thinner")
 DISTANCE_SUPERLATIVES: Final = frozenset({Superlative.NEAREST, Superlative.FARTHEST})
 # superlatives of properties that geometry does not show
 UNSEEN_SUPERLATIVES: Final = word_set(
     "oldest newest heaviest lightest cheapest cleanest dirtiest hottest coldest warmest coolest best worst fastest "
     "slowest freshest strongest weakest hardest softest brightest darkest safest loudest quietest ripest sharpest "
     "youngest latest earliest nicest prettiest fullest emptiest driest wettest finest poorest richest heavier older "
-    "newer cheaper cleaner dirtier hotter colder warmer younger fresher sturdiest busiest simplest easiest fanciest "
+    "newer cheaper dirtier hotter colder warmer younger fresher sturdiest busiest simplest easiest fanciest "
     "darker "
     "brighter softer harder stronger weaker fuller emptier dirtiest drier wetter safer"
 )

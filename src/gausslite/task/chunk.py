@@ -15,6 +15,7 @@ class ChunkKind(Enum):
     SUBJECT_VERB: a verb whose objects precede it ("the mugs belong in the cupboard"). STATEMENT: the start of a
     clause that requests nothing. ANAPHOR: "it" or "them". DEMONSTRATIVE: "this" or "those" without a noun.
     ATTRIBUTE: a colour or superlative of the noun before it ("the mug that is red").
+    NOT_UNDERSTOOD: words without a place in a graph ("that is not broken").
     """
 
     VERB = "verb"
@@ -28,6 +29,7 @@ class ChunkKind(Enum):
     ANAPHOR = "anaphor"
     DEMONSTRATIVE = "demonstrative"
     ATTRIBUTE = "attribute"
+    NOT_UNDERSTOOD = "not understood"
 
 
 @dataclass(frozen=True, slots=True)

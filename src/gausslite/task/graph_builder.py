@@ -74,6 +74,8 @@ class GraphBuilder:
             self._resolve_back_reference(chunk.word, before)
         elif chunk.kind is ChunkKind.DEMONSTRATIVE:
             self._handle_demonstrative(chunk.word, before, after)
+        elif chunk.kind is ChunkKind.NOT_UNDERSTOOD:
+            self._draft.warnings.append(f"{chunk.word!r} is not understood: it is dropped")
         elif chunk.kind is ChunkKind.ATTRIBUTE:
             self._describe(chunk.word, chunk.negated)
 
@@ -126,6 +128,8 @@ class GraphBuilder:
         if is_leave and self._draft.targets and self._leave_excludes():
             self._negate()
             return
+        if chunk.gerund and before is not None and before.kind is ChunkKind.VERB and before.word == "avoid":
+            self._negation("avoid " + chunk.word)
         same_negation = self._negated and (
             self._clause.nouns_since_negation == 0
             or chunk.gerund
@@ -215,12 +219,17 @@ class GraphBuilder:
             return
         if not names_object(noun, pending, after):
             self._skip_noun(noun, pending, conjoined, after)
+            if pending is not None and self._clause.terms.negated:
+                words = f"not {self._clause.preposition} {noun.text}"
+                self._draft.warnings.append(f"{words!r} is not understood: it is dropped")
             return
         if pending is not None and lexicon.is_space(noun.words) and self._clause.preposition in _SPACE_PREPOSITIONS:
             pending = "inside"
         nouns = [*(with_shared_head(adjective, noun) for adjective in self._adjectives), noun]
         self._adjectives = []
         for each in nouns:
+            if self._negated and pending == "to" and not self._clause.verb_since_negation:
+                self._negated = False  # "bring everything except the knife to the sink"
             if self._negated:
                 self._exclude(each, pending)
             else:
@@ -235,7 +244,8 @@ class GraphBuilder:
         named = (
             self._clause.objects or self._clause.referents or self._draft.targets or self._draft.excluded or ["object"]
         )
-        nouns = [word for word in named[-1].split() if not is_attribute(word)] or ["object"]
+        *adjectives, head = named[-1].split()
+        nouns = [*(word for word in adjectives if not adjectives_only((word,))), head]
         same = phrase_from_text(" ".join(nouns))
         if len(one.words) == 1:
             return phrase_from_text(named[-1])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from typing import Final
 
-from gausslite.task.attributes import COLOURS
+from gausslite.task.attributes import COLOURS, COMPARATIVES
 from gausslite.task.distances import mark_distances
 
 _NUMBER: Final = r"(?:a few|a couple of|several|some|at least|about|one|two|three|four|five|half an?|a|\d+)"
@@ -14,7 +14,9 @@ _DISTANCE: Final = rf"{_NUMBER}(?: (?:one|two|three|a|\d+))? {_LENGTH}"
 _PLAIN: Final = {
     # short forms
     r"(it|there|that|what|who|where|here|which|how|he|she)'s": r"\1 is",
-    r"(i|you|we|they|it)'(?:ve|d|ll|m|re)": r"\1",
+    r"(you|we|they)'re": r"\1 are",
+    r"(i|you|we|they|it)'(?:ve|d|ll|m)": r"\1",
+    rf"at (?:least|most)(?= (?:one|two|three|four|five|six|seven|eight|nine|ten|\d+) (?!{_LENGTH}\b))": "",
     r"(is|are|was|were|does|did|has|have|would|could|should|must)n't": r"\1 not",
     r"let's": "let us",
     r"there (?:is|are|was|were|should be|must be|might be)(?! (?:not?|any)\b)": "i see",
@@ -75,11 +77,21 @@ _COLOUR: Final = "|".join(sorted(COLOURS))
 _TWO_COLOURS: Final = re.compile(
     rf"\b(?:(?<=\ba )|(?<=\bthe )|(?<=\bthat ))({_COLOUR}) and ({_COLOUR})(?= \w*[^s\W]\b)"
 )
+# no graph states a comparison; comparatives of distance ("further than 2 m from") are no comparisons of objects
+_COMPARISON: Final = re.compile(
+    rf"\b(?:{'|'.join(sorted(COMPARATIVES))}) than (?:(?:the|an?|my|your|this|that|its|all|any) )*[\w.]+"
+    rf"(?: (?:{_LENGTH}|kg|others?|ones?|high|tall|wide|long)\b)*"
+)
 _ARROW: Final = re.compile(r"\s*(?:->|=>|\u2192)\s*")
 _LEAVE_ALONE: Final = re.compile(
     r"\bleav(?:e|ing) ((?:\w+ ){1,4})(?:alone|untouched|undisturbed|unchanged|in peace|as (?:it is|is|they are)"
     r"|be|for (?:now|later)|where (?:it is|they are))\b"
 )
+
+
+def comparisons(text: str) -> list[str]:
+    """Return the comparisons of a normalised text, such as "taller than one metre", which no graph states."""
+    return [match[0] for match in _COMPARISON.finditer(text)]
 
 
 def replace_idioms(text: str) -> str:
@@ -88,4 +100,5 @@ def replace_idioms(text: str) -> str:
     text = _LEAVE_ALONE.sub(r"do not touch \1", text)
     for idiom, plain in _IDIOMS:
         text = idiom.sub(plain, text)
+    text = _COMPARISON.sub("", text)
     return mark_distances(_TWO_COLOURS.sub(r"\1-and-\2", text))

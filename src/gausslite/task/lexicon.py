@@ -97,6 +97,7 @@ def is_space(words: tuple[str, ...]) -> bool:
 
 
 # defects that an inspection searches for in an object
+BODY_PARTS: Final = word_set("hand hands arm arms finger fingers gripper grippers")
 DEFECTS: Final = word_set(
     "leak crack dent scratch rust stain hole corrosion damage wear tear mold mould rot chip blockage fault defect "
     "wetness gap fraying blister failure error hazard sign pest disease"
@@ -116,7 +117,7 @@ PARTS: Final = word_set(
 # tools to take something with
 HELD_TOOLS: Final = word_set(
     "tongs gripper tweezers cart trolley tray glove gloves pliers forklift magnet shovel spoon fork net scoop hook "
-    "hand wheelbarrow ladder pallet-jack claw arm suction dolly towel cloth oven-mitt mitt crane rope winch"
+    "wheelbarrow ladder pallet-jack claw arm suction dolly towel cloth oven-mitt mitt crane rope winch"
 )
 GENERIC: Final = word_set("object thing item stuff obstacle obstruction clutter hazard debris target")
 

@@ -22,6 +22,7 @@ _VERB_FORMS: Final = frozenset({Tag.VERB, Tag.GERUND, Tag.PARTICIPLE})
 _NOUN_BEFORE: Final = frozenset({Tag.NOUN, Tag.INDEFINITE, Tag.RELATIVE, Tag.AUXILIARY, Tag.ANAPHOR, Tag.CONJUNCTION})
 _NOTS: Final = word_set("not never") | {"but not", "do not", "doesn't", "don't", "dont"}
 _CLAUSE_START_TAGS: Final = frozenset({None, Tag.CLAUSE_BREAK, Tag.CONJUNCTION})
+_HAVE_FORMS: Final = word_set("have has had")
 _QUESTION_WORDS: Final = word_set("is are was were does did has have can could would will")
 
 
@@ -44,7 +45,7 @@ def chunk_negation(buffer: ChunkBuffer, word: str) -> None:
     elif after is Tag.AUXILIARY and buffer.tag(2) in (Tag.PARTICIPLE, Tag.VERB):
         _exclude_subject(buffer, word)
     elif before is Tag.AUXILIARY and buffer.word(-1) != "do" and after not in _EXCLUDING_TAGS:
-        buffer.close()
+        buffer.emit(ChunkKind.NOT_UNDERSTOOD, f"{word} {buffer.word(1)}".strip())
     else:
         buffer.emit(ChunkKind.NEGATION, word)
 
@@ -61,6 +62,8 @@ def _negates_place(buffer: ChunkBuffer) -> bool:
     if buffer.tag(1) is Tag.PREPOSITION:
         return True
     base, after = verb_base(buffer.word(1)), buffer.tag(2)
+    if buffer.tag(-1) is Tag.AUXILIARY and buffer.word(1) in _HAVE_FORMS and after in OBJECT_START_TAGS:
+        return True
     in_clause = buffer.tag(-1) in (Tag.AUXILIARY, Tag.RELATIVE) and buffer.tag(1) in _VERB_FORMS
     is_place = base in POSTURE_VERBS and after is Tag.PREPOSITION
     return in_clause and (is_place or (base in HOLDING_VERBS and after in OBJECT_START_TAGS))

@@ -199,6 +199,8 @@ class RoleAssigner:
         """Assign the noun after "with": the hat of "find a man with a hat" is near him, a sponge is a tool."""
         clause = self.clause
         is_part = noun.head in lexicon.PARTS or noun.head in lexicon.CLOTHING
+        if noun.head in lexicon.BODY_PARTS and clause.objects and not self._are_people(clause.objects):
+            return  # "with both hands"
         if clause.last_relation == "to" and clause.places and (is_part or self._are_people(clause.places)):
             self._relate_places(RelationTerms("near"), noun)
         elif (

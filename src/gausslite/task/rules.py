@@ -9,6 +9,7 @@ from gausslite.task.chunk import Chunk, ChunkKind
 from gausslite.task.chunker import chunk_sentence
 from gausslite.task.graph_builder import build_draft
 from gausslite.task.graph_grounding import ParsedPhrases, grounded_graph
+from gausslite.task.idioms import comparisons
 from gausslite.task.parser import normalise_text
 
 
@@ -23,6 +24,7 @@ class RuleParser:
         draft = build_draft(chunks)
         if not draft.targets:
             raise TaskError(_no_object_message(text, tuple(draft.excluded)))
+        draft.warnings += [f"{each!r} is not understood: it is dropped" for each in comparisons(normalise_text(text))]
         parsed = ParsedPhrases(
             {target: draft.roles[target] for target in draft.targets},
             draft.anchors,

@@ -37,7 +37,7 @@ LOOKING_VERBS: Final = (
 # with and without an object: "move to the chair", "move the chair to the door"
 MOVING_VERBS: Final = word_set("move roll run advance return get land park dock drive fly race")
 # "stop behind the car": the car is the target
-STOPPING_VERBS: Final = word_set("stop wait stand stay sit park halt pause")
+STOPPING_VERBS: Final = word_set("stop wait stand stay sit park halt pause hover")
 # "hand the nurse the towel": the first noun is the recipient
 GIVING_VERBS: Final = word_set(
     "hand give bring pass fetch get send offer serve show throw feed find grab lend buy read toss"
