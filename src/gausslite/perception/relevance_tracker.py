@@ -84,8 +84,14 @@ class RelevanceTracker:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Anchors that no frame has shown yet."""
-        return tuple(f"anchor {name!r} not seen yet: its targets are kept" for name in self._filter.unseen_anchors)
+        """Attributes of the task that are not evaluated, and anchors that no frame has shown yet."""
+        attributes = (
+            f"{each.colour or each.superlative} {noun_of(each.name)!r}: colours and sizes are not evaluated, "
+            f"every {noun_of(each.name)!r} counts"
+            for each in self._graph.attributes
+        )
+        unseen = (f"anchor {name!r} not seen yet: its targets are kept" for name in self._filter.unseen_anchors)
+        return (*attributes, *unseen)
 
     @property
     def landmarks(self) -> tuple[Landmark, ...]:
