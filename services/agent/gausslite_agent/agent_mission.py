@@ -156,17 +156,20 @@ class AgentMission:
         if self._state_machine.state is not MissionState.WAITING_FOR_TASK:
             self._end(self.end_by_options, None)
 
-    def save(self) -> None:
-        """Save the mission after the current frame if there is a file for it. Raises StorageError."""
-        settings = self._settings
-        if settings.state is not None:
-            config = ResumeConfig.of(*settings.fixed_settings)
-            self._worker.save(settings.state, config, settings.task or "").result()
+    def save(self) -> float:
+        """Save the mission after the current frame if there is a file for it; returns the seconds that it took.
 
-    def save_if_mapping(self) -> None:
-        """Save the mission, unless it is not mapping now. Raises StorageError."""
-        if self._state_machine.state is MissionState.MAPPING:
-            self.save()
+        Raises StorageError.
+        """
+        settings = self._settings
+        if settings.state is None:
+            return 0.0
+        config = ResumeConfig.of(*settings.fixed_settings)
+        return self._worker.save(settings.state, config, settings.task or "").result()
+
+    def save_if_mapping(self) -> float:
+        """Do the same, unless the mission is not mapping now."""
+        return self.save() if self._state_machine.state is MissionState.MAPPING else 0.0
 
     def _begin(self) -> None:
         if self._state_machine.state is not MissionState.MAPPING:

@@ -110,8 +110,8 @@ class MappingWorker:
         """Continue a saved mission; call it before the first frame. The future raises MapFileError."""
         return self._submit(lambda: self._restore(saved))
 
-    def save(self, path: Path, config: ResumeConfig, requested_task: str) -> Future[bool]:
-        """Save the mission after the current frame. The future returns False if there is no task yet.
+    def save(self, path: Path, config: ResumeConfig, requested_task: str) -> Future[float]:
+        """Save the mission after the current frame. The future returns the seconds that it took; 0 without a task.
 
         requested_task: the task of the command line. The future raises StorageError.
         """
@@ -204,13 +204,14 @@ class MappingWorker:
         self._publish(self._sent_voxels.exclude_frozen(roi))
         self._on_change()
 
-    def _save(self, path: Path, config: ResumeConfig, requested_task: str) -> bool:
+    def _save(self, path: Path, config: ResumeConfig, requested_task: str) -> float:
         graph, task_mapper = self.status().graph, self._task_mapper
         if graph is None or task_mapper is None:
-            return False
+            return 0.0
+        start_s = time.monotonic()
         checkpoint = MissionCheckpoint(self._last_index, graph, requested_task, self.revision())
         save_run(path, task_mapper, config, checkpoint.last_index, checkpoint.state())
-        return True
+        return time.monotonic() - start_s
 
     def _map_next(self) -> None:
         queued = self._queue.get()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import threading
-import time
 from collections.abc import Callable
 
 from gausslite.domain.errors import GaussLiteError
@@ -17,8 +16,8 @@ _MIN_INTERVAL_PER_SAVE = 20.0
 class PeriodicSave:
     """A context that calls `save` on a thread of its own; with an interval of 0 it does nothing."""
 
-    def __init__(self, save: Callable[[], None], interval_s: float) -> None:
-        """interval_s: seconds between two saves; slow saves are repeated later."""
+    def __init__(self, save: Callable[[], float], interval_s: float) -> None:
+        """`save` returns the seconds that it took. interval_s: between two saves; slow ones are rarer."""
         self._save, self._interval_s = save, interval_s
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._run, name="periodic save", daemon=True)
@@ -35,12 +34,11 @@ class PeriodicSave:
     def _run(self) -> None:
         wait_s, failed = self._interval_s, False
         while not self._ended.wait(wait_s):
-            start_s = time.monotonic()
+            wait_s = self._interval_s
             try:
-                self._save()
+                wait_s = max(wait_s, _MIN_INTERVAL_PER_SAVE * self._save())
                 failed = False
             except GaussLiteError as error:
                 if not failed:
                     _log.warning("the mission is not saved: %s", error)
                 failed = True
-            wait_s = max(self._interval_s, _MIN_INTERVAL_PER_SAVE * (time.monotonic() - start_s))

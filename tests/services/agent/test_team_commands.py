@@ -1,0 +1,61 @@
+"""The commands that reach a running team: status, end, refine and fetch, against real services."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from agent_running import TASK, agent
+from fusion_running import GRID, frame, fusion_server
+
+from gausslite.cli.main import main
+from gausslite.codec.ply import read_ply
+from gausslite.wire.clients import FusionClient
+from gausslite.wire.spool import Spool
+from gausslite.wire.uplink import Uplink
+from gausslite.wire.uplink_values import UplinkSettings
+
+
+def test_a_team_is_watched_ended_refined_and_fetched(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with fusion_server() as fusion:
+        server = fusion.client.address
+        spool = Spool(None, "robot", GRID)
+        link = Uplink(FusionClient(server), "robot", spool, GRID, UplinkSettings(interval_s=0.0))
+        try:
+            with agent(uplink=link) as a:
+                robot = a.client.address
+                assert main(["status", robot]) == 0
+                assert capsys.readouterr().out.startswith("agent robot: waiting for task\n")
+                a.client.assign_task(TASK)
+                list(a.client.ingest([frame(0)]))
+                assert main(["status", robot, "--json"]) == 0
+                assert json.loads(capsys.readouterr().out)["frames_mapped"] == "1"
+                assert main(["end", robot, "--handover"]) == 0
+                assert capsys.readouterr().out.strip().endswith("nothing was left")
+        finally:
+            link.close()
+        assert main(["status", server]) == 0
+        out = capsys.readouterr().out
+        assert "keyframes  1; not refined yet" in out
+        assert "robot      joined" in out
+        refined, voted = tmp_path / "refined.ply", tmp_path / "voted.ply"
+        assert main(["refine", server, "--iterations", "2", "--out", str(refined)]) == 0
+        assert main(["fetch", server, "--out", str(voted)]) == 0
+        assert main(["fetch", server, "--strategy", "refined", "--out", str(tmp_path / "again.ply")]) == 0
+        assert len(read_ply(refined)) == len(read_ply(tmp_path / "again.ply")) > 0
+        assert len(read_ply(voted)) > 0
+
+
+def test_errors_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with fusion_server() as fusion, agent() as a:
+        for arguments, expected in (
+            (["end", a.client.address], "call AssignTask"),
+            (["status", "nowhere"], "nowhere: UNAVAILABLE"),
+            (["fetch", fusion.client.address, "--strategy", "refined", "--out", str(tmp_path / "x.ply")], "refine"),
+            (["refine", fusion.client.address, "--out", "/dev/null/x"], "/dev/null"),
+        ):
+            assert main(arguments) == 2
+            [line] = capsys.readouterr().err.splitlines()[-1:]
+            assert expected in line
+    assert not (tmp_path / "x.ply").exists()
