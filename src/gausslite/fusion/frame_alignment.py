@@ -141,6 +141,11 @@ class FrameAlignments:
         """Return the latest T_fused_agent of the agents whose frame differs from the fused map's."""
         return {name: each.T_fused_agent for name, each in self._by_agent.items() if not each.is_identity}
 
+    def in_other_frames(self) -> set[str]:
+        """Return the agents whose frame differs from the fused map's, as far as is known."""
+        quarantined = {name for name, each in self._by_agent.items() if each.state is AlignmentState.QUARANTINED}
+        return quarantined | set(self.transforms())
+
     def earlier(self, agent_id: str) -> set[str]:
         """Return the agents that contributed before this one and are not quarantined."""
         order = self.get(agent_id).order

@@ -53,7 +53,7 @@ class VoteInput:
         table = self._fused_scores(keys)
         if self._free_space is None:
             return table
-        kept = ~self._free_space.contradicts(table.keys, set(self._alignments.transforms()))
+        kept = ~self._free_space.contradicts(table.keys, self._alignments.in_other_frames())
         return _merge_scores(table, kept, {})
 
     def _fused_scores(self, keys: Int64[ndarray, " k"] | None) -> VoxelScoreTable:
@@ -72,7 +72,7 @@ class VoteInput:
         }
         if self._free_space is None:
             return fused
-        differ = set(self._alignments.transforms())
+        differ = self._alignments.in_other_frames()
         free = self._free_space
         return {name: select_voxels(each, ~free.contradicts(each.keys, differ)) for name, each in fused.items()}
 

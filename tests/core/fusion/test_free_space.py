@@ -20,6 +20,7 @@ from gausslite.domain.voxel_batch import RoiSubset
 from gausslite.domain.voxel_operations import group_by_voxel
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.fusion.engine import FusionEngine
+from gausslite.fusion.frame_alignment import AlignmentState, FrameAlignment, FrameAlignments
 from gausslite.fusion.limits import FusionSettings, VoteRule
 from gausslite.fusion.mission_config import MissionConfig
 from gausslite.fusion.sqlite_store import SqliteStore
@@ -147,3 +148,13 @@ def test_free_space_of_wrong_shape_is_refused() -> None:
     for wrong in ({"keys": free.keys[::-1].copy()}, {"counts": free.counts + np.uint8(3)}):
         with pytest.raises(GaussLiteError, match="free space"):
             replace(free, **wrong)
+
+
+def test_free_space_of_a_quarantined_agent_does_not_count(tmp_path: Path) -> None:
+    store = SqliteStore(tmp_path / "a.sqlite")
+    _, bee = team(store, VoteRule.FREE_SPACE)
+    FrameAlignments(store).set("bee", FrameAlignment(1, AlignmentState.QUARANTINED, message="far away"))
+    engine = FusionEngine(store, FusionSettings(grid=GRID, vote=VoteRule.FREE_SPACE))
+    engine.contribute_free_space(bee, observed(2), GRID)
+    assert len(engine.maps.voted_map()) == 2
+    store.close()
