@@ -90,8 +90,10 @@ class _Chunker:
         self._buffer.close()
 
     def _noun(self, word: str) -> None:
-        # "the red and blue mugs": a lone adjective shares the noun of the next phrase
         buffer = self._buffer
+        if buffer.tag(-1) is Tag.NEGATION and buffer.last_kind() is ChunkKind.NOT_UNDERSTOOD:
+            return  # "that is not rotten"
+        # "the red and blue mugs": a lone adjective shares the noun of the next phrase
         if not buffer.words and buffer.last_kind() is ChunkKind.CONJUNCTION and len(buffer.chunks) >= 2:
             before = buffer.chunks[-2].noun
             if before is not None and adjectives_only(before.words):

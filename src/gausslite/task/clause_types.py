@@ -18,6 +18,8 @@ MODALS: Final = word_set("must should ought")
 SEMI_MODALS: Final = word_set("has have had need needs")
 WISHES: Final = word_set("need want like love require prefer seek")
 SUBJECT_TAGS: Final = frozenset({Tag.NOUN, Tag.INDEFINITE, Tag.PRONOUN, Tag.RELATIVE, Tag.ANAPHOR})
+# after a subject they state what someone cannot do: "my son can't find his bear"
+INABILITIES: Final = word_set("can't cannot doesn't")
 _LOST_STATES: Final = word_set("missing lost gone")
 _UNKNOWN_PEOPLE: Final = word_set("somebody someone nobody everybody everyone")
 _OTHER_PEOPLE: Final = word_set("i he she they")
@@ -60,6 +62,8 @@ def is_command(tagged: TaggedWords, index: int) -> bool:
     if subject is Tag.PRONOUN:
         is_relative = subject_at > 0 and tagged[subject_at - 1][1] is Tag.RELATIVE
         return before not in _OTHER_PEOPLE and not is_relative
+    if subject in SUBJECT_TAGS and tagged[index - 1][0] in INABILITIES:
+        return False
     if subject not in SUBJECT_TAGS or subject_at < index - 1:
         return True
     if subject is Tag.RELATIVE or verb_base(word) != word or _is_question_subject(tagged, subject_at):
@@ -138,7 +142,7 @@ def _is_request(tagged: TaggedWords, index: int) -> bool:
     word, tag = tagged[index]
     before = tagged[index - 1][1] if index else None
     if tag is Tag.NEGATION:
-        return before is not Tag.PRONOUN
+        return before is not Tag.PRONOUN and not (word in INABILITIES and before in SUBJECT_TAGS)
     if tag is Tag.GERUND:
         return before not in SUBJECT_TAGS and before is not Tag.AUXILIARY and before is not Tag.DETERMINER
     if word in _LOST_STATES and before is Tag.AUXILIARY:

@@ -117,15 +117,17 @@ class GraphBuilder:
         self._clause.nouns_since_negation = 0
         self._clause.verb_since_negation = False
 
-    def _leave_excludes(self) -> bool:
+    def _leave_excludes(self, before: Chunk | None) -> bool:
         """Return True if "leave" excludes its object, as in "take the cups and leave the plates"."""
         rest = [chunk.kind for chunk in self._following if chunk.kind not in (ChunkKind.NOUN, ChunkKind.CONJUNCTION)]
         named = bool(self._following) and self._following[0].kind is ChunkKind.NOUN
+        if named and before is not None and before.word == "but":
+            return True  # "but leave the plates on the table"
         return named and (not rest or rest[0] in (ChunkKind.CLAUSE_BREAK, ChunkKind.VERB))
 
     def _verb(self, before: Chunk | None, chunk: Chunk) -> None:
         is_leave = chunk.word == "leave" and not self._clause.statement
-        if is_leave and self._draft.targets and self._leave_excludes():
+        if is_leave and self._draft.targets and self._leave_excludes(before):
             self._negate()
             return
         if chunk.gerund and before is not None and before.kind is ChunkKind.VERB and before.word == "avoid":

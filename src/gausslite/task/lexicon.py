@@ -93,7 +93,8 @@ _SPACE_HEADS: Final = word_set("room area lot hall park site zone storey wing de
 
 def is_space(words: tuple[str, ...]) -> bool:
     """Return True if a noun phrase is a room or a place: "kitchen", "parking lot", "living room"."""
-    return words[-1] in _SPACES or (len(words) > 1 and words[-1] in _SPACE_HEADS)
+    named = [word for word in words if not word[0].isdigit()] or list(words)
+    return named[-1] in _SPACES or (len(words) > 1 and named[-1] in _SPACE_HEADS)
 
 
 # defects that an inspection searches for in an object

@@ -8,8 +8,9 @@ from gausslite.task import lexicon
 from gausslite.task.attributes import is_attribute
 from gausslite.task.chunk import Chunk, ChunkKind
 from gausslite.task.chunk_buffer import ChunkBuffer
-from gausslite.task.clause_types import WISHES
+from gausslite.task.clause_types import INABILITIES, WISHES
 from gausslite.task.part_of_speech import Tag
+from gausslite.task.singular import singular
 from gausslite.task.verb_chunks import OBJECT_START_TAGS
 from gausslite.task.verb_forms import verb_base
 from gausslite.task.verbs import HOLDING_VERBS, POSTURE_VERBS, TOOL_VERBS
@@ -31,6 +32,10 @@ def chunk_negation(buffer: ChunkBuffer, word: str) -> None:
     before, after = buffer.tag(-1), buffer.tag(1)
     if before is Tag.PRONOUN and buffer.word(-1) != "you" and verb_base(buffer.word(1)) not in _NEGATED_VERBS:
         buffer.close()  # "I can't find my phone"
+    elif word in INABILITIES and before in (Tag.NOUN, Tag.INDEFINITE) and after is Tag.VERB:
+        buffer.close()  # "my son can't find his bear"
+        if buffer.last_kind() is ChunkKind.NOUN:
+            buffer.chunks.pop()
     elif _opens_question(buffer):
         buffer.close()  # "isn't there a mug on the table?"
     elif (word in _NOTS and _negates_place(buffer)) or (
@@ -44,10 +49,16 @@ def chunk_negation(buffer: ChunkBuffer, word: str) -> None:
         buffer.emit_preposition("near", word)
     elif after is Tag.AUXILIARY and buffer.tag(2) in (Tag.PARTICIPLE, Tag.VERB):
         _exclude_subject(buffer, word)
-    elif before is Tag.AUXILIARY and buffer.word(-1) != "do" and after not in _EXCLUDING_TAGS:
+    elif before is Tag.AUXILIARY and buffer.word(-1) != "do" and (after not in _EXCLUDING_TAGS or _is_state(buffer)):
         buffer.emit(ChunkKind.NOT_UNDERSTOOD, f"{word} {buffer.word(1)}".strip())
     else:
         buffer.emit(ChunkKind.NEGATION, word)
+
+
+def _is_state(buffer: ChunkBuffer) -> bool:
+    """Return True for an unknown word in "that is not rotten", unlike "that are not chairs"."""
+    word = buffer.word(1)
+    return buffer.tag(1) is Tag.NOUN and word not in lexicon.NOUNS and singular(word) == word
 
 
 def _opens_question(buffer: ChunkBuffer) -> bool:

@@ -38,6 +38,7 @@ _FINAL_DESTINATIONS: Final = word_set("on inside")
 _DESTINATION_RELATIONS: Final = word_set("to on inside near under behind in_front_of above between left_of right_of")
 # both objects of these verbs are targets
 _PAIRING_VERBS: Final = word_set("compare swap exchange")
+_ROUTE_PREPOSITIONS: Final = word_set("around past through along across")
 _PASSING_RELATIONS: Final = word_set("past beyond")
 
 
@@ -103,7 +104,8 @@ class RoleAssigner:
             self._relate_extreme(noun)
             return
         if pending == "closer":
-            pending = "to" if clause.verb in DELIVERY_VERBS else "near"
+            moves = clause.verb in DELIVERY_VERBS - FETCHING_VERBS | GO_VERBS and not clause.current_place
+            pending = "to" if moves else "closest_to"
         handlers = {
             "to": self._destination,
             "for": self._assign_searched_object,
@@ -120,6 +122,8 @@ class RoleAssigner:
             self.relate("near", noun)
         elif pending in _PASSING_RELATIONS and clause.verb in DELIVERY_VERBS:
             self._draft.add_target(noun.text)
+        elif clause.preposition in _ROUTE_PREPOSITIONS and clause.verb in DELIVERY_VERBS and not clause.objects:
+            self.target(noun, TargetRole.OBJECT)  # "lead me around the puddle"
         elif self._is_route_point(pending) or (pending == "with" and clause.verb in _PAIRING_VERBS):
             self.target(noun, TargetRole.OBJECT, conjoined=True)
         elif pending == "with" and clause.verb in FILLING_VERBS and clause.objects:
@@ -201,7 +205,9 @@ class RoleAssigner:
         is_part = noun.head in lexicon.PARTS or noun.head in lexicon.CLOTHING
         if noun.head in lexicon.BODY_PARTS and clause.objects and not self._are_people(clause.objects):
             return  # "with both hands"
-        if clause.last_relation == "to" and clause.places and (is_part or self._are_people(clause.places)):
+        if clause.last_relation == "for":
+            return  # "for the man with the trolley"
+        if clause.last_relation == "to" and clause.places and (is_part or noun.head not in lexicon.HELD_TOOLS):
             self._relate_places(RelationTerms("near"), noun)
         elif (
             clause.verb in LOOKING_VERBS
@@ -346,6 +352,8 @@ class RoleAssigner:
                     self.relate("inside" if place.head in lexicon.CONTAINERS else "near", place)
         elif not clause.objects:
             self.target(noun, TargetRole.OBJECT)
+        else:
+            clause.last_relation = "for"
 
     def _assign_after_of(self, noun: NounPhrase) -> None:
         clause = self.clause
