@@ -73,14 +73,24 @@ def score_parser(
         if parsed is not None:
             fallbacks += any(warning.startswith("backend ") for warning in parsed.warnings)
             reversed_relations += _is_reversed(graph, parsed)
-    shares = [statistics.fmean(column) for column in zip(*matches, strict=True)]
+    targets, roles, anchors, relations, attributes, excluded = map(statistics.fmean, zip(*matches, strict=True))
     exact = [all(parts) for parts in matches]
-    wrong = tuple(graph.text for graph, is_exact in zip(expected, exact, strict=True) if not is_exact)
-    median_ms, slowest_ms = statistics.median(times_ms), max(times_ms)
     return ParserScore(
-        backend, len(matches), statistics.fmean(exact), *shares, reversed_relations, median_ms, slowest_ms, fallbacks,
-        wrong,
-    )  # fmt: skip
+        backend=backend,
+        sentences=len(matches),
+        exact=statistics.fmean(exact),
+        target_set=targets,
+        role_set=roles,
+        anchor_set=anchors,
+        relation_set=relations,
+        attribute_set=attributes,
+        excluded_set=excluded,
+        reversed_relations=reversed_relations,
+        median_ms=statistics.median(times_ms),
+        slowest_ms=max(times_ms),
+        by_fallback=fallbacks,
+        wrong=tuple(graph.text for graph, is_exact in zip(expected, exact, strict=True) if not is_exact),
+    )
 
 
 def matching_parts(expected: TaskGraph, parsed: TaskGraph | None) -> tuple[bool, ...]:

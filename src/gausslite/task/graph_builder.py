@@ -163,8 +163,9 @@ class GraphBuilder:
             return
         pending, self._pending = self._pending, None
         if self._negated:
-            for each in (clause.objects or clause.referents)[-1:] if pending is not None else ():
-                self._place_negated(phrase_from_text(each), pending)
+            named = (clause.objects or clause.referents)[-1:]
+            if pending is not None and named:
+                self._place_negated(phrase_from_text(named[0]), pending)
             return
         if pending is None:
             clause.objects = clause.objects or list(clause.referents)

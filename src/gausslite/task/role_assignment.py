@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Final
 
-from gausslite.domain.task import Predicate, Superlative, TargetRole
+from gausslite.domain.task import TargetRole
 from gausslite.task import lexicon
-from gausslite.task.attributes import SUPERLATIVES
 from gausslite.task.chunk import Chunk, ChunkKind
 from gausslite.task.clause import Clause
 from gausslite.task.graph_draft import GraphDraft, RelationTerms
 from gausslite.task.noun_phrase import NounPhrase, phrase_from_text
+from gausslite.task.relation_assignment import RelationAssigner
 from gausslite.task.verbs import (
     ATTACHING_VERBS,
     AVOIDING_VERBS,
@@ -47,7 +47,16 @@ class RoleAssigner:
 
     def __init__(self, draft: GraphDraft) -> None:
         self._draft = draft
-        self.clause = Clause()
+        self._relations = RelationAssigner(draft)
+
+    @property
+    def clause(self) -> Clause:
+        """The current clause."""
+        return self._relations.clause
+
+    def rename(self, phrase: str, new: str) -> None:
+        """Change the description of an object that the sentence has named."""
+        self._relations.rename(phrase, new)
 
     def end_clause(self, verb: str | None) -> None:
         """Start another clause. The places of a clause without objects ("look under the bed") become targets.
@@ -59,7 +68,7 @@ class RoleAssigner:
             self._search_places_for_referents(before)
         elif not before.statement:
             self._make_places_targets()
-        self.clause = Clause(verb=verb, referents=before.objects or before.referents)
+        self._relations.clause = Clause(verb=verb, referents=before.objects or before.referents)
         self.clause.pending_places, self.clause.follows_statement = before.pending_places, before.statement
 
     def _searches_for_referent(self) -> bool:
@@ -73,7 +82,7 @@ class RoleAssigner:
         self._draft.confirm_targets(clause.objects)
         pending_places, clause.pending_places = clause.pending_places, []
         for terms, noun in pending_places:
-            self._relate(terms, noun)
+            self._relations.relate_by(terms, noun)
 
     def _make_places_targets(self) -> None:
         pending_places, self.clause.pending_places = self.clause.pending_places, []
@@ -100,8 +109,8 @@ class RoleAssigner:
     def assign_by_preposition(self, pending: str, noun: NounPhrase, following: Sequence[Chunk] = ()) -> None:
         """Assign the noun's role relative to the clause's objects, by the preposition before it."""
         clause = self.clause
-        if self._is_extreme(pending):
-            self._relate_extreme(noun)
+        if self._relations.is_extreme(pending):
+            self._relations.relate_extreme(noun)
             return
         if pending == "closer":
             moves = clause.verb in DELIVERY_VERBS - FETCHING_VERBS | GO_VERBS and not clause.current_place
@@ -119,7 +128,7 @@ class RoleAssigner:
         elif pending == "purpose":
             self._assign_path_end(noun)
         elif pending == "inside" and noun.head in lexicon.CLOTHING and self._acts_on_people():
-            self.relate("near", noun)
+            self._relations.relate("near", noun)
         elif pending in _PASSING_RELATIONS and clause.verb in DELIVERY_VERBS:
             self._draft.add_target(noun.text)
         elif clause.preposition in _ROUTE_PREPOSITIONS and clause.verb in DELIVERY_VERBS and not clause.objects:
@@ -136,16 +145,16 @@ class RoleAssigner:
         elif clause.last_relation == "to" and clause.terms.negated and clause.adds_place:
             self._draft.exclude(noun.text)  # "put it on the table, not on the shelf"
         elif clause.last_relation in ("to", "with") and clause.places:
-            self._relate_places(RelationTerms(pending, clause.terms.negated, clause.terms.bounds), noun)
+            self._relations.relate_places(RelationTerms(pending, clause.terms.negated, clause.terms.bounds), noun)
         elif self._is_destination(pending, following):
             self._add_destination(noun)
             clause.between = pending == "between"
         elif pending == "far_from" and clause.verb in PUSHING_VERBS | DELIVERY_VERBS and not clause.current_place:
-            self.relate("near", noun)  # "pull the chair away from the wall": it is there now
+            self._relations.relate("near", noun)  # "pull the chair away from the wall": it is there now
         else:
             if clause.pending_places and clause.verb in GO_VERBS | STOPPING_VERBS:
                 self._make_places_targets()  # "stop behind the car near the tree"
-            self.relate(pending, noun)
+            self._relations.relate(pending, noun)
 
     def _assign_waypoint(self, noun: NounPhrase) -> None:
         self.target(noun, TargetRole.OBJECT)
@@ -181,7 +190,7 @@ class RoleAssigner:
         elif relation == "with":
             self._add_tool(noun, conjoined=True)
         else:
-            self.relate(relation, noun)
+            self._relations.relate(relation, noun)
 
     def _add_destination(self, noun: NounPhrase, conjoined: bool = False) -> None:
         self._add_place(noun, TargetRole.DESTINATION, conjoined)
@@ -208,14 +217,14 @@ class RoleAssigner:
         if clause.last_relation == "for":
             return  # "for the man with the trolley"
         if clause.last_relation == "to" and clause.places and (is_part or noun.head not in lexicon.HELD_TOOLS):
-            self._relate_places(RelationTerms("near"), noun)
+            self._relations.relate_places(RelationTerms("near"), noun)
         elif (
             clause.verb in LOOKING_VERBS
             or is_part
             or self._are_people(clause.objects)
             or (clause.verb in FETCHING_VERBS and noun.head not in lexicon.HELD_TOOLS)
         ):
-            self.relate("near", noun)
+            self._relations.relate("near", noun)
         else:
             self._add_tool(noun)
 
@@ -272,59 +281,10 @@ class RoleAssigner:
         clause.is_part = noun.head in lexicon.PARTS
         pending_places, clause.pending_places = clause.pending_places, []
         for terms, anchor in pending_places:
-            self._relate(terms, anchor)
-
-    def relate(self, relation: str, noun: NounPhrase) -> None:
-        """Relate the clause's objects to the noun; a place named before any object is kept for the next object."""
-        self._relate(RelationTerms(relation, self.clause.terms.negated, self.clause.terms.bounds), noun)
-
-    def _relate(self, terms: RelationTerms, noun: NounPhrase) -> None:
-        clause = self.clause
-        clause.last_relation = terms.relation
-        clause.in_space = self._is_context(terms, noun)
-        if not clause.objects:
-            clause.pending_places.append((terms, noun))
-        elif clause.in_space:
-            self._draft.add_context(noun.text)
-        else:
-            self._draft.add_relation(terms, clause.objects, noun.text)
-
-    def _relate_places(self, terms: RelationTerms, noun: NounPhrase) -> None:
-        """Relate the destinations or tools named last: "put it on the table by the window"."""
-        if self._is_context(terms, noun):
-            self._draft.add_context(noun.text)
-        else:
-            self._draft.add_relation(terms, self.clause.places, noun.text)
-
-    def _is_context(self, terms: RelationTerms, noun: NounPhrase) -> bool:
-        is_context = terms.relation == "inside" and lexicon.is_space(noun.words)
-        if is_context and terms.negated:
-            self._draft.warnings.append(f"not in {noun.text!r}: a place is not evaluated, the exception is dropped")
-        return is_context
+            self._relations.relate_by(terms, anchor)
 
     def _are_people(self, phrases: Sequence[str]) -> bool:
         return any(phrase.split()[-1] in lexicon.PEOPLE for phrase in phrases)
-
-    def _is_extreme(self, pending: str) -> bool:
-        """Return True for "the nearest chair to", "the farthest cone from"."""
-        superlative = SUPERLATIVES.get(self.clause.superlative or "")
-        is_farthest = superlative is Superlative.FARTHEST and pending == "from"
-        return bool(self.clause.objects) and (is_farthest or (superlative is not None and pending == "to"))
-
-    def _relate_extreme(self, noun: NounPhrase) -> None:
-        clause = self.clause
-        word = clause.superlative or ""
-        for phrase in list(clause.objects):
-            self.rename(phrase, " ".join(each for each in phrase.split() if each != word))
-        farthest = SUPERLATIVES[word] is Superlative.FARTHEST
-        clause.superlative = None
-        self.relate(Predicate.FARTHEST_FROM if farthest else Predicate.CLOSEST_TO, noun)
-
-    def rename(self, phrase: str, new: str) -> None:
-        """Change the description of an object that the sentence has named."""
-        self._draft.rename(phrase, new)
-        for phrases in (self.clause.objects, self.clause.referents, self.clause.places):
-            phrases[:] = [new if each == phrase else each for each in phrases]
 
     def _destination(self, noun: NounPhrase) -> None:
         clause = self.clause
@@ -349,7 +309,7 @@ class RoleAssigner:
             self.target(noun, TargetRole.OBJECT)
             for place in map(phrase_from_text, places):
                 if place.text != "object":  # a room is context
-                    self.relate("inside" if place.head in lexicon.CONTAINERS else "near", place)
+                    self._relations.relate("inside" if place.head in lexicon.CONTAINERS else "near", place)
         elif not clause.objects:
             self.target(noun, TargetRole.OBJECT)
         else:
@@ -364,16 +324,16 @@ class RoleAssigner:
         elif lexicon.is_space(noun.words):
             self._draft.add_context(noun.text)
         elif (clause.is_part or noun.has_determiner) and clause.last_relation is None:
-            self.relate("near", noun)
+            self._relations.relate("near", noun)
 
     def _assign_origin(self, pending: str, noun: NounPhrase) -> None:
         going = self.clause.verb in GO_VERBS - MOVING_VERBS and self.clause.objects
         if going or self.clause.last_relation == "with":
             return
         if pending in _ORIGIN_RELATIONS:
-            self.relate(_ORIGIN_RELATIONS[pending], noun)
+            self._relations.relate(_ORIGIN_RELATIONS[pending], noun)
         elif noun.head in lexicon.PEOPLE:
-            self.relate("near", noun)
+            self._relations.relate("near", noun)
         else:
             encloses = noun.head in lexicon.CONTAINERS or lexicon.is_space(noun.words)
-            self.relate("inside" if encloses else "on", noun)
+            self._relations.relate("inside" if encloses else "on", noun)
