@@ -18,7 +18,7 @@ _STATES = {
 }
 
 
-_LAYERS = {
+_LAYERS: dict[int, MapLayer] = {
     pb.MAP_LAYER_UNSPECIFIED: MapLayer.VOTE,
     pb.MAP_LAYER_VOTE: MapLayer.VOTE,
     pb.MAP_LAYER_REFINED: MapLayer.REFINED,

@@ -41,4 +41,5 @@ def _multiply(left: Float64[ndarray, "4"], right: Float64[ndarray, "n 4"]) -> Fl
     """Return the Hamilton products of one quaternion (w, x, y, z) with many."""
     w, x, y, z = left
     matrix = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
-    return right @ matrix.T
+    product: Float64[ndarray, "n 4"] = right @ matrix.T
+    return product

@@ -44,10 +44,10 @@ class FrameAligner:
         self._changed.setdefault(agent_id, set()).update(accepted.tolist())
         alignment = self._alignments.get(agent_id)
         if alignment.state is AlignmentState.UNKNOWN and not self._alignments.earlier(agent_id):
-            self._alignments.set(agent_id, replace(alignment, state=AlignmentState.REFERENCE))
+            self._alignments.put(agent_id, replace(alignment, state=AlignmentState.REFERENCE))
         elif alignment.fit is None and agent_id not in self._next_seq:
             # fixes the order of the agents
-            self._alignments.set(agent_id, alignment)
+            self._alignments.put(agent_id, alignment)
             self._next_seq[agent_id] = 0
 
     def due(self) -> tuple[str, ...]:
@@ -84,7 +84,7 @@ class FrameAligner:
         self._next_seq.pop(agent_id, None)
 
     def _apply(self, agent_id: str, before: FrameAlignment, after: FrameAlignment) -> Int64[ndarray, " k"]:
-        self._alignments.set(agent_id, after)
+        self._alignments.put(agent_id, after)
         if after.state is not before.state:
             level = logging.WARNING if after.state is AlignmentState.QUARANTINED else logging.INFO
             _log.log(

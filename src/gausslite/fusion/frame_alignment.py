@@ -122,7 +122,7 @@ class FrameAlignments:
         """Return the agent's alignment."""
         return self._by_agent.get(agent_id) or FrameAlignment(order=len(self._by_agent))
 
-    def set(self, agent_id: str, alignment: FrameAlignment) -> None:
+    def put(self, agent_id: str, alignment: FrameAlignment) -> None:
         """Replace the agent's alignment. Raises StorageError."""
         self._store.save_record(agent_id, _RECORD, _encode(alignment))
         self._by_agent[agent_id] = alignment
@@ -131,7 +131,7 @@ class FrameAlignments:
         """Set the motion that the agent declares; estimates from before are dropped if it changed."""
         current = self.get(agent_id)
         if not np.array_equal(current.declared, T_fused_agent):
-            self.set(agent_id, FrameAlignment(current.order, declared=T_fused_agent))
+            self.put(agent_id, FrameAlignment(current.order, declared=T_fused_agent))
 
     def remove_agent(self, agent_id: str) -> None:
         """Forget the agent; the store deletes its record with its updates."""
@@ -180,9 +180,9 @@ def _decode(data: bytes) -> FrameAlignment:
         stored = value["fit"]
         fit = None
         if stored is not None:
-            misfits = (Misfit(*(float(each) for each in stored[name])) for name in ("before", "after"))
+            before, after = (Misfit(*(float(each) for each in stored[name])) for name in ("before", "after"))
             shift_m, rotation_deg, compared = stored["rest"]
-            fit = FrameFit(_matrix(stored["T"]), *misfits, float(shift_m), float(rotation_deg), int(compared))
+            fit = FrameFit(_matrix(stored["T"]), before, after, float(shift_m), float(rotation_deg), int(compared))
         segments = tuple((int(first), _matrix(T)) for first, T in value["segments"])
         state = AlignmentState(value["state"])
         declared = _matrix(value["declared"])

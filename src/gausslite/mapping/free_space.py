@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
+from jaxtyping import Int64
+from numpy import ndarray
 
 from gausslite.domain.camera import project
 from gausslite.domain.frame import Frame
@@ -56,7 +58,7 @@ class FreeSpaceMap:
         self._changed.clear()
         return FreeSpace(self._free.keys[chosen], self._free.counts[chosen])
 
-    def _free_indices(self, frame: Frame) -> np.ndarray:
+    def _free_indices(self, frame: Frame) -> Int64[ndarray, "n 3"]:
         """Return the (i, j, k) of the voxels that this frame shows to be free."""
         size_m, camera = self._grid.size_m, frame.camera
         half_m = 0.5 * np.sqrt(3.0) * size_m
@@ -84,4 +86,5 @@ class FreeSpaceMap:
             inside = (pixels >= 0).all(axis=1) & (pixels < (camera.width_px, camera.height_px)).all(axis=1)
             columns, rows = np.where(inside[:, None], pixels, 0).T
             free &= inside & (frame.depth_m[rows, columns] > far_m)
-        return indices[free]
+        chosen: Int64[ndarray, "n 3"] = indices[free]
+        return chosen

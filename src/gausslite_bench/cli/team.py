@@ -8,6 +8,9 @@ import sys
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
+
+from tqdm import tqdm
 
 from gausslite.cli.progress import print_above_bar, progress_bar
 from gausslite.codec.files import write_atomic
@@ -76,11 +79,15 @@ def run_team(options: argparse.Namespace) -> int:
     frames = sum(trial.plan.agents * trial.plan.frames for trial in trials)
     with progress_bar(frames, "team", "frame") as bar:
         for trial in trials:
-            results.append(run_trial(trial, trial.plan.load(trial.size), lambda _: bar.update()))
+            results.append(run_trial(trial, trial.plan.load(trial.size), lambda _: _count(bar)))
             _write(options.out, results)
             print_above_bar(team_table(results[-1:]).splitlines()[-1])
     print(as_text({"trials": [each.as_json() for each in results]}) if options.json else team_table(results))
     return 0
+
+
+def _count(bar: tqdm[Any]) -> None:
+    bar.update()
 
 
 def _run_late_joiner(options: argparse.Namespace, trials: Sequence[TeamTrial]) -> int:

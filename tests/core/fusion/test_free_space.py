@@ -153,7 +153,7 @@ def test_free_space_of_wrong_shape_is_refused() -> None:
 def test_free_space_of_a_quarantined_agent_does_not_count(tmp_path: Path) -> None:
     store = SqliteStore(tmp_path / "a.sqlite")
     _, bee = team(store, VoteRule.FREE_SPACE)
-    FrameAlignments(store).set("bee", FrameAlignment(1, AlignmentState.QUARANTINED, message="far away"))
+    FrameAlignments(store).put("bee", FrameAlignment(1, AlignmentState.QUARANTINED, message="far away"))
     engine = FusionEngine(store, FusionSettings(grid=GRID, vote=VoteRule.FREE_SPACE))
     engine.contribute_free_space(bee, observed(2), GRID)
     assert len(engine.maps.voted_map()) == 2
