@@ -55,6 +55,11 @@ def require_graph(graph: TaskGraph, limits: TaskLimits = LIMITS) -> None:
         ("context", graph.context, limits.max_anchors),
     ):
         _require_phrases(role, names, max_count, limits.max_phrase_chars)
+    both = set(graph.excluded) & {*graph.targets, *graph.anchors}
+    if both:
+        raise TaskError(
+            f"task excluded: expected other objects than targets and anchors, got {', '.join(sorted(both))}"
+        )
     if len(graph.relations) > limits.max_relations or len(graph.warnings) > limits.max_warnings:
         expected = f"{limits.max_relations} relations and {limits.max_warnings} warnings"
         raise TaskError(f"task: expected at most {expected}, got {len(graph.relations)} and {len(graph.warnings)}")

@@ -69,6 +69,7 @@ def grounded_graph(text: str, parsed: ParsedPhrases, draft: GraphDraft | None = 
     targets = _without_excluded(draft, _mentioned_phrases("target", tuple(parsed.targets), mentioned, warn), warn)
     anchors = _mentioned_phrases("anchor", parsed.anchors, mentioned, warn)
     excluded = _mentioned_phrases("excluded object", parsed.excluded, mentioned, warn)
+    excluded = _without_used(excluded, (*targets, *anchors), warn)
     if not targets:
         shown = " ".join(text.split())[:60]
         raise TaskError(
@@ -83,6 +84,7 @@ def grounded_graph(text: str, parsed: ParsedPhrases, draft: GraphDraft | None = 
     target_roles: dict[str, TargetRole] = {}
     for target in targets:
         target_roles.setdefault(names[target], roles[target])
+    context = _mentioned_phrases("place", parsed.context, mentioned, warn)[: LIMITS.max_anchors]
     graph = TaskGraph(
         task_id=task_id_of(text),
         text=text.strip(),
@@ -95,7 +97,7 @@ def grounded_graph(text: str, parsed: ParsedPhrases, draft: GraphDraft | None = 
         roles=tuple(target_roles.values()),
         attributes=named.attributes,
         excluded=_renamed(excluded, names),
-        context=tuple(dict.fromkeys(filter(None, map(plain_phrase, parsed.context)))),
+        context=context,
     )
     require_graph(graph)
     return graph
@@ -152,6 +154,14 @@ def _without_excluded(draft: GraphDraft, targets: tuple[str, ...], warn: Callabl
 def _may_be_same_object(one: str, other: str) -> bool:
     """Return True if the phrases are equal, or one is the other with more words before it."""
     return f" {one}".endswith(f" {other}") or f" {other}".endswith(f" {one}")
+
+
+def _without_used(excluded: tuple[str, ...], used: tuple[str, ...], warn: Callable[[str], None]) -> tuple[str, ...]:
+    """Return the excluded objects that are neither targets nor anchors."""
+    for phrase in excluded:
+        if phrase in used:
+            warn(f"{_abbreviate(phrase)} is excluded and also a target or an anchor: its exclusion is dropped")
+    return tuple(phrase for phrase in excluded if phrase not in used)
 
 
 def plain_phrase(phrase: str) -> str:

@@ -31,7 +31,8 @@ WORDS = st.sampled_from(
             "; : . ! + it them this that these mug table chairs map go door picture path is are was don't touching who "
             "which what where when while whether because so until then before after i you we they me her one "
             "ones everything put leave left right holding stands needs belong lost found u there's mug's 3 back up "
-            "down out off"
+            "down out off largest nearest bigger than second neither nor isn't can't kitchen room 12 within 2 m metres "
+            "half between at least from away far throw water avoid touching fill use wearing handle they should black"
         )
     )
 )
