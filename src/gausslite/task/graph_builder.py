@@ -213,18 +213,10 @@ class GraphBuilder:
             noun = NounPhrase((*superlative.words, *noun.words), True)
         of_follows = after is not None and after.kind is ChunkKind.PREPOSITION and after.word == "of"
         if adjectives_only(noun.words) and not (of_follows and noun.head in lexicon.PLACES):
-            if after is not None and after.kind is ChunkKind.CONJUNCTION:
-                self._adjectives.append(noun)
-            elif any(word in SUPERLATIVES for word in noun.words) and self._described is not None:
-                self._describe(" ".join(word for word in noun.words if is_attribute(word)), negated=False)
-            elif is_attribute(noun.head) and (of_follows or (after is not None and after.kind is ChunkKind.NOUN)):
-                self._partitive = noun, pending
+            self._lone_adjectives(noun, pending, after)
             return
         if not names_object(noun, pending, after):
             self._skip_noun(noun, pending, conjoined, after)
-            if pending is not None and self._clause.terms.negated:
-                words = f"not {self._clause.preposition} {noun.text}"
-                self._draft.warnings.append(f"{words!r} is not understood: it is dropped")
             return
         if pending is not None and lexicon.is_space(noun.words) and self._clause.preposition in _SPACE_PREPOSITIONS:
             pending = "inside"
@@ -241,6 +233,16 @@ class GraphBuilder:
                 if self._alternative is not None:
                     self._assigner.assign_by_preposition(self._alternative, each)
         self._alternative = None
+
+    def _lone_adjectives(self, noun: NounPhrase, pending: str | None, after: Chunk | None) -> None:
+        """Handle adjectives without a noun: "the red" and blue mugs, "the largest" of the boxes."""
+        before_noun = after is not None and (after.kind is ChunkKind.NOUN or after.word == "of")
+        if after is not None and after.kind is ChunkKind.CONJUNCTION:
+            self._adjectives.append(noun)
+        elif any(word in SUPERLATIVES for word in noun.words) and self._described is not None:
+            self._describe(" ".join(word for word in noun.words if is_attribute(word)), negated=False)
+        elif is_attribute(noun.head) and before_noun:
+            self._partitive = noun, pending
 
     def _resolve_one(self, one: NounPhrase) -> NounPhrase:
         """Return the phrase with the latest object's noun in place of "one": "the blue one"."""
@@ -259,6 +261,9 @@ class GraphBuilder:
 
     def _skip_noun(self, noun: NounPhrase, pending: str | None, conjoined: bool, after: Chunk | None) -> None:
         """Skip a noun that names no object; in "on the edge of the table" the table inherits the "on"."""
+        if pending is not None and self._clause.terms.negated:
+            words = f"not {self._clause.preposition} {noun.text}"
+            self._draft.warnings.append(f"{words!r} is not understood: it is dropped")
         if noun.head in lexicon.ROUTES:
             self._clause.route = True
         elif noun.head in lexicon.PLACES and pending is None:

@@ -76,31 +76,46 @@ def grounded_graph(text: str, parsed: ParsedPhrases, draft: GraphDraft | None = 
             f"task targets: expected at least one object of the sentence, such as in {EXAMPLE}, got {shown!r}"
         )
     roles = {plain_phrase(phrase): role for phrase, role in parsed.targets.items()}
-    relations = _valid_relations(parsed.relations, targets, anchors, warn)
-    order = [plain_phrase(each) for each in parsed.mentions]
-    kept = (*targets, *anchors, *excluded)
-    named = name_objects([*(each for each in order if each in kept), *kept], excluded)
-    names = named.names
-    target_roles: dict[str, TargetRole] = {}
-    for target in targets:
-        target_roles.setdefault(names[target], roles[target])
-    context = _mentioned_phrases("place", parsed.context, mentioned, warn)[: LIMITS.max_anchors]
-    graph = TaskGraph(
-        task_id=task_id_of(text),
-        text=text.strip(),
-        targets=tuple(target_roles),
-        anchors=_renamed(anchors, names),
-        relations=tuple(
-            dict.fromkeys(replace(each, target=names[each.target], anchor=names[each.anchor]) for each in relations)
+    graph = _named_graph(
+        replace(
+            parsed,
+            targets={
+                each: role for phrase, role in parsed.targets.items() if (each := plain_phrase(phrase)) in targets
+            },
+            anchors=anchors,
+            relations=_valid_relations(parsed.relations, targets, anchors, warn),
+            excluded=excluded,
+            context=_mentioned_phrases("place", parsed.context, mentioned, warn)[: LIMITS.max_anchors],
+            warnings=all_warnings,
         ),
-        warnings=tuple((*all_warnings, *named.warnings)[: LIMITS.max_warnings]),
-        roles=tuple(target_roles.values()),
-        attributes=named.attributes,
-        excluded=_renamed(excluded, names),
-        context=context,
+        text,
     )
     require_graph(graph)
     return graph
+
+
+def _named_graph(parsed: ParsedPhrases, text: str) -> TaskGraph:
+    """Return the graph of normalised phrases, with one name for each object."""
+    order = [plain_phrase(each) for each in parsed.mentions]
+    kept = (*parsed.targets, *parsed.anchors, *parsed.excluded)
+    named = name_objects([*(each for each in order if each in kept), *kept], parsed.excluded)
+    names = named.names
+    roles: dict[str, TargetRole] = {}
+    for target, role in parsed.targets.items():
+        roles.setdefault(names[target], role)
+    relations = (replace(each, target=names[each.target], anchor=names[each.anchor]) for each in parsed.relations)
+    return TaskGraph(
+        task_id=task_id_of(text),
+        text=text.strip(),
+        targets=tuple(roles),
+        anchors=_renamed(parsed.anchors, names),
+        relations=tuple(dict.fromkeys(relations)),
+        warnings=tuple((*parsed.warnings, *named.warnings)[: LIMITS.max_warnings]),
+        roles=tuple(roles.values()),
+        attributes=named.attributes,
+        excluded=_renamed(parsed.excluded, names),
+        context=tuple(parsed.context),
+    )
 
 
 def _with_rule_negations(parsed: ParsedPhrases, draft: GraphDraft, warn: Callable[[str], None]) -> ParsedPhrases:

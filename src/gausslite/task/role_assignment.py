@@ -142,7 +142,13 @@ class RoleAssigner:
                 self._assign_after_with(noun)
         elif pending == "from" or pending in _ORIGIN_RELATIONS:
             self._assign_origin(pending, noun)
-        elif clause.last_relation == "to" and clause.terms.negated and clause.adds_place:
+        else:
+            self._assign_place(pending, noun, following)
+
+    def _assign_place(self, pending: str, noun: NounPhrase, following: Sequence[Chunk]) -> None:
+        """Assign a noun after a preposition of place: a destination, or where an object or a destination is."""
+        clause = self.clause
+        if clause.last_relation == "to" and clause.terms.negated and clause.adds_place:
             self._draft.exclude(noun.text)  # "put it on the table, not on the shelf"
         elif clause.last_relation in ("to", "with") and clause.places:
             self._relations.relate_places(RelationTerms(pending, clause.terms.negated, clause.terms.bounds), noun)
