@@ -79,9 +79,7 @@ def grounded_graph(text: str, parsed: ParsedPhrases, draft: GraphDraft | None = 
     graph = _named_graph(
         replace(
             parsed,
-            targets={
-                each: role for phrase, role in parsed.targets.items() if (each := plain_phrase(phrase)) in targets
-            },
+            targets={target: roles[target] for target in targets},
             anchors=anchors,
             relations=_valid_relations(parsed.relations, targets, anchors, warn),
             excluded=excluded,
