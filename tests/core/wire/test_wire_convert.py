@@ -15,6 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gausslite.codec.subset_codec import DEFAULT_LIMITS, encode_subset
+from gausslite.codec.task_json import graph_as_json, graph_from_json
 from gausslite.domain.camera import Camera
 from gausslite.domain.camera_motion import CameraMotion
 from gausslite.domain.errors import GaussLiteError, InvalidInputError, PoseError, TaskError
@@ -23,7 +24,7 @@ from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.image_bytes import image_size
 from gausslite.domain.lens import Lens, LensModel
 from gausslite.domain.pose import require_rigid
-from gausslite.domain.task import Predicate, Relation, TaskGraph
+from gausslite.domain.task import ObjectAttributes, Predicate, Relation, Superlative, TargetRole, TaskGraph
 from gausslite.domain.trajectory import Twist
 from gausslite.domain.voxel_batch import RoiSubset, VoxelBatch
 from gausslite.domain.voxels import AxisAlignedBox, VoxelGrid
@@ -36,6 +37,18 @@ from gausslite.wire.images import decode_colour, encode_colour, encode_depth
 CAMERA = Camera(500.0, 501.0, 32.5, 24.5, 64, 48)
 GRAPH = TaskGraph(
     "id", "Pick up the mug on the table", ("mug",), ("table",), (Relation(Predicate.ON, "mug", "table"),), ("odd",)
+)
+FULL_GRAPH = TaskGraph(
+    "id",
+    "Put the red block on the blue block",
+    ("block", "block_2", "vase"),
+    ("table",),
+    (Relation(Predicate.NEAR, "block", "table", True, 0.5, 2.0), Relation(Predicate.ON, "block_2", "table")),
+    ("odd",),
+    (TargetRole.OBJECT, TargetRole.DESTINATION, TargetRole.OBSTACLE),
+    (ObjectAttributes("block", "red"), ObjectAttributes("block_2", "blue", Superlative.LARGEST)),
+    ("cat",),
+    ("kitchen",),
 )
 
 
@@ -64,8 +77,15 @@ def test_a_frame_is_unchanged_by_a_round_trip(lossless: bool) -> None:
 
 def test_a_task_graph_is_unchanged_by_a_round_trip() -> None:
     relations = tuple(Relation(predicate, "mug", "table") for predicate in Predicate)
-    for graph in (GRAPH, TaskGraph("id", "", ("mug",), ("table",), relations)):
+    for graph in (GRAPH, FULL_GRAPH, TaskGraph("id", "", ("mug",), ("table",), relations)):
+        assert graph_from_json({**graph_as_json(graph), "text": graph.text, "task_id": graph.task_id}) == graph
         assert convert_task.graph_from_message(convert_task.graph_to_message(graph)) == graph
+
+
+def test_a_graph_without_roles_has_objects_only() -> None:
+    message = convert_task.graph_to_message(GRAPH)
+    message.ClearField("roles")
+    assert convert_task.graph_from_message(message) == GRAPH
 
 
 @pytest.mark.parametrize(
@@ -78,6 +98,14 @@ def test_a_task_graph_is_unchanged_by_a_round_trip() -> None:
         {"text": "x" * 5000},
         {"relations": [task_pb2.Relation(predicate=task_pb2.PREDICATE_ON, target="mug", anchor="chair")]},
         {"relations": [task_pb2.Relation(target="mug", anchor="table")]},
+        {"relations": [task_pb2.Relation(predicate=1, target="mug", anchor="table", min_m=2.0, max_m=1.0)]},
+        {"relations": [task_pb2.Relation(predicate=1, target="mug", anchor="table", max_m=float("nan"))]},
+        {"roles": [1, 1]},
+        {"roles": [99]},
+        {"attributes": [task_pb2.ObjectAttributes(name="chair", colour="red")]},
+        {"attributes": [task_pb2.ObjectAttributes(name="mug", superlative=99)]},  # type: ignore[arg-type]
+        {"excluded": ["mug"]},
+        {"context": ["kitchen"] * 100},
         {"relations": [task_pb2.Relation(predicate=99, target="mug", anchor="table")]},  # type: ignore[arg-type]
     ],
 )
