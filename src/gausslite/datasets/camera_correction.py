@@ -124,10 +124,10 @@ def _undistorted(camera: Camera, lens: Lens) -> Camera:
             K_ideal = cv2.fisheye.estimateNewCameraMatrixForUndistortRectify(K, D, size, np.eye(3), balance=0.0)
         else:
             K_ideal, _ = cv2.getOptimalNewCameraMatrix(K, D, size, 0.0)
-    except cv2.error as error:
+        fx_px, fy_px, cx_px, cy_px = (float(K_ideal[at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2)))
+        return replace(camera, fx_px=fx_px, fy_px=fy_px, cx_px=cx_px + 0.5, cy_px=cy_px + 0.5)
+    except (cv2.error, InvalidInputError) as error:
         raise InvalidInputError(f"lens {lens}: expected one that can be inverted over the image") from error
-    fx_px, fy_px, cx_px, cy_px = (float(K_ideal[at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2)))
-    return replace(camera, fx_px=fx_px, fy_px=fy_px, cx_px=cx_px + 0.5, cy_px=cy_px + 0.5)
 
 
 def _lookup(

@@ -15,6 +15,8 @@ from numpy import ndarray
 from gausslite.domain.errors import InvalidInputError
 
 _MAX_SIDE_PX = 16384
+_MAX_FOCAL_PX = 1e6
+"""Larger focal lengths overflow float32 in products with pixels; real cameras have a hundredth of it."""
 _MAX_SLOPE = 100.0
 """Largest tangent of a ray's angle to the optical axis (89.4 degrees); steeper rays are not a pinhole camera."""
 
@@ -33,8 +35,10 @@ class Camera:
     def __post_init__(self) -> None:
         for name in ("fx_px", "fy_px"):
             value = getattr(self, name)
-            if not (np.isfinite(value) and value > 0):
-                raise InvalidInputError(f"camera {name}: expected a positive number, got {value}")
+            if not 0 < value <= _MAX_FOCAL_PX:
+                raise InvalidInputError(
+                    f"camera {name}: expected a positive number up to {_MAX_FOCAL_PX:g}, got {value}"
+                )
         for name in ("cx_px", "cy_px"):
             value = getattr(self, name)
             if not np.isfinite(value):

@@ -5,11 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from gausslite.datasets.camera_correction import ideal_camera, undistort_frame
 from gausslite.domain.camera import Camera
 from gausslite.domain.camera_correction import CameraCorrection
 from gausslite.domain.camera_motion import CameraMotion
+from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
 from gausslite.domain.lens import Lens, LensModel
 from gausslite.domain.trajectory import Twist
@@ -46,3 +48,9 @@ def test_a_live_frame_is_corrected_as_a_recorded_one() -> None:
 def test_a_live_frame_without_lens_and_motion_is_used_as_sent() -> None:
     frame = sample_frame()
     assert correct_live_frame(frame, None) is frame
+
+
+def test_a_lens_without_a_pinhole_camera_is_named_in_the_error() -> None:
+    folding = Lens(LensModel.FISHEYE, (-900.0, 0.0, 0.0, 0.0))
+    with pytest.raises(InvalidInputError, match="lens fisheye:-900,0,0,0: expected one that can be inverted"):
+        correct_live_frame(sample_frame(), folding)
