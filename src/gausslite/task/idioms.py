@@ -19,6 +19,11 @@ _PLAIN: Final = {
     rf"at (?:least|most)(?= (?:one|two|three|four|five|six|seven|eight|nine|ten|\d+) (?!{_LENGTH}\b))": "",
     r"(is|are|was|were|does|did|has|have|would|could|should|must)n't": r"\1 not",
     r"let's": "let us",
+    # a double negation is a request
+    r"(?:do not|don't|dont|never) (?:forget|fail|neglect|omit|hesitate) to": "",
+    r"(?:do not|don't|dont|never) (?:forget|skip|ignore|overlook|miss|omit|neglect|leave out|disregard)(?: about)?": (
+        "handle"
+    ),
     r"(on|in|inside|under|near|behind|at|above) neither (.{2,40}?) nor(?: \1)?": r"not \1 \2 and not \1",
     r"neither (on|in|inside|under|near|behind|at|above) (.{2,40}?) nor \1": r"not \1 \2 and not \1",
     r"face[ -](?:down|up)": "",

@@ -29,6 +29,7 @@ from gausslite.task.verbs import (
     REACHING_VERBS,
     SEARCH_VERBS,
     STOPPING_VERBS,
+    TOOL_VERBS,
 )
 from gausslite.task.word_set import word_set
 
@@ -222,7 +223,7 @@ class RoleAssigner:
             return  # "with both hands"
         if clause.last_relation == "for":
             return  # "for the man with the trolley"
-        if clause.last_relation == "to" and clause.places and (is_part or noun.head not in lexicon.HELD_TOOLS):
+        if clause.last_relation == "to" and clause.places and (is_part or not self._may_be_tool(noun)):
             self._relations.relate_places(RelationTerms("near"), noun)
         elif (
             clause.verb in LOOKING_VERBS
@@ -233,6 +234,9 @@ class RoleAssigner:
             self._relations.relate("near", noun)
         else:
             self._add_tool(noun)
+
+    def _may_be_tool(self, noun: NounPhrase) -> bool:
+        return self.clause.verb in TOOL_VERBS or noun.head in lexicon.HELD_TOOLS
 
     def _assign_loaded(self, noun: NounPhrase) -> None:
         """Make the noun the object and the objects so far destinations: "load the van with boxes"."""

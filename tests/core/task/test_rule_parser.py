@@ -199,6 +199,14 @@ def test_a_negated_relation_is_never_read_as_its_opposite(text, relation):
 
 
 @pytest.mark.parametrize(
+    "text", ["Take the keys and don't forget the umbrella", "Don't forget to take the keys and the umbrella"]
+)
+def test_a_double_negation_is_a_request(text):
+    graph = RuleParser().parse(text)
+    assert (graph.targets, graph.excluded) == (("key", "umbrella"), ())
+
+
+@pytest.mark.parametrize(
     ("phrase", "predicate", "min_m", "max_m"),
     [
         ("1.5 m from", Predicate.NEAR, 1.5, 1.5),
