@@ -124,8 +124,12 @@ def test_parse_prints_the_stable_json() -> None:
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout) == {
         "targets": ["mug"],
+        "roles": {"mug": "object"},
         "anchors": ["table"],
         "relations": [{"predicate": "on", "target": "mug", "anchor": "table"}],
+        "attributes": {},
+        "excluded": [],
+        "context": [],
         "warnings": [],
     }
 
