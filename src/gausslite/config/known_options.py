@@ -7,7 +7,7 @@ from typing import Final
 
 KNOWN_OPTIONS: Final = frozenset(
     {
-        *("absent", "after", "agent-id", "backend", "before", "blur", "camera-correction", "changes"),
+        *("absent", "after", "agent-id", "backend", "before", "blur", "camera-correction", "caps", "changes"),
         *("deadline-slack", "details", "detector", "disable", "drain-timeout", "equal", "exit-when-done"),
         *("frame-alignment", "frame-error", "free-space", "homes", "late-joiner", "team-map", "team-sizes", "vote"),
         *("external-rasterizer", "fit-views", "frames", "frames-a", "frames-b", "fusion", "gaussians"),

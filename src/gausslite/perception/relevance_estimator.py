@@ -16,8 +16,8 @@ from gausslite.domain.state import State
 from gausslite.domain.task import TaskGraph
 from gausslite.perception.detect import Detector, Segmenter
 from gausslite.perception.object_map import Landmark
-from gausslite.perception.spatial import best_depth_m
 from gausslite.perception.relevance_tracker import RelevanceTracker, RelevanceTrackerSettings
+from gausslite.perception.spatial import best_depth_m
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -12,8 +12,8 @@ from numpy import ndarray
 
 from gausslite.domain.errors import DatasetError, InvalidInputError
 from gausslite.domain.frame import Frame
-from gausslite.domain.pose_exposure_prior import PoseExposurePrior
 from gausslite.domain.objects import ObjectLandmark
+from gausslite.domain.pose_exposure_prior import PoseExposurePrior
 from gausslite.domain.region import Region
 from gausslite.domain.relevance import RelevanceMap
 from gausslite.domain.state import State

@@ -69,13 +69,14 @@ def ticking_mapper(seconds_per_frame: float) -> TaskMapper:
 
 
 def test_the_time_of_a_frame_includes_publishing() -> None:
-    task_mapper = ticking_mapper(60.0)
+    # time for the min_iterations of 15 also when steps alternate between warm-up and active: that reads the clock more
+    task_mapper = ticking_mapper(66.0)
     for index in range(4):
         budget = task_mapper.process(wall_frame(index, SIZE, shift_m=0.1 * index)).timing
         optional = {Stage.TRACKING, Stage.PRUNING, Stage.DENSIFICATION, Stage.RENDERING, Stage.REEVALUATION}
         assert set(Stage) - optional <= set(budget.stages_s)
         # an iteration takes one second plus some clock readings
-        assert budget.seconds <= 60.0 + 8.0
+        assert budget.seconds <= 66.0 + 8.0
         assert not budget.under_trained
     # except the first iteration, which every frame trains
     assert ticking_mapper(1e-6).process(wall_frame(0, SIZE)).iterations == 1

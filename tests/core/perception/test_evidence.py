@@ -18,8 +18,8 @@ from gausslite.perception.foreground import foreground_mask
 from gausslite.perception.object_map import Landmark, ObjectMap, Observation
 from gausslite.perception.relations import SpatialSettings
 from gausslite.perception.relevance_estimator import TaskRelevanceEstimator
-from gausslite.perception.spatial import SpatialFilter
 from gausslite.perception.relevance_tracker import RelevanceTrackerSettings
+from gausslite.perception.spatial import SpatialFilter
 
 CAMERA = Camera(100.0, 100.0, 80.0, 60.0, 160, 120)
 WHOLE = np.ones((120, 160), np.bool_)

@@ -12,8 +12,8 @@ from gausslite.datasets.regions import load_voxel_regions
 from gausslite.datasets.source import Source
 from gausslite.perception.models.model_file import open_model
 from gausslite.perception.relevance_estimator import TaskRelevanceEstimator
-from gausslite.perception.text_embeddings import TextEmbeddings, classes_for
 from gausslite.perception.relevance_tracker import RelevanceTrackerSettings
+from gausslite.perception.text_embeddings import TextEmbeddings, classes_for
 from gausslite.perception.yolo import YoloSegDetector, load_yolo
 from gausslite.task.rules import RuleParser
 

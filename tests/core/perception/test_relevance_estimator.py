@@ -18,9 +18,9 @@ from gausslite.perception.ground_truth import RegionDetector
 from gausslite.perception.object_map import Observation
 from gausslite.perception.relations import SpatialSettings
 from gausslite.perception.relevance_estimator import TaskRelevanceEstimator
+from gausslite.perception.relevance_tracker import RelevanceTrackerSettings
 from gausslite.perception.spatial import SpatialFilter, best_depth_m
 from gausslite.perception.text_embeddings import classes_for
-from gausslite.perception.relevance_tracker import RelevanceTrackerSettings
 
 CAMERA = Camera(100.0, 100.0, 80.0, 60.0, 160, 120)
 UP = (0.0, -1.0, 0.0)
