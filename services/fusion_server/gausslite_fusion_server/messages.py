@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import numpy as np
+from jaxtyping import Float64
+from numpy import ndarray
+
 from gausslite.domain.errors import InvalidInputError
+from gausslite.domain.frame import MAX_COORDINATE_M
 from gausslite.fusion.frame_alignment import AlignmentState, FrameAlignment
 from gausslite.fusion.fused_map import MapLayer
 from gausslite.fusion.traffic import AgentContribution
 from gausslite.v1 import fusion_service_pb2 as pb
-from gausslite.wire.convert import transform_to_message
+from gausslite.wire.convert import transform_from_message, transform_to_message
 
 _STATES = {
     AlignmentState.UNKNOWN: pb.ALIGNMENT_STATE_UNSPECIFIED,
@@ -30,6 +35,18 @@ def layer_from_message(number: int) -> MapLayer:
     if number not in _LAYERS:
         raise InvalidInputError(f"layer: expected VOTE or REFINED, got {number}")
     return _LAYERS[number]
+
+
+def declared_frame_from_message(request: pb.JoinSessionRequest) -> Float64[ndarray, "4 4"] | None:
+    """Decode T_fused_agent, None if the agent does not declare it. Raises PoseError, InvalidInputError."""
+    if not request.HasField("t_fused_agent"):
+        return None
+    T_fused_agent = transform_from_message("t_fused_agent", request.t_fused_agent)
+    if np.abs(T_fused_agent[:3, 3]).max() > MAX_COORDINATE_M:
+        raise InvalidInputError(
+            f"t_fused_agent: expected a translation within {MAX_COORDINATE_M:g} m, got {T_fused_agent[:3, 3].tolist()}"
+        )
+    return T_fused_agent
 
 
 def alignment_to_message(alignment: FrameAlignment) -> pb.FrameAlignment:

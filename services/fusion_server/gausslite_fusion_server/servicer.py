@@ -44,7 +44,11 @@ from gausslite_fusion_server.change_blocks import change_blocks
 from gausslite_fusion_server.contributions import store_free_space, store_keyframe, store_subset
 from gausslite_fusion_server.drain_gate import DrainGate
 from gausslite_fusion_server.map_renderer import MapRenderer
-from gausslite_fusion_server.messages import contribution_to_message, layer_from_message
+from gausslite_fusion_server.messages import (
+    contribution_to_message,
+    declared_frame_from_message,
+    layer_from_message,
+)
 from gausslite_fusion_server.refinement_worker import RefinementWorker, RefineRequest
 
 _log = logging.getLogger(__name__)
@@ -93,9 +97,9 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         grid = grid_from_message(request.grid)
         requested = MissionConfig(request.mission_id, request.world_frame, grid.size_m)
         task = graph_from_message(request.task) if request.HasField("task") else None
+        T_fused_agent = declared_frame_from_message(request)
         joined = await self._work(self._engine.join, request.agent_id, requested, request.fresh_map)
-        if request.HasField("t_fused_agent"):
-            T_fused_agent = transform_from_message("t_fused_agent", request.t_fused_agent)
+        if T_fused_agent is not None:
             await self._work(self._engine.declare_frame, request.agent_id, T_fused_agent)
         if task is not None:
             report = ObjectReport(task, self._engine.reported_objects(request.agent_id, task))

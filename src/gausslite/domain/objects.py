@@ -14,7 +14,7 @@ from gausslite.domain.voxels import AxisAlignedBox
 
 MAX_OBJECTS_PER_AGENT = 200
 NO_TARGET_INDEX = -1
-_MAX_COORDINATE_M = 1e6
+MAX_OBJECT_COORDINATE_M = 1e6
 _MAX_TIME_NS = 1 << 62
 
 
@@ -48,9 +48,10 @@ class ObjectLandmark:
             if not text:
                 raise InvalidInputError(f"object {name}: expected a text, got an empty one")
         numbers = (*self.centroid_m, *self.extent_m.min_m, *self.extent_m.max_m)
-        if not all(abs(value) <= _MAX_COORDINATE_M for value in numbers):
+        if not all(abs(value) <= MAX_OBJECT_COORDINATE_M for value in numbers):
             raise InvalidInputError(
-                f"object {quote_name(self.object_id)}: expected coordinates within ±{_MAX_COORDINATE_M:g} m, got others"
+                f"object {quote_name(self.object_id)}: expected coordinates within "
+                f"±{MAX_OBJECT_COORDINATE_M:g} m, got others"
             )
         if not 0.0 <= self.confidence <= 1.0:
             raise InvalidInputError(f"object confidence: expected 0 to 1, got {self.confidence}")

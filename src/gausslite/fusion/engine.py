@@ -13,6 +13,7 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from gausslite.domain.errors import InvalidInputError, MismatchError, NotPermittedError, QuotaError
+from gausslite.domain.frame import MAX_COORDINATE_M
 from gausslite.domain.free_space import FreeSpace
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.names import quote_name, require_name
@@ -256,10 +257,11 @@ class FusionEngine:
         return gaussians, self.in_fused_frame(self._keyframes.decode(encoded)), revision
 
     def in_fused_frame(self, keyframes: Sequence[AgentKeyframe]) -> list[AgentKeyframe]:
-        """Return the keyframes with camera poses in the fused map's frame."""
+        """Return the keyframes with camera poses in the fused map's frame, without those too far from its origin."""
         with self._lock:
             frames = self._alignments.transforms()
-        return [_in_fused_frame(each, frames) for each in keyframes]
+        moved = (_in_fused_frame(each, frames) for each in keyframes)
+        return [each for each in moved if each is not None]
 
     def status(self) -> MissionStatus:
         """Return the totals of the mission and of each agent."""
@@ -305,10 +307,12 @@ class FusionEngine:
         self._objects.remove_agent(agent_id)
 
 
-def _in_fused_frame(keyframe: AgentKeyframe, frames: Mapping[str, Float64[ndarray, "4 4"]]) -> AgentKeyframe:
-    """Return the keyframe with its camera pose in the fused map's frame."""
+def _in_fused_frame(keyframe: AgentKeyframe, frames: Mapping[str, Float64[ndarray, "4 4"]]) -> AgentKeyframe | None:
+    """Return the keyframe with its camera pose in the fused map's frame; None if no frame can have this pose."""
     T_fused_agent = frames.get(keyframe.agent_id)
     if T_fused_agent is None:
         return keyframe
     pose = T_fused_agent @ keyframe.frame.T_world_camera
+    if np.abs(pose[:3, 3]).max() > MAX_COORDINATE_M:
+        return None
     return replace(keyframe, frame=replace(keyframe.frame, T_world_camera=pose))

@@ -12,7 +12,7 @@ from gausslite.codec.object_report import decode_object_report, encode_object_re
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.names import quote_name, require_name
 from gausslite.domain.object_names import same_kind
-from gausslite.domain.objects import ObjectLandmark, ObjectReport, TeamObject
+from gausslite.domain.objects import MAX_OBJECT_COORDINATE_M, ObjectLandmark, ObjectReport, TeamObject
 from gausslite.domain.pose import transform_points
 from gausslite.domain.task import TaskGraph
 from gausslite.domain.voxels import AxisAlignedBox
@@ -62,7 +62,7 @@ def find_objects(
     """Merge the reports; return the objects that the noun names, or all, the most confident first.
 
     frames: T_fused_agent of the agents whose landmarks are moved to the fused map's frame; absent: not moved.
-    Raises InvalidInputError if the noun is not printable.
+    A landmark that this moves out of range is left out. Raises InvalidInputError if the noun is not printable.
     """
     require_name("noun", noun)
     if noun and not noun.strip():
@@ -76,14 +76,17 @@ def find_objects(
 
 
 def _moved(report: ObjectReport, T_fused_agent: Float64[ndarray, "4 4"]) -> ObjectReport:
-    return replace(report, objects=tuple(_move(each, T_fused_agent) for each in report.objects))
+    moved = (_move(each, T_fused_agent) for each in report.objects)
+    return replace(report, objects=tuple(each for each in moved if each is not None))
 
 
-def _move(landmark: ObjectLandmark, T_fused_agent: Float64[ndarray, "4 4"]) -> ObjectLandmark:
-    """Return the landmark in the fused frame; its box contains the moved box."""
+def _move(landmark: ObjectLandmark, T_fused_agent: Float64[ndarray, "4 4"]) -> ObjectLandmark | None:
+    """Return the landmark in the fused frame, None if it is out of range; its box contains the moved box."""
     low, high = np.array(landmark.extent_m.min_m), np.array(landmark.extent_m.max_m)
     corners = np.array([np.where([bit & 1, bit & 2, bit & 4], high, low) for bit in range(8)])
     points = transform_points(T_fused_agent, np.vstack([corners, landmark.centroid_m]))
+    if not (np.abs(points) <= MAX_OBJECT_COORDINATE_M).all():
+        return None
     low_x, low_y, low_z = points[:8].min(axis=0).tolist()
     high_x, high_y, high_z = points[:8].max(axis=0).tolist()
     x, y, z = points[8].tolist()

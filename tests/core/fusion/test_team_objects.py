@@ -99,6 +99,14 @@ def test_a_query_finds_synonyms_and_plurals_and_moves_landmarks_to_the_fused_fra
             find_objects(reports, {}, noun)
 
 
+def test_a_landmark_that_moves_out_of_range_is_left_out_and_others_are_found() -> None:
+    reports = {"ant": report(landmark("mug", (999_999, 0, 0)), landmark("table", (0, 0, 0)))}
+    T = np.eye(4)
+    T[0, 3] = 9000.0
+    [table] = find_objects(reports, {"ant": T})
+    assert table.landmark.centroid_m == (9000.0, 0.0, 0.0)
+
+
 def test_a_gaussian_leads_to_the_object_of_its_target() -> None:
     reports = {
         "ant": report(landmark("mug", (0, 0, 0), 1), landmark("mug", (1, 0, 0), 2), landmark("table", (1, 0, 0)))

@@ -106,10 +106,14 @@ def test_a_declared_frame_moves_the_agents_map() -> None:
         assert (batch.gaussians.means_m[:, 2] > 2.9).all()
         [agent] = server.client.status().agents
         assert list(agent.alignment.t_fused_agent.row_major) == T.reshape(-1).tolist()
-        request.t_fused_agent.row_major[0] = 5.0
-        with pytest.raises(grpc.RpcError) as refused:
-            server.stub.JoinSession(request)
-        assert refused.value.code() is grpc.StatusCode.INVALID_ARGUMENT
+        for position, value in ((0, 5.0), (3, 1e200)):
+            wrong = pb.JoinSessionRequest(agent_id="ant", grid=request.grid, t_fused_agent=request.t_fused_agent)
+            wrong.t_fused_agent.row_major[position] = value
+            with pytest.raises(grpc.RpcError) as refused:
+                server.stub.JoinSession(wrong)
+            assert refused.value.code() is grpc.StatusCode.INVALID_ARGUMENT
+        [agent] = server.client.status().agents
+        assert list(agent.alignment.t_fused_agent.row_major) == T.reshape(-1).tolist()
 
 
 def test_free_space_is_stored_and_hostile_bytes_are_refused() -> None:
