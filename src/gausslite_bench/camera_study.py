@@ -62,6 +62,11 @@ class CameraStudy:
         for name in ("frames", "stride", "views"):
             if not 1 <= getattr(self, name) <= 1000:
                 raise InvalidInputError(f"camera study {name}: expected 1 to 1000, got {getattr(self, name)}")
+        if self.truth.readout_s < 0:
+            raise InvalidInputError(
+                f"camera study readout: expected at least 0 ms, as homes read rows from the top, "
+                f"got {_MS_PER_S * self.truth.readout_s:g}"
+            )
         if self.truth.time_offset_s:
             raise InvalidInputError("camera study: expected no time offset: simulated poses are exact")
 

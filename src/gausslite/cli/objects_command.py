@@ -42,8 +42,10 @@ def run(options: argparse.Namespace) -> int:
 
 def _query(options: argparse.Namespace) -> Sequence[TeamObject]:
     # imported late, because the objects of a folder need no gRPC
+    from gausslite.wire.address import require_callable
     from gausslite.wire.clients import FusionClient
 
+    require_callable("a fusion server or the output folder of a run", options.place)
     with FusionClient(options.place, mission_id=options.mission, tls=read_tls(options)) as client:
         return client.query_objects(options.noun)
 

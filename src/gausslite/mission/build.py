@@ -11,6 +11,7 @@ from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.region import Region
 from gausslite.domain.task import TaskGraph
 from gausslite.mapping.mapper import GaussianMapper
+from gausslite.mapping.tracking.tracker import CameraTracker
 from gausslite.mission.frame_scheduler import FrameScheduler
 from gausslite.mission.settings import MissionSettings, PerceptionSettings, PoseMode, SceneInfo
 from gausslite.mission.task_mapper import TaskMapper
@@ -18,7 +19,6 @@ from gausslite.perception.fixed_relevance import NoTaskEstimator, RegionRelevanc
 from gausslite.perception.relevance_estimator import AsyncRelevanceEstimator, RelevanceEstimator, TaskRelevanceEstimator
 from gausslite.perception.relevance_tracker import RelevanceTrackerSettings
 from gausslite.render.choose import choose_rasterizer
-from gausslite.tracking.tracker import CameraTracker
 
 if TYPE_CHECKING:
     from gausslite.perception.detect import Detector

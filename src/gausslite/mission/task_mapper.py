@@ -20,9 +20,9 @@ from gausslite.mapping.sent_voxels import SentVoxelTracker
 from gausslite.mapping.stages import SkippableStage, Stage
 from gausslite.mapping.task_change import Reevaluation
 from gausslite.mapping.team_voxels import InsertedVoxels
+from gausslite.mapping.tracking.tracker import CameraTracker
 from gausslite.mission.frame_scheduler import FrameScheduler, FrameTiming
 from gausslite.perception.relevance_estimator import DelayedRelevance, RelevanceEstimate, RelevanceEstimator
-from gausslite.tracking.tracker import CameraTracker
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -10,6 +10,7 @@ from google.protobuf.message import Message
 
 from gausslite.domain.errors import InvalidInputError
 from gausslite.v1 import agent_service_pb2, fusion_service_pb2
+from gausslite.wire.address import require_callable
 from gausslite.wire.clients import AgentClient, FusionClient
 from gausslite.wire.health import serves
 from gausslite.wire.tls import Tls
@@ -31,6 +32,7 @@ class ServiceStatus:
 
 def query_status(address: str, tls: Tls | None) -> ServiceStatus:
     """Return the status of the agent or fusion server. Raises UnavailableError, InvalidInputError if it is neither."""
+    require_callable("address", address)
     if serves(address, _AGENT, tls):
         with AgentClient(address, tls=tls) as agent:
             return ServiceStatus(True, _to_values(agent.status()))

@@ -90,6 +90,8 @@ def from_rpc_error(error: grpc.RpcError, address: str) -> GaussLiteError:
         return errors.UnavailableError(f"{address}: no answer in time")
     if code is grpc.StatusCode.UNAVAILABLE and any(cause in text for cause in _NOT_LISTENING):
         return errors.UnavailableError(f"{address}: connection refused")
+    if code is grpc.StatusCode.UNIMPLEMENTED:
+        return errors.InvalidInputError(f"{address}: another service listens there, or one of another version")
     first_line = text.splitlines()[0]
     return _BY_CODE.get(code, GaussLiteError)(f"{address}: {code.name}: {first_line}")
 

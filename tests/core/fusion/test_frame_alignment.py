@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 from sample_gaussians import plain_gaussians
 
+from gausslite.domain.camera import Camera
+from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.moved_gaussians import move_gaussians
 from gausslite.domain.pose import inverse, rotation_angle_deg, transform_of, transform_points
@@ -18,6 +20,7 @@ from gausslite.domain.voxels import VoxelGrid
 from gausslite.fusion.alignment import SurfaceSamples, fit_frame
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.frame_alignment import AlignmentSettings, AlignmentState
+from gausslite.fusion.keyframes import AgentKeyframe
 from gausslite.fusion.limits import FusionSettings
 from gausslite.fusion.memory_store import MemoryStore
 from gausslite.fusion.mission_config import MissionConfig
@@ -154,6 +157,18 @@ def test_a_declared_frame_is_used_and_can_be_refined() -> None:
     engine.align_due()
     assert state_of(engine, "bee") is AlignmentState.CORRECTED
     assert surface_error_m(engine.maps.voted_map("bee").gaussians.means_m) < 0.005
+
+
+def test_a_keyframe_that_a_declared_frame_moves_out_of_range_is_left_out() -> None:
+    engine = FusionEngine(MemoryStore(), SETTINGS)
+    engine.join("bee", ANYTHING)
+    engine.declare_frame("bee", wrong_frame((9000.0, 0.0, 0.0)))
+    near, far = (
+        Frame(0, 0, np.zeros((8, 8, 3), np.uint8), np.ones((8, 8), np.float32), Camera(8, 8, 4, 4, 8, 8), T)
+        for T in (np.eye(4), wrong_frame((5000.0, 0.0, 0.0)))
+    )
+    [moved] = engine.in_fused_frame([AgentKeyframe("bee", near), AgentKeyframe("bee", far)])
+    assert moved.frame.T_world_camera[0, 3] == 9000.0
 
 
 def test_moved_gaussians_keep_their_shape() -> None:

@@ -51,7 +51,12 @@ def test_errors_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     with fusion_server() as fusion, agent() as a:
         for arguments, expected in (
             (["end", a.client.address], "call AssignTask"),
-            (["status", "nowhere"], "nowhere: UNAVAILABLE"),
+            (["status", "nowhere.invalid:1"], "nowhere.invalid:1: "),
+            (["status", "nowhere"], "address: expected HOST:PORT or unix:PATH, got 'nowhere'"),
+            (["status", ""], "address: expected HOST:PORT or unix:PATH, got ''"),
+            (["objects", str(tmp_path / "none")], "output folder of a run: expected HOST:PORT"),
+            (["end", fusion.client.address], "another service listens there"),
+            (["fetch", a.client.address, "--out", str(tmp_path / "x.ply")], "another service listens there"),
             (["fetch", fusion.client.address, "--strategy", "refined", "--out", str(tmp_path / "x.ply")], "refine"),
             (["refine", fusion.client.address, "--out", "/dev/null/x"], "/dev/null"),
         ):

@@ -18,10 +18,10 @@ from gausslite.domain.frame import Frame
 from gausslite.domain.motion_model import MotionModel
 from gausslite.domain.pose import inverse, orthonormal, require_rigid, transform_of, twist_of
 from gausslite.domain.state import State, add_prefix, get_array, get_counts, int_array, select_prefix
+from gausslite.mapping.tracking.alignment import COARSE_TO_FINE, FINE, Alignment, Level, align
+from gausslite.mapping.tracking.features import FeatureView, detect_features, relative_pose
+from gausslite.mapping.tracking.relocalisation import KeyframeIndex
 from gausslite.render.rasterizer import Rendering
-from gausslite.tracking.alignment import COARSE_TO_FINE, FINE, Alignment, Level, align
-from gausslite.tracking.features import FeatureView, detect_features, relative_pose
-from gausslite.tracking.relocalisation import KeyframeIndex
 
 _MIN_OVERLAP = 0.5
 _MAX_RESIDUAL = 0.15

@@ -13,7 +13,7 @@ from gausslite.domain.camera import Camera
 from gausslite.domain.errors import MapFileError
 from gausslite.domain.pose import inverse, require_rigid, rotation_angle_deg, translation_m
 from gausslite.domain.state import State, add_prefix, get_array, get_counts, int_array, select_prefix
-from gausslite.tracking.features import FeatureView, relative_pose
+from gausslite.mapping.tracking.features import FeatureView, relative_pose
 
 _MIN_DISTANCE_M, _MIN_ANGLE_DEG = 0.25, 15.0
 """A keyframe is added if no other one is as near in both."""

@@ -16,14 +16,14 @@ from gausslite.domain.motion_model import MotionModel
 from gausslite.domain.pose import inverse, rotation_angle_deg, transform_of, translation_m
 from gausslite.domain.trajectory import Trajectory
 from gausslite.evaluation.trajectory_error import trajectory_error
+from gausslite.mapping.tracking.alignment import align
+from gausslite.mapping.tracking.features import detect_features, relative_pose
+from gausslite.mapping.tracking.tracker import CameraTracker
 from gausslite.mission.build import build_mapper, build_tracker
 from gausslite.mission.settings import MissionSettings, PoseMode
 from gausslite.mission.task_mapper import TaskMapper
 from gausslite.perception.fixed_relevance import NoTaskEstimator
 from gausslite.render.rasterizer import Rendering
-from gausslite.tracking.alignment import align
-from gausslite.tracking.features import detect_features, relative_pose
-from gausslite.tracking.tracker import CameraTracker
 
 PRIOR_STD = np.array([0.1] * 3 + [0.1] * 3)
 SETTINGS = MissionSettings(policy="uniform", max_gaussians=20_000, threads=1, poses=PoseMode.TRACK)
