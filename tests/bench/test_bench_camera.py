@@ -46,7 +46,11 @@ def test_the_true_camera_is_that_of_the_options() -> None:
 
 
 def test_wrong_options_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for option, expected in ((["--pair", "home-1"], "one task"), (["--speeds", "5000"], "1 to 1000"), (["--shutter", "-3"], "readout")):
+    for option, expected in (
+        (["--pair", "home-1"], "one task"),
+        (["--speeds", "5000"], "1 to 1000"),
+        (["--shutter", "-3"], "readout"),
+    ):
         assert main(["bench", "camera", "--out", str(tmp_path), *option]) == 2
         assert expected in capsys.readouterr().err
     with pytest.raises(InvalidInputError, match="time offset"):
