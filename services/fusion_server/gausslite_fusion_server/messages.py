@@ -1,4 +1,4 @@
-"""Encode the figures of a mission as messages."""
+"""Convert figures, layers, frames and views of a mission from and to messages."""
 
 from __future__ import annotations
 
@@ -10,9 +10,11 @@ from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import MAX_COORDINATE_M
 from gausslite.fusion.frame_alignment import AlignmentState, FrameAlignment
 from gausslite.fusion.fused_map import MapLayer
+from gausslite.fusion.map_renderer import LayerView
 from gausslite.fusion.traffic import AgentContribution
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.wire.convert import transform_from_message, transform_to_message
+from gausslite.wire.images import encode_colour, encode_depth
 
 _STATES = {
     AlignmentState.UNKNOWN: pb.ALIGNMENT_STATE_UNSPECIFIED,
@@ -21,8 +23,6 @@ _STATES = {
     AlignmentState.CORRECTED: pb.ALIGNMENT_STATE_CORRECTED,
     AlignmentState.QUARANTINED: pb.ALIGNMENT_STATE_QUARANTINED,
 }
-
-
 _LAYERS: dict[int, MapLayer] = {
     pb.MAP_LAYER_UNSPECIFIED: MapLayer.VOTE,
     pb.MAP_LAYER_VOTE: MapLayer.VOTE,
@@ -35,6 +35,13 @@ def layer_from_message(number: int) -> MapLayer:
     if number not in _LAYERS:
         raise InvalidInputError(f"layer: expected VOTE or REFINED, got {number}")
     return _LAYERS[number]
+
+
+def view_to_message(view: LayerView) -> pb.RenderFusedViewResponse:
+    """Encode a rendered view as PNG images."""
+    return pb.RenderFusedViewResponse(
+        colour_png=encode_colour(view.rgb, lossless=True), depth_png=encode_depth(view.depth_m), revision=view.revision
+    )
 
 
 def declared_frame_from_message(request: pb.JoinSessionRequest) -> Float64[ndarray, "4 4"] | None:

@@ -24,6 +24,7 @@ from gausslite.domain.objects import ObjectReport
 from gausslite.domain.voxel_batch import VoxelBatch
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.fused_map import FusedMapChanges, MapLayer
+from gausslite.fusion.map_renderer import MapRenderer
 from gausslite.fusion.mission_config import MissionConfig
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.v1 import fusion_service_pb2_grpc as pb_grpc
@@ -43,11 +44,11 @@ from gausslite.wire.tls import require_agent_certificate
 from gausslite_fusion_server.change_blocks import change_blocks
 from gausslite_fusion_server.contributions import store_free_space, store_keyframe, store_subset
 from gausslite_fusion_server.drain_gate import DrainGate
-from gausslite_fusion_server.map_renderer import MapRenderer
 from gausslite_fusion_server.messages import (
     contribution_to_message,
     declared_frame_from_message,
     layer_from_message,
+    view_to_message,
 )
 from gausslite_fusion_server.refinement_worker import RefinementWorker, RefineRequest
 
@@ -222,7 +223,7 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         T_world_camera = transform_from_message("t_world_camera", request.t_world_camera)
         layer = layer_from_message(request.layer)
         render = functools.partial(self._renderer.render, camera, T_world_camera, layer)
-        return await asyncio.get_running_loop().run_in_executor(self._background, render)
+        return view_to_message(await asyncio.get_running_loop().run_in_executor(self._background, render))
 
     async def GetSessionStatus(self, request: pb.GetSessionStatusRequest, context: Any) -> pb.GetSessionStatusResponse:
         """Return the figures of the mission and of each agent."""

@@ -1,11 +1,12 @@
-"""Render views of the fused map for clients."""
+"""Render views of the fused map."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float32, Float64, UInt8
 from numpy import ndarray
 
 from gausslite.domain.camera import Camera
@@ -15,10 +16,17 @@ from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.fused_map import MapLayer
 from gausslite.render.rasterizer import Rasterizer
 from gausslite.render.row_encoding import gaussians_to_rows
-from gausslite.v1 import fusion_service_pb2 as pb
-from gausslite.wire.images import encode_colour, encode_depth
 
 _MAX_VIEW_PX = 1920 * 1080
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LayerView:
+    """A rendering of a map layer; depth is 0 where the map is not opaque. revision: of the rendered layer."""
+
+    rgb: UInt8[ndarray, "h w 3"]
+    depth_m: Float32[ndarray, "h w"]
+    revision: int
 
 
 class MapRenderer:
@@ -30,10 +38,8 @@ class MapRenderer:
         self._shown: tuple[MapLayer, int] | None = None
         self._rows = np.zeros((0, 16), np.float32)
 
-    def render(
-        self, camera: Camera, T_world_camera: Float64[ndarray, "4 4"], layer: MapLayer
-    ) -> pb.RenderFusedViewResponse:
-        """Return a view of a layer as PNG images. Raises QuotaError above two megapixels, KernelError."""
+    def render(self, camera: Camera, T_world_camera: Float64[ndarray, "4 4"], layer: MapLayer) -> LayerView:
+        """Return a view of a layer. Raises QuotaError above two megapixels, KernelError."""
         pixels = camera.width_px * camera.height_px
         if pixels > _MAX_VIEW_PX:
             raise QuotaError(f"view: expected at most {_MAX_VIEW_PX} pixels, got {pixels}")
@@ -49,6 +55,4 @@ class MapRenderer:
             rendering = self._rasterizer.forward(self._rows, camera, inverse(T_world_camera))
             rgb = np.rint(np.clip(rendering.rgb, 0.0, 1.0) * 255).astype(np.uint8)
             depth_m = rendering.expected_depth_m()
-        return pb.RenderFusedViewResponse(
-            colour_png=encode_colour(rgb, lossless=True), depth_png=encode_depth(depth_m), revision=revision
-        )
+        return LayerView(rgb, depth_m, revision)
