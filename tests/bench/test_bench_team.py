@@ -54,6 +54,9 @@ def test_wrong_options_fail_before_any_mapping(capsys: pytest.CaptureFixture[str
         (("--homes", "x"), "homes"),
         (("--team-sizes", "7"), "agents"),
         (("--policies", "best"), "policies"),
+        (("--views", "0"), "views"),
+        (("--frames", "1000000"), "frames"),
+        (("--refine-iterations", "-1"), "refine-iterations"),
     ):
         assert main(["bench", "team", "--out", str(tmp_path), *wrong]) == 2
         assert expected in capsys.readouterr().err

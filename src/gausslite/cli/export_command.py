@@ -48,7 +48,10 @@ def run(options: argparse.Namespace) -> int:
     """Read the map and write the file. Returns the exit code."""
     chosen = FORMATS[options.to]
     region = options.region or ("roi" if chosen.region_only else "all")
-    content = read_map(options.map, region, read_report(options.map))
+    report = read_report(options.map)
+    if options.to == "json" and not report and (options.map / "report.json").exists():
+        raise InvalidInputError(f"{options.map}/report.json: expected the report of a run, got something else")
+    content = read_map(options.map, region, report)
     out = options.out or _default_file(options.map, chosen.suffix)
     _require_separate(out, options.map)
     if not options.overwrite:

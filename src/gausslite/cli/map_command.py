@@ -46,6 +46,7 @@ from gausslite.mission.runner import MissionResult, MissionRunner
 from gausslite.mission.settings import PoseMode, SceneInfo
 from gausslite.mission.task_mapper import TaskMapper
 from gausslite.mission.task_schedule import ScheduledTaskMapper
+from gausslite.process.interrupts import DeferredInterrupt
 from gausslite.process.messages import print_message
 
 _NOT_RESUMED = -1
@@ -111,11 +112,15 @@ def run(options: argparse.Namespace) -> int:
         saved.restore(mapper)
         saved = None  # its arrays, as large as the map and the keyframes, have been copied
     mapping = _Run(options, inputs, mapper)
-    result = mapping.map_frames(estimators, resumed_after)
-    if result.processed > 0 or result.stopped_by is None:
-        mapping.write_results(result)
+    # a signal while the results are written must not lose the rest of them
+    with DeferredInterrupt() as interrupt:
+        result = mapping.map_frames(estimators, resumed_after)
+        if result.processed > 0 or result.stopped_by is None:
+            mapping.write_results(result)
     # an early end keeps the map so far; the exit code reports it
     mapping.raise_if_stopped(result)
+    if interrupt.pending_exception is not None:
+        raise type(interrupt.pending_exception)(f"all frames are mapped, and all files are in {options.out}")
     mapping.print_results(result)
     return 0
 

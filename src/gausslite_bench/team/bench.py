@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
+from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.free_space import FreeSpace
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.voxel_batch import RoiSubset
@@ -44,6 +45,10 @@ class TeamTrial:
     refine_iterations: int = 300
     frame_error: FrameError = field(default_factory=FrameError)
     grid: VoxelGrid = field(default_factory=VoxelGrid)
+
+    def __post_init__(self) -> None:
+        if self.refine_iterations < 0:
+            raise InvalidInputError(f"refine-iterations: expected at least 0, got {self.refine_iterations}")
 
 
 @dataclass(frozen=True, slots=True)

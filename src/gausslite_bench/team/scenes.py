@@ -17,6 +17,7 @@ from gausslite_bench.quality.home_tasks import HOME_TASKS, HomeTask
 
 _HELD_OUT_TRAJECTORY = 2
 _TRAJECTORIES = (0, 1, 3, 4)
+_MAX_FRAMES = 10_000
 MAX_AGENTS = len(_TRAJECTORIES)
 
 
@@ -51,6 +52,9 @@ class TeamPlan:
     def __post_init__(self) -> None:
         if not 2 <= self.agents <= MAX_AGENTS:
             raise InvalidInputError(f"agents: expected 2 to {MAX_AGENTS}, got {self.agents}")
+        for name in ("frames", "views"):
+            if not 1 <= getattr(self, name) <= _MAX_FRAMES:
+                raise InvalidInputError(f"{name}: expected 1 to {_MAX_FRAMES}, got {getattr(self, name)}")
         if not any(task.home == self.home for task in HOME_TASKS):
             raise InvalidInputError(f"homes: expected 1 to 8, got {self.home}")
 

@@ -1,6 +1,7 @@
 """`gausslite export` over a results folder that `gausslite map` wrote."""
 
 import json
+import shutil
 
 import pytest
 
@@ -43,3 +44,11 @@ def test_the_map_itself_is_never_the_output(results, capsys):
 def test_a_missing_run_is_one_line(tmp_path, capsys):
     assert main(["export", str(tmp_path / "nothing"), "--to", "spz"]) == 2
     assert "map.ply" in capsys.readouterr().err
+
+
+def test_the_objects_of_a_damaged_report_are_not_exported_as_none(results, tmp_path, capsys):
+    shutil.copy(results / "map.ply", tmp_path)
+    (tmp_path / "report.json").write_text("{")
+    assert main(["export", str(tmp_path), "--to", "json", "--region", "all"]) == 2
+    assert "report.json: expected the report of a run" in capsys.readouterr().err
+    assert not (tmp_path / "map.json").exists()

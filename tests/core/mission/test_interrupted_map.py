@@ -10,10 +10,12 @@ import numpy as np
 import pytest
 from tiny_sequences import write_seven_scenes
 
+from gausslite.cli import map_command
 from gausslite.cli.main import main
 from gausslite.codec.state_file import read_state
 from gausslite.datasets.sevenscenes import SevenScenesSource
 from gausslite.domain.frame import Frame
+from gausslite.mapping.pose_history import PoseHistory
 from gausslite.process.interrupts import DeferredInterrupt
 
 pytest.importorskip("gausslite.render._kernels", reason="the native kernels are not built")
@@ -54,6 +56,24 @@ def test_a_signal_ends_the_run_after_the_current_frame_and_it_can_be_resumed(
     assert (report["frames"], report["stopped_by"]) == (3, "interrupted")
     assert mapped(sequence, tmp_path / "rest", "--resume", state) == 0
     assert (tmp_path / "rest" / "map.ply").read_bytes() == (tmp_path / "whole" / "map.ply").read_bytes()
+
+
+def test_a_signal_while_results_are_written_loses_none_of_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    sequence = write_seven_scenes(tmp_path / "kitchen")
+    write = map_command.write_poses
+
+    def write_and_raise_signal(folder: Path, poses: PoseHistory) -> None:
+        signal.raise_signal(signal.SIGTERM)
+        write(folder, poses)
+
+    assert mapped(sequence, tmp_path / "whole") == 0
+    monkeypatch.setattr(map_command, "write_poses", write_and_raise_signal)
+    assert mapped(sequence, tmp_path / "out") == 143
+    assert capsys.readouterr().err.splitlines()[-1].startswith("gausslite: terminated: all frames are mapped")
+    names = [sorted(path.name for path in (tmp_path / name).iterdir()) for name in ("whole", "out")]
+    assert names[0] == names[1]
 
 
 def test_a_second_ctrl_c_interrupts_at_once() -> None:
