@@ -26,6 +26,7 @@ from gausslite.domain.trajectory import Twist
 _FIXED_POINT_STEPS = 3
 _GRID_PX = 4
 _MIN_DEPTH_M = 0.05
+_SAMPLES, _SLOPE_STEP = 17, 1e-5
 
 
 def ideal_camera(camera: Camera, correction: CameraCorrection, angular_speed_rad_s: float) -> Camera:
@@ -125,9 +126,22 @@ def _undistorted(camera: Camera, lens: Lens) -> Camera:
         else:
             K_ideal, _ = cv2.getOptimalNewCameraMatrix(K, D, size, 0.0)
         fx_px, fy_px, cx_px, cy_px = (float(K_ideal[at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2)))
-        return replace(camera, fx_px=fx_px, fy_px=fy_px, cx_px=cx_px + 0.5, cy_px=cy_px + 0.5)
+        ideal = replace(camera, fx_px=fx_px, fy_px=fy_px, cx_px=cx_px + 0.5, cy_px=cy_px + 0.5)
+        _require_invertible(lens, ideal)
+        return ideal
     except (cv2.error, InvalidInputError) as error:
         raise InvalidInputError(f"lens {lens}: expected one that can be inverted over the image") from error
+
+
+def _require_invertible(lens: Lens, camera: Camera) -> None:
+    """Raise InvalidInputError if the lens folds the image of this pinhole camera, by its Jacobian at sampled points."""
+    columns, rows = np.linspace(0, camera.width_px, _SAMPLES), np.linspace(0, camera.height_px, _SAMPLES)
+    x, y = np.meshgrid((columns - camera.cx_px) / camera.fx_px, (rows - camera.cy_px) / camera.fy_px)
+    h = _SLOPE_STEP
+    right, left, below, above = (lens.distort(x + dx, y + dy) for dx, dy in ((h, 0), (-h, 0), (0, h), (0, -h)))
+    determinant = (right[0] - left[0]) * (below[1] - above[1]) - (below[0] - above[0]) * (right[1] - left[1])
+    if not (determinant > 0).all():
+        raise InvalidInputError(f"lens {lens}: expected one that does not fold the image")
 
 
 def _lookup(

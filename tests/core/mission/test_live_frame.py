@@ -50,7 +50,7 @@ def test_a_live_frame_without_lens_and_motion_is_used_as_sent() -> None:
     assert correct_live_frame(frame, None) is frame
 
 
-def test_a_lens_without_a_pinhole_camera_is_named_in_the_error() -> None:
-    folding = Lens(LensModel.FISHEYE, (-900.0, 0.0, 0.0, 0.0))
-    with pytest.raises(InvalidInputError, match="lens fisheye:-900,0,0,0: expected one that can be inverted"):
-        correct_live_frame(sample_frame(), folding)
+@pytest.mark.parametrize("text", ["fisheye:-900,0,0,0", "radtan:-900,0,0,0"])
+def test_a_lens_without_a_pinhole_camera_is_named_in_the_error(text: str) -> None:
+    with pytest.raises(InvalidInputError, match=f"lens {text}: expected one that can be inverted"):
+        correct_live_frame(sample_frame(), Lens.parse(text))
