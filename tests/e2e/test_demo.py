@@ -98,7 +98,7 @@ def test_agents_register_depth_and_refine_keyframes_as_the_demo_sets_it(tmp_path
     report = json.loads((out / "report.json").read_text())
     assert DepthRegistration.parse(report["colour_camera"]) == DepthRegistration.parse(camera)
     assert report["view_error"] == "0.01,0.5,0.1,0.03"
-    assert report["scored"] == {"objects": ["mug_1"], "views": 2, "fitted": True}
+    assert report["scored"] == {"objects": ["mug_1"], "views": 2, "fitted": True, "frames_corrupt": 0}
     assert [agent["frames"] for agent in report["agents"].values()] == [7, 7]
 
 

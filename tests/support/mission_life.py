@@ -31,8 +31,8 @@ RENDER_SIZE = (320, 240)
 class Life:
     """What the mission left.
 
-    keyframes_before_end: selected while mapping. objects: those that the noun names. rendered_share: of the pixels of a
-    view of the fused map.
+    keyframes_before_end: sent or waiting; one with a corrected pose counts again. objects: those that the noun names.
+    rendered_share: of the pixels of a view of the fused map.
     """
 
     mapped: int
@@ -40,6 +40,7 @@ class Life:
     summary: str
     state: str
     keyframes_before_end: int
+    keyframes_on_server_before_end: int
     keyframes: int
     fused_gaussians: int
     agent_gaussians: int
@@ -136,6 +137,7 @@ def _end(
 ) -> Life:
     """End the mission, refine, query and render."""
     before = agent.call("GetAgentStatus")
+    on_server = fusion.call("GetSessionStatus").keyframes
     ended = agent.call("EndMission", drain_seconds=300.0)
     progress = list(fusion.read("RefineFusedMap", iterations=50))
     status = fusion.call("GetSessionStatus")
@@ -149,6 +151,7 @@ def _end(
         summary=ended.summary,
         state=agent.enum_name(ended, "state"),
         keyframes_before_end=before.uplink.keyframes_sent + before.uplink.keyframes_waiting,
+        keyframes_on_server_before_end=on_server,
         keyframes=status.keyframes,
         fused_gaussians=status.fused_gaussians,
         agent_gaussians=ended.gaussians,

@@ -116,7 +116,7 @@ def _block_line(cost: BlockCost) -> str:
 def _motion_line(cost: MotionCost) -> str:
     return (
         f"  {cost.motion:<12} {cost.loss:<13} {cost.moving.min_ms:8.2f} / {cost.moving.median_ms:8.2f}   "
-        f"at rest {cost.still.min_ms:8.2f} / {cost.still.median_ms:8.2f}   time ratio {cost.ratio:.3f}"
+        f"at rest {cost.still.min_ms:8.2f} / {cost.still.median_ms:8.2f}   {cost.ratio:.3f} times"
     )
 
 
@@ -124,5 +124,5 @@ def _region_line(cost: RegionCost) -> str:
     return (
         f"  {cost.share_percent:5g} % {cost.layout:<9} {cost.loss:<13} {cost.region.min_ms:8.2f} / "
         f"{cost.region.median_ms:8.2f}   full {cost.full.min_ms:8.2f} / {cost.full.median_ms:8.2f}   "
-        f"time ratio {cost.ratio:.3f}, work share {cost.work_share:.3f}"
+        f"{cost.ratio:.3f} times as long, work share {cost.work_share:.3f}"
     )
