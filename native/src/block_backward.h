@@ -107,7 +107,7 @@ GAUSSLITE_INLINE Pack8 shift_moments(Pack8 m, Pack8 xy) {
 }
 
 GAUSSLITE_INLINE float* gradient_row(Workspace& ws, const Splat& splat, const TilePosition& tile) {
-  return ws.gradient_rows.data() + size_t(kRowWidth) * uint32_t(splat.gradient_row + uint32_t(tile.y));
+  return ws.gradient_rows.data() + size_t(kRowWidth) * uint32_t(splat.gradient_row_minus_tile_y + uint32_t(tile.y));
 }
 
 GAUSSLITE_INLINE void prefetch_rows(Workspace& ws, const Splat* records, int n, const TilePosition& tile) {

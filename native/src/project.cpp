@@ -13,7 +13,8 @@ namespace gausslite::GAUSSLITE_ISA {
 
 namespace {
 
-// First and last tiles of the pixels with centres in the bounding box of alpha >= 1/255.
+// First and last tile columns (x0, x1) and tile rows (y0, y1) of a splat: those with a pixel centre in the bounding box
+// of the splat's pixels with alpha >= 1/255.
 struct Box {
   Pack16 x0, x1, y0, y1;
   Mask16 visible;
@@ -33,18 +34,19 @@ struct Box {
     y1 = floor(bottom * (1.0f / kTileSide));
   }
 
-  // Returns the few lanes with a box that is too large for narrow(): over kSmallBox tiles across or two down.
+  // Returns the few lanes with a box that is too large for narrow(): more than kSmallBox tile columns or two tile rows.
   GAUSSLITE_INLINE uint32_t large() const {
-    return bits(((x1 - x0 > Pack16(kMaxAcross)) | (y1 - y0 > Pack16(1.0f))) & visible);
+    return bits(((x1 - x0 > Pack16(kMaxColumnDifference)) | (y1 - y0 > Pack16(1.0f))) & visible);
   }
 
-  // Removes the upper or lower row of tiles from boxes that are not large, if no tile in it is active. Returns the
-  // lanes with an active tile. All rows are looked up: no branch to mispredict.
+  // Removes the upper or lower row of tiles from boxes that are not large, if no tile in it is active. A tile is
+  // active if the view's mask has a weight above 0 in it. Returns the lanes with an active tile. All rows are looked
+  // up: no branch to mispredict.
   GAUSSLITE_INLINE uint32_t narrow(const ActiveTiles& active, Pack16 tiles_x) {
     alignas(64) int32_t upper[16], lower[16], across[16];
     store_int(upper, zero_unless(visible, fma(y0, tiles_x, x0)));
     store_int(lower, zero_unless(visible, fma(y1, tiles_x, x0)));
-    store_int(across, zero_unless(visible, min(x1 - x0, Pack16(kMaxAcross))));
+    store_int(across, zero_unless(visible, min(x1 - x0, Pack16(kMaxColumnDifference))));
     uint32_t in_upper = 0, in_lower = 0;
     for (int j = 0; j < 16; ++j) {
       in_upper |= uint32_t(active.any_in_small_box(uint32_t(upper[j]), uint32_t(across[j]))) << j;
@@ -58,7 +60,7 @@ struct Box {
   }
 
  private:
-  static constexpr float kMaxAcross = float(ActiveTiles::kSmallBox - 1);
+  static constexpr float kMaxColumnDifference = float(ActiveTiles::kSmallBox - 1);
 };
 
 // Returns false for rows with a NaN or infinite parameter, and for splats with an overflow in their projection.
@@ -128,7 +130,7 @@ class Segment {
       const uint32_t height = uint32_t(last - first + 1);
       Splat& splat = ws_.splats[slot];
       store(reinterpret_cast<float*>(&splat), splats[j]);
-      splat.gradient_row = gradient_row - uint32_t(first);
+      splat.gradient_row_minus_tile_y = gradient_row - uint32_t(first);
       ws_.visible[slot] = {ids[j], gradient_row, height};
       const DepthKey key{__builtin_bit_cast(uint32_t, depth[j]), slot};
       add_key(key, first, counted);

@@ -13,7 +13,8 @@ namespace gausslite::GAUSSLITE_ISA {
 namespace {
 
 void load_pixels(const Workspace& ws, const float* planes, const TilePosition& tile, int b, Pack16 (&out)[5]) {
-  for (int k = 0; k < 5; ++k) out[k] = load_block(planes + k * ws.plane_pixels + tile.block(ws, b), ws.padded_width);
+  for (int k = 0; k < 5; ++k)
+    out[k] = load_block(planes + k * ws.plane_pixels + tile.block_offset(ws, b), ws.padded_width);
 }
 
 void backward_tile(Workspace& ws, const TileList& list, const TilePosition& tile) {

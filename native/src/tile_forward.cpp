@@ -11,7 +11,7 @@ namespace gausslite::GAUSSLITE_ISA {
 namespace {
 
 void store_pixels(Workspace& ws, const TilePosition& tile, int b, const BlockState& state) {
-  float* out = ws.image.data() + tile.block(ws, b);
+  float* out = ws.image.data() + tile.block_offset(ws, b);
   store_block(out, ws.padded_width, state.r);
   store_block(out + ws.plane_pixels, ws.padded_width, state.g);
   store_block(out + 2 * ws.plane_pixels, ws.padded_width, state.b);

@@ -66,7 +66,8 @@ void TileRowSchedule::start(const std::vector<uint32_t>& key_counts, int threads
   last_thread_of_cache_.resize(size_t(cache_slots), -1);
   squares_of_square_row_.assign(size_t(tile_rows) + 1, -1);
   missing_square_rows_.assign(size_t(tile_rows), 2);
-  // A row of squares needs two tile rows, and two need it; only one at the top and bottom of the image.
+  // A row of SSIM squares k spans the lower half of tile row k - 1 and the upper half of tile row k. It needs both, and
+  // both need it. The first and the last row of squares have one tile row only.
   for (std::vector<int>* adjacent_tile_rows : {&missing_tile_rows_, &square_row_users_}) {
     adjacent_tile_rows->assign(size_t(tile_rows) + 1, 2);
     adjacent_tile_rows->front() = adjacent_tile_rows->back() = 1;
@@ -92,15 +93,16 @@ TileRowTask TileRowSchedule::next(int thread) {
 //
 // Returns false if nothing can be taken now. There is no deadlock, because then a task of another thread is running,
 // and its end makes others ready. Suppose that no task is ready or running. Then each forward cache in use holds a
-// rendered tile row next to one that is not rendered. The rendered rows of a thread are contiguous, and those of
-// threads 2 i and 2 i + 1 touch each other or the image's edge. So at most threads + 1 caches are in use, or one by a
-// single thread, which starts at the top. These are fewer than cache_slots, so that a row can be rendered.
+// rendered tile row next to one that is not rendered. The rendered rows of each range are contiguous, whoever
+// rendered them, and those of ranges 2 i and 2 i + 1 form one block. A block has at most two ends next to rows that are
+// not rendered, and each end holds one cache. So at most threads + 1 caches are in use, or one by a single thread,
+// which starts at the top. These are fewer than cache_slots, so that a row can be rendered.
 bool TileRowSchedule::take(TileRowTask& task, int thread) {
   const bool can_render = not_rendered_ > 0 && !free_caches_.empty();
   if (const int tile_row = pop_own_tile_row(thread); tile_row >= 0) {
     task = backward_task(tile_row);
-  } else if (const int row = pop_own_square_row(thread); row >= 0) {
-    task = ssim_task(row);
+  } else if (const int square_row = pop_own_square_row(thread); square_row >= 0) {
+    task = ssim_task(square_row);
   } else if (can_render && ranges_[size_t(thread)].left > 0) {
     task = render_task(thread);
   } else if (!ssim_ready_.empty()) {
@@ -126,18 +128,18 @@ TileRowTask TileRowSchedule::render_task(int thread) {
   range->next += range->step;
   --range->left;
   --not_rendered_;
-  int cache = pop_own(free_caches_, [&](int place) { return last_thread_of_cache_[size_t(place)] == thread; });
+  int cache = pop_own(free_caches_, [&](int candidate) { return last_thread_of_cache_[size_t(candidate)] == thread; });
   if (cache < 0) cache = pop(free_caches_);
   cache_of_tile_row_[size_t(tile_row)] = cache;
   rendered_by_[size_t(tile_row)] = last_thread_of_cache_[size_t(cache)] = thread;
   return {TileRowTask::kRender, tile_row, {cache, -1}, {-1, -1}};
 }
 
-TileRowTask TileRowSchedule::ssim_task(int row) {
-  const int above = row > 0 ? cache_of_tile_row_[size_t(row - 1)] : -1;
-  const int below = row < tile_rows_ ? cache_of_tile_row_[size_t(row)] : -1;
-  const int squares = squares_of_square_row_[size_t(row)] = pop(free_squares_);
-  return {TileRowTask::kSsim, row, {above, below}, {squares, -1}};
+TileRowTask TileRowSchedule::ssim_task(int square_row) {
+  const int above = square_row > 0 ? cache_of_tile_row_[size_t(square_row - 1)] : -1;
+  const int below = square_row < tile_rows_ ? cache_of_tile_row_[size_t(square_row)] : -1;
+  const int squares = squares_of_square_row_[size_t(square_row)] = pop(free_squares_);
+  return {TileRowTask::kSsim, square_row, {above, below}, {squares, -1}};
 }
 
 TileRowTask TileRowSchedule::backward_task(int tile_row) {
@@ -153,9 +155,9 @@ int TileRowSchedule::pop_own_tile_row(int thread) {
 }
 
 int TileRowSchedule::pop_own_square_row(int thread) {
-  return pop_own(ssim_ready_, [&](int row) {
-    return (row > 0 && rendered_by_[size_t(row - 1)] == thread) ||
-           (row < tile_rows_ && rendered_by_[size_t(row)] == thread);
+  return pop_own(ssim_ready_, [&](int square_row) {
+    return (square_row > 0 && rendered_by_[size_t(square_row - 1)] == thread) ||
+           (square_row < tile_rows_ && rendered_by_[size_t(square_row)] == thread);
   });
 }
 

@@ -53,7 +53,7 @@ class TileRowSchedule {
   };
   bool take(TileRowTask& task, int thread);
   TileRowTask render_task(int thread);
-  TileRowTask ssim_task(int row);
+  TileRowTask ssim_task(int square_row);
   TileRowTask backward_task(int tile_row);
   // The latest ready tile row that this thread rendered, or row of squares next to such a tile row; -1 if there is
   // none.

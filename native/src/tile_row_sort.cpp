@@ -12,7 +12,7 @@ namespace {
 
 constexpr int kDigits = 3, kDigitBits = 8, kDigitValues = 1 << kDigitBits;
 
-// Calls f(key) for all keys of the tile row in slot order, for all threads that wrote them.
+// Calls f(key) for all keys of the tile row, of all threads, in slot order.
 template <class F>
 GAUSSLITE_INLINE void for_each_key(const Workspace& ws, int tile_row, F f) {
   for (uint32_t segment = 0; segment < ws.segments; ++segment) {

@@ -16,7 +16,7 @@ namespace {
 
 // Sixteen visible splats: their rows and the sums of their gradient rows, transposed.
 struct Group {
-  Pack16 row[16], image[16];
+  Pack16 row[16], image_gradient[16];
   uint32_t id[16];
   int lanes;
 
@@ -27,11 +27,12 @@ struct Group {
       row[j] = load(ws.rows + size_t(kRowWidth) * splat.id);
       // Most splats have one or two gradient rows. Both are always read, and masked: no branch to mispredict.
       const uint32_t rows = j < n ? splat.gradient_rows : 0;
-      image[j] = gradient(ws, splat.gradient_row, rows > 0) + gradient(ws, splat.gradient_row + 1, rows > 1);
-      for (uint32_t r = 2; r < rows; ++r) image[j] = image[j] + gradient(ws, splat.gradient_row + r, true);
+      image_gradient[j] = gradient(ws, splat.gradient_row, rows > 0) + gradient(ws, splat.gradient_row + 1, rows > 1);
+      for (uint32_t r = 2; r < rows; ++r)
+        image_gradient[j] = image_gradient[j] + gradient(ws, splat.gradient_row + r, true);
     }
     transpose(row);
-    transpose(image);
+    transpose(image_gradient);
   }
 
  private:
@@ -66,41 +67,44 @@ GAUSSLITE_INLINE void for_each_group(Workspace& ws, int thread, Prefetch prefetc
   }
 }
 
-// Adam on whole rows. Columns kGradSum and kGradCount of the first moment are sums over the steps: the recurrence of
-// Adam with factors of 1 in those lanes. Column kUpdates of the row increases by one.
+// Adam on whole rows. Columns kGradSum and kGradCount of the first moment are sums over the steps, not averages: in
+// these two lanes, the decay and the gain of the first moment are 1. Column kUpdates of the row increases by one.
 class Adam {
  public:
   GAUSSLITE_INLINE explicit Adam(const UpdateArguments& args)
       : args_(args), rate_(load(args.adam.rates)), epsilon_(args.adam.epsilon) {
     const AdamSettings& adam = args.adam;
-    alignas(64) float factors[5][16];
+    alignas(64) float lanes[5][16];
     for (int k = 0; k < 16; ++k) {
       const bool trained = k < kTrainedColumns;
-      factors[0][k] = trained ? adam.beta1 : 1.0f;
-      factors[1][k] = trained ? 1.0f - adam.beta1 : 1.0f;
-      factors[2][k] = trained ? adam.beta2 : 1.0f;
-      factors[3][k] = trained ? 1.0f - adam.beta2 : 0.0f;
-      factors[4][k] = k == kUpdates ? 1.0f : 0.0f;
+      lanes[0][k] = trained ? adam.beta1 : 1.0f;
+      lanes[1][k] = trained ? 1.0f - adam.beta1 : 1.0f;
+      lanes[2][k] = trained ? adam.beta2 : 1.0f;
+      lanes[3][k] = trained ? 1.0f - adam.beta2 : 0.0f;
+      lanes[4][k] = k == kUpdates ? 1.0f : 0.0f;
     }
-    first_decay_ = load(factors[0]);
-    first_gain_ = load(factors[1]);
-    second_decay_ = load(factors[2]);
-    second_gain_ = load(factors[3]);
-    count_ = load(factors[4]);
+    first_decay_ = load(lanes[0]);
+    first_gain_ = load(lanes[1]);
+    second_decay_ = load(lanes[2]);
+    second_gain_ = load(lanes[3]);
+    update_increment_ = load(lanes[4]);
   }
 
   GAUSSLITE_INLINE void step(uint32_t id, Pack16 gradient) const {
     const size_t at = size_t(kRowWidth) * id;
     float *row = args_.rows + at, *m = args_.first_moment + at, *v = args_.second_moment + at;
+    // Two values per number of updates (AdamCorrections::table): the learning-rate decay with the bias correction of
+    // the first moment, and the bias correction of the second.
     const float* factors = args_.adam.step_factors + 2 * step_factor_index(row[kUpdates]);
+    const float rate_factor = factors[0], second_correction = factors[1];
     const Pack16 m_new = fma(load(m), first_decay_, gradient * first_gain_);
     const Pack16 v_new = fma(load(v), second_decay_, gradient * gradient * second_gain_);
     store(m, m_new);
     store(v, v_new);
     // 14 bits suffice for the size of a step. The smallest float avoids 0 / 0 in unused columns.
-    const Pack16 square = max(v_new * factors[1], Pack16(std::numeric_limits<float>::min()));
-    const Pack16 size = fma(square, rough_inverse_sqrt(square), epsilon_);
-    store(row, fnma(rate_ * factors[0], m_new * rough_reciprocal(size), load(row)) + count_);
+    const Pack16 square = max(v_new * second_correction, Pack16(std::numeric_limits<float>::min()));
+    const Pack16 denominator = fma(square, rough_inverse_sqrt(square), epsilon_);
+    store(row, fnma(rate_ * rate_factor, m_new * rough_reciprocal(denominator), load(row)) + update_increment_);
   }
 
  private:
@@ -111,7 +115,7 @@ class Adam {
   }
 
   const UpdateArguments& args_;
-  Pack16 rate_, epsilon_, first_decay_, first_gain_, second_decay_, second_gain_, count_;
+  Pack16 rate_, epsilon_, first_decay_, first_gain_, second_decay_, second_gain_, update_increment_;
 };
 
 template <bool kMotion>
@@ -125,7 +129,7 @@ void update_splats(Workspace& ws, const UpdateArguments& args, int thread) {
   };
   for_each_group(ws, thread, prefetch_splat, [&](uint32_t, const Group& group, const Slots& slots) {
     ParameterGradients g;
-    backward16<false, kMotion>(group.row, group.image, ws.camera, g);
+    backward16<false, kMotion>(group.row, group.image_gradient, ws.camera, g);
     zero_invalid(g);
     g.column[kGradSum] = g.mean_2d_grad_norm;
     g.column[kGradCount] = Pack16(1.0f);
@@ -148,7 +152,7 @@ void write_gradients(Workspace& ws, const GradientOutput& args, int thread) {
   const auto prefetch_splat = [&](const VisibleSplat& splat) { prefetch(ws.rows + size_t(kRowWidth) * splat.id); };
   for_each_group(ws, thread, prefetch_splat, [&](uint32_t segment, const Group& group, const Slots& slots) {
     ParameterGradients g;
-    backward16<true, kMotion>(group.row, group.image, ws.camera, g);
+    backward16<true, kMotion>(group.row, group.image_gradient, ws.camera, g);
     zero_invalid(g);
     for (int k = 0; k < 6; ++k) {
       args.d_twist[6 * size_t(segment) + size_t(k)] += double(sum(zero_unless(is_finite(g.twist[k]), g.twist[k])));

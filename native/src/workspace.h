@@ -24,7 +24,9 @@ struct alignas(64) Splat {
   float slope_y;           // the dy that minimises the quadric at dx = 1, and
   float slope_x;           // the dx at dy = 1, for the overlap test of ellipse and block
   float tile_x0, tile_x1;  // integers: first and last tile column of the bounding box
-  uint32_t gradient_row;   // row of its image gradients in tile row y: gradient_row + y (modulo 2^32)
+  // Its first gradient row minus its first tile row. Its gradients in tile row y are in row
+  // gradient_row_minus_tile_y + y (modulo 2^32).
+  uint32_t gradient_row_minus_tile_y;
 };
 static_assert(sizeof(Splat) == 64);
 
