@@ -26,6 +26,9 @@ from gausslite_sim.sensor_noise import SensorNoise
 from gausslite_sim.trajectory import Waypoint, spline_trajectory
 
 _EXPOSURE_DRIFT = 0.12
+"""Maximum deviation of the camera's gain from 1 (a factor) along a trajectory."""
+_FURNITURE_STREAM = 2
+"""Third element of the random seed of a home's furniture."""
 _SENSOR = SensorNoise(dark_loss=0.55, gloss_loss=0.5)
 
 
@@ -63,7 +66,7 @@ def plan_home(number: int, seed: int) -> HomePlan:
             seed, two_room_layout.furnish(seed), textures, two_room_layout.LIGHTING, two_room_trajectories.TRAJECTORIES
         )
     home = HOMES[number - 1]
-    items = home.furnish(np.random.default_rng([seed, number, 2]))
+    items = home.furnish(np.random.default_rng([seed, number, _FURNITURE_STREAM]))
     used = {part.texture for item in items for part in item.parts}
     return HomePlan(
         seed,

@@ -12,8 +12,9 @@ from numpy import ndarray
 Vector = tuple[float, float, float]
 
 _CELL_M = 0.12
+"""Edge length of the cells of panels: light is stored per vertex, so that large faces need inner vertices."""
 _BAND_M = 0.03
-"""Edge length of the tessellation: light is stored per vertex, so that large faces need inner vertices."""
+"""Length of the steps along the profile of a surface of revolution."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -67,11 +68,13 @@ def panel(top_left_m: Vector, right_m: Vector, down_m: Vector, fit: bool = False
     origin, right, down = (np.asarray(value, np.float64) for value in (top_left_m, right_m, down_m))
     width, height = float(np.linalg.norm(right)), float(np.linalg.norm(down))
     columns, rows = max(1, round(width / cell_m)), max(1, round(height / cell_m))
-    b, a = (axis[:, None] for axis in _grid(np.linspace(0, 1, rows + 1), np.linspace(0, 1, columns + 1)))
+    down_share, right_share = (
+        axis[:, None] for axis in _grid(np.linspace(0, 1, rows + 1), np.linspace(0, 1, columns + 1))
+    )
     normal = np.cross(down, right)
-    normals = np.broadcast_to(normal / np.linalg.norm(normal), (len(a), 3)).copy()
-    uv = np.hstack([a, b]) * ((1.0, 1.0) if fit else (width, height))
-    return Mesh(origin + a * right + b * down, uv, normals, _grid_faces(rows, columns))
+    normals = np.broadcast_to(normal / np.linalg.norm(normal), (len(right_share), 3)).copy()
+    uv = np.hstack([right_share, down_share]) * ((1.0, 1.0) if fit else (width, height))
+    return Mesh(origin + right_share * right + down_share * down, uv, normals, _grid_faces(rows, columns))
 
 
 def box(low_m: Vector, high_m: Vector, fit: bool = False, cell_m: float = _CELL_M) -> Mesh:
@@ -110,10 +113,16 @@ def lathe(profile_m: list[tuple[float, float]], smooth: bool = False, fit: bool 
     along = np.concatenate([[0.0], np.cumsum(lengths)])
     around_m = 2 * np.pi * float(points[:, 0].max())
     scale = np.array([1.0, 1.0 / along[-1]]) if fit else np.array([around_m, 1.0])
-    strips = []
-    for i in range(len(steps)):
-        ends = (points[i + 1], points[i]), (stop[i], start[i]), (along[-1] - along[i + 1], along[-1] - along[i])
-        strips.append(_strip(*ends, scale, sectors))
+    strips = [
+        _strip(
+            points=(points[i + 1], points[i]),
+            normals=(stop[i], start[i]),
+            v=(along[-1] - along[i + 1], along[-1] - along[i]),
+            scale=scale,
+            sectors=sectors,
+        )
+        for i in range(len(steps))
+    ]
     return merge_meshes(strips)
 
 
@@ -128,7 +137,10 @@ def ring(major_m: float, minor_m: float, start_rad: float, stop_rad: float) -> M
 
 
 def leaf(length_m: float, width_m: float, rise_m: float) -> Mesh:
-    """Return a bent leaf from the origin along +x with a fitted texture, stem at v = 1."""
+    """Return a bent leaf from the origin along +x with a fitted texture, stem at v = 1.
+
+    The middle line rises to 0.76 rise_m and ends at 0.6 rise_m.
+    """
     rows, columns = 8, 2
     t, s = _grid(np.linspace(0, 1, rows + 1), np.linspace(-1, 1, columns + 1))
     half = 0.5 * width_m * np.sin(np.pi * np.clip(0.06 + 0.94 * t, 0, 0.995)) ** 0.8

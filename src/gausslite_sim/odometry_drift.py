@@ -9,7 +9,7 @@ from numpy import ndarray
 from gausslite.domain.pose import inverse, orthonormal, transform_of, twist_of
 
 _TURNS = 2.0
-"""How often the direction of the errors turns around each axis during a trajectory."""
+"""Number of sine periods of each component of the error direction during a trajectory."""
 
 
 def drifting_poses(

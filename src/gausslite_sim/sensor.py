@@ -12,6 +12,9 @@ from gausslite_sim.view import View
 _DARK = 45.0
 """Mean colour, 0 to 255, below which a surface may return too little light."""
 _MIRROR = 0.4
+"""Gloss, 0 to 1, from which a surface has the full probability SensorNoise.gloss_loss of no return."""
+_BEST_RANGE_M = 0.4
+"""Depth at which the axial noise is smallest (SensorNoise)."""
 
 
 def colour_image(rgb: Float32[ndarray, "h w 3"]) -> UInt8[ndarray, "h w 3"]:
@@ -21,24 +24,31 @@ def colour_image(rgb: Float32[ndarray, "h w 3"]) -> UInt8[ndarray, "h w 3"]:
 
 
 def noisy_colour(view: View, noise: SensorNoise, strength: float, rng: np.random.Generator) -> UInt8[ndarray, "h w 3"]:
-    """Return the image with colour noise of standard deviation sqrt(read^2 + shot^2 * value)."""
+    """Return the image with colour noise of standard deviation sqrt(read^2 + shot^2 * value).
+
+    strength: factor of the deviation, above 0; at 0 the caller adds no noise.
+    """
     deviation = np.sqrt(np.float32(noise.colour_read**2) + np.float32(noise.colour_shot**2) * view.rgb)
     grains = rng.standard_normal(view.rgb.shape, np.float32)
     return colour_image(view.rgb + np.float32(strength) * deviation * grains)
 
 
 def noisy_depth(view: View, noise: SensorNoise, strength: float, rng: np.random.Generator) -> Float32[ndarray, "h w"]:
-    """Return the sensor's depth in metres, 0 without a return."""
+    """Return the sensor's depth in metres, 0 without a return.
+
+    strength: factor of the errors and of the probabilities of lost pixels, above 0; at 0 the caller adds no noise.
+    """
     z = view.depth_m.astype(np.float32, copy=True)
-    chance = rng.random(z.shape, np.float32)
+    draw = rng.random(z.shape, np.float32)
     grains = rng.standard_normal(z.shape, np.float32)
     edge, other_side = _edges(z, noise.edge_step_m)
-    fly = edge & (chance < strength * noise.edge_flight)
-    z[fly] += (other_side - z)[fly] * (chance / max(strength * noise.edge_flight, 1e-6))[fly]
-    z += np.float32(strength) * (noise.base_m + noise.growth_per_m * np.square(z - 0.4)) * grains
+    # flying pixels: a depth between both sides of the edge; edge_flight is their share of the edge pixels
+    fly = edge & (draw < strength * noise.edge_flight)
+    z[fly] += (other_side - z)[fly] * (draw / max(strength * noise.edge_flight, 1e-6))[fly]
+    z += np.float32(strength) * (noise.base_m + noise.growth_per_m * np.square(z - _BEST_RANGE_M)) * grains
     z = _quantised(z, noise, strength)
-    lost = edge & ~fly & (chance < strength * (noise.edge_flight + noise.edge_loss))
-    lost |= ~edge & (chance < strength * noise.speckle_loss)
+    lost = edge & ~fly & (draw < strength * (noise.edge_flight + noise.edge_loss))
+    lost |= ~edge & (draw < strength * noise.speckle_loss)
     lost |= view.facing < noise.grazing_cosine
     if noise.dark_loss > 0 or noise.gloss_loss > 0:
         lost |= rng.random(z.shape, np.float32) < strength * _absorbed(view, noise)
@@ -49,7 +59,7 @@ def noisy_depth(view: View, noise: SensorNoise, strength: float, rng: np.random.
 
 def _quantised(z: Float32[ndarray, "h w"], noise: SensorNoise, strength: float) -> Float32[ndarray, "h w"]:
     """Return the depth with its disparity rounded to the sensor's steps; weaker noise has finer steps."""
-    steps = np.float32(noise.baseline_px_m * noise.disparity_steps_per_px / strength)
+    steps = np.float32(noise.focal_times_baseline_px_m * noise.disparity_steps_per_px / strength)
     rounded: Float32[ndarray, "h w"] = steps / np.maximum(np.rint(steps / np.maximum(z, np.float32(0.05))), 1)
     return rounded.astype(np.float32)
 

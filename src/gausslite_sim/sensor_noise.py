@@ -10,15 +10,15 @@ class SensorNoise:
     """Errors at strength 1.
 
     Axial depth noise: standard deviation base_m + growth_per_m (z - 0.4 m)^2 (Nguyen, Izadi and Lovell 2012, Kinect).
-    Disparity steps: 1/disparity_steps_per_px, with baseline_px_m = baseline times focal length; depth steps grow with
-    z^2. No return outside [near_m, far_m] and at grazing incidence. Edge pixels lose their depth, or get a depth
+    Disparity steps: 1/disparity_steps_per_px, with focal_times_baseline_px_m; depth steps grow with z^2.
+    No return outside [near_m, far_m] and at grazing incidence. Edge pixels lose their depth, or get a depth
     between both sides (flying pixels). dark_loss, gloss_loss: probability of no return from black and glossy
     surfaces. Colour: read-out noise and shot noise.
     """
 
     base_m: float = 0.0012
     growth_per_m: float = 0.0016
-    baseline_px_m: float = 43.5
+    focal_times_baseline_px_m: float = 43.5
     disparity_steps_per_px: float = 8.0
     near_m: float = 0.35
     far_m: float = 6.0

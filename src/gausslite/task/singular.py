@@ -17,8 +17,8 @@ _IRREGULAR: Final = {
     "caches": "cache", "aches": "ache", "axes": "axe", "persons": "person", "gases": "gas", "calves": "calf",
     "humans": "human", "rubbish": "rubbish", "quizzes": "quiz", "policemen": "policeman", "workmen": "workman",
 }  # fmt: skip
-# plural in form only, or singular with a final s
-PLURAL_ONLY: Final = word_set(
+# words that singular() returns unchanged: plural in form only, or singular with a final s
+UNCHANGED: Final = word_set(
     "scissors glasses sunglasses eyeglasses headphones earphones pants jeans trousers shorts pliers tongs tweezers "
     "binoculars goggles clothes stairs valuables electronics groceries gas bus lens news series species thermos "
     "asbestos christmas canvas atlas chaos always mass pass chess press cutlery pajamas pyjamas overalls tights "
@@ -30,7 +30,7 @@ def singular(word: str) -> str:
     """Return the singular of a lower-case English word, or the word itself if it has none."""
     if word in _IRREGULAR:
         return _IRREGULAR[word]
-    if word in PLURAL_ONLY or len(word) <= 3 or not word.endswith("s") or word.endswith(("ss", "us", "is", "'s")):
+    if word in UNCHANGED or len(word) <= 3 or not word.endswith("s") or word.endswith(("ss", "us", "is", "'s")):
         return word
     if word.endswith("ies"):
         return word[:-3] + "y"

@@ -9,7 +9,7 @@ from gausslite.task import lexicon
 from gausslite.task.attributes import is_attribute
 from gausslite.task.part_of_speech import Tag, best_tags
 from gausslite.task.prepositions import PREPOSITIONS
-from gausslite.task.singular import PLURAL_ONLY, singular
+from gausslite.task.singular import UNCHANGED, singular
 from gausslite.task.tokenizer import split_bounds
 from gausslite.task.verb_forms import base_of_ed, base_of_ing, base_of_s, verb_base
 from gausslite.task.verbs import GO_VERBS, SEARCH_VERBS, TOOL_VERBS, VERBS
@@ -130,7 +130,7 @@ def _tag_options(before: str, word: str, after: str) -> Options:
         return {Tag.DETERMINER: 0, Tag.NOUN: 5}
     if word.endswith(_POSSESSIVES) and len(word) > 3:
         return {Tag.ADJECTIVE: 0, Tag.DETERMINER: 0}
-    is_noun = singular(word) in _NOUNS or word in _NOUNS or word in PLURAL_ONLY
+    is_noun = singular(word) in _NOUNS or word in _NOUNS or word in UNCHANGED
     options = _verb_options(before, word, is_noun)
     if word in lexicon.ADJECTIVES or is_attribute(word):
         options[Tag.ADJECTIVE] = 0
