@@ -134,10 +134,6 @@ class TaskGraph:
         targets = {noun_of(name) for name in self.targets}
         return tuple(dict.fromkeys(noun for noun in map(noun_of, self.excluded) if noun not in targets))
 
-    def role_of(self, target: str) -> TargetRole:
-        """Return the role of a target. Raises ValueError for other names."""
-        return self.roles[self.targets.index(target)]
-
 
 def noun_of(name: str) -> str:
     """Return the noun of an object's name: "block_2" is a "block"."""

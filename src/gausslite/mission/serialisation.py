@@ -1,4 +1,4 @@
-"""Convert settings dataclasses to plain JSON values and back, for checkpoints and for other processes."""
+"""Convert settings dataclasses to plain JSON values and back, for checkpoints."""
 
 from __future__ import annotations
 
@@ -7,11 +7,9 @@ from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from enum import Enum
 from pathlib import Path
-from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Any, Union, get_args, get_origin, get_type_hints
 
 from gausslite.domain.errors import InvalidInputError
-
-Settings = TypeVar("Settings")
 
 
 def to_plain(value: object) -> Any:
@@ -34,17 +32,12 @@ def to_plain(value: object) -> Any:
     raise TypeError(f"settings: expected plain values, got {type(value).__name__}")
 
 
-def from_plain(kind: type[Settings], values: object) -> Settings:
-    """Return the settings object that `to_plain` converted.
-
-    Missing fields get their default. Raises InvalidInputError for unknown fields, other types and invalid values.
-    """
-    settings: Settings = _convert(kind, values, kind.__name__)
-    return settings
-
-
 def field_from_plain(kind: type, name: str, value: object) -> Any:
-    """Return one field of a settings class from its JSON value. Raises InvalidInputError."""
+    """Return one field of a settings class from the value that `to_plain` made.
+
+    Missing fields of a nested class get their default. Raises InvalidInputError for unknown fields, other types and
+    invalid values.
+    """
     return _convert(get_type_hints(kind)[name], value, f"{kind.__name__}.{name}")
 
 

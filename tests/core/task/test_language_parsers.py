@@ -90,7 +90,7 @@ def test_the_rules_correct_an_answer_that_reverses_the_sentence():
     assert graph.relations == (Relation(Predicate.ON, "mug", "table", negated=True),)
     assert "contradicts the sentence" in graph.warnings[0]
     graph = parse_answer("Take the mug without touching the vase", answer(["mug", "vase"], []))
-    assert graph.role_of("vase") is TargetRole.OBSTACLE
+    assert graph.roles[graph.targets.index("vase")] is TargetRole.OBSTACLE
 
 
 def test_an_answer_within_prose_is_found():

@@ -136,7 +136,7 @@ def test_excluded_objects_are_no_targets(text, excluded):
 )
 def test_objects_not_to_be_touched_are_obstacles(text, obstacle):
     graph = RuleParser().parse(text)
-    assert graph.role_of(obstacle) is TargetRole.OBSTACLE
+    assert graph.roles[graph.targets.index(obstacle)] is TargetRole.OBSTACLE
     assert graph.excluded == ()
 
 
