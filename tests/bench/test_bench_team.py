@@ -5,14 +5,16 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 from mapping_scenes import wall_frame
+from tiny_sequences import write_seven_scenes
 
 from gausslite.cli.main import main
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.pose import rotation_angle_deg, translation_m
 from gausslite_bench.team.frame_errors import FrameError
-from gausslite_bench.team.scenes import TeamPlan
+from gausslite_bench.team.scenes import HomeTeamPlan
 
 
 def test_a_team_is_mapped_fused_and_scored(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -48,6 +50,34 @@ def test_a_late_robot_is_measured_alone_and_with_the_teams_map(
     assert 0 < scene["team_bytes"] < 100_000
 
 
+def test_positions_of_objects_are_compared_with_ground_truth(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    size = ("--size", "160x120", "--frames", "12", "--views", "4", "--threads", "1")
+    assert main(["bench", "team", "--positions", "--homes", "4", *size, "--json", "--out", str(tmp_path)]) == 0
+    alone, team = json.loads(capsys.readouterr().out)["scenes"]
+    assert (alone["agents"], team["agents"]) == (1, 2)
+    for each in (alone, team):
+        [error_m] = each["errors_m"]
+        assert error_m < 0.05
+        assert each["others"] == 0
+    assert "| home-4 x 2 |" in (tmp_path / "positions.md").read_text()
+
+
+def test_parts_of_a_recording_make_a_team(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = write_seven_scenes(tmp_path / "wall", tuple(range(18)))
+    voxels = np.stack(np.meshgrid(range(-4, 4), range(-4, 4), [19, 20], indexing="ij"), axis=-1).reshape(-1, 3)
+    np.savez(folder / "roi_voxels.npz", voxel_size_m=0.1, cup_1=voxels.astype(np.int32))
+    source = ["--real", str(folder), "--size", "24x18", "--pose-prior", "none", "--no-fit-views"]
+    budget = ["--max-gaussians", "300", "--iterations", "2", "--refine-iterations", "2", "--threads", "1"]
+    arguments = ["bench", "team", *source, *budget, "--policies", "task", "--json", "--out", str(tmp_path / "out")]
+    assert main(arguments) == 0
+    [trial] = json.loads(capsys.readouterr().out)["trials"]
+    assert trial["scene"] == "wall-cup x 2"
+    assert 5 < trial["roi_psnr"]["vote"] < 60
+    assert set(trial["alignment"]) == {"agent-0", "agent-1"}
+
+
 def test_wrong_options_fail_before_any_mapping(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     for wrong, expected in (
         (("--homes", "9"), "homes"),
@@ -57,11 +87,14 @@ def test_wrong_options_fail_before_any_mapping(capsys: pytest.CaptureFixture[str
         (("--views", "0"), "views"),
         (("--frames", "1000000"), "frames"),
         (("--refine-iterations", "-1"), "refine-iterations"),
+        (("--late-joiner", "--positions"), "got both"),
+        (("--detector", "yolo.onnx"), "--positions"),
+        (("--kinds", "mug"), "--real"),
     ):
         assert main(["bench", "team", "--out", str(tmp_path), *wrong]) == 2
         assert expected in capsys.readouterr().err
     with pytest.raises(InvalidInputError, match="agents"):
-        TeamPlan(1, 5)
+        HomeTeamPlan(1, 5)
 
 
 def test_a_frame_error_shifts_turns_and_drifts() -> None:

@@ -9,7 +9,7 @@ KNOWN_OPTIONS: Final = frozenset(
     {
         *("absent", "after", "agent-id", "backend", "before", "blur", "camera-correction", "caps", "changes"),
         *("deadline-slack", "details", "detector", "disable", "drain-timeout", "equal", "exit-when-done"),
-        *("frame-alignment", "frame-error", "free-space", "homes", "late-joiner", "team-map", "team-sizes", "vote"),
+        *("frame-alignment", "frame-error", "free-space", "homes", "late-joiner", "positions", "team-map"),
         *("external-rasterizer", "fit-views", "frames", "frames-a", "frames-b", "fusion", "gaussians"),
         *(
             "grace-period",
@@ -22,7 +22,7 @@ KNOWN_OPTIONS: Final = frozenset(
             "listen",
             "llm-format",
         ),
-        *("lens", "shutter", "speeds"),
+        *("lens", "shutter", "speeds", "team-sizes", "vote"),
         *("llm-key-variable", "llm-model", "llm-timeout", "llm-url", "loop", "lpips-weights", "map", "masks"),
         *("max-gaussians", "min-iterations", "mission", "objects", "out", "overwrite", "pair", "pairs"),
         *("parser", "perception", "pictures", "policies", "policy", "pose-prior", "poses", "preset", "queue"),

@@ -48,16 +48,17 @@ def add_study_options(parser: argparse.ArgumentParser, default_seeds: tuple[int,
         default=[],
         help="weights of AlexNet and LPIPS; repeatable (default: LPIPS is not computed)",
     )
+    add_real_sequence(parser)
+
+
+def add_real_sequence(parser: argparse.ArgumentParser) -> None:
+    """Add the options of a real sequence, and how its pose errors are handled."""
     add_pose_prior(parser, None, f"homes none, real {REAL_CAMERA.pose_prior}", allow_auto=False)
-    add(
+    parser.add_argument(
         "--fit-views",
         action=argparse.BooleanOptionalAction,
         help="also score with each view's pose and exposure fitted (default: real sequences only)",
     )
-    _add_real_sequence_options(parser)
-
-
-def _add_real_sequence_options(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("real sequence")
     add = group.add_argument
     add("--real", metavar="FOLDER", type=Path, help="measure on this sequence; on homes too if they are named")
@@ -81,7 +82,7 @@ def scene_plans(
     task_names: homes or home-task pairs; default_names replaces an empty list if there is no real sequence. Raises
     InvalidInputError, DatasetError.
     """
-    real = _real_plans(options)
+    real = real_sequence_plans(options)
     if real is None:
         return [*_home_plans(options, choose_home_tasks(task_names or default_names))], _HOME_SIZE
     plans, size = real
@@ -94,8 +95,11 @@ def _home_plans(options: argparse.Namespace, tasks: Sequence[HomeTask]) -> list[
     return [HomeScenePlan(task, frames, options.views, pose_policy=pose_policy) for task in tasks]
 
 
-def _real_plans(options: argparse.Namespace) -> tuple[list[RealScenePlan], tuple[int, int]] | None:
-    """Return the plans of the real sequence and an image size with its aspect ratio; None without --real."""
+def real_sequence_plans(options: argparse.Namespace) -> tuple[list[RealScenePlan], tuple[int, int]] | None:
+    """Return the plans of the real sequence and an image size with its aspect ratio; None without --real.
+
+    Raises InvalidInputError, DatasetError.
+    """
     if options.real is None:
         for name in ("roi", "kinds"):
             if getattr(options, name):

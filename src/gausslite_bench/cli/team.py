@@ -1,4 +1,4 @@
-"""`gausslite bench team`: quality of fused maps by strategy and policy, and what the agents send for it."""
+"""`gausslite bench team`: quality of fused maps, what the agents send for it, late robots, and object positions."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import argparse
 import shlex
 import sys
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,22 +19,25 @@ from gausslite.config.values import read_names
 from gausslite.domain.errors import InvalidInputError
 from gausslite.mapping.policies import POLICIES
 from gausslite.mission.results import as_text, prepare_folder, write_json
-from gausslite.mission.settings import MissionSettings
+from gausslite.mission.settings import MissionSettings, PerceptionSettings
 from gausslite_bench.cli.argument_types import read_image_size, read_seeds
+from gausslite_bench.cli.study_options import add_real_sequence, real_sequence_plans
 from gausslite_bench.team.bench import TeamResult, TeamTrial, run_trial
 from gausslite_bench.team.frame_errors import FrameError
 from gausslite_bench.team.late_joiner import late_joiner_table, run_late_joiner
-from gausslite_bench.team.scenes import TeamPlan
+from gausslite_bench.team.object_positions import PositionScore, measure_positions, positions_table
+from gausslite_bench.team.scenes import HomeTeamPlan, RecordingTeamPlan, TeamPlan
 from gausslite_bench.team.tables import team_table
 
 _SIZE = (320, 240)
+_HOME_FRAMES = 60
 
 
 def configure_team(parser: argparse.ArgumentParser) -> None:
     """Add the options of `bench team`."""
     add = parser.add_argument
     add("--out", metavar="DIR", type=Path, required=True, help="folder for team.md and team.json")
-    add("--homes", metavar="N,...", type=read_names, default=("1",), help="homes, 1 to 8 (default: 1)")
+    add("--homes", metavar="N,...", type=read_names, help="homes, 1 to 8 (default: 1, or none with --real)")
     add("--team-sizes", metavar="N,...", type=read_names, default=("2",), help="numbers of agents, 2 to 4 (default: 2)")
     add(
         "--policies",
@@ -44,8 +47,13 @@ def configure_team(parser: argparse.ArgumentParser) -> None:
         help="policies (default: task and the four baselines)",
     )
     add("--seeds", metavar="N,...", type=read_seeds, default=(0,), help="mapping seeds (default: 0)")
-    add("--size", metavar="WxH", type=read_image_size, default=_SIZE, help="image size (default: 320x240)")
-    add("--frames", metavar="N", type=int, default=60, help="frames of each agent (default: %(default)s)")
+    add(
+        "--size",
+        metavar="WxH",
+        type=read_image_size,
+        help="image size (default: 320x240; recordings keep their aspect)",
+    )
+    add("--frames", metavar="N", type=int, help="frames of each agent (default: 60 in a home, all of a recording)")
     add("--views", metavar="N", type=int, default=16, help="held-out views (default: %(default)s)")
     add("--max-gaussians", metavar="N", type=int, default=60_000, help="hard cap of each agent (default: %(default)s)")
     add("--iterations", metavar="N", type=int, default=8, help="iterations per frame (default: %(default)s)")
@@ -65,75 +73,140 @@ def configure_team(parser: argparse.ArgumentParser) -> None:
     )
     add("--threads", metavar="N", type=int, help="threads (default: all available cores)")
     add_switch(parser, "--late-joiner", "only measure a robot that joins late, alone and with the team's map")
+    add_switch(parser, "--positions", "only measure where perception places the objects of the first agent's task")
+    add(
+        "--detector",
+        metavar="FILE.onnx",
+        type=Path,
+        help="detector of --positions (default: exact masks of the ground truth)",
+    )
+    add_real_sequence(parser)
     add_switch(parser, "--json", "print JSON for scripts")
     parser.set_defaults(run=run_team)
 
 
 def run_team(options: argparse.Namespace) -> int:
     """Run the trials; the files are rewritten after each, so that an interrupt loses one trial at most."""
-    trials = _trials(options)
+    if options.late_joiner and options.positions:
+        raise InvalidInputError("--late-joiner and --positions: expected one of them, got both")
+    if options.detector is not None and not options.positions:
+        raise InvalidInputError("--detector: expected --positions, which uses it; other trials have exact masks")
+    plans, size = _plans(options)
+    if options.positions:
+        return _run_positions(options, plans, size)
+    trials = [(plan, _trials(options, plan, size)) for plan in plans]
     prepare_folder(options.out)
     if options.late_joiner:
         return _run_late_joiner(options, trials)
     results: list[TeamResult] = []
-    frames = sum(trial.plan.agents * trial.plan.frames for trial in trials)
-    with progress_bar(frames, "team", "frame") as bar:
-        for trial in trials:
-            results.append(run_trial(trial, trial.plan.load(trial.size), lambda _: _count(bar)))
-            _write(options.out, results)
-            print_above_bar(team_table(results[-1:]).splitlines()[-1])
+    with progress_bar(0, "team", "frame") as bar:
+        for plan, plan_trials in trials:
+            scene = plan.load(size)
+            _expect(bar, len(plan_trials) * sum(len(agent.frames) for agent in scene.agents))
+            for trial in plan_trials:
+                results.append(run_trial(trial, scene, lambda _: _count(bar)))
+                _write(options.out, results)
+                print_above_bar(team_table(results[-1:]).splitlines()[-1])
     print(as_text({"trials": [each.as_json() for each in results]}) if options.json else team_table(results))
     return 0
+
+
+def _expect(bar: tqdm[Any], frames: int) -> None:
+    bar.total = (bar.total or 0) + frames
 
 
 def _count(bar: tqdm[Any]) -> None:
     bar.update()
 
 
-def _run_late_joiner(options: argparse.Namespace, trials: Sequence[TeamTrial]) -> int:
+def _run_late_joiner(options: argparse.Namespace, trials: Sequence[tuple[TeamPlan, Sequence[TeamTrial]]]) -> int:
     """Measure each scene, policy and seed; write late-joiner.md and .json."""
     results = []
-    for trial in trials:
+    for trial in (trial for _, plan_trials in trials for trial in plan_trials):
         results.append(run_late_joiner(trial.plan, trial.settings, trial.size, trial.grid))
         print_above_bar(results[-1].row)
-    command, table = shlex.join(["gausslite", *sys.argv[1:]]), late_joiner_table(results)
-    write_atomic(options.out / "late-joiner.md", f"# bench team\n\n`{command}`\n\n{table}".encode())
-    report = {"command": command, "scenes": [asdict(each) for each in results]}
-    write_json(options.out / "late-joiner.json", report)
-    print(as_text(report) if options.json else table)
+    _write_table(options, "late-joiner", late_joiner_table(results), [asdict(each) for each in results])
     return 0
 
 
-def _trials(options: argparse.Namespace) -> list[TeamTrial]:
-    """Return the trials; invalid names and numbers fail here. Raises InvalidInputError."""
+def _run_positions(options: argparse.Namespace, plans: Sequence[TeamPlan], size: tuple[int, int]) -> int:
+    """Measure each scene; write positions.md and .json."""
+    prepare_folder(options.out)
+    perception = PerceptionSettings(options.detector, threads=options.threads)
+    scores: list[PositionScore] = []
+    with progress_bar(0, "positions", "frame") as bar:
+        for plan in plans:
+            scene = plan.load(size)
+            _expect(bar, sum(len(agent.frames) for agent in scene.agents))
+            scores += measure_positions(scene, perception, lambda: _count(bar))
+    _write_table(options, "positions", positions_table(scores), [asdict(each) for each in scores])
+    return 0
+
+
+def _write_table(options: argparse.Namespace, name: str, table: str, scenes: list[dict[str, Any]]) -> None:
+    command = shlex.join(["gausslite", *sys.argv[1:]])
+    write_atomic(options.out / f"{name}.md", f"# bench team\n\n`{command}`\n\n{table}".encode())
+    report = {"command": command, "scenes": scenes}
+    write_json(options.out / f"{name}.json", report)
+    print(as_text(report) if options.json else table)
+
+
+def _plans(options: argparse.Namespace) -> tuple[list[TeamPlan], tuple[int, int]]:
+    """Return the teams in homes and in a recording, and the image size. Raises InvalidInputError, DatasetError."""
+    sizes = [_number("team-sizes", agents) for agents in options.team_sizes]
+    # all agents look for the objects of the first task, so that one and several agents can be compared
+    same_task = options.positions
+    homes = ("1",) if options.homes is None and options.real is None else options.homes or ()
+    plans: list[TeamPlan] = [
+        HomeTeamPlan(
+            _number("homes", home),
+            agents,
+            _HOME_FRAMES if options.frames is None else options.frames,
+            options.views,
+            same_task,
+        )
+        for home in homes
+        for agents in sizes
+    ]
+    real = real_sequence_plans(options)
+    if real is None:
+        return plans, options.size or _SIZE
+    kinds, size = real
+    for agents in sizes:
+        frames = None if options.frames is None else agents * options.frames
+        parts = tuple(replace(kind, frames=frames) for kind in kinds)
+        groups = [(kind,) for kind in parts] if same_task else [parts]
+        plans += [RecordingTeamPlan(group, agents) for group in groups]
+    return plans, options.size or size
+
+
+def _trials(options: argparse.Namespace, plan: TeamPlan, size: tuple[int, int]) -> list[TeamTrial]:
+    """Return the trials of one scene; invalid names and numbers fail here. Raises InvalidInputError."""
     unknown = [name for name in options.policies if name not in POLICIES]
     if unknown or not options.policies:
         raise InvalidInputError(
             f"policies: expected names among {', '.join(POLICIES)}, got {', '.join(unknown) or 'none'}"
         )
-    plans = [
-        TeamPlan(_number("homes", home), _number("team-sizes", agents), options.frames, options.views)
-        for home in options.homes
-        for agents in options.team_sizes
-    ]
+    policy = plan.pose_policy
     return [
         TeamTrial(
             plan,
-            policy,
+            name,
             seed,
             MissionSettings(
-                policy=policy,
+                policy=name,
                 max_gaussians=options.max_gaussians,
                 iterations=options.iterations,
                 seed=seed,
                 threads=options.threads,
+                pose_prior=options.pose_prior or policy.pose_prior,
             ),
-            options.size,
+            size,
             options.refine_iterations,
+            policy.fit_views if options.fit_views is None else options.fit_views,
             options.frame_error,
         )
-        for plan in plans
-        for policy in options.policies
+        for name in options.policies
         for seed in options.seeds
     ]
 

@@ -35,7 +35,7 @@ FREE_SPACE_VOTE = "free-space vote"
 
 @dataclass(frozen=True, slots=True)
 class TeamTrial:
-    """One policy in one home with one seed. frame_error: of every agent except the first."""
+    """One policy in one scene with one seed. frame_error: of every agent except the first."""
 
     plan: TeamPlan
     policy: str
@@ -43,6 +43,7 @@ class TeamTrial:
     settings: MissionSettings
     size: tuple[int, int] = (320, 240)
     refine_iterations: int = 300
+    fit_views: bool = False
     frame_error: FrameError = field(default_factory=FrameError)
     grid: VoxelGrid = field(default_factory=VoxelGrid)
 
@@ -115,7 +116,7 @@ def run_trial(trial: TeamTrial, scene: TeamScene, on_frame: Callable[[FrameOutco
     )
     return TeamResult(
         trial,
-        score_team(viewers, scene.views, sheets=0).scores,
+        score_team(viewers, scene.views, trial.fit_views, sheets=0).scores,
         100.0 * float(active) / max(total, 1),
         sum(each.bytes_sent for each in maps),
         sum(each.gaussians_sent for each in maps),

@@ -49,7 +49,8 @@ def run_late_joiner(plan: TeamPlan, settings: MissionSettings, size: tuple[int, 
 
     Raises InvalidInputError if no held-out view shows the region.
     """
-    scene, regions = plan.load(size), plan.regions_of_first_task(size)
+    scene = plan.load(size)
+    regions = scene.regions(scene.agents[0].objects)
     views = [view for view in (HeldOutView.of(each.frame, regions) for each in scene.views) if view.shows_region]
     if not views:
         raise InvalidInputError(f"{plan.name}: expected held-out views that show the first task's region, got none")

@@ -78,7 +78,7 @@ def map_agent(
 ) -> AgentMap:
     """Return the agent's map after all its frames. A policy without a task sends its whole map once, at the end."""
     follows_task = settings.mapper_settings().components.follow_task
-    scene = Scene(agent.task.task, agent.frames, agent.masks, (), SceneInfo())
+    scene = Scene(agent.task, agent.frames, agent.masks, (), SceneInfo())
     estimator = RecordedRelevanceEstimator(scene) if follows_task else NoTaskEstimator()
     sent = _SentMessages(agent.agent_id, grid)
     mapper = TaskMapper(

@@ -1,9 +1,10 @@
-"""Scenes for a team in a simulated home: each agent has its own trajectory and task."""
+"""Scenes for a team: each agent has its own frames and task, in a simulated home or in parts of a recording."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Protocol, runtime_checkable
 
 from gausslite.datasets.open import open_source
 from gausslite.datasets.regions import choose_regions
@@ -12,8 +13,11 @@ from gausslite.domain.frame import Frame
 from gausslite.domain.region import Region
 from gausslite.domain.relevance import RelevanceMap
 from gausslite.evaluation.views import HeldOutView
+from gausslite.mission.settings import SceneInfo
 from gausslite.perception.fixed_relevance import RegionRelevanceEstimator
 from gausslite_bench.quality.home_tasks import HOME_TASKS, HomeTask
+from gausslite_bench.quality.real_scenes import RealScenePlan
+from gausslite_bench.quality.scenes import PosePolicy
 
 _HELD_OUT_TRAJECTORY = 2
 _TRAJECTORIES = (0, 1, 3, 4)
@@ -23,31 +27,65 @@ MAX_AGENTS = len(_TRAJECTORIES)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AgentScene:
-    """One agent's task and its frames with the task's masks."""
+    """One agent's task with its ground-truth objects, and the agent's frames with the task's masks."""
 
     agent_id: str
-    task: HomeTask
+    task: str
+    objects: tuple[str, ...]
     frames: Sequence[Frame]
     masks: Sequence[RelevanceMap]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TeamScene:
-    """The agents, and held-out views with the union of their tasks' regions."""
+    """The agents, held-out views with the union of their tasks' regions, and the ground truth of the whole scene."""
 
     name: str
     agents: tuple[AgentScene, ...]
     views: Sequence[HeldOutView]
+    info: SceneInfo
+
+    def regions(self, names: Sequence[str]) -> list[Region]:
+        """Return the regions of these objects. Raises DatasetError for an unknown name."""
+        return list(choose_regions(self.info.regions, names))
+
+
+@runtime_checkable
+class TeamPlan(Protocol):
+    """Description of a team's scene before its frames are loaded."""
+
+    @property
+    def name(self) -> str:
+        """Short name for tables."""
+        ...
+
+    @property
+    def agents(self) -> int:
+        """Number of agents."""
+        ...
+
+    @property
+    def pose_policy(self) -> PosePolicy:
+        """Handling of pose and exposure errors, the same for every policy."""
+        ...
+
+    def load(self, size: tuple[int, int]) -> TeamScene:
+        """Return the scene at (width_px, height_px). Raises DatasetError, InvalidInputError."""
+        ...
 
 
 @dataclass(frozen=True, slots=True)
-class TeamPlan:
-    """A team in one home: agent i has the i-th of the home's tasks, in turn, on its own trajectory."""
+class HomeTeamPlan:
+    """A team in one home: agent i has the i-th of the home's tasks, in turn, on its own trajectory.
+
+    same_task: all agents have the first task instead.
+    """
 
     home: int
     agents: int = 2
     frames: int = 60
     views: int = 16
+    same_task: bool = False
 
     def __post_init__(self) -> None:
         if not 2 <= self.agents <= MAX_AGENTS:
@@ -63,27 +101,72 @@ class TeamPlan:
         """Such as home-3 x 2."""
         return f"home-{self.home} x {self.agents}"
 
+    @property
+    def pose_policy(self) -> PosePolicy:
+        """Trust the poses."""
+        return PosePolicy()
+
     def load(self, size: tuple[int, int]) -> TeamScene:
         """Return the scene at (width_px, height_px). Raises DatasetError, InvalidInputError."""
-        tasks = [task for task in HOME_TASKS if task.home == self.home]
+        tasks = [task for task in HOME_TASKS if task.home == self.home][: 1 if self.same_task else None]
         chosen = [tasks[i % len(tasks)] for i in range(self.agents)]
         agents = tuple(self._agent_scene(f"agent-{i}", task, _TRAJECTORIES[i], size) for i, task in enumerate(chosen))
         held_out = open_source(f"{self._spec(_HELD_OUT_TRAJECTORY, self.views, size)}&noise=0&exposure=0")
         names = tuple(dict.fromkeys(name for task in chosen for name in task.objects))
         regions = choose_regions(held_out.regions(), names)
         views = [HeldOutView.of(held_out.frame(i), regions) for i in range(len(held_out))]
-        return TeamScene(self.name, agents, [view for view in views if view.frame.has_depth])
-
-    def regions_of_first_task(self, size: tuple[int, int]) -> list[Region]:
-        """Return the regions of the first agent's task."""
-        task = next(task for task in HOME_TASKS if task.home == self.home)
-        return list(choose_regions(open_source(self._spec(0, self.frames, size)).regions(), task.objects))
+        info = SceneInfo(held_out.up_axis, held_out.regions())
+        return TeamScene(self.name, agents, [view for view in views if view.frame.has_depth], info)
 
     def _agent_scene(self, agent_id: str, task: HomeTask, trajectory: int, size: tuple[int, int]) -> AgentScene:
         source = open_source(self._spec(trajectory, self.frames, size))
         frames = [frame for frame in (source.frame(i) for i in range(len(source))) if frame.has_depth]
-        estimator = RegionRelevanceEstimator(choose_regions(source.regions(), task.objects))
-        return AgentScene(agent_id, task, frames, [estimator.estimate(frame).relevance for frame in frames])
+        return agent_scene(agent_id, task.task, task.objects, frames, source.regions())
 
     def _spec(self, trajectory: int, frames: int, size: tuple[int, int]) -> str:
         return f"sim:home-{self.home}?seed=0&trajectory={trajectory}&frames={frames}&size={size[0]}x{size[1]}"
+
+
+@dataclass(frozen=True, slots=True)
+class RecordingTeamPlan:
+    """A team in one recording: agent i has the i-th of equal parts in time, and the i-th kind of object, in turn."""
+
+    kinds: tuple[RealScenePlan, ...]
+    agents: int = 2
+
+    def __post_init__(self) -> None:
+        if not 2 <= self.agents <= MAX_AGENTS:
+            raise InvalidInputError(f"agents: expected 2 to {MAX_AGENTS}, got {self.agents}")
+        if not self.kinds:
+            raise InvalidInputError("kinds: expected at least one kind of object, got none")
+
+    @property
+    def name(self) -> str:
+        """Such as redkitchen-mug-chair x 2."""
+        return f"{'-'.join([self.kinds[0].name, *(plan.kind for plan in self.kinds[1 : self.agents])])} x {self.agents}"
+
+    @property
+    def pose_policy(self) -> PosePolicy:
+        """That of the recording."""
+        return self.kinds[0].pose_policy
+
+    def load(self, size: tuple[int, int]) -> TeamScene:
+        """Return the scene at (width_px, height_px). Raises DatasetError, InvalidInputError."""
+        chosen = [self.kinds[i % len(self.kinds)] for i in range(self.agents)]
+        names = tuple(dict.fromkeys(name for plan in chosen for name in plan.objects))
+        scene = replace(self.kinds[0], objects=names).load(size)
+        count = len(scene.training)
+        agents = []
+        for i, plan in enumerate(chosen):
+            part = scene.training[i * count // self.agents : (i + 1) * count // self.agents]
+            agents.append(agent_scene(f"agent-{i}", plan.task, plan.objects, part, scene.info.regions))
+        return TeamScene(self.name, tuple(agents), scene.held_out, scene.info)
+
+
+def agent_scene(
+    agent_id: str, task: str, objects: tuple[str, ...], frames: Sequence[Frame], regions: Mapping[str, Region]
+) -> AgentScene:
+    """Return the agent's scene, with the masks of its objects. Raises DatasetError for an object without a region."""
+    estimator = RegionRelevanceEstimator(choose_regions(regions, objects))
+    masks = [estimator.estimate(frame).relevance for frame in frames]
+    return AgentScene(agent_id, task, objects, frames, masks)
