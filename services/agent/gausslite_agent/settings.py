@@ -22,6 +22,7 @@ from gausslite.config.numbers import Number
 from gausslite.config.source_options import add_camera_correction, add_frames
 from gausslite.config.switches import add_switch, set_dependent_default
 from gausslite.config.tls_options import add_tls, read_server_tls
+from gausslite.config.values import read_rigid_transform
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.names import require_name
 from gausslite.domain.pose import UpAxis
@@ -128,7 +129,12 @@ def parse_arguments(arguments: Sequence[str] | None = None) -> AgentSettings:
         options.fusion,
         options.mission,
         VoxelGrid(options.voxel_size),
-        UplinkSettings(kbps=options.uplink_kbps, interval_s=options.uplink_interval, world_frame=options.world_frame),
+        UplinkSettings(
+            kbps=options.uplink_kbps,
+            interval_s=options.uplink_interval,
+            world_frame=options.world_frame,
+            T_fused_agent=options.fused_from_agent,
+        ),
         options.spool,
         options.handover,
         options.drain_timeout,
@@ -236,6 +242,12 @@ def _add_connections(parser: argparse.ArgumentParser) -> None:
     add("--fusion", metavar="ADDRESS", help="fusion server (default: none; nothing is sent)")
     add("--mission", metavar="ID", default="", help="mission to join (default: the server's only one)")
     add("--world-frame", metavar="NAME", default="", help="name of the frame of all poses (default: the server's)")
+    add(
+        "--fused-from-agent",
+        metavar="X,Y,Z[,QX,QY,QZ,QW]",
+        type=read_rigid_transform,
+        help="pose of this agent's world frame in the fused map's frame, if it is known (default: the same frame)",
+    )
     add("--uplink-kbps", metavar="N", type=float, help="bandwidth limit in kilobits per second (default: none)")
     add(
         "--uplink-interval",
@@ -251,7 +263,13 @@ def _add_connections(parser: argparse.ArgumentParser) -> None:
         default=NO_TEAM_MAP,
         help="insert teammates' voxels of the task's region, voted or refined (default: %(default)s)",
     )
-    add_switch(group, "--free-space", "send what the camera has observed as free, for the free-space vote")
+    add_switch(
+        group,
+        "--free-space",
+        "send what the camera has observed as free: it shows frames that do not fit, and counts in the free-space vote "
+        "(default: --free-space)",
+        default=True,
+    )
     add_switch(group, "--handover", "at the end also send the map outside the ROI")
     keyframes = add(
         "--keyframes",

@@ -22,7 +22,7 @@ KNOWN_OPTIONS: Final = frozenset(
             "listen",
             "llm-format",
         ),
-        *("lens", "shutter", "speeds", "team-sizes", "vote"),
+        *("fused-from-agent", "lens", "shutter", "speeds", "team-sizes", "vote"),
         *("llm-key-variable", "llm-model", "llm-timeout", "llm-url", "loop", "lpips-weights", "map", "masks"),
         *("max-gaussians", "min-iterations", "mission", "objects", "out", "overwrite", "pair", "pairs"),
         *("parser", "perception", "pictures", "policies", "policy", "pose-prior", "poses", "preset", "queue"),

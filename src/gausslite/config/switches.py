@@ -11,11 +11,11 @@ DependentDefault = Callable[[argparse.Namespace], OptionValue]
 """Returns the value that a program uses for an unset option, from its other options."""
 
 
-def add_switch(parser: argparse._ActionsContainer, flag: str, help_text: str) -> None:
-    """Add a boolean option that is off by default: --flag turns it on, --no-flag turns it off."""
+def add_switch(parser: argparse._ActionsContainer, flag: str, help_text: str, default: bool = False) -> None:
+    """Add a boolean option, off unless `default` is True: --flag turns it on, --no-flag turns it off."""
     action = parser.add_argument(flag, action=argparse.BooleanOptionalAction, help=help_text)
     # set afterwards, because the action would append its default to the help
-    action.default = False
+    action.default = default
 
 
 def set_dependent_default(action: argparse.Action, default: DependentDefault) -> None:

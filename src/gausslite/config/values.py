@@ -5,8 +5,14 @@ from __future__ import annotations
 import argparse
 import math
 
+import numpy as np
+from jaxtyping import Float64
+from numpy import ndarray
+
+from gausslite.datasets.poses import pose_from_quaternion
 from gausslite.domain.camera_correction import CameraCorrection
 from gausslite.domain.depth_registration import DepthRegistration
+from gausslite.domain.errors import PoseError
 from gausslite.domain.pose import UpAxis
 from gausslite.domain.pose_exposure_prior import PoseExposurePrior
 from gausslite.mapping.stages import SkippableStage
@@ -34,6 +40,15 @@ def read_up_axis(text: str) -> UpAxis:
     """Return the axis of "x,y,z". Raises ArgumentTypeError."""
     x, y, z = read_numbers(text, 3)
     return (x, y, z)
+
+
+def read_rigid_transform(text: str) -> Float64[ndarray, "4 4"]:
+    """Return the transform of "x,y,z" in metres, or with a quaternion "x,y,z,qx,qy,qz,qw". Raises ArgumentTypeError."""
+    values = np.array(read_numbers(text, 3 if text.count(",") < 3 else 7))
+    try:
+        return pose_from_quaternion("", values[:3], values[3:] if len(values) == 7 else np.array([0.0, 0.0, 0.0, 1.0]))
+    except PoseError:
+        raise argparse.ArgumentTypeError(f"expected a quaternion of length 1 as qx,qy,qz,qw, got {text!r}") from None
 
 
 def read_skip_stages(text: str) -> tuple[SkippableStage, ...]:

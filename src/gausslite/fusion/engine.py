@@ -83,7 +83,9 @@ class FusionEngine:
         uses_free_space = settings.vote is VoteRule.FREE_SPACE
         free_space = self._free_space if uses_free_space else None
         self._votes = VoteInput(store, self._alignments, settings.grid, free_space)
-        self._aligner = FrameAligner(store, self._alignments, self._votes, self._lock, settings.alignment)
+        self._aligner = FrameAligner(
+            store, self._alignments, self._votes, self._free_space, self._lock, settings.alignment
+        )
         self._maps = FusedMapLayers(self._votes, self._lock, settings.grid, first_revision, settings.max_removed_voxels)
 
     @property
@@ -200,6 +202,7 @@ class FusionEngine:
             if grid != self.grid:
                 raise MismatchError(f"voxel size: this mission votes on {self.grid.size_m:g} m, got {grid.size_m:g} m")
             keys = self._free_space.contribute(agent_id, blocks)
+            self._aligner.record_free_space(agent_id)
             if self._settings.vote is VoteRule.FREE_SPACE:
                 for name in self._votes.agents():
                     self._maps.record(name, keys)

@@ -7,14 +7,16 @@ from dataclasses import replace
 from threading import RLock
 
 import numpy as np
-from jaxtyping import Int64
+from jaxtyping import Float64, Int64
 from numpy import ndarray
 
 from gausslite.domain.gaussians import Gaussians
+from gausslite.domain.moved_gaussians import move_gaussians
 from gausslite.domain.names import quote_name
-from gausslite.domain.voxel_operations import select_voxels
+from gausslite.domain.voxel_operations import VoxelIndex, select_voxels
 from gausslite.fusion.alignment import SurfaceSamples, crop_to_overlap, fit_frame
 from gausslite.fusion.frame_alignment import AlignmentSettings, AlignmentState, FrameAlignment, FrameAlignments
+from gausslite.fusion.free_space import FreeSpaceRecords
 from gausslite.fusion.store import FusionStore
 from gausslite.fusion.vote_input import VoteInput
 
@@ -30,12 +32,15 @@ class FrameAligner:
         store: FusionStore,
         alignments: FrameAlignments,
         votes: VoteInput,
+        free_space: FreeSpaceRecords,
         lock: RLock,
         settings: AlignmentSettings | None,
     ) -> None:
         """Without settings, frames are used as declared and nothing is estimated."""
         self._store, self._alignments, self._votes, self._lock = store, alignments, votes, lock
+        self._free_space = free_space
         self._settings = settings
+        self._free_space_changed: set[str] = set()
         self._changed: dict[str, set[int]] = {}
         self._next_seq: dict[str, int] = {}
 
@@ -50,6 +55,14 @@ class FrameAligner:
             self._alignments.put(agent_id, alignment)
             self._next_seq[agent_id] = 0
 
+    def record_free_space(self, agent_id: str) -> None:
+        """Note that an agent's free space changed: agents after it without enough overlap are evaluated again."""
+        self._free_space_changed |= {
+            name
+            for name in self._next_seq
+            if agent_id in self._alignments.earlier(name) and self._alignments.get(name).fit is None
+        }
+
     def due(self) -> tuple[str, ...]:
         """Return the agents with enough changed voxels for a new estimate."""
         if self._settings is None:
@@ -62,6 +75,7 @@ class FrameAligner:
         assert self._settings is not None
         with self._lock:
             self._changed[agent_id] = set()
+            self._free_space_changed.discard(agent_id)
             alignment = self._alignments.get(agent_id)
             first_seq = self._next_seq.get(agent_id, 0)
             source = self._recent(agent_id, first_seq)
@@ -69,19 +83,23 @@ class FrameAligner:
             highest_seq = self._store.highest_update_seq(agent_id)
         # QUARANTINED agents are fitted from their declared frame, so that they can return
         start = alignment.declared if alignment.state is AlignmentState.QUARANTINED else alignment.T_fused_agent
-        source, reference = crop_to_overlap(source, reference, start)
-        fit = fit_frame(source, SurfaceSamples.of(reference), start) if len(reference) >= _MIN_GAUSSIANS else None
+        overlap, reference = crop_to_overlap(source, reference, start)
+        fit = fit_frame(overlap, SurfaceSamples.of(reference), start) if len(reference) >= _MIN_GAUSSIANS else None
         with self._lock:
-            if fit is None or self._alignments.get(agent_id) is not alignment:
+            if self._alignments.get(agent_id) is not alignment:
                 return np.zeros(0, np.int64)
-            aligned = alignment.after_fit(fit, first_seq, self._settings)
-            self._next_seq[agent_id] = highest_seq + 1
+            if fit is None:
+                aligned = alignment.without_overlap(self._free_share(agent_id, source, start), self._settings)
+            else:
+                aligned = alignment.after_fit(fit, first_seq, self._settings)
+                self._next_seq[agent_id] = highest_seq + 1
             return self._apply(agent_id, alignment, aligned)
 
     def remove_agent(self, agent_id: str) -> None:
         """Forget the agent."""
         self._changed.pop(agent_id, None)
         self._next_seq.pop(agent_id, None)
+        self._free_space_changed.discard(agent_id)
 
     def _apply(self, agent_id: str, before: FrameAlignment, after: FrameAlignment) -> Int64[ndarray, " k"]:
         self._alignments.put(agent_id, after)
@@ -97,12 +115,25 @@ class FrameAligner:
 
     def _is_due(self, agent_id: str, changed: int) -> bool:
         assert self._settings is not None
-        if changed == 0 or not self._alignments.earlier(agent_id):
+        if (changed == 0 and agent_id not in self._free_space_changed) or not self._alignments.earlier(agent_id):
             return False
         scores = self._store.scores()
         own = scores.agent_index == scores.agents.index(agent_id) if agent_id in scores.agents else slice(0)
         has_enough = int(scores.counts[own].sum(dtype=np.int64)) >= _MIN_GAUSSIANS
-        return has_enough and changed >= self._settings.refit_share * len(scores.keys[own])
+        is_changed = changed >= self._settings.refit_share * len(scores.keys[own])
+        return has_enough and (is_changed or agent_id in self._free_space_changed)
+
+    def _free_share(self, agent_id: str, source: Gaussians, T_fused_agent: Float64[ndarray, "4 4"]) -> float:
+        """Return the share of the occupied voxels that agents before this one have observed as free."""
+        frames_differ = self._alignments.in_other_frames()
+        observers = self._alignments.earlier(agent_id) - frames_differ
+        grid = self._free_space.grid
+        moved = move_gaussians(source, T_fused_agent).means_m
+        inside = (np.abs(moved) < grid.max_coordinate_m).all(axis=1)
+        if not inside.any():
+            return 0.0
+        free = self._free_space.seen_by(observers, VoxelIndex.from_points(moved[inside], grid).keys)
+        return float(free.mean())
 
     def _recent(self, agent_id: str, first_seq: int) -> Gaussians:
         """Return the Gaussians of the updates from first_seq on, or all if these are few."""

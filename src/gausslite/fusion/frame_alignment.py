@@ -28,7 +28,7 @@ class AlignmentState(StrEnum):
     """How an agent's contribution is used."""
 
     UNKNOWN = "unknown"
-    """Too little overlap with the agents before it: used as sent, or as declared."""
+    """Too little overlap with the agents before it, and not in their free space: used as sent, or as declared."""
     REFERENCE = "reference"
     ALIGNED = "aligned"
     CORRECTED = "corrected"
@@ -42,7 +42,8 @@ class AlignmentSettings:
     min_shift_m, min_rotation_deg: smaller misfits are noise of the maps and are not corrected. min_improvement: the
     factor by which a correction has to reduce the median point-to-plane distance. max_distance_m: a larger distance is
     quarantined unless a correction within max_shift_m and max_rotation_deg reduces it below. refit_share: an estimate
-    is due when this share of the agent's voxels has changed since the last one.
+    is due when this share of the agent's voxels has changed since the last one. max_free_share: without enough overlap,
+    an agent is quarantined if a larger share of its voxels is where agents before it have observed free space.
     """
 
     min_shift_m: float = 0.01
@@ -52,6 +53,7 @@ class AlignmentSettings:
     max_distance_m: float = 0.03
     min_improvement: float = 1.4
     refit_share: float = 0.25
+    max_free_share: float = 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -87,10 +89,20 @@ class FrameAlignment:
         """Return T_fused_agent of a segment."""
         return self.declared if segment < 0 else self.segments[segment][1]
 
-    def after_fit(self, fit: FrameFit | None, first_seq: int, settings: AlignmentSettings) -> FrameAlignment:
+    def without_overlap(self, free_share: float, settings: AlignmentSettings) -> FrameAlignment:
+        """Return the alignment of an agent that cannot be fitted; free_share: of its voxels in others' free space."""
+        if free_share > settings.max_free_share:
+            message = (
+                f"frame: {free_share:.0%} of the agent's voxels are where agents before it have observed free space, "
+                f"expected at most {settings.max_free_share:.0%}; check the agent's localisation"
+            )
+            return replace(self, state=AlignmentState.QUARANTINED, fit=None, message=message)
+        if self.state is AlignmentState.QUARANTINED and self.fit is None:
+            return replace(self, state=AlignmentState.UNKNOWN, message="")
+        return self
+
+    def after_fit(self, fit: FrameFit, first_seq: int, settings: AlignmentSettings) -> FrameAlignment:
         """Return the alignment after a fit of the updates from first_seq on, which started at T_fused_agent."""
-        if fit is None:
-            return self
         too_far = fit.shift_m > settings.max_shift_m or fit.rotation_deg > settings.max_rotation_deg
         is_bad = fit.before.distance_m > settings.max_distance_m
         if is_bad and (too_far or fit.after.distance_m > settings.max_distance_m):

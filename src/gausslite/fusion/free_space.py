@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
 import numpy as np
 from jaxtyping import Bool, Int64
 from numpy import ndarray
@@ -22,7 +24,7 @@ class FreeSpaceRecords:
     """Each agent's free space, in the store. Not thread-safe; FusionEngine holds a lock."""
 
     def __init__(self, store: FusionStore, grid: VoxelGrid) -> None:
-        self._store, self._grid = store, grid
+        self._store, self.grid = store, grid
         stored = store.records(_RECORD).items()
         self._by_agent = {agent_id: decode_free_space(data, _STORED_BYTES)[0] for agent_id, data in stored}
 
@@ -35,8 +37,8 @@ class FreeSpaceRecords:
         if len(after.keys) > MAX_BLOCKS:
             raise QuotaError(f"free space: expected at most {MAX_BLOCKS} blocks of an agent, got {len(after.keys)}")
         # before it is stored, because blocks outside the grid's range raise here
-        earlier, now = (each.voxel_keys(self._grid, MIN_VIEWS) for each in (before, after))
-        self._store.save_record(agent_id, _RECORD, encode_free_space(after, self._grid))
+        earlier, now = (each.voxel_keys(self.grid, MIN_VIEWS) for each in (before, after))
+        self._store.save_record(agent_id, _RECORD, encode_free_space(after, self.grid))
         self._by_agent[agent_id] = after
         return np.setxor1d(earlier, now)
 
@@ -49,11 +51,14 @@ class FreeSpaceRecords:
 
         Agents in `frames_differ` do not count, because their voxels are not those of the fused map.
         """
-        contradicted = np.zeros(len(keys), np.bool_)
-        for agent_id, free in self._by_agent.items():
-            if agent_id not in frames_differ:
-                contradicted |= free.views(keys, self._grid) >= MIN_VIEWS
-        return contradicted
+        return self.seen_by(self._by_agent.keys() - frames_differ, keys)
+
+    def seen_by(self, agents: Collection[str], keys: Int64[ndarray, " k"]) -> Bool[ndarray, " k"]:
+        """Return True for the voxels that one of these agents has observed as free in two views."""
+        seen = np.zeros(len(keys), np.bool_)
+        for agent_id in self._by_agent.keys() & set(agents):
+            seen |= self._by_agent[agent_id].views(keys, self.grid) >= MIN_VIEWS
+        return seen
 
     def remove_agent(self, agent_id: str) -> None:
         """Forget the agent; the store deletes its record with its updates."""

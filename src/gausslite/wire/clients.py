@@ -179,8 +179,12 @@ class FusionClient(ServiceChannel):
         world_frame: str = "",
         fresh_map: bool = False,
         task: TaskGraph | None = None,
+        T_fused_agent: Float64[ndarray, "4 4"] | None = None,
     ) -> Session:
-        """Join the mission. Raises MismatchError if the grid, the world frame or the mission differ."""
+        """Join the mission; T_fused_agent declares the pose of the agent's frame in the fused map's.
+
+        Raises MismatchError if the grid, the world frame or the mission differ.
+        """
         request = fusion_service_pb2.JoinSessionRequest(
             agent_id=agent_id,
             mission_id=self.mission_id,
@@ -188,6 +192,7 @@ class FusionClient(ServiceChannel):
             world_frame=world_frame,
             fresh_map=fresh_map,
             task=None if task is None else convert_task.graph_to_message(task),
+            t_fused_agent=None if T_fused_agent is None else convert.transform_to_message(T_fused_agent),
         )
         response = self._call(self._stub.JoinSession, request)
         return Session(

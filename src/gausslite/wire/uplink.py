@@ -283,7 +283,9 @@ class Uplink:
             fresh = self._spool.is_new and not self._has_restored_map and self._counters.joins == 0
             report, frame = self._objects.latest, self._settings.world_frame
             task = None if report is None else report.graph
-            self._session = self._client.join(self._agent_id, self._grid, frame, fresh, task)
+            self._session = self._client.join(
+                self._agent_id, self._grid, frame, fresh, task, self._settings.T_fused_agent
+            )
             if self._session.highest_update_seq == 0:
                 # the server has no updates of this agent
                 self._spool.mark_all_unsent()

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+
+from jaxtyping import Float64
+from numpy import ndarray
 
 from gausslite.domain.errors import InvalidInputError
 
@@ -14,7 +17,8 @@ class UplinkSettings:
     kbps: bandwidth limit in kilobits per second, None without a limit. interval_s: minimum time between rounds, so that
     several changes of a voxel are sent as one. resend_threshold: change of a voxel's Σkappa, as a share of the sent
     value, from which it is sent again; 0 while the uplink drains. round_bytes: size limit of a round. deadline_s: of
-    each call. first_backoff_s: wait before the first retry.
+    each call. first_backoff_s: wait before the first retry. T_fused_agent: declared pose of the agent's frame in the
+    fused map's; None: not declared.
     """
 
     kbps: float | None = None
@@ -24,6 +28,7 @@ class UplinkSettings:
     deadline_s: float = 30.0
     first_backoff_s: float = 0.2
     world_frame: str = ""
+    T_fused_agent: Float64[ndarray, "4 4"] | None = field(default=None, compare=False)
 
     def __post_init__(self) -> None:
         if self.kbps is not None and not self.kbps > 0:

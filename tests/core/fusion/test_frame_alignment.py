@@ -11,6 +11,7 @@ from sample_gaussians import plain_gaussians
 
 from gausslite.domain.camera import Camera
 from gausslite.domain.frame import Frame
+from gausslite.domain.free_space import FreeSpace, split_indices
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.moved_gaussians import move_gaussians
 from gausslite.domain.pose import inverse, rotation_angle_deg, transform_of, transform_points
@@ -130,6 +131,53 @@ def test_a_gross_misfit_is_quarantined_with_a_message_and_returns_when_it_is_men
     send(engine, "bee", corner(1, kappa=9), seq=2)
     engine.align_due()
     assert state_of(engine, "bee") is not AlignmentState.QUARANTINED
+
+
+def observe_free(engine: FusionEngine, agent_id: str, low: int, high: int, views: int = 2) -> None:
+    """This many views of the agent have seen every voxel of the cube low <= i, j, k < high as free."""
+    indices = np.stack(np.meshgrid(*[np.arange(low, high)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    blocks, cells = split_indices(indices, GRID)
+    keys, rows = np.unique(blocks, return_inverse=True)
+    counts = np.zeros((len(keys), 512), np.uint8)
+    counts[rows, cells] = views
+    session = engine.join(agent_id, ANYTHING).session.session_id
+    engine.contribute_free_space(session, FreeSpace(keys, counts), GRID)
+
+
+def small_object(centre_m: tuple[float, float, float]) -> Gaussians:
+    return plain_gaussians(np.random.default_rng(3).uniform(-0.1, 0.1, (80, 3)) + centre_m, kappa=9)
+
+
+@pytest.mark.parametrize("free_space_comes_first", [True, False])
+def test_a_region_without_overlap_in_free_space_is_quarantined_and_returns(free_space_comes_first: bool) -> None:
+    engine = FusionEngine(MemoryStore(), SETTINGS)
+    send(engine, "ant", small_object((0.0, 0.0, 0.0)))
+    if free_space_comes_first:
+        observe_free(engine, "ant", 5, 15)
+    send(engine, "bee", small_object((1.0, 1.0, 1.0)))
+    if not free_space_comes_first:
+        engine.align_due()
+        assert state_of(engine, "bee") is AlignmentState.UNKNOWN
+        observe_free(engine, "ant", 5, 15)
+    assert engine.align_due()
+    [bee] = [each for each in engine.status().agents if each.agent_id == "bee"]
+    assert bee.alignment.state is AlignmentState.QUARANTINED
+    assert "observed free space" in bee.alignment.message
+    assert bee.won_voxels == 0
+    # the same voxels without an observation
+    observe_free(engine, "ant", 5, 15, views=0)
+    assert engine.align_due()
+    assert state_of(engine, "bee") is AlignmentState.UNKNOWN
+    assert len(engine.maps.voted_map("bee")) > 0
+
+
+def test_an_agents_own_free_space_is_no_evidence_against_it() -> None:
+    engine = FusionEngine(MemoryStore(), SETTINGS)
+    send(engine, "ant", small_object((0.0, 0.0, 0.0)))
+    send(engine, "bee", small_object((1.0, 1.0, 1.0)))
+    observe_free(engine, "bee", 5, 15)
+    engine.align_due()
+    assert state_of(engine, "bee") is AlignmentState.UNKNOWN
 
 
 def test_later_updates_of_a_drifting_agent_get_their_own_correction() -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from fusion_running import GRID, fusion_server, make_batch
-from uplink_running import WAIT_S, accepted, expected_kappas, scripted, stored_kappas, uplink
+from uplink_running import EAGER, WAIT_S, accepted, expected_kappas, scripted, stored_kappas, uplink
 
 from gausslite.domain.errors import (
     InvalidInputError,
@@ -38,6 +38,17 @@ def test_the_latest_update_of_each_voxel_arrives() -> None:
     assert counters.voxels_waiting == 0
     assert counters.subsets_rejected == 0
     assert counters.bytes_sent == counters.roi_bytes > 0
+
+
+def test_the_agent_declares_its_frame() -> None:
+    T_fused_agent = np.eye(4)
+    T_fused_agent[:3, 3] = (4.0, -2.0, 0.5)
+    options = replace(EAGER, T_fused_agent=T_fused_agent)
+    with fusion_server() as fusion, uplink(fusion.client.address, options) as link:
+        link.enqueue(make_batch({1: [5]}))
+        assert link.drain(WAIT_S)
+        [agent] = fusion.client.status().agents
+    assert list(agent.alignment.t_fused_agent.row_major) == T_fused_agent.reshape(-1).tolist()
 
 
 def test_handover_is_counted_separately_and_sends_only_changed_voxels() -> None:
