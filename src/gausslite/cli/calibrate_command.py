@@ -28,7 +28,9 @@ _KNOWN_HELP = "keep these values, and estimate what they leave out (default: the
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the options of `gausslite calibrate`."""
-    parser.add_argument("source", metavar="SOURCE", help="a folder (TUM, 7-Scenes or Replica layout) or sim:home?...")
+    parser.add_argument(
+        "source", metavar="SOURCE", help="a folder (TUM, 7-Scenes or Replica layout), a ROS bag, or sim:home?..."
+    )
     parser.add_argument("--up", metavar="X,Y,Z", type=read_up_axis, help="upward direction (default: the source's)")
     parser.add_argument("--lens", metavar="MODEL:K1,...", help=_KNOWN_HELP)
     parser.add_argument("--json", action="store_true", help="print JSON for scripts")

@@ -13,6 +13,7 @@ from gausslite.config.values import AUTO, NONE, read_names, read_numbers
 from gausslite.datasets.corrected_source import CorrectedSource
 from gausslite.datasets.open import has_exact_poses, is_simulated, open_source
 from gausslite.datasets.registered_source import RegisteredSource
+from gausslite.datasets.ros.bag_source import BagSource
 from gausslite.datasets.source import Source
 from gausslite.domain.camera_correction import CameraCorrection
 from gausslite.domain.depth_registration import DepthRegistration
@@ -28,7 +29,8 @@ def add_source(parser: argparse.ArgumentParser, default_text: str = NONE) -> Non
     parser.add_argument(
         "source",
         metavar="SOURCE",
-        help='a folder (TUM, 7-Scenes or Replica layout) or "sim:home?seed=0&trajectory=0", sim:home-1 to sim:home-8',
+        help='a folder (TUM, 7-Scenes or Replica layout), a ROS bag ("bag:run1.mcap?depth=TOPIC"), '
+        'or "sim:home?seed=0&trajectory=0", sim:home-1 to sim:home-8',
     )
     add_frames(parser, allow_auto=True, default_text=default_text)
 
@@ -48,8 +50,13 @@ def open_with_warnings(
 
 
 def open_recorded(spec: str, up_axis: UpAxis | None, require_poses: bool = True) -> Source:
-    """Open a sequence without registration, and report excluded frames. Raises DatasetError, InvalidInputError."""
+    """Open a sequence without registration; report the topics of a bag, and excluded frames.
+
+    Raises DatasetError, InvalidInputError.
+    """
     source = open_source(spec, up_axis, require_poses=require_poses)
+    if isinstance(source, BagSource):
+        print_message(f"{spec}: {source.description}")
     if source.excluded_frames:
         print_message(f"{spec}: {source.excluded_frames}")
     return source

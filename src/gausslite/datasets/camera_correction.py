@@ -106,13 +106,26 @@ def _recorded_row_shares(recorded: Camera, lens: Lens | None, ideal: Camera) -> 
 
 def undistort_colour(rgb: UInt8[ndarray, "h w 3"], camera: Camera, lens: Lens) -> UInt8[ndarray, "h w 3"]:
     """Return the image as a pinhole camera with these intrinsics would have recorded it; borders are repeated."""
-    still = Twist(np.zeros(3), np.zeros(3))
-    no_depth = np.zeros(rgb.shape[:2], np.float32)
-    columns, rows = _lookup(camera, CameraCorrection(lens), camera, still, no_depth)
+    columns, rows = _pinhole_lookup(camera, lens)
     undistorted: UInt8[ndarray, "h w 3"] = cv2.remap(
         rgb, columns, rows, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE
     )
     return undistorted
+
+
+def undistort_depth(depth_m: Float32[ndarray, "h w"], camera: Camera, lens: Lens) -> Float32[ndarray, "h w"]:
+    """Return the depth image as a pinhole camera with these intrinsics would have recorded it, by nearest pixel."""
+    columns, rows = _pinhole_lookup(camera, lens)
+    undistorted: Float32[ndarray, "h w"] = cv2.remap(
+        depth_m, columns, rows, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT
+    )
+    return undistorted
+
+
+def _pinhole_lookup(camera: Camera, lens: Lens) -> tuple[Float32[ndarray, "h w"], Float32[ndarray, "h w"]]:
+    still = Twist(np.zeros(3), np.zeros(3))
+    no_depth = np.zeros((camera.height_px, camera.width_px), np.float32)
+    return _lookup(camera, CameraCorrection(lens), camera, still, no_depth)
 
 
 def _undistorted(camera: Camera, lens: Lens) -> Camera:

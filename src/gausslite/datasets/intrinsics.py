@@ -74,7 +74,7 @@ def read_json_camera(path: Path) -> FolderCamera:
     try:
         fields = json.loads(read_text(path))["camera"]
         numbers = {name: float(fields[name]) for name in ("w", "h", "fx", "fy", "cx", "cy", "scale")}
-        lens = _lens(path, fields.get("distortion_model", "plumb_bob"), fields.get("distortion", ()))
+        lens = lens_of(str(path), fields.get("distortion_model", "plumb_bob"), fields.get("distortion", ()))
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         expected = '{"camera": {"w", "h", "fx", "fy", "cx", "cy", "scale"}} with numbers'
         raise DatasetError(f"{path}: expected {expected}; {type(error).__name__}: {error}") from None
@@ -97,7 +97,9 @@ def read_camera_info(path: Path) -> FolderCamera:
         fields = yaml.safe_load(read_text(path))
         width, height = int(fields["image_width"]), int(fields["image_height"])
         K = [float(value) for value in fields["camera_matrix"]["data"]]
-        lens = _lens(path, fields.get("distortion_model", "plumb_bob"), fields["distortion_coefficients"]["data"])
+        lens = lens_of(
+            str(path), fields.get("distortion_model", "plumb_bob"), fields["distortion_coefficients"]["data"]
+        )
         intrinsics = FileIntrinsics(K[0], K[4], K[2], K[5])
     except (yaml.YAMLError, ValueError, KeyError, TypeError, IndexError, AttributeError) as error:
         expected = "image_width, image_height, camera_matrix and distortion_coefficients with data"
@@ -135,7 +137,7 @@ def read_colmap_camera(path: Path) -> FolderCamera:
         fx, fy, cx, cy, *distortion = _COLMAP_LENSES[model](numbers[2:])
     except (IndexError, ValueError):
         raise DatasetError(f"{place}: expected more parameters for {model}, got {len(numbers) - 2}") from None
-    lens = _lens(path, "equidistant" if model == "OPENCV_FISHEYE" else "plumb_bob", distortion)
+    lens = lens_of(str(path), "equidistant" if model == "OPENCV_FISHEYE" else "plumb_bob", distortion)
     camera = FileIntrinsics(fx, fy, cx - 0.5, cy - 0.5).camera(str(path), int(numbers[0]), int(numbers[1]))
     return FolderCamera(camera, lens=lens)
 
@@ -149,14 +151,14 @@ _LENS_MODELS = {
 }
 
 
-def _lens(path: Path, model: str, coefficients: Iterable[float]) -> Lens | None:
+def lens_of(place: str, model: str, coefficients: Iterable[float]) -> Lens | None:
     """Return the lens of these coefficients in OpenCV's order; None without distortion. Raises DatasetError."""
     values = tuple(float(value) for value in coefficients)
     if not any(values):
         return None
     if model not in _LENS_MODELS:
-        raise DatasetError(f"{path}: distortion_model: expected one of {', '.join(_LENS_MODELS)}, got {model!r}")
+        raise DatasetError(f"{place}: distortion_model: expected one of {', '.join(_LENS_MODELS)}, got {model!r}")
     try:
         return Lens(_LENS_MODELS[model], values)
     except InvalidInputError as error:
-        raise DatasetError(f"{path}: {error}") from None
+        raise DatasetError(f"{place}: {error}") from None

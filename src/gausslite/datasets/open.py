@@ -1,4 +1,4 @@
-"""Open a sequence: a folder of a known layout, or a simulated home."""
+"""Open a sequence: a folder of a known layout, a ROS bag, or a simulated home."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ from pathlib import Path
 
 from gausslite.datasets.registered_source import RegisteredSource
 from gausslite.datasets.replica import ReplicaSource
+from gausslite.datasets.ros.address import BagAddress
+from gausslite.datasets.ros.bag_source import BagSource
 from gausslite.datasets.sevenscenes import SevenScenesSource
 from gausslite.datasets.source import Source
 from gausslite.datasets.tum import TumSource
@@ -32,12 +34,13 @@ def open_source(
     depth_registration: DepthRegistration | None = None,
     require_poses: bool = True,
 ) -> Source:
-    """Return the sequence in a folder, or a simulated one ("sim:home?seed=0&trajectory=0").
+    """Return the sequence in a folder, a ROS bag ("bag:run1.mcap?depth=/cam/depth") or a simulated home ("sim:home").
 
-    A folder that contains exactly one sequence folder also works. depth_registration: the colour camera to which depth
-    is registered; None if the recording is registered. A lens that is stated for unregistered depth is the colour
-    camera's alone; colour images are undistorted. require_poses: False also accepts frames and sequences without
-    poses, for tracking; these frames get the identity. Raises DatasetError, PoseError, InvalidInputError.
+    A path that is a bag needs no prefix. A folder that contains exactly one sequence folder also works.
+    depth_registration: the colour camera to which depth is registered; None if the recording is registered. A lens that
+    is stated for unregistered depth is the colour camera's alone; colour images are undistorted. require_poses: False
+    also accepts frames and sequences without poses, for tracking; these frames get the identity. Raises DatasetError,
+    PoseError, InvalidInputError.
     """
     source = _open(spec, up_axis, require_poses)
     if source.lens is not None and not source.depth_registered:
@@ -72,10 +75,13 @@ def _open(spec: str, up_axis: UpAxis | None, require_poses: bool) -> Source:
         open_simulated: Callable[[str, UpAxis | None], Source] = import_module(_SIMULATOR).open_simulated
 
         return open_simulated(spec.removeprefix(_SIMULATED), up_axis)
+    bag = BagAddress.parse(spec)
+    if bag is not None:
+        return BagSource(bag, up_axis, require_poses)
     folder = Path(spec).expanduser()
     if not folder.is_dir():
         found = "a file" if folder.is_file() else "nothing there"
-        raise DatasetError(f"{spec}: expected a folder with a sequence, or sim:home; got {found}")
+        raise DatasetError(f"{spec}: expected a folder with a sequence, a ROS bag, or sim:home; got {found}")
     source = _open_folder(folder, up_axis, require_poses)
     if source is not None:
         return source

@@ -14,7 +14,8 @@ from numpy import ndarray
 from gausslite.datasets.folder_source import FolderSource
 from gausslite.datasets.images import DepthUnits, first_readable_size, load_rgbd
 from gausslite.datasets.intrinsics import CAMERA_FILE, INTRINSICS_FILE, FolderCamera, read_folder_camera
-from gausslite.datasets.poses import FIRST_VIEW_UP, is_lost, pose_from_quaternion, slerp
+from gausslite.datasets.pose_track import PoseTrack
+from gausslite.datasets.poses import FIRST_VIEW_UP, is_lost, pose_from_quaternion
 from gausslite.datasets.source import excluded_frames_note, require_frames, require_position
 from gausslite.datasets.text_files import parse_numbers, read_rows
 from gausslite.domain.depth_registration import FileIntrinsics
@@ -113,7 +114,7 @@ def _associate(folder: Path, require_poses: bool) -> tuple[list[_Match], int]:
     colour_times, colour_names = _read_stamps(folder / "rgb.txt")
     depth_times, depth_names = _read_stamps(folder / "depth.txt")
     poses = folder / _POSES
-    trajectory = _Trajectory(poses) if require_poses or poses.is_file() else None
+    trajectory = _read_poses(poses) if require_poses or poses.is_file() else None
     matches = []
     for number, (time_s, name) in enumerate(zip(colour_times, colour_names, strict=True)):
         nearest = int(np.abs(depth_times - time_s).argmin())
@@ -143,37 +144,20 @@ def _read_stamps(path: Path) -> tuple[Float64[ndarray, " n"], list[str]]:
     return np.array(times), names
 
 
-class _Trajectory:
-    """Poses over time from rows of: time tx ty tz qx qy qz qw."""
-
-    def __init__(self, path: Path) -> None:
-        rows = read_rows(path)
-        meaning = "time tx ty tz qx qy qz qw"
-        table = np.array([parse_numbers(place, fields, 8, meaning) for place, fields in rows])
-        known = np.array([not is_lost(row[1:]) for row in table], np.bool_)
-        if np.count_nonzero(known) < 2:
-            raise DatasetError(f"{path}: expected at least 2 poses, got {np.count_nonzero(known)}")
-        for i in np.flatnonzero(known):
-            pose_from_quaternion(rows[i][0], table[i, 1:4], table[i, 4:8])
-        if not (np.isfinite(table[:, 0]).all() and (np.diff(table[:, 0]) >= 0).all()):
-            raise DatasetError(f"{path}: expected finite times in ascending order")
-        self._path, self._table = path, table[known]
-
-    def at(self, time_s: float) -> Float64[ndarray, "4 4"] | None:
-        """Return the interpolated pose; in gaps over 0.1 s a pose within 10 ms, else None."""
-        times = self._table[:, 0]
-        after = int(np.searchsorted(times, time_s))
-        before, after = max(after - 1, 0), min(after, len(times) - 1)
-        gap_s = float(times[after] - times[before])
-        if before == after or gap_s > _MAX_POSE_GAP_S:
-            # trajectories of keyframes have poses far apart, each at the timestamp of its image
-            nearest = int(np.abs(times - time_s).argmin())
-            if abs(float(times[nearest]) - time_s) > _MAX_POSE_LAG_S:
-                return None
-            before, after, gap_s = nearest, nearest, 0.0
-        share = (time_s - float(times[before])) / gap_s if gap_s > 0 else 0.0
-        a, b = self._table[before], self._table[after]
-        return pose_from_quaternion(str(self._path), a[1:4] + share * (b[1:4] - a[1:4]), slerp(a[4:8], b[4:8], share))
+def _read_poses(path: Path) -> PoseTrack:
+    """Return the poses of rows of: time tx ty tz qx qy qz qw. Raises DatasetError, PoseError."""
+    rows = read_rows(path)
+    meaning = "time tx ty tz qx qy qz qw"
+    table = np.array([parse_numbers(place, fields, 8, meaning) for place, fields in rows])
+    known = np.array([not is_lost(row[1:]) for row in table], np.bool_)
+    if np.count_nonzero(known) < 2:
+        raise DatasetError(f"{path}: expected at least 2 poses, got {np.count_nonzero(known)}")
+    for i in np.flatnonzero(known):
+        pose_from_quaternion(rows[i][0], table[i, 1:4], table[i, 4:8])
+    if not (np.isfinite(table[:, 0]).all() and (np.diff(table[:, 0]) >= 0).all()):
+        raise DatasetError(f"{path}: expected finite times in ascending order")
+    times_s, translations_m, quats_xyzw = table[known, 0], table[known, 1:4], table[known, 4:8]
+    return PoseTrack(str(path), times_s, translations_m, quats_xyzw, _MAX_POSE_GAP_S, _MAX_POSE_LAG_S)
 
 
 def _camera(folder: Path, width_px: int, height_px: int) -> FolderCamera:

@@ -1,0 +1,183 @@
+"""Read messages of a bag: ROS 1 files, ROS 2 folders (SQLite or MCAP) and single files, through rosbags."""
+
+from __future__ import annotations
+
+import struct
+import weakref
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from gausslite.domain.errors import DatasetError
+
+if TYPE_CHECKING:
+    from rosbags.interfaces import Connection
+    from rosbags.typesys.store import Typestore
+
+_TF_MESSAGE = "tf2_msgs/msg/TFMessage"
+_ALIASES = {"tf/msg/tfMessage": _TF_MESSAGE}
+_STAMP_ROS1, _STAMP_ROS2 = struct.Struct("<4xII"), (struct.Struct(">4xiI"), struct.Struct("<4xiI"))
+
+
+@dataclass(frozen=True, slots=True)
+class MessageKey:
+    """Where a message is in a bag: its topic, the time when it was recorded, and its rank among equal times."""
+
+    topic: str
+    recorded_ns: int
+    rank: int
+
+
+@dataclass(frozen=True, slots=True)
+class StampedMessage:
+    """A message by its place in the bag and the stamp of its header."""
+
+    key: MessageKey
+    stamp_ns: int
+
+
+class BagFile:
+    """An opened bag with random access to its messages.
+
+    Only the types of topics that are read are defined, so that a damaged definition of another type does no harm.
+    Raises DatasetError for a bag that cannot be read, and without the extra `ros`.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._stores: dict[str, Typestore] = {}
+        reader_class = _reader_class(path)
+        with self._readable():
+            reader = reader_class(path)
+            reader.open()
+            weakref.finalize(self, reader.close)
+            self._reader = reader
+            self._connections: dict[str, list[Connection]] = {}
+            for connection in reader.connections:
+                self._connections.setdefault(connection.topic, []).append(connection)
+
+    @property
+    def path(self) -> Path:
+        """File or folder of the bag."""
+        return self._path
+
+    @property
+    def types(self) -> dict[str, str]:
+        """Message type of each topic, such as sensor_msgs/msg/Image, sorted by topic; topics without messages too."""
+        return {topic: _type_of(found[0]) for topic, found in sorted(self._connections.items())}
+
+    def first(self, topic: str) -> Any | None:
+        """Return the first message of a topic; None if it has none. Raises DatasetError."""
+        return next(self.messages(topic), None)
+
+    def messages(self, topic: str) -> Iterator[Any]:
+        """Yield all messages of a topic in the order of recording. Raises DatasetError."""
+        if topic not in self._connections:
+            return
+        with self._readable(topic):
+            for connection, _, data in self._reader.messages(connections=self._connections[topic]):
+                yield self._deserialise(connection, data)
+
+    def stamps(self, topic: str) -> list[StampedMessage]:
+        """Return all messages of a topic by the stamps of their headers, ascending. Raises DatasetError.
+
+        A header without a stamp counts from the time when the message was recorded. Payloads are not decoded.
+        """
+        found: list[StampedMessage] = []
+        last_ns, rank = -1, 0
+        with self._readable(topic):
+            for connection, time_ns, data in self._reader.messages(connections=self._connections[topic]):
+                rank = rank + 1 if time_ns == last_ns else 0
+                last_ns = time_ns
+                stamp_ns = _header_stamp_ns(data, _is_ros1(connection)) or time_ns
+                found.append(StampedMessage(MessageKey(topic, time_ns, rank), stamp_ns))
+        return sorted(found, key=lambda message: message.stamp_ns)
+
+    def read(self, key: MessageKey) -> Any:
+        """Return one message. Raises DatasetError."""
+        start_ns = key.recorded_ns
+        with self._readable(key.topic):
+            at_time = self._reader.messages(connections=self._connections[key.topic], start=start_ns, stop=start_ns + 1)
+            for rank, (connection, _, data) in enumerate(at_time):
+                if rank == key.rank:
+                    return self._deserialise(connection, data)
+        raise DatasetError(f"{self._path}: {key.topic}: expected a message at {start_ns} ns, got none")
+
+    def _deserialise(self, connection: Connection, data: bytes) -> Any:
+        store, message_type = self._store_of(connection), _type_of(connection)
+        if _is_ros1(connection):
+            return store.deserialize_ros1(data, message_type)
+        return store.deserialize_cdr(data, message_type)
+
+    def _store_of(self, connection: Connection) -> Typestore:
+        """Return the definition of a topic's message type in the bag, else the standard one."""
+        if connection.topic not in self._stores:
+            self._stores[connection.topic] = _typestore(connection)
+        return self._stores[connection.topic]
+
+    @contextmanager
+    def _readable(self, topic: str = "") -> Iterator[None]:
+        """Raise DatasetError for any error of the reader: damaged files cause errors of many types in it."""
+        try:
+            yield
+        except (DatasetError, GeneratorExit):
+            raise
+        except Exception as error:
+            place = f"{self._path}: {topic}" if topic else str(self._path)
+            reason = " ".join(str(error).split())[:160] or type(error).__name__
+            raise DatasetError(f"{place}: expected a readable bag; {reason}") from None
+
+
+def _reader_class(path: Path) -> Callable[[Path], Any]:
+    """Return the reader for a bag. Raises DatasetError without the extra `ros`."""
+    try:
+        from rosbags.rosbag1 import Reader as Reader1
+        from rosbags.rosbag2 import Reader as Reader2
+    except ImportError:
+        raise DatasetError(
+            f"{path}: a bag needs the extra `ros`; install it with: pip install 'gausslite[ros]'"
+        ) from None
+    return Reader1 if path.suffix == ".bag" and path.is_file() else Reader2
+
+
+def _typestore(connection: Connection) -> Typestore:
+    from rosbags.interfaces import MessageDefinitionFormat
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    if connection.msgdef.format is MessageDefinitionFormat.MSG and connection.msgdef.data:
+        store = get_typestore(Stores.EMPTY)
+        store.register(get_types_from_msg(connection.msgdef.data, _type_of(connection)))
+        return store
+    if not _is_ros1(connection):
+        return get_typestore(Stores.ROS2_HUMBLE)
+    store = get_typestore(Stores.ROS1_NOETIC)
+    store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", _TF_MESSAGE))
+    return store
+
+
+def _type_of(connection: Connection) -> str:
+    """Return the type's name as ROS 2 writes it."""
+    name = connection.msgtype
+    if "/msg/" not in name:
+        name = name.replace("/", "/msg/", 1)
+    return _ALIASES.get(name, name)
+
+
+def _is_ros1(connection: Connection) -> bool:
+    """True for messages in the serialisation of ROS 1, which MCAP files may have too."""
+    serialisation = getattr(connection.ext, "serialization_format", "ros1")
+    if serialisation not in ("ros1", "cdr"):
+        raise DatasetError(f"{connection.topic}: expected messages as ros1 or cdr, got {serialisation!r}")
+    return bool(serialisation == "ros1")
+
+
+def _header_stamp_ns(data: bytes, is_ros1: bool) -> int:
+    """Return the stamp of the header with which a serialised message begins."""
+    if is_ros1:
+        seconds, nanoseconds = _STAMP_ROS1.unpack_from(data)
+    else:
+        # the second byte states the byte order
+        seconds, nanoseconds = _STAMP_ROS2[data[1] & 1].unpack_from(data)
+    return int(seconds) * 10**9 + int(nanoseconds)

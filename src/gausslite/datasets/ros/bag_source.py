@@ -1,0 +1,211 @@
+"""A bag as a sequence of posed RGB-D frames, with the stamps of the message headers as times."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float32, Float64, UInt8
+from numpy import ndarray
+
+from gausslite.datasets.images import resize_rgbd
+from gausslite.datasets.intrinsics import FolderCamera
+from gausslite.datasets.poses import FIRST_VIEW_UP
+from gausslite.datasets.ros.address import BagAddress
+from gausslite.datasets.ros.bag_file import BagFile, MessageKey, StampedMessage
+from gausslite.datasets.ros.bag_poses import choose_poses, read_tree
+from gausslite.datasets.ros.camera_info import camera_of
+from gausslite.datasets.ros.image_messages import (
+    decode_colour,
+    decode_compressed_colour,
+    decode_compressed_depth,
+    decode_depth,
+)
+from gausslite.datasets.ros.realsense_recording import depth_units_per_metre
+from gausslite.datasets.ros.rgbd_camera import RgbdCamera
+from gausslite.datasets.ros.topics import ImageTopic, choose_colour, choose_depth, choose_info, image_topics
+from gausslite.datasets.ros.transform_tree import TransformTree, seconds
+from gausslite.datasets.source import excluded_frames_note, require_frames, require_position
+from gausslite.domain.camera import Camera
+from gausslite.domain.errors import DatasetError
+from gausslite.domain.frame import Frame
+from gausslite.domain.lens import Lens
+from gausslite.domain.pose import UpAxis, unit_up_axis
+from gausslite.domain.region import Region
+from gausslite.domain.trajectory import Trajectory
+
+_WORLD_UP = (0.0, 0.0, 1.0)
+_BODY_TO_OPTICAL = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+"""T_body_optical: a body's axes point forward, left and up; an optical frame's right, down and forward (REP 103)."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Match:
+    number: int
+    stamp_ns: int
+    colour: MessageKey
+    depth: MessageKey
+    T_world_camera: Float64[ndarray, "4 4"]
+
+
+class BagSource:
+    """The frames of a bag's colour topic, each with the nearest depth image and the camera's pose at its stamp.
+
+    Depth images that are not aligned to colour are registered to it. Colour images without depth or pose are excluded.
+    Frame numbers are the positions of the colour images by their stamps, from 0. World frames of ROS have z up.
+    Raises DatasetError, PoseError, InvalidInputError.
+    """
+
+    def __init__(self, address: BagAddress, up_axis: UpAxis | None = None, require_poses: bool = True) -> None:
+        self._bag = BagFile(address.path)
+        self._options = address.options
+        topics = image_topics(self._bag)
+        self._colour = choose_colour(self._bag, topics, address.options)
+        self._depth = choose_depth(self._bag, topics, self._colour, address.options)
+        tree = read_tree(self._bag)
+        camera_frame = address.options.camera or self._colour.frame
+        poses = choose_poses(self._bag, tree, camera_frame, address.options)
+        if poses is None and require_poses:
+            raise DatasetError(
+                f"{address.path}: expected poses: tf between a world frame and {camera_frame!r}, or an odometry topic, "
+                f"got none"
+            )
+        self._poses = poses
+        self._units_per_metre = depth_units_per_metre(self._bag, self._depth.name)
+        self._require_poses = require_poses
+        colours, depths = self._bag.stamps(self._colour.name), self._bag.stamps(self._depth.name)
+        self._cameras = self._read_cameras(tree, colours[0].stamp_ns)
+        self._matches, self._recorded = self._associate(colours, depths), len(colours)
+        tolerance = f"{1000 * self._options.tolerance_s:g} ms"
+        require_frames(address.path, len(self._matches), f"a colour image with a pose, and depth within {tolerance}")
+        self._up_axis = unit_up_axis(up_axis or (_WORLD_UP if poses is not None else FIRST_VIEW_UP))
+
+    @property
+    def name(self) -> str:
+        """Name of the file or folder, without the ending of a bag."""
+        path = self._bag.path.resolve()
+        return path.name if path.is_dir() else path.stem
+
+    @property
+    def description(self) -> str:
+        """Which topics and poses are used, for a message to the user."""
+        depth = "aligned" if self._cameras.depth is None else "registered to colour here"
+        poses = "none" if self._poses is None else str(self._poses)
+        return f"color={self._colour.name}, depth={self._depth.name} ({depth}), poses: {poses}"
+
+    @property
+    def camera(self) -> Camera:
+        """Colour camera."""
+        return self._cameras.camera
+
+    @property
+    def lens(self) -> Lens | None:
+        """Lens of camera_info for aligned depth; None if colour is undistorted here to register depth to it."""
+        return self._cameras.lens
+
+    @property
+    def up_axis(self) -> UpAxis:
+        """z, as in world frames of ROS, unless the caller gives another; without poses, up in a level first view."""
+        return self._up_axis
+
+    @property
+    def depth_registered(self) -> bool:
+        """True: depth is aligned as recorded, or registered here."""
+        return True
+
+    @property
+    def excluded_frames(self) -> str:
+        """Message on the colour images without depth or pose at their stamp."""
+        reason = f"without a pose at their stamp or depth within {1000 * self._options.tolerance_s:g} ms"
+        return excluded_frames_note(self._recorded - len(self), self._recorded, reason)
+
+    def __len__(self) -> int:
+        return len(self._matches)
+
+    def frame(self, i: int, size: tuple[int, int] | None = None) -> Frame:
+        """Return the frame at position i. Raises DatasetError."""
+        require_position(self.name, i, len(self))
+        match = self._matches[i]
+        place = f"{self._bag.path}: message at {match.stamp_ns / 1e9:.9f} s"
+        rgb = _colour_image(f"{place}: {self._colour.name}", self._colour, self._bag.read(match.colour))
+        depth_message = self._bag.read(match.depth)
+        depth_m = _depth_image(f"{place}: {self._depth.name}", self._depth, depth_message, self._units_per_metre)
+        image = resize_rgbd(self._cameras.join(place, rgb, depth_m), size)
+        # to the precision of a float64 in seconds, as in folders: keyframes are chosen by their times
+        time_ns = round(match.stamp_ns / 10**9 * 1e9)
+        return Frame(match.number, time_ns, image.rgb, image.depth_m, image.camera, match.T_world_camera)
+
+    def indices(self) -> Sequence[int]:
+        """Return the positions of the colour images in their topic, from 0."""
+        return [match.number for match in self._matches]
+
+    def trajectory(self) -> Trajectory:
+        """Return the interpolated pose of every colour image."""
+        times_s = seconds(match.stamp_ns for match in self._matches)
+        return Trajectory(times_s, np.array([match.T_world_camera for match in self._matches]))
+
+    def regions(self) -> Mapping[str, Region]:
+        """Return no regions."""
+        return {}
+
+    def _read_cameras(self, tree: TransformTree, first_ns: int) -> RgbdCamera:
+        options = self._options
+        colour = self._read_camera(self._colour, options.color_info, "color_info")
+        if self._depth.frame == self._colour.frame and not options.depth_info:
+            T_colour_depth = np.eye(4)
+            depth = self._read_aligned_camera()
+        else:
+            depth = self._read_camera(self._depth, options.depth_info, "depth_info")
+            T = tree.at(options.camera or self._colour.frame, self._depth.frame, first_ns / 10**9)
+            if T is None:
+                raise DatasetError(
+                    f"{self._bag.path}: tf: no transform from {self._depth.frame!r} to {self._colour.frame!r} at the "
+                    "time of the first colour image; expected it in /tf_static"
+                )
+            T_colour_depth = T
+        if options.axes == "body":
+            T_colour_depth = _BODY_TO_OPTICAL.T @ T_colour_depth @ _BODY_TO_OPTICAL
+        return RgbdCamera.of(colour, depth, T_colour_depth)
+
+    def _read_camera(self, image: ImageTopic, named: str, option: str) -> FolderCamera:
+        topic = choose_info(self._bag, image, named, option)
+        message = self._bag.first(topic)
+        place = f"{self._bag.path}: {topic}"
+        if message is None:
+            raise DatasetError(f"{place}: expected a camera_info message, got none")
+        return camera_of(place, message, image.camera_name)
+
+    def _read_aligned_camera(self) -> FolderCamera | None:
+        """Return the camera of depth with the colour camera's frame; None if the bag does not state it."""
+        try:
+            topic = choose_info(self._bag, self._depth, "", "depth_info")
+        except DatasetError:
+            return None
+        return self._read_camera(self._depth, topic, "depth_info")
+
+    def _associate(self, colours: Sequence[StampedMessage], depths: Sequence[StampedMessage]) -> list[_Match]:
+        """Return the colour images with depth and a pose; without poses they get the identity if none is required."""
+        depth_ns = np.array([depth.stamp_ns for depth in depths], np.int64)
+        matches = []
+        for number, colour in enumerate(colours):
+            nearest = int(np.abs(depth_ns - colour.stamp_ns).argmin())
+            lag_s = abs(int(depth_ns[nearest]) - colour.stamp_ns) / 10**9
+            T = None if self._poses is None else self._poses.at(colour.stamp_ns / 10**9)
+            if T is not None and self._options.axes == "body":
+                T = T @ _BODY_TO_OPTICAL
+            if T is None and not self._require_poses:
+                T = np.eye(4)
+            if lag_s <= self._options.tolerance_s and T is not None:
+                matches.append(_Match(number, colour.stamp_ns, colour.key, depths[nearest].key, T))
+        return matches
+
+
+def _colour_image(place: str, topic: ImageTopic, message: Any) -> UInt8[ndarray, "h w 3"]:
+    return decode_compressed_colour(place, message) if topic.compressed else decode_colour(place, message)
+
+
+def _depth_image(place: str, topic: ImageTopic, message: Any, units_per_metre: float) -> Float32[ndarray, "h w"]:
+    decode = decode_compressed_depth if topic.compressed else decode_depth
+    return decode(place, message, units_per_metre)

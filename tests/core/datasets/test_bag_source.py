@@ -1,0 +1,63 @@
+"""Bags give the same frames as the folder that they were made from, in every format of ROS 1 and ROS 2."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tum_recording import write_home
+
+import gausslite as gl
+from gausslite.datasets.open import open_source
+
+pytest.importorskip("rosbags", reason="bags need the extra ros")
+TOOL = Path(__file__).resolve().parents[3] / "tools" / "write_bag.py"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_home(tmp_path_factory.mktemp("bags") / "home")
+
+
+def convert(folder: Path, bag: Path, *options: str) -> None:
+    command = [sys.executable, str(TOOL), str(folder), str(bag), *options]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("options", [(), ("--compressed",)])
+@pytest.mark.parametrize(
+    ("written", "opened"), [("b.bag", "b.bag"), ("b", "b"), ("b.mcap", "b"), ("b.mcap", "b/b.mcap")]
+)
+def test_a_bag_has_the_frames_of_its_folder(
+    tmp_path: Path, folder: Path, written: str, opened: str, options: tuple[str, ...]
+) -> None:
+    convert(folder, tmp_path / written, *options)
+    expected, bag = open_source(str(folder)), open_source(str(tmp_path / opened))
+    assert bag.camera == expected.camera
+    assert list(bag.indices()) == list(expected.indices())
+    assert bag.up_axis == expected.up_axis
+    np.testing.assert_array_equal(bag.trajectory().times_s, expected.trajectory().times_s)
+    for i in range(len(expected)):
+        frame, other = bag.frame(i), expected.frame(i)
+        assert (frame.index, frame.capture_time_ns) == (other.index, other.capture_time_ns)
+        assert frame.rgb.tobytes() == other.rgb.tobytes()
+        assert frame.depth_m.tobytes() == other.depth_m.tobytes()
+        assert frame.T_world_camera.tobytes() == other.T_world_camera.tobytes()
+
+
+@pytest.mark.parametrize("name", ["b.bag", "b", "b.mcap"])
+def test_a_bag_gives_the_map_of_its_folder_bit_for_bit(tmp_path: Path, folder: Path, name: str) -> None:
+    convert(folder, tmp_path / name)
+    settings = gl.MissionSettings(max_gaussians=2000, iterations=2)
+    maps = [
+        gl.map_sequence(gl.open_sequence(path), settings=settings).gaussians
+        for path in (folder, (tmp_path / name).with_suffix(".bag" if name.endswith(".bag") else ""))
+    ]
+    columns = [field.name for field in fields(maps[0])]
+    assert len(maps[0]) > 500
+    assert all(getattr(maps[0], name).tobytes() == getattr(maps[1], name).tobytes() for name in columns)
