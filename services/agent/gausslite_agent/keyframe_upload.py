@@ -7,12 +7,12 @@ from collections.abc import Sequence
 
 from gausslite.domain.errors import InvalidInputError, StorageError
 from gausslite.domain.voxels import VoxelGrid
+from gausslite.mapping.keyframe_selection import Coverage, KeyframeSelection, KnownKeyframe, Selected
 from gausslite.mapping.keyframes import Keyframe
 from gausslite.v1 import geometry_pb2
 from gausslite.wire.convert import frame_to_message, transform_from_message
 from gausslite.wire.spooled_keyframes import SpooledKeyframe
 from gausslite.wire.uplink import Uplink
-from gausslite_agent.keyframe_selection import Coverage, KeyframeSelection, KnownKeyframe, Selected
 
 _log = logging.getLogger(__name__)
 

@@ -49,6 +49,11 @@ class KeyframeStore:
         """Keyframes of the whole mission, oldest first, thinned evenly if the buffer is full."""
         return tuple(self._buffer)
 
+    @property
+    def kept(self) -> tuple[Keyframe, ...]:
+        """Every keyframe of the buffer and of the window once, by capture time."""
+        return tuple(sorted(self._keyframes(), key=lambda keyframe: keyframe.frame.capture_time_ns))
+
     def add(self, view: WindowView) -> None:
         """Store a mapped frame if it shows the ROI or is the next `every`th frame."""
         self._limit_for(view.keyframe)

@@ -216,8 +216,8 @@ class GaussianMapper:
         return self._table.to_gaussians(np.flatnonzero(self._table.active), use_ema)
 
     def keyframes(self) -> list[Keyframe]:
-        """Return the buffered keyframes of the mission, oldest first, for joint refinement (Sec. III-E)."""
-        return list(self._keyframes.buffer)
+        """Return the keyframes kept of the whole mission and those that train the map, by capture time (Sec. III-E)."""
+        return list(self._keyframes.kept)
 
     def memory_mib(self) -> dict[str, float]:
         """Return the memory in MiB of the table, of Adam's moments and of the keyframes' images."""

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from gausslite.codec.subset_codec import encode_subset, split_batch
+from gausslite.domain.frame import Frame
 from gausslite.domain.free_space import FreeSpace
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.voxel_batch import RoiSubset, VoxelBatch
@@ -13,6 +14,8 @@ from gausslite.domain.voxel_operations import group_by_voxel
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.fusion.keyframes import AgentKeyframe
 from gausslite.mapping.free_space import FreeSpaceMap
+from gausslite.mapping.keyframe_selection import KeyframeSelection
+from gausslite.mapping.keyframes import Keyframe
 from gausslite.mapping.sent_voxels import SentVoxelTracker
 from gausslite.mission.build import build_mapper
 from gausslite.mission.frame_scheduler import FrameScheduler
@@ -28,6 +31,7 @@ _RESEND_THRESHOLD = 0.25
 _ROUND_FRAMES = 4
 _FREE_SPACE_FRAMES = 5
 _SUBSET_BYTES = 1 << 20
+_MAX_KEYFRAMES = 64
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -99,7 +103,7 @@ def map_agent(
 
     MissionRunner(mapper.process, after_frame).run(agent.frames).raise_if_stopped()
     sent.send(0.0)
-    keyframes = tuple(AgentKeyframe(agent.agent_id, each.frame) for each in mapper.keyframes())
+    keyframes = tuple(AgentKeyframe(agent.agent_id, each) for each in _select_keyframes(mapper.keyframes(), grid))
     gaussians_sent = sum(len(message.batch.gaussians) for message in sent.messages)
     gaussians = mapper.gaussians()
     whole = split_batch(group_by_voxel(gaussians, grid), _SUBSET_BYTES)
@@ -114,6 +118,18 @@ def map_agent(
         bytes_whole,
         _observe_free_space(agent, grid),
     )
+
+
+def _select_keyframes(keyframes: Sequence[Keyframe], grid: VoxelGrid) -> list[Frame]:
+    """Return the frames that an agent with --handover has sent at its end."""
+    selection = KeyframeSelection(_MAX_KEYFRAMES, grid)
+    frames: dict[int | None, Frame] = {}
+    for keyframe in keyframes:
+        selected = selection.offer(keyframe, min_gain_share=0.0)
+        if selected is not None:
+            frames[keyframe.frame.index] = keyframe.frame
+            frames.pop(selected.replaced, None)
+    return list(frames.values())
 
 
 def _observe_free_space(agent: AgentScene, grid: VoxelGrid) -> FreeSpace:

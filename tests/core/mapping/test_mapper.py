@@ -200,10 +200,12 @@ def test_expected_depth_is_the_depth_of_the_wall() -> None:
     assert np.median(depth_m[depth_m > 0]) == pytest.approx(2.0, abs=0.05)
 
 
-def test_keyframes_returns_every_nth_frame() -> None:
-    mapper = mapper_of()
-    map_wall(mapper, 5)
-    assert [keyframe.frame.index for keyframe in mapper.keyframes()] == [0, 2, 4]
+def test_keyframes_are_every_nth_frame_and_the_frames_that_train_the_map() -> None:
+    no_long_term = replace(SMALL, keyframes=replace(SMALL.keyframes, long_term_keyframes=0))
+    for settings, expected in ((no_long_term, [0, 2, 4]), (SMALL, [0, 1, 2, 3, 4])):
+        mapper = mapper_of(settings)
+        map_wall(mapper, 5)
+        assert [keyframe.frame.index for keyframe in mapper.keyframes()] == expected
 
 
 def test_policies_by_name() -> None:

@@ -7,8 +7,8 @@ import pytest
 from fusion_running import CAMERA, GRID, frame
 
 from gausslite.domain.relevance import RelevanceMap
+from gausslite.mapping.keyframe_selection import Coverage, KeyframeSelection, KnownKeyframe
 from gausslite.mapping.keyframes import Keyframe
-from gausslite_agent.keyframe_selection import Coverage, KeyframeSelection, KnownKeyframe
 
 
 def pose(x_m: float, yaw_deg: float = 0.0) -> np.ndarray:
