@@ -1,11 +1,12 @@
 #!/usr/bin/env bash
 # Create a certificate authority, and a certificate for each name, to test encrypted services:
-#   deploy/make_certificates.sh FOLDER NAME...
-# A name is a host, a compose service or an agent's --agent-id. An existing authority in FOLDER is reused.
+#   deploy/make_certificates.sh FOLDER NAME[:ROLE]...
+# A name is a host, a compose service or an agent's --agent-id. A role is robot (default), viewer, operator, or none for
+# a service that calls no other. An existing authority in FOLDER is reused.
 # FOLDER/NAME gets ca.pem, cert.pem and key.pem: all that this service may read. Only FOLDER has the authority's key.
 set -euo pipefail
 fail() { echo "make_certificates: $1" >&2; exit 1; }
-[ $# -ge 2 ] || fail "expected FOLDER NAME..."
+[ $# -ge 2 ] || fail "expected FOLDER NAME[:ROLE]..."
 command -v openssl >/dev/null || fail "expected the program openssl, found none"
 folder=$1
 shift
@@ -16,13 +17,17 @@ new_key=(-newkey ec -pkeyopt ec_paramgen_curve:prime256v1 -nodes)
 [ -e "$folder/ca.pem" ] ||
   openssl req -x509 "${new_key[@]}" -keyout "$folder/ca.key" -out "$folder/ca.pem" -subj "/CN=GaussLite team" -days "$days" 2>/dev/null
 
-for name in "$@"; do
+for argument in "$@"; do
+  name=${argument%%:*}
+  role=robot
+  [[ $argument != *:* ]] || role=${argument#*:}
   [[ $name =~ ^[A-Za-z0-9][A-Za-z0-9._-]*$ ]] || fail "expected names of letters, digits and ._-, got '$name'"
+  [[ $role =~ ^(robot|viewer|operator|none)$ ]] || fail "expected the role robot, viewer, operator or none, got '$role'"
   own=$folder/$name
   mkdir -p "$own"
   openssl req "${new_key[@]}" -keyout "$own/key.pem" -out "$own/request" -subj "/CN=$name" 2>/dev/null
   openssl x509 -req -in "$own/request" -CA "$folder/ca.pem" -CAkey "$folder/ca.key" -CAcreateserial -days "$days" \
-    -extfile <(echo "subjectAltName=DNS:$name,DNS:localhost,IP:127.0.0.1") -out "$own/cert.pem" 2>/dev/null
+    -extfile <(echo "subjectAltName=DNS:$name,DNS:localhost,IP:127.0.0.1,URI:gausslite:role:$role") -out "$own/cert.pem" 2>/dev/null
   rm "$own/request"
   cp "$folder/ca.pem" "$own/ca.pem"
 done

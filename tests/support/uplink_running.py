@@ -34,7 +34,8 @@ WAIT_S = 20.0
 def uplink(
     address: str, options: UplinkSettings = EAGER, spool: Path | None = None, grid: VoxelGrid = GRID
 ) -> Iterator[Uplink]:
-    link = Uplink(FusionClient(address), "robot", Spool(spool, "robot", grid), grid, options)
+    opened_spool = Spool(spool, "robot", grid)
+    link = Uplink(FusionClient(address, token=opened_spool.token), "robot", opened_spool, grid, options)
     try:
         yield link
     finally:
@@ -74,6 +75,9 @@ class ScriptedServer(pb_grpc.FusionServiceServicer):
     async def JoinSession(self, request: pb.JoinSessionRequest, context: Any) -> pb.JoinSessionResponse:
         self.joined.append(request.fresh_map)
         return pb.JoinSessionResponse(session_id=f"s{len(self.joined)}", highest_update_seq=100)
+
+    async def LeaveSession(self, request: pb.LeaveSessionRequest, context: Any) -> pb.LeaveSessionResponse:
+        return pb.LeaveSessionResponse()
 
     async def ContributeSubsets(self, request_iterator: Any, context: Any) -> Any:
         async for request in request_iterator:

@@ -162,7 +162,7 @@ def _open_uplink(settings: AgentSettings, stack: ExitStack, has_restored_map: bo
     if link.fusion is None:
         return None
     spool = Spool(link.spool, settings.agent_id, link.grid)
-    client = FusionClient(link.fusion, mission_id=link.mission_id, tls=settings.tls)
+    client = FusionClient(link.fusion, mission_id=link.mission_id, tls=settings.tls, token=spool.token)
     uplink = Uplink(client, settings.agent_id, spool, link.grid, link.uplink, has_restored_map)
     stack.callback(uplink.close)
     return uplink

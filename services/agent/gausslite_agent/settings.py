@@ -24,7 +24,7 @@ from gausslite.config.switches import add_switch, set_dependent_default
 from gausslite.config.tls_options import add_tls, read_server_tls
 from gausslite.config.values import read_rigid_transform
 from gausslite.domain.errors import InvalidInputError
-from gausslite.domain.names import require_name
+from gausslite.domain.names import require_identifier, require_name
 from gausslite.domain.pose import UpAxis
 from gausslite.domain.task_limits import require_task_text
 from gausslite.domain.voxels import VoxelGrid
@@ -182,10 +182,10 @@ def _default_keyframes(options: argparse.Namespace) -> int:
 
 def _require_valid(options: argparse.Namespace) -> None:
     """Raise InvalidInputError for values that would fail only in the middle of a mission."""
-    for name in ("agent_id", "mission", "world_frame"):
-        require_name(f"--{name.replace('_', '-')}", getattr(options, name))
-    if not options.agent_id:
-        raise InvalidInputError("--agent-id: expected a name, got an empty text")
+    require_identifier("--agent-id", options.agent_id)
+    if options.mission:
+        require_identifier("--mission", options.mission)
+    require_name("--world-frame", options.world_frame)
     for name in ("parser", "fusion"):
         address = getattr(options, name)
         if address is not None:

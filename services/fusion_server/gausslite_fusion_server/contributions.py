@@ -15,6 +15,7 @@ from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.keyframes import EncodedKeyframe
 from gausslite.fusion.traffic import TrafficCounters
 from gausslite.v1 import fusion_service_pb2 as pb
+from gausslite.wire.caller import Caller
 from gausslite.wire.convert import frame_from_message
 from gausslite.wire.status import code_and_reason
 
@@ -28,9 +29,16 @@ _ACCEPTED, _STALE, _REJECTED = (
 )
 
 
-def store_subset(engine: FusionEngine, request: pb.ContributeSubsetsRequest) -> pb.SubsetOutcome:
+def agent_of_session(engine: FusionEngine, session_id: str, caller: Caller) -> str:
+    """Return the agent of a session. Raises SessionUnknownError, NotPermittedError if the caller is another robot."""
+    agent_id = engine.session(session_id).agent_id
+    caller.require_agent(agent_id)
+    return agent_id
+
+
+def store_subset(engine: FusionEngine, request: pb.ContributeSubsetsRequest, caller: Caller) -> pb.SubsetOutcome:
     """Store one message. An invalid one gives a REJECTED outcome; errors of the whole stream are raised."""
-    agent_id = engine.session(request.session_id).agent_id
+    agent_id = agent_of_session(engine, request.session_id, caller)
     size = len(request.subset)
     is_handover = request.purpose == pb.PURPOSE_HANDOVER
     traffic = TrafficCounters(handover_bytes=size) if is_handover else TrafficCounters(roi_bytes=size)
@@ -52,18 +60,22 @@ def store_subset(engine: FusionEngine, request: pb.ContributeSubsetsRequest) -> 
     return outcome
 
 
-def store_free_space(engine: FusionEngine, request: pb.ContributeFreeSpaceRequest) -> int:
+def store_free_space(engine: FusionEngine, request: pb.ContributeFreeSpaceRequest, caller: Caller) -> int:
     """Store free space; returns the agent's number of free voxels. Raises CodecError, QuotaError and the like."""
-    engine.session(request.session_id)
+    agent_of_session(engine, request.session_id, caller)
     blocks, grid = decode_free_space(request.free_space)
     return engine.contribute_free_space(request.session_id, blocks, grid)
 
 
-def store_keyframe(engine: FusionEngine, request: pb.ContributeKeyframesRequest) -> None:
+def store_keyframe(engine: FusionEngine, request: pb.ContributeKeyframesRequest, caller: Caller) -> None:
     """Store a keyframe as it was received. Raises InvalidInputError, QuotaError, SessionUnknownError."""
-    agent_id = engine.session(request.session_id).agent_id
+    agent_id = agent_of_session(engine, request.session_id, caller)
+    message = request.keyframe
+    # before any image is decoded: its header must then state the camera's size
+    pixels = message.camera.width_px * message.camera.height_px
+    engine.settings.quotas.keyframe_limits.require_within(message.index, pixels, message.ByteSize())
     # decoded here to refuse invalid images; stored as received, which needs less space
-    frame = frame_from_message(request.keyframe)
-    data = request.keyframe.SerializeToString()
+    frame = frame_from_message(message)
+    data = message.SerializeToString()
     keyframe = EncodedKeyframe(agent_id, frame.index, frame.depth_m.size, data)
     engine.add_keyframe(keyframe, request.selected[:_MAX_SELECTED_KEYFRAMES])

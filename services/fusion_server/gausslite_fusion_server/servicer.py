@@ -19,7 +19,7 @@ from gausslite.domain.errors import (
     QuotaError,
     RevisionGoneError,
 )
-from gausslite.domain.names import require_name
+from gausslite.domain.names import require_identifier
 from gausslite.domain.objects import ObjectReport
 from gausslite.domain.voxel_batch import VoxelBatch
 from gausslite.fusion.engine import FusionEngine
@@ -29,6 +29,7 @@ from gausslite.fusion.mission_config import MissionConfig
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.v1 import fusion_service_pb2_grpc as pb_grpc
 from gausslite.v1.gaussians_pb2 import MapBlock
+from gausslite.wire.caller import Caller
 from gausslite.wire.change_notifier import ChangeNotifier
 from gausslite.wire.convert import (
     box_from_message,
@@ -40,9 +41,8 @@ from gausslite.wire.convert import (
 from gausslite.wire.convert_objects import object_to_message, report_from_message
 from gausslite.wire.convert_task import graph_from_message
 from gausslite.wire.server import Service
-from gausslite.wire.tls import require_agent_certificate
 from gausslite_fusion_server.change_blocks import change_blocks
-from gausslite_fusion_server.contributions import store_free_space, store_keyframe, store_subset
+from gausslite_fusion_server.contributions import agent_of_session, store_free_space, store_keyframe, store_subset
 from gausslite_fusion_server.drain_gate import DrainGate
 from gausslite_fusion_server.messages import (
     contribution_to_message,
@@ -94,12 +94,12 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
 
     async def JoinSession(self, request: pb.JoinSessionRequest, context: Any) -> pb.JoinSessionResponse:
         """Join the mission."""
-        require_agent_certificate(context, request.agent_id)
+        Caller.of(context).require_agent(request.agent_id)
         grid = grid_from_message(request.grid)
         requested = MissionConfig(request.mission_id, request.world_frame, grid.size_m)
         task = graph_from_message(request.task) if request.HasField("task") else None
         T_fused_agent = declared_frame_from_message(request)
-        joined = await self._work(self._engine.join, request.agent_id, requested, request.fresh_map)
+        joined = await self._work(self._engine.join, request.agent_id, requested, request.fresh_map, request.token)
         if T_fused_agent is not None:
             await self._work(self._engine.declare_frame, request.agent_id, T_fused_agent)
         if task is not None:
@@ -121,9 +121,9 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         self, request_iterator: AsyncIterator[pb.ContributeSubsetsRequest], context: Any
     ) -> AsyncIterator[pb.ContributeSubsetsResponse]:
         """Store voxel updates; one acknowledgement for each message."""
-        acknowledged = 0
+        acknowledged, caller = 0, Caller.of(context)
         async for request in self._gate.admit(request_iterator):
-            outcome = await self._work(store_subset, self._engine, request)
+            outcome = await self._work(store_subset, self._engine, request, caller)
             self._map_changes.notify()
             self._align_in_background()
             acknowledged = max(acknowledged, request.sequence)
@@ -133,10 +133,10 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         self, request_iterator: AsyncIterator[pb.ContributeKeyframesRequest], context: Any
     ) -> pb.ContributeKeyframesResponse:
         """Store keyframes for the refinement; invalid ones are reported and the others stored."""
-        response = pb.ContributeKeyframesResponse()
+        response, caller = pb.ContributeKeyframesResponse(), Caller.of(context)
         async for request in self._gate.admit(request_iterator):
             try:
-                await self._work(store_keyframe, self._engine, request)
+                await self._work(store_keyframe, self._engine, request, caller)
                 response.accepted += 1
             except (InvalidInputError, QuotaError) as error:
                 if len(response.rejected) >= _MAX_REPORTED_REJECTIONS:
@@ -151,7 +151,8 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         self._engine.require_mission(request.mission_id)
         region = box_from_message(request.region) if request.HasField("region") else None
         layer, excluded = layer_from_message(request.layer), request.exclude_agent_id
-        require_name("exclude_agent_id", excluded)
+        if excluded:
+            require_identifier("exclude_agent_id", excluded)
         changes = await self._work(self._engine.maps.changes, request.since_revision, layer, excluded)
         while True:
             blocks = change_blocks(changes, self._engine.grid, region)
@@ -197,7 +198,7 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
 
     async def ReportObjects(self, request: pb.ReportObjectsRequest, context: Any) -> pb.ReportObjectsResponse:
         """Replace the agent's task graph and objects."""
-        self._engine.session(request.session_id)
+        agent_of_session(self._engine, request.session_id, Caller.of(context))
         await self._work(self._engine.report_objects, request.session_id, report_from_message(request))
         return pb.ReportObjectsResponse()
 
@@ -211,7 +212,7 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         self, request: pb.ContributeFreeSpaceRequest, context: Any
     ) -> pb.ContributeFreeSpaceResponse:
         """Replace what an agent observed as free in some blocks of voxels."""
-        free_voxels = await self._work(store_free_space, self._engine, request)
+        free_voxels = await self._work(store_free_space, self._engine, request, Caller.of(context))
         self._map_changes.notify()
         return pb.ContributeFreeSpaceResponse(free_voxels=free_voxels)
 
@@ -240,13 +241,30 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
             keyframes=status.keyframes,
             refined=status.refined,
             vote=str(self._engine.settings.vote),
+            banned_agents=status.banned_agents,
         )
 
     async def LeaveSession(self, request: pb.LeaveSessionRequest, context: Any) -> pb.LeaveSessionResponse:
         """End a session; with `forget` the agent's updates are deleted."""
+        agent_of_session(self._engine, request.session_id, Caller.of(context))
         revision = await self._work(self._engine.leave, request.session_id, request.forget)
         self._map_changes.notify()
         return pb.LeaveSessionResponse(fused_revision=revision)
+
+    async def EvictAgent(self, request: pb.EvictAgentRequest, context: Any) -> pb.EvictAgentResponse:
+        """End an agent's session and delete its data; with `ban` its later joins are refused."""
+        self._engine.require_mission(request.mission_id)
+        voxels = await self._work(self._engine.evict, request.agent_id, request.ban)
+        self._map_changes.notify()
+        _log.warning("agent %s: %s, data of %d voxels deleted", request.agent_id, _evicted(request), voxels)
+        return pb.EvictAgentResponse(fused_revision=self._engine.revision, voxels=voxels)
+
+    async def UnbanAgent(self, request: pb.UnbanAgentRequest, context: Any) -> pb.UnbanAgentResponse:
+        """Let a banned agent join again."""
+        self._engine.require_mission(request.mission_id)
+        await self._work(self._engine.unban, request.agent_id)
+        _log.warning("agent %s: may join again", request.agent_id)
+        return pb.UnbanAgentResponse()
 
     def _changes_or_snapshot(self, revision: int, layer: MapLayer, excluded: str) -> FusedMapChanges:
         try:
@@ -294,6 +312,10 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         """Run the function in a worker thread. Raises UnavailableError if the server drains."""
         self._gate.require_open()
         return await asyncio.get_running_loop().run_in_executor(self._workers, function, *arguments)
+
+
+def _evicted(request: pb.EvictAgentRequest) -> str:
+    return "banned" if request.ban else "evicted"
 
 
 def _next_block(blocks: Iterator[MapBlock]) -> MapBlock | None:

@@ -2,7 +2,12 @@
 
 
 class GaussLiteError(Exception):
-    """Base of all deliberate errors. The message is one line: the name, what was expected, what was received."""
+    """Base of all deliberate errors. The message is one line: the name, what was expected, what was received.
+
+    retry_after_s: the time after which the same call may succeed; None if the error does not state it.
+    """
+
+    retry_after_s: float | None = None
 
 
 class InvalidInputError(GaussLiteError):
@@ -55,6 +60,14 @@ class RevisionGoneError(GaussLiteError):
 
 class QuotaError(GaussLiteError):
     """A size or count exceeds a limit of the receiver."""
+
+
+class RateLimitError(QuotaError):
+    """A caller sends more in a time than the receiver accepts; it may go on after `retry_after_s`."""
+
+
+class NameInUseError(GaussLiteError):
+    """Another robot holds the lease of this agent name; it ends after `retry_after_s` unless the robot renews it."""
 
 
 class NotPermittedError(GaussLiteError):

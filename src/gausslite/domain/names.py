@@ -1,10 +1,14 @@
-"""Check names that come from outside: agents, missions and world frames."""
+"""Check names that come from outside: agents and missions (a safe alphabet), world frames and nouns (printable)."""
 
 from __future__ import annotations
+
+import re
 
 from gausslite.domain.errors import InvalidInputError
 
 MAX_NAME_BYTES = 255
+MAX_IDENTIFIER_CHARACTERS = 64
+_IDENTIFIER = re.compile(rf"[A-Za-z0-9][A-Za-z0-9._-]{{0,{MAX_IDENTIFIER_CHARACTERS - 1}}}")
 _MAX_QUOTED_CHARACTERS = 64
 
 
@@ -18,6 +22,15 @@ def require_name(field: str, name: str) -> None:
         raise InvalidInputError(f"{field}: expected at most {MAX_NAME_BYTES} bytes, got {size}")
     if not name.isprintable():
         raise InvalidInputError(f"{field}: expected no line breaks or control characters, got {quote_name(name)}")
+
+
+def require_identifier(field: str, name: str) -> None:
+    """Raise InvalidInputError unless the name is safe in logs, file names, labels and shells; empty is refused."""
+    if not _IDENTIFIER.fullmatch(name):
+        raise InvalidInputError(
+            f"{field}: expected 1 to {MAX_IDENTIFIER_CHARACTERS} letters, digits and . _ -, beginning with a letter or "
+            f"a digit, got {quote_name(name)}"
+        )
 
 
 def quote_name(name: str) -> str:

@@ -16,11 +16,12 @@ from gausslite.domain.errors import InvalidInputError, MismatchError, NotPermitt
 from gausslite.domain.frame import MAX_COORDINATE_M
 from gausslite.domain.free_space import FreeSpace
 from gausslite.domain.gaussians import Gaussians
-from gausslite.domain.names import quote_name, require_name
+from gausslite.domain.names import quote_name, require_identifier
 from gausslite.domain.objects import ObjectLandmark, ObjectReport, TeamObject
 from gausslite.domain.task import TaskGraph
 from gausslite.domain.voxel_batch import RoiSubset
 from gausslite.domain.voxels import VoxelGrid
+from gausslite.fusion.bans import BanList
 from gausslite.fusion.frame_aligner import FrameAligner
 from gausslite.fusion.frame_alignment import FrameAlignments
 from gausslite.fusion.free_space import FreeSpaceRecords
@@ -32,6 +33,7 @@ from gausslite.fusion.sessions import SessionRegistry
 from gausslite.fusion.store import FusionStore, PutOutcome, SessionRecord
 from gausslite.fusion.team_objects import TeamObjects, find_objects
 from gausslite.fusion.traffic import MissionStatus, TrafficCounters, contribution
+from gausslite.fusion.update_checks import UpdateChecks
 from gausslite.fusion.usage import UsageLedger
 from gausslite.fusion.vote import rank_voxels
 from gausslite.fusion.vote_input import VoteInput
@@ -72,9 +74,11 @@ class FusionEngine:
         self._mission_config = reconcile(store.mission_config() or own, own)
         first_revision = time.time_ns() // 1000 if first_revision is None else first_revision
         quotas = settings.quotas
-        self._keyframes = KeyframePool(store, quotas.keyframes_per_agent, quotas.keyframe_pixels, decode_keyframe)
+        self._keyframes = KeyframePool(store, quotas.keyframe_limits, decode_keyframe)
         self._objects = TeamObjects(store)
-        self._sessions = SessionRegistry(store)
+        self._sessions = SessionRegistry(store, settings.lease_s)
+        self._bans = BanList(store)
+        self._checks = UpdateChecks(store, quotas)
         self._traffic: dict[str, TrafficCounters] = {}
         scores = store.scores()
         self._usage = UsageLedger(scores, quotas)
@@ -120,29 +124,28 @@ class FusionEngine:
         if mission_id and mission_id != own:
             raise MismatchError(f"mission: expected {quote_name(own)} as agreed here, got {quote_name(mission_id)}")
 
-    def join(self, agent_id: str, requested: MissionConfig, fresh_map: bool = False) -> JoinResult:
+    def join(self, agent_id: str, requested: MissionConfig, fresh_map: bool = False, token: str = "") -> JoinResult:
         """Open a session and end the agent's earlier one; fresh_map also deletes all that the agent sent before.
 
-        Empty names in `requested` accept the server's. Raises InvalidInputError, MismatchError, QuotaError,
-        StorageError.
+        Empty names in `requested` accept the server's. token: the robot's secret, see SessionRegistry. Raises
+        InvalidInputError, MismatchError, NameInUseError, NotPermittedError (banned), QuotaError, StorageError.
         """
-        require_name("agent_id", agent_id)
-        if not agent_id:
-            raise InvalidInputError("agent_id: expected a name, got an empty string")
+        require_identifier("agent_id", agent_id)
         with self._lock:
-            mission_config = reconcile(self._mission_config, requested).with_default_names()
-            known_agents = self._sessions.agents | self._usage.agents
-            limit = self._settings.quotas.agents
-            if agent_id not in known_agents and len(known_agents) >= limit:
-                raise QuotaError(f"agents: expected at most {limit} in this mission, {quote_name(agent_id)} exceeds it")
+            self._bans.require_allowed(agent_id)
+            self._sessions.require_free(agent_id, token)
+            self._make_room(agent_id)
+            agreed = self._mission_config if self._is_agreed(agent_id) else self._settings.mission_config
+            mission_config = reconcile(agreed, requested).with_default_names()
             self._store.set_mission_config(mission_config)
             self._mission_config = mission_config
             if fresh_map:
                 self._remove_agent(agent_id)
-            session = self._sessions.open(agent_id)
+            session = self._sessions.open(agent_id, token)
+            self._checks.record_join(agent_id)
             return JoinResult(
                 session,
-                self._store.highest_update_seq(agent_id),
+                self._checks.highest_seq(agent_id),
                 self._maps.revision(),
                 self._keyframes.indices(agent_id),
             )
@@ -166,8 +169,10 @@ class FusionEngine:
                 )
             if grid != self.grid:
                 raise MismatchError(f"voxel size: this mission votes on {self.grid.size_m:g} m, got {grid.size_m:g} m")
+            subset = self._checks.check(subset)
             usage = self._usage.after(subset, self._store)
             outcome = self._store.put(subset)
+            self._checks.record(subset)
             self._usage.set(agent_id, usage)
             self._aligner.record(agent_id, outcome.accepted)
             self._maps.record(agent_id, self._votes.changed_keys(agent_id, outcome.accepted))
@@ -238,6 +243,30 @@ class FusionEngine:
             reports, frames = self._objects.reports(), self._alignments.transforms()
         return find_objects(reports, frames, noun)
 
+    def evict(self, agent_id: str, ban: bool = False) -> int:
+        """End the agent's session and delete all its data; returns the number of its voxels. For operators.
+
+        ban: refuse later joins under this name, also after a restart. Raises InvalidInputError for an unknown agent
+        that is not banned, StorageError.
+        """
+        require_identifier("agent_id", agent_id)
+        with self._lock:
+            known_agents = self._sessions.agents | self._usage.agents
+            if not ban and agent_id not in known_agents:
+                expected = ", ".join(sorted(known_agents)[:8]) or "no agents yet"
+                raise InvalidInputError(f"agent_id: expected an agent of the mission ({expected}), got {agent_id!r}")
+            voxels = self._usage.get(agent_id).voxels
+            self._sessions.end_agent(agent_id)
+            self._remove_agent(agent_id)
+            if ban:
+                self._bans.add(agent_id)
+            return voxels
+
+    def unban(self, agent_id: str) -> None:
+        """Let a banned agent join again. Raises InvalidInputError if it is not banned, StorageError."""
+        with self._lock:
+            self._bans.remove(agent_id)
+
     def leave(self, session_id: str, forget: bool = False) -> int:
         """End a session and return the fused revision; with `forget` all updates of the agent are deleted."""
         with self._lock:
@@ -291,12 +320,27 @@ class FusionEngine:
                 len(self._keyframes),
                 self._maps.is_refined,
                 agents,
+                self._bans.agents,
             )
 
     def close(self) -> None:
         """Close the store."""
         with self._lock:
             self._store.close()
+
+    def _is_agreed(self, agent_id: str) -> bool:
+        """Return whether another live agent, or any data, fixes the mission's configuration."""
+        return bool(self._usage.agents or self._sessions.live_agents - {agent_id})
+
+    def _make_room(self, agent_id: str) -> None:
+        """End sessions without a lease and without data if the mission is full. Raises QuotaError, StorageError."""
+        limit = self._settings.quotas.agents
+        known_agents = self._sessions.agents | self._usage.agents
+        if agent_id in known_agents or len(known_agents) < limit:
+            return
+        self._sessions.end_expired(kept=self._usage.agents)
+        if len(self._sessions.agents | self._usage.agents) >= limit:
+            raise QuotaError(f"agents: expected at most {limit} in this mission, {quote_name(agent_id)} exceeds it")
 
     def _remove_agent(self, agent_id: str) -> None:
         keys = np.union1d(self._store.remove_agent(agent_id), self._votes.remove_agent(agent_id))
@@ -305,6 +349,7 @@ class FusionEngine:
         self._aligner.remove_agent(agent_id)
         self._free_space.remove_agent(agent_id)
         self._usage.remove_agent(agent_id)
+        self._checks.remove_agent(agent_id)
         self._traffic.pop(agent_id, None)
         self._keyframes.remove_agent(agent_id)
         self._objects.remove_agent(agent_id)

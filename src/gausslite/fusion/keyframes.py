@@ -40,63 +40,83 @@ class EncodedKeyframe:
     data: bytes
 
 
-class KeyframePool:
-    """Keeps at most `max_per_agent` keyframes of each agent in the store; a repeated index replaces the earlier one.
+@dataclass(frozen=True, slots=True)
+class KeyframeLimits:
+    """The limits of one agent's keyframes."""
 
-    Only indices are in memory. Not thread-safe; FusionEngine holds a lock.
+    frames: int = 64
+    pixels: int = 1920 * 1080
+    bytes_in_all: int = 64 << 20
+
+    def __post_init__(self) -> None:
+        if min(self.frames, self.pixels, self.bytes_in_all) < 1:
+            raise InvalidInputError(f"keyframe limits: expected at least 1, got {self}")
+
+    def require_within(self, index: int, pixels: int, size_bytes: int) -> None:
+        """Raise QuotaError if one keyframe exceeds the limits; needs no decoded image."""
+        for unit, value, limit in (("pixels", pixels, self.pixels), ("bytes", size_bytes, self.bytes_in_all)):
+            if value > limit:
+                raise QuotaError(f"keyframe {index}: expected at most {limit} {unit}, got {value}")
+
+
+class KeyframePool:
+    """Keeps the keyframes of each agent in the store, within the limits; a repeated index replaces the earlier one.
+
+    Only indices and sizes are in memory. Not thread-safe; FusionEngine holds a lock.
     """
 
-    def __init__(
-        self, store: FusionStore, max_per_agent: int, max_pixels: int, decode: FrameDecoder = no_decoder
-    ) -> None:
-        if max_per_agent < 1 or max_pixels < 1:
-            raise InvalidInputError(
-                f"keyframe pool: expected limits of at least 1, got {max_per_agent} frames of {max_pixels} pixels"
-            )
-        self._store, self._decode = store, decode
-        self._max_per_agent = max_per_agent
-        self._max_pixels = max_pixels
-        self._indices = {agent_id: set(indices) for agent_id, indices in store.keyframe_indices().items()}
+    def __init__(self, store: FusionStore, limits: KeyframeLimits, decode: FrameDecoder = no_decoder) -> None:
+        self._store, self._limits, self._decode = store, limits, decode
+        self._sizes_bytes = store.keyframe_sizes()
 
     def __len__(self) -> int:
-        return sum(len(indices) for indices in self._indices.values())
+        return sum(len(sizes) for sizes in self._sizes_bytes.values())
 
     def add(self, keyframe: EncodedKeyframe, selected: Collection[int] = ()) -> None:
-        """Store the keyframe; delete the agent's keyframes that are not selected, and its oldest above the limit.
+        """Store the keyframe; delete the agent's keyframes that are not selected, and its oldest above the limits.
 
-        An empty `selected` deletes none. Raises QuotaError for too many pixels, StorageError.
+        An empty `selected` deletes none. Raises QuotaError if this keyframe alone exceeds a limit, StorageError.
         """
-        if keyframe.pixels > self._max_pixels:
-            raise QuotaError(
-                f"keyframe {keyframe.index}: expected at most {self._max_pixels} pixels, got {keyframe.pixels}"
-            )
+        self._limits.require_within(keyframe.index, keyframe.pixels, len(keyframe.data))
         self._store.save_keyframe(keyframe.agent_id, keyframe.index, keyframe.data)
-        indices = self._indices.setdefault(keyframe.agent_id, set())
-        indices.add(keyframe.index)
-        kept = indices & {*selected, keyframe.index} if selected else set(indices)
-        kept = set(sorted(kept)[-self._max_per_agent :])
-        if kept != indices:
-            self._store.remove_keyframes(keyframe.agent_id, sorted(indices - kept))
-            self._indices[keyframe.agent_id] = kept
+        sizes = self._sizes_bytes.setdefault(keyframe.agent_id, {})
+        sizes[keyframe.index] = len(keyframe.data)
+        kept = self._newest_within_limits(
+            {index: size for index, size in sizes.items() if not selected or index in {*selected, keyframe.index}}
+        )
+        if len(kept) < len(sizes):
+            self._store.remove_keyframes(keyframe.agent_id, sorted(sizes.keys() - kept.keys()))
+            self._sizes_bytes[keyframe.agent_id] = kept
 
     def count(self, agent_id: str) -> int:
         """Return the number of keyframes of this agent."""
-        return len(self._indices.get(agent_id, ()))
+        return len(self._sizes_bytes.get(agent_id, ()))
 
     def indices(self, agent_id: str) -> tuple[int, ...]:
         """Return the frame indices of this agent's keyframes, ascending."""
-        return tuple(sorted(self._indices.get(agent_id, ())))
+        return tuple(sorted(self._sizes_bytes.get(agent_id, ())))
 
     def remove_agent(self, agent_id: str) -> None:
         """Delete an agent's keyframes."""
-        self._store.remove_keyframes(agent_id, sorted(self._indices.pop(agent_id, ())))
+        self._store.remove_keyframes(agent_id, sorted(self._sizes_bytes.pop(agent_id, ())))
+
+    def _newest_within_limits(self, sizes_bytes: dict[int, int]) -> dict[int, int]:
+        """Return the frames with the highest indices that are within the limits together."""
+        kept: dict[int, int] = {}
+        spent_bytes = 0
+        for index in sorted(sizes_bytes, reverse=True)[: self._limits.frames]:
+            spent_bytes += sizes_bytes[index]
+            if spent_bytes > self._limits.bytes_in_all:
+                break
+            kept[index] = sizes_bytes[index]
+        return kept
 
     def encoded(self) -> list[tuple[str, bytes]]:
         """Return the agent id and the bytes of all keyframes, sorted by agent id and frame index."""
         return [
             (agent_id, self._store.keyframe(agent_id, index))
-            for agent_id in sorted(self._indices)
-            for index in sorted(self._indices[agent_id])
+            for agent_id in sorted(self._sizes_bytes)
+            for index in sorted(self._sizes_bytes[agent_id])
         ]
 
     def decode(self, encoded: Iterable[tuple[str, bytes]]) -> list[AgentKeyframe]:

@@ -1,4 +1,4 @@
-"""Limit what a mission accepts: the number of agents, and the voxels, Gaussians and keyframes of each."""
+"""Limit what a mission accepts: the number of agents, and the voxels, Gaussians, kappa and keyframes of each."""
 
 from __future__ import annotations
 
@@ -8,13 +8,16 @@ from enum import StrEnum
 import numpy as np
 
 from gausslite.domain.errors import InvalidInputError, QuotaError
-from gausslite.domain.names import quote_name, require_name
+from gausslite.domain.names import quote_name, require_identifier, require_name
 from gausslite.domain.revision_log import MAX_REMOVED_VOXELS
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.fusion.frame_alignment import AlignmentSettings
+from gausslite.fusion.keyframes import KeyframeLimits
 from gausslite.fusion.mission_config import MissionConfig
 from gausslite.fusion.store import VoxelScoreTable
 
+DEFAULT_LEASE_S = 60.0
+"""Longer than a robot needs to notice a lost server and to reconnect, see wire/connection.py."""
 MAX_REFINE_ITERATIONS = 30_000
 """A larger number would occupy a server for hours with one request."""
 
@@ -28,13 +31,25 @@ class VoteRule(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Quotas:
-    """Upper limits of one mission. voxels_per_agent includes tombstones, because the store keeps them."""
+    """Upper limits of one mission. voxels_per_agent includes tombstones, because the store keeps them.
+
+    kappa_at_join: of one Gaussian at the agent's first join; kappa_per_second: its growth since then. An agent at 4 Hz
+    with 8 iterations a frame trains a Gaussian at most 32 times a second.
+    """
 
     agents: int = 64
     voxels_per_agent: int = 500_000
     gaussians_per_agent: int = 3_000_000
     keyframes_per_agent: int = 64
     keyframe_pixels: int = 1920 * 1080
+    keyframe_bytes_per_agent: int = 64 << 20
+    kappa_at_join: int = 120_000
+    kappa_per_second: int = 200
+
+    @property
+    def keyframe_limits(self) -> KeyframeLimits:
+        """The limits of one agent's keyframes."""
+        return KeyframeLimits(self.keyframes_per_agent, self.keyframe_pixels, self.keyframe_bytes_per_agent)
 
     def __post_init__(self) -> None:
         for quota in fields(self):
@@ -47,7 +62,8 @@ class FusionSettings:
     """The server's configuration. If mission_id or world_frame is empty, the first agent that names it fixes it.
 
     max_removed_voxels: number of removed voxels that a watcher can still catch up with; see RevisionLog.
-    alignment: how agents' frames are estimated; None uses them as declared. vote: the rule of the vote.
+    alignment: how agents' frames are estimated; None uses them as declared. vote: the rule of the vote. lease_s: time
+    after an agent's last call during which no other robot can take its name.
     """
 
     grid: VoxelGrid = field(default_factory=VoxelGrid)
@@ -57,9 +73,11 @@ class FusionSettings:
     max_removed_voxels: int = MAX_REMOVED_VOXELS
     alignment: AlignmentSettings | None = None
     vote: VoteRule = VoteRule.PAPER
+    lease_s: float = DEFAULT_LEASE_S
 
     def __post_init__(self) -> None:
-        require_name("mission", self.mission_id)
+        if self.mission_id:
+            require_identifier("mission", self.mission_id)
         require_name("world frame", self.world_frame)
 
     @property

@@ -149,10 +149,14 @@ class MemoryStore:
             for index in indices:
                 self._keyframes.get(agent_id, {}).pop(index, None)
 
-    def keyframe_indices(self) -> dict[str, tuple[int, ...]]:
-        """Return the frame indices of each agent's keyframes, ascending."""
+    def keyframe_sizes(self) -> dict[str, dict[int, int]]:
+        """Return the number of bytes of each agent's keyframes by frame index."""
         with self._lock:
-            return {agent_id: tuple(sorted(frames)) for agent_id, frames in self._keyframes.items() if frames}
+            return {
+                agent_id: {index: len(data) for index, data in frames.items()}
+                for agent_id, frames in self._keyframes.items()
+                if frames
+            }
 
     def keyframe(self, agent_id: str, index: int) -> bytes:
         """Return an encoded keyframe; empty if it does not exist."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from gausslite.domain.errors import MismatchError
-from gausslite.domain.names import quote_name, require_name
+from gausslite.domain.names import quote_name, require_identifier, require_name
 
 _DEFAULT_MISSION_ID, _DEFAULT_WORLD_FRAME = "mission", "world"
 
@@ -32,9 +32,10 @@ class MissionConfig:
 def reconcile(own: MissionConfig, requested: MissionConfig) -> MissionConfig:
     """Return the configuration that satisfies both sides; an empty name accepts the other side's.
 
-    Raises InvalidInputError if a requested name is too long or not printable, MismatchError if the sides differ.
+    Raises InvalidInputError if a requested name is not permitted, MismatchError if the sides differ.
     """
-    require_name("mission_id", requested.mission_id)
+    if requested.mission_id:
+        require_identifier("mission_id", requested.mission_id)
     require_name("world_frame", requested.world_frame)
     if requested.voxel_size_m != own.voxel_size_m:
         raise MismatchError(

@@ -38,6 +38,11 @@ class SessionRegistry:
         """The agents that have a session."""
         return frozenset(session.agent_id for session in self._sessions.values())
 
+    @property
+    def live_agents(self) -> frozenset[str]:
+        """The agents that have a session whose lease has not ended."""
+        return frozenset(agent_id for agent_id in self.agents if self._remaining_s(agent_id) > 0)
+
     def require_free(self, agent_id: str, token: str) -> None:
         """Raise NameInUseError while another token holds the agent's lease."""
         remaining_s = self._remaining_s(agent_id)

@@ -171,12 +171,12 @@ class SqliteStore:
             rows = ((agent_id, index) for index in indices)
             db.executemany("DELETE FROM keyframes WHERE agent_id = ? AND frame_index = ?", rows)
 
-    def keyframe_indices(self) -> dict[str, tuple[int, ...]]:
-        """Return the frame indices of each agent's keyframes, ascending."""
-        indices: dict[str, tuple[int, ...]] = {}
-        for agent_id, index in self._read("SELECT agent_id, frame_index FROM keyframes ORDER BY frame_index"):
-            indices[agent_id] = (*indices.get(agent_id, ()), index)
-        return indices
+    def keyframe_sizes(self) -> dict[str, dict[int, int]]:
+        """Return the number of bytes of each agent's keyframes by frame index."""
+        sizes: dict[str, dict[int, int]] = {}
+        for agent_id, index, size in self._read("SELECT agent_id, frame_index, length(data) FROM keyframes"):
+            sizes.setdefault(agent_id, {})[index] = size
+        return sizes
 
     def keyframe(self, agent_id: str, index: int) -> bytes:
         """Return an encoded keyframe; empty if it does not exist."""

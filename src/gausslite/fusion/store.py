@@ -115,8 +115,8 @@ class FusionStore(Protocol):
         """Delete these keyframes of an agent, if they exist."""
         ...
 
-    def keyframe_indices(self) -> dict[str, tuple[int, ...]]:
-        """Return the frame indices of each agent's keyframes, ascending."""
+    def keyframe_sizes(self) -> dict[str, dict[int, int]]:
+        """Return the number of bytes of each agent's keyframes by frame index."""
         ...
 
     def keyframe(self, agent_id: str, index: int) -> bytes:

@@ -64,6 +64,7 @@ class MissionStatus:
     keyframes: int
     refined: bool
     agents: tuple[AgentContribution, ...]
+    banned_agents: tuple[str, ...] = ()
 
 
 def contribution(agent_id: str, scores: VoxelScoreTable, vote: VoteResult) -> AgentContribution:

@@ -32,9 +32,13 @@ class UsageLedger:
         replaced = own & np.isin(scores.keys, batch.keys[accepted])
         removed = AgentUsage(int(np.count_nonzero(replaced)), int(scores.counts[replaced].sum(dtype=np.int64)))
         added = AgentUsage(int(np.count_nonzero(accepted)), int(batch.counts[accepted].sum(dtype=np.int64)))
-        usage = self._usage.get(subset.agent_id, AgentUsage()).replace_part(removed, added)
+        usage = self.get(subset.agent_id).replace_part(removed, added)
         usage.require_within(self._quotas, subset.agent_id)
         return usage
+
+    def get(self, agent_id: str) -> AgentUsage:
+        """Return the usage of an agent; zero for an unknown one."""
+        return self._usage.get(agent_id, AgentUsage())
 
     def set(self, agent_id: str, usage: AgentUsage) -> None:
         """Store the usage of an agent."""

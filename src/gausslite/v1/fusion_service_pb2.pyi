@@ -161,13 +161,17 @@ class JoinSessionRequest(_message.Message):
     FRESH_MAP_FIELD_NUMBER: _builtins.int
     TASK_FIELD_NUMBER: _builtins.int
     T_FUSED_AGENT_FIELD_NUMBER: _builtins.int
+    TOKEN_FIELD_NUMBER: _builtins.int
     agent_id: _builtins.str
+    """1 to 64 letters, digits and . _ -, beginning with a letter or a digit; so is the mission."""
     mission_id: _builtins.str
     """Agents of one mission share a map; empty accepts the server's mission."""
     world_frame: _builtins.str
     """Name of the coordinate frame of all poses and means; empty accepts the server's."""
     fresh_map: _builtins.bool
     """The agent starts with an empty map, so the server deletes its earlier updates."""
+    token: _builtins.str
+    """A secret of this robot, the same in all of its joins. While the name's lease lasts, only its holder may join again."""
     @_builtins.property
     def grid(self) -> _geometry_pb2.VoxelGrid: ...
     @_builtins.property
@@ -188,10 +192,11 @@ class JoinSessionRequest(_message.Message):
         fresh_map: _builtins.bool = ...,
         task: _task_pb2.TaskGraph | None = ...,
         t_fused_agent: _geometry_pb2.RigidTransform | None = ...,
+        token: _builtins.str = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["grid", b"grid", "t_fused_agent", b"t_fused_agent", "task", b"task"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["agent_id", b"agent_id", "fresh_map", b"fresh_map", "grid", b"grid", "mission_id", b"mission_id", "t_fused_agent", b"t_fused_agent", "task", b"task", "world_frame", b"world_frame"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["agent_id", b"agent_id", "fresh_map", b"fresh_map", "grid", b"grid", "mission_id", b"mission_id", "t_fused_agent", b"t_fused_agent", "task", b"task", "token", b"token", "world_frame", b"world_frame"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
@@ -615,6 +620,7 @@ class GetSessionStatusResponse(_message.Message):
     KEYFRAMES_FIELD_NUMBER: _builtins.int
     REFINED_FIELD_NUMBER: _builtins.int
     VOTE_FIELD_NUMBER: _builtins.int
+    BANNED_AGENTS_FIELD_NUMBER: _builtins.int
     mission_id: _builtins.str
     world_frame: _builtins.str
     fused_revision: _builtins.int
@@ -629,6 +635,10 @@ class GetSessionStatusResponse(_message.Message):
     def grid(self) -> _geometry_pb2.VoxelGrid: ...
     @_builtins.property
     def agents(self) -> _containers.RepeatedCompositeFieldContainer[Global___AgentContribution]: ...
+    @_builtins.property
+    def banned_agents(self) -> _containers.RepeatedScalarFieldContainer[_builtins.str]:
+        """Names of the agents that an operator has banned."""
+
     def __init__(
         self,
         *,
@@ -642,10 +652,11 @@ class GetSessionStatusResponse(_message.Message):
         keyframes: _builtins.int = ...,
         refined: _builtins.bool = ...,
         vote: _builtins.str = ...,
+        banned_agents: _abc.Iterable[_builtins.str] | None = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["grid", b"grid"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["agents", b"agents", "fused_gaussians", b"fused_gaussians", "fused_revision", b"fused_revision", "fused_voxels", b"fused_voxels", "grid", b"grid", "keyframes", b"keyframes", "mission_id", b"mission_id", "refined", b"refined", "vote", b"vote", "world_frame", b"world_frame"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["agents", b"agents", "banned_agents", b"banned_agents", "fused_gaussians", b"fused_gaussians", "fused_revision", b"fused_revision", "fused_voxels", b"fused_voxels", "grid", b"grid", "keyframes", b"keyframes", "mission_id", b"mission_id", "refined", b"refined", "vote", b"vote", "world_frame", b"world_frame"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
@@ -1010,3 +1021,89 @@ class LeaveSessionResponse(_message.Message):
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
 Global___LeaveSessionResponse: _TypeAlias = LeaveSessionResponse  # noqa: Y015
+
+@_typing.final
+class EvictAgentRequest(_message.Message):
+    DESCRIPTOR: _descriptor.Descriptor
+
+    MISSION_ID_FIELD_NUMBER: _builtins.int
+    AGENT_ID_FIELD_NUMBER: _builtins.int
+    BAN_FIELD_NUMBER: _builtins.int
+    mission_id: _builtins.str
+    agent_id: _builtins.str
+    ban: _builtins.bool
+    """Also refuse later joins under this name, until UnbanAgent."""
+    def __init__(
+        self,
+        *,
+        mission_id: _builtins.str = ...,
+        agent_id: _builtins.str = ...,
+        ban: _builtins.bool = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["agent_id", b"agent_id", "ban", b"ban", "mission_id", b"mission_id"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___EvictAgentRequest: _TypeAlias = EvictAgentRequest  # noqa: Y015
+
+@_typing.final
+class EvictAgentResponse(_message.Message):
+    DESCRIPTOR: _descriptor.Descriptor
+
+    FUSED_REVISION_FIELD_NUMBER: _builtins.int
+    VOXELS_FIELD_NUMBER: _builtins.int
+    fused_revision: _builtins.int
+    voxels: _builtins.int
+    """Voxels of which the agent's data was deleted."""
+    def __init__(
+        self,
+        *,
+        fused_revision: _builtins.int = ...,
+        voxels: _builtins.int = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["fused_revision", b"fused_revision", "voxels", b"voxels"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___EvictAgentResponse: _TypeAlias = EvictAgentResponse  # noqa: Y015
+
+@_typing.final
+class UnbanAgentRequest(_message.Message):
+    DESCRIPTOR: _descriptor.Descriptor
+
+    MISSION_ID_FIELD_NUMBER: _builtins.int
+    AGENT_ID_FIELD_NUMBER: _builtins.int
+    mission_id: _builtins.str
+    agent_id: _builtins.str
+    def __init__(
+        self,
+        *,
+        mission_id: _builtins.str = ...,
+        agent_id: _builtins.str = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["agent_id", b"agent_id", "mission_id", b"mission_id"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___UnbanAgentRequest: _TypeAlias = UnbanAgentRequest  # noqa: Y015
+
+@_typing.final
+class UnbanAgentResponse(_message.Message):
+    DESCRIPTOR: _descriptor.Descriptor
+
+    def __init__(
+        self,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___UnbanAgentResponse: _TypeAlias = UnbanAgentResponse  # noqa: Y015

@@ -94,14 +94,25 @@ class FusionServiceStub(object):
                 request_serializer=gausslite_dot_v1_dot_fusion__service__pb2.LeaveSessionRequest.SerializeToString,
                 response_deserializer=gausslite_dot_v1_dot_fusion__service__pb2.LeaveSessionResponse.FromString,
                 _registered_method=True)
+        self.EvictAgent = channel.unary_unary(
+                '/gausslite.v1.FusionService/EvictAgent',
+                request_serializer=gausslite_dot_v1_dot_fusion__service__pb2.EvictAgentRequest.SerializeToString,
+                response_deserializer=gausslite_dot_v1_dot_fusion__service__pb2.EvictAgentResponse.FromString,
+                _registered_method=True)
+        self.UnbanAgent = channel.unary_unary(
+                '/gausslite.v1.FusionService/UnbanAgent',
+                request_serializer=gausslite_dot_v1_dot_fusion__service__pb2.UnbanAgentRequest.SerializeToString,
+                response_deserializer=gausslite_dot_v1_dot_fusion__service__pb2.UnbanAgentResponse.FromString,
+                _registered_method=True)
 
 
 class FusionServiceServicer(object):
     """Missing associated documentation comment in .proto file."""
 
     def JoinSession(self, request, context):
-        """Join a mission. Joining again is safe: the new session replaces the agent's earlier one.
-        FAILED_PRECONDITION if the grid, the world frame or the mission differ from the server's.
+        """Join a mission. Joining again with the same token is safe: the new session replaces the agent's earlier one.
+        FAILED_PRECONDITION if the grid, the world frame or the mission differ from the server's. ALREADY_EXISTS while
+        another token holds the name's lease, with the remaining time in RetryInfo. PERMISSION_DENIED for a banned agent.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
@@ -187,6 +198,20 @@ class FusionServiceServicer(object):
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
+    def EvictAgent(self, request, context):
+        """For operators: end an agent's session and delete all data of it; with `ban` its later joins get PERMISSION_DENIED.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
+    def UnbanAgent(self, request, context):
+        """For operators: let a banned agent join again. INVALID_ARGUMENT if it is not banned.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
 
 def add_FusionServiceServicer_to_server(servicer, server):
     rpc_method_handlers = {
@@ -249,6 +274,16 @@ def add_FusionServiceServicer_to_server(servicer, server):
                     servicer.LeaveSession,
                     request_deserializer=gausslite_dot_v1_dot_fusion__service__pb2.LeaveSessionRequest.FromString,
                     response_serializer=gausslite_dot_v1_dot_fusion__service__pb2.LeaveSessionResponse.SerializeToString,
+            ),
+            'EvictAgent': grpc.unary_unary_rpc_method_handler(
+                    servicer.EvictAgent,
+                    request_deserializer=gausslite_dot_v1_dot_fusion__service__pb2.EvictAgentRequest.FromString,
+                    response_serializer=gausslite_dot_v1_dot_fusion__service__pb2.EvictAgentResponse.SerializeToString,
+            ),
+            'UnbanAgent': grpc.unary_unary_rpc_method_handler(
+                    servicer.UnbanAgent,
+                    request_deserializer=gausslite_dot_v1_dot_fusion__service__pb2.UnbanAgentRequest.FromString,
+                    response_serializer=gausslite_dot_v1_dot_fusion__service__pb2.UnbanAgentResponse.SerializeToString,
             ),
     }
     generic_handler = grpc.method_handlers_generic_handler(
@@ -575,6 +610,60 @@ class FusionService(object):
             '/gausslite.v1.FusionService/LeaveSession',
             gausslite_dot_v1_dot_fusion__service__pb2.LeaveSessionRequest.SerializeToString,
             gausslite_dot_v1_dot_fusion__service__pb2.LeaveSessionResponse.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def EvictAgent(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/gausslite.v1.FusionService/EvictAgent',
+            gausslite_dot_v1_dot_fusion__service__pb2.EvictAgentRequest.SerializeToString,
+            gausslite_dot_v1_dot_fusion__service__pb2.EvictAgentResponse.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def UnbanAgent(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/gausslite.v1.FusionService/UnbanAgent',
+            gausslite_dot_v1_dot_fusion__service__pb2.UnbanAgentRequest.SerializeToString,
+            gausslite_dot_v1_dot_fusion__service__pb2.UnbanAgentResponse.FromString,
             options,
             channel_credentials,
             insecure,

@@ -35,8 +35,9 @@ class FusionServiceStub:
     @_typing.overload
     def __new__(cls, channel: _aio.Channel) -> FusionServiceAsyncStub: ...
     JoinSession: _grpc.UnaryUnaryMultiCallable[_fusion_service_pb2.JoinSessionRequest, _fusion_service_pb2.JoinSessionResponse]
-    """Join a mission. Joining again is safe: the new session replaces the agent's earlier one.
-    FAILED_PRECONDITION if the grid, the world frame or the mission differ from the server's.
+    """Join a mission. Joining again with the same token is safe: the new session replaces the agent's earlier one.
+    FAILED_PRECONDITION if the grid, the world frame or the mission differ from the server's. ALREADY_EXISTS while
+    another token holds the name's lease, with the remaining time in RetryInfo. PERMISSION_DENIED for a banned agent.
     """
     ContributeSubsets: _grpc.StreamStreamMultiCallable[_fusion_service_pb2.ContributeSubsetsRequest, _fusion_service_pb2.ContributeSubsetsResponse]
     """Send voxel updates; the server answers with cumulative acknowledgements. An acknowledged update is as durable as
@@ -66,13 +67,18 @@ class FusionServiceStub:
     """Render a layer of the map from a camera pose. RESOURCE_EXHAUSTED for more pixels than the server renders."""
     GetSessionStatus: _grpc.UnaryUnaryMultiCallable[_fusion_service_pb2.GetSessionStatusRequest, _fusion_service_pb2.GetSessionStatusResponse]
     LeaveSession: _grpc.UnaryUnaryMultiCallable[_fusion_service_pb2.LeaveSessionRequest, _fusion_service_pb2.LeaveSessionResponse]
+    EvictAgent: _grpc.UnaryUnaryMultiCallable[_fusion_service_pb2.EvictAgentRequest, _fusion_service_pb2.EvictAgentResponse]
+    """For operators: end an agent's session and delete all data of it; with `ban` its later joins get PERMISSION_DENIED."""
+    UnbanAgent: _grpc.UnaryUnaryMultiCallable[_fusion_service_pb2.UnbanAgentRequest, _fusion_service_pb2.UnbanAgentResponse]
+    """For operators: let a banned agent join again. INVALID_ARGUMENT if it is not banned."""
 
 @_typing.type_check_only
 class FusionServiceAsyncStub(FusionServiceStub):
     def __init__(self, channel: _aio.Channel) -> None: ...
     JoinSession: _aio.UnaryUnaryMultiCallable[_fusion_service_pb2.JoinSessionRequest, _fusion_service_pb2.JoinSessionResponse]  # type: ignore[assignment]
-    """Join a mission. Joining again is safe: the new session replaces the agent's earlier one.
-    FAILED_PRECONDITION if the grid, the world frame or the mission differ from the server's.
+    """Join a mission. Joining again with the same token is safe: the new session replaces the agent's earlier one.
+    FAILED_PRECONDITION if the grid, the world frame or the mission differ from the server's. ALREADY_EXISTS while
+    another token holds the name's lease, with the remaining time in RetryInfo. PERMISSION_DENIED for a banned agent.
     """
     ContributeSubsets: _aio.StreamStreamMultiCallable[_fusion_service_pb2.ContributeSubsetsRequest, _fusion_service_pb2.ContributeSubsetsResponse]  # type: ignore[assignment]
     """Send voxel updates; the server answers with cumulative acknowledgements. An acknowledged update is as durable as
@@ -102,6 +108,10 @@ class FusionServiceAsyncStub(FusionServiceStub):
     """Render a layer of the map from a camera pose. RESOURCE_EXHAUSTED for more pixels than the server renders."""
     GetSessionStatus: _aio.UnaryUnaryMultiCallable[_fusion_service_pb2.GetSessionStatusRequest, _fusion_service_pb2.GetSessionStatusResponse]  # type: ignore[assignment]
     LeaveSession: _aio.UnaryUnaryMultiCallable[_fusion_service_pb2.LeaveSessionRequest, _fusion_service_pb2.LeaveSessionResponse]  # type: ignore[assignment]
+    EvictAgent: _aio.UnaryUnaryMultiCallable[_fusion_service_pb2.EvictAgentRequest, _fusion_service_pb2.EvictAgentResponse]  # type: ignore[assignment]
+    """For operators: end an agent's session and delete all data of it; with `ban` its later joins get PERMISSION_DENIED."""
+    UnbanAgent: _aio.UnaryUnaryMultiCallable[_fusion_service_pb2.UnbanAgentRequest, _fusion_service_pb2.UnbanAgentResponse]  # type: ignore[assignment]
+    """For operators: let a banned agent join again. INVALID_ARGUMENT if it is not banned."""
 
 class FusionServiceServicer(metaclass=_abc_1.ABCMeta):
     @_abc_1.abstractmethod
@@ -110,8 +120,9 @@ class FusionServiceServicer(metaclass=_abc_1.ABCMeta):
         request: _fusion_service_pb2.JoinSessionRequest,
         context: _ServicerContext,
     ) -> _typing.Union[_fusion_service_pb2.JoinSessionResponse, _abc.Awaitable[_fusion_service_pb2.JoinSessionResponse]]:
-        """Join a mission. Joining again is safe: the new session replaces the agent's earlier one.
-        FAILED_PRECONDITION if the grid, the world frame or the mission differ from the server's.
+        """Join a mission. Joining again with the same token is safe: the new session replaces the agent's earlier one.
+        FAILED_PRECONDITION if the grid, the world frame or the mission differ from the server's. ALREADY_EXISTS while
+        another token holds the name's lease, with the remaining time in RetryInfo. PERMISSION_DENIED for a banned agent.
         """
 
     @_abc_1.abstractmethod
@@ -207,5 +218,21 @@ class FusionServiceServicer(metaclass=_abc_1.ABCMeta):
         request: _fusion_service_pb2.LeaveSessionRequest,
         context: _ServicerContext,
     ) -> _typing.Union[_fusion_service_pb2.LeaveSessionResponse, _abc.Awaitable[_fusion_service_pb2.LeaveSessionResponse]]: ...
+
+    @_abc_1.abstractmethod
+    def EvictAgent(
+        self,
+        request: _fusion_service_pb2.EvictAgentRequest,
+        context: _ServicerContext,
+    ) -> _typing.Union[_fusion_service_pb2.EvictAgentResponse, _abc.Awaitable[_fusion_service_pb2.EvictAgentResponse]]:
+        """For operators: end an agent's session and delete all data of it; with `ban` its later joins get PERMISSION_DENIED."""
+
+    @_abc_1.abstractmethod
+    def UnbanAgent(
+        self,
+        request: _fusion_service_pb2.UnbanAgentRequest,
+        context: _ServicerContext,
+    ) -> _typing.Union[_fusion_service_pb2.UnbanAgentResponse, _abc.Awaitable[_fusion_service_pb2.UnbanAgentResponse]]:
+        """For operators: let a banned agent join again. INVALID_ARGUMENT if it is not banned."""
 
 def add_FusionServiceServicer_to_server(servicer: FusionServiceServicer, server: _typing.Union[_grpc.Server, _aio.Server]) -> None: ...

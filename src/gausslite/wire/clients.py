@@ -5,6 +5,7 @@ Clients are thread-safe. Streams are iterators; closing one cancels the call.
 
 from __future__ import annotations
 
+import secrets
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
@@ -166,10 +167,17 @@ class FusionClient(ServiceChannel):
     kind = "fusion server"
 
     def __init__(
-        self, address: str, deadline_s: float = DEADLINE_S, mission_id: str = "", tls: Tls | None = None
+        self,
+        address: str,
+        deadline_s: float = DEADLINE_S,
+        mission_id: str = "",
+        tls: Tls | None = None,
+        token: str | None = None,
     ) -> None:
+        """token: the robot's secret in all its joins, for the lease of its name; by default one of this client."""
         super().__init__(address, deadline_s, tls)
         self.mission_id = mission_id
+        self._token = secrets.token_hex(16) if token is None else token
         self._stub = fusion_service_pb2_grpc.FusionServiceStub(self._channel)
 
     def join(
@@ -183,7 +191,8 @@ class FusionClient(ServiceChannel):
     ) -> Session:
         """Join the mission; T_fused_agent declares the pose of the agent's frame in the fused map's.
 
-        Raises MismatchError if the grid, the world frame or the mission differ.
+        Raises MismatchError if the grid, the world frame or the mission differ, NameInUseError while another robot
+        holds the name's lease, NotPermittedError for a banned agent.
         """
         request = fusion_service_pb2.JoinSessionRequest(
             agent_id=agent_id,
@@ -193,6 +202,7 @@ class FusionClient(ServiceChannel):
             fresh_map=fresh_map,
             task=None if task is None else convert_task.graph_to_message(task),
             t_fused_agent=None if T_fused_agent is None else convert.transform_to_message(T_fused_agent),
+            token=self._token,
         )
         response = self._call(self._stub.JoinSession, request)
         return Session(
@@ -323,6 +333,19 @@ class FusionClient(ServiceChannel):
         request = fusion_service_pb2.GetSessionStatusRequest(mission_id=self.mission_id)
         response: fusion_service_pb2.GetSessionStatusResponse = self._call(self._stub.GetSessionStatus, request)
         return response
+
+    def evict(self, agent_id: str, ban: bool = False) -> int:
+        """End an agent's session and delete its data; `ban` refuses its later joins. Returns the number of its voxels.
+
+        Raises NotPermittedError unless the caller is an operator, InvalidInputError for an unknown agent.
+        """
+        request = fusion_service_pb2.EvictAgentRequest(mission_id=self.mission_id, agent_id=agent_id, ban=ban)
+        return int(self._call(self._stub.EvictAgent, request).voxels)
+
+    def unban(self, agent_id: str) -> None:
+        """Let a banned agent join again. Raises NotPermittedError, InvalidInputError if it is not banned."""
+        request = fusion_service_pb2.UnbanAgentRequest(mission_id=self.mission_id, agent_id=agent_id)
+        self._call(self._stub.UnbanAgent, request)
 
     def leave(self, session_id: str, forget: bool = False) -> int:
         """Leave the mission; with `forget` the server deletes the agent's updates. Returns the fused revision."""

@@ -23,7 +23,9 @@ from grpc_reflection.v1alpha import reflection
 
 from gausslite.domain.errors import GaussLiteError, InvalidInputError, UnavailableError
 from gausslite.wire.address import UNIX, host_and_port
+from gausslite.wire.caller import Caller
 from gausslite.wire.connection import KEEPALIVE_S, connection_options
+from gausslite.wire.roles import require_role
 from gausslite.wire.status import to_status
 from gausslite.wire.tls import Tls
 
@@ -67,7 +69,7 @@ async def start_server(listen: str, services: Sequence[Service], tls: Tls | None
     Raises UnavailableError if the address is in use, InvalidInputError if it is not an address.
     """
     _require_free_address(listen)
-    server = grpc.aio.server(interceptors=[ErrorInterceptor()], options=_OPTIONS)
+    server = grpc.aio.server(interceptors=[CallInterceptor()], options=_OPTIONS)
     health_servicer = health.aio.HealthServicer()  # type: ignore[attr-defined]
     health_pb2_grpc.add_HealthServicer_to_server(health_servicer, server)
     for service in services:
@@ -128,8 +130,11 @@ async def serve_until_stopped(
             raise result
 
 
-class ErrorInterceptor(grpc.aio.ServerInterceptor):  # type: ignore[type-arg]
-    """End a call with the status of the error that its method raised; unexpected errors are INTERNAL and logged."""
+class CallInterceptor(grpc.aio.ServerInterceptor):  # type: ignore[type-arg]
+    """Check the caller's role, and end a call with the status of the error that its method raised.
+
+    Unexpected errors are INTERNAL and logged.
+    """
 
     async def intercept_service(
         self,
@@ -176,6 +181,7 @@ def _decoder(deserialize: Callable[[bytes], Any], method: str, streaming: bool) 
 def _guard_unary(inner: Any, decode: Callable[[Any], Any], method: str) -> Any:
     async def guarded(request: Any, context: Any) -> Any:
         try:
+            require_role(method, Caller.of(context))
             return await inner(decode(request), context)
         except Exception as error:
             await _abort(error, method, context)
@@ -186,6 +192,7 @@ def _guard_unary(inner: Any, decode: Callable[[Any], Any], method: str) -> Any:
 def _guard_stream(inner: Any, decode: Callable[[Any], Any], method: str) -> Any:
     async def guarded(request: Any, context: Any) -> AsyncIterator[Any]:
         try:
+            require_role(method, Caller.of(context))
             async for response in inner(decode(request), context):
                 yield response
         except Exception as error:

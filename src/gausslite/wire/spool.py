@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import heapq
 import os
+import secrets
 import sqlite3
 import threading
 from collections.abc import Iterable, Iterator
@@ -106,9 +107,12 @@ class Spool:
             self.is_new = self._property("agent_id") is None
             if self.is_new:
                 properties = [("agent_id", agent_id), ("voxel_size_m", grid.size_m), ("update_seq", 0)]
+                properties.append(("token", secrets.token_hex(16)))
                 self._database.executemany("INSERT INTO properties VALUES (?, ?)", properties)
                 self._database.commit()
             stored = self._property("agent_id"), self._property("voxel_size_m")
+            # with this secret, a restarted robot takes its own name back before the lease has ended
+            self.token = str(self._property("token"))
         if stored != (agent_id, grid.size_m):
             self.close()
             raise MismatchError(

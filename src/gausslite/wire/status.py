@@ -6,8 +6,10 @@ use the code.
 
 from __future__ import annotations
 
+from typing import Any
+
 import grpc
-from google.protobuf import any_pb2
+from google.protobuf import any_pb2, duration_pb2
 from google.rpc import code_pb2, error_details_pb2, status_pb2  # type: ignore[import-untyped]
 from grpc_status import rpc_status
 
@@ -29,8 +31,10 @@ _TABLE: tuple[tuple[type[GaussLiteError], grpc.StatusCode, str], ...] = (
     (errors.SessionUnknownError, grpc.StatusCode.NOT_FOUND, "SESSION_UNKNOWN"),
     (errors.MismatchError, grpc.StatusCode.FAILED_PRECONDITION, "MISMATCH"),
     (errors.RevisionGoneError, grpc.StatusCode.OUT_OF_RANGE, "REVISION_GONE"),
+    (errors.RateLimitError, grpc.StatusCode.RESOURCE_EXHAUSTED, "RATE_LIMIT"),
     (errors.QuotaError, grpc.StatusCode.RESOURCE_EXHAUSTED, "QUOTA"),
     (errors.StorageError, grpc.StatusCode.RESOURCE_EXHAUSTED, "STORAGE"),
+    (errors.NameInUseError, grpc.StatusCode.ALREADY_EXISTS, "NAME_IN_USE"),
     (errors.NotPermittedError, grpc.StatusCode.PERMISSION_DENIED, "NOT_PERMITTED"),
     (errors.UnavailableError, grpc.StatusCode.UNAVAILABLE, "UNAVAILABLE"),
     (errors.LanguageModelError, grpc.StatusCode.INTERNAL, "LANGUAGE_MODEL"),
@@ -64,12 +68,18 @@ def code_and_reason(error: GaussLiteError) -> tuple[grpc.StatusCode, str]:
 
 
 def to_status(error: GaussLiteError) -> grpc.Status:
-    """Return the status of an error: its code, its message and an ErrorInfo."""
+    """Return the status of an error: its code, its message, an ErrorInfo, and a RetryInfo if it has a retry time."""
     code, reason = code_and_reason(error)
-    detail = any_pb2.Any()
-    detail.Pack(error_details_pb2.ErrorInfo(reason=reason, domain=DOMAIN))
+    details: list[Any] = [error_details_pb2.ErrorInfo(reason=reason, domain=DOMAIN)]
+    if error.retry_after_s is not None:
+        delay = duration_pb2.Duration()
+        delay.FromMilliseconds(round(1000 * error.retry_after_s))
+        details.append(error_details_pb2.RetryInfo(retry_delay=delay))
+    packed = [any_pb2.Any() for _ in details]
+    for target, detail in zip(packed, details, strict=True):
+        target.Pack(detail)
     number = code_pb2.Code.Value(code.name)
-    status: grpc.Status = rpc_status.to_status(status_pb2.Status(code=number, message=str(error), details=[detail]))
+    status: grpc.Status = rpc_status.to_status(status_pb2.Status(code=number, message=str(error), details=packed))
     return status
 
 
@@ -83,9 +93,11 @@ def from_rpc_error(error: grpc.RpcError, address: str) -> GaussLiteError:
     if not isinstance(error, grpc.Call):
         return errors.UnavailableError(f"{address}: {error}")
     code, text = error.code(), error.details() or "no details"
-    reason = _reason(error)
+    reason, retry_after_s = _details(error)
     if reason is not None:
-        return error_from_reason(reason, text)
+        raised = error_from_reason(reason, text)
+        raised.retry_after_s = retry_after_s
+        return raised
     if code is grpc.StatusCode.DEADLINE_EXCEEDED:
         return errors.UnavailableError(f"{address}: no answer in time")
     if code is grpc.StatusCode.UNAVAILABLE and any(cause in text for cause in _NOT_LISTENING):
@@ -96,14 +108,18 @@ def from_rpc_error(error: grpc.RpcError, address: str) -> GaussLiteError:
     return _BY_CODE.get(code, GaussLiteError)(f"{address}: {code.name}: {first_line}")
 
 
-def _reason(error: grpc.Call) -> str | None:
+def _details(error: grpc.Call) -> tuple[str | None, float | None]:
+    """Return the ErrorInfo's reason and the RetryInfo's time in seconds; None for what the status does not have."""
     try:
         status = rpc_status.from_call(error)
     except ValueError:
         # the details contradict the code, so another program sent this status
-        return None
+        return None, None
+    reason, retry_after_s = None, None
     for detail in status.details if status is not None else ():
-        info = error_details_pb2.ErrorInfo()
+        info, retry = error_details_pb2.ErrorInfo(), error_details_pb2.RetryInfo()
         if detail.Unpack(info) and info.domain == DOMAIN:
-            return str(info.reason)
-    return None
+            reason = str(info.reason)
+        elif detail.Unpack(retry):
+            retry_after_s = retry.retry_delay.ToMilliseconds() / 1000
+    return reason, retry_after_s

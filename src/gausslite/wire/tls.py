@@ -11,10 +11,7 @@ from typing import Any, NoReturn
 
 import grpc
 
-from gausslite.domain.errors import InvalidInputError, NotPermittedError
-
-_CERTIFICATE_NAME_PROPERTIES = ("x509_common_name", "x509_subject_alternative_name")
-_CERTIFICATE = "x509_pem_cert"
+from gausslite.domain.errors import InvalidInputError
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,19 +67,6 @@ def open_channel(address: str, tls: Tls | None, options: Sequence[tuple[str, Any
     if address.startswith("unix:"):
         options = [*options, ("grpc.ssl_target_name_override", "localhost")]
     return grpc.secure_channel(address, tls.client_credentials(), options=options)
-
-
-def require_agent_certificate(context: Any, agent_id: str) -> None:
-    """Raise NotPermittedError if the client of this call has a certificate that does not name the agent."""
-    properties = context.auth_context()
-    if _CERTIFICATE not in properties:
-        return
-    names = {
-        name.decode(errors="replace") for kind in _CERTIFICATE_NAME_PROPERTIES for name in properties.get(kind, ())
-    }
-    if agent_id not in names:
-        owner = ", ".join(sorted(names))[:200]
-        raise NotPermittedError(f"agent {agent_id[:80]!r}: expected a certificate that names it, got one for {owner!r}")
 
 
 def _read(option: str, path: Path) -> bytes:

@@ -19,6 +19,7 @@ from gausslite.domain.errors import (
     GaussLiteError,
     InvalidInputError,
     MismatchError,
+    NameInUseError,
     NotPermittedError,
     QuotaError,
     SessionUnknownError,
@@ -34,6 +35,7 @@ from gausslite.v1 import geometry_pb2
 from gausslite.wire.clients import FusionClient, Session
 from gausslite.wire.free_space_outbox import FreeSpaceOutbox
 from gausslite.wire.object_outbox import ObjectOutbox
+from gausslite.wire.retry_delay import RetryDelay
 from gausslite.wire.spool import Purpose, Spool, SpoolBatch
 from gausslite.wire.spooled_keyframes import SpooledKeyframe
 from gausslite.wire.token_bucket import TokenBucket
@@ -42,7 +44,7 @@ from gausslite.wire.uplink_values import UplinkCounters, UplinkSettings
 _log = logging.getLogger(__name__)
 _MIN_SUBSET_BYTES = 1 << 16
 _MIN_INTERVAL_S = 0.02
-_MAX_BACKOFF_S = 5.0
+_LEAVE_S = 1.0
 _PURPOSES = {Purpose.ROI: pb.PURPOSE_ROI, Purpose.HANDOVER: pb.PURPOSE_HANDOVER}
 
 
@@ -69,7 +71,7 @@ class Uplink:
         self._message_seq = 0
         self._subset_bytes = MAX_SUBSET_BYTES
         self._token_bucket = TokenBucket(self._settings.kbps)
-        self._backoff_s = 0.0
+        self._retry_delay = RetryDelay(self._settings.first_backoff_s)
         self._last_error = ""
         self._next_round_s = 0.0
         self._draining = self._closing = False
@@ -148,10 +150,11 @@ class Uplink:
             self._changed.notify_all()
 
     def close(self) -> None:
-        """End the thread and the connection; pending updates stay in the spool."""
+        """Leave the session, end the thread and the connection; pending updates stay in the spool."""
         with self._changed:
             self._closing = True
             self._changed.notify_all()
+        self._thread.join(_LEAVE_S)
         # cancels a call in flight, so that the thread does not block on the network
         self._client.close()
         self._thread.join()
@@ -174,6 +177,9 @@ class Uplink:
                 except GaussLiteError as error:
                     if not self._closing:
                         self._recover(error)
+            if self._session is not None and not self._last_error:
+                # ends the lease, so that a robot without its spool can take the name again at once
+                self._client.leave(self._session.session_id)
         except Exception as error:
             # `close` makes a call in flight fail
             if not self._closing:
@@ -364,8 +370,9 @@ class Uplink:
             # logged once and not at every retry, because a robot may be offline for hours
             _log.warning("uplink: %s; retrying", error)
             self._last_error = str(error)
-        if isinstance(error, SessionUnknownError):
+        if isinstance(error, (NameInUseError, SessionUnknownError)):
             self._session = None
+        if isinstance(error, SessionUnknownError):
             self._spool.mark_all_unsent()
             self._objects.mark_unsent()
             self._free_space.mark_unsent()
@@ -373,15 +380,14 @@ class Uplink:
             self._subset_bytes = max(_MIN_SUBSET_BYTES, self._subset_bytes // 2)
         with self._changed:
             self._counters = replace(self._counters, connected=False)
-            self._backoff_s = min(max(2 * self._backoff_s, self._settings.first_backoff_s), _MAX_BACKOFF_S)
-            self._next_round_s = time.monotonic() + self._backoff_s
+            self._next_round_s = time.monotonic() + self._retry_delay.after(error)
 
     def _end_round(self, sent: bool) -> None:
         if sent and self._last_error:
             _log.info("uplink: %s accepts updates again", self._client)
             self._last_error = ""
         with self._changed:
-            self._backoff_s = 0.0
+            self._retry_delay.reset()
             self._counters = replace(self._counters, connected=self._session is not None)
             if not (sent and self._draining):
                 self._next_round_s = time.monotonic() + max(self._settings.interval_s, _MIN_INTERVAL_S)

@@ -11,7 +11,7 @@ from gausslite.domain.errors import CodecError, InvalidInputError, QuotaError
 from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.fusion.joint_refinement import RefineProgress, RefineSettings, refine
-from gausslite.fusion.keyframes import AgentKeyframe, EncodedKeyframe, KeyframePool
+from gausslite.fusion.keyframes import AgentKeyframe, EncodedKeyframe, KeyframeLimits, KeyframePool
 from gausslite.fusion.memory_store import MemoryStore
 from gausslite.optimize.density import DensitySettings
 from gausslite.optimize.rates import ONLINE_RATES
@@ -140,25 +140,35 @@ def encoded(agent_id: str, index: int, data: bytes = b"") -> EncodedKeyframe:
 
 def test_the_pool_keeps_the_newest_of_each_agent_and_replaces_a_resent_one() -> None:
     store = MemoryStore()
-    pool = KeyframePool(store, max_per_agent=2, max_pixels=18 * 24)
+    limits = KeyframeLimits(2, 18 * 24, bytes_in_all=9)
+    pool = KeyframePool(store, limits)
     for index, data in ((3, b"first"), (1, b""), (2, b""), (3, b"again")):
         pool.add(encoded("ant", index, data))
     pool.add(encoded("aardvark", 7))
     assert pool.encoded() == [("aardvark", b""), ("ant", b""), ("ant", b"again")]
     assert (len(pool), pool.count("ant"), pool.indices("ant"), pool.count("bee")) == (3, 2, (2, 3), 0)
     # the store keeps them for the next process
-    assert KeyframePool(store, 2, 18 * 24).indices("ant") == (2, 3)
+    assert KeyframePool(store, limits).indices("ant") == (2, 3)
     pool.remove_agent("ant")
     assert len(pool) == 1
-    assert store.keyframe_indices() == {"aardvark": (7,)}
+    assert {name: list(sizes) for name, sizes in store.keyframe_sizes().items()} == {"aardvark": [7]}
     with pytest.raises(QuotaError, match="at most 1 pixels"):
-        KeyframePool(store, 2, max_pixels=1).add(encoded("ant", 1))
-    with pytest.raises(InvalidInputError, match="limits of at least 1"):
-        KeyframePool(store, max_per_agent=0, max_pixels=1)
+        KeyframePool(store, KeyframeLimits(pixels=1)).add(encoded("ant", 1))
+    with pytest.raises(InvalidInputError, match="expected at least 1"):
+        KeyframeLimits(frames=0)
+
+
+def test_the_bytes_of_an_agents_keyframes_are_bounded_also_after_a_restart() -> None:
+    store, limits = MemoryStore(), KeyframeLimits(frames=64, bytes_in_all=10)
+    for index in (1, 2, 3):
+        KeyframePool(store, limits).add(encoded("ant", index, b"1234"))
+    assert KeyframePool(store, limits).indices("ant") == (2, 3)
+    with pytest.raises(QuotaError, match="keyframe 4: expected at most 10 bytes, got 11"):
+        KeyframePool(store, limits).add(encoded("ant", 4, b"x" * 11))
 
 
 def test_keyframes_that_are_not_selected_are_deleted() -> None:
-    pool = KeyframePool(MemoryStore(), max_per_agent=4, max_pixels=18 * 24)
+    pool = KeyframePool(MemoryStore(), KeyframeLimits(4, 18 * 24))
     for index in (1, 2, 3):
         pool.add(encoded("ant", index))
     pool.add(encoded("ant", 9), selected=(2, 5))
@@ -166,7 +176,7 @@ def test_keyframes_that_are_not_selected_are_deleted() -> None:
 
 
 def test_a_damaged_keyframe_is_named() -> None:
-    pool = KeyframePool(MemoryStore(), 4, 18 * 24, decode_frame)
+    pool = KeyframePool(MemoryStore(), KeyframeLimits(4, 18 * 24), decode_frame)
     pool.add(encoded("ant", 1, b"\xff\xff"))
     with pytest.raises(CodecError, match="expected an EncodedFrame"):
         pool.decode(pool.encoded())

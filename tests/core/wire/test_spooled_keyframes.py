@@ -100,10 +100,14 @@ def test_a_server_that_lost_its_keyframes_gets_them_again_and_one_that_has_them_
     assert agent.keyframes == 1
 
 
-def test_the_server_keeps_exactly_the_selected_keyframes() -> None:
-    with fusion_server() as fusion, uplink(fusion.client.address) as link:
-        for index, replaced in ((1, None), (2, None), (3, 1)):
-            link.enqueue_keyframe(encoded(index), replaced)
-            assert link.drain(WAIT_S)
-        with FusionClient(fusion.client.address) as client:
+def test_the_server_keeps_exactly_the_selected_keyframes(tmp_path: Path) -> None:
+    path = tmp_path / "x.spool"
+    with fusion_server() as fusion:
+        with uplink(fusion.client.address, spool=path) as link:
+            for index, replaced in ((1, None), (2, None), (3, 1)):
+                link.enqueue_keyframe(encoded(index), replaced)
+                assert link.drain(WAIT_S)
+        spool = Spool(path, "robot", GRID)
+        with FusionClient(fusion.client.address, token=spool.token) as client:
             assert client.join("robot", GRID).keyframes == (2, 3)
+        spool.close()

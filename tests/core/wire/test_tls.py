@@ -183,7 +183,7 @@ def test_a_key_is_in_no_representation(certs: Path, caplog: pytest.LogCaptureFix
     assert "BEGIN PRIVATE KEY" not in caplog.text
 
 
-@pytest.mark.parametrize("arguments", [[], ["folder"], ["folder", "../x"], ["folder", "a b"]])
+@pytest.mark.parametrize("arguments", [[], ["folder"], ["folder", "../x"], ["folder", "a b"], ["folder", "a:king"]])
 def test_the_script_names_the_expected_arguments(arguments: list[str], tmp_path: Path) -> None:
     done = subprocess.run(
         ["bash", str(SCRIPT), *(argument.replace("folder", str(tmp_path)) for argument in arguments)],

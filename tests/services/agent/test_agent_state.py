@@ -53,8 +53,8 @@ def agent_run(
     )
     uplink = None
     if fusion is not None:
-        client = FusionClient(fusion.client.address)
         opened_spool = Spool(spool, "robot", GRID)
+        client = FusionClient(fusion.client.address, token=opened_spool.token)
         uplink_settings = UplinkSettings(interval_s=0.0)
         uplink = Uplink(client, "robot", opened_spool, GRID, uplink_settings, has_restored_map=saved is not None)
     worker = MappingWorker(options.mission, GRID, lambda _graph: RegionRelevanceEstimator([MUG]), uplink)

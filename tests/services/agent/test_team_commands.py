@@ -38,7 +38,7 @@ def test_a_team_is_watched_ended_refined_and_fetched(tmp_path: Path, capsys: pyt
         assert main(["status", server]) == 0
         out = capsys.readouterr().out
         assert "keyframes  1; not refined yet" in out
-        assert "robot      joined" in out
+        assert "robot      absent" in out
         refined, voted = tmp_path / "refined.ply", tmp_path / "voted.ply"
         assert main(["refine", server, "--iterations", "2", "--out", str(refined)]) == 0
         assert main(["fetch", server, "--out", str(voted)]) == 0

@@ -13,6 +13,7 @@ from gausslite.codec.ply import gaussians_from_ply
 from gausslite.domain.errors import (
     InvalidInputError,
     MismatchError,
+    NameInUseError,
     QuotaError,
     RevisionGoneError,
     SessionUnknownError,
@@ -24,7 +25,7 @@ from gausslite.fusion.limits import FusionSettings, Quotas
 from gausslite.fusion.memory_store import MemoryStore
 from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.v1 import fusion_service_pb2 as pb
-from gausslite.wire.clients import Export
+from gausslite.wire.clients import Export, FusionClient
 
 ACCEPTED, STALE, REJECTED = pb.SUBSET_STATUS_ACCEPTED, pb.SUBSET_STATUS_STALE, pb.SUBSET_STATUS_REJECTED
 
@@ -100,10 +101,14 @@ def test_a_quota_counts_stored_and_not_sent_gaussians() -> None:
 def test_a_robot_whose_agent_id_another_one_uses_is_refused() -> None:
     with fusion_server() as t:
         first, second = (t.client.join("ant", GRID).session_id for _ in range(2))
-        with pytest.raises(MismatchError, match="another robot has joined under this name"):
+        with pytest.raises(MismatchError, match="another robot uses this name"):
             t.contribute_subsets(first, make_subset("ant", 1, {0: [1]}))
         with pytest.raises(MismatchError):
             t.client.leave(first)
+        other = FusionClient(t.client.address)
+        with other, pytest.raises(NameInUseError, match="end of its lease") as refused:
+            other.join("ant", GRID)
+        assert 0 < refused.value.retry_after_s <= 60
         assert t.contribute_subsets(second, make_subset("ant", 1, {0: [1]}))[0].status == ACCEPTED
 
 
@@ -139,10 +144,15 @@ def test_another_mission_config_is_a_mismatch_that_names_both_values() -> None:
             t.contribute_subsets(session, subset, grid=coarse)
 
 
-@pytest.mark.parametrize("agent_id", ["", "x" * 256])
-def test_an_agent_id_must_be_a_name_of_limited_length(agent_id: str) -> None:
-    with fusion_server() as t, pytest.raises(InvalidInputError, match="agent_id"):
-        t.client.join(agent_id, GRID)
+@pytest.mark.parametrize("name", ["", "x" * 65, "-rf", "a b", "a\nb", "a/b", "\x1b[31m", "Ünal"])
+def test_names_of_agents_and_missions_have_a_safe_alphabet(name: str) -> None:
+    with fusion_server() as t:
+        with pytest.raises(InvalidInputError, match=r"agent_id: expected 1 to 64 letters, digits and \. _ -"):
+            t.client.join(name, GRID)
+        t.client.mission_id = name
+        if name:
+            with pytest.raises(InvalidInputError, match="mission_id: expected 1 to 64 letters"):
+                t.client.join("ant", GRID)
 
 
 def test_a_grid_is_required() -> None:

@@ -1,0 +1,176 @@
+"""What a hostile or faulty agent can do to a mission: nothing beyond its own name and a plausible kappa."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fusion_running import GRID, make_subset
+
+from gausslite.domain.errors import (
+    InvalidInputError,
+    MismatchError,
+    NameInUseError,
+    NotPermittedError,
+    QuotaError,
+    SessionUnknownError,
+)
+from gausslite.domain.voxel_batch import RoiSubset
+from gausslite.fusion.engine import FusionEngine
+from gausslite.fusion.limits import FusionSettings, Quotas
+from gausslite.fusion.memory_store import MemoryStore
+from gausslite.fusion.mission_config import MissionConfig
+from gausslite.fusion.sessions import SessionRegistry
+from gausslite.fusion.sqlite_store import SqliteStore
+from gausslite.fusion.store import FusionStore
+from gausslite.fusion.update_checks import MAX_SEQ_STEP, UpdateChecks
+
+ANYTHING = MissionConfig("", "", GRID.size_m)
+LARGEST = (1 << 63) - 1
+
+
+class Clock:
+    """A time that the test sets."""
+
+    now_s = 1000.0
+
+    def __call__(self) -> float:
+        return self.now_s
+
+
+def new_engine(store: FusionStore | None = None, **settings: object) -> FusionEngine:
+    return FusionEngine(store or MemoryStore(), FusionSettings(grid=GRID, **settings))
+
+
+def join(engine: FusionEngine, agent_id: str, token: str = "own") -> str:
+    return engine.join(agent_id, ANYTHING, token=token).session.session_id
+
+
+def with_declared_sum(subset: RoiSubset, kappa_sum: int) -> RoiSubset:
+    sums = np.full(len(subset.batch), kappa_sum, np.uint64)
+    return replace(subset, batch=replace(subset.batch, kappa_sums=sums))
+
+
+@pytest.mark.parametrize("declared", [LARGEST, (1 << 64) - 1, 0])
+def test_a_declared_kappa_sum_wins_no_voxel(declared: int) -> None:
+    engine = new_engine()
+    cells = {cell: [3, 4] for cell in range(1000)}
+    engine.contribute(join(engine, "good"), make_subset("good", 1, cells), GRID)
+    liar = make_subset("liar", 1, {cell: [0] for cell in cells})
+    engine.contribute(join(engine, "liar"), with_declared_sum(liar, declared), GRID)
+    won = {agent.agent_id: (agent.won_voxels, agent.kappa_sum) for agent in engine.status().agents}
+    assert won == {"good": (1000, 7000), "liar": (0, 0)}
+
+
+def test_the_kappa_of_a_gaussian_is_bounded_by_the_time_since_the_first_join() -> None:
+    store, clock = MemoryStore(), Clock()
+    quotas = Quotas(kappa_at_join=100, kappa_per_second=10)
+    checks = UpdateChecks(store, quotas, clock)
+    checks.record_join("ant")
+    assert checks.check(make_subset("ant", 1, {0: [100], 1: []})).batch.kappa_sums.tolist() == [100, 0]
+    with pytest.raises(QuotaError, match="'ant': expected a kappa of at most 100 this long after its first join"):
+        checks.check(make_subset("ant", 1, {0: [101]}))
+    clock.now_s += 5
+    checks.record_join("ant")
+    assert checks.check(make_subset("ant", 1, {0: [150]}))
+    # a restarted server does not start again
+    assert UpdateChecks(store, quotas, clock).check(make_subset("ant", 1, {0: [150]}))
+    clock.now_s -= 500
+    assert checks.check(make_subset("ant", 1, {0: [100]}))
+
+
+def test_a_sequence_number_cannot_use_up_all_later_ones() -> None:
+    engine = new_engine()
+    ant = join(engine, "ant")
+    for poison in (LARGEST, MAX_SEQ_STEP + 1):
+        with pytest.raises(InvalidInputError, match="expected an update_seq of at most"):
+            engine.contribute(ant, make_subset("ant", poison, {0: [1]}), GRID)
+    assert engine.join("ant", ANYTHING, token="own").highest_update_seq == 0
+    ant = join(engine, "ant")
+    assert len(engine.contribute(ant, make_subset("ant", MAX_SEQ_STEP, {0: [1]}), GRID).accepted) == 1
+    assert len(engine.contribute(ant, make_subset("ant", MAX_SEQ_STEP + 7, {0: [1]}), GRID).accepted) == 1
+
+
+def test_an_evicted_agent_leaves_no_data_and_a_banned_one_stays_out_after_a_restart(tmp_path: Path) -> None:
+    store = SqliteStore(tmp_path / "store.sqlite")
+    engine = new_engine(store)
+    ant, bee = join(engine, "ant"), join(engine, "bee")
+    engine.contribute(ant, make_subset("ant", 1, {0: [9], 1: [9]}), GRID)
+    engine.contribute(bee, make_subset("bee", 1, {1: [1]}), GRID)
+    assert engine.evict("ant", ban=True) == 2
+    assert [agent.agent_id for agent in engine.status().agents] == ["bee"]
+    assert engine.maps.voted_map().gaussians.kappa.tolist() == [1]
+    with pytest.raises(SessionUnknownError):
+        engine.contribute(ant, make_subset("ant", 2, {0: [9]}), GRID)
+    store.close()
+    store = SqliteStore(tmp_path / "store.sqlite")
+    engine = new_engine(store)
+    assert engine.status().banned_agents == ("ant",)
+    with pytest.raises(NotPermittedError, match="'ant': banned by an operator"):
+        join(engine, "ant")
+    engine.unban("ant")
+    assert join(engine, "ant")
+    assert engine.evict("ant") == 0
+    assert join(engine, "ant")
+    with pytest.raises(InvalidInputError, match=r"expected an agent of the mission \(ant, bee\), got 'cat'"):
+        engine.evict("cat")
+    with pytest.raises(InvalidInputError, match=r"expected a banned agent \(none is banned\)"):
+        engine.unban("ant")
+    assert engine.evict("cat", ban=True) == 0
+    assert engine.status().banned_agents == ("cat",)
+    store.close()
+
+
+def test_the_name_of_a_live_robot_is_taken_over_only_with_its_token_or_after_its_lease() -> None:
+    store, clock = MemoryStore(), Clock()
+    sessions = SessionRegistry(store, 60.0, clock)
+    first = sessions.open("ant", "token").session_id
+    clock.now_s += 59
+    with pytest.raises(NameInUseError, match="wait 1 s for the end of its lease") as refused:
+        sessions.open("ant", "thief")
+    assert refused.value.retry_after_s == pytest.approx(1)
+    assert sessions.get(first).agent_id == "ant"
+    clock.now_s += 59
+    with pytest.raises(NameInUseError):
+        sessions.open("ant", "")
+    # also after a restart of the server, which has no token in clear
+    assert b"token" not in b"".join(store.records("join-token").values())
+    restarted = SessionRegistry(store, 60.0, clock)
+    with pytest.raises(NameInUseError):
+        restarted.open("ant", "thief")
+    second = restarted.open("ant", "token").session_id
+    with pytest.raises(MismatchError, match="another robot uses this name"):
+        restarted.get(first)
+    clock.now_s += 61
+    third = restarted.open("ant", "thief").session_id
+    with pytest.raises(NameInUseError) as replaced:
+        restarted.get(second)
+    assert replaced.value.retry_after_s == 60
+    clock.now_s += 61
+    assert restarted.open("ant", "token").session_id != third
+
+
+def test_names_that_never_contributed_do_not_fill_a_mission() -> None:
+    engine = new_engine(quotas=Quotas(agents=3), lease_s=0.0)
+    engine.contribute(join(engine, "good"), make_subset("good", 1, {0: [1]}), GRID)
+    for number in range(10):
+        join(engine, f"junk-{number}")
+    assert join(engine, "late")
+    assert {agent.agent_id for agent in engine.status().agents} >= {"good", "late"}
+    crowded = new_engine(quotas=Quotas(agents=3))
+    for number in range(3):
+        join(crowded, f"junk-{number}")
+    with pytest.raises(QuotaError, match="at most 3 in this mission"):
+        join(crowded, "late")
+
+
+def test_a_joiner_that_is_gone_and_never_contributed_fixes_nothing() -> None:
+    engine = new_engine(lease_s=0.0)
+    engine.join("junk", MissionConfig("wrong", "wrong", GRID.size_m))
+    session = engine.join("ant", MissionConfig("rescue", "map", GRID.size_m)).session.session_id
+    assert engine.mission_config.mission_id == "rescue"
+    engine.contribute(session, make_subset("ant", 1, {0: [1]}), GRID)
+    with pytest.raises(MismatchError, match="expected 'map' as agreed here, got 'odom'"):
+        engine.join("bee", MissionConfig("", "odom", GRID.size_m))
