@@ -29,7 +29,7 @@ from gausslite_bench.team.missions import AgentMap, map_agent
 from gausslite_bench.team.scenes import TeamPlan, TeamScene
 
 CONCATENATION, VOTE, REFINED, SHARED_VOTE = "concatenation", "vote", "refine", "vote of shared regions"
-UNALIGNED = "vote, frames trusted"
+TRUSTED = ", frames trusted"
 FREE_SPACE_VOTE = "free-space vote"
 
 
@@ -94,21 +94,10 @@ def run_trial(trial: TeamTrial, scene: TeamScene, on_frame: Callable[[FrameOutco
     for i, agent in enumerate(scene.agents):
         wrong = agent if i == 0 else replace(agent, frames=trial.frame_error.apply(agent.frames))
         maps.append(map_agent(wrong, replace(trial.settings, seed=trial.seed + i), trial.grid, on_frame))
-    engine = fuse_messages({each.agent_id: whole_map(each, trial.grid) for each in maps}, trial.grid, align=True)
-    fused = {CONCATENATION: engine.maps.union_map().gaussians, VOTE: engine.maps.voted_map().gaussians}
+    fused, engine = _fuse(trial, maps, align=True)
     if not trial.frame_error.is_zero:
-        trusted = fuse_messages({each.agent_id: whole_map(each, trial.grid) for each in maps}, trial.grid, align=False)
-        fused[UNALIGNED] = trusted.maps.voted_map().gaussians
-    whole = {each.agent_id: whole_map(each, trial.grid) for each in maps}
-    free = {each.agent_id: each.free_space for each in maps}
-    fused[FREE_SPACE_VOTE] = fuse_messages(whole, trial.grid, align=True, free_space=free).maps.voted_map().gaussians
-    first, *others = maps
-    shared = {first.agent_id: whole_map(first, trial.grid), **{each.agent_id: each.messages for each in others}}
-    fused[SHARED_VOTE] = fuse_messages(shared, trial.grid, align=True).maps.voted_map().gaussians
-    if trial.refine_iterations > 0:
-        fused[REFINED] = _refine(
-            trial, fused[VOTE], engine.in_fused_frame([k for each in maps for k in each.keyframes])
-        )
+        trusted, _ = _fuse(trial, maps, align=False)
+        fused |= {f"{name}{TRUSTED}": gaussians for name, gaussians in trusted.items() if name != CONCATENATION}
     rasterizer = choose_rasterizer(threads=trial.settings.threads)
     viewers = {name: MapViewer(gaussians, rasterizer) for name, gaussians in fused.items() if len(gaussians)}
     total, active = (
@@ -124,6 +113,23 @@ def run_trial(trial: TeamTrial, scene: TeamScene, on_frame: Callable[[FrameOutco
         sum(each.bytes_whole for each in maps),
         {each.agent_id: str(each.alignment.state) for each in engine.status().agents},
     )
+
+
+def _fuse(trial: TeamTrial, maps: Sequence[AgentMap], align: bool) -> tuple[dict[str, Gaussians], FusionEngine]:
+    """Return the fused map of each strategy, and the engine that has received the whole maps."""
+    grid = trial.grid
+    whole = {each.agent_id: whole_map(each, grid) for each in maps}
+    engine = fuse_messages(whole, grid, align)
+    fused = {CONCATENATION: engine.maps.union_map().gaussians, VOTE: engine.maps.voted_map().gaussians}
+    free = {each.agent_id: each.free_space for each in maps}
+    fused[FREE_SPACE_VOTE] = fuse_messages(whole, grid, align, free_space=free).maps.voted_map().gaussians
+    first, *others = maps
+    shared = {first.agent_id: whole_map(first, grid), **{each.agent_id: each.messages for each in others}}
+    fused[SHARED_VOTE] = fuse_messages(shared, grid, align).maps.voted_map().gaussians
+    if trial.refine_iterations > 0:
+        keyframes = engine.in_fused_frame([keyframe for each in maps for keyframe in each.keyframes])
+        fused[REFINED] = _refine(trial, fused[VOTE], keyframes)
+    return fused, engine
 
 
 def whole_map(agent_map: AgentMap, grid: VoxelGrid) -> tuple[RoiSubset, ...]:
