@@ -1,0 +1,123 @@
+"""MkDocs hook: shows README files as pages of the site, adapts links and lists, and renders equations as MathML."""
+
+from __future__ import annotations
+
+import html
+import os
+import posixpath
+import re
+import subprocess
+import sys
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from latex2mathml.converter import convert as mathml
+from mkdocs.structure.files import File, Files
+
+if TYPE_CHECKING:
+    from mkdocs.config.defaults import MkDocsConfig
+    from mkdocs.structure.pages import Page
+
+ROOT = Path(__file__).resolve().parents[1]
+
+# Files outside docs/, and the names of their pages
+PAGES = {
+    "README.md": "index.md",
+    "ARCHITECTURE.md": "architecture.md",
+    "CONTRIBUTING.md": "contributing.md",
+    "CHANGELOG.md": "changelog.md",
+    "services/agent/README.md": "services/agent.md",
+    "services/fusion_server/README.md": "services/fusion-server.md",
+    "services/parser/README.md": "services/parser.md",
+    "native/README.md": "development/kernels.md",
+    "proto/gausslite/v1/README.md": "development/messages.md",
+    "src/gausslite/codec/README.md": "development/codec.md",
+    "src/gausslite/wire/README.md": "development/wire.md",
+}
+COMMANDS_PAGE = "reference/commands.md"
+SERVICES = {
+    "gausslite-agent": "gausslite_agent",
+    "gausslite-fusion-server": "gausslite_fusion_server",
+    "gausslite-parser": "gausslite_parser",
+}
+
+_FENCE = re.compile(r"^(```.*?^```)", re.MULTILINE | re.DOTALL)
+_LINK = re.compile(r"(!?)\[((?:[^\[\]]|\[[^\]]*\])*)\]\(([^)\s]+)\)")
+_LIST_AFTER_TEXT = re.compile(r"^(?!\s*(?:[-*]|\d+\.) )(.*\S.*)\n(?=(?:[-*]|\d+\.) )", re.MULTILINE)
+_EQUATION = re.compile(r'<(span|div) class="arithmatex">\\([(\[])(.*?)\\[)\]]</\1>', re.DOTALL)
+
+
+def on_files(files: Files, *, config: MkDocsConfig) -> Files:
+    """Add the pages of files outside docs/, and the reference of all commands."""
+    for source, uri in PAGES.items():
+        files.append(File.generated(config, uri, content=(ROOT / source).read_text(encoding="utf-8")))
+    files.append(File.generated(config, COMMANDS_PAGE, content=_commands_page()))
+    return files
+
+
+def on_page_markdown(markdown: str, *, page: Page, **_: object) -> str:
+    """Return a page with links between pages of the site, and with blank lines before lists.
+
+    A list that follows a line of text is a list on GitHub, but not in Python-Markdown.
+    """
+    parts = _FENCE.split(markdown)
+    for index in range(0, len(parts), 2):  # the odd parts are fenced code
+        parts[index] = _LIST_AFTER_TEXT.sub(r"\1\n\n", _LINK.sub(lambda link: _site_link(link, page), parts[index]))
+    return "".join(parts)
+
+
+def on_page_content(content: str, **_: object) -> str:
+    """Return a page's HTML with equations as MathML, which browsers render without a script."""
+
+    def equation(match: re.Match[str]) -> str:
+        return mathml(html.unescape(match[3]), display="block" if match[2] == "[" else "inline")
+
+    return _EQUATION.sub(equation, content)
+
+
+def _site_link(link: re.Match[str], page: Page) -> str:
+    """Return a link to a page of the site; of a link to a source file, return its text."""
+    image, text, target = link.groups()
+    path, hash_sign, anchor = target.partition("#")
+    if not path or re.match(r"[a-z]+:", target):
+        return link[0]
+    site_uri = page.file.src_uri
+    source = next((source for source, uri in PAGES.items() if uri == site_uri), f"docs/{site_uri}")
+    resolved = posixpath.normpath(posixpath.join(posixpath.dirname(source), path))
+    if resolved in PAGES:
+        uri = PAGES[resolved]
+    elif resolved.startswith("docs/"):
+        uri = resolved.removeprefix("docs/")
+    elif (ROOT / resolved).exists():
+        return text
+    else:
+        return link[0]  # MkDocs reports it
+    relative = posixpath.relpath(uri, posixpath.dirname(site_uri) or ".")
+    return f"{image}[{text}]({relative}{hash_sign}{anchor})"
+
+
+def _help(module: str, *arguments: str) -> str:
+    command = [sys.executable, "-m", module, *arguments, "--help"]
+    return subprocess.run(
+        command, check=True, capture_output=True, text=True, env={**os.environ, "COLUMNS": "110"}
+    ).stdout
+
+
+def _sub_commands(help_text: str) -> list[str]:
+    """Return the names of sub-commands in a help text: the words that argparse indents by four spaces."""
+    _, _, listed = help_text.partition("positional arguments:")
+    return re.findall(r"^    ([a-z][\w-]*)(?:\s|$)", listed.partition("\noptions:")[0], re.MULTILINE)
+
+
+@cache
+def _commands_page() -> str:
+    """Return the help texts of all programs and their sub-commands as one page."""
+    sections = [("gausslite", _help("gausslite"))]
+    for name in _sub_commands(sections[0][1]):
+        text = _help("gausslite", name)
+        sections.append((f"gausslite {name}", text))
+        sections += [(f"gausslite {name} {sub}", _help("gausslite", name, sub)) for sub in _sub_commands(text)]
+    sections += [(program, _help(module)) for program, module in SERVICES.items()]
+    body = "\n\n".join(f"## `{title}`\n\n```text\n{text.rstrip()}\n```" for title, text in sections)
+    return f"# Commands\n\nThe help texts of all programs, as `--help` prints them.\n\n{body}\n"
