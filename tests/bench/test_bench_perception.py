@@ -84,6 +84,11 @@ def test_scores_of_a_weak_detector():
         vase.stages[PerceptionStage.TRACKED].marked_frames == vase.stages[PerceptionStage.CONFIRMED].marked_frames == 0
     )
     assert vase.stages[PerceptionStage.DETECTED].iou is None
+    found, missed = mugs.object_scores
+    assert (found.name, found.shown_frames, found.detected_share) == ("mug_1", 4, 1.0)
+    # confirmed by the second detection, so three of the four frames since the first one are marked
+    assert found.recall == {"detected": 1.0, "related": 1.0, "confirmed": 0.75, "tracked": 0.75}
+    assert (missed.detected_share, set(missed.recall.values())) == (0.0, {None})
 
 
 def test_a_sheet_has_a_row_for_each_segment_and_a_column_for_each_stage():
@@ -119,7 +124,10 @@ def test_the_command_prints_its_figures(arguments, tmp_path, capsys):
     assert set(printed["tasks"][0]["stages"]) == {"detected", "related", "confirmed", "tracked"}
     assert len(list((tmp_path / "sheets").iterdir())) == 2
     assert main(arguments) == 0
-    assert "| Find the dog (nothing; shown in 0 of 3 frames) | detected |" in capsys.readouterr().out
+    printed_tables = capsys.readouterr().out
+    assert "| Find the dog (nothing; shown in 0 of 3 frames) | detected |" in printed_tables
+    # the network marks a corner of the mug, less than a quarter of it
+    assert "| Find the mug | mug | 3 | 0 |  |" in printed_tables
 
 
 @pytest.mark.parametrize(

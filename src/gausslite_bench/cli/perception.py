@@ -22,7 +22,7 @@ from gausslite.domain.region import Region
 from gausslite.mission.results import as_text, prepare_folder
 from gausslite.task.rules import RuleParser
 from gausslite_bench.perception.contact_sheet import PerceptionSheet
-from gausslite_bench.perception.stage_scores import PerceptionBench, TaskQuery, TaskScore
+from gausslite_bench.perception.stage_scores import PerceptionBench, PerceptionStage, TaskQuery, TaskScore
 
 _COLUMNS = ("IoU", "precision", "recall", "marked, %", "max, %", "frames", "right", "found", "late")
 
@@ -75,7 +75,7 @@ def run_perception(options: argparse.Namespace) -> int:
     if options.json:
         print(as_text({"command": command, "tasks": [asdict(score) for score in bench.scores()]}))
     else:
-        print(f"`{command}`\n\n{perception_table(bench.scores())}")
+        print(f"`{command}`\n\n{perception_table(bench.scores())}\n\n{object_table(bench.scores())}")
     return 0
 
 
@@ -98,6 +98,21 @@ def perception_table(scores: Sequence[TaskScore]) -> str:
             )
             lines.append(f"| {title} | {stage} | {' | '.join(cells)} |")
             title = ""
+    return "\n".join(lines)
+
+
+def object_table(scores: Sequence[TaskScore]) -> str:
+    """Return a Markdown table with one row per object: how often it is detected, and its recall from then on."""
+    stages = " | ".join(f"recall {stage}" for stage in PerceptionStage)
+    lines = [
+        f"| task | object | frames | detected, % | {stages} |",
+        "|---|---" + "|---:" * (2 + len(PerceptionStage)) + "|",
+    ]
+    for score in scores:
+        for each in score.object_scores:
+            recalls = " | ".join(_format(each.recall[stage], 2) for stage in PerceptionStage)
+            detected = f"{100 * each.detected_share:.0f}"
+            lines.append(f"| {score.task} | {each.name} | {each.shown_frames} | {detected} | {recalls} |")
     return "\n".join(lines)
 
 

@@ -81,6 +81,21 @@ class StageScore:
 
 
 @dataclass(frozen=True, slots=True)
+class ObjectScore:
+    """Scores of one object of a task.
+
+    shown_frames: frames that show at least MIN_ROI_PIXELS of it. detected_share: share of them in which the detector
+    marks a quarter of its pixels. recall: by stage, marked share of its pixels from its first detection on; None if it
+    is never detected.
+    """
+
+    name: str
+    shown_frames: int
+    detected_share: float
+    recall: Mapping[PerceptionStage, float | None]
+
+
+@dataclass(frozen=True, slots=True)
 class TaskScore:
     """Scores of one task over all frames. shown_frames show at least MIN_ROI_PIXELS of its objects."""
 
@@ -90,6 +105,7 @@ class TaskScore:
     shown_frames: int
     shown_objects: int
     stages: Mapping[PerceptionStage, StageScore]
+    object_scores: tuple[ObjectScore, ...] = ()
 
 
 class PerceptionBench:
@@ -142,6 +158,7 @@ class _TaskEvaluation:
         self._first_shown: dict[str, int] = {}
         self._shown_frames = self._frames = 0
         self._counters = {stage: _StageCounter() for stage in PerceptionStage}
+        self._object_counters = {name: _ObjectCounter() for name in query.objects}
 
     def process(self, frame: Frame, truths: Mapping[str, Bool[ndarray, "h w"]]) -> FrameMasks:
         graph = self._query.graph
@@ -161,15 +178,42 @@ class _TaskEvaluation:
         self._shown_frames += bool(np.count_nonzero(truth) >= MIN_ROI_PIXELS)
         for stage, mask in masks.items():
             self._counters[stage].add(self._frames, mask, has_depth, truth, objects)
+        for name, pixels in objects.items():
+            self._object_counters[name].add(masks, pixels)
         self._frames += 1
         return FrameMasks(self._query, frame, detections, masks, truth)
 
     def score(self) -> TaskScore:
         stages = {stage: counter.score(self._frames, self._first_shown) for stage, counter in self._counters.items()}
         query = self._query
-        return TaskScore(
-            query.graph.text, query.objects, self._frames, self._shown_frames, len(self._first_shown), stages
-        )
+        counts = self._frames, self._shown_frames, len(self._first_shown)
+        object_scores = tuple(counter.score(name) for name, counter in self._object_counters.items())
+        return TaskScore(query.graph.text, query.objects, *counts, stages, object_scores)
+
+
+class _ObjectCounter:
+    """Counts of one object: its pixels from the first detection on, and those that each stage marks."""
+
+    def __init__(self) -> None:
+        self._shown_frames = self._detected_frames = self._pixels = 0
+        self._marked = dict.fromkeys(PerceptionStage, 0)
+
+    def add(self, masks: Mapping[PerceptionStage, Bool[ndarray, "h w"]], pixels: Bool[ndarray, "h w"]) -> None:
+        size = int(np.count_nonzero(pixels))
+        if size < MIN_ROI_PIXELS:
+            return
+        marked = {stage: int(np.count_nonzero(mask & pixels)) for stage, mask in masks.items()}
+        self._shown_frames += 1
+        self._detected_frames += marked[PerceptionStage.DETECTED] >= _MIN_FOUND_SHARE * size
+        if self._detected_frames > 0:
+            self._pixels += size
+            for stage, count in marked.items():
+                self._marked[stage] += count
+
+    def score(self, name: str) -> ObjectScore:
+        detected_share = self._detected_frames / max(1, self._shown_frames)
+        recall = {stage: count / self._pixels if self._pixels else None for stage, count in self._marked.items()}
+        return ObjectScore(name, self._shown_frames, detected_share, recall)
 
 
 class _StageCounter:
