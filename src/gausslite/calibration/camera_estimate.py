@@ -8,6 +8,7 @@ only if it explains a clear share of the disagreement.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -151,12 +152,15 @@ def _around(value: float, step: float) -> tuple[float, float, float]:
 
 
 def minimum(values: Sequence[float], cost: Callable[[float], float]) -> float:
-    """Return the minimum of a parabola through the best of evenly spaced values and its neighbours."""
+    """Return the minimum of a parabola through the best of evenly spaced values and its neighbours.
+
+    A cost may be infinite: nothing could be compared at this value.
+    """
     costs: ndarray = np.array([cost(value) for value in values])
     best = int(np.clip(np.argmin(costs), 1, len(values) - 2))
-    a, b, c = costs[best - 1 : best + 2]
+    a, b, c = map(float, costs[best - 1 : best + 2])
     curvature = a - 2 * b + c
-    if not curvature > 0:
+    if not 0 < curvature < math.inf:
         return values[int(np.argmin(costs))]
     step = values[1] - values[0]
     return values[best] + step * float(np.clip(0.5 * (a - c) / curvature, -1.0, 1.0))

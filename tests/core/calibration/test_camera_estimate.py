@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
-import pytest
+import math
+from pathlib import Path
 
-from gausslite.calibration.camera_estimate import estimate_camera
+import pytest
+from tum_recording import write_home
+
+from gausslite.calibration.camera_estimate import estimate_camera, minimum
 from gausslite.calibration.exposure_time import estimate_exposure_time
 from gausslite.datasets.open import open_source
 from gausslite.domain.camera_correction import CameraCorrection
@@ -53,3 +57,14 @@ def test_a_slow_camera_gives_no_estimate() -> None:
     estimate = estimate_camera(open_source(f"{HOME}&speed=2&shutter=30ms"), CameraCorrection())
     assert estimate.correction.is_identity
     assert "turn fast enough" in estimate.evidence[0]
+
+
+def test_times_are_not_estimated_from_a_few_tiny_frames(tmp_path: Path) -> None:
+    correction = estimate_camera(open_source(str(write_home(tmp_path / "recording"))), CameraCorrection()).correction
+    assert (correction.readout_s, correction.time_offset_s, correction.exposure_s) == (0.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize("costs", [(math.inf, 1.0, math.inf), (math.inf, 1.0, 2.0), (math.inf, math.inf, math.inf)])
+def test_values_at_which_nothing_could_be_compared_are_not_interpolated(costs: tuple[float, ...]) -> None:
+    values = (-1.0, 0.0, 1.0)
+    assert minimum(values, dict(zip(values, costs, strict=True)).__getitem__) == values[costs.index(min(costs))]
