@@ -17,7 +17,7 @@ FURNITURE: Final = frozenset(
      "bed", "shelf", "bookshelf", "bookcase", "cabinet", "cupboard", "dresser", "wardrobe", "closet", "sideboard",
      "refrigerator", "fridge", "freezer", "oven", "stove", "dishwasher", "sink", "toilet", "bathtub", "door", "window",
      "wall", "floor", "rug", "carpet", "car", "truck", "bus", "van", "boat", "train", "airplane", "tree", "person",
-     "piano", "workbench", "nightstand", "ottoman", "television", "whiteboard", "curtain", "fence", "gate"}
+     "piano", "workbench", "nightstand", "ottoman", "television", "tv", "whiteboard", "curtain", "fence", "gate"}
 )  # fmt: skip
 # objects that may fill most of an image
 SURFACE: Final = frozenset(

@@ -1,4 +1,4 @@
-"""The interfaces of detectors and segmenters, and what all of them share: box limits and overlaps."""
+"""The interfaces of detectors and segmenters, and what all of them share: boxes and their overlaps."""
 
 from __future__ import annotations
 
@@ -10,9 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float32
 from numpy import ndarray
 
-from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
-from gausslite.domain.object_names import is_furniture, is_generic, is_surface
 from gausslite.domain.relevance import Detection
 
 
@@ -87,37 +85,6 @@ class SegmentedDetector:
             for box, mask in zip(boxes, masks, strict=True)
             if mask is not None
         ]
-
-
-@dataclass(frozen=True, slots=True)
-class BoxFractions:
-    """Largest share of the image that a box may cover; larger boxes are false detections (comment in Sec. III-B.2).
-
-    `surface` is not in the paper: in a real kitchen, 0.40 would reject more than half of the true tables.
-    """
-
-    small: float = 0.20
-    furniture: float = 0.40
-    surface: float = 0.80
-    many: float = 0.70
-
-    def __post_init__(self) -> None:
-        for name in ("small", "furniture", "surface", "many"):
-            if not 0.0 < getattr(self, name) <= 1.0:
-                raise InvalidInputError(f"box fraction {name}: expected 0 to 1, got {getattr(self, name)}")
-
-    def limit(self, phrase: str, many_objects: bool) -> float:
-        """Return the largest share for objects of this name."""
-        if is_surface(phrase):
-            return self.surface
-        if many_objects:
-            return self.many
-        return self.furniture if is_furniture(phrase) else self.small
-
-
-def concerns_many_objects(queries: Sequence[str]) -> bool:
-    """Return True for a generic noun, or for more queries than one target and its anchor."""
-    return len(queries) > 2 or any(is_generic(query) for query in queries)
 
 
 def box_iou(boxes_a: Float32[ndarray, "n 4"], boxes_b: Float32[ndarray, "m 4"]) -> Float32[ndarray, "n m"]:

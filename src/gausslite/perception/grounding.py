@@ -14,7 +14,8 @@ from numpy import ndarray
 
 from gausslite.domain.errors import InvalidInputError, ModelFileError
 from gausslite.domain.frame import Frame
-from gausslite.perception.detect import BoxFractions, DetectedBox, concerns_many_objects
+from gausslite.perception.box_size import BoxSizeLimits
+from gausslite.perception.detect import DetectedBox
 from gausslite.perception.grounding_text import PhraseInput, Tokenizer, encode_phrase
 from gausslite.perception.models.model_file import OpenModel, run_once
 
@@ -41,7 +42,7 @@ class GroundingSettings:
     text_score: float = 0.25
     nms_max_iou: float = 0.7
     max_boxes: int = 50
-    box_fractions: BoxFractions = field(default_factory=BoxFractions)
+    box_limits: BoxSizeLimits = field(default_factory=BoxSizeLimits)
 
     def __post_init__(self) -> None:
         for name in ("box_score", "text_score", "nms_max_iou"):
@@ -73,15 +74,12 @@ class GroundingDino:
         return ()
 
     def boxes(self, frame: Frame, queries: Sequence[str]) -> list[DetectedBox]:
-        """Return all instances of each query, best first, without boxes that cover too much of the image."""
+        """Return all instances of each query, best first, without boxes too large for their noun."""
         pixel_values, pixel_mask = self._preprocess(frame.rgb)
-        many_objects = concerns_many_objects(queries)
-        size_px = (frame.camera.width_px, frame.camera.height_px)
         found: list[DetectedBox] = []
         for query in queries:
             logits, boxes_cxcywh = self._run(pixel_values, pixel_mask, self._encoded_phrase(query))
-            max_share = self._settings.box_fractions.limit(query, many_objects)
-            found += self._select_boxes(query, logits, boxes_cxcywh, max_share, size_px)
+            found += self._select_boxes(query, logits, boxes_cxcywh, frame)
         return found
 
     def _select_boxes(
@@ -89,15 +87,14 @@ class GroundingDino:
         query: str,
         logits: Float32[ndarray, "q l"],
         boxes_cxcywh: Float32[ndarray, "q 4"],
-        max_share: float,
-        size_px: tuple[int, int],
+        frame: Frame,
     ) -> list[DetectedBox]:
         """Return the boxes above the thresholds, not too large, after non-maximum suppression."""
         scores, noun_scores = phrase_scores(logits, self._encoded_phrase(query).is_noun)
-        boxes_px = corners_px(boxes_cxcywh, size_px)
-        shares = (boxes_px[:, 2:] - boxes_px[:, :2]).prod(axis=1) / (size_px[0] * size_px[1])
+        boxes_px = corners_px(boxes_cxcywh, (frame.camera.width_px, frame.camera.height_px))
+        areas = (boxes_px[:, 2:] - boxes_px[:, :2]).prod(axis=1)
         is_match = (scores >= self._settings.box_score) & (noun_scores >= self._settings.text_score)
-        rows = np.flatnonzero(is_match & (shares > 0) & (shares <= max_share))
+        rows = np.flatnonzero(is_match & (areas > 0))
         if len(rows) == 0:
             return []
         boxes = boxes_px[rows].astype(np.float64)
@@ -108,7 +105,8 @@ class GroundingDino:
         for row in selected:
             left, top, right, bottom = (float(edge) for edge in boxes_px[row])
             found.append(DetectedBox(query, float(scores[row]), (left, top, right, bottom)))
-        return found
+        limits = self._settings.box_limits
+        return [box for box in found if limits.accepts(query, box.score, box.box_px, frame)]
 
     def _encoded_phrase(self, query: str) -> PhraseInput:
         if query not in self._phrases:

@@ -10,8 +10,9 @@ import numpy as np
 from gausslite.domain.errors import InvalidInputError, ModelFileError
 from gausslite.domain.frame import Frame
 from gausslite.domain.relevance import Detection
+from gausslite.perception.box_size import BoxSizeLimits
 from gausslite.perception.class_agnostic import ClassAgnosticSegmenter
-from gausslite.perception.detect import BoxFractions, DetectedBox, concerns_many_objects
+from gausslite.perception.detect import DetectedBox
 from gausslite.perception.models.model_file import OpenModel
 from gausslite.perception.text_embeddings import TextEmbeddings, classes_for
 from gausslite.perception.yolo_decode import Candidates, suppress
@@ -25,7 +26,7 @@ class YoloSettings:
     min_score: float = 0.25
     nms_max_iou: float = 0.7
     max_boxes: int = 100
-    box_fractions: BoxFractions = field(default_factory=BoxFractions)
+    box_limits: BoxSizeLimits = field(default_factory=BoxSizeLimits)
 
     def __post_init__(self) -> None:
         for name in ("min_score", "nms_max_iou"):
@@ -65,17 +66,16 @@ class YoloSegDetector:
         return ClassAgnosticSegmenter(self._network)
 
     def detect(self, frame: Frame, queries: Sequence[str]) -> list[Detection]:
-        """Return all instances of each query with masks, best first, without boxes that cover too much of the image."""
+        """Return all instances of each query with masks, best first, without boxes too large for their class."""
         query_classes = self._query_classes(queries)
         if not query_classes:
             return []
         output = self._network.run(frame)
         candidates = self._distinct(output.candidates(self._settings.min_score), query_classes)
         masks = output.masks(candidates)
-        many_objects = concerns_many_objects(queries)
         return [
             Detection(box.phrase, box.score, box.box_px, masks[row])
-            for row, box in self._matches(candidates, query_classes, many_objects, frame.depth_m.size)
+            for row, box in self._matches(candidates, query_classes, frame)
             if masks[row].any()
         ]
 
@@ -85,24 +85,23 @@ class YoloSegDetector:
         if not query_classes:
             return []
         candidates = self._distinct(self._network.run(frame).candidates(self._settings.min_score), query_classes)
-        matches = self._matches(candidates, query_classes, concerns_many_objects(queries), frame.depth_m.size)
-        return [box for _, box in matches]
+        return [box for _, box in self._matches(candidates, query_classes, frame)]
 
     def _query_classes(self, queries: Sequence[str]) -> dict[str, tuple[int, ...]]:
         """Return the class indices of each query that matches any class."""
         return {query: classes for query in queries if (classes := self._classes(query))}
 
     def _matches(
-        self, candidates: Candidates, query_classes: Mapping[str, tuple[int, ...]], many_objects: bool, pixels: int
+        self, candidates: Candidates, query_classes: Mapping[str, tuple[int, ...]], frame: Frame
     ) -> Iterator[tuple[int, DetectedBox]]:
-        """Yield row and box of each query's candidates, without boxes that cover too much of the image."""
-        shares = (candidates.boxes_px[:, 2:] - candidates.boxes_px[:, :2]).prod(axis=1) / pixels
+        """Yield row and box of each query's candidates, without boxes too large for their class."""
         for query, classes in query_classes.items():
             for row in np.flatnonzero(np.isin(candidates.classes, classes)):
                 name = self.class_names[candidates.classes[row]]
-                if shares[row] <= self._settings.box_fractions.limit(name, many_objects):
-                    left, top, right, bottom = (float(edge) for edge in candidates.boxes_px[row])
-                    yield int(row), DetectedBox(query, float(candidates.scores[row]), (left, top, right, bottom))
+                left, top, right, bottom = (float(edge) for edge in candidates.boxes_px[row])
+                box = DetectedBox(query, float(candidates.scores[row]), (left, top, right, bottom))
+                if self._settings.box_limits.accepts(name, box.score, box.box_px, frame):
+                    yield int(row), box
 
     def _distinct(self, candidates: Candidates, query_classes: Mapping[str, tuple[int, ...]]) -> Candidates:
         """Return the candidates of the queries' classes after non-maximum suppression."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -79,9 +80,10 @@ def test_duplicate_and_too_large_boxes_are_dropped(tmp_path):
     beside, huge = (0.26, 0.5, 0.25, 0.5), (0.5, 0.5, 0.6, 0.6)
     answers = [(beside, {"mug": 1.0}), (LEFT, {"mug": SURE}), (huge, {"mug": SURE, "table": SURE})]
     grounding = detector(tmp_path, answers)
-    (mug,) = grounding.boxes(frame(), ["mug"])
+    far = replace(frame(), depth_m=np.full((60, 80), 4.0, np.float32))
+    (mug,) = grounding.boxes(far, ["mug"])
     assert mug.box_px[0] == 10
-    (table,) = grounding.boxes(frame(), ["table"])
+    (table,) = grounding.boxes(far, ["table"])
     assert table.box_px == pytest.approx((16, 12, 64, 48))
 
 

@@ -11,7 +11,7 @@ from tiny_grounding import TinyTokenizer
 
 from gausslite.domain.camera import Camera
 from gausslite.domain.frame import Frame
-from gausslite.perception.detect import BoxFractions
+from gausslite.perception.box_size import BoxSizeLimits
 from gausslite.perception.grounding import INPUTS, OUTPUTS, GroundingDino, GroundingSettings, preprocess
 from gausslite.perception.grounding_text import encode_phrase
 from gausslite.perception.models.model_file import open_model
@@ -86,7 +86,7 @@ def network_inputs(seed: int, phrase: str):
 
 @pytest.mark.parametrize("phrase", ["red mug", "table", "red table"])
 def test_every_box_and_score_is_torchs(network, path, phrase):
-    lenient = GroundingSettings(0.001, 0.001, nms_max_iou=0.999, box_fractions=BoxFractions(1.0, 1.0, 1.0, 1.0))
+    lenient = GroundingSettings(0.001, 0.001, nms_max_iou=0.999, box_limits=BoxSizeLimits(1e6, 1e6, 1e6, 1.0, 1.0, 1.0))
     detector = GroundingDino(open_model(path, 1), TinyTokenizer(), lenient)
     text = encode_phrase(phrase, TinyTokenizer(), TOKENS)
     for seed in SEEDS:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from tiny_yolo import write_boxes_only, write_tiny_yolo
 from gausslite.domain.camera import Camera
 from gausslite.domain.errors import InvalidInputError, ModelFileError
 from gausslite.domain.frame import Frame
-from gausslite.perception.detect import BoxFractions
+from gausslite.perception.box_size import BoxSizeLimits
 from gausslite.perception.models.model_file import open_model
 from gausslite.perception.yolo import YoloSegDetector, YoloSettings, load_yolo
 
@@ -72,12 +73,17 @@ def test_boxes_below_the_score_or_without_a_mask_are_dropped(tmp_path):
     assert detector.detect(frame_with_red_square(), ["cup"]) == []
 
 
-def test_boxes_that_cover_too_much_are_dropped(tmp_path):
+def test_boxes_too_large_for_their_class_are_dropped_whatever_else_is_asked_for(tmp_path):
     huge = (32.0, 32.0, 64.0, 24.0, 0, 0.9)
     path = write_tiny_yolo(tmp_path / "tiny.onnx", NAMES, [huge])
-    assert detector_from(path).detect(frame_with_red_square(), ["cup"]) == []
-    lenient = YoloSegDetector(open_model(path), None, YoloSettings(box_fractions=BoxFractions(small=1.0)))
-    assert len(lenient.detect(frame_with_red_square(), ["cup"])) == 1
+    near = frame_with_red_square()
+    far = replace(near, depth_m=2.0 * near.depth_m)
+    # the box is 1.28 m wide at a depth of 1 m, and 2.56 m wide at 2 m
+    for queries in (["cup"], ["cup", "chair", "table"]):
+        assert len(detector_from(path).detect(near, queries)) == 1
+        assert detector_from(path).detect(far, queries) == []
+    lenient = YoloSegDetector(open_model(path), None, YoloSettings(box_limits=BoxSizeLimits(small_m=2.0)))
+    assert len(lenient.detect(far, ["cup"])) == 1
 
 
 def test_a_generic_noun_matches_every_class(tmp_path):
@@ -135,8 +141,10 @@ def test_a_model_without_class_names_is_refused(tmp_path):
 def test_settings_are_checked():
     with pytest.raises(InvalidInputError, match="detector min_score: expected between 0 and 1"):
         YoloSettings(min_score=1.5)
-    with pytest.raises(InvalidInputError, match="box fraction small"):
-        BoxFractions(small=0.0)
+    with pytest.raises(InvalidInputError, match="box limit small_m: expected a positive length"):
+        BoxSizeLimits(small_m=0.0)
+    with pytest.raises(InvalidInputError, match="box limit small_share: expected 0 to 1"):
+        BoxSizeLimits(small_share=1.5)
 
 
 def _refused(path: Path, expected: str) -> None:
