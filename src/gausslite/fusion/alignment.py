@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float64, Int64
@@ -24,6 +24,10 @@ _COLOUR_WEIGHT_M = 0.1
 """Geometric residual that weighs as much as a luminance difference of 1."""
 _PRIOR_TRANSLATION_M, _PRIOR_ROTATION_RAD = 0.15, 0.05
 _OVERLAP_GRID = VoxelGrid(0.5)
+_MIN_NORMAL_COSINE = 0.8
+"""Cosine of the largest angle between the normals of a match (37 deg)."""
+_BACK_MATCH_M = 0.05
+"""Largest distance between a sample and the one that is nearest to its own reference."""
 _LUMINANCE = np.array([0.299, 0.587, 0.114])
 
 
@@ -64,9 +68,9 @@ class SurfaceSamples:
     gradients: Float64[ndarray, "n 3"]
 
     @classmethod
-    def of(cls, gaussians: Gaussians, seed: int = 0) -> SurfaceSamples:
+    def of(cls, gaussians: Gaussians, limit: int = _MAX_REFERENCE, seed: int = 0) -> SurfaceSamples:
         """Draw samples from the means of opaque Gaussians; the local plane and gradient come from their neighbours."""
-        points, luminance = _sample(gaussians, _MAX_REFERENCE, seed)
+        points, luminance = _sample(gaussians, limit, seed)
         if len(points) <= _NEIGHBOURS:
             return cls(points, np.zeros_like(points), luminance, np.zeros_like(points))
         near = _nearest(points, points, _NEIGHBOURS)
@@ -81,6 +85,16 @@ class SurfaceSamples:
         gradients = np.linalg.solve(covariance + ridge, slope[:, :, None])[:, :, 0]
         gradients -= np.einsum("ni,ni->n", gradients, normals)[:, None] * normals
         return cls(points, normals, luminance, gradients)
+
+    def moved(self, T: Float64[ndarray, "4 4"]) -> SurfaceSamples:
+        """Return the samples after a rigid motion."""
+        turn = T[:3, :3].T
+        return replace(
+            self,
+            points_m=transform_points(T, self.points_m),
+            normals=self.normals @ turn,
+            gradients=self.gradients @ turn,
+        )
 
 
 def crop_to_overlap(
@@ -97,26 +111,26 @@ def crop_to_overlap(
 
 
 def fit_frame(source: Gaussians, reference: SurfaceSamples, start: Float64[ndarray, "4 4"]) -> FrameFit | None:
-    """Fit the source map to the reference from an initial T_fused_agent; None if fewer than 50 samples overlap.
+    """Fit the source map to the reference from an initial T_fused_agent; None if fewer than 50 samples match.
 
     The fit is a robust Gauss-Newton with a weak prior at the start, so directions that the overlap does not constrain
     keep the initial value.
     """
-    points, luminance = _sample(source, _MAX_SOURCE, seed=1)
+    samples = SurfaceSamples.of(source, _MAX_SOURCE, seed=1)
     T = start.copy()
-    if len(points) < _MIN_COMPARED or len(reference.points_m) < _MIN_COMPARED:
+    if min(len(samples.points_m), len(reference.points_m)) < _MIN_COMPARED:
         return None
-    before = _misfit(points, luminance, reference, T)
+    before = _misfit(samples, reference, T)
     for reach_m in _REACH_M:
-        update = _step(transform_points(T, points), luminance, reference, reach_m, T @ inverse(start))
+        update = _step(samples.moved(T), reference, reach_m, T @ inverse(start))
         if update is None:
             return None
         T = update @ T
-    matches = _match(transform_points(T, points), reference, _OVERLAP_M)
+    matches = _match(samples.moved(T), reference, _OVERLAP_M)
     if len(matches[0]) < _MIN_COMPARED:
         return None
-    after = _misfit(points, luminance, reference, T)
-    centre = points[matches[0]].mean(axis=0)[None]
+    after = _misfit(samples, reference, T)
+    centre = samples.points_m[matches[0]].mean(axis=0)[None]
     shift = transform_points(T, centre) - transform_points(start, centre)
     turn = T[:3, :3] @ start[:3, :3].T
     rotation_deg = float(np.degrees(np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1))))
@@ -124,8 +138,7 @@ def fit_frame(source: Gaussians, reference: SurfaceSamples, start: Float64[ndarr
 
 
 def _step(
-    moved: Float64[ndarray, "n 3"],
-    luminance: Float64[ndarray, " n"],
+    moved: SurfaceSamples,
     reference: SurfaceSamples,
     reach_m: float,
     correction: Float64[ndarray, "4 4"],
@@ -134,18 +147,19 @@ def _step(
     rows, near = _match(moved, reference, reach_m)
     if len(rows) < _MIN_COMPARED:
         return None
+    points = moved.points_m[rows]
     offset, normals, gradients = (
-        moved[rows] - reference.points_m[near],
+        points - reference.points_m[near],
         reference.normals[near],
         reference.gradients[near],
     )
     distance = np.einsum("ni,ni->n", offset, normals)
-    colour = luminance[rows] - reference.luminance[near] - np.einsum("ni,ni->n", gradients, offset)
+    colour = moved.luminance[rows] - reference.luminance[near] - np.einsum("ni,ni->n", gradients, offset)
     # agents' exposures may differ
     colour -= np.median(colour)
     # rotations about the centre of the matches, so that they are independent of the translation
-    centre = moved[rows].mean(axis=0)
-    arms = moved[rows] - centre
+    centre = points.mean(axis=0)
+    arms = points - centre
     jacobian = np.vstack([_rows_of(normals, arms), -_COLOUR_WEIGHT_M * _rows_of(gradients, arms)])
     residual = np.concatenate([distance, _COLOUR_WEIGHT_M * colour])
     weight = np.concatenate([_tukey(distance), _tukey(_COLOUR_WEIGHT_M * colour)])
@@ -179,26 +193,34 @@ def _tukey(residual: Float64[ndarray, " n"]) -> Float64[ndarray, " n"]:
     return weight
 
 
-def _misfit(
-    points: Float64[ndarray, "n 3"], luminance: Float64[ndarray, " n"], reference: SurfaceSamples, T: ndarray
-) -> Misfit:
-    moved = transform_points(T, points)
+def _misfit(samples: SurfaceSamples, reference: SurfaceSamples, T: Float64[ndarray, "4 4"]) -> Misfit:
+    moved = samples.moved(T)
     rows, near = _match(moved, reference, _REACH_M[0])
     if len(rows) == 0:
         return Misfit(float("inf"), 1.0, 0.0)
-    offset = moved[rows] - reference.points_m[near]
+    offset = moved.points_m[rows] - reference.points_m[near]
     distance = np.abs(np.einsum("ni,ni->n", offset, reference.normals[near]))
-    colour = np.abs(luminance[rows] - reference.luminance[near])
-    overlap = float(np.mean(np.linalg.norm(offset, axis=1) <= _OVERLAP_M) * len(rows) / len(points))
+    colour = np.abs(moved.luminance[rows] - reference.luminance[near])
+    overlap = float(np.mean(np.linalg.norm(offset, axis=1) <= _OVERLAP_M) * len(rows) / len(moved.points_m))
     return Misfit(float(np.median(distance)), float(np.median(colour)), overlap)
 
 
 def _match(
-    moved: Float64[ndarray, "n 3"], reference: SurfaceSamples, reach_m: float
+    moved: SurfaceSamples, reference: SurfaceSamples, reach_m: float
 ) -> tuple[Int64[ndarray, " m"], Int64[ndarray, " m"]]:
-    """Return the samples whose nearest reference is within reach, and the indices of these references."""
-    near = _nearest(moved, reference.points_m, 1)[:, 0]
-    rows = np.flatnonzero(np.linalg.norm(moved - reference.points_m[near], axis=1) <= reach_m)
+    """Return the samples with a match within reach, and the indices of the matched references.
+
+    The normals of a match agree, and the reference's own nearest sample is near: so a mug is not matched to the table
+    under it, nor the part of a table that only one agent has mapped to the edge of the other's part.
+    """
+    near = _nearest(moved.points_m, reference.points_m, 1)[:, 0]
+    distance_m = np.linalg.norm(moved.points_m - reference.points_m[near], axis=1)
+    cosine = np.abs(np.einsum("ni,ni->n", moved.normals, reference.normals[near]))
+    rows = np.flatnonzero((distance_m <= reach_m) & (cosine >= _MIN_NORMAL_COSINE))
+    if len(rows) == 0:
+        return rows, rows
+    back = _nearest(reference.points_m[near[rows]], moved.points_m, 1)[:, 0]
+    rows = rows[np.linalg.norm(moved.points_m[rows] - moved.points_m[back], axis=1) <= _BACK_MATCH_M]
     return rows, near[rows]
 
 

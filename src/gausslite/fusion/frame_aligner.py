@@ -7,13 +7,14 @@ from dataclasses import replace
 from threading import RLock
 
 import numpy as np
-from jaxtyping import Float64, Int64
+from jaxtyping import Int64
 from numpy import ndarray
 
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.moved_gaussians import move_gaussians
 from gausslite.domain.names import quote_name
 from gausslite.domain.voxel_operations import VoxelIndex, select_voxels
+from gausslite.domain.voxels import VoxelGrid
 from gausslite.fusion.alignment import SurfaceSamples, crop_to_overlap, fit_frame
 from gausslite.fusion.frame_alignment import AlignmentSettings, AlignmentState, FrameAlignment, FrameAlignments
 from gausslite.fusion.free_space import FreeSpaceRecords
@@ -22,6 +23,7 @@ from gausslite.fusion.vote_input import VoteInput
 
 _log = logging.getLogger(__name__)
 _MIN_GAUSSIANS = 50
+_MOVED_VOXELS = 3
 
 
 class FrameAligner:
@@ -83,13 +85,14 @@ class FrameAligner:
             highest_seq = self._store.highest_update_seq(agent_id)
         # QUARANTINED agents are fitted from their declared frame, so that they can return
         start = alignment.declared if alignment.state is AlignmentState.QUARANTINED else alignment.T_fused_agent
-        overlap, reference = crop_to_overlap(source, reference, start)
-        fit = fit_frame(overlap, SurfaceSamples.of(reference), start) if len(reference) >= _MIN_GAUSSIANS else None
+        overlap, near = crop_to_overlap(source, reference, start)
+        fit = fit_frame(overlap, SurfaceSamples.of(near), start) if len(near) >= _MIN_GAUSSIANS else None
         with self._lock:
             if self._alignments.get(agent_id) is not alignment:
                 return np.zeros(0, np.int64)
-            if fit is None:
-                aligned = alignment.without_overlap(self._free_share(agent_id, source, start), self._settings)
+            if fit is None or self._settings.is_chance(fit):
+                contradicted = self._contradicted_share(agent_id, move_gaussians(source, start), reference)
+                aligned = alignment.without_overlap(contradicted, self._settings)
             else:
                 aligned = alignment.after_fit(fit, first_seq, self._settings)
                 self._next_seq[agent_id] = highest_seq + 1
@@ -123,17 +126,15 @@ class FrameAligner:
         is_changed = changed >= self._settings.refit_share * len(scores.keys[own])
         return has_enough and (is_changed or agent_id in self._free_space_changed)
 
-    def _free_share(self, agent_id: str, source: Gaussians, T_fused_agent: Float64[ndarray, "4 4"]) -> float:
-        """Return the share of the occupied voxels that agents before this one have observed as free."""
-        frames_differ = self._alignments.in_other_frames()
-        observers = self._alignments.earlier(agent_id) - frames_differ
+    def _contradicted_share(self, agent_id: str, moved: Gaussians, reference: Gaussians) -> float:
+        """Return the share of voxels in free space, of those that the agents before this one have observed."""
+        observers = self._alignments.earlier(agent_id) - self._alignments.in_other_frames()
         grid = self._free_space.grid
-        moved = move_gaussians(source, T_fused_agent).means_m
-        inside = (np.abs(moved) < grid.max_coordinate_m).all(axis=1)
-        if not inside.any():
-            return 0.0
-        free = self._free_space.seen_by(observers, VoxelIndex.from_points(moved[inside], grid).keys)
-        return float(free.mean())
+        own, occupied = (_occupied_voxels(each, grid) for each in (moved, reference))
+        free = self._free_space.seen_by(observers, own)
+        observed = free | np.isin(own, occupied)
+        # a few voxels are no evidence: an object may have been moved
+        return max(int(free.sum()) - _MOVED_VOXELS, 0) / max(int(observed.sum()), 1)
 
     def _recent(self, agent_id: str, first_seq: int) -> Gaussians:
         """Return the Gaussians of the updates from first_seq on, or all if these are few."""
@@ -146,3 +147,9 @@ class FrameAligner:
     def _reference(self, agent_id: str) -> Gaussians:
         earlier = self._alignments.earlier(agent_id)
         return Gaussians.concatenate([b.gaussians for name, b in self._votes.batches().items() if name in earlier])
+
+
+def _occupied_voxels(gaussians: Gaussians, grid: VoxelGrid) -> Int64[ndarray, " k"]:
+    """Return the keys of the voxels that hold a Gaussian, without those outside the grid's range."""
+    inside = (np.abs(gaussians.means_m) < grid.max_coordinate_m).all(axis=1)
+    return VoxelIndex.from_points(gaussians.means_m[inside], grid).keys

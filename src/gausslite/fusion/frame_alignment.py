@@ -42,8 +42,9 @@ class AlignmentSettings:
     min_shift_m, min_rotation_deg: smaller misfits are noise of the maps and are not corrected. min_improvement: the
     factor by which a correction has to reduce the median point-to-plane distance. max_distance_m: a larger distance is
     quarantined unless a correction within max_shift_m and max_rotation_deg reduces it below. refit_share: an estimate
-    is due when this share of the agent's voxels has changed since the last one. max_free_share: without enough overlap,
-    an agent is quarantined if a larger share of its voxels is where agents before it have observed free space.
+    is due when this share of the agent's voxels has changed since the last one. min_overlap: share of the samples that
+    match within 10 cm after a fit; with fewer, the fit is chance. max_contradicted_share: after such a fit, an agent is
+    quarantined if agents before it have observed free space in a larger share of its voxels that they have observed.
     """
 
     min_shift_m: float = 0.01
@@ -53,7 +54,12 @@ class AlignmentSettings:
     max_distance_m: float = 0.03
     min_improvement: float = 1.4
     refit_share: float = 0.25
-    max_free_share: float = 0.5
+    min_overlap: float = 0.3
+    max_contradicted_share: float = 0.2
+
+    def is_chance(self, fit: FrameFit) -> bool:
+        """Return whether the maps may share too little surface to compare the frames."""
+        return fit.after.overlap < self.min_overlap and fit.before.distance_m <= self.max_distance_m
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -89,12 +95,13 @@ class FrameAlignment:
         """Return T_fused_agent of a segment."""
         return self.declared if segment < 0 else self.segments[segment][1]
 
-    def without_overlap(self, free_share: float, settings: AlignmentSettings) -> FrameAlignment:
-        """Return the alignment of an agent that cannot be fitted; free_share: of its voxels in others' free space."""
-        if free_share > settings.max_free_share:
+    def without_overlap(self, contradicted_share: float, settings: AlignmentSettings) -> FrameAlignment:
+        """Return the alignment of an agent that cannot be fitted; contradicted_share: see AlignmentSettings."""
+        if contradicted_share > settings.max_contradicted_share:
             message = (
-                f"frame: {free_share:.0%} of the agent's voxels are where agents before it have observed free space, "
-                f"expected at most {settings.max_free_share:.0%}; check the agent's localisation"
+                f"frame: agents before it have observed free space in {contradicted_share:.0%} of those of its voxels "
+                f"that they have observed, expected at most {settings.max_contradicted_share:.0%}; check the agent's "
+                "localisation"
             )
             return replace(self, state=AlignmentState.QUARANTINED, fit=None, message=message)
         if self.state is AlignmentState.QUARANTINED and self.fit is None:
@@ -105,11 +112,13 @@ class FrameAlignment:
         """Return the alignment after a fit of the updates from first_seq on, which started at T_fused_agent."""
         too_far = fit.shift_m > settings.max_shift_m or fit.rotation_deg > settings.max_rotation_deg
         is_bad = fit.before.distance_m > settings.max_distance_m
-        if is_bad and (too_far or fit.after.distance_m > settings.max_distance_m):
+        is_poor = fit.after.distance_m > settings.max_distance_m or fit.after.overlap < settings.min_overlap
+        if is_bad and (too_far or is_poor):
             message = (
                 f"frame: expected a misfit of at most {settings.max_shift_m:g} m and {settings.max_rotation_deg:g} "
-                f"deg, with {1e3 * settings.max_distance_m:g} mm left after its correction, got {fit.shift_m:.2f} m, "
-                f"{fit.rotation_deg:.1f} deg and {1e3 * fit.after.distance_m:.0f} mm; check the agent's localisation"
+                f"deg, and after its correction {1e3 * settings.max_distance_m:g} mm and an overlap of "
+                f"{settings.min_overlap:.0%}, got {fit.shift_m:.2f} m, {fit.rotation_deg:.1f} deg, "
+                f"{1e3 * fit.after.distance_m:.0f} mm and {fit.after.overlap:.0%}; check the agent's localisation"
             )
             return replace(self, state=AlignmentState.QUARANTINED, fit=fit, message=message)
         is_small = fit.shift_m < settings.min_shift_m and fit.rotation_deg < settings.min_rotation_deg

@@ -119,13 +119,13 @@ def _fuse(trial: TeamTrial, maps: Sequence[AgentMap], align: bool) -> tuple[dict
     """Return the fused map of each strategy, and the engine that has received the whole maps."""
     grid = trial.grid
     whole = {each.agent_id: whole_map(each, grid) for each in maps}
-    engine = fuse_messages(whole, grid, align)
-    fused = {CONCATENATION: engine.maps.union_map().gaussians, VOTE: engine.maps.voted_map().gaussians}
     free = {each.agent_id: each.free_space for each in maps}
-    fused[FREE_SPACE_VOTE] = fuse_messages(whole, grid, align, free_space=free).maps.voted_map().gaussians
+    engine = fuse_messages(whole, grid, align, free)
+    fused = {CONCATENATION: engine.maps.union_map().gaussians, VOTE: engine.maps.voted_map().gaussians}
+    fused[FREE_SPACE_VOTE] = fuse_messages(whole, grid, align, free, VoteRule.FREE_SPACE).maps.voted_map().gaussians
     first, *others = maps
     shared = {first.agent_id: whole_map(first, grid), **{each.agent_id: each.messages for each in others}}
-    fused[SHARED_VOTE] = fuse_messages(shared, grid, align).maps.voted_map().gaussians
+    fused[SHARED_VOTE] = fuse_messages(shared, grid, align, free).maps.voted_map().gaussians
     if trial.refine_iterations > 0:
         keyframes = engine.in_fused_frame([keyframe for each in maps for keyframe in each.keyframes])
         fused[REFINED] = _refine(trial, fused[VOTE], keyframes)
@@ -142,20 +142,20 @@ def fuse_messages(
     messages: Mapping[str, Sequence[RoiSubset]],
     grid: VoxelGrid,
     align: bool,
-    free_space: Mapping[str, FreeSpace] | None = None,
+    free_space: Mapping[str, FreeSpace],
+    vote: VoteRule = VoteRule.PAPER,
 ) -> FusionEngine:
-    """Return a fusion engine that has received these messages, agent by agent; with free space it is in the vote."""
+    """Return a fusion engine that has received each agent's free space and messages, agent by agent."""
     quotas = Quotas(voxels_per_agent=10_000_000, gaussians_per_agent=100_000_000)
     settings = FusionSettings(grid, quotas=quotas, alignment=AlignmentSettings() if align else None)
-    settings = replace(settings, vote=VoteRule.PAPER if free_space is None else VoteRule.FREE_SPACE)
+    settings = replace(settings, vote=vote)
     engine = FusionEngine(MemoryStore(), settings)
     for agent_id, subsets in messages.items():
         session_id = engine.join(agent_id, MissionConfig("", "", grid.size_m)).session.session_id
+        engine.contribute_free_space(session_id, free_space[agent_id], grid)
         for subset in subsets:
             engine.contribute(session_id, subset, grid)
             engine.align_due()
-        if free_space is not None:
-            engine.contribute_free_space(session_id, free_space[agent_id], grid)
     return engine
 
 

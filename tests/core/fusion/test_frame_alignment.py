@@ -118,6 +118,39 @@ def test_five_centimetres_and_two_degrees_are_corrected_also_after_a_restart(tmp
     store.close()
 
 
+def table_part(seed: int, low_m: float, high_m: float) -> np.ndarray:
+    """Points of a part of a table top at z = 0."""
+    rng = np.random.default_rng(seed)
+    return np.column_stack([rng.uniform(low_m, high_m, 400), rng.uniform(0, 1, 400), rng.normal(0, 0.002, 400)])
+
+
+def box_on_table(seed: int) -> np.ndarray:
+    """Points of the sides and the top of a box of 10 cm on the table."""
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(0, 0.1, (400, 3))
+    face = rng.integers(0, 5, 400)
+    points[np.arange(400), face // 2] = np.where(face == 4, 0.1, 0.1 * (face % 2))
+    return points + np.array([0.4, 0.4, 0.0]) + rng.normal(0, 0.002, points.shape)
+
+
+@pytest.mark.parametrize(
+    "points",
+    [
+        box_on_table(1),
+        table_part(1, 0.55, 1.0),
+        np.vstack([box_on_table(1), table_part(1, 0.45, 0.8)]),
+    ],
+    ids=["a box on the table", "another part of the table", "box and another part"],
+)
+def test_correct_frames_of_regions_that_hardly_overlap_stay_as_they_are(points: np.ndarray) -> None:
+    engine = FusionEngine(MemoryStore(), SETTINGS)
+    send(engine, "ant", plain_gaussians(table_part(0, 0.0, 0.5), kappa=5))
+    for seq in range(1, 5):
+        send(engine, "bee", plain_gaussians(points[: seq * len(points) // 4], kappa=9), seq)
+        engine.align_due()
+        assert state_of(engine, "bee") in (AlignmentState.UNKNOWN, AlignmentState.ALIGNED)
+
+
 def test_a_gross_misfit_is_quarantined_with_a_message_and_returns_when_it_is_mended() -> None:
     engine = team(wrong_frame((0.25, 0.25, 0.2)))
     assert len(engine.maps.voted_map("bee")) > 0
