@@ -8,6 +8,7 @@ import posixpath
 import re
 import subprocess
 import sys
+import tomllib
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -48,23 +49,30 @@ _LIST_AFTER_TEXT = re.compile(r"^(?!\s*(?:[-*]|\d+\.) )(.*\S.*)\n(?=(?:[-*]|\d+\
 _EQUATION = re.compile(r'<(span|div) class="arithmatex">\\([(\[])(.*?)\\[)\]]</\1>', re.DOTALL)
 
 
+def on_config(config: MkDocsConfig) -> MkDocsConfig:
+    """State the version of the package at the foot of every page."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    config.copyright = f"GaussLite {project['version']}, {project['license']}"
+    return config
+
+
 def on_files(files: Files, *, config: MkDocsConfig) -> Files:
-    """Add the pages of files outside docs/, and the reference of all commands."""
+    """Add the pages of files outside docs/."""
     for source, uri in PAGES.items():
         files.append(File.generated(config, uri, content=(ROOT / source).read_text(encoding="utf-8")))
-    files.append(File.generated(config, COMMANDS_PAGE, content=_commands_page()))
     return files
 
 
 def on_page_markdown(markdown: str, *, page: Page, **_: object) -> str:
-    """Return a page with links between pages of the site, and with blank lines before lists.
+    """Return a page with links between pages of the site, blank lines before lists, and on one page all help texts.
 
     A list that follows a line of text is a list on GitHub, but not in Python-Markdown.
     """
     parts = _FENCE.split(markdown)
     for index in range(0, len(parts), 2):  # the odd parts are fenced code
         parts[index] = _LIST_AFTER_TEXT.sub(r"\1\n\n", _LINK.sub(lambda link: _site_link(link, page), parts[index]))
-    return "".join(parts)
+    helps = _help_texts() if page.file.src_uri == COMMANDS_PAGE else ""
+    return "".join(parts) + helps
 
 
 def on_page_content(content: str, **_: object) -> str:
@@ -111,13 +119,12 @@ def _sub_commands(help_text: str) -> list[str]:
 
 
 @cache
-def _commands_page() -> str:
-    """Return the help texts of all programs and their sub-commands as one page."""
+def _help_texts() -> str:
+    """Return the help texts of all programs and their sub-commands as sections of a page."""
     sections = [("gausslite", _help("gausslite"))]
     for name in _sub_commands(sections[0][1]):
         text = _help("gausslite", name)
         sections.append((f"gausslite {name}", text))
         sections += [(f"gausslite {name} {sub}", _help("gausslite", name, sub)) for sub in _sub_commands(text)]
     sections += [(program, _help(module)) for program, module in SERVICES.items()]
-    body = "\n\n".join(f"## `{title}`\n\n```text\n{text.rstrip()}\n```" for title, text in sections)
-    return f"# Commands\n\nThe help texts of all programs, as `--help` prints them.\n\n{body}\n"
+    return "\n\n" + "\n\n".join(f"## `{title}`\n\n```text\n{text.rstrip()}\n```" for title, text in sections)

@@ -33,6 +33,13 @@ def test_older_python_versions_are_refused_before_pip_searches() -> None:
     assert f"needs Python {minimum} or newer" in refusal["messages"]["after-failure"]
 
 
+def test_wheels_are_built_for_every_declared_python() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    declared = [line.rpartition(":: 3.")[2] for line in project["project"]["classifiers"] if "Python :: 3." in line]
+    assert project["tool"]["cibuildwheel"]["build"] == [f"cp3{minor}-manylinux_*" for minor in declared]
+    assert project["project"]["requires-python"] == f">=3.{declared[0]}"
+
+
 def test_source_files_have_at_most_400_lines() -> None:
     sources = [path for path in _tracked("*.py", "*.cpp", "*.h") if "v1" not in path.parts]
     too_long = {str(p.relative_to(ROOT)): n for p in sources if (n := len(p.read_text().splitlines())) > 400}
