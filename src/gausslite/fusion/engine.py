@@ -289,10 +289,13 @@ class FusionEngine:
         return gaussians, self.in_fused_frame(self._keyframes.decode(encoded)), revision
 
     def in_fused_frame(self, keyframes: Sequence[AgentKeyframe]) -> list[AgentKeyframe]:
-        """Return the keyframes with camera poses in the fused map's frame, without those too far from its origin."""
+        """Return the keyframes with camera poses in the fused map's frame.
+
+        Those of quarantined agents, and those too far from the origin, are left out.
+        """
         with self._lock:
-            frames = self._alignments.transforms()
-        moved = (_in_fused_frame(each, frames) for each in keyframes)
+            frames, quarantined = self._alignments.transforms(), self._alignments.quarantined
+        moved = (_in_fused_frame(each, frames) for each in keyframes if each.agent_id not in quarantined)
         return [each for each in moved if each is not None]
 
     def status(self) -> MissionStatus:

@@ -162,16 +162,19 @@ class FrameAlignments:
         """Return the latest T_fused_agent of the agents whose frame differs from the fused map's."""
         return {name: each.T_fused_agent for name, each in self._by_agent.items() if not each.is_identity}
 
+    @property
+    def quarantined(self) -> set[str]:
+        """The agents whose contribution is not used."""
+        return {name for name, each in self._by_agent.items() if each.state is AlignmentState.QUARANTINED}
+
     def in_other_frames(self) -> set[str]:
         """Return the agents whose frame differs from the fused map's, as far as is known."""
-        quarantined = {name for name, each in self._by_agent.items() if each.state is AlignmentState.QUARANTINED}
-        return quarantined | set(self.transforms())
+        return self.quarantined | set(self.transforms())
 
     def earlier(self, agent_id: str) -> set[str]:
         """Return the agents that contributed before this one and are not quarantined."""
         order = self.get(agent_id).order
-        usable = {name: each for name, each in self._by_agent.items() if each.state is not AlignmentState.QUARANTINED}
-        return {name for name, each in usable.items() if each.order < order}
+        return {name for name, each in self._by_agent.items() if each.order < order} - self.quarantined
 
 
 def _encode(alignment: FrameAlignment) -> bytes:

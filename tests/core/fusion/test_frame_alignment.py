@@ -161,6 +161,9 @@ def test_a_gross_misfit_is_quarantined_with_a_message_and_returns_when_it_is_men
     assert bee.gaussians > 0
     assert bee.won_voxels == 0
     assert {each.agent_id for each in engine.status().agents if each.won_voxels} == {"ant"}
+    seen = Frame(0, 0, np.zeros((8, 8, 3), np.uint8), np.ones((8, 8), np.float32), Camera(8, 8, 4, 4, 8, 8), np.eye(4))
+    kept = engine.in_fused_frame([AgentKeyframe("ant", seen), AgentKeyframe("bee", seen)])
+    assert [each.agent_id for each in kept] == ["ant"]
     send(engine, "bee", corner(1, kappa=9), seq=2)
     engine.align_due()
     assert state_of(engine, "bee") is not AlignmentState.QUARANTINED
