@@ -14,6 +14,7 @@ from gausslite.cli.main import main
 from gausslite.domain.camera import Camera
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
+from gausslite.domain.noun_match import NounMatch
 from gausslite.domain.region import BallRegion
 from gausslite.domain.relevance import Detection
 from gausslite.domain.task import TaskGraph
@@ -36,7 +37,7 @@ def frames(count: int) -> list[Frame]:
 class WeakDetector:
     """Detects one of two mugs with a low score, and a false vase in the first frame."""
 
-    def unsupported(self, queries: Sequence[str]) -> tuple[str, ...]:
+    def matches(self, queries: Sequence[str]) -> tuple[NounMatch, ...]:
         return ()
 
     def detect(self, frame: Frame, queries: Sequence[str]) -> list[Detection]:

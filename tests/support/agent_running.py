@@ -14,6 +14,7 @@ from fusion_running import GRID
 from serving import serving
 
 from gausslite.domain.frame import Frame
+from gausslite.domain.noun_match import NounReport
 from gausslite.domain.objects import ObjectLandmark
 from gausslite.domain.region import BallRegion
 from gausslite.domain.relevance import RelevanceMap
@@ -65,6 +66,10 @@ class Gate:
 
     @property
     def objects(self) -> tuple[ObjectLandmark, ...]:
+        return ()
+
+    @property
+    def nouns(self) -> tuple[NounReport, ...]:
         return ()
 
     def state(self) -> State:

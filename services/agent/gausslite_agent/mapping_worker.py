@@ -189,6 +189,8 @@ class MappingWorker:
         self._status.update(graph=graph)
         self._update_notes(self._task_mapper.notes)
         self._update_objects(self._task_mapper.objects)
+        for noun in self._task_mapper.nouns:
+            _log.info("%s", noun.match.describe())
 
     def _restore(self, saved: SavedMission) -> None:
         checkpoint = saved.checkpoint
@@ -264,7 +266,8 @@ class MappingWorker:
 
     def _update_objects(self, objects: tuple[ObjectLandmark, ...]) -> None:
         """Store the confirmed objects, and report them with the task to the fusion server."""
-        self._status.update(objects=objects)
+        assert self._task_mapper is not None
+        self._status.update(objects=objects, nouns=self._task_mapper.nouns)
         graph = self.status().graph
         if self.uplink is not None and graph is not None:
             self.uplink.report_objects(ObjectReport(graph, objects))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from gausslite.codec.object_report import object_as_json
+from gausslite.codec.object_report import noun_as_json, object_as_json
 from gausslite.domain.gaussians import Gaussians
 from gausslite.mission.results import peak_rss_mib
 from gausslite.wire.uplink_values import UplinkCounters
@@ -52,5 +52,6 @@ def mission_report(
         "peak_rss_mib": peak_rss_mib(),
         "team_gaussians_inserted": status.team_gaussians,
         "objects": [object_as_json(each) for each in status.objects],
+        "nouns": [noun_as_json(each) for each in status.nouns],
         "notes": [*status.notes, *status.task_notes, *status.load_notes],
     }

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from gausslite.domain.noun_match import NounReport
 from gausslite.domain.objects import ObjectLandmark
 from gausslite.domain.pose_correction import PoseCorrection
 from gausslite.domain.task import TaskGraph
@@ -52,8 +53,8 @@ class WorkerStatus:
     too short for all of it. max_detection_lag: longest delay of a detection, in frames. keyframes_reevaluated:
     keyframes evaluated for a new task. publish_error: why the uplink refused the newest changes. ages_s: ages of the
     latest mapped frames. correction: the odometry's latest correction, mapped at corrected_at_s of the monotonic clock.
-    notes: messages of the relevance estimator. objects: the confirmed
-    objects of the task. team_gaussians: Gaussians inserted from the fused map.
+    notes: messages of the relevance estimator. objects: the confirmed objects of the task. nouns: what is searched for
+    each noun, and what was detected. team_gaussians: Gaussians inserted from the fused map.
     """
 
     graph: TaskGraph | None = None
@@ -78,7 +79,13 @@ class WorkerStatus:
     correction: PoseCorrection | None = None
     corrected_at_s: float = 0.0
     objects: tuple[ObjectLandmark, ...] = ()
+    nouns: tuple[NounReport, ...] = ()
     team_gaussians: int = 0
+
+    @property
+    def noun_notes(self) -> tuple[str, ...]:
+        """One line for each noun that is searched: its class, detections and best score."""
+        return tuple(each.describe() for each in self.nouns if each.match.is_searched)
 
     @property
     def task_notes(self) -> tuple[str, ...]:

@@ -14,7 +14,7 @@ from gausslite.cli.progress import MappingBar, print_above_bar
 from gausslite.cli.source_options import add_regions, add_source, report_region_file, selected_regions
 from gausslite.cli.trajectory_report import tracking_text, trajectory_report
 from gausslite.codec.keyframe_views import KeyframeView, write_keyframe_views
-from gausslite.codec.object_report import object_as_json
+from gausslite.codec.object_report import noun_as_json, object_as_json
 from gausslite.codec.png import write_png
 from gausslite.config.mapping_options import HOLD_OUT_HELP, add_budget, add_detector, add_policy
 from gausslite.config.source_options import add_camera_correction
@@ -168,6 +168,7 @@ class _Run:
             "peak_rss_mib": peak_rss_mib(),
             "memory_mib": self._mapper.memory_mib(),
             "objects": [object_as_json(each) for each in self._mapper.objects],
+            "nouns": [noun_as_json(each) for each in self._mapper.nouns],
             "notes": list(self._notes),
         }
         prepare_folder(options.out)
@@ -199,6 +200,8 @@ class _Run:
             print(f"  {tracking_text(report)}")
         if result.processed == 0:
             print(f"  no selected frame comes after frame {result.last_index}, the last one of the resumed run")
+        for noun in self._mapper.nouns:
+            print(f"  {noun.describe()}")
         for note in self._notes:
             print(f"  {note}")
 
@@ -212,12 +215,12 @@ class _Run:
 def _first_roi(
     options: argparse.Namespace, inputs: MapInputs, estimators: EstimatorFactory, resumed_after: int
 ) -> TaskGraph | list[Region]:
-    """Return the first frame's task or the regions, and report nouns that the detector cannot find."""
+    """Return the first frame's task or the regions, and report what is searched for each noun."""
     if options.detector is None and inputs.schedule.graphs():
         report_region_file(options.source, inputs.stream.source)
     for scheduled in inputs.schedule.graphs():
-        for warning in estimators.unsupported_nouns(scheduled):
-            print_message(warning)
+        for match in estimators.noun_matches(scheduled):
+            print_message(match.describe())
     graph = inputs.schedule.at(resumed_after)
     return selected_regions(options, inputs.stream.source) if graph is None else graph
 

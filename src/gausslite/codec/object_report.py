@@ -8,6 +8,7 @@ from typing import Any
 
 from gausslite.codec.task_json import graph_as_json, graph_from_json
 from gausslite.domain.errors import CodecError, GaussLiteError
+from gausslite.domain.noun_match import NounReport
 from gausslite.domain.objects import ObjectLandmark, ObjectReport, ObjectRole
 from gausslite.domain.voxels import AxisAlignedBox
 
@@ -45,6 +46,22 @@ def object_as_json(landmark: ObjectLandmark) -> dict[str, Any]:
         "confidence": landmark.confidence,
         "first_seen_ns": landmark.first_seen_ns,
         "last_seen_ns": landmark.last_seen_ns,
+    }
+
+
+def noun_as_json(report: NounReport) -> dict[str, Any]:
+    """Return what was searched and detected for a noun as JSON values, as in report.json."""
+    match = report.match
+    return {
+        "noun": match.noun,
+        "classes": list(match.classes),
+        "basis": str(match.basis),
+        "similarity": match.similarity,
+        "searched": match.is_searched,
+        "detections": report.detections,
+        "best_score": report.best_score,
+        "confirmed_objects": report.objects,
+        "rival": report.rival,
     }
 
 

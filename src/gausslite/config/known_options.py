@@ -7,7 +7,8 @@ from typing import Final
 
 KNOWN_OPTIONS: Final = frozenset(
     {
-        *("absent", "after", "agent-id", "backend", "before", "blur", "camera-correction", "caps", "changes"),
+        *("absent", "accept-similar", "after", "agent-id", "backend", "before", "blur", "camera-correction", "caps"),
+        "changes",
         *("deadline-slack", "details", "detector", "disable", "drain-timeout", "equal", "exit-when-done"),
         *("frame-alignment", "frame-error", "free-space", "homes", "late-joiner", "positions", "team-map"),
         *("external-rasterizer", "fit-views", "frames", "frames-a", "frames-b", "fusion", "gaussians"),

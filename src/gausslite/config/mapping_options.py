@@ -55,7 +55,7 @@ _SKIP_STAGES_HELP = (
 
 
 def add_detector(parser: argparse.ArgumentParser) -> None:
-    """Add --detector, --segmenter, --vocabulary and --resegment: how the task's objects are detected and outlined."""
+    """Add the options that state how the task's objects are detected and outlined."""
     group = parser.add_argument_group("perception")
     add = group.add_argument
     add(
@@ -76,6 +76,7 @@ def add_detector(parser: argparse.ArgumentParser) -> None:
         help="Grounding DINO's vocabulary (default: vocab.txt in the model's folder)",
     )
     add_switch(group, "--resegment", "run the segmenter on every frame (slower)")
+    add_switch(group, "--accept-similar", "also map objects of a class that is only similar to the task's noun")
 
 
 def add_policy(
@@ -211,6 +212,7 @@ def perception_settings(options: argparse.Namespace) -> PerceptionSettings:
         asynchronous=options.rate is not None,
         segmenter=options.segmenter,
         vocabulary=options.vocabulary,
+        accept_similar=options.accept_similar,
     )
 
 
@@ -244,6 +246,7 @@ def perception_options(settings: PerceptionSettings) -> dict[str, OptionValue]:
         "segmenter": settings.segmenter,
         "vocabulary": None if settings.vocabulary is None else str(settings.vocabulary.absolute()),
         "resegment": settings.resegment,
+        "accept-similar": settings.accept_similar,
     }
 
 

@@ -13,14 +13,23 @@ from gausslite.domain.arrays import require_array
 NO_TARGET = -1
 
 
+@dataclass(frozen=True, slots=True)
+class Rival:
+    """A class of a different thing that a detector finds in the same place, and its score."""
+
+    name: str
+    score: float
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Detection:
-    """One detected object in one image. box_px is (left, top, right, bottom)."""
+    """One detected object in one image. box_px is (left, top, right, bottom). rival: None without another class."""
 
     phrase: str
     score: float
     box_px: tuple[float, float, float, float]
     mask: Bool[ndarray, "h w"]
+    rival: Rival | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING
 
 from gausslite.domain.errors import InvalidInputError
+from gausslite.domain.noun_match import NounMatch
 from gausslite.domain.region import Region
 from gausslite.domain.task import TaskGraph
 from gausslite.mapping.mapper import GaussianMapper
@@ -15,6 +17,7 @@ from gausslite.mapping.tracking.tracker import CameraTracker
 from gausslite.mission.frame_scheduler import FrameScheduler
 from gausslite.mission.settings import MissionSettings, PerceptionSettings, PoseMode, SceneInfo
 from gausslite.mission.task_mapper import TaskMapper
+from gausslite.perception.evidence import EvidenceSettings
 from gausslite.perception.fixed_relevance import NoTaskEstimator, RegionRelevanceEstimator
 from gausslite.perception.relevance_estimator import AsyncRelevanceEstimator, RelevanceEstimator, TaskRelevanceEstimator
 from gausslite.perception.relevance_tracker import RelevanceTrackerSettings
@@ -46,7 +49,9 @@ def open_models(perception: PerceptionSettings) -> ModelRegistry | None:
         return None
     from gausslite.perception.models.model_registry import ModelRegistry
 
-    return ModelRegistry(perception.model, perception.segmenter, perception.vocabulary, perception.threads)
+    return ModelRegistry(
+        perception.model, perception.segmenter, perception.vocabulary, perception.threads, perception.accept_similar
+    )
 
 
 def region_estimator(regions: Sequence[Region]) -> RelevanceEstimator:
@@ -87,17 +92,19 @@ class EstimatorFactory:
                 "detector: the sequence has no ground-truth regions; name an ONNX file with --detector"
             )
 
-    def unsupported_nouns(self, graph: TaskGraph) -> tuple[str, ...]:
-        """Return one message for each noun of the task that the detector cannot find."""
+    def noun_matches(self, graph: TaskGraph) -> tuple[NounMatch, ...]:
+        """Return what the detector searches for each noun of the task."""
         detector = self._ground_truth_detector() if self._models is None else self._models.detector
-        return detector.unsupported(graph.queries)
+        return detector.matches(graph.queries)
 
     def build(self, graph: TaskGraph) -> RelevanceEstimator:
         """Return the relevance estimator of a task.
 
         It uses the user's models or, without any, the scene's ground truth. Raises InvalidInputError without both.
         """
-        settings = RelevanceTrackerSettings(up_axis=self._scene().up_axis)
+        accept_similar = self._perception.accept_similar
+        evidence = EvidenceSettings(max_rival_ratio=math.inf) if accept_similar else EvidenceSettings()
+        settings = RelevanceTrackerSettings(up_axis=self._scene().up_axis, evidence=evidence)
         if self._models is None:
             return TaskRelevanceEstimator(graph, self._ground_truth_detector(), settings)
         detector = self._models.detector

@@ -121,7 +121,8 @@ class PerceptionSettings:
 
     resegment: also run the segmenter on frames between detections. Otherwise masks are cut by depth inside the
     re-projected boxes, which on a real kitchen is as accurate at a third of the time. asynchronous: mapping does not
-    wait for detections; they run on their own thread and take effect when they are finished.
+    wait for detections; they run on their own thread and take effect when they are finished. accept_similar: also map
+    objects of a class that is only similar to the task's noun.
     """
 
     model: Path | None = field(default=None, metadata={"flag": "--detector", **FILE})
@@ -130,6 +131,7 @@ class PerceptionSettings:
     asynchronous: bool = field(default=False, metadata=MAY_CHANGE)
     segmenter: str | None = field(default=None, metadata=FILE)
     vocabulary: Path | None = field(default=None, metadata=FILE)
+    accept_similar: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
+from gausslite.domain.noun_match import NounReport
 from gausslite.domain.objects import ObjectLandmark
 from gausslite.domain.relevance import RelevanceMap
 from gausslite.domain.state import State, add_prefix, select_prefix
@@ -89,6 +90,11 @@ class TaskMapper:
     def objects(self) -> tuple[ObjectLandmark, ...]:
         """The confirmed objects of the current task."""
         return self._estimator.objects
+
+    @property
+    def nouns(self) -> tuple[NounReport, ...]:
+        """What the detector searches for each noun of the current task, and what it has detected."""
+        return self._estimator.nouns
 
     def insert_team_voxels(self, received: VoxelBatch, grid: VoxelGrid) -> InsertedVoxels:
         """Insert voxels that a teammate trained more than this agent, for the current task's region.

@@ -52,6 +52,8 @@ def encode_landmark(landmark: Landmark) -> dict[str, NDArray[Any]]:
         "seen_missed": int_array(landmark.seen_count, landmark.missed_count),
         "seen_ns_number": np.array([landmark.first_seen_ns, landmark.last_seen_ns, landmark.number], np.int64),
         "best_score_farthest_m": np.array([landmark.best_score, landmark.farthest_m]),
+        "rival_names": encode_text("\n".join(landmark.rival_scores)),
+        "score_sums": np.array([landmark.score_sum, *landmark.rival_scores.values()]),
     }
 
 
@@ -65,5 +67,10 @@ def decode_landmark(state: State) -> Landmark:
     seen_count, missed_count = get_counts(state, "seen_missed", 2)
     best_score, farthest_m = get_floats(state, "best_score_farthest_m", 2)
     extent = (get_text(state, "phrase"), np.array([x_m, y_m, z_m]), radius_m, cells, counts)
-    seen_ns_number = (int(value) for value in get_array(state, "seen_ns_number", (3,), np.int64))
-    return Landmark(*extent, seen_count, missed_count, best_score, farthest_m, *seen_ns_number)
+    first_ns, last_ns, number = (int(value) for value in get_array(state, "seen_ns_number", (3,), np.int64))
+    names = get_text(state, "rival_names").splitlines()
+    score_sum, *rival_sums = get_floats(state, "score_sums", 1 + len(names))
+    rivals = dict(zip(names, rival_sums, strict=True))
+    return Landmark(
+        *extent, seen_count, missed_count, best_score, farthest_m, first_ns, last_ns, number, score_sum, rivals
+    )

@@ -11,7 +11,8 @@ from jaxtyping import Bool, Float32
 from numpy import ndarray
 
 from gausslite.domain.frame import Frame
-from gausslite.domain.relevance import Detection
+from gausslite.domain.noun_match import NounMatch
+from gausslite.domain.relevance import Detection, Rival
 
 
 @runtime_checkable
@@ -22,18 +23,19 @@ class Detector(Protocol):
         """Return all instances of each query, best first; one object may match several queries."""
         ...
 
-    def unsupported(self, queries: Sequence[str]) -> tuple[str, ...]:
-        """Return one message for each query that this detector can never find."""
+    def matches(self, queries: Sequence[str]) -> tuple[NounMatch, ...]:
+        """Return what this detector searches for each query."""
         ...
 
 
 @dataclass(frozen=True, slots=True)
 class DetectedBox:
-    """A detection without a mask; box_px is (left, top, right, bottom)."""
+    """A detection without a mask; box_px is (left, top, right, bottom). rival: the class detected in the same box."""
 
     phrase: str
     score: float
     box_px: tuple[float, float, float, float]
+    rival: Rival | None = None
 
 
 @runtime_checkable
@@ -44,8 +46,8 @@ class BoxDetector(Protocol):
         """Return all instances of each query, best first."""
         ...
 
-    def unsupported(self, queries: Sequence[str]) -> tuple[str, ...]:
-        """Return one message for each query that this detector can never find."""
+    def matches(self, queries: Sequence[str]) -> tuple[NounMatch, ...]:
+        """Return what this detector searches for each query."""
         ...
 
 
@@ -65,9 +67,9 @@ class SegmentedDetector:
         self._detector = detector
         self._segmenters = tuple(segmenters)
 
-    def unsupported(self, queries: Sequence[str]) -> tuple[str, ...]:
-        """Return one message for each query that the box detector can never find."""
-        return self._detector.unsupported(queries)
+    def matches(self, queries: Sequence[str]) -> tuple[NounMatch, ...]:
+        """Return what the box detector searches for each query."""
+        return self._detector.matches(queries)
 
     def detect(self, frame: Frame, queries: Sequence[str]) -> list[Detection]:
         """Return the boxes with a mask, in the box detector's order."""
@@ -81,7 +83,7 @@ class SegmentedDetector:
             for row, mask in zip(rows, segmenter.segment(frame, boxes_px), strict=True):
                 masks[row] = mask
         return [
-            Detection(box.phrase, box.score, box.box_px, mask)
+            Detection(box.phrase, box.score, box.box_px, mask, box.rival)
             for box, mask in zip(boxes, masks, strict=True)
             if mask is not None
         ]

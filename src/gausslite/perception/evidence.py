@@ -27,12 +27,15 @@ _MAX_DISTANCE_FACTOR: Final = 1.1
 class EvidenceSettings:
     """A landmark is confirmed after min_seen detections, or one of confident_score or more.
 
-    Of the frames in which it should be visible, at least min_seen_fraction must have detected it.
+    Of the frames that should show it, at least min_seen_fraction must have detected it. Its scores must sum to
+    at least 1 / max_rival_ratio of those of any different thing detected in its place: the nearest class of a detector
+    is not always the class of the object.
     """
 
     min_seen: int = 2
     confident_score: float = 0.6
     min_seen_fraction: float = 0.25
+    max_rival_ratio: float = 1.3
 
     def __post_init__(self) -> None:
         if self.min_seen < 1:
@@ -40,17 +43,25 @@ class EvidenceSettings:
         for name in ("confident_score", "min_seen_fraction"):
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise InvalidInputError(f"evidence {name}: expected 0 to 1, got {getattr(self, name)}")
+        if not self.max_rival_ratio > 0:
+            raise InvalidInputError(f"evidence max_rival_ratio: expected a positive number, got {self.max_rival_ratio}")
 
     @classmethod
     def accept_all(cls) -> EvidenceSettings:
         """Return settings that confirm every detection."""
-        return cls(min_seen=1, confident_score=0.0, min_seen_fraction=0.0)
+        return cls(min_seen=1, confident_score=0.0, min_seen_fraction=0.0, max_rival_ratio=np.inf)
 
     def is_confirmed(self, landmark: Landmark) -> bool:
         """Return True if the landmark has enough evidence to exist."""
         seen, missed = landmark.seen_count, landmark.missed_count
         has_evidence = seen >= self.min_seen or landmark.best_score >= self.confident_score
-        return has_evidence and seen >= self.min_seen_fraction * (seen + missed)
+        is_found = seen >= self.min_seen_fraction * (seen + missed)
+        return has_evidence and is_found and self.rival(landmark) is None
+
+    def rival(self, landmark: Landmark) -> str | None:
+        """Return the different thing that the landmark rather is by the sums of the scores; None if there is none."""
+        name, score = max(landmark.rival_scores.items(), key=lambda each: each[1], default=("", 0.0))
+        return name if score > self.max_rival_ratio * landmark.score_sum else None
 
     def is_reliable(self, landmark: Landmark) -> bool:
         """Return True if a confident detection, or three times min_seen detections, confirm the landmark.

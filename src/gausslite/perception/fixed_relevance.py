@@ -10,6 +10,7 @@ from numpy import ndarray
 
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
+from gausslite.domain.noun_match import NounReport
 from gausslite.domain.objects import ObjectLandmark
 from gausslite.domain.region import Region
 from gausslite.domain.relevance import NO_TARGET, RelevanceMap
@@ -47,6 +48,11 @@ class RegionRelevanceEstimator:
         """Empty: there is no object map."""
         return ()
 
+    @property
+    def nouns(self) -> tuple[NounReport, ...]:
+        """Empty: there is no detector."""
+        return ()
+
     def state(self) -> State:
         """Return nothing: each frame's relevance is independent of the others."""
         return {}
@@ -76,6 +82,11 @@ class NoTaskEstimator:
     @property
     def objects(self) -> tuple[ObjectLandmark, ...]:
         """Empty: there is no object map."""
+        return ()
+
+    @property
+    def nouns(self) -> tuple[NounReport, ...]:
+        """Empty: there is no detector."""
         return ()
 
     def state(self) -> State:

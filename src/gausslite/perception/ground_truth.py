@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from gausslite.domain.frame import Frame
+from gausslite.domain.noun_match import MatchBasis, NounMatch
 from gausslite.domain.object_names import same_kind
 from gausslite.domain.region import Region
 from gausslite.domain.relevance import Detection
@@ -17,12 +18,10 @@ class RegionDetector:
     def __init__(self, regions: Mapping[str, Region]) -> None:
         self._regions = dict(regions)
 
-    def unsupported(self, queries: Sequence[str]) -> tuple[str, ...]:
-        """Return one message for each query that matches no region."""
-        known = ", ".join(self._regions) or "none"
-        return tuple(
-            f"no region matches {query!r}; the regions are {known}" for query in queries if not self._names(query)
-        )
+    def matches(self, queries: Sequence[str]) -> tuple[NounMatch, ...]:
+        """Return the regions that match each query."""
+        known = tuple(self._regions)
+        return tuple(NounMatch(query, MatchBasis.REGION, tuple(self._names(query)), known=known) for query in queries)
 
     def detect(self, frame: Frame, queries: Sequence[str]) -> list[Detection]:
         """Return the visible regions of each query, with score 1 and exact masks."""

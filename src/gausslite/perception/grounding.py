@@ -14,6 +14,7 @@ from numpy import ndarray
 
 from gausslite.domain.errors import InvalidInputError, ModelFileError
 from gausslite.domain.frame import Frame
+from gausslite.domain.noun_match import MatchBasis, NounMatch
 from gausslite.perception.box_size import BoxSizeLimits
 from gausslite.perception.detect import DetectedBox
 from gausslite.perception.grounding_text import PhraseInput, Tokenizer, encode_phrase
@@ -68,10 +69,9 @@ class GroundingDino:
         self._phrases: dict[str, PhraseInput] = {}
         self._check_outputs(model)
 
-    def unsupported(self, queries: Sequence[str]) -> tuple[str, ...]:
-        """Return nothing: the network accepts any phrase."""
-        del queries
-        return ()
+    def matches(self, queries: Sequence[str]) -> tuple[NounMatch, ...]:
+        """Return a match for every query: the network accepts any phrase."""
+        return tuple(NounMatch(query, MatchBasis.PHRASE) for query in queries)
 
     def boxes(self, frame: Frame, queries: Sequence[str]) -> list[DetectedBox]:
         """Return all instances of each query, best first, without boxes too large for their noun."""

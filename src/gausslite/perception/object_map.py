@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int64
 from numpy import ndarray
 
+from gausslite.domain.relevance import Rival
 from gausslite.domain.voxels import AxisAlignedBox, VoxelGrid
 
 _CELL_GRID: Final = VoxelGrid(0.05)
@@ -27,7 +28,7 @@ class Observation:
 
     The radius is twice the median distance of the points to the centroid: masks of chairs include background, which
     would dominate the outermost points. camera_m is the camera's centre, None without a camera. time_ns is the frame's
-    capture time.
+    capture time. rival: a different thing detected in the same place.
     """
 
     phrase: str
@@ -37,6 +38,7 @@ class Observation:
     camera_m: Float64[ndarray, "3"] | None = None
     score: float = 1.0
     time_ns: int = 0
+    rival: Rival | None = None
 
     @classmethod
     def from_points(
@@ -68,6 +70,7 @@ class Landmark:
     cells: keys of surface cells, with the number of observations of each in counts. missed_count: frames that should
     have shown the object but did not. farthest_m: the largest distance of an observation. first_seen_ns, last_seen_ns:
     capture times of its observations. number: assigned by the object map, in the order of first observations.
+    score_sum: sum of its scores; rival_scores: sums of the scores of different things detected in its place.
     """
 
     phrase: str
@@ -82,6 +85,8 @@ class Landmark:
     first_seen_ns: int = 0
     last_seen_ns: int = 0
     number: int = 0
+    score_sum: float = 0.0
+    rival_scores: dict[str, float] = field(default_factory=dict)
 
     @classmethod
     def from_observation(cls, observation: Observation) -> Landmark:
@@ -96,6 +101,8 @@ class Landmark:
             farthest_m=observation.distance_m,
             first_seen_ns=observation.time_ns,
             last_seen_ns=observation.time_ns,
+            score_sum=observation.score,
+            rival_scores={} if observation.rival is None else {observation.rival.name: observation.rival.score},
         )
 
     def is_colocated_with(self, other: Observation) -> bool:
@@ -116,6 +123,9 @@ class Landmark:
         self.farthest_m = max(self.farthest_m, other.farthest_m)
         self.first_seen_ns = min(self.first_seen_ns, other.first_seen_ns)
         self.last_seen_ns = max(self.last_seen_ns, other.last_seen_ns)
+        self.score_sum += other.score_sum
+        for name, score in other.rival_scores.items():
+            self.rival_scores[name] = self.rival_scores.get(name, 0.0) + score
         merged, where = np.unique(np.concatenate([self.cells, other.cells]), return_inverse=True)
         total = np.bincount(where, weights=np.concatenate([self.counts, other.counts])).astype(np.int64)
         if len(merged) > _MAX_CELLS:

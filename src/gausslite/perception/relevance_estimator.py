@@ -10,6 +10,7 @@ from jaxtyping import Float32
 from numpy import ndarray
 
 from gausslite.domain.frame import Frame
+from gausslite.domain.noun_match import NounReport, match_warnings
 from gausslite.domain.objects import ObjectLandmark
 from gausslite.domain.relevance import Detection, RelevanceMap
 from gausslite.domain.state import State
@@ -62,6 +63,11 @@ class RelevanceEstimator(Protocol):
         """The confirmed objects of the task so far; empty if the estimator has no object map."""
         ...
 
+    @property
+    def nouns(self) -> tuple[NounReport, ...]:
+        """What is searched for each noun of the task, and what was detected; empty without a detector."""
+        ...
+
     def state(self) -> State:
         """Return everything that the next frame's relevance depends on, except the frame, as named arrays."""
         ...
@@ -89,7 +95,7 @@ class TaskRelevanceEstimator:
     @property
     def notes(self) -> tuple[str, ...]:
         """Nouns that the detector cannot find, and anchors that no frame has shown yet."""
-        return (*self._detector.unsupported(self._graph.queries), *self._tracker.notes)
+        return (*match_warnings(self._detector.matches(self._graph.queries)), *self._tracker.notes)
 
     @property
     def landmarks(self) -> tuple[Landmark, ...]:
@@ -100,6 +106,11 @@ class TaskRelevanceEstimator:
     def objects(self) -> tuple[ObjectLandmark, ...]:
         """The confirmed objects of the task so far."""
         return self._tracker.objects
+
+    @property
+    def nouns(self) -> tuple[NounReport, ...]:
+        """What the detector searches for each noun of the task, and what it has detected."""
+        return tuple(self._tracker.report(match) for match in self._detector.matches(self._graph.queries))
 
     def estimate(self, frame: Frame, rendered_depth_m: Float32[ndarray, "h w"] | None = None) -> RelevanceEstimate:
         """Return weight 1 on the pixels of the targets that satisfy the task's relations."""
@@ -152,7 +163,7 @@ class AsyncRelevanceEstimator:
     @property
     def notes(self) -> tuple[str, ...]:
         """Nouns that the detector cannot find, anchors not seen yet, and the number of skipped keyframes."""
-        unsupported = self._detector.unsupported(self._graph.queries)
+        unsupported = match_warnings(self._detector.matches(self._graph.queries))
         count = self._skipped_keyframes
         skipped = (f"detector too slow: {count} keyframes were skipped",) if count else ()
         return (*unsupported, *self._tracker.notes, *skipped)
@@ -161,6 +172,11 @@ class AsyncRelevanceEstimator:
     def objects(self) -> tuple[ObjectLandmark, ...]:
         """The confirmed objects of the task so far."""
         return self._tracker.objects
+
+    @property
+    def nouns(self) -> tuple[NounReport, ...]:
+        """What the detector searches for each noun of the task, and what it has detected."""
+        return tuple(self._tracker.report(match) for match in self._detector.matches(self._graph.queries))
 
     def state(self) -> State:
         """Return the tracker's state as named arrays, without running detections."""

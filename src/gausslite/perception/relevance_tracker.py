@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from gausslite.domain.errors import InvalidInputError, MapFileError
 from gausslite.domain.frame import Frame
+from gausslite.domain.noun_match import NounMatch, NounReport
 from gausslite.domain.object_names import is_generic
 from gausslite.domain.objects import ObjectLandmark
 from gausslite.domain.pose import UpAxis, require_rigid, rotation_angle_deg, translation_m, unit_up_axis
@@ -84,14 +85,18 @@ class RelevanceTracker:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Attributes of the task that are not evaluated, and anchors that no frame has shown yet."""
+        """Attributes of the task that are not evaluated, different things, and anchors that no frame has shown yet."""
         attributes = (
             f"{each.colour or each.superlative} {noun_of(each.name)!r}: colours and sizes are not evaluated, "
             f"every {noun_of(each.name)!r} counts"
             for each in self._graph.attributes
         )
+        rivals = (
+            f"what looks like {each.phrase!r} is rather {rival!r}: not activated; --accept-similar accepts it"
+            for each, rival in self._filter.rivals
+        )
         unseen = (f"anchor {name!r} not seen yet: its targets are kept" for name in self._filter.unseen_anchors)
-        return (*attributes, *unseen)
+        return (*attributes, *dict.fromkeys(rivals), *unseen)
 
     @property
     def landmarks(self) -> tuple[Landmark, ...]:
@@ -102,6 +107,14 @@ class RelevanceTracker:
     def objects(self) -> tuple[ObjectLandmark, ...]:
         """The confirmed objects of the task, in the order of their first detection."""
         return describe_landmarks(self._filter.confirmed_landmarks, self._graph)
+
+    def report(self, match: NounMatch) -> NounReport:
+        """Return what has been detected of a noun so far."""
+        landmarks = [each for each in self.landmarks if each.phrase == match.noun]
+        confirmed = sum(each.phrase == match.noun for each in self._filter.confirmed_landmarks)
+        rival = next((name for each, name in self._filter.rivals if each.phrase == match.noun), None)
+        best_score = max((each.best_score for each in landmarks), default=0.0)
+        return NounReport(match, sum(each.seen_count for each in landmarks), best_score, confirmed, rival)
 
     def state(self) -> State:
         """Return landmarks, propagated detections and the keyframe's pose as named arrays."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float32
@@ -47,7 +48,8 @@ def lift_observation(detection: Detection, depth_m: Float32[ndarray, "h w"], fra
     T_world_camera = frame.T_world_camera
     points_m = transform_points(T_world_camera, points)
     camera_m, time_ns = T_world_camera[:3, 3], frame.capture_time_ns
-    return Observation.from_points(detection.phrase, points_m, camera_m, detection.score, time_ns)
+    observation = Observation.from_points(detection.phrase, points_m, camera_m, detection.score, time_ns)
+    return replace(observation, rival=detection.rival)
 
 
 class SpatialFilter:
@@ -75,6 +77,12 @@ class SpatialFilter:
     def confirmed_landmarks(self) -> tuple[Landmark, ...]:
         """The objects that have enough evidence to exist."""
         return tuple(each for each in self._object_map.objects if self._evidence.is_confirmed(each))
+
+    @property
+    def rivals(self) -> tuple[tuple[Landmark, str], ...]:
+        """The landmarks that rather show a different thing, with its name."""
+        rivals = ((each, self._evidence.rival(each)) for each in self._object_map.objects)
+        return tuple((each, rival) for each, rival in rivals if rival is not None)
 
     @property
     def unseen_anchors(self) -> tuple[str, ...]:

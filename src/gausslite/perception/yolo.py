@@ -9,27 +9,35 @@ import numpy as np
 
 from gausslite.domain.errors import InvalidInputError, ModelFileError
 from gausslite.domain.frame import Frame
-from gausslite.domain.relevance import Detection
+from gausslite.domain.noun_match import NounMatch
+from gausslite.domain.object_names import is_generic, same_kind
+from gausslite.domain.relevance import Detection, Rival
 from gausslite.perception.box_size import BoxSizeLimits
 from gausslite.perception.class_agnostic import ClassAgnosticSegmenter
-from gausslite.perception.detect import DetectedBox
+from gausslite.perception.detect import DetectedBox, box_iou
 from gausslite.perception.models.model_file import OpenModel
-from gausslite.perception.text_embeddings import TextEmbeddings, classes_for
+from gausslite.perception.text_embeddings import TextEmbeddings, match_noun
 from gausslite.perception.yolo_decode import Candidates, suppress
 from gausslite.perception.yolo_network import YoloSegNetwork
 
 
 @dataclass(frozen=True, slots=True)
 class YoloSettings:
-    """Thresholds of score, overlap and size of the boxes."""
+    """Thresholds of score, overlap and size of the boxes.
+
+    accept_similar: also search classes that are only similar to a noun. rival_min_iou: lowest overlap of a box with one
+    of a different class that may show the same object.
+    """
 
     min_score: float = 0.25
     nms_max_iou: float = 0.7
     max_boxes: int = 100
+    accept_similar: bool = False
+    rival_min_iou: float = 0.6
     box_limits: BoxSizeLimits = field(default_factory=BoxSizeLimits)
 
     def __post_init__(self) -> None:
-        for name in ("min_score", "nms_max_iou"):
+        for name in ("min_score", "nms_max_iou", "rival_min_iou"):
             if not 0.0 < getattr(self, name) < 1.0:
                 raise InvalidInputError(f"detector {name}: expected between 0 and 1, got {getattr(self, name)}")
         if not 1 <= self.max_boxes <= 1000:
@@ -57,9 +65,9 @@ class YoloSegDetector:
         """The names of the network's classes."""
         return self._network.names
 
-    def unsupported(self, queries: Sequence[str]) -> tuple[str, ...]:
-        """Return one message for each query that matches no class of the network."""
-        return tuple(f"no class of the detector matches {query!r}" for query in queries if not self._classes(query))
+    def matches(self, queries: Sequence[str]) -> tuple[NounMatch, ...]:
+        """Return the network's classes that match each query."""
+        return tuple(self._match(query) for query in queries)
 
     def segmenter(self) -> ClassAgnosticSegmenter:
         """Return a Segmenter over the same network, which uses masks of all classes."""
@@ -71,11 +79,12 @@ class YoloSegDetector:
         if not query_classes:
             return []
         output = self._network.run(frame)
-        candidates = self._distinct(output.candidates(self._settings.min_score), query_classes)
+        every = output.candidates(self._settings.min_score)
+        candidates = self._distinct(every, query_classes)
         masks = output.masks(candidates)
         return [
-            Detection(box.phrase, box.score, box.box_px, masks[row])
-            for row, box in self._matches(candidates, query_classes, frame)
+            Detection(box.phrase, box.score, box.box_px, masks[row], box.rival)
+            for row, box in self._boxes(candidates, every, query_classes, frame)
             if masks[row].any()
         ]
 
@@ -84,22 +93,32 @@ class YoloSegDetector:
         query_classes = self._query_classes(queries)
         if not query_classes:
             return []
-        candidates = self._distinct(self._network.run(frame).candidates(self._settings.min_score), query_classes)
-        return [box for _, box in self._matches(candidates, query_classes, frame)]
+        every = self._network.run(frame).candidates(self._settings.min_score)
+        candidates = self._distinct(every, query_classes)
+        return [box for _, box in self._boxes(candidates, every, query_classes, frame)]
 
     def _query_classes(self, queries: Sequence[str]) -> dict[str, tuple[int, ...]]:
-        """Return the class indices of each query that matches any class."""
-        return {query: classes for query in queries if (classes := self._classes(query))}
+        """Return the class indices of each query that is searched."""
+        found = {match.noun: match.classes for match in self.matches(queries) if match.is_searched}
+        return {
+            query: tuple(index for index, name in enumerate(self.class_names) if name in names)
+            for query, names in found.items()
+        }
 
-    def _matches(
-        self, candidates: Candidates, query_classes: Mapping[str, tuple[int, ...]], frame: Frame
+    def _boxes(
+        self, candidates: Candidates, every: Candidates, query_classes: Mapping[str, tuple[int, ...]], frame: Frame
     ) -> Iterator[tuple[int, DetectedBox]]:
-        """Yield row and box of each query's candidates, without boxes too large for their class."""
+        """Yield row and box of each query's candidates, without boxes too large for their class.
+
+        every: the candidates of all classes.
+        """
+        overlaps = box_iou(candidates.boxes_px, every.boxes_px) >= self._settings.rival_min_iou
         for query, classes in query_classes.items():
             for row in np.flatnonzero(np.isin(candidates.classes, classes)):
                 name = self.class_names[candidates.classes[row]]
                 left, top, right, bottom = (float(edge) for edge in candidates.boxes_px[row])
-                box = DetectedBox(query, float(candidates.scores[row]), (left, top, right, bottom))
+                rival = self._rival(query, classes, every.take(np.flatnonzero(overlaps[row])))
+                box = DetectedBox(query, float(candidates.scores[row]), (left, top, right, bottom), rival)
                 if self._settings.box_limits.accepts(name, box.score, box.box_px, frame):
                     yield int(row), box
 
@@ -109,10 +128,20 @@ class YoloSegDetector:
         candidates = candidates.take(np.flatnonzero(np.isin(candidates.classes, classes)))
         return suppress(candidates, self._settings.nms_max_iou, self._settings.max_boxes, across_classes=False)
 
-    def _classes(self, query: str) -> tuple[int, ...]:
-        return classes_for(query, self.class_names, self._embeddings)
+    def _rival(self, query: str, classes: tuple[int, ...], overlapping: Candidates) -> Rival | None:
+        """Return the best overlapping detection of a different thing; None without one, and for generic nouns."""
+        for row in np.argsort(-overlapping.scores, kind="stable"):
+            index = int(overlapping.classes[row])
+            name = self.class_names[index]
+            if index not in classes and not is_generic(query) and not same_kind(query, name):
+                return Rival(name, float(overlapping.scores[row]))
+        return None
+
+    def _match(self, query: str) -> NounMatch:
+        return match_noun(query, self.class_names, self._embeddings, self._settings.accept_similar)
 
 
-def load_yolo(model: OpenModel) -> YoloSegDetector:
+def load_yolo(model: OpenModel, accept_similar: bool = False) -> YoloSegDetector:
     """Return the detector with the text embeddings of the model's folder. Raises ModelFileError."""
-    return YoloSegDetector(model, TextEmbeddings.from_model_folder(model.path))
+    settings = YoloSettings(accept_similar=accept_similar)
+    return YoloSegDetector(model, TextEmbeddings.from_model_folder(model.path), settings)

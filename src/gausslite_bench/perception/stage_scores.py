@@ -12,6 +12,7 @@ from numpy import ndarray
 
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
+from gausslite.domain.noun_match import NounMatch
 from gausslite.domain.pose import UpAxis
 from gausslite.domain.region import Region
 from gausslite.domain.relevance import Detection
@@ -267,8 +268,8 @@ class _CachedDetector:
         self._detector = detector
         self._last: tuple[Frame, list[Detection]] | None = None
 
-    def unsupported(self, queries: Sequence[str]) -> tuple[str, ...]:
-        return self._detector.unsupported(queries)
+    def matches(self, queries: Sequence[str]) -> tuple[NounMatch, ...]:
+        return self._detector.matches(queries)
 
     def detect(self, frame: Frame, queries: Sequence[str]) -> list[Detection]:
         if self._last is None or self._last[0] is not frame:

@@ -12,6 +12,7 @@ from numpy import ndarray
 
 from gausslite.domain.errors import DatasetError, InvalidInputError
 from gausslite.domain.frame import Frame
+from gausslite.domain.noun_match import NounReport
 from gausslite.domain.objects import ObjectLandmark
 from gausslite.domain.pose_exposure_prior import PoseExposurePrior
 from gausslite.domain.region import Region
@@ -113,6 +114,11 @@ class RecordedRelevanceEstimator:
     @property
     def objects(self) -> tuple[ObjectLandmark, ...]:
         """Empty: there is no object map."""
+        return ()
+
+    @property
+    def nouns(self) -> tuple[NounReport, ...]:
+        """Empty: there is no detector."""
         return ()
 
     def state(self) -> State:

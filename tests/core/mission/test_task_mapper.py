@@ -8,6 +8,7 @@ import numpy as np
 from mapping_scenes import wall_frame
 
 from gausslite.domain.frame import Frame
+from gausslite.domain.noun_match import NounReport
 from gausslite.domain.objects import ObjectLandmark
 from gausslite.domain.region import BallRegion
 from gausslite.domain.relevance import RelevanceMap
@@ -113,6 +114,10 @@ class SlowEstimator:
 
     @property
     def objects(self) -> tuple[ObjectLandmark, ...]:
+        return ()
+
+    @property
+    def nouns(self) -> tuple[NounReport, ...]:
         return ()
 
     def state(self) -> State:

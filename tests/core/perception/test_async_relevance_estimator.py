@@ -11,6 +11,7 @@ from mapping_scenes import wall_frame
 
 from gausslite.domain.errors import ModelFileError
 from gausslite.domain.frame import Frame
+from gausslite.domain.noun_match import NounMatch
 from gausslite.domain.region import BallRegion
 from gausslite.domain.relevance import Detection
 from gausslite.domain.task import TaskGraph
@@ -28,7 +29,7 @@ TASK = TaskGraph("id", "a task", ("mug",), (), ())
 
 
 class BrokenDetector:
-    def unsupported(self, queries: tuple[str, ...]) -> tuple[str, ...]:
+    def matches(self, queries: Sequence[str]) -> tuple[NounMatch, ...]:
         return ()
 
     def detect(self, frame: Frame, queries: tuple[str, ...]) -> list[Detection]:

@@ -11,6 +11,7 @@ import pytest
 from gausslite.domain.camera import Camera
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
+from gausslite.domain.noun_match import NounMatch
 from gausslite.domain.relevance import Detection
 from gausslite.domain.task import Predicate, Relation, TaskGraph
 from gausslite.perception.evidence import EvidenceSettings, VisibilityCheck
@@ -45,7 +46,7 @@ class ScriptedDetector:
     scores: Sequence[float | None]
     calls: int = 0
 
-    def unsupported(self, queries: Sequence[str]) -> tuple[str, ...]:
+    def matches(self, queries: Sequence[str]) -> tuple[NounMatch, ...]:
         return ()
 
     def detect(self, frame: Frame, queries: Sequence[str]) -> list[Detection]:

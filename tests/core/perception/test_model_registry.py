@@ -12,6 +12,7 @@ from tiny_yolo import write_boxes_only, write_tiny_yolo
 from gausslite.domain.camera import Camera
 from gausslite.domain.errors import InvalidInputError, KernelError, ModelFileError
 from gausslite.domain.frame import Frame
+from gausslite.domain.noun_match import MatchBasis, NounMatch
 from gausslite.perception.detect import DetectedBox, SegmentedDetector
 from gausslite.perception.models.model_file import choose_providers, open_model
 from gausslite.perception.models.model_registry import ModelFamily, ModelRegistry, identify_family
@@ -84,8 +85,8 @@ def test_a_second_file_segments_boxes_and_depth_segments_the_rest(tmp_path):
 
 def test_boxes_without_a_mask_are_dropped():
     class TwoBoxes:
-        def unsupported(self, queries):
-            return ("no class",)
+        def matches(self, queries):
+            return (NounMatch(queries[0], MatchBasis.NONE),)
 
         def boxes(self, frame, queries):
             return [DetectedBox(queries[0], 0.9, (32, 16, 64, 48)), DetectedBox(queries[0], 0.8, (0, 0, 9, 9))]
@@ -96,7 +97,7 @@ def test_boxes_without_a_mask_are_dropped():
 
     detector = SegmentedDetector(TwoBoxes(), [LeftHalf(), LeftHalf()])
     assert [each.score for each in detector.detect(frame(), ["cup"])] == [0.9]
-    assert detector.unsupported(["cup"]) == ("no class",)
+    assert [each.is_searched for each in detector.matches(["cup"])] == [False]
 
 
 def test_grounding_dino_needs_a_vocabulary_and_has_no_masks(tmp_path):

@@ -10,10 +10,11 @@ import pytest
 from gausslite.datasets.open import open_source
 from gausslite.datasets.regions import load_voxel_regions
 from gausslite.datasets.source import Source
+from gausslite.domain.noun_match import MatchBasis
 from gausslite.perception.models.model_file import open_model
 from gausslite.perception.relevance_estimator import TaskRelevanceEstimator
 from gausslite.perception.relevance_tracker import RelevanceTrackerSettings
-from gausslite.perception.text_embeddings import TextEmbeddings, classes_for
+from gausslite.perception.text_embeddings import TextEmbeddings, match_noun
 from gausslite.perception.yolo import YoloSegDetector, load_yolo
 from gausslite.task.rules import RuleParser
 
@@ -45,13 +46,16 @@ def test_text_embeddings_match_nouns_to_classes_or_to_none(shared_dir, detector)
     vectors = TextEmbeddings.from_model_folder(shared_dir / "models" / "yolo11n-seg_int8.onnx")
     assert vectors is not None
     names = detector.class_names
-    expected = {"mug": "cup", "armchair": "chair", "desk": "dining table", "stool": "chair", "wheelchair": "chair"}
-    for noun, name in expected.items():
-        best = vectors.best_class(noun, names)
-        assert best is not None
-        assert names[best] == name
+    for noun, name in {"kitten": "cat", "shears": "scissors", "river boat": "boat"}.items():
+        match = match_noun(noun, names, vectors)
+        assert (match.classes, match.is_searched) == ((name,), True)
+    # siblings: the nearest class is a different thing
+    for noun, name in {"pliers": "scissors", "tiger": "zebra", "faucet": "sink"}.items():
+        match = match_noun(noun, names, vectors)
+        assert (match.classes, match.basis, match.is_searched) == ((name,), MatchBasis.SIMILAR, False)
+        assert match_noun(noun, names, vectors, accept_similar=True).is_searched
     for noun in ("lamp", "fan", "towel", "fire extinguisher", "pillow", "key", "mirror", "trash can"):
-        assert classes_for(noun, names, vectors) == ()
+        assert not match_noun(noun, names, vectors).is_searched
 
 
 def test_the_chair_closest_to_the_table(kitchen, detector, shared_dir):

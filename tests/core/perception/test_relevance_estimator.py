@@ -10,6 +10,7 @@ import pytest
 from gausslite.domain.camera import Camera
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
+from gausslite.domain.noun_match import MatchBasis
 from gausslite.domain.region import BallRegion
 from gausslite.domain.relevance import NO_TARGET
 from gausslite.domain.task import Predicate, Relation, TaskGraph
@@ -20,7 +21,7 @@ from gausslite.perception.relations import SpatialSettings
 from gausslite.perception.relevance_estimator import TaskRelevanceEstimator
 from gausslite.perception.relevance_tracker import RelevanceTrackerSettings
 from gausslite.perception.spatial import SpatialFilter, best_depth_m
-from gausslite.perception.text_embeddings import classes_for
+from gausslite.perception.text_embeddings import match_noun
 
 CAMERA = Camera(100.0, 100.0, 80.0, 60.0, 160, 120)
 UP = (0.0, -1.0, 0.0)
@@ -55,8 +56,8 @@ class CountingDetector:
     inner: RegionDetector
     calls: int = 0
 
-    def unsupported(self, queries):
-        return self.inner.unsupported(queries)
+    def matches(self, queries):
+        return self.inner.matches(queries)
 
     def detect(self, frame, queries):
         self.calls += 1
@@ -215,9 +216,9 @@ def test_region_detector_matches_head_nouns_and_lists_unsupported_queries():
     assert len(detector.detect(frame_at(), ["cup"])) == 2
     assert len(detector.detect(frame_at(), ["object"])) == 2
     assert detector.detect(frame_at(), ["umbrella"]) == []
-    assert detector.unsupported(["cup", "umbrella"]) == (
-        "no region matches 'umbrella'; the regions are mug_1, mug_2, wall",
-    )
+    cup, umbrella = detector.matches(["cup", "umbrella"])
+    assert (cup.classes, cup.warning) == (("mug_1", "mug_2"), None)
+    assert umbrella.warning == "no region matches 'umbrella'; the regions are mug_1, mug_2, wall"
 
 
 def test_region_estimator_assigns_target_indices():
@@ -230,12 +231,20 @@ def test_region_estimator_assigns_target_indices():
 
 def test_nouns_match_classes_by_name_head_and_synonym():
     names = ("person", "chair", "cup", "dining table", "couch")
-    assert classes_for("mug", names, None) == (2,)
-    assert classes_for("lawn chair", names, None) == (1,)
-    assert classes_for("wooden desk", names, None) == (3,)
-    assert classes_for("sofa", names, None) == (4,)
-    assert classes_for("umbrella", names, None) == ()
-    assert classes_for("thing", names, None) == (0, 1, 2, 3, 4)
+    expected = {
+        "cup": (("cup",), MatchBasis.NAME),
+        "mug": (("cup",), MatchBasis.SYNONYM),
+        "wooden chair": (("chair",), MatchBasis.NAME),
+        "lawn chair": (("chair",), MatchBasis.SYNONYM),
+        "wooden desk": (("dining table",), MatchBasis.SYNONYM),
+        "sofa": (("couch",), MatchBasis.SYNONYM),
+        "umbrella": ((), MatchBasis.NONE),
+        "thing": (names, MatchBasis.GENERIC),
+    }
+    for noun, (classes, basis) in expected.items():
+        match = match_noun(noun, names, None)
+        assert (match.classes, match.basis) == (classes, basis)
+        assert match.is_searched == bool(classes)
 
 
 @pytest.mark.parametrize("settings", [{"up_axis": (0.0, 0.0, 0.0)}, {"max_frames": 0}, {"max_rotation_deg": -1.0}])

@@ -12,8 +12,12 @@ from tiny_yolo import write_boxes_only, write_tiny_yolo
 from gausslite.domain.camera import Camera
 from gausslite.domain.errors import InvalidInputError, ModelFileError
 from gausslite.domain.frame import Frame
+from gausslite.domain.task import TaskGraph
 from gausslite.perception.box_size import BoxSizeLimits
+from gausslite.perception.evidence import EvidenceSettings
 from gausslite.perception.models.model_file import open_model
+from gausslite.perception.relevance_estimator import TaskRelevanceEstimator
+from gausslite.perception.relevance_tracker import RelevanceTrackerSettings
 from gausslite.perception.yolo import YoloSegDetector, YoloSettings, load_yolo
 
 NAMES = ("cup", "chair", "dining table")
@@ -95,7 +99,39 @@ def test_a_generic_noun_matches_every_class(tmp_path):
 def test_a_noun_without_a_class_is_unsupported(tmp_path):
     detector = detector_from(write_tiny_yolo(tmp_path / "tiny.onnx", NAMES, [CUP]))
     assert detector.detect(frame_with_red_square(), ["umbrella"]) == []
-    assert detector.unsupported(["cup", "umbrella"]) == ("no class of the detector matches 'umbrella'",)
+    cup, umbrella = detector.matches(["cup", "umbrella"])
+    assert (cup.classes, cup.is_searched, cup.warning) == (("cup",), True, None)
+    assert (umbrella.is_searched, umbrella.warning) == (False, "no class of the detector matches 'umbrella'")
+
+
+def test_a_different_class_in_the_same_box_is_the_rival(tmp_path):
+    tv, laptop = (24.0, 32.0, 16.0, 16.0, 0, 0.8), (25.0, 32.0, 16.0, 16.0, 1, 0.4)
+    detector = detector_from(write_tiny_yolo(tmp_path / "tiny.onnx", ("tv", "laptop"), [tv, laptop]))
+    (found,) = detector.detect(frame_with_red_square(), ["laptop"])
+    assert found.rival is not None
+    assert (found.rival.name, found.rival.score) == ("tv", pytest.approx(0.8))
+    (object_1, object_2) = detector.detect(frame_with_red_square(), ["object"])
+    assert (object_1.rival, object_2.rival) == (None, None)
+
+
+def test_what_is_rather_another_class_is_reported_and_not_activated(tmp_path):
+    tv, laptop = (24.0, 32.0, 16.0, 16.0, 0, 0.8), (25.0, 32.0, 16.0, 16.0, 1, 0.4)
+    detector = detector_from(write_tiny_yolo(tmp_path / "tiny.onnx", ("tv", "laptop"), [tv, laptop]))
+    task = TaskGraph("id", "find the laptop", ("laptop",), (), ())
+    strict = TaskRelevanceEstimator(task, detector)
+    lenient = TaskRelevanceEstimator(
+        task, detector, RelevanceTrackerSettings(evidence=EvidenceSettings(max_rival_ratio=float("inf")))
+    )
+    frames = [replace(frame_with_red_square(), index=index) for index in range(7)]
+    assert not any(strict.estimate(frame).relevance.roi.any() for frame in frames)
+    assert any(lenient.estimate(frame).relevance.roi.any() for frame in frames)
+    assert strict.notes == ("what looks like 'laptop' is rather 'tv': not activated; --accept-similar accepts it",)
+    (report,) = strict.nouns
+    assert (report.rival, report.objects, report.best_score) == ("tv", 0, pytest.approx(0.4))
+    assert report.describe().endswith("best score 0.40, 0 confirmed")
+    restored = TaskRelevanceEstimator(task, detector)
+    restored.restore(strict.state())
+    assert restored.nouns == strict.nouns
 
 
 def test_segmenter_matches_instances_of_any_class_to_boxes(tmp_path):

@@ -43,18 +43,22 @@ def identify_family(model: OpenModel) -> ModelFamily:
 class ModelRegistry:
     """The detector and the segmenter of one mission; each file is opened once."""
 
-    def __init__(self, detector: Path, segmenter: str | None, vocabulary: Path | None, threads: int | None) -> None:
+    def __init__(
+        self, detector: Path, segmenter: str | None, vocabulary: Path | None, threads: int | None,
+        accept_similar: bool = False,
+    ) -> None:  # fmt: skip
         """Open the detector's file and build the segmenter.
 
         segmenter: "yolo" (the detector's own masks), "depth" (by depth and colour), or the path of a FastSAM file. None
-        selects the detector's own masks if it has them, else "depth". Raises ModelFileError, InvalidInputError,
+        selects the detector's own masks if it has them, else "depth". accept_similar: also detect classes that are only
+        similar to a noun. Raises ModelFileError, InvalidInputError,
         KernelError.
         """
         model = open_model(detector, threads)
         if identify_family(model) is ModelFamily.GROUNDING_DINO:
             self._use_grounding(model, segmenter, vocabulary, threads)
         else:
-            self._use_yolo(model, segmenter, threads)
+            self._use_yolo(model, segmenter, threads, accept_similar)
 
     @property
     def detector(self) -> Detector:
@@ -81,10 +85,10 @@ class ModelRegistry:
         self._segmenter: Segmenter = _segmenter(segmenter or DEPTH, threads)
         self._detector: Detector = SegmentedDetector(network, _with_depth_fallback(self._segmenter))
 
-    def _use_yolo(self, model: OpenModel, segmenter: str | None, threads: int | None) -> None:
+    def _use_yolo(self, model: OpenModel, segmenter: str | None, threads: int | None, accept_similar: bool) -> None:
         from gausslite.perception.yolo import load_yolo
 
-        network = load_yolo(model)
+        network = load_yolo(model, accept_similar)
         if segmenter in (None, OWN_MASKS):
             self._segmenter, self._detector = network.segmenter(), network
         else:
