@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 from collections import OrderedDict
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 from jaxtyping import Int64
@@ -25,6 +26,7 @@ class RevisionLog:
     def __init__(self, first_revision: int, max_removed: int = MAX_REMOVED_VOXELS) -> None:
         self._revision = self._oldest = first_revision
         self._max_removed = max_removed
+        # both in the order of the revisions, so that changed_since reads only what changed
         self._changed_at: dict[int, int] = {}
         self._removed_at: OrderedDict[int, int] = OrderedDict()
 
@@ -38,6 +40,7 @@ class RevisionLog:
         self._revision = revision
         for key in changed:
             self._removed_at.pop(key, None)
+            self._changed_at.pop(key, None)
             self._changed_at[key] = revision
         for key in removed:
             del self._changed_at[key]
@@ -55,5 +58,9 @@ class RevisionLog:
             raise RevisionGoneError(
                 f"since_revision: expected {self._oldest} to {self._revision}, or 0 for a snapshot, got {revision}"
             )
-        logs = (self._changed_at, self._removed_at)
-        return np.array(sorted(key for log in logs for key, at in log.items() if at > revision), np.int64)
+        recent = [*_keys_after(self._changed_at, revision), *_keys_after(self._removed_at, revision)]
+        return np.sort(np.array(recent, np.int64))
+
+
+def _keys_after(revisions: dict[int, int], revision: int) -> Iterator[int]:
+    return itertools.takewhile(lambda key: revisions[key] > revision, reversed(revisions))

@@ -103,4 +103,16 @@ def crop_to_box(batch: VoxelBatch, box: AxisAlignedBox, grid: VoxelGrid) -> Voxe
 
 def select_keys(batch: VoxelBatch, keys: Int64[ndarray, " k"]) -> VoxelBatch:
     """Return the voxels of the batch that are in `keys`, which may be unsorted."""
-    return select_voxels(batch, np.isin(batch.keys, keys))
+    wanted = np.unique(keys)
+    rows = np.searchsorted(batch.keys, wanted)
+    rows = rows[np.append(batch.keys, np.int64(-1))[rows] == wanted]
+    counts, starts = batch.counts[rows], batch.offsets[rows]
+    gaussians = batch.gaussians.take(gather_rows(starts, counts))
+    return VoxelBatch(batch.keys[rows], batch.kappa_sums[rows], counts, gaussians)
+
+
+def slice_voxels(batch: VoxelBatch, start: int, stop: int) -> VoxelBatch:
+    """Return the voxels with the indices start to stop - 1, or fewer at the end of the batch."""
+    stop = min(stop, len(batch))
+    gaussians = batch.gaussians.take(np.arange(batch.offsets[start], batch.offsets[stop]))
+    return VoxelBatch(batch.keys[start:stop], batch.kappa_sums[start:stop], batch.counts[start:stop], gaussians)

@@ -1,6 +1,8 @@
-"""Record at which revision of the fused map each voxel last changed, for the streams of WatchFusedMap."""
+"""Record which agent wins each voxel and at which revision the voxel last changed, for the status and the watchers."""
 
 from __future__ import annotations
+
+from collections.abc import Iterable
 
 import numpy as np
 from jaxtyping import Int64
@@ -11,38 +13,75 @@ from gausslite.fusion.vote import VoteResult
 
 
 class ChangeLog:
-    """Count the revisions of the fused map since the server started, and store each voxel's winner.
+    """Count the revisions of the fused map since the server started, and store each voxel's winner with its Gaussians.
 
     `first_revision` must exceed all revisions from before a restart.
     """
 
     def __init__(self, first_revision: int = 1, max_removed: int = MAX_REMOVED_VOXELS) -> None:
         self._log = RevisionLog(first_revision, max_removed)
-        self._winner: dict[int, str] = {}
+        self._winner: dict[int, tuple[str, int]] = {}
+        self._won_voxels: dict[str, int] = {}
+        self._fused_gaussians = 0
 
     @property
     def revision(self) -> int:
         """The fused map's current revision."""
         return self._log.revision
 
+    @property
+    def fused_voxels(self) -> int:
+        """The number of voxels of the fused map."""
+        return len(self._winner)
+
+    @property
+    def fused_gaussians(self) -> int:
+        """The number of Gaussians of the fused map."""
+        return self._fused_gaussians
+
+    def won_voxels(self, agent_id: str) -> int:
+        """Return the number of voxels that the agent wins."""
+        return self._won_voxels.get(agent_id, 0)
+
+    def keys(self) -> Int64[ndarray, " v"]:
+        """Return the voxels of the fused map, ascending."""
+        return np.sort(np.fromiter(self._winner, np.int64, len(self._winner)))
+
+    def winners(self, keys: Iterable[int]) -> dict[str, list[int]]:
+        """Return those of the voxels that are in the fused map, by winner."""
+        won: dict[str, list[int]] = {}
+        for key in keys:
+            winner = self._winner.get(key)
+            if winner is not None:
+                won.setdefault(winner[0], []).append(key)
+        return won
+
+    def load(self, vote: VoteResult) -> None:
+        """Record the first result of the vote, on all voxels."""
+        names = [vote.agents[index] for index in vote.winner_index.tolist()]
+        counts = vote.counts[vote.offsets[:-1]].tolist()
+        keys = vote.keys.tolist()
+        for key, name, count in zip(keys, names, counts, strict=True):
+            self._set(key, (name, count))
+        if keys:
+            self._log.record(keys, (), self._log.revision + 1)
+
     def record(self, agent_id: str, keys: Int64[ndarray, " k"], vote: VoteResult) -> Int64[ndarray, " c"]:
         """Record that this agent's updates of `keys` changed; `vote` is the new result on these voxels.
 
         Returns the voxels where the fused map changed: those that the agent wins now or won before.
         """
-        new_winner = dict(zip(vote.keys.tolist(), vote.winner_index.tolist(), strict=True))
-        changed, removed = [], []
+        counts = vote.counts[vote.offsets[:-1]].tolist()
+        winners = zip((vote.agents[index] for index in vote.winner_index.tolist()), counts, strict=True)
+        new_winner = dict(zip(vote.keys.tolist(), winners, strict=True))
+        changed: list[int] = []
+        removed: list[int] = []
         for key in keys.tolist():
-            index = new_winner.get(key)
-            winner = None if index is None else vote.agents[index]
-            if agent_id not in (winner, self._winner.get(key)):
+            new, old = new_winner.get(key), self._winner.get(key)
+            if agent_id not in (new and new[0], old and old[0]):
                 continue
-            if winner is None:
-                del self._winner[key]
-                removed.append(key)
-            else:
-                self._winner[key] = winner
-                changed.append(key)
+            self._set(key, new)
+            (removed if new is None else changed).append(key)
         if changed or removed:
             self._log.record(changed, removed, self._log.revision + 1)
         return np.array(sorted(changed + removed), np.int64)
@@ -50,3 +89,13 @@ class ChangeLog:
     def changed_since(self, revision: int) -> Int64[ndarray, " c"]:
         """Return the voxels that changed or became empty after this revision, ascending. Raises RevisionGoneError."""
         return self._log.changed_since(revision)
+
+    def _set(self, key: int, new: tuple[str, int] | None) -> None:
+        old = self._winner.pop(key, None)
+        if old is not None:
+            self._won_voxels[old[0]] -= 1
+            self._fused_gaussians -= old[1]
+        if new is not None:
+            self._winner[key] = new
+            self._won_voxels[new[0]] = self._won_voxels.get(new[0], 0) + 1
+            self._fused_gaussians += new[1]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Collection, Mapping, Sequence
+from concurrent.futures import Future
 from dataclasses import replace
 from threading import RLock
 from typing import NamedTuple
@@ -30,12 +31,13 @@ from gausslite.fusion.keyframes import AgentKeyframe, EncodedKeyframe, FrameDeco
 from gausslite.fusion.limits import FusionSettings, VoteRule
 from gausslite.fusion.mission_config import MissionConfig, reconcile
 from gausslite.fusion.sessions import SessionRegistry
-from gausslite.fusion.store import FusionStore, PutOutcome, SessionRecord
+from gausslite.fusion.store import FusionStore, PutOutcome, SessionRecord, require_storable
 from gausslite.fusion.team_objects import TeamObjects, find_objects
-from gausslite.fusion.traffic import MissionStatus, TrafficCounters, contribution
+from gausslite.fusion.traffic import AgentContribution, MissionStatus, TrafficCounters
 from gausslite.fusion.update_checks import UpdateChecks
-from gausslite.fusion.usage import UsageLedger
-from gausslite.fusion.vote import rank_voxels
+from gausslite.fusion.update_committer import UpdateCommitter
+from gausslite.fusion.update_queue import PendingUpdate
+from gausslite.fusion.usage import require_within_quotas
 from gausslite.fusion.vote_input import VoteInput
 
 
@@ -80,8 +82,6 @@ class FusionEngine:
         self._bans = BanList(store)
         self._checks = UpdateChecks(store, quotas)
         self._traffic: dict[str, TrafficCounters] = {}
-        scores = store.scores()
-        self._usage = UsageLedger(scores, quotas)
         self._alignments = FrameAlignments(store)
         self._free_space = FreeSpaceRecords(store, settings.grid)
         uses_free_space = settings.vote is VoteRule.FREE_SPACE
@@ -91,6 +91,7 @@ class FusionEngine:
             store, self._alignments, self._votes, self._free_space, self._lock, settings.alignment
         )
         self._maps = FusedMapLayers(self._votes, self._lock, settings.grid, first_revision, settings.max_removed_voxels)
+        self._committer = UpdateCommitter(store, self._lock, self._check_update, self._record_update)
 
     @property
     def grid(self) -> VoxelGrid:
@@ -131,7 +132,7 @@ class FusionEngine:
         InvalidInputError, MismatchError, NameInUseError, NotPermittedError (banned), QuotaError, StorageError.
         """
         require_identifier("agent_id", agent_id)
-        with self._lock:
+        with self._committer.committing, self._lock:
             self._bans.require_allowed(agent_id)
             self._sessions.require_free(agent_id, token)
             self._make_room(agent_id)
@@ -145,7 +146,7 @@ class FusionEngine:
             self._checks.record_join(agent_id)
             return JoinResult(
                 session,
-                self._checks.highest_seq(agent_id),
+                self._store.totals(agent_id).highest_update_seq,
                 self._maps.revision(),
                 self._keyframes.indices(agent_id),
             )
@@ -159,24 +160,30 @@ class FusionEngine:
         """Store an agent's voxel updates; they are durable on return, if the store is.
 
         Raises SessionUnknownError, MismatchError (another grid), NotPermittedError (another agent's name),
-        InvalidInputError, QuotaError, StorageError; in all these cases nothing of the message is stored.
+        InvalidInputError, QuotaError, StorageError, UnavailableError; see UpdateCommitter for what is stored then.
         """
-        with self._lock:
-            agent_id = self._sessions.get(session_id).agent_id
-            if subset.agent_id != agent_id:
-                raise NotPermittedError(
-                    f"subset agent_id: expected {quote_name(agent_id)}, got {quote_name(subset.agent_id)}"
-                )
-            if grid != self.grid:
-                raise MismatchError(f"voxel size: this mission votes on {self.grid.size_m:g} m, got {grid.size_m:g} m")
-            subset = self._checks.check(subset)
-            usage = self._usage.after(subset, self._store)
-            outcome = self._store.put(subset)
-            self._checks.record(subset)
-            self._usage.set(agent_id, usage)
-            self._aligner.record(agent_id, outcome.accepted)
-            self._maps.record(agent_id, self._votes.changed_keys(agent_id, outcome.accepted))
-            return outcome
+        future = self.enqueue_update(session_id, subset, grid)
+        while not future.done():
+            self._committer.commit()
+        return future.result()
+
+    def enqueue_update(self, session_id: str, subset: RoiSubset, grid: VoxelGrid) -> Future[PutOutcome]:
+        """Queue an agent's voxel updates; the future has what `contribute` returns or raises, after a commit.
+
+        Raises NotPermittedError for another agent's name, so that no agent waits in another one's queue.
+        """
+        agent_id = self.session(session_id).agent_id
+        if subset.agent_id != agent_id:
+            raise NotPermittedError(
+                f"subset agent_id: expected {quote_name(agent_id)}, got {quote_name(subset.agent_id)}"
+            )
+        if grid != self.grid:
+            raise MismatchError(f"voxel size: this mission votes on {self.grid.size_m:g} m, got {grid.size_m:g} m")
+        return self._committer.add(session_id, subset)
+
+    def commit_updates(self) -> None:
+        """Commit the next group of queued updates. Call it once for each enqueued one, or more often."""
+        self._committer.commit()
 
     def align_due(self) -> bool:
         """Estimate the frames of the agents with enough new updates; returns whether the fused map changed.
@@ -250,12 +257,12 @@ class FusionEngine:
         that is not banned, StorageError.
         """
         require_identifier("agent_id", agent_id)
-        with self._lock:
-            known_agents = self._sessions.agents | self._usage.agents
+        with self._committer.committing, self._lock:
+            known_agents = self._sessions.agents | frozenset(self._store.agents())
             if not ban and agent_id not in known_agents:
                 expected = ", ".join(sorted(known_agents)[:8]) or "no agents yet"
                 raise InvalidInputError(f"agent_id: expected an agent of the mission ({expected}), got {agent_id!r}")
-            voxels = self._usage.get(agent_id).voxels
+            voxels = self._store.totals(agent_id).voxels
             self._sessions.end_agent(agent_id)
             self._remove_agent(agent_id)
             if ban:
@@ -269,7 +276,7 @@ class FusionEngine:
 
     def leave(self, session_id: str, forget: bool = False) -> int:
         """End a session and return the fused revision; with `forget` all updates of the agent are deleted."""
-        with self._lock:
+        with self._committer.committing, self._lock:
             agent_id = self._sessions.get(session_id).agent_id
             if forget:
                 self._remove_agent(agent_id)
@@ -301,28 +308,16 @@ class FusionEngine:
     def status(self) -> MissionStatus:
         """Return the totals of the mission and of each agent."""
         with self._lock:
-            scores, vote = self._store.scores(), rank_voxels(self._votes.scores())
-            joined = self._sessions.agents
-            agents = tuple(
-                replace(
-                    contribution(agent_id, scores, vote),
-                    joined=agent_id in joined,
-                    keyframes=self._keyframes.count(agent_id),
-                    targets=self._objects.targets(agent_id),
-                    free_voxels=self._free_space.free_voxels(agent_id),
-                    alignment=self._alignments.get(agent_id),
-                    traffic=self._traffic.get(agent_id, TrafficCounters()),
-                )
-                for agent_id in sorted(joined | set(scores.agents))
-            )
+            names = sorted(self._sessions.agents | set(self._store.agents()))
+            fused_voxels, fused_gaussians = self._maps.size()
             return MissionStatus(
                 self._mission_config.with_default_names(),
                 self._maps.revision(),
-                int(vote.counts[vote.offsets[:-1]].sum(dtype=np.int64)),
-                len(vote),
+                fused_gaussians,
+                fused_voxels,
                 len(self._keyframes),
                 self._maps.is_refined,
-                agents,
+                tuple(self._contribution(agent_id) for agent_id in names),
                 self._bans.agents,
             )
 
@@ -331,18 +326,49 @@ class FusionEngine:
         with self._lock:
             self._store.close()
 
+    def _contribution(self, agent_id: str) -> AgentContribution:
+        totals = self._store.totals(agent_id)
+        return AgentContribution(
+            agent_id,
+            joined=agent_id in self._sessions.agents,
+            voxels=totals.occupied_voxels,
+            gaussians=totals.gaussians,
+            kappa_sum=totals.kappa_sum,
+            won_voxels=self._maps.won_voxels(agent_id),
+            last_update_seq=totals.highest_update_seq,
+            keyframes=self._keyframes.count(agent_id),
+            targets=self._objects.targets(agent_id),
+            free_voxels=self._free_space.free_voxels(agent_id),
+            alignment=self._alignments.get(agent_id),
+            traffic=self._traffic.get(agent_id, TrafficCounters()),
+        )
+
+    def _check_update(self, update: PendingUpdate) -> RoiSubset:
+        """Return the message with computed sums. Raises the errors of `contribute`."""
+        self._sessions.get(update.session_id)
+        subset = self._checks.check(update.subset)
+        require_storable(subset)
+        require_within_quotas(subset, self._store, self._settings.quotas)
+        return subset
+
+    def _record_update(self, subset: RoiSubset, outcome: PutOutcome) -> None:
+        """Update the fused map after a commit."""
+        self._aligner.record(subset.agent_id, outcome.accepted)
+        if len(outcome.accepted):
+            self._maps.record(subset.agent_id, self._votes.changed_keys(subset.agent_id, outcome.accepted))
+
     def _is_agreed(self, agent_id: str) -> bool:
         """Return whether another live agent, or any data, fixes the mission's configuration."""
-        return bool(self._usage.agents or self._sessions.live_agents - {agent_id})
+        return bool(frozenset(self._store.agents()) or self._sessions.live_agents - {agent_id})
 
     def _make_room(self, agent_id: str) -> None:
         """End sessions without a lease and without data if the mission is full. Raises QuotaError, StorageError."""
         limit = self._settings.quotas.agents
-        known_agents = self._sessions.agents | self._usage.agents
+        known_agents = self._sessions.agents | frozenset(self._store.agents())
         if agent_id in known_agents or len(known_agents) < limit:
             return
-        self._sessions.end_expired(kept=self._usage.agents)
-        if len(self._sessions.agents | self._usage.agents) >= limit:
+        self._sessions.end_expired(kept=frozenset(self._store.agents()))
+        if len(self._sessions.agents | frozenset(self._store.agents())) >= limit:
             raise QuotaError(f"agents: expected at most {limit} in this mission, {quote_name(agent_id)} exceeds it")
 
     def _remove_agent(self, agent_id: str) -> None:
@@ -351,7 +377,6 @@ class FusionEngine:
         self._alignments.remove_agent(agent_id)
         self._aligner.remove_agent(agent_id)
         self._free_space.remove_agent(agent_id)
-        self._usage.remove_agent(agent_id)
         self._checks.remove_agent(agent_id)
         self._traffic.pop(agent_id, None)
         self._keyframes.remove_agent(agent_id)

@@ -82,7 +82,7 @@ class FrameAligner:
             first_seq = self._next_seq.get(agent_id, 0)
             source = self._recent(agent_id, first_seq)
             reference = self._reference(agent_id)
-            highest_seq = self._store.highest_update_seq(agent_id)
+            highest_seq = self._store.totals(agent_id).highest_update_seq
         # QUARANTINED agents are fitted from their declared frame, so that they can return
         start = alignment.declared if alignment.state is AlignmentState.QUARANTINED else alignment.T_fused_agent
         overlap, near = crop_to_overlap(source, reference, start)
@@ -120,10 +120,9 @@ class FrameAligner:
         assert self._settings is not None
         if (changed == 0 and agent_id not in self._free_space_changed) or not self._alignments.earlier(agent_id):
             return False
-        scores = self._store.scores()
-        own = scores.agent_index == scores.agents.index(agent_id) if agent_id in scores.agents else slice(0)
-        has_enough = int(scores.counts[own].sum(dtype=np.int64)) >= _MIN_GAUSSIANS
-        is_changed = changed >= self._settings.refit_share * len(scores.keys[own])
+        totals = self._store.totals(agent_id)
+        has_enough = totals.gaussians >= _MIN_GAUSSIANS
+        is_changed = changed >= self._settings.refit_share * totals.voxels
         return has_enough and (is_changed or agent_id in self._free_space_changed)
 
     def _contradicted_share(self, agent_id: str, moved: Gaussians, reference: Gaussians) -> float:
@@ -139,8 +138,7 @@ class FrameAligner:
     def _recent(self, agent_id: str, first_seq: int) -> Gaussians:
         """Return the Gaussians of the updates from first_seq on, or all if these are few."""
         batch = self._store.batch(agent_id)
-        scores = self._store.scores(batch.keys)
-        seqs = scores.update_seqs[scores.agent_index == scores.agents.index(agent_id)]
+        seqs = self._store.stored(agent_id, batch.keys).update_seqs
         recent = select_voxels(batch, seqs >= first_seq).gaussians
         return recent if len(recent) >= 4 * _MIN_GAUSSIANS else batch.gaussians
 

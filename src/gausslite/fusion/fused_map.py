@@ -52,13 +52,25 @@ class FusedMapLayers:
         self._refined_log = RevisionLog(first_revision, max_removed_voxels)
         self._refined_keys: set[int] = set()
         vote = rank_voxels(votes.scores())
-        for index, agent_id in enumerate(vote.agents):
-            self._record(agent_id, vote.keys[vote.winner_index == index])
+        self._change_log.load(vote)
+        if len(vote):
+            self._refined_keys.update(vote.keys.tolist())
+            self._refined_log.record(vote.keys.tolist(), (), first_revision + 1)
 
     def revision(self, layer: MapLayer = MapLayer.VOTE) -> int:
         """Return the layer's revision; it increases with every change."""
         with self._lock:
             return self._change_log.revision if layer is MapLayer.VOTE else self._refined_log.revision
+
+    def size(self) -> tuple[int, int]:
+        """Return the number of voxels and of Gaussians of the vote."""
+        with self._lock:
+            return self._change_log.fused_voxels, self._change_log.fused_gaussians
+
+    def won_voxels(self, agent_id: str) -> int:
+        """Return the number of voxels that the agent wins in the vote."""
+        with self._lock:
+            return self._change_log.won_voxels(agent_id)
 
     @property
     def is_refined(self) -> bool:

@@ -5,16 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass, field, fields
 from enum import StrEnum
 
-import numpy as np
-
-from gausslite.domain.errors import InvalidInputError, QuotaError
-from gausslite.domain.names import quote_name, require_identifier, require_name
+from gausslite.domain.errors import InvalidInputError
+from gausslite.domain.names import require_identifier, require_name
 from gausslite.domain.revision_log import MAX_REMOVED_VOXELS
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.fusion.frame_alignment import AlignmentSettings
 from gausslite.fusion.keyframes import KeyframeLimits
 from gausslite.fusion.mission_config import MissionConfig
-from gausslite.fusion.store import VoxelScoreTable
 
 DEFAULT_LEASE_S = 60.0
 """Longer than a robot needs to notice a lost server and to reconnect, see wire/connection.py."""
@@ -84,34 +81,3 @@ class FusionSettings:
     def mission_config(self) -> MissionConfig:
         """The mission configuration of the server; its names may be empty."""
         return MissionConfig(self.mission_id, self.world_frame, self.grid.size_m)
-
-
-@dataclass(frozen=True, slots=True)
-class AgentUsage:
-    """The number of voxels (with tombstones) and Gaussians that the store keeps of one agent."""
-
-    voxels: int = 0
-    gaussians: int = 0
-
-    @classmethod
-    def from_scores(cls, scores: VoxelScoreTable, agent_id: str) -> AgentUsage:
-        """Count the agent's rows and Gaussians in these scores."""
-        if agent_id not in scores.agents:
-            return cls()
-        own = scores.agent_index == scores.agents.index(agent_id)
-        return cls(int(np.count_nonzero(own)), int(scores.counts[own].sum(dtype=np.int64)))
-
-    def replace_part(self, removed: AgentUsage, added: AgentUsage) -> AgentUsage:
-        """Return the usage after `added` replaced `removed`."""
-        return AgentUsage(
-            self.voxels - removed.voxels + added.voxels, self.gaussians - removed.gaussians + added.gaussians
-        )
-
-    def require_within(self, quotas: Quotas, agent_id: str) -> None:
-        """Raise QuotaError if the usage exceeds the quotas of one agent."""
-        for name, value, limit in (
-            ("voxels", self.voxels, quotas.voxels_per_agent),
-            ("Gaussians", self.gaussians, quotas.gaussians_per_agent),
-        ):
-            if value > limit:
-                raise QuotaError(f"agent {quote_name(agent_id)}: expected at most {limit} {name} in all, got {value}")

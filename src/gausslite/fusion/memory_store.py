@@ -2,60 +2,57 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+import itertools
+import secrets
+from collections.abc import Iterable, Sequence
 from threading import RLock
 
 import numpy as np
 from jaxtyping import Int64
 from numpy import ndarray
 
-from gausslite.codec.records import from_bytes, to_records
+from gausslite.codec.records import from_bytes
 from gausslite.domain.voxel_batch import RoiSubset, VoxelBatch
 from gausslite.fusion.mission_config import MissionConfig
-from gausslite.fusion.store import PutOutcome, SessionRecord, VoxelScoreTable, require_storable
-
-
-@dataclass(frozen=True, slots=True)
-class _VoxelUpdate:
-    """An agent's latest update of one voxel; the records are those of codec.records."""
-
-    update_seq: int
-    kappa_sum: int
-    count: int
-    records: bytes
+from gausslite.fusion.score_index import ScoreIndex, newer_voxels, scores_of, voxel_records
+from gausslite.fusion.store import (
+    AgentTotals,
+    PutOutcome,
+    SessionRecord,
+    StoredScores,
+    VoxelScoreTable,
+    require_storable,
+)
 
 
 class MemoryStore:
-    """A FusionStore in dictionaries; 63 bytes per Gaussian and about 250 per voxel."""
+    """A FusionStore in dictionaries; 63 bytes per Gaussian and about 400 per voxel."""
 
     def __init__(self) -> None:
         self._lock = RLock()
-        self._updates: dict[str, dict[int, _VoxelUpdate]] = {}
+        self._incarnation_id = secrets.token_hex(16)
+        self._index = ScoreIndex()
+        self._updates: dict[str, dict[int, bytes]] = {}
         self._sessions: dict[str, SessionRecord] = {}
         self._mission_config: MissionConfig | None = None
         self._keyframes: dict[str, dict[int, bytes]] = {}
         self._records: dict[str, dict[str, bytes]] = {}
 
+    @property
+    def incarnation_id(self) -> str:
+        """A new id with every store in memory."""
+        return self._incarnation_id
+
     def put(self, subset: RoiSubset) -> PutOutcome:
-        """Store one message; an update that is not newer than the stored one is stale. Raises InvalidInputError."""
-        require_storable(subset)
-        batch, offsets = subset.batch, subset.batch.offsets
-        records = to_records(batch.gaussians)
-        accepted = np.zeros(len(batch), np.bool_)
+        """Store one message completely, or nothing of it on an error. Raises InvalidInputError."""
+        return self.put_all([subset])[0]
+
+    def put_all(self, subsets: Sequence[RoiSubset]) -> list[PutOutcome]:
+        """Store messages of different agents: all, or none on an error. Raises InvalidInputError."""
+        for subset in subsets:
+            require_storable(subset)
         with self._lock:
-            stored = self._updates.setdefault(subset.agent_id, {})
-            for i, key in enumerate(batch.keys.tolist()):
-                update = stored.get(key)
-                if update is not None and update.update_seq >= subset.update_seq:
-                    continue
-                # tobytes copies, so that a small update does not keep the whole message in memory
-                data = records[offsets[i] : offsets[i + 1]].tobytes()
-                stored[key] = _VoxelUpdate(subset.update_seq, int(batch.kappa_sums[i]), int(batch.counts[i]), data)
-                accepted[i] = True
-            if not stored:
-                del self._updates[subset.agent_id]
-        return PutOutcome(batch.keys[accepted], batch.keys[~accepted])
+            return [self._put(subset) for subset in subsets]
 
     def remove_agent(self, agent_id: str) -> Int64[ndarray, " v"]:
         """Delete an agent's updates, keyframes and records; returns the keys of the updates' voxels, ascending."""
@@ -63,47 +60,38 @@ class MemoryStore:
             self._keyframes.pop(agent_id, None)
             for records in self._records.values():
                 records.pop(agent_id, None)
-            return np.array(sorted(self._updates.pop(agent_id, {})), np.int64)
+            self._updates.pop(agent_id, None)
+            return self._index.remove_agent(agent_id)
 
     def agents(self) -> tuple[str, ...]:
         """Return the ids of the agents with updates, sorted."""
         with self._lock:
-            return tuple(sorted(self._updates))
+            return self._index.agents
 
-    def highest_update_seq(self, agent_id: str) -> int:
-        """Return the highest sequence number among an agent's updates; 0 without any."""
+    def totals(self, agent_id: str) -> AgentTotals:
+        """Return the sums over an agent's updates, in constant time; zero for an unknown agent."""
         with self._lock:
-            return max((update.update_seq for update in self._updates.get(agent_id, {}).values()), default=0)
+            return self._index.totals(agent_id)
+
+    def stored(self, agent_id: str, keys: Int64[ndarray, " k"]) -> StoredScores:
+        """Return the agent's totals on these voxels, in their order."""
+        with self._lock:
+            return self._index.stored(agent_id, keys)
 
     def scores(self, keys: Int64[ndarray, " k"] | None = None) -> VoxelScoreTable:
         """Return all agents' totals on these voxels, or on all."""
         with self._lock:
-            agents = self.agents()
-            rows = [
-                (index, key, update.update_seq, update.kappa_sum, update.count)
-                for index, agent_id in enumerate(agents)
-                for key, update in self._select(agent_id, keys)
-            ]
-        columns = list(zip(*rows, strict=True)) or [()] * 5
-        return VoxelScoreTable(
-            agents,
-            np.array(columns[0], np.int32),
-            np.array(columns[1], np.int64),
-            np.array(columns[2], np.int64),
-            np.array(columns[3], np.uint64),
-            np.array(columns[4], np.uint32),
-        )
+            return self._index.scores(keys)
 
     def batch(self, agent_id: str, keys: Int64[ndarray, " k"] | None = None) -> VoxelBatch:
         """Return an agent's updates (with tombstones) of these voxels, or of all; empty for an unknown agent."""
         with self._lock:
-            selected = self._select(agent_id, keys)
-        return VoxelBatch(
-            np.array([key for key, _ in selected], np.int64),
-            np.array([update.kappa_sum for _, update in selected], np.uint64),
-            np.array([update.count for _, update in selected], np.uint32),
-            from_bytes(b"".join(update.records for _, update in selected)),
-        )
+            stored = self._updates.get(agent_id, {})
+            wanted = stored if keys is None else (key for key in set(keys.tolist()) if key in stored)
+            found = np.array(sorted(wanted), np.int64)
+            scores = self._index.stored(agent_id, found)
+            records = b"".join(stored[key] for key in found.tolist())
+        return VoxelBatch(found, scores.kappa_sums, scores.counts, from_bytes(records))
 
     def batches(self, keys: Int64[ndarray, " k"] | None = None) -> dict[str, VoxelBatch]:
         """Return the batch of every agent, all read at one instant."""
@@ -176,8 +164,13 @@ class MemoryStore:
     def close(self) -> None:
         """Do nothing; there are no files to close."""
 
-    def _select(self, agent_id: str, keys: Int64[ndarray, " k"] | None) -> list[tuple[int, _VoxelUpdate]]:
-        stored = self._updates.get(agent_id, {})
-        if keys is None:
-            return sorted(stored.items())
-        return [(key, stored[key]) for key in sorted(set(keys.tolist())) if key in stored]
+    def _put(self, subset: RoiSubset) -> PutOutcome:
+        batch = subset.batch
+        records = voxel_records(batch)
+        accepted = newer_voxels(self._index, subset, records, lambda agent_id, key: self._updates[agent_id][key])
+        keys = batch.keys[accepted]
+        if len(keys):
+            stored = self._updates.setdefault(subset.agent_id, {})
+            stored.update(zip(keys.tolist(), itertools.compress(records, accepted), strict=True))
+            self._index.put(subset.agent_id, keys, scores_of(subset, accepted))
+        return PutOutcome(keys, batch.keys[~accepted])

@@ -2,135 +2,173 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import sqlite3
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from threading import RLock
 from typing import Any
 
 import numpy as np
-from jaxtyping import Int64
+from jaxtyping import Bool, Int64
 from numpy import ndarray
 
-from gausslite.codec.records import from_bytes, to_records
+from gausslite.codec.records import RECORD, from_bytes
 from gausslite.domain.errors import StorageError
 from gausslite.domain.voxel_batch import RoiSubset, VoxelBatch
+from gausslite.domain.voxel_operations import empty_batch
 from gausslite.fusion.mission_config import MissionConfig
-from gausslite.fusion.store import PutOutcome, SessionRecord, VoxelScoreTable, require_storable
+from gausslite.fusion.score_index import ScoreIndex, newer_voxels, scores_of, voxel_records
+from gausslite.fusion.sqlite_file import (
+    PAGE_BYTES,
+    RESTORE_ADVICE,
+    StoreLock,
+    connect,
+    data_checksum,
+    open_or_create,
+    storage_errors,
+    update_checksum,
+)
+from gausslite.fusion.store import (
+    AgentTotals,
+    PutOutcome,
+    SessionRecord,
+    StoredScores,
+    VoxelScoreTable,
+    require_storable,
+)
 
-SCHEMA_VERSION = 4
-_APPLICATION_ID = 0x47534C54  # "GSLT", to recognise other programs' databases
-_PAGE_BYTES = 4096
-_SCHEMA = """
-CREATE TABLE voxel_updates (
-    agent_id TEXT NOT NULL, voxel INTEGER NOT NULL, update_seq INTEGER NOT NULL,
-    kappa_sum INTEGER NOT NULL, count INTEGER NOT NULL, records BLOB NOT NULL,
-    PRIMARY KEY (agent_id, voxel));
-CREATE TABLE sessions (session_id TEXT PRIMARY KEY, agent_id TEXT NOT NULL UNIQUE);
-CREATE TABLE keyframes (
-    agent_id TEXT NOT NULL, frame_index INTEGER NOT NULL, data BLOB NOT NULL, PRIMARY KEY (agent_id, frame_index));
-CREATE TABLE records (name TEXT NOT NULL, agent_id TEXT NOT NULL, data BLOB NOT NULL, PRIMARY KEY (name, agent_id));
-CREATE TABLE mission_config (
-    only INTEGER PRIMARY KEY CHECK (only = 1),
-    mission_id TEXT NOT NULL, world_frame TEXT NOT NULL, voxel_size_m REAL NOT NULL);
+_LOADED_ROWS = 10_000
+_UPSERT = """
+INSERT INTO voxel_updates VALUES (?, ?, ?, ?, ?, ?, ?) ON CONFLICT (agent_id, voxel) DO UPDATE SET
+    update_seq = excluded.update_seq, kappa_sum = excluded.kappa_sum, count = excluded.count,
+    checksum = excluded.checksum, records = excluded.records
 """
-_WITH_KEYS = " AND voxel IN (SELECT value FROM json_each(?))"
-_UPSERT = "INSERT OR REPLACE INTO voxel_updates VALUES (?, ?, ?, ?, ?, ?)"
+_SELECT_UPDATES = "SELECT agent_id, voxel, update_seq, kappa_sum, count, checksum, records FROM voxel_updates"
+_SELECT_AGENT = f"{_SELECT_UPDATES} WHERE agent_id = ? ORDER BY voxel"
+_SELECT_VOXELS = f"{_SELECT_UPDATES} WHERE agent_id = ? AND voxel IN (SELECT value FROM json_each(?)) ORDER BY voxel"  # noqa: S608
+_UpdateRow = tuple[str, int, int, int, int, int, bytes]
 
 
 class SqliteStore:
-    """A FusionStore in a file: write-ahead log, synchronous=FULL, one transaction per message, one server at a time.
+    """A FusionStore in a file: write-ahead log, synchronous=FULL, one transaction per call, one server at a time.
 
-    max_bytes limits the file size; a put beyond it raises StorageError and changes nothing. The constructor raises
-    StorageError if the file cannot be opened, is in use by another server, is damaged, or has another schema.
+    The totals of all updates are in memory (ScoreIndex). Reads use a second connection and so do not wait for a commit.
+    max_bytes limits the file size; a put beyond it raises StorageError and changes nothing. The constructor reads and
+    checks every row. It raises StorageError if the file cannot be opened, is in use by another server, is damaged, or
+    has another schema.
     """
 
     def __init__(self, path: Path, max_bytes: int | None = None) -> None:
         self._path = path
-        self._lock = RLock()
-        self._db = _connect(path)
-        try:
-            with self._storage_errors():
-                self._prepare(max_bytes)
-        except BaseException:
-            self._db.close()
-            raise
+        self._write_lock, self._read_lock, self._index_lock = RLock(), RLock(), RLock()
+        self._index = ScoreIndex()
+        with ExitStack() as opened:
+            lock = StoreLock(path)
+            opened.callback(lock.release)
+            self._writer = open_or_create(path)
+            opened.callback(self._writer.close)
+            self._reader = connect(path)
+            opened.callback(self._reader.close)
+            if max_bytes is not None:
+                self._writer.execute(f"PRAGMA max_page_count = {max(1, max_bytes // PAGE_BYTES)}")
+            self._load()
+            self._incarnation_id = str(self._read("SELECT value FROM properties WHERE name = 'incarnation_id'")[0][0])
+            self._opened = opened.pop_all()
+
+    @property
+    def incarnation_id(self) -> str:
+        """The id made with the file, by a restore or by a repair."""
+        return self._incarnation_id
 
     def put(self, subset: RoiSubset) -> PutOutcome:
         """Store one message in one transaction. Raises InvalidInputError, StorageError."""
-        require_storable(subset)
-        batch, offsets = subset.batch, subset.batch.offsets
-        records = to_records(batch.gaussians)
-        with self._transaction() as db:
-            query = "SELECT voxel, update_seq FROM voxel_updates WHERE agent_id = ?"
-            stored = dict(db.execute(query + _WITH_KEYS, (subset.agent_id, _keys_as_json(batch.keys))))
-            accepted = np.array([stored.get(key, -1) < subset.update_seq for key in batch.keys.tolist()], np.bool_)
-            rows = (
-                (
-                    subset.agent_id,
-                    int(batch.keys[i]),
-                    subset.update_seq,
-                    int(batch.kappa_sums[i]),
-                    int(batch.counts[i]),
-                    records[offsets[i] : offsets[i + 1]].tobytes(),
-                )
-                for i in np.flatnonzero(accepted)
-            )
-            db.executemany(_UPSERT, rows)
-        return PutOutcome(batch.keys[accepted], batch.keys[~accepted])
+        return self.put_all([subset])[0]
+
+    def put_all(self, subsets: Sequence[RoiSubset]) -> list[PutOutcome]:
+        """Store messages of different agents in one transaction. Raises InvalidInputError, StorageError."""
+        for subset in subsets:
+            require_storable(subset)
+        records = [voxel_records(subset.batch) for subset in subsets]
+        with self._write_lock:
+            masks = [
+                newer_voxels(self._index, subset, data, self._records_of)
+                for subset, data in zip(subsets, records, strict=True)
+            ]
+            if any(mask.any() for mask in masks):
+                with self._transaction() as db:
+                    for subset, data, mask in zip(subsets, records, masks, strict=True):
+                        db.executemany(_UPSERT, _rows(subset, data, mask))
+            with self._index_lock:
+                for subset, mask in zip(subsets, masks, strict=True):
+                    self._index.put(subset.agent_id, subset.batch.keys[mask], scores_of(subset, mask))
+        return [
+            PutOutcome(subset.batch.keys[mask], subset.batch.keys[~mask])
+            for subset, mask in zip(subsets, masks, strict=True)
+        ]
 
     def remove_agent(self, agent_id: str) -> Int64[ndarray, " v"]:
         """Delete an agent's updates, keyframes and records; returns the keys of the updates' voxels, ascending."""
-        with self._transaction() as db:
-            rows = db.execute(
-                "SELECT voxel FROM voxel_updates WHERE agent_id = ? ORDER BY voxel", (agent_id,)
-            ).fetchall()
-            for table in ("voxel_updates", "keyframes", "records"):
-                db.execute(f"DELETE FROM {table} WHERE agent_id = ?", (agent_id,))  # noqa: S608 - the names are constants
-        return np.array([voxel for (voxel,) in rows], np.int64)
+        with self._write_lock:
+            with self._transaction() as db:
+                for table in ("voxel_updates", "keyframes", "records"):
+                    db.execute(f"DELETE FROM {table} WHERE agent_id = ?", (agent_id,))  # noqa: S608 - the names are constants
+            with self._index_lock:
+                return self._index.remove_agent(agent_id)
 
     def agents(self) -> tuple[str, ...]:
         """Return the ids of the agents with updates, sorted."""
-        rows = self._read("SELECT DISTINCT agent_id FROM voxel_updates")
-        # not sorted by SQL, because the order must be the same in every store
-        return tuple(sorted(agent_id for (agent_id,) in rows))
+        return self._index.agents
 
-    def highest_update_seq(self, agent_id: str) -> int:
-        """Return the highest sequence number among an agent's updates; 0 without any."""
-        rows = self._read("SELECT COALESCE(MAX(update_seq), 0) FROM voxel_updates WHERE agent_id = ?", (agent_id,))
-        return int(rows[0][0])
+    def totals(self, agent_id: str) -> AgentTotals:
+        """Return the sums over an agent's updates, in constant time; zero for an unknown agent."""
+        with self._index_lock:
+            return self._index.totals(agent_id)
+
+    def stored(self, agent_id: str, keys: Int64[ndarray, " k"]) -> StoredScores:
+        """Return the agent's totals on these voxels, in their order."""
+        with self._index_lock:
+            return self._index.stored(agent_id, keys)
 
     def scores(self, keys: Int64[ndarray, " k"] | None = None) -> VoxelScoreTable:
         """Return all agents' totals on these voxels, or on all."""
-        with self._lock:
-            agents = self.agents()
-            parts = [self._select("voxel, update_seq, kappa_sum, count", agent_id, keys) for agent_id in agents]
-        rows = [row for part in parts for row in part]
-        return VoxelScoreTable(
-            agents,
-            np.repeat(np.arange(len(agents), dtype=np.int32), [len(part) for part in parts]),
-            np.array([row[0] for row in rows], np.int64),
-            np.array([row[1] for row in rows], np.int64),
-            np.array([row[2] for row in rows], np.uint64),
-            np.array([row[3] for row in rows], np.uint32),
-        )
+        with self._index_lock:
+            return self._index.scores(keys)
 
     def batch(self, agent_id: str, keys: Int64[ndarray, " k"] | None = None) -> VoxelBatch:
         """Return an agent's updates (with tombstones) of these voxels, or of all; empty for an unknown agent."""
-        rows = self._select("voxel, kappa_sum, count, records", agent_id, keys)
+        rows: list[_UpdateRow] = (
+            self._read(_SELECT_AGENT, (agent_id,))
+            if keys is None
+            else self._read(_SELECT_VOXELS, (agent_id, _as_json(keys)))
+        )
+        for row in rows:
+            self._require_intact(row)
         return VoxelBatch(
-            np.array([row[0] for row in rows], np.int64),
-            np.array([row[1] for row in rows], np.uint64),
-            np.array([row[2] for row in rows], np.uint32),
-            from_bytes(b"".join(row[3] for row in rows)),
+            np.array([row[1] for row in rows], np.int64),
+            np.array([row[3] for row in rows], np.uint64),
+            np.array([row[4] for row in rows], np.uint32),
+            from_bytes(b"".join(row[6] for row in rows)),
         )
 
     def batches(self, keys: Int64[ndarray, " k"] | None = None) -> dict[str, VoxelBatch]:
         """Return the batch of every agent, all read at one instant."""
-        with self._lock:
-            return {agent_id: self.batch(agent_id, keys) for agent_id in self.agents()}
+        scores = None if keys is None else self.scores(keys)
+        with self._read_lock, storage_errors(self._path):
+            # a read transaction: all queries see the same commit
+            self._reader.execute("BEGIN")
+            try:
+                if scores is None:
+                    return {agent_id: self.batch(agent_id) for agent_id in self.agents()}
+                present = set(np.unique(scores.agent_index).tolist())
+                return {
+                    agent_id: self.batch(agent_id, keys) if index in present else empty_batch()
+                    for index, agent_id in enumerate(scores.agents)
+                }
+            finally:
+                self._reader.execute("COMMIT")
 
     def mission_config(self) -> MissionConfig | None:
         """Return the mission's configuration; None before an agent has joined."""
@@ -139,11 +177,9 @@ class SqliteStore:
 
     def set_mission_config(self, mission_config: MissionConfig) -> None:
         """Store the mission's configuration."""
+        values = mission_config.mission_id, mission_config.world_frame, mission_config.voxel_size_m
         with self._transaction() as db:
-            db.execute(
-                "INSERT OR REPLACE INTO mission_config VALUES (1, ?, ?, ?)",
-                (mission_config.mission_id, mission_config.world_frame, mission_config.voxel_size_m),
-            )
+            db.execute("INSERT OR REPLACE INTO mission_config VALUES (1, ?, ?, ?)", values)
 
     def sessions(self) -> tuple[SessionRecord, ...]:
         """Return all open sessions, sorted by session id."""
@@ -162,8 +198,9 @@ class SqliteStore:
 
     def save_keyframe(self, agent_id: str, index: int, data: bytes) -> None:
         """Store an encoded keyframe; it replaces the agent's one of this frame index."""
+        row = agent_id, index, data_checksum(agent_id, index, data), data
         with self._transaction() as db:
-            db.execute("INSERT OR REPLACE INTO keyframes VALUES (?, ?, ?)", (agent_id, index, data))
+            db.execute("INSERT OR REPLACE INTO keyframes VALUES (?, ?, ?, ?)", row)
 
     def remove_keyframes(self, agent_id: str, indices: Iterable[int]) -> None:
         """Delete these keyframes of an agent, if they exist."""
@@ -179,94 +216,93 @@ class SqliteStore:
         return sizes
 
     def keyframe(self, agent_id: str, index: int) -> bytes:
-        """Return an encoded keyframe; empty if it does not exist."""
-        query = "SELECT data FROM keyframes WHERE agent_id = ? AND frame_index = ?"
-        rows = self._read(query, (agent_id, index))
-        return bytes(rows[0][0]) if rows else b""
+        """Return an encoded keyframe; empty if it does not exist. Raises StorageError for a damaged one."""
+        query = "SELECT data, checksum FROM keyframes WHERE agent_id = ? AND frame_index = ?"
+        for data, checksum in self._read(query, (agent_id, index)):
+            if data_checksum(agent_id, index, data) != checksum:
+                raise self._damaged(f"keyframe {index} of agent {agent_id!r}")
+            return bytes(data)
+        return b""
 
     def save_record(self, agent_id: str, name: str, data: bytes) -> None:
         """Store a named record of an agent; it replaces the earlier one."""
+        row = name, agent_id, data_checksum(agent_id, name, data), data
         with self._transaction() as db:
-            db.execute("INSERT OR REPLACE INTO records VALUES (?, ?, ?)", (name, agent_id, data))
+            db.execute("INSERT OR REPLACE INTO records VALUES (?, ?, ?, ?)", row)
 
     def records(self, name: str) -> dict[str, bytes]:
-        """Return the record of this name of every agent that has one."""
-        return dict(self._read("SELECT agent_id, data FROM records WHERE name = ?", (name,)))
+        """Return the record of this name of every agent that has one. Raises StorageError for a damaged one."""
+        rows = self._read("SELECT agent_id, data, checksum FROM records WHERE name = ?", (name,))
+        for agent_id, data, checksum in rows:
+            if data_checksum(agent_id, name, data) != checksum:
+                raise self._damaged(f"record {name!r} of agent {agent_id!r}")
+        return {agent_id: data for agent_id, data, _ in rows}
 
     def close(self) -> None:
         """Write the log into the file and close it."""
-        with self._lock:
-            self._db.close()
+        with self._write_lock, self._read_lock:
+            self._opened.close()
 
-    def _prepare(self, max_bytes: int | None) -> None:
-        db = self._db
-        # exclusive: a second server on this file would not see the changes of the first
-        db.execute("PRAGMA locking_mode = EXCLUSIVE")
-        is_store = db.execute("PRAGMA application_id").fetchone()[0] == _APPLICATION_ID
-        is_new = db.execute("SELECT COUNT(*) FROM sqlite_master").fetchone()[0] == 0
-        version = db.execute("PRAGMA user_version").fetchone()[0]
-        if not is_store and not is_new:
-            raise StorageError(f"store {self._path}: expected a GaussLite store, got another program's database")
-        if is_store and not is_new and version != SCHEMA_VERSION:
-            raise StorageError(f"store {self._path}: expected schema version {SCHEMA_VERSION}, got {version}")
-        db.execute("PRAGMA journal_mode = WAL")
-        db.execute("PRAGMA synchronous = FULL")
-        if is_new:
-            header = f"PRAGMA application_id = {_APPLICATION_ID}; PRAGMA user_version = {SCHEMA_VERSION};"
-            db.executescript(f"BEGIN IMMEDIATE; {header} {_SCHEMA} COMMIT;")
-        check = db.execute("PRAGMA quick_check(1)").fetchone()[0]
-        if check != "ok":
-            raise StorageError(f"store {self._path}: expected an undamaged file, got: {check}".replace("\n", " "))
-        if max_bytes is not None:
-            db.execute(f"PRAGMA max_page_count = {max(1, max_bytes // _PAGE_BYTES)}")
+    def _load(self) -> None:
+        """Check every row of updates and fill the index."""
+        with storage_errors(self._path):
+            check = self._reader.execute("PRAGMA quick_check(1)").fetchone()[0]
+            if check != "ok":
+                raise StorageError(f"store {self._path}: expected an undamaged file, got {check!r}; {RESTORE_ADVICE}")
+            cursor = self._reader.execute(f"{_SELECT_UPDATES} ORDER BY agent_id, voxel")
+            while rows := cursor.fetchmany(_LOADED_ROWS):
+                for row in rows:
+                    self._require_intact(row)
+                for agent_id, own in itertools.groupby(rows, key=lambda row: row[0]):
+                    _, voxels, seqs, sums, counts, _, _ = zip(*own, strict=True)
+                    columns = np.array(seqs, np.int64), np.array(sums, np.uint64), np.array(counts, np.uint32)
+                    self._index.put(agent_id, np.array(voxels, np.int64), StoredScores(*columns))
 
-    def _select(self, columns: str, agent_id: str, keys: Int64[ndarray, " k"] | None) -> list[tuple[Any, ...]]:
-        query, values = f"SELECT {columns} FROM voxel_updates WHERE agent_id = ?", [agent_id]  # noqa: S608 - the names are constants
-        if keys is not None:
-            query, values = query + _WITH_KEYS, [agent_id, _keys_as_json(keys)]
-        return self._read(f"{query} ORDER BY voxel", tuple(values))
+    def _records_of(self, agent_id: str, voxel: int) -> bytes:
+        rows = self._read(f"{_SELECT_UPDATES} WHERE agent_id = ? AND voxel = ?", (agent_id, voxel))
+        self._require_intact(rows[0])
+        return bytes(rows[0][6])
+
+    def _require_intact(self, row: _UpdateRow) -> None:
+        if not is_intact(row):
+            raise self._damaged(f"voxel {row[1]} of agent {row[0]!r}")
+
+    def _damaged(self, what: str) -> StorageError:
+        return StorageError(f"store {self._path}: {what} is damaged (its checksum does not match); {RESTORE_ADVICE}")
 
     def _read(self, query: str, values: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
-        with self._lock, self._storage_errors():
-            return self._db.execute(query, values).fetchall()
+        with self._read_lock, storage_errors(self._path):
+            return self._reader.execute(query, values).fetchall()
 
     @contextmanager
     def _transaction(self) -> Iterator[sqlite3.Connection]:
-        with self._lock, self._storage_errors():
-            self._db.execute("BEGIN IMMEDIATE")
+        with self._write_lock, storage_errors(self._path):
+            self._writer.execute("BEGIN IMMEDIATE")
             try:
-                yield self._db
-                self._db.execute("COMMIT")
+                yield self._writer
+                self._writer.execute("COMMIT")
             except BaseException:
-                if self._db.in_transaction:
-                    self._db.execute("ROLLBACK")
+                if self._writer.in_transaction:
+                    self._writer.execute("ROLLBACK")
                 raise
 
-    @contextmanager
-    def _storage_errors(self) -> Iterator[None]:
-        try:
-            yield
-        except sqlite3.Error as error:
-            raise StorageError(f"store {self._path}: {_explain(error)}") from error
+
+def is_intact(row: _UpdateRow) -> bool:
+    """Return whether a row of updates has its checksum and as many records as it counts."""
+    agent_id, voxel, update_seq, kappa_sum, count, checksum, records = row
+    return (
+        len(records) == count * RECORD.itemsize
+        and update_checksum(agent_id, voxel, (update_seq, kappa_sum, count), records) == checksum
+    )
 
 
-def _connect(path: Path) -> sqlite3.Connection:
-    try:
-        return sqlite3.connect(path, timeout=0.5, isolation_level=None, check_same_thread=False)
-    except sqlite3.Error as error:
-        raise StorageError(f"store {path}: cannot be opened ({error}); expected a file in a writable folder") from error
+def _rows(subset: RoiSubset, records: list[bytes], selected: Bool[ndarray, " v"]) -> Iterator[_UpdateRow]:
+    batch = subset.batch
+    for i in np.flatnonzero(selected).tolist():
+        key = int(batch.keys[i])
+        scores = subset.update_seq, int(batch.kappa_sums[i]), int(batch.counts[i])
+        yield (subset.agent_id, key, *scores, update_checksum(subset.agent_id, key, scores, records[i]), records[i])
 
 
-def _keys_as_json(keys: Int64[ndarray, " k"]) -> str:
+def _as_json(keys: Int64[ndarray, " k"]) -> str:
     return json.dumps(keys.tolist())
-
-
-def _explain(error: sqlite3.Error) -> str:
-    text = str(error)
-    if "not a database" in text or "malformed" in text:
-        return f"expected an undamaged GaussLite store, got another kind of file ({text})"
-    if "locked" in text:
-        return "in use by another server; give each its own file"
-    if "full" in text:
-        return "no space left (disk full or the store's size limit); nothing of this message was stored"
-    return f"refused ({text})"

@@ -1,13 +1,14 @@
 """The store of voxel updates: (agent, voxel) → the agent's latest update of that voxel.
 
-An update replaces the agent's earlier update of the voxel if its sequence number is higher; otherwise it is STALE. So
-duplicates, resends and reordering change nothing, and removing an agent leaves no trace. An update without Gaussians
-is a tombstone. It is kept, because an older update of the voxel may still arrive.
+An update replaces the agent's earlier update of the voxel if its sequence number is higher, and otherwise it is STALE.
+Between equal numbers the larger content wins. So duplicates, resends and reordering change nothing, and removing an
+agent leaves no trace. An update without Gaussians is a tombstone. It is kept, because an older update of the voxel may
+still arrive.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -51,16 +52,63 @@ class VoxelScoreTable:
     counts: UInt32[ndarray, " w"]
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class StoredScores:
+    """The totals of an agent's updates of some voxels; update_seq is -1 where it has no update."""
+
+    update_seqs: Int64[ndarray, " k"]
+    kappa_sums: UInt64[ndarray, " k"]
+    counts: UInt32[ndarray, " k"]
+
+    @classmethod
+    def missing(cls, voxels: int) -> StoredScores:
+        """Return the totals of an agent without updates."""
+        return cls(np.full(voxels, -1, np.int64), np.zeros(voxels, np.uint64), np.zeros(voxels, np.uint32))
+
+
+@dataclass(frozen=True, slots=True)
+class AgentTotals:
+    """Sums over an agent's updates: voxels with and without tombstones, Gaussians, Σkappa; the highest update_seq."""
+
+    voxels: int = 0
+    occupied_voxels: int = 0
+    gaussians: int = 0
+    kappa_sum: int = 0
+    highest_update_seq: int = 0
+
+    def replace_part(self, removed: StoredScores, added: StoredScores) -> AgentTotals:
+        """Return the totals after `added` replaced `removed`."""
+        return AgentTotals(
+            self.voxels + len(added.counts) - int(np.count_nonzero(removed.update_seqs >= 0)),
+            self.occupied_voxels + int(np.count_nonzero(added.counts)) - int(np.count_nonzero(removed.counts)),
+            self.gaussians + int(added.counts.sum(dtype=np.int64)) - int(removed.counts.sum(dtype=np.int64)),
+            self.kappa_sum + _exact_sum(added.kappa_sums) - _exact_sum(removed.kappa_sums),
+            max(self.highest_update_seq, int(added.update_seqs.max(initial=0))),
+        )
+
+
 @runtime_checkable
 class FusionStore(Protocol):
     """Owns the voxel updates, the mission's configuration and the sessions. Thread-safe.
+
+    incarnation_id changes when the content may be older than what was acknowledged: with a new store, after a restore
+    and after a repair. Then the agents send everything again.
 
     When a method of a durable store has returned, its effect survives a crash. All methods raise StorageError if the
     storage refuses; the store stays usable for other calls.
     """
 
+    @property
+    def incarnation_id(self) -> str:
+        """The id of this content; see the class."""
+        ...
+
     def put(self, subset: RoiSubset) -> PutOutcome:
         """Store one message completely, or nothing of it on an error. Raises InvalidInputError."""
+        ...
+
+    def put_all(self, subsets: Sequence[RoiSubset]) -> list[PutOutcome]:
+        """Store messages of different agents in one transaction: all, or none on an error. Raises InvalidInputError."""
         ...
 
     def remove_agent(self, agent_id: str) -> Int64[ndarray, " v"]:
@@ -71,8 +119,12 @@ class FusionStore(Protocol):
         """Return the ids of the agents with updates, sorted."""
         ...
 
-    def highest_update_seq(self, agent_id: str) -> int:
-        """Return the highest sequence number among an agent's updates; 0 without any."""
+    def totals(self, agent_id: str) -> AgentTotals:
+        """Return the sums over an agent's updates, in constant time; zero for an unknown agent."""
+        ...
+
+    def stored(self, agent_id: str, keys: Int64[ndarray, " k"]) -> StoredScores:
+        """Return the agent's totals on these voxels, in their order."""
         ...
 
     def scores(self, keys: Int64[ndarray, " k"] | None = None) -> VoxelScoreTable:
@@ -144,3 +196,8 @@ def require_storable(subset: RoiSubset) -> None:
     for name, value in numbers:
         if value > limit:
             raise InvalidInputError(f"subset {name}: expected at most {limit}, got {value}")
+
+
+def _exact_sum(values: UInt64[ndarray, " k"]) -> int:
+    """Return a sum that cannot wrap around."""
+    return (int((values >> np.uint64(32)).sum()) << 32) + int((values & np.uint64(0xFFFFFFFF)).sum())

@@ -1,15 +1,11 @@
-"""Count the messages of each agent, its stored data, and the voxels that it wins."""
+"""The figures of a mission and of its agents: messages, stored data, voxels won."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-import numpy as np
-
 from gausslite.fusion.frame_alignment import FrameAlignment
 from gausslite.fusion.mission_config import MissionConfig
-from gausslite.fusion.store import VoxelScoreTable
-from gausslite.fusion.vote import VoteResult
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,19 +61,3 @@ class MissionStatus:
     refined: bool
     agents: tuple[AgentContribution, ...]
     banned_agents: tuple[str, ...] = ()
-
-
-def contribution(agent_id: str, scores: VoxelScoreTable, vote: VoteResult) -> AgentContribution:
-    """Return the agent's totals and the number of voxels it wins; tombstones do not count as voxels."""
-    if agent_id not in scores.agents:
-        return AgentContribution(agent_id)
-    index = scores.agents.index(agent_id)
-    own = scores.agent_index == index
-    return AgentContribution(
-        agent_id,
-        voxels=int(np.count_nonzero(scores.counts[own])),
-        gaussians=int(scores.counts[own].sum(dtype=np.int64)),
-        kappa_sum=int(scores.kappa_sums[own].sum(dtype=np.uint64)),
-        won_voxels=int(np.count_nonzero(vote.winner_index == index)),
-        last_update_seq=int(scores.update_seqs[own].max(initial=0)),
-    )

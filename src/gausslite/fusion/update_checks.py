@@ -22,7 +22,7 @@ _JOINED = struct.Struct("<d")
 
 
 class UpdateChecks:
-    """Knows when each agent first joined and its highest sequence number. Not thread-safe; FusionEngine holds a lock.
+    """Knows when each agent first joined. Not thread-safe; FusionEngine holds a lock.
 
     The first joins persist with the store. clock_s: the time since the epoch in seconds.
     """
@@ -32,7 +32,6 @@ class UpdateChecks:
         self._first_joined_s = {
             agent_id: _JOINED.unpack(data)[0] for agent_id, data in store.records(_JOINED_RECORD).items()
         }
-        self._highest_seq: dict[str, int] = {}
 
     def record_join(self, agent_id: str) -> None:
         """Note the agent's first join. Raises StorageError."""
@@ -41,19 +40,13 @@ class UpdateChecks:
             self._store.save_record(agent_id, _JOINED_RECORD, _JOINED.pack(now_s))
             self._first_joined_s[agent_id] = now_s
 
-    def highest_seq(self, agent_id: str) -> int:
-        """Return the highest sequence number stored of this agent; 0 without any. Raises StorageError."""
-        if agent_id not in self._highest_seq:
-            self._highest_seq[agent_id] = self._store.highest_update_seq(agent_id)
-        return self._highest_seq[agent_id]
-
     def check(self, subset: RoiSubset) -> RoiSubset:
         """Return the message with Σkappa computed from its Gaussians, whatever it declares.
 
         Raises InvalidInputError for a sequence number too far above the stored ones, QuotaError for a kappa that no
         robot can have reached yet: the bound grows with the time since its first join.
         """
-        name, highest = quote_name(subset.agent_id), self.highest_seq(subset.agent_id)
+        name, highest = quote_name(subset.agent_id), self._store.totals(subset.agent_id).highest_update_seq
         if subset.update_seq > highest + MAX_SEQ_STEP:
             raise InvalidInputError(
                 f"agent {name}: expected an update_seq of at most {highest + MAX_SEQ_STEP}, got {subset.update_seq}"
@@ -66,14 +59,9 @@ class UpdateChecks:
             )
         return replace(subset, batch=with_computed_sums(batch))
 
-    def record(self, subset: RoiSubset) -> None:
-        """Note that the store has this message."""
-        self._highest_seq[subset.agent_id] = max(self.highest_seq(subset.agent_id), subset.update_seq)
-
     def remove_agent(self, agent_id: str) -> None:
         """Delete what is known of the agent; the store deletes its records."""
         self._first_joined_s.pop(agent_id, None)
-        self._highest_seq.pop(agent_id, None)
 
     def _kappa_bound(self, agent_id: str) -> int:
         """Return the largest plausible kappa: the iterations before the first join, and those since then."""

@@ -64,6 +64,14 @@ class VoteInput:
         moved = {i: _select(self._moved[name], keys) for i, name in enumerate(table.agents) if name in self._moved}
         return _merge_scores(table, kept, moved)
 
+    def batch(self, agent_id: str, keys: Int64[ndarray, " k"]) -> VoxelBatch:
+        """Return the updates of one agent on these voxels."""
+        is_moved = agent_id in self._moved
+        batch = _select(self._moved[agent_id], keys) if is_moved else self._store.batch(agent_id, keys)
+        if self._free_space is None:
+            return batch
+        return select_voxels(batch, ~self._free_space.contradicts(batch.keys, self._alignments.in_other_frames()))
+
     def batches(self, keys: Int64[ndarray, " k"] | None = None) -> dict[str, VoxelBatch]:
         """Return the updates of every agent on these voxels, or on all."""
         batches = self._store.batches(keys)
@@ -116,12 +124,7 @@ class VoteInput:
         alignment = self._alignments.get(agent_id)
         if alignment.state is AlignmentState.QUARANTINED:
             return empty_batch()
-        return move_batch(sent, self._update_seqs(agent_id, sent), alignment, self._grid)
-
-    def _update_seqs(self, agent_id: str, batch: VoxelBatch) -> Int64[ndarray, " v"]:
-        scores = self._store.scores(batch.keys)
-        own = scores.agent_index == scores.agents.index(agent_id) if agent_id in scores.agents else slice(0)
-        return scores.update_seqs[own]
+        return move_batch(sent, self._store.stored(agent_id, sent.keys).update_seqs, alignment, self._grid)
 
 
 def move_batch(

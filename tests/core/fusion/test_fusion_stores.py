@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import signal
 import sqlite3
 import subprocess
@@ -18,8 +19,9 @@ from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.voxel_batch import RoiSubset, VoxelBatch
 from gausslite.domain.voxel_operations import gather_rows, select_keys
 from gausslite.fusion.memory_store import MemoryStore
-from gausslite.fusion.sqlite_store import SCHEMA_VERSION, SqliteStore
-from gausslite.fusion.store import FusionStore, MissionConfig, SessionRecord
+from gausslite.fusion.sqlite_file import SCHEMA_VERSION
+from gausslite.fusion.sqlite_store import SqliteStore
+from gausslite.fusion.store import AgentTotals, FusionStore, MissionConfig, SessionRecord
 
 KEYS = (11, 22, 33)
 
@@ -64,15 +66,37 @@ def test_stored_updates_are_read_back(store: FusionStore) -> None:
     assert store.agents() == ("ant",)
 
 
-def test_the_highest_update_seq_wins_and_an_equal_one_is_stale(store: FusionStore) -> None:
+def test_the_highest_update_seq_wins(store: FusionStore) -> None:
     store.put(make_subset("ant", 5, {11: 2, 22: 2}))
-    assert store.put(make_subset("ant", 5, {11: 4})).stale.tolist() == [11]
+    assert store.put(make_subset("ant", 5, {11: 2, 22: 2})).stale.tolist() == [11, 22]
     assert store.put(make_subset("ant", 4, {11: 4})).stale.tolist() == [11]
     later = store.put(make_subset("ant", 6, {11: 1, 33: 1}))
     assert later.accepted.tolist() == [11, 33]
     assert store.batch("ant").counts.tolist() == [1, 2, 1]
-    assert store.highest_update_seq("ant") == 6
-    assert store.highest_update_seq("bee") == 0
+    assert store.totals("ant") == AgentTotals(3, 3, 4, 4, 6)
+    assert store.totals("bee") == AgentTotals()
+
+
+@pytest.mark.parametrize("contents", list(itertools.permutations([(2, 0), (4, 0), (4, 1)])))
+def test_of_equal_update_seqs_the_larger_content_wins_in_every_order(
+    store: FusionStore, contents: list[tuple[int, int]]
+) -> None:
+    messages = {content: make_subset("ant", 5, {11: content[0]}, seed=content[1]) for content in contents}
+    for content in contents:
+        store.put(messages[content])
+    largest = max(messages[4, seed].batch.gaussians.means_m[0, 0].tobytes() for seed in (0, 1))
+    assert store.batch("ant").gaussians.means_m[0, 0].tobytes() == largest
+    assert all(store.put(message).accepted.tolist() == [] for message in messages.values())
+
+
+def test_messages_of_several_agents_are_stored_together(store: FusionStore) -> None:
+    messages = [make_subset(name, 1, {11: 2, 22: index}) for index, name in enumerate(("ant", "bee"))]
+    assert [each.accepted.tolist() for each in store.put_all(messages)] == [[11, 22]] * 2
+    assert [each.stale.tolist() for each in store.put_all(messages)] == [[11, 22]] * 2
+    assert store.scores().counts.tolist() == [2, 0, 2, 1]
+    with pytest.raises(InvalidInputError):
+        store.put_all([make_subset("ant", 2, {33: 1}), make_subset("bee", 2**63, {33: 1})])
+    assert 33 not in store.scores().keys
 
 
 def test_a_tombstone_is_kept_and_makes_older_updates_stale(store: FusionStore) -> None:
@@ -191,7 +215,7 @@ def test_acknowledged_updates_survive_a_kill(tmp_path: Path) -> None:
     store = SqliteStore(path)
     batch = store.batch("ant")
     assert set(range(101, 101 + acknowledged)) <= set(batch.keys.tolist())
-    assert store.highest_update_seq("ant") in (acknowledged, acknowledged + 1)
+    assert store.totals("ant").highest_update_seq in (acknowledged, acknowledged + 1)
     assert batch.counts.tolist()[0] == 3
     store.close()
 
