@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from pathlib import Path
 
@@ -36,6 +37,15 @@ def test_a_team_is_mapped_fused_and_scored(tmp_path: Path, capsys: pytest.Captur
     # a policy without a task has no region to send
     assert uniform["share_percent"] == 0
     assert (tmp_path / "team.md").read_text().count("| home-4 x 2 |") == 10
+
+
+def test_four_agents_of_a_home_see_different_views() -> None:
+    scene = HomeTeamPlan(4, agents=4, frames=6, views=1).load((32, 24))
+    walks = [np.array([frame.T_world_camera for frame in agent.frames]) for agent in scene.agents]
+    assert [agent.task for agent in scene.agents[:3]] != [scene.agents[0].task] * 3
+    for first, second in itertools.combinations(walks, 2):
+        distances_m = np.linalg.norm(first[:, None, :3, 3] - second[None, :, :3, 3], axis=-1)
+        assert np.median(distances_m.min(axis=1)) > 0.01
 
 
 def test_a_late_robot_is_measured_alone_and_with_the_teams_map(

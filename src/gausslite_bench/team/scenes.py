@@ -20,9 +20,10 @@ from gausslite_bench.quality.real_scenes import RealScenePlan
 from gausslite_bench.quality.scenes import PosePolicy
 
 _HELD_OUT_TRAJECTORY = 2
-_TRAJECTORIES = (0, 1, 3, 4)
+_WALKS = ((0, 0), (1, 0), (0, 3), (1, 3))
+"""Trajectory of each agent, and frames beyond the stated number: a second robot on the same way sees other views."""
 _MAX_FRAMES = 10_000
-MAX_AGENTS = len(_TRAJECTORIES)
+MAX_AGENTS = len(_WALKS)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,7 +77,7 @@ class TeamPlan(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class HomeTeamPlan:
-    """A team in one home: agent i has the i-th of the home's tasks, in turn, on its own trajectory.
+    """A team in one home: agent i has the i-th of the home's tasks, in turn, and its own views of the home.
 
     same_task: all agents have the first task instead.
     """
@@ -110,7 +111,7 @@ class HomeTeamPlan:
         """Return the scene at (width_px, height_px). Raises DatasetError, InvalidInputError."""
         tasks = [task for task in HOME_TASKS if task.home == self.home][: 1 if self.same_task else None]
         chosen = [tasks[i % len(tasks)] for i in range(self.agents)]
-        agents = tuple(self._agent_scene(f"agent-{i}", task, _TRAJECTORIES[i], size) for i, task in enumerate(chosen))
+        agents = tuple(self._agent_scene(f"agent-{i}", task, _WALKS[i], size) for i, task in enumerate(chosen))
         held_out = open_source(f"{self._spec(_HELD_OUT_TRAJECTORY, self.views, size)}&noise=0&exposure=0")
         names = tuple(dict.fromkeys(name for task in chosen for name in task.objects))
         regions = choose_regions(held_out.regions(), names)
@@ -118,8 +119,9 @@ class HomeTeamPlan:
         info = SceneInfo(held_out.up_axis, held_out.regions())
         return TeamScene(self.name, agents, [view for view in views if view.frame.has_depth], info)
 
-    def _agent_scene(self, agent_id: str, task: HomeTask, trajectory: int, size: tuple[int, int]) -> AgentScene:
-        source = open_source(self._spec(trajectory, self.frames, size))
+    def _agent_scene(self, agent_id: str, task: HomeTask, walk: tuple[int, int], size: tuple[int, int]) -> AgentScene:
+        trajectory, more_frames = walk
+        source = open_source(self._spec(trajectory, self.frames + more_frames, size))
         frames = [frame for frame in (source.frame(i) for i in range(len(source))) if frame.has_depth]
         return agent_scene(agent_id, task.task, task.objects, frames, source.regions())
 
