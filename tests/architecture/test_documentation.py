@@ -20,7 +20,7 @@ PROGRAMS = {
     "gausslite-parser": "gausslite_parser",
 }
 SUB_COMMANDS = (
-    *("map", "demo", "parse", "eval", "calibrate", "fuse", "export"),
+    *("map", "demo", "parse", "eval", "calibrate", "fuse", "export", "view"),
     *("status", "end", "refine", "fetch", "objects"),
 )
 BENCHMARKS = (

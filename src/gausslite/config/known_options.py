@@ -33,6 +33,6 @@ KNOWN_OPTIONS: Final = frozenset(
         *("segmenter", "sentences", "shares", "simd", "size", "sizes", "skip-stages", "source", "spool"),
         *("state", "store", "store-max-mb", "strict", "task", "task-a", "task-at", "task-b", "test-every"),
         *("threads", "timed", "tls-ca", "tls-cert", "tls-key", "track-motion", "unlimited", "up", "uplink-interval"),
-        *("uplink-kbps", "views", "vocabulary", "voxel-size", "world-frame"),
+        *("uplink-kbps", "view", "views", "vocabulary", "voxel-size", "world-frame"),
     }
 )

@@ -1,0 +1,1 @@
+"""A page in the browser that shows maps, runs, agents and fusion servers."""

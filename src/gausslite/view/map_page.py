@@ -1,0 +1,114 @@
+"""The page: splats, trajectory, keyframes and objects of a map, with the controls that choose what is drawn."""
+
+from __future__ import annotations
+
+import html
+import threading
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from gausslite.view.colours import ColourMode, colours_of, legend_of
+from gausslite.view.contents import ViewContents
+from gausslite.view.level_of_detail import DEFAULT_LIMIT, choose_gaussians, covariances_m2
+from gausslite.view.local_server import LOOPBACK, LocalServer
+from gausslite.view.scene_markers import SceneMarkers
+from gausslite.view.start_view import start_view
+
+_THOUSAND = 1000
+_MAX_SHOWN = 2_000_000
+_SPLATS = "/splats"
+_BACKGROUND_GREY = 40
+
+
+class MapPage:
+    """Owns the server and the newest contents. Thread-safe."""
+
+    def __init__(self, port: int, title: str, limit: int = DEFAULT_LIMIT) -> None:
+        """Serve the page. port: 0 chooses a free one. limit: the most Gaussians drawn. Raises InvalidInputError."""
+        self.server = LocalServer(port, title)
+        self.server.scene.world_axes.visible = False
+        self.server.scene.set_background_image(np.full((1, 1, 3), _BACKGROUND_GREY, np.uint8))
+        self._lock = threading.RLock()
+        self._contents: ViewContents | None = None
+        gui = self.server.gui
+        highest = _MAX_SHOWN // _THOUSAND
+        with gui.add_folder("Map"):
+            self._figures = gui.add_html("")
+            self._colour = gui.add_dropdown("Colour", [str(mode) for mode in ColourMode])
+            self._limit = gui.add_slider("Shown (1000)", 10, highest, 10, min(max(limit // _THOUSAND, 10), highest))
+            self._legend = gui.add_html("")
+        self._markers = SceneMarkers(self.server)
+        self._colour.on_update(lambda _: self._draw_splats())
+        self._limit.on_update(lambda _: self._draw_splats())
+
+    @property
+    def url(self) -> str:
+        """Where a browser of this machine finds the page."""
+        return f"http://{LOOPBACK}:{self.server.get_port()}"
+
+    def show(self, contents: ViewContents) -> None:
+        """Replace what the page shows."""
+        with self._lock:
+            is_first, self._contents = self._contents is None or not len(self._contents.gaussians), contents
+            if is_first and len(contents.gaussians):
+                self._set_start_view(contents)
+            self._draw_splats()
+            self._markers.show(contents)
+
+    def close(self) -> None:
+        """Stop serving."""
+        self.server.stop()
+
+    def _set_start_view(self, contents: ViewContents) -> None:
+        view = start_view(contents)
+        self.server.scene.set_up_direction(view.up)
+        cameras: list[Any] = [self.server.initial_camera, *(each.camera for each in self.server.get_clients().values())]
+        for camera in cameras:
+            camera.up = view.up
+            camera.position = view.position_m
+            camera.look_at = view.look_at_m
+
+    def _draw_splats(self) -> None:
+        with self._lock:
+            contents = self._contents
+            if contents is None:
+                return
+            mode = ColourMode(self._colour.value)
+            rows = choose_gaussians(contents.gaussians, int(self._limit.value) * _THOUSAND)
+            self._figures.content = _paragraph(_count_text(len(rows), len(contents.gaussians)))
+            self._legend.content = legend_html(legend_of(contents, mode))
+            if not len(rows):
+                return
+            shown = contents.gaussians.take(rows)
+            arrays = (
+                shown.means_m,
+                covariances_m2(shown),
+                colours_of(contents, mode)[rows],
+                shown.opacities[:, None],
+            )
+            self.server.scene.add_gaussian_splats(_SPLATS, *arrays)
+
+
+def legend_html(entries: Sequence[tuple[str, tuple[int, int, int]]]) -> str:
+    """Return the legend as HTML; names come from the network or from files and are escaped."""
+    rows = (
+        f'<div><span style="display:inline-block;width:0.8em;height:0.8em;margin-right:0.5em;'
+        f'background:rgb({r},{g},{b})"></span>{html.escape(name)}</div>'
+        for name, (r, g, b) in entries
+    )
+    return f'<div style="padding:0 0.75em;font-size:0.85em">{"".join(rows)}</div>'
+
+
+def text_html(lines: Sequence[str]) -> str:
+    """Return lines of text as HTML, escaped."""
+    return "".join(_paragraph(line) for line in lines)
+
+
+def _paragraph(text: str) -> str:
+    return f'<div style="padding:0 0.75em;font-size:0.85em;overflow-wrap:anywhere">{html.escape(text)}</div>'
+
+
+def _count_text(shown: int, total: int) -> str:
+    return f"{total:,} Gaussians" if shown == total else f"{shown:,} of {total:,} Gaussians, the most important ones"
