@@ -80,8 +80,9 @@ def fusion_server(
     settings: FusionSettings | None = None,
     refine: RefineSettings | None = None,
     tls: Tls | None = None,
+    address: str = "127.0.0.1:0",
 ) -> Iterator[RunningServer]:
-    """Start a fusion server on a free port with the reference rasterizer; the caller owns the store.
+    """Start a fusion server on a free port or `address` with the reference rasterizer; the caller owns the store.
 
     With tls the client uses the server's certificate; the stub and the channel do not work then.
     """
@@ -96,7 +97,7 @@ def fusion_server(
 
     try:
         with (
-            serving([Service(servicer.service().name, register)], tls=tls) as running,
+            serving([Service(servicer.service().name, register)], address, tls=tls) as running,
             FusionClient(running.address, tls=tls) as client,
             grpc.insecure_channel(running.address) as channel,
         ):

@@ -74,7 +74,7 @@ class ScriptedServer(pb_grpc.FusionServiceServicer):
 
     async def JoinSession(self, request: pb.JoinSessionRequest, context: Any) -> pb.JoinSessionResponse:
         self.joined.append(request.fresh_map)
-        return pb.JoinSessionResponse(session_id=f"s{len(self.joined)}", highest_update_seq=100)
+        return pb.JoinSessionResponse(session_id=f"s{len(self.joined)}", highest_update_seq=max([100, *self.revisions]))
 
     async def LeaveSession(self, request: pb.LeaveSessionRequest, context: Any) -> pb.LeaveSessionResponse:
         return pb.LeaveSessionResponse()

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import asyncio
+from concurrent.futures import Future
+from dataclasses import dataclass
+
 from gausslite.codec.free_space import decode_free_space
 from gausslite.codec.subset_codec import decode_subset
 from gausslite.domain.errors import (
@@ -13,6 +17,7 @@ from gausslite.domain.errors import (
 )
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.keyframes import EncodedKeyframe
+from gausslite.fusion.store import PutOutcome
 from gausslite.fusion.traffic import TrafficCounters
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.wire.caller import Caller
@@ -36,27 +41,47 @@ def agent_of_session(engine: FusionEngine, session_id: str, caller: Caller) -> s
     return agent_id
 
 
-def store_subset(engine: FusionEngine, request: pb.ContributeSubsetsRequest, caller: Caller) -> pb.SubsetOutcome:
-    """Store one message. An invalid one gives a REJECTED outcome; errors of the whole stream are raised."""
+@dataclass(frozen=True, slots=True)
+class QueuedSubset:
+    """A message of an agent that waits for its commit."""
+
+    agent_id: str
+    sequence: int
+    traffic: TrafficCounters
+    put: Future[PutOutcome]
+
+
+def enqueue_subset(engine: FusionEngine, request: pb.ContributeSubsetsRequest, caller: Caller) -> QueuedSubset:
+    """Decode one message and queue it. An invalid one is rejected by `put`; errors of the whole stream are raised."""
     agent_id = agent_of_session(engine, request.session_id, caller)
     size = len(request.subset)
     is_handover = request.purpose == pb.PURPOSE_HANDOVER
     traffic = TrafficCounters(handover_bytes=size) if is_handover else TrafficCounters(roi_bytes=size)
-    outcome = pb.SubsetOutcome(sequence=request.sequence)
+    put: Future[PutOutcome] = Future()
     try:
         subset, grid = decode_subset(request.subset)
-        put = engine.contribute(request.session_id, subset, grid)
+        put = engine.enqueue_update(request.session_id, subset, grid)
+    except GaussLiteError as error:
+        put.set_exception(error)
+    return QueuedSubset(agent_id, request.sequence, traffic, put)
+
+
+async def outcome_of(engine: FusionEngine, queued: QueuedSubset) -> pb.SubsetOutcome:
+    """Wait for the commit. A rejected message gives a REJECTED outcome; errors of the whole stream are raised."""
+    outcome = pb.SubsetOutcome(sequence=queued.sequence)
+    try:
+        put = await asyncio.wrap_future(queued.put)
     except _STREAM_ERRORS:
         raise
     except GaussLiteError as error:
         outcome.status, outcome.reason, outcome.message = _REJECTED, code_and_reason(error)[1], str(error)
-        engine.record_traffic(agent_id, traffic.plus(TrafficCounters(subsets_rejected=1)))
+        engine.record_traffic(queued.agent_id, queued.traffic.plus(TrafficCounters(subsets_rejected=1)))
         return outcome
     accepted = len(put.accepted) > 0 or len(put.stale) == 0
     outcome.status = _ACCEPTED if accepted else _STALE
     outcome.accepted_voxels, outcome.stale_voxels = len(put.accepted), len(put.stale)
     stored = TrafficCounters(subsets_accepted=int(accepted), subsets_stale=int(not accepted))
-    engine.record_traffic(agent_id, traffic.plus(stored))
+    engine.record_traffic(queued.agent_id, queued.traffic.plus(stored))
     return outcome
 
 

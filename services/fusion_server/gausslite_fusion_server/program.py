@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import sys
 from collections.abc import Sequence
 
 from gausslite.fusion.engine import FusionEngine
@@ -14,6 +15,7 @@ from gausslite.fusion.store import FusionStore
 from gausslite.wire.convert import decode_frame
 from gausslite.wire.process import run_service
 from gausslite.wire.server import serve_until_stopped
+from gausslite_fusion_server.maintenance import COMMANDS, run_command
 from gausslite_fusion_server.refinement_worker import RefinementWorker
 from gausslite_fusion_server.servicer import FusionServicer
 from gausslite_fusion_server.settings import ServerSettings, parse_arguments
@@ -22,7 +24,13 @@ _PROGRAM = "gausslite-fusion-server"
 
 
 def run(arguments: Sequence[str] | None = None) -> int:
-    """Serve until a signal arrives. Returns the exit code: 0, or 2 with one line on stderr if the server fails."""
+    """Serve until a signal arrives, or run a maintenance command.
+
+    Returns the exit code: 0, or 2 with one line on stderr if the server fails.
+    """
+    given = sys.argv[1:] if arguments is None else arguments
+    if given and given[0] in COMMANDS:
+        return run_command(given)
 
     async def serve() -> None:
         settings = parse_arguments(arguments)

@@ -10,8 +10,6 @@ from collections.abc import AsyncIterator, Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, TypeVar
 
-import google_crc32c
-
 from gausslite.codec.ply import ply_bytes
 from gausslite.codec.subset_codec import MAX_SUBSET_BYTES
 from gausslite.domain.errors import (
@@ -23,7 +21,6 @@ from gausslite.domain.names import require_identifier
 from gausslite.domain.objects import ObjectReport
 from gausslite.domain.voxel_batch import VoxelBatch
 from gausslite.fusion.engine import FusionEngine
-from gausslite.fusion.fused_map import FusedMapChanges, MapLayer
 from gausslite.fusion.map_renderer import MapRenderer
 from gausslite.fusion.mission_config import MissionConfig
 from gausslite.v1 import fusion_service_pb2 as pb
@@ -41,19 +38,26 @@ from gausslite.wire.convert import (
 from gausslite.wire.convert_objects import object_to_message, report_from_message
 from gausslite.wire.convert_task import graph_from_message
 from gausslite.wire.server import Service
-from gausslite_fusion_server.change_blocks import change_blocks
-from gausslite_fusion_server.contributions import agent_of_session, store_free_space, store_keyframe, store_subset
+from gausslite_fusion_server.change_blocks import ChangeBlocks, WatchedPart
+from gausslite_fusion_server.contributions import (
+    agent_of_session,
+    enqueue_subset,
+    outcome_of,
+    store_free_space,
+    store_keyframe,
+)
 from gausslite_fusion_server.drain_gate import DrainGate
+from gausslite_fusion_server.exported_file import ExportedFile
 from gausslite_fusion_server.messages import (
     contribution_to_message,
     declared_frame_from_message,
     layer_from_message,
     view_to_message,
 )
+from gausslite_fusion_server.read_deadline import read_deadline
 from gausslite_fusion_server.refinement_worker import RefinementWorker, RefineRequest
 
 _log = logging.getLogger(__name__)
-_CHUNK_BYTES = 1 << 20
 _MAX_REPORTED_REJECTIONS = 1000
 _WORKERS = 4
 
@@ -67,12 +71,17 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         self._engine = engine
         self._refinement_worker = refinement_worker
         self._workers = ThreadPoolExecutor(_WORKERS, "fusion")
+        # one thread: messages that arrive during a commit wait for the next one and share it
+        self._committer = ThreadPoolExecutor(1, "commit")
+        self._change_blocks = ChangeBlocks(engine.maps, engine.grid)
         # one thread: an estimate of frames or a rendering must not delay the acknowledgements
         self._background = ThreadPoolExecutor(1, "background")
         self._aligning = False
         self._renderer = MapRenderer(engine, refinement_worker.create_rasterizer)
         self._map_changes = ChangeNotifier()
         self._gate = DrainGate()
+        # one map at a time is in memory
+        self._exports = asyncio.Semaphore(1)
 
     def service(self) -> Service:
         """Return the servicer, ready for a server."""
@@ -90,6 +99,7 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         """Wait until the work in threads has ended."""
         self._background.shutdown(wait=True, cancel_futures=True)
         self._workers.shutdown(wait=True)
+        self._committer.shutdown(wait=True)
         self._refinement_worker.close()
 
     async def JoinSession(self, request: pb.JoinSessionRequest, context: Any) -> pb.JoinSessionResponse:
@@ -115,6 +125,14 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
             max_gaussians=self._engine.settings.quotas.gaussians_per_agent,
             keyframes=joined.keyframes,
             max_keyframes=self._engine.settings.quotas.keyframes_per_agent,
+            incarnation_id=self._engine.incarnation_id,
+        )
+
+    async def KeepSession(self, request: pb.KeepSessionRequest, context: Any) -> pb.KeepSessionResponse:
+        """Renew the agent's lease; return what identifies the stored updates."""
+        agent_id = agent_of_session(self._engine, request.session_id, Caller.of(context))
+        return pb.KeepSessionResponse(
+            highest_update_seq=self._engine.highest_update_seq(agent_id), incarnation_id=self._engine.incarnation_id
         )
 
     async def ContributeSubsets(
@@ -123,7 +141,10 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         """Store voxel updates; one acknowledgement for each message."""
         acknowledged, caller = 0, Caller.of(context)
         async for request in self._gate.admit(request_iterator):
-            outcome = await self._work(store_subset, self._engine, request, caller)
+            queued = await self._work(enqueue_subset, self._engine, request, caller)
+            if not queued.put.done():
+                self._committer.submit(self._engine.commit_updates)
+            outcome = await outcome_of(self._engine, queued)
             self._map_changes.notify()
             self._align_in_background()
             acknowledged = max(acknowledged, request.sequence)
@@ -150,19 +171,22 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         """Send the map, then its changes. A slow watcher gets several changes as one; nothing is queued."""
         self._engine.require_mission(request.mission_id)
         region = box_from_message(request.region) if request.HasField("region") else None
-        layer, excluded = layer_from_message(request.layer), request.exclude_agent_id
-        if excluded:
-            require_identifier("exclude_agent_id", excluded)
-        changes = await self._work(self._engine.maps.changes, request.since_revision, layer, excluded)
+        if request.exclude_agent_id:
+            require_identifier("exclude_agent_id", request.exclude_agent_id)
+        watched = WatchedPart(layer_from_message(request.layer), region, request.exclude_agent_id)
+        blocks = self._change_blocks.blocks(watched, request.since_revision)
+        block = await self._work(_next_block, blocks)
         while True:
-            blocks = change_blocks(changes, self._engine.grid, region)
-            while (block := await self._work(_next_block, blocks)) is not None:
-                yield pb.WatchFusedMapResponse(block=block)
+            while block is not None:
+                revision = block.revision
+                with read_deadline():
+                    yield pb.WatchFusedMapResponse(block=block)
+                block = await self._work(_next_block, blocks)
             changed = self._map_changes.subscribe()
-            while self._engine.maps.revision(layer) == changes.revision and self._gate.is_open:
+            while self._engine.maps.revision(watched.layer) == revision and self._gate.is_open:
                 await changed.wait()
                 changed = self._map_changes.subscribe()
-            changes = await self._work(self._changes_or_snapshot, changes.revision, layer, excluded)
+            blocks, block = await self._work(self._changes_or_snapshot, watched, revision)
 
     async def RefineFusedMap(
         self, request: pb.RefineFusedMapRequest, context: Any
@@ -190,11 +214,13 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
     ) -> AsyncIterator[pb.ExportFusedMapResponse]:
         """Send a map as the bytes of a PLY file."""
         self._engine.require_mission(request.mission_id)
-        data, crc32c = await self._work(self._export, request)
-        for offset in range(0, len(data), _CHUNK_BYTES):
-            self._gate.require_open()
-            chunk = data[offset : offset + _CHUNK_BYTES]
-            yield pb.ExportFusedMapResponse(offset=offset, total_bytes=len(data), data=chunk, crc32c=crc32c)
+        async with self._exports:
+            exported = await self._work(self._export, request)
+        with exported:
+            while chunk := await self._work(exported.next_chunk):
+                self._gate.require_open()
+                with read_deadline():
+                    yield chunk
 
     async def ReportObjects(self, request: pb.ReportObjectsRequest, context: Any) -> pb.ReportObjectsResponse:
         """Replace the agent's task graph and objects."""
@@ -266,17 +292,19 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         _log.warning("agent %s: may join again", request.agent_id)
         return pb.UnbanAgentResponse()
 
-    def _changes_or_snapshot(self, revision: int, layer: MapLayer, excluded: str) -> FusedMapChanges:
+    def _changes_or_snapshot(self, watched: WatchedPart, revision: int) -> tuple[Iterator[MapBlock], MapBlock | None]:
+        """Return the blocks of the changes after the first one, and the first one."""
+        blocks = self._change_blocks.blocks(watched, revision)
         try:
-            return self._engine.maps.changes(revision, layer, excluded)
+            return blocks, next(blocks)
         except RevisionGoneError:
             # the watcher missed more removals than are recorded, so it gets a snapshot
-            return self._engine.maps.changes(0, layer, excluded)
+            blocks = self._change_blocks.blocks(watched, 0)
+            return blocks, next(blocks)
 
-    def _export(self, request: pb.ExportFusedMapRequest) -> tuple[bytes, int]:
+    def _export(self, request: pb.ExportFusedMapRequest) -> ExportedFile:
         batch = self._select_map(request)
-        data = ply_bytes(batch.gaussians, self._engine.mission_config.given_world_frame)
-        return data, google_crc32c.value(data)
+        return ExportedFile(ply_bytes(batch.gaussians, self._engine.mission_config.given_world_frame))
 
     def _select_map(self, request: pb.ExportFusedMapRequest) -> VoxelBatch:
         match request.strategy:

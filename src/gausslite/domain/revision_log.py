@@ -49,6 +49,10 @@ class RevisionLog:
                 _, dropped_revision = self._removed_at.popitem(last=False)
                 self._oldest = max(self._oldest, dropped_revision)
 
+    def changed_at(self, key: int) -> int:
+        """Return the revision at which a voxel of the map last changed; 0 if it is not in the map."""
+        return self._changed_at.get(key, 0)
+
     def changed_since(self, revision: int) -> Int64[ndarray, " c"]:
         """Return the keys of the voxels that changed or became empty after this revision, ascending.
 

@@ -13,6 +13,9 @@ from gausslite.domain.errors import InvalidInputError
 _BITS_PER_AXIS = 21
 _OFFSET = 1 << (_BITS_PER_AXIS - 1)
 _MASK = (1 << _BITS_PER_AXIS) - 1
+TILE_VOXELS = 16
+"""Voxels of a tile along each axis."""
+_TILE_MASK = sum((_MASK - (TILE_VOXELS - 1)) << (axis * _BITS_PER_AXIS) for axis in range(3))
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,6 +77,11 @@ class VoxelGrid:
                 f"points: expected coordinates within ±{self.max_coordinate_m:g} m, got one outside"
             )
         return axes
+
+
+def tile_of(key: int) -> int:
+    """Return the smallest key of the voxel's tile, which names the tile."""
+    return key & _TILE_MASK
 
 
 def _pack(axes: Float64[ndarray, "3 n"]) -> Int64[ndarray, " n"]:

@@ -9,6 +9,7 @@ from jaxtyping import Int64
 from numpy import ndarray
 
 from gausslite.domain.revision_log import MAX_REMOVED_VOXELS, RevisionLog
+from gausslite.fusion.tile_index import TileIndex
 from gausslite.fusion.vote import VoteResult
 
 
@@ -23,6 +24,7 @@ class ChangeLog:
         self._winner: dict[int, tuple[str, int]] = {}
         self._won_voxels: dict[str, int] = {}
         self._fused_gaussians = 0
+        self._tiles = TileIndex()
 
     @property
     def revision(self) -> int:
@@ -43,9 +45,10 @@ class ChangeLog:
         """Return the number of voxels that the agent wins."""
         return self._won_voxels.get(agent_id, 0)
 
-    def keys(self) -> Int64[ndarray, " v"]:
-        """Return the voxels of the fused map, ascending."""
-        return np.sort(np.fromiter(self._winner, np.int64, len(self._winner)))
+    @property
+    def tiles(self) -> TileIndex:
+        """The voxels of the fused map by tile."""
+        return self._tiles
 
     def winners(self, keys: Iterable[int]) -> dict[str, list[int]]:
         """Return those of the voxels that are in the fused map, by winner."""
@@ -64,7 +67,7 @@ class ChangeLog:
         for key, name, count in zip(keys, names, counts, strict=True):
             self._set(key, (name, count))
         if keys:
-            self._log.record(keys, (), self._log.revision + 1)
+            self._advance(keys, [])
 
     def record(self, agent_id: str, keys: Int64[ndarray, " k"], vote: VoteResult) -> Int64[ndarray, " c"]:
         """Record that this agent's updates of `keys` changed; `vote` is the new result on these voxels.
@@ -83,12 +86,21 @@ class ChangeLog:
             self._set(key, new)
             (removed if new is None else changed).append(key)
         if changed or removed:
-            self._log.record(changed, removed, self._log.revision + 1)
+            self._advance(changed, removed)
         return np.array(sorted(changed + removed), np.int64)
 
     def changed_since(self, revision: int) -> Int64[ndarray, " c"]:
         """Return the voxels that changed or became empty after this revision, ascending. Raises RevisionGoneError."""
         return self._log.changed_since(revision)
+
+    def changed_after(self, keys: Iterable[int], revision: int) -> list[int]:
+        """Return those of the voxels of the fused map that changed after this revision."""
+        return [key for key in keys if self._log.changed_at(key) > revision]
+
+    def _advance(self, changed: list[int], removed: list[int]) -> None:
+        revision = self._log.revision + 1
+        self._log.record(changed, removed, revision)
+        self._tiles.record(changed, removed, revision)
 
     def _set(self, key: int, new: tuple[str, int] | None) -> None:
         old = self._winner.pop(key, None)

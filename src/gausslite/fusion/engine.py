@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from concurrent.futures import Future
 from dataclasses import replace
 from threading import RLock
@@ -14,7 +14,6 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from gausslite.domain.errors import InvalidInputError, MismatchError, NotPermittedError, QuotaError
-from gausslite.domain.frame import MAX_COORDINATE_M
 from gausslite.domain.free_space import FreeSpace
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.names import quote_name, require_identifier
@@ -27,7 +26,14 @@ from gausslite.fusion.frame_aligner import FrameAligner
 from gausslite.fusion.frame_alignment import FrameAlignments
 from gausslite.fusion.free_space import FreeSpaceRecords
 from gausslite.fusion.fused_map import FusedMapLayers
-from gausslite.fusion.keyframes import AgentKeyframe, EncodedKeyframe, FrameDecoder, KeyframePool, no_decoder
+from gausslite.fusion.keyframes import (
+    AgentKeyframe,
+    EncodedKeyframe,
+    FrameDecoder,
+    KeyframePool,
+    in_fused_frame,
+    no_decoder,
+)
 from gausslite.fusion.limits import FusionSettings, VoteRule
 from gausslite.fusion.mission_config import MissionConfig, reconcile
 from gausslite.fusion.sessions import SessionRegistry
@@ -110,6 +116,15 @@ class FusionEngine:
             return self._mission_config.with_default_names()
 
     @property
+    def incarnation_id(self) -> str:
+        """The id of the store's content, see FusionStore."""
+        return self._store.incarnation_id
+
+    def highest_update_seq(self, agent_id: str) -> int:
+        """Return the highest sequence number among the agent's stored updates; 0 without any."""
+        return self._store.totals(agent_id).highest_update_seq
+
+    @property
     def revision(self) -> int:
         """The revision of the vote; it increases with every change."""
         return self._maps.revision()
@@ -146,7 +161,7 @@ class FusionEngine:
             self._checks.record_join(agent_id)
             return JoinResult(
                 session,
-                self._store.totals(agent_id).highest_update_seq,
+                self.highest_update_seq(agent_id),
                 self._maps.revision(),
                 self._keyframes.indices(agent_id),
             )
@@ -163,8 +178,8 @@ class FusionEngine:
         InvalidInputError, QuotaError, StorageError, UnavailableError; see UpdateCommitter for what is stored then.
         """
         future = self.enqueue_update(session_id, subset, grid)
-        while not future.done():
-            self._committer.commit()
+        self._committer.commit()
+        # another thread may be committing it
         return future.result()
 
     def enqueue_update(self, session_id: str, subset: RoiSubset, grid: VoxelGrid) -> Future[PutOutcome]:
@@ -182,7 +197,7 @@ class FusionEngine:
         return self._committer.add(session_id, subset)
 
     def commit_updates(self) -> None:
-        """Commit the next group of queued updates. Call it once for each enqueued one, or more often."""
+        """Commit the queued updates. Call it after each `enqueue_update`."""
         self._committer.commit()
 
     def align_due(self) -> bool:
@@ -302,7 +317,7 @@ class FusionEngine:
         """
         with self._lock:
             frames, quarantined = self._alignments.transforms(), self._alignments.quarantined
-        moved = (_in_fused_frame(each, frames) for each in keyframes if each.agent_id not in quarantined)
+        moved = (in_fused_frame(each, frames) for each in keyframes if each.agent_id not in quarantined)
         return [each for each in moved if each is not None]
 
     def status(self) -> MissionStatus:
@@ -344,8 +359,10 @@ class FusionEngine:
         )
 
     def _check_update(self, update: PendingUpdate) -> RoiSubset:
-        """Return the message with computed sums. Raises the errors of `contribute`."""
+        """Return the message with computed sums; only its first part is checked. Raises GaussLiteError."""
         self._sessions.get(update.session_id)
+        if update.outcomes:
+            return update.subset
         subset = self._checks.check(update.subset)
         require_storable(subset)
         require_within_quotas(subset, self._store, self._settings.quotas)
@@ -381,14 +398,3 @@ class FusionEngine:
         self._traffic.pop(agent_id, None)
         self._keyframes.remove_agent(agent_id)
         self._objects.remove_agent(agent_id)
-
-
-def _in_fused_frame(keyframe: AgentKeyframe, frames: Mapping[str, Float64[ndarray, "4 4"]]) -> AgentKeyframe | None:
-    """Return the keyframe with its camera pose in the fused map's frame; None if no frame can have this pose."""
-    T_fused_agent = frames.get(keyframe.agent_id)
-    if T_fused_agent is None:
-        return keyframe
-    pose = T_fused_agent @ keyframe.frame.T_world_camera
-    if np.abs(pose[:3, 3]).max() > MAX_COORDINATE_M:
-        return None
-    return replace(keyframe, frame=replace(keyframe.frame, T_world_camera=pose))

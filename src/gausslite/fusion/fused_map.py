@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import reduce
 from threading import RLock
 
 import numpy as np
@@ -15,11 +17,12 @@ from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.names import quote_name
 from gausslite.domain.revision_log import RevisionLog
 from gausslite.domain.voxel_batch import VoxelBatch
-from gausslite.domain.voxel_operations import group_by_voxel, select_keys, select_voxels
+from gausslite.domain.voxel_operations import empty_batch, group_by_voxel, merge_batches, select_keys, select_voxels
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.fusion.change_log import ChangeLog
 from gausslite.fusion.refined_map import RefinedMap
-from gausslite.fusion.vote import FusedMap, fuse, rank_voxels, union_maps
+from gausslite.fusion.tile_index import TileIndex
+from gausslite.fusion.vote import fuse, rank_voxels, union_maps
 from gausslite.fusion.vote_input import VoteInput
 
 
@@ -31,12 +34,28 @@ class MapLayer(StrEnum):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class WonVoxels:
+    """Voxels of a layer with their Gaussians, and the keys that each agent wins in the vote."""
+
+    batch: VoxelBatch
+    keys_by_winner: Mapping[str, Sequence[int]]
+
+    def without(self, agent_id: str) -> WonVoxels:
+        """Return the voxels that this agent does not win."""
+        own = np.array(self.keys_by_winner.get(agent_id, ()), np.int64)
+        return WonVoxels(
+            select_voxels(self.batch, ~np.isin(self.batch.keys, own)),
+            {name: keys for name, keys in self.keys_by_winner.items() if name != agent_id},
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class FusedMapChanges:
-    """The fused voxels that changed up to `revision`, and the keys of those that became empty."""
+    """The voxels of a layer that changed up to `revision`, and the keys of those that became empty."""
 
     revision: int
     snapshot: bool
-    fused: FusedMap
+    won: WonVoxels
     removed: Int64[ndarray, " e"]
 
 
@@ -50,12 +69,11 @@ class FusedMapLayers:
         self._change_log = ChangeLog(first_revision, max_removed_voxels)
         self._refined: RefinedMap | None = None
         self._refined_log = RevisionLog(first_revision, max_removed_voxels)
-        self._refined_keys: set[int] = set()
+        self._refined_tiles = TileIndex()
         vote = rank_voxels(votes.scores())
         self._change_log.load(vote)
         if len(vote):
-            self._refined_keys.update(vote.keys.tolist())
-            self._refined_log.record(vote.keys.tolist(), (), first_revision + 1)
+            self._record_refined(vote.keys.tolist(), [])
 
     def revision(self, layer: MapLayer = MapLayer.VOTE) -> int:
         """Return the layer's revision; it increases with every change."""
@@ -82,26 +100,17 @@ class FusedMapLayers:
         with self._lock:
             self._record(agent_id, keys)
 
-    def changes(
-        self, since_revision: int = 0, layer: MapLayer = MapLayer.VOTE, exclude_agent: str = ""
-    ) -> FusedMapChanges:
-        """Return the changes of a layer since a revision; the whole map for 0. Raises RevisionGoneError.
-
-        exclude_agent: voxels that this agent wins count as empty; only for the vote. Raises InvalidInputError.
-        """
-        if layer is MapLayer.REFINED:
-            if exclude_agent:
-                raise InvalidInputError("exclude_agent_id: expected none with REFINED, whose voxels belong to everyone")
-            return self._refined_changes(since_revision)
+    def changes(self, since_revision: int = 0, layer: MapLayer = MapLayer.VOTE) -> FusedMapChanges:
+        """Return the changes of a layer since a revision; the whole map for 0. Raises RevisionGoneError."""
         with self._lock:
-            revision = self._change_log.revision
-            keys = None if since_revision == 0 else self._change_log.changed_since(since_revision)
-            batches = self._votes.batches(keys)
-        fused = fuse(batches)
-        if exclude_agent:
-            fused = FusedMap(select_voxels(fused.batch, ~fused.won_by(exclude_agent)), fused.vote)
-        removed = np.zeros(0, np.int64) if keys is None else np.setdiff1d(keys, fused.batch.keys)
-        return FusedMapChanges(revision, since_revision == 0, fused, removed)
+            log = self._change_log if layer is MapLayer.VOTE else self._refined_log
+            if since_revision:
+                keys = log.changed_since(since_revision)
+            else:
+                keys = np.array(sorted(self._tiles_of(layer).all_keys()), np.int64)
+            won = self._won_voxels(layer, keys)
+            removed = np.setdiff1d(keys, won.batch.keys) if since_revision else np.zeros(0, np.int64)
+            return FusedMapChanges(log.revision, since_revision == 0, won, removed)
 
     def voted_map(self, only_agent: str = "") -> VoxelBatch:
         """Return the fused map, or its voxels that one agent wins."""
@@ -127,10 +136,10 @@ class FusedMapLayers:
         refined = RefinedMap(group_by_voxel(gaussians, self._grid), revision)
         with self._lock:
             changed = set(self._change_log.changed_since(revision).tolist())
-            shown = (set(refined.batch.keys.tolist()) - changed) | (self._refined_keys & changed)
-            removed = self._refined_keys - shown
-            self._refined_log.record(sorted(shown - changed), sorted(removed), self._refined_log.revision + 1)
-            self._refined, self._refined_keys = refined, shown
+            before = self._refined_tiles.all_keys()
+            shown = (set(refined.batch.keys.tolist()) - changed) | (before & changed)
+            self._record_refined(sorted(shown - changed), sorted(before - shown))
+            self._refined = refined
 
     def refined_map(self) -> VoxelBatch:
         """Return the refined map; voxels that changed after the refinement started show the newer vote.
@@ -150,27 +159,52 @@ class FusedMapLayers:
         with self._lock:
             return self.refined_map() if layer is MapLayer.REFINED and self.is_refined else self.voted_map()
 
-    def _refined_changes(self, since_revision: int) -> FusedMapChanges:
+    def tiles(self, layer: MapLayer) -> tuple[int, Int64[ndarray, " t"]]:
+        """Return the layer's revision and the tiles of its voxels, ascending."""
         with self._lock:
-            revision = self._refined_log.revision
-            keys = None if since_revision == 0 else self._refined_log.changed_since(since_revision)
-            batch = self.layer(MapLayer.REFINED)
-            vote = rank_voxels(self._votes.scores(keys))
-        if keys is None:
-            return FusedMapChanges(revision, True, FusedMap(batch, vote), np.zeros(0, np.int64))
-        present = select_keys(batch, keys)
-        return FusedMapChanges(revision, False, FusedMap(present, vote), np.setdiff1d(keys, present.keys))
+            return self.revision(layer), self._tiles_of(layer).tiles()
+
+    def tile_revision(self, layer: MapLayer, tile: int) -> int:
+        """Return the revision of the last change in a tile."""
+        with self._lock:
+            return self._tiles_of(layer).revision(tile)
+
+    def tile(self, layer: MapLayer, tile: int) -> WonVoxels:
+        """Return the voxels of a tile as they are now."""
+        with self._lock:
+            return self._won_voxels(layer, self._tiles_of(layer).keys(tile))
+
+    def _tiles_of(self, layer: MapLayer) -> TileIndex:
+        return self._change_log.tiles if layer is MapLayer.VOTE else self._refined_tiles
+
+    def _won_voxels(self, layer: MapLayer, keys: Int64[ndarray, " k"]) -> WonVoxels:
+        voted = keys
+        parts = []
+        refined = self._refined if layer is MapLayer.REFINED else None
+        if refined is not None:
+            voted = np.array(self._change_log.changed_after(keys.tolist(), refined.revision), np.int64)
+            parts.append(select_keys(refined.batch, np.setdiff1d(keys, voted)))
+        winners = self._change_log.winners(voted.tolist())
+        parts += [self._votes.batch(name, np.array(own, np.int64)) for name, own in winners.items()]
+        batch = reduce(merge_batches, parts, empty_batch())
+        # a commit may have stored a tombstone that is not recorded yet; it follows as a change
+        batch = select_voxels(batch, batch.counts > 0)
+        winners = self._change_log.winners(batch.keys.tolist())
+        return WonVoxels(batch, winners)
 
     def _record(self, agent_id: str, keys: Int64[ndarray, " k"]) -> None:
         vote = rank_voxels(self._votes.scores(keys))
         fused_changes = self._change_log.record(agent_id, keys, vote)
         present = set(vote.keys.tolist())
         changed = [key for key in fused_changes.tolist() if key in present]
-        removed = [key for key in fused_changes.tolist() if key not in present and key in self._refined_keys]
+        removed = [key for key in fused_changes.tolist() if key not in present and key in self._refined_tiles]
         if changed or removed:
-            self._refined_log.record(changed, removed, self._refined_log.revision + 1)
-            self._refined_keys.update(changed)
-            self._refined_keys.difference_update(removed)
+            self._record_refined(changed, removed)
+
+    def _record_refined(self, changed: list[int], removed: list[int]) -> None:
+        revision = self._refined_log.revision + 1
+        self._refined_log.record(changed, removed, revision)
+        self._refined_tiles.record(changed, removed, revision)
 
     def _require_contributor(self, agent_id: str) -> None:
         agents = self._votes.agents()

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Iterable, Mapping
+from dataclasses import dataclass, replace
 
-from jaxtyping import Float32
+import numpy as np
+from jaxtyping import Float32, Float64
 from numpy import ndarray
 
 from gausslite.domain.errors import CodecError, GaussLiteError, InvalidInputError, QuotaError
-from gausslite.domain.frame import Frame
+from gausslite.domain.frame import MAX_COORDINATE_M, Frame
 from gausslite.fusion.store import FusionStore
 
 FrameDecoder = Callable[[bytes], Frame]
@@ -125,3 +126,14 @@ class KeyframePool:
             return [AgentKeyframe(agent_id, self._decode(data)) for agent_id, data in encoded]
         except GaussLiteError as error:
             raise CodecError(f"stored keyframe: {error}") from error
+
+
+def in_fused_frame(keyframe: AgentKeyframe, frames: Mapping[str, Float64[ndarray, "4 4"]]) -> AgentKeyframe | None:
+    """Return the keyframe with its camera pose in the fused map's frame; None if no frame can have this pose."""
+    T_fused_agent = frames.get(keyframe.agent_id)
+    if T_fused_agent is None:
+        return keyframe
+    pose = T_fused_agent @ keyframe.frame.T_world_camera
+    if np.abs(pose[:3, 3]).max() > MAX_COORDINATE_M:
+        return None
+    return replace(keyframe, frame=replace(keyframe.frame, T_world_camera=pose))

@@ -46,9 +46,10 @@ INSERT INTO voxel_updates VALUES (?, ?, ?, ?, ?, ?, ?) ON CONFLICT (agent_id, vo
     update_seq = excluded.update_seq, kappa_sum = excluded.kappa_sum, count = excluded.count,
     checksum = excluded.checksum, records = excluded.records
 """
-_SELECT_UPDATES = "SELECT agent_id, voxel, update_seq, kappa_sum, count, checksum, records FROM voxel_updates"
-_SELECT_AGENT = f"{_SELECT_UPDATES} WHERE agent_id = ? ORDER BY voxel"
-_SELECT_VOXELS = f"{_SELECT_UPDATES} WHERE agent_id = ? AND voxel IN (SELECT value FROM json_each(?)) ORDER BY voxel"  # noqa: S608
+SELECT_UPDATES = "SELECT agent_id, voxel, update_seq, kappa_sum, count, checksum, records FROM voxel_updates"
+"""Rows as `is_intact` reads them."""
+_SELECT_AGENT = f"{SELECT_UPDATES} WHERE agent_id = ? ORDER BY voxel"
+_SELECT_VOXELS = f"{SELECT_UPDATES} WHERE agent_id = ? AND voxel IN (SELECT value FROM json_each(?)) ORDER BY voxel"  # noqa: S608
 _UpdateRow = tuple[str, int, int, int, int, int, bytes]
 
 
@@ -249,7 +250,7 @@ class SqliteStore:
             check = self._reader.execute("PRAGMA quick_check(1)").fetchone()[0]
             if check != "ok":
                 raise StorageError(f"store {self._path}: expected an undamaged file, got {check!r}; {RESTORE_ADVICE}")
-            cursor = self._reader.execute(f"{_SELECT_UPDATES} ORDER BY agent_id, voxel")
+            cursor = self._reader.execute(f"{SELECT_UPDATES} ORDER BY agent_id, voxel")
             while rows := cursor.fetchmany(_LOADED_ROWS):
                 for row in rows:
                     self._require_intact(row)
@@ -259,7 +260,7 @@ class SqliteStore:
                     self._index.put(agent_id, np.array(voxels, np.int64), StoredScores(*columns))
 
     def _records_of(self, agent_id: str, voxel: int) -> bytes:
-        rows = self._read(f"{_SELECT_UPDATES} WHERE agent_id = ? AND voxel = ?", (agent_id, voxel))
+        rows = self._read(f"{SELECT_UPDATES} WHERE agent_id = ? AND voxel = ?", (agent_id, voxel))
         self._require_intact(rows[0])
         return bytes(rows[0][6])
 

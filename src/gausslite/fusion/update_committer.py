@@ -38,26 +38,26 @@ class UpdateCommitter:
         return update.future
 
     def commit(self) -> None:
-        """Commit the next group of messages, if any waits."""
-        with self.committing:
-            group = self._queue.take(_GROUP_VOXELS)
-            try:
-                self._commit(group)
-            except BaseException as error:
-                for update in group:
-                    _fail(update, error)
-                raise
-            finally:
-                for update in group:
-                    self._queue.put_back(update, update.future.done())
+        """Commit the queued messages, group by group, until none waits."""
+        while self._queue.has_waiting:
+            with self.committing:
+                group = self._queue.take(_GROUP_VOXELS)
+                try:
+                    self._commit(group)
+                except Exception as error:
+                    # reaches the senders through their futures
+                    for update in group:
+                        _fail(update, error)
+                finally:
+                    for update in group:
+                        self._queue.put_back(update, update.future.done())
 
     def _commit(self, group: list[PendingUpdate]) -> None:
         checked: list[tuple[PendingUpdate, RoiSubset]] = []
         with self._lock:
             for update in group:
                 try:
-                    if not update.outcomes:
-                        update.subset = self._check(update)
+                    update.subset = self._check(update)
                     checked.append((update, update.next_slice()))
                 except GaussLiteError as error:
                     _fail(update, error)

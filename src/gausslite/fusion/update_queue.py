@@ -34,6 +34,10 @@ class PendingUpdate:
     next_voxel: int = 0
     outcomes: list[PutOutcome] = field(default_factory=list)
 
+    def __post_init__(self) -> None:
+        # a client that disconnects cannot cancel it any more: the message is stored in any case
+        self.future.set_running_or_notify_cancel()
+
     def next_slice(self) -> RoiSubset:
         """Return the part of the message to store next."""
         subset, start = self.subset, self.next_voxel
@@ -84,6 +88,11 @@ class UpdateQueue:
             own.append(update)
             if len(own) == 1:
                 self._wait(agent_id)
+
+    @property
+    def has_waiting(self) -> bool:
+        """Whether `take` would return a message."""
+        return bool(self._waiting)
 
     def take(self, max_voxels: int) -> list[PendingUpdate]:
         """Return the first message of the agents whose turn it is, at least one if any wait; they stay in the queue."""

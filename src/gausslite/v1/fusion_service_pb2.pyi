@@ -214,6 +214,7 @@ class JoinSessionResponse(_message.Message):
     MAX_GAUSSIANS_FIELD_NUMBER: _builtins.int
     KEYFRAMES_FIELD_NUMBER: _builtins.int
     MAX_KEYFRAMES_FIELD_NUMBER: _builtins.int
+    INCARNATION_ID_FIELD_NUMBER: _builtins.int
     session_id: _builtins.str
     highest_update_seq: _builtins.int
     """The highest sequence number of the updates stored of this agent; later updates must have a higher one."""
@@ -224,6 +225,8 @@ class JoinSessionResponse(_message.Message):
     """Limit of stored Gaussians per agent; 0 = no limit."""
     max_keyframes: _builtins.int
     """Limit of stored keyframes per agent; 0 = no limit."""
+    incarnation_id: _builtins.str
+    """See KeepSessionResponse."""
     @_builtins.property
     def grid(self) -> _geometry_pb2.VoxelGrid: ...
     @_builtins.property
@@ -241,14 +244,62 @@ class JoinSessionResponse(_message.Message):
         max_gaussians: _builtins.int = ...,
         keyframes: _abc.Iterable[_builtins.int] | None = ...,
         max_keyframes: _builtins.int = ...,
+        incarnation_id: _builtins.str = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["grid", b"grid"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["fused_revision", b"fused_revision", "grid", b"grid", "highest_update_seq", b"highest_update_seq", "keyframes", b"keyframes", "max_gaussians", b"max_gaussians", "max_keyframes", b"max_keyframes", "max_subset_bytes", b"max_subset_bytes", "session_id", b"session_id"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["fused_revision", b"fused_revision", "grid", b"grid", "highest_update_seq", b"highest_update_seq", "incarnation_id", b"incarnation_id", "keyframes", b"keyframes", "max_gaussians", b"max_gaussians", "max_keyframes", b"max_keyframes", "max_subset_bytes", b"max_subset_bytes", "session_id", b"session_id"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
 Global___JoinSessionResponse: _TypeAlias = JoinSessionResponse  # noqa: Y015
+
+@_typing.final
+class KeepSessionRequest(_message.Message):
+    DESCRIPTOR: _descriptor.Descriptor
+
+    SESSION_ID_FIELD_NUMBER: _builtins.int
+    session_id: _builtins.str
+    def __init__(
+        self,
+        *,
+        session_id: _builtins.str = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["session_id", b"session_id"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___KeepSessionRequest: _TypeAlias = KeepSessionRequest  # noqa: Y015
+
+@_typing.final
+class KeepSessionResponse(_message.Message):
+    DESCRIPTOR: _descriptor.Descriptor
+
+    HIGHEST_UPDATE_SEQ_FIELD_NUMBER: _builtins.int
+    INCARNATION_ID_FIELD_NUMBER: _builtins.int
+    highest_update_seq: _builtins.int
+    """If this is lower than a sequence number that the server has acknowledged, it has lost updates, for example with the
+    end of its log. The agent then sends everything again.
+    """
+    incarnation_id: _builtins.str
+    """The id of the store's content. It changes with a new store, a restored backup and a repair. The agent then sends
+    everything again.
+    """
+    def __init__(
+        self,
+        *,
+        highest_update_seq: _builtins.int = ...,
+        incarnation_id: _builtins.str = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["highest_update_seq", b"highest_update_seq", "incarnation_id", b"incarnation_id"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___KeepSessionResponse: _TypeAlias = KeepSessionResponse  # noqa: Y015
 
 @_typing.final
 class ContributeSubsetsRequest(_message.Message):

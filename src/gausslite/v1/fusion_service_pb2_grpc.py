@@ -89,6 +89,11 @@ class FusionServiceStub(object):
                 request_serializer=gausslite_dot_v1_dot_fusion__service__pb2.GetSessionStatusRequest.SerializeToString,
                 response_deserializer=gausslite_dot_v1_dot_fusion__service__pb2.GetSessionStatusResponse.FromString,
                 _registered_method=True)
+        self.KeepSession = channel.unary_unary(
+                '/gausslite.v1.FusionService/KeepSession',
+                request_serializer=gausslite_dot_v1_dot_fusion__service__pb2.KeepSessionRequest.SerializeToString,
+                response_deserializer=gausslite_dot_v1_dot_fusion__service__pb2.KeepSessionResponse.FromString,
+                _registered_method=True)
         self.LeaveSession = channel.unary_unary(
                 '/gausslite.v1.FusionService/LeaveSession',
                 request_serializer=gausslite_dot_v1_dot_fusion__service__pb2.LeaveSessionRequest.SerializeToString,
@@ -192,6 +197,13 @@ class FusionServiceServicer(object):
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
+    def KeepSession(self, request, context):
+        """Renews the lease of an agent that has nothing to send, and says what the server has of it.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
     def LeaveSession(self, request, context):
         """Missing associated documentation comment in .proto file."""
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
@@ -269,6 +281,11 @@ def add_FusionServiceServicer_to_server(servicer, server):
                     servicer.GetSessionStatus,
                     request_deserializer=gausslite_dot_v1_dot_fusion__service__pb2.GetSessionStatusRequest.FromString,
                     response_serializer=gausslite_dot_v1_dot_fusion__service__pb2.GetSessionStatusResponse.SerializeToString,
+            ),
+            'KeepSession': grpc.unary_unary_rpc_method_handler(
+                    servicer.KeepSession,
+                    request_deserializer=gausslite_dot_v1_dot_fusion__service__pb2.KeepSessionRequest.FromString,
+                    response_serializer=gausslite_dot_v1_dot_fusion__service__pb2.KeepSessionResponse.SerializeToString,
             ),
             'LeaveSession': grpc.unary_unary_rpc_method_handler(
                     servicer.LeaveSession,
@@ -583,6 +600,33 @@ class FusionService(object):
             '/gausslite.v1.FusionService/GetSessionStatus',
             gausslite_dot_v1_dot_fusion__service__pb2.GetSessionStatusRequest.SerializeToString,
             gausslite_dot_v1_dot_fusion__service__pb2.GetSessionStatusResponse.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def KeepSession(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/gausslite.v1.FusionService/KeepSession',
+            gausslite_dot_v1_dot_fusion__service__pb2.KeepSessionRequest.SerializeToString,
+            gausslite_dot_v1_dot_fusion__service__pb2.KeepSessionResponse.FromString,
             options,
             channel_credentials,
             insecure,

@@ -66,6 +66,8 @@ class FusionServiceStub:
     RenderView: _grpc.UnaryUnaryMultiCallable[_fusion_service_pb2.RenderFusedViewRequest, _fusion_service_pb2.RenderFusedViewResponse]
     """Render a layer of the map from a camera pose. RESOURCE_EXHAUSTED for more pixels than the server renders."""
     GetSessionStatus: _grpc.UnaryUnaryMultiCallable[_fusion_service_pb2.GetSessionStatusRequest, _fusion_service_pb2.GetSessionStatusResponse]
+    KeepSession: _grpc.UnaryUnaryMultiCallable[_fusion_service_pb2.KeepSessionRequest, _fusion_service_pb2.KeepSessionResponse]
+    """Renews the lease of an agent that has nothing to send, and says what the server has of it."""
     LeaveSession: _grpc.UnaryUnaryMultiCallable[_fusion_service_pb2.LeaveSessionRequest, _fusion_service_pb2.LeaveSessionResponse]
     EvictAgent: _grpc.UnaryUnaryMultiCallable[_fusion_service_pb2.EvictAgentRequest, _fusion_service_pb2.EvictAgentResponse]
     """For operators: end an agent's session and delete all data of it; with `ban` its later joins get PERMISSION_DENIED."""
@@ -107,6 +109,8 @@ class FusionServiceAsyncStub(FusionServiceStub):
     RenderView: _aio.UnaryUnaryMultiCallable[_fusion_service_pb2.RenderFusedViewRequest, _fusion_service_pb2.RenderFusedViewResponse]  # type: ignore[assignment]
     """Render a layer of the map from a camera pose. RESOURCE_EXHAUSTED for more pixels than the server renders."""
     GetSessionStatus: _aio.UnaryUnaryMultiCallable[_fusion_service_pb2.GetSessionStatusRequest, _fusion_service_pb2.GetSessionStatusResponse]  # type: ignore[assignment]
+    KeepSession: _aio.UnaryUnaryMultiCallable[_fusion_service_pb2.KeepSessionRequest, _fusion_service_pb2.KeepSessionResponse]  # type: ignore[assignment]
+    """Renews the lease of an agent that has nothing to send, and says what the server has of it."""
     LeaveSession: _aio.UnaryUnaryMultiCallable[_fusion_service_pb2.LeaveSessionRequest, _fusion_service_pb2.LeaveSessionResponse]  # type: ignore[assignment]
     EvictAgent: _aio.UnaryUnaryMultiCallable[_fusion_service_pb2.EvictAgentRequest, _fusion_service_pb2.EvictAgentResponse]  # type: ignore[assignment]
     """For operators: end an agent's session and delete all data of it; with `ban` its later joins get PERMISSION_DENIED."""
@@ -211,6 +215,14 @@ class FusionServiceServicer(metaclass=_abc_1.ABCMeta):
         request: _fusion_service_pb2.GetSessionStatusRequest,
         context: _ServicerContext,
     ) -> _typing.Union[_fusion_service_pb2.GetSessionStatusResponse, _abc.Awaitable[_fusion_service_pb2.GetSessionStatusResponse]]: ...
+
+    @_abc_1.abstractmethod
+    def KeepSession(
+        self,
+        request: _fusion_service_pb2.KeepSessionRequest,
+        context: _ServicerContext,
+    ) -> _typing.Union[_fusion_service_pb2.KeepSessionResponse, _abc.Awaitable[_fusion_service_pb2.KeepSessionResponse]]:
+        """Renews the lease of an agent that has nothing to send, and says what the server has of it."""
 
     @_abc_1.abstractmethod
     def LeaveSession(

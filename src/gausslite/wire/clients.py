@@ -55,6 +55,7 @@ class Session:
     max_subset_bytes: int
     max_gaussians: int
     keyframes: tuple[int, ...] = ()
+    incarnation_id: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -212,7 +213,14 @@ class FusionClient(ServiceChannel):
             response.max_subset_bytes,
             response.max_gaussians,
             tuple(response.keyframes),
+            response.incarnation_id,
         )
+
+    def keep_session(self, session_id: str) -> fusion_service_pb2.KeepSessionResponse:
+        """Renew the lease; returns what identifies the updates that the server has. Raises SessionUnknownError."""
+        request = fusion_service_pb2.KeepSessionRequest(session_id=session_id)
+        response: fusion_service_pb2.KeepSessionResponse = self._call(self._stub.KeepSession, request)
+        return response
 
     def contribute(
         self, requests: Sequence[fusion_service_pb2.ContributeSubsetsRequest], deadline_s: float

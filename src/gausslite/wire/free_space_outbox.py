@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+import logging
 from threading import Lock
 
+from gausslite.domain.errors import GaussLiteError, InvalidInputError, QuotaError
 from gausslite.domain.free_space import FreeSpace
+from gausslite.domain.voxels import VoxelGrid
+from gausslite.wire.clients import FusionClient
+
+_log = logging.getLogger(__name__)
 
 
 class FreeSpaceOutbox:
@@ -24,16 +30,24 @@ class FreeSpaceOutbox:
         """Return whether a block has to be sent."""
         return len(self._pending.keys) > 0
 
-    def take(self) -> FreeSpace:
-        """Return the blocks to send; they no longer wait."""
-        with self._lock:
-            taken, self._pending = self._pending, FreeSpace.empty()
-            return taken
+    def send(self, client: FusionClient, session_id: str, grid: VoxelGrid) -> int:
+        """Send the blocks that wait; returns the bytes. Raises GaussLiteError, and then they wait again.
 
-    def put_back(self, blocks: FreeSpace) -> None:
-        """Let blocks wait again that were not sent, unless newer ones do."""
+        Rejected blocks are dropped, because the map does not depend on them.
+        """
         with self._lock:
-            self._pending = blocks.replace_blocks(self._pending)
+            blocks, self._pending = self._pending, FreeSpace.empty()
+        if not len(blocks.keys):
+            return 0
+        try:
+            return client.contribute_free_space(session_id, blocks, grid)
+        except (InvalidInputError, QuotaError) as error:
+            _log.warning("uplink: free space is dropped: %s", error)
+            return 0
+        except GaussLiteError:
+            with self._lock:
+                self._pending = blocks.replace_blocks(self._pending)
+            raise
 
     def mark_unsent(self) -> None:
         """Let all blocks wait, because the server has lost them."""

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import logging
 from threading import Lock
 
+from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.objects import ObjectReport
+from gausslite.wire.clients import FusionClient
+
+_log = logging.getLogger(__name__)
 
 
 class ObjectOutbox:
@@ -32,10 +37,21 @@ class ObjectOutbox:
         with self._lock:
             return None if self._latest == self._sent else self._latest
 
-    def mark_done(self, report: ObjectReport) -> None:
-        """Note that the server has this report, or has rejected it."""
+    def send(self, client: FusionClient, session_id: str) -> int:
+        """Send the report if the server does not have it; returns the bytes. Raises GaussLiteError.
+
+        A rejected report is dropped, because the map does not depend on it.
+        """
+        report, sent_bytes = self.pending, 0
+        if report is None:
+            return 0
+        try:
+            sent_bytes = client.report_objects(session_id, report)
+        except InvalidInputError as error:
+            _log.warning("uplink: the report of objects is dropped: %s", error)
         with self._lock:
             self._sent = report
+        return sent_bytes
 
     def mark_unsent(self) -> None:
         """Note that the server has lost the report."""

@@ -190,6 +190,26 @@ class Spool:
         with self._transaction():
             return self._keyframes.count_pending()
 
+    def is_stored_by(self, incarnation_id: str, highest_update_seq: int) -> bool:
+        """Return whether a server with this content has every update that was acknowledged to this spool."""
+        with self._transaction():
+            acknowledged = int(self._property("acknowledged_seq") or 0)
+            return self._property("incarnation_id") == incarnation_id and highest_update_seq >= acknowledged
+
+    def begin_sending_to(self, incarnation_id: str) -> None:
+        """Mark every voxel as pending and never sent; the updates acknowledged from now on are stored there."""
+        self.mark_all_unsent()
+        with self._transaction():
+            properties = [("incarnation_id", incarnation_id), ("acknowledged_seq", 0)]
+            self._database.executemany("INSERT OR REPLACE INTO properties VALUES (?, ?)", properties)
+
+    def record_acknowledged(self, update_seq: int) -> None:
+        """Record that the server has stored the updates with this sequence number."""
+        with self._transaction():
+            self._database.execute(
+                "UPDATE properties SET value = max(value, ?) WHERE name = 'acknowledged_seq'", (update_seq,)
+            )
+
     def mark_done(self, sent: SpoolBatch) -> None:
         """Mark these updates as not pending, because the server has accepted or permanently rejected them."""
         triples = zip(

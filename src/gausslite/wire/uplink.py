@@ -39,7 +39,7 @@ from gausslite.wire.retry_delay import RetryDelay
 from gausslite.wire.spool import Purpose, Spool, SpoolBatch
 from gausslite.wire.spooled_keyframes import SpooledKeyframe
 from gausslite.wire.token_bucket import TokenBucket
-from gausslite.wire.uplink_values import UplinkCounters, UplinkSettings
+from gausslite.wire.uplink_values import SentPart, UplinkCounters, UplinkSettings
 
 _log = logging.getLogger(__name__)
 _MIN_SUBSET_BYTES = 1 << 16
@@ -74,6 +74,7 @@ class Uplink:
         self._retry_delay = RetryDelay(self._settings.first_backoff_s)
         self._last_error = ""
         self._next_round_s = 0.0
+        self._next_check_s = math.inf
         self._draining = self._closing = False
         self._drain_limit_s = math.inf
         self._sent_keyframes: set[int] = set()
@@ -193,21 +194,24 @@ class Uplink:
             while not self._closing and not self._counters.stopped_because:
                 now_s = time.monotonic()
                 wait_s = max(self._next_round_s - now_s, self._token_bucket.seconds_until_positive(now_s))
-                if wait_s <= 0 and self._has_pending():
+                check_in_s = self._next_check_s - now_s
+                if wait_s <= 0 and (self._has_pending() or check_in_s <= 0):
                     return True
-                self._changed.wait(wait_s if wait_s > 0 else None)
+                self._changed.wait(min(wait_s if wait_s > 0 else check_in_s, threading.TIMEOUT_MAX))
         return False
 
     def _send_round(self) -> bool:
         """Join if needed, send what is due and mark what is acknowledged. False if nothing was due."""
+        if time.monotonic() >= self._next_check_s:
+            self._check_server()
         resend_threshold = 0.0 if self._draining else self._settings.resend_threshold
         max_bytes = self._token_bucket.available_bytes(self._settings.round_bytes)
         due = self._spool.next_round(max_bytes, resend_threshold)
         if due is None and self._objects.pending is None and not self._free_space.has_pending:
             return False
         session = self._join_if_needed()
-        self._send_objects(session)
-        self._send_free_space(session)
+        self._token_bucket.spend(self._objects.send(self._client, session.session_id))
+        self._token_bucket.spend(self._free_space.send(self._client, session.session_id, self._grid))
         if due is None:
             return True
         if due.voxels is not None:
@@ -216,34 +220,28 @@ class Uplink:
             self._send_keyframes(due.keyframes, session)
         return True
 
-    def _send_objects(self, session: Session) -> None:
-        """Send the agent's report if it has changed. A rejected one is dropped: the map does not depend on it."""
-        report = self._objects.pending
-        if report is None:
+    def _check_server(self) -> None:
+        """Ask the server whether it has every acknowledged update; if not, join again and send everything."""
+        if self._session is None:
+            self._next_check_s = math.inf
             return
-        try:
-            self._token_bucket.spend(self._client.report_objects(session.session_id, report))
-        except InvalidInputError as error:
-            _log.warning("uplink: the report of objects is dropped: %s", error)
-        self._objects.mark_done(report)
+        kept = self._client.keep_session(self._session.session_id)
+        self._next_check_s = time.monotonic() + self._settings.check_interval_s
+        if not self._spool.is_stored_by(kept.incarnation_id, kept.highest_update_seq):
+            _log.warning("uplink: %s has lost updates; everything is sent again", self._client)
+            self._forget_session()
 
-    def _send_free_space(self, session: Session) -> None:
-        """Send the blocks that wait. Rejected ones are dropped: the map does not depend on them."""
-        if not self._free_space.has_pending:
-            return
-        blocks = self._free_space.take()
-        try:
-            self._token_bucket.spend(self._client.contribute_free_space(session.session_id, blocks, self._grid))
-        except (InvalidInputError, QuotaError) as error:
-            _log.warning("uplink: free space is dropped: %s", error)
-        except GaussLiteError:
-            self._free_space.put_back(blocks)
-            raise
+    def _forget_session(self) -> None:
+        """Mark everything as unsent, so that the next round joins again and sends it."""
+        self._session = None
+        self._spool.mark_all_unsent()
+        self._objects.mark_unsent()
+        self._free_space.mark_unsent()
 
     def _send_voxels(self, due: SpoolBatch, session: Session) -> None:
-        sent: dict[int, tuple[SpoolBatch, int]] = {}
+        sent: dict[int, SentPart] = {}
         requests = list(self._requests(due, session, sent))
-        self._token_bucket.spend(sum(size for _, size in sent.values()))
+        self._token_bucket.spend(sum(each.size_bytes for each in sent.values()))
         error = self._exchange(requests, sent)
         if error is not None:
             raise error
@@ -267,7 +265,7 @@ class Uplink:
             self._counters = replace(self._counters, keyframe_bytes=self._counters.keyframe_bytes + byte_count)
 
     def _exchange(
-        self, requests: list[pb.ContributeSubsetsRequest], sent: dict[int, tuple[SpoolBatch, int]]
+        self, requests: list[pb.ContributeSubsetsRequest], sent: dict[int, SentPart]
     ) -> GaussLiteError | None:
         """Send on one stream and handle the outcomes; returns the last error that needs a retry."""
         error_to_retry: GaussLiteError | None = None
@@ -275,11 +273,11 @@ class Uplink:
             for response in self._client.contribute(requests, self._settings.deadline_s):
                 for outcome in response.outcomes:
                     if outcome.sequence in sent:
-                        error_to_retry = self._handle_outcome(outcome, *sent.pop(outcome.sequence)) or error_to_retry
+                        error_to_retry = self._handle_outcome(outcome, sent.pop(outcome.sequence)) or error_to_retry
         except InvalidInputError as error:
             # the server refuses these messages permanently
-            for part, _ in sent.values():
-                self._drop(part, str(error))
+            for each in sent.values():
+                self._drop(each.batch, str(error))
             sent.clear()
         return error_to_retry
 
@@ -292,18 +290,18 @@ class Uplink:
             self._session = self._client.join(
                 self._agent_id, self._grid, frame, fresh, task, self._settings.T_fused_agent
             )
-            if self._session.highest_update_seq == 0:
-                # the server has no updates of this agent
-                self._spool.mark_all_unsent()
+            if not self._spool.is_stored_by(self._session.incarnation_id, self._session.highest_update_seq):
+                self._spool.begin_sending_to(self._session.incarnation_id)
             self._spool.mark_keyframes_missing(self._session.keyframes)
             self._message_seq = 0
+            self._next_check_s = time.monotonic() + self._settings.check_interval_s
             self._subset_bytes = min(self._subset_bytes, self._session.max_subset_bytes or MAX_SUBSET_BYTES)
             with self._changed:
                 self._counters = replace(self._counters, connected=True, joins=self._counters.joins + 1)
         return self._session
 
     def _requests(
-        self, due: SpoolBatch, session: Session, sent: dict[int, tuple[SpoolBatch, int]]
+        self, due: SpoolBatch, session: Session, sent: dict[int, SentPart]
     ) -> Iterator[pb.ContributeSubsetsRequest]:
         start = 0
         for part in split_batch(due.batch, self._subset_bytes):
@@ -319,7 +317,7 @@ class Uplink:
             except InvalidInputError as error:
                 self._drop(spooled, str(error))
                 continue
-            sent[self._message_seq] = spooled, len(data)
+            sent[self._message_seq] = SentPart(spooled, len(data), update_seq)
             yield pb.ContributeSubsetsRequest(
                 session_id=session.session_id,
                 sequence=self._message_seq,
@@ -327,11 +325,14 @@ class Uplink:
                 subset=data,
             )
 
-    def _handle_outcome(self, outcome: pb.SubsetOutcome, part: SpoolBatch, size: int) -> GaussLiteError | None:
+    def _handle_outcome(self, outcome: pb.SubsetOutcome, sent: SentPart) -> GaussLiteError | None:
         """Mark one subset as acknowledged or dropped; returns the error if it must be sent again."""
+        part = sent.batch
         keys = set(part.batch.keys.tolist())
         rejected = outcome.status == pb.SUBSET_STATUS_REJECTED
-        self._count(part, size, keys, rejected)
+        if outcome.status == pb.SUBSET_STATUS_ACCEPTED:
+            self._spool.record_acknowledged(sent.update_seq)
+        self._count(part, sent.size_bytes, keys, rejected)
         if rejected and outcome.reason in ("QUOTA", "STORAGE"):
             return QuotaError(outcome.message)
         if rejected and outcome.reason == "CHECKSUM" and not keys & self._resent_damaged:
@@ -370,12 +371,10 @@ class Uplink:
             # logged once and not at every retry, because a robot may be offline for hours
             _log.warning("uplink: %s; retrying", error)
             self._last_error = str(error)
-        if isinstance(error, (NameInUseError, SessionUnknownError)):
+        if isinstance(error, NameInUseError):
             self._session = None
         if isinstance(error, SessionUnknownError):
-            self._spool.mark_all_unsent()
-            self._objects.mark_unsent()
-            self._free_space.mark_unsent()
+            self._forget_session()
         if isinstance(error, (QuotaError, StorageError)):
             self._subset_bytes = max(_MIN_SUBSET_BYTES, self._subset_bytes // 2)
         with self._changed:

@@ -8,6 +8,7 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from gausslite.domain.errors import InvalidInputError
+from gausslite.wire.spool import SpoolBatch
 
 
 @dataclass(frozen=True, slots=True)
@@ -17,8 +18,9 @@ class UplinkSettings:
     kbps: bandwidth limit in kilobits per second, None without a limit. interval_s: minimum time between rounds, so that
     several changes of a voxel are sent as one. resend_threshold: change of a voxel's Σkappa, as a share of the sent
     value, from which it is sent again; 0 while the uplink drains. round_bytes: size limit of a round. deadline_s: of
-    each call. first_backoff_s: wait before the first retry. T_fused_agent: declared pose of the agent's frame in the
-    fused map's; None: not declared.
+    each call. first_backoff_s: wait before the first retry. check_interval_s: how often an idle uplink asks the server
+    whether it still has everything. T_fused_agent: declared pose of the agent's frame in the fused map's; None: not
+    declared.
     """
 
     kbps: float | None = None
@@ -27,6 +29,7 @@ class UplinkSettings:
     round_bytes: int = 4 << 20
     deadline_s: float = 30.0
     first_backoff_s: float = 0.2
+    check_interval_s: float = 10.0
     world_frame: str = ""
     T_fused_agent: Float64[ndarray, "4 4"] | None = field(default=None, compare=False)
 
@@ -66,3 +69,12 @@ class UplinkCounters:
     def bytes_sent(self) -> int:
         """All subset bytes, resends included."""
         return self.roi_bytes + self.handover_bytes
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SentPart:
+    """A message that waits for its outcome."""
+
+    batch: SpoolBatch
+    size_bytes: int
+    update_seq: int

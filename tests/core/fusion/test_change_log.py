@@ -7,16 +7,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from sample_gaussians import plain_gaussians
+from test_fusion_properties import assert_same_batch
 
 from gausslite.domain.errors import RevisionGoneError
 from gausslite.domain.voxel_batch import RoiSubset, VoxelBatch
+from gausslite.domain.voxel_operations import empty_batch, merge_batches, select_voxels
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.fusion.change_log import ChangeLog
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.limits import FusionSettings
 from gausslite.fusion.memory_store import MemoryStore
 from gausslite.fusion.mission_config import MissionConfig
-from gausslite.fusion.vote import rank_voxels
+from gausslite.fusion.vote import FusedMap, fuse, rank_voxels
 
 GRID = VoxelGrid(0.10)
 STEPS = st.lists(
@@ -39,11 +41,12 @@ def make_batch(counts: dict[int, int]) -> VoxelBatch:
 @settings(max_examples=60, deadline=None)
 @given(STEPS)
 def test_a_watcher_that_applies_the_changes_has_the_fused_map(steps) -> None:
-    engine = FusionEngine(MemoryStore(), FusionSettings(grid=GRID), first_revision=1)
+    store = MemoryStore()
+    engine = FusionEngine(store, FusionSettings(grid=GRID), first_revision=1)
     sessions = {
         name: engine.join(name, MissionConfig("", "", 0.10)).session.session_id for name in ("ant", "bee", "cat")
     }
-    known, latest_votes = 0, {}
+    known, watched, winners = 0, empty_batch(), {}
     for revision, (agent_id, counts, looks) in enumerate(steps, start=1):
         if counts is None:
             engine.leave(sessions[agent_id], forget=True)
@@ -52,17 +55,24 @@ def test_a_watcher_that_applies_the_changes_has_the_fused_map(steps) -> None:
             engine.contribute(sessions[agent_id], RoiSubset(agent_id, "", revision, revision, make_batch(counts)), GRID)
         if looks:
             changes = engine.maps.changes(known)
-            latest_votes.update(zip(changes.fused.batch.keys.tolist(), changes.fused.vote.votes(), strict=True))
+            changed = np.union1d(changes.won.batch.keys, changes.removed)
+            kept = select_voxels(watched, ~np.isin(watched.keys, changed))
+            watched = merge_batches(kept, changes.won.batch)
             for key in changes.removed.tolist():
-                latest_votes.pop(key, None)
+                winners.pop(key, None)
+            winners.update({key: name for name, keys in changes.won.keys_by_winner.items() for key in keys})
             known = changes.revision
-            votes = engine.maps.changes(0).fused.vote.votes()
-            assert {key: vote.winner for key, vote in latest_votes.items()} == {vote.key: vote.winner for vote in votes}
-            assert all(latest_votes[key].scores[0] == vote.scores[0] for key, vote in _by_key(engine).items())
+            fused = fuse(store.batches())
+            assert_same_batch(watched, fused.batch)
+            assert winners == {vote.key: vote.winner for vote in fused.vote.votes()}
+            assert_status_is_counted_from_the_map(engine, fused)
 
 
-def _by_key(engine: FusionEngine) -> dict:
-    return {vote.key: vote for vote in engine.maps.changes(0).fused.vote.votes()}
+def assert_status_is_counted_from_the_map(engine: FusionEngine, fused: FusedMap) -> None:
+    status = engine.status()
+    assert (status.fused_voxels, status.fused_gaussians) == (len(fused.batch), len(fused.gaussians))
+    for agent in status.agents:
+        assert agent.won_voxels == int(fused.won_by(agent.agent_id).sum())
 
 
 def record(change_log: ChangeLog, store: MemoryStore, subset: RoiSubset) -> list[int]:

@@ -111,7 +111,7 @@ def test_five_centimetres_and_two_degrees_are_corrected_also_after_a_restart(tmp
     assert corrected < 0.005
     assert engine.revision > revision
     # a watcher that follows the changes has the map of a new watcher
-    assert len(engine.maps.changes(revision).fused.batch) > 0
+    assert len(engine.maps.changes(revision).won.batch) > 0
     store.close()
     store = SqliteStore(tmp_path / "store.sqlite")
     assert surface_error_m(FusionEngine(store, SETTINGS).maps.voted_map("bee").gaussians.means_m) == corrected

@@ -61,7 +61,7 @@ def test_a_mission_without_updates_has_an_empty_map() -> None:
     engine = FusionEngine(MemoryStore(), FusionSettings(grid=GRID))
     assert len(engine.maps.voted_map()) == len(engine.maps.union_map()) == 0
     assert engine.status().agents == ()
-    assert len(engine.maps.changes().fused.gaussians) == 0
+    assert len(engine.maps.changes().won.batch) == 0
     engine.close()
 
 

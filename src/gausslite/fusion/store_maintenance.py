@@ -1,0 +1,164 @@
+"""Back up, restore, verify, repair and compact the SQLite file of a fusion server."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sqlite3
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from gausslite.domain.errors import StorageError
+from gausslite.fusion.sqlite_file import (
+    RESTORE_ADVICE,
+    StoreLock,
+    data_checksum,
+    open_existing,
+    renew_incarnation,
+    storage_errors,
+)
+from gausslite.fusion.sqlite_store import SELECT_UPDATES, is_intact
+
+
+@dataclass(frozen=True, slots=True)
+class StoreReport:
+    """What a verification has found; damaged_rows: those whose checksum does not match, in all tables."""
+
+    agents: int
+    voxels: int
+    gaussians: int
+    keyframes: int
+    damaged_rows: int
+
+
+def verify(path: Path, repair: bool = False) -> StoreReport:
+    """Check every row, also while a server uses the store. Raises StorageError if the file is damaged as a whole.
+
+    repair: delete the damaged rows, without a server; then the agents send everything again.
+    """
+    with contextlib.ExitStack() as held:
+        if repair:
+            held.enter_context(_locked(path))
+        db = held.enter_context(contextlib.closing(open_existing(path)))
+        with storage_errors(path):
+            report, damaged = _check(db, path)
+            if repair and damaged:
+                db.execute("BEGIN IMMEDIATE")
+                for table, rowid in damaged:
+                    db.execute(f"DELETE FROM {table} WHERE rowid = ?", (rowid,))  # noqa: S608 - constant names
+                renew_incarnation(db)
+                db.execute("COMMIT")
+    return report
+
+
+def back_up(store: Path, target: Path) -> StoreReport:
+    """Copy a store to a new file, also while a server uses it, and verify the copy. Raises StorageError."""
+    if target.exists():
+        raise StorageError(f"backup {target}: the file exists; choose another name")
+    with contextlib.closing(open_existing(store)) as source:
+        _copy(source, store, target)
+    return _require_intact(target)
+
+
+def restore(backup: Path, store: Path) -> tuple[StoreReport, Path | None]:
+    """Put a verified copy of the backup in the store's place, without a server; agents then send everything again.
+
+    Returns the report and the new name of the file that was there before. Raises StorageError.
+    """
+    with _locked(store):
+        report = _require_intact(backup)
+        copy = store.with_name(store.name + ".restoring")
+        copy.unlink(missing_ok=True)
+        with contextlib.closing(open_existing(backup)) as source:
+            _copy(source, backup, copy)
+        with contextlib.closing(open_existing(copy)) as db, storage_errors(copy):
+            renew_incarnation(db)
+        replaced = _move_away(store)
+        copy.replace(store)
+        _synchronise_folder(store.parent)
+    return report, replaced
+
+
+def compact(path: Path) -> tuple[int, int]:
+    """Rewrite the file without unused pages, without a server; returns the bytes before and after."""
+    with _locked(path), contextlib.closing(open_existing(path)) as db, storage_errors(path):
+        before = path.stat().st_size
+        _check(db, path)
+        db.execute("VACUUM")
+        db.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+        return before, path.stat().st_size
+
+
+@contextlib.contextmanager
+def _locked(path: Path) -> Iterator[None]:
+    lock = StoreLock(path)
+    try:
+        yield
+    finally:
+        lock.release()
+
+
+def _check(db: sqlite3.Connection, path: Path) -> tuple[StoreReport, list[tuple[str, int]]]:
+    """Return the report and the (table, rowid) of each damaged row."""
+    found = db.execute("PRAGMA quick_check(1)").fetchone()[0]
+    if found != "ok":
+        raise StorageError(f"store {path}: expected an undamaged file, got {found!r}; restore a backup")
+    agents, voxels, gaussians, damaged = set(), 0, 0, list(_damaged_data(db))
+    for rowid, *row in db.execute(SELECT_UPDATES.replace("SELECT", "SELECT rowid,", 1)):
+        if is_intact(tuple(row)):
+            agents.add(row[0])
+            voxels += 1
+            gaussians += row[4]
+        else:
+            damaged.append(("voxel_updates", rowid))
+    keyframes = db.execute("SELECT count(*) FROM keyframes").fetchone()[0]
+    return StoreReport(len(agents), voxels, gaussians, keyframes, len(damaged)), damaged
+
+
+def _damaged_data(db: sqlite3.Connection) -> Iterator[tuple[str, int]]:
+    for table, name in (("keyframes", "frame_index"), ("records", "name")):
+        query = f"SELECT rowid, agent_id, {name}, data, checksum FROM {table}"  # noqa: S608 - constant names
+        for rowid, agent_id, key, data, checksum in db.execute(query):
+            if data_checksum(agent_id, key, data) != checksum:
+                yield table, rowid
+
+
+def _require_intact(path: Path) -> StoreReport:
+    report = verify(path)
+    if report.damaged_rows:
+        raise StorageError(
+            f"store {path}: expected intact rows, got {report.damaged_rows} damaged ones; {RESTORE_ADVICE}"
+        )
+    return report
+
+
+def _copy(source: sqlite3.Connection, path: Path, target: Path) -> None:
+    with storage_errors(path):
+        copy = sqlite3.connect(target, isolation_level=None)
+        with contextlib.closing(copy):
+            source.backup(copy)
+            # one file, without a log beside it
+            copy.execute("PRAGMA journal_mode = DELETE")
+
+
+def _move_away(store: Path) -> Path | None:
+    """Rename the store and its log, so that nothing is deleted; returns the new name."""
+    if not store.exists():
+        return None
+    number = 1
+    while (kept := store.with_name(f"{store.name}.replaced-{number}")).exists():
+        number += 1
+    for suffix in ("", "-wal", "-shm"):
+        part = store.with_name(store.name + suffix)
+        if part.exists():
+            part.rename(kept.with_name(kept.name + suffix))
+    return kept
+
+
+def _synchronise_folder(folder: Path) -> None:
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)

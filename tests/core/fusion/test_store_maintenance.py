@@ -1,0 +1,131 @@
+"""A damaged store is repaired, refused or restored, and never served silently."""
+
+from __future__ import annotations
+
+import sqlite3
+from pathlib import Path
+
+import pytest
+from test_fusion_stores import make_subset
+
+from gausslite.domain.errors import StorageError
+from gausslite.fusion.sqlite_store import SqliteStore
+from gausslite.fusion.store_maintenance import back_up, compact, restore, verify
+
+VOXELS = range(1, 41)
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    """A closed store with 40 voxels, a keyframe and a record."""
+    path = tmp_path / "store.sqlite"
+    store = SqliteStore(path)
+    store.put(make_subset("ant", 7, dict.fromkeys(VOXELS, 3)))
+    store.save_keyframe("ant", 1, b"image")
+    store.save_record("ant", "objects", b"mug")
+    store.close()
+    return path
+
+
+def flip_a_bit(path: Path, table: str, column: str, where: str = "1") -> None:
+    """Change one stored value and not its checksum, as bit rot does."""
+    with sqlite3.connect(path) as db:
+        rowid, data = db.execute(f"SELECT rowid, {column} FROM {table} WHERE {where}").fetchone()
+        damaged = data ^ 4 if isinstance(data, int) else bytes([data[0] ^ 4]) + data[1:]
+        db.execute(f"UPDATE {table} SET {column} = ? WHERE rowid = ?", (damaged, rowid))
+    db.close()
+
+
+@pytest.mark.parametrize("column", ["update_seq", "kappa_sum", "count", "records", "voxel"])
+def test_a_damaged_row_is_refused_with_the_way_out_and_repair_removes_only_it(path: Path, column: str) -> None:
+    before = SqliteStore(path)
+    incarnation_id = before.incarnation_id
+    before.close()
+    flip_a_bit(path, "voxel_updates", column, "voxel = 40")
+    with pytest.raises(StorageError, match=r"is damaged.*restore a backup.*--repair"):
+        SqliteStore(path)
+    assert verify(path).damaged_rows == 1
+    assert verify(path, repair=True).damaged_rows == 1
+    assert verify(path).damaged_rows == 0
+    store = SqliteStore(path)
+    assert store.batch("ant").keys.tolist() == list(VOXELS)[:-1]
+    assert store.incarnation_id != incarnation_id
+    store.close()
+
+
+@pytest.mark.parametrize(("table", "read"), [("keyframes", "keyframe"), ("records", "records")])
+def test_a_damaged_keyframe_or_record_is_not_served(path: Path, table: str, read: str) -> None:
+    flip_a_bit(path, table, "data")
+    store = SqliteStore(path)
+    with pytest.raises(StorageError, match="is damaged"):
+        store.keyframe("ant", 1) if read == "keyframe" else store.records("objects")
+    store.close()
+    assert verify(path, repair=True).damaged_rows == 1
+    assert verify(path).damaged_rows == 0
+
+
+def test_an_emptied_file_is_refused(path: Path) -> None:
+    path.write_bytes(b"")
+    with pytest.raises(StorageError, match="got an empty file; restore a backup"):
+        SqliteStore(path)
+
+
+def test_a_torn_log_is_cut_at_the_last_whole_message(tmp_path: Path) -> None:
+    path = tmp_path / "store.sqlite"
+    store = SqliteStore(path)
+    for update_seq in range(1, 6):
+        store.put(make_subset("ant", update_seq, {update_seq: 30}))
+    files = {each.name: each.read_bytes() for each in tmp_path.iterdir()}
+    store.close()
+    for cut in (1, 3000, 9000):
+        folder = tmp_path / str(cut)
+        folder.mkdir()
+        for name, data in files.items():
+            (folder / name).write_bytes(data[:-cut] if name.endswith("-wal") else data)
+        (folder / "store.sqlite-shm").unlink()
+        torn = SqliteStore(folder / "store.sqlite")
+        highest = torn.totals("ant").highest_update_seq
+        # the agents compare this number with what was acknowledged, and send again what is missing
+        assert highest < 5
+        assert torn.batch("ant").keys.tolist() == list(range(1, highest + 1))
+        torn.close()
+
+
+def test_a_backup_of_a_running_store_is_restored_as_another_incarnation(tmp_path: Path) -> None:
+    path, backup = tmp_path / "store.sqlite", tmp_path / "backup.sqlite"
+    store = SqliteStore(path)
+    store.put(make_subset("ant", 1, {11: 2}))
+    assert back_up(path, backup).voxels == 1
+    with pytest.raises(StorageError, match="the file exists"):
+        back_up(path, backup)
+    store.put(make_subset("ant", 2, {22: 2}))
+    with pytest.raises(StorageError, match="in use by another server"):
+        restore(backup, path)
+    incarnation_id = store.incarnation_id
+    store.close()
+    report, replaced = restore(backup, path)
+    assert report.gaussians == 2
+    assert verify(replaced).voxels == 2
+    restored = SqliteStore(path)
+    assert restored.batch("ant").keys.tolist() == [11]
+    assert restored.incarnation_id != incarnation_id
+    restored.close()
+
+
+def test_a_damaged_backup_replaces_nothing(path: Path, tmp_path: Path) -> None:
+    backup = tmp_path / "backup.sqlite"
+    back_up(path, backup)
+    flip_a_bit(backup, "voxel_updates", "records")
+    with pytest.raises(StorageError, match="1 damaged"):
+        restore(backup, path)
+    assert verify(path).voxels == len(VOXELS)
+
+
+def test_compact_gives_back_the_space_of_removed_agents(path: Path) -> None:
+    store = SqliteStore(path)
+    store.put(make_subset("bee", 1, dict.fromkeys(range(500), 20)))
+    store.remove_agent("bee")
+    store.close()
+    before, after = compact(path)
+    assert after < before
+    assert verify(path).voxels == len(VOXELS)

@@ -1,0 +1,58 @@
+"""An idle uplink notices that the server has lost updates, and sends them again."""
+
+from __future__ import annotations
+
+import sqlite3
+import threading
+from pathlib import Path
+
+from fusion_running import GRID, fusion_server, make_batch
+
+from gausslite.fusion.memory_store import MemoryStore
+from gausslite.fusion.sqlite_store import SqliteStore
+from gausslite.fusion.store import FusionStore
+from gausslite.wire.clients import FusionClient
+from gausslite.wire.spool import Purpose, Spool
+from gausslite.wire.uplink import Uplink
+from gausslite.wire.uplink_values import UplinkSettings
+
+QUICK = UplinkSettings(interval_s=0.02, first_backoff_s=0.05, check_interval_s=0.1)
+
+
+def wait_until(condition) -> None:
+    """Wait for a change that another thread makes; the test's own timeout limits it."""
+    pause = threading.Event()
+    while not condition():
+        pause.wait(0.02)
+
+
+def send_then_replace(first: FusionStore, second: FusionStore, tmp_path: Path) -> None:
+    """Send everything to a server on the first store, then serve the second one at the same address."""
+    address = f"unix:{tmp_path}/fusion.sock"
+    spool = Spool(tmp_path / "spool.sqlite", "ant", GRID)
+    with fusion_server(first, address=address):
+        uplink = Uplink(FusionClient(address, deadline_s=5.0), "ant", spool, GRID, QUICK)
+        uplink.enqueue(make_batch({0: [5], 1: [1, 2]}), Purpose.ROI)
+        assert uplink.drain(20.0)
+        assert uplink.counters().voxels_waiting == 0
+    with fusion_server(second, address=address):
+        wait_until(lambda: second.totals("ant").voxels == 2)
+        assert uplink.drain(20.0)
+        uplink.close()
+    assert second.totals("ant").gaussians == 3
+
+
+def test_after_a_restart_with_an_empty_store(tmp_path: Path) -> None:
+    send_then_replace(MemoryStore(), MemoryStore(), tmp_path)
+
+
+def test_after_a_restart_with_a_store_that_has_lost_its_newest_updates(tmp_path: Path) -> None:
+    first, path = SqliteStore(tmp_path / "first.sqlite"), tmp_path / "second.sqlite"
+    with sqlite3.connect(tmp_path / "first.sqlite") as source, sqlite3.connect(path) as copy:
+        source.backup(copy)
+    # the same incarnation, as after the loss of the log
+    second = SqliteStore(path)
+    assert second.incarnation_id == first.incarnation_id
+    send_then_replace(first, second, tmp_path)
+    first.close()
+    second.close()
