@@ -11,9 +11,11 @@ fusion=127.0.0.1:$GAUSSLITE_FUSION_PORT
 out=$(mktemp -d)
 say() { echo "smoke test: $*"; }
 fail() { say "FAILED: $*"; docker compose logs --no-color --tail 50; exit 1; }
+trap 'say "FAILED in line $LINENO"' ERR
 trap 'docker compose down --volumes --timeout 5 >/dev/null 2>&1; rm -rf "$out"' EXIT
 
-container() { docker compose ps --all --quiet "$1" | head -1; }
+# sed reads to the end: head would end the listing with SIGPIPE, which pipefail reports
+container() { docker compose ps --all --quiet "$1" | sed -n 1p; }
 agent_status() { # SERVICE INDEX: the state in the first line of `gausslite status`
   gausslite status "$(docker compose port --index "$1" agent 50053)" | sed -n '1s/.*: //p'
 }
