@@ -43,21 +43,21 @@ def uplink(
 
 
 def stored_kappas(store: MemoryStore) -> dict[int, list[int]]:
-    """Return the kappas that the server stores of the robot, by voxel."""
+    """Return the kappas that the server stores of the robot, by voxel, ascending: the codec reorders them."""
     table = store.batch("robot")
     return {
-        key: table.gaussians.kappa[start:end].tolist()
+        key: sorted(table.gaussians.kappa[start:end].tolist())
         for key, start, end in zip(table.keys.tolist(), table.offsets[:-1], table.offsets[1:], strict=True)
     }
 
 
 def expected_kappas(*updates: dict[int, list[int]]) -> dict[int, list[int]]:
-    """Return the kappas that remain after these updates, by voxel."""
+    """Return the kappas that remain after these updates, by voxel, ascending."""
     last: dict[int, list[int]] = {}
     for update in updates:
         table = make_batch(update)
         for key, start, end in zip(table.keys.tolist(), table.offsets[:-1], table.offsets[1:], strict=True):
-            last[key] = table.gaussians.kappa[start:end].tolist()
+            last[key] = sorted(table.gaussians.kappa[start:end].tolist())
     return last
 
 

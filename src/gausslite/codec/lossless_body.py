@@ -1,0 +1,62 @@
+"""The body of a lossless message: every value as float32, every Gaussian in its place; 40 to 45 bytes a Gaussian."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gausslite.codec.body_layout import (
+    MAX_LABEL_BYTES,
+    VOXEL_BYTES,
+    BodyLayout,
+    decode_kappa_sums,
+    decode_labels,
+    decode_voxels,
+    encode_labels,
+    encode_voxels,
+    require_encodable,
+)
+from gausslite.codec.column_frame import Column, compress_columns, decompress_columns
+from gausslite.domain.errors import CodecError, InvalidInputError
+from gausslite.domain.gaussians import Gaussians
+from gausslite.domain.voxel_batch import VoxelBatch
+from gausslite.domain.voxels import VoxelGrid
+
+__all__ = ["MAX_GAUSSIAN_BYTES", "VOXEL_BYTES", "decode", "encode"]
+
+_WIDTHS = {"means_m": 3, "quats_wxyz": 4, "scales_m": 3, "opacities": 1, "rgb": 3}
+MAX_GAUSSIAN_BYTES = 4 * sum(_WIDTHS.values()) + MAX_LABEL_BYTES
+"""Upper limit before compression."""
+
+
+def encode(batch: VoxelBatch, grid: VoxelGrid, layout: BodyLayout) -> bytes:
+    """Return the body. Raises InvalidInputError if a mean lies outside its voxel."""
+    if not _are_inside(batch, grid):
+        raise InvalidInputError("voxel batch means_m: expected every mean inside its voxel, got one outside")
+    values = [getattr(batch.gaussians, name) for name in _WIDTHS]
+    return compress_columns(
+        [*encode_voxels(batch), *values, *encode_labels(batch.gaussians, layout)], _columns(layout)
+    )
+
+
+def decode(body: bytes, grid: VoxelGrid, layout: BodyLayout) -> VoxelBatch:
+    """Return the voxels of a body. Raises CodecError, InvalidInputError."""
+    raw = decompress_columns(body, _columns(layout))
+    keys, offsets = decode_voxels(raw[:3], layout)
+    active, kappa, target = decode_labels(raw[-3:])
+    means_m, quats_wxyz, scales_m, opacities, rgb = (each.astype(np.float32) for each in raw[3:-3])
+    gaussians = Gaussians(means_m, quats_wxyz, scales_m, opacities, rgb, active, kappa, target)
+    require_encodable(gaussians)
+    batch = VoxelBatch(keys, decode_kappa_sums(raw[:3], gaussians, offsets), raw[2].astype(np.uint32), gaussians)
+    if not _are_inside(batch, grid):
+        raise CodecError("subset means_m: expected every mean inside its voxel, got one outside")
+    return batch
+
+
+def _columns(layout: BodyLayout) -> list[Column]:
+    n = layout.gaussians
+    values = [Column("<f4", (n,) if width == 1 else (n, width)) for width in _WIDTHS.values()]
+    return [*layout.voxel_columns(), *values, *layout.label_columns()]
+
+
+def _are_inside(batch: VoxelBatch, grid: VoxelGrid) -> bool:
+    return np.array_equal(grid.keys(batch.gaussians.means_m), np.repeat(batch.keys, batch.counts))

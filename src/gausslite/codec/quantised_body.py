@@ -1,0 +1,121 @@
+"""The body of a quantised message: about 8 bytes a Gaussian.
+
+One zstd frame with the columns of `_columns`, its size (u32) before it, then the bit fields of `positions.py`. The
+Gaussians of a voxel are sorted by position and, in one coarse cell, by kappa; neighbours are then alike, so that the
+first scale, the colours and kappa are stored as differences to the Gaussian before. The other two scales are stored as
+differences to the first. All differences wrap at the range of their type.
+"""
+
+from __future__ import annotations
+
+import struct
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gausslite.codec import columns, positions
+from gausslite.codec.body_layout import (
+    MAX_LABEL_BYTES,
+    VOXEL_BYTES,
+    BodyLayout,
+    decode_differences,
+    decode_kappa_sums,
+    decode_labels,
+    decode_voxels,
+    encode_differences,
+    encode_labels,
+    encode_voxels,
+)
+from gausslite.codec.column_frame import Column, compress_columns, decompress_columns
+from gausslite.domain.errors import CodecError
+from gausslite.domain.gaussians import Gaussians
+from gausslite.domain.voxel_batch import VoxelBatch
+from gausslite.domain.voxels import VoxelGrid
+
+__all__ = ["MAX_GAUSSIAN_BYTES", "VOXEL_BYTES", "decode", "encode"]
+
+_SYMBOL_BYTES = 1 + 3 + 1 + 3 + 1 + 3
+_MAX_BIT_FIELD_BYTES = (3 * positions.MAX_FINE_BITS + 7) // 8
+MAX_GAUSSIAN_BYTES = _SYMBOL_BYTES + _MAX_BIT_FIELD_BYTES + MAX_LABEL_BYTES
+"""Upper limit before compression."""
+_FRAME_SIZE = struct.Struct("<I")
+
+
+def encode(batch: VoxelBatch, grid: VoxelGrid, layout: BodyLayout) -> bytes:
+    """Return the body. Raises InvalidInputError if a mean lies outside its voxel."""
+    coarse_bits = layout.precision.coarse_bits
+    scales = columns.encode_scales(batch.gaussians.scales_m)
+    bits = layout.precision.bits(scales)
+    voxel = np.repeat(grid.indices(batch.keys), batch.counts, axis=0)
+    cells = positions.cells_of(batch.gaussians.means_m, voxel, bits, grid)
+    codes = positions.morton_codes(cells, bits, coarse_bits)
+    order = np.lexsort((batch.gaussians.kappa, codes, np.repeat(np.arange(len(batch)), batch.counts)))
+    gaussians, scales = batch.gaussians.take(order), scales[order]
+    starts = batch.offsets[:-1][batch.counts > 0]
+    lengths, packed = positions.encode_positions(cells[order], codes[order], bits[order], starts, coarse_bits)
+    largest, others = columns.encode_quats(gaussians.quats_wxyz, columns.quat_steps(scales))
+    frame = compress_columns(
+        [
+            *encode_voxels(batch),
+            lengths,
+            *_scale_symbols(scales),
+            largest,
+            *others.T,
+            columns.encode_opacities(gaussians.opacities),
+            *encode_differences(columns.encode_rgb(gaussians.rgb)).T,
+            *encode_labels(gaussians, layout),
+        ],
+        _columns(layout),
+    )
+    return _FRAME_SIZE.pack(len(frame)) + frame + packed
+
+
+def decode(body: bytes, grid: VoxelGrid, layout: BodyLayout) -> VoxelBatch:
+    """Return the voxels of a body. Raises CodecError, InvalidInputError."""
+    frame, packed = _split(body)
+    raw = decompress_columns(frame, _columns(layout))
+    of_voxels, (lengths, first, second, third, largest, *rest), labels = raw[:3], raw[3:-3], raw[-3:]
+    keys, offsets = decode_voxels(of_voxels, layout)
+    counts = np.diff(offsets)
+    scales = _scale_codes(first, second, third)
+    bits, steps = layout.precision.bits(scales), columns.quat_steps(scales)
+    starts = offsets[:-1][counts > 0]
+    cells = positions.decode_positions(lengths, packed, bits, starts, layout.precision.coarse_bits)
+    active, kappa, target = decode_labels(labels)
+    gaussians = Gaussians(
+        positions.centres_of(cells, np.repeat(grid.indices(keys), counts, axis=0), bits, grid),
+        columns.decode_quats(largest, np.stack(rest[:3], axis=1), steps),
+        columns.decode_scales(scales),
+        columns.decode_opacities(rest[3]),
+        columns.decode_rgb(decode_differences(np.stack(rest[4:], axis=1))),
+        active,
+        kappa,
+        target,
+    )
+    return VoxelBatch(keys, decode_kappa_sums(of_voxels, gaussians, offsets), raw[2].astype(np.uint32), gaussians)
+
+
+def _columns(layout: BodyLayout) -> list[Column]:
+    """Voxels; bit lengths, 3 scales, largest component, 3 components, opacities, 3 colours; labels."""
+    symbols = [Column("<u1", (layout.gaussians,))] * _SYMBOL_BYTES
+    return [*layout.voxel_columns(), *symbols, *layout.label_columns()]
+
+
+def _split(body: bytes) -> tuple[bytes, bytes]:
+    if len(body) < _FRAME_SIZE.size:
+        raise CodecError(f"subset: expected a body of at least {_FRAME_SIZE.size} bytes, got {len(body)}")
+    end = _FRAME_SIZE.size + _FRAME_SIZE.unpack_from(body)[0]
+    if end > len(body):
+        raise CodecError(f"subset: expected a frame of at most {len(body) - _FRAME_SIZE.size} bytes, got a longer one")
+    return body[_FRAME_SIZE.size : end], body[end:]
+
+
+def _scale_symbols(codes: NDArray[np.uint8]) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
+    first = codes[:, 0]
+    return encode_differences(first), codes[:, 1] - first, codes[:, 2] - first
+
+
+def _scale_codes(first: NDArray[np.uint8], second: NDArray[np.uint8], third: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    codes = decode_differences(first)
+    return np.stack([codes, codes + second, codes + third], axis=1)
