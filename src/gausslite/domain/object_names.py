@@ -19,6 +19,11 @@ FURNITURE: Final = frozenset(
      "wall", "floor", "rug", "carpet", "car", "truck", "bus", "van", "boat", "train", "airplane", "tree", "person",
      "piano", "workbench", "nightstand", "ottoman", "television", "tv", "whiteboard", "curtain", "fence", "gate"}
 )  # fmt: skip
+# furniture and plants that are hardly larger than a person's arm span
+MEDIUM: Final = frozenset(
+    {"chair", "armchair", "stool", "nightstand", "ottoman", "toilet", "sink", "oven", "stove", "dishwasher", "tv",
+     "television", "monitor", "plant", "houseplant", "suitcase", "lamp"}
+)  # fmt: skip
 # objects that may fill most of an image
 SURFACE: Final = frozenset(
     {"table", "desk", "counter", "countertop", "bed", "workbench", "wall", "floor", "ceiling", "door", "rug", "carpet",
@@ -89,6 +94,11 @@ def is_structure(phrase: str) -> bool:
 def is_surface(phrase: str) -> bool:
     """Return True for tables, beds, walls and the like."""
     return head_of(phrase) in SURFACE
+
+
+def is_medium(phrase: str) -> bool:
+    """Return True for chairs, plants, televisions and other objects of about a metre."""
+    return head_of(phrase) in MEDIUM
 
 
 def is_furniture(phrase: str) -> bool:

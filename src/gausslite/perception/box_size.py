@@ -9,7 +9,7 @@ import numpy as np
 
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
-from gausslite.domain.object_names import is_furniture, is_generic, is_surface
+from gausslite.domain.object_names import is_furniture, is_generic, is_medium, is_surface
 
 Box = tuple[float, float, float, float]
 
@@ -31,6 +31,7 @@ class BoxSizeLimits:
     """
 
     small_m: float = 1.0
+    medium_m: float = 1.2
     furniture_m: float = 3.0
     surface_m: float = 6.0
     small_share: float = 0.20
@@ -38,7 +39,7 @@ class BoxSizeLimits:
     surface_share: float = 0.80
 
     def __post_init__(self) -> None:
-        for name in ("small_m", "furniture_m", "surface_m"):
+        for name in ("small_m", "medium_m", "furniture_m", "surface_m"):
             if not (np.isfinite(getattr(self, name)) and getattr(self, name) > 0):
                 raise InvalidInputError(f"box limit {name}: expected a positive length, got {getattr(self, name)}")
         for name in ("small_share", "furniture_share", "surface_share"):
@@ -57,6 +58,8 @@ class BoxSizeLimits:
     def _limits(self, name: str) -> tuple[float, float]:
         if is_surface(name):
             return self.surface_m, self.surface_share
+        if is_medium(name):
+            return self.medium_m, self.furniture_share
         if is_furniture(name) or is_generic(name):
             return self.furniture_m, self.furniture_share
         return self.small_m, self.small_share

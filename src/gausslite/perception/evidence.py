@@ -16,6 +16,8 @@ from gausslite.domain.pose import inverse, transform_points
 from gausslite.perception.object_map import Landmark
 
 _RELIABLE_FACTOR: Final = 3
+# slightly below a third: two misses for each detection are accepted
+_MIN_PRESENT_SHARE: Final = 0.33
 _NEAR_M: Final = 0.05
 _DEPTH_SLACK_M: Final = 0.10
 _DEPTH_SLACK_SHARE: Final = 0.02
@@ -71,6 +73,13 @@ class EvidenceSettings:
         min_seen = _RELIABLE_FACTOR * self.min_seen
         has_evidence = landmark.seen_count >= min_seen or landmark.best_score >= self.confident_score
         return has_evidence and self.is_confirmed(landmark)
+
+    def is_present(self, landmark: Landmark) -> bool:
+        """Return True if the latest frame with detections found the landmark, or few frames missed a reliable one."""
+        if landmark.missed_in_a_row == 0:
+            return True
+        is_often_seen = landmark.seen_count >= _MIN_PRESENT_SHARE * (landmark.seen_count + landmark.missed_count)
+        return is_often_seen and self.is_reliable(landmark)
 
     def needs_observation(self, landmark: Landmark) -> bool:
         """Return True if one more observation could confirm the landmark."""

@@ -12,6 +12,7 @@ from numpy import ndarray
 
 from gausslite.domain.relevance import Rival
 from gausslite.domain.voxels import AxisAlignedBox, VoxelGrid
+from gausslite.perception.surface_votes import SurfaceVotes
 
 _CELL_GRID: Final = VoxelGrid(0.05)
 _MIN_MATCH_DISTANCE_M: Final = 0.15
@@ -28,7 +29,8 @@ class Observation:
 
     The radius is twice the median distance of the points to the centroid: masks of chairs include background, which
     would dominate the outermost points. camera_m is the camera's centre, None without a camera. time_ns is the frame's
-    capture time. rival: a different thing detected in the same place.
+    capture time. rival: a different thing detected in the same place. votes: which voxels the mask
+    shows inside and outside the object.
     """
 
     phrase: str
@@ -39,6 +41,7 @@ class Observation:
     score: float = 1.0
     time_ns: int = 0
     rival: Rival | None = None
+    votes: SurfaceVotes = field(default_factory=SurfaceVotes.empty)
 
     @classmethod
     def from_points(
@@ -70,7 +73,8 @@ class Landmark:
     cells: keys of surface cells, with the number of observations of each in counts. missed_count: frames that should
     have shown the object but did not. farthest_m: the largest distance of an observation. first_seen_ns, last_seen_ns:
     capture times of its observations. number: assigned by the object map, in the order of first observations.
-    score_sum: sum of its scores; rival_scores: sums of the scores of different things detected in its place.
+    score_sum: sum of its scores; rival_scores: sums of the scores of different things in its place. votes: of its
+    masks, on its surface. missed_in_a_row: frames since the last detection that should have shown it.
     """
 
     phrase: str
@@ -87,6 +91,8 @@ class Landmark:
     number: int = 0
     score_sum: float = 0.0
     rival_scores: dict[str, float] = field(default_factory=dict)
+    votes: SurfaceVotes = field(default_factory=SurfaceVotes.empty)
+    missed_in_a_row: int = 0
 
     @classmethod
     def from_observation(cls, observation: Observation) -> Landmark:
@@ -103,12 +109,17 @@ class Landmark:
             last_seen_ns=observation.time_ns,
             score_sum=observation.score,
             rival_scores={} if observation.rival is None else {observation.rival.name: observation.rival.score},
+            votes=observation.votes,
         )
 
     def is_colocated_with(self, other: Observation) -> bool:
         """Return True if the centroids are so close that both are one object; their phrases may differ."""
         max_distance_m = max(_MIN_MATCH_DISTANCE_M, 0.75 * min(self.radius_m, other.radius_m))
         return float(np.linalg.norm(self.centroid_m - other.centroid_m)) < max_distance_m
+
+    def seen_from(self, camera_m: Float64[ndarray, "3"]) -> Observation:
+        """Return the whole object as an observation by a camera, to evaluate relations."""
+        return Observation(self.phrase, self.centroid_m, self.radius_m, self.cells, camera_m)
 
     def matches(self, other: Observation) -> bool:
         """Return True if an observation of the same phrase shows this object, in whole or in part."""
@@ -124,6 +135,8 @@ class Landmark:
         self.first_seen_ns = min(self.first_seen_ns, other.first_seen_ns)
         self.last_seen_ns = max(self.last_seen_ns, other.last_seen_ns)
         self.score_sum += other.score_sum
+        self.votes = self.votes.add(other.votes)
+        self.missed_in_a_row = min(self.missed_in_a_row, other.missed_in_a_row)
         for name, score in other.rival_scores.items():
             self.rival_scores[name] = self.rival_scores.get(name, 0.0) + score
         merged, where = np.unique(np.concatenate([self.cells, other.cells]), return_inverse=True)
@@ -180,8 +193,9 @@ class ObjectMap:
         observed = [self._add(observation) for observation in observations]
         if is_visible is not None:
             for each in self._objects:
-                if not any(each is other for other in observed):
-                    each.missed_count += is_visible(each)
+                if not any(each is other for other in observed) and is_visible(each):
+                    each.missed_count += 1
+                    each.missed_in_a_row += 1
         while len(self._objects) > _MAX_OBJECTS:
             self._objects.remove(min(self._objects, key=lambda each: each.seen_count))
 

@@ -122,7 +122,7 @@ class TaskRelevanceEstimator:
 
     def evaluate_past(self, frame: Frame) -> RelevanceMap:
         """Return the relevance of an earlier frame after a detection on it."""
-        return self._tracker.evaluate_past(frame, self._detector.detect(frame, self._graph.queries))
+        return self._tracker.integrate(frame, frame.depth_m, self._detector.detect(frame, self._graph.queries))
 
     def state(self) -> State:
         """Return the tracker's state as named arrays."""
@@ -209,7 +209,7 @@ class AsyncRelevanceEstimator:
         if not future.done():
             return None
         self._past_detection = None
-        return self._tracker.evaluate_past(frame, future.result())
+        return self._tracker.integrate(frame, frame.depth_m, future.result())
 
     def _collect(self) -> DelayedRelevance | None:
         """Integrate the running detection if it has finished."""

@@ -1,6 +1,7 @@
 """Decide the relevance of each frame: which pixels show the task's targets.
 
-Detections are localised in 3D, filtered by the task's relations, and propagated to the following frames.
+Detections are localised in 3D and filtered by the task's relations. The masks of all frames follow from the measured
+surfaces of the objects.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float32, Float64
+from jaxtyping import Bool, Float32, Float64
 from numpy import ndarray
 from numpy.typing import NDArray
 
@@ -23,14 +24,14 @@ from gausslite.domain.pose import UpAxis, require_rigid, rotation_angle_deg, tra
 from gausslite.domain.relevance import NO_TARGET, Detection, RelevanceMap
 from gausslite.domain.state import State, add_prefix, get_array, get_counts, int_array, select_prefix
 from gausslite.domain.task import TaskGraph, noun_of
-from gausslite.perception.checkpoint import decode_frustum, decode_landmark, encode_frustum, encode_landmark
-from gausslite.perception.detect import Segmenter
+from gausslite.perception.checkpoint import decode_landmark, encode_landmark
+from gausslite.perception.detect import Segmenter, bounding_box
 from gausslite.perception.evidence import EvidenceSettings, VisibilityCheck
 from gausslite.perception.foreground import foreground_mask
-from gausslite.perception.object_map import Landmark, Observation
+from gausslite.perception.object_map import Landmark
+from gausslite.perception.object_masks import refined_mask, surface_mask
 from gausslite.perception.object_report import describe_landmarks
 from gausslite.perception.relations import SpatialSettings
-from gausslite.perception.reproject import Frustum, lift_frustum, mask_in_frustum, reprojected_box_px
 from gausslite.perception.spatial import SpatialFilter, lift_observation
 
 # a detection with a smaller share of its pixels outside excluded objects shows one of them
@@ -41,15 +42,13 @@ _MIN_SHARE_LEFT = 0.3
 class RelevanceTrackerSettings:
     """Limits of the camera's motion and of the frames between two detections (a comment in Sec. III-B.2).
 
-    up_axis: up in the world frame, by default that of a level first camera. max_missed_detections: detections in a row
-    that may miss a reliable target before it is dropped.
+    up_axis: up in the world frame, by default that of a level first camera.
     """
 
     up_axis: UpAxis = (0.0, -1.0, 0.0)
     max_translation_m: float = 1.0
     max_rotation_deg: float = 15.0
     max_frames: int = 5
-    max_missed_detections: int = 2
     spatial: SpatialSettings = field(default_factory=SpatialSettings)
     evidence: EvidenceSettings = field(default_factory=EvidenceSettings)
 
@@ -58,38 +57,33 @@ class RelevanceTrackerSettings:
             if not getattr(self, name) > 0:
                 raise InvalidInputError(f"tracker {name}: expected a positive number, got {getattr(self, name)}")
         unit_up_axis(self.up_axis)
-        if self.max_missed_detections < 0:
-            raise InvalidInputError(
-                f"tracker max_missed_detections: expected at least 0, got {self.max_missed_detections}"
-            )
         if self.max_frames < 1:
             raise InvalidInputError(f"tracker max_frames: expected at least 1, got {self.max_frames}")
 
 
 class RelevanceTracker:
-    """State of the tracked targets: latest keyframe, propagated detections, landmarks. Use from one thread at a time.
+    """State of the tracked targets: latest keyframe, landmarks with their surfaces. Use from one thread at a time.
 
     The caller runs the detector.
     """
 
     def __init__(self, graph: TaskGraph, settings: RelevanceTrackerSettings, segmenter: Segmenter | None) -> None:
-        """Without a segmenter, masks are propagated by depth alone."""
+        """Without a segmenter, the masks of frames without detection are the objects' surfaces alone."""
         self._graph = graph
         self._settings = settings
         self._segmenter = segmenter
         self._filter = SpatialFilter(graph, settings.up_axis, settings.spatial, settings.evidence)
         self._T_world_keyframe: Float64[ndarray, "4 4"] | None = None
         self._frames_since = 0
-        self._frustums: list[Frustum] = []
         self._needs_observation = False
 
     @property
     def notes(self) -> tuple[str, ...]:
         """Attributes of the task that are not evaluated, different things, and anchors that no frame has shown yet."""
         attributes = (
-            f"{each.colour or each.superlative} {noun_of(each.name)!r}: colours and sizes are not evaluated, "
-            f"every {noun_of(each.name)!r} counts"
+            f"{each.colour} {noun_of(each.name)!r}: colours are not evaluated, every {noun_of(each.name)!r} counts"
             for each in self._graph.attributes
+            if each.colour is not None
         )
         rivals = (
             f"what looks like {each.phrase!r} is rather {rival!r}: not activated; --accept-similar accepts it"
@@ -117,15 +111,13 @@ class RelevanceTracker:
         return NounReport(match, sum(each.seen_count for each in landmarks), best_score, confirmed, rival)
 
     def state(self) -> State:
-        """Return landmarks, propagated detections and the keyframe's pose as named arrays."""
+        """Return the landmarks and the keyframe's pose as named arrays."""
         pose = np.zeros((0, 4, 4)) if self._T_world_keyframe is None else self._T_world_keyframe[None]
         state: dict[str, NDArray[Any]] = {
             "T_world_keyframe": pose,
             "keyframe_age": int_array(self._frames_since, self._needs_observation),
         }
-        state["counts"] = int_array(len(self._frustums), len(self.landmarks))
-        for i, frustum in enumerate(self._frustums):
-            state |= add_prefix(f"frustum-{i}", encode_frustum(frustum))
+        state["count"] = int_array(len(self.landmarks))
         for i, landmark in enumerate(self.landmarks):
             state |= add_prefix(f"landmark-{i}", encode_landmark(landmark))
         return state
@@ -133,15 +125,11 @@ class RelevanceTracker:
     def restore(self, state: State) -> None:
         """Replace the state by that of a tracker of the same task. Raises MapFileError, InvalidInputError."""
         poses = get_array(state, "T_world_keyframe", (None, 4, 4), np.float64)
-        frustums, landmarks = get_counts(state, "counts", 2)
-        if len(poses) > 1 or frustums + landmarks > len(state):
-            raise MapFileError(f"state tracker: expected {frustums} detections and {landmarks} landmarks, got fewer")
+        (landmarks,) = get_counts(state, "count", 1)
+        if len(poses) > 1 or landmarks > len(state):
+            raise MapFileError(f"state tracker: expected {landmarks} landmarks, got fewer")
         for pose in poses:
             require_rigid("state T_world_keyframe", pose)
-        self._frustums = [decode_frustum(select_prefix(state, f"frustum-{i}")) for i in range(frustums)]
-        unknown = {frustum.detection.phrase for frustum in self._frustums} - set(self._graph.targets)
-        if unknown:
-            raise MapFileError(f"state tracker: expected targets of the task, got {len(unknown)} other phrases")
         saved_landmarks = [select_prefix(state, f"landmark-{i}") for i in range(landmarks)]
         self._filter.restore_landmarks([decode_landmark(each) for each in saved_landmarks])
         self._T_world_keyframe = poses[0].copy() if len(poses) else None
@@ -170,71 +158,50 @@ class RelevanceTracker:
     def integrate(
         self, frame: Frame, depth_m: Float32[ndarray, "h w"], detections: Sequence[Detection]
     ) -> RelevanceMap:
-        """Return the relevance of a keyframe from its detections, and propagate its targets from now on."""
-        confirmed = self._observe(frame, depth_m, detections)
-        targets = [detection for detection, _ in confirmed]
-        undetected = self._undetected(frame, depth_m, [observation for _, observation in confirmed])
-        lifted = [lift_frustum(detection, depth_m, frame) for detection in targets]
-        self._frustums = [*(new for new in lifted if new is not None), *(frustum for frustum, _ in undetected)]
-        return merge_detections([*targets, *(detection for _, detection in undetected)], self._graph.targets, frame)
-
-    def evaluate_past(self, frame: Frame, detections: Sequence[Detection]) -> RelevanceMap:
-        """Return the relevance of an earlier frame; its detections update the landmarks but are not propagated."""
-        confirmed = self._observe(frame, frame.depth_m, detections)
-        return merge_detections([detection for detection, _ in confirmed], self._graph.targets, frame)
+        """Return the relevance of a frame with detections; they update the objects."""
+        detected = self._observe(frame, depth_m, detections)
+        return self._relevance(frame, detected)
 
     def propagate(self, frame: Frame) -> RelevanceMap:
-        """Return the relevance of a frame without a detection: the latest targets, reprojected."""
-        detections = [detection for _, detection in self._propagated_detections(frame)]
-        if self._segmenter is not None and detections:
-            boxes_px = np.asarray([detection.box_px for detection in detections], np.float32)
-            masks = self._segmenter.segment(frame, boxes_px)
-            detections = [
-                detection if mask is None else replace(detection, mask=mask)
-                for detection, mask in zip(detections, masks, strict=True)
-            ]
-        return merge_detections(detections, self._graph.targets, frame)
+        """Return the relevance of a frame without detections: the surfaces of the targets, wherever it shows them."""
+        return self._relevance(frame, [])
 
-    def _propagated_detections(self, frame: Frame) -> list[tuple[Frustum, Detection]]:
-        """Return the propagated detections in view of this frame, reprojected into it, with their frustums."""
-        boxes = [(frustum, reprojected_box_px(frustum, frame)) for frustum in self._frustums]
-        return [
-            (frustum, replace(frustum.detection, box_px=box, mask=mask_in_frustum(frustum, box, frame)))
-            for frustum, box in boxes
-            if box is not None
-        ]
+    def _relevance(self, frame: Frame, detected: Sequence[tuple[Landmark, Bool[ndarray, "h w"]]]) -> RelevanceMap:
+        """Return the masks of all targets. A detected mask adds pixels that no other frame shows outside its object."""
+        viewpoint = frame.T_world_camera if self._T_world_keyframe is None else self._T_world_keyframe
+        masks = []
+        for landmark, name in self._filter.targets(viewpoint):
+            own = [mask for owner, mask in detected if owner is landmark]
+            if own:
+                mask = refined_mask(np.logical_or.reduce(own), landmark.votes, frame)
+            else:
+                mask = self._resegmented(surface_mask(landmark.votes, frame), frame)
+            masks.append((name, mask))
+        return merge_masks(masks, self._graph.targets, frame)
 
-    def _undetected(
-        self, frame: Frame, depth_m: Float32[ndarray, "h w"], detected: Sequence[Observation]
-    ) -> list[tuple[Frustum, Detection]]:
-        """Return reliable targets in view that the detector missed this time, with their missed detections counted."""
-        undetected = []
-        for frustum, detection in self._propagated_detections(frame):
-            observation = lift_observation(replace(detection, phrase=noun_of(detection.phrase)), depth_m, frame)
-            if observation is None or frustum.missed_detections >= self._settings.max_missed_detections:
-                continue
-            is_detected = any(self._filter.is_same_object(observation, other) for other in detected)
-            is_target = self._filter.is_reliable(observation) and self._filter.satisfies_relations(observation)
-            if is_target and not is_detected:
-                undetected.append((replace(frustum, missed_detections=frustum.missed_detections + 1), detection))
-        return undetected
+    def _resegmented(self, mask: Bool[ndarray, "h w"], frame: Frame) -> Bool[ndarray, "h w"]:
+        """Return the segmenter's mask for the box of a mask; the mask itself if it finds nothing."""
+        box_px = bounding_box(mask)
+        if self._segmenter is None or box_px is None:
+            return mask
+        (segmented,) = self._segmenter.segment(frame, np.asarray([box_px], np.float32))
+        return mask if segmented is None else segmented
 
     def _observe(
         self, frame: Frame, depth_m: Float32[ndarray, "h w"], detections: Sequence[Detection]
-    ) -> list[tuple[Detection, Observation]]:
-        """Add the detections to the object map; return the confirmed targets that satisfy the relations."""
+    ) -> list[tuple[Landmark, Bool[ndarray, "h w"]]]:
+        """Add the detections to the object map; return the masks of its landmarks in this frame."""
         kept = self._drop_excluded(self._drop_generic_anchors(detections))
         masked = [replace(each, mask=foreground_mask(each.mask, depth_m)) for each in kept]
         lifted = [(each, lift_observation(each, depth_m, frame)) for each in masked]
         localised = [(detection, observation) for detection, observation in lifted if observation is not None]
         self._filter.observe([observation for _, observation in localised], VisibilityCheck(frame, frame.depth_m))
-        targets = [
-            (replace(detection, phrase=name), observation)
-            for detection, observation in localised
-            if (name := self._filter.target_of(observation)) is not None
-        ]
-        self._needs_observation = any(self._filter.needs_observation(observation) for _, observation in targets)
-        return [(detection, each) for detection, each in targets if self._filter.is_confirmed(each)]
+        self._needs_observation = any(
+            self._filter.needs_observation(observation) and self._filter.target_of(observation) is not None
+            for _, observation in localised
+        )
+        owners = [(self._filter.landmark_of(observation), detection.mask) for detection, observation in localised]
+        return [(landmark, mask) for landmark, mask in owners if landmark is not None]
 
     def _drop_generic_anchors(self, detections: Sequence[Detection]) -> list[Detection]:
         """Drop detections of a generic noun that are an anchor: "the object on the desk" is not the desk."""
@@ -263,8 +230,15 @@ class RelevanceTracker:
 
 
 def merge_detections(detections: Sequence[Detection], targets: Sequence[str], frame: Frame) -> RelevanceMap:
+    """Return the binary w(u, v) of detections whose phrases are targets."""
+    return merge_masks([(each.phrase, each.mask) for each in detections], targets, frame)
+
+
+def merge_masks(
+    masks: Sequence[tuple[str, Bool[ndarray, "h w"]]], targets: Sequence[str], frame: Frame
+) -> RelevanceMap:
     """Return the binary w(u, v): 1 on every target's mask; in an overlap the pixel belongs to the smaller object."""
     target = np.full(frame.depth_m.shape, NO_TARGET, np.int16)
-    for detection in sorted(detections, key=lambda each: int(np.count_nonzero(each.mask)), reverse=True):
-        target[detection.mask] = targets.index(detection.phrase)
+    for name, mask in sorted(masks, key=lambda each: int(np.count_nonzero(each[1])), reverse=True):
+        target[mask] = targets.index(name)
     return RelevanceMap((target != NO_TARGET).astype(np.float32), target)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float32, Float64
 from numpy import ndarray
 
 from gausslite.domain.camera import lift
@@ -16,7 +16,9 @@ from gausslite.domain.relevance import Detection
 from gausslite.domain.task import Predicate, Relation, TaskGraph, noun_of
 from gausslite.perception.evidence import EvidenceSettings, VisibilityCheck
 from gausslite.perception.object_map import Landmark, ObjectMap, Observation
+from gausslite.perception.object_masks import mask_votes
 from gausslite.perception.relations import RelationGeometry, SpatialSettings, surface_distance_m
+from gausslite.perception.superlatives import select_extreme
 
 _MIN_PIXELS = 8
 _MAX_PIXELS = 4000
@@ -49,7 +51,7 @@ def lift_observation(detection: Detection, depth_m: Float32[ndarray, "h w"], fra
     points_m = transform_points(T_world_camera, points)
     camera_m, time_ns = T_world_camera[:3, 3], frame.capture_time_ns
     observation = Observation.from_points(detection.phrase, points_m, camera_m, detection.score, time_ns)
-    return replace(observation, rival=detection.rival)
+    return replace(observation, rival=detection.rival, votes=mask_votes(detection.mask, frame))
 
 
 class SpatialFilter:
@@ -64,7 +66,10 @@ class SpatialFilter:
         }
         nouns = dict.fromkeys(noun_of(target) for target in graph.targets)
         self._names = {noun: tuple(each for each in graph.targets if noun_of(each) == noun) for noun in nouns}
-        self._geometry = RelationGeometry(np.array(unit_up_axis(up_axis)), settings)
+        superlatives = {each.name: each.superlative for each in graph.attributes}
+        self._superlatives = {target: superlatives.get(target) for target in graph.targets}
+        self._up = np.array(unit_up_axis(up_axis))
+        self._geometry = RelationGeometry(self._up, settings)
         self._evidence = evidence or EvidenceSettings()
         self._object_map = ObjectMap()
 
@@ -99,15 +104,25 @@ class SpatialFilter:
         landmark = self._object_map.match(observation)
         return landmark is not None and self._evidence.is_confirmed(landmark)
 
-    def is_reliable(self, observation: Observation) -> bool:
-        """Return True if the observed object is a reliable landmark."""
-        landmark = self._object_map.match(observation)
-        return landmark is not None and self._evidence.is_reliable(landmark)
+    def targets(self, T_world_camera: Float64[ndarray, "4 4"]) -> list[tuple[Landmark, str]]:
+        """Return the confirmed landmarks that satisfy the relations of a target, with the target's name.
 
-    def is_same_object(self, observation: Observation, other: Observation) -> bool:
-        """Return True if both observations show the same object."""
-        landmark = self._object_map.match(observation)
-        return landmark is not None and landmark is self._object_map.match(other)
+        A superlative selects one of them, before those are left out that are no longer present. T_world_camera: the
+        viewpoint of relations such as left_of.
+        """
+        named = [(each, self.target_of(each.seen_from(T_world_camera[:3, 3]))) for each in self.confirmed_landmarks]
+        chosen = []
+        for target, superlative in self._superlatives.items():
+            candidates = [landmark for landmark, name in named if name == target]
+            if candidates and superlative is not None:
+                reliable = [each for each in candidates if self._evidence.is_reliable(each)]
+                candidates = [select_extreme(reliable or candidates, superlative, self._up, T_world_camera)]
+            chosen += [(landmark, target) for landmark in candidates if self._evidence.is_present(landmark)]
+        return chosen
+
+    def landmark_of(self, observation: Observation) -> Landmark | None:
+        """Return the landmark that an observation shows."""
+        return self._object_map.match(observation)
 
     def needs_observation(self, observation: Observation) -> bool:
         """Return True if one more observation could confirm the object."""
@@ -122,10 +137,6 @@ class SpatialFilter:
         """Return the first target of the observation's noun whose relations it satisfies; None if there is none."""
         names = self._names.get(observation.phrase, ())
         return next((name for name in names if self._satisfies(self._relations[name], observation)), None)
-
-    def satisfies_relations(self, observation: Observation) -> bool:
-        """Return True if the object satisfies the relations of a target of its noun; True for other nouns."""
-        return observation.phrase not in self._names or self.target_of(observation) is not None
 
     def _satisfies(self, relations: Sequence[Relation], observation: Observation) -> bool:
         """Return True if no negated relation holds, and any other does (Sec. III-B.3) or none can be evaluated.

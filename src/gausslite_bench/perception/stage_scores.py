@@ -29,9 +29,9 @@ _MIN_FOUND_SHARE = 0.25
 class PerceptionStage(StrEnum):
     """Stages of perception; each includes the previous ones.
 
-    detected: the detector's masks. related: masks limited to the object's foreground in depth and filtered by the
-    task's relations. confirmed: objects with sufficient evidence. These three run the detector on every frame.
-    tracked: as in a mission, with detection on keyframes only and propagation between them.
+    detected: the detector's masks. related: objects whose masks are limited to the foreground in depth, merged with the
+    object's measured surface and filtered by the task's relations. confirmed: objects with sufficient evidence. These
+    three run the detector on every frame. tracked: as in a mission, with detection on keyframes only.
     """
 
     DETECTED = "detected"
@@ -146,7 +146,7 @@ class _TaskEvaluation:
     def __init__(self, query: TaskQuery, detector: Detector, up_axis: UpAxis, segmenter: Segmenter | None) -> None:
         self._query = query
         self._detector = _CachedDetector(detector)
-        every_frame = RelevanceTrackerSettings(up_axis=up_axis, max_frames=1, max_missed_detections=0)
+        every_frame = RelevanceTrackerSettings(up_axis=up_axis, max_frames=1)
         settings = {
             PerceptionStage.RELATED: replace(every_frame, evidence=EvidenceSettings.accept_all()),
             PerceptionStage.CONFIRMED: every_frame,

@@ -111,6 +111,10 @@ def test_a_reliable_target_survives_a_few_missed_detections():
     assert target_marked([0.9, None, None, 0.9, None, None, None], 7) == [True] * 6 + [False]
 
 
+def test_an_unreliable_target_is_marked_while_no_frame_misses_it():
+    assert target_marked([0.4, 0.4, None, 0.4], 4) == [False, True, False, True]
+
+
 def test_an_object_missed_by_most_frames_is_not_confirmed():
     assert not any(target_marked([0.4, *[None] * 9, 0.4], 11))
 
@@ -172,8 +176,8 @@ def test_the_closest_chair_is_found_from_a_part_of_the_table():
     for part in parts:
         spatial_filter = closest_chair()
         spatial_filter.observe([part, side_chair, end_chair])
-        assert spatial_filter.satisfies_relations(side_chair)
-        assert not spatial_filter.satisfies_relations(end_chair)
+        assert spatial_filter.target_of(side_chair) is not None
+        assert spatial_filter.target_of(end_chair) is None
 
 
 def test_an_unreliable_candidate_does_not_decide_a_superlative():
@@ -185,8 +189,8 @@ def test_an_unreliable_candidate_does_not_decide_a_superlative():
     for _ in range(3):
         spatial_filter.observe([table, unreliable, reliable])
     assert spatial_filter.is_confirmed(unreliable)
-    assert spatial_filter.satisfies_relations(reliable)
-    assert not spatial_filter.satisfies_relations(unreliable)
+    assert spatial_filter.target_of(reliable) is not None
+    assert spatial_filter.target_of(unreliable) is None
 
 
 @pytest.mark.parametrize("settings", [{"min_seen": 0}, {"confident_score": -0.1}, {"min_seen_fraction": 1.1}])

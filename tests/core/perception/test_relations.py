@@ -37,7 +37,7 @@ def satisfies(predicate: Predicate, target: Observation, *others: Observation) -
     relations = tuple(Relation(predicate, target.phrase, anchor) for anchor in anchors)
     spatial = SpatialFilter(TaskGraph("id", "", (target.phrase,), anchors, relations), UP, SpatialSettings())
     spatial.observe([*others, target])
-    return spatial.satisfies_relations(target)
+    return spatial.target_of(target) is not None
 
 
 @pytest.mark.parametrize(
@@ -106,8 +106,8 @@ def test_the_farthest_is_one_candidate_and_not_the_closest():
         relation = Relation(predicate, "chair", "door")
         spatial = SpatialFilter(TaskGraph("id", "", ("chair",), ("door",), (relation,)), UP, SpatialSettings())
         spatial.observe([small_object("door", 0.0, 0.0, 0.0), near, far])
-        assert spatial.satisfies_relations(chosen)
-        assert not spatial.satisfies_relations(other)
+        assert spatial.target_of(chosen) is not None
+        assert spatial.target_of(other) is None
 
 
 def filter_of(*relations: Relation) -> SpatialFilter:
@@ -119,10 +119,10 @@ def filter_of(*relations: Relation) -> SpatialFilter:
 def test_a_negated_relation_keeps_the_objects_that_do_not_satisfy_it():
     spatial = filter_of(Relation(Predicate.ON, "mug", "table", negated=True))
     on, beside = small_object("mug", 0.4, -0.4, 0.1), small_object("mug", 2.0, -0.4, 0.1)
-    assert spatial.satisfies_relations(on)  # no table has been seen
+    assert spatial.target_of(on) is not None  # no table has been seen
     spatial.observe([TABLE, on, beside])
-    assert not spatial.satisfies_relations(on)
-    assert spatial.satisfies_relations(beside)
+    assert spatial.target_of(on) is None
+    assert spatial.target_of(beside) is not None
 
 
 @given(st.floats(0.7, 6.0), st.floats(0.3, 4.0), st.floats(0.0, 3.0))
@@ -134,7 +134,7 @@ def test_distances_bound_near_and_negation_reverses_it(x_m, low_m, width_m):
         spatial.observe([TABLE, mug])
         is_within = low_m <= x_m <= low_m + width_m + 0.5
         if min(abs(x_m - low_m), abs(x_m - low_m - width_m - 0.5)) > 0.06:  # cells of the object map
-            assert spatial.satisfies_relations(mug) is (is_within is not negated)
+            assert (spatial.target_of(mug) is not None) is (is_within is not negated)
 
 
 @pytest.mark.parametrize(("x_m", "holds"), [(1.3, False), (1.6, True), (2.4, True), (2.7, False)])
@@ -142,7 +142,7 @@ def test_equal_bounds_mean_about(x_m, holds):
     spatial = filter_of(Relation(Predicate.NEAR, "mug", "table", False, 2.0, 2.0))
     mug = small_object("mug", x_m + 0.6, 0.0, 0.0)
     spatial.observe([TABLE, mug])
-    assert spatial.satisfies_relations(mug) is holds
+    assert (spatial.target_of(mug) is not None) is holds
 
 
 def test_a_bound_beyond_the_reach_of_a_side_extends_it():
@@ -150,7 +150,7 @@ def test_a_bound_beyond_the_reach_of_a_side_extends_it():
     for max_m, holds in ((None, False), (6.0, True), (4.0, False)):
         spatial = filter_of(Relation(Predicate.BEHIND, "mug", "table", False, None, max_m))
         spatial.observe([TABLE, mug])
-        assert spatial.satisfies_relations(mug) is holds
+        assert (spatial.target_of(mug) is not None) is holds
 
 
 def test_relations_separate_two_targets_of_one_noun():

@@ -130,8 +130,8 @@ def test_an_anchor_out_of_view_still_counts():
     spatial_filter = SpatialFilter(graph_of(Relation(Predicate.NEAR, "mug", "sink")), UP, SpatialSettings())
     spatial_filter.observe([observation("sink", 0, 0, 0)])
     spatial_filter.observe([])
-    assert spatial_filter.satisfies_relations(observation("mug", 0.9, 0, 0))
-    assert not spatial_filter.satisfies_relations(observation("mug", 1.2, 0, 0))
+    assert spatial_filter.target_of(observation("mug", 0.9, 0, 0)) is not None
+    assert spatial_filter.target_of(observation("mug", 1.2, 0, 0)) is None
 
 
 @pytest.mark.parametrize(
@@ -141,7 +141,7 @@ def test_an_anchor_out_of_view_still_counts():
 def test_on_means_above_within_a_horizontal_distance(centre_m, expected):
     spatial_filter = SpatialFilter(graph_of(Relation(Predicate.ON, "mug", "table")), UP, SpatialSettings())
     spatial_filter.observe([observation("table", 0, 0, 0)])
-    assert spatial_filter.satisfies_relations(observation("mug", *centre_m)) is expected
+    assert (spatial_filter.target_of(observation("mug", *centre_m)) is not None) is expected
 
 
 def test_on_a_long_table_means_over_its_footprint():
@@ -150,8 +150,8 @@ def test_on_a_long_table_means_over_its_footprint():
     spatial_filter.observe(
         [Observation.from_points("table", np.stack([x.ravel(), np.zeros(x.size), z.ravel()], axis=1))]
     )
-    assert spatial_filter.satisfies_relations(observation("mug", 0.9, -0.1, 0.3, radius_m=0.04))
-    assert not spatial_filter.satisfies_relations(observation("mug", 1.4, -0.1, 0.3, radius_m=0.04))
+    assert spatial_filter.target_of(observation("mug", 0.9, -0.1, 0.3, radius_m=0.04)) is not None
+    assert spatial_filter.target_of(observation("mug", 1.4, -0.1, 0.3, radius_m=0.04)) is None
 
 
 def test_closest_to_selects_one_of_all_seen_candidates():
@@ -160,19 +160,19 @@ def test_closest_to_selects_one_of_all_seen_candidates():
     )
     near, far = observation("chair", 0.8, 0, 0), observation("chair", 2.0, 0, 0)
     spatial_filter.observe([observation("table", 0, 0, 0), far])
-    assert spatial_filter.satisfies_relations(far)
+    assert spatial_filter.target_of(far) is not None
     spatial_filter.observe([near, far])
     spatial_filter.observe([near])
-    assert spatial_filter.satisfies_relations(near)
-    assert not spatial_filter.satisfies_relations(far)
+    assert spatial_filter.target_of(near) is not None
+    assert spatial_filter.target_of(far) is None
 
 
 def test_one_satisfied_relation_is_enough():
     near_sink, near_stove = (Relation(Predicate.NEAR, "mug", anchor) for anchor in ("sink", "stove"))
     spatial_filter = SpatialFilter(graph_of(near_sink, near_stove), UP, SpatialSettings())
     spatial_filter.observe([observation("sink", 0, 0, 0), observation("stove", 5, 0, 0)])
-    assert spatial_filter.satisfies_relations(observation("mug", 5.5, 0, 0))
-    assert not spatial_filter.satisfies_relations(observation("mug", 2.5, 0, 0))
+    assert spatial_filter.target_of(observation("mug", 5.5, 0, 0)) is not None
+    assert spatial_filter.target_of(observation("mug", 2.5, 0, 0)) is None
 
 
 def test_partial_views_merge_to_the_true_centroid():

@@ -1,0 +1,97 @@
+"""Surfaces of objects from the votes of masks, and the masks that follow from them in other frames."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from gausslite.domain.camera import Camera, back_project
+from gausslite.domain.frame import Frame
+from gausslite.domain.pose import transform_points
+from gausslite.perception.object_masks import mask_votes, refined_mask, surface_mask
+from gausslite.perception.surface_votes import SurfaceVotes
+
+CAMERA = Camera(150.0, 150.0, 80.0, 60.0, 160, 120)
+
+
+def frame_at(x_m: float = 0.0, z_m: float = 0.0, turn_deg: float = 0.0) -> Frame:
+    """A box of 0.4 m at 1.6 m before a wall at 2 m, seen by a camera that moves and turns."""
+    T_world_camera = np.eye(4)
+    T_world_camera[:3, 3] = x_m, 0.0, z_m
+    cos, sin = np.cos(np.radians(turn_deg)), np.sin(np.radians(turn_deg))
+    T_world_camera[:3, :3] = [[cos, 0, sin], [0, 1, 0], [-sin, 0, cos]]
+    columns, rows = np.meshgrid(np.arange(160) + 0.5, np.arange(120) + 0.5)
+    rays = np.stack([(columns - 80) / 150, (rows - 60) / 150, np.ones_like(rows)], axis=-1) @ T_world_camera[:3, :3].T
+    depth_m = (2.0 - z_m) / rays[..., 2]
+    box_m = (1.6 - z_m) / rays[..., 2]
+    points = T_world_camera[:3, 3] + box_m[..., None] * rays
+    on_box = (np.abs(points[..., 0]) < 0.2) & (np.abs(points[..., 1]) < 0.2)
+    depth_m = np.where(on_box, box_m, depth_m).astype(np.float32)
+    return Frame(0, 0, np.zeros((120, 160, 3), np.uint8), depth_m, CAMERA, T_world_camera)
+
+
+def box_mask(frame: Frame) -> np.ndarray:
+    points = back_project(frame.depth_m, CAMERA).reshape(-1, 3).astype(np.float64)
+    return (transform_points(frame.T_world_camera, points)[:, 2] < 1.8).reshape(frame.depth_m.shape)
+
+
+def iou(a: np.ndarray, b: np.ndarray) -> float:
+    return float((a & b).sum() / (a | b).sum())
+
+
+@pytest.mark.parametrize("pose", [(0.3, 0.0, 0.0), (-0.2, -0.5, 0.0), (0.2, 0.0, 10.0)])
+def test_a_surface_gives_the_mask_in_other_frames(pose):
+    first, other = frame_at(), frame_at(*pose)
+    votes = mask_votes(box_mask(first), first)
+    assert iou(surface_mask(votes, other), box_mask(other)) > 0.9
+
+
+def test_an_occluder_and_a_removed_object_leave_no_mask():
+    first = frame_at()
+    votes = mask_votes(box_mask(first), first)
+    hidden = replace(first, depth_m=np.full_like(first.depth_m, 0.5))
+    removed = replace(first, depth_m=np.full_like(first.depth_m, 2.0))
+    assert not surface_mask(votes, hidden).any()
+    assert not surface_mask(votes, removed).any()
+    assert not surface_mask(SurfaceVotes.empty(), first).any()
+    passed = np.eye(4)
+    passed[2, 3] = 3.0
+    behind = replace(first, T_world_camera=passed)
+    assert not surface_mask(votes, behind).any()
+
+
+def test_a_mask_that_spills_over_the_wall_is_cut_back_to_the_measured_object():
+    frames = [frame_at(x_m) for x_m in (0.0, 0.1, -0.1)]
+    votes = SurfaceVotes.empty()
+    for frame in frames:
+        votes = votes.add(mask_votes(box_mask(frame), frame))
+    spilled = frame_at(0.05)
+    mask = box_mask(spilled)
+    mask[35:90, 30:130] = True
+    votes = votes.add(mask_votes(mask, spilled))
+    assert iou(mask, box_mask(spilled)) < 0.4
+    refined = refined_mask(mask, votes, spilled)
+    assert refined[box_mask(spilled)].all()
+    assert iou(refined, box_mask(spilled)) > 0.8
+    assert iou(surface_mask(votes, frames[0]), box_mask(frames[0])) > 0.9
+
+
+def test_a_detection_of_a_part_is_completed():
+    frames = [frame_at(x_m) for x_m in (0.0, 0.1, -0.1)]
+    votes = SurfaceVotes.empty()
+    for frame in frames:
+        votes = votes.add(mask_votes(box_mask(frame), frame))
+    part = box_mask(frames[0])
+    part[:, 80:] = False
+    assert iou(refined_mask(part, votes, frames[0]), box_mask(frames[0])) > 0.8
+
+
+def test_votes_of_two_halves_are_their_sum():
+    frames = [frame_at(x_m) for x_m in (0.0, 0.1, -0.1, 0.2)]
+    each = [mask_votes(box_mask(frame), frame) for frame in frames]
+    left, right = each[0].add(each[1]), each[2].add(each[3])
+    one, other = left.add(right), each[3].add(each[0]).add(each[2].add(each[1]))
+    for name in ("keys", "inside", "outside"):
+        assert np.array_equal(getattr(one, name), getattr(other, name))
