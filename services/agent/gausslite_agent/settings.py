@@ -23,6 +23,7 @@ from gausslite.config.source_options import add_camera_correction, add_frames
 from gausslite.config.switches import add_switch, set_dependent_default
 from gausslite.config.tls_options import add_tls, read_server_tls
 from gausslite.config.values import read_rigid_transform
+from gausslite.config.view_option import add_view
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.names import require_identifier, require_name
 from gausslite.domain.pose import UpAxis
@@ -81,7 +82,7 @@ class AgentSettings:
 
     source: the sequence that replaces the robot's camera, None for frames by IngestFrames. strict: end the mission at a
     frame of the source that cannot be read. state: file of the saved mission; it is saved every save_interval_s seconds
-    (0: only at the end).
+    (0: only at the end). view: port of the page that shows the agent, None for no page.
     """
 
     listen: str
@@ -99,6 +100,7 @@ class AgentSettings:
     state: Path | None = None
     strict: bool = False
     save_interval_s: float = 0.0
+    view: int | None = None
 
     @property
     def fixed_settings(self) -> tuple[Any, ...]:
@@ -159,6 +161,7 @@ def parse_arguments(arguments: Sequence[str] | None = None) -> AgentSettings:
         options.state,
         options.strict,
         options.save_interval,
+        options.view,
     )
 
 
@@ -214,6 +217,7 @@ def _parser() -> argparse.ArgumentParser:
         help="seconds between two saves of --state during the mission; 0: only at the end (default: %(default)s)",
     )
     add_switch(parser, "--exit-when-done", "exit after the mission (default: continue to serve)")
+    add_view(parser, "the agent")
     _add_replay(parser)
     add_frames(parser)
     add_camera_correction(parser)

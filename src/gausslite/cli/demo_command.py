@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import argparse
 import signal
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from types import FrameType
@@ -29,6 +30,7 @@ from gausslite.config.source_options import add_camera_correction, add_register_
 from gausslite.config.switches import add_switch
 from gausslite.config.toml_text import OptionValue
 from gausslite.config.values import AUTO, read_names
+from gausslite.config.view_option import add_view
 from gausslite.datasets.sequence_name import default_world_frame
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.names import require_name
@@ -72,6 +74,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         metavar="NAME",
         help="name of the poses' frame in all maps (default: the sequence folder's name or the simulated home)",
     )
+    add_view(parser, "the fused map and each agent's")
     parser.set_defaults(run=run)
 
 
@@ -94,7 +97,8 @@ def run(options: argparse.Namespace) -> int:
     )
     remove_results(options.out)
     with running_services(plan, options.out.absolute()) as services:
-        watch_missions(services)
+        with _page(options, services.fusion_address):
+            watch_missions(services)
         maps = collect_maps(services, options.out)
         agents = agent_reports(scenario.agents, options.out)
     corrupt = CorruptFrames(print_message)
@@ -105,6 +109,19 @@ def run(options: argparse.Namespace) -> int:
     print(report_tables(agents, result.scores, scenario.fit_views))
     print(f"report, maps and pictures are in {options.out}")
     return 0
+
+
+@contextmanager
+def _page(options: argparse.Namespace, fusion_address: str) -> Iterator[None]:
+    """Show the fusion server on a page, if the options ask for it."""
+    if options.view is None:
+        yield
+        return
+    from gausslite.view.live_page import live_page
+
+    with live_page(options.view, fusion_address, is_agent=False) as url:
+        print_message(f"the page is at {url}")
+        yield
 
 
 def _require_valid(options: argparse.Namespace) -> None:

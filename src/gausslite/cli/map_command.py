@@ -20,6 +20,7 @@ from gausslite.config.mapping_options import HOLD_OUT_HELP, add_budget, add_dete
 from gausslite.config.source_options import add_camera_correction
 from gausslite.config.switches import add_switch
 from gausslite.config.values import AUTO, NONE
+from gausslite.config.view_option import add_view
 from gausslite.domain.errors import DatasetError
 from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
@@ -44,10 +45,11 @@ from gausslite.mission.results import (
 )
 from gausslite.mission.runner import MissionResult, MissionRunner
 from gausslite.mission.settings import PoseMode, SceneInfo
-from gausslite.mission.task_mapper import TaskMapper
+from gausslite.mission.task_mapper import FrameOutcome, TaskMapper
 from gausslite.mission.task_schedule import ScheduledTaskMapper
 from gausslite.process.interrupts import DeferredInterrupt
 from gausslite.process.messages import print_message
+from gausslite.view.mission_view import mission_view
 
 _NOT_RESUMED = -1
 _WORLD_FRAME_HELP = (
@@ -74,6 +76,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_policy(parser, allow_auto=True, default_policy=policy_of)
     add_budget(parser)
     parser.add_argument("--test-every", metavar="N", type=int, help=HOLD_OUT_HELP)
+    add_view(parser, "the map")
     group = parser.add_argument_group("output")
     add = group.add_argument
     add(
@@ -143,9 +146,14 @@ class _Run:
         stream, schedule = inputs.stream.after(resumed_after), inputs.schedule
         scheduled = ScheduledTaskMapper(self._mapper, schedule, estimators, schedule.at(resumed_after))
         frames = stream.frames(None if options.strict else self._corrupt)
-        with MappingBar(len(stream)) as bar:
+        with mission_view(options.view, self._mapper, schedule.at) as draw, MappingBar(len(stream)) as bar:
+
+            def report(outcome: FrameOutcome) -> None:
+                bar.count(outcome)
+                draw(outcome)
+
             checkpoint = None if options.save_state is None else self._save
-            result = MissionRunner(scheduled.process, bar.count, checkpoint).run(frames, resumed_after)
+            result = MissionRunner(scheduled.process, report, checkpoint).run(frames, resumed_after)
         if result.processed == 0 and self._corrupt.first_error is not None:
             raise self._corrupt.first_error
         self._gaussians = self._mapper.gaussians()

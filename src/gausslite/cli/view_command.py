@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import threading
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
 from gausslite.config.numbers import Number
+from gausslite.config.tls_options import add_tls, read_tls
 from gausslite.process.messages import print_message
 from gausslite.view.level_of_detail import DEFAULT_LIMIT
 from gausslite.view.open_page import open_page
@@ -33,20 +37,43 @@ def configure(parser: argparse.ArgumentParser) -> None:
         default=DEFAULT_LIMIT,
         help=f"draw the N most important Gaussians; a slider changes it (default: {DEFAULT_LIMIT})",
     )
+    add_tls(parser)
     parser.set_defaults(run=run)
 
 
 def run(options: argparse.Namespace) -> int:
-    """Serve the page until Ctrl-C. Raises MapFileError, InvalidInputError."""
+    """Serve the page until Ctrl-C. Raises MapFileError, InvalidInputError, UnavailableError."""
+    with _show_files(options) if _is_path(options.place) else _follow(options) as url:
+        print_message(f"{options.place} is shown at {url}; end with Ctrl-C")
+        with contextlib.suppress(KeyboardInterrupt):
+            threading.Event().wait()
+    return 0
+
+
+@contextmanager
+def _show_files(options: argparse.Namespace) -> Iterator[str]:
     path = Path(options.place)
     contents = read_contents(path)
-    page = open_page(options.port, f"GaussLite {path.name}", options.max_shown)
+    page = open_page(options.port, f"GaussLite {path.resolve().name}", options.max_shown)
     try:
         page.show(contents)
-        print_message(f"{options.place} is shown at {page.url}; end with Ctrl-C")
-        threading.Event().wait()
-    except KeyboardInterrupt:
-        pass
+        yield page.url
     finally:
         page.close()
-    return 0
+
+
+def _follow(options: argparse.Namespace) -> AbstractContextManager[str]:
+    # imported late, because files need no gRPC
+    from gausslite.view.live_page import live_page
+    from gausslite.wire.service_status import query_status
+
+    tls = read_tls(options)
+    is_agent = query_status(options.place, tls).is_agent
+    return live_page(options.port, options.place, is_agent, tls, options.max_shown)
+
+
+def _is_path(place: str) -> bool:
+    """Return True unless the place can only be an address: HOST:PORT or unix:PATH."""
+    if Path(place).exists():
+        return True
+    return not place.startswith("unix:") and not place.rpartition(":")[2].isdecimal()

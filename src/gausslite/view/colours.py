@@ -52,9 +52,7 @@ def legend_of(contents: ViewContents, mode: ColourMode) -> list[tuple[str, tuple
             highest = int(contents.gaussians.kappa.max(initial=0))
             # the colours are logarithmic in kappa, so are the values of the legend
             values = np.unique(np.expm1(np.linspace(0, np.log1p(highest), 5)).round().astype(np.uint32))
-            return [
-                (f"kappa {v}", _as_rgb(c)) for v, c in zip(values, _kappa_colours(values, highest), strict=True)
-            ]
+            return [(f"kappa {v}", _as_rgb(c)) for v, c in zip(values, _kappa_colours(values, highest), strict=True)]
         case ColourMode.AGENT:
             return _category_legend(contents.agents, contents.agent)
         case ColourMode.OBJECT:
@@ -85,9 +83,7 @@ def _category_colours(indices: Int[ndarray, " n"]) -> UInt8[ndarray, "n 3"]:
     return colours
 
 
-def _category_legend(
-    names: Sequence[str], indices: Int[ndarray, " n"]
-) -> list[tuple[str, tuple[int, int, int]]]:
+def _category_legend(names: Sequence[str], indices: Int[ndarray, " n"]) -> list[tuple[str, tuple[int, int, int]]]:
     present = [int(index) for index in np.unique(indices) if index >= 0]
     entries = [(names[i] if i < len(names) else f"number {i}", category_colour(i)) for i in present]
     return entries if len(indices) and indices.min() >= 0 else [*entries, ("none", UNASSIGNED_RGB)]

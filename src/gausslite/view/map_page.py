@@ -34,6 +34,7 @@ class MapPage:
         self._contents: ViewContents | None = None
         gui = self.server.gui
         highest = _MAX_SHOWN // _THOUSAND
+        self._problem = gui.add_html("", order=-1)
         with gui.add_folder("Map"):
             self._figures = gui.add_html("")
             self._colour = gui.add_dropdown("Colour", [str(mode) for mode in ColourMode])
@@ -56,6 +57,12 @@ class MapPage:
                 self._set_start_view(contents)
             self._draw_splats()
             self._markers.show(contents)
+
+    def show_problem(self, text: str) -> None:
+        """Show why the page is out of date; an empty text removes it."""
+        shown = text_html([f"Not up to date: {text}"]) if text else ""
+        if self._problem.content != shown:
+            self._problem.content = shown
 
     def close(self) -> None:
         """Stop serving."""

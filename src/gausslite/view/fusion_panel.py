@@ -1,0 +1,103 @@
+"""The panel of a fusion server: its map or one agent's, figures of each agent, and the start of a refinement."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from typing import Any
+
+from gausslite.codec.ply import gaussians_from_ply
+from gausslite.domain.errors import GaussLiteError
+from gausslite.view.contents import ViewContents
+from gausslite.view.history_plot import HistoryPlot
+from gausslite.view.map_follower import MapFollower
+from gausslite.view.map_page import MapPage, text_html
+from gausslite.wire.clients import Export, FusionClient
+
+_FUSED, _REFINED = "fused map", "refined map"
+_KB = 1e3
+
+
+class FusionPanel:
+    """Owns the page's content while it follows one fusion server. `poll` is called on one thread."""
+
+    def __init__(self, page: MapPage, client: FusionClient) -> None:
+        self._page, self._client = page, client
+        self._follower = MapFollower(client.watch)
+        self._started_s = self._polled_s = time.monotonic()
+        self._bytes = 0
+        self._shown: tuple[str, int] | None = None
+        gui = page.server.gui
+        with gui.add_folder("Fusion server", order=0):
+            self._layer: Any = gui.add_dropdown("Shown map", [_FUSED])
+            self._status = gui.add_html("")
+            self._refine = gui.add_button("Start refinement")
+            self._message = gui.add_html("")
+        with gui.add_folder("History", expand_by_default=False):
+            self._traffic = HistoryPlot(gui, "received (kB/s)", ["kB/s"])
+            self._size = HistoryPlot(gui, "fused Gaussians (1000)", ["thousand"])
+        self._refine.on_click(lambda _: self._run_refinement())
+
+    def poll(self) -> None:
+        """Read the server's status and draw what changed. Raises GaussLiteError."""
+        status = self._client.status()
+        self._show_status(status)
+        agents = [each.agent_id for each in status.agents]
+        layers = (_FUSED, *([_REFINED] if status.refined else []), *agents)
+        if layers != tuple(self._layer.options):
+            self._layer.options = layers
+        followed = self._follower.newest()
+        revision = status.fused_revision if followed is None else followed.revision
+        shown = (str(self._layer.value), revision)
+        if followed is None or shown == self._shown:
+            return
+        targets = {each.agent_id: tuple(each.targets) for each in status.agents}
+        contents = followed.contents(targets) if shown[0] == _FUSED else self._download(shown[0], targets)
+        objects = tuple(each.landmark for each in self._client.query_objects())
+        self._page.show(replace(contents, objects=objects))
+        self._shown = shown
+
+    def close(self) -> None:
+        """Close the client and end the follower."""
+        self._client.close()
+        self._follower.close()
+
+    def _download(self, layer: str, targets: dict[str, tuple[str, ...]]) -> ViewContents:
+        """Return the refined map, or all that one agent has sent."""
+        export = Export("refined") if layer == _REFINED else Export("concatenation", layer)
+        agent_id = "" if layer == _REFINED else layer
+        contents = ViewContents.of_one_agent(gaussians_from_ply(self._client.export(export)), agent_id)
+        return replace(contents, targets=targets.get(agent_id, ()))
+
+    def _show_status(self, status: Any) -> None:
+        now_s = time.monotonic()
+        received = sum(each.roi_bytes + each.handover_bytes for each in status.agents)
+        rate = max(0, received - self._bytes) / max(now_s - self._polled_s, 1e-3) / _KB
+        if self._bytes:
+            self._traffic.add(now_s - self._started_s, [rate])
+        self._size.add(now_s - self._started_s, [status.fused_gaussians / 1e3])
+        self._bytes, self._polled_s = received, now_s
+        lines = [
+            f"mission {status.mission_id or '(unnamed)'}: {status.fused_gaussians:,} Gaussians in "
+            f"{status.fused_voxels:,} voxels, {status.keyframes} keyframes",
+            *(
+                f"{each.agent_id}{'' if each.joined else ' (left)'}: wins {each.won_voxels:,} of {each.voxels:,} "
+                f"voxels, {(each.roi_bytes + each.handover_bytes) / 1e6:.1f} MB received"
+                for each in status.agents
+            ),
+        ]
+        self._status.content = text_html(lines)
+
+    def _run_refinement(self) -> None:
+        """Refine the fused map; runs on a thread of the page's server."""
+        self._refine.disabled = True
+        try:
+            for progress in self._client.refine():
+                self._message.content = text_html(
+                    [f"refinement: iteration {progress.iteration} of {progress.iterations}, loss {progress.loss:.4f}"]
+                )
+            self._message.content = text_html(["refinement complete: choose the refined map above"])
+        except GaussLiteError as error:
+            self._message.content = text_html([str(error)])
+        finally:
+            self._refine.disabled = False

@@ -1,0 +1,74 @@
+"""A page that follows a running service until it is closed."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+from gausslite.domain.errors import GaussLiteError, InvalidInputError
+from gausslite.view.level_of_detail import DEFAULT_LIMIT
+from gausslite.view.open_page import open_page
+from gausslite.wire.address import UNIX, host_and_port, require_callable
+from gausslite.wire.clients import AgentClient, FusionClient
+from gausslite.wire.tls import Tls
+
+if TYPE_CHECKING:
+    from gausslite.view.map_page import MapPage
+
+_POLL_S = 1.0
+_DEADLINE_S = 120.0
+_ANY_HOST = ("0.0.0.0", "[::]")  # noqa: S104  (recognised, not bound)
+
+
+@contextmanager
+def live_page(
+    port: int, address: str, is_agent: bool, tls: Tls | None = None, limit: int = DEFAULT_LIMIT
+) -> Iterator[str]:
+    """Serve the page of an agent or a fusion server, also one that starts later; yield the page's URL.
+
+    Raises InvalidInputError for an unusable address or port.
+    """
+    require_callable("view", address)
+    page = open_page(port, f"GaussLite {'agent' if is_agent else 'fusion server'}", limit)
+    stopped = threading.Event()
+    follower = threading.Thread(target=_follow, args=(page, address, is_agent, tls, stopped), daemon=True)
+    follower.start()
+    try:
+        yield page.url
+    finally:
+        stopped.set()
+        follower.join(_POLL_S * 5)
+        page.close()
+
+
+def own_address(listen: str) -> str:
+    """Return the address at which a process reaches its own service. Raises InvalidInputError for port 0."""
+    if listen.startswith(UNIX):
+        return listen
+    host, port = host_and_port("--listen", listen)
+    if port == 0:
+        raise InvalidInputError("--view: expected a fixed port in --listen, got 0")
+    return f"localhost:{port}" if host in _ANY_HOST else listen
+
+
+def _follow(page: MapPage, address: str, is_agent: bool, tls: Tls | None, stopped: threading.Event) -> None:
+    from gausslite.view.agent_panel import AgentPanel
+    from gausslite.view.fusion_panel import FusionPanel
+
+    panel: AgentPanel | FusionPanel
+    if is_agent:
+        panel = AgentPanel(page, AgentClient(address, _DEADLINE_S, tls))
+    else:
+        panel = FusionPanel(page, FusionClient(address, _DEADLINE_S, tls=tls))
+    poll: Callable[[], None] = panel.poll
+    try:
+        while not stopped.wait(_POLL_S):
+            try:
+                poll()
+                page.show_problem("")
+            except GaussLiteError as error:
+                page.show_problem(str(error))
+    finally:
+        panel.close()

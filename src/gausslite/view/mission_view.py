@@ -1,0 +1,112 @@
+"""Show a mission of this process on a page while it maps: the map, its keyframes, and the newest keyframe's region."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Bool, UInt8
+from numpy import ndarray
+
+from gausslite.codec.keyframe_views import KeyframeView
+from gausslite.domain.task import TaskGraph
+from gausslite.mapping.keyframes import Keyframe
+from gausslite.mission.task_mapper import FrameOutcome, TaskMapper
+from gausslite.process.messages import print_message
+from gausslite.view.contents import ViewContents
+from gausslite.view.history_plot import HistoryPlot
+from gausslite.view.open_page import open_page
+
+if TYPE_CHECKING:
+    from gausslite.view.map_page import MapPage
+
+_INTERVAL_S = 1.0
+_REGION_RGB = (255, 60, 60)
+_REGION_WEIGHT = 0.45
+_NS_PER_S = 1e9
+
+
+class MissionView:
+    """Draws at most once a second; call it from the thread that maps."""
+
+    def __init__(self, page: MapPage, mapper: TaskMapper, task_at: Callable[[int], TaskGraph | None]) -> None:
+        self._page, self._mapper, self._task_at = page, mapper, task_at
+        self._started_s = time.monotonic()
+        self._drawn_s = -_INTERVAL_S
+        self._image: Any = None
+        gui = page.server.gui
+        with gui.add_folder("Camera", order=0) as self._folder:
+            pass
+        with gui.add_folder("History", expand_by_default=False):
+            self._rate = HistoryPlot(gui, "mapping (Hz)", ["Hz"])
+            self._roi = HistoryPlot(gui, "pixels in the task's region (%)", ["ROI %"])
+
+    def update(self, outcome: FrameOutcome) -> None:
+        """Draw the map after a frame, if the last drawing is older than a second."""
+        now_s = time.monotonic()
+        if now_s - self._drawn_s < _INTERVAL_S or not outcome.gaussians:
+            return
+        self._drawn_s = now_s
+        keyframes = self._mapper.keyframes()
+        if keyframes:
+            self._show_image(keyframes[-1])
+        if outcome.timing.seconds > 0:
+            self._rate.add(now_s - self._started_s, [1 / outcome.timing.seconds])
+        self._roi.add(now_s - self._started_s, [100 * outcome.roi_share])
+        self._page.show(self._contents(outcome.index, keyframes))
+
+    def _contents(self, index: int, keyframes: list[Keyframe]) -> ViewContents:
+        graph, trajectory = self._task_at(index), self._mapper.poses.trajectory()
+        return replace(
+            ViewContents.of_one_agent(self._mapper.gaussians(), "this run"),
+            targets=() if graph is None else graph.targets,
+            objects=self._mapper.objects,
+            times_ns=np.round(trajectory.times_s * _NS_PER_S).astype(np.int64),
+            T_world_camera=trajectory.T_world_camera,
+            keyframes=[_view(each) for each in keyframes],
+        )
+
+    def _show_image(self, keyframe: Keyframe) -> None:
+        image = with_region(keyframe.frame.rgb, keyframe.relevance.roi)
+        if self._image is None:
+            with self._folder:
+                label = "Newest keyframe, the task's region in red"
+                self._image = self._page.server.gui.add_image(image, label=label, format="jpeg")
+        else:
+            self._image.image = image
+
+
+@contextmanager
+def mission_view(
+    port: int | None, mapper: TaskMapper, task_at: Callable[[int], TaskGraph | None]
+) -> Iterator[Callable[[FrameOutcome], None]]:
+    """Serve a page during a mission, none without a port; yield what to call after each frame.
+
+    Raises InvalidInputError for a port in use.
+    """
+    if port is None:
+        yield lambda _outcome: None
+        return
+    page = open_page(port, "GaussLite map")
+    try:
+        print_message(f"the page is at {page.url}")
+        yield MissionView(page, mapper, task_at).update
+    finally:
+        page.close()
+
+
+def with_region(rgb: UInt8[ndarray, "h w 3"], roi: Bool[ndarray, "h w"]) -> UInt8[ndarray, "h w 3"]:
+    """Return the image with the region in red."""
+    tinted = rgb.copy()
+    tinted[roi] = (1 - _REGION_WEIGHT) * rgb[roi] + _REGION_WEIGHT * np.array(_REGION_RGB)
+    return tinted
+
+
+def _view(keyframe: Keyframe) -> KeyframeView:
+    frame = keyframe.frame
+    pixels = int(np.count_nonzero(keyframe.relevance.roi))
+    return KeyframeView(frame.index, frame.capture_time_ns, frame.camera, frame.T_world_camera, pixels)

@@ -1,0 +1,59 @@
+"""The page of an agent in a real browser: its map appears, and a task assigned there arrives at the agent."""
+
+from __future__ import annotations
+
+import pytest
+from agent_running import TASK, agent
+from browser import open_browser
+from fusion_running import frame
+
+from gausslite.domain.errors import InvalidInputError
+from gausslite.view.live_page import live_page, own_address
+
+pytest.importorskip("viser")
+
+
+def test_a_task_from_the_page_arrives_and_the_mission_ends_from_it():
+    with agent() as running, open_browser() as browser, live_page(0, running.client.address, is_agent=True) as url:
+        tab = browser.new_page()
+        tab.goto(url)
+        tab.get_by_role("textbox").first.fill(TASK)
+        tab.get_by_role("textbox").first.blur()
+        tab.get_by_role("button", name="Assign task").click()
+        tab.get_by_text("assigned: targets mug").wait_for()
+        assert running.client.status().graph.text == TASK
+        report = next(running.client.ingest([frame(0)]))
+        assert report.gaussians > 0
+        tab.get_by_text(f"{report.gaussians:,} Gaussians", exact=True).wait_for()
+        tab.get_by_text("robot: mapping").wait_for()
+        tab.get_by_role("button", name="End mission").click()
+        tab.get_by_text("robot: ended").wait_for()
+
+
+def test_a_wrong_task_is_reported_on_the_page():
+    with agent() as running, open_browser() as browser, live_page(0, running.client.address, is_agent=True) as url:
+        tab = browser.new_page()
+        tab.goto(url)
+        tab.get_by_role("textbox").first.fill("<b>")
+        tab.get_by_role("textbox").first.blur()
+        tab.get_by_role("button", name="Assign task").click()
+        tab.get_by_text("'<b>'").wait_for()
+        assert not running.client.status().graph.text
+
+
+@pytest.mark.parametrize(
+    ("listen", "expected"),
+    [
+        ("unix:/tmp/agent.sock", "unix:/tmp/agent.sock"),
+        ("0.0.0.0:50053", "localhost:50053"),
+        ("[::]:50053", "localhost:50053"),
+        ("robot:50053", "robot:50053"),
+    ],
+)
+def test_the_own_address_can_be_called(listen, expected):
+    assert own_address(listen) == expected
+
+
+def test_a_service_with_a_random_port_has_no_page():
+    with pytest.raises(InvalidInputError, match="fixed port"):
+        own_address("127.0.0.1:0")
