@@ -21,7 +21,7 @@ PROGRAMS = {
 }
 SUB_COMMANDS = (
     *("map", "demo", "parse", "eval", "calibrate", "fuse", "export", "view"),
-    *("status", "end", "refine", "fetch", "objects"),
+    *("status", "end", "refine", "fetch", "evict", "unban", "objects"),
 )
 BENCHMARKS = (
     "raster",
@@ -32,6 +32,7 @@ BENCHMARKS = (
     "quality",
     "ablation",
     "budget",
+    "codec",
     "task-change",
     "team",
     "registration",

@@ -27,6 +27,8 @@ _COMMANDS = {
     "end": "end the mission of a running agent: send what waits, hand over, save",
     "refine": "refine the fused map of a running team",
     "fetch": "download the fused map of a running team",
+    "evict": "delete the data of an agent from a fusion server, and keep it out on request",
+    "unban": "let a banned agent join a fusion server again",
     "objects": "print where the objects of a task are, from a fusion server or from the report of a run",
     "models": "list, download, verify and inspect model files for detection and segmentation",
     "bench": "measure the rasterizer, the mapping loop, the GPU, map quality or a task parser",

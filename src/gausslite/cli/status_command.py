@@ -67,3 +67,5 @@ def _fusion_lines(status: Mapping[str, Any]) -> Iterator[str]:
             f"wins {agent['won_voxels']} of {agent['voxels']} voxels, {agent['keyframes']} keyframes; "
             f"received {agent['roi_bytes']} bytes of the task's region, {agent['handover_bytes']} of handovers"
         )
+    if status["banned_agents"]:
+        yield f"banned     {', '.join(status['banned_agents'])}"
