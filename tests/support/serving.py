@@ -7,18 +7,21 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+from gausslite.wire.call_limits import CallLimits
 from gausslite.wire.server import RunningServer, Service, start_server
 from gausslite.wire.tls import Tls
 
 
 @contextmanager
-def serving(services: list[Service], listen: str = "127.0.0.1:0", tls: Tls | None = None) -> Iterator[RunningServer]:
+def serving(
+    services: list[Service], listen: str = "127.0.0.1:0", tls: Tls | None = None, limits: CallLimits | None = None
+) -> Iterator[RunningServer]:
     """Start a server; it is drained at the end."""
     loop = asyncio.new_event_loop()
     thread = threading.Thread(target=loop.run_forever)
     thread.start()
     try:
-        running = asyncio.run_coroutine_threadsafe(start_server(listen, services, tls), loop).result(10)
+        running = asyncio.run_coroutine_threadsafe(start_server(listen, services, tls, limits), loop).result(10)
         try:
             yield running
         finally:

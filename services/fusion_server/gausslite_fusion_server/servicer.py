@@ -37,6 +37,7 @@ from gausslite.wire.convert import (
 )
 from gausslite.wire.convert_objects import object_to_message, report_from_message
 from gausslite.wire.convert_task import graph_from_message
+from gausslite.wire.rejection_log import RejectionLog
 from gausslite.wire.server import Service
 from gausslite_fusion_server.change_blocks import ChangeBlocks, WatchedPart
 from gausslite_fusion_server.contributions import (
@@ -80,6 +81,7 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         self._renderer = MapRenderer(engine, refinement_worker.create_rasterizer)
         self._map_changes = ChangeNotifier()
         self._gate = DrainGate()
+        self._rejections = RejectionLog(_log)
         # one map at a time is in memory
         self._exports = asyncio.Semaphore(1)
 
@@ -145,6 +147,8 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
             if not queued.put.done():
                 self._committer.submit(self._engine.commit_updates)
             outcome = await outcome_of(self._engine, queued)
+            if outcome.status == pb.SUBSET_STATUS_REJECTED:
+                self._rejections.record(caller.key, outcome.reason, outcome.message)
             self._map_changes.notify()
             self._align_in_background()
             acknowledged = max(acknowledged, request.sequence)

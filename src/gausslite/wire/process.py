@@ -3,12 +3,22 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import logging
 import sys
 from collections.abc import Awaitable, Callable
+from datetime import UTC, datetime
+from enum import StrEnum
 
 from gausslite.domain.errors import GaussLiteError
 from gausslite.process.messages import print_message, printable
+
+
+class LogFormat(StrEnum):
+    """How a service writes its log."""
+
+    TEXT = "text"
+    JSON = "json"
 
 
 class _OneLine(logging.Formatter):
@@ -19,11 +29,34 @@ class _OneLine(logging.Formatter):
         return " | ".join(printable(line) for line in super().format(record).splitlines())
 
 
-def log_to_stderr(program: str) -> None:
-    """Log records of level INFO and higher to stderr as `time program level message`."""
+class _JsonLine(logging.Formatter):
+    """Format a record as one JSON object; JSON escapes control characters."""
+
+    def __init__(self, program: str) -> None:
+        super().__init__()
+        self._program = program
+
+    def format(self, record: logging.LogRecord) -> str:
+        """Return time (UTC, ISO 8601), program, level, logger and message, and a traceback as `error`."""
+        values = {
+            "time": datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds"),
+            "program": self._program,
+            "level": record.levelname,
+            "logger": record.name,
+            "message": record.getMessage(),
+        }
+        if record.exc_info:
+            values["error"] = self.formatException(record.exc_info)
+        return json.dumps(values)
+
+
+def log_to_stderr(program: str, log_format: LogFormat = LogFormat.TEXT) -> None:
+    """Log records of level INFO and higher to stderr: `time program level message`, or a JSON object a line."""
     handler = logging.StreamHandler(sys.stderr)
-    handler.setFormatter(_OneLine(f"%(asctime)s {program} %(levelname)s %(message)s"))
-    logging.basicConfig(level=logging.INFO, handlers=[handler])
+    text = _OneLine(f"%(asctime)s {program} %(levelname)s %(message)s")
+    handler.setFormatter(text if log_format is LogFormat.TEXT else _JsonLine(program))
+    # JSON replaces the text that a service starts with
+    logging.basicConfig(level=logging.INFO, handlers=[handler], force=log_format is LogFormat.JSON)
 
 
 def run_service(program: str, serve: Callable[[], Awaitable[None]]) -> int:

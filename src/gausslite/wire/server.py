@@ -23,11 +23,14 @@ from grpc_reflection.v1alpha import reflection
 
 from gausslite.domain.errors import GaussLiteError, InvalidInputError, UnavailableError
 from gausslite.wire.address import UNIX, host_and_port
+from gausslite.wire.call_limits import CallLimits, CallUsage, limit_stream, wait_for_bandwidth
 from gausslite.wire.caller import Caller
 from gausslite.wire.connection import KEEPALIVE_S, connection_options
+from gausslite.wire.rejection_log import RejectionLog
 from gausslite.wire.roles import require_role
-from gausslite.wire.status import to_status
+from gausslite.wire.status import code_and_reason, to_status
 from gausslite.wire.tls import Tls
+from gausslite.wire.token_bucket import TokenBucket
 
 _log = logging.getLogger(__name__)
 # the longest path of a unix socket that Linux accepts
@@ -63,13 +66,19 @@ class RunningServer:
         await self._server.stop(grace_s)
 
 
-async def start_server(listen: str, services: Sequence[Service], tls: Tls | None = None) -> RunningServer:
+async def start_server(
+    listen: str, services: Sequence[Service], tls: Tls | None = None, limits: CallLimits | None = None
+) -> RunningServer:
     """Serve on HOST:PORT (port 0 = any free port) or unix:PATH, with health and reflection; encrypted with `tls`.
 
+    limits: of each caller, None for the default ones.
     Raises UnavailableError if the address is in use, InvalidInputError if it is not an address.
     """
     _require_free_address(listen)
-    server = grpc.aio.server(interceptors=[CallInterceptor()], options=_OPTIONS)
+    limits = limits or CallLimits()
+    server = grpc.aio.server(
+        interceptors=[CallInterceptor(CallUsage(limits))], options=(*_OPTIONS, *limits.connection_options)
+    )
     health_servicer = health.aio.HealthServicer()  # type: ignore[attr-defined]
     health_pb2_grpc.add_HealthServicer_to_server(health_servicer, server)
     for service in services:
@@ -98,6 +107,7 @@ async def serve_until_stopped(
     services: Sequence[Service],
     background_task: Callable[[], Awaitable[None]] | None = None,
     tls: Tls | None = None,
+    limits: CallLimits | None = None,
     grace_s: float = 5.0,
 ) -> None:
     """Serve until SIGTERM or SIGINT, or until the background task ends; then drain the server. Logs the address.
@@ -108,7 +118,7 @@ async def serve_until_stopped(
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, stopping.set)
-    running = await start_server(listen, services, tls)
+    running = await start_server(listen, services, tls, limits)
     service_names = ", ".join(service.name for service in services)
     _log.info("%s listening on %s%s", service_names, running.address, "" if tls is None else ", encrypted")
     waits: list[asyncio.Future[Any]] = [asyncio.ensure_future(stopping.wait())]
@@ -131,10 +141,14 @@ async def serve_until_stopped(
 
 
 class CallInterceptor(grpc.aio.ServerInterceptor):  # type: ignore[type-arg]
-    """Check the caller's role, and end a call with the status of the error that its method raised.
+    """Check the caller's role and limits, and end a call with the status of the error that its method raised.
 
     Unexpected errors are INTERNAL and logged.
     """
+
+    def __init__(self, usage: CallUsage) -> None:
+        self._usage = usage
+        self._rejections = RejectionLog(_log)
 
     async def intercept_service(
         self,
@@ -148,7 +162,7 @@ class CallInterceptor(grpc.aio.ServerInterceptor):  # type: ignore[type-arg]
             return handler
         # requests are decoded inside the guard, because gRPC itself would answer UNKNOWN to an invalid message
         message_codecs = {"request_deserializer": None, "response_serializer": handler.response_serializer}
-        decode = _decoder(handler.request_deserializer, method, handler.request_streaming)
+        guard = _Guard(method, self._usage, self._rejections, handler.request_deserializer, handler.request_streaming)
         if handler.response_streaming:
             inner = handler.stream_stream if handler.request_streaming else handler.unary_stream
             make = (
@@ -156,59 +170,78 @@ class CallInterceptor(grpc.aio.ServerInterceptor):  # type: ignore[type-arg]
                 if handler.request_streaming
                 else grpc.unary_stream_rpc_method_handler
             )
-            return make(_guard_stream(inner, decode, method), **message_codecs)
+            return make(guard.stream_method(inner), **message_codecs)
         inner = handler.stream_unary if handler.request_streaming else handler.unary_unary
         make = (
             grpc.stream_unary_rpc_method_handler if handler.request_streaming else grpc.unary_unary_rpc_method_handler
         )
-        return make(_guard_unary(inner, decode, method), **message_codecs)
+        return make(guard.unary_method(inner), **message_codecs)
 
 
-def _decoder(deserialize: Callable[[bytes], Any], method: str, streaming: bool) -> Callable[[Any], Any]:
-    def decode_one(data: bytes) -> Any:
-        try:
-            return deserialize(data)
-        except DecodeError as error:
-            raise InvalidInputError(f"{method}: expected its request message, got {len(data)} invalid bytes") from error
+@dataclass(frozen=True, slots=True)
+class _Guard:
+    """Runs one method of a servicer for callers that may call it, within their limits."""
 
-    async def decode_stream(stream: AsyncIterator[bytes]) -> AsyncIterator[Any]:
-        async for data in stream:
-            yield decode_one(data)
+    method: str
+    usage: CallUsage
+    rejections: RejectionLog
+    deserialize: Callable[[bytes], Any]
+    request_streaming: bool
 
-    return decode_stream if streaming else decode_one
+    def unary_method(self, inner: Any) -> Any:
+        async def guarded(request: Any, context: Any) -> Any:
+            try:
+                caller = Caller.of(context)
+                require_role(self.method, caller)
+                with self.usage.open_call(caller) as bandwidth:
+                    return await inner(await self._admit(request, bandwidth), context)
+            except Exception as error:
+                await self._abort(error, context)
 
+        return guarded
 
-def _guard_unary(inner: Any, decode: Callable[[Any], Any], method: str) -> Any:
-    async def guarded(request: Any, context: Any) -> Any:
-        try:
-            require_role(method, Caller.of(context))
-            return await inner(decode(request), context)
-        except Exception as error:
-            await _abort(error, method, context)
+    def stream_method(self, inner: Any) -> Any:
+        async def guarded(request: Any, context: Any) -> AsyncIterator[Any]:
+            try:
+                caller = Caller.of(context)
+                require_role(self.method, caller)
+                with self.usage.open_call(caller) as bandwidth:
+                    async for response in inner(await self._admit(request, bandwidth), context):
+                        yield response
+            except Exception as error:
+                await self._abort(error, context)
 
-    return guarded
+        return guarded
 
+    async def _admit(self, request: Any, bandwidth: TokenBucket | None) -> Any:
+        """Return the decoded request or stream of requests, at the caller's bandwidth. Raises InvalidInputError."""
+        if self.request_streaming:
+            return self._decode_stream(limit_stream(request, bandwidth))
+        await wait_for_bandwidth(bandwidth, len(request))
+        return self._decode(request)
 
-def _guard_stream(inner: Any, decode: Callable[[Any], Any], method: str) -> Any:
-    async def guarded(request: Any, context: Any) -> AsyncIterator[Any]:
-        try:
-            require_role(method, Caller.of(context))
-            async for response in inner(decode(request), context):
-                yield response
-        except Exception as error:
-            await _abort(error, method, context)
-
-    return guarded
-
-
-async def _abort(error: Exception, method: str, context: Any) -> NoReturn:
-    if isinstance(error, grpc.aio.AbortError):
+    async def _abort(self, error: Exception, context: Any) -> NoReturn:
+        if isinstance(error, grpc.aio.AbortError):
+            raise error
+        if not isinstance(error, GaussLiteError):
+            _log.error("%s failed: %s: %s", self.method, type(error).__name__, error, exc_info=error)
+            error = GaussLiteError(f"{self.method}: unexpected error in the server; see its log")
+        elif not isinstance(error, UnavailableError):
+            self.rejections.record(Caller.of(context).key, code_and_reason(error)[1], str(error))
+        await context.abort_with_status(to_status(error))
         raise error
-    if not isinstance(error, GaussLiteError):
-        _log.error("%s failed: %s: %s", method, type(error).__name__, error, exc_info=error)
-        error = GaussLiteError(f"{method}: unexpected error in the server; see its log")
-    await context.abort_with_status(to_status(error))
-    raise error
+
+    async def _decode_stream(self, requests: AsyncIterator[bytes]) -> AsyncIterator[Any]:
+        async for data in requests:
+            yield self._decode(data)
+
+    def _decode(self, data: bytes) -> Any:
+        try:
+            return self.deserialize(data)
+        except DecodeError as error:
+            raise InvalidInputError(
+                f"{self.method}: expected its request message, got {len(data)} invalid bytes"
+            ) from error
 
 
 def _require_free_address(listen: str) -> None:

@@ -23,6 +23,13 @@ class TokenBucket:
         self._bytes, self._filled_s = min(self._bytes + added, self._bytes_per_s * _BURST_S), now_s
         return max(0.0, -self._bytes / self._bytes_per_s)
 
+    def is_full(self, now_s: float) -> bool:
+        """Return whether nothing has been spent that is not filled up again."""
+        if self._bytes_per_s is None:
+            return True
+        self.seconds_until_positive(now_s)
+        return self._bytes >= self._bytes_per_s * _BURST_S
+
     def available_bytes(self, limit: int) -> int:
         """Return the number of bytes that may be sent now, from 1 to the limit."""
         return limit if self._bytes_per_s is None else max(1, min(limit, int(self._bytes)))
