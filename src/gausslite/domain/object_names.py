@@ -17,12 +17,13 @@ FURNITURE: Final = frozenset(
      "bed", "shelf", "bookshelf", "bookcase", "cabinet", "cupboard", "dresser", "wardrobe", "closet", "sideboard",
      "refrigerator", "fridge", "freezer", "oven", "stove", "dishwasher", "sink", "toilet", "bathtub", "door", "window",
      "wall", "floor", "rug", "carpet", "car", "truck", "bus", "van", "boat", "train", "airplane", "tree", "person",
-     "piano", "workbench", "nightstand", "ottoman", "television", "tv", "whiteboard", "curtain", "fence", "gate"}
+     "plant", "houseplant", "piano", "workbench", "nightstand", "ottoman",
+     "television", "tv", "whiteboard", "curtain", "fence", "gate"}
 )  # fmt: skip
-# furniture and plants that are hardly larger than a person's arm span
+# furniture and appliances of about a metre
 MEDIUM: Final = frozenset(
     {"chair", "armchair", "stool", "nightstand", "ottoman", "toilet", "sink", "oven", "stove", "dishwasher", "tv",
-     "television", "monitor", "plant", "houseplant", "suitcase", "lamp"}
+     "television", "monitor", "suitcase", "lamp"}
 )  # fmt: skip
 # objects that may fill most of an image
 SURFACE: Final = frozenset(
@@ -97,7 +98,7 @@ def is_surface(phrase: str) -> bool:
 
 
 def is_medium(phrase: str) -> bool:
-    """Return True for chairs, plants, televisions and other objects of about a metre."""
+    """Return True for chairs, televisions and other objects of about a metre."""
     return head_of(phrase) in MEDIUM
 
 
