@@ -27,13 +27,15 @@ def test_a_near_object_may_fill_the_image_and_a_far_one_may_not():
     limits = BoxSizeLimits()
     assert limits.accepts("mug", 0.5, WHOLE_IMAGE, frame_at(0.4))
     assert not limits.accepts("mug", 0.5, WHOLE_IMAGE, frame_at(1.0))
-    assert limits.accepts("chair", 0.5, WHOLE_IMAGE, frame_at(1.0))
+    assert limits.accepts("chair", 0.5, WHOLE_IMAGE, frame_at(0.5))
+    assert not limits.accepts("chair", 0.5, WHOLE_IMAGE, frame_at(1.0))
+    assert limits.accepts("couch", 0.5, WHOLE_IMAGE, frame_at(1.0))
     assert limits.accepts("table", 0.5, WHOLE_IMAGE, frame_at(2.5))
     assert not limits.accepts("wardrobe", 0.5, WHOLE_IMAGE, frame_at(2.5))
 
 
 def test_a_confident_detection_may_be_larger():
-    accepted = [BoxSizeLimits().accepts("monitor", score, WHOLE_IMAGE, frame_at(0.6)) for score in (0.3, 0.6, 0.8)]
+    accepted = [BoxSizeLimits().accepts("monitor", score, WHOLE_IMAGE, frame_at(0.7)) for score in (0.3, 0.6, 0.8)]
     assert accepted == [False, False, True]
 
 
