@@ -1,13 +1,14 @@
 """Write a sequence in TUM layout as a ROS bag: python tools/write_bag.py FOLDER run1.bag (or run1.mcap, or run1).
 
 The bag has the folder's images, poses and camera without any loss, so mapping it gives the same map, bit for bit. A
-folder name without ending gives a ROS 2 bag with SQLite; NAME.mcap gives one with MCAP in the folder NAME.
+name without ending gives the folder of a ROS 2 bag with SQLite.
 """
 
 from __future__ import annotations
 
 import argparse
 import contextlib
+import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from decimal import Decimal
@@ -44,14 +45,21 @@ class BagWriter:
     @classmethod
     @contextlib.contextmanager
     def open(cls, path: Path) -> Iterator[BagWriter]:
-        """Open a new bag: NAME.bag of ROS 1, NAME.mcap (in the folder NAME) or the folder NAME of ROS 2."""
+        """Open a new bag: the file NAME.bag of ROS 1, the file NAME.mcap or the folder NAME of ROS 2."""
+        if path.exists():
+            raise SystemExit(f"{path}: expected the name of a new bag, got one that exists")
         if path.suffix == ".bag":
             with Writer1(path) as writer:
                 yield cls(writer, ros1=True)
             return
-        plugin = StoragePlugin.MCAP if path.suffix == ".mcap" else StoragePlugin.SQLITE3
-        with Writer2(path.with_suffix(""), version=9, storage_plugin=plugin) as writer:
-            yield cls(writer, ros1=False)
+        if path.suffix != ".mcap":
+            with Writer2(path, version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
+                yield cls(writer, ros1=False)
+            return
+        with tempfile.TemporaryDirectory(dir=path.parent) as folder:
+            with Writer2(Path(folder) / path.stem, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+                yield cls(writer, ros1=False)
+            (Path(folder) / path.stem / path.name).rename(path)
 
     def write(self, topic: str, message_type: str, time_ns: int, fields: dict[str, Any]) -> None:
         """Write one message; nested messages are dictionaries, and names of fields are those of ROS 2."""
@@ -189,12 +197,12 @@ def _write_colour(bag: BagWriter, time_ns: int, file: Path, compressed: bool) ->
         }
         bag.write(f"{COLOUR}/image_raw/compressed", "sensor_msgs/msg/CompressedImage", time_ns, fields)
         return
-    pixels = cv2.imread(str(file), cv2.IMREAD_COLOR)
+    pixels = _read_image(file, cv2.IMREAD_COLOR)
     bag.write(f"{COLOUR}/image_raw", "sensor_msgs/msg/Image", time_ns, image(time_ns, COLOUR_FRAME, "bgr8", pixels))
 
 
 def _write_depth(bag: BagWriter, time_ns: int, file: Path, units_per_metre: float, compressed: bool) -> None:
-    raw = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+    raw = _read_image(file, cv2.IMREAD_UNCHANGED)
     topic = "/camera/aligned_depth_to_color/image_raw"
     if units_per_metre != 1000.0:
         metres = raw.astype(np.float32) / np.float32(units_per_metre)
@@ -209,6 +217,13 @@ def _write_depth(bag: BagWriter, time_ns: int, file: Path, units_per_metre: floa
     bag.write(topic, "sensor_msgs/msg/Image", time_ns, fields)
 
 
+def _read_image(file: Path, flags: int) -> np.ndarray:
+    pixels = cv2.imread(str(file), flags)
+    if pixels is None:
+        raise SystemExit(f"{file}: expected an image")
+    return pixels
+
+
 def _nanoseconds(seconds: str) -> int:
     return int(Decimal(seconds) * 10**9)
 
@@ -217,7 +232,7 @@ def main() -> None:
     """Convert the folder of the command line."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path, help="a sequence in TUM layout with a camera file")
-    parser.add_argument("bag", type=Path, help="NAME.bag (ROS 1), NAME.mcap or NAME (ROS 2)")
+    parser.add_argument("bag", type=Path, help="NAME.bag (ROS 1), NAME.mcap or the folder NAME (ROS 2)")
     parser.add_argument("--compressed", action="store_true", help="compressed images instead of raw ones")
     options = parser.parse_args()
     write_tum_bag(options.folder, options.bag, options.compressed)
