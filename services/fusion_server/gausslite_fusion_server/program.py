@@ -13,9 +13,10 @@ from gausslite.fusion.memory_store import MemoryStore
 from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.fusion.store import FusionStore
 from gausslite.wire.convert import decode_frame
-from gausslite.wire.process import run_service
+from gausslite.wire.process import LogFormat, log_to_stderr, run_service
 from gausslite.wire.server import serve_until_stopped
 from gausslite_fusion_server.maintenance import COMMANDS, run_command
+from gausslite_fusion_server.metrics import metrics_server
 from gausslite_fusion_server.refinement_worker import RefinementWorker
 from gausslite_fusion_server.servicer import FusionServicer
 from gausslite_fusion_server.settings import ServerSettings, parse_arguments
@@ -34,6 +35,8 @@ def run(arguments: Sequence[str] | None = None) -> int:
 
     async def serve() -> None:
         settings = parse_arguments(arguments)
+        if settings.log_format is LogFormat.JSON:
+            log_to_stderr(_PROGRAM, LogFormat.JSON)
         with contextlib.closing(_open_store(settings)) as store:
             await _serve(settings, store)
 
@@ -58,6 +61,9 @@ async def _serve(settings: ServerSettings, store: FusionStore) -> None:
             servicer.drain()
 
     try:
-        await serve_until_stopped(settings.listen, [servicer.service()], drain_when_stopping, settings.tls)
+        with metrics_server(settings.metrics, engine):
+            await serve_until_stopped(
+                settings.listen, [servicer.service()], drain_when_stopping, settings.tls, settings.limits
+            )
     finally:
         servicer.close()

@@ -16,6 +16,8 @@ from gausslite.fusion.frame_alignment import AlignmentSettings
 from gausslite.fusion.joint_refinement import RefineSettings
 from gausslite.fusion.limits import MAX_REFINE_ITERATIONS, FusionSettings, Quotas, VoteRule
 from gausslite.process.messages import print_message
+from gausslite.wire.call_limits import CallLimits
+from gausslite.wire.process import LogFormat
 from gausslite.wire.tls import Tls
 
 MEMORY = "memory"
@@ -34,6 +36,9 @@ class ServerSettings:
     refine: RefineSettings = field(default_factory=RefineSettings)
     rasterizer: str = "auto"
     tls: Tls | None = None
+    limits: CallLimits = field(default_factory=CallLimits)
+    log_format: LogFormat = LogFormat.TEXT
+    metrics: str | None = None
 
 
 def parse_arguments(arguments: Sequence[str] | None = None) -> ServerSettings:
@@ -61,6 +66,9 @@ def parse_arguments(arguments: Sequence[str] | None = None) -> ServerSettings:
         RefineSettings(iterations=options.refine_iterations),
         options.rasterizer,
         read_server_tls(options),
+        CallLimits(options.limit_calls, options.limit_kbps, options.limit_connections, options.limit_idle),
+        LogFormat(options.log_format),
+        options.metrics,
     )
 
 
@@ -108,5 +116,26 @@ def _parser() -> argparse.ArgumentParser:
         help="iterations of joint refinement if a request states none (default: %(default)s)",
     )
     add_rasterizer(add, "backend of the refinement")
+    limits = defaults.limits
+    for name, default, metavar, meaning in (
+        ("calls", limits.calls, "N", "number of open calls of one caller"),
+        ("kbps", limits.kbps, "KBPS", "bandwidth of one caller's requests, in kilobits per second"),
+        ("connections", limits.connections, "N", "number of connections"),
+        ("idle", limits.idle_s, "S", "time of a connection without a call, in seconds"),
+    ):
+        add(
+            f"--limit-{name}",
+            type=int,
+            default=default,
+            metavar=metavar,
+            help=f"largest {meaning} (default: %(default)s)",
+        )
+    add(
+        "--log-format",
+        choices=[str(each) for each in LogFormat],
+        default=str(LogFormat.TEXT),
+        help="lines of the log (default: %(default)s)",
+    )
+    add("--metrics", metavar="HOST:PORT", help="serve figures for Prometheus there over HTTP (default: no)")
     add_tls(parser)
     return parser

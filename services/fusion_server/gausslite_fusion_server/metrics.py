@@ -1,0 +1,96 @@
+"""Serve the figures of a mission to Prometheus over HTTP, for `--metrics` (the extra metrics)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any, NamedTuple
+
+from gausslite.domain.errors import InvalidInputError, UnavailableError
+from gausslite.fusion.engine import FusionEngine
+from gausslite.fusion.traffic import AgentContribution
+from gausslite.wire.address import host_and_port
+
+
+class _AgentMetric(NamedTuple):
+    name: str
+    help_text: str
+    is_counter: bool
+    value: Callable[[AgentContribution], float]
+
+
+_OF_AGENTS = (
+    _AgentMetric("joined", "1 while the agent has a session", False, lambda each: each.joined),
+    _AgentMetric("voxels", "voxels that the agent has contributed", False, lambda each: each.voxels),
+    _AgentMetric("gaussians", "Gaussians that the agent has contributed", False, lambda each: each.gaussians),
+    _AgentMetric("won_voxels", "voxels of the fused map that the agent won", False, lambda each: each.won_voxels),
+    _AgentMetric("keyframes", "stored keyframes of the agent", False, lambda each: each.keyframes),
+    _AgentMetric(
+        "last_seen_seconds",
+        "time of the last message since the epoch",
+        False,
+        lambda each: each.traffic.last_seen_ns / 1e9,
+    ),
+    _AgentMetric("roi_bytes", "received bytes of the task's region", True, lambda each: each.traffic.roi_bytes),
+    _AgentMetric("handover_bytes", "received bytes of handovers", True, lambda each: each.traffic.handover_bytes),
+    _AgentMetric("subsets_accepted", "messages stored", True, lambda each: each.traffic.subsets_accepted),
+    _AgentMetric("subsets_stale", "messages without news", True, lambda each: each.traffic.subsets_stale),
+    _AgentMetric("subsets_rejected", "messages refused", True, lambda each: each.traffic.subsets_rejected),
+)
+
+
+class MissionCollector:
+    """Reads the figures when Prometheus asks for them; counters start at 0 with the server."""
+
+    def __init__(self, engine: FusionEngine) -> None:
+        self._engine = engine
+
+    def collect(self) -> Iterator[Any]:
+        """Yield the metrics of the mission and of each agent; the label `agent` is the agent's id."""
+        from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
+
+        status = self._engine.status()
+        for name, help_text, value in (
+            ("revision", "revision of the fused map", status.revision),
+            ("fused_voxels", "voxels of the fused map", status.fused_voxels),
+            ("fused_gaussians", "Gaussians of the fused map", status.fused_gaussians),
+            ("stored_keyframes", "keyframes of all agents", status.keyframes),
+            ("banned_agents", "names that operators have banned", len(status.banned_agents)),
+        ):
+            yield GaugeMetricFamily(f"gausslite_fusion_{name}", help_text, value=value)
+        for metric in _OF_AGENTS:
+            kind = CounterMetricFamily if metric.is_counter else GaugeMetricFamily
+            family = kind(f"gausslite_agent_{metric.name}", metric.help_text, labels=["agent"])
+            for agent in status.agents:
+                family.add_metric([agent.agent_id], metric.value(agent))
+            yield family
+
+
+@contextmanager
+def metrics_server(address: str | None, engine: FusionEngine) -> Iterator[int]:
+    """Serve /metrics on HOST:PORT while the context is open, with the figures of the process; gives the actual port.
+
+    None serves nothing and gives 0. Raises InvalidInputError without prometheus-client or for another address,
+    UnavailableError if the address is in use.
+    """
+    if address is None:
+        yield 0
+        return
+    host, port = host_and_port("--metrics", address)
+    try:
+        from prometheus_client import CollectorRegistry, ProcessCollector, start_http_server
+    except ImportError as error:
+        raise InvalidInputError("--metrics: needs prometheus-client; pip install 'gausslite[metrics]'") from error
+    registry = CollectorRegistry()
+    ProcessCollector(registry=registry)
+    registry.register(MissionCollector(engine))
+    try:
+        server, thread = start_http_server(port, host.strip("[]"), registry)
+    except OSError as error:
+        raise UnavailableError(f"--metrics {address}: {error.strerror or error}; choose another address") from error
+    try:
+        yield server.server_port
+    finally:
+        server.shutdown()
+        server.server_close()
+        thread.join()
