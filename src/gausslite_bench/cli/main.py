@@ -14,6 +14,7 @@ from gausslite_bench.cli.perception import configure_perception
 from gausslite_bench.cli.quality import configure_ablation, configure_quality
 from gausslite_bench.cli.raster import configure_raster
 from gausslite_bench.cli.registration import configure_registration
+from gausslite_bench.cli.server import configure_server
 from gausslite_bench.cli.task_change import configure_task_change
 from gausslite_bench.cli.team import configure_team
 
@@ -29,6 +30,12 @@ _BENCHMARKS: dict[str, tuple[Callable[[argparse.ArgumentParser], None], str, str
         "speed and memory of one agent's mapping loop on a sequence",
         "Map a sequence and report latency percentiles of each stage, the frame rate and the memory use. Optionally "
         "measure the quality lost to a frame rate (--unlimited).",
+    ),
+    "server": (
+        configure_server,
+        "largest team, memory and times of a fusion server by the size of its map",
+        "Fill a fusion server with synthetic updates, and measure acknowledgements of agents that send at 4 Hz, the "
+        "snapshot, the status, a restart and the memory.",
     ),
     "gpu": (
         configure_gpu,

@@ -1,0 +1,88 @@
+"""`gausslite bench server`: the fusion server under the load of many agents."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Iterator
+from dataclasses import asdict
+
+from tqdm import tqdm
+
+from gausslite.config.switches import add_switch
+from gausslite.domain.errors import InvalidInputError
+from gausslite_bench.server.agent_load import LoadResult
+from gausslite_bench.server.bench import P99_LIMIT_MS, HeldResult, ServerBenchSettings, measure
+from gausslite_bench.server.running_server import DEFAULT_COMMAND
+
+
+def configure_server(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `bench server`."""
+    add = parser.add_argument
+    add("--held", default="0,1000000", metavar="N,N", help="Gaussians that the server holds (default: %(default)s)")
+    add("--agents", default="8,16,32,64", metavar="N,N", help="agents that send at 4 Hz (default: %(default)s)")
+    add("--seconds", type=float, default=10.0, metavar="S", help="duration of each load (default: %(default)s)")
+    add("--store", choices=["sqlite", "memory"], default="sqlite", help="store of the server (default: %(default)s)")
+    add("--watchers", type=int, default=20, metavar="N", help="watchers that stop reading (default: %(default)s)")
+    add("--server", default=DEFAULT_COMMAND, metavar="COMMAND", help="starts the server, to compare versions")
+    add_switch(parser, "--hostile", "also measure 8 agents beside one that resends a message of 200000 tombstones")
+    add_switch(parser, "--json", "print JSON for scripts")
+    parser.set_defaults(run=run_server)
+
+
+def run_server(options: argparse.Namespace) -> int:
+    """Measure a server for each number of Gaussians held."""
+    if not options.seconds > 0:
+        raise InvalidInputError(f"--seconds: expected more than 0, got {options.seconds:g}")
+    settings = ServerBenchSettings(
+        _numbers("--held", options.held, 0),
+        _numbers("--agents", options.agents, 1),
+        options.seconds,
+        options.server,
+        options.store,
+        options.watchers,
+        options.hostile,
+    )
+    with tqdm(total=len(settings.held), unit="server", disable=None, leave=False) as progress:
+        results = []
+        for held in settings.held:
+            results.append(measure(settings, held, progress.set_description))
+            progress.update()
+            if not options.json:
+                progress.write("\n".join(_lines(results[-1])))
+    if options.json:
+        sys.stdout.write(json.dumps(list(map(_values, results)), indent=1) + "\n")
+    return 0
+
+
+def _numbers(name: str, text: str, least: int) -> list[int]:
+    try:
+        numbers = [int(each) for each in text.split(",")]
+    except ValueError:
+        numbers = []
+    if not numbers or min(numbers) < least:
+        raise InvalidInputError(f"{name}: expected whole numbers of at least {least} between commas, got {text!r}")
+    return numbers
+
+
+def _values(result: HeldResult) -> dict[str, object]:
+    return asdict(result) | {"largest_team": result.largest_team}
+
+
+def _lines(result: HeldResult) -> Iterator[str]:
+    yield f"{result.held} Gaussians held (filled in {result.fill_s:.1f} s)"
+    yield f"  largest team with p99 < {P99_LIMIT_MS:g} ms: {result.largest_team} agents"
+    for load in result.loads:
+        yield f"{_load_line(load)}, server {load.server_cpu_ms:.1f} ms of CPU per message"
+    if result.hostile is not None:
+        yield f"{_load_line(result.hostile)}, beside a hostile agent"
+    yield (
+        f"  snapshot {result.snapshot_s:.2f} s, status {result.status_ms:.1f} ms, restart {result.restart_s:.1f} s, "
+        f"memory {result.rss_mib:.0f} MiB, watchers that do not read {result.watchers_mib:.0f} MiB"
+    )
+
+
+def _load_line(load: LoadResult) -> str:
+    times = f"p50 {load.p50_ms:.1f} ms, p99 {load.p99_ms:.1f} ms"
+    return f"  {load.agents} agents: {times}, {load.missing} of {load.messages} not acknowledged"

@@ -1,0 +1,1 @@
+"""Benchmark of the fusion server under the load of many agents."""

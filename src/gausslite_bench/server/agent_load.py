@@ -1,0 +1,125 @@
+"""Send updates at a fixed rate from many agents, and measure the time to each acknowledgement."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import AsyncIterator, Sequence
+from dataclasses import dataclass
+
+import grpc
+import numpy as np
+
+from gausslite.v1 import fusion_service_pb2 as pb
+from gausslite.v1 import fusion_service_pb2_grpc as pb_grpc
+from gausslite.wire.clients import FusionClient
+from gausslite_bench.server.synthetic_updates import GRID, delta_messages, fill_messages, tombstone_message
+
+RATE_HZ = 4.0
+HOSTILE_TOMBSTONES = 200_000
+_FILL_AGENTS = 16
+_TOKEN = "bench"  # noqa: S105 - the same in all loads, so that the agents can join again
+_SETTLE_S = 60.0
+"""Acknowledgements later than this after the last message are counted as missing."""
+
+
+@dataclass(frozen=True, slots=True)
+class LoadResult:
+    """Acknowledgement times of one load; missing: messages that were not acknowledged.
+
+    server_cpu_ms: processor time of the server per message, which other programs on the machine hardly change.
+    """
+
+    agents: int
+    messages: int
+    p50_ms: float
+    p99_ms: float
+    missing: int
+    server_cpu_ms: float = float("nan")
+
+
+class AgentLoad:
+    """Joins agents and sends their messages. Sequence numbers continue from one load to the next."""
+
+    def __init__(self, address: str) -> None:
+        self._address = address
+        self._next_seq = 1
+
+    def fill(self, gaussians: int, gaussians_per_voxel: int) -> None:
+        """Store this many Gaussians, from _FILL_AGENTS agents."""
+        voxels = gaussians // gaussians_per_voxel // _FILL_AGENTS
+        if not voxels:
+            return
+        with FusionClient(self._address, deadline_s=600.0) as client:
+            for number in range(_FILL_AGENTS):
+                agent_id = f"fill-{number}"
+                session_id = client.join(agent_id, GRID).session_id
+                for sequence, data in enumerate(fill_messages(agent_id, 200_000 + number * voxels, voxels), start=1):
+                    request = pb.ContributeSubsetsRequest(session_id=session_id, sequence=sequence, subset=data)
+                    for response in client.contribute([request], 600.0):
+                        assert response.outcomes[0].status == pb.SUBSET_STATUS_ACCEPTED, response
+
+    def run(self, agents: int, seconds: float, hostile: bool = False) -> LoadResult:
+        """Send deltas from these agents; hostile: one more agent resends a message of 200 000 tombstones."""
+        count = max(int(seconds * RATE_HZ), 1)
+        names = [f"load-{number}" for number in range(agents)]
+        with FusionClient(self._address, deadline_s=60.0, token=_TOKEN) as client:
+            sessions = [client.join(name, GRID).session_id for name in names]
+            hostile_session = client.join("hostile", GRID).session_id if hostile else ""
+        messages = [delta_messages(name, number, count, self._next_seq) for number, name in enumerate(names)]
+        self._next_seq += count
+        times_s, missing = asyncio.run(self._send(sessions, messages, hostile_session))
+        p50, p99 = np.percentile(times_s or [np.inf], [50, 99]) * 1000
+        return LoadResult(agents, agents * count, float(p50), float(p99), missing)
+
+    async def _send(
+        self, sessions: Sequence[str], messages: Sequence[Sequence[bytes]], hostile_session: str
+    ) -> tuple[list[float], int]:
+        times_s: list[float] = []
+        async with grpc.aio.insecure_channel(self._address) as channel:
+            stub = pb_grpc.FusionServiceStub(channel)
+            hostile = asyncio.ensure_future(self._resend(stub, hostile_session)) if hostile_session else None
+            begin_s = time.monotonic() + 0.5
+            tasks = [
+                asyncio.ensure_future(
+                    _send_agent(stub, session, own, begin_s + number / len(sessions) / RATE_HZ, times_s)
+                )
+                for number, (session, own) in enumerate(zip(sessions, messages, strict=True))
+            ]
+            duration_s = len(messages[0]) / RATE_HZ
+            _, late = await asyncio.wait(tasks, timeout=duration_s + _SETTLE_S)
+            for task in (*late, *([hostile] if hostile else [])):
+                task.cancel()
+            await asyncio.gather(*tasks, *([hostile] if hostile else []), return_exceptions=True)
+        return times_s, sum(map(len, messages)) - len(times_s)
+
+    async def _resend(self, stub: pb_grpc.FusionServiceAsyncStub, session_id: str) -> None:
+        data = tombstone_message("hostile", HOSTILE_TOMBSTONES, self._next_seq)
+
+        async def requests() -> AsyncIterator[pb.ContributeSubsetsRequest]:
+            sequence = 0
+            while True:
+                sequence += 1
+                yield pb.ContributeSubsetsRequest(session_id=session_id, sequence=sequence, subset=data)
+
+        async for _ in stub.ContributeSubsets(requests()):
+            pass
+
+
+async def _send_agent(
+    stub: pb_grpc.FusionServiceAsyncStub,
+    session_id: str,
+    messages: Sequence[bytes],
+    begin_s: float,
+    times_s: list[float],
+) -> None:
+    """Send one message each period; a time counts from when the message was due, also if the one before was late."""
+    # without an iterator, the caller writes
+    call = stub.ContributeSubsets()  # type: ignore[call-arg]
+    for index, data in enumerate(messages):
+        due_s = begin_s + index / RATE_HZ
+        await asyncio.sleep(max(0.0, due_s - time.monotonic()))
+        await call.write(pb.ContributeSubsetsRequest(session_id=session_id, sequence=index + 1, subset=data))
+        await call.read()
+        times_s.append(time.monotonic() - due_s)
+    await call.done_writing()

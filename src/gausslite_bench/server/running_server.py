@@ -1,0 +1,76 @@
+"""Start a fusion server as its own process, and read its time to start and its memory."""
+
+from __future__ import annotations
+
+import os
+import shlex
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import grpc
+
+from gausslite.domain.errors import UnavailableError
+
+DEFAULT_COMMAND = f"{shlex.quote(sys.executable)} -m gausslite_fusion_server"
+_START_LIMIT_S = 300.0
+_QUOTAS = (
+    *("--quota-agents", "1000", "--quota-voxels", "20000000", "--quota-gaussians", "500000000"),
+    # the agents' frames agree by construction
+    *("--frame-alignment", "trust"),
+)
+
+
+class RunningServer:
+    """Owns the process of a server on a store; `start_s` is the time until it was ready."""
+
+    def __init__(self, command: str, folder: Path, store: str) -> None:
+        self._command, self._store = command, "memory" if store == "memory" else str(folder / "store.sqlite")
+        self.address = f"unix:{folder}/fusion.sock"
+        self.start_s = self._start()
+
+    def restart(self) -> float:
+        """End the server as a service manager does and start it again; returns the time until it is ready."""
+        self.close()
+        return self._start()
+
+    def rss_mib(self) -> float:
+        """Return the resident memory of the process."""
+        for line in Path(f"/proc/{self._process.pid}/status").read_text().splitlines():
+            if line.startswith("VmRSS:"):
+                return int(line.split()[1]) / 1024
+        raise UnavailableError("server: its process has ended")
+
+    def cpu_s(self) -> float:
+        """Return the processor time that the process has used."""
+        fields = Path(f"/proc/{self._process.pid}/stat").read_text().rpartition(")")[2].split()
+        return sum(map(int, fields[11:13])) / os.sysconf("SC_CLK_TCK")
+
+    def close(self) -> None:
+        """End the process."""
+        self._process.send_signal(signal.SIGTERM)
+        try:
+            self._process.wait(60)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+
+    def _start(self) -> float:
+        begin_s = time.monotonic()
+        arguments = [*shlex.split(self._command), "--listen", self.address, "--store", self._store, *_QUOTAS]
+        self._process = subprocess.Popen(arguments, stderr=subprocess.DEVNULL)  # noqa: S603 - the user's own command
+        options = [("grpc.initial_reconnect_backoff_ms", 50), ("grpc.max_reconnect_backoff_ms", 50)]
+        with grpc.insecure_channel(self.address, options) as channel:
+            ready = grpc.channel_ready_future(channel)
+            while time.monotonic() - begin_s < _START_LIMIT_S:
+                try:
+                    ready.result(0.2)
+                except grpc.FutureTimeoutError:
+                    if self._process.poll() is not None:
+                        break
+                else:
+                    return time.monotonic() - begin_s
+        self.close()
+        raise UnavailableError(f"server: expected it to start within {_START_LIMIT_S:g} s ({self._command})")

@@ -1,0 +1,70 @@
+"""Make voxel updates of many agents whose areas overlap, without mapping anything."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from gausslite.codec.subset_codec import encode_subset
+from gausslite.domain.gaussians import Gaussians
+from gausslite.domain.voxel_batch import RoiSubset, VoxelBatch
+from gausslite.domain.voxel_operations import group_by_voxel, tombstones
+from gausslite.domain.voxels import VoxelGrid
+
+GRID = VoxelGrid(0.10)
+GAUSSIANS_PER_VOXEL = 40
+DELTA_VOXELS = 30
+_ROW_VOXELS = 400
+_FILL_VOXELS = 500
+_PATCHES = 8
+
+
+def voxels_batch(first: int, count: int, seed: int) -> VoxelBatch:
+    """Return `count` voxels of a slab, from the voxel `first` on, each with GAUSSIANS_PER_VOXEL Gaussians."""
+    rng = np.random.default_rng(seed)
+    cells = np.repeat(np.arange(first, first + count), GAUSSIANS_PER_VOXEL)
+    corners = np.stack([cells % _ROW_VOXELS, cells // _ROW_VOXELS % _ROW_VOXELS, cells // _ROW_VOXELS**2], axis=1)
+    n = len(cells)
+    means_m = (corners + rng.uniform(0.05, 0.95, (n, 3))) * GRID.size_m
+    gaussians = Gaussians(
+        means_m.astype(np.float32),
+        rng.normal(size=(n, 4)).astype(np.float32),
+        rng.uniform(0.005, 0.05, (n, 3)).astype(np.float32),
+        rng.uniform(0.1, 0.9, n).astype(np.float32),
+        rng.uniform(0, 1, (n, 3)).astype(np.float32),
+        np.ones(n, np.bool_),
+        rng.integers(1, 500, n).astype(np.uint32),
+        np.zeros(n, np.int16),
+    )
+    return group_by_voxel(gaussians, GRID)
+
+
+def fill_messages(agent_id: str, first: int, voxels: int) -> Iterator[bytes]:
+    """Yield encoded messages that fill these voxels."""
+    for seq, start in enumerate(range(first, first + voxels, _FILL_VOXELS), start=1):
+        batch = voxels_batch(start, min(_FILL_VOXELS, first + voxels - start), seed=start)
+        yield encode_subset(RoiSubset(agent_id, "", seq, seq, batch), GRID)
+
+
+def delta_messages(agent_id: str, number: int, count: int, first_seq: int) -> list[bytes]:
+    """Return encoded updates of the agent's area; half of it is shared with the next agent."""
+    area = number * _PATCHES // 2 * DELTA_VOXELS
+    batches = [
+        voxels_batch(area + patch * DELTA_VOXELS, DELTA_VOXELS, number * 100 + patch) for patch in range(_PATCHES)
+    ]
+    return [
+        encode_subset(RoiSubset(agent_id, "", seq, seq, batches[seq % _PATCHES]), GRID)
+        for seq in range(first_seq, first_seq + count)
+    ]
+
+
+def tombstone_message(agent_id: str, voxels: int, update_seq: int) -> bytes:
+    """Return one small message with many tombstones, far from all Gaussians."""
+    batch = tombstones(voxels_keys(voxels))
+    return encode_subset(RoiSubset(agent_id, "", update_seq, update_seq, batch), GRID)
+
+
+def voxels_keys(voxels: int) -> np.ndarray:
+    """Return the keys of a row of voxels far from the slab."""
+    return np.arange(voxels, dtype=np.int64) + (1 << 40)
