@@ -7,6 +7,7 @@ from collections.abc import Callable
 
 from gausslite_bench.cli.budget import configure_budget
 from gausslite_bench.cli.camera import configure_camera
+from gausslite_bench.cli.codec import configure_codec
 from gausslite_bench.cli.gpu import configure_gpu
 from gausslite_bench.cli.loop import configure_loop
 from gausslite_bench.cli.parser import configure_parser
@@ -76,6 +77,12 @@ _BENCHMARKS: dict[str, tuple[Callable[[argparse.ArgumentParser], None], str, str
         "map quality with rolling shutter, motion blur and lens distortion",
         "Map one walk with an ideal camera and with a real one at several angular speeds: uncorrected, corrected with "
         "the true values, and corrected with estimates.",
+    ),
+    "codec": (
+        configure_codec,
+        "size and loss of the subset codec beside other formats",
+        "Map scenes and encode the region and the whole map: bytes a Gaussian, lost ROI PSNR, and time to encode and "
+        "decode.",
     ),
     "team": (
         configure_team,

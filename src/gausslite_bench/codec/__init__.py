@@ -1,0 +1,1 @@
+"""Size and loss of the subset codec beside other formats."""
