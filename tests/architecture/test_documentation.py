@@ -34,6 +34,7 @@ BENCHMARKS = (
     "budget",
     "codec",
     "task-change",
+    "server",
     "team",
     "registration",
 )
@@ -106,6 +107,7 @@ def known_flags() -> set[str]:
     commands += [["gausslite", "bench", name, "--help"] for name in BENCHMARKS]
     commands += [["gausslite", "models", name, "--help"] for name in ("fetch", "verify", "list", "inspect")]
     commands += [[program, "--help"] for program in PROGRAMS if program != "gausslite"]
+    commands.append(["gausslite-fusion-server", "verify", "--help"])
     flags: set[str] = set()
     for program, *arguments in commands:
         done = subprocess.run(
