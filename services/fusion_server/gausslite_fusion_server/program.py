@@ -19,9 +19,7 @@ from gausslite_fusion_server.maintenance import COMMANDS, run_command
 from gausslite_fusion_server.metrics import metrics_server
 from gausslite_fusion_server.refinement_worker import RefinementWorker
 from gausslite_fusion_server.servicer import FusionServicer
-from gausslite_fusion_server.settings import ServerSettings, parse_arguments
-
-_PROGRAM = "gausslite-fusion-server"
+from gausslite_fusion_server.settings import PROGRAM, ServerSettings, parse_arguments
 
 
 def run(arguments: Sequence[str] | None = None) -> int:
@@ -36,11 +34,11 @@ def run(arguments: Sequence[str] | None = None) -> int:
     async def serve() -> None:
         settings = parse_arguments(arguments)
         if settings.log_format is LogFormat.JSON:
-            log_to_stderr(_PROGRAM, LogFormat.JSON)
+            log_to_stderr(PROGRAM, LogFormat.JSON)
         with contextlib.closing(_open_store(settings)) as store:
             await _serve(settings, store)
 
-    return run_service(_PROGRAM, serve)
+    return run_service(PROGRAM, serve)
 
 
 def _open_store(settings: ServerSettings) -> FusionStore:

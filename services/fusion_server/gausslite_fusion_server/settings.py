@@ -20,6 +20,7 @@ from gausslite.wire.call_limits import CallLimits
 from gausslite.wire.process import LogFormat
 from gausslite.wire.tls import Tls
 
+PROGRAM = "gausslite-fusion-server"
 MEMORY = "memory"
 _CORRECT, _TRUST = "correct", "trust"
 _MAX_STORE_MB = 1 << 24
@@ -39,6 +40,17 @@ class ServerSettings:
     limits: CallLimits = field(default_factory=CallLimits)
     log_format: LogFormat = LogFormat.TEXT
     metrics: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class MaintenanceSettings:
+    """A maintenance command of a store's file. other: the new copy of `backup`, the source of `restore`."""
+
+    command: str
+    store: Path
+    other: Path
+    json: bool
+    repair: bool
 
 
 def parse_arguments(arguments: Sequence[str] | None = None) -> ServerSettings:
@@ -74,7 +86,7 @@ def parse_arguments(arguments: Sequence[str] | None = None) -> ServerSettings:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
-        prog="gausslite-fusion-server",
+        prog=PROGRAM,
         description="Store every agent's latest voxel updates and serve the fused map. In each voxel the agent with "
         "the largest sum of kappa (per Gaussian, the training steps in which it was visible and active) wins.",
     )
@@ -138,4 +150,29 @@ def _parser() -> argparse.ArgumentParser:
     )
     add("--metrics", metavar="HOST:PORT", help="serve figures for Prometheus there over HTTP (default: no)")
     add_tls(parser)
+    return parser
+
+
+def parse_maintenance(arguments: Sequence[str]) -> MaintenanceSettings:
+    """Return the settings of a maintenance command."""
+    options = _maintenance_parser().parse_args(arguments)
+    other = getattr(options, "target", None) or getattr(options, "backup", options.store)
+    return MaintenanceSettings(options.command, options.store, other, options.json, getattr(options, "repair", False))
+
+
+def _maintenance_parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog=PROGRAM, description="Maintain the file of a store.")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    for name, paths, text in (
+        ("backup", ("store", "target"), "copy a store to a new file and verify the copy; a server may be using it"),
+        ("restore", ("backup", "store"), "replace a store by a backup; the earlier file is kept under another name"),
+        ("verify", ("store",), "check every row; a server may be using the store"),
+        ("compact", ("store",), "rewrite the file without unused space; no server may be using it"),
+    ):
+        command = commands.add_parser(name, help=text, description=text.capitalize() + ".")
+        for path in paths:
+            command.add_argument(path, type=Path, metavar=path.upper())
+        command.add_argument("--json", action="store_true", help="print one JSON object")
+        if name == "verify":
+            command.add_argument("--repair", action="store_true", help="delete the damaged rows; without a server")
     return parser

@@ -36,7 +36,8 @@ def gradient_deviation(
     """
     first, second = _gradient_magnitude(a), _gradient_magnitude(b)
     similarity = (2.0 * first * second + _GMS_CONSTANT) / (first * first + second * second + _GMS_CONSTANT)
-    return float(similarity[_inside(mask, a)].std())
+    # in double precision, so that the order of the sum does not show
+    return float(similarity[_inside(mask, a)].std(dtype=np.float64))
 
 
 def _laplacian(image: Shaped[ndarray, "h w 3"]) -> Float32[ndarray, "h w"]:

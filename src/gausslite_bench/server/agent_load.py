@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import AsyncIterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
-import grpc
 import numpy as np
 
-from gausslite.v1 import fusion_service_pb2 as pb
-from gausslite.v1 import fusion_service_pb2_grpc as pb_grpc
 from gausslite.wire.clients import FusionClient
+from gausslite.wire.update_streams import UpdateStream, UpdateStreams
 from gausslite_bench.server.synthetic_updates import GRID, delta_messages, fill_messages, tombstone_message
 
 RATE_HZ = 4.0
@@ -54,10 +52,8 @@ class AgentLoad:
             for number in range(_FILL_AGENTS):
                 agent_id = f"fill-{number}"
                 session_id = client.join(agent_id, GRID).session_id
-                for sequence, data in enumerate(fill_messages(agent_id, 200_000 + number * voxels, voxels), start=1):
-                    request = pb.ContributeSubsetsRequest(session_id=session_id, sequence=sequence, subset=data)
-                    for response in client.contribute([request], 600.0):
-                        assert response.outcomes[0].status == pb.SUBSET_STATUS_ACCEPTED, response
+                messages = list(fill_messages(agent_id, 200_000 + number * voxels, voxels))
+                asyncio.run(self._send_all(session_id, messages))
 
     def run(self, agents: int, seconds: float, hostile: bool = False) -> LoadResult:
         """Send deltas from these agents; hostile: one more agent resends a message of 200 000 tombstones."""
@@ -72,54 +68,44 @@ class AgentLoad:
         p50, p99 = np.percentile(times_s or [np.inf], [50, 99]) * 1000
         return LoadResult(agents, agents * count, float(p50), float(p99), missing)
 
+    async def _send_all(self, session_id: str, messages: Sequence[bytes]) -> None:
+        async with UpdateStreams(self._address) as streams:
+            stream = streams.open(session_id)
+            for data in messages:
+                await stream.send(data)
+            await stream.close()
+
     async def _send(
         self, sessions: Sequence[str], messages: Sequence[Sequence[bytes]], hostile_session: str
     ) -> tuple[list[float], int]:
         times_s: list[float] = []
-        async with grpc.aio.insecure_channel(self._address) as channel:
-            stub = pb_grpc.FusionServiceStub(channel)
-            hostile = asyncio.ensure_future(self._resend(stub, hostile_session)) if hostile_session else None
+        async with UpdateStreams(self._address) as streams:
+            data = tombstone_message("hostile", HOSTILE_TOMBSTONES, self._next_seq) if hostile_session else b""
+            hostile = [
+                asyncio.ensure_future(streams.open(session).resend_forever(data))
+                for session in (hostile_session,)
+                if session
+            ]
             begin_s = time.monotonic() + 0.5
             tasks = [
                 asyncio.ensure_future(
-                    _send_agent(stub, session, own, begin_s + number / len(sessions) / RATE_HZ, times_s)
+                    _send_agent(streams.open(session), own, begin_s + number / len(sessions) / RATE_HZ, times_s)
                 )
                 for number, (session, own) in enumerate(zip(sessions, messages, strict=True))
             ]
             duration_s = len(messages[0]) / RATE_HZ
             _, late = await asyncio.wait(tasks, timeout=duration_s + _SETTLE_S)
-            for task in (*late, *([hostile] if hostile else [])):
+            for task in (*late, *hostile):
                 task.cancel()
-            await asyncio.gather(*tasks, *([hostile] if hostile else []), return_exceptions=True)
+            await asyncio.gather(*tasks, *hostile, return_exceptions=True)
         return times_s, sum(map(len, messages)) - len(times_s)
 
-    async def _resend(self, stub: pb_grpc.FusionServiceAsyncStub, session_id: str) -> None:
-        data = tombstone_message("hostile", HOSTILE_TOMBSTONES, self._next_seq)
 
-        async def requests() -> AsyncIterator[pb.ContributeSubsetsRequest]:
-            sequence = 0
-            while True:
-                sequence += 1
-                yield pb.ContributeSubsetsRequest(session_id=session_id, sequence=sequence, subset=data)
-
-        async for _ in stub.ContributeSubsets(requests()):
-            pass
-
-
-async def _send_agent(
-    stub: pb_grpc.FusionServiceAsyncStub,
-    session_id: str,
-    messages: Sequence[bytes],
-    begin_s: float,
-    times_s: list[float],
-) -> None:
+async def _send_agent(stream: UpdateStream, messages: Sequence[bytes], begin_s: float, times_s: list[float]) -> None:
     """Send one message each period; a time counts from when the message was due, also if the one before was late."""
-    # without an iterator, the caller writes
-    call = stub.ContributeSubsets()  # type: ignore[call-arg]
     for index, data in enumerate(messages):
         due_s = begin_s + index / RATE_HZ
         await asyncio.sleep(max(0.0, due_s - time.monotonic()))
-        await call.write(pb.ContributeSubsetsRequest(session_id=session_id, sequence=index + 1, subset=data))
-        await call.read()
+        await stream.send(data)
         times_s.append(time.monotonic() - due_s)
-    await call.done_writing()
+    await stream.close()

@@ -10,12 +10,12 @@ import sys
 import time
 from pathlib import Path
 
-import grpc
-
 from gausslite.domain.errors import UnavailableError
+from gausslite.wire.clients import FusionClient
 
 DEFAULT_COMMAND = f"{shlex.quote(sys.executable)} -m gausslite_fusion_server"
 _START_LIMIT_S = 300.0
+_POLL_S = 0.02
 _QUOTAS = (
     *("--quota-agents", "1000", "--quota-voxels", "20000000", "--quota-gaussians", "500000000"),
     # the agents' frames agree by construction
@@ -61,16 +61,17 @@ class RunningServer:
         begin_s = time.monotonic()
         arguments = [*shlex.split(self._command), "--listen", self.address, "--store", self._store, *_QUOTAS]
         self._process = subprocess.Popen(arguments, stderr=subprocess.DEVNULL)  # noqa: S603 - the user's own command
-        options = [("grpc.initial_reconnect_backoff_ms", 50), ("grpc.max_reconnect_backoff_ms", 50)]
-        with grpc.insecure_channel(self.address, options) as channel:
-            ready = grpc.channel_ready_future(channel)
-            while time.monotonic() - begin_s < _START_LIMIT_S:
+        socket = Path(self.address.removeprefix("unix:"))
+        while time.monotonic() - begin_s < _START_LIMIT_S and self._process.poll() is None:
+            # a call to a socket that does not exist yet would wait for a second before it tries again
+            if socket.exists():
                 try:
-                    ready.result(0.2)
-                except grpc.FutureTimeoutError:
-                    if self._process.poll() is not None:
-                        break
+                    with FusionClient(self.address, deadline_s=5.0) as client:
+                        client.status()
+                except UnavailableError:
+                    pass
                 else:
                     return time.monotonic() - begin_s
+            time.sleep(_POLL_S)
         self.close()
         raise UnavailableError(f"server: expected it to start within {_START_LIMIT_S:g} s ({self._command})")

@@ -127,7 +127,7 @@ def agent_process(folder: Path, fusion: str, *more: str) -> Iterator[tuple[subpr
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
         assert process.stderr is not None
         try:
-            assert "listening on" in process.stderr.readline()
+            assert any("listening on" in line for line in process.stderr)
             with AgentClient(address) as client:
                 yield process, client
         finally:
