@@ -33,9 +33,7 @@ def encode(batch: VoxelBatch, grid: VoxelGrid, layout: BodyLayout) -> bytes:
     if not _are_inside(batch, grid):
         raise InvalidInputError("voxel batch means_m: expected every mean inside its voxel, got one outside")
     values = [getattr(batch.gaussians, name) for name in _WIDTHS]
-    return compress_columns(
-        [*encode_voxels(batch), *values, *encode_labels(batch.gaussians, layout)], _columns(layout)
-    )
+    return compress_columns([*encode_voxels(batch), *values, *encode_labels(batch.gaussians, layout)], _columns(layout))
 
 
 def decode(body: bytes, grid: VoxelGrid, layout: BodyLayout) -> VoxelBatch:

@@ -77,9 +77,7 @@ def centres_of(
     return np.where(index > voxel, np.nextafter(means_m, np.float32(-np.inf)), means_m)
 
 
-def morton_codes(
-    cells: Int64[ndarray, "n 3"], bits: Int64[ndarray, " n"], coarse_bits: int
-) -> Int64[ndarray, " n"]:
+def morton_codes(cells: Int64[ndarray, "n 3"], bits: Int64[ndarray, " n"], coarse_bits: int) -> Int64[ndarray, " n"]:
     """Return the interleaved high bits of the cells' indices; x has the highest of three bits."""
     coarse = cells >> (bits - coarse_bits)[:, None]
     codes = np.zeros(len(cells), np.int64)

@@ -51,6 +51,4 @@ def decode_landmark(state: State) -> Landmark:
     score_sum, *rival_sums = get_floats(state, "score_sums", 1 + len(names))
     rivals = dict(zip(names, rival_sums, strict=True))
     landmark = Landmark(*extent, seen_count, missed_count, best_score, farthest_m, first_ns, last_ns, number)
-    return replace(
-        landmark, score_sum=score_sum, rival_scores=rivals, votes=votes, missed_in_a_row=missed_in_a_row
-    )
+    return replace(landmark, score_sum=score_sum, rival_scores=rivals, votes=votes, missed_in_a_row=missed_in_a_row)
