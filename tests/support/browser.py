@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 _PROGRAMS = ("chromium", "chromium-browser", "google-chrome", "chrome")
-_TIMEOUT_MS = 200_000
+_TIMEOUT_MS = 60_000
 _SOFTWARE_RENDERING = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 
 

@@ -107,13 +107,14 @@ def run(options: argparse.Namespace) -> int:
         require_additional_file(options.save_state, options.out)
     resumed_after = _NOT_RESUMED if saved is None else saved.last_index
     estimators = EstimatorFactory(inputs.perception, lambda: SceneInfo.of(inputs.stream.source))
-    roi = _first_roi(options, inputs, estimators, resumed_after)
+    roi = _first_roi(options, inputs, resumed_after)
     if saved is None:
         inputs = inputs.calibrated(options)
     mapper = build_task_mapper(inputs.mission, estimators, roi)
     if saved is not None:
         saved.restore(mapper)
         saved = None  # its arrays, as large as the map and the keyframes, have been copied
+    _report_search(options, inputs, estimators)
     mapping = _Run(options, inputs, mapper)
     # a signal while the results are written must not lose the rest of them
     with DeferredInterrupt() as interrupt:
@@ -220,17 +221,19 @@ class _Run:
         save_run(self._options.save_state, self._mapper, config, last_index, extra)
 
 
-def _first_roi(
-    options: argparse.Namespace, inputs: MapInputs, estimators: EstimatorFactory, resumed_after: int
-) -> TaskGraph | list[Region]:
-    """Return the first frame's task or the regions, and report what is searched for each noun."""
+def _first_roi(options: argparse.Namespace, inputs: MapInputs, resumed_after: int) -> TaskGraph | list[Region]:
+    """Return the first frame's task or the regions."""
+    graph = inputs.schedule.at(resumed_after)
+    return selected_regions(options, inputs.stream.source) if graph is None else graph
+
+
+def _report_search(options: argparse.Namespace, inputs: MapInputs, estimators: EstimatorFactory) -> None:
+    """Report what is searched for each noun of the tasks."""
     if options.detector is None and inputs.schedule.graphs():
         report_region_file(options.source, inputs.stream.source)
     for scheduled in inputs.schedule.graphs():
         for match in estimators.noun_matches(scheduled):
             print_message(match.describe())
-    graph = inputs.schedule.at(resumed_after)
-    return selected_regions(options, inputs.stream.source) if graph is None else graph
 
 
 def _view(frame: Frame, roi: Bool[ndarray, "h w"]) -> KeyframeView:

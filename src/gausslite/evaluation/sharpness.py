@@ -9,7 +9,7 @@ from numpy import ndarray
 from gausslite.domain.arrays import require_array
 from gausslite.domain.errors import InvalidInputError
 
-_LUMINANCE = np.array([0.299, 0.587, 0.114], np.float32)
+_RED, _GREEN, _BLUE = (np.float32(weight) for weight in (0.299, 0.587, 0.114))
 _GMS_CONSTANT = 170.0 / 255.0**2
 """The constant c of Xue et al. 2014 for colours in [0, 1]."""
 
@@ -52,12 +52,14 @@ def _gradient_magnitude(image: Shaped[ndarray, "h w 3"]) -> Float32[ndarray, "h 
     prewitt = np.array([[1.0, 0.0, -1.0]] * 3, np.float32) / np.float32(3.0)
     luminance = _luminance(image)
     dx, dy = (cv2.filter2D(luminance, cv2.CV_32F, kernel) for kernel in (prewitt, prewitt.T))
-    return np.asarray(cv2.magnitude(dx, dy))
+    return np.asarray(np.sqrt(dx * dx + dy * dy))
 
 
 def _luminance(image: Shaped[ndarray, "h w 3"]) -> Float32[ndarray, "h w"]:
     scale = np.float32(1.0 / 255.0 if image.dtype == np.uint8 else 1.0)
-    luminance: Float32[ndarray, "h w"] = np.clip(image.astype(np.float32) * scale, 0.0, 1.0) @ _LUMINANCE
+    red, green, blue = np.moveaxis(np.clip(image.astype(np.float32) * scale, 0.0, 1.0), -1, 0)
+    # not a matrix product, whose rounding depends on where the array lies in memory
+    luminance: Float32[ndarray, "h w"] = _RED * red + _GREEN * green + _BLUE * blue
     return luminance
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 from agent_running import TASK, agent
 from browser import open_browser
@@ -13,13 +15,22 @@ from gausslite.view.live_page import live_page, own_address
 pytest.importorskip("viser")
 
 
+def assign(tab: Any, task: str) -> None:
+    """Write a task and press the button; write until it stays, as a page that is still being built ignores it."""
+    field = tab.get_by_role("textbox").first
+    for _ in range(60):
+        field.fill(task)
+        tab.wait_for_timeout(500)
+        if field.input_value() == task:
+            break
+    tab.get_by_role("button", name="Assign task").click()
+
+
 def test_a_task_from_the_page_arrives_and_the_mission_ends_from_it():
     with agent() as running, open_browser() as browser, live_page(0, running.client.address, is_agent=True) as url:
         tab = browser.new_page()
         tab.goto(url)
-        tab.get_by_role("textbox").first.fill(TASK)
-        tab.get_by_role("textbox").first.blur()
-        tab.get_by_role("button", name="Assign task").click()
+        assign(tab, TASK)
         tab.get_by_text("assigned: targets mug").wait_for()
         assert running.client.status().graph.text == TASK
         report = next(running.client.ingest([frame(0)]))
@@ -34,9 +45,7 @@ def test_a_wrong_task_is_reported_on_the_page():
     with agent() as running, open_browser() as browser, live_page(0, running.client.address, is_agent=True) as url:
         tab = browser.new_page()
         tab.goto(url)
-        tab.get_by_role("textbox").first.fill("<b>")
-        tab.get_by_role("textbox").first.blur()
-        tab.get_by_role("button", name="Assign task").click()
+        assign(tab, "<b>")
         tab.get_by_text("'<b>'").wait_for()
         assert not running.client.status().graph.text
 
