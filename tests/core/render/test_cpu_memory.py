@@ -22,8 +22,10 @@ from gausslite.render.cpu import CpuRasterizer
 from gausslite.render.rasterizer import AdamSettings, LossWeights
 
 def limit_to(more_bytes):
-    pages = int(open("/proc/self/statm").read().split()[0])
-    limit = resource.RLIM_INFINITY if more_bytes is None else pages * resource.getpagesize() + more_bytes
+    limit = resource.RLIM_INFINITY
+    # without the limit no file is opened, because there may be no memory for it
+    if more_bytes is not None:
+        limit = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize() + more_bytes
     resource.setrlimit(resource.RLIMIT_AS, (limit, resource.RLIM_INFINITY))
 """
 
