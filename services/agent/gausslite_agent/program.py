@@ -16,7 +16,7 @@ from gausslite.mission.results import prepare_file, prepare_folder
 from gausslite.mission.settings import SceneInfo
 from gausslite.task.parser import TaskParser
 from gausslite.task.rules import RuleParser
-from gausslite.view.live_page import live_page, own_address
+from gausslite.view.live_page import own_page
 from gausslite.wire.change_notifier import ChangeNotifier
 from gausslite.wire.clients import FusionClient, ParserClient
 from gausslite.wire.process import run_service
@@ -97,7 +97,7 @@ async def _serve(settings: AgentSettings) -> None:
         can_detect = stream is not None or settings.perception.model is not None
         mission = AgentMission(settings, worker, first_parser, resumed, can_detect)
         servicer = AgentServicer(settings.agent_id, worker, mission, parser, changes)
-        _open_page(settings, stack)
+        stack.enter_context(own_page(settings.view, settings.listen, is_agent=True, tls=settings.tls))
         run_mission = functools.partial(_run_mission, _Mission(mission, stream, first_parser), settings)
         await serve_until_stopped(settings.listen, [servicer.service()], run_mission, settings.tls)
 
@@ -184,14 +184,6 @@ def _follow_team_map(settings: AgentSettings, worker: MappingWorker, stack: Exit
         lambda batch: worker.insert_team_voxels(batch).result(),
     )
     stack.callback(follower.close)
-
-
-def _open_page(settings: AgentSettings, stack: ExitStack) -> None:
-    """Show the agent on a page, if the options ask for it. Raises InvalidInputError."""
-    if settings.view is None:
-        return
-    page = live_page(settings.view, own_address(settings.listen), is_agent=True, tls=settings.tls)
-    _log.info("the page is at %s", stack.enter_context(page))
 
 
 def _keyframe_upload(link: LinkSettings, uplink: Uplink | None) -> KeyframeUpload | None:

@@ -12,6 +12,7 @@ from gausslite.fusion.joint_refinement import rasterizer_of_backend
 from gausslite.fusion.memory_store import MemoryStore
 from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.fusion.store import FusionStore
+from gausslite.view.live_page import own_page
 from gausslite.wire.convert import decode_frame
 from gausslite.wire.process import LogFormat, log_to_stderr, run_service
 from gausslite.wire.server import serve_until_stopped
@@ -59,7 +60,8 @@ async def _serve(settings: ServerSettings, store: FusionStore) -> None:
             servicer.drain()
 
     try:
-        with metrics_server(settings.metrics, engine):
+        page = own_page(settings.view, settings.listen, is_agent=False, tls=settings.tls)
+        with metrics_server(settings.metrics, engine), page:
             await serve_until_stopped(
                 settings.listen, [servicer.service()], drain_when_stopping, settings.tls, settings.limits
             )

@@ -11,6 +11,7 @@ from gausslite.config.layers import parse_options
 from gausslite.config.mapping_options import add_rasterizer, add_voxel_size
 from gausslite.config.numbers import Number
 from gausslite.config.tls_options import add_tls, read_server_tls
+from gausslite.config.view_option import add_view
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.fusion.frame_alignment import AlignmentSettings
 from gausslite.fusion.joint_refinement import RefineSettings
@@ -28,7 +29,10 @@ _MAX_STORE_MB = 1 << 24
 
 @dataclass(frozen=True, slots=True)
 class ServerSettings:
-    """Address, storage (None: in memory) and limits of the server, and the mission that it serves."""
+    """Address, storage (None: in memory) and limits of the server, and the mission that it serves.
+
+    view: port of the page that shows the server, None for no page.
+    """
 
     listen: str = "127.0.0.1:50052"
     store: Path | None = None
@@ -40,6 +44,7 @@ class ServerSettings:
     limits: CallLimits = field(default_factory=CallLimits)
     log_format: LogFormat = LogFormat.TEXT
     metrics: str | None = None
+    view: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,6 +86,7 @@ def parse_arguments(arguments: Sequence[str] | None = None) -> ServerSettings:
         CallLimits(options.limit_calls, options.limit_kbps, options.limit_connections, options.limit_idle),
         LogFormat(options.log_format),
         options.metrics,
+        options.view,
     )
 
 
@@ -149,6 +155,7 @@ def _parser() -> argparse.ArgumentParser:
         help="lines of the log (default: %(default)s)",
     )
     add("--metrics", metavar="HOST:PORT", help="serve figures for Prometheus there over HTTP (default: no)")
+    add_view(parser, "the fused map")
     add_tls(parser)
     return parser
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -16,6 +17,8 @@ from gausslite.wire.tls import Tls
 
 if TYPE_CHECKING:
     from gausslite.view.map_page import MapPage
+
+_log = logging.getLogger(__name__)
 
 _POLL_S = 1.0
 _DEADLINE_S = 120.0
@@ -41,6 +44,20 @@ def live_page(
         stopped.set()
         follower.join(_POLL_S * 5)
         page.close()
+
+
+@contextmanager
+def own_page(port: int | None, listen: str, is_agent: bool, tls: Tls | None = None) -> Iterator[None]:
+    """Serve the page of a service from its own process and log the page's URL; without a port do nothing.
+
+    Raises InvalidInputError.
+    """
+    if port is None:
+        yield
+        return
+    with live_page(port, own_address(listen), is_agent, tls) as url:
+        _log.info("the page is at %s", url)
+        yield
 
 
 def own_address(listen: str) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 import socket
 import subprocess
+import urllib.request
 from pathlib import Path
 
 import pytest
@@ -73,6 +74,19 @@ def test_an_error_that_the_operator_can_fix_is_one_line_and_code_2(tmp_path: Pat
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         assert "in use" in ends_with_one_line("--listen", f"127.0.0.1:{taken.getsockname()[1]}")
+
+
+def test_the_server_shows_itself_on_a_page(tmp_path: Path) -> None:
+    pytest.importorskip("viser")
+    command = [*COMMAND, "--listen", f"unix:{tmp_path}/fusion.sock", "--view", "0"]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stderr is not None
+        try:
+            url = next(line.split()[-1] for line in process.stderr if "the page is at" in line)
+            with urllib.request.urlopen(url, timeout=60) as page:
+                assert b"<html" in page.read()
+        finally:
+            process.kill()
 
 
 def test_help_lists_the_options() -> None:
