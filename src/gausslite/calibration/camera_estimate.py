@@ -34,6 +34,7 @@ _MIN_ROTATION_DEG = 0.01
 _EXCHANGE = 0.4
 """Squared slope at which the two radial terms exchange: half way to the corner of an image 60 degrees wide."""
 _MIN_TIMING_RESIDUAL_GAIN, _MIN_MOTION_GAIN = 0.005, 0.3
+_CLEAR_MOTION_GAIN, _CLEAR_ROTATION_DEG = 0.6, 0.1
 _MIN_COARSE_LENS_GAIN, _MIN_LENS_RESIDUAL_GAIN, _MIN_SECOND_RADIAL_GAIN = 0.01, 0.03, 0.01
 
 
@@ -131,11 +132,23 @@ def _with_times(moving: MovingPairs, coarse: MovingPairs, known: CameraCorrectio
         f"frames: residual {before.residual:.2f} becomes {after.residual:.2f} of 255, "
         f"rotation error {before.rotation_deg:.2f} becomes {after.rotation_deg:.2f} deg"
     )
-    is_clear = (
-        after.residual <= (1.0 - _MIN_TIMING_RESIDUAL_GAIN) * before.residual
-        and after.rotation_deg <= (1.0 - _MIN_MOTION_GAIN) * before.rotation_deg
-    )
-    return (found, evidence) if is_clear else (known, f"{evidence}; no clear gain, not used")
+    if _explain_motion(before, after):
+        return found, evidence
+    return known, f"{evidence}; no clear gain, not used"
+
+
+def _explain_motion(before: PairError, after: PairError) -> bool:
+    """Return True if new times lower both errors, or the rotation so far that the residual need not fall.
+
+    The pose fit hides a slow camera's readout from the residual: most of it looks like a rotation of the whole image.
+    """
+    if after.residual > before.residual:
+        return False
+    rotation_gain = 1.0 - after.rotation_deg / max(before.rotation_deg, _MIN_ROTATION_DEG)
+    residual_gain = 1.0 - after.residual / before.residual
+    if rotation_gain >= _MIN_MOTION_GAIN and residual_gain >= _MIN_TIMING_RESIDUAL_GAIN:
+        return True
+    return rotation_gain >= _CLEAR_MOTION_GAIN and before.rotation_deg >= _CLEAR_ROTATION_DEG
 
 
 def _relative(error: PairError, before: PairError) -> float:

@@ -18,6 +18,7 @@ from gausslite_bench.cli.registration import configure_registration
 from gausslite_bench.cli.server import configure_server
 from gausslite_bench.cli.task_change import configure_task_change
 from gausslite_bench.cli.team import configure_team
+from gausslite_bench.cli.view import configure_view
 
 _BENCHMARKS: dict[str, tuple[Callable[[argparse.ArgumentParser], None], str, str]] = {
     "raster": (
@@ -89,6 +90,12 @@ _BENCHMARKS: dict[str, tuple[Callable[[argparse.ArgumentParser], None], str, str
         "quality of the fused map of several agents, by strategy and policy",
         "Map one home with several agents and tasks. Fuse their maps by concatenation, by the vote and with a joint "
         "refinement, and score the fused maps on held-out views.",
+    ),
+    "view": (
+        configure_view,
+        "loading time and frame rate of the live view in a headless browser",
+        "Serve synthetic maps on the page of `gausslite view`, open it in a headless Chromium with software rendering, "
+        "and measure the time until the map is drawn and the frame rates at rest and while the camera moves.",
     ),
     "task-change": (
         configure_task_change,

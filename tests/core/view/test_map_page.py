@@ -1,13 +1,16 @@
-"""The page of a results folder: the scrub over time, the port, and who may connect."""
+"""The page of a results folder: what a browser draws and asks for, the scrub over time, the port, who may connect."""
 
 from __future__ import annotations
 
 import json
 import re
+import time
 from urllib.parse import urlsplit
 
+import cv2
 import numpy as np
 import pytest
+from browser import open_browser
 from sample_gaussians import plain_gaussians
 
 from gausslite.codec.keyframe_views import KeyframeView, write_keyframe_views
@@ -21,6 +24,7 @@ from gausslite.view.open_page import open_page
 
 HOSTILE = "<img src=http://other.example/x onerror=document.title='broken'>"
 RED, GREEN = (230, 30, 30), (20, 200, 40)
+WAIT_S = 120.0
 
 
 @pytest.fixture
@@ -57,6 +61,29 @@ def page(run_folder):
     page.show(read_contents(run_folder))
     yield page
     page.close()
+
+
+def columns_near(tab, rgb, tolerance=70):
+    """Return the columns of the screenshot's pixels with about this colour, without the controls on the right."""
+    image = cv2.imdecode(np.frombuffer(tab.screenshot(), np.uint8), cv2.IMREAD_COLOR)[:, :400, ::-1].astype(int)
+    return np.nonzero(np.abs(image - rgb).max(axis=2) < tolerance)[1]
+
+
+def test_a_browser_draws_the_map_and_asks_no_other_machine(page):
+    with open_browser() as browser:
+        tab = browser.new_page()
+        requested = []
+        tab.on("request", lambda request: requested.append(request.url))
+        tab.on("websocket", lambda socket: requested.append(socket.url))
+        tab.goto(page.url)
+        deadline_s = time.monotonic() + WAIT_S
+        while min(len(columns_near(tab, RED)), len(columns_near(tab, GREEN))) < 2000:
+            assert time.monotonic() < deadline_s
+        # the camera starts behind the keyframe, which has red on its left
+        assert np.mean(columns_near(tab, RED)) < np.mean(columns_near(tab, GREEN))
+        assert tab.title() != "broken"
+        hosts = {urlsplit(url.removeprefix("blob:")).netloc for url in requested if not url.startswith("data:")}
+        assert hosts == {urlsplit(page.url).netloc}
 
 
 def test_the_scrub_shortens_the_trajectory(page):

@@ -1,0 +1,145 @@
+"""Times of the live view in a headless Chromium: until a map is drawn, and frame rates while the camera moves."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from gausslite.domain.errors import InvalidInputError
+from gausslite.domain.gaussians import Gaussians
+from gausslite.domain.pose import inverse
+from gausslite.render.rasterizer import LOG_SCALE, MEAN, OPACITY_LOGIT, QUAT, RGB
+from gausslite.view.contents import ViewContents
+from gausslite.view.open_page import open_page
+from gausslite_bench.browser import open_browser
+from gausslite_bench.raster.procedural_room import held_out_view, seed_rows
+
+if TYPE_CHECKING:
+    from gausslite.view.map_page import MapPage
+
+_OPACITY = 0.9
+_LIMIT_S = 180.0
+_POLL_MS = 20
+_DRAG_PX = (120.0, 40.0)
+_COUNT_DRAWN = """
+(() => {
+  window.splatsDrawn = []; window.largestDrawn = 0;
+  const draw = WebGL2RenderingContext.prototype.drawElementsInstanced;
+  WebGL2RenderingContext.prototype.drawElementsInstanced = function (...call) {
+    window.splatsDrawn.push(performance.now()); window.largestDrawn = Math.max(window.largestDrawn, call[4]);
+    return draw.apply(this, call);
+  };
+})()
+"""
+"""Runs before the page's scripts: viser draws all splats with one instanced call a frame."""
+
+
+@dataclass(frozen=True, slots=True)
+class ViewRate:
+    """Times of one map: shown of its Gaussians are drawn at rest.
+
+    drawn_s: from the request of the page until the first frame with the splats is finished. response_s: from
+    the first move of the mouse to a finished frame with all shown Gaussians. moving_fps: frames a second in the second
+    half of a drag, when the page draws fewer Gaussians if needed.
+    """
+
+    gaussians: int
+    shown: int
+    width_px: int
+    height_px: int
+    drawn_s: float
+    response_s: float
+    moving_fps: float
+
+    def as_json(self) -> dict[str, object]:
+        """Return the times as JSON values."""
+        return asdict(self)
+
+
+def measure_view(gaussians: int, limit: int, size: tuple[int, int], drag_s: float) -> ViewRate:
+    """Serve a procedural room, open its page and drag the camera for drag_s. Raises InvalidInputError."""
+    if drag_s <= 0:
+        raise InvalidInputError(f"drag: expected more than 0 s, got {drag_s:g}")
+    contents = _room(gaussians)
+    page = open_page(0, "GaussLite view", limit)
+    try:
+        page.show(contents)
+        with open_browser(size) as browser:
+            return _measure(page, browser, gaussians, size, drag_s)
+    finally:
+        page.close()
+
+
+def _measure(page: MapPage, browser: Any, gaussians: int, size: tuple[int, int], drag_s: float) -> ViewRate:
+    browser.add_init_script(_COUNT_DRAWN)
+    tab = browser.new_page()
+    started_s = time.perf_counter()
+    tab.goto(page.url)
+    _wait(tab, lambda: tab.evaluate("window.splatsDrawn.length") > 0)
+    _finish_frame(tab)
+    drawn_s = time.perf_counter() - started_s
+    middle_px = np.array([0.3 * size[0], 0.5 * size[1]])
+    tab.mouse.move(*middle_px)
+    tab.mouse.down()
+    response_s = _response_s(tab, middle_px + 5.0)
+    _drag(tab, middle_px, 0.5 * drag_s)
+    moving_fps = _drag(tab, middle_px, 0.5 * drag_s)
+    tab.mouse.up()
+    return ViewRate(gaussians, int(tab.evaluate("window.largestDrawn")), *size, drawn_s, response_s, moving_fps)
+
+
+def _drag(tab: Any, middle_px: np.ndarray, duration_s: float) -> float:
+    """Move the mouse in ellipses for this long; return the frames a second that the page drew."""
+    before, started_s = tab.evaluate("window.splatsDrawn.length"), time.perf_counter()
+    while (elapsed_s := time.perf_counter() - started_s) < duration_s:
+        angle = 2 * math.pi * elapsed_s / 4.0
+        tab.mouse.move(*(middle_px + np.array(_DRAG_PX) * (math.sin(angle), math.cos(angle))))
+    return float((tab.evaluate("window.splatsDrawn.length") - before) / (time.perf_counter() - started_s))
+
+
+def _response_s(tab: Any, to_px: np.ndarray) -> float:
+    """Return the time from a move of the mouse to the finished frame."""
+    before, started_s = tab.evaluate("window.splatsDrawn.length"), time.perf_counter()
+    tab.mouse.move(*to_px)
+    _wait(tab, lambda: tab.evaluate("window.splatsDrawn.length") > before)
+    _finish_frame(tab)
+    return time.perf_counter() - started_s
+
+
+def _finish_frame(tab: Any) -> None:
+    """Wait until what the page has asked for is drawn: reading a pixel back waits for the renderer."""
+    tab.evaluate(
+        """() => new Promise(done => requestAnimationFrame(() => requestAnimationFrame(() => {
+          const gl = document.querySelector("canvas").getContext("webgl2");
+          gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4)); done(); })))"""
+    )
+
+
+def _wait(tab: Any, condition: Callable[[], bool]) -> None:
+    deadline_s = time.perf_counter() + _LIMIT_S
+    while not condition():
+        if time.perf_counter() > deadline_s:
+            raise InvalidInputError(f"the page: expected splats within {_LIMIT_S:g} s, got none")
+        tab.wait_for_timeout(_POLL_MS)
+
+
+def _room(count: int) -> ViewContents:
+    rows = seed_rows(count, _OPACITY)
+    gaussians = Gaussians(
+        np.ascontiguousarray(rows[:, MEAN]),
+        np.ascontiguousarray(rows[:, QUAT]),
+        np.exp(rows[:, LOG_SCALE]),
+        1.0 / (1.0 + np.exp(-rows[:, OPACITY_LOGIT].reshape(-1))),
+        np.clip(rows[:, RGB], 0.0, 1.0),
+        np.zeros(count, np.bool_),
+        np.zeros(count, np.uint32),
+        np.full(count, -1, np.int16),
+    )
+    view = ViewContents.of_one_agent(gaussians)
+    pose = inverse(held_out_view(320, 240).T_camera_world)[None]
+    return ViewContents(gaussians, view.agent, times_ns=np.zeros(1, np.int64), T_world_camera=pose)
