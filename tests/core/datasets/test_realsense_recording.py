@@ -11,7 +11,11 @@ import numpy as np
 import pytest
 
 from gausslite.datasets.open import open_source
+from gausslite.datasets.poses import pose_from_quaternion
 from gausslite.datasets.registered_source import register_depth
+from gausslite.datasets.ros.bag_file import BagFile
+from gausslite.datasets.ros.realsense_recording import stream_transforms
+from gausslite.datasets.ros.transform_tree import TransformTree
 from gausslite.domain.camera import Camera
 
 pytest.importorskip("rosbags", reason="bags need the extra ros")
@@ -77,3 +81,33 @@ def test_depth_is_registered_with_the_units_and_the_extrinsics_of_the_recording(
     np.testing.assert_array_equal(frame.rgb, colour)
     np.testing.assert_allclose(frame.depth_m, expected, atol=1e-6)
     assert 0.75 < frame.depth_m[height // 2, width // 2] < 0.85
+
+
+def transform_point(rotation: np.ndarray, translation_m: np.ndarray, from_point: np.ndarray) -> np.ndarray:
+    """Return `rs2_transform_point_to_point` of librealsense: the rotation's 9 numbers are column-major."""
+    r, t, p = rotation, translation_m, from_point
+    return np.array([r[i] * p[0] + r[3 + i] * p[1] + r[6 + i] * p[2] + t[i] for i in range(3)])
+
+
+def test_extrinsics_transform_points_from_the_reference_to_the_stream(tmp_path: Path, tool: ModuleType) -> None:
+    # as the SDK writes them: the reference is a third stream, and w is negative
+    written = {
+        COLOUR: ((0.015, 0.001, -0.0005), (0.02, -0.03, 0.04)),
+        DEPTH: ((-0.03, 0.002, 0.001), (0.0, 0.05, 0.01)),
+    }
+    extrinsics = {}
+    with tool.BagWriter.open(tmp_path / "camera.bag") as bag:
+        for stream, (translation_m, (x, y, z)) in written.items():
+            w = -np.sqrt(1 - x * x - y * y - z * z)
+            pose = {
+                "translation": dict(zip("xyz", translation_m, strict=True)),
+                "rotation": {"x": x, "y": y, "z": z, "w": w},
+            }
+            bag.write(f"{stream}/tf/0", "geometry_msgs/msg/Transform", START_NS, pose)
+            R = pose_from_quaternion(stream, np.zeros(3), np.array((x, y, z, w)))[:3, :3]
+            extrinsics[stream] = R.T.ravel(), np.array(translation_m)
+    T_colour_depth = TransformTree(stream_transforms(BagFile(tmp_path / "camera.bag"))).at(COLOUR, DEPTH, 0.0)
+    assert T_colour_depth is not None
+    for p_reference in np.random.default_rng(0).uniform(-2, 2, (5, 3)):
+        p_depth, p_colour = (transform_point(*extrinsics[stream], p_reference) for stream in (DEPTH, COLOUR))
+        np.testing.assert_allclose(T_colour_depth @ [*p_depth, 1.0], [*p_colour, 1.0], atol=1e-9)

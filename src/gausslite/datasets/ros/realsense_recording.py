@@ -1,7 +1,11 @@
 """Recordings of the RealSense SDK (realsense-viewer, rs-record): ROS 1 bags with the SDK's own topics.
 
-A stream's topics begin with its name, such as /device_0/sensor_1/Color_0. The extrinsics of a stream are messages of
-STREAM/tf/N: the pose of the reference N in the stream's frame. All frame_ids are equal, or missing.
+A stream's topics begin with its name, such as /device_0/sensor_1/Color_0. All frame_ids are equal, or missing.
+
+STREAM/tf/N holds the extrinsics from the reference stream of group N to the stream, as T_stream_reference:
+p_stream = R @ p_reference + t. Sources in librealsense: rs2_extrinsics in h/rs_sensor.h (R is column-major) and
+rs2_transform_point_to_point in rsutil.h (the direction); ros_writer::write_extrinsics and device::get_extrinsics, which
+fetches them from the group's reference to the stream; rot2quat in ros_file_format.h, whose w may be negative.
 """
 
 from __future__ import annotations
