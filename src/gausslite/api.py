@@ -118,8 +118,8 @@ class RenderedImage:
 def open_sequence(
     spec: str | Path, *, up_axis: UpAxis | None = None, depth_registration: DepthRegistration | None = None
 ) -> Source:
-    """Open a folder in TUM, 7-Scenes or Replica layout, a ROS bag such as "bag:run1.mcap?depth=/camera/depth/image", or
-    a simulated home such as "sim:home?seed=0&trajectory=0".
+    """Open a folder in TUM, 7-Scenes or Replica layout, an export of ZED or Record3D, a ROS bag such as
+    "bag:run1.mcap?depth=/camera/depth/image", or a simulated home such as "sim:home?seed=0&trajectory=0".
 
     up_axis: unit vector of the world frame that points up, if not the layout's. depth_registration: the colour camera,
     for recordings with unregistered depth. Raises DatasetError, PoseError, InvalidInputError.

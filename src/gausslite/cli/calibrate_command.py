@@ -29,7 +29,9 @@ _KNOWN_HELP = "keep these values, and estimate what they leave out (default: the
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the options of `gausslite calibrate`."""
     parser.add_argument(
-        "source", metavar="SOURCE", help="a folder (TUM, 7-Scenes or Replica layout), a ROS bag, or sim:home?..."
+        "source",
+        metavar="SOURCE",
+        help="a folder (TUM, 7-Scenes, Replica, ZED or Record3D layout), a ROS bag, or sim:home?...",
     )
     parser.add_argument("--up", metavar="X,Y,Z", type=read_up_axis, help="upward direction (default: the source's)")
     parser.add_argument("--lens", metavar="MODEL:K1,...", help=_KNOWN_HELP)

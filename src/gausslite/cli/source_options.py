@@ -29,7 +29,7 @@ def add_source(parser: argparse.ArgumentParser, default_text: str = NONE) -> Non
     parser.add_argument(
         "source",
         metavar="SOURCE",
-        help='a folder (TUM, 7-Scenes or Replica layout), a ROS bag ("bag:run1.mcap?depth=TOPIC"), '
+        help='a folder (TUM, 7-Scenes, Replica, ZED or Record3D layout), a ROS bag ("bag:run1.mcap?depth=TOPIC"), '
         'or "sim:home?seed=0&trajectory=0", sim:home-1 to sim:home-8',
     )
     add_frames(parser, allow_auto=True, default_text=default_text)

@@ -18,7 +18,7 @@ from gausslite.datasets.poses import is_lost, nearest_rigid
 from gausslite.datasets.regions import regions_in_folder
 from gausslite.datasets.source import excluded_frames_note, require_frames, require_position
 from gausslite.domain.camera import Camera
-from gausslite.domain.errors import DatasetError
+from gausslite.domain.errors import DatasetError, PoseError
 from gausslite.domain.frame import Frame
 from gausslite.domain.lens import Lens
 from gausslite.domain.pose import UpAxis
@@ -133,7 +133,7 @@ class NumberedFolderSource(FolderSource, ABC):
     def _is_lost(self, number: int) -> bool:
         try:
             return is_lost(self._read_matrix(number)[:3])
-        except DatasetError:
+        except (DatasetError, PoseError):
             return False  # `frame` reports a damaged pose if it is used
 
     def _read_pose(self, number: int) -> Float64[ndarray, "4 4"]:
@@ -144,5 +144,5 @@ class NumberedFolderSource(FolderSource, ABC):
     def _has_pose(self, number: int) -> bool:
         try:
             return not is_lost(self._read_matrix(number)[:3])
-        except DatasetError:
+        except (DatasetError, PoseError):
             return False

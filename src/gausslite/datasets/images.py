@@ -63,7 +63,14 @@ def first_readable_size(paths: Iterable[Path]) -> tuple[int, int]:
 
 
 def read_depth(path: Path, units: DepthUnits) -> Float32[ndarray, "h w"]:
-    """Return depth in metres, 0 if invalid. Raises DatasetError with the file name."""
+    """Return depth in metres, 0 if invalid, of a 16-bit image or of a .npy file of float32 in the same units.
+
+    Raises DatasetError with the file name.
+    """
+    if path.suffix == ".npy":
+        depth_m = (_read_npy(path) / np.float32(units.per_metre)).astype(np.float32, copy=False)
+        depth_m[~(np.isfinite(depth_m) & (depth_m > 0))] = 0.0
+        return depth_m
     raw = _decode(path, cv2.IMREAD_UNCHANGED)
     if raw.dtype != np.uint16 or raw.ndim != 2:
         raise DatasetError(f"{path}: expected a 16-bit image of one channel, got {raw.dtype} of shape {raw.shape}")
@@ -94,9 +101,30 @@ def resize_rgbd(image: RgbdImage, size: tuple[int, int] | None) -> RgbdImage:
     width, height = size
     camera = image.camera.resized(width, height)
     rgb = cv2.resize(image.rgb, size, interpolation=cv2.INTER_AREA)
-    rows = ((np.arange(height) + 0.5) * (image.camera.height_px / height)).astype(np.int64)
-    columns = ((np.arange(width) + 0.5) * (image.camera.width_px / width)).astype(np.int64)
-    return RgbdImage(rgb, np.ascontiguousarray(image.depth_m[np.ix_(rows, columns)]), camera)
+    return RgbdImage(rgb, resize_depth(image.depth_m, size), camera)
+
+
+def resize_depth(depth_m: Float32[ndarray, "h w"], size: tuple[int, int]) -> Float32[ndarray, "ho wo"]:
+    """Return the depth image at (width, height) by nearest pixel."""
+    width, height = size
+    rows = ((np.arange(height) + 0.5) * (depth_m.shape[0] / height)).astype(np.int64)
+    columns = ((np.arange(width) + 0.5) * (depth_m.shape[1] / width)).astype(np.int64)
+    return np.ascontiguousarray(depth_m[np.ix_(rows, columns)])
+
+
+def _read_npy(path: Path) -> Float32[ndarray, "h w"]:
+    """Return a float32 image. Type, shape and size in the header are checked before memory is taken."""
+    try:
+        mapped = np.load(path, mmap_mode="r", allow_pickle=False)
+    except FileNotFoundError:
+        raise DatasetError(f"{path}: expected a depth image, got none") from None
+    except (OSError, ValueError, EOFError) as error:
+        raise DatasetError(f"{path}: expected a .npy file; {' '.join(str(error).split())[:120]}") from None
+    if not isinstance(mapped, np.ndarray) or mapped.dtype != np.float32 or mapped.ndim != 2:
+        got = f"{mapped.dtype} of shape {mapped.shape}" if isinstance(mapped, np.ndarray) else "an archive"
+        raise DatasetError(f"{path}: expected a float32 image of one channel, got {got}")
+    require_pixel_count(str(path), mapped.shape[1], mapped.shape[0])
+    return np.array(mapped)
 
 
 def _decode(path: Path, flags: int) -> NDArray[Any]:

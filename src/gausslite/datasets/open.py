@@ -1,4 +1,4 @@
-"""Open a sequence: a folder of a known layout, a ROS bag, or a simulated home."""
+"""Open a sequence: a folder of a known layout, a Record3D file, a ROS bag, or a simulated home."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
 
+from gausslite.datasets.record3d import Record3dSource
 from gausslite.datasets.registered_source import RegisteredSource
 from gausslite.datasets.replica import ReplicaSource
 from gausslite.datasets.ros.address import BagAddress
@@ -15,14 +16,16 @@ from gausslite.datasets.sevenscenes import SevenScenesSource
 from gausslite.datasets.source import Source
 from gausslite.datasets.tum import TumSource
 from gausslite.datasets.undistorted_colour import UndistortedColourSource
+from gausslite.datasets.zed import ZedSource
 from gausslite.domain.depth_registration import DepthRegistration
 from gausslite.domain.errors import DatasetError, PoseError
 from gausslite.domain.pose import UpAxis
 
-_READERS = (TumSource, SevenScenesSource, ReplicaSource)
+_READERS = (TumSource, SevenScenesSource, ReplicaSource, ZedSource, Record3dSource)
 _LAYOUTS = (
-    "TUM RGB-D (rgb.txt, depth.txt, groundtruth.txt), 7-Scenes (frame-000000.color.png ...) "
-    "or Replica (results/frame000000.jpg, traj.txt)"
+    "TUM RGB-D (rgb.txt, depth.txt, groundtruth.txt), 7-Scenes (frame-000000.color.png ...), "
+    "Replica (results/frame000000.jpg, traj.txt), ZED (left000000.png, depth000000.png) "
+    "or Record3D (metadata, rgbd/0.jpg)"
 )
 _SIMULATED = "sim:"
 _SIMULATOR = "gausslite_sim.source"
@@ -34,9 +37,10 @@ def open_source(
     depth_registration: DepthRegistration | None = None,
     require_poses: bool = True,
 ) -> Source:
-    """Return the sequence in a folder, a ROS bag ("bag:run1.mcap?depth=/cam/depth") or a simulated home ("sim:home").
+    """Return the sequence in a folder, a Record3D file, a ROS bag or a simulated home ("sim:home").
 
-    A path that is a bag needs no prefix. A folder that contains exactly one sequence folder also works.
+    A bag may state topics ("bag:run1.mcap?depth=/cam/depth"); a path that is a bag needs no prefix. A folder that
+    contains exactly one sequence also works.
     depth_registration: the colour camera to which depth is registered; None if the recording is registered. A lens that
     is stated for unregistered depth is the colour camera's alone; colour images are undistorted. require_poses: False
     also accepts frames and sequences without poses, for tracking; these frames get the identity. Raises DatasetError,
@@ -79,9 +83,11 @@ def _open(spec: str, up_axis: UpAxis | None, require_poses: bool) -> Source:
     if bag is not None:
         return BagSource(bag, up_axis, require_poses)
     folder = Path(spec).expanduser()
-    if not folder.is_dir():
+    if not folder.is_dir() and not _recognised(folder):
         found = "a file" if folder.is_file() else "nothing there"
-        raise DatasetError(f"{spec}: expected a folder with a sequence, a ROS bag, or sim:home; got {found}")
+        raise DatasetError(
+            f"{spec}: expected a folder with a sequence, a ROS bag, an .r3d file, or sim:home; got {found}"
+        )
     source = _open_folder(folder, up_axis, require_poses)
     if source is not None:
         return source
