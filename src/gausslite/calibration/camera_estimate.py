@@ -24,6 +24,7 @@ from gausslite.domain.camera_correction import CameraCorrection
 from gausslite.domain.lens import Lens, LensModel
 
 _MIN_PAIRS = 4
+_MIN_PIXELS = 160 * 120
 _READOUTS_S = (0.0, 0.015, 0.03, 0.045)
 _OFFSETS_S = (-0.02, 0.0, 0.02)
 _FINE_STEP_S = 0.0075
@@ -34,7 +35,7 @@ _MIN_ROTATION_DEG = 0.01
 _EXCHANGE = 0.4
 """Squared slope at which the two radial terms exchange: half way to the corner of an image 60 degrees wide."""
 _MIN_TIMING_RESIDUAL_GAIN, _MIN_MOTION_GAIN = 0.005, 0.3
-_CLEAR_MOTION_GAIN, _CLEAR_ROTATION_DEG = 0.6, 0.1
+_CLEAR_MOTION_GAIN, _CLEAR_ROTATION_DEG, _MAX_RESIDUAL_LOSS = 0.6, 0.1, 0.02
 _MIN_COARSE_LENS_GAIN, _MIN_LENS_RESIDUAL_GAIN, _MIN_SECOND_RADIAL_GAIN = 0.01, 0.03, 0.01
 
 
@@ -51,6 +52,10 @@ def estimate_camera(source: Source, known: CameraCorrection) -> CameraEstimate:
 
     A lens of `known` is kept. Frames that cannot be read are skipped. Depth must be registered to colour.
     """
+    width_px, height_px = source.camera.width_px, source.camera.height_px
+    if width_px * height_px < _MIN_PIXELS:
+        # noise of tiny images looks like a lens
+        return CameraEstimate(known, (f"images of {width_px}x{height_px} pixels, expected at least 160x120",))
     moving = MovingPairs.read(source, downscaled_size(source.camera))
     if len(moving.pairs) < _MIN_PAIRS:
         reason = f"{len(moving.pairs)} pairs of frames turn fast enough, expected at least {_MIN_PAIRS}"
@@ -121,7 +126,7 @@ def _with_times(moving: MovingPairs, coarse: MovingPairs, known: CameraCorrectio
         _READOUTS_S, lambda value: _relative(coarse.error(replace(known, readout_s=value)), coarse_before)
     )
     found = replace(known, readout_s=readout_s)
-    offset_s = minimum(_OFFSETS_S, lambda value: moving.error(replace(found, time_offset_s=value)).rotation_deg)
+    offset_s = minimum(_OFFSETS_S, lambda value: moving.error(replace(found, time_offset_s=value)).rotation_deg ** 2)
     found = replace(found, time_offset_s=round(offset_s, 3) + 0.0)
     around_s = _around(readout_s, _FINE_STEP_S)
     readout_s = minimum(around_s, lambda value: _relative(moving.error(replace(found, readout_s=value)), before))
@@ -142,18 +147,17 @@ def _explain_motion(before: PairError, after: PairError) -> bool:
 
     The pose fit hides a slow camera's readout from the residual: most of it looks like a rotation of the whole image.
     """
-    if after.residual > before.residual:
-        return False
     rotation_gain = 1.0 - after.rotation_deg / max(before.rotation_deg, _MIN_ROTATION_DEG)
     residual_gain = 1.0 - after.residual / before.residual
     if rotation_gain >= _MIN_MOTION_GAIN and residual_gain >= _MIN_TIMING_RESIDUAL_GAIN:
         return True
-    return rotation_gain >= _CLEAR_MOTION_GAIN and before.rotation_deg >= _CLEAR_ROTATION_DEG
+    is_far = rotation_gain >= _CLEAR_MOTION_GAIN and before.rotation_deg >= _CLEAR_ROTATION_DEG
+    return is_far and residual_gain >= -_MAX_RESIDUAL_LOSS
 
 
 def _relative(error: PairError, before: PairError) -> float:
-    """Return residual and rotation relative to those before, added: on few pairs, either alone has a flat minimum."""
-    return error.residual / before.residual + error.rotation_deg / max(before.rotation_deg, _MIN_ROTATION_DEG)
+    """Return residual and squared rotation relative to those before, added: on few pairs, either alone is flat."""
+    return error.residual / before.residual + (error.rotation_deg / max(before.rotation_deg, _MIN_ROTATION_DEG)) ** 2
 
 
 def _radial(k1: float, k2: float) -> Lens:

@@ -38,7 +38,11 @@ _PAIR_TURN_RAD = math.radians(8.0)
 
 @dataclass(frozen=True, slots=True)
 class PairError:
-    """Disagreement of frame pairs: robust residual of the luminance (0 to 255), and rotation of the pose fit."""
+    """Disagreement of frame pairs: robust residual of the luminance (0 to 255), and rotation of the pose fit.
+
+    The rotation is the root of the mean square: wrong times turn each pair in proportion, so that its square is a
+    parabola over the readout time and the offset.
+    """
 
     residual: float
     rotation_deg: float
@@ -97,7 +101,8 @@ class MovingPairs:
             rotations_deg.append(math.degrees(float(np.linalg.norm(change[3:]))))
         if not residuals:
             return PairError(math.inf, math.inf, 0)
-        return PairError(float(np.mean(residuals)), float(np.median(rotations_deg)), len(residuals))
+        rotation_deg = math.sqrt(float(np.mean(np.square(rotations_deg))))
+        return PairError(float(np.mean(residuals)), rotation_deg, len(residuals))
 
 
 def fastest_pairs(trajectory: Trajectory) -> list[tuple[int, int]]:

@@ -16,6 +16,7 @@ from gausslite.domain.pose import inverse, twist_of
 _MIN_BASELINE_S = 1e-6
 _TYPICAL_DISTANCE_M = 2.0
 _MAX_VELOCITY_CHANGE = 0.5
+_MAX_GAP_RATIO = 2.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,17 +52,29 @@ class Trajectory:
             raise InvalidInputError("trajectory times_s: expected finite, ascending times")
 
     def twist(self, i: int) -> Twist:
-        """Return the velocity at pose i, by central difference; 0 if the trajectory has a single time."""
+        """Return the velocity at pose i; 0 if the trajectory has a single time.
+
+        It is the derivative of the polynomial through two poses on each side, or of the line through the nearest ones
+        at the ends of the trajectory and beside gaps. A line alone underestimates the peaks of a hand-held camera.
+        """
         before, after = max(i - 1, 0), min(i + 1, len(self.times_s) - 1)
-        seconds = float(self.times_s[after] - self.times_s[before])
-        if seconds < _MIN_BASELINE_S:
+        if self.times_s[after] - self.times_s[before] < _MIN_BASELINE_S:
             return Twist(np.zeros(3), np.zeros(3))
-        T_camera_world = inverse(self.T_world_camera[i])
-        step_m = self.T_world_camera[after][:3, 3] - self.T_world_camera[before][:3, 3]
-        R_before_after = self.T_world_camera[before][:3, :3].T @ self.T_world_camera[after][:3, :3]
-        R_camera_before = T_camera_world[:3, :3] @ self.T_world_camera[before][:3, :3]
-        turn_rad = R_camera_before @ cv2.Rodrigues(R_before_after)[0].ravel()
-        return Twist(T_camera_world[:3, :3] @ step_m / seconds, turn_rad / seconds)
+        neighbours = [i - 2, i - 1, i + 1, i + 2]
+        if not self._is_evenly_spaced(neighbours):
+            neighbours = [before, after]
+        times_s = self.times_s[neighbours] - self.times_s[i]
+        T_camera_neighbour = inverse(self.T_world_camera[i]) @ self.T_world_camera[neighbours]
+        turns_rad = np.stack([cv2.Rodrigues(T[:3, :3])[0].ravel() for T in T_camera_neighbour])
+        weights = _derivative_weights(times_s)
+        return Twist(weights @ T_camera_neighbour[:, :3, 3], weights @ turns_rad)
+
+    def _is_evenly_spaced(self, neighbours: list[int]) -> bool:
+        """True if these poses exist, and no gap between them or to pose i is over twice as long as another."""
+        if neighbours[0] < 0 or neighbours[-1] >= len(self.times_s):
+            return False
+        gaps_s = np.diff(self.times_s[neighbours[0] : neighbours[-1] + 1])
+        return bool(gaps_s.min() >= _MIN_BASELINE_S and gaps_s.max() <= _MAX_GAP_RATIO * gaps_s.min())
 
     def is_steady(self, i: int) -> bool:
         """True if the velocities before and after pose i are similar: only then do the poses state the velocity there.
@@ -83,3 +96,17 @@ class Trajectory:
     def angular_speeds_rad_s(self) -> Float64[ndarray, " n"]:
         """Return the magnitude of the angular velocity at every pose."""
         return np.array([np.linalg.norm(self.twist(i).angular_rad_s) for i in range(len(self.times_s))])
+
+
+def _derivative_weights(times_s: Float64[ndarray, " k"]) -> Float64[ndarray, " k"]:
+    """Return the weights of values at these times in the derivative at 0 of the polynomial through them and (0, 0).
+
+    Two times of which one is 0 give the line through both, and two others the line through them.
+    """
+    weights: Float64[ndarray, " k"]
+    if len(times_s) == 2:
+        weights = np.array([-1.0, 1.0]) / (times_s[1] - times_s[0])
+    else:
+        powers = times_s[:, None] ** np.arange(1, len(times_s) + 1)
+        weights = np.linalg.solve(powers.T, np.eye(len(times_s))[0])
+    return weights
