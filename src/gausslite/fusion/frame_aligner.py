@@ -13,8 +13,7 @@ from numpy import ndarray
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.moved_gaussians import move_gaussians
 from gausslite.domain.names import quote_name
-from gausslite.domain.voxel_operations import VoxelIndex, select_voxels
-from gausslite.domain.voxels import VoxelGrid
+from gausslite.domain.voxel_operations import select_voxels
 from gausslite.fusion.alignment import SurfaceSamples, crop_to_overlap, fit_frame
 from gausslite.fusion.frame_alignment import AlignmentSettings, AlignmentState, FrameAlignment, FrameAlignments
 from gausslite.fusion.free_space import FreeSpaceRecords
@@ -91,7 +90,7 @@ class FrameAligner:
             if self._alignments.get(agent_id) is not alignment:
                 return np.zeros(0, np.int64)
             if fit is None or self._settings.is_chance(fit):
-                contradicted = self._contradicted_share(agent_id, move_gaussians(source, start), reference)
+                contradicted = self._contradicted_share(agent_id, move_gaussians(source, start))
                 aligned = alignment.without_overlap(contradicted, self._settings)
             else:
                 aligned = alignment.after_fit(fit, first_seq, self._settings)
@@ -125,15 +124,20 @@ class FrameAligner:
         is_changed = changed >= self._settings.refit_share * totals.voxels
         return has_enough and (is_changed or agent_id in self._free_space_changed)
 
-    def _contradicted_share(self, agent_id: str, moved: Gaussians, reference: Gaussians) -> float:
-        """Return the share of voxels in free space, of those that the agents before this one have observed."""
+    def _contradicted_share(self, agent_id: str, moved: Gaussians) -> float:
+        """Return the share of Gaussians in voxels that agents before this one have observed as free.
+
+        Gaussians are counted and not voxels, because stray ones are few but have many voxels to themselves.
+        """
         observers = self._alignments.earlier(agent_id) - self._alignments.in_other_frames()
         grid = self._free_space.grid
-        own, occupied = (_occupied_voxels(each, grid) for each in (moved, reference))
-        free = self._free_space.seen_by(observers, own)
-        observed = free | np.isin(own, occupied)
+        inside = (np.abs(moved.means_m) < grid.max_coordinate_m).all(axis=1)
+        keys, counts = np.unique(grid.keys(moved.means_m[inside]), return_counts=True)
+        free = self._free_space.seen_by(observers, keys)
         # a few voxels are no evidence: an object may have been moved
-        return max(int(free.sum()) - _MOVED_VOXELS, 0) / max(int(observed.sum()), 1)
+        if np.count_nonzero(free) <= _MOVED_VOXELS:
+            return 0.0
+        return float(counts[free].sum() / len(moved))
 
     def _recent(self, agent_id: str, first_seq: int) -> Gaussians:
         """Return the Gaussians of the updates from first_seq on, or all if these are few."""
@@ -145,9 +149,3 @@ class FrameAligner:
     def _reference(self, agent_id: str) -> Gaussians:
         earlier = self._alignments.earlier(agent_id)
         return Gaussians.concatenate([b.gaussians for name, b in self._votes.batches().items() if name in earlier])
-
-
-def _occupied_voxels(gaussians: Gaussians, grid: VoxelGrid) -> Int64[ndarray, " k"]:
-    """Return the keys of the voxels that hold a Gaussian, without those outside the grid's range."""
-    inside = (np.abs(gaussians.means_m) < grid.max_coordinate_m).all(axis=1)
-    return VoxelIndex.from_points(gaussians.means_m[inside], grid).keys

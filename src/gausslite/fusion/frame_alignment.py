@@ -44,7 +44,7 @@ class AlignmentSettings:
     quarantined unless a correction within max_shift_m and max_rotation_deg reduces it below. refit_share: an estimate
     is due when this share of the agent's voxels has changed since the last one. min_overlap: share of the samples that
     match within 10 cm after a fit; with fewer, the fit is chance. max_contradicted_share: after such a fit, an agent is
-    quarantined if agents before it have observed free space in a larger share of its voxels that they have observed.
+    quarantined if agents before it have observed free space where a larger share of its Gaussians is.
     """
 
     min_shift_m: float = 0.01
@@ -55,7 +55,7 @@ class AlignmentSettings:
     min_improvement: float = 1.4
     refit_share: float = 0.25
     min_overlap: float = 0.3
-    max_contradicted_share: float = 0.2
+    max_contradicted_share: float = 0.1
 
     def is_chance(self, fit: FrameFit) -> bool:
         """Return whether the maps may share too little surface to compare the frames."""
@@ -99,9 +99,8 @@ class FrameAlignment:
         """Return the alignment of an agent that cannot be fitted; contradicted_share: see AlignmentSettings."""
         if contradicted_share > settings.max_contradicted_share:
             message = (
-                f"frame: agents before it have observed free space in {contradicted_share:.0%} of those of its voxels "
-                f"that they have observed, expected at most {settings.max_contradicted_share:.0%}; check the agent's "
-                "localisation"
+                f"frame: {contradicted_share:.0%} of its Gaussians are where agents before it have observed free "
+                f"space, expected at most {settings.max_contradicted_share:.0%}; check the agent's localisation"
             )
             return replace(self, state=AlignmentState.QUARANTINED, fit=None, message=message)
         if self.state is AlignmentState.QUARANTINED and self.fit is None:

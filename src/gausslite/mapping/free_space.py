@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
-from jaxtyping import Int64
+from jaxtyping import Float32, Int64
 from numpy import ndarray
 
 from gausslite.domain.camera import project
 from gausslite.domain.frame import Frame
-from gausslite.domain.free_space import BLOCK_VOXELS, MAX_VIEWS, FreeSpace, split_indices
+from gausslite.domain.free_space import BLOCK_SIDE, BLOCK_VOXELS, MAX_VIEWS, FreeSpace, split_indices
 from gausslite.domain.pose import inverse, transform_points
 from gausslite.domain.voxels import VoxelGrid
 
 _MAX_RANGE_M, _NEAR_M = 4.0, 0.2
-_MAX_VOXELS = 400_000
+_MAX_VOXELS = 1_000_000
 _SLACK_M, _SLACK_SHARE = 0.05, 0.02
-_FOOTPRINT = np.array([(x, y) for x in (0, -1, 1) for y in (0, -1, 1)], np.float64)
-"""Pixels of a voxel's outline in units of its radius, the centre first."""
+_RADII_PX = np.array([1, 2, 3, 4, 5, 6, 8, 10, 13, 16, 20, 25, 32, 40, 50, 64], np.int64)
+"""Sizes of the squares in the image that hold a voxel; nearer voxels, which are larger, are not evaluated."""
 
 
 class FreeSpaceMap:
@@ -35,8 +36,8 @@ class FreeSpaceMap:
     def observe(self, frame: Frame) -> None:
         """Count one view for the voxels that lie completely in front of the measured surface.
 
-        A voxel is free if nine pixels of its outline have a depth, each behind the voxel's farthest point.
-        Voxels beyond 4 m are not evaluated.
+        A voxel is free if all pixels that it may cover have a depth, each behind the voxel's farthest point. Voxels
+        beyond 4 m are not evaluated.
         """
         indices = self._free_indices(frame)
         if len(indices) == 0:
@@ -67,29 +68,52 @@ class FreeSpaceMap:
         points = transform_points(inverse(frame.T_world_camera), (indices + 0.5) * size_m)
         z_m = points[:, 2]
         chosen = np.flatnonzero((z_m > _NEAR_M + half_m) & (z_m < min(_MAX_RANGE_M, float(frame.depth_m.max()))))
-        centres_px = project(points[chosen].astype(np.float32), camera).astype(np.float64)
         z_m = z_m[chosen]
-        radius_px = max(camera.fx_px, camera.fy_px) * half_m / z_m
+        pixels = np.floor(project(points[chosen].astype(np.float32), camera)).astype(np.int64)
+        radius_px = np.ceil(max(camera.fx_px, camera.fy_px) * half_m / z_m).astype(np.int64)
         far_m = (z_m + half_m) * (1.0 + _SLACK_SHARE) + _SLACK_M
-        # the centre first: few voxels remain for the other pixels
-        for offset in _FOOTPRINT:
-            pixels = np.floor(centres_px + offset * radius_px[:, None]).astype(np.int64)
-            inside = (pixels >= 0).all(axis=1) & (pixels < (camera.width_px, camera.height_px)).all(axis=1)
-            columns, rows = np.where(inside[:, None], pixels, 0).T
-            free = inside & (frame.depth_m[rows, columns] > far_m)
-            chosen, centres_px, radius_px, far_m = chosen[free], centres_px[free], radius_px[free], far_m[free]
-        return indices[chosen]
+        size_px = (camera.width_px, camera.height_px)
+        inside = ((pixels >= radius_px[:, None]) & (pixels < size_px - radius_px[:, None])).all(axis=1)
+        chosen, pixels, radius_px, far_m = chosen[inside], pixels[inside], radius_px[inside], far_m[inside]
+        is_free = np.zeros(len(chosen), np.bool_)
+        levels = np.searchsorted(_RADII_PX, np.minimum(radius_px, _RADII_PX[-1]))
+        for level in np.unique(levels):
+            of_level = np.flatnonzero(levels == level)
+            columns, rows = pixels[of_level].T
+            nearest_m = _nearest_depth(frame.depth_m, int(_RADII_PX[level]))
+            is_free[of_level] = nearest_m[rows, columns] > far_m[of_level]
+        free: Int64[ndarray, "n 3"] = indices[chosen[is_free & (radius_px <= _RADII_PX[-1])]]
+        return free
+
+
+def _nearest_depth(depth_m: Float32[ndarray, "h w"], radius_px: int) -> Float32[ndarray, "h w"]:
+    """Return the smallest depth in the square around each pixel; 0 if a pixel of it has none."""
+    side = 2 * radius_px + 1
+    nearest_m: Float32[ndarray, "h w"] = cv2.erode(depth_m, np.ones((side, side), np.uint8)).astype(np.float32)
+    return nearest_m
 
 
 def _indices_in_view(frame: Frame, size_m: float) -> Int64[ndarray, "n 3"]:
-    """Return the (i, j, k) of the voxels in the box around the view up to its farthest depth; none if too many."""
-    camera = frame.camera
-    corners_px = np.array([(0, 0), (camera.width_px, 0), (0, camera.height_px), (camera.width_px, camera.height_px)])
+    """Return the (i, j, k) of the voxels of all blocks that touch the view up to its farthest depth.
+
+    If they are too many, those of the nearest blocks.
+    """
+    camera, block_m = frame.camera, size_m * BLOCK_SIDE
+    corners_px = np.array([(0, 0), (camera.width_px, 0), (camera.width_px, camera.height_px), (0, camera.height_px)])
     rays = np.column_stack([(corners_px - (camera.cx_px, camera.cy_px)) / (camera.fx_px, camera.fy_px), np.ones(4)])
     reach_m = min(_MAX_RANGE_M, float(frame.depth_m.max()))
     hull = transform_points(frame.T_world_camera, np.vstack([rays * reach_m, rays * _NEAR_M]))
-    low, high = np.floor(hull.min(axis=0) / size_m), np.ceil(hull.max(axis=0) / size_m)
+    low, high = np.floor(hull.min(axis=0) / block_m), np.ceil(hull.max(axis=0) / block_m)
     axes = [np.arange(a, b, dtype=np.int64) for a, b in zip(low, high, strict=True)]
-    if np.prod([len(axis) for axis in axes]) > _MAX_VOXELS:
-        return np.zeros((0, 3), np.int64)
-    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    blocks = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    centres_m = transform_points(inverse(frame.T_world_camera), (blocks + 0.5) * block_m)
+    # the sides of the view: planes through the camera's centre and two rays, with normals that point inwards
+    normals = np.cross(rays, np.roll(rays, -1, axis=0))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    radius_m = 0.5 * np.sqrt(3.0) * block_m
+    touches = (centres_m @ normals.T > -radius_m).all(axis=1) & (centres_m[:, 2] < reach_m + radius_m)
+    blocks, z_m = blocks[touches], centres_m[touches, 2]
+    blocks = blocks[np.argsort(z_m)[: _MAX_VOXELS // BLOCK_VOXELS]]
+    offsets = np.stack(np.unravel_index(np.arange(BLOCK_VOXELS), (BLOCK_SIDE,) * 3), axis=1)
+    indices: Int64[ndarray, "n 3"] = (blocks[:, None] * BLOCK_SIDE + offsets).reshape(-1, 3)
+    return indices

@@ -207,6 +207,17 @@ def test_a_region_without_overlap_in_free_space_is_quarantined_and_returns(free_
     assert len(engine.maps.voted_map("bee")) > 0
 
 
+def test_stray_gaussians_in_free_space_do_not_quarantine_a_correct_frame() -> None:
+    engine = FusionEngine(MemoryStore(), SETTINGS)
+    send(engine, "ant", small_object((0.0, 0.0, 0.0)))
+    observe_free(engine, "ant", 5, 15)
+    # a large surface that ant has not seen, and stray Gaussians that have many voxels of free space to themselves
+    strays = plain_gaussians(np.random.default_rng(4).uniform(0.5, 1.5, (60, 3)))
+    send(engine, "bee", Gaussians.concatenate([corner(1, kappa=9, count=3000), strays]))
+    engine.align_due()
+    assert state_of(engine, "bee") is not AlignmentState.QUARANTINED
+
+
 def test_an_agents_own_free_space_is_no_evidence_against_it() -> None:
     engine = FusionEngine(MemoryStore(), SETTINGS)
     send(engine, "ant", small_object((0.0, 0.0, 0.0)))

@@ -6,6 +6,7 @@ import struct
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import google_crc32c
 import numpy as np
 import pytest
@@ -64,6 +65,29 @@ def test_counts_saturate_and_pixels_without_depth_show_nothing() -> None:
     holes.depth_m[20:28, 28:36] = 0.0
     free.observe(holes)
     assert free.free_space.views(key_at(0.05, 0.05, 1.05), GRID).tolist() == [0]
+
+
+def test_a_thin_post_is_never_free() -> None:
+    free = FreeSpaceMap(GRID)
+    frame = wall(2.0)
+    frame.depth_m[:, 35] = 1.0
+    free.observe(frame)
+    x_m = (35.5 - CAMERA.cx_px) / CAMERA.fx_px
+    assert free.free_space.views(key_at(x_m, 0.05, 1.05), GRID).tolist() == [0]
+    assert free.free_space.views(key_at(-0.35, 0.05, 1.05), GRID).tolist() == [1]
+
+
+@pytest.mark.parametrize("voxel_m", [0.02, 0.05])
+def test_an_oblique_view_of_a_large_room_shows_free_space(voxel_m: float) -> None:
+    camera = Camera(272.0, 272.0, 160.0, 120.0, 320, 240)
+    T_world_camera = np.eye(4)
+    T_world_camera[:3, :3] = cv2.Rodrigues(np.array([0.4, 0.7, 0.2]))[0]
+    rgb, depth_m = np.zeros((240, 320, 3), np.uint8), np.full((240, 320), 6.0, np.float32)
+    free = FreeSpaceMap(VoxelGrid(voxel_m))
+    free.observe(Frame(0, 0, rgb, depth_m, camera, T_world_camera))
+    ahead = (T_world_camera @ np.array([0.0, 0.0, 1.0, 1.0]))[:3]
+    keys = VoxelGrid(voxel_m).keys(ahead[None].astype(np.float32))
+    assert free.free_space.views(keys, VoxelGrid(voxel_m)).tolist() == [1]
 
 
 def test_only_changed_blocks_are_collected() -> None:
