@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from gausslite.domain.errors import MapFileError
 from gausslite.domain.state import State, encode_text, get_array, get_counts, get_floats, get_text, int_array
 from gausslite.perception.object_map import Landmark
-from gausslite.perception.surface_votes import SurfaceVotes
+from gausslite.perception.surface_votes import VOXEL_SIZES_M, SurfaceVotes
 
 
 def encode_landmark(landmark: Landmark) -> dict[str, NDArray[Any]]:
@@ -27,6 +27,7 @@ def encode_landmark(landmark: Landmark) -> dict[str, NDArray[Any]]:
         "rival_names": encode_text("\n".join(landmark.rival_scores)),
         "vote_keys": landmark.votes.keys,
         "votes": np.stack([landmark.votes.inside, landmark.votes.outside]),
+        "vote_voxel_m": np.array([landmark.votes.voxel_m]),
         "score_sums": np.array([landmark.score_sum, *landmark.rival_scores.values()]),
     }
 
@@ -46,7 +47,10 @@ def decode_landmark(state: State) -> Landmark:
     inside, outside = get_array(state, "votes", (2, len(keys)), np.int64).copy()
     if (keys[1:] <= keys[:-1]).any() or (inside < 0).any() or (outside < 0).any():
         raise MapFileError("state landmark: expected ascending voxels with votes, got others")
-    votes = SurfaceVotes(keys, inside, outside)
+    (voxel_m,) = get_floats(state, "vote_voxel_m", 1)
+    if voxel_m not in VOXEL_SIZES_M:
+        raise MapFileError(f"state landmark: expected voxels of {', '.join(map(str, VOXEL_SIZES_M))} m, got {voxel_m}")
+    votes = SurfaceVotes(keys, inside, outside, voxel_m)
     names = get_text(state, "rival_names").splitlines()
     score_sum, *rival_sums = get_floats(state, "score_sums", 1 + len(names))
     rivals = dict(zip(names, rival_sums, strict=True))

@@ -14,6 +14,7 @@ from gausslite.domain.camera import back_project, project
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import inverse, transform_points
 from gausslite.perception.detect import bounding_box
+from gausslite.perception.mask_edges import snapped_to_edges
 from gausslite.perception.surface_votes import SurfaceVotes
 
 _MIN_Z_M: Final = 0.05
@@ -44,18 +45,20 @@ def mask_votes(mask: Bool[ndarray, "h w"], frame: Frame) -> SurfaceVotes:
 def surface_mask(votes: SurfaceVotes, frame: Frame) -> Bool[ndarray, "h w"]:
     """Return the pixels of a frame that show the object's surface, and gaps in depth between such pixels.
 
-    A pixel whose depth is not that of the surface shows something in front of the object, or what is behind it.
+    A pixel whose depth is not that of the surface shows something in front of the object, or what is behind it. The
+    outline follows the colour edges next to it.
     """
     mask = np.zeros(frame.depth_m.shape, np.bool_)
     window = _projected_window(votes, frame)
     if window is None:
         return mask
+    votes = _resolved(votes, frame)
     points_m, is_known = _points_m(frame, window)
     shown = np.zeros(is_known.shape, np.bool_)
     shown[is_known] = votes.is_on_surface(points_m)
     closed = cv2.morphologyEx(shown.astype(np.uint8), cv2.MORPH_CLOSE, _CLOSING) > 0
     mask[window] = shown | (closed & ~is_known)
-    return mask
+    return snapped_to_edges(mask, frame.rgb)
 
 
 def refined_mask(detected: Bool[ndarray, "h w"], votes: SurfaceVotes, frame: Frame) -> Bool[ndarray, "h w"]:
@@ -66,6 +69,7 @@ def refined_mask(detected: Bool[ndarray, "h w"], votes: SurfaceVotes, frame: Fra
     mask = detected.copy()
     box_px = bounding_box(detected)
     windows = (_projected_window(votes, frame), None if box_px is None else _box_window(box_px))
+    votes = _resolved(votes, frame)
     for window in windows:
         if window is not None:
             points_m, is_known = _points_m(frame, window)
@@ -73,6 +77,18 @@ def refined_mask(detected: Bool[ndarray, "h w"], votes: SurfaceVotes, frame: Fra
             part[is_known] |= votes.is_surely_inside(points_m)
             part[is_known] &= ~votes.is_surely_outside(points_m)
     return mask
+
+
+def _resolved(votes: SurfaceVotes, frame: Frame) -> SurfaceVotes:
+    """Return the votes in voxels that the frame resolves: of a pixel's width, and of twice its depth's deviation."""
+    z_m = transform_points(inverse(frame.T_world_camera), votes.surface_m.astype(np.float64))[:, 2]
+    middle_m = max(_MIN_Z_M, float(np.median(z_m))) if len(z_m) else _MIN_Z_M
+    return votes.resolved(max(middle_m / frame.camera.fx_px, 2.0 * depth_deviation_m(middle_m)))
+
+
+def depth_deviation_m(depth_m: float) -> float:
+    """Return the standard deviation of a structured-light camera's depth (Nguyen et al., 3DIMPVT 2012, Eq. 3)."""
+    return 0.0012 + 0.0019 * (depth_m - 0.4) ** 2
 
 
 def _box_window(box_px: tuple[float, float, float, float]) -> Window:

@@ -11,7 +11,8 @@ from gausslite.domain.camera import Camera, back_project
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import transform_points
 from gausslite.perception.object_masks import mask_votes, refined_mask, surface_mask
-from gausslite.perception.surface_votes import SurfaceVotes
+from gausslite.perception.surface_parts import is_in_large_part
+from gausslite.perception.surface_votes import VOXEL_SIZES_M, SurfaceVotes
 
 CAMERA = Camera(150.0, 150.0, 80.0, 60.0, 160, 120)
 
@@ -95,3 +96,47 @@ def test_votes_of_two_halves_are_their_sum():
     one, other = left.add(right), each[3].add(each[0]).add(each[2].add(each[1]))
     for name in ("keys", "inside", "outside"):
         assert np.array_equal(getattr(one, name), getattr(other, name))
+
+
+def test_a_part_apart_from_the_object_is_left_out():
+    frame = frame_at()
+    mask = box_mask(frame)
+    mask[50:60, 125:135] = True
+    votes = mask_votes(mask, frame)
+    assert iou(surface_mask(votes, frame), box_mask(frame)) > 0.9
+
+
+def test_two_large_parts_are_one_object():
+    columns, rows = np.meshgrid(np.linspace(0.0, 0.2, 20), np.linspace(0.0, 0.2, 20))
+    part = np.stack([columns, rows, np.ones_like(rows)], axis=-1).reshape(-1, 3).astype(np.float32)
+    points = np.concatenate([part, part + np.float32((0.5, 0, 0)), part[:9] + np.float32((0, 0.5, 0))])
+    kept = is_in_large_part(points, np.ones(len(points), np.int64))
+    assert kept[:800].all()
+    assert not kept[800:].any()
+    assert is_in_large_part(points[:0], np.ones(0, np.int64)).shape == (0,)
+
+
+def test_voxels_follow_the_extent_and_what_a_frame_resolves():
+    def disc(diameter_m: float) -> SurfaceVotes:
+        grid = np.arange(-diameter_m / 2, diameter_m / 2, diameter_m / 60)
+        points = np.stack([*np.meshgrid(grid, grid), np.ones((len(grid), len(grid)))], axis=-1).reshape(-1, 3)
+        return SurfaceVotes.from_points(points, np.hypot(points[:, 0], points[:, 1]) < diameter_m / 2)
+
+    mug, table = disc(0.09), disc(0.9)
+    assert mug.extent_m == pytest.approx(0.09, rel=0.2)
+    assert mug.resolved(0.001).voxel_m == VOXEL_SIZES_M[0]
+    assert mug.resolved(0.014).voxel_m == VOXEL_SIZES_M[1]
+    assert table.resolved(0.001).voxel_m == VOXEL_SIZES_M[-1]
+
+
+def test_votes_that_exceed_the_memory_get_larger_voxels():
+    side = np.arange(0.0, 2.0, 0.008)
+    points = np.stack([*np.meshgrid(side, side), np.ones((len(side), len(side)))], axis=-1).reshape(-1, 3)
+    inside = SurfaceVotes.from_points(points, np.ones(len(points), np.bool_))
+    assert inside.voxel_m > VOXEL_SIZES_M[0]
+    assert len(inside.keys) < len(points) / 2
+    assert inside.is_on_surface(points).all()
+    near = SurfaceVotes.from_points(points[:10], np.zeros(10, np.bool_))
+    both = near.add(inside)
+    assert both.voxel_m == inside.voxel_m
+    assert np.array_equal(both.outside, inside.add(near).outside)
