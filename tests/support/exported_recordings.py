@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import zipfile
 from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
 
 import cv2
@@ -18,9 +19,10 @@ from gausslite.domain.frame import Frame
 OPENCV_TO_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
-def home_frames(count: int = 4, size: tuple[int, int] = (64, 48)) -> list[Frame]:
+@cache
+def home_frames(count: int = 4, size: tuple[int, int] = (64, 48)) -> tuple[Frame, ...]:
     home = open_source(f"sim:home?seed=0&trajectory=0&frames={count}&size={size[0]}x{size[1]}")
-    return [home.frame(i) for i in range(count)]
+    return tuple(home.frame(i) for i in range(count))
 
 
 def quaternion_row(T: np.ndarray) -> list[float]:

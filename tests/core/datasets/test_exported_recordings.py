@@ -18,15 +18,16 @@ from gausslite.domain.errors import DatasetError, PoseError
 from gausslite.domain.frame import Frame
 
 BIG_TIME = 1e300
+Frames = tuple[Frame, ...]
 
 
 @pytest.fixture(scope="module")
-def frames() -> list[Frame]:
+def frames() -> Frames:
     return home_frames()
 
 
 @pytest.mark.parametrize("exact_depth", [False, True])
-def test_a_zed_export_gives_the_frames_it_was_made_from(tmp_path: Path, frames: list[Frame], exact_depth: bool) -> None:
+def test_a_zed_export_gives_the_frames_it_was_made_from(tmp_path: Path, frames: Frames, exact_depth: bool) -> None:
     source = open_source(str(write_zed(tmp_path / "zed", frames, exact_depth)))
     assert list(source.indices()) == [frame.index for frame in frames]
     assert source.depth_registered
@@ -41,7 +42,7 @@ def test_a_zed_export_gives_the_frames_it_was_made_from(tmp_path: Path, frames: 
         np.testing.assert_allclose(source.trajectory().T_world_camera[i], expected.T_world_camera, atol=1e-7)
 
 
-def test_zed_frames_without_a_pose_are_excluded_unless_poses_are_tracked(tmp_path: Path, frames: list[Frame]) -> None:
+def test_zed_frames_without_a_pose_are_excluded_unless_poses_are_tracked(tmp_path: Path, frames: Frames) -> None:
     folder = write_zed(tmp_path / "zed", frames)
     _header, *rows = (folder / "poses.csv").read_text().splitlines()
     (folder / "poses.csv").unlink()
@@ -56,7 +57,7 @@ def test_zed_frames_without_a_pose_are_excluded_unless_poses_are_tracked(tmp_pat
 
 
 @pytest.mark.parametrize("packed", [False, True])
-def test_record3d_gives_the_frames_it_was_made_from(tmp_path: Path, frames: list[Frame], packed: bool) -> None:
+def test_record3d_gives_the_frames_it_was_made_from(tmp_path: Path, frames: Frames, packed: bool) -> None:
     path = write_record3d(tmp_path / "scan", frames)
     if packed:
         path = zip_folder(path, tmp_path / "scan.r3d")
@@ -79,7 +80,7 @@ def test_record3d_gives_the_frames_it_was_made_from(tmp_path: Path, frames: list
     assert source.frame(1, (32, 24)).camera.width_px == 32
 
 
-def test_record3d_without_poses_or_times_is_read_for_tracking(tmp_path: Path, frames: list[Frame]) -> None:
+def test_record3d_without_poses_or_times_is_read_for_tracking(tmp_path: Path, frames: Frames) -> None:
     folder = write_record3d(tmp_path / "scan", frames)
     fields = json.loads((folder / "metadata").read_text())
     for name in ("poses", "frameTimestamps", "perFrameIntrinsicCoeffs"):
@@ -95,7 +96,7 @@ def test_record3d_without_poses_or_times_is_read_for_tracking(tmp_path: Path, fr
 
 
 @pytest.mark.parametrize("kind", ["zed", "record3d"])
-def test_exports_can_be_mapped(tmp_path: Path, frames: list[Frame], kind: str) -> None:
+def test_exports_can_be_mapped(tmp_path: Path, frames: Frames, kind: str) -> None:
     path = write_zed(tmp_path / "a", frames) if kind == "zed" else write_record3d(tmp_path / "a", frames)
     settings = gl.MissionSettings(max_gaussians=2000, iterations=2)
     assert len(gl.map_sequence(gl.open_sequence(path), settings=settings).gaussians) > 500
@@ -136,7 +137,7 @@ def write_bytes(name: str, data: bytes) -> Callable[[Path], None]:
     ],
 )
 def test_a_damaged_record3d_recording_gives_one_line(
-    tmp_path: Path, frames: list[Frame], damage: Callable[[Path], None], message: str
+    tmp_path: Path, frames: Frames, damage: Callable[[Path], None], message: str
 ) -> None:
     folder = write_record3d(tmp_path / "scan", frames)
     damage(folder)
@@ -146,7 +147,7 @@ def test_a_damaged_record3d_recording_gives_one_line(
 
 
 def test_a_depth_file_that_declares_gigabytes_is_refused_before_it_is_decompressed(
-    tmp_path: Path, frames: list[Frame]
+    tmp_path: Path, frames: Frames
 ) -> None:
     folder = write_record3d(tmp_path / "scan", frames)
     data = bytearray((folder / "rgbd" / "0.depth").read_bytes())
@@ -182,7 +183,7 @@ def test_an_r3d_file_that_is_no_zip_gives_one_line(tmp_path: Path) -> None:
     ],
 )
 def test_a_damaged_zed_export_gives_one_line(
-    tmp_path: Path, frames: list[Frame], damage: Callable[[Path], None], message: str
+    tmp_path: Path, frames: Frames, damage: Callable[[Path], None], message: str
 ) -> None:
     folder = write_zed(tmp_path / "zed", frames)
     damage(folder)

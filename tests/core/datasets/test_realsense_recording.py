@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import importlib.util
-import sys
 from pathlib import Path
 from types import ModuleType
 
 import numpy as np
 import pytest
+from robot_bag import load_write_bag
 
 from gausslite.datasets.open import open_source
 from gausslite.datasets.poses import pose_from_quaternion
@@ -18,8 +17,6 @@ from gausslite.datasets.ros.realsense_recording import stream_transforms
 from gausslite.datasets.ros.transform_tree import TransformTree
 from gausslite.domain.camera import Camera
 
-pytest.importorskip("rosbags", reason="bags need the extra ros")
-TOOL = Path(__file__).resolve().parents[3] / "tools" / "write_bag.py"
 COLOUR, DEPTH = "/device_0/sensor_1/Color_0", "/device_0/sensor_0/Depth_0"
 SIZE = (32, 24)
 FOCAL_PX = {COLOUR: 30.0, DEPTH: 24.0}
@@ -30,13 +27,7 @@ DEPTH_UNIT_M = 0.0005
 
 @pytest.fixture(scope="module")
 def tool() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("write_bag", TOOL)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
+    return load_write_bag()
 
 
 def write_recording(tool: ModuleType, path: Path, frames: int = 3) -> tuple[np.ndarray, np.ndarray]:

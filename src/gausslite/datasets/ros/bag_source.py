@@ -4,25 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from jaxtyping import Float32, Float64, UInt8
+from jaxtyping import Float64
 from numpy import ndarray
 
-from gausslite.datasets.images import resize_rgbd
 from gausslite.datasets.intrinsics import FolderCamera
 from gausslite.datasets.poses import FIRST_VIEW_UP
 from gausslite.datasets.ros.address import BagAddress
 from gausslite.datasets.ros.bag_file import BagFile, MessageKey, StampedMessage
 from gausslite.datasets.ros.bag_poses import choose_poses, read_tree
 from gausslite.datasets.ros.camera_info import camera_of
-from gausslite.datasets.ros.image_messages import (
-    decode_colour,
-    decode_compressed_colour,
-    decode_compressed_depth,
-    decode_depth,
-)
+from gausslite.datasets.ros.frame_conversion import FrameConverter, join_cameras, optical_pose
 from gausslite.datasets.ros.realsense_recording import depth_units_per_metre
 from gausslite.datasets.ros.rgbd_camera import RgbdCamera
 from gausslite.datasets.ros.topics import ImageTopic, choose_colour, choose_depth, choose_info, image_topics
@@ -37,8 +30,6 @@ from gausslite.domain.region import Region
 from gausslite.domain.trajectory import Trajectory
 
 _WORLD_UP = (0.0, 0.0, 1.0)
-_BODY_TO_OPTICAL = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
-"""T_body_optical: a body's axes point forward, left and up; an optical frame's right, down and forward (REP 103)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -73,10 +64,11 @@ class BagSource:
                 f"got none"
             )
         self._poses = poses
-        self._units_per_metre = depth_units_per_metre(self._bag, self._depth.name)
         self._require_poses = require_poses
         colours, depths = self._bag.stamps(self._colour.name), self._bag.stamps(self._depth.name)
         self._cameras = self._read_cameras(tree, colours[0].stamp_ns)
+        units_per_metre = depth_units_per_metre(self._bag, self._depth.name)
+        self._converter = FrameConverter(self._cameras, self._colour.name, self._depth.name, units_per_metre)
         self._matches, self._recorded = self._associate(colours, depths), len(colours)
         tolerance = f"{1000 * self._options.tolerance_s:g} ms"
         require_frames(address.path, len(self._matches), f"a colour image with a pose, and depth within {tolerance}")
@@ -128,14 +120,9 @@ class BagSource:
         """Return the frame at position i. Raises DatasetError."""
         require_position(self.name, i, len(self))
         match = self._matches[i]
-        place = f"{self._bag.path}: message at {match.stamp_ns / 1e9:.9f} s"
-        rgb = _colour_image(f"{place}: {self._colour.name}", self._colour, self._bag.read(match.colour))
-        depth_message = self._bag.read(match.depth)
-        depth_m = _depth_image(f"{place}: {self._depth.name}", self._depth, depth_message, self._units_per_metre)
-        image = resize_rgbd(self._cameras.join(place, rgb, depth_m), size)
-        # to the precision of a float64 in seconds, as in folders: keyframes are chosen by their times
-        time_ns = round(match.stamp_ns / 10**9 * 1e9)
-        return Frame(match.number, time_ns, image.rgb, image.depth_m, image.camera, match.T_world_camera)
+        messages = self._bag.read(match.colour), self._bag.read(match.depth)
+        place = str(self._bag.path)
+        return self._converter.frame(place, match.number, messages, match.stamp_ns, match.T_world_camera, size)
 
     def indices(self) -> Sequence[int]:
         """Return the positions of the colour images in their topic, from 0."""
@@ -165,9 +152,7 @@ class BagSource:
                     "time of the first colour image; expected it in /tf_static"
                 )
             T_colour_depth = T
-        if options.axes == "body":
-            T_colour_depth = _BODY_TO_OPTICAL.T @ T_colour_depth @ _BODY_TO_OPTICAL
-        return RgbdCamera.of(colour, depth, T_colour_depth)
+        return join_cameras(colour, depth, T_colour_depth, options.axes)
 
     def _read_camera(self, image: ImageTopic, named: str, option: str) -> FolderCamera:
         topic = choose_info(self._bag, image, named, option)
@@ -193,19 +178,10 @@ class BagSource:
             nearest = int(np.abs(depth_ns - colour.stamp_ns).argmin())
             lag_s = abs(int(depth_ns[nearest]) - colour.stamp_ns) / 10**9
             T = None if self._poses is None else self._poses.at(colour.stamp_ns / 10**9)
-            if T is not None and self._options.axes == "body":
-                T = T @ _BODY_TO_OPTICAL
-            if T is None and not self._require_poses:
+            if T is not None:
+                T = optical_pose(T, self._options.axes)
+            elif not self._require_poses:
                 T = np.eye(4)
             if lag_s <= self._options.tolerance_s and T is not None:
                 matches.append(_Match(number, colour.stamp_ns, colour.key, depths[nearest].key, T))
         return matches
-
-
-def _colour_image(place: str, topic: ImageTopic, message: Any) -> UInt8[ndarray, "h w 3"]:
-    return decode_compressed_colour(place, message) if topic.compressed else decode_colour(place, message)
-
-
-def _depth_image(place: str, topic: ImageTopic, message: Any, units_per_metre: float) -> Float32[ndarray, "h w"]:
-    decode = decode_compressed_depth if topic.compressed else decode_depth
-    return decode(place, message, units_per_metre)

@@ -31,14 +31,19 @@ class ImageTopic:
     @property
     def camera_name(self) -> str:
         """The topic without the transport that compresses it."""
-        for transport in _TRANSPORTS:
-            if self.name.endswith(transport):
-                return self.name.removesuffix(transport)
-        return self.name
+        return camera_name(self.name)
 
     def __str__(self) -> str:
         """Return the name with the encoding, for messages."""
         return f"{self.name} ({self.encoding})"
+
+
+def camera_name(image_topic: str) -> str:
+    """Return an image topic without the transport that compresses it."""
+    for transport in _TRANSPORTS:
+        if image_topic.endswith(transport):
+            return image_topic.removesuffix(transport)
+    return image_topic
 
 
 def image_topics(bag: BagFile) -> list[ImageTopic]:

@@ -107,6 +107,18 @@ class TransformTree:
             f"which have {'the frames ' + known if frames else 'no transforms'}"
         )
 
+    def last_time_s(self, target: str, source: str) -> float:
+        """Return the time until which all moving transforms between two frames are known; infinite if none moves.
+
+        Raises DatasetError.
+        """
+        self.require_path(target, source)
+        up_target, up_source = self.ancestors(target), self.ancestors(source)
+        common = next(frame for frame in up_source if frame in up_target)
+        links = [link for chain in (up_target, up_source) for link in pairwise(chain[: chain.index(common) + 1])]
+        moving = [self._tracks[child][parent] for child, parent in links if (child, parent) not in self._static]
+        return min((float(track.times_s[-1]) for track in moving), default=np.inf)
+
     def at(self, target: str, source: str, time_s: float) -> Float64[ndarray, "4 4"] | None:
         """Return T_target_source at a time; None if a transform has no pose near it. Raises DatasetError, PoseError."""
         self.require_path(target, source)

@@ -1,0 +1,77 @@
+"""Convert a colour and a depth message, with the camera's pose, to a frame: for bags and for live topics alike."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float32, Float64, UInt8
+from numpy import ndarray
+
+from gausslite.datasets.images import resize_rgbd
+from gausslite.datasets.intrinsics import FolderCamera
+from gausslite.datasets.ros.image_messages import (
+    decode_colour,
+    decode_compressed_colour,
+    decode_compressed_depth,
+    decode_depth,
+)
+from gausslite.datasets.ros.messages import CompressedImageMessage
+from gausslite.datasets.ros.rgbd_camera import RgbdCamera
+from gausslite.domain.frame import Frame
+
+_BODY_TO_OPTICAL = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+"""T_body_optical: a body's axes point forward, left and up; an optical frame's right, down and forward (REP 103)."""
+
+
+def join_cameras(
+    colour: FolderCamera, depth: FolderCamera | None, T_colour_depth: Float64[ndarray, "4 4"], axes: str
+) -> RgbdCamera:
+    """Return the pair of cameras; depth None: aligned. axes: convention of the transform, "optical" or "body"."""
+    if axes == "body":
+        T_colour_depth = _BODY_TO_OPTICAL.T @ T_colour_depth @ _BODY_TO_OPTICAL
+    return RgbdCamera.of(colour, depth, T_colour_depth)
+
+
+def optical_pose(T_world_camera: Float64[ndarray, "4 4"], axes: str) -> Float64[ndarray, "4 4"]:
+    """Return the pose with optical axes of a camera frame whose axes are "optical" or "body"."""
+    return T_world_camera @ _BODY_TO_OPTICAL if axes == "body" else T_world_camera
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FrameConverter:
+    """The cameras of a colour and a depth topic, and the units per metre of 16-bit depth."""
+
+    cameras: RgbdCamera
+    colour_topic: str
+    depth_topic: str
+    units_per_metre: float
+
+    def frame(
+        self,
+        place: str,
+        number: int,
+        messages: tuple[Any, Any],
+        stamp_ns: int,
+        T_world_camera: Float64[ndarray, "4 4"],
+        size: tuple[int, int] | None = None,
+    ) -> Frame:
+        """Return the frame of the colour and the depth message, resized. Raises DatasetError with the place."""
+        place = f"{place}: message at {stamp_ns / 1e9:.9f} s"
+        rgb = _colour_image(f"{place}: {self.colour_topic}", messages[0])
+        depth_m = _depth_image(f"{place}: {self.depth_topic}", messages[1], self.units_per_metre)
+        image = resize_rgbd(self.cameras.join(place, rgb, depth_m), size)
+        # to the precision of a float64 in seconds, as in folders: keyframes are chosen by their times
+        time_ns = round(stamp_ns / 10**9 * 1e9)
+        return Frame(number, time_ns, image.rgb, image.depth_m, image.camera, T_world_camera)
+
+
+def _colour_image(place: str, message: Any) -> UInt8[ndarray, "h w 3"]:
+    compressed = isinstance(message, CompressedImageMessage)
+    return decode_compressed_colour(place, message) if compressed else decode_colour(place, message)
+
+
+def _depth_image(place: str, message: Any, units_per_metre: float) -> Float32[ndarray, "h w"]:
+    compressed = isinstance(message, CompressedImageMessage)
+    return (decode_compressed_depth if compressed else decode_depth)(place, message, units_per_metre)
