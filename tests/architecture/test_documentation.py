@@ -35,6 +35,7 @@ BENCHMARKS = (
     "codec",
     "task-change",
     "server",
+    "chaos",
     "team",
     "registration",
 )

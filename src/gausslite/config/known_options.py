@@ -7,7 +7,7 @@ from typing import Final
 
 KNOWN_OPTIONS: Final = frozenset(
     {
-        *("agents", "held", "hostile", "seconds", "server", "watchers"),
+        *("agents", "held", "hostile", "kills", "seconds", "server", "watchers"),
         *("absent", "accept-similar", "after", "agent-id", "backend", "before", "blur", "camera-correction", "caps"),
         "changes",
         *("deadline-slack", "details", "detector", "disable", "drain-timeout", "equal", "exit-when-done"),

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator
+import contextlib
+from collections.abc import AsyncIterator, Sequence
 
 import grpc
 
@@ -10,6 +11,11 @@ from gausslite.domain.errors import CodecError
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.v1 import fusion_service_pb2_grpc as pb_grpc
 from gausslite.wire.address import require_callable
+
+
+def is_stored(outcome: pb.SubsetOutcome) -> bool:
+    """Return whether the server has the updates of a message, or newer ones of the same voxels."""
+    return outcome.status in (pb.SUBSET_STATUS_ACCEPTED, pb.SUBSET_STATUS_STALE)
 
 
 class UpdateStream:
@@ -30,6 +36,19 @@ class UpdateStream:
             raise CodecError(f"subset {self._sequence}: expected an acknowledgement, got the end of the stream")
         if response.outcomes[0].status != pb.SUBSET_STATUS_ACCEPTED:
             raise CodecError(f"subset {self._sequence}: {response.outcomes[0].message or 'not accepted'}")
+
+    async def resend(self, subsets: Sequence[bytes]) -> int:
+        """Send messages of the past again, in this order; returns how many got an outcome before the stream ended."""
+        count = 0
+        with contextlib.suppress(grpc.RpcError):
+            for subset in subsets:
+                self._sequence += 1
+                await self._call.write(self._request(subset, self._sequence))
+                if not isinstance(await self._call.read(), pb.ContributeSubsetsResponse):
+                    break
+                count += 1
+            await self.close()
+        return count
 
     async def close(self) -> None:
         """End the stream."""

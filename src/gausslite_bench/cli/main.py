@@ -7,6 +7,7 @@ from collections.abc import Callable
 
 from gausslite_bench.cli.budget import configure_budget
 from gausslite_bench.cli.camera import configure_camera
+from gausslite_bench.cli.chaos import configure_chaos
 from gausslite_bench.cli.codec import configure_codec
 from gausslite_bench.cli.gpu import configure_gpu
 from gausslite_bench.cli.loop import configure_loop
@@ -38,6 +39,12 @@ _BENCHMARKS: dict[str, tuple[Callable[[argparse.ArgumentParser], None], str, str
         "largest team, memory and times of a fusion server by the size of its map",
         "Fill a fusion server with synthetic updates, and measure acknowledgements of agents that send at 4 Hz, the "
         "snapshot, the status, a restart and the memory.",
+    ),
+    "chaos": (
+        configure_chaos,
+        "a fusion server and its agents under kills, partitions, wrong clocks and a full disk",
+        "Drive agents and a fusion server through seeded faults. Check after each kill of the server, and at the end, "
+        "that every acknowledged voxel is stored, and that the fused map equals the one computed offline.",
     ),
     "gpu": (
         configure_gpu,

@@ -24,17 +24,35 @@ _QUOTAS = (
 
 
 class RunningServer:
-    """Owns the process of a server on a store; `start_s` is the time until it was ready."""
+    """Owns the process of a server on a store, and appends what it logs to a file."""
 
     def __init__(self, command: str, folder: Path, store: str) -> None:
         self._command, self._store = command, "memory" if store == "memory" else str(folder / "store.sqlite")
         self.address = f"unix:{folder}/fusion.sock"
-        self.start_s = self._start()
+        self.log = folder / "server.log"
+        self.start()
+
+    @property
+    def pid(self) -> int:
+        """The id of the process."""
+        return self._process.pid
+
+    @property
+    def is_running(self) -> bool:
+        """False after the process has ended."""
+        return self._process.poll() is None
 
     def restart(self) -> float:
         """End the server as a service manager does and start it again; returns the time until it is ready."""
         self.close()
-        return self._start()
+        return self.start()
+
+    def kill(self) -> None:
+        """End the process at once, as the kernel does when memory runs out."""
+        self._process.kill()
+        self._process.wait()
+        # else a client would find the socket of the dead process and wait before it tries again
+        Path(self.address.removeprefix("unix:")).unlink(missing_ok=True)
 
     def rss_mib(self) -> float:
         """Return the resident memory of the process."""
@@ -57,10 +75,16 @@ class RunningServer:
             self._process.kill()
             self._process.wait()
 
-    def _start(self) -> float:
+    def start(self, command: str = "") -> float:
+        """Start the server, with another command if one is given; returns the time until it is ready.
+
+        Raises UnavailableError.
+        """
         begin_s = time.monotonic()
+        self._command = command or self._command
         arguments = [*shlex.split(self._command), "--listen", self.address, "--store", self._store, *_QUOTAS]
-        self._process = subprocess.Popen(arguments, stderr=subprocess.DEVNULL)  # noqa: S603 - the user's own command
+        with self.log.open("ab") as log:
+            self._process = subprocess.Popen(arguments, stderr=log)  # noqa: S603 - the user's own command
         socket = Path(self.address.removeprefix("unix:"))
         while time.monotonic() - begin_s < _START_LIMIT_S and self._process.poll() is None:
             # a call to a socket that does not exist yet would wait for a second before it tries again

@@ -1,0 +1,144 @@
+"""Follow what the server has acknowledged to each agent, and compare a store and a fused map with it."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections import deque
+from collections.abc import Mapping
+from contextlib import closing
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from gausslite.codec.records import from_bytes
+from gausslite.codec.subset_codec import decode_subset
+from gausslite.domain.voxel_batch import VoxelBatch
+from gausslite.fusion.score_index import voxel_records
+from gausslite.fusion.sqlite_store import SqliteStore
+from gausslite.fusion.vote import FusedMap, fuse
+from gausslite_bench.chaos.journal import JournalReader, RecordKind
+
+_KEPT_MESSAGES = 500
+"""The messages per agent that may be sent again."""
+
+
+@dataclass(frozen=True, slots=True)
+class StoredVoxel:
+    """The content of a voxel after its latest acknowledged update."""
+
+    update_seq: int
+    kappa_sum: int
+    records: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class StoreComparison:
+    """Voxels of all agents: those acknowledged, and of them those that a store has lost or holds with other content.
+
+    extra: voxels of a store that hold another update than the latest acknowledged one, or none was acknowledged.
+    """
+
+    voxels: int = 0
+    lost: int = 0
+    wrong: int = 0
+    extra: int = 0
+
+
+@dataclass(slots=True)
+class AgentAcknowledgements:
+    """What one agent has sent, and the latest acknowledged content of each voxel."""
+
+    readers: list[JournalReader] = field(default_factory=list)
+    voxels: dict[int, StoredVoxel] = field(default_factory=dict)
+    sent: deque[bytes] = field(default_factory=lambda: deque(maxlen=_KEPT_MESSAGES))
+    session_id: str = ""
+    messages: int = 0
+    updates: int = 0
+    _waiting: dict[int, bytes] = field(default_factory=dict)
+
+    def add_journal(self, path: Path) -> None:
+        """Follow the journal of a new process of this agent."""
+        self.read()
+        self._waiting.clear()
+        self.readers = [JournalReader(path)]
+
+    def read(self) -> None:
+        """Take in what the journal has gained."""
+        for reader in self.readers:
+            for record in reader.new_records():
+                match record.kind:
+                    case RecordKind.SENT:
+                        self._waiting[record.sequence] = record.subset
+                        self.sent.append(record.subset)
+                        self.session_id = record.session_id
+                    case RecordKind.STORED:
+                        self._acknowledge(self._waiting.pop(record.sequence))
+                    case RecordKind.REFUSED:
+                        # the agent sends its content again, in a new message
+                        self._waiting.pop(record.sequence)
+
+    def batch(self) -> VoxelBatch:
+        """Return the latest acknowledged content, with tombstones."""
+        keys = sorted(self.voxels)
+        voxels = [self.voxels[key] for key in keys]
+        parts = [from_bytes(each.records) for each in voxels]
+        return VoxelBatch(
+            np.array(keys, np.int64),
+            np.array([each.kappa_sum for each in voxels], np.uint64),
+            np.array([len(each) for each in parts], np.uint32),
+            from_bytes(b"".join(each.records for each in voxels)),
+        )
+
+    def _acknowledge(self, message: bytes) -> None:
+        subset, _ = decode_subset(message)
+        self.messages += 1
+        self.updates += len(subset.batch)
+        offsets, kappa = subset.batch.offsets, subset.batch.gaussians.kappa
+        for i, (key, records) in enumerate(zip(subset.batch.keys.tolist(), voxel_records(subset.batch), strict=True)):
+            earlier = self.voxels.get(key)
+            if earlier is None or earlier.update_seq < subset.update_seq:
+                kappa_sum = int(kappa[offsets[i] : offsets[i + 1]].sum(dtype=np.uint64))
+                self.voxels[key] = StoredVoxel(subset.update_seq, kappa_sum, records)
+
+
+def offline_map(agents: Mapping[str, AgentAcknowledgements]) -> FusedMap:
+    """Return the vote over the latest acknowledged content of every agent, without a server or a store."""
+    return fuse({agent_id: each.batch() for agent_id, each in agents.items() if each.voxels})
+
+
+def compare_store(agents: Mapping[str, AgentAcknowledgements], store: Path) -> StoreComparison:
+    """Compare a store whose server was killed with what it had acknowledged; the files are copied and not changed."""
+    with tempfile.TemporaryDirectory() as folder:
+        for path in (store, store.with_name(f"{store.name}-wal")):
+            if path.exists():
+                shutil.copy(path, folder)
+        with closing(SqliteStore(Path(folder) / store.name)) as opened:
+            results = [_compare_agent(agent_id, each, opened) for agent_id, each in agents.items()]
+    return StoreComparison(
+        sum(each.voxels for each in results),
+        sum(each.lost for each in results),
+        sum(each.wrong for each in results),
+        sum(each.extra for each in results),
+    )
+
+
+def _compare_agent(agent_id: str, acknowledged: AgentAcknowledgements, store: SqliteStore) -> StoreComparison:
+    batch = store.batch(agent_id)
+    seqs = store.stored(agent_id, batch.keys).update_seqs.tolist()
+    held = {
+        key: StoredVoxel(seq, kappa_sum, records)
+        for key, seq, kappa_sum, records in zip(
+            batch.keys.tolist(), seqs, batch.kappa_sums.tolist(), voxel_records(batch), strict=True
+        )
+    }
+    lost = wrong = 0
+    for key, expected in acknowledged.voxels.items():
+        got = held.get(key)
+        if got is None or got.update_seq < expected.update_seq:
+            lost += 1
+        elif got.update_seq == expected.update_seq and got != expected:
+            wrong += 1
+    same = sum(held[key].update_seq == each.update_seq for key, each in acknowledged.voxels.items() if key in held)
+    return StoreComparison(len(acknowledged.voxels), lost, wrong, len(held) - same)

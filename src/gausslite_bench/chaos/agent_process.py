@@ -1,0 +1,74 @@
+"""The process of one agent: a map that changes at random, and the agent's own spool and uplink.
+
+`python -m gausslite_bench.chaos.agent_process SETTINGS`, with AgentSettings as JSON. The process sends until its
+standard input ends. Then it drains the uplink and prints one line of JSON.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import threading
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from gausslite.domain.voxel_batch import VoxelBatch
+from gausslite.domain.voxel_operations import merge_batches, select_voxels, tombstones
+from gausslite.wire.spool import Spool
+from gausslite.wire.uplink import Uplink
+from gausslite.wire.uplink_values import UplinkSettings
+from gausslite_bench.chaos.journal import Journal, JournalingClient
+from gausslite_bench.server.synthetic_updates import GRID, voxels_batch
+
+_PERIOD_S = 0.05
+_AREA_VOXELS = 300
+_STEP_VOXELS = 12
+_TOMBSTONE_SHARE = 0.1
+DRAIN_S = 240.0
+_UPLINK = UplinkSettings(interval_s=0.05, deadline_s=20.0, first_backoff_s=0.05, check_interval_s=1.0)
+
+
+@dataclass(frozen=True, slots=True)
+class AgentSettings:
+    """What one process needs; seed: of its changes, another one after each restart."""
+
+    agent_id: str
+    address: str
+    spool: str
+    journal: str
+    seed: int
+
+
+def changed_voxels(rng: np.random.Generator) -> VoxelBatch:
+    """Return new content of some neighbouring voxels of the area that all agents share; some of them are empty now."""
+    first = int(rng.integers(_AREA_VOXELS - _STEP_VOXELS))
+    batch = voxels_batch(first, _STEP_VOXELS, int(rng.integers(1 << 31)))
+    removed = rng.random(len(batch)) < _TOMBSTONE_SHARE
+    return merge_batches(select_voxels(batch, ~removed), tombstones(batch.keys[removed]))
+
+
+def run(settings: AgentSettings) -> dict[str, object]:
+    """Send changes until the standard input ends; returns whether everything was acknowledged, and the counters."""
+    spool = Spool(Path(settings.spool), settings.agent_id, GRID)
+    client = JournalingClient(settings.address, spool.token, Journal(Path(settings.journal)))
+    uplink = Uplink(client, settings.agent_id, spool, GRID, _UPLINK)
+    stopping = threading.Event()
+    threading.Thread(target=_set_at_end_of_input, args=(stopping,), daemon=True).start()
+    rng = np.random.default_rng(settings.seed)
+    while not stopping.wait(_PERIOD_S):
+        uplink.enqueue(changed_voxels(rng))
+    drained = uplink.drain(DRAIN_S)
+    counters = uplink.counters()
+    uplink.close()
+    return {"drained": drained, "stopped_because": counters.stopped_because}
+
+
+def _set_at_end_of_input(stopping: threading.Event) -> None:
+    sys.stdin.read()
+    stopping.set()
+
+
+if __name__ == "__main__":
+    sys.stdout.write(json.dumps(run(AgentSettings(**json.loads(sys.argv[1])))) + "\n")

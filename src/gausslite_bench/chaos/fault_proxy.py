@@ -1,0 +1,118 @@
+"""Forward the agents' connections to the server, and partition or delay them on request."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import threading
+from collections.abc import Coroutine, Sequence
+from pathlib import Path
+from typing import TypeVar
+
+_CHUNK_BYTES = 1 << 14
+_Result = TypeVar("_Result")
+
+
+class _Link:
+    """The connections of one agent. Use it on the event loop only."""
+
+    def __init__(self, path: Path, target: Path) -> None:
+        self.path, self._target = path, target
+        self._is_cut = False
+        self._delay_s = 0.0
+        self._flows = asyncio.Event()
+        self._flows.set()
+        self._writers: set[asyncio.StreamWriter] = set()
+
+    def set_fault(self, is_cut: bool, is_stalled: bool, delay_s: float) -> None:
+        self._is_cut, self._delay_s = is_cut, delay_s
+        if is_stalled:
+            self._flows.clear()
+        else:
+            self._flows.set()
+        if is_cut:
+            for writer in self._writers:
+                writer.transport.abort()
+
+    async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        if self._is_cut:
+            writer.transport.abort()
+            return
+        try:
+            upstream_reader, upstream_writer = await asyncio.open_unix_connection(self._target)
+        except OSError:
+            writer.transport.abort()
+            return
+        pair = {writer, upstream_writer}
+        self._writers |= pair
+        try:
+            await asyncio.gather(self._pump(reader, upstream_writer), self._pump(upstream_reader, writer))
+        finally:
+            self._writers -= pair
+
+    async def _pump(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        with contextlib.suppress(OSError):
+            while data := await reader.read(_CHUNK_BYTES):
+                await self._flows.wait()
+                if self._delay_s:
+                    await asyncio.sleep(self._delay_s)
+                writer.write(data)
+                await writer.drain()
+        writer.close()
+
+
+class FaultProxy:
+    """Owns one listening socket per agent, and a thread. The methods are thread-safe."""
+
+    def __init__(self, folder: Path, target: Path, agents: Sequence[str]) -> None:
+        self._links = {name: _Link(folder / f"{name}.sock", target) for name in agents}
+        self._loop = asyncio.new_event_loop()
+        self._thread = threading.Thread(target=self._loop.run_forever, name="fault-proxy", daemon=True)
+        self._thread.start()
+        self._servers = [self._run(asyncio.start_unix_server(each.serve, each.path)) for each in self._links.values()]
+
+    def address(self, agent_id: str) -> str:
+        """Return where the agent has to connect."""
+        return f"unix:{self._links[agent_id].path}"
+
+    def cut(self, agent_id: str) -> None:
+        """Reset the agent's connections and refuse new ones."""
+        self._set(agent_id, is_cut=True)
+
+    def stall(self, agent_id: str) -> None:
+        """Stop forwarding without closing a connection, as when packets are lost."""
+        self._set(agent_id, is_stalled=True)
+
+    def delay(self, agent_id: str, delay_s: float) -> None:
+        """Forward every chunk late."""
+        self._set(agent_id, delay_s=delay_s)
+
+    def heal(self, agent_id: str) -> None:
+        """End all faults of the agent's connections."""
+        self._set(agent_id)
+
+    def close(self) -> None:
+        """Close all connections and end the thread."""
+        self._run(self._close())
+        self._loop.call_soon_threadsafe(self._loop.stop)
+        self._thread.join()
+        self._loop.close()
+
+    async def _close(self) -> None:
+        for server in self._servers:
+            server.close()
+        for link in self._links.values():
+            link.set_fault(is_cut=True, is_stalled=False, delay_s=0.0)
+        tasks = asyncio.all_tasks() - {asyncio.current_task()}
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+    def _set(self, agent_id: str, is_cut: bool = False, is_stalled: bool = False, delay_s: float = 0.0) -> None:
+        async def apply() -> None:
+            self._links[agent_id].set_fault(is_cut, is_stalled, delay_s)
+
+        self._run(apply())
+
+    def _run(self, coroutine: Coroutine[object, object, _Result]) -> _Result:
+        return asyncio.run_coroutine_threadsafe(coroutine, self._loop).result(30)

@@ -1,0 +1,257 @@
+"""Run agents and a server through seeded faults, and compare what the server has with what it acknowledged."""
+
+from __future__ import annotations
+
+import asyncio
+import random
+import resource
+import shlex
+import shutil
+import sys
+import tempfile
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from enum import StrEnum
+from pathlib import Path
+
+from gausslite.codec.ply import ply_bytes
+from gausslite.domain.errors import UnavailableError
+from gausslite.wire.clients import Export, FusionClient
+from gausslite.wire.update_streams import UpdateStreams
+from gausslite_bench.chaos.acknowledged import StoreComparison, compare_store, offline_map
+from gausslite_bench.chaos.agent_team import AgentTeam
+from gausslite_bench.chaos.fault_proxy import FaultProxy
+from gausslite_bench.server.running_server import RunningServer
+
+_STORE = "store.sqlite"
+_DAY_S = 86_400.0
+_PROGRESS_MESSAGES_PER_AGENT = 2
+_PROGRESS_S = 120.0
+_POLL_S = 0.02
+_MAX_FAULT_S = 1.0
+_MAX_DELAY_S = 0.15
+_RESENT_MESSAGES = 20
+_DISK_FULL_SHARE, _RESEND_SHARE, _CLOCK_SHARE = 0.15, 0.4, 0.5
+_FREE_BYTES = 40_000
+"""Left on the disk when it begins to fill."""
+
+
+class Fault(StrEnum):
+    """What is counted. The first five are the kills and partitions of a run."""
+
+    SERVER_KILL = "server kills"
+    AGENT_KILL = "agent kills"
+    CUT = "cut connections"
+    STALL = "stalled connections"
+    DELAY = "delayed connections"
+    CLOCK_JUMP = "clock jumps"
+    DISK_FULL = "full disks"
+    RESEND = "resent messages"
+
+
+_WEIGHTS = {Fault.SERVER_KILL: 3, Fault.AGENT_KILL: 3, Fault.CUT: 2, Fault.STALL: 1, Fault.DELAY: 1}
+
+
+@dataclass(frozen=True, slots=True)
+class ChaosSettings:
+    """kills: number of kills and partitions. out: folder that receives the store, journals and logs."""
+
+    kills: int = 200
+    agents: int = 4
+    seed: int = 0
+    out: Path | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class ChaosResult:
+    """Figures of a run.
+
+    lost, wrong: sums over the comparisons of the store after each kill of the server, and after the run.
+    same_map: the map that the server exports at the end is the offline one, bit for bit. storage_refusals: lines in the
+    server's log about messages that it could not store; server_errors: unexpected errors there.
+    """
+
+    faults: dict[str, int]
+    acknowledged_messages: int
+    acknowledged_updates: int
+    storage_refusals: int
+    comparisons: int
+    voxels: int
+    fused_voxels: int
+    lost: int
+    wrong: int
+    extra_at_end: int
+    same_map: bool
+    server_errors: int
+    time_s: float
+    rss_mib: tuple[float, float]
+
+    @property
+    def is_correct(self) -> bool:
+        """True if nothing that was acknowledged is lost or differs."""
+        return not (self.lost or self.wrong or self.extra_at_end or self.server_errors) and self.same_map
+
+
+def run_chaos(settings: ChaosSettings, note: Callable[[], object]) -> ChaosResult:
+    """Run the faults; `note` is called after each kill or partition. Raises UnavailableError."""
+    with tempfile.TemporaryDirectory() as name, ExitStack() as opened:
+        folder = Path(name)
+        if settings.out is not None:
+            opened.callback(shutil.copytree, folder, settings.out, dirs_exist_ok=True, ignore=_ignore_sockets)
+        agents = [f"agent-{number}" for number in range(settings.agents)]
+        server = RunningServer(_server_command(0.0), folder, "sqlite")
+        opened.callback(server.kill)
+        proxy = FaultProxy(folder, Path(server.address.removeprefix("unix:")), agents)
+        opened.callback(proxy.close)
+        team = AgentTeam(folder, agents, proxy.address)
+        opened.callback(team.close)
+        return _ChaosRun(settings, folder, server, proxy, team).run(note)
+
+
+@dataclass(slots=True)
+class _ChaosRun:
+    """Runs the faults of one seed and counts them."""
+
+    settings: ChaosSettings
+    folder: Path
+    server: RunningServer
+    proxy: FaultProxy
+    team: AgentTeam
+    faults: Counter[Fault] = field(default_factory=Counter)
+    comparisons: list[StoreComparison] = field(default_factory=list)
+    _random: random.Random = field(init=False)
+    _peak_mib: float = 0.0
+
+    def run(self, note: Callable[[], object]) -> ChaosResult:
+        begin_s = time.monotonic()
+        self._random = random.Random(self.settings.seed)  # noqa: S311 - reproducible faults
+        for agent_id in self.team.acknowledged:
+            self._start_agent(agent_id)
+        for _ in range(self.settings.kills):
+            self._wait_for_progress()
+            if self._random.random() < _DISK_FULL_SHARE:
+                self._fill_disk()
+            if self._random.random() < _RESEND_SHARE:
+                self._resend()
+            self._inject(self._random.choices(list(_WEIGHTS), list(_WEIGHTS.values()))[0])
+            note()
+        return self._finish(begin_s)
+
+    def _inject(self, fault: Fault) -> None:
+        self.faults[fault] += 1
+        agent_id = self._random.choice(list(self.team.acknowledged))
+        match fault:
+            case Fault.SERVER_KILL:
+                self._kill_server()
+                self.server.start(_server_command(self._clock_offset_s()))
+            case Fault.AGENT_KILL:
+                self.team.kill(agent_id)
+                self._start_agent(agent_id)
+            case _:
+                self._disturb(agent_id, fault)
+
+    def _disturb(self, agent_id: str, fault: Fault) -> None:
+        if fault is Fault.CUT:
+            self.proxy.cut(agent_id)
+        elif fault is Fault.STALL:
+            self.proxy.stall(agent_id)
+        else:
+            self.proxy.delay(agent_id, self._random.uniform(0.01, _MAX_DELAY_S))
+        self._pause()
+        self.proxy.heal(agent_id)
+
+    def _kill_server(self) -> None:
+        self._peak_mib = max(self._peak_mib, self.server.rss_mib())
+        self.server.kill()
+        # what has been acknowledged by now must be in the store; later acknowledgements were sent before
+        self.team.messages  # noqa: B018
+        self.comparisons.append(compare_store(self.team.acknowledged, self.folder / _STORE))
+
+    def _fill_disk(self) -> None:
+        """Let every file of the server grow a little and no further, as on a full disk."""
+        self.faults[Fault.DISK_FULL] += 1
+        size = max(path.stat().st_size for path in self.folder.glob(f"{_STORE}*"))
+        _, hard = resource.prlimit(self.server.pid, resource.RLIMIT_FSIZE)
+        resource.prlimit(self.server.pid, resource.RLIMIT_FSIZE, (size + _FREE_BYTES, hard))
+        self._pause()
+        if self._random.random() < 0.5:
+            # otherwise the server is killed while its disk is full, or goes on with the space that it has got again
+            self._inject(Fault.SERVER_KILL)
+        elif self.server.is_running:
+            resource.prlimit(self.server.pid, resource.RLIMIT_FSIZE, (hard, hard))
+
+    def _resend(self) -> None:
+        """Send messages of the past again: duplicates, in another order."""
+        agent_id = self._random.choice(list(self.team.acknowledged))
+        acknowledged = self.team.acknowledged[agent_id]
+        acknowledged.read()
+        if acknowledged.sent:
+            messages = self._random.choices(list(acknowledged.sent), k=_RESENT_MESSAGES)
+            self.faults[Fault.RESEND] += asyncio.run(
+                _resend_messages(self.server.address, acknowledged.session_id, messages)
+            )
+
+    def _start_agent(self, agent_id: str) -> None:
+        self.team.start(agent_id, self._random.getrandbits(31), self._clock_offset_s())
+
+    def _clock_offset_s(self) -> float:
+        if self._random.random() > _CLOCK_SHARE:
+            return 0.0
+        self.faults[Fault.CLOCK_JUMP] += 1
+        return self._random.uniform(-_DAY_S, _DAY_S)
+
+    def _pause(self) -> None:
+        threading.Event().wait(self._random.uniform(0.1, _MAX_FAULT_S))
+
+    def _wait_for_progress(self) -> None:
+        """Wait until the agents have sent some messages since the last fault, so that every fault meets a load."""
+        target = self.team.messages + _PROGRESS_MESSAGES_PER_AGENT * self.settings.agents
+        limit_s = time.monotonic() + _PROGRESS_S
+        while self.team.messages < target:
+            if time.monotonic() > limit_s or not self.server.is_running:
+                raise UnavailableError(f"chaos: expected acknowledgements within {_PROGRESS_S:.0f} s after a fault")
+            threading.Event().wait(_POLL_S)
+
+    def _finish(self, begin_s: float) -> ChaosResult:
+        self.team.finish()
+        offline = offline_map(self.team.acknowledged)
+        with FusionClient(self.server.address, deadline_s=60.0) as client:
+            exported = client.export(Export())
+        rss_mib = self.server.rss_mib()
+        self._kill_server()
+        log = self.server.log.read_text(errors="replace")
+        parts, last = list(self.team.acknowledged.values()), self.comparisons[-1]
+        return ChaosResult(
+            {str(fault): self.faults[fault] for fault in Fault},
+            sum(each.messages for each in parts),
+            sum(each.updates for each in parts),
+            log.count("refused STORAGE"),
+            len(self.comparisons),
+            last.voxels,
+            len(offline.batch),
+            sum(each.lost for each in self.comparisons),
+            sum(each.wrong for each in self.comparisons),
+            last.extra,
+            exported == ply_bytes(offline.gaussians),
+            log.count("Traceback"),
+            time.monotonic() - begin_s,
+            (rss_mib, max(self._peak_mib, rss_mib)),
+        )
+
+
+async def _resend_messages(address: str, session_id: str, messages: list[bytes]) -> int:
+    async with UpdateStreams(address) as streams:
+        return await streams.open(session_id).resend(messages)
+
+
+def _server_command(clock_offset_s: float) -> str:
+    shifted = f"-m gausslite_bench.chaos.shifted_clock {clock_offset_s}"
+    return f"{shlex.quote(sys.executable)} {shifted} gausslite_fusion_server"
+
+
+def _ignore_sockets(folder: str, names: list[str]) -> list[str]:
+    return [name for name in names if (Path(folder) / name).is_socket()]

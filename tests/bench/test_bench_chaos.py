@@ -1,0 +1,103 @@
+"""A short chaos run with real processes, and the comparison that it rests on."""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+from fusion_running import GRID, make_subset
+
+from gausslite.cli.main import main
+from gausslite.codec.subset_codec import decode_subset, encode_subset
+from gausslite.fusion.sqlite_store import SqliteStore
+from gausslite_bench.chaos.acknowledged import AgentAcknowledgements, StoreComparison, compare_store, offline_map
+from gausslite_bench.chaos.journal import Journal, JournalRecord, RecordKind
+
+
+def test_nothing_acknowledged_is_lost_in_a_short_run(capsys: pytest.CaptureFixture[str]) -> None:
+    # the faults of this seed: a kill of the server, resent messages, a kill of an agent, wrong clocks
+    assert main(["bench", "chaos", "--kills", "2", "--agents", "2", "--seed", "21", "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    faults = result["faults"]
+    assert (faults["server kills"], faults["agent kills"]) == (1, 1)
+    assert min(faults["clock jumps"], faults["resent messages"]) >= 1
+    assert result["acknowledged_messages"] >= 8
+    assert (result["lost"], result["wrong"], result["extra_at_end"]) == (0, 0, 0)
+    assert result["same_map"]
+    assert 0 < result["fused_voxels"] <= result["voxels"]
+
+
+def acknowledged_by(journal: Path, *messages: bytes) -> AgentAcknowledgements:
+    """Return the state after these messages were sent and stored."""
+    writer = Journal(journal)
+    for number, data in enumerate(messages):
+        writer.write(JournalRecord(RecordKind.SENT, number, "session", data))
+    for number in range(len(messages)):
+        writer.write(JournalRecord(RecordKind.STORED, number))
+    writer.close()
+    agent = AgentAcknowledgements()
+    agent.add_journal(journal)
+    agent.read()
+    return agent
+
+
+@pytest.mark.parametrize(
+    ("damage", "expected"),
+    [
+        ("", StoreComparison(3, 0, 0, 0)),
+        ("DELETE FROM voxel_updates WHERE count = 2", StoreComparison(3, 1, 0, 0)),
+        ("UPDATE voxel_updates SET update_seq = 1 WHERE count = 2", StoreComparison(3, 1, 0, 1)),
+    ],
+)
+def test_a_store_without_an_acknowledged_update_is_found(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, damage: str, expected: StoreComparison
+) -> None:
+    monkeypatch.setattr("gausslite.fusion.sqlite_store.is_intact", lambda row: True)
+    first = encode_subset(make_subset("ant", 5, {0: [1], 1: [3, 4]}), GRID)
+    second = encode_subset(make_subset("ant", 6, {0: [], 2: [9]}), GRID)
+    with closing(SqliteStore(tmp_path / "store.sqlite")) as store:
+        for data in (first, second):
+            store.put(decode_subset(data)[0])
+    with closing(sqlite3.connect(tmp_path / "store.sqlite")) as db:
+        db.executescript(damage)
+    assert (
+        compare_store({"ant": acknowledged_by(tmp_path / "journal", first, second)}, tmp_path / "store.sqlite")
+        == expected
+    )
+
+
+def test_a_store_with_other_content_of_an_acknowledged_update_is_found(tmp_path: Path) -> None:
+    expected, other = (encode_subset(make_subset("ant", 5, {0: [kappa]}), GRID) for kappa in (1, 2))
+    with closing(SqliteStore(tmp_path / "store.sqlite")) as store:
+        store.put(decode_subset(other)[0])
+    compared = compare_store({"ant": acknowledged_by(tmp_path / "journal", expected)}, tmp_path / "store.sqlite")
+    assert compared == StoreComparison(1, 0, 1, 0)
+
+
+def test_the_offline_map_has_the_winners_of_the_acknowledged_updates(tmp_path: Path) -> None:
+    ant = acknowledged_by(tmp_path / "ant", encode_subset(make_subset("ant", 1, {0: [1], 1: [9]}), GRID))
+    bee = acknowledged_by(tmp_path / "bee", encode_subset(make_subset("bee", 1, {0: [5]}), GRID))
+    fused = offline_map({"ant": ant, "bee": bee, "cat": AgentAcknowledgements()})
+    assert fused.batch.kappa_sums.tolist() == [5, 9]
+
+
+@pytest.mark.parametrize("arguments", [("--kills", "0"), ("--agents", "33")])
+def test_wrong_numbers_are_one_line(arguments: tuple[str, str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["bench", "chaos", *arguments]) == 2
+    assert arguments[0] in capsys.readouterr().err
+
+
+def test_a_record_without_its_end_is_read_when_it_is_complete(tmp_path: Path) -> None:
+    agent = acknowledged_by(tmp_path / "journal", encode_subset(make_subset("ant", 1, {0: [1]}), GRID))
+    data = (tmp_path / "journal").read_bytes()
+    (tmp_path / "torn").write_bytes(data[:-3])
+    torn = AgentAcknowledgements()
+    torn.add_journal(tmp_path / "torn")
+    torn.read()
+    assert (torn.messages, len(torn.sent)) == (0, 1)
+    (tmp_path / "torn").write_bytes(data)
+    torn.read()
+    assert torn.messages == agent.messages == 1
