@@ -5,23 +5,21 @@ from __future__ import annotations
 import time
 from collections.abc import Collection, Sequence
 from concurrent.futures import Future
-from dataclasses import replace
 from threading import RLock
 from typing import NamedTuple
 
-import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from gausslite.domain.errors import InvalidInputError, MismatchError, NotPermittedError, QuotaError
+from gausslite.domain.errors import MismatchError, NotPermittedError
 from gausslite.domain.free_space import FreeSpace
 from gausslite.domain.gaussians import Gaussians
-from gausslite.domain.names import quote_name, require_identifier
+from gausslite.domain.names import quote_name
 from gausslite.domain.objects import ObjectLandmark, ObjectReport, TeamObject
 from gausslite.domain.task import TaskGraph
 from gausslite.domain.voxel_batch import RoiSubset
 from gausslite.domain.voxels import VoxelGrid
-from gausslite.fusion.bans import BanList
+from gausslite.fusion.agent_data import AgentData
 from gausslite.fusion.frame_aligner import FrameAligner
 from gausslite.fusion.frame_alignment import FrameAlignments
 from gausslite.fusion.free_space import FreeSpaceRecords
@@ -35,11 +33,11 @@ from gausslite.fusion.keyframes import (
     no_decoder,
 )
 from gausslite.fusion.limits import FusionSettings, VoteRule
-from gausslite.fusion.mission_config import MissionConfig, reconcile
-from gausslite.fusion.sessions import SessionRegistry
+from gausslite.fusion.membership import Membership
+from gausslite.fusion.mission_config import MissionConfig
 from gausslite.fusion.store import FusionStore, PutOutcome, SessionRecord, require_storable
 from gausslite.fusion.team_objects import TeamObjects, find_objects
-from gausslite.fusion.traffic import AgentContribution, MissionStatus, TrafficCounters
+from gausslite.fusion.traffic import AgentContribution, MissionStatus, TrafficCounters, TrafficLog
 from gausslite.fusion.update_checks import UpdateChecks
 from gausslite.fusion.update_committer import UpdateCommitter
 from gausslite.fusion.update_queue import PendingUpdate
@@ -78,16 +76,13 @@ class FusionEngine:
         self._lock = RLock()
         self._store = store
         self._settings = settings
-        own = settings.mission_config
-        self._mission_config = reconcile(store.mission_config() or own, own)
+        self._members = Membership(store, settings)
         first_revision = time.time_ns() // 1000 if first_revision is None else first_revision
         quotas = settings.quotas
         self._keyframes = KeyframePool(store, quotas.keyframe_limits, decode_keyframe)
         self._objects = TeamObjects(store)
-        self._sessions = SessionRegistry(store, settings.lease_s)
-        self._bans = BanList(store)
         self._checks = UpdateChecks(store, quotas)
-        self._traffic: dict[str, TrafficCounters] = {}
+        self._traffic = TrafficLog()
         self._alignments = FrameAlignments(store)
         self._free_space = FreeSpaceRecords(store, settings.grid)
         uses_free_space = settings.vote is VoteRule.FREE_SPACE
@@ -97,6 +92,8 @@ class FusionEngine:
             store, self._alignments, self._votes, self._free_space, self._lock, settings.alignment
         )
         self._maps = FusedMapLayers(self._votes, self._lock, settings.grid, first_revision, settings.max_removed_voxels)
+        parts = self._aligner, self._free_space, self._checks, self._traffic, self._keyframes, self._objects
+        self._data = AgentData(store, self._votes, self._maps, self._alignments, parts)
         self._committer = UpdateCommitter(store, self._lock, self._check_update, self._record_update)
 
     @property
@@ -113,7 +110,7 @@ class FusionEngine:
     def mission_config(self) -> MissionConfig:
         """The mission's configuration, with default names in place of empty ones."""
         with self._lock:
-            return self._mission_config.with_default_names()
+            return self._members.mission_config
 
     @property
     def incarnation_id(self) -> str:
@@ -141,23 +138,16 @@ class FusionEngine:
             raise MismatchError(f"mission: expected {quote_name(own)} as agreed here, got {quote_name(mission_id)}")
 
     def join(self, agent_id: str, requested: MissionConfig, fresh_map: bool = False, token: str = "") -> JoinResult:
-        """Open a session and end the agent's earlier one; fresh_map also deletes all that the agent sent before.
+        """Open a session and end the agent's earlier one; fresh_map: the agent begins a new map, see AgentData.
 
         Empty names in `requested` accept the server's. token: the robot's secret, see SessionRegistry. Raises
         InvalidInputError, MismatchError, NameInUseError, NotPermittedError (banned), QuotaError, StorageError.
         """
-        require_identifier("agent_id", agent_id)
         with self._committer.committing, self._lock:
-            self._bans.require_allowed(agent_id)
-            self._sessions.require_free(agent_id, token)
-            self._make_room(agent_id)
-            agreed = self._mission_config if self._is_agreed(agent_id) else self._settings.mission_config
-            mission_config = reconcile(agreed, requested).with_default_names()
-            self._store.set_mission_config(mission_config)
-            self._mission_config = mission_config
+            self._members.admit(agent_id, requested, token)
             if fresh_map:
-                self._remove_agent(agent_id)
-            session = self._sessions.open(agent_id, token)
+                self._data.begin_new_map(agent_id)
+            session = self._members.open_session(agent_id, token)
             self._checks.record_join(agent_id)
             return JoinResult(
                 session,
@@ -169,7 +159,7 @@ class FusionEngine:
     def session(self, session_id: str) -> SessionRecord:
         """Return the session of this id. Raises SessionUnknownError, and MismatchError for a replaced session."""
         with self._lock:
-            return self._sessions.get(session_id)
+            return self._members.session(session_id)
 
     def contribute(self, session_id: str, subset: RoiSubset, grid: VoxelGrid) -> PutOutcome:
         """Store an agent's voxel updates; they are durable on return, if the store is.
@@ -208,9 +198,9 @@ class FusionEngine:
         changed = False
         for agent_id in self._aligner.due():
             keys = self._aligner.estimate(agent_id)
-            if len(keys):
+            with self._lock:
                 self._maps.record(agent_id, keys)
-                changed = True
+                changed |= self._data.drop_contradicted(agent_id) or len(keys) > 0
         return changed
 
     def declare_frame(self, agent_id: str, T_fused_agent: Float64[ndarray, "4 4"]) -> None:
@@ -225,7 +215,7 @@ class FusionEngine:
         Raises SessionUnknownError, MismatchError (another grid), QuotaError, StorageError.
         """
         with self._lock:
-            agent_id = self._sessions.get(session_id).agent_id
+            agent_id = self._members.session(session_id).agent_id
             if grid != self.grid:
                 raise MismatchError(f"voxel size: this mission votes on {self.grid.size_m:g} m, got {grid.size_m:g} m")
             keys = self._free_space.contribute(agent_id, blocks)
@@ -238,8 +228,7 @@ class FusionEngine:
     def record_traffic(self, agent_id: str, traffic: TrafficCounters) -> None:
         """Add to the agent's counters, and set its last_seen_ns to now."""
         with self._lock:
-            newer = replace(traffic, last_seen_ns=time.time_ns())
-            self._traffic[agent_id] = self._traffic.get(agent_id, TrafficCounters()).plus(newer)
+            self._traffic.record(agent_id, traffic)
 
     def add_keyframe(self, keyframe: EncodedKeyframe, selected: Collection[int] = ()) -> None:
         """Store a keyframe for the refinement; the agent's others that are not `selected` are deleted.
@@ -252,7 +241,7 @@ class FusionEngine:
     def report_objects(self, session_id: str, report: ObjectReport) -> None:
         """Replace the agent's task graph and objects. Raises SessionUnknownError, MismatchError, StorageError."""
         with self._lock:
-            self._objects.report(self._sessions.get(session_id).agent_id, report)
+            self._objects.report(self._members.session(session_id).agent_id, report)
 
     def reported_objects(self, agent_id: str, graph: TaskGraph) -> tuple[ObjectLandmark, ...]:
         """Return the objects that the agent has reported for an equivalent task; empty for another task."""
@@ -268,34 +257,30 @@ class FusionEngine:
     def evict(self, agent_id: str, ban: bool = False) -> int:
         """End the agent's session and delete all its data; returns the number of its voxels. For operators.
 
-        ban: refuse later joins under this name, also after a restart. Raises InvalidInputError for an unknown agent
-        that is not banned, StorageError.
+        ban: refuse later joins under this name, also after a restart. The name of an earlier map (AgentData) deletes
+        only that. Raises InvalidInputError for an unknown agent that is not banned, StorageError.
         """
-        require_identifier("agent_id", agent_id)
         with self._committer.committing, self._lock:
-            known_agents = self._sessions.agents | frozenset(self._store.agents())
-            if not ban and agent_id not in known_agents:
-                expected = ", ".join(sorted(known_agents)[:8]) or "no agents yet"
-                raise InvalidInputError(f"agent_id: expected an agent of the mission ({expected}), got {agent_id!r}")
             voxels = self._store.totals(agent_id).voxels
-            self._sessions.end_agent(agent_id)
-            self._remove_agent(agent_id)
+            self._members.require_evictable(agent_id, ban)
+            self._members.end_agent(agent_id)
+            self._data.remove(agent_id)
             if ban:
-                self._bans.add(agent_id)
+                self._members.ban(agent_id)
             return voxels
 
     def unban(self, agent_id: str) -> None:
         """Let a banned agent join again. Raises InvalidInputError if it is not banned, StorageError."""
         with self._lock:
-            self._bans.remove(agent_id)
+            self._members.unban(agent_id)
 
     def leave(self, session_id: str, forget: bool = False) -> int:
         """End a session and return the fused revision; with `forget` all updates of the agent are deleted."""
         with self._committer.committing, self._lock:
-            agent_id = self._sessions.get(session_id).agent_id
+            agent_id = self._members.session(session_id).agent_id
             if forget:
-                self._remove_agent(agent_id)
-            self._sessions.end(session_id)
+                self._data.remove(agent_id)
+            self._members.end_session(session_id)
             return self._maps.revision()
 
     def refinement_input(self) -> tuple[Gaussians, list[AgentKeyframe], int]:
@@ -323,17 +308,16 @@ class FusionEngine:
     def status(self) -> MissionStatus:
         """Return the totals of the mission and of each agent."""
         with self._lock:
-            names = sorted(self._sessions.agents | set(self._store.agents()))
             fused_voxels, fused_gaussians = self._maps.size()
             return MissionStatus(
-                self._mission_config.with_default_names(),
+                self._members.mission_config,
                 self._maps.revision(),
                 fused_gaussians,
                 fused_voxels,
                 len(self._keyframes),
                 self._maps.is_refined,
-                tuple(self._contribution(agent_id) for agent_id in names),
-                self._bans.agents,
+                tuple(self._contribution(agent_id) for agent_id in sorted(self._members.sources)),
+                self._members.banned,
             )
 
     def close(self) -> None:
@@ -345,7 +329,7 @@ class FusionEngine:
         totals = self._store.totals(agent_id)
         return AgentContribution(
             agent_id,
-            joined=agent_id in self._sessions.agents,
+            joined=agent_id in self._members.joined,
             voxels=totals.occupied_voxels,
             gaussians=totals.gaussians,
             kappa_sum=totals.kappa_sum,
@@ -355,12 +339,12 @@ class FusionEngine:
             targets=self._objects.targets(agent_id),
             free_voxels=self._free_space.free_voxels(agent_id),
             alignment=self._alignments.get(agent_id),
-            traffic=self._traffic.get(agent_id, TrafficCounters()),
+            traffic=self._traffic.of(agent_id),
         )
 
     def _check_update(self, update: PendingUpdate) -> RoiSubset:
         """Return the message with computed sums; only its first part is checked. Raises GaussLiteError."""
-        self._sessions.get(update.session_id)
+        self._members.session(update.session_id)
         if update.outcomes:
             return update.subset
         subset = self._checks.check(update.subset)
@@ -373,28 +357,4 @@ class FusionEngine:
         self._aligner.record(subset.agent_id, outcome.accepted)
         if len(outcome.accepted):
             self._maps.record(subset.agent_id, self._votes.changed_keys(subset.agent_id, outcome.accepted))
-
-    def _is_agreed(self, agent_id: str) -> bool:
-        """Return whether another live agent, or any data, fixes the mission's configuration."""
-        return bool(frozenset(self._store.agents()) or self._sessions.live_agents - {agent_id})
-
-    def _make_room(self, agent_id: str) -> None:
-        """End sessions without a lease and without data if the mission is full. Raises QuotaError, StorageError."""
-        limit = self._settings.quotas.agents
-        known_agents = self._sessions.agents | frozenset(self._store.agents())
-        if agent_id in known_agents or len(known_agents) < limit:
-            return
-        self._sessions.end_expired(kept=frozenset(self._store.agents()))
-        if len(self._sessions.agents | frozenset(self._store.agents())) >= limit:
-            raise QuotaError(f"agents: expected at most {limit} in this mission, {quote_name(agent_id)} exceeds it")
-
-    def _remove_agent(self, agent_id: str) -> None:
-        keys = np.union1d(self._store.remove_agent(agent_id), self._votes.remove_agent(agent_id))
-        self._maps.record(agent_id, keys)
-        self._alignments.remove_agent(agent_id)
-        self._aligner.remove_agent(agent_id)
-        self._free_space.remove_agent(agent_id)
-        self._checks.remove_agent(agent_id)
-        self._traffic.pop(agent_id, None)
-        self._keyframes.remove_agent(agent_id)
-        self._objects.remove_agent(agent_id)
+            self._data.drop_outgrown(subset.agent_id)

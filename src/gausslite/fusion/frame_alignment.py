@@ -140,7 +140,11 @@ class FrameAlignments:
 
     def get(self, agent_id: str) -> FrameAlignment:
         """Return the agent's alignment."""
-        return self._by_agent.get(agent_id) or FrameAlignment(order=len(self._by_agent))
+        orders = (each.order for each in self._by_agent.values())
+        return self._by_agent.get(agent_id) or FrameAlignment(order=1 + max(orders, default=-1))
+
+    def __contains__(self, agent_id: str) -> bool:
+        return agent_id in self._by_agent
 
     def put(self, agent_id: str, alignment: FrameAlignment) -> None:
         """Replace the agent's alignment. Raises StorageError."""

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import time
+from dataclasses import dataclass, field, replace
 
 from gausslite.fusion.frame_alignment import FrameAlignment
 from gausslite.fusion.mission_config import MissionConfig
@@ -29,6 +30,26 @@ class TrafficCounters:
             self.subsets_stale + newer.subsets_stale,
             self.subsets_rejected + newer.subsets_rejected,
         )
+
+
+class TrafficLog:
+    """The counters of each agent. Not thread-safe; FusionEngine holds a lock."""
+
+    def __init__(self) -> None:
+        self._by_agent: dict[str, TrafficCounters] = {}
+
+    def record(self, agent_id: str, traffic: TrafficCounters) -> None:
+        """Add to the agent's counters, and set its last_seen_ns to now."""
+        newer = replace(traffic, last_seen_ns=time.time_ns())
+        self._by_agent[agent_id] = self.of(agent_id).plus(newer)
+
+    def of(self, agent_id: str) -> TrafficCounters:
+        """Return the agent's counters; zero for an unknown agent."""
+        return self._by_agent.get(agent_id, TrafficCounters())
+
+    def remove_agent(self, agent_id: str) -> None:
+        """Forget the agent."""
+        self._by_agent.pop(agent_id, None)
 
 
 @dataclass(frozen=True, slots=True)

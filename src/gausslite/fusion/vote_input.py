@@ -72,6 +72,10 @@ class VoteInput:
             return batch
         return select_voxels(batch, ~self._free_space.contradicts(batch.keys, self._alignments.in_other_frames()))
 
+    def fused_batch(self, agent_id: str) -> VoxelBatch:
+        """Return all updates of one agent in the fused frame, also those in free space; empty in quarantine."""
+        return self._moved[agent_id] if agent_id in self._moved else self._store.batch(agent_id)
+
     def batches(self, keys: Int64[ndarray, " k"] | None = None) -> dict[str, VoxelBatch]:
         """Return the updates of every agent on these voxels, or on all."""
         batches = self._store.batches(keys)

@@ -169,7 +169,9 @@ class JoinSessionRequest(_message.Message):
     world_frame: _builtins.str
     """Name of the coordinate frame of all poses and means; empty accepts the server's."""
     fresh_map: _builtins.bool
-    """The agent starts with an empty map, so the server deletes its earlier updates."""
+    """The agent begins a new map. Its earlier updates stay in the vote as agent_id + ":earlier", until the new map has
+    the higher sum of kappa in all their voxels. Its keyframes, objects and free space are deleted.
+    """
     token: _builtins.str
     """A secret of this robot, the same in all of its joins. While the name's lease lasts, only its holder may join again."""
     @_builtins.property

@@ -56,3 +56,16 @@ def test_after_a_restart_with_a_store_that_has_lost_its_newest_updates(tmp_path:
     send_then_replace(first, second, tmp_path)
     first.close()
     second.close()
+
+
+def test_a_robot_that_reboots_without_its_spool_keeps_its_map(tmp_path: Path) -> None:
+    store, address = MemoryStore(), f"unix:{tmp_path}/fusion.sock"
+    with fusion_server(store, address=address) as t:
+        for cells, gaussians in ((range(40), 80), (range(3, 6), 80)):
+            spool = Spool(None, "ant", GRID)
+            uplink = Uplink(FusionClient(address, deadline_s=5.0), "ant", spool, GRID, QUICK)
+            uplink.enqueue(make_batch({cell: [5, 6] for cell in cells}), Purpose.ROI)
+            assert uplink.drain(20.0)
+            uplink.close()
+            status = t.client.status()
+            assert (status.fused_gaussians, status.fused_voxels) == (gaussians, 40)

@@ -161,15 +161,15 @@ def test_a_grid_is_required() -> None:
     assert caught.value.code() is grpc.StatusCode.INVALID_ARGUMENT
 
 
-def test_a_fresh_map_and_a_forgotten_agent_leave_no_updates() -> None:
+def test_a_fresh_map_begins_at_zero_and_a_forgotten_agent_leaves_no_updates() -> None:
     with fusion_server() as t:
         t.contribute_subsets(t.client.join("ant", GRID).session_id, make_subset("ant", 7, {0: [1]}))
         session = t.client.join("ant", GRID, fresh_map=True)
         assert session.highest_update_seq == 0
-        assert t.client.status().fused_voxels == 0
+        assert t.client.status().fused_voxels == 1
         assert t.contribute_subsets(session.session_id, make_subset("ant", 1, {1: [1]}))[0].status == ACCEPTED
         t.client.leave(session.session_id)
-        assert t.client.status().fused_voxels == 1
+        assert t.client.status().fused_voxels == 2
         assert not t.client.status().agents[0].joined
         t.client.leave(t.client.join("ant", GRID).session_id, forget=True)
         assert t.client.status().fused_voxels == 0

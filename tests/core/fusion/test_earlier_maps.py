@@ -1,0 +1,149 @@
+"""A robot that begins a new map: its earlier one stays in the fused map until the new one has outgrown it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fusion_running import GRID, keys, make_subset
+from sample_gaussians import plain_gaussians
+
+from gausslite.domain.errors import InvalidInputError
+from gausslite.domain.voxel_batch import RoiSubset
+from gausslite.domain.voxel_operations import group_by_voxel
+from gausslite.fusion.agent_data import earlier_map_of
+from gausslite.fusion.engine import FusionEngine
+from gausslite.fusion.frame_alignment import AlignmentSettings, AlignmentState
+from gausslite.fusion.limits import FusionSettings, Quotas
+from gausslite.fusion.memory_store import MemoryStore
+from gausslite.fusion.mission_config import MissionConfig
+from gausslite.fusion.sqlite_store import SqliteStore
+from gausslite.fusion.store import FusionStore
+
+ANYTHING = MissionConfig("", "", GRID.size_m)
+EARLIER = "ant:earlier"
+
+
+def engine_on(store: FusionStore | None = None, **settings: object) -> FusionEngine:
+    return FusionEngine(store or MemoryStore(), FusionSettings(grid=GRID, **settings))
+
+
+def reboot(engine: FusionEngine, agent_id: str = "ant") -> str:
+    """Join as a robot without its spool and its map; returns the session."""
+    return engine.join(agent_id, ANYTHING, fresh_map=True).session.session_id
+
+
+def send(engine: FusionEngine, session: str, seq: int, cells: dict[int, list[int]]) -> None:
+    engine.contribute(session, make_subset("ant", seq, cells), GRID)
+
+
+def fused_kappas(engine: FusionEngine) -> dict[int, int]:
+    """Return Σkappa of the fused map by cell, for the cells 0 to 99."""
+    fused = engine.maps.voted_map()
+    cell_of = {int(key): cell for cell, key in enumerate(keys(*range(100)))}
+    return {cell_of[int(key)]: int(total) for key, total in zip(fused.keys, fused.kappa_sums, strict=True)}
+
+
+def test_an_earlier_map_stays_until_it_is_outgrown_also_after_a_restart(tmp_path: Path) -> None:
+    store = SqliteStore(tmp_path / "store.sqlite")
+    engine = engine_on(store)
+    send(engine, reboot(engine), 50, {cell: [10, 10] for cell in range(20)})
+    session = reboot(engine)
+    send(engine, session, 1, {0: [1], 1: [30], 30: [2]})
+    expected = {**dict.fromkeys(range(20), 20), 1: 30, 30: 2}
+    assert fused_kappas(engine) == expected
+    engine.close()
+    engine = engine_on(SqliteStore(tmp_path / "store.sqlite"))
+    assert fused_kappas(engine) == expected
+    assert {each.agent_id: each.won_voxels for each in engine.status().agents} == {"ant": 2, EARLIER: 19}
+    send(engine, session, 2, {cell: [25] for cell in range(20)})
+    assert [each.agent_id for each in engine.status().agents] == ["ant"]
+    assert fused_kappas(engine) == {**dict.fromkeys(range(20), 25), 30: 2}
+    engine.close()
+
+
+def test_a_tombstone_of_the_new_map_leaves_the_earlier_one() -> None:
+    engine = engine_on()
+    send(engine, reboot(engine), 50, {0: [5], 1: [5]})
+    session = reboot(engine)
+    send(engine, session, 1, {0: [9], 2: [9]})
+    send(engine, session, 2, {0: [], 1: [], 2: []})
+    assert fused_kappas(engine) == {0: 5, 1: 5}
+
+
+def test_of_many_maps_two_are_stored_and_the_best_of_each_voxel_stays() -> None:
+    engine = engine_on()
+    for life in range(5):
+        send(engine, reboot(engine), 1, {0: [10 - life], life + 1: [7]})
+        # an answer that was lost: the robot joins again before it has sent anything
+        reboot(engine)
+        reboot(engine)
+    assert fused_kappas(engine) == {0: 10, **dict.fromkeys(range(1, 6), 7)}
+    assert [each.agent_id for each in engine.status().agents if each.voxels] == [EARLIER]
+
+
+def test_watchers_get_what_a_new_map_changes() -> None:
+    engine = engine_on()
+    send(engine, reboot(engine), 1, {0: [5], 1: [5]})
+    revision = engine.revision
+    session = reboot(engine)
+    send(engine, session, 1, {1: [9]})
+    changes = engine.maps.changes(revision)
+    assert {name: sorted(won) for name, won in changes.won.keys_by_winner.items()} == {
+        EARLIER: keys(0).tolist(),
+        "ant": keys(1).tolist(),
+    }
+    assert len(changes.removed) == 0
+
+
+def test_an_earlier_map_is_no_agent_of_its_own() -> None:
+    engine = engine_on(quotas=Quotas(agents=2))
+    send(engine, reboot(engine), 1, {0: [5]})
+    session = reboot(engine)
+    send(engine, session, 1, {1: [5]})
+    engine.join("bee", ANYTHING)
+    with pytest.raises(InvalidInputError, match="letters, digits"):
+        engine.join(EARLIER, ANYTHING)
+    with pytest.raises(InvalidInputError, match="letters, digits"):
+        engine.evict(EARLIER, ban=True)
+
+
+def test_operators_delete_an_earlier_map_alone_or_with_its_agent() -> None:
+    engine = engine_on()
+    for evicted, left in ((EARLIER, {1: 5}), ("ant", {})):
+        send(engine, reboot(engine), 1, {0: [5]})
+        send(engine, reboot(engine), 1, {1: [5]})
+        assert fused_kappas(engine) == {0: 5, 1: 5}
+        engine.evict(evicted)
+        assert fused_kappas(engine) == left
+    send(engine, reboot(engine), 1, {0: [5]})
+    engine.leave(reboot(engine), forget=True)
+    assert fused_kappas(engine) == {}
+
+
+def corner_subset(seed: int, shift_m: float = 0.0) -> RoiSubset:
+    """Samples of a textured corner of a room: a floor and two walls of 2 m."""
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(0, 2, (3000, 3))
+    points[np.arange(3000), rng.integers(0, 3, 3000)] = 0.0
+    texture = 0.5 + 0.4 * np.sin(6 * points[:, 0] + 4 * points[:, 1] + 5 * points[:, 2])
+    gaussians = plain_gaussians(points + shift_m, rgb=np.repeat(texture[:, None], 3, 1), kappa=5)
+    return RoiSubset("ant", "", 1, 1, group_by_voxel(gaussians, GRID))
+
+
+@pytest.mark.parametrize(("shift_m", "is_kept"), [(0.0, True), (0.05, True), (0.22, False)])
+def test_an_earlier_map_in_another_frame_is_corrected_or_deleted(shift_m: float, is_kept: bool) -> None:
+    engine = engine_on(alignment=AlignmentSettings())
+    engine.contribute(reboot(engine), corner_subset(0), GRID)
+    engine.contribute(reboot(engine), corner_subset(1, shift_m), GRID)
+    engine.align_due()
+    status = {each.agent_id: each for each in engine.status().agents}
+    assert (EARLIER in status) == is_kept
+    assert status["ant"].alignment.state is not AlignmentState.QUARANTINED
+    if not is_kept:
+        assert status["ant"].won_voxels == status["ant"].voxels > 0
+
+
+def test_the_name_of_an_earlier_map_is_derived_from_its_agent() -> None:
+    assert earlier_map_of("ant") == EARLIER
