@@ -16,6 +16,7 @@ from gausslite.mission.live_frame import correct_live_frame
 from gausslite.task.parser import TaskParser
 from gausslite.v1 import agent_service_pb2 as pb
 from gausslite.v1 import agent_service_pb2_grpc as pb_grpc
+from gausslite.wire.camera_view import camera_view_to_message
 from gausslite.wire.change_notifier import ChangeNotifier
 from gausslite.wire.convert import (
     box_from_message,
@@ -28,6 +29,7 @@ from gausslite.wire.map_blocks import map_blocks
 from gausslite.wire.server import Service
 from gausslite.wire.uplink_values import UplinkCounters
 from gausslite_agent.agent_mission import AgentMission
+from gausslite_agent.camera_view import newest_camera_view
 from gausslite_agent.map_changes import MapChangeLog
 from gausslite_agent.mapping_worker import MappingWorker
 from gausslite_agent.messages import (
@@ -115,6 +117,13 @@ class AgentServicer(pb_grpc.AgentServiceServicer):
             return view_to_message(rendering.rgb, rendering.expected_depth_m(), revision)
 
         return await asyncio.wrap_future(self._worker.run(render))
+
+    async def GetCameraView(  # noqa: N802
+        self, _request: pb.GetCameraViewRequest, _context: Any
+    ) -> pb.GetCameraViewResponse:
+        """Return the newest keyframe and the camera's path."""
+        view = await asyncio.wrap_future(self._worker.run(newest_camera_view))
+        return await asyncio.to_thread(camera_view_to_message, view)
 
     async def WatchMap(  # noqa: N802
         self, request: pb.WatchMapRequest, _context: Any

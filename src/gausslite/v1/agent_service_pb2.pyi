@@ -504,6 +504,92 @@ class RenderViewResponse(_message.Message):
 Global___RenderViewResponse: _TypeAlias = RenderViewResponse  # noqa: Y015
 
 @_typing.final
+class GetCameraViewRequest(_message.Message):
+    DESCRIPTOR: _descriptor.Descriptor
+
+    def __init__(
+        self,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___GetCameraViewRequest: _TypeAlias = GetCameraViewRequest  # noqa: Y015
+
+@_typing.final
+class GetCameraViewResponse(_message.Message):
+    """Empty before the first keyframe."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    COLOUR_JPEG_FIELD_NUMBER: _builtins.int
+    REGION_PNG_FIELD_NUMBER: _builtins.int
+    CAMERA_FIELD_NUMBER: _builtins.int
+    FRAME_INDEX_FIELD_NUMBER: _builtins.int
+    T_WORLD_CAMERA_FIELD_NUMBER: _builtins.int
+    PATH_FIELD_NUMBER: _builtins.int
+    KEYFRAMES_FIELD_NUMBER: _builtins.int
+    colour_jpeg: _builtins.bytes
+    region_png: _builtins.bytes
+    """One channel, 8 bits, the size of the colour: 255 in the task's region, otherwise 0."""
+    frame_index: _builtins.int
+    @_builtins.property
+    def camera(self) -> _geometry_pb2.Camera: ...
+    @_builtins.property
+    def t_world_camera(self) -> _geometry_pb2.RigidTransform: ...
+    @_builtins.property
+    def path(self) -> _containers.RepeatedCompositeFieldContainer[Global___StampedPose]:
+        """Poses of the mapped frames in the map, oldest first; at most 1000, evenly spaced over the mission."""
+
+    @_builtins.property
+    def keyframes(self) -> _containers.RepeatedCompositeFieldContainer[_geometry_pb2.RigidTransform]:
+        """Poses of kept keyframes; at most 60, evenly spaced."""
+
+    def __init__(
+        self,
+        *,
+        colour_jpeg: _builtins.bytes = ...,
+        region_png: _builtins.bytes = ...,
+        camera: _geometry_pb2.Camera | None = ...,
+        frame_index: _builtins.int = ...,
+        t_world_camera: _geometry_pb2.RigidTransform | None = ...,
+        path: _abc.Iterable[Global___StampedPose] | None = ...,
+        keyframes: _abc.Iterable[_geometry_pb2.RigidTransform] | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["camera", b"camera", "t_world_camera", b"t_world_camera"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["camera", b"camera", "colour_jpeg", b"colour_jpeg", "frame_index", b"frame_index", "keyframes", b"keyframes", "path", b"path", "region_png", b"region_png", "t_world_camera", b"t_world_camera"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___GetCameraViewResponse: _TypeAlias = GetCameraViewResponse  # noqa: Y015
+
+@_typing.final
+class StampedPose(_message.Message):
+    DESCRIPTOR: _descriptor.Descriptor
+
+    CAPTURE_TIME_NS_FIELD_NUMBER: _builtins.int
+    T_WORLD_CAMERA_FIELD_NUMBER: _builtins.int
+    capture_time_ns: _builtins.int
+    @_builtins.property
+    def t_world_camera(self) -> _geometry_pb2.RigidTransform: ...
+    def __init__(
+        self,
+        *,
+        capture_time_ns: _builtins.int = ...,
+        t_world_camera: _geometry_pb2.RigidTransform | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["t_world_camera", b"t_world_camera"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["capture_time_ns", b"capture_time_ns", "t_world_camera", b"t_world_camera"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___StampedPose: _TypeAlias = StampedPose  # noqa: Y015
+
+@_typing.final
 class WatchMapRequest(_message.Message):
     DESCRIPTOR: _descriptor.Descriptor
 

@@ -59,6 +59,11 @@ class AgentServiceStub(object):
                 request_serializer=gausslite_dot_v1_dot_agent__service__pb2.RenderViewRequest.SerializeToString,
                 response_deserializer=gausslite_dot_v1_dot_agent__service__pb2.RenderViewResponse.FromString,
                 _registered_method=True)
+        self.GetCameraView = channel.unary_unary(
+                '/gausslite.v1.AgentService/GetCameraView',
+                request_serializer=gausslite_dot_v1_dot_agent__service__pb2.GetCameraViewRequest.SerializeToString,
+                response_deserializer=gausslite_dot_v1_dot_agent__service__pb2.GetCameraViewResponse.FromString,
+                _registered_method=True)
         self.WatchMap = channel.unary_stream(
                 '/gausslite.v1.AgentService/WatchMap',
                 request_serializer=gausslite_dot_v1_dot_agent__service__pb2.WatchMapRequest.SerializeToString,
@@ -105,6 +110,13 @@ class AgentServiceServicer(object):
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
+    def GetCameraView(self, request, context):
+        """What the robot's camera sees, for a person: the newest keyframe with the task's region, and the camera's path.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
     def WatchMap(self, request, context):
         """A snapshot of the agent's map, then its changes. OUT_OF_RANGE if since_revision is too old.
         """
@@ -139,6 +151,11 @@ def add_AgentServiceServicer_to_server(servicer, server):
                     servicer.RenderView,
                     request_deserializer=gausslite_dot_v1_dot_agent__service__pb2.RenderViewRequest.FromString,
                     response_serializer=gausslite_dot_v1_dot_agent__service__pb2.RenderViewResponse.SerializeToString,
+            ),
+            'GetCameraView': grpc.unary_unary_rpc_method_handler(
+                    servicer.GetCameraView,
+                    request_deserializer=gausslite_dot_v1_dot_agent__service__pb2.GetCameraViewRequest.FromString,
+                    response_serializer=gausslite_dot_v1_dot_agent__service__pb2.GetCameraViewResponse.SerializeToString,
             ),
             'WatchMap': grpc.unary_stream_rpc_method_handler(
                     servicer.WatchMap,
@@ -281,6 +298,33 @@ class AgentService(object):
             '/gausslite.v1.AgentService/RenderView',
             gausslite_dot_v1_dot_agent__service__pb2.RenderViewRequest.SerializeToString,
             gausslite_dot_v1_dot_agent__service__pb2.RenderViewResponse.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def GetCameraView(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/gausslite.v1.AgentService/GetCameraView',
+            gausslite_dot_v1_dot_agent__service__pb2.GetCameraViewRequest.SerializeToString,
+            gausslite_dot_v1_dot_agent__service__pb2.GetCameraViewResponse.FromString,
             options,
             channel_credentials,
             insecure,

@@ -47,6 +47,8 @@ class AgentServiceStub:
     GetAgentStatus: _grpc.UnaryUnaryMultiCallable[_agent_service_pb2.GetAgentStatusRequest, _agent_service_pb2.GetAgentStatusResponse]
     RenderView: _grpc.UnaryUnaryMultiCallable[_agent_service_pb2.RenderViewRequest, _agent_service_pb2.RenderViewResponse]
     """Render the agent's map from a camera pose."""
+    GetCameraView: _grpc.UnaryUnaryMultiCallable[_agent_service_pb2.GetCameraViewRequest, _agent_service_pb2.GetCameraViewResponse]
+    """What the robot's camera sees, for a person: the newest keyframe with the task's region, and the camera's path."""
     WatchMap: _grpc.UnaryStreamMultiCallable[_agent_service_pb2.WatchMapRequest, _agent_service_pb2.WatchMapResponse]
     """A snapshot of the agent's map, then its changes. OUT_OF_RANGE if since_revision is too old."""
 
@@ -66,6 +68,8 @@ class AgentServiceAsyncStub(AgentServiceStub):
     GetAgentStatus: _aio.UnaryUnaryMultiCallable[_agent_service_pb2.GetAgentStatusRequest, _agent_service_pb2.GetAgentStatusResponse]  # type: ignore[assignment]
     RenderView: _aio.UnaryUnaryMultiCallable[_agent_service_pb2.RenderViewRequest, _agent_service_pb2.RenderViewResponse]  # type: ignore[assignment]
     """Render the agent's map from a camera pose."""
+    GetCameraView: _aio.UnaryUnaryMultiCallable[_agent_service_pb2.GetCameraViewRequest, _agent_service_pb2.GetCameraViewResponse]  # type: ignore[assignment]
+    """What the robot's camera sees, for a person: the newest keyframe with the task's region, and the camera's path."""
     WatchMap: _aio.UnaryStreamMultiCallable[_agent_service_pb2.WatchMapRequest, _agent_service_pb2.WatchMapResponse]  # type: ignore[assignment]
     """A snapshot of the agent's map, then its changes. OUT_OF_RANGE if since_revision is too old."""
 
@@ -112,6 +116,14 @@ class AgentServiceServicer(metaclass=_abc_1.ABCMeta):
         context: _ServicerContext,
     ) -> _typing.Union[_agent_service_pb2.RenderViewResponse, _abc.Awaitable[_agent_service_pb2.RenderViewResponse]]:
         """Render the agent's map from a camera pose."""
+
+    @_abc_1.abstractmethod
+    def GetCameraView(
+        self,
+        request: _agent_service_pb2.GetCameraViewRequest,
+        context: _ServicerContext,
+    ) -> _typing.Union[_agent_service_pb2.GetCameraViewResponse, _abc.Awaitable[_agent_service_pb2.GetCameraViewResponse]]:
+        """What the robot's camera sees, for a person: the newest keyframe with the task's region, and the camera's path."""
 
     @_abc_1.abstractmethod
     def WatchMap(

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import Any
 
-import numpy as np
-
+from gausslite.codec.keyframe_views import KeyframeView
 from gausslite.domain.errors import GaussLiteError
+from gausslite.domain.objects import ObjectLandmark
+from gausslite.view.camera_image import with_objects, with_region
 from gausslite.view.contents import ViewContents
 from gausslite.view.history_plot import HistoryPlot
 from gausslite.view.map_follower import MapFollower
 from gausslite.view.map_page import MapPage, text_html
+from gausslite.wire.camera_view import CameraView
 from gausslite.wire.clients import AgentClient
 from gausslite.wire.convert_objects import object_from_message
 
@@ -29,6 +32,7 @@ class AgentPanel:
         self._started_s = self._polled_s = time.monotonic()
         self._bytes = 0
         self._shown_revision = -1
+        self._image: Any = None
         gui = page.server.gui
         with gui.add_folder("Agent", order=0):
             self._status = gui.add_html("")
@@ -36,6 +40,8 @@ class AgentPanel:
             self._assign = gui.add_button("Assign task")
             self._end = gui.add_button("End mission", color="red")
             self._message = gui.add_html("")
+        with gui.add_folder("Camera", order=0) as self._camera_folder:
+            pass
         with gui.add_folder("History", expand_by_default=False):
             self._rate = HistoryPlot(gui, "mapping (Hz)", ["Hz"])
             self._roi = HistoryPlot(gui, "pixels in the task's region (%)", ["ROI %"])
@@ -50,16 +56,33 @@ class AgentPanel:
         followed = self._follower.newest()
         if followed is None or followed.revision == self._shown_revision:
             return
-        gaussians = followed.batch.gaussians
         objects = tuple(object_from_message(each) for each in status.objects)
-        agent = np.zeros(len(gaussians), np.int64)
-        self._page.show(ViewContents(gaussians, agent, (status.agent_id,), tuple(status.graph.targets), objects))
+        contents = replace(
+            ViewContents.of_one_agent(followed.batch.gaussians, status.agent_id),
+            targets=tuple(status.graph.targets),
+            objects=objects,
+        )
+        view = self._client.camera_view()
+        if view is not None:
+            self._show_image(view, objects)
+            keyframes = [KeyframeView(i, 0, view.camera, T, 0) for i, T in enumerate(view.keyframes)]
+            contents = replace(contents, times_ns=view.times_ns, T_world_camera=view.path, keyframes=keyframes)
+        self._page.show(contents)
         self._shown_revision = followed.revision
 
     def close(self) -> None:
         """Close the client and end the follower."""
         self._client.close()
         self._follower.close()
+
+    def _show_image(self, view: CameraView, objects: tuple[ObjectLandmark, ...]) -> None:
+        image = with_objects(with_region(view.rgb, view.roi), objects, view.camera, view.T_world_camera)
+        if self._image is None:
+            with self._camera_folder:
+                label = "Newest keyframe: the task's region in red, objects in green"
+                self._image = self._page.server.gui.add_image(image, label=label, format="jpeg")
+        else:
+            self._image.image = image
 
     def _show_status(self, status: Any) -> None:
         now_s, uplink = time.monotonic(), status.uplink

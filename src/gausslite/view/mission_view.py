@@ -9,14 +9,13 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Bool, UInt8
-from numpy import ndarray
 
 from gausslite.codec.keyframe_views import KeyframeView
 from gausslite.domain.task import TaskGraph
 from gausslite.mapping.keyframes import Keyframe
 from gausslite.mission.task_mapper import FrameOutcome, TaskMapper
 from gausslite.process.messages import print_message
+from gausslite.view.camera_image import with_objects, with_region
 from gausslite.view.contents import ViewContents
 from gausslite.view.history_plot import HistoryPlot
 from gausslite.view.open_page import open_page
@@ -25,8 +24,6 @@ if TYPE_CHECKING:
     from gausslite.view.map_page import MapPage
 
 _INTERVAL_S = 1.0
-_REGION_RGB = (255, 60, 60)
-_REGION_WEIGHT = 0.45
 _NS_PER_S = 1e9
 
 
@@ -71,10 +68,12 @@ class MissionView:
         )
 
     def _show_image(self, keyframe: Keyframe) -> None:
-        image = with_region(keyframe.frame.rgb, keyframe.relevance.roi)
+        frame = keyframe.frame
+        image = with_region(frame.rgb, keyframe.relevance.roi)
+        image = with_objects(image, self._mapper.objects, frame.camera, frame.T_world_camera)
         if self._image is None:
             with self._folder:
-                label = "Newest keyframe, the task's region in red"
+                label = "Newest keyframe: the task's region in red, objects in green"
                 self._image = self._page.server.gui.add_image(image, label=label, format="jpeg")
         else:
             self._image.image = image
@@ -97,13 +96,6 @@ def mission_view(
         yield MissionView(page, mapper, task_at).update
     finally:
         page.close()
-
-
-def with_region(rgb: UInt8[ndarray, "h w 3"], roi: Bool[ndarray, "h w"]) -> UInt8[ndarray, "h w 3"]:
-    """Return the image with the region in red."""
-    tinted = rgb.copy()
-    tinted[roi] = (1 - _REGION_WEIGHT) * rgb[roi] + _REGION_WEIGHT * np.array(_REGION_RGB)
-    return tinted
 
 
 def _view(keyframe: Keyframe) -> KeyframeView:

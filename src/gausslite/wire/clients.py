@@ -33,6 +33,7 @@ from gausslite.v1 import (
     parser_service_pb2_grpc,
 )
 from gausslite.wire import convert, convert_task
+from gausslite.wire.camera_view import CameraView, camera_view_from_message
 from gausslite.wire.channel import DEADLINE_S, ServiceChannel
 from gausslite.wire.connection import MAX_MESSAGE_BYTES
 from gausslite.wire.convert_objects import report_to_message, team_object_from_message
@@ -141,6 +142,10 @@ class AgentClient(ServiceChannel):
         response = self._call(self._stub.RenderView, request)
         size = camera.width_px, camera.height_px
         return decode_colour(response.colour_png, *size), decode_depth(response.depth_png, *size)
+
+    def camera_view(self) -> CameraView | None:
+        """Return the newest keyframe with its region and the camera's path; None before the first keyframe."""
+        return camera_view_from_message(self._call(self._stub.GetCameraView, agent_service_pb2.GetCameraViewRequest()))
 
     def watch_map(
         self, since_revision: int = 0, region: AxisAlignedBox | None = None, roi_only: bool = False

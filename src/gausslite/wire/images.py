@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float32, UInt8
+from jaxtyping import Bool, Float32, UInt8
 from numpy import ndarray
 
 from gausslite.domain.errors import InvalidInputError
@@ -35,6 +35,25 @@ def encode_depth(depth_m: Float32[ndarray, "h w"], compression: int = PNG_COMPRE
     depth_mm[depth_mm > _MAX_DEPTH_MM] = 0
     options = [cv2.IMWRITE_PNG_COMPRESSION, compression]
     return bytes(cv2.imencode(".png", depth_mm.astype(np.uint16), options)[1].tobytes())
+
+
+def encode_mask(mask: Bool[ndarray, "h w"]) -> bytes:
+    """Encode as 8-bit PNG: 255 where True, otherwise 0."""
+    import cv2
+
+    options = [cv2.IMWRITE_PNG_COMPRESSION, PNG_COMPRESSION]
+    return bytes(cv2.imencode(".png", mask.astype(np.uint8) * np.uint8(255), options)[1].tobytes())
+
+
+def decode_mask(data: bytes, width_px: int, height_px: int) -> Bool[ndarray, "h w"]:
+    """Decode a mask of exactly this size. Raises InvalidInputError."""
+    import cv2
+
+    _require_size("mask", data, width_px, height_px)
+    image = _decode(data, cv2.IMREAD_UNCHANGED)
+    if image is None or image.shape != (height_px, width_px) or image.dtype != np.uint8:
+        raise InvalidInputError("mask: expected a one-channel 8-bit PNG, got something else")
+    return image > 0
 
 
 def decode_colour(data: bytes, width_px: int, height_px: int) -> UInt8[ndarray, "h w 3"]:

@@ -18,6 +18,7 @@ ROLES_OF_METHOD: Final = {
     _AGENT + "IngestFrames": _ROBOT | _OPERATOR,
     _AGENT + "GetAgentStatus": _ANY,
     _AGENT + "WatchMap": _ANY,
+    _AGENT + "GetCameraView": _ANY,
     _AGENT + "RenderView": _ANY,
     _FUSION + "JoinSession": _ROBOT,
     _FUSION + "ContributeSubsets": _ROBOT,

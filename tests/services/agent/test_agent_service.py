@@ -184,6 +184,21 @@ def test_render_view_shows_the_map() -> None:
     assert np.median(depth_m[depth_m > 0]) == pytest.approx(1.2, abs=0.1)
 
 
+def test_the_camera_view_shows_the_newest_keyframe_and_the_path() -> None:
+    with agent() as a:
+        assert a.client.camera_view() is None
+        a.client.assign_task(TASK)
+        list(a.client.ingest([frame(index) for index in range(3)]))
+        view = a.client.camera_view()
+    assert view is not None
+    assert view.camera == CAMERA
+    assert np.abs(view.rgb.astype(int) - frame(view.frame_index).rgb).mean() < 5
+    assert 0 < np.count_nonzero(view.roi) < view.roi.size
+    assert view.times_ns.tolist() == [frame(index).capture_time_ns for index in range(3)]
+    np.testing.assert_allclose(view.path[2], frame(2).T_world_camera, atol=0.05)
+    assert len(view.keyframes) >= 1
+
+
 @pytest.mark.parametrize(
     ("camera", "T_world_camera"),
     [(Camera(1e4, 1e4, 1.0, 1.0, 16384, 16384), np.eye(4)), (CAMERA, np.full((4, 4), np.nan)), (CAMERA, np.eye(3))],

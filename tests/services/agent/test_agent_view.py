@@ -37,6 +37,7 @@ def test_a_task_from_the_page_arrives_and_the_mission_ends_from_it():
         assert report.gaussians > 0
         tab.get_by_text(f"{report.gaussians:,} Gaussians", exact=True).wait_for()
         tab.get_by_text("robot: mapping").wait_for()
+        tab.get_by_text("Newest keyframe").wait_for()
         tab.get_by_role("button", name="End mission").click()
         tab.get_by_text("robot: ended").wait_for()
 

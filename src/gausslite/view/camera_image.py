@@ -1,0 +1,53 @@
+"""The camera's image for a person: the task's region in red, the confirmed objects as boxes with names."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import product
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float64, UInt8
+from numpy import ndarray
+
+from gausslite.domain.camera import Camera, project
+from gausslite.domain.objects import ObjectLandmark
+from gausslite.domain.pose import inverse, transform_points
+
+_REGION_RGB, _BOX_RGB = (255, 60, 60), (60, 230, 90)
+_REGION_WEIGHT = 0.45
+_NEAR_M = 0.1
+_MAX_NAME = 40
+
+
+def with_region(rgb: UInt8[ndarray, "h w 3"], roi: Bool[ndarray, "h w"]) -> UInt8[ndarray, "h w 3"]:
+    """Return the image with the region in red."""
+    tinted = rgb.copy()
+    tinted[roi] = (1 - _REGION_WEIGHT) * rgb[roi] + _REGION_WEIGHT * np.array(_REGION_RGB)
+    return tinted
+
+
+def with_objects(
+    rgb: UInt8[ndarray, "h w 3"],
+    objects: Sequence[ObjectLandmark],
+    camera: Camera,
+    T_world_camera: Float64[ndarray, "4 4"],
+) -> UInt8[ndarray, "h w 3"]:
+    """Return the image with the outline and the name of each object whose whole extent lies in front of the camera."""
+    drawn = rgb.copy()
+    for landmark in objects:
+        corners_m = np.array(list(product(*zip(landmark.extent_m.min_m, landmark.extent_m.max_m, strict=True))))
+        p_camera = transform_points(inverse(T_world_camera), corners_m)
+        if p_camera[:, 2].min() < _NEAR_M:
+            continue
+        pixels_px = project(p_camera.astype(np.float32), camera)
+        size_px = (camera.width_px, camera.height_px)
+        low, high = (np.clip(limit, 0, size_px) for limit in (pixels_px.min(axis=0), pixels_px.max(axis=0)))
+        if (high - low).min() < 1:
+            continue
+        (x0, y0), (x1, y1) = low.astype(int).tolist(), high.astype(int).tolist()
+        cv2.rectangle(drawn, (x0, y0), (x1, y1), _BOX_RGB, 1)
+        # the font has ASCII characters only
+        name = landmark.noun[:_MAX_NAME].encode("ascii", "replace").decode()
+        cv2.putText(drawn, name, (x0 + 2, max(y0 - 3, 9)), cv2.FONT_HERSHEY_SIMPLEX, 0.35, _BOX_RGB, 1, cv2.LINE_AA)
+    return drawn

@@ -1,0 +1,91 @@
+"""What a robot sees, for a person: the newest keyframe with its region, and the camera's path, as a message."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int64, UInt8
+from numpy import ndarray
+
+from gausslite.domain.camera import Camera
+from gausslite.domain.errors import InvalidInputError
+from gausslite.v1 import agent_service_pb2 as pb
+from gausslite.v1 import geometry_pb2
+from gausslite.wire.convert import (
+    camera_from_message,
+    camera_to_message,
+    transform_from_message,
+    transform_to_message,
+)
+from gausslite.wire.images import decode_colour, decode_mask, encode_colour, encode_mask
+
+MAX_POSES, MAX_KEYFRAMES = 1000, 60
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraView:
+    """The newest keyframe, its pose, and the poses of all frames and keyframes, in the map.
+
+    roi: True in the task's region. times_ns: the capture times of the path, oldest first.
+    """
+
+    rgb: UInt8[ndarray, "h w 3"]
+    roi: Bool[ndarray, "h w"]
+    camera: Camera
+    frame_index: int
+    T_world_camera: Float64[ndarray, "4 4"]
+    times_ns: Int64[ndarray, " t"]
+    path: Float64[ndarray, "t 4 4"]
+    keyframes: Float64[ndarray, "k 4 4"]
+
+
+def camera_view_to_message(view: CameraView | None) -> pb.GetCameraViewResponse:
+    """Encode a view with a JPEG; long paths are thinned evenly. An agent without keyframes has an empty view."""
+    if view is None:
+        return pb.GetCameraViewResponse()
+    return pb.GetCameraViewResponse(
+        colour_jpeg=encode_colour(view.rgb),
+        region_png=encode_mask(view.roi),
+        camera=camera_to_message(view.camera),
+        frame_index=view.frame_index,
+        t_world_camera=transform_to_message(view.T_world_camera),
+        path=[
+            pb.StampedPose(capture_time_ns=int(view.times_ns[i]), t_world_camera=transform_to_message(view.path[i]))
+            for i in _evenly(len(view.path), MAX_POSES)
+        ],
+        keyframes=[transform_to_message(view.keyframes[i]) for i in _evenly(len(view.keyframes), MAX_KEYFRAMES)],
+    )
+
+
+def camera_view_from_message(message: pb.GetCameraViewResponse) -> CameraView | None:
+    """Decode a view; None for an agent without keyframes. Raises InvalidInputError, PoseError."""
+    if not message.colour_jpeg:
+        return None
+    for name, count, highest in (
+        ("path", len(message.path), MAX_POSES),
+        ("keyframes", len(message.keyframes), MAX_KEYFRAMES),
+    ):
+        if count > highest:
+            raise InvalidInputError(f"camera view {name}: expected at most {highest} poses, got {count}")
+    camera = camera_from_message(message.camera)
+    return CameraView(
+        rgb=decode_colour(message.colour_jpeg, camera.width_px, camera.height_px),
+        roi=decode_mask(message.region_png, camera.width_px, camera.height_px),
+        camera=camera,
+        frame_index=message.frame_index,
+        T_world_camera=transform_from_message("camera view t_world_camera", message.t_world_camera),
+        times_ns=np.array([each.capture_time_ns for each in message.path], np.int64),
+        path=_poses("camera view path", [each.t_world_camera for each in message.path]),
+        keyframes=_poses("camera view keyframes", list(message.keyframes)),
+    )
+
+
+def _poses(name: str, messages: list[geometry_pb2.RigidTransform]) -> Float64[ndarray, "n 4 4"]:
+    return np.array([transform_from_message(name, each) for each in messages], np.float64).reshape(-1, 4, 4)
+
+
+def _evenly(count: int, highest: int) -> Int64[ndarray, " n"]:
+    """Return the positions of at most this many of `count` values, evenly spaced, with the first and the last."""
+    positions: Int64[ndarray, " n"] = np.unique(np.linspace(0, max(count - 1, 0), min(count, highest)).astype(np.int64))
+    return positions
