@@ -64,6 +64,11 @@ class Gate:
     def evaluate_past(self, frame: Frame) -> RelevanceMap | None:
         return self.inner.evaluate_past(frame)
 
+    known_objects = 0
+
+    def complete(self, frame: Frame, relevance: RelevanceMap) -> RelevanceMap:
+        return relevance
+
     @property
     def objects(self) -> tuple[ObjectLandmark, ...]:
         return ()
@@ -96,6 +101,7 @@ def agent(
     uplink: Uplink | None = None,
     queue_frames: int = 4,
     options: Sequence[str] = (),
+    listen: str = "127.0.0.1:0",
 ) -> Iterator[Agent]:
     loops: list[asyncio.AbstractEventLoop] = []
     notifiers: list[ChangeNotifier] = []
@@ -121,7 +127,7 @@ def agent(
 
     try:
         with (
-            serving([Service("gausslite.v1.AgentService", register)]) as running,
+            serving([Service("gausslite.v1.AgentService", register)], listen) as running,
             AgentClient(running.address) as client,
             grpc.insecure_channel(running.address) as channel,
         ):
