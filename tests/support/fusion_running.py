@@ -31,7 +31,6 @@ from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.v1 import fusion_service_pb2_grpc as pb_grpc
 from gausslite.wire.clients import FusionClient
 from gausslite.wire.convert import decode_frame
-from gausslite.wire.server import Service
 from gausslite.wire.tls import Tls
 from gausslite_fusion_server.refinement_worker import RefinementWorker
 from gausslite_fusion_server.servicer import FusionServicer
@@ -97,7 +96,7 @@ def fusion_server(
 
     try:
         with (
-            serving([Service(servicer.service().name, register)], address, tls=tls) as running,
+            serving([replace(servicer.service(), register=register)], address, tls=tls) as running,
             FusionClient(running.address, tls=tls) as client,
             grpc.insecure_channel(running.address) as channel,
         ):

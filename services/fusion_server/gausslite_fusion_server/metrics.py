@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, NamedTuple
@@ -10,6 +11,8 @@ from gausslite.domain.errors import InvalidInputError, UnavailableError
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.traffic import AgentContribution
 from gausslite.wire.address import host_and_port
+
+_log = logging.getLogger(__name__)
 
 
 class _AgentMetric(NamedTuple):
@@ -55,6 +58,7 @@ class MissionCollector:
             ("fused_voxels", "voxels of the fused map", status.fused_voxels),
             ("fused_gaussians", "Gaussians of the fused map", status.fused_gaussians),
             ("stored_keyframes", "keyframes of all agents", status.keyframes),
+            ("store_writable", "1 while the store can write", int(self._engine.storage.is_writable)),
             ("banned_agents", "names that operators have banned", len(status.banned_agents)),
         ):
             yield GaugeMetricFamily(f"gausslite_fusion_{name}", help_text, value=value)
@@ -88,6 +92,7 @@ def metrics_server(address: str | None, engine: FusionEngine) -> Iterator[int]:
         server, thread = start_http_server(port, host.strip("[]"), registry)
     except OSError as error:
         raise UnavailableError(f"--metrics {address}: {error.strerror or error}; choose another address") from error
+    _log.info("metrics on http://%s:%d/metrics", host, server.server_port)
     try:
         yield server.server_port
     finally:

@@ -90,6 +90,7 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         return Service(
             pb.DESCRIPTOR.services_by_name["FusionService"].full_name,
             functools.partial(pb_grpc.add_FusionServiceServicer_to_server, self),
+            self._engine.storage.check,
         )
 
     def drain(self) -> None:

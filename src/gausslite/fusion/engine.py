@@ -35,6 +35,7 @@ from gausslite.fusion.keyframes import (
 from gausslite.fusion.limits import FusionSettings, VoteRule
 from gausslite.fusion.membership import Membership
 from gausslite.fusion.mission_config import MissionConfig
+from gausslite.fusion.storage_probe import StorageProbe
 from gausslite.fusion.store import FusionStore, PutOutcome, SessionRecord, require_storable
 from gausslite.fusion.team_objects import TeamObjects, find_objects
 from gausslite.fusion.traffic import AgentContribution, MissionStatus, TrafficCounters, TrafficLog
@@ -77,6 +78,7 @@ class FusionEngine:
         self._store = store
         self._settings = settings
         self._members = Membership(store, settings)
+        self._storage = StorageProbe(store)
         first_revision = time.time_ns() // 1000 if first_revision is None else first_revision
         quotas = settings.quotas
         self._keyframes = KeyframePool(store, quotas.keyframe_limits, decode_keyframe)
@@ -120,6 +122,11 @@ class FusionEngine:
     def highest_update_seq(self, agent_id: str) -> int:
         """Return the highest sequence number among the agent's stored updates; 0 without any."""
         return self._store.totals(agent_id).highest_update_seq
+
+    @property
+    def storage(self) -> StorageProbe:
+        """The check whether the store can write."""
+        return self._storage
 
     @property
     def revision(self) -> int:

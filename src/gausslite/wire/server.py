@@ -7,6 +7,7 @@ so that a servicer's method only decodes, calls and encodes. No client message c
 from __future__ import annotations
 
 import asyncio
+import functools
 import logging
 import os
 import signal
@@ -21,11 +22,12 @@ from google.protobuf.message import DecodeError
 from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection
 
-from gausslite.domain.errors import GaussLiteError, InvalidInputError, UnavailableError
+from gausslite.domain.errors import GaussLiteError, InvalidInputError, StorageError, UnavailableError
 from gausslite.wire.address import UNIX, host_and_port
 from gausslite.wire.call_limits import CallLimits, CallUsage, limit_stream, wait_for_bandwidth
 from gausslite.wire.caller import Caller
 from gausslite.wire.connection import KEEPALIVE_S, connection_options
+from gausslite.wire.readiness import LIVENESS, Check, ReadinessWatch
 from gausslite.wire.rejection_log import RejectionLog
 from gausslite.wire.roles import require_role
 from gausslite.wire.status import code_and_reason, to_status
@@ -46,22 +48,29 @@ _OPTIONS = (
 
 @dataclass(frozen=True, slots=True)
 class Service:
-    """A servicer's full name, and a function that adds it to a server."""
+    """A servicer's full name, a function that adds it to a server, and a check whether it can work."""
 
     name: str
     register: Callable[[grpc.aio.Server], None]
+    check: Check | None = None
 
 
 class RunningServer:
     """A running server. `address` holds the actual port."""
 
-    def __init__(self, server: grpc.aio.Server, address: str, health_servicer: Any) -> None:
+    def __init__(
+        self, server: grpc.aio.Server, address: str, health_servicer: Any, watches: Sequence[asyncio.Task[None]]
+    ) -> None:
         self._server = server
         self._health = health_servicer
+        self._watches = watches
         self.address = address
 
     async def stop(self, grace_s: float = 5.0) -> None:
         """Report NOT_SERVING, refuse new calls, and cancel the open ones after `grace_s`."""
+        for watch in self._watches:
+            watch.cancel()
+        await asyncio.gather(*self._watches, return_exceptions=True)
         await self._health.enter_graceful_shutdown()
         await self._server.stop(grace_s)
 
@@ -76,15 +85,19 @@ async def start_server(
     """
     _require_free_address(listen)
     limits = limits or CallLimits()
-    server = grpc.aio.server(
-        interceptors=[CallInterceptor(CallUsage(limits))], options=(*_OPTIONS, *limits.connection_options)
-    )
     health_servicer = health.aio.HealthServicer()  # type: ignore[attr-defined]
+    watches = [
+        ReadinessWatch(service.name, service.check, functools.partial(_set_health, health_servicer, service.name))
+        for service in services
+        if service.check is not None
+    ]
+    interceptor = CallInterceptor(CallUsage(limits), watches)
+    server = grpc.aio.server(interceptors=[interceptor], options=(*_OPTIONS, *limits.connection_options))
     health_pb2_grpc.add_HealthServicer_to_server(health_servicer, server)
     for service in services:
         service.register(server)
-        await health_servicer.set(service.name, health_pb2.HealthCheckResponse.SERVING)
-    await health_servicer.set("", health_pb2.HealthCheckResponse.SERVING)
+        await _set_health(health_servicer, service.name, True)
+    await health_servicer.set(LIVENESS, health_pb2.HealthCheckResponse.SERVING)
     names = [service.name for service in services]
     reflection.enable_server_reflection([*names, health.SERVICE_NAME, reflection.SERVICE_NAME], server)
     try:
@@ -99,7 +112,7 @@ async def start_server(
         raise UnavailableError(f"listen {listen}: the address is in use or cannot be bound; choose another")
     await server.start()
     address = listen if listen.startswith("unix:") else f"{listen.rpartition(':')[0]}:{port}"
-    return RunningServer(server, address, health_servicer)
+    return RunningServer(server, address, health_servicer, [asyncio.create_task(watch.run()) for watch in watches])
 
 
 async def serve_until_stopped(
@@ -146,8 +159,8 @@ class CallInterceptor(grpc.aio.ServerInterceptor):  # type: ignore[type-arg]
     Unexpected errors are INTERNAL and logged.
     """
 
-    def __init__(self, usage: CallUsage) -> None:
-        self._usage = usage
+    def __init__(self, usage: CallUsage, watches: Sequence[ReadinessWatch] = ()) -> None:
+        self._usage, self._watches = usage, watches
         self._rejections = RejectionLog(_log)
 
     async def intercept_service(
@@ -162,7 +175,14 @@ class CallInterceptor(grpc.aio.ServerInterceptor):  # type: ignore[type-arg]
             return handler
         # requests are decoded inside the guard, because gRPC itself would answer UNKNOWN to an invalid message
         message_codecs = {"request_deserializer": None, "response_serializer": handler.response_serializer}
-        guard = _Guard(method, self._usage, self._rejections, handler.request_deserializer, handler.request_streaming)
+        guard = _Guard(
+            method,
+            self._usage,
+            self._rejections,
+            self._watches,
+            handler.request_deserializer,
+            handler.request_streaming,
+        )
         if handler.response_streaming:
             inner = handler.stream_stream if handler.request_streaming else handler.unary_stream
             make = (
@@ -185,6 +205,7 @@ class _Guard:
     method: str
     usage: CallUsage
     rejections: RejectionLog
+    watches: Sequence[ReadinessWatch]
     deserialize: Callable[[bytes], Any]
     request_streaming: bool
 
@@ -226,6 +247,10 @@ class _Guard:
         if not isinstance(error, GaussLiteError):
             _log.error("%s failed: %s: %s", self.method, type(error).__name__, error, exc_info=error)
             error = GaussLiteError(f"{self.method}: unexpected error in the server; see its log")
+        elif isinstance(error, StorageError):
+            # the watch logs it once, not for every call
+            for watch in self.watches:
+                watch.wake()
         elif not isinstance(error, UnavailableError):
             self.rejections.record(Caller.of(context).key, code_and_reason(error)[1], str(error))
         await context.abort_with_status(to_status(error))
@@ -242,6 +267,13 @@ class _Guard:
             raise InvalidInputError(
                 f"{self.method}: expected its request message, got {len(data)} invalid bytes"
             ) from error
+
+
+async def _set_health(health_servicer: Any, service: str, is_serving: bool) -> None:
+    """Set the health of a service, and with it that of the whole server."""
+    states = health_pb2.HealthCheckResponse
+    for name in ("", service):
+        await health_servicer.set(name, states.SERVING if is_serving else states.NOT_SERVING)
 
 
 def _require_free_address(listen: str) -> None:

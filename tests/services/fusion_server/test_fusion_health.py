@@ -1,0 +1,113 @@
+"""The health of a fusion server whose store cannot write: NOT_SERVING, and SERVING again when it can."""
+
+from __future__ import annotations
+
+import re
+import resource
+import subprocess
+import urllib.request
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import grpc
+import pytest
+from fusion_running import COMMAND, GRID, fusion_server, make_subset, request
+from grpc_health.v1 import health_pb2, health_pb2_grpc
+
+from gausslite.domain.errors import StorageError
+from gausslite.fusion.sqlite_store import SqliteStore
+from gausslite.fusion.storage_probe import StorageProbe
+from gausslite.wire.clients import FusionClient
+
+SERVING, NOT_SERVING = health_pb2.HealthCheckResponse.SERVING, health_pb2.HealthCheckResponse.NOT_SERVING
+WAIT_S = 60.0
+
+
+def watch_health(channel: grpc.Channel, name: str = "") -> Iterator[int]:
+    """Yield the health at each change."""
+    stream = health_pb2_grpc.HealthStub(channel).Watch(health_pb2.HealthCheckRequest(service=name), timeout=WAIT_S)
+    return (answer.status for answer in stream)
+
+
+def check_health(channel: grpc.Channel, name: str) -> int:
+    request = health_pb2.HealthCheckRequest(service=name)
+    return health_pb2_grpc.HealthStub(channel).Check(request, timeout=WAIT_S).status
+
+
+@contextmanager
+def limited_files(process: subprocess.Popen[bytes], size_bytes: int) -> Iterator[None]:
+    """Make every write of the process beyond this size of a file fail, as on a full disk."""
+    before = resource.prlimit(process.pid, resource.RLIMIT_FSIZE)
+    resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (size_bytes, before[1]))
+    try:
+        yield
+    finally:
+        resource.prlimit(process.pid, resource.RLIMIT_FSIZE, before)
+
+
+def test_health_metric_and_log_follow_a_full_disk(tmp_path: Path) -> None:
+    pytest.importorskip("prometheus_client", reason="the extra metrics is not installed")
+    address, log = f"unix:{tmp_path}/fusion.sock", tmp_path / "log"
+    with log.open("wb") as stderr:
+        command = [*COMMAND, "--listen", address, "--store", str(tmp_path / "s.sqlite"), "--metrics", "127.0.0.1:0"]
+        process = subprocess.Popen(command, stderr=stderr)
+    try:
+        with grpc.insecure_channel(address) as channel, FusionClient(address) as client:
+            grpc.channel_ready_future(channel).result(WAIT_S)
+            session = client.join("ant", GRID).session_id
+            health = watch_health(channel)
+            assert next(health) == SERVING
+            with limited_files(process, 4096):
+                for seq in (1, 2, 3):
+                    with pytest.raises(StorageError):
+                        list(client.contribute([request(session, make_subset("ant", seq, {0: [seq]}))], 20.0))
+                assert next(health) == NOT_SERVING
+                assert check_health(channel, "gausslite.v1.FusionService") == NOT_SERVING
+                assert check_health(channel, "liveness") == SERVING
+                assert metric(log, "store_writable") == 0
+            assert next(health) == SERVING
+            assert metric(log, "store_writable") == 1
+            list(client.contribute([request(session, make_subset("ant", 4, {0: [4]}))], 20.0))
+            assert client.status().fused_gaussians == 1
+    finally:
+        process.terminate()
+        process.wait(20)
+    lines = log.read_text().splitlines()
+    assert len([line for line in lines if "NOT_SERVING" in line and "refused (disk I/O error)" in line]) == 1
+    assert len([line for line in lines if "SERVING again" in line]) == 1
+
+
+def metric(log: Path, name: str) -> float:
+    """Return a metric of the server that has written this log."""
+    port = re.search(r"metrics.*:(\d+)", log.read_text())
+    assert port is not None
+    with urllib.request.urlopen(f"http://127.0.0.1:{port[1]}/metrics", timeout=20) as response:
+        value = re.search(rf"^gausslite_fusion_{name} (\S+)$", response.read().decode(), re.MULTILINE)
+    assert value is not None
+    return float(value[1])
+
+
+def test_a_store_at_its_limit_is_not_writable_until_data_is_deleted(tmp_path: Path) -> None:
+    store = SqliteStore(tmp_path / "store.sqlite", max_bytes=1 << 20)
+    with fusion_server(store) as t:
+        session = t.client.join("ant", GRID).session_id
+        health = watch_health(t.channel)
+        assert next(health) == SERVING
+        with pytest.raises(StorageError):
+            t.send(*(request(session, make_subset("ant", seq, {seq: [1] * 1000})) for seq in range(1, 30)))
+        assert next(health) == NOT_SERVING
+        t.client.leave(session, forget=True)
+        assert next(health) == SERVING
+    store.close()
+
+
+def test_a_check_leaves_nothing_in_the_store(tmp_path: Path) -> None:
+    store = SqliteStore(tmp_path / "store.sqlite", max_bytes=1 << 20)
+    probe = StorageProbe(store)
+    for _ in range(20):
+        probe.check()
+    assert probe.is_writable
+    assert store.agents() == ()
+    assert (tmp_path / "store.sqlite").stat().st_size < 1 << 20
+    store.close()
