@@ -36,6 +36,7 @@ BENCHMARKS = (
     "task-change",
     "server",
     "chaos",
+    "fuzz",
     "team",
     "registration",
 )

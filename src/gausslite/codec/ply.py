@@ -109,7 +109,7 @@ def gaussians_from_ply(data: bytes) -> Gaussians:
         raise MapFileError(f"expected {count} Gaussians of {row.itemsize} bytes, got {len(data) - start} bytes of them")
     rows = np.frombuffer(data, row, count, start)
     present = [name for name in (*_STANDARD, *_EXTRAS) if name in (row.names or ())]
-    not_finite = [name for name in present if not np.isfinite(rows[name].astype(np.float64)).all()]
+    not_finite = [name for name in present if not np.isfinite(rows[name]).all()]
     if not_finite:
         raise MapFileError(f"column {not_finite[0]}: expected finite values, got NaN or infinity")
     try:

@@ -7,7 +7,7 @@ from typing import Final
 
 KNOWN_OPTIONS: Final = frozenset(
     {
-        *("agents", "held", "hostile", "kills", "seconds", "server", "watchers"),
+        *("agents", "corpus", "held", "hostile", "kills", "messages", "seconds", "server", "watchers"),
         *("absent", "accept-similar", "after", "agent-id", "backend", "before", "blur", "camera-correction", "caps"),
         "changes",
         *("deadline-slack", "details", "detector", "disable", "drain-timeout", "equal", "exit-when-done"),
@@ -32,7 +32,7 @@ KNOWN_OPTIONS: Final = frozenset(
         *("queue-policy", "quota-agents", "quota-gaussians", "quota-keyframe-pixels", "quota-keyframes"),
         *("quota-voxels", "rasterizer", "rate", "real", "refine-iterations", "register-depth", "reps"),
         *("resegment", "resume", "reuse-other-code", "roi", "roi-ball", "save-interval", "save-state", "seed", "seeds"),
-        *("segmenter", "sentences", "shares", "simd", "size", "sizes", "skip-stages", "source", "spool"),
+        *("save-scores", "segmenter", "sentences", "shares", "simd", "size", "sizes", "skip-stages", "source", "spool"),
         *("state", "store", "store-max-mb", "strict", "task", "task-a", "task-at", "task-b", "test-every"),
         *("threads", "timed", "tls-ca", "tls-cert", "tls-key", "track-motion", "unlimited", "up", "uplink-interval"),
         *("uplink-kbps", "view", "views", "vocabulary", "voxel-size", "world-frame"),

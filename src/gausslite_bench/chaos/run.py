@@ -36,7 +36,7 @@ _MAX_FAULT_S = 1.0
 _MAX_DELAY_S = 0.15
 _RESENT_MESSAGES = 20
 _DISK_FULL_SHARE, _RESEND_SHARE, _CLOCK_SHARE = 0.15, 0.4, 0.5
-_FREE_BYTES = 40_000
+_FREE_BYTES = 8_000
 """Left on the disk when it begins to fill."""
 
 

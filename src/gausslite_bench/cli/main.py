@@ -9,6 +9,7 @@ from gausslite_bench.cli.budget import configure_budget
 from gausslite_bench.cli.camera import configure_camera
 from gausslite_bench.cli.chaos import configure_chaos
 from gausslite_bench.cli.codec import configure_codec
+from gausslite_bench.cli.fuzz import configure_fuzz
 from gausslite_bench.cli.gpu import configure_gpu
 from gausslite_bench.cli.loop import configure_loop
 from gausslite_bench.cli.parser import configure_parser
@@ -45,6 +46,12 @@ _BENCHMARKS: dict[str, tuple[Callable[[argparse.ArgumentParser], None], str, str
         "a fusion server and its agents under kills, partitions, wrong clocks and a full disk",
         "Drive agents and a fusion server through seeded faults. Check after each kill of the server, and at the end, "
         "that every acknowledged voxel is stored, and that the fused map equals the one computed offline.",
+    ),
+    "fuzz": (
+        configure_fuzz,
+        "mutated messages for the codec and for every method of the services",
+        "Mutate valid messages. Decode most of them in this process, and send the others to every method of a fusion "
+        "server, an agent and a parser. No message may crash a program, take over a second, or make its memory grow.",
     ),
     "gpu": (
         configure_gpu,

@@ -56,10 +56,7 @@ class RunningServer:
 
     def rss_mib(self) -> float:
         """Return the resident memory of the process."""
-        for line in Path(f"/proc/{self._process.pid}/status").read_text().splitlines():
-            if line.startswith("VmRSS:"):
-                return int(line.split()[1]) / 1024
-        raise UnavailableError("server: its process has ended")
+        return resident_mib_of(self._process.pid)
 
     def cpu_s(self) -> float:
         """Return the processor time that the process has used."""
@@ -99,3 +96,12 @@ class RunningServer:
             time.sleep(_POLL_S)
         self.close()
         raise UnavailableError(f"server: expected it to start within {_START_LIMIT_S:g} s ({self._command})")
+
+
+def resident_mib_of(process_id: int) -> float:
+    """Return the resident memory of a process. Raises UnavailableError if it has ended."""
+    status = Path(f"/proc/{process_id}/status")
+    for line in status.read_text().splitlines() if status.exists() else ():
+        if line.startswith("VmRSS:"):
+            return int(line.split()[1]) / 1024
+    raise UnavailableError("server: its process has ended")

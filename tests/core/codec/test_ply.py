@@ -172,3 +172,11 @@ def test_an_ambiguous_or_invalid_world_frame_in_a_file_is_refused(comments: byte
     (tmp_path / "map.ply").write_bytes(data)
     with pytest.raises(MapFileError, match=r"map\.ply: expected (one|a) world frame"):
         read_world_frame(tmp_path / "map.ply")
+
+
+def test_a_signalling_nan_is_refused_without_a_warning() -> None:
+    data = bytearray(ply_bytes(random_gaussians(1)))
+    start = data.index(b"end_header\n") + len(b"end_header\n")
+    data[start : start + 4] = b"\x01\x00\x80\x7f"
+    with pytest.raises(MapFileError, match="column x: expected finite values"):
+        gaussians_from_ply(bytes(data))

@@ -1,0 +1,1 @@
+"""Fuzzing of the codec and of every call of the services with mutated messages."""
