@@ -20,7 +20,7 @@ def format_pose_rows(title: str, times_ns: Int64[ndarray, " n"], T: Float64[ndar
     """Return the text of a pose file: the title as a comment, then times in seconds, metres and unit quaternions."""
     rows = [f"# {title}: {_MEANING}"]
     for time_ns, pose in zip(times_ns.tolist(), T, strict=True):
-        numbers = " ".join(f"{value:.9f}" for value in (*pose[:3, 3], *_quat_xyzw(pose[:3, :3])))
+        numbers = " ".join(f"{value:.9f}" for value in (*pose[:3, 3], *quat_xyzw(pose[:3, :3])))
         rows.append(f"{time_ns / 1e9:.9f} {numbers}")
     return "\n".join(rows) + "\n"
 
@@ -40,7 +40,8 @@ def read_pose_rows(path: Path) -> tuple[Int64[ndarray, " n"], Float64[ndarray, "
     return np.array(times_ns, np.int64)[order], np.array(poses)[order]
 
 
-def _quat_xyzw(R: Float64[ndarray, "3 3"]) -> Float64[ndarray, "4"]:
+def quat_xyzw(R: Float64[ndarray, "3 3"]) -> Float64[ndarray, "4"]:
+    """Return the unit quaternion of a rotation, in the order x y z w."""
     rotation_rad = cv2.Rodrigues(R)[0].ravel()
     half = 0.5 * float(np.linalg.norm(rotation_rad))
     # np.sinc(x / π) = sin(x) / x, 1 at 0

@@ -173,12 +173,12 @@ class LiveFrames:
         T_colour_depth: Float64[ndarray, "4 4"] | None = np.eye(4)
         depth: FolderCamera | None = None
         try:
-            colour = camera_of(f"{_PLACE}: {options.color_info}", self._colour_info, camera_name(options.color))
+            colour = _camera(self._colour_info, options.color)
+            if not aligned and self._depth_info is None:
+                self._problem = "waiting for the camera_info of depth, which is not aligned to colour"
+                return None
             if not aligned:
-                if self._depth_info is None:
-                    self._problem = "waiting for the camera_info of depth, which is not aligned to colour"
-                    return None
-                depth = camera_of(f"{_PLACE}: {options.depth_info}", self._depth_info, camera_name(options.depth))
+                depth = _camera(self._depth_info, options.depth)
                 tree = self._transforms.tree((camera_frame, depth_frame))
                 T_colour_depth = tree.at(camera_frame, depth_frame, time_ns / 10**9)
         except InvalidInputError as error:
@@ -232,3 +232,7 @@ class LiveFrames:
 
     def _count(self, name: str) -> None:
         self._counters = replace(self._counters, **{name: getattr(self._counters, name) + 1})
+
+
+def _camera(info: Any, image_topic: str) -> FolderCamera:
+    return camera_of(f"{_PLACE}: camera_info of {image_topic}", info, camera_name(image_topic))

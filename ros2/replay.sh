@@ -1,0 +1,33 @@
+#!/usr/bin/env bash
+# Replay a bag through the node to an agent, on a machine with ROS 2: replay.sh BAG [PARAMETER:=VALUE ...]
+# Prints the node's last diagnostics and the mission's summary. Fails if no frame was mapped.
+set -euo pipefail
+bag=${1:?expected a bag: replay.sh BAG [PARAMETER:=VALUE ...]}
+shift
+out=$(mktemp -d)
+listen=unix:$out/agent.sock
+trap 'kill $(jobs -p) 2>/dev/null || true' EXIT
+
+gausslite-agent --agent-id replay --policy uniform --listen "$listen" --out "$out/mission" &
+agent=$!
+parameters=(-p "agent:=$listen" -p use_sim_time:=true)
+for parameter in "$@"; do parameters+=(-p "$parameter"); done
+ros2 run gausslite_ros gausslite_node --ros-args "${parameters[@]}" &
+node=$!
+ros2 topic echo --field status /diagnostics > "$out/diagnostics.txt" &
+until ros2 node list | grep -q /gausslite; do :; done
+
+ros2 bag play --clock 100 "$bag"
+kill -INT "$node"
+wait "$node" || true
+kill -TERM "$agent"
+wait "$agent" || true
+tail -n 60 "$out/diagnostics.txt"
+python3 - "$out/mission/report.json" <<'PYTHON'
+import json
+import sys
+
+report = json.load(open(sys.argv[1]))
+print(f"frames mapped: {report['frames']}, Gaussians: {report['gaussians']}")
+sys.exit(0 if report["frames"] > 0 else 1)
+PYTHON

@@ -1,0 +1,59 @@
+"""The colcon package is consistent: entry point, parameters file, dependencies, and rclpy only in the node."""
+
+from __future__ import annotations
+
+import ast
+import re
+from pathlib import Path
+from xml.etree import ElementTree
+
+import yaml
+
+from gausslite_ros.parameters import NodeParameters
+from gausslite_ros.robot_session import PUBLICATIONS
+
+PACKAGE = Path(__file__).resolve().parents[2] / "ros2" / "gausslite_ros"
+ROS_MODULES = {"rclpy", "rosidl_runtime_py", "launch", "launch_ros", "ament_index_python"}
+AMENT = {"ament_index_python"}
+"""Comes with launch_ros."""
+
+
+def imports(path: Path) -> set[str]:
+    nodes = list(ast.walk(ast.parse(path.read_text())))
+    plain = {alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names}
+    named = {node.module or "" for node in nodes if isinstance(node, ast.ImportFrom)}
+    return {name.partition(".")[0] for name in plain | named}
+
+
+def declared() -> set[str]:
+    root = ElementTree.parse(PACKAGE / "package.xml").getroot()
+    return {element.text or "" for element in root.findall("exec_depend")}
+
+
+def test_only_the_node_and_the_launch_file_import_ros() -> None:
+    importing = {path.name for path in PACKAGE.rglob("*.py") if imports(path) & ROS_MODULES}
+    assert importing == {"node.py", "gausslite.launch.py"}
+
+
+def test_the_manifest_declares_what_is_imported_and_published() -> None:
+    used = set().union(*(imports(path) & ROS_MODULES for path in PACKAGE.rglob("*.py"))) - AMENT
+    session = (PACKAGE / "gausslite_ros" / "robot_session.py").read_text()
+    messages = set(re.findall(r'"(\w+)/msg/\w+"', session)) | {name.partition("/")[0] for name in PUBLICATIONS.values()}
+    assert used | messages == declared()
+
+
+def test_the_parameters_file_has_the_defaults() -> None:
+    content = yaml.safe_load((PACKAGE / "config" / "gausslite.yaml").read_text())
+    assert content["gausslite"]["ros__parameters"] == NodeParameters.defaults()
+
+
+def test_setup_installs_every_file_and_the_entry_point_exists() -> None:
+    setup = (PACKAGE / "setup.py").read_text()
+    for name in ("package.xml", "launch/gausslite.launch.py", "config/gausslite.yaml"):
+        assert name in setup
+        assert (PACKAGE / name).is_file()
+    assert (PACKAGE / "resource" / "gausslite_ros").is_file()
+    module = ast.parse((PACKAGE / "gausslite_ros" / "node.py").read_text())
+    assert "main" in [node.name for node in module.body if isinstance(node, ast.FunctionDef)]
+    version = ElementTree.parse(PACKAGE / "package.xml").getroot().findtext("version")
+    assert f'version="{version}"' in setup
